@@ -1,0 +1,398 @@
+"""The scene file: one TOML that says everything a dataset is made from. Strict, units in names.
+
+Unknown keys, wrong types, reversed bounds and values out of range are refused in one sentence that names the
+file, the key, the value and the allowed range. The tables under `[faults]` are checked against the registry by
+`faults.from_dict`, since every fault model brings its own keys.
+"""
+
+from __future__ import annotations
+
+import difflib
+import hashlib
+import json
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from . import resources, spectra
+from .errors import InputError
+
+Architecture = Literal["full_frame_ccd", "frame_transfer_ccd", "interline_ccd", "cmos"]
+Direction = Literal["up", "down", "left", "right"]
+Layer = Annotated[
+    str, Field(pattern="^(clean|depth_m|normal|semantic|raw|radiance|mask_effect|without_[a-z_]+)$")
+]
+
+
+def _ordered(pair: tuple[float, float]) -> tuple[float, float]:
+    if pair[0] > pair[1]:
+        raise ValueError("bounds reversed, the lower one comes first")
+    return pair
+
+
+def _pair(lo: float, hi: float) -> Any:
+    value = Annotated[float, Field(ge=lo, le=hi)]
+    return Annotated[tuple[value, value], AfterValidator(_ordered)]
+
+
+class Table(BaseModel):
+    """A table of the scene file: frozen, strict, no unknown keys."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, validate_default=True)
+
+
+class SplitTable(Table):
+    """Fractions of the sites in each split."""
+
+    train: float = Field(0.7, ge=0, le=1)
+    val: float = Field(0.15, ge=0, le=1)
+    test: float = Field(0.15, ge=0, le=1)
+
+    @model_validator(mode="after")
+    def _sum(self) -> SplitTable:
+        if abs(self.train + self.val + self.test - 1) > 1e-6:
+            raise ValueError("train, val and test must add up to 1")
+        return self
+
+
+class DatasetTable(Table):
+    """What is stored."""
+
+    samples: int = Field(16, ge=1, le=10_000_000)
+    seed: int = Field(1, ge=0, le=2**63 - 1)
+    sites: int = Field(32, ge=1, le=100_000, description="sites on the body; samples are grouped by site")
+    shard_samples: int = Field(
+        8, ge=1, le=16, description="samples a shard, all of one site: what a kill can lose at most"
+    )
+    layers: tuple[Layer, ...] = ("clean", "without_straylight", "depth_m", "normal", "semantic")
+    mask_any: tuple[str, ...] | None = Field(
+        None, description="classes united in mask_any; default: the localised ones of the scene"
+    )
+    split: SplitTable = SplitTable()
+    licence: str = "CC-BY-4.0"
+    citation: str = ""
+
+
+class BodyTable(Table):
+    """The target body, in its body-fixed frame T."""
+
+    name: str = "67P/Churyumov-Gerasimenko"
+    shape: str = Field("embedded", description="'embedded', 'ellipsoid', or a mesh file: OBJ, PLY, STL, GLB")
+    unit: Literal["auto", "m", "km"] = "auto"
+    semi_axes_m: tuple[float, float, float] = Field((1000.0, 1000.0, 1000.0), description="of an 'ellipsoid'")
+    density_kg_m3: float = Field(537.8, gt=0, le=30_000)
+    rotation_period_h: float = Field(
+        24 * 360 / 696.543884683, gt=0.01, le=1e5, description="67P before perihelion 2015: 12.4041 h"
+    )
+    pole_ra_deg: float = Field(69.54, ge=0, le=360)
+    pole_dec_deg: float = Field(64.11, ge=-90, le=90)
+    prime_meridian_deg: float = Field(114.69, ge=-360, le=360, description="W at J2000.0")
+    reflectance: str | Annotated[float, Field(ge=0, le=1)] = Field(
+        "67p", description="a named reflectance or a grey value"
+    )
+
+    @model_validator(mode="after")
+    def _known(self) -> BodyTable:
+        if isinstance(self.reflectance, str) and self.reflectance not in spectra.REFLECTANCES:
+            known = ", ".join(spectra.REFLECTANCES)
+            raise ValueError(f"reflectance = {self.reflectance!r}: must be a grey value 0 to 1 or one of {known}")
+        if min(self.semi_axes_m) <= 0 or max(self.semi_axes_m) > 1e9:
+            raise ValueError("semi_axes_m: each must be above 0 and at most 1e9")
+        return self
+
+
+class PatchTable(Table):
+    """Terrain around a site: how far and how fine the model is refined."""
+
+    facet_m: float = Field(1.0, ge=0.05, le=1e6, description="edge length aimed at within radius_m of the site")
+    radius_m: float = Field(250.0, ge=1, le=1e8)
+    relief: float = Field(1.0, ge=0, le=10, description="amplitude of relief below the model's facets; 0: none")
+    boulders: bool = True
+    min_boulder_m: float = Field(0.8, ge=0.05, le=1000)
+
+
+class SunTable(Table):
+    """Where the Sun is: from the ephemeris of 67P at a Julian date, unless a distance is given."""
+
+    julian_date: float = Field(2456974.0, ge=1_000_000, le=5_000_000, description="TDB; sets the body's attitude")
+    distance_au: float | None = Field(None, gt=0.01, le=1000)
+
+
+class CameraTable(Table):
+    """Camera and exposure."""
+
+    fov_deg: float = Field(65.0, ge=0.01, le=160, description="full field of view across the width")
+    width_px: int = Field(1024, ge=16, le=16384)
+    height_px: int = Field(1024, ge=16, le=16384)
+    f_number: float = Field(4.0, ge=0.5, le=200)
+    transmission: float = Field(0.9, gt=0, le=1)
+    focus_distance_m: float | None = Field(None, gt=0, description="default: infinity")
+    pixel_pitch_um: float = Field(5.5, ge=0.5, le=100)
+    full_well_e: float = Field(13_500.0, ge=10, le=1e8)
+    read_noise_e_rms: float = Field(13.0, ge=0, le=1e5)
+    dark_current_e_s: float = Field(125.0, ge=0, le=1e9)
+    adc_bits: int = Field(12, ge=8, le=16)
+    bias_dn: int = Field(64, ge=0, le=1000)
+    response: str = "nikon_5100"
+    quantum_efficiency_peak: float = Field(0.5, gt=0, le=1)
+    exposure_s: float | Literal["auto"] = Field("auto", description="seconds, or metered on each clean frame")
+    exposure_min_s: float = Field(1e-5, gt=0, le=1e4)
+    exposure_max_s: float = Field(5.0, gt=0, le=1e4)
+    metering_level: float = Field(
+        0.75, gt=0, le=1, description="fraction of white given to metering_percentile of the sunlit pixels"
+    )
+    metering_percentile: float = Field(99.0, gt=0, le=100)
+    architectures: tuple[Architecture, ...] = Field(
+        ("full_frame_ccd", "frame_transfer_ccd", "interline_ccd", "cmos"), min_length=1
+    )
+    readout_directions: tuple[Direction, ...] = Field(("up", "down", "left", "right"), min_length=1)
+
+    @model_validator(mode="after")
+    def _known(self) -> CameraTable:
+        if self.response not in spectra.RESPONSES:
+            raise ValueError(f"response = {self.response!r}: must be one of {', '.join(spectra.RESPONSES)}")
+        if isinstance(self.exposure_s, float | int) and not 0 < self.exposure_s <= 1e4:
+            raise ValueError(f"exposure_s = {self.exposure_s!r}: must be 'auto' or above 0 and at most 1e4 s")
+        if self.exposure_min_s > self.exposure_max_s:
+            raise ValueError("exposure_min_s, exposure_max_s: bounds reversed, the lower one comes first")
+        return self
+
+
+class RenderTable(Table):
+    """Spectral bands and sampling."""
+
+    band_min_nm: float = Field(400.0, ge=280, le=3900)
+    band_max_nm: float = Field(700.0, ge=290, le=4000)
+    bands: int = Field(8, ge=1, le=64)
+    samples_per_pixel: int = Field(16, ge=1, le=4096, description="a power of four: strata of each pixel")
+
+    @model_validator(mode="after")
+    def _valid(self) -> RenderTable:
+        if self.band_min_nm >= self.band_max_nm:
+            raise ValueError("band_min_nm, band_max_nm: bounds reversed, the lower one comes first")
+        n = self.samples_per_pixel
+        if n & (n - 1) or (n.bit_length() - 1) % 2:
+            raise ValueError(f"samples_per_pixel = {n}: must be 1, 4, 16, 64, 256, 1024 or 4096")
+        return self
+
+
+class StratumTable(Table):
+    """Bounds of one stratum of the sampling (Gallon et al., Table of bounds). Angles in degrees.
+
+    Roll and pitch tilt the boresight away from the reference direction, yaw turns the camera about it. The
+    site's own elevation of the Sun counts from the horizon upwards, azimuth from north towards east.
+    """
+
+    sun_azimuth_deg: _pair(-360, 720) | None = None  # type: ignore[valid-type]
+    sun_elevation_deg: _pair(-90, 90) | None = None  # type: ignore[valid-type]
+    roll_deg: _pair(-360, 720) | None = None  # type: ignore[valid-type]
+    pitch_deg: _pair(-360, 720) | None = None  # type: ignore[valid-type]
+    yaw_deg: _pair(-360, 720) | None = None  # type: ignore[valid-type]
+    reference: Literal["sun", "nadir"] = Field("sun", description="where the boresight points at zero angles")
+
+
+class GeometryTable(Table):
+    """Where the camera is and looks. Unset bounds follow the paper's table for the camera's field of view."""
+
+    x_m: _pair(-1e9, 1e9) = (-150.0, 150.0)  # type: ignore[valid-type]
+    y_m: _pair(-1e9, 1e9) = (-150.0, 150.0)  # type: ignore[valid-type]
+    height_m: _pair(0, 1e12) = (0.0, 100.0)  # type: ignore[valid-type]
+    clearance_m: float = Field(0.5, ge=0, le=1e9, description="least distance to any surface, else drawn again")
+    max_tries: int = Field(256, ge=1, le=100_000)
+    sun_facing: StratumTable | None = None
+    sun_averted: StratumTable | None = None
+
+
+class PlanTable(Table):
+    """The fault matrix."""
+
+    mode: Literal["per_class", "per_sample"] = "per_sample"
+    faulty_fraction: float = Field(0.5, ge=0, le=1, description="the paper's percentage p")
+    classes_per_sample: Annotated[
+        tuple[Annotated[int, Field(ge=1, le=64)], Annotated[int, Field(ge=1, le=64)]], AfterValidator(_ordered)
+    ] = (1, 6)
+    sun_facing_nominal_fraction: float = Field(
+        0.0, ge=0, le=1, description="share of all samples that face the Sun without straylight"
+    )
+
+
+class SceneConfig(Table):
+    """A whole scene file, defaults filled in."""
+
+    title: str
+    description: str = ""
+    dataset: DatasetTable = DatasetTable()
+    body: BodyTable = BodyTable()
+    patch: PatchTable = PatchTable()
+    sun: SunTable = SunTable()
+    camera: CameraTable = CameraTable()
+    render: RenderTable = RenderTable()
+    geometry: GeometryTable = GeometryTable()
+    plan: PlanTable = PlanTable()
+    faults: dict[str, dict[str, Any]] = Field(default_factory=dict)
+
+    @model_validator(mode="after")
+    def _strata(self) -> SceneConfig:
+        half, full = self.camera.fov_deg / 2, 360.0
+        near, far, turn = (-half, half), (half, full - half), (0.0, full)
+        paper = {
+            "sun_facing": {"sun_elevation_deg": (-30.0, 30.0), "roll_deg": near, "pitch_deg": near},
+            "sun_averted": {"sun_elevation_deg": (-30.0, 90.0), "roll_deg": far, "pitch_deg": far},
+        }
+        strata = {}
+        for name, bounds in paper.items():
+            given = getattr(self.geometry, name) or StratumTable()
+            bounds |= {"sun_azimuth_deg": turn, "yaw_deg": turn}
+            unset = {key: value for key, value in bounds.items() if getattr(given, key) is None}
+            strata[name] = given.model_copy(update=unset)
+        object.__setattr__(self, "geometry", self.geometry.model_copy(update=strata))
+        return self
+
+    def resolved(self) -> dict[str, Any]:
+        """The whole scene as plain JSON-able data."""
+        plain: dict[str, Any] = json.loads(self.model_dump_json())
+        return plain
+
+
+def load_scene(name_or_path: str | Path, overrides: Mapping[str, Any] | None = None) -> SceneConfig:
+    """Load a scene by path or packaged name; `overrides` maps dotted keys to values that replace the file's.
+
+    A relative path in the file (mesh, texture) is taken from the file's folder. Raises InputError.
+    """
+    path = resources.find("scenes", name_or_path)
+    try:
+        table = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: not a TOML file: {error}") from None
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror}") from None
+    for key, value in (overrides or {}).items():
+        *parents, leaf = key.split(".")
+        node = table
+        for parent in parents:
+            node = node.setdefault(parent, {})
+        node[leaf] = value
+    _anchor_paths(table, path.parent)
+    return parse_scene(table, source=str(path))
+
+
+def parse_scene(table: Mapping[str, Any], *, source: str) -> SceneConfig:
+    """Check plain data as a scene; raises InputError with one sentence naming `source`, key and value."""
+    try:
+        # JSON mode: strict about types, yet arrays become tuples
+        return SceneConfig.model_validate_json(json.dumps(table, default=str), strict=True)
+    except ValidationError as error:
+        raise InputError(f"{source}: {_sentence(error)}") from None
+
+
+def _anchor_paths(table: dict[str, Any], folder: Path) -> None:
+    body = table.get("body")
+    if isinstance(body, dict) and isinstance(body.get("shape"), str):
+        shape = body["shape"]
+        if shape not in ("embedded", "ellipsoid") and not Path(shape).is_absolute():
+            beside = folder / shape
+            body["shape"] = str((beside if beside.exists() else Path(shape)).resolve())
+    faults = table.get("faults")
+    for fault in faults.values() if isinstance(faults, dict) else ():
+        if isinstance(fault, dict) and isinstance(fault.get("file"), str) and fault["file"]:
+            beside = folder / fault["file"]
+            fault["file"] = str((beside if beside.exists() else Path(fault["file"])).resolve())
+
+
+def _sentence(error: ValidationError) -> str:
+    first = error.errors()[0]
+    keys, schema = _locate(first["loc"])
+    key = ".".join(keys)
+    value = first.get("input")
+    if first["type"] == "extra_forbidden":
+        known = list(schema.get("properties", {}))
+        close = difflib.get_close_matches(str(first["loc"][-1]), known, n=1)
+        hint = f" (did you mean {close[0]}?)" if close else f"; known: {', '.join(known)}"
+        return f"{'.'.join(str(part) for part in first['loc'])}: unknown key{hint}"
+    if first["type"] == "missing":
+        return f"{'.'.join(str(part) for part in first['loc'])}: missing"
+    lo = schema.get("minimum", schema.get("exclusiveMinimum"))
+    hi = schema.get("maximum", schema.get("exclusiveMaximum"))
+    if lo is not None or hi is not None:
+        kind = "a whole number" if schema.get("type") == "integer" else "a number"
+        above = "" if lo is None else f" {'above' if 'exclusiveMinimum' in schema else 'from'} {lo:g}"
+        upto = "" if hi is None else f" {'to' if above else 'up to'} {hi:g}"
+        message = f"must be {kind}{above}{upto}"
+    else:
+        message = str(first.get("ctx", {}).get("error", first["msg"])).replace("Input should be", "must be")
+    shown = "" if isinstance(value, dict | BaseModel) else f" = {value!r}"
+    return f"{key}{shown}: {message}" if key else message
+
+
+def _locate(loc: tuple[int | str, ...]) -> tuple[list[str], dict[str, Any]]:
+    """The keys of an error's location without pydantic's union tags, and the schema found there."""
+    root = SceneConfig.model_json_schema()
+
+    def plain(node: dict[str, Any]) -> dict[str, Any]:
+        while "$ref" in node or "allOf" in node:
+            node = root["$defs"][node["$ref"].rsplit("/", 1)[-1]] if "$ref" in node else node["allOf"][0]
+        options = [plain(o) for o in node.get("anyOf", ()) if o.get("type") != "null"]
+        numeric = [o for o in options if o.get("type") in ("number", "integer")]
+        return options[0] if len(options) == 1 else {**node, **(numeric[0] if numeric else {})}
+
+    keys: list[str] = []
+    node = plain(root)
+    for part in loc:
+        if part in node.get("properties", {}):
+            node = plain(node["properties"][part])
+        elif isinstance(part, int) and ("prefixItems" in node or "items" in node):
+            node = plain(node["prefixItems"][part] if "prefixItems" in node else node["items"])
+        elif isinstance(part, str) and part not in ("str", "float") and not part.startswith("constrained"):
+            if part.startswith(("literal", "function", "tuple")):
+                continue
+        else:
+            continue
+        keys.append(str(part))
+    return keys, node
+
+
+def json_schema(faults: Mapping[str, Any]) -> dict[str, Any]:
+    """JSON Schema of the scene file; `faults` is the schema of the fault registry."""
+    schema = SceneConfig.model_json_schema()
+    schema["$schema"] = "https://json-schema.org/draft/2020-12/schema"
+    schema["properties"]["faults"] = dict(faults)
+    return schema
+
+
+def content_hash(*parts: Any) -> str:
+    """sha256 (hex) over JSON-able parts and bytes, order-sensitive; dictionaries by sorted key."""
+    digest = hashlib.sha256()
+    for part in parts:
+        data = part if isinstance(part, bytes) else json.dumps(part, sort_keys=True).encode()
+        digest.update(len(data).to_bytes(8, "little"))
+        digest.update(data)
+    return digest.hexdigest()
+
+
+def rng(seed: int, sample: int, stage: str, name: str) -> np.random.Generator:
+    """The generator keyed by (seed, sample, stage, name): never by the order of execution.
+
+    Switching one fault off, or simulating samples in another order, leaves every other draw unchanged.
+    """
+    key = hashlib.sha256(f"{seed}\0{sample}\0{stage}\0{name}".encode()).digest()
+    return np.random.Generator(np.random.SFC64(np.random.SeedSequence(list(np.frombuffer(key, np.uint32)))))
+
+
+def keyed_uniform(seed: int, samples: NDArray[np.int64], stage: str, name: str) -> NDArray[np.float64]:
+    """Uniform numbers in [0, 1), float64 like `samples`, each keyed by (seed, its sample, stage, name).
+
+    The vectorised sibling of `rng` for one number a sample: the splitmix64 finaliser (Steele et al. 2014,
+    doi 10.1145/2660193.2660195) over the sample number, its start given by a hash of the other keys.
+    """
+    start = int.from_bytes(hashlib.sha256(f"{seed}\0{stage}\0{name}".encode()).digest()[:8], "little")
+    x = np.asarray(samples).astype(np.uint64) * np.uint64(0x9E3779B97F4A7C15) + np.uint64(start)
+    for _ in range(2):
+        x = (x ^ (x >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+        x = (x ^ (x >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+        x ^= x >> np.uint64(31)
+    return (x >> np.uint64(11)).astype(np.float64) * 2.0**-53

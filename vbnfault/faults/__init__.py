@@ -1,0 +1,29 @@
+"""Fault classes and their models; see `base` for the contract."""
+
+from .base import (
+    FAULT_AXIS,
+    PHYSICAL_ORDER,
+    Fault,
+    FaultContext,
+    Interval,
+    Params,
+    dataset_order,
+    from_dict,
+    json_schema,
+    physical_order,
+    registry,
+)
+
+__all__ = [
+    "FAULT_AXIS",
+    "PHYSICAL_ORDER",
+    "Fault",
+    "FaultContext",
+    "Interval",
+    "Params",
+    "dataset_order",
+    "from_dict",
+    "json_schema",
+    "physical_order",
+    "registry",
+]

@@ -1,0 +1,383 @@
+"""The `Fault` contract and its registry. A new fault is one file beside this one, plus one test.
+
+A fault *class* (`dust_on_optics`) has one or more *models* (`gaussian`). A model is a frozen, keyword-only
+dataclass derived from `Fault` that names its class and model; being defined registers it. Its fields are the
+keys of the scene file: an `Interval` is drawn from, anything else is fixed.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from functools import lru_cache
+from typing import Any, ClassVar, NamedTuple, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..camera import Camera
+from ..errors import InputError
+from ..quantities import RGBI, Electrons
+
+Params = dict[str, Any]
+T = TypeVar("T")
+
+# The `fault` axis of the dataset begins with the six classes of the paper, in this order.
+FAULT_AXIS = (
+    "dust_on_optics",
+    "broken_pixels",
+    "broken_lines",
+    "straylight",
+    "vignetting",
+    "optics_degradation",
+)
+
+# Order of effects: it belongs to the class, so mixed models cannot change it. Optical effects act on the
+# noise-free photo-electrons, readout effects on the digital image; hence a defect is never blurred and a
+# flare never covers a broken line. Classes not named here follow, in the order of their names.
+PHYSICAL_ORDER = (
+    "straylight",
+    "dust_on_optics",
+    "optics_degradation",
+    "vignetting",
+    "broken_pixels",
+    "broken_lines",
+)
+
+REFERENCE_WIDTH_PX = 1024
+
+
+class Interval(NamedTuple):
+    """Closed bounds of a uniform draw. `lo == hi` is a fixed value."""
+
+    lo: float
+    hi: float
+
+    def uniform(self, rng: np.random.Generator, size: int | None = None) -> Any:
+        """Uniform float(s) in [lo, hi]."""
+        value = rng.uniform(self.lo, self.hi, size)
+        return float(value) if size is None else value
+
+    def integer(self, rng: np.random.Generator) -> int:
+        """A uniform integer in lo … hi, both included."""
+        return int(rng.integers(int(self.lo), int(self.hi), endpoint=True))
+
+
+def bounds(
+    lo: float, hi: float, *, limits: tuple[float, float], doc: str, unit: str = "", integer: bool = False
+) -> Any:
+    """A field drawn uniformly from [lo, hi]; a scene may set other bounds, or one value, within `limits`."""
+    return field(
+        default=Interval(lo, hi),
+        metadata={"kind": "bounds", "limits": limits, "doc": doc, "unit": unit, "integer": integer},
+    )
+
+
+def number(
+    default: float | None, *, limits: tuple[float, float], doc: str, unit: str = "", integer: bool = False
+) -> Any:
+    """A fixed number within `limits`; with default None it may be left out."""
+    return field(
+        default=default,
+        metadata={"kind": "number", "limits": limits, "doc": doc, "unit": unit, "integer": integer},
+    )
+
+
+def flag(default: bool, *, doc: str) -> Any:
+    """A fixed true or false."""
+    return field(default=default, metadata={"kind": "flag", "doc": doc})
+
+
+def choice(default: str, options: tuple[str, ...], *, doc: str) -> Any:
+    """One of `options`."""
+    return field(default=default, metadata={"kind": "choice", "options": options, "doc": doc})
+
+
+def text(default: str, *, doc: str) -> Any:
+    """A fixed string, such as a path."""
+    return field(default=default, metadata={"kind": "text", "doc": doc})
+
+
+def rows(columns: Mapping[str, tuple[float, float]], *, doc: str) -> Any:
+    """A list of tables with the given numeric columns and their limits; empty by default (then drawn)."""
+    return field(default=(), metadata={"kind": "rows", "columns": dict(columns), "doc": doc})
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FaultContext:
+    """What a fault may know of the sample it acts on.
+
+    `sun_xy_px` float64[2], the pixel position of the Sun's centre (it may lie outside the frame; None behind
+    the camera), `sun_direction_C` unit float64[3], `sun_irradiance_W_m2_nm` float64[band] at the camera,
+    `sun_visible_fraction` in [0, 1]. All None where a user's own image is injected.
+    """
+
+    camera: Camera
+    sun_xy_px: NDArray[np.float64] | None = None
+    sun_direction_C: NDArray[np.float64] | None = None
+    sun_irradiance_W_m2_nm: NDArray[np.float64] | None = None
+    sun_visible_fraction: float | None = None
+    # not an init field: `dataclasses.replace` must not hand results for one frame to another
+    _memo: dict[Any, Any] = field(default_factory=dict, init=False, repr=False)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(height, width) in pixels."""
+        return self.camera.height_px, self.camera.width_px
+
+    @property
+    def scale(self) -> float:
+        """Factor from the pixels of a 1024 px wide image to this camera's."""
+        return self.camera.width_px / REFERENCE_WIDTH_PX
+
+    def once(self, name: str, params: Params, make: Callable[[], T]) -> T:
+        """`make()` once per (name, params object) and sample: apply and footprint share what it costs."""
+        key = (name, id(params))
+        if key not in self._memo:
+            # params is kept too, so that its id cannot be taken over by another object
+            self._memo[key] = (params, make())
+        result: T = self._memo[key][1]
+        return result
+
+
+Q = TypeVar("Q", Electrons, RGBI)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Fault:
+    """Base of all fault models; every hook is the identity by default.
+
+    Class attributes of a model: `fault` (its class), `model`, `step` (what `apply` receives: `electrons`, the
+    expected photo-electrons on the sensor, or `rgbi`), `localised` (False where the footprint is about the
+    whole frame), `needs_sun`, `effect_mask` (True: the mask is the effect rule, not the footprint).
+    """
+
+    fault: ClassVar[str]
+    model: ClassVar[str]
+    step: ClassVar[str]
+    localised: ClassVar[bool] = True
+    needs_sun: ClassVar[bool] = False
+    effect_mask: ClassVar[bool] = False
+
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        super().__init_subclass__(**kwargs)
+        if "model" not in cls.__dict__:
+            return  # an intermediate base
+        known = _REGISTRY.setdefault(cls.fault, {})
+        if cls.model in known and known[cls.model].__qualname__ != cls.__qualname__:
+            raise TypeError(f"fault model {cls.fault}/{cls.model} is defined twice")
+        known[cls.model] = cls
+
+    def __post_init__(self) -> None:
+        # a fault made in Python is checked like one from a scene file, and may give plain numbers and pairs
+        for f in dataclasses.fields(self):
+            where = f"{self.fault}.{f.name}"
+            object.__setattr__(self, f.name, _parse(getattr(self, f.name), f, where))
+
+    def draw(self, context: FaultContext, rng: np.random.Generator) -> Params:
+        """Plain, JSON-able parameters, complete enough to draw the fault again."""
+        return {}
+
+    def alter(self, camera: Camera, params: Params) -> Camera:
+        """The camera with this fault, where the fault is an instrument parameter."""
+        return camera
+
+    def apply(self, quantity: Q, params: Params, context: FaultContext) -> Q:
+        """The quantity of `step` with this fault; the input is not modified."""
+        return quantity
+
+    def footprint(self, params: Params, context: FaultContext) -> NDArray[np.bool_] | None:
+        """bool[y, x], where the fault sits; None where the class has no footprint."""
+        return None
+
+    def validate(self) -> None:
+        """Raise ValueError with one sentence where fields contradict each other."""
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain data that `from_dict` turns back into an equal fault."""
+        plain: dict[str, Any] = {"model": self.model}
+        for f in dataclasses.fields(self):
+            value = getattr(self, f.name)
+            if isinstance(value, Interval):
+                value = [value.lo, value.hi]
+            elif f.metadata.get("kind") == "rows":
+                value = [dict(row) for row in value]
+            if value is not None:  # TOML has no null: a number left out stays out
+                plain[f.name] = value
+        return plain
+
+
+_REGISTRY: dict[str, dict[str, type[Fault]]] = {}
+
+
+def registry() -> dict[str, dict[str, type[Fault]]]:
+    """Fault class → model → type, classes in dataset order."""
+    _import_all()
+    return {name: dict(_REGISTRY[name]) for name in dataset_order(_REGISTRY)}
+
+
+@lru_cache(maxsize=1)
+def _import_all() -> None:
+    import importlib
+    import pkgutil
+
+    package = __package__ or ""
+    for info in pkgutil.iter_modules(importlib.import_module(package).__path__):
+        importlib.import_module(f"{package}.{info.name}")
+
+
+def _ordered(names: Any, order: tuple[str, ...]) -> list[str]:
+    present = set(names)
+    return [n for n in order if n in present] + sorted(present - set(order))
+
+
+def dataset_order(names: Any) -> list[str]:
+    """Names in the order of the dataset's `fault` axis."""
+    return _ordered(names, FAULT_AXIS)
+
+
+def physical_order(names: Any) -> list[str]:
+    """Names in the order in which the effects act."""
+    return _ordered(names, PHYSICAL_ORDER)
+
+
+def from_dict(fault_class: str, table: Mapping[str, Any], *, source: str) -> Fault:
+    """Build one fault from its scene-file table `[faults.<fault_class>]`.
+
+    `model` may be left out where the class has one model only (or one called `texture`/the first defined).
+    Raises `InputError` naming `source`, the key, the value and the allowed range.
+    """
+    models = registry().get(fault_class)
+    where = f"{source}: faults.{fault_class}"
+    if models is None:
+        raise InputError(f"{where}: no such fault class{_hint(fault_class, registry())}")
+    name = table.get("model", next(iter(models)))
+    if name not in models:
+        raise InputError(f"{where}.model = {name!r}: must be one of {', '.join(models)}")
+    cls = models[name]
+    fields = {f.name: f for f in dataclasses.fields(cls)}
+    values: dict[str, Any] = {}
+    for key, value in table.items():
+        if key == "model":
+            continue
+        if key not in fields:
+            raise InputError(f"{where}.{key}: unknown key{_hint(key, fields)}")
+        values[key] = _parse(value, fields[key], f"{where}.{key}")
+    fault = cls(**values)
+    try:
+        fault.validate()
+    except ValueError as error:
+        raise InputError(f"{where}: {error}") from None
+    return fault
+
+
+def _hint(word: str, known: Any) -> str:
+    close = difflib.get_close_matches(word, list(known), n=1)
+    return f" (did you mean {close[0]}?)" if close else f"; known: {', '.join(known)}"
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and bool(np.isfinite(value))
+
+
+def _parse(value: Any, f: dataclasses.Field[Any], where: str) -> Any:
+    meta = f.metadata
+    kind = meta["kind"]
+    if kind == "number" and value is None and f.default is None:
+        return None
+    if kind == "flag":
+        if not isinstance(value, bool):
+            raise InputError(f"{where} = {value!r}: must be true or false")
+        return value
+    if kind == "choice":
+        if value not in meta["options"]:
+            raise InputError(f"{where} = {value!r}: must be one of {', '.join(meta['options'])}")
+        return value
+    if kind == "text":
+        if not isinstance(value, str):
+            raise InputError(f"{where} = {value!r}: must be a string")
+        return value
+    if kind == "rows":
+        return _parse_rows(value, meta["columns"], where)
+    lo, hi = meta["limits"]
+    whole = " whole" if meta["integer"] else ""
+    if kind == "number":
+        fits = _is_number(value) and lo <= value <= hi and (not whole or float(value).is_integer())
+        if not fits:
+            raise InputError(f"{where} = {value!r}: must be a{whole} number from {lo:g} to {hi:g}")
+        return value
+    pair = value if isinstance(value, list | tuple) else [value, value]
+    ok = len(pair) == 2 and all(_is_number(v) and (not whole or float(v).is_integer()) for v in pair)
+    if not ok or not (lo <= pair[0] and pair[1] <= hi):
+        raise InputError(
+            f"{where} = {value!r}: must be one{whole} number, or [lower, upper]{whole} bounds, "
+            f"from {lo:g} to {hi:g}"
+        )
+    if pair[0] > pair[1]:
+        raise InputError(f"{where} = {value!r}: bounds reversed, the lower one comes first")
+    return Interval(*pair)
+
+
+def _parse_rows(value: Any, columns: Mapping[str, tuple[float, float]], where: str) -> tuple[Any, ...]:
+    if not isinstance(value, list | tuple):
+        raise InputError(f"{where} = {value!r}: must be a list of tables with keys {', '.join(columns)}")
+    for i, row in enumerate(value):
+        if not isinstance(row, Mapping) or set(row) != set(columns):
+            raise InputError(f"{where}[{i}] = {row!r}: must be a table with the keys {', '.join(columns)}")
+        for key, (lo, hi) in columns.items():
+            if not _is_number(row[key]) or not lo <= row[key] <= hi:
+                raise InputError(f"{where}[{i}].{key} = {row[key]!r}: must be a number from {lo:g} to {hi:g}")
+    return tuple(dict(row) for row in value)
+
+
+def json_schema() -> dict[str, Any]:
+    """JSON Schema of the `faults` table, from the fields of every registered model."""
+    classes: dict[str, Any] = {}
+    for fault_class, models in registry().items():
+        options = []
+        for name, cls in models.items():
+            properties: dict[str, Any] = {"model": {"const": name}}
+            for f in dataclasses.fields(cls):
+                properties[f.name] = _field_schema(f)
+            options.append({"type": "object", "properties": properties, "additionalProperties": False})
+        classes[fault_class] = options[0] if len(options) == 1 else {"anyOf": options}
+    return {"type": "object", "properties": classes, "additionalProperties": False}
+
+
+def _field_schema(f: dataclasses.Field[Any]) -> dict[str, Any]:
+    meta = f.metadata
+    unit = f" [{meta['unit']}]" if meta.get("unit") else ""
+    schema: dict[str, Any] = {"description": meta["doc"] + unit}
+    kind = meta["kind"]
+    if kind in ("bounds", "number"):
+        lo, hi = meta["limits"]
+        value = {"type": "integer" if meta.get("integer") else "number"}
+        value |= {k: v for k, v in (("minimum", lo), ("maximum", hi)) if np.isfinite(v)}
+        if kind == "number":
+            return schema | value | ({} if f.default is None else {"default": f.default})
+        pair = {"type": "array", "items": value, "minItems": 2, "maxItems": 2}
+        return schema | {"anyOf": [value, pair], "default": list(f.default)}  # type: ignore[call-overload]
+    if kind == "rows":
+        columns = {k: {"type": "number", "minimum": v[0], "maximum": v[1]} for k, v in meta["columns"].items()}
+        item = {"type": "object", "properties": columns, "required": list(columns), "additionalProperties": False}
+        return schema | {"type": "array", "items": item, "default": []}
+    if kind == "choice":
+        return schema | {"enum": list(meta["options"]), "default": f.default}
+    return schema | {"type": "boolean" if kind == "flag" else "string", "default": f.default}
+
+
+def scale_by_intensity(rgbi: NDArray[np.uint8], intensity: NDArray[np.float32]) -> NDArray[np.uint8]:
+    """RGBI uint8[..., 4] with I set to `intensity` (0-255) and RGB scaled by the same ratio.
+
+    Where I was 0 RGB becomes I; overflow clips per channel (design.md, conventions).
+    """
+    before = rgbi[..., 3].astype(np.float32)
+    ratio = intensity / np.maximum(before, 1)
+    rgb = np.where(before[..., None] > 0, rgbi[..., :3] * ratio[..., None], intensity[..., None])
+    out = np.empty_like(rgbi)
+    np.clip(np.rint(rgb), 0, 255, out=rgb)
+    out[..., :3] = rgb
+    out[..., 3] = np.clip(np.rint(intensity), 0, 255)
+    return out

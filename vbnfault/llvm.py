@@ -1,0 +1,162 @@
+"""Find a libLLVM that Mitsuba's LLVM backend can use, before drjit or mitsuba load.
+
+Mitsuba does not ship LLVM. Versions 14 and 15, the defaults of Debian 12, abort the whole process inside the
+first render ("Cannot select … fminimum"), so anything below 16 is refused here with a sentence. The C function
+`LLVMGetVersion` is exported from 16 on: a library without it is too old.
+
+Order: `DRJIT_LIBLLVM_PATH` if usable, the wheel `karellen-llvm-core`, then the system's libraries, newest first.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+import importlib.metadata
+import os
+import re
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from .errors import VbnfaultError
+
+OLDEST_USABLE = 16
+VARIABLE = "DRJIT_LIBLLVM_PATH"
+_WHEEL = "karellen-llvm-core"
+
+_SYSTEM_PATTERNS = {
+    "linux": (
+        ("/usr/lib", "llvm-*/lib/libLLVM*.so*"),
+        ("/usr/lib", "*-linux-gnu/libLLVM*.so*"),
+        ("/usr/lib64", "libLLVM*.so*"),
+        ("/usr/lib64", "llvm*/lib*/libLLVM*.so*"),
+        ("/usr/lib", "libLLVM*.so*"),
+        ("/usr/local/lib", "libLLVM*.so*"),
+    ),
+    "darwin": (
+        ("/opt/homebrew/opt", "llvm*/lib/libLLVM*.dylib"),
+        ("/usr/local/opt", "llvm*/lib/libLLVM*.dylib"),
+    ),
+    "win32": (("C:/Program Files/LLVM", "bin/LLVM-C.dll"),),
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Candidate:
+    """One library that was looked at. `version` is (major, minor, patch), None where it could not be told."""
+
+    path: Path
+    origin: str
+    version: tuple[int, int, int] | None
+    problem: str
+
+    @property
+    def usable(self) -> bool:
+        return not self.problem
+
+
+def candidates() -> Iterator[Candidate]:
+    """Every library found, in the order of preference, each with its version and what is wrong with it."""
+    seen: set[Path] = set()
+    for origin, path in _paths():
+        resolved = path.resolve()
+        if resolved in seen:
+            continue
+        seen.add(resolved)
+        yield _inspect(path, origin)
+
+
+def find() -> Candidate:
+    """The first usable library. Raises VbnfaultError with a sentence that says what was found instead."""
+    looked_at = []
+    for candidate in candidates():
+        if candidate.usable:
+            return candidate
+        looked_at.append(f"{candidate.path} ({candidate.problem})")
+    found = "; ".join(looked_at) if looked_at else "none found"
+    raise VbnfaultError(
+        f"no usable LLVM: rendering needs libLLVM {OLDEST_USABLE} or newer, {found}; install one with "
+        f"'pip install {_WHEEL}' (Linux x86-64) or your system's package, or set {VARIABLE} to its path"
+    )
+
+
+@functools.lru_cache(maxsize=1)
+def prepare() -> Candidate:
+    """Point drjit to a usable library; call before drjit or mitsuba are imported. Raises VbnfaultError."""
+    found = find()
+    os.environ[VARIABLE] = str(found.path)
+    return found
+
+
+def _paths() -> Iterator[tuple[str, Path]]:
+    if os.environ.get(VARIABLE):
+        yield VARIABLE, Path(os.environ[VARIABLE])
+    yield from ((_WHEEL, path) for path in _wheel_files("libLLVM.so"))
+    system = {
+        path
+        for folder, pattern in _SYSTEM_PATTERNS.get(sys.platform, ())
+        for path in Path(folder).glob(pattern)
+    }
+    yield from (("system", path) for path in sorted(system, key=_name_version, reverse=True))
+
+
+def _wheel_files(stem: str) -> list[Path]:
+    """Files of the wheel whose name begins with `stem`; real files, not the links a start-up hook makes."""
+    try:
+        files = importlib.metadata.files(_WHEEL) or []
+    except importlib.metadata.PackageNotFoundError:
+        return []
+    paths = (Path(str(f.locate())).resolve() for f in files if f.name.startswith(stem))
+    return sorted({p for p in paths if p.is_file() and not p.is_symlink() and ".json" not in p.suffixes})
+
+
+def _name_version(path: Path) -> tuple[int, ...]:
+    numbers = re.findall(r"\d+", str(path).replace("x86_64", "").replace("64", ""))
+    return tuple(int(n) for n in numbers)
+
+
+def _inspect(path: Path, origin: str) -> Candidate:
+    if not path.is_file():
+        return Candidate(path=path, origin=origin, version=None, problem="no such file")
+    by_name = re.search(r"libLLVM[.-](?:so\.)?(\d+)", path.resolve().name)
+    if by_name and int(by_name[1]) < OLDEST_USABLE:  # told by the name alone: do not load it
+        version = (int(by_name[1]), 0, 0)
+        return Candidate(path=path, origin=origin, version=version, problem=_too_old(version))
+    try:
+        library = _load(path, origin)
+    except OSError as error:
+        return Candidate(path=path, origin=origin, version=None, problem=f"does not load: {error}")
+    try:
+        get_version = library.LLVMGetVersion
+    except AttributeError:
+        problem = f"older than {OLDEST_USABLE}, or no LLVM: it exports no LLVMGetVersion"
+        return Candidate(path=path, origin=origin, version=None, problem=problem)
+    parts = [ctypes.c_uint() for _ in range(3)]
+    get_version(*map(ctypes.byref, parts))
+    version = (parts[0].value, parts[1].value, parts[2].value)
+    return Candidate(
+        path=path, origin=origin, version=version, problem=_too_old(version) if version[0] < OLDEST_USABLE else ""
+    )
+
+
+def _too_old(version: tuple[int, int, int]) -> str:
+    return f"version {version[0]} aborts the first render"
+
+
+def _load(path: Path, origin: str) -> ctypes.CDLL:
+    try:
+        return ctypes.CDLL(str(path))
+    except OSError:
+        if _WHEEL not in (origin, _origin_of(path)):
+            raise
+    # Where site-packages is read-only the wheel's start-up hook could not link libc++.so.1; with the real
+    # files loaded first, and globally, the loader finds the names.
+    for stem in ("libunwind.so.1", "libc++abi.so.1", "libc++.so.1"):
+        for dependency in _wheel_files(stem)[:1]:
+            ctypes.CDLL(str(dependency), mode=ctypes.RTLD_GLOBAL)
+    return ctypes.CDLL(str(path))
+
+
+def _origin_of(path: Path) -> str:
+    return _WHEEL if path.resolve() in _wheel_files("libLLVM.so") else "system"

@@ -1,0 +1,114 @@
+"""The quantities that flow through the pipeline: an array, its unit and its axes, frozen.
+
+    Radiance ─ lens ─▶ Irradiance ─ detector ─▶ Electrons ─▶ RawDN ─▶ RGBI ─▶ Sample
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any, ClassVar, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+CHANNELS = ("R", "G", "B", "I")
+
+# Rec. 709 luminance of linear RGB; the intensity channel of a camera without a W pixel.
+LUMINANCE = np.array([0.2126, 0.7152, 0.0722], dtype=np.float32)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Quantity:
+    """Base of all quantities. Arrays are made read-only: a step returns a new quantity, never edits one."""
+
+    array: NDArray[Any]
+
+    unit: ClassVar[str] = "1"
+    axes: ClassVar[tuple[str, ...]] = ()
+    dtype: ClassVar[type] = np.float32
+
+    def __post_init__(self) -> None:
+        if self.array.ndim != len(self.axes):
+            raise ValueError(f"{type(self).__name__} has axes {self.axes}, got shape {self.array.shape}")
+        if self.array.dtype != self.dtype:
+            raise TypeError(f"{type(self).__name__} is {self.dtype.__name__}, got {self.array.dtype}")
+        self.array.flags.writeable = False
+
+    def with_array(self, array: NDArray[Any]) -> Self:
+        """The same quantity with another array of the same axes."""
+        return replace(self, array=array)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Radiance(Quantity):
+    """Spectral radiance at the camera, per band node; `wavelength_nm` float64[band]."""
+
+    wavelength_nm: NDArray[np.float64]
+    unit = "W m-2 sr-1 nm-1"
+    axes = ("band", "y", "x")
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Irradiance(Quantity):
+    """Spectral irradiance on the sensor plane, per band node; `wavelength_nm` float64[band]."""
+
+    wavelength_nm: NDArray[np.float64]
+    unit = "W m-2 nm-1"
+    axes = ("band", "y", "x")
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Electrons(Quantity):
+    """Electrons per pixel and colour, R, G, B.
+
+    `white_e` float32[3]: the signal of each colour that the 8 bit image shows as 255. Expected (noise-free)
+    photo-electrons may lie above it; saturation belongs to the detector.
+    """
+
+    white_e: NDArray[np.float32]
+    unit = "e-"
+    axes = ("y", "x", "channel")
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class RawDN(Quantity):
+    """Digital numbers of the analogue-to-digital converter, bias included, per colour R, G, B."""
+
+    unit = "DN"
+    axes = ("y", "x", "channel")
+    dtype = np.uint16
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class RGBI(Quantity):
+    """The 8 bit image: R, G, B and intensity."""
+
+    unit = "DN"
+    axes = ("y", "x", "channel")
+    dtype = np.uint8
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Truth:
+    """Noise-free truth of the pixel centres.
+
+    `depth_m` float32[y, x], along the boresight, inf on the sky; `normal` float16[y, x, 3] in C, 0 on the sky;
+    `semantic` uint8[y, x]: 0 sky, 1 body, 2 Sun, 3 spacecraft.
+    """
+
+    depth_m: NDArray[np.float32]
+    normal: NDArray[np.float16]
+    semantic: NDArray[np.uint8]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Sample:
+    """One finished sample: the layers and scalars that the store holds, by the names of its arrays.
+
+    `layers` maps array name to ndarray; `scalars` maps array name to number, small vector or string.
+    """
+
+    index: int
+    layers: Mapping[str, NDArray[Any]]
+    scalars: Mapping[str, Any] = field(default_factory=dict)

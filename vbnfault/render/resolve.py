@@ -1,0 +1,82 @@
+"""Questions the planner asks of the terrain: ground height, clearance, how much of the Sun is visible."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..scene import Sunlight
+from .runtime import dr, mi
+from .surface import Surface
+
+F64 = NDArray[np.float64]
+
+_SUN_SAMPLES = 64
+_DIRECTIONS = 64
+_GROUND_HITS = 4
+
+
+def ground_height_m(surface: Surface, x_m: F64, y_m: F64, start_height_m: float) -> F64:
+    """Height (up, −z of L) of the ground at positions in L, float64 like `x_m`; 0 where there is none.
+
+    The first surface that faces up below `start_height_m`: a start inside an overhang first leaves the body.
+    """
+    n = len(x_m)
+    origin = np.column_stack([x_m, y_m, np.full(n, -start_height_m)])
+    down = mi.Vector3f(0, 0, 1)
+    height = np.zeros(n)
+    open_ = np.ones(n, dtype=bool)
+    for _ in range(_GROUND_HITS):
+        points = mi.Point3f(*(mi.Float(np.ascontiguousarray(c, np.float32)) for c in origin.T))
+        hit = surface.intersect(mi.Ray3f(points, down))
+        normal, distance, valid = hit.facet_normal, hit.distance_m, hit.valid
+        dr.eval(normal, distance, valid)
+        found, up = valid.numpy().astype(bool), normal.z.numpy() < 0
+        depth = origin[:, 2] + np.where(found, distance.numpy(), 0.0)
+        hit_ground = open_ & found & up
+        height[hit_ground] = -depth[hit_ground]
+        open_ &= found & ~up
+        if not open_.any():
+            break
+        origin[:, 2] = np.where(open_, depth + 1e-3, origin[:, 2])
+    return height
+
+
+def is_clear(surface: Surface, position_L_m: F64, clearance_m: float) -> NDArray[np.bool_]:
+    """bool[n]: no surface within `clearance_m` of positions float64[n, 3], along 64 directions."""
+    k = np.arange(_DIRECTIONS) + 0.5  # spherical Fibonacci points
+    z, turn = 1 - 2 * k / _DIRECTIONS, k * np.pi * (3 - np.sqrt(5))
+    r = np.sqrt(1 - z * z)
+    directions = np.column_stack([r * np.cos(turn), r * np.sin(turn), z])
+    return ~_any_hit(surface, position_L_m, directions[None], clearance_m).any(axis=1)
+
+
+def sun_visible_fraction(surface: Surface, position_L_m: F64, suns: list[Sunlight]) -> F64:
+    """Share of the Sun's disc not hidden by the body, float64[n], from 64 points of the disc each."""
+    k = np.arange(_SUN_SAMPLES) + 0.5  # a sunflower: equal areas
+    radius, turn = np.sqrt(k / _SUN_SAMPLES), k * np.pi * (3 - np.sqrt(5))
+    directions = []
+    for sun in suns:
+        axis = sun.direction_L
+        x = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
+        x /= np.linalg.norm(x)
+        y = np.cross(axis, x)
+        offset = np.tan(sun.angular_radius_rad) * radius[:, None] * (
+            np.cos(turn)[:, None] * x + np.sin(turn)[:, None] * y
+        )
+        d = axis + offset
+        directions.append(d / np.linalg.norm(d, axis=1, keepdims=True))
+    return 1 - _any_hit(surface, position_L_m, np.stack(directions), np.inf).mean(axis=1)
+
+
+def _any_hit(surface: Surface, position: F64, directions: F64, reach_m: float) -> NDArray[np.bool_]:
+    """bool[n, k] for positions float64[n, 3] and directions float64[n or 1, k, 3]."""
+    n, k = len(position), directions.shape[1]
+    origins = np.repeat(position, k, axis=0)
+    d = np.broadcast_to(directions, (n, k, 3)).reshape(-1, 3)
+    o = mi.Point3f(*(mi.Float(np.ascontiguousarray(c, np.float32)) for c in origins.T))
+    v = mi.Vector3f(*(mi.Float(np.ascontiguousarray(c, np.float32)) for c in d.T))
+    rays = mi.Ray3f(o, v)
+    rays.maxt = mi.Float(min(reach_m, 3e38))
+    hits = surface.occluded(rays, mi.Bool(True))
+    return hits.numpy().astype(bool).reshape(n, k)

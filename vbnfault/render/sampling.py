@@ -1,0 +1,100 @@
+"""Primary rays: strata of each pixel, their jitter, and the thin lens.
+
+Samples of a pixel are neighbours in the wavefront, so packets of rays are coherent and the sum over a pixel is
+a block sum: bit-identical from run to run, whatever the number of threads.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from ..scene import View
+from .runtime import dr, mi
+
+_TO_UNIT = 2.0**-32
+
+
+class Strata:
+    """Jittered strata of all pixels: `pixel`, `index` within the pixel, and stratified uniform pairs."""
+
+    def __init__(self, width: int, rows: int, samples_per_pixel: int, key: int, first_row: int = 0) -> None:
+        self.side = round(samples_per_pixel**0.5)
+        self.samples = samples_per_pixel
+        wavefront = dr.arange(mi.UInt32, width * rows * samples_per_pixel)
+        wavefront += dr.opaque(mi.UInt32, first_row * width * samples_per_pixel)
+        shift = int(samples_per_pixel).bit_length() - 1
+        self.pixel = wavefront >> shift
+        self.index = wavefront & (samples_per_pixel - 1)
+        self._key = dr.opaque(mi.UInt32, key & 0xFFFFFFFF)
+        self._wavefront = wavefront
+
+    def pair(self, dimension: int) -> tuple[Any, Any]:
+        """Two stratified uniform numbers in [0, 1). Dimension 0 (the pixel area) keeps its strata in order,
+        the others visit theirs in an order shuffled per pixel, so that dimensions do not correlate."""
+        u, v = mi.sample_tea_32(self._wavefront, self._key + (dimension * 0x9E3779B9 & 0xFFFFFFFF), 4)
+        stratum = self.index
+        if dimension:
+            turn, _ = mi.sample_tea_32(self.pixel, self._key + (dimension * 0x85EBCA6B & 0xFFFFFFFF), 4)
+            stratum = (self.index * (2 * dimension + 5) + turn) & (self.samples - 1)
+        shift = self.side.bit_length() - 1
+        sx, sy = stratum & (self.side - 1), stratum >> shift
+        # 2⁻³² · u may round to 1.0 in float32, which is still inside the closed stratum: harmless here
+        return (
+            (mi.Float(sx) + mi.Float(u) * _TO_UNIT) / self.side,
+            (mi.Float(sy) + mi.Float(v) * _TO_UNIT) / self.side,
+        )
+
+
+def disc(u: Any, v: Any) -> Any:
+    """Uniform point on the unit disc from two uniform numbers (concentric map of Shirley and Chiu 1997)."""
+    return mi.warp.square_to_uniform_disk_concentric(mi.Point2f(u, v))
+
+
+class Optics:
+    """A view with its numbers as opaque variables, so that no view recompiles a kernel."""
+
+    def __init__(self, view: View) -> None:
+        self.width, self.height = view.width_px, view.height_px
+        self.origin = opaque_vector(mi.Point3f, view.position_L_m)
+        self.axes = [opaque_vector(mi.Vector3f, view.L_from_C[:, i]) for i in range(3)]
+        fx, fy, cx, cy = (float(v) for v in view.intrinsics)
+        self.scale = opaque_vector(mi.Vector2f, np.array([1 / fx, 1 / fy]))
+        self.centre = opaque_vector(mi.Vector2f, np.array([cx, cy]))
+        self.aperture = view.aperture_radius_m
+        self._radius = dr.opaque(mi.Float, view.aperture_radius_m)
+        self._inverse_focus = dr.opaque(mi.Float, 1.0 / view.focus_distance_m)
+
+    def direction(self, x: Any, y: Any, lens: Any = None) -> tuple[Any, Any]:
+        """Origin and unit direction in L of the ray through image point (x, y) in pixels; `lens` is a point of
+        the unit disc on the aperture."""
+        cx = (x - self.centre.x) * self.scale.x
+        cy = (y - self.centre.y) * self.scale.y
+        ax, ay, az = self.axes
+        origin = self.origin
+        if lens is not None:
+            lx, ly = lens.x * self._radius, lens.y * self._radius
+            origin = origin + lx * ax + ly * ay
+            cx, cy = cx - lx * self._inverse_focus, cy - ly * self._inverse_focus
+        return origin, dr.normalize(cx * ax + cy * ay + az)
+
+    def camera_rays(self, strata: Strata) -> Any:
+        """One ray a stratum, through the thin lens."""
+        u, v = strata.pair(0)
+        x = mi.Float(strata.pixel % self.width) + u
+        y = mi.Float(strata.pixel // self.width) + v
+        lens = disc(*strata.pair(2)) if self.aperture > 0 else None
+        return mi.Ray3f(*self.direction(x, y, lens))
+
+    def centre_rays(self) -> Any:
+        """One pinhole ray through every pixel centre."""
+        pixel = dr.arange(mi.UInt32, self.width * self.height)
+        x = mi.Float(pixel % self.width) + 0.5
+        y = mi.Float(pixel // self.width) + 0.5
+        return mi.Ray3f(*self.direction(x, y))
+
+
+def opaque_vector(kind: Any, values: np.ndarray) -> Any:
+    """A drjit vector whose entries are runtime values, not constants of the kernel."""
+    return kind(*(dr.opaque(mi.Float, float(v)) for v in values))

@@ -1,0 +1,38 @@
+"""Where the packaged scenes and textures lie: in the wheel, or beside the package in a checkout."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from .errors import InputError
+
+_PACKAGE = Path(__file__).resolve().parent
+
+
+def data_dir(kind: str) -> Path:
+    """The folder `scenes` or `textures`; raises InputError where the installation lacks it."""
+    for candidate in (_PACKAGE / kind, _PACKAGE.parent / kind):
+        if candidate.is_dir():
+            return candidate
+    raise InputError(f"{kind}: the folder is missing from this installation of vbnfault; install it again")
+
+
+def packaged(kind: str) -> dict[str, Path]:
+    """Name → path of every packaged TOML of a kind: `scenes`, `scenes/lenses`, `scenes/detectors`."""
+    top, *rest = kind.split("/")
+    folder = data_dir(top).joinpath(*rest)
+    return {p.stem: p for p in sorted(folder.glob("*.toml"))}
+
+
+def find(kind: str, name_or_path: str | Path) -> Path:
+    """A path as given, or the packaged file of that name. Raises InputError listing the packaged names."""
+    path = Path(name_or_path)
+    if path.suffix or path.exists():
+        if path.is_file():
+            return path
+        raise InputError(f"{path}: no such file")
+    known = packaged(kind)
+    if str(name_or_path) in known:
+        return known[str(name_or_path)]
+    what = kind.rsplit("/", 1)[-1]
+    raise InputError(f"{name_or_path}: neither a file nor a packaged name; {what}: {', '.join(known)}")

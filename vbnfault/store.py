@@ -1,0 +1,963 @@
+"""The dataset: one Zarr v3 group. Its schema, and how it is created, written, opened, verified.
+
+The only importer of zarr. How a store survives what happens to it:
+
+- Every file is written beside its place and renamed into it, so it is either the old or the new one.
+  `create` builds the whole group that way. A kill leaves `*.partial` files, which `recover` removes.
+- A per-pixel layer is sharded: a chunk is one sample, a file holds `shard_samples` of them. One task owns a
+  shard. Whoever rewrites it copies the compressed chunks of the samples it does not rebuild, untouched.
+- `crc32c` holds a checksum of every layer and of all scalars of a sample, over decoded bytes; a chunk carries
+  Zstd's own checksum besides. `done` is written last. So a lost power supply or a bad disk is found, and
+  exactly the samples concerned are rebuilt.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import os
+import shutil
+import struct
+import uuid
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, dataclass, field, fields
+from functools import cached_property, lru_cache
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import google_crc32c
+import numpy as np
+import zarr
+from numcodecs import Zstd
+from numpy.typing import NDArray
+from zarr.codecs import ZstdCodec
+
+from .errors import InputError, VbnfaultError
+from .quantities import CHANNELS, Sample
+
+FORMAT_VERSION = 1
+SPLITS = ("train", "val", "test")
+STRATA = ("sun-facing", "sun-averted")
+SEMANTIC = ("sky", "body", "sun", "spacecraft")
+
+# Root attributes that say when or how a store was written, not what it holds: no part of the digest.
+VOLATILE_ATTRIBUTES = ("created", "modified", "command")
+
+MAX_SHARD_SAMPLES = 16
+MAX_SHARD_BYTES = 2**30
+MAX_HELD_BYTES = 2**31  # all layers of a shard, uncompressed: what a task may have to hold
+
+# Level 1: 16 ms for a noisy 1024 px RGBI image; level 3 takes three times as long and saves a sixth.
+_ZSTD_LEVEL = 1
+_SCALARS = "scalars"  # the entry of the `layer` axis that stands for all scalars of a sample
+_ABSENT = 2**64 - 1  # how a shard's index says that it has no such chunk
+
+
+@dataclass(frozen=True, kw_only=True)
+class Array:
+    """One row of the schema. `ratio`: a typical compressed size over the uncompressed one."""
+
+    dims: tuple[str, ...]
+    dtype: str
+    units: str
+    long_name: str
+    names: tuple[str, ...] = ()  # CF flag meanings
+    ratio: float = 1.0
+
+    @property
+    def is_text(self) -> bool:
+        return self.dtype == "str"
+
+    @property
+    def fill(self) -> Any:
+        """What an unwritten sample reads as."""
+        return "" if self.is_text else float("nan") if self.dtype == "float64" else 0
+
+
+def _row(
+    dims: str, dtype: str, units: str, long_name: str, names: Iterable[str] = (), ratio: float = 1.0
+) -> Array:
+    return Array(
+        dims=tuple(dims.split()),
+        dtype=dtype,
+        units=units,
+        long_name=long_name,
+        names=tuple(names),
+        ratio=ratio,
+    )
+
+
+_IMAGE = "sample y x channel"
+
+# The schema. Per-pixel layers: one chunk a sample, sharded.
+LAYERS: dict[str, Array] = {
+    "image": _row(_IMAGE, "uint8", "DN", "image with faults", ratio=0.45),
+    "mask": _row("sample fault y x", "bool", "1", "footprint of each fault", ratio=0.005),
+    "mask_any": _row(
+        "sample y x", "bool", "1", "union of the footprints of the faults named here", ratio=0.005
+    ),
+    "clean": _row(_IMAGE, "uint8", "DN", "same camera, exposure and noise, no fault", ratio=0.45),
+    # optional from here on; `without_<fault>` follows the pattern of the straylight one
+    "mask_effect": _row(
+        "sample fault y x", "bool", "1", "noise-free change of 1 DN or more by this fault", ratio=0.02
+    ),
+    "raw": _row("sample y x", "uint16", "DN", "raw mosaic of the analogue-to-digital converter", ratio=0.6),
+    "depth_m": _row("sample y x", "float32", "m", "depth along the boresight, inf on the sky", ratio=0.5),
+    "normal": _row("sample y x xyz", "float16", "1", "surface normal in C, 0 on the sky", ratio=0.55),
+    "semantic": _row("sample y x", "uint8", "1", "what a pixel shows", SEMANTIC, ratio=0.01),
+    "radiance": _row(
+        "sample band y x", "float16", "W m-2 sr-1 nm-1", "spectral radiance at the camera", ratio=0.7
+    ),
+}
+REQUIRED_LAYERS = ("image", "mask", "mask_any", "clean")
+
+# Scalars and small vectors: a chunk is a shard, so that a task writes whole chunks.
+SCALARS: dict[str, Array] = {
+    "injected": _row("sample fault", "bool", "1", "faults that are in the pixels"),
+    "camera_position_T_m": _row("sample xyz", "float64", "m", "camera position in T"),
+    "position_L_m": _row("sample xyz", "float64", "m", "camera position in L, from the site"),
+    "camera_from_T": _row("sample quaternion", "float64", "1", "attitude, unit quaternion"),
+    "T_from_L": _row("sample axis_row axis_col", "float64", "1", "rotation from the local level frame to T"),
+    "T_from_J": _row("sample axis_row axis_col", "float64", "1", "rotation from the inertial frame J to T"),
+    "site_T_m": _row("sample xyz", "float64", "m", "site, the origin of L, in T"),
+    "sun_direction_T": _row("sample xyz", "float64", "1", "unit vector towards the Sun in T"),
+    "sun_distance_au": _row("sample", "float64", "au", "distance to the Sun"),
+    "julian_date": _row("sample", "float64", "d", "Julian date (TDB)"),
+    "intrinsics": _row("sample intrinsic", "float64", "px", "pinhole camera, pixel centres at +0.5"),
+    "sun_azimuth_deg": _row("sample", "float64", "deg", "Sun azimuth in L, from north towards east"),
+    "sun_elevation_deg": _row("sample", "float64", "deg", "Sun elevation in L, up"),
+    "roll_deg": _row("sample", "float64", "deg", "tilt of the boresight from the Sun about x"),
+    "pitch_deg": _row("sample", "float64", "deg", "tilt of the boresight from the Sun about y"),
+    "yaw_deg": _row("sample", "float64", "deg", "turn about the boresight"),
+    "sun_xy_px": _row("sample xy", "float64", "px", "Sun centre in the image, NaN behind the camera"),
+    "sun_visible_fraction": _row("sample", "float64", "1", "part of the solar disc that is not occluded"),
+    "exposure_s": _row("sample", "float64", "s", "exposure time"),
+    "tries": _row("sample", "int32", "1", "proposals drawn until one could be used"),
+    "stratum": _row("sample", "uint8", "1", "stratum of the sampling", STRATA),
+    "site": _row("sample", "int32", "1", "index of the site"),
+    "lens": _row("sample", "int32", "1", "index of the lens"),
+    "detector_individual": _row("sample", "int32", "1", "index of the individual detector"),
+    "split": _row("sample", "uint8", "1", "split of the dataset, constant per site", SPLITS),
+    "parameters": _row("sample", "str", "1", "drawn parameters of every injected fault, JSON"),
+    "proposal": _row("sample", "str", "1", "proposed variables before redraws, JSON"),
+}
+
+_LABELS = {  # coordinates of the short axes
+    "channel": CHANNELS,
+    "xyz": ("x", "y", "z"),
+    "axis_row": ("x", "y", "z"),
+    "axis_col": ("x", "y", "z"),
+    "xy": ("x", "y"),
+    "quaternion": ("w", "x", "y", "z"),
+    "intrinsic": ("fx", "fy", "cx", "cy"),
+}
+
+
+def known_layer(name: str) -> bool:
+    """Is this the name of a per-pixel layer that a store may hold?"""
+    return name in LAYERS or name.startswith("without_")
+
+
+@dataclass(frozen=True, kw_only=True)
+class StoreSpec:
+    """What a store holds, as plain data.
+
+    `faults`: the fault axis in dataset order. `mask_any_faults`: the union that `mask_any` is.
+    `localised_faults`: those whose mask may not be empty where they are injected (default: `mask_any_faults`).
+    `layers`: the optional layers, of `LAYERS` or `without_<fault>`. `shard_samples` 0 chooses the most, up to
+    16, that keeps the largest array of a shard within 1 GiB and all of them within 2 GiB; a larger one is
+    lowered. `attributes`: JSON-able root attributes. Raises InputError for names that do not exist.
+    """
+
+    height: int
+    width: int
+    faults: tuple[str, ...]
+    mask_any_faults: tuple[str, ...]
+    wavelength_nm: tuple[float, ...] = ()
+    layers: tuple[str, ...] = ()
+    localised_faults: tuple[str, ...] | None = None
+    site_names: tuple[str, ...] = ()
+    lens_names: tuple[str, ...] = ()
+    detector_names: tuple[str, ...] = ()
+    radiance_dtype: str = "float16"
+    shard_samples: int = 0
+    attributes: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        allowed = {*LAYERS, *(f"without_{f}" for f in self.faults)}
+        for name in self.layers:
+            if name not in allowed:
+                raise InputError(f"layers: {name!r} is no layer; known: {', '.join(sorted(allowed))}")
+        for name in (*self.mask_any_faults, *(self.localised_faults or ())):
+            if name not in self.faults:
+                raise InputError(f"mask_any_faults: {name!r} is not one of {', '.join(self.faults)}")
+        if self.localised_faults is None:
+            object.__setattr__(self, "localised_faults", self.mask_any_faults)
+        sizes = [self.layer_bytes(name) for name in self.pixel_layers]
+        most = max(1, min(MAX_SHARD_SAMPLES, MAX_SHARD_BYTES // max(sizes), MAX_HELD_BYTES // sum(sizes)))
+        object.__setattr__(
+            self, "shard_samples", min(self.shard_samples, most) if self.shard_samples > 0 else most
+        )
+
+    @cached_property
+    def pixel_layers(self) -> dict[str, Array]:
+        """Name → schema row of every per-pixel layer, in the order of the `layer` axis."""
+        rows = {name: LAYERS[name] for name in REQUIRED_LAYERS}
+        for name in self.layers:
+            if name == "radiance":
+                rows[name] = Array(**{**asdict(LAYERS[name]), "dtype": self.radiance_dtype})
+            elif name in LAYERS:
+                rows[name] = LAYERS[name]
+            else:
+                without = name.removeprefix("without_")
+                rows[name] = _row(_IMAGE, "uint8", "DN", f"the image without {without}", ratio=0.45)
+        return rows
+
+    @property
+    def checked(self) -> tuple[str, ...]:
+        """The `layer` axis of `crc32c`."""
+        return (*self.pixel_layers, _SCALARS)
+
+    def shape(self, row: Array) -> tuple[int, ...]:
+        """Shape of one sample of an array: its dims without `sample`."""
+        sizes = {
+            "y": self.height,
+            "x": self.width,
+            "fault": len(self.faults),
+            "band": len(self.wavelength_nm),
+            "layer": len(self.checked),
+            **{name: len(labels) for name, labels in _LABELS.items()},
+        }
+        return tuple(sizes[d] for d in row.dims if d != "sample")
+
+    def layer_bytes(self, name: str) -> int:
+        """Uncompressed bytes of one sample of a per-pixel layer."""
+        row = self.pixel_layers[name]
+        return int(np.prod(self.shape(row), dtype=np.int64)) * np.dtype(row.dtype).itemsize
+
+    @property
+    def estimated_sample_bytes(self) -> int:
+        """About what a sample takes on disk."""
+        pixels = sum(self.layer_bytes(name) * row.ratio for name, row in self.pixel_layers.items())
+        return int(pixels) + 4096
+
+    def plain(self) -> dict[str, Any]:
+        """JSON-able fields without the root attributes; `_spec` reads them back."""
+        # not asdict: it would copy the whole scene to leave it out
+        return {f.name: getattr(self, f.name) for f in fields(self) if f.name != "attributes"}
+
+
+def _spec(plain: Mapping[str, Any], attributes: Mapping[str, Any]) -> StoreSpec:
+    known = {f.name for f in fields(StoreSpec)}
+    values = {k: tuple(v) if isinstance(v, list) else v for k, v in plain.items() if k in known}
+    return StoreSpec(**values, attributes=attributes)
+
+
+@contextlib.contextmanager
+def _disk(path: Path, doing: str) -> Iterator[None]:
+    """Turn what the operating system refuses into one sentence; what was finished stays as it is."""
+    try:
+        yield
+    except OSError as error:
+        raise VbnfaultError(
+            f"{path}: {error.strerror or error} while {doing}; finished samples stay, "
+            f"and the same command resumes once that is mended"
+        ) from error
+
+
+def _put(path: Path, data: bytes) -> None:
+    """Write a file that is either the old or the whole new one at any moment."""
+    partial = path.with_name(f"{path.name}.{uuid.uuid4().hex}.partial")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        partial.write_bytes(data)
+        os.replace(partial, path)
+    except BaseException:
+        partial.unlink(missing_ok=True)
+        raise
+
+
+def _threads() -> int:
+    return max(1, min(4, int(os.environ.get("VBNFAULT_THREADS", "0")) or os.cpu_count() or 1))
+
+
+def _crc32c(array: NDArray[Any]) -> int:
+    frozen = np.ascontiguousarray(array).view()
+    frozen.flags.writeable = False  # the C function takes read-only buffers alone
+    return int(google_crc32c.value(frozen))
+
+
+# --- shard files: the `sharding_indexed` layout of the Zarr v3 specification, index at the end -------------
+
+
+def _join_shard(chunks: Mapping[int, bytes], count: int) -> bytes:
+    """A shard file of `count` chunks; those missing from `chunks` are marked absent."""
+    index = np.full((count, 2), _ABSENT, dtype="<u8")
+    position = 0
+    for i in sorted(chunks):
+        index[i] = position, len(chunks[i])
+        position += len(chunks[i])
+    table = index.tobytes()
+    parts = [chunks[i] for i in sorted(chunks)]
+    return b"".join([*parts, table, struct.pack("<I", google_crc32c.value(table))])
+
+
+def _split_shard(data: bytes, count: int) -> dict[int, bytes]:
+    """Chunk number → compressed bytes. Raises ValueError where the file is no whole shard."""
+    size = 16 * count
+    table, crc = data[-size - 4 : -4], data[-4:]
+    if len(table) != size or struct.pack("<I", google_crc32c.value(table)) != crc:
+        raise ValueError("truncated or overwritten: its index does not match its checksum")
+    chunks = {}
+    for i, (start, length) in enumerate(np.frombuffer(table, dtype="<u8").reshape(count, 2).tolist()):
+        if start != _ABSENT:
+            chunks[i] = data[start : start + length]
+    return chunks
+
+
+# --- one sample, ready to be written ----------------------------------------------------------------------
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Encoded:
+    """A sample with its layers compressed: what a task keeps until its shard is complete."""
+
+    index: int
+    chunks: Mapping[str, bytes]
+    scalars: Mapping[str, Any]
+    crc32c: NDArray[np.uint32]
+
+
+def encode(spec: StoreSpec, sample: Sample) -> Encoded:
+    """Check a sample against the schema, compress its layers, compute its checksums.
+
+    `mask_any` is made here where the sample has none. Raises ValueError that names the sample and the array
+    where one is missing, unknown, or of another shape or dtype.
+    """
+    layers = dict(sample.layers)
+    if "mask" in layers and "mask_any" not in layers:
+        layers["mask_any"] = mask_union(spec, layers["mask"])
+    _same_names(sample.index, "layer", layers, spec.pixel_layers)
+    _same_names(sample.index, "scalar", sample.scalars, SCALARS)
+
+    def pack(name: str) -> tuple[bytes, int]:
+        row, array = spec.pixel_layers[name], np.ascontiguousarray(layers[name])
+        if array.shape != spec.shape(row) or array.dtype != np.dtype(row.dtype):
+            raise ValueError(
+                f"sample {sample.index}: {name} is {array.dtype}{list(array.shape)}, "
+                f"not {row.dtype}{list(spec.shape(row))}"
+            )
+        return bytes(Zstd(level=_ZSTD_LEVEL, checksum=True).encode(array)), _crc32c(array)
+
+    with ThreadPoolExecutor(_threads()) as pool:
+        packed = dict(zip(spec.pixel_layers, pool.map(pack, spec.pixel_layers), strict=True))
+    scalars = {name: _scalar(spec, sample.index, name, sample.scalars[name]) for name in SCALARS}
+    crcs = [crc for _, crc in packed.values()]
+    return Encoded(
+        index=sample.index,
+        chunks={name: chunk for name, (chunk, _) in packed.items()},
+        scalars=scalars,
+        crc32c=np.array([*crcs, _crc_of_scalars(scalars)], dtype=np.uint32),
+    )
+
+
+def mask_union(spec: StoreSpec, mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """bool[y, x] from bool[fault, y, x]: what `mask_any` must be."""
+    union: NDArray[np.bool_] = mask[[f in spec.mask_any_faults for f in spec.faults]].any(axis=0)
+    return union
+
+
+def _same_names(index: int, kind: str, got: Iterable[str], expected: Iterable[str]) -> None:
+    for name in set(expected) - set(got):
+        raise ValueError(f"sample {index}: the {kind} {name} is missing")
+    for name in set(got) - set(expected):
+        raise ValueError(f"sample {index}: the store holds no {kind} {name}")
+
+
+def _scalar(spec: StoreSpec, index: int, name: str, value: Any) -> Any:
+    row = SCALARS[name]
+    if row.is_text:
+        return value if isinstance(value, str) else json.dumps(value, sort_keys=True)
+    array = np.asarray(value)
+    shape = spec.shape(row)
+    if array.shape != shape:
+        raise ValueError(f"sample {index}: {name} has shape {list(array.shape)}, not {list(shape)}")
+    typed = array.astype(row.dtype)
+    if row.dtype != "float64" and not np.array_equal(typed, array):
+        raise ValueError(f"sample {index}: {name} = {value!r} does not fit {row.dtype}")
+    return typed
+
+
+def _crc_of_scalars(scalars: Mapping[str, Any]) -> int:
+    """One checksum over all scalars of a sample, in the order of the schema."""
+    parts = []
+    for name, row in SCALARS.items():
+        data = (
+            scalars[name].encode() if row.is_text else np.asarray(scalars[name]).astype(row.dtype).tobytes()
+        )
+        parts.append(struct.pack("<Q", len(data)) + data)
+    return int(google_crc32c.value(b"".join(parts)))
+
+
+# --- an open store ----------------------------------------------------------------------------------------
+
+
+class Problem(NamedTuple):
+    """What is wrong with some samples, in one sentence."""
+
+    samples: tuple[int, ...]
+    sentence: str
+
+
+class Store:
+    """An open store. `open_store` makes one; reads go through zarr, as a user's do."""
+
+    def __init__(self, path: Path, group: zarr.Group, attributes: dict[str, Any]) -> None:
+        self.path = path
+        self.attributes = {
+            k: v for k, v in attributes.items() if k not in ("store", "samples", "coordinates")
+        }
+        self.samples = int(attributes["samples"])
+        self.spec = _spec(attributes["store"], self.attributes)
+        self._group = group
+        self._arrays: dict[str, zarr.Array[Any]] = {}
+
+    @property
+    def shards(self) -> int:
+        """Number of shards along the sample axis."""
+        return -(-self.samples // self.spec.shard_samples)
+
+    def shard(self, number: int) -> range:
+        """The samples of a shard."""
+        size = self.spec.shard_samples
+        return range(number * size, min((number + 1) * size, self.samples))
+
+    def array(self, name: str) -> zarr.Array[Any]:
+        """The zarr array. A chunk of zeros is written like any other: an absent one reads as zeros too."""
+        if name not in self._arrays:
+            array = self._group[name]
+            assert isinstance(array, zarr.Array)
+            self._arrays[name] = array.with_config({"write_empty_chunks": True})
+        return self._arrays[name]
+
+    def read(self, name: str, start: int = 0, stop: int | None = None) -> NDArray[Any]:
+        """Samples `start` … `stop` of an array. Raises VbnfaultError where they cannot be decoded."""
+        stop = self.samples if stop is None else stop
+        try:
+            values = self.array(name)[start:stop]
+        except Exception as error:
+            raise VbnfaultError(
+                f"{self.path}: {name} of samples {start}-{stop - 1} cannot be read ({error}); "
+                f"the build command repairs it"
+            ) from error
+        return np.asarray(values)
+
+    def read_sample(self, index: int) -> Sample:
+        """One sample as it was written. Raises InputError where it does not exist or is not finished."""
+        if not 0 <= index < self.samples:
+            raise InputError(
+                f"{self.path}: sample {index} does not exist; the range is 0 to {self.samples - 1}"
+            )
+        if not self.read("done", index, index + 1)[0]:
+            raise InputError(f"{self.path}: sample {index} is not finished yet; the build command resumes")
+        one = {name: self.read(name, index, index + 1)[0] for name in (*self.spec.pixel_layers, *SCALARS)}
+        return Sample(
+            index=index,
+            layers={name: one[name] for name in self.spec.pixel_layers},
+            scalars={name: str(one[name]) if row.is_text else one[name] for name, row in SCALARS.items()},
+        )
+
+    def done(self, number: int) -> NDArray[np.bool_]:
+        """bool[sample of the shard]: which are finished; none where that cannot be read."""
+        samples = self.shard(number)
+        try:
+            return self.read("done", samples.start, samples.stop).astype(bool)
+        except VbnfaultError:
+            return np.zeros(len(samples), bool)
+
+    def finished(self) -> int:
+        """How many samples say that they are finished."""
+        return sum(int(self.done(n).sum()) for n in range(self.shards))
+
+    def file(self, name: str, number: int) -> Path:
+        """The file of a shard: of a layer its chunks, of a scalar its one chunk."""
+        row = _schema(self.spec)[name]
+        return self.path.joinpath(name, "c", str(number), *("0" for _ in row.dims[1:]))
+
+    def chunk(self, name: str, number: int) -> dict[int, bytes]:
+        """Sample → compressed bytes of a layer's shard. Raises ValueError or OSError where it is damaged."""
+        size = self.spec.shard_samples
+        chunks = _split_shard(self.file(name, number).read_bytes(), size)
+        return {number * size + i: chunk for i, chunk in chunks.items()}
+
+    def _write(self, name: str, samples: range, values: Any) -> None:
+        self.array(name)[samples.start : samples.stop] = values
+
+    def write_shard(self, number: int, given: Mapping[int, Encoded]) -> None:
+        """Write a shard: the `given` samples, and those that were finished before, unchanged.
+
+        `done` comes last. Raises VbnfaultError where the disk refuses.
+        """
+        samples = self.shard(number)
+        first, last = samples.start, samples.stop - 1
+        with _disk(self.path, f"writing samples {first}-{last}"):
+            done = dict(zip(samples, self.done(number).tolist(), strict=True))
+            if any(done[i] for i in given):
+                self._write("done", samples, [done[i] and i not in given for i in samples])
+            kept = {i for i in samples if done[i] and i not in given}
+            for name in self.spec.pixel_layers:
+                old: dict[int, bytes] = {}
+                if kept:
+                    with contextlib.suppress(ValueError, FileNotFoundError):
+                        old = self.chunk(name, number)
+                kept &= set(old)
+                chunks = {i: given[i].chunks[name] if i in given else old[i] for i in {*given, *kept}}
+                _put(
+                    self.file(name, number),
+                    _join_shard({i - first: c for i, c in chunks.items()}, self.spec.shard_samples),
+                )
+            kept = self._write_scalars(samples, given, kept)
+            self._write("done", samples, [i in given or i in kept for i in samples])
+
+    def _write_scalars(self, samples: range, given: Mapping[int, Encoded], kept: set[int]) -> set[int]:
+        for name, row in {**SCALARS, "crc32c": _schema(self.spec)["crc32c"]}.items():
+            shape = (len(samples), *self.spec.shape(row))
+            column = np.full(shape, row.fill, dtype=object if row.is_text else row.dtype)
+            if kept:
+                try:
+                    old = self.read(name, samples.start, samples.stop)
+                except VbnfaultError:
+                    kept = set()
+                for i in kept:
+                    column[i - samples.start] = old[i - samples.start]
+            for i, sample in given.items():
+                column[i - samples.start] = sample.crc32c if name == "crc32c" else sample.scalars[name]
+            self._write(name, samples, column)
+        return kept
+
+
+@lru_cache(maxsize=8)
+def _schema_of(faults: int, layers: tuple[tuple[str, Array], ...]) -> dict[str, Array]:
+    return {
+        **dict(layers),
+        **SCALARS,
+        "crc32c": _row("sample layer", "uint32", "1", "CRC-32C of the decoded bytes"),
+        "done": _row("sample", "uint8", "1", "1 where a sample is whole; written last"),
+    }
+
+
+def _schema(spec: StoreSpec) -> dict[str, Array]:
+    """Every array along `sample` that tasks write."""
+    return _schema_of(len(spec.faults), tuple(spec.pixel_layers.items()))
+
+
+# --- create, open, grow -----------------------------------------------------------------------------------
+
+
+def create(path: str | os.PathLike[str], spec: StoreSpec, samples: int, *, overwrite: bool = False) -> Store:
+    """Create an empty store of `samples` samples and open it for writing.
+
+    It appears under its name only once it is whole. With `overwrite` an existing store is replaced; a folder
+    that holds anything else never is. Raises InputError where the path cannot be used.
+    """
+    target = Path(path)
+    if samples < 1:
+        raise InputError(f"samples = {samples}: must be at least 1")
+    old = is_store(target)
+    if old and not overwrite:
+        raise InputError(f"{target}: exists already; resume it, or give --overwrite to replace it")
+    if not old and target.exists() and (not target.is_dir() or any(target.iterdir())):
+        raise InputError(
+            f"{target}: exists and is no vbnfault store, so it is left alone; choose another --out"
+        )
+    hidden = target.absolute().parent / f".{target.name}.{uuid.uuid4().hex}.partial"
+    try:
+        hidden.parent.mkdir(parents=True, exist_ok=True)
+        for leftover in hidden.parent.glob(f".{target.name}.*.partial"):
+            shutil.rmtree(leftover, ignore_errors=True)
+        _create_group(hidden, spec, samples)
+        if old:
+            retired = hidden.with_name(f".{target.name}.{uuid.uuid4().hex}.partial")
+            os.replace(target, retired)
+            os.replace(hidden, target)
+            shutil.rmtree(retired, ignore_errors=True)
+        else:
+            if target.is_dir():
+                target.rmdir()
+            os.replace(hidden, target)
+    except OSError as error:
+        shutil.rmtree(hidden, ignore_errors=True)
+        raise InputError(f"{target}: no store can be created here: {error.strerror or error}") from error
+    return open_store(target, "r+")
+
+
+def _create_group(path: Path, spec: StoreSpec, samples: int) -> None:
+    attributes = {
+        **json.loads(json.dumps(spec.attributes)),
+        "format": "vbnfault",
+        "format_version": FORMAT_VERSION,
+        "store": json.loads(json.dumps(spec.plain())),
+        "samples": samples,
+        "coordinates": "wavelength_nm",  # makes xarray show it as a coordinate of `band`
+    }
+    group = zarr.open_group(path, mode="w-", zarr_format=3, attributes=attributes)
+    codec = ZstdCodec(level=_ZSTD_LEVEL, checksum=True)
+    extra: dict[str, dict[str, Any]] = {
+        "mask_any": {"faults": list(spec.mask_any_faults)},
+        "site": {"names": list(spec.site_names)},
+        "lens": {"names": list(spec.lens_names)},
+        "detector_individual": {"names": list(spec.detector_names)},
+        "split": {"names": list(SPLITS)},
+        "radiance": {"coordinates": "wavelength_nm"},
+    }
+    for name, row in _schema(spec).items():
+        shape, size = spec.shape(row), spec.shard_samples
+        sharded = name in spec.pixel_layers
+        flags = {"flag_values": list(range(len(row.names))), "flag_meanings": " ".join(row.names)}
+        group.create_array(
+            name,
+            shape=(samples, *shape),
+            chunks=(1 if sharded else size, *shape),
+            shards=(size, *shape) if sharded else None,
+            dtype=str if row.is_text else row.dtype,
+            fill_value=row.fill,
+            compressors=codec,
+            dimension_names=row.dims,
+            attributes={
+                "long_name": row.long_name,
+                "units": row.units,
+                **(flags if row.names else {}),
+                **extra.get(name, {}),
+            },
+        )
+    coordinates: dict[str, tuple[str, Any, dict[str, str]]] = {
+        "y": ("y", np.arange(spec.height) + 0.5, {"units": "px", "long_name": "row, pixel centres at +0.5"}),
+        "x": (
+            "x",
+            np.arange(spec.width) + 0.5,
+            {"units": "px", "long_name": "column, pixel centres at +0.5"},
+        ),
+        "fault": ("fault", list(spec.faults), {"long_name": "fault class"}),
+        "layer": ("layer", list(spec.checked), {"long_name": "what a checksum covers"}),
+        **{name: (name, list(labels), {"long_name": name}) for name, labels in _LABELS.items()},
+    }
+    if spec.wavelength_nm:
+        nodes = np.array(spec.wavelength_nm, dtype=np.float64)
+        coordinates["wavelength_nm"] = ("band", nodes, {"units": "nm", "long_name": "wavelength of the band"})
+    for name, (dim, values, attrs) in coordinates.items():
+        array = group.create_array(
+            name,
+            shape=(len(values),),
+            dtype=values.dtype if isinstance(values, np.ndarray) else str,
+            compressors=codec,
+            dimension_names=(dim,),
+            attributes=dict(attrs),
+        )
+        array[:] = values
+    index = group.create_array(
+        "sample",
+        shape=(samples,),
+        chunks=(65536,),
+        dtype="int64",
+        compressors=codec,
+        dimension_names=("sample",),
+        attributes={"long_name": "sample"},
+    )
+    index[:] = np.arange(samples)
+
+
+def _root(path: Path) -> dict[str, Any] | None:
+    """Root attributes of a vbnfault store, None where there is none."""
+    try:
+        meta = json.loads((path / "zarr.json").read_text())
+        attributes = meta["attributes"]
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+    return attributes if isinstance(attributes, dict) and attributes.get("format") == "vbnfault" else None
+
+
+def is_store(path: str | os.PathLike[str]) -> bool:
+    """Is there a vbnfault store at this path?"""
+    return _root(Path(path)) is not None
+
+
+def open_store(path: str | os.PathLike[str] | Store, mode: str = "r") -> Store:
+    """Open a store, `r` or `r+`. Raises InputError where the path holds none, or one of a newer format."""
+    if isinstance(path, Store):
+        return path
+    path = Path(path)
+    attributes = _root(path)
+    if attributes is None:
+        what = "is no vbnfault store" if path.exists() else "no such store"
+        raise InputError(f"{path}: {what}")
+    if attributes["format_version"] > FORMAT_VERSION:
+        raise InputError(
+            f"{path}: format_version = {attributes['format_version']}: "
+            f"this vbnfault reads up to {FORMAT_VERSION}; install a newer one"
+        )
+    group = zarr.open_group(path, mode="r+" if mode == "r+" else "r", zarr_format=3, use_consolidated=False)
+    return Store(path, group, attributes)
+
+
+def append_samples(
+    store: str | os.PathLike[str] | Store, count: int, attributes: Mapping[str, Any] | None = None
+) -> Store:
+    """Grow a store by `count` unfinished samples, with further root attributes, and open it again.
+
+    Earlier samples keep their bits. A kill half-way is mended by `recover`.
+    """
+    store = open_store(store, "r+")
+    if count < 1:
+        raise InputError(f"append = {count}: must be at least 1")
+    with _disk(store.path, f"adding {count} samples"):
+        store._group.update_attributes({**(attributes or {}), "samples": store.samples + count})
+    return recover(store.path)
+
+
+def recover(path: str | os.PathLike[str]) -> Store:
+    """Open a store for writing after whatever happened to it; only while nothing else writes to it.
+
+    Removes the `*.partial` files of a killed process and brings every array to the length that the root says.
+    """
+    store = open_store(path, "r+")
+    with _disk(store.path, "recovering the store"):
+        for folder, _, files in os.walk(store.path):
+            for name in files:
+                if name.endswith(".partial"):
+                    Path(folder, name).unlink(missing_ok=True)
+        for name in _schema(store.spec):
+            array = store.array(name)
+            if array.shape[0] != store.samples:
+                array.resize((store.samples, *array.shape[1:]))
+        index = store.array("sample")
+        if index.shape != (store.samples,) or index[-1] != store.samples - 1:
+            index.resize((store.samples,))
+            index[:] = np.arange(store.samples)
+    return open_store(store.path, "r+")
+
+
+def write_samples(store: str | os.PathLike[str] | Store, samples: Iterable[Sample | Encoded]) -> None:
+    """Write samples into their shards, whole files only; the other samples of those shards keep their bits.
+
+    Only one process may write to a shard at a time. Raises ValueError for a sample that does not fit the
+    schema or the store, VbnfaultError where the disk refuses.
+    """
+    store = open_store(store, "r+")
+    by_shard: dict[int, dict[int, Encoded]] = {}
+    for sample in samples:
+        if not 0 <= sample.index < store.samples:
+            raise ValueError(f"sample {sample.index}: the store holds 0 to {store.samples - 1}")
+        encoded = sample if isinstance(sample, Encoded) else encode(store.spec, sample)
+        by_shard.setdefault(sample.index // store.spec.shard_samples, {})[sample.index] = encoded
+    for number, given in sorted(by_shard.items()):
+        store.write_shard(number, given)
+
+
+# --- check ------------------------------------------------------------------------------------------------
+
+
+def check_shard(store: Store, number: int) -> list[Problem]:
+    """What is unfinished, missing or damaged in one shard; every finished layer is decoded and compared."""
+    samples = store.shard(number)
+    try:
+        done = store.read("done", samples.start, samples.stop).astype(bool)
+    except VbnfaultError:
+        where = store.file("done", number).relative_to(store.path)
+        return [Problem(tuple(samples), f"samples {_spans(samples)}: done cannot be decoded ({where})")]
+    finished = [i for i, d in zip(samples, done, strict=True) if d]
+    problems = []
+    if not done.all():
+        missing = tuple(i for i in samples if i not in finished)
+        problems.append(Problem(missing, f"samples {_spans(missing)}: not finished"))
+    if not finished:
+        return problems
+
+    columns: dict[str, NDArray[Any]] = {}
+    for name in (*SCALARS, "crc32c", "done"):
+        file = store.file(name, number)
+        where = f"{name} of samples {_spans(finished)}"
+        try:
+            columns[name] = store.read(name, samples.start, samples.stop)
+        except VbnfaultError:
+            what = f"{where} cannot be decoded ({file.relative_to(store.path)})"
+            problems.append(Problem(tuple(finished), what))
+        else:
+            if not file.exists():
+                what = f"{where}: the chunk file {file.relative_to(store.path)} is missing"
+                problems.append(Problem(tuple(finished), what))
+    if "crc32c" not in columns:
+        return problems
+    if len(columns) == len(SCALARS) + 2:
+        for i in finished:
+            k = i - samples.start
+            if _crc_of_scalars({n: columns[n][k] for n in SCALARS}) != columns["crc32c"][k, -1]:
+                problems.append(Problem((i,), f"sample {i}: its scalars do not match their crc32c"))
+
+    crcs = {i: columns["crc32c"][i - samples.start] for i in finished}
+    with ThreadPoolExecutor(_threads()) as pool:
+        for found in pool.map(lambda name: _check_layer(store, name, number, crcs), store.spec.pixel_layers):
+            problems += found
+    return problems
+
+
+def _check_layer(
+    store: Store, name: str, number: int, crcs: Mapping[int, NDArray[np.uint32]]
+) -> list[Problem]:
+    file = store.file(name, number)
+    where = str(file.relative_to(store.path))
+    column = store.spec.checked.index(name)
+    try:
+        chunks = store.chunk(name, number)
+    except FileNotFoundError:
+        return [Problem(tuple(crcs), f"{name} of samples {_spans(crcs)}: the shard file {where} is missing")]
+    except (OSError, ValueError) as error:
+        return [
+            Problem(
+                tuple(crcs), f"{name} of samples {_spans(crcs)}: the shard file {where} is damaged: {error}"
+            )
+        ]
+    problems = []
+    for i, stored in crcs.items():
+        if i not in chunks:
+            problems.append(Problem((i,), f"sample {i}: {name} has no chunk in {where}"))
+            continue
+        try:
+            crc = google_crc32c.value(bytes(Zstd().decode(chunks[i])))
+        except (RuntimeError, ValueError):
+            problems.append(
+                Problem((i,), f"sample {i}: {name} cannot be decoded, its chunk in {where} is damaged")
+            )
+            continue
+        if crc != stored[column]:
+            problems.append(Problem((i,), f"sample {i}: {name} in {where} does not match its stored crc32c"))
+    return problems
+
+
+def _spans(indices: Iterable[int]) -> str:
+    """`3-7, 9` for 3, 4, 5, 6, 7, 9."""
+    runs: list[list[int]] = []
+    for i in sorted(indices):
+        if runs and i == runs[-1][1] + 1:
+            runs[-1][1] = i
+        else:
+            runs.append([i, i])
+    return ", ".join(str(a) if a == b else f"{a}-{b}" for a, b in runs)
+
+
+def problem_samples(store: str | os.PathLike[str] | Store) -> list[int]:
+    """Samples that have to be built, or built again: unfinished, missing or damaged ones."""
+    store = open_store(store)
+    return sorted({i for n in range(store.shards) for p in check_shard(store, n) for i in p.samples})
+
+
+def verify(
+    path: str | os.PathLike[str] | Store,
+    *,
+    expected: Callable[[int], Mapping[str, Any]] | None = None,
+    progress: Callable[[int], None] | None = None,
+) -> list[str]:
+    """Every problem of a store, one sentence each that names the array, the sample and the file.
+
+    Checks that each sample is whole (`check_shard`) and labelled: masks, `injected` and `parameters` agree,
+    a site lies in one split. `expected(sample)` gives the scalars as planned, compared exactly. `progress` is
+    called with the number of samples just checked. Raises InputError where there is no store.
+    """
+    store = open_store(path)
+    problems = [
+        f"{name} holds {store.array(name).shape[0]} samples, not {store.samples}: appending was interrupted, "
+        f"the build command resumes it"
+        for name in _schema(store.spec)
+        if store.array(name).shape[0] != store.samples
+    ]
+    if problems:
+        return problems
+    split_of: dict[int, tuple[int, int]] = {}
+    for number in range(store.shards):
+        found = check_shard(store, number)
+        problems += [p.sentence for p in found]
+        broken = {i for p in found for i in p.samples}
+        sound = [i for i in store.shard(number) if i not in broken]
+        if sound:
+            start, stop = store.shard(number).start, store.shard(number).stop
+            columns = {name: store.read(name, start, stop) for name in SCALARS}
+            for i in sound:
+                scalars = {name: column[i - start] for name, column in columns.items()}
+                problems += _check_labels(store, i, scalars)
+                problems += _check_split(store, i, scalars, split_of)
+                problems += _check_plan(i, scalars, expected(i) if expected else {})
+        if progress:
+            progress(len(store.shard(number)))
+    return problems
+
+
+def _check_labels(store: Store, i: int, scalars: Mapping[str, Any]) -> Iterator[str]:
+    spec, injected = store.spec, scalars["injected"]
+    parameters = json.loads(str(scalars["parameters"]) or "{}")
+    for fault, is_in in zip(spec.faults, injected.tolist(), strict=True):
+        drawn = parameters.get(fault)
+        listed = drawn is not None and not (isinstance(drawn, dict) and drawn.get("injected") is False)
+        if listed != is_in:
+            words = ("is", "no") if is_in else ("is not", "its")
+            yield f"sample {i}: {fault} {words[0]} marked in injected, but parameters hold {words[1]} parameters"
+    mask = store.read("mask", i, i + 1)[0]
+    for k, fault in enumerate(spec.faults):
+        if not injected[k] and mask[k].any():
+            yield f"sample {i}: mask of {fault} is not empty, although it is not injected"
+        if injected[k] and fault in (spec.localised_faults or ()) and not mask[k].any():
+            yield f"sample {i}: mask of {fault} is empty, although it is injected"
+    if not np.array_equal(store.read("mask_any", i, i + 1)[0], mask_union(spec, mask)):
+        yield f"sample {i}: mask_any is not the union of the masks of {', '.join(spec.mask_any_faults)}"
+
+
+def _check_split(
+    store: Store, i: int, scalars: Mapping[str, Any], split_of: dict[int, tuple[int, int]]
+) -> Iterator[str]:
+    site, split = int(scalars["site"]), int(scalars["split"])
+    first, before = split_of.setdefault(site, (i, split))
+    if split != before:
+        names = store.spec.site_names
+        named = names[site] if 0 <= site < len(names) else str(site)
+        yield f"sample {i}: split = {split}, but sample {first} of the same site {named} has {before}"
+
+
+def _check_plan(i: int, scalars: Mapping[str, Any], expected: Mapping[str, Any]) -> Iterator[str]:
+    for name, planned in expected.items():
+        stored = scalars[name]
+        if SCALARS[name].is_text:
+            planned = json.loads(planned) if isinstance(planned, str) else json.loads(json.dumps(planned))
+            same = json.loads(str(stored)) == planned
+        else:
+            values = np.asarray(planned).astype(SCALARS[name].dtype)
+            same = np.array_equal(values, stored, equal_nan=SCALARS[name].dtype == "float64")
+        if not same:
+            yield f"sample {i}: {name} = {_short(stored)} is not as planned ({_short(planned)})"
+
+
+def _short(value: Any) -> str:
+    text = str(value.tolist() if isinstance(value, np.ndarray | np.generic) else value)
+    return text if len(text) <= 80 else text[:77] + "..."
+
+
+def digest(path: str | os.PathLike[str] | Store) -> str:
+    """sha256 (hex) of what a store holds: root attributes, and decoded arrays with dims and dtypes.
+
+    Time of creation, sharding and compression are no part of it. Raises VbnfaultError for damaged chunks.
+    """
+    store = open_store(path)
+    total = hashlib.sha256()
+    attributes = {k: v for k, v in store.attributes.items() if k not in VOLATILE_ATTRIBUTES}
+    plain = {k: v for k, v in store.spec.plain().items() if k != "shard_samples"}
+    total.update(json.dumps([attributes, plain, store.samples], sort_keys=True).encode())
+    for name, row in sorted(_schema(store.spec).items()):
+        total.update(json.dumps([name, row.dims, row.dtype]).encode())
+        step = 1 if name in store.spec.pixel_layers else store.spec.shard_samples
+        for start in range(0, store.samples, step):
+            values = store.read(name, start, min(start + step, store.samples))
+            if row.is_text:
+                for text in values.tolist():
+                    total.update(json.dumps(text).encode())
+            else:
+                total.update(np.ascontiguousarray(values).data)
+    return total.hexdigest()
