@@ -1,0 +1,55 @@
+"""Masks: where a fault sits, and where it shows.
+
+The mask of a class is its *footprint*, except for classes that label by *effect* (straylight): the pixels that
+change by at least one digital number, noise-free, when the fault is switched off. Whatever overwrites a flare
+(a broken line, saturation) therefore drops out of its mask.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from .faults import Fault, FaultContext, Params
+
+Mask = NDArray[np.bool_]
+
+
+def effect(image: NDArray[np.uint8], without: NDArray[np.uint8]) -> Mask:
+    """bool[y, x]: pixels of two noise-free 8 bit images that differ in any channel."""
+    # four 8 bit channels compare as one 32 bit word
+    a, b = (np.ascontiguousarray(x).view(np.uint32)[..., 0] for x in (image, without))
+    return a != b
+
+
+def mask_layers(
+    faults: Mapping[str, Fault],
+    drawn: Mapping[str, Params],
+    context: FaultContext,
+    effects: Mapping[str, Mask],
+) -> Mask:
+    """bool[fault, y, x] in the order of `faults`; classes not in `drawn` are empty."""
+    out = np.zeros((len(faults), *context.shape), dtype=bool)
+    for k, (name, fault) in enumerate(faults.items()):
+        if name not in drawn:
+            continue
+        mask = effects[name] if fault.effect_mask else fault.footprint(drawn[name], context)
+        if mask is not None:
+            out[k] = mask
+    return out
+
+
+def union(masks: Mask, faults: Iterable[str], members: Iterable[str]) -> Mask:
+    """bool[y, x]: where any of the classes `members` has its mask."""
+    chosen = set(members)
+    out: Mask = masks[[name in chosen for name in faults]].any(axis=0)
+    return out
+
+
+def outline(mask: Mask) -> Mask:
+    """bool[y, x]: the inner border of a mask."""
+    solid = mask.astype(np.uint8)
+    return mask & (cv2.erode(solid, np.ones((3, 3), np.uint8)) == 0)

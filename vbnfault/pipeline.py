@@ -1,0 +1,685 @@
+"""From one planned sample to one labelled sample, in physical order.
+
+    resolve ▶ render ▶ meter ▶ photograph ▶ label
+
+One expensive render serves every twin: the picture with all faults, the clean one and `without_<fault>` share
+radiance, exposure and noise, so they differ by the faults alone.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from . import camera as cameras
+from . import config, frames, labels, plan, spectra
+from .body import Body, Patch, Site, build_patch, choose_sites, load_body
+from .camera import Camera
+from .config import SceneConfig
+from .detector import Detector, Noise
+from .errors import InputError
+from .faults import Fault, FaultContext, Params, dataset_order, from_dict, physical_order, registry
+from .lens import ThinLens
+from .quantities import RGBI, Electrons, Radiance, RawDN, Sample, Truth
+from .scene import Scene, Sunlight, View
+
+if TYPE_CHECKING:
+    from .render import Surface
+
+F64 = NDArray[np.float64]
+
+_RESOLVE_BATCH = 8
+_DRAW_TRIES = 8
+# The metered exposure stays within these factors of what a facet lit at 45 degrees would be given, so that a
+# sliver of grazing light does not turn the frame into noise.
+_METERING_RANGE = (0.25, 8.0)
+# A step's own change of this many DN survives every later optical step of the paper's tables (cos⁴ at 255 → 105
+# keeps 41 %), so the fault needs no full comparison to be called present.
+_CLEARLY_VISIBLE_DN = 6.0
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Terrain:
+    """A site with its patch and the renderer's copy of it."""
+
+    body: Body
+    site: Site
+    surface: Surface
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Pose:
+    """The outcome of `resolve`: where the camera and the Sun are. `tries` counts the proposals drawn."""
+
+    position_L_m: F64
+    L_from_C: F64
+    sun_L: F64
+    sun_azimuth_deg: float
+    sun_elevation_deg: float
+    sun_visible_fraction: float
+    tries: int
+    resolved: bool
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SampleSpec:
+    """One sample of a plan, with all that `simulate` needs."""
+
+    index: int
+    scene: SceneConfig
+    plan: plan.Plan
+    faults: Mapping[str, Fault]
+    terrain: Terrain
+
+    @property
+    def seed(self) -> int:
+        return self.scene.dataset.seed
+
+    def rng(self, stage: str, name: str) -> np.random.Generator:
+        """The generator of this sample for (stage, name)."""
+        return config.rng(self.seed, self.index, stage, name)
+
+
+@dataclass(kw_only=True, eq=False)
+class Frame:
+    """What the stages add to, one after the other."""
+
+    spec: SampleSpec
+    pose: Pose = field(init=False)
+    camera: Camera = field(init=False)
+    sunlight: Sunlight = field(init=False)
+    radiance: Radiance = field(init=False)
+    truth: Truth = field(init=False)
+    context: FaultContext = field(init=False)
+    drawn: dict[str, Params] = field(default_factory=dict)
+    images: dict[str, RGBI] = field(default_factory=dict)
+    pictures: dict[Any, tuple[RGBI, RawDN]] = field(default_factory=dict)
+    raw: RawDN | None = None
+    mask: NDArray[np.bool_] = field(init=False)
+    effects: dict[str, NDArray[np.bool_]] = field(default_factory=dict)
+
+
+def simulate(spec: SampleSpec) -> Sample:
+    """One finished sample, every stage in order."""
+    return to_sample(develop_frame(spec))
+
+
+def develop_frame(spec: SampleSpec) -> Frame:
+    """All stages, everything between radiance and labels kept."""
+    frame = Frame(spec=spec)
+    for stage in STAGES:
+        stage(frame)
+    return frame
+
+
+# --- resolve -----------------------------------------------------------------------------------------------
+
+
+def resolve(frame: Frame) -> None:
+    """Settle height and Sun elevation against the terrain, by keyed tries of the proposal.
+
+    A try is accepted when nothing lies within the clearance, when a Sun-averted camera does not look at the Sun
+    and when a straylight sample sees the whole of it. If none is, the last clear one is taken.
+    """
+    from . import render
+
+    spec = frame.spec
+    scene, i = spec.scene, spec.index
+    samples, stratum = np.full(1, i), spec.plan.stratum[i : i + 1]
+    fixed = {name: float(values[i]) for name, values in spec.plan.variables.items()}
+    geometry = scene.geometry
+    start = max(300.0, 2 * float(np.hypot(fixed["x_m"], fixed["y_m"])))
+    surface = spec.terrain.surface
+    ground = float(
+        render.ground_height_m(surface, np.array([fixed["x_m"]]), np.array([fixed["y_m"]]), start)[0]
+    )
+    needs_sun = bool(spec.plan.injects(plan.STRAYLIGHT)[i])
+    least = plan.least_sun_angle_deg(scene)
+    fallback: Pose | None = None
+    for first in range(0, geometry.max_tries, _RESOLVE_BATCH):
+        attempts = range(first, min(first + _RESOLVE_BATCH, geometry.max_tries))
+        tries = [
+            plan.propose(scene, samples, stratum, ("sun_elevation_deg", "height_m"), attempt)
+            for attempt in attempts
+        ]
+        # the first try is the proposal itself, and a batch has a fixed size: one kernel for all
+        elevation = np.array([float(t["sun_elevation_deg"][0]) for t in tries])
+        height = np.array([float(t["height_m"][0]) for t in tries])
+        position = np.column_stack(
+            [np.full(len(tries), fixed["x_m"]), np.full(len(tries), fixed["y_m"]), -(ground + height)]
+        )
+        suns = [sunlight(scene, frames.direction_L(fixed["sun_azimuth_deg"], e)) for e in elevation]
+        clear = render.is_clear(surface, position, geometry.clearance_m)
+        visible = render.sun_visible_fraction(surface, position, suns)
+        for k, attempt in enumerate(attempts):
+            axes = _attitude(scene, int(stratum[0]), suns[k].direction_L, fixed)
+            angle = np.degrees(np.arccos(np.clip(axes[:, 2] @ suns[k].direction_L, -1, 1)))
+            averted_ok = stratum[0] != plan.SUN_AVERTED or angle >= least
+            good = bool(clear[k] and averted_ok and (not needs_sun or visible[k] == 1.0))
+            pose = Pose(
+                position_L_m=position[k],
+                L_from_C=axes,
+                sun_L=suns[k].direction_L,
+                sun_azimuth_deg=fixed["sun_azimuth_deg"],
+                sun_elevation_deg=float(elevation[k]),
+                sun_visible_fraction=float(visible[k]),
+                tries=attempt + 1,
+                resolved=good,
+            )
+            if good:
+                frame.pose = pose
+                return
+            if fallback is None or clear[k]:
+                fallback = pose
+    assert fallback is not None
+    frame.pose = replace(fallback, tries=geometry.max_tries)
+
+
+def _attitude(scene: SceneConfig, stratum: int, sun_L: F64, fixed: Mapping[str, float]) -> F64:
+    down = np.array([0.0, 0.0, 1.0])
+    reference = sun_L if plan.strata(scene)[stratum].reference == "sun" else down
+    return frames.L_from_C(reference, fixed["roll_deg"], fixed["pitch_deg"], fixed["yaw_deg"])
+
+
+# --- render ------------------------------------------------------------------------------------------------
+
+
+def sun_distance_au(scene: SceneConfig) -> float:
+    """The body's distance from the Sun: as given, or of 67P at the Julian date."""
+    if scene.sun.distance_au is not None:
+        return scene.sun.distance_au
+    return float(np.linalg.norm(frames.ORBIT_67P.position_J_au(scene.sun.julian_date)))
+
+
+def sunlight(scene: SceneConfig, direction_L: F64) -> Sunlight:
+    """The Sun at the scene's distance in a direction of L."""
+    distance = sun_distance_au(scene)
+    return Sunlight(
+        direction_L=direction_L,
+        angular_radius_rad=spectra.sun_angular_radius_rad(distance),
+        irradiance_W_m2_nm=spectra.solar_band_irradiance_W_m2_nm(wavelengths_nm(scene), distance),
+    )
+
+
+def wavelengths_nm(scene: SceneConfig) -> F64:
+    """Band nodes of the scene."""
+    r = scene.render
+    return spectra.band_nodes_nm(r.band_min_nm, r.band_max_nm, r.bands)
+
+
+def base_camera(scene: SceneConfig, *, architecture: int = 0, readout_direction: int = 0) -> Camera:
+    """The scene's camera without exposure; the integers index its lists of options."""
+    c = scene.camera
+    return Camera(
+        lens=ThinLens(
+            focal_length_mm=cameras.focal_length_mm(c.fov_deg, c.width_px, c.pixel_pitch_um),
+            f_number=c.f_number,
+            transmission=c.transmission,
+            focus_distance_m=float("inf") if c.focus_distance_m is None else c.focus_distance_m,
+        ),
+        detector=Detector(
+            width_px=c.width_px,
+            height_px=c.height_px,
+            pixel_pitch_um=c.pixel_pitch_um,
+            full_well_e=c.full_well_e,
+            read_noise_e_rms=c.read_noise_e_rms,
+            dark_current_e_s=c.dark_current_e_s,
+            adc_bits=c.adc_bits,
+            bias_dn=c.bias_dn,
+            response=c.response,
+            quantum_efficiency_peak=c.quantum_efficiency_peak,
+        ),
+        architecture=c.architectures[architecture],
+        readout_direction=c.readout_directions[readout_direction],
+    )
+
+
+def describe(frame: Frame) -> Scene:
+    """The sample as the renderer takes it."""
+    spec, camera = frame.spec, frame.camera
+    scene = spec.scene
+    view = View(
+        position_L_m=frame.pose.position_L_m,
+        L_from_C=frame.pose.L_from_C,
+        intrinsics=camera.intrinsics,
+        width_px=camera.width_px,
+        height_px=camera.height_px,
+        aperture_radius_m=camera.lens.aperture_radius_m,
+        focus_distance_m=camera.lens.focus_distance_m,
+    )
+    wavelength = wavelengths_nm(scene)
+    return Scene(
+        view=view,
+        sun=frame.sunlight,
+        wavelength_nm=wavelength,
+        reflectance=spectra.reflectance(scene.body.reflectance, wavelength),
+        samples_per_pixel=scene.render.samples_per_pixel,
+        key=int(spec.rng("render", "jitter").integers(2**32)),
+    )
+
+
+def render_frame(frame: Frame) -> None:
+    """Radiance of every band, and truth."""
+    from . import render
+
+    spec, i = frame.spec, frame.spec.index
+    frame.camera = base_camera(
+        spec.scene,
+        architecture=int(spec.plan.architecture[i]),
+        readout_direction=int(spec.plan.readout_direction[i]),
+    )
+    frame.sunlight = sunlight(spec.scene, frame.pose.sun_L)
+    scene = describe(frame)
+    frame.radiance = render.radiance(spec.terrain.surface, scene)
+    frame.truth = render.truth(spec.terrain.surface, scene.view, scene.sun)
+
+
+# --- meter -------------------------------------------------------------------------------------------------
+
+
+def meter(frame: Frame) -> None:
+    """Exposure: fixed, or metered once on the noise-free, fault-free frame; all twins share it."""
+    settings = frame.spec.scene.camera
+    if settings.exposure_s == "auto":
+        exposure = _metered_exposure_s(frame)
+    else:
+        exposure = float(settings.exposure_s)
+    frame.camera = replace(frame.camera, exposure_s=exposure)
+    direction_C = frame.pose.L_from_C.T @ frame.pose.sun_L
+    frame.context = FaultContext(
+        camera=frame.camera,
+        sun_xy_px=frame.camera.project(direction_C),
+        sun_direction_C=direction_C,
+        sun_irradiance_W_m2_nm=frame.sunlight.irradiance_W_m2_nm,
+        sun_visible_fraction=frame.pose.sun_visible_fraction,
+    )
+
+
+def _metered_exposure_s(frame: Frame) -> float:
+    settings, detector = frame.spec.scene.camera, frame.camera.detector
+    # as a facet whose normal is 45 degrees from the Sun would be exposed
+    scene = frame.spec.scene
+    wavelength = frame.radiance.wavelength_nm
+    lit = spectra.reflectance(scene.body.reflectance, wavelength) / np.pi * np.cos(np.pi / 4)
+    flat = (lit * frame.sunlight.irradiance_W_m2_nm).astype(np.float32).reshape(-1, 1, 1)
+    reference = settings.metering_level / max(float(_brightness(frame, flat).max()), 1e-30)
+    body = frame.truth.semantic == 1
+    shown = _brightness(frame, frame.radiance.array[:, body][:, None, :])
+    shown = shown[shown > 0.02 / reference]  # sunlit: above a fiftieth of the reference facet
+    exposure = reference
+    if len(shown) >= 64:
+        metered = settings.metering_level / float(np.percentile(shown, settings.metering_percentile))
+        low, high = _METERING_RANGE
+        exposure = float(np.clip(metered, low * reference, high * reference))
+    return float(np.clip(exposure, settings.exposure_min_s, settings.exposure_max_s))
+
+
+def _brightness(frame: Frame, radiance: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Greatest of R, G, B per pixel after one second, as a fraction of white."""
+    quantity = frame.radiance.with_array(np.ascontiguousarray(radiance))
+    expected = frame.camera.detector.electrons_expected(frame.camera.lens.image(quantity), 1.0)
+    return (expected.array / expected.white_e).max(axis=-1).ravel()
+
+
+# --- photograph --------------------------------------------------------------------------------------------
+
+
+def photograph(frame: Frame) -> None:
+    """Draw the commanded faults and take the pictures: `clean`, `image` and the twins the scene asks for.
+
+    A drawn fault that does not show is drawn again a few times, then left out, so that `frame.drawn` holds what
+    is in the pixels and labels never claim more.
+    """
+    spec = frame.spec
+    noise = Noise.draw(frame.context.shape, spec.rng("detector", "shot"), spec.rng("detector", "read"))
+    commanded = [name for name in spec.faults if spec.plan.injects(name)[spec.index]]
+    if not frame.pose.resolved:
+        commanded = [name for name in commanded if not spec.faults[name].needs_sun]
+    frame.images["clean"], frame.raw = _develop(frame, {}, noise)
+    for attempt in range(_DRAW_TRIES):
+        for name in commanded:
+            if name not in frame.drawn:
+                generator = spec.rng("fault", f"{name}/{attempt}")
+                frame.drawn[name] = spec.faults[name].draw(frame.context, generator)
+        invisible = _invisible(frame, noise)
+        for name in invisible:
+            del frame.drawn[name]
+        if not invisible:
+            break
+    frame.images["image"], frame.raw = _develop(frame, frame.drawn, noise)
+    twins = [layer for layer in spec.scene.dataset.layers if layer.startswith("without_")]
+    for layer in twins:
+        name = layer.removeprefix("without_")
+        if name in frame.drawn:
+            frame.images[layer] = _develop(frame, _but(frame.drawn, name), noise)[0]
+        else:
+            frame.images[layer] = frame.images["image"]
+
+
+def _but(drawn: Mapping[str, Params], left_out: str) -> dict[str, Params]:
+    return {name: params for name, params in drawn.items() if name != left_out}
+
+
+def _in_order(frame: Frame, drawn: Mapping[str, Params], step: str) -> list[str]:
+    return [name for name in physical_order(drawn) if frame.spec.faults[name].step == step]
+
+
+def _signals(frame: Frame, drawn: Mapping[str, Params]) -> tuple[Camera, list[tuple[str, Electrons]]]:
+    """The camera as the faults alter it, and the expected electrons after each optical fault, in order."""
+    camera = frame.camera
+    for name in physical_order(drawn):
+        camera = frame.spec.faults[name].alter(camera, drawn[name])
+    if camera == frame.camera:
+        signal = frame.context.once("signal", _NOTHING, lambda: _expected(frame, frame.camera))
+    else:
+        signal = _expected(frame, camera)
+    steps = [("", signal)]
+    for name in _in_order(frame, drawn, "electrons"):
+        signal = frame.spec.faults[name].apply(signal, drawn[name], frame.context)
+        steps.append((name, signal))
+    return camera, steps
+
+
+_NOTHING: Params = {}
+
+
+def _expected(frame: Frame, camera: Camera) -> Electrons:
+    return camera.detector.electrons_expected(camera.lens.image(frame.radiance), camera.exposure_s)
+
+
+def _develop(frame: Frame, drawn: Mapping[str, Params], noise: Noise | None) -> tuple[RGBI, RawDN]:
+    """The finished picture with the faults `drawn`; noise-free without `noise`."""
+    key = (tuple((name, id(drawn[name])) for name in physical_order(drawn)), noise is None)
+
+    def take() -> tuple[RGBI, RawDN]:
+        camera, steps = _signals(frame, drawn)
+        rgbi, raw = camera.detector.develop(steps[-1][1], camera.exposure_s, noise)
+        for name in _in_order(frame, drawn, "rgbi"):
+            rgbi = frame.spec.faults[name].apply(rgbi, drawn[name], frame.context)
+        return rgbi, raw
+
+    if key not in frame.pictures:
+        frame.pictures[key] = take()
+    return frame.pictures[key]
+
+
+def _invisible(frame: Frame, noise: Noise) -> list[str]:
+    """Drawn faults without any effect on the noise-free picture."""
+    return [
+        name
+        for name in sorted(_doubtful(frame, noise))
+        if not effect_of(frame, name).any()
+    ]
+
+
+def effect_of(frame: Frame, name: str) -> NDArray[np.bool_]:
+    """bool[y, x]: where the noise-free picture changes when one of the drawn faults is switched off."""
+    everything = _develop(frame, frame.drawn, None)[0].array
+    return labels.effect(everything, _develop(frame, _but(frame.drawn, name), None)[0].array)
+
+
+def _doubtful(frame: Frame, noise: Noise) -> set[str]:
+    """Drawn faults that a cheap look does not show to be plainly visible."""
+    faults = frame.spec.faults
+    camera, steps = _signals(frame, frame.drawn)
+    if camera != frame.camera:
+        return set(frame.drawn)
+    out = {name for name in frame.drawn if faults[name].effect_mask}
+    every = slice(frame.context.shape[0] // 32, None, 16)
+    for (_, before), (name, after) in pairwise(steps):
+        a, b = (np.minimum(q.array[every], q.white_e) * (255 / q.white_e) for q in (before, after))
+        if np.abs(b - a).max(initial=0) < _CLEARLY_VISIBLE_DN:
+            out.add(name)
+    readout = _in_order(frame, frame.drawn, "rgbi")
+    optical = {name: frame.drawn[name] for name in frame.drawn if name not in readout}
+    before = _develop(frame, optical, noise)[0]
+    untouched = np.ones(frame.context.shape, dtype=bool)
+    changes = {}
+    for name in readout:
+        after = faults[name].apply(before, frame.drawn[name], frame.context)
+        changes[name] = cv2.absdiff(after.array, before.array).max(axis=-1)
+        before = after
+    for name in reversed(readout):  # what a later fault overwrites does not count
+        if (changes[name] * untouched).max() < _CLEARLY_VISIBLE_DN:
+            out.add(name)
+        untouched &= changes[name] == 0
+    return out
+
+
+# --- label -------------------------------------------------------------------------------------------------
+
+
+def label(frame: Frame) -> None:
+    """Masks of every class, by footprint or by effect."""
+    spec = frame.spec
+    wanted = spec.scene.dataset.layers
+    frame.effects = {
+        name: effect_of(frame, name)
+        for name in frame.drawn
+        if spec.faults[name].effect_mask or "mask_effect" in wanted
+    }
+    frame.mask = labels.mask_layers(spec.faults, frame.drawn, frame.context, frame.effects)
+
+
+# The stages, in physical order.
+STAGES = (resolve, render_frame, meter, photograph, label)
+
+
+def to_sample(frame: Frame) -> Sample:
+    """The layers and scalars of the dataset, by the names of its arrays."""
+    spec, pose, i = frame.spec, frame.pose, frame.spec.index
+    dataset, site = spec.scene.dataset, spec.terrain.site
+    assert frame.raw is not None
+    names = list(spec.faults)
+    available: dict[str, Any] = {
+        "depth_m": frame.truth.depth_m,
+        "normal": frame.truth.normal,
+        "semantic": frame.truth.semantic,
+        "radiance": frame.radiance.array.astype(np.float16),
+    }
+    layers = {
+        "image": frame.images["image"].array,
+        "clean": frame.images["clean"].array,
+        "mask": frame.mask,
+        "mask_any": labels.union(frame.mask, names, mask_any_faults(spec.scene, spec.faults)),
+    }
+    for name in dataset.layers:
+        if name.startswith("without_"):
+            layers[name] = frame.images[name].array
+        elif name == "mask_effect":
+            empty = np.zeros(frame.context.shape, dtype=bool)
+            layers[name] = np.stack([frame.effects.get(f, empty) for f in names])
+        elif name in available:
+            layers[name] = available[name]
+    T_from_L = site.T_from_L
+    T_from_C = T_from_L @ pose.L_from_C
+    sun_T = T_from_L @ pose.sun_L
+    sun_xy = frame.context.sun_xy_px
+    fixed = {name: float(values[i]) for name, values in spec.plan.variables.items()}
+    scalars: dict[str, Any] = {
+        "injected": np.array([name in frame.drawn for name in names]),
+        "camera_position_T_m": site.position_T_m + T_from_L @ pose.position_L_m,
+        "position_L_m": pose.position_L_m,
+        "camera_from_T": frames.quaternion(T_from_C.T),
+        "T_from_L": T_from_L,
+        "T_from_J": target_attitude(spec.scene, sun_T),
+        "site_T_m": site.position_T_m,
+        "sun_direction_T": sun_T,
+        "sun_distance_au": sun_distance_au(spec.scene),
+        "julian_date": spec.scene.sun.julian_date,
+        "intrinsics": frame.camera.intrinsics,
+        "sun_azimuth_deg": pose.sun_azimuth_deg,
+        "sun_elevation_deg": pose.sun_elevation_deg,
+        "roll_deg": fixed["roll_deg"],
+        "pitch_deg": fixed["pitch_deg"],
+        "yaw_deg": fixed["yaw_deg"],
+        "sun_xy_px": np.full(2, np.nan) if sun_xy is None else sun_xy,
+        "sun_visible_fraction": pose.sun_visible_fraction,
+        "exposure_s": frame.camera.exposure_s,
+        "tries": pose.tries + int(spec.plan.attitude_tries[i]) - 1,
+        "stratum": int(spec.plan.stratum[i]),
+        "site": int(spec.plan.site[i]),
+        "lens": 0,
+        "detector_individual": 0,
+        "split": int(spec.plan.split[i]),
+        "parameters": {
+            name: {"model": spec.faults[name].model, **params} for name, params in sorted(frame.drawn.items())
+        },
+        "proposal": {
+            **fixed,
+            "injected": [n for n in names if spec.plan.injects(n)[i]],
+            "architecture": frame.camera.architecture,
+            "readout_direction": frame.camera.readout_direction,
+        },
+    }
+    return Sample(index=i, layers=layers, scalars=scalars)
+
+
+def target_attitude(scene: SceneConfig, sun_T: F64) -> F64:
+    """T_from_J of the target under the commanded Sun: the attitude nearest to the body's own at the date."""
+    body, date = scene.body, scene.sun.julian_date
+    own = frames.Rotation(
+        pole_ra_deg=body.pole_ra_deg,
+        pole_dec_deg=body.pole_dec_deg,
+        prime_meridian_deg=body.prime_meridian_deg,
+        period_h=body.rotation_period_h,
+    ).J_from_T(date)
+    sun_J = -frames.unit(frames.ORBIT_67P.position_J_au(date))
+    return frames.T_from_J_commanded(own.T, sun_J, sun_T)
+
+
+# --- a session: many samples of one scene ------------------------------------------------------------------
+
+
+def configure_faults(scene: SceneConfig, source: str = "scene") -> dict[str, Fault]:
+    """The scene's faults in dataset order. Raises InputError."""
+    for name in scene.faults:
+        from_dict(name, scene.faults[name], source=source)  # unknown classes first: they cannot be ordered
+    faults = {n: from_dict(n, scene.faults[n], source=source) for n in dataset_order(scene.faults)}
+    for layer in scene.dataset.layers:
+        if layer.startswith("without_") and layer != "without_straylight" and layer[8:] not in faults:
+            raise InputError(f"{source}: dataset.layers: {layer!r}: the scene has no such fault")
+    for name in scene.dataset.mask_any or ():
+        if name not in faults:
+            raise InputError(f"{source}: dataset.mask_any: {name!r}: the scene has no such fault")
+    return faults
+
+
+def mask_any_faults(scene: SceneConfig, faults: Mapping[str, Fault]) -> tuple[str, ...]:
+    """The classes united in mask_any: as configured, else the localised ones."""
+    if scene.dataset.mask_any is not None:
+        return scene.dataset.mask_any
+    return tuple(name for name, fault in faults.items() if fault.localised)
+
+
+def make_body(scene: SceneConfig) -> Body:
+    """The scene's body. Raises InputError."""
+    table = scene.body
+    physical = {
+        "density_kg_m3": table.density_kg_m3,
+        "rotation_period_s": table.rotation_period_h * 3600,
+    }
+    if table.shape == "ellipsoid":
+        vertices, faces = ellipsoid(table.semi_axes_m)
+        return Body(name=table.name, vertices_m=vertices, faces=faces, **physical)
+    return load_body(table.shape, unit=table.unit, name=table.name, **physical)
+
+
+class Session:
+    """A scene with its plan, and the terrain of the site at work: `simulate` for any sample, in any order.
+
+    `blocks`: sizes of the planned blocks (default: one of `dataset.samples`); `threads`: render threads of this
+    process. Raises InputError for a scene that cannot be used.
+    """
+
+    def __init__(
+        self,
+        scene: SceneConfig,
+        *,
+        blocks: Sequence[int] | None = None,
+        threads: int | None = None,
+        source: str = "scene",
+    ) -> None:
+        self.scene = scene
+        self.faults = configure_faults(scene, source)
+        self.plan = plan.make_plan(scene, list(self.faults), blocks)
+        self._threads = threads
+        self._terrain: Terrain | None = None
+
+    @cached_property
+    def body(self) -> Body:
+        """The body, loaded when first asked for."""
+        return make_body(self.scene)
+
+    @cached_property
+    def sites(self) -> tuple[Site, ...]:
+        """All sites of the scene."""
+        return choose_sites(self.body, self.scene.dataset.sites, self.scene.dataset.seed)
+
+    def terrain(self, site: int) -> Terrain:
+        """The terrain of a site; the one used last is kept."""
+        if self._terrain is None or self._terrain.site.index != site:
+            from . import render
+
+            if self._threads is not None:
+                render.set_threads(self._threads)
+            self._terrain = None  # let go of the old one first: two do not fit a small machine
+            patch = self._patch(self.sites[site])
+            surface = render.Surface(patch.vertices_L_m, patch.faces, patch.face_is_boulder)
+            self._terrain = Terrain(body=self.body, site=patch.site, surface=surface)
+        return self._terrain
+
+    def _patch(self, site: Site) -> Patch:
+        table = self.scene.patch
+        return build_patch(
+            self.body,
+            site,
+            seed=self.scene.dataset.seed,
+            facet_m=table.facet_m,
+            radius_m=table.radius_m,
+            relief=table.relief,
+            min_boulder_m=table.min_boulder_m if table.boulders else 1e6,
+        )
+
+    def spec(self, index: int) -> SampleSpec:
+        """What `simulate` needs for one sample."""
+        return SampleSpec(
+            index=index,
+            scene=self.scene,
+            plan=self.plan,
+            faults=self.faults,
+            terrain=self.terrain(int(self.plan.site[index])),
+        )
+
+    def simulate(self, index: int) -> Sample:
+        """One finished sample."""
+        return simulate(self.spec(index))
+
+    def frame(self, index: int) -> Frame:
+        """One sample with all that lies between radiance and labels."""
+        return develop_frame(self.spec(index))
+
+
+def ellipsoid(semi_axes_m: tuple[float, float, float]) -> tuple[F64, NDArray[np.int32]]:
+    """A triaxial ellipsoid as a closed mesh of 82,000 triangles: vertices float64[n, 3] in m, faces int32."""
+    import trimesh
+
+    sphere = trimesh.creation.icosphere(subdivisions=6)
+    return np.asarray(sphere.vertices) * np.array(semi_axes_m), np.asarray(sphere.faces, dtype=np.int32)
+
+
+def registered_faults() -> list[tuple[str, str, str]]:
+    """(class, model, first line of its docstring) of every registered fault model."""
+    return [
+        (name, model, (cls.__doc__ or "").strip().split("\n")[0])
+        for name, models in registry().items()
+        for model, cls in models.items()
+    ]
