@@ -299,9 +299,11 @@ def _anchor_paths(table: dict[str, Any], folder: Path) -> None:
             body["shape"] = str((beside if beside.exists() else Path(shape)).resolve())
     faults = table.get("faults")
     for fault in faults.values() if isinstance(faults, dict) else ():
-        if isinstance(fault, dict) and isinstance(fault.get("file"), str) and fault["file"]:
-            beside = folder / fault["file"]
-            fault["file"] = str((beside if beside.exists() else Path(fault["file"])).resolve())
+        if isinstance(fault, dict) and isinstance(fault.get("texture_file"), str) and fault["texture_file"]:
+            beside = folder / fault["texture_file"]
+            fault["texture_file"] = str(
+                (beside if beside.exists() else Path(fault["texture_file"])).resolve()
+            )
 
 
 def _sentence(error: ValidationError) -> str:

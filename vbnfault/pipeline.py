@@ -533,14 +533,20 @@ def to_sample(frame: Frame) -> Sample:
         "parameters": {
             name: {"model": spec.faults[name].model, **params} for name, params in sorted(frame.drawn.items())
         },
-        "proposal": {
-            **fixed,
-            "injected": [n for n in names if spec.plan.injects(n)[i]],
-            "architecture": frame.camera.architecture,
-            "readout_direction": frame.camera.readout_direction,
-        },
+        "proposal": proposal(spec.scene, spec.plan, i),
     }
     return Sample(index=i, layers=layers, scalars=scalars)
+
+
+def proposal(scene: SceneConfig, table: plan.Plan, index: int) -> dict[str, Any]:
+    """What the plan proposed for a sample, before redraws; plain data."""
+    camera = scene.camera
+    return {
+        **{name: float(values[index]) for name, values in table.variables.items()},
+        "injected": [name for name in table.faults if table.injects(name)[index]],
+        "architecture": camera.architectures[int(table.architecture[index])],
+        "readout_direction": camera.readout_directions[int(table.readout_direction[index])],
+    }
 
 
 def target_attitude(scene: SceneConfig, sun_T: F64) -> F64:
@@ -613,6 +619,11 @@ class Session:
         self.plan = plan.make_plan(scene, list(self.faults), blocks)
         self._threads = threads
         self._terrain: Terrain | None = None
+
+    @cached_property
+    def base_camera(self) -> Camera:
+        """The camera before a sample's exposure, architecture and readout direction."""
+        return base_camera(self.scene)
 
     @cached_property
     def body(self) -> Body:

@@ -5,11 +5,41 @@ from .resolve import ground_height_m, is_clear, sun_visible_fraction
 from .runtime import set_threads
 from .surface import Surface
 
+
+
+def self_test() -> str:
+    """Render a Lambert square facing the Sun and compare its radiance with ρE/π; a sentence for `doctor`."""
+    import numpy as np
+
+    from ..scene import Scene, Sunlight, View
+
+    square = np.array([[-9, -9, 0], [9, -9, 0], [9, 9, 0], [-9, 9, 0]], dtype=np.float32)
+    faces = np.array([[0, 2, 1], [0, 3, 2]], dtype=np.int32)
+    up = np.array([0.0, 0.0, -1.0])
+    sun = Sunlight(direction_L=up, angular_radius_rad=0.005, irradiance_W_m2_nm=np.array([1.5]))
+    view = View(
+        position_L_m=5 * up, L_from_C=np.eye(3), intrinsics=np.array([16.0, 16, 8, 8]), width_px=16, height_px=16
+    )
+    scene = Scene(
+        view=view,
+        sun=sun,
+        wavelength_nm=np.array([550.0]),
+        reflectance=np.array([0.06]),
+        samples_per_pixel=4,
+        key=0,
+    )
+    got = float(radiance(Surface(square, faces, np.ones(2, dtype=bool)), scene).array.mean())
+    want = 0.06 * 1.5 / np.pi
+    verdict = "as it should be" if abs(got / want - 1) < 1e-3 else "WRONG"
+    return f"radiance {got:.6f} W m-2 sr-1 nm-1, expected {want:.6f}: {verdict}"
+
+
 __all__ = [
     "Surface",
     "ground_height_m",
     "is_clear",
     "radiance",
+    "self_test",
     "set_threads",
     "sun_visible_fraction",
     "truth",

@@ -1,0 +1,257 @@
+"""The command line. It parses, calls and prints; no physics here, and nothing heavy is imported before its use.
+
+Exit codes: 0 done, 1 a failed run, 2 bad input, 130 interrupted. A user's mistake never shows a traceback.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import sys
+import tomllib
+import warnings
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from . import __version__
+from .errors import InputError, VbnfaultError
+
+if TYPE_CHECKING:
+    from .config import SceneConfig
+
+app = typer.Typer(
+    name="vbnfault",
+    help="Labelled, fault-injected camera images for vision-based navigation near comets.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+
+SceneArgument = Annotated[str, typer.Argument(help="path of a scene file, or the name of a packaged scene")]
+StoreArgument = Annotated[Path, typer.Argument(help="path of a Zarr store")]
+SetOption = Annotated[
+    list[str] | None,
+    typer.Option("--set", metavar="KEY=VALUE", help="replace a value of the scene, e.g. body.shape=comet.obj"),
+]
+SeedOption = Annotated[int | None, typer.Option(min=0, help="replace the scene's seed")]
+
+
+def main() -> None:
+    """Entry point: turns errors into one sentence and an exit code."""
+    warnings.showwarning = lambda message, *_, **__: typer.echo(f"warning: {message}", err=True)
+    try:
+        app(standalone_mode=False)
+    except VbnfaultError as error:
+        typer.echo(f"vbnfault: {error}", err=True)
+        sys.exit(error.exit_code)
+    except typer.Exit as stop:
+        sys.exit(stop.exit_code)
+    except (KeyboardInterrupt, typer.Abort):
+        typer.echo("vbnfault: interrupted; the same command resumes where it stopped", err=True)
+        sys.exit(130)
+    except Exception as error:
+        # click's own usage errors (bad option, missing argument) know how to print themselves
+        show = getattr(error, "show", None)
+        if show is None:
+            raise
+        show()
+        sys.exit(getattr(error, "exit_code", 2))
+
+
+def _version(show: bool) -> None:
+    if show:
+        typer.echo(f"vbnfault {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _options(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="print the version and exit")
+    ] = False,
+) -> None:
+    """Labelled, fault-injected camera images for vision-based navigation near comets."""
+
+
+def _overrides(settings: list[str] | None, **named: Any) -> dict[str, Any]:
+    values: dict[str, Any] = {}
+    for setting in settings or ():
+        key, equals, text = setting.partition("=")
+        if not equals or not key.strip():
+            raise InputError(f"--set {setting}: must be KEY=VALUE, such as body.shape=comet.obj")
+        try:
+            values[key.strip()] = tomllib.loads(f"value = {text}")["value"]
+        except tomllib.TOMLDecodeError:
+            values[key.strip()] = text.strip()  # a bare word or path
+    return values | {key.replace("__", "."): value for key, value in named.items() if value is not None}
+
+
+def _scene(name: str, settings: list[str] | None, **named: Any) -> SceneConfig:
+    from . import config
+
+    return config.load_scene(name, _overrides(settings, **named))
+
+
+@app.command()
+def build(
+    scene: SceneArgument,
+    out: Annotated[Path, typer.Option(help="path of the Zarr store to make, or to resume")],
+    samples: Annotated[int | None, typer.Option(min=1, help="number of samples, in place of the scene's")] = None,
+    seed: SeedOption = None,
+    workers: Annotated[int, typer.Option(min=1, help="processes on this machine")] = 1,
+    threads: Annotated[
+        int | None, typer.Option(min=1, help="render threads a worker; default: the cores shared out")
+    ] = None,
+    scheduler: Annotated[str | None, typer.Option(help="address of a Dask scheduler to run on")] = None,
+    append: Annotated[int | None, typer.Option(min=1, help="add a block of M samples to the store")] = None,
+    overwrite: Annotated[bool, typer.Option(help="delete an existing store first")] = False,
+    dry_run: Annotated[bool, typer.Option(help="plan and print, render nothing")] = False,
+    settings: SetOption = None,
+) -> None:
+    """Build a dataset, or resume one: a store of the same scene is completed and mended where it is damaged."""
+    from . import build as builder
+    from . import llvm
+
+    source = _scene(scene, settings, dataset__samples=samples, dataset__seed=seed)
+    if not dry_run:
+        llvm.find()
+    builder.build_scene(
+        source,
+        out,
+        workers=workers,
+        threads=threads,
+        scheduler=scheduler,
+        append=append,
+        overwrite=overwrite,
+        dry_run=dry_run,
+        samples_given=samples is not None,
+        name=scene,
+    )
+
+
+@app.command()
+def verify(store: StoreArgument) -> None:
+    """Check a store: exit code 0 only if every sample is whole, labelled and as planned."""
+    from . import dataset
+    from . import store as stores
+
+    opened = stores.open_store(store)
+    expected = dataset.planned(opened.spec.attributes, opened.spec.faults)
+    problems = stores.verify(opened, expected=expected)
+    for problem in problems:
+        typer.echo(f"{store}: {problem}", err=True)
+    if problems:
+        typer.echo(f"vbnfault: {store}: {len(problems)} problems; the build command mends them", err=True)
+        raise typer.Exit(1)
+    typer.echo(f"{store}: {opened.samples} samples, whole, labelled and as planned")
+
+
+@app.command()
+def preview(
+    store: StoreArgument,
+    out: Annotated[Path, typer.Option(help="PNG to write")],
+    samples: Annotated[int, typer.Option(min=1, help="at most this many samples")] = 16,
+    masks: Annotated[bool, typer.Option(help="overlay the masks")] = True,
+) -> None:
+    """Contact sheet of a store, masks overlaid."""
+    from . import report
+
+    report.preview(store, out, max_samples=samples, masks=masks)
+    typer.echo(str(out))
+
+
+@app.command()
+def render(
+    scene: SceneArgument,
+    out: Annotated[Path, typer.Option(help="folder to write to")],
+    sample: Annotated[int, typer.Option(min=0, help="index of the sample")] = 0,
+    samples: Annotated[int | None, typer.Option(min=1, help="number of samples planned")] = None,
+    seed: SeedOption = None,
+    settings: SetOption = None,
+) -> None:
+    """Render one sample of a scene as EXR, PNG and JSON; equal to the stored one bit for bit."""
+    from . import llvm
+
+    source = _scene(scene, settings, dataset__samples=samples, dataset__seed=seed)
+    if sample >= source.dataset.samples:
+        last = source.dataset.samples - 1
+        raise InputError(f"--sample {sample}: {scene} plans samples 0 to {last}; --samples plans more")
+    llvm.find()
+    from . import export, pipeline
+
+    session = pipeline.Session(source, source=scene)
+    for path in export.write_frame(session.frame(sample), out):
+        typer.echo(str(path))
+
+
+@app.command("list")
+def list_(
+    what: Annotated[str, typer.Argument(help="scenes, lenses, detectors or faults", metavar="KIND")],
+) -> None:
+    """List what is packaged: scenes, lenses, detectors, or the fault models with their keys."""
+    from . import resources
+
+    if what == "faults":
+        _list_faults()
+        return
+    kinds = {"scenes": "scenes", "lenses": "scenes/lenses", "detectors": "scenes/detectors"}
+    if what not in kinds:
+        raise InputError(f"list {what}: must be one of {', '.join(kinds)}, faults")
+    found = resources.packaged(kinds[what])
+    if not found:
+        typer.echo(f"no packaged {what}")
+    width = max((len(name) for name in found), default=0)
+    for name, path in found.items():
+        table = tomllib.loads(path.read_text(encoding="utf-8"))
+        typer.echo(f"{name:<{width}}  {table.get('description', '')}")
+
+
+def _list_faults() -> None:
+    from . import faults
+
+    for name, models in faults.json_schema()["properties"].items():
+        for model in models.get("anyOf", [models]):
+            keys = dict(model["properties"])
+            typer.echo(f"{name} / {keys.pop('model')['const']}")
+            for key, value in keys.items():
+                typer.echo(f"    {key} = {json.dumps(value['default'])}    {value['description']}")
+
+
+@app.command()
+def schema() -> None:
+    """Print the JSON Schema of the scene file."""
+    from . import config, faults
+
+    typer.echo(json.dumps(config.json_schema(faults.json_schema()), indent=2))
+
+
+@app.command()
+def doctor() -> None:
+    """What is installed, which LLVM was found, and whether a small render works."""
+    import importlib.metadata
+    import platform
+
+    from . import llvm, resources
+
+    typer.echo(f"vbnfault   {__version__}")
+    typer.echo(f"python     {platform.python_version()} on {platform.platform()}, {os.cpu_count()} cores")
+    for name in ("mitsuba", "drjit", "numpy", "zarr", "trimesh", "OpenEXR", "colour-science", "dask"):
+        with contextlib.suppress(importlib.metadata.PackageNotFoundError):
+            typer.echo(f"{name:<15}{importlib.metadata.version(name)}")
+    for kind in ("scenes", "textures"):
+        typer.echo(f"{kind:<15}{resources.data_dir(kind)}")
+    for candidate in llvm.candidates():
+        version = ".".join(map(str, candidate.version)) if candidate.version else "?"
+        verdict = "usable" if candidate.usable else candidate.problem
+        typer.echo(f"LLVM {version:<10}{candidate.path} ({candidate.origin}): {verdict}")
+    typer.echo(f"LLVM in use    {llvm.find().path}")
+    from . import render
+
+    typer.echo(f"test render    {render.self_test()}")
+
+
+if __name__ == "__main__":
+    main()

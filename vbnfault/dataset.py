@@ -1,0 +1,118 @@
+"""What the store of a scene holds: its schema, its root attributes, and what `verify` may expect of a sample."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import importlib.metadata
+import platform
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from . import __version__, config, pipeline, plan, resources
+from .config import SceneConfig
+from .errors import InputError
+from .store import StoreSpec
+
+# Libraries whose version may change a pixel.
+_LIBRARIES = ("mitsuba", "drjit", "numpy", "scipy", "trimesh", "scikit-image", "colour-science", "zarr")
+_OPENCV = ("opencv-python-headless", "opencv-python")
+
+
+def versions() -> dict[str, str]:
+    """Versions of vbnfault and of every library that affects pixels, and the machine type."""
+    found = {"vbnfault": __version__}
+    for name in (*_LIBRARIES, *_OPENCV):
+        try:
+            found[name] = importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            continue
+    return found | {"machine": platform.machine()}
+
+
+def scene_identity(session: pipeline.Session) -> dict[str, Any]:
+    """The resolved scene with the contents, not the paths, of what it names; sizes of blocks left out."""
+    scene = session.scene.resolved()
+    scene["body"]["shape_sha256"] = session.body.content_hash
+    if session.scene.body.shape not in ("embedded", "ellipsoid"):
+        scene["body"]["shape"] = Path(session.scene.body.shape).name
+    scene["faults"] = {name: fault.to_dict() for name, fault in session.faults.items()}
+    for table in scene["faults"].values():
+        if table.get("texture_file"):
+            data = Path(table["texture_file"]).read_bytes()
+            table["texture_file"] = f"sha256:{hashlib.sha256(data).hexdigest()}"
+    if "straylight" in session.faults:
+        textures = sorted(resources.data_dir("textures").glob("*.png"))
+        scene["textures_sha256"] = hashlib.sha256(b"".join(p.read_bytes() for p in textures)).hexdigest()
+    del scene["dataset"]["samples"]  # a block more makes no other scene
+    return scene
+
+
+def store_spec(session: pipeline.Session, blocks: Sequence[int]) -> StoreSpec:
+    """The store of a scene, planned in `blocks`. Raises InputError for layers this world cannot give."""
+    scene = session.scene
+    dataset, camera = scene.dataset, scene.camera
+    if "raw" in dataset.layers:
+        raise InputError("dataset.layers: 'raw' needs a mosaic detector; the paper world has none")
+    layers = tuple(name for name in dataset.layers if name != "clean")
+    identity = scene_identity(session)
+    attributes: dict[str, Any] = {
+        "title": scene.title,
+        "description": scene.description,
+        "scene": identity,
+        "scene_hash": config.content_hash(identity, versions()),
+        "scene_source": scene.resolved(),
+        "seed": dataset.seed,
+        "blocks": list(blocks),
+        "versions": versions(),
+        "licence": dataset.licence,
+        "citation": dataset.citation,
+        "intensity_channel": "luminance of RGB, Rec. 709 weights",
+        "fault_models": {name: fault.model for name, fault in session.faults.items()},
+    }
+    return StoreSpec(
+        height=camera.height_px,
+        width=camera.width_px,
+        faults=tuple(session.faults),
+        mask_any_faults=pipeline.mask_any_faults(scene, session.faults),
+        localised_faults=tuple(name for name, fault in session.faults.items() if fault.localised),
+        wavelength_nm=tuple(float(w) for w in pipeline.wavelengths_nm(scene)),
+        layers=layers,
+        site_names=tuple(f"site_{k:05d}" for k in range(dataset.sites)),
+        lens_names=("thin lens",),
+        detector_names=(session.base_camera.detector.name,),
+        shard_samples=dataset.shard_samples,
+        attributes=attributes,
+    )
+
+
+def planned(attributes: Mapping[str, Any], faults: Sequence[str]) -> Callable[[int], dict[str, Any]]:
+    """What the plan of a stored scene says of a sample: the scalars that rendering cannot change."""
+    scene: SceneConfig = config.parse_scene(attributes["scene_source"], source="the store's own scene")
+    table = plan.make_plan(scene, faults, attributes["blocks"])
+
+    def expected(index: int) -> dict[str, Any]:
+        drawn = {name: float(table.variables[name][index]) for name in plan.VARIABLES}
+        angles = ("sun_azimuth_deg", "roll_deg", "pitch_deg", "yaw_deg")
+        return {
+            **{name: drawn[name] for name in angles},
+            "stratum": int(table.stratum[index]),
+            "site": int(table.site[index]),
+            "split": int(table.split[index]),
+            "proposal": pipeline.proposal(scene, table, index),
+        }
+
+    return expected
+
+
+@dataclasses.dataclass(frozen=True)
+class SessionFactory:
+    """Makes the session of a scene in a worker; picklable. `threads`: render threads of that worker."""
+
+    scene: SceneConfig
+    blocks: tuple[int, ...]
+    threads: int | None = None
+
+    def __call__(self) -> pipeline.Session:
+        return pipeline.Session(self.scene, blocks=self.blocks, threads=self.threads)

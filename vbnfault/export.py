@@ -1,0 +1,79 @@
+"""One sample as files a person can open: EXR for radiance and truth, PNG for pictures and masks, JSON."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from . import pipeline
+from .errors import VbnfaultError
+from .pipeline import Frame
+from .quantities import Sample
+
+
+def write_frame(frame: Frame, folder: Path) -> list[Path]:
+    """Write one simulated frame to `folder` (made if missing); returns the files.
+
+    `sample.exr`: `radiance.<wavelength>nm` (W m⁻² sr⁻¹ nm⁻¹), `depth.Z` (m), `normal.X/Y/Z` (C frame) and
+    `semantic`; `image.png`, `clean.png`, `without_<fault>.png` as RGB, each with its intensity channel beside it;
+    `mask_<fault>.png`, `mask_any.png`; `parameters.json` with every scalar of the dataset.
+    Raises VbnfaultError where a file cannot be written.
+    """
+    sample = pipeline.to_sample(frame)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        files = [_write_exr(frame, folder / "sample.exr")]
+        for name, layer in sample.layers.items():
+            if layer.ndim == 3 and layer.shape[-1] == 4:
+                files.append(_write_png(folder / f"{name}.png", layer[..., 2::-1]))
+                files.append(_write_png(folder / f"{name}_intensity.png", layer[..., 3]))
+        for layer_name, prefix in (("mask", "mask_"), ("mask_effect", "mask_effect_")):
+            for fault, mask in zip(frame.spec.faults, sample.layers.get(layer_name, ()), strict=False):
+                files.append(_write_png(folder / f"{prefix}{fault}.png", mask.astype(np.uint8) * 255))
+        union = sample.layers["mask_any"].astype(np.uint8) * 255
+        files.append(_write_png(folder / "mask_any.png", union))
+        path = folder / "parameters.json"
+        path.write_text(json.dumps(_plain(sample), indent=2) + "\n")
+        return [*files, path]
+    except OSError as error:
+        raise VbnfaultError(f"{error.filename or folder}: cannot be written: {error.strerror}") from None
+
+
+def _plain(sample: Sample) -> dict[str, Any]:
+    def plain(value: Any) -> Any:
+        if isinstance(value, np.ndarray):
+            return [None if isinstance(v, float) and np.isnan(v) else v for v in value.ravel().tolist()]
+        return value
+
+    return {"sample": sample.index, **{name: plain(value) for name, value in sample.scalars.items()}}
+
+
+def _write_png(path: Path, array: NDArray[np.uint8]) -> Path:
+    ok, data = cv2.imencode(".png", np.ascontiguousarray(array))
+    if not ok:
+        raise VbnfaultError(f"{path}: PNG encoding failed")
+    path.write_bytes(data.tobytes())
+    return path
+
+
+def _write_exr(frame: Frame, path: Path) -> Path:
+    import OpenEXR
+
+    truth = frame.truth
+    channels: dict[str, NDArray[Any]] = {
+        f"radiance.{wavelength:.1f}nm": np.ascontiguousarray(band)
+        for wavelength, band in zip(frame.radiance.wavelength_nm, frame.radiance.array, strict=True)
+    }
+    channels["depth.Z"] = truth.depth_m
+    normal = truth.normal.astype(np.float32)
+    channels |= {f"normal.{axis}": np.ascontiguousarray(normal[..., k]) for k, axis in enumerate("XYZ")}
+    channels["semantic"] = truth.semantic.astype(np.uint32)
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    # OpenEXR takes writeable arrays only
+    OpenEXR.File(header, {name: array.copy() for name, array in channels.items()}).write(str(path))
+    return path
