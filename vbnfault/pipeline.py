@@ -12,10 +12,8 @@ from collections import OrderedDict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -28,7 +26,7 @@ from .detector import Detector, Noise
 from .errors import InputError
 from .faults import Fault, FaultContext, Params, dataset_order, from_dict, physical_order, registry
 from .lens import ThinLens
-from .quantities import RGBI, Electrons, Radiance, RawDN, Sample, Truth
+from .quantities import RGBI, Electrons, Radiance, Sample, Truth
 from .scene import Scene, Sunlight, View
 
 if TYPE_CHECKING:
@@ -101,8 +99,8 @@ class Frame:
     context: FaultContext = field(init=False)
     drawn: dict[str, Params] = field(default_factory=dict)
     images: dict[str, RGBI] = field(default_factory=dict)
-    pictures: dict[Any, tuple[RGBI, RawDN]] = field(default_factory=dict)
-    raw: RawDN | None = None
+    signals: dict[Any, Electrons] = field(default_factory=dict)
+    pictures: dict[Any, RGBI] = field(default_factory=dict)
     mask: NDArray[np.bool_] = field(init=False)
     effects: dict[str, NDArray[np.bool_]] = field(default_factory=dict)
 
@@ -304,15 +302,15 @@ def meter(frame: Frame) -> None:
 
 
 def _metered_exposure_s(frame: Frame) -> float:
-    settings, detector = frame.spec.scene.camera, frame.camera.detector
+    settings, scene = frame.spec.scene.camera, frame.spec.scene
     # as a facet whose normal is 45 degrees from the Sun would be exposed
-    scene = frame.spec.scene
     wavelength = frame.radiance.wavelength_nm
     lit = spectra.reflectance(scene.body.reflectance, wavelength) / np.pi * np.cos(np.pi / 4)
-    flat = (lit * frame.sunlight.irradiance_W_m2_nm).astype(np.float32).reshape(-1, 1, 1)
-    reference = settings.metering_level / max(float(_brightness(frame, flat).max()), 1e-30)
-    body = frame.truth.semantic == 1
-    shown = _brightness(frame, frame.radiance.array[:, body][:, None, :])
+    facet = (lit * frame.sunlight.irradiance_W_m2_nm).astype(np.float32).reshape(-1, 1, 1)
+    reference = settings.metering_level / max(float(_brightness(frame, facet).max()), 1e-30)
+    # every other pixel each way is sample enough for a percentile
+    body = frame.truth.semantic[::2, ::2] == 1
+    shown = _brightness(frame, frame.radiance.array[:, ::2, ::2])[body]
     shown = shown[shown > 0.02 / reference]  # sunlit: above a fiftieth of the reference facet
     exposure = reference
     if len(shown) >= 64:
@@ -323,10 +321,12 @@ def _metered_exposure_s(frame: Frame) -> float:
 
 
 def _brightness(frame: Frame, radiance: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Greatest of R, G, B per pixel after one second, as a fraction of white."""
+    """Greatest of R, G, B per pixel after one second, as a fraction of white, float32[y, x]."""
     quantity = frame.radiance.with_array(np.ascontiguousarray(radiance))
     expected = frame.camera.detector.electrons_expected(frame.camera.lens.image(quantity), 1.0)
-    return (expected.array / expected.white_e).max(axis=-1).ravel()
+    r, g, b = np.moveaxis(expected.array / expected.white_e, -1, 0)
+    brightness: NDArray[np.float32] = np.maximum(np.maximum(r, g), b)
+    return brightness
 
 
 # --- photograph --------------------------------------------------------------------------------------------
@@ -343,7 +343,7 @@ def photograph(frame: Frame) -> None:
     commanded = [name for name in spec.faults if spec.plan.injects(name)[spec.index]]
     if not frame.pose.resolved:
         commanded = [name for name in commanded if not spec.faults[name].needs_sun]
-    frame.images["clean"], frame.raw = _develop(frame, {}, noise)
+    frame.images["clean"] = _develop(frame, {}, noise)
     for attempt in range(_DRAW_TRIES):
         for name in commanded:
             if name not in frame.drawn:
@@ -354,12 +354,12 @@ def photograph(frame: Frame) -> None:
             del frame.drawn[name]
         if not invisible:
             break
-    frame.images["image"], frame.raw = _develop(frame, frame.drawn, noise)
+    frame.images["image"] = _develop(frame, frame.drawn, noise)
     twins = [layer for layer in spec.scene.dataset.layers if layer.startswith("without_")]
     for layer in twins:
         name = layer.removeprefix("without_")
         if name in frame.drawn:
-            frame.images[layer] = _develop(frame, _but(frame.drawn, name), noise)[0]
+            frame.images[layer] = _develop(frame, _but(frame.drawn, name), noise)
         else:
             frame.images[layer] = frame.images["image"]
 
@@ -372,43 +372,49 @@ def _in_order(frame: Frame, drawn: Mapping[str, Params], step: str) -> list[str]
     return [name for name in physical_order(drawn) if frame.spec.faults[name].step == step]
 
 
-def _signals(frame: Frame, drawn: Mapping[str, Params]) -> tuple[Camera, list[tuple[str, Electrons]]]:
-    """The camera as the faults alter it, and the expected electrons after each optical fault, in order."""
+def _altered(frame: Frame, drawn: Mapping[str, Params]) -> Camera:
+    """The camera as the drawn faults alter it."""
     camera = frame.camera
     for name in physical_order(drawn):
         camera = frame.spec.faults[name].alter(camera, drawn[name])
-    if camera == frame.camera:
-        signal = frame.context.once("signal", _NOTHING, lambda: _expected(frame, frame.camera))
+    return camera
+
+
+def _key(drawn: Mapping[str, Params], names: Sequence[str]) -> tuple[tuple[str, int], ...]:
+    return tuple((name, id(drawn[name])) for name in names)
+
+
+def _signal(frame: Frame, drawn: Mapping[str, Params], names: Sequence[str]) -> Electrons:
+    """Expected electrons with the optical faults `names`, of those drawn; twins share what they have in common."""
+    camera = _altered(frame, drawn)
+    if camera != frame.camera:
+        cached, key = {}, ()
     else:
-        signal = _expected(frame, camera)
-    steps = [("", signal)]
-    for name in _in_order(frame, drawn, "electrons"):
-        signal = frame.spec.faults[name].apply(signal, drawn[name], frame.context)
-        steps.append((name, signal))
-    return camera, steps
+        cached, key = frame.signals, _key(drawn, names)
+    if key not in cached:
+        if names:
+            *before, last = names
+            signal = _signal(frame, drawn, before)
+            cached[key] = frame.spec.faults[last].apply(signal, drawn[last], frame.context)
+        else:
+            cached[key] = camera.detector.electrons_expected(
+                camera.lens.image(frame.radiance), camera.exposure_s
+            )
+    return cached[key]
 
 
-_NOTHING: Params = {}
-
-
-def _expected(frame: Frame, camera: Camera) -> Electrons:
-    return camera.detector.electrons_expected(camera.lens.image(frame.radiance), camera.exposure_s)
-
-
-def _develop(frame: Frame, drawn: Mapping[str, Params], noise: Noise | None) -> tuple[RGBI, RawDN]:
+def _develop(frame: Frame, drawn: Mapping[str, Params], noise: Noise | None) -> RGBI:
     """The finished picture with the faults `drawn`; noise-free without `noise`."""
-    key = (tuple((name, id(drawn[name])) for name in physical_order(drawn)), noise is None)
-
-    def take() -> tuple[RGBI, RawDN]:
-        camera, steps = _signals(frame, drawn)
-        rgbi, raw = camera.detector.develop(steps[-1][1], camera.exposure_s, noise)
-        for name in _in_order(frame, drawn, "rgbi"):
-            rgbi = frame.spec.faults[name].apply(rgbi, drawn[name], frame.context)
-        return rgbi, raw
-
+    optical, readout = (_in_order(frame, drawn, step) for step in ("electrons", "rgbi"))
+    camera = _altered(frame, drawn)
+    key = (camera, _key(drawn, optical), noise is None)
     if key not in frame.pictures:
-        frame.pictures[key] = take()
-    return frame.pictures[key]
+        signal = _signal(frame, drawn, optical)
+        frame.pictures[key] = camera.detector.develop(signal, camera.exposure_s, noise)
+    picture = frame.pictures[key]
+    for name in readout:
+        picture = frame.spec.faults[name].apply(picture, drawn[name], frame.context)
+    return picture
 
 
 def _invisible(frame: Frame, noise: Noise) -> list[str]:
@@ -422,35 +428,38 @@ def _invisible(frame: Frame, noise: Noise) -> list[str]:
 
 def effect_of(frame: Frame, name: str) -> NDArray[np.bool_]:
     """bool[y, x]: where the noise-free picture changes when one of the drawn faults is switched off."""
-    everything = _develop(frame, frame.drawn, None)[0].array
-    return labels.effect(everything, _develop(frame, _but(frame.drawn, name), None)[0].array)
+    everything = _develop(frame, frame.drawn, None).array
+    return labels.effect(everything, _develop(frame, _but(frame.drawn, name), None).array)
 
 
 def _doubtful(frame: Frame, noise: Noise) -> set[str]:
     """Drawn faults that a cheap look does not show to be plainly visible."""
-    faults = frame.spec.faults
-    camera, steps = _signals(frame, frame.drawn)
-    if camera != frame.camera:
-        return set(frame.drawn)
-    out = {name for name in frame.drawn if faults[name].effect_mask}
-    every = slice(frame.context.shape[0] // 32, None, 16)
-    for (_, before), (name, after) in pairwise(steps):
-        a, b = (np.minimum(q.array[every], q.white_e) * (255 / q.white_e) for q in (before, after))
+    faults, drawn = frame.spec.faults, frame.drawn
+    if _altered(frame, drawn) != frame.camera:
+        return set(drawn)
+    out = {name for name in drawn if faults[name].effect_mask}
+    optical, readout = (_in_order(frame, drawn, step) for step in ("electrons", "rgbi"))
+    some_rows = slice(frame.context.shape[0] // 32, None, 16)
+    for k, name in enumerate(optical):
+        a, b = (
+            np.minimum(q.array[some_rows], q.white_e) * (255 / q.white_e)
+            for q in (_signal(frame, drawn, optical[:k]), _signal(frame, drawn, optical[: k + 1]))
+        )
         if np.abs(b - a).max(initial=0) < _CLEARLY_VISIBLE_DN:
             out.add(name)
-    readout = _in_order(frame, frame.drawn, "rgbi")
-    optical = {name: frame.drawn[name] for name in frame.drawn if name not in readout}
-    before = _develop(frame, optical, noise)[0]
-    untouched = np.ones(frame.context.shape, dtype=bool)
-    changes = {}
+    picture = _develop(frame, {name: drawn[name] for name in optical}, noise)
+    touched = []
     for name in readout:
-        after = faults[name].apply(before, frame.drawn[name], frame.context)
-        changes[name] = cv2.absdiff(after.array, before.array).max(axis=-1)
-        before = after
-    for name in reversed(readout):  # what a later fault overwrites does not count
-        if (changes[name] * untouched).max() < _CLEARLY_VISIBLE_DN:
+        after = faults[name].apply(picture, drawn[name], frame.context)
+        where = np.flatnonzero(labels.effect(after.array, picture.array))
+        a, b = (q.array.reshape(-1, 4)[where].astype(np.int16) for q in (picture, after))
+        touched.append((name, where[(np.abs(b - a) >= _CLEARLY_VISIBLE_DN).any(axis=1)]))
+        picture = after
+    overwritten = np.zeros(frame.context.shape[0] * frame.context.shape[1], dtype=bool)
+    for name, where in reversed(touched):  # what a later fault overwrites does not count
+        if overwritten[where].all():
             out.add(name)
-        untouched &= changes[name] == 0
+        overwritten[where] = True
     return out
 
 
@@ -477,13 +486,11 @@ def to_sample(frame: Frame) -> Sample:
     """The layers and scalars of the dataset, by the names of its arrays."""
     spec, pose, i = frame.spec, frame.pose, frame.spec.index
     dataset, site = spec.scene.dataset, spec.terrain.site
-    assert frame.raw is not None
     names = list(spec.faults)
     available: dict[str, Any] = {
         "depth_m": frame.truth.depth_m,
         "normal": frame.truth.normal,
         "semantic": frame.truth.semantic,
-        "radiance": frame.radiance.array.astype(np.float16),
     }
     layers = {
         "image": frame.images["image"].array,
@@ -497,6 +504,8 @@ def to_sample(frame: Frame) -> Sample:
         elif name == "mask_effect":
             empty = np.zeros(frame.context.shape, dtype=bool)
             layers[name] = np.stack([frame.effects.get(f, empty) for f in names])
+        elif name == "radiance":
+            layers[name] = frame.radiance.array.astype(np.float16)
         elif name in available:
             layers[name] = available[name]
     T_from_L = site.T_from_L

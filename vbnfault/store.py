@@ -2,6 +2,8 @@
 
 The only importer of zarr. How a store survives what happens to it:
 
+- Chunk files are encoded here, not by zarr, which would drop a chunk of zeros (an absent one reads as zeros
+  too) and recompress the neighbours of a sample that is built again. Reads go through zarr, as a user's do.
 - Every file is written beside its place and renamed into it, so it is either the old or the new one.
   `create` builds the whole group that way. A kill leaves `*.partial` files, which `recover` removes.
 - A per-pixel layer is sharded: a chunk is one sample, a file holds `shard_samples` of them. One task owns a
@@ -20,17 +22,18 @@ import os
 import shutil
 import struct
 import uuid
+import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass, field, fields
-from functools import cached_property, lru_cache
+from dataclasses import dataclass, field, fields, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import google_crc32c
 import numpy as np
 import zarr
-from numcodecs import Zstd
+from numcodecs import VLenUTF8, Zstd
 from numpy.typing import NDArray
 from zarr.codecs import ZstdCodec
 
@@ -55,16 +58,20 @@ _SCALARS = "scalars"  # the entry of the `layer` axis that stands for all scalar
 _ABSENT = 2**64 - 1  # how a shard's index says that it has no such chunk
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Array:
     """One row of the schema. `ratio`: a typical compressed size over the uncompressed one."""
 
-    dims: tuple[str, ...]
+    dimensions: str
     dtype: str
     units: str
     long_name: str
     names: tuple[str, ...] = ()  # CF flag meanings
     ratio: float = 1.0
+
+    @property
+    def dims(self) -> tuple[str, ...]:
+        return tuple(self.dimensions.split())
 
     @property
     def is_text(self) -> bool:
@@ -76,72 +83,53 @@ class Array:
         return "" if self.is_text else float("nan") if self.dtype == "float64" else 0
 
 
-def _row(
-    dims: str, dtype: str, units: str, long_name: str, names: Iterable[str] = (), ratio: float = 1.0
-) -> Array:
-    return Array(
-        dims=tuple(dims.split()),
-        dtype=dtype,
-        units=units,
-        long_name=long_name,
-        names=tuple(names),
-        ratio=ratio,
-    )
-
-
 _IMAGE = "sample y x channel"
 
 # The schema. Per-pixel layers: one chunk a sample, sharded.
 LAYERS: dict[str, Array] = {
-    "image": _row(_IMAGE, "uint8", "DN", "image with faults", ratio=0.45),
-    "mask": _row("sample fault y x", "bool", "1", "footprint of each fault", ratio=0.005),
-    "mask_any": _row(
-        "sample y x", "bool", "1", "union of the footprints of the faults named here", ratio=0.005
-    ),
-    "clean": _row(_IMAGE, "uint8", "DN", "same camera, exposure and noise, no fault", ratio=0.45),
+    "image": Array(_IMAGE, "uint8", "DN", "image with faults", ratio=0.45),
+    "mask": Array("sample fault y x", "bool", "1", "footprint of each fault", ratio=0.005),
+    "mask_any": Array("sample y x", "bool", "1", "union over the faults named here", ratio=0.005),
+    "clean": Array(_IMAGE, "uint8", "DN", "same camera, exposure and noise, no fault", ratio=0.45),
     # optional from here on; `without_<fault>` follows the pattern of the straylight one
-    "mask_effect": _row(
-        "sample fault y x", "bool", "1", "noise-free change of 1 DN or more by this fault", ratio=0.02
-    ),
-    "raw": _row("sample y x", "uint16", "DN", "raw mosaic of the analogue-to-digital converter", ratio=0.6),
-    "depth_m": _row("sample y x", "float32", "m", "depth along the boresight, inf on the sky", ratio=0.5),
-    "normal": _row("sample y x xyz", "float16", "1", "surface normal in C, 0 on the sky", ratio=0.55),
-    "semantic": _row("sample y x", "uint8", "1", "what a pixel shows", SEMANTIC, ratio=0.01),
-    "radiance": _row(
-        "sample band y x", "float16", "W m-2 sr-1 nm-1", "spectral radiance at the camera", ratio=0.7
-    ),
+    "mask_effect": Array("sample fault y x", "bool", "1", "noise-free change of 1 DN or more", ratio=0.02),
+    "raw": Array("sample y x", "uint16", "DN", "raw mosaic of the analogue-to-digital converter", ratio=0.6),
+    "depth_m": Array("sample y x", "float32", "m", "depth along the boresight, inf on the sky", ratio=0.5),
+    "normal": Array("sample y x xyz", "float16", "1", "surface normal in C, 0 on the sky", ratio=0.55),
+    "semantic": Array("sample y x", "uint8", "1", "what a pixel shows", SEMANTIC, ratio=0.01),
+    "radiance": Array("sample band y x", "float16", "W m-2 sr-1 nm-1", "radiance at the camera", ratio=0.7),
 }
 REQUIRED_LAYERS = ("image", "mask", "mask_any", "clean")
 
 # Scalars and small vectors: a chunk is a shard, so that a task writes whole chunks.
 SCALARS: dict[str, Array] = {
-    "injected": _row("sample fault", "bool", "1", "faults that are in the pixels"),
-    "camera_position_T_m": _row("sample xyz", "float64", "m", "camera position in T"),
-    "position_L_m": _row("sample xyz", "float64", "m", "camera position in L, from the site"),
-    "camera_from_T": _row("sample quaternion", "float64", "1", "attitude, unit quaternion"),
-    "T_from_L": _row("sample axis_row axis_col", "float64", "1", "rotation from the local level frame to T"),
-    "T_from_J": _row("sample axis_row axis_col", "float64", "1", "rotation from the inertial frame J to T"),
-    "site_T_m": _row("sample xyz", "float64", "m", "site, the origin of L, in T"),
-    "sun_direction_T": _row("sample xyz", "float64", "1", "unit vector towards the Sun in T"),
-    "sun_distance_au": _row("sample", "float64", "au", "distance to the Sun"),
-    "julian_date": _row("sample", "float64", "d", "Julian date (TDB)"),
-    "intrinsics": _row("sample intrinsic", "float64", "px", "pinhole camera, pixel centres at +0.5"),
-    "sun_azimuth_deg": _row("sample", "float64", "deg", "Sun azimuth in L, from north towards east"),
-    "sun_elevation_deg": _row("sample", "float64", "deg", "Sun elevation in L, up"),
-    "roll_deg": _row("sample", "float64", "deg", "tilt of the boresight from the Sun about x"),
-    "pitch_deg": _row("sample", "float64", "deg", "tilt of the boresight from the Sun about y"),
-    "yaw_deg": _row("sample", "float64", "deg", "turn about the boresight"),
-    "sun_xy_px": _row("sample xy", "float64", "px", "Sun centre in the image, NaN behind the camera"),
-    "sun_visible_fraction": _row("sample", "float64", "1", "part of the solar disc that is not occluded"),
-    "exposure_s": _row("sample", "float64", "s", "exposure time"),
-    "tries": _row("sample", "int32", "1", "proposals drawn until one could be used"),
-    "stratum": _row("sample", "uint8", "1", "stratum of the sampling", STRATA),
-    "site": _row("sample", "int32", "1", "index of the site"),
-    "lens": _row("sample", "int32", "1", "index of the lens"),
-    "detector_individual": _row("sample", "int32", "1", "index of the individual detector"),
-    "split": _row("sample", "uint8", "1", "split of the dataset, constant per site", SPLITS),
-    "parameters": _row("sample", "str", "1", "drawn parameters of every injected fault, JSON"),
-    "proposal": _row("sample", "str", "1", "proposed variables before redraws, JSON"),
+    "injected": Array("sample fault", "bool", "1", "faults that are in the pixels"),
+    "camera_position_T_m": Array("sample xyz", "float64", "m", "camera position in T"),
+    "position_L_m": Array("sample xyz", "float64", "m", "camera position in L, from the site"),
+    "camera_from_T": Array("sample quaternion", "float64", "1", "attitude, unit quaternion"),
+    "T_from_L": Array("sample axis_row axis_col", "float64", "1", "rotation from the local level frame to T"),
+    "T_from_J": Array("sample axis_row axis_col", "float64", "1", "rotation from the inertial frame J to T"),
+    "site_T_m": Array("sample xyz", "float64", "m", "site, the origin of L, in T"),
+    "sun_direction_T": Array("sample xyz", "float64", "1", "unit vector towards the Sun in T"),
+    "sun_distance_au": Array("sample", "float64", "au", "distance to the Sun"),
+    "julian_date": Array("sample", "float64", "d", "Julian date (TDB)"),
+    "intrinsics": Array("sample intrinsic", "float64", "px", "pinhole camera, pixel centres at +0.5"),
+    "sun_azimuth_deg": Array("sample", "float64", "deg", "Sun azimuth in L, from north towards east"),
+    "sun_elevation_deg": Array("sample", "float64", "deg", "Sun elevation in L, up"),
+    "roll_deg": Array("sample", "float64", "deg", "tilt of the boresight from the Sun about x"),
+    "pitch_deg": Array("sample", "float64", "deg", "tilt of the boresight from the Sun about y"),
+    "yaw_deg": Array("sample", "float64", "deg", "turn about the boresight"),
+    "sun_xy_px": Array("sample xy", "float64", "px", "Sun centre in the image, NaN behind the camera"),
+    "sun_visible_fraction": Array("sample", "float64", "1", "part of the solar disc that is not occluded"),
+    "exposure_s": Array("sample", "float64", "s", "exposure time"),
+    "tries": Array("sample", "int32", "1", "proposals drawn until one could be used"),
+    "stratum": Array("sample", "uint8", "1", "stratum of the sampling", STRATA),
+    "site": Array("sample", "int32", "1", "index of the site"),
+    "lens": Array("sample", "int32", "1", "index of the lens"),
+    "detector_individual": Array("sample", "int32", "1", "index of the individual detector"),
+    "split": Array("sample", "uint8", "1", "split of the dataset, constant per site", SPLITS),
+    "parameters": Array("sample", "str", "1", "drawn parameters of every injected fault, JSON"),
+    "proposal": Array("sample", "str", "1", "proposed variables before redraws, JSON"),
 }
 
 _LABELS = {  # coordinates of the short axes
@@ -155,17 +143,12 @@ _LABELS = {  # coordinates of the short axes
 }
 
 
-def known_layer(name: str) -> bool:
-    """Is this the name of a per-pixel layer that a store may hold?"""
-    return name in LAYERS or name.startswith("without_")
-
-
 @dataclass(frozen=True, kw_only=True)
 class StoreSpec:
     """What a store holds, as plain data.
 
     `faults`: the fault axis in dataset order. `mask_any_faults`: the union that `mask_any` is.
-    `localised_faults`: those whose mask may not be empty where they are injected (default: `mask_any_faults`).
+    `localised_faults`: those whose mask is not empty where they are injected (default: `mask_any_faults`).
     `layers`: the optional layers, of `LAYERS` or `without_<fault>`. `shard_samples` 0 chooses the most, up to
     16, that keeps the largest array of a shard within 1 GiB and all of them within 2 GiB; a larger one is
     lowered. `attributes`: JSON-able root attributes. Raises InputError for names that do not exist.
@@ -207,13 +190,20 @@ class StoreSpec:
         rows = {name: LAYERS[name] for name in REQUIRED_LAYERS}
         for name in self.layers:
             if name == "radiance":
-                rows[name] = Array(**{**asdict(LAYERS[name]), "dtype": self.radiance_dtype})
+                rows[name] = replace(LAYERS[name], dtype=self.radiance_dtype)
             elif name in LAYERS:
                 rows[name] = LAYERS[name]
             else:
                 without = name.removeprefix("without_")
-                rows[name] = _row(_IMAGE, "uint8", "DN", f"the image without {without}", ratio=0.45)
+                rows[name] = Array(_IMAGE, "uint8", "DN", f"the image without {without}", ratio=0.45)
         return rows
+
+    @cached_property
+    def arrays(self) -> dict[str, Array]:
+        """Name → schema row of every array that tasks write."""
+        crc32c = Array("sample layer", "uint32", "1", "CRC-32C of the decoded bytes")
+        done = Array("sample", "uint8", "1", "1 where a sample is whole; written last")
+        return {**self.pixel_layers, **SCALARS, "crc32c": crc32c, "done": done}
 
     @property
     def checked(self) -> tuple[str, ...]:
@@ -251,7 +241,9 @@ class StoreSpec:
 
 def _spec(plain: Mapping[str, Any], attributes: Mapping[str, Any]) -> StoreSpec:
     known = {f.name for f in fields(StoreSpec)}
-    values = {k: tuple(v) if isinstance(v, list) else v for k, v in plain.items() if k in known}
+    values: dict[str, Any] = {
+        k: tuple(v) if isinstance(v, list) else v for k, v in plain.items() if k in known
+    }
     return StoreSpec(**values, attributes=attributes)
 
 
@@ -287,6 +279,18 @@ def _crc32c(array: NDArray[Any]) -> int:
     frozen = np.ascontiguousarray(array).view()
     frozen.flags.writeable = False  # the C function takes read-only buffers alone
     return int(google_crc32c.value(frozen))
+
+
+def _compress(data: Any) -> bytes:
+    return bytes(Zstd(level=_ZSTD_LEVEL, checksum=True).encode(data))
+
+
+def _decompress(data: bytes) -> bytes:
+    """Raises ValueError where the frame or its checksum is broken."""
+    try:
+        return bytes(Zstd().decode(data))
+    except (RuntimeError, MemoryError) as error:  # a damaged header may ask for any size
+        raise ValueError(str(error)) from error
 
 
 # --- shard files: the `sharding_indexed` layout of the Zarr v3 specification, index at the end -------------
@@ -349,7 +353,7 @@ def encode(spec: StoreSpec, sample: Sample) -> Encoded:
                 f"sample {sample.index}: {name} is {array.dtype}{list(array.shape)}, "
                 f"not {row.dtype}{list(spec.shape(row))}"
             )
-        return bytes(Zstd(level=_ZSTD_LEVEL, checksum=True).encode(array)), _crc32c(array)
+        return _compress(array), _crc32c(array)
 
     with ThreadPoolExecutor(_threads()) as pool:
         packed = dict(zip(spec.pixel_layers, pool.map(pack, spec.pixel_layers), strict=True))
@@ -365,8 +369,8 @@ def encode(spec: StoreSpec, sample: Sample) -> Encoded:
 
 def mask_union(spec: StoreSpec, mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """bool[y, x] from bool[fault, y, x]: what `mask_any` must be."""
-    union: NDArray[np.bool_] = mask[[f in spec.mask_any_faults for f in spec.faults]].any(axis=0)
-    return union
+    chosen = np.array([f in spec.mask_any_faults for f in spec.faults])
+    return np.logical_or.reduce(mask[chosen], axis=0)
 
 
 def _same_names(index: int, kind: str, got: Iterable[str], expected: Iterable[str]) -> None:
@@ -435,11 +439,11 @@ class Store:
         return range(number * size, min((number + 1) * size, self.samples))
 
     def array(self, name: str) -> zarr.Array[Any]:
-        """The zarr array. A chunk of zeros is written like any other: an absent one reads as zeros too."""
+        """The zarr array."""
         if name not in self._arrays:
             array = self._group[name]
             assert isinstance(array, zarr.Array)
-            self._arrays[name] = array.with_config({"write_empty_chunks": True})
+            self._arrays[name] = array
         return self._arrays[name]
 
     def read(self, name: str, start: int = 0, stop: int | None = None) -> NDArray[Any]:
@@ -469,21 +473,36 @@ class Store:
             scalars={name: str(one[name]) if row.is_text else one[name] for name, row in SCALARS.items()},
         )
 
-    def done(self, number: int) -> NDArray[np.bool_]:
-        """bool[sample of the shard]: which are finished; none where that cannot be read."""
+    def column(self, name: str, number: int) -> NDArray[Any]:
+        """A scalar for all samples of a shard. Raises OSError or ValueError where its chunk is damaged."""
+        row, size = self.spec.arrays[name], self.spec.shard_samples
+        data = _decompress(self.file(name, number).read_bytes())
+        values = VLenUTF8().decode(data) if row.is_text else np.frombuffer(data, dtype=row.dtype)
+        return values.reshape(size, *self.spec.shape(row))[: len(self.shard(number))]
+
+    def _put_column(self, name: str, number: int, values: Mapping[int, Any]) -> None:
+        row, first = self.spec.arrays[name], self.shard(number).start
+        dtype = object if row.is_text else row.dtype
+        column = np.full((self.spec.shard_samples, *self.spec.shape(row)), row.fill, dtype=dtype)
+        for i, value in values.items():
+            column[i - first] = value
+        _put(self.file(name, number), _compress(VLenUTF8().encode(column) if row.is_text else column))
+
+    def done(self, number: int) -> dict[int, bool]:
+        """Sample → is it finished; none of the shard is where that cannot be read."""
         samples = self.shard(number)
         try:
-            return self.read("done", samples.start, samples.stop).astype(bool)
-        except VbnfaultError:
-            return np.zeros(len(samples), bool)
+            return dict(zip(samples, self.column("done", number).astype(bool).tolist(), strict=True))
+        except (OSError, ValueError):
+            return dict.fromkeys(samples, False)
 
     def finished(self) -> int:
         """How many samples say that they are finished."""
-        return sum(int(self.done(n).sum()) for n in range(self.shards))
+        return sum(sum(self.done(n).values()) for n in range(self.shards))
 
     def file(self, name: str, number: int) -> Path:
         """The file of a shard: of a layer its chunks, of a scalar its one chunk."""
-        row = _schema(self.spec)[name]
+        row = self.spec.arrays[name]
         return self.path.joinpath(name, "c", str(number), *("0" for _ in row.dims[1:]))
 
     def chunk(self, name: str, number: int) -> dict[int, bytes]:
@@ -492,20 +511,17 @@ class Store:
         chunks = _split_shard(self.file(name, number).read_bytes(), size)
         return {number * size + i: chunk for i, chunk in chunks.items()}
 
-    def _write(self, name: str, samples: range, values: Any) -> None:
-        self.array(name)[samples.start : samples.stop] = values
-
     def write_shard(self, number: int, given: Mapping[int, Encoded]) -> None:
         """Write a shard: the `given` samples, and those that were finished before, unchanged.
 
         `done` comes last. Raises VbnfaultError where the disk refuses.
         """
-        samples = self.shard(number)
+        samples, size = self.shard(number), self.spec.shard_samples
         first, last = samples.start, samples.stop - 1
         with _disk(self.path, f"writing samples {first}-{last}"):
-            done = dict(zip(samples, self.done(number).tolist(), strict=True))
+            done = self.done(number)
             if any(done[i] for i in given):
-                self._write("done", samples, [done[i] and i not in given for i in samples])
+                self._put_column("done", number, {i: done[i] and i not in given for i in samples})
             kept = {i for i in samples if done[i] and i not in given}
             for name in self.spec.pixel_layers:
                 old: dict[int, bytes] = {}
@@ -514,43 +530,18 @@ class Store:
                         old = self.chunk(name, number)
                 kept &= set(old)
                 chunks = {i: given[i].chunks[name] if i in given else old[i] for i in {*given, *kept}}
-                _put(
-                    self.file(name, number),
-                    _join_shard({i - first: c for i, c in chunks.items()}, self.spec.shard_samples),
-                )
-            kept = self._write_scalars(samples, given, kept)
-            self._write("done", samples, [i in given or i in kept for i in samples])
-
-    def _write_scalars(self, samples: range, given: Mapping[int, Encoded], kept: set[int]) -> set[int]:
-        for name, row in {**SCALARS, "crc32c": _schema(self.spec)["crc32c"]}.items():
-            shape = (len(samples), *self.spec.shape(row))
-            column = np.full(shape, row.fill, dtype=object if row.is_text else row.dtype)
-            if kept:
-                try:
-                    old = self.read(name, samples.start, samples.stop)
-                except VbnfaultError:
-                    kept = set()
-                for i in kept:
-                    column[i - samples.start] = old[i - samples.start]
-            for i, sample in given.items():
-                column[i - samples.start] = sample.crc32c if name == "crc32c" else sample.scalars[name]
-            self._write(name, samples, column)
-        return kept
-
-
-@lru_cache(maxsize=8)
-def _schema_of(faults: int, layers: tuple[tuple[str, Array], ...]) -> dict[str, Array]:
-    return {
-        **dict(layers),
-        **SCALARS,
-        "crc32c": _row("sample layer", "uint32", "1", "CRC-32C of the decoded bytes"),
-        "done": _row("sample", "uint8", "1", "1 where a sample is whole; written last"),
-    }
-
-
-def _schema(spec: StoreSpec) -> dict[str, Array]:
-    """Every array along `sample` that tasks write."""
-    return _schema_of(len(spec.faults), tuple(spec.pixel_layers.items()))
+                shard = _join_shard({i - first: chunk for i, chunk in chunks.items()}, size)
+                _put(self.file(name, number), shard)
+            for name in (*SCALARS, "crc32c"):
+                values = {i: e.crc32c if name == "crc32c" else e.scalars[name] for i, e in given.items()}
+                if kept:
+                    try:
+                        column = self.column(name, number)
+                    except (OSError, ValueError):
+                        kept = set()
+                    values |= {i: column[i - first] for i in kept}
+                self._put_column(name, number, values)
+            self._put_column("done", number, {i: i in given or i in kept for i in samples})
 
 
 # --- create, open, grow -----------------------------------------------------------------------------------
@@ -572,6 +563,9 @@ def create(path: str | os.PathLike[str], spec: StoreSpec, samples: int, *, overw
         raise InputError(
             f"{target}: exists and is no vbnfault store, so it is left alone; choose another --out"
         )
+    above = next(p for p in target.absolute().parents if p.exists())
+    if not above.is_dir():
+        raise InputError(f"{target}: no store can be created here: {above} is a file, not a folder")
     hidden = target.absolute().parent / f".{target.name}.{uuid.uuid4().hex}.partial"
     try:
         hidden.parent.mkdir(parents=True, exist_ok=True)
@@ -612,10 +606,13 @@ def _create_group(path: Path, spec: StoreSpec, samples: int) -> None:
         "split": {"names": list(SPLITS)},
         "radiance": {"coordinates": "wavelength_nm"},
     }
-    for name, row in _schema(spec).items():
+    for name, row in spec.arrays.items():
         shape, size = spec.shape(row), spec.shard_samples
         sharded = name in spec.pixel_layers
-        flags = {"flag_values": list(range(len(row.names))), "flag_meanings": " ".join(row.names)}
+        flags: dict[str, Any] = {
+            "flag_values": list(range(len(row.names))),
+            "flag_meanings": " ".join(row.names),
+        }
         group.create_array(
             name,
             shape=(samples, *shape),
@@ -628,7 +625,7 @@ def _create_group(path: Path, spec: StoreSpec, samples: int) -> None:
             attributes={
                 "long_name": row.long_name,
                 "units": row.units,
-                **(flags if row.names else {}),
+                **dict[str, Any](flags if row.names else {}),
                 **extra.get(name, {}),
             },
         )
@@ -666,6 +663,14 @@ def _create_group(path: Path, spec: StoreSpec, samples: int) -> None:
         attributes={"long_name": "sample"},
     )
     index[:] = np.arange(samples)
+    _consolidate(path)
+
+
+def _consolidate(path: Path) -> None:
+    """Gather all metadata in the root, where xarray looks first (it warns where there is none)."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="Consolidated metadata", category=UserWarning)
+        zarr.consolidate_metadata(path, zarr_format=3)
 
 
 def _root(path: Path) -> dict[str, Any] | None:
@@ -727,7 +732,7 @@ def recover(path: str | os.PathLike[str]) -> Store:
             for name in files:
                 if name.endswith(".partial"):
                     Path(folder, name).unlink(missing_ok=True)
-        for name in _schema(store.spec):
+        for name in store.spec.arrays:
             array = store.array(name)
             if array.shape[0] != store.samples:
                 array.resize((store.samples, *array.shape[1:]))
@@ -735,6 +740,7 @@ def recover(path: str | os.PathLike[str]) -> Store:
         if index.shape != (store.samples,) or index[-1] != store.samples - 1:
             index.resize((store.samples,))
             index[:] = np.arange(store.samples)
+        _consolidate(store.path)
     return open_store(store.path, "r+")
 
 
@@ -761,35 +767,30 @@ def write_samples(store: str | os.PathLike[str] | Store, samples: Iterable[Sampl
 def check_shard(store: Store, number: int) -> list[Problem]:
     """What is unfinished, missing or damaged in one shard; every finished layer is decoded and compared."""
     samples = store.shard(number)
-    try:
-        done = store.read("done", samples.start, samples.stop).astype(bool)
-    except VbnfaultError:
-        where = store.file("done", number).relative_to(store.path)
-        return [Problem(tuple(samples), f"samples {_spans(samples)}: done cannot be decoded ({where})")]
-    finished = [i for i, d in zip(samples, done, strict=True) if d]
-    problems = []
-    if not done.all():
-        missing = tuple(i for i in samples if i not in finished)
-        problems.append(Problem(missing, f"samples {_spans(missing)}: not finished"))
+    columns: dict[str, NDArray[Any]] = {}
+    unreadable = {}
+    for name in ("done", "crc32c", *SCALARS):
+        where = store.file(name, number).relative_to(store.path)
+        try:
+            columns[name] = store.column(name, number)
+        except FileNotFoundError:
+            unreadable[name] = f"the chunk file {where} is missing"
+        except (OSError, ValueError):
+            unreadable[name] = f"cannot be decoded, {where} is damaged"
+        if name == "done" and unreadable and store.file("image", number).exists():
+            return [Problem(tuple(samples), f"done of samples {_spans(samples)}: {unreadable[name]}")]
+        if name == "done" and unreadable:
+            break
+    finished = [i for i in samples if "done" in columns and columns["done"][i - samples.start]]
+    missing = tuple(i for i in samples if i not in finished)
+    problems = [Problem(missing, f"samples {_spans(missing)}: not finished")] if missing else []
     if not finished:
         return problems
-
-    columns: dict[str, NDArray[Any]] = {}
-    for name in (*SCALARS, "crc32c", "done"):
-        file = store.file(name, number)
-        where = f"{name} of samples {_spans(finished)}"
-        try:
-            columns[name] = store.read(name, samples.start, samples.stop)
-        except VbnfaultError:
-            what = f"{where} cannot be decoded ({file.relative_to(store.path)})"
-            problems.append(Problem(tuple(finished), what))
-        else:
-            if not file.exists():
-                what = f"{where}: the chunk file {file.relative_to(store.path)} is missing"
-                problems.append(Problem(tuple(finished), what))
+    many = f"of samples {_spans(finished)}"
+    problems += [Problem(tuple(finished), f"{name} {many}: {why}") for name, why in unreadable.items()]
     if "crc32c" not in columns:
         return problems
-    if len(columns) == len(SCALARS) + 2:
+    if not unreadable:
         for i in finished:
             k = i - samples.start
             if _crc_of_scalars({n: columns[n][k] for n in SCALARS}) != columns["crc32c"][k, -1]:
@@ -805,33 +806,27 @@ def check_shard(store: Store, number: int) -> list[Problem]:
 def _check_layer(
     store: Store, name: str, number: int, crcs: Mapping[int, NDArray[np.uint32]]
 ) -> list[Problem]:
-    file = store.file(name, number)
-    where = str(file.relative_to(store.path))
-    column = store.spec.checked.index(name)
+    file, column = store.file(name, number), store.spec.checked.index(name)
+    where, many = file.relative_to(store.path), f"{name} of samples {_spans(crcs)}"
     try:
         chunks = store.chunk(name, number)
     except FileNotFoundError:
-        return [Problem(tuple(crcs), f"{name} of samples {_spans(crcs)}: the shard file {where} is missing")]
+        return [Problem(tuple(crcs), f"{many}: the shard file {where} is missing")]
     except (OSError, ValueError) as error:
-        return [
-            Problem(
-                tuple(crcs), f"{name} of samples {_spans(crcs)}: the shard file {where} is damaged: {error}"
-            )
-        ]
+        return [Problem(tuple(crcs), f"{many}: the shard file {where} is damaged: {error}")]
     problems = []
     for i, stored in crcs.items():
+        wrong = ""
         if i not in chunks:
-            problems.append(Problem((i,), f"sample {i}: {name} has no chunk in {where}"))
-            continue
-        try:
-            crc = google_crc32c.value(bytes(Zstd().decode(chunks[i])))
-        except (RuntimeError, ValueError):
-            problems.append(
-                Problem((i,), f"sample {i}: {name} cannot be decoded, its chunk in {where} is damaged")
-            )
-            continue
-        if crc != stored[column]:
-            problems.append(Problem((i,), f"sample {i}: {name} in {where} does not match its stored crc32c"))
+            wrong = f"has no chunk in {where}"
+        else:
+            try:
+                if google_crc32c.value(_decompress(chunks[i])) != stored[column]:
+                    wrong = f"in {where} does not match its stored crc32c"
+            except ValueError:
+                wrong = f"cannot be decoded, its chunk in {where} is damaged"
+        if wrong:
+            problems.append(Problem((i,), f"sample {i}: {name} {wrong}"))
     return problems
 
 
@@ -868,7 +863,7 @@ def verify(
     problems = [
         f"{name} holds {store.array(name).shape[0]} samples, not {store.samples}: appending was interrupted, "
         f"the build command resumes it"
-        for name in _schema(store.spec)
+        for name in store.spec.arrays
         if store.array(name).shape[0] != store.samples
     ]
     if problems:
@@ -880,8 +875,8 @@ def verify(
         broken = {i for p in found for i in p.samples}
         sound = [i for i in store.shard(number) if i not in broken]
         if sound:
-            start, stop = store.shard(number).start, store.shard(number).stop
-            columns = {name: store.read(name, start, stop) for name in SCALARS}
+            start = store.shard(number).start
+            columns = {name: store.column(name, number) for name in SCALARS}
             for i in sound:
                 scalars = {name: column[i - start] for name, column in columns.items()}
                 problems += _check_labels(store, i, scalars)
@@ -899,8 +894,8 @@ def _check_labels(store: Store, i: int, scalars: Mapping[str, Any]) -> Iterator[
         drawn = parameters.get(fault)
         listed = drawn is not None and not (isinstance(drawn, dict) and drawn.get("injected") is False)
         if listed != is_in:
-            words = ("is", "no") if is_in else ("is not", "its")
-            yield f"sample {i}: {fault} {words[0]} marked in injected, but parameters hold {words[1]} parameters"
+            says = "has no parameters, although" if is_in else "has parameters, although not"
+            yield f"sample {i}: {fault} {says} marked in injected"
     mask = store.read("mask", i, i + 1)[0]
     for k, fault in enumerate(spec.faults):
         if not injected[k] and mask[k].any():
@@ -950,9 +945,9 @@ def digest(path: str | os.PathLike[str] | Store) -> str:
     attributes = {k: v for k, v in store.attributes.items() if k not in VOLATILE_ATTRIBUTES}
     plain = {k: v for k, v in store.spec.plain().items() if k != "shard_samples"}
     total.update(json.dumps([attributes, plain, store.samples], sort_keys=True).encode())
-    for name, row in sorted(_schema(store.spec).items()):
+    for name, row in sorted(store.spec.arrays.items()):
         total.update(json.dumps([name, row.dims, row.dtype]).encode())
-        step = 1 if name in store.spec.pixel_layers else store.spec.shard_samples
+        step = max(1, 2**26 // store.spec.layer_bytes(name)) if name in store.spec.pixel_layers else 4096
         for start in range(0, store.samples, step):
             values = store.read(name, start, min(start + step, store.samples))
             if row.is_text:

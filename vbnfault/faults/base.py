@@ -358,11 +358,13 @@ def _field_schema(f: dataclasses.Field[Any]) -> dict[str, Any]:
         if kind == "number":
             return schema | value | ({} if f.default is None else {"default": f.default})
         pair = {"type": "array", "items": value, "minItems": 2, "maxItems": 2}
-        return schema | {"anyOf": [value, pair], "default": list(f.default)}  # type: ignore[call-overload]
+        return schema | {"anyOf": [value, pair], "default": list(f.default)}  # type: ignore
     if kind == "rows":
-        columns = {k: {"type": "number", "minimum": v[0], "maximum": v[1]} for k, v in meta["columns"].items()}
-        item = {"type": "object", "properties": columns, "required": list(columns), "additionalProperties": False}
-        return schema | {"type": "array", "items": item, "default": []}
+        columns = {
+            k: {"type": "number", "minimum": v[0], "maximum": v[1]} for k, v in meta["columns"].items()
+        }
+        item = {"type": "object", "properties": columns, "required": list(columns)}
+        return schema | {"type": "array", "items": item | {"additionalProperties": False}, "default": []}
     if kind == "choice":
         return schema | {"enum": list(meta["options"]), "default": f.default}
     return schema | {"type": "boolean" if kind == "flag" else "string", "default": f.default}
@@ -373,11 +375,13 @@ def scale_by_intensity(rgbi: NDArray[np.uint8], intensity: NDArray[np.float32]) 
 
     Where I was 0 RGB becomes I; overflow clips per channel (design.md, conventions).
     """
-    before = rgbi[..., 3].astype(np.float32)
-    ratio = intensity / np.maximum(before, 1)
-    rgb = np.where(before[..., None] > 0, rgbi[..., :3] * ratio[..., None], intensity[..., None])
+    before = rgbi[..., 3]
+    dark = before == 0
+    ratio = intensity / np.maximum(before, np.float32(1))
     out = np.empty_like(rgbi)
-    np.clip(np.rint(rgb), 0, 255, out=rgb)
-    out[..., :3] = rgb
-    out[..., 3] = np.clip(np.rint(intensity), 0, 255)
+    for channel in range(4):
+        value = intensity.copy() if channel == 3 else rgbi[..., channel] * ratio
+        np.copyto(value, intensity, where=dark)
+        np.rint(value, out=value)
+        out[..., channel] = np.clip(value, 0, 255, out=value)
     return out

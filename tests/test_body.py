@@ -1,0 +1,298 @@
+"""Shapes, the embedded nucleus, sites and their frames."""
+
+from __future__ import annotations
+
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from vbnfault.body import (
+    Body,
+    check_mesh,
+    choose_sites,
+    embedded_nucleus,
+    load_body,
+    load_shape,
+    local_level,
+)
+from vbnfault.body.noise import block_noise, gradient_noise
+from vbnfault.body.shape import face_normals_areas, signed_volume
+from vbnfault.errors import InputError
+
+REAL_SHAPE = Path(__file__).parents[2] / "shared/data/shapes/67p_18k.obj"
+CUBE = """v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nv 0 0 1\nv 1 0 1\nv 1 1 1\nv 0 1 1
+f 1 3 2\nf 1 4 3\nf 5 6 7\nf 5 7 8\nf 1 2 6\nf 1 6 5\nf 2 3 7\nf 2 7 6
+f 3 4 8\nf 3 8 7\nf 4 1 5\nf 4 5 8\n"""
+
+
+def box() -> tuple[np.ndarray, np.ndarray]:
+    mesh = trimesh.creation.box((1.0, 2.0, 3.0))
+    return np.array(mesh.vertices), np.array(mesh.faces)
+
+
+def write(tmp_path: Path, text: str, name: str = "shape.obj") -> Path:
+    path = tmp_path / name
+    path.write_text(text)
+    return path
+
+
+# --- reading ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("suffix", ["obj", "ply", "stl", "glb"])
+def test_every_format_gives_the_same_solid(tmp_path: Path, suffix: str) -> None:
+    mesh = trimesh.creation.icosphere(subdivisions=2, radius=2.0)
+    path = tmp_path / f"ball.{suffix}"
+    mesh.export(path)
+    vertices, faces = load_shape(path)
+    assert (vertices.dtype, faces.dtype) == (np.float64, np.int32)
+    assert (len(vertices), len(faces)) == (162, 320)
+    # Extent 4 < 150, so kilometres; STL and GLB keep float32, OBJ eight decimals: 1e-7 each way, times 3.
+    assert signed_volume(vertices, faces) == pytest.approx(1e9 * mesh.volume, rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("size", "unit", "side_m"),
+    [(1, "auto", 1000), (149, "auto", 149_000), (151, "auto", 151), (1, "m", 1), (151, "km", 151_000)],
+)
+def test_units(tmp_path: Path, size: float, unit: str, side_m: float) -> None:
+    mesh = trimesh.creation.box((size, size, size))
+    mesh.export(tmp_path / "box.ply")
+    vertices, _ = load_shape(tmp_path / "box.ply", unit)  # type: ignore[arg-type]
+    np.testing.assert_allclose(np.ptp(vertices, axis=0), side_m, rtol=1e-6)  # PLY may hold float32
+
+
+@pytest.mark.parametrize(
+    ("text", "name", "says"),
+    [
+        ("", "empty.obj", "empty"),
+        ("# nothing here\n", "comment.obj", "no vertices|0 faces|unreadable"),
+        ("v 0 0 0\nv 1 0 0\nv 0 1 0\n", "points.obj", "0 faces"),
+        (CUBE.replace("v 1 1 1", "v nan 1 1"), "nan.obj", "1 vertices with NaN"),
+        (CUBE.replace("v 1 1 1", "v inf 1 1"), "inf.obj", "NaN or infinite"),
+        ("ply\nformat ascii 1.0\nelement vertex 3\ngarbage", "broken.ply", "unreadable"),
+        ("not a mesh at all", "noise.glb", "unreadable"),
+        ("not a mesh at all", "noise.stl", "unreadable|no vertices|0 faces|open"),
+        (CUBE, "cube.dxf", "unsupported"),
+        ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 9\n", "index.obj", "unreadable|outside"),
+    ],
+)
+def test_bad_files_are_refused_in_one_sentence(tmp_path: Path, text: str, name: str, says: str) -> None:
+    path = write(tmp_path, text, name)
+    with pytest.raises(InputError, match=says) as caught:
+        load_shape(path)
+    assert str(path) in str(caught.value)
+    assert "\n" not in str(caught.value)
+    assert str(caught.value).endswith(".")
+
+
+def test_missing_file_folder_and_unit(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="not found"):
+        load_shape(tmp_path / "nowhere.obj")
+    (tmp_path / "folder.obj").mkdir()
+    with pytest.raises(InputError, match="not a file"):
+        load_shape(tmp_path / "folder.obj")
+    with pytest.raises(InputError, match="unit must be one of"):
+        load_shape(write(tmp_path, CUBE), "miles")  # type: ignore[arg-type]
+
+
+def test_open_mesh_is_refused_with_the_count_of_edges() -> None:
+    ball = trimesh.creation.icosphere(subdivisions=2)
+    # The cap above z = 0.5 cut off leaves a loop of more than eight edges, which is not filled.
+    faces = ball.faces[ball.triangles_center[:, 2] < 0.5]
+    edges = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+    boundary = int((np.unique(edges, axis=0, return_counts=True)[1] == 1).sum())
+    assert boundary > 8
+    with pytest.raises(InputError, match=f"^ball: mesh is open, {boundary} boundary edges"):
+        check_mesh(ball.vertices, faces, "ball")
+
+
+def test_inverted_mesh_is_turned_with_a_warning() -> None:
+    vertices, faces = box()
+    with pytest.warns(UserWarning, match="inside-out.obj: .*outwards"):
+        mended_vertices, mended = check_mesh(vertices, faces[:, ::-1], "inside-out.obj")
+    assert signed_volume(mended_vertices, mended) == pytest.approx(6.0, rel=1e-12)
+
+
+def test_inconsistent_winding_is_mended() -> None:
+    vertices, faces = box()
+    faces[3] = faces[3, ::-1]
+    with pytest.warns(UserWarning, match="consistent"):
+        mended_vertices, mended = check_mesh(vertices, faces, "box")
+    assert signed_volume(mended_vertices, mended) == pytest.approx(6.0, rel=1e-12)
+
+
+def test_small_hole_duplicates_and_degenerate_faces_are_mended() -> None:
+    vertices, faces = box()
+    with pytest.warns(UserWarning, match="filled holes with 2 faces"):
+        whole = check_mesh(
+            vertices, np.delete(faces, np.flatnonzero((vertices[faces][:, :, 0] > 0).all(1)), 0), "b"
+        )
+    assert signed_volume(*whole) == pytest.approx(6.0, rel=1e-12)
+    soup = vertices[faces].reshape(-1, 3)
+    with pytest.warns(UserWarning, match="merged 28 duplicate vertices"):
+        welded, _ = check_mesh(soup, np.arange(36).reshape(-1, 3), "soup")
+    assert len(welded) == 8
+    with pytest.warns(UserWarning, match="dropped 1 degenerate"):
+        _, kept = check_mesh(vertices, np.vstack([faces, [[0, 0, 1]]]), "needle")
+    assert len(kept) == 12
+
+
+def test_sound_mesh_passes_in_silence_and_input_is_untouched() -> None:
+    vertices, faces = box()
+    before = vertices.copy(), faces.copy()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_mesh(vertices, faces, "box")
+    np.testing.assert_array_equal(vertices, before[0])
+    np.testing.assert_array_equal(faces, before[1])
+
+
+def test_flat_and_branching_meshes_are_refused() -> None:
+    vertices, faces = box()
+    with pytest.raises(InputError, match=r"more than two faces|no volume|orientable"):
+        check_mesh(vertices, np.vstack([faces, faces[:, ::-1]]), "double")
+    triangle = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])
+    with pytest.raises(InputError, match="no volume"):
+        check_mesh(triangle, np.array([[0, 1, 2], [0, 2, 1]]), "sheet")
+    with pytest.raises(InputError, match=r"outside 0\.\.7"):
+        check_mesh(vertices, faces + 1, "shifted")
+
+
+# --- the embedded nucleus -----------------------------------------------------------------------------------
+
+
+def test_nucleus_is_a_closed_bilobed_body_of_the_published_size() -> None:
+    vertices, faces = embedded_nucleus()
+    mesh = trimesh.Trimesh(vertices, faces, process=False)
+    assert mesh.is_watertight
+    assert mesh.is_winding_consistent
+    assert 15_000 <= len(faces) <= 40_000
+    # 18.56 km³ (Preusker 2017) to 18.8 ± 0.3 km³ (Jorda 2016); the procedural stand-in is tuned to 2 %.
+    assert mesh.volume == pytest.approx(18.6e9, rel=0.02)
+    # 5.0 × 3.7 × 3.2 km, which lobe ellipsoids alone miss by up to 10 %.
+    np.testing.assert_allclose(mesh.extents, [5000, 3700, 3200], rtol=0.10)
+    # The waist between the lobes is slimmer than either (67P: sections of 7.7, 1.9 and 4.5 km² along this axis).
+    centres = 1000 * np.array([[-0.42, 0.26, -0.06], [1.48, -0.34, 0.25]])
+    axis = (centres[1] - centres[0]) / np.linalg.norm(centres[1] - centres[0])
+    steps = np.linspace(0.0, 1.0, 11)[:, None]
+    area = [_section_area(mesh, at, axis) for at in centres[0] + steps * (centres[1] - centres[0])]
+    assert min(area[3:-1]) < 0.7 * min(area[0], area[-1])
+
+
+def _section_area(mesh: trimesh.Trimesh, origin: object, axis: np.ndarray) -> float:
+    """Area of a plane cut, by Green's theorem over its segments, turned so that the solid lies to their left."""
+    point = np.asarray(origin, dtype=float)
+    lines, face = trimesh.intersections.mesh_plane(mesh, axis, point, return_faces=True)
+    a, b = lines[:, 0] - point, lines[:, 1] - point
+    ahead = np.cross(axis, mesh.face_normals[face])
+    turned = np.sign(np.einsum("ij,ij->i", ahead, b - a))
+    return float(0.5 * np.sum(turned * (np.cross(a, b) @ axis)))
+
+
+def test_nucleus_is_the_same_every_time() -> None:
+    first = embedded_nucleus()
+    embedded_nucleus.cache_clear()
+    again = embedded_nucleus()
+    np.testing.assert_array_equal(first[0], again[0])
+    np.testing.assert_array_equal(first[1], again[1])
+
+
+def test_noise_is_a_function_of_place() -> None:
+    points = np.random.default_rng(1).uniform(-3000, 3000, (40_000, 3))
+    value = gradient_noise(points, 5)
+    # Shuffling or slicing the points must not matter, nor where the chunks of 32768 fall.
+    np.testing.assert_array_equal(value[35_000:], gradient_noise(points[35_000:], 5))
+    assert abs(value.mean()) < 4 * value.std() / np.sqrt(40_000)  # independent cells: 4 sigma of the mean
+    assert 0.15 < value.std() < 0.35
+    assert np.abs(np.corrcoef(value, gradient_noise(points, 6))[0, 1]) < 4 / np.sqrt(40_000)
+    # Continuous: slopes of unit gradients stay below 4 per unit.
+    near = gradient_noise(points + np.array([1e-3, 0, 0]), 5)
+    assert np.abs(near - value).max() < 4e-3
+    level, neighbour, gap = block_noise(points, 5)
+    assert (gap >= 0).all()
+    assert np.abs(np.corrcoef(level, neighbour)[0, 1]) < 0.5
+
+
+# --- body and sites -----------------------------------------------------------------------------------------
+
+
+def test_body_defaults_hash_and_bounds() -> None:
+    body = load_body()
+    assert body.density_kg_m3 == 537.8
+    # GM from the published mass, 9.982e12 kg (Preusker 2017), within the nucleus's volume tolerance.
+    assert body.gravity.mass_kg == pytest.approx(9.982e12, rel=0.02)
+    assert body.omega_rad_s == pytest.approx(2 * np.pi / (12.4041 * 3600), rel=1e-6)
+    assert len(body.content_hash) == 64
+    moved = Body(name="moved", vertices_m=body.vertices_m + 1e-9, faces=body.faces)
+    assert moved.content_hash != body.content_hash
+    with pytest.raises(InputError, match="density_kg_m3"):
+        load_body(density_kg_m3=-1.0)
+    with pytest.raises(InputError, match="rotation_period_s"):
+        load_body(rotation_period_s=float("nan"))
+
+
+def test_real_shape_loads_as_it_is() -> None:
+    if not REAL_SHAPE.exists():
+        pytest.skip(f"the real shape model is not at {REAL_SHAPE}")
+    body = load_body(REAL_SHAPE)
+    # Metres, not kilometres: 5.0 km long, 18.406 km³ as stated with the file.
+    assert body.volume_m3 == pytest.approx(18.406e9, rel=1e-4)
+    assert body.name == "67p_18k"
+    assert len(body.faces) == 18_294
+
+
+def test_local_level_axes() -> None:
+    # On the equator at +x, gravity towards -x: down is -x, north is +z, east is +y (the way the body turns).
+    frame = local_level([-2.0, 0.0, 0.0])
+    np.testing.assert_allclose(frame, [[0, 0, -1], [0, 1, 0], [1, 0, 0]], atol=1e-15)
+    # At the pole north has no meaning: +x of T stands in.
+    pole = local_level([0.0, 0.0, -1.0])
+    np.testing.assert_allclose(pole[:, 0], [1, 0, 0], atol=1e-15)
+    np.testing.assert_allclose(pole[:, 2], [0, 0, -1], atol=1e-15)
+    with pytest.raises(ValueError, match="zero"):
+        local_level([0.0, 0.0, 0.0])
+
+
+@pytest.mark.parametrize("tilt", [1.0, 1e-3, 1e-5, 1e-7, 0.0])
+def test_local_level_is_a_rotation_up_to_the_pole(tilt: float) -> None:
+    frame = local_level([tilt, 0.3 * tilt, 1.0])
+    np.testing.assert_allclose(frame.T @ frame, np.eye(3), atol=1e-15)
+    assert np.linalg.det(frame) == pytest.approx(1.0, abs=1e-14)
+
+
+def test_sites_lie_on_gentle_ground_and_keep_when_the_list_grows() -> None:
+    body = load_body()
+    sites = choose_sites(body, 12, seed=0)
+    for longer, shorter in zip(sites, choose_sites(body, 4, seed=0), strict=False):
+        np.testing.assert_array_equal(longer.position_T_m, shorter.position_T_m)
+        np.testing.assert_array_equal(longer.T_from_L, shorter.T_from_L)
+    other = choose_sites(body, 1, seed=1)[0]
+    assert np.linalg.norm(other.position_T_m - sites[0].position_T_m) > 1.0
+    normals, _ = face_normals_areas(body.vertices_m, body.faces)
+    corners = body.vertices_m[body.faces]
+    for site in sites:
+        # The facet that holds the point: smallest distance to the plane among the nearest centres.
+        near = np.argsort(np.linalg.norm(corners.mean(axis=1) - site.position_T_m, axis=1))[:40]
+        _, distance, index = trimesh.proximity.closest_point_naive(
+            trimesh.Trimesh(body.vertices_m, body.faces[near], process=False), site.position_T_m[None]
+        )
+        assert distance[0] < 1e-6  # rounding of metres in kilometres
+        up = -site.T_from_L[:, 2]
+        slope = np.degrees(np.arccos(np.clip(normals[near[index[0]]] @ up, -1, 1)))
+        assert slope < 35.0 + 1e-6
+        np.testing.assert_allclose(site.T_from_L.T @ site.T_from_L, np.eye(3), atol=1e-14)
+        assert site.T_from_L[2, 0] >= 0  # north leans towards the pole
+
+
+def test_site_bounds() -> None:
+    body = load_body()
+    assert choose_sites(body, 0, seed=0) == ()
+    for arguments, key in (((-1, 0), "sites"), ((1, -1), "seed")):
+        with pytest.raises(InputError, match=key):
+            choose_sites(body, *arguments)
+    with pytest.raises(InputError, match="max_slope_deg"):
+        choose_sites(body, 1, 0, max_slope_deg=120.0)

@@ -1,0 +1,188 @@
+"""Terrain patches: closed, fine where it matters, deterministic, with the published boulders."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from vbnfault.body import Body, Patch, Site, build_patch, choose_sites, load_body
+from vbnfault.body.patch import _scatter
+from vbnfault.body.shape import check_mesh, signed_volume
+from vbnfault.errors import InputError
+
+REAL_SHAPE = Path(__file__).parents[2] / "shared/data/shapes/67p_18k.obj"
+QUICK = {"facet_m": 4.0, "radius_m": 150.0}
+
+
+@pytest.fixture(scope="module")
+def body() -> Body:
+    return load_body()
+
+
+@pytest.fixture(scope="module")
+def site(body: Body) -> Site:
+    return choose_sites(body, 3, seed=7)[2]
+
+
+@pytest.fixture(scope="module")
+def patch(body: Body, site: Site) -> Patch:
+    return build_patch(body, site, seed=7, **QUICK)
+
+
+@pytest.fixture(scope="module")
+def full(body: Body, site: Site) -> Patch:
+    return build_patch(body, site, seed=7)
+
+
+def ground(patch: Patch) -> trimesh.Trimesh:
+    return trimesh.Trimesh(patch.vertices_L_m, patch.faces[~patch.face_is_boulder], process=False)
+
+
+def near_edges(patch: Patch, radius_m: float) -> np.ndarray:
+    faces = patch.faces[~patch.face_is_boulder]
+    faces = faces[np.linalg.norm(patch.vertices_L_m[faces].mean(axis=1), axis=1) < radius_m]
+    a, b = patch.vertices_L_m[faces], patch.vertices_L_m[np.roll(faces, 1, axis=1)]
+    return np.linalg.norm(a - b, axis=2)
+
+
+def test_full_patch_keeps_its_budget_and_resolution(full: Patch) -> None:
+    assert full.vertices_L_m.dtype == np.float32
+    assert full.faces.dtype == np.int32
+    assert full.face_is_boulder.dtype == np.bool_
+    assert full.triangles == len(full.face_is_boulder) <= 1_200_000
+    # One metre, coarsened by at most sqrt(2) to keep the budget; relief tilts facets and lengthens edges.
+    assert 0.8 < near_edges(full, 200.0).mean() < 1.6
+    assert full.face_is_boulder.sum() > 50_000
+
+
+def test_ground_and_boulders_are_closed(patch: Patch, body: Body) -> None:
+    # No T-junctions, no seams, wound outwards: every edge twice, once each way.
+    assert ground(patch).is_watertight
+    assert ground(patch).is_winding_consistent
+    # Metres of relief over a square kilometre are 1e-4 of the volume; float32 adds less.
+    assert ground(patch).volume == pytest.approx(body.volume_m3, rel=2e-3)
+    rocks = trimesh.Trimesh(patch.vertices_L_m, patch.faces[patch.face_is_boulder], process=False)
+    assert rocks.is_watertight
+    label = trimesh.graph.connected_component_labels(rocks.face_adjacency, node_count=len(rocks.faces))
+    # Volumes about each rock's first corner: about the origin, float32's rounding would hide a small rock.
+    corner = rocks.triangles - rocks.triangles[np.unique(label, return_index=True)[1]][label][:, :1]
+    volume = np.bincount(label, np.linalg.det(corner) / 6.0)
+    assert len(volume) > 1000
+    assert (volume > 0).all()
+
+
+def test_smooth_patch_stays_near_the_model(body: Body, site: Site) -> None:
+    smooth = build_patch(body, site, seed=7, relief=0.0, min_boulder_m=100.0, **QUICK)
+    assert not smooth.face_is_boulder.any()
+    model = (body.vertices_m - site.position_T_m) @ site.T_from_L
+    # The model's own points come first and do not move: float32 of kilometres keeps 0.25 mm.
+    np.testing.assert_allclose(smooth.vertices_L_m[: len(model)], model, atol=3e-4)
+    # The site is on the model's surface; new points leave a chord by at most 6 % of it, level after level:
+    # under 0.06 · 2 · 100 m for edges of up to 100 m.
+    assert np.linalg.norm(smooth.vertices_L_m, axis=1).min() < 12.0
+    check_mesh(smooth.vertices_L_m, smooth.faces, "smooth patch")
+    # Longest edges first keeps shapes: the worst angle of the fine ground stays above a third of the model's
+    # worst tenth of a percent.
+    assert _smallest_angles(smooth, 150.0).min() > 3.0
+
+
+def _smallest_angles(patch: Patch, radius_m: float) -> np.ndarray:
+    corners = patch.vertices_L_m[patch.faces].astype(np.float64)
+    corners = corners[np.linalg.norm(corners.mean(axis=1), axis=1) < radius_m]
+    angles = []
+    for k in range(3):
+        u, v = (corners[:, (k + j) % 3] - corners[:, k] for j in (1, 2))
+        angles.append(np.arctan2(np.linalg.norm(np.cross(u, v), axis=1), np.einsum("ij,ij->i", u, v)))
+    return np.degrees(np.min(angles, axis=0))
+
+
+def test_refining_a_coarse_ball_rounds_it() -> None:
+    ball = trimesh.creation.icosphere(subdivisions=2, radius=1000.0)
+    body = Body(name="ball", vertices_m=np.array(ball.vertices), faces=np.array(ball.faces))
+    site = choose_sites(body, 1, seed=0)[0]
+    fine = build_patch(body, site, seed=0, facet_m=10.0, radius_m=3000.0, relief=0.0, min_boulder_m=100.0)
+    centre = -site.position_T_m @ site.T_from_L
+    radius = np.linalg.norm(fine.vertices_L_m - centre, axis=1)
+    # Edges of 0.31 rad: the midpoint rule errs by 0.24 m, of fourth order; area-weighted normals are up to
+    # 0.03 rad from radial, which moves a midpoint by 0.03 · 310 m / 4 = 2.3 m.
+    assert np.abs(radius - 1000.0).max() < 3.0
+    chord = 1000.0 * (1 - np.cos(np.radians(9.3)))
+    assert chord > 12.0  # what straight midpoints would have missed by
+
+
+def test_origin_and_down(patch: Patch, body: Body) -> None:
+    # Near the site there is ground, and the bulk of the body lies below: +z is down.
+    assert np.linalg.norm(patch.vertices_L_m, axis=1).min() < 15.0
+    assert (-patch.site.position_T_m @ patch.site.T_from_L)[2] > 300.0
+
+
+def test_same_key_same_patch_other_seed_other_relief(body: Body, site: Site, patch: Patch) -> None:
+    again = build_patch(body, site, seed=7, **QUICK)
+    np.testing.assert_array_equal(again.vertices_L_m, patch.vertices_L_m)
+    np.testing.assert_array_equal(again.faces, patch.faces)
+    other = build_patch(body, site, seed=8, **QUICK)
+    same = min(len(again.vertices_L_m), len(other.vertices_L_m))
+    assert np.abs(again.vertices_L_m[:same] - other.vertices_L_m[:same]).max() > 0.5
+
+
+def test_relief_is_a_few_percent_of_its_wavelength(body: Body, site: Site) -> None:
+    plain = {**QUICK, "min_boulder_m": 100.0}
+    smooth = build_patch(body, site, seed=7, relief=0.0, **plain)
+    rough = build_patch(body, site, seed=7, **plain)
+    np.testing.assert_array_equal(smooth.faces, rough.faces)
+    near = np.linalg.norm(smooth.vertices_L_m, axis=1) < 150.0
+    moved = np.linalg.norm(rough.vertices_L_m - smooth.vertices_L_m, axis=1)
+    # Amplitude 5 m at 96 m wavelength and blocks of 4 m: metres, neither centimetres nor tens of metres.
+    assert 0.5 < moved[near].std() < 6.0
+    assert moved.max() < 25.0
+    # Far away, where facets are coarser than half of every wavelength, nothing moves.
+    far = np.linalg.norm(smooth.vertices_L_m, axis=1) > 1500.0
+    assert moved[far].max() == 0.0
+
+
+def test_boulder_sizes_and_numbers_follow_the_published_law() -> None:
+    # Ten flat square kilometres in unequal strips, boulders from 2 m; half the ground avoided.
+    x = np.array([0.0, 1000.0, 4000.0, 10_000.0])
+    points = np.concatenate([np.column_stack([x, 0 * x, 0 * x]), np.column_stack([x, 0 * x + 1000.0, 0 * x])])
+    faces = np.array([f for k in range(3) for f in ((k, k + 1, k + 5), (k, k + 5, k + 4))], dtype=np.int32)
+    favour = np.array([1.0, 1.0, 1.0, 1.0, 0.0, 0.0])
+    diameter, face, at = _scatter(points, faces, favour, np.full(6, 2.0), np.random.default_rng(4))
+    # N(>= D) = 98 (D/7)^-3.6 per km² (Pajola 2015), Poisson; less the truncation above 45 m, 0.1 %.
+    for size in (2.0, 3.0, 7.0):
+        expected = 10 * 98.0 * (size / 7.0) ** -3.6
+        assert abs((diameter >= size).sum() - expected) < 4 * np.sqrt(expected) + 2e-3 * expected
+    # Maximum-likelihood exponent, standard error alpha / sqrt(n); the truncation biases by less than 0.1 %.
+    alpha = len(diameter) / np.log(diameter / 2.0).sum()
+    assert abs(alpha - 3.6) < 4 * 3.6 / np.sqrt(len(diameter)) + 0.004
+    assert diameter.max() <= 45.0
+    assert set(np.unique(face)) == {0, 1, 2, 3}
+    # On the favoured strips alone, and even over them: the mean of x over 0..4000 m within 4 sigma.
+    assert abs(at[:, 0].mean() - 2000.0) < 4 * 4000.0 / np.sqrt(12 * len(at))
+
+
+def test_bounds(body: Body, site: Site) -> None:
+    for arguments, key in (
+        ({"facet_m": 0.0}, "facet_m"),
+        ({"radius_m": -1.0}, "radius_m"),
+        ({"relief": float("nan")}, "relief"),
+        ({"min_boulder_m": 0.0}, "min_boulder_m"),
+        ({"max_triangles": 100}, "max_triangles"),
+    ):
+        with pytest.raises(InputError, match=key):
+            build_patch(body, site, seed=0, **arguments)  # type: ignore[arg-type]
+    with pytest.raises(InputError, match="seed"):
+        build_patch(body, site, seed=-1)
+
+
+def test_real_shape_patch_is_closed() -> None:
+    if not REAL_SHAPE.exists():
+        pytest.skip(f"the real shape model is not at {REAL_SHAPE}")
+    real = load_body(REAL_SHAPE)
+    patch = build_patch(real, choose_sites(real, 1, seed=3)[0], seed=3, **QUICK)
+    assert ground(patch).is_watertight
+    assert signed_volume(patch.vertices_L_m, patch.faces[~patch.face_is_boulder]) == pytest.approx(
+        real.volume_m3, rel=2e-3
+    )

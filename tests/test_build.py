@@ -1,0 +1,371 @@
+"""Builds: the same bits for any workers, order and interruption; what fails is named, nothing else lost."""
+
+from __future__ import annotations
+
+import os
+import pickle
+import re
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+from test_store import fake_sample, flip, make_spec
+
+from vbnfault import build as bd
+from vbnfault import store as st
+from vbnfault.errors import InputError, VbnfaultError
+from vbnfault.quantities import Sample
+
+SAMPLES = 18
+HERE = Path(__file__).resolve().parent
+
+
+def site_of(samples: int = SAMPLES) -> np.ndarray:
+    """Shards of 4 that share sites, out of order."""
+    return np.arange(samples) // 3 % 3
+
+
+@dataclass(frozen=True)
+class Session:
+    """Makes fake samples slowly; may raise, die or write down what it was asked for."""
+
+    seconds: float = 0.0
+    raises: frozenset[int] = frozenset()
+    dies: frozenset[int] = frozenset()
+    dies_once: str = ""  # a file that is made at the first death
+    log: str = ""
+
+    def __call__(self) -> Session:
+        return self
+
+    def simulate(self, index: int) -> Sample:
+        if self.log:
+            with open(self.log, "a") as log:
+                log.write(f"{os.getpid()} {index}\n")
+        if index in self.raises:
+            raise KeyError(f"no terrain for {index}")
+        if index in self.dies and not (self.dies_once and Path(self.dies_once).exists()):
+            if self.dies_once:
+                Path(self.dies_once).touch()
+            os.kill(os.getpid(), signal.SIGKILL)
+        time.sleep(self.seconds)
+        return fake_sample(make_spec(), index, site=int(site_of(index + 1)[-1]))
+
+
+@dataclass(frozen=True)
+class Broken:
+    """A factory that cannot make a session."""
+
+    def __call__(self) -> Session:
+        raise InputError("67P.obj: no such mesh")
+
+
+def run(out: Path, session: object = None, samples: int = SAMPLES, **options: object) -> bd.Summary:
+    values: dict = {"site": site_of(samples), "progress": False, **options}
+    return bd.build(session or Session(), values.pop("spec", make_spec()), out, **values)  # type: ignore[arg-type]
+
+
+@pytest.fixture(scope="module")
+def reference(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
+    """An uninterrupted build in one process, and its digest."""
+    out = tmp_path_factory.mktemp("build") / "reference.zarr"
+    summary = run(out)
+    assert (summary.built, summary.finished, summary.shards, summary.sites) == (SAMPLES, 0, 5, 3)
+    assert st.verify(out) == []
+    return out, st.digest(out)
+
+
+def test_two_workers_make_the_same_bits_and_share_the_work(
+    reference: tuple[Path, str], tmp_path: Path
+) -> None:
+    log = tmp_path / "log"
+    run(tmp_path / "s.zarr", Session(log=str(log), seconds=0.05), workers=2, recycle_shards=2)
+    assert st.digest(tmp_path / "s.zarr") == reference[1]
+    calls = [line.split() for line in log.read_text().splitlines()]
+    assert sorted(int(i) for _, i in calls) == list(range(SAMPLES))
+    # 5 shards by processes that end after 2 each: at least 3 processes, none of them this one
+    assert len({pid for pid, _ in calls} - {str(os.getpid())}) >= 3
+
+
+def test_a_finished_store_is_left_as_it_is(reference: tuple[Path, str], tmp_path: Path) -> None:
+    run(tmp_path / "s.zarr")
+    times = {p: p.stat().st_mtime_ns for p in (tmp_path / "s.zarr").rglob("c/**/*") if p.is_file()}
+    log = tmp_path / "log"
+    summary = run(tmp_path / "s.zarr", Session(log=str(log)))
+    assert (summary.built, summary.finished) == (0, SAMPLES)
+    assert not log.exists()
+    assert {p: p.stat().st_mtime_ns for p in times} == times
+
+
+def test_damage_is_repaired_by_building_exactly_the_samples_concerned(
+    reference: tuple[Path, str], tmp_path: Path
+) -> None:
+    out, log = tmp_path / "s.zarr", tmp_path / "log"
+    run(out)
+    store = st.open_store(out)
+    flip(store.file("image", 1), 20)  # the first chunk: sample 4
+    store.file("depth_m", 3).unlink()  # 12 to 15
+    chunks = store.chunk("clean", 2)
+    del chunks[9]
+    store.file("clean", 2).write_bytes(st._join_shard({i - 8: c for i, c in chunks.items()}, 4))
+    (out / "image" / "c" / "0.1f.partial").write_bytes(b"half")
+    assert run(out, Session(log=str(log))).built == 6
+    assert sorted(int(line.split()[1]) for line in log.read_text().splitlines()) == [4, 9, 12, 13, 14, 15]
+    assert st.verify(out) == []
+    assert st.digest(out) == reference[1]
+    assert not list(out.rglob("*.partial"))
+
+
+def start(out: Path, *arguments: str) -> subprocess.Popen[str]:
+    """This file as a program, see the end."""
+    path = os.pathsep.join([str(HERE.parent), str(HERE)])
+    return subprocess.Popen(
+        [sys.executable, __file__, str(out), *arguments],
+        env={**os.environ, "PYTHONPATH": path},
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+@pytest.mark.parametrize(("workers", "kills"), [("1", 4), ("2", 3)])
+def test_kill_9_at_any_moment_then_resuming_makes_the_same_bits(
+    reference: tuple[Path, str], tmp_path: Path, workers: str, kills: int
+) -> None:
+    out, log = tmp_path / "s.zarr", tmp_path / "log"
+    log.touch()
+    progress = [0]
+    for moment in np.random.default_rng(int(workers)).uniform(0.0, 0.6, kills):
+        before = log.stat().st_size
+        process = start(out, workers, "0.07", str(log))
+        deadline = time.monotonic() + 20
+        while log.stat().st_size == before and time.monotonic() < deadline:
+            time.sleep(0.005)
+        time.sleep(moment)
+        process.kill()
+        process.communicate()
+        assert process.returncode == -signal.SIGKILL
+        progress.append(st.open_store(out).finished())
+        assert progress[-1] >= progress[-2]
+    assert 0 < progress[-1] < SAMPLES, progress  # else the kills tested nothing
+    assert run(out).built == SAMPLES - progress[-1]
+    assert st.verify(out) == []
+    assert st.digest(out) == reference[1]
+    assert not list(tmp_path.rglob("*.partial"))
+
+
+@pytest.mark.parametrize(
+    ("workers", "number"), [("1", signal.SIGINT), ("1", signal.SIGTERM), ("2", signal.SIGINT)]
+)
+def test_an_interrupt_keeps_what_was_made(
+    reference: tuple[Path, str], tmp_path: Path, workers: str, number: signal.Signals
+) -> None:
+    out, log = tmp_path / "s.zarr", tmp_path / "log"
+    process = start(out, workers, "0.2", str(log))
+    deadline = time.monotonic() + 30
+    while (not log.exists() or len(log.read_text().splitlines()) < 3) and time.monotonic() < deadline:
+        time.sleep(0.02)
+    process.send_signal(number)
+    _, errors = process.communicate(timeout=30)
+    assert process.returncode == 130, errors
+    assert "Traceback" not in errors
+    match = re.search(r"interrupted; (\d+) of 18 samples are finished, and the same command resumes", errors)
+    assert match, errors
+    finished = int(match[1])
+    assert 1 <= finished < SAMPLES  # the shard in work was kept as well
+    assert st.open_store(out).finished() == finished
+    assert run(out).built == SAMPLES - finished
+    assert st.digest(out) == reference[1]
+
+
+def test_samples_that_fail_are_named_and_all_others_are_built(
+    reference: tuple[Path, str], tmp_path: Path
+) -> None:
+    out = tmp_path / "s.zarr"
+    with pytest.raises(
+        bd.BuildFailed, match=r"2 samples \(5, 9\) failed, the first with: KeyError.*for 5.*py:\d"
+    ) as e:
+        run(out, Session(raises=frozenset({5, 9})))
+    assert set(e.value.failures) == {5, 9}
+    assert "Traceback" in e.value.failures[5]
+    assert pickle.loads(pickle.dumps(e.value)).failures == e.value.failures
+    assert st.problem_samples(out) == [5, 9]
+    assert run(out, workers=2).built == 2
+    assert st.digest(out) == reference[1]
+
+
+def test_a_hopeless_build_stops_early(tmp_path: Path) -> None:
+    log = tmp_path / "log"
+    with pytest.raises(bd.BuildFailed, match=r"32 samples .* before any succeeded"):
+        run(tmp_path / "s.zarr", Session(raises=frozenset(range(60)), log=str(log)), samples=60)
+    assert len(log.read_text().splitlines()) == 32
+
+
+def test_a_worker_that_dies_costs_its_sample_alone(reference: tuple[Path, str], tmp_path: Path) -> None:
+    out = tmp_path / "s.zarr"
+    with pytest.raises(bd.BuildFailed, match=r"sample 6 failed.*worker process was killed \(signal 9.*twice"):
+        run(out, Session(dies=frozenset({6})), workers=2)
+    assert st.problem_samples(out) == [6]
+    assert run(out).built == 1
+    assert st.digest(out) == reference[1]
+
+
+def test_a_worker_that_dies_once_is_replaced(reference: tuple[Path, str], tmp_path: Path) -> None:
+    session = Session(dies=frozenset({6}), dies_once=str(tmp_path / "died"))
+    assert run(tmp_path / "s.zarr", session, workers=2).built == SAMPLES
+    assert (tmp_path / "died").exists()
+    assert st.digest(tmp_path / "s.zarr") == reference[1]
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_a_session_that_cannot_start_ends_the_build_with_its_sentence(tmp_path: Path, workers: int) -> None:
+    with pytest.raises(VbnfaultError, match=r"^67P.obj: no such mesh$"):
+        run(tmp_path / "s.zarr", Broken(), workers=workers)
+
+
+def test_append_keeps_earlier_bits_and_resumes_itself(reference: tuple[Path, str], tmp_path: Path) -> None:
+    out = tmp_path / "s.zarr"
+    assert bd.planned_blocks(out, SAMPLES) == (SAMPLES,)
+    with pytest.raises(InputError, match="there is no store"):
+        bd.planned_blocks(out, SAMPLES, append=3)
+    run(out)
+    old = [st.open_store(out).read_sample(i) for i in (0, 16, 17)]
+    blocks = bd.planned_blocks(out, SAMPLES, append=5)
+    assert blocks == (SAMPLES, 5)
+    with pytest.raises(bd.BuildFailed):
+        run(out, Session(raises=frozenset({20})), samples=23, blocks=blocks)
+    assert bd.planned_blocks(out, SAMPLES, append=5) == blocks  # the same command resumes
+    assert bd.planned_blocks(out, SAMPLES) == blocks
+    assert run(out, samples=23, blocks=blocks).built == 1
+    assert bd.planned_blocks(out, SAMPLES, append=5) == (SAMPLES, 5, 5)
+    assert st.verify(out) == []
+    for sample in old:
+        again = st.open_store(out).read_sample(sample.index)
+        assert all(again.layers[n].tobytes() == a.tobytes() for n, a in sample.layers.items())
+    with pytest.raises(InputError, match=r"samples = 20, but the store was made with 18; use --append"):
+        bd.planned_blocks(out, 20)
+    with pytest.raises(InputError, match=r"holds blocks of 18 \+ 5 samples, not 23"):
+        run(out, samples=23)
+
+
+def test_another_scene_is_refused_and_says_what_differs(tmp_path: Path) -> None:
+    out = tmp_path / "s.zarr"
+    run(out)
+    before = st.digest(out)
+    scene = {
+        "scene": {"body": {"name": "1P"}, "samples": 10, "sun": {"deg": [1, 2]}},
+        "scene_hash": "xyz",
+        "seed": 7,
+    }
+    with pytest.raises(InputError) as e:
+        run(out, spec=make_spec(attributes={**scene, "created": "2031"}))
+    assert "scene.body.name is '67P' in the store and '1P' now" in str(e.value)
+    assert "scene.sun.deg is absent in the store and [1, 2] now" in str(e.value)
+    assert str(e.value).index("scene.body") < str(e.value).index("scene_hash")
+    with pytest.raises(InputError, match="height is 24 in the store and 32 now"):
+        run(out, spec=make_spec(32, width=32))
+    run(out, spec=make_spec(attributes={**make_spec().attributes, "created": "2031"}))
+    assert st.digest(out) == before
+    run(out, spec=make_spec(attributes=scene), overwrite=True)
+    assert st.digest(out) != before
+
+
+def test_dry_run_touches_nothing(tmp_path: Path) -> None:
+    summary = run(tmp_path / "s.zarr", dry_run=True, fault_counts={"straylight": 9})
+    assert not (tmp_path / "s.zarr").exists()
+    assert summary.lines()[0].startswith(f"{tmp_path / 's.zarr'}: 18 samples at 3 sites in 5 shards, about ")
+    assert summary.lines()[1] == "faults: straylight 9"
+
+
+def test_too_little_room_is_said_before_the_first_sample(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    needed = make_spec().estimated_sample_bytes * SAMPLES
+    monkeypatch.setattr(bd, "_free_bytes", lambda path: needed // 2 - SAMPLES)
+    with pytest.raises(VbnfaultError, match=r"are needed, but only .*B are free there"):
+        run(tmp_path / "s.zarr")
+    assert not (tmp_path / "s.zarr").exists()
+    monkeypatch.setattr(bd, "_free_bytes", lambda path: needed - 1)
+    run(tmp_path / "s.zarr")
+    assert "warning: " in capsys.readouterr().err
+
+
+def test_paths_that_cannot_be_used_are_bad_input(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("x")
+    for out in (tmp_path / "file", tmp_path / "file" / "s.zarr", Path("/proc/none/s.zarr")):
+        with pytest.raises(InputError, match=str(out)):
+            run(out)
+    with pytest.raises(InputError, match="--workers 0"):
+        run(tmp_path / "s.zarr", workers=0)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no folder locks there")
+def test_two_builds_at_once_are_refused(tmp_path: Path) -> None:
+    run(tmp_path / "s.zarr")
+    with bd._locked(tmp_path / "s.zarr"), pytest.raises(VbnfaultError, match="another build is writing"):
+        run(tmp_path / "s.zarr")
+
+
+def test_sites_are_worked_through_one_after_another(tmp_path: Path) -> None:
+    store = st.create(tmp_path / "s.zarr", make_spec(), 40)
+    plan = bd._Run(store, np.arange(40) // 4 % 3, bd._Progress(40, shown=False))
+    order, last = [], None
+    while (last := plan.next_shard(last)) is not None:
+        order.append(plan.lead(last))
+    assert order == [0] * 4 + [1] * 3 + [2] * 3
+    plan = bd._Run(store, np.arange(40) // 4 % 3, bd._Progress(40, shown=False))
+    first = plan.next_shard()
+    assert first is not None
+    second = plan.next_shard(None, [first])
+    assert second is not None
+    assert plan.lead(second) != plan.lead(first)  # a second worker goes elsewhere
+
+
+def test_progress_without_a_terminal_is_plain_lines(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(bd, "_SECONDS_BETWEEN_LINES", 0.0)
+    run(tmp_path / "s.zarr", Session(seconds=0.01), progress=True)
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) >= SAMPLES
+    assert all(re.fullmatch(r"\d+/18 samples, [\d.]+ samples/s, \d+ s left", line) for line in lines), lines
+
+
+@pytest.mark.filterwarnings("default")
+def test_a_dask_cluster_makes_the_same_bits(reference: tuple[Path, str], tmp_path: Path) -> None:
+    distributed = pytest.importorskip("distributed")
+    out = tmp_path / "s.zarr"
+    with distributed.LocalCluster(
+        n_workers=2, threads_per_worker=2, processes=False, dashboard_address=None
+    ) as cluster:
+        with pytest.raises(bd.BuildFailed, match=r"sample 5 failed.*KeyError"):
+            run(out, Session(raises=frozenset({5})), scheduler=cluster.scheduler_address)
+        assert run(out, scheduler=cluster.scheduler_address).built == 1
+        with pytest.raises(VbnfaultError, match="no such mesh"):
+            run(tmp_path / "t.zarr", Broken(), scheduler=cluster.scheduler_address)
+    assert st.digest(out) == reference[1]
+
+
+def test_without_dask_the_sentence_says_how_to_get_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    with pytest.raises(InputError, match=r"pip install 'vbnfault\[dask\]'"):
+        run(tmp_path / "s.zarr", scheduler="tcp://127.0.0.1:1")
+
+
+def main(out: str, workers: str, seconds: str, log: str = "") -> int:
+    try:
+        run(Path(out), Session(seconds=float(seconds), log=log), workers=int(workers))
+    except VbnfaultError as error:
+        print(error, file=sys.stderr)
+        return error.exit_code
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(*sys.argv[1:]))

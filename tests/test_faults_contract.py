@@ -1,0 +1,265 @@
+"""One contract for every fault model in the registry."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import pickle
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, assume, given, settings
+from hypothesis import strategies as st
+from test_faults_kit import make_context, noisy_electrons, noisy_rgbi
+
+from vbnfault.camera import ARCHITECTURES, READOUT_DIRECTIONS
+from vbnfault.errors import InputError
+from vbnfault.faults import (
+    FAULT_AXIS,
+    PHYSICAL_ORDER,
+    Fault,
+    FaultContext,
+    dataset_order,
+    from_dict,
+    json_schema,
+    physical_order,
+    registry,
+)
+from vbnfault.faults.base import scale_by_intensity
+
+MODELS = [(fault, model) for fault, models in registry().items() for model in models]
+WITH_BOUNDS = [
+    (fault, model, f.name)
+    for fault, model in MODELS
+    for f in dataclasses.fields(registry()[fault][model])
+    if f.metadata["kind"] == "bounds"
+]
+
+SHAPES = [(96, 64), (200, 200), (60, 130)]  # width, height
+LIGHT = settings(
+    max_examples=12,
+    deadline=None,
+    suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
+)
+
+
+@pytest.fixture(scope="module")
+def required(tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict[str, Any]]:
+    """Keys without which a fault class is refused."""
+    path = tmp_path_factory.mktemp("texture") / "texture.png"
+    texture = np.random.default_rng(0).integers(0, 256, (40, 50, 4), dtype=np.uint8)
+    texture[:20, :, 3] = 0
+    assert cv2.imwrite(str(path), texture)
+    return {"pixel_overwriting": {"texture_file": str(path)}}
+
+
+@st.composite
+def tables(draw: st.DrawFn, fault: str, model: str) -> dict[str, Any]:
+    """A scene-file table with values within the declared bounds, from the fields' metadata alone."""
+    table: dict[str, Any] = {"model": model}
+    for f in dataclasses.fields(registry()[fault][model]):
+        if not draw(st.booleans()):
+            continue
+        kind = f.metadata["kind"]
+        if kind == "bounds":
+            lo, hi = f.default  # type: ignore[misc]
+            one = st.integers(int(lo), int(hi)) if f.metadata["integer"] else st.floats(lo, hi)
+            pair = sorted((draw(one), draw(one)))
+            table[f.name] = pair if draw(st.booleans()) else pair[0]
+        elif kind == "flag":
+            table[f.name] = draw(st.booleans())
+        elif kind == "choice":
+            table[f.name] = draw(st.sampled_from(f.metadata["options"]))
+    return table
+
+
+@st.composite
+def contexts(draw: st.DrawFn) -> FaultContext:
+    width, height = draw(st.sampled_from(SHAPES))
+    suns = [None, (width / 2, height / 2), (0.3 * width, 0.2 * height), (-0.4 * width, 1.7 * height)]
+    return make_context(
+        width,
+        height,
+        sun=draw(st.sampled_from(suns)),
+        visible=draw(st.sampled_from([0.0, 0.5, 1.0])),
+        architecture=draw(st.sampled_from(ARCHITECTURES)),
+        readout_direction=draw(st.sampled_from(READOUT_DIRECTIONS)),
+    )
+
+
+def fresh(context: FaultContext) -> FaultContext:
+    """The same context with an empty memo."""
+    return dataclasses.replace(context)
+
+
+def image(fault: Fault, context: FaultContext) -> Any:
+    return noisy_electrons(context) if fault.step == "electrons" else noisy_rgbi(context)
+
+
+def build(fault: str, table: dict[str, Any], required: dict[str, dict[str, Any]]) -> Fault:
+    try:
+        return from_dict(fault, required.get(fault, {}) | table, source="test.toml")
+    except InputError:  # drawn fields that contradict each other
+        assume(False)
+        raise
+
+
+@pytest.mark.parametrize(("name", "model"), MODELS)
+@LIGHT
+@given(data=st.data())
+def test_contract(name: str, model: str, required: dict[str, dict[str, Any]], data: st.DataObject) -> None:
+    fault = build(name, data.draw(tables(name, model)), required)
+    context = data.draw(contexts())
+    key = data.draw(st.integers(0, 2**32 - 1))
+    params = fault.draw(context, np.random.default_rng(key))
+    quantity = image(fault, context)
+    before = quantity.array.tobytes()
+    result = fault.apply(quantity, params, context)
+    mask = fault.footprint(params, context)
+
+    assert quantity.array.tobytes() == before, "input modified"
+    assert type(result) is type(quantity)
+    assert result.unit == quantity.unit
+    assert result.array.shape == quantity.array.shape
+    assert result.array.dtype == quantity.array.dtype
+    if fault.step == "electrons":
+        assert np.isfinite(result.array).all()
+        assert (result.array >= 0).all()
+
+    # the same key gives the same parameters and the same image, from an empty memo
+    again = fault.draw(fresh(context), np.random.default_rng(key))
+    assert again == params
+    assert fault.apply(quantity, again, fresh(context)).array.tobytes() == result.array.tobytes()
+
+    # what the store keeps is enough to draw the fault again, by the bits
+    stored = json.loads(json.dumps(params, allow_nan=False))
+    assert stored == params
+    assert fault.apply(quantity, stored, fresh(context)).array.tobytes() == result.array.tobytes()
+
+    if mask is not None:
+        assert mask.shape == context.shape
+        assert mask.dtype == np.bool_
+        other = fault.footprint(params, fresh(context))
+        assert other is not None
+        assert np.array_equal(other, mask)
+        if fault.localised and not fault.effect_mask:
+            assert result.array[~mask].tobytes() == quantity.array[~mask].tobytes()
+
+
+@pytest.mark.parametrize(("name", "model"), MODELS)
+@LIGHT
+@given(data=st.data())
+def test_round_trips(name: str, model: str, required: dict[str, dict[str, Any]], data: st.DataObject) -> None:
+    fault = build(name, data.draw(tables(name, model)), required)
+    table = fault.to_dict()
+    assert from_dict(name, json.loads(json.dumps(table)), source="test.toml") == fault
+    assert pickle.loads(pickle.dumps(fault)) == fault
+
+
+@pytest.mark.parametrize(("name", "model"), MODELS)
+def test_defaults_are_within_limits(name: str, model: str, required: dict[str, dict[str, Any]]) -> None:
+    fault = from_dict(name, required.get(name, {}) | {"model": model}, source="test.toml")
+    assert (fault.fault, fault.model) == (name, model)
+    assert fault.step in ("electrons", "rgbi")
+    for f in dataclasses.fields(fault):
+        assert f.metadata["doc"]
+
+
+@pytest.mark.parametrize(("name", "model", "key"), WITH_BOUNDS)
+def test_bad_bounds_are_refused(name: str, model: str, key: str, required: dict[str, dict[str, Any]]) -> None:
+    f = registry()[name][model].__dataclass_fields__[key]
+    lo, hi = f.metadata["limits"]
+    bad: list[Any] = [hi + 1, lo - 1, [lo, hi + 1], "wide", True, None, [lo], [lo, hi, hi], float("nan")]
+    if hi > lo:
+        bad.append([hi, lo])
+    if f.metadata["integer"]:
+        bad.append(lo + 0.5)
+    for value in bad:
+        with pytest.raises(InputError, match=rf"^test.toml: faults\.{name}\.{key} = ") as caught:
+            from_dict(name, required.get(name, {}) | {"model": model, key: value}, source="test.toml")
+        assert "\n" not in str(caught.value)
+        pickle.loads(pickle.dumps(caught.value))
+
+
+@pytest.mark.parametrize(("name", "model"), MODELS)
+def test_wrong_types_and_unknown_keys_are_refused(
+    name: str, model: str, required: dict[str, dict[str, Any]]
+) -> None:
+    base = required.get(name, {}) | {"model": model}
+    with pytest.raises(InputError, match=rf"faults\.{name}\.colour_of_the_moon: unknown key"):
+        from_dict(name, base | {"colour_of_the_moon": 1}, source="test.toml")
+    wrong = {"number": "a lot", "flag": 1, "choice": "sideways", "text": 3, "rows": [{"nothing": 1}]}
+    for f in dataclasses.fields(registry()[name][model]):
+        if f.metadata["kind"] in wrong:
+            with pytest.raises(InputError, match=rf"faults\.{name}\.{f.name}"):
+                from_dict(name, base | {f.name: wrong[f.metadata["kind"]]}, source="test.toml")
+
+
+def test_unknown_class_and_model_are_refused() -> None:
+    with pytest.raises(InputError, match="did you mean vignetting"):
+        from_dict("vigneting", {}, source="test.toml")
+    with pytest.raises(InputError, match=r"faults\.vignetting\.model = 'cos5': must be one of"):
+        from_dict("vignetting", {"model": "cos5"}, source="test.toml")
+
+
+@pytest.mark.parametrize(("name", "model"), MODELS)
+def test_params_are_plain(name: str, model: str, required: dict[str, dict[str, Any]]) -> None:
+    def check(value: Any) -> None:
+        assert type(value) in (dict, list, str, int, float, bool, type(None)), type(value)
+        for item in value.values() if isinstance(value, dict) else value if isinstance(value, list) else ():
+            check(item)
+
+    fault = from_dict(name, required.get(name, {}) | {"model": model}, source="test.toml")
+    check(fault.draw(make_context(96, sun=(30.0, 20.0)), np.random.default_rng(0)))
+
+
+def test_orders() -> None:
+    names = list(registry())
+    assert tuple(names[: len(FAULT_AXIS)]) == FAULT_AXIS
+    assert names.index("pixel_overwriting") >= len(FAULT_AXIS)
+    assert dataset_order(reversed(names)) == names
+    order = physical_order(names)
+    assert tuple(order[: len(PHYSICAL_ORDER)]) == PHYSICAL_ORDER
+    # optical effects come before readout effects, whatever the models
+    steps = [{m.step for m in registry()[n].values()} for n in order]
+    assert all(len(s) == 1 for s in steps)
+    flat = [next(iter(s)) for s in steps]
+    assert flat == sorted(flat, key=["electrons", "rgbi"].index)
+
+
+def test_json_schema_names_every_key() -> None:
+    schema = json.loads(json.dumps(json_schema()))
+    for name, model in MODELS:
+        entry = schema["properties"][name]
+        options = entry.get("anyOf", [entry])
+        (match,) = [o for o in options if o["properties"]["model"]["const"] == model]
+        assert set(match["properties"]) == {"model"} | {
+            f.name for f in dataclasses.fields(registry()[name][model])
+        }
+
+
+def test_plain_numbers_make_bounds_in_python_too() -> None:
+    cls = registry()["dust_on_optics"]["gaussian"]
+    assert cls(count=50) == from_dict("dust_on_optics", {"count": 50}, source="test.toml")
+    with pytest.raises(InputError, match=r"dust_on_optics\.count = -1"):
+        cls(count=-1)
+
+
+def test_replace_forgets_what_was_made_once() -> None:
+    context = make_context(96)
+    params: dict[str, Any] = {}
+    assert context.once("thing", params, lambda: 1) == 1
+    assert context.once("thing", params, lambda: 2) == 1
+    assert dataclasses.replace(context).once("thing", params, lambda: 3) == 3
+
+
+def test_scale_by_intensity() -> None:
+    pixels = np.array([[100, 50, 20, 60], [0, 0, 0, 0], [9, 7, 5, 0], [200, 100, 0, 100]], np.uint8)
+    wanted = np.array([30, 77, 10, 200], np.float32)
+    # ratio ½; I = 0 gives RGB = I; I = 0 below coloured RGB likewise; overflow clips in its channel only
+    expected = [[50, 25, 10, 30], [77, 77, 77, 77], [10, 10, 10, 10], [255, 200, 0, 200]]
+    assert scale_by_intensity(pixels, wanted).tolist() == expected
+    unchanged = scale_by_intensity(pixels[[0, 3]], np.array([60, 100], np.float32))
+    assert np.array_equal(unchanged, pixels[[0, 3]])

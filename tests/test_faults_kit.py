@@ -1,0 +1,68 @@
+"""Cameras, contexts and images for the tests of faults; no tests of its own."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from vbnfault.camera import Camera, focal_length_mm
+from vbnfault.detector import Detector
+from vbnfault.faults import Fault, FaultContext, from_dict
+from vbnfault.lens import ThinLens
+from vbnfault.quantities import RGBI, Electrons
+
+FOV_DEG = 40.0
+
+
+def make_context(
+    width: int = 1024,
+    height: int | None = None,
+    sun: tuple[float, float] | None = None,
+    visible: float = 1.0,
+    fov_deg: float = FOV_DEG,
+    **camera: Any,
+) -> FaultContext:
+    """A context with a thin lens of `fov_deg` across the width; height as width unless given."""
+    detector = Detector(width_px=width, height_px=height or width)
+    focal = focal_length_mm(fov_deg, width, detector.pixel_pitch_um)
+    return FaultContext(
+        camera=Camera(lens=ThinLens(focal_length_mm=focal, f_number=4.0), detector=detector, **camera),
+        sun_xy_px=None if sun is None else np.array(sun),
+        sun_visible_fraction=None if sun is None else visible,
+    )
+
+
+def flat_electrons(context: FaultContext, share: float = 0.5) -> Electrons:
+    """Every pixel at `share` of white."""
+    white = context.camera.detector.white_e
+    return Electrons(array=np.full((*context.shape, 3), share, np.float32) * white, white_e=white)
+
+
+def noisy_electrons(context: FaultContext, seed: int = 0) -> Electrons:
+    """Random signal from 0 to twice white."""
+    white = context.camera.detector.white_e
+    share = np.random.default_rng(seed).uniform(0, 2, (*context.shape, 3)).astype(np.float32)
+    return Electrons(array=share * white, white_e=white)
+
+
+def noisy_rgbi(context: FaultContext, seed: int = 0) -> RGBI:
+    """Random bytes, with zeros and full pixels among them."""
+    array = np.random.default_rng(seed).integers(0, 256, (*context.shape, 4), dtype=np.uint8)
+    array[::7, ::5] = 0
+    array[::5, ::7] = 255
+    return RGBI(array=array)
+
+
+def flat_rgbi(context: FaultContext, value: int) -> RGBI:
+    """Every channel of every pixel at `value`."""
+    return RGBI(array=np.full((*context.shape, 4), value, np.uint8))
+
+
+def make(fault_class: str, **table: Any) -> Fault:
+    """A fault as a scene file would make it."""
+    return from_dict(fault_class, table, source="test.toml")
+
+
+def rng(seed: int = 0) -> np.random.Generator:
+    return np.random.default_rng(seed)

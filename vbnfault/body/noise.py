@@ -1,0 +1,156 @@
+"""Hash-based noise in three dimensions: a function of position and seed alone, the same on every call."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+Float32 = NDArray[np.float32]
+UInt32 = NDArray[np.uint32]
+
+_CHUNK = 32_768  # points at once: the temporaries stay in the cache, which more than halves the time
+_PRIMES = tuple(np.uint32(p) for p in (0x8DA6B343, 0xD8163841, 0xCB1AB31F))
+_MIX = (np.uint32(0x7FEB352D), np.uint32(0x846CA68B))
+
+
+def _mix(h: UInt32) -> UInt32:
+    """The lowbias32 finaliser (C. Wellons, public domain): each input bit reaches each output bit."""
+    h = h ^ (h >> np.uint32(16))
+    h = h * _MIX[0]
+    h = h ^ (h >> np.uint32(15))
+    h = h * _MIX[1]
+    return h ^ (h >> np.uint32(16))
+
+
+def _sphere_table() -> Float32:
+    """256 nearly even directions: a Fibonacci sphere."""
+    k = np.arange(256) + 0.5
+    z = 1.0 - 2.0 * k / 256
+    azimuth = np.pi * (1.0 + np.sqrt(5.0)) * k
+    ring = np.sqrt(1.0 - z * z)
+    return np.column_stack([ring * np.cos(azimuth), ring * np.sin(azimuth), z]).astype(np.float32)
+
+
+_GRADIENTS = _sphere_table()
+
+
+def _axis_hashes(cell: NDArray[np.int64]) -> list[tuple[UInt32, UInt32]]:
+    low = cell.astype(np.uint32)  # wraps: negative cells are as good as any
+    return [(low[:, k] * _PRIMES[k], (low[:, k] + np.uint32(1)) * _PRIMES[k]) for k in range(3)]
+
+
+def _seed_word(seed: int) -> UInt32:
+    return _mix(_mix(np.array([seed & 0xFFFFFFFF], dtype=np.uint32)) ^ np.uint32((seed >> 32) & 0xFFFFFFFF))
+
+
+def noise_key(seed: int, stream: int) -> int:
+    """A noise seed for one use (`stream`, below 65536) of a run's seed: no two pairs share one below 2^48."""
+    return (seed << 16) + stream
+
+
+def _by_chunks(
+    kernel: Callable[[NDArray, UInt32], Float32], points: NDArray, seed: int, columns: int
+) -> Float32:
+    out = np.empty((len(points), columns), dtype=np.float32)
+    word = _seed_word(seed)
+    for start in range(0, len(points), _CHUNK):
+        out[start : start + _CHUNK] = kernel(points[start : start + _CHUNK], word)
+    return out
+
+
+def _gradient_kernel(points: NDArray, word: UInt32) -> Float32:
+    floor = np.floor(points)
+    f = (points - floor).astype(np.float32)
+    fade = f * f * f * (f * (f * np.float32(6) - np.float32(15)) + np.float32(10))
+    axes = _axis_hashes(floor.astype(np.int64))
+    value = np.zeros(len(points), dtype=np.float32)
+    for i in (0, 1):
+        wx = fade[:, 0] if i else 1 - fade[:, 0]
+        dx = f[:, 0] - i
+        for j in (0, 1):
+            wxy = wx * (fade[:, 1] if j else 1 - fade[:, 1])
+            dy = f[:, 1] - j
+            hxy = axes[0][i] ^ axes[1][j] ^ word
+            for k in (0, 1):
+                g = _GRADIENTS[_mix(hxy ^ axes[2][k]) & np.uint32(255)]
+                dot = g[:, 0] * dx + g[:, 1] * dy + g[:, 2] * (f[:, 2] - k)
+                value += wxy * (fade[:, 2] if k else 1 - fade[:, 2]) * dot
+    return value[:, None]
+
+
+def gradient_noise(points: NDArray, seed: int) -> Float32:
+    """Gradient noise with one cycle per 1-2 units: float32[n], mean 0, standard deviation 0.22, within ±1.
+
+    Parameters
+    ----------
+    points
+        float64[n, 3] in units of the wavelength. Float64, so that kilometres in units of a metre keep their
+        fraction.
+    seed
+        Any integer; its low 64 bits count.
+    """
+    return _by_chunks(_gradient_kernel, points, seed, 1)[:, 0]
+
+
+def _block_kernel(points: NDArray, word: UInt32) -> Float32:
+    base = np.floor(points - 0.5)
+    f = (points - base).astype(np.float32)
+    axes = _axis_hashes(base.astype(np.int64))
+    n = len(points)
+    nearest = np.full(n, 9.0, dtype=np.float32)
+    second = nearest.copy()
+    plane = np.zeros(n, dtype=np.float32)
+    other = plane.copy()
+    unit = np.float32(1.0 / 1024.0)
+    for i in (0, 1):
+        for j in (0, 1):
+            hxy = axes[0][i] ^ axes[1][j] ^ word
+            for k in (0, 1):
+                h = _mix(hxy ^ axes[2][k])
+                # Jitter of ±0.35 about the cell's centre: the nearest point is then nearly always among the
+                # eight cells looked at, and a miss only moves a fracture.
+                jx, jy, jz = (
+                    ((h >> np.uint32(s)) & np.uint32(1023)).astype(np.float32) * unit for s in (0, 10, 20)
+                )
+                dx = f[:, 0] - (np.float32(i + 0.15) + np.float32(0.7) * jx)
+                dy = f[:, 1] - (np.float32(j + 0.15) + np.float32(0.7) * jy)
+                dz = f[:, 2] - (np.float32(k + 0.15) + np.float32(0.7) * jz)
+                d = np.sqrt(dx * dx + dy * dy + dz * dz)
+                g = _GRADIENTS[_mix(h + np.uint32(0x9E3779B9)) & np.uint32(255)]
+                closer = d < nearest
+                beaten = d < second
+                level = (h >> np.uint32(24)).astype(np.float32) / np.float32(255) - np.float32(0.5)
+                tilt = g[:, 0] * dx + g[:, 1] * dy + g[:, 2] * dz + level
+                other = np.where(closer, plane, np.where(beaten, tilt, other))
+                second = np.where(closer, nearest, np.where(beaten, d, second))
+                plane = np.where(closer, tilt, plane)
+                nearest = np.where(closer, d, nearest)
+    return np.column_stack([plane, other, second - nearest])
+
+
+def block_noise(points: NDArray, seed: int) -> tuple[Float32, Float32, Float32]:
+    """Broken ground: space cut into cells about one unit wide, each with its own level and tilt.
+
+    Parameters
+    ----------
+    points, seed
+        As for `gradient_noise`.
+
+    Returns
+    -------
+    level, neighbour, gap
+        float32[n] each: the cell's plane, standard deviation about 0.4; the next nearest cell's plane; and
+        how much farther that cell's centre is, in units (0 on the border), for whoever blends the two there.
+    """
+    columns = _by_chunks(_block_kernel, points, seed, 3)
+    return columns[:, 0], columns[:, 1], columns[:, 2]
+
+
+def fractal_noise(points_m: NDArray, seed: int, wavelengths_m: NDArray, amplitudes_m: NDArray) -> Float32:
+    """Sum of gradient-noise octaves, float32[n] in the unit of the amplitudes."""
+    total = np.zeros(len(points_m), dtype=np.float32)
+    for octave, (wavelength, amplitude) in enumerate(zip(wavelengths_m, amplitudes_m, strict=True)):
+        total += np.float32(amplitude) * gradient_noise(points_m / wavelength, seed + 7919 * octave)
+    return total

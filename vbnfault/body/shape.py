@@ -1,0 +1,248 @@
+"""Reading shape models and making sure that they bound a solid."""
+
+from __future__ import annotations
+
+import warnings
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+
+from vbnfault.errors import InputError
+
+Unit = Literal["auto", "m", "km"]
+Float64 = NDArray[np.float64]
+Int32 = NDArray[np.int32]
+
+METRES_PER_KM = 1000.0
+# Dimorphos, the smallest body with a shape model, is 177 m long; Lutetia, the largest usually given in
+# kilometres to this kind of work, 121 km. No extent between the two is ambiguous.
+AUTO_KM_BELOW_EXTENT = 150.0
+FILE_TYPES = (".obj", ".ply", ".stl", ".glb", ".gltf")
+# These formats store a vertex once per face or per texture seam, so welding mends nothing worth a warning.
+_SPLIT_VERTEX_TYPES = (".stl", ".glb", ".gltf")
+_LARGEST_HOLE_EDGES = 8
+# Relative to the squared extent: below it a facet's normal is rounding noise in float64.
+_DEGENERATE_AREA_FRACTION = 1e-16
+
+
+def load_shape(path: str | Path, unit: Unit = "auto") -> tuple[Float64, Int32]:
+    """Read a closed triangle mesh in its own body-fixed axes.
+
+    Parameters
+    ----------
+    path
+        OBJ, PLY, STL, GLB or GLTF file. Polygons are triangulated, several objects joined.
+    unit
+        Unit of the file: "m", "km", or "auto": kilometres if the longest side of the bounding box is below
+        150, else metres. No body with a shape model lies between Dimorphos (177 m) and the bodies modelled
+        in kilometres (Lutetia 121 km); for larger ones in kilometres (Vesta) or smaller ones in metres give
+        the unit.
+
+    Returns
+    -------
+    vertices_m, faces
+        float64[n, 3] in metres and int32[m, 3], outward winding, checked and mended by `check_mesh`.
+
+    Raises
+    ------
+    InputError
+        The file is missing, unreadable, of another type, or not a closed mesh.
+    """
+    path = Path(path)
+    if unit not in ("auto", "m", "km"):
+        raise InputError(f"{path}: unit must be one of auto, m, km; got {unit!r}.")
+    if not path.exists():
+        raise InputError(f"{path}: shape file not found.")
+    if not path.is_file():
+        raise InputError(f"{path}: shape is not a file.")
+    suffix = path.suffix.lower()
+    if suffix not in FILE_TYPES:
+        raise InputError(f"{path}: unsupported shape type {suffix!r}; allowed are {', '.join(FILE_TYPES)}.")
+    if path.stat().st_size == 0:
+        raise InputError(f"{path}: shape file is empty.")
+    try:
+        # numpy warns on NaN while the readers normalise; the check below reports it as an error.
+        with warnings.catch_warnings(), np.errstate(all="ignore"):
+            warnings.simplefilter("ignore")
+            mesh = trimesh.load(path, process=False, force="mesh")
+            vertices = np.array(getattr(mesh, "vertices", np.empty((0, 3))), dtype=np.float64)
+            faces = np.array(getattr(mesh, "faces", np.empty((0, 3))), dtype=np.int64)
+    except Exception as error:  # the readers raise whatever their parsers raise
+        reason = " ".join(str(error).split())[:120] or type(error).__name__
+        raise InputError(f"{path}: unreadable as {suffix[1:].upper()}: {reason.rstrip('.')}.") from None
+    _check_arrays(vertices, faces, str(path))
+    extent = float(np.ptp(vertices, axis=0).max())
+    if unit == "km" or (unit == "auto" and extent < AUTO_KM_BELOW_EXTENT):
+        vertices = vertices * METRES_PER_KM
+    if suffix in _SPLIT_VERTEX_TYPES:
+        vertices, faces, _ = _weld(vertices, faces)
+    return check_mesh(vertices, faces, str(path))
+
+
+def check_mesh(vertices: NDArray, faces: NDArray, source: str) -> tuple[Float64, Int32]:
+    """Check that a mesh bounds a solid, mending what can be mended without guessing.
+
+    Merges coincident vertices, drops degenerate faces, fills holes of up to eight edges and turns the winding
+    outwards, each reported in one `UserWarning`. Unreferenced vertices are dropped in silence.
+
+    Parameters
+    ----------
+    vertices, faces
+        float[n, 3] (any unit) and int[m, 3]; not modified.
+    source
+        What to call the mesh in messages, usually the file's path.
+
+    Returns
+    -------
+    vertices, faces
+        float64[n, 3], int32[m, 3]: every edge shared by two faces in opposite directions, volume > 0.
+
+    Raises
+    ------
+    InputError
+        Empty, no faces, NaN or infinite coordinates, indices out of range, open or non-manifold edges,
+        winding that cannot be made consistent, zero volume.
+    """
+    vertices = np.array(vertices, dtype=np.float64)
+    faces = np.array(faces, dtype=np.int64)
+    _check_arrays(vertices, faces, source)
+    mended: list[str] = []
+
+    vertices, faces, merged = _weld(vertices, faces)
+    if merged:
+        mended.append(f"merged {merged} duplicate vertices")
+    sound = _sound_faces(vertices, faces)
+    if not sound.all():
+        mended.append(f"dropped {int((~sound).sum())} degenerate faces")
+        faces = faces[sound]
+    if len(faces) == 0:
+        raise InputError(f"{source}: mesh has only degenerate faces.")
+
+    counts = _undirected_counts(faces)
+    if (counts == 1).any():
+        filled = _fill_holes(faces)
+        if len(filled) > len(faces) and _sound_faces(vertices, filled).all():
+            mended.append(f"filled holes with {len(filled) - len(faces)} faces")
+            faces = filled
+            counts = _undirected_counts(faces)
+    if (counts == 1).any():
+        raise InputError(f"{source}: mesh is open, {int((counts == 1).sum())} boundary edges.")
+    if (counts > 2).any():
+        raise InputError(f"{source}: mesh has {int((counts > 2).sum())} edges shared by more than two faces.")
+
+    if not _consistent(faces):
+        mesh = trimesh.Trimesh(vertices, faces, process=False)
+        trimesh.repair.fix_winding(mesh)
+        faces = np.array(mesh.faces, dtype=np.int64)
+        if not _consistent(faces):
+            raise InputError(f"{source}: mesh cannot be wound consistently (it is not orientable).")
+        mended.append("made the winding consistent")
+    volume = signed_volume(vertices, faces)
+    if volume < 0:
+        faces = faces[:, ::-1]
+        mended.append("turned the winding outwards")
+    if abs(volume) <= 1e-12 * float(np.ptp(vertices, axis=0).max()) ** 3:
+        raise InputError(f"{source}: mesh encloses no volume.")
+    if mended:
+        warnings.warn(f"{source}: mended the mesh: {', '.join(mended)}.", UserWarning, stacklevel=2)
+
+    used, index = np.unique(faces, return_inverse=True)
+    return np.ascontiguousarray(vertices[used]), np.ascontiguousarray(index.reshape(-1, 3).astype(np.int32))
+
+
+def signed_volume(vertices: NDArray, faces: NDArray) -> float:
+    """Volume by the divergence theorem, positive for outward winding, in the cube of the vertices' unit."""
+    a, b, c = (vertices[faces[:, k]].astype(np.float64) for k in range(3))
+    return float(np.sum(a * np.cross(b, c)) / 6.0)
+
+
+def face_normals_areas(vertices: NDArray, faces: NDArray) -> tuple[Float64, Float64]:
+    """Outward unit normals float64[m, 3] (zero where degenerate) and areas float64[m] in unit²."""
+    a, b, c = (vertices[faces[:, k]].astype(np.float64) for k in range(3))
+    cross = np.cross(b - a, c - a)
+    length = np.linalg.norm(cross, axis=1)
+    return cross / np.where(length > 0, length, 1.0)[:, None], 0.5 * length
+
+
+def vertex_normals(vertices: NDArray, faces: NDArray) -> Float64:
+    """Area-weighted unit normals float64[n, 3]."""
+    a, b, c = (vertices[faces[:, k]].astype(np.float64) for k in range(3))
+    cross = np.cross(b - a, c - a)
+    normals = np.column_stack(
+        [np.bincount(faces.ravel(), np.repeat(cross[:, k], 3), minlength=len(vertices)) for k in range(3)]
+    )
+    length = np.linalg.norm(normals, axis=1)
+    return normals / np.where(length > 0, length, 1.0)[:, None]
+
+
+def _check_arrays(vertices: NDArray, faces: NDArray, source: str) -> None:
+    # Faces first: the readers give no vertices either where nothing refers to them.
+    if faces.ndim != 2 or faces.shape[-1] != 3 or len(faces) == 0:
+        raise InputError(f"{source}: mesh has 0 faces.")
+    if vertices.ndim != 2 or vertices.shape[-1] != 3 or len(vertices) == 0:
+        raise InputError(f"{source}: mesh has no vertices.")
+    bad = int((~np.isfinite(vertices)).any(axis=1).sum())
+    if bad:
+        raise InputError(f"{source}: mesh has {bad} vertices with NaN or infinite coordinates.")
+    if faces.min() < 0 or faces.max() >= len(vertices):
+        raise InputError(f"{source}: mesh has faces that name vertices outside 0..{len(vertices) - 1}.")
+
+
+def _weld(vertices: Float64, faces: NDArray) -> tuple[Float64, NDArray, int]:
+    """Merge vertices at the same position, keeping the order of first appearance; also how many went."""
+    _, first, inverse = np.unique(vertices, axis=0, return_index=True, return_inverse=True)
+    if len(first) == len(vertices):
+        return vertices, faces, 0
+    order = np.argsort(first)
+    rank = np.empty_like(order)
+    rank[order] = np.arange(len(order))
+    return vertices[first[order]], rank[inverse.ravel()][faces], len(vertices) - len(first)
+
+
+def _sound_faces(vertices: Float64, faces: NDArray) -> NDArray[np.bool_]:
+    distinct = (faces != np.roll(faces, 1, axis=1)).all(axis=1)
+    extent = float(np.ptp(vertices, axis=0).max())
+    return distinct & (face_normals_areas(vertices, faces)[1] > _DEGENERATE_AREA_FRACTION * extent**2)
+
+
+def _directed_edges(faces: NDArray) -> NDArray[np.int64]:
+    return np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).astype(np.int64)
+
+
+def _undirected_counts(faces: NDArray) -> NDArray[np.int64]:
+    edges = np.sort(_directed_edges(faces), axis=1)
+    return np.unique(edges[:, 0] * (int(faces.max()) + 1) + edges[:, 1], return_counts=True)[1]
+
+
+def _consistent(faces: NDArray) -> bool:
+    """Every edge runs once in each direction."""
+    edges = _directed_edges(faces)
+    count = int(faces.max()) + 1
+    forward = np.sort(edges[:, 0] * count + edges[:, 1])
+    backward = np.sort(edges[:, 1] * count + edges[:, 0])
+    return bool((forward[1:] != forward[:-1]).all() and (forward == backward).all())
+
+
+def _fill_holes(faces: NDArray) -> NDArray:
+    """Close simple boundary loops of up to eight edges with a fan; larger holes are left open."""
+    edges = _directed_edges(faces)
+    count = int(faces.max()) + 1
+    key = edges.min(axis=1) * count + edges.max(axis=1)
+    _, inverse, counts = np.unique(key, return_inverse=True, return_counts=True)
+    boundary = edges[counts[inverse.ravel()] == 1]
+    follow = {int(b): int(a) for a, b in boundary}  # against the faces' direction, as a filling face runs
+    if len(follow) != len(boundary):
+        return faces  # loops that touch in a vertex, or mixed winding: no simple loop to fill
+    fans: list[tuple[int, int, int]] = []
+    while follow:
+        start, step = follow.popitem()
+        loop = [start]
+        while step != start and step in follow:
+            loop.append(step)
+            step = follow.pop(step)
+        if step == start and 3 <= len(loop) <= _LARGEST_HOLE_EDGES:
+            fans += [(loop[0], loop[k], loop[k + 1]) for k in range(1, len(loop) - 1)]
+    return np.vstack([faces, np.array(fans, dtype=faces.dtype).reshape(-1, 3)])

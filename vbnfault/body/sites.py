@@ -1,0 +1,122 @@
+"""Sites on the surface and their local-level frame L."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from vbnfault.body.shape import Float64, face_normals_areas
+from vbnfault.errors import InputError
+
+if TYPE_CHECKING:
+    from vbnfault.body import Body
+
+MAX_SLOPE_DEG = 35.0
+_ATTEMPTS = 1000
+# sin of the angle to the pole below which "north" is rounding noise and +x of T stands in for the pole.
+_POLE_SIN = 1e-6
+_STREAM = 0x51735  # keeps these draws apart from other users of the same seed
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Site:
+    """A place on the body and its local-level frame.
+
+    Attributes
+    ----------
+    index
+        Number of the site in its set.
+    position_T_m
+        float64[3], on the global model's surface, body-fixed axes.
+    T_from_L
+        float64[3, 3] rotation; its columns are L's axes in T: x north, y east, z down (effective gravity).
+    """
+
+    index: int
+    position_T_m: Float64
+    T_from_L: Float64
+
+
+def local_level(effective_gravity_m_s2: ArrayLike) -> Float64:
+    """T_from_L, float64[3, 3], from effective gravity float64[3] in T.
+
+    z points along it; x is T's +z (the pole) projected onto the horizontal plane (T's +x within 1e-6 rad of
+    the pole's own direction); y = z × x is east.
+
+    Raises
+    ------
+    ValueError
+        Zero gravity.
+    """
+    gravity = np.asarray(effective_gravity_m_s2, dtype=np.float64)
+    length = np.sqrt(np.sum(gravity**2))
+    if not length > 0:
+        raise ValueError("no local-level frame where effective gravity is zero")
+    down = gravity / length
+    north = np.array([0.0, 0.0, 1.0]) - down[2] * down
+    if np.sqrt(np.sum(north**2)) < _POLE_SIN:
+        north = np.array([1.0, 0.0, 0.0]) - down[0] * down
+    north /= np.sqrt(np.sum(north**2))
+    # Once more: near the pole the first projection leaves a rounding error of 1e-16 / _POLE_SIN.
+    north -= np.sum(north * down) * down
+    north /= np.sqrt(np.sum(north**2))
+    return np.column_stack([north, np.cross(down, north), down])
+
+
+def site_at(body: Body, index: int, position_T_m: ArrayLike) -> Site:
+    """The site at a given point, float64[3] metres in T."""
+    position = np.array(position_T_m, dtype=np.float64)
+    gravity = body.effective_gravity(position)[0]
+    return Site(index=index, position_T_m=position, T_from_L=local_level(gravity))
+
+
+def choose_sites(
+    body: Body, count: int, seed: int, *, max_slope_deg: float = MAX_SLOPE_DEG
+) -> tuple[Site, ...]:
+    """Random sites, uniform over the surface area that is no steeper than `max_slope_deg`.
+
+    Site k depends on (body, seed, k, max_slope_deg) only, so a longer list begins with the shorter one.
+
+    Parameters
+    ----------
+    count
+        Number of sites, >= 0.
+    seed
+        Non-negative integer.
+    max_slope_deg
+        Largest angle, 0 to 90°, between the facet's normal and up (against effective gravity); steeper ground
+        would not fill the lower half of a level camera's view.
+
+    Raises
+    ------
+    InputError
+        A parameter out of range, or no place found in 1000 draws.
+    """
+    if count < 0:
+        raise InputError(f"sites: must be 0 or more; got {count}.")
+    if seed < 0:
+        raise InputError(f"seed: must be 0 or more; got {seed}.")
+    if not 0.0 < max_slope_deg <= 90.0:
+        raise InputError(f"max_slope_deg: must be in (0, 90]; got {max_slope_deg}.")
+    normals, areas = face_normals_areas(body.vertices_m, body.faces)
+    cumulative = np.cumsum(areas)
+    cos_bound = np.cos(np.radians(max_slope_deg))
+    return tuple(_draw(body, index, seed, normals, cumulative, cos_bound) for index in range(count))
+
+
+def _draw(body: Body, index: int, seed: int, normals: Float64, cumulative: Float64, cos_bound: float) -> Site:
+    for attempt in range(_ATTEMPTS):
+        rng = np.random.Generator(np.random.Philox(np.random.SeedSequence((seed, _STREAM, index, attempt))))
+        pick, u, v = rng.random(3)
+        face = min(int(np.searchsorted(cumulative, pick * cumulative[-1], side="right")), len(normals) - 1)
+        root = np.sqrt(u)
+        weights = np.array([1.0 - root, root * (1.0 - v), root * v])
+        site = site_at(body, index, np.sum(weights[:, None] * body.vertices_m[body.faces[face]], axis=0))
+        if -np.sum(normals[face] * site.T_from_L[:, 2]) >= cos_bound:
+            return site
+    raise InputError(
+        f"{body.name}: no place for site {index} in {_ATTEMPTS} draws; raise max_slope_deg (at most 90)."
+    )

@@ -1,0 +1,108 @@
+"""Broken lines, the paper's model: whole rows or columns dead (0) or saturated (255) in R, G, B and I.
+
+Which way they run belongs to the sensor's architecture, which a sample's broken pixels share:
+- full-frame and frame-transfer CCD: rows or columns, never both. The lines run along the camera's readout
+  direction (left, right: rows; up, down: columns), the flag by which the paper commands the direction of
+  lines. It is the direction in which charge is shifted: a fault there takes what follows in the same line,
+  and broken lines lie parallel to the lines subtended by broken pixels.
+- interline CCD and CMOS: each line is a row or a column with equal chance.
+
+Each line is dead or saturated with equal chance unless the scene fixes the numbers. No line occurs twice.
+Where a saturated and a dead line cross, the pixel is saturated.
+"""
+
+# ruff: noqa: RUF009 (bounds() and its kin are field specifiers)
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .base import Fault, FaultContext, Interval, Params, bounds, choice, number
+
+BOTH_WAYS = ("interline_ccd", "cmos")
+
+
+@dataclass(frozen=True, kw_only=True)
+class TextureBrokenLines(Fault):
+    """Dead and saturated lines (Gallon et al., table of broken pixels and lines)."""
+
+    fault = "broken_lines"
+    model = "texture"
+    step = "rgbi"
+
+    count: Interval = bounds(1, 5, limits=(0, 10_000), integer=True, doc="number of broken lines")
+    white_count: int | None = number(
+        None, limits=(0, 10_000), integer=True, doc="how many of them are saturated; left out: drawn"
+    )
+    black_count: int | None = number(
+        None,
+        limits=(0, 10_000),
+        integer=True,
+        doc="how many are dead; left out: the rest. With both given, their sum is the number of lines",
+    )
+    direction: str = choice(
+        "camera",
+        ("camera", "rows", "columns"),
+        doc="camera: by the sensor's architecture and readout direction; rows or columns: all lines so",
+    )
+
+    def validate(self) -> None:
+        fixed = {"white_count": self.white_count, "black_count": self.black_count}
+        given = {name: value for name, value in fixed.items() if value is not None}
+        if len(given) == 1:
+            ((name, value),) = given.items()
+            if value > self.count.lo:
+                raise ValueError(
+                    f"{name} = {value}: must not exceed the least number of lines, {self.count.lo:g}"
+                )
+
+    def draw(self, context: FaultContext, rng: np.random.Generator) -> Params:
+        """Lists of broken `rows` and `columns` (pixel indices) with their values, 0 or 255."""
+        height, width = context.shape
+        count = self.count.integer(rng)
+        if self.white_count is not None and self.black_count is not None:
+            count = int(self.white_count) + int(self.black_count)
+        whites = int(rng.binomial(count, 0.5))
+        if self.white_count is not None:
+            whites = int(self.white_count)
+        elif self.black_count is not None:
+            whites = count - int(self.black_count)
+        values = rng.permutation(np.where(np.arange(count) < whites, 255, 0))
+
+        is_row = rng.random(count) < 0.5
+        if self.direction != "camera":
+            is_row[:] = self.direction == "rows"
+        elif context.camera.architecture not in BOTH_WAYS:
+            is_row[:] = context.camera.readout_direction in ("left", "right")
+        # a frame of a few pixels may have fewer lines than asked for
+        rows = rng.permutation(height)[: int(is_row.sum())]
+        columns = rng.permutation(width)[: int((~is_row).sum())]
+        return {
+            "rows": rows.tolist(),
+            "row_values": values[is_row][: len(rows)].tolist(),
+            "columns": columns.tolist(),
+            "column_values": values[~is_row][: len(columns)].tolist(),
+        }
+
+    def apply(self, quantity: Any, params: Params, context: FaultContext) -> Any:
+        """The image with the lines set in all four channels."""
+        out = quantity.array.copy()
+        for value in (0, 255):  # saturated last: it wins where lines cross
+            out[_of_value(params, "row", value)] = value
+            out[:, _of_value(params, "column", value)] = value
+        return quantity.with_array(out)
+
+    def footprint(self, params: Params, context: FaultContext) -> NDArray[np.bool_]:
+        """bool[y, x]: the lines."""
+        out = np.zeros(context.shape, dtype=bool)
+        out[params["rows"]] = True
+        out[:, params["columns"]] = True
+        return out
+
+
+def _of_value(params: Params, kind: str, value: int) -> list[int]:
+    lines = zip(params[f"{kind}s"], params[f"{kind}_values"], strict=True)
+    return [index for index, v in lines if v == value]

@@ -1,0 +1,228 @@
+"""Makes the flare and glare textures of straylight/texture:  python -m vbnfault.faults.flare_textures OUTDIR
+
+The paper shows ten flares and two glares but publishes none of them: these are our own, computed from
+closed-form profiles. Close to the Sun (1-5) dense orbs and discs; far from it (6-10) rings, iris polygons, a
+clipped pupil. Each is what the out-of-focus image of an aperture looks like after two reflections at coated
+surfaces: a tint from the coating, colours that part at the rim (the ghost's size depends on wavelength), a
+bright or a faint rim (aberration gathers light there or spreads it), weak ripples of diffraction.
+
+A texture spans [-1/FILL, 1/FILL]² around its centre, its outline at radius 1, its +x axis along the line
+from the Sun through the centre of the image. Values are linear in light, 1 being white at brightness 1,
+stored as 16 bit RGB PNG (65535 = 1) in steps of 1/4096.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+F64 = NDArray[np.float64]
+
+SIZE_PX = 384
+FILL = 0.9  # radius of a flare's outline over half the texture's size
+STEP = 16  # of 65535: coarse enough that the files stay small, far finer than one DN
+
+# Relative size of a ghost in R, G, B per unit of dispersion.
+_SPREAD = (1.0, 0.0, -1.0)
+
+
+def _grid() -> tuple[F64, F64]:
+    axis = ((np.arange(SIZE_PX) + 0.5) / SIZE_PX * 2 - 1) / FILL
+    return np.meshgrid(axis, axis)
+
+
+def _inside(signed_distance: F64, softness: float) -> F64:
+    """1 inside, 0 outside, a smooth step of total width 2·softness around signed distance 0."""
+    t = np.clip(0.5 - signed_distance / (2 * softness), 0, 1)
+    return t * t * (3 - 2 * t)
+
+
+def _bump(x: F64, width: float) -> F64:
+    return np.exp(-0.5 * (x / width) ** 2)
+
+
+def _polygon(x: F64, y: F64, sides: int, turn: float, bulge: float) -> F64:
+    """Signed distance to an iris of `sides` blades, circumradius 1; `bulge` 0 (straight) … 1 (a circle)."""
+    angle = np.arctan2(y, x) - turn
+    sector = 2 * np.pi / sides
+    inner = np.cos(sector / 2)
+    folded = np.mod(angle, sector) - sector / 2
+    straight = np.hypot(x, y) * np.cos(folded) - inner
+    # blending with the circle rounds the blades; the corners stay at radius 1
+    return (1 - bulge) * straight / inner * (1 + inner) / 2 + bulge * (np.hypot(x, y) - 1)
+
+
+def _coloured(tint: tuple[float, float, float], dispersion: float, shape: Callable[[F64, F64], F64]) -> F64:
+    """`shape` in three colours: tinted, each of a slightly other size and shifted along the axis."""
+    x, y = _grid()
+    planes = []
+    for gain, spread in zip(tint, _SPREAD, strict=True):
+        size = 1 + dispersion * (spread - 1)  # red is largest and reaches radius 1
+        planes.append(gain * shape(x / size, y / size))
+    return np.stack(planes, axis=-1)
+
+
+def _radius(x: F64, y: F64) -> F64:
+    return np.hypot(x, y)
+
+
+def _orb(x: F64, y: F64) -> F64:
+    r = _radius(x, y)
+    return (0.35 + 0.65 * _bump(r, 0.38)) * _inside(r - 0.8, 0.2)
+
+
+def _disc(x: F64, y: F64) -> F64:
+    r = _radius(x, y)
+    return (0.78 + 0.08 * x + 0.14 * r**4) * _inside(r - 0.94, 0.06)
+
+
+def _limb_disc(x: F64, y: F64) -> F64:
+    r = _radius(x, y)
+    return (0.4 + 0.35 * r**2 + 0.25 * _bump(r - 0.86, 0.06)) * _inside(r - 0.93, 0.06)
+
+
+def _leaning_orb(x: F64, y: F64) -> F64:
+    r = _radius(x, y)
+    return (0.45 + 0.55 * _bump(np.hypot(x - 0.35, y), 0.5)) * _inside(r - 0.9, 0.1)
+
+
+def _cored_disc(x: F64, y: F64) -> F64:
+    r = _radius(x, y)
+    return 0.45 * _inside(r - 0.93, 0.07) + 0.55 * _inside(r - 0.42, 0.14)
+
+
+def _ring(x: F64, y: F64) -> F64:
+    r = _radius(x, y)
+    ripple = 0.05 * np.cos(95 * (1 - r**2)) * _bump(r - 0.8, 0.12)
+    return (_bump(r - 0.93, 0.022) + (0.1 + ripple) * r**3) * _inside(r - 0.96, 0.04)
+
+
+def _hexagon(x: F64, y: F64) -> F64:
+    d = _polygon(x, y, 6, 0.2, 0.12)
+    lit = 0.42 + 0.2 * _radius(x, y) ** 2 - 0.12 * x  # spread thin in the middle, gathered towards the Sun
+    return (lit + 0.4 * _bump(d + 0.05, 0.035)) * _inside(d + 0.03, 0.025)
+
+
+def _heptagon(x: F64, y: F64) -> F64:
+    d = _polygon(x, y, 7, 0.0, 0.3)
+    return (0.65 + 0.3 * x + 0.15 * _bump(d + 0.06, 0.04)) * _inside(d + 0.04, 0.035)
+
+
+def _halo(x: F64, y: F64) -> F64:
+    r = _radius(x, y)
+    return (0.8 * _bump(r - 0.84, 0.055) + 0.3 * _bump(r - 0.6, 0.03) + 0.05 * _bump(r, 0.5)) * _inside(
+        r - 0.95, 0.05
+    )
+
+
+def _crescent(x: F64, y: F64) -> F64:
+    # the pupil's rim clipped by a second opening, brightest along the caustic at its outer edge
+    r = _radius(x, y)
+    cut = np.hypot(x + 0.75, y) - 1.05
+    return (0.35 + 0.65 * _bump(r - 0.9, 0.09)) * _inside(r - 0.94, 0.05) * _inside(-cut, 0.18)
+
+
+def _soft_glare() -> F64:
+    x, y = _grid()
+    r = _radius(x, y)
+    fade = _inside(r - 0.55, 0.45)
+    core, skirt = _bump(r, 0.045), 0.22 / (1 + (r / 0.07) ** 2) + 0.05 * np.exp(-r / 0.3)
+    tint = np.array([1.0, 0.96, 0.9])
+    return ((core + skirt) * fade)[..., None] * tint
+
+
+def _starburst_glare() -> F64:
+    x, y = _grid()
+    r = _radius(x, y)
+    angle = np.arctan2(y, x)
+    planes = []
+    for wavelength in (1.15, 1.0, 0.85):  # diffraction reaches further in red
+        q = r / wavelength
+        # 14 rays of a seven-bladed iris, each of constant width
+        across = q * np.abs(np.sin(7 * angle + 0.4)) / 7
+        rays = 0.5 * np.exp(-q / 0.2) * _bump(across, 0.006 + 0.004 * wavelength)
+        glow = _bump(q, 0.04) + 0.16 / (1 + (q / 0.05) ** 2)
+        planes.append((rays + glow) * _inside(r - 0.6, 0.38))
+    return np.stack(planes, axis=-1) * np.array([1.0, 0.97, 0.93])
+
+
+# name → (how it was made, maker)
+TEXTURES: dict[str, tuple[str, Callable[[], F64]]] = {
+    "flare_01": ("close: warm orb, bright core", lambda: _coloured((0.30, 0.27, 0.21), 0.02, _orb)),
+    "flare_02": ("close: dense green disc", lambda: _coloured((0.07, 0.15, 0.12), 0.02, _disc)),
+    "flare_03": ("close: amber disc, bright limb", lambda: _coloured((0.18, 0.135, 0.08), 0.025, _limb_disc)),
+    "flare_04": (
+        "close: magenta orb, leaning outwards",
+        lambda: _coloured((0.18, 0.10, 0.17), 0.02, _leaning_orb),
+    ),
+    "flare_05": (
+        "close: blue disc with a denser core",
+        lambda: _coloured((0.07, 0.14, 0.21), 0.03, _cored_disc),
+    ),
+    "flare_06": ("far: thin ring, colours parted", lambda: _coloured((0.17, 0.17, 0.18), 0.022, _ring)),
+    "flare_07": (
+        "far: iris of six blades, bright edge",
+        lambda: _coloured((0.06, 0.13, 0.10), 0.02, _hexagon),
+    ),
+    "flare_08": (
+        "far: iris of seven blades, graded",
+        lambda: _coloured((0.13, 0.08, 0.15), 0.025, _heptagon),
+    ),
+    "flare_09": ("far: double halo, colours parted", lambda: _coloured((0.14, 0.135, 0.13), 0.03, _halo)),
+    "flare_10": ("far: clipped pupil with a caustic", lambda: _coloured((0.16, 0.15, 0.20), 0.03, _crescent)),
+    "glare_1": ("glare: core and soft skirt", _soft_glare),
+    "glare_2": ("glare: core and starburst of 14 rays", _starburst_glare),
+}
+
+
+def make(name: str) -> NDArray[np.uint16]:
+    """One texture, uint16[y, x, 3] RGB, 65535 = 1."""
+    values = TEXTURES[name][1]()
+    steps = np.rint(np.clip(values, 0, 1) * (65536 / STEP))
+    return np.minimum(steps * STEP, 65535).astype(np.uint16)
+
+
+def write_all(folder: Path) -> None:
+    """Write every texture, and SOURCES.md."""
+    folder.mkdir(parents=True, exist_ok=True)
+    rows = []
+    for name, (how, _) in TEXTURES.items():
+        path = folder / f"{name}.png"
+        cv2.imwrite(str(path), make(name)[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 9])
+        rows.append(f"| `{path.name}` | {how} | `{hashlib.sha256(path.read_bytes()).hexdigest()}` |")
+    (folder / "SOURCES.md").write_text(_SOURCES.format(size=SIZE_PX, fill=FILL, rows="\n".join(rows)))
+
+
+_SOURCES = """\
+# Textures
+
+Flares and glares of `straylight/texture`. All are our own work, computed from closed-form profiles by
+`python -m vbnfault.faults.flare_textures textures` (no photograph, no third party's texture), under the
+project's licence.
+
+Unit: share of white at brightness 1, linear in light, 65535 = 1; 16 bit RGB, {size} × {size} px. A flare's
+outline lies at {fill} of the half size; its +x axis points along the line from the Sun through the centre of
+the image. Flares 1-5 form the group `close` to the Sun, 6-10 the group `far` from it.
+
+| file | how it was made | sha256 |
+|---|---|---|
+{rows}
+"""
+
+
+def main() -> None:
+    """Command line: one argument, the folder to write to."""
+    import sys
+
+    if len(sys.argv) != 2:
+        raise SystemExit("usage: python -m vbnfault.faults.flare_textures OUTDIR")
+    write_all(Path(sys.argv[1]))
+
+
+if __name__ == "__main__":
+    main()

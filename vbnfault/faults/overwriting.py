@@ -1,0 +1,164 @@
+"""Pixel overwriting: a user's own texture on the image, the general tool behind the paper's faults.
+
+The texture file (PNG or TIFF, 8 or 16 bit, grey or RGB, with or without alpha) is stretched to the frame and
+blended with the chosen channels, t being the texture and v the image, both 0-255:
+
+    replace   v' = t              add       v' = v + t
+    multiply  v' = v · t / 255    mixture   v' = (1 - strength) v + strength · t
+
+Where the texture has an alpha channel a, the result is v + a (v' - v). A grey texture serves all channels;
+of an RGB texture I takes the luminance. Channels "I" alone follows the paper's way of changing the
+intensity: R, G and B are scaled by the same ratio. Values clip to 0-255.
+
+The mask holds the pixels on which the texture can act: alpha above 0 and, in the chosen channels, a value
+above 0 (add), below 255 (multiply) or any (replace, mixture).
+"""
+
+# ruff: noqa: RUF009 (bounds() and its kin are field specifiers)
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import InputError
+from ..quantities import CHANNELS, LUMINANCE
+from .base import Fault, FaultContext, Params, choice, number, scale_by_intensity, text
+
+BLENDS = ("replace", "add", "multiply", "mixture")
+
+
+@dataclass(frozen=True, kw_only=True)
+class TextureOverwriting(Fault):
+    """A texture file blended with the digital image."""
+
+    fault = "pixel_overwriting"
+    model = "texture"
+    step = "rgbi"
+
+    texture_file: str = text("", doc="path of a PNG or TIFF texture; required")
+    channels: str = text("RGBI", doc='the channels to overwrite, such as "RGBI", "I" or "R"')
+    blend: str = choice("replace", BLENDS, doc="how the texture joins the image")
+    strength: float = number(0.5, limits=(0, 1), doc="weight of the texture in a mixture")
+
+    def validate(self) -> None:
+        if not self.texture_file:
+            raise ValueError("texture_file is missing: name a PNG or TIFF texture")
+        if not Path(self.texture_file).is_file():
+            raise ValueError(f"texture_file = {self.texture_file!r}: no such file")
+        known = sorted(self.channels, key="RGBI".find)
+        if not known or known != [c for c in CHANNELS if c in self.channels]:
+            raise ValueError(f"channels = {self.channels!r}: must name some of R, G, B, I, each once")
+
+    def draw(self, context: FaultContext, rng: np.random.Generator) -> Params:
+        """Nothing is random: the settings, and the SHA-256 of the texture file."""
+        path = Path(self.texture_file)
+        if not path.is_file():
+            raise InputError(f"faults.{self.fault}.texture_file = {self.texture_file!r}: no such file")
+        return {
+            "texture_file": self.texture_file,
+            "sha256": hashlib.sha256(path.read_bytes()).hexdigest(),
+            "channels": self.channels,
+            "blend": self.blend,
+            "strength": float(self.strength),
+        }
+
+    def apply(self, quantity: Any, params: Params, context: FaultContext) -> Any:
+        """The image with the texture blended in."""
+        texture, alpha = _fitted(params, context)
+        where = np.flatnonzero(self._mask(params, context))
+        out = quantity.array.copy()
+        flat = out.reshape(-1, 4)
+        before = flat[where].astype(np.float32)
+        t, a = texture.reshape(-1, 4)[where], alpha.reshape(-1, 1)[where]
+        blended = _blend(before, t, params["blend"], params["strength"])
+        after = before + a * (blended - before)
+        if params["channels"] == "I":
+            flat[where] = scale_by_intensity(flat[where], np.clip(after[:, 3], 0, 255))
+        else:
+            for channel in params["channels"]:
+                c = CHANNELS.index(channel)
+                flat[where, c] = np.clip(np.rint(after[:, c]), 0, 255).astype(np.uint8)
+        return quantity.with_array(out)
+
+    def footprint(self, params: Params, context: FaultContext) -> NDArray[np.bool_]:
+        """bool[y, x]: where the texture can act."""
+        mask: NDArray[np.bool_] = self._mask(params, context).copy()
+        return mask
+
+    def _mask(self, params: Params, context: FaultContext) -> NDArray[np.bool_]:
+        return context.once("overwriting.mask", params, lambda: _mask(params, *_fitted(params, context)))
+
+
+def _fitted(params: Params, context: FaultContext) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    return _stretch(params["texture_file"], params["sha256"], context.shape)
+
+
+def _mask(params: Params, texture: NDArray[np.float32], alpha: NDArray[np.float32]) -> NDArray[np.bool_]:
+    mask = alpha > 0
+    used = texture[..., [CHANNELS.index(c) for c in params["channels"]]]
+    if params["blend"] == "add":
+        mask &= (used > 0).any(axis=-1)
+    elif params["blend"] == "multiply":
+        mask &= (used < 255).any(axis=-1)
+    elif params["blend"] == "mixture" and params["strength"] == 0:
+        mask[:] = False
+    return mask
+
+
+def _blend(
+    v: NDArray[np.float32], t: NDArray[np.float32], blend: str, strength: float
+) -> NDArray[np.float32]:
+    if blend == "add":
+        return v + t
+    if blend == "multiply":
+        return v * t * np.float32(1 / 255)
+    weight = np.float32(strength if blend == "mixture" else 1.0)
+    return v + weight * (t - v)
+
+
+@lru_cache(maxsize=2)
+def _stretch(
+    path: str, sha256: str, shape: tuple[int, int]
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Texture RGBI float32[y, x, 4] in 0-255 and alpha float32[y, x] in 0-1, at the frame's size."""
+    texture, alpha = load(path, sha256)
+    if texture.shape[:2] != shape:
+        shrinks = texture.shape[0] > shape[0] and texture.shape[1] > shape[1]
+        how = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
+        texture, alpha = (
+            np.asarray(cv2.resize(a, shape[::-1], interpolation=how), dtype=np.float32)
+            for a in (texture, alpha)
+        )
+    return texture, alpha
+
+
+def load(path: str, sha256: str | None = None) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """A texture file as RGBI float32[y, x, 4] in 0-255 and alpha float32[y, x] in 0-1.
+
+    Raises InputError where it is missing, is no such image, or its content is not that of `sha256`.
+    """
+    where = f"faults.pixel_overwriting.texture_file = {path!r}"
+    try:
+        data = Path(path).read_bytes()
+    except OSError as error:
+        raise InputError(f"{where}: cannot be read ({error.strerror})") from None
+    if sha256 and hashlib.sha256(data).hexdigest() != sha256:
+        raise InputError(f"{where}: its content has changed since the parameters were drawn")
+    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if data else None
+    if image is None or image.dtype not in (np.uint8, np.uint16):
+        raise InputError(f"{where}: must be a PNG or TIFF image of 8 or 16 bits")
+    full = 255 if image.dtype == np.uint8 else 65535
+    plain = np.atleast_3d(image).astype(np.float32) / np.float32(full)
+    alpha = np.ones(plain.shape[:2], np.float32)
+    if plain.shape[2] in (2, 4):
+        alpha = np.ascontiguousarray(plain[..., -1])
+    rgb = plain[..., 2::-1] if plain.shape[2] >= 3 else np.repeat(plain[..., :1], 3, axis=2)
+    intensity = rgb @ LUMINANCE if plain.shape[2] >= 3 else plain[..., 0]
+    return np.concatenate([rgb, intensity[..., None]], axis=2) * np.float32(255), alpha

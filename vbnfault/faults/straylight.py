@@ -1,0 +1,276 @@
+"""Straylight, the paper's model: flare and glare textures on the line from the Sun through the centre.
+
+On that line the Sun lies at position 0 and the centre of the image at 1 (King 2001). A flare is a texture
+centred at sun + position · (centre - sun), its outline at `radius` · image width, turned so that its own axis
+follows the line, and added to the image:
+
+    signal += brightness · visible fraction of the Sun · texture · white
+
+per colour, texture in [0, 1] linear (1 = white), white the signal shown as 255. Nothing clips here.
+
+As in the paper: flares are drawn without replacement from ten; positions and radii are sorted together, so
+that flares grow with the distance from the Sun; textures of the group *close* (1-5) take the nearer
+positions, those of the group *far* (6-10) the farther ones.
+
+Choices where the paper is silent:
+- position, radius and brightness are drawn uniformly within the table's bounds (the text's remark on
+  positions beyond (0, 1) explains why the table ends at 2: further out they leave the frame). The radius
+  refers to the width of the image. A draw without a flare in the frame is repeated, up to 256 times.
+- One of two glares, or none, with equal chance, sits at the Sun, when the Sun is in the frame or so near
+  that the glare reaches into it. Its bounds, radius 0.2-0.45 and brightness 0.8-1.6, are ours.
+- The mask is the effect rule; the footprint is the texture from 1 DN of 255 on.
+"""
+
+# ruff: noqa: RUF009 (bounds() and its kin are field specifiers)
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import VbnfaultError
+from ..resources import data_dir
+from .base import Fault, FaultContext, Interval, Params, bounds, number, rows
+from .flare_textures import FILL
+
+CLOSE = (1, 2, 3, 4, 5)
+FAR = (6, 7, 8, 9, 10)
+GLARES = (1, 2)
+MAX_DRAWS = 256
+
+Window = tuple[slice, slice]
+
+
+@dataclass(frozen=True, kw_only=True)
+class TextureStraylight(Fault):
+    """Flares and glare from textures (Gallon et al., table of straylight parameters)."""
+
+    fault = "straylight"
+    model = "texture"
+    step = "electrons"
+    needs_sun = True
+    effect_mask = True
+
+    count: Interval = bounds(
+        1, 10, limits=(0, 10), integer=True, doc="number of flares, at most one per texture"
+    )
+    index: Interval = bounds(
+        1,
+        10,
+        limits=(1, 10),
+        integer=True,
+        doc="textures to choose from: 1-5 close to the Sun, 6-10 far from it",
+    )
+    position: Interval = bounds(
+        0.5, 2, limits=(-20, 20), doc="place on the line: 0 the Sun, 1 the centre of the image"
+    )
+    radius: Interval = bounds(0.05, 0.3, limits=(1e-3, 5), unit="image widths", doc="radius of a flare")
+    brightness: Interval = bounds(1.5, 2.5, limits=(0, 1000), doc="factor on a flare's texture")
+    glare: Interval = bounds(
+        0, 2, limits=(0, 2), integer=True, doc="glare at the Sun: 0 none, or texture 1 or 2"
+    )
+    glare_radius: Interval = bounds(
+        0.2, 0.45, limits=(1e-3, 5), unit="image widths", doc="radius of the glare"
+    )
+    glare_brightness: Interval = bounds(0.8, 1.6, limits=(0, 1000), doc="factor on the glare's texture")
+    mask_level_dn: float = number(
+        1.0,
+        limits=(0.01, 255),
+        unit="DN of 255",
+        doc="the footprint holds the pixels that gain at least this much",
+    )
+    flares: tuple[Mapping[str, float], ...] = rows(
+        {"index": (1, 10), "position": (-20, 20), "radius": (1e-3, 5), "brightness": (0, 1000)},
+        doc="the flares themselves, in place of a draw of count, index, position, radius and brightness",
+    )
+
+    def validate(self) -> None:
+        choices = int(self.index.hi) - int(self.index.lo) + 1
+        if self.count.lo > choices:
+            raise ValueError(f"count = {list(self.count)}: index leaves {choices} textures, each used once")
+        for i, row in enumerate(self.flares):
+            if not float(row["index"]).is_integer():
+                raise ValueError(f"flares[{i}].index = {row['index']}: must be a whole number from 1 to 10")
+
+    def draw(self, context: FaultContext, rng: np.random.Generator) -> Params:
+        """`flares` (tables of index, position, radius, brightness), `glare` (a table or None), the centre."""
+        height, width = context.shape
+        params: Params = {
+            "flares": [],
+            "glare": self._draw_glare(context, rng),
+            "centre_xy_px": [width / 2, height / 2],
+            "mask_level_dn": float(self.mask_level_dn),
+        }
+        if self.flares:
+            params["flares"] = [
+                {"index": int(r["index"])} | {k: float(r[k]) for k in ("position", "radius", "brightness")}
+                for r in self.flares
+            ]
+            return params
+        for _ in range(MAX_DRAWS):
+            params["flares"] = self._draw_flares(rng)
+            if not params["flares"] or context.sun_xy_px is None or _any_in_frame(params, context):
+                break
+        return params
+
+    def _draw_flares(self, rng: np.random.Generator) -> list[dict[str, Any]]:
+        textures = np.arange(int(self.index.lo), int(self.index.hi) + 1)
+        count = min(self.count.integer(rng), len(textures))
+        chosen = rng.permutation(textures)[:count]
+        chosen = np.concatenate([chosen[chosen <= CLOSE[-1]], chosen[chosen > CLOSE[-1]]])
+        position = np.sort(self.position.uniform(rng, count))
+        radius = np.sort(self.radius.uniform(rng, count))
+        brightness = self.brightness.uniform(rng, count)
+        return [
+            {"index": int(i), "position": float(p), "radius": float(r), "brightness": float(b)}
+            for i, p, r, b in zip(chosen, position, radius, brightness, strict=True)
+        ]
+
+    def _draw_glare(self, context: FaultContext, rng: np.random.Generator) -> dict[str, Any] | None:
+        index = self.glare.integer(rng)
+        radius = self.glare_radius.uniform(rng)
+        brightness = self.glare_brightness.uniform(rng)
+        if index == 0 or context.sun_xy_px is None:
+            return None
+        if not _reaches_frame(context.sun_xy_px, radius * context.shape[1], context.shape):
+            return None
+        return {"index": index, "radius": radius, "brightness": brightness}
+
+    def apply(self, quantity: Any, params: Params, context: FaultContext) -> Any:
+        """Expected electrons plus flares and glare."""
+        layer = _layer_once(params, context, quantity.white_e)
+        return quantity if layer is None else quantity.with_array(cv2.add(quantity.array, layer))
+
+    def footprint(self, params: Params, context: FaultContext) -> NDArray[np.bool_]:
+        """bool[y, x]: where any colour gains at least `mask_level_dn`."""
+        white = context.camera.detector.white_e
+        layer = _layer_once(params, context, white)
+        if layer is None:
+            return np.zeros(context.shape, dtype=bool)
+        level = white * np.float32(params["mask_level_dn"] / 255)
+        below = tuple(map(float, np.nextafter(level, np.float32(0))))
+        return cv2.inRange(layer, (-1.0,) * 3, below) == 0
+
+
+def flare_centres_px(params: Params, sun_xy_px: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Pixel x, y of the drawn flares' centres, float64[flare, 2]."""
+    sun, centre = np.asarray(sun_xy_px, dtype=float), np.asarray(params["centre_xy_px"], dtype=float)
+    position = np.array([f["position"] for f in params["flares"]], dtype=float)
+    return sun + position[:, None] * (centre - sun)
+
+
+def _any_in_frame(params: Params, context: FaultContext) -> bool:
+    assert context.sun_xy_px is not None
+    centres = flare_centres_px(params, context.sun_xy_px)
+    width = context.shape[1]
+    return any(
+        _reaches_frame(c, 0.8 * f["radius"] * width, context.shape)
+        for c, f in zip(centres, params["flares"], strict=True)
+    )
+
+
+def _reaches_frame(xy: NDArray[np.float64], radius_px: float, shape: tuple[int, int]) -> bool:
+    """Whether a disc overlaps the frame."""
+    nearest = np.clip(xy, 0, shape[::-1])
+    return bool(np.hypot(*(nearest - xy)) < radius_px)
+
+
+def _layer_once(
+    params: Params, context: FaultContext, white_e: NDArray[np.float32]
+) -> NDArray[np.float32] | None:
+    white = np.asarray(white_e, dtype=np.float32)
+    name = f"straylight.layer {white.tobytes().hex()}"
+    return context.once(name, params, lambda: _layer(params, context, white))
+
+
+def _layer(params: Params, context: FaultContext, white_e: NDArray[np.float32]) -> NDArray[np.float32] | None:
+    """All flares and the glare, electrons float32[y, x, 3]; None where there is nothing to add."""
+    visible = 1.0 if context.sun_visible_fraction is None else float(context.sun_visible_fraction)
+    if context.sun_xy_px is None or visible <= 0:
+        return None
+    sun = np.asarray(context.sun_xy_px, dtype=float)
+    height, width = context.shape
+    along = np.asarray(params["centre_xy_px"]) - sun
+    angle = float(np.arctan2(along[1], along[0])) if along.any() else 0.0
+
+    stamps = [
+        (f"flare_{f['index']:02d}", centre, f)
+        for f, centre in zip(params["flares"], flare_centres_px(params, sun), strict=True)
+    ]
+    if params["glare"]:
+        stamps.append((f"glare_{params['glare']['index']}", sun, params["glare"]))
+    layer = None
+    for name, centre, f in stamps:
+        gain = white_e * np.float32(visible * f["brightness"])
+        placed = _stamp(name, centre, f["radius"] * width, angle, gain, context.shape)
+        if placed is None:
+            continue
+        if layer is None:
+            layer = np.zeros((height, width, 3), dtype=np.float32)
+        window, stamp = placed
+        cv2.add(layer[window], stamp, layer[window])
+    return layer
+
+
+def _stamp(
+    name: str,
+    centre: NDArray[np.float64],
+    radius_px: float,
+    angle: float,
+    gain: NDArray[np.float32],
+    shape: tuple[int, int],
+) -> tuple[Window, NDArray[np.float32]] | None:
+    """A texture times `gain` (per colour), resampled onto the pixels it covers; None outside the frame.
+
+    `angle` in radians turns the texture's +x towards image +y. With pixel centres at +0.5 on both sides, the
+    pixel of index i shows the texel of index S/2 - 0.5 + Rᵀ(i + 0.5 - centre) / s, s pixels wide being a
+    texel.
+    """
+    half = radius_px / FILL
+    x0, y0 = (max(0, int(np.floor(v - half))) for v in centre)
+    x1, y1 = (min(size, int(np.ceil(v + half))) for v, size in zip(centre, shape[::-1], strict=True))
+    if x0 >= x1 or y0 >= y1:
+        return None
+    levels = pyramid(name)
+    # halved by averaging until a texel is about as wide as a pixel: thin rings do not alias
+    texels_per_px = len(levels[0]) / (2 * half)
+    level = levels[int(np.clip(round(np.log2(texels_per_px)), 0, len(levels) - 1))]
+    size = len(level)
+    zoom = size / (2 * half)
+    cos, sin = zoom * np.cos(angle), zoom * np.sin(angle)
+    dx, dy = x0 + 0.5 - centre[0], y0 + 0.5 - centre[1]
+    origin = size / 2 - 0.5
+    matrix = np.array(
+        [[cos, sin, origin + cos * dx + sin * dy], [-sin, cos, origin - sin * dx + cos * dy]],
+        dtype=np.float64,
+    )
+    stamp = cv2.warpAffine(
+        level * gain,
+        matrix,
+        (x1 - x0, y1 - y0),
+        flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
+        borderMode=cv2.BORDER_CONSTANT,
+        borderValue=0,
+    )
+    return (slice(y0, y1), slice(x0, x1)), np.asarray(stamp, dtype=np.float32)
+
+
+@lru_cache(maxsize=16)
+def pyramid(name: str) -> tuple[NDArray[np.float32], ...]:
+    """A packaged texture, RGB float32[y, x, 3] in [0, 1], and its halvings by 2×2 means; read-only."""
+    path = data_dir("textures") / f"{name}.png"
+    image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    if image is None or image.dtype != np.uint16 or image.ndim != 3:
+        raise VbnfaultError(f"{path}: missing or damaged; install vbnfault again")
+    levels = [np.ascontiguousarray(image[..., ::-1], dtype=np.float32) / np.float32(65535)]
+    while levels[-1].shape[0] % 2 == 0 and levels[-1].shape[0] > 6:
+        half = levels[-1].shape[0] // 2
+        levels.append(levels[-1].reshape(half, 2, half, 2, 3).mean(axis=(1, 3), dtype=np.float32))
+    for level in levels:
+        level.flags.writeable = False
+    return tuple(levels)

@@ -1,0 +1,77 @@
+"""Vignetting, the paper's model: the cos⁴ law with a random on-axis illuminance E0.
+
+    factor(θ) = E0 / 255 · cos⁴θ,     tan θ = r / f,
+
+r being the distance of a pixel's centre from the frame's middle and f the focal length in pixels. E0 below
+255 darkens the whole image, as the paper's texture does. It acts on the expected photo-electrons, on R, G
+and B alike. The thin lens applies no cos⁴ of its own, so nothing is counted twice.
+"""
+
+# ruff: noqa: RUF009 (bounds() and its kin are field specifiers)
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from .base import Fault, FaultContext, Interval, Params, bounds, number
+
+
+@dataclass(frozen=True, kw_only=True)
+class Cos4Vignetting(Fault):
+    """Natural vignetting by the cos⁴ law (Gallon et al., table of vignetting parameters)."""
+
+    fault = "vignetting"
+    model = "cos4"
+    step = "electrons"
+    localised = False
+
+    on_axis_illuminance_dn: Interval = bounds(
+        105, 255, limits=(0, 255), unit="DN of 255", doc="E0: 255 leaves the centre as it is"
+    )
+    mask_loss: float = number(
+        0.1, limits=(0, 1), doc="the mask holds the pixels that lose at least this fraction"
+    )
+
+    def draw(self, context: FaultContext, rng: np.random.Generator) -> Params:
+        """E0, and the loss from which the mask starts."""
+        return {
+            "on_axis_illuminance_dn": self.on_axis_illuminance_dn.uniform(rng),
+            "mask_loss": float(self.mask_loss),
+        }
+
+    def apply(self, quantity: Any, params: Params, context: FaultContext) -> Any:
+        """Expected electrons times the factor of each pixel."""
+        cos4 = _cos4_rgb(context.shape, context.camera.focal_length_px)
+        e0 = params["on_axis_illuminance_dn"] / 255
+        return quantity.with_array(cv2.multiply(quantity.array, cos4, scale=e0))
+
+    def footprint(self, params: Params, context: FaultContext) -> NDArray[np.bool_]:
+        """bool[y, x]: where the loss reaches `mask_loss`."""
+        e0 = np.float32(params["on_axis_illuminance_dn"] / 255)
+        factor = e0 * cos4_map(context.shape, context.camera.focal_length_px)
+        return factor <= np.float32(1 - params["mask_loss"])
+
+
+@lru_cache(maxsize=2)
+def cos4_map(shape: tuple[int, int], focal_length_px: float) -> NDArray[np.float32]:
+    """cos⁴ of the off-axis angle of every pixel's centre, float32[y, x] in (0, 1], read-only."""
+    height, width = shape
+    x2 = ((np.arange(width) + 0.5 - width / 2) / focal_length_px) ** 2
+    y2 = ((np.arange(height) + 0.5 - height / 2) / focal_length_px) ** 2
+    cos2 = 1 / (1 + x2[None, :] + y2[:, None])
+    out = (cos2 * cos2).astype(np.float32)
+    out.flags.writeable = False
+    return out
+
+
+@lru_cache(maxsize=2)
+def _cos4_rgb(shape: tuple[int, int], focal_length_px: float) -> NDArray[np.float32]:
+    # three equal planes, kept for all samples of a camera: one fast product in place of a broadcast
+    out = np.repeat(cos4_map(shape, focal_length_px)[..., None], 3, axis=2)
+    out.flags.writeable = False
+    return out
