@@ -175,7 +175,7 @@ def test_nucleus_is_a_closed_bilobed_body_of_the_published_size() -> None:
     assert mesh.volume == pytest.approx(18.6e9, rel=0.02)
     # 5.0 × 3.7 × 3.2 km, which lobe ellipsoids alone miss by up to 10 %.
     np.testing.assert_allclose(mesh.extents, [5000, 3700, 3200], rtol=0.10)
-    # The waist between the lobes is slimmer than either (67P: sections of 7.7, 1.9 and 4.5 km² along this axis).
+    # The waist between the lobes is slimmer than either (67P: 7.7, 1.9 and 4.5 km² along this axis).
     centres = 1000 * np.array([[-0.42, 0.26, -0.06], [1.48, -0.34, 0.25]])
     axis = (centres[1] - centres[0]) / np.linalg.norm(centres[1] - centres[0])
     steps = np.linspace(0.0, 1.0, 11)[:, None]
@@ -184,7 +184,7 @@ def test_nucleus_is_a_closed_bilobed_body_of_the_published_size() -> None:
 
 
 def _section_area(mesh: trimesh.Trimesh, origin: object, axis: np.ndarray) -> float:
-    """Area of a plane cut, by Green's theorem over its segments, turned so that the solid lies to their left."""
+    """Area of a plane cut, by Green's theorem over its segments, the solid on their left."""
     point = np.asarray(origin, dtype=float)
     lines, face = trimesh.intersections.mesh_plane(mesh, axis, point, return_faces=True)
     a, b = lines[:, 0] - point, lines[:, 1] - point

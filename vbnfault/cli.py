@@ -112,15 +112,15 @@ def build(
     settings: SetOption = None,
 ) -> None:
     """Build a dataset, or resume one: a store of the same scene is completed and mended where it is damaged."""
-    from . import build as builder
-    from . import llvm
+    from . import dataset, llvm
 
     source = _scene(scene, settings, dataset__samples=samples, dataset__seed=seed)
     if not dry_run:
         llvm.find()
-    builder.build_scene(
+    summary = dataset.build_scene(
         source,
         out,
+        source=scene,
         workers=workers,
         threads=threads,
         scheduler=scheduler,
@@ -128,8 +128,9 @@ def build(
         overwrite=overwrite,
         dry_run=dry_run,
         samples_given=samples is not None,
-        name=scene,
     )
+    for line in summary.lines():
+        typer.echo(line)
 
 
 @app.command()

@@ -5,12 +5,13 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import importlib.metadata
+import os
 import platform
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from . import __version__, config, pipeline, plan, resources
+from . import __version__, build, config, pipeline, plan, resources, store
 from .config import SceneConfig
 from .errors import InputError
 from .store import StoreSpec
@@ -62,7 +63,6 @@ def store_spec(session: pipeline.Session, blocks: Sequence[int]) -> StoreSpec:
         "description": scene.description,
         "scene": identity,
         "scene_hash": config.content_hash(identity, versions()),
-        "scene_source": scene.resolved(),
         "seed": dataset.seed,
         "blocks": list(blocks),
         "versions": versions(),
@@ -89,7 +89,10 @@ def store_spec(session: pipeline.Session, blocks: Sequence[int]) -> StoreSpec:
 
 def planned(attributes: Mapping[str, Any], faults: Sequence[str]) -> Callable[[int], dict[str, Any]]:
     """What the plan of a stored scene says of a sample: the scalars that rendering cannot change."""
-    scene: SceneConfig = config.parse_scene(attributes["scene_source"], source="the store's own scene")
+    stored = {key: value for key, value in attributes["scene"].items() if key != "textures_sha256"}
+    stored["body"] = {key: value for key, value in stored["body"].items() if key != "shape_sha256"}
+    stored["dataset"] = {**stored["dataset"], "samples": attributes["blocks"][0]}
+    scene = config.parse_scene(stored, source="the store's own scene")
     table = plan.make_plan(scene, faults, attributes["blocks"])
 
     def expected(index: int) -> dict[str, Any]:
@@ -115,4 +118,43 @@ class SessionFactory:
     threads: int | None = None
 
     def __call__(self) -> pipeline.Session:
-        return pipeline.Session(self.scene, blocks=self.blocks, threads=self.threads)
+        threads = self.threads or int(os.environ.get("VBNFAULT_THREADS", "0")) or None
+        return pipeline.Session(self.scene, blocks=self.blocks, threads=threads)
+
+
+def build_scene(
+    scene: SceneConfig,
+    out: Path,
+    *,
+    source: str,
+    workers: int = 1,
+    threads: int | None = None,
+    scheduler: str | None = None,
+    append: int | None = None,
+    overwrite: bool = False,
+    dry_run: bool = False,
+    samples_given: bool = True,
+) -> build.Summary:
+    """Build, resume, mend or extend the store of a scene at `out`; see `build.build` for what is raised.
+
+    `source` names the scene in errors. With `append` and no samples given, the store's own first block counts.
+    """
+    samples = scene.dataset.samples
+    if append and not samples_given and store.is_store(out):
+        samples = int(store.open_store(out).attributes["blocks"][0])
+    blocks = build.planned_blocks(out, samples, append=append or 0, overwrite=overwrite)
+    session = pipeline.Session(scene, blocks=blocks, source=source)
+    counts = {name: int(session.plan.injects(name).sum()) for name in session.faults}
+    return build.build(
+        SessionFactory(scene, blocks, threads),
+        store_spec(session, blocks),
+        out,
+        site=session.plan.site,
+        blocks=blocks,
+        workers=workers,
+        scheduler=scheduler,
+        threads=threads,
+        overwrite=overwrite,
+        dry_run=dry_run,
+        fault_counts=counts,
+    )

@@ -59,7 +59,7 @@ def preview(
     columns = min(len(tiles), max(1, round(np.sqrt(len(tiles) * 1.25))))
     body = _grid(tiles, columns)
     name = f"{store.path.name}: {len(chosen)} of {store.samples} samples"
-    sheet = np.vstack([_header(name, store.spec.faults, short, body.shape[1], masks), body])
+    sheet = np.vstack([_header(name, store.spec.faults, short, body.shape[1]), body])
     _write_png(Path(out_png), sheet)
     return len(tiles)
 
@@ -160,7 +160,7 @@ def _grid(tiles: Sequence[U8], columns: int) -> U8:
     return sheet
 
 
-def _header(name: str, faults: Sequence[str], short: Mapping[str, str], width: int, masks: bool) -> U8:
+def _header(name: str, faults: Sequence[str], short: Mapping[str, str], width: int) -> U8:
     """Name of the store, and the legend in as many lines as it takes."""
     entries = [(k, f"{short[f]}  {f.replace('_', ' ')}") for k, f in enumerate(faults)]
     places, x, line = [], _GAP_PX, 0
@@ -174,7 +174,7 @@ def _header(name: str, faults: Sequence[str], short: Mapping[str, str], width: i
     _write(header, name, (_GAP_PX, 30), _TEXT, 0.6)
     for (k, text), (x, line) in zip(entries, places, strict=True):
         y, colour = 44 + line * _LINE_PX, COLOURS[k % len(COLOURS)]
-        veil = tuple(int(c * (0.55 if masks else 1)) for c in colour)
+        veil = tuple(int(c * 0.55) for c in colour)
         cv2.rectangle(header, (x, y), (x + 14, y + 14), veil, -1)
         cv2.rectangle(header, (x, y), (x + 14, y + 14), colour, 1, cv2.LINE_AA)
         _write(header, text, (x + 22, y + 12), _TEXT, 0.42)
