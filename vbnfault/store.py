@@ -877,9 +877,11 @@ def verify(
         if sound:
             start = store.shard(number).start
             columns = {name: store.column(name, number) for name in SCALARS}
+            masks = {name: store.chunk(name, number) for name in ("mask", "mask_any")}
             for i in sound:
                 scalars = {name: column[i - start] for name, column in columns.items()}
-                problems += _check_labels(store, i, scalars)
+                layers = {name: _decode(store.spec, name, chunks[i]) for name, chunks in masks.items()}
+                problems += _check_labels(store.spec, i, scalars, layers)
                 problems += _check_split(store, i, scalars, split_of)
                 problems += _check_plan(i, scalars, expected(i) if expected else {})
         if progress:
@@ -887,8 +889,15 @@ def verify(
     return problems
 
 
-def _check_labels(store: Store, i: int, scalars: Mapping[str, Any]) -> Iterator[str]:
-    spec, injected = store.spec, scalars["injected"]
+def _decode(spec: StoreSpec, name: str, chunk: bytes) -> NDArray[Any]:
+    row = spec.pixel_layers[name]
+    return np.frombuffer(_decompress(chunk), dtype=row.dtype).reshape(spec.shape(row))
+
+
+def _check_labels(
+    spec: StoreSpec, i: int, scalars: Mapping[str, Any], layers: Mapping[str, NDArray[Any]]
+) -> Iterator[str]:
+    injected, mask = scalars["injected"], layers["mask"]
     parameters = json.loads(str(scalars["parameters"]) or "{}")
     for fault, is_in in zip(spec.faults, injected.tolist(), strict=True):
         drawn = parameters.get(fault)
@@ -896,13 +905,12 @@ def _check_labels(store: Store, i: int, scalars: Mapping[str, Any]) -> Iterator[
         if listed != is_in:
             says = "has no parameters, although" if is_in else "has parameters, although not"
             yield f"sample {i}: {fault} {says} marked in injected"
-    mask = store.read("mask", i, i + 1)[0]
     for k, fault in enumerate(spec.faults):
         if not injected[k] and mask[k].any():
             yield f"sample {i}: mask of {fault} is not empty, although it is not injected"
         if injected[k] and fault in (spec.localised_faults or ()) and not mask[k].any():
             yield f"sample {i}: mask of {fault} is empty, although it is injected"
-    if not np.array_equal(store.read("mask_any", i, i + 1)[0], mask_union(spec, mask)):
+    if not np.array_equal(layers["mask_any"], mask_union(spec, mask)):
         yield f"sample {i}: mask_any is not the union of the masks of {', '.join(spec.mask_any_faults)}"
 
 

@@ -11,9 +11,10 @@ Choices where the paper is silent or of two minds:
 - σxx and σyy (3-6) are taken as entries of the covariance matrix, as its table names them: the standard
   deviations are 1.7-2.4 grid units. (Read as standard deviations, grains would be up to 2.5 times as wide.)
 - One grid unit is 4.5 px of a 1024 px wide image: grains are then 33-47 px wide at a tenth of their depth,
-  the soft blobs of its figure, and 47-72 px where they end.
-- "The corners of the grid are removed": the grain ends on the ellipse where it falls below 1 DN, which
-  removes the corners of any square grid and leaves no visible edge.
+  the soft blobs of its figure, and 44-67 px where they end.
+- "The corners of the grid are removed": the grain ends on the ellipse where it falls below 2 DN of
+  255, which removes the corners of any square grid. That step of 0.8 % lies within the sensor's noise, and
+  from a quarter of white on it is what changes the 8 bit image: the mask is the grain.
 - Where grains overlap, their transmissions multiply (two grains in one beam); the order does not matter.
 """
 
@@ -67,7 +68,7 @@ class GaussianDust(Fault):
         4.5, limits=(0.01, 1e3), unit="px", doc="size of a grid unit in a 1024 px wide image"
     )
     mask_level_dn: float = number(
-        1.0,
+        2.0,
         limits=(0.01, 255),
         unit="DN of 255",
         doc="a grain ends where its darkening falls below this level; what remains is its mask",

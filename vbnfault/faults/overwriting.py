@@ -14,7 +14,6 @@ The mask holds the pixels on which the texture can act: alpha above 0 and, in th
 above 0 (add), below 255 (multiply) or any (replace, mixture).
 """
 
-# ruff: noqa: RUF009 (bounds() and its kin are field specifiers)
 from __future__ import annotations
 
 import hashlib
@@ -159,6 +158,6 @@ def load(path: str, sha256: str | None = None) -> tuple[NDArray[np.float32], NDA
     alpha = np.ones(plain.shape[:2], np.float32)
     if plain.shape[2] in (2, 4):
         alpha = np.ascontiguousarray(plain[..., -1])
-    rgb = plain[..., :3] if plain.shape[2] >= 3 else np.repeat(plain[..., :1], 3, axis=2)
+    rgb = plain[..., 2::-1] if plain.shape[2] >= 3 else np.repeat(plain[..., :1], 3, axis=2)
     intensity = rgb @ LUMINANCE if plain.shape[2] >= 3 else plain[..., 0]
     return np.concatenate([rgb, intensity[..., None]], axis=2) * np.float32(255), alpha

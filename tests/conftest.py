@@ -1,0 +1,43 @@
+"""What several test files share: small scenes, and the real shape where it is at hand."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+REAL_SHAPE = Path(__file__).resolve().parents[2] / "shared/data/shapes/67p_18k.obj"
+
+ALL_FAULTS = (
+    "dust_on_optics",
+    "broken_pixels",
+    "broken_lines",
+    "straylight",
+    "vignetting",
+    "optics_degradation",
+)
+
+
+@pytest.fixture(scope="session")
+def real_shape() -> Path:
+    """The 67P shape model; skips where it is not at hand, since it is not part of the project."""
+    if not REAL_SHAPE.is_file():
+        pytest.skip(f"the real shape model is not part of the project: no file {REAL_SHAPE}")
+    return REAL_SHAPE
+
+
+def small_scene(**tables: dict[str, Any]) -> dict[str, Any]:
+    """A scene of small images over coarse terrain, as plain data; `tables` are merged into it."""
+    scene: dict[str, Any] = {
+        "title": "small",
+        "dataset": {"samples": 16, "seed": 11, "sites": 4, "shard_samples": 4},
+        "patch": {"facet_m": 12.0, "radius_m": 60.0, "min_boulder_m": 6.0},
+        "camera": {"width_px": 96, "height_px": 80},
+        "render": {"samples_per_pixel": 4},
+        "plan": {"faulty_fraction": 0.75},
+        "faults": {name: {} for name in ALL_FAULTS},
+    }
+    for name, table in tables.items():
+        scene[name] = {**scene.get(name, {}), **table}
+    return scene
