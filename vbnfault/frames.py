@@ -61,11 +61,11 @@ def azimuth_elevation_deg(direction: F64) -> tuple[float, float]:
 def L_from_C0(reference_L: F64) -> F64:
     """Axes of C0 in L: z at the reference direction, y along the projection of L's down (0, 0, 1).
 
-    Where the reference is vertical the projection vanishes; y then points along the projection of south, which
-    continues the case of a reference tilted slightly north.
+    Where the reference is vertical the projection vanishes; y then points south for nadir and north for the
+    zenith, which continues the case of a reference tilted slightly north.
     """
     z = unit(reference_L)
-    for down in (np.array([0.0, 0.0, 1.0]), np.array([-1.0, 0.0, 0.0])):
+    for down in (np.array([0.0, 0.0, 1.0]), np.array([-z[2], 0.0, 0.0])):
         y = down - (down @ z) * z
         if np.linalg.norm(y) > 1e-9:
             break

@@ -419,11 +419,29 @@ def _develop(frame: Frame, drawn: Mapping[str, Params], noise: Noise | None) -> 
 
 def _invisible(frame: Frame, noise: Noise) -> list[str]:
     """Drawn faults without any effect on the noise-free picture."""
-    return [
-        name
-        for name in sorted(_doubtful(frame, noise))
-        if not effect_of(frame, name).any()
-    ]
+    doubtful = sorted(_doubtful(frame, noise))
+    return [n for n in doubtful if not (_shows_on_some_rows(frame, n) or effect_of(frame, n).any())]
+
+
+def _shows_on_some_rows(frame: Frame, name: str) -> bool:
+    """Whether every eighth row of the noise-free picture is enough to see an optical fault."""
+    faults, drawn = frame.spec.faults, frame.drawn
+    optical, readout = (_in_order(frame, drawn, step) for step in ("electrons", "rgbi"))
+    if name not in optical or _altered(frame, drawn) != frame.camera:
+        return False
+    rows = slice(frame.context.shape[0] // 32, None, 8)
+    detector, exposure = frame.camera.detector, frame.camera.exposure_s
+    pictures = []
+    for names in (optical, [n for n in optical if n != name]):
+        signal = _signal(frame, drawn, names)
+        some = signal.with_array(np.ascontiguousarray(signal.array[rows]))
+        pictures.append(detector.develop(some, exposure, None).array)
+    seen = labels.effect(*pictures)
+    for other in readout:
+        over = faults[other].footprint(drawn[other], frame.context)
+        if over is not None:
+            seen &= ~over[rows]
+    return bool(seen.any())
 
 
 def effect_of(frame: Frame, name: str) -> NDArray[np.bool_]:

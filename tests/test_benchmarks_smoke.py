@@ -1,0 +1,52 @@
+"""The benchmarks still run: tiny frame, coarse terrain, one round."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+
+
+@pytest.mark.slow
+def test_benchmarks_print_every_stage_and_ratio(tmp_path: Path) -> None:
+    options = [
+        "--size",
+        "128",
+        "--facet-m",
+        "3",
+        "--rounds",
+        "1",
+        "--deselect",
+        "benchmarks/test_speed.py::test_cycles",
+    ]
+    done = subprocess.run(
+        [
+            sys.executable,
+            "-m",
+            "pytest",
+            "benchmarks",
+            "--benchmark-only",
+            "-p",
+            "no:cacheprovider",
+            *options,
+        ],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    for line in (
+        "bound:",
+        "render:",
+        "photograph:",
+        "store:",
+        "labelled sample",
+        "at least 0.7",
+        "at most 0.25",
+    ):
+        assert line in done.stdout

@@ -1,0 +1,343 @@
+"""Frames: signs and axes against appendix A of Gallon et al., scipy's rotations, and 67P's published geometry."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import assume, given
+from hypothesis import strategies as st
+from scipy.optimize import brentq
+from scipy.spatial.transform import Rotation as Reference
+
+from vbnfault import frames
+
+ROTATION_67P = frames.Rotation(
+    pole_ra_deg=69.54, pole_dec_deg=64.11, prime_meridian_deg=114.69, period_h=24 * 360 / 696.543884683
+)
+ORBIT = frames.ORBIT_67P
+angles = st.floats(-720, 720)
+
+
+@st.composite
+def unit_vectors(draw: st.DrawFn) -> np.ndarray:
+    """Any direction, the poles and near-poles included."""
+    z = draw(st.floats(-1, 1))
+    a = draw(st.floats(0, 2 * np.pi))
+    return frames.unit(np.array([np.sqrt(1 - z * z) * np.cos(a), np.sqrt(1 - z * z) * np.sin(a), z]))
+
+
+def assert_proper_rotation(matrix: np.ndarray) -> None:
+    # entries are sums of three products of numbers up to 1, each rounded at 1.1e-16; chains of five multiply that
+    np.testing.assert_allclose(matrix @ matrix.T, np.eye(3), atol=1e-14)
+    assert np.linalg.det(matrix) == pytest.approx(1, abs=1e-14)
+
+
+def angle_between_rad(a: np.ndarray, b: np.ndarray) -> float:
+    return float(2 * np.arctan2(np.linalg.norm(a - b), np.linalg.norm(a + b)))
+
+
+# -------------------------------------------------------------------------------------- elementary rotations
+
+
+@given(angles)
+def test_elementary_rotations_agree_with_scipy(degrees: float) -> None:
+    for name, make in (("x", frames.rx), ("y", frames.ry), ("z", frames.rz)):
+        expected = Reference.from_euler(name, degrees, degrees=True).as_matrix()
+        # radians(720) carries 9e-16 of rounding into the entries
+        np.testing.assert_allclose(make(np.radians(degrees)), expected, atol=5e-15)
+
+
+def test_quarter_turns_carry_the_axes_round() -> None:
+    x, y, z = np.eye(3)
+    for make, before, after in ((frames.rx, y, z), (frames.ry, z, x), (frames.rz, x, y)):
+        np.testing.assert_allclose(make(np.pi / 2) @ before, after, atol=1e-16)
+
+
+# ------------------------------------------------------------------------------------------ directions in L
+
+
+@pytest.mark.parametrize(
+    ("azimuth", "elevation", "expected"),
+    [
+        (0, 0, (1, 0, 0)),  # north
+        (90, 0, (0, 1, 0)),  # east
+        (180, 0, (-1, 0, 0)),
+        (270, 0, (0, -1, 0)),
+        (0, 90, (0, 0, -1)),  # up, L's z being down
+        (0, -90, (0, 0, 1)),
+        (90, 45, (0, np.sqrt(0.5), -np.sqrt(0.5))),
+    ],
+)
+def test_azimuth_runs_from_north_to_east_and_elevation_upwards(
+    azimuth: float, elevation: float, expected: tuple[float, float, float]
+) -> None:
+    np.testing.assert_allclose(frames.direction_L(azimuth, elevation), expected, atol=2e-16)
+
+
+@given(st.floats(0, 360, exclude_max=True), st.floats(-89.999, 89.999))
+def test_azimuth_and_elevation_round_trip(azimuth: float, elevation: float) -> None:
+    a, e = frames.azimuth_elevation_deg(frames.direction_L(azimuth, elevation))
+    # 1e-16 across the circle of radius cos(89.999°) = 1.7e-5 is 6e-12 rad of azimuth
+    assert 0 <= a < 360 or a == pytest.approx(360)
+    assert abs((a - azimuth + 180) % 360 - 180) < 1e-9
+    assert e == pytest.approx(elevation, abs=1e-9)
+
+
+@given(unit_vectors())
+def test_direction_round_trip_also_at_the_poles(direction: np.ndarray) -> None:
+    again = frames.direction_L(*frames.azimuth_elevation_deg(direction))
+    np.testing.assert_allclose(again, direction, atol=1e-15)
+
+
+# ------------------------------------------------------------------------------------------ camera attitudes
+
+
+@given(unit_vectors())
+def test_c0_has_the_axes_of_appendix_a(sun: np.ndarray) -> None:
+    assume(np.hypot(sun[0], sun[1]) > 1e-6)
+    x, y, z = frames.L_from_C0(sun).T
+    np.testing.assert_allclose(z, sun, atol=1e-15)
+    # y along the projection of down on the plane across the Sun: no part towards the Sun, none across both,
+    # and a positive part downwards. Near the zenith the projection is a small difference: 1e-16 / 1e-6.
+    down = np.array([0.0, 0.0, 1.0])
+    assert y @ sun == pytest.approx(0, abs=1e-9)
+    assert y @ np.cross(down, sun) == pytest.approx(0, abs=1e-9)
+    assert y @ down > 0
+    np.testing.assert_allclose(x, np.cross(y, z), atol=1e-15)
+    assert np.linalg.det(np.column_stack([x, y, z])) == pytest.approx(1, abs=1e-9)
+
+
+def test_c0_for_a_sun_in_the_north_is_written_out() -> None:
+    # Sun on the northern horizon: the picture's down is down, its right is east
+    np.testing.assert_allclose(frames.L_from_C0(np.array([1.0, 0, 0])).T, [[0, 1, 0], [0, 0, 1], [1, 0, 0]])
+
+
+@pytest.mark.parametrize("vertical", [1.0, -1.0])
+def test_c0_with_a_vertical_reference_continues_one_slightly_north(vertical: float) -> None:
+    exact = frames.L_from_C0(np.array([0, 0, vertical]))
+    assert_proper_rotation(exact)
+    tilted = frames.L_from_C0(frames.unit(np.array([1e-7, 0, vertical])))
+    # the two references are 1e-7 rad apart, and so are the attitudes
+    np.testing.assert_allclose(exact, tilted, atol=2e-7)
+    np.testing.assert_allclose(exact[:, 1], [-vertical, 0, 0])  # nadir: south; zenith: north
+
+
+@given(unit_vectors(), angles, angles, angles)
+def test_l_from_c_is_the_product_of_the_conventions(sun: np.ndarray, roll: float, pitch: float, yaw: float) -> None:
+    assume(np.hypot(sun[0], sun[1]) > 1e-3)
+    got = frames.L_from_C(sun, roll, pitch, yaw)
+    # intrinsic rotations about x, then y, then z, in scipy's notation
+    expected = frames.L_from_C0(sun) @ Reference.from_euler("XYZ", [roll, pitch, yaw], degrees=True).as_matrix()
+    np.testing.assert_allclose(got, expected, atol=2e-14)
+
+
+@pytest.mark.parametrize("yaw", [0.0, 77.0, 200.0])
+def test_yaw_turns_about_the_boresight_and_leaves_it(yaw: float) -> None:
+    sun = frames.direction_L(123.0, 21.0)
+    still, turned = frames.L_from_C(sun, 10.0, -20.0, 0.0), frames.L_from_C(sun, 10.0, -20.0, yaw)
+    np.testing.assert_allclose(turned[:, 2], still[:, 2], atol=1e-15)
+    # the picture's x axis goes towards its y axis by the yaw
+    assert still[:, 0] @ turned[:, 0] == pytest.approx(np.cos(np.radians(yaw)), abs=1e-15)
+    assert still[:, 1] @ turned[:, 0] == pytest.approx(np.sin(np.radians(yaw)), abs=1e-15)
+
+
+def test_signs_of_roll_and_pitch_in_the_picture() -> None:
+    # Roll turns y to z: the boresight rises (-y of C0), so the Sun sinks in the picture (towards +y).
+    # Pitch turns z to x: the boresight goes right, so the Sun goes left.
+    sun = frames.direction_L(40.0, 5.0)
+    sun_C = frames.L_from_C(sun, 10.0, 0.0, 0.0).T @ sun
+    np.testing.assert_allclose(sun_C, [0, np.sin(np.radians(10)), np.cos(np.radians(10))], atol=1e-15)
+    sun_C = frames.L_from_C(sun, 0.0, 10.0, 0.0).T @ sun
+    np.testing.assert_allclose(sun_C, [-np.sin(np.radians(10)), 0, np.cos(np.radians(10))], atol=1e-15)
+
+
+@given(unit_vectors(), angles, angles, angles)
+def test_boresight_angle_agrees_with_the_matrices(sun: np.ndarray, roll: float, pitch: float, yaw: float) -> None:
+    assume(np.hypot(sun[0], sun[1]) > 1e-3)
+    boresight = frames.L_from_C(sun, roll, pitch, yaw)[:, 2]
+    expected = np.degrees(angle_between_rad(boresight, sun))
+    # arccos near 1 magnifies 4e-16 to √(8e-16) = 3e-8 rad = 1.6e-6°
+    assert float(frames.boresight_angle_deg(roll, pitch)) == pytest.approx(expected, abs=4e-6)
+
+
+def test_boresight_angle_takes_arrays() -> None:
+    np.testing.assert_allclose(
+        frames.boresight_angle_deg(np.array([0.0, 60.0, 180.0, 180.0]), np.array([30.0, 60.0, 0.0, 180.0])),
+        [30.0, np.degrees(np.arccos(0.25)), 180.0, 0.0],  # two half turns look at the Sun again
+        atol=1e-6,
+    )
+
+
+# ------------------------------------------------------------------------------------------------ quaternion
+
+
+@given(angles, angles, angles)
+def test_quaternion_is_unit_w_first_and_gives_back_the_matrix(a: float, b: float, c: float) -> None:
+    matrix = frames.rz(np.radians(a)) @ frames.rx(np.radians(b)) @ frames.ry(np.radians(c))
+    w, x, y, z = frames.quaternion(matrix)
+    assert w >= 0
+    assert w * w + x * x + y * y + z * z == pytest.approx(1, abs=1e-14)
+    back = [  # the textbook form, active rotation
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    np.testing.assert_allclose(back, matrix, atol=1e-13)
+
+
+def test_quaternion_of_known_turns() -> None:
+    h = np.sqrt(0.5)
+    np.testing.assert_allclose(frames.quaternion(np.eye(3)), [1, 0, 0, 0], atol=1e-16)
+    np.testing.assert_allclose(frames.quaternion(frames.rz(np.pi / 2)), [h, 0, 0, h], atol=1e-15)
+    np.testing.assert_allclose(frames.quaternion(frames.rx(-np.pi / 2)), [h, -h, 0, 0], atol=1e-15)
+
+
+# ----------------------------------------------------------------------------------------- smallest rotation
+
+
+def assert_takes_by_the_smallest_angle(source: np.ndarray, target: np.ndarray) -> None:
+    matrix = frames.minimal_rotation(source, target)
+    assert_proper_rotation(matrix)
+    np.testing.assert_allclose(matrix @ source, target, atol=1e-14)
+    # no rotation that does it turns by less than the angle between the two: compare its own angle, from the
+    # antisymmetric part and the trace (stable at both ends), with that
+    k = np.array([matrix[2, 1] - matrix[1, 2], matrix[0, 2] - matrix[2, 0], matrix[1, 0] - matrix[0, 1]]) / 2
+    own = np.arctan2(np.linalg.norm(k), (np.trace(matrix) - 1) / 2)
+    assert own == pytest.approx(angle_between_rad(source, target), abs=1e-7)
+
+
+@given(unit_vectors(), unit_vectors())
+def test_minimal_rotation(source: np.ndarray, target: np.ndarray) -> None:
+    assume(np.linalg.norm(source + target) > 0.5)  # the neighbourhood of opposite has its own test
+    assert_takes_by_the_smallest_angle(source, target)
+
+
+@pytest.mark.parametrize("axis", [*np.eye(3), *-np.eye(3), frames.unit(np.array([0.3, -0.5, 0.2]))])
+def test_minimal_rotation_of_opposite_and_of_equal_vectors(axis: np.ndarray) -> None:
+    assert_takes_by_the_smallest_angle(axis, -axis)
+    np.testing.assert_allclose(frames.minimal_rotation(axis, axis), np.eye(3), atol=1e-15)
+
+
+@pytest.mark.parametrize("short_of_half_a_turn_rad", [1e-3, 1e-5, 2e-6, 1e-6, 1e-9, 1e-13])
+def test_minimal_rotation_close_to_opposite(short_of_half_a_turn_rad: float) -> None:
+    source = frames.unit(np.array([0.2, -0.7, 0.4]))
+    across = frames.unit(np.cross(source, [0.0, 0.0, 1.0]))
+    target = -np.cos(short_of_half_a_turn_rad) * source + np.sin(short_of_half_a_turn_rad) * across
+    assert_takes_by_the_smallest_angle(source, frames.unit(target))
+
+
+# ------------------------------------------------------------------------------------------- orbit and spin
+
+
+@pytest.mark.parametrize(
+    ("julian_date", "subsolar_latitude_deg"),
+    [
+        (2456875.5, 44.6),  # 2014-08-06 0 h
+        (2457152.5, 0.3),  # 2015-05-10
+        (2457247.5, -47.7),  # 2015-08-13, perihelion
+        (2457269.5, -52.1),  # 2015-09-04
+        (2457468.5, 0.0),  # 2016-03-21
+    ],
+)
+def test_subsolar_latitudes_of_67p(julian_date: float, subsolar_latitude_deg: float) -> None:
+    sun_J = -frames.unit(ORBIT.position_J_au(julian_date))
+    sun_T = ROTATION_67P.J_from_T(julian_date).T @ sun_J
+    # the reference values are rounded to 0.1°
+    assert np.degrees(np.arcsin(sun_T[2])) == pytest.approx(subsolar_latitude_deg, abs=0.05)
+
+
+def test_distance_of_67p() -> None:
+    assert np.linalg.norm(ORBIT.position_J_au(2456875.5)) == pytest.approx(3.6007, abs=5e-5)
+    assert np.linalg.norm(ORBIT.position_J_au(ORBIT.perihelion_jd)) == pytest.approx(ORBIT.perihelion_au, rel=1e-12)
+
+
+def test_orbit_obeys_keplers_laws() -> None:
+    e, q, n = ORBIT.eccentricity, ORBIT.perihelion_au, np.radians(ORBIT.mean_motion_deg_day)
+    a = q / (1 - e)
+    # third law with the Gaussian constant: n² a³ = k², the mean motion being printed to nine digits
+    assert n**2 * a**3 == pytest.approx(0.01720209895**2, rel=1e-7)
+    period = 2 * np.pi / n
+    dates = ORBIT.perihelion_jd + period * np.linspace(-0.5, 1.7, 23)
+    for date in dates:
+        # Kepler's equation by bisection; the conic r = a(1 - e cos E); one plane
+        mean = n * (date - ORBIT.perihelion_jd)
+        anomaly = brentq(lambda E, mean=mean: E - e * np.sin(E) - mean, mean - 2, mean + 2, xtol=1e-14)
+        r = ORBIT.position_J_au(date)
+        assert np.linalg.norm(r) == pytest.approx(a * (1 - e * np.cos(anomaly)), rel=1e-9)
+        np.testing.assert_allclose(ORBIT.position_J_au(date + period), r, atol=1e-7)
+    # second law: the areal velocity by central differences over 2 h is h = n a² √(1-e²), towards one direction
+    h = 1 / 24
+    for date in dates:
+        velocity = (ORBIT.position_J_au(date + h) - ORBIT.position_J_au(date - h)) / (2 * h)
+        momentum = np.cross(ORBIT.position_J_au(date), velocity)
+        # truncation h²/6 · r‴/r' is below 1e-6 at perihelion
+        assert np.linalg.norm(momentum) == pytest.approx(n * a**2 * np.sqrt(1 - e * e), rel=1e-5)
+        ecliptic = frames.rx(np.radians(-23.4392911)) @ frames.unit(momentum)
+        assert np.degrees(np.arccos(ecliptic[2])) == pytest.approx(ORBIT.inclination_deg, abs=1e-4)
+        # the ascending node lies 90° behind the pole's projection
+        node = np.degrees(np.arctan2(ecliptic[0], -ecliptic[1])) % 360
+        assert node == pytest.approx(ORBIT.node_deg, abs=1e-3)
+
+
+def test_pole_and_prime_meridian_of_67p() -> None:
+    for date in (2451545.0, 2456974.25):
+        J_from_T = ROTATION_67P.J_from_T(date)
+        assert_proper_rotation(J_from_T)
+        ra, dec = np.radians([69.54, 64.11])
+        np.testing.assert_allclose(
+            J_from_T[:, 2], [np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)], atol=1e-15
+        )
+    # at J2000 the prime meridian lies W from the node Q of the body's equator, Q = (−sin α, cos α, 0)
+    J_from_T = ROTATION_67P.J_from_T(2451545.0)
+    node = np.array([-np.sin(ra), np.cos(ra), 0])
+    ahead = np.cross(J_from_T[:, 2], node)
+    w = np.degrees(np.arctan2(J_from_T[:, 0] @ ahead, J_from_T[:, 0] @ node))
+    assert w == pytest.approx(114.69, abs=1e-10)
+
+
+def test_spin_is_the_published_rate_eastwards() -> None:
+    # W grows by 696.543884683° a day: in a thousandth of a day by 0.6965°
+    before, after = (ROTATION_67P.J_from_T(2456974.0 + t) for t in (0.0, 1e-3))
+    turn = Reference.from_matrix(after @ before.T).as_rotvec(degrees=True)
+    # 3.9e6° of W are known to 1e-9°, and the Julian date to 4e-10 d: 3e-7°
+    np.testing.assert_allclose(turn, 0.696543884683 * before[:, 2], atol=1e-6)
+    assert ROTATION_67P.period_h == pytest.approx(12.4041, abs=5e-5)
+
+
+# ----------------------------------------------------------------------------------------- commanded attitude
+
+
+@given(unit_vectors(), unit_vectors(), angles, angles, angles)
+def test_commanded_attitude_puts_the_sun_where_commanded(
+    sun_J: np.ndarray, sun_T: np.ndarray, a: float, b: float, c: float
+) -> None:
+    own = Reference.from_euler("XYZ", [a, b, c], degrees=True).as_matrix()
+    assume(np.linalg.norm(own @ sun_J + sun_T) > 0.5)
+    commanded = frames.T_from_J_commanded(own, sun_J, sun_T)
+    assert_proper_rotation(commanded)
+    np.testing.assert_allclose(commanded @ sun_J, sun_T, atol=1e-14)
+
+
+def test_commanded_attitude_is_the_nearest_of_all_that_do_it() -> None:
+    rng = np.random.default_rng(8)
+    for _ in range(20):
+        own = Reference.random(random_state=rng).as_matrix()
+        sun_J, sun_T = (frames.unit(rng.normal(size=3)) for _ in range(2))
+        commanded = frames.T_from_J_commanded(own, sun_J, sun_T)
+
+        def turn_deg(attitude: np.ndarray, own: np.ndarray = own) -> float:
+            return float(np.degrees(Reference.from_matrix(attitude @ own.T).magnitude()))
+
+        # every other attitude that does it differs by a spin about the commanded Sun
+        spun = [
+            Reference.from_rotvec(s * sun_T, degrees=True).as_matrix() @ commanded
+            for s in np.r_[-170:181:10, -1, 1]
+            if s
+        ]
+        assert turn_deg(commanded) < min(turn_deg(a) for a in spun)
+
+
+def test_commanded_where_it_already_is_changes_nothing() -> None:
+    own = Reference.from_euler("XYZ", [10, 20, 30], degrees=True).as_matrix()
+    sun_J = frames.unit(np.array([1.0, 2.0, -0.5]))
+    np.testing.assert_allclose(frames.T_from_J_commanded(own, 3 * sun_J, 2 * (own @ sun_J)), own, atol=1e-15)
