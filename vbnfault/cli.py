@@ -218,7 +218,8 @@ def _list_faults() -> None:
             keys = dict(model["properties"])
             typer.echo(f"{name} / {keys.pop('model')['const']}")
             for key, value in keys.items():
-                typer.echo(f"    {key} = {json.dumps(value['default'])}    {value['description']}")
+                default = json.dumps(value.get("default"))
+                typer.echo(f"    {key} = {default}    {value['description']}")
 
 
 @app.command()

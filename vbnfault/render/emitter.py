@@ -8,7 +8,7 @@ import numpy as np
 
 from ..scene import Sunlight
 from .runtime import dr, mi
-from .sampling import disc, opaque_vector
+from .sampling import opaque_vector
 
 
 class SunDisc:
@@ -24,12 +24,9 @@ class SunDisc:
         self._y = opaque_vector(mi.Vector3f, np.cross(z, x))
         self._tangent = dr.opaque(mi.Float, np.tan(sun.angular_radius_rad))
         self._chord2 = dr.opaque(mi.Float, (2 * np.sin(sun.angular_radius_rad / 2)) ** 2)
-        self.irradiance = [dr.opaque(mi.Float, float(v)) for v in sun.irradiance_W_m2_nm]
-        self.radiance = [dr.opaque(mi.Float, float(v)) for v in sun.radiance_W_m2_sr_nm]
 
-    def sample(self, u: Any, v: Any) -> Any:
-        """Unit direction towards a uniform point of the disc."""
-        p = disc(u, v)
+    def towards(self, p: Any) -> Any:
+        """Unit direction towards the point of the disc at `p` on the unit disc."""
         return dr.normalize(self.direction + self._tangent * (p.x * self._x + p.y * self._y))
 
     def contains(self, direction: Any) -> Any:

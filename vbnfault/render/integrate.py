@@ -27,28 +27,31 @@ def radiance(surface: Surface, scene: Scene) -> Radiance:
     view, spp = scene.view, scene.samples_per_pixel
     optics, sun, bsdf = Optics(view), SunDisc(scene.sun), Lambert(scene.reflectance)
     bands = len(scene.wavelength_nm)
-    pixels = view.width_px * view.height_px
-    out = np.empty((bands, pixels), dtype=np.float32)
+    # what a unit of each summed term adds to each band: reflected light, and the Sun seen directly
+    weights = np.vstack([bsdf.weights * scene.sun.irradiance_W_m2_nm, scene.sun.radiance_W_m2_sr_nm]) / spp
+    out = np.empty((bands, view.width_px * view.height_px), dtype=np.float32)
     for start, stop in _slabs(view, spp):
         strata = Strata(view.width_px, stop - start, spp, scene.key, first_row=start)
         rays = optics.camera_rays(strata)
         hit = surface.intersect(rays)
-        normal = hit.facet_normal
-        towards = sun.sample(*strata.pair(1))
-        lit = hit.valid & (dr.dot(normal, towards) > 0)
-        lit &= ~surface.occluded(hit.shadow_rays(towards, normal), lit)
-        disc = ~hit.valid & sun.contains(rays.d)
-        reflected = bsdf.evaluate(dr.dot(hit.shading_normal, towards))
-        samples = [
-            dr.select(lit, brdf * irradiance, dr.select(disc, direct, 0))
-            for brdf, irradiance, direct in zip(reflected, sun.irradiance, sun.radiance, strict=True)
-        ]
-        dr.eval(*samples)  # unevaluated, every block sum would trace the rays again
-        sums = [dr.block_sum(band, spp) for band in samples]
+        towards = sun.towards(strata.disc(0))
+        cosine = dr.dot(hit.normal, towards)
+        lit = hit.valid & (cosine > 0)
+        lit &= ~surface.occluded(hit.shadow_rays(towards), lit)
+        terms = [dr.select(lit, term, 0) for term in bsdf.terms(cosine)]
+        terms.append(dr.select(~hit.valid & sun.contains(rays.d), mi.Float(1), 0))
+        dr.eval(*terms)  # unevaluated, every block sum would trace the rays again
+        sums = [dr.block_sum(term, spp) for term in terms]
         dr.eval(*sums)
         span = slice(start * view.width_px, stop * view.width_px)
-        for band, total in enumerate(sums):
-            np.multiply(total.numpy(), np.float32(1 / spp), out=out[band, span])
+        for k, total in enumerate(sums):
+            values = total.numpy()
+            for band in range(bands):
+                weight = np.float32(weights[k, band])
+                if k == 0:
+                    np.multiply(values, weight, out=out[band, span])
+                elif values.any():
+                    out[band, span] += values * weight
     return Radiance(
         array=out.reshape(bands, view.height_px, view.width_px), wavelength_nm=scene.wavelength_nm
     )
@@ -66,7 +69,7 @@ def truth(surface: Surface, view: View, sun: Sunlight) -> Truth:
     hit = surface.intersect(rays)
     boresight = optics.axes[2]
     depth = dr.select(hit.valid, hit.distance_m * dr.dot(rays.d, boresight), dr.inf)
-    normal = hit.shading_normal
+    normal = hit.normal
     in_camera = [dr.select(hit.valid, dr.dot(normal, axis), 0) for axis in optics.axes]
     # a pixel shows the Sun if its centre lies within half a pixel of the disc
     half_pixel = 0.5 / float(view.intrinsics[0])

@@ -29,7 +29,7 @@ def ground_height_m(surface: Surface, x_m: F64, y_m: F64, start_height_m: float)
     for _ in range(_GROUND_HITS):
         points = mi.Point3f(*(mi.Float(np.ascontiguousarray(c, np.float32)) for c in origin.T))
         hit = surface.intersect(mi.Ray3f(points, down))
-        normal, distance, valid = hit.facet_normal, hit.distance_m, hit.valid
+        normal, distance, valid = hit.normal, hit.distance_m, hit.valid
         dr.eval(normal, distance, valid)
         found, up = valid.numpy().astype(bool), normal.z.numpy() < 0
         depth = origin[:, 2] + np.where(found, distance.numpy(), 0.0)
@@ -78,5 +78,5 @@ def _any_hit(surface: Surface, position: F64, directions: F64, reach_m: float) -
     v = mi.Vector3f(*(mi.Float(np.ascontiguousarray(c, np.float32)) for c in d.T))
     rays = mi.Ray3f(o, v)
     rays.maxt = mi.Float(min(reach_m, 3e38))
-    hits = surface.occluded(rays, mi.Bool(True))
+    hits = surface.occluded(rays, mi.Bool(True), coherent=False)
     return hits.numpy().astype(bool).reshape(n, k)

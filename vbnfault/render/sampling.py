@@ -6,6 +6,7 @@ a block sum: bit-identical from run to run, whatever the number of threads.
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -17,39 +18,58 @@ _TO_UNIT = 2.0**-32
 
 
 class Strata:
-    """Jittered strata of all pixels: `pixel`, `index` within the pixel, and stratified uniform pairs."""
+    """Jittered strata of all pixels: `pixel`, `index` within the pixel, a point of the pixel's area, and points
+    of unit discs (the lens, the Sun) stratified over the samples of a pixel."""
 
     def __init__(self, width: int, rows: int, samples_per_pixel: int, key: int, first_row: int = 0) -> None:
         self.side = round(samples_per_pixel**0.5)
         self.samples = samples_per_pixel
         wavefront = dr.arange(mi.UInt32, width * rows * samples_per_pixel)
         wavefront += dr.opaque(mi.UInt32, first_row * width * samples_per_pixel)
-        shift = int(samples_per_pixel).bit_length() - 1
-        self.pixel = wavefront >> shift
+        self._shift = int(samples_per_pixel).bit_length() - 1
+        self.pixel = wavefront >> self._shift
         self.index = wavefront & (samples_per_pixel - 1)
         self._key = dr.opaque(mi.UInt32, key & 0xFFFFFFFF)
         self._wavefront = wavefront
 
-    def pair(self, dimension: int) -> tuple[Any, Any]:
-        """Two stratified uniform numbers in [0, 1). Dimension 0 (the pixel area) keeps its strata in order,
-        the others visit theirs in an order shuffled per pixel, so that dimensions do not correlate."""
-        u, v = mi.sample_tea_32(self._wavefront, self._key + (dimension * 0x9E3779B9 & 0xFFFFFFFF), 4)
-        stratum = self.index
-        if dimension:
-            turn, _ = mi.sample_tea_32(self.pixel, self._key + (dimension * 0x85EBCA6B & 0xFFFFFFFF), 4)
-            stratum = (self.index * (2 * dimension + 5) + turn) & (self.samples - 1)
-        shift = self.side.bit_length() - 1
-        sx, sy = stratum & (self.side - 1), stratum >> shift
-        # 2⁻³² · u may round to 1.0 in float32, which is still inside the closed stratum: harmless here
+    def square(self) -> tuple[Any, Any]:
+        """A uniform point of each stratum of the pixel, x and y in [0, 1]."""
+        u, v = mi.sample_tea_32(self._wavefront, self._key, 4)
+        sx, sy = self.index & (self.side - 1), self.index >> (self.side.bit_length() - 1)
+        # 2⁻³² · u may round to 1.0 in float32, which is still inside the closed stratum: harmless
         return (
             (mi.Float(sx) + mi.Float(u) * _TO_UNIT) / self.side,
             (mi.Float(sy) + mi.Float(v) * _TO_UNIT) / self.side,
         )
 
+    def disc(self, dimension: int) -> Any:
+        """A point of the unit disc; the samples of a pixel share one of 256 stratified sets, chosen by a hash.
 
-def disc(u: Any, v: Any) -> Any:
-    """Uniform point on the unit disc from two uniform numbers (concentric map of Shirley and Chiu 1997)."""
-    return mi.warp.square_to_uniform_disk_concentric(mi.Point2f(u, v))
+        `dimension` tells uses apart: they take different sets, in different orders.
+        """
+        h = (self.pixel ^ self._key) * (0x9E3779B1 + 2 * dimension)
+        h ^= h >> 15
+        h *= 0x85EBCA77
+        h ^= h >> 13
+        at = ((h & (_DISC_SETS - 1)) << self._shift) + self.index
+        return dr.gather(mi.Point2f, _disc_table(self.samples, dimension), at)
+
+
+_DISC_SETS = 256
+
+
+@lru_cache(maxsize=8)
+def _disc_table(samples: int, dimension: int) -> Any:
+    """Stratified points of the unit disc, `_DISC_SETS` sets of `samples`, each set in an order of its own."""
+    rng = np.random.Generator(np.random.Philox(np.random.SeedSequence((samples, dimension))))
+    side = round(samples**0.5)
+    stratum = np.argsort(rng.random((_DISC_SETS, samples)), axis=1)
+    radius2 = (stratum % side + rng.random(stratum.shape)) / side
+    turn = (stratum // side + rng.random(stratum.shape)) / side * 2 * np.pi
+    points = np.sqrt(radius2)[..., None] * np.stack([np.cos(turn), np.sin(turn)], axis=-1)
+    table = mi.Float(points.astype(np.float32).ravel())
+    dr.eval(table)
+    return table
 
 
 class Optics:
@@ -81,10 +101,10 @@ class Optics:
 
     def camera_rays(self, strata: Strata) -> Any:
         """One ray a stratum, through the thin lens."""
-        u, v = strata.pair(0)
+        u, v = strata.square()
         x = mi.Float(strata.pixel % self.width) + u
         y = mi.Float(strata.pixel // self.width) + v
-        lens = disc(*strata.pair(2)) if self.aperture > 0 else None
+        lens = strata.disc(1) if self.aperture > 0 else None
         return mi.Ray3f(*self.direction(x, y, lens))
 
     def centre_rays(self) -> Any:

@@ -30,60 +30,62 @@ class Surface:
         parameters["faces"] = mi.UInt32(np.ascontiguousarray(faces, np.uint32).ravel())
         parameters.update()
         self.scene = mi.load_dict({"type": "scene", "terrain": mesh})
-        corner, facet = _normals(vertices_m, faces, flat)
-        self._facet_normal = mi.Float(facet.ravel())
-        self._corner_normals = mi.Float(corner.ravel())
-        dr.eval(self._facet_normal, self._corner_normals)
+        self._corners = mi.Float(_corner_records(vertices_m, faces, flat).ravel())
+        dr.eval(self._corners)
 
     def intersect(self, rays: Any) -> Hit:
         """Closest hits."""
         return Hit(self, rays, self.scene.ray_intersect_preliminary(rays, coherent=True))
 
-    def occluded(self, rays: Any, active: Any) -> Any:
-        """Whether anything lies along the rays."""
-        return self.scene.ray_test(rays, active)
+    def occluded(self, rays: Any, active: Any, *, coherent: bool = True) -> Any:
+        """Whether anything lies along the rays; `coherent` where neighbours run alike."""
+        return self.scene.ray_test(rays, coherent, active)
 
 
 class Hit:
-    """Closest hits of a wavefront; properties are only traced into the kernel when they are used."""
+    """Closest hits of a wavefront: `valid`, `distance_m`, and the unit outward `normal` that shades, interpolated
+    over the facet unless it is flat."""
 
     def __init__(self, surface: Surface, rays: Any, found: Any) -> None:
-        self._surface, self._rays, self._found = surface, rays, found
         self.valid = found.is_valid()
         self.distance_m = found.t
+        self._rays = rays
+        b1, b2 = found.prim_uv.x, found.prim_uv.y
+        self._weights = (1 - b1 - b2, b1, b2)
+        first = found.prim_index * 3
+        self._corners = [dr.gather(mi.Vector4f, surface._corners, first + k, self.valid) for k in range(3)]
+        w = self._weights
+        self.normal = dr.normalize(sum((c.xyz * w[k] for k, c in enumerate(self._corners)), mi.Vector3f(0)))
 
-    @property
-    def facet_normal(self) -> Any:
-        """Unit outward normal of the facet."""
-        return dr.gather(mi.Normal3f, self._surface._facet_normal, self._found.prim_index, self.valid)
-
-    @property
-    def shading_normal(self) -> Any:
-        """Unit normal, interpolated over the facet unless it is shaded flat."""
-        b1, b2 = self._found.prim_uv.x, self._found.prim_uv.y
-        first = self._found.prim_index * 3
-        n = [
-            dr.gather(mi.Normal3f, self._surface._corner_normals, first + corner, self.valid)
-            for corner in range(3)
-        ]
-        return dr.normalize(n[0] * (1 - b1 - b2) + n[1] * b1 + n[2] * b2)
-
-    def shadow_rays(self, direction: Any, facet_normal: Any) -> Any:
-        """Rays from the hits, lifted off their facets on the outer side."""
-        point = self._rays(self.distance_m)
-        reach = dr.maximum(dr.max(dr.abs(point)), dr.max(dr.abs(self._rays.o)))
-        offset = _OFFSET * (reach + self.distance_m) + 1e-6
-        return mi.Ray3f(point + facet_normal * offset, direction)
+    def shadow_rays(self, direction: Any) -> Any:
+        """Rays from the hits. The origin is moved off the facet to the smooth surface that the corner normals
+        suggest, so that facets near the terminator do not shadow themselves (Hanika 2021, Ray Tracing Gems II,
+        chapter 4), and then by a few units of float32 resolution."""
+        point = mi.Vector3f(self._rays(self.distance_m))
+        lift = mi.Vector3f(0)
+        for corner, weight in zip(self._corners, self._weights, strict=True):
+            lift += corner.xyz * (weight * dr.maximum(corner.w - dr.dot(point, corner.xyz), 0))
+        offset = _OFFSET * (dr.max(dr.abs(point)) + self.distance_m) + 1e-6
+        return mi.Ray3f(mi.Point3f(point + lift + self.normal * offset), direction)
 
 
-def _normals(
+def _corner_records(
     vertices: NDArray[np.float32], faces: NDArray[np.int32], flat: NDArray[np.bool_]
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Corner normals float32[m, 3, 3] and facet normals float32[m, 3], unit length."""
+) -> NDArray[np.float32]:
+    """Per corner of each facet, float32[m, 3, 4]: its normal, and the distance of its tangent plane from the
+    origin. Four floats: drjit fetches a power of two in one packet."""
+    normals = _corner_normals(vertices, faces, flat)
+    plane = np.einsum("fki,fki->fk", normals.astype(np.float64), vertices[faces].astype(np.float64))
+    return np.concatenate([normals, plane[..., None]], axis=2).astype(np.float32)
+
+
+def _corner_normals(
+    vertices: NDArray[np.float32], faces: NDArray[np.int32], flat: NDArray[np.bool_]
+) -> NDArray[np.float32]:
+    """Unit normals of the corners of each facet, float32[m, 3, 3]: of the facet itself where it is flat, else
+    the mean of the smooth facets around the vertex, weighted by area."""
     a, b, c = (vertices[faces[:, i]].astype(np.float64) for i in range(3))
     area = np.cross(b - a, c - a)
-    facet = area / np.maximum(np.linalg.norm(area, axis=1, keepdims=True), 1e-300)
-    # vertex normals weighted by area, flat facets left out
     weighted = np.where(flat[:, None], 0.0, area)
     vertex = np.stack(
         [
@@ -92,6 +94,6 @@ def _normals(
         ],
         axis=1,
     )
-    vertex /= np.maximum(np.linalg.norm(vertex, axis=1, keepdims=True), 1e-300)
-    corner = np.where(flat[:, None, None], facet[:, None, :], vertex[faces])
-    return corner.astype(np.float32), facet.astype(np.float32)
+    corner = np.where(flat[:, None, None], area[:, None, :], vertex[faces])
+    corner /= np.maximum(np.linalg.norm(corner, axis=2, keepdims=True), 1e-300)
+    return corner.astype(np.float32)

@@ -1,0 +1,54 @@
+"""Where the time of one sample goes:  python benchmarks/profile_sample.py [SCENE] [--sample I] [--rounds N]
+
+Prints the stages with their median in ms, after one warm-up; with --functions N also the N functions of our
+own that take longest in the stages after the render (threads are counted where they are waited for).
+"""
+
+from __future__ import annotations
+
+import argparse
+import cProfile
+import pstats
+
+from workload import clock, medians
+
+from vbnfault import config, pipeline
+from vbnfault.pipeline import Frame, SampleSpec
+
+
+def stages(spec: SampleSpec, profile: cProfile.Profile | None = None) -> dict[str, float]:
+    """Seconds per stage of one sample, the render's among them; `profile` sees the stages after it."""
+    frame, seconds = Frame(spec=spec), {}
+    for stage in pipeline.STAGES:
+        after = profile is not None and stage not in (pipeline.resolve, pipeline.render_frame)
+        if after:
+            profile.enable()
+        seconds[stage.__name__], _ = clock(lambda stage=stage: stage(frame))
+        if after:
+            profile.disable()
+    seconds["to_sample"], _ = clock(lambda: pipeline.to_sample(frame))
+    return seconds
+
+
+def main() -> None:
+    """Command line."""
+    parser = argparse.ArgumentParser(description="Time per stage of one sample.")
+    parser.add_argument("scene", nargs="?", default="quickstart", help="a scene file or a packaged scene")
+    parser.add_argument("--sample", type=int, default=0)
+    parser.add_argument("--rounds", type=int, default=5)
+    parser.add_argument("--functions", type=int, default=0, metavar="N")
+    options = parser.parse_args()
+    spec = pipeline.Session(config.load_scene(options.scene)).spec(options.sample)
+    stages(spec)
+    found = medians([stages(spec) for _ in range(options.rounds)])
+    for name, seconds in found.items():
+        print(f"{name:<16}{seconds * 1e3:9.1f} ms")
+    print(f"{'sum':<16}{sum(found.values()) * 1e3:9.1f} ms")
+    if options.functions:
+        profile = cProfile.Profile()
+        stages(spec, profile)
+        pstats.Stats(profile).sort_stats("cumtime").print_stats("vbnfault", options.functions)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,74 @@
+"""The table of medians, and the ratios that the project aims at."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+AFTER = ("meter", "photograph", "label", "to_sample", "store")
+SAMPLE = ("resolve", "render", "truth", *AFTER)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Target:
+    """A ratio with the value it must reach (`least`) or keep below."""
+
+    what: str
+    ratio: float
+    limit: float
+    least: bool
+
+    @property
+    def met(self) -> bool:
+        return self.ratio >= self.limit if self.least else self.ratio <= self.limit
+
+
+def sample_seconds(seconds: Mapping[str, float]) -> float:
+    """The whole labelled sample."""
+    return sum(seconds[name] for name in SAMPLE)
+
+
+def targets(seconds: Mapping[str, float]) -> list[Target]:
+    """The ratios of one run; that to Cycles only where it was measured."""
+    after = sum(seconds[name] for name in AFTER)
+    found = [
+        Target(
+            what="speed of the render over the bound's",
+            ratio=seconds["bound"] / seconds["render"],
+            limit=0.7,
+            least=True,
+        ),
+        Target(
+            what="all that follows, over the render", ratio=after / seconds["render"], limit=0.25, least=False
+        ),
+    ]
+    if "cycles" in seconds:
+        ratio = seconds["cycles"] / sample_seconds(seconds)
+        found.append(Target(what="Cycles' render over our labelled sample", ratio=ratio, limit=4, least=True))
+    return found
+
+
+def table(seconds: Mapping[str, float]) -> str:
+    """Medians in ms, then the ratios."""
+    names = {
+        "bound": "bound: closest hit + shadow ray, one kernel",
+        "resolve": "resolve",
+        "render": "render: eight bands",
+        "truth": "truth: depth, normals, classes",
+        "meter": "meter",
+        "photograph": "photograph: image with six faults, clean twin",
+        "label": "label: masks",
+        "to_sample": "to_sample",
+        "store": "store: encode and write, per sample of a shard",
+        "cycles": "Blender Cycles, render call alone",
+    }
+    lines = [f"{text:<52}{seconds[n] * 1e3:9.1f} ms" for n, text in names.items() if n in seconds]
+    lines.insert(
+        -1 if "cycles" in seconds else len(lines),
+        f"{'= labelled sample':<52}{sample_seconds(seconds) * 1e3:9.1f} ms",
+    )
+    lines.append("")
+    for t in targets(seconds):
+        wanted = f"{'at least' if t.least else 'at most'} {t.limit:g}"
+        lines.append(f"{t.what:<52}{t.ratio:9.2f}      {wanted}: {'met' if t.met else 'MISSED'}")
+    return "\n".join(lines)

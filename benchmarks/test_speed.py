@@ -1,0 +1,104 @@
+"""How fast a labelled sample is made, against the tracing bound and against Blender Cycles.
+
+    python -m pytest benchmarks --benchmark-only
+    python -m pytest benchmarks --benchmark-only --picture pair.png     (look whether both show the same)
+
+1024×1024 pixels, 16 samples per pixel, direct light, 1.2 million triangles that fill the frame, one run.
+Every round times bound, render, truth, the stages after it and the store in turn, so that whatever else the
+machine does falls on all alike. The table comes at the end. Cycles is optional: see `blender_cycles.py`.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from blender_cycles import Cycles, Unavailable, interpreter
+from report import SAMPLE, targets
+from workload import Workload, clock, medians
+
+from vbnfault.pipeline import Frame
+
+
+@pytest.fixture(scope="session")
+def workload(request: pytest.FixtureRequest) -> Workload:
+    """The sample, its terrain built once."""
+    return Workload.load(request.config.getoption("--size"), facet_m=request.config.getoption("--facet-m"))
+
+
+@pytest.fixture
+def rounds(request: pytest.FixtureRequest) -> int:
+    return request.config.getoption("--rounds")
+
+
+def test_labelled_sample(
+    benchmark: Any, workload: Workload, results: dict[str, float], rounds: int, tmp_path: Path
+) -> None:
+    folder, taken = workload.empty_store(tmp_path / "store.zarr"), []
+
+    def one_round() -> Frame:
+        bound, _ = clock(workload.bound)
+        seconds, frame = workload.labelled_sample(folder)
+        taken.append({"bound": bound, **seconds})
+        return frame
+
+    frame = benchmark.pedantic(one_round, rounds=rounds, warmup_rounds=1)
+    results |= medians(taken[1:] or taken)
+    benchmark.extra_info |= results
+    assert set(SAMPLE) <= set(results)
+    assert (frame.truth.semantic == 1).all(), "the terrain must fill the frame"
+    missing = set(workload.spec.faults) - set(frame.drawn)
+    assert not missing, f"every fault must show: {missing}"
+    assert folder.finished() == folder.samples
+
+
+def test_cycles(
+    benchmark: Any, workload: Workload, results: dict[str, float], rounds: int, request: pytest.FixtureRequest
+) -> None:
+    try:
+        python = interpreter()
+    except Unavailable as why:
+        pytest.skip(str(why))
+    scene, patch = workload.scene, workload.patch
+    with Cycles(
+        python,
+        vertices_m=patch.vertices_L_m,
+        faces=patch.faces,
+        flat=patch.face_is_boulder,
+        position_L_m=scene.view.position_L_m,
+        L_from_C=scene.view.L_from_C,
+        fov_deg=workload.session.base_camera.fov_deg,
+        size_px=scene.view.width_px,
+        samples_per_pixel=scene.samples_per_pixel,
+        sun_direction_L=scene.sun.direction_L,
+        sun_angular_radius_rad=scene.sun.angular_radius_rad,
+        threads=os.cpu_count() or 1,
+    ) as blender:
+        taken: list[dict[str, float]] = []
+        # the warm-up builds the BVH; later renders reuse it, as ours do
+        benchmark.pedantic(lambda: taken.append({"cycles": blender.render()}), rounds=rounds, warmup_rounds=1)
+        theirs = blender.picture()
+    results |= medians(taken[1:] or taken)
+    ours = workload.grey()
+    if path := request.config.getoption("--picture"):
+        _write_pair(path, ours, theirs)
+    assert np.corrcoef(ours.ravel(), theirs.ravel())[0, 1] > 0.9
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _enforce(results: dict[str, float], request: pytest.FixtureRequest) -> Iterator[None]:
+    yield
+    if results and request.config.getoption("--enforce"):
+        missed = [t.what for t in targets(results) if not t.met]
+        assert not missed, f"missed: {missed}"
+
+
+def _write_pair(path: Path, ours: np.ndarray, theirs: np.ndarray) -> None:
+    shown = [np.clip(255 * (p / np.percentile(p, 99)) ** (1 / 2.2), 0, 255) for p in (ours, theirs)]
+    path.parent.mkdir(parents=True, exist_ok=True)
+    assert cv2.imwrite(str(path), np.hstack(shown).astype(np.uint8))

@@ -1,0 +1,152 @@
+"""What the benchmarks time: one labelled sample of a frame filled with terrain, cut into its stages."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vbnfault import config, dataset, frames, pipeline, render, store
+from vbnfault.body import Patch
+from vbnfault.pipeline import Frame, Pose, SampleSpec
+from vbnfault.quantities import Sample
+from vbnfault.render.emitter import SunDisc
+from vbnfault.render.runtime import dr
+from vbnfault.render.sampling import Optics, Strata
+from vbnfault.scene import Scene
+
+SCENE = "paper_example"  # its six faults; the view is our own
+SHARD_SAMPLES = 8
+
+# An oblique look at talus, no sky in the frame, the Sun ahead and above it: long shadows, flares in view.
+CAMERA_HEIGHT_M = 80.0
+CAMERA_AZIMUTH_DEG = 240.0
+CAMERA_BELOW_HORIZON_DEG = 52.0
+SUN_AZIMUTH_DEG = 225.0
+SUN_ELEVATION_DEG = 24.0
+
+
+def clock(function: Callable[[], Any]) -> tuple[float, Any]:
+    """Seconds that a call takes, what it queued on the render threads included, and what it returned."""
+    dr.sync_thread()
+    start = time.perf_counter()
+    result = function()
+    dr.sync_thread()
+    return time.perf_counter() - start, result
+
+
+@dataclass(frozen=True, eq=False)
+class Workload:
+    """A terrain, a pose above it, and a sample of the scene that is put there."""
+
+    session: pipeline.Session
+    patch: Patch
+    spec: SampleSpec
+    pose: Pose
+
+    @classmethod
+    def load(cls, size_px: int, *, facet_m: float | None = None) -> Workload:
+        """The scene at `size_px`; `facet_m` coarsens the terrain (for a quick look)."""
+        overrides: dict[str, Any] = {
+            "camera.width_px": size_px,
+            "camera.height_px": size_px,
+            "dataset.layers": ["clean"],
+            "dataset.samples": SHARD_SAMPLES,
+            "dataset.shard_samples": SHARD_SAMPLES,
+            "faults.optics_degradation.scale_with_resolution": False,  # else too fine to show at small sizes
+        }
+        if facet_m is not None:
+            overrides |= {"patch.facet_m": facet_m, "patch.min_boulder_m": 4 * facet_m}
+        session = pipeline.Session(config.load_scene(SCENE, overrides))
+        patch = session._patch(session.sites[0])
+        surface = render.Surface(patch.vertices_L_m, patch.faces, patch.face_is_boulder)
+        terrain = pipeline.Terrain(body=session.body, site=patch.site, surface=surface)
+        spec = SampleSpec(
+            index=0, scene=session.scene, plan=session.plan, faults=session.faults, terrain=terrain
+        )
+        return cls(session, patch, spec, _pose(surface))
+
+    @cached_property
+    def scene(self) -> Scene:
+        """What the renderer is given."""
+        return self._placed()[1]
+
+    def _placed(self) -> tuple[Frame, Scene]:
+        frame = Frame(spec=self.spec)
+        frame.pose = self.pose
+        frame.camera = self.session.base_camera
+        frame.sunlight = pipeline.sunlight(self.spec.scene, self.pose.sun_L)
+        return frame, pipeline.describe(frame)
+
+    def bound(self) -> None:
+        """As fast as tracing gets: the render's own rays in its order, a closest hit and a shadow ray each.
+
+        One kernel, which writes a byte a sample: no bands, no shading, no sum over pixels.
+        """
+        view, surface = self.scene.view, self.spec.terrain.surface
+        optics, sun = Optics(view), SunDisc(self.scene.sun)
+        strata = Strata(view.width_px, view.height_px, self.scene.samples_per_pixel, self.scene.key)
+        hit = surface.intersect(optics.camera_rays(strata))
+        normal, towards = hit.facet_normal, sun.sample(*strata.pair(1))
+        lit = hit.valid & (dr.dot(normal, towards) > 0)
+        lit &= ~surface.occluded(hit.shadow_rays(towards, normal), lit)
+        dr.eval(lit)
+
+    def grey(self) -> np.ndarray:
+        """The render as linear grey float32[y, x]: the middle band."""
+        array = render.radiance(self.spec.terrain.surface, self.scene).array
+        return array[len(array) // 2]
+
+    def labelled_sample(self, folder: store.Store) -> tuple[dict[str, float], Frame]:
+        """Seconds per stage of a sample from proposal to disk, and its frame.
+
+        `store` is the time per sample of encoding and writing a shard of 8.
+        """
+        seconds: dict[str, float] = {}
+        surface = self.spec.terrain.surface
+        seconds["resolve"], _ = clock(lambda: pipeline.resolve(Frame(spec=self.spec)))
+        frame, scene = self._placed()
+        seconds["render"], frame.radiance = clock(lambda: render.radiance(surface, scene))
+        seconds["truth"], frame.truth = clock(lambda: render.truth(surface, scene.view, scene.sun))
+        for stage in (pipeline.meter, pipeline.photograph, pipeline.label):
+            seconds[stage.__name__], _ = clock(lambda stage=stage: stage(frame))
+        seconds["to_sample"], sample = clock(lambda: pipeline.to_sample(frame))
+        shard, _ = clock(lambda: write_shard(folder, sample))
+        seconds["store"] = shard / SHARD_SAMPLES
+        return seconds, frame
+
+    def empty_store(self, path: Path) -> store.Store:
+        """A store for one shard of samples."""
+        return store.create(path, dataset.store_spec(self.session, [SHARD_SAMPLES]), SHARD_SAMPLES)
+
+
+def write_shard(folder: store.Store, sample: Sample) -> None:
+    """Encode and write the sample eight times, as a build writes a shard."""
+    store.write_samples(folder, (replace(sample, index=i) for i in range(SHARD_SAMPLES)))
+
+
+def _pose(surface: render.Surface) -> Pose:
+    ground = float(render.ground_height_m(surface, np.zeros(1), np.zeros(1), 300.0)[0])
+    z = frames.direction_L(CAMERA_AZIMUTH_DEG, -CAMERA_BELOW_HORIZON_DEG)
+    x = np.cross([0.0, 0.0, 1.0], z)  # level: y of the image points down
+    x /= np.linalg.norm(x)
+    return Pose(
+        position_L_m=np.array([0.0, 0.0, -(ground + CAMERA_HEIGHT_M)]),
+        L_from_C=np.column_stack([x, np.cross(z, x), z]),
+        sun_L=frames.direction_L(SUN_AZIMUTH_DEG, SUN_ELEVATION_DEG),
+        sun_azimuth_deg=SUN_AZIMUTH_DEG,
+        sun_elevation_deg=SUN_ELEVATION_DEG,
+        sun_visible_fraction=1.0,
+        tries=1,
+        resolved=True,
+    )
+
+
+def medians(rounds: list[Mapping[str, float]]) -> dict[str, float]:
+    """Median over the rounds of every entry."""
+    return {name: float(np.median([r[name] for r in rounds])) for name in rounds[0]}

@@ -1,0 +1,353 @@
+"""The command line on real scenes: build, resume, verify, render, and one sentence for every mistake."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from conftest import small_scene
+
+from vbnfault import cli, store
+
+ENVIRONMENT = {**os.environ, "PYTHONWARNINGS": "error::UserWarning"}
+
+
+def toml(table: dict[str, Any]) -> str:
+    """Enough TOML for a scene of plain values and nested tables."""
+
+    def value(v: Any) -> str:
+        if isinstance(v, dict):
+            return "{ " + ", ".join(f"{k} = {value(x)}" for k, x in v.items()) + " }"
+        if isinstance(v, list | tuple):
+            return "[" + ", ".join(map(value, v)) + "]"
+        return json.dumps(v)
+
+    return "\n".join(f"{k} = {value(v)}" for k, v in table.items()) + "\n"
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("scene") / "small.toml"
+    path.write_text(toml(small_scene()))
+    return path
+
+
+def run(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
+    """The command in this process; its exit code."""
+    monkeypatch.setattr(sys, "argv", ["vbnfault", *map(str, arguments)])
+    try:
+        cli.main()
+    except SystemExit as stop:
+        return int(stop.code or 0)
+    return 0
+
+
+def command(*arguments: object) -> list[str]:
+    return [sys.executable, "-m", "vbnfault.cli", *map(str, arguments)]
+
+
+@pytest.fixture(scope="module")
+def built(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The reference store: one process, two threads, nothing interrupted."""
+    out = tmp_path_factory.mktemp("built") / "reference.zarr"
+    done = subprocess.run(
+        command("build", scene, "--out", out, "--threads", 2), env=ENVIRONMENT, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+    return out
+
+
+def test_a_build_is_whole_and_labelled(
+    built: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(monkeypatch, "verify", built) == 0
+    assert "16 samples, whole, labelled and as planned" in capsys.readouterr().out
+
+
+def test_xarray_shows_labelled_axes(built: Path) -> None:
+    import xarray
+
+    with xarray.open_zarr(built) as data:
+        assert data["image"].dims == ("sample", "y", "x", "channel")
+        assert data["fault"].values.tolist()[:3] == ["dust_on_optics", "broken_pixels", "broken_lines"]
+        assert data["channel"].values.tolist() == ["R", "G", "B", "I"]
+        assert data["depth_m"].attrs["units"] == "m"
+        assert data.attrs["scene"]["camera"]["fov_deg"] == 65.0
+        planned = json.loads(str(data["proposal"].values[0]))
+        assert "sun_elevation_deg" in planned
+
+
+@pytest.mark.parametrize(("workers", "threads"), [(1, 1), (2, 1)])
+def test_the_digest_depends_on_no_workers_or_threads(
+    built: Path, scene: Path, tmp_path: Path, workers: int, threads: int
+) -> None:
+    out = tmp_path / "again.zarr"
+    options = ("--workers", workers, "--threads", threads)
+    done = subprocess.run(
+        command("build", scene, "--out", out, *options), env=ENVIRONMENT, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+    assert store.digest(out) == store.digest(built)
+
+
+def test_the_digest_survives_five_kills(built: Path, scene: Path, tmp_path: Path) -> None:
+    """kill -9 after each time that new samples have landed, or at a random moment before."""
+    out = tmp_path / "killed.zarr"
+    dice = random.Random(5)
+    killed = 0
+    for _ in range(40):
+        process = subprocess.Popen(
+            command("build", scene, "--out", out), env=ENVIRONMENT,
+            stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+        )
+        before = store.open_store(out).finished() if store.is_store(out) else 0
+        deadline = time.monotonic() + 120
+        while process.poll() is None and time.monotonic() < deadline:
+            time.sleep(0.02)
+            if killed < 5 and store.is_store(out) and store.open_store(out).finished() > before:
+                time.sleep(dice.uniform(0, 0.3))
+                process.send_signal(signal.SIGKILL)
+                killed += process.wait() == -signal.SIGKILL
+        assert process.wait() in (0, -signal.SIGKILL)
+        if process.returncode == 0:
+            break
+    assert killed >= 2, "too fast to be interrupted: enlarge the scene"
+    assert store.verify(out) == []
+    assert store.digest(out) == store.digest(built)
+    assert not list(out.rglob("*.partial"))
+
+
+def test_a_rendered_sample_equals_the_stored_one(
+    built: Path, scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import cv2
+    import OpenEXR
+
+    assert run(monkeypatch, "render", scene, "--sample", 5, "--out", tmp_path) == 0
+    stored = store.open_store(built).read_sample(5)
+    image = cv2.imread(str(tmp_path / "image.png"))[..., ::-1]
+    assert np.array_equal(image, stored.layers["image"][..., :3])
+    assert np.array_equal(
+        cv2.imread(str(tmp_path / "image_intensity.png"), cv2.IMREAD_UNCHANGED), stored.layers["image"][..., 3]
+    )
+    for k, name in enumerate(store.open_store(built).spec.faults):
+        mask = cv2.imread(str(tmp_path / f"mask_{name}.png"), cv2.IMREAD_UNCHANGED) > 0
+        assert np.array_equal(mask, stored.layers["mask"][k])
+    scalars = json.loads((tmp_path / "parameters.json").read_text())
+    assert scalars["exposure_s"] == stored.scalars["exposure_s"]
+    with OpenEXR.File(str(tmp_path / "sample.exr"), separate_channels=True) as exr:
+        channels = exr.channels()
+        assert np.array_equal(channels["depth.Z"].pixels, stored.layers["depth_m"])
+        assert sum(name.startswith("radiance.") for name in channels) == 8
+
+
+def test_damage_is_named_and_exactly_mended(
+    built: Path, scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    import shutil
+
+    hurt = tmp_path / "hurt.zarr"
+    shutil.copytree(built, hurt)
+    flipped = store.open_store(hurt).file("image", 1)
+    data = bytearray(flipped.read_bytes())
+    data[len(data) // 3] ^= 0x10
+    flipped.write_bytes(bytes(data))
+    missing = store.open_store(hurt).file("depth_m", 3)
+    missing.unlink()
+    intact = store.open_store(hurt).file("image", 2)
+    stamp = intact.stat().st_mtime_ns
+    assert run(monkeypatch, "verify", hurt) == 1
+    said = capsys.readouterr().err
+    assert "image" in said
+    assert "depth_m" in said
+    assert run(monkeypatch, "build", scene, "--out", hurt) == 0
+    assert run(monkeypatch, "verify", hurt) == 0
+    assert store.digest(hurt) == store.digest(built)
+    assert intact.stat().st_mtime_ns == stamp
+
+
+def test_append_keeps_earlier_bits(
+    built: Path, scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import shutil
+
+    longer = tmp_path / "longer.zarr"
+    shutil.copytree(built, longer)
+    assert run(monkeypatch, "build", scene, "--out", longer, "--append", 3) == 0
+    assert run(monkeypatch, "verify", longer) == 0
+    before, after = store.open_store(built), store.open_store(longer)
+    assert after.samples == 19
+    for i in (0, 7, 15):
+        a, b = before.read_sample(i), after.read_sample(i)
+        assert all(np.array_equal(a.layers[n], b.layers[n]) for n in a.layers)
+        assert a.scalars["parameters"] == b.scalars["parameters"]
+
+
+def test_ctrl_c_stops_cleanly_and_resumes(scene: Path, built: Path, tmp_path: Path) -> None:
+    out = tmp_path / "stopped.zarr"
+    process = subprocess.Popen(
+        command("build", scene, "--out", out), env=ENVIRONMENT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    deadline = time.monotonic() + 120
+    while not (store.is_store(out) and store.open_store(out).finished()) and time.monotonic() < deadline:
+        time.sleep(0.02)
+    process.send_signal(signal.SIGINT)
+    _, said = process.communicate(timeout=60)
+    assert process.returncode in (0, 130)
+    assert "Traceback" not in said
+    again = subprocess.run(command("build", scene, "--out", out), env=ENVIRONMENT, capture_output=True, text=True)
+    assert again.returncode == 0, again.stderr
+    assert store.digest(out) == store.digest(built)
+
+
+def write_obj(path: Path, kind: str) -> None:
+    import trimesh
+
+    mesh = trimesh.creation.icosphere(subdivisions=2, radius=1000.0)
+    vertices, faces = mesh.vertices.copy(), mesh.faces.copy()
+    if kind == "open":
+        faces = faces[len(faces) // 3 :]
+    if kind == "nan":
+        vertices[7] = np.nan
+    if kind == "faceless":
+        faces = faces[:0]
+    lines = [f"v {x} {y} {z}" for x, y, z in vertices] + [f"f {a + 1} {b + 1} {c + 1}" for a, b, c in faces]
+    path.write_text("" if kind == "empty" else "\n".join(lines) + "\n")
+
+
+@pytest.mark.parametrize("kind", ["open", "nan", "faceless", "empty", "absent"])
+def test_a_bad_mesh_is_refused_in_one_sentence(
+    kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    mesh = tmp_path / f"{kind}.obj"
+    if kind != "absent":
+        write_obj(mesh, kind)
+    code = run(monkeypatch, "build", "quickstart", "--set", f"body.shape={mesh}", "--out", tmp_path / "x.zarr")
+    assert_one_sentence(code, capsys.readouterr().err, mesh.name)
+    assert not (tmp_path / "x.zarr").exists()
+
+
+@pytest.mark.parametrize(
+    ("setting", "expected"),
+    [
+        ("camera.fov_deg=0", "camera.fov_deg = 0"),
+        ("camera.fov_deg=200", "camera.fov_deg = 200"),
+        ("camera.fovdeg=65", "camera.fovdeg"),
+        ("camera.width_px=true", "camera.width_px = True"),
+        ("dataset.seed='one'", "dataset.seed = 'one'"),
+        ("geometry.x_m=[5, -5]", "bounds reversed"),
+        ("faults.dust_on_optics.count=[9, 3]", "bounds reversed"),
+        ("faults.dust_on_optics.peak_dn=300", "faults.dust_on_optics.peak_dn = 300"),
+        ("faults.dust_on_optics.grains=3", "faults.dust_on_optics.grains"),
+        ("faults.dust.count=3", "faults.dust"),
+        ("faults.straylight.model=nope", "faults.straylight.model"),
+        ("render.samples_per_pixel=12", "samples_per_pixel = 12"),
+        ("dataset.layers=['nope']", "dataset.layers"),
+    ],
+)
+def test_a_bad_key_is_named_with_its_value(
+    setting: str, expected: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    code = run(monkeypatch, "build", "quickstart", "--set", setting, "--out", tmp_path / "x.zarr")
+    said = capsys.readouterr().err
+    assert_one_sentence(code, said, expected)
+    assert "quickstart" in said
+
+
+def assert_one_sentence(code: int, said: str, expected: str) -> None:
+    assert code == 2
+    lines = [line for line in said.splitlines() if not line.startswith("warning:")]
+    assert len(lines) == 1, said
+    assert expected in lines[0]
+    assert "Traceback" not in said
+
+
+def test_another_scene_is_refused_and_named(
+    built: Path, scene: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = store.digest(built)
+    code = run(monkeypatch, "build", scene, "--out", built, "--set", "camera.fov_deg=40")
+    said = capsys.readouterr().err
+    assert_one_sentence(code, said, "fov_deg")
+    assert re.search(r"65.* store and 40", said)
+    assert store.digest(built) == before
+
+
+def test_a_path_that_cannot_be_written_is_one_sentence(
+    scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    blocked = tmp_path / "file"
+    blocked.write_text("in the way")
+    code = run(monkeypatch, "build", scene, "--out", blocked / "x.zarr")
+    said = capsys.readouterr().err
+    assert code in (1, 2)
+    assert str(blocked) in said
+    assert "Traceback" not in said
+
+
+def test_no_usable_llvm_is_one_sentence_and_no_abort(scene: Path, tmp_path: Path) -> None:
+    """Only LLVM 14 in sight: a sentence, whatever the machine has."""
+    program = (
+        "import sys; from pathlib import Path; from vbnfault import cli, llvm\n"
+        f"old = Path({str(tmp_path / 'libLLVM-14.so.1')!r}); old.write_bytes(b'')\n"
+        "llvm._paths = lambda: iter([('system', old)])\n"
+        f"sys.argv = ['vbnfault', 'build', {str(scene)!r}, '--out', {str(tmp_path / 'x.zarr')!r}]\n"
+        "cli.main()\n"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert done.returncode == 1
+    assert "no usable LLVM" in done.stderr
+    assert "version 14" in done.stderr
+    assert len(done.stderr.splitlines()) == 1
+
+
+def test_list_schema_doctor_and_dry_run(
+    scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(monkeypatch, "list", "scenes") == 0
+    assert "quickstart" in capsys.readouterr().out
+    assert run(monkeypatch, "list", "faults") == 0
+    assert "straylight / texture" in capsys.readouterr().out
+    assert run(monkeypatch, "list", "lenses") == 0
+    assert run(monkeypatch, "list", "detectors") == 0
+    capsys.readouterr()
+    assert run(monkeypatch, "schema") == 0
+    schema = json.loads(capsys.readouterr().out)
+    assert "straylight" in schema["properties"]["faults"]["properties"]
+    assert run(monkeypatch, "doctor") == 0
+    assert "as it should be" in capsys.readouterr().out
+    assert run(monkeypatch, "build", scene, "--out", tmp_path / "x.zarr", "--dry-run") == 0
+    assert "16 samples" in capsys.readouterr().out
+    assert not (tmp_path / "x.zarr").exists()
+
+
+def test_help_is_quick() -> None:
+    # 0.5 s of processor time on a quiet machine; best of three, since others may be at work
+    times = []
+    for _ in range(3):
+        start = os.times()
+        subprocess.run(command("--help"), check=True, capture_output=True)
+        end = os.times()
+        used = end.children_user + end.children_system - start.children_user - start.children_system
+        times.append(used)
+    assert min(times) < 0.5
+
+
+def test_the_real_shape_builds(real_shape: Path, scene: Path, tmp_path: Path) -> None:
+    out = tmp_path / "real.zarr"
+    options = ("--set", f"body.shape={real_shape}", "--samples", 2)
+    done = subprocess.run(
+        command("build", scene, "--out", out, *options), env=ENVIRONMENT, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+    assert store.verify(out) == []

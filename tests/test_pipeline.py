@@ -1,0 +1,288 @@
+"""A sample as a whole: labels on their pixels, twins, keyed draws, geometry, exposure."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import numpy as np
+import pytest
+from conftest import ALL_FAULTS, small_scene
+
+from vbnfault import config, frames, labels, pipeline, plan, resources
+from vbnfault.faults.straylight import flare_centres_px
+from vbnfault.pipeline import Frame, Session
+
+_SESSIONS: dict[str, Session] = {}
+
+
+def session(**tables: Any) -> Session:
+    """Sessions are kept: terrain takes seconds."""
+    key = json.dumps(tables, sort_keys=True, default=str)
+    if key not in _SESSIONS:
+        scene = config.parse_scene(small_scene(**tables), source="test")
+        _SESSIONS[key] = Session(scene)
+    return _SESSIONS[key]
+
+
+@pytest.fixture(scope="module")
+def frames_() -> list[Frame]:
+    """Sixteen frames, all classes, every optional layer."""
+    without = [f"without_{f}" for f in ALL_FAULTS]
+    layers = ["clean", "depth_m", "normal", "semantic", "mask_effect", *without]
+    s = session(dataset={"layers": layers})
+    return [s.frame(i) for i in range(16)]
+
+
+def test_masks_of_defects_lie_exactly_on_their_pixels(frames_: list[Frame]) -> None:
+    # noise-free twins with and without the class differ inside its mask and nowhere else
+    seen = set()
+    for frame in frames_:
+        for k, name in enumerate(frame.spec.faults):
+            if name not in frame.drawn:
+                assert not frame.mask[k].any()
+                continue
+            seen.add(name)
+            effect = pipeline.effect_of(frame, name)
+            assert effect.any(), f"{name} is claimed and not in the pixels"
+            if name == "straylight":
+                assert np.array_equal(frame.mask[k], effect)
+            elif name in ("broken_pixels", "broken_lines"):
+                assert not (effect & ~frame.mask[k]).any()
+    assert seen == set(ALL_FAULTS)
+
+
+def test_broken_lines_are_whole_lines_of_their_value(frames_: list[Frame]) -> None:
+    checked = 0
+    k = ALL_FAULTS.index("broken_lines")
+    for frame in frames_:
+        if "broken_lines" not in frame.drawn:
+            continue
+        mask, image = frame.mask[k], frame.images["image"].array
+        rows, columns = mask.all(axis=1), mask.all(axis=0)
+        rebuilt = rows[:, None] | columns[None, :]
+        assert np.array_equal(mask, rebuilt)
+        assert np.isin(image[mask], (0, 255)).all()
+        assert (image[mask] == image[mask][:, :1]).all()  # all four channels alike
+        if frame.camera.architecture in ("full_frame_ccd", "frame_transfer_ccd"):
+            assert not (rows.any() and columns.any())
+        checked += 1
+    assert checked >= 4
+
+
+def test_flares_lie_on_the_line_from_the_sun_through_the_centre(frames_: list[Frame]) -> None:
+    checked = 0
+    for frame in frames_:
+        if "straylight" not in frame.drawn:
+            continue
+        sun, centre = frame.context.sun_xy_px, np.array([48.0, 40.0])
+        along = (centre - sun) / np.linalg.norm(centre - sun)
+        centres = flare_centres_px(frame.drawn["straylight"], sun)
+        offset = (centres - sun) @ np.array([-along[1], along[0]])
+        np.testing.assert_allclose(offset, 0, atol=0.5)
+        checked += 1
+    assert checked >= 4
+
+
+def test_sun_is_whole_and_a_flare_is_in_the_frame_where_straylight_is(frames_: list[Frame]) -> None:
+    for frame in frames_:
+        if "straylight" in frame.drawn:
+            assert frame.pose.sun_visible_fraction == 1.0
+            assert frame.mask[ALL_FAULTS.index("straylight")].any()
+            assert frame.spec.plan.stratum[frame.spec.index] == plan.SUN_FACING
+        else:
+            angle = np.degrees(np.arccos(frame.pose.L_from_C[:, 2] @ frame.pose.sun_L))
+            assert angle >= np.sqrt(2) * 32.5 - 1e-9
+
+
+def test_the_image_without_a_class_equals_the_one_of_a_scene_that_lacks_it(frames_: list[Frame]) -> None:
+    # switching a class off leaves every other draw, the noise and the exposure unchanged
+    for dropped in ("dust_on_optics", "broken_lines"):
+        faults = {name: {} for name in ALL_FAULTS if name != dropped}
+        other = session(dataset={"layers": ["clean"]})
+        lacking = Session(config.parse_scene({**small_scene(), "faults": faults}, source="test"))
+        lacking._terrain = other._terrain
+        i = next(f.spec.index for f in frames_ if dropped in f.drawn)
+        # the same fault matrix for the other classes: take it from the full plan
+        columns = [k for k, name in enumerate(ALL_FAULTS) if name != dropped]
+        full = frames_[i].spec.plan
+        object.__setattr__(lacking.plan, "injected", full.injected[:, columns])
+        object.__setattr__(lacking.plan, "stratum", full.stratum)
+        object.__setattr__(lacking.plan, "variables", full.variables)
+        frame = lacking.frame(i)
+        assert np.array_equal(frame.images["clean"].array, frames_[i].images["clean"].array)
+        want = frames_[i].images[f"without_{dropped}"].array
+        assert np.array_equal(frame.images["image"].array, want)
+
+
+def test_clean_twin_differs_only_where_faults_are(frames_: list[Frame]) -> None:
+    local = [ALL_FAULTS.index(n) for n in ("dust_on_optics", "broken_pixels", "broken_lines")]
+    checked = 0
+    for frame in frames_:
+        if not set(frame.drawn) <= {ALL_FAULTS[k] for k in local}:
+            continue
+        changed = labels.effect(frame.images["image"].array, frame.images["clean"].array)
+        assert not (changed & ~frame.mask[local].any(axis=0)).any()
+        checked += 1
+    assert checked >= 1
+
+
+def test_geometry_scalars_agree_with_one_another(frames_: list[Frame]) -> None:
+    from scipy.spatial.transform import Rotation
+
+    for frame in frames_:
+        sample = pipeline.to_sample(frame)
+        s = sample.scalars
+        w, x, y, z = s["camera_from_T"]
+        camera_from_T = Rotation.from_quat([x, y, z, w]).as_matrix()
+        sun_C = camera_from_T @ s["sun_direction_T"]
+        np.testing.assert_allclose(sun_C, frame.context.sun_direction_C, atol=1e-12)
+        fx, fy, cx, cy = s["intrinsics"]
+        if sun_C[2] > 0:
+            want = [cx + fx * sun_C[0] / sun_C[2], cy + fy * sun_C[1] / sun_C[2]]
+            np.testing.assert_allclose(s["sun_xy_px"], want, rtol=1e-9)
+        position = s["site_T_m"] + s["T_from_L"] @ s["position_L_m"]
+        np.testing.assert_allclose(position, s["camera_position_T_m"], atol=1e-9)
+        # the commanded Sun, by way of the target's attitude in J
+        sun_J = -frames.unit(frames.ORBIT_67P.position_J_au(s["julian_date"]))
+        np.testing.assert_allclose(s["T_from_J"] @ sun_J, s["sun_direction_T"], atol=1e-12)
+        azimuth, elevation = frames.azimuth_elevation_deg(s["T_from_L"].T @ s["sun_direction_T"])
+        assert azimuth == pytest.approx(s["sun_azimuth_deg"] % 360, abs=1e-9)
+        assert elevation == pytest.approx(s["sun_elevation_deg"], abs=1e-9)
+
+
+def test_surface_points_reproject_to_their_pixels(frames_: list[Frame]) -> None:
+    """Depth, pose and intrinsics agree: the 3-D point of a pixel, seen from it, lies on the body's surface."""
+    from vbnfault import render
+
+    checked = 0
+    for frame in frames_:
+        body = frame.truth.semantic == 1
+        if body.mean() < 0.2:
+            continue
+        y, x = np.nonzero(body)
+        pick = slice(None, None, max(1, len(y) // 200))
+        depth = frame.truth.depth_m[y[pick], x[pick]].astype(float)
+        fx, fy, cx, cy = frame.camera.intrinsics
+        in_C = np.stack([(x[pick] + 0.5 - cx) / fx, (y[pick] + 0.5 - cy) / fy, np.ones_like(depth)], -1)
+        point = frame.pose.position_L_m + (in_C * depth[:, None]) @ frame.pose.L_from_C.T
+        # a probe half a millimetre-per-metre in front is in the open, and surface lies within twice that
+        away = frame.pose.position_L_m - point
+        reach = np.linalg.norm(away, axis=1)
+        probe = point + away * 5e-4
+        hits = [
+            not render.is_clear(frame.spec.terrain.surface, probe[j : j + 1], 0.02 * reach[j] + 1e-3)[0]
+            for j in range(0, len(probe), 20)
+        ]
+        assert np.mean(hits) > 0.95
+        checked += 1
+    assert checked >= 2
+
+
+def test_cameras_are_above_ground_and_clear(frames_: list[Frame]) -> None:
+    from vbnfault import render
+
+    for frame in frames_:
+        p = frame.pose.position_L_m
+        surface = frame.spec.terrain.surface
+        ground = render.ground_height_m(surface, p[:1], p[1:2], 500.0)[0]
+        lo, hi = frame.spec.scene.geometry.height_m
+        assert lo - 1e-3 <= -p[2] - ground <= hi + 1e-3
+        assert render.is_clear(surface, p[None], frame.spec.scene.geometry.clearance_m)[0]
+
+
+def test_metered_exposure_puts_the_percentile_at_its_level() -> None:
+    s = session(camera={"metering_level": 0.5, "metering_percentile": 90.0})
+    checked = 0
+    for i in range(16):
+        frame = Frame(spec=s.spec(i))
+        for stage in pipeline.STAGES[:3]:
+            stage(frame)
+        signal = frame.camera.detector.electrons_expected(
+            frame.camera.lens.image(frame.radiance), frame.camera.exposure_s
+        )
+        share = (signal.array / signal.white_e).max(axis=-1)[frame.truth.semantic == 1]
+        bright = share[share > 0.05]
+        if len(bright) < 0.1 * share.size or len(bright) < 500:
+            continue
+        # metered on a quarter of the pixels, with a slightly different bound of what counts as lit
+        if frame.camera.exposure_s not in (1e-5, 5.0):
+            checked += abs(np.percentile(bright, 90) - 0.5) < 0.05
+    assert checked >= 3
+
+
+def test_a_fixed_exposure_is_kept_and_scales_the_signal() -> None:
+    s = session(camera={"exposure_s": 0.004})
+    frame = s.frame(3)
+    assert frame.camera.exposure_s == 0.004
+
+
+def test_black_lines_on_black_sky_are_not_claimed() -> None:
+    # far above a body that is out of view: only the sky, where a dead line changes nothing
+    s = session(
+        dataset={"samples": 2, "sites": 1, "shard_samples": 2},
+        geometry={
+            "height_m": [5e4, 6e4],
+            "sun_averted": {"reference": "nadir", "roll_deg": [180, 180], "pitch_deg": [0, 0],
+                            "sun_elevation_deg": [-80, -60]},
+        },
+        plan={"faulty_fraction": 1.0, "mode": "per_class"},
+        faults={},
+    )
+    table = small_scene()
+    table |= {
+        "dataset": {**table["dataset"], "samples": 2, "sites": 1, "shard_samples": 2},
+        "geometry": {
+            "height_m": [5e4, 6e4],
+            "sun_averted": {"reference": "nadir", "roll_deg": [180, 180], "pitch_deg": [0, 0],
+                            "sun_elevation_deg": [-80, -60]},
+        },
+        "plan": {"faulty_fraction": 1.0, "mode": "per_class"},
+        "faults": {"broken_lines": {"white_count": 0, "black_count": 3, "count": 3}, "vignetting": {}},
+    }
+    dark = Session(config.parse_scene(table, source="test"))
+    dark._terrain = s.spec(0).terrain
+    sample = dark.simulate(0)
+    assert (sample.layers["semantic"] == 0).all()
+    assert not sample.scalars["injected"].any()
+    assert not sample.layers["mask"].any()
+    assert sample.scalars["parameters"] == {}
+    assert sample.scalars["proposal"]["injected"] == ["broken_lines", "vignetting"]
+
+
+@pytest.mark.parametrize("name", sorted(resources.packaged("scenes")))
+def test_every_packaged_scene_makes_a_sample(name: str) -> None:
+    shrink = {"camera.width_px": 64, "camera.height_px": 64, "render.samples_per_pixel": 4}
+    scene = config.load_scene(name, shrink)
+    coarse = max(scene.patch.facet_m, 15.0)
+    scene = config.load_scene(name, {**shrink, "patch.facet_m": coarse, "patch.radius_m": 60.0})
+    s = Session(scene)
+    # the first sample and the last: both strata where the scene has both
+    for i in (0, scene.dataset.samples - 1):
+        s._terrain = s.terrain(int(s.plan.site[0]))
+        spec = pipeline.SampleSpec(index=i, scene=scene, plan=s.plan, faults=s.faults, terrain=s._terrain)
+        sample = pipeline.simulate(spec)
+        assert sample.layers["image"].shape == (64, 64, 4)
+        assert sample.layers["image"].dtype == np.uint8
+
+
+def test_the_paper_example_has_the_papers_parameters() -> None:
+    shrink = {"camera.width_px": 256, "camera.height_px": 256, "patch.facet_m": 8.0}
+    s = Session(config.load_scene("paper_example", shrink))
+    parameters = pipeline.to_sample(s.frame(0)).scalars["parameters"]
+    assert len(parameters["dust_on_optics"]["x_px"]) == 50
+    assert parameters["broken_pixels"]["sensor"] == "ccd"
+    assert parameters["broken_pixels"]["line_direction"] == "right"
+    assert len(parameters["broken_pixels"]["x"]) == 9
+    values = parameters["broken_lines"]["row_values"] + parameters["broken_lines"]["column_values"]
+    assert sorted(values) == [0, 0, 255, 255, 255]
+    assert parameters["optics_degradation"]["filter_size_px"] == 3
+    flares = parameters["straylight"]["flares"]
+    assert [(f["index"], f["position"], f["radius"], f["brightness"]) for f in flares] == [
+        (3, 0.83, 0.11, 1.5),
+        (4, 1.00, 0.13, 1.5),
+        (5, 1.17, 0.16, 1.5),
+    ]
+    assert parameters["vignetting"]["on_axis_illuminance_dn"] == 255
+    spec = s.spec(0)
+    assert spec.scene.camera.readout_directions == ("right",)

@@ -1,0 +1,457 @@
+"""The plan: bounds and proportions of the sampling, an exact fault matrix, stability under appending."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy import stats
+
+from vbnfault import config, plan
+from vbnfault.config import SceneConfig, parse_scene
+from vbnfault.errors import InputError
+from vbnfault.faults import FAULT_AXIS
+
+N = 2000
+FAR = plan.SUN_AVERTED
+NEAR = plan.SUN_FACING
+
+# Every statistic below is of fixed seeds, so nothing here is flaky; a wrong plan would have to hide behind
+# this level: 1e-3 over about 30 comparisons.
+LEVEL = 1e-3 / 30
+
+
+def scene(**tables: dict[str, Any]) -> SceneConfig:
+    dataset = {"samples": N, "seed": 20} | tables.pop("dataset", {})
+    return parse_scene({"title": "t", "dataset": dataset, **tables}, source="here")
+
+
+def make(**tables: dict[str, Any]) -> plan.Plan:
+    return plan.make_plan(scene(**tables), FAULT_AXIS)
+
+
+@pytest.fixture(scope="module")
+def paper() -> plan.Plan:
+    return make()
+
+
+def sun_angle_deg(p: plan.Plan) -> np.ndarray:
+    roll, pitch = np.radians(p.variables["roll_deg"]), np.radians(p.variables["pitch_deg"])
+    return np.degrees(np.arccos(np.clip(np.cos(roll) * np.cos(pitch), -1, 1)))
+
+
+# ------------------------------------------------------------------------------------------------ proposals
+
+PAPER_BOUNDS = {  # table of the boundaries of dataset variables; degrees, metres
+    "sun_azimuth_deg": ((0, 360), (0, 360)),
+    "sun_elevation_deg": ((-30, 30), (-30, 90)),
+    "roll_deg": ((-32.5, 32.5), (32.5, 327.5)),
+    "pitch_deg": ((-32.5, 32.5), (32.5, 327.5)),
+    "yaw_deg": ((0, 360), (0, 360)),
+    "x_m": ((-150, 150), (-150, 150)),
+    "y_m": ((-150, 150), (-150, 150)),
+    "height_m": ((0, 100), (0, 100)),
+}
+
+
+def test_the_plan_has_the_papers_variables(paper: plan.Plan) -> None:
+    assert tuple(paper.variables) == plan.VARIABLES == tuple(PAPER_BOUNDS)
+    assert len(paper) == N
+    assert all(v.shape == (N,) and v.dtype == np.float64 for v in paper.variables.values())
+
+
+@pytest.mark.parametrize("stratum", [NEAR, FAR])
+@pytest.mark.parametrize("name", PAPER_BOUNDS)
+def test_variables_are_uniform_within_the_papers_bounds(paper: plan.Plan, name: str, stratum: int) -> None:
+    lo, hi = PAPER_BOUNDS[name][stratum]
+    values = paper.variables[name][paper.stratum == stratum]
+    assert len(values) > 400
+    assert values.min() >= lo
+    assert values.max() <= hi
+    # n uniform numbers come within 10/n of the range to both its ends, but for a chance of 2·e^-10
+    assert values.min() < lo + 10 / len(values) * (hi - lo)
+    assert values.max() > hi - 10 / len(values) * (hi - lo)
+    if stratum == FAR and name in ("roll_deg", "pitch_deg"):
+        return  # conditional on the Sun: the next test
+    assert stats.kstest(values, stats.uniform(lo, hi - lo).cdf).pvalue > LEVEL
+
+
+def conditional_cdf(
+    lo: float, hi: float, least_deg: float
+) -> tuple[Callable[[np.ndarray], np.ndarray], float]:
+    """CDF of the roll, and the share kept, of a uniform (roll, pitch) in [lo, hi]² given a Sun angle ≥ least.
+
+    For a given roll the pitches to leave out are arcs about 0 or 180°, of half width
+    acos(cos least / |cos roll|).
+    """
+    roll = np.linspace(lo, hi, 200_001)
+    c = np.cos(np.radians(roll))
+    # the angle is below least where cos roll cos pitch > cos least: about 0 if cos roll > 0, else about 180
+    ratio = np.clip(np.cos(np.radians(least_deg)) / np.maximum(np.abs(c), 1e-12), -1, 1)
+    half = np.degrees(np.arccos(ratio))
+    out = np.zeros_like(roll)
+    for centre in (0.0, 180.0, 360.0):
+        mine = (c > 0) if centre != 180 else (c < 0)
+        overlap = np.clip(np.minimum(hi, centre + half) - np.maximum(lo, centre - half), 0, None)
+        out += np.where(mine, overlap, 0.0)
+    density = (hi - lo - out) / (hi - lo) ** 2
+    cdf = np.concatenate([[0], np.cumsum((density[1:] + density[:-1]) / 2 * np.diff(roll))])
+    return lambda x: np.interp(x, roll, cdf / cdf[-1]), float(cdf[-1])
+
+
+def test_the_conditional_distribution_agrees_with_rejection_sampling() -> None:
+    rng = np.random.default_rng(1)
+    roll, pitch = rng.uniform(32.5, 327.5, (2, 400_000))
+    cosine = np.cos(np.radians(roll)) * np.cos(np.radians(pitch))
+    keep = cosine <= np.cos(np.radians(32.5 * np.sqrt(2)))
+    cdf, share = conditional_cdf(32.5, 327.5, 32.5 * np.sqrt(2))
+    assert keep.mean() == pytest.approx(share, abs=4.5 * np.sqrt(share * (1 - share) / len(keep)))
+    assert stats.kstest(roll[keep], cdf).pvalue > LEVEL
+
+
+@pytest.mark.parametrize("fov_deg", [65.0, 5.0, 100.0])
+def test_sun_averted_attitudes_are_the_papers_given_that_the_sun_is_out_of_view(fov_deg: float) -> None:
+    p = make(camera={"fov_deg": fov_deg})
+    far = p.stratum == FAR
+    assert sun_angle_deg(p)[far].min() >= np.sqrt(2) * fov_deg / 2
+    assert sun_angle_deg(p)[far].min() < np.sqrt(2) * fov_deg / 2 + 10  # and no farther away than need be
+    cdf, share = conditional_cdf(fov_deg / 2, 360 - fov_deg / 2, np.sqrt(2) * fov_deg / 2)
+    for name in ("roll_deg", "pitch_deg"):
+        assert stats.kstest(p.variables[name][far], cdf).pvalue > LEVEL
+    # tries are geometric: mean 1/share, variance (1 - share)/share²
+    tries = p.attitude_tries[far]
+    assert tries.min() == 1
+    spread = np.sqrt((1 - share) / share**2 / len(tries))
+    assert tries.mean() == pytest.approx(1 / share, abs=4.5 * spread + 1e-12)
+    np.testing.assert_array_equal(p.attitude_tries[~far], 1)
+
+
+def test_sun_facing_attitudes_keep_the_sun_near_the_frame(paper: plan.Plan) -> None:
+    near = paper.stratum == NEAR
+    # both angles within ±FoV/2: at most acos(cos² 32.5°) = 44.7°
+    assert sun_angle_deg(paper)[near].max() <= np.degrees(np.arccos(np.cos(np.radians(32.5)) ** 2))
+
+
+def test_variables_are_independent_of_each_other_and_of_the_faults(paper: plan.Plan) -> None:
+    near = paper.stratum == NEAR
+    for mask in (near, ~near):
+        columns = [paper.variables[name][mask] for name in plan.VARIABLES]
+        columns += [
+            paper.injected[mask, k].astype(float) for k, f in enumerate(FAULT_AXIS) if f != plan.STRAYLIGHT
+        ]
+        columns += [paper.architecture[mask], paper.readout_direction[mask]]
+        rho = stats.spearmanr(np.column_stack(columns)).statistic
+        v = len(plan.VARIABLES)
+        pairs = np.abs(rho[:v])[np.triu_indices(v, 1, rho.shape[1])]
+        # about 170 rank correlations of spread 1/√n: 5 of it is 6e-7 two-sided
+        assert pairs.max() < 5 / np.sqrt(mask.sum())
+
+
+def test_architecture_and_readout_direction_are_uniform_and_independent(paper: plan.Plan) -> None:
+    table = np.histogram2d(paper.architecture, paper.readout_direction, bins=4, range=[[0, 4], [0, 4]])[0]
+    assert table.sum() == N
+    assert stats.chisquare(table.ravel()).pvalue > LEVEL
+    one = make(camera={"architectures": ["cmos"], "readout_directions": ["left", "up"]})
+    assert set(one.architecture) == {0}
+    assert set(one.readout_direction) == {0, 1}
+
+
+def test_nadir_referenced_attitudes_are_left_alone() -> None:
+    p = make(geometry={"sun_averted": {"reference": "nadir", "roll_deg": [-10, 10], "pitch_deg": [-5, 5]}})
+    far = p.stratum == FAR
+    for name, half in (("roll_deg", 10), ("pitch_deg", 5)):
+        assert stats.kstest(p.variables[name][far], stats.uniform(-half, 2 * half).cdf).pvalue > LEVEL
+    np.testing.assert_array_equal(p.attitude_tries, 1)
+
+
+def test_attitudes_that_never_lose_the_sun_are_refused() -> None:
+    with pytest.raises(InputError) as caught:
+        make(geometry={"sun_averted": {"roll_deg": [-5, 5], "pitch_deg": [-5, 5]}}, dataset={"samples": 4})
+    for part in ("geometry.sun_averted", "roll_deg", "46.0"):
+        assert part in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.xfail(strict=True, reason="the half diagonal counts the width twice, whatever the height")
+def test_the_sun_stays_out_of_an_upright_frame() -> None:
+    s = scene(camera={"width_px": 512, "height_px": 1024, "fov_deg": 65})
+    diagonal = np.degrees(np.arctan(np.hypot(1, 2) * np.tan(np.radians(32.5))))
+    assert plan.least_sun_angle_deg(s) >= diagonal
+
+
+# --------------------------------------------------------------------------------------------- fault matrix
+
+fractions = st.floats(0, 1) | st.sampled_from([0.0, 0.25, 1 / 3, 0.5, 0.75, 1.0])
+subsets = st.lists(st.sampled_from(FAULT_AXIS), max_size=6, unique=True).map(tuple)
+
+
+@st.composite
+def size_bounds(draw: st.DrawFn) -> tuple[int, int]:
+    lo = draw(st.integers(1, 6))
+    return lo, draw(st.integers(lo, 8))
+
+
+@given(st.integers(1, 300), subsets, fractions, st.integers(0, 2**32))
+def test_per_class_gives_every_class_its_exact_share(
+    n: int, faults: tuple[str, ...], p: float, seed: int
+) -> None:
+    matrix = plan.fault_matrix_per_class(n, faults, p, np.random.default_rng(seed))
+    assert matrix.shape == (n, len(faults))
+    assert matrix.dtype == bool
+    for k, fault in enumerate(faults):
+        assert matrix[:, k].sum() == round(p * n)
+        if fault == plan.STRAYLIGHT:  # Gallon et al., equation of the straylight injection
+            np.testing.assert_array_equal(matrix[:, k], np.arange(n) < round(p * n))
+
+
+@given(st.integers(1, 300), subsets, fractions, st.integers(0, 2**32), size_bounds())
+def test_per_sample_gives_exactly_the_faulty_samples(
+    n: int, faults: tuple[str, ...], p: float, seed: int, sizes: tuple[int, int]
+) -> None:
+    matrix = plan.fault_matrix_per_sample(n, faults, p, np.random.default_rng(seed), sizes)
+    assert matrix.shape == (n, len(faults))
+    assert matrix.dtype == bool
+    in_row = matrix.sum(axis=1)
+    faulty = in_row > 0
+    assert faulty.sum() == (round(p * n) if faults else 0)
+    lo, hi = (min(s, len(faults)) for s in sizes)
+    assert set(in_row[faulty]) <= set(range(lo, hi + 1))
+    if faults:  # dealt from decks of one card a class
+        per_class = matrix.sum(axis=0)
+        assert per_class.max() - per_class.min() <= 1
+    if plan.STRAYLIGHT in faults:
+        column = matrix[:, faults.index(plan.STRAYLIGHT)]
+        np.testing.assert_array_equal(column, np.arange(n) < column.sum())
+
+
+@pytest.mark.parametrize(("sizes", "classes"), [((1, 6), 6), ((2, 4), 6), ((1, 6), 3), ((3, 3), 5)])
+def test_per_sample_subset_sizes_are_uniform(sizes: tuple[int, int], classes: int) -> None:
+    faults = FAULT_AXIS[:classes]
+    matrix = plan.fault_matrix_per_sample(6000, faults, 1.0, np.random.default_rng(5), sizes)
+    lo, hi = (min(s, classes) for s in sizes)
+    counts = np.bincount(matrix.sum(axis=1), minlength=hi + 1)[lo:]
+    assert counts.sum() == 6000
+    if hi > lo:
+        assert stats.chisquare(counts).pvalue > LEVEL
+
+
+def test_per_sample_rows_are_shuffled() -> None:
+    # without straylight neither the faulty rows nor their sizes depend on the place: rank correlations of
+    # spread 1/√n
+    n = 4000
+    matrix = plan.fault_matrix_per_sample(n, FAULT_AXIS[:3], 0.5, np.random.default_rng(5))
+    rank = np.arange(n)
+    for column in (matrix.any(axis=1), *matrix.T):
+        assert abs(stats.spearmanr(rank, column).statistic) < 4.5 / np.sqrt(n)
+    faulty = np.flatnonzero(matrix.any(axis=1))
+    assert abs(stats.spearmanr(faulty, matrix[faulty].sum(axis=1)).statistic) < 4.5 / np.sqrt(len(faulty))
+
+
+@pytest.mark.parametrize("mode", ["per_class", "per_sample"])
+def test_2000_samples_in_the_papers_proportions(mode: str) -> None:
+    p = make(plan={"mode": mode, "faulty_fraction": 0.5})
+    per_class = p.injected.sum(axis=0)
+    if mode == "per_class":
+        np.testing.assert_array_equal(per_class, 1000)
+        # the columns but straylight's fall independently: pairs meet in a quarter of the samples, a
+        # hypergeometric count of variance n/16
+        for a in range(6):
+            for b in range(a):
+                both = (p.injected[:, a] & p.injected[:, b]).sum()
+                assert abs(both - 500) < 4.5 * np.sqrt(N / 16)
+    else:
+        assert p.injected.any(axis=1).sum() == 1000
+        assert np.ptp(per_class) <= 1
+        # sizes 1 … 6 are uniform: 3500 expected in all, variance 35/12 each
+        assert abs(per_class.sum() - 3500) < 4.5 * np.sqrt(1000 * 35 / 12)
+
+
+# -------------------------------------------------------------------------------------------------- strata
+
+
+@pytest.mark.parametrize("mode", ["per_class", "per_sample"])
+def test_straylight_comes_first_and_faces_the_sun(mode: str) -> None:
+    p = make(plan={"mode": mode})
+    straylight = p.injects("straylight")
+    n_straylight = int(straylight.sum())
+    assert 0 < n_straylight < N
+    np.testing.assert_array_equal(straylight, np.arange(N) < n_straylight)
+    np.testing.assert_array_equal(p.stratum, np.where(straylight, NEAR, FAR))
+
+
+def test_nominal_sun_facing_samples_follow_the_straylight() -> None:
+    p = make(plan={"sun_facing_nominal_fraction": 0.1})
+    n_straylight = int(p.injects("straylight").sum())
+    assert (p.stratum == NEAR).sum() == n_straylight + 200
+    np.testing.assert_array_equal(p.stratum == NEAR, np.arange(N) < n_straylight + 200)
+    assert not p.injects("straylight")[n_straylight:].any()
+
+
+def test_too_many_sun_facing_samples_are_refused() -> None:
+    with pytest.raises(InputError) as caught:
+        make(plan={"mode": "per_class", "faulty_fraction": 0.8, "sun_facing_nominal_fraction": 0.3})
+    for part in ("plan.sun_facing_nominal_fraction = 0.3", "1600", "0.2"):
+        assert part in str(caught.value)
+    assert "\n" not in str(caught.value)
+    # what is said to fit does
+    p = make(plan={"mode": "per_class", "faulty_fraction": 0.8, "sun_facing_nominal_fraction": 0.2})
+    np.testing.assert_array_equal(p.stratum, NEAR)
+
+
+def test_a_scene_without_straylight_never_faces_the_sun() -> None:
+    faults = tuple(f for f in FAULT_AXIS if f != "straylight")
+    p = plan.make_plan(scene(), faults)
+    np.testing.assert_array_equal(p.stratum, FAR)
+    assert not p.injects("straylight").any()
+    assert p.injects("vignetting").any()
+
+
+# ------------------------------------------------------------------------------------------ blocks and seeds
+
+
+def assert_same_rows(a: plan.Plan, b: plan.Plan, rows: slice, *, faults: bool = True) -> None:
+    for name in plan.VARIABLES:
+        np.testing.assert_array_equal(a.variables[name][rows], b.variables[name][rows])
+    for name in (
+        "stratum",
+        "site",
+        "split",
+        "architecture",
+        "readout_direction",
+        "attitude_tries",
+        "injected",
+    ):
+        if faults or name != "injected":
+            np.testing.assert_array_equal(getattr(a, name)[rows], getattr(b, name)[rows])
+
+
+@given(
+    st.integers(1, 40),
+    st.integers(1, 40),
+    st.integers(0, 2**63 - 1),
+    st.sampled_from(["per_class", "per_sample"]),
+)
+@settings(max_examples=25, deadline=None)
+def test_appending_a_block_leaves_earlier_rows_alone(first: int, more: int, seed: int, mode: str) -> None:
+    s = scene(dataset={"samples": first, "seed": seed}, plan={"mode": mode})
+    short, long = (plan.make_plan(s, FAULT_AXIS, blocks) for blocks in ([first], [first, more]))
+    assert len(long) == first + more
+    assert_same_rows(short, long, slice(0, first))
+    # the block appended has the matrix of its own size, straylight first in it
+    count = round(0.5 * more)
+    appended = long.injected[first:]
+    faulty = appended.sum(axis=0) if mode == "per_class" else appended.any(axis=1).sum()
+    np.testing.assert_array_equal(faulty, count)
+    straylight = long.injects("straylight")[first:]
+    np.testing.assert_array_equal(straylight, np.arange(more) < straylight.sum())
+
+
+def test_an_appended_block_has_its_own_matrix() -> None:
+    p = plan.make_plan(scene(), FAULT_AXIS, [N, N])
+    assert not np.array_equal(p.injected[:N], p.injected[N:])
+
+
+def test_a_longer_plan_keeps_the_numbers_of_the_shorter_within_a_stratum() -> None:
+    facing = {"mode": "per_class", "faulty_fraction": 1.0}
+    short = make(plan=facing, dataset={"samples": 50, "seed": 20})
+    assert_same_rows(short, make(plan=facing), slice(0, 50))
+
+
+def test_the_plan_follows_its_seed(paper: plan.Plan) -> None:
+    assert_same_rows(paper, make(), slice(None))
+    other = make(dataset={"samples": N, "seed": 21})
+    for name in plan.VARIABLES:
+        assert not np.any(paper.variables[name] == other.variables[name])
+    assert not np.array_equal(paper.injected, other.injected)
+    assert not np.array_equal(paper.site, other.site)
+    zero = make(dataset={"samples": N, "seed": 0})  # 0 is a seed like any other
+    assert not np.array_equal(zero.variables["x_m"], make(dataset={"samples": N, "seed": 1}).variables["x_m"])
+
+
+def test_redraws_are_other_numbers_of_the_same_bounds() -> None:
+    s, samples = scene(), np.arange(N)
+    stratum = np.full(N, NEAR, dtype=np.uint8)
+    first, second = (plan.propose(s, samples, stratum, ("x_m",), attempt)["x_m"] for attempt in (0, 1))
+    assert abs(np.corrcoef(first, second)[0, 1]) < 4.5 / np.sqrt(N)
+    assert stats.kstest(second, stats.uniform(-150, 300).cdf).pvalue > LEVEL
+    # one sample alone is proposed the same numbers
+    alone = plan.propose(s, samples[7:8], stratum[7:8], ("x_m",), 1)["x_m"]
+    np.testing.assert_array_equal(alone, second[7:8])
+
+
+# ------------------------------------------------------------------------------------------- sites and splits
+
+
+@pytest.mark.parametrize(("sites", "shard"), [(32, 8), (3, 16), (1, 1), (500, 4)])
+def test_a_shard_has_one_site_and_sites_are_used_evenly(sites: int, shard: int) -> None:
+    p = make(dataset={"samples": N, "sites": sites, "shard_samples": shard})
+    assert p.site.min() >= 0
+    assert p.site.max() < sites
+    shards = [p.site[i : i + shard] for i in range(0, N, shard)]
+    assert all(len(set(s)) == 1 for s in shards)
+    used = np.bincount([s[0] for s in shards], minlength=sites)
+    assert used.max() - used.min() <= 1  # shuffled rounds
+
+
+def test_rounds_of_sites_are_shuffled() -> None:
+    p = make(dataset={"samples": N, "sites": 32, "shard_samples": 8})
+    order = p.site[::8]
+    assert sorted(order[:32]) == list(range(32))
+    assert not np.array_equal(order[:32], np.arange(32))
+    assert not np.array_equal(order[:32], order[32:64])
+
+
+@given(st.integers(1, 400), st.integers(0, 100), st.integers(0, 100), st.integers(0, 2**32))
+@settings(deadline=None)
+def test_splits_are_whole_sites_in_proportion(sites: int, a: int, b: int, seed: int) -> None:
+    lo, hi = sorted((a, b))
+    fractions = {"train": lo / 100, "val": (hi - lo) / 100, "test": 1 - hi / 100}
+    s = scene(dataset={"sites": sites, "seed": seed, "split": fractions})
+    split = plan.site_split(s)
+    assert split.shape == (sites,)
+    for k, name in enumerate(plan.SPLITS):
+        # each edge is rounded to a whole site, by at most a half; each split has two
+        assert abs((split == k).sum() - fractions[name] * sites) <= 1 + 1e-6
+        if fractions[name] == 0:
+            assert not (split == k).any()
+
+
+def test_no_site_is_in_two_splits_and_splits_are_not_the_first_sites() -> None:
+    p = make(dataset={"samples": N, "sites": 32})
+    for site in range(32):
+        assert len(set(p.split[p.site == site])) == 1
+    by_site = plan.site_split(scene())
+    np.testing.assert_array_equal(p.split, by_site[p.site])
+    # edges at 0.7 · 32 = 22.4 and 0.85 · 32 = 27.2 sites
+    assert [int((by_site == k).sum()) for k in range(3)] == [22, 5, 5]
+    assert not np.array_equal(by_site, np.sort(by_site))
+
+
+# ---------------------------------------------------------------------------------------------------- speed
+
+
+@pytest.mark.parametrize("mode", ["per_class", "per_sample"])
+def test_100_000_samples_are_planned_in_seconds(mode: str) -> None:
+    s = scene(dataset={"samples": 100_000}, plan={"mode": mode})
+    start = time.process_time()
+    p = plan.make_plan(s, FAULT_AXIS)
+    assert time.process_time() - start < 10
+    assert len(p) == 100_000
+    far = p.stratum == FAR
+    assert sun_angle_deg(p)[far].min() >= 32.5 * np.sqrt(2)
+
+
+def test_bounds_of_one_value_are_met_exactly() -> None:
+    p = make(geometry={"sun_facing": {"yaw_deg": [-4, -4]}, "x_m": [7.25, 7.25]})
+    np.testing.assert_array_equal(p.variables["x_m"], 7.25)
+    np.testing.assert_array_equal(p.variables["yaw_deg"][p.stratum == NEAR], -4)
+
+
+def test_every_number_is_keyed_by_its_sample() -> None:
+    u = config.keyed_uniform(20, np.arange(N), "plan", "height_m/0")
+    np.testing.assert_allclose(make().variables["height_m"], 100 * u, rtol=1e-15)
