@@ -38,9 +38,7 @@ def targets(seconds: Mapping[str, float]) -> list[Target]:
             limit=0.7,
             least=True,
         ),
-        Target(
-            what="all that follows, over the render", ratio=after / seconds["render"], limit=0.25, least=False
-        ),
+        Target(what="all that follows, over the render", ratio=after / seconds["render"], limit=0.25, least=False),
     ]
     if "cycles" in seconds:
         ratio = seconds["cycles"] / sample_seconds(seconds)

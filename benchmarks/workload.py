@@ -16,7 +16,7 @@ from vbnfault.body import Patch
 from vbnfault.pipeline import Frame, Pose, SampleSpec
 from vbnfault.quantities import Sample
 from vbnfault.render.emitter import SunDisc
-from vbnfault.render.runtime import dr
+from vbnfault.render.runtime import dr, mi
 from vbnfault.render.sampling import Optics, Strata
 from vbnfault.scene import Scene
 
@@ -66,9 +66,7 @@ class Workload:
         patch = session._patch(session.sites[0])
         surface = render.Surface(patch.vertices_L_m, patch.faces, patch.face_is_boulder)
         terrain = pipeline.Terrain(body=session.body, site=patch.site, surface=surface)
-        spec = SampleSpec(
-            index=0, scene=session.scene, plan=session.plan, faults=session.faults, terrain=terrain
-        )
+        spec = SampleSpec(index=0, scene=session.scene, plan=session.plan, faults=session.faults, terrain=terrain)
         return cls(session, patch, spec, _pose(surface))
 
     @cached_property
@@ -88,13 +86,14 @@ class Workload:
 
         One kernel, which writes a byte a sample: no bands, no shading, no sum over pixels.
         """
-        view, surface = self.scene.view, self.spec.terrain.surface
+        view, traced = self.scene.view, self.spec.terrain.surface.scene
         optics, sun = Optics(view), SunDisc(self.scene.sun)
         strata = Strata(view.width_px, view.height_px, self.scene.samples_per_pixel, self.scene.key)
-        hit = surface.intersect(optics.camera_rays(strata))
-        normal, towards = hit.facet_normal, sun.sample(*strata.pair(1))
-        lit = hit.valid & (dr.dot(normal, towards) > 0)
-        lit &= ~surface.occluded(hit.shadow_rays(towards, normal), lit)
+        rays = optics.camera_rays(strata)
+        found = traced.ray_intersect_preliminary(rays, coherent=True)
+        # towards the Sun's centre, from just in front of the hit: no normal, no point of the disc is fetched
+        shadow = mi.Ray3f(rays(found.t * (1 - 1e-4)), sun.direction)
+        lit = found.is_valid() & ~traced.ray_test(shadow, True, found.is_valid())
         dr.eval(lit)
 
     def grey(self) -> np.ndarray:

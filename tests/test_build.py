@@ -80,9 +80,7 @@ def reference(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
     return out, st.digest(out)
 
 
-def test_two_workers_make_the_same_bits_and_share_the_work(
-    reference: tuple[Path, str], tmp_path: Path
-) -> None:
+def test_two_workers_make_the_same_bits_and_share_the_work(reference: tuple[Path, str], tmp_path: Path) -> None:
     log = tmp_path / "log"
     run(tmp_path / "s.zarr", Session(log=str(log), seconds=0.05), workers=2, recycle_shards=2)
     assert st.digest(tmp_path / "s.zarr") == reference[1]
@@ -158,9 +156,7 @@ def test_kill_9_at_any_moment_then_resuming_makes_the_same_bits(
     assert not list(tmp_path.rglob("*.partial"))
 
 
-@pytest.mark.parametrize(
-    ("workers", "number"), [("1", signal.SIGINT), ("1", signal.SIGTERM), ("2", signal.SIGINT)]
-)
+@pytest.mark.parametrize(("workers", "number"), [("1", signal.SIGINT), ("1", signal.SIGTERM), ("2", signal.SIGINT)])
 def test_an_interrupt_keeps_what_was_made(
     reference: tuple[Path, str], tmp_path: Path, workers: str, number: signal.Signals
 ) -> None:
@@ -182,9 +178,7 @@ def test_an_interrupt_keeps_what_was_made(
     assert st.digest(out) == reference[1]
 
 
-def test_samples_that_fail_are_named_and_all_others_are_built(
-    reference: tuple[Path, str], tmp_path: Path
-) -> None:
+def test_samples_that_fail_are_named_and_all_others_are_built(reference: tuple[Path, str], tmp_path: Path) -> None:
     out = tmp_path / "s.zarr"
     with pytest.raises(
         bd.BuildFailed, match=r"2 samples \(5, 9\) failed, the first with: KeyError.*for 5.*py:\d"
@@ -350,9 +344,7 @@ def test_a_dask_cluster_makes_the_same_bits(reference: tuple[Path, str], tmp_pat
     assert st.digest(out) == reference[1]
 
 
-def test_without_dask_the_sentence_says_how_to_get_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_without_dask_the_sentence_says_how_to_get_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "distributed", None)
     with pytest.raises(InputError, match=r"pip install 'vbnfault\[dask\]'"):
         run(tmp_path / "s.zarr", scheduler="tcp://127.0.0.1:1")

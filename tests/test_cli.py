@@ -107,8 +107,10 @@ def test_the_digest_survives_five_kills(built: Path, scene: Path, tmp_path: Path
     killed = 0
     for _ in range(40):
         process = subprocess.Popen(
-            command("build", scene, "--out", out), env=ENVIRONMENT,
-            stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+            command("build", scene, "--out", out),
+            env=ENVIRONMENT,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
         )
         before = store.open_store(out).finished() if store.is_store(out) else 0
         deadline = time.monotonic() + 120
@@ -138,7 +140,8 @@ def test_a_rendered_sample_equals_the_stored_one(
     image = cv2.imread(str(tmp_path / "image.png"))[..., ::-1]
     assert np.array_equal(image, stored.layers["image"][..., :3])
     assert np.array_equal(
-        cv2.imread(str(tmp_path / "image_intensity.png"), cv2.IMREAD_UNCHANGED), stored.layers["image"][..., 3]
+        cv2.imread(str(tmp_path / "image_intensity.png"), cv2.IMREAD_UNCHANGED),
+        stored.layers["image"][..., 3],
     )
     for k, name in enumerate(store.open_store(built).spec.faults):
         mask = cv2.imread(str(tmp_path / f"mask_{name}.png"), cv2.IMREAD_UNCHANGED) > 0
@@ -152,7 +155,11 @@ def test_a_rendered_sample_equals_the_stored_one(
 
 
 def test_damage_is_named_and_exactly_mended(
-    built: Path, scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    built: Path,
+    scene: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     import shutil
 
@@ -196,7 +203,11 @@ def test_append_keeps_earlier_bits(
 def test_ctrl_c_stops_cleanly_and_resumes(scene: Path, built: Path, tmp_path: Path) -> None:
     out = tmp_path / "stopped.zarr"
     process = subprocess.Popen(
-        command("build", scene, "--out", out), env=ENVIRONMENT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        command("build", scene, "--out", out),
+        env=ENVIRONMENT,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
     )
     deadline = time.monotonic() + 120
     while not (store.is_store(out) and store.open_store(out).finished()) and time.monotonic() < deadline:
@@ -256,7 +267,11 @@ def test_a_bad_mesh_is_refused_in_one_sentence(
     ],
 )
 def test_a_bad_key_is_named_with_its_value(
-    setting: str, expected: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    setting: str,
+    expected: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     code = run(monkeypatch, "build", "quickstart", "--set", setting, "--out", tmp_path / "x.zarr")
     said = capsys.readouterr().err

@@ -116,9 +116,7 @@ TITLE = 'title = "t"\n'
         pytest.param(TITLE + "[geometry]\nx_m = [3]", ["geometry.x_m = [3]"], marks=UNVALUED),
         pytest.param(TITLE + "[geometry]\nx_m = 3", ["geometry.x_m = 3:", "two"], marks=UNVALUED),
         pytest.param(TITLE + "[body]\nsemi_axes_m = [0, 1, 1]", ["semi_axes_m = [0", "1e9"], marks=UNVALUED),
-        pytest.param(
-            TITLE + '[camera]\nexposure_s = "fast"', ["exposure_s = 'fast'", "'auto'"], marks=UNVALUED
-        ),
+        pytest.param(TITLE + '[camera]\nexposure_s = "fast"', ["exposure_s = 'fast'", "'auto'"], marks=UNVALUED),
         pytest.param(TITLE + "[dataset]\nsplit = {train = 0.5}", ["train", "0.5"], marks=UNVALUED),
         pytest.param(
             TITLE + "[camera]\nexposure_min_s = 3\nexposure_max_s = 1", ["exposure_min_s = 3"], marks=UNVALUED

@@ -28,7 +28,7 @@ def draw(seed: int, shape: tuple[int, int] = (64, 64)) -> Noise:
     return Noise.draw(shape, np.random.default_rng([seed, 1]), np.random.default_rng([seed, 2]))
 
 
-# ----------------------------------------------------------------------------------------------------- noise
+# ------------------------------------------------------------------------------------------------------ noise
 
 
 def test_noise_fields_are_standard_normal_and_unrelated() -> None:
@@ -64,7 +64,7 @@ def test_noise_follows_its_generators() -> None:
     assert (a.shot != a.read).mean() > 0.99
 
 
-# --------------------------------------------------------------------------------------------------- Poisson
+# ---------------------------------------------------------------------------------------------------- Poisson
 
 # midpoints of a million equal slices of the distribution: no sampling noise
 SLICES = (np.arange(1_000_000) + 0.5) / 1e6
@@ -120,9 +120,7 @@ def test_poisson_quantile_of_random_variates_is_poisson(mean: float) -> None:
 
 
 def test_poisson_of_nothing_is_nothing() -> None:
-    np.testing.assert_array_equal(
-        poisson_quantile(np.zeros(9, np.float32), np.linspace(-6, 6, 9, dtype="f4")), 0
-    )
+    np.testing.assert_array_equal(poisson_quantile(np.zeros(9, np.float32), np.linspace(-6, 6, 9, dtype="f4")), 0)
 
 
 def test_poisson_rises_with_the_variate_and_spares_its_arguments() -> None:
@@ -151,16 +149,12 @@ def test_dark_frame_is_the_poisson_of_its_dark_current(dark_e: float) -> None:
     detector = Detector(dark_current_e_s=dark_e / SHORT_S)
     noise = draw(5, (128, 128))
     electrons = detector.electrons(flat(detector, 0.0, (128, 128)), SHORT_S, noise).array
-    exact = (
-        stats.poisson.ppf(stats.norm.cdf(noise.shot.astype(np.float64)), np.float32(dark_e))
-        if dark_e
-        else 0.0
-    )
+    exact = stats.poisson.ppf(stats.norm.cdf(noise.shot.astype(np.float64)), np.float32(dark_e)) if dark_e else 0.0
     assert np.abs(electrons - exact).max() <= 1
     assert (electrons != exact).mean() <= 0.003
 
 
-# --------------------------------------------------------------------------------------------------- photons
+# ---------------------------------------------------------------------------------------------------- photons
 
 
 def test_electrons_expected_is_the_weighted_sum_of_the_bands() -> None:
@@ -208,7 +202,7 @@ def test_white_is_where_255_begins() -> None:
         )
 
 
-# --------------------------------------------------------------------------------------- exact degenerate cases
+# ------------------------------------------------------------------------------------- exact degenerate cases
 
 
 @pytest.mark.parametrize("bits", [8, 10, 12, 14, 16])
@@ -243,9 +237,7 @@ def test_saturation_gives_the_top_code_and_255(bits: int) -> None:
         np.testing.assert_array_equal(detector.develop(flat(detector, light), SHORT_S, None).array, 255)
 
 
-@pytest.mark.xfail(
-    strict=True, reason="white counts from bias + dark to bias + full well: dark current dims it"
-)
+@pytest.mark.xfail(strict=True, reason="white counts from bias + dark to bias + full well: dark current dims it")
 def test_saturation_is_white_after_a_long_exposure_too() -> None:
     detector = Detector(dark_current_e_s=125)
     np.testing.assert_array_equal(detector.develop(flat(detector, 1e6), 5.0, None).array, 255)
@@ -283,9 +275,7 @@ def test_the_bias_keeps_the_noise_of_a_dark_frame_whole() -> None:
 # -------------------------------------------------------------------------------------------- gain, linearity
 
 
-@pytest.mark.parametrize(
-    ("bits", "bias", "full_well"), [(12, 64, 13_500.0), (8, 0, 1000.0), (16, 500, 100_000.0)]
-)
+@pytest.mark.parametrize(("bits", "bias", "full_well"), [(12, 64, 13_500.0), (8, 0, 1000.0), (16, 500, 100_000.0)])
 def test_gain_takes_the_full_well_to_the_top_code(bits: int, bias: int, full_well: float) -> None:
     detector = Detector(adc_bits=bits, bias_dn=bias, full_well_e=full_well)
     assert detector.adc_max_dn == 2**bits - 1
@@ -317,9 +307,7 @@ def test_photon_transfer(signal_e: float) -> None:
     expected = k**2 * (signal_e + 20 + 13**2) + 1 / 12
     # nearly normal: a variance spreads by √(2/n); excess kurtosis below 1/20
     assert raw.var(dtype=np.float64) == pytest.approx(expected, rel=4 * np.sqrt(2.05 / n))
-    assert raw.mean(dtype=np.float64) == pytest.approx(
-        64 + k * (signal_e + 20), abs=4 * np.sqrt(expected / n)
-    )
+    assert raw.mean(dtype=np.float64) == pytest.approx(64 + k * (signal_e + 20), abs=4 * np.sqrt(expected / n))
 
 
 def test_intensity_is_the_luminance() -> None:
@@ -359,8 +347,7 @@ def test_brightening_a_patch_changes_no_other_pixel(brighter: float) -> None:
     patch[10:40, 5:33] = True  # over sky and ground
     lit = signal + np.float32(brighter) * patch[..., None]
     one, two = (
-        detector.develop(Electrons(array=a, white_e=detector.white_e), 0.1, noise).array
-        for a in (signal, lit)
+        detector.develop(Electrons(array=a, white_e=detector.white_e), 0.1, noise).array for a in (signal, lit)
     )
     np.testing.assert_array_equal(one[~patch], two[~patch])
     assert (one[patch] != two[patch]).any() or brighter == 1.0
@@ -431,9 +418,7 @@ def test_steps_return_new_read_only_quantities() -> None:
     assert image.array.shape == (64, 64, 4)
 
 
-@pytest.mark.xfail(
-    strict=True, reason="the pool's threads do not live on in a forked process: it waits for ever"
-)
+@pytest.mark.xfail(strict=True, reason="the pool's threads do not live on in a forked process: it waits for ever")
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="this system has no fork")
 def test_a_forked_process_can_develop_too() -> None:
     # data loaders of learning frameworks fork their workers

@@ -68,8 +68,6 @@ def test_contradicting_counts_are_refused() -> None:
 
 def test_values_are_a_fair_coin() -> None:
     context = make_context(64)
-    values = [
-        v for s in range(300) for v in make("broken_lines", count=5).draw(context, rng(s))["row_values"]
-    ]
+    values = [v for s in range(300) for v in make("broken_lines", count=5).draw(context, rng(s))["row_values"]]
     # 1500 tosses: standard deviation 19.4; four of them
     assert abs(values.count(255) - 750) < 78

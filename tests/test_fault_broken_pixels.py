@@ -66,9 +66,7 @@ def test_neighbour_looks_at_its_far_side() -> None:
     context = make_context(9)
     array = np.full((9, 9, 4), 40, np.uint8)
     array[4, 6] = 240  # far side of (4, 5)
-    out = FAULT.apply(
-        flat_rgbi(context, 0).with_array(array), cmos(x=[4], y=[4], brightness_dn=[100]), context
-    )
+    out = FAULT.apply(flat_rgbi(context, 0).with_array(array), cmos(x=[4], y=[4], brightness_dn=[100]), context)
     assert out.array[4, 5, 3] == (100 + 240) / 2
     assert out.array[4, 3, 3] == (100 + 40) / 2
 

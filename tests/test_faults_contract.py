@@ -235,9 +235,7 @@ def test_json_schema_names_every_key() -> None:
         entry = schema["properties"][name]
         options = entry.get("anyOf", [entry])
         (match,) = [o for o in options if o["properties"]["model"]["const"] == model]
-        assert set(match["properties"]) == {"model"} | {
-            f.name for f in dataclasses.fields(registry()[name][model])
-        }
+        assert set(match["properties"]) == {"model"} | {f.name for f in dataclasses.fields(registry()[name][model])}
 
 
 def test_plain_numbers_make_bounds_in_python_too() -> None:

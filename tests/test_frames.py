@@ -36,7 +36,7 @@ def angle_between_rad(a: np.ndarray, b: np.ndarray) -> float:
     return float(2 * np.arctan2(np.linalg.norm(a - b), np.linalg.norm(a + b)))
 
 
-# -------------------------------------------------------------------------------------- elementary rotations
+# --------------------------------------------------------------------------------------- elementary rotations
 
 
 @given(angles)
@@ -53,7 +53,7 @@ def test_quarter_turns_carry_the_axes_round() -> None:
         np.testing.assert_allclose(make(np.pi / 2) @ before, after, atol=1e-16)
 
 
-# ------------------------------------------------------------------------------------------ directions in L
+# -------------------------------------------------------------------------------------------- directions in L
 
 
 @pytest.mark.parametrize(
@@ -89,7 +89,7 @@ def test_direction_round_trip_also_at_the_poles(direction: np.ndarray) -> None:
     np.testing.assert_allclose(again, direction, atol=1e-15)
 
 
-# ------------------------------------------------------------------------------------------ camera attitudes
+# ------------------------------------------------------------------------------------------- camera attitudes
 
 
 @given(unit_vectors())
@@ -123,15 +123,11 @@ def test_c0_with_a_vertical_reference_continues_one_slightly_north(vertical: flo
 
 
 @given(unit_vectors(), angles, angles, angles)
-def test_l_from_c_is_the_product_of_the_conventions(
-    sun: np.ndarray, roll: float, pitch: float, yaw: float
-) -> None:
+def test_l_from_c_is_the_product_of_the_conventions(sun: np.ndarray, roll: float, pitch: float, yaw: float) -> None:
     assume(np.hypot(sun[0], sun[1]) > 1e-3)
     got = frames.L_from_C(sun, roll, pitch, yaw)
     # intrinsic rotations about x, then y, then z, in scipy's notation
-    expected = (
-        frames.L_from_C0(sun) @ Reference.from_euler("XYZ", [roll, pitch, yaw], degrees=True).as_matrix()
-    )
+    expected = frames.L_from_C0(sun) @ Reference.from_euler("XYZ", [roll, pitch, yaw], degrees=True).as_matrix()
     np.testing.assert_allclose(got, expected, atol=2e-14)
 
 
@@ -156,9 +152,7 @@ def test_signs_of_roll_and_pitch_in_the_picture() -> None:
 
 
 @given(unit_vectors(), angles, angles, angles)
-def test_boresight_angle_agrees_with_the_matrices(
-    sun: np.ndarray, roll: float, pitch: float, yaw: float
-) -> None:
+def test_boresight_angle_agrees_with_the_matrices(sun: np.ndarray, roll: float, pitch: float, yaw: float) -> None:
     assume(np.hypot(sun[0], sun[1]) > 1e-3)
     boresight = frames.L_from_C(sun, roll, pitch, yaw)[:, 2]
     expected = np.degrees(angle_between_rad(boresight, sun))
@@ -174,7 +168,7 @@ def test_boresight_angle_takes_arrays() -> None:
     )
 
 
-# ------------------------------------------------------------------------------------------------ quaternion
+# ------------------------------------------------------------------------------------------------- quaternion
 
 
 @given(angles, angles, angles)
@@ -198,7 +192,7 @@ def test_quaternion_of_known_turns() -> None:
     np.testing.assert_allclose(frames.quaternion(frames.rx(-np.pi / 2)), [h, -h, 0, 0], atol=1e-15)
 
 
-# ----------------------------------------------------------------------------------------- smallest rotation
+# ------------------------------------------------------------------------------------------ smallest rotation
 
 
 def assert_takes_by_the_smallest_angle(source: np.ndarray, target: np.ndarray) -> None:
@@ -237,16 +231,14 @@ NOT_ORTHONORMAL = pytest.mark.xfail(
 def test_minimal_rotation_close_to_opposite(short_of_half_a_turn_rad: float) -> None:
     source = frames.unit(np.array([0.2, -0.7, 0.4]))
     across = frames.unit(np.cross(source, [0.0, 0.0, 1.0]))
-    target = frames.unit(
-        -np.cos(short_of_half_a_turn_rad) * source + np.sin(short_of_half_a_turn_rad) * across
-    )
+    target = frames.unit(-np.cos(short_of_half_a_turn_rad) * source + np.sin(short_of_half_a_turn_rad) * across)
     matrix = frames.minimal_rotation(source, target)
     assert_proper_rotation(matrix)
     # a bisector of length d is known to 1e-16 / d: 1e-8 is the best that both sides of any threshold can do
     np.testing.assert_allclose(matrix @ source, target, atol=5e-8)
 
 
-# ------------------------------------------------------------------------------------------- orbit and spin
+# --------------------------------------------------------------------------------------------- orbit and spin
 
 
 @pytest.mark.parametrize(
@@ -268,9 +260,7 @@ def test_subsolar_latitudes_of_67p(julian_date: float, subsolar_latitude_deg: fl
 
 def test_distance_of_67p() -> None:
     assert np.linalg.norm(ORBIT.position_J_au(2456875.5)) == pytest.approx(3.6007, abs=5e-5)
-    assert np.linalg.norm(ORBIT.position_J_au(ORBIT.perihelion_jd)) == pytest.approx(
-        ORBIT.perihelion_au, rel=1e-12
-    )
+    assert np.linalg.norm(ORBIT.position_J_au(ORBIT.perihelion_jd)) == pytest.approx(ORBIT.perihelion_au, rel=1e-12)
 
 
 def test_orbit_obeys_keplers_laws() -> None:

@@ -105,9 +105,7 @@ def test_acceleration_is_the_potentials_gradient(bodies: dict[str, Body]) -> Non
     plus = gravity.evaluate(point + offsets).potential_m2_s2
     minus = gravity.evaluate(point - offsets).potential_m2_s2
     # Central differences err by step²/6 · U'''/U' ~ 1/6 / 1000² = 2e-7.
-    np.testing.assert_allclose(
-        (plus - minus) / (2 * step), gravity.evaluate(point).acceleration_m_s2[0], rtol=1e-5
-    )
+    np.testing.assert_allclose((plus - minus) / (2 * step), gravity.evaluate(point).acceleration_m_s2[0], rtol=1e-5)
 
 
 def test_points_on_the_surface_and_on_edges_are_finite(bodies: dict[str, Body]) -> None:

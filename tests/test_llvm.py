@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import ctypes
 import os
 import pickle
@@ -21,7 +22,8 @@ NOT_LLVM = Path(some_library.__file__)  # a shared library of every system these
 
 @pytest.fixture(autouse=True)
 def keep_environment(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    monkeypatch.delenv(llvm.VARIABLE, raising=False)
+    monkeypatch.setenv(llvm.VARIABLE, "")  # so that it is put back, or taken away, afterwards
+    monkeypatch.delenv(llvm.VARIABLE)
     llvm.prepare.cache_clear()
     yield
     llvm.prepare.cache_clear()
@@ -55,7 +57,7 @@ def fake_libraries(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Looked:
         return found
 
     def load(path: Path, origin: str) -> FakeLibrary:
-        return FakeLibrary(*eval(path.read_bytes()))
+        return FakeLibrary(*ast.literal_eval(path.read_text()))
 
     monkeypatch.setattr(llvm, "_load", load)
     return install
@@ -68,7 +70,7 @@ def forbid_loading(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(llvm, "_load", load)
 
 
-# ---------------------------------------------------------------------------------------------- order of search
+# -------------------------------------------------------------------------------------------- order of search
 
 
 def test_the_variable_comes_first_then_the_wheel_then_the_system_newest_first(
@@ -111,9 +113,7 @@ def test_candidates_keep_the_order_and_name_each_library_once(fake_libraries: Lo
     assert llvm.find() == got[0]
 
 
-@pytest.mark.parametrize(
-    ("version", "usable"), [((14, 0, 6), False), ((15, 0, 7), False), ((16, 0, 0), True)]
-)
+@pytest.mark.parametrize(("version", "usable"), [((14, 0, 6), False), ((15, 0, 7), False), ((16, 0, 0), True)])
 def test_the_oldest_usable_version_is_16(
     version: tuple[int, int, int], usable: bool, fake_libraries: Looked
 ) -> None:
@@ -135,7 +135,7 @@ def test_prepare_points_drjit_to_it(fake_libraries: Looked) -> None:
     assert os.environ[llvm.VARIABLE] == str(found[1][1])
 
 
-# -------------------------------------------------------------------------------------------- the real variable
+# ------------------------------------------------------------------------------------------ the real variable
 
 
 def real_candidate() -> llvm.Candidate:
@@ -219,9 +219,7 @@ def test_old_versions_are_refused_by_name_without_loading(
         assert f"version {major}" in candidate.problem
 
 
-@pytest.mark.parametrize(
-    "name", ["libLLVM-16.so", "libLLVM.so.18.1", "libLLVM-19.so.1", "libLLVM.so", "other.so"]
-)
+@pytest.mark.parametrize("name", ["libLLVM-16.so", "libLLVM.so.18.1", "libLLVM-19.so.1", "libLLVM.so", "other.so"])
 def test_newer_and_unversioned_names_are_loaded_to_ask(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -232,7 +230,7 @@ def test_newer_and_unversioned_names_are_loaded_to_ask(
         list(llvm.candidates())
 
 
-# ---------------------------------------------------------------------------------------------- nothing usable
+# --------------------------------------------------------------------------------------------- nothing usable
 
 
 def test_nothing_found_is_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -266,7 +264,7 @@ def test_nothing_usable_says_what_was_looked_at(tmp_path: Path, monkeypatch: pyt
         assert reason in sentence
 
 
-# ------------------------------------------------------------------------------------------------- never abort
+# ------------------------------------------------------------------------------------------------ never abort
 
 
 @pytest.mark.parametrize(
@@ -277,7 +275,8 @@ def test_nothing_usable_says_what_was_looked_at(tmp_path: Path, monkeypatch: pyt
         pytest.param(
             "cut_short",
             marks=[
-                pytest.mark.xfail(strict=True, reason="the loader maps beyond the end of the file: SIGBUS"),
+                # not strict: whether the loader touches what is missing depends on the layout of the library
+                pytest.mark.xfail(reason="the loader maps beyond the end of the file: SIGBUS"),
                 pytest.mark.skipif(sys.platform != "linux", reason="the loader of Linux is meant"),
             ],
         ),

@@ -223,8 +223,12 @@ def test_black_lines_on_black_sky_are_not_claimed() -> None:
         dataset={"samples": 2, "sites": 1, "shard_samples": 2},
         geometry={
             "height_m": [5e4, 6e4],
-            "sun_averted": {"reference": "nadir", "roll_deg": [180, 180], "pitch_deg": [0, 0],
-                            "sun_elevation_deg": [-80, -60]},
+            "sun_averted": {
+                "reference": "nadir",
+                "roll_deg": [180, 180],
+                "pitch_deg": [0, 0],
+                "sun_elevation_deg": [-80, -60],
+            },
         },
         plan={"faulty_fraction": 1.0, "mode": "per_class"},
         faults={},
@@ -234,8 +238,12 @@ def test_black_lines_on_black_sky_are_not_claimed() -> None:
         "dataset": {**table["dataset"], "samples": 2, "sites": 1, "shard_samples": 2},
         "geometry": {
             "height_m": [5e4, 6e4],
-            "sun_averted": {"reference": "nadir", "roll_deg": [180, 180], "pitch_deg": [0, 0],
-                            "sun_elevation_deg": [-80, -60]},
+            "sun_averted": {
+                "reference": "nadir",
+                "roll_deg": [180, 180],
+                "pitch_deg": [0, 0],
+                "sun_elevation_deg": [-80, -60],
+            },
         },
         "plan": {"faulty_fraction": 1.0, "mode": "per_class"},
         "faults": {"broken_lines": {"white_count": 0, "black_count": 3, "count": 3}, "vignetting": {}},

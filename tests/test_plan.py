@@ -45,7 +45,7 @@ def sun_angle_deg(p: plan.Plan) -> np.ndarray:
     return np.degrees(np.arccos(np.clip(np.cos(roll) * np.cos(pitch), -1, 1)))
 
 
-# ------------------------------------------------------------------------------------------------ proposals
+# -------------------------------------------------------------------------------------------------- proposals
 
 PAPER_BOUNDS = {  # table of the boundaries of dataset variables; degrees, metres
     "sun_azimuth_deg": ((0, 360), (0, 360)),
@@ -81,9 +81,7 @@ def test_variables_are_uniform_within_the_papers_bounds(paper: plan.Plan, name: 
     assert stats.kstest(values, stats.uniform(lo, hi - lo).cdf).pvalue > LEVEL
 
 
-def conditional_cdf(
-    lo: float, hi: float, least_deg: float
-) -> tuple[Callable[[np.ndarray], np.ndarray], float]:
+def conditional_cdf(lo: float, hi: float, least_deg: float) -> tuple[Callable[[np.ndarray], np.ndarray], float]:
     """CDF of the roll, and the share kept, of a uniform (roll, pitch) in [lo, hi]² given a Sun angle ≥ least.
 
     For a given roll the pitches to leave out are arcs about 0 or 180°, of half width
@@ -141,9 +139,7 @@ def test_variables_are_independent_of_each_other_and_of_the_faults(paper: plan.P
     near = paper.stratum == NEAR
     for mask in (near, ~near):
         columns = [paper.variables[name][mask] for name in plan.VARIABLES]
-        columns += [
-            paper.injected[mask, k].astype(float) for k, f in enumerate(FAULT_AXIS) if f != plan.STRAYLIGHT
-        ]
+        columns += [paper.injected[mask, k].astype(float) for k, f in enumerate(FAULT_AXIS) if f != plan.STRAYLIGHT]
         columns += [paper.architecture[mask], paper.readout_direction[mask]]
         rho = stats.spearmanr(np.column_stack(columns)).statistic
         v = len(plan.VARIABLES)
@@ -184,7 +180,7 @@ def test_the_sun_stays_out_of_an_upright_frame() -> None:
     assert plan.least_sun_angle_deg(s) >= diagonal
 
 
-# --------------------------------------------------------------------------------------------- fault matrix
+# ----------------------------------------------------------------------------------------------- fault matrix
 
 fractions = st.floats(0, 1) | st.sampled_from([0.0, 0.25, 1 / 3, 0.5, 0.75, 1.0])
 subsets = st.lists(st.sampled_from(FAULT_AXIS), max_size=6, unique=True).map(tuple)
@@ -197,9 +193,7 @@ def size_bounds(draw: st.DrawFn) -> tuple[int, int]:
 
 
 @given(st.integers(1, 300), subsets, fractions, st.integers(0, 2**32))
-def test_per_class_gives_every_class_its_exact_share(
-    n: int, faults: tuple[str, ...], p: float, seed: int
-) -> None:
+def test_per_class_gives_every_class_its_exact_share(n: int, faults: tuple[str, ...], p: float, seed: int) -> None:
     matrix = plan.fault_matrix_per_class(n, faults, p, np.random.default_rng(seed))
     assert matrix.shape == (n, len(faults))
     assert matrix.dtype == bool
@@ -271,7 +265,7 @@ def test_2000_samples_in_the_papers_proportions(mode: str) -> None:
         assert abs(per_class.sum() - 3500) < 4.5 * np.sqrt(1000 * 35 / 12)
 
 
-# -------------------------------------------------------------------------------------------------- strata
+# ----------------------------------------------------------------------------------------------------- strata
 
 
 @pytest.mark.parametrize("mode", ["per_class", "per_sample"])
@@ -311,7 +305,7 @@ def test_a_scene_without_straylight_never_faces_the_sun() -> None:
     assert p.injects("vignetting").any()
 
 
-# ------------------------------------------------------------------------------------------ blocks and seeds
+# ------------------------------------------------------------------------------------------- blocks and seeds
 
 
 def assert_same_rows(a: plan.Plan, b: plan.Plan, rows: slice, *, faults: bool = True) -> None:
@@ -432,7 +426,7 @@ def test_no_site_is_in_two_splits_and_splits_are_not_the_first_sites() -> None:
     assert not np.array_equal(by_site, np.sort(by_site))
 
 
-# ---------------------------------------------------------------------------------------------------- speed
+# ------------------------------------------------------------------------------------------------------ speed
 
 
 @pytest.mark.parametrize("mode", ["per_class", "per_sample"])

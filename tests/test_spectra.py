@@ -36,7 +36,7 @@ def band_electrons(reflectance_at_nodes: np.ndarray, nodes: np.ndarray = NODES) 
     return spectra.band_weights("nikon_5100", 0.5, nodes) @ (reflectance_at_nodes * sun)
 
 
-# ------------------------------------------------------------------------------------------------------- Sun
+# -------------------------------------------------------------------------------------------------------- Sun
 
 
 def test_the_solar_table_is_the_published_one() -> None:
@@ -132,9 +132,7 @@ def test_nodes() -> None:
     st.integers(2, 16).flatmap(lambda n: st.lists(st.floats(0, 1), min_size=n, max_size=n)),
     st.sampled_from([(400.0, 700.0), (420.0, 680.0), (450.0, 900.0)]),
 )
-def test_exact_for_reflectances_linear_between_the_nodes(
-    values: list[float], ends: tuple[float, float]
-) -> None:
+def test_exact_for_reflectances_linear_between_the_nodes(values: list[float], ends: tuple[float, float]) -> None:
     nodes = spectra.band_nodes_nm(*ends, len(values))
     one_nm = np.arange(ends[0], ends[1] + 0.5)
     expected = direct_electrons(np.interp(one_nm, nodes, values), one_nm)
@@ -162,13 +160,7 @@ def test_67p_in_eight_bands_is_within_half_a_percent_of_the_converged_integral()
     naive = []
     for c in range(3):
         f = spectra.response("nikon_5100", NODES, 0.5)[c] * spectra.solar_irradiance_W_m2_nm(NODES)
-        f = (
-            f
-            * spectra.reflectance("67p", NODES)
-            * NODES
-            * 1e-9
-            / (spectra.PLANCK_J_S * spectra.LIGHT_SPEED_M_S)
-        )
+        f = f * spectra.reflectance("67p", NODES) * NODES * 1e-9 / (spectra.PLANCK_J_S * spectra.LIGHT_SPEED_M_S)
         naive.append(np.trapezoid(f, NODES))
     assert np.abs(got / expected - 1).max() < np.abs(np.array(naive) / expected - 1).max() / 5
 

@@ -276,9 +276,7 @@ def test_a_truncated_shard_is_found_and_rebuilt(whole: st.Store, keep: int) -> N
     file = whole.file("without_straylight", 2)
     file.write_bytes(file.read_bytes()[:keep])
     (sentence,) = st.verify(whole)
-    assert sentence.startswith(
-        "without_straylight of samples 8-9: the shard file without_straylight/c/2/0/0/0"
-    )
+    assert sentence.startswith("without_straylight of samples 8-9: the shard file without_straylight/c/2/0/0/0")
     repaired(whole, [8, 9], before)
 
 
@@ -357,9 +355,7 @@ def test_labels_that_contradict_each_other_are_found(whole: st.Store) -> None:
     mask = sample.layers["mask"].copy()
     mask[off, 3, 3] = True
     any_of = mask[:3].any(0)
-    assert (
-        f"sample 1: mask of {FAULTS[off]} is not empty" in relabelled(whole, 1, mask=mask, mask_any=any_of)[0]
-    )
+    assert f"sample 1: mask of {FAULTS[off]} is not empty" in relabelled(whole, 1, mask=mask, mask_any=any_of)[0]
     mask = sample.layers["mask"].copy()
     mask[on] = False
     assert f"sample 1: mask of {FAULTS[on]} is empty" in relabelled(whole, 1, mask=mask)[0]
@@ -407,9 +403,7 @@ def test_append_keeps_earlier_bits_also_in_the_shard_it_shares(whole: st.Store) 
     np.testing.assert_array_equal(store.array("sample")[:], np.arange(15))
 
 
-def test_an_interrupted_append_is_reported_and_mended(
-    whole: st.Store, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_interrupted_append_is_reported_and_mended(whole: st.Store, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(st, "recover", st.open_store)  # killed once the root was written
     st.append_samples(whole, 4)
     assert st.verify(whole.path)[0].startswith("image holds 10 samples, not 14")

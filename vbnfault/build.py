@@ -193,8 +193,7 @@ def build(
         except KeyboardInterrupt as stop:
             done = store_module.open_store(path).finished() if store_module.is_store(path) else 0
             raise Interrupted(
-                f"{path}: interrupted; {done} of {len(sites)} samples are finished, "
-                f"and the same command resumes"
+                f"{path}: interrupted; {done} of {len(sites)} samples are finished, and the same command resumes"
             ) from stop
         run.raise_failures()
     return Summary(**{**vars(summary), "built": run.built, "seconds": time.monotonic() - began})
@@ -280,9 +279,7 @@ def _size(count: float) -> str:
 
 def _duration(seconds: float) -> str:
     minutes, hours = seconds / 60, seconds / 3600
-    return (
-        f"{seconds:.0f} s" if seconds < 100 else f"{minutes:.0f} min" if minutes < 100 else f"{hours:.1f} h"
-    )
+    return f"{seconds:.0f} s" if seconds < 100 else f"{minutes:.0f} min" if minutes < 100 else f"{hours:.1f} h"
 
 
 @contextlib.contextmanager
@@ -739,9 +736,7 @@ def _run_on_dask(factory: SessionFactory, run: _Run, scheduler: str) -> None:
     try:
         import distributed
     except ImportError as error:
-        raise InputError(
-            f"--scheduler {scheduler}: Dask is not installed; pip install 'vbnfault[dask]'"
-        ) from error
+        raise InputError(f"--scheduler {scheduler}: Dask is not installed; pip install 'vbnfault[dask]'") from error
     try:
         client = distributed.Client(scheduler, timeout="10s", set_as_default=False)
     except (OSError, ValueError) as error:
@@ -753,9 +748,7 @@ def _run_on_dask(factory: SessionFactory, run: _Run, scheduler: str) -> None:
         while shard is not None:
             task = run.task(shard)
             priority = -len(futures)  # in the order of the sites
-            futures[client.submit(_work_on_cluster, pickled, path, task, pure=False, priority=priority)] = (
-                shard
-            )
+            futures[client.submit(_work_on_cluster, pickled, path, task, pure=False, priority=priority)] = shard
             shard = run.next_shard(shard)
         try:
             for future in distributed.as_completed(list(futures), loop=client.loop):

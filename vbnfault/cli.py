@@ -43,12 +43,10 @@ def main() -> None:
     """Entry point: turns errors into one sentence and an exit code."""
     warnings.showwarning = lambda message, *_, **__: typer.echo(f"warning: {message}", err=True)
     try:
-        app(standalone_mode=False)
+        code = app(standalone_mode=False)  # a command's typer.Exit comes back as its exit code
     except VbnfaultError as error:
         typer.echo(f"vbnfault: {error}", err=True)
         sys.exit(error.exit_code)
-    except typer.Exit as stop:
-        sys.exit(stop.exit_code)
     except (KeyboardInterrupt, typer.Abort):
         typer.echo("vbnfault: interrupted; the same command resumes where it stopped", err=True)
         sys.exit(130)
@@ -59,6 +57,7 @@ def main() -> None:
             raise
         show()
         sys.exit(getattr(error, "exit_code", 2))
+    sys.exit(code if isinstance(code, int) else 0)
 
 
 def _version(show: bool) -> None:

@@ -24,9 +24,7 @@ from .errors import InputError
 
 Architecture = Literal["full_frame_ccd", "frame_transfer_ccd", "interline_ccd", "cmos"]
 Direction = Literal["up", "down", "left", "right"]
-Layer = Annotated[
-    str, Field(pattern="^(clean|depth_m|normal|semantic|raw|radiance|mask_effect|without_[a-z_]+)$")
-]
+Layer = Annotated[str, Field(pattern="^(clean|depth_m|normal|semantic|raw|radiance|mask_effect|without_[a-z_]+)$")]
 
 
 def _ordered(pair: tuple[float, float]) -> tuple[float, float]:
@@ -136,7 +134,10 @@ class CameraTable(Table):
     full_well_e: float = Field(13_500.0, ge=10, le=1e8)
     read_noise_e_rms: float = Field(13.0, ge=0, le=1e5)
     dark_current_e_s: float = Field(
-        15.0, ge=0, le=1e9, description="default: a CMV4000's 125 e/s at 25 °C brought to 0 °C, halving every 8 K"
+        15.0,
+        ge=0,
+        le=1e9,
+        description="default: a CMV4000's 125 e/s at 25 °C brought to 0 °C, halving every 8 K",
     )
     adc_bits: int = Field(12, ge=8, le=16)
     bias_dn: int = Field(64, ge=0, le=1000)
@@ -216,7 +217,8 @@ class PlanTable(Table):
     mode: Literal["per_class", "per_sample"] = "per_sample"
     faulty_fraction: float = Field(0.5, ge=0, le=1, description="the paper's percentage p")
     classes_per_sample: Annotated[
-        tuple[Annotated[int, Field(ge=1, le=64)], Annotated[int, Field(ge=1, le=64)]], AfterValidator(_ordered)
+        tuple[Annotated[int, Field(ge=1, le=64)], Annotated[int, Field(ge=1, le=64)]],
+        AfterValidator(_ordered),
     ] = (1, 6)
     sun_facing_nominal_fraction: float = Field(
         0.0, ge=0, le=1, description="share of all samples that face the Sun without straylight"
@@ -303,9 +305,7 @@ def _anchor_paths(table: dict[str, Any], folder: Path) -> None:
     for fault in faults.values() if isinstance(faults, dict) else ():
         if isinstance(fault, dict) and isinstance(fault.get("texture_file"), str) and fault["texture_file"]:
             beside = folder / fault["texture_file"]
-            fault["texture_file"] = str(
-                (beside if beside.exists() else Path(fault["texture_file"])).resolve()
-            )
+            fault["texture_file"] = str((beside if beside.exists() else Path(fault["texture_file"])).resolve())
 
 
 def _sentence(error: ValidationError) -> str:

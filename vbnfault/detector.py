@@ -166,10 +166,7 @@ class Detector:
         full_well = np.float32(self.full_well_e)
 
         def collect(signal: F32, shot: F32 | None) -> F32:
-            if shot is None:
-                mean = signal + dark
-            else:
-                mean = _poisson_on_dark(signal, dark, shot)
+            mean = signal + dark if shot is None else _poisson_on_dark(signal, dark, shot)
             return np.minimum(mean, full_well, out=mean)
 
         return collect

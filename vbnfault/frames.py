@@ -157,9 +157,7 @@ class Rotation:
         """Rz(90° + α) · Rx(90° − δ) · Rz(W): body-fixed to ICRF."""
         w = self.prime_meridian_deg + 360.0 * 24.0 / self.period_h * (julian_date - J2000_JD)
         return (
-            rz(np.radians(90 + self.pole_ra_deg))
-            @ rx(np.radians(90 - self.pole_dec_deg))
-            @ rz(np.radians(w % 360))
+            rz(np.radians(90 + self.pole_ra_deg)) @ rx(np.radians(90 - self.pole_dec_deg)) @ rz(np.radians(w % 360))
         )
 
 

@@ -45,8 +45,7 @@ def mask_layers(
 def union(masks: Mask, faults: Iterable[str], members: Iterable[str]) -> Mask:
     """bool[y, x]: where any of the classes `members` has its mask."""
     chosen = set(members)
-    out: Mask = masks[[name in chosen for name in faults]].any(axis=0)
-    return out
+    return np.asarray(masks[[name in chosen for name in faults]].any(axis=0))
 
 
 def outline(mask: Mask) -> Mask:

@@ -94,9 +94,7 @@ def _paths() -> Iterator[tuple[str, Path]]:
         yield VARIABLE, Path(os.environ[VARIABLE])
     yield from ((_WHEEL, path) for path in _wheel_files("libLLVM.so"))
     system = {
-        path
-        for folder, pattern in _SYSTEM_PATTERNS.get(sys.platform, ())
-        for path in Path(folder).glob(pattern)
+        path for folder, pattern in _SYSTEM_PATTERNS.get(sys.platform, ()) for path in Path(folder).glob(pattern)
     }
     yield from (("system", path) for path in sorted(system, key=_name_version, reverse=True))
 
@@ -136,7 +134,10 @@ def _inspect(path: Path, origin: str) -> Candidate:
     get_version(*map(ctypes.byref, parts))
     version = (parts[0].value, parts[1].value, parts[2].value)
     return Candidate(
-        path=path, origin=origin, version=version, problem=_too_old(version) if version[0] < OLDEST_USABLE else ""
+        path=path,
+        origin=origin,
+        version=version,
+        problem=_too_old(version) if version[0] < OLDEST_USABLE else "",
     )
 
 

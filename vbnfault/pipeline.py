@@ -8,7 +8,6 @@ radiance, exposure and noise, so they differ by the faults alone.
 
 from __future__ import annotations
 
-from collections import OrderedDict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -136,9 +135,7 @@ def resolve(frame: Frame) -> None:
     geometry = scene.geometry
     start = max(300.0, 2 * float(np.hypot(fixed["x_m"], fixed["y_m"])))
     surface = spec.terrain.surface
-    ground = float(
-        render.ground_height_m(surface, np.array([fixed["x_m"]]), np.array([fixed["y_m"]]), start)[0]
-    )
+    ground = float(render.ground_height_m(surface, np.array([fixed["x_m"]]), np.array([fixed["y_m"]]), start)[0])
     needs_sun = bool(spec.plan.injects(plan.STRAYLIGHT)[i])
     least = plan.least_sun_angle_deg(scene)
     fallback: Pose | None = None
@@ -286,10 +283,8 @@ def render_frame(frame: Frame) -> None:
 def meter(frame: Frame) -> None:
     """Exposure: fixed, or metered once on the noise-free, fault-free frame; all twins share it."""
     settings = frame.spec.scene.camera
-    if settings.exposure_s == "auto":
-        exposure = _metered_exposure_s(frame)
-    else:
-        exposure = float(settings.exposure_s)
+    fixed = settings.exposure_s
+    exposure = _metered_exposure_s(frame) if fixed == "auto" else float(fixed)
     frame.camera = replace(frame.camera, exposure_s=exposure)
     direction_C = frame.pose.L_from_C.T @ frame.pose.sun_L
     frame.context = FaultContext(
@@ -388,18 +383,17 @@ def _signal(frame: Frame, drawn: Mapping[str, Params], names: Sequence[str]) -> 
     """Expected electrons with the optical faults `names`, of those drawn; twins share what they have in common."""
     camera = _altered(frame, drawn)
     if camera != frame.camera:
-        cached, key = {}, ()
+        cached: dict[Any, Electrons] = {}  # another instrument: not to be mixed with the others
     else:
-        cached, key = frame.signals, _key(drawn, names)
+        cached = frame.signals
+    key = _key(drawn, names)
     if key not in cached:
         if names:
             *before, last = names
             signal = _signal(frame, drawn, before)
             cached[key] = frame.spec.faults[last].apply(signal, drawn[last], frame.context)
         else:
-            cached[key] = camera.detector.electrons_expected(
-                camera.lens.image(frame.radiance), camera.exposure_s
-            )
+            cached[key] = camera.detector.electrons_expected(camera.lens.image(frame.radiance), camera.exposure_s)
     return cached[key]
 
 

@@ -1,6 +1,6 @@
 """The quantities that flow through the pipeline: an array, its unit and its axes, frozen.
 
-    Radiance ─ lens ─▶ Irradiance ─ detector ─▶ Electrons ─▶ RawDN ─▶ RGBI ─▶ Sample
+Radiance ─ lens ─▶ Irradiance ─ detector ─▶ Electrons ─▶ RawDN ─▶ RGBI ─▶ Sample
 """
 
 from __future__ import annotations

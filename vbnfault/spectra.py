@@ -81,7 +81,7 @@ def _band_irradiance(nodes: tuple[float, ...]) -> F64:
     fine = _fine_nm(nodes_nm)
     hats = _hats(nodes_nm, fine)
     sun = solar_irradiance_W_m2_nm(fine)
-    return np.trapezoid(hats * sun, fine, axis=1) / np.trapezoid(hats, fine, axis=1)
+    return np.asarray(np.trapezoid(hats * sun, fine, axis=1) / np.trapezoid(hats, fine, axis=1))
 
 
 def solar_band_irradiance_W_m2_nm(nodes_nm: F64, distance_au: float) -> F64:
@@ -141,4 +141,4 @@ def band_weights(name: str, quantum_efficiency_peak: float, nodes_nm: F64) -> F6
     efficiency = response(name, fine, quantum_efficiency_peak)
     mean = np.trapezoid(hats * sun, fine, axis=1) / np.trapezoid(hats, fine, axis=1)
     integrand = efficiency[:, None, :] * (hats * sun * per_photon)[None]
-    return np.trapezoid(integrand, fine, axis=2) / mean
+    return np.asarray(np.trapezoid(integrand, fine, axis=2) / mean)

@@ -180,9 +180,7 @@ class StoreSpec:
             object.__setattr__(self, "localised_faults", self.mask_any_faults)
         sizes = [self.layer_bytes(name) for name in self.pixel_layers]
         most = max(1, min(MAX_SHARD_SAMPLES, MAX_SHARD_BYTES // max(sizes), MAX_HELD_BYTES // sum(sizes)))
-        object.__setattr__(
-            self, "shard_samples", min(self.shard_samples, most) if self.shard_samples > 0 else most
-        )
+        object.__setattr__(self, "shard_samples", min(self.shard_samples, most) if self.shard_samples > 0 else most)
 
     @cached_property
     def pixel_layers(self) -> dict[str, Array]:
@@ -241,9 +239,7 @@ class StoreSpec:
 
 def _spec(plain: Mapping[str, Any], attributes: Mapping[str, Any]) -> StoreSpec:
     known = {f.name for f in fields(StoreSpec)}
-    values: dict[str, Any] = {
-        k: tuple(v) if isinstance(v, list) else v for k, v in plain.items() if k in known
-    }
+    values: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in plain.items() if k in known}
     return StoreSpec(**values, attributes=attributes)
 
 
@@ -398,9 +394,7 @@ def _crc_of_scalars(scalars: Mapping[str, Any]) -> int:
     """One checksum over all scalars of a sample, in the order of the schema."""
     parts = []
     for name, row in SCALARS.items():
-        data = (
-            scalars[name].encode() if row.is_text else np.asarray(scalars[name]).astype(row.dtype).tobytes()
-        )
+        data = scalars[name].encode() if row.is_text else np.asarray(scalars[name]).astype(row.dtype).tobytes()
         parts.append(struct.pack("<Q", len(data)) + data)
     return int(google_crc32c.value(b"".join(parts)))
 
@@ -420,9 +414,7 @@ class Store:
 
     def __init__(self, path: Path, group: zarr.Group, attributes: dict[str, Any]) -> None:
         self.path = path
-        self.attributes = {
-            k: v for k, v in attributes.items() if k not in ("store", "samples", "coordinates")
-        }
+        self.attributes = {k: v for k, v in attributes.items() if k not in ("store", "samples", "coordinates")}
         self.samples = int(attributes["samples"])
         self.spec = _spec(attributes["store"], self.attributes)
         self._group = group
@@ -461,9 +453,7 @@ class Store:
     def read_sample(self, index: int) -> Sample:
         """One sample as it was written. Raises InputError where it does not exist or is not finished."""
         if not 0 <= index < self.samples:
-            raise InputError(
-                f"{self.path}: sample {index} does not exist; the range is 0 to {self.samples - 1}"
-            )
+            raise InputError(f"{self.path}: sample {index} does not exist; the range is 0 to {self.samples - 1}")
         if not self.read("done", index, index + 1)[0]:
             raise InputError(f"{self.path}: sample {index} is not finished yet; the build command resumes")
         one = {name: self.read(name, index, index + 1)[0] for name in (*self.spec.pixel_layers, *SCALARS)}
@@ -560,9 +550,7 @@ def create(path: str | os.PathLike[str], spec: StoreSpec, samples: int, *, overw
     if old and not overwrite:
         raise InputError(f"{target}: exists already; resume it, or give --overwrite to replace it")
     if not old and target.exists() and (not target.is_dir() or any(target.iterdir())):
-        raise InputError(
-            f"{target}: exists and is no vbnfault store, so it is left alone; choose another --out"
-        )
+        raise InputError(f"{target}: exists and is no vbnfault store, so it is left alone; choose another --out")
     above = next(p for p in target.absolute().parents if p.exists())
     if not above.is_dir():
         raise InputError(f"{target}: no store can be created here: {above} is a file, not a folder")
@@ -803,9 +791,7 @@ def check_shard(store: Store, number: int) -> list[Problem]:
     return problems
 
 
-def _check_layer(
-    store: Store, name: str, number: int, crcs: Mapping[int, NDArray[np.uint32]]
-) -> list[Problem]:
+def _check_layer(store: Store, name: str, number: int, crcs: Mapping[int, NDArray[np.uint32]]) -> list[Problem]:
     file, column = store.file(name, number), store.spec.checked.index(name)
     where, many = file.relative_to(store.path), f"{name} of samples {_spans(crcs)}"
     try:

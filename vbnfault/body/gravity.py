@@ -111,9 +111,7 @@ class PolyhedronGravity:
 
         gravity = GRAVITATIONAL_CONSTANT * self.density_kg_m3
         potential = 0.5 * gravity * (np.sum(to_edge * edge_vector) - np.sum(weighted * height))
-        acceleration = gravity * (
-            -edge_vector.sum(axis=0) + (self._face_normal * weighted[:, None]).sum(axis=0)
-        )
+        acceleration = gravity * (-edge_vector.sum(axis=0) + (self._face_normal * weighted[:, None]).sum(axis=0))
         return float(potential), acceleration
 
     def effective(self, points_m: ArrayLike, omega_rad_s: float) -> Float64:
@@ -124,16 +122,12 @@ class PolyhedronGravity:
         return acceleration
 
 
-def polyhedron_gravity(
-    vertices_m: NDArray, faces: NDArray, density_kg_m3: float, points_m: ArrayLike
-) -> Float64:
+def polyhedron_gravity(vertices_m: NDArray, faces: NDArray, density_kg_m3: float, points_m: ArrayLike) -> Float64:
     """Acceleration float64[k, 3] in m/s² at `points_m` float64[k, 3]; see `PolyhedronGravity`."""
     return PolyhedronGravity(vertices_m, faces, density_kg_m3).evaluate(points_m).acceleration_m_s2
 
 
-def polyhedron_potential(
-    vertices_m: NDArray, faces: NDArray, density_kg_m3: float, points_m: ArrayLike
-) -> Float64:
+def polyhedron_potential(vertices_m: NDArray, faces: NDArray, density_kg_m3: float, points_m: ArrayLike) -> Float64:
     """Potential float64[k] in m²/s², positive, at `points_m` float64[k, 3]; see `PolyhedronGravity`."""
     return PolyhedronGravity(vertices_m, faces, density_kg_m3).evaluate(points_m).potential_m2_s2
 

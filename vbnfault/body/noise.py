@@ -50,9 +50,7 @@ def noise_key(seed: int, stream: int) -> int:
     return (seed << 16) + stream
 
 
-def _by_chunks(
-    kernel: Callable[[NDArray, UInt32], Float32], points: NDArray, seed: int, columns: int
-) -> Float32:
+def _by_chunks(kernel: Callable[[NDArray, UInt32], Float32], points: NDArray, seed: int, columns: int) -> Float32:
     out = np.empty((len(points), columns), dtype=np.float32)
     word = _seed_word(seed)
     for start in range(0, len(points), _CHUNK):

@@ -132,8 +132,7 @@ def build_patch(
 
     if max_triangles < 2 * len(body.faces):
         raise InputError(
-            f"patch: max_triangles must be at least twice the model's {len(body.faces)} faces; "
-            f"got {max_triangles}."
+            f"patch: max_triangles must be at least twice the model's {len(body.faces)} faces; got {max_triangles}."
         )
 
     model = (body.vertices_m - site.position_T_m, vertex_normals(body.vertices_m, body.faces), body.faces)
@@ -168,9 +167,7 @@ class _EdgeLimit:
     def along(self, a: Float64, b: Float64) -> Float64:
         """At the point nearest the site on each edge a-b: a long one can pass it between two far ends."""
         edge = b - a
-        at = np.einsum("...i,...i->...", -a, edge) / np.maximum(
-            np.einsum("...i,...i->...", edge, edge), 1e-30
-        )
+        at = np.einsum("...i,...i->...", -a, edge) / np.maximum(np.einsum("...i,...i->...", edge, edge), 1e-30)
         return self(a + np.clip(at, 0.25, 0.75)[..., None] * edge)
 
     def _at(self, distance: Float64) -> Float64:
@@ -195,9 +192,7 @@ def _affordable(limit: _EdgeLimit, model: tuple[Float64, Float64, Int32], budget
 # --- refinement ---------------------------------------------------------------------------------------------
 
 
-def _refine(
-    points: Float64, normals: Float64, faces: Int32, limit: _EdgeLimit
-) -> tuple[Float64, Float64, Int32]:
+def _refine(points: Float64, normals: Float64, faces: Int32, limit: _EdgeLimit) -> tuple[Float64, Float64, Int32]:
     """Split every edge longer than its limit, the longest first.
 
     Whether an edge is split depends on its own two ends alone, so the triangles on both sides always agree
@@ -276,8 +271,7 @@ def _midpoints(p: Float64, q: Float64, n_p: Float64, n_q: Float64) -> tuple[Floa
     """The curved point-normal triangle's edge midpoint (Vlachos et al. 2001), its departure limited."""
     along = q - p
     bulge = (
-        -(np.einsum("ij,ij->i", along, n_p)[:, None] * n_p - np.einsum("ij,ij->i", along, n_q)[:, None] * n_q)
-        / 8.0
+        -(np.einsum("ij,ij->i", along, n_p)[:, None] * n_p - np.einsum("ij,ij->i", along, n_q)[:, None] * n_q) / 8.0
     )
     size = np.linalg.norm(bulge, axis=1)
     most = _MAX_BULGE * np.linalg.norm(along, axis=1)
@@ -334,9 +328,7 @@ class _Octaves:
         return out
 
 
-def _relief(
-    points: Float64, normals: Float64, site: Site, seed: int, limit: _EdgeLimit, scale: float
-) -> Float64:
+def _relief(points: Float64, normals: Float64, site: Site, seed: int, limit: _EdgeLimit, scale: float) -> Float64:
     """Displacement in metres, float64[n, 3], at points relative to the site in T axes."""
     facet = limit(points) / _LIMIT_PER_TARGET
     chosen = np.flatnonzero(facet < 0.5 * _LARGEST_WAVELENGTH_M)
@@ -399,9 +391,7 @@ def _icosphere(level: int) -> tuple[Float64, Int32]:
         dtype=np.int64,
     )
     for _ in range(level):
-        points, _, faces = _split(
-            points, points, faces, np.ones(faces.shape, dtype=bool), np.ones(faces.shape)
-        )
+        points, _, faces = _split(points, points, faces, np.ones(faces.shape, dtype=bool), np.ones(faces.shape))
         points = points / np.linalg.norm(points, axis=1)[:, None]
     return points, faces.astype(np.int32)
 

@@ -73,9 +73,7 @@ def site_at(body: Body, index: int, position_T_m: ArrayLike) -> Site:
     return Site(index=index, position_T_m=position, T_from_L=local_level(gravity))
 
 
-def choose_sites(
-    body: Body, count: int, seed: int, *, max_slope_deg: float = MAX_SLOPE_DEG
-) -> tuple[Site, ...]:
+def choose_sites(body: Body, count: int, seed: int, *, max_slope_deg: float = MAX_SLOPE_DEG) -> tuple[Site, ...]:
     """Random sites, uniform over the surface area that is no steeper than `max_slope_deg`.
 
     Site k depends on (body, seed, k, max_slope_deg) only, so a longer list begins with the shorter one.

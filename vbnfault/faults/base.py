@@ -360,9 +360,7 @@ def _field_schema(f: dataclasses.Field[Any]) -> dict[str, Any]:
         pair = {"type": "array", "items": value, "minItems": 2, "maxItems": 2}
         return schema | {"anyOf": [value, pair], "default": list(f.default)}  # type: ignore
     if kind == "rows":
-        columns = {
-            k: {"type": "number", "minimum": v[0], "maximum": v[1]} for k, v in meta["columns"].items()
-        }
+        columns = {k: {"type": "number", "minimum": v[0], "maximum": v[1]} for k, v in meta["columns"].items()}
         item = {"type": "object", "properties": columns, "required": list(columns)}
         return schema | {"type": "array", "items": item | {"additionalProperties": False}, "default": []}
     if kind == "choice":

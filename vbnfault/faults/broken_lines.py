@@ -11,7 +11,6 @@ Each line is dead or saturated with equal chance unless the scene fixes the numb
 Where a saturated and a dead line cross, the pixel is saturated.
 """
 
-# ruff: noqa: RUF009 (bounds() and its kin are field specifiers)
 from __future__ import annotations
 
 from dataclasses import dataclass
@@ -55,9 +54,7 @@ class TextureBrokenLines(Fault):
         if len(given) == 1:
             ((name, value),) = given.items()
             if value > self.count.lo:
-                raise ValueError(
-                    f"{name} = {value}: must not exceed the least number of lines, {self.count.lo:g}"
-                )
+                raise ValueError(f"{name} = {value}: must not exceed the least number of lines, {self.count.lo:g}")
 
     def draw(self, context: FaultContext, rng: np.random.Generator) -> Params:
         """Lists of broken `rows` and `columns` (pixel indices) with their values, 0 or 255."""

@@ -24,7 +24,6 @@ OSIRIS-REx saw more than three in a close neighbourhood matter to navigation: he
 these three shares are ours: 10 %, 10 %, 5 %.
 """
 
-# ruff: noqa: RUF009 (bounds() and its kin are field specifiers)
 from __future__ import annotations
 
 from dataclasses import dataclass
@@ -82,9 +81,7 @@ class TextureBrokenPixels(Fault):
         height, width = context.shape
         count = min(self.count.integer(rng), height * width // 4)
         x, y = self._positions(count, height, width, rng)
-        brightness = rng.integers(
-            int(self.brightness_dn.lo), int(self.brightness_dn.hi), count, endpoint=True
-        )
+        brightness = rng.integers(int(self.brightness_dn.lo), int(self.brightness_dn.hi), count, endpoint=True)
         extreme = np.where(rng.random(count) < 0.5, 0, 255)
         is_extreme = rng.random(count) < self.salt_and_pepper_fraction
         brightness = np.where(is_extreme, extreme, brightness)
@@ -117,9 +114,7 @@ class TextureBrokenPixels(Fault):
         for k in range(beside):
             spot = spare[k]  # stays alone where no free neighbour turns up
             for _ in range(64):
-                parent = (
-                    placed[0] if dense and k < DENSE_CLUSTER - 1 else placed[int(rng.integers(len(placed)))]
-                )
+                parent = placed[0] if dense and k < DENSE_CLUSTER - 1 else placed[int(rng.integers(len(placed)))]
                 dy, dx = rng.integers(-1, 1, 2, endpoint=True)
                 near = (parent[0] + int(dy), parent[1] + int(dx))
                 if 0 <= near[0] < height and 0 <= near[1] < width and near not in taken:

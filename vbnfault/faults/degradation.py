@@ -13,7 +13,6 @@ clipped to white before filtering: otherwise the Sun (10⁵ times white) would f
 filter's tails. Beyond the frame the image is mirrored about its outermost pixels.
 """
 
-# ruff: noqa: RUF009 (bounds() and its kin are field specifiers)
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
@@ -39,9 +38,7 @@ class GaussianDegradation(Fault):
     filter_size_px: Interval = bounds(
         3, 17, limits=(1, 1001), integer=True, unit="px", doc="size of the square filter; odd sizes are drawn"
     )
-    scale_with_resolution: bool = flag(
-        True, doc="filter size refers to a 1024 px wide image and scales with it"
-    )
+    scale_with_resolution: bool = flag(True, doc="filter size refers to a 1024 px wide image and scales with it")
 
     def validate(self) -> None:
         if _odd_bounds(self.filter_size_px)[0] > _odd_bounds(self.filter_size_px)[1]:

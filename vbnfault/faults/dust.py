@@ -18,7 +18,6 @@ Choices where the paper is silent or of two minds:
 - Where grains overlap, their transmissions multiply (two grains in one beam); the order does not matter.
 """
 
-# ruff: noqa: RUF009 (bounds() and its kin are field specifiers)
 from __future__ import annotations
 
 from dataclasses import dataclass
@@ -73,9 +72,7 @@ class GaussianDust(Fault):
         unit="DN of 255",
         doc="a grain ends where its darkening falls below this level; what remains is its mask",
     )
-    scale_with_resolution: bool = flag(
-        True, doc="grain size refers to a 1024 px wide image and scales with it"
-    )
+    scale_with_resolution: bool = flag(True, doc="grain size refers to a 1024 px wide image and scales with it")
 
     def validate(self) -> None:
         largest = max(abs(v) for v in self.sigma_xy)
@@ -139,9 +136,7 @@ def transmission(params: Params, shape: tuple[int, int]) -> NDArray[np.float32]:
         columns, rows = x1[i] - x0[i], y1[i] - y0[i]
         dark = np.multiply.outer(along_y[i, :rows], along_x[i, :columns])
         if xy[i]:
-            dark *= np.exp(
-                np.multiply.outer(dy[i, :rows], dx[i, :columns]) * np.float32(xy[i] / determinant[i])
-            )
+            dark *= np.exp(np.multiply.outer(dy[i, :rows], dx[i, :columns]) * np.float32(xy[i] / determinant[i]))
         cv2.threshold(dark, level / 255, 0, cv2.THRESH_TOZERO, dst=dark)
         np.subtract(1, dark, out=dark)
         out[y0[i] : y1[i], x0[i] : x1[i]] *= dark

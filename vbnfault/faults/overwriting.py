@@ -111,9 +111,7 @@ def _mask(params: Params, texture: NDArray[np.float32], alpha: NDArray[np.float3
     return mask
 
 
-def _blend(
-    v: NDArray[np.float32], t: NDArray[np.float32], blend: str, strength: float
-) -> NDArray[np.float32]:
+def _blend(v: NDArray[np.float32], t: NDArray[np.float32], blend: str, strength: float) -> NDArray[np.float32]:
     if blend == "add":
         return v + t
     if blend == "multiply":
@@ -123,17 +121,14 @@ def _blend(
 
 
 @lru_cache(maxsize=2)
-def _stretch(
-    path: str, sha256: str, shape: tuple[int, int]
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def _stretch(path: str, sha256: str, shape: tuple[int, int]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Texture RGBI float32[y, x, 4] in 0-255 and alpha float32[y, x] in 0-1, at the frame's size."""
     texture, alpha = load(path, sha256)
     if texture.shape[:2] != shape:
         shrinks = texture.shape[0] > shape[0] and texture.shape[1] > shape[1]
         how = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
         texture, alpha = (
-            np.asarray(cv2.resize(a, shape[::-1], interpolation=how), dtype=np.float32)
-            for a in (texture, alpha)
+            np.asarray(cv2.resize(a, shape[::-1], interpolation=how), dtype=np.float32) for a in (texture, alpha)
         )
     return texture, alpha
 

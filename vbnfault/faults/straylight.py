@@ -21,7 +21,6 @@ Choices where the paper is silent:
 - The mask is the effect rule; the footprint is the texture from 1 DN of 255 on.
 """
 
-# ruff: noqa: RUF009 (bounds() and its kin are field specifiers)
 from __future__ import annotations
 
 from collections.abc import Mapping
@@ -56,9 +55,7 @@ class TextureStraylight(Fault):
     needs_sun = True
     effect_mask = True
 
-    count: Interval = bounds(
-        1, 10, limits=(0, 10), integer=True, doc="number of flares, at most one per texture"
-    )
+    count: Interval = bounds(1, 10, limits=(0, 10), integer=True, doc="number of flares, at most one per texture")
     index: Interval = bounds(
         1,
         10,
@@ -71,12 +68,8 @@ class TextureStraylight(Fault):
     )
     radius: Interval = bounds(0.05, 0.3, limits=(1e-3, 5), unit="image widths", doc="radius of a flare")
     brightness: Interval = bounds(1.5, 2.5, limits=(0, 1000), doc="factor on a flare's texture")
-    glare: Interval = bounds(
-        0, 2, limits=(0, 2), integer=True, doc="glare at the Sun: 0 none, or texture 1 or 2"
-    )
-    glare_radius: Interval = bounds(
-        0.2, 0.45, limits=(1e-3, 5), unit="image widths", doc="radius of the glare"
-    )
+    glare: Interval = bounds(0, 2, limits=(0, 2), integer=True, doc="glare at the Sun: 0 none, or texture 1 or 2")
+    glare_radius: Interval = bounds(0.2, 0.45, limits=(1e-3, 5), unit="image widths", doc="radius of the glare")
     glare_brightness: Interval = bounds(0.8, 1.6, limits=(0, 1000), doc="factor on the glare's texture")
     mask_level_dn: float = number(
         1.0,
@@ -180,9 +173,7 @@ def _reaches_frame(xy: NDArray[np.float64], radius_px: float, shape: tuple[int, 
     return bool(np.hypot(*(nearest - xy)) < radius_px)
 
 
-def _layer_once(
-    params: Params, context: FaultContext, white_e: NDArray[np.float32]
-) -> NDArray[np.float32] | None:
+def _layer_once(params: Params, context: FaultContext, white_e: NDArray[np.float32]) -> NDArray[np.float32] | None:
     white = np.asarray(white_e, dtype=np.float32)
     name = f"straylight.layer {white.tobytes().hex()}"
     return context.once(name, params, lambda: _layer(params, context, white))

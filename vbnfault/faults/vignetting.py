@@ -7,7 +7,6 @@ r being the distance of a pixel's centre from the frame's middle and f the focal
 and B alike. The thin lens applies no cos⁴ of its own, so nothing is counted twice.
 """
 
-# ruff: noqa: RUF009 (bounds() and its kin are field specifiers)
 from __future__ import annotations
 
 from dataclasses import dataclass
@@ -33,9 +32,7 @@ class Cos4Vignetting(Fault):
     on_axis_illuminance_dn: Interval = bounds(
         105, 255, limits=(0, 255), unit="DN of 255", doc="E0: 255 leaves the centre as it is"
     )
-    mask_loss: float = number(
-        0.1, limits=(0, 1), doc="the mask holds the pixels that lose at least this fraction"
-    )
+    mask_loss: float = number(0.1, limits=(0, 1), doc="the mask holds the pixels that lose at least this fraction")
 
     def draw(self, context: FaultContext, rng: np.random.Generator) -> Params:
         """E0, and the loss from which the mask starts."""

@@ -6,7 +6,6 @@ from .runtime import set_threads
 from .surface import Surface
 
 
-
 def self_test() -> str:
     """Render a Lambert square facing the Sun and compare its radiance with ρE/π; a sentence for `doctor`."""
     import numpy as np
@@ -18,7 +17,11 @@ def self_test() -> str:
     up = np.array([0.0, 0.0, -1.0])
     sun = Sunlight(direction_L=up, angular_radius_rad=0.005, irradiance_W_m2_nm=np.array([1.5]))
     view = View(
-        position_L_m=5 * up, L_from_C=np.eye(3), intrinsics=np.array([16.0, 16, 8, 8]), width_px=16, height_px=16
+        position_L_m=5 * up,
+        L_from_C=np.eye(3),
+        intrinsics=np.array([16.0, 16, 8, 8]),
+        width_px=16,
+        height_px=16,
     )
     scene = Scene(
         view=view,

@@ -52,9 +52,7 @@ def radiance(surface: Surface, scene: Scene) -> Radiance:
                     np.multiply(values, weight, out=out[band, span])
                 elif values.any():
                     out[band, span] += values * weight
-    return Radiance(
-        array=out.reshape(bands, view.height_px, view.width_px), wavelength_nm=scene.wavelength_nm
-    )
+    return Radiance(array=out.reshape(bands, view.height_px, view.width_px), wavelength_nm=scene.wavelength_nm)
 
 
 def _slabs(view: View, spp: int) -> list[tuple[int, int]]:

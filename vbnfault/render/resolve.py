@@ -48,7 +48,7 @@ def is_clear(surface: Surface, position_L_m: F64, clearance_m: float) -> NDArray
     z, turn = 1 - 2 * k / _DIRECTIONS, k * np.pi * (3 - np.sqrt(5))
     r = np.sqrt(1 - z * z)
     directions = np.column_stack([r * np.cos(turn), r * np.sin(turn), z])
-    return ~_any_hit(surface, position_L_m, directions[None], clearance_m).any(axis=1)
+    return np.asarray(~_any_hit(surface, position_L_m, directions[None], clearance_m).any(axis=1))
 
 
 def sun_visible_fraction(surface: Surface, position_L_m: F64, suns: list[Sunlight]) -> F64:
@@ -61,8 +61,10 @@ def sun_visible_fraction(surface: Surface, position_L_m: F64, suns: list[Sunligh
         x = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
         x /= np.linalg.norm(x)
         y = np.cross(axis, x)
-        offset = np.tan(sun.angular_radius_rad) * radius[:, None] * (
-            np.cos(turn)[:, None] * x + np.sin(turn)[:, None] * y
+        offset = (
+            np.tan(sun.angular_radius_rad)
+            * radius[:, None]
+            * (np.cos(turn)[:, None] * x + np.sin(turn)[:, None] * y)
         )
         d = axis + offset
         directions.append(d / np.linalg.norm(d, axis=1, keepdims=True))

@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from .. import llvm
 
 llvm.prepare()
 
-import drjit as dr  # noqa: E402
-import mitsuba as mi  # noqa: E402
+import drjit  # noqa: E402
+import mitsuba  # noqa: E402
 
-mi.set_variant("llvm_ad_spectral")
-mi.set_log_level(mi.LogLevel.Error)
+mitsuba.set_variant("llvm_ad_spectral")
+mitsuba.set_log_level(mitsuba.LogLevel.Error)
+
+# their stubs do not know what broadcasting and swizzling allow
+dr: Any = drjit
+mi: Any = mitsuba
 
 __all__ = ["dr", "mi", "set_threads"]
 

@@ -88,10 +88,7 @@ def _corner_normals(
     area = np.cross(b - a, c - a)
     weighted = np.where(flat[:, None], 0.0, area)
     vertex = np.stack(
-        [
-            np.bincount(faces.ravel(), np.repeat(weighted[:, k], 3), minlength=len(vertices))
-            for k in range(3)
-        ],
+        [np.bincount(faces.ravel(), np.repeat(weighted[:, k], 3), minlength=len(vertices)) for k in range(3)],
         axis=1,
     )
     corner = np.where(flat[:, None, None], area[:, None, :], vertex[faces])

@@ -1,0 +1,284 @@
+"""Who may import whom: the table of modules, kept by reading the sources."""
+
+from __future__ import annotations
+
+import ast
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cache
+from graphlib import CycleError, TopologicalSorter
+from pathlib import Path
+
+import pytest
+
+import vbnfault
+
+ROOT = Path(vbnfault.__file__).parent
+
+# Unit (module or package of vbnfault) → the units it may import, besides itself and EVERYWHERE. Data flows
+# one way; a new unit has to be given its place here.
+EVERYWHERE = {"errors", "resources", "__init__"}
+FOUNDATION = {"llvm", "spectra", "quantities", "config", "frames"}
+GEOMETRY = FOUNDATION | {"body", "plan", "scene"}
+CAMERA = {"spectra", "quantities", "llvm", "lens", "detector", "camera"}
+PIPELINE = GEOMETRY | CAMERA | {"render", "faults", "labels", "pipeline"}
+DATASET = PIPELINE | {"store", "build", "dataset"}
+MAY_IMPORT: dict[str, set[str]] = {
+    "__init__": set(),
+    "errors": set(),
+    "resources": set(),
+    "llvm": set(),
+    "spectra": set(),
+    "quantities": set(),
+    "frames": set(),
+    "config": {"spectra", "quantities"},
+    "body": FOUNDATION,
+    "plan": FOUNDATION | {"body"},
+    "scene": FOUNDATION | {"body", "plan"},
+    "render": {"scene", "llvm", "quantities"},  # quantities: what it returns
+    "lens": {"spectra", "quantities", "llvm"},
+    "detector": {"spectra", "quantities"},
+    "camera": {"lens", "detector"},
+    "faults": CAMERA,
+    "labels": GEOMETRY | CAMERA | {"faults"},
+    "pipeline": PIPELINE,
+    "store": {"quantities", "config", "plan"},
+    "build": PIPELINE | {"store"},
+    "dataset": DATASET,
+    "study": DATASET,
+    "report": DATASET,
+    "export": DATASET,
+    "inject": DATASET,
+    "cli": DATASET | {"study", "report", "export", "inject"},
+    "__main__": {"cli"},
+}
+
+ONLY = {  # distribution → the one unit that imports it
+    "mitsuba": {"render"},
+    "drjit": {"render", "lens"},
+    "zarr": {"store"},
+    "numcodecs": {"store"},
+    "dask": {"build"},
+    "distributed": {"build"},
+    "typer": {"cli"},
+}
+
+
+@dataclass(frozen=True)
+class Import:
+    """One import statement: of `target` (dotted), by `module` (dotted, within vbnfault), where and when."""
+
+    module: str
+    target: str
+    line: int
+    at_load: bool  # run when the module is loaded: neither in a function nor for the type checker only
+
+    @property
+    def unit(self) -> str:
+        return self.module.split(".")[0]
+
+    @property
+    def target_unit(self) -> str | None:
+        parts = self.target.split(".")
+        return (parts[1] if len(parts) > 1 else "__init__") if parts[0] == "vbnfault" else None
+
+
+def module_name(path: Path) -> str:
+    parts = path.relative_to(ROOT).with_suffix("").parts
+    return ".".join(parts[:-1] if len(parts) > 1 and parts[-1] == "__init__" else parts)
+
+
+@cache
+def sources() -> dict[str, ast.Module]:
+    return {module_name(p): ast.parse(p.read_text(encoding="utf-8")) for p in sorted(ROOT.rglob("*.py"))}
+
+
+def is_module(dotted: str) -> bool:
+    parts = dotted.split(".")[1:]
+    return ROOT.joinpath(*parts).is_dir() or ROOT.joinpath(*parts).with_suffix(".py").is_file()
+
+
+def targets(node: ast.Import | ast.ImportFrom, module: str) -> Iterator[str]:
+    if isinstance(node, ast.Import):
+        yield from (alias.name for alias in node.names)
+        return
+    base = node.module or ""
+    if node.level:
+        inside = ["vbnfault"] if module == "__init__" else ["vbnfault", *module.split(".")]
+        package = inside if ROOT.joinpath(*inside[1:]).is_dir() else inside[:-1]
+        package = package[: len(package) - (node.level - 1)]
+        base = ".".join([*package, base] if base else package)
+    for alias in node.names:  # `from . import plan` imports a module, `from .plan import Plan` a name of one
+        dotted = f"{base}.{alias.name}"
+        yield dotted if dotted.startswith("vbnfault.") and is_module(dotted) else base
+
+
+def imports_of(module: str) -> Iterator[Import]:
+    def walk(node: ast.AST, at_load: bool) -> Iterator[Import]:
+        for child in ast.iter_child_nodes(node):
+            if isinstance(child, ast.Import | ast.ImportFrom):
+                for target in targets(child, module):
+                    yield Import(module, target, child.lineno, at_load)
+            elif isinstance(child, ast.If) and "TYPE_CHECKING" in ast.dump(child.test):
+                for part in child.body:
+                    yield from walk(ast.Module([part], []), False)
+                yield from walk(ast.Module(child.orelse, []), at_load)
+            else:
+                inside = isinstance(child, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda)
+                yield from walk(child, at_load and not inside)
+
+    return walk(sources()[module], True)
+
+
+@cache
+def imports() -> tuple[Import, ...]:
+    return tuple(i for module in sources() for i in imports_of(module))
+
+
+# ------------------------------------------------------------------------------------ the reading itself
+
+
+def test_the_walk_reads_every_form_of_import() -> None:
+    found = {(i.module, i.target, i.at_load) for i in imports()}
+    assert ("plan", "vbnfault.config", True) in found  # from . import config
+    assert ("plan", "vbnfault.errors", True) in found  # from .errors import InputError
+    assert ("faults.base", "vbnfault.camera", True) in found  # from ..camera import Camera
+    assert ("body.patch", "vbnfault.body.noise", True) in found  # from vbnfault.body.noise import …
+    assert ("pipeline", "vbnfault.render", False) in found  # within a function
+    assert ("render.runtime", "mitsuba", True) in found  # import mitsuba as mi
+    assert len(sources()) > 30
+
+
+# ------------------------------------------------------------------------------------ the table
+
+
+def test_every_module_has_its_place_in_the_table() -> None:
+    assert {module.split(".")[0] for module in sources()} <= set(MAY_IMPORT)
+
+
+@pytest.mark.parametrize("unit", sorted(MAY_IMPORT))
+def test_imports_keep_to_the_table(unit: str) -> None:
+    allowed = MAY_IMPORT[unit] | EVERYWHERE | {unit}
+    if unit in ("__init__", "errors"):
+        allowed = {unit}
+    wrong = [
+        f"vbnfault/{i.module.replace('.', '/')}.py:{i.line} imports {i.target}"
+        for i in imports()
+        if i.unit == unit and i.target_unit is not None and i.target_unit not in allowed
+    ]
+    assert not wrong
+
+
+@pytest.mark.parametrize("library", ONLY)
+def test_only_one_unit_imports(library: str) -> None:
+    wrong = [
+        f"vbnfault/{i.module.replace('.', '/')}.py:{i.line}"
+        for i in imports()
+        if i.target.split(".")[0] == library and i.unit not in ONLY[library]
+    ]
+    assert not wrong
+
+
+def test_spectra_need_numpy_scipy_and_colour_only() -> None:
+    libraries = {i.target.split(".")[0] for i in imports() if i.unit == "spectra"} - set(sys.stdlib_module_names)
+    assert libraries <= {"numpy", "scipy", "colour", "vbnfault"}
+
+
+def test_the_table_itself_has_no_cycles() -> None:
+    order = {unit: {u for u in allowed if u != unit} for unit, allowed in MAY_IMPORT.items()}
+    for unit, allowed in order.items():
+        assert not [u for u in allowed if unit in order.get(u, ())], unit
+    assert list(TopologicalSorter(order).static_order())
+
+
+def fault_files() -> set[str]:
+    """Modules of `faults` that define a model: a class with a `model` of its own."""
+    return {
+        module
+        for module, tree in sources().items()
+        if module.startswith("faults.")
+        for node in ast.walk(tree)
+        if isinstance(node, ast.ClassDef)
+        and any(isinstance(a, ast.Assign) and getattr(a.targets[0], "id", "") == "model" for a in node.body)
+    }
+
+
+def test_faults_import_no_other_fault() -> None:
+    files = fault_files()
+    assert {"faults.straylight", "faults.dust", "faults.vignetting"} <= files
+    wrong = [
+        f"{i.module} imports {i.target}"
+        for i in imports()
+        if i.module in files | {"faults.base"} and i.target.removeprefix("vbnfault.") in files - {i.module}
+    ]
+    assert not wrong
+
+
+# ------------------------------------------------------------------------------------ cycles
+
+
+def assert_no_cycle(edges: dict[str, set[str]]) -> None:
+    try:
+        tuple(TopologicalSorter(edges).static_order())
+    except CycleError as error:
+        pytest.fail("import cycle: " + " → ".join(error.args[1]))
+
+
+def test_no_cycles_between_units() -> None:
+    units: dict[str, set[str]] = {}
+    for i in imports():  # lazy and type-only imports included
+        if i.target_unit not in (None, i.unit):
+            units.setdefault(i.unit, set()).add(str(i.target_unit))
+    assert len(units) > 10
+    assert_no_cycle(units)
+
+
+def test_no_cycles_between_modules_as_they_load() -> None:
+    modules: dict[str, set[str]] = {}
+    for i in imports():
+        target = i.target.removeprefix("vbnfault.")
+        if i.at_load and i.target_unit is not None and target != i.module:
+            modules.setdefault(i.module, set()).add(target)
+    assert_no_cycle(modules)
+
+
+def test_a_cycle_would_be_found() -> None:
+    with pytest.raises(pytest.fail.Exception, match="import cycle"):
+        assert_no_cycle({"a": {"b"}, "b": {"c"}, "c": {"a"}})
+
+
+# ------------------------------------------------------------------------------------ Mitsuba
+
+
+def test_mitsuba_is_not_imported_by_loading_anything_but_render() -> None:
+    # whoever needs render imports it within a function
+    wrong = [f"{i.module}:{i.line}" for i in imports() if i.at_load and i.target_unit == "render" != i.unit]
+    assert not wrong
+
+
+LIGHT = (
+    "config",
+    "plan",
+    "frames",
+    "spectra",
+    "detector",
+    "camera",
+    "faults",
+    "labels",
+    "body",
+    "pipeline",
+    "llvm",
+)
+
+
+@pytest.mark.parametrize("modules", [(), LIGHT, ("faults",)], ids=["vbnfault", "all light ones", "faults"])
+def test_mitsuba_stays_unloaded(modules: tuple[str, ...]) -> None:
+    script = ["import sys", "import vbnfault", *(f"import vbnfault.{m}" for m in modules)]
+    if "faults" in modules:
+        script.append("assert len(vbnfault.faults.registry()) >= 6")
+    heavy = "{'mitsuba', 'drjit', 'zarr', 'dask', 'distributed', 'typer', 'vbnfault.render'}"
+    script.append(f"loaded = sorted({heavy} & set(sys.modules)); assert not loaded, loaded")
+    done = subprocess.run([sys.executable, "-c", "; ".join(script)], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
