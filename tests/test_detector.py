@@ -237,7 +237,6 @@ def test_saturation_gives_the_top_code_and_255(bits: int) -> None:
         np.testing.assert_array_equal(detector.develop(flat(detector, light), SHORT_S, None).array, 255)
 
 
-@pytest.mark.xfail(strict=True, reason="white counts from bias + dark to bias + full well: dark current dims it")
 def test_saturation_is_white_after_a_long_exposure_too() -> None:
     detector = Detector(dark_current_e_s=125)
     np.testing.assert_array_equal(detector.develop(flat(detector, 1e6), 5.0, None).array, 255)
@@ -418,7 +417,6 @@ def test_steps_return_new_read_only_quantities() -> None:
     assert image.array.shape == (64, 64, 4)
 
 
-@pytest.mark.xfail(strict=True, reason="the pool's threads do not live on in a forked process: it waits for ever")
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="this system has no fork")
 def test_a_forked_process_can_develop_too() -> None:
     # data loaders of learning frameworks fork their workers

@@ -173,7 +173,6 @@ def test_attitudes_that_never_lose_the_sun_are_refused() -> None:
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.xfail(strict=True, reason="the half diagonal counts the width twice, whatever the height")
 def test_the_sun_stays_out_of_an_upright_frame() -> None:
     s = scene(camera={"width_px": 512, "height_px": 1024, "fov_deg": 65})
     diagonal = np.degrees(np.arctan(np.hypot(1, 2) * np.tan(np.radians(32.5))))

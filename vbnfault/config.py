@@ -11,7 +11,7 @@ import difflib
 import hashlib
 import json
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -54,7 +54,7 @@ class SplitTable(Table):
     @model_validator(mode="after")
     def _sum(self) -> SplitTable:
         if abs(self.train + self.val + self.test - 1) > 1e-6:
-            raise ValueError("train, val and test must add up to 1")
+            raise ValueError(f"train = {self.train:g}, val = {self.val:g}, test = {self.test:g}: must add up to 1")
         return self
 
 
@@ -100,7 +100,7 @@ class BodyTable(Table):
             known = ", ".join(spectra.REFLECTANCES)
             raise ValueError(f"reflectance = {self.reflectance!r}: must be a grey value 0 to 1 or one of {known}")
         if min(self.semi_axes_m) <= 0 or max(self.semi_axes_m) > 1e9:
-            raise ValueError("semi_axes_m: each must be above 0 and at most 1e9")
+            raise ValueError(f"semi_axes_m = {list(self.semi_axes_m)}: each must be above 0 and at most 1e9")
         return self
 
 
@@ -162,7 +162,10 @@ class CameraTable(Table):
         if isinstance(self.exposure_s, float | int) and not 0 < self.exposure_s <= 1e4:
             raise ValueError(f"exposure_s = {self.exposure_s!r}: must be 'auto' or above 0 and at most 1e4 s")
         if self.exposure_min_s > self.exposure_max_s:
-            raise ValueError("exposure_min_s, exposure_max_s: bounds reversed, the lower one comes first")
+            raise ValueError(
+                f"exposure_min_s = {self.exposure_min_s:g}, "
+                f"exposure_max_s = {self.exposure_max_s:g}: bounds reversed"
+            )
         return self
 
 
@@ -177,7 +180,9 @@ class RenderTable(Table):
     @model_validator(mode="after")
     def _valid(self) -> RenderTable:
         if self.band_min_nm >= self.band_max_nm:
-            raise ValueError("band_min_nm, band_max_nm: bounds reversed, the lower one comes first")
+            raise ValueError(
+                f"band_min_nm = {self.band_min_nm:g}, band_max_nm = {self.band_max_nm:g}: bounds reversed"
+            )
         n = self.samples_per_pixel
         if n & (n - 1) or (n.bit_length() - 1) % 2:
             raise ValueError(f"samples_per_pixel = {n}: must be 1, 4, 16, 64, 256, 1024 or 4096")
@@ -280,6 +285,8 @@ def load_scene(name_or_path: str | Path, overrides: Mapping[str, Any] | None = N
         node = table
         for parent in parents:
             node = node.setdefault(parent, {})
+            if not isinstance(node, dict):
+                raise InputError(f"{path}: {key} = {value!r}: {parent} is a value, not a table")
         node[leaf] = value
     _anchor_paths(table, path.parent)
     return parse_scene(table, source=str(path))
@@ -288,8 +295,8 @@ def load_scene(name_or_path: str | Path, overrides: Mapping[str, Any] | None = N
 def parse_scene(table: Mapping[str, Any], *, source: str) -> SceneConfig:
     """Check plain data as a scene; raises InputError with one sentence naming `source`, key and value."""
     try:
-        # JSON mode: strict about types, yet arrays become tuples
-        return SceneConfig.model_validate_json(json.dumps(table, default=str), strict=True)
+        # JSON mode: strict about types, yet arrays become tuples; TOML's dates suit no key, as lists they fail
+        return SceneConfig.model_validate_json(json.dumps(table, default=lambda date: [str(date)]), strict=True)
     except ValidationError as error:
         raise InputError(f"{source}: {_sentence(error)}") from None
 
@@ -311,26 +318,56 @@ def _anchor_paths(table: dict[str, Any], folder: Path) -> None:
 def _sentence(error: ValidationError) -> str:
     first = error.errors()[0]
     keys, schema = _locate(first["loc"])
-    key = ".".join(keys)
-    value = first.get("input")
+    value, message = first.get("input"), str(first.get("ctx", {}).get("error", first["msg"]))
     if first["type"] == "extra_forbidden":
         known = list(schema.get("properties", {}))
         close = difflib.get_close_matches(str(first["loc"][-1]), known, n=1)
         hint = f" (did you mean {close[0]}?)" if close else f"; known: {', '.join(known)}"
-        return f"{'.'.join(str(part) for part in first['loc'])}: unknown key{hint}"
-    if first["type"] == "missing":
-        return f"{'.'.join(str(part) for part in first['loc'])}: missing"
+        return f"{_dotted(first['loc'])}: unknown key{hint}"
+    if first["type"] == "missing" and not isinstance(value, list):
+        return f"{_dotted(first['loc'])}: missing"
+    if first["type"] == "missing":  # a pair with one end
+        keys, schema = _locate(first["loc"][:-1])
+    elif first["type"] == "value_error":
+        return f"{_dotted(keys)}{_shown(value)}: {message}" if keys else message
+    return f"{_dotted(keys)}{_shown(value)}: must be {_wanted(schema, message)}"
+
+
+def _dotted(keys: Sequence[int | str]) -> str:
+    return ".".join(k if str(k).isprintable() else repr(k) for k in map(str, keys))
+
+
+def _shown(value: Any) -> str:
+    return "" if isinstance(value, dict | BaseModel) else f" = {value!r}"
+
+
+def _wanted(schema: Mapping[str, Any], message: str) -> str:
+    """What a key takes, in words, from its JSON schema; else what pydantic says."""
+    items = schema.get("prefixItems")
+    if items:
+        each = _wanted(items[0], "a value").removeprefix("a ")
+        count = {2: "two", 3: "three"}.get(len(items), str(len(items)))
+        return f"a list of {count} values, each a {each}"
+    if schema.get("type") == "array" and schema.get("minItems") and "at least" in message:
+        return f"a list of at least {schema['minItems']}"
+    if schema.get("pattern", "").startswith("^("):
+        options = schema["pattern"].removeprefix("^(").removesuffix(")$").replace("[a-z_]+", "<fault>")
+        return f"one of {', '.join(options.split('|'))}"
     lo = schema.get("minimum", schema.get("exclusiveMinimum"))
     hi = schema.get("maximum", schema.get("exclusiveMaximum"))
-    if lo is not None or hi is not None:
-        kind = "a whole number" if schema.get("type") == "integer" else "a number"
-        above = "" if lo is None else f" {'above' if 'exclusiveMinimum' in schema else 'from'} {lo:g}"
-        upto = "" if hi is None else f" {'to' if above else 'up to'} {hi:g}"
-        message = f"must be {kind}{above}{upto}"
-    else:
-        message = str(first.get("ctx", {}).get("error", first["msg"])).replace("Input should be", "must be")
-    shown = "" if isinstance(value, dict | BaseModel) else f" = {value!r}"
-    return f"{key}{shown}: {message}" if key else message
+    word = f"{schema['const']!r} or " if "const" in schema else ""
+    if lo is None and hi is None:
+        if word:
+            return f"{word}a number"
+        return message.replace("Input should be ", "")
+    kind = "a whole number" if schema.get("type") == "integer" else "a number"
+    above = "" if lo is None else f" {'above' if 'exclusiveMinimum' in schema else 'from'} {lo:g}"
+    joint = (
+        ""
+        if hi is None
+        else f" {'to' if above.startswith(' from') else 'and at most' if above else 'up to'} {hi:g}"
+    )
+    return f"{word}{kind}{above}{joint}"
 
 
 def _locate(loc: tuple[int | str, ...]) -> tuple[list[str], dict[str, Any]]:
@@ -342,7 +379,8 @@ def _locate(loc: tuple[int | str, ...]) -> tuple[list[str], dict[str, Any]]:
             node = root["$defs"][node["$ref"].rsplit("/", 1)[-1]] if "$ref" in node else node["allOf"][0]
         options = [plain(o) for o in node.get("anyOf", ()) if o.get("type") != "null"]
         numeric = [o for o in options if o.get("type") in ("number", "integer")]
-        return options[0] if len(options) == 1 else {**node, **(numeric[0] if numeric else {})}
+        constant = next(({"const": o["const"]} for o in options if "const" in o), {})
+        return options[0] if len(options) == 1 else {**node, **(numeric[0] if numeric else {}), **constant}
 
     keys: list[str] = []
     node = plain(root)

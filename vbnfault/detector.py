@@ -10,6 +10,7 @@ differ only where their signals differ.
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -182,7 +183,8 @@ class Detector:
 
     def _shower(self, exposure_s: float) -> Callable[[F32], NDArray[np.uint8]]:
         black = np.float32(self.bias_dn + self.dark_current_e_s * exposure_s * self.gain_dn_per_e)
-        scale = (255.0 / (self.adc_max_dn - self.bias_dn) * self.white_balance).astype(np.float32)
+        # what is left above the black level is white: a saturated pixel stays so after a long exposure
+        scale = (255.0 / max(self.adc_max_dn - float(black), 1.0) * self.white_balance).astype(np.float32)
         luminance = LUMINANCE.reshape(1, 3).astype(np.float64)
 
         def show(dn: F32) -> NDArray[np.uint8]:
@@ -286,6 +288,10 @@ def _normal_steps(mean: float) -> tuple[np.float32, ...]:
 @lru_cache(maxsize=1)
 def _pool() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(2)
+
+
+if hasattr(os, "register_at_fork"):  # threads do not live on in a forked process, such as a data loader's
+    os.register_at_fork(after_in_child=_pool.cache_clear)
 
 
 def _blockwise(step: Callable[..., NDArray[Any]], array: NDArray[Any], *more: NDArray[Any] | None) -> NDArray[Any]:

@@ -94,13 +94,13 @@ def quaternion(matrix: F64) -> F64:
 
 def minimal_rotation(source: F64, target: F64) -> F64:
     """The rotation matrix by the smallest angle that takes unit vector `source` to `target`."""
-    cosine = float(source @ target)
-    if cosine < -1 + 1e-12:  # opposite: half a turn about any axis across
+    both = source + target
+    if np.linalg.norm(both) < 1e-8:  # opposite: half a turn about any axis across
         axis = unit(np.cross(source, np.eye(3)[np.argmin(np.abs(source))]))
         return 2 * np.outer(axis, axis) - np.eye(3)
-    v = np.cross(source, target)
-    k = np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])
-    return np.eye(3) + k + k @ k / (1 + cosine)
+    # two half turns, about the source and about the bisector: orthonormal to rounding at any angle
+    half = unit(both)
+    return (2 * np.outer(half, half) - np.eye(3)) @ (2 * np.outer(source, source) - np.eye(3))
 
 
 @dataclass(frozen=True, kw_only=True)

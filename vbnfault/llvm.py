@@ -18,6 +18,7 @@ import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 from .errors import VbnfaultError
 
@@ -121,6 +122,8 @@ def _inspect(path: Path, origin: str) -> Candidate:
     if by_name and int(by_name[1]) < OLDEST_USABLE:  # told by the name alone: do not load it
         version = (int(by_name[1]), 0, 0)
         return Candidate(path=path, origin=origin, version=version, problem=_too_old(version))
+    if _is_cut_short(path):
+        return Candidate(path=path, origin=origin, version=None, problem="does not load: the file is cut short")
     try:
         library = _load(path, origin)
     except OSError as error:
@@ -139,6 +142,26 @@ def _inspect(path: Path, origin: str) -> Candidate:
         version=version,
         problem=_too_old(version) if version[0] < OLDEST_USABLE else "",
     )
+
+
+def _is_cut_short(path: Path) -> bool:
+    """Whether a 64 bit ELF file ends before its segments do: loading such a file kills the process."""
+    with path.open("rb") as file:
+        header = file.read(64)
+        if len(header) < 64 or header[:5] != b"\x7fELF\x02":
+            return False
+        order: Literal["little", "big"] = "little" if header[5] == 1 else "big"
+        table, entry, count = (int.from_bytes(header[a:b], order) for a, b in ((32, 40), (54, 56), (56, 58)))
+        file.seek(table)
+        rows = file.read(entry * count)
+    size = path.stat().st_size
+    if len(rows) < entry * count:
+        return True
+    ends = (
+        int.from_bytes(row[8:16], order) + int.from_bytes(row[32:40], order)
+        for row in (rows[k * entry : (k + 1) * entry] for k in range(count))
+    )
+    return any(end > size for end in ends)
 
 
 def _too_old(version: tuple[int, int, int]) -> str:

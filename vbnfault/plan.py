@@ -110,8 +110,11 @@ def propose(
 
 
 def least_sun_angle_deg(scene: SceneConfig) -> float:
-    """Sun-averted boresights stay farther than this from the Sun: the half diagonal √2·FoV/2."""
-    return float(np.sqrt(2) * scene.camera.fov_deg / 2)
+    """Sun-averted boresights stay farther than this from the Sun: √2·FoV/2 as the paper's square frame has it,
+    and the half diagonal of a frame that is higher than wide."""
+    camera = scene.camera
+    diagonal = np.hypot(1.0, camera.height_px / camera.width_px) * np.tan(np.radians(camera.fov_deg) / 2)
+    return float(max(np.sqrt(2) * camera.fov_deg / 2, np.degrees(np.arctan(diagonal))))
 
 
 def strata(scene: SceneConfig) -> tuple[StratumTable, StratumTable]:
@@ -199,7 +202,7 @@ def _keep_sun_out_of_view(
     stratum: NDArray[np.uint8],
     variables: dict[str, NDArray[np.float64]],
 ) -> NDArray[np.int32]:
-    # The literal bounds leave 5 % of the Sun-averted draws looking at the Sun: roll and pitch both near half a
+    # The literal bounds leave 8 % of the Sun-averted draws looking at the Sun: roll and pitch both near half a
     # turn. Where the angles count from the Sun, it is a matter of roll and pitch alone and is settled here.
     tries = np.ones(len(samples), dtype=np.int32)
     if strata(scene)[SUN_AVERTED].reference != "sun":
