@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from . import pipeline
+from . import labels, pipeline, report
 from .errors import VbnfaultError
 from .pipeline import Frame
 from .quantities import Sample
@@ -21,7 +21,8 @@ def write_frame(frame: Frame, folder: Path) -> list[Path]:
 
     `sample.exr`: `radiance.<wavelength>nm` (W m⁻² sr⁻¹ nm⁻¹), `depth.Z` (m), `normal.X/Y/Z` (C frame) and
     `semantic`; `image.png`, `clean.png`, `without_<fault>.png` as RGB, each with its intensity channel beside it;
-    `mask_<fault>.png`, `mask_any.png`; `parameters.json` with every scalar of the dataset.
+    `mask_<fault>.png`, `mask_any.png`; `annotated_<fault>.png`, the image with a class pointed out;
+    `parameters.json` with every scalar of the dataset.
     Raises VbnfaultError where a file cannot be written.
     """
     sample = pipeline.to_sample(frame)
@@ -37,11 +38,41 @@ def write_frame(frame: Frame, folder: Path) -> list[Path]:
                 files.append(_write_png(folder / f"{prefix}{fault}.png", mask.astype(np.uint8) * 255))
         union = sample.layers["mask_any"].astype(np.uint8) * 255
         files.append(_write_png(folder / "mask_any.png", union))
+        for name in frame.drawn:
+            files.append(_write_png(folder / f"annotated_{name}.png", annotated(frame, name)[..., ::-1]))
         path = folder / "parameters.json"
         path.write_text(json.dumps(_plain(sample), indent=2) + "\n")
         return [*files, path]
     except OSError as error:
         raise VbnfaultError(f"{error.filename or folder}: cannot be written: {error.strerror}") from None
+
+
+def annotated(frame: Frame, fault: str) -> NDArray[np.uint8]:
+    """The image with one class pointed out, uint8[y, x, 3] R, G, B: the outline of its mask and, for straylight,
+    the line from the Sun through the centre with every flare's centre and radius on it."""
+    names = list(frame.spec.faults)
+    colour = report.COLOURS[names.index(fault) % len(report.COLOURS)]
+    picture = np.ascontiguousarray(frame.images["image"].array[..., :3])
+    picture[labels.outline(frame.mask[names.index(fault)])] = colour
+    params, sun = frame.drawn[fault], frame.context.sun_xy_px
+    if "flares" in params and sun is not None:
+        width = frame.camera.width_px
+        centre = np.array([width / 2, frame.camera.height_px / 2])
+
+        def at(point: NDArray[np.float64]) -> tuple[int, int]:
+            # a pixel's centre lies at +0.5 here and at 0 in OpenCV, whose points have 1/16 px with shift = 4
+            return round(float(point[0] - 0.5) * 16), round(float(point[1] - 0.5) * 16)
+
+        far = sun + 2.2 * (centre - sun)
+        cv2.line(picture, at(sun), at(far), (255, 255, 255), 1, cv2.LINE_AA, 4)
+        cv2.circle(picture, at(sun), 10 * 16, (255, 255, 255), 1, cv2.LINE_AA, 4)
+        for flare in params["flares"]:
+            middle = sun + flare["position"] * (centre - sun)
+            cv2.circle(picture, at(middle), round(flare["radius"] * width * 16), colour, 1, cv2.LINE_AA, 4)
+            x, y = (round(float(v) - 0.5) for v in middle)
+            cv2.drawMarker(picture, (x, y), colour, cv2.MARKER_CROSS, 13, 1)
+            cv2.putText(picture, str(flare["index"]), (x + 8, y - 6), cv2.FONT_HERSHEY_SIMPLEX, 0.5, colour, 1)
+    return picture
 
 
 def _plain(sample: Sample) -> dict[str, Any]:
