@@ -56,7 +56,7 @@ def store_spec(session: pipeline.Session, blocks: Sequence[int]) -> StoreSpec:
     dataset, camera = scene.dataset, scene.camera
     if "raw" in dataset.layers:
         raise InputError("dataset.layers: 'raw' needs a mosaic detector; the paper world has none")
-    layers = tuple(name for name in dataset.layers if name != "clean")
+    layers = tuple(name for name in pipeline.stored_layers(scene, session.faults) if name != "clean")
     identity = scene_identity(session)
     attributes: dict[str, Any] = {
         "title": scene.title,

@@ -350,7 +350,7 @@ def photograph(frame: Frame) -> None:
         if not invisible:
             break
     frame.images["image"] = _develop(frame, frame.drawn, noise)
-    twins = [layer for layer in spec.scene.dataset.layers if layer.startswith("without_")]
+    twins = [layer for layer in stored_layers(spec.scene, spec.faults) if layer.startswith("without_")]
     for layer in twins:
         name = layer.removeprefix("without_")
         if name in frame.drawn:
@@ -481,7 +481,7 @@ def _doubtful(frame: Frame, noise: Noise) -> set[str]:
 def label(frame: Frame) -> None:
     """Masks of every class, by footprint or by effect."""
     spec = frame.spec
-    wanted = spec.scene.dataset.layers
+    wanted = stored_layers(spec.scene, spec.faults)
     frame.effects = {
         name: effect_of(frame, name)
         for name in frame.drawn
@@ -497,7 +497,7 @@ STAGES = (resolve, render_frame, meter, photograph, label)
 def to_sample(frame: Frame) -> Sample:
     """The layers and scalars of the dataset, by the names of its arrays."""
     spec, pose, i = frame.spec, frame.pose, frame.spec.index
-    dataset, site = spec.scene.dataset, spec.terrain.site
+    site = spec.terrain.site
     names = list(spec.faults)
     available: dict[str, Any] = {
         "depth_m": frame.truth.depth_m,
@@ -510,7 +510,7 @@ def to_sample(frame: Frame) -> Sample:
         "mask": frame.mask,
         "mask_any": labels.union(frame.mask, names, mask_any_faults(spec.scene, spec.faults)),
     }
-    for name in dataset.layers:
+    for name in stored_layers(spec.scene, spec.faults):
         if name.startswith("without_"):
             layers[name] = frame.images[name].array
         elif name == "mask_effect":
@@ -598,6 +598,13 @@ def configure_faults(scene: SceneConfig, source: str = "scene") -> dict[str, Fau
         if name not in faults:
             raise InputError(f"{source}: dataset.mask_any: {name!r}: the scene has no such fault")
     return faults
+
+
+def stored_layers(scene: SceneConfig, faults: Mapping[str, Fault]) -> tuple[str, ...]:
+    """The optional layers of the scene; the default asks for a twin without straylight, which a scene that has
+    no straylight does without."""
+    idle = "without_straylight" if plan.STRAYLIGHT not in faults else None
+    return tuple(layer for layer in scene.dataset.layers if layer != idle)
 
 
 def mask_any_faults(scene: SceneConfig, faults: Mapping[str, Fault]) -> tuple[str, ...]:
