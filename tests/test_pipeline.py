@@ -294,3 +294,12 @@ def test_the_paper_example_has_the_papers_parameters() -> None:
     assert parameters["vignetting"]["on_axis_illuminance_dn"] == 255
     spec = s.spec(0)
     assert spec.scene.camera.readout_directions == ("right",)
+
+
+def test_the_effect_by_rows_equals_the_effect_of_whole_pictures(frames_: list[Frame]) -> None:
+    # the pipeline develops only the rows whose signal changes
+    for frame in frames_:
+        whole = pipeline._develop(frame, frame.drawn, None).array
+        for name in frame.drawn:
+            other = pipeline._develop(frame, pipeline._but(frame.drawn, name), None).array
+            assert np.array_equal(pipeline.effect_of(frame, name), (whole != other).any(axis=-1))

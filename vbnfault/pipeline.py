@@ -9,6 +9,7 @@ radiance, exposure and noise, so they differ by the faults alone.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -96,7 +97,9 @@ class Frame:
     radiance: Radiance = field(init=False)
     truth: Truth = field(init=False)
     context: FaultContext = field(init=False)
+    rate: Electrons = field(init=False)
     drawn: dict[str, Params] = field(default_factory=dict)
+    rejected: list[Params] = field(default_factory=list)
     images: dict[str, RGBI] = field(default_factory=dict)
     signals: dict[Any, Electrons] = field(default_factory=dict)
     pictures: dict[Any, RGBI] = field(default_factory=dict)
@@ -282,8 +285,8 @@ def render_frame(frame: Frame) -> None:
 
 def meter(frame: Frame) -> None:
     """Exposure: fixed, or metered once on the noise-free, fault-free frame; all twins share it."""
-    settings = frame.spec.scene.camera
-    fixed = settings.exposure_s
+    frame.rate = _rate(frame, frame.radiance)
+    fixed = frame.spec.scene.camera.exposure_s
     exposure = _metered_exposure_s(frame) if fixed == "auto" else float(fixed)
     frame.camera = replace(frame.camera, exposure_s=exposure)
     direction_C = frame.pose.L_from_C.T @ frame.pose.sun_L
@@ -302,10 +305,12 @@ def _metered_exposure_s(frame: Frame) -> float:
     wavelength = frame.radiance.wavelength_nm
     lit = spectra.reflectance(scene.body.reflectance, wavelength) / np.pi * np.cos(np.pi / 4)
     facet = (lit * frame.sunlight.irradiance_W_m2_nm).astype(np.float32).reshape(-1, 1, 1)
-    reference = settings.metering_level / max(float(_brightness(frame, facet).max()), 1e-30)
+    per_second = _rate(frame, frame.radiance.with_array(facet))
+    facet_brightness = float(_brightness(per_second.array, per_second.white_e).max())
+    reference = settings.metering_level / max(facet_brightness, 1e-30)
     # every other pixel each way is sample enough for a percentile
     body = frame.truth.semantic[::2, ::2] == 1
-    shown = _brightness(frame, frame.radiance.array[:, ::2, ::2])[body]
+    shown = _brightness(frame.rate.array[::2, ::2], frame.rate.white_e)[body]
     shown = shown[shown > 0.02 / reference]  # sunlit: above a fiftieth of the reference facet
     exposure = reference
     if len(shown) >= 64:
@@ -315,13 +320,16 @@ def _metered_exposure_s(frame: Frame) -> float:
     return float(np.clip(exposure, settings.exposure_min_s, settings.exposure_max_s))
 
 
-def _brightness(frame: Frame, radiance: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Greatest of R, G, B per pixel after one second, as a fraction of white, float32[y, x]."""
-    quantity = frame.radiance.with_array(np.ascontiguousarray(radiance))
-    expected = frame.camera.detector.electrons_expected(frame.camera.lens.image(quantity), 1.0)
-    r, g, b = np.moveaxis(expected.array / expected.white_e, -1, 0)
-    brightness: NDArray[np.float32] = np.maximum(np.maximum(r, g), b)
-    return brightness
+def _brightness(electrons: NDArray[np.float32], white_e: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Greatest of R, G, B per pixel as a fraction of white, float32[y, x]."""
+    r, g, b = np.moveaxis(electrons / white_e, -1, 0)
+    return np.asarray(np.maximum(np.maximum(r, g), b))
+
+
+def _rate(frame: Frame, radiance: Radiance) -> Electrons:
+    """Expected electrons after one second."""
+    camera = frame.camera
+    return camera.detector.electrons_expected(camera.lens.image(radiance), 1.0)
 
 
 # --- photograph --------------------------------------------------------------------------------------------
@@ -334,21 +342,27 @@ def photograph(frame: Frame) -> None:
     is in the pixels and labels never claim more.
     """
     spec = frame.spec
-    noise = Noise.draw(frame.context.shape, spec.rng("detector", "shot"), spec.rng("detector", "read"))
     commanded = [name for name in spec.faults if spec.plan.injects(name)[spec.index]]
     if not frame.pose.resolved:
         commanded = [name for name in commanded if not spec.faults[name].needs_sun]
-    frame.images["clean"] = _develop(frame, {}, noise)
-    for attempt in range(_DRAW_TRIES):
-        for name in commanded:
-            if name not in frame.drawn:
-                generator = spec.rng("fault", f"{name}/{attempt}")
-                frame.drawn[name] = spec.faults[name].draw(frame.context, generator)
+    # noise and the clean picture need one core, the faults' optics another
+    undisturbed = _signal(frame, {}, [])
+    with ThreadPoolExecutor(1) as aside:
+        exposed = aside.submit(_expose_clean, frame, undisturbed)
+        _draw(frame, commanded, attempt=0)
+        optical = _in_order(frame, frame.drawn, "electrons")
+        _signal(frame, frame.drawn, optical)
+        for name in [n for n in optical if spec.faults[n].effect_mask]:
+            _signal(frame, frame.drawn, [n for n in optical if n != name])
+        noise, frame.images["clean"] = exposed.result()
+    frame.pictures[frame.camera, (), False] = frame.images["clean"]
+    for attempt in range(1, _DRAW_TRIES + 1):
         invisible = _invisible(frame, noise)
-        for name in invisible:
-            del frame.drawn[name]
-        if not invisible:
+        # the rejected are kept, or a new draw could take over the identity of an old one
+        frame.rejected += [frame.drawn.pop(name) for name in invisible]
+        if not invisible or attempt == _DRAW_TRIES:
             break
+        _draw(frame, commanded, attempt)
     frame.images["image"] = _develop(frame, frame.drawn, noise)
     twins = [layer for layer in stored_layers(spec.scene, spec.faults) if layer.startswith("without_")]
     for layer in twins:
@@ -357,6 +371,20 @@ def photograph(frame: Frame) -> None:
             frame.images[layer] = _develop(frame, _but(frame.drawn, name), noise)
         else:
             frame.images[layer] = frame.images["image"]
+
+
+def _expose_clean(frame: Frame, signal: Electrons) -> tuple[Noise, RGBI]:
+    spec, camera = frame.spec, frame.camera
+    noise = Noise.draw(frame.context.shape, spec.rng("detector", "shot"), spec.rng("detector", "read"))
+    return noise, camera.detector.develop(signal, camera.exposure_s, noise)
+
+
+def _draw(frame: Frame, commanded: Sequence[str], attempt: int) -> None:
+    """Draw the commanded faults that are not drawn yet."""
+    for name in commanded:
+        if name not in frame.drawn:
+            generator = frame.spec.rng("fault", f"{name}/{attempt}")
+            frame.drawn[name] = frame.spec.faults[name].draw(frame.context, generator)
 
 
 def _but(drawn: Mapping[str, Params], left_out: str) -> dict[str, Params]:
@@ -393,20 +421,28 @@ def _signal(frame: Frame, drawn: Mapping[str, Params], names: Sequence[str]) -> 
             signal = _signal(frame, drawn, before)
             cached[key] = frame.spec.faults[last].apply(signal, drawn[last], frame.context)
         else:
-            cached[key] = camera.detector.electrons_expected(camera.lens.image(frame.radiance), camera.exposure_s)
+            if camera == frame.camera:
+                signal = frame.rate.with_array(frame.rate.array * np.float32(camera.exposure_s))
+            else:
+                signal = camera.detector.electrons_expected(camera.lens.image(frame.radiance), camera.exposure_s)
+            cached[key] = signal
     return cached[key]
 
 
 def _develop(frame: Frame, drawn: Mapping[str, Params], noise: Noise | None) -> RGBI:
     """The finished picture with the faults `drawn`; noise-free without `noise`."""
-    optical, readout = (_in_order(frame, drawn, step) for step in ("electrons", "rgbi"))
+    optical = _in_order(frame, drawn, "electrons")
     camera = _altered(frame, drawn)
     key = (camera, _key(drawn, optical), noise is None)
     if key not in frame.pictures:
         signal = _signal(frame, drawn, optical)
         frame.pictures[key] = camera.detector.develop(signal, camera.exposure_s, noise)
-    picture = frame.pictures[key]
-    for name in readout:
+    return _read_out(frame, frame.pictures[key], drawn)
+
+
+def _read_out(frame: Frame, picture: RGBI, drawn: Mapping[str, Params]) -> RGBI:
+    """The picture with the drawn readout faults."""
+    for name in _in_order(frame, drawn, "rgbi"):
         picture = frame.spec.faults[name].apply(picture, drawn[name], frame.context)
     return picture
 
@@ -440,8 +476,25 @@ def _shows_on_some_rows(frame: Frame, name: str) -> bool:
 
 def effect_of(frame: Frame, name: str) -> NDArray[np.bool_]:
     """bool[y, x]: where the noise-free picture changes when one of the drawn faults is switched off."""
-    everything = _develop(frame, frame.drawn, None).array
-    return labels.effect(everything, _develop(frame, _but(frame.drawn, name), None).array)
+    drawn, others = frame.drawn, _but(frame.drawn, name)
+    optical = _in_order(frame, drawn, "electrons")
+    if name not in optical or _altered(frame, drawn) != frame.camera:
+        return labels.effect(_develop(frame, drawn, None).array, _develop(frame, others, None).array)
+    # only rows whose signal changes can change: the others need not be developed
+    signals = [_signal(frame, d, [n for n in optical if n in d]) for d in (drawn, others)]
+    height = frame.context.shape[0]
+    changed = np.flatnonzero((signals[0].array != signals[1].array).reshape(height, -1).any(axis=1))
+    if not len(changed):
+        return np.zeros(frame.context.shape, dtype=bool)
+    # with a margin: a broken pixel's neighbours look two pixels far
+    rows = slice(max(changed[0] - 2, 0), changed[-1] + 3)
+    pictures = []
+    for signal in signals:
+        part = frame.camera.detector.develop(signal.with_array(signal.array[rows]), frame.camera.exposure_s, None)
+        whole = np.zeros((*frame.context.shape, 4), dtype=np.uint8)
+        whole[rows] = part.array
+        pictures.append(_read_out(frame, RGBI(array=whole), others).array)
+    return labels.effect(*pictures)
 
 
 def _doubtful(frame: Frame, noise: Noise) -> set[str]:
