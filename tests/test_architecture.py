@@ -49,7 +49,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "dataset": DATASET,
     "study": DATASET,
     "report": DATASET,
-    "export": DATASET,
+    "export": DATASET | {"report"},
     "inject": DATASET,
     "cli": DATASET | {"study", "report", "export", "inject"},
     "__main__": {"cli"},

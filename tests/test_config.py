@@ -58,13 +58,13 @@ TITLE = 'title = "t"\n'
             ["geometry.sun_facing.rol_deg", "did you mean roll_deg?"],
         ),
         # field of view
-        (TITLE + "[camera]\nfov_deg = 0", ["camera.fov_deg = 0:", "0.01 to 160"]),
-        (TITLE + "[camera]\nfov_deg = 200", ["camera.fov_deg = 200:", "0.01 to 160"]),
-        (TITLE + "[camera]\nfov_deg = -65.5", ["camera.fov_deg = -65.5:", "0.01 to 160"]),
-        (TITLE + "[camera]\nfov_deg = nan", ["camera.fov_deg = nan:", "0.01 to 160"]),
-        (TITLE + "[camera]\nfov_deg = inf", ["camera.fov_deg = inf:", "0.01 to 160"]),
+        (TITLE + "[camera]\nfov_deg = 0", ["camera.fov_deg = 0:", "0.01 to 140"]),
+        (TITLE + "[camera]\nfov_deg = 200", ["camera.fov_deg = 200:", "0.01 to 140"]),
+        (TITLE + "[camera]\nfov_deg = -65.5", ["camera.fov_deg = -65.5:", "0.01 to 140"]),
+        (TITLE + "[camera]\nfov_deg = nan", ["camera.fov_deg = nan:", "0.01 to 140"]),
+        (TITLE + "[camera]\nfov_deg = inf", ["camera.fov_deg = inf:", "0.01 to 140"]),
         # types are not converted
-        (TITLE + '[camera]\nfov_deg = "65"', ["camera.fov_deg = '65':", "number", "0.01 to 160"]),
+        (TITLE + '[camera]\nfov_deg = "65"', ["camera.fov_deg = '65':", "number", "0.01 to 140"]),
         (TITLE + "[camera]\nfov_deg = true", ["camera.fov_deg = True:", "number"]),
         (TITLE + '[camera]\nwidth_px = "1024"', ["camera.width_px = '1024':", "whole number", "16 to 16384"]),
         (TITLE + "[camera]\nwidth_px = 1024.5", ["camera.width_px = 1024.5:", "whole number"]),
@@ -431,7 +431,7 @@ def test_json_schema_describes_the_scene_file() -> None:
     assert set(schema["properties"]) == set(SceneConfig.model_fields)
     assert set(schema["properties"]["faults"]["properties"]) == set(faults.registry())
     fov = schema["$defs"]["CameraTable"]["properties"]["fov_deg"]
-    assert (fov["type"], fov["minimum"], fov["maximum"], fov["default"]) == ("number", 0.01, 160, 65)
+    assert (fov["type"], fov["minimum"], fov["maximum"], fov["default"]) == ("number", 0.01, 140, 65)
 
     def walk(node: Any) -> None:
         if isinstance(node, dict):

@@ -82,9 +82,10 @@ def test_bad_files_are_refused(tmp_path: Path) -> None:
     junk.write_text("no image")
     with pytest.raises(InputError, match="must be a PNG or TIFF image of 8 or 16 bits"):
         run(str(junk))
+    good = save(tmp_path / "good.png", np.full((12, 16), 200, np.uint8))
     for channels in ("", "RGX", "RR"):
         with pytest.raises(InputError, match="channels = "):
-            make("pixel_overwriting", texture_file=str(junk), channels=channels)
+            make("pixel_overwriting", texture_file=str(good), channels=channels)
 
 
 def test_a_file_that_changed_is_refused(tmp_path: Path) -> None:

@@ -169,6 +169,7 @@ def render(
     out: Annotated[Path, typer.Option(help="folder to write to")],
     sample: Annotated[int, typer.Option(min=0, help="index of the sample")] = 0,
     samples: Annotated[int | None, typer.Option(min=1, help="number of samples planned")] = None,
+    append: Annotated[list[int] | None, typer.Option(min=1, help="blocks appended to the store, in order")] = None,
     seed: SeedOption = None,
     settings: SetOption = None,
 ) -> None:
@@ -176,13 +177,13 @@ def render(
     from . import llvm
 
     source = _scene(scene, settings, dataset__samples=samples, dataset__seed=seed)
-    if sample >= source.dataset.samples:
-        last = source.dataset.samples - 1
-        raise InputError(f"--sample {sample}: {scene} plans samples 0 to {last}; --samples plans more")
+    blocks = (source.dataset.samples, *(append or ()))
+    if sample >= sum(blocks):
+        raise InputError(f"--sample {sample}: {scene} plans samples 0 to {sum(blocks) - 1}; --samples plans more")
     llvm.find()
     from . import export, pipeline
 
-    session = pipeline.Session(source, source=scene)
+    session = pipeline.Session(source, blocks=blocks, source=scene)
     for path in export.write_frame(session.frame(sample), out):
         typer.echo(str(path))
 

@@ -124,7 +124,7 @@ class SunTable(Table):
 class CameraTable(Table):
     """Camera and exposure."""
 
-    fov_deg: float = Field(65.0, ge=0.01, le=160, description="full field of view across the width")
+    fov_deg: float = Field(65.0, ge=0.01, le=140, description="full field of view across the width")
     width_px: int = Field(1024, ge=16, le=16384)
     height_px: int = Field(1024, ge=16, le=16384)
     f_number: float = Field(4.0, ge=0.5, le=200)
@@ -283,29 +283,46 @@ def load_scene(name_or_path: str | Path, overrides: Mapping[str, Any] | None = N
     for key, value in (overrides or {}).items():
         *parents, leaf = key.split(".")
         node = table
+        if isinstance(value, str) and (
+            key.endswith(".texture_file") or (key == "body.shape" and not _built_in(value))
+        ):
+            value = str(Path(value).resolve())  # a path on the command line is taken from the working folder
         for parent in parents:
             node = node.setdefault(parent, {})
             if not isinstance(node, dict):
                 raise InputError(f"{path}: {key} = {value!r}: {parent} is a value, not a table")
         node[leaf] = value
     _anchor_paths(table, path.parent)
-    return parse_scene(table, source=str(path))
+    return parse_scene(table, source=str(path), overrides=tuple(overrides or ()))
 
 
-def parse_scene(table: Mapping[str, Any], *, source: str) -> SceneConfig:
-    """Check plain data as a scene; raises InputError with one sentence naming `source`, key and value."""
+def _built_in(shape: str) -> bool:
+    return shape in ("embedded", "ellipsoid")
+
+
+def parse_scene(table: Mapping[str, Any], *, source: str, overrides: Sequence[str] = ()) -> SceneConfig:
+    """Check plain data as a scene; raises InputError with one sentence naming `source`, key and value.
+
+    `overrides`: dotted keys that did not come from `source` but were set in its place, to be named as such.
+    """
     try:
         # JSON mode: strict about types, yet arrays become tuples; TOML's dates suit no key, as lists they fail
         return SceneConfig.model_validate_json(json.dumps(table, default=lambda date: [str(date)]), strict=True)
     except ValidationError as error:
-        raise InputError(f"{source}: {_sentence(error)}") from None
+        at = ".".join(map(str, error.errors()[0]["loc"]))
+        given = (
+            " (set in place of the file)"
+            if any(at.startswith(key) or key.startswith(at + ".") for key in overrides)
+            else ""
+        )
+        raise InputError(f"{source}: {_sentence(error)}{given}") from None
 
 
 def _anchor_paths(table: dict[str, Any], folder: Path) -> None:
     body = table.get("body")
     if isinstance(body, dict) and isinstance(body.get("shape"), str):
         shape = body["shape"]
-        if shape not in ("embedded", "ellipsoid") and not Path(shape).is_absolute():
+        if not _built_in(shape) and not Path(shape).is_absolute():
             beside = folder / shape
             body["shape"] = str((beside if beside.exists() else Path(shape)).resolve())
     faults = table.get("faults")
@@ -359,7 +376,10 @@ def _wanted(schema: Mapping[str, Any], message: str) -> str:
     if lo is None and hi is None:
         if word:
             return f"{word}a number"
-        return message.replace("Input should be ", "")
+        plain = message.replace("Input should be ", "")
+        return {"a valid string": "a string", "an object": "a table", "a valid boolean": "true or false"}.get(
+            plain, plain
+        )
     kind = "a whole number" if schema.get("type") == "integer" else "a number"
     above = "" if lo is None else f" {'above' if 'exclusiveMinimum' in schema else 'from'} {lo:g}"
     joint = (

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import hashlib
 import importlib.metadata
@@ -11,9 +12,9 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from . import __version__, build, config, pipeline, plan, resources, store
+from . import __version__, build, config, llvm, pipeline, plan, resources, store
 from .config import SceneConfig
-from .errors import InputError
+from .errors import VbnfaultError
 from .store import StoreSpec
 
 # Libraries whose version may change a pixel.
@@ -29,6 +30,9 @@ def versions() -> dict[str, str]:
             found[name] = importlib.metadata.version(name)
         except importlib.metadata.PackageNotFoundError:
             continue
+    with contextlib.suppress(VbnfaultError):  # planning and verifying need no LLVM
+        version = llvm.find().version or ()
+        found["llvm"] = ".".join(map(str, version))
     return found | {"machine": platform.machine()}
 
 
@@ -54,8 +58,6 @@ def store_spec(session: pipeline.Session, blocks: Sequence[int]) -> StoreSpec:
     """The store of a scene, planned in `blocks`. Raises InputError for layers this world cannot give."""
     scene = session.scene
     dataset, camera = scene.dataset, scene.camera
-    if "raw" in dataset.layers:
-        raise InputError("dataset.layers: 'raw' needs a mosaic detector; the paper world has none")
     layers = tuple(name for name in pipeline.stored_layers(scene, session.faults) if name != "clean")
     identity = scene_identity(session)
     attributes: dict[str, Any] = {
@@ -82,6 +84,7 @@ def store_spec(session: pipeline.Session, blocks: Sequence[int]) -> StoreSpec:
         site_names=tuple(f"site_{k:05d}" for k in range(dataset.sites)),
         lens_names=("thin lens",),
         detector_names=(session.base_camera.detector.name,),
+        radiance_dtype="float32",
         shard_samples=dataset.shard_samples,
         attributes=attributes,
     )

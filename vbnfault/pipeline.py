@@ -570,7 +570,7 @@ def to_sample(frame: Frame) -> Sample:
             empty = np.zeros(frame.context.shape, dtype=bool)
             layers[name] = np.stack([frame.effects.get(f, empty) for f in names])
         elif name == "radiance":
-            layers[name] = frame.radiance.array.astype(np.float16)
+            layers[name] = frame.radiance.array
         elif name in available:
             layers[name] = available[name]
     T_from_L = site.T_from_L
@@ -613,7 +613,8 @@ def to_sample(frame: Frame) -> Sample:
 
 
 def proposal(scene: SceneConfig, table: plan.Plan, index: int) -> dict[str, Any]:
-    """What the plan proposed for a sample, before redraws; plain data."""
+    """What the plan proposed for a sample, before `resolve`; plain data. Where the Sun-averted attitude was
+    drawn again, the one that was kept (`tries` counts it)."""
     camera = scene.camera
     return {
         **{name: float(values[index]) for name, values in table.variables.items()},
@@ -647,6 +648,8 @@ def configure_faults(scene: SceneConfig, source: str = "scene") -> dict[str, Fau
     for layer in scene.dataset.layers:
         if layer.startswith("without_") and layer != "without_straylight" and layer[8:] not in faults:
             raise InputError(f"{source}: dataset.layers: {layer!r}: the scene has no such fault")
+    if "raw" in scene.dataset.layers:
+        raise InputError(f"{source}: dataset.layers: 'raw' needs a mosaic detector, which no detector here has")
     for name in scene.dataset.mask_any or ():
         if name not in faults:
             raise InputError(f"{source}: dataset.mask_any: {name!r}: the scene has no such fault")

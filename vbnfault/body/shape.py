@@ -71,8 +71,8 @@ def load_shape(path: str | Path, unit: Unit = "auto") -> tuple[Float64, Int32]:
             vertices = np.array(getattr(mesh, "vertices", np.empty((0, 3))), dtype=np.float64)
             faces = np.array(getattr(mesh, "faces", np.empty((0, 3))), dtype=np.int64)
     except Exception as error:  # the readers raise whatever their parsers raise
-        reason = " ".join(str(error).split())[:120] or type(error).__name__
-        raise InputError(f"{path}: unreadable as {suffix[1:].upper()}: {reason.rstrip('.')}.") from None
+        kind, what = suffix[1:].upper(), type(error).__name__
+        raise InputError(f"{path}: is unreadable as {kind} ({what} while parsing).") from None
     _check_arrays(vertices, faces, str(path))
     extent = float(np.ptp(vertices, axis=0).max())
     if unit == "km" or (unit == "auto" and extent < AUTO_KM_BELOW_EXTENT):

@@ -254,7 +254,7 @@ def from_dict(fault_class: str, table: Mapping[str, Any], *, source: str) -> Fau
     if models is None:
         raise InputError(f"{where}: no such fault class{_hint(fault_class, registry())}")
     name = table.get("model", next(iter(models)))
-    if name not in models:
+    if not isinstance(name, str) or name not in models:
         raise InputError(f"{where}.model = {name!r}: must be one of {', '.join(models)}")
     cls = models[name]
     fields = {f.name: f for f in dataclasses.fields(cls)}

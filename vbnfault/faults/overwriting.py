@@ -51,6 +51,10 @@ class TextureOverwriting(Fault):
             raise ValueError("texture_file is missing: name a PNG or TIFF texture")
         if not Path(self.texture_file).is_file():
             raise ValueError(f"texture_file = {self.texture_file!r}: no such file")
+        try:
+            load(self.texture_file)
+        except InputError as error:
+            raise ValueError(str(error).removeprefix(f"faults.{self.fault}.")) from None
         known = sorted(self.channels, key="RGBI".find)
         if not known or known != [c for c in CHANNELS if c in self.channels]:
             raise ValueError(f"channels = {self.channels!r}: must name some of R, G, B, I, each once")
