@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import pickle
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -348,6 +349,28 @@ def test_without_dask_the_sentence_says_how_to_get_it(tmp_path: Path, monkeypatc
     monkeypatch.setitem(sys.modules, "distributed", None)
     with pytest.raises(InputError, match=r"pip install 'vbnfault\[dask\]'"):
         run(tmp_path / "s.zarr", scheduler="tcp://127.0.0.1:1")
+
+
+@pytest.mark.parametrize("what", ["mask", "image/zarr.json", "sample", "done", "fault/c"])
+def test_arrays_that_are_missing_are_made_again(reference: tuple[Path, str], tmp_path: Path, what: str) -> None:
+    out = shutil.copytree(reference[0], tmp_path / "s.zarr")
+    target = out / what
+    shutil.rmtree(target) if target.is_dir() else target.unlink()
+    assert len(st.verify(out)) == 1
+    assert run(out).built == (SAMPLES if what in ("mask", "done") else 0)
+    assert st.verify(out) == []
+    assert st.digest(out) == reference[1]
+
+
+@pytest.mark.parametrize("address", ["nonsense", "foo://x:1", "tcp://127.0.0.1:1", "tcp://127.0.0.1:99999999"])
+def test_a_scheduler_that_cannot_be_reached_is_one_sentence(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], address: str
+) -> None:
+    pytest.importorskip("distributed")
+    with pytest.raises(InputError, match=f"^--scheduler {address}: "):
+        run(tmp_path / "s.zarr", scheduler=address)
+    assert not (tmp_path / "s.zarr").exists()
+    assert capsys.readouterr().err == ""
 
 
 def main(out: str, workers: str, seconds: str, log: str = "") -> int:

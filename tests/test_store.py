@@ -493,3 +493,84 @@ def test_a_full_disk_is_one_sentence_and_what_was_done_stays(
     monkeypatch.undo()
     assert not list(whole.path.rglob("*.partial"))
     repaired(whole, [6], before)
+
+
+# --- arrays, coordinates and attributes -------------------------------------------------------------------
+
+
+def test_a_store_without_fault_classes_works(tmp_path: Path) -> None:
+    changes: dict = {"faults": (), "mask_any_faults": (), "layers": ("mask_effect", "depth_m")}
+    store = filled(tmp_path / "s.zarr", **changes)
+    assert store.array("mask").shape == (10, 0, 24, 32)
+    assert not (store.path / "mask/c").exists()
+    assert st.verify(store) == []
+    assert st.problem_samples(store) == []
+    assert store.read_sample(4).layers["mask"].shape == (0, 24, 32)
+    assert st.digest(store) == st.digest(filled(tmp_path / "t.zarr", **changes, shard_samples=3))
+    flip(store.file("image", 1), 20)
+    assert st.problem_samples(store) == [4]
+    store = st.append_samples(store, 3)
+    st.write_samples(store, [fake_sample(store.spec, i) for i in (4, 10, 11, 12)])
+    assert st.verify(store) == []
+    xarray = pytest.importorskip("xarray")
+    with xarray.open_zarr(store.path) as data:
+        assert data["mask"].load().shape == (13, 0, 24, 32)
+        assert data["fault"].shape == (0,)
+
+
+def test_wrong_coordinates_and_attributes_are_found_and_mended(whole: st.Store) -> None:
+    before = st.digest(whole)
+    for name, position, value in (
+        ("fault", 1, "smear"),
+        ("channel", 0, "I"),
+        ("wavelength_nm", 2, 700.0),
+        ("x", 3, 0.0),
+        ("layer", 0, "raw"),
+        ("sample", 5, 6),
+    ):
+        good = whole.array(name)[:]
+        whole.array(name)[position] = value
+        (sentence,) = st.verify(whole.path)
+        assert sentence.startswith(f"array {name}: its value {position} is {value}, not ")
+        st.recover(whole.path)
+        assert st.verify(whole.path) == []
+        np.testing.assert_array_equal(st.open_store(whole.path).array(name)[:], good)
+    for name, key, wrong in (
+        ("mask_any", "faults", ["vignetting"]),
+        ("stratum", "flag_meanings", "a b"),
+        ("site", "names", []),
+        ("depth_m", "units", "km"),
+    ):
+        whole.array(name).update_attributes({key: wrong})
+        (sentence,) = st.verify(whole.path)
+        assert sentence.startswith(f"array {name}: its attribute {key} = {wrong}, not ")
+        st.recover(whole.path)
+    file = whole.path / "mask/zarr.json"
+    meta = json.loads(file.read_text())
+    file.write_text(json.dumps({**meta, "dimension_names": ["sample", "fault", "x", "y"]}))
+    (sentence,) = st.verify(whole.path)
+    assert sentence.startswith("array mask: its dims = ")
+    assert st.problem_samples(st.recover(whole.path)) == []
+    assert st.verify(whole.path) == []
+    assert st.digest(whole.path) == before
+
+
+@pytest.mark.parametrize("name", ["mask", "done", "parameters", "sample", "fault", "wavelength_nm"])
+def test_a_missing_array_is_one_sentence_and_made_again(whole: st.Store, name: str) -> None:
+    before = st.digest(whole)
+    for damage in ("folder", "zarr.json", "unparsable"):
+        file = whole.path / name / "zarr.json"
+        if damage == "folder":
+            shutil.rmtree(file.parent)
+        elif damage == "zarr.json":
+            file.unlink()
+        else:
+            file.write_text("{")
+        what = "cannot be opened" if damage == "unparsable" else "is missing"
+        (sentence,) = st.verify(whole.path)
+        assert sentence.startswith(f"array {name} {what}")
+        with pytest.raises(VbnfaultError, match=f"array {name} {what}"):
+            st.open_store(whole.path).array(name)
+        store = st.recover(whole.path)
+        lost = damage == "folder" and name in store.spec.arrays
+        repaired(store, list(range(10)) if lost else [], before)

@@ -15,6 +15,7 @@ import os
 import pickle
 import shutil
 import signal
+import socket
 import sys
 import threading
 import time
@@ -36,6 +37,7 @@ from .store import Encoded, Store, StoreSpec
 
 RECYCLE_SHARDS = 32  # a worker process is replaced after so many: long LLVM runs grow and at last fail
 _SECONDS_TO_STOP = 15.0
+_SECONDS_TO_CONNECT = 5.0
 _HOPELESS = 32  # so many failed samples and not one success: the rest would fail as well
 _SECONDS_BETWEEN_LINES = 5.0
 
@@ -142,8 +144,9 @@ def build(
     this process), each with `threads` threads (an equal share of the cores by default; VBNFAULT_THREADS and
     OMP_NUM_THREADS in its environment), or the Dask cluster at `scheduler`, whose workers must see `out`.
 
-    Raises InputError where `out` holds another scene, BuildFailed where samples failed (all others are
-    built), Interrupted after Ctrl-C or SIGTERM, VbnfaultError where the disk or the cluster fails.
+    Raises InputError where `out` holds another scene or nothing answers at `scheduler`, BuildFailed where
+    samples failed (all others are built), Interrupted after Ctrl-C or SIGTERM, VbnfaultError where the disk
+    or the cluster fails.
     """
     sites = np.asarray(site, dtype=np.int64)
     blocks = tuple(blocks or (len(sites),))
@@ -170,6 +173,8 @@ def build(
     if dry_run:
         return summary
     _check_room(summary, spec)
+    if scheduler is not None:
+        _check_scheduler(scheduler)
 
     began = time.monotonic()
     with _interruptible(), contextlib.ExitStack() as stack:
@@ -732,11 +737,27 @@ def _work_on_cluster(pickled: bytes, path: Path, task: _Task) -> list[tuple[int,
     return events
 
 
-def _run_on_dask(factory: SessionFactory, run: _Run, scheduler: str) -> None:
+def _check_scheduler(address: str) -> None:
+    """Refuse an address that is none, or where nothing listens: Dask's client would leave a traceback."""
     try:
-        import distributed
+        from distributed import comm
     except ImportError as error:
-        raise InputError(f"--scheduler {scheduler}: Dask is not installed; pip install 'vbnfault[dask]'") from error
+        raise InputError(f"--scheduler {address}: Dask is not installed; pip install 'vbnfault[dask]'") from error
+    try:
+        if comm.parse_address(address)[0] in ("inproc", "ucx"):  # no TCP
+            return
+        host, port = comm.get_address_host_port(address)
+    except ValueError as error:
+        raise InputError(f"--scheduler {address}: is no address such as tcp://host:8786: {error}") from error
+    try:
+        socket.create_connection((host, port), timeout=_SECONDS_TO_CONNECT).close()
+    except (OSError, OverflowError, UnicodeError) as error:
+        raise InputError(f"--scheduler {address}: nothing answers there: {error}") from error
+
+
+def _run_on_dask(factory: SessionFactory, run: _Run, scheduler: str) -> None:
+    import distributed
+
     try:
         client = distributed.Client(scheduler, timeout="10s", set_as_default=False)
     except (OSError, ValueError) as error:

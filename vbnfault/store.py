@@ -143,6 +143,29 @@ _LABELS = {  # coordinates of the short axes
 }
 
 
+class Member(NamedTuple):
+    """One array of the group as it must be: `create`, `verify` and `recover` go by it.
+
+    `values`: of a coordinate; None for what tasks write. `chunks`, `shards`: of zarr, 1 at least in every axis.
+    """
+
+    shape: tuple[int, ...]
+    chunks: tuple[int, ...]
+    shards: tuple[int, ...] | None
+    dtype: str
+    fill: Any
+    dims: tuple[str, ...]
+    attributes: dict[str, Any]
+    values: NDArray[Any] | tuple[str, ...] | None = None
+
+
+def _coordinate(dim: str, values: NDArray[Any] | tuple[str, ...], **attributes: str) -> Member:
+    """A row of `StoreSpec.members` for a coordinate of one axis."""
+    dtype, fill = (values.dtype.name, 0) if isinstance(values, np.ndarray) else ("str", "")
+    chunks = (65536 if dim == "sample" else max(1, len(values)),)
+    return Member((len(values),), chunks, None, dtype, fill, (dim,), attributes, values)
+
+
 @dataclass(frozen=True, kw_only=True)
 class StoreSpec:
     """What a store holds, as plain data.
@@ -175,7 +198,8 @@ class StoreSpec:
                 raise InputError(f"layers: {name!r} is no layer; known: {', '.join(sorted(allowed))}")
         for name in (*self.mask_any_faults, *(self.localised_faults or ())):
             if name not in self.faults:
-                raise InputError(f"mask_any_faults: {name!r} is not one of {', '.join(self.faults)}")
+                known = ", ".join(self.faults) or "no faults"
+                raise InputError(f"mask_any_faults: {name!r} is not one of {known}")
         if self.localised_faults is None:
             object.__setattr__(self, "localised_faults", self.mask_any_faults)
         sizes = [self.layer_bytes(name) for name in self.pixel_layers]
@@ -219,6 +243,56 @@ class StoreSpec:
             **{name: len(labels) for name, labels in _LABELS.items()},
         }
         return tuple(sizes[d] for d in row.dims if d != "sample")
+
+    def empty(self, name: str) -> bool:
+        """Has an array an axis of no length, as `mask` without fault classes? It has no data files then."""
+        return 0 in self.shape(self.arrays[name])
+
+    def members(self, samples: int) -> dict[str, Member]:
+        """Name → what it must be, for every array of a group of `samples` samples, coordinates last."""
+        extra: dict[str, dict[str, Any]] = {
+            "mask_any": {"faults": list(self.mask_any_faults)},
+            "site": {"names": list(self.site_names)},
+            "lens": {"names": list(self.lens_names)},
+            "detector_individual": {"names": list(self.detector_names)},
+            "split": {"names": list(SPLITS)},
+            "radiance": {"coordinates": "wavelength_nm"},
+        }
+        size = self.shard_samples
+        members = {}
+        for name, row in self.arrays.items():
+            shape = self.shape(row)
+            chunk = tuple(max(1, n) for n in shape)
+            sharded = name in self.pixel_layers
+            attributes: dict[str, Any] = {"long_name": row.long_name, "units": row.units}
+            if row.names:
+                attributes["flag_values"] = list(range(len(row.names)))
+                attributes["flag_meanings"] = " ".join(row.names)
+            members[name] = Member(
+                shape=(samples, *shape),
+                chunks=(1 if sharded else size, *chunk),
+                shards=(size, *chunk) if sharded else None,
+                dtype=row.dtype,
+                fill=row.fill,
+                dims=row.dims,
+                attributes={**attributes, **extra.get(name, {})},
+            )
+        return {**members, **self.coordinates(samples)}
+
+    def coordinates(self, samples: int) -> dict[str, Member]:
+        """Name → what it must be, for every coordinate of a group of `samples` samples."""
+        y, x = np.arange(self.height) + 0.5, np.arange(self.width) + 0.5
+        nodes = np.array(self.wavelength_nm, dtype=np.float64)
+        bands = {"wavelength_nm": _coordinate("band", nodes, units="nm", long_name="wavelength of the band")}
+        return {
+            "y": _coordinate("y", y, units="px", long_name="row, pixel centres at +0.5"),
+            "x": _coordinate("x", x, units="px", long_name="column, pixel centres at +0.5"),
+            "fault": _coordinate("fault", self.faults, long_name="fault class"),
+            "layer": _coordinate("layer", self.checked, long_name="what a checksum covers"),
+            **{name: _coordinate(name, tuple(labels), long_name=name) for name, labels in _LABELS.items()},
+            **(bands if self.wavelength_nm else {}),
+            "sample": _coordinate("sample", np.arange(samples, dtype=np.int64), long_name="sample"),
+        }
 
     def layer_bytes(self, name: str) -> int:
         """Uncompressed bytes of one sample of a per-pixel layer."""
@@ -349,7 +423,7 @@ def encode(spec: StoreSpec, sample: Sample) -> Encoded:
                 f"sample {sample.index}: {name} is {array.dtype}{list(array.shape)}, "
                 f"not {row.dtype}{list(spec.shape(row))}"
             )
-        return _compress(array), _crc32c(array)
+        return (_compress(array), _crc32c(array)) if array.size else (b"", 0)
 
     with ThreadPoolExecutor(_threads()) as pool:
         packed = dict(zip(spec.pixel_layers, pool.map(pack, spec.pixel_layers), strict=True))
@@ -365,7 +439,7 @@ def encode(spec: StoreSpec, sample: Sample) -> Encoded:
 
 def mask_union(spec: StoreSpec, mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """bool[y, x] from bool[fault, y, x]: what `mask_any` must be."""
-    chosen = np.array([f in spec.mask_any_faults for f in spec.faults])
+    chosen = np.array([f in spec.mask_any_faults for f in spec.faults], dtype=bool)
     return np.logical_or.reduce(mask[chosen], axis=0)
 
 
@@ -431,18 +505,29 @@ class Store:
         return range(number * size, min((number + 1) * size, self.samples))
 
     def array(self, name: str) -> zarr.Array[Any]:
-        """The zarr array."""
+        """The zarr array. Raises VbnfaultError where it is missing or its metadata cannot be read."""
         if name not in self._arrays:
-            array = self._group[name]
-            assert isinstance(array, zarr.Array)
+            try:
+                array = self._group[name]
+            except Exception:  # zarr raises many kinds for metadata that it cannot parse
+                array = None
+            if not isinstance(array, zarr.Array):
+                raise VbnfaultError(f"{self.path}: {self._why_closed(name)}; the build command re-creates it")
             self._arrays[name] = array
         return self._arrays[name]
+
+    def _why_closed(self, name: str) -> str:
+        if not (self.path / name / "zarr.json").is_file():
+            return f"array {name} is missing"
+        return f"array {name} cannot be opened, {name}/zarr.json is damaged"
 
     def read(self, name: str, start: int = 0, stop: int | None = None) -> NDArray[Any]:
         """Samples `start` … `stop` of an array. Raises VbnfaultError where they cannot be decoded."""
         stop = self.samples if stop is None else stop
         try:
             values = self.array(name)[start:stop]
+        except VbnfaultError:
+            raise
         except Exception as error:
             raise VbnfaultError(
                 f"{self.path}: {name} of samples {start}-{stop - 1} cannot be read ({error}); "
@@ -466,11 +551,15 @@ class Store:
     def column(self, name: str, number: int) -> NDArray[Any]:
         """A scalar for all samples of a shard. Raises OSError or ValueError where its chunk is damaged."""
         row, size = self.spec.arrays[name], self.spec.shard_samples
+        if self.spec.empty(name):
+            return np.zeros((len(self.shard(number)), *self.spec.shape(row)), dtype=row.dtype)
         data = _decompress(self.file(name, number).read_bytes())
         values = VLenUTF8().decode(data) if row.is_text else np.frombuffer(data, dtype=row.dtype)
         return values.reshape(size, *self.spec.shape(row))[: len(self.shard(number))]
 
     def _put_column(self, name: str, number: int, values: Mapping[int, Any]) -> None:
+        if self.spec.empty(name):
+            return
         row, first = self.spec.arrays[name], self.shard(number).start
         dtype = object if row.is_text else row.dtype
         column = np.full((self.spec.shard_samples, *self.spec.shape(row)), row.fill, dtype=dtype)
@@ -497,6 +586,8 @@ class Store:
 
     def chunk(self, name: str, number: int) -> dict[int, bytes]:
         """Sample → compressed bytes of a layer's shard. Raises ValueError or OSError where it is damaged."""
+        if self.spec.empty(name):
+            return dict.fromkeys(self.shard(number), b"")
         size = self.spec.shard_samples
         chunks = _split_shard(self.file(name, number).read_bytes(), size)
         return {number * size + i: chunk for i, chunk in chunks.items()}
@@ -514,6 +605,8 @@ class Store:
                 self._put_column("done", number, {i: done[i] and i not in given for i in samples})
             kept = {i for i in samples if done[i] and i not in given}
             for name in self.spec.pixel_layers:
+                if self.spec.empty(name):
+                    continue
                 old: dict[int, bytes] = {}
                 if kept:
                     with contextlib.suppress(ValueError, FileNotFoundError):
@@ -585,73 +678,91 @@ def _create_group(path: Path, spec: StoreSpec, samples: int) -> None:
         "coordinates": "wavelength_nm",  # makes xarray show it as a coordinate of `band`
     }
     group = zarr.open_group(path, mode="w-", zarr_format=3, attributes=attributes)
-    codec = ZstdCodec(level=_ZSTD_LEVEL, checksum=True)
-    extra: dict[str, dict[str, Any]] = {
-        "mask_any": {"faults": list(spec.mask_any_faults)},
-        "site": {"names": list(spec.site_names)},
-        "lens": {"names": list(spec.lens_names)},
-        "detector_individual": {"names": list(spec.detector_names)},
-        "split": {"names": list(SPLITS)},
-        "radiance": {"coordinates": "wavelength_nm"},
-    }
-    for name, row in spec.arrays.items():
-        shape, size = spec.shape(row), spec.shard_samples
-        sharded = name in spec.pixel_layers
-        flags: dict[str, Any] = {
-            "flag_values": list(range(len(row.names))),
-            "flag_meanings": " ".join(row.names),
-        }
-        group.create_array(
-            name,
-            shape=(samples, *shape),
-            chunks=(1 if sharded else size, *shape),
-            shards=(size, *shape) if sharded else None,
-            dtype=str if row.is_text else row.dtype,
-            fill_value=row.fill,
-            compressors=codec,
-            dimension_names=row.dims,
-            attributes={
-                "long_name": row.long_name,
-                "units": row.units,
-                **dict[str, Any](flags if row.names else {}),
-                **extra.get(name, {}),
-            },
-        )
-    coordinates: dict[str, tuple[str, Any, dict[str, str]]] = {
-        "y": ("y", np.arange(spec.height) + 0.5, {"units": "px", "long_name": "row, pixel centres at +0.5"}),
-        "x": (
-            "x",
-            np.arange(spec.width) + 0.5,
-            {"units": "px", "long_name": "column, pixel centres at +0.5"},
-        ),
-        "fault": ("fault", list(spec.faults), {"long_name": "fault class"}),
-        "layer": ("layer", list(spec.checked), {"long_name": "what a checksum covers"}),
-        **{name: (name, list(labels), {"long_name": name}) for name, labels in _LABELS.items()},
-    }
-    if spec.wavelength_nm:
-        nodes = np.array(spec.wavelength_nm, dtype=np.float64)
-        coordinates["wavelength_nm"] = ("band", nodes, {"units": "nm", "long_name": "wavelength of the band"})
-    for name, (dim, values, attrs) in coordinates.items():
-        array = group.create_array(
-            name,
-            shape=(len(values),),
-            dtype=values.dtype if isinstance(values, np.ndarray) else str,
-            compressors=codec,
-            dimension_names=(dim,),
-            attributes=dict(attrs),
-        )
-        array[:] = values
-    index = group.create_array(
-        "sample",
-        shape=(samples,),
-        chunks=(65536,),
-        dtype="int64",
-        compressors=codec,
-        dimension_names=("sample",),
-        attributes={"long_name": "sample"},
-    )
-    index[:] = np.arange(samples)
+    for name, member in spec.members(samples).items():
+        _create_array(group, name, member)
     _consolidate(path)
+
+
+def _create_array(group: zarr.Group, name: str, member: Member) -> None:
+    """Write the metadata of an array, and the values of a coordinate; data files that exist stay."""
+    array = group.create_array(
+        name,
+        shape=member.shape,
+        chunks=member.chunks,
+        shards=member.shards,
+        dtype=str if member.dtype == "str" else member.dtype,
+        fill_value=member.fill,
+        compressors=ZstdCodec(level=_ZSTD_LEVEL, checksum=True),
+        dimension_names=member.dims,
+        attributes=dict(member.attributes),
+    )
+    if member.values is not None and len(member.values):
+        array[:] = member.values if isinstance(member.values, np.ndarray) else list(member.values)
+
+
+def _misshapen(array: zarr.Array[Any], member: Member) -> Iterator[str]:
+    """What of an array's layout is not as it must be, the number of samples left out."""
+    is_text = array.dtype.kind in "OTU"
+    layout: dict[str, tuple[Any, Any]] = {
+        "dims": (tuple(getattr(array.metadata, "dimension_names", None) or ()), member.dims),
+        "dtype": ("str" if is_text else array.dtype.name, member.dtype),
+    }
+    if member.values is None:
+        layout["shape of a sample"] = array.shape[1:], member.shape[1:]
+        layout["chunks"] = array.chunks, member.chunks
+        layout["shards"] = array.shards, member.shards
+    for what, (stored, wanted) in layout.items():
+        if stored != wanted:
+            yield f"its {what} = {_short(stored)}, not {_short(wanted)}"
+
+
+def _misnamed(array: zarr.Array[Any], member: Member) -> Iterator[str]:
+    """Which attributes that carry meaning are not as they must be."""
+    for key, wanted in member.attributes.items():
+        stored = array.attrs.get(key)
+        if key != "long_name" and stored != wanted:
+            yield f"its attribute {key} = {_short(stored)}, not {_short(wanted)}"
+
+
+def _misvalued(array: zarr.Array[Any], member: Member) -> Iterator[str]:
+    """What of a coordinate's values is not as it must be."""
+    if member.values is None:
+        return
+    try:
+        stored = np.asarray(array[:])
+    except Exception:  # zarr raises many kinds for chunks that it cannot decode
+        yield "its values cannot be decoded"
+        return
+    if stored.shape != member.shape:
+        yield f"it has the shape {list(stored.shape)}, not {list(member.shape)}"
+    elif not np.array_equal(stored, np.asarray(member.values, dtype=stored.dtype)):
+        first = next(i for i, (a, b) in enumerate(zip(stored, member.values, strict=True)) if a != b)
+        yield f"its value {first} is {_short(stored[first])}, not {_short(member.values[first])}"
+
+
+def _mend(store: Store, name: str, member: Member) -> None:
+    """Bring the metadata of an array, and the values of a coordinate, to what they must be."""
+    folder = store.path / name
+    try:
+        array: zarr.Array[Any] | None = store.array(name)
+    except VbnfaultError:
+        array = None
+    if array is not None:
+        sound = not any(_misshapen(array, member)) and not any(_misvalued(array, member))
+        if sound and any(_misnamed(array, member)):
+            array.update_attributes(member.attributes)
+        if sound and array.shape != member.shape:
+            array.resize(member.shape)
+        if sound:
+            return
+    if not folder.is_dir():
+        folder.unlink(missing_ok=True)
+    elif member.values is not None:
+        shutil.rmtree(folder)
+    else:
+        (folder / "zarr.json").unlink(missing_ok=True)
+    store._arrays.pop(name, None)
+    _create_array(store._group, name, member)
 
 
 def _consolidate(path: Path) -> None:
@@ -712,7 +823,9 @@ def append_samples(
 def recover(path: str | os.PathLike[str]) -> Store:
     """Open a store for writing after whatever happened to it; only while nothing else writes to it.
 
-    Removes the `*.partial` files of a killed process and brings every array to the length that the root says.
+    Removes the `*.partial` files of a killed process and brings every array to the length that the root says,
+    its layout and attributes and all coordinates to what the root's spec says. Arrays that are missing are made
+    again, unwritten.
     """
     store = open_store(path, "r+")
     with _disk(store.path, "recovering the store"):
@@ -720,14 +833,8 @@ def recover(path: str | os.PathLike[str]) -> Store:
             for name in files:
                 if name.endswith(".partial"):
                     Path(folder, name).unlink(missing_ok=True)
-        for name in store.spec.arrays:
-            array = store.array(name)
-            if array.shape[0] != store.samples:
-                array.resize((store.samples, *array.shape[1:]))
-        index = store.array("sample")
-        if index.shape != (store.samples,) or index[-1] != store.samples - 1:
-            index.resize((store.samples,))
-            index[:] = np.arange(store.samples)
+        for name, member in store.spec.members(store.samples).items():
+            _mend(store, name, member)
         _consolidate(store.path)
     return open_store(store.path, "r+")
 
@@ -792,6 +899,8 @@ def check_shard(store: Store, number: int) -> list[Problem]:
 
 
 def _check_layer(store: Store, name: str, number: int, crcs: Mapping[int, NDArray[np.uint32]]) -> list[Problem]:
+    if store.spec.empty(name):
+        return []
     file, column = store.file(name, number), store.spec.checked.index(name)
     where, many = file.relative_to(store.path), f"{name} of samples {_spans(crcs)}"
     try:
@@ -841,24 +950,38 @@ def verify(
 ) -> list[str]:
     """Every problem of a store, one sentence each that names the array, the sample and the file.
 
-    Checks that each sample is whole (`check_shard`) and labelled: masks, `injected` and `parameters` agree,
-    a site lies in one split. `expected(sample)` gives the scalars as planned, compared exactly. `progress` is
-    called with the number of samples just checked. Raises InputError where there is no store.
+    Checks that every array is there with its layout, attributes and coordinates; where an array of samples is
+    not, samples are not looked at. Checks that each sample is whole (`check_shard`) and labelled: masks,
+    `injected` and `parameters` agree, a site lies in one split. `expected(sample)` gives the scalars as planned,
+    compared exactly. `progress` is called with the number of samples just checked. Raises InputError where there
+    is no store.
     """
     store = open_store(path)
-    problems = [
-        f"{name} holds {store.array(name).shape[0]} samples, not {store.samples}: appending was interrupted, "
-        f"the build command resumes it"
-        for name in store.spec.arrays
-        if store.array(name).shape[0] != store.samples
-    ]
-    if problems:
+    problems, hopeless = [], False
+    for name, member in store.spec.members(store.samples).items():
+        try:
+            array = store.array(name)
+        except VbnfaultError:
+            problems.append(store._why_closed(name))
+            hopeless |= member.values is None
+            continue
+        misshapen = list(_misshapen(array, member))
+        if member.values is None and not misshapen and array.shape != member.shape:
+            problems.append(
+                f"{name} holds {array.shape[0]} samples, not {store.samples}: appending was interrupted, "
+                f"the build command resumes it"
+            )
+            hopeless = True
+        hopeless |= member.values is None and bool(misshapen)
+        found = misshapen + [*_misnamed(array, member)] + ([] if misshapen else [*_misvalued(array, member)])
+        problems += [f"array {name}: {what}" for what in found]
+    if hopeless:
         return problems
     split_of: dict[int, tuple[int, int]] = {}
     for number in range(store.shards):
-        found = check_shard(store, number)
-        problems += [p.sentence for p in found]
-        broken = {i for p in found for i in p.samples}
+        damage = check_shard(store, number)
+        problems += [p.sentence for p in damage]
+        broken = {i for p in damage for i in p.samples}
         sound = [i for i in store.shard(number) if i not in broken]
         if sound:
             start = store.shard(number).start
@@ -877,6 +1000,8 @@ def verify(
 
 def _decode(spec: StoreSpec, name: str, chunk: bytes) -> NDArray[Any]:
     row = spec.pixel_layers[name]
+    if spec.empty(name):
+        return np.zeros(spec.shape(row), dtype=row.dtype)
     return np.frombuffer(_decompress(chunk), dtype=row.dtype).reshape(spec.shape(row))
 
 
@@ -941,7 +1066,7 @@ def digest(path: str | os.PathLike[str] | Store) -> str:
     total.update(json.dumps([attributes, plain, store.samples], sort_keys=True).encode())
     for name, row in sorted(store.spec.arrays.items()):
         total.update(json.dumps([name, row.dims, row.dtype]).encode())
-        step = max(1, 2**26 // store.spec.layer_bytes(name)) if name in store.spec.pixel_layers else 4096
+        step = max(1, 2**26 // max(1, store.spec.layer_bytes(name))) if name in store.spec.pixel_layers else 4096
         for start in range(0, store.samples, step):
             values = store.read(name, start, min(start + step, store.samples))
             if row.is_text:
