@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import signal
 from pathlib import Path
 from typing import Any
 
 import pytest
+
+# A shell that starts the tests in the background makes them, and every process they start, deaf to Ctrl-C;
+# with a handler here, processes that are started begin with the default again.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 REAL_SHAPE = Path(__file__).resolve().parents[2] / "shared/data/shapes/67p_18k.obj"
 
