@@ -8,20 +8,15 @@ from typing import Any
 
 import pytest
 
+from vbnfault.faults import FAULT_AXIS
+
 # A shell that starts the tests in the background makes them, and every process they start, deaf to Ctrl-C;
 # with a handler here, processes that are started begin with the default again.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 REAL_SHAPE = Path(__file__).resolve().parents[2] / "shared/data/shapes/67p_18k.obj"
 
-ALL_FAULTS = (
-    "dust_on_optics",
-    "broken_pixels",
-    "broken_lines",
-    "straylight",
-    "vignetting",
-    "optics_degradation",
-)
+ALL_FAULTS = FAULT_AXIS
 
 
 @pytest.fixture(scope="session")

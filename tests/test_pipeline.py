@@ -219,23 +219,8 @@ def test_a_fixed_exposure_is_kept_and_scales_the_signal() -> None:
 
 def test_black_lines_on_black_sky_are_not_claimed() -> None:
     # far above a body that is out of view: only the sky, where a dead line changes nothing
-    s = session(
-        dataset={"samples": 2, "sites": 1, "shard_samples": 2},
-        geometry={
-            "height_m": [5e4, 6e4],
-            "sun_averted": {
-                "reference": "nadir",
-                "roll_deg": [180, 180],
-                "pitch_deg": [0, 0],
-                "sun_elevation_deg": [-80, -60],
-            },
-        },
-        plan={"faulty_fraction": 1.0, "mode": "per_class"},
-        faults={},
-    )
-    table = small_scene()
-    table |= {
-        "dataset": {**table["dataset"], "samples": 2, "sites": 1, "shard_samples": 2},
+    tables = {
+        "dataset": {"samples": 2, "sites": 1, "shard_samples": 2},
         "geometry": {
             "height_m": [5e4, 6e4],
             "sun_averted": {
@@ -246,10 +231,9 @@ def test_black_lines_on_black_sky_are_not_claimed() -> None:
             },
         },
         "plan": {"faulty_fraction": 1.0, "mode": "per_class"},
-        "faults": {"broken_lines": {"white_count": 0, "black_count": 3, "count": 3}, "vignetting": {}},
     }
-    dark = Session(config.parse_scene(table, source="test"))
-    dark._terrain = s.spec(0).terrain
+    faults = {"broken_lines": {"white_count": 0, "black_count": 3, "count": 3}, "vignetting": {}}
+    dark = Session(config.parse_scene({**small_scene(**tables), "faults": faults}, source="test"))
     sample = dark.simulate(0)
     assert (sample.layers["semantic"] == 0).all()
     assert not sample.scalars["injected"].any()

@@ -24,7 +24,7 @@ from .camera import Camera
 from .config import SceneConfig
 from .detector import Detector, Noise
 from .errors import InputError
-from .faults import Fault, FaultContext, Params, dataset_order, from_dict, physical_order, registry
+from .faults import Fault, FaultContext, Params, dataset_order, from_dict, physical_order
 from .lens import ThinLens
 from .quantities import RGBI, Electrons, Radiance, Sample, Truth
 from .scene import Scene, Sunlight, View
@@ -769,12 +769,3 @@ def ellipsoid(semi_axes_m: tuple[float, float, float]) -> tuple[F64, NDArray[np.
 
     sphere = trimesh.creation.icosphere(subdivisions=6)
     return np.asarray(sphere.vertices) * np.array(semi_axes_m), np.asarray(sphere.faces, dtype=np.int32)
-
-
-def registered_faults() -> list[tuple[str, str, str]]:
-    """(class, model, first line of its docstring) of every registered fault model."""
-    return [
-        (name, model, (cls.__doc__ or "").strip().split("\n")[0])
-        for name, models in registry().items()
-        for model, cls in models.items()
-    ]
