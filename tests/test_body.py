@@ -139,6 +139,10 @@ def test_small_hole_duplicates_and_degenerate_faces_are_mended() -> None:
     with pytest.warns(UserWarning, match="dropped 1 degenerate"):
         _, kept = check_mesh(vertices, np.vstack([faces, [[0, 0, 1]]]), "needle")
     assert len(kept) == 12
+    fin = np.vstack([vertices, [[2.0, 0, 0], [2, 1, 0]]])  # hangs on the box by a corner
+    with pytest.warns(UserWarning, match="dropped 1 loose"):
+        _, kept = check_mesh(fin, np.vstack([faces, [[0, 8, 9]]]), "fin")
+    assert len(kept) == 12
 
 
 def test_sound_mesh_passes_in_silence_and_input_is_untouched() -> None:

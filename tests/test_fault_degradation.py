@@ -73,3 +73,15 @@ def test_blur_scales_with_the_resolution() -> None:
     small = make("optics_degradation", filter_size_px=17, scale_with_resolution=False)
     assert small.draw(make_context(128), rng())["kernel_px"] == 17
     assert fault.draw(make_context(128), rng())["kernel_px"] == 3
+
+
+def test_a_small_image_is_still_blurred() -> None:
+    context = make_context(64)
+    fault = make("optics_degradation", filter_size_px=3)
+    params = fault.draw(context, rng())
+    assert params == {"filter_size_px": 3, "kernel_px": 3, "sigma_px": 0.4}
+    flat = flat_electrons(context, 0.5)
+    edge = flat.with_array(flat.array * (np.arange(64) < 32).reshape(1, -1, 1))
+    blurred = fault.apply(edge, params, context).array
+    # e^(-1/(2·0.16)) / (1 + 2 e^(-1/(2·0.16))) of the lit side arrives behind the edge: 4 %, 5 DN at half white
+    assert blurred[20, 32] == pytest.approx(0.0404 * edge.array[20, 31], rel=0.01)

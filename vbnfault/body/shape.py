@@ -85,8 +85,8 @@ def load_shape(path: str | Path, unit: Unit = "auto") -> tuple[Float64, Int32]:
 def check_mesh(vertices: NDArray, faces: NDArray, source: str) -> tuple[Float64, Int32]:
     """Check that a mesh bounds a solid, mending what can be mended without guessing.
 
-    Merges coincident vertices, drops degenerate faces, fills holes of up to eight edges and turns the winding
-    outwards, each reported in one `UserWarning`. Unreferenced vertices are dropped in silence.
+    Merges coincident vertices, drops degenerate and loose faces, fills holes of up to eight edges and turns the
+    winding outwards, each reported in one `UserWarning`. Unreferenced vertices are dropped in silence.
 
     Parameters
     ----------
@@ -121,6 +121,10 @@ def check_mesh(vertices: NDArray, faces: NDArray, source: str) -> tuple[Float64,
     if len(faces) == 0:
         raise InputError(f"{source}: mesh has only degenerate faces.")
 
+    loose = _loose_faces(faces)
+    if loose.any() and not loose.all():
+        mended.append(f"dropped {int(loose.sum())} loose faces")
+        faces = faces[~loose]
     counts = _undirected_counts(faces)
     if (counts == 1).any():
         filled = _fill_holes(faces)
@@ -210,6 +214,15 @@ def _sound_faces(vertices: Float64, faces: NDArray) -> NDArray[np.bool_]:
 
 def _directed_edges(faces: NDArray) -> NDArray[np.int64]:
     return np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).astype(np.int64)
+
+
+def _loose_faces(faces: NDArray) -> NDArray[np.bool_]:
+    """Faces without a neighbour over any edge: filling their outline would only double them."""
+    edges = np.sort(_directed_edges(faces), axis=1)
+    _, inverse, counts = np.unique(
+        edges[:, 0] * (int(faces.max()) + 1) + edges[:, 1], return_inverse=True, return_counts=True
+    )
+    return np.asarray((counts[inverse.ravel()].reshape(3, -1) == 1).all(axis=0))
 
 
 def _undirected_counts(faces: NDArray) -> NDArray[np.int64]:

@@ -6,7 +6,8 @@ The paper states the filter's size (3-17 px), not its σ. Here σ follows from t
     σ = 0.3 ((k - 1) / 2 - 1) + 0.8,
 
 which gives 0.8 px at k = 3 and 2.9 px at k = 17 of a 1024 px wide image. Sizes are drawn odd, so that the
-filter has a centre; an even bound means the odd sizes within.
+filter has a centre; an even bound means the odd sizes within. Scaled to a smaller image σ stays at least 0.4 px
+(the smallest filter of the paper at 512 px): below that nothing is left of the blur.
 
 The paper filters an 8 bit image, in which the Sun is no brighter than white. Signal above white is therefore
 clipped to white before filtering: otherwise the Sun (10⁵ times white) would flood the frame through the
@@ -24,6 +25,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .base import Fault, FaultContext, Interval, Params, bounds, flag
+
+_LEAST_SIGMA_PX = 0.4
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,7 +55,7 @@ class GaussianDegradation(Fault):
         return {
             "filter_size_px": size,
             "kernel_px": size if scale == 1 else max(3, 2 * round((size * scale - 1) / 2) + 1),
-            "sigma_px": float(sigma_px(size) * scale),
+            "sigma_px": max(float(sigma_px(size) * scale), _LEAST_SIGMA_PX),
         }
 
     def apply(self, quantity: Any, params: Params, context: FaultContext) -> Any:
