@@ -216,6 +216,19 @@ def test_faults_import_no_other_fault() -> None:
     assert not wrong
 
 
+def test_modules_of_the_store_import_only_those_before_them() -> None:
+    order = ["schema", "codec", "group", "metadata", "check"]
+    inside = {module for module in sources() if module.split(".")[0] == "store"}
+    assert inside == {"store", *(f"store.{name}" for name in order)}
+    wrong = [
+        f"{i.module} imports {i.target}"
+        for i in imports()
+        if i.module.startswith("store.") and i.target.startswith("vbnfault.store")
+        if order.index(i.target.removeprefix("vbnfault.store.")) >= order.index(i.module.removeprefix("store."))
+    ]
+    assert not wrong
+
+
 # ------------------------------------------------------------------------------------ cycles
 
 

@@ -21,6 +21,7 @@ from vbnfault import build as bd
 from vbnfault import store as st
 from vbnfault.errors import InputError, VbnfaultError
 from vbnfault.quantities import Sample
+from vbnfault.store import codec
 
 SAMPLES = 18
 HERE = Path(__file__).resolve().parent
@@ -111,7 +112,7 @@ def test_damage_is_repaired_by_building_exactly_the_samples_concerned(
     store.file("depth_m", 3).unlink()  # 12 to 15
     chunks = store.chunk("clean", 2)
     del chunks[9]
-    store.file("clean", 2).write_bytes(st._join_shard({i - 8: c for i, c in chunks.items()}, 4))
+    store.file("clean", 2).write_bytes(codec.join_shard({i - 8: c for i, c in chunks.items()}, 4))
     (out / "image" / "c" / "0.1f.partial").write_bytes(b"half")
     assert run(out, Session(log=str(log))).built == 6
     assert sorted(int(line.split()[1]) for line in log.read_text().splitlines()) == [4, 9, 12, 13, 14, 15]

@@ -17,6 +17,7 @@ import zarr
 from vbnfault import store as st
 from vbnfault.errors import InputError, VbnfaultError
 from vbnfault.quantities import Sample
+from vbnfault.store import codec, group, metadata
 
 FAULTS = ("dust_on_optics", "broken_pixels", "straylight", "vignetting")
 LOCALISED = FAULTS[:3]
@@ -246,7 +247,7 @@ def test_damage_that_decodes_is_found_by_the_stored_checksum(whole: st.Store) ->
             scalars=fake_sample(whole.spec, 1).scalars,
         ),
     )
-    whole.file("depth_m", 0).write_bytes(st._join_shard({**chunks, 1: other.chunks["depth_m"]}, 4))
+    whole.file("depth_m", 0).write_bytes(codec.join_shard({**chunks, 1: other.chunks["depth_m"]}, 4))
     before_sentence = "sample 1: depth_m in depth_m/c/0/0/0 does not match its stored crc32c"
     assert st.verify(whole) == [before_sentence]
 
@@ -255,7 +256,7 @@ def test_a_missing_chunk_is_found_although_it_reads_as_zeros(whole: st.Store) ->
     before = st.digest(whole)
     chunks = whole.chunk("mask", 1)
     del chunks[6]
-    whole.file("mask", 1).write_bytes(st._join_shard({i - 4: c for i, c in chunks.items()}, 4))
+    whole.file("mask", 1).write_bytes(codec.join_shard({i - 4: c for i, c in chunks.items()}, 4))
     assert not whole.read("mask", 6, 7).any()
     assert st.verify(whole) == ["sample 6: mask has no chunk in mask/c/1/0/0/0"]
     repaired(whole, [6], before)
@@ -322,14 +323,14 @@ def test_samples_not_given_keep_their_compressed_bytes(whole: st.Store) -> None:
 def test_the_order_is_done_last(whole: st.Store, monkeypatch: pytest.MonkeyPatch) -> None:
     """A kill between any two writes leaves no unfinished sample marked as done."""
     written: list[str] = []
-    put = st._put
+    put = group.put
 
     def note(path: Path, data: bytes) -> None:
         put(path, data)
         name = path.relative_to(whole.path).parts[0]
         written.append(f"done={whole.column(name, 1).tolist()}" if name == "done" else name)
 
-    monkeypatch.setattr(st, "_put", note)
+    monkeypatch.setattr(group, "put", note)
     st.write_samples(whole, [fake_sample(whole.spec, 5)])
     assert written[0] == "done=[1, 0, 1, 1]"
     assert written[-1] == "done=[1, 1, 1, 1]"
@@ -404,7 +405,7 @@ def test_append_keeps_earlier_bits_also_in_the_shard_it_shares(whole: st.Store) 
 
 
 def test_an_interrupted_append_is_reported_and_mended(whole: st.Store, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(st, "recover", st.open_store)  # killed once the root was written
+    monkeypatch.setattr(metadata, "recover", st.open_store)  # killed once the root was written
     st.append_samples(whole, 4)
     assert st.verify(whole.path)[0].startswith("image holds 10 samples, not 14")
     monkeypatch.undo()

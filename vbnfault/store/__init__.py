@@ -1,0 +1,61 @@
+"""The dataset: one Zarr v3 group. Its schema, and how it is created, written, opened, verified.
+
+The only importer of zarr. How a store survives what happens to it:
+
+- Chunk files are encoded here, not by zarr, which would drop a chunk of zeros (an absent one reads as zeros
+  too) and recompress the neighbours of a sample that is built again. Reads go through zarr, as a user's do.
+- Every file is written beside its place and renamed into it, so it is either the old or the new one.
+  `create` builds the whole group that way. A kill leaves `*.partial` files, which `recover` removes.
+- A per-pixel layer is sharded: a chunk is one sample, a file holds `shard_samples` of them. One task owns a
+  shard. Whoever rewrites it copies the compressed chunks of the samples it does not rebuild, untouched.
+- `crc32c` holds a checksum of every layer and of all scalars of a sample, over decoded bytes; a chunk carries
+  Zstd's own checksum besides. `done` is written last. So a lost power supply or a bad disk is found, and
+  exactly the samples concerned are rebuilt.
+"""
+
+from .check import Problem, check_shard, digest, problem_samples, verify
+from .codec import Encoded, encode, mask_union
+from .group import Store, create, is_store, open_store, write_samples
+from .metadata import append_samples, recover
+from .schema import (
+    FORMAT_VERSION,
+    LAYERS,
+    REQUIRED_LAYERS,
+    SCALARS,
+    SEMANTIC,
+    SPLITS,
+    STRATA,
+    VOLATILE_ATTRIBUTES,
+    Array,
+    Member,
+    StoreSpec,
+)
+
+__all__ = [
+    "FORMAT_VERSION",
+    "LAYERS",
+    "REQUIRED_LAYERS",
+    "SCALARS",
+    "SEMANTIC",
+    "SPLITS",
+    "STRATA",
+    "VOLATILE_ATTRIBUTES",
+    "Array",
+    "Encoded",
+    "Member",
+    "Problem",
+    "Store",
+    "StoreSpec",
+    "append_samples",
+    "check_shard",
+    "create",
+    "digest",
+    "encode",
+    "is_store",
+    "mask_union",
+    "open_store",
+    "problem_samples",
+    "recover",
+    "verify",
+    "write_samples",
+]

@@ -1,0 +1,287 @@
+"""The schema: every array of a store, with its dims, dtype, unit and layout. Plain data; touches no file."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields, replace
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import InputError
+from ..plan import SPLITS, STRATA
+from ..quantities import CHANNELS
+
+FORMAT_VERSION = 1
+SEMANTIC = ("sky", "body", "sun", "spacecraft")
+
+# Root attributes that say when or how a store was written, not what it holds: no part of the digest.
+VOLATILE_ATTRIBUTES = ("created", "modified", "command")
+
+MAX_SHARD_SAMPLES = 16
+MAX_SHARD_BYTES = 2**30
+MAX_HELD_BYTES = 2**31  # all layers of a shard, uncompressed: what a task may have to hold
+
+_SCALARS = "scalars"  # the entry of the `layer` axis that stands for all scalars of a sample
+
+
+@dataclass(frozen=True)
+class Array:
+    """One row of the schema. `ratio`: a typical compressed size over the uncompressed one."""
+
+    dimensions: str
+    dtype: str
+    units: str
+    long_name: str
+    names: tuple[str, ...] = ()  # CF flag meanings
+    ratio: float = 1.0
+
+    @property
+    def dims(self) -> tuple[str, ...]:
+        return tuple(self.dimensions.split())
+
+    @property
+    def is_text(self) -> bool:
+        return self.dtype == "str"
+
+    @property
+    def fill(self) -> Any:
+        """What an unwritten sample reads as."""
+        return "" if self.is_text else float("nan") if self.dtype == "float64" else 0
+
+
+_IMAGE = "sample y x channel"
+
+# The schema. Per-pixel layers: one chunk a sample, sharded.
+LAYERS: dict[str, Array] = {
+    "image": Array(_IMAGE, "uint8", "DN", "image with faults", ratio=0.45),
+    "mask": Array("sample fault y x", "bool", "1", "footprint of each fault", ratio=0.005),
+    "mask_any": Array("sample y x", "bool", "1", "union over the faults named here", ratio=0.005),
+    "clean": Array(_IMAGE, "uint8", "DN", "same camera, exposure and noise, no fault", ratio=0.45),
+    # optional from here on; `without_<fault>` follows the pattern of the straylight one
+    "mask_effect": Array("sample fault y x", "bool", "1", "noise-free change of 1 DN or more", ratio=0.02),
+    "raw": Array("sample y x", "uint16", "DN", "raw mosaic of the analogue-to-digital converter", ratio=0.6),
+    "depth_m": Array("sample y x", "float32", "m", "depth along the boresight, inf on the sky", ratio=0.5),
+    "normal": Array("sample y x xyz", "float16", "1", "surface normal in C, 0 on the sky", ratio=0.55),
+    "semantic": Array("sample y x", "uint8", "1", "what a pixel shows", SEMANTIC, ratio=0.01),
+    "radiance": Array("sample band y x", "float16", "W m-2 sr-1 nm-1", "radiance at the camera", ratio=0.7),
+}
+REQUIRED_LAYERS = ("image", "mask", "mask_any", "clean")
+
+# Scalars and small vectors: a chunk is a shard, so that a task writes whole chunks.
+SCALARS: dict[str, Array] = {
+    "injected": Array("sample fault", "bool", "1", "faults that are in the pixels"),
+    "camera_position_T_m": Array("sample xyz", "float64", "m", "camera position in T"),
+    "position_L_m": Array("sample xyz", "float64", "m", "camera position in L, from the site"),
+    "camera_from_T": Array("sample quaternion", "float64", "1", "attitude, unit quaternion"),
+    "T_from_L": Array("sample axis_row axis_col", "float64", "1", "rotation from the local level frame to T"),
+    "T_from_J": Array("sample axis_row axis_col", "float64", "1", "rotation from the inertial frame J to T"),
+    "site_T_m": Array("sample xyz", "float64", "m", "site, the origin of L, in T"),
+    "sun_direction_T": Array("sample xyz", "float64", "1", "unit vector towards the Sun in T"),
+    "sun_distance_au": Array("sample", "float64", "au", "distance to the Sun"),
+    "julian_date": Array("sample", "float64", "d", "Julian date (TDB)"),
+    "intrinsics": Array("sample intrinsic", "float64", "px", "pinhole camera, pixel centres at +0.5"),
+    "sun_azimuth_deg": Array("sample", "float64", "deg", "Sun azimuth in L, from north towards east"),
+    "sun_elevation_deg": Array("sample", "float64", "deg", "Sun elevation in L, up"),
+    "roll_deg": Array("sample", "float64", "deg", "tilt of the boresight from the Sun about x"),
+    "pitch_deg": Array("sample", "float64", "deg", "tilt of the boresight from the Sun about y"),
+    "yaw_deg": Array("sample", "float64", "deg", "turn about the boresight"),
+    "sun_xy_px": Array("sample xy", "float64", "px", "Sun centre in the image, NaN behind the camera"),
+    "sun_visible_fraction": Array("sample", "float64", "1", "part of the solar disc that is not occluded"),
+    "exposure_s": Array("sample", "float64", "s", "exposure time"),
+    "tries": Array("sample", "int32", "1", "proposals drawn until one could be used"),
+    "stratum": Array("sample", "uint8", "1", "stratum of the sampling", STRATA),
+    "site": Array("sample", "int32", "1", "index of the site"),
+    "lens": Array("sample", "int32", "1", "index of the lens"),
+    "detector_individual": Array("sample", "int32", "1", "index of the individual detector"),
+    "split": Array("sample", "uint8", "1", "split of the dataset, constant per site", SPLITS),
+    "parameters": Array("sample", "str", "1", "drawn parameters of every injected fault, JSON"),
+    "proposal": Array("sample", "str", "1", "proposed variables before redraws, JSON"),
+}
+
+_LABELS = {  # coordinates of the short axes
+    "channel": CHANNELS,
+    "xyz": ("x", "y", "z"),
+    "axis_row": ("x", "y", "z"),
+    "axis_col": ("x", "y", "z"),
+    "xy": ("x", "y"),
+    "quaternion": ("w", "x", "y", "z"),
+    "intrinsic": ("fx", "fy", "cx", "cy"),
+}
+
+
+class Member(NamedTuple):
+    """One array of the group as it must be: `create`, `verify` and `recover` go by it.
+
+    `values`: of a coordinate; None for what tasks write. `chunks`, `shards`: of zarr, 1 at least in every axis.
+    """
+
+    shape: tuple[int, ...]
+    chunks: tuple[int, ...]
+    shards: tuple[int, ...] | None
+    dtype: str
+    fill: Any
+    dims: tuple[str, ...]
+    attributes: dict[str, Any]
+    values: NDArray[Any] | tuple[str, ...] | None = None
+
+
+def _coordinate(dim: str, values: NDArray[Any] | tuple[str, ...], **attributes: str) -> Member:
+    """A row of `StoreSpec.members` for a coordinate of one axis."""
+    dtype, fill = (values.dtype.name, 0) if isinstance(values, np.ndarray) else ("str", "")
+    chunks = (65536 if dim == "sample" else max(1, len(values)),)
+    return Member((len(values),), chunks, None, dtype, fill, (dim,), attributes, values)
+
+
+@dataclass(frozen=True, kw_only=True)
+class StoreSpec:
+    """What a store holds, as plain data.
+
+    `faults`: the fault axis in dataset order. `mask_any_faults`: the union that `mask_any` is.
+    `localised_faults`: those whose mask is not empty where they are injected (default: `mask_any_faults`).
+    `layers`: the optional layers, of `LAYERS` or `without_<fault>`. `shard_samples` 0 chooses the most, up to
+    16, that keeps the largest array of a shard within 1 GiB and all of them within 2 GiB; a larger one is
+    lowered. `attributes`: JSON-able root attributes. Raises InputError for names that do not exist.
+    """
+
+    height: int
+    width: int
+    faults: tuple[str, ...]
+    mask_any_faults: tuple[str, ...]
+    wavelength_nm: tuple[float, ...] = ()
+    layers: tuple[str, ...] = ()
+    localised_faults: tuple[str, ...] | None = None
+    site_names: tuple[str, ...] = ()
+    lens_names: tuple[str, ...] = ()
+    detector_names: tuple[str, ...] = ()
+    radiance_dtype: str = "float16"
+    shard_samples: int = 0
+    attributes: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        allowed = {*LAYERS, *(f"without_{f}" for f in self.faults)}
+        for name in self.layers:
+            if name not in allowed:
+                raise InputError(f"layers: {name!r} is no layer; known: {', '.join(sorted(allowed))}")
+        for name in (*self.mask_any_faults, *(self.localised_faults or ())):
+            if name not in self.faults:
+                known = ", ".join(self.faults) or "no faults"
+                raise InputError(f"mask_any_faults: {name!r} is not one of {known}")
+        if self.localised_faults is None:
+            object.__setattr__(self, "localised_faults", self.mask_any_faults)
+        sizes = [self.layer_bytes(name) for name in self.pixel_layers]
+        most = max(1, min(MAX_SHARD_SAMPLES, MAX_SHARD_BYTES // max(sizes), MAX_HELD_BYTES // sum(sizes)))
+        object.__setattr__(self, "shard_samples", min(self.shard_samples, most) if self.shard_samples > 0 else most)
+
+    @cached_property
+    def pixel_layers(self) -> dict[str, Array]:
+        """Name → schema row of every per-pixel layer, in the order of the `layer` axis."""
+        rows = {name: LAYERS[name] for name in REQUIRED_LAYERS}
+        for name in self.layers:
+            if name == "radiance":
+                rows[name] = replace(LAYERS[name], dtype=self.radiance_dtype)
+            elif name in LAYERS:
+                rows[name] = LAYERS[name]
+            else:
+                without = name.removeprefix("without_")
+                rows[name] = Array(_IMAGE, "uint8", "DN", f"the image without {without}", ratio=0.45)
+        return rows
+
+    @cached_property
+    def arrays(self) -> dict[str, Array]:
+        """Name → schema row of every array that tasks write."""
+        crc32c = Array("sample layer", "uint32", "1", "CRC-32C of the decoded bytes")
+        done = Array("sample", "uint8", "1", "1 where a sample is whole; written last")
+        return {**self.pixel_layers, **SCALARS, "crc32c": crc32c, "done": done}
+
+    @property
+    def checked(self) -> tuple[str, ...]:
+        """The `layer` axis of `crc32c`."""
+        return (*self.pixel_layers, _SCALARS)
+
+    def shape(self, row: Array) -> tuple[int, ...]:
+        """Shape of one sample of an array: its dims without `sample`."""
+        sizes = {
+            "y": self.height,
+            "x": self.width,
+            "fault": len(self.faults),
+            "band": len(self.wavelength_nm),
+            "layer": len(self.checked),
+            **{name: len(labels) for name, labels in _LABELS.items()},
+        }
+        return tuple(sizes[d] for d in row.dims if d != "sample")
+
+    def empty(self, name: str) -> bool:
+        """Has an array an axis of no length, as `mask` without fault classes? It has no data files then."""
+        return 0 in self.shape(self.arrays[name])
+
+    def members(self, samples: int) -> dict[str, Member]:
+        """Name → what it must be, for every array of a group of `samples` samples, coordinates last."""
+        extra: dict[str, dict[str, Any]] = {
+            "mask_any": {"faults": list(self.mask_any_faults)},
+            "site": {"names": list(self.site_names)},
+            "lens": {"names": list(self.lens_names)},
+            "detector_individual": {"names": list(self.detector_names)},
+            "split": {"names": list(SPLITS)},
+            "radiance": {"coordinates": "wavelength_nm"},
+        }
+        size = self.shard_samples
+        members = {}
+        for name, row in self.arrays.items():
+            shape = self.shape(row)
+            chunk = tuple(max(1, n) for n in shape)
+            sharded = name in self.pixel_layers
+            attributes: dict[str, Any] = {"long_name": row.long_name, "units": row.units}
+            if row.names:
+                attributes["flag_values"] = list(range(len(row.names)))
+                attributes["flag_meanings"] = " ".join(row.names)
+            members[name] = Member(
+                shape=(samples, *shape),
+                chunks=(1 if sharded else size, *chunk),
+                shards=(size, *chunk) if sharded else None,
+                dtype=row.dtype,
+                fill=row.fill,
+                dims=row.dims,
+                attributes={**attributes, **extra.get(name, {})},
+            )
+        return {**members, **self.coordinates(samples)}
+
+    def coordinates(self, samples: int) -> dict[str, Member]:
+        """Name → what it must be, for every coordinate of a group of `samples` samples."""
+        y, x = np.arange(self.height) + 0.5, np.arange(self.width) + 0.5
+        nodes = np.array(self.wavelength_nm, dtype=np.float64)
+        bands = {"wavelength_nm": _coordinate("band", nodes, units="nm", long_name="wavelength of the band")}
+        return {
+            "y": _coordinate("y", y, units="px", long_name="row, pixel centres at +0.5"),
+            "x": _coordinate("x", x, units="px", long_name="column, pixel centres at +0.5"),
+            "fault": _coordinate("fault", self.faults, long_name="fault class"),
+            "layer": _coordinate("layer", self.checked, long_name="what a checksum covers"),
+            **{name: _coordinate(name, tuple(labels), long_name=name) for name, labels in _LABELS.items()},
+            **(bands if self.wavelength_nm else {}),
+            "sample": _coordinate("sample", np.arange(samples, dtype=np.int64), long_name="sample"),
+        }
+
+    def layer_bytes(self, name: str) -> int:
+        """Uncompressed bytes of one sample of a per-pixel layer."""
+        row = self.pixel_layers[name]
+        return int(np.prod(self.shape(row), dtype=np.int64)) * np.dtype(row.dtype).itemsize
+
+    @property
+    def estimated_sample_bytes(self) -> int:
+        """About what a sample takes on disk."""
+        pixels = sum(self.layer_bytes(name) * row.ratio for name, row in self.pixel_layers.items())
+        return int(pixels) + 4096
+
+    def plain(self) -> dict[str, Any]:
+        """JSON-able fields without the root attributes; `spec_from_plain` reads them back."""
+        # not asdict: it would copy the whole scene to leave it out
+        return {f.name: getattr(self, f.name) for f in fields(self) if f.name != "attributes"}
+
+
+def spec_from_plain(plain: Mapping[str, Any], attributes: Mapping[str, Any]) -> StoreSpec:
+    """What `StoreSpec.plain` gave, with the root attributes of a store."""
+    known = {f.name for f in fields(StoreSpec)}
+    values: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in plain.items() if k in known}
+    return StoreSpec(**values, attributes=attributes)
