@@ -384,6 +384,22 @@ def test_verify_compares_with_the_plan(whole: st.Store) -> None:
     assert sentence.startswith('sample 3: proposal = {"sun_elevation_deg": 0.3} is not as planned')
 
 
+def test_a_fault_that_was_not_commanded_is_found(whole: st.Store) -> None:
+    """The sample is labelled soundly in itself, its checksums are right: the plan alone says that it is wrong."""
+    commanded = {i: fake_sample(whole.spec, i).scalars["injected"] for i in range(10)}
+    commanded[4] = np.ones(4, bool)  # what had no effect is not injected, and that is no problem
+    assert st.verify(whole, expected=lambda i: {"injected": commanded[i]}) == []
+    sample = fake_sample(whole.spec, 1)
+    off = int(np.flatnonzero(~commanded[1])[0])
+    injected, mask = commanded[1].copy(), sample.layers["mask"].copy()
+    injected[off] = mask[off, 3, 3] = True
+    changes = {"injected": injected, "mask": mask, "mask_any": mask[:3].any(0)}
+    parameters = {**sample.scalars["parameters"], FAULTS[off]: {"amplitude": 0.1}}
+    assert relabelled(whole, 1, **changes, parameters=parameters) == []
+    (sentence,) = st.verify(whole, expected=lambda i: {"injected": commanded[i]})
+    assert sentence == f"sample 1: {FAULTS[off]} is injected, but the plan does not command it"
+
+
 # --- growing, recovering, refusing ------------------------------------------------------------------------
 
 

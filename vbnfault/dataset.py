@@ -91,7 +91,8 @@ def store_spec(session: pipeline.Session, blocks: Sequence[int]) -> StoreSpec:
 
 
 def planned(attributes: Mapping[str, Any], faults: Sequence[str]) -> Callable[[int], dict[str, Any]]:
-    """What the plan of a stored scene says of a sample: the scalars that rendering cannot change."""
+    """What the plan of a stored scene says of a sample: the scalars that rendering cannot change, and the
+    commanded faults as `injected`."""
     stored = {key: value for key, value in attributes["scene"].items() if key != "textures_sha256"}
     stored["body"] = {key: value for key, value in stored["body"].items() if key != "shape_sha256"}
     stored["dataset"] = {**stored["dataset"], "samples": attributes["blocks"][0]}
@@ -107,6 +108,7 @@ def planned(attributes: Mapping[str, Any], faults: Sequence[str]) -> Callable[[i
             "site": int(table.site[index]),
             "split": int(table.split[index]),
             "proposal": pipeline.proposal(scene, table, index),
+            "injected": table.injected[index],
         }
 
     return expected

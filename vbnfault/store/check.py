@@ -117,11 +117,12 @@ def verify(
 ) -> list[str]:
     """Every problem of a store, one sentence each that names the array, the sample and the file.
 
-    Checks that every array is there with its layout, attributes and coordinates; where an array of samples is
-    not, samples are not looked at. Checks that each sample is whole (`check_shard`) and labelled: masks,
-    `injected` and `parameters` agree, a site lies in one split. `expected(sample)` gives the scalars as planned,
-    compared exactly. `progress` is called with the number of samples just checked. Raises InputError where there
-    is no store.
+    Checks that every array is there with its layout, attributes and coordinates, and as the consolidated
+    metadata say; where an array of samples is not, samples are not looked at. Checks that each sample is whole
+    (`check_shard`) and labelled: masks, `injected` and `parameters` agree, a site lies in one split.
+    `expected(sample)` gives the scalars as planned, compared exactly, except for `injected`: there it gives the
+    commanded faults, of which some may have had no effect. `progress` is called with the number of samples just
+    checked. Raises InputError where there is no store.
     """
     store = open_store(path)
     problems, hopeless = metadata_problems(store)
@@ -142,7 +143,7 @@ def verify(
                 layers = {name: _decode(store.spec, name, chunks[i]) for name, chunks in masks.items()}
                 problems += _check_labels(store.spec, i, scalars, layers)
                 problems += _check_split(store, i, scalars, split_of)
-                problems += _check_plan(i, scalars, expected(i) if expected else {})
+                problems += _check_plan(store.spec, i, scalars, expected(i) if expected else {})
         if progress:
             progress(len(store.shard(number)))
     return problems
@@ -186,9 +187,14 @@ def _check_split(
         yield f"sample {i}: split = {split}, but sample {first} of the same site {named} has {before}"
 
 
-def _check_plan(i: int, scalars: Mapping[str, Any], expected: Mapping[str, Any]) -> Iterator[str]:
+def _check_plan(spec: StoreSpec, i: int, scalars: Mapping[str, Any], expected: Mapping[str, Any]) -> Iterator[str]:
     for name, planned in expected.items():
         stored = scalars[name]
+        if name == "injected":  # a commanded fault may have no effect, but no other may be there
+            for fault, is_in, commanded in zip(spec.faults, stored, planned, strict=True):
+                if is_in and not commanded:
+                    yield f"sample {i}: {fault} is injected, but the plan does not command it"
+            continue
         if SCALARS[name].is_text:
             planned = json.loads(planned) if isinstance(planned, str) else json.loads(json.dumps(planned))
             same = json.loads(str(stored)) == planned
