@@ -13,9 +13,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import zarr
+from conftest import small_scene
 
 from vbnfault import store as st
+from vbnfault.config import parse_scene
 from vbnfault.errors import InputError, VbnfaultError
+from vbnfault.plan import make_plan
 from vbnfault.quantities import Sample
 from vbnfault.store import codec, group, metadata
 
@@ -169,6 +172,21 @@ def test_shards_shrink_for_large_images() -> None:
         assert spec.shard_samples == 1 or spec.shard_samples * largest <= 2**30
     assert make_spec(1024, shard_samples=0).shard_samples == 16
     assert make_spec(24, shard_samples=400).shard_samples == 16
+
+
+def test_a_shard_that_was_lowered_keeps_to_one_site() -> None:
+    """The plan groups samples by site in shards of the wished size, the store lowers that for large frames."""
+    for wished, size in ((16, 4), (12, 4), (10, 5), (9, 3), (7, 1), (4, 4)):
+        spec = make_spec(3072, width=3072, shard_samples=wished)
+        assert spec.shard_samples == size
+        assert size * sum(map(spec.layer_bytes, spec.pixel_layers)) <= 2**31
+        scene = parse_scene(small_scene(dataset={"samples": 100, "shard_samples": wished}), source="here")
+        sites = make_plan(scene, ()).site
+        assert len(np.unique(sites)) > 1
+        for start in range(0, 100, size):
+            assert len(np.unique(sites[start : start + size])) == 1
+    lowered = make_spec(3072, width=3072, shard_samples=12)
+    assert st.StoreSpec(**lowered.plain()).shard_samples == 4  # as a store that is opened again has it
 
 
 def test_unknown_layers_and_faults_are_refused() -> None:

@@ -143,7 +143,8 @@ class StoreSpec:
     `localised_faults`: those whose mask is not empty where they are injected (default: `mask_any_faults`).
     `layers`: the optional layers, of `LAYERS` or `without_<fault>`. `shard_samples` 0 chooses the most, up to
     16, that keeps the largest array of a shard within 1 GiB and all of them within 2 GiB; a larger one is
-    lowered. `attributes`: JSON-able root attributes. Raises InputError for names that do not exist.
+    lowered to its largest divisor that does. `attributes`: JSON-able root attributes. Raises InputError for
+    names that do not exist.
     """
 
     height: int
@@ -173,7 +174,10 @@ class StoreSpec:
             object.__setattr__(self, "localised_faults", self.mask_any_faults)
         sizes = [self.layer_bytes(name) for name in self.pixel_layers]
         most = max(1, min(MAX_SHARD_SAMPLES, MAX_SHARD_BYTES // max(sizes), MAX_HELD_BYTES // sum(sizes)))
-        object.__setattr__(self, "shard_samples", min(self.shard_samples, most) if self.shard_samples > 0 else most)
+        wished = self.shard_samples if self.shard_samples > 0 else most
+        # a divisor: what the plan groups by site in shards of the wished size is then in no shard with another
+        size = next(n for n in range(min(wished, most), 0, -1) if wished % n == 0)
+        object.__setattr__(self, "shard_samples", size)
 
     @cached_property
     def pixel_layers(self) -> dict[str, Array]:
