@@ -590,6 +590,34 @@ def test_wrong_coordinates_and_attributes_are_found_and_mended(whole: st.Store) 
     assert st.digest(whole.path) == before
 
 
+@pytest.mark.parametrize("damage", ["changed", "absent entry", "foreign entry", "absent", "nonsense"])
+def test_consolidated_metadata_that_differ_are_found_and_mended(whole: st.Store, damage: str) -> None:
+    """xarray and zarr look there first, and would show what the arrays' own metadata do not say."""
+    before, file = st.digest(whole), whole.path / "zarr.json"
+    good = file.read_text()
+    root = json.loads(good)
+    entries = root["consolidated_metadata"]["metadata"]
+    if damage == "changed":
+        entries["depth_m"]["attributes"]["units"] = "km"
+        said = "array depth_m: the consolidated metadata in zarr.json differ from depth_m/zarr.json"
+    elif damage == "absent entry":
+        del entries["mask"]
+        said = "array mask: the consolidated metadata in zarr.json differ from mask/zarr.json"
+    elif damage == "foreign entry":
+        entries["smear"] = entries["mask"]
+        said = "array smear: the consolidated metadata in zarr.json differ from smear/zarr.json"
+    else:
+        root["consolidated_metadata"] = None if damage == "absent" else {"metadata": [3]}
+        said = "zarr.json holds no consolidated metadata"
+    file.write_text(json.dumps(root))
+    assert st.verify(whole.path) == [said]
+    assert st.problem_samples(whole.path) == []
+    st.recover(whole.path)
+    assert json.loads(file.read_text()) == json.loads(good)
+    assert st.verify(whole.path) == []
+    assert st.digest(whole.path) == before
+
+
 @pytest.mark.parametrize("name", ["mask", "done", "parameters", "sample", "fault", "wavelength_nm"])
 def test_a_missing_array_is_one_sentence_and_made_again(whole: st.Store, name: str) -> None:
     before = st.digest(whole)

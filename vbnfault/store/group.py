@@ -282,6 +282,15 @@ def consolidate(path: Path) -> None:
         zarr.consolidate_metadata(path, zarr_format=3)
 
 
+def consolidated_metadata(path: Path) -> dict[str, Any] | None:
+    """Array name → what the root says its metadata are; None where the root does not say, or says nonsense."""
+    try:
+        entries = json.loads((path / "zarr.json").read_text())["consolidated_metadata"]["metadata"]
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+    return entries if isinstance(entries, dict) else None
+
+
 def _root(path: Path) -> dict[str, Any] | None:
     """Root attributes of a vbnfault store, None where there is none."""
     try:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 from collections.abc import Iterator, Mapping
@@ -12,7 +13,7 @@ import numpy as np
 import zarr
 
 from ..errors import InputError, VbnfaultError
-from .group import Store, consolidate, disk, open_store
+from .group import Store, consolidate, consolidated_metadata, disk, open_store
 from .schema import Member
 
 
@@ -20,6 +21,7 @@ def metadata_problems(store: Store) -> tuple[list[str], bool]:
     """What of the arrays' layout, attributes and coordinates is not as the spec says, one sentence each; and
     whether samples cannot be looked at before that is mended."""
     problems: list[str] = []
+    sound: list[str] = []
     hopeless = False
     for name, member in store.spec.members(store.samples).items():
         try:
@@ -38,7 +40,9 @@ def metadata_problems(store: Store) -> tuple[list[str], bool]:
         hopeless |= member.values is None and bool(misshapen)
         found = misshapen + [*_misnamed(array, member)] + ([] if misshapen else [*_misvalued(array, member)])
         problems += [f"array {name}: {what}" for what in found]
-    return problems, hopeless
+        if not found:
+            sound.append(name)
+    return problems + list(_misconsolidated(store, sound)), hopeless
 
 
 def _misshapen(array: zarr.Array[Any], member: Member) -> Iterator[str]:
@@ -79,6 +83,23 @@ def _misvalued(array: zarr.Array[Any], member: Member) -> Iterator[str]:
     elif not np.array_equal(stored, np.asarray(member.values, dtype=stored.dtype)):
         first = next(i for i, (a, b) in enumerate(zip(stored, member.values, strict=True)) if a != b)
         yield f"its value {first} is {short(stored[first])}, not {short(member.values[first])}"
+
+
+def _misconsolidated(store: Store, names: list[str]) -> Iterator[str]:
+    """What the consolidated metadata say of the arrays `names`, or of arrays outside the schema, that the arrays
+    themselves do not say: readers look into the consolidated ones first."""
+    consolidated = consolidated_metadata(store.path)
+    if consolidated is None:
+        yield "zarr.json holds no consolidated metadata"
+        return
+    foreign = consolidated.keys() - store.spec.members(store.samples).keys()
+    for name in (*names, *sorted(foreign)):
+        try:
+            own = json.loads((store.path / name / "zarr.json").read_text())
+        except (OSError, ValueError):
+            own = None
+        if own is None or consolidated.get(name) != own:
+            yield f"array {name}: the consolidated metadata in zarr.json differ from {name}/zarr.json"
 
 
 def short(value: Any) -> str:
