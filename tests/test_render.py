@@ -10,6 +10,7 @@ import pytest
 from vbnfault import frames, render, spectra
 from vbnfault.detector import Detector
 from vbnfault.lens import ThinLens
+from vbnfault.photometry import Diffuse
 from vbnfault.render.runtime import dr
 from vbnfault.scene import Scene, Sunlight, View
 
@@ -67,7 +68,7 @@ def scene(a_view: View, light: Sunlight, spp: int = 16, reflectance: float | str
         view=a_view,
         sun=light,
         wavelength_nm=NODES,
-        reflectance=spectra.reflectance(reflectance, NODES),
+        photometry=Diffuse(reflectance=spectra.reflectance(reflectance, NODES)),
         samples_per_pixel=spp,
         key=key,
     )

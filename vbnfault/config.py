@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from . import resources, spectra
+from . import photometry, resources, spectra
 from .errors import InputError
 
 Architecture = Literal["full_frame_ccd", "frame_transfer_ccd", "interline_ccd", "cmos"]
@@ -76,6 +76,52 @@ class DatasetTable(Table):
     citation: str = ""
 
 
+class HapkeRow(Table):
+    """Hapke's parameters at one wavelength (Hapke 2002, 2012)."""
+
+    wavelength_nm: float = Field(gt=0, le=1e5)
+    single_scattering_albedo: float = Field(ge=0, le=1, description="w")
+    asymmetry: float = Field(gt=-1, lt=1, description="g of Henyey-Greenstein; negative scatters back")
+    shadow_hiding_amplitude: float = Field(0.0, ge=0, le=100, description="B0")
+    shadow_hiding_width: float = Field(1.0, gt=0, le=100, description="h_s, dimensionless: not an angle")
+    coherent_amplitude: float = Field(0.0, ge=0, le=100, description="B_C0")
+    coherent_width: float = Field(1.0, gt=0, le=100, description="h_c")
+    roughness_deg: float = Field(0.0, ge=0, le=60, description="mean slope below a pixel")
+    porosity_factor: float = Field(1.0, ge=1, le=10, description="K")
+
+
+class PhotometryTable(Table):
+    """How the ground reflects. All models but Hapke's scale `body.reflectance`."""
+
+    model: Literal["lambert", "lommel_seeliger", "mcewen", "hapke"] = "lambert"
+    phase_slope_mag_deg: float = Field(
+        0.0, ge=0, le=1, description="fading with phase angle, not for 'hapke'; 67P: 0.047"
+    )
+    parameters: str = Field("67p_fornasier2015", description="a named set of Hapke's parameters")
+    hapke: tuple[HapkeRow, ...] | None = Field(
+        None, min_length=1, description="Hapke's parameters at wavelengths of one's own, in place of a named set"
+    )
+    dust_contrast: float = Field(
+        0.0, ge=-0.9, le=4, description="how much brighter dust-covered ground is at 649 nm: 0.2 for 20 %"
+    )
+    dust_slope_per_100nm: float = Field(
+        0.0, ge=-0.2, le=0.2, description="spectral slope of dust-covered over bare ground"
+    )
+
+    @model_validator(mode="after")
+    def _known(self) -> PhotometryTable:
+        if self.parameters not in photometry.HAPKE_TABLES:
+            known = ", ".join(photometry.HAPKE_TABLES)
+            raise ValueError(f"parameters = {self.parameters!r}: must be one of {known}")
+        return self
+
+    def rows(self) -> tuple[tuple[float, ...], ...]:
+        """`hapke` as `photometry.hapke_at` takes it."""
+        return tuple(
+            (row.wavelength_nm, *(getattr(row, name) for name in photometry.COLUMNS)) for row in self.hapke or ()
+        )
+
+
 class BodyTable(Table):
     """The target body, in its body-fixed frame T."""
 
@@ -93,6 +139,7 @@ class BodyTable(Table):
     reflectance: str | Annotated[float, Field(ge=0, le=1)] = Field(
         "67p", description="a named reflectance or a grey value"
     )
+    photometry: PhotometryTable = PhotometryTable()
 
     @model_validator(mode="after")
     def _known(self) -> BodyTable:
@@ -119,6 +166,7 @@ class SunTable(Table):
 
     julian_date: float = Field(2456974.0, ge=1_000_000, le=5_000_000, description="TDB; sets the body's attitude")
     distance_au: float | None = Field(None, gt=0.01, le=1000)
+    limb_darkening: bool = Field(True, description="after Neckel & Labs 1994; else a uniform disc")
 
 
 class CameraTable(Table):
@@ -176,6 +224,7 @@ class RenderTable(Table):
     band_max_nm: float = Field(700.0, ge=290, le=4000)
     bands: int = Field(8, ge=1, le=64)
     samples_per_pixel: int = Field(16, ge=1, le=4096, description="a power of four: strata of each pixel")
+    bounces: int = Field(0, ge=0, le=4, description="reflections between sunlit ground and the ground that is seen")
 
     @model_validator(mode="after")
     def _valid(self) -> RenderTable:

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from . import camera as cameras
-from . import config, frames, labels, plan, spectra
+from . import config, frames, labels, photometry, plan, spectra
 from .body import Body, Patch, Site, build_patch, choose_sites, load_body
 from .camera import Camera
 from .config import SceneConfig
@@ -26,6 +26,7 @@ from .detector import Detector, Noise
 from .errors import InputError
 from .faults import Fault, FaultContext, Params, dataset_order, from_dict, physical_order
 from .lens import ThinLens
+from .photometry import Photometry
 from .quantities import RGBI, Electrons, Radiance, Sample, Truth
 from .scene import Scene, Sunlight, View
 
@@ -204,7 +205,29 @@ def sunlight(scene: SceneConfig, direction_L: F64) -> Sunlight:
         direction_L=direction_L,
         angular_radius_rad=spectra.sun_angular_radius_rad(distance),
         irradiance_W_m2_nm=spectra.solar_band_irradiance_W_m2_nm(wavelengths_nm(scene), distance),
+        limb_darkening=spectra.limb_darkening(wavelengths_nm(scene)) if scene.sun.limb_darkening else None,
     )
+
+
+def photometry_of(scene: SceneConfig) -> Photometry:
+    """How the scene's ground reflects, at its band nodes."""
+    table, wavelength = scene.body.photometry, wavelengths_nm(scene)
+    if table.model == "hapke":
+        rows = table.parameters if table.hapke is None else table.rows()
+        return photometry.hapke_at(wavelength, rows)
+    return photometry.Diffuse(
+        reflectance=spectra.reflectance(scene.body.reflectance, wavelength),
+        disc=table.model,
+        phase_slope_mag_deg=table.phase_slope_mag_deg,
+    )
+
+
+def dust_contrast(scene: SceneConfig) -> F64 | None:
+    """Reflectance of dust-covered over bare ground, minus 1, float64[band]; None where they are alike."""
+    table, wavelength = scene.body.photometry, wavelengths_nm(scene)
+    slope = table.dust_slope_per_100nm * (wavelength - photometry.REFERENCE_NM) / 100
+    contrast = (1 + table.dust_contrast) * (1 + slope) - 1
+    return contrast if np.any(contrast) else None
 
 
 def wavelengths_nm(scene: SceneConfig) -> F64:
@@ -258,7 +281,9 @@ def describe(frame: Frame) -> Scene:
         view=view,
         sun=frame.sunlight,
         wavelength_nm=wavelength,
-        reflectance=spectra.reflectance(scene.body.reflectance, wavelength),
+        photometry=photometry_of(scene),
+        dust_contrast=dust_contrast(scene),
+        bounces=scene.render.bounces,
         samples_per_pixel=scene.render.samples_per_pixel,
         key=int(spec.rng("render", "jitter").integers(2**32)),
     )
@@ -302,8 +327,8 @@ def meter(frame: Frame) -> None:
 def _metered_exposure_s(frame: Frame) -> float:
     settings, scene = frame.spec.scene.camera, frame.spec.scene
     # as a facet whose normal is 45 degrees from the Sun would be exposed
-    wavelength = frame.radiance.wavelength_nm
-    lit = spectra.reflectance(scene.body.reflectance, wavelength) / np.pi * np.cos(np.pi / 4)
+    half = np.sqrt(0.5)
+    lit = photometry.radiance_factor(photometry_of(scene), [0, half, half], [half, 0, half])[:, 0] / np.pi
     facet = (lit * frame.sunlight.irradiance_W_m2_nm).astype(np.float32).reshape(-1, 1, 1)
     per_second = _rate(frame, frame.radiance.with_array(facet))
     facet_brightness = float(_brightness(per_second.array, per_second.white_e).max())

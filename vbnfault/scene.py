@@ -7,6 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from .photometry import Photometry
+
 F64 = NDArray[np.float64]
 
 
@@ -28,28 +30,36 @@ class View:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Sunlight:
-    """The Sun as a uniform disc: unit `direction_L`, `angular_radius_rad`, irradiance W m⁻² nm⁻¹ per band."""
+    """The Sun as a disc: unit `direction_L`, `angular_radius_rad`, irradiance W m⁻² nm⁻¹ per band.
+
+    `limb_darkening` float64[band, 6]: see `spectra.limb_darkening`; None for a uniform disc.
+    """
 
     direction_L: F64
     angular_radius_rad: float
     irradiance_W_m2_nm: F64
+    limb_darkening: F64 | None = None
 
     @property
     def radiance_W_m2_sr_nm(self) -> F64:
-        """Radiance of the disc, E / (π sin² α), per band."""
+        """Mean radiance of the disc, E / (π sin² α), per band."""
         return self.irradiance_W_m2_nm / (np.pi * np.sin(self.angular_radius_rad) ** 2)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Scene:
-    """A view of a sunlit Lambert surface: `wavelength_nm` and `reflectance` float64[band].
+    """A view of a sunlit surface: `wavelength_nm` float64[band] and how the surface reflects there.
 
-    `samples_per_pixel` is a power of four; `key` (uint32) selects the sample's own sub-pixel jitter.
+    `dust_contrast` float64[band]: reflectance of dust-covered ground over that of bare ground, minus 1.
+    `samples_per_pixel` is a power of four; `bounces` counts the reflections between sunlit ground and the ground
+    that is seen; `key` (uint32) selects the sample's own sub-pixel jitter.
     """
 
     view: View
     sun: Sunlight
     wavelength_nm: F64
-    reflectance: F64
+    photometry: Photometry
     samples_per_pixel: int
     key: int
+    bounces: int = 0
+    dust_contrast: F64 | None = None

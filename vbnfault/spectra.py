@@ -94,6 +94,44 @@ def sun_angular_radius_rad(distance_au: float) -> float:
     return float(np.arcsin(SUN_RADIUS_M / (distance_au * AU_M)))
 
 
+# Limb darkening I(μ)/I(1) = Σ A_k μᵏ: Neckel & Labs 1994, Solar Physics 153, 91, table 1
+_LIMB_NM_AND_A = np.array(
+    [
+        (401.970, 0.12323, 1.08648, -0.43974, 0.45912, -0.32759, 0.09850),
+        (427.930, 0.14249, 1.28796, -1.19564, 1.68603, -1.36658, 0.44572),
+        (443.885, 0.16220, 1.24893, -0.92165, 0.89978, -0.50148, 0.11220),
+        (457.345, 0.16604, 1.38544, -1.52275, 2.00232, -1.45969, 0.42864),
+        (477.427, 0.19571, 1.30551, -1.25845, 1.50626, -1.05472, 0.30570),
+        (492.905, 0.20924, 1.30798, -1.20411, 1.21505, -0.67196, 0.14381),
+        (519.930, 0.23695, 1.29927, -1.28034, 1.37760, -0.85054, 0.21706),
+        (541.760, 0.26073, 1.27428, -1.30352, 1.47085, -0.96618, 0.26384),
+        (559.950, 0.26892, 1.34319, -1.58427, 1.91271, -1.31350, 0.37295),
+        (579.880, 0.28392, 1.36896, -1.75998, 2.22154, -1.56074, 0.44630),
+        (610.975, 0.30854, 1.36620, -1.83572, 2.33221, -1.63082, 0.45959),
+        (640.970, 0.33644, 1.30590, -1.79238, 2.45040, -1.89979, 0.59943),
+        (669.400, 0.34685, 1.37539, -2.04425, 2.70493, -1.94290, 0.55999),
+        (700.875, 0.37885, 1.25553, -1.70908, 2.19647, -1.59554, 0.47378),
+        (748.710, 0.40627, 1.22842, -1.67877, 2.05535, -1.39972, 0.38845),
+        (811.760, 0.42977, 1.25182, -1.85164, 2.31949, -1.59101, 0.44155),
+        (869.600, 0.45396, 1.25101, -2.02958, 2.75410, -2.02287, 0.59338),
+        (948.850, 0.47855, 1.19813, -1.86296, 2.36939, -1.64367, 0.46056),
+    ]
+)
+
+
+def limb_darkening(wavelength_nm: F64) -> F64:
+    """Coefficients float64[band, 6] of Σ c_k μᵏ, the Sun's radiance over the mean of its disc.
+
+    μ is the cosine of the angle from the local vertical, √(1 - ρ²) at a fraction ρ of the disc's radius. Linear
+    between the tabulated wavelengths, constant beyond them (402 to 949 nm).
+    """
+    nodes, a = _LIMB_NM_AND_A[:, 0], _LIMB_NM_AND_A[:, 1:]
+    a = a / a.sum(axis=1, keepdims=True)  # the table's sums are 1 to its five digits
+    at = np.column_stack([np.interp(wavelength_nm, nodes, column) for column in a.T])
+    mean = at @ (2 / (np.arange(6) + 2))  # of μᵏ over the disc
+    return np.asarray(at / mean[:, None])
+
+
 def reflectance(spec: str | float | Mapping[str, tuple[float, ...]], wavelength_nm: F64) -> F64:
     """Lambert reflectance at `wavelength_nm`, float64: a name of `REFLECTANCES`, a grey value, or a table
     with `wavelength_nm` and `value`, interpolated linearly and held constant beyond its ends."""

@@ -10,6 +10,7 @@ def self_test() -> str:
     """Render a Lambert square facing the Sun and compare its radiance with ρE/π; a sentence for `doctor`."""
     import numpy as np
 
+    from ..photometry import Diffuse
     from ..scene import Scene, Sunlight, View
 
     square = np.array([[-9, -9, 0], [9, -9, 0], [9, 9, 0], [-9, 9, 0]], dtype=np.float32)
@@ -27,7 +28,7 @@ def self_test() -> str:
         view=view,
         sun=sun,
         wavelength_nm=np.array([550.0]),
-        reflectance=np.array([0.06]),
+        photometry=Diffuse(reflectance=np.array([0.06])),
         samples_per_pixel=4,
         key=0,
     )

@@ -1,4 +1,4 @@
-"""The Sun as a disc of finite angular size and true spectral irradiance."""
+"""The Sun as a limb-darkened disc of finite angular size and true spectral irradiance."""
 
 from __future__ import annotations
 
@@ -29,6 +29,42 @@ class SunDisc:
         """Unit direction towards the point of the disc at `p` on the unit disc."""
         return dr.normalize(self.direction + self._tangent * (p.x * self._x + p.y * self._y))
 
-    def contains(self, direction: Any) -> Any:
-        """Whether a unit direction looks at the disc."""
-        return dr.squared_norm(direction - self.direction) < self._chord2
+    def seen(self, direction: Any) -> tuple[Any, Any]:
+        """Whether a unit direction looks at the disc, and μ there."""
+        share = dr.squared_norm(direction - self.direction) / self._chord2
+        return share < 1, dr.sqrt(dr.maximum(1 - share, 0))
+
+
+def mu(p: Any) -> Any:
+    """Cosine from the Sun's local vertical at a point of the unit disc."""
+    return dr.sqrt(dr.maximum(1 - dr.squared_norm(p), 0))
+
+
+class Limb:
+    """Limb darkening as few terms: Σ_k weights[k, b] · term_k(μ) is the radiance of band b over its disc's mean.
+
+    The profiles of neighbouring bands are nearly multiples of one another: a singular value decomposition keeps
+    what stands out above 1e-4.
+    """
+
+    def __init__(self, sun: Sunlight) -> None:
+        bands = len(sun.irradiance_W_m2_nm)
+        self.coefficients, self.weights = np.ones((1, 1)), np.ones((1, bands))
+        self.profiles = sun.limb_darkening
+        if sun.limb_darkening is not None:
+            grid = np.linspace(0, 1, 256)[None, :] ** np.arange(6)[:, None]
+            u, s, _ = np.linalg.svd(sun.limb_darkening @ grid, full_matrices=False)
+            kept = max(1, int(np.sum(s > 1e-4 * s[0])))
+            self.coefficients, self.weights = u[:, :kept].T @ sun.limb_darkening, u[:, :kept].T
+
+    def terms(self, mu: Any) -> list[Any]:
+        """The terms at μ."""
+        return [polynomial(c, mu) for c in self.coefficients]
+
+
+def polynomial(coefficients: np.ndarray, x: Any) -> Any:
+    """Σ c_k xᵏ by Horner's rule; the coefficients are runtime values, not constants of the kernel."""
+    total = dr.opaque(mi.Float, float(coefficients[-1]))
+    for c in coefficients[-2::-1]:
+        total = dr.fma(total, x, dr.opaque(mi.Float, float(c)))
+    return total

@@ -32,9 +32,9 @@ class Strata:
         self._key = dr.opaque(mi.UInt32, key & 0xFFFFFFFF)
         self._wavefront = wavefront
 
-    def square(self) -> tuple[Any, Any]:
-        """A uniform point of each stratum of the pixel, x and y in [0, 1]."""
-        u, v = mi.sample_tea_32(self._wavefront, self._key, 4)
+    def square(self, dimension: int = 0) -> tuple[Any, Any]:
+        """A uniform point of each stratum of the unit square, x and y in [0, 1]; of the pixel, for dimension 0."""
+        u, v = mi.sample_tea_32(self._wavefront, self._key ^ (0x9E3779B9 * dimension & 0xFFFFFFFF), 4)
         sx, sy = self.index & (self.side - 1), self.index >> (self.side.bit_length() - 1)
         # 2⁻³² · u may round to 1.0 in float32, which is still inside the closed stratum: harmless
         return (

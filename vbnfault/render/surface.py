@@ -21,9 +21,16 @@ _OFFSET = 8 * 2.0**-23
 
 class Surface:
     """A triangle mesh in L. `vertices_m` float32[n, 3], `faces` int32[m, 3], `flat` bool[m]: facets shaded with
-    their own normal, such as boulders; the others with normals interpolated from their vertices."""
+    their own normal, such as boulders; the others with normals interpolated from their vertices. `dust` float32[n]
+    in [0, 1]: how far each vertex is covered (default: none is)."""
 
-    def __init__(self, vertices_m: NDArray[np.float32], faces: NDArray[np.int32], flat: NDArray[np.bool_]) -> None:
+    def __init__(
+        self,
+        vertices_m: NDArray[np.float32],
+        faces: NDArray[np.int32],
+        flat: NDArray[np.bool_],
+        dust: NDArray[np.float32] | None = None,
+    ) -> None:
         mesh = mi.Mesh("terrain", len(vertices_m), len(faces))
         parameters = mi.traverse(mesh)
         parameters["vertex_positions"] = mi.Float(np.ascontiguousarray(vertices_m, np.float32).ravel())
@@ -31,11 +38,12 @@ class Surface:
         parameters.update()
         self.scene = mi.load_dict({"type": "scene", "terrain": mesh})
         self._corners = mi.Float(_corner_records(vertices_m, faces, flat).ravel())
-        dr.eval(self._corners)
+        self._dust = mi.Float(0.0 if dust is None else np.ascontiguousarray(_with_a_fourth(dust[faces])).ravel())
+        dr.eval(self._corners, self._dust)
 
-    def intersect(self, rays: Any) -> Hit:
-        """Closest hits."""
-        return Hit(self, rays, self.scene.ray_intersect_preliminary(rays, coherent=True))
+    def intersect(self, rays: Any, active: Any = True, *, coherent: bool = True) -> Hit:
+        """Closest hits; `coherent` where neighbours run alike."""
+        return Hit(self, rays, self.scene.ray_intersect_preliminary(rays, coherent=coherent, active=active))
 
     def occluded(self, rays: Any, active: Any, *, coherent: bool = True) -> Any:
         """Whether anything lies along the rays; `coherent` where neighbours run alike."""
@@ -49,6 +57,7 @@ class Hit:
     def __init__(self, surface: Surface, rays: Any, found: Any) -> None:
         self.valid = found.is_valid()
         self.distance_m = found.t
+        self._surface, self._first = surface, found.prim_index
         self._rays = rays
         b1, b2 = found.prim_uv.x, found.prim_uv.y
         self._weights = (1 - b1 - b2, b1, b2)
@@ -56,6 +65,15 @@ class Hit:
         self._corners = [dr.gather(mi.Vector4f, surface._corners, first + k, self.valid) for k in range(3)]
         w = self._weights
         self.normal = dr.normalize(sum((c.xyz * w[k] for k, c in enumerate(self._corners)), mi.Vector3f(0)))
+
+    @property
+    def dust(self) -> Any:
+        """How far the ground is covered with dust, in [0, 1], interpolated over the facet."""
+        table = self._surface._dust
+        if len(table) == 1:
+            return mi.Float(0)
+        corners = dr.gather(mi.Vector4f, table, self._first, self.valid)
+        return sum((corners[k] * w for k, w in enumerate(self._weights)), mi.Float(0))
 
     def shadow_rays(self, direction: Any) -> Any:
         """Rays from the hits. The origin is moved off the facet to the smooth surface that the corner normals
@@ -67,6 +85,11 @@ class Hit:
             lift += corner.xyz * (weight * dr.maximum(corner.w - dr.dot(point, corner.xyz), 0))
         offset = _OFFSET * (dr.max(dr.abs(point)) + self.distance_m) + 1e-6
         return mi.Ray3f(mi.Point3f(point + lift + self.normal * offset), direction)
+
+
+def _with_a_fourth(three: NDArray[np.float32]) -> NDArray[np.float32]:
+    """float32[m, 4] of float32[m, 3]: a power of two is fetched in one packet."""
+    return np.pad(three.astype(np.float32), ((0, 0), (0, 1)))
 
 
 def _corner_records(

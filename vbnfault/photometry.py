@@ -1,0 +1,292 @@
+"""How the ground reflects: photometric models and their parameters per wavelength.
+
+Every model gives the bidirectional reflectance r in sr⁻¹, radiance over the irradiance of a beam on a plane normal
+to it (BRDF · cos i), so that I/F = πr. The formulas are written once, over an array namespace: `evaluate` takes
+numpy arrays (float64) or drjit arrays (float32, in the renderer) alike.
+
+Directions are unit vectors in the local frame of the surface, z along its normal: `light` towards the Sun, `view`
+towards the camera, each a triple of arrays. Angles are never taken by arccos: in float32 that errs the opposition
+surge by 0.4 % at small phase angles (physics of Hapke 2012 needs tan(α/2) alone).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from functools import cached_property
+from types import SimpleNamespace
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+F64 = NDArray[np.float64]
+Triple = tuple[Any, Any, Any]
+
+NUMPY = SimpleNamespace(
+    exp=np.exp, log=np.log, sqrt=np.sqrt, atan=np.arctan, maximum=np.maximum, minimum=np.minimum, select=np.where
+)
+
+# Below this cosine a direction counts as grazing along the surface: an interpolated normal may put the camera
+# slightly under the horizon of a facet that it does see.
+_LEAST_COSINE = 1e-4
+_TINY = 1e-30
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Diffuse:
+    """A disc function times a phase function times a reflectance: r = (A/π) D(i, e, α) 10^(-0.4 β α).
+
+    `reflectance` float64[band] in [0, 1], the normal reflectance A at zero phase; D is 1 at i = e = α = 0:
+
+    - `lambert`: cos i
+    - `lommel_seeliger`: 2 cos i / (cos i + cos e)
+    - `mcewen`: 2 L cos i / (cos i + cos e) + (1 - L) cos i, the lunar-Lambert function of McEwen (1991, Icarus
+      92, 298), with L(α) = 1 - 0.019 α + 2.42e-4 α² - 1.46e-6 α³, α in degrees, at least 0 (McEwen 1996, LPSC 27).
+
+    `phase_slope_mag_deg` β in magnitudes per degree; 67P has 0.047 in 1.3-54° (Fornasier et al. 2015).
+    """
+
+    reflectance: F64
+    disc: Literal["lambert", "lommel_seeliger", "mcewen"] = "lambert"
+    phase_slope_mag_deg: float = 0.0
+
+    # one shape for all wavelengths: a single term, weighted per band
+    terms: ClassVar[int] = 1
+
+    @property
+    def weights(self) -> F64:
+        """float64[1, band]: what a unit of the term adds to each band."""
+        return self.reflectance[None, :] / np.pi
+
+    def evaluate(self, m: Any, light: Triple, view: Triple) -> list[Any]:
+        """The term: π r / A, 0 where the light comes from below."""
+        mu0, mu = light[2], m.maximum(view[2], _LEAST_COSINE)
+        lit = m.maximum(mu0, 0)
+        if self.disc == "lambert":
+            value = lit
+        else:
+            seeliger = 2 * lit / m.maximum(lit + mu, _LEAST_COSINE)
+            value = seeliger
+            if self.disc == "mcewen":
+                a = _phase_deg(m, light, view)
+                share = m.maximum(1 + a * (-0.019 + a * (2.42e-4 - a * 1.46e-6)), 0)
+                value = share * seeliger + (1 - share) * lit
+        if self.phase_slope_mag_deg:
+            decay = 0.4 * np.log(10) * self.phase_slope_mag_deg
+            value = value * m.exp(-decay * _phase_deg(m, light, view))
+        return [value]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Hapke:
+    """Hapke's model with opposition surges, roughness and porosity (Hapke 2002, Icarus 157, 523; 2012, Theory of
+    Reflectance and Emittance Spectroscopy, 2nd ed., chapters 9 and 12).
+
+    float64[band] each:
+
+    - `single_scattering_albedo` w in [0, 1]
+    - `asymmetry` g in (-1, 1) of the Henyey-Greenstein function; negative scatters back
+    - `shadow_hiding_amplitude` B0 >= 0 and `shadow_hiding_width` h_s > 0 (dimensionless, not an angle)
+    - `coherent_amplitude` B_C0 >= 0 and `coherent_width` h_c > 0
+    - `roughness_deg` mean slope angle, 0 to 60, of relief below a pixel
+    - `porosity_factor` K >= 1
+    """
+
+    single_scattering_albedo: F64
+    asymmetry: F64
+    shadow_hiding_amplitude: F64
+    shadow_hiding_width: F64
+    coherent_amplitude: F64
+    coherent_width: F64
+    roughness_deg: F64
+    porosity_factor: F64
+
+    @property
+    def terms(self) -> int:
+        """The shape changes with wavelength: a term a band."""
+        return len(self.single_scattering_albedo)
+
+    @cached_property
+    def weights(self) -> F64:
+        """float64[band, band]: each term goes to its own band."""
+        return np.eye(self.terms)
+
+    def evaluate(self, m: Any, light: Triple, view: Triple) -> list[Any]:
+        """r per band, 0 where the light comes from below."""
+        lit = light[2] > 0
+        light = (light[0], light[1], m.maximum(light[2], _TINY))
+        view = (view[0], view[1], m.maximum(view[2], _LEAST_COSINE))
+        half = _tan_half_phase(m, light, view)
+        cos_phase = light[0] * view[0] + light[1] * view[1] + light[2] * view[2]
+        shared: dict[tuple[float, float], tuple[Any, ...]] = {}
+        out = []
+        for band in range(self.terms):
+            p = {f.name: float(getattr(self, f.name)[band]) for f in fields(self)}
+            k = p["porosity_factor"]
+            key = p["roughness_deg"], k
+            if key not in shared:
+                mu0, mu, shadowing = _rough(m, light, view, np.radians(p["roughness_deg"]))
+                x0, x = m.maximum(mu0 / k, _TINY), m.maximum(mu / k, _TINY)
+                seeliger = m.select(lit, shadowing * (mu0 / (mu0 + mu)) * (k / (4 * np.pi)), 0)
+                shared[key] = seeliger, x0, x, m.log((1 + x0) / x0), m.log((1 + x) / x)
+            seeliger, x0, x, log0, log1 = shared[key]
+            w = p["single_scattering_albedo"]
+            single = _henyey_greenstein(m, p["asymmetry"], cos_phase)
+            if p["shadow_hiding_amplitude"]:
+                h = p["shadow_hiding_width"]
+                single = single * (1 + p["shadow_hiding_amplitude"] * h / (h + half))
+            multiple = _chandrasekhar(w, x0, log0) * _chandrasekhar(w, x, log1) - 1
+            value = w * seeliger * (single + multiple)
+            if p["coherent_amplitude"]:
+                value = value * (1 + p["coherent_amplitude"] * _coherent(m, half / p["coherent_width"]))
+            out.append(value)
+        return out
+
+
+Photometry = Diffuse | Hapke
+
+
+def radiance_factor(model: Photometry, light: ArrayLike, view: ArrayLike) -> F64:
+    """I/F = πr, float64[band, n], for unit directions float64[n, 3] in the surface's frame (z its normal)."""
+    triples = [tuple(np.atleast_2d(np.asarray(d, dtype=np.float64)).T) for d in (light, view)]
+    with np.errstate(under="ignore"):
+        terms = np.stack(np.broadcast_arrays(*model.evaluate(NUMPY, *triples)))
+    return np.pi * np.einsum("tb,tn->bn", model.weights, terms)
+
+
+# --- parts of the models ------------------------------------------------------------------------------------
+
+
+def _tan_half_phase(m: Any, light: Triple, view: Triple) -> Any:
+    """tan(α/2) = |l - v| / |l + v|."""
+    apart = sum((a - b) * (a - b) for a, b in zip(light, view, strict=True))
+    together = sum((a + b) * (a + b) for a, b in zip(light, view, strict=True))
+    return m.sqrt(apart / m.maximum(together, 1e-12))
+
+
+def _phase_deg(m: Any, light: Triple, view: Triple) -> Any:
+    return np.degrees(2.0) * m.atan(_tan_half_phase(m, light, view))
+
+
+def _henyey_greenstein(m: Any, g: float, cos_phase: Any) -> Any:
+    """P(α) = (1 - g²) / (1 + 2 g cos α + g²)^(3/2)."""
+    base = 1 + g * g + 2 * g * cos_phase
+    return (1 - g * g) / (base * m.sqrt(base))
+
+
+def _chandrasekhar(w: float, x: Any, log: Any) -> Any:
+    """H(x) (Hapke 2002, eq. 13), with log = ln((1 + x) / x)."""
+    gamma = np.sqrt(1 - w)
+    r0 = float((1 - gamma) / (1 + gamma))
+    return 1 / (1 - w * x * (r0 + (0.5 - r0 * x) * log))
+
+
+def _coherent(m: Any, z: Any) -> Any:
+    """[1 + (1 - e^-z) / z] / [2 (1 + z)²], the coherent-backscatter surge (Hapke 2002, eq. 32)."""
+    # the series where the difference has lost its digits
+    share = m.select(z < 1e-2, 1 - z * (0.5 - z * (1 / 6)), (1 - m.exp(-z)) / m.maximum(z, 1e-2))
+    return (1 + share) / (2 * (1 + z) * (1 + z))
+
+
+def _rough(m: Any, light: Triple, view: Triple, theta: float) -> tuple[Any, Any, Any]:
+    """Effective cosines and shadowing S of a rough surface (Hapke 1984, Icarus 59, 41)."""
+    mu0, mu = light[2], view[2]
+    if theta == 0:
+        return mu0, mu, 1.0
+    tan, cot = float(np.tan(theta)), float(1 / np.tan(theta))
+    chi = float(1 / np.sqrt(1 + np.pi * tan * tan))
+    sin_i = m.sqrt(light[0] * light[0] + light[1] * light[1])
+    sin_e = m.sqrt(view[0] * view[0] + view[1] * view[1])
+    # azimuth ψ between the two from the tangent vectors; where one vanishes ψ drops out of all that follows
+    lx, ly = (light[k] / m.maximum(sin_i, 1e-15) for k in (0, 1))
+    vx, vy = (view[k] / m.maximum(sin_e, 1e-15) for k in (0, 1))
+    sin2 = 0.25 * ((lx - vx) * (lx - vx) + (ly - vy) * (ly - vy))
+    cos2 = 0.25 * ((lx + vx) * (lx + vx) + (ly + vy) * (ly + vy))
+    tan_half = m.sqrt(sin2 / m.maximum(cos2, 1e-15))
+    psi_share = m.atan(tan_half) * (2 / np.pi)
+    cos_psi = cos2 - sin2
+    f = m.exp(-2 * tan_half)
+
+    def averages(cos: Any, sin: Any) -> tuple[Any, Any, Any]:
+        c = m.minimum(cot * cos / m.maximum(sin, 1e-15), 1e6)
+        e1, e2 = m.exp(-2 / np.pi * c), m.exp(-1 / np.pi * c * c)
+        return e1, e2, chi * (cos + sin * tan * e2 / (2 - e1))
+
+    e1_i, e2_i, eta_i = averages(mu0, sin_i)
+    e1_e, e2_e, eta_e = averages(mu, sin_e)
+    high = mu0 >= mu  # i <= e
+    e1_far, e1_near = m.select(high, e1_e, e1_i), m.select(high, e1_i, e1_e)
+    e2_far, e2_near = m.select(high, e2_e, e2_i), m.select(high, e2_i, e2_e)
+    scale = tan / (2 - e1_far - psi_share * e1_near)
+    near = (cos_psi * e2_far + sin2 * e2_near) * scale  # of the direction nearer to the normal
+    far = (e2_far - sin2 * e2_near) * scale
+    mu0_e = chi * (mu0 + sin_i * m.select(high, near, far))
+    mu_e = chi * (mu + sin_e * m.select(high, far, near))
+    nearest = m.select(high, mu0 / eta_i, mu / eta_e)
+    shadowing = (mu_e / eta_e) * (mu0 / eta_i) * chi / (1 - f + f * chi * nearest)
+    return mu0_e, mu_e, shadowing
+
+
+# --- parameters ---------------------------------------------------------------------------------------------
+
+# Contrasts between terrains are given at this wavelength, the reference of Fornasier et al. 2015.
+REFERENCE_NM = 649.0
+
+COLUMNS = tuple(f.name for f in fields(Hapke))
+# w, g, B0, h_s, B_C0, h_c, roughness, K at each wavelength
+HAPKE_TABLES: dict[str, tuple[tuple[float, ...], ...]] = {
+    # disc-integrated, per filter (Fornasier et al. 2015, A&A 583, A30, table 3)
+    "67p_fornasier2015": (
+        (325.0, 0.028, -0.35, 1.83, 0.029, 0.0, 1.0, 15.0, 1.0),
+        (480.0, 0.035, -0.43, 1.91, 0.021, 0.0, 1.0, 15.0, 1.0),
+        (535.0, 0.037, -0.42, 1.95, 0.023, 0.0, 1.0, 15.0, 1.0),
+        (649.0, 0.045, -0.41, 1.97, 0.026, 0.0, 1.0, 15.0, 1.0),
+        (700.0, 0.050, -0.38, 2.22, 0.027, 0.0, 1.0, 15.0, 1.0),
+        (743.0, 0.053, -0.40, 1.96, 0.023, 0.0, 1.0, 15.0, 1.0),
+        (882.0, 0.052, -0.40, 2.08, 0.027, 0.0, 1.0, 15.0, 1.0),
+        (989.0, 0.066, -0.35, 2.07, 0.032, 0.0, 1.0, 15.0, 1.0),
+    ),
+    # disc-resolved at 649 nm (the same paper, table 4); w follows the disc-integrated spectrum at other wavelengths
+    "67p_hapke2002": ((649.0, 0.042, -0.37, 2.5, 0.079, 0.188, 0.017, 15.0, 1.0),),
+    "67p_hapke2012": ((649.0, 0.034, -0.42, 2.25, 0.061, 0.0, 1.0, 28.0, 1.20),),
+}
+
+
+def hapke_at(wavelength_nm: ArrayLike, table: str | tuple[tuple[float, ...], ...] = "67p_fornasier2015") -> Hapke:
+    """Hapke's parameters at wavelengths float64[band] in nm, interpolated linearly, constant beyond the ends.
+
+    `table` names one of `HAPKE_TABLES` or gives rows (wavelength in nm, then the columns of `Hapke` in order).
+    The single-wavelength sets of 67P take the relative spectrum of w from the disc-integrated table.
+
+    Raises
+    ------
+    KeyError
+        No table of that name.
+    """
+    wanted = np.asarray(wavelength_nm, dtype=np.float64)
+    rows = np.array(HAPKE_TABLES[table] if isinstance(table, str) else table, dtype=np.float64)
+    rows = rows[np.argsort(rows[:, 0])]
+    columns = {name: np.interp(wanted, rows[:, 0], rows[:, k]) for k, name in enumerate(COLUMNS, start=1)}
+    if isinstance(table, str) and len(rows) == 1:
+        spectrum = np.array(HAPKE_TABLES["67p_fornasier2015"])
+        at, reference = (np.interp(x, spectrum[:, 0], spectrum[:, 1]) for x in (wanted, rows[0, 0]))
+        columns["single_scattering_albedo"] = columns["single_scattering_albedo"] * at / reference
+    return Hapke(**columns)
+
+
+def porosity_factor(filling: float) -> float:
+    """K of the filling factor φ, 0 < φ < 0.75 (Hapke 2008, Icarus 195, 918): 1 for a dilute medium."""
+    x = 1.209 * filling ** (2 / 3)
+    return float(-np.log(1 - x) / x)
+
+
+def geometric_albedo(model: Hapke) -> F64:
+    """float64[band]: A_geo of a smooth sphere (Hapke 2012, eq. 11.34 with K = 1): the published tables' own check.
+
+    r0/2 + r0²/6 + (w/8) [(1 + B0) P(0) - 1]; roughness lowers it by less than 1 % at 15°.
+    """
+    w, g = model.single_scattering_albedo, model.asymmetry
+    gamma = np.sqrt(1 - w)
+    r0 = (1 - gamma) / (1 + gamma)
+    p0 = (1 - g * g) / (1 + g) ** 3
+    return np.asarray(r0 / 2 + r0**2 / 6 + w / 8 * ((1 + model.shadow_hiding_amplitude) * p0 - 1))
