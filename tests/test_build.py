@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import contextlib
+import gc
 import os
 import pickle
 import re
 import shutil
 import signal
+import socket
 import subprocess
 import sys
+import threading
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -336,13 +341,16 @@ def test_a_dask_cluster_makes_the_same_bits(reference: tuple[Path, str], tmp_pat
     distributed = pytest.importorskip("distributed")
     out = tmp_path / "s.zarr"
     with distributed.LocalCluster(
-        n_workers=2, threads_per_worker=2, processes=False, dashboard_address=None
+        n_workers=2, threads_per_worker=2, processes=False, protocol="tcp://", dashboard_address=None
     ) as cluster:
         with pytest.raises(bd.BuildFailed, match=r"sample 5 failed.*KeyError"):
             run(out, Session(raises=frozenset({5})), scheduler=cluster.scheduler_address)
         assert run(out, scheduler=cluster.scheduler_address).built == 1
         with pytest.raises(VbnfaultError, match="no such mesh"):
             run(tmp_path / "t.zarr", Broken(), scheduler=cluster.scheduler_address)
+        worker = next(iter(cluster.scheduler_info["workers"]))
+        with pytest.raises(InputError, match="a Dask worker listens there, no scheduler"):
+            run(tmp_path / "u.zarr", scheduler=worker)
     assert st.digest(out) == reference[1]
 
 
@@ -372,6 +380,48 @@ def test_a_scheduler_that_cannot_be_reached_is_one_sentence(
         run(tmp_path / "s.zarr", scheduler=address)
     assert not (tmp_path / "s.zarr").exists()
     assert capsys.readouterr().err == ""
+
+
+@contextlib.contextmanager
+def listening(reply: bytes | None) -> Iterator[str]:
+    """Address of a socket that sends `reply` to everyone and hangs up; that stays silent where it is None."""
+    kept: list[socket.socket] = []
+
+    def serve() -> None:
+        with contextlib.suppress(OSError):  # closed at the end
+            while True:
+                kept.append(server.accept()[0])
+                if reply is not None:
+                    kept[-1].sendall(reply)
+                    kept.pop().close()
+
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        thread = threading.Thread(target=serve, daemon=True)
+        thread.start()
+        yield f"tcp://127.0.0.1:{server.getsockname()[1]}"
+        server.shutdown(socket.SHUT_RDWR)
+        thread.join()
+    for link in kept:
+        link.close()
+
+
+@pytest.mark.parametrize(
+    "reply", [b"", b"HTTP/1.1 400 Bad\r\n\r\n", bytes(64), None], ids=["closes", "http", "zeros", "silent"]
+)
+def test_what_is_no_dask_scheduler_is_one_sentence(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, reply: bytes | None
+) -> None:
+    pytest.importorskip("distributed")
+    monkeypatch.setattr(bd, "_SECONDS_TO_ANSWER", 2.0)
+    with listening(reply) as address:
+        began = time.monotonic()
+        with pytest.raises(InputError) as e:
+            run(tmp_path / "s.zarr", scheduler=address)
+        assert time.monotonic() - began < 20
+    assert str(e.value) == f"--scheduler {address}: what listens there does not answer as a Dask scheduler does"
+    assert not (tmp_path / "s.zarr").exists()
+    gc.collect()
+    assert capfd.readouterr().err == ""
 
 
 def main(out: str, workers: str, seconds: str, log: str = "") -> int:

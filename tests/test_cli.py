@@ -7,6 +7,7 @@ import os
 import random
 import re
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -17,7 +18,7 @@ import numpy as np
 import pytest
 from conftest import small_scene
 
-from vbnfault import cli, store
+from vbnfault import build, cli, store
 
 ENVIRONMENT = {**os.environ, "PYTHONWARNINGS": "error::UserWarning"}
 
@@ -312,6 +313,18 @@ def test_a_path_that_cannot_be_written_is_one_sentence(
     assert code in (1, 2)
     assert str(blocked) in said
     assert "Traceback" not in said
+
+
+def test_a_port_where_no_scheduler_answers_is_one_sentence(
+    scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("distributed")
+    monkeypatch.setattr(build, "_SECONDS_TO_ANSWER", 1.0)
+    with socket.create_server(("127.0.0.1", 0)) as silent:  # connections wait in its queue for ever
+        address = f"tcp://127.0.0.1:{silent.getsockname()[1]}"
+        code = run(monkeypatch, "build", scene, "--out", tmp_path / "x.zarr", "--scheduler", address)
+    assert_one_sentence(code, capsys.readouterr().err, address)
+    assert not (tmp_path / "x.zarr").exists()
 
 
 def test_no_usable_llvm_is_one_sentence_and_no_abort(scene: Path, tmp_path: Path) -> None:

@@ -8,6 +8,7 @@ no trace in the arrays.
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import json
 import multiprocessing
@@ -22,6 +23,7 @@ import time
 import traceback
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from multiprocessing import connection
 from pathlib import Path
@@ -38,6 +40,7 @@ from .store import Encoded, Store, StoreSpec
 RECYCLE_SHARDS = 32  # a worker process is replaced after so many: long LLVM runs grow and at last fail
 _SECONDS_TO_STOP = 15.0
 _SECONDS_TO_CONNECT = 5.0
+_SECONDS_TO_ANSWER = 15.0  # a busy scheduler takes its time
 _HOPELESS = 32  # so many failed samples and not one success: the rest would fail as well
 _SECONDS_BETWEEN_LINES = 5.0
 
@@ -738,7 +741,8 @@ def _work_on_cluster(pickled: bytes, path: Path, task: _Task) -> list[tuple[int,
 
 
 def _check_scheduler(address: str) -> None:
-    """Refuse an address that is none, or where nothing listens: Dask's client would leave a traceback."""
+    """Refuse an address that is none, or where no Dask scheduler answers: Dask's client would leave a traceback,
+    and would wait for ever for an answer."""
     try:
         from distributed import comm
     except ImportError as error:
@@ -753,6 +757,31 @@ def _check_scheduler(address: str) -> None:
         socket.create_connection((host, port), timeout=_SECONDS_TO_CONNECT).close()
     except (OSError, OverflowError, UnicodeError) as error:
         raise InputError(f"--scheduler {address}: nothing answers there: {error}") from error
+    with ThreadPoolExecutor(1) as pool:  # a loop of its own: the caller's thread may be running one
+        kind = pool.submit(asyncio.run, _kind_of_dask_node(address)).result()
+    if not kind:
+        raise InputError(f"--scheduler {address}: what listens there does not answer as a Dask scheduler does")
+    if kind != "Scheduler":
+        raise InputError(f"--scheduler {address}: a Dask {kind.lower()} listens there, no scheduler")
+
+
+async def _kind_of_dask_node(address: str) -> str:
+    """`Scheduler`, `Worker` or `Nanny`, as what listens there says; empty where it does not speak Dask."""
+    from distributed import Security, comm
+
+    async def ask() -> Any:
+        link = await comm.connect(address, timeout=_SECONDS_TO_ANSWER, **Security().get_connection_args("client"))
+        try:
+            await link.write({"op": "identity", "reply": True})
+            return await link.read()
+        finally:
+            link.abort()
+
+    try:
+        answer = await asyncio.wait_for(ask(), _SECONDS_TO_ANSWER)
+        return str(answer["type"])
+    except Exception:  # other protocols are read as Dask's: absurd sizes, undecodable messages, silence
+        return ""
 
 
 def _run_on_dask(factory: SessionFactory, run: _Run, scheduler: str) -> None:
