@@ -1,4 +1,4 @@
-"""Rendered light against closed forms: phase curves, limb darkening, penumbrae, light between surfaces, the plugin."""
+"""Rendered light against closed forms: phase curves, limb, penumbrae, light between surfaces, the plugin."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from test_photometry import SETS, by_angles, directions, model
+from test_photometry import SETS, by_angles, directions
 from test_render import NODES, UP, join, plane, sun, view
 
 from vbnfault import frames, render, spectra
@@ -78,7 +78,7 @@ def test_every_band_has_its_own_phase_function() -> None:
     rows = np.column_stack([getattr(hapke_at(NODES), name) for name in _columns()])
     i = np.radians(55.0)
     expected = [by_angles(i, 1e-6, 0.0, tuple(row)) for row in rows] * light.irradiance_W_m2_nm
-    # half a degree of field and the disc's quarter of a degree change cos i by 0.2 % at most, and cancel to first order
+    # half a degree of field and a quarter of disc change cos i by 0.2 % at most, and cancel to first order
     np.testing.assert_allclose(got, expected, rtol=1e-3)
 
 
@@ -228,7 +228,7 @@ def test_light_from_a_wall(bounces: int, *, dusty: bool) -> None:
     once = 0.3 * light.irradiance_W_m2_nm * factor * 0.3 / np.pi
     if bounces == 1:
         np.testing.assert_allclose(image, once, rtol=0.005)
-    else:  # light from wall to floor to wall to floor cannot come in two reflections more than one: wall, floor, wall
+    else:  # a second reflection adds wall, floor, wall, floor: some per cent
         assert (image >= once * 0.995).all()
         assert (image < once * 1.1).all()
 

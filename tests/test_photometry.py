@@ -113,7 +113,7 @@ def test_reciprocity(name: str) -> None:
 
 
 def hemispherical_albedo(parameters: tuple[float, ...], incidence_deg: float) -> float:
-    """Reflected over incident power: ∫ r cos e dω / cos i by Gauss-Legendre in cos e and the trapezoid in azimuth."""
+    """Reflected over incident power: ∫ r cos e dω / cos i by Gauss-Legendre in cos e, trapezoid in azimuth."""
     mu, weight = np.polynomial.legendre.leggauss(96)
     mu, weight = (mu + 1) / 2, weight / 2
     azimuth = (np.arange(128) + 0.5) * 2 * np.pi / 128
@@ -126,8 +126,8 @@ def hemispherical_albedo(parameters: tuple[float, ...], incidence_deg: float) ->
 
 @pytest.mark.parametrize("incidence_deg", [0.0, 45.0, 80.0])
 def test_energy_is_conserved_by_isotropic_scatterers(incidence_deg: float) -> None:
-    # g = 0, B0 = 0, K = 1, smooth. With the exact H functions the albedo is 1 - γ H(μ0). Hapke's H errs by under 1 %
-    # (Hapke 2002): 2 % of an albedo up to 1 through the product of two, 1 % of γ H through the closed form.
+    # g = 0, B0 = 0, K = 1, smooth. With the exact H functions the albedo is 1 - γ H(μ0). Hapke's H errs by under
+    # 1 % (Hapke 2002): 2 % of an albedo up to 1 through the product of two, 1 % of γ H through the closed form.
     for w in (0.05, 0.5, 0.9, 0.999999):
         albedo = hemispherical_albedo((w, 0.0, 0.0, 1.0, 0.0, 1.0, 0.0, 1.0), incidence_deg)
         gamma = math.sqrt(1 - w)
@@ -138,7 +138,7 @@ def test_energy_is_conserved_by_isotropic_scatterers(incidence_deg: float) -> No
 
 
 def test_published_geometric_albedos() -> None:
-    # Fornasier et al. 2015, table 3; its parameters are printed with two digits: 1/2 in the last of w = 0.028 is 2 %
+    # Fornasier et al. 2015, table 3; its parameters have two digits: 1/2 in the last of w = 0.028 is 2 %
     published = {480: 0.0554, 535: 0.0589, 649: 0.0677, 700: 0.0720, 743: 0.0766, 882: 0.0780}
     got = photometry.geometric_albedo(hapke_at(np.array([*published], dtype=float)))
     np.testing.assert_allclose(got, [*published.values()], rtol=0.03)
