@@ -23,7 +23,7 @@ EVERYWHERE = {"errors", "resources", "__init__"}
 FOUNDATION = {"llvm", "spectra", "quantities", "config", "frames"}
 GEOMETRY = FOUNDATION | {"body", "plan", "scene"}
 CAMERA = {"spectra", "quantities", "llvm", "lens", "detector", "camera"}
-PIPELINE = GEOMETRY | CAMERA | {"render", "faults", "labels", "pipeline"}
+PIPELINE = GEOMETRY | CAMERA | {"sky", "spacecraft", "render", "faults", "labels", "pipeline"}
 DATASET = PIPELINE | {"store", "build", "dataset"}
 MAY_IMPORT: dict[str, set[str]] = {
     "__init__": set(),
@@ -37,6 +37,8 @@ MAY_IMPORT: dict[str, set[str]] = {
     "body": FOUNDATION,
     "plan": FOUNDATION | {"body"},
     "scene": FOUNDATION | {"body", "plan"},
+    "sky": {"spectra", "quantities", "frames"},
+    "spacecraft": {"frames"},
     "render": {"scene", "llvm", "quantities"},  # quantities: what it returns
     "lens": {"spectra", "quantities", "llvm"},
     "detector": {"spectra", "quantities"},
