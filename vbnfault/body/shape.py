@@ -10,6 +10,7 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
+from vbnfault.body import formats
 from vbnfault.errors import InputError
 
 Unit = Literal["auto", "m", "km"]
@@ -20,9 +21,10 @@ METRES_PER_KM = 1000.0
 # Dimorphos, the smallest body with a shape model, is 177 m long; Lutetia, the largest usually given in
 # kilometres to this kind of work, 121 km. No extent between the two is ambiguous.
 AUTO_KM_BELOW_EXTENT = 150.0
-FILE_TYPES = (".obj", ".ply", ".stl", ".glb", ".gltf")
-# These formats store a vertex once per face or per texture seam, so welding mends nothing worth a warning.
-_SPLIT_VERTEX_TYPES = (".stl", ".glb", ".gltf")
+FILE_TYPES = (".obj", ".ply", ".stl", ".glb", ".gltf", *formats.SUFFIXES)
+# These store a vertex once per face or per seam (plate tables and DSKs made from the six faces of an ICQ), so
+# welding mends nothing worth a warning.
+_SPLIT_VERTEX_TYPES = (".stl", ".glb", ".gltf", *formats.SUFFIXES)
 _LARGEST_HOLE_EDGES = 8
 # Relative to the squared extent: below it a facet's normal is rounding noise in float64.
 _DEGENERATE_AREA_FRACTION = 1e-16
@@ -34,12 +36,14 @@ def load_shape(path: str | Path, unit: Unit = "auto") -> tuple[Float64, Int32]:
     Parameters
     ----------
     path
-        OBJ, PLY, STL, GLB or GLTF file. Polygons are triangulated, several objects joined.
+        OBJ, PLY, STL, GLB or GLTF file; PDS plate table (TAB, PLT, VER, TXT), Gaskell's ICQ (ICQ, TAB, TXT),
+        VRML (WRL); NAIF DSK (BDS), which needs spiceypy: `pip install 'vbnfault[spice]'`. Which of the tables it
+        is, the content says. Polygons are triangulated, several objects joined.
     unit
-        Unit of the file: "m", "km", or "auto": kilometres if the longest side of the bounding box is below
-        150, else metres. No body with a shape model lies between Dimorphos (177 m) and the bodies modelled
-        in kilometres (Lutetia 121 km); for larger ones in kilometres (Vesta) or smaller ones in metres give
-        the unit.
+        Unit of the file: "m", "km", or "auto": kilometres if the format defines them (DSK) or the longest side of
+        the bounding box is below 150, else metres. No body with a shape model lies between Dimorphos (177 m) and
+        the bodies modelled in kilometres (Lutetia 121 km); for larger ones in kilometres (Vesta) or smaller ones
+        in metres give the unit, which always wins.
 
     Returns
     -------
@@ -63,6 +67,24 @@ def load_shape(path: str | Path, unit: Unit = "auto") -> tuple[Float64, Int32]:
         raise InputError(f"{path}: unsupported shape type {suffix!r}; allowed are {', '.join(FILE_TYPES)}.")
     if path.stat().st_size == 0:
         raise InputError(f"{path}: shape file is empty.")
+    native: Unit | None = None
+    if suffix in formats.SUFFIXES:
+        raw = formats.read_shape(path)
+        vertices, faces, native = raw.vertices, raw.faces, raw.unit
+    else:
+        vertices, faces = _read_with_trimesh(path)
+    _check_arrays(vertices, faces, str(path))
+    if unit == "auto":
+        extent = float(np.ptp(vertices, axis=0).max())
+        unit = native or ("km" if extent < AUTO_KM_BELOW_EXTENT else "m")
+    if unit == "km":
+        vertices = vertices * METRES_PER_KM
+    if suffix in _SPLIT_VERTEX_TYPES:
+        vertices, faces, _ = _weld(vertices, faces)
+    return check_mesh(vertices, faces, str(path))
+
+
+def _read_with_trimesh(path: Path) -> tuple[Float64, NDArray[np.int64]]:
     try:
         # numpy warns on NaN while the readers normalise; the check below reports it as an error.
         with warnings.catch_warnings(), np.errstate(all="ignore"):
@@ -71,15 +93,9 @@ def load_shape(path: str | Path, unit: Unit = "auto") -> tuple[Float64, Int32]:
             vertices = np.array(getattr(mesh, "vertices", np.empty((0, 3))), dtype=np.float64)
             faces = np.array(getattr(mesh, "faces", np.empty((0, 3))), dtype=np.int64)
     except Exception as error:  # the readers raise whatever their parsers raise
-        kind, what = suffix[1:].upper(), type(error).__name__
+        kind, what = path.suffix[1:].upper(), type(error).__name__
         raise InputError(f"{path}: is unreadable as {kind} ({what} while parsing).") from None
-    _check_arrays(vertices, faces, str(path))
-    extent = float(np.ptp(vertices, axis=0).max())
-    if unit == "km" or (unit == "auto" and extent < AUTO_KM_BELOW_EXTENT):
-        vertices = vertices * METRES_PER_KM
-    if suffix in _SPLIT_VERTEX_TYPES:
-        vertices, faces, _ = _weld(vertices, faces)
-    return check_mesh(vertices, faces, str(path))
+    return vertices, faces
 
 
 def check_mesh(vertices: NDArray, faces: NDArray, source: str) -> tuple[Float64, Int32]:

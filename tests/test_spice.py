@@ -1,0 +1,309 @@
+"""SPICE kernels against the built-in ephemeris, rotation and frames; every kernel is written here."""
+
+from __future__ import annotations
+
+import sys
+import threading
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from vbnfault import frames, spice
+from vbnfault.errors import InputError
+
+spiceypy: Any = pytest.importorskip("spiceypy", reason="spiceypy (the extra 'spice') is not installed")
+
+COMET, SPACECRAFT, CAMERA = 1000012, -999, -999100
+ET_S = 300_000_000.0  # 2009-07-04, within every kernel below
+JD = spice.julian_date_from_et_s(ET_S)
+
+# Scholten, Cheops frame document: the constants of the built-in 67P. SPICE knows the body's name by itself.
+PCK = r"""KPL/PCK
+\begindata
+BODY1000012_POLE_RA = ( 69.54 0. 0. )
+BODY1000012_POLE_DEC = ( 64.11 0. 0. )
+BODY1000012_PM = ( 114.69 696.543884683 0. )
+\begintext
+"""
+LSK = r"""KPL/LSK
+\begindata
+DELTET/DELTA_T_A = 32.184
+DELTET/K = 1.657D-3
+DELTET/EB = 1.671D-2
+DELTET/M = ( 6.239996D0 1.99096871D-7 )
+DELTET/DELTA_AT = ( 32, @1999-JAN-1, 33, @2006-JAN-1, 34, @2009-JAN-1, 35, @2012-JUL-1 )
+\begintext
+"""
+FK = rf"""KPL/FK
+\begindata
+NAIF_BODY_NAME += ( 'TESTCRAFT' )
+NAIF_BODY_CODE += ( {SPACECRAFT} )
+FRAME_COMET_FIXED = 1400012
+FRAME_1400012_NAME = 'COMET_FIXED'
+FRAME_1400012_CLASS = 2
+FRAME_1400012_CLASS_ID = {COMET}
+FRAME_1400012_CENTER = {COMET}
+FRAME_TEST_BUS = {SPACECRAFT}000
+FRAME_{SPACECRAFT}000_NAME = 'TEST_BUS'
+FRAME_{SPACECRAFT}000_CLASS = 3
+FRAME_{SPACECRAFT}000_CLASS_ID = {SPACECRAFT}000
+FRAME_{SPACECRAFT}000_CENTER = {SPACECRAFT}
+CK_{SPACECRAFT}000_SCLK = {SPACECRAFT}
+CK_{SPACECRAFT}000_SPK = {SPACECRAFT}
+FRAME_TEST_CAMERA = {CAMERA}
+FRAME_{CAMERA}_NAME = 'TEST_CAMERA'
+FRAME_{CAMERA}_CLASS = 4
+FRAME_{CAMERA}_CLASS_ID = {CAMERA}
+FRAME_{CAMERA}_CENTER = {SPACECRAFT}
+TKFRAME_{CAMERA}_SPEC = 'MATRIX'
+TKFRAME_{CAMERA}_RELATIVE = 'TEST_BUS'
+TKFRAME_{CAMERA}_MATRIX = ( 0 1 0  -1 0 0  0 0 1 )
+\begintext
+"""
+# Ticks of a second since J2000.0, counted in TDB: encoded time is ephemeris time.
+SCLK = r"""KPL/SCLK
+\begindata
+SCLK_KERNEL_ID = ( @2009-JAN-1 )
+SCLK_DATA_TYPE_999 = ( 1 )
+SCLK01_TIME_SYSTEM_999 = ( 1 )
+SCLK01_N_FIELDS_999 = ( 1 )
+SCLK01_MODULI_999 = ( 4000000000 )
+SCLK01_OFFSETS_999 = ( 0 )
+SCLK01_OUTPUT_DELIM_999 = ( 1 )
+SCLK_PARTITION_START_999 = ( 0.0 )
+SCLK_PARTITION_END_999 = ( 4.0E9 )
+SCLK01_COEFFICIENTS_999 = ( 0 0 1 )
+\begintext
+"""
+BUS_FROM_J = frames.rx(0.3) @ frames.rz(-1.1)
+POSITION_T_M = np.array([12_000.0, -34_000.0, 56_000.0])
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Text kernels, an SPK of the two-body comet and of a spacecraft at rest in T, a CK of a constant attitude."""
+    folder = tmp_path_factory.mktemp("kernels")
+    for name, text in (("a.tpc", PCK), ("a.tls", LSK), ("a.tf", FK), ("a.tsc", SCLK)):
+        (folder / name).write_text(text)
+
+    epochs = ET_S + np.arange(-40, 41) * 3600.0
+    orbit = [orbit_state_J_km(et) for et in epochs]
+    rotation = frames.Rotation(
+        pole_ra_deg=69.54, pole_dec_deg=64.11, prime_meridian_deg=114.69, period_h=8640 / 696.543884683
+    )
+    near = ET_S + np.arange(-10, 11) * 60.0
+    at_rest = [
+        np.r_[rotation.J_from_T(spice.julian_date_from_et_s(et)) @ POSITION_T_M / 1000, np.zeros(3)] for et in near
+    ]
+    handle = spiceypy.spkopn(str(folder / "a.bsp"), "test", 0)
+    # Hermite (13) for the comet, whose states come with velocities; Lagrange (9) for positions alone.
+    spiceypy.spkw13(handle, COMET, 10, "J2000", epochs[0], epochs[-1], "comet", 7, len(epochs), orbit, epochs)
+    spiceypy.spkw09(handle, SPACECRAFT, COMET, "J2000", near[0], near[-1], "craft", 7, len(near), at_rest, near)
+    spiceypy.spkcls(handle)
+
+    handle = spiceypy.ckopn(str(folder / "a.bc"), "test", 0)
+    ticks = np.array([ET_S - 500, ET_S + 500])
+    spiceypy.ckw03(
+        handle, ticks[0], ticks[-1], SPACECRAFT * 1000, "J2000", False, "bus", 2, ticks,
+        np.array([spiceypy.m2q(BUS_FROM_J)] * 2), np.zeros((2, 3)), 1, ticks[:1],
+    )  # fmt: skip
+    spiceypy.ckcls(handle)
+    spiceypy.kclear()
+    return folder
+
+
+def conic_elements() -> np.ndarray:
+    """The built-in orbit as SPICE's conic elements: km, rad, s; μ from the mean motion, n² a³."""
+    orbit = frames.ORBIT_67P
+    perihelion_km = orbit.perihelion_au * spice.KM_PER_AU
+    a_km = perihelion_km / (1 - orbit.eccentricity)
+    mu = (np.radians(orbit.mean_motion_deg_day) / spice.SECONDS_PER_DAY) ** 2 * a_km**3
+    angles = np.radians([orbit.inclination_deg, orbit.node_deg, orbit.argument_deg])
+    return np.array(
+        [perihelion_km, orbit.eccentricity, *angles, 0.0, spice.et_s_from_julian_date(orbit.perihelion_jd), mu]
+    )
+
+
+def orbit_state_J_km(et_s: float) -> np.ndarray:
+    """Heliocentric state in ICRF axes, km and km/s, by SPICE's propagation of the conic."""
+    rotate = spiceypy.pxform("ECLIPJ2000", "J2000", et_s)
+    state = spiceypy.conics(conic_elements(), et_s)
+    return np.r_[rotate @ state[:3], rotate @ state[3:]]
+
+
+def all_of(folder: Path) -> list[Path]:
+    return [folder / f"a.{suffix}" for suffix in ("tls", "tpc", "tf", "tsc", "bsp", "bc")]
+
+
+# --- the built-in models -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("julian_date", [2451545.0, 2456876.0, 2456974.0, 2457247.5886578634, 2457468.5])
+def test_rotation_is_that_of_a_text_pck(folder: Path, julian_date: float) -> None:
+    rotation = frames.Rotation(
+        pole_ra_deg=69.54, pole_dec_deg=64.11, prime_meridian_deg=114.69, period_h=8640 / 696.543884683
+    )
+    with spice.kernels(folder / "a.tpc", folder / "a.tf"):
+        ours, theirs = (
+            rotation.J_from_T(julian_date),
+            spice.J_from_T("COMET_FIXED", spice.et_s_from_julian_date(julian_date)),
+        )
+    # 6000 days of 12 rad hold W to 7e4 rad · 2⁻⁵³ ≈ 1e-11 rad.
+    between = frames.quaternion(ours @ theirs.T)
+    assert 2 * np.linalg.norm(between[1:]) < 1e-9
+
+
+@pytest.mark.parametrize("days", [-540.0, -200.0, -1.0, 0.0, 3.0, 77.7, 540.0])
+def test_two_body_ephemeris_is_that_of_spice(days: float) -> None:
+    julian_date = frames.ORBIT_67P.perihelion_jd + days
+    ours = frames.ORBIT_67P.position_J_au(julian_date)
+    theirs = orbit_state_J_km(spice.et_s_from_julian_date(julian_date))[:3] / spice.KM_PER_AU
+    # SPICE's obliquity, 84381.448", has two digits more than the built-in one: 2e-10 rad. A Julian date holds
+    # 4e-5 s, in which the comet moves 1.4 m or 1e-11 au.
+    np.testing.assert_allclose(ours, theirs, rtol=0, atol=1e-9 * np.linalg.norm(theirs))
+
+
+def test_julian_dates_and_ephemeris_time() -> None:
+    assert spice.et_s_from_julian_date(2451545.0) == 0.0
+    assert spice.julian_date_from_et_s(86400.0) == 2451546.0
+    assert spice.et_s_from_julian_date(JD) == pytest.approx(ET_S, abs=1e-4)  # a Julian date holds 4e-5 s
+
+
+# --- positions, attitudes, poses -----------------------------------------------------------------------------
+
+
+def test_sun_position_is_the_opposite_of_the_orbit(folder: Path) -> None:
+    with spice.kernels(*all_of(folder)):
+        for target in ("67P/CHURYUMOV-GERASIMENKO (1969 R1)", str(COMET)):
+            sun_J_au = spice.sun_position_J_au(target, ET_S)
+            np.testing.assert_allclose(sun_J_au, -frames.ORBIT_67P.position_J_au(JD), rtol=0, atol=1e-8)
+    assert (sun_J_au.shape, sun_J_au.dtype) == ((3,), np.float64)
+
+
+def test_pose_of_a_spacecraft_at_rest_in_T(folder: Path) -> None:
+    K_from_C = frames.rz(np.pi)
+    with spice.kernels(*all_of(folder)):
+        T_from_J = spice.J_from_T("COMET_FIXED", ET_S).T
+        pose = spice.pose_T("TESTCRAFT", str(COMET), "COMET_FIXED", "TEST_CAMERA", ET_S)
+        turned = spice.pose_T("TESTCRAFT", str(COMET), "COMET_FIXED", "TEST_CAMERA", ET_S, K_from_C)
+    # The epochs were rounded to Julian dates, 2e-5 s, in which T turns by 2e-4 m at 67 km.
+    np.testing.assert_allclose(pose.camera_position_T_m, POSITION_T_M, rtol=0, atol=1e-3)
+    # The matrix of a TK frame kernel, listed by columns, takes the camera's axes to the bus's.
+    bus_from_camera = np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1.0]])
+    np.testing.assert_allclose(pose.T_from_C, T_from_J @ BUS_FROM_J.T @ bus_from_camera, atol=1e-12)
+    np.testing.assert_allclose(pose.T_from_C @ pose.T_from_C.T, np.eye(3), atol=1e-14)
+    np.testing.assert_allclose(turned.T_from_C, pose.T_from_C @ K_from_C, atol=1e-12)
+    # The boresight is the bus's z: not touched by a turn about it.
+    np.testing.assert_allclose(turned.T_from_C[:, 2], T_from_J @ BUS_FROM_J[2], atol=1e-12)
+
+
+def test_utc_counts_leap_seconds(folder: Path) -> None:
+    with spice.kernels(folder / "a.tls"):
+        # 34 leap seconds and TT - TAI = 32.184 s; TDB - TT is below 2 ms.
+        assert spice.et_s_from_utc("2010-01-01T12:00:00") == pytest.approx(3653 * 86400 + 66.184, abs=2e-3)
+        with pytest.raises(InputError, match="UTC 'yesterday'"):
+            spice.et_s_from_utc("yesterday")
+
+
+# --- the kernel pool -----------------------------------------------------------------------------------------
+
+
+def test_kernels_leave_nothing_behind(folder: Path) -> None:
+    spiceypy.furnsh(str(folder / "a.tls"))  # a user's own, to be left alone
+    try:
+        with spice.kernels(*all_of(folder)), spice.kernels(folder / "a.tpc"):
+            assert spiceypy.ktotal("ALL") == 8
+        assert spiceypy.ktotal("ALL") == 1
+        with pytest.raises(ZeroDivisionError), spice.kernels(folder / "a.tpc"):
+            _ = 1 / 0
+        assert spiceypy.ktotal("ALL") == 1
+        assert spice.et_s_from_utc("2010-01-01T12:00:00") > 0
+    finally:
+        spiceypy.kclear()
+    with pytest.raises(InputError, match="no leap-second kernel is loaded"):
+        spice.et_s_from_utc("2010-01-01T12:00:00")
+
+
+def test_meta_kernels(folder: Path, tmp_path: Path) -> None:
+    meta = tmp_path / "all.tm"
+    listed = " ".join(f"'$K/{path.name}'" for path in all_of(folder))
+    text = (
+        f"KPL/MK\n\\begindata\nPATH_VALUES = ( '{folder}' )\nPATH_SYMBOLS = ( 'K' )\nKERNELS_TO_LOAD = ( {{}} )\n"
+    )
+    meta.write_text(text.format(listed))
+    with spice.kernels(meta):
+        assert np.linalg.norm(spice.sun_position_J_au(str(COMET), ET_S)) > 1
+    assert spiceypy.ktotal("ALL") == 0
+    meta.write_text(text.format(listed + " '$K/lost.bsp'"))
+    with pytest.raises(InputError, match=r"all\.tm: SPICE says: .*lost\.bsp"), spice.kernels(meta):
+        pass
+    assert spiceypy.ktotal("ALL") == 0
+
+
+def test_threads_take_turns(folder: Path) -> None:
+    entered: list[int] = []
+
+    def load() -> None:
+        with spice.kernels(folder / "a.tls"):
+            entered.append(spiceypy.ktotal("ALL"))
+
+    thread = threading.Thread(target=load)
+    with spice.kernels(folder / "a.tpc"):
+        thread.start()
+        thread.join(0.2)
+        assert entered == []
+    thread.join(10)
+    assert entered == [1]
+
+
+# --- errors --------------------------------------------------------------------------------------------------
+
+
+def test_missing_kernels_are_named(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    nowhere = tmp_path / "nowhere.tm"
+    with pytest.raises(InputError, match=r"nowhere\.tm: SPICE kernel not found\.$"), spice.kernels(nowhere):
+        pass
+    with pytest.raises(InputError, match="at least one path"), spice.kernels():
+        pass
+    (tmp_path / "rubbish.bsp").write_bytes(b"DAF/SPK " + bytes(100))
+    with pytest.raises(InputError, match=r"rubbish\.bsp: "), spice.kernels(tmp_path / "rubbish.bsp"):
+        pass
+    assert spiceypy.ktotal("ALL") == 0
+    monkeypatch.setitem(sys.modules, "spiceypy", None)
+    with pytest.raises(InputError, match=r"pip install 'vbnfault\[spice\]'"), spice.kernels(folder / "a.tls"):
+        pass
+
+
+def test_what_the_kernels_do_not_hold_is_said_in_a_sentence(folder: Path) -> None:
+    far = ET_S + 1e8
+
+    def pose(
+        spacecraft: str = "TESTCRAFT", camera_frame: str = "TEST_CAMERA", et_s: float = ET_S, **more: Any
+    ) -> Any:
+        return spice.pose_T(spacecraft, str(COMET), "COMET_FIXED", camera_frame, et_s, **more)
+
+    cases = [
+        (
+            lambda: spice.sun_position_J_au(str(COMET), far),
+            r"Sun from 1000012 at JD 2456174\.\d+ TDB: .*no position",
+        ),
+        (lambda: spice.sun_position_J_au("NOBODY", ET_S), "Sun from NOBODY at .*no body of that name"),
+        (lambda: spice.J_from_T("NOFRAME", ET_S), "frame NOFRAME at .*: the kernels define no such frame"),
+        (lambda: spice.J_from_T("IAU_EROS", ET_S), "frame IAU_EROS at "),
+        (lambda: spice.J_from_T("TEST_BUS", ET_S + 5000), "frame TEST_BUS at .*: the kernels hold no attitude"),
+        (lambda: pose(et_s=ET_S + 700), "TESTCRAFT from 1000012 in frame COMET_FIXED at .*no position"),
+        (lambda: pose(et_s=ET_S + 550), "frame TEST_CAMERA in COMET_FIXED at .*no attitude"),
+        (lambda: pose(spacecraft="VOYAGER 9"), "VOYAGER 9 from .*no body of that name"),
+        (lambda: pose(camera_frame="TEST_LENS"), "frame TEST_LENS in .*no such frame"),
+        (lambda: pose(K_from_C=np.diag([1.0, 1.0, -1.0])), "K_from_C must be a 3 × 3 rotation"),
+    ]
+    with spice.kernels(*all_of(folder)):
+        for ask, says in cases:
+            with pytest.raises(InputError, match=says) as caught:
+                ask()
+            assert "\n" not in str(caught.value)
+            assert str(caught.value).endswith(".")
+    with pytest.raises(InputError, match="no kernel with positions is loaded"):
+        spice.sun_position_J_au(str(COMET), ET_S)

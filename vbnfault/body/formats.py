@@ -1,0 +1,662 @@
+"""Readers of the shape formats of small-body science: plate tables, Gaskell's ICQ, VRML, NAIF's DSK.
+
+Each reader takes a file's bytes (the DSK reader its path) and the name to use in messages, and returns the
+file's own mesh: vertices float64[n, 3] in the file's unit, faces int64[m, 3] counted from 0, indices within range.
+What the mesh bounds is for `shape.check_mesh` to say. A malformed file raises InputError with the line.
+"""
+
+from __future__ import annotations
+
+import re
+import warnings
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from itertools import islice
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vbnfault.errors import InputError
+
+Float64 = NDArray[np.float64]
+Int64 = NDArray[np.int64]
+Mesh = tuple[Float64, Int64]
+Lines = Callable[[int], int]
+
+SUFFIXES = (".tab", ".plt", ".ver", ".txt", ".icq", ".wrl", ".bds")
+
+_UNSIGNED = rb"(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][+-]?[0-9]+)?"
+_NUMBER = rb"[+-]?" + _UNSIGNED
+_NOT_A_NUMBER = re.compile(rb"(?<!\S)(?!" + _NUMBER + rb"(?:-" + _UNSIGNED + rb")*(?!\S))\S+")
+_FORTRAN = bytes.maketrans(b"Dd,", b"Ee ")
+_GLUED = re.compile(rb"(?<=[0-9.])-")
+# Gaskell's faces are stored with their common edges twice, rounded alike; more than this apart they do not meet.
+_ICQ_GAP_FRACTION = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class RawShape:
+    """A mesh as its file has it.
+
+    Attributes
+    ----------
+    vertices, faces
+        float64[n, 3] in the file's unit, int64[m, 3] from 0.
+    unit
+        "km" where the format defines it, else None.
+    """
+
+    vertices: Float64
+    faces: Int64
+    unit: Literal["km"] | None = None
+
+
+def read_shape(path: Path) -> RawShape:
+    """Read a file of one of `SUFFIXES`, whose content says which reader it needs.
+
+    Raises
+    ------
+    InputError
+        The file is of none of the formats, malformed, or a DSK and spiceypy is not installed.
+    """
+    source = str(path)
+    with path.open("rb") as file:
+        head = file.read(65536)
+    if head.startswith((b"DAS/DSK", b"NAIF/DAS")):
+        return RawShape(*read_dsk(path), unit="km")
+    if path.suffix.lower() == ".bds":
+        raise InputError(f"{source}: line 1: expected the mark 'DAS/DSK' of a NAIF DSK, found {_shown(head)}.")
+    data = path.read_bytes()
+    if b"\0" in data:
+        raise InputError(f"{source}: line {_line(data, data.index(0))}: expected text, found binary data.")
+    if re.match(rb"\s*#VRML", data) or path.suffix.lower() == ".wrl":
+        return RawShape(*read_vrml(data, source))
+    data = _without_comments(data)
+    if not data.translate(_FORTRAN).strip():
+        raise InputError(f"{source}: line 1: expected vertices and facets, found nothing.")
+    if re.match(rb"\s*[A-Za-z]", data):
+        return RawShape(*read_vertex_facet_letters(data, source))
+    if path.suffix.lower() == ".icq" or _is_icq(data):
+        return RawShape(*read_icq(data, source))
+    return RawShape(*read_plate_table(data, source))
+
+
+def read_plate_table(data: bytes, source: str) -> Mesh:
+    """A table of vertices and one of triangular plates, as in the PDS Small Bodies Node's models.
+
+    The number of vertices, then of plates, both first or each above its table. A vertex is `x y z`, a plate three
+    vertex numbers; either may be preceded by its own number, or, as in OSIRIS's .ver, a plate by the count 3.
+    Numbers are counted from 1, or from 0 where a 0 occurs. Fixed or free format, commas, D exponents.
+
+    Raises
+    ------
+    InputError
+        With the line: no number where one is due, counts that the tables do not keep, numbers out of range, or
+        vertices given as latitude, longitude and radius.
+    """
+    table = _numbers(data, source)
+    first = table[0]
+    if not (first == np.floor(first) and 4 <= first < 2**31):
+        at = _token_line(data, 0)
+        raise InputError(
+            f"{source}: line {at}: expected the number of vertices, an integer of at least 4, found {first:g}."
+        )
+    layout = _layout(table)
+    if layout is None:
+        raise _table_error(data, table, source)
+    vertex_at, vertex_width, face_at, face_width, faces_n = layout
+    vertices_n = int(first)
+    vertices = table[vertex_at : vertex_at + vertex_width * vertices_n].reshape(-1, vertex_width)[:, -3:]
+    faces = table[face_at : face_at + face_width * faces_n].reshape(-1, face_width)[:, -3:]
+
+    def line(row: int) -> int:
+        return _token_line(data, face_at + face_width * row + face_width - 3)
+
+    mesh = _from_one(vertices, faces, source, line)
+    x, y, z = mesh[0].T
+    # A body-centred Cartesian model has vertices on both sides of the equator.
+    if z.min() > 0 and np.abs(x).max() <= 90 and np.ptp(x) > 150 and y.min() >= -180 and np.ptp(y) > 300:
+        at = _token_line(data, vertex_at)
+        raise InputError(
+            f"{source}: line {at}: expected Cartesian coordinates, found what looks like latitude, longitude and "
+            "radius."
+        )
+    return mesh
+
+
+def read_vertex_facet_letters(data: bytes, source: str) -> Mesh:
+    """Lines `v x y z` and `f a b c`, as in the PDS's radar shapes and early models of Eros.
+
+    Numbers are counted from 1, or from 0 where a 0 occurs; polygons are split into fans; whatever follows the
+    coordinates on a line, or a slash, is left out, as are the other statements of an OBJ file.
+
+    Raises
+    ------
+    InputError
+        With the line: other text, too few numbers, numbers out of range.
+    """
+    vertex_rows = re.findall(rb"(?m)^[ \t]*v[ \t]+([^\r\n]*)", data)
+    face_rows = re.findall(rb"(?m)^[ \t]*f[ \t]+([^\r\n]*)", data)
+    other = re.search(rb"(?m)^[ \t]*(?!(?:v|f|vn|vt|g|o|s|usemtl|mtllib)(?:[ \t]|[\r\n]|\Z))[^\s]", data)
+    if other:
+        raise _not_a_statement(data, other.start(), source)
+    end = _line(data, len(data.rstrip()))
+    if not vertex_rows or not face_rows:
+        missing = "f a b c" if vertex_rows else "v x y z"
+        raise InputError(f"{source}: line {end}: expected lines {missing!r}, found none before the end.")
+    if any(b"/" in row for row in face_rows[:1]):
+        face_rows = [re.sub(rb"/\S*", b"", row) for row in face_rows]
+    vertices = _rows(vertex_rows, "v x y z", source, lambda row: _letter_line(data, b"v", row))
+    polygons = _rows(face_rows, "f a b c", source, lambda row: _letter_line(data, b"f", row))
+    corners = polygons.shape[1]
+    fan = np.array([(0, k, k + 1) for k in range(1, corners - 1)])
+    return _from_one(
+        vertices[:, :3],
+        polygons[:, fan].reshape(-1, 3),
+        source,
+        lambda row: _letter_line(data, b"f", row // (corners - 2)),
+    )
+
+
+def read_icq(data: bytes, source: str) -> Mesh:
+    """Gaskell's implicitly connected quadrilaterals: Q, then 6(Q + 1)² vertices on the faces of a cube.
+
+    The six faces are joined at their edges and each quadrilateral is split along its shorter diagonal; wound
+    outwards. A column after the coordinates (albedo) is left out.
+
+    Source: Gaskell, "The Implicitly Connected Quadrilateral Format", document icqmodel of the PDS data set
+    HAY-A-AMICA-5-ITOKAWASHAPE-V1.0, which gives the order of the vertices and which of them coincide.
+
+    Raises
+    ------
+    InputError
+        With the line: no number where one is due, another number of vertices than Q tells, edges that do not meet.
+    """
+    table = _numbers(data, source)
+    q = int(table[0]) if 1 <= table[0] < 2**15 and table[0] == np.floor(table[0]) else 0
+    if q == 0:
+        raise InputError(
+            f"{source}: line {_token_line(data, 0)}: expected Q, a positive integer, found {table[0]:g}."
+        )
+    count = 6 * (q + 1) ** 2
+    if len(table) - 1 not in (3 * count, 4 * count):
+        raise InputError(
+            f"{source}: line {_token_line(data, len(table) - 1)}: expected {count} vertices of three numbers "
+            f"for Q = {q}, found {len(table) - 1} numbers."
+        )
+    rows = table[1:].reshape(count, -1)[:, :3]
+
+    # Where the vertex (i, j) of each face lies on a cube of side Q, laid out so that just those vertices meet
+    # which the format says are the same; i runs fastest.
+    j, i = np.meshgrid(np.arange(q + 1), np.arange(q + 1), indexing="ij")
+    zero, full = np.zeros_like(i), np.full_like(i, q)
+    cube = np.stack(
+        [
+            np.stack(face, axis=-1)
+            for face in (
+                (i, j, full),
+                (i, full, q - j),
+                (zero, i, q - j),
+                (q - i, zero, q - j),
+                (full, q - i, q - j),
+                (i, q - j, zero),
+            )
+        ]
+    ).reshape(-1, 3)
+    key = (cube[:, 0] * (q + 1) + cube[:, 1]) * (q + 1) + cube[:, 2]
+    _, first, shared = np.unique(key, return_index=True, return_inverse=True)
+    shared = shared.ravel()
+    vertices = rows[first]
+    gap = np.abs(rows - vertices[shared]).max(axis=1)
+    worst = int(np.argmax(gap))
+    if gap[worst] > _ICQ_GAP_FRACTION * np.ptp(rows, axis=0).max():
+        at = _token_line(data, 1 + worst * (len(table) - 1) // count)
+        raise InputError(f"{source}: line {at}: expected the vertex that the neighbouring face has there.")
+
+    grid = shared.reshape(6, q + 1, q + 1)
+    a, b, c, d = (grid[:, j0 : j0 + q, i0 : i0 + q].ravel() for j0, i0 in ((0, 0), (0, 1), (1, 1), (1, 0)))
+    ac = np.linalg.norm(vertices[a] - vertices[c], axis=1)
+    bd = np.linalg.norm(vertices[b] - vertices[d], axis=1)
+    along_ac = (ac <= bd)[:, None]
+    faces = np.concatenate(
+        [
+            np.where(along_ac, np.stack([a, b, c], axis=1), np.stack([a, b, d], axis=1)),
+            np.where(along_ac, np.stack([a, c, d], axis=1), np.stack([b, c, d], axis=1)),
+        ]
+    )
+    corners = vertices[faces]
+    if np.sum(corners[:, 0] * np.cross(corners[:, 1], corners[:, 2])) < 0:  # six times the volume
+        faces = faces[:, ::-1]
+    return vertices, faces.astype(np.int64)
+
+
+def read_vrml(data: bytes, source: str) -> Mesh:
+    """All IndexedFaceSets of a VRML 1 or 2 file, polygons split into fans.
+
+    Node names (DEF) of coordinates may be used again (USE).
+
+    Raises
+    ------
+    InputError
+        With the line: what would change the shape unseen (transforms other than the identity, geometry used
+        again), lists that are not closed, are no numbers, or name points that do not exist.
+    """
+    if not re.match(rb"\s*#VRML", data):
+        raise InputError(
+            f"{source}: line 1: expected '#VRML V1.0 ascii' or '#VRML V2.0 utf8', found {_shown(data)}."
+        )
+    # Strings and comments are blanked, not cut, so that places keep their line.
+    text = re.sub(rb'"(?:\\.|[^"\\])*"|#[^\r\n]*', lambda m: re.sub(rb"[^\r\n]", b" ", m[0]), data)
+    vertices: list[Float64] = []
+    faces: list[Int64] = []
+    base = 0
+    for points, index in _face_sets(text, source):
+        coordinates = _list_numbers(text, points, source)
+        if len(coordinates) % 3 or len(coordinates) == 0:
+            raise InputError(
+                f"{source}: line {_line(text, points.start())}: expected points of three coordinates, "
+                f"found {len(coordinates)} numbers."
+            )
+        triangles = _fans(_list_numbers(text, index, source), len(coordinates) // 3, text, index, source)
+        vertices.append(coordinates.reshape(-1, 3))
+        faces.append(triangles + base)
+        base += len(coordinates) // 3
+    if not faces:
+        end = _line(data, len(data.rstrip()))
+        raise InputError(f"{source}: line {end}: expected an IndexedFaceSet, found none before the end.")
+    return np.concatenate(vertices), np.concatenate(faces)
+
+
+def read_dsk(path: Path) -> Mesh:
+    """The plates of a NAIF DSK, all type 2 segments of its one body and surface.
+
+    Vertices are in kilometres by definition; the body-fixed frame the segments name is the file's own.
+
+    Raises
+    ------
+    InputError
+        spiceypy is not installed, the file is no DSK, or holds no segment of type 2 or those of several surfaces.
+    """
+    from vbnfault import spice  # spiceypy is an optional extra
+
+    source = str(path)
+    vertices: list[Float64] = []
+    faces: list[Int64] = []
+    surfaces: set[tuple[int, int]] = set()
+    base = 0
+    with spice.reported(source) as spiceypy:
+        handle = spiceypy.dasopr(source)
+        try:
+            with spiceypy.no_found_check():
+                segment, found = spiceypy.dlabfs(handle)
+                while found:
+                    about = spiceypy.dskgd(handle, segment)
+                    if about.dtype == 2:
+                        vertices_n, faces_n = spiceypy.dskz02(handle, segment)
+                        vertices.append(np.array(spiceypy.dskv02(handle, segment, 1, vertices_n), dtype=np.float64))
+                        faces.append(
+                            np.array(spiceypy.dskp02(handle, segment, 1, faces_n), dtype=np.int64) - 1 + base
+                        )
+                        base += vertices_n
+                        surfaces.add((about.center, about.surfce))
+                    segment, found = spiceypy.dlafns(handle, segment)
+        finally:
+            spiceypy.dascls(handle)
+    if not faces:
+        raise InputError(f"{source}: expected a DSK segment of type 2 (triangular plates), found none.")
+    if len(surfaces) > 1:
+        listed = ", ".join(f"body {body} surface {surface}" for body, surface in sorted(surfaces))
+        raise InputError(f"{source}: expected the segments of one surface, found {listed}.")
+    return np.concatenate(vertices), np.concatenate(faces)
+
+
+# --- numbers and lines ---------------------------------------------------------------------------------------
+
+
+def _line(data: bytes, offset: int) -> int:
+    return data.count(b"\n", 0, offset) + 1
+
+
+def _shown(data: bytes) -> str:
+    return repr(data.strip()[:24].split(b"\n")[0].decode("ascii", "replace"))
+
+
+def _token_line(data: bytes, token: int) -> int:
+    """Line of the token-th number (from 0). For messages only: slow."""
+    data = _clean(data)
+    start = 0
+    for count, match in enumerate(re.finditer(rb"\S+", data)):
+        start = match.start()
+        if count == token:
+            break
+    return _line(data, start)
+
+
+def _without_comments(data: bytes) -> bytes:
+    data = data.rstrip(b"\x1a\r\n\t ")
+    return re.sub(rb"#[^\r\n]*", b"", data) if b"#" in data else data
+
+
+def _clean(data: bytes) -> bytes:
+    """Exponents with E, no commas, and the blank that Fortran's fixed columns may lack before a minus sign."""
+    return _GLUED.sub(b" -", data.translate(_FORTRAN))
+
+
+def _parsed(data: bytes) -> Float64 | None:
+    """All numbers of a text, None where something else is in it; "nan" and overflows are let through."""
+    text = data.translate(_FORTRAN)
+    if not text.strip():
+        return np.empty(0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")  # numpy has both warned and raised here
+        for clean in (lambda: text, lambda: _clean(text)):  # few files need the search for glued numbers
+            try:
+                return np.fromstring(clean(), dtype=np.float64, sep=" ")  # type: ignore[call-overload]
+            except (ValueError, DeprecationWarning):
+                continue
+    return None
+
+
+def _numbers(data: bytes, source: str, lines: Lines = lambda line: line) -> Float64:
+    """All numbers of a text, float64[n], finite. `lines`: line of the file from a line of the text."""
+    values = _parsed(data)
+    if values is not None and np.isfinite(values).all():
+        return values
+    wrong = _NOT_A_NUMBER.search(data.translate(_FORTRAN))  # as long as the text it shows a piece of
+    if wrong is None:
+        at = 1 if values is None else _token_line(data, int(np.argmin(np.isfinite(values))))
+        raise InputError(f"{source}: line {lines(at)}: expected a number, found one that is too large.")
+    at, what = _line(data, wrong.start()), _shown(data[wrong.start() : wrong.end()])
+    raise InputError(f"{source}: line {lines(at)}: expected a number, found {what}.")
+
+
+def _from_one(vertices: Float64, faces: Float64, source: str, line: Lines) -> Mesh:
+    """Facets counted from 1, or from 0 where a 0 occurs, to indices; `line` gives that of a row of `faces`."""
+    broken = (faces != np.floor(faces)).any(axis=1)
+    if broken.any():
+        row = int(np.argmax(broken))
+        raise InputError(f"{source}: line {line(row)}: expected three vertex numbers, found {_listed(faces[row])}.")
+    lowest = 0 if len(faces) and faces.min() == 0 else 1
+    highest = len(vertices) - 1 + lowest
+    outside = ((faces < lowest) | (faces > highest)).any(axis=1)
+    if outside.any():
+        row = int(np.argmax(outside))
+        raise InputError(
+            f"{source}: line {line(row)}: expected vertex numbers from {lowest} to {highest}, "
+            f"found {_listed(faces[row])}."
+        )
+    return np.ascontiguousarray(vertices), faces.astype(np.int64) - lowest
+
+
+def _listed(values: Float64) -> str:
+    return " ".join(f"{value:g}" for value in values)
+
+
+# --- plate tables --------------------------------------------------------------------------------------------
+
+
+def _is_icq(data: bytes) -> bool:
+    """Whether a lone number is an ICQ's Q rather than a plate table's number of vertices."""
+    rows = re.finditer(rb"\S[^\n]*", data)
+    header = next(rows)[0].strip()
+    if not re.fullmatch(rb"[0-9]{1,9}", header):
+        return False
+    # A closed plate table of n vertices has 3n rows or fewer, an ICQ 6(Q + 1)²; and after its n vertices the plate
+    # table has the number of facets on a line of its own.
+    if data.count(b"\n") <= 4 * int(header):
+        return False
+    after = next(islice(rows, int(header), None), None)
+    return after is not None and len(after[0].split()) > 1
+
+
+def _counted(column: Float64) -> bool:
+    return bool((column == np.arange(len(column)) + column[0]).all() and column[0] in (0, 1))
+
+
+def _layout(table: Float64) -> tuple[int, int, int, int, int] | None:
+    """Start and width of the vertices, start, width and number of the facets: the first that fits the whole."""
+    vertices_n = int(table[0])
+    for both_first in (True, False):
+        for vertex_width in (4, 3):
+            vertex_at = 2 if both_first else 1
+            vertices_end = vertex_at + vertex_width * vertices_n
+            count_at = 1 if both_first else vertices_end
+            if count_at >= len(table) or vertices_end > len(table):
+                continue
+            faces_n = table[count_at]
+            face_at = vertices_end + (0 if both_first else 1)
+            for face_width in (4, 3):
+                if not (
+                    faces_n == np.floor(faces_n) and faces_n >= 1 and len(table) == face_at + face_width * faces_n
+                ):
+                    continue
+                vertices = table[vertex_at:vertices_end].reshape(-1, vertex_width)
+                faces = table[face_at:].reshape(-1, face_width)
+                if vertex_width == 4 and not _counted(vertices[:, 0]):
+                    continue
+                if face_width == 4 and not (_counted(faces[:, 0]) or (faces[:, 0] == 3).all()):
+                    continue
+                return vertex_at, vertex_width, face_at, face_width, int(faces_n)
+    return None
+
+
+def _table_error(data: bytes, table: Float64, source: str) -> InputError:
+    """Why no layout fits: the first line that is not as the counts and the first rows say."""
+
+    def error(line: int, expected: str, found: str) -> InputError:
+        return InputError(f"{source}: line {line}: expected {expected}, found {found}.")
+
+    rows: Iterator[tuple[int, list[bytes]]] = (
+        (number, row.split()) for number, row in enumerate(_clean(data).split(b"\n"), 1) if row.strip()
+    )
+    at, header = next(rows)
+    vertices_n = int(table[0])
+    if len(header) > 2:
+        return error(at, "the number of vertices and of facets", f"{len(header)} numbers")
+    faces_n = int(table[1]) if len(header) == 2 else 0
+    for what, length in (("vertex", vertices_n), ("facet", None)):
+        if what == "facet" and len(header) == 1:
+            at, row = next(rows, (at, []))
+            if len(row) != 1 or not row[0].isdigit():
+                return error(
+                    at, f"the number of facets after {vertices_n} vertices", b" ".join(row).decode() or "the end"
+                )
+            faces_n = int(row[0])
+        total = faces_n if length is None else length
+        width = 0
+        for k in range(1, total + 1):
+            at, row = next(rows, (at, []))
+            if not row:
+                return error(
+                    at, f"{total} {'vertices' if what == 'vertex' else 'facets'}", f"the end after {k - 1}"
+                )
+            width = width or len(row)
+            if len(row) != width or width not in (3, 4):
+                wanted = f"{width} numbers" if width in (3, 4) else "3 or 4 numbers"
+                return error(at, f"{wanted} for {what} {k} of {total}", str(len(row)))
+            if width == 4 and float(row[0]) not in (k, k - 1, 3):
+                return error(at, f"number {k} in front of a {what}", row[0].decode())
+    at, row = next(rows, (at, []))
+    if row:
+        return error(at, f"the end after {vertices_n} vertices and {faces_n} facets", f"{len(row)} more numbers")
+    return error(
+        1, "the number of vertices and of facets, then the two tables", f"{len(table)} numbers in no such order"
+    )
+
+
+# --- v and f lines -------------------------------------------------------------------------------------------
+
+
+def _not_a_statement(data: bytes, offset: int, source: str) -> InputError:
+    found = _shown(data[offset : offset + 80])
+    return InputError(f"{source}: line {_line(data, offset)}: expected 'v x y z' or 'f a b c', found {found}.")
+
+
+def _letter_line(data: bytes, letter: bytes, row: int) -> int:
+    for count, match in enumerate(re.finditer(rb"(?m)^[ \t]*" + letter + rb"[ \t]+", data)):
+        if count == row:
+            return _line(data, match.end())
+    return _line(data, len(data))
+
+
+def _rows(rows: list[bytes], form: str, source: str, line: Lines) -> Float64:
+    """Rows of numbers, all of the first one's width (at least 3), float64[n, width]."""
+    # One NaN as a mark at every row's end: a short row followed by a long one must not pass.
+    marked = _parsed(b" nan\n".join([*rows, b""]))
+    width = len(_clean(rows[0]).split())
+    if (
+        marked is not None
+        and width >= 3
+        and len(marked) == len(rows) * (width + 1)
+        and np.isnan(marked.reshape(-1, width + 1)[:, width]).all()
+        and np.isfinite(values := marked.reshape(-1, width + 1)[:, :width]).all()
+    ):
+        return np.ascontiguousarray(values)
+    _numbers(b"\n".join(rows), source, lambda at: line(at - 1))
+    for row, text in enumerate(rows):
+        found = len(_clean(text).split())
+        if found < 3 or found != width:
+            raise InputError(
+                f"{source}: line {line(row)}: expected {form!r} with {max(width, 3)} numbers, found {found}."
+            )
+    raise InputError(f"{source}: line {line(0)}: expected {form!r}, found {_shown(rows[0])}.")
+
+
+# --- VRML ----------------------------------------------------------------------------------------------------
+
+_TOKEN = re.compile(rb"\[[^\[\]{}]*\]|[\[\]{}]|[^\s,\[\]{}]+")
+_IDENTITY = {
+    b"translation": (0.0, 0.0, 0.0),
+    b"center": None,  # of a rotation and scale that are none
+    b"scale": (1.0, 1.0, 1.0),
+    b"scaleFactor": (1.0, 1.0, 1.0),
+    b"scaleOrientation": None,
+    b"matrix": tuple(np.eye(4).ravel()),
+}
+_TRANSFORMS = (b"Transform", b"Translation", b"Rotation", b"Scale", b"MatrixTransform")
+Match = re.Match[bytes]
+
+
+@dataclass
+class _Node:
+    """A node while its braces are open."""
+
+    kind: bytes
+    name: bytes | None
+    start: int
+    points: Match | None = None
+    index: Match | None = None
+    has_faces: bool = False
+    values: dict[bytes, list[float]] = field(default_factory=dict)
+
+
+def _face_sets(text: bytes, source: str) -> Iterator[tuple[Match, Match]]:
+    """The lists of points and of indices of every IndexedFaceSet, in order."""
+    stack = [_Node(b"", None, 0)]
+    named: dict[bytes, Match | None] = {}
+    shapes: set[bytes] = set()
+    current: Match | None = None  # VRML 1: the last Coordinate3 holds for what follows
+    before = [b"", b"", b""]
+    key = b""
+
+    def error(offset: int, expected: str, found: str) -> InputError:
+        return InputError(f"{source}: line {_line(text, offset)}: expected {expected}, found {found}.")
+
+    for match in _TOKEN.finditer(text):
+        token, node = match[0], stack[-1]
+        if token == b"{":
+            name = before[-2] if before[-3] == b"DEF" else None
+            stack.append(_Node(before[-1], name, match.start()))
+            key = b""
+        elif token == b"}":
+            if len(stack) == 1:
+                raise error(match.start(), "a node", "'}' that closes none")
+            stack.pop()
+            parent = stack[-1]
+            if node.kind in (b"Coordinate", b"Coordinate3"):
+                current = parent.points = node.points
+                if node.name is not None:
+                    named[node.name] = node.points
+            elif node.kind in _TRANSFORMS:
+                _check_identity(node, text, source)
+            elif node.kind == b"IndexedFaceSet" and node.index is not None:
+                points = node.points or current
+                if points is None:
+                    raise error(node.start, "points for the IndexedFaceSet", "none")
+                node.has_faces = True
+                yield points, node.index
+            if node.has_faces and node.name is not None:
+                shapes.add(node.name)
+            parent.has_faces |= node.has_faces
+            key = b""
+        elif token.startswith(b"[") and token.endswith(b"]"):
+            if before[-1] == b"point":
+                node.points = match
+            elif before[-1] == b"coordIndex":
+                node.index = match
+            elif before[-1] == b"children" and b"USE" in token.split():
+                raise error(match.start(), "geometry written out", "geometry used again by USE")
+        elif token == b"[":
+            if before[-1] in (b"point", b"coordIndex"):
+                raise error(
+                    match.start(), f"a list of numbers closed by ']' after {before[-1].decode()}", "no such end"
+                )
+        elif before[-1] == b"USE":
+            if token in named and before[-2] == b"coord":
+                node.points = named[token]
+            elif token in shapes or before[-2] == b"coord":
+                raise error(match.start(), "geometry written out", f"USE {token.decode('ascii', 'replace')}")
+        elif node.kind in _TRANSFORMS and re.fullmatch(_NUMBER, token):
+            node.values.setdefault(key, []).append(float(token))
+        else:
+            key = token
+        before = [*before[1:], token]
+    if len(stack) > 1:
+        kind = stack[-1].kind.decode("ascii", "replace")
+        raise error(len(text.rstrip()), f"'}}' for {kind!r} of line {_line(text, stack[-1].start)}", "the end")
+
+
+def _check_identity(node: _Node, text: bytes, source: str) -> None:
+    for key, values in node.values.items():
+        if key == b"rotation":
+            same = len(values) == 4 and values[3] == 0
+        else:
+            identity = _IDENTITY.get(key)
+            same = identity is None or tuple(values) == identity
+        if not same:
+            raise InputError(
+                f"{source}: line {_line(text, node.start)}: expected coordinates of the body itself, "
+                f"found a {node.kind.decode()} with {key.decode()} {' '.join(f'{v:g}' for v in values)}."
+            )
+
+
+def _list_numbers(text: bytes, found: Match, source: str) -> Float64:
+    start = _line(text, found.start())
+    return _numbers(found[0][1:-1], source, lambda line: start + line - 1)
+
+
+def _fans(values: Float64, points: int, text: bytes, found: Match, source: str) -> Int64:
+    """Polygons ended by -1, from `values` float64[n], as triangles int64[m, 3] that start in the first corner."""
+
+    def error(at: int, what: str) -> InputError:
+        line = _line(text, found.start()) + _token_line(found[0][1:-1], at) - 1
+        return InputError(f"{source}: line {line}: expected {what}, found {values[at]:g}.")
+
+    wrong = (values != np.floor(values)) | (values < -1) | (values >= points)
+    if wrong.any():
+        raise error(int(np.argmax(wrong)), f"point numbers from 0 to {points - 1} or -1")
+    index = values.astype(np.int64)
+    if len(index) == 0 or index[-1] != -1:
+        index = np.append(index, -1)
+    ends = np.flatnonzero(index == -1)
+    starts = np.concatenate([[0], ends[:-1] + 1])
+    corners = ends - starts
+    few = (corners == 1) | (corners == 2)
+    if few.any():
+        raise error(int(starts[np.argmax(few)]), "polygons of at least three corners")
+    triangles = np.maximum(corners - 2, 0)
+    first = np.repeat(starts, triangles)
+    step = np.arange(triangles.sum()) - np.repeat(np.cumsum(triangles) - triangles, triangles) + 1
+    return np.stack([index[first], index[first + step], index[first + step + 1]], axis=1)
