@@ -20,7 +20,7 @@ ROOT = Path(vbnfault.__file__).parent
 # Unit (module or package of vbnfault) → the units it may import, besides itself and EVERYWHERE. Data flows
 # one way; a new unit has to be given its place here.
 EVERYWHERE = {"errors", "resources", "__init__"}
-FOUNDATION = {"llvm", "spectra", "quantities", "config", "frames"}
+FOUNDATION = {"llvm", "spectra", "quantities", "config", "frames", "spice"}
 GEOMETRY = FOUNDATION | {"body", "plan", "scene"}
 CAMERA = {"spectra", "quantities", "llvm", "lens", "detector", "camera"}
 PIPELINE = GEOMETRY | CAMERA | {"sky", "spacecraft", "render", "faults", "labels", "pipeline"}
@@ -33,6 +33,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "spectra": set(),
     "quantities": set(),
     "frames": set(),
+    "spice": {"frames"},
     "config": {"spectra", "quantities"},
     "body": FOUNDATION,
     "plan": FOUNDATION | {"body"},
@@ -65,6 +66,7 @@ ONLY = {  # distribution → the one unit that imports it
     "dask": {"build"},
     "distributed": {"build"},
     "typer": {"cli"},
+    "spiceypy": {"spice"},
 }
 
 
