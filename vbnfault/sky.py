@@ -1,8 +1,8 @@
 """The stars: a catalogue to magnitude 7 and the radiance that it adds to a frame.
 
-Positions and proper motions refer to ICRF axes (frame J). Ignored are stellar aberration, up to 24″ for a camera that
-moves with 67P at perihelion (34 km/s: a pixel of 1024 across 7°), parallax (3″ at most, α Centauri from 3.6 au),
-and variability. Planets, the Moon and nebulae are absent.
+Positions and proper motions refer to ICRF axes (frame J). Ignored are stellar aberration, up to 24″ for a camera
+that moves with 67P at perihelion (34 km/s: a pixel of 1024 across 7°), parallax (3″ at most, α Centauri from
+3.6 au), and variability. Planets, the Moon and nebulae are absent.
 A double star that Hipparcos lists as one entry is one point with the light of both.
 """
 
