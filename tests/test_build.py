@@ -341,17 +341,26 @@ def test_a_dask_cluster_makes_the_same_bits(reference: tuple[Path, str], tmp_pat
     distributed = pytest.importorskip("distributed")
     out = tmp_path / "s.zarr"
     with distributed.LocalCluster(
-        n_workers=2, threads_per_worker=2, processes=False, protocol="tcp://", dashboard_address=None
+        n_workers=2, threads_per_worker=2, processes=False, dashboard_address=None
     ) as cluster:
         with pytest.raises(bd.BuildFailed, match=r"sample 5 failed.*KeyError"):
             run(out, Session(raises=frozenset({5})), scheduler=cluster.scheduler_address)
         assert run(out, scheduler=cluster.scheduler_address).built == 1
         with pytest.raises(VbnfaultError, match="no such mesh"):
             run(tmp_path / "t.zarr", Broken(), scheduler=cluster.scheduler_address)
-        worker = next(iter(cluster.scheduler_info["workers"]))
-        with pytest.raises(InputError, match="a Dask worker listens there, no scheduler"):
-            run(tmp_path / "u.zarr", scheduler=worker)
     assert st.digest(out) == reference[1]
+
+
+@pytest.mark.filterwarnings("default")
+def test_a_scheduler_is_told_from_a_worker() -> None:
+    distributed = pytest.importorskip("distributed")
+    with distributed.LocalCluster(
+        n_workers=1, processes=False, protocol="tcp://", dashboard_address=None
+    ) as cluster:
+        bd._check_scheduler(cluster.scheduler_address)
+        (worker,) = cluster.scheduler_info["workers"]
+        with pytest.raises(InputError, match="a Dask worker listens there, no scheduler"):
+            bd._check_scheduler(worker)
 
 
 def test_without_dask_the_sentence_says_how_to_get_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
