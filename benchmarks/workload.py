@@ -11,13 +11,13 @@ from typing import Any
 
 import numpy as np
 
-from vbnfault import config, dataset, frames, pipeline, render, store
+from vbnfault import config, dataset, frames, pipeline, render, store, world
 from vbnfault.body import Patch
 from vbnfault.pipeline import Frame, Pose, SampleSpec
 from vbnfault.quantities import Sample
 from vbnfault.render.emitter import SunDisc
 from vbnfault.render.runtime import dr, mi
-from vbnfault.render.sampling import Optics, Strata
+from vbnfault.render.sampling import Optics, Pixels, Strata
 from vbnfault.scene import Scene
 
 SCENE = "paper_example"  # its six faults; the view is our own
@@ -78,7 +78,7 @@ class Workload:
         frame = Frame(spec=self.spec)
         frame.pose = self.pose
         frame.camera = self.session.base_camera
-        frame.sunlight = pipeline.sunlight(self.spec.scene, self.pose.sun_L)
+        frame.sunlight = world.sunlight(self.spec.scene, self.pose.sun_L)
         return frame, pipeline.describe(frame)
 
     def bound(self) -> None:
@@ -88,7 +88,7 @@ class Workload:
         """
         view, traced = self.scene.view, self.spec.terrain.surface.scene
         optics, sun = Optics(view), SunDisc(self.scene.sun)
-        strata = Strata(view.width_px, view.height_px, self.scene.samples_per_pixel, self.scene.key)
+        strata = Strata(Pixels(view.width_px * view.height_px), self.scene.samples_per_pixel, self.scene.key)
         rays = optics.camera_rays(strata)
         found = traced.ray_intersect_preliminary(rays, coherent=True)
         # towards the Sun's centre, from just in front of the hit: no normal, no point of the disc is fetched

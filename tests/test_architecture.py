@@ -20,10 +20,10 @@ ROOT = Path(vbnfault.__file__).parent
 # Unit (module or package of vbnfault) → the units it may import, besides itself and EVERYWHERE. Data flows
 # one way; a new unit has to be given its place here.
 EVERYWHERE = {"errors", "resources", "__init__"}
-FOUNDATION = {"llvm", "spectra", "quantities", "config", "frames", "spice"}
+FOUNDATION = {"llvm", "spectra", "quantities", "config", "frames", "photometry", "spice"}
 GEOMETRY = FOUNDATION | {"body", "plan", "scene"}
 CAMERA = {"spectra", "quantities", "llvm", "lens", "detector", "camera"}
-PIPELINE = GEOMETRY | CAMERA | {"sky", "spacecraft", "render", "faults", "labels", "pipeline"}
+PIPELINE = GEOMETRY | CAMERA | {"sky", "spacecraft", "world", "render", "faults", "labels", "pipeline"}
 DATASET = PIPELINE | {"store", "build", "dataset"}
 MAY_IMPORT: dict[str, set[str]] = {
     "__init__": set(),
@@ -32,20 +32,22 @@ MAY_IMPORT: dict[str, set[str]] = {
     "llvm": set(),
     "spectra": set(),
     "quantities": set(),
+    "photometry": set(),
     "frames": set(),
     "spice": {"frames"},
-    "config": {"spectra", "quantities"},
+    "config": {"photometry", "spectra", "quantities"},
     "body": FOUNDATION,
     "plan": FOUNDATION | {"body"},
     "scene": FOUNDATION | {"body", "plan"},
     "sky": {"spectra", "quantities", "frames"},
     "spacecraft": {"frames"},
-    "render": {"scene", "llvm", "quantities"},  # quantities: what it returns
+    "render": {"scene", "llvm", "photometry", "quantities"},  # quantities: what it returns
     "lens": {"spectra", "quantities", "llvm"},
     "detector": {"spectra", "quantities"},
     "camera": {"lens", "detector"},
     "faults": CAMERA,
     "labels": GEOMETRY | CAMERA | {"faults"},
+    "world": PIPELINE - {"pipeline"},
     "pipeline": PIPELINE,
     "store": {"quantities", "config", "plan"},
     "build": PIPELINE | {"store"},
@@ -60,7 +62,7 @@ MAY_IMPORT: dict[str, set[str]] = {
 
 ONLY = {  # distribution → the one unit that imports it
     "mitsuba": {"render"},
-    "drjit": {"render", "lens"},
+    "drjit": {"body", "render", "lens"},
     "zarr": {"store"},
     "numcodecs": {"store"},
     "dask": {"build"},

@@ -7,7 +7,7 @@ import pytest
 from conftest import small_scene
 from scipy import stats
 
-from vbnfault import config, frames, pipeline, plan, render
+from vbnfault import config, frames, pipeline, plan, render, world
 from vbnfault.pipeline import Frame, SampleSpec, Session
 
 N = 2000
@@ -94,7 +94,7 @@ def test_redrawn_samples_follow_the_conditional_distribution(resolved: tuple[Ses
         e, h = rng.uniform(-30, 30, len(left)), rng.uniform(0, 100, len(left))
         position = np.column_stack([x[left], y[left], -(ground[left] + h)])
         suns = [
-            pipeline.sunlight(session.scene, frames.direction_L(a, b))
+            world.sunlight(session.scene, frames.direction_L(a, b))
             for a, b in zip(azimuth[left], e, strict=True)
         ]
         good = render.is_clear(surface, position, session.scene.geometry.clearance_m)

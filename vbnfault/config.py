@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import difflib
 import hashlib
+import itertools
 import json
 import tomllib
 from collections.abc import Mapping, Sequence
@@ -24,7 +25,14 @@ from .errors import InputError
 
 Architecture = Literal["full_frame_ccd", "frame_transfer_ccd", "interline_ccd", "cmos"]
 Direction = Literal["up", "down", "left", "right"]
-Layer = Annotated[str, Field(pattern="^(clean|depth_m|normal|semantic|raw|radiance|mask_effect|without_[a-z_]+)$")]
+_LAYERS = (
+    "clean|depth_m|normal|semantic|raw|radiance|mask_effect|"
+    "point_T_m|incidence_deg|emission_deg|phase_deg|albedo|without_[a-z_]+"
+)
+# What names no file.
+_SHAPES = ("embedded", "ellipsoid")
+_VEHICLES = ("none", "default")
+Layer = Annotated[str, Field(pattern=f"^({_LAYERS})$")]
 
 
 def _ordered(pair: tuple[float, float]) -> tuple[float, float]:
@@ -74,6 +82,21 @@ class DatasetTable(Table):
     split: SplitTable = SplitTable()
     licence: str = "CC-BY-4.0"
     citation: str = ""
+
+
+class SpectrumTable(Table):
+    """Values at wavelengths, interpolated linearly, constant beyond the ends."""
+
+    wavelength_nm: tuple[Annotated[float, Field(gt=0, le=1e5)], ...] = Field(min_length=1)
+    value: tuple[Annotated[float, Field(ge=0, le=1)], ...] = Field(min_length=1)
+
+    @model_validator(mode="after")
+    def _paired(self) -> SpectrumTable:
+        if len(self.wavelength_nm) != len(self.value):
+            raise ValueError(f"{len(self.wavelength_nm)} wavelengths for {len(self.value)} values: must be as many")
+        if any(a >= b for a, b in itertools.pairwise(self.wavelength_nm)):
+            raise ValueError(f"wavelength_nm = {list(self.wavelength_nm)}: must increase")
+        return self
 
 
 class HapkeRow(Table):
@@ -126,7 +149,10 @@ class BodyTable(Table):
     """The target body, in its body-fixed frame T."""
 
     name: str = "67P/Churyumov-Gerasimenko"
-    shape: str = Field("embedded", description="'embedded', 'ellipsoid', or a mesh file: OBJ, PLY, STL, GLB")
+    shape: str = Field(
+        "embedded",
+        description="'embedded', 'ellipsoid', or a shape file: OBJ, PLY, STL, GLB, PDS TAB, ICQ, WRL, BDS",
+    )
     unit: Literal["auto", "m", "km"] = "auto"
     semi_axes_m: tuple[float, float, float] = Field((1000.0, 1000.0, 1000.0), description="of an 'ellipsoid'")
     density_kg_m3: float = Field(537.8, gt=0, le=30_000)
@@ -136,8 +162,8 @@ class BodyTable(Table):
     pole_ra_deg: float = Field(69.54, ge=0, le=360)
     pole_dec_deg: float = Field(64.11, ge=-90, le=90)
     prime_meridian_deg: float = Field(114.69, ge=-360, le=360, description="W at J2000.0")
-    reflectance: str | Annotated[float, Field(ge=0, le=1)] = Field(
-        "67p", description="a named reflectance or a grey value"
+    reflectance: str | Annotated[float, Field(ge=0, le=1)] | SpectrumTable = Field(
+        "67p", description="a named reflectance, a grey value, or a table of values at wavelengths"
     )
     photometry: PhotometryTable = PhotometryTable()
 
@@ -167,6 +193,53 @@ class SunTable(Table):
     julian_date: float = Field(2456974.0, ge=1_000_000, le=5_000_000, description="TDB; sets the body's attitude")
     distance_au: float | None = Field(None, gt=0.01, le=1000)
     limb_darkening: bool = Field(True, description="after Neckel & Labs 1994; else a uniform disc")
+
+
+class SpiceTable(Table):
+    """SPICE kernels for the Sun's place and the target's attitude; without, the built-in 67P."""
+
+    kernels: tuple[str, ...] = Field((), description="kernels or meta-kernels; needs the extra 'spice'")
+    target: str = Field("CHURYUMOV-GERASIMENKO", description="SPICE name or number")
+    frame: str = Field("", description="body-fixed frame; default: pole and period of [body]")
+
+    @model_validator(mode="after")
+    def _served(self) -> SpiceTable:
+        if self.frame and not self.kernels:
+            raise ValueError(f"frame = {self.frame!r}: needs kernels")
+        return self
+
+
+class SkyTable(Table):
+    """Stars: hidden by the exposure of a sunlit comet, so off unless asked for."""
+
+    stars: Literal["off", "auto", "on"] = Field("off", description="auto: those that the exposure can show")
+    limiting_magnitude: float = Field(7.0, ge=-2, le=7)
+    sigma_px: float = Field(0.6, ge=0, le=16, description="Gaussian point spread of the lens")
+
+
+class PoseTable(Table):
+    """A turn of a part about its hinge, in the camera's axes B."""
+
+    hinge_m: tuple[float, float, float] | None = None
+    axis: tuple[float, float, float] | None = None
+    angle_deg: float = Field(0.0, ge=-360, le=360)
+
+
+Paint = str | Annotated[float, Field(ge=0, le=1)] | SpectrumTable
+
+
+class SpacecraftTable(Table):
+    """The spacecraft that carries the camera, in the camera's axes B (x right, y down, z boresight)."""
+
+    model: str = Field("none", description="'none', 'default' (a lander), or an OBJ or GLB file")
+    unit: Literal["m", "cm", "mm"] = "m"
+    roll_deg: float = Field(0.0, ge=-360, le=360)
+    pitch_deg: float = Field(0.0, ge=-360, le=360)
+    yaw_deg: float = Field(0.0, ge=-360, le=360)
+    translation_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    default_material: Paint = Field(0.3, description="a named material, a grey value, or a table")
+    materials: dict[str, Paint] = Field(default_factory=dict, description="by part or material of the file")
+    pose: dict[str, PoseTable] = Field(default_factory=dict, description="by part")
 
 
 class CameraTable(Table):
@@ -224,6 +297,14 @@ class RenderTable(Table):
     band_max_nm: float = Field(700.0, ge=290, le=4000)
     bands: int = Field(8, ge=1, le=64)
     samples_per_pixel: int = Field(16, ge=1, le=4096, description="a power of four: strata of each pixel")
+    noise_fraction: float | None = Field(
+        None,
+        gt=0.01,
+        le=10,
+        description="most noise of sampling, in units of the sensor's own, in 99 % of lit pixels: more samples where "
+        "it takes them; default: no more anywhere",
+    )
+    max_samples_per_pixel: int = Field(256, ge=1, le=4096, description="a power of four; for noise_fraction")
     bounces: int = Field(0, ge=0, le=4, description="reflections between sunlit ground and the ground that is seen")
 
     @model_validator(mode="after")
@@ -232,9 +313,10 @@ class RenderTable(Table):
             raise ValueError(
                 f"band_min_nm = {self.band_min_nm:g}, band_max_nm = {self.band_max_nm:g}: bounds reversed"
             )
-        n = self.samples_per_pixel
-        if n & (n - 1) or (n.bit_length() - 1) % 2:
-            raise ValueError(f"samples_per_pixel = {n}: must be 1, 4, 16, 64, 256, 1024 or 4096")
+        for key in ("samples_per_pixel", "max_samples_per_pixel"):
+            n = getattr(self, key)
+            if n & (n - 1) or (n.bit_length() - 1) % 2:
+                raise ValueError(f"{key} = {n}: must be 1, 4, 16, 64, 256, 1024 or 4096")
         return self
 
 
@@ -288,6 +370,9 @@ class SceneConfig(Table):
     body: BodyTable = BodyTable()
     patch: PatchTable = PatchTable()
     sun: SunTable = SunTable()
+    spice: SpiceTable = SpiceTable()
+    spacecraft: SpacecraftTable = SpacecraftTable()
+    sky: SkyTable = SkyTable()
     camera: CameraTable = CameraTable()
     render: RenderTable = RenderTable()
     geometry: GeometryTable = GeometryTable()
@@ -333,7 +418,9 @@ def load_scene(name_or_path: str | Path, overrides: Mapping[str, Any] | None = N
         *parents, leaf = key.split(".")
         node = table
         if isinstance(value, str) and (
-            key.endswith(".texture_file") or (key == "body.shape" and not _built_in(value))
+            key.endswith(".texture_file")
+            or (key == "body.shape" and value not in _SHAPES)
+            or (key == "spacecraft.model" and value not in _VEHICLES)
         ):
             value = str(Path(value).resolve())  # a path on the command line is taken from the working folder
         for parent in parents:
@@ -343,10 +430,6 @@ def load_scene(name_or_path: str | Path, overrides: Mapping[str, Any] | None = N
         node[leaf] = value
     _anchor_paths(table, path.parent)
     return parse_scene(table, source=str(path), overrides=tuple(overrides or ()))
-
-
-def _built_in(shape: str) -> bool:
-    return shape in ("embedded", "ellipsoid")
 
 
 def parse_scene(table: Mapping[str, Any], *, source: str, overrides: Sequence[str] = ()) -> SceneConfig:
@@ -368,17 +451,24 @@ def parse_scene(table: Mapping[str, Any], *, source: str, overrides: Sequence[st
 
 
 def _anchor_paths(table: dict[str, Any], folder: Path) -> None:
-    body = table.get("body")
-    if isinstance(body, dict) and isinstance(body.get("shape"), str):
-        shape = body["shape"]
-        if not _built_in(shape) and not Path(shape).is_absolute():
-            beside = folder / shape
-            body["shape"] = str((beside if beside.exists() else Path(shape)).resolve())
+    """Relative paths are taken from the scene file's folder, or the working folder where nothing lies there."""
+
+    def anchored(path: str) -> str:
+        beside = folder / path
+        return str((beside if beside.exists() else Path(path)).resolve())
+
+    def anchor(node: Any, key: str, built_in: tuple[str, ...] = ()) -> None:
+        if isinstance(node, dict) and isinstance(node.get(key), str) and node[key] not in ("", *built_in):
+            node[key] = anchored(node[key])
+
+    anchor(table.get("body"), "shape", _SHAPES)
+    anchor(table.get("spacecraft"), "model", _VEHICLES)
+    kernels = table.get("spice")
+    if isinstance(kernels, dict) and isinstance(kernels.get("kernels"), list):
+        kernels["kernels"] = [anchored(k) if isinstance(k, str) and k else k for k in kernels["kernels"]]
     faults = table.get("faults")
     for fault in faults.values() if isinstance(faults, dict) else ():
-        if isinstance(fault, dict) and isinstance(fault.get("texture_file"), str) and fault["texture_file"]:
-            beside = folder / fault["texture_file"]
-            fault["texture_file"] = str((beside if beside.exists() else Path(fault["texture_file"])).resolve())
+        anchor(fault, "texture_file")
 
 
 def _sentence(error: ValidationError) -> str:

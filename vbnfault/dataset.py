@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from . import __version__, build, config, llvm, pipeline, plan, resources, store
+from . import __version__, build, config, llvm, pipeline, plan, resources, store, world
 from .config import SceneConfig
 from .errors import VbnfaultError
 from .store import StoreSpec
@@ -47,11 +47,29 @@ def scene_identity(session: pipeline.Session) -> dict[str, Any]:
         if table.get("texture_file"):
             data = Path(table["texture_file"]).read_bytes()
             table["texture_file"] = f"sha256:{hashlib.sha256(data).hexdigest()}"
+    _contents_of_files(scene, session.scene)
     if "straylight" in session.faults:
         textures = sorted(resources.data_dir("textures").glob("*.png"))
         scene["textures_sha256"] = hashlib.sha256(b"".join(p.read_bytes() for p in textures)).hexdigest()
     del scene["dataset"]["samples"]  # a block more makes no other scene
     return scene
+
+
+def _contents_of_files(identity: dict[str, Any], scene: SceneConfig) -> None:
+    """Put the sha256 of what spacecraft, kernels and stars are read from in the place of paths."""
+
+    def digest(path: str | Path) -> str:
+        return f"sha256:{hashlib.sha256(Path(path).read_bytes()).hexdigest()}"
+
+    if scene.spacecraft.model not in ("none", "default"):
+        identity["spacecraft"]["model"] = digest(scene.spacecraft.model)
+    if scene.spice.kernels:
+        # a meta-kernel only names others: what follows from them all says more than its own text
+        sun_J_au, T_from_J = world.ephemeris(scene)
+        numbers = config.content_hash([*sun_J_au.tolist(), *T_from_J.ravel().tolist()])
+        identity["spice"]["kernels"] = [f"ephemeris:{numbers}"]
+    if scene.sky.stars != "off":
+        identity["sky"]["catalogue"] = digest(resources.data_dir("catalogues") / "stars.npz")
 
 
 def store_spec(session: pipeline.Session, blocks: Sequence[int]) -> StoreSpec:
@@ -79,7 +97,7 @@ def store_spec(session: pipeline.Session, blocks: Sequence[int]) -> StoreSpec:
         faults=tuple(session.faults),
         mask_any_faults=pipeline.mask_any_faults(scene, session.faults),
         localised_faults=tuple(name for name, fault in session.faults.items() if fault.localised),
-        wavelength_nm=tuple(float(w) for w in pipeline.wavelengths_nm(scene)),
+        wavelength_nm=tuple(float(w) for w in world.wavelengths_nm(scene)),
         layers=layers,
         site_names=tuple(f"site_{k:05d}" for k in range(dataset.sites)),
         lens_names=("thin lens",),
@@ -95,6 +113,7 @@ def planned(attributes: Mapping[str, Any], faults: Sequence[str]) -> Callable[[i
     commanded faults as `injected`."""
     stored = {key: value for key, value in attributes["scene"].items() if key != "textures_sha256"}
     stored["body"] = {key: value for key, value in stored["body"].items() if key != "shape_sha256"}
+    stored["sky"] = {key: value for key, value in stored["sky"].items() if key != "catalogue"}
     stored["dataset"] = {**stored["dataset"], "samples": attributes["blocks"][0]}
     scene = config.parse_scene(stored, source="the store's own scene")
     table = plan.make_plan(scene, faults, attributes["blocks"])

@@ -14,21 +14,20 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from . import camera as cameras
-from . import config, frames, labels, photometry, plan, spectra
-from .body import Body, Patch, Site, build_patch, choose_sites, load_body
+from . import config, frames, labels, photometry, plan, world
+from .body import Body, Patch, Site, build_patch, choose_sites
 from .camera import Camera
 from .config import SceneConfig
-from .detector import Detector, Noise
+from .detector import Noise
 from .errors import InputError
 from .faults import Fault, FaultContext, Params, dataset_order, from_dict, physical_order
-from .lens import ThinLens
-from .photometry import Photometry
 from .quantities import RGBI, Electrons, Radiance, Sample, Truth
 from .scene import Scene, Sunlight, View
+from .spacecraft import SpacecraftMesh
 
 if TYPE_CHECKING:
     from .render import Surface
@@ -43,15 +42,21 @@ _METERING_RANGE = (0.25, 8.0)
 # A step's own change of this many DN survives every later optical step of the paper's tables (cos⁴ at 255 → 105
 # keeps 41 %), so the fault needs no full comparison to be called present.
 _CLEARLY_VISIBLE_DN = 6.0
+# Share of the lit pixels that may keep more noise of sampling than the scene allows.
+_FEW = 0.01
+# Values of the semantic layer.
+SKY, BODY = 0, 1
+_ANGLE_LAYERS = {"incidence_deg", "emission_deg", "phase_deg", "albedo"}
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Terrain:
-    """A site with its patch and the renderer's copy of it."""
+    """A site with its patch and the renderer's copy of it, and the spacecraft above it, if there is one."""
 
     body: Body
     site: Site
     surface: Surface
+    vehicle: SpacecraftMesh | None = None
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -104,6 +109,8 @@ class Frame:
     images: dict[str, RGBI] = field(default_factory=dict)
     signals: dict[Any, Electrons] = field(default_factory=dict)
     pictures: dict[Any, RGBI] = field(default_factory=dict)
+    samples_per_pixel: float = field(init=False)
+    noise_fraction_p99: float = float("nan")
     mask: NDArray[np.bool_] = field(init=False)
     effects: dict[str, NDArray[np.bool_]] = field(default_factory=dict)
 
@@ -155,13 +162,16 @@ def resolve(frame: Frame) -> None:
         position = np.column_stack(
             [np.full(len(tries), fixed["x_m"]), np.full(len(tries), fixed["y_m"]), -(ground + height)]
         )
-        suns = [sunlight(scene, frames.direction_L(fixed["sun_azimuth_deg"], e)) for e in elevation]
+        suns = [world.sunlight(scene, frames.direction_L(fixed["sun_azimuth_deg"], e)) for e in elevation]
         clear = render.is_clear(surface, position, geometry.clearance_m)
         visible = render.sun_visible_fraction(surface, position, suns)
         for k, attempt in enumerate(attempts):
             axes = _attitude(scene, int(stratum[0]), suns[k].direction_L, fixed)
             angle = np.degrees(np.arccos(np.clip(axes[:, 2] @ suns[k].direction_L, -1, 1)))
             averted_ok = stratum[0] != plan.SUN_AVERTED or angle >= least
+            vehicle = spec.terrain.vehicle
+            if vehicle is not None and vehicle.blocked((axes.T @ suns[k].direction_L)[None])[0]:
+                visible[k] = 0.0
             good = bool(clear[k] and averted_ok and (not needs_sun or visible[k] == 1.0))
             pose = Pose(
                 position_L_m=position[k],
@@ -191,78 +201,6 @@ def _attitude(scene: SceneConfig, stratum: int, sun_L: F64, fixed: Mapping[str, 
 # --- render ------------------------------------------------------------------------------------------------
 
 
-def sun_distance_au(scene: SceneConfig) -> float:
-    """The body's distance from the Sun: as given, or of 67P at the Julian date."""
-    if scene.sun.distance_au is not None:
-        return scene.sun.distance_au
-    return float(np.linalg.norm(frames.ORBIT_67P.position_J_au(scene.sun.julian_date)))
-
-
-def sunlight(scene: SceneConfig, direction_L: F64) -> Sunlight:
-    """The Sun at the scene's distance in a direction of L."""
-    distance = sun_distance_au(scene)
-    return Sunlight(
-        direction_L=direction_L,
-        angular_radius_rad=spectra.sun_angular_radius_rad(distance),
-        irradiance_W_m2_nm=spectra.solar_band_irradiance_W_m2_nm(wavelengths_nm(scene), distance),
-        limb_darkening=spectra.limb_darkening(wavelengths_nm(scene)) if scene.sun.limb_darkening else None,
-    )
-
-
-def photometry_of(scene: SceneConfig) -> Photometry:
-    """How the scene's ground reflects, at its band nodes."""
-    table, wavelength = scene.body.photometry, wavelengths_nm(scene)
-    if table.model == "hapke":
-        rows = table.parameters if table.hapke is None else table.rows()
-        return photometry.hapke_at(wavelength, rows)
-    return photometry.Diffuse(
-        reflectance=spectra.reflectance(scene.body.reflectance, wavelength),
-        disc=table.model,
-        phase_slope_mag_deg=table.phase_slope_mag_deg,
-    )
-
-
-def dust_contrast(scene: SceneConfig) -> F64 | None:
-    """Reflectance of dust-covered over bare ground, minus 1, float64[band]; None where they are alike."""
-    table, wavelength = scene.body.photometry, wavelengths_nm(scene)
-    slope = table.dust_slope_per_100nm * (wavelength - photometry.REFERENCE_NM) / 100
-    contrast = (1 + table.dust_contrast) * (1 + slope) - 1
-    return contrast if np.any(contrast) else None
-
-
-def wavelengths_nm(scene: SceneConfig) -> F64:
-    """Band nodes of the scene."""
-    r = scene.render
-    return spectra.band_nodes_nm(r.band_min_nm, r.band_max_nm, r.bands)
-
-
-def base_camera(scene: SceneConfig, *, architecture: int = 0, readout_direction: int = 0) -> Camera:
-    """The scene's camera without exposure; the integers index its lists of options."""
-    c = scene.camera
-    return Camera(
-        lens=ThinLens(
-            focal_length_mm=cameras.focal_length_mm(c.fov_deg, c.width_px, c.pixel_pitch_um),
-            f_number=c.f_number,
-            transmission=c.transmission,
-            focus_distance_m=float("inf") if c.focus_distance_m is None else c.focus_distance_m,
-        ),
-        detector=Detector(
-            width_px=c.width_px,
-            height_px=c.height_px,
-            pixel_pitch_um=c.pixel_pitch_um,
-            full_well_e=c.full_well_e,
-            read_noise_e_rms=c.read_noise_e_rms,
-            dark_current_e_s=c.dark_current_e_s,
-            adc_bits=c.adc_bits,
-            bias_dn=c.bias_dn,
-            response=c.response,
-            quantum_efficiency_peak=c.quantum_efficiency_peak,
-        ),
-        architecture=c.architectures[architecture],
-        readout_direction=c.readout_directions[readout_direction],
-    )
-
-
 def describe(frame: Frame) -> Scene:
     """The sample as the renderer takes it."""
     spec, camera = frame.spec, frame.camera
@@ -276,13 +214,13 @@ def describe(frame: Frame) -> Scene:
         aperture_radius_m=camera.lens.aperture_radius_m,
         focus_distance_m=camera.lens.focus_distance_m,
     )
-    wavelength = wavelengths_nm(scene)
+    wavelength = world.wavelengths_nm(scene)
     return Scene(
         view=view,
         sun=frame.sunlight,
         wavelength_nm=wavelength,
-        photometry=photometry_of(scene),
-        dust_contrast=dust_contrast(scene),
+        photometry=world.photometric_model(scene),
+        dust_contrast=world.dust_contrast(scene),
         bounces=scene.render.bounces,
         samples_per_pixel=scene.render.samples_per_pixel,
         key=int(spec.rng("render", "jitter").integers(2**32)),
@@ -294,15 +232,67 @@ def render_frame(frame: Frame) -> None:
     from . import render
 
     spec, i = frame.spec, frame.spec.index
-    frame.camera = base_camera(
+    frame.camera = world.base_camera(
         spec.scene,
         architecture=int(spec.plan.architecture[i]),
         readout_direction=int(spec.plan.readout_direction[i]),
     )
-    frame.sunlight = sunlight(spec.scene, frame.pose.sun_L)
+    frame.sunlight = world.sunlight(spec.scene, frame.pose.sun_L)
+    frame.samples_per_pixel = float(spec.scene.render.samples_per_pixel)
     scene = describe(frame)
-    frame.radiance = render.radiance(spec.terrain.surface, scene)
-    frame.truth = render.truth(spec.terrain.surface, scene.view, scene.sun)
+    surface = spec.terrain.surface
+    angles = bool(_ANGLE_LAYERS & set(spec.scene.dataset.layers))
+    frame.truth = render.truth(surface, scene.view, scene.sun, angles=angles)
+    if spec.scene.render.noise_fraction is None:
+        frame.radiance = render.radiance(surface, scene)
+    else:
+        _render_to_the_noise(frame, scene, spec.scene.render.noise_fraction)
+
+
+def _render_to_the_noise(frame: Frame, scene: Scene, fraction: float) -> None:
+    """Render with more samples where chance would show: up to `fraction` of the sensor's own noise.
+
+    The error of a pixel is judged by two halves of its samples, over 3×3 pixels; those that err too much are
+    rendered again with four times as many, and so on, until at most 1 % of the lit pixels are left or the scene's
+    limit is reached. All of it follows from scene and sample, so the bits do not depend on how a build runs.
+    """
+    from . import render
+
+    surface, settings = frame.spec.terrain.surface, frame.spec.scene.render
+    lens_and_sensor = _green_per_second(frame)
+    frame.radiance, halves = render.estimate(surface, scene, lens_and_sensor)
+    exposure = _exposure_s(frame, _rate(frame, frame.radiance))
+    error_e = np.abs(halves) * exposure
+    signal_e = np.einsum("b,byx->yx", lens_and_sensor * exposure, frame.radiance.array)
+    detector = frame.camera.detector
+    sensor_e2 = signal_e + detector.dark_current_e_s * exposure + detector.read_noise_e_rms**2
+    lit = signal_e > 0.01 * detector.full_well_e
+    samples, spent = scene.samples_per_pixel, np.full(error_e.shape, scene.samples_per_pixel, dtype=np.int32)
+    array = frame.radiance.array.copy()
+    while True:
+        share = np.sqrt(cv2.blur(error_e**2, (3, 3)) / sensor_e2)
+        noisy = np.flatnonzero((share > fraction) & (spent == samples)).astype(np.uint32)
+        samples *= 4
+        if np.count_nonzero(share[lit] > fraction) <= _FEW * np.count_nonzero(lit):
+            break
+        if samples > settings.max_samples_per_pixel or not len(noisy):
+            break
+        # samples of their own: the first ones chose the pixel, and a lucky choice would be a bias
+        again = replace(scene, samples_per_pixel=samples, key=(scene.key + samples) & 0xFFFFFFFF)
+        more, halves = render.estimate(surface, again, lens_and_sensor, noisy)
+        array.reshape(len(array), -1)[:, noisy] = more.array[:, 0]
+        error_e.ravel()[noisy] = np.abs(halves[0]) * exposure
+        spent.ravel()[noisy] = samples
+    frame.radiance = frame.radiance.with_array(array)
+    frame.samples_per_pixel = float(spent.mean())
+    frame.noise_fraction_p99 = float(np.percentile(share[lit], 99)) if lit.any() else 0.0
+
+
+def _green_per_second(frame: Frame) -> F64:
+    """Electrons per second of the green pixels for a unit of radiance in each band, float64[band]."""
+    nodes = world.wavelengths_nm(frame.spec.scene)
+    unit = Radiance(array=np.eye(len(nodes), dtype=np.float32)[:, :, None], wavelength_nm=nodes)
+    return np.asarray(_rate(frame, unit).array[:, 0, 1], dtype=np.float64)
 
 
 # --- meter -------------------------------------------------------------------------------------------------
@@ -311,9 +301,8 @@ def render_frame(frame: Frame) -> None:
 def meter(frame: Frame) -> None:
     """Exposure: fixed, or metered once on the noise-free, fault-free frame; all twins share it."""
     frame.rate = _rate(frame, frame.radiance)
-    fixed = frame.spec.scene.camera.exposure_s
-    exposure = _metered_exposure_s(frame) if fixed == "auto" else float(fixed)
-    frame.camera = replace(frame.camera, exposure_s=exposure)
+    frame.camera = replace(frame.camera, exposure_s=_exposure_s(frame, frame.rate))
+    _add_stars(frame)
     direction_C = frame.pose.L_from_C.T @ frame.pose.sun_L
     frame.context = FaultContext(
         camera=frame.camera,
@@ -324,18 +313,37 @@ def meter(frame: Frame) -> None:
     )
 
 
-def _metered_exposure_s(frame: Frame) -> float:
+def _exposure_s(frame: Frame, rate: Electrons) -> float:
+    fixed = frame.spec.scene.camera.exposure_s
+    return _metered_exposure_s(frame, rate) if fixed == "auto" else float(fixed)
+
+
+def _add_stars(frame: Frame) -> None:
+    """Stars after metering: no exposure is made for them."""
+    scene, truth = frame.spec.scene, frame.truth
+    if scene.sky.stars == "off":
+        return
+    T_from_L = frame.spec.terrain.site.T_from_L
+    T_from_J = world.target_attitude(scene, T_from_L @ frame.pose.sun_L)
+    J_from_C = T_from_J.T @ T_from_L @ frame.pose.L_from_C
+    starry = world.with_stars(scene, frame.radiance, frame.camera, J_from_C, truth.semantic == SKY)
+    if starry is not frame.radiance:
+        frame.radiance = starry
+        frame.rate = _rate(frame, starry)
+
+
+def _metered_exposure_s(frame: Frame, rate: Electrons) -> float:
     settings, scene = frame.spec.scene.camera, frame.spec.scene
     # as a facet whose normal is 45 degrees from the Sun would be exposed
     half = np.sqrt(0.5)
-    lit = photometry.radiance_factor(photometry_of(scene), [0, half, half], [half, 0, half])[:, 0] / np.pi
+    lit = photometry.radiance_factor(world.photometric_model(scene), [0, half, half], [half, 0, half])[:, 0] / np.pi
     facet = (lit * frame.sunlight.irradiance_W_m2_nm).astype(np.float32).reshape(-1, 1, 1)
     per_second = _rate(frame, frame.radiance.with_array(facet))
     facet_brightness = float(_brightness(per_second.array, per_second.white_e).max())
     reference = settings.metering_level / max(facet_brightness, 1e-30)
     # every other pixel each way is sample enough for a percentile
-    body = frame.truth.semantic[::2, ::2] == 1
-    shown = _brightness(frame.rate.array[::2, ::2], frame.rate.white_e)[body]
+    body = frame.truth.semantic[::2, ::2] == BODY
+    shown = _brightness(rate.array[::2, ::2], rate.white_e)[body]
     shown = shown[shown > 0.02 / reference]  # sunlit: above a fiftieth of the reference facet
     exposure = reference
     if len(shown) >= 64:
@@ -582,6 +590,9 @@ def to_sample(frame: Frame) -> Sample:
         "depth_m": frame.truth.depth_m,
         "normal": frame.truth.normal,
         "semantic": frame.truth.semantic,
+        "incidence_deg": frame.truth.incidence_deg,
+        "emission_deg": frame.truth.emission_deg,
+        "phase_deg": frame.truth.phase_deg,
     }
     layers = {
         "image": frame.images["image"].array,
@@ -597,6 +608,10 @@ def to_sample(frame: Frame) -> Sample:
             layers[name] = np.stack([frame.effects.get(f, empty) for f in names])
         elif name == "radiance":
             layers[name] = frame.radiance.array
+        elif name == "albedo" and frame.truth.dust is not None:
+            layers[name] = world.normal_albedo(spec.scene, frame.truth.dust)
+        elif name == "point_T_m":
+            layers[name] = _points_T_m(frame)
         elif name in available:
             layers[name] = available[name]
     T_from_L = site.T_from_L
@@ -610,10 +625,10 @@ def to_sample(frame: Frame) -> Sample:
         "position_L_m": pose.position_L_m,
         "camera_from_T": frames.quaternion(T_from_C.T),
         "T_from_L": T_from_L,
-        "T_from_J": target_attitude(spec.scene, sun_T),
+        "T_from_J": world.target_attitude(spec.scene, sun_T),
         "site_T_m": site.position_T_m,
         "sun_direction_T": sun_T,
-        "sun_distance_au": sun_distance_au(spec.scene),
+        "sun_distance_au": world.sun_distance_au(spec.scene),
         "julian_date": spec.scene.sun.julian_date,
         "intrinsics": frame.camera.intrinsics,
         "sun_azimuth_deg": pose.sun_azimuth_deg,
@@ -624,6 +639,8 @@ def to_sample(frame: Frame) -> Sample:
         "sun_xy_px": np.full(2, np.nan) if sun_xy is None else sun_xy,
         "sun_visible_fraction": pose.sun_visible_fraction,
         "exposure_s": frame.camera.exposure_s,
+        "samples_per_pixel": frame.samples_per_pixel,
+        "noise_fraction_p99": frame.noise_fraction_p99,
         "tries": pose.tries + int(spec.plan.attitude_tries[i]) - 1,
         "stratum": int(spec.plan.stratum[i]),
         "site": int(spec.plan.site[i]),
@@ -638,6 +655,19 @@ def to_sample(frame: Frame) -> Sample:
     return Sample(index=i, layers=layers, scalars=scalars)
 
 
+def _points_T_m(frame: Frame) -> F64:
+    """Surface points of the pixel centres in T, float64[y, x, 3] metres, NaN on the sky."""
+    fx, fy, cx, cy = frame.camera.intrinsics
+    height, width = frame.context.shape
+    x, y = (np.arange(width) + 0.5 - cx) / fx, (np.arange(height) + 0.5 - cy) / fy
+    depth = np.where(np.isfinite(frame.truth.depth_m), frame.truth.depth_m.astype(np.float64), np.nan)
+    seen_C = np.stack([x[None, :] * depth, y[:, None] * depth, depth], axis=-1)
+    site, pose = frame.spec.terrain.site, frame.pose
+    T_from_C = site.T_from_L @ pose.L_from_C
+    camera_T_m = site.position_T_m + site.T_from_L @ pose.position_L_m
+    return np.asarray(seen_C @ T_from_C.T + camera_T_m)
+
+
 def proposal(scene: SceneConfig, table: plan.Plan, index: int) -> dict[str, Any]:
     """What the plan proposed for a sample, before `resolve`; plain data. Where the Sun-averted attitude was
     drawn again, the one that was kept (`tries` counts it)."""
@@ -648,19 +678,6 @@ def proposal(scene: SceneConfig, table: plan.Plan, index: int) -> dict[str, Any]
         "architecture": camera.architectures[int(table.architecture[index])],
         "readout_direction": camera.readout_directions[int(table.readout_direction[index])],
     }
-
-
-def target_attitude(scene: SceneConfig, sun_T: F64) -> F64:
-    """T_from_J of the target under the commanded Sun: the attitude nearest to the body's own at the date."""
-    body, date = scene.body, scene.sun.julian_date
-    own = frames.Rotation(
-        pole_ra_deg=body.pole_ra_deg,
-        pole_dec_deg=body.pole_dec_deg,
-        prime_meridian_deg=body.prime_meridian_deg,
-        period_h=body.rotation_period_h,
-    ).J_from_T(date)
-    sun_J = -frames.unit(frames.ORBIT_67P.position_J_au(date))
-    return frames.T_from_J_commanded(own.T, sun_J, sun_T)
 
 
 # --- a session: many samples of one scene ------------------------------------------------------------------
@@ -696,19 +713,6 @@ def mask_any_faults(scene: SceneConfig, faults: Mapping[str, Fault]) -> tuple[st
     return tuple(name for name, fault in faults.items() if fault.localised)
 
 
-def make_body(scene: SceneConfig) -> Body:
-    """The scene's body. Raises InputError."""
-    table = scene.body
-    physical = {
-        "density_kg_m3": table.density_kg_m3,
-        "rotation_period_s": table.rotation_period_h * 3600,
-    }
-    if table.shape == "ellipsoid":
-        vertices, faces = ellipsoid(table.semi_axes_m)
-        return Body(name=table.name, vertices_m=vertices, faces=faces, **physical)
-    return load_body(table.shape, unit=table.unit, name=table.name, **physical)
-
-
 class Session:
     """A scene with its plan, and the terrain of the site at work: `simulate` for any sample, in any order.
 
@@ -733,12 +737,17 @@ class Session:
     @cached_property
     def base_camera(self) -> Camera:
         """The camera before a sample's exposure, architecture and readout direction."""
-        return base_camera(self.scene)
+        return world.base_camera(self.scene)
 
     @cached_property
     def body(self) -> Body:
         """The body, loaded when first asked for."""
-        return make_body(self.scene)
+        return world.make_body(self.scene)
+
+    @cached_property
+    def vehicle(self) -> SpacecraftMesh | None:
+        """The spacecraft that carries the camera, if the scene has one."""
+        return world.spacecraft(self.scene)
 
     @cached_property
     def sites(self) -> tuple[Site, ...]:
@@ -754,8 +763,15 @@ class Session:
                 render.set_threads(self._threads)
             self._terrain = None  # let go of the old one first: two do not fit a small machine
             patch = self._patch(self.sites[site])
-            surface = render.Surface(patch.vertices_L_m, patch.faces, patch.face_is_boulder)
-            self._terrain = Terrain(body=self.body, site=patch.site, surface=surface)
+            vehicle = self.vehicle
+            surface = render.Surface(
+                patch.vertices_L_m,
+                patch.faces,
+                patch.face_is_boulder,
+                dust=getattr(patch, "dust", None),
+                vehicle=None if vehicle is None else world.render_vehicle(self.scene, vehicle),
+            )
+            self._terrain = Terrain(body=self.body, site=patch.site, surface=surface, vehicle=vehicle)
         return self._terrain
 
     def _patch(self, site: Site) -> Patch:
@@ -787,11 +803,3 @@ class Session:
     def frame(self, index: int) -> Frame:
         """One sample with all that lies between radiance and labels."""
         return develop_frame(self.spec(index))
-
-
-def ellipsoid(semi_axes_m: tuple[float, float, float]) -> tuple[F64, NDArray[np.int32]]:
-    """A triaxial ellipsoid as a closed mesh of 82,000 triangles: vertices float64[n, 3] in m, faces int32."""
-    import trimesh
-
-    sphere = trimesh.creation.icosphere(subdivisions=6)
-    return np.asarray(sphere.vertices) * np.array(semi_axes_m), np.asarray(sphere.faces, dtype=np.int32)

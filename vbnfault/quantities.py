@@ -94,12 +94,18 @@ class Truth:
     """Noise-free truth of the pixel centres.
 
     `depth_m` float32[y, x], along the boresight, inf on the sky; `normal` float16[y, x, 3] in C, 0 on the sky;
-    `semantic` uint8[y, x]: 0 sky, 1 body, 2 Sun, 3 spacecraft.
+    `semantic` uint8[y, x]: 0 sky, 1 body, 2 Sun, 3 spacecraft. Where asked for, float32[y, x], NaN on the sky:
+    `incidence_deg` and `emission_deg` from the normal to the Sun and to the camera, `phase_deg` between the two,
+    and `dust`, how far the ground is covered, in [0, 1].
     """
 
     depth_m: NDArray[np.float32]
     normal: NDArray[np.float16]
     semantic: NDArray[np.uint8]
+    incidence_deg: NDArray[np.float32] | None = None
+    emission_deg: NDArray[np.float32] | None = None
+    phase_deg: NDArray[np.float32] | None = None
+    dust: NDArray[np.float32] | None = None
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -1,9 +1,10 @@
 """Rendering with Mitsuba 3 (LLVM, spectral). The only package that imports it; importing this loads it."""
 
-from .integrate import radiance, truth
+from .integrate import estimate, radiance, truth
 from .resolve import ground_height_m, is_clear, sun_visible_fraction
 from .runtime import set_threads
 from .surface import Surface
+from .vehicle import Vehicle
 
 
 def self_test() -> str:
@@ -40,6 +41,8 @@ def self_test() -> str:
 
 __all__ = [
     "Surface",
+    "Vehicle",
+    "estimate",
     "ground_height_m",
     "is_clear",
     "radiance",

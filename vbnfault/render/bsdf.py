@@ -10,30 +10,55 @@ from typing import Any
 
 import numpy as np
 
-from ..photometry import Hapke, Photometry
+from ..photometry import Hapke
+from ..scene import Scene
 from .runtime import dr, mi
+from .surface import Surface
+
+
+def has_bands(surface: Surface, scene: Scene) -> bool:
+    """Whether bands differ by more than a factor, so that each needs a term of its own."""
+    return scene.photometry.terms > 1 or scene.dust_contrast is not None or surface.vehicle is not None
 
 
 class Reflection:
-    """A photometric model at hits with unit `normal`, seen along unit `view` (away from the surface)."""
+    """Reflection at `hit`, seen along unit `view` (away from the surface): a term a band if `banded`, with the
+    model's weights in it, else the model's single term."""
 
-    def __init__(self, model: Photometry, normal: Any, view: Any) -> None:
-        self._model = model
-        self._frame = mi.Frame3f(normal)
+    def __init__(self, surface: Surface, scene: Scene, hit: Any, view: Any, *, banded: bool) -> None:
+        self._scene, self._hit, self._banded = scene, hit, banded
+        self._vehicle = surface.vehicle
+        self._frame = mi.Frame3f(hit.normal)
         self._view = _triple(self._frame.to_local(view))
 
     def terms(self, light: Any) -> list[Any]:
         """Per sample, BRDF × cos i for unit directions towards the light; 0 where it comes from below."""
-        return self._model.evaluate(dr, _triple(self._frame.to_local(light)), self._view)
+        return self._evaluate(self._frame.to_local(light))
 
     def scattered(self, u: Any, v: Any) -> tuple[Any, list[Any]]:
         """A direction drawn by the cosine, from two uniform numbers, and the terms over its density there."""
         local = mi.warp.square_to_cosine_hemisphere(mi.Point2f(u, v))
         local.z = dr.maximum(local.z, 1e-5)
-        # BRDF × cos i over cos i / π
-        weight = dr.pi / local.z
-        terms = self._model.evaluate(dr, _triple(local), self._view)
-        return self._frame.to_world(local), [term * weight for term in terms]
+        weight = dr.pi / local.z  # BRDF × cos i over cos i / π
+        return self._frame.to_world(local), [term * weight for term in self._evaluate(local)]
+
+    def _evaluate(self, light: Any) -> list[Any]:
+        model, contrast = self._scene.photometry, self._scene.dust_contrast
+        terms = model.evaluate(dr, _triple(light), self._view)
+        if not self._banded:
+            return terms
+        if model.terms == 1:
+            terms = [terms[0] * dr.opaque(mi.Float, float(w)) for w in model.weights[0]]
+        if contrast is not None:
+            dust = self._hit.dust
+            terms = [
+                t * dr.fma(dust, dr.opaque(mi.Float, float(c)), 1) for t, c in zip(terms, contrast, strict=True)
+            ]
+        if self._vehicle is not None:
+            on, lambert = self._hit.on_vehicle, dr.maximum(light.z, 0) * dr.inv_pi
+            albedo = self._vehicle.albedo(self._hit.material, on)
+            terms = [dr.select(on, lambert * a, t) for a, t in zip(albedo, terms, strict=True)]
+        return terms
 
 
 def _triple(v: Any) -> tuple[Any, Any, Any]:

@@ -6,10 +6,13 @@ a block sum: bit-identical from run to run, whatever the number of threads.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..scene import View
 from .runtime import dr, mi
@@ -21,12 +24,16 @@ class Strata:
     """Jittered strata of all pixels: `pixel`, `index` within the pixel, a point of the pixel's area, and points
     of unit discs (the lens, the Sun) stratified over the samples of a pixel."""
 
-    def __init__(self, width: int, rows: int, samples_per_pixel: int, key: int, first_row: int = 0) -> None:
+    def __init__(self, pixels: Pixels, samples_per_pixel: int, key: int) -> None:
         self.side = round(samples_per_pixel**0.5)
         self.samples = samples_per_pixel
-        wavefront = dr.arange(mi.UInt32, width * rows * samples_per_pixel)
-        wavefront += dr.opaque(mi.UInt32, first_row * width * samples_per_pixel)
         self._shift = int(samples_per_pixel).bit_length() - 1
+        wavefront = dr.arange(mi.UInt32, pixels.count * samples_per_pixel)
+        if pixels.listed is None:
+            wavefront += dr.opaque(mi.UInt32, pixels.first * samples_per_pixel)
+        else:
+            pixel = dr.gather(mi.UInt32, mi.UInt32(pixels.listed), wavefront >> self._shift)
+            wavefront = (pixel << self._shift) + (wavefront & (samples_per_pixel - 1))
         self.pixel = wavefront >> self._shift
         self.index = wavefront & (samples_per_pixel - 1)
         self._key = dr.opaque(mi.UInt32, key & 0xFFFFFFFF)
@@ -42,6 +49,11 @@ class Strata:
             (mi.Float(sy) + mi.Float(v) * _TO_UNIT) / self.side,
         )
 
+    def checkered(self) -> Any:
+        """+1 and -1 by turns, as on a chessboard: two halves of the samples that each cover the pixel."""
+        parity = (self.index ^ (self.index >> (self.side.bit_length() - 1))) & 1
+        return 1 - 2 * mi.Float(parity)
+
     def disc(self, dimension: int) -> Any:
         """A point of the unit disc; the samples of a pixel share one of 256 stratified sets, chosen by a hash.
 
@@ -53,6 +65,24 @@ class Strata:
         h ^= h >> 13
         at = ((h & (_DISC_SETS - 1)) << self._shift) + self.index
         return dr.gather(mi.Point2f, _disc_table(self.samples, dimension), at)
+
+
+@dataclass(frozen=True)
+class Pixels:
+    """Pixels of a frame by their number, row after row: `count` of them from `first` on, or those `listed`."""
+
+    count: int
+    first: int = 0
+    listed: NDArray[np.uint32] | None = None
+
+    def parts(self, most: int) -> Iterator[Pixels]:
+        """The same in parts of at most `most`."""
+        for start in range(0, self.count, most):
+            count = min(most, self.count - start)
+            if self.listed is None:
+                yield Pixels(count, self.first + start)
+            else:
+                yield Pixels(count, listed=self.listed[start : start + count])
 
 
 _DISC_SETS = 256

@@ -12,7 +12,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..scene import View
 from .runtime import dr, mi
+from .vehicle import Vehicle, World
 
 # Float32 resolves 2⁻²³ of a coordinate; hit distance, ray direction and vertex rounding each err by about one
 # unit, so eight of them clear the facet without visibly moving the shadow (1 mm at 1 km).
@@ -22,7 +24,7 @@ _OFFSET = 8 * 2.0**-23
 class Surface:
     """A triangle mesh in L. `vertices_m` float32[n, 3], `faces` int32[m, 3], `flat` bool[m]: facets shaded with
     their own normal, such as boulders; the others with normals interpolated from their vertices. `dust` float32[n]
-    in [0, 1]: how far each vertex is covered (default: none is)."""
+    in [0, 1]: how far each vertex is covered (default: none is). `vehicle`: the spacecraft with the camera."""
 
     def __init__(
         self,
@@ -30,6 +32,7 @@ class Surface:
         faces: NDArray[np.int32],
         flat: NDArray[np.bool_],
         dust: NDArray[np.float32] | None = None,
+        vehicle: Vehicle | None = None,
     ) -> None:
         mesh = mi.Mesh("terrain", len(vertices_m), len(faces))
         parameters = mi.traverse(mesh)
@@ -40,6 +43,11 @@ class Surface:
         self._corners = mi.Float(_corner_records(vertices_m, faces, flat).ravel())
         self._dust = mi.Float(0.0 if dust is None else np.ascontiguousarray(_with_a_fourth(dust[faces])).ravel())
         dr.eval(self._corners, self._dust)
+        self.vehicle = vehicle
+
+    def seen_from(self, view: View) -> Surface | World:
+        """What a camera sees: the terrain, and its own spacecraft if there is one."""
+        return self if self.vehicle is None else World(self, self.vehicle, view)
 
     def intersect(self, rays: Any, active: Any = True, *, coherent: bool = True) -> Hit:
         """Closest hits; `coherent` where neighbours run alike."""
@@ -52,7 +60,9 @@ class Surface:
 
 class Hit:
     """Closest hits of a wavefront: `valid`, `distance_m`, and the unit outward `normal` that shades, interpolated
-    over the facet unless it is flat."""
+    over the facet unless it is flat. `material`: of the vehicle's, None for terrain alone."""
+
+    material = None
 
     def __init__(self, surface: Surface, rays: Any, found: Any) -> None:
         self.valid = found.is_valid()

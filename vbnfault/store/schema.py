@@ -66,6 +66,13 @@ LAYERS: dict[str, Array] = {
     "depth_m": Array("sample y x", "float32", "m", "depth along the boresight, inf on the sky", ratio=0.5),
     "normal": Array("sample y x xyz", "float16", "1", "surface normal in C, 0 on the sky", ratio=0.55),
     "semantic": Array("sample y x", "uint8", "1", "what a pixel shows", SEMANTIC, ratio=0.01),
+    "point_T_m": Array("sample y x xyz", "float64", "m", "surface point in T, NaN on the sky", ratio=0.9),
+    "incidence_deg": Array("sample y x", "float32", "deg", "normal to Sun, NaN on the sky", ratio=0.8),
+    "emission_deg": Array("sample y x", "float32", "deg", "normal to camera, NaN on the sky", ratio=0.8),
+    "phase_deg": Array("sample y x", "float32", "deg", "Sun to camera at the surface, NaN on the sky", ratio=0.7),
+    "albedo": Array(
+        "sample y x", "float32", "1", "I/F at i = e = phase = 0 near 649 nm, NaN on the sky", ratio=0.4
+    ),
     "radiance": Array("sample band y x", "float16", "W m-2 sr-1 nm-1", "radiance at the camera", ratio=0.7),
 }
 REQUIRED_LAYERS = ("image", "mask", "mask_any", "clean")
@@ -91,6 +98,13 @@ SCALARS: dict[str, Array] = {
     "sun_xy_px": Array("sample xy", "float64", "px", "Sun centre in the image, NaN behind the camera"),
     "sun_visible_fraction": Array("sample", "float64", "1", "part of the solar disc that is not occluded"),
     "exposure_s": Array("sample", "float64", "s", "exposure time"),
+    "samples_per_pixel": Array("sample", "float64", "1", "mean number of render samples a pixel"),
+    "noise_fraction_p99": Array(
+        "sample",
+        "float64",
+        "1",
+        "noise of sampling over the sensor's, 99th percentile of lit pixels; NaN: not asked",
+    ),
     "tries": Array("sample", "int32", "1", "proposals drawn until one could be used"),
     "stratum": Array("sample", "uint8", "1", "stratum of the sampling", STRATA),
     "site": Array("sample", "int32", "1", "index of the site"),

@@ -1,0 +1,118 @@
+"""The spacecraft around the camera, traced in its own frame.
+
+The vehicle moves with the camera, so its mesh stays as it is and the rays are turned into its frame B: nothing is
+built again from sample to sample, and parts near the camera keep float32's precision.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..scene import View
+from .runtime import dr, mi
+from .sampling import opaque_vector
+
+if TYPE_CHECKING:
+    from .surface import Hit, Surface
+
+# Metres off a facet where shadow rays start: far above float32's resolution at 1 km, far below a part's size.
+_OFFSET_M = 5e-4
+
+
+class Vehicle:
+    """A spacecraft of diffuse facets in B: `vertices_m` float32[n, 3], `faces` int32[m, 3], `face_material`
+    int32[m], `reflectance` float64[material, band]. Facets are seen, and shine, on both sides."""
+
+    def __init__(
+        self,
+        vertices_m: NDArray[np.float32],
+        faces: NDArray[np.int32],
+        face_material: NDArray[np.int32],
+        reflectance: NDArray[np.float64],
+    ) -> None:
+        mesh = mi.Mesh("vehicle", len(vertices_m), len(faces))
+        parameters = mi.traverse(mesh)
+        parameters["vertex_positions"] = mi.Float(np.ascontiguousarray(vertices_m, np.float32).ravel())
+        parameters["faces"] = mi.UInt32(np.ascontiguousarray(faces, np.uint32).ravel())
+        parameters.update()
+        self.scene = mi.load_dict({"type": "scene", "vehicle": mesh})
+        a, b, c = (vertices_m[faces[:, k]].astype(np.float64) for k in range(3))
+        normal = np.cross(b - a, c - a)
+        normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
+        # four floats a facet, fetched in one packet: its normal and its material
+        self._facets = mi.Float(np.column_stack([normal, face_material]).astype(np.float32).ravel())
+        self._reflectance = [mi.Float(np.ascontiguousarray(column, np.float32)) for column in reflectance.T]
+        dr.eval(self._facets, *self._reflectance)
+
+    def facet(self, index: Any, active: Any) -> tuple[Any, Any]:
+        """Normal in B and material of facets."""
+        record = dr.gather(mi.Vector4f, self._facets, index, active)
+        return mi.Vector3f(record.xyz), mi.UInt32(record.w)
+
+    def albedo(self, material: Any, active: Any) -> list[Any]:
+        """Reflectance per band."""
+        return [dr.gather(mi.Float, band, material, active) for band in self._reflectance]
+
+
+class World:
+    """Terrain and a vehicle in its place: intersected as one."""
+
+    def __init__(self, surface: Surface, vehicle: Vehicle, view: View) -> None:
+        self.surface, self.vehicle = surface, vehicle
+        self._origin = opaque_vector(mi.Point3f, view.position_L_m)
+        self._axes = [opaque_vector(mi.Vector3f, view.L_from_C[:, k]) for k in range(3)]  # B coincides with C
+
+    def intersect(self, rays: Any, active: Any = True, *, coherent: bool = True) -> VehicleHit:
+        """Closest hits of either; `material` tells the vehicle's from the ground's."""
+        hit = self.surface.intersect(rays, active, coherent=coherent)
+        found = self.vehicle.scene.ray_intersect_preliminary(self._in_B(rays), coherent=coherent, active=active)
+        nearer = found.is_valid() & (~hit.valid | (found.t < hit.distance_m))
+        normal, material = self.vehicle.facet(found.prim_index, nearer)
+        normal = self._in_L(normal)
+        normal = dr.mulsign(normal, -dr.dot(normal, rays.d))  # towards who looks
+        return VehicleHit(hit, nearer, found.t, normal, material, rays)
+
+    def occluded(self, rays: Any, active: Any, *, coherent: bool = True) -> Any:
+        """Whether anything lies along the rays."""
+        behind = self.vehicle.scene.ray_test(self._in_B(rays), coherent, active)
+        return behind | self.surface.occluded(rays, active & ~behind, coherent=coherent)
+
+    def _in_B(self, rays: Any) -> Any:
+        o = rays.o - self._origin
+        turned = mi.Ray3f(
+            mi.Point3f(*(dr.dot(o, axis) for axis in self._axes)),
+            mi.Vector3f(*(dr.dot(rays.d, axis) for axis in self._axes)),
+        )
+        turned.maxt = rays.maxt
+        return turned
+
+    def _in_L(self, v: Any) -> Any:
+        x, y, z = self._axes
+        return v.x * x + v.y * y + v.z * z
+
+
+class VehicleHit:
+    """Hits of which some are on the vehicle; the rest is as the terrain's."""
+
+    def __init__(self, ground: Hit, nearer: Any, distance_m: Any, normal: Any, material: Any, rays: Any) -> None:
+        self._ground, self._rays = ground, rays
+        self.on_vehicle, self.material = nearer, material
+        self.valid = ground.valid | nearer
+        self.distance_m = dr.select(nearer, distance_m, ground.distance_m)
+        self.normal = dr.select(nearer, normal, ground.normal)
+
+    @property
+    def dust(self) -> Any:
+        """As the ground's; none on the vehicle."""
+        return dr.select(self.on_vehicle, 0, self._ground.dust)
+
+    def shadow_rays(self, direction: Any) -> Any:
+        """Rays from the hits, off the facet."""
+        rays = self._ground.shadow_rays(direction)
+        # to the side that the ray leaves on
+        side = dr.mulsign(mi.Vector3f(self.normal), dr.dot(self.normal, direction))
+        rays.o = dr.select(self.on_vehicle, self._rays(self.distance_m) + side * _OFFSET_M, rays.o)
+        return rays

@@ -1,0 +1,269 @@
+"""What a scene file stands for: its Sun and ephemeris, ground, body, camera, spacecraft and stars, as objects."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from . import camera as cameras
+from . import frames, photometry, sky, spectra, spice
+from .body import Body, load_body
+from .camera import Camera
+from .config import BodyTable, PoseTable, SceneConfig, SpiceTable, SunTable
+from .detector import Detector
+from .errors import InputError
+from .lens import ThinLens
+from .photometry import Photometry
+from .quantities import Radiance
+from .scene import Sunlight
+from .spacecraft import Placement, Pose, Spacecraft, SpacecraftMesh, default_spacecraft, load_spacecraft
+
+if TYPE_CHECKING:
+    from .render import Vehicle
+
+F64 = NDArray[np.float64]
+
+# Stars whose brightest pixel collects less than this share of the read noise are left out by `stars = "auto"`.
+_STAR_OVER_READ_NOISE = 0.1
+
+
+# --- Sun and ephemeris --------------------------------------------------------------------------------------
+
+
+@lru_cache(maxsize=8)
+def _ephemeris(sun: SunTable, body: BodyTable, kernels: SpiceTable) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    date = sun.julian_date
+    own = frames.Rotation(
+        pole_ra_deg=body.pole_ra_deg,
+        pole_dec_deg=body.pole_dec_deg,
+        prime_meridian_deg=body.prime_meridian_deg,
+        period_h=body.rotation_period_h,
+    ).J_from_T(date)
+    sun_J_au = -frames.ORBIT_67P.position_J_au(date)
+    if kernels.kernels:
+        with spice.kernels(*kernels.kernels):
+            et_s = spice.et_s_from_julian_date(date)
+            sun_J_au = spice.sun_position_J_au(kernels.target, et_s)
+            if kernels.frame:
+                own = spice.J_from_T(kernels.frame, et_s)
+    return tuple(sun_J_au), tuple(own.T.ravel())
+
+
+def ephemeris(scene: SceneConfig) -> tuple[F64, F64]:
+    """The Sun seen from the target in J, float64[3] in au, and the target's own T_from_J, float64[3, 3].
+
+    From SPICE kernels where the scene names some, else from 67P's two-body orbit and the pole and period of
+    `[body]`. Raises InputError for kernels that do not serve.
+    """
+    sun_J_au, own = _ephemeris(scene.sun, scene.body, scene.spice)
+    return np.array(sun_J_au), np.array(own).reshape(3, 3)
+
+
+def sun_distance_au(scene: SceneConfig) -> float:
+    """The body's distance from the Sun: as given, or by the ephemeris at the Julian date."""
+    if scene.sun.distance_au is not None:
+        return scene.sun.distance_au
+    return float(np.linalg.norm(ephemeris(scene)[0]))
+
+
+def sunlight(scene: SceneConfig, direction_L: F64) -> Sunlight:
+    """The Sun at the scene's distance in a direction of L."""
+    distance = sun_distance_au(scene)
+    return Sunlight(
+        direction_L=direction_L,
+        angular_radius_rad=spectra.sun_angular_radius_rad(distance),
+        irradiance_W_m2_nm=spectra.solar_band_irradiance_W_m2_nm(wavelengths_nm(scene), distance),
+        limb_darkening=spectra.limb_darkening(wavelengths_nm(scene)) if scene.sun.limb_darkening else None,
+    )
+
+
+def target_attitude(scene: SceneConfig, sun_T: F64) -> F64:
+    """T_from_J of the target under the commanded Sun: the attitude nearest to the body's own at the date."""
+    sun_J_au, own = ephemeris(scene)
+    return frames.T_from_J_commanded(own, frames.unit(sun_J_au), sun_T)
+
+
+# --- ground -------------------------------------------------------------------------------------------------
+
+
+def wavelengths_nm(scene: SceneConfig) -> F64:
+    """Band nodes of the scene."""
+    r = scene.render
+    return spectra.band_nodes_nm(r.band_min_nm, r.band_max_nm, r.bands)
+
+
+def photometric_model(scene: SceneConfig) -> Photometry:
+    """How the scene's ground reflects, at its band nodes."""
+    table, wavelength = scene.body.photometry, wavelengths_nm(scene)
+    if table.model == "hapke":
+        rows = table.parameters if table.hapke is None else table.rows()
+        return photometry.hapke_at(wavelength, rows)
+    return photometry.Diffuse(
+        reflectance=spectra.reflectance(_plain(scene.body.reflectance), wavelength),
+        disc=table.model,
+        phase_slope_mag_deg=table.phase_slope_mag_deg,
+    )
+
+
+def dust_contrast(scene: SceneConfig) -> F64 | None:
+    """Reflectance of dust-covered over bare ground, minus 1, float64[band]; None where they are alike."""
+    table, wavelength = scene.body.photometry, wavelengths_nm(scene)
+    slope = table.dust_slope_per_100nm * (wavelength - photometry.REFERENCE_NM) / 100
+    contrast = (1 + table.dust_contrast) * (1 + slope) - 1
+    return contrast if np.any(contrast) else None
+
+
+def normal_albedo(scene: SceneConfig, dust: NDArray[np.float32]) -> NDArray[np.float32]:
+    """I/F at normal incidence and emission, at the band node nearest to 649 nm, of ground covered with `dust`."""
+    band = int(np.argmin(np.abs(wavelengths_nm(scene) - photometry.REFERENCE_NM)))
+    contrast = dust_contrast(scene)
+    bare = photometry.radiance_factor(photometric_model(scene), [0, 0, 1], [0, 0, 1])[band, 0]
+    return np.asarray(bare * (1 + (0 if contrast is None else contrast[band]) * dust), dtype=np.float32)
+
+
+def make_body(scene: SceneConfig) -> Body:
+    """The scene's body. Raises InputError."""
+    table = scene.body
+    physical = {
+        "density_kg_m3": table.density_kg_m3,
+        "rotation_period_s": table.rotation_period_h * 3600,
+    }
+    if table.shape == "ellipsoid":
+        vertices, faces = ellipsoid(table.semi_axes_m)
+        return Body(name=table.name, vertices_m=vertices, faces=faces, **physical)
+    return load_body(table.shape, unit=table.unit, name=table.name, **physical)
+
+
+def ellipsoid(semi_axes_m: tuple[float, float, float]) -> tuple[F64, NDArray[np.int32]]:
+    """A triaxial ellipsoid as a closed mesh of 82,000 triangles: vertices float64[n, 3] in m, faces int32."""
+    import trimesh
+
+    sphere = trimesh.creation.icosphere(subdivisions=6)
+    return np.asarray(sphere.vertices) * np.array(semi_axes_m), np.asarray(sphere.faces, dtype=np.int32)
+
+
+# --- camera and spacecraft ----------------------------------------------------------------------------------
+
+
+def base_camera(scene: SceneConfig, *, architecture: int = 0, readout_direction: int = 0) -> Camera:
+    """The scene's camera without exposure; the integers index its lists of options."""
+    c = scene.camera
+    return Camera(
+        lens=ThinLens(
+            focal_length_mm=cameras.focal_length_mm(c.fov_deg, c.width_px, c.pixel_pitch_um),
+            f_number=c.f_number,
+            transmission=c.transmission,
+            focus_distance_m=float("inf") if c.focus_distance_m is None else c.focus_distance_m,
+        ),
+        detector=Detector(
+            width_px=c.width_px,
+            height_px=c.height_px,
+            pixel_pitch_um=c.pixel_pitch_um,
+            full_well_e=c.full_well_e,
+            read_noise_e_rms=c.read_noise_e_rms,
+            dark_current_e_s=c.dark_current_e_s,
+            adc_bits=c.adc_bits,
+            bias_dn=c.bias_dn,
+            response=c.response,
+            quantum_efficiency_peak=c.quantum_efficiency_peak,
+        ),
+        architecture=c.architectures[architecture],
+        readout_direction=c.readout_directions[readout_direction],
+    )
+
+
+def spacecraft(scene: SceneConfig) -> SpacecraftMesh | None:
+    """The vehicle that carries the camera, in B; None where the scene has none. Raises InputError."""
+    table = scene.spacecraft
+    if table.model == "none":
+        return None
+    if table.model == "default":
+        vehicle = default_spacecraft()
+        unknown = sorted(set(table.pose) - set(vehicle.hinges))
+        if unknown:
+            known = ", ".join(vehicle.hinges)
+            raise InputError(f"spacecraft.pose.{unknown[0]}: the default vehicle has no such joint; it has {known}")
+        return vehicle.posed({name: _pose(name, t, vehicle) for name, t in table.pose.items()}).merged()
+    return load_spacecraft(
+        Path(table.model),
+        unit=table.unit,
+        placement=Placement(
+            roll_deg=table.roll_deg,
+            pitch_deg=table.pitch_deg,
+            yaw_deg=table.yaw_deg,
+            translation_B_m=table.translation_m,
+        ),
+        materials={name: _plain(value) for name, value in table.materials.items()},
+        poses={name: _pose(name, t, None) for name, t in table.pose.items()},
+        default_material=_plain(table.default_material),
+    ).merged()
+
+
+def _plain(material: object) -> Any:
+    return material.model_dump() if hasattr(material, "model_dump") else material
+
+
+def _pose(name: str, table: PoseTable, vehicle: Spacecraft | None) -> Pose:
+    hinge = None if vehicle is None else vehicle.hinges[name]
+    at = table.hinge_m or (hinge.hinge_B_m if hinge else None)
+    axis = table.axis or (hinge.axis_B if hinge else None)
+    if at is None or axis is None:
+        raise InputError(f"spacecraft.pose.{name}: hinge_m and axis are missing")
+    return Pose(hinge_B_m=at, axis_B=axis, angle_deg=table.angle_deg)
+
+
+def render_vehicle(scene: SceneConfig, mesh: SpacecraftMesh) -> Vehicle:
+    """The renderer's copy of the spacecraft."""
+    from . import render
+
+    return render.Vehicle(
+        mesh.vertices_B_m, mesh.faces, mesh.face_material, mesh.reflectance(wavelengths_nm(scene))
+    )
+
+
+# --- stars --------------------------------------------------------------------------------------------------
+
+
+def with_stars(
+    scene: SceneConfig, radiance: Radiance, camera: Camera, J_from_C: F64, open_sky: NDArray[np.bool_]
+) -> Radiance:
+    """The radiance with the stars that the scene asks for and the exposure can show.
+
+    `camera` has its exposure; `open_sky` bool[y, x]: pixels that see neither a body nor the Sun.
+    """
+    table = scene.sky
+    if table.stars == "off" or not open_sky.any():
+        return radiance
+    faintest = table.limiting_magnitude
+    if table.stars == "auto":
+        lens = camera.lens
+        faintest = min(
+            faintest,
+            sky.limiting_magnitude(
+                electron_rate_weights=camera.detector.electron_rate_weights(radiance.wavelength_nm),
+                wavelength_nm=radiance.wavelength_nm,
+                irradiance_per_radiance=np.pi * lens.transmission / (4 * lens.f_number**2),
+                focal_length_px=camera.focal_length_px,
+                exposure_s=camera.exposure_s,
+                sigma_px=table.sigma_px,
+                threshold_e=_STAR_OVER_READ_NOISE * max(camera.detector.read_noise_e_rms, 1.0),
+            ),
+        )
+    if faintest < sky.BRIGHTEST_V:
+        return radiance
+    stars = sky.star_radiance(
+        sky.load_catalogue().brighter_than(faintest),
+        J_from_C=J_from_C,
+        intrinsics=camera.intrinsics,
+        width_px=camera.width_px,
+        height_px=camera.height_px,
+        wavelength_nm=radiance.wavelength_nm,
+        sigma_px=table.sigma_px,
+        julian_date=scene.sun.julian_date,
+        sky=open_sky,
+    )
+    return stars.added_to(radiance)
