@@ -7,14 +7,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from scipy import stats
 
 from vbnfault.body import Body, Patch, Site, build_patch, choose_sites, load_body
-from vbnfault.body.patch import _scatter
+from vbnfault.body.boulders import SizeLaw, scatter, smallest_at
 from vbnfault.body.shape import check_mesh, signed_volume
 from vbnfault.errors import InputError
 
 REAL_SHAPE = Path(__file__).parents[2] / "shared/data/shapes/67p_18k.obj"
-QUICK = {"facet_m": 4.0, "radius_m": 150.0}
+QUICK = {"facet_m": 4.0, "radius_m": 150.0, "min_boulder_m": 0.8, "max_triangles": 1_200_000}
 
 
 @pytest.fixture(scope="module")
@@ -49,13 +50,18 @@ def near_edges(patch: Patch, radius_m: float) -> np.ndarray:
 
 
 def test_full_patch_keeps_its_budget_and_resolution(full: Patch) -> None:
-    assert full.vertices_L_m.dtype == np.float32
+    assert full.vertices_L_m.dtype == full.dust.dtype == np.float32
     assert full.faces.dtype == np.int32
-    assert full.face_is_boulder.dtype == np.bool_
-    assert full.triangles == len(full.face_is_boulder) <= 1_200_000
-    # One metre, coarsened by at most sqrt(2) to keep the budget; relief tilts facets and lengthens edges.
-    assert 0.8 < near_edges(full, 200.0).mean() < 1.6
-    assert full.face_is_boulder.sum() > 50_000
+    assert full.face_is_boulder.dtype == full.face_is_flat.dtype == np.bool_
+    assert full.triangles == len(full.face_is_boulder) == len(full.face_is_flat) <= 1_600_000
+    # Twelve centimetres, coarsened by at most sqrt(2) to keep the budget; relief lengthens edges.
+    assert 0.10 < near_edges(full, 20.0).mean() < 0.22
+    # Beyond, less than three pixels of the widest view (65° over 1024 px: 1.24 mm per metre) from 100 m above.
+    assert near_edges(full, 60.0).mean() < 3 * 100.0 * 1.24e-3 * 1.5
+    assert full.face_is_boulder.sum() > 100_000
+    assert len(full.dust) == len(full.vertices_L_m)
+    assert 0.0 <= full.dust.min() < full.dust.max() <= 1.0
+    assert full.dust[full.faces[full.face_is_boulder].min() :].max() == 0.0
 
 
 def test_ground_and_boulders_are_closed(patch: Patch, body: Body) -> None:
@@ -75,7 +81,8 @@ def test_ground_and_boulders_are_closed(patch: Patch, body: Body) -> None:
 
 
 def test_smooth_patch_stays_near_the_model(body: Body, site: Site) -> None:
-    smooth = build_patch(body, site, seed=7, relief=0.0, min_boulder_m=100.0, **QUICK)
+    plain = {**QUICK, "min_boulder_m": 100.0}
+    smooth = build_patch(body, site, seed=7, relief=0.0, **plain)
     assert not smooth.face_is_boulder.any()
     model = (body.vertices_m - site.position_T_m) @ site.T_from_L
     # The model's own points come first and do not move: float32 of kilometres keeps 0.25 mm.
@@ -135,11 +142,11 @@ def test_relief_is_a_few_percent_of_its_wavelength(body: Body, site: Site) -> No
     np.testing.assert_array_equal(smooth.faces, rough.faces)
     near = np.linalg.norm(smooth.vertices_L_m, axis=1) < 150.0
     moved = np.linalg.norm(rough.vertices_L_m - smooth.vertices_L_m, axis=1)
-    # Amplitude 5 m at 96 m wavelength and blocks of 4 m: metres, neither centimetres nor tens of metres.
-    assert 0.5 < moved[near].std() < 6.0
-    assert moved.max() < 25.0
+    # Octaves of 3 m at 57 m wavelength and less below, scarps, pits: metres, neither centimetres nor tens of them.
+    assert 0.5 < moved[near].std() < 8.0
+    assert moved.max() < 40.0
     # Far away, where facets are coarser than half of every wavelength, nothing moves.
-    far = np.linalg.norm(smooth.vertices_L_m, axis=1) > 1500.0
+    far = np.linalg.norm(smooth.vertices_L_m, axis=1) > 2500.0
     assert moved[far].max() == 0.0
 
 
@@ -149,18 +156,51 @@ def test_boulder_sizes_and_numbers_follow_the_published_law() -> None:
     points = np.concatenate([np.column_stack([x, 0 * x, 0 * x]), np.column_stack([x, 0 * x + 1000.0, 0 * x])])
     faces = np.array([f for k in range(3) for f in ((k, k + 1, k + 5), (k, k + 5, k + 4))], dtype=np.int32)
     favour = np.array([1.0, 1.0, 1.0, 1.0, 0.0, 0.0])
-    diameter, face, at = _scatter(points, faces, favour, np.full(6, 2.0), np.random.default_rng(4))
+    rng = np.random.default_rng(4)
+    diameter, face, at, least = scatter(points, faces, favour, np.full(6, 2.0), SizeLaw(), rng)
+    assert (least == 2.0).all()
     # N(>= D) = 98 (D/7)^-3.6 per km² (Pajola 2015), Poisson; less the truncation above 45 m, 0.1 %.
     for size in (2.0, 3.0, 7.0):
         expected = 10 * 98.0 * (size / 7.0) ** -3.6
         assert abs((diameter >= size).sum() - expected) < 4 * np.sqrt(expected) + 2e-3 * expected
-    # Maximum-likelihood exponent, standard error alpha / sqrt(n); the truncation biases by less than 0.1 %.
-    alpha = len(diameter) / np.log(diameter / 2.0).sum()
-    assert abs(alpha - 3.6) < 4 * 3.6 / np.sqrt(len(diameter)) + 0.004
+    assert stats.kstest(_quantiles(diameter, least, 3.6), "uniform").pvalue > 1e-3
     assert diameter.max() <= 45.0
     assert set(np.unique(face)) == {0, 1, 2, 3}
     # On the favoured strips alone, and even over them: the mean of x over 0..4000 m within 4 sigma.
     assert abs(at[:, 0].mean() - 2000.0) < 4 * 4000.0 / np.sqrt(12 * len(at))
+
+
+def _quantiles(diameter: np.ndarray, smallest: np.ndarray, index: float) -> np.ndarray:
+    """Where each size stands in the law truncated at the smallest and at 45 m: uniform over 0..1 if it holds."""
+    d, s = diameter.astype(np.float64), smallest.astype(np.float64)
+    return (1 - (s / d) ** index) / (1 - (s / 45.0) ** index)
+
+
+@pytest.mark.parametrize("index", [2.5, 3.6])
+def test_boulders_of_a_patch_follow_the_law(body: Body, site: Site, index: float) -> None:
+    stony = build_patch(body, site, seed=7, **QUICK, boulder_index=index)
+    diameter, smallest = stony.boulder_diameter_m, stony.boulder_smallest_m
+    assert len(diameter) > 500
+    quantiles = _quantiles(diameter, smallest, index)
+    # Float32 rounds sizes by 6e-8 of themselves, quantiles by less than 1e-6.
+    assert -1e-6 < quantiles.min() <= quantiles.max() < 1 + 1e-6
+    assert stats.kstest(quantiles, "uniform").pvalue > 1e-3
+    distance = np.linalg.norm(stony.boulder_position_L_m, axis=1)
+    assert (smallest > 0.95 * smallest_at(distance, 0.8) - 0.1).all()
+
+
+def test_density_of_boulders_is_what_was_asked_for(body: Body, site: Site) -> None:
+    # Large ones only, so that neither paving nor the triangle budget leaves any out.
+    counts = {}
+    for density in (0.0, 24.5, 98.0):
+        sparse = build_patch(
+            body, site, seed=7, facet_m=12.0, radius_m=400.0, min_boulder_m=1.5, boulders_per_km2=density
+        )
+        counts[density] = len(sparse.boulder_diameter_m)
+    assert counts[0.0] == 0
+    assert not build_patch(body, site, seed=7, facet_m=12.0, min_boulder_m=1e6).face_is_boulder.any()
+    # Four times the density, Poisson; paving takes the smallest in the densest places.
+    assert 2.5 < counts[98.0] / counts[24.5] < 4.6
 
 
 def test_bounds(body: Body, site: Site) -> None:
@@ -170,6 +210,10 @@ def test_bounds(body: Body, site: Site) -> None:
         ({"relief": float("nan")}, "relief"),
         ({"min_boulder_m": 0.0}, "min_boulder_m"),
         ({"max_triangles": 100}, "max_triangles"),
+        ({"boulder_index": 0.0}, "boulder_index"),
+        ({"boulders_per_km2": -1.0}, "boulders_per_km2"),
+        ({"craters_per_km2": 1e4}, "craters_per_km2"),
+        ({"hurst": 2.0}, "hurst"),
     ):
         with pytest.raises(InputError, match=key):
             build_patch(body, site, seed=0, **arguments)  # type: ignore[arg-type]

@@ -41,7 +41,8 @@ def _axis_hashes(cell: NDArray[np.int64]) -> list[tuple[UInt32, UInt32]]:
     return [(low[:, k] * _PRIMES[k], (low[:, k] + np.uint32(1)) * _PRIMES[k]) for k in range(3)]
 
 
-def _seed_word(seed: int) -> UInt32:
+def seed_word(seed: int) -> UInt32:
+    """uint32[1]: a seed's low 64 bits, mixed."""
     return _mix(_mix(np.array([seed & 0xFFFFFFFF], dtype=np.uint32)) ^ np.uint32((seed >> 32) & 0xFFFFFFFF))
 
 
@@ -52,7 +53,7 @@ def noise_key(seed: int, stream: int) -> int:
 
 def _by_chunks(kernel: Callable[[NDArray, UInt32], Float32], points: NDArray, seed: int, columns: int) -> Float32:
     out = np.empty((len(points), columns), dtype=np.float32)
-    word = _seed_word(seed)
+    word = seed_word(seed)
     for start in range(0, len(points), _CHUNK):
         out[start : start + _CHUNK] = kernel(points[start : start + _CHUNK], word)
     return out

@@ -1,0 +1,316 @@
+"""Boulders: how many of which size lie where, their shapes, and how they rest on the ground."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial import cKDTree
+
+from vbnfault.body.fields import GRADIENT_STD, Points
+from vbnfault.body.noise import noise_key
+from vbnfault.body.refine import split
+from vbnfault.body.shape import Float64, Int32, face_normals_areas
+
+PER_KM2 = 98.0  # N(>= 7 m): 3546 boulders on 36.4 km², Pajola et al. 2015, A&A 583, A37
+INDEX = 3.6
+REFERENCE_M = 7.0
+LARGEST_M = 45.0
+NEAR_M = 20.0  # up to there the smallest are drawn; beyond, those that look as small as there
+# The law with its steep index would pave the ground many times over at a few decimetres. Where boulders cover
+# this share of it (more than 1: heaps), smaller ones are left out.
+_MOST_COVER = 1.2
+_MOST_DRAWN = 150_000
+
+_PLANES = 13  # flat sides; deep cuts, or rocks look like eggs
+_LEVELS = 6  # of detail: 20 · 4^level triangles
+_EDGE_FACETS = 2.4  # a rock's edges, in facets of the ground around it
+_FLAT_LEVELS = 2  # up to that level faces are the rock's own fracture planes
+_RING = 12  # directions in which the ground around a rock is looked at
+_BURIED = (0.12, 0.45)  # of its height, below the lowest ground around
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Boulders:
+    """All boulders of a patch: closed meshes, and what was drawn.
+
+    Attributes
+    ----------
+    vertices_m, faces
+        float64[n, 3] in L and int32[m, 3], outward winding; boulder after boulder.
+    flat
+        bool[m]: shaded with the face's own normal.
+    diameter_m, position_m
+        float64[k] the largest diameters and float64[k, 3] the centres.
+    smallest_m
+        float64[k]: where each lies, the law was drawn from this diameter on.
+    """
+
+    vertices_m: Float64
+    faces: Int32
+    flat: NDArray[np.bool_]
+    diameter_m: Float64
+    position_m: Float64
+    smallest_m: Float64
+
+
+def smallest_at(distance_m: Float64, min_boulder_m: float) -> Float64:
+    """Smallest diameter drawn at that distance from the site, metres."""
+    return min_boulder_m * np.maximum(np.asarray(distance_m) / NEAR_M, 1.0)
+
+
+def add_boulders(
+    points: Float64,
+    faces: Int32,
+    facet_m: Float64,
+    dust: NDArray[np.float32],
+    talus: NDArray[np.float32],
+    place_T_m: Float64,
+    *,
+    rng: np.random.Generator,
+    seed: int,
+    min_boulder_m: float,
+    per_km2: float,
+    index: float,
+    budget: int,
+) -> Boulders:
+    """Scatter boulders over the ground, `budget` triangles at most; beyond, the smallest (in angle) are left out.
+
+    `points` float64[n, 3] in L and `facet_m`, `dust`, `talus`, `place_T_m` (body-fixed) at each of them.
+    """
+    normals, _ = face_normals_areas(points, faces)
+    centre = points[faces].mean(axis=1)
+    distance = np.sqrt(np.einsum("ni,ni->n", centre, centre))
+    smallest = smallest_at(distance, min_boulder_m)
+    wanted = smallest < LARGEST_M
+    favour = np.zeros(len(faces))
+    favour[wanted] = _favour(
+        normals[wanted], dust[faces[wanted]], talus[faces[wanted]], seed, place_T_m, faces[wanted]
+    )
+    law = SizeLaw(per_m2=1e-6 * per_km2, index=index)
+    diameter, face, at, least = scatter(points, faces, favour, smallest, law, rng)
+
+    detail = facet_m[faces[face, 0]]
+    level = np.clip(np.ceil(np.log2(0.53 * diameter / (_EDGE_FACETS * detail))), 0, _LEVELS).astype(np.int64)
+    # Cut at one multiple of the smallest everywhere, the law holds above that.
+    order = np.argsort(-diameter / least, kind="stable")
+    fits = np.cumsum(20 * 4 ** level[order]) <= budget
+    kept = order[: int(np.argmin(fits)) if not fits.all() else len(order)]
+    if len(kept) < len(order):
+        least = least * (diameter[order[len(kept)]] / least[order[len(kept)]])
+    kept = np.sort(kept)
+    kept = kept[np.argsort(level[kept], kind="stable")]
+
+    tree = cKDTree(points, balanced_tree=False, compact_nodes=False)
+    vertices, triangles, flat, positions, start = [np.empty((0, 3))], [np.empty((0, 3), np.int64)], [], [], 0
+    for k in range(_LEVELS + 1):
+        group = kept[level[kept] == k]
+        if len(group):
+            rocks, sphere_faces, centres = _rocks(
+                k, diameter[group], at[group], normals[face[group]], points, tree, rng
+            )
+            offsets = start + np.arange(len(group))[:, None, None] * rocks.shape[1]
+            vertices.append(rocks.reshape(-1, 3))
+            triangles.append((sphere_faces[None] + offsets).reshape(-1, 3))
+            flat.append(np.full(len(triangles[-1]), k <= _FLAT_LEVELS))
+            positions.append(centres)
+            start += len(vertices[-1])
+    return Boulders(
+        vertices_m=np.concatenate(vertices),
+        faces=np.concatenate(triangles).astype(np.int32),
+        flat=np.concatenate([np.empty(0, bool), *flat]),
+        diameter_m=diameter[kept],
+        position_m=np.concatenate([np.empty((0, 3)), *positions]),
+        smallest_m=least[kept],
+    )
+
+
+def _favour(
+    normals: Float64, dust: NDArray, talus: NDArray, seed: int, place_T_m: Float64, faces: Int32
+) -> Float64:
+    """How much likelier than elsewhere a boulder lies on each face."""
+    place = Points(place_T_m[faces].mean(axis=1))
+    count = len(faces)
+    broad = place.gradient(110.0, noise_key(seed, 9001), count) / GRADIENT_STD
+    close = place.gradient(23.0, noise_key(seed, 9002), count) / GRADIENT_STD
+    cluster = np.exp(0.75 * broad.astype(np.float64) + 0.55 * close)
+    ground = 0.30 + 0.5 * (1 - dust.mean(axis=1)) + 7.0 * talus.mean(axis=1)
+    # None stay on steep ground.
+    lie = np.clip((-normals[:, 2] - 0.70) / (0.84 - 0.70), 0, 1)
+    return np.asarray(cluster * ground * lie, dtype=np.float64)
+
+
+# --- numbers and sizes ------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, kw_only=True)
+class SizeLaw:
+    """N(>= D) = per_m2 · (D / 7 m)^-index boulders per square metre, none above 45 m."""
+
+    per_m2: float = 1e-6 * PER_KM2
+    index: float = INDEX
+
+    def above(self, diameter_m: ArrayLike) -> Float64:
+        """Cumulative number per square metre from that diameter up to the largest, 0 beyond."""
+        d = np.minimum(np.asarray(diameter_m, dtype=np.float64), LARGEST_M)
+        return self.per_m2 * ((d / REFERENCE_M) ** -self.index - (LARGEST_M / REFERENCE_M) ** -self.index)
+
+    def draw(self, smallest_m: Float64, u: Float64) -> Float64:
+        """Diameters at quantiles u in [0, 1) of the law from `smallest_m` to 45 m."""
+        truncated = 1.0 - (smallest_m / LARGEST_M) ** self.index
+        return np.asarray(smallest_m * (1.0 - u * truncated) ** (-1.0 / self.index))
+
+    def paved_m(self, share: Float64) -> Float64:
+        """The diameter from which on boulders `share` times as dense as the law cover the most they may."""
+        index = max(self.index, 2.05)
+        unit = np.pi / 4 * index / (index - 2) * self.per_m2 * REFERENCE_M**index
+        return np.asarray((np.maximum(share, 0.0) * unit / _MOST_COVER) ** (1.0 / (index - 2)))
+
+
+def scatter(
+    points: Float64,
+    faces: Int32,
+    favour: Float64,
+    smallest_m: Float64,
+    law: SizeLaw,
+    rng: np.random.Generator,
+) -> tuple[Float64, NDArray[np.int64], Float64, Float64]:
+    """Draw boulders after a size law.
+
+    Parameters
+    ----------
+    favour
+        float64[m], how much likelier than elsewhere a boulder lies on each face; only ratios count.
+    smallest_m
+        float64[m], the smallest diameter drawn there; raised where boulders would pave the ground, and
+        everywhere where they would be too many.
+
+    Returns
+    -------
+    diameter_m, face, at, smallest_m
+        float64[n], int[n], float64[n, 3] and float64[n]: how large, on which face, where on it, and from which
+        diameter on the law was drawn there.
+    """
+    area = face_normals_areas(points, faces)[1]
+    # Normalised by area, so that clustering and bare slopes leave the mean density as published.
+    share = favour / max(float(np.sum(favour * area) / np.sum(area)), 1e-12)
+    least = np.maximum(smallest_m, law.paved_m(share))
+    expected = share * area * law.above(least)
+    if expected.sum() > _MOST_DRAWN:
+        least = least * (expected.sum() / _MOST_DRAWN) ** (1.0 / law.index)
+        expected = share * area * law.above(least)
+    cumulative = np.cumsum(expected)
+    total = int(rng.poisson(float(cumulative[-1])))
+    face = np.searchsorted(cumulative, rng.random(total) * cumulative[-1], side="right")
+    face = np.minimum(face, len(faces) - 1)
+    diameter = law.draw(least[face], rng.random(total))
+    u, v = np.sqrt(rng.random(total)), rng.random(total)
+    weights = np.column_stack([1.0 - u, u * (1.0 - v), u * v])
+    return diameter, face, np.einsum("nk,nki->ni", weights, points[faces[face]]), least[face]
+
+
+# --- shapes -----------------------------------------------------------------------------------------------------
+
+
+@lru_cache(maxsize=8)
+def _icosphere(level: int) -> tuple[Float64, Int32]:
+    """Unit sphere of 20 · 4^level triangles, outward winding."""
+    t = (1.0 + np.sqrt(5.0)) / 2.0
+    corners = np.array([(s, r * t, 0.0) for r in (1, -1) for s in (-1, 1)])
+    points = np.concatenate([np.roll(corners, shift, axis=1) for shift in (0, 1, 2)])
+    points /= np.linalg.norm(points, axis=1)[:, None]
+    # Neighbours on the icosahedron are 63.4° apart, the next nearest 116.6°.
+    near = np.einsum("ik,jk->ij", points, points) > 0.4
+    faces = np.array(
+        [
+            (i, j, k) if np.linalg.det(points[[i, j, k]]) > 0 else (i, k, j)
+            for i in range(12)
+            for j in range(i + 1, 12)
+            for k in range(j + 1, 12)
+            if near[i, j] and near[j, k] and near[i, k]
+        ],
+        dtype=np.int64,
+    )
+    for _ in range(level):
+        points, _, faces = split(points, points, faces, np.ones(faces.shape, dtype=bool), np.ones(faces.shape))
+        points = points / np.linalg.norm(points, axis=1)[:, None]
+    return points, faces.astype(np.int32)
+
+
+def _unit(v: Float64) -> Float64:
+    return v / np.maximum(np.sqrt(np.einsum("...i,...i->...", v, v)), 1e-12)[..., None]
+
+
+def _rocks(
+    level: int,
+    diameter: Float64,
+    at: Float64,
+    normal: Float64,
+    ground: Float64,
+    tree: cKDTree,
+    rng: np.random.Generator,
+) -> tuple[Float64, Int32, Float64]:
+    """Rocks of one level of detail, float64[k, v, 3], the faces they share and their centres float64[k, 3]:
+    spheres cut by random planes, squeezed, turned and set into the ground."""
+    sphere, faces = _icosphere(level)
+    count = len(diameter)
+    planes = _unit(rng.normal(size=(count, _PLANES, 3)))
+    depth = rng.uniform(0.42, 0.86, size=(count, _PLANES))
+    # Joints come in families: some planes face the opposite or a perpendicular way of the first.
+    planes[:, 1] = _unit(-planes[:, 0] + 0.15 * rng.normal(size=(count, 3)))
+    planes[:, 2] = _unit(np.cross(planes[:, 0], planes[:, 3]) + 0.1 * rng.normal(size=(count, 3)))
+    radius = np.ones((count, len(sphere)))
+    for k in range(_PLANES):  # plane by plane: all at once would take a gigabyte
+        cosine = np.einsum("ni,vi->nv", planes[:, k], sphere)
+        radius = np.minimum(radius, depth[:, k, None] / np.maximum(cosine, 0.05))
+    radius /= radius.max(axis=1, keepdims=True)
+    if level >= 2:
+        radius *= _weathered(sphere, level, count, rng)
+    semi = (
+        0.5
+        * diameter[:, None]
+        * np.column_stack([np.ones(count), rng.uniform(0.65, 0.95, count), rng.uniform(0.45, 0.80, count)])
+    )
+    rock = radius[:, :, None] * sphere * semi[:, None, :]
+    # The squeezed axis lies near the ground's normal, heading at random: rocks rest on their broad side.
+    up = _unit(normal + 0.25 * rng.normal(size=(count, 3)))
+    side = _unit(np.cross(up, rng.normal(size=(count, 3))))
+    rock = np.einsum("nvk,nki->nvi", rock, np.stack([side, np.cross(up, side), up], axis=1))
+
+    along = np.einsum("nvi,ni->nv", rock, normal)
+    low, high = along.min(axis=1), along.max(axis=1)
+    lowest = _lowest_ground(at, normal, side, 0.5 * diameter, ground, tree)
+    lift = lowest - low - rng.uniform(*_BURIED, count) * (high - low)
+    centre = at + lift[:, None] * normal
+    return rock + centre[:, None, :], faces, centre
+
+
+def _weathered(sphere: Float64, level: int, count: int, rng: np.random.Generator) -> Float64:
+    """Factors on the radius, float64[count, v]: lumps, pits and roughness, finer with each level."""
+    origin = rng.uniform(-1e5, 1e5, size=(count, 1, 3))
+    field = Points((origin + sphere[None]).reshape(-1, 3))
+    size = count * len(sphere)
+    out = np.zeros(size)
+    for octave in range(level):
+        wave = 0.9 / 2**octave
+        out += 0.035 * wave**0.8 / GRADIENT_STD * field.gradient(wave, 77_000 + octave, size)
+    return 1.0 + out.reshape(count, -1)
+
+
+def _lowest_ground(
+    at: Float64, normal: Float64, side: Float64, radius: Float64, ground: Float64, tree: cKDTree
+) -> Float64:
+    """Height of the lowest ground within a rock's reach, along the normal, float64[n] metres; at most 0."""
+    across = _unit(side - np.einsum("ni,ni->n", side, normal)[:, None] * normal)
+    other = np.cross(normal, across)
+    lowest = np.zeros(len(at))
+    for reach in (0.5, 1.0):
+        for turn in np.linspace(0, 2 * np.pi, _RING, endpoint=False):
+            ring = at + reach * radius[:, None] * (np.cos(turn) * across + np.sin(turn) * other)
+            near = ground[tree.query(ring)[1]] - at
+            height = np.einsum("ni,ni->n", near, normal)
+            aside = np.sqrt(np.maximum(np.einsum("ni,ni->n", near, near) - height**2, 0.0))
+            lowest = np.minimum(lowest, np.where(aside < 1.3 * radius, height, 0.0))
+    return lowest

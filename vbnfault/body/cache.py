@@ -1,0 +1,162 @@
+"""Patches kept on disk, by content: what took many seconds to build is read in a fraction of one.
+
+A file's name is a hash over all that decides its content: the body, the site, every parameter, the sources of the
+terrain code and the versions of the libraries that compute it. A file that is cut short or altered fails zip's
+own checksum and is built again; a folder that cannot be written only costs the time.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import importlib.metadata
+import inspect
+import json
+import os
+import platform
+import sys
+import tempfile
+import time
+import zipfile
+import zlib
+from functools import lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from vbnfault.body.patch import Patch, build_patch
+from vbnfault.body.sites import Site
+from vbnfault.errors import InputError
+
+if TYPE_CHECKING:
+    from vbnfault.body import Body
+
+FOLDER_VARIABLE = "VBNFAULT_CACHE_DIR"
+SIZE_VARIABLE = "VBNFAULT_CACHE_GIB"
+DEFAULT_GIB = 4.0
+_SOURCES = ("fields", "noise", "refine", "relief", "roughness", "boulders", "patch", "gravity", "shape")
+_LIBRARIES = ("numpy", "scipy", "drjit")
+_ARRAYS = tuple(name for name in Patch.__dataclass_fields__ if name != "site")
+_STALE_S = 3600.0  # an unfinished file that old belongs to no one
+
+
+def cache_folder() -> Path:
+    """Where patches are kept: $VBNFAULT_CACHE_DIR, or vbnfault in the user's cache folder."""
+    given = os.environ.get(FOLDER_VARIABLE)
+    if given:
+        return Path(given)
+    if sys.platform == "win32":
+        base = os.environ.get("LOCALAPPDATA")
+        return (Path(base) if base else Path.home() / "AppData" / "Local") / "vbnfault" / "cache"
+    base = os.environ.get("XDG_CACHE_HOME")
+    return (Path(base) if base else Path.home() / ".cache") / "vbnfault"
+
+
+def cache_limit_bytes() -> int:
+    """How much may be kept: $VBNFAULT_CACHE_GIB (4 by default); 0 keeps nothing. Raises InputError."""
+    text = os.environ.get(SIZE_VARIABLE, "")
+    try:
+        gib = float(text) if text else DEFAULT_GIB
+    except ValueError:
+        gib = -1.0
+    if not 0 <= gib < 1e6:
+        raise InputError(f"{SIZE_VARIABLE} must be a number from 0 to 1e6; got {text!r}.")
+    return int(gib * 2**30)
+
+
+def cached_patch(body: Body, site: Site, **parameters: Any) -> Patch:
+    """`build_patch` with the same arguments, read from disk where it was built before; the same bits either way.
+
+    Raises what `build_patch` raises, and InputError for an unusable $VBNFAULT_CACHE_GIB.
+    """
+    limit = cache_limit_bytes()
+    if limit == 0:
+        return build_patch(body, site, **parameters)
+    try:
+        path = cache_folder() / f"patch-{patch_key(body, site, **parameters)}.npz"
+    except (RuntimeError, OSError):  # no home folder
+        return build_patch(body, site, **parameters)
+    patch = _read(path, site)
+    if patch is None:
+        patch = build_patch(body, site, **parameters)
+        _write(path, patch, limit)
+    return patch
+
+
+def patch_key(body: Body, site: Site, **parameters: Any) -> str:
+    """sha256 (hex) of all that decides a patch: parameters left out count with their defaults."""
+    bound = inspect.signature(build_patch).bind(body, site, **parameters)
+    bound.apply_defaults()
+    content = {
+        "code": _code_hash(),
+        "body": [body.content_hash, body.density_kg_m3, body.rotation_period_s],
+        "site": [site.index, site.position_T_m.tolist(), site.T_from_L.tolist()],
+        # Numbers alike in value are alike: 1 and 1.0 build the same patch.
+        "parameters": {
+            key: value if value is None else int(value) if key == "seed" else float(value)
+            for key, value in bound.arguments.items()
+            if key not in ("body", "site")
+        },
+    }
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+
+
+@lru_cache(maxsize=1)
+def _code_hash() -> str:
+    parts = hashlib.sha256()
+    for name in _SOURCES:
+        parts.update(Path(__file__).with_name(f"{name}.py").read_bytes())
+    versions = [importlib.metadata.version(name) for name in _LIBRARIES]
+    parts.update(json.dumps([versions, platform.machine(), sys.byteorder]).encode())
+    return parts.hexdigest()
+
+
+def _read(path: Path, site: Site) -> Patch | None:
+    try:
+        # Opened here: numpy leaves a file open that is no zip.
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
+            arrays = {name: archive[name] for name in _ARRAYS}
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error, NotImplementedError):
+        return None
+    with contextlib.suppress(OSError):
+        os.utime(path)  # used last: evicted last
+    return Patch(site=site, **arrays)
+
+
+def _write(path: Path, patch: Patch, limit_bytes: int) -> None:
+    """Write under another name, then rename: whoever reads finds a whole file or none."""
+    unfinished = None
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.NamedTemporaryFile(dir=path.parent, prefix="patch-", suffix=".part", delete=False) as file:
+            unfinished = Path(file.name)
+            np.savez(file, **{name: getattr(patch, name) for name in _ARRAYS})
+        os.replace(unfinished, path)
+        unfinished = None
+        _evict(path.parent, limit_bytes)
+    except OSError:  # read-only, full, or another worker's file in use: the patch is built, and that is enough
+        pass
+    finally:
+        if unfinished is not None:
+            with contextlib.suppress(OSError):
+                unfinished.unlink()
+
+
+def _evict(folder: Path, limit_bytes: int) -> None:
+    """Remove what was used longest ago until the rest fits, and what a killed process left unfinished."""
+    kept = []
+    for path in folder.glob("patch-*"):
+        with contextlib.suppress(OSError):  # another worker may evict as well
+            status = path.stat()
+            if path.suffix == ".npz":
+                kept.append((status.st_mtime, status.st_size, path))
+            elif path.suffix == ".part" and time.time() - status.st_mtime > _STALE_S:
+                path.unlink()
+    total = sum(size for _, size, _ in kept)
+    for _, size, path in sorted(kept, key=lambda entry: (entry[0], entry[2].name)):
+        if total <= limit_bytes:
+            break
+        with contextlib.suppress(OSError):
+            path.unlink()
+        total -= size

@@ -1,0 +1,142 @@
+"""Splitting a mesh's edges near a place until they meet a length, with no seam anywhere."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vbnfault.body.shape import Float64, Int32
+
+# Splitting halves an edge, so lengths end between half the limit and the limit; their mean is then near 1.
+LIMIT_PER_TARGET = 1.6
+# Beyond the radius the limit grows as this power of the distance: a little faster than a pixel's width does, so
+# that the triangles, which then fall off as distance to the -0.4, end with the body.
+GROWTH_POWER = 1.2
+_PROBE = 4.0  # the triangle count is foretold with facets coarser by this, in a fraction of the time
+# A midpoint may leave the chord by at most this fraction of the edge: cliffs stay cliffs instead of bulging.
+_MAX_BULGE = 0.06
+
+
+@dataclass(frozen=True)
+class EdgeLimit:
+    """Longest edge left unsplit, in metres, at points given relative to the site."""
+
+    facet_m: float
+    radius_m: float
+
+    def facet_at(self, points: Float64) -> Float64:
+        """Mean edge length in metres aimed at there."""
+        return self(points) / LIMIT_PER_TARGET
+
+    def __call__(self, points: Float64) -> Float64:
+        return self._at(np.sqrt(np.einsum("...i,...i->...", points, points)))
+
+    def along(self, a: Float64, b: Float64) -> Float64:
+        """At the point nearest the site on each edge a-b: a long one can pass it between two far ends."""
+        edge = b - a
+        at = np.einsum("...i,...i->...", -a, edge) / np.maximum(np.einsum("...i,...i->...", edge, edge), 1e-30)
+        return self(a + np.clip(at, 0.25, 0.75)[..., None] * edge)
+
+    def _at(self, distance: Float64) -> Float64:
+        return LIMIT_PER_TARGET * self.facet_m * np.maximum(distance / self.radius_m, 1.0) ** GROWTH_POWER
+
+
+def affordable(limit: EdgeLimit, model: tuple[Float64, Float64, Int32], budget: int) -> EdgeLimit:
+    """The limit itself, or a coarser one with which the ground stays within about `budget` triangles."""
+    coarse = EdgeLimit(_PROBE * limit.facet_m, limit.radius_m)
+    before = len(model[2])
+    added = (len(refine(*model, coarse)[2]) - before) * _PROBE**2
+    if before + added <= budget:
+        return limit
+    return EdgeLimit(limit.facet_m * float(np.sqrt(added / (budget - before))), limit.radius_m)
+
+
+def refine(points: Float64, normals: Float64, faces: Int32, limit: EdgeLimit) -> tuple[Float64, Float64, Int32]:
+    """Split every edge longer than its limit, the longest first.
+
+    Whether an edge is split depends on its own two ends alone, so the triangles on both sides always agree
+    and the mesh stays conforming with no neighbour search. Taking lengths in steps of sqrt 2, longest first,
+    splits each triangle across its longest edge, which keeps the angles from degenerating.
+    """
+    done: list[NDArray] = []
+    active = faces.astype(np.int64)
+    bar = np.inf
+    while len(active):
+        ends = active[:, [[1, 2], [2, 0], [0, 1]]]  # edge k is opposite corner k
+        a, b = points[ends[..., 0]], points[ends[..., 1]]
+        length = np.sqrt(np.einsum("fki,fki->fk", b - a, b - a))
+        long = length > limit.along(a, b)
+        finished = ~long.any(axis=1)
+        done.append(active[finished])
+        active, long, length = active[~finished], long[~finished], length[~finished]
+        if not len(active):
+            break
+        bar = min(float(length[long].max()), bar) / np.sqrt(2.0)
+        chosen = long & (length > bar)
+        points, normals, active = split(points, normals, active, chosen, length)
+    return points, normals, np.concatenate(done).astype(np.int32)
+
+
+def split(
+    points: Float64, normals: Float64, faces: NDArray[np.int64], marked: NDArray[np.bool_], length: Float64
+) -> tuple[Float64, Float64, NDArray[np.int64]]:
+    """One pass: insert the marked edges' midpoints and cut triangles with one, two or three of them."""
+    ends = faces[:, [[1, 2], [2, 0], [0, 1]]][marked]
+    low, high = ends.min(axis=1), ends.max(axis=1)
+    count = len(points)
+    keys, inverse = np.unique(low * count + high, return_inverse=True)
+    i, j = keys // count, keys % count
+    new_points, new_normals = _midpoints(points[i], points[j], normals[i], normals[j])
+    middle = np.full(faces.shape, -1, dtype=np.int64)
+    middle[marked] = count + inverse.ravel()
+
+    how_many = marked.sum(axis=1)
+    out = [faces[how_many == 0]]
+
+    one = how_many == 1
+    f, m = _turn(faces[one], middle[one], np.argmax(marked[one], axis=1))
+    out += [np.column_stack([f[:, 0], f[:, 1], m[:, 0]]), np.column_stack([f[:, 0], m[:, 0], f[:, 2]])]
+
+    two = how_many == 2
+    # Turned so that edge 0 is the unsplit one: corner 0 is cut off, the rest is a quadrilateral whose
+    # diagonal starts at the middle of its longer side, as repeated longest-edge bisection would have it.
+    turn = np.argmin(marked[two], axis=1)
+    f, m = _turn(faces[two], middle[two], turn)
+    side = np.take_along_axis(length[two], (turn[:, None] + np.arange(3)) % 3, axis=1)
+    from_m1 = side[:, 1] >= side[:, 2]
+    out.append(np.column_stack([f[:, 0], m[:, 2], m[:, 1]]))
+    g, n = f[from_m1], m[from_m1]
+    out += [np.column_stack([n[:, 2], g[:, 1], n[:, 1]]), np.column_stack([g[:, 1], g[:, 2], n[:, 1]])]
+    g, n = f[~from_m1], m[~from_m1]
+    out += [np.column_stack([n[:, 2], g[:, 1], g[:, 2]]), np.column_stack([n[:, 2], g[:, 2], n[:, 1]])]
+
+    f, m = faces[how_many == 3], middle[how_many == 3]
+    out += [
+        np.column_stack([f[:, 0], m[:, 2], m[:, 1]]),
+        np.column_stack([f[:, 1], m[:, 0], m[:, 2]]),
+        np.column_stack([f[:, 2], m[:, 1], m[:, 0]]),
+        m,
+    ]
+    return np.concatenate([points, new_points]), np.concatenate([normals, new_normals]), np.concatenate(out)
+
+
+def _turn(faces: NDArray, middle: NDArray, first: NDArray) -> tuple[NDArray, NDArray]:
+    """Renumber each triangle's corners so that corner `first` comes first."""
+    order = (first[:, None] + np.arange(3)) % 3
+    return np.take_along_axis(faces, order, axis=1), np.take_along_axis(middle, order, axis=1)
+
+
+def _midpoints(p: Float64, q: Float64, n_p: Float64, n_q: Float64) -> tuple[Float64, Float64]:
+    """The curved point-normal triangle's edge midpoint (Vlachos et al. 2001), its departure limited."""
+    along = q - p
+    bulge = (
+        -(np.einsum("ij,ij->i", along, n_p)[:, None] * n_p - np.einsum("ij,ij->i", along, n_q)[:, None] * n_q) / 8.0
+    )
+    size = np.linalg.norm(bulge, axis=1)
+    most = _MAX_BULGE * np.linalg.norm(along, axis=1)
+    bulge *= np.minimum(1.0, most / np.maximum(size, 1e-12))[:, None]
+    normal = n_p + n_q
+    length = np.linalg.norm(normal, axis=1)
+    return 0.5 * (p + q) + bulge, normal / np.where(length > 1e-9, length, 1.0)[:, None]

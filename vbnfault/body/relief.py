@@ -1,0 +1,377 @@
+"""Relief below the shape model's facets: what a comet's ground adds at each scale, and where dust covers it.
+
+Heights are added along the model's normal, each a function of body-fixed position, of the facets' size there and
+of the slope against gravity:
+
+- fractal octaves whose deviogram continues the model's own (`roughness`), creased and patchy;
+- terraces: treads and scarps of a few metres; pits and craters with rims;
+- where the slope or the ground's history leaves it bare: strata, blocks and the cracks between them;
+- dust that fills lows and level ground up to a smooth surface of its own, with faint ripples.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from vbnfault.body.fields import GRADIENT_STD, Points
+from vbnfault.body.noise import Float32, noise_key
+from vbnfault.body.roughness import Roughness, deviogram
+from vbnfault.body.shape import Float64, Int32, vertex_normals
+from vbnfault.body.sites import Site
+
+if TYPE_CHECKING:
+    from vbnfault.body import Body
+
+# A field fades in between facets of 1/1.6 and 1/2.8 of its wavelength.
+_FADE = (1.6, 2.8)
+_SHARED_M = 20.0  # octaves at least that long lift dust and rock alike
+LONGEST_EDGES = 1.0  # the longest octave, in mean edges of the model
+_SHORTEST_FACETS = 1.8
+
+_CRATER_WIDTHS_M = (90.0, 45.0, 22.5, 11.25)  # cells; diameters are a third to two thirds of that
+_CRATER_SHARE_PER_DENSITY = 1534e-6  # of the cells, per crater of 10 m or more in a square kilometre
+
+_TERRACE_M = (5.5, 2.6)  # height of a step, and of the smaller ones between them
+# (cell width, height per unit of block noise) of the broken ground, in metres
+_BLOCKS_M = ((17.0, 1.9), (6.0, 0.95), (2.2, 0.40), (0.85, 0.14))
+_CRACK_DEPTH = 0.30  # between blocks, per unit of their height
+_STRATA_M = ((9.0, 1.3), (3.1, 0.55), (1.1, 0.20))  # thickness and how far a hard one stands out
+
+_CLOD_CELLS_M = (2.1, 1.2, 0.7)
+
+_DUST_LEAVES_DEG = (27.0, 40.0)  # slopes that dust lies on, and that it has slid from
+_BARE_DEG = (30.0, 44.0)  # slopes of loose and of consolidated ground
+_CLIFF_DEG = (38.0, 52.0)
+_GRAVITY_STEP_M = 250.0  # gravity is taken as linear over a patch, from differences over this step
+_GRAVITY_REACH_M = 1500.0
+
+_TALUS_CELL_M = 4.0
+_TALUS_REACH_M = 480.0
+_TALUS_WIDTH_M = 9.0
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Ground:
+    """Relief at each vertex of a patch.
+
+    Attributes
+    ----------
+    height_m
+        float64[n], along the model's normal.
+    dust
+        float32[n] in [0, 1]; 1 is covered by dust.
+    talus
+        float32[n] in [0, 1]; 1 is debris at the foot of a cliff.
+    """
+
+    height_m: Float64
+    dust: Float32
+    talus: Float32
+
+
+def add_relief(
+    body: Body,
+    site: Site,
+    mesh: tuple[Float64, Float64, Int32],
+    facet_m: Float64,
+    *,
+    seed: int,
+    scale: float,
+    roughness: Roughness,
+    longest_m: float,
+    craters_per_km2: float,
+) -> Ground:
+    """Relief on a refined mesh (points relative to the site in T axes, normals, faces).
+
+    Parameters
+    ----------
+    facet_m
+        float64[n], the facets' size at each vertex: what is shorter than two of them is left out.
+    scale
+        Multiplies the heights.
+    longest_m
+        The longest octave's wavelength: what is longer belongs to the model.
+    craters_per_km2
+        Of 10 m diameter or more.
+    """
+    points, normals, faces = mesh
+    up, elevation = _vertical(body, site, points)
+    if scale == 0:
+        slope = _slope_deg(points, normals, faces, up)
+        return Ground(
+            height_m=np.zeros(len(points)),
+            dust=1 - _smooth_step(*_DUST_LEAVES_DEG, slope),
+            talus=np.zeros(len(points), dtype=np.float32),
+        )
+    # Coarse ground sorts last, so that an octave works on a leading part of the points.
+    order = np.argsort(facet_m, kind="stable")
+    rank = np.empty_like(order)
+    rank[order] = np.arange(len(order))
+    noise = _Octaves(points[order] + site.position_T_m, facet_m[order], seed, roughness, longest_m)
+
+    swell = noise.fractal(longest_m, _SHARED_M, 0)
+    broad = _terraced(noise, swell) + noise.craters(craters_per_km2)
+    shown = noise.shown(longest_m)
+    raised = points + (scale * (broad * shown)[rank].astype(np.float64))[:, None] * normals
+    slope = _slope_deg(raised, normals, faces, up)
+    talus = _talus(np.einsum("ni,ij->nj", raised, site.T_from_L), slope)
+    height, dust = _surface(noise, broad, slope[order], talus[order], elevation[order])
+    return Ground(height_m=scale * (height * shown)[rank].astype(np.float64), dust=dust[rank], talus=talus)
+
+
+def _smooth_step(low: float, high: float, x: NDArray) -> Float32:
+    t = np.clip((np.asarray(x, dtype=np.float32) - np.float32(low)) / np.float32(high - low), 0, 1)
+    return np.asarray(t * t * (3 - 2 * t), dtype=np.float32)
+
+
+def _smooth_max(a: NDArray, b: NDArray, width: float) -> NDArray:
+    h = np.maximum(np.float32(width) - np.abs(a - b), 0) / np.float32(width)
+    return np.asarray(np.maximum(a, b) + h * h * np.float32(width / 4))
+
+
+# --- where is up ------------------------------------------------------------------------------------------------
+
+
+def _vertical(body: Body, site: Site, points: Float64) -> tuple[Float64, Float64]:
+    """Unit up float64[n, 3] (T axes) and elevation float64[n] in metres of effective potential.
+
+    From gravity and its gradient at the site: linear within 1.5 km, constant beyond. The potential is divided by
+    the body's mean gravity, so that elevation, and with it the strata, hardly depends on the site.
+    """
+    centre = site.position_T_m
+    steps = _GRAVITY_STEP_M * np.concatenate([np.eye(3), -np.eye(3)])
+    gravity = body.effective_gravity(np.concatenate([centre[None], centre + steps]))
+    gradient = (gravity[1:4] - gravity[4:7]) / (2 * _GRAVITY_STEP_M)
+    distance = np.sqrt(np.einsum("ni,ni->n", points, points))
+    near = points * np.minimum(1.0, _GRAVITY_REACH_M / np.maximum(distance, 1e-9))[:, None]
+    bend = np.einsum("ni,ij->nj", near, gradient)
+    up = -(gravity[0] + bend)
+    up /= np.maximum(np.sqrt(np.einsum("ni,ni->n", up, up)), 1e-30)[:, None]
+    at_site = float(body.gravity.evaluate(centre).potential_m2_s2[0])
+    at_site += 0.5 * body.omega_rad_s**2 * float(centre[0] ** 2 + centre[1] ** 2)
+    potential = at_site + np.einsum("ni,ni->n", near, gravity[0] + 0.5 * bend)
+    radius = (3 * body.volume_m3 / (4 * np.pi)) ** (1 / 3)
+    mean_gravity = 4 / 3 * np.pi * 6.6743e-11 * body.density_kg_m3 * radius
+    return up, -potential / mean_gravity
+
+
+def _slope_deg(points: Float64, normals: Float64, faces: Int32, up: Float64) -> Float32:
+    """Angle between the mesh's normals and up, float32[n], 0 to 180°."""
+    cosine = np.einsum("ni,ni->n", vertex_normals(points, faces), up)
+    return np.degrees(np.arccos(np.clip(cosine, -1, 1))).astype(np.float32)
+
+
+# --- noise, where the facets can show it ------------------------------------------------------------------------
+
+
+class _Octaves:
+    """Fields at points sorted by the facet size there; what a facet cannot show is 0."""
+
+    def __init__(
+        self, place_m: Float64, facet_m: Float64, seed: int, roughness: Roughness, longest_m: float
+    ) -> None:
+        self.place_m = place_m
+        self.facet_m = facet_m
+        self._seed = seed
+        self._points = Points(place_m)
+        self._roughness = roughness
+        self._longest_m = longest_m
+        self._unit = 1.0 / windowed_deviation(roughness.hurst)
+
+    def bent(self, shift_m: NDArray) -> _Octaves:
+        """The same fields at shifted places."""
+        return _Octaves(self.place_m + shift_m, self.facet_m, self._seed, self._roughness, self._longest_m)
+
+    def shown(self, wavelength_m: float) -> Float32:
+        return _smooth_step(*_FADE, wavelength_m / self.facet_m)
+
+    def _count(self, wavelength_m: float) -> int:
+        return int(np.searchsorted(self.facet_m, wavelength_m / _FADE[0]))
+
+    def _full(self, part: Float32, wavelength_m: float) -> Float32:
+        out = np.zeros(len(self.facet_m), dtype=np.float32)
+        n = len(part)
+        out[:n] = part * _smooth_step(*_FADE, wavelength_m / self.facet_m[:n])
+        return out
+
+    def gradient(self, wavelength_m: float, stream: int) -> Float32:
+        """Standard deviation 1."""
+        count = self._count(wavelength_m)
+        part = self._points.gradient(wavelength_m, noise_key(self._seed, stream), count)
+        return self._full(part, wavelength_m) * np.float32(1 / GRADIENT_STD)
+
+    def amplitude(self, wavelength_m: float) -> np.float32:
+        """Of an octave, per unit of standard deviation, so that all together follow the roughness law."""
+        return np.float32(self._unit * float(self._roughness.deviation_at(wavelength_m)))
+
+    def wavelengths(self, longest_m: float, shortest_m: float) -> list[tuple[int, float]]:
+        """Octave numbers and wavelengths in (shortest, longest], counted from the patch's longest."""
+        last = int(np.ceil(np.log2(self._longest_m / shortest_m)))
+        both = [(k, self._longest_m / 2**k) for k in range(last + 1)]
+        return [(k, w) for k, w in both if shortest_m < w <= longest_m * 1.0001]
+
+    def fractal(self, longest_m: float, shortest_m: float, stream: int) -> Float32:
+        """Metres: plain octaves of the roughness law."""
+        total = np.zeros(len(self.facet_m), dtype=np.float32)
+        for k, wavelength in self.wavelengths(longest_m, shortest_m):
+            total += self.amplitude(wavelength) * self.gradient(wavelength, stream + k)
+        return total
+
+    def blocks(self, width_m: float, stream: int) -> tuple[Float32, Float32]:
+        """Levels of blocks, and 1 in the cracks between them."""
+        count = self._count(width_m)
+        level, other, gap = self._points.blocks(width_m, noise_key(self._seed, stream), count)
+        # A step narrower than two or three facets would come out as a saw.
+        ramp = np.maximum(0.06 * width_m, 1.8 * self.facet_m[:count]).astype(np.float32)
+        edge = 1 - _smooth_step(0, 1, gap / ramp)
+        return self._full(level + 0.5 * edge * (other - level), width_m), self._full(edge, width_m)
+
+    def craters(self, per_km2: float) -> Float32:
+        total = np.zeros(len(self.facet_m), dtype=np.float32)
+        share = min(1.0, _CRATER_SHARE_PER_DENSITY * per_km2)
+        for k, width in enumerate(_CRATER_WIDTHS_M):
+            shows = width / 4  # the smallest bowls are half that wide
+            part = self._points.craters(width, noise_key(self._seed, 400 + k), self._count(shows), share)
+            total += self._full(part, shows)
+        return total
+
+    def clods(self, width_m: float, stream: int, share: float) -> Float32:
+        shows = 0.7 * width_m
+        part = self._points.clods(width_m, noise_key(self._seed, stream), self._count(shows), share)
+        return self._full(part, shows)
+
+
+@lru_cache(maxsize=16)
+def windowed_deviation(hurst: float) -> float:
+    """ν(1) by `deviogram` of octaves with wavelengths w and standard deviations w^hurst.
+
+    Measured over 40 tiles: the fit under each takes a part of the long octaves away, as it does on a model.
+    """
+    side, tiles = 36, 40
+    x, y = np.meshgrid(np.arange(side) / 6.0, np.arange(side) / 6.0, indexing="ij")
+    tile = np.column_stack([x.ravel(), y.ravel(), np.zeros(side * side)])
+    place = (tile[None] + 400.0 * np.arange(tiles)[:, None, None] * np.array([1.0, 0.7, 0.3])).reshape(-1, 3)
+    field, height = Points(place), np.zeros(len(place))
+    for k in range(-4, 6):
+        key = noise_key(1, 40 + k)
+        height += 2.0 ** (k * hurst) / GRADIENT_STD * field.gradient(2.0**k, key, len(place))
+    total = 0.0
+    up = np.tile([0.0, 0.0, 1.0], (side * side, 1))
+    for part in range(tiles):
+        # Made low, so that distances stay those along the plane.
+        surface = tile + np.array([0.0, 0.0, 1e-4]) * height.reshape(tiles, -1)[part][:, None]
+        total += 1e8 * float(deviogram(surface, up, np.array([1.0]), windows=9)[0]) ** 2
+    return float(np.sqrt(total / tiles))
+
+
+# --- what the ground is made of ---------------------------------------------------------------------------------
+
+
+def _terraced(noise: _Octaves, swell: Float32) -> Float32:
+    """Heights gathered into treads of uneven rise, in patches: scarps that run out along their length."""
+    where = _smooth_step(0.1, 1.5, noise.gradient(120.0, 200) + 0.5 * noise.gradient(31.0, 201))
+    wander = swell + 1.6 * noise.gradient(43.0, 202) + 0.7 * noise.gradient(17.0, 203)
+    wander += 0.30 * noise.gradient(6.0, 204) + 0.12 * noise.gradient(2.3, 205)
+    out = swell.copy()
+    for number, (step, share) in enumerate(zip(_TERRACE_M, (0.8, 0.5), strict=True)):
+        rise = np.random.Generator(np.random.Philox(900 + number)).uniform(0.0, 1.0, 256).astype(np.float32)
+        u = wander / np.float32(step)
+        tread = np.floor(u)
+        # Some of the steps are left out.
+        kept = where * share * rise[tread.astype(np.int64) & 255]
+        out += kept * (step * (tread + _smooth_step(0.50, 0.98, u - tread)) - wander)
+    return out
+
+
+def _surface(
+    noise: _Octaves, broad: Float32, slope: Float32, talus: Float32, elevation: Float64
+) -> tuple[Float32, Float32]:
+    """Height in metres and dust, both float32[n]."""
+    history = noise.gradient(66.0, 100) + 0.45 * noise.gradient(25.0, 101)
+    cliff = _smooth_step(*_CLIFF_DEG, slope + 3 * history)
+    # Consolidated and broken (1), or not (0).
+    bare = _smooth_step(*_BARE_DEG, slope + 11 * history)
+    vigour = 0.45 + 0.9 * _smooth_step(-1.2, 1.4, noise.gradient(47.0, 102)) * (0.6 + 0.4 * bare)
+
+    shortest = max(_SHORTEST_FACETS * float(noise.facet_m[0]), 0.05)
+    rough, grit = np.zeros_like(broad), np.zeros_like(broad)
+    for k, wavelength in noise.wavelengths(_SHARED_M, shortest):
+        value = noise.gradient(wavelength, 300 + k)
+        # Creased into ridges: plain noise alone looks like blobs.
+        creased = (0.80 - np.abs(value)) / np.float32(0.60)
+        crease = np.float32(0.8 if k % 2 else 0.35) * bare
+        rough += noise.amplitude(wavelength) * (value + crease * (creased - value))
+        if wavelength < 7.0:
+            grit += np.float32(0.022 * wavelength**0.7) * value
+    rock = broad + vigour * rough
+
+    # Bent, or the walls between blocks are dead straight.
+    bend = np.column_stack([1.1 * noise.gradient(7.0, 110 + axis) for axis in range(3)])
+    bend += np.column_stack([0.25 * noise.gradient(1.9, 113 + axis) for axis in range(3)])
+    bent = noise.bent(bend)
+    joints = _smooth_step(-1.0, 0.8, noise.gradient(33.0, 116))
+    for number, (width, height) in enumerate(_BLOCKS_M):
+        level, crack = bent.blocks(width, 120 + number)
+        rock += bare * (0.4 + 0.6 * joints) * np.float32(height) * (level - np.float32(_CRACK_DEPTH) * crack)
+    rock += cliff * _strata(noise, elevation + np.einsum("ni,i->n", bend, np.array([0.5, 0.3, 0.4])))
+    rock += talus * (0.25 * noise.gradient(2.6, 140) + 0.10 * noise.gradient(1.1, 141))
+
+    # Dust settles on level ground and hides all below its own slowly varying surface.
+    depth = 0.75 + 0.9 * noise.gradient(58.0, 130) + 0.4 * noise.gradient(19.0, 131)
+    depth -= 1.1 * bare * (0.5 + 0.5 * joints) + 0.5 * talus
+    depth -= 9.0 * _smooth_step(*_DUST_LEAVES_DEG, slope)
+    ripples = 0.5 + 0.5 * np.tanh(noise.gradient(40.0, 132))
+    dust = broad + depth + grit + 0.05 * ripples * noise.gradient(4.5, 133)
+    clods = np.zeros_like(rock)
+    for number, width in enumerate(_CLOD_CELLS_M):
+        clods = np.maximum(clods, noise.clods(width, 160 + number, 0.55))
+    strewn = 0.15 + 0.85 * _smooth_step(-0.4, 1.4, noise.gradient(13.0, 170) + 0.6 * noise.gradient(41.0, 171))
+    dust = dust + clods * np.maximum(strewn, talus)
+    cover = _smooth_step(-0.12, 0.30, dust - rock)
+    # Stones and lumps of the ground below show through thin dust.
+    return _smooth_max(rock, dust, 0.30), cover
+
+
+def _strata(noise: _Octaves, elevation: Float64) -> Float32:
+    """Layers of uneven hardness in a cliff: how far each stands out, metres."""
+    total = np.zeros(len(elevation), dtype=np.float32)
+    for number, (thickness, reach) in enumerate(_STRATA_M):
+        hard = np.random.Generator(np.random.Philox(4096 + number)).random(4096).astype(np.float32)
+        u = elevation / thickness + 0.35 * noise.gradient(70.0, 150 + number)
+        layer = np.floor(u)
+        k = layer.astype(np.int64)
+        inside = (u - layer).astype(np.float32)
+        ramp = np.clip(1.5 * noise.facet_m / thickness, 0.12, 0.5).astype(np.float32)
+        blend = _smooth_step(0, 1, inside / ramp)
+        below, here = hard[(k - 1) & 4095], hard[k & 4095]
+        total += noise.shown(thickness) * np.float32(reach) * (below + blend * (here - below) - 0.5)
+    return total
+
+
+def _talus(points_L: Float64, slope: Float32) -> Float32:
+    """Debris at the feet of cliffs, float32[n]: below steep ground close by, on ground that is not."""
+    cells = int(2 * _TALUS_REACH_M / _TALUS_CELL_M)
+    place = np.floor((points_L[:, :2] + _TALUS_REACH_M) / _TALUS_CELL_M).astype(np.int64)
+    inside = ((place >= 0) & (place < cells)).all(axis=1) & (np.abs(points_L[:, 2]) < _TALUS_REACH_M)
+    cell = place[inside, 0] * cells + place[inside, 1]
+    weight = _smooth_step(*_CLIFF_DEG, slope[inside]).astype(np.float64)
+    height = -points_L[inside, 2]
+
+    def grid(values: NDArray) -> Float64:
+        return np.asarray(np.bincount(cell, values, minlength=cells * cells), np.float64).reshape(cells, cells)
+
+    count = np.maximum(grid(np.ones(len(cell))), 1)
+    steep, above = grid(weight) / count, grid(weight * height) / count
+    spread = _TALUS_WIDTH_M / _TALUS_CELL_M
+    near = ndimage.gaussian_filter(steep, spread)
+    level = ndimage.gaussian_filter(above, spread) / np.maximum(near, 1e-6)
+    out = np.zeros(len(points_L), dtype=np.float32)
+    below = _smooth_step(1.0, 5.0, level.ravel()[cell] - height)
+    out[inside] = _smooth_step(0.02, 0.22, near.ravel()[cell]) * below
+    return out * (1 - _smooth_step(33.0, 42.0, slope))

@@ -1,0 +1,117 @@
+"""How rough a body is at which scale, and how the ground below its model's facets has to go on.
+
+The deviogram (Shepard et al. 2001, JGR 106, 32777): ν(L), the root mean square difference in height between
+points a distance L apart, heights against the local shape. Over a self-affine surface ν = ν₀ (L/L₀)^H.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from vbnfault.body.shape import Float64, vertex_normals
+
+if TYPE_CHECKING:
+    from vbnfault.body import Body
+
+_WINDOWS = 120  # places looked at, spread over the points
+_MOST_POINTS = 300  # of a window: more add little but time
+_FEWEST_POINTS = 16  # for a quadric
+_WINDOW_BASELINES = 3.0  # radius of a window in baselines
+_BIN = 1.15  # half the width of a baseline's bin, as a factor
+# Baselines the law is fitted over, in mean edges: below, the facets are flat; above, the body is round.
+_FIT_EDGES = (1.3, 1.7, 2.2, 2.9, 3.8)
+# Natural surfaces lie within 0.3 to 1 (Shepard et al. 2001). Heights against a quadric show exponents up to 2:
+# that of a shape model near its facets comes out above 1 where the model was smoothed.
+_HURST_RANGE = (0.5, 1.0)
+_FACING = 0.5  # cos of the angle between a vertex's normal and the plane's: steeper belongs to another side
+
+
+@dataclass(frozen=True, kw_only=True)
+class Roughness:
+    """A self-affine surface: ν(L) = deviation_m · (L / baseline_m)^hurst, metres."""
+
+    deviation_m: float
+    baseline_m: float
+    hurst: float
+
+    def deviation_at(self, baseline_m: NDArray | float) -> Float64:
+        """RMS deviation in metres at baselines in metres."""
+        return np.asarray(self.deviation_m * (np.asarray(baseline_m) / self.baseline_m) ** self.hurst)
+
+
+def deviogram(points_m: NDArray, normals: NDArray, baselines_m: NDArray, *, windows: int = _WINDOWS) -> Float64:
+    """Deviation in metres, float64[k], over a surface given by its points; nan where none lie so far apart.
+
+    The median over neighbourhoods of their RMS deviation: typical ground, where the mean square would be that of
+    the few highest cliffs. Heights refer to the quadric fitted within three baselines: the body is round, and
+    over a self-affine surface of any exponent the fit takes the same share of ν away at each scale.
+
+    Parameters
+    ----------
+    points_m, normals
+        float[n, 3]: metres in any axes, and unit outward normals.
+    baselines_m
+        float[k], metres along the local plane.
+    windows
+        How many neighbourhoods, spread evenly over the points' order.
+    """
+    points = np.asarray(points_m, dtype=np.float64)
+    tree = cKDTree(points)
+    centres = np.unique(np.linspace(0, len(points) - 1, windows).astype(int))
+    out = np.full(len(baselines_m), np.nan)
+    for k, baseline in enumerate(baselines_m):
+        squares = [_mean_square(points, normals, tree, centre, float(baseline)) for centre in centres]
+        known = [square for square in squares if square is not None]
+        if known:
+            out[k] = np.sqrt(np.median(known))
+    return out
+
+
+def _mean_square(points: Float64, normals: NDArray, tree: cKDTree, centre: int, baseline: float) -> float | None:
+    """Of height differences over the baseline around one point; None with too few points."""
+    reach = _WINDOW_BASELINES * baseline
+    near = np.sort(tree.query_ball_point(points[centre], reach))
+    near = near[np.einsum("ni,i->n", normals[near], normals[centre]) > _FACING]
+    if len(near) < _FEWEST_POINTS:
+        return None
+    near = near[np.unique(np.linspace(0, len(near) - 1, _MOST_POINTS).astype(int))]
+    offset = points[near] - points[near].mean(axis=0)
+    axes = np.linalg.eigh(np.einsum("ni,nj->ij", offset, offset))[1]
+    height, x, y = np.einsum("ni,ij->jn", offset, axes) / reach
+    terms = np.column_stack([np.ones_like(x), x, y, x * x, x * y, y * y])
+    height = reach * (height - np.einsum("nk,k->n", terms, np.linalg.lstsq(terms, height, rcond=None)[0]))
+    i, j = np.triu_indices(len(near), 1)
+    apart = reach * np.hypot(x[i] - x[j], y[i] - y[j])
+    chosen = (apart > baseline / _BIN) & (apart < baseline * _BIN)
+    return float(np.mean((height[i] - height[j])[chosen] ** 2)) if chosen.any() else None
+
+
+def mean_edge_m(vertices_m: NDArray, faces: NDArray) -> float:
+    """Mean edge length of a mesh, metres."""
+    side = vertices_m[faces] - vertices_m[np.roll(faces, 1, axis=1)]
+    return float(np.linalg.norm(side, axis=2).mean())
+
+
+def model_roughness(body: Body) -> Roughness:
+    """The law that continues the body's own shape model below its facets; about a second for 36,000 faces.
+
+    Anchored at 1.3 mean edges, the exponent fitted over 1.3 to 3.8 and kept within 0.5 to 1.
+    """
+    edge = mean_edge_m(body.vertices_m, body.faces)
+    baselines = edge * np.array(_FIT_EDGES)
+    deviation = deviogram(body.vertices_m, vertex_normals(body.vertices_m, body.faces), baselines)
+    used = np.isfinite(deviation) & (deviation > 0)
+    if used.sum() < 2:
+        return Roughness(deviation_m=0.0, baseline_m=float(baselines[0]), hurst=_HURST_RANGE[1])
+    log_l, log_v = np.log(baselines[used]), np.log(deviation[used])
+    slope = float(np.sum((log_l - log_l.mean()) * log_v) / np.sum((log_l - log_l.mean()) ** 2))
+    return Roughness(
+        deviation_m=float(np.exp(log_v[0])),
+        baseline_m=float(np.exp(log_l[0])),
+        hurst=float(np.clip(slope, *_HURST_RANGE)),
+    )
