@@ -24,12 +24,15 @@ NEAR_M = 20.0  # up to there the smallest are drawn; beyond, those that look as 
 _MOST_COVER = 1.2
 _MOST_DRAWN = 150_000
 
-_PLANES = 13  # flat sides; deep cuts, or rocks look like eggs
+_PLANES = 18  # flat sides; deep cuts, or rocks look like eggs
 _LEVELS = 6  # of detail: 20 · 4^level triangles
-_EDGE_FACETS = 2.4  # a rock's edges, in facets of the ground around it
+_EDGE_FACETS = 2.4  # edges of a rock of half a metre, in facets of the ground around it; of larger ones less
+_EDGE_POWER = -0.3
+_COARSER = (1.0, 1.2, 1.45, 1.75, 2.1)
 _FLAT_LEVELS = 2  # up to that level faces are the rock's own fracture planes
 _RING = 12  # directions in which the ground around a rock is looked at
-_BURIED = (0.12, 0.45)  # of its height, below the lowest ground around
+_LOWEST_CORNERS = 8
+_BURIED = (0.10, 0.40)  # of its height, below the lowest ground around
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -93,7 +96,13 @@ def add_boulders(
     diameter, face, at, least = scatter(points, faces, favour, smallest, law, rng)
 
     detail = facet_m[faces[face, 0]]
-    level = np.clip(np.ceil(np.log2(0.53 * diameter / (_EDGE_FACETS * detail))), 0, _LEVELS).astype(np.int64)
+    edge = _EDGE_FACETS * detail * np.maximum(diameter / 0.5, 1.0) ** _EDGE_POWER
+    # Rather coarser rocks than fewer, and none that takes a large part of the triangles.
+    finest = min(_LEVELS, max(1, int(np.log2(max(0.04 * budget / 20, 1.0)) / 2)))
+    for coarser in _COARSER:
+        level = np.clip(np.ceil(np.log2(0.53 * diameter / (coarser * edge))), 0, finest).astype(np.int64)
+        if np.sum(20 * 4**level) <= budget:
+            break
     # Cut at one multiple of the smallest everywhere, the law holds above that.
     order = np.argsort(-diameter / least, kind="stable")
     fits = np.cumsum(20 * 4 ** level[order]) <= budget
@@ -135,8 +144,8 @@ def _favour(
     count = len(faces)
     broad = place.gradient(110.0, noise_key(seed, 9001), count) / GRADIENT_STD
     close = place.gradient(23.0, noise_key(seed, 9002), count) / GRADIENT_STD
-    cluster = np.exp(0.75 * broad.astype(np.float64) + 0.55 * close)
-    ground = 0.30 + 0.5 * (1 - dust.mean(axis=1)) + 7.0 * talus.mean(axis=1)
+    cluster = np.exp(1.0 * broad.astype(np.float64) + 0.6 * close)
+    ground = 0.15 + 0.6 * (1 - dust.mean(axis=1)) + 7.0 * talus.mean(axis=1)
     # None stay on steep ground.
     lie = np.clip((-normals[:, 2] - 0.70) / (0.84 - 0.70), 0, 1)
     return np.asarray(cluster * ground * lie, dtype=np.float64)
@@ -257,7 +266,7 @@ def _rocks(
     sphere, faces = _icosphere(level)
     count = len(diameter)
     planes = _unit(rng.normal(size=(count, _PLANES, 3)))
-    depth = rng.uniform(0.42, 0.86, size=(count, _PLANES))
+    depth = rng.uniform(0.45, 0.80, size=(count, _PLANES))
     # Joints come in families: some planes face the opposite or a perpendicular way of the first.
     planes[:, 1] = _unit(-planes[:, 0] + 0.15 * rng.normal(size=(count, 3)))
     planes[:, 2] = _unit(np.cross(planes[:, 0], planes[:, 3]) + 0.1 * rng.normal(size=(count, 3)))
@@ -274,6 +283,7 @@ def _rocks(
         * np.column_stack([np.ones(count), rng.uniform(0.65, 0.95, count), rng.uniform(0.45, 0.80, count)])
     )
     rock = radius[:, :, None] * sphere * semi[:, None, :]
+    normal = _ground_normal(at, normal, 0.5 * diameter, ground, tree)
     # The squeezed axis lies near the ground's normal, heading at random: rocks rest on their broad side.
     up = _unit(normal + 0.25 * rng.normal(size=(count, 3)))
     side = _unit(np.cross(up, rng.normal(size=(count, 3))))
@@ -281,10 +291,38 @@ def _rocks(
 
     along = np.einsum("nvi,ni->nv", rock, normal)
     low, high = along.min(axis=1), along.max(axis=1)
-    lowest = _lowest_ground(at, normal, side, 0.5 * diameter, ground, tree)
+    lowest = _lowest_ground(at, normal, 0.5 * diameter, ground, tree)
     lift = lowest - low - rng.uniform(*_BURIED, count) * (high - low)
     centre = at + lift[:, None] * normal
+    for _ in range(3):  # down, until the lowest corners are in the ground beside them
+        corners = rock + centre[:, None, :]
+        lowest_few = np.argsort(-corners[..., 2], axis=1, kind="stable")[:, :_LOWEST_CORNERS]
+        corners = np.take_along_axis(corners, lowest_few[..., None], axis=1)
+        beside = ground[tree.query(corners.reshape(-1, 3))[1]].reshape(corners.shape)
+        gap = np.einsum("nvi,ni->nv", corners - beside, normal).max(axis=1)
+        centre = centre - np.maximum(gap + 0.08 * (high - low), 0.0)[:, None] * normal
     return rock + centre[:, None, :], faces, centre
+
+
+def _ground_normal(at: Float64, normal: Float64, radius: Float64, ground: Float64, tree: cKDTree) -> Float64:
+    """The ground's normal on the scale of a rock, float64[n, 3]: that of a ring around it."""
+    across, other = _tangents(normal)
+    ring = [
+        ground[tree.query(at + radius[:, None] * (np.cos(turn) * across + np.sin(turn) * other))[1]] - at
+        for turn in np.linspace(0, 2 * np.pi, _RING, endpoint=False)
+    ]
+    total = np.zeros_like(normal)
+    for k in range(_RING):
+        total += np.cross(ring[k - 1], ring[k])
+    mean = _unit(total)
+    usable = np.einsum("ni,ni->n", mean, normal) > 0.5
+    return np.where(usable[:, None], mean, normal)
+
+
+def _tangents(normal: Float64) -> tuple[Float64, Float64]:
+    axis = np.where(np.abs(normal[:, :1]) < 0.7, np.array([1.0, 0.0, 0.0]), np.array([0.0, 1.0, 0.0]))
+    across = _unit(np.cross(axis, normal))
+    return across, np.cross(normal, across)
 
 
 def _weathered(sphere: Float64, level: int, count: int, rng: np.random.Generator) -> Float64:
@@ -295,16 +333,13 @@ def _weathered(sphere: Float64, level: int, count: int, rng: np.random.Generator
     out = np.zeros(size)
     for octave in range(level):
         wave = 0.9 / 2**octave
-        out += 0.035 * wave**0.8 / GRADIENT_STD * field.gradient(wave, 77_000 + octave, size)
+        out += 0.05 * wave / GRADIENT_STD * field.gradient(wave, 77_000 + octave, size)
     return 1.0 + out.reshape(count, -1)
 
 
-def _lowest_ground(
-    at: Float64, normal: Float64, side: Float64, radius: Float64, ground: Float64, tree: cKDTree
-) -> Float64:
+def _lowest_ground(at: Float64, normal: Float64, radius: Float64, ground: Float64, tree: cKDTree) -> Float64:
     """Height of the lowest ground within a rock's reach, along the normal, float64[n] metres; at most 0."""
-    across = _unit(side - np.einsum("ni,ni->n", side, normal)[:, None] * normal)
-    other = np.cross(normal, across)
+    across, other = _tangents(normal)
     lowest = np.zeros(len(at))
     for reach in (0.5, 1.0):
         for turn in np.linspace(0, 2 * np.pi, _RING, endpoint=False):

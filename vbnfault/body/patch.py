@@ -97,7 +97,7 @@ def build_patch(
         Non-negative integer.
     facet_m
         Mean edge length within `radius_m` of the site, 0.05 to 1e6 m; beyond, it grows as the distance to the
-        power 1.2 until the global model's facets are reached. Coarsened where the ground alone would take more
+        power 1.1 until the global model's facets are reached. Coarsened where the ground alone would take more
         than 72 % of `max_triangles`.
     radius_m
         1 to 1e8 m.

@@ -12,8 +12,8 @@ from vbnfault.body.shape import Float64, Int32
 # Splitting halves an edge, so lengths end between half the limit and the limit; their mean is then near 1.
 LIMIT_PER_TARGET = 1.6
 # Beyond the radius the limit grows as this power of the distance: a little faster than a pixel's width does, so
-# that the triangles, which then fall off as distance to the -0.4, end with the body.
-GROWTH_POWER = 1.2
+# that the triangles, which then fall off as distance to the -0.2, end with the body.
+GROWTH_POWER = 1.1
 _PROBE = 4.0  # the triangle count is foretold with facets coarser by this, in a fraction of the time
 # A midpoint may leave the chord by at most this fraction of the edge: cliffs stay cliffs instead of bulging.
 _MAX_BULGE = 0.06

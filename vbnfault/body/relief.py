@@ -223,14 +223,17 @@ class _Octaves:
             total += self.amplitude(wavelength) * self.gradient(wavelength, stream + k)
         return total
 
-    def blocks(self, width_m: float, stream: int) -> tuple[Float32, Float32]:
-        """Levels of blocks, and 1 in the cracks between them."""
+    def blocks(self, width_m: float, height_m: float, stream: int) -> Float32:
+        """Metres: blocks of that width, each at its own level, and the cracks between them."""
         count = self._count(width_m)
         level, other, gap = self._points.blocks(width_m, noise_key(self._seed, stream), count)
-        # A step narrower than two or three facets would come out as a saw.
+        step = np.float32(height_m) * (other - level)
+        # A step narrower than two facets, or steeper than 60°, would come out as a saw.
         ramp = np.maximum(0.06 * width_m, 1.8 * self.facet_m[:count]).astype(np.float32)
+        ramp = np.maximum(ramp, 0.45 * np.abs(step))
         edge = 1 - _smooth_step(0, 1, gap / ramp)
-        return self._full(level + 0.5 * edge * (other - level), width_m), self._full(edge, width_m)
+        crack = np.minimum(np.float32(_CRACK_DEPTH * height_m), 0.5 * ramp)
+        return self._full(height_m * level + (0.5 * step - crack) * edge, width_m)
 
     def craters(self, per_km2: float) -> Float32:
         total = np.zeros(len(self.facet_m), dtype=np.float32)
@@ -277,15 +280,15 @@ def _terraced(noise: _Octaves, swell: Float32) -> Float32:
     """Heights gathered into treads of uneven rise, in patches: scarps that run out along their length."""
     where = _smooth_step(0.1, 1.5, noise.gradient(120.0, 200) + 0.5 * noise.gradient(31.0, 201))
     wander = swell + 1.6 * noise.gradient(43.0, 202) + 0.7 * noise.gradient(17.0, 203)
-    wander += 0.30 * noise.gradient(6.0, 204) + 0.12 * noise.gradient(2.3, 205)
+    wander += 0.16 * noise.gradient(6.0, 204) + 0.05 * noise.gradient(2.3, 205)
     out = swell.copy()
-    for number, (step, share) in enumerate(zip(_TERRACE_M, (0.8, 0.5), strict=True)):
+    for number, (step, share) in enumerate(zip(_TERRACE_M, (0.7, 0.5), strict=True)):
         rise = np.random.Generator(np.random.Philox(900 + number)).uniform(0.0, 1.0, 256).astype(np.float32)
         u = wander / np.float32(step)
         tread = np.floor(u)
         # Some of the steps are left out.
         kept = where * share * rise[tread.astype(np.int64) & 255]
-        out += kept * (step * (tread + _smooth_step(0.50, 0.98, u - tread)) - wander)
+        out += kept * (step * (tread + _smooth_step(0.30, 0.98, u - tread)) - wander)
     return out
 
 
@@ -297,7 +300,7 @@ def _surface(
     cliff = _smooth_step(*_CLIFF_DEG, slope + 3 * history)
     # Consolidated and broken (1), or not (0).
     bare = _smooth_step(*_BARE_DEG, slope + 11 * history)
-    vigour = 0.45 + 0.9 * _smooth_step(-1.2, 1.4, noise.gradient(47.0, 102)) * (0.6 + 0.4 * bare)
+    vigour = 0.55 + 1.0 * _smooth_step(-1.2, 1.4, noise.gradient(47.0, 102)) * (0.6 + 0.4 * bare)
 
     shortest = max(_SHORTEST_FACETS * float(noise.facet_m[0]), 0.05)
     rough, grit = np.zeros_like(broad), np.zeros_like(broad)
@@ -317,8 +320,7 @@ def _surface(
     bent = noise.bent(bend)
     joints = _smooth_step(-1.0, 0.8, noise.gradient(33.0, 116))
     for number, (width, height) in enumerate(_BLOCKS_M):
-        level, crack = bent.blocks(width, 120 + number)
-        rock += bare * (0.4 + 0.6 * joints) * np.float32(height) * (level - np.float32(_CRACK_DEPTH) * crack)
+        rock += bare * (0.4 + 0.6 * joints) * bent.blocks(width, height, 120 + number)
     rock += cliff * _strata(noise, elevation + np.einsum("ni,i->n", bend, np.array([0.5, 0.3, 0.4])))
     rock += talus * (0.25 * noise.gradient(2.6, 140) + 0.10 * noise.gradient(1.1, 141))
 
