@@ -98,7 +98,7 @@ def add_boulders(
     detail = facet_m[faces[face, 0]]
     edge = _EDGE_FACETS * detail * np.maximum(diameter / 0.5, 1.0) ** _EDGE_POWER
     # Rather coarser rocks than fewer, and none that takes a large part of the triangles.
-    finest = min(_LEVELS, max(1, int(np.log2(max(0.04 * budget / 20, 1.0)) / 2)))
+    finest = min(_LEVELS, max(1, int(np.log2(max(0.06 * budget / 20, 1.0)) / 2)))
     for coarser in _COARSER:
         level = np.clip(np.ceil(np.log2(0.53 * diameter / (coarser * edge))), 0, finest).astype(np.int64)
         if np.sum(20 * 4**level) <= budget:

@@ -86,7 +86,7 @@ def build_patch(
     max_triangles: int = 1_600_000,
     boulder_index: float = rocks.INDEX,
     boulders_per_km2: float = rocks.PER_KM2,
-    craters_per_km2: float = 100.0,
+    craters_per_km2: float = 60.0,
     hurst: float | None = None,
 ) -> Patch:
     """Build the terrain around a site; deterministic in (body, site, seed and the parameters).
@@ -112,7 +112,7 @@ def build_patch(
         The cumulative size law N(>= D) = boulders_per_km2 · (D / 7 m)^-boulder_index over the whole patch; 0.5 to
         6, and 0 to 1e5. Defaults: 67P, Pajola et al. 2015.
     craters_per_km2
-        Pits and craters of 10 m diameter or more, cumulative index 2, 5 to 60 m; 0 to 600.
+        Pits and craters of 10 m diameter or more, cumulative index 2, 3 to 48 m; 0 to 600.
     hurst
         Exponent of the roughness below the model's facets, 0.3 to 1.2; None: measured on the model.
 

@@ -32,9 +32,10 @@ if TYPE_CHECKING:
 _FADE = (1.6, 2.8)
 _SHARED_M = 20.0  # octaves at least that long lift dust and rock alike
 LONGEST_EDGES = 1.0  # the longest octave, in mean edges of the model
+_REGION_EDGES = 4.5  # the size of regions, in longest octaves
 _SHORTEST_FACETS = 1.8
 
-_CRATER_WIDTHS_M = (90.0, 45.0, 22.5, 11.25)  # cells; diameters are a third to two thirds of that
+_CRATER_WIDTHS_M = (72.0, 36.0, 18.0, 9.0)  # cells; diameters are a third to two thirds of that
 _CRATER_SHARE_PER_DENSITY = 1534e-6  # of the cells, per crater of 10 m or more in a square kilometre
 
 _TERRACE_M = (5.5, 2.6)  # height of a step, and of the smaller ones between them
@@ -115,8 +116,11 @@ def add_relief(
     rank[order] = np.arange(len(order))
     noise = _Octaves(points[order] + site.position_T_m, facet_m[order], seed, roughness, longest_m)
 
-    swell = noise.fractal(longest_m, _SHARED_M, 0)
-    broad = _terraced(noise, swell) + noise.craters(craters_per_km2)
+    # Regions differ: evenly rough ground, with few octaves shown far away, looks like orange peel.
+    region = 0.45 + 0.95 * _smooth_step(-1.0, 1.2, noise.gradient(_REGION_EDGES * longest_m, 210))
+    swell = region * noise.fractal(longest_m, _SHARED_M, 0)
+    on_cliffs = _smooth_step(26.0, 42.0, _slope_deg(points, normals, faces, up))[order]
+    broad = _terraced(noise, swell) + (1 - on_cliffs) * noise.craters(craters_per_km2)
     shown = noise.shown(longest_m)
     raised = points + (scale * (broad * shown)[rank].astype(np.float64))[:, None] * normals
     slope = _slope_deg(raised, normals, faces, up)
@@ -311,7 +315,7 @@ def _surface(
         crease = np.float32(0.8 if k % 2 else 0.35) * bare
         rough += noise.amplitude(wavelength) * (value + crease * (creased - value))
         if wavelength < 7.0:
-            grit += np.float32(0.022 * wavelength**0.7) * value
+            grit += np.float32(0.028 * wavelength**0.65) * value
     rock = broad + vigour * rough
 
     # Bent, or the walls between blocks are dead straight.
