@@ -69,7 +69,7 @@ def test_cycles(
         python,
         vertices_m=patch.vertices_L_m,
         faces=patch.faces,
-        flat=patch.face_is_boulder,
+        flat=patch.face_is_flat,
         position_L_m=scene.view.position_L_m,
         L_from_C=scene.view.L_from_C,
         fov_deg=workload.session.base_camera.fov_deg,

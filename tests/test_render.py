@@ -276,16 +276,16 @@ def test_a_new_view_compiles_nothing() -> None:
 
 def test_large_images_are_cut_without_a_seam() -> None:
     # rows are traced in slabs; a slab must not change what a pixel sees
-    from vbnfault.render import integrate
+    from vbnfault.render import light
 
     surface = join(plane(), box(np.array([0.0, 0.0, -1.0]), 1.0))
     a = scene(view(10 * UP, -UP), sun(frames.direction_L(0, 30)))
     whole = render.radiance(surface, a).array
-    limit, integrate._WAVEFRONT = integrate._WAVEFRONT, 64 * 16 * 10
+    limit, light.WAVEFRONT = light.WAVEFRONT, 64 * 16 * 10
     try:
         cut = render.radiance(surface, a).array
     finally:
-        integrate._WAVEFRONT = limit
+        light.WAVEFRONT = limit
     assert np.array_equal(whole, cut)
 
 

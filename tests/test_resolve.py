@@ -94,8 +94,7 @@ def test_redrawn_samples_follow_the_conditional_distribution(resolved: tuple[Ses
         e, h = rng.uniform(-30, 30, len(left)), rng.uniform(0, 100, len(left))
         position = np.column_stack([x[left], y[left], -(ground[left] + h)])
         suns = [
-            world.sunlight(session.scene, frames.direction_L(a, b))
-            for a, b in zip(azimuth[left], e, strict=True)
+            world.sunlight(session.scene, frames.direction_L(a, b)) for a, b in zip(azimuth[left], e, strict=True)
         ]
         good = render.is_clear(surface, position, session.scene.geometry.clearance_m)
         good &= render.sun_visible_fraction(surface, position, suns) == 1.0

@@ -180,11 +180,20 @@ class BodyTable(Table):
 class PatchTable(Table):
     """Terrain around a site: how far and how fine the model is refined."""
 
-    facet_m: float = Field(1.0, ge=0.05, le=1e6, description="edge length aimed at within radius_m of the site")
-    radius_m: float = Field(250.0, ge=1, le=1e8)
+    facet_m: float = Field(0.12, ge=0.05, le=1e6, description="edge length aimed at within radius_m of the site")
+    radius_m: float = Field(20.0, ge=1, le=1e8, description="beyond, facets grow with the distance")
+    max_triangles: int = Field(
+        1_600_000, ge=10_000, le=20_000_000, description="facets are coarsened to keep to it"
+    )
     relief: float = Field(1.0, ge=0, le=10, description="amplitude of relief below the model's facets; 0: none")
+    hurst: float | None = Field(
+        None, ge=0.3, le=1.2, description="exponent of the relief's roughness; default: as the model's own"
+    )
+    craters_per_km2: float = Field(60.0, ge=0, le=600, description="of 10 m or more")
     boulders: bool = True
-    min_boulder_m: float = Field(0.8, ge=0.05, le=1000)
+    min_boulder_m: float = Field(0.25, ge=0.05, le=1000, description="diameter of the smallest near the site")
+    boulder_index: float = Field(3.6, ge=0.5, le=6, description="of the cumulative size law; Pajola et al. 2015")
+    boulders_per_km2: float = Field(98.0, ge=0, le=1e5, description="of 7 m or more; Pajola et al. 2015")
 
 
 class SunTable(Table):
@@ -301,8 +310,8 @@ class RenderTable(Table):
         None,
         gt=0.01,
         le=10,
-        description="most noise of sampling, in units of the sensor's own, in 99 % of lit pixels: more samples where "
-        "it takes them; default: no more anywhere",
+        description="most noise of sampling, over the sensor's own, in 99 % of lit pixels: more samples where it "
+        "takes them; default: no more anywhere",
     )
     max_samples_per_pixel: int = Field(256, ge=1, le=4096, description="a power of four; for noise_fraction")
     bounces: int = Field(0, ge=0, le=4, description="reflections between sunlit ground and the ground that is seen")

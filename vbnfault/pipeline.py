@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from . import config, frames, labels, photometry, plan, world
-from .body import Body, Patch, Site, build_patch, choose_sites
+from .body import Body, Patch, Site, cached_patch, choose_sites
 from .camera import Camera
 from .config import SceneConfig
 from .detector import Noise
@@ -42,6 +42,8 @@ _METERING_RANGE = (0.25, 8.0)
 # A step's own change of this many DN survives every later optical step of the paper's tables (cos⁴ at 255 → 105
 # keeps 41 %), so the fault needs no full comparison to be called present.
 _CLEARLY_VISIBLE_DN = 6.0
+# Of the full well: what counts as lit where noise of sampling is judged.
+_LIT = 0.01
 # Share of the lit pixels that may keep more noise of sampling than the scene allows.
 _FEW = 0.01
 # Values of the semantic layer.
@@ -244,7 +246,7 @@ def render_frame(frame: Frame) -> None:
     angles = bool(_ANGLE_LAYERS & set(spec.scene.dataset.layers))
     frame.truth = render.truth(surface, scene.view, scene.sun, angles=angles)
     if spec.scene.render.noise_fraction is None:
-        frame.radiance = render.radiance(surface, scene)
+        frame.radiance = render.radiance(surface, scene, frame.truth)
     else:
         _render_to_the_noise(frame, scene, spec.scene.render.noise_fraction)
 
@@ -260,18 +262,22 @@ def _render_to_the_noise(frame: Frame, scene: Scene, fraction: float) -> None:
 
     surface, settings = frame.spec.terrain.surface, frame.spec.scene.render
     lens_and_sensor = _green_per_second(frame)
-    frame.radiance, halves = render.estimate(surface, scene, lens_and_sensor)
+    found, halves = render.direct(surface, scene, lens_and_sensor)
+    array = found.array.copy()
+    once_more = render.indirect(surface, scene, frame.truth) if scene.bounces else np.zeros_like(array)
+    frame.radiance = found.with_array(array + once_more)
     exposure = _exposure_s(frame, _rate(frame, frame.radiance))
     error_e = np.abs(halves) * exposure
     signal_e = np.einsum("b,byx->yx", lens_and_sensor * exposure, frame.radiance.array)
     detector = frame.camera.detector
     sensor_e2 = signal_e + detector.dark_current_e_s * exposure + detector.read_noise_e_rms**2
-    lit = signal_e > 0.01 * detector.full_well_e
+    # neither what is hardly lit nor what saturates shows this noise
+    lit = (signal_e > _LIT * detector.full_well_e) & (signal_e - 4 * error_e < detector.full_well_e)
+    worth = cv2.dilate(lit.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
     samples, spent = scene.samples_per_pixel, np.full(error_e.shape, scene.samples_per_pixel, dtype=np.int32)
-    array = frame.radiance.array.copy()
     while True:
-        share = np.sqrt(cv2.blur(error_e**2, (3, 3)) / sensor_e2)
-        noisy = np.flatnonzero((share > fraction) & (spent == samples)).astype(np.uint32)
+        share = np.sqrt(np.maximum(cv2.blur(np.where(worth, error_e, 0) ** 2, (3, 3)), 0) / sensor_e2)
+        noisy = np.flatnonzero((share > fraction) & worth & (spent == samples)).astype(np.uint32)
         samples *= 4
         if np.count_nonzero(share[lit] > fraction) <= _FEW * np.count_nonzero(lit):
             break
@@ -279,11 +285,11 @@ def _render_to_the_noise(frame: Frame, scene: Scene, fraction: float) -> None:
             break
         # samples of their own: the first ones chose the pixel, and a lucky choice would be a bias
         again = replace(scene, samples_per_pixel=samples, key=(scene.key + samples) & 0xFFFFFFFF)
-        more, halves = render.estimate(surface, again, lens_and_sensor, noisy)
+        more, halves = render.direct(surface, again, lens_and_sensor, noisy)
         array.reshape(len(array), -1)[:, noisy] = more.array[:, 0]
         error_e.ravel()[noisy] = np.abs(halves[0]) * exposure
         spent.ravel()[noisy] = samples
-    frame.radiance = frame.radiance.with_array(array)
+    frame.radiance = found.with_array(array + once_more)
     frame.samples_per_pixel = float(spent.mean())
     frame.noise_fraction_p99 = float(np.percentile(share[lit], 99)) if lit.any() else 0.0
 
@@ -767,8 +773,8 @@ class Session:
             surface = render.Surface(
                 patch.vertices_L_m,
                 patch.faces,
-                patch.face_is_boulder,
-                dust=getattr(patch, "dust", None),
+                patch.face_is_flat,
+                dust=patch.dust,
                 vehicle=None if vehicle is None else world.render_vehicle(self.scene, vehicle),
             )
             self._terrain = Terrain(body=self.body, site=patch.site, surface=surface, vehicle=vehicle)
@@ -776,14 +782,19 @@ class Session:
 
     def _patch(self, site: Site) -> Patch:
         table = self.scene.patch
-        return build_patch(
+        return cached_patch(
             self.body,
             site,
             seed=self.scene.dataset.seed,
             facet_m=table.facet_m,
             radius_m=table.radius_m,
             relief=table.relief,
+            hurst=table.hurst,
+            craters_per_km2=table.craters_per_km2,
             min_boulder_m=table.min_boulder_m if table.boulders else 1e6,
+            boulder_index=table.boulder_index,
+            boulders_per_km2=table.boulders_per_km2,
+            max_triangles=max(table.max_triangles, 2 * len(self.body.faces)),
         )
 
     def spec(self, index: int) -> SampleSpec:

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
+from vbnfault.body.cache import cached_patch
 from vbnfault.body.gravity import PolyhedronGravity
 from vbnfault.body.nucleus import embedded_nucleus
 from vbnfault.body.patch import Patch, build_patch
@@ -24,6 +25,7 @@ __all__ = [
     "PolyhedronGravity",
     "Site",
     "build_patch",
+    "cached_patch",
     "check_mesh",
     "choose_sites",
     "embedded_nucleus",

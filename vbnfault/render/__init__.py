@@ -1,6 +1,9 @@
 """Rendering with Mitsuba 3 (LLVM, spectral). The only package that imports it; importing this loads it."""
 
-from .integrate import estimate, radiance, truth
+from .bounces import indirect
+from .integrate import radiance
+from .layers import truth
+from .light import direct
 from .resolve import ground_height_m, is_clear, sun_visible_fraction
 from .runtime import set_threads
 from .surface import Surface
@@ -42,8 +45,9 @@ def self_test() -> str:
 __all__ = [
     "Surface",
     "Vehicle",
-    "estimate",
+    "direct",
     "ground_height_m",
+    "indirect",
     "is_clear",
     "radiance",
     "self_test",

@@ -41,13 +41,15 @@ class Strata:
 
     def square(self, dimension: int = 0) -> tuple[Any, Any]:
         """A uniform point of each stratum of the unit square, x and y in [0, 1]; of the pixel, for dimension 0."""
-        u, v = mi.sample_tea_32(self._wavefront, self._key ^ (0x9E3779B9 * dimension & 0xFFFFFFFF), 4)
+        u, v = self.jitter(dimension)
         sx, sy = self.index & (self.side - 1), self.index >> (self.side.bit_length() - 1)
+        return (mi.Float(sx) + u) / self.side, (mi.Float(sy) + v) / self.side
+
+    def jitter(self, dimension: int) -> tuple[Any, Any]:
+        """Two uniform numbers in [0, 1] a sample."""
+        u, v = mi.sample_tea_32(self._wavefront, self._key ^ (0x9E3779B9 * dimension & 0xFFFFFFFF), 4)
         # 2⁻³² · u may round to 1.0 in float32, which is still inside the closed stratum: harmless
-        return (
-            (mi.Float(sx) + mi.Float(u) * _TO_UNIT) / self.side,
-            (mi.Float(sy) + mi.Float(v) * _TO_UNIT) / self.side,
-        )
+        return mi.Float(u) * _TO_UNIT, mi.Float(v) * _TO_UNIT
 
     def checkered(self) -> Any:
         """+1 and -1 by turns, as on a chessboard: two halves of the samples that each cover the pixel."""

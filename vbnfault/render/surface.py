@@ -51,7 +51,15 @@ class Surface:
 
     def intersect(self, rays: Any, active: Any = True, *, coherent: bool = True) -> Hit:
         """Closest hits; `coherent` where neighbours run alike."""
-        return Hit(self, rays, self.scene.ray_intersect_preliminary(rays, coherent=coherent, active=active))
+        return self.hit(rays, self.trace(rays, active, coherent=coherent))
+
+    def trace(self, rays: Any, active: Any = True, *, coherent: bool = True) -> tuple[Any, ...]:
+        """What `hit` needs besides the rays: can be evaluated, reordered with `dr.gather`, and used later."""
+        return (self.scene.ray_intersect_preliminary(rays, coherent=coherent, active=active),)
+
+    def hit(self, rays: Any, traced: tuple[Any, ...]) -> Hit:
+        """The closest hits that `trace` found for these rays."""
+        return Hit(self, rays, *traced)
 
     def occluded(self, rays: Any, active: Any, *, coherent: bool = True) -> Any:
         """Whether anything lies along the rays; `coherent` where neighbours run alike."""
@@ -62,7 +70,8 @@ class Hit:
     """Closest hits of a wavefront: `valid`, `distance_m`, and the unit outward `normal` that shades, interpolated
     over the facet unless it is flat. `material`: of the vehicle's, None for terrain alone."""
 
-    material = None
+    material: Any = None
+    on_vehicle: Any = None
 
     def __init__(self, surface: Surface, rays: Any, found: Any) -> None:
         self.valid = found.is_valid()
@@ -105,25 +114,25 @@ def _with_a_fourth(three: NDArray[np.float32]) -> NDArray[np.float32]:
 def _corner_records(
     vertices: NDArray[np.float32], faces: NDArray[np.int32], flat: NDArray[np.bool_]
 ) -> NDArray[np.float32]:
-    """Per corner of each facet, float32[m, 3, 4]: its normal, and the distance of its tangent plane from the
-    origin. Four floats: drjit fetches a power of two in one packet."""
-    normals = _corner_normals(vertices, faces, flat)
-    plane = np.einsum("fki,fki->fk", normals.astype(np.float64), vertices[faces].astype(np.float64))
-    return np.concatenate([normals, plane[..., None]], axis=2).astype(np.float32)
+    """Per corner of each facet, float32[m, 3, 4]: its unit normal, and the distance of its tangent plane from the
+    origin. Four floats: drjit fetches a power of two in one packet.
 
-
-def _corner_normals(
-    vertices: NDArray[np.float32], faces: NDArray[np.int32], flat: NDArray[np.bool_]
-) -> NDArray[np.float32]:
-    """Unit normals of the corners of each facet, float32[m, 3, 3]: of the facet itself where it is flat, else
-    the mean of the smooth facets around the vertex, weighted by area."""
-    a, b, c = (vertices[faces[:, i]].astype(np.float64) for i in range(3))
-    area = np.cross(b - a, c - a)
-    weighted = np.where(flat[:, None], 0.0, area)
-    vertex = np.stack(
-        [np.bincount(faces.ravel(), np.repeat(weighted[:, k], 3), minlength=len(vertices)) for k in range(3)],
-        axis=1,
+    The normal is the facet's own where it is flat, else the mean of the smooth facets around the vertex, weighted
+    by area.
+    """
+    corner = vertices[faces]
+    area = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+    smooth, at = area[~flat].astype(np.float64), faces[~flat].ravel()
+    vertex: NDArray[np.float64] = np.column_stack(
+        [np.bincount(at, np.repeat(smooth[:, k], 3), minlength=len(vertices)) for k in range(3)]
     )
-    corner = np.where(flat[:, None, None], area[:, None, :], vertex[faces])
-    corner /= np.maximum(np.linalg.norm(corner, axis=2, keepdims=True), 1e-300)
-    return corner.astype(np.float32)
+    record = np.empty((len(faces), 3, 4), dtype=np.float32)
+    record[..., :3] = _unit(vertex).astype(np.float32)[faces]
+    record[flat, :, :3] = _unit(area[flat].astype(np.float64))[:, None, :]
+    record[..., 3] = np.einsum("fki,fki->fk", record[..., :3], corner)
+    return record
+
+
+def _unit(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+    length = np.sqrt(np.einsum("ni,ni->n", vectors, vectors))
+    return np.asarray(vectors / np.maximum(length, 1e-300)[:, None])

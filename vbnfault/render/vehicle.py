@@ -66,14 +66,22 @@ class World:
         self._axes = [opaque_vector(mi.Vector3f, view.L_from_C[:, k]) for k in range(3)]  # B coincides with C
 
     def intersect(self, rays: Any, active: Any = True, *, coherent: bool = True) -> VehicleHit:
-        """Closest hits of either; `material` tells the vehicle's from the ground's."""
-        hit = self.surface.intersect(rays, active, coherent=coherent)
+        """Closest hits of either; `on_vehicle` tells the vehicle's from the ground's."""
+        return self.hit(rays, self.trace(rays, active, coherent=coherent))
+
+    def trace(self, rays: Any, active: Any = True, *, coherent: bool = True) -> tuple[Any, ...]:
+        """As `Surface.trace`: the terrain's hits and the vehicle's."""
         found = self.vehicle.scene.ray_intersect_preliminary(self._in_B(rays), coherent=coherent, active=active)
-        nearer = found.is_valid() & (~hit.valid | (found.t < hit.distance_m))
+        return *self.surface.trace(rays, active, coherent=coherent), found
+
+    def hit(self, rays: Any, traced: tuple[Any, ...]) -> VehicleHit:
+        """The nearer hits of the two."""
+        ground, found = self.surface.hit(rays, traced[:-1]), traced[-1]
+        nearer = found.is_valid() & (~ground.valid | (found.t < ground.distance_m))
         normal, material = self.vehicle.facet(found.prim_index, nearer)
         normal = self._in_L(normal)
         normal = dr.mulsign(normal, -dr.dot(normal, rays.d))  # towards who looks
-        return VehicleHit(hit, nearer, found.t, normal, material, rays)
+        return VehicleHit(ground, nearer, found.t, normal, material, rays)
 
     def occluded(self, rays: Any, active: Any, *, coherent: bool = True) -> Any:
         """Whether anything lies along the rays."""
