@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from . import config, frames, labels, photometry, plan, world
 from .body import Body, Patch, Site, cached_patch, choose_sites
+from .body.roughness import model_roughness
 from .camera import Camera
 from .config import SceneConfig
 from .detector import Noise
@@ -46,6 +47,8 @@ _CLEARLY_VISIBLE_DN = 6.0
 _LIT = 0.01
 # Share of the lit pixels that may keep more noise of sampling than the scene allows.
 _FEW = 0.01
+# Slope an octave of the finest relief: steeper would be a wall of needles.
+_STEEPEST_DETAIL = 0.12
 # Values of the semantic layer.
 SKY, BODY = 0, 1
 _ANGLE_LAYERS = {"incidence_deg", "emission_deg", "phase_deg", "albedo"}
@@ -111,7 +114,7 @@ class Frame:
     images: dict[str, RGBI] = field(default_factory=dict)
     signals: dict[Any, Electrons] = field(default_factory=dict)
     pictures: dict[Any, RGBI] = field(default_factory=dict)
-    samples_per_pixel: float = field(init=False)
+    samples_per_pixel: float = float("nan")
     noise_fraction_p99: float = float("nan")
     mask: NDArray[np.bool_] = field(init=False)
     effects: dict[str, NDArray[np.bool_]] = field(default_factory=dict)
@@ -776,9 +779,19 @@ class Session:
                 patch.face_is_flat,
                 dust=patch.dust,
                 vehicle=None if vehicle is None else world.render_vehicle(self.scene, vehicle),
+                detail_slope=self._detail_slope,
             )
             self._terrain = Terrain(body=self.body, site=patch.site, surface=surface, vehicle=vehicle)
         return self._terrain
+
+    @cached_property
+    def _detail_slope(self) -> float:
+        """RMS slope an octave of the relief finer than facets, as the body's own roughness has it."""
+        # slopes of an octave of wavelength λ are 0.44 times the deviation over λ/4 a length of λ/4, for a
+        # self-affine surface of Hurst exponent 0.85: the ratio of the integrals of its spectrum
+        length = 0.075
+        steep = float(model_roughness(self.body).deviation_at(length)) / length
+        return min(0.44 * steep, _STEEPEST_DETAIL) * self.scene.patch.relief
 
     def _patch(self, site: Site) -> Patch:
         table = self.scene.patch

@@ -547,7 +547,7 @@ def _default_at_rest() -> Spacecraft:
         add(f"{leg}/strut", rod(hip, (pad[0], pad[1] - 0.02, pad[2]), 0.025), "aluminium")
         brace = tuple(0.45 * h + 0.55 * p for h, p in zip(hip, pad, strict=True))
         add(f"{leg}/brace", rod((0.3 * x, 0.48, hip_z), brace, 0.015), "aluminium")
-        add(f"{leg}/footpad", rod((pad[0], pad[1] - 0.04, pad[2]), pad, 0.14, 32), "aluminium")
+        add(f"{leg}/footpad", rod((pad[0], pad[1] - 0.04, pad[2]), pad, 0.14, 32), "black_mli")
 
     hinges["antenna"] = Pose(hinge_B_m=(0.0, -0.75, -0.95), axis_B=(1.0, 0.0, 0.0))
     add("antenna_mast", rod((0.0, -0.48, -0.95), (0.0, -0.75, -0.95), 0.03), "aluminium")

@@ -225,4 +225,4 @@ class _Guide:
                 weight = dr.select(far > 0, weight, 0)
                 total += weight * dr.gather(mi.Float, values, mi.UInt32(qy * self.width + qx))
                 weights += weight
-        return dr.select(weights > 0, total / dr.maximum(weights, 1e-20), 0)
+        return dr.select((depth > 0) & (weights > 0), total / dr.maximum(weights, 1e-20), values)

@@ -22,13 +22,13 @@ def has_bands(surface: Surface, scene: Scene) -> bool:
 
 
 class Reflection:
-    """Reflection at `hit`, seen along unit `view` (away from the surface): a term a band if `banded`, with the
-    model's weights in it, else the model's single term."""
+    """Reflection at `hit` with unit `normal`, seen along unit `view` (away from the surface): a term a band if
+    `banded`, with the model's weights in it, else the model's single term."""
 
-    def __init__(self, surface: Surface, scene: Scene, hit: Any, view: Any, *, banded: bool) -> None:
+    def __init__(self, surface: Surface, scene: Scene, hit: Any, normal: Any, view: Any, *, banded: bool) -> None:
         self._scene, self._hit, self._banded = scene, hit, banded
         self._vehicle = surface.vehicle
-        self._frame = mi.Frame3f(hit.normal)
+        self._frame = mi.Frame3f(normal)
         self._view = _triple(self._frame.to_local(view))
 
     def terms(self, light: Any) -> list[Any]:

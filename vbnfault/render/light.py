@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from ..quantities import Radiance
 from ..scene import Scene, Sunlight, View
 from .bsdf import Reflection, has_bands
+from .detail import Detail
 from .emitter import Limb, SunDisc, mu, polynomial
 from .runtime import dr, mi
 from .sampling import Optics, Pixels, Strata
@@ -55,6 +56,9 @@ class Light:
         self.surface, self.scene, self.banded = surface, scene, banded
         self.world = surface.seen_from(scene.view)
         self.optics, self.sun = Optics(scene.view), SunDisc(scene.sun)
+        self.detail = None
+        if surface.detail_slope:
+            self.detail = Detail(surface.detail_slope, 1 / float(scene.view.intrinsics[0]))
 
     def lit(self, hit: Any, point_of_sun: Any, *, coherent: bool = True) -> tuple[Any, Any]:
         """Direction towards a point of the Sun's disc, and whether its light arrives; `coherent` where neighbours
@@ -64,9 +68,12 @@ class Light:
         lit &= ~self.world.occluded(hit.shadow_rays(towards), lit, coherent=coherent)
         return towards, lit
 
-    def reflection(self, hit: Any, rays: Any) -> Reflection:
-        """How the ground at `hit` reflects towards where the rays come from."""
-        return Reflection(self.surface, self.scene, hit, -rays.d, banded=self.banded)
+    def reflection(self, hit: Any, rays: Any, strata: Strata | None = None) -> Reflection:
+        """How the ground at `hit` reflects towards where the rays come from; with its finest relief where `strata`
+        of the pixel's samples are given."""
+        dither = None if strata is None else (mi.Float(strata.index) + 0.5) / strata.samples
+        normal = hit.normal if dither is None else hit.shading_normal(self.detail, dither)
+        return Reflection(self.surface, self.scene, hit, normal, -rays.d, banded=self.banded)
 
 
 class _Direct(Light):
@@ -122,7 +129,7 @@ class _Direct(Light):
         hit = self.world.intersect(rays)
         point = strata.disc(SUN_DIMENSION)
         towards, lit = self.lit(hit, point)
-        terms = self.reflection(hit, rays).terms(towards)
+        terms = self.reflection(hit, rays, strata).terms(towards)
         if not self.banded:
             terms = [terms[0] * profile for profile in self.limb.terms(mu(point))]
         elif self.limb.profiles is not None:

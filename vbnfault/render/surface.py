@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..scene import View
+from .detail import Detail
 from .runtime import dr, mi
 from .vehicle import Vehicle, World
 
@@ -24,7 +25,8 @@ _OFFSET = 8 * 2.0**-23
 class Surface:
     """A triangle mesh in L. `vertices_m` float32[n, 3], `faces` int32[m, 3], `flat` bool[m]: facets shaded with
     their own normal, such as boulders; the others with normals interpolated from their vertices. `dust` float32[n]
-    in [0, 1]: how far each vertex is covered (default: none is). `vehicle`: the spacecraft with the camera."""
+    in [0, 1]: how far each vertex is covered (default: none is). `vehicle`: the spacecraft with the camera.
+    `detail_slope`: RMS slope an octave of relief finer than the facets."""
 
     def __init__(
         self,
@@ -33,6 +35,7 @@ class Surface:
         flat: NDArray[np.bool_],
         dust: NDArray[np.float32] | None = None,
         vehicle: Vehicle | None = None,
+        detail_slope: float = 0.0,
     ) -> None:
         mesh = mi.Mesh("terrain", len(vertices_m), len(faces))
         parameters = mi.traverse(mesh)
@@ -43,7 +46,7 @@ class Surface:
         self._corners = mi.Float(_corner_records(vertices_m, faces, flat).ravel())
         self._dust = mi.Float(0.0 if dust is None else np.ascontiguousarray(_with_a_fourth(dust[faces])).ravel())
         dr.eval(self._corners, self._dust)
-        self.vehicle = vehicle
+        self.vehicle, self.detail_slope = vehicle, detail_slope
 
     def seen_from(self, view: View) -> Surface | World:
         """What a camera sees: the terrain, and its own spacecraft if there is one."""
@@ -93,6 +96,13 @@ class Hit:
             return mi.Float(0)
         corners = dr.gather(mi.Vector4f, table, self._first, self.valid)
         return sum((corners[k] * w for k, w in enumerate(self._weights)), mi.Float(0))
+
+    def shading_normal(self, detail: Detail | None, dither: Any) -> Any:
+        """The normal turned by the relief finer than facets."""
+        if detail is None:
+            return self.normal
+        point = self._rays(self.distance_m)
+        return detail.turned(self.normal, point, self._rays.d, self.distance_m, self.dust, dither)
 
     def shadow_rays(self, direction: Any) -> Any:
         """Rays from the hits. The origin is moved off the facet to the smooth surface that the corner normals

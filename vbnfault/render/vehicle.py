@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..scene import View
+from .detail import Detail
 from .runtime import dr, mi
 from .sampling import opaque_vector
 
@@ -116,6 +117,10 @@ class VehicleHit:
     def dust(self) -> Any:
         """As the ground's; none on the vehicle."""
         return dr.select(self.on_vehicle, 0, self._ground.dust)
+
+    def shading_normal(self, detail: Detail | None, dither: Any) -> Any:
+        """As the ground's; the vehicle has no finer relief."""
+        return dr.select(self.on_vehicle, self.normal, self._ground.shading_normal(detail, dither))
 
     def shadow_rays(self, direction: Any) -> Any:
         """Rays from the hits, off the facet."""
