@@ -33,7 +33,7 @@ _FIRST_BOUNCE = 2  # the first free dimension of a sample's random numbers; thre
 _SIGMA_NORMAL = 0.3
 _SIGMA_PLANE_PX = 3.0
 _SPLINE = (3 / 8, 1 / 4, 1 / 16)
-_STRIDES = (1, 3)
+_STRIDES = (1, 2, 4)
 _COLOUR_PX = 12  # standard deviation: colour varies less than brightness, so it is averaged more widely
 
 

@@ -1,0 +1,257 @@
+"""The physical scene: truth on its pixels, spacecraft, stars, samples to the sensor's noise, finest relief."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from conftest import small_scene
+from scipy.spatial.transform import Rotation
+from test_light import scene
+from test_render import NODES, UP, join, plane, sun, view
+
+from vbnfault import config, frames, pipeline, render, sky, world
+from vbnfault.errors import InputError
+from vbnfault.photometry import hapke_at
+from vbnfault.pipeline import Frame, Session
+from vbnfault.render.detail import _LEVELS, _SIDE, _pyramid
+
+TRUTH = ["depth_m", "normal", "semantic", "point_T_m", "incidence_deg", "emission_deg", "phase_deg", "albedo"]
+
+
+def physical(**tables: dict[str, object]) -> dict[str, object]:
+    base = small_scene(
+        body={"photometry": {"model": "hapke", "dust_contrast": 0.16}},
+        dataset={"layers": ["clean", "without_straylight", *TRUTH]},
+        render={"samples_per_pixel": 16, "bounces": 1},
+        camera={"width_px": 96, "height_px": 96},
+        spacecraft={"model": "default"},
+    )
+    for name, table in tables.items():
+        base[name] = {**base.get(name, {}), **table}
+    return base
+
+
+def session(**tables: dict[str, object]) -> Session:
+    return Session(config.parse_scene(physical(**tables), source="test"))
+
+
+def rotation(quaternion: np.ndarray) -> np.ndarray:
+    """The matrix of a unit quaternion, w first."""
+    return Rotation.from_quat(np.roll(quaternion, -1)).as_matrix()
+
+
+@pytest.fixture(scope="module")
+def samples() -> tuple[Session, list[Frame]]:
+    s = session()
+    return s, [s.frame(i) for i in range(6)]
+
+
+def test_surface_points_reproject_onto_their_pixels(samples: tuple[Session, list[Frame]]) -> None:
+    """A surface point, carried through T and the stored pose, lands on its pixel's centre to 0.01 px."""
+    s, all_frames = samples
+    seen = 0
+    for frame in all_frames:
+        sample = pipeline.to_sample(frame)
+        points = sample.layers["point_T_m"].reshape(-1, 3)
+        body = sample.layers["semantic"].ravel() == pipeline.BODY
+        seen += body.sum()
+        C_from_T = rotation(sample.scalars["camera_from_T"])
+        in_C = (points[body] - sample.scalars["camera_position_T_m"]) @ C_from_T.T
+        fx, fy, cx, cy = sample.scalars["intrinsics"]
+        xy = np.column_stack([in_C[:, 0] / in_C[:, 2] * fx + cx, in_C[:, 1] / in_C[:, 2] * fy + cy])
+        rows, columns = np.divmod(np.flatnonzero(body), s.scene.camera.width_px)
+        np.testing.assert_allclose(xy, np.column_stack([columns, rows]) + 0.5, atol=0.01)
+        # and the renderer finds the ground there: the same point by a ray of its own, from the stored pose
+        assert np.isnan(points[sample.layers["semantic"].ravel() == pipeline.SKY]).all()
+    assert seen > 5000
+
+
+def test_truth_angles_are_those_of_the_points(samples: tuple[Session, list[Frame]]) -> None:
+    _, all_frames = samples
+    for frame in all_frames:
+        sample = pipeline.to_sample(frame)
+        on = sample.layers["semantic"] == pipeline.BODY
+        if not on.any():
+            continue
+        C_from_T = rotation(sample.scalars["camera_from_T"])
+        sun_C = C_from_T @ sample.scalars["sun_direction_T"]
+        towards = -((sample.layers["point_T_m"][on] - sample.scalars["camera_position_T_m"]) @ C_from_T.T)
+        towards /= np.linalg.norm(towards, axis=1)[:, None]
+        normal = sample.layers["normal"][on].astype(float)
+        normal /= np.linalg.norm(normal, axis=1)[:, None]
+        for name, a, b in (
+            ("incidence_deg", normal, sun_C[None]),
+            ("emission_deg", normal, towards),
+            ("phase_deg", towards, sun_C[None]),
+        ):
+            expected = np.degrees(np.arctan2(np.linalg.norm(np.cross(a, b), axis=1), (a * b).sum(axis=1)))
+            # normals are stored with half precision: 5e-4 of a radian in each of three entries
+            atol = 1e-3 if name == "phase_deg" else 0.1
+            np.testing.assert_allclose(sample.layers[name][on], expected, atol=atol)
+        albedo = sample.layers["albedo"][on]
+        bare = world.normal_albedo(frame.spec.scene, np.zeros(1, np.float32))[0]
+        assert albedo.min() >= bare * (1 - 1e-5)
+        assert albedo.max() <= bare * 1.16 * (1 + 1e-5)
+
+
+def test_spacecraft_is_in_its_own_pictures(samples: tuple[Session, list[Frame]]) -> None:
+    s, all_frames = samples
+    assert s.vehicle is not None
+    height, width = all_frames[0].context.shape
+    camera = s.base_camera
+    x = (np.arange(width) + 0.5 - width / 2) / camera.focal_length_px
+    y = (np.arange(height) + 0.5 - height / 2) / camera.focal_length_px
+    rays = np.stack([*np.meshgrid(x, y), np.ones((height, width))], axis=-1).reshape(-1, 3)
+    blocked = s.vehicle.blocked(rays / np.linalg.norm(rays, axis=1)[:, None]).reshape(height, width)
+    assert blocked.any()
+    for frame in all_frames:
+        np.testing.assert_array_equal(frame.truth.semantic == 3, blocked & (frame.truth.semantic == 3))
+        # ground may lie before a footpad, nothing else may hide one
+        hidden = blocked & (frame.truth.semantic != 3)
+        assert (frame.truth.semantic[hidden] == pipeline.BODY).all()
+
+
+def test_spacecraft_casts_its_shadow() -> None:
+    plate = np.array([[-1, -1, -5], [1, -1, -5], [1, 1, -5], [-1, 1, -5]], np.float32)  # 5 m behind the camera
+    faces = np.array([[0, 1, 2], [0, 2, 3]], np.int32)
+    vehicle = render.Vehicle(plate, faces, np.zeros(2, np.int32), np.full((1, len(NODES)), 0.5))
+    vertices, ground = plane()
+    surface = render.Surface(vertices, ground, np.ones(2, bool), vehicle=vehicle)
+    # looking straight down from 10 m with the Sun at the zenith: the plate's shadow is its own size, 2 m
+    a_view, light = view(10 * UP, -UP, width=128, fov_deg=40.0), sun(UP, 2.0)
+    image = render.radiance(surface, scene(a_view, light, 0.06)).array[4]
+    dark = image < 0.5 * image.max()
+    side_px = 2.0 * a_view.intrinsics[0] / 10
+    # half light lies on the geometric edge; a pixel's width of it may fall either way
+    assert np.sqrt(dark.sum()) == pytest.approx(side_px, abs=1.0)
+    rows, columns = np.nonzero(dark)
+    assert rows.mean() + 0.5 == pytest.approx(64, abs=0.5)
+    assert columns.mean() + 0.5 == pytest.approx(64, abs=0.5)
+
+
+def test_stars_fall_where_the_catalogue_says() -> None:
+    table = physical(
+        sky={"stars": "on", "limiting_magnitude": 3.0, "sigma_px": 0.7},
+        camera={"exposure_s": 2.0, "fov_deg": 60.0, "width_px": 256, "height_px": 256},
+        spacecraft={"model": "none"},
+        plan={"faulty_fraction": 0.0},
+    )
+    s = Session(config.parse_scene(table, source="test"))
+    checked = 0
+    for i in range(8):
+        frame = s.frame(i)
+        sample = pipeline.to_sample(frame)
+        J_from_C = sample.scalars["T_from_J"].T @ rotation(sample.scalars["camera_from_T"]).T
+        bright = sky.load_catalogue().brighter_than(2.0)
+        in_C = bright.direction_J(s.scene.sun.julian_date) @ J_from_C
+        for direction in in_C[in_C[:, 2] > 0.3]:
+            xy = frame.camera.project(direction)
+            assert xy is not None
+            column, row = np.floor(xy).astype(int)
+            if not (4 <= column < 252 and 4 <= row < 252):
+                continue
+            window = np.s_[row - 3 : row + 4, column - 3 : column + 4]
+            if (frame.truth.semantic[window] != pipeline.SKY).any():
+                continue
+            light = frame.radiance.array[4][window].astype(float)
+            y, x = np.mgrid[-3:4, -3:4] + 0.5
+            centroid = np.array([(light * x).sum(), (light * y).sum()]) / light.sum() + [column, row]
+            np.testing.assert_allclose(centroid, xy, atol=0.05)  # other stars of V < 3 may shine into the window
+            checked += 1
+    assert checked >= 3
+
+
+def test_noise_of_sampling_stays_below_the_sensors() -> None:
+    """Error against a converged render, not the estimate: below the fraction in 99 % of the lit pixels."""
+    table = physical(
+        render={"samples_per_pixel": 16, "bounces": 0, "noise_fraction": 0.3, "max_samples_per_pixel": 1024},
+        spacecraft={"model": "none"},
+        dataset={"layers": ["clean", "without_straylight"]},
+    )
+    s = Session(config.parse_scene(table, source="test"))
+    judged = 0
+    for i in range(10):
+        frame = Frame(spec=s.spec(i))
+        for stage in (pipeline.resolve, pipeline.render_frame, pipeline.meter):
+            stage(frame)
+        described = dataclasses.replace(pipeline.describe(frame), samples_per_pixel=4096, key=99)
+        converged, _ = render.direct(frame.spec.terrain.surface, described)
+        to_e = frame.camera.exposure_s * pipeline._green_per_second(frame)
+        signal, error = (np.einsum("b,byx->yx", to_e, a) for a in (converged.array, frame.radiance.array))
+        detector = frame.camera.detector
+        sensor = np.sqrt(
+            signal + detector.read_noise_e_rms**2 + detector.dark_current_e_s * frame.camera.exposure_s
+        )
+        lit = (signal > 0.01 * detector.full_well_e) & (signal < 0.9 * detector.full_well_e)
+        if lit.sum() < 500:
+            continue
+        judged += 1
+        share = np.abs(error - signal)[lit] / sensor[lit]
+        # the fraction is a standard deviation: two thirds of the errors lie within it, so ask that those of the
+        # 99 % whose deviation is allowed to reach it exceed three of it in no more than another 1 %
+        assert np.mean(share > 3 * 0.3) < 0.02
+        assert frame.samples_per_pixel > 16
+    assert judged >= 3
+
+
+def test_listed_pixels_are_the_frames_own() -> None:
+    surface = join(plane())
+    a_scene = scene(view(10 * UP, -UP), sun(frames.direction_L(30, 20)), hapke_at(NODES))
+    whole, halves = render.direct(surface, a_scene, np.ones(len(NODES)))
+    chosen = np.array([5, 64, 1000, 4095], dtype=np.uint32)
+    some, some_halves = render.direct(surface, a_scene, np.ones(len(NODES)), chosen)
+    np.testing.assert_array_equal(some.array[:, 0], whole.array.reshape(len(NODES), -1)[:, chosen])
+    np.testing.assert_array_equal(some_halves[0], halves.ravel()[chosen])
+
+
+def test_finest_relief_has_its_slopes_and_fades_into_the_pixel() -> None:
+    table, starts = (np.array(a) for a in _pyramid())
+    rms = []
+    for level in range(_LEVELS):
+        side = _SIDE >> level
+        block = table[2 * starts[level] : 2 * (starts[level] + side * side)]
+        rms.append(np.sqrt(np.mean(block**2)))
+    octaves = np.log2(_SIDE / 2 / (2.03 / 0.3))
+    assert rms[0] == pytest.approx(np.sqrt(octaves), rel=1e-6)  # unit variance an octave, both axes
+    assert (np.diff(rms) < 0).all()
+    assert rms[-1] < 0.2 * rms[0]
+
+    vertices, faces = plane()
+    light = sun(frames.direction_L(0, 30), 2.0)
+    spread = []
+    for height in (2.0, 400.0):
+        a_view = view(height * UP, -UP, width=64, fov_deg=30.0)
+        rough = render.Surface(vertices, faces, np.ones(2, bool), detail_slope=0.08)
+        image = render.radiance(rough, scene(a_view, light, 0.06)).array[4]
+        flat = render.radiance(join(plane()), scene(a_view, light, 0.06)).array[4]
+        # slopes to all sides cancel in the mean, up to the curvature of the cosine: tilt² / 2, 3 %
+        assert image.mean() == pytest.approx(flat.mean(), rel=0.05)
+        spread.append(image.std() / image.mean())
+    assert spread[0] > 0.1
+    assert spread[1] < 0.05
+
+
+@pytest.mark.parametrize(
+    ("tables", "words"),
+    [
+        (
+            {"spacecraft": {"model": "default", "pose": {"wing": {"angle_deg": 3}}}},
+            ["spacecraft.pose.wing", "joint"],
+        ),
+        ({"spacecraft": {"model": "no/such.glb"}}, ["no/such.glb"]),
+        ({"spice": {"kernels": ["no_such.tm"]}}, ["no_such.tm"]),
+    ],
+)
+def test_bad_worlds_are_told_in_a_sentence(tables: dict[str, dict[str, object]], words: list[str]) -> None:
+    scene_ = config.parse_scene(physical(**tables), source="test")
+
+    def whole() -> None:
+        world.spacecraft(scene_)
+        world.ephemeris(scene_)
+
+    with pytest.raises(InputError) as told:
+        whole()
+    assert all(word in str(told.value) for word in words)
+    assert "\n" not in str(told.value)
