@@ -72,6 +72,7 @@ class Cycles:
         sun_direction_L: np.ndarray,
         sun_angular_radius_rad: float,
         threads: int,
+        bounces: int = 0,
     ) -> None:
         self._folder = tempfile.TemporaryDirectory()
         folder = Path(self._folder.name)
@@ -86,6 +87,7 @@ class Cycles:
             "sun": sun_direction_L.tolist(),
             "sun_angle_rad": 2 * sun_angular_radius_rad,
             "threads": threads,
+            "bounces": bounces,
         }
         (folder / "scene.json").write_text(json.dumps(numbers))
         with (folder / "stderr.txt").open("w") as stderr:
@@ -198,7 +200,8 @@ def _set_up(folder: Path) -> Any:
     cycles.device = "CPU"
     cycles.samples = numbers["samples"]
     cycles.use_adaptive_sampling = cycles.use_denoising = False
-    cycles.max_bounces = cycles.diffuse_bounces = cycles.glossy_bounces = cycles.transmission_bounces = 0
+    cycles.max_bounces = cycles.diffuse_bounces = numbers["bounces"]
+    cycles.glossy_bounces = cycles.transmission_bounces = 0
     cycles.volume_bounces = cycles.transparent_max_bounces = 0
     cycles.pixel_filter_type = "BOX"
     cycles.use_light_tree = False  # one lamp

@@ -40,9 +40,26 @@ def targets(seconds: Mapping[str, float]) -> list[Target]:
         ),
         Target(what="all that follows, over the render", ratio=after / seconds["render"], limit=0.25, least=False),
     ]
+    found += [
+        Target(
+            what="the same with Hapke's photometry",
+            ratio=seconds["bound"] / seconds["hapke"],
+            limit=0.7,
+            least=True,
+        ),
+        Target(
+            what="light between surfaces, over Hapke's render",
+            ratio=seconds["bounce"] / seconds["hapke"] - 1,
+            limit=0.6,
+            least=False,
+        ),
+    ]
     if "cycles" in seconds:
         ratio = seconds["cycles"] / sample_seconds(seconds)
         found.append(Target(what="Cycles' render over our labelled sample", ratio=ratio, limit=4, least=True))
+    if "cycles_bounce" in seconds:
+        ratio = seconds["cycles_bounce"] / seconds["bounce"]
+        found.append(Target(what="Cycles' one bounce over ours", ratio=ratio, limit=4, least=True))
     return found
 
 
@@ -58,13 +75,22 @@ def table(seconds: Mapping[str, float]) -> str:
         "label": "label: masks",
         "to_sample": "to_sample",
         "store": "store: encode and write, per sample of a shard",
-        "cycles": "Blender Cycles, render call alone",
     }
-    lines = [f"{text:<52}{seconds[n] * 1e3:9.1f} ms" for n, text in names.items() if n in seconds]
-    lines.insert(
-        -1 if "cycles" in seconds else len(lines),
+    others = {
+        "hapke": "render with Hapke's photometry",
+        "bounce": "render with Hapke's photometry and one bounce",
+        "cycles": "Blender Cycles, render call alone",
+        "cycles_bounce": "Blender Cycles with one bounce",
+    }
+
+    def lines_of(of: Mapping[str, str]) -> list[str]:
+        return [f"{text:<52}{seconds[n] * 1e3:9.1f} ms" for n, text in of.items() if n in seconds]
+
+    lines = [
+        *lines_of(names),
         f"{'= labelled sample':<52}{sample_seconds(seconds) * 1e3:9.1f} ms",
-    )
+        *lines_of(others),
+    ]
     lines.append("")
     for t in targets(seconds):
         wanted = f"{'at least' if t.least else 'at most'} {t.limit:g}"

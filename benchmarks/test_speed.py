@@ -57,8 +57,14 @@ def test_labelled_sample(
     assert folder.finished() == folder.samples
 
 
+@pytest.mark.parametrize("bounces", [0, 1])
 def test_cycles(
-    benchmark: Any, workload: Workload, results: dict[str, float], rounds: int, request: pytest.FixtureRequest
+    benchmark: Any,
+    workload: Workload,
+    results: dict[str, float],
+    rounds: int,
+    bounces: int,
+    request: pytest.FixtureRequest,
 ) -> None:
     try:
         python = interpreter()
@@ -78,14 +84,16 @@ def test_cycles(
         sun_direction_L=scene.sun.direction_L,
         sun_angular_radius_rad=scene.sun.angular_radius_rad,
         threads=os.cpu_count() or 1,
+        bounces=bounces,
     ) as blender:
         taken: list[dict[str, float]] = []
+        name = "cycles_bounce" if bounces else "cycles"
         # the warm-up builds the BVH; later renders reuse it, as ours do
-        benchmark.pedantic(lambda: taken.append({"cycles": blender.render()}), rounds=rounds, warmup_rounds=1)
+        benchmark.pedantic(lambda: taken.append({name: blender.render()}), rounds=rounds, warmup_rounds=1)
         theirs = blender.picture()
     results |= medians(taken[1:] or taken)
     ours = workload.grey()
-    if path := request.config.getoption("--picture"):
+    if (path := request.config.getoption("--picture")) and not bounces:
         _write_pair(path, ours, theirs)
     assert np.corrcoef(ours.ravel(), theirs.ravel())[0, 1] > 0.9
 

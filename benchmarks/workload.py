@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from vbnfault import config, dataset, frames, pipeline, render, store, world
+from vbnfault import config, dataset, frames, photometry, pipeline, render, store, world
 from vbnfault.body import Patch
 from vbnfault.pipeline import Frame, Pose, SampleSpec
 from vbnfault.quantities import Sample
@@ -114,6 +114,11 @@ class Workload:
         seconds["truth"], frame.truth = clock(lambda: render.truth(surface, scene.view, scene.sun))
         for stage in (pipeline.meter, pipeline.photograph, pipeline.label):
             seconds[stage.__name__], _ = clock(lambda stage=stage: stage(frame))
+        # the same view as the physical scenes have it; not part of the sample
+        physical = replace(scene, photometry=photometry.hapke_at(scene.wavelength_nm))
+        seconds["hapke"], _ = clock(lambda: render.radiance(surface, physical))
+        lit = replace(physical, bounces=1)
+        seconds["bounce"], _ = clock(lambda: render.radiance(surface, lit, frame.truth))
         seconds["to_sample"], sample = clock(lambda: pipeline.to_sample(frame))
         shard, _ = clock(lambda: write_shard(folder, sample))
         seconds["store"] = shard / SHARD_SAMPLES

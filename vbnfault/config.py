@@ -181,7 +181,7 @@ class PatchTable(Table):
     """Terrain around a site: how far and how fine the model is refined."""
 
     facet_m: float = Field(0.12, ge=0.05, le=1e6, description="edge length aimed at within radius_m of the site")
-    radius_m: float = Field(20.0, ge=1, le=1e8, description="beyond, facets grow with the distance")
+    radius_m: float = Field(40.0, ge=1, le=1e8, description="beyond, facets grow with the distance")
     max_triangles: int = Field(
         1_600_000, ge=10_000, le=20_000_000, description="facets are coarsened to keep to it"
     )
