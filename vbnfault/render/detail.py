@@ -37,36 +37,35 @@ class Detail:
     def turned(self, normal: Any, point: Any, view: Any, distance_m: Any, dust: Any, dither: Any) -> Any:
         """Unit normals turned by the slopes at points of L. `dither` in [0, 1) chooses between two neighbouring
         levels of the pyramid: over the samples of a pixel they mix."""
-        footprint = distance_m * self._pixel / dr.sqrt(dr.maximum(dr.abs(dr.dot(normal, view)), _GRAZING))
-        # the plane that the normal is nearest to
-        a = dr.abs(normal)
-        flat, steep_x = (a.z >= a.x) & (a.z >= a.y), a.x > a.y
-        zero, one = mi.Vector3f(0), mi.Float(1)
-        u_axis = dr.select(flat | ~steep_x, mi.Vector3f(one, 0, 0) + zero, mi.Vector3f(0, one, 0) + zero)
-        v_axis = dr.select(flat, mi.Vector3f(0, one, 0) + zero, mi.Vector3f(0, 0, one) + zero)
-        u, v = dr.dot(point, u_axis), dr.dot(point, v_axis)
-        su, sv = mi.Float(0), mi.Float(0)
-        for k, tile in enumerate(_TILES_M):
-            c, s = float(np.cos(k * _TURN)), float(np.sin(k * _TURN))
-            du, dv = self._slopes(
-                (c * u + s * v) / tile, (c * v - s * u) / tile, footprint * (_SIDE / tile), dither
-            )
-            su += c * du - s * dv
-            sv += s * du + c * dv
-        strength = self._slope * dr.lerp(1.0, _ON_DUST, dust)
-        return dr.normalize(normal - strength * (su * u_axis + sv * v_axis))
-
-    def _slopes(self, u: Any, v: Any, footprint_texels: Any, dither: Any) -> tuple[Any, Any]:
-        level = mi.Int32(dr.floor(dr.log2(dr.maximum(footprint_texels, 1.0)) + dither))
-        within = level < _LEVELS
+        footprint = distance_m * self._pixel * dr.rsqrt(dr.maximum(dr.abs(dr.dot(normal, view)), _GRAZING))
+        texels = dr.maximum(footprint * (_SIDE / _TILES_M[0]), 1.0)
+        level = mi.Int32(dr.floor(dr.log2(texels) + dither))
+        shown = level < _LEVELS
         level = dr.clip(level, 0, _LEVELS - 1)  # a ray that hits nothing may give any number
         side = mi.Int32(_SIDE) >> level
         start = dr.gather(mi.Int32, self._starts, level)
-        x = mi.Int32((u - dr.floor(u)) * mi.Float(side))
-        y = mi.Int32((v - dr.floor(v)) * mi.Float(side))
-        at = start + (y & (side - 1)) * side + (x & (side - 1))
-        pair = dr.gather(mi.Vector2f, self._pyramid, mi.UInt32(at), within)
-        return pair.x, pair.y
+        # the plane that the normal is nearest to: xy, yz or xz
+        a = dr.abs(normal)
+        level_ground, faces_x = (a.z >= a.x) & (a.z >= a.y), a.x > a.y
+        u = dr.select(level_ground | ~faces_x, point.x, point.y)
+        v = dr.select(level_ground, point.y, point.z)
+        su, sv = mi.Float(0), mi.Float(0)
+        for k, tile in enumerate(_TILES_M):
+            c, s = float(np.cos(k * _TURN)), float(np.sin(k * _TURN))
+            tu, tv = (c / tile) * u + (s / tile) * v, (c / tile) * v - (s / tile) * u
+            x = mi.Int32((tu - dr.floor(tu)) * mi.Float(side)) & (side - 1)
+            y = mi.Int32((tv - dr.floor(tv)) * mi.Float(side)) & (side - 1)
+            pair = dr.gather(mi.Vector2f, self._pyramid, mi.UInt32(start + y * side + x), shown)
+            su += c * pair.x - s * pair.y
+            sv += s * pair.x + c * pair.y
+        strength = self._slope * dr.lerp(1.0, _ON_DUST, dust)
+        su, sv = su * strength, sv * strength
+        off = mi.Vector3f(
+            dr.select(level_ground | ~faces_x, su, 0),
+            dr.select(level_ground, sv, dr.select(faces_x, su, 0)),
+            dr.select(level_ground, 0, sv),
+        )
+        return dr.normalize(normal - off)
 
 
 @lru_cache(maxsize=1)
