@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import signal
+import tempfile
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +19,10 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 REAL_SHAPE = Path(__file__).resolve().parents[2] / "shared/data/shapes/67p_18k.obj"
 
 ALL_FAULTS = FAULT_AXIS
+
+# Patches are cached for this run alone: the tests neither read nor fill the user's cache.
+_CACHE = tempfile.TemporaryDirectory(prefix="vbnfault-tests-")
+os.environ["VBNFAULT_CACHE_DIR"] = _CACHE.name
 
 
 @pytest.fixture(scope="session")

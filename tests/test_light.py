@@ -10,7 +10,7 @@ from test_photometry import SETS, by_angles, directions
 from test_render import NODES, UP, join, plane, sun, view
 
 from vbnfault import frames, render, spectra
-from vbnfault.photometry import Diffuse, Photometry, hapke_at
+from vbnfault.photometry import HAPKE_TABLES, Diffuse, Photometry, hapke_at
 from vbnfault.render.runtime import dr, mi
 from vbnfault.scene import Scene, Sunlight, View
 
@@ -130,6 +130,19 @@ def test_plugin(name: str) -> None:
     assert estimate.mean() == pytest.approx(expected, abs=4 * estimate.std() / np.sqrt(count))
     pdf = plugin.pdf(context, si, sample.wo).numpy()
     np.testing.assert_allclose(pdf, sample.pdf.numpy(), rtol=1e-6)
+
+
+def test_plugin_by_wavelength() -> None:
+    plugin = mi.load_dict({"type": "hapke", "parameters": "67p_fornasier2015"})
+    si = dr.zeros(mi.SurfaceInteraction3f, 1)
+    light, seen = directions(np.radians([[30.0, 40.0, 70.0]]))
+    si.wi = mi.Vector3f(*(float(c) for c in seen[0]))
+    si.wavelengths = type(si.wavelengths)(480.0, 592.0, 649.0, 1200.0)
+    got = np.array(plugin.eval(mi.BSDFContext(), si, mi.Vector3f(*(float(c) for c in light[0])))).ravel()
+    rows = {row[0]: row[1:] for row in HAPKE_TABLES["67p_fornasier2015"]}
+    of = {nm: by_angles(*np.radians([30.0, 40.0, 70.0]), rows[nm]) for nm in (480.0, 535.0, 649.0, 989.0)}
+    expected = [of[480.0], (of[535.0] + of[649.0]) / 2, of[649.0], of[989.0]]
+    np.testing.assert_allclose(got, expected, rtol=1e-4)
 
 
 def limb(distance_au: float = 1.0) -> Sunlight:

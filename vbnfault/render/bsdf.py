@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from ..photometry import Hapke
+from ..photometry import HAPKE_TABLES, Hapke, hapke_at
 from ..scene import Scene
 from .runtime import dr, mi
 from .surface import Surface
@@ -66,30 +66,37 @@ def _triple(v: Any) -> tuple[Any, Any, Any]:
 
 
 class HapkeBSDF(mi.BSDF):  # type: ignore[misc]
-    """Mitsuba plugin `hapke`, for scenes of one's own: `mi.load_dict({"type": "hapke", "w": 0.045, ...})`.
+    """Mitsuba plugin `hapke`, for scenes of one's own.
 
-    Numbers, the same at all wavelengths: `w`, `g`, `B0`, `h_s`, `B_C0` (default 0), `h_c` (1), `roughness_deg` (0),
-    `K` (1), as `photometry.Hapke`; directions are drawn by the cosine, which is unbiased for any of them.
-    One-sided: black from below.
+    `mi.load_dict({"type": "hapke", "parameters": "67p_fornasier2015"})` takes a set of `photometry.HAPKE_TABLES`:
+    the reflectance is that of the tabulated wavelengths, linear between them. Or numbers, the same at all
+    wavelengths: `w`, `g`, `B0`, `h_s`, `B_C0` (default 0), `h_c` (1), `roughness_deg` (0), `K` (1), as
+    `photometry.Hapke`. Directions are drawn by the cosine, which is unbiased for any of them. One-sided: black from
+    below. Raises RuntimeError, through Mitsuba, for a set that is not known or a number that is missing.
     """
 
     def __init__(self, props: Any) -> None:
         mi.BSDF.__init__(self, props)
 
         def one(key: str, default: float | None = None) -> np.ndarray:
-            value = props[key] if default is None else props.get(key, default)
-            return np.array([float(value)])
+            return np.array([float(props[key] if default is None else props.get(key, default))])
 
-        self._model = Hapke(
-            single_scattering_albedo=one("w"),
-            asymmetry=one("g"),
-            shadow_hiding_amplitude=one("B0"),
-            shadow_hiding_width=one("h_s"),
-            coherent_amplitude=one("B_C0", 0.0),
-            coherent_width=one("h_c", 1.0),
-            roughness_deg=one("roughness_deg", 0.0),
-            porosity_factor=one("K", 1.0),
-        )
+        if "parameters" in props:
+            rows = HAPKE_TABLES[props["parameters"]]
+            self._nodes_nm = np.array([row[0] for row in rows])
+            self._model = hapke_at(self._nodes_nm, rows)
+        else:
+            self._nodes_nm = np.zeros(1)
+            self._model = Hapke(
+                single_scattering_albedo=one("w"),
+                asymmetry=one("g"),
+                shadow_hiding_amplitude=one("B0"),
+                shadow_hiding_width=one("h_s"),
+                coherent_amplitude=one("B_C0", 0.0),
+                coherent_width=one("h_c", 1.0),
+                roughness_deg=one("roughness_deg", 0.0),
+                porosity_factor=one("K", 1.0),
+            )
         flags = mi.BSDFFlags.GlossyReflection | mi.BSDFFlags.FrontSide
         self.m_flags = flags
         self.m_components = [flags]
@@ -106,9 +113,13 @@ class HapkeBSDF(mi.BSDF):  # type: ignore[misc]
         return sample, dr.select(usable, value / dr.maximum(sample.pdf, 1e-20), 0) & active
 
     def eval(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
-        (value,) = self._model.evaluate(dr, _triple(wo), _triple(si.wi))
+        values = self._model.evaluate(dr, _triple(wo), _triple(si.wi))
+        value = mi.Spectrum(values[0])
+        for k in range(1, len(values)):  # piecewise linear: each node's step away from the one before
+            low, high = self._nodes_nm[k - 1 : k + 1]
+            value += dr.clip((si.wavelengths - low) / (high - low), 0, 1) * (values[k] - values[k - 1])
         seen = (si.wi.z > 0) & (wo.z > 0) & active
-        return mi.Spectrum(dr.select(seen, value, 0))
+        return dr.select(seen, value, 0)
 
     def pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
         seen = (si.wi.z > 0) & (wo.z > 0) & active
