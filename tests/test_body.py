@@ -18,7 +18,7 @@ from vbnfault.body import (
     load_shape,
     local_level,
 )
-from vbnfault.body.noise import block_noise, gradient_noise
+from vbnfault.body.noise import gradient_noise
 from vbnfault.body.shape import face_normals_areas, signed_volume
 from vbnfault.errors import InputError
 
@@ -216,9 +216,6 @@ def test_noise_is_a_function_of_place() -> None:
     # Continuous: slopes of unit gradients stay below 4 per unit.
     near = gradient_noise(points + np.array([1e-3, 0, 0]), 5)
     assert np.abs(near - value).max() < 4e-3
-    level, neighbour, gap = block_noise(points, 5)
-    assert (gap >= 0).all()
-    assert np.abs(np.corrcoef(level, neighbour)[0, 1]) < 0.5
 
 
 # --- body and sites -----------------------------------------------------------------------------------------

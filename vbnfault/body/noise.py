@@ -93,60 +93,6 @@ def gradient_noise(points: NDArray, seed: int) -> Float32:
     return _by_chunks(_gradient_kernel, points, seed, 1)[:, 0]
 
 
-def _block_kernel(points: NDArray, word: UInt32) -> Float32:
-    base = np.floor(points - 0.5)
-    f = (points - base).astype(np.float32)
-    axes = _axis_hashes(base.astype(np.int64))
-    n = len(points)
-    nearest = np.full(n, 9.0, dtype=np.float32)
-    second = nearest.copy()
-    plane = np.zeros(n, dtype=np.float32)
-    other = plane.copy()
-    unit = np.float32(1.0 / 1024.0)
-    for i in (0, 1):
-        for j in (0, 1):
-            hxy = axes[0][i] ^ axes[1][j] ^ word
-            for k in (0, 1):
-                h = _mix(hxy ^ axes[2][k])
-                # Jitter of ±0.35 about the cell's centre: the nearest point is then nearly always among the
-                # eight cells looked at, and a miss only moves a fracture.
-                jx, jy, jz = (
-                    ((h >> np.uint32(s)) & np.uint32(1023)).astype(np.float32) * unit for s in (0, 10, 20)
-                )
-                dx = f[:, 0] - (np.float32(i + 0.15) + np.float32(0.7) * jx)
-                dy = f[:, 1] - (np.float32(j + 0.15) + np.float32(0.7) * jy)
-                dz = f[:, 2] - (np.float32(k + 0.15) + np.float32(0.7) * jz)
-                d = np.sqrt(dx * dx + dy * dy + dz * dz)
-                g = _GRADIENTS[_mix(h + np.uint32(0x9E3779B9)) & np.uint32(255)]
-                closer = d < nearest
-                beaten = d < second
-                level = (h >> np.uint32(24)).astype(np.float32) / np.float32(255) - np.float32(0.5)
-                tilt = g[:, 0] * dx + g[:, 1] * dy + g[:, 2] * dz + level
-                other = np.where(closer, plane, np.where(beaten, tilt, other))
-                second = np.where(closer, nearest, np.where(beaten, d, second))
-                plane = np.where(closer, tilt, plane)
-                nearest = np.where(closer, d, nearest)
-    return np.column_stack([plane, other, second - nearest])
-
-
-def block_noise(points: NDArray, seed: int) -> tuple[Float32, Float32, Float32]:
-    """Broken ground: space cut into cells about one unit wide, each with its own level and tilt.
-
-    Parameters
-    ----------
-    points, seed
-        As for `gradient_noise`.
-
-    Returns
-    -------
-    level, neighbour, gap
-        float32[n] each: the cell's plane, standard deviation about 0.4; the next nearest cell's plane; and
-        how much farther that cell's centre is, in units (0 on the border), for whoever blends the two there.
-    """
-    columns = _by_chunks(_block_kernel, points, seed, 3)
-    return columns[:, 0], columns[:, 1], columns[:, 2]
-
-
 def fractal_noise(points_m: NDArray, seed: int, wavelengths_m: NDArray, amplitudes_m: NDArray) -> Float32:
     """Sum of gradient-noise octaves, float32[n] in the unit of the amplitudes."""
     total = np.zeros(len(points_m), dtype=np.float32)

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from ..scene import View
 from .detail import Detail
+from .mesh import mesh_scene
 from .runtime import dr, mi
 from .vehicle import Vehicle, World
 
@@ -37,12 +38,7 @@ class Surface:
         vehicle: Vehicle | None = None,
         detail_slope: float = 0.0,
     ) -> None:
-        mesh = mi.Mesh("terrain", len(vertices_m), len(faces))
-        parameters = mi.traverse(mesh)
-        parameters["vertex_positions"] = mi.Float(np.ascontiguousarray(vertices_m, np.float32).ravel())
-        parameters["faces"] = mi.UInt32(np.ascontiguousarray(faces, np.uint32).ravel())
-        parameters.update()
-        self.scene = mi.load_dict({"type": "scene", "terrain": mesh})
+        self.scene = mesh_scene("terrain", vertices_m, faces)
         self._corners = mi.Float(_corner_records(vertices_m, faces, flat).ravel())
         self._dust = mi.Float(0.0 if dust is None else np.ascontiguousarray(_with_a_fourth(dust[faces])).ravel())
         dr.eval(self._corners, self._dust)

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from ..scene import View
 from .detail import Detail
+from .mesh import mesh_scene
 from .runtime import dr, mi
 from .sampling import opaque_vector
 
@@ -34,12 +35,7 @@ class Vehicle:
         face_material: NDArray[np.int32],
         reflectance: NDArray[np.float64],
     ) -> None:
-        mesh = mi.Mesh("vehicle", len(vertices_m), len(faces))
-        parameters = mi.traverse(mesh)
-        parameters["vertex_positions"] = mi.Float(np.ascontiguousarray(vertices_m, np.float32).ravel())
-        parameters["faces"] = mi.UInt32(np.ascontiguousarray(faces, np.uint32).ravel())
-        parameters.update()
-        self.scene = mi.load_dict({"type": "scene", "vehicle": mesh})
+        self.scene = mesh_scene("vehicle", vertices_m, faces)
         a, b, c = (vertices_m[faces[:, k]].astype(np.float64) for k in range(3))
         normal = np.cross(b - a, c - a)
         normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)

@@ -1,0 +1,20 @@
+"""Triangles as a scene of their own that rays can be traced through."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .runtime import mi
+
+
+def mesh_scene(name: str, vertices_m: NDArray[np.float32], faces: NDArray[np.int32]) -> Any:
+    """A Mitsuba scene of one triangle mesh: `vertices_m` float32[n, 3], `faces` int32[m, 3]."""
+    mesh = mi.Mesh(name, len(vertices_m), len(faces))
+    parameters = mi.traverse(mesh)
+    parameters["vertex_positions"] = mi.Float(np.ascontiguousarray(vertices_m, np.float32).ravel())
+    parameters["faces"] = mi.UInt32(np.ascontiguousarray(faces, np.uint32).ravel())
+    parameters.update()
+    return mi.load_dict({"type": "scene", name: mesh})
