@@ -25,6 +25,36 @@ AZIMUTHS_DEG = (0.0, 0.05, 1.0, 30.0, 90.0, 135.0, 179.0, 179.95, 180.0)
 GRID = np.radians(list(itertools.product(ANGLES_DEG, ANGLES_DEG, AZIMUTHS_DEG)))
 
 
+# w, g, B0, h_s, roughness, incidence, emission, azimuth (deg), BRDF · cos i: the `hapke` BSDF of eradiate-mitsuba
+# 0.5.0 in scalar_mono_double, whose c = 1 (0) is g < 0 (> 0), b = |g|
+ERADIATE = (
+    (0.045, -0.41, 1.97, 0.026, 15, 10, 10, 90, 8.8373001763e-03),
+    (0.045, -0.41, 1.97, 0.026, 15, 10, 45, 135, 3.5463750565e-03),
+    (0.045, -0.41, 1.97, 0.026, 15, 45, 1, 90, 3.0943605197e-03),
+    (0.045, -0.41, 1.97, 0.026, 15, 45, 45, 30, 7.2712753413e-03),
+    (0.045, -0.41, 1.97, 0.026, 15, 60, 1, 179, 1.5915808505e-03),
+    (0.045, -0.41, 1.97, 0.026, 15, 75, 85, 135, 3.4498030809e-04),
+    (0.045, -0.41, 1.97, 0.026, 15, 85, 45, 135, 1.4255673282e-04),
+    (0.045, -0.41, 1.97, 0.026, 15, 85, 60, 1, 1.5778182192e-03),
+    (0.045, -0.41, 1.97, 0.026, 15, 89.5, 60, 0.05, 1.4658659410e-04),
+    (0.9, 0.3, 1, 0.05, 0, 1, 60, 90, 1.1627722799e-01),
+    (0.9, 0.3, 1, 0.05, 0, 30, 89.5, 0.05, 9.9795074144e-02),
+    (0.9, 0.3, 1, 0.05, 0, 75, 1, 135, 3.1918397834e-02),
+    (0.9, 0.3, 1, 0.05, 0, 85, 60, 135, 2.3531351366e-02),
+    (0.9, 0.3, 1, 0.05, 0, 88, 30, 30, 4.1896333710e-03),
+    (0.9, 0.3, 1, 0.05, 0, 89.5, 10, 90, 1.0714726069e-03),
+    (0.034, -0.42, 2.25, 0.061, 28, 1, 75, 30, 1.7702939262e-03),
+    (0.034, -0.42, 2.25, 0.061, 28, 30, 88, 30, 2.6247777501e-03),
+    (0.034, -0.42, 2.25, 0.061, 28, 60, 30, 30, 2.8861455502e-03),
+    (0.034, -0.42, 2.25, 0.061, 28, 85, 88, 30, 1.8135479766e-03),
+    (0.034, -0.42, 2.25, 0.061, 28, 89.5, 45, 30, 4.2367031959e-05),
+    (0.95, -0.1, 0.6, 0.1, 40, 10, 75, 90, 1.1654046618e-01),
+    (0.95, -0.1, 0.6, 0.1, 40, 10, 89.5, 1, 1.2946221814e-01),
+    (0.95, -0.1, 0.6, 0.1, 40, 60, 1, 90, 6.0466733980e-02),
+    (0.95, -0.1, 0.6, 0.1, 40, 60, 89.5, 90, 5.3919639885e-02),
+)
+
+
 def by_angles(i: float, e: float, psi: float, parameters: tuple[float, ...]) -> float:
     """r of Hapke (1984, 2002, 2012) from incidence, emission and azimuth in radians, one number at a time."""
     w, g, b0, hs, bc0, hc, theta_deg, k = parameters
@@ -89,6 +119,13 @@ def test_hapke_in_float64(name: str) -> None:
     got = radiance_factor(model(SETS[name]), *directions(GRID))[0] / np.pi
     # the azimuth comes from vectors: at ψ = π its sine keeps 1e-16 of 1, its half-angle tangent is cut at 3e7
     np.testing.assert_allclose(got, expected, rtol=1e-7)
+
+
+def test_hapke_against_eradiate() -> None:
+    for w, g, b0, hs, theta, i, e, psi, expected in ERADIATE:
+        ground = model((w, g, b0, hs, 0.0, 1.0, theta, 1.0))
+        got = radiance_factor(ground, *directions(np.radians([[i, e, psi]])))[0, 0] / np.pi
+        assert got == pytest.approx(expected, rel=1e-8)  # printed with ten digits, angles with six
 
 
 @pytest.mark.parametrize("name", SETS)
