@@ -176,7 +176,7 @@ def test_noise_of_sampling_stays_below_the_sensors() -> None:
         frame = Frame(spec=s.spec(i))
         for stage in (pipeline.resolve, pipeline.render_frame, pipeline.meter):
             stage(frame)
-        described = dataclasses.replace(pipeline.describe(frame), samples_per_pixel=4096, key=99)
+        described = dataclasses.replace(pipeline.describe(frame), samples_per_pixel=1024, key=99)
         converged, _ = render.direct(frame.spec.terrain.surface, described)
         to_e = frame.camera.exposure_s * pipeline._green_per_second(frame)
         signal, error = (np.einsum("b,byx->yx", to_e, a) for a in (converged.array, frame.radiance.array))
@@ -188,6 +188,8 @@ def test_noise_of_sampling_stays_below_the_sensors() -> None:
         if lit.sum() < 500:
             continue
         judged += 1
+        if judged > 3:
+            break
         share = np.abs(error - signal)[lit] / sensor[lit]
         # the fraction is a standard deviation: two thirds of the errors lie within it, so ask that those of the
         # 99 % whose deviation is allowed to reach it exceed three of it in no more than another 1 %

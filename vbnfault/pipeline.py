@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 
 from . import config, frames, labels, photometry, plan, world
 from .body import Body, Patch, Site, cached_patch, choose_sites
-from .body.roughness import model_roughness
 from .camera import Camera
 from .config import SceneConfig
 from .detector import Noise
@@ -790,7 +789,7 @@ class Session:
         # slopes of an octave of wavelength λ are 0.44 times the deviation over λ/4 a length of λ/4, for a
         # self-affine surface of Hurst exponent 0.85: the ratio of the integrals of its spectrum
         length = 0.075
-        steep = float(model_roughness(self.body).deviation_at(length)) / length
+        steep = float(self.body.roughness.deviation_at(length)) / length
         return min(0.44 * steep, _STEEPEST_DETAIL) * self.scene.patch.relief
 
     def _patch(self, site: Site) -> Patch:

@@ -15,6 +15,7 @@ from vbnfault.body.cache import cached_patch
 from vbnfault.body.gravity import PolyhedronGravity
 from vbnfault.body.nucleus import embedded_nucleus
 from vbnfault.body.patch import Patch, build_patch
+from vbnfault.body.roughness import Roughness, model_roughness
 from vbnfault.body.shape import Float64, Int32, Unit, check_mesh, load_shape, signed_volume
 from vbnfault.body.sites import Site, choose_sites, local_level, site_at
 from vbnfault.errors import InputError
@@ -84,6 +85,11 @@ class Body:
     @cached_property
     def gravity(self) -> PolyhedronGravity:
         return PolyhedronGravity(self.vertices_m, self.faces, self.density_kg_m3)
+
+    @cached_property
+    def roughness(self) -> Roughness:
+        """The law that continues the shape's own roughness below its facets."""
+        return model_roughness(self)
 
     @property
     def omega_rad_s(self) -> float:

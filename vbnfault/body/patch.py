@@ -23,7 +23,7 @@ from vbnfault.body import boulders as rocks
 from vbnfault.body.noise import Float32
 from vbnfault.body.refine import EdgeLimit, affordable, refine
 from vbnfault.body.relief import LONGEST_EDGES, add_relief
-from vbnfault.body.roughness import Roughness, mean_edge_m, model_roughness
+from vbnfault.body.roughness import Roughness, mean_edge_m
 from vbnfault.body.shape import Int32, vertex_normals
 from vbnfault.body.sites import Site
 from vbnfault.errors import InputError
@@ -196,4 +196,4 @@ def build_patch(
 @lru_cache(maxsize=4)
 def _roughness(body: Body) -> tuple[Roughness, float]:
     """The model's law and mean edge: once a body, not once a site."""
-    return model_roughness(body), mean_edge_m(body.vertices_m, body.faces)
+    return body.roughness, mean_edge_m(body.vertices_m, body.faces)
