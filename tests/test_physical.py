@@ -63,7 +63,6 @@ def test_surface_points_reproject_onto_their_pixels(samples: tuple[Session, list
         xy = np.column_stack([in_C[:, 0] / in_C[:, 2] * fx + cx, in_C[:, 1] / in_C[:, 2] * fy + cy])
         rows, columns = np.divmod(np.flatnonzero(body), s.scene.camera.width_px)
         np.testing.assert_allclose(xy, np.column_stack([columns, rows]) + 0.5, atol=0.01)
-        # and the renderer finds the ground there: the same point by a ray of its own, from the stored pose
         assert np.isnan(points[sample.layers["semantic"].ravel() == pipeline.SKY]).all()
     assert seen > 5000
 

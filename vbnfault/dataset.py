@@ -113,7 +113,7 @@ def planned(attributes: Mapping[str, Any], faults: Sequence[str]) -> Callable[[i
     commanded faults as `injected`."""
     stored = {key: value for key, value in attributes["scene"].items() if key != "textures_sha256"}
     stored["body"] = {key: value for key, value in stored["body"].items() if key != "shape_sha256"}
-    stored["sky"] = {key: value for key, value in stored["sky"].items() if key != "catalogue"}
+    stored["sky"] = {key: value for key, value in stored.get("sky", {}).items() if key != "catalogue"}
     stored["dataset"] = {**stored["dataset"], "samples": attributes["blocks"][0]}
     scene = config.parse_scene(stored, source="the store's own scene")
     table = plan.make_plan(scene, faults, attributes["blocks"])

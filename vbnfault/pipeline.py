@@ -25,7 +25,7 @@ from .config import SceneConfig
 from .detector import Noise
 from .errors import InputError
 from .faults import Fault, FaultContext, Params, dataset_order, from_dict, physical_order
-from .quantities import RGBI, Electrons, Radiance, Sample, Truth
+from .quantities import BODY, RGBI, SKY, Electrons, Radiance, Sample, Truth
 from .scene import Scene, Sunlight, View
 from .spacecraft import SpacecraftMesh
 
@@ -48,8 +48,6 @@ _LIT = 0.01
 _FEW = 0.01
 # Slope an octave of the finest relief: steeper would be a wall of needles.
 _STEEPEST_DETAIL = 0.12
-# Values of the semantic layer.
-SKY, BODY = 0, 1
 _ANGLE_LAYERS = {"incidence_deg", "emission_deg", "phase_deg", "albedo"}
 
 

@@ -89,6 +89,10 @@ class RGBI(Quantity):
     dtype = np.uint8
 
 
+# Values of `Truth.semantic`.
+SKY, BODY, SUN, SPACECRAFT = 0, 1, 2, 3
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Truth:
     """Noise-free truth of the pixel centres.

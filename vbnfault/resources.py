@@ -1,12 +1,30 @@
-"""Where the packaged scenes and textures lie: in the wheel, or beside the package in a checkout."""
+"""Where the packaged scenes and textures lie, and the first look at a file that a user names."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 from .errors import InputError
 
 _PACKAGE = Path(__file__).resolve().parent
+
+
+def input_file(path: Path, what: str, types: Sequence[str]) -> str:
+    """Suffix, in lower case, of a user's file of one of `types`; `what` names it in errors.
+
+    Raises InputError for a file that is missing, no file, of another type, or empty.
+    """
+    if not path.exists():
+        raise InputError(f"{path}: {what} file not found.")
+    if not path.is_file():
+        raise InputError(f"{path}: {what} is not a file.")
+    suffix = path.suffix.lower()
+    if suffix not in types:
+        raise InputError(f"{path}: unsupported {what} type {suffix!r}; allowed are {', '.join(types)}.")
+    if path.stat().st_size == 0:
+        raise InputError(f"{path}: {what} file is empty.")
+    return suffix
 
 
 def data_dir(kind: str) -> Path:

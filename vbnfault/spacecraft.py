@@ -21,6 +21,7 @@ import trimesh
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from . import resources
 from .errors import InputError
 from .frames import rx, ry, rz
 
@@ -358,15 +359,7 @@ def load_spacecraft(
 
 
 def _read(path: Path) -> list[_Piece]:
-    if not path.exists():
-        raise InputError(f"{path}: spacecraft file not found")
-    if not path.is_file():
-        raise InputError(f"{path}: spacecraft is not a file")
-    suffix = path.suffix.lower()
-    if suffix not in FILE_TYPES:
-        raise InputError(f"{path}: unsupported spacecraft type {suffix!r}; allowed are {', '.join(FILE_TYPES)}")
-    if path.stat().st_size == 0:
-        raise InputError(f"{path}: spacecraft file is empty")
+    suffix = resources.input_file(path, "spacecraft", FILE_TYPES)
     try:
         # numpy warns on NaN while the readers work; the check below reports it as an error
         with warnings.catch_warnings(), np.errstate(all="ignore"):

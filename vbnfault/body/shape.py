@@ -10,6 +10,7 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
+from vbnfault import resources
 from vbnfault.body import formats
 from vbnfault.errors import InputError
 
@@ -58,15 +59,7 @@ def load_shape(path: str | Path, unit: Unit = "auto") -> tuple[Float64, Int32]:
     path = Path(path)
     if unit not in ("auto", "m", "km"):
         raise InputError(f"{path}: unit must be one of auto, m, km; got {unit!r}.")
-    if not path.exists():
-        raise InputError(f"{path}: shape file not found.")
-    if not path.is_file():
-        raise InputError(f"{path}: shape is not a file.")
-    suffix = path.suffix.lower()
-    if suffix not in FILE_TYPES:
-        raise InputError(f"{path}: unsupported shape type {suffix!r}; allowed are {', '.join(FILE_TYPES)}.")
-    if path.stat().st_size == 0:
-        raise InputError(f"{path}: shape file is empty.")
+    suffix = resources.input_file(path, "shape", FILE_TYPES)
     native: Unit | None = None
     if suffix in formats.SUFFIXES:
         raw = formats.read_shape(path)

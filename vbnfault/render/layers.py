@@ -6,14 +6,12 @@ from typing import Any
 
 import numpy as np
 
-from ..quantities import Truth
+from ..quantities import BODY, SKY, SPACECRAFT, SUN, Truth
 from ..scene import Sunlight, View
 from .emitter import SunDisc
 from .runtime import dr, mi
 from .sampling import Optics
 from .surface import Surface
-
-SKY, BODY, SUN, SPACECRAFT = 0, 1, 2, 3
 
 
 def truth(surface: Surface, view: View, sun: Sunlight, *, angles: bool = False) -> Truth:
