@@ -1,6 +1,6 @@
-"""Pictures of the terrain: sites × heights × Sun, for looking at.
+"""Pictures of the terrain: sites × views × Sun, for looking at, and sheets of them.
 
-python benchmarks/terrain_gallery.py --out FOLDER [--shape FILE] [--sites N] [--first K] [--size PX]
+python benchmarks/terrain_gallery.py --out FOLDER [--scene SCENE] [--shape FILE] [--sites 0 1 2] [--size PX]
 """
 
 from __future__ import annotations
@@ -13,28 +13,28 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vbnfault import frames, render
-from vbnfault.body import EMBEDDED, Patch, build_patch, choose_sites, load_body
-from vbnfault.photometry import hapke_at
-from vbnfault.scene import Scene, Sunlight, View
+from vbnfault import config, frames, pipeline, render
+from vbnfault.body import EMBEDDED
+from vbnfault.pipeline import Frame, Pose, Session
+from vbnfault.scene import Sunlight
 
-SUNS_DEG = {"low": 15.0, "high": 50.0}
+SUNS_DEG = {"low": 12.0, "high": 50.0}
 # name → height above ground in m, degrees below the horizon
 VIEWS = {
-    "h005_horizon": (5.0, 12.0),
-    "h015_oblique": (15.0, 32.0),
-    "h050_horizon": (50.0, 24.0),
-    "h050_nadir": (50.0, 90.0),
-    "h100_oblique": (100.0, 45.0),
-    "h100_horizon": (100.0, 20.0),
+    "h002_oblique": (2.0, 35.0),
+    "h008_horizon": (8.0, 14.0),
+    "h030_oblique": (30.0, 32.0),
+    "h060_nadir": (60.0, 90.0),
+    "h100_horizon": (100.0, 22.0),
 }
-FOV_DEG = 65.0
-DUST_CONTRAST = 0.12
 SUN_TO_VIEW_DEG = 100.0  # the Sun from the side: relief shows
 SUN_TRIES_DEG = (35.0, -35.0, 0.0, 70.0, -70.0, 105.0, -105.0, 180.0)  # from downhill, until the site is lit
+GAMMA = 2.2
 
 
-def view_at(surface: render.Surface, height_m: float, below_deg: float, azimuth_deg: float, size: int) -> View:
+def pose_at(
+    surface: render.Surface, height_m: float, below_deg: float, azimuth_deg: float, sun: tuple[float, float]
+) -> Pose:
     """A level camera that height above the ground, moved off the site against its heading."""
     heading = frames.direction_L(azimuth_deg, 0.0)
     foot = -0.35 * height_m * heading
@@ -42,26 +42,24 @@ def view_at(surface: render.Surface, height_m: float, below_deg: float, azimuth_
     z = frames.direction_L(azimuth_deg, -min(below_deg, 89.99))
     x = np.cross([0.0, 0.0, 1.0], heading)
     x /= np.linalg.norm(x)
-    focal = 0.5 * size / np.tan(np.radians(FOV_DEG / 2))
-    return View(
+    return Pose(
         position_L_m=np.array([foot[0], foot[1], -(ground + height_m)]),
         L_from_C=np.column_stack([x, np.cross(z, x), z]),
-        intrinsics=np.array([focal, focal, size / 2, size / 2]),
-        width_px=size,
-        height_px=size,
+        sun_L=frames.direction_L(*sun),
+        sun_azimuth_deg=sun[0],
+        sun_elevation_deg=sun[1],
+        sun_visible_fraction=1.0,
+        tries=1,
+        resolved=True,
     )
 
 
-def sunlit_azimuth(surface: render.Surface, patch: Patch) -> float:
-    """From where a low Sun reaches most of the ground around the site: near downhill."""
-    near = np.linalg.norm(patch.vertices_L_m[patch.faces[:, 0]], axis=1) < 60.0
-    a, b, c = (
-        patch.vertices_L_m[patch.faces[near & ~patch.face_is_boulder, k]].astype(np.float64) for k in range(3)
-    )
-    north, east, _ = np.cross(b - a, c - a).sum(axis=0)
-    downhill = float(np.degrees(np.arctan2(east, north)))
+def sunlit_azimuth(surface: render.Surface) -> float:
+    """From where a low Sun reaches most of the ground around the site."""
     x, y = (axis.ravel() for axis in np.meshgrid(np.linspace(-40, 40, 7), np.linspace(-40, 40, 7)))
     height = render.ground_height_m(surface, x, y, 400.0) + 0.5
+    fit = np.linalg.lstsq(np.column_stack([x, y, np.ones_like(x)]), height, rcond=None)[0]
+    downhill = float(np.degrees(np.arctan2(-fit[1], -fit[0])))
     lit = []
     for turn in SUN_TRIES_DEG:
         sun = Sunlight(
@@ -76,55 +74,58 @@ def sunlit_azimuth(surface: render.Surface, patch: Patch) -> float:
     return downhill + SUN_TRIES_DEG[int(np.argmax(lit))]
 
 
-def picture(surface: render.Surface, view: View, sun_azimuth_deg: float, sun_elevation_deg: float) -> NDArray:
-    """uint8[y, x]: exposed for the brightest 0.3 %, gamma 2.2."""
-    sun = Sunlight(
-        direction_L=frames.direction_L(sun_azimuth_deg, sun_elevation_deg),
-        angular_radius_rad=np.radians(0.12),
-        irradiance_W_m2_nm=np.ones(1),
-    )
-    scene = Scene(
-        view=view,
-        sun=sun,
-        wavelength_nm=np.array([550.0]),
-        photometry=hapke_at(np.array([550.0])),
-        dust_contrast=np.array([DUST_CONTRAST]),
-        samples_per_pixel=16,
-        key=1,
-    )
-    grey = render.radiance(surface, scene).array[0]
-    white = max(float(np.percentile(grey, 99.7)), 1e-9)
-    return np.round(255 * np.clip(grey / white, 0, 1) ** (1 / 2.2)).astype(np.uint8)
+def picture(session: Session, site: int, pose: Pose) -> NDArray:
+    """uint8[y, x, 3], as the scene's camera takes it without faults or noise, gamma 2.2 for the eye."""
+    frame = Frame(spec=session.spec(int(np.flatnonzero(session.plan.site == site)[0])))
+    frame.pose = pose
+    pipeline.render_frame(frame)
+    pipeline.meter(frame)
+    exposed = frame.rate.with_array(frame.rate.array * np.float32(frame.camera.exposure_s))
+    image = frame.camera.detector.develop(exposed, frame.camera.exposure_s, None).array[..., 2::-1]
+    return np.round(255 * (image / 255.0) ** (1 / GAMMA)).astype(np.uint8)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--scene", default="physical67p")
     parser.add_argument("--shape", default=EMBEDDED)
-    parser.add_argument("--sites", type=int, default=4)
-    parser.add_argument("--first", type=int, default=0)
-    parser.add_argument("--seed", type=int, default=7)
+    parser.add_argument("--sites", type=int, nargs="*", default=list(range(8)))
     parser.add_argument("--size", type=int, default=1024)
     parser.add_argument("--views", nargs="*", default=list(VIEWS), choices=list(VIEWS))
     parser.add_argument("--suns", nargs="*", default=list(SUNS_DEG), choices=list(SUNS_DEG))
     arguments = parser.parse_args()
     arguments.out.mkdir(parents=True, exist_ok=True)
-    body = load_body(arguments.shape)
-    for site in choose_sites(body, arguments.first + arguments.sites, arguments.seed)[arguments.first :]:
+    scene = config.load_scene(
+        arguments.scene,
+        {
+            "camera.width_px": arguments.size,
+            "camera.height_px": arguments.size,
+            "body.shape": arguments.shape,
+            "spacecraft.model": "none",
+            "dataset.samples": 2048,  # some for every site
+        },
+    )
+    scene = scene.model_copy(update={"render": scene.render.model_copy(update={"noise_fraction": None})})
+    session = Session(scene)
+    for site in arguments.sites:
         start = time.perf_counter()
-        patch: Patch = build_patch(body, site, seed=arguments.seed)
+        surface = session.terrain(site).surface
         built = time.perf_counter()
-        surface = render.Surface(patch.vertices_L_m, patch.faces, patch.face_is_flat, patch.dust)
-        sun_azimuth = sunlit_azimuth(surface, patch)
-        azimuth = sun_azimuth + SUN_TO_VIEW_DEG * (-1) ** site.index
-        for name in arguments.views:
-            view = view_at(surface, *VIEWS[name], azimuth, arguments.size)
-            for sun in arguments.suns:
-                image = picture(surface, view, sun_azimuth, SUNS_DEG[sun])
-                cv2.imwrite(str(arguments.out / f"{body.name}_{site.index}_{name}_{sun}.png"), image)
+        sun_azimuth = sunlit_azimuth(surface)
+        azimuth = sun_azimuth + SUN_TO_VIEW_DEG * (-1) ** site
+        rows = []
+        for sun in arguments.suns:
+            row = []
+            for name in arguments.views:
+                pose = pose_at(surface, *VIEWS[name], azimuth, (sun_azimuth, SUNS_DEG[sun]))
+                row.append(picture(session, site, pose))
+                cv2.imwrite(str(arguments.out / f"site{site:02d}_{name}_{sun}.png"), row[-1])
+            rows.append(np.hstack(row))
+        sheet = cv2.resize(np.vstack(rows), None, fx=0.4, fy=0.4, interpolation=cv2.INTER_AREA)
+        cv2.imwrite(str(arguments.out / f"site{site:02d}_sheet.png"), sheet)
         print(
-            f"{body.name} site {site.index}: built in {built - start:.1f} s, {patch.triangles} triangles, "
-            f"{len(patch.boulder_diameter_m)} boulders, dust {patch.dust.mean():.2f}"
+            f"site {site}: terrain in {built - start:.1f} s, {len(arguments.suns) * len(arguments.views)} pictures"
         )
 
 

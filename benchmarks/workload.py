@@ -64,9 +64,7 @@ class Workload:
             overrides |= {"patch.facet_m": facet_m, "patch.min_boulder_m": 4 * facet_m}
         session = pipeline.Session(config.load_scene(SCENE, overrides))
         patch = session._patch(session.sites[0])
-        surface = render.Surface(
-            patch.vertices_L_m, patch.faces, patch.face_is_flat, patch.dust, detail_slope=session._detail_slope
-        )
+        surface = session.surface(patch)
         terrain = pipeline.Terrain(body=session.body, site=patch.site, surface=surface)
         spec = SampleSpec(index=0, scene=session.scene, plan=session.plan, faults=session.faults, terrain=terrain)
         return cls(session, patch, spec, _pose(surface))

@@ -38,8 +38,8 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def same(a: Patch, b: Patch) -> bool:
     return all(
-        getattr(a, name).dtype == getattr(b, name).dtype and np.array_equal(getattr(a, name), getattr(b, name))
-        for name in cache._ARRAYS
+        np.asarray(x).dtype == np.asarray(y).dtype and np.array_equal(x, y)
+        for x, y in ((getattr(a, name), getattr(b, name)) for name in cache._ARRAYS)
     )
 
 

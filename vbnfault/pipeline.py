@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from . import config, frames, labels, photometry, plan, world
 from .body import Body, Patch, Site, cached_patch, choose_sites
+from .body.refine import GROWTH_POWER
 from .camera import Camera
 from .config import SceneConfig
 from .detector import Noise
@@ -769,26 +770,35 @@ class Session:
                 render.set_threads(self._threads)
             self._terrain = None  # let go of the old one first: two do not fit a small machine
             patch = self._patch(self.sites[site])
-            vehicle = self.vehicle
-            surface = render.Surface(
-                patch.vertices_L_m,
-                patch.faces,
-                patch.face_is_flat,
-                dust=patch.dust,
-                vehicle=None if vehicle is None else world.render_vehicle(self.scene, vehicle),
-                detail_slope=self._detail_slope,
-            )
-            self._terrain = Terrain(body=self.body, site=patch.site, surface=surface, vehicle=vehicle)
+            surface = self.surface(patch)
+            self._terrain = Terrain(body=self.body, site=patch.site, surface=surface, vehicle=self.vehicle)
         return self._terrain
 
-    @cached_property
-    def _detail_slope(self) -> float:
-        """RMS slope an octave of the relief finer than facets, as the body's own roughness has it."""
+    def surface(self, patch: Patch) -> Surface:
+        """The renderer's copy of a patch, with relief finer than its facets and the scene's spacecraft."""
+        from . import render
+
+        vehicle = None if self.vehicle is None else world.render_vehicle(self.scene, self.vehicle)
+        fine = render.FineRelief(
+            slope=0.0,
+            facet_m=patch.facet_m,
+            radius_m=patch.radius_m,
+            growth=GROWTH_POWER,
+            hurst=self.body.roughness.hurst,
+        )
         # slopes of an octave of wavelength λ are 0.44 times the deviation over λ/4 a length of λ/4, for a
         # self-affine surface of Hurst exponent 0.85: the ratio of the integrals of its spectrum
-        length = 0.075
-        steep = float(self.body.roughness.deviation_at(length)) / length
-        return min(0.44 * steep, _STEEPEST_DETAIL) * self.scene.patch.relief
+        length = fine.longest_m / 4
+        slope = 0.44 * float(self.body.roughness.deviation_at(length)) / length
+        slope = min(slope, _STEEPEST_DETAIL) * self.scene.patch.relief
+        return render.Surface(
+            patch.vertices_L_m,
+            patch.faces,
+            patch.face_is_flat,
+            dust=patch.dust,
+            vehicle=vehicle,
+            fine=replace(fine, slope=slope),
+        )
 
     def _patch(self, site: Site) -> Patch:
         table = self.scene.patch

@@ -28,6 +28,7 @@ _PLANES = 18  # flat sides; deep cuts, or rocks look like eggs
 _LEVELS = 6  # of detail: 20 · 4^level triangles
 _EDGE_FACETS = 2.4  # edges of a rock of half a metre, in facets of the ground around it; of larger ones less
 _EDGE_POWER = -0.3
+_CLOSE_M, _CLOSEST = 50.0, 0.45  # nearer, edges are shorter in proportion, down to that share
 _COARSER = (1.0, 1.2, 1.45, 1.75, 2.1)
 _FLAT_LEVELS = 2  # up to that level faces are the rock's own fracture planes
 _RING = 12  # directions in which the ground around a rock is looked at
@@ -97,6 +98,7 @@ def add_boulders(
 
     detail = facet_m[faces[face, 0]]
     edge = _EDGE_FACETS * detail * np.maximum(diameter / 0.5, 1.0) ** _EDGE_POWER
+    edge *= np.clip(distance[face] / _CLOSE_M, _CLOSEST, 1.0)
     # Rather coarser rocks than fewer, and none that takes a large part of the triangles.
     finest = min(_LEVELS, max(1, int(np.log2(max(0.06 * budget / 20, 1.0)) / 2)))
     for coarser in _COARSER:

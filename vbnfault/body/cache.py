@@ -116,7 +116,8 @@ def _read(path: Path, site: Site) -> Patch | None:
     try:
         # Opened here: numpy leaves a file open that is no zip.
         with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
-            arrays = {name: archive[name] for name in _ARRAYS}
+            # numbers come back as arrays without axes
+            arrays = {name: archive[name][()] for name in _ARRAYS}
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error, NotImplementedError):
         return None
     with contextlib.suppress(OSError):

@@ -31,7 +31,7 @@ from vbnfault.errors import InputError
 if TYPE_CHECKING:
     from vbnfault.body import Body
 
-_GROUND_SHARE = 0.72  # of the triangles; the rest is left to the boulders
+_GROUND_SHARE = 0.66  # of the triangles; the rest is left to the boulders
 _BOULDER_STREAM = 0xB0D
 
 
@@ -57,6 +57,9 @@ class Patch:
         float32[k] largest diameter, and float32[k, 3] centre of each boulder.
     boulder_smallest_m
         float32[k]: the diameter from which on the size law was drawn at the boulder's place.
+    facet_m, radius_m
+        Mean edge length of the ground up to that distance from the site; beyond, it grows as the distance to the
+        power `GROWTH_POWER`.
     """
 
     site: Site
@@ -68,6 +71,8 @@ class Patch:
     boulder_diameter_m: Float32
     boulder_position_L_m: Float32
     boulder_smallest_m: Float32
+    facet_m: float
+    radius_m: float
 
     @property
     def triangles(self) -> int:
@@ -98,7 +103,7 @@ def build_patch(
     facet_m
         Mean edge length within `radius_m` of the site, 0.05 to 1e6 m; beyond, it grows as the distance to the
         power 1.1 until the global model's facets are reached. Coarsened where the ground alone would take more
-        than 72 % of `max_triangles`.
+        than 66 % of `max_triangles`.
     radius_m
         1 to 1e8 m.
     relief
@@ -190,6 +195,8 @@ def build_patch(
         boulder_diameter_m=stones.diameter_m.astype(np.float32),
         boulder_position_L_m=stones.position_m.astype(np.float32),
         boulder_smallest_m=stones.smallest_m.astype(np.float32),
+        facet_m=limit.facet_m,
+        radius_m=limit.radius_m,
     )
 
 

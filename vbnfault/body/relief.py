@@ -52,6 +52,9 @@ _CLIFF_DEG = (38.0, 52.0)
 _GRAVITY_STEP_M = 250.0  # gravity is taken as linear over a patch, from differences over this step
 _GRAVITY_REACH_M = 1500.0
 
+_STEEPEST = 1.5  # tangent of the relief's slope against the model
+_SLUMPS, _SLUMP_STEPS = 4, 25
+
 _TALUS_CELL_M = 4.0
 _TALUS_REACH_M = 480.0
 _TALUS_WIDTH_M = 9.0
@@ -126,7 +129,8 @@ def add_relief(
     slope = _slope_deg(raised, normals, faces, up)
     talus = _talus(np.einsum("ni,ij->nj", raised, site.T_from_L), slope)
     height, dust = _surface(noise, broad, slope[order], talus[order], elevation[order])
-    return Ground(height_m=scale * (height * shown)[rank].astype(np.float64), dust=dust[rank], talus=talus)
+    height_m = scale * (height * shown)[rank].astype(np.float64)
+    return Ground(height_m=_slumped(points, faces, height_m), dust=dust[rank], talus=talus)
 
 
 def _smooth_step(low: float, high: float, x: NDArray) -> Float32:
@@ -358,6 +362,35 @@ def _strata(noise: _Octaves, elevation: Float64) -> Float32:
         below, here = hard[(k - 1) & 4095], hard[k & 4095]
         total += noise.shown(thickness) * np.float32(reach) * (below + blend * (here - below) - 0.5)
     return total
+
+
+def _slumped(points: Float64, faces: Int32, height_m: Float64) -> Float64:
+    """Heights with no edge of the mesh steeper than the steepest wall: what facets cannot show would come out as
+    saw teeth along every scarp."""
+    # in a closed mesh every edge runs once each way
+    a, b = (np.concatenate([faces[:, k] for k in ends]) for ends in ((0, 1, 2), (1, 2, 0)))
+    a, b = a[a < b], b[a < b]
+    off = points[a] - points[b]
+    most = _STEEPEST * np.sqrt(np.einsum("ni,ni->n", off, off))
+    height = height_m.copy()
+    for _ in range(_SLUMPS):
+        # those nearly too steep become so while others give way
+        near = np.abs(height[a] - height[b]) > 0.8 * most
+        if not near.any():
+            break
+        i, j, limit = a[near], b[near], most[near]
+        ends, at = np.unique(np.concatenate([i, j]), return_inverse=True)
+        i, j, moved = at[: len(i)], at[len(i) :], height[ends]
+        for _ in range(_SLUMP_STEPS):
+            step = moved[i] - moved[j]
+            excess = step - np.clip(step, -limit, limit)
+            touched = (excess != 0).astype(np.float64)
+            pull = np.bincount(j, excess, len(ends)) - np.bincount(i, excess, len(ends))
+            moved += (
+                0.5 * pull / np.maximum(np.bincount(i, touched, len(ends)) + np.bincount(j, touched, len(ends)), 1)
+            )
+        height[ends] = moved
+    return height
 
 
 def _talus(points_L: Float64, slope: Float32) -> Float32:

@@ -1,6 +1,7 @@
 """Rendering with Mitsuba 3 (LLVM, spectral). The only package that imports it; importing this loads it."""
 
 from .bounces import indirect
+from .detail import FineRelief
 from .integrate import radiance
 from .layers import truth
 from .light import direct
@@ -43,6 +44,7 @@ def self_test() -> str:
 
 
 __all__ = [
+    "FineRelief",
     "Surface",
     "Vehicle",
     "direct",

@@ -1,17 +1,21 @@
 """Relief finer than facets: slopes that turn the normal, down to the pixel and no further.
 
-A facet near the site is a decimetre wide, a pixel seen from ten metres a centimetre. What lies between is a
-self-affine surface that continues the terrain's roughness: two periodic fields of slopes, turned against each other
-so that their repetition does not show, averaged over the pixel (a pyramid) so that what is smaller than a pixel is
-left to the photometric model's own roughness. It shades; it does not cast shadows.
+A facet near the site is a decimetre wide, a pixel seen from ten metres a centimetre; far away, facets are metres
+wide and pixels decimetres. What lies between is a self-affine surface strewn with pebbles, that continues the
+terrain's roughness: two periodic fields of slopes, turned against each other so that their repetition does not
+show, averaged over the pixel (a pyramid) so that what is smaller than a pixel is left to the photometric model's
+own roughness. Both grow with the facets in factors of four, by turns: each while it has no weight, so that no
+border shows. It shades; it does not cast shadows.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .runtime import dr, mi
 
@@ -19,45 +23,82 @@ _SIDE = 512  # texels
 _LEVELS = 8
 _TILES_M = (2.03, 1.37)
 _TURN = np.radians(37.0)
-_LONGEST_M = 0.3  # wavelength: what is longer is in the facets
+_LONGEST_M = 0.3  # wavelength in tiles as large as this: what is longer is in the facets
+_FACETS = 2.5  # the longest wavelength, in facets
 _HURST = 0.85
 # Dust lies smoother than the ground that it covers.
-_ON_DUST = 0.35
+_ON_DUST = 0.5
 _GRAZING = 0.15
+_PEBBLES = 0.5  # of the variance of slopes
+_PEBBLE_CELLS = (4, 8, 16, 32, 64)  # texels; one pebble at most in each, up to 0.4 of it in radius
+_PEBBLE_SHARE = 0.5
+_STEEPEST = 1.5
+# Steps of the sequence R2 (M. Roberts 2018): where in a texel's surroundings a sample looks.
+_R2 = (0.7548776662, 0.5698402910)
+
+
+@dataclass(frozen=True, kw_only=True)
+class FineRelief:
+    """How a self-affine surface goes on below facets of `facet_m` up to `radius_m` from the origin, and beyond of
+    a size that grows as the distance to the power `growth`.
+
+    `slope`: RMS an octave and axis on bare ground, at wavelengths of 2.5 `facet_m`; of longer ones it changes as
+    the wavelength to the power `hurst` - 1.
+    """
+
+    slope: float
+    facet_m: float = _LONGEST_M / _FACETS
+    radius_m: float = 1e9
+    growth: float = 1.0
+    hurst: float = _HURST
+
+    @property
+    def longest_m(self) -> float:
+        """The longest wavelength near the origin."""
+        return _FACETS * self.facet_m
 
 
 class Detail:
-    """Slopes of RMS `slope` an octave and axis on bare ground; `pixel_rad`: angle that a pixel subtends."""
+    """The relief seen with pixels that subtend `pixel_rad`."""
 
-    def __init__(self, slope: float, pixel_rad: float) -> None:
-        self._slope = dr.opaque(mi.Float, slope / np.sqrt(len(_TILES_M)))
+    def __init__(self, relief: FineRelief, pixel_rad: float) -> None:
+        self._slope = dr.opaque(mi.Float, relief.slope)
         self._pixel = dr.opaque(mi.Float, pixel_rad)
-        self._pyramid, self._starts = _pyramid()
+        self._inverse_radius2 = dr.opaque(mi.Float, relief.radius_m**-2)
+        self._growth = dr.opaque(mi.Float, relief.growth)
+        # the two tiles' scales differ by 2 near the site
+        self._per_m = dr.opaque(mi.Float, _LONGEST_M * np.sqrt(2) / relief.longest_m)
+        self._fall = dr.opaque(mi.Float, relief.hurst - 1)
+        self._pyramid = _pyramid()
 
-    def turned(self, normal: Any, point: Any, view: Any, distance_m: Any, dust: Any, dither: Any) -> Any:
-        """Unit normals turned by the slopes at points of L. `dither` in [0, 1) chooses between two neighbouring
-        levels of the pyramid: over the samples of a pixel they mix."""
+    def turned(
+        self, normal: Any, point: Any, view: Any, distance_m: Any, dust: Any, index: Any, samples: int
+    ) -> Any:
+        """Unit normals turned by the slopes at points of L. `index` of the pixel's `samples` chooses between two
+        neighbouring levels of the pyramid and between neighbouring texels: over the pixel they mix."""
+        dither = (mi.Float(index) + 0.5) / samples
+        jitter = [mi.Float(index) * step for step in _R2]
+        jitter = [x - dr.floor(x) - 0.5 for x in jitter]
         footprint = distance_m * self._pixel * dr.rsqrt(dr.maximum(dr.abs(dr.dot(normal, view)), _GRAZING))
-        texels = dr.maximum(footprint * (_SIDE / _TILES_M[0]), 1.0)
-        level = mi.Int32(dr.floor(dr.log2(texels) + dither))
-        shown = level < _LEVELS
-        level = dr.clip(level, 0, _LEVELS - 1)  # a ray that hits nothing may give any number
-        side = mi.Int32(_SIDE) >> level
-        start = dr.gather(mi.Int32, self._starts, level)
         # the plane that the normal is nearest to: xy, yz or xz
         a = dr.abs(normal)
         level_ground, faces_x = (a.z >= a.x) & (a.z >= a.y), a.x > a.y
         u = dr.select(level_ground | ~faces_x, point.x, point.y)
         v = dr.select(level_ground, point.y, point.z)
+        # facets twice as large: 1 more
+        larger = self._growth * _log2(dr.maximum(dr.squared_norm(point) * self._inverse_radius2, 1.0)) * 0.5
         su, sv = mi.Float(0), mi.Float(0)
         for k, tile in enumerate(_TILES_M):
+            turn = 0.5 * (larger + 0.5 - k)
+            step = dr.round(turn)
+            octave = 2 * step + k
+            # nearly a cosine: 1 in the middle of a step, 0 where the next begins
+            weight = (1 - 4 * dr.square(turn - step)) * dr.exp2(self._fall * octave)
+            per_m = _power_of_two(-mi.Int32(octave)) * (self._per_m / tile)
+            pair = self._slopes(k, u * per_m, v * per_m, footprint * per_m * _SIDE, dither, jitter)
             c, s = float(np.cos(k * _TURN)), float(np.sin(k * _TURN))
-            tu, tv = (c / tile) * u + (s / tile) * v, (c / tile) * v - (s / tile) * u
-            x = mi.Int32((tu - dr.floor(tu)) * mi.Float(side)) & (side - 1)
-            y = mi.Int32((tv - dr.floor(tv)) * mi.Float(side)) & (side - 1)
-            pair = dr.gather(mi.Vector2f, self._pyramid, mi.UInt32(start + y * side + x), shown)
-            su += c * pair.x - s * pair.y
-            sv += s * pair.x + c * pair.y
+            su += weight * (c * pair.x - s * pair.y)
+            sv += weight * (s * pair.x + c * pair.y)
         strength = self._slope * dr.lerp(1.0, _ON_DUST, dust)
         su, sv = su * strength, sv * strength
         off = mi.Vector3f(
@@ -67,10 +108,32 @@ class Detail:
         )
         return dr.normalize(normal - off)
 
+    def _slopes(self, k: int, u: Any, v: Any, texels: Any, dither: Any, jitter: list[Any]) -> Any:
+        """Slopes along the axes of tile k at places in tiles, averaged over that many texels."""
+        level = mi.Int32(dr.floor(_log2(dr.maximum(texels, 1.0)) + dither))
+        shown = level < _LEVELS
+        level = dr.clip(level, 0, _LEVELS - 1)  # a ray that hits nothing may give any number
+        side = mi.Int32(_SIDE) >> level
+        c, s = float(np.cos(k * _TURN)), float(np.sin(k * _TURN))
+        tu, tv = c * u + s * v, c * v - s * u
+        x = mi.Int32(dr.floor((tu - dr.floor(tu)) * mi.Float(side) + jitter[0])) & (side - 1)
+        y = mi.Int32(dr.floor((tv - dr.floor(tv)) * mi.Float(side) + jitter[1])) & (side - 1)
+        start = (_SIDE * _SIDE - side * side) // 3 * 4  # the larger levels' texels
+        return dr.gather(mi.Vector2f, self._pyramid, mi.UInt32(start + y * side + x), shown)
+
+
+def _log2(x: Any) -> Any:
+    """log2 of positive numbers within 0.09, exact at powers of two, rising: the bits of a float are nearly that."""
+    return mi.Float(dr.reinterpret_array(mi.Int32, x)) * 2.0**-23 - 127
+
+
+def _power_of_two(exponent: Any) -> Any:
+    return dr.reinterpret_array(mi.Float, (exponent + 127) << 23)
+
 
 @lru_cache(maxsize=1)
-def _pyramid() -> tuple[Any, Any]:
-    """Slopes of all levels as pairs, and where each level starts."""
+def _pyramid() -> Any:
+    """Slopes of all levels as pairs, level after level."""
     k = np.fft.fftfreq(_SIDE) * _SIDE
     kx, ky = np.meshgrid(k, k)
     radius = np.hypot(kx, ky)
@@ -79,15 +142,37 @@ def _pyramid() -> tuple[Any, Any]:
     rng = np.random.Generator(np.random.Philox(np.random.SeedSequence(0xDE7A11)))
     height = np.sqrt(power) * np.fft.fft2(rng.normal(size=(_SIDE, _SIDE)))
     slopes = np.stack([np.fft.ifft2(2j * np.pi * f * height).real for f in (kx, ky)], axis=-1)
+    slopes *= np.sqrt((1 - _PEBBLES) / np.mean(slopes**2))
+    strewn = _pebbles(rng)
+    slopes += strewn * np.sqrt(_PEBBLES / np.mean(strewn**2))
     octaves = np.log2(_SIDE / 2 / longest)
-    slopes *= np.sqrt(octaves) / np.sqrt(np.mean(slopes**2))
+    slopes *= np.sqrt(octaves / np.mean(slopes**2))
     levels: list[np.ndarray] = []
-    starts: list[int] = []
     for _ in range(_LEVELS):
-        starts.append(sum(level.shape[0] ** 2 for level in levels))
         levels.append(slopes)
         slopes = slopes.reshape(len(slopes) // 2, 2, -1, 2, 2).mean(axis=(1, 3))
     table = mi.Float(np.concatenate([level.reshape(-1) for level in levels]).astype(np.float32))
-    first = mi.Int32(np.array(starts, dtype=np.int32))
-    dr.eval(table, first)
-    return table, first
+    dr.eval(table)
+    return table
+
+
+def _pebbles(rng: np.random.Generator) -> NDArray[np.float64]:
+    """Slopes float64[y, x, 2] of a periodic heap of pebbles, as many of each size as fit."""
+    row, column = np.indices((_SIDE, _SIDE))
+    highest = np.zeros((_SIDE, _SIDE))
+    for cell in _PEBBLE_CELLS:
+        count = _SIDE // cell
+        at = rng.random((2, count, count))
+        radius = cell * (0.15 + 0.25 * rng.random((count, count)) ** 2)
+        tall = radius * (0.4 + 0.5 * rng.random((count, count))) * (rng.random((count, count)) < _PEBBLE_SHARE)
+        turn, squeeze = rng.random((count, count)) * np.pi, 1 + 0.6 * rng.random((count, count))
+        for down in (-1, 0, 1):
+            for right in (-1, 0, 1):
+                j, i = row // cell + down, column // cell + right
+                wrapped = (j % count, i % count)
+                y, x = row - cell * (j + at[0][wrapped]), column - cell * (i + at[1][wrapped])
+                c, s = np.cos(turn[wrapped]), np.sin(turn[wrapped])
+                square = ((c * x + s * y) ** 2 + (squeeze[wrapped] * (c * y - s * x)) ** 2) / radius[wrapped] ** 2
+                highest = np.maximum(highest, tall[wrapped] * (1 - square**1.5))
+    slopes = np.stack([0.5 * (np.roll(highest, -1, axis) - np.roll(highest, 1, axis)) for axis in (1, 0)], axis=-1)
+    return np.asarray(np.clip(slopes, -_STEEPEST, _STEEPEST))

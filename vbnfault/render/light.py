@@ -57,8 +57,8 @@ class Light:
         self.world = surface.seen_from(scene.view)
         self.optics, self.sun = Optics(scene.view), SunDisc(scene.sun)
         self.detail = None
-        if surface.detail_slope:
-            self.detail = Detail(surface.detail_slope, 1 / float(scene.view.intrinsics[0]))
+        if surface.fine is not None and surface.fine.slope:
+            self.detail = Detail(surface.fine, 1 / float(scene.view.intrinsics[0]))
 
     def lit(self, hit: Any, point_of_sun: Any, *, coherent: bool = True) -> tuple[Any, Any]:
         """Direction towards a point of the Sun's disc, and whether its light arrives; `coherent` where neighbours
@@ -71,8 +71,9 @@ class Light:
     def reflection(self, hit: Any, rays: Any, strata: Strata | None = None) -> Reflection:
         """How the ground at `hit` reflects towards where the rays come from; with its finest relief where `strata`
         of the pixel's samples are given."""
-        dither = None if strata is None else (mi.Float(strata.index) + 0.5) / strata.samples
-        normal = hit.normal if dither is None else hit.shading_normal(self.detail, dither)
+        normal = hit.normal
+        if strata is not None:
+            normal = hit.shading_normal(self.detail, strata.index, strata.samples)
         return Reflection(self.surface, self.scene, hit, normal, -rays.d, banded=self.banded)
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..scene import View
-from .detail import Detail
+from .detail import Detail, FineRelief
 from .mesh import mesh_scene
 from .runtime import dr, mi
 from .vehicle import Vehicle, World
@@ -27,7 +27,7 @@ class Surface:
     """A triangle mesh in L. `vertices_m` float32[n, 3], `faces` int32[m, 3], `flat` bool[m]: facets shaded with
     their own normal, such as boulders; the others with normals interpolated from their vertices. `dust` float32[n]
     in [0, 1]: how far each vertex is covered (default: none is). `vehicle`: the spacecraft with the camera.
-    `detail_slope`: RMS slope an octave of relief finer than the facets."""
+    `fine`: relief finer than the facets."""
 
     def __init__(
         self,
@@ -36,13 +36,13 @@ class Surface:
         flat: NDArray[np.bool_],
         dust: NDArray[np.float32] | None = None,
         vehicle: Vehicle | None = None,
-        detail_slope: float = 0.0,
+        fine: FineRelief | None = None,
     ) -> None:
         self.scene = mesh_scene("terrain", vertices_m, faces)
         self._corners = mi.Float(_corner_records(vertices_m, faces, flat).ravel())
         self._dust = mi.Float(0.0 if dust is None else np.ascontiguousarray(_with_a_fourth(dust[faces])).ravel())
         dr.eval(self._corners, self._dust)
-        self.vehicle, self.detail_slope = vehicle, detail_slope
+        self.vehicle, self.fine = vehicle, fine
 
     def seen_from(self, view: View) -> Surface | World:
         """What a camera sees: the terrain, and its own spacecraft if there is one."""
@@ -93,12 +93,12 @@ class Hit:
         corners = dr.gather(mi.Vector4f, table, self._first, self.valid)
         return sum((corners[k] * w for k, w in enumerate(self._weights)), mi.Float(0))
 
-    def shading_normal(self, detail: Detail | None, dither: Any) -> Any:
-        """The normal turned by the relief finer than facets."""
+    def shading_normal(self, detail: Detail | None, index: Any, samples: int) -> Any:
+        """The normal turned by the relief finer than facets, for the sample `index` of its pixel's `samples`."""
         if detail is None:
             return self.normal
         point = self._rays(self.distance_m)
-        return detail.turned(self.normal, point, self._rays.d, self.distance_m, self.dust, dither)
+        return detail.turned(self.normal, point, self._rays.d, self.distance_m, self.dust, index, samples)
 
     def shadow_rays(self, direction: Any) -> Any:
         """Rays from the hits. The origin is moved off the facet to the smooth surface that the corner normals

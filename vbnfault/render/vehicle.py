@@ -114,9 +114,9 @@ class VehicleHit:
         """As the ground's; none on the vehicle."""
         return dr.select(self.on_vehicle, 0, self._ground.dust)
 
-    def shading_normal(self, detail: Detail | None, dither: Any) -> Any:
+    def shading_normal(self, detail: Detail | None, index: Any, samples: int) -> Any:
         """As the ground's; the vehicle has no finer relief."""
-        return dr.select(self.on_vehicle, self.normal, self._ground.shading_normal(detail, dither))
+        return dr.select(self.on_vehicle, self.normal, self._ground.shading_normal(detail, index, samples))
 
     def shadow_rays(self, direction: Any) -> Any:
         """Rays from the hits, off the facet."""
