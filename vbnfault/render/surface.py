@@ -7,6 +7,7 @@ the facet's data come from tables instead of a virtual call: faster, and contact
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
@@ -38,8 +39,11 @@ class Surface:
         vehicle: Vehicle | None = None,
         fine: FineRelief | None = None,
     ) -> None:
-        self.scene = mesh_scene("terrain", vertices_m, faces)
-        self._corners = mi.Float(_corner_records(vertices_m, faces, flat).ravel())
+        vertices_m, faces = np.asarray(vertices_m, dtype=np.float32), np.asarray(faces, dtype=np.int32)
+        with ThreadPoolExecutor(1) as aside:  # the tree's last steps keep one core busy
+            normals = aside.submit(_vertex_normals, vertices_m, faces, flat)
+            self.scene = mesh_scene("terrain", vertices_m, faces)
+        self._corners = _corner_records(vertices_m, faces, flat, normals.result())
         self._dust = mi.Float(0.0 if dust is None else np.ascontiguousarray(_with_a_fourth(dust[faces])).ravel())
         dr.eval(self._corners, self._dust)
         self.vehicle, self.fine = vehicle, fine
@@ -118,27 +122,42 @@ def _with_a_fourth(three: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def _corner_records(
-    vertices: NDArray[np.float32], faces: NDArray[np.int32], flat: NDArray[np.bool_]
-) -> NDArray[np.float32]:
-    """Per corner of each facet, float32[m, 3, 4]: its unit normal, and the distance of its tangent plane from the
+    vertices: NDArray[np.float32], faces: NDArray[np.int32], flat: NDArray[np.bool_], normals: NDArray[np.float32]
+) -> Any:
+    """Per corner of each facet, floats [m, 3, 4]: its unit normal, and the distance of its tangent plane from the
     origin. Four floats: drjit fetches a power of two in one packet.
 
-    The normal is the facet's own where it is flat, else the mean of the smooth facets around the vertex, weighted
-    by area.
+    The normal is the facet's own where it is flat, else that of the vertex.
     """
-    corner = vertices[faces]
-    area = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
-    smooth, at = area[~flat].astype(np.float64), faces[~flat].ravel()
-    vertex: NDArray[np.float64] = np.column_stack(
-        [np.bincount(at, np.repeat(smooth[:, k], 3), minlength=len(vertices)) for k in range(3)]
-    )
-    record = np.empty((len(faces), 3, 4), dtype=np.float32)
-    record[..., :3] = _unit(vertex).astype(np.float32)[faces]
-    record[flat, :, :3] = _unit(area[flat].astype(np.float64))[:, None, :]
-    record[..., 3] = np.einsum("fki,fki->fk", record[..., :3], corner)
-    return record
+    corner = dr.arange(mi.UInt32, 3 * len(faces))
+    facet = corner // 3
+    table = mi.UInt32(np.ascontiguousarray(faces, np.uint32).ravel())
+    places = mi.Float(np.ascontiguousarray(vertices).ravel())
+    a, b, c = (dr.gather(mi.Vector3f, places, dr.gather(mi.UInt32, table, 3 * facet + k)) for k in range(3))
+    across = dr.cross(b - a, c - a)
+    own = across * dr.rcp(dr.maximum(dr.norm(across), 1e-30))
+    vertex = dr.gather(mi.UInt32, table, corner)
+    smooth = dr.gather(mi.Vector3f, mi.Float(normals.ravel()), vertex)
+    normal = dr.select(dr.gather(mi.Bool, mi.Bool(flat), facet), own, smooth)
+    return dr.ravel(mi.Vector4f(*normal, dr.dot(normal, dr.gather(mi.Vector3f, places, vertex))))
 
 
-def _unit(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
-    length = np.sqrt(np.einsum("ni,ni->n", vectors, vectors))
-    return np.asarray(vectors / np.maximum(length, 1e-300)[:, None])
+def _vertex_normals(
+    vertices: NDArray[np.float32], faces: NDArray[np.int32], flat: NDArray[np.bool_]
+) -> NDArray[np.float32]:
+    """Unit means of the smooth facets around each vertex, weighted by area, float32[n, 3]; 0 where all are flat.
+
+    Not on the device: sums over facets there depend on the order in which threads come.
+    """
+    # axis by axis: numpy is several times slower on arrays of triples
+    at = [np.ascontiguousarray(faces[~flat, k]) for k in range(3)]
+    axes = [np.ascontiguousarray(vertices[:, axis]) for axis in range(3)]
+    one, other = ([of[at[k]] - of[at[0]] for of in axes] for k in (1, 2))
+    area = [
+        one[1] * other[2] - one[2] * other[1],
+        one[2] * other[0] - one[0] * other[2],
+        one[0] * other[1] - one[1] * other[0],
+    ]
+    total = np.stack([np.sum([np.bincount(i, of, len(vertices)) for i in at], axis=0) for of in area], axis=1)
+    length = np.sqrt(np.einsum("ni,ni->n", total, total))
+    return np.asarray(total / np.maximum(length, 1e-300)[:, None], np.float32)
