@@ -15,7 +15,7 @@ from vbnfault import config, frames, pipeline, render, sky, world
 from vbnfault.errors import InputError
 from vbnfault.photometry import hapke_at
 from vbnfault.pipeline import Frame, Session
-from vbnfault.render.detail import _LEVELS, _SIDE, _pyramid
+from vbnfault.render.detail import _LEVELS, _SIDE, _UNIT, _pyramid
 
 TRUTH = ["depth_m", "normal", "semantic", "point_T_m", "incidence_deg", "emission_deg", "phase_deg", "albedo"]
 
@@ -211,9 +211,10 @@ def test_finest_relief_has_its_slopes_and_fades_into_the_pixel() -> None:
     table, start = np.array(_pyramid()), 0
     rms = []
     for level in range(_LEVELS):
-        block = table[start : start + 2 * (_SIDE >> level) ** 2]
+        block = table[start : start + 4 * (_SIDE >> level) ** 2]
         start += len(block)
-        rms.append(np.sqrt(np.mean(block**2)))
+        slopes = block.reshape(-1, 4)[:, :1].copy().view(np.int16) * _UNIT
+        rms.append(np.sqrt(np.mean(slopes**2)))
     octaves = np.log2(_SIDE / 2 / (2.03 / 0.3))
     assert rms[0] == pytest.approx(np.sqrt(octaves), rel=1e-6)  # unit variance an octave, both axes
     assert (np.diff(rms) < 0).all()

@@ -33,8 +33,7 @@ _PEBBLES = 0.5  # of the variance of slopes
 _PEBBLE_CELLS = (4, 8, 16, 32, 64)  # texels; one pebble at most in each, up to 0.4 of it in radius
 _PEBBLE_SHARE = 0.5
 _STEEPEST = 1.5
-# Steps of the sequence R2 (M. Roberts 2018): where in a texel's surroundings a sample looks.
-_R2 = (0.7548776662, 0.5698402910)
+_UNIT = 2.0**-11  # slopes are kept as int16
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,14 +70,9 @@ class Detail:
         self._fall = dr.opaque(mi.Float, relief.hurst - 1)
         self._pyramid = _pyramid()
 
-    def turned(
-        self, normal: Any, point: Any, view: Any, distance_m: Any, dust: Any, index: Any, samples: int
-    ) -> Any:
-        """Unit normals turned by the slopes at points of L. `index` of the pixel's `samples` chooses between two
-        neighbouring levels of the pyramid and between neighbouring texels: over the pixel they mix."""
-        dither = (mi.Float(index) + 0.5) / samples
-        jitter = [mi.Float(index) * step for step in _R2]
-        jitter = [x - dr.floor(x) - 0.5 for x in jitter]
+    def turned(self, normal: Any, point: Any, view: Any, distance_m: Any, dust: Any, dither: Any) -> Any:
+        """Unit normals turned by the slopes at points of L. `dither` in [0, 1), one number a pixel, chooses between
+        two neighbouring levels of the pyramid: from pixel to pixel they mix, and within one nothing is random."""
         footprint = distance_m * self._pixel * dr.rsqrt(dr.maximum(dr.abs(dr.dot(normal, view)), _GRAZING))
         # the plane that the normal is nearest to: xy, yz or xz
         a = dr.abs(normal)
@@ -95,10 +89,10 @@ class Detail:
             # nearly a cosine: 1 in the middle of a step, 0 where the next begins
             weight = (1 - 4 * dr.square(turn - step)) * dr.exp2(self._fall * octave)
             per_m = _power_of_two(-mi.Int32(octave)) * (self._per_m / tile)
-            pair = self._slopes(k, u * per_m, v * per_m, footprint * per_m * _SIDE, dither, jitter)
+            pair = self._slopes(k, u * per_m, v * per_m, footprint * per_m * _SIDE, dither)
             c, s = float(np.cos(k * _TURN)), float(np.sin(k * _TURN))
-            su += weight * (c * pair.x - s * pair.y)
-            sv += weight * (s * pair.x + c * pair.y)
+            su += weight * (c * pair[0] - s * pair[1])
+            sv += weight * (s * pair[0] + c * pair[1])
         strength = self._slope * dr.lerp(1.0, _ON_DUST, dust)
         su, sv = su * strength, sv * strength
         off = mi.Vector3f(
@@ -108,7 +102,7 @@ class Detail:
         )
         return dr.normalize(normal - off)
 
-    def _slopes(self, k: int, u: Any, v: Any, texels: Any, dither: Any, jitter: list[Any]) -> Any:
+    def _slopes(self, k: int, u: Any, v: Any, texels: Any, dither: Any) -> tuple[Any, Any]:
         """Slopes along the axes of tile k at places in tiles, averaged over that many texels."""
         level = mi.Int32(dr.floor(_log2(dr.maximum(texels, 1.0)) + dither))
         shown = level < _LEVELS
@@ -116,10 +110,17 @@ class Detail:
         side = mi.Int32(_SIDE) >> level
         c, s = float(np.cos(k * _TURN)), float(np.sin(k * _TURN))
         tu, tv = c * u + s * v, c * v - s * u
-        x = mi.Int32(dr.floor((tu - dr.floor(tu)) * mi.Float(side) + jitter[0])) & (side - 1)
-        y = mi.Int32(dr.floor((tv - dr.floor(tv)) * mi.Float(side) + jitter[1])) & (side - 1)
-        start = (_SIDE * _SIDE - side * side) // 3 * 4  # the larger levels' texels
-        return dr.gather(mi.Vector2f, self._pyramid, mi.UInt32(start + y * side + x), shown)
+        x = (tu - dr.floor(tu)) * mi.Float(side)
+        y = (tv - dr.floor(tv)) * mi.Float(side)
+        column, row = mi.Int32(x), mi.Int32(y)
+        x, y = x - mi.Float(column), y - mi.Float(row)
+        # the larger levels' texels come first; what rounds up to the side is the next tile's
+        start, last = (_SIDE * _SIDE - side * side) // 3 * 4, side - 1
+        at = mi.UInt32(start + (row & last) * side + (column & last))
+        corners = dr.gather(mi.Vector4i, self._pyramid, at, shown)
+        su, sv = ([mi.Float(c << 16 >> 16 if low else c >> 16) for c in corners] for low in (True, False))
+        first, second = (dr.lerp(dr.lerp(of[0], of[1], x), dr.lerp(of[2], of[3], x), y) for of in (su, sv))
+        return first * _UNIT, second * _UNIT
 
 
 def _log2(x: Any) -> Any:
@@ -133,7 +134,7 @@ def _power_of_two(exponent: Any) -> Any:
 
 @lru_cache(maxsize=1)
 def _pyramid() -> Any:
-    """Slopes of all levels as pairs, level after level."""
+    """Slopes of all levels, level after level: of each texel and its neighbours, two to a word."""
     k = np.fft.fftfreq(_SIDE) * _SIDE
     kx, ky = np.meshgrid(k, k)
     radius = np.hypot(kx, ky)
@@ -151,7 +152,12 @@ def _pyramid() -> Any:
     for _ in range(_LEVELS):
         levels.append(slopes)
         slopes = slopes.reshape(len(slopes) // 2, 2, -1, 2, 2).mean(axis=(1, 3))
-    table = mi.Float(np.concatenate([level.reshape(-1) for level in levels]).astype(np.float32))
+    words = [
+        np.round(level / _UNIT).clip(-32768, 32767).astype(np.int16).view(np.int32)[..., 0] for level in levels
+    ]
+    # with its neighbours to the right, below, and both: one packet
+    corners = [np.stack([np.roll(w, (-j, -i), (0, 1)) for j in (0, 1) for i in (0, 1)], axis=-1) for w in words]
+    table = mi.Int32(np.concatenate([of.reshape(-1) for of in corners]))
     dr.eval(table)
     return table
 

@@ -73,7 +73,7 @@ class Light:
         of the pixel's samples are given."""
         normal = hit.normal
         if strata is not None:
-            normal = hit.shading_normal(self.detail, strata.index, strata.samples)
+            normal = hit.shading_normal(self.detail, strata.dither())
         return Reflection(self.surface, self.scene, hit, normal, -rays.d, banded=self.banded)
 
 

@@ -56,8 +56,14 @@ class Strata:
         parity = (self.index ^ (self.index >> (self.side.bit_length() - 1))) & 1
         return 1 - 2 * mi.Float(parity)
 
+    def dither(self) -> Any:
+        """A number in [0, 1) for each pixel, the same whatever the sample and the frame."""
+        h = self.pixel * 0x9E3779B1
+        h ^= h >> 15
+        return mi.Float((h * 0x85EBCA77) >> 8) * 2.0**-24
+
     def disc(self, dimension: int) -> Any:
-        """A point of the unit disc; the samples of a pixel share one of 256 stratified sets, chosen by a hash.
+        """A point of the unit disc; the samples of a pixel share one of 256 even sets, chosen by a hash.
 
         `dimension` tells uses apart: they take different sets, in different orders.
         """
@@ -93,15 +99,43 @@ _DISC_SETS = 256
 @lru_cache(maxsize=8)
 def _disc_table(samples: int, dimension: int) -> Any:
     """Stratified points of the unit disc, `_DISC_SETS` sets of `samples`, each set in an order of its own."""
-    rng = np.random.Generator(np.random.Philox(np.random.SeedSequence((samples, dimension))))
-    side = round(samples**0.5)
-    stratum = np.argsort(rng.random((_DISC_SETS, samples)), axis=1)
-    radius2 = (stratum % side + rng.random(stratum.shape)) / side
-    turn = (stratum // side + rng.random(stratum.shape)) / side * 2 * np.pi
-    points = np.sqrt(radius2)[..., None] * np.stack([np.cos(turn), np.sin(turn)], axis=-1)
-    table = mi.Float(points.astype(np.float32).ravel())
+    table = mi.Float(disc_sets(samples, dimension).astype(np.float32).ravel())
     dr.eval(table)
     return table
+
+
+def disc_sets(samples: int, dimension: int) -> NDArray[np.float64]:
+    """Points of the unit disc, float64[set, sample, 2]: one in each ring and in each sector, as in each tile of a
+    few of both (Hammersley's points under random digit shifts).
+
+    A ring's radius is where the cosine from the Sun's vertical has the ring's mean: limb darkening, a polynomial
+    of that cosine, then adds no noise where the whole disc is seen. Both halves of a chessboard over the samples
+    take rings and sectors evenly, by the parity of the digits' sum.
+    """
+    rng = np.random.Generator(np.random.Philox(np.random.SeedSequence((samples, dimension))))
+    if samples == 1:
+        radius, turn = np.sqrt(rng.random((_DISC_SETS, 1))), 2 * np.pi * rng.random((_DISC_SETS, 1))
+        return radius[..., None] * np.stack([np.cos(turn), np.sin(turn)], axis=-1)
+    bits = samples.bit_length() - 1
+    k = np.arange(samples)
+    digits = (k[:, None] >> np.arange(bits)) & 1
+    mirrored = digits @ (1 << np.arange(bits)[::-1])
+    edge = (1 - np.arange(samples + 1) / samples) ** 1.5
+    mean_mu = 2 / 3 * samples * (edge[:-1] - edge[1:])
+    ring = k ^ rng.integers(samples, size=(_DISC_SETS, 1))
+    sector = mirrored ^ rng.integers(samples, size=(_DISC_SETS, 1))
+    radius = np.sqrt(1 - mean_mu[ring] ** 2)
+    turn = 2 * np.pi * (sector + rng.random(sector.shape)) / samples
+    points = radius[..., None] * np.stack([np.cos(turn), np.sin(turn)], axis=-1)
+    # which of them go to the white squares, and which to the black ones
+    colour = (k ^ (k >> bits // 2)) & 1
+    out = np.empty_like(points)
+    swap = rng.integers(2, size=_DISC_SETS)
+    for parity in (0, 1):
+        of_half = np.argsort((digits.sum(axis=1) & 1) != (parity ^ swap)[:, None], axis=1, kind="stable")
+        chosen = rng.permuted(of_half[:, : samples // 2], axis=1)
+        out[:, colour == parity] = np.take_along_axis(points, chosen[..., None], axis=1)
+    return out
 
 
 class Optics:

@@ -8,6 +8,7 @@ the facet's data come from tables instead of a virtual call: faster, and contact
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -88,7 +89,7 @@ class Hit:
         w = self._weights
         self.normal = dr.normalize(sum((c.xyz * w[k] for k, c in enumerate(self._corners)), mi.Vector3f(0)))
 
-    @property
+    @cached_property
     def dust(self) -> Any:
         """How far the ground is covered with dust, in [0, 1], interpolated over the facet."""
         table = self._surface._dust
@@ -97,12 +98,12 @@ class Hit:
         corners = dr.gather(mi.Vector4f, table, self._first, self.valid)
         return sum((corners[k] * w for k, w in enumerate(self._weights)), mi.Float(0))
 
-    def shading_normal(self, detail: Detail | None, index: Any, samples: int) -> Any:
-        """The normal turned by the relief finer than facets, for the sample `index` of its pixel's `samples`."""
+    def shading_normal(self, detail: Detail | None, dither: Any) -> Any:
+        """The normal turned by the relief finer than facets; `dither` in [0, 1), one number a pixel."""
         if detail is None:
             return self.normal
         point = self._rays(self.distance_m)
-        return detail.turned(self.normal, point, self._rays.d, self.distance_m, self.dust, index, samples)
+        return detail.turned(self.normal, point, self._rays.d, self.distance_m, self.dust, dither)
 
     def shadow_rays(self, direction: Any) -> Any:
         """Rays from the hits. The origin is moved off the facet to the smooth surface that the corner normals

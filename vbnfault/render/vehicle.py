@@ -6,6 +6,7 @@ built again from sample to sample, and parts near the camera keep float32's prec
 
 from __future__ import annotations
 
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -109,14 +110,14 @@ class VehicleHit:
         self.distance_m = dr.select(nearer, distance_m, ground.distance_m)
         self.normal = dr.select(nearer, normal, ground.normal)
 
-    @property
+    @cached_property
     def dust(self) -> Any:
         """As the ground's; none on the vehicle."""
         return dr.select(self.on_vehicle, 0, self._ground.dust)
 
-    def shading_normal(self, detail: Detail | None, index: Any, samples: int) -> Any:
+    def shading_normal(self, detail: Detail | None, dither: Any) -> Any:
         """As the ground's; the vehicle has no finer relief."""
-        return dr.select(self.on_vehicle, self.normal, self._ground.shading_normal(detail, index, samples))
+        return dr.select(self.on_vehicle, self.normal, self._ground.shading_normal(detail, dither))
 
     def shadow_rays(self, direction: Any) -> Any:
         """Rays from the hits, off the facet."""
