@@ -272,24 +272,28 @@ def _render_to_the_noise(frame: Frame, scene: Scene, fraction: float) -> None:
     signal_e = np.einsum("b,byx->yx", lens_and_sensor * exposure, frame.radiance.array)
     detector = frame.camera.detector
     sensor_e2 = signal_e + detector.dark_current_e_s * exposure + detector.read_noise_e_rms**2
-    # neither what is hardly lit nor what saturates shows this noise
-    lit = (signal_e > _LIT * detector.full_well_e) & (signal_e - 4 * error_e < detector.full_well_e)
-    worth = cv2.dilate(lit.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
-    samples, spent = scene.samples_per_pixel, np.full(error_e.shape, scene.samples_per_pixel, dtype=np.int32)
+    # neither what is hardly lit nor what saturates shows this noise; the latter is lit all the same
+    lit = signal_e > _LIT * detector.full_well_e
+    shows = lit & (signal_e - 4 * error_e < detector.full_well_e)
+    worth = cv2.dilate(shows.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    spent = np.full(error_e.shape, scene.samples_per_pixel, dtype=np.int32)
     while True:
-        share = np.sqrt(np.maximum(cv2.blur(np.where(worth, error_e, 0) ** 2, (3, 3)), 0) / sensor_e2)
-        noisy = np.flatnonzero((share > fraction) & worth & (spent == samples)).astype(np.uint32)
-        samples *= 4
-        if np.count_nonzero(share[lit] > fraction) <= _FEW * np.count_nonzero(lit):
+        # of nine pixels, each as if it had this one's samples: along an edge variance falls as their number^-3/2
+        each = np.where(worth, error_e**2 / sensor_e2, 0) * spent**1.5
+        share = np.sqrt(np.maximum(cv2.blur(each, (3, 3)), 0) / spent**1.5)
+        noisy = (share > fraction) & worth & (4 * spent <= settings.max_samples_per_pixel)
+        share[~shows] = 0
+        if np.count_nonzero(share[lit] > fraction) <= _FEW * np.count_nonzero(lit) or not noisy.any():
             break
-        if samples > settings.max_samples_per_pixel or not len(noisy):
-            break
-        # samples of their own: the first ones chose the pixel, and a lucky choice would be a bias
-        again = replace(scene, samples_per_pixel=samples, key=(scene.key + samples) & 0xFFFFFFFF)
-        more, halves = render.direct(surface, again, lens_and_sensor, noisy)
-        array.reshape(len(array), -1)[:, noisy] = more.array[:, 0]
-        error_e.ravel()[noisy] = np.abs(halves[0]) * exposure
-        spent.ravel()[noisy] = samples
+        for samples in np.unique(spent[noisy]):
+            chosen = np.flatnonzero(noisy & (spent == samples)).astype(np.uint32)
+            # samples of their own: the first ones chose the pixel, and a lucky choice would be a bias
+            key = (scene.key + 4 * int(samples)) & 0xFFFFFFFF
+            again = replace(scene, samples_per_pixel=4 * int(samples), key=key)
+            more, halves = render.direct(surface, again, lens_and_sensor, chosen)
+            array.reshape(len(array), -1)[:, chosen] = more.array[:, 0]
+            error_e.ravel()[chosen] = np.abs(halves[0]) * exposure
+        spent[noisy] *= 4
     frame.radiance = found.with_array(array + once_more)
     frame.samples_per_pixel = float(spent.mean())
     frame.noise_fraction_p99 = float(np.percentile(share[lit], 99)) if lit.any() else 0.0
