@@ -347,3 +347,35 @@ def test_commanded_where_it_already_is_changes_nothing() -> None:
     own = Reference.from_euler("XYZ", [10, 20, 30], degrees=True).as_matrix()
     sun_J = frames.unit(np.array([1.0, 2.0, -0.5]))
     np.testing.assert_allclose(frames.T_from_J_commanded(own, 3 * sun_J, 2 * (own @ sun_J)), own, atol=1e-15)
+
+
+def test_a_bodys_own_orbit() -> None:
+    """Elements of 67P written down give the built-in Sun; Kepler's third law gives the mean motion."""
+    from dataclasses import asdict
+
+    from conftest import small_scene
+
+    from vbnfault import config, world
+
+    elements = asdict(frames.ORBIT_67P)
+    built_in = world.ephemeris(config.parse_scene(small_scene(), source="test"))[0]
+    written = config.parse_scene(small_scene(orbit=elements), source="test")
+    np.testing.assert_array_equal(world.ephemeris(written)[0], built_in)
+    del elements["mean_motion_deg_day"]
+    derived = config.parse_scene(small_scene(orbit=elements), source="test")
+    # Gauss's constant and the published mean motion agree to 1e-7, over 273 days from perihelion
+    np.testing.assert_allclose(world.ephemeris(derived)[0], built_in, rtol=1e-5)
+    circle = {"eccentricity": 0.0, "perihelion_au": 1.0, "perihelion_jd": 2456974.0 - 365.2568984 / 4}
+    circle |= {"inclination_deg": 0.0, "node_deg": 0.0, "argument_deg": 0.0}
+    sun = world.ephemeris(config.parse_scene(small_scene(orbit=circle), source="test"))[0]
+    # a quarter of a Gaussian year after perihelion on +x: on +y of the ecliptic
+    tilt = np.radians(frames.OBLIQUITY_DEG)
+    np.testing.assert_allclose(-sun, [0, np.cos(tilt), np.sin(tilt)], atol=1e-8)
+
+
+def test_roll_pitch_and_yaw_come_back() -> None:
+    reference = frames.direction_L(40, 12)
+    angles = (20.0, -35.0, 170.0)
+    np.testing.assert_allclose(
+        frames.roll_pitch_yaw_deg(reference, frames.L_from_C(reference, *angles)), angles, atol=1e-9
+    )

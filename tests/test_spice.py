@@ -307,3 +307,76 @@ def test_what_the_kernels_do_not_hold_is_said_in_a_sentence(folder: Path) -> Non
             assert str(caught.value).endswith(".")
     with pytest.raises(InputError, match="no kernel with positions is loaded"):
         spice.sun_position_J_au(str(COMET), ET_S)
+
+
+# --- a scene on a spacecraft's way -----------------------------------------------------------------------------
+
+
+def test_a_scene_on_a_spacecrafts_way(folder: Path) -> None:
+    """Camera and Sun of every sample are SPICE's at its own date; the picture looks where the camera does."""
+    from conftest import small_scene
+
+    from vbnfault import config
+    from vbnfault.pipeline import Session
+
+    far = np.linalg.norm(POSITION_T_M)
+    # the bus holds an attitude of no importance: mount the camera so that it looks at the body's centre
+    with spice.kernels(*all_of(folder)):
+        T_from_K = spice.pose_T("TESTCRAFT", str(COMET), "COMET_FIXED", "TEST_CAMERA", ET_S).T_from_C
+    z = -POSITION_T_M / far
+    x = frames.unit(np.cross(z, [0.0, 0.0, 1.0]))
+    K_from_C = T_from_K.T @ np.column_stack([x, np.cross(z, x), z])
+    table = small_scene(
+        sun={"julian_date": JD - 200 / 86400},
+        spice={
+            "kernels": [str(path) for path in all_of(folder)],
+            "target": str(COMET),
+            "frame": "COMET_FIXED",
+            "spacecraft": "TESTCRAFT",
+            "camera_frame": "TEST_CAMERA",
+            "camera_axes": K_from_C.ravel().tolist(),
+            "until_julian_date": JD + 200 / 86400,
+        },
+    )
+    table["camera"]["fov_deg"] = 5.0
+    session = Session(config.parse_scene(table, source="test"))
+    middle = session.sites[0].position_T_m
+    across = np.cross(middle - POSITION_T_M, z)
+    assert np.linalg.norm(across) < far * 0.02  # 90 s before ET_S the body turns by 0.7°
+    dates = set()
+    for index in range(3):
+        sample = session.simulate(index).scalars
+        dates.add(sample["julian_date"])
+        with spice.kernels(*all_of(folder)):
+            et_s = spice.et_s_from_julian_date(sample["julian_date"])
+            T_from_J = spice.J_from_T("COMET_FIXED", et_s).T
+            sun_T = T_from_J @ frames.unit(spice.sun_position_J_au(str(COMET), et_s))
+        np.testing.assert_allclose(sample["camera_position_T_m"], POSITION_T_M, atol=0.05)
+        np.testing.assert_allclose(sample["sun_direction_T"], sun_T, atol=1e-9)
+        np.testing.assert_allclose(sample["T_from_J"], T_from_J, atol=1e-9)
+        Lx = np.array(sample["T_from_L"]).T @ sun_T
+        np.testing.assert_allclose(
+            frames.direction_L(sample["sun_azimuth_deg"], sample["sun_elevation_deg"]), Lx, atol=1e-9
+        )
+        turned = frames.L_from_C(Lx, sample["roll_deg"], sample["pitch_deg"], sample["yaw_deg"])
+        q = frames.quaternion((np.array(sample["T_from_L"]) @ turned).T)
+        np.testing.assert_allclose(q, sample["camera_from_T"], atol=1e-9)
+    assert len(dates) == 3
+
+
+@pytest.mark.parametrize(
+    ("table", "words"),
+    [
+        ({"spacecraft": "X"}, "needs kernels"),
+        ({"kernels": ["a.tm"], "spacecraft": "X"}, "needs frame"),
+        ({"kernels": ["a.tm"], "frame": "F", "spacecraft": "X"}, "needs camera_frame"),
+        ({"kernels": ["a.tm"], "camera_frame": "X"}, "need spacecraft"),
+    ],
+)
+def test_a_way_needs_all_its_keys(table: dict[str, Any], words: str) -> None:
+    from conftest import small_scene
+
+    from vbnfault import config
+
+    with pytest.raises(InputError, match=words):
+        config.parse_scene(small_scene(spice=table), source="test")

@@ -204,17 +204,47 @@ class SunTable(Table):
     limb_darkening: bool = Field(True, description="after Neckel & Labs 1994; else a uniform disc")
 
 
+class OrbitTable(Table):
+    """The body's two-body orbit about the Sun, ecliptic and equinox J2000; default: 67P's of 2015."""
+
+    eccentricity: float = Field(ge=0, lt=1)
+    perihelion_au: float = Field(gt=0.01, le=1000)
+    inclination_deg: float = Field(ge=0, le=180)
+    node_deg: float = Field(ge=-360, le=360)
+    argument_deg: float = Field(ge=-360, le=360, description="of perihelion")
+    perihelion_jd: float = Field(ge=1_000_000, le=5_000_000, description="TDB")
+    mean_motion_deg_day: float | None = Field(None, gt=0, le=1000, description="default: Kepler's third law")
+
+
 class SpiceTable(Table):
-    """SPICE kernels for the Sun's place and the target's attitude; without, the built-in 67P."""
+    """SPICE kernels for the Sun's place, the target's attitude and a spacecraft's pose; without, the built-in 67P.
+
+    With a spacecraft, samples lie on its way from `sun.julian_date` to `until_julian_date`, which the sites share
+    out among themselves: `[geometry]` and the Sun's bounds do not count.
+    """
 
     kernels: tuple[str, ...] = Field((), description="kernels or meta-kernels; needs the extra 'spice'")
     target: str = Field("CHURYUMOV-GERASIMENKO", description="SPICE name or number")
     frame: str = Field("", description="body-fixed frame; default: pole and period of [body]")
+    spacecraft: str = Field("", description="SPICE name or number of what carries the camera")
+    camera_frame: str = Field("", description="the camera's frame, such as ROS_NAVCAM-A")
+    camera_axes: tuple[float, float, float, float, float, float, float, float, float] | None = Field(
+        None, description="rows of the rotation from image axes (x right, y down, z boresight) to camera_frame"
+    )
+    until_julian_date: float | None = Field(
+        None, ge=1_000_000, le=5_000_000, description="TDB; default: all samples at sun.julian_date"
+    )
 
     @model_validator(mode="after")
     def _served(self) -> SpiceTable:
         if self.frame and not self.kernels:
             raise ValueError(f"frame = {self.frame!r}: needs kernels")
+        if self.spacecraft:
+            for key in ("kernels", "frame", "camera_frame"):
+                if not getattr(self, key):
+                    raise ValueError(f"spacecraft = {self.spacecraft!r}: needs {key}")
+        elif self.camera_frame or self.camera_axes:
+            raise ValueError("camera_frame and camera_axes need spacecraft")
         return self
 
 
@@ -379,6 +409,7 @@ class SceneConfig(Table):
     body: BodyTable = BodyTable()
     patch: PatchTable = PatchTable()
     sun: SunTable = SunTable()
+    orbit: OrbitTable | None = None
     spice: SpiceTable = SpiceTable()
     spacecraft: SpacecraftTable = SpacecraftTable()
     sky: SkyTable = SkyTable()

@@ -66,8 +66,14 @@ def _contents_of_files(identity: dict[str, Any], scene: SceneConfig) -> None:
     if scene.spice.kernels:
         # a meta-kernel only names others: what follows from them all says more than its own text
         sun_J_au, T_from_J = world.ephemeris(scene)
-        numbers = config.content_hash([*sun_J_au.tolist(), *T_from_J.ravel().tolist()])
+        follows = [*sun_J_au.tolist(), *T_from_J.ravel().tolist()]
+        if scene.spice.spacecraft:
+            for k in range(scene.dataset.sites):
+                pose = world.spacecraft_pose(scene, world.epoch_jd(scene, k, 0.5))
+                follows += [*pose.camera_position_T_m.tolist(), *pose.T_from_C.ravel().tolist()]
+        numbers = config.content_hash(follows)
         identity["spice"]["kernels"] = [f"ephemeris:{numbers}"]
+        identity["spice"]["spiceypy"] = importlib.metadata.version("spiceypy")
     if scene.sky.stars != "off":
         identity["sky"]["catalogue"] = digest(resources.data_dir("catalogues") / "stars.npz")
 

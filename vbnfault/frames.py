@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 F64 = NDArray[np.float64]
 
 J2000_JD = 2451545.0
+GAUSS_DEG_DAY = np.degrees(0.01720209895)  # mean motion at 1 au: Gauss's constant
 OBLIQUITY_DEG = 23.4392911  # ecliptic → ICRF, IAU 1976 at J2000
 
 
@@ -77,6 +78,14 @@ def L_from_C(reference_L: F64, roll_deg: float, pitch_deg: float, yaw_deg: float
     """Camera axes in L from the reference direction and the three Euler angles (module docstring)."""
     roll, pitch, yaw = np.radians([roll_deg, pitch_deg, yaw_deg])
     return L_from_C0(reference_L) @ rx(roll) @ ry(pitch) @ rz(yaw)
+
+
+def roll_pitch_yaw_deg(reference_L: F64, L_from_C_: F64) -> tuple[float, float, float]:
+    """The Euler angles of camera axes in L: the inverse of `L_from_C`, pitch within ±90°."""
+    m = L_from_C0(reference_L).T @ L_from_C_
+    pitch = np.arcsin(np.clip(m[0, 2], -1, 1))
+    roll, yaw = np.arctan2(-m[1, 2], m[2, 2]), np.arctan2(-m[0, 1], m[0, 0])
+    return float(np.degrees(roll)), float(np.degrees(pitch)), float(np.degrees(yaw))
 
 
 def boresight_angle_deg(roll_deg: F64 | float, pitch_deg: F64 | float) -> F64:

@@ -137,12 +137,16 @@ def develop_frame(spec: SampleSpec) -> Frame:
 def resolve(frame: Frame) -> None:
     """Settle height and Sun elevation against the terrain, by keyed tries of the proposal.
 
-    A try is accepted when nothing lies within the clearance, when a Sun-averted camera does not look at the Sun
-    and when a straylight sample sees the whole of it. If none is, the last clear one is taken.
+    A try is accepted when nothing lies within the clearance, when the spacecraft does not reach into the ground,
+    when a Sun-averted camera does not look at the Sun and when a straylight sample sees the whole of it. If none
+    is, the last clear one is taken. A spacecraft that SPICE places stays where it is.
     """
     from . import render
 
     spec = frame.spec
+    if spec.scene.spice.spacecraft:
+        frame.pose = _on_the_way(spec)
+        return
     scene, i = spec.scene, spec.index
     samples, stratum = np.full(1, i), spec.plan.stratum[i : i + 1]
     fixed = {name: float(values[i]) for name, values in spec.plan.variables.items()}
@@ -173,8 +177,12 @@ def resolve(frame: Frame) -> None:
             angle = np.degrees(np.arccos(np.clip(axes[:, 2] @ suns[k].direction_L, -1, 1)))
             averted_ok = stratum[0] != plan.SUN_AVERTED or angle >= least
             vehicle = spec.terrain.vehicle
-            if vehicle is not None and vehicle.blocked((axes.T @ suns[k].direction_L)[None])[0]:
-                visible[k] = 0.0
+            if vehicle is not None:
+                if vehicle.blocked((axes.T @ suns[k].direction_L)[None])[0]:
+                    visible[k] = 0.0
+                if clear[k]:
+                    parts = position[k] + vehicle.outline_B_m @ axes.T
+                    clear[k] = not render.is_between(surface, position[k], parts)
             good = bool(clear[k] and averted_ok and (not needs_sun or visible[k] == 1.0))
             pose = Pose(
                 position_L_m=position[k],
@@ -193,6 +201,33 @@ def resolve(frame: Frame) -> None:
                 fallback = pose
     assert fallback is not None
     frame.pose = replace(fallback, tries=geometry.max_tries)
+
+
+def _on_the_way(spec: SampleSpec) -> Pose:
+    """Camera and Sun where SPICE has them at the sample's epoch, which is its scene's."""
+    from . import render
+
+    scene, site, surface = spec.scene, spec.terrain.site, spec.terrain.surface
+    placed = world.spacecraft_pose(scene, scene.sun.julian_date)
+    sun_J_au, T_from_J = world.ephemeris(scene)
+    L_from_T = site.T_from_L.T
+    position = L_from_T @ (placed.camera_position_T_m - site.position_T_m)
+    axes, sun_L = L_from_T @ placed.T_from_C, L_from_T @ T_from_J @ frames.unit(sun_J_au)
+    visible = float(render.sun_visible_fraction(surface, position[None], [world.sunlight(scene, sun_L)])[0])
+    if spec.terrain.vehicle is not None and spec.terrain.vehicle.blocked((axes.T @ sun_L)[None])[0]:
+        visible = 0.0
+    azimuth, elevation = frames.azimuth_elevation_deg(sun_L)
+    clear = bool(render.is_clear(surface, position[None], scene.geometry.clearance_m)[0])
+    return Pose(
+        position_L_m=position,
+        L_from_C=axes,
+        sun_L=sun_L,
+        sun_azimuth_deg=azimuth,
+        sun_elevation_deg=elevation,
+        sun_visible_fraction=visible,
+        tries=1,
+        resolved=clear and (visible == 1.0 or not spec.plan.injects(plan.STRAYLIGHT)[spec.index]),
+    )
 
 
 def _attitude(scene: SceneConfig, stratum: int, sun_L: F64, fixed: Mapping[str, float]) -> F64:
@@ -630,6 +665,9 @@ def to_sample(frame: Frame) -> Sample:
     sun_T = T_from_L @ pose.sun_L
     sun_xy = frame.context.sun_xy_px
     fixed = {name: float(values[i]) for name, values in spec.plan.variables.items()}
+    angles = fixed["roll_deg"], fixed["pitch_deg"], fixed["yaw_deg"]
+    if spec.scene.spice.spacecraft:
+        angles = frames.roll_pitch_yaw_deg(pose.sun_L, pose.L_from_C)
     scalars: dict[str, Any] = {
         "injected": np.array([name in frame.drawn for name in names]),
         "camera_position_T_m": site.position_T_m + T_from_L @ pose.position_L_m,
@@ -644,9 +682,9 @@ def to_sample(frame: Frame) -> Sample:
         "intrinsics": frame.camera.intrinsics,
         "sun_azimuth_deg": pose.sun_azimuth_deg,
         "sun_elevation_deg": pose.sun_elevation_deg,
-        "roll_deg": fixed["roll_deg"],
-        "pitch_deg": fixed["pitch_deg"],
-        "yaw_deg": fixed["yaw_deg"],
+        "roll_deg": angles[0],
+        "pitch_deg": angles[1],
+        "yaw_deg": angles[2],
         "sun_xy_px": np.full(2, np.nan) if sun_xy is None else sun_xy,
         "sun_visible_fraction": pose.sun_visible_fraction,
         "exposure_s": frame.camera.exposure_s,
@@ -763,6 +801,8 @@ class Session:
     @cached_property
     def sites(self) -> tuple[Site, ...]:
         """All sites of the scene."""
+        if self.scene.spice.spacecraft:
+            return world.way_sites(self.scene, self.body)
         return choose_sites(self.body, self.scene.dataset.sites, self.scene.dataset.seed)
 
     def terrain(self, site: int) -> Terrain:
@@ -822,14 +862,13 @@ class Session:
         )
 
     def spec(self, index: int) -> SampleSpec:
-        """What `simulate` needs for one sample."""
-        return SampleSpec(
-            index=index,
-            scene=self.scene,
-            plan=self.plan,
-            faults=self.faults,
-            terrain=self.terrain(int(self.plan.site[index])),
-        )
+        """What `simulate` needs for one sample. On a spacecraft's way every sample has a date of its own."""
+        scene, site = self.scene, int(self.plan.site[index])
+        if scene.spice.spacecraft:
+            share = float(config.keyed_uniform(scene.dataset.seed, np.array([index]), "plan", "epoch")[0])
+            sun = scene.sun.model_copy(update={"julian_date": world.epoch_jd(scene, site, share)})
+            scene = scene.model_copy(update={"sun": sun})
+        return SampleSpec(index=index, scene=scene, plan=self.plan, faults=self.faults, terrain=self.terrain(site))
 
     def simulate(self, index: int) -> Sample:
         """One finished sample."""

@@ -12,7 +12,7 @@ import re
 import warnings
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any, Literal
 
@@ -183,6 +183,12 @@ class SpacecraftMesh:
     def reflectance(self, wavelength_nm: F64) -> F64:
         """Lambert reflectance, float64[material, band]."""
         return np.stack([material.at(wavelength_nm) for material in self.materials])
+
+    @cached_property
+    def outline_B_m(self) -> F64:
+        """Vertices that tell how far the vehicle reaches, float64[256, 3]: every n-th, or some more than once."""
+        n = len(self.vertices_B_m)
+        return self.vertices_B_m[np.linspace(0, n - 1, 256).astype(int)].astype(np.float64)
 
     def blocked(self, directions_B: F64) -> NDArray[np.bool_]:
         """Which of the rays from the pupil's centre along `directions_B`, float64[n, 3], meet the vehicle."""

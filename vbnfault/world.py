@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from . import camera as cameras
 from . import frames, photometry, sky, spectra, spice
-from .body import Body, load_body
+from .body import Body, Site, load_body, site_at
 from .camera import Camera
-from .config import BodyTable, PoseTable, SceneConfig, SpiceTable, SunTable
+from .config import BodyTable, OrbitTable, PoseTable, SceneConfig, SpiceTable, SunTable
 from .detector import Detector
 from .errors import InputError
 from .lens import ThinLens
@@ -35,7 +35,9 @@ _STAR_OVER_READ_NOISE = 0.1
 
 
 @lru_cache(maxsize=8)
-def _ephemeris(sun: SunTable, body: BodyTable, kernels: SpiceTable) -> tuple[tuple[float, ...], tuple[float, ...]]:
+def _ephemeris(
+    sun: SunTable, body: BodyTable, orbit: OrbitTable | None, kernels: SpiceTable
+) -> tuple[tuple[float, ...], tuple[float, ...]]:
     date = sun.julian_date
     own = frames.Rotation(
         pole_ra_deg=body.pole_ra_deg,
@@ -43,7 +45,7 @@ def _ephemeris(sun: SunTable, body: BodyTable, kernels: SpiceTable) -> tuple[tup
         prime_meridian_deg=body.prime_meridian_deg,
         period_h=body.rotation_period_h,
     ).J_from_T(date)
-    sun_J_au = -frames.ORBIT_67P.position_J_au(date)
+    sun_J_au = -_orbit(orbit).position_J_au(date)
     if kernels.kernels:
         with spice.kernels(*kernels.kernels):
             et_s = spice.et_s_from_julian_date(date)
@@ -56,11 +58,66 @@ def _ephemeris(sun: SunTable, body: BodyTable, kernels: SpiceTable) -> tuple[tup
 def ephemeris(scene: SceneConfig) -> tuple[F64, F64]:
     """The Sun seen from the target in J, float64[3] in au, and the target's own T_from_J, float64[3, 3].
 
-    From SPICE kernels where the scene names some, else from 67P's two-body orbit and the pole and period of
-    `[body]`. Raises InputError for kernels that do not serve.
+    From SPICE kernels where the scene names some, else from the two-body `[orbit]` (67P's by default) and the pole
+    and period of `[body]`. Raises InputError for kernels that do not serve.
     """
-    sun_J_au, own = _ephemeris(scene.sun, scene.body, scene.spice)
+    sun_J_au, own = _ephemeris(scene.sun, scene.body, scene.orbit, scene.spice)
     return np.array(sun_J_au), np.array(own).reshape(3, 3)
+
+
+def _orbit(table: OrbitTable | None) -> frames.Orbit:
+    if table is None:
+        return frames.ORBIT_67P
+    elements = table.model_dump()
+    if table.mean_motion_deg_day is None:
+        semi_major_au = table.perihelion_au / (1 - table.eccentricity)
+        elements["mean_motion_deg_day"] = frames.GAUSS_DEG_DAY * semi_major_au**-1.5
+    return frames.Orbit(**elements)
+
+
+def epoch_jd(scene: SceneConfig, site: int, share: float) -> float:
+    """TDB Julian date at that share, 0 to 1, of the time that a site has on the spacecraft's way."""
+    start, end = scene.sun.julian_date, scene.spice.until_julian_date
+    return start if end is None else start + (end - start) * (site + share) / scene.dataset.sites
+
+
+@lru_cache(maxsize=256)
+def _spacecraft_pose(table: SpiceTable, julian_date: float) -> spice.Pose:
+    axes = None if table.camera_axes is None else np.array(table.camera_axes).reshape(3, 3)
+    with spice.kernels(*table.kernels):
+        et_s = spice.et_s_from_julian_date(julian_date)
+        return spice.pose_T(table.spacecraft, table.target, table.frame, table.camera_frame, et_s, axes)
+
+
+def spacecraft_pose(scene: SceneConfig, julian_date: float) -> spice.Pose:
+    """Where SPICE has the scene's spacecraft and its camera. Raises InputError for kernels that do not serve."""
+    return _spacecraft_pose(scene.spice, julian_date)
+
+
+def way_sites(scene: SceneConfig, body: Body) -> tuple[Site, ...]:
+    """The sites of a scene on a spacecraft's way: the ground in the middle of the picture, half-way through each
+    site's time; where the camera looks past the body, the ground nearest to the line of sight."""
+    sites = []
+    for k in range(scene.dataset.sites):
+        pose = spacecraft_pose(scene, epoch_jd(scene, k, 0.5))
+        sites.append(site_at(body, k, looked_at(body, pose.camera_position_T_m, pose.T_from_C[:, 2])))
+    return tuple(sites)
+
+
+def looked_at(body: Body, origin_T_m: F64, direction_T: F64) -> F64:
+    """Where a ray first meets the body's shape model, float64[3] metres in T; else the vertex nearest to it."""
+    a, b, c = (body.vertices_m[body.faces[:, k]] - origin_T_m for k in range(3))
+    normal = np.cross(b - a, c - a)
+    turn = np.stack([np.cross(p, q) @ direction_T for p, q in ((a, b), (b, c), (c, a))])
+    facing = normal @ direction_T
+    with np.errstate(divide="ignore", invalid="ignore"):
+        distance = np.einsum("ni,ni->n", a, normal) / facing
+    hit = ((turn >= 0).all(axis=0) | (turn <= 0).all(axis=0)) & (distance > 0)
+    if hit.any():
+        return np.asarray(origin_T_m + distance[hit].min() * direction_T)
+    away = body.vertices_m - origin_T_m
+    along = np.maximum(away @ direction_T, 0)
+    return np.asarray(body.vertices_m[np.argmin(np.linalg.norm(away - along[:, None] * direction_T, axis=1))])
 
 
 def sun_distance_au(scene: SceneConfig) -> float:

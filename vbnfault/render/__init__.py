@@ -5,7 +5,7 @@ from .detail import FineRelief
 from .integrate import radiance
 from .layers import truth
 from .light import direct
-from .resolve import ground_height_m, is_clear, sun_visible_fraction
+from .resolve import ground_height_m, is_between, is_clear, sun_visible_fraction
 from .runtime import set_threads
 from .surface import Surface
 from .vehicle import Vehicle
@@ -50,6 +50,7 @@ __all__ = [
     "direct",
     "ground_height_m",
     "indirect",
+    "is_between",
     "is_clear",
     "radiance",
     "self_test",

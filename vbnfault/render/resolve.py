@@ -51,6 +51,13 @@ def is_clear(surface: Surface, position_L_m: F64, clearance_m: float) -> NDArray
     return np.asarray(~_any_hit(surface, position_L_m, directions[None], clearance_m).any(axis=1))
 
 
+def is_between(surface: Surface, origin_L_m: F64, points_L_m: F64) -> bool:
+    """Whether any surface lies between `origin_L_m`, float64[3], and any of the points, float64[n, 3]."""
+    way = points_L_m - origin_L_m
+    length = np.maximum(np.linalg.norm(way, axis=1), 1e-9)
+    return bool(_any_hit(surface, origin_L_m[None], (way / length[:, None])[None], length).any())
+
+
 def sun_visible_fraction(surface: Surface, position_L_m: F64, suns: list[Sunlight]) -> F64:
     """Share of the Sun's disc not hidden by the body, float64[n], from 64 points of the disc each."""
     k = np.arange(_SUN_SAMPLES) + 0.5  # a sunflower: equal areas
@@ -71,14 +78,15 @@ def sun_visible_fraction(surface: Surface, position_L_m: F64, suns: list[Sunligh
     return 1 - _any_hit(surface, position_L_m, np.stack(directions), np.inf).mean(axis=1)
 
 
-def _any_hit(surface: Surface, position: F64, directions: F64, reach_m: float) -> NDArray[np.bool_]:
-    """bool[n, k] for positions float64[n, 3] and directions float64[n or 1, k, 3]."""
+def _any_hit(surface: Surface, position: F64, directions: F64, reach_m: float | F64) -> NDArray[np.bool_]:
+    """bool[n, k] for positions float64[n, 3] and directions float64[n or 1, k, 3], as far as `reach_m`, which may
+    be one number for each of the n · k."""
     n, k = len(position), directions.shape[1]
     origins = np.repeat(position, k, axis=0)
     d = np.broadcast_to(directions, (n, k, 3)).reshape(-1, 3)
     o = mi.Point3f(*(mi.Float(np.ascontiguousarray(c, np.float32)) for c in origins.T))
     v = mi.Vector3f(*(mi.Float(np.ascontiguousarray(c, np.float32)) for c in d.T))
     rays = mi.Ray3f(o, v)
-    rays.maxt = mi.Float(min(reach_m, 3e38))
+    rays.maxt = mi.Float(np.minimum(reach_m, 3e38).astype(np.float32))
     hits = surface.occluded(rays, mi.Bool(True), coherent=False)
     return hits.numpy().astype(bool).reshape(n, k)
