@@ -15,9 +15,9 @@ ROOT = Path(__file__).parents[1]
 def test_benchmarks_print_every_stage_and_ratio(tmp_path: Path) -> None:
     options = [
         "--size",
-        "128",
+        "96",
         "--facet-m",
-        "3",
+        "6",
         "--rounds",
         "1",
         "--deselect",

@@ -185,7 +185,7 @@ def test_noise_of_sampling_stays_below_the_sensors() -> None:
             signal + detector.read_noise_e_rms**2 + detector.dark_current_e_s * frame.camera.exposure_s
         )
         lit = (signal > 0.01 * detector.full_well_e) & (signal < 0.9 * detector.full_well_e)
-        if lit.sum() < 300:
+        if lit.sum() < 200:
             continue
         judged += 1
         if judged > 3:
