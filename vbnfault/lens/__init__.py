@@ -1,5 +1,17 @@
 """The optics: from scene radiance to irradiance on the sensor plane."""
 
+from .first_order import FirstOrder, first_order, scaled_to_field, scaled_to_focal_length
+from .prescription import Prescription, Surface, load_lens, parse_lens
 from .thin import ThinLens
 
-__all__ = ["ThinLens"]
+__all__ = [
+    "FirstOrder",
+    "Prescription",
+    "Surface",
+    "ThinLens",
+    "first_order",
+    "load_lens",
+    "parse_lens",
+    "scaled_to_field",
+    "scaled_to_focal_length",
+]

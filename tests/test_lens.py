@@ -1,0 +1,238 @@
+"""Prescriptions, glass and coatings against published values, closed forms and the package tmm."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from vbnfault import resources
+from vbnfault.errors import InputError
+from vbnfault.lens import first_order, load_lens, parse_lens, scaled_to_field, scaled_to_focal_length
+from vbnfault.lens.coating import NAMES, Layer, design, mean_reflectance, reflect_transmit
+from vbnfault.lens.first_order import gap, refraction, system
+from vbnfault.lens.glass import GLASSES, from_abbe
+
+# (EFL, BFD, f-number by the paraxial pupil), the patents' rows recomputed
+PUBLISHED = {
+    "nikkor_35_f2p8": (36.00, 38.65, 2.72),
+    "nikkor_28_f2p8": (28.60, 38.09, 2.76),
+    "distagon_25_f2p8": (25.00, 37.19, 2.68),
+    "tessar_50_f2p8": (49.94, 40.27, 2.74),
+    "heliar_100_f3p5": (100.6, 82.6, 3.49),
+    "biotar_100_f1p4": (99.91, 65.33, 1.437),
+}
+
+
+def test_every_published_lens_is_packaged() -> None:
+    assert set(PUBLISHED) <= set(resources.packaged("scenes/lenses"))
+
+
+@pytest.mark.parametrize("name", PUBLISHED)
+def test_first_order_properties(name: str) -> None:
+    lens = load_lens(name)
+    found = first_order(lens)
+    efl, bfd, f_number = PUBLISHED[name]
+    # the published figures are rounded to their last digit
+    assert found.efl_mm == pytest.approx(efl, abs=0.006 if efl < 100 else 0.06)
+    assert found.bfd_mm == pytest.approx(bfd, abs=0.006 if bfd != 82.6 else 0.06)
+    assert found.f_number == pytest.approx(f_number, abs=0.006)
+    # a ray along the axis's direction through the entrance pupil's rim meets the rim of the stop
+    front = system(lens, 0, lens.stop - 1)
+    front = gap(lens.surfaces[lens.stop - 1].thickness_mm) @ front
+    rim, _ = front @ [found.entrance_pupil_diameter_mm / 2, 0.0]
+    assert rim == pytest.approx(lens.surfaces[lens.stop].semi_diameter_mm, rel=1e-12)
+    # a ray to the middle of the entrance pupil leaves from the middle of the exit pupil
+    whole = system(lens, 0, len(lens.surfaces) - 1)
+    height, slope = whole @ [-found.entrance_pupil_mm * 0.1, 0.1]
+    assert height + slope * found.exit_pupil_mm == pytest.approx(0.0, abs=1e-9)
+
+
+def test_a_thick_lens_and_two_thin_ones() -> None:
+    """Closed forms: the lensmaker's equation with thickness; two lenses a distance apart."""
+    n, r1, r2, d = 1.5, 50.0, -80.0, 6.0
+    lens = parse_lens(
+        {
+            "surface": [
+                {"stop": True, "diameter_mm": 10.0, "thickness_mm": 0.0},
+                {"radius_mm": r1, "thickness_mm": d, "nd": n, "diameter_mm": 12.0},
+                {"radius_mm": r2, "diameter_mm": 12.0},
+            ]
+        },
+        source="thick",
+    )
+    power = (n - 1) * (1 / r1 - 1 / r2 + (n - 1) * d / (n * r1 * r2))
+    found = first_order(lens)
+    assert found.efl_mm == pytest.approx(1 / power, rel=1e-12)
+    assert found.bfd_mm == pytest.approx((1 - (n - 1) * d / (n * r1)) / power, rel=1e-12)
+    assert found.entrance_pupil_mm == pytest.approx(0.0, abs=1e-12)
+    assert found.f_number == pytest.approx(found.efl_mm / 10.0, rel=1e-12)
+    np.testing.assert_allclose(refraction(1.0, 1.5, 0.02) @ [1.0, 0.0], [1.0, -0.5 * 0.02 / 1.5])
+
+
+def test_scaling() -> None:
+    lens = load_lens("nikkor_35_f2p8")
+    scaled = scaled_to_focal_length(lens, 7.9)
+    assert first_order(scaled).efl_mm == pytest.approx(7.9, rel=1e-12)
+    assert first_order(scaled).f_number == pytest.approx(first_order(lens).f_number, rel=1e-12)
+    wide = scaled_to_field(lens, 65.0, 10.0)
+    assert math.degrees(2 * math.atan(5.0 / first_order(wide).efl_mm)) == pytest.approx(65.0, rel=1e-9)
+    glass = GLASS | {"conic": -1.0, "aspheric_mm": [1e-5, -2e-8]}
+    conic = parse_lens({"surface": [STOP, glass, BACK]}, source="asphere")
+    heights = np.array([0.0, 1.0, 4.0])
+    np.testing.assert_allclose(
+        conic.scaled(3.0).surfaces[1].sag_mm(3 * heights), 3 * conic.surfaces[1].sag_mm(heights), rtol=1e-12
+    )
+    np.testing.assert_allclose(
+        conic.surfaces[1].sag_mm(heights), heights**2 / 100 + 1e-5 * heights**4 - 2e-8 * heights**6, rtol=1e-12
+    )
+
+
+# --- glass ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("name", "nd", "vd"),
+    [
+        ("N-BK7", 1.5168, 64.17),
+        ("F2", 1.62004, 36.37),
+        ("SF6", 1.80518, 25.43),
+        ("silica", 1.45846, 67.82),
+        ("BK7G18", 1.519747, 63.65),
+    ],
+)
+def test_catalogued_glasses_have_their_published_index(name: str, nd: float, vd: float) -> None:
+    assert GLASSES[name].nd == pytest.approx(nd, abs=6e-6)
+    assert GLASSES[name].vd == pytest.approx(vd, abs=0.006)
+
+
+def test_a_glass_from_its_abbe_number() -> None:
+    glass = from_abbe(1.6516, 58.5)
+    assert glass.nd == pytest.approx(1.6516, rel=1e-12)
+    assert glass.vd == pytest.approx(58.5, rel=1e-9)
+    assert float(from_abbe(1.7, None).index(400.0)) == 1.7
+
+
+# --- coatings ---------------------------------------------------------------------------------------------------
+
+BK7 = 1.5185  # at 550 nm
+
+
+def test_coatings_against_tmm() -> None:
+    tmm = pytest.importorskip("tmm", reason="tmm (of the extra 'test') is not installed")
+    stacks = [design(name, BK7) for name in NAMES] + [
+        (Layer(n=1.46, k=0.02, thickness_nm=310.0), Layer(n=0.06, k=3.6, thickness_nm=12.0)),  # with a metal
+    ]
+    for layers in stacks:
+        for front, back in ((1.0, BK7), (BK7, 1.0), (1.33, 1.8)):
+            most = math.degrees(math.asin(min(1.0, back / front)))
+            for angle in np.radians([0.0, 20.0, 0.95 * most]):
+                for wavelength in (400.0, 550.0, 871.0):
+                    ours = reflect_transmit(layers, front, back, np.cos(angle), wavelength)
+                    n = [front, *(f.n + 1j * f.k for f in layers), back]
+                    d = [np.inf, *(f.thickness_nm for f in layers), np.inf]
+                    theirs = [tmm.coh_tmm(p, n, d, angle, wavelength) for p in "sp"]
+                    expected = [t[key] for key in ("R", "T") for t in theirs]
+                    np.testing.assert_allclose([float(v) for v in ours], expected, atol=1e-9)
+
+
+def test_published_reflectances() -> None:
+    """Per cent on N-BK7, non-dispersive; V: 125.9 and 19.4 nm; at 45° and 550 nm 2.09 for magnesium fluoride."""
+    wavelength = np.array([450.0, 550.0, 650.0, 700.0])
+    got = {name: 100 * mean_reflectance(design(name, 1.5168), 1.0, 1.5168, 1.0, wavelength) for name in NAMES}
+    assert got["none"][0] == pytest.approx(4.22, abs=0.01)
+    np.testing.assert_allclose(got["mgf2"], [1.63, 1.28, 1.46, 1.61], atol=0.03)
+    np.testing.assert_allclose(got["v"], [2.60, 0.00, 0.93, 1.62], atol=0.05)
+    thick, thin = design("v", 1.5168)
+    assert (thick.thickness_nm, thin.thickness_nm) == pytest.approx((125.9, 19.4), abs=0.1)
+    tilted = 100 * mean_reflectance(design("mgf2", 1.5168), 1.0, 1.5168, np.sqrt(0.5), 550.0)
+    assert tilted == pytest.approx(2.09, abs=0.03)
+    for index in (1.5168, 1.65, 1.805, 1.9):  # designed for the glass
+        broad = 100 * mean_reflectance(design("bbar", index), 1.0, index, 1.0, np.linspace(430, 670, 25))
+        assert broad.mean() < 0.5
+        assert 100 * mean_reflectance(design("v", index), 1.0, index, 1.0, 550.0) < 0.05
+
+
+def test_energy_is_conserved_and_both_ways_alike() -> None:
+    cosines = np.cos(np.radians([0.0, 30.0, 60.0, 85.0]))
+    wavelength = np.array([[400.0], [700.0]])
+    for name in NAMES:
+        layers = design(name, BK7)
+        rs, rp, ts, tp = reflect_transmit(layers, 1.0, BK7, cosines, wavelength)
+        np.testing.assert_allclose(rs + ts, 1, atol=1e-12)
+        np.testing.assert_allclose(rp + tp, 1, atol=1e-12)
+        inside = np.sqrt(1 - (1 - cosines**2) / BK7**2)
+        back = reflect_transmit(layers[::-1], BK7, 1.0, inside, wavelength)
+        np.testing.assert_allclose(back[0], rs, atol=1e-10)
+        np.testing.assert_allclose(back[3], tp, atol=1e-10)
+
+
+def test_a_coating_faces_the_air() -> None:
+    lens = parse_lens({"surface": [STOP, GLASS | {"coating": "v"}, BACK | {"coating": "v"}]}, source="coated")
+    front, back = (surface.coating for surface in lens.surfaces[1:])
+    assert front == back[::-1]
+    assert front[0].n == 1.38
+
+
+# --- bad input --------------------------------------------------------------------------------------------------
+
+GLASS: dict[str, Any] = {"radius_mm": 50.0, "thickness_mm": 4.0, "nd": 1.5, "vd": 60.0, "diameter_mm": 20.0}
+GLASS |= {"stop": False}
+BACK: dict[str, Any] = {"radius_mm": -50.0, "diameter_mm": 20.0}
+STOP: dict[str, Any] = {"stop": True, "thickness_mm": 1.0, "diameter_mm": 10.0}
+
+
+def lens_of(*rows: dict[str, Any], **more: Any) -> dict[str, Any]:
+    return {"surface": list(rows), **more}
+
+
+@pytest.mark.parametrize(
+    ("table", "words"),
+    [
+        ({}, ["surface", "at least one"]),
+        (lens_of(GLASS, BACK), ["stop", "none has"]),
+        (lens_of(STOP, GLASS, BACK | {"thickness_mm": 1.0}, STOP), ["stop", "surfaces 0, 3"]),
+        (lens_of(STOP, GLASS | {"radius_mm": 9.0}, BACK), ["surface 1", "diameter_mm = 20", "radius_mm = 9"]),
+        (lens_of(STOP, GLASS | {"thickness_mm": -1.0}, BACK), ["surface 1", "thickness_mm = -1.0", "0 to 1e+06"]),
+        (lens_of(STOP, GLASS | {"thickness_mm": 0.5}, BACK), ["surface 1", "thickness_mm = 0.5", "cross"]),
+        (lens_of(STOP, GLASS | {"nd": 0.9}, BACK), ["surface 1", "nd = 0.9", "from 1 to 5"]),
+        (lens_of(STOP, GLASS | {"coating": "gold"}, BACK), ["surface 1", "'gold'", "mgf2"]),
+        (lens_of(STOP, GLASS | {"coating": [{"n": 1.4}]}, BACK), ["coating[0]", "thickness_nm", "missing"]),
+        (lens_of(STOP, {**GLASS, "glass": "X9"}, BACK), ["surface 1", "either glass or nd"]),
+        (lens_of(STOP, {k: v for k, v in GLASS.items() if k[1] != "d"} | {"glass": "X9"}, BACK), ["'X9'", "N-BK7"]),
+        (lens_of(STOP, GLASS, BACK | {"nd": 1.5}), ["surface 2", "air"]),
+        (lens_of(STOP, GLASS | {"radius": 3.0}, BACK), ["surface 1", "radius", "unknown key"]),
+        (lens_of(STOP, GLASS | {"radius_mm": True}, BACK), ["radius_mm = True"]),
+        (lens_of(STOP, GLASS | {"radius_mm": 0.0}, BACK), ["radius_mm = 0", "inf"]),
+        (lens_of(STOP, GLASS, BACK, sensor_reflectance=1.5), ["sensor_reflectance = 1.5", "0 to 1"]),
+    ],
+)
+def test_bad_prescriptions_are_told_in_a_sentence(table: dict[str, Any], words: list[str]) -> None:
+    with pytest.raises(InputError) as told:
+        parse_lens(table, source="x.toml")
+    sentence = str(told.value)
+    assert sentence.startswith("x.toml: ")
+    assert "\n" not in sentence
+    assert all(word in sentence for word in words), sentence
+
+
+def test_a_lens_that_does_not_focus(tmp_path: Path) -> None:
+    diverging = parse_lens(
+        lens_of(STOP, GLASS | {"radius_mm": -50.0}, BACK | {"radius_mm": 50.0}), source="diverging"
+    )
+    with pytest.raises(InputError, match=r"no ray reaches the sensor"):
+        first_order(diverging)
+    window = parse_lens(
+        lens_of(STOP, GLASS | {"radius_mm": math.inf}, BACK | {"radius_mm": math.inf}), source="window"
+    )
+    with pytest.raises(InputError, match="afocal"):
+        first_order(window)
+    path = tmp_path / "broken.toml"
+    path.write_text("surface = ")
+    with pytest.raises(InputError, match=r"broken\.toml: not a TOML file"):
+        load_lens(path)
+    with pytest.raises(InputError, match="nikkor_35_f2p8"):
+        load_lens("no_such_lens")

@@ -1,0 +1,114 @@
+"""Thin-film coatings: stacks of layers, their reflectance and transmittance per wavelength, angle, polarisation.
+
+Airy's recursion over the interfaces, from the substrate outwards; indices n + ik with k ≥ 0 absorb (Macleod 2010,
+Thin-Film Optical Filters, chapter 2).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..errors import InputError
+
+F64 = NDArray[np.float64]
+
+DESIGN_NM = 550.0
+_MGF2, _HIGH = 1.38, 2.05  # magnesium fluoride; a mixed oxide
+NAMES = ("none", "mgf2", "v", "bbar")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Layer:
+    """A film: index n + ik and thickness."""
+
+    n: float
+    thickness_nm: float
+    k: float = 0.0
+
+
+def design(name: str, glass_index: float) -> tuple[Layer, ...]:
+    """Layers of a named coating between air and glass, the air's side first.
+
+    `none`; `mgf2`: a quarter wave of magnesium fluoride; `v`: two layers without reflection at 550 nm; `bbar`:
+    quarter, half and quarter wave, broad, its innermost layer chosen for the glass. A V coating whose glass has too
+    high an index for it is a quarter wave, which then serves as well. Raises InputError for another name.
+    """
+    if name not in NAMES:
+        raise InputError(f"coating = {name!r}: unknown; known are {', '.join(NAMES)}, or a list of layers")
+    if name == "none":
+        return ()
+    outer = Layer(n=_MGF2, thickness_nm=DESIGN_NM / 4 / _MGF2)
+    if name == "mgf2":
+        return (outer,)
+    if name == "bbar":
+        # the half wave is absent at 550 nm, where the two quarters cancel if the inner one has this index
+        inner = _MGF2 * np.sqrt(glass_index)
+        half = Layer(n=_HIGH, thickness_nm=DESIGN_NM / 2 / _HIGH)
+        return (outer, half, Layer(n=float(inner), thickness_nm=float(DESIGN_NM / 4 / inner)))
+    # Macleod 2010, section 4.2.2, thick outer and thin inner solution
+    a, b = glass_index - _MGF2**2, _HIGH**2 - glass_index
+    c, d = _MGF2**2 * glass_index - _HIGH**2, glass_index - 1
+    if a * c <= 0:
+        return (outer,)
+    phase_outer = np.pi - np.arctan(_MGF2 * np.sqrt(d * b / (c * a)))
+    phase_inner = np.arctan(_HIGH * np.sqrt(d * a / (c * b)))
+    return (
+        Layer(n=_MGF2, thickness_nm=float(phase_outer * DESIGN_NM / (2 * np.pi * _MGF2))),
+        Layer(n=_HIGH, thickness_nm=float(phase_inner * DESIGN_NM / (2 * np.pi * _HIGH))),
+    )
+
+
+def reflect_transmit(
+    layers: Sequence[Layer], n_front: ArrayLike, n_back: ArrayLike, cos_front: ArrayLike, wavelength_nm: ArrayLike
+) -> tuple[F64, F64, F64, F64]:
+    """Reflectance and transmittance of power, (R_s, R_p, T_s, T_p), each of the arguments' common shape.
+
+    Parameters
+    ----------
+    layers
+        In the order that light meets them.
+    n_front, n_back
+        Indices of the media before and behind, real.
+    cos_front
+        Cosine of the angle of incidence, in (0, 1].
+    wavelength_nm
+        In vacuum.
+    """
+    n0, ns, c0, wavelength = np.broadcast_arrays(
+        np.asarray(n_front, complex), np.asarray(n_back, complex), np.asarray(cos_front, complex), wavelength_nm
+    )
+    across2 = n0 * n0 * (1 - c0 * c0)
+
+    def normal(index: NDArray) -> NDArray:
+        """n cos θ: the branch that decays or runs backwards into the medium."""
+        q = np.sqrt(index * index - across2 + 0j)
+        return np.where((q.imag < 0) | ((q.imag == 0) & (q.real < 0)), -q, q)
+
+    films = [np.full(n0.shape, layer.n + 1j * layer.k) for layer in layers]
+    media = [n0, *films, ns]
+    runs = [n0 * c0, *(normal(index) for index in media[1:])]
+    powers = []
+    for p in (False, True):
+        # admittance: n cos θ across the plane of incidence, n / cos θ in it
+        y = [index * index / q if p else q for index, q in zip(media, runs, strict=True)]
+        r, t = (y[-2] - y[-1]) / (y[-2] + y[-1]), 2 * y[-2] / (y[-2] + y[-1])
+        for k in range(len(layers) - 1, -1, -1):
+            turn = np.exp(2j * np.pi * runs[k + 1] * layers[k].thickness_nm / wavelength)
+            first, through = (y[k] - y[k + 1]) / (y[k] + y[k + 1]), 2 * y[k] / (y[k] + y[k + 1])
+            below = 1 + first * r * turn * turn
+            r, t = (first + r * turn * turn) / below, through * t * turn / below
+        powers.append((np.abs(r) ** 2, np.abs(t) ** 2 * y[-1].real / y[0].real))
+    (rs, ts), (rp, tp) = powers
+    return rs, rp, ts, tp
+
+
+def mean_reflectance(
+    layers: Sequence[Layer], n_front: ArrayLike, n_back: ArrayLike, cos_front: ArrayLike, wavelength_nm: ArrayLike
+) -> F64:
+    """Reflectance of unpolarised light: the mean of both polarisations."""
+    rs, rp, _, _ = reflect_transmit(layers, n_front, n_back, cos_front, wavelength_nm)
+    return np.asarray((rs + rp) / 2)

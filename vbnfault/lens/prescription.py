@@ -1,0 +1,286 @@
+"""Lens prescriptions: rows of surfaces from a TOML file, checked, and scaled to a focal length or field."""
+
+from __future__ import annotations
+
+import math
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .. import resources
+from ..errors import InputError
+from .coating import DESIGN_NM, Layer, design
+from .glass import AIR, D_NM, Glass, from_abbe, from_coefficients, named
+
+F64 = NDArray[np.float64]
+
+_SURFACE_KEYS = (
+    "radius_mm",
+    "thickness_mm",
+    "nd",
+    "vd",
+    "glass",
+    "diameter_mm",
+    "coating",
+    "stop",
+    "conic",
+    "aspheric_mm",
+)
+_LENS_KEYS = ("name", "source", "surface", "sensor_reflectance")
+_INDEX_RANGE = (1.0, 5.0)
+_RIM_POINTS = 65
+
+
+@dataclass(frozen=True, kw_only=True)
+class Surface:
+    """One row: a surface of revolution, and the medium behind it.
+
+    Attributes
+    ----------
+    radius_mm
+        Of curvature at the vertex; positive where the centre lies behind, inf for a plane.
+    thickness_mm
+        From this vertex to the next.
+    medium
+        What is behind.
+    semi_diameter_mm
+        A ray that meets the surface farther from the axis is lost.
+    coating
+        Its films, those that light from the front meets first.
+    stop
+        Whether it is the aperture stop, which has no other effect.
+    conic
+        0 sphere, -1 paraboloid.
+    aspheric_mm
+        Coefficients of r⁴, r⁶, … of the sag, in mm to the power -3, -5, …
+    """
+
+    radius_mm: float
+    thickness_mm: float
+    medium: Glass
+    semi_diameter_mm: float
+    coating: tuple[Layer, ...] = ()
+    stop: bool = False
+    conic: float = 0.0
+    aspheric_mm: tuple[float, ...] = ()
+
+    @property
+    def curvature_per_mm(self) -> float:
+        """1 / radius; 0 for a plane."""
+        return 0.0 if math.isinf(self.radius_mm) else 1.0 / self.radius_mm
+
+    def sag_mm(self, height_mm: F64 | float) -> F64:
+        """Depth of the surface behind its vertex at a distance from the axis; nan where it has none."""
+        r2 = np.asarray(height_mm, dtype=np.float64) ** 2
+        c = self.curvature_per_mm
+        with np.errstate(invalid="ignore"):
+            sag = c * r2 / (1 + np.sqrt(1 - (1 + self.conic) * c * c * r2))
+        for k, a in enumerate(self.aspheric_mm):
+            sag = sag + a * r2 ** (k + 2)
+        return np.asarray(sag)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Prescription:
+    """A lens as its rows, front to back, air in front and behind. The sensor stands at the paraxial focus at the
+    d line, not where the last row's thickness ends.
+
+    `sensor_reflectance`: share of the light that the sensor's surface sends back.
+    """
+
+    name: str
+    source: str
+    surfaces: tuple[Surface, ...]
+    sensor_reflectance: float = 0.0
+
+    @property
+    def stop(self) -> int:
+        """Row of the stop."""
+        return next(k for k, s in enumerate(self.surfaces) if s.stop)
+
+    @property
+    def vertices_mm(self) -> F64:
+        """Where each vertex lies behind the first, float64[row]."""
+        return np.concatenate([[0.0], np.cumsum([s.thickness_mm for s in self.surfaces[:-1]])])
+
+    def indices(self, wavelength_nm: float = D_NM) -> F64:
+        """Indices of all media, float64[row + 1]: in front of the first row, then behind each."""
+        return np.array([1.0, *(float(s.medium.index(wavelength_nm)) for s in self.surfaces)])
+
+    def scaled(self, factor: float) -> Prescription:
+        """The lens with every length multiplied."""
+        surfaces = tuple(
+            replace(
+                s,
+                radius_mm=s.radius_mm * factor,
+                thickness_mm=s.thickness_mm * factor,
+                semi_diameter_mm=s.semi_diameter_mm * factor,
+                aspheric_mm=tuple(a * factor ** -(2 * k + 3) for k, a in enumerate(s.aspheric_mm)),
+            )
+            for s in self.surfaces
+        )
+        return replace(self, surfaces=surfaces)
+
+
+def load_lens(name_or_path: str | Path) -> Prescription:
+    """A prescription by path or packaged name. Raises InputError naming file, surface and value."""
+    path = resources.find("scenes/lenses", name_or_path)
+    try:
+        table = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: not a TOML file: {error}") from None
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror}") from None
+    return parse_lens(table, source=str(path))
+
+
+def parse_lens(table: Mapping[str, Any], *, source: str) -> Prescription:
+    """A prescription from plain data. Raises InputError in a sentence that names `source`, surface and value."""
+    for key in table:
+        if key not in _LENS_KEYS:
+            raise InputError(f"{source}: {key}: unknown key; known: {', '.join(_LENS_KEYS)}")
+    rows = table.get("surface")
+    if not isinstance(rows, list) or not rows or not all(isinstance(row, dict) for row in rows):
+        raise InputError(f"{source}: surface: at least one [[surface]] is needed")
+    surfaces: tuple[Surface, ...] = ()
+    for k, row in enumerate(rows):
+        front = surfaces[-1].medium if surfaces else AIR
+        surfaces += (_surface(row, front, f"{source}: surface {k}", last=k == len(rows) - 1),)
+    lens = Prescription(
+        name=str(table.get("name", Path(source).stem)),
+        source=str(table.get("source", "")),
+        surfaces=surfaces,
+        sensor_reflectance=_number(table, "sensor_reflectance", source, 0.0, low=0.0, high=1.0),
+    )
+    _check(lens, source)
+    return lens
+
+
+def _surface(row: Mapping[str, Any], front: Glass, where: str, *, last: bool) -> Surface:
+    for key in row:
+        if key not in _SURFACE_KEYS:
+            raise InputError(f"{where}: {key}: unknown key; known: {', '.join(_SURFACE_KEYS)}")
+    stop = row.get("stop", False)
+    if not isinstance(stop, bool):
+        raise InputError(f"{where}: stop = {stop!r}: must be true or false")
+    radius = _number(row, "radius_mm", where, math.inf if stop else None, low=-math.inf, high=math.inf)
+    if radius == 0:
+        raise InputError(f"{where}: radius_mm = 0: must not be 0; a plane has inf")
+    coefficients = row.get("aspheric_mm", [])
+    if not isinstance(coefficients, list):
+        raise InputError(f"{where}: aspheric_mm = {coefficients!r}: must be a list of numbers")
+    medium = _medium(row, where)
+    surface = Surface(
+        radius_mm=radius,
+        thickness_mm=_number(row, "thickness_mm", where, 0.0 if last else None, low=0.0, high=1e6),
+        medium=medium,
+        semi_diameter_mm=0.5 * _number(row, "diameter_mm", where, None, low=1e-6, high=1e6),
+        coating=_coating(row.get("coating", "none"), front, medium, where),
+        stop=stop,
+        conic=_number(row, "conic", where, 0.0, low=-1e6, high=1e6),
+        aspheric_mm=tuple(
+            _number({"aspheric_mm": c}, "aspheric_mm", where, None, low=-1e12, high=1e12) for c in coefficients
+        ),
+    )
+    if np.isnan(surface.sag_mm(surface.semi_diameter_mm)):
+        raise InputError(
+            f"{where}: diameter_mm = {2 * surface.semi_diameter_mm:g}: a surface with radius_mm = {radius:g} ends "
+            f"before that; at most {2 * abs(radius):g} for a sphere"
+        )
+    return surface
+
+
+def _medium(row: Mapping[str, Any], where: str) -> Glass:
+    glass = row.get("glass")
+    if glass is not None and ("nd" in row or "vd" in row):
+        raise InputError(f"{where}: glass: give either glass or nd and vd")
+    try:
+        if isinstance(glass, str):
+            medium = named(glass)
+        elif isinstance(glass, dict):
+            medium = from_coefficients(str(glass.get("formula")), list(glass.get("coefficients", [])))
+        elif glass is not None:
+            raise InputError(f"glass = {glass!r}: must be a name or a table of formula and coefficients")
+        elif "nd" in row:
+            nd = _number(row, "nd", "", None, low=_INDEX_RANGE[0], high=_INDEX_RANGE[1])
+            vd = _number(row, "vd", "", 0.0, low=5.0, high=200.0) if "vd" in row else None
+            medium = from_abbe(nd, vd)
+        elif "vd" in row:
+            raise InputError("vd: needs nd")
+        else:
+            return AIR
+    except InputError as error:
+        raise InputError(f"{where}: {str(error).removeprefix(': ')}") from None
+    index = medium.index(np.linspace(400, 1000, 61))
+    if not (np.isfinite(index).all() and index.min() >= _INDEX_RANGE[0] and index.max() <= _INDEX_RANGE[1]):
+        raise InputError(
+            f"{where}: glass: its index must be from 1 to 5 between 400 and 1000 nm; got {index.min():g}"
+        )
+    return medium
+
+
+def _coating(given: object, front: Glass, back: Glass, where: str) -> tuple[Layer, ...]:
+    if isinstance(given, list):  # films of one's own, from the front
+        return tuple(_layer(film, f"{where}: coating[{k}]") for k, film in enumerate(given))
+    try:
+        if not isinstance(given, str):
+            raise InputError(f"coating = {given!r}: must be a name or a list of layers")
+        glass = max(front.index(DESIGN_NM), back.index(DESIGN_NM))
+        films = design(given, float(glass))
+        if films and 1.0 not in (front.nd, back.nd):
+            raise InputError(f"coating = {given!r}: is made for a surface in air, not between two glasses")
+    except InputError as error:
+        raise InputError(f"{where}: {error}") from None
+    return films if front.nd == 1.0 else films[::-1]
+
+
+def _layer(film: object, where: str) -> Layer:
+    if not isinstance(film, dict) or not set(film) <= {"n", "k", "thickness_nm"}:
+        raise InputError(f"{where}: must be a table of n, thickness_nm and, if it absorbs, k")
+    return Layer(
+        n=_number(film, "n", where, None, low=0.01, high=10.0),
+        k=_number(film, "k", where, 0.0, low=0.0, high=20.0),
+        thickness_nm=_number(film, "thickness_nm", where, None, low=0.0, high=1e5),
+    )
+
+
+def _number(
+    table: Mapping[str, Any], key: str, where: str, default: float | None, *, low: float, high: float
+) -> float:
+    value = table.get(key, default)
+    if value is None:
+        raise InputError(f"{where}: {key}: missing")
+    if (
+        isinstance(value, bool)
+        or not isinstance(value, int | float)
+        or math.isnan(value)
+        or not low <= value <= high
+    ):
+        raise InputError(f"{where}: {key} = {value!r}: must be a number from {low:g} to {high:g}")
+    return float(value)
+
+
+def _check(lens: Prescription, source: str) -> None:
+    stops = [k for k, s in enumerate(lens.surfaces) if s.stop]
+    if len(stops) != 1:
+        found = "none has" if not stops else f"surfaces {', '.join(map(str, stops))} have"
+        raise InputError(f"{source}: stop: exactly one surface must have stop = true; {found}")
+    if lens.surfaces[-1].medium.nd != 1.0:
+        raise InputError(f"{source}: surface {len(lens.surfaces) - 1}: nd: behind the last surface there is air")
+    media = (AIR, *(s.medium for s in lens.surfaces))
+    stop = stops[0]
+    if media[stop].coefficients != media[stop + 1].coefficients:
+        raise InputError(f"{source}: surface {stop}: nd: the stop has the same medium on both sides")
+    for k, (front, back) in enumerate(zip(lens.surfaces[:-1], lens.surfaces[1:], strict=True)):
+        height = np.linspace(0, min(front.semi_diameter_mm, back.semi_diameter_mm), _RIM_POINTS)
+        gap = front.thickness_mm + back.sag_mm(height) - front.sag_mm(height)
+        if gap.min() < -1e-6:
+            raise InputError(
+                f"{source}: surface {k}: thickness_mm = {front.thickness_mm:g}: surfaces {k} and {k + 1} cross by "
+                f"{-gap.min():.3g} mm, {height[int(np.argmin(gap))]:.3g} mm from the axis"
+            )
