@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +14,12 @@ import pytest
 from vbnfault import resources
 from vbnfault.errors import InputError
 from vbnfault.lens import first_order, load_lens, parse_lens, scaled_to_field, scaled_to_focal_length
+from vbnfault.lens import trace as trace_module
 from vbnfault.lens.coating import NAMES, Layer, design, mean_reflectance, reflect_transmit
 from vbnfault.lens.first_order import gap, refraction, system
-from vbnfault.lens.glass import GLASSES, from_abbe
+from vbnfault.lens.glass import AIR, GLASSES, from_abbe
+from vbnfault.lens.prescription import Surface
+from vbnfault.lens.trace import ghost, real_pupil_diameter_mm, trace
 
 # (EFL, BFD, f-number by the paraxial pupil), the patents' rows recomputed
 PUBLISHED = {
@@ -236,3 +241,101 @@ def test_a_lens_that_does_not_focus(tmp_path: Path) -> None:
         load_lens(path)
     with pytest.raises(InputError, match="nikkor_35_f2p8"):
         load_lens("no_such_lens")
+
+
+# --- exact rays -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("name", "f_number"),
+    [
+        ("nikkor_35_f2p8", 2.80),
+        ("nikkor_28_f2p8", 2.86),
+        ("distagon_25_f2p8", 2.80),
+        ("tessar_50_f2p8", 2.80),
+        ("heliar_100_f3p5", 3.54),
+        ("biotar_100_f1p4", 1.405),
+    ],
+)
+def test_f_numbers_of_real_rays(name: str, f_number: float) -> None:
+    lens = load_lens(name)
+    assert first_order(lens).efl_mm / real_pupil_diameter_mm(lens) == pytest.approx(f_number, abs=0.006)
+
+
+def test_exact_rays_near_the_axis_are_first_order() -> None:
+    for name in PUBLISHED:
+        lens = load_lens(name)
+        theta, height = 1e-4, 1e-3
+        found = first_order(lens)
+        rays = trace(lens, [[height, 0.0, 0.0], [0.0, -height, 0.0]], [[np.tan(theta), 0.0, 1.0], [0.0, 0.0, 1.0]])
+        # third order: a millionth of these heights and slopes, over a few of the lens's radii
+        assert rays.points_mm[-1, 0, 0] == pytest.approx(found.efl_mm * np.tan(theta), rel=1e-6)
+        assert np.hypot(*rays.points_mm[-1, 1, :2]) < 1e-8
+        assert rays.arrives.all()
+
+
+def test_ghosts_near_the_axis_are_the_published_matrices() -> None:
+    """Spot values of Lee & Eisemann's matrix for the AF Nikkor: 0-based rows, M00 and M01."""
+    lens = load_lens("nikkor_28_f2p8")
+    published = {
+        (0, 1): (-0.70089, 26.5483),
+        (1, 3): (5.35157, 46.674),
+        (2, 5): (4.27177, 95.588),
+        (8, 13): (-3.11568, -26.0005),
+        (10, 12): (0.17949, 32.572),
+        (3, 9): (-17.4788, -495.97),
+    }
+    tiny = 1e-6
+    for (a, b), (m00, m01) in published.items():
+        rays = trace(lens, [[tiny, 0, 0], [0, 0, 0]], [[0, 0, 1], [tiny, 0, 1]], path=ghost(lens, a, b))
+        np.testing.assert_allclose(rays.points_mm[-1, :, 0] / tiny, [m00, m01], rtol=2e-5)
+
+
+def test_a_paraboloid_focuses_every_ray_and_an_asphere_is_met() -> None:
+    """A concave paraboloidal mirror met twice would be a telescope: its rays cross the axis at half its radius."""
+    mirror = Surface(radius_mm=-200.0, thickness_mm=0.0, medium=AIR, semi_diameter_mm=60.0, conic=-1.0)
+    rays = np.array([[20.0, 0.0, -1.0], [0.0, 55.0, -1.0], [-10.0, 30.0, -1.0]])
+    hit, normal = trace_module._meet(mirror, rays, np.tile([0.0, 0.0, 1.0], (3, 1)))
+    incoming = np.array([0.0, 0.0, 1.0])
+    out = incoming - 2 * (normal @ incoming)[:, None] * normal
+    crossing = hit[:, 2] - out[:, 2] * (hit * out)[:, :2].sum(axis=1) / (out[:, :2] ** 2).sum(axis=1)
+    np.testing.assert_allclose(crossing, -100.0, rtol=1e-12)
+    bent = replace(mirror, conic=0.4, aspheric_mm=(1e-6, -3e-10))
+    direction = np.tile([0.05, -0.02, 0.9], (3, 1))
+    hit, normal = trace_module._meet(bent, rays, direction / np.linalg.norm(direction, axis=1, keepdims=True))
+    np.testing.assert_allclose(hit[:, 2], bent.sag_mm(np.hypot(hit[:, 0], hit[:, 1])), atol=1e-12)
+    step = 1e-4
+    for axis in (0, 1):  # the normal is across the surface: a step along it stays on the surface to second order
+        beside = hit.copy()
+        beside[:, axis] += step
+        rise = bent.sag_mm(np.hypot(beside[:, 0], beside[:, 1])) - hit[:, 2]
+        np.testing.assert_allclose(normal[:, axis] * step + normal[:, 2] * rise, 0, atol=1e-9)
+
+
+def test_rims_lose_rays() -> None:
+    lens = load_lens("nikkor_35_f2p8")
+    found = trace(lens, [[0, 0, -5], [14.0, 0, -5], [20.0, 0, -5]], np.tile([0.0, 0, 1], (3, 1)))
+    assert found.arrives.tolist() == [True, False, False]
+    assert found.relative_radius[2] > 1
+
+
+# --- the command ------------------------------------------------------------------------------------------------
+
+
+def test_the_command_draws_and_tabulates(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    import cv2
+    from test_cli import run
+
+    monkeypatch.chdir(tmp_path)
+    assert run(monkeypatch, "lens", "tessar_50_f2p8", "--json", tmp_path / "t.json") == 0
+    assert "efl_mm" in capsys.readouterr().out
+    table = json.loads((tmp_path / "t.json").read_text())
+    assert table["bfd_mm"] == pytest.approx(40.27, abs=0.006)
+    picture = cv2.imread("tessar_50_f2p8.png")
+    blue = (picture == (242, 227, 207)).all(axis=2)  # glass
+    assert 0.005 < blue.mean() < 0.3
+    assert run(monkeypatch, "lens", "no_such_lens") == 2
+    assert "biotar_100_f1p4" in capsys.readouterr().err
+    assert run(monkeypatch, "lens", "tessar_50_f2p8", "--out", tmp_path / "x.gif") == 2

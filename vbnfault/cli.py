@@ -188,6 +188,40 @@ def render(
         typer.echo(str(path))
 
 
+@app.command()
+def lens(
+    lens: Annotated[str, typer.Argument(help="path of a prescription, or the name of a packaged lens")],
+    out: Annotated[Path | None, typer.Option(help="PNG of the layout [default: the lens's name, here]")] = None,
+    json_: Annotated[Path | None, typer.Option("--json", help="the table as JSON")] = None,
+) -> None:
+    """First-order table of a lens (EFL, BFD, f-number, pupils) and a drawing of its layout."""
+    from dataclasses import asdict
+
+    from . import lens as optics
+    from .lens.drawing import draw
+
+    prescription = optics.load_lens(lens)
+    figures = asdict(optics.first_order(prescription))
+    typer.echo(f"{prescription.name}: {len(prescription.surfaces)} surfaces, {prescription.source}")
+    for name, value in figures.items():
+        typer.echo(f"  {name:<28}{value:10.4f}")
+    if json_ is not None:
+        table = {"name": prescription.name, "source": prescription.source, **figures}
+        _write_text(json_, json.dumps(table, indent=2) + "\n")
+    path = Path(f"{Path(lens).stem}.png") if out is None else out
+    if path.suffix.lower() != ".png" or not path.absolute().parent.is_dir():
+        raise InputError(f"--out {path}: must be a .png in a folder that exists")
+    draw(prescription, path)
+    typer.echo(f"{path}")
+
+
+def _write_text(path: Path, text: str) -> None:
+    try:
+        path.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written: {error.strerror}") from None
+
+
 @app.command("list")
 def list_(
     what: Annotated[str, typer.Argument(help="scenes, lenses, detectors or faults", metavar="KIND")],
@@ -207,7 +241,7 @@ def list_(
     width = max((len(name) for name in found), default=0)
     for name, path in found.items():
         table = tomllib.loads(path.read_text(encoding="utf-8"))
-        typer.echo(f"{name:<{width}}  {table.get('description', '')}")
+        typer.echo(f"{name:<{width}}  {table.get('description') or table.get('name', '')}")
 
 
 def _list_faults() -> None:

@@ -70,7 +70,7 @@ def first_order(lens: Prescription, wavelength_nm: float = D_NM) -> FirstOrder:
     whole = system(lens, 0, last, wavelength_nm)
     if abs(whole[1, 0]) < 1e-12:
         raise InputError(f"{lens.name}: surface 0 to {last}: the lens has no focal length (it is afocal)")
-    efl, bfd = -1 / whole[1, 0], -whole[0, 0] / whole[1, 0]
+    efl, bfd = float(-1 / whole[1, 0]), float(-whole[0, 0] / whole[1, 0])
     if efl <= 0 or bfd <= 0:
         raise InputError(
             f"{lens.name}: surface {last}: no ray reaches the sensor: EFL {efl:.4g} mm, back focal distance "
@@ -81,14 +81,14 @@ def first_order(lens: Prescription, wavelength_nm: float = D_NM) -> FirstOrder:
     if stop:
         front = gap(lens.surfaces[stop - 1].thickness_mm) @ front
     back = system(lens, stop, last, wavelength_nm)
-    entrance_diameter = 2 * abs(radius / front[0, 0])
+    entrance_diameter = float(2 * abs(radius / front[0, 0]))
     return FirstOrder(
         efl_mm=efl,
         bfd_mm=bfd,
-        entrance_pupil_mm=front[0, 1] / front[0, 0],
+        entrance_pupil_mm=float(front[0, 1] / front[0, 0]),
         entrance_pupil_diameter_mm=entrance_diameter,
-        exit_pupil_mm=-back[0, 1] / back[1, 1],
-        exit_pupil_diameter_mm=2 * abs(radius * np.linalg.det(back) / back[1, 1]),
+        exit_pupil_mm=float(-back[0, 1] / back[1, 1]),
+        exit_pupil_diameter_mm=float(2 * abs(radius * np.linalg.det(back) / back[1, 1])),
         f_number=efl / entrance_diameter,
     )
 
