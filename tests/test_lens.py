@@ -13,7 +13,7 @@ import pytest
 
 from vbnfault import resources
 from vbnfault.errors import InputError
-from vbnfault.lens import first_order, load_lens, parse_lens, scaled_to_field, scaled_to_focal_length
+from vbnfault.lens import first_order, load_lens, paraxial, parse_lens, scaled_to_field, scaled_to_focal_length
 from vbnfault.lens import trace as trace_module
 from vbnfault.lens.coating import NAMES, Layer, design, mean_reflectance, reflect_transmit
 from vbnfault.lens.first_order import gap, refraction, system
@@ -274,19 +274,22 @@ def test_exact_rays_near_the_axis_are_first_order() -> None:
         assert rays.arrives.all()
 
 
+# the AF Nikkor's pairs of rows → M00 and M01
+GHOSTS = {
+    (0, 1): (-0.70089, 26.5483),
+    (1, 3): (5.35157, 46.674),
+    (2, 5): (4.27177, 95.588),
+    (8, 13): (-3.11568, -26.0005),
+    (10, 12): (0.17949, 32.572),
+    (3, 9): (-17.4788, -495.97),
+}
+
+
 def test_ghosts_near_the_axis_are_the_published_matrices() -> None:
     """Spot values of Lee & Eisemann's matrix for the AF Nikkor: 0-based rows, M00 and M01."""
     lens = load_lens("nikkor_28_f2p8")
-    published = {
-        (0, 1): (-0.70089, 26.5483),
-        (1, 3): (5.35157, 46.674),
-        (2, 5): (4.27177, 95.588),
-        (8, 13): (-3.11568, -26.0005),
-        (10, 12): (0.17949, 32.572),
-        (3, 9): (-17.4788, -495.97),
-    }
     tiny = 1e-6
-    for (a, b), (m00, m01) in published.items():
+    for (a, b), (m00, m01) in GHOSTS.items():
         rays = trace(lens, [[tiny, 0, 0], [0, 0, 0]], [[0, 0, 1], [tiny, 0, 1]], path=ghost(lens, a, b))
         np.testing.assert_allclose(rays.points_mm[-1, :, 0] / tiny, [m00, m01], rtol=2e-5)
 
@@ -339,3 +342,64 @@ def test_the_command_draws_and_tabulates(
     assert run(monkeypatch, "lens", "no_such_lens") == 2
     assert "biotar_100_f1p4" in capsys.readouterr().err
     assert run(monkeypatch, "lens", "tessar_50_f2p8", "--out", tmp_path / "x.gif") == 2
+
+
+# --- ghosts to first order --------------------------------------------------------------------------------------
+
+
+def test_ghost_matrices_are_the_published_ones() -> None:
+    lens = load_lens("nikkor_28_f2p8")
+    assert len(paraxial.pairs(lens)) == 66  # 12 interfaces: the stop and an air-air dummy left out
+    for (a, b), expected in GHOSTS.items():
+        matrix, met = paraxial.along(lens, ghost(lens, a, b))
+        np.testing.assert_allclose(matrix[0], expected, rtol=2e-5)
+        assert len(met) == len(ghost(lens, a, b))
+
+
+@pytest.mark.parametrize("name", ["nikkor_28_f2p8", "tessar_50_f2p8"])
+def test_paraxial_ghosts_are_the_limit_of_exact_ones(name: str) -> None:
+    """A stop of a hundredth and the Sun at 0.05°: flux, place and size of every ghost against exact rays."""
+    lens = load_lens(name)
+    rows = list(lens.surfaces)
+    rows[lens.stop] = replace(rows[lens.stop], semi_diameter_mm=0.01 * rows[lens.stop].semi_diameter_mm)
+    small = replace(lens, surfaces=tuple(rows))
+    angle = 0.05
+    pupil = np.pi / 4 * first_order(small).entrance_pupil_diameter_mm ** 2
+    slope = np.tan(np.radians(angle))
+    compared = 0
+    for found in paraxial.paraxial_ghosts(small, angle):
+        path = ghost(small, *found.pair)
+        _, met = paraxial.along(small, path)
+        rims = np.array([small.surfaces[row].semi_diameter_mm for row, _ in path])
+        least = int(np.argmin(rims / np.abs(met[:, 0, 0])))
+        radius, middle = (rims / np.abs(met[:, 0, 0]))[least], -met[least, 0, 1] / met[least, 0, 0] * slope
+        if radius > 0.3:  # a ghost that the stop hardly limits is wide, and not paraxial
+            continue
+        side = 1.02 * radius * ((np.arange(101) + 0.5) / 101 * 2 - 1)
+        x, y = (axis.ravel() for axis in np.meshgrid(side, side))
+        origin = np.column_stack([middle + x, y, np.zeros_like(x)])
+        rays = trace(small, origin, np.tile([slope, 0.0, 1.0], (len(x), 1)), path=path)
+        if rays.arrives.sum() < 800:
+            continue
+        compared += 1
+        at = rays.points_mm[-1, rays.arrives, :2]
+        share = paraxial.transmittance(small, path)
+        flux = share * rays.arrives.sum() * (2.04 * radius / 101) ** 2 / pupil
+        # both count points of a grid: a disc of 100 across holds 8e3, its rim errs by 0.5 %
+        assert flux == pytest.approx(found.flux_fraction, rel=0.015)
+        spread = np.sqrt(np.mean(np.sum((at - at.mean(axis=0)) ** 2, axis=1)))
+        assert spread == pytest.approx(found.rms_radius_mm, rel=0.015)
+        np.testing.assert_allclose(at.mean(axis=0), found.centroid_mm, atol=0.01 * spread + 1e-5)
+    assert compared > 20 if name.startswith("nikkor") else compared > 10
+
+
+def test_a_source_on_the_axis_gives_centred_ghosts_and_an_azimuth_turns_them() -> None:
+    lens = load_lens("nikkor_35_f2p8")
+    for found in paraxial.paraxial_ghosts(lens, 0.0):
+        np.testing.assert_allclose(found.centroid_mm, 0, atol=1e-9)
+    right, turned = paraxial.paraxial_ghosts(lens, 10.0), paraxial.paraxial_ghosts(lens, 10.0, azimuth_deg=90.0)
+    assert len(right) == len(turned)
+    for a, b in zip(right, turned, strict=True):
+        assert a.pair == b.pair
+        np.testing.assert_allclose(a.centroid_mm[::-1], b.centroid_mm, atol=1e-9 + 1e-9 * a.rms_radius_mm)
+        assert a.flux_fraction == pytest.approx(b.flux_fraction, rel=1e-9)

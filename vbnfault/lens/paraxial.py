@@ -1,0 +1,130 @@
+"""Ghosts to first order: every path of two reflections is one matrix (Lee & Eisemann 2013, CGF 32, 1).
+
+A ray of a ghost leaves the first vertex's plane at height r with the slope θ of the Sun, meets every surface of its
+path at A_k r + B_k θ, and the sensor at M₀₀ r + M₀₁ θ; slopes are unfolded, so heights keep their sign. The rays
+that pass all rims are those within discs of the entrance plane, and the ghost is their overlap, magnified.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .coating import mean_reflectance
+from .first_order import first_order, gap, refraction
+from .glass import D_NM
+from .prescription import Prescription
+from .trace import ghost
+
+F64 = NDArray[np.float64]
+
+_GRID = 129  # points across the smallest disc
+
+
+@dataclass(frozen=True, kw_only=True)
+class Ghost:
+    """One ghost of a far point source.
+
+    Attributes
+    ----------
+    pair
+        The reflecting rows, the one nearer the front first.
+    flux_fraction
+        Flux on the unbounded sensor plane over source irradiance × cos(angle) × area of the paraxial entrance
+        pupil.
+    centroid_mm, rms_radius_mm
+        On the sensor, from the axis, and about the centroid.
+    peak_irradiance_fraction
+        Over the source's irradiance at the entrance.
+    """
+
+    pair: tuple[int, int]
+    flux_fraction: float
+    centroid_mm: tuple[float, float]
+    rms_radius_mm: float
+    peak_irradiance_fraction: float
+
+
+def mirrors(lens: Prescription) -> tuple[int, ...]:
+    """Rows that reflect: the stop does not, nor does a surface with the same medium on both sides."""
+    index = lens.indices()
+    return tuple(k for k in range(len(lens.surfaces)) if index[k] != index[k + 1])
+
+
+def pairs(lens: Prescription) -> tuple[tuple[int, int], ...]:
+    """All pairs of reflecting rows, n (n - 1) / 2 of them."""
+    return tuple(combinations(mirrors(lens), 2))
+
+
+def along(lens: Prescription, path: Sequence[tuple[int, bool]], wavelength_nm: float = D_NM) -> tuple[F64, F64]:
+    """The matrix from the first vertex's plane to the sensor, float64[2, 2], and that to each surface met,
+    float64[step, 2, 2]."""
+    index, vertex = lens.indices(wavelength_nm), lens.vertices_mm
+    total, met, onward = np.eye(2), [], True
+    for step, (row, mirror) in enumerate(path):
+        if step:
+            total = gap(abs(vertex[row] - vertex[path[step - 1][0]])) @ total
+        met.append(total)
+        curvature = lens.surfaces[row].curvature_per_mm
+        if mirror:
+            total = np.array([[1.0, 0.0], [2 * (curvature if onward else -curvature), 1.0]]) @ total
+            onward = not onward
+        elif onward:
+            total = refraction(index[row], index[row + 1], curvature) @ total
+        else:
+            total = refraction(index[row + 1], index[row], -curvature) @ total
+    return gap(first_order(lens).bfd_mm) @ total, np.stack(met)
+
+
+def transmittance(lens: Prescription, path: Sequence[tuple[int, bool]], wavelength_nm: float = D_NM) -> float:
+    """Share of the light that takes a path, at normal incidence on every surface."""
+    index = lens.indices(wavelength_nm)
+    share = 1.0
+    for row, mirror in path:
+        films = lens.surfaces[row].coating
+        reflected = float(mean_reflectance(films, index[row], index[row + 1], 1.0, wavelength_nm))
+        share *= reflected if mirror else 1 - reflected
+    return share
+
+
+def paraxial_ghosts(
+    lens: Prescription, sun_deg: float, *, azimuth_deg: float = 0.0, wavelength_nm: float = D_NM
+) -> tuple[Ghost, ...]:
+    """Ghosts of a far point source at an angle from the axis, towards an azimuth (0: +x); those that no ray takes
+    are left out."""
+    turn = np.radians(azimuth_deg)
+    slope = np.tan(np.radians(sun_deg)) * np.array([np.cos(turn), np.sin(turn)])
+    pupil = np.pi / 4 * first_order(lens, wavelength_nm).entrance_pupil_diameter_mm ** 2
+    side = (np.arange(_GRID) + 0.5) / _GRID * 2 - 1
+    square = np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2)
+    found = []
+    for pair in pairs(lens):
+        path = ghost(lens, *pair)
+        matrix, met = along(lens, path, wavelength_nm)
+        rims = np.array([lens.surfaces[row].semi_diameter_mm for row, _ in path])
+        with np.errstate(divide="ignore"):
+            radius = rims / np.abs(met[:, 0, 0])
+        least = int(np.argmin(radius))
+        middle = -met[least, 0, 1] / met[least, 0, 0] * slope
+        places = middle + radius[least] * square
+        heights = met[:, 0, 0, None, None] * places + met[:, 0, 1, None, None] * slope
+        passing = places[(np.einsum("knc,knc->kn", heights, heights) <= rims[:, None] ** 2).all(axis=0)]
+        if not len(passing):
+            continue
+        on_sensor = matrix[0, 0] * passing + matrix[0, 1] * slope
+        centroid = on_sensor.mean(axis=0)
+        share = transmittance(lens, path, wavelength_nm)
+        found.append(
+            Ghost(
+                pair=pair,
+                flux_fraction=share * len(passing) * (2 * radius[least] / _GRID) ** 2 / pupil,
+                centroid_mm=(float(centroid[0]), float(centroid[1])),
+                rms_radius_mm=float(np.sqrt(np.mean(np.sum((on_sensor - centroid) ** 2, axis=1)))),
+                peak_irradiance_fraction=float(share * np.cos(np.radians(sun_deg)) / matrix[0, 0] ** 2),
+            )
+        )
+    return tuple(found)
