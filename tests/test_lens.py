@@ -212,7 +212,7 @@ def lens_of(*rows: dict[str, Any], **more: Any) -> dict[str, Any]:
         (lens_of(STOP, GLASS | {"radius": 3.0}, BACK), ["surface 1", "radius", "unknown key"]),
         (lens_of(STOP, GLASS | {"radius_mm": True}, BACK), ["radius_mm = True"]),
         (lens_of(STOP, GLASS | {"radius_mm": 0.0}, BACK), ["radius_mm = 0", "inf"]),
-        (lens_of(STOP, GLASS, BACK, sensor_reflectance=1.5), ["sensor_reflectance = 1.5", "0 to 1"]),
+        (lens_of(STOP, GLASS, BACK, surfaces=[]), ["surfaces", "unknown key"]),
     ],
 )
 def test_bad_prescriptions_are_told_in_a_sentence(table: dict[str, Any], words: list[str]) -> None:
@@ -341,7 +341,10 @@ def test_the_command_draws_and_tabulates(
     assert 0.005 < blue.mean() < 0.3
     assert run(monkeypatch, "lens", "no_such_lens") == 2
     assert "biotar_100_f1p4" in capsys.readouterr().err
-    assert run(monkeypatch, "lens", "tessar_50_f2p8", "--out", tmp_path / "x.gif") == 2
+    assert run(monkeypatch, "lens", "tessar_50_f2p8", "--out", tmp_path / "x.gif", "--json", "x.json") == 2
+    assert not Path("x.json").exists()
+    assert run(monkeypatch, "lens", "tessar_50_f2p8", "--json", tmp_path) == 2
+    assert "cannot be written" in capsys.readouterr().err
 
 
 # --- ghosts to first order --------------------------------------------------------------------------------------

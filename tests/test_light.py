@@ -12,6 +12,7 @@ from test_render import NODES, UP, join, plane, sun, view
 from vbnfault import frames, render, spectra
 from vbnfault.photometry import HAPKE_TABLES, Diffuse, Photometry, hapke_at
 from vbnfault.render.runtime import dr, mi
+from vbnfault.render.sampling import disc_sets
 from vbnfault.scene import Scene, Sunlight, View
 
 
@@ -284,3 +285,44 @@ def _stone(k: int) -> tuple[np.ndarray, np.ndarray]:
     from test_render import box
 
     return box(np.array([np.cos(k) * 3, np.sin(2 * k) * 3, -0.3]), 0.4)
+
+
+# --- samples of the disc ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("samples", [4, 16, 256])
+def test_samples_of_the_disc_lie_one_to_a_ring_and_a_sector(samples: int) -> None:
+    points = disc_sets(samples, 3)
+    radius2, turn = (points**2).sum(axis=2), np.arctan2(points[..., 1], points[..., 0]) % (2 * np.pi)
+    for k, of in ((samples, radius2), (samples, turn / (2 * np.pi))):
+        cells = np.sort(np.floor(of * k).astype(int), axis=1)
+        assert (cells == np.arange(samples)).all()
+    # a limb-darkened disc that is wholly seen: the same from every set, and from each half of a chessboard
+    profile = np.polynomial.polynomial.polyval(np.sqrt(1 - radius2), spectra.limb_darkening(NODES)[0])
+    assert profile.mean(axis=1).std() < 1e-12
+    assert profile.mean() == pytest.approx(1, abs=0.05 / samples)
+    side = round(samples**0.5)
+    white = (np.arange(samples) % side + np.arange(samples) // side) % 2 == 0
+    apart = profile[:, white].mean(axis=1) - profile[:, ~white].mean(axis=1)
+    # the digits' parity cancels what is smooth in the ring's number; what is left comes from the outermost rings,
+    # where the cosine goes as a root: samples^-3/2 of the profile's 0.7. By chance it would be 0.3 samples^-1/2
+    assert np.abs(apart).max() < 0.8 * samples**-1.5
+
+
+def test_limb_darkening_adds_no_noise() -> None:
+    """A level plane under a limb-darkened Sun, 4 and 16 samples: alike in every pixel, and the halves too."""
+    a_view = view(10 * UP, -UP, width=32, fov_deg=1.0)
+    light = dataclasses.replace(limb(), direction_L=frames.direction_L(20, 60))
+    for spp in (4, 16):
+        image, halves = render.direct(join(plane()), scene(a_view, light, 0.06, spp), np.ones(len(NODES)))
+        signal = image.array.sum(axis=0)
+        assert signal.std() / signal.mean() < 1e-3
+        assert np.abs(halves).max() / signal.mean() < 0.3 / spp
+
+
+def test_what_lies_between() -> None:
+    ground = join(plane())
+    above, below = np.array([[3.0, 0.0, -0.5], [0.0, 1.0, -1.9]]), np.array([[1.0, 1.0, 0.2]])
+    origin = np.array([0.0, 0.0, -2.0])
+    assert not render.is_between(ground, origin, above)
+    assert render.is_between(ground, origin, np.concatenate([above, below]))

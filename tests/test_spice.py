@@ -312,9 +312,12 @@ def test_what_the_kernels_do_not_hold_is_said_in_a_sentence(folder: Path) -> Non
 # --- a scene on a spacecraft's way -----------------------------------------------------------------------------
 
 
-def test_a_scene_on_a_spacecrafts_way(folder: Path) -> None:
+def test_a_scene_on_a_spacecrafts_way(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     """Camera and Sun of every sample are SPICE's at its own date; the picture looks where the camera does."""
     from conftest import small_scene
+    from test_cli import run, toml
 
     from vbnfault import config
     from vbnfault.pipeline import Session
@@ -362,6 +365,11 @@ def test_a_scene_on_a_spacecrafts_way(folder: Path) -> None:
         q = frames.quaternion((np.array(sample["T_from_L"]) @ turned).T)
         np.testing.assert_allclose(q, sample["camera_from_T"], atol=1e-9)
     assert len(dates) == 3
+    # and a store of it is whole and as planned
+    table["dataset"] |= {"samples": 3, "shard_samples": 3}
+    (tmp_path / "way.toml").write_text(toml(table))
+    assert run(monkeypatch, "build", tmp_path / "way.toml", "--out", tmp_path / "way.zarr") == 0
+    assert run(monkeypatch, "verify", tmp_path / "way.zarr") == 0, capsys.readouterr()
 
 
 @pytest.mark.parametrize(

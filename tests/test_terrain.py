@@ -10,7 +10,7 @@ import pytest
 import trimesh
 
 from vbnfault import llvm
-from vbnfault.body import Body, Patch, Site, build_patch, choose_sites, load_body, site_at
+from vbnfault.body import Body, Patch, Site, build_patch, choose_sites, load_body, relief, site_at
 from vbnfault.body.fields import GRADIENT_STD, Points
 from vbnfault.body.patch import _roughness
 from vbnfault.body.roughness import Roughness, deviogram, mean_edge_m, model_roughness
@@ -264,3 +264,24 @@ def test_boulders_are_where_they_are_said_to_be(patches: list[Patch]) -> None:
         # The longest half-axis is half the diameter, where no plane cuts it off.
         assert 0.25 * patch.boulder_diameter_m[np.flatnonzero(order == k)[0]] < reach
         assert reach <= 0.56 * patch.boulder_diameter_m[np.flatnonzero(order == k)[0]] + 1e-3
+
+
+def test_walls_are_no_steeper_than_facets_can_show() -> None:
+    """A wall four times too steep across a mesh slumps to the limit; gentle ground is left as it was."""
+    n = 40
+    x, y = (axis.ravel().astype(float) for axis in np.meshgrid(np.arange(n), np.arange(n), indexing="ij"))
+    points = np.column_stack([x, y, np.zeros(n * n)])
+    corner = np.arange(n * n).reshape(n, n)
+    a, b, c, d = (corner[i : n - 1 + i, j : n - 1 + j].ravel() for i, j in ((0, 0), (1, 0), (0, 1), (1, 1)))
+    faces = np.concatenate([np.column_stack([a, b, d]), np.column_stack([a, d, c])])
+    both = np.concatenate([faces, faces[:, ::-1]]).astype(np.int32)  # closed: every edge runs both ways
+    gentle = 0.2 * x + np.sin(y)
+    np.testing.assert_array_equal(relief._slumped(points, both, gentle), gentle)
+    wall = gentle + 6.0 * (x > n / 2)
+    slumped = relief._slumped(points, both, wall)
+    i, j = both[:, 0], both[:, 1]
+    length = np.linalg.norm(points[i] - points[j], axis=1)
+    assert (np.abs(wall[i] - wall[j]) / length).max() > 6
+    assert (np.abs(slumped[i] - slumped[j]) / length).max() < 1.001 * relief._STEEPEST
+    assert slumped.mean() == pytest.approx(wall.mean(), abs=1e-3)
+    assert np.ptp(slumped) == pytest.approx(np.ptp(wall), rel=1e-3)

@@ -11,6 +11,7 @@ import os
 import sys
 import tomllib
 import warnings
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -202,22 +203,25 @@ def lens(
 
     prescription = optics.load_lens(lens)
     figures = asdict(optics.first_order(prescription))
+    path = Path(f"{Path(lens).stem}.png") if out is None else out
+    if path.suffix.lower() != ".png" or not path.absolute().parent.is_dir():
+        raise InputError(f"--out {path}: must be a .png in a folder that exists")
     typer.echo(f"{prescription.name}: {len(prescription.surfaces)} surfaces, {prescription.source}")
     for name, value in figures.items():
         typer.echo(f"  {name:<28}{value:10.4f}")
     if json_ is not None:
         table = {"name": prescription.name, "source": prescription.source, **figures}
-        _write_text(json_, json.dumps(table, indent=2) + "\n")
-    path = Path(f"{Path(lens).stem}.png") if out is None else out
-    if path.suffix.lower() != ".png" or not path.absolute().parent.is_dir():
-        raise InputError(f"--out {path}: must be a .png in a folder that exists")
-    draw(prescription, path)
-    typer.echo(f"{path}")
+        with _written(json_):
+            json_.write_text(json.dumps(table, indent=2) + "\n", encoding="utf-8")
+    with _written(path):
+        draw(prescription, path)
+    typer.echo(str(path))
 
 
-def _write_text(path: Path, text: str) -> None:
+@contextlib.contextmanager
+def _written(path: Path) -> Iterator[None]:
     try:
-        path.write_text(text, encoding="utf-8")
+        yield
     except OSError as error:
         raise InputError(f"{path}: cannot be written: {error.strerror}") from None
 
@@ -240,7 +244,7 @@ def list_(
         typer.echo(f"no packaged {what}")
     width = max((len(name) for name in found), default=0)
     for name, path in found.items():
-        table = tomllib.loads(path.read_text(encoding="utf-8"))
+        table = resources.read_toml(path)
         typer.echo(f"{name:<{width}}  {table.get('description') or table.get('name', '')}")
 
 

@@ -11,7 +11,6 @@ import difflib
 import hashlib
 import itertools
 import json
-import tomllib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -448,12 +447,7 @@ def load_scene(name_or_path: str | Path, overrides: Mapping[str, Any] | None = N
     A relative path in the file (mesh, texture) is taken from the file's folder. Raises InputError.
     """
     path = resources.find("scenes", name_or_path)
-    try:
-        table = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: not a TOML file: {error}") from None
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror}") from None
+    table = resources.read_toml(path)
     for key, value in (overrides or {}).items():
         *parents, leaf = key.split(".")
         node = table

@@ -119,14 +119,17 @@ def planned(attributes: Mapping[str, Any], faults: Sequence[str]) -> Callable[[i
     commanded faults as `injected`."""
     stored = {key: value for key, value in attributes["scene"].items() if key != "textures_sha256"}
     stored["body"] = {key: value for key, value in stored["body"].items() if key != "shape_sha256"}
-    stored["sky"] = {key: value for key, value in stored.get("sky", {}).items() if key != "catalogue"}
+    # what is added to the tables of a scene's identity is no key of a scene
+    for name, added in (("sky", "catalogue"), ("spice", "spiceypy")):
+        stored[name] = {key: value for key, value in stored.get(name, {}).items() if key != added}
     stored["dataset"] = {**stored["dataset"], "samples": attributes["blocks"][0]}
     scene = config.parse_scene(stored, source="the store's own scene")
     table = plan.make_plan(scene, faults, attributes["blocks"])
 
     def expected(index: int) -> dict[str, Any]:
         drawn = {name: float(table.variables[name][index]) for name in plan.VARIABLES}
-        angles = ("sun_azimuth_deg", "roll_deg", "pitch_deg", "yaw_deg")
+        # where SPICE places camera and Sun, they are not the plan's
+        angles = () if scene.spice.spacecraft else ("sun_azimuth_deg", "roll_deg", "pitch_deg", "yaw_deg")
         return {
             **{name: drawn[name] for name in angles},
             "stratum": int(table.stratum[index]),

@@ -365,8 +365,8 @@ def _strata(noise: _Octaves, elevation: Float64) -> Float32:
 
 
 def _slumped(points: Float64, faces: Int32, height_m: Float64) -> Float64:
-    """Heights with no edge of the mesh steeper than the steepest wall: what facets cannot show would come out as
-    saw teeth along every scarp."""
+    """Heights with hardly an edge of the mesh steeper than `_STEEPEST`: what facets cannot show would come out as
+    saw teeth along every scarp. Every step takes half of what is too much off both ends."""
     # in a closed mesh every edge runs once each way
     a, b = (np.concatenate([faces[:, k] for k in ends]) for ends in ((0, 1, 2), (1, 2, 0)))
     a, b = a[a < b], b[a < b]
@@ -386,9 +386,8 @@ def _slumped(points: Float64, faces: Int32, height_m: Float64) -> Float64:
             excess = step - np.clip(step, -limit, limit)
             touched = (excess != 0).astype(np.float64)
             pull = np.bincount(j, excess, len(ends)) - np.bincount(i, excess, len(ends))
-            moved += (
-                0.5 * pull / np.maximum(np.bincount(i, touched, len(ends)) + np.bincount(j, touched, len(ends)), 1)
-            )
+            edges = np.bincount(i, touched, len(ends)) + np.bincount(j, touched, len(ends))
+            moved += 0.5 * pull / np.maximum(edges, 1)
         height[ends] = moved
     return height
 

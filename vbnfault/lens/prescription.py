@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -31,7 +30,7 @@ _SURFACE_KEYS = (
     "conic",
     "aspheric_mm",
 )
-_LENS_KEYS = ("name", "source", "surface", "sensor_reflectance")
+_LENS_KEYS = ("name", "source", "surface")
 _INDEX_RANGE = (1.0, 5.0)
 _RIM_POINTS = 65
 
@@ -89,14 +88,11 @@ class Surface:
 class Prescription:
     """A lens as its rows, front to back, air in front and behind. The sensor stands at the paraxial focus at the
     d line, not where the last row's thickness ends.
-
-    `sensor_reflectance`: share of the light that the sensor's surface sends back.
     """
 
     name: str
     source: str
     surfaces: tuple[Surface, ...]
-    sensor_reflectance: float = 0.0
 
     @property
     def stop(self) -> int:
@@ -130,13 +126,7 @@ class Prescription:
 def load_lens(name_or_path: str | Path) -> Prescription:
     """A prescription by path or packaged name. Raises InputError naming file, surface and value."""
     path = resources.find("scenes/lenses", name_or_path)
-    try:
-        table = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: not a TOML file: {error}") from None
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror}") from None
-    return parse_lens(table, source=str(path))
+    return parse_lens(resources.read_toml(path), source=str(path))
 
 
 def parse_lens(table: Mapping[str, Any], *, source: str) -> Prescription:
@@ -155,7 +145,6 @@ def parse_lens(table: Mapping[str, Any], *, source: str) -> Prescription:
         name=str(table.get("name", Path(source).stem)),
         source=str(table.get("source", "")),
         surfaces=surfaces,
-        sensor_reflectance=_number(table, "sensor_reflectance", source, 0.0, low=0.0, high=1.0),
     )
     _check(lens, source)
     return lens
