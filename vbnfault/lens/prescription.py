@@ -29,7 +29,14 @@ _SURFACE_KEYS = (
     "stop",
     "conic",
     "aspheric_mm",
+    "internal_transmittance_10mm",
+    "blades",
+    "blade_rounding",
+    "rotation_deg",
+    "sensor",
+    "reflectance",
 )
+_STOP_KEYS = ("blades", "blade_rounding", "rotation_deg")
 _LENS_KEYS = ("name", "source", "surface")
 _INDEX_RANGE = (1.0, 5.0)
 _RIM_POINTS = 65
@@ -57,6 +64,11 @@ class Surface:
         0 sphere, -1 paraboloid.
     aspheric_mm
         Coefficients of r⁴, r⁶, … of the sag, in mm to the power -3, -5, …
+    internal_transmittance_10mm
+        Of 10 mm of `medium`: wavelengths in nm, and the share that passes, linear between, constant beyond.
+    blades, blade_rounding, rotation_deg
+        Of the stop: 0 blades make it round; else a polygon whose corners lie at `semi_diameter_mm`, the first one
+        at `rotation_deg` from +x, and whose edges bulge towards the circle by `blade_rounding`, 0 to 1.
     """
 
     radius_mm: float
@@ -67,6 +79,10 @@ class Surface:
     stop: bool = False
     conic: float = 0.0
     aspheric_mm: tuple[float, ...] = ()
+    internal_transmittance_10mm: tuple[tuple[float, ...], tuple[float, ...]] = ((D_NM,), (1.0,))
+    blades: int = 0
+    blade_rounding: float = 0.0
+    rotation_deg: float = 0.0
 
     @property
     def curvature_per_mm(self) -> float:
@@ -83,16 +99,33 @@ class Surface:
             sag = sag + a * r2 ** (k + 2)
         return np.asarray(sag)
 
+    def absorption_per_mm(self, wavelength_nm: float) -> float:
+        """Absorption coefficient of the medium behind, 1 / mm."""
+        share = float(np.interp(wavelength_nm, *self.internal_transmittance_10mm))
+        return -math.log(max(share, 1e-30)) / 10
+
+    def rim_mm(self, angle_rad: F64 | float) -> F64:
+        """Distance of the rim from the axis in a direction from +x towards +y: `semi_diameter_mm` but for a stop
+        with blades."""
+        angle = np.asarray(angle_rad, dtype=np.float64)
+        if not self.blades:
+            return np.full(angle.shape, self.semi_diameter_mm)
+        half = np.pi / self.blades
+        beside = np.mod(angle - np.radians(self.rotation_deg), 2 * half) - half
+        edge = np.cos(half) / np.cos(beside)
+        return np.asarray(self.semi_diameter_mm * (edge + (1 - edge) * self.blade_rounding))
+
 
 @dataclass(frozen=True, kw_only=True)
 class Prescription:
     """A lens as its rows, front to back, air in front and behind. The sensor stands at the paraxial focus at the
-    d line, not where the last row's thickness ends.
+    d line, not where the last row's thickness ends; it reflects `sensor_reflectance` of the light, at all angles.
     """
 
     name: str
     source: str
     surfaces: tuple[Surface, ...]
+    sensor_reflectance: float = 0.0
 
     @property
     def stop(self) -> int:
@@ -122,6 +155,16 @@ class Prescription:
         )
         return replace(self, surfaces=surfaces)
 
+    def coated(self, name: str) -> Prescription:
+        """The lens with a named coating on every surface between glass and air. Raises InputError."""
+        media = (AIR, *(s.medium for s in self.surfaces))
+        surfaces = []
+        for front, surface in zip(media, self.surfaces, strict=False):
+            bare = front.nd == surface.medium.nd or 1.0 not in (front.nd, surface.medium.nd)
+            films = () if bare else _facing_air(name, front, surface.medium)
+            surfaces.append(replace(surface, coating=films))
+        return replace(self, surfaces=tuple(surfaces))
+
 
 def load_lens(name_or_path: str | Path) -> Prescription:
     """A prescription by path or packaged name. Raises InputError naming file, surface and value."""
@@ -137,6 +180,12 @@ def parse_lens(table: Mapping[str, Any], *, source: str) -> Prescription:
     rows = table.get("surface")
     if not isinstance(rows, list) or not rows or not all(isinstance(row, dict) for row in rows):
         raise InputError(f"{source}: surface: at least one [[surface]] is needed")
+    sensor_reflectance = 0.0
+    if rows[-1].get("sensor", False) is not False:
+        sensor_reflectance = _sensor(rows[-1], f"{source}: surface {len(rows) - 1}")
+        rows = rows[:-1]
+        if not rows:
+            raise InputError(f"{source}: surface: at least one [[surface]] before the sensor is needed")
     surfaces: tuple[Surface, ...] = ()
     for k, row in enumerate(rows):
         front = surfaces[-1].medium if surfaces else AIR
@@ -145,19 +194,45 @@ def parse_lens(table: Mapping[str, Any], *, source: str) -> Prescription:
         name=str(table.get("name", Path(source).stem)),
         source=str(table.get("source", "")),
         surfaces=surfaces,
+        sensor_reflectance=sensor_reflectance,
     )
     _check(lens, source)
     return lens
 
 
-def _surface(row: Mapping[str, Any], front: Glass, where: str, *, last: bool) -> Surface:
+def _known_keys(row: Mapping[str, Any], where: str) -> None:
     for key in row:
         if key not in _SURFACE_KEYS:
             raise InputError(f"{where}: {key}: unknown key; known: {', '.join(_SURFACE_KEYS)}")
+
+
+def _sensor(row: Mapping[str, Any], where: str) -> float:
+    """Reflectance of the sensor, whose row is the last one."""
+    _known_keys(row, where)
+    if row["sensor"] is not True:
+        raise InputError(f"{where}: sensor = {row['sensor']!r}: must be true or false")
+    for key in row:
+        if key not in ("sensor", "reflectance"):
+            raise InputError(f"{where}: {key}: the sensor takes reflectance alone: it is a plane at the focus")
+    return _number(row, "reflectance", where, None, low=0.0, high=1.0)
+
+
+def _surface(row: Mapping[str, Any], front: Glass, where: str, *, last: bool) -> Surface:
+    _known_keys(row, where)
+    if row.get("sensor", False) is not False:
+        raise InputError(f"{where}: sensor = {row['sensor']!r}: only the last surface can be the sensor")
+    if "reflectance" in row:
+        raise InputError(f"{where}: reflectance: only the sensor has one; elsewhere it follows from coating and glass")
     stop = row.get("stop", False)
     if not isinstance(stop, bool):
         raise InputError(f"{where}: stop = {stop!r}: must be true or false")
     radius = _number(row, "radius_mm", where, math.inf if stop else None, low=-math.inf, high=math.inf)
+    for key in _STOP_KEYS:
+        if key in row and not stop:
+            raise InputError(f"{where}: {key}: only the stop has it")
+    blades = _number(row, "blades", where, 0, low=0, high=64)
+    if blades in (1, 2) or not blades.is_integer():
+        raise InputError(f"{where}: blades = {row['blades']!r}: must be 0, for a round stop, or from 3 to 64")
     if radius == 0:
         raise InputError(f"{where}: radius_mm = 0: must not be 0; a plane has inf")
     coefficients = row.get("aspheric_mm", [])
@@ -175,6 +250,10 @@ def _surface(row: Mapping[str, Any], front: Glass, where: str, *, last: bool) ->
         aspheric_mm=tuple(
             _number({"aspheric_mm": c}, "aspheric_mm", where, None, low=-1e12, high=1e12) for c in coefficients
         ),
+        internal_transmittance_10mm=_internal(row.get("internal_transmittance_10mm", 1.0), where),
+        blades=int(blades),
+        blade_rounding=_number(row, "blade_rounding", where, 0.0, low=0.0, high=1.0),
+        rotation_deg=_number(row, "rotation_deg", where, 0.0, low=-360.0, high=360.0),
     )
     if np.isnan(surface.sag_mm(surface.semi_diameter_mm)):
         raise InputError(
@@ -213,18 +292,40 @@ def _medium(row: Mapping[str, Any], where: str) -> Glass:
     return medium
 
 
+def _internal(given: object, where: str) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """A share for all wavelengths, or a table of them."""
+    where, key = f"{where}: internal_transmittance_10mm", "value"
+    if not isinstance(given, dict):
+        return (D_NM,), (_number({key: given}, key, where, None, low=0.0, high=1.0),)
+    columns = []
+    for name, high in (("wavelength_nm", 1e5), ("value", 1.0)):
+        column = given.get(name)
+        if not isinstance(column, list) or not column:
+            raise InputError(f"{where}.{name}: must be a list of numbers")
+        columns.append(tuple(_number({name: v}, name, where, None, low=0.0, high=high) for v in column))
+    nodes, values = columns
+    if set(given) != {"wavelength_nm", "value"} or len(nodes) != len(values) or list(nodes) != sorted(set(nodes)):
+        raise InputError(f"{where}: must be a share, or a table of rising wavelength_nm and as many of value")
+    return nodes, values
+
+
 def _coating(given: object, front: Glass, back: Glass, where: str) -> tuple[Layer, ...]:
     if isinstance(given, list):  # films of one's own, from the front
         return tuple(_layer(film, f"{where}: coating[{k}]") for k, film in enumerate(given))
     try:
         if not isinstance(given, str):
             raise InputError(f"coating = {given!r}: must be a name or a list of layers")
-        glass = max(front.index(DESIGN_NM), back.index(DESIGN_NM))
-        films = design(given, float(glass))
+        films = _facing_air(given, front, back)
         if films and 1.0 not in (front.nd, back.nd):
             raise InputError(f"coating = {given!r}: is made for a surface in air, not between two glasses")
     except InputError as error:
         raise InputError(f"{where}: {error}") from None
+    return films
+
+
+def _facing_air(name: str, front: Glass, back: Glass) -> tuple[Layer, ...]:
+    """A named coating with its outer film on the side of the air, in the order that light from the front meets."""
+    films = design(name, float(max(front.index(DESIGN_NM), back.index(DESIGN_NM))))
     return films if front.nd == 1.0 else films[::-1]
 
 
