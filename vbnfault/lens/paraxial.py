@@ -12,10 +12,10 @@ from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from .coating import mean_reflectance
-from .first_order import first_order, gap, refraction
+from .first_order import first_order
 from .glass import D_NM
 from .prescription import Prescription
 from .trace import ghost
@@ -60,24 +60,28 @@ def pairs(lens: Prescription) -> tuple[tuple[int, int], ...]:
     return tuple(combinations(mirrors(lens), 2))
 
 
-def along(lens: Prescription, path: Sequence[tuple[int, bool]], wavelength_nm: float = D_NM) -> tuple[F64, F64]:
-    """The matrix from the first vertex's plane to the sensor, float64[2, 2], and that to each surface met,
-    float64[step, 2, 2]."""
-    index, vertex = lens.indices(wavelength_nm), lens.vertices_mm
-    total, met, onward = np.eye(2), [], True
-    for step, (row, mirror) in enumerate(path):
-        if step:
-            total = gap(abs(vertex[row] - vertex[path[step - 1][0]])) @ total
-        met.append(total)
-        curvature = lens.surfaces[row].curvature_per_mm
+def along(lens: Prescription, path: Sequence[tuple[int, bool]], wavelength_nm: ArrayLike = D_NM) -> tuple[F64, F64]:
+    """The matrix from the first vertex's plane to the sensor, float64[..., 2, 2], and that to each surface met,
+    float64[step, ..., 2, 2]; ... is the shape of `wavelength_nm`. The sensor is the row behind the last."""
+    wavelength = np.asarray(wavelength_nm, dtype=np.float64)
+    index = np.stack([np.ones(wavelength.shape), *(s.medium.index(wavelength) for s in lens.surfaces)])
+    sensor_mm = first_order(lens).bfd_mm
+    vertex = np.append(lens.vertices_mm, lens.vertices_mm[-1] + sensor_mm)
+    height, slope = (np.broadcast_to(row, (*wavelength.shape, 2)).copy() for row in np.eye(2))
+    met, onward, before = [], True, 0
+    for row, mirror in path:
+        height = height + abs(vertex[row] - vertex[before]) * slope
+        met.append(np.stack([height, slope], axis=-2))
+        curvature = lens.surfaces[row].curvature_per_mm if row < len(lens.surfaces) else 0.0
+        sense = curvature if onward else -curvature
         if mirror:
-            total = np.array([[1.0, 0.0], [2 * (curvature if onward else -curvature), 1.0]]) @ total
-            onward = not onward
-        elif onward:
-            total = refraction(index[row], index[row + 1], curvature) @ total
+            slope, onward = slope + 2 * sense * height, not onward
         else:
-            total = refraction(index[row + 1], index[row], -curvature) @ total
-    return gap(first_order(lens).bfd_mm) @ total, np.stack(met)
+            into, out = (index[row], index[row + 1]) if onward else (index[row + 1], index[row])
+            slope = ((into - out) * sense / out)[..., None] * height + (into / out)[..., None] * slope
+        before = row
+    height = height + (vertex[-1] - vertex[before]) * slope
+    return np.stack([height, slope], axis=-2), np.stack(met)
 
 
 def transmittance(lens: Prescription, path: Sequence[tuple[int, bool]], wavelength_nm: float = D_NM) -> float:

@@ -1,0 +1,384 @@
+"""Ghosts of the Sun as an irradiance picture: by exact rays or to first order, per band, on its disc.
+
+A ghost is an image of the openings on its way. The Sun's disc and diffraction soften the edges of that image by
+known widths (the first-order shift over the disc's radius, and Fresnel's of a straight edge), which each rim has of
+its own. Where the Sun itself is nearly in focus, its disc is sampled instead.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import InputError
+from .ghosts import Rays, Spots, Tracer, backend
+from .paraxial import Ghost, along
+from .prescription import Prescription
+from .raster import LEVELS, Canvas, Placement, Sums, edge_kind
+
+F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
+
+MODELS = ("traced", "paraxial")
+_ACROSS = 37  # rays across a ghost
+_ACROSS_FOCUSED = 17
+_SUBDIVISIONS = 8  # of the interval between two bands, where colours part
+_APART_PX = 1.5  # of a ghost's level: colours farther apart than this take more wavelengths
+_FOCUSED = 0.35  # width of an edge in radii of its rim above which the disc is sampled
+_DISC_RINGS = 3
+_PLAIN = 0.03  # edges of this contrast are drawn in full; of a quarter of it a level coarser, and so on
+_RAMP, _RAMP_PX = 7.0, 24.0  # how far from an edge, in its widths and in pixels at least, details are drawn
+_LEAST = 1e-10  # irradiance over the Sun's below which a ghost is left out
+
+
+class FirstOrderTracer(Tracer):
+    """Rays by matrices instead of surfaces: Lee & Eisemann's model, in the same tables."""
+
+    def __init__(
+        self, lens: Prescription, wavelength_nm: F64, *, reflections: int = 2, routes_: Any = None
+    ) -> None:
+        super().__init__(lens, wavelength_nm, reflections=reflections, routes_=routes_)
+        be = backend()
+        found = [along(lens, path, self.wavelength_nm) for path in self._paths]
+        whole = np.stack([m for m, _ in found])  # route, wavelength
+        met = np.concatenate([m for _, m in found])  # step, wavelength
+        index = np.stack([np.append(lens.indices(w), 1.0) for w in self.wavelength_nm])
+        passed = self._shares(index)[:, :, :, -1].reshape(len(index), -1)
+        shares = np.ones(whole.shape[:2])
+        look_up = self._look_up
+        for k, (first, last) in enumerate(zip(self.first_step[:-1], self.first_step[1:], strict=True)):
+            shares[k] = passed[:, look_up[first:last]].prod(axis=1)
+        self._first_order = {
+            "whole": be.Float(whole[:, :, 0, :].transpose(1, 0, 2).astype(np.float32).ravel()),
+            "met": be.Float(met[:, :, 0, :].transpose(1, 0, 2).astype(np.float32).ravel()),
+            "share": be.Float(shares.T.astype(np.float32).ravel()),
+        }
+
+    def trace(self, rays: Rays, across: int, width: F64 | None = None, *, centred: bool = False) -> Spots:
+        """As `Tracer.trace`, to first order; the Sun's slope is its tangent."""
+        be, t, f = backend(), self._tables, self._first_order
+        dr = be.dr
+        start = self._start(rays, across, centred)
+        per_width = be.Float((1 / (self._no_width if width is None else width)).astype(np.float32))
+        rim = self.lens.surfaces[self.lens.stop]
+        x, y = start.x, start.y
+        sx, sy = start.dx / start.dz, start.dy / start.dz
+        of = start.wavelength * dr.opaque(be.UInt32, len(self.routes)) + start.route
+        m00, m01 = (dr.gather(be.Float, f["whole"], 2 * of + k) for k in (0, 1))
+        steps = start.wavelength * dr.opaque(be.UInt32, len(self.rows))
+        end = dr.gather(be.UInt32, t["end"], start.route)
+
+        def on(step: Any, *_: Any) -> Any:
+            return step < end
+
+        def body(step: Any, radius: Any, margin: Any) -> Any:
+            row = dr.gather(be.UInt32, t["row"], step)
+            a, b = (dr.gather(be.Float, f["met"], 2 * (steps + step) + k) for k in (0, 1))
+            hx, hy = dr.fma(a, x, b * sx), dr.fma(a, y, b * sy)
+            beyond = dr.sqrt(hx * hx + hy * hy) * dr.gather(be.Float, t["per_rim"], row)
+            if rim.blades:
+                blade = self._within_blades(hx, hy)
+                beyond = dr.select(dr.gather(be.UInt32, t["stop"], step) == 1, blade, beyond)
+            margin = dr.minimum(margin, (1 - beyond) * dr.gather(be.Float, per_width, step))
+            return step + 1, dr.maximum(radius, beyond), margin
+
+        count = dr.width(x)
+        first = (
+            dr.gather(be.UInt32, t["start"], start.route),
+            dr.zeros(be.Float, count),
+            dr.full(be.Float, 1e6, count),
+        )
+        _, radius, margin = dr.while_loop(first, on, body, mode="symbolic")
+        spots = Spots(
+            x_mm=dr.fma(m00, x, m01 * sx),
+            y_mm=dr.fma(m00, y, m01 * sy),
+            share=dr.gather(be.Float, f["share"], of),
+            radius=radius,
+            margin=margin,
+        )
+        dr.eval(spots.x_mm, spots.y_mm, spots.share, spots.radius, spots.margin)
+        return spots
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Flare:
+    """What one position of the Sun gives: `irradiance` float32[band, y, x] over the Sun's own at the entrance, and
+    the ghosts that took part, at the wavelength in the middle."""
+
+    irradiance: F32
+    ghosts: tuple[Ghost, ...]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Detail:
+    """How finely routes are drawn: `Placement`'s columns by route, and the width of each step's rim's edge."""
+
+    level: NDArray[np.int64]
+    inner_level: NDArray[np.int64]
+    fold_level: NDArray[np.int64]
+    ramp: F64
+    kind: NDArray[np.int64]
+    width: F64
+
+
+class FlareModel:
+    """Ghosts of one lens on one sensor, made once; `image` for every position of the Sun.
+
+    Parameters
+    ----------
+    lens
+        At its final size.
+    wavelength_nm
+        float64[band]: nodes of the bands; one node is one wavelength.
+    shape, pitch_mm
+        Pixels (height, width) of the sensor and their pitch.
+    sun_radius_rad
+        Of the Sun's disc; 0 is a point.
+    model
+        'traced' or 'paraxial'.
+    reflections
+        2, or 4 for ghosts of four reflections too.
+    diffraction
+        Whether edges ring as Fresnel's do.
+    """
+
+    def __init__(
+        self,
+        lens: Prescription,
+        wavelength_nm: F64,
+        *,
+        shape: tuple[int, int],
+        pitch_mm: float,
+        sun_radius_rad: float,
+        model: str = "traced",
+        reflections: int = 2,
+        diffraction: bool = True,
+    ) -> None:
+        if model not in MODELS:
+            raise InputError(f"model = {model!r}: must be one of {', '.join(MODELS)}")
+        self.lens = lens
+        self.nodes_nm = np.atleast_1d(np.asarray(wavelength_nm, dtype=np.float64))
+        self.canvas = Canvas(shape=shape, pitch_mm=pitch_mm, bands=len(self.nodes_nm))
+        self.sun_radius_rad = sun_radius_rad
+        kind = Tracer if model == "traced" else FirstOrderTracer
+        steps_between = _SUBDIVISIONS
+        at = np.arange((len(self.nodes_nm) - 1) * steps_between + 1) / steps_between
+        self._fine = np.interp(at, np.arange(len(self.nodes_nm)), self.nodes_nm)
+        self._tracer = kind(lens, self._fine, reflections=reflections)
+        self._diffraction = diffraction
+        self._reach_mm = float(np.hypot(*shape) / 2 * pitch_mm)
+        self._soften()
+
+    def _soften(self) -> None:
+        """Widths of the rims' soft edges for every step, the level and the edge's kind of every route."""
+        t = self._tracer
+        counts = np.diff(t.first_step)
+        route = np.repeat(np.arange(len(t.routes)), counts)
+        whole, met = t.matrix[route], t.met
+        a, b = met[:, 0, 0], met[:, 0, 1]
+        a = np.where(np.abs(a) < 1e-9, 1e-9, a)
+        m00 = np.where(np.abs(whole[:, 0, 0]) < 1e-9, 1e-9, whole[:, 0, 0])
+        rim = t.rims_mm[t.rows]
+        # at one place of the sensor, how far the ray at this rim moves with the Sun
+        self._sun = self.sun_radius_rad * np.abs(b - a * whole[:, 0, 1] / m00) / rim
+        # phase over the rim's plane: π (Δy)² m / (λ B), Fresnel's variable is Δy √(2 m / (λ B))
+        onwards = np.einsum("kij,kjl->kil", whole, np.linalg.inv(met))
+        in_air = onwards[:, 0, 1] / t.medium_index
+        nm = float(np.median(self.nodes_nm))
+        fresnel = np.sqrt(nm * 1e-6 * np.abs(in_air * a / m00) / 2) / rim
+        self._fresnel = fresnel if self._diffraction else 0 * fresnel
+        self._px = rim * np.abs(m00 / a) / self.canvas.pitch_mm  # pixels a radius of the rim
+        disc = np.abs(rim / a)
+        bounds = zip(t.first_step[:-1], t.first_step[1:], strict=True)
+        self._least = np.array([first + int(np.argmin(disc[first:last])) for first, last in bounds], dtype=np.int64)
+        self._sampled = self._sun[self._least] > _FOCUSED
+        self._sun[self._sampled[route]] = 0
+        self._detail = self._details(np.zeros(len(t.routes), dtype=np.int64))
+
+    def _details(self, coarser: NDArray[np.int64]) -> _Detail:
+        """Levels and edges of every route, `coarser` by so many levels than its edges ask for."""
+        t, least = self._tracer, self._least
+        blur_px = np.hypot(self._sun[least], self._fresnel[least]) * self._px[least]
+        # the disc's samples lie about a third of its radius apart
+        apart_px = 0.3 * self.sun_radius_rad * np.abs(t.matrix[:, 0, 1]) / self.canvas.pitch_mm
+        blur_px = np.where(self._sampled, apart_px, blur_px)
+        level = np.floor(np.log2(np.maximum(blur_px / 1.5, 1.0))).astype(np.int64) + coarser
+        level = np.minimum(level, LEVELS - 1)
+        route = np.repeat(np.arange(len(t.routes)), np.diff(t.first_step))
+        steady = np.hypot(self._sun, 0.5 * 2.0 ** level[route] / self._px)
+        width = np.clip(np.hypot(steady, self._fresnel), 1e-4, 0.5)
+        one_px = width[least] * self._px[least]
+        ramp = np.maximum(_RAMP, _RAMP_PX * 2.0**coarser / one_px)
+        return _Detail(
+            level=level,
+            # pixels a fifth of the ramp wide for what lies within
+            inner_level=np.clip(np.floor(np.log2(ramp * one_px / 5)), level, LEVELS - 1).astype(np.int64),
+            fold_level=np.maximum(level - 1, np.minimum(level, 1)),
+            ramp=ramp,
+            kind=edge_kind(steady[least], self._fresnel[least]),
+            width=width,
+        )
+
+    def image(self, sun_deg: float, azimuth_deg: float = 0.0, *, only: tuple[int, int] | None = None) -> Flare:
+        """Ghosts of a Sun at an angle from the axis, towards an azimuth: its direct image lies at +f tan θ there
+        (azimuth 0: +x, right; 90°: +y, down). `only` keeps one pair of reflecting rows.
+
+        Raises InputError for an angle of 90° or more.
+        """
+        if not 0 <= sun_deg < 90:
+            raise InputError(f"sun_deg = {sun_deg:g}: must be from 0 to below 90")
+        turn = float(np.radians(azimuth_deg))
+        made = self._tracer.turned(turn)
+        rays, where = made.boxes(sun_deg, self._detail.width, self._reach_mm)
+        shown = self._in_frame(where) & (where[:, 4] > _LEAST)
+        if only is not None:
+            shown &= np.array([tuple(sorted(made.routes[r])) == only for r in rays.route], dtype=bool)
+        rays, where = rays.take(shown), where[shown]
+        detail = self._details(self._fainter(rays, where))
+        sums = Sums(self.canvas)
+        ghosts: tuple[Ghost, ...] = ()
+        steady = ~self._sampled[rays.route]
+        cosine = float(np.cos(np.radians(sun_deg)))
+        for sampled in (False, True):
+            chosen = steady ^ sampled
+            if not chosen.any():
+                continue
+            bundles, band, weight, plain = self._coloured(rays.take(chosen), where[chosen], detail)
+            strength, across = np.full(len(bundles), cosine), _ACROSS
+            if sampled:
+                each, bundles, strength = self._over_disc(bundles, sun_deg)
+                band, weight, plain = band[each], weight[each], plain[each]
+                across = _ACROSS_FOCUSED
+            spots = made.trace(bundles, across, detail.width)
+            # within, where a ghost is smooth, the bands' own wavelengths will do
+            nodes = np.flatnonzero(plain >= 0)
+            own = np.column_stack([plain, plain])[nodes]
+            once = np.tile([1.0, 0.0], (len(nodes), 1))
+            sums.draw(spots, self._place(detail, bundles, nodes, own, once, strength, "inner"), across, turn)
+            every = np.arange(len(bundles))
+            for part in ("edge", "fold"):
+                sums.draw(spots, self._place(detail, bundles, every, band, weight, strength, part), across, turn)
+        return Flare(irradiance=sums.irradiance(), ghosts=ghosts)
+
+    def _fainter(self, rays: Rays, where: F64) -> NDArray[np.int64]:
+        """Levels by which routes may be drawn coarser: their edges are too faint against the sum of all to show."""
+        height, width = (n / 2 * self.canvas.pitch_mm for n in self.canvas.shape)
+        frame = np.hypot(height, width)
+        across = np.clip(np.minimum(where[:, 2:4], frame) - np.maximum(where[:, :2], -frame), 0, None)
+        total = (where[:, 4] * np.minimum(across.prod(axis=1) / (4 * height * width), 1)).sum()
+        out = np.zeros(len(self._tracer.routes), dtype=np.int64)
+        faint = np.log(_PLAIN * total / np.maximum(where[:, 4], 1e-300)) / np.log(4)
+        out[rays.route] = np.clip(np.ceil(faint), 0, 1)
+        return out
+
+    def _in_frame(self, where: F64) -> NDArray[np.bool_]:
+        beyond = np.maximum(np.maximum(where[:, :2], -where[:, 2:4]), 0)
+        soft = 8 * 2.0**LEVELS * self.canvas.pitch_mm
+        return np.asarray(np.hypot(beyond[:, 0], beyond[:, 1]) < self._reach_mm + soft)
+
+    def _coloured(
+        self, rays: Rays, where: F64, detail: _Detail
+    ) -> tuple[Rays, NDArray[np.int64], F64, NDArray[np.int64]]:
+        """One bundle a wavelength, more of them where the colours of a ghost part by more than a pixel: bundles,
+        two bands of each with their weights, and the band whose node it is, or -1."""
+        bands = len(self.nodes_nm)
+        pixel = self.canvas.pitch_mm * 2.0 ** detail.level[rays.route]
+        apart = where[:, 5] / max(bands - 1, 1) / pixel
+        parts = 2 ** np.clip(np.ceil(np.log2(np.maximum(apart / _APART_PX, 1))), 0, 3).astype(np.int64)
+        if bands == 1:
+            parts[:] = _SUBDIVISIONS
+        chosen, wavelength, weights = [], [], []
+        for n in np.unique(parts):
+            at = np.arange(0, len(self._fine), _SUBDIVISIONS // n)
+            hats = np.maximum(1 - np.abs(at[:, None] / _SUBDIVISIONS - np.arange(bands)), 0)
+            hats /= hats.sum(axis=0)
+            which = np.flatnonzero(parts == n)
+            chosen.append(np.repeat(which, len(at)))
+            wavelength.append(np.tile(at, len(which)))
+            weights.append(np.tile(hats, (len(which), 1)))
+        at, both = np.concatenate(wavelength), np.concatenate(weights)
+        bundles = replace(rays.take(np.concatenate(chosen)), wavelength=at)
+        first = np.argmax(both > 0, axis=1)
+        second = np.minimum(first + 1, bands - 1)
+        rows = np.arange(len(both))
+        other = np.where(second > first, both[rows, second], 0)
+        plain = np.where(at % _SUBDIVISIONS == 0, at // _SUBDIVISIONS, -1)
+        return bundles, np.column_stack([first, second]), np.column_stack([both[rows, first], other]), plain
+
+    def _over_disc(self, rays: Rays, sun_deg: float) -> tuple[NDArray[np.int64], Rays, F64]:
+        """The bundles from every sample of the Sun's disc: of which each is one, and its strength."""
+        samples = disc_samples(_DISC_RINGS) * self.sun_radius_rad
+        count = len(samples)
+        theta = np.radians(sun_deg) + samples[:, 0]
+        direction = np.column_stack([np.sin(theta), np.sin(samples[:, 1]), np.cos(theta)])
+        direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+        each = np.repeat(np.arange(len(rays)), count)
+        which = np.tile(np.arange(count), len(rays))
+        return each, replace(rays.take(each), direction=direction[which]), direction[which, 2] / count
+
+    def _place(
+        self,
+        detail: _Detail,
+        bundles: Rays,
+        source: NDArray[np.int64],
+        band: NDArray[np.int64],
+        weight: F64,
+        strength: F64,
+        part: str,
+    ) -> Placement:
+        route = bundles.route[source]
+        level = {"inner": detail.inner_level, "edge": detail.level, "fold": detail.fold_level}[part]
+        return Placement(
+            source=source,
+            level=level[route],
+            band=band,
+            weight=weight,
+            strength=strength[source],
+            kind=detail.kind[route],
+            box_mm=bundles.box_mm[source],
+            ramp=detail.ramp[route],
+            part=part,
+        )
+
+
+def disc_samples(rings: int) -> F64:
+    """Points of a unit disc, float64[n, 2], each for the same share of its area: one, and 6 k on ring k."""
+    points = [np.zeros((1, 2))]
+    total = 1 + 3 * rings * (rings + 1)
+    inner = 1
+    for k in range(1, rings + 1):
+        n = 6 * k
+        radius = np.sqrt((inner + n / 2) / total)
+        angle = 2 * np.pi * (np.arange(n) + 0.5 * (k % 2)) / n
+        points.append(radius * np.column_stack([np.cos(angle), np.sin(angle)]))
+        inner += n
+    return np.concatenate(points)
+
+
+@lru_cache(maxsize=4)
+def flare_model(
+    lens: Prescription,
+    nodes_nm: tuple[float, ...],
+    shape: tuple[int, int],
+    pitch_mm: float,
+    sun_radius_rad: float,
+    model: str,
+    reflections: int = 2,
+) -> FlareModel:
+    """A model, made once for what it depends on."""
+    return FlareModel(
+        lens,
+        np.array(nodes_nm),
+        shape=shape,
+        pitch_mm=pitch_mm,
+        sun_radius_rad=sun_radius_rad,
+        model=model,
+        reflections=reflections,
+    )
+
+
+__all__ = ["MODELS", "Flare", "FlareModel", "disc_samples", "flare_model"]

@@ -1,0 +1,656 @@
+"""Ghosts by exact rays: every path of two or four reflections, all wavelengths, one kernel (Hullin et al. 2011).
+
+A path is a table of steps, so that rays of all ghosts run side by side through one loop. Rays start on a grid in
+the plane of the first vertex, within the box that a path's rims leave open; the box is found by two coarse passes.
+Single precision: a ray's place is kept relative to the vertex it has just met.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from itertools import combinations
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import InputError
+from .coating import reflect_transmit
+from .first_order import first_order
+from .glass import D_NM
+from .paraxial import Ghost, along, mirrors
+from .prescription import Prescription
+from .trace import ghost
+
+F64 = NDArray[np.float64]
+Steps = tuple[tuple[int, bool], ...]
+
+_COSINES = 256  # nodes of the reflectance tables
+_COARSE = 25  # rays across a box while boxes are sought
+_FINE = 512  # rays across a box where flux and place are told
+_PEAK = 128  # and where the peak is sought
+_TOGETHER = 8  # bundles at a time there, for the memory's sake
+_LOST = -1e6
+
+
+@lru_cache(maxsize=1)
+def backend() -> Any:
+    """drjit with its array types, on a usable LLVM."""
+    from .. import llvm
+
+    llvm.prepare()
+    import drjit
+    import drjit.llvm as types
+
+    return SimpleNamespace(
+        dr=drjit,
+        Float=types.Float,
+        UInt32=types.UInt,
+        Int32=types.Int,
+        UInt64=types.UInt64,
+        Int64=types.Int64,
+        Double=types.Float64,
+        Bool=types.Bool,
+    )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Rays:
+    """Which rays to trace: for each bundle its path, wavelength, box in the plane of the first vertex, direction.
+
+    `route` and `wavelength` index those of the tracer, int[bundle]; `box_mm` float64[bundle, 4] is centre x, y and
+    half width x, y; `direction` float64[bundle, 3] unit vectors, with the Sun's azimuth at 0.
+    """
+
+    route: NDArray[np.int64]
+    wavelength: NDArray[np.int64]
+    box_mm: F64
+    direction: F64
+
+    def __len__(self) -> int:
+        return len(self.route)
+
+    def take(self, chosen: NDArray[Any]) -> Rays:
+        """Some of the bundles."""
+        return Rays(
+            route=self.route[chosen],
+            wavelength=self.wavelength[chosen],
+            box_mm=self.box_mm[chosen],
+            direction=self.direction[chosen],
+        )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Spots:
+    """Where rays arrive: device arrays, bundle after bundle, rows of the grid along x within one.
+
+    `x_mm`, `y_mm` on the sensor, `share` of the light, `radius`: the largest distance from the axis over the rim's
+    on the way, and `margin`: the least of (1 - radius) over the width of the rim's soft edge; a ray that misses a
+    surface has a radius of 1e6.
+    """
+
+    x_mm: Any
+    y_mm: Any
+    share: Any
+    radius: Any
+    margin: Any
+
+
+def _paired(first: NDArray[Any], second: NDArray[Any]) -> NDArray[np.uint64]:
+    """Two arrays of numbers in single precision as one of words."""
+    pair = np.stack([np.asarray(first, dtype=np.float32), np.asarray(second, dtype=np.float32)], axis=-1)
+    return np.ascontiguousarray(pair).view(np.uint64).ravel()
+
+
+def _unpaired(words: Any, index: Any) -> tuple[Any, Any]:
+    """What `_paired` put together."""
+    be = backend()
+    word = be.dr.gather(be.UInt64, words, index)
+    halves = be.UInt32(word), be.UInt32(word >> 32)
+    return tuple(be.dr.reinterpret_array(be.Float, half) for half in halves)  # type: ignore[return-value]
+
+
+def routes(lens: Prescription, reflections: int = 2) -> tuple[tuple[int, ...], ...]:
+    """Sequences of reflecting rows in the order met: back, forward, and with four reflections back, forward."""
+    rows = (*mirrors(lens), *((len(lens.surfaces),) if lens.sensor_reflectance else ()))
+    two = [(b, a) for a, b in combinations(rows, 2)]
+    if reflections == 2:
+        return tuple(two)
+    if reflections != 4:
+        raise InputError(f"reflections = {reflections}: must be 2 or 4")
+    return (*two, *(first + second for first in two for second in two if second[0] > first[1]))
+
+
+def steps(lens: Prescription, route: Sequence[int]) -> Steps:
+    """(row, whether it reflects) of a route; the sensor is the row behind the last."""
+    if len(route) == 2:
+        path = ghost(lens, route[1], route[0]) if route[0] < len(lens.surfaces) else ()
+        if path:
+            return path
+    out: list[tuple[int, bool]] = []
+    at, onward = -1, True
+    for row in route:
+        between = range(at + 1, row) if onward else range(at - 1, row, -1)
+        out += [(k, False) for k in between]
+        out.append((row, True))
+        at, onward = row, not onward
+    return (*out, *((k, False) for k in range(at + 1, len(lens.surfaces))))
+
+
+class Tracer:
+    """A lens made ready for tracing: tables of its paths, indices and reflectances at wavelengths, made once.
+
+    `reflections`: 2, or 4 for the paths of four reflections too.
+    """
+
+    def __init__(
+        self, lens: Prescription, wavelength_nm: F64, *, reflections: int = 2, routes_: Any = None
+    ) -> None:
+        self.lens = lens
+        self.wavelength_nm = np.atleast_1d(np.asarray(wavelength_nm, dtype=np.float64))
+        self.routes = routes(lens, reflections) if routes_ is None else tuple(routes_)
+        self.sensor_mm = first_order(lens).bfd_mm
+        self._paths = [steps(lens, route) for route in self.routes]
+        self.first_step = np.concatenate([[0], np.cumsum([len(path) for path in self._paths])])
+        middle = float(np.median(self.wavelength_nm))
+        pairs_of = [along(lens, path, middle) for path in self._paths]
+        self.matrix = np.stack([m for m, _ in pairs_of]) if pairs_of else np.zeros((0, 2, 2))
+        self.met = np.concatenate([met for _, met in pairs_of]) if pairs_of else np.zeros((0, 2, 2))
+        self._tables = self._upload()
+
+    def _upload(self) -> dict[str, Any]:
+        be, lens = backend(), self.lens
+        vertex = np.append(lens.vertices_mm, lens.vertices_mm[-1] + self.sensor_mm)
+        sensor = len(lens.surfaces)
+        row, mirror, medium, other, gap = [], [], [], [], []
+        last = []
+        for path in self._paths:
+            onward, before = True, 0
+            for k, reflects in path:
+                row.append(k)
+                mirror.append(reflects)
+                medium.append(k if onward else k + 1)
+                other.append(k + 1 if onward else k)
+                gap.append(vertex[before] - vertex[k])
+                before, onward = k, onward ^ reflects
+            last.append(vertex[before] - vertex[sensor])
+        index = np.stack([np.append(lens.indices(w), 1.0) for w in self.wavelength_nm])
+        absorption = np.zeros_like(index)
+        for k, surface in enumerate(lens.surfaces):
+            absorption[:, k + 1] = [surface.absorption_per_mm(w) for w in self.wavelength_nm]
+        self._absorbs = bool(absorption.any())
+        rows = np.array(row, dtype=np.uint32)
+        # by what the reflectance is looked up: 0 from the front, 1 from behind, 2 what passes
+        use = np.where(mirror, np.array(medium, dtype=np.int64) != rows, 2)
+        self.rows = rows
+        self._look_up = rows.astype(np.int64) * 3 + use
+        middle = lens.indices(float(np.median(self.wavelength_nm)))
+        self.medium_index = np.append(middle, 1.0)[medium]
+        self.rims_mm = np.array([s.semi_diameter_mm for s in lens.surfaces] + [np.inf])
+        most = max((len(s.aspheric_mm) for s in lens.surfaces), default=0)
+        aspheric = np.zeros((most, sensor + 1))
+        for k, s in enumerate(lens.surfaces):
+            aspheric[: len(s.aspheric_mm), k] = s.aspheric_mm
+        flat = [s.curvature_per_mm for s in lens.surfaces] + [0.0]
+        conic = [1 + s.conic for s in lens.surfaces] + [1.0]
+        stops_ = len(rows)
+        before, behind = index[:, medium], index[:, other]
+        # a ray's step asks for few but wide records: fetching is what takes the time
+        curvature, per_rim = (np.array(flat)[rows], (1 / self.rims_mm)[rows])
+        share = self._shares(index)
+        rise = np.diff(share, axis=-1, append=share[..., -1:])
+        self._look_up_word = ((rows * 3 + use) * _COSINES * 2 + np.array(mirror, dtype=np.int64)).astype(np.uint32)
+        tables = {
+            "row": be.UInt32(rows),
+            "stop": be.UInt32((rows == lens.stop).astype(np.uint32)),
+            "place": be.UInt64(_paired(np.array(gap), curvature)),
+            "bend": be.UInt64(_paired(before / behind, np.broadcast_to(per_rim, (len(index), stops_)))),
+            "share": be.UInt64(_paired(share, rise)),
+            "end": be.UInt32(self.first_step[1:].astype(np.uint32)),
+            "start": be.UInt32(self.first_step[:-1].astype(np.uint32)),
+            "last": be.Float(np.array(last, dtype=np.float32)),
+            "conic": be.Float(np.array(conic, dtype=np.float32)),
+            "per_rim": be.Float(per_rim.astype(np.float32)),
+            "absorption": be.Float(absorption[:, medium].astype(np.float32).ravel()),
+            "aspheric": [be.Float(c.astype(np.float32)) for c in aspheric],
+        }
+        self._conic = any(c != 1 for c in conic)
+        be.dr.eval(tables)
+        return tables
+
+    def _shares(self, index: F64) -> F64:
+        """What each surface reflects from the front, from behind, and passes, float64[wavelength, row, 3, cosine]:
+        over the cosine in the thinner of its two media, mean of both polarisations."""
+        lens = self.lens
+        cosine = np.maximum(np.linspace(0, 1, _COSINES), 1e-6)[None, :]
+        out = np.zeros((len(index), len(lens.surfaces) + 1, 3, _COSINES))
+        wavelength = self.wavelength_nm[:, None]
+        for k, surface in enumerate(lens.surfaces):
+            front, back = index[:, k, None], index[:, k + 1, None]
+            # the cosine on either side; the square root is of what the denser side has left
+            thin = np.minimum(front, back)
+            at_front, at_back = (np.sqrt(1 - (thin / n) ** 2 * (1 - cosine**2)) for n in (front, back))
+            films = surface.coating
+            rs, rp, ts, tp = reflect_transmit(films, front, back, at_front, wavelength)
+            out[:, k, 0], out[:, k, 2] = (rs + rp) / 2, (ts + tp) / 2
+            rs, rp, _, _ = reflect_transmit(films[::-1], back, front, at_back, wavelength)
+            out[:, k, 1] = (rs + rp) / 2
+        out[:, -1, :2] = lens.sensor_reflectance
+        return out
+
+    @cached_property
+    def _no_width(self) -> F64:
+        return np.full(len(self.met), 1e-3)
+
+    def trace(self, rays: Rays, across: int, width: F64 | None = None, *, centred: bool = False) -> Spots:
+        """Trace `across` × `across` rays of every bundle.
+
+        Parameters
+        ----------
+        width
+            float64[step]: of the soft edge of the rim at each step of each route, in radii of the rim.
+        centred
+            Rays in the middles of the box's cells, else on its lattice, edges included.
+        """
+        be, t = backend(), self._tables
+        dr = be.dr
+        per_width = (1 / (self._no_width if width is None else width)).astype(np.float32)
+        edge = be.UInt64(_paired(per_width, self._look_up_word.view(np.float32)))
+        rim = self.lens.surfaces[self.lens.stop]
+        start = self._start(rays, across, centred)
+        count, route = dr.width(start.x), start.route
+        wavelength = start.wavelength * dr.opaque(be.UInt32, len(self.rows))
+        shares = start.wavelength * dr.opaque(be.UInt32, 3 * _COSINES * (len(self.lens.surfaces) + 1))
+        end = dr.gather(be.UInt32, t["end"], route)
+        state = (
+            dr.gather(be.UInt32, t["start"], route),
+            start.x,
+            start.y,
+            dr.zeros(be.Float, count),
+            start.dx,
+            start.dy,
+            start.dz,
+            dr.full(be.Float, 1, count),
+            dr.zeros(be.Float, count),
+            dr.full(be.Float, 1e6, count),
+        )
+
+        special = self._conic or bool(t["aspheric"])
+
+        def on(step: Any, *_: Any) -> Any:
+            return step < end
+
+        def body(
+            step: Any, x: Any, y: Any, z: Any, dx: Any, dy: Any, dz: Any, share: Any, radius: Any, margin: Any
+        ) -> Any:
+            gap, c = _unpaired(t["place"], step)
+            eta, per_rim = _unpaired(t["bend"], wavelength + step)
+            sharpness, word = _unpaired(edge, step)
+            word = dr.reinterpret_array(be.UInt32, word)
+            mirror = (word & 1) == 1
+            row = dr.gather(be.UInt32, t["row"], step) if special else None
+            conic = dr.gather(be.Float, t["conic"], row) if special else 1.0
+            z = z + gap
+            # to the plane of the vertex, then to the surface
+            to_plane = -z / dz
+            x, y = dr.fma(to_plane, dx, x), dr.fma(to_plane, dy, y)
+            a = c * (dx * dx + dy * dy + conic * dz * dz) if special else c
+            b = c * (x * dx + y * dy) - dz
+            e = c * (x * x + y * y)
+            under = b * b - a * e
+            met = under >= 0
+            t_hit = e / (-b + dr.copysign(dr.sqrt(dr.maximum(under, 0)), dz))
+            x, y, z = dr.fma(t_hit, dx, x), dr.fma(t_hit, dy, y), t_hit * dz
+            nx, ny, nz = c * x, c * y, c * conic * z - 1
+            length = t_hit + to_plane
+            if t["aspheric"]:
+                x, y, z, nx, ny, nz, more = self._to_asphere(row, c, conic, x, y, z, dx, dy, dz)
+                length = length + more
+            if self._absorbs:
+                share = share * dr.exp(-dr.gather(be.Float, t["absorption"], wavelength + step) * dr.abs(length))
+            # of a sphere it is of length 1
+            norm = dr.rsqrt(nx * nx + ny * ny + nz * nz) if special else 1.0
+            along_normal = (nx * dx + ny * dy + nz * dz) * norm
+            # the normal towards where the ray comes from
+            norm = dr.select(along_normal > 0, -norm, norm)
+            nx, ny, nz = nx * norm, ny * norm, nz * norm
+            cosine = dr.abs(along_normal)
+            beyond = dr.sqrt(x * x + y * y) * per_rim
+            if rim.blades:
+                blade = self._within_blades(x, y)
+                beyond = dr.select(dr.gather(be.UInt32, t["stop"], step) == 1, blade, beyond)
+            left = 1 - eta * eta * (1 - cosine * cosine)
+            total = left < 0
+            out_cosine = dr.sqrt(dr.maximum(left, 0))
+            thin = dr.select(eta > 1, out_cosine, cosine) * (_COSINES - 1)
+            node = dr.minimum(be.UInt32(thin), _COSINES - 2)
+            low, rise = _unpaired(t["share"], (word >> 1) + shares + node)
+            passed = dr.fma(thin - be.Float(node), rise, low)
+            share = share * dr.select(total & mirror, 1, passed)
+            turn = dr.select(mirror, 2 * cosine, eta * cosine - out_cosine)
+            keep = dr.select(mirror, 1, eta)
+            forward = dz > 0
+            dx, dy, dz = dr.fma(turn, nx, keep * dx), dr.fma(turn, ny, keep * dy), dr.fma(turn, nz, keep * dz)
+            right_way = (dz > 0) == (forward ^ mirror)
+            met &= (mirror | ~total) & right_way
+            beyond = dr.select(met, beyond, 1e6)
+            radius = dr.maximum(radius, beyond)
+            margin = dr.minimum(margin, (1 - beyond) * sharpness)
+            return step + 1, x, y, z, dx, dy, dz, share, radius, margin
+
+        _, x, y, z, dx, dy, dz, share, radius, margin = dr.while_loop(state, on, body, mode="symbolic")
+        away = -(z + dr.gather(be.Float, t["last"], route)) / dz
+        x, y = dr.fma(away, dx, x), dr.fma(away, dy, y)
+        found = radius < 1e5
+        spots = Spots(
+            x_mm=dr.select(found, x, 0),
+            y_mm=dr.select(found, y, 0),
+            share=dr.select(found, share, 0),
+            radius=radius,
+            margin=dr.select(found, margin, _LOST),
+        )
+        dr.eval(spots.x_mm, spots.y_mm, spots.share, spots.radius, spots.margin)
+        return spots
+
+    def _start(self, rays: Rays, across: int, centred: bool) -> Any:
+        """Place, direction, route and wavelength of every ray, on the device."""
+        be = backend()
+        dr = be.dr
+        square = dr.opaque(be.UInt32, across * across)
+        each = dr.arange(be.UInt32, len(rays) * across * across)
+        bundle = each // square
+        cell = each - bundle * square
+        iy = cell // dr.opaque(be.UInt32, across)
+        ix = cell - iy * dr.opaque(be.UInt32, across)
+        offset, spacing = (0.5, 2 / across) if centred else (0.0, 2 / (across - 1))
+        offset, spacing = dr.opaque(be.Float, offset), dr.opaque(be.Float, spacing)
+
+        def given(values: F64) -> Any:
+            return dr.gather(be.Float, be.Float(np.ascontiguousarray(values, dtype=np.float32)), bundle)
+
+        def whole(values: NDArray[Any]) -> Any:
+            return dr.gather(be.UInt32, be.UInt32(np.ascontiguousarray(values, dtype=np.uint32)), bundle)
+
+        x, y, half_x, half_y = (given(c) for c in rays.box_mm.T)
+        dx, dy, dz = (given(c) for c in rays.direction.T)
+        return SimpleNamespace(
+            x=dr.fma(half_x, (be.Float(ix) + offset) * spacing - 1, x),
+            y=dr.fma(half_y, (be.Float(iy) + offset) * spacing - 1, y),
+            dx=dx,
+            dy=dy,
+            dz=dz,
+            route=whole(rays.route),
+            wavelength=whole(rays.wavelength),
+        )
+
+    def _within_blades(self, x: Any, y: Any) -> Any:
+        """Distance from the axis over that of the stop's rim in the same direction (`Surface.rim_mm`)."""
+        be, rim = backend(), self.lens.surfaces[self.lens.stop]
+        dr = be.dr
+        half = np.pi / rim.blades
+        angle = (dr.atan2(y, x) - dr.opaque(be.Float, self._stop_turn_rad)) * (0.5 / half)
+        beside = (angle - dr.floor(angle)) * (2 * half) - half
+        edge = np.cos(half) / dr.cos(beside)
+        return dr.sqrt(x * x + y * y) / (rim.semi_diameter_mm * (edge + (1 - edge) * rim.blade_rounding))
+
+    _stop_turn_rad = 0.0
+
+    def turned(self, azimuth_rad: float) -> Tracer:
+        """The same tracer for a Sun at an azimuth: rays are traced with the Sun at azimuth 0, and the stop's blades
+        turned back instead."""
+        other = Tracer.__new__(Tracer)
+        other.__dict__.update(self.__dict__)
+        rim = self.lens.surfaces[self.lens.stop]
+        other._stop_turn_rad = float(np.radians(rim.rotation_deg) - azimuth_rad)
+        return other
+
+    def _to_asphere(
+        self, row: Any, c: Any, conic: Any, x: Any, y: Any, z: Any, dx: Any, dy: Any, dz: Any
+    ) -> tuple[Any, ...]:
+        """From a conic to the asphere beside it, by Newton's method: place, normal, and how far it was."""
+        be = backend()
+        dr = be.dr
+        terms = [dr.gather(be.Float, a, row) for a in self._tables["aspheric"]]
+        way = 0 * x
+        for k in range(5):
+            r2 = x * x + y * y
+            root = dr.sqrt(dr.maximum(1 - conic * c * c * r2, 1e-6))
+            sag, slope, power = c * r2 / (1 + root), c / root, r2
+            for n, term in enumerate(terms):
+                slope = slope + (2 * n + 4) * term * power
+                sag = sag + term * power * r2
+                power = power * r2
+            nx, ny = slope * x, slope * y
+            if k == 4:
+                return x, y, z, nx, ny, 0 * x - 1, way
+            step = (z - sag) / (nx * dx + ny * dy - dz)
+            x, y, z = dr.fma(step, dx, x), dr.fma(step, dy, y), dr.fma(step, dz, z)
+            way = way + step
+        raise AssertionError("unreachable")
+
+    # --- where rays get through ---------------------------------------------------------------------------------
+
+    def boxes(self, sun_deg: float, width: F64 | None = None, reach_mm: float = np.inf) -> tuple[Rays, F64]:
+        """The box of every route that lets light through from a Sun at azimuth 0, and where it arrives.
+
+        Returns rays of one bundle a route, at the first wavelength, and float64[route, 6] of the sensor: least x,
+        y, largest x, y, the largest share over area magnification, and how far rays that arrive within `reach_mm` of
+        the axis move from the first wavelength to the last, mm (80 % of them move less).
+        """
+        tangent = np.tan(np.radians(sun_deg))
+        direction = np.array([np.sin(np.radians(sun_deg)), 0.0, np.cos(np.radians(sun_deg))])
+        front = self.lens.surfaces[0]
+        reach = front.semi_diameter_mm + abs(float(front.sag_mm(front.semi_diameter_mm))) * tangent
+        count = len(self.routes)
+        everywhere = np.tile([0.0, 0.0, reach, reach], (count, 1))
+        box = np.concatenate([everywhere, self._paraxial_boxes(tangent, reach)])
+        route = np.tile(np.arange(count), 2)
+        where = np.zeros((count, 6))
+        for _ in range(2):
+            box, where = self._narrowed(route, box, direction, count, width, reach_mm)
+            route = np.flatnonzero(np.isfinite(box[:, 0]))
+            box = box[route]
+            if not len(route):
+                break
+        rays = Rays(
+            route=route,
+            wavelength=np.zeros(len(route), dtype=np.int64),
+            box_mm=box,
+            direction=np.tile(direction, (len(route), 1)),
+        )
+        return rays, where[route]
+
+    def _paraxial_boxes(self, tangent: float, reach: float) -> F64:
+        """Where all rims let first-order rays through, with room; around the narrowest rim's disc where nowhere."""
+        a, b = self.met[:, 0, 0], self.met[:, 0, 1]
+        rim = self.rims_mm[self.rows]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            middle, half = -b * tangent / a, np.abs(rim / a)
+        middle, half = np.where(np.isfinite(middle), middle, 0.0), np.where(np.isfinite(half), half, reach)
+        out = np.empty((len(self.routes), 4))
+        for k, (first, last) in enumerate(zip(self.first_step[:-1], self.first_step[1:], strict=True)):
+            m, h = middle[first:last], half[first:last]
+            low, high = (m - h).max(), (m + h).min()
+            if low >= high:
+                least = int(np.argmin(h))
+                low, high = m[least] - h[least], m[least] + h[least]
+            out[k] = (low + high) / 2, 0.0, 0.8 * (high - low), 1.6 * h.min()
+        return out
+
+    def _narrowed(
+        self,
+        route: NDArray[np.int64],
+        box: F64,
+        direction: F64,
+        count: int,
+        width: F64 | None,
+        reach_mm: float,
+    ) -> tuple[F64, F64]:
+        """The boxes of what gets through the given ones, nan where nothing does, by route."""
+        ends = np.array([0, len(self.wavelength_nm) - 1])
+        rays = Rays(
+            route=np.tile(route, 2),
+            wavelength=np.repeat(ends, len(route)),
+            box_mm=np.tile(box, (2, 1)),
+            direction=np.tile(direction, (2 * len(route), 1)),
+        )
+        spots = self.trace(rays, _COARSE, width)
+        margin, x, y, share = (
+            v.numpy().reshape(2, len(route), _COARSE, _COARSE)
+            for v in (spots.margin, spots.x_mm, spots.y_mm, spots.share)
+        )
+        passes = (margin > -1).any(axis=0)
+        near = (margin > -1).all(axis=0) & (np.hypot(x[0], y[0]) < reach_mm)
+        apart = np.where(near, np.hypot(x[1] - x[0], y[1] - y[0]), np.nan).reshape(len(route), -1)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", RuntimeWarning)  # a bundle of which nothing arrives near
+            move = np.nan_to_num(np.nanpercentile(apart, 80, axis=1))
+        inside = margin[0] > -1
+        far = np.float32(3e38)
+        least_x, least_y = (np.where(inside, v[0], far).min(axis=(1, 2)) for v in (x, y))
+        most_x, most_y = (np.where(inside, v[0], -far).max(axis=(1, 2)) for v in (x, y))
+        # area of the cells of the lattice on the sensor
+        ax, ay = (v[0][:, 1:, 1:] - v[0][:, :-1, :-1] for v in (x, y))
+        bx, by = (v[0][:, 1:, :-1] - v[0][:, :-1, 1:] for v in (x, y))
+        on_sensor = np.abs(ax * by - ay * bx) / 2
+        at_entrance = 4 * box[:, 2] * box[:, 3] / (_COARSE - 1) ** 2
+        whole = inside[:, 1:, 1:] & inside[:, :-1, :-1] & inside[:, 1:, :-1] & inside[:, :-1, 1:]
+        density = share[0][:, 1:, 1:] * at_entrance[:, None, None] / np.maximum(on_sensor, 1e-9)
+        peak = np.where(whole, density, 0).max(axis=(1, 2))
+        lattice = np.linspace(-1, 1, _COARSE)
+        out = np.full((count, 4), np.nan)
+        told = np.zeros((count, 6))
+        low = np.full((count, 2), np.inf)
+        high = np.full((count, 2), -np.inf)
+        spacing = np.zeros((count, 2))
+        for k in np.flatnonzero(passes.any(axis=(1, 2))):
+            r = route[k]
+            columns, rows = np.flatnonzero(passes[k].any(axis=0)), np.flatnonzero(passes[k].any(axis=1))
+            here_low = box[k, :2] + box[k, 2:] * lattice[[columns[0], rows[0]]]
+            here_high = box[k, :2] + box[k, 2:] * lattice[[columns[-1], rows[-1]]]
+            step = 2 * box[k, 2:] / (_COARSE - 1)
+            # of two boxes of one route the finer one knows better
+            if np.isfinite(low[r, 0]) and (spacing[r] < step).all() and (here_high - here_low < 3 * step).any():
+                continue
+            low[r], high[r] = np.minimum(low[r], here_low - step), np.maximum(high[r], here_high + step)
+            spacing[r] = step
+            bounds = np.array([least_x[k], least_y[k], most_x[k], most_y[k]], dtype=np.float64)
+            if inside[k].any():
+                if told[r, 4]:
+                    bounds = np.concatenate(
+                        [np.minimum(told[r, :2], bounds[:2]), np.maximum(told[r, 2:4], bounds[2:])]
+                    )
+                told[r, :4] = bounds
+                told[r, 4] = max(told[r, 4], peak[k], 1e-30)
+            told[r, 5] = max(told[r, 5], move[k])
+        good = np.isfinite(low[:, 0])
+        out[good, :2] = (low[good] + high[good]) / 2
+        out[good, 2:] = np.maximum((high[good] - low[good]) / 2, 1e-6)
+        return out, told
+
+
+def tracer(lens: Prescription, wavelength_nm: tuple[float, ...], reflections: int = 2) -> Tracer:
+    """A tracer, made once for a lens and its wavelengths."""
+    return _tracer(lens, wavelength_nm, reflections)
+
+
+@lru_cache(maxsize=8)
+def _tracer(lens: Prescription, wavelength_nm: tuple[float, ...], reflections: int) -> Tracer:
+    return Tracer(lens, np.array(wavelength_nm), reflections=reflections)
+
+
+def traced_ghosts(
+    lens: Prescription,
+    sun_deg: float,
+    *,
+    azimuth_deg: float = 0.0,
+    wavelength_nm: float = D_NM,
+    reflections: int = 2,
+    across: int = _FINE,
+) -> tuple[Ghost, ...]:
+    """Ghosts of a far point source by exact rays, as `paraxial.paraxial_ghosts` tells them.
+
+    `across` rays span each ghost's box either way. The peak is the largest irradiance of a cell of that grid.
+    """
+    turn = np.radians(azimuth_deg)
+    made = tracer(lens, (float(wavelength_nm),), reflections).turned(turn)
+    rays, _ = made.boxes(sun_deg)
+    if not len(rays):
+        return ()
+    pupil = np.pi / 4 * first_order(lens, wavelength_nm).entrance_pupil_diameter_mm ** 2
+    out = []
+    for first in range(0, len(rays), _TOGETHER):
+        part = rays.take(np.arange(first, min(first + _TOGETHER, len(rays))))
+        out += _told(made, part, across, turn, pupil, float(np.cos(np.radians(sun_deg))))
+    return tuple(sorted(out, key=lambda g: g.pair))
+
+
+def _told(made: Tracer, rays: Rays, across: int, turn: float, pupil_mm2: float, cosine: float) -> list[Ghost]:
+    be = backend()
+    dr, Double = be.dr, be.Double
+    spots = made.trace(rays, across, centred=True)
+    weight = Double(dr.select(spots.radius <= 1, spots.share, 0))
+    x, y = Double(spots.x_mm), Double(spots.y_mm)
+    parts = (weight, weight * x, weight * y, weight * (x * x + y * y))
+    dr.eval(*parts)
+    total, mx, my, square = (dr.block_sum(v, across * across).numpy() for v in parts)
+    cell = 4 * rays.box_mm[:, 2] * rays.box_mm[:, 3] / across**2
+    peak = _peaks(made, rays) * cosine
+    out = []
+    for k in np.flatnonzero(total > 0):
+        cx, cy = mx[k] / total[k], my[k] / total[k]
+        place = (cx * np.cos(turn) - cy * np.sin(turn), cx * np.sin(turn) + cy * np.cos(turn))
+        out.append(
+            Ghost(
+                pair=tuple(sorted(made.routes[rays.route[k]])),  # type: ignore[arg-type]
+                flux_fraction=float(total[k] * cell[k] / pupil_mm2),
+                centroid_mm=(float(place[0]), float(place[1])),
+                rms_radius_mm=float(np.sqrt(max(square[k] / total[k] - cx * cx - cy * cy, 0.0))),
+                peak_irradiance_fraction=float(peak[k]),
+            )
+        )
+    return out
+
+
+def _peaks(made: Tracer, rays: Rays) -> F64:
+    """The largest share over magnification of area among the cells of a lattice, float64[bundle]."""
+    spots = made.trace(rays, _PEAK, centred=True)
+    x, y, share, radius = (
+        v.numpy().reshape(len(rays), _PEAK, _PEAK) for v in (spots.x_mm, spots.y_mm, spots.share, spots.radius)
+    )
+    ux, uy = (np.diff(v, axis=2)[:, 1:] for v in (x, y))
+    vx, vy = (np.diff(v, axis=1)[:, :, 1:] for v in (x, y))
+    passes = radius <= 1
+    whole = passes[:, 1:, 1:] & passes[:, 1:, :-1] & passes[:, :-1, 1:]
+    cell = 4 * rays.box_mm[:, 2] * rays.box_mm[:, 3] / _PEAK**2
+    with np.errstate(divide="ignore", invalid="ignore"):
+        density = np.where(whole, share[:, 1:, 1:] * cell[:, None, None] / np.abs(ux * vy - uy * vx), 0)
+    # a ghost that only a few rays take has no whole cell: its light over its extent
+    found = np.nan_to_num(density, posinf=0.0).max(axis=(1, 2))
+    return np.asarray(found, dtype=np.float64)
+
+
+def surface_interactions_per_second(lens: Prescription, rays: int = 1_000_000, rounds: int = 5) -> float:
+    """Surfaces met per second by rays sent straight through the lens, in whole calls, median of rounds."""
+    import time
+
+    made = Tracer(lens, np.array([D_NM]), routes_=[()])
+    across = int(np.ceil(np.sqrt(rays)))
+    radius = first_order(lens).entrance_pupil_diameter_mm / 2 / np.sqrt(2)
+    bundle = Rays(
+        route=np.zeros(1, dtype=np.int64),
+        wavelength=np.zeros(1, dtype=np.int64),
+        box_mm=np.array([[0.0, 0.0, radius, radius]]),
+        direction=np.array([[0.0, 0.0, 1.0]]),
+    )
+    be, seconds = backend(), []
+    for _ in range(rounds + 1):
+        start = time.perf_counter()
+        made.trace(bundle, across)
+        be.dr.sync_thread()
+        seconds.append(time.perf_counter() - start)
+    return across * across * len(lens.surfaces) / float(np.median(seconds[1:]))
