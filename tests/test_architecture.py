@@ -46,6 +46,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "detector": {"spectra", "quantities"},
     "camera": {"lens", "detector"},
     "faults": CAMERA,
+    "flares": FOUNDATION | CAMERA | {"faults"},
     "labels": GEOMETRY | CAMERA | {"faults"},
     "world": PIPELINE - {"pipeline"},
     "pipeline": PIPELINE,
@@ -56,7 +57,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "report": DATASET,
     "export": DATASET | {"report"},
     "inject": DATASET,
-    "cli": DATASET | {"study", "report", "export", "inject"},
+    "cli": DATASET | {"flares", "study", "report", "export", "inject"},
     "__main__": {"cli"},
 }
 

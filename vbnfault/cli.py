@@ -218,6 +218,86 @@ def lens(
     typer.echo(str(path))
 
 
+@app.command()
+def flare(
+    lens: Annotated[str, typer.Argument(help="path of a prescription, or the name of a packaged lens")],
+    out: Annotated[Path, typer.Option(help="picture: .png, or .exr with every band")],
+    sun_deg: Annotated[float, typer.Option(help="angle of the Sun from the axis, 0 to below 90")],
+    azimuth_deg: Annotated[float, typer.Option(help="of the Sun in the picture: 0 to the right, 90 down")] = 0.0,
+    model: Annotated[str, typer.Option(help="of the ghosts: traced, paraxial or texture")] = "traced",
+    wavelength_nm: Annotated[
+        float | None, typer.Option(help="one wavelength [default: the Sun's spectrum in the camera's bands]")
+    ] = None,
+    json_: Annotated[Path | None, typer.Option("--json", help="every ghost as JSON")] = None,
+    coating: Annotated[
+        str | None, typer.Option(help="of all surfaces in air: none, mgf2, v or bbar [default: as prescribed]")
+    ] = None,
+    focal_length_mm: Annotated[
+        float | None, typer.Option(help="scale the lens to it [default: as prescribed]")
+    ] = None,
+    fov_deg: Annotated[float, typer.Option(min=0.1, max=140, help="across the picture's width")] = 65.0,
+    pixels: Annotated[int, typer.Option(min=16, max=8192, help="width and height of the picture")] = 1024,
+    sun_distance_au: Annotated[
+        float, typer.Option(min=0.01, max=1000, help="sets the size of the Sun's disc")
+    ] = 1.0,
+    reflections: Annotated[int, typer.Option(help="of a ghost: 2, or 4 for those of four too")] = 2,
+    roughness_nm: Annotated[float, typer.Option(min=0, max=100, help="rms roughness of the surfaces")] = 1.0,
+    cleanliness_level: Annotated[
+        float, typer.Option(min=0, max=2000, help="particles on the surfaces, IEST-STD-CC1246; 0: none")
+    ] = 0.0,
+) -> None:
+    """Ghosts, starburst and glare of the Sun through a lens: a picture, and a table of every ghost."""
+    if out.suffix.lower() not in (".png", ".exr") or not out.absolute().parent.is_dir():
+        raise InputError(f"--out {out}: must be a .png or .exr in a folder that exists")
+    if not 0 <= sun_deg < 90:
+        raise InputError(f"--sun-deg {sun_deg:g}: must be from 0 to below 90")
+    if reflections not in (2, 4):
+        raise InputError(f"--reflections {reflections}: must be 2 or 4")
+    if focal_length_mm is not None and not 0.01 <= focal_length_mm <= 1e5:
+        raise InputError(f"--focal-length-mm {focal_length_mm:g}: must be from 0.01 to 1e5")
+    from . import flares
+    from . import lens as optics
+
+    if model not in flares.MODELS:
+        raise InputError(f"--model {model}: must be one of {', '.join(flares.MODELS)}")
+    prescription = optics.load_lens(lens)
+    if focal_length_mm is not None:
+        prescription = optics.scaled_to_focal_length(prescription, focal_length_mm)
+    optics.first_order(prescription)  # refuses a lens that no ray passes
+    view = flares.View(
+        lens=prescription if coating is None else prescription.coated(coating),
+        sun_deg=sun_deg,
+        azimuth_deg=azimuth_deg,
+        fov_deg=fov_deg,
+        pixels=pixels,
+        wavelength_nm=flares.wavelengths_nm(wavelength_nm),
+        sun_distance_au=sun_distance_au,
+        model=model,
+        reflections=reflections,
+        roughness_nm=roughness_nm,
+        cleanliness_level=cleanliness_level,
+    )
+    if model != "texture":
+        found = flares.ghosts(view)
+        total = sum(ghost.flux_fraction for ghost in found)
+        typer.echo(f"{prescription.name}: {len(found)} ghosts hold {total:.3e} of the light that enters the pupil")
+        brightest = sorted(found, key=lambda g: -g.peak_irradiance_fraction)[:10]
+        typer.echo("  rows        flux      peak E/E0     x mm      y mm   rms mm")
+        for g in brightest:
+            x, y = g.centroid_mm
+            typer.echo(
+                f"  {'-'.join(map(str, g.pair)):<9}{g.flux_fraction:9.2e}  {g.peak_irradiance_fraction:9.2e}"
+                f"  {x:9.3f} {y:9.3f}{g.rms_radius_mm:9.3f}"
+            )
+    if json_ is not None:
+        with _written(json_):
+            flares.write_table(view, () if model == "texture" else found, json_)
+        typer.echo(str(json_))
+    with _written(out):
+        flares.write_picture(view, flares.layers(view), out)
+    typer.echo(str(out))
+
+
 @contextlib.contextmanager
 def _written(path: Path) -> Iterator[None]:
     try:

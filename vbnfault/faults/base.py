@@ -111,14 +111,17 @@ class FaultContext:
 
     `sun_xy_px` float64[2], the pixel position of the Sun's centre (it may lie outside the frame; None behind
     the camera), `sun_direction_C` unit float64[3], `sun_irradiance_W_m2_nm` float64[band] at the camera,
-    `sun_visible_fraction` in [0, 1]. All None where a user's own image is injected.
+    with `wavelength_nm` its nodes, `sun_visible_fraction` in [0, 1], `sun_angular_radius_rad` of its disc. All None
+    where a user's own image is injected.
     """
 
     camera: Camera
     sun_xy_px: NDArray[np.float64] | None = None
     sun_direction_C: NDArray[np.float64] | None = None
     sun_irradiance_W_m2_nm: NDArray[np.float64] | None = None
+    wavelength_nm: NDArray[np.float64] | None = None
     sun_visible_fraction: float | None = None
+    sun_angular_radius_rad: float | None = None
     # not an init field: `dataclasses.replace` must not hand results for one frame to another
     _memo: dict[Any, Any] = field(default_factory=dict, init=False, repr=False)
 

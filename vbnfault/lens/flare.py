@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
-from .ghosts import Rays, Spots, Tracer, backend
+from .ghosts import Rays, Spots, Tracer, backend, told
 from .paraxial import Ghost, along
 from .prescription import Prescription
 from .raster import LEVELS, Canvas, Placement, Sums, edge_kind
@@ -102,15 +102,6 @@ class FirstOrderTracer(Tracer):
         )
         dr.eval(spots.x_mm, spots.y_mm, spots.share, spots.radius, spots.margin)
         return spots
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Flare:
-    """What one position of the Sun gives: `irradiance` float32[band, y, x] over the Sun's own at the entrance, and
-    the ghosts that took part, at the wavelength in the middle."""
-
-    irradiance: F32
-    ghosts: tuple[Ghost, ...]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -223,9 +214,10 @@ class FlareModel:
             width=width,
         )
 
-    def image(self, sun_deg: float, azimuth_deg: float = 0.0, *, only: tuple[int, int] | None = None) -> Flare:
+    def image(self, sun_deg: float, azimuth_deg: float = 0.0, *, only: tuple[int, int] | None = None) -> F32:
         """Ghosts of a Sun at an angle from the axis, towards an azimuth: its direct image lies at +f tan θ there
-        (azimuth 0: +x, right; 90°: +y, down). `only` keeps one pair of reflecting rows.
+        (azimuth 0: +x, right; 90°: +y, down). Returns irradiance over the Sun's own at the entrance,
+        float32[band, y, x]. `only` keeps one pair of reflecting rows.
 
         Raises InputError for an angle of 90° or more.
         """
@@ -240,7 +232,6 @@ class FlareModel:
         rays, where = rays.take(shown), where[shown]
         detail = self._details(self._fainter(rays, where))
         sums = Sums(self.canvas)
-        ghosts: tuple[Ghost, ...] = ()
         steady = ~self._sampled[rays.route]
         cosine = float(np.cos(np.radians(sun_deg)))
         for sampled in (False, True):
@@ -262,7 +253,16 @@ class FlareModel:
             every = np.arange(len(bundles))
             for part in ("edge", "fold"):
                 sums.draw(spots, self._place(detail, bundles, every, band, weight, strength, part), across, turn)
-        return Flare(irradiance=sums.irradiance(), ghosts=ghosts)
+        return sums.irradiance()
+
+    def ghosts(self, sun_deg: float, azimuth_deg: float = 0.0, *, across: int = 96) -> tuple[Ghost, ...]:
+        """The ghosts of a point Sun that reach the frame, at the wavelength in the middle."""
+        turn = float(np.radians(azimuth_deg))
+        made = self._tracer.turned(turn)
+        rays, where = made.boxes(sun_deg, self._detail.width, self._reach_mm)
+        rays = rays.take(self._in_frame(where) & (where[:, 4] > _LEAST))
+        middle = np.full(len(rays), len(self._fine) // 2)
+        return told(made, replace(rays, wavelength=middle), sun_deg, turn, across)
 
     def _fainter(self, rays: Rays, where: F64) -> NDArray[np.int64]:
         """Levels by which routes may be drawn coarser: their edges are too faint against the sum of all to show."""
@@ -381,4 +381,4 @@ def flare_model(
     )
 
 
-__all__ = ["MODELS", "Flare", "FlareModel", "disc_samples", "flare_model"]
+__all__ = ["MODELS", "FlareModel", "disc_samples", "flare_model"]

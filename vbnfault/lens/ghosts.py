@@ -197,8 +197,8 @@ class Tracer:
             aspheric[: len(s.aspheric_mm), k] = s.aspheric_mm
         flat = [s.curvature_per_mm for s in lens.surfaces] + [0.0]
         conic = [1 + s.conic for s in lens.surfaces] + [1.0]
-        stops_ = len(rows)
-        before, behind = index[:, medium], index[:, other]
+        count = len(rows)
+        ratio = index[:, medium] / index[:, other]
         # a ray's step asks for few but wide records: fetching is what takes the time
         curvature, per_rim = (np.array(flat)[rows], (1 / self.rims_mm)[rows])
         share = self._shares(index)
@@ -208,7 +208,7 @@ class Tracer:
             "row": be.UInt32(rows),
             "stop": be.UInt32((rows == lens.stop).astype(np.uint32)),
             "place": be.UInt64(_paired(np.array(gap), curvature)),
-            "bend": be.UInt64(_paired(before / behind, np.broadcast_to(per_rim, (len(index), stops_)))),
+            "bend": be.UInt64(_paired(ratio, np.broadcast_to(per_rim, (len(index), count)))),
             "share": be.UInt64(_paired(share, rise)),
             "end": be.UInt32(self.first_step[1:].astype(np.uint32)),
             "start": be.UInt32(self.first_step[:-1].astype(np.uint32)),
@@ -438,8 +438,8 @@ class Tracer:
         """The box of every route that lets light through from a Sun at azimuth 0, and where it arrives.
 
         Returns rays of one bundle a route, at the first wavelength, and float64[route, 6] of the sensor: least x,
-        y, largest x, y, the largest share over area magnification, and how far rays that arrive within `reach_mm` of
-        the axis move from the first wavelength to the last, mm (80 % of them move less).
+        y, largest x, y, the largest share over area magnification, and how far rays that arrive within `reach_mm`
+        of the axis move from the first wavelength to the last, mm (80 % of them move less).
         """
         tangent = np.tan(np.radians(sun_deg))
         direction = np.array([np.sin(np.radians(sun_deg)), 0.0, np.cos(np.radians(sun_deg))])
@@ -581,11 +581,16 @@ def traced_ghosts(
     rays, _ = made.boxes(sun_deg)
     if not len(rays):
         return ()
-    pupil = np.pi / 4 * first_order(lens, wavelength_nm).entrance_pupil_diameter_mm ** 2
+    return told(made, rays, sun_deg, turn, across)
+
+
+def told(made: Tracer, rays: Rays, sun_deg: float, turn_rad: float, across: int) -> tuple[Ghost, ...]:
+    """What bundles of the Sun's light, one a ghost, do on the sensor's plane."""
+    pupil = np.pi / 4 * first_order(made.lens).entrance_pupil_diameter_mm ** 2
     out = []
     for first in range(0, len(rays), _TOGETHER):
         part = rays.take(np.arange(first, min(first + _TOGETHER, len(rays))))
-        out += _told(made, part, across, turn, pupil, float(np.cos(np.radians(sun_deg))))
+        out += _told(made, part, across, turn_rad, pupil, float(np.cos(np.radians(sun_deg))))
     return tuple(sorted(out, key=lambda g: g.pair))
 
 

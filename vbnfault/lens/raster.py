@@ -25,6 +25,7 @@ F64 = NDArray[np.float64]
 LEVELS = 6
 _MARGIN = 4  # pixels around each level, for what lies half outside
 _UNITS = 2.0**40  # of the integer sums, per unit of irradiance
+_CALM_SIGMA = 0.8  # pixels of a coarser level by which it is smoothed
 _SMALL = 0.5  # cells below this many pixels are splatted
 EDGE_LOW, EDGE_HIGH = -1.0, 5.0  # of the soft edge's profile
 _EDGE_NODES = 2049
@@ -203,7 +204,9 @@ class Sums:
                 # a level's pixel 0 covers the pixels -M·2 + M and the next one of the finer level
                 top = _MARGIN
                 for band in range(canvas.bands):
-                    bigger = cv2.resize(below[band], None, fx=2, fy=2, interpolation=cv2.INTER_LINEAR)
+                    # folds end in steps, which a lattice of pixel centres samples unevenly
+                    calm = cv2.GaussianBlur(below[band], (3, 3), _CALM_SIGMA)
+                    bigger = cv2.resize(calm, None, fx=2, fy=2, interpolation=cv2.INTER_LINEAR)
                     here[band] += bigger[top : top + height, top : top + width]
             below = here
         assert below is not None
