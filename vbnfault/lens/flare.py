@@ -76,10 +76,9 @@ class FirstOrderTracer(Tracer):
             return step < end
 
         def body(step: Any, radius: Any, margin: Any) -> Any:
-            row = dr.gather(be.UInt32, t["row"], step)
             a, b = (dr.gather(be.Float, f["met"], 2 * (steps + step) + k) for k in (0, 1))
             hx, hy = dr.fma(a, x, b * sx), dr.fma(a, y, b * sy)
-            beyond = dr.sqrt(hx * hx + hy * hy) * dr.gather(be.Float, t["per_rim"], row)
+            beyond = dr.sqrt(hx * hx + hy * hy) * dr.gather(be.Float, t["per_rim"], step)
             if rim.blades:
                 blade = self._within_blades(hx, hy)
                 beyond = dr.select(dr.gather(be.UInt32, t["stop"], step) == 1, blade, beyond)
@@ -135,6 +134,9 @@ class FlareModel:
         2, or 4 for ghosts of four reflections too.
     diffraction
         Whether edges ring as Fresnel's do.
+    across
+        Rays across a ghost either way: its light converges with them, to some 1 % with the default, ghosts that
+        are flung far apart to some 4 %.
     """
 
     def __init__(
@@ -148,6 +150,7 @@ class FlareModel:
         model: str = "traced",
         reflections: int = 2,
         diffraction: bool = True,
+        across: int = _ACROSS,
     ) -> None:
         if model not in MODELS:
             raise InputError(f"model = {model!r}: must be one of {', '.join(MODELS)}")
@@ -160,7 +163,7 @@ class FlareModel:
         at = np.arange((len(self.nodes_nm) - 1) * steps_between + 1) / steps_between
         self._fine = np.interp(at, np.arange(len(self.nodes_nm)), self.nodes_nm)
         self._tracer = kind(lens, self._fine, reflections=reflections)
-        self._diffraction = diffraction
+        self._diffraction, self._across = diffraction, across
         self._reach_mm = float(np.hypot(*shape) / 2 * pitch_mm)
         self._soften()
 
@@ -239,7 +242,7 @@ class FlareModel:
             if not chosen.any():
                 continue
             bundles, band, weight, plain = self._coloured(rays.take(chosen), where[chosen], detail)
-            strength, across = np.full(len(bundles), cosine), _ACROSS
+            strength, across = np.full(len(bundles), cosine), self._across
             if sampled:
                 each, bundles, strength = self._over_disc(bundles, sun_deg)
                 band, weight, plain = band[each], weight[each], plain[each]

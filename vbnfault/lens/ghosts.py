@@ -391,10 +391,10 @@ class Tracer:
         """Distance from the axis over that of the stop's rim in the same direction (`Surface.rim_mm`)."""
         be, rim = backend(), self.lens.surfaces[self.lens.stop]
         dr = be.dr
-        half = np.pi / rim.blades
+        half = float(np.pi / rim.blades)
         angle = (dr.atan2(y, x) - dr.opaque(be.Float, self._stop_turn_rad)) * (0.5 / half)
         beside = (angle - dr.floor(angle)) * (2 * half) - half
-        edge = np.cos(half) / dr.cos(beside)
+        edge = float(np.cos(half)) / dr.cos(beside)
         return dr.sqrt(x * x + y * y) / (rim.semi_diameter_mm * (edge + (1 - edge) * rim.blade_rounding))
 
     _stop_turn_rad = 0.0
@@ -402,7 +402,7 @@ class Tracer:
     def turned(self, azimuth_rad: float) -> Tracer:
         """The same tracer for a Sun at an azimuth: rays are traced with the Sun at azimuth 0, and the stop's blades
         turned back instead."""
-        other = Tracer.__new__(Tracer)
+        other = type(self).__new__(type(self))
         other.__dict__.update(self.__dict__)
         rim = self.lens.surfaces[self.lens.stop]
         other._stop_turn_rad = float(np.radians(rim.rotation_deg) - azimuth_rad)

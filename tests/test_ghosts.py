@@ -1,0 +1,327 @@
+"""Ghosts by exact rays and their pictures, against the double-precision trace, matrices and closed forms."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from test_lens import BACK, GLASS, STOP
+
+from vbnfault import llvm
+from vbnfault.errors import InputError, VbnfaultError
+from vbnfault.lens import first_order, load_lens, parse_lens, scaled_to_focal_length
+from vbnfault.lens.glass import D_NM
+from vbnfault.lens.paraxial import paraxial_ghosts
+from vbnfault.lens.prescription import Prescription
+from vbnfault.lens.trace import forward, trace
+
+try:
+    llvm.find()
+except VbnfaultError as error:
+    pytest.skip(f"no usable LLVM: {error}", allow_module_level=True)
+
+from vbnfault.lens.flare import FlareModel, disc_samples
+from vbnfault.lens.ghosts import Rays, Tracer, backend, routes, steps, traced_ghosts
+from vbnfault.lens.raster import _EDGE_NODES, EDGE_HIGH, EDGE_LOW, edge_profiles
+
+LENSES = (
+    "nikkor_35_f2p8",
+    "nikkor_28_f2p8",
+    "distagon_25_f2p8",
+    "tessar_50_f2p8",
+    "heliar_100_f3p5",
+    "biotar_100_f1p4",
+)
+
+
+def pixel_mm(lens: Prescription) -> float:
+    """Of a camera of 1024 px and 65° across."""
+    return float(2 * first_order(lens).efl_mm * np.tan(np.radians(32.5)) / 1024)
+
+
+def bundle(route: int, box: tuple[float, float, float, float], direction: Any) -> Rays:
+    direction = np.asarray(direction, dtype=float)
+    return Rays(
+        route=np.array([route]),
+        wavelength=np.array([0]),
+        box_mm=np.array([box]),
+        direction=(direction / np.linalg.norm(direction))[None],
+    )
+
+
+def both_ways(lens: Prescription, made: Tracer, rays: Rays, across: int) -> tuple[Any, Any, Any, Any]:
+    """Places in single and in double precision, float64[n, 2], radii in single, and what arrives in double."""
+    spots = made.trace(rays, across)
+    single = np.column_stack([spots.x_mm.numpy(), spots.y_mm.numpy()]).astype(np.float64)
+    cx, cy, hx, hy = rays.box_mm[0]
+    side = np.linspace(-1, 1, across)
+    x, y = np.meshgrid(cx + hx * side, cy + hy * side)
+    start = np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)])
+    path = steps(lens, made.routes[rays.route[0]]) if made.routes[rays.route[0]] else forward(lens)
+    found = trace(lens, start, np.tile(rays.direction[0], (len(start), 1)), path=path)
+    return single, found.points_mm[-1, :, :2], spots.radius.numpy(), found
+
+
+@pytest.mark.parametrize("name", LENSES)
+def test_single_precision_keeps_to_a_hundredth_of_a_pixel(name: str) -> None:
+    lens = load_lens(name)
+    made = Tracer(lens, np.array([D_NM]), routes_=[()])
+    radius = first_order(lens).entrance_pupil_diameter_mm / 2
+    for degrees in (0.0, 10.0, 20.0):
+        slope = np.tan(np.radians(degrees))
+        aim = -slope * first_order(lens).entrance_pupil_mm
+        rays = bundle(0, (aim, 0.0, radius, radius), [slope, 0.0, 1.0])
+        single, double, beyond, found = both_ways(lens, made, rays, 31)
+        kept = found.arrives
+        assert kept.sum() > 100
+        np.testing.assert_array_equal(beyond[kept] < 1 + 1e-5, True)
+        assert np.hypot(*(single - double)[kept].T).max() < 0.01 * pixel_mm(lens)
+
+
+def test_ghosts_of_a_kernel_are_those_of_exact_rays() -> None:
+    """Every ghost of a lens. Float32 carries 6e-8 of some 50 mm through up to 27 surfaces, and a ghost's last
+    gap magnifies angles: the worst ray errs by a fiftieth of a pixel, half of them by less than a thousandth."""
+    lens = load_lens("nikkor_35_f2p8")
+    made = Tracer(lens, np.array([D_NM]))
+    rays, _ = made.boxes(12.0)
+    assert len(rays) > 40
+    off = []
+    for k in range(len(rays)):
+        single, double, beyond, found = both_ways(lens, made, rays.take(np.array([k])), 15)
+        kept = found.arrives
+        assert ((beyond <= 1) == kept).mean() > 0.99  # a rim's own ray may fall on either side
+        off.append(np.hypot(*(single - double)[kept & (beyond <= 1)].T))
+    every = np.concatenate(off) / pixel_mm(lens)
+    assert every.max() < 0.02
+    assert np.median(every) < 1e-3
+
+
+def test_aspheres_conics_and_glass_that_absorbs() -> None:
+    rows = [
+        STOP,
+        GLASS | {"conic": -0.7, "aspheric_mm": [2e-6, -1e-8], "internal_transmittance_10mm": 0.5},
+        BACK | {"conic": 1.2},
+    ]
+    lens = parse_lens({"surface": rows}, source="asphere")
+    made = Tracer(lens, np.array([D_NM]), routes_=[(), (2, 1)])
+    for route in (0, 1):
+        rays = bundle(route, (0.0, 0.0, 4.0, 4.0), [0.1, 0.0, 1.0])
+        single, double, _, found = both_ways(lens, made, rays, 15)
+        assert np.abs(single - double)[found.arrives].max() < 1e-4
+    straight = made.trace(bundle(0, (0.0, 0.0, 1e-3, 1e-3), [0.0, 0.0, 1.0]), 3).share.numpy()
+    n = 1.5
+    assert straight == pytest.approx((1 - ((n - 1) / (n + 1)) ** 2) ** 2 * 0.5**0.4, rel=1e-4)
+
+
+def test_paths_of_four_reflections_and_the_sensor_as_a_mirror() -> None:
+    lens = load_lens("tessar_50_f2p8")
+    mirrors = 7
+    assert len(routes(lens)) == mirrors * (mirrors - 1) / 2
+    four = [r for r in routes(lens, 4) if len(r) == 4]
+    assert all(b > a and d > c and d > a for b, a, d, c in four)
+    rows = [(row, mirror) for row, mirror in steps(lens, (3, 1, 2, 0)) if mirror]
+    assert rows == [(3, True), (1, True), (2, True), (0, True)]
+    assert [row for row, _ in steps(lens, (2, 0, 1, 0))] == [0, 1, 2, 1, 0, 1, 0, 1, 2, 3, 4, 5, 6, 7]
+    made = Tracer(lens, np.array([D_NM]), routes_=[(3, 1, 2, 0)])
+    single, double, _, found = both_ways(lens, made, bundle(0, (0, 0, 1.0, 1.0), [0.02, 0, 1]), 9)
+    assert np.abs(single - double)[found.arrives].max() < 5e-4
+    shiny = replace(lens, sensor_reflectance=0.3)
+    assert len(routes(shiny)) == (mirrors + 1) * mirrors / 2
+    back = {g.pair: g for g in traced_ghosts(shiny, 1.0, across=64)}
+    assert back[(0, 8)].flux_fraction > back[(0, 7)].flux_fraction
+    dark = {g.pair: g for g in traced_ghosts(replace(lens, sensor_reflectance=0.15), 1.0, across=64)}
+    assert dark[(0, 8)].flux_fraction == pytest.approx(back[(0, 8)].flux_fraction / 2, rel=1e-5)
+
+
+# --- the table of ghosts ----------------------------------------------------------------------------------------
+
+
+def test_flux_converges_with_the_number_of_rays() -> None:
+    lens = load_lens("tessar_50_f2p8")
+    counts = (32, 64, 128, 256)
+    found = [{g.pair: g.flux_fraction for g in traced_ghosts(lens, 8.0, across=n)} for n in (*counts, 1024)]
+    best = found[-1]
+    worst = [max(abs(f.get(pair, 0) / best[pair] - 1) for pair in best) for f in found[:-1]]
+    # what a rim's cells err by falls at least as fast as the rays' spacing
+    slope = np.polyfit(np.log(counts), np.log(worst), 1)[0]
+    assert slope < -1
+    assert worst[-1] < 0.003
+
+
+def test_ghosts_turn_with_the_sun_and_lie_on_the_axis_under_it() -> None:
+    lens = load_lens("nikkor_35_f2p8")
+    one, other = (traced_ghosts(lens, 9.0, azimuth_deg=a, across=96) for a in (0.0, 130.0))
+    turn = np.radians(130.0)
+    for a, b in zip(one, other, strict=True):
+        assert a.pair == b.pair
+        assert b.flux_fraction == pytest.approx(a.flux_fraction, rel=1e-6)
+        x, y = a.centroid_mm
+        expected = (x * np.cos(turn) - y * np.sin(turn), x * np.sin(turn) + y * np.cos(turn))
+        assert b.centroid_mm == pytest.approx(expected, abs=1e-4)
+        assert abs(y) < 2e-3 * a.rms_radius_mm
+    for ghost in traced_ghosts(lens, 0.0, across=96):
+        assert np.hypot(*ghost.centroid_mm) < 1e-3 * ghost.rms_radius_mm
+
+
+def test_first_order_is_the_limit_of_a_small_stop_and_angle() -> None:
+    """Flux and place of every ghost: what differs falls as the square of aperture and angle together."""
+    lens = load_lens("nikkor_28_f2p8")
+    differ = []
+    shares = (1.0, 0.5, 0.25)
+    for share in shares:
+        surfaces = list(lens.surfaces)
+        rim = surfaces[lens.stop].semi_diameter_mm
+        surfaces[lens.stop] = replace(surfaces[lens.stop], semi_diameter_mm=0.2 * share * rim)
+        small = replace(lens, surfaces=tuple(surfaces))
+        angle = 2.0 * share
+        traced = {g.pair: g for g in traced_ghosts(small, angle, across=256)}
+        first = {g.pair: g for g in paraxial_ghosts(small, angle)}
+        pairs = [p for p in first if p in traced]
+        assert len(pairs) > 60
+        apart = [
+            np.hypot(*np.subtract(traced[p].centroid_mm, first[p].centroid_mm)) / np.hypot(*first[p].centroid_mm)
+            for p in pairs
+        ]
+        differ.append(np.median(apart))
+    slope = np.polyfit(np.log(shares), np.log(differ), 1)[0]
+    assert 1.6 < slope < 2.4
+    assert differ[-1] < 2e-3
+
+
+def test_coatings_and_blades_in_the_flux() -> None:
+    lens = load_lens("tessar_50_f2p8")
+    flux = [sum(g.flux_fraction for g in traced_ghosts(lens.coated(c), 5.0, across=64)) for c in ("none", "bbar")]
+    assert flux[1] < 0.02 * flux[0]
+
+
+def test_blades_bound_the_beam() -> None:
+    """A beam along the axis, through a stop alone: what passes is the area of its outline."""
+    rows = [STOP | {"blades": 5, "blade_rounding": 0.3, "rotation_deg": 20.0}, GLASS, BACK]
+    lens = parse_lens({"surface": rows}, source="bladed")
+    stop = lens.surfaces[0]
+    made = Tracer(lens, np.array([D_NM]), routes_=[()])
+    across = 400
+    spots = made.turned(0.0).trace(bundle(0, (0, 0, 5.0, 5.0), [0, 0, 1]), across, centred=True)
+    angle = np.linspace(0, 2 * np.pi, 100_000, endpoint=False)
+    area = np.mean(stop.rim_mm(angle) ** 2) / (4 / np.pi * stop.semi_diameter_mm**2)
+    passes = spots.radius.numpy().reshape(across, across) <= 1
+    assert passes.mean() == pytest.approx(area, rel=2e-3)
+    # a corner at 20° from +x towards +y, the middle of an edge opposite
+    side = (np.arange(across) + 0.5) / across * 10 - 5
+    x, y = np.meshgrid(side, side)
+    reach = [np.max((x * np.cos(t) + y * np.sin(t)) * passes) for t in np.radians([20.0, 200.0])]
+    assert reach == pytest.approx([5.0, float(stop.rim_mm(np.radians(200.0)))], abs=0.03)
+
+
+# --- pictures ---------------------------------------------------------------------------------------------------
+
+
+def model(lens: Prescription, **more: Any) -> FlareModel:
+    settings: dict[str, Any] = {"shape": (160, 200), "pitch_mm": 0.2, "sun_radius_rad": 2e-3} | more
+    return FlareModel(lens, settings.pop("wavelength_nm", np.array([D_NM])), **settings)
+
+
+@pytest.mark.parametrize(("kind", "worst"), [("traced", 0.03), ("paraxial", 0.01)])
+def test_a_picture_holds_the_flux_of_its_ghosts(kind: str, worst: float) -> None:
+    """Every ghost by itself that lies within the frame: light and place as its rays have them. Cells of a lattice
+    are linear in it: exact for first-order ghosts but for their rims; of the others the most distorted err most."""
+    lens = load_lens("tessar_50_f2p8")
+    pitch, half = 0.5, 120
+    made = model(lens, model=kind, pitch_mm=pitch, shape=(2 * half, 2 * half), diffraction=False, across=73)
+    area = np.pi / 4 * first_order(lens).entrance_pupil_diameter_mm ** 2
+    told = (
+        {g.pair: g for g in traced_ghosts(lens, 6.0, azimuth_deg=40.0, across=192)}
+        if kind == "traced"
+        else {g.pair: g for g in paraxial_ghosts(lens, 6.0, azimuth_deg=40.0)}
+    )
+    axis = (np.arange(2 * half) + 0.5 - half) * pitch
+    rays, where = made._tracer.boxes(6.0)
+    off = []
+    for route, bounds in zip(rays.route, where, strict=True):
+        ghost = told[tuple(sorted(made._tracer.routes[route]))]
+        if np.abs(bounds[:4]).max() > 0.7 * half * pitch:
+            continue
+        picture = made.image(6.0, 40.0, only=ghost.pair)[0].astype(np.float64)
+        light = picture.sum()
+        off.append(light * pitch**2 / (np.cos(np.radians(6.0)) * area) / ghost.flux_fraction - 1)
+        x, y = (picture.sum(axis=0) @ axis) / light, (picture.sum(axis=1) @ axis) / light
+        apart = np.hypot(x - ghost.centroid_mm[0], y - ghost.centroid_mm[1])
+        assert apart < 0.1 * pitch + 0.03 * ghost.rms_radius_mm, ghost.pair
+    assert len(off) >= 10
+    assert np.abs(off).max() < worst
+    assert np.median(np.abs(off)) < 0.008
+
+
+def test_a_picture_turns_with_the_sun() -> None:
+    made = model(load_lens("tessar_50_f2p8"), shape=(160, 160))
+    right, down = made.image(10.0, 0.0)[0], made.image(10.0, 90.0)[0]
+    np.testing.assert_allclose(np.rot90(right, -1), down, atol=2e-3 * right.max(), rtol=0.02)
+
+
+def test_threads_do_not_change_a_bit() -> None:
+    made = model(load_lens("tessar_50_f2p8"), wavelength_nm=np.linspace(400, 700, 3))
+    dr = backend().dr
+    threads = dr.thread_count()
+    pictures = []
+    try:
+        for count in (1, 2, 2):
+            dr.set_thread_count(count)
+            pictures.append(made.image(7.0, 20.0).tobytes())
+    finally:
+        dr.set_thread_count(threads)
+    assert len(set(pictures)) == 1
+
+
+def test_bands_differ_by_colour_alone() -> None:
+    """Without dispersion and coating all bands are one picture; with glass of its own they part."""
+    lens = load_lens("tessar_50_f2p8")
+    grey = replace(
+        lens,
+        surfaces=tuple(
+            replace(s, medium=replace(s.medium, formula="cauchy", coefficients=(s.medium.nd, 0.0)))
+            for s in lens.surfaces
+        ),
+    )
+    nodes = np.array([400.0, 550.0, 700.0])
+    bands = model(grey, wavelength_nm=nodes, diffraction=False).image(8.0)
+    np.testing.assert_allclose(bands[0], bands[2], rtol=1e-5, atol=1e-9 * bands.max())
+    bands = model(lens, wavelength_nm=nodes).image(8.0)
+    assert np.abs(bands[0] - bands[2]).max() > 0.05 * bands[1].max()
+
+
+def test_four_reflections_add_little_light() -> None:
+    lens = scaled_to_focal_length(load_lens("tessar_50_f2p8"), 10.0)
+    two, four = (model(lens, pitch_mm=0.05, reflections=n).image(5.0).sum() for n in (2, 4))
+    assert 1.0 < four / two < 1.05
+
+
+def test_soft_edges() -> None:
+    s = np.linspace(EDGE_LOW, EDGE_HIGH, _EDGE_NODES)
+    profiles = edge_profiles()
+    # a uniform disc, a straight edge through it: half the light where the edge crosses its middle
+    assert np.interp(0.0, s, profiles[0]) == pytest.approx(0.5, abs=1e-3)
+    assert np.interp(0.5, s, profiles[0]) == pytest.approx(
+        0.5 + (0.5 * np.sqrt(0.75) + np.arcsin(0.5)) / np.pi, abs=1e-3
+    )
+    # Fresnel's straight edge: a quarter at the edge, 1.370 at v = 1.217 (Born & Wolf, section 8.7.3)
+    assert np.interp(0.0, s, profiles[-1]) == pytest.approx(0.25, abs=2e-3)
+    assert profiles[-1].max() == pytest.approx(1.370, abs=2e-3)
+    assert s[np.argmax(profiles[-1])] == pytest.approx(1.217, abs=0.01)
+    # an edge redistributes light: as much is missing inside as lies outside
+    light = ((profiles - (s > 0)) @ np.ones_like(s)) * (s[1] - s[0])
+    assert np.abs(light[0]) < 1e-3
+    points = disc_samples(3)
+    assert len(points) == 37
+    assert (points**2).sum(axis=1).mean() == pytest.approx(0.5, rel=0.02)
+
+
+def test_a_sun_that_cannot_be() -> None:
+    made = model(load_lens("tessar_50_f2p8"))
+    with pytest.raises(InputError, match=r"sun_deg = 90: must be from 0 to below 90"):
+        made.image(90.0)
+    with pytest.raises(InputError, match="model = 'exact'"):
+        model(load_lens("tessar_50_f2p8"), model="exact")
+    with pytest.raises(InputError, match="reflections = 3"):
+        routes(load_lens("tessar_50_f2p8"), 3)
