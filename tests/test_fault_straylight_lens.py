@@ -1,0 +1,124 @@
+"""Straylight from a prescription: the light of a frame, its truth, and what its keys do."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from test_faults_kit import flat_electrons, make_context
+
+from vbnfault import llvm, spectra
+from vbnfault.errors import InputError, VbnfaultError
+from vbnfault.faults import FaultContext, from_dict, registry
+from vbnfault.lens import first_order, load_lens, scaled_to_focal_length
+
+try:
+    llvm.find()
+except VbnfaultError as error:
+    pytest.skip(f"no usable LLVM: {error}", allow_module_level=True)
+
+MODELS = ("traced", "paraxial")
+SIZE = 256
+SUN = (0.8 * SIZE, 0.35 * SIZE)
+
+
+def context(sun: tuple[float, float] | None = SUN, **more: Any) -> FaultContext:
+    made = make_context(SIZE, sun=sun, exposure_s=1e-3)
+    nodes = spectra.band_nodes_nm(400.0, 700.0, 4)
+    return replace(
+        made,
+        wavelength_nm=nodes,
+        sun_irradiance_W_m2_nm=spectra.solar_band_irradiance_W_m2_nm(nodes, 3.0),
+        sun_angular_radius_rad=spectra.sun_angular_radius_rad(3.0),
+        **more,
+    )
+
+
+def light(model: str, where: FaultContext, **keys: Any) -> tuple[Any, dict[str, Any]]:
+    """What a fault adds, electrons float64[y, x, 3], and its parameters."""
+    fault = registry()["straylight"][model](**({"cleanliness_level": 0, "roughness_nm": 1.0} | keys))
+    params = fault.draw(where, np.random.default_rng(3))
+    black = flat_electrons(where, 0.0)
+    return fault.apply(black, params, where).array.astype(np.float64), params
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_ghosts_lie_on_the_line_from_the_sun_through_the_centre(model: str) -> None:
+    where = context()
+    added, params = light(model, where, coating="none", roughness_nm=0)
+    assert (added >= 0).all()
+    assert len(params["ghosts"]) >= 10
+    middle = np.array([SIZE / 2, SIZE / 2])
+    along = (np.array(SUN) - middle) / np.hypot(*(np.array(SUN) - middle))
+    across = np.array([-along[1], along[0]])
+    for ghost in params["ghosts"]:
+        place = np.array([ghost["x_px"], ghost["y_px"]]) - middle
+        # a ghost's rays are symmetrical about the line; of wide ones, to some parts in a thousand
+        assert abs(place @ across) < 0.05 + 0.004 * ghost["rms_radius_px"]
+    # so is the whole picture: mirrored about that line it is itself, but for resampling
+    y, x = np.mgrid[:SIZE, :SIZE] + 0.5
+    side = np.stack([x - middle[0], y - middle[1]], axis=-1)
+    mirrored = side - 2 * (side @ across)[..., None] * across
+    mx, my = (np.floor(mirrored[..., k] + middle[k]).astype(int) for k in (0, 1))
+    inside = (mx >= 0) & (mx < SIZE) & (my >= 0) & (my < SIZE)
+    green = added[..., 1]
+    other = green[my[inside], mx[inside]]
+    assert np.corrcoef(np.log(green[inside] + 1), np.log(other + 1))[0, 1] > 0.98
+
+
+def test_models_agree_on_the_pairs_and_differ_in_the_light() -> None:
+    (a, p), (b, q) = (light(model, context(), coating="none") for model in MODELS)
+    assert {tuple(g["pair"]) for g in p["ghosts"]} & {tuple(g["pair"]) for g in q["ghosts"]}
+    assert 0.3 < a.sum() / b.sum() < 3
+    assert np.abs(a - b).max() > 0.1 * a.mean()
+
+
+def test_light_follows_sun_exposure_and_coating() -> None:
+    where = context()
+    base, _ = light("traced", where)
+    assert where.sun_irradiance_W_m2_nm is not None
+    twice, _ = light("traced", replace(where, sun_irradiance_W_m2_nm=2 * where.sun_irradiance_W_m2_nm))
+    np.testing.assert_allclose(twice, 2 * base, rtol=1e-4, atol=1e-3)
+    half, _ = light("traced", replace(where, sun_visible_fraction=0.5))
+    np.testing.assert_allclose(half, base / 2, rtol=1e-4, atol=1e-3)
+    longer = replace(where, camera=replace(where.camera, exposure_s=4e-3))
+    np.testing.assert_allclose(light("traced", longer)[0], 4 * base, rtol=1e-4, atol=1e-3)
+    truths = [light("traced", where, coating=c) for c in ("bbar", "mgf2", "none")]
+    flux = [sum(ghost["flux_fraction"] for ghost in params["ghosts"]) for _, params in truths]
+    assert 10 * flux[0] < flux[1] < 0.3 * flux[2]
+    far = np.hypot(*(np.mgrid[:SIZE, :SIZE] - np.array(SUN[::-1])[:, None, None])) > 40
+    assert np.median(truths[1][0][far]) < np.median(truths[2][0][far])
+    dirty, _ = light("traced", where, cleanliness_level=500)
+    assert np.median(dirty[far]) > np.median(base[far])
+
+
+def test_no_sun_no_light() -> None:
+    for where in (context(None), context(sun_visible_fraction=0.0)):
+        added, params = light("traced", where)
+        assert not added.any()
+        assert params["ghosts"] == []
+
+
+def test_a_sun_outside_the_field_still_gives_ghosts() -> None:
+    added, _ = light("traced", context((1.25 * SIZE, 0.5 * SIZE)), coating="none")
+    assert added.max() > 0
+
+
+def test_the_lens_is_the_cameras_own_or_the_one_named() -> None:
+    where = context()
+    default, _ = light("traced", where, coating="as_prescribed")
+    named, params = light("traced", where, lens="nikkor_35_f2p8", coating="as_prescribed")
+    np.testing.assert_array_equal(default, named)
+    other, _ = light("traced", where, lens="tessar_50_f2p8", coating="as_prescribed")
+    assert np.abs(other - named).max() > 0
+    scaled = scaled_to_focal_length(load_lens("tessar_50_f2p8"), where.camera.lens.focal_length_mm)
+    assert first_order(scaled).efl_mm == pytest.approx(where.camera.lens.focal_length_mm)
+    assert params["lens"] == "nikkor_35_f2p8"
+    with pytest.raises(InputError, match=r"scene\.toml: faults\.straylight|no_such_lens"):
+        from_dict("straylight", {"model": "traced", "lens": "no_such_lens"}, source="scene.toml")
+    with pytest.raises(InputError, match="baffle_length_mm"):
+        from_dict("straylight", {"model": "traced", "baffle_length_mm": 5.0}, source="scene.toml")
+    with pytest.raises(InputError, match="reflections = 3"):
+        from_dict("straylight", {"model": "traced", "reflections": 3}, source="scene.toml")
