@@ -194,14 +194,26 @@ def lens(
     lens: Annotated[str, typer.Argument(help="path of a prescription, or the name of a packaged lens")],
     out: Annotated[Path | None, typer.Option(help="PNG of the layout [default: the lens's name, here]")] = None,
     json_: Annotated[Path | None, typer.Option("--json", help="the table as JSON")] = None,
+    vary_seed: Annotated[
+        int | None, typer.Option(min=0, help="a random relative of the lens in its place, by this seed")
+    ] = None,
+    spread: Annotated[
+        float, typer.Option(help="of the relative's curvatures, thicknesses and rims, as a share of each")
+    ] = 0.03,
+    toml: Annotated[Path | None, typer.Option(help="write the prescription, such as a relative's")] = None,
 ) -> None:
     """First-order table of a lens (EFL, BFD, f-number, pupils) and a drawing of its layout."""
     from dataclasses import asdict
 
+    import numpy as np
+
     from . import lens as optics
     from .lens.drawing import draw
+    from .lens.family import relative, write_lens
 
     prescription = optics.load_lens(lens)
+    if vary_seed is not None:
+        prescription = relative(prescription, np.random.default_rng(vary_seed), spread=spread)
     figures = asdict(optics.first_order(prescription))
     path = Path(f"{Path(lens).stem}.png") if out is None else out
     if path.suffix.lower() != ".png" or not path.absolute().parent.is_dir():
@@ -213,6 +225,10 @@ def lens(
         table = {"name": prescription.name, "source": prescription.source, **figures}
         with _written(json_):
             json_.write_text(json.dumps(table, indent=2) + "\n", encoding="utf-8")
+    if toml is not None:
+        with _written(toml):
+            write_lens(prescription, toml)
+        typer.echo(str(toml))
     with _written(path):
         draw(prescription, path)
     typer.echo(str(path))
