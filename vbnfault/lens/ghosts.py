@@ -34,7 +34,9 @@ _COARSE = 25  # rays across a box while boxes are sought
 _FINE = 512  # rays across a box where flux and place are told
 _PEAK = 128  # and where the peak is sought
 _TOGETHER = 8  # bundles at a time there, for the memory's sake
-_LOST = -1e6
+_LOST, _FAR = -1e6, -1e4
+_LIMIT_SHARPNESS = 100.0  # of the edge where a limit other than a rim ends the light
+_LEAST_SLOPE = 1e-3  # of a ray against the sensor's plane, once it is lost
 
 
 @lru_cache(maxsize=1)
@@ -302,7 +304,6 @@ class Tracer:
             b = c * (x * dx + y * dy) - dz
             e = c * (x * x + y * y)
             under = b * b - a * e
-            met = under >= 0
             t_hit = e / (-b + dr.copysign(dr.sqrt(dr.maximum(under, 0)), dz))
             x, y, z = dr.fma(t_hit, dx, x), dr.fma(t_hit, dy, y), t_hit * dz
             nx, ny, nz = c * x, c * y, c * conic * z - 1
@@ -318,7 +319,7 @@ class Tracer:
             # the normal towards where the ray comes from
             norm = dr.select(along_normal > 0, -norm, norm)
             nx, ny, nz = nx * norm, ny * norm, nz * norm
-            cosine = dr.abs(along_normal)
+            cosine = dr.minimum(dr.abs(along_normal), 1)
             beyond = dr.sqrt(x * x + y * y) * per_rim
             if rim.blades:
                 blade = self._within_blades(x, y)
@@ -326,7 +327,7 @@ class Tracer:
             left = 1 - eta * eta * (1 - cosine * cosine)
             total = left < 0
             out_cosine = dr.sqrt(dr.maximum(left, 0))
-            thin = dr.select(eta > 1, out_cosine, cosine) * (_COSINES - 1)
+            thin = dr.minimum(dr.select(eta > 1, out_cosine, cosine), 1) * (_COSINES - 1)
             node = dr.minimum(be.UInt32(thin), _COSINES - 2)
             low, rise = _unpaired(t["share"], (word >> 1) + shares + node)
             passed = dr.fma(thin - be.Float(node), rise, low)
@@ -335,23 +336,26 @@ class Tracer:
             keep = dr.select(mirror, 1, eta)
             forward = dz > 0
             dx, dy, dz = dr.fma(turn, nx, keep * dx), dr.fma(turn, ny, keep * dy), dr.fma(turn, nz, keep * dz)
-            right_way = (dz > 0) == (forward ^ mirror)
-            met &= (mirror | ~total) & right_way
-            beyond = dr.select(met, beyond, 1e6)
-            radius = dr.maximum(radius, beyond)
-            margin = dr.minimum(margin, (1 - beyond) * sharpness)
+            # lost too: a surface missed, light all reflected, a ray turned back; on it goes, along the limit, so
+            # that between rays it is known where that began
+            onward = dr.select(forward ^ mirror, 1.0, -1.0)
+            left = dr.select(mirror, 1, left)
+            room = dr.minimum(dr.minimum(under, left), 4 * dz * onward)
+            dz = onward * dr.maximum(dz * onward, _LEAST_SLOPE)
+            radius = dr.maximum(radius, dr.maximum(beyond, 1 - room))
+            margin = dr.minimum(margin, dr.minimum((1 - beyond) * sharpness, room * _LIMIT_SHARPNESS))
             return step + 1, x, y, z, dx, dy, dz, share, radius, margin
 
         _, x, y, z, dx, dy, dz, share, radius, margin = dr.while_loop(state, on, body, mode="symbolic")
         away = -(z + dr.gather(be.Float, t["last"], route)) / dz
         x, y = dr.fma(away, dx, x), dr.fma(away, dy, y)
-        found = radius < 1e5
+        found = dr.isfinite(x + y + radius) & (dr.abs(x) + dr.abs(y) < 1e9)
         spots = Spots(
             x_mm=dr.select(found, x, 0),
             y_mm=dr.select(found, y, 0),
             share=dr.select(found, share, 0),
-            radius=radius,
-            margin=dr.select(found, margin, _LOST),
+            radius=dr.select(found, radius, -_LOST),
+            margin=dr.select(found, dr.maximum(margin, _FAR), _LOST),
         )
         dr.eval(spots.x_mm, spots.y_mm, spots.share, spots.radius, spots.margin)
         return spots

@@ -222,7 +222,7 @@ def _surface(row: Mapping[str, Any], front: Glass, where: str, *, last: bool) ->
     if row.get("sensor", False) is not False:
         raise InputError(f"{where}: sensor = {row['sensor']!r}: only the last surface can be the sensor")
     if "reflectance" in row:
-        raise InputError(f"{where}: reflectance: only the sensor has one; elsewhere it follows from coating and glass")
+        raise InputError(f"{where}: reflectance: only the sensor has one; elsewhere coating and glass give it")
     stop = row.get("stop", False)
     if not isinstance(stop, bool):
         raise InputError(f"{where}: stop = {stop!r}: must be true or false")

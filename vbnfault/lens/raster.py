@@ -24,7 +24,8 @@ F64 = NDArray[np.float64]
 
 LEVELS = 6
 _MARGIN = 4  # pixels around each level, for what lies half outside
-_UNITS = 2.0**40  # of the integer sums, per unit of irradiance
+_UNITS = 2.0**36  # of the integer sums, per unit of irradiance
+_MOST = 1e5  # irradiance that one ghost may add to a pixel: far beyond white
 _CALM_SIGMA = 0.8  # pixels of a coarser level by which it is smoothed
 _SMALL = 0.5  # cells below this many pixels are splatted
 EDGE_LOW, EDGE_HIGH = -1.0, 5.0  # of the soft edge's profile
@@ -180,7 +181,7 @@ class Sums:
             at, shown = UInt32(Int32(y)) * width + UInt32(Int32(x)), here & (value != 0)
             for start, share in ((base, weight), (second, other))[: 1 + twice]:
                 # negative numbers wrap around, and back when read
-                units = be.UInt64(be.Int64(dr.round(value * share)))
+                units = be.UInt64(be.Int64(dr.round(dr.clip(value, -_MOST, _MOST) * share)))
                 dr.scatter_add(total, units, start + at, shown & (share > 0), mode=dr.ReduceMode.Expand)
             down = x >= end
             y = dr.select(down, y + 1, y)
@@ -211,7 +212,8 @@ class Sums:
             below = here
         assert below is not None
         height, width = canvas.shape
-        return np.ascontiguousarray(below[:, _MARGIN : _MARGIN + height, _MARGIN : _MARGIN + width])
+        # the parts that add up meet on lattices of their own: where little is left of much it may be below nothing
+        return np.maximum(below[:, _MARGIN : _MARGIN + height, _MARGIN : _MARGIN + width], 0)
 
 
 class _Triangle:
@@ -228,14 +230,17 @@ class _Triangle:
 
     def at(self, x: Any, y: Any) -> tuple[Any, ...]:
         """Whether a point lies inside, and the values there."""
+        dr = backend().dr
         inside, values = None, [0.0] * (len(self._corners[0]) - 2)
         for (ox, oy, ux, uy, flip), corner in zip(self._edges, self._corners, strict=True):
             share = (ux * (y - oy) - uy * (x - ox)) * (flip * self._sign)
             # a point on an edge belongs to the side that the edge, always read the same way, has on its left
             here = (share > 0) | ((share == 0) & (flip * self._sign > 0))
             inside = here if inside is None else inside & here
-            values = [value + share * more for value, more in zip(values, corner[2:], strict=True)]
-        return inside, *(value * self._per_area for value in values)
+            # of a sliver's area little but rounding may be left
+            weight = dr.clip(share * self._per_area, 0, 1)
+            values = [dr.fma(weight, more, value) for value, more in zip(values, corner[2:], strict=True)]
+        return inside, *values
 
 
 def _edge(p: tuple[Any, ...], q: tuple[Any, ...]) -> tuple[Any, ...]:

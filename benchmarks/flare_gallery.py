@@ -1,0 +1,96 @@
+"""Flares of every packaged lens over Sun angles, one sheet a lens:
+
+    python benchmarks/flare_gallery.py OUT_FOLDER [--lens NAME ...] [--coating mgf2] [--model traced|paraxial|both]
+
+One row a model, one column an angle; with both models a third row shows where they part: traced over paraxial
+light, red where there is more of it, blue where less, a factor of ten at full colour. Also writes `energy.csv`: the
+flux of all ghosts over the light that enters the pupil, by lens, coating and angle.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from vbnfault import flares, resources
+from vbnfault.lens import load_lens
+
+ANGLES_DEG = (0.0, 8.0, 16.0, 24.0, 34.0)
+AZIMUTH_DEG = 30.0
+FOV_DEG = 60.0
+
+
+def part(traced: np.ndarray, paraxial: np.ndarray) -> np.ndarray:
+    """Ratio of two irradiance pictures as colours, uint8[y, x, 3] R, G, B."""
+    floor = 1e-3 * np.percentile(traced, 90)
+    ratio = np.clip(np.log10((traced + floor) / (paraxial + floor)), -1, 1)
+    out = np.full((*ratio.shape, 3), 255.0)
+    out[..., 1:] -= 255 * np.maximum(ratio, 0)[..., None]
+    out[..., :2] -= 255 * np.maximum(-ratio, 0)[..., None]
+    return np.clip(out, 0, 255).astype(np.uint8)
+
+
+def sheet(name: str, coating: str, models: tuple[str, ...], pixels: int) -> tuple[np.ndarray, list[list[object]]]:
+    lens = load_lens(name).coated(coating)
+    columns, energy = [], []
+    white = None
+    for angle in ANGLES_DEG:
+        cells, light = [], []
+        for model in models:
+            view = flares.View(
+                lens=lens,
+                sun_deg=angle,
+                azimuth_deg=AZIMUTH_DEG,
+                fov_deg=FOV_DEG,
+                pixels=pixels,
+                wavelength_nm=flares.wavelengths_nm(),
+                sun_distance_au=3.0,
+                model=model,
+            )
+            found = flares.layers(view)
+            if white is None:  # one exposure for the sheet
+                ghosts = flares.colours(view, found["ghosts"]).max(axis=2)
+                white = float(np.percentile(ghosts, 99)) * 2
+            cells.append(flares.picture(view, found, white))
+            light.append(flares.colours(view, found["ghosts"])[..., 1])
+            one = replace(view, wavelength_nm=flares.wavelengths_nm(550.0))
+            told = flares.ghosts(one)
+            energy.append([name, coating, model, angle, len(told), sum(g.flux_fraction for g in told)])
+        if len(models) == 2:
+            cells.append(part(light[0], light[1]))
+        columns.append(np.concatenate(cells))
+    return np.concatenate(columns, axis=1), energy
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("out", type=Path)
+    parser.add_argument("--lens", nargs="*")
+    parser.add_argument("--coating", default="mgf2")
+    parser.add_argument("--model", choices=["traced", "paraxial", "both"], default="both")
+    parser.add_argument("--pixels", type=int, default=384)
+    args = parser.parse_args()
+    args.out.mkdir(parents=True, exist_ok=True)
+    models = ("traced", "paraxial") if args.model == "both" else (args.model,)
+    rows: list[list[object]] = []
+    for name in args.lens or resources.packaged("scenes/lenses"):
+        picture, energy = sheet(name, args.coating, models, args.pixels)
+        path = args.out / f"{name}_{args.coating}.png"
+        cv2.imwrite(str(path), picture[..., ::-1])
+        print(path)
+        rows += energy
+        for row in energy:
+            print("  {:<18}{:<6}{:<10}{:5.0f} deg {:4d} ghosts {:10.3e}".format(*row))
+    with (args.out / "energy.csv").open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(["lens", "coating", "model", "sun_deg", "ghosts", "flux_fraction"])
+        writer.writerows(rows)
+
+
+if __name__ == "__main__":
+    main()
