@@ -11,8 +11,10 @@ from typing import Any
 
 import numpy as np
 
-from vbnfault import config, dataset, frames, photometry, pipeline, render, store, world
+from vbnfault import config, dataset, frames, photometry, pipeline, render, spectra, store, world
 from vbnfault.body import Patch
+from vbnfault.lens import load_lens, scaled_to_focal_length
+from vbnfault.lens.flare import FlareModel
 from vbnfault.pipeline import Frame, Pose, SampleSpec
 from vbnfault.quantities import Sample
 from vbnfault.render.emitter import SunDisc
@@ -29,6 +31,9 @@ CAMERA_AZIMUTH_DEG = 240.0
 CAMERA_BELOW_HORIZON_DEG = 52.0
 SUN_AZIMUTH_DEG = 225.0
 SUN_ELEVATION_DEG = 24.0
+
+FLARE_LENS = "nikkor_35_f2p8"
+FLARE_SUN_DEG = 16.0
 
 
 def clock(function: Callable[[], Any]) -> tuple[float, Any]:
@@ -119,10 +124,28 @@ class Workload:
         seconds["hapke"], _ = clock(lambda: render.radiance(surface, physical))
         lit = replace(physical, bounces=1)
         seconds["bounce"], _ = clock(lambda: render.radiance(surface, lit, frame.truth))
+        seconds["flare"], _ = clock(self.flare)
         seconds["to_sample"], sample = clock(lambda: pipeline.to_sample(frame))
         shard, _ = clock(lambda: write_shard(folder, sample))
         seconds["store"] = shard / SHARD_SAMPLES
         return seconds, frame
+
+    @cached_property
+    def flares(self) -> FlareModel:
+        """All ghosts of an 11-surface lens on the camera's own sensor, eight wavelengths."""
+        camera = self.session.base_camera
+        lens = scaled_to_focal_length(load_lens(FLARE_LENS), camera.lens.focal_length_mm)
+        return FlareModel(
+            lens,
+            spectra.band_nodes_nm(400.0, 700.0, 8),
+            shape=(camera.height_px, camera.width_px),
+            pitch_mm=camera.detector.pixel_pitch_um * 1e-3,
+            sun_radius_rad=self.scene.sun.angular_radius_rad,
+        )
+
+    def flare(self) -> np.ndarray:
+        """A full flare frame: irradiance of all ghosts, float32[band, y, x]."""
+        return self.flares.image(FLARE_SUN_DEG, 30.0)
 
     def empty_store(self, path: Path) -> store.Store:
         """A store for one shard of samples."""
