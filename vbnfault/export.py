@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,8 @@ from . import labels, pipeline, report
 from .errors import VbnfaultError
 from .pipeline import Frame
 from .quantities import Sample
+
+_MARKED_GHOSTS = 10
 
 
 def write_frame(frame: Frame, folder: Path) -> list[Path]:
@@ -49,15 +52,15 @@ def write_frame(frame: Frame, folder: Path) -> list[Path]:
 
 def annotated(frame: Frame, fault: str) -> NDArray[np.uint8]:
     """The image with one class pointed out, uint8[y, x, 3] R, G, B: the outline of its mask and, for straylight,
-    the line from the Sun through the centre with every flare's centre and radius on it."""
+    the line from the Sun through the centre with every flare's or bright ghost's centre and radius on it."""
     names = list(frame.spec.faults)
     colour = report.COLOURS[names.index(fault) % len(report.COLOURS)]
     picture = np.ascontiguousarray(frame.images["image"].array[..., :3])
     picture[labels.outline(frame.mask[names.index(fault)])] = colour
     params, sun = frame.drawn[fault], frame.context.sun_xy_px
-    if "flares" in params and sun is not None:
-        width = frame.camera.width_px
-        centre = np.array([width / 2, frame.camera.height_px / 2])
+    marks = _marks(params, sun, frame.camera.width_px, frame.camera.height_px)
+    if marks and sun is not None:
+        centre = np.array([frame.camera.width_px / 2, frame.camera.height_px / 2])
 
         def at(point: NDArray[np.float64]) -> tuple[int, int]:
             # a pixel's centre lies at +0.5 here and at 0 in OpenCV, whose points have 1/16 px with shift = 4
@@ -66,13 +69,31 @@ def annotated(frame: Frame, fault: str) -> NDArray[np.uint8]:
         far = sun + 2.2 * (centre - sun)
         cv2.line(picture, at(sun), at(far), (255, 255, 255), 1, cv2.LINE_AA, 4)
         cv2.circle(picture, at(sun), 10 * 16, (255, 255, 255), 1, cv2.LINE_AA, 4)
-        for flare in params["flares"]:
-            middle = sun + flare["position"] * (centre - sun)
-            cv2.circle(picture, at(middle), round(flare["radius"] * width * 16), colour, 1, cv2.LINE_AA, 4)
+        for name, middle, radius in marks:
+            cv2.circle(picture, at(middle), round(radius * 16), colour, 1, cv2.LINE_AA, 4)
             x, y = (round(float(v) - 0.5) for v in middle)
             cv2.drawMarker(picture, (x, y), colour, cv2.MARKER_CROSS, 13, 1)
-            cv2.putText(picture, str(flare["index"]), (x + 8, y - 6), cv2.FONT_HERSHEY_SIMPLEX, 0.5, colour, 1)
+            cv2.putText(picture, name, (x + 8, y - 6), cv2.FONT_HERSHEY_SIMPLEX, 0.5, colour, 1)
     return picture
+
+
+def _marks(
+    params: Mapping[str, Any], sun: NDArray[np.float64] | None, width: int, height: int
+) -> list[tuple[str, NDArray[np.float64], float]]:
+    """Name, place and radius in pixels of what straylight has drawn: textures, or a lens's brightest ghosts, whose
+    radius is that of a disc with their spread."""
+    if sun is None:
+        return []
+    centre = np.array([width / 2, height / 2])
+    marks = [
+        (str(flare["index"]), sun + flare["position"] * (centre - sun), flare["radius"] * width)
+        for flare in params.get("flares", ())
+    ]
+    for ghost in params.get("ghosts", ())[:_MARKED_GHOSTS]:
+        place = np.array([ghost["x_px"], ghost["y_px"]])
+        if np.abs(place - centre).max() < width and ghost["rms_radius_px"] < width:
+            marks.append(("-".join(map(str, ghost["pair"])), place, np.sqrt(2) * ghost["rms_radius_px"]))
+    return marks
 
 
 def _plain(sample: Sample) -> dict[str, Any]:
