@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,7 @@ from .detector import Detector
 from .errors import InputError
 from .faults import FaultContext, registry
 from .lens import Prescription, ThinLens, first_order
-from .lens.paraxial import Ghost, paraxial_ghosts
+from .lens.paraxial import Ghost, mean_ghost, paraxial_ghosts
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -106,7 +106,7 @@ def ghosts(view: View, progress: Callable[[float], None] | None = None) -> tuple
             found.setdefault(ghost.pair, []).append((float(share), ghost))
         if progress is not None:
             progress((k + 1) / len(weight))
-    return tuple(_mean(rows) for _, rows in sorted(found.items()))
+    return tuple(mean_ghost(rows) for _, rows in sorted(found.items()))
 
 
 def _ghosts_at(view: View, wavelength_nm: float, *, alone: bool) -> tuple[Ghost, ...]:
@@ -122,21 +122,6 @@ def _ghosts_at(view: View, wavelength_nm: float, *, alone: bool) -> tuple[Ghost,
         wavelength_nm=wavelength_nm,
         reflections=view.reflections,
         **more,
-    )
-
-
-def _mean(rows: list[tuple[float, Ghost]]) -> Ghost:
-    share = np.array([weight for weight, _ in rows])
-    flux = share * [ghost.flux_fraction for _, ghost in rows]
-    place = np.array([ghost.centroid_mm for _, ghost in rows])
-    centre = flux @ place / flux.sum()
-    square = [g.rms_radius_mm**2 + float(((p - centre) ** 2).sum()) for (_, g), p in zip(rows, place, strict=True)]
-    return replace(
-        rows[0][1],
-        flux_fraction=float(flux.sum()),
-        centroid_mm=(float(centre[0]), float(centre[1])),
-        rms_radius_mm=float(np.sqrt(flux @ square / flux.sum())),
-        peak_irradiance_fraction=float(share @ [ghost.peak_irradiance_fraction for _, ghost in rows]),
     )
 
 

@@ -43,13 +43,13 @@ class _LensStraylight(Fault):
         f"camera's own, or {_DEFAULT_LENS} where that is a thin lens",
     )
     coating: str = choice(
-        "mgf2",
+        "bbar",
         ("as_prescribed", "none", "mgf2", "v", "bbar"),
         doc="of every surface between glass and air",
     )
-    roughness_nm: Interval = bounds(0.5, 2.0, limits=(0, 100), unit="nm", doc="rms roughness of the surfaces")
+    roughness_nm: Interval = bounds(0.2, 1.0, limits=(0, 100), unit="nm", doc="rms roughness of the surfaces")
     cleanliness_level: Interval = bounds(
-        100, 300, limits=(0, 2000), doc="of particles on the surfaces, IEST-STD-CC1246; 0: none"
+        20, 100, limits=(0, 2000), doc="of particles on the surfaces, IEST-STD-CC1246; 0: none"
     )
     reflections: int = number(2, limits=(2, 4), integer=True, doc="of the ghosts: 2, or 4 for those of four too")
     baffle_length_mm: float = number(0.0, limits=(0, 1e4), unit="mm", doc="of a tube in front of the lens")

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from .ghosts import Rays, Spots, Tracer, backend, told
-from .paraxial import Ghost, along
+from .paraxial import Ghost, along, mean_ghost
 from .prescription import Prescription
 from .raster import LEVELS, Canvas, Placement, Sums, edge_kind
 
@@ -258,14 +258,18 @@ class FlareModel:
                 sums.draw(spots, self._place(detail, bundles, every, band, weight, strength, part), across, turn)
         return sums.irradiance()
 
-    def ghosts(self, sun_deg: float, azimuth_deg: float = 0.0, *, across: int = 96) -> tuple[Ghost, ...]:
-        """The ghosts of a point Sun that reach the frame, at the wavelength in the middle."""
+    def ghosts(self, sun_deg: float, azimuth_deg: float = 0.0, *, across: int = 48) -> tuple[Ghost, ...]:
+        """The ghosts of a point Sun that reach the frame, the mean of all bands."""
         turn = float(np.radians(azimuth_deg))
         made = self._tracer.turned(turn)
         rays, where = made.boxes(sun_deg, self._detail.width, self._reach_mm)
         rays = rays.take(self._in_frame(where) & (where[:, 4] > _LEAST))
-        middle = np.full(len(rays), len(self._fine) // 2)
-        return told(made, replace(rays, wavelength=middle), sun_deg, turn, across)
+        found: dict[tuple[int, ...], list[tuple[float, Ghost]]] = {}
+        for node in range(0, len(self._fine), _SUBDIVISIONS):
+            at = replace(rays, wavelength=np.full(len(rays), node))
+            for ghost in told(made, at, sun_deg, turn, across):
+                found.setdefault(ghost.pair, []).append((1 / len(self.nodes_nm), ghost))
+        return tuple(mean_ghost(rows) for _, rows in sorted(found.items()))
 
     def _fainter(self, rays: Rays, where: F64) -> NDArray[np.int64]:
         """Levels by which routes may be drawn coarser: their edges are too faint against the sum of all to show."""

@@ -32,8 +32,8 @@ Steps = tuple[tuple[int, bool], ...]
 _COSINES = 256  # nodes of the reflectance tables
 _COARSE = 25  # rays across a box while boxes are sought
 _FINE = 512  # rays across a box where flux and place are told
-_PEAK = 128  # and where the peak is sought
-_TOGETHER = 8  # bundles at a time there, for the memory's sake
+_PEAK = 64  # and where the peak is sought
+_TOGETHER = 1 << 22  # rays at a time there, for the memory's sake
 _LOST, _FAR = -1e6, -1e4
 _LIMIT_SHARPNESS = 100.0  # of the edge where a limit other than a rim ends the light
 _LEAST_SLOPE = 1e-3  # of a ray against the sensor's plane, once it is lost
@@ -592,8 +592,9 @@ def told(made: Tracer, rays: Rays, sun_deg: float, turn_rad: float, across: int)
     """What bundles of the Sun's light, one a ghost, do on the sensor's plane."""
     pupil = np.pi / 4 * first_order(made.lens).entrance_pupil_diameter_mm ** 2
     out = []
-    for first in range(0, len(rays), _TOGETHER):
-        part = rays.take(np.arange(first, min(first + _TOGETHER, len(rays))))
+    together = max(1, _TOGETHER // across**2)
+    for first in range(0, len(rays), together):
+        part = rays.take(np.arange(first, min(first + together, len(rays))))
         out += _told(made, part, across, turn_rad, pupil, float(np.cos(np.radians(sun_deg))))
     return tuple(sorted(out, key=lambda g: g.pair))
 

@@ -8,7 +8,7 @@ that pass all rims are those within discs of the entrance plane, and the ghost i
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
@@ -47,6 +47,22 @@ class Ghost:
     centroid_mm: tuple[float, float]
     rms_radius_mm: float
     peak_irradiance_fraction: float
+
+
+def mean_ghost(rows: Sequence[tuple[float, Ghost]]) -> Ghost:
+    """One ghost at several wavelengths, each with its share of the light that enters."""
+    share = np.array([weight for weight, _ in rows])
+    flux = share * [ghost.flux_fraction for _, ghost in rows]
+    place = np.array([ghost.centroid_mm for _, ghost in rows])
+    centre = flux @ place / flux.sum()
+    square = [g.rms_radius_mm**2 + float(((p - centre) ** 2).sum()) for (_, g), p in zip(rows, place, strict=True)]
+    return replace(
+        rows[0][1],
+        flux_fraction=float(flux.sum()),
+        centroid_mm=(float(centre[0]), float(centre[1])),
+        rms_radius_mm=float(np.sqrt(flux @ square / flux.sum())),
+        peak_irradiance_fraction=float(share @ [ghost.peak_irradiance_fraction for _, ghost in rows]),
+    )
 
 
 def mirrors(lens: Prescription) -> tuple[int, ...]:
