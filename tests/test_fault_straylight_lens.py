@@ -87,7 +87,7 @@ def test_light_follows_sun_exposure_and_coating() -> None:
     np.testing.assert_allclose(light("traced", longer)[0], 4 * base, rtol=1e-4, atol=1e-3)
     truths = [light("traced", where, coating=c) for c in ("bbar", "mgf2", "none")]
     flux = [sum(ghost["flux_fraction"] for ghost in params["ghosts"]) for _, params in truths]
-    assert 3 * flux[0] < flux[1] < 0.3 * flux[2]
+    assert 5 * max(flux[:2]) < flux[2]
     far = np.hypot(*(np.mgrid[:SIZE, :SIZE] - np.array(SUN[::-1])[:, None, None])) > 40
     assert np.median(truths[1][0][far]) < np.median(truths[2][0][far])
     dirty, _ = light("traced", where, cleanliness_level=500)
