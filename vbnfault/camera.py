@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .detector import Detector
-from .lens import ThinLens
+from .lens import RealLens, ThinLens
 
 ARCHITECTURES = ("full_frame_ccd", "frame_transfer_ccd", "interline_ccd", "cmos")
 READOUT_DIRECTIONS = ("up", "down", "left", "right")
@@ -22,7 +22,7 @@ class Camera:
     broken pixels and broken lines. `exposure_s` > 0.
     """
 
-    lens: ThinLens
+    lens: ThinLens | RealLens
     detector: Detector
     architecture: str = "full_frame_ccd"
     readout_direction: str = "right"
@@ -42,7 +42,7 @@ class Camera:
 
     @property
     def focal_length_px(self) -> float:
-        """Focal length in pixels: the OpenCV intrinsics fx = fy."""
+        """Focal length in pixels, of the image near the axis: the OpenCV intrinsics fx = fy."""
         return self.lens.focal_length_mm * 1e3 / self.detector.pixel_pitch_um
 
     @property
@@ -53,7 +53,7 @@ class Camera:
 
     @property
     def fov_deg(self) -> float:
-        """Full field of view across the width, degrees."""
+        """Full field of view across the width, degrees, distortion left out."""
         return float(np.degrees(2 * np.arctan(self.width_px / 2 / self.focal_length_px)))
 
     def project(self, direction_C: NDArray[np.float64]) -> NDArray[np.float64] | None:
@@ -62,7 +62,30 @@ class Camera:
         if z <= 1e-9:
             return None
         fx, fy, cx, cy = self.intrinsics
+        if isinstance(self.lens, RealLens):
+            slope = np.hypot(x, y) / z
+            stretch = float(self.lens.distorted(slope) / slope) if slope > 1e-9 else 1.0
+            return np.array([cx + fx * x / z * stretch, cy + fy * y / z * stretch])
         return np.array([cx + fx * x / z, cy + fy * y / z])
+
+    @property
+    def lens_name(self) -> str:
+        return self.lens.name if isinstance(self.lens, RealLens) else "thin lens"
+
+    @property
+    def distortion(self) -> NDArray[np.float64]:
+        """OpenCV's k1, k2, p1, p2, k3, float64[5]; zeros for a thin lens."""
+        return np.array(self.lens.distortion) if isinstance(self.lens, RealLens) else np.zeros(5)
+
+    @property
+    def distortion_residual_px(self) -> tuple[float, float]:
+        """What those leave of the lens's own map over the frame: root mean square and largest."""
+        return self.lens.distortion_residual_px if isinstance(self.lens, RealLens) else (0.0, 0.0)
+
+    @property
+    def guard_px(self) -> tuple[int, int]:
+        """Pixels of a render beyond either side of the frame, in x and in y, that its lens draws on."""
+        return self.lens.guard_px if isinstance(self.lens, RealLens) else (0, 0)
 
 
 def focal_length_mm(fov_deg: float, width_px: int, pixel_pitch_um: float) -> float:

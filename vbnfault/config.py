@@ -286,8 +286,18 @@ class CameraTable(Table):
     fov_deg: float = Field(65.0, ge=0.01, le=140, description="full field of view across the width")
     width_px: int = Field(1024, ge=16, le=16384)
     height_px: int = Field(1024, ge=16, le=16384)
-    f_number: float = Field(4.0, ge=0.5, le=200)
-    transmission: float = Field(0.9, gt=0, le=1)
+    lens: str = Field(
+        "",
+        description="a packaged lens or a prescription's TOML, scaled to the field of view; default: a thin lens",
+    )
+    lens_coating: str = Field(
+        "", description="put on all its surfaces between glass and air: none, mgf2, v or bbar; default: its own"
+    )
+    focus: Literal["paraxial", "best"] = Field(
+        "paraxial", description="where its sensor stands: best has the smallest spots over the frame"
+    )
+    f_number: float = Field(4.0, ge=0.5, le=200, description="of the thin lens; a prescription has its own")
+    transmission: float = Field(0.9, gt=0, le=1, description="of the thin lens; a prescription has its own")
     focus_distance_m: float | None = Field(None, gt=0, description="default: infinity")
     pixel_pitch_um: float = Field(5.5, ge=0.5, le=100)
     full_well_e: float = Field(13_500.0, ge=10, le=1e8)
@@ -320,6 +330,10 @@ class CameraTable(Table):
             raise ValueError(f"response = {self.response!r}: must be one of {', '.join(spectra.RESPONSES)}")
         if isinstance(self.exposure_s, float | int) and not 0 < self.exposure_s <= 1e4:
             raise ValueError(f"exposure_s = {self.exposure_s!r}: must be 'auto' or above 0 and at most 1e4 s")
+        for key in ("lens_coating", "focus"):
+            value = getattr(self, key)
+            if not self.lens and value not in ("", "paraxial"):
+                raise ValueError(f"{key} = {value!r}: needs lens")
         if self.exposure_min_s > self.exposure_max_s:
             raise ValueError(
                 f"exposure_min_s = {self.exposure_min_s:g}, "
@@ -453,6 +467,7 @@ def load_scene(name_or_path: str | Path, overrides: Mapping[str, Any] | None = N
         node = table
         if isinstance(value, str) and (
             key.endswith(".texture_file")
+            or (key.endswith(".lens") and Path(value).suffix)
             or (key == "body.shape" and value not in _SHAPES)
             or (key == "spacecraft.model" and value not in _VEHICLES)
         ):
@@ -495,14 +510,20 @@ def _anchor_paths(table: dict[str, Any], folder: Path) -> None:
         if isinstance(node, dict) and isinstance(node.get(key), str) and node[key] not in ("", *built_in):
             node[key] = anchored(node[key])
 
+    def anchor_lens(node: Any) -> None:
+        if isinstance(node, dict) and isinstance(node.get("lens"), str) and Path(node["lens"]).suffix:
+            anchor(node, "lens")  # without a suffix it is the name of a packaged one
+
     anchor(table.get("body"), "shape", _SHAPES)
     anchor(table.get("spacecraft"), "model", _VEHICLES)
+    anchor_lens(table.get("camera"))
     kernels = table.get("spice")
     if isinstance(kernels, dict) and isinstance(kernels.get("kernels"), list):
         kernels["kernels"] = [anchored(k) if isinstance(k, str) and k else k for k in kernels["kernels"]]
     faults = table.get("faults")
     for fault in faults.values() if isinstance(faults, dict) else ():
         anchor(fault, "texture_file")
+        anchor_lens(fault)
 
 
 def _sentence(error: ValidationError) -> str:

@@ -47,6 +47,9 @@ def scene_identity(session: pipeline.Session) -> dict[str, Any]:
         if table.get("texture_file"):
             data = Path(table["texture_file"]).read_bytes()
             table["texture_file"] = f"sha256:{hashlib.sha256(data).hexdigest()}"
+        if table.get("lens"):
+            data = resources.find("scenes/lenses", table["lens"]).read_bytes()
+            table["lens"] = f"sha256:{hashlib.sha256(data).hexdigest()}"
     _contents_of_files(scene, session.scene)
     if "straylight" in session.faults:
         textures = sorted(resources.data_dir("textures").glob("*.png"))
@@ -56,11 +59,13 @@ def scene_identity(session: pipeline.Session) -> dict[str, Any]:
 
 
 def _contents_of_files(identity: dict[str, Any], scene: SceneConfig) -> None:
-    """Put the sha256 of what spacecraft, kernels and stars are read from in the place of paths."""
+    """Put the sha256 of what lens, spacecraft, kernels and stars are read from in the place of paths."""
 
     def digest(path: str | Path) -> str:
         return f"sha256:{hashlib.sha256(Path(path).read_bytes()).hexdigest()}"
 
+    if scene.camera.lens:
+        identity["camera"]["lens"] = digest(resources.find("scenes/lenses", scene.camera.lens))
     if scene.spacecraft.model not in ("none", "default"):
         identity["spacecraft"]["model"] = digest(scene.spacecraft.model)
     if scene.spice.kernels:
@@ -81,7 +86,7 @@ def _contents_of_files(identity: dict[str, Any], scene: SceneConfig) -> None:
 def store_spec(session: pipeline.Session, blocks: Sequence[int]) -> StoreSpec:
     """The store of a scene, planned in `blocks`. Raises InputError for layers this world cannot give."""
     scene = session.scene
-    dataset, camera = scene.dataset, scene.camera
+    dataset, camera = scene.dataset, session.base_camera  # first of all: a lens that cannot be had is told here
     layers = tuple(name for name in pipeline.stored_layers(scene, session.faults) if name != "clean")
     identity = scene_identity(session)
     attributes: dict[str, Any] = {
@@ -106,8 +111,9 @@ def store_spec(session: pipeline.Session, blocks: Sequence[int]) -> StoreSpec:
         wavelength_nm=tuple(float(w) for w in world.wavelengths_nm(scene)),
         layers=layers,
         site_names=tuple(f"site_{k:05d}" for k in range(dataset.sites)),
-        lens_names=("thin lens",),
-        detector_names=(session.base_camera.detector.name,),
+        lens_names=(camera.lens_name,),
+        distortion_residual_px=camera.distortion_residual_px,
+        detector_names=(camera.detector.name,),
         radiance_dtype="float32",
         shard_samples=dataset.shard_samples,
         attributes=attributes,

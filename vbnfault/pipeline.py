@@ -26,6 +26,7 @@ from .config import SceneConfig
 from .detector import Noise
 from .errors import InputError
 from .faults import Fault, FaultContext, Params, dataset_order, from_dict, physical_order
+from .lens import RealLens
 from .quantities import BODY, RGBI, SKY, Electrons, Radiance, Sample, Truth
 from .scene import Scene, Sunlight, View
 from .spacecraft import SpacecraftMesh
@@ -104,6 +105,9 @@ class Frame:
     camera: Camera = field(init=False)
     sunlight: Sunlight = field(init=False)
     radiance: Radiance = field(init=False)
+    # what was rendered and where it shows open sky, guard band included, where the picture has another grid
+    rendered: Radiance | None = None
+    open_sky: NDArray[np.bool_] | None = None
     truth: Truth = field(init=False)
     context: FaultContext = field(init=False)
     rate: Electrons = field(init=False)
@@ -243,12 +247,13 @@ def describe(frame: Frame) -> Scene:
     """The sample as the renderer takes it."""
     spec, camera = frame.spec, frame.camera
     scene = spec.scene
+    guard_x, guard_y = camera.guard_px
     view = View(
         position_L_m=frame.pose.position_L_m,
         L_from_C=frame.pose.L_from_C,
-        intrinsics=camera.intrinsics,
-        width_px=camera.width_px,
-        height_px=camera.height_px,
+        intrinsics=camera.intrinsics + np.array([0, 0, guard_x, guard_y]),
+        width_px=camera.width_px + 2 * guard_x,
+        height_px=camera.height_px + 2 * guard_y,
         aperture_radius_m=camera.lens.aperture_radius_m,
         focus_distance_m=camera.lens.focus_distance_m,
     )
@@ -266,7 +271,12 @@ def describe(frame: Frame) -> Scene:
 
 
 def render_frame(frame: Frame) -> None:
-    """Radiance of every band, and truth."""
+    """Radiance of every band, and truth.
+
+    The renderer knows pinhole cameras only. Behind a prescription `rendered` is what it gives, guard band included;
+    `radiance` is the same on the picture's own grid, distorted, before any of it is lost or blurred, and truth is
+    that of the rendered pixel nearest to what a pixel's centre sees, less than a pixel away.
+    """
     from . import render
 
     spec, i = frame.spec, frame.spec.index
@@ -280,14 +290,38 @@ def render_frame(frame: Frame) -> None:
     scene = describe(frame)
     surface = spec.terrain.surface
     angles = bool(_ANGLE_LAYERS & set(spec.scene.dataset.layers))
-    frame.truth = render.truth(surface, scene.view, scene.sun, angles=angles)
+    guide = render.truth(surface, scene.view, scene.sun, angles=angles)
+    lens = frame.camera.lens
+    frame.truth = guide
+    if isinstance(lens, RealLens):
+        frame.truth, frame.open_sky = _at_pixels(guide, lens.nearest_pixels), guide.semantic == SKY
     if spec.scene.render.noise_fraction is None:
-        frame.radiance = render.radiance(surface, scene, frame.truth)
+        _keep(frame, render.radiance(surface, scene, guide))
     else:
-        _render_to_the_noise(frame, scene, spec.scene.render.noise_fraction)
+        _render_to_the_noise(frame, scene, guide, spec.scene.render.noise_fraction)
 
 
-def _render_to_the_noise(frame: Frame, scene: Scene, fraction: float) -> None:
+def _keep(frame: Frame, radiance: Radiance) -> None:
+    """Radiance as rendered, on whose grid the lens acts, and as the picture has it."""
+    lens = frame.camera.lens
+    if isinstance(lens, RealLens):
+        frame.rendered, radiance = radiance, lens.on_frame(radiance)
+    frame.radiance = radiance
+
+
+def _imaged(frame: Frame) -> Radiance:
+    """What the lens takes."""
+    return frame.radiance if frame.rendered is None else frame.rendered
+
+
+def _at_pixels(truth: Truth, pixels: NDArray[np.int32]) -> Truth:
+    """The truth of pixels by their number, on the grid of those numbers."""
+    layers = {name: getattr(truth, name) for name in truth.__dataclass_fields__}
+    flat = {name: a.reshape(-1, *a.shape[2:]) for name, a in layers.items() if a is not None}
+    return replace(truth, **{name: a[pixels] for name, a in flat.items()})
+
+
+def _render_to_the_noise(frame: Frame, scene: Scene, guide: Truth, fraction: float) -> None:
     """Render with more samples where chance would show: up to `fraction` of the sensor's own noise.
 
     The error of a pixel is judged by two halves of its samples, over 3×3 pixels; those that err too much are
@@ -300,11 +334,11 @@ def _render_to_the_noise(frame: Frame, scene: Scene, fraction: float) -> None:
     lens_and_sensor = _green_per_second(frame)
     found, halves = render.direct(surface, scene, lens_and_sensor)
     array = found.array.copy()
-    once_more = render.indirect(surface, scene, frame.truth) if scene.bounces else np.zeros_like(array)
-    frame.radiance = found.with_array(array + once_more)
-    exposure = _exposure_s(frame, _rate(frame, frame.radiance))
+    once_more = render.indirect(surface, scene, guide) if scene.bounces else np.zeros_like(array)
+    whole = found.with_array(array + once_more)
+    exposure = _exposure_s(frame, _rate(frame, whole))
     error_e = np.abs(halves) * exposure
-    signal_e = np.einsum("b,byx->yx", lens_and_sensor * exposure, frame.radiance.array)
+    signal_e = np.einsum("b,byx->yx", lens_and_sensor * exposure, whole.array)
     detector = frame.camera.detector
     sensor_e2 = signal_e + detector.dark_current_e_s * exposure + detector.read_noise_e_rms**2
     # neither what is hardly lit nor what saturates shows this noise; the latter is lit all the same
@@ -329,7 +363,7 @@ def _render_to_the_noise(frame: Frame, scene: Scene, fraction: float) -> None:
             array.reshape(len(array), -1)[:, chosen] = more.array[:, 0]
             error_e.ravel()[chosen] = np.abs(halves[0]) * exposure
         spent[noisy] *= 4
-    frame.radiance = found.with_array(array + once_more)
+    _keep(frame, found.with_array(array + once_more))
     frame.samples_per_pixel = float(spent.mean())
     frame.noise_fraction_p99 = float(np.percentile(share[lit], 99)) if lit.any() else 0.0
 
@@ -338,7 +372,7 @@ def _green_per_second(frame: Frame) -> F64:
     """Electrons per second of the green pixels for a unit of radiance in each band, float64[band]."""
     nodes = world.wavelengths_nm(frame.spec.scene)
     unit = Radiance(array=np.eye(len(nodes), dtype=np.float32)[:, :, None], wavelength_nm=nodes)
-    return np.asarray(_rate(frame, unit).array[:, 0, 1], dtype=np.float64)
+    return np.asarray(_rate_on_axis(frame, unit).array[:, 0, 1], dtype=np.float64)
 
 
 # --- meter -------------------------------------------------------------------------------------------------
@@ -346,7 +380,7 @@ def _green_per_second(frame: Frame) -> F64:
 
 def meter(frame: Frame) -> None:
     """Exposure: fixed, or metered once on the noise-free, fault-free frame; all twins share it."""
-    frame.rate = _rate(frame, frame.radiance)
+    frame.rate = _rate(frame, _imaged(frame))
     frame.camera = replace(frame.camera, exposure_s=_exposure_s(frame, frame.rate))
     _add_stars(frame)
     direction_C = frame.pose.L_from_C.T @ frame.pose.sun_L
@@ -355,6 +389,8 @@ def meter(frame: Frame) -> None:
         sun_xy_px=frame.camera.project(direction_C),
         sun_direction_C=direction_C,
         sun_irradiance_W_m2_nm=frame.sunlight.irradiance_W_m2_nm,
+        wavelength_nm=frame.radiance.wavelength_nm,
+        sun_angular_radius_rad=frame.sunlight.angular_radius_rad,
         sun_visible_fraction=frame.pose.sun_visible_fraction,
     )
 
@@ -372,9 +408,13 @@ def _add_stars(frame: Frame) -> None:
     T_from_L = frame.spec.terrain.site.T_from_L
     T_from_J = world.target_attitude(scene, T_from_L @ frame.pose.sun_L)
     J_from_C = T_from_J.T @ T_from_L @ frame.pose.L_from_C
-    starry = world.with_stars(scene, frame.radiance, frame.camera, J_from_C, truth.semantic == SKY)
-    if starry is not frame.radiance:
-        frame.radiance = starry
+    before = _imaged(frame)
+    if frame.open_sky is None:
+        starry = world.with_stars(scene, before, frame.camera, J_from_C, truth.semantic == SKY)
+    else:
+        starry = world.with_stars(scene, before, frame.camera, J_from_C, frame.open_sky, describe(frame).view)
+    if starry is not before:
+        _keep(frame, starry)
         frame.rate = _rate(frame, starry)
 
 
@@ -384,7 +424,8 @@ def _metered_exposure_s(frame: Frame, rate: Electrons) -> float:
     half = np.sqrt(0.5)
     lit = photometry.radiance_factor(world.photometric_model(scene), [0, half, half], [half, 0, half])[:, 0] / np.pi
     facet = (lit * frame.sunlight.irradiance_W_m2_nm).astype(np.float32).reshape(-1, 1, 1)
-    per_second = _rate(frame, frame.radiance.with_array(facet))
+    wavelength = world.wavelengths_nm(scene)
+    per_second = _rate_on_axis(frame, Radiance(array=facet, wavelength_nm=wavelength))
     facet_brightness = float(_brightness(per_second.array, per_second.white_e).max())
     reference = settings.metering_level / max(facet_brightness, 1e-30)
     # every other pixel each way is sample enough for a percentile
@@ -409,6 +450,13 @@ def _rate(frame: Frame, radiance: Radiance) -> Electrons:
     """Expected electrons after one second."""
     camera = frame.camera
     return camera.detector.electrons_expected(camera.lens.image(radiance), 1.0)
+
+
+def _rate_on_axis(frame: Frame, radiance: Radiance) -> Electrons:
+    """Expected electrons after one second of radiance of any shape, as if all of it were seen along the axis."""
+    lens = frame.camera.lens
+    irradiance = lens.on_axis(radiance) if isinstance(lens, RealLens) else lens.image(radiance)
+    return frame.camera.detector.electrons_expected(irradiance, 1.0)
 
 
 # --- photograph --------------------------------------------------------------------------------------------
@@ -503,7 +551,7 @@ def _signal(frame: Frame, drawn: Mapping[str, Params], names: Sequence[str]) -> 
             if camera == frame.camera:
                 signal = frame.rate.with_array(frame.rate.array * np.float32(camera.exposure_s))
             else:
-                signal = camera.detector.electrons_expected(camera.lens.image(frame.radiance), camera.exposure_s)
+                signal = camera.detector.electrons_expected(camera.lens.image(_imaged(frame)), camera.exposure_s)
             cached[key] = signal
     return cached[key]
 
@@ -680,6 +728,7 @@ def to_sample(frame: Frame) -> Sample:
         "sun_distance_au": world.sun_distance_au(spec.scene),
         "julian_date": spec.scene.sun.julian_date,
         "intrinsics": frame.camera.intrinsics,
+        "distortion": frame.camera.distortion,
         "sun_azimuth_deg": pose.sun_azimuth_deg,
         "sun_elevation_deg": pose.sun_elevation_deg,
         "roll_deg": angles[0],
@@ -705,12 +754,17 @@ def to_sample(frame: Frame) -> Sample:
 
 
 def _points_T_m(frame: Frame) -> F64:
-    """Surface points of the pixel centres in T, float64[y, x, 3] metres, NaN on the sky."""
+    """Surface points that truth belongs to, of the pixel centres, in T, float64[y, x, 3] metres, NaN on the sky."""
     fx, fy, cx, cy = frame.camera.intrinsics
     height, width = frame.context.shape
-    x, y = (np.arange(width) + 0.5 - cx) / fx, (np.arange(height) + 0.5 - cy) / fy
+    rows, columns = np.ogrid[:height, :width]
+    lens, (guard_x, guard_y) = frame.camera.lens, frame.camera.guard_px
+    if isinstance(lens, RealLens):
+        rows, columns = np.divmod(lens.nearest_pixels, width + 2 * guard_x)
+        rows, columns = rows - guard_y, columns - guard_x
+    x, y = (columns + 0.5 - cx) / fx, (rows + 0.5 - cy) / fy
     depth = np.where(np.isfinite(frame.truth.depth_m), frame.truth.depth_m.astype(np.float64), np.nan)
-    seen_C = np.stack([x[None, :] * depth, y[:, None] * depth, depth], axis=-1)
+    seen_C = np.stack([x * depth, y * depth, depth], axis=-1)
     site, pose = frame.spec.terrain.site, frame.pose
     T_from_C = site.T_from_L @ pose.L_from_C
     camera_T_m = site.position_T_m + site.T_from_L @ pose.position_L_m

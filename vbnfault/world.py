@@ -13,13 +13,13 @@ from . import camera as cameras
 from . import frames, photometry, sky, spectra, spice
 from .body import Body, Site, load_body, site_at
 from .camera import Camera
-from .config import BodyTable, OrbitTable, PoseTable, SceneConfig, SpiceTable, SunTable
+from .config import BodyTable, CameraTable, OrbitTable, PoseTable, SceneConfig, SpiceTable, SunTable
 from .detector import Detector
 from .errors import InputError
-from .lens import ThinLens
+from .lens import RealLens, ThinLens, coating, load_lens, scaled_to_focal_length
 from .photometry import Photometry
 from .quantities import Radiance
-from .scene import Sunlight
+from .scene import Sunlight, View
 from .spacecraft import Placement, Pose, Spacecraft, SpacecraftMesh, default_spacecraft, load_spacecraft
 
 if TYPE_CHECKING:
@@ -29,6 +29,9 @@ F64 = NDArray[np.float64]
 
 # Stars whose brightest pixel collects less than this share of the read noise are left out by `stars = "auto"`.
 _STAR_OVER_READ_NOISE = 0.1
+
+# Narrower, a star's light would depend on its place among the pixels that a lens resamples: 1 % at this deviation.
+_STAR_SIGMA_PX = 0.6
 
 
 # --- Sun and ephemeris --------------------------------------------------------------------------------------
@@ -210,12 +213,7 @@ def base_camera(scene: SceneConfig, *, architecture: int = 0, readout_direction:
     """The scene's camera without exposure; the integers index its lists of options."""
     c = scene.camera
     return Camera(
-        lens=ThinLens(
-            focal_length_mm=cameras.focal_length_mm(c.fov_deg, c.width_px, c.pixel_pitch_um),
-            f_number=c.f_number,
-            transmission=c.transmission,
-            focus_distance_m=float("inf") if c.focus_distance_m is None else c.focus_distance_m,
-        ),
+        lens=real_lens(c) if c.lens else _thin_lens(c),
         detector=Detector(
             width_px=c.width_px,
             height_px=c.height_px,
@@ -230,6 +228,38 @@ def base_camera(scene: SceneConfig, *, architecture: int = 0, readout_direction:
         ),
         architecture=c.architectures[architecture],
         readout_direction=c.readout_directions[readout_direction],
+    )
+
+
+def _thin_lens(c: CameraTable) -> ThinLens:
+    return ThinLens(
+        focal_length_mm=cameras.focal_length_mm(c.fov_deg, c.width_px, c.pixel_pitch_um),
+        f_number=c.f_number,
+        transmission=c.transmission,
+        focus_distance_m=float("inf") if c.focus_distance_m is None else c.focus_distance_m,
+    )
+
+
+@lru_cache(maxsize=4)
+def real_lens(c: CameraTable) -> RealLens:
+    """The prescription that a camera names, scaled to its field of view. Raises InputError."""
+    try:
+        prescription = load_lens(c.lens)
+    except InputError as error:
+        raise InputError(f"camera.lens: {error}") from None
+    if c.lens_coating:
+        if c.lens_coating not in coating.NAMES:
+            known = ", ".join(coating.NAMES)
+            raise InputError(f"camera.lens_coating = {c.lens_coating!r}: must be one of {known}")
+        prescription = prescription.coated(c.lens_coating)
+    thin = _thin_lens(c)
+    return RealLens(
+        prescription=scaled_to_focal_length(prescription, thin.focal_length_mm),
+        width_px=c.width_px,
+        height_px=c.height_px,
+        pixel_pitch_um=c.pixel_pitch_um,
+        focus=c.focus,
+        focus_distance_m=thin.focus_distance_m,
     )
 
 
@@ -286,18 +316,27 @@ def render_vehicle(scene: SceneConfig, mesh: SpacecraftMesh) -> Vehicle:
 
 
 def with_stars(
-    scene: SceneConfig, radiance: Radiance, camera: Camera, J_from_C: F64, open_sky: NDArray[np.bool_]
+    scene: SceneConfig,
+    radiance: Radiance,
+    camera: Camera,
+    J_from_C: F64,
+    open_sky: NDArray[np.bool_],
+    view: View | None = None,
 ) -> Radiance:
     """The radiance with the stars that the scene asks for and the exposure can show.
 
-    `camera` has its exposure; `open_sky` bool[y, x]: pixels that see neither a body nor the Sun.
+    `camera` has its exposure; `open_sky` bool[y, x]: pixels that see neither a body nor the Sun; `view`: the grid
+    of the radiance where it is not the camera's frame. A prescription blurs the stars itself: they then come to it
+    as small as a grid can hold them in place.
     """
     table = scene.sky
     if table.stars == "off" or not open_sky.any():
         return radiance
+    lens = camera.lens
+    real = isinstance(lens, RealLens)
+    sigma_px = min(table.sigma_px, _STAR_SIGMA_PX) if real else table.sigma_px
     faintest = table.limiting_magnitude
     if table.stars == "auto":
-        lens = camera.lens
         faintest = min(
             faintest,
             sky.limiting_magnitude(
@@ -306,7 +345,7 @@ def with_stars(
                 irradiance_per_radiance=np.pi * lens.transmission / (4 * lens.f_number**2),
                 focal_length_px=camera.focal_length_px,
                 exposure_s=camera.exposure_s,
-                sigma_px=table.sigma_px,
+                sigma_px=sigma_px,
                 threshold_e=_STAR_OVER_READ_NOISE * max(camera.detector.read_noise_e_rms, 1.0),
             ),
         )
@@ -315,12 +354,13 @@ def with_stars(
     stars = sky.star_radiance(
         sky.load_catalogue().brighter_than(faintest),
         J_from_C=J_from_C,
-        intrinsics=camera.intrinsics,
-        width_px=camera.width_px,
-        height_px=camera.height_px,
+        intrinsics=camera.intrinsics if view is None else view.intrinsics,
+        width_px=camera.width_px if view is None else view.width_px,
+        height_px=camera.height_px if view is None else view.height_px,
         wavelength_nm=radiance.wavelength_nm,
-        sigma_px=table.sigma_px,
+        sigma_px=sigma_px,
         julian_date=scene.sun.julian_date,
         sky=open_sky,
+        lens_falloff=real,
     )
     return stars.added_to(radiance)

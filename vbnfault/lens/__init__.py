@@ -1,12 +1,14 @@
 """The optics: from scene radiance to irradiance on the sensor plane."""
 
 from .first_order import FirstOrder, first_order, scaled_to_field, scaled_to_focal_length
+from .imaging import RealLens
 from .prescription import Prescription, Surface, load_lens, parse_lens
 from .thin import ThinLens
 
 __all__ = [
     "FirstOrder",
     "Prescription",
+    "RealLens",
     "Surface",
     "ThinLens",
     "first_order",

@@ -90,6 +90,9 @@ SCALARS: dict[str, Array] = {
     "sun_distance_au": Array("sample", "float64", "au", "distance to the Sun"),
     "julian_date": Array("sample", "float64", "d", "Julian date (TDB)"),
     "intrinsics": Array("sample intrinsic", "float64", "px", "pinhole camera, pixel centres at +0.5"),
+    "distortion": Array(
+        "sample coefficient", "float64", "1", "of the lens at 587.6 nm, as OpenCV takes it, for the intrinsics"
+    ),
     "sun_azimuth_deg": Array("sample", "float64", "deg", "Sun azimuth in L, from north towards east"),
     "sun_elevation_deg": Array("sample", "float64", "deg", "Sun elevation in L, up"),
     "roll_deg": Array("sample", "float64", "deg", "tilt of the boresight from the Sun about x"),
@@ -123,6 +126,7 @@ _LABELS = {  # coordinates of the short axes
     "xy": ("x", "y"),
     "quaternion": ("w", "x", "y", "z"),
     "intrinsic": ("fx", "fy", "cx", "cy"),
+    "coefficient": ("k1", "k2", "p1", "p2", "k3"),
 }
 
 
@@ -158,7 +162,8 @@ class StoreSpec:
     `layers`: the optional layers, of `LAYERS` or `without_<fault>`. `shard_samples` 0 chooses the most, up to
     16, that keeps the largest array of a shard within 1 GiB and all of them within 2 GiB; a larger one is
     lowered to its largest divisor that does. `attributes`: JSON-able root attributes. Raises InputError for
-    names that do not exist.
+    names that do not exist. `distortion_residual_px`: root mean square and largest deviation of the coefficients
+    of distortion from the lens's own map, over the frame.
     """
 
     height: int
@@ -170,6 +175,7 @@ class StoreSpec:
     localised_faults: tuple[str, ...] | None = None
     site_names: tuple[str, ...] = ()
     lens_names: tuple[str, ...] = ()
+    distortion_residual_px: tuple[float, float] = (0.0, 0.0)
     detector_names: tuple[str, ...] = ()
     radiance_dtype: str = "float16"
     shard_samples: int = 0
@@ -241,6 +247,10 @@ class StoreSpec:
             "mask_any": {"faults": list(self.mask_any_faults)},
             "site": {"names": list(self.site_names)},
             "lens": {"names": list(self.lens_names)},
+            "distortion": {
+                "residual_px_rms": self.distortion_residual_px[0],
+                "residual_px_max": self.distortion_residual_px[1],
+            },
             "detector_individual": {"names": list(self.detector_names)},
             "split": {"names": list(SPLITS)},
             "radiance": {"coordinates": "wavelength_nm"},

@@ -1,0 +1,613 @@
+"""Image formation by a prescription: distortion, light, colour and point spread against rays of the tests' own,
+closed forms and OpenCV; labels and light on the same pixels, through the whole pipeline."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from conftest import small_scene
+from numpy.typing import NDArray
+from scipy.signal import convolve2d
+from scipy.special import ndtr
+
+from vbnfault import config, dataset, pipeline, sky, world
+from vbnfault.camera import Camera
+from vbnfault.detector import Detector
+from vbnfault.errors import InputError
+from vbnfault.lens import (
+    RealLens,
+    ThinLens,
+    first_order,
+    imaging,
+    load_lens,
+    parse_lens,
+    scaled_to_field,
+)
+from vbnfault.lens.coating import design, mean_reflectance
+from vbnfault.lens.glass import C_NM, D_NM, F_NM
+from vbnfault.lens.trace import real_pupil_diameter_mm, trace
+from vbnfault.quantities import BODY, SUN, Radiance
+from vbnfault.scene import View
+
+F64 = NDArray[np.float64]
+
+# Lens → field angles, degrees, at which it has chief rays that are its own and not those of a lens beyond its field
+LENSES = {
+    "nikkor_35_f2p8": (5.0, 15.0, 25.0, 35.0, 40.0),
+    "nikkor_28_f2p8": (5.0, 15.0, 25.0, 35.0, 40.0),
+    "distagon_25_f2p8": (5.0, 15.0, 25.0, 35.0, 40.0),
+    "tessar_50_f2p8": (5.0, 12.0, 20.0, 25.0),
+    "heliar_100_f3p5": (5.0, 12.0, 20.0, 28.0),
+    "biotar_100_f1p4": (5.0, 12.0, 20.0, 25.0),
+}
+PITCH_UM, SIDE_PX = 5.5, 1024
+
+
+@cache
+def real(name: str, **changes: Any) -> RealLens:
+    """A packaged lens scaled to 65° over 1024 pixels of 5.5 µm."""
+    prescription = scaled_to_field(load_lens(name), 65.0, SIDE_PX * PITCH_UM * 1e-3)
+    given = {"prescription": prescription, "width_px": SIDE_PX, "height_px": SIDE_PX, "pixel_pitch_um": PITCH_UM}
+    return RealLens(**(given | changes))
+
+
+def camera(lens: RealLens | ThinLens, width_px: int = SIDE_PX, height_px: int = SIDE_PX) -> Camera:
+    pitch = lens.pixel_pitch_um if isinstance(lens, RealLens) else PITCH_UM
+    return Camera(lens=lens, detector=Detector(width_px=width_px, height_px=height_px, pixel_pitch_um=pitch))
+
+
+def rays(lens: RealLens, slope: Any, x: Any, y: Any, wavelength_nm: float) -> Any:
+    """Rays through (x, y) of the plane of the first vertex, with a slope along x."""
+    slope, x, y = (v.ravel() for v in np.broadcast_arrays(slope, x, y))
+    nothing = np.zeros(len(x))
+    return trace(
+        lens.prescription,
+        np.column_stack([x, y, nothing]),
+        np.column_stack([slope, nothing, nothing + 1]),
+        wavelength_nm=wavelength_nm,
+        sensor_mm=lens.sensor_mm,
+    )
+
+
+def chief_px(lens: RealLens, slope: F64, wavelength_nm: float) -> F64:
+    """Distances of images from the axis, by bisection for the ray through the middle of the stop."""
+    first, row = lens.prescription.surfaces[0], 1 + lens.prescription.stop
+    middle, step = -slope * first_order(lens.prescription).entrance_pupil_mm, 0.02 * first.semi_diameter_mm
+
+    def off(x: F64) -> F64:
+        return np.asarray(rays(lens, slope, x, np.zeros(1), wavelength_nm).points_mm[row, :, 0])
+
+    low, high = middle - step, middle + step
+    while (off(low) > 0).any() or (
+        off(high) < 0
+    ).any():  # the stop is met farther out, the farther out the entrance
+        low, high = np.where(off(low) > 0, low - step, low), np.where(off(high) < 0, high + step, high)
+    assert np.isfinite(off(low) + off(high)).all()
+    for _ in range(45):
+        half = (low + high) / 2
+        low, high = np.where(off(half) < 0, half, low), np.where(off(half) < 0, high, half)
+    found = rays(lens, slope, half, np.zeros(1), wavelength_nm)
+    return np.asarray(found.points_mm[-1, :, 0] * 1e3 / lens.pixel_pitch_um)
+
+
+def beam(lens: RealLens, slope: F64) -> tuple[F64, float]:
+    """A square of the plane of the first vertex about what passes: its middles along x, its half width, mm."""
+    semi = lens.prescription.surfaces[0].semi_diameter_mm
+    fan = np.linspace(-1.5 * semi, 1.5 * semi, 301)
+    passing = rays(lens, slope[:, None], fan, np.zeros(1), D_NM).arrives.reshape(len(slope), -1)
+    low, high = np.argmax(passing, axis=1), len(fan) - 1 - np.argmax(passing[:, ::-1], axis=1)
+    half = 0.55 * max(float(np.ptp(fan[[low, high]], axis=0).max()), real_pupil_diameter_mm(lens.prescription))
+    return (fan[low] + fan[high]) / 2, 1.1 * half
+
+
+def bundle(lens: RealLens, slope: float, wavelength_nm: float, side: int = 121) -> tuple[F64, float]:
+    """Where the rays of a bundle arrive, float64[ray, 2] pixels from the axis, and the area they came through, mm²:
+    those of a square grid that pass."""
+    (middle,), half = beam(lens, np.array([slope]))
+    grid = (np.arange(side) + 0.5) / side * 2 - 1
+    x, y = np.meshgrid(middle + half * grid, half * grid)
+    found = rays(lens, slope, x, y, wavelength_nm)
+    at = found.points_mm[-1, found.arrives, :2] * 1e3 / lens.pixel_pitch_um
+    return at, float(found.arrives.sum() * (2 * half / side) ** 2)
+
+
+# --- distortion and colour -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", LENSES)
+def test_distortion_is_that_of_chief_rays(name: str) -> None:
+    lens = real(name)
+    assert lens.focal_length_px == pytest.approx(SIDE_PX / 2 / math.tan(math.radians(32.5)), rel=1e-9)
+    slope = np.tan(np.radians(LENSES[name]))
+    for wavelength in (D_NM, 440.0):
+        expected = chief_px(lens, slope, wavelength)
+        # the table interpolates linearly between 4097 slopes: (1.5 / 4096)² / 8 of some 800 px is 1e-5
+        found = lens.distorted(slope, wavelength) * lens.focal_length_px
+        np.testing.assert_allclose(found, expected, atol=2e-3)
+        np.testing.assert_allclose(lens.undistorted(found / lens.focal_length_px, wavelength), slope, rtol=1e-6)
+    assert abs(expected / (slope * lens.focal_length_px) - 1).max() > 1e-3  # there is some
+
+
+def test_lateral_colour_is_that_of_chief_rays() -> None:
+    lens = real("nikkor_28_f2p8")
+    slope = np.tan(np.radians([20.0, 41.0]))
+    blue, red = (lens.distorted(slope, wavelength) * lens.focal_length_px for wavelength in (F_NM, C_NM))
+    expected = chief_px(lens, slope, F_NM) - chief_px(lens, slope, C_NM)
+    np.testing.assert_allclose(blue - red, expected, atol=2e-3)
+    assert expected[0] < -0.1 < 0.1 < expected[1]  # it changes its sign on the way out
+
+
+@pytest.mark.parametrize("name", ["distagon_25_f2p8", "nikkor_28_f2p8", "heliar_100_f3p5"])
+def test_opencv_reproduces_the_map_within_the_stored_residual(name: str) -> None:
+    c = camera(real(name))
+    fx, fy, cx, cy = c.intrinsics
+    rng = np.random.default_rng(3)
+    pixels = rng.uniform(0, SIDE_PX, (600, 2))
+    offset = (pixels - [cx, cy]) / [fx, fy]
+    distance = np.hypot(*offset.T)
+    lens = c.lens
+    assert isinstance(lens, RealLens)
+    keep = lens.relative_illumination(distance) > 0
+    slope = offset * (lens.undistorted(distance) / distance)[:, None]
+    directions = np.column_stack([slope, np.ones(len(slope))])[keep]
+    matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+    seen, _ = cv2.projectPoints(directions, np.zeros(3), np.zeros(3), matrix, c.distortion)
+    exact = np.array([c.project(direction) for direction in directions])
+    np.testing.assert_allclose(exact, pixels[keep], atol=1e-4)
+    off = np.hypot(*(seen[:, 0] - exact).T)
+    rms, most = c.distortion_residual_px
+    assert off.max() <= most + 1e-3
+    # 600 pixels at random against a grid of all: the sum is ruled by the few per cent near the corners
+    assert np.sqrt(np.mean(off**2)) == pytest.approx(rms, rel=0.3)
+    assert rms < 0.3
+
+
+def test_a_lens_that_sees_more_than_the_render_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(imaging, "_BEYOND", 0.8)
+    with pytest.raises(InputError, match=r"AF Nikkor.*fov_deg.*36 degrees"):
+        _ = real("nikkor_28_f2p8", focus_distance_m=10.0).guard_px  # another lens to the caches
+
+
+def test_directions_far_outside_have_a_place_too() -> None:
+    for name in ("nikkor_28_f2p8", "biotar_100_f1p4"):
+        c = camera(real(name))
+        angles = np.radians(np.arange(1.0, 89.5, 0.5))
+        x = [c.project(np.array([np.sin(a), 0.0, np.cos(a)]))[0] for a in angles]  # type: ignore[index]
+        assert (np.diff(x) > 0).all()
+        assert np.isfinite(x).all()
+    assert camera(real("nikkor_28_f2p8")).project(np.array([0.0, 0.0, 1.0])).tolist() == [512.0, 512.0]  # type: ignore[union-attr]
+    assert camera(real("nikkor_28_f2p8")).project(np.array([0.0, 0.0, -1.0])) is None
+
+
+# --- light -----------------------------------------------------------------------------------------------------
+
+
+def thin_one(**changes: Any) -> RealLens:
+    """A lens of next to no thickness behind its stop: no distortion, and the pupil is the stop."""
+    back = {"radius_mm": -100.0, "diameter_mm": 2.4}
+    rows = [
+        {"stop": True, "diameter_mm": 0.5, "thickness_mm": 0.0},
+        {"radius_mm": 100.0, "thickness_mm": 0.02, "nd": 1.5, "diameter_mm": 2.4} | changes,
+        back | {key: changes[key] for key in ("coating",) if key in changes},
+    ]
+    lens = parse_lens({"surface": rows}, source="thin")
+    return RealLens(prescription=lens, width_px=200, height_px=160, pixel_pitch_um=800.0)
+
+
+def test_a_thin_lens_of_small_aperture_follows_cos4() -> None:
+    lens = thin_one()
+    slope = np.linspace(0.01, 0.85, 25)
+    # the thickness, 2e-4 of the focal length, is what is left of distortion; the rim's table holds 1e-5
+    np.testing.assert_allclose(lens.distorted(slope), slope, rtol=2e-4)
+    np.testing.assert_allclose(lens.relative_illumination(lens.distorted(slope)), (1 + slope**2) ** -2, rtol=1e-3)
+    assert lens.f_number == pytest.approx(first_order(lens.prescription).efl_mm / 0.5, rel=1e-4)
+    np.testing.assert_allclose(lens.distortion, 0, atol=1e-3)
+
+
+@pytest.mark.parametrize(("name", "distance_px"), [("nikkor_28_f2p8", 620.0), ("tessar_50_f2p8", 300.0)])
+def test_light_that_lands_on_a_ring_of_the_sensor(name: str, distance_px: float) -> None:
+    """Rays of a uniform field, counted where they arrive: both vignettings and distortion at once."""
+    lens = real(name)
+
+    def per_area(near: float, far: float) -> float:
+        """Σ cos θ dΩ dA of the rays that land on a ring, over its area; one azimuth stands for all."""
+        edges = lens.undistorted(np.linspace(max(near - 12, 0), far + 12, 65) / lens.focal_length_px)
+        slope, step = (edges[1:] + edges[:-1]) / 2, np.diff(edges)
+        middle, half = beam(lens, slope)
+        grid = (np.arange(51) + 0.5) / 51 * 2 - 1
+        x, y = (v.ravel() for v in np.meshgrid(grid, grid))
+        found = rays(lens, slope[:, None], middle[:, None] + half * x, half * y, D_NM)
+        at = np.hypot(*found.points_mm[-1, :, :2].T) * 1e3 / PITCH_UM
+        there = (found.arrives & (at >= near) & (at < far)).reshape(len(slope), -1).sum(axis=1)
+        # cos θ sin θ dθ = t dt / (1 + t²)²
+        return float(there @ (slope * step / (1 + slope**2) ** 2) * half**2 / (far**2 - near**2))
+
+    # 40 steps across each ring, a thousand points of the grid in each beam: 0.5 % each; coma's shift from the chief
+    # ray, which is left out, changes over the field and moves light by 0.6 % of it
+    expected = per_area(distance_px - 12, distance_px + 12) / per_area(0.0, 24.0)
+    found = lens.relative_illumination(np.array([distance_px, 12.0]) / lens.focal_length_px)
+    assert found[0] / found[1] == pytest.approx(expected, rel=0.015)
+    assert found[0] < 0.9 * math.cos(math.atan(distance_px / lens.focal_length_px)) ** 4  # rims take their share
+
+
+@pytest.mark.parametrize("name", ["nikkor_35_f2p8", "biotar_100_f1p4"])
+def test_irradiance_on_the_axis(name: str) -> None:
+    """E = π T L / (4 N²) with the f-number of real rays; T by the coatings' own function."""
+    lens = real(name)
+    n = first_order(lens.prescription).efl_mm / real_pupil_diameter_mm(lens.prescription)
+    index = lens.prescription.indices(D_NM)
+    loss = [mean_reflectance((), a, b, 1.0, D_NM) for a, b in itertools.pairwise(index) if a != b]
+    share = float(np.prod(1 - np.array(loss)))
+    assert lens.transmission == pytest.approx(share, rel=1e-9)
+    patch = Radiance(array=np.full((1, 2, 3), 7.0, np.float32), wavelength_nm=np.array([D_NM]))
+    assert lens.f_number == pytest.approx(n, rel=0.01)
+    np.testing.assert_allclose(lens.on_axis(patch).array, 7 * math.pi * share / (4 * n**2), rtol=0.01)
+
+
+def test_coatings_and_glass_take_their_share() -> None:
+    wavelength = np.array([450.0, 650.0])
+    lens = thin_one(coating="mgf2", internal_transmittance_10mm=0.5, thickness_mm=2.0)
+    reflected = mean_reflectance(design("mgf2", 1.5), 1.0, 1.5, 1.0, wavelength)
+    np.testing.assert_allclose(lens.transmittance(wavelength), (1 - reflected) ** 2 * 0.5**0.2, rtol=1e-9)
+
+
+def test_a_uniform_field_shows_the_relative_illumination() -> None:
+    lens = real("nikkor_28_f2p8", width_px=96, height_px=64, pixel_pitch_um=PITCH_UM * SIDE_PX / 96)
+    gx, gy = lens.guard_px
+    nodes = np.array([450.0, D_NM, 650.0])
+    field = Radiance(array=np.full((3, 64 + 2 * gy, 96 + 2 * gx), 3.0, np.float32), wavelength_nm=nodes)
+    image = lens.image(field)
+    assert image.array.shape == (3, 64, 96)
+    assert image.array.dtype == np.float32
+    x, y = np.meshgrid(np.arange(96) + 0.5 - 48, np.arange(64) + 0.5 - 32)
+    distance = np.hypot(x, y) / lens.focal_length_px
+    on_axis = lens.axial_solid_angle_sr(nodes)
+    for band, wavelength in enumerate(nodes):
+        expected = 3 * on_axis[band] * lens.relative_illumination(distance, wavelength)
+        np.testing.assert_allclose(image.array[band], expected, rtol=5e-4)
+    assert image.array[1].min() < 0.5 * image.array[1].max()
+    np.testing.assert_allclose(lens.on_frame(field).array, 3.0, rtol=1e-6)
+    with pytest.raises(ValueError, match="guard band"):
+        lens.image(Radiance(array=np.ones((3, 64, 96), np.float32), wavelength_nm=nodes))
+
+
+def test_a_stop_with_blades_counts_by_its_area() -> None:
+    lens = real("tessar_50_f2p8")
+    rows = list(lens.prescription.surfaces)
+    rows[lens.prescription.stop] = replace(rows[lens.prescription.stop], blades=6)
+    bladed = replace(lens, prescription=replace(lens.prescription, surfaces=tuple(rows)))
+    hexagon = 6 * math.sin(math.pi / 3) * math.cos(math.pi / 3) / math.pi  # of its circle
+    stop = rows[lens.prescription.stop]
+    rows[lens.prescription.stop] = replace(
+        stop, blades=0, semi_diameter_mm=math.sqrt(hexagon) * stop.semi_diameter_mm
+    )
+    smaller = replace(lens.prescription, surfaces=tuple(rows))
+    n = first_order(smaller).efl_mm / real_pupil_diameter_mm(smaller)
+    assert bladed.f_number == pytest.approx(n, rel=1e-4)
+    assert n > 1.05 * lens.f_number
+
+
+# --- point spread ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("name", "angle_deg"), [("nikkor_28_f2p8", 38.0), ("biotar_100_f1p4", 15.0)])
+def test_point_spreads_have_the_moments_of_their_rays(name: str, angle_deg: float) -> None:
+    """Along and across the radius, against a square grid of rays; turned with the azimuth."""
+    lens = real(name)
+    slope = math.tan(math.radians(angle_deg))
+    at, _ = bundle(lens, slope, D_NM, side=201)
+    at = at - at.mean(axis=0)
+    assert np.hypot(*at.T).max() < imaging.REACH_PX  # no light is cut off
+    distance = lens.distorted(np.array([slope] * 4))
+    turns = np.radians([0.0, 90.0, 180.0, 30.0])
+    kernels = imaging.point_spreads(lens, distance, turns, D_NM)
+    place = np.arange(-imaging.REACH_PX, imaging.REACH_PX + 1)
+    x, y = np.meshgrid(place, place)
+    # diffraction: a Gaussian of 0.42 λ N each way, N by the irradiance there
+    light = float(lens.relative_illumination(distance)[0])
+    blur = (0.42 * D_NM * 1e-3 * lens.f_number / math.sqrt(light) / PITCH_UM) ** 2
+    for kernel, turn in zip(kernels, turns, strict=True):
+        along, across = x * math.cos(turn) + y * math.sin(turn), y * math.cos(turn) - x * math.sin(turn)
+        found = [float((kernel * v**2).sum()) for v in (along, across)]
+        # ten rings of rays each way, spots between the field angles of the table: 4 %
+        np.testing.assert_allclose(found, at.var(axis=0) + blur, rtol=0.04)
+        assert kernel.sum() == pytest.approx(1, abs=1e-6)
+        assert abs((kernel * x).sum()) + abs((kernel * y).sum()) < 2e-3
+    assert kernels.min() >= 0
+    np.testing.assert_allclose(kernels[1], kernels[0].T, atol=1e-5)
+    np.testing.assert_allclose(kernels[2], kernels[0][:, ::-1], atol=1e-5)
+    # coma: the tail lies on the side where the rays have it
+    assert np.sign((kernels[0] * x**3).sum()) == np.sign((at[:, 0] ** 3).mean())
+
+
+# Field angle and azimuth, degrees, of points of a frame of 65°
+POINTS = ((0.3, 10.0), (12.0, 77.0), (21.0, 190.0), (29.0, 268.0), (31.0, 2.0), (38.0, 47.0), (40.0, 134.0))
+
+
+@pytest.mark.parametrize(("sigma", "light"), [(0.6, 0.05), (1.5, 5e-3)])
+def test_points_land_where_the_camera_has_them_with_all_their_light(sigma: float, light: float) -> None:
+    """Stars on the render's grid: centroid by `project` and the chief rays' colour, flux by the rays that pass.
+
+    A narrow star's light depends on its place among the pixels, as the cubic between them does not overshoot.
+    """
+    lens = real("nikkor_28_f2p8")
+    c = camera(lens)
+    gx, gy = lens.guard_px
+    nodes = np.array([450.0, 650.0])
+    render = np.zeros((2, SIDE_PX + 2 * gy, SIDE_PX + 2 * gx), dtype=np.float32)
+    f = lens.focal_length_px
+    for angle, azimuth in POINTS:
+        slope, turn = math.tan(math.radians(angle)), math.radians(azimuth)
+        places = (f * slope * math.cos(turn) + SIDE_PX / 2 + gx, f * slope * math.sin(turn) + SIDE_PX / 2 + gy)
+        column, row = (
+            np.diff(ndtr((np.arange(n + 1) - at) / sigma))
+            for n, at in zip((render.shape[2], render.shape[1]), places, strict=True)
+        )
+        # irradiance 1 across its direction: Σ L = f² / cos³ θ
+        render += (np.outer(row, column) * f**2 * (1 + slope**2) ** 1.5).astype(np.float32)
+    image = lens.image(Radiance(array=render, wavelength_nm=nodes))
+    slopes = np.tan(np.radians([angle for angle, _ in POINTS]))
+    colours = [chief_px(lens, slopes, wavelength) - chief_px(lens, slopes, D_NM) for wavelength in nodes]
+    for k, (slope, (_, azimuth)) in enumerate(zip(slopes, POINTS, strict=True)):
+        outwards = np.array([math.cos(math.radians(azimuth)), math.sin(math.radians(azimuth))])
+        place = c.project(np.array([*(slope * outwards), 1.0]))
+        assert place is not None
+        left, top = (max(int(v) - 20, 0) for v in place)
+        _, area = bundle(lens, slope, D_NM)
+        for band, passed in enumerate(lens.transmittance(nodes)):
+            window = image.array[band, top : top + 41, left : left + 41].astype(float)
+            total = window.sum()
+            x = (window.sum(axis=0) * (np.arange(window.shape[1]) + left + 0.5)).sum() / total
+            y = (window.sum(axis=1) * (np.arange(window.shape[0]) + top + 0.5)).sum() / total
+            np.testing.assert_allclose([x, y], place + colours[band][k] * outwards, atol=0.05)
+            # the grid of rays counts the area to 0.3 %
+            flux = area * passed / math.sqrt(1 + slope**2)
+            assert total * (PITCH_UM * 1e-3) ** 2 == pytest.approx(flux, rel=light + 3e-3)
+
+
+def test_what_a_point_spread_leaves_out_moves_no_light() -> None:
+    """Coma that reaches beyond a kernel: what is kept has its centroid in the middle all the same."""
+    for name, angle_deg in (("distagon_25_f2p8", 18.0), ("nikkor_35_f2p8", 37.0)):
+        lens = real(name)
+        slope = math.tan(math.radians(angle_deg))
+        at, _ = bundle(lens, slope, D_NM)
+        assert (np.hypot(*(at - at.mean(axis=0)).T) > imaging.REACH_PX).mean() > 0.01
+        turns = np.radians([0.0, 70.0])
+        place = np.arange(-imaging.REACH_PX, imaging.REACH_PX + 1)
+        for kernel in imaging.point_spreads(lens, lens.distorted(np.full(2, slope)), turns, D_NM):
+            assert kernel.sum() == pytest.approx(1, abs=1e-6)
+            assert abs((kernel.sum(axis=0) * place).sum()) < 2e-3
+            assert abs((kernel.sum(axis=1) * place).sum()) < 2e-3
+
+
+def test_spreading_keeps_light_and_its_place() -> None:
+    lens = real("biotar_100_f1p4")
+    spreads = imaging._spreads(lens, (D_NM,))
+    light = np.zeros((SIDE_PX + 14, SIDE_PX + 14), dtype=np.float32)
+    places = [(519, 519), (515, 648), (640, 400), (651, 655), (300, 519)]
+    for row, column in places:
+        light[row, column] = 1e5
+    out = spreads.applied(light, 0)
+    assert out.min() >= 0  # no rounding of the Sun's light elsewhere, no ripples
+    for row, column in places:
+        window = out[row - 12 : row + 13, column - 12 : column + 13].astype(float)
+        assert window.sum() == pytest.approx(1e5, rel=1e-5)
+        at = np.arange(-12, 13)
+        # what the border of a kernel leaves out, 0.2 % of its light at most, is all that moves the centroid
+        assert abs((window * at).sum()) < 1e5 * 2e-3 * 8
+        assert abs((window * at[:, None]).sum()) < 1e5 * 2e-3 * 8
+    assert (out > 0).sum() < len(places) * 15**2 + 1
+
+
+def test_the_whole_convolution() -> None:
+    rng = np.random.default_rng(5)
+    light = rng.random((23, 37), dtype=np.float32)
+    for n in (3, 11, 13, 15):  # with more than 121 taps it goes in two parts
+        kernel = rng.random((n, n), dtype=np.float32)
+        np.testing.assert_allclose(imaging.spread(light, kernel), convolve2d(light, kernel), rtol=1e-5)
+
+
+def test_a_finer_grid_keeps_its_pixels_and_does_not_ripple() -> None:
+    rng = np.random.default_rng(6)
+    band = rng.random((9, 12), dtype=np.float32)
+    band[4, 5] = 1e6
+    fine = imaging.finer(band)
+    assert np.array_equal(fine[::2, ::2], band)
+    assert fine.min() >= band.min()
+    assert fine.max() <= band.max()
+    x, y = np.meshgrid(np.arange(12.0), np.arange(9.0))
+    bent = imaging.finer((x**2 + 3 * y + 1).astype(np.float32))
+    x, y = np.meshgrid(np.arange(0, 11.1, 0.5), np.arange(0, 8.1, 0.5))
+    np.testing.assert_allclose(bent[2:-2, 2:-2], (x**2 + 3 * y + 1)[2:-2, 2:-2], rtol=1e-6)  # quadratics are exact
+
+
+# --- focus -----------------------------------------------------------------------------------------------------
+
+
+def test_the_best_focus_has_the_least_spots() -> None:
+    paraxial, best = real("nikkor_28_f2p8"), real("nikkor_28_f2p8", focus="best")
+    assert paraxial.sensor_mm == pytest.approx(first_order(paraxial.prescription).bfd_mm, rel=1e-12)
+    x = np.arange(SIDE_PX) + 0.5 - SIDE_PX / 2
+    radius = np.hypot(x[None], x[:, None]) / paraxial.focal_length_px
+    angles = np.radians(np.arange(1.0, 42.0, 3.0))
+    pixels, _ = np.histogram(np.arctan(radius), np.append(angles - np.radians(1.5), angles[-1] + np.radians(1.5)))
+
+    def mean_square(shift_mm: float) -> float:
+        lens = replace(paraxial)
+        object.__setattr__(lens, "sensor_mm", paraxial.sensor_mm + shift_mm)
+        total = 0.0
+        for angle, count in zip(angles, pixels, strict=True):
+            at, area = bundle(lens, math.tan(angle), D_NM, side=41)
+            total += count * area * math.cos(angle) ** 4 * at.var(axis=0).sum()
+        return total
+
+    shift = best.sensor_mm - paraxial.sensor_mm
+    around = [mean_square(shift + offset) for offset in (-0.01, 0.0, 0.01)]
+    # the vertex of the parabola through them; field and pupil are sampled otherwise here
+    vertex = 0.01 * (around[0] - around[2]) / (2 * (around[0] - 2 * around[1] + around[2]))
+    assert abs(vertex) < 0.1 * abs(shift)
+    # the intrinsics follow the sensor, so that only distortion is left to the coefficients
+    slope = np.array([1e-3])
+    expected = chief_px(best, slope, D_NM) / slope
+    assert best.focal_length_px == pytest.approx(float(expected[0]), rel=1e-6)
+    assert best.focal_length_px < paraxial.focal_length_px
+    assert best.distortion_residual_px[1] < 1
+
+
+# --- scenes ----------------------------------------------------------------------------------------------------
+
+
+def scene(tmp: Path | None = None, **keys: Any) -> config.SceneConfig:
+    table = small_scene(camera={"width_px": 128, "height_px": 112, "pixel_pitch_um": 44.0, **keys})
+    table["dataset"] |= {"layers": ["clean", "depth_m", "semantic", "normal", "radiance", "point_T_m"]}
+    return config.parse_scene(table, source="test")
+
+
+def test_bad_lenses_are_told_in_a_sentence(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"camera.*lens_coating = 'mgf2': needs lens"):
+        scene(lens_coating="mgf2")
+    with pytest.raises(InputError, match=r"camera.*focus = 'best': needs lens"):
+        scene(focus="best")
+    with pytest.raises(InputError, match=r"camera\.lens: no_such: .*nikkor_35_f2p8"):
+        world.base_camera(scene(lens="no_such"))
+    with pytest.raises(InputError, match=r"camera\.lens_coating = 'gold': must be one of none, mgf2"):
+        world.base_camera(scene(lens="tessar_50_f2p8", lens_coating="gold"))
+
+
+def test_a_lens_beside_the_scene_file_is_found_and_told_by_its_contents(tmp_path: Path) -> None:
+    source = Path(imaging.__file__).parents[2] / "scenes/lenses/tessar_50_f2p8.toml"
+    (tmp_path / "own.toml").write_text(source.read_text())
+    (tmp_path / "scene.toml").write_text('title = "x"\n[camera]\nlens = "own.toml"\nlens_coating = "v"\n')
+    found = config.load_scene(tmp_path / "scene.toml")
+    assert found.camera.lens == str((tmp_path / "own.toml").resolve())
+    lens = world.base_camera(found).lens
+    assert isinstance(lens, RealLens)
+    assert lens.prescription.surfaces[0].coating
+    named = config.load_scene(tmp_path / "scene.toml", {"camera.lens": "tessar_50_f2p8"})
+    assert named.camera.lens == "tessar_50_f2p8"
+    identities = [dataset.scene_identity(pipeline.Session(s)) for s in (found, named)]
+    assert identities[0]["camera"] == identities[1]["camera"]
+    assert identities[0]["camera"]["lens"].startswith("sha256:")
+    assert world.base_camera(named).lens is world.base_camera(named).lens  # its tables are made once
+
+
+def test_stars_go_through_the_lens() -> None:
+    """A catalogue's stars on the sensor: where the camera has them, with the light that the beam lets pass."""
+    table = small_scene(
+        camera={"width_px": 256, "height_px": 256, "pixel_pitch_um": 22.0, "lens": "nikkor_28_f2p8"},
+        sky={"stars": "on", "limiting_magnitude": 2.5, "sigma_px": 0.9},
+        render={"bands": 3, "band_min_nm": 550.0, "band_max_nm": 620.0},
+    )
+    stars = config.parse_scene(table, source="test")
+    c, nodes, date = world.base_camera(stars), world.wavelengths_nm(stars), stars.sun.julian_date
+    lens = c.lens
+    assert isinstance(lens, RealLens)
+    gx, gy = c.guard_px
+    view = View(
+        position_L_m=np.zeros(3),
+        L_from_C=np.eye(3),
+        intrinsics=c.intrinsics + np.array([0, 0, gx, gy]),
+        width_px=256 + 2 * gx,
+        height_px=256 + 2 * gy,
+    )
+    dark = Radiance(array=np.zeros((3, view.height_px, view.width_px), np.float32), wavelength_nm=nodes)
+    seen = world.with_stars(stars, dark, c, np.eye(3), np.ones(dark.array.shape[1:], dtype=bool), view)
+    image = lens.image(seen)
+    catalogue = sky.load_catalogue().brighter_than(2.5)
+    found = [
+        (place, k)
+        for k, direction in enumerate(catalogue.direction_J(date))
+        if (place := c.project(direction)) is not None and (np.abs(place - 128) < 115).all()
+    ]
+    assert len(found) >= 4
+    checked = 0
+    for place, k in found:
+        if min(np.hypot(*(other - place)) for other, j in found if j != k) < 20:
+            continue
+        checked += 1
+        left, top = (int(v) - 8 for v in place)
+        window = image.array[1, top : top + 17, left : left + 17].astype(float)
+        at, total = np.arange(17) + 0.5, window.sum()
+        centroid = [left + (window.sum(axis=0) * at).sum() / total, top + (window.sum(axis=1) * at).sum() / total]
+        np.testing.assert_allclose(centroid, place, atol=0.06)
+        z = float(catalogue.direction_J(date)[k, 2])
+        flux = sky.star_irradiance_W_m2_nm(catalogue.magnitude_V[k], catalogue.colour_BV[k], nodes)[0, 1]
+        _, area = bundle(lens, math.sqrt(1 / z**2 - 1), D_NM)
+        passed = flux * area * z * lens.transmittance(nodes)[1]
+        assert total * 22e-3**2 == pytest.approx(passed, rel=0.06)
+    assert checked >= 3
+
+
+def test_a_thin_lens_has_neither_distortion_nor_guard_band() -> None:
+    thin = world.base_camera(scene())
+    assert isinstance(thin.lens, ThinLens)
+    assert thin.guard_px == (0, 0)
+    assert thin.lens_name == "thin lens"
+    assert not thin.distortion.any()
+
+
+def test_samples_of_a_scene_with_a_lens() -> None:
+    """Render, picture and labels of a small frame: all on the picture's grid, and on each other's pixels."""
+    session = pipeline.Session(scene(lens="nikkor_28_f2p8", lens_coating="mgf2"))
+    c = session.base_camera
+    spec = dataset.store_spec(session, [16])
+    assert spec.lens_names == ("AF Nikkor 28 mm f/2.8D",)
+    members = spec.members(16)
+    assert members["distortion"].attributes["residual_px_max"] == c.distortion_residual_px[1] > 0
+    frame = session.frame(0)
+    lens = frame.camera.lens
+    assert isinstance(lens, RealLens)
+    assert frame.rendered is not None
+    assert frame.rendered.array.shape[1:] == (112 + 2 * c.guard_px[1], 128 + 2 * c.guard_px[0])
+    sample = pipeline.to_sample(frame)
+    for name, layer in sample.layers.items():
+        assert (112, 128) in (layer.shape[:2], layer.shape[1:3], layer.shape[-2:]), name
+    np.testing.assert_array_equal(sample.scalars["distortion"], c.distortion)
+    assert sample.scalars["intrinsics"].tolist() == c.intrinsics.tolist()
+
+    # the Sun is in this frame: label and light where the camera has it
+    sun = sample.scalars["sun_xy_px"]
+    assert (sun > 5).all()
+    assert (sun < (123, 107)).all()
+    rows, columns = np.nonzero(sample.layers["semantic"] == SUN)
+    np.testing.assert_allclose([columns.mean() + 0.5, rows.mean() + 0.5], sun, atol=0.8)
+    bright = np.argmax(frame.rate.array[..., 1])
+    assert np.hypot(bright % 128 + 0.5 - sun[0], bright // 128 + 0.5 - sun[1]) < 1
+
+    # surface points through the stored pose, the intrinsics and OpenCV's model
+    body = sample.layers["semantic"] == BODY
+    assert 0.2 < body.mean() < 0.9
+    T_from_C = frame.spec.terrain.site.T_from_L @ frame.pose.L_from_C
+    in_C = (sample.layers["point_T_m"][body] - sample.scalars["camera_position_T_m"]) @ T_from_C
+    np.testing.assert_allclose(in_C[:, 2], sample.layers["depth_m"][body], rtol=1e-5)
+    fx, fy, cx, cy = sample.scalars["intrinsics"]
+    matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+    seen, _ = cv2.projectPoints(in_C, np.zeros(3), np.zeros(3), matrix, sample.scalars["distortion"])
+    rows, columns = np.nonzero(body)
+    off = np.abs(seen[:, 0] - np.column_stack([columns, rows]) - 0.5)
+    # the nearest rendered pixel is at most half a pixel away each way, times the stretch; plus the fit's residual
+    assert off.max() < 0.5 * 1.15 + c.distortion_residual_px[1]
+
+    # light ends where the body does: dark sky holds none
+    lit = frame.rate.array[..., 1] > 0
+    away = cv2.dilate((sample.layers["semantic"] > 0).astype(np.uint8), np.ones((5, 5), np.uint8)) == 0
+    assert not (lit & away).any()
+    assert (lit & body).sum() > 0.3 * body.sum()
+    # and the stored radiance, with the light the lens takes, is the picture up to its blur
+    solid = lens.axial_solid_angle_sr(frame.radiance.wavelength_nm)
+    x, y = np.arange(128) + 0.5 - 64, np.arange(112) + 0.5 - 56
+    distance = np.hypot(x[None], y[:, None]) / lens.focal_length_px
+    band = 4
+    expected = frame.radiance.array[band] * solid[band] * lens.relative_illumination(distance)
+    image = lens.image(frame.rendered).array[band]
+    inner = cv2.erode((body & lit).astype(np.uint8), np.ones((9, 9), np.uint8)) > 0
+    assert inner.sum() > 500
+    assert image[inner].sum() == pytest.approx(expected[inner].sum(), rel=5e-3)

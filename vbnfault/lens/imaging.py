@@ -1,0 +1,797 @@
+"""Image formation by a prescription, from exact rays: distortion, relative illumination, colour, point spread.
+
+A render on the grid of a pinhole camera, with a guard band around the frame, becomes irradiance on the sensor:
+
+    radiance ─ resampled, each band where it lands ─ × transmission and solid angle ─ ∗ point spread ─▶ irradiance
+
+- Chief rays, through the middle of the real stop, give the height of the image h(θ, λ).
+- The bundle that passes all rims gives the light. A field of radiance L at the angle θ sends L A cos θ dΩ through
+  the area A that the bundle takes in the plane of the first vertex, and it lands on dA = h dh dφ: with t = tan θ
+
+      E = L T A cos⁴θ · t / (h dh/dt),
+
+  natural and mechanical vignetting and the stretch of distortion in one; no cos⁴ falls on top.
+- Its rays on the sensor, weighted with the area they came through and blurred by diffraction, are the point spread.
+
+Left out: the shift of a spot's centroid from its chief ray (coma), so that light lies where the labels have it;
+reflection losses off the axis; distance of the object, since rays come from infinity. A stop with blades counts as
+a round one of the same area.
+"""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline, PchipInterpolator
+from scipy.special import ndtr
+
+from ..errors import InputError
+from ..quantities import Irradiance, Radiance
+from .coating import mean_reflectance
+from .first_order import first_order
+from .glass import D_NM
+from .prescription import Prescription
+from .trace import Path, trace
+
+F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
+
+# The point spread reaches this many pixels from its centre; light beyond is shared out within.
+REACH_PX = 7
+# A point spread with a smaller root-mean-square radius leaves a pixel's light where it is.
+_SHARP_PX = 0.3
+
+_ANGLES = 65  # field angles of the tables
+_BEYOND = 1.6  # of the frame's corner, as a tangent: how far the tables reach
+_STEEPNESS = (0.3, 3.0)  # of the map of the field beyond its last chief ray: dh/dt in focal lengths
+_HEIGHTS = 129  # of a meridional fan
+_SECANT_STEPS = 7
+_AZIMUTHS = 32  # of half a bundle
+_RADII = 33  # samples along which a bundle's rim is sought, then
+_FINE_RADII = 9  # within the interval found
+_RINGS = 10  # of a bundle's rays
+_DENSE = 4097  # nodes of the tables over slope
+_STEPS = 65536  # nodes of those over squared radius
+_COLOUR_PX = 4  # by which colours may want more of a render than the d line does
+_TILE_PX = 128
+_STRIP_PX = 64
+_FINE = 5  # cells of a pixel in which rays of a spot are counted
+_ROUNDS = 12  # in which a spot's width is brought to what it is to be
+_TRIM = 2e-3  # share of a point spread that its outermost pixels may hold without being kept
+_AIRY_SIGMA = 0.42  # of the Gaussian closest to an Airy pattern's core, in wavelengths × f-number
+_MIDWAY: F32 = np.array([[-1 / 16, 9 / 16, 9 / 16, -1 / 16]], dtype=np.float32)
+_INSIDE = (slice(REACH_PX, -REACH_PX), slice(REACH_PX, -REACH_PX))
+_DIRECT_TAPS = 121  # OpenCV filters with more by Fourier transforms, which spread the Sun's rounding errors
+
+
+# --- rays ------------------------------------------------------------------------------------------------------
+
+
+def _rays(
+    lens: Prescription, slope: F64, x: F64, y: F64, wavelength_nm: float, sensor_mm: float
+) -> tuple[Path, tuple[int, ...]]:
+    """Rays that cross the first vertex's plane at (x, y) with the slope dx/dz; and the arguments' common shape."""
+    slope, x, y = np.broadcast_arrays(slope, x, y)
+    nothing = np.zeros(x.size)
+    found = trace(
+        lens,
+        np.column_stack([x.ravel(), y.ravel(), nothing]),
+        np.column_stack([slope.ravel(), nothing, nothing + 1]),
+        wavelength_nm=wavelength_nm,
+        sensor_mm=sensor_mm,
+    )
+    return found, x.shape
+
+
+def _fan_heights_mm(lens: Prescription, slope: F64) -> F64:
+    """Heights in the first vertex's plane, float64[angle, height], of which some meet all of the first surface."""
+    first = lens.surfaces[0]
+    reach = first.semi_diameter_mm + np.abs(first.sag_mm(first.semi_diameter_mm)) * slope
+    return np.asarray(reach[:, None] * np.linspace(-1, 1, _HEIGHTS))
+
+
+def chief_heights_mm(lens: Prescription, slope: F64, *, wavelength_nm: float, sensor_mm: float) -> F64:
+    """Where chief rays meet the sensor, float64[n] mm from the axis; nan where there is none.
+
+    `slope` float64[n]: tangents of the field angles. A chief ray passes the middle of the stop; it is found in a
+    fan of exact rays and then by the secant method, and may itself be beyond a rim.
+    """
+    heights = _fan_heights_mm(lens, slope)
+    row = 1 + lens.stop
+    found, shape = _rays(lens, slope[:, None], heights, np.zeros(1), wavelength_nm, sensor_mm)
+    off = np.where(np.isfinite(found.points_mm[-1, :, 0]), found.points_mm[row, :, 0], np.nan).reshape(shape)
+    outside = found.relative_radius.reshape(shape)
+    with np.errstate(invalid="ignore"):
+        through = off[:, :-1] * off[:, 1:] <= 0
+    k = np.argmin(np.where(through, outside[:, :-1], np.inf), axis=1)
+    at = np.arange(len(slope))
+    a, b, off_a, off_b = heights[at, k], heights[at, k + 1], off[at, k], off[at, k + 1]
+    for _ in range(_SECANT_STEPS):
+        with np.errstate(invalid="ignore", divide="ignore"):
+            next_ = np.where(off_b == off_a, b, b - off_b * (b - a) / (off_b - off_a))
+        found, _ = _rays(lens, slope, next_, np.zeros(1), wavelength_nm, sensor_mm)
+        a, off_a, b, off_b = b, off_b, next_, found.points_mm[row, :, 0]
+    # what has not settled is no ray through the middle
+    settled = through.any(axis=1) & (np.abs(off_b) < 1e-6 * lens.surfaces[lens.stop].semi_diameter_mm)
+    return np.where(settled, found.points_mm[-1, :, 0], np.nan)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Beams:
+    """What passes all rims, per field angle, in the first vertex's plane: centres float64[angle] mm on the x axis,
+    and distances of the rim from there, float64[angle, azimuth] mm, for azimuths within half a turn."""
+
+    slope: F64
+    centre_mm: F64
+    rim_mm: F64
+
+    @property
+    def azimuth_rad(self) -> F64:
+        return np.asarray((np.arange(_AZIMUTHS) + 0.5) * np.pi / _AZIMUTHS)
+
+    @property
+    def area_mm2(self) -> F64:
+        """float64[angle]; the midpoint rule, which converges fast for a whole turn of a smooth rim."""
+        return np.asarray((self.rim_mm**2).sum(axis=1) * np.pi / _AZIMUTHS)
+
+
+def _beams(lens: Prescription, slope: F64) -> _Beams:
+    """Bundles at the d line: their rims are found between rays that pass and rays that do not."""
+    sensor = first_order(lens).bfd_mm
+
+    def beyond(x: F64, y: F64) -> F64:
+        found, shape = _rays(lens, slope.reshape(-1, *(1,) * (x.ndim - 1)), x, y, D_NM, sensor)
+        lost = ~np.isfinite(found.points_mm[-1, :, 0])
+        return np.where(lost, np.inf, found.relative_radius).reshape(shape)
+
+    heights = _fan_heights_mm(lens, slope)
+    outside = beyond(heights, np.zeros(1))
+    at = np.arange(len(slope))
+    centre = heights[at, np.argmin(outside, axis=1)]
+    passing = outside <= 1
+    width = passing.sum(axis=1) * (heights[:, 1] - heights[:, 0])
+    reach = 1.5 * np.maximum(width, width[0])
+    azimuth = (np.arange(_AZIMUTHS) + 0.5) * np.pi / _AZIMUTHS
+
+    def rim(near: F64, far: F64, samples: int) -> tuple[F64, F64, F64]:
+        """An interval of distances that holds the rim, and the rim by linear interpolation within."""
+        distance = near[..., None] + (far - near)[..., None] * np.linspace(0, 1, samples)
+        x = centre[:, None, None] + distance * np.cos(azimuth)[:, None]
+        over = beyond(x, distance * np.sin(azimuth)[:, None])
+        k = np.maximum(np.argmax(over > 1, axis=2), 1)[..., None]
+        (low, high), (a, b) = (
+            (np.take_along_axis(v, k - 1, 2)[..., 0], np.take_along_axis(v, k, 2)[..., 0]) for v in (distance, over)
+        )
+        with np.errstate(invalid="ignore"):
+            share = np.where(np.isfinite(b), (1 - a) / np.maximum(b - a, 1e-12), 0.0)
+        return low, high, low + np.clip(share, 0, 1) * (high - low)
+
+    nothing = np.zeros((len(slope), _AZIMUTHS))
+    low, high, _ = rim(nothing, nothing + reach[:, None], _RADII)
+    _, _, found = rim(low, high, _FINE_RADII)
+    found[~passing.any(axis=1)] = 0
+    return _Beams(slope=slope, centre_mm=centre, rim_mm=found)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Spots:
+    """Rays of bundles as they arrive, half of each (the others mirror them): places on the sensor and slopes,
+    float64[angle, ray, 2], x outwards, and the areas they came through, float64[angle, ray]."""
+
+    place_mm: F64
+    slope: F64
+    weight_mm2: F64
+
+    def centred(self, values: F64) -> F64:
+        """Without the weighted mean of x; the mean of y is 0 by symmetry."""
+        total = np.maximum(self.weight_mm2.sum(axis=1), 1e-300)
+        mean = (self.weight_mm2 * values[..., 0]).sum(axis=1) / total
+        return np.asarray(values - np.stack([mean, np.zeros_like(mean)], axis=-1)[:, None])
+
+    def mean(self, values: F64) -> F64:
+        """Weighted mean over the rays, float64[angle]."""
+        total = np.maximum(self.weight_mm2.sum(axis=1), 1e-300)
+        return np.asarray((self.weight_mm2 * values).sum(axis=1) / total)
+
+
+def _spots(lens: Prescription, beams: _Beams, wavelength_nm: float, sensor_mm: float) -> _Spots:
+    ring = np.sqrt((np.arange(_RINGS) + 0.5) / _RINGS)
+    azimuth = beams.azimuth_rad
+    distance = (beams.rim_mm[:, :, None] * ring).reshape(len(beams.slope), -1)
+    turn = np.repeat(azimuth, _RINGS)
+    x, y = beams.centre_mm[:, None] + distance * np.cos(turn), distance * np.sin(turn)
+    found, shape = _rays(lens, beams.slope[:, None], x, y, wavelength_nm, sensor_mm)
+    weight = np.repeat(beams.rim_mm**2, _RINGS, axis=1)
+    lost = ~np.isfinite(found.points_mm[-1, :, 0]).reshape(shape)
+    slope = found.directions[:, :2] / found.directions[:, 2:]
+    return _Spots(
+        place_mm=np.nan_to_num(found.points_mm[-1, :, :2]).reshape(*shape, 2),
+        slope=np.nan_to_num(slope).reshape(*shape, 2),
+        weight_mm2=np.where(lost, 0, weight),
+    )
+
+
+# --- the lens --------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Map:
+    """Heights of the image over the slope of the field at one wavelength, dense; straight on beyond the table."""
+
+    slope: F64
+    height_mm: F64
+    rise_mm: F64  # dh/dt
+    end: float  # slope of the last chief ray
+
+    def height(self, slope: F64) -> F64:
+        beyond = np.maximum(slope - self.slope[-1], 0)
+        return np.asarray(np.interp(slope, self.slope, self.height_mm) + beyond * self.rise_mm[-1])
+
+    def slope_at(self, height_mm: F64) -> F64:
+        beyond = np.maximum(height_mm - self.height_mm[-1], 0)
+        return np.asarray(np.interp(height_mm, self.height_mm, self.slope) + beyond / self.rise_mm[-1])
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Tables:
+    """Per band, over the squared distance from the axis in the picture, float32[band, step]: the slope of the field
+    over the distance in focal lengths, and irradiance over radiance in sr."""
+
+    stretch: F32
+    solid_angle_sr: F32
+
+
+@dataclass(frozen=True, kw_only=True)
+class RealLens:
+    """A prescription at its scale, with a sensor behind it; the interface of `ThinLens`, and more.
+
+    `focus`: the sensor stands at the paraxial focus of a far object, or where the mean square of the spots' radii
+    over the frame is least ("best"), both at the d line. `focus_distance_m` is what the renderer defocuses by.
+    """
+
+    prescription: Prescription
+    width_px: int
+    height_px: int
+    pixel_pitch_um: float
+    focus: str = "paraxial"
+    focus_distance_m: float = float("inf")
+
+    @property
+    def name(self) -> str:
+        return self.prescription.name
+
+    @cached_property
+    def sensor_mm(self) -> float:
+        """The sensor's plane behind the last vertex."""
+        paraxial = first_order(self._round).bfd_mm
+        return paraxial if self.focus == "paraxial" else paraxial + self._best_shift_mm
+
+    @cached_property
+    def focal_length_mm(self) -> float:
+        """Image height over the tangent of the field angle near the axis, at the d line: the EFL where the sensor
+        stands at the paraxial focus."""
+        efl = first_order(self._round).efl_mm
+        return efl if self.focus == "paraxial" else float(self._map(D_NM).rise_mm[0])
+
+    @cached_property
+    def f_number(self) -> float:
+        """EFL over the diameter of the real beam along the axis (of a disc of the same area)."""
+        area = float(self._beams.area_mm2[0])
+        return float(first_order(self._round).efl_mm / (2 * np.sqrt(area / np.pi)))
+
+    @property
+    def aperture_radius_m(self) -> float:
+        """Radius of the beam along the axis, in metres."""
+        return float(np.sqrt(self._beams.area_mm2[0] / np.pi)) * 1e-3
+
+    @property
+    def transmission(self) -> float:
+        """On the axis at the d line."""
+        return float(self.transmittance(np.array([D_NM]))[0])
+
+    def transmittance(self, wavelength_nm: F64) -> F64:
+        """Share of the light along the axis that coatings and glass let pass, float64[band]."""
+        share = np.ones(len(wavelength_nm))
+        surfaces = self.prescription.surfaces
+        for k, wavelength in enumerate(wavelength_nm.tolist()):
+            index = self.prescription.indices(wavelength)
+            for front, back, surface in zip(index[:-1], index[1:], surfaces, strict=True):
+                if front != back or surface.coating:
+                    share[k] *= 1 - float(mean_reflectance(surface.coating, front, back, 1.0, wavelength))
+            share[k] *= np.exp(-sum(s.thickness_mm * s.absorption_per_mm(wavelength) for s in surfaces[:-1]))
+        return share
+
+    def axial_solid_angle_sr(self, wavelength_nm: F64) -> F64:
+        """Irradiance over radiance on the axis, T A / f², float64[band]: π T / (4 N²) at the paraxial focus."""
+        return np.asarray(
+            [
+                share * self._beams.area_mm2[0] / self._map(wavelength).rise_mm[0] ** 2
+                for share, wavelength in zip(self.transmittance(wavelength_nm), wavelength_nm.tolist(), strict=True)
+            ]
+        )
+
+    # --- geometry
+
+    def distorted(self, slope: F64, wavelength_nm: float = D_NM) -> F64:
+        """Distances from the axis in the picture, in focal lengths, of tangents of field angles; float64 alike."""
+        return self._map(wavelength_nm).height(slope) / self.focal_length_mm
+
+    def undistorted(self, distance: F64, wavelength_nm: float = D_NM) -> F64:
+        """Tangents of the field angles seen at distances from the axis in focal lengths; float64 alike."""
+        return self._map(wavelength_nm).slope_at(distance * self.focal_length_mm)
+
+    @cached_property
+    def distortion(self) -> tuple[float, float, float, float, float]:
+        """OpenCV's k1, k2, p1, p2, k3 at the d line, fitted over the lit part of the frame; p1 = p2 = 0."""
+        return self._distortion[0]
+
+    @cached_property
+    def distortion_residual_px(self) -> tuple[float, float]:
+        """What `distortion` leaves of the exact map: root mean square and largest, pixels over the frame."""
+        return self._distortion[1]
+
+    @cached_property
+    def _distortion(self) -> tuple[tuple[float, float, float, float, float], tuple[float, float]]:
+        x, y = (np.linspace(0, size / 2 / self.focal_length_px, 65) for size in (self.width_px, self.height_px))
+        distance = np.hypot(x[None, :], y[:, None]).ravel()
+        slope = self.undistorted(distance)
+        lit = (self.relative_illumination(distance) > 0) & (slope > 0)
+        slope, distance = slope[lit], distance[lit]
+        most = slope.max()
+        powers = slope[:, None] * (slope[:, None] / most) ** [2, 4, 6] * self.focal_length_px
+        aim = (distance - slope) * self.focal_length_px
+        # sums in one order, which a threaded product would not keep: stores are the same bit for bit
+        normal, right = np.einsum("ni,nj->ij", powers, powers), np.einsum("ni,n->i", powers, aim)
+        found = np.linalg.solve(normal, right)
+        left = np.einsum("ni,i->n", powers, found) - aim
+        k1, k2, k3 = found / most ** np.array([2, 4, 6])
+        residual = float(np.sqrt(np.mean(left**2))), float(np.abs(left).max())
+        return (float(k1), float(k2), 0.0, 0.0, float(k3)), residual
+
+    @property
+    def focal_length_px(self) -> float:
+        return self.focal_length_mm * 1e3 / self.pixel_pitch_um
+
+    def relative_illumination(self, distance: F64, wavelength_nm: float = D_NM) -> F64:
+        """Irradiance of a uniform field over that on the axis, at distances from the axis in focal lengths."""
+        mapped = self._map(wavelength_nm)
+        solid = self._solid_angle_sr(mapped)
+        at = np.interp(mapped.slope_at(distance * self.focal_length_mm), mapped.slope, solid, right=0.0)
+        return np.asarray(at / solid[0])
+
+    @cached_property
+    def guard_px(self) -> tuple[int, int]:
+        """Pixels that a render needs on the left and right, and at top and bottom, beyond the frame, at the same
+        focal length: for light from outside that distortion and point spread bring in. Raises InputError for a lens
+        that sees much more than the render of a pinhole camera of its focal length can hold."""
+        mapped = self._map(D_NM)
+        if self._beams.area_mm2[-1] > 0 and mapped.height_mm[-1] < self._corner * self.focal_length_mm:
+            angle = np.degrees(np.arctan(mapped.slope[-1]))
+            raise InputError(
+                f"{self.name}: camera.fov_deg: barrel distortion brings light from beyond {angle:.0f} degrees into "
+                "the corners, which the render has not; it must be smaller"
+            )
+        half = np.array([self.width_px, self.height_px]) / 2
+        share, whole = np.linspace(0, 1, 129), np.ones(129)
+        border = np.concatenate([np.column_stack([share, whole]), np.column_stack([whole, share])])
+        border *= half + REACH_PX
+        distance = np.hypot(*border.T) / self.focal_length_px
+        lit = self.relative_illumination(distance) > 0
+        seen = border * (self.undistorted(distance) / distance * lit)[:, None]
+        gx, gy = np.ceil(np.maximum(seen.max(axis=0) - half, 0)).astype(int) + _COLOUR_PX
+        return int(gx), int(gy)
+
+    # --- what the tables are made of
+
+    @cached_property
+    def _round(self) -> Prescription:
+        """The prescription with a round stop."""
+        lens = self.prescription
+        stop = lens.surfaces[lens.stop]
+        if not stop.blades:
+            return lens
+        turn = np.linspace(0, 2 * np.pi, 3600, endpoint=False)
+        radius = float(np.sqrt(np.mean(stop.rim_mm(turn) ** 2)))
+        surfaces = list(lens.surfaces)
+        surfaces[lens.stop] = replace(stop, semi_diameter_mm=radius, blades=0)
+        return replace(lens, surfaces=tuple(surfaces))
+
+    @cached_property
+    def _corner(self) -> float:
+        """Distance of the frame's corner, point spread included, from the axis, in EFL."""
+        half = np.hypot(self.width_px / 2 + REACH_PX, self.height_px / 2 + REACH_PX)
+        return float(half * self.pixel_pitch_um * 1e-3 / first_order(self._round).efl_mm)
+
+    @cached_property
+    def _slopes(self) -> F64:
+        """Tangents of the tables' field angles, float64[angle]; the first is all but 0."""
+        slope = np.tan(np.linspace(0, np.arctan(_BEYOND * self._corner), _ANGLES))
+        slope[0] = 1e-3 * slope[1]
+        return slope
+
+    @cached_property
+    def _beams(self) -> _Beams:
+        return _beams(self._round, self._slopes)
+
+    @cached_property
+    def _zones(self) -> _Beams:
+        """The bundles of point spreads: those with light, from the axis to the corner."""
+        beams = self._beams
+        lit = (beams.area_mm2 > 0) & (beams.slope <= 1.1 * self._corner)
+        return _Beams(slope=beams.slope[lit], centre_mm=beams.centre_mm[lit], rim_mm=beams.rim_mm[lit])
+
+    @cached_property
+    def _best_shift_mm(self) -> float:
+        """From the paraxial focus to the least mean square radius of spots, each ray as much as its light."""
+        beams, lens = self._zones, self._round
+        order = first_order(lens)
+        spots = _spots(lens, beams, D_NM, order.bfd_mm)
+        place, slope = spots.centred(spots.place_mm), spots.centred(spots.slope)
+        # pixels of the frame nearest to each zone's undistorted place
+        x, y = (np.abs(np.arange(n) + 0.5 - n / 2) for n in (self.width_px, self.height_px))
+        radius = np.hypot(x[None, ::8], y[::8, None]).ravel() * self.pixel_pitch_um * 1e-3 / order.efl_mm
+        edges = (beams.slope[1:] + beams.slope[:-1]) / 2
+        lit = radius[radius <= beams.slope[-1]]
+        pixels = np.bincount(np.searchsorted(edges, lit), minlength=len(beams.slope))
+        light = pixels * beams.area_mm2 / (1 + beams.slope**2) ** 2
+        together, alone = (spots.mean((v * slope).sum(axis=-1)) for v in (place, slope))
+        return float(-(light @ together) / (light @ alone))
+
+    def _map(self, wavelength_nm: float) -> _Map:
+        return _map(self, float(wavelength_nm))
+
+    def _solid_angle_sr(self, mapped: _Map) -> F64:
+        """Irradiance over radiance without losses, float64 like `mapped.slope`."""
+        beams, slope = self._beams, mapped.slope
+        area = np.maximum(PchipInterpolator(beams.slope, beams.area_mm2, extrapolate=True)(slope), 0)
+        dark = beams.area_mm2 == 0
+        if dark.any():  # the last of the light goes linearly
+            first = int(np.argmax(dark))
+            fades = slope > beams.slope[first - 1]
+            area[fades] = np.interp(slope[fades], beams.slope, beams.area_mm2)
+        stretch = np.empty_like(slope)
+        stretch[1:] = slope[1:] / mapped.height_mm[1:]
+        stretch[0] = 1 / mapped.rise_mm[0]
+        return np.asarray(area / (1 + slope**2) ** 2 * stretch / mapped.rise_mm)
+
+    # --- pictures
+
+    def on_axis(self, radiance: Radiance) -> Irradiance:
+        """Irradiance that radiance gives on the axis, of any shape: no place in the frame counts."""
+        factor = self.axial_solid_angle_sr(radiance.wavelength_nm).astype(np.float32)
+        return Irradiance(array=radiance.array * factor[:, None, None], wavelength_nm=radiance.wavelength_nm)
+
+    def image(self, radiance: Radiance) -> Irradiance:
+        """Irradiance on the sensor, float32[band, y, x], of a render with its guard band."""
+        self._check(radiance)
+        bands = _key(radiance.wavelength_nm)
+        tables, spreads = _tables(self, bands), _spreads(self, bands)
+        array = np.empty((len(radiance.array), self.height_px, self.width_px), dtype=np.float32)
+
+        def one(band: int) -> None:
+            light = self._resampled(radiance.array[band], tables.stretch[band], tables.solid_angle_sr[band])
+            array[band] = spreads.applied(light, band)[_INSIDE]
+
+        with ThreadPoolExecutor(2) as pool:
+            list(pool.map(one, range(len(array))))
+        return Irradiance(array=array, wavelength_nm=radiance.wavelength_nm)
+
+    def on_frame(self, radiance: Radiance) -> Radiance:
+        """A render with its guard band on the picture's own grid: distortion and lateral colour alone, no light
+        lost and nothing blurred."""
+        self._check(radiance)
+        tables = _tables(self, _key(radiance.wavelength_nm))
+
+        def one(band: int) -> F32:
+            return self._resampled(radiance.array[band], tables.stretch[band], None)[_INSIDE]
+
+        with ThreadPoolExecutor(2) as pool:
+            return radiance.with_array(np.stack(list(pool.map(one, range(len(radiance.array))))))
+
+    @cached_property
+    def nearest_pixels(self) -> NDArray[np.int32]:
+        """For each pixel of the picture the number of the render's pixel, row after row, that its centre sees at
+        the d line, int32[y, x]."""
+        gx, gy = self.guard_px
+        width, height = self.width_px + 2 * gx, self.height_px + 2 * gy
+        x, y = (np.arange(n) + 0.5 - n / 2 for n in (self.width_px, self.height_px))
+        distance = np.hypot(x[None, :], y[:, None]) / self.focal_length_px
+        stretch = self.undistorted(distance) / np.maximum(distance, 1e-12)
+        stretch[distance < 1e-9] = 1
+        column, row = (
+            np.clip(np.floor(v + n / 2).astype(np.int32), 0, n - 1)
+            for v, n in ((x[None, :] * stretch, width), (y[:, None] * stretch, height))
+        )
+        return np.asarray(row * width + column)
+
+    def _check(self, radiance: Radiance) -> None:
+        gx, gy = self.guard_px
+        wanted = self.height_px + 2 * gy, self.width_px + 2 * gx
+        if radiance.array.shape[1:] != wanted:
+            raise ValueError(f"radiance of {radiance.array.shape[1:]} pixels: with its guard band it has {wanted}")
+
+    @cached_property
+    def _steps(self) -> NDArray[np.uint16]:
+        """For each pixel of the picture, point spread's reach included, its place in `_Tables`."""
+        x, y = (np.arange(n + 2 * REACH_PX) + 0.5 - (n / 2 + REACH_PX) for n in (self.width_px, self.height_px))
+        square = x[None, :] ** 2 + y[:, None] ** 2
+        return np.asarray(np.rint(square * ((_STEPS - 1) / self._most_px**2)), dtype=np.uint16)
+
+    @property
+    def _most_px(self) -> float:
+        return float(np.hypot(self.width_px / 2 + REACH_PX, self.height_px / 2 + REACH_PX))
+
+    def _resampled(self, band: F32, stretch: F32, solid_angle_sr: F32 | None) -> F32:
+        """Where light of the picture's pixels, point spread's reach included, comes from: strip by strip, so that
+        what lies between stays near the processor."""
+        gx, gy = self.guard_px
+        height, width = self._steps.shape
+        out = np.empty((height, width), dtype=np.float32)
+        # on the grid of half the pitch; between its pixels a linear interpolation blurs little
+        x = 2 * np.arange(width, dtype=np.float32) + np.float32(1 - width)
+        y = 2 * np.arange(height, dtype=np.float32) + np.float32(1 - height)
+        for start in range(0, height, _STRIP_PX):
+            rows = slice(start, start + _STRIP_PX)
+            steps = self._steps[rows]
+            row = np.take(stretch, steps, mode="clip")
+            column = row * x
+            column += np.float32(self.width_px + 2 * gx - 1)
+            row *= y[rows, None]
+            row += np.float32(self.height_px + 2 * gy - 1)
+            top = int(np.clip(row.min() // 2 - 1, 0, len(band) - 2))
+            bottom = int(np.clip(row.max() // 2 + 3, top + 2, len(band)))
+            row -= np.float32(2 * top)
+            source = finer(band[top:bottom])
+            light = cv2.remap(source, column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+            if solid_angle_sr is not None:
+                light *= np.take(solid_angle_sr, steps, mode="clip")
+            out[rows] = light
+        return out
+
+
+def _key(wavelength_nm: F64) -> tuple[float, ...]:
+    return tuple(float(w) for w in wavelength_nm)
+
+
+@lru_cache(maxsize=64)
+def _map(lens: RealLens, wavelength_nm: float) -> _Map:
+    slope = lens._slopes
+    height = chief_heights_mm(lens._round, slope, wavelength_nm=wavelength_nm, sensor_mm=lens.sensor_mm)
+    efl = first_order(lens._round).efl_mm
+    with np.errstate(invalid="ignore"):
+        good = np.diff(height) > _STEEPNESS[0] * efl * np.diff(slope)
+    # no chief ray, or one that turns back: a lens beyond its field. Colours go on side by side.
+    last = len(slope) - 1 if good.all() else int(np.argmin(good))
+    main = None if wavelength_nm == D_NM else lens._map(D_NM)
+    end = slope[last] if main is None else min(slope[last], main.end)
+    last = int(np.searchsorted(slope, end))
+    if last < 3:
+        angle = np.degrees(np.arctan(end))
+        raise InputError(
+            f"{lens.name}: no ray through the middle of the stop comes from beyond {angle:.2g} degrees"
+        )
+    # h / t is even in t
+    ratio = CubicSpline(slope[: last + 1], height[: last + 1] / slope[: last + 1], bc_type=((1, 0.0), "not-a-knot"))
+    dense = np.linspace(0, slope[-1], _DENSE)
+    known = np.minimum(dense, end)
+    rise = ratio(known) + known * ratio(known, 1)
+    onward = np.clip(rise[-1], _STEEPNESS[0] * efl, _STEEPNESS[1] * efl) if main is None else main.rise_mm[-1]
+    rise[dense > end] = onward
+    return _Map(
+        slope=dense, height_mm=known * ratio(known) + (dense - known) * onward, rise_mm=rise, end=float(end)
+    )
+
+
+@lru_cache(maxsize=8)
+def _tables(lens: RealLens, wavelength_nm: tuple[float, ...]) -> _Tables:
+    # the first step has no distance: its pixels are those next to the axis
+    square = np.maximum(np.arange(_STEPS), 1e-3) / (_STEPS - 1)
+    distance = np.sqrt(square) * lens._most_px / lens.focal_length_px
+    stretch, solid = [], []
+    for wavelength, share in zip(wavelength_nm, lens.transmittance(np.array(wavelength_nm)), strict=True):
+        mapped = lens._map(wavelength)
+        slope = mapped.slope_at(distance * lens.focal_length_mm)
+        stretch.append(slope / distance)
+        solid.append(share * np.interp(slope, mapped.slope, lens._solid_angle_sr(mapped), right=0.0))
+    return _Tables(stretch=np.array(stretch, np.float32), solid_angle_sr=np.array(solid, np.float32))
+
+
+def finer(band: F32) -> F32:
+    """A picture on a grid of half the pitch, float32[2 y - 1, 2 x - 1]: its own pixels, and between them a cubic
+    (Keys 1981, IEEE ASSP 29, 1153) held within the two neighbours, so that the Sun casts no ripples."""
+    height, width = band.shape
+    out = np.empty((2 * height - 1, 2 * width - 1), dtype=np.float32)
+    out[::2, ::2] = band
+    out[::2, 1::2] = _between(band, _MIDWAY)
+    out[1::2] = _between(np.ascontiguousarray(out[::2]), _MIDWAY.T)
+    return out
+
+
+def _between(band: F32, kernel: F32) -> F32:
+    """Midpoints of neighbours along the axis of a kernel of four taps, one fewer than those."""
+    height, width = band.shape
+    across = kernel.shape[0] == 1
+    one, other = (band[:, :-1], band[:, 1:]) if across else (band[:-1], band[1:])
+    middle = cv2.filter2D(
+        band, cv2.CV_32F, kernel, anchor=(1, 0) if across else (0, 1), borderType=cv2.BORDER_REPLICATE
+    )[: height - (not across), : width - across]
+    return np.asarray(cv2.min(cv2.max(middle, cv2.min(one, other)), cv2.max(one, other)))
+
+
+# --- point spread ----------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Spreads:
+    """Point spreads of tiles of the picture: `kernels[band][row][column]`, float32[n, n] with sum 1, None for a
+    single pixel; light of a tile fades into that of the next. `rows`, `columns`: start, stop, weights of each."""
+
+    kernels: tuple[tuple[tuple[F32 | None, ...], ...], ...]
+    rows: tuple[tuple[int, int, F32], ...]
+    columns: tuple[tuple[int, int, F32], ...]
+
+    def applied(self, light: F32, band: int) -> F32:
+        """Light, float32[y, x], spread: every pixel's goes where its tiles' kernels send it."""
+        kernels = self.kernels[band]
+        if all(kernel is None for row in kernels for kernel in row):
+            return light
+        r = REACH_PX
+        out = np.zeros((light.shape[0] + 2 * r, light.shape[1] + 2 * r), dtype=np.float32)
+        for (top, bottom, down), of_row in zip(self.rows, kernels, strict=True):
+            for (left, right, across), kernel in zip(self.columns, of_row, strict=True):
+                part = light[top:bottom, left:right]
+                if not part.any():
+                    continue
+                part = part * (down[:, None] * across)
+                reach = 0
+                if kernel is not None:
+                    part, reach = spread(part, kernel), len(kernel) // 2
+                window = out[top + r - reach : bottom + r + reach, left + r - reach : right + r + reach]
+                cv2.add(window, part, window)
+        return out[r:-r, r:-r]
+
+
+def spread(light: F32, kernel: F32) -> F32:
+    """The whole convolution of light with a square kernel of odd size n, float32[y + n - 1, x + n - 1]."""
+    n, half = len(kernel), len(kernel) // 2
+    taps = np.ascontiguousarray(kernel[::-1, ::-1])
+    rows = n if n * n <= _DIRECT_TAPS else half + 1
+    wide = cv2.copyMakeBorder(light, half, half + n - rows, half, half, cv2.BORDER_CONSTANT, value=0)
+    out = cv2.filter2D(wide, cv2.CV_32F, taps[:rows], anchor=(half, half), borderType=cv2.BORDER_CONSTANT)
+    if rows < n:  # the rows of taps below the middle
+        below = cv2.filter2D(wide, cv2.CV_32F, taps[rows:], anchor=(half, 0), borderType=cv2.BORDER_CONSTANT)
+        out[:-1] += below[1:]
+        out = out[: half - n + 1 or None]
+    return np.asarray(out)
+
+
+def _tiles(size: int) -> tuple[F64, tuple[tuple[int, int, F32], ...]]:
+    """Centres of tiles along an axis, and start, stop and weights of each; the weights of all add up to 1."""
+    count = max(1, round(size / _TILE_PX))
+    edges = np.linspace(0, size, count + 1)
+    ramp = size / count / 16
+    found = []
+    for k in range(count):
+        low, high = (edges[k] - ramp if k else 0), (edges[k + 1] + ramp if k < count - 1 else size)
+        start, stop = max(int(np.floor(low)), 0), min(int(np.ceil(high)), size)
+        at = np.arange(start, stop) + 0.5
+        weight = np.ones(len(at))
+        if k:
+            weight *= np.clip((at - low) / (2 * ramp), 0, 1)
+        if k < count - 1:
+            weight *= np.clip((high - at) / (2 * ramp), 0, 1)
+        found.append((start, stop, weight.astype(np.float32)))
+    return (edges[:-1] + edges[1:]) / 2, tuple(found)
+
+
+@lru_cache(maxsize=8)
+def _spreads(lens: RealLens, wavelength_nm: tuple[float, ...]) -> _Spreads:
+    centre_x, columns = _tiles(lens.width_px + 2 * REACH_PX)
+    centre_y, rows = _tiles(lens.height_px + 2 * REACH_PX)
+    x, y = centre_x - (lens.width_px / 2 + REACH_PX), centre_y - (lens.height_px / 2 + REACH_PX)
+    distance = np.hypot(x[None, :], y[:, None]).ravel() / lens.focal_length_px
+    azimuth = np.arctan2(y[:, None], x[None, :]).ravel()
+    kernels = []
+    for wavelength in wavelength_nm:
+        stack = point_spreads(lens, distance, azimuth, wavelength)
+        trimmed = [_trimmed(kernel) for kernel in stack]
+        kernels.append(tuple(tuple(trimmed[k * len(x) : (k + 1) * len(x)]) for k in range(len(y))))
+    return _Spreads(kernels=tuple(kernels), rows=rows, columns=columns)
+
+
+def point_spreads(lens: RealLens, distance: F64, azimuth_rad: F64, wavelength_nm: float) -> F32:
+    """Point spreads at places of the picture, float32[n, y, x] of sum 1: distances from the axis in focal lengths,
+    azimuths from +x towards +y. Their centroids are their middles."""
+    beams = lens._zones
+    spots = _spots(lens._round, beams, wavelength_nm, lens.sensor_mm)
+    place = spots.centred(spots.place_mm) * 1e3 / lens.pixel_pitch_um
+    mapped = lens._map(wavelength_nm)
+    slope = mapped.slope_at(distance * lens.focal_length_mm)
+    # between two field angles every ray of the bundle lies between those of both
+    k = np.clip(np.searchsorted(beams.slope, slope) - 1, 0, len(beams.slope) - 2)
+    share = np.clip((slope - beams.slope[k]) / (beams.slope[k + 1] - beams.slope[k]), 0, 1)[:, None]
+    place = place[k] * (1 - share[..., None]) + place[k + 1] * share[..., None]
+    weight = spots.weight_mm2[k] * (1 - share) + spots.weight_mm2[k + 1] * share
+    x, y = place[..., 0], place[..., 1]
+    for _ in range(3):
+        near = x * x + y * y <= REACH_PX**2
+        weight = np.where(near | ~np.any(near & (weight > 0), axis=1, keepdims=True), weight, 0)
+        x = x - ((weight * x).sum(axis=1) / weight.sum(axis=1))[:, None]
+    x, y, weight = np.hstack([x, x]), np.hstack([y, -y]), np.hstack([weight, weight])
+    solid = np.interp(slope, mapped.slope, lens._solid_angle_sr(mapped))
+    f_number = np.sqrt(np.pi / np.maximum(solid, 1e-3 * solid.max())) / 2
+    sigma = _AIRY_SIGMA * wavelength_nm * 1e-3 * f_number / lens.pixel_pitch_um
+    return _rasterised(x, y, weight / weight.sum(axis=1)[:, None], azimuth_rad, sigma)
+
+
+def _rasterised(x: F64, y: F64, weight: F64, azimuth_rad: F64, sigma: F64) -> F32:
+    """Rays of spots, float64[n, ray] in pixels about the middle, turned by azimuths and blurred by Gaussians, as
+    kernels; x and y are the spots' own axes, along and across the radius.
+
+    A render's pixel is a mean over the pixel already. What sharing rays out between pixels adds to the mean squares
+    along both axes is therefore taken from the spot before, so that a kernel has its spot's centroid and width.
+    """
+    cos, sin = np.cos(azimuth_rad)[:, None], np.sin(azimuth_rad)[:, None]
+    squares = [np.maximum((weight * v * v).sum(axis=1), 1e-12) for v in (x, y)]
+    scale = [np.ones(len(x)), np.ones(len(x))]
+    for _ in range(_ROUNDS):
+        turned = _turned(x * scale[0][:, None], y * scale[1][:, None], cos, sin)
+        parts = [np.abs(v) % 1 for v in turned]
+        added = [(weight * part * (1 - part)).sum(axis=1) for part in parts]
+        share = cos[:, 0] ** 2
+        more = share * added[0] + (1 - share) * added[1], share * added[1] + (1 - share) * added[0]
+        scale = [
+            (old + np.sqrt(np.maximum(1 - extra / square, 0))) / 2
+            for old, extra, square in zip(scale, more, squares, strict=True)
+        ]
+    wanted = squares[0] + squares[1] + 2 * sigma**2
+    x, y = _turned(x * scale[0][:, None], y * scale[1][:, None], cos, sin)
+    n, side = len(x), 2 * REACH_PX + 1
+    cells = side * _FINE
+    total = np.zeros(n * cells * cells)
+    u, v = ((p + side / 2) * _FINE - 0.5 for p in (x, y))
+    column, row = np.floor(u).astype(np.int64), np.floor(v).astype(np.int64)
+    for dy in (0, 1):
+        for dx in (0, 1):
+            share = weight * np.abs(1 - dx - (u - column)) * np.abs(1 - dy - (v - row))
+            at = (np.arange(n)[:, None] * cells + np.clip(row + dy, 0, cells - 1)) * cells
+            at += np.clip(column + dx, 0, cells - 1)
+            total += np.bincount(at.ravel(), share.ravel(), minlength=len(total))
+    edge = np.arange(cells + 1) / _FINE - side / 2
+    middle = (edge[1:] + edge[:-1]) / 2
+    pixel = np.arange(side) - REACH_PX
+    linear = np.maximum(1 - np.abs(middle[None, :] - pixel[:, None]), 0)
+    s = np.maximum(sigma, 1e-3)[:, None, None]
+    gauss = np.diff(ndtr((edge[None, :, None] - middle[None, None, :]) / s), axis=1)
+    gather = np.einsum("ki,nij->nkj", linear, gauss)
+    along = np.einsum("nyi,nij->nyj", gather, total.reshape(n, cells, cells))
+    kernels = np.einsum("nyj,nxj->nyx", along, gather)
+    kernels /= np.maximum(kernels.sum(axis=(1, 2), keepdims=True), 1e-300)
+    # what is left of it, light for the middle takes back
+    square = (kernels * (pixel[None, :] ** 2 + pixel[:, None] ** 2)).sum(axis=(1, 2))
+    kernels *= np.minimum(wanted / np.maximum(square, 1e-300), 1)[:, None, None]
+    kernels[:, REACH_PX, REACH_PX] += 1 - kernels.sum(axis=(1, 2))
+    return np.asarray(kernels, dtype=np.float32)
+
+
+def _turned(x: F64, y: F64, cos: F64, sin: F64) -> tuple[F64, F64]:
+    return x * cos - y * sin, x * sin + y * cos
+
+
+def _trimmed(kernel: F32) -> F32 | None:
+    """The kernel without the border that holds next to nothing, its sum still 1; None where it hardly blurs."""
+    half = len(kernel) // 2
+    at = np.arange(-half, half + 1)
+    square = float((kernel * (at[None, :] ** 2 + at[:, None] ** 2)).sum())
+    if np.sqrt(square) < _SHARP_PX:
+        return None
+    for reach in range(1, half + 1):
+        inner = kernel[half - reach : half + reach + 1, half - reach : half + reach + 1]
+        if inner.sum() >= 1 - _TRIM:
+            break
+    return np.ascontiguousarray(inner / inner.sum(dtype=np.float64), dtype=np.float32)
