@@ -223,7 +223,7 @@ def model(lens: Prescription, **more: Any) -> FlareModel:
     return FlareModel(lens, settings.pop("wavelength_nm", np.array([D_NM])), **settings)
 
 
-@pytest.mark.parametrize(("kind", "worst"), [("traced", 0.04), ("paraxial", 0.01)])
+@pytest.mark.parametrize(("kind", "worst"), [("traced", 0.05), ("paraxial", 0.01)])
 def test_a_picture_holds_the_flux_of_its_ghosts(kind: str, worst: float) -> None:
     """Every ghost by itself that lies within the frame: light and place as its rays have them. Cells of a lattice
     are linear in it: exact for first-order ghosts but for their rims; of the others the most distorted err most."""

@@ -220,7 +220,17 @@ class Tracer:
             "absorption": be.Float(absorption[:, medium].astype(np.float32).ravel()),
             "aspheric": [be.Float(c.astype(np.float32)) for c in aspheric],
         }
-        self._conic = any(c != 1 for c in conic)
+        self._special = bool(most) or any(c != 1 for c in conic)
+        self._bladed = bool(lens.surfaces[lens.stop].blades)
+        self._numbers = {
+            "gap": np.array(gap),
+            "curvature": curvature,
+            "eta": ratio,
+            "per_rim": per_rim,
+            "conic": conic,
+            "aspheric": aspheric,
+            "absorption": absorption[:, medium],
+        }
         be.dr.eval(tables)
         return tables
 
@@ -248,7 +258,9 @@ class Tracer:
     def _no_width(self) -> F64:
         return np.full(len(self.met), 1e-3)
 
-    def trace(self, rays: Rays, across: int, width: F64 | None = None, *, centred: bool = False) -> Spots:
+    def trace(
+        self, rays: Rays, across: int, width: F64 | None = None, *, centred: bool = False, light: bool = True
+    ) -> Spots:
         """Trace `across` × `across` rays of every bundle.
 
         Parameters
@@ -257,126 +269,192 @@ class Tracer:
             float64[step]: of the soft edge of the rim at each step of each route, in radii of the rim.
         centred
             Rays in the middles of the box's cells, else on its lattice, edges included.
+        light
+            Without it, a tracer of one path and wavelength leaves `share` at 1.
         """
         be, t = backend(), self._tables
         dr = be.dr
         per_width = (1 / (self._no_width if width is None else width)).astype(np.float32)
-        edge = be.UInt64(_paired(per_width, self._look_up_word.view(np.float32)))
-        rim = self.lens.surfaces[self.lens.stop]
         start = self._start(rays, across, centred)
         count, route = dr.width(start.x), start.route
-        wavelength = start.wavelength * dr.opaque(be.UInt32, len(self.rows))
-        shares = start.wavelength * dr.opaque(be.UInt32, 3 * _COSINES * (len(self.lens.surfaces) + 1))
-        end = dr.gather(be.UInt32, t["end"], route)
-        state = (
-            dr.gather(be.UInt32, t["start"], route),
-            start.x,
-            start.y,
-            dr.zeros(be.Float, count),
-            start.dx,
-            start.dy,
-            start.dz,
-            dr.full(be.Float, 1, count),
-            dr.zeros(be.Float, count),
-            dr.full(be.Float, 1e6, count),
-        )
+        none, one = dr.zeros(be.Float, count), dr.full(be.Float, 1, count)
+        ray = (start.x, start.y, none, start.dx, start.dy, start.dz, one, none, dr.full(be.Float, 1e6, count))
+        if len(self.routes) == len(self.wavelength_nm) == 1:
+            # one path, one wavelength: every number is known, and nothing need be fetched
+            for step in range(len(self.rows)):
+                ray = self._meet(self._known(step, per_width, light), *ray)
+            last: Any = float(t["last"].numpy()[0])
+        else:
+            edge = be.UInt64(_paired(per_width, self._look_up_word.view(np.float32)))
+            wavelength = start.wavelength * dr.opaque(be.UInt32, len(self.rows))
+            shares = start.wavelength * dr.opaque(be.UInt32, 3 * _COSINES * (len(self.lens.surfaces) + 1))
+            end = dr.gather(be.UInt32, t["end"], route)
 
-        special = self._conic or bool(t["aspheric"])
+            def on(step: Any, *_: Any) -> Any:
+                return step < end
 
-        def on(step: Any, *_: Any) -> Any:
-            return step < end
+            def body(step: Any, *ray: Any) -> Any:
+                return step + 1, *self._meet(self._fetched(step, edge, wavelength, shares), *ray)
 
-        def body(
-            step: Any, x: Any, y: Any, z: Any, dx: Any, dy: Any, dz: Any, share: Any, radius: Any, margin: Any
-        ) -> Any:
-            gap, c = _unpaired(t["place"], step)
-            eta, per_rim = _unpaired(t["bend"], wavelength + step)
-            sharpness, word = _unpaired(edge, step)
-            word = dr.reinterpret_array(be.UInt32, word)
-            mirror = (word & 1) == 1
-            row = dr.gather(be.UInt32, t["row"], step) if special else None
-            conic = dr.gather(be.Float, t["conic"], row) if special else 1.0
-            z = z + gap
-            # to the plane of the vertex, then to the surface
-            to_plane = -z / dz
-            x, y = dr.fma(to_plane, dx, x), dr.fma(to_plane, dy, y)
-            a = c * (dx * dx + dy * dy + conic * dz * dz) if special else c
-            b = c * (x * dx + y * dy) - dz
-            e = c * (x * x + y * y)
-            under = b * b - a * e
-            t_hit = e / (-b + dr.copysign(dr.sqrt(dr.maximum(under, 0)), dz))
-            x, y, z = dr.fma(t_hit, dx, x), dr.fma(t_hit, dy, y), t_hit * dz
-            nx, ny, nz = c * x, c * y, c * conic * z - 1
-            length = t_hit + to_plane
-            if t["aspheric"]:
-                x, y, z, nx, ny, nz, more = self._to_asphere(row, c, conic, x, y, z, dx, dy, dz)
-                length = length + more
-            if self._absorbs:
-                share = share * dr.exp(-dr.gather(be.Float, t["absorption"], wavelength + step) * dr.abs(length))
-            # of a sphere it is of length 1
-            norm = dr.rsqrt(nx * nx + ny * ny + nz * nz) if special else 1.0
-            along_normal = (nx * dx + ny * dy + nz * dz) * norm
-            # the normal towards where the ray comes from
-            norm = dr.select(along_normal > 0, -norm, norm)
-            nx, ny, nz = nx * norm, ny * norm, nz * norm
-            cosine = dr.minimum(dr.abs(along_normal), 1)
-            beyond = dr.sqrt(x * x + y * y) * per_rim
-            if rim.blades:
-                blade = self._within_blades(x, y)
-                beyond = dr.select(dr.gather(be.UInt32, t["stop"], step) == 1, blade, beyond)
-            left = 1 - eta * eta * (1 - cosine * cosine)
-            total = left < 0
-            out_cosine = dr.sqrt(dr.maximum(left, 0))
-            thin = dr.minimum(dr.select(eta > 1, out_cosine, cosine), 1) * (_COSINES - 1)
-            node = dr.minimum(be.UInt32(thin), _COSINES - 2)
-            low, rise = _unpaired(t["share"], (word >> 1) + shares + node)
-            passed = dr.fma(thin - be.Float(node), rise, low)
-            share = share * dr.select(total & mirror, 1, passed)
-            turn = dr.select(mirror, 2 * cosine, eta * cosine - out_cosine)
-            keep = dr.select(mirror, 1, eta)
-            forward = dz > 0
-            dx, dy, dz = dr.fma(turn, nx, keep * dx), dr.fma(turn, ny, keep * dy), dr.fma(turn, nz, keep * dz)
-            # lost too: a surface missed, light all reflected, a ray turned back; on it goes, along the limit, so
-            # that between rays it is known where that began
-            onward = dr.select(forward ^ mirror, 1.0, -1.0)
-            left = dr.select(mirror, 1, left)
-            room = dr.minimum(dr.minimum(under, left), 4 * dz * onward)
-            dz = onward * dr.maximum(dz * onward, _LEAST_SLOPE)
-            radius = dr.maximum(radius, dr.maximum(beyond, 1 - room))
-            margin = dr.minimum(margin, dr.minimum((1 - beyond) * sharpness, room * _LIMIT_SHARPNESS))
-            return step + 1, x, y, z, dx, dy, dz, share, radius, margin
-
-        _, x, y, z, dx, dy, dz, share, radius, margin = dr.while_loop(state, on, body, mode="symbolic")
-        away = -(z + dr.gather(be.Float, t["last"], route)) / dz
+            first = dr.gather(be.UInt32, t["start"], route)
+            _, *ray = dr.while_loop((first, *ray), on, body, mode="symbolic")
+            last = dr.gather(be.Float, t["last"], route)
+        x, y, z, dx, dy, dz, share, radius, margin = ray
+        away = -(z + last) / dz
         x, y = dr.fma(away, dx, x), dr.fma(away, dy, y)
         found = dr.isfinite(x + y + radius) & (dr.abs(x) + dr.abs(y) < 1e9)
         spots = Spots(
             x_mm=dr.select(found, x, 0),
             y_mm=dr.select(found, y, 0),
             share=dr.select(found, share, 0),
-            radius=dr.select(found, radius, -_LOST),
+            radius=dr.select(found, dr.sqrt(radius), -_LOST),
             margin=dr.select(found, dr.maximum(margin, _FAR), _LOST),
         )
         dr.eval(spots.x_mm, spots.y_mm, spots.share, spots.radius, spots.margin)
         return spots
 
+    def _fetched(self, step: Any, edge: Any, wavelength: Any, shares: Any) -> Any:
+        """What a step of every lane's own path is made of, from the tables."""
+        be, t = backend(), self._tables
+        dr = be.dr
+        gap, curvature = _unpaired(t["place"], step)
+        eta, per_rim = _unpaired(t["bend"], wavelength + step)
+        sharpness, word = _unpaired(edge, step)
+        word = dr.reinterpret_array(be.UInt32, word)
+        row = dr.gather(be.UInt32, t["row"], step) if self._special else None
+
+        def passed(cosine: Any) -> Any:
+            at = cosine * (_COSINES - 1)
+            node = dr.minimum(be.UInt32(at), _COSINES - 2)
+            low, rise = _unpaired(t["share"], (word >> 1) + shares + node)
+            return dr.fma(at - be.Float(node), rise, low)
+
+        return SimpleNamespace(
+            gap=gap,
+            curvature=curvature,
+            eta=eta,
+            per_rim=per_rim,
+            sharpness=sharpness,
+            mirror=(word & 1) == 1,
+            stop=dr.gather(be.UInt32, t["stop"], step) == 1 if self._bladed else False,
+            conic=dr.gather(be.Float, t["conic"], row) if self._special else 1.0,
+            aspheric=[dr.gather(be.Float, a, row) for a in t["aspheric"]],
+            absorption=dr.gather(be.Float, t["absorption"], wavelength + step) if self._absorbs else None,
+            passed=passed,
+        )
+
+    def _known(self, step: int, per_width: NDArray[np.float32], light: bool) -> Any:
+        """What a step of the only path is made of, as numbers."""
+        be, n = backend(), self._numbers
+        dr = be.dr
+        word, row = int(self._look_up_word[step]), int(self.rows[step])
+
+        def passed(cosine: Any) -> Any:
+            at = cosine * (_COSINES - 1)
+            node = dr.minimum(be.UInt32(at), _COSINES - 2)
+            low, rise = _unpaired(self._tables["share"], (word >> 1) + node)
+            return dr.fma(at - be.Float(node), rise, low)
+
+        return SimpleNamespace(
+            gap=float(n["gap"][step]),
+            curvature=float(n["curvature"][step]),
+            eta=float(n["eta"][0, step]),
+            per_rim=float(n["per_rim"][step]),
+            sharpness=float(per_width[step]),
+            mirror=bool(word & 1),
+            stop=row == self.lens.stop,
+            conic=float(n["conic"][row]),
+            aspheric=[float(a[row]) for a in n["aspheric"]],
+            absorption=float(n["absorption"][0, step]) if self._absorbs else None,
+            passed=passed if light else None,
+        )
+
+    def _meet(
+        self, at: Any, x: Any, y: Any, z: Any, dx: Any, dy: Any, dz: Any, share: Any, radius: Any, margin: Any
+    ) -> tuple[Any, ...]:
+        """On to the next surface of the path, and off it: refracted or reflected."""
+        dr = backend().dr
+        c, eta, mirror = at.curvature, at.eta, at.mirror
+        z = z + at.gap
+        if self._special:
+            # to the plane of the vertex, then to the surface
+            to_plane = -z / dz
+            x, y = dr.fma(to_plane, dx, x), dr.fma(to_plane, dy, y)
+            a = c * (dx * dx + dy * dy + at.conic * dz * dz)
+            b = c * (x * dx + y * dy) - dz
+            e = c * (x * x + y * y)
+            under = b * b - a * e
+            t_hit = e / (-b + dr.copysign(dr.sqrt(dr.maximum(under, 0)), dz))
+            x, y, z = dr.fma(t_hit, dx, x), dr.fma(t_hit, dy, y), t_hit * dz
+            length = t_hit + to_plane
+            nx, ny, nz = c * x, c * y, c * at.conic * z - 1
+            if at.aspheric:
+                x, y, z, nx, ny, nz, more = self._to_asphere(at, x, y, z, dx, dy, dz)
+                length = length + more
+            norm = dr.rsqrt(nx * nx + ny * ny + nz * nz)
+            along_normal = (nx * dx + ny * dy + nz * dz) * norm
+            # the normal towards where the ray comes from
+            norm = dr.select(along_normal > 0, -norm, norm)
+            cosine = dr.minimum(dr.abs(along_normal), 1)
+        else:
+            # a sphere: its normal has length 1, and the root is the angle's cosine
+            b = dz - c * dr.fma(x, dx, dr.fma(y, dy, z * dz))
+            e = dr.fma(c, dr.fma(x, x, dr.fma(y, y, z * z)), -2 * z)
+            under = dr.fma(b, b, -c * e)
+            root = dr.sqrt(dr.maximum(under, 0))
+            length = e / (b + dr.copysign(root, dz))
+            x, y, z = dr.fma(length, dx, x), dr.fma(length, dy, y), dr.fma(length, dz, z)
+            nx, ny, nz = c * x, c * y, dr.fma(c, z, -1)
+            norm = dr.copysign(1, dz)
+            cosine = dr.minimum(root, 1)
+        nx, ny, nz = nx * norm, ny * norm, nz * norm
+        if at.absorption is not None:
+            share = share * dr.exp(-at.absorption * dr.abs(length))
+        # the square of what lies beyond a rim grows by twice as much
+        beyond = dr.fma(x, x, y * y) * (at.per_rim * at.per_rim)
+        if self._bladed and at.stop is not False:
+            blade = self._within_blades(x, y)
+            beyond = dr.select(at.stop, blade * blade, beyond)
+        left = 1 - eta * eta * (1 - cosine * cosine)
+        out_cosine = dr.sqrt(dr.maximum(left, 0))
+        if at.passed is not None:
+            passed = at.passed(dr.minimum(dr.select(eta > 1, out_cosine, cosine), 1))
+            share = share * dr.select((left < 0) & mirror, 1, passed)
+        turn = dr.select(mirror, 2 * cosine, eta * cosine - out_cosine)
+        keep = dr.select(mirror, 1, eta)
+        onward = dr.copysign(dr.select(mirror, -1.0, 1.0), dr.select(mirror, -dz, dz))
+        dx, dy, dz = dr.fma(turn, nx, keep * dx), dr.fma(turn, ny, keep * dy), dr.fma(turn, nz, keep * dz)
+        # lost too: a surface missed, light all reflected, a ray turned back; on it goes, along the limit, so that
+        # between rays it is known where that began
+        left = dr.select(mirror, 1, left)
+        room = dr.minimum(dr.minimum(under, left), 4 * dz * onward)
+        dz = onward * dr.maximum(dz * onward, _LEAST_SLOPE)
+        radius = dr.maximum(radius, dr.maximum(beyond, 1 - room))
+        margin = dr.minimum(margin, dr.minimum((1 - beyond) * (0.5 * at.sharpness), room * _LIMIT_SHARPNESS))
+        return x, y, z, dx, dy, dz, share, radius, margin
+
     def _start(self, rays: Rays, across: int, centred: bool) -> Any:
         """Place, direction, route and wavelength of every ray, on the device."""
         be = backend()
         dr = be.dr
-        square = dr.opaque(be.UInt32, across * across)
+        # whole divisions by a number that the kernel knows are cheap, by others they take longer than a surface
         each = dr.arange(be.UInt32, len(rays) * across * across)
-        bundle = each // square
-        cell = each - bundle * square
-        iy = cell // dr.opaque(be.UInt32, across)
-        ix = cell - iy * dr.opaque(be.UInt32, across)
+        bundle = each // (across * across)
+        cell = each - bundle * (across * across)
+        alone = len(rays) == 1
+        iy = cell // across
+        ix = cell - iy * across
         offset, spacing = (0.5, 2 / across) if centred else (0.0, 2 / (across - 1))
         offset, spacing = dr.opaque(be.Float, offset), dr.opaque(be.Float, spacing)
 
         def given(values: F64) -> Any:
+            if alone:
+                return dr.opaque(be.Float, float(values[0]))
             return dr.gather(be.Float, be.Float(np.ascontiguousarray(values, dtype=np.float32)), bundle)
 
         def whole(values: NDArray[Any]) -> Any:
+            if alone:
+                return dr.opaque(be.UInt32, int(values[0]))
             return dr.gather(be.UInt32, be.UInt32(np.ascontiguousarray(values, dtype=np.uint32)), bundle)
 
         x, y, half_x, half_y = (given(c) for c in rays.box_mm.T)
@@ -412,13 +490,11 @@ class Tracer:
         other._stop_turn_rad = float(np.radians(rim.rotation_deg) - azimuth_rad)
         return other
 
-    def _to_asphere(
-        self, row: Any, c: Any, conic: Any, x: Any, y: Any, z: Any, dx: Any, dy: Any, dz: Any
-    ) -> tuple[Any, ...]:
+    def _to_asphere(self, at: Any, x: Any, y: Any, z: Any, dx: Any, dy: Any, dz: Any) -> tuple[Any, ...]:
         """From a conic to the asphere beside it, by Newton's method: place, normal, and how far it was."""
         be = backend()
         dr = be.dr
-        terms = [dr.gather(be.Float, a, row) for a in self._tables["aspheric"]]
+        c, conic, terms = at.curvature, at.conic, at.aspheric
         way = 0 * x
         for k in range(5):
             r2 = x * x + y * y
@@ -644,8 +720,11 @@ def _peaks(made: Tracer, rays: Rays) -> F64:
     return np.asarray(found, dtype=np.float64)
 
 
-def surface_interactions_per_second(lens: Prescription, rays: int = 1_000_000, rounds: int = 5) -> float:
-    """Surfaces met per second by rays sent straight through the lens, in whole calls, median of rounds."""
+def surface_interactions_per_second(
+    lens: Prescription, rays: int = 1_000_000, rounds: int = 5, *, light: bool = False
+) -> float:
+    """Surfaces met per second by rays sent straight through the lens, in whole calls, median of rounds; with
+    `light` what each surface passes is told too."""
     import time
 
     made = Tracer(lens, np.array([D_NM]), routes_=[()])
@@ -660,7 +739,7 @@ def surface_interactions_per_second(lens: Prescription, rays: int = 1_000_000, r
     be, seconds = backend(), []
     for _ in range(rounds + 1):
         start = time.perf_counter()
-        made.trace(bundle, across)
+        made.trace(bundle, across, light=light)
         be.dr.sync_thread()
         seconds.append(time.perf_counter() - start)
     return across * across * len(lens.surfaces) / float(np.median(seconds[1:]))

@@ -53,7 +53,7 @@ _STRIP = 64  # rows of a frame at a time
 _ROW_BLUR = 0.5  # of fringes, in steps of the table
 _NARROW = 1 / 8  # disc over distance from which a sine is its angle
 _WING_SUNS = 12.0  # distance from an edge's normal, in radii of the disc, from which cot² needs no average
-_WING_STEP, _WING_POINTS, _WING_PLACES = 0.05, 1200, 481
+_WING_STEP, _WING_POINTS, _WING_PLACES = 0.05, 1200, 241
 _STRAIGHT_PER_MM = 1e-9
 _LEAST_CORNER_RAD = 1e-3
 _LONE_BAND_NM = 150.0  # half width of what a single band stands for, as in vbnfault.spectra
@@ -241,15 +241,15 @@ class Starburst:
             gain[direct] = 0
             angle = np.arctan2(np.abs(dv), np.copysign(du, du * dv)) * np.float32(self.angles / np.pi)
             row = (np.log(apart) - np.float32(2 * np.log(nearest))) * per_log
-            part = part[:, : strip.shape[1]]
-            for layer, table in zip(part, tables, strict=True):
+            layers = part[:, : strip.shape[1]] if len(tables) < len(mix) else strip
+            for layer, table in zip(layers, tables, strict=True):
                 cv2.remap(table, angle, row, cv2.INTER_LINEAR, dst=layer, borderMode=cv2.BORDER_REPLICATE)
                 layer *= gain
-            for band, shares in zip(strip, mix, strict=True):
-                first, *rest = np.flatnonzero(shares)
-                np.multiply(part[first], shares[first], out=band)
-                for k in rest:
-                    cv2.scaleAdd(part[k], float(shares[k]), band, dst=band)
+            if len(tables) < len(mix):
+                for band, (first, *rest) in zip(strip, mix, strict=True):
+                    np.multiply(layers[0], first, out=band)
+                    for layer, share in zip(layers[1:], rest, strict=True):
+                        cv2.scaleAdd(layer, float(share), band, dst=band)
         return out
 
     def _sines(self, pitch_mm: float) -> F64:
@@ -444,20 +444,25 @@ def _corner(
     radius = float(np.hypot(burst.sun_radius_rad, 2 * pixel_rad))
     per_radius = sine[:, None] / radius
     y = (np.arange(_WING_POINTS) + 0.5) * _WING_STEP
-    q = np.linspace(-_WING_SUNS, _WING_SUNS, _WING_PLACES)
+    q = np.linspace(0, _WING_SUNS, _WING_PLACES)
     s = y * burst.sun_radius_rad / radius
     # without the last factor, a twentieth of a radius, the limb would leave a cusp
     coherence = 2 * j1(s) / s * np.exp(-((y * pixel_rad / radius) ** 2 + (0.05 * y) ** 2) / 2) * _WING_STEP
-    wave = np.exp(1j * y[:, None] * q)
+    sines, cosines = np.sin(y[:, None] * q), np.cos(y[:, None] * q)
+
+    def integral(of: NDArray[Any]) -> F64:
+        """Im ∫ μ(y) of(y) exp(iqy) dy at -q and q."""
+        odd, even = (coherence * of.real) @ sines, (coherence * of.imag) @ cosines
+        return np.concatenate([(even - odd)[..., :0:-1], even + odd], axis=-1)
+
     if curvature_per_mm > _STRAIGHT_PER_MM:
         tau = (curvature_per_mm * sine * wavelength_mm[:, None] / (4 * np.pi * radius**2))[..., None]
         chirp = np.exp(1j * tau * y**2)
-        square = -((coherence * (chirp - 1) / (tau * y)) @ wave).imag
-        single = ((coherence * chirp / (1 + tau * y / (per_radius * np.sin(opening)))) @ wave).imag
+        square = -integral((chirp - 1) / (tau * y))
+        single = integral(chirp / (1 + tau * y / (per_radius * np.sin(opening))))
     else:
-        square = -((coherence * 1j * y) @ wave).imag[None, None]
-        single = (coherence @ wave).imag[None, None]
-    places = (len(wavelength_mm), len(sine), len(q))
+        square, single = -integral(1j * y[None, None]), integral(np.ones((1, 1, len(y)), dtype=np.complex128))
+    places = (len(wavelength_mm), len(sine), 2 * len(q) - 1)
     kernels = [np.ascontiguousarray(np.broadcast_to(kernel, places)) for kernel in (single, square)]
 
     angle = np.arange(burst.angles // 2 + 1) * np.pi / burst.angles  # the other half is its mirror image
@@ -466,8 +471,8 @@ def _corner(
         psi = np.mod(psi + np.pi / 2, np.pi) - np.pi / 2
         at = per_radius * np.sin(psi)
         near = np.nonzero(np.abs(at) < _WING_SUNS)
-        place = (at[near] + _WING_SUNS) * ((len(q) - 1) / (2 * _WING_SUNS))
-        below = np.minimum(place.astype(np.intp), len(q) - 2)
+        place = (at[near] + _WING_SUNS) * ((len(q) - 1) / _WING_SUNS)
+        below = np.minimum(place.astype(np.intp), 2 * len(q) - 3)
         part = place - below
         with np.errstate(divide="ignore"):
             inverse = 1 / at
