@@ -791,6 +791,11 @@ def configure_faults(scene: SceneConfig, source: str = "scene") -> dict[str, Fau
     for name in scene.faults:
         from_dict(name, scene.faults[name], source=source)  # unknown classes first: they cannot be ordered
     faults = {n: from_dict(n, scene.faults[n], source=source) for n in dataset_order(scene.faults)}
+    if scene.camera.lens and "vignetting" in faults and faults["vignetting"].model == "cos4":
+        raise InputError(
+            f"{source}: faults.vignetting.model = 'cos4': with camera.lens = {scene.camera.lens!r} pictures fall "
+            "off as its rays do, and cos⁴ would count that twice; use model 'lens'"
+        )
     for layer in scene.dataset.layers:
         if layer.startswith("without_") and layer != "without_straylight" and layer[8:] not in faults:
             raise InputError(f"{source}: dataset.layers: {layer!r}: the scene has no such fault")

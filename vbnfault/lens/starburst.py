@@ -205,7 +205,8 @@ class Starburst:
         ----------
         sun_xy_mm
             Image of the Sun's centre, from the middle of the frame, x to the right and y down (the lens's own x and
-            y); it may lie outside the frame. Within the Sun's own image and a pixel around it the result is 0.
+            y); it may lie outside the frame. Within the Sun's own image the value is that next to it: the direct image,
+            which is drawn elsewhere, outshines it.
         wavelength_nm
             Band nodes, float64[band], rising. A band is a hat that ends at its neighbours.
         shape, pitch_mm
@@ -233,12 +234,10 @@ class Starburst:
             cosine = 1 / np.sqrt((1 + x * x) + y * y)
             du, dv = x * cosine - sun_u, y * cosine - sun_v
             apart = du * du + dv * dv
-            direct = apart + (cosine - np.float32(sun_cos)) ** 2 < (sigma + pitch_mm / f) ** 2
             # next to a foreshortened Sun u can lie within the circle that the table takes for the disc
             apart = np.maximum(apart, np.float32(nearest**2))
             cosine *= cosine
             gain = cosine * cosine * np.float32(sun_cos / f**2) / (apart - np.float32(sigma**2))
-            gain[direct] = 0
             angle = np.arctan2(np.abs(dv), np.copysign(du, du * dv)) * np.float32(self.angles / np.pi)
             row = (np.log(apart) - np.float32(2 * np.log(nearest))) * per_log
             layers = part[:, : strip.shape[1]] if len(tables) < len(mix) else strip
