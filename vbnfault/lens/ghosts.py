@@ -8,8 +8,8 @@ Single precision: a ray's place is kept relative to the vertex it has just met.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from itertools import combinations
 from types import SimpleNamespace
@@ -31,7 +31,8 @@ Steps = tuple[tuple[int, bool], ...]
 
 _COSINES = 256  # nodes of the reflectance tables
 _COARSE = 25  # rays across a box while boxes are sought
-_FINE = 512  # rays across a box where flux and place are told
+_FINE = 560  # rays across a box where flux and place are told
+_STEEP = 0.3  # rise of the radius over a cell
 _PEAK = 64  # and where the peak is sought
 _TOGETHER = 1 << 22  # rays at a time there, for the memory's sake
 _LOST, _FAR = -1e6, -1e4
@@ -429,7 +430,7 @@ class Tracer:
         left = dr.select(mirror, 1, left)
         room = dr.minimum(dr.minimum(under, left), 4 * dz * onward)
         dz = onward * dr.maximum(dz * onward, _LEAST_SLOPE)
-        radius = dr.maximum(radius, dr.maximum(beyond, 1 - room))
+        radius = dr.maximum(radius, dr.select(room < 0, 1e6, beyond))
         margin = dr.minimum(margin, dr.minimum((1 - beyond) * (0.5 * at.sharpness), room * _LIMIT_SHARPNESS))
         return x, y, z, dx, dy, dz, share, radius, margin
 
@@ -651,14 +652,19 @@ def traced_ghosts(
     wavelength_nm: float = D_NM,
     reflections: int = 2,
     across: int = _FINE,
+    only: Collection[tuple[int, ...]] | None = None,
 ) -> tuple[Ghost, ...]:
     """Ghosts of a far point source by exact rays, as `paraxial.paraxial_ghosts` tells them.
 
-    `across` rays span each ghost's box either way. The peak is the largest irradiance of a cell of that grid.
+    `across` rays span each ghost's box either way; `only` these pairs of rows. The peak is the largest irradiance
+    of a cell of a coarser grid.
     """
     turn = np.radians(azimuth_deg)
     made = tracer(lens, (float(wavelength_nm),), reflections).turned(turn)
     rays, _ = made.boxes(sun_deg)
+    if only is not None:
+        chosen = {tuple(sorted(pair)) for pair in only}
+        rays = rays.take(np.array([tuple(sorted(made.routes[r])) in chosen for r in rays.route], dtype=bool))
     if not len(rays):
         return ()
     return told(made, rays, sun_deg, turn, across)
@@ -678,17 +684,22 @@ def told(made: Tracer, rays: Rays, sun_deg: float, turn_rad: float, across: int)
 def _told(made: Tracer, rays: Rays, across: int, turn: float, pupil_mm2: float, cosine: float) -> list[Ghost]:
     be = backend()
     dr, Double = be.dr, be.Double
+    whole, mirrored = rays, not made.lens.surfaces[made.lens.stop].blades
+    if mirrored:
+        # with a round stop both sides of the plane of axis and Sun are alike: one side, twice as finely
+        half = (np.abs(rays.box_mm[:, 1]) + rays.box_mm[:, 3]) / 2
+        rays = replace(rays, box_mm=np.column_stack([rays.box_mm[:, 0], half, rays.box_mm[:, 2], half]))
     spots = made.trace(rays, across, centred=True)
-    weight = Double(dr.select(spots.radius <= 1, spots.share, 0))
+    weight = Double(spots.share * _inside(spots.radius, across))
     x, y = Double(spots.x_mm), Double(spots.y_mm)
     parts = (weight, weight * x, weight * y, weight * (x * x + y * y))
     dr.eval(*parts)
     total, mx, my, square = (dr.block_sum(v, across * across).numpy() for v in parts)
-    cell = 4 * rays.box_mm[:, 2] * rays.box_mm[:, 3] / across**2
-    peak = _peaks(made, rays) * cosine
+    cell = (1 + mirrored) * 4 * rays.box_mm[:, 2] * rays.box_mm[:, 3] / across**2
+    peak = _peaks(made, whole) * cosine
     out = []
     for k in np.flatnonzero(total > 0):
-        cx, cy = mx[k] / total[k], my[k] / total[k]
+        cx, cy = mx[k] / total[k], 0.0 if mirrored else my[k] / total[k]
         place = (cx * np.cos(turn) - cy * np.sin(turn), cx * np.sin(turn) + cy * np.cos(turn))
         out.append(
             Ghost(
@@ -700,6 +711,23 @@ def _told(made: Tracer, rays: Rays, across: int, turn: float, pupil_mm2: float, 
             )
         )
     return out
+
+
+def _inside(radius: Any, across: int) -> Any:
+    """How much of each cell of a grid lies within the rims: all or nothing but for cells that a rim crosses."""
+    be = backend()
+    dr = be.dr
+    each = dr.arange(be.UInt32, dr.width(radius))
+    row = each // across
+    ix, iy = each - row * across, row % across
+    rise: Any = 0.0
+    for at, step in ((ix, 1), (iy, across)):
+        before = dr.gather(be.Float, radius, dr.select(at > 0, each - step, each))
+        behind = dr.gather(be.Float, radius, dr.select(at < across - 1, each + step, each))
+        rise = rise + dr.abs(behind - before) * 0.5
+    part = dr.clip(0.5 + (1 - radius) / dr.maximum(rise, 1e-9), 0, 1)
+    # where the radius jumps a ray was lost elsewhere, and its slope means nothing
+    return dr.select(rise < _STEEP, part, dr.select(radius <= 1, 1.0, 0.0))
 
 
 def _peaks(made: Tracer, rays: Rays) -> F64:

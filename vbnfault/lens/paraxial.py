@@ -35,7 +35,7 @@ class Ghost:
         The reflecting rows, the one nearer the front first.
     flux_fraction
         Flux on the unbounded sensor plane over source irradiance × cos(angle) × area of the paraxial entrance
-        pupil.
+        pupil at the d line.
     centroid_mm, rms_radius_mm
         On the sensor, from the axis, and about the centroid.
     peak_irradiance_fraction
@@ -118,7 +118,7 @@ def paraxial_ghosts(
     are left out."""
     turn = np.radians(azimuth_deg)
     slope = np.tan(np.radians(sun_deg)) * np.array([np.cos(turn), np.sin(turn)])
-    pupil = np.pi / 4 * first_order(lens, wavelength_nm).entrance_pupil_diameter_mm ** 2
+    pupil = np.pi / 4 * first_order(lens).entrance_pupil_diameter_mm ** 2
     side = (np.arange(_GRID) + 0.5) / _GRID * 2 - 1
     square = np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2)
     found = []

@@ -46,8 +46,9 @@ class Path:
 
     @property
     def arrives(self) -> NDArray[np.bool_]:
-        """bool[n]: not lost."""
-        return np.isfinite(self.points_mm[-1, :, 0]) & (self.relative_radius <= 1)
+        """bool[n]: not lost, and on the way to the sensor at the end."""
+        there = np.isfinite(self.points_mm[-1, :, 0]) & (self.directions[:, 2] > 0)
+        return np.asarray(there & (self.relative_radius <= 1))
 
 
 def forward(lens: Prescription) -> tuple[tuple[int, bool], ...]:
