@@ -556,7 +556,11 @@ def test_a_thin_lens_has_neither_distortion_nor_guard_band() -> None:
 
 def test_samples_of_a_scene_with_a_lens() -> None:
     """Render, picture and labels of a small frame: all on the picture's grid, and on each other's pixels."""
-    session = pipeline.Session(scene(lens="nikkor_28_f2p8", lens_coating="mgf2"))
+    settings = scene(lens="nikkor_28_f2p8", lens_coating="mgf2")
+    with pytest.raises(InputError, match=r"vignetting\.model = 'cos4'.*would count that twice"):
+        pipeline.Session(settings)
+    faults = settings.faults | {"vignetting": {"model": "lens"}}
+    session = pipeline.Session(settings.model_copy(update={"faults": faults}))
     c = session.base_camera
     spec = dataset.store_spec(session, [16])
     assert spec.lens_names == ("AF Nikkor 28 mm f/2.8D",)

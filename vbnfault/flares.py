@@ -110,18 +110,17 @@ def ghosts(view: View, progress: Callable[[float], None] | None = None) -> tuple
 
 
 def _ghosts_at(view: View, wavelength_nm: float, *, alone: bool) -> tuple[Ghost, ...]:
-    from .lens.ghosts import traced_ghosts
+    from .lens.ghosts import FINE, traced_ghosts
 
     if view.model == "paraxial":
         return paraxial_ghosts(view.lens, view.sun_deg, azimuth_deg=view.azimuth_deg, wavelength_nm=wavelength_nm)
-    more = {} if alone else {"across": _ACROSS_SPECTRUM}
     return traced_ghosts(
         view.lens,
         view.sun_deg,
         azimuth_deg=view.azimuth_deg,
         wavelength_nm=wavelength_nm,
         reflections=view.reflections,
-        **more,
+        across=FINE if alone else _ACROSS_SPECTRUM,
     )
 
 

@@ -58,7 +58,9 @@ class FirstOrderTracer(Tracer):
             "share": be.Float(shares.T.astype(np.float32).ravel()),
         }
 
-    def trace(self, rays: Rays, across: int, width: F64 | None = None, *, centred: bool = False) -> Spots:
+    def trace(
+        self, rays: Rays, across: int, width: F64 | None = None, *, centred: bool = False, light: bool = True
+    ) -> Spots:
         """As `Tracer.trace`, to first order; the Sun's slope is its tangent."""
         be, t, f = backend(), self._tables, self._first_order
         dr = be.dr
@@ -95,7 +97,7 @@ class FirstOrderTracer(Tracer):
         spots = Spots(
             x_mm=dr.fma(m00, x, m01 * sx),
             y_mm=dr.fma(m00, y, m01 * sy),
-            share=dr.gather(be.Float, f["share"], of),
+            share=dr.select(radius >= 0, dr.gather(be.Float, f["share"], of), 0),  # one a ray
             radius=radius,
             margin=margin,
         )

@@ -31,7 +31,7 @@ Steps = tuple[tuple[int, bool], ...]
 
 _COSINES = 256  # nodes of the reflectance tables
 _COARSE = 25  # rays across a box while boxes are sought
-_FINE = 560  # rays across a box where flux and place are told
+FINE = 560  # rays across a box where flux and place are told
 _STEEP = 0.3  # rise of the radius over a cell
 _PEAK = 64  # and where the peak is sought
 _TOGETHER = 1 << 22  # rays at a time there, for the memory's sake
@@ -651,7 +651,7 @@ def traced_ghosts(
     azimuth_deg: float = 0.0,
     wavelength_nm: float = D_NM,
     reflections: int = 2,
-    across: int = _FINE,
+    across: int = FINE,
     only: Collection[tuple[int, ...]] | None = None,
 ) -> tuple[Ghost, ...]:
     """Ghosts of a far point source by exact rays, as `paraxial.paraxial_ghosts` tells them.

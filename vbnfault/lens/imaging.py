@@ -21,7 +21,7 @@ a round one of the same area.
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property, lru_cache
 
 import cv2
@@ -391,15 +391,7 @@ class RealLens:
     @cached_property
     def _round(self) -> Prescription:
         """The prescription with a round stop."""
-        lens = self.prescription
-        stop = lens.surfaces[lens.stop]
-        if not stop.blades:
-            return lens
-        turn = np.linspace(0, 2 * np.pi, 3600, endpoint=False)
-        radius = float(np.sqrt(np.mean(stop.rim_mm(turn) ** 2)))
-        surfaces = list(lens.surfaces)
-        surfaces[lens.stop] = replace(stop, semi_diameter_mm=radius, blades=0)
-        return replace(lens, surfaces=tuple(surfaces))
+        return self.prescription.with_round_stop()
 
     @cached_property
     def _corner(self) -> float:

@@ -155,6 +155,17 @@ class Prescription:
         )
         return replace(self, surfaces=surfaces)
 
+    def with_round_stop(self) -> Prescription:
+        """Blades replaced by a round stop of the same area, for what knows no azimuth."""
+        rim = self.surfaces[self.stop]
+        if not rim.blades:
+            return self
+        turn = np.linspace(0, 2 * np.pi, 3600, endpoint=False)
+        radius = float(np.sqrt(np.mean(rim.rim_mm(turn) ** 2)))
+        surfaces = list(self.surfaces)
+        surfaces[self.stop] = replace(rim, semi_diameter_mm=radius, blades=0)
+        return replace(self, surfaces=tuple(surfaces))
+
     def coated(self, name: str) -> Prescription:
         """The lens with a named coating on every surface between glass and air. Raises InputError."""
         media = (AIR, *(s.medium for s in self.surfaces))

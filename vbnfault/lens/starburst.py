@@ -205,8 +205,8 @@ class Starburst:
         ----------
         sun_xy_mm
             Image of the Sun's centre, from the middle of the frame, x to the right and y down (the lens's own x and
-            y); it may lie outside the frame. Within the Sun's own image the value is that next to it: the direct image,
-            which is drawn elsewhere, outshines it.
+            y); it may lie outside the frame. Within the Sun's own image the value is that next to it: the direct
+            image, which is drawn elsewhere, outshines it.
         wavelength_nm
             Band nodes, float64[band], rising. A band is a hat that ends at its neighbours.
         shape, pitch_mm

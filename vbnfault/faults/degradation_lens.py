@@ -1,0 +1,301 @@
+"""Degraded optics by physics: a hazy film, scratches, glass browned by radiation, coatings worn off.
+
+    I' = T_c · [(1 - h - Σ s) · I + h · (I ∗ H) + Σ s · (I ∗ S)]     for each colour c
+
+- A film, of molecules that settled or of fine dust, turns the share h of the light away. Its BSDF is Harvey's,
+  b0 [1 + (β/L)²]^(S/2), over all angles of unit integral; on the sensor β is the sine of the angle, whose tangent is
+  the distance over the focal length.
+- A scratch of the width w turns the share s away that it takes of the beam on the front, across its own direction,
+  as a slit of its width diffracts: sinc²(π w β/λ), here its mean, a Lorentz curve of the half width λ/(2π w), which
+  falls alike. Scratches are bent, so that a streak fans out.
+- Glass darkens with dose by exp(-a0 D (λ0/λ)^p) a mm of its thickness on the axis (form of Appourchaux et al.
+  1994, Opt. Eng. 33, 1659, without saturation). The coefficients are assumed, of the size of what crown glasses
+  show (half of the light gone in 10 mm at 400 nm after 100 krad); in glasses stabilised with cerium, whose names
+  have a G and a number behind their type as in BK7G18, and in silica, they are a hundredth of that. Recovery is
+  left out.
+- Where a share of the coatings is gone, a surface reflects the mean of coated and bare, and the image loses that.
+
+T_c is the mean of what passes over the colour's response to sunlight. Light is the true light: the Sun in the
+frame, 10⁵ times white, floods it at a haze of a few per cent, as it would. What lies beyond the frame is taken to
+mirror it, without what is brighter than white; light that goes farther than a frame's width is lost.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft
+
+from .. import spectra
+from ..camera import Camera
+from ..lens import Prescription, load_lens
+from ..lens.coating import mean_reflectance
+from ..lens.footprint import Frame
+from ..lens.scatter import Harvey
+from .base import Fault, FaultContext, Interval, Params, bounds, choice, number, text
+
+F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
+
+_REFERENCE_NM = 400.0  # λ0 of browning
+_STREAK_NM = 550.0  # for the width of streaks
+_STABILISED = 0.01  # of the browning of ordinary glass
+_CELLS = 256  # places across a frame at which scattered light is told
+_SOFT_CELLS = 0.7  # least standard deviation of a streak's width
+_FINE = 8  # samples each way of a cell near the middle of a kernel
+
+
+@dataclass(frozen=True, kw_only=True)
+class Contamination(Fault):
+    """Haze, scratches, browning and lost coatings of a lens."""
+
+    fault = "optics_degradation"
+    model = "contamination"
+    step = "electrons"
+    localised = False
+
+    lens: str = text(
+        "",
+        doc="path of a prescription or name of a packaged lens, scaled to the camera's focal length; default: the "
+        "camera's own, or nikkor_35_f2p8 where that is a thin lens",
+    )
+    coating: str = choice(
+        "mgf2", ("as_prescribed", "none", "mgf2", "v", "bbar"), doc="of surfaces between glass and air, when whole"
+    )
+    haze: Interval = bounds(0.01, 0.1, limits=(0, 0.9), doc="share of the light that a film scatters")
+    haze_knee: Interval = bounds(
+        0.01, 0.05, limits=(1e-3, 1), unit="rad", doc="L of the film's BSDF: where its fall begins"
+    )
+    haze_slope: Interval = bounds(-2.5, -1.8, limits=(-4, 0), doc="S of the film's BSDF in double logarithms")
+    scratches: Interval = bounds(0, 5, limits=(0, 50), integer=True, doc="number of scratches on the front")
+    scratch_width_um: Interval = bounds(2, 15, limits=(0.1, 1e3), unit="µm", doc="of a scratch")
+    scratch_length: Interval = bounds(
+        0.3, 1.0, limits=(0, 1), unit="beam diameters", doc="of a scratch, as far as it lies in the beam"
+    )
+    scratch_bend_deg: float = number(
+        1.5, limits=(0.1, 45), unit="deg", doc="standard deviation of a scratch's direction along it"
+    )
+    dose_krad: Interval = bounds(0, 100, limits=(0, 1e5), unit="krad", doc="of radiation in the glass")
+    browning_per_mm_krad: float = number(
+        7e-4, limits=(0, 1), unit="1/(mm krad)", doc="a0, absorption of ordinary glass at 400 nm; assumed"
+    )
+    browning_exponent: float = number(
+        4.0, limits=(0, 12), doc="p of the fall of that absorption with wavelength; assumed"
+    )
+    coating_loss: Interval = bounds(0.0, 0.3, limits=(0, 1), doc="share of the coatings' area that is gone")
+
+    def validate(self) -> None:
+        if self.lens:
+            load_lens(self.lens)
+
+    def draw(self, context: FaultContext, rng: np.random.Generator) -> Params:
+        """Lens and coating; the haze; of each scratch the direction from +x towards +y, width and share of the
+        beam; dose, coefficients and loss."""
+        frame = _frame(context.camera)
+        beam_mm = frame.lens.focal_length_mm / frame.lens.f_number
+        params: Params = {"lens": self.lens, "coating": self.coating}
+        for name in ("haze", "haze_knee", "haze_slope", "dose_krad", "coating_loss"):
+            params[name] = getattr(self, name).uniform(rng)
+        scratches = []
+        for _ in range(self.scratches.integer(rng)):
+            width, length = self.scratch_width_um.uniform(rng), self.scratch_length.uniform(rng)
+            share = width * 1e-3 * length * beam_mm / (np.pi / 4 * beam_mm**2)
+            angle = rng.uniform(0, 180)
+            scratches.append({"angle_deg": float(angle), "width_um": width, "share": float(share)})
+        most = (1 - params["haze"]) / 2
+        too_much = max(1.0, sum(s["share"] for s in scratches) / most)
+        params["scratches"] = [s | {"share": s["share"] / too_much} for s in scratches]
+        for name in ("scratch_bend_deg", "browning_per_mm_krad", "browning_exponent"):
+            params[name] = float(getattr(self, name))
+        return params
+
+    def apply(self, quantity: Any, params: Params, context: FaultContext) -> Any:
+        """Expected electrons, scattered and darkened."""
+        passes = colours(params, context)
+        lost = params["haze"] + sum(s["share"] for s in params["scratches"])
+        out = cv2.multiply(quantity.array, (*(passes * (1 - lost)).tolist(), 0.0))
+        if lost:
+            strewn = _strewn(quantity.array, quantity.white_e, params, _frame(context.camera))
+            out = cv2.add(out, cv2.multiply(strewn, (*passes.tolist(), 0.0)))
+        return quantity.with_array(out)
+
+    def footprint(self, params: Params, context: FaultContext) -> NDArray[np.bool_]:
+        """bool[y, x]: the whole image."""
+        return np.ones(context.shape, dtype=bool)
+
+
+def _frame(camera: Camera) -> Frame:
+    return Frame(
+        lens=camera.lens,
+        width_px=camera.width_px,
+        height_px=camera.height_px,
+        pixel_pitch_um=camera.detector.pixel_pitch_um,
+    )
+
+
+# --- what passes -----------------------------------------------------------------------------------------------
+
+
+def stabilised(glass: str) -> bool:
+    """Whether radiation hardly browns a glass of that name: BK7G18 and its like, and silica."""
+    return glass == "silica" or re.search(r"\dG\d+$", glass) is not None
+
+
+def browned(
+    lens: Prescription, wavelength_nm: F64, *, dose_krad: float, per_mm_krad: float, exponent: float
+) -> F64:
+    """Share of the light along the axis that browned glass lets pass, of what it did when new, float64[band]."""
+    depth = 0.0
+    for surface in lens.surfaces[:-1]:
+        if surface.medium.nd > 1.0:
+            depth += surface.thickness_mm * (_STABILISED if stabilised(surface.medium.name) else 1.0)
+    return np.asarray(np.exp(-depth * per_mm_krad * dose_krad * (_REFERENCE_NM / wavelength_nm) ** exponent))
+
+
+@lru_cache(maxsize=8)
+def _reflectances(lens: Prescription, wavelength_nm: tuple[float, ...]) -> tuple[F64, F64]:
+    """Of every surface at normal incidence, coated and bare, float64[row, band] each."""
+    nodes = np.array(wavelength_nm)
+    media = [np.ones_like(nodes), *(surface.medium.index(nodes) for surface in lens.surfaces)]
+    coated, bare = (
+        np.stack(
+            [
+                mean_reflectance(surface.coating if whole else (), front, back, 1.0, nodes)
+                for surface, front, back in zip(lens.surfaces, media[:-1], media[1:], strict=True)
+            ]
+        )
+        for whole in (True, False)
+    )
+    return coated, bare
+
+
+def surface_reflectances(lens: Prescription, wavelength_nm: F64, coating_loss: float) -> F64:
+    """Of every surface at normal incidence, a share of the coatings' area gone, float64[row, band]."""
+    coated, bare = _reflectances(lens, tuple(float(w) for w in wavelength_nm))
+    return np.asarray(coated + coating_loss * (bare - coated))
+
+
+def worn(lens: Prescription, wavelength_nm: F64, coating_loss: float) -> F64:
+    """Share of the light that passes worn coatings, of what passed when they were whole, float64[band]."""
+    passes, passed = (1 - surface_reflectances(lens, wavelength_nm, loss) for loss in (coating_loss, 0.0))
+    return np.asarray(np.prod(passes / passed, axis=0))
+
+
+def colours(params: Params, context: FaultContext) -> F64:
+    """What passes of red, green and blue sunlight, float64[3]."""
+    nodes, sun = context.wavelength_nm, context.sun_irradiance_W_m2_nm
+    if nodes is None or sun is None:
+        nodes = spectra.band_nodes_nm(400.0, 700.0, 8)
+        sun = spectra.solar_band_irradiance_W_m2_nm(nodes, 1.0)
+    lens = _coated(_frame(context.camera).real_lens(params["lens"]).prescription, params["coating"])
+    passes = worn(lens, nodes, params["coating_loss"]) * browned(
+        lens,
+        nodes,
+        dose_krad=params["dose_krad"],
+        per_mm_krad=params["browning_per_mm_krad"],
+        exponent=params["browning_exponent"],
+    )
+    weights = context.camera.detector.electron_rate_weights(nodes) * sun
+    return np.asarray(weights @ passes / weights.sum(axis=1))
+
+
+@lru_cache(maxsize=8)
+def _coated(lens: Prescription, coating: str) -> Prescription:
+    return lens if coating == "as_prescribed" else lens.coated(coating)
+
+
+# --- what is scattered -----------------------------------------------------------------------------------------
+
+
+def haze_kernel(distance: NDArray, knee: float, slope: float) -> F64:
+    """The film's point spread, float64 like `distance` on the sensor from the image's place, near the axis, in focal
+    lengths; its integral over the plane is 1. The distance is a tangent: of the directions there the sine is β."""
+    square = np.asarray(distance, dtype=np.float64) ** 2 + 1
+    whole = Harvey(b0=1 / Harvey(b0=1.0, L=knee, S=slope).tis, L=knee, S=slope)
+    return whole.bsdf(np.sqrt(1 - 1 / square)) / square**2
+
+
+def scratch_kernel(
+    along: NDArray, across: NDArray, *, width_um: float, bend_rad: float, soft: float, cell: float
+) -> NDArray:
+    """A scratch's point spread, 1/sr, like the places along and across the streak, in focal lengths; the streak
+    lies across the scratch. `soft`: standard deviation of its width at its source; `cell`: over which length along
+    it the mean is taken. Its integral over the plane is 1."""
+    half = _STREAK_NM * 1e-3 / (2 * np.pi * width_um)
+    square = along * along
+    variance = square * bend_rad**2 + soft**2
+    fan = np.exp(across * across / (-2 * variance))
+    fan /= np.sqrt(variance * (2 * np.pi))
+    # the difference of the arcus tangents of both ends of the cell
+    fan *= np.arctan2(cell * half, square + (half**2 - cell**2 / 4))
+    fan *= 1 / (np.pi * cell)
+    return fan
+
+
+def _cell_px(frame: Frame) -> int:
+    return max(1, round(max(frame.width_px, frame.height_px) / _CELLS))
+
+
+def kernel(params: Params, frame: Frame, shape: tuple[int, int]) -> F32:
+    """Shares of the light of a cell that scatter to the cells of a periodic grid, float32[y, x], its own first."""
+    cell = _cell_px(frame) * frame.pixel_pitch_um * 1e-3 / frame.lens.focal_length_mm
+    y, x = (fft.fftfreq(n, 1 / n).astype(np.float32) * np.float32(cell) for n in shape)
+    out = (
+        params["haze"]
+        * cell**2
+        * haze_kernel(np.hypot(x[None, :], y[:, None]), params["haze_knee"], params["haze_slope"])
+    )
+    # near the middle a cell's mean is not its middle's value
+    reach = min(4, (min(shape) - 1) // 2)
+    fine = (np.arange((2 * reach + 1) * _FINE) + 0.5) / _FINE - reach - 0.5
+    near = haze_kernel(cell * np.hypot(fine[None, :], fine[:, None]), params["haze_knee"], params["haze_slope"])
+    near = near.reshape(2 * reach + 1, _FINE, 2 * reach + 1, _FINE).mean(axis=(1, 3))
+    at = np.arange(-reach, reach + 1)
+    out[at[:, None], at[None, :]] = params["haze"] * cell**2 * near
+    for scratch in params["scratches"]:
+        turn = np.radians(scratch["angle_deg"] + 90)
+        cos, sin = np.float32(np.cos(turn)), np.float32(np.sin(turn))
+        out += np.float32(scratch["share"] * cell**2) * scratch_kernel(
+            x[None, :] * cos + y[:, None] * sin,
+            y[:, None] * cos - x[None, :] * sin,
+            width_um=scratch["width_um"],
+            bend_rad=float(np.radians(params["scratch_bend_deg"])),
+            soft=_SOFT_CELLS * cell,
+            cell=cell,
+        )
+    return out.astype(np.float32)
+
+
+def _strewn(array: F32, white_e: F32, params: Params, frame: Frame) -> F32:
+    """Scattered light, float32[y, x, 3]."""
+    step = _cell_px(frame)
+    height, width = array.shape[:2]
+    rows, columns = -(-height // step), -(-width // step)
+    whole = cv2.copyMakeBorder(array, 0, rows * step - height, 0, columns * step - width, cv2.BORDER_REPLICATE)
+    cells = cv2.resize(whole, (columns, rows), interpolation=cv2.INTER_AREA)
+    # twice the frame: no two of its cells meet around the grid's far side
+    shape = (fft.next_fast_len(2 * rows, real=True), fft.next_fast_len(2 * columns, real=True))
+    top, left = (shape[0] - rows) // 2, (shape[1] - columns) // 2
+    around = cv2.copyMakeBorder(
+        np.minimum(cells, white_e),
+        top,
+        shape[0] - rows - top,
+        left,
+        shape[1] - columns - left,
+        cv2.BORDER_REFLECT,
+    )
+    around[top : top + rows, left : left + columns] = cells
+    planes = np.ascontiguousarray(np.moveaxis(around, -1, 0))
+    spread = fft.irfft2(fft.rfft2(planes) * fft.rfft2(kernel(params, frame, shape)), s=shape)
+    inner = np.moveaxis(spread[:, top - 1 : top + rows + 1, left - 1 : left + columns + 1], 0, -1)
+    inner = np.maximum(np.ascontiguousarray(inner), np.float32(0))
+    if step == 1:
+        return np.ascontiguousarray(inner[1:-1, 1:-1])
+    finer = cv2.resize(inner, ((columns + 2) * step, (rows + 2) * step), interpolation=cv2.INTER_LINEAR)
+    return np.ascontiguousarray(finer[step : step + height, step : step + width])

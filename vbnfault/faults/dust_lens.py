@@ -1,0 +1,500 @@
+"""Dust by physics: grains on a surface of the lens, or on the sensor's window, in the beams that cross them there.
+
+A pixel loses the share of its beam's footprint that grains cover (design from exact rays, `lens.footprint`):
+
+    τ = 1 - Σ (1 - t_g) · |grain ∩ footprint| / |footprint|.
+
+Before a pupil of the diameter D at a distance z a grain of the diameter d gives a shadow f (D + d) / z wide with a
+plateau f |D - d| / z wide and (d/D)² deep; at a height s over the sensor, in a cone of the f-number N, one that is
+d + s/N wide. Grains are discs across the axis, with the transmission t_g; colours lose alike.
+
+In the Sun a grain glows: it diffracts as much light as it takes, as a disc of its radius a does,
+
+    dσ/dΩ = (1 - t_g) k² a⁴ [J1(x) / x]²,   x = k a sin θ,
+
+averaged over radii within ±50 %, since a disc's rings are not seen of grains; and its outside reflects as a
+sphere's does, (1 - t_g) a²/4 R((π - θ)/2). A pixel whose beam crosses the grain receives E = E☉ T dσ/dΩ dΩ/dA
+(the form of Peterson 2004, Proc. SPIE 5178, 184, for a single grain), and no other: so grains on the front are
+bright discs near the Sun, outlined as their shadows are. Left out: glow of grains on the window, which is lost in
+the Sun's own image, and light that grains behind the first surface get from beside the beam that reaches the
+sensor.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import j1
+
+from ..camera import Camera
+from ..lens import RealLens, load_lens
+from ..lens.coating import reflect_transmit
+from ..lens.footprint import Footprint, Frame
+from ..lens.glass import D_NM
+from ..lens.paraxial import along
+from ..lens.scatter import DUST_INDEX
+from ..lens.trace import forward
+from .base import Fault, FaultContext, Interval, Params, bounds, number, text
+
+F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
+
+_DRAWN, _WINDOW = -1, -2
+_NODES = 129  # of the frame, each way, where a shadow is looked for
+_COARSEST = 8  # px between the places where a shadow is told
+_ERROR = 3e-4  # of the light: what interpolation between them may miss
+_OFFSETS: F64 = np.geomspace(1e-5, 2.0, 257)
+_LOOKUP = 1 << 14
+_RADII = 32  # over which a lobe is averaged
+_SMOOTH = 30.0  # k a sin θ from which on a lobe falls evenly
+
+
+@dataclass(frozen=True, kw_only=True)
+class DefocusedDust(Fault):
+    """Shadows of grains far out of focus, and their glow in the Sun."""
+
+    fault = "dust_on_optics"
+    model = "defocused"
+    step = "electrons"
+    localised = False
+
+    lens: str = text(
+        "",
+        doc="path of a prescription or name of a packaged lens, scaled to the camera's focal length and closed to "
+        "its f-number; default: the camera's own, or nikkor_35_f2p8 where that is a thin lens",
+    )
+    surface: int = number(
+        0,
+        limits=(_WINDOW, 99),
+        integer=True,
+        doc="row of the prescription that the grains lie on; -1: each grain on the front or on the sensor's "
+        "window, by chance; -2: all on the window",
+    )
+    count: Interval = bounds(20, 60, limits=(0, 1000), integer=True, doc="number of grains on the clear aperture")
+    diameter_um: Interval = bounds(
+        50, 300, limits=(0.1, 1e4), unit="µm", doc="smallest and largest diameter of a grain"
+    )
+    size_exponent: float = number(
+        1.0, limits=(0, 6), doc="p of the number of grains larger than D, ∝ D⁻ᵖ; 0: uniform in log D"
+    )
+    transmission: Interval = bounds(0.0, 0.3, limits=(0, 1), doc="share of the light that a grain lets pass")
+    window_height_mm: Interval = bounds(
+        0.3, 1.0, limits=(1e-3, 100), unit="mm", doc="of the window's dusty side above the sensor"
+    )
+    mask_loss: float = number(
+        0.01, limits=(1e-4, 1), doc="the mask holds the pixels that lose at least this fraction"
+    )
+
+    def validate(self) -> None:
+        if self.lens and self.surface >= (rows := len(load_lens(self.lens).surfaces)):
+            raise ValueError(f"surface = {self.surface}: {self.lens} has rows 0 to {rows - 1}")
+
+    def draw(self, context: FaultContext, rng: np.random.Generator) -> Params:
+        """Lens, row, height of the window, and columns of grains: `on_window`, place on the surface in mm from the
+        axis (x to the right, y down, as their shadows on the window lie), diameter in µm, transmission."""
+        frame = _frame(context.camera)
+        surfaces = frame.real_lens(self.lens).prescription.surfaces
+        row = min(max(int(self.surface), 0), len(surfaces) - 1)
+        count = self.count.integer(rng)
+        height = self.window_height_mm.uniform(rng)
+        by_chance = rng.random(count) < 0.5
+        on_window = by_chance if self.surface == _DRAWN else np.full(count, self.surface == _WINDOW)
+        largest = surfaces[row].semi_diameter_mm
+        radius, turn = largest * np.sqrt(rng.random(count)), rng.uniform(0, 2 * np.pi, count)
+        across = rng.uniform(-0.5, 0.5, (2, count))
+        size_mm = np.array([[frame.width_px], [frame.height_px]]) * frame.pixel_pitch_um * 1e-3
+        x, y = np.where(on_window, across * size_mm, radius * np.stack([np.cos(turn), np.sin(turn)]))
+        return {
+            "lens": self.lens,
+            "surface": row,
+            "window_height_mm": float(height),
+            "on_window": on_window.tolist(),
+            "x_mm": np.round(x, 5).tolist(),
+            "y_mm": np.round(y, 5).tolist(),
+            "diameter_um": np.round(
+                _power_law(rng.random(count), self.diameter_um, self.size_exponent), 3
+            ).tolist(),
+            "transmission": np.round(self.transmission.uniform(rng, count), 4).tolist(),
+            "mask_loss": float(self.mask_loss),
+        }
+
+    def apply(self, quantity: Any, params: Params, context: FaultContext) -> Any:
+        """Expected electrons times the transmission of all grains, plus their glow."""
+        factor = _shadows_once(params, context).transmission
+        out = cv2.multiply(quantity.array, cv2.merge([factor, factor, factor]))
+        light = context.once("dust.glow", params, lambda: _glow(params, context))
+        return quantity.with_array(out if light is None else cv2.add(out, light))
+
+    def footprint(self, params: Params, context: FaultContext) -> NDArray[np.bool_]:
+        """bool[y, x]: where the loss reaches `mask_loss`."""
+        factor = _shadows_once(params, context).transmission
+        return np.asarray(factor <= np.float32(1 - params["mask_loss"]))
+
+
+def _power_law(uniform: F64, diameter_um: Interval, exponent: float) -> F64:
+    """Diameters of which the number above D falls as D^-exponent, between the bounds."""
+    lo, hi = diameter_um
+    if exponent < 1e-9:
+        return np.asarray(lo * (hi / lo) ** uniform)
+    a, b = lo**-exponent, hi**-exponent
+    return np.asarray((a + (b - a) * uniform) ** (-1 / exponent))
+
+
+# --- geometry --------------------------------------------------------------------------------------------------
+
+
+def _frame(camera: Camera) -> Frame:
+    return Frame(
+        lens=camera.lens,
+        width_px=camera.width_px,
+        height_px=camera.height_px,
+        pixel_pitch_um=camera.detector.pixel_pitch_um,
+    )
+
+
+@lru_cache(maxsize=8)
+def _footprint(frame: Frame, name: str, row: int, height_mm: float) -> Footprint:
+    """On a row, or with a height in that plane above the sensor."""
+    found = frame.beams(name)
+    return found.above_sensor(height_mm) if height_mm else found.on_row(row)
+
+
+class _Grains(NamedTuple):
+    """Grains of one surface: places and radii in mm, share of light taken."""
+
+    x_mm: F64
+    y_mm: F64
+    radius_mm: F64
+    taken: F64
+
+
+def _grains(params: Params, on_window: bool) -> _Grains:
+    chosen = np.array(params["on_window"], dtype=bool) == on_window
+    names = ("x_mm", "y_mm", "diameter_um", "transmission")
+    x, y, diameter, passes = (np.asarray(params[n], dtype=np.float64)[chosen] for n in names)
+    return _Grains(x, y, diameter / 2e3, 1 - passes)
+
+
+# --- shadows ---------------------------------------------------------------------------------------------------
+
+
+class _Shadows(NamedTuple):
+    """`transmission` float32[y, x]; and sums over the grains on the row that the Sun lights of (1 - t) · share of
+    the grain in a pixel's beam · its radius, and its square, `seen` float32[2, y, x] in mm and mm²; None if it
+    lights none."""
+
+    transmission: F32
+    seen: F32 | None
+
+
+def _shadows_once(params: Params, context: FaultContext) -> _Shadows:
+    return context.once("dust.shadows", params, lambda: _shadows(params, context))
+
+
+def _shadows(params: Params, context: FaultContext) -> _Shadows:
+    frame = _frame(context.camera)
+    total: F32 | None = None
+    seen: F32 | None = None
+    for on_window in (False, True):
+        grains = _grains(params, on_window)
+        if not len(grains.x_mm):
+            continue
+        height = params["window_height_mm"] if on_window else 0.0
+        footprint = _footprint(frame, params["lens"], params["surface"], height)
+        lit = None if on_window else _lit(params, context, grains)
+        lost, seen_here = _sums(grains, footprint, frame, on_window, lit)
+        kept = np.maximum(np.float32(1) - lost, np.float32(0))
+        total = kept if total is None else total * kept
+        seen = seen if seen_here is None else seen_here
+    if total is None:
+        total = np.ones(context.shape, dtype=np.float32)
+    return _Shadows(total, seen)
+
+
+def _step_px(grains: _Grains, footprint: Footprint, frame: Frame) -> int:
+    """Distance of the places where shadows are told, a power of two, and linear between: the soft edge of a shadow
+    is as wide as the grain, or the beam if that is narrower."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        moves = np.abs(np.gradient(footprint.centre_mm, footprint.slope)).max()
+    focal_px = frame.lens.focal_length_mm * 1e3 / frame.pixel_pitch_um
+    beam_mm2 = float(np.median(footprint.area_mm2[footprint.area_mm2 > 0]))
+    edge_px = 2 * np.minimum(grains.radius_mm, np.sqrt(beam_mm2 / np.pi)) * focal_px / max(float(moves), 1e-9)
+    depth = grains.taken * np.minimum(np.pi * grains.radius_mm**2 / beam_mm2, 1)
+    # the edge rises over its width as a chord's area does: linear pieces miss 0.3 (step / width)^1.5 of it
+    step = float((edge_px * (_ERROR / np.maximum(0.3 * depth, 1e-12)) ** (2 / 3)).min())
+    return int(2 ** np.clip(np.floor(np.log2(max(step, 1))), 0, np.log2(_COARSEST)))
+
+
+def _sums(
+    grains: _Grains, footprint: Footprint, frame: Frame, on_window: bool, lit: F64 | None
+) -> tuple[F32, F32 | None]:
+    """Σ of shares taken, float32[y, x], and `seen` of `_Shadows`."""
+    height, width = frame.height_px, frame.width_px
+    step = _step_px(grains, footprint, frame)
+    # with places beyond the frame on all sides, so that those within lie between some
+    rows, columns = -(-height // step) + 2, -(-width // step) + 2
+    x_px, y_px = ((np.arange(n) - 0.5) * step for n in (columns, rows))
+    sums = np.zeros((1 if lit is None else 3, rows, columns), dtype=np.float32)
+    # few places are known at once; of many, those that each grain asks for
+    whole = footprint.places(*frame.slopes(x_px, y_px)) if step > 1 else None
+    for k, (top, bottom, left, right) in enumerate(_windows(grains, footprint, frame, x_px, y_px)):
+        if top >= bottom or left >= right:
+            continue
+        part = (slice(top, bottom), slice(left, right))
+        places = (
+            footprint.places(*frame.slopes(x_px[left:right], y_px[top:bottom]), light=not on_window)
+            if whole is None
+            else whole.part(part)
+        )
+        radius = float(grains.radius_mm[k])
+        # in a narrow cone near the sensor shadows are small, and footprints far from round at the frame's corners
+        cover = places.covered_nearby if on_window else places.covered
+        covered = cover(float(grains.x_mm[k]), float(grains.y_mm[k]), radius)
+        covered *= np.float32(grains.taken[k])
+        sums[0][part] += covered
+        if lit is not None and lit[k] > 0:
+            covered *= places.area_mm2
+            sums[1][part] += covered * np.float32(lit[k] / (np.pi * radius))
+            sums[2][part] += covered * np.float32(lit[k] / np.pi)
+    finer = [_finer(v, step, (height, width)) for v in sums]
+    return finer[0], None if lit is None else np.stack(finer[1:])
+
+
+def _windows(
+    grains: _Grains, footprint: Footprint, frame: Frame, x_px: NDArray, y_px: NDArray
+) -> list[tuple[int, int, int, int]]:
+    """Rows and columns, start and stop each, outside of which a grain touches no footprint."""
+    x, y = (np.linspace(v[0], v[-1], min(_NODES, len(v))) for v in (x_px, y_px))
+    places = footprint.places(*frame.slopes(x, y), light=False)
+    at_x, at_y = places.centre_mm * places.cos, places.centre_mm * places.sin
+    # from a node to any place nearer to it than to others
+    apart = sum(float(np.hypot(np.diff(at_x, axis=a), np.diff(at_y, axis=a)).max(initial=0)) for a in (0, 1))
+    reach = footprint.largest_mm + grains.radius_mm + 0.55 * apart
+    grain_x, grain_y, square = (v.astype(np.float32)[:, None, None] for v in (grains.x_mm, grains.y_mm, reach**2))
+    near: Any = (at_x - grain_x) ** 2 + (at_y - grain_y) ** 2 < square
+    near &= places.area_mm2 > 0
+    spans = []
+    for fine, coarse, touched in ((y_px, y, near.any(axis=2)), (x_px, x, near.any(axis=1))):
+        gap = coarse[1] - coarse[0] if len(coarse) > 1 else 1.0
+        first, last = touched.argmax(axis=1), touched.shape[1] - 1 - touched[:, ::-1].argmax(axis=1)
+        start = np.searchsorted(fine, coarse[first] - gap)
+        stop = np.where(touched.any(axis=1), np.searchsorted(fine, coarse[last] + gap, side="right"), 0)
+        spans += [start, stop]
+    return [(int(a), int(b), int(c), int(d)) for a, b, c, d in zip(*spans, strict=True)]
+
+
+def _finer(coarse: F32, step: int, shape: tuple[int, int]) -> F32:
+    """From places `step` apart, the first of them half a step outside, to pixels."""
+    if step == 1:
+        return np.ascontiguousarray(coarse[1:-1, 1:-1])
+    rows, columns = coarse.shape
+    whole = cv2.resize(coarse, (columns * step, rows * step), interpolation=cv2.INTER_LINEAR)
+    return np.ascontiguousarray(whole[step : step + shape[0], step : step + shape[1]])
+
+
+# --- glow ------------------------------------------------------------------------------------------------------
+
+
+class _Sun(NamedTuple):
+    """Slopes of its direction, and the direction; irradiance in the bands, W m⁻² nm⁻¹."""
+
+    slope: F64
+    direction: F64
+    wavelength_nm: F64
+    irradiance: F64
+    radius_rad: float
+
+
+def _sun(context: FaultContext) -> _Sun | None:
+    """None where it is unknown or gives no light."""
+    direction, irradiance = context.sun_direction_C, context.sun_irradiance_W_m2_nm
+    if direction is None or irradiance is None or context.wavelength_nm is None or direction[2] <= 1e-3:
+        return None
+    visible = 1.0 if context.sun_visible_fraction is None else float(context.sun_visible_fraction)
+    if visible == 0:
+        return None
+    unit = direction / np.linalg.norm(direction)
+    radius = 0.0 if context.sun_angular_radius_rad is None else float(context.sun_angular_radius_rad)
+    return _Sun(unit[:2] / unit[2], unit, context.wavelength_nm, irradiance * visible, radius)
+
+
+def _in_suns_beam(params: Params, context: FaultContext, grains: _Grains, sun: _Sun) -> F64:
+    """Share of each grain on the row that lies in the beam of the Sun's image, float64[grain]."""
+    footprint = _footprint(_frame(context.camera), params["lens"], params["surface"], 0.0)
+    if np.hypot(*sun.slope) > footprint.slope[-1]:
+        return np.zeros(len(grains.x_mm))
+    places = footprint.places(*sun.slope.reshape(2, 1, 1))
+    shares = [
+        float((places.covered(x, y, a) * places.area_mm2)[0, 0]) / (np.pi * a * a)
+        for x, y, a, _ in zip(*grains, strict=True)
+    ]
+    return np.array(shares)
+
+
+def _lit(params: Params, context: FaultContext, grains: _Grains) -> F64 | None:
+    """Share of each grain on the row that the Sun lights: all of it on the front. None where it lights none."""
+    sun = _sun(context)
+    if sun is None:
+        return None
+    lit = _in_suns_beam(params, context, grains, sun) if params["surface"] else np.ones(len(grains.x_mm))
+    return lit if lit.any() else None
+
+
+def lobe(x: F64) -> F64:
+    """[J1(x)/x]² of a grain without a sharp radius, float64 alike: the mean over radii s a of s⁴ [J1(s x)/(s
+    x)]², s within ±50 % about its middle and scaled to a mean square of 1, so that the scattered light, ∝ a², is
+    kept."""
+    u = 2 * (np.arange(_RADII) + 0.5) / _RADII - 1
+    weight = 1 + np.cos(np.pi * u)
+    s = 1 + 0.5 * u
+    s /= np.sqrt(np.average(s**2, weights=weight))
+    of = np.maximum(np.multiply.outer(x, s), 1e-6)
+    return np.asarray(np.average(s**4 * (j1(of) / of) ** 2, axis=-1, weights=weight))
+
+
+@lru_cache(maxsize=1)
+def _lobe_nodes() -> tuple[F64, F64]:
+    x = np.linspace(0, _SMOOTH, 3001)
+    found = lobe(x)
+    return x, found
+
+
+def lobe_tail() -> float:
+    """π x³ times `lobe`, for large x."""
+    nodes, values = _lobe_nodes()
+    return float(np.pi * nodes[-1] ** 3 * values[-1])
+
+
+def _lobe_table(x: F64) -> F64:
+    """`lobe` by linear interpolation, within 1e-4; beyond `_SMOOTH` its fall with x⁻³."""
+    nodes, values = _lobe_nodes()
+    out = np.interp(x, nodes, values)
+    far = x >= _SMOOTH
+    out[far] = values[-1] * (_SMOOTH / x[far]) ** 3
+    return out
+
+
+def _glow(params: Params, context: FaultContext) -> F32 | None:
+    """Light that grains send astray, electrons float32[y, x, 3].
+
+    Beyond their cores the lobes of all grains fall alike, as a / (π k sin³θ), and there a sum over the grains in a
+    pixel's beam is enough. Near the Sun each has a lobe of its own, but there the pixels' beams are the Sun's.
+    """
+    seen, sun = _shadows_once(params, context).seen, _sun(context)
+    if seen is None or sun is None:
+        return None
+    camera = context.camera
+    lens = _frame(camera).real_lens(params["lens"])
+    grains = _grains(params, on_window=False)
+    lit = _lit(params, context, grains)
+    assert lit is not None
+    core = lit * _in_suns_beam(params, context, grains, sun) * grains.taken
+    passes = (
+        camera.lens.transmittance(sun.wavelength_nm)
+        if isinstance(camera.lens, RealLens)
+        else np.full(len(sun.irradiance), camera.lens.transmission)
+    )
+    light = sun.irradiance * passes / camera.lens.focal_length_mm**2
+    to_e = camera.detector.electron_rate_weights(sun.wavelength_nm) * camera.exposure_s * light
+    pixel_rad = camera.detector.pixel_pitch_um * 1e-3 / camera.lens.focal_length_mm
+    sun = sun._replace(radius_rad=float(np.hypot(sun.radius_rad, pixel_rad / np.sqrt(np.pi))))
+    own, factor, common, reflected = _lobes(grains.radius_mm, core, sun, _stretch(lens, params["surface"]))
+    return _painted(to_e @ own, (to_e @ factor, to_e.sum(axis=1)), (common, reflected), seen, sun, camera)
+
+
+def _stretch(lens: RealLens, row: int) -> float:
+    """How much smaller than at the entrance the beam is on a row, to first order."""
+    marginal = abs(float(along(lens.prescription, forward(lens.prescription))[1][row, 0, 0]))
+    return 1 / max(marginal, 1e-6)
+
+
+def _lobes(radius_mm: F64, core: F64, sun: _Sun, stretch: float) -> tuple[F64, F64, F64, F64]:
+    """Scattered intensity over `_OFFSETS`, averaged over the Sun's disc (and that of a pixel's area).
+
+    Of the grains in the Sun's beam, with the shares `core`, what they have beyond the common lobe, float64[band,
+    offset] in mm²; the common lobe per mm of radius, as factors of the bands and float64[offset]; and what is
+    reflected, per mm² of squared radius, float64[offset].
+    """
+    k = 2 * np.pi * 1e6 / sun.wavelength_nm  # per mm
+    factor = lobe_tail() / (np.pi * k)
+    knee = 2 / (k.mean() * np.median(radius_mm))
+
+    # `_OFFSETS` are twice the sines of half the angles
+    sine = np.minimum(stretch * _OFFSETS * np.sqrt(np.maximum(1 - _OFFSETS**2 / 4, 0)), 1)
+    common = (sine**2 + knee**2) ** -1.5 * (_OFFSETS**2 < 2)
+    rs, rp, _, _ = reflect_transmit((), 1.0, DUST_INDEX.real, np.minimum(_OFFSETS / 2, 1), D_NM)
+    own = -np.multiply.outer((core * radius_mm).sum() * factor, common)
+    for radius, share in zip(radius_mm, core, strict=True):
+        if share > 1e-6:
+            strength = (share * k**2 * radius**4)[:, None]
+            own += strength * _lobe_table(np.multiply.outer(k * radius, sine)) * (common > 0)
+    # a narrow lobe is told in the steps of `_OFFSETS`, and its mean over the disc follows from it ring by ring
+    over_disc = _over_disc(sun.radius_rad).T * stretch**4
+    return own @ over_disc, factor, common @ over_disc, (rs + rp) / 8 @ over_disc
+
+
+def _over_disc(radius_rad: float) -> F64:
+    """The mean over a disc about a place, as weights of a function of the distance at `_OFFSETS`: float64[of the
+    mean, of the function]. Far from the disc it is the function itself."""
+    r, s = _OFFSETS[:, None], _OFFSETS[None, :]
+    # of a ring about the place where the function has its middle, the arc within the disc
+    arc = np.arccos(np.clip((s * s + r * r - radius_rad**2) / (2 * s * r), -1, 1))
+    weight = arc * s * np.gradient(_OFFSETS)
+    weight /= np.maximum(weight.sum(axis=1, keepdims=True), 1e-300)
+    return np.where(r < 8 * radius_rad, weight, np.eye(len(_OFFSETS)))
+
+
+@lru_cache(maxsize=2)
+def _field(frame: Frame) -> tuple[F32, F32 | None]:
+    """Directions of all pixels, float32[3, y, x]; and of a real lens the solid angle that it has on an area of the
+    sensor over that on the axis."""
+    lens = frame.lens
+    x, y = frame.slopes(np.arange(frame.width_px) + 0.5, np.arange(frame.height_px) + 0.5)
+    per_length = 1 / np.sqrt(1 + x * x + y * y)
+    density = None
+    if isinstance(lens, RealLens):
+        slope = np.hypot(x, y)
+        nodes = np.linspace(1e-4, float(slope.max()) + 1e-3, 1025)
+        height = lens.distorted(nodes)
+        on_area = nodes / (height * np.gradient(height, nodes)) / (1 + nodes**2) ** 1.5
+        density = np.interp(slope, nodes, on_area).astype(np.float32)
+    return np.stack([x * per_length, y * per_length, per_length]), density
+
+
+def _painted(
+    own_e: F64, factors_e: tuple[F64, F64], lobes: tuple[F64, F64], seen: F32, sun: _Sun, camera: Camera
+) -> F32:
+    """`own_e` float64[colour, offset], plus each of the two lobes, float64[offset], times its factor for the colour
+    and its layer of `seen`; electrons float32[y, x, 3]."""
+    directions, density = _field(_frame(camera))
+    square = np.zeros_like(directions[0])
+    for component, at in zip(directions, sun.direction, strict=True):
+        away = component - np.float32(at)
+        away *= away
+        square += away
+    nodes = 2 * np.log(_OFFSETS)
+    steps = np.linspace(nodes[0], nodes[-1], _LOOKUP)
+    position = np.log(np.maximum(square, np.float32(_OFFSETS[0] ** 2), out=square), out=square)
+    position -= np.float32(steps[0])
+    position *= np.float32(1 / (steps[1] - steps[0]))
+    position += np.float32(0.5)
+    at_step = position.astype(np.int32)
+
+    def looked_up(values: F64) -> F32:
+        return np.take(np.interp(steps, nodes, values).astype(np.float32), at_step, mode="clip")
+
+    diffracted, reflected = (looked_up(lobe) * layer for lobe, layer in zip(lobes, seen, strict=True))
+    colours = []
+    for own, one, other in zip(own_e, *factors_e, strict=True):
+        light = cv2.addWeighted(diffracted, float(one), reflected, float(other), 0)
+        if own.any():
+            light += looked_up(own)
+        if density is not None:
+            light *= density
+        colours.append(cv2.max(light, 0))
+    return np.asarray(cv2.merge(colours))

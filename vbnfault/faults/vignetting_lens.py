@@ -1,0 +1,224 @@
+"""Vignetting by a prescription: what the lens itself takes, and what a slipped ring or a hood in the way takes
+more.
+
+The share of the light that a faulty lens passes is that of its beam's rays, from exact tracing, that clear both
+
+- a ring as wide as the stop that has slipped sideways in the stop's plane: what is left is the overlap of the two,
+- a round opening in front of the lens, a hood that was bent or moved,
+
+each ray for the area that it comes through in the plane of the first vertex. It is never above 1.
+
+Where the camera has a prescription the image is already formed by it, and only this share is applied. A thin lens
+has no vignetting: there the relative illumination E(θ) / E(0) of the named lens comes with it, natural and
+mechanical vignetting and distortion in one (`lens.imaging`); no cos⁴ falls on top. Both are those of the d line.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ..camera import Camera
+from ..lens import RealLens, load_lens
+from ..lens.footprint import Beams, Frame
+from .base import Fault, FaultContext, Interval, Params, bounds, number, text
+
+F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
+
+_COARSEST_PX = 16  # between the places where the share of a beam is told
+_EVERY = 2  # of a beam's lines of rays is followed
+_ROUNDING = 1e-4  # within which a beam's rim is known
+_TOGETHER = 2048  # places at a time, for the memory's sake
+
+
+@dataclass(frozen=True, kw_only=True)
+class LensVignetting(Fault):
+    """Light lost at a slipped ring and a moved hood, and with a thin lens in the lens itself."""
+
+    fault = "vignetting"
+    model = "lens"
+    step = "electrons"
+    localised = False
+
+    lens: str = text(
+        "",
+        doc="path of a prescription or name of a packaged lens, scaled to the camera's focal length and closed to "
+        "its f-number; default: the camera's own, or nikkor_35_f2p8 where that is a thin lens",
+    )
+    decentre: Interval = bounds(
+        0.0,
+        0.3,
+        limits=(0, 2),
+        unit="stop radii",
+        doc="how far a ring as wide as the stop has slipped in its plane",
+    )
+    hood_offset: Interval = bounds(
+        0.0, 0.4, limits=(0, 10), unit="hood radii", doc="how far the hood's opening has moved sideways"
+    )
+    hood_radius_mm: float | None = number(
+        None,
+        limits=(1e-3, 1e4),
+        unit="mm",
+        doc="of the hood's opening; default: it just clears the frame's corners",
+    )
+    hood_distance_mm: float | None = number(
+        None,
+        limits=(0, 1e4),
+        unit="mm",
+        doc="of the hood's opening before the first vertex; default: a focal length",
+    )
+    mask_loss: float = number(0.1, limits=(0, 1), doc="the mask holds the pixels that lose at least this fraction")
+
+    def validate(self) -> None:
+        if self.lens:
+            load_lens(self.lens)
+
+    def draw(self, context: FaultContext, rng: np.random.Generator) -> Params:
+        """Lens; slip of the ring; the hood's distance, radius and place, in mm, x to the right and y down."""
+        frame = _frame(context.camera)
+        beams = frame.beams(self.lens)
+        distance = frame.lens.focal_length_mm if self.hood_distance_mm is None else float(self.hood_distance_mm)
+        radius = _clear_radius_mm(beams, distance) if self.hood_radius_mm is None else float(self.hood_radius_mm)
+        stop_mm = beams.lens.surfaces[beams.lens.stop].semi_diameter_mm
+        slip, moved = self.decentre.uniform(rng) * stop_mm, self.hood_offset.uniform(rng) * radius
+        turn = rng.uniform(0, 2 * np.pi, 2)
+        return {
+            "lens": self.lens,
+            "decentre_mm": [float(slip * np.cos(turn[0])), float(slip * np.sin(turn[0]))],
+            "hood_distance_mm": distance,
+            "hood_radius_mm": radius,
+            "hood_offset_mm": [float(moved * np.cos(turn[1])), float(moved * np.sin(turn[1]))],
+            "mask_loss": float(self.mask_loss),
+        }
+
+    def apply(self, quantity: Any, params: Params, context: FaultContext) -> Any:
+        """Expected electrons times the factor of each pixel."""
+        factor = _factor_once(params, context)
+        return quantity.with_array(cv2.multiply(quantity.array, cv2.merge([factor, factor, factor])))
+
+    def footprint(self, params: Params, context: FaultContext) -> NDArray[np.bool_]:
+        """bool[y, x]: where the loss reaches `mask_loss`."""
+        return np.asarray(_factor_once(params, context) <= np.float32(1 - params["mask_loss"]))
+
+
+def _frame(camera: Camera) -> Frame:
+    return Frame(
+        lens=camera.lens,
+        width_px=camera.width_px,
+        height_px=camera.height_px,
+        pixel_pitch_um=camera.detector.pixel_pitch_um,
+    )
+
+
+def _factor_once(params: Params, context: FaultContext) -> F32:
+    return context.once("vignetting.factor", params, lambda: factor(params, _frame(context.camera)))
+
+
+def factor(params: Params, frame: Frame) -> F32:
+    """What is left of the light, float32[y, x] in [0, 1]."""
+    left = _share_left(params, frame)
+    return left if isinstance(frame.lens, RealLens) else left * _illumination(frame, params["lens"])
+
+
+@lru_cache(maxsize=2)
+def _illumination(frame: Frame, name: str) -> F32:
+    """E(θ) / E(0) of a lens at the field angles of a thin lens's pixels, float32[y, x]."""
+    lens = frame.real_lens(name)
+    slope = np.hypot(*frame.slopes(np.arange(frame.width_px) + 0.5, np.arange(frame.height_px) + 0.5))
+    nodes = np.linspace(0, float(slope.max()) * 1.001, 2049)
+    light = np.minimum(lens.relative_illumination(lens.distorted(nodes)), 1.0)
+    out = np.interp(slope, nodes, light).astype(np.float32)
+    out.flags.writeable = False
+    return out
+
+
+# --- rays ------------------------------------------------------------------------------------------------------
+
+
+def _clear_radius_mm(beams: Beams, distance_mm: float) -> float:
+    """Of an opening about the axis, a distance before the first vertex, that takes no light of the frame's."""
+    rim = beams.bundle.points_mm[0, :, :2].reshape(len(beams.slope), -1, 2)
+    lit = beams.rim_mm.min(axis=1) > 0
+    return float(np.hypot(rim[lit, :, 0] - distance_mm * beams.slope[lit, None], rim[lit, :, 1]).max())
+
+
+@lru_cache(maxsize=4)
+def _lines(beams: Beams) -> tuple[F64, F64]:
+    """Of the straight lines of rays from the middle of a beam to its rim, in the plane of the first vertex and in
+    that of the stop: where they begin, float64[2, angle], on the x axis, and from there to the rim, float64[2, 2,
+    angle, turn], x and y; turns all around."""
+    shape = (len(beams.slope), beams.rim_mm.shape[1], -1, 2)
+    planes = np.stack([beams.bundle.points_mm[k, :, :2].reshape(shape) for k in (0, 1 + beams.lens.stop)])
+    planes = np.nan_to_num(planes)
+    begin = planes[:, :, 0, 0, 0]
+    to_rim = np.moveaxis(planes[:, :, ::_EVERY, -1] - planes[:, :, ::_EVERY, 0], -1, 1)
+    # the half below the axis mirrors that above
+    below = to_rim[:, :, :, -2:0:-1] * np.array([1, -1])[None, :, None, None]
+    return begin, np.concatenate([to_rim, below], axis=3)
+
+
+def _share_left(params: Params, frame: Frame) -> F32:
+    """Of the beams' light, what clears the slipped ring and the hood, float32[y, x] in [0, 1]."""
+    beams = frame.beams(params["lens"])
+    stop_mm = beams.lens.surfaces[beams.lens.stop].semi_diameter_mm
+    focal_px = frame.lens.focal_length_mm * 1e3 / frame.pixel_pitch_um
+    # the edge of a far hood is as wide as the beam's image through it
+    soft_px = focal_px * beams.rim_mm[0].mean() / max(params["hood_distance_mm"], 1e-3)
+    finest = 2 ** int(np.clip(np.log2(frame.width_px * frame.height_px) / 2 - 7, 0, 6))
+    step = int(np.clip(2 ** np.floor(np.log2(max(soft_px / 6, 1))), finest, max(_COARSEST_PX, finest)))
+    rows, columns = -(-frame.height_px // step) + 2, -(-frame.width_px // step) + 2
+    x, y = (v.ravel() for v in frame.slopes(*((np.arange(n) - 0.5) * step for n in (columns, rows))))
+    left = np.empty(rows * columns, dtype=np.float32)
+    for start in range(0, len(left), _TOGETHER):
+        some = slice(start, start + _TOGETHER)
+        left[some] = _left_of(params, beams, stop_mm, x[some].astype(np.float64), y[some].astype(np.float64))
+    coarse = left.reshape(rows, columns)
+    whole = (
+        cv2.resize(coarse, (columns * step, rows * step), interpolation=cv2.INTER_LINEAR) if step > 1 else coarse
+    )
+    return np.ascontiguousarray(whole[step : step + frame.height_px, step : step + frame.width_px])
+
+
+def _left_of(params: Params, beams: Beams, stop_mm: float, slope_x: F64, slope_y: F64) -> F64:
+    """Share left of the beams of directions, float64[n] each. Along a line of rays the light within a distance from
+    the beam's middle goes with its square."""
+    begin, to_rim = _lines(beams)
+    slope = np.hypot(slope_x, slope_y)
+    low = np.clip(np.searchsorted(beams.slope, slope, side="right") - 1, 0, len(beams.slope) - 2)
+    part = np.clip((slope - beams.slope[low]) / (beams.slope[low + 1] - beams.slope[low]), 0, 1)
+    begin = begin[:, low] * (1 - part) + begin[:, low + 1] * part
+    to_rim = to_rim[:, :, low] * (1 - part[:, None]) + to_rim[:, :, low + 1] * part[:, None]
+    cos, sin = (v / np.maximum(slope, 1e-12) for v in (slope_x, slope_y))
+    before = begin[0] - params["hood_distance_mm"] * slope
+    first, last = np.zeros(to_rim.shape[2:]), np.ones(to_rim.shape[2:])
+    openings = (
+        (before, to_rim[0], params["hood_offset_mm"], params["hood_radius_mm"]),
+        (begin[1], to_rim[1], params["decentre_mm"], stop_mm),
+    )
+    for start, onwards, (x, y), radius in openings:
+        # the opening's middle as the beam has its axes, outwards and across
+        along, across = x * cos + y * sin, y * cos - x * sin
+        enters, leaves = _crossings(start - along, -across, onwards, radius)
+        first, last = np.maximum(first, enters), np.minimum(last, leaves)
+    light = to_rim[0, 0] ** 2 + to_rim[0, 1] ** 2
+    whole = light.sum(axis=1)
+    kept = (light * np.maximum(last**2 - first**2, 0) * (last > first)).sum(axis=1)
+    return np.where(whole > 0, kept / np.where(whole > 0, whole, 1), 1.0)
+
+
+def _crossings(x: F64, y: F64, onwards: F64, radius: float) -> tuple[F64, F64]:
+    """Between which shares of their way lines from (x, y), seen from the middle of a disc, lie within it."""
+    a = np.maximum(onwards[0] ** 2 + onwards[1] ** 2, 1e-300)
+    b = (x[:, None] * onwards[0] + y[:, None] * onwards[1]) / a
+    c = (x**2 + y**2 - radius**2)[:, None] / a
+    under = b * b - c
+    root = np.sqrt(np.maximum(under, 0))
+    # a rim that is the opening's own is not to be cut by rounding
+    leaves = np.where(under > 0, -b + root, -1.0)
+    return np.where(under > 0, -b - root, 2.0), np.where(leaves > 1 - _ROUNDING, 1.0, leaves)
