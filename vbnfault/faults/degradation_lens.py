@@ -3,8 +3,8 @@
     I' = T_c · [(1 - h - Σ s) · I + h · (I ∗ H) + Σ s · (I ∗ S)]     for each colour c
 
 - A film, of molecules that settled or of fine dust, turns the share h of the light away. Its BSDF is Harvey's,
-  b0 [1 + (β/L)²]^(S/2), over all angles of unit integral; on the sensor β is the sine of the angle, whose tangent is
-  the distance over the focal length.
+  b0 [1 + (β/L)²]^(S/2), over all angles of unit integral; on the sensor β is the sine of the angle, whose tangent
+  is the distance over the focal length.
 - A scratch of the width w turns the share s away that it takes of the beam on the front, across its own direction,
   as a slit of its width diffracts: sinc²(π w β/λ), here its mean, a Lorentz curve of the half width λ/(2π w), which
   falls alike. Scratches are bent, so that a streak fans out.
@@ -214,8 +214,8 @@ def _coated(lens: Prescription, coating: str) -> Prescription:
 
 
 def haze_kernel(distance: NDArray, knee: float, slope: float) -> F64:
-    """The film's point spread, float64 like `distance` on the sensor from the image's place, near the axis, in focal
-    lengths; its integral over the plane is 1. The distance is a tangent: of the directions there the sine is β."""
+    """The film's point spread, float64 like `distance` on the sensor from the image's place, near the axis, in
+    focal lengths; its integral over the plane is 1. The distance is a tangent: β is the sine of its angle."""
     square = np.asarray(distance, dtype=np.float64) ** 2 + 1
     whole = Harvey(b0=1 / Harvey(b0=1.0, L=knee, S=slope).tis, L=knee, S=slope)
     return whole.bsdf(np.sqrt(1 - 1 / square)) / square**2

@@ -190,8 +190,10 @@ def _left_of(params: Params, beams: Beams, stop_mm: float, slope_x: F64, slope_y
     the beam's middle goes with its square."""
     begin, to_rim = _lines(beams)
     slope = np.hypot(slope_x, slope_y)
-    low = np.clip(np.searchsorted(beams.slope, slope, side="right") - 1, 0, len(beams.slope) - 2)
-    part = np.clip((slope - beams.slope[low]) / (beams.slope[low + 1] - beams.slope[low]), 0, 1)
+    # where the lens is dark, as where it has the last of its light
+    known = np.minimum(slope, beams.slope[np.flatnonzero(beams.rim_mm.min(axis=1) > 0).max()])
+    low = np.clip(np.searchsorted(beams.slope, known, side="right") - 1, 0, len(beams.slope) - 2)
+    part = (known - beams.slope[low]) / (beams.slope[low + 1] - beams.slope[low])
     begin = begin[:, low] * (1 - part) + begin[:, low + 1] * part
     to_rim = to_rim[:, :, low] * (1 - part[:, None]) + to_rim[:, :, low + 1] * part[:, None]
     cos, sin = (v / np.maximum(slope, 1e-12) for v in (slope_x, slope_y))
@@ -207,9 +209,8 @@ def _left_of(params: Params, beams: Beams, stop_mm: float, slope_x: F64, slope_y
         enters, leaves = _crossings(start - along, -across, onwards, radius)
         first, last = np.maximum(first, enters), np.minimum(last, leaves)
     light = to_rim[0, 0] ** 2 + to_rim[0, 1] ** 2
-    whole = light.sum(axis=1)
     kept = (light * np.maximum(last**2 - first**2, 0) * (last > first)).sum(axis=1)
-    return np.where(whole > 0, kept / np.where(whole > 0, whole, 1), 1.0)
+    return np.asarray(kept / light.sum(axis=1))
 
 
 def _crossings(x: F64, y: F64, onwards: F64, radius: float) -> tuple[F64, F64]:
