@@ -176,7 +176,7 @@ def test_first_order_is_the_limit_of_a_small_stop_and_angle() -> None:
         surfaces[lens.stop] = replace(surfaces[lens.stop], semi_diameter_mm=0.2 * share * rim)
         small = replace(lens, surfaces=tuple(surfaces))
         angle = 2.0 * share
-        traced = {g.pair: g for g in traced_ghosts(small, angle, across=256)}
+        traced = {g.pair: g for g in traced_ghosts(small, angle, across=160)}
         first = {g.pair: g for g in paraxial_ghosts(small, angle)}
         pairs = [p for p in first if p in traced]
         assert len(pairs) > 60

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy.signal import convolve2d
 from scipy.special import ndtr
 
-from vbnfault import config, dataset, pipeline, sky, world
+from vbnfault import config, dataset, pipeline, resources, sky, world
 from vbnfault.camera import Camera
 from vbnfault.detector import Detector
 from vbnfault.errors import InputError
@@ -483,7 +483,7 @@ def test_bad_lenses_are_told_in_a_sentence(tmp_path: Path) -> None:
 
 
 def test_a_lens_beside_the_scene_file_is_found_and_told_by_its_contents(tmp_path: Path) -> None:
-    source = Path(imaging.__file__).parents[2] / "scenes/lenses/tessar_50_f2p8.toml"
+    source = resources.find("scenes/lenses", "tessar_50_f2p8")
     (tmp_path / "own.toml").write_text(source.read_text())
     (tmp_path / "scene.toml").write_text('title = "x"\n[camera]\nlens = "own.toml"\nlens_coating = "v"\n')
     found = config.load_scene(tmp_path / "scene.toml")

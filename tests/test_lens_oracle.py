@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import replace
 from typing import Any
 
@@ -290,9 +291,15 @@ def pixel_mm(lens: Prescription) -> float:
     return float(2 * first_order(lens).efl_mm * np.tan(np.radians(32.5)) / 1024)
 
 
+WHOLE = "VBNFAULT_WHOLE_ORACLE"
+ALL_ANGLES = ("nikkor_28_f2p8", "tessar_50_f2p8")
+
+
 @pytest.mark.parametrize("sun_deg", SUN_DEG)
 @pytest.mark.parametrize("name", PAIRS)
 def test_traced_ghosts_against_the_sequential_trace(name: str, sun_deg: float) -> None:
+    if sun_deg != 8.0 and name not in ALL_ANGLES and not os.environ.get(WHOLE):
+        pytest.skip(f"takes two seconds a case: of these lenses 8 degrees alone, unless {WHOLE} is set")
     try:
         llvm.find()
     except VbnfaultError as error:
