@@ -216,9 +216,16 @@ _REGISTRY: dict[str, dict[str, type[Fault]]] = {}
 
 
 def registry() -> dict[str, dict[str, type[Fault]]]:
-    """Fault class → model → type, classes in dataset order."""
+    """Fault class → model → type, classes in dataset order; models in the order of their modules, this package's
+    first, whichever was imported before: the first one is a class's default."""
     _import_all()
-    return {name: dict(_REGISTRY[name]) for name in dataset_order(_REGISTRY)}
+    package = __package__ or ""
+
+    def place(model: tuple[str, type[Fault]]) -> tuple[bool, str]:
+        module = model[1].__module__
+        return not module.startswith(package), module
+
+    return {name: dict(sorted(_REGISTRY[name].items(), key=place)) for name in dataset_order(_REGISTRY)}
 
 
 @lru_cache(maxsize=1)
