@@ -15,7 +15,7 @@ from vbnfault.lens import first_order, load_lens, parse_lens, scaled_to_focal_le
 from vbnfault.lens.glass import D_NM
 from vbnfault.lens.paraxial import paraxial_ghosts
 from vbnfault.lens.prescription import Prescription
-from vbnfault.lens.trace import forward, trace
+from vbnfault.lens.trace import path_of, trace
 
 try:
     llvm.find()
@@ -23,8 +23,9 @@ except VbnfaultError as error:
     pytest.skip(f"no usable LLVM: {error}", allow_module_level=True)
 
 from vbnfault.lens.flare import FlareModel, disc_samples
-from vbnfault.lens.ghosts import Rays, Tracer, backend, routes, steps, traced_ghosts
+from vbnfault.lens.ghosts import boxes, traced_ghosts
 from vbnfault.lens.raster import _EDGE_NODES, EDGE_HIGH, EDGE_LOW, edge_profiles
+from vbnfault.lens.tracer import Rays, Tracer, backend, name_of, routes
 
 LENSES = (
     "nikkor_35_f2p8",
@@ -59,7 +60,7 @@ def both_ways(lens: Prescription, made: Tracer, rays: Rays, across: int) -> tupl
     side = np.linspace(-1, 1, across)
     x, y = np.meshgrid(cx + hx * side, cy + hy * side)
     start = np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)])
-    path = steps(lens, made.routes[rays.route[0]]) if made.routes[rays.route[0]] else forward(lens)
+    path = path_of(lens, made.routes[rays.route[0]])
     found = trace(lens, start, np.tile(rays.direction[0], (len(start), 1)), path=path)
     return single, found.points_mm[-1, :, :2], spots.radius.numpy(), found
 
@@ -85,7 +86,7 @@ def test_ghosts_of_a_kernel_are_those_of_exact_rays() -> None:
     gap magnifies angles: the worst ray errs by a fiftieth of a pixel, half of them by less than a thousandth."""
     lens = load_lens("nikkor_35_f2p8")
     made = Tracer(lens, np.array([D_NM]))
-    rays, _ = made.boxes(12.0)
+    rays, _ = boxes(made, 12.0)
     assert len(rays) > 40
     off = []
     for k in range(len(rays)):
@@ -121,9 +122,11 @@ def test_paths_of_four_reflections_and_the_sensor_as_a_mirror() -> None:
     assert len(routes(lens)) == mirrors * (mirrors - 1) / 2
     four = [r for r in routes(lens, 4) if len(r) == 4]
     assert all(b > a and d > c and d > a for b, a, d, c in four)
-    rows = [(row, mirror) for row, mirror in steps(lens, (3, 1, 2, 0)) if mirror]
+    rows = [(row, mirror) for row, mirror in path_of(lens, (3, 1, 2, 0)) if mirror]
     assert rows == [(3, True), (1, True), (2, True), (0, True)]
-    assert [row for row, _ in steps(lens, (2, 0, 1, 0))] == [0, 1, 2, 1, 0, 1, 0, 1, 2, 3, 4, 5, 6, 7]
+    # two ghosts of four reflections on the same rows keep names of their own
+    assert name_of((3, 1, 2, 0)) == (1, 3, 0, 2) != name_of((3, 0, 2, 1))
+    assert [row for row, _ in path_of(lens, (2, 0, 1, 0))] == [0, 1, 2, 1, 0, 1, 0, 1, 2, 3, 4, 5, 6, 7]
     made = Tracer(lens, np.array([D_NM]), routes_=[(3, 1, 2, 0)])
     single, double, _, found = both_ways(lens, made, bundle(0, (0, 0, 1.0, 1.0), [0.02, 0, 1]), 9)
     assert np.abs(single - double)[found.arrives].max() < 5e-4
@@ -237,11 +240,11 @@ def test_a_picture_holds_the_flux_of_its_ghosts(kind: str, worst: float) -> None
         else {g.pair: g for g in paraxial_ghosts(lens, 6.0, azimuth_deg=40.0)}
     )
     axis = (np.arange(2 * half) + 0.5 - half) * pitch
-    rays, where = made._tracer.boxes(6.0)
+    rays, arrivals = boxes(made._tracer, 6.0)
     off = []
-    for route, bounds in zip(rays.route, where, strict=True):
-        ghost = told[tuple(sorted(made._tracer.routes[route]))]
-        if np.abs(bounds[:4]).max() > 0.7 * half * pitch:
+    for route, least, most in zip(rays.route, arrivals.least_mm, arrivals.most_mm, strict=True):
+        ghost = told[name_of(made._tracer.routes[route])]
+        if max(np.abs(least).max(), np.abs(most).max()) > 0.7 * half * pitch:
             continue
         picture = made.image(6.0, 40.0, only=ghost.pair)[0].astype(np.float64)
         light = picture.sum()

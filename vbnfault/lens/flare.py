@@ -15,16 +15,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
-from .ghosts import Rays, Spots, Tracer, backend, told
+from .ghosts import Arrivals, boxes, named, told
 from .paraxial import Ghost, along, mean_ghost
 from .prescription import Prescription
-from .raster import LEVELS, Canvas, Placement, Sums, edge_kind
+from .raster import LEVELS, PARTS, Canvas, Placement, Sums, edge_kind
+from .tracer import Rays, Spots, Tracer, backend
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
 MODELS = ("traced", "paraxial")
 _ACROSS = 37  # rays across a ghost
+_ACROSS_UNEVEN = 73  # and across one of which more than the share _UNEVEN is magnified unevenly
+_UNEVEN = 0.3
 _ACROSS_FOCUSED = 17
 _SUBDIVISIONS = 8  # of the interval between two bands, where colours part
 _APART_PX = 1.5  # of a ghost's level: colours farther apart than this take more wavelengths
@@ -32,6 +35,7 @@ _FOCUSED = 0.35  # width of an edge in radii of its rim above which the disc is 
 _DISC_RINGS = 3
 _PLAIN = 0.03  # edges of this contrast are drawn in full; of a quarter of it a level coarser, and so on
 _RAMP, _RAMP_PX = 7.0, 24.0  # how far from an edge, in its widths and in pixels at least, details are drawn
+_SPREAD = 0.25, 4.0  # bounds of how much larger than to first order pictures of rims are taken to be
 _LEAST = 1e-10  # irradiance over the Sun's below which a ghost is left out
 
 
@@ -59,13 +63,21 @@ class FirstOrderTracer(Tracer):
         }
 
     def trace(
-        self, rays: Rays, across: int, width: F64 | None = None, *, centred: bool = False, light: bool = True
+        self,
+        rays: Rays,
+        across: int | NDArray[np.int64],
+        width: F64 | None = None,
+        *,
+        centred: bool = False,
+        light: bool = True,
+        halved: bool = True,
     ) -> Spots:
         """As `Tracer.trace`, to first order; the Sun's slope is its tangent."""
         be, t, f = backend(), self._tables, self._first_order
         dr = be.dr
-        start = self._start(rays, across, centred)
-        per_width = be.Float((1 / (self._no_width if width is None else width)).astype(np.float32))
+        side = np.broadcast_to(np.asarray(across, dtype=np.int64), len(rays))
+        start = self._start(rays, side, centred, False)
+        per_width = be.Float((np.zeros(len(self.rows)) if width is None else 1 / width).astype(np.float32))
         rim = self.lens.surfaces[self.lens.stop]
         x, y = start.x, start.y
         sx, sy = start.dx / start.dz, start.dy / start.dz
@@ -95,6 +107,7 @@ class FirstOrderTracer(Tracer):
         )
         _, radius, margin = dr.while_loop(first, on, body, mode="symbolic")
         spots = Spots(
+            across=side,
             x_mm=dr.fma(m00, x, m01 * sx),
             y_mm=dr.fma(m00, y, m01 * sy),
             share=dr.select(radius >= 0, dr.gather(be.Float, f["share"], of), 0),  # one a ray
@@ -111,10 +124,32 @@ class _Detail:
 
     level: NDArray[np.int64]
     inner_level: NDArray[np.int64]
-    fold_level: NDArray[np.int64]
+    rough_level: NDArray[np.int64]
     ramp: F64
     kind: NDArray[np.int64]
     width: F64
+    magnification: F64
+
+
+@dataclass(frozen=True, eq=False)
+class _Drawn:
+    """What is drawn: bundles, two bands of each with their weights, whether it is rough, and which part of it."""
+
+    source: NDArray[np.int64]
+    band: NDArray[np.int64]
+    weight: F64
+    rough: NDArray[np.bool_]
+    part: NDArray[np.int64]
+
+    def of(self, each: NDArray[np.int64]) -> _Drawn:
+        """The same of bundles that stand for others: `each` for which, in order."""
+        count = np.bincount(each)
+        first = np.cumsum(count) - count
+        many = count[self.source]
+        rows = np.repeat(np.arange(len(many)), many)
+        within = np.arange(len(rows)) - np.repeat(np.cumsum(many) - many, many)
+        source = first[self.source][rows] + within
+        return _Drawn(source, self.band[rows], self.weight[rows], self.rough[rows], self.part[rows])
 
 
 class FlareModel:
@@ -161,8 +196,7 @@ class FlareModel:
         self.canvas = Canvas(shape=shape, pitch_mm=pitch_mm, bands=len(self.nodes_nm))
         self.sun_radius_rad = sun_radius_rad
         kind = Tracer if model == "traced" else FirstOrderTracer
-        steps_between = _SUBDIVISIONS
-        at = np.arange((len(self.nodes_nm) - 1) * steps_between + 1) / steps_between
+        at = np.arange((len(self.nodes_nm) - 1) * _SUBDIVISIONS + 1) / _SUBDIVISIONS
         self._fine = np.interp(at, np.arange(len(self.nodes_nm)), self.nodes_nm)
         self._tracer = kind(lens, self._fine, reflections=reflections)
         self._diffraction, self._across = diffraction, across
@@ -193,31 +227,45 @@ class FlareModel:
         self._least = np.array([first + int(np.argmin(disc[first:last])) for first, last in bounds], dtype=np.int64)
         self._sampled = self._sun[self._least] > _FOCUSED
         self._sun[self._sampled[route]] = 0
-        self._detail = self._details(np.zeros(len(t.routes), dtype=np.int64))
+        self._detail = self._details(np.zeros(len(t.routes), dtype=np.int64), np.ones(len(t.routes)))
 
-    def _details(self, coarser: NDArray[np.int64]) -> _Detail:
-        """Levels and edges of every route, `coarser` by so many levels than its edges ask for."""
+    def _details(self, coarser: NDArray[np.int64], spread: F64) -> _Detail:
+        """Levels and edges of every route, `coarser` by so many levels than its edges ask for; the picture of its
+        rim is larger by `spread` than to first order."""
         t, least = self._tracer, self._least
-        blur_px = np.hypot(self._sun[least], self._fresnel[least]) * self._px[least]
-        # the disc's samples lie about a third of its radius apart
-        apart_px = 0.3 * self.sun_radius_rad * np.abs(t.matrix[:, 0, 1]) / self.canvas.pitch_mm
-        blur_px = np.where(self._sampled, apart_px, blur_px)
-        level = np.floor(np.log2(np.maximum(blur_px / 1.5, 1.0))).astype(np.int64) + coarser
-        level = np.minimum(level, LEVELS - 1)
         route = np.repeat(np.arange(len(t.routes)), np.diff(t.first_step))
-        steady = np.hypot(self._sun, 0.5 * 2.0 ** level[route] / self._px)
+        px = self._px * spread[route]
+        blur_px = np.hypot(self._sun[least], self._fresnel[least]) * px[least]
+        # the disc's samples lie about a third of its radius apart
+        sun_px = self.sun_radius_rad * np.abs(t.matrix[:, 0, 1]) / self.canvas.pitch_mm
+        blur_px = np.where(self._sampled, 0.3 * sun_px, blur_px)
+
+        def level(px_: F64) -> NDArray[np.int64]:
+            return np.floor(np.log2(np.maximum(px_, 1.0))).astype(np.int64)
+
+        edge = np.minimum(level(blur_px / 1.5) + coarser, LEVELS - 1)
+        steady = np.hypot(self._sun, 0.5 * 2.0 ** edge[route] / px)
         width = np.clip(np.hypot(steady, self._fresnel), 1e-4, 0.5)
-        one_px = width[least] * self._px[least]
+        one_px = width[least] * px[least]
         ramp = np.maximum(_RAMP, _RAMP_PX * 2.0**coarser / one_px)
         return _Detail(
-            level=level,
+            level=edge,
             # pixels a fifth of the ramp wide for what lies within
-            inner_level=np.clip(np.floor(np.log2(ramp * one_px / 5)), level, LEVELS - 1).astype(np.int64),
-            fold_level=np.maximum(level - 1, np.minimum(level, 1)),
+            inner_level=np.clip(level(ramp * one_px / spread / 5), edge, LEVELS - 1),
+            # a fold is as sharp as the Sun's disc, of twice the radius, lets it be
+            rough_level=np.minimum(np.minimum(level(1.3 * sun_px), edge) + coarser, LEVELS - 1),
             ramp=ramp,
             kind=edge_kind(steady[least], self._fresnel[least]),
             width=width,
+            magnification=np.abs(t.matrix[:, 0, 0]) * spread,
         )
+
+    def _spread(self, arrivals: Arrivals, route: NDArray[np.int64]) -> F64:
+        """How much larger than to first order the pictures of the rims are, float64[route]."""
+        out = np.ones(len(self._tracer.routes))
+        first = np.abs(self._tracer.matrix[route, 0, 0])
+        out[route] = np.clip(arrivals.magnification / np.maximum(first, 1e-9), *_SPREAD)
+        return out
 
     def image(self, sun_deg: float, azimuth_deg: float = 0.0, *, only: tuple[int, int] | None = None) -> F32:
         """Ghosts of a Sun at an angle from the axis, towards an azimuth: its direct image lies at +f tan θ there
@@ -230,42 +278,34 @@ class FlareModel:
             raise InputError(f"sun_deg = {sun_deg:g}: must be from 0 to below 90")
         turn = float(np.radians(azimuth_deg))
         made = self._tracer.turned(turn)
-        rays, where = made.boxes(sun_deg, self._detail.width, self._reach_mm)
-        shown = self._in_frame(where) & (where[:, 4] > _LEAST)
+        rays, arrivals = boxes(made, sun_deg, self._detail.width, self._reach_mm)
+        shown = self._in_frame(arrivals) & (arrivals.peak > _LEAST)
         if only is not None:
-            shown &= np.array([tuple(sorted(made.routes[r])) == only for r in rays.route], dtype=bool)
-        rays, where = rays.take(shown), where[shown]
-        detail = self._details(self._fainter(rays, where))
+            shown &= named(made, rays, [only])
+        rays, arrivals = rays.take(shown), arrivals.take(shown)
+        detail = self._details(self._fainter(rays, arrivals), self._spread(arrivals, rays.route))
         sums = Sums(self.canvas)
-        steady = ~self._sampled[rays.route]
         cosine = float(np.cos(np.radians(sun_deg)))
-        for sampled in (False, True):
-            chosen = steady ^ sampled
+        across = np.where(arrivals.uneven > _UNEVEN, max(self._across, _ACROSS_UNEVEN), self._across)
+        sampled = self._sampled[rays.route]
+        for chosen in (~sampled, sampled):
             if not chosen.any():
                 continue
-            bundles, band, weight, plain = self._coloured(rays.take(chosen), where[chosen], detail)
-            strength, across = np.full(len(bundles), cosine), self._across
-            if sampled:
+            each, bundles, drawn = self._coloured(rays.take(chosen), arrivals.take(chosen), detail)
+            strength, side = np.full(len(bundles), cosine), across[chosen][each]
+            if chosen is sampled:
                 each, bundles, strength = self._over_disc(bundles, sun_deg)
-                band, weight, plain = band[each], weight[each], plain[each]
-                across = _ACROSS_FOCUSED
-            spots = made.trace(bundles, across, detail.width)
-            # within, where a ghost is smooth, the bands' own wavelengths will do
-            nodes = np.flatnonzero(plain >= 0)
-            own = np.column_stack([plain, plain])[nodes]
-            once = np.tile([1.0, 0.0], (len(nodes), 1))
-            sums.draw(spots, self._place(detail, bundles, nodes, own, once, strength, "inner"), across, turn)
-            every = np.arange(len(bundles))
-            for part in ("edge", "fold"):
-                sums.draw(spots, self._place(detail, bundles, every, band, weight, strength, part), across, turn)
+                drawn, side = drawn.of(each), np.full(len(bundles), _ACROSS_FOCUSED)
+            spots = made.trace(bundles, side, detail.width)
+            sums.draw(spots, self._place(detail, bundles, drawn, strength), turn)
         return sums.irradiance()
 
     def ghosts(self, sun_deg: float, azimuth_deg: float = 0.0, *, across: int = 48) -> tuple[Ghost, ...]:
         """The ghosts of a point Sun that reach the frame, the mean of all bands."""
         turn = float(np.radians(azimuth_deg))
         made = self._tracer.turned(turn)
-        rays, where = made.boxes(sun_deg, self._detail.width, self._reach_mm)
-        rays = rays.take(self._in_frame(where) & (where[:, 4] > _LEAST))
+        rays, arrivals = boxes(made, sun_deg, self._detail.width, self._reach_mm)
+        rays = rays.take(self._in_frame(arrivals) & (arrivals.peak > _LEAST))
         found: dict[tuple[int, ...], list[tuple[float, Ghost]]] = {}
         for node in range(0, len(self._fine), _SUBDIVISIONS):
             at = replace(rays, wavelength=np.full(len(rays), node))
@@ -273,50 +313,58 @@ class FlareModel:
                 found.setdefault(ghost.pair, []).append((1 / len(self.nodes_nm), ghost))
         return tuple(mean_ghost(rows) for _, rows in sorted(found.items()))
 
-    def _fainter(self, rays: Rays, where: F64) -> NDArray[np.int64]:
+    def _fainter(self, rays: Rays, arrivals: Arrivals) -> NDArray[np.int64]:
         """Levels by which routes may be drawn coarser: their edges are too faint against the sum of all to show."""
         height, width = (n / 2 * self.canvas.pitch_mm for n in self.canvas.shape)
         frame = np.hypot(height, width)
-        across = np.clip(np.minimum(where[:, 2:4], frame) - np.maximum(where[:, :2], -frame), 0, None)
-        total = (where[:, 4] * np.minimum(across.prod(axis=1) / (4 * height * width), 1)).sum()
+        across = np.clip(np.minimum(arrivals.most_mm, frame) - np.maximum(arrivals.least_mm, -frame), 0, None)
+        total = (arrivals.peak * np.minimum(across.prod(axis=1) / (4 * height * width), 1)).sum()
         out = np.zeros(len(self._tracer.routes), dtype=np.int64)
-        faint = np.log(_PLAIN * total / np.maximum(where[:, 4], 1e-300)) / np.log(4)
+        faint = np.log(_PLAIN * total / np.maximum(arrivals.peak, 1e-300)) / np.log(4)
         out[rays.route] = np.clip(np.ceil(faint), 0, 1)
         return out
 
-    def _in_frame(self, where: F64) -> NDArray[np.bool_]:
-        beyond = np.maximum(np.maximum(where[:, :2], -where[:, 2:4]), 0)
+    def _in_frame(self, arrivals: Arrivals) -> NDArray[np.bool_]:
+        beyond = np.maximum(np.maximum(arrivals.least_mm, -arrivals.most_mm), 0)
         soft = 8 * 2.0**LEVELS * self.canvas.pitch_mm
         return np.asarray(np.hypot(beyond[:, 0], beyond[:, 1]) < self._reach_mm + soft)
 
-    def _coloured(
-        self, rays: Rays, where: F64, detail: _Detail
-    ) -> tuple[Rays, NDArray[np.int64], F64, NDArray[np.int64]]:
-        """One bundle a wavelength, more of them where the colours of a ghost part by more than a pixel: bundles,
-        two bands of each with their weights, and the band whose node it is, or -1."""
+    def _coloured(self, rays: Rays, arrivals: Arrivals, detail: _Detail) -> tuple[NDArray[np.int64], Rays, _Drawn]:
+        """One bundle a wavelength, more of them where the colours of a ghost part by more than a pixel: of which
+        ghost each is, the bundles, and from which of them each part of the light is drawn: what lies within is
+        smooth, and takes the bands' nodes alone."""
         bands = len(self.nodes_nm)
-        pixel = self.canvas.pitch_mm * 2.0 ** detail.level[rays.route]
-        apart = where[:, 5] / max(bands - 1, 1) / pixel
-        parts = 2 ** np.clip(np.ceil(np.log2(np.maximum(apart / _APART_PX, 1))), 0, 3).astype(np.int64)
-        if bands == 1:
-            parts[:] = _SUBDIVISIONS
-        chosen, wavelength, weights = [], [], []
-        for n in np.unique(parts):
-            at = np.arange(0, len(self._fine), _SUBDIVISIONS // n)
-            hats = np.maximum(1 - np.abs(at[:, None] / _SUBDIVISIONS - np.arange(bands)), 0)
-            hats /= hats.sum(axis=0)
-            which = np.flatnonzero(parts == n)
-            chosen.append(np.repeat(which, len(at)))
-            wavelength.append(np.tile(at, len(which)))
-            weights.append(np.tile(hats, (len(which), 1)))
-        at, both = np.concatenate(wavelength), np.concatenate(weights)
-        bundles = replace(rays.take(np.concatenate(chosen)), wavelength=at)
-        first = np.argmax(both > 0, axis=1)
+        apart = arrivals.move_mm / max(bands - 1, 1) / self.canvas.pitch_mm
+
+        def divided(level: NDArray[np.int64]) -> NDArray[np.int64]:
+            wanted = apart / 2.0 ** level[rays.route] / _APART_PX
+            return 2 ** np.clip(np.ceil(np.log2(np.maximum(wanted, 1))), 0, 3).astype(np.int64)
+
+        divisions = {"inner": np.ones(len(rays), dtype=np.int64), "edge": divided(detail.level)}
+        rough = arrivals.folded | (arrivals.uneven > 0)
+        divisions["rough"] = np.where(rough, divided(detail.rough_level), 0)
+        most = np.maximum.reduce(list(divisions.values()))
+        at = np.arange(len(self._fine))
+        taken = at[None, :] % (_SUBDIVISIONS // most)[:, None] == 0
+        which, wavelength = np.nonzero(taken)
+        bundles = replace(rays.take(which), wavelength=wavelength)
+        hats = np.maximum(1 - np.abs(at[:, None] / _SUBDIVISIONS - np.arange(bands)), 0)
+        first = np.minimum(at // _SUBDIVISIONS, bands - 1)
         second = np.minimum(first + 1, bands - 1)
-        rows = np.arange(len(both))
-        other = np.where(second > first, both[rows, second], 0)
-        plain = np.where(at % _SUBDIVISIONS == 0, at // _SUBDIVISIONS, -1)
-        return bundles, np.column_stack([first, second]), np.column_stack([both[rows, first], other]), plain
+        band = np.column_stack([first, second])
+        parts = []
+        for part, name in enumerate(PARTS):
+            divided_ = divisions[name]
+            step = _SUBDIVISIONS // np.maximum(divided_, 1)
+            source = np.flatnonzero((divided_ > 0)[which] & (wavelength % step[which] == 0))
+            # the hats of the wavelengths taken add up to one in every band
+            total = np.stack([hats[::n].sum(axis=0) for n in range(1, _SUBDIVISIONS + 1)])
+            rows = wavelength[source]
+            weight = np.take_along_axis(hats[rows] / total[step[which[source]] - 1], band[rows], axis=1)
+            weight[:, 1] *= band[rows, 1] > band[rows, 0]
+            of = np.full(len(source), part)
+            parts.append((source, band[rows], weight, rough[which[source]], of))
+        return which, bundles, _Drawn(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
 
     def _over_disc(self, rays: Rays, sun_deg: float) -> tuple[NDArray[np.int64], Rays, F64]:
         """The bundles from every sample of the Sun's disc: of which each is one, and its strength."""
@@ -329,28 +377,22 @@ class FlareModel:
         which = np.tile(np.arange(count), len(rays))
         return each, replace(rays.take(each), direction=direction[which]), direction[which, 2] / count
 
-    def _place(
-        self,
-        detail: _Detail,
-        bundles: Rays,
-        source: NDArray[np.int64],
-        band: NDArray[np.int64],
-        weight: F64,
-        strength: F64,
-        part: str,
-    ) -> Placement:
-        route = bundles.route[source]
-        level = {"inner": detail.inner_level, "edge": detail.level, "fold": detail.fold_level}[part]
+    def _place(self, detail: _Detail, bundles: Rays, drawn: _Drawn, strength: F64) -> Placement:
+        route = bundles.route[drawn.source]
+        levels = np.stack([detail.inner_level, detail.level, detail.rough_level])
         return Placement(
-            source=source,
-            level=level[route],
-            band=band,
-            weight=weight,
-            strength=strength[source],
+            source=drawn.source,
+            level=levels[drawn.part, route],
+            band=drawn.band,
+            weight=drawn.weight,
+            strength=strength[drawn.source],
             kind=detail.kind[route],
-            box_mm=bundles.box_mm[source],
+            box_mm=bundles.box_mm[drawn.source],
             ramp=detail.ramp[route],
-            part=part,
+            rough=drawn.rough,
+            magnification=detail.magnification[route],
+            inner_level=detail.inner_level[route],
+            part=drawn.part,
         )
 
 

@@ -9,6 +9,7 @@ the bits do not depend on the order in which threads add.
 from __future__ import annotations
 
 import itertools
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
@@ -17,12 +18,15 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from .ghosts import Spots, backend
+from .tracer import Spots, backend, lattice_places
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
 LEVELS = 6
+PARTS = ("inner", "edge", "rough")
+# of each part: the share of light with an edge's profile is a + b × calm, that without c × calm × rise
+_SHARES = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, -1.0], [1.0, -1.0, 0.0]])
 _MARGIN = 4  # pixels around each level, for what lies half outside
 _UNITS = 2.0**36  # of the integer sums, per unit of irradiance
 _MOST = 1e5  # irradiance that one ghost may add to a pixel: far beyond white
@@ -30,6 +34,8 @@ _CALM_SIGMA = 0.8  # pixels of a coarser level by which it is smoothed
 _SMALL = 0.5  # cells below this many pixels are splatted
 EDGE_LOW, EDGE_HIGH = -1.0, 5.0  # of the soft edge's profile
 _EDGE_NODES = 2049
+_UNLIKE, _ALIKE = 0.05, 0.3  # ratio of neighbouring areas from which, and above which, no fold is near
+_COARSE_PX = 6.0  # cells of so many pixels of what lies within show it smooth, however unlike they are
 _EDGE_KINDS = 9
 
 
@@ -58,8 +64,10 @@ class Placement:
 
     `source`: which of the traced bundles. Of each its `level`; two bands with their weights, int64 and
     float64[bundle, 2]; `strength`, irradiance for a share of 1 where nothing is magnified; the `kind` of its edges;
-    `box_mm` of its rays; and `ramp`, in widths of its edge. `part` says which of three parts of the light that add
-    up: `inner` rises smoothly over the ramp from the rims, `edge` is the rest, but near folds all is `fold`.
+    `box_mm` of its rays; `ramp`, in widths of its edge; whether it is `rough`, folded or unevenly magnified; the
+    `magnification` of lengths that its levels are made for; and `inner_level`, that of the first of three parts of
+    the light that add up. `part`, an index of `PARTS`, says which: `inner` rises smoothly over the ramp from the
+    rims, `edge` is the rest, but near folds and where light is crowded all is `rough`.
     """
 
     source: NDArray[np.int64]
@@ -70,7 +78,10 @@ class Placement:
     kind: NDArray[np.int64]
     box_mm: F64
     ramp: F64
-    part: str
+    rough: NDArray[np.bool_]
+    magnification: F64
+    inner_level: NDArray[np.int64]
+    part: NDArray[np.int64]
 
     def __len__(self) -> int:
         return len(self.level)
@@ -119,27 +130,23 @@ class Sums:
         be = backend()
         self._total = be.dr.zeros(be.UInt64, int(canvas.starts[-1]))
 
-    def draw(self, spots: Spots, placement: Placement, across: int, azimuth_rad: float) -> None:
-        """Add bundles of `across` × `across` rays on a lattice, turned by the Sun's azimuth."""
+    def draw(self, spots: Spots, placement: Placement, azimuth_rad: float) -> None:
+        """Add bundles of rays on lattices, turned by the Sun's azimuth."""
         be = backend()
-        dr = be.dr
-        lattice = _Lattice(self.canvas, spots, placement, across, azimuth_rad)
-        count = len(placement) * (across - 1) ** 2
-        area = lattice.cells(dr.arange(be.UInt32, count)).signed_area
-        dr.eval(area)
-        cells = lattice.cells(dr.arange(be.UInt32, count))
-        number = cells.pixels(*cells.ends(area, placement)[1:])[2]
+        lattice = _Lattice(self.canvas, spots, placement, azimuth_rad)
+        cells = lattice.cells()
+        number = cells.pixels(*cells.ends()[1:])[2]
         # neighbours in the vector unit wait for one another: cells of one size go together
         size = np.minimum(number.numpy(), 65535).astype(np.uint16)
         order = np.argsort(size, kind="stable")[np.count_nonzero(size == 0) :]
         if len(order):
-            self._fill(lattice, be.UInt32(order.astype(np.uint32)), area, placement)
+            self._fill(lattice.cells(be.UInt32(order.astype(np.uint32))))
 
-    def _fill(self, lattice: _Lattice, index: Any, area: Any, placement: Placement) -> None:
+    def _fill(self, cells: _Cells) -> None:
         be = backend()
         dr, Float, Int32, UInt32 = be.dr, be.Float, be.Int32, be.UInt32
-        cells = lattice.cells(index)
-        densities, factors, offsets = cells.ends(area, placement)
+        lattice, placement = cells.lattice, cells.lattice.placement
+        densities, factors, offsets = cells.ends()
         first, last, _ = cells.pixels(factors, offsets)
         a, b, c, d = (
             (x, y, density, margin, factor, offset)
@@ -153,8 +160,6 @@ class Sums:
         nodes = (_EDGE_NODES - 1) / (EDGE_HIGH - EDGE_LOW)
 
         def shade(margin: Any, factor: Any, offset: Any) -> Any:
-            if placement.part == "inner":
-                return offset
             node = UInt32(dr.clip(dr.fma(margin, nodes, 0.5 - EDGE_LOW * nodes), 0, _EDGE_NODES - 1))
             return dr.fma(dr.gather(Float, profile, edge + node), factor, offset)
 
@@ -182,7 +187,7 @@ class Sums:
             for start, share in ((base, weight), (second, other))[: 1 + twice]:
                 # negative numbers wrap around, and back when read
                 units = be.UInt64(be.Int64(dr.round(dr.clip(value, -_MOST, _MOST) * share)))
-                dr.scatter_add(total, units, start + at, shown & (share > 0), mode=dr.ReduceMode.Expand)
+                dr.scatter_add(total, units, start + at, shown & (share > 0), mode=dr.ReduceMode.Auto)
             down = x >= end
             y = dr.select(down, y + 1, y)
             low, high = cells.columns(y)
@@ -194,26 +199,33 @@ class Sums:
 
     def irradiance(self) -> F32:
         """float32[band, y, x]: the levels laid over one another."""
-        canvas = self.canvas
-        total = self._total.numpy().view(np.int64)
-        below: F32 | None = None
-        for level in range(LEVELS - 1, -1, -1):
-            height, width = (int(v) for v in canvas.sizes[level])
-            part = total[canvas.starts[level] : canvas.starts[level + 1]].reshape(canvas.bands, height, width)
-            here = np.multiply(part, 1 / _UNITS, dtype=np.float32)
-            if below is not None:
-                # a level's pixel 0 covers the pixels -M·2 + M and the next one of the finer level
-                top = _MARGIN
-                for band in range(canvas.bands):
+        canvas, total = self.canvas, self._total.numpy().view(np.int64)
+        out = np.empty((canvas.bands, *canvas.shape), dtype=np.float32)
+
+        def one(band: int) -> None:
+            below: F32 | None = None
+            for level in range(LEVELS - 1, -1, -1):
+                height, width = (int(v) for v in canvas.sizes[level])
+                first = canvas.starts[level] + band * height * width
+                part = total[first : first + height * width].reshape(height, width)
+                here = np.multiply(part, 1 / _UNITS, dtype=np.float32)
+                if below is not None:
                     # folds end in steps, which a lattice of pixel centres samples unevenly
-                    calm = cv2.GaussianBlur(below[band], (3, 3), _CALM_SIGMA)
+                    calm = cv2.GaussianBlur(below, (3, 3), _CALM_SIGMA)
                     bigger = cv2.resize(calm, None, fx=2, fy=2, interpolation=cv2.INTER_LINEAR)
-                    here[band] += bigger[top : top + height, top : top + width]
-            below = here
-        assert below is not None
-        height, width = canvas.shape
-        # the parts that add up meet on lattices of their own: where little is left of much it may be below nothing
-        return np.maximum(below[:, _MARGIN : _MARGIN + height, _MARGIN : _MARGIN + width], 0)
+                    # a level's pixel 0 covers the pixels -M·2 + M and the next one of the finer level
+                    here += bigger[_MARGIN : _MARGIN + height, _MARGIN : _MARGIN + width]
+                below = here
+            assert below is not None
+            rows, columns = (slice(_MARGIN, _MARGIN + n) for n in canvas.shape)
+            # the parts that add up meet on lattices of their own: where little is left of much it may be below
+            # nothing
+            np.maximum(below[rows, columns], 0, out=out[band])
+
+        # numpy and OpenCV let go of the interpreter
+        with ThreadPoolExecutor(backend().dr.thread_count()) as pool:
+            list(pool.map(one, range(canvas.bands)))
+        return out
 
 
 class _Triangle:
@@ -254,14 +266,15 @@ def _edge(p: tuple[Any, ...], q: tuple[Any, ...]) -> tuple[Any, ...]:
 
 _CORNERS = ((0, 0), (1, 0), (1, 1), (0, 1))
 _NO_AREA = 3e38
+_WHOLE = -1e5  # margins below are those of lost rays
 _OUTWARDS = ((-1, -1), (1, -1), (1, 1), (-1, 1))
 
 
 class _Lattice:
     """The cells of bundles on the sensor, in pixels of their level."""
 
-    def __init__(self, canvas: Canvas, spots: Spots, placement: Placement, across: int, azimuth_rad: float) -> None:
-        self.spots, self.across, self.source = spots, across, placement.source
+    def __init__(self, canvas: Canvas, spots: Spots, placement: Placement, azimuth_rad: float) -> None:
+        self.spots, self.placement = spots, placement
         self.turn = np.cos(azimuth_rad), np.sin(azimuth_rad)
         step = 2.0**placement.level
         self.per_mm = 1 / (canvas.pitch_mm * step)
@@ -269,11 +282,36 @@ class _Lattice:
         self.sides = canvas.sizes[placement.level]
         self.size = self.sides.prod(axis=1)
         self.start = canvas.starts[placement.level]
+        rays, cells = spots.across**2, (spots.across - 1) ** 2
+        self.across = spots.across[placement.source]
+        self.first_ray = (np.cumsum(rays) - rays)[placement.source]
+        self.first_cell = (np.cumsum(cells) - cells)[placement.source]
         # light of a cell for a share of 1, in irradiance times pixels of the level
-        at_entrance = placement.box_mm[:, 2] * placement.box_mm[:, 3] * 4 / (across - 1) ** 2
+        at_entrance = placement.box_mm[:, 2] * placement.box_mm[:, 3] * 4 / (self.across - 1) ** 2
         self.energy = at_entrance * placement.strength * self.per_mm**2
+        # area of a cell as the levels are made for, mm²
+        self.usual_mm2 = np.maximum(at_entrance * placement.magnification**2, 1e-12)
+        self.area_mm2 = self._areas()
+        self.places = lattice_places(self.across - 1, self.across - 1)
 
-    def cells(self, index: Any) -> _Cells:
+    def _areas(self) -> Any:
+        """Signed area of every cell of every bundle that was traced, `_NO_AREA` where a ray was lost."""
+        be = backend()
+        dr, across = be.dr, self.spots.across
+        bundle, ix, iy, side = lattice_places(across - 1, across - 1)
+        rays = be.UInt32((np.cumsum(across**2) - across**2).astype(np.uint32))
+        first = dr.gather(be.UInt32, rays, bundle) + iy * (side + 1) + ix
+        at = [first + dx + dy * (side + 1) for dx, dy in _CORNERS]
+        (xa, xb, xc, xd), (ya, yb, yc, yd), margins = (
+            [dr.gather(be.Float, v, k) for k in at] for v in (self.spots.x_mm, self.spots.y_mm, self.spots.margin)
+        )
+        area = ((xc - xa) * (yd - yb) - (yc - ya) * (xd - xb)) * 0.5
+        out = dr.select(_least(*margins) > _WHOLE, area, _NO_AREA)
+        dr.eval(out)
+        return out
+
+    def cells(self, index: Any = None) -> _Cells:
+        """All cells, or some."""
         return _Cells(self, index)
 
 
@@ -283,16 +321,17 @@ class _Cells:
     def __init__(self, lattice: _Lattice, index: Any) -> None:
         be = backend()
         dr, Float, UInt32 = be.dr, be.Float, be.UInt32
-        side = lattice.across - 1
-        self.side, self.square = dr.opaque(UInt32, side), dr.opaque(UInt32, side * side)
-        self.bundle = index // self.square
-        cell = index - self.bundle * self.square
-        self.iy = cell // self.side
-        self.ix = cell - self.iy * self.side
-        across, rays = dr.opaque(UInt32, lattice.across), dr.opaque(UInt32, lattice.across**2)
-        first = self.given(lattice.source, UInt32) * rays + self.iy * across + self.ix
+        self.lattice = lattice
+        places = lattice.places
+        if index is not None:
+            dr.eval(*places)
+            places = tuple(dr.gather(UInt32, v, index) if dr.width(v) > 1 else v for v in places)
+        self.bundle, self.ix, self.iy, self.side = places
+        across = self.side + 1
+        first = self.given(lattice.first_ray, UInt32) + self.iy * across + self.ix
+        self.first_cell = self.given(lattice.first_cell, UInt32)
         cos, sin = (dr.opaque(Float, v) for v in lattice.turn)
-        scale = self.given(lattice.per_mm)
+        scale = self.scale = self.given(lattice.per_mm)
         middle_x, middle_y = (self.given(v) for v in lattice.middle)
         self.energy = self.given(lattice.energy)
         self.height, self.width = (self.given(lattice.sides[:, k]) for k in (0, 1))
@@ -312,9 +351,8 @@ class _Cells:
                 )
             )
         (xa, ya, _, ma), (xb, yb, _, mb), (xc, yc, _, mc), (xd, yd, _, md) = self.corners
-        self.valid = _least(ma, mb, mc, md) > -1e5
-        area = ((xc - xa) * (yd - yb) - (yc - ya) * (xd - xb)) * 0.5
-        self.signed_area = dr.select(self.valid, area, _NO_AREA)
+        self.valid = _least(ma, mb, mc, md) > _WHOLE
+        self.own_mm2 = dr.gather(Float, lattice.area_mm2, self.first_cell + self.iy * self.side + self.ix)
         self.low = _least(xa, xb, xc, xd), _least(ya, yb, yc, yd)
         self.high = _most(xa, xb, xc, xd), _most(ya, yb, yc, yd)
         self.small = dr.maximum(self.high[0] - self.low[0], self.high[1] - self.low[1]) < _SMALL
@@ -347,7 +385,7 @@ class _Cells:
         lit &= last >= start
         wide = dr.minimum(self.high[0], self.width) - dr.maximum(self.low[0], 0)
         about = (last - start + 1) * (
-            1 + dr.minimum(wide, dr.abs(self.signed_area) / (self.high[1] - self.low[1] + 1))
+            1 + dr.minimum(wide, dr.abs(self.own_mm2) * self.scale**2 / (self.high[1] - self.low[1] + 1))
         )
         return start, dr.select(lit, last, -1), be.UInt32(dr.select(lit, dr.minimum(about, 60000), 0))
 
@@ -364,36 +402,44 @@ class _Cells:
         last = dr.select(self.small, start + 1, dr.floor(high - 0.499))
         return dr.maximum(start, 0), dr.minimum(last, self.width - 1)
 
-    def ends(self, area: Any, placement: Placement) -> tuple[list[Any], list[Any], list[Any]]:
+    def ends(self) -> tuple[list[Any], list[Any], list[Any]]:
         """At the four corners irradiance without edges, and how much of the part drawn is light with an edge's
         profile (factor) and without (offset)."""
-        dr = backend().dr
-        per_ramp = self.given(1 / placement.ramp)
+        dr, placement = backend().dr, self.lattice.placement
+        per_ramp, even = self.given(1 / placement.ramp), self.given(2.0 * ~placement.rough)
+        inner = (self.lattice.per_mm * 2.0 ** (placement.level - placement.inner_level)) ** 2
+        per_inner, per_usual = self.given(inner / _COARSE_PX), self.given(1 / self.lattice.usual_mm2)
+        energy = self.energy / (self.scale * self.scale)
+        rest, with_calm, with_rise = (self.given(column) for column in _SHARES[placement.part].T)
         densities, factors, offsets = [], [], []
         for corner, (sx, sy) in zip(self.corners, _OUTWARDS, strict=True):
-            mean, least, most = self._around(area, sx, sy)
-            densities.append(corner[2] * self.energy / dr.maximum(mean, 1e-6))
-            # areas of one sign and of like size: no fold near
-            calm = dr.clip((least / dr.maximum(most, 1e-12) - 0.05) * 4, 0, 1)
+            mean, least, most = self._around(sx, sy)
+            densities.append(corner[2] * energy / dr.maximum(mean, 1e-12))
+            # areas of one sign and of like size, or large: no fold near
+            ratio = least / dr.maximum(most, 1e-18)
+            large = dr.minimum(least * per_inner - 1, ratio / _UNLIKE)
+            calm = dr.maximum((ratio - _UNLIKE) / (_ALIKE - _UNLIKE), large)
+            # magnified half as much as is usual, or more: not crowded
+            calm = dr.clip(dr.minimum(calm, 4 * dr.sqrt(mean * per_usual) - 1) + even, 0, 1)
             rise = dr.clip(corner[3] * per_ramp, 0, 1)
             rise = rise * rise * (3 - 2 * rise)
-            factors.append({"inner": 0 * calm, "edge": calm, "fold": 1 - calm}[placement.part])
-            offsets.append({"inner": calm * rise, "edge": -calm * rise, "fold": 0 * calm}[placement.part])
+            factors.append(dr.fma(with_calm, calm, rest))
+            offsets.append(with_rise * calm * rise)
         return densities, factors, offsets
 
-    def _around(self, area: Any, sx: int, sy: int) -> tuple[Any, Any, Any]:
+    def _around(self, sx: int, sy: int) -> tuple[Any, Any, Any]:
         """Mean size of the cells that meet in a corner, and the least and the largest of their areas, counted
-        positive where they have this cell's sign."""
+        positive where they have this cell's sign, mm²."""
         be = backend()
         dr, Int32, UInt32 = be.dr, be.Int32, be.UInt32
-        own = dr.select(self.valid, self.signed_area, 0)
+        own = dr.select(self.valid, self.own_mm2, 0)
         sign = dr.select(own < 0, -1.0, 1.0)
         total, number, side = dr.abs(own), be.Float(1), Int32(self.side)
         least, most = dr.abs(own), dr.abs(own)
         for dx, dy in ((sx, 0), (0, sy), (sx, sy)):
             jx, jy = Int32(self.ix) + dx, Int32(self.iy) + dy
             inside = (jx >= 0) & (jy >= 0) & (jx < side) & (jy < side)
-            near = dr.gather(be.Float, area, self.bundle * self.square + UInt32(jy * side + jx), inside)
+            near = dr.gather(be.Float, self.lattice.area_mm2, self.first_cell + UInt32(jy * side + jx), inside)
             inside &= near != _NO_AREA
             total, number = total + dr.select(inside, dr.abs(near), 0), number + dr.select(inside, 1, 0)
             least = dr.select(inside, dr.minimum(least, near * sign), least)

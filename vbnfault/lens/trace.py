@@ -51,17 +51,26 @@ class Path:
         return np.asarray(there & (self.relative_radius <= 1))
 
 
+def path_of(lens: Prescription, route: Sequence[int] = ()) -> tuple[tuple[int, bool], ...]:
+    """(row, whether it reflects) in the order met, for the rows that reflect, in that order: back, forward, and so
+    on; the sensor is the row behind the last."""
+    out: list[tuple[int, bool]] = []
+    at, onward = -1, True
+    for row in route:
+        between = range(at + 1, row) if onward else range(at - 1, row, -1)
+        out += [*((k, False) for k in between), (row, True)]
+        at, onward = row, not onward
+    return (*out, *((k, False) for k in range(at + 1, len(lens.surfaces))))
+
+
 def forward(lens: Prescription) -> tuple[tuple[int, bool], ...]:
     """The path of the image: every row once, none as a mirror."""
-    return tuple((row, False) for row in range(len(lens.surfaces)))
+    return path_of(lens)
 
 
 def ghost(lens: Prescription, first: int, second: int) -> tuple[tuple[int, bool], ...]:
     """The path of a ghost: back at row `second`, forward again at row `first` < `second`."""
-    down = [(row, False) for row in range(second)]
-    back = [(row, False) for row in range(second - 1, first, -1)]
-    rest = [(row, False) for row in range(first + 1, len(lens.surfaces))]
-    return (*down, (second, True), *back, (first, True), *rest)
+    return path_of(lens, (second, first))
 
 
 def trace(
