@@ -30,7 +30,7 @@ _ACROSS_UNEVEN = 73  # and across one of which more than the share _UNEVEN is ma
 _UNEVEN = 0.3
 _ACROSS_FOCUSED = 17
 _SUBDIVISIONS = 8  # of the interval between two bands, where colours part
-_APART_PX = 1.5  # of a ghost's level: colours farther apart than this take more wavelengths
+_APART_PX = 2.0  # of a ghost's level: colours farther apart than this take more wavelengths
 _FOCUSED = 0.35  # width of an edge in radii of its rim above which the disc is sampled
 _DISC_RINGS = 3
 _PLAIN = 0.03  # edges of this contrast are drawn in full; of a quarter of it a level coarser, and so on
@@ -250,8 +250,8 @@ class FlareModel:
         ramp = np.maximum(_RAMP, _RAMP_PX * 2.0**coarser / one_px)
         return _Detail(
             level=edge,
-            # pixels a fifth of the ramp wide for what lies within
-            inner_level=np.clip(level(ramp * one_px / spread / 5), edge, LEVELS - 1),
+            # pixels a quarter of the ramp wide for what lies within
+            inner_level=np.clip(level(ramp * one_px / spread / 4), edge, LEVELS - 1),
             # a fold is as sharp as the Sun's disc, of twice the radius, lets it be
             rough_level=np.minimum(np.minimum(level(1.3 * sun_px), edge) + coarser, LEVELS - 1),
             ramp=ramp,

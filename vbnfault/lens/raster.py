@@ -11,7 +11,7 @@ from __future__ import annotations
 import itertools
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Any
 
 import cv2
@@ -25,6 +25,7 @@ F64 = NDArray[np.float64]
 
 LEVELS = 6
 PARTS = ("inner", "edge", "rough")
+ROUGH = PARTS.index("rough")
 # of each part: the share of light with an edge's profile is a + b × calm, that without c × calm × rise
 _SHARES = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, -1.0], [1.0, -1.0, 0.0]])
 _MARGIN = 4  # pixels around each level, for what lies half outside
@@ -35,6 +36,9 @@ _SMALL = 0.5  # cells below this many pixels are splatted
 EDGE_LOW, EDGE_HIGH = -1.0, 5.0  # of the soft edge's profile
 _EDGE_NODES = 2049
 _UNLIKE, _ALIKE = 0.05, 0.3  # ratio of neighbouring areas from which, and above which, no fold is near
+_LANES = 16  # of a vector unit
+_POINTS = 64  # along either side of a cell that is drawn by points
+_WANDER = 1.0  # sizes of a cell by which its points may lie beyond its corners
 _COARSE_PX = 6.0  # cells of so many pixels of what lies within show it smooth, however unlike they are
 _EDGE_KINDS = 9
 
@@ -83,8 +87,9 @@ class Placement:
     inner_level: NDArray[np.int64]
     part: NDArray[np.int64]
 
-    def __len__(self) -> int:
-        return len(self.level)
+    def take(self, chosen: NDArray[Any]) -> Placement:
+        """Some of the bundles."""
+        return Placement(**{name: values[chosen] for name, values in vars(self).items()})
 
 
 @lru_cache(maxsize=1)
@@ -132,22 +137,23 @@ class Sums:
 
     def draw(self, spots: Spots, placement: Placement, azimuth_rad: float) -> None:
         """Add bundles of rays on lattices, turned by the Sun's azimuth."""
-        be = backend()
-        lattice = _Lattice(self.canvas, spots, placement, azimuth_rad)
-        cells = lattice.cells()
-        number = cells.pixels(*cells.ends()[1:])[2]
-        # neighbours in the vector unit wait for one another: cells of one size go together
-        size = np.minimum(number.numpy(), 65535).astype(np.uint16)
-        order = np.argsort(size, kind="stable")[np.count_nonzero(size == 0) :]
-        if len(order):
-            self._fill(lattice.cells(be.UInt32(order.astype(np.uint32))))
+        traced = _Traced(spots)
+        everything = np.ones(len(placement.part), dtype=bool)
+        rough = placement.part == ROUGH
+        for chosen, count, add in ((everything, _Cells.pixels, self._fill), (rough, _Cells.points, self._splat)):
+            if not chosen.any():
+                continue
+            lattice = _Lattice(self.canvas, traced, placement.take(chosen), azimuth_rad)
+            order = _shared_out(count(lattice.cells()).numpy())
+            if len(order):
+                add(lattice.cells(backend().UInt32(order)))
 
     def _fill(self, cells: _Cells) -> None:
         be = backend()
         dr, Float, Int32, UInt32 = be.dr, be.Float, be.Int32, be.UInt32
-        lattice, placement = cells.lattice, cells.lattice.placement
-        densities, factors, offsets = cells.ends()
-        first, last, _ = cells.pixels(factors, offsets)
+        ends = cells.ends()
+        densities, factors, offsets, _ = ends
+        first, last, _ = cells.rows(ends)
         a, b, c, d = (
             (x, y, density, margin, factor, offset)
             for (x, y, _, margin), density, factor, offset in zip(
@@ -155,21 +161,15 @@ class Sums:
             )
         )
         triangles = (_Triangle(a, b, c), _Triangle(a, c, d))
-        profile = Float(edge_profiles().ravel())
-        edge = cells.given(placement.kind * _EDGE_NODES, UInt32)
-        nodes = (_EDGE_NODES - 1) / (EDGE_HIGH - EDGE_LOW)
+        profile = cells.profile()
 
         def shade(margin: Any, factor: Any, offset: Any) -> Any:
-            node = UInt32(dr.clip(dr.fma(margin, nodes, 0.5 - EDGE_LOW * nodes), 0, _EDGE_NODES - 1))
-            return dr.fma(dr.gather(Float, profile, edge + node), factor, offset)
+            return dr.fma(profile(margin), factor, offset)
 
         margins = [corner[3] for corner in cells.corners]
         splat = sum(corner[2] for corner in cells.corners) * 0.25 * cells.energy
         splat = splat * shade(*(sum(four) * 0.25 for four in (margins, factors, offsets)))
-        base, second = (cells.given(lattice.start + placement.band[:, k] * lattice.size, UInt32) for k in (0, 1))
-        weight, other = (cells.given(placement.weight[:, k] * _UNITS) for k in (0, 1))
-        width, small, total = UInt32(cells.width), cells.small, self._total
-        twice = bool((placement.weight[:, 1] > 0).any())
+        add, width, small = self._adder(cells), UInt32(cells.width), cells.small
 
         def more(_x: Any, y: Any, _end: Any) -> Any:
             return y <= last
@@ -184,10 +184,7 @@ class Sums:
             tent = tent * dr.maximum(1 - dr.abs(y + 0.5 - cells.middle[1]), 0)
             value = dr.select(small, tent * splat, found[0] * shade(*found[1:]))
             at, shown = UInt32(Int32(y)) * width + UInt32(Int32(x)), here & (value != 0)
-            for start, share in ((base, weight), (second, other))[: 1 + twice]:
-                # negative numbers wrap around, and back when read
-                units = be.UInt64(be.Int64(dr.round(dr.clip(value, -_MOST, _MOST) * share)))
-                dr.scatter_add(total, units, start + at, shown & (share > 0), mode=dr.ReduceMode.Auto)
+            add(value, at, shown)
             down = x >= end
             y = dr.select(down, y + 1, y)
             low, high = cells.columns(y)
@@ -195,7 +192,75 @@ class Sums:
 
         low, high = cells.columns(first)
         dr.while_loop((low, first, high), more, pixel, mode="symbolic")
-        dr.eval(total)
+        dr.eval(self._total)
+
+    def _splat(self, cells: _Cells) -> None:
+        """Points of a cell, closer than pixels: where light folds its surface is not that of its corners."""
+        be = backend()
+        dr, Float, Int32, UInt32 = be.dr, be.Float, be.Int32, be.UInt32
+        across, down = cells.points_along()
+        number, columns = UInt32(across * down), UInt32(across)
+        profile, add, width = cells.profile(), self._adder(cells), UInt32(cells.width)
+        _, factors, _, _ = cells.ends()
+        light = cells.energy / (across * down)
+        (xa, ya, sa, ma), (xb, yb, sb, mb), (xc, yc, sc, mc), (xd, yd, sd, md) = cells.corners
+        fa, fb, fc, fd = factors
+        bends = cells.bends()
+
+        def on(point: Any) -> Any:
+            return point < number
+
+        def one(point: Any) -> Any:
+            row = UInt32((Float(point) + 0.5) / across)
+            u, v = (Float(point - row * columns) + 0.5) / across, (Float(row) + 0.5) / down
+
+            def between(a: Any, b: Any, c: Any, d: Any) -> Any:
+                return dr.lerp(dr.lerp(a, b, u), dr.lerp(d, c, u), v)
+
+            # Lagrange's cubic along either side
+            along = [u * (1 - u) * (-1 / 6) * k for k in (2 - u, 1 + u)]
+            aside = [v * (1 - v) * (-1 / 6) * k for k in (2 - v, 1 + v)]
+            place = []
+            for corners, (bent_u, bent_v) in zip(((xa, xb, xc, xd), (ya, yb, yc, yd)), bends, strict=True):
+                a, b, c, d = bent_u
+                bow = dr.fma(along[0], dr.lerp(a, d, v), along[1] * dr.lerp(b, c, v))
+                a, b, c, d = bent_v
+                bow = bow + dr.fma(aside[0], dr.lerp(a, b, u), aside[1] * dr.lerp(d, c, u))
+                place.append(between(*corners) + bow - 0.5)
+            value = light * between(sa, sb, sc, sd) * between(fa, fb, fc, fd) * profile(between(ma, mb, mc, md))
+            x, y = (dr.clip(p, -10, 1e5) for p in place)
+            left, top = dr.floor(x), dr.floor(y)
+            right_share, low_share = x - left, y - top
+            for dx, dy in _CORNERS:
+                share = (right_share if dx else 1 - right_share) * (low_share if dy else 1 - low_share)
+                px, py = left + dx, top + dy
+                inside = (px >= 0) & (py >= 0) & (px < cells.width) & (py < cells.height) & (value != 0)
+                add(value * share, UInt32(Int32(py)) * width + UInt32(Int32(px)), inside)
+            return (point + 1,)
+
+        dr.while_loop((dr.zeros(UInt32, dr.width(number)),), on, one, mode="symbolic")
+        dr.eval(self._total)
+
+    def _adder(self, cells: _Cells) -> Any:
+        """Adds irradiance to a pixel of the level of a cell's bundle, in its bands."""
+        be = backend()
+        dr, lattice, placement, total = be.dr, cells.lattice, cells.lattice.placement, self._total
+        bands = [
+            (
+                cells.given(lattice.start + placement.band[:, k] * lattice.size, be.UInt32),
+                cells.given(placement.weight[:, k] * _UNITS),
+            )
+            for k in (0, 1)
+            if (placement.weight[:, k] > 0).any()
+        ]
+
+        def add(value: Any, at: Any, shown: Any) -> None:
+            for start, share in bands:
+                # negative numbers wrap around, and back when read
+                units = be.UInt64(be.Int64(dr.round(dr.clip(value, -_MOST, _MOST) * share)))
+                dr.scatter_add(total, units, start + at, shown & (share > 0), mode=dr.ReduceMode.Auto)
+
+        return add
 
     def irradiance(self) -> F32:
         """float32[band, y, x]: the levels laid over one another."""
@@ -226,6 +291,17 @@ class Sums:
         with ThreadPoolExecutor(backend().dr.thread_count()) as pool:
             list(pool.map(one, range(canvas.bands)))
         return out
+
+
+def _shared_out(work: NDArray[np.uint32]) -> NDArray[np.uint32]:
+    """Lanes in which there is work, those with as much of it side by side, for neighbours in the vector unit wait
+    for one another; groups of them in an order that gives every thread its share of the large ones."""
+    size = np.minimum(work, 65535).astype(np.uint16)
+    order = np.argsort(size, kind="stable")[np.count_nonzero(size == 0) :].astype(np.uint32)
+    groups = len(order) // _LANES
+    golden = np.argsort(np.arange(groups) * ((np.sqrt(5) - 1) / 2) % 1)
+    rest = order[groups * _LANES :]
+    return np.concatenate([order[: groups * _LANES].reshape(groups, _LANES)[golden].ravel(), rest])
 
 
 class _Triangle:
@@ -270,11 +346,57 @@ _WHOLE = -1e5  # margins below are those of lost rays
 _OUTWARDS = ((-1, -1), (1, -1), (1, 1), (-1, 1))
 
 
-class _Lattice:
-    """The cells of bundles on the sensor, in pixels of their level."""
+class _Traced:
+    """Lattices of rays on the sensor, whatever is drawn of them: areas of their cells, and how they bend."""
 
-    def __init__(self, canvas: Canvas, spots: Spots, placement: Placement, azimuth_rad: float) -> None:
-        self.spots, self.placement = spots, placement
+    def __init__(self, spots: Spots) -> None:
+        be = backend()
+        self.spots, self.across = spots, spots.across
+        rays, cells = self.across**2, (self.across - 1) ** 2
+        self.first_ray, self.first_cell = np.cumsum(rays) - rays, np.cumsum(cells) - cells
+        self._first_ray = be.UInt32(self.first_ray.astype(np.uint32))
+        self.area_mm2 = self._areas()
+
+    def _areas(self) -> Any:
+        """Signed area of every cell, `_NO_AREA` where a ray was lost."""
+        be = backend()
+        dr, spots = be.dr, self.spots
+        bundle, ix, iy, side = lattice_places(self.across - 1, self.across - 1)
+        first = dr.gather(be.UInt32, self._first_ray, bundle) + iy * (side + 1) + ix
+        at = [first + dx + dy * (side + 1) for dx, dy in _CORNERS]
+        (xa, xb, xc, xd), (ya, yb, yc, yd), margins = (
+            [dr.gather(be.Float, v, k) for k in at] for v in (spots.x_mm, spots.y_mm, spots.margin)
+        )
+        area = ((xc - xa) * (yd - yb) - (yc - ya) * (xd - xb)) * 0.5
+        out = dr.select(_least(*margins) > _WHOLE, area, _NO_AREA)
+        dr.eval(out)
+        return out
+
+    @cached_property
+    def bends_mm(self) -> tuple[tuple[Any, Any], tuple[Any, Any]]:
+        """Second differences at every ray: of x along rows and columns, and of y; 0 beside a lattice's end or a ray
+        that was lost."""
+        be = backend()
+        dr, spots = be.dr, self.spots
+        _, ix, iy, side = lattice_places(self.across, self.across)
+        here = dr.arange(be.UInt32, int((self.across**2).sum()))
+        found: list[list[Any]] = [[], []]
+        for at, step in ((ix, be.UInt32(1)), (iy, side)):
+            inside = (at > 0) & (at < side - 1)
+            before, behind = (dr.select(inside, k, here) for k in (here - step, here + step))
+            kept = [dr.gather(be.Float, spots.margin, k) > _WHOLE for k in (before, here, behind)]
+            for of, values in zip(found, (spots.x_mm, spots.y_mm), strict=True):
+                one, two, three = (dr.gather(be.Float, values, k) for k in (before, here, behind))
+                of.append(dr.select(inside & kept[0] & kept[1] & kept[2], one - 2 * two + three, 0))
+        dr.eval(found)
+        return (found[0][0], found[0][1]), (found[1][0], found[1][1])
+
+
+class _Lattice:
+    """The cells of bundles that are drawn, in pixels of their level."""
+
+    def __init__(self, canvas: Canvas, traced: _Traced, placement: Placement, azimuth_rad: float) -> None:
+        self.traced, self.spots, self.placement = traced, traced.spots, placement
         self.turn = np.cos(azimuth_rad), np.sin(azimuth_rad)
         step = 2.0**placement.level
         self.per_mm = 1 / (canvas.pitch_mm * step)
@@ -282,33 +404,15 @@ class _Lattice:
         self.sides = canvas.sizes[placement.level]
         self.size = self.sides.prod(axis=1)
         self.start = canvas.starts[placement.level]
-        rays, cells = spots.across**2, (spots.across - 1) ** 2
-        self.across = spots.across[placement.source]
-        self.first_ray = (np.cumsum(rays) - rays)[placement.source]
-        self.first_cell = (np.cumsum(cells) - cells)[placement.source]
+        self.across, self.first_ray, self.first_cell = (
+            v[placement.source] for v in (traced.across, traced.first_ray, traced.first_cell)
+        )
         # light of a cell for a share of 1, in irradiance times pixels of the level
         at_entrance = placement.box_mm[:, 2] * placement.box_mm[:, 3] * 4 / (self.across - 1) ** 2
         self.energy = at_entrance * placement.strength * self.per_mm**2
         # area of a cell as the levels are made for, mm²
         self.usual_mm2 = np.maximum(at_entrance * placement.magnification**2, 1e-12)
-        self.area_mm2 = self._areas()
         self.places = lattice_places(self.across - 1, self.across - 1)
-
-    def _areas(self) -> Any:
-        """Signed area of every cell of every bundle that was traced, `_NO_AREA` where a ray was lost."""
-        be = backend()
-        dr, across = be.dr, self.spots.across
-        bundle, ix, iy, side = lattice_places(across - 1, across - 1)
-        rays = be.UInt32((np.cumsum(across**2) - across**2).astype(np.uint32))
-        first = dr.gather(be.UInt32, rays, bundle) + iy * (side + 1) + ix
-        at = [first + dx + dy * (side + 1) for dx, dy in _CORNERS]
-        (xa, xb, xc, xd), (ya, yb, yc, yd), margins = (
-            [dr.gather(be.Float, v, k) for k in at] for v in (self.spots.x_mm, self.spots.y_mm, self.spots.margin)
-        )
-        area = ((xc - xa) * (yd - yb) - (yc - ya) * (xd - xb)) * 0.5
-        out = dr.select(_least(*margins) > _WHOLE, area, _NO_AREA)
-        dr.eval(out)
-        return out
 
     def cells(self, index: Any = None) -> _Cells:
         """All cells, or some."""
@@ -329,6 +433,7 @@ class _Cells:
         self.bundle, self.ix, self.iy, self.side = places
         across = self.side + 1
         first = self.given(lattice.first_ray, UInt32) + self.iy * across + self.ix
+        self.rays = [first + dx + (across if dy else 0) for dx, dy in _CORNERS]
         self.first_cell = self.given(lattice.first_cell, UInt32)
         cos, sin = (dr.opaque(Float, v) for v in lattice.turn)
         scale = self.scale = self.given(lattice.per_mm)
@@ -336,8 +441,7 @@ class _Cells:
         self.energy = self.given(lattice.energy)
         self.height, self.width = (self.given(lattice.sides[:, k]) for k in (0, 1))
         self.corners = []
-        for dx, dy in _CORNERS:
-            at = first + dx + (across if dy else 0)
+        for at in self.rays:
             x, y, share, margin = (
                 dr.gather(Float, v, at)
                 for v in (lattice.spots.x_mm, lattice.spots.y_mm, lattice.spots.share, lattice.spots.margin)
@@ -352,7 +456,7 @@ class _Cells:
             )
         (xa, ya, _, ma), (xb, yb, _, mb), (xc, yc, _, mc), (xd, yd, _, md) = self.corners
         self.valid = _least(ma, mb, mc, md) > _WHOLE
-        self.own_mm2 = dr.gather(Float, lattice.area_mm2, self.first_cell + self.iy * self.side + self.ix)
+        self.own_mm2 = dr.gather(Float, lattice.traced.area_mm2, self.first_cell + self.iy * self.side + self.ix)
         self.low = _least(xa, xb, xc, xd), _least(ya, yb, yc, yd)
         self.high = _most(xa, xb, xc, xd), _most(ya, yb, yc, yd)
         self.small = dr.maximum(self.high[0] - self.low[0], self.high[1] - self.low[1]) < _SMALL
@@ -365,9 +469,66 @@ class _Cells:
         dtype = np.float32 if kind is be.Float else np.uint32
         return be.dr.gather(kind, kind(np.ascontiguousarray(values, dtype=dtype)), self.bundle)
 
-    def pixels(self, factors: list[Any], offsets: list[Any]) -> tuple[Any, Any, Any]:
+    def pixels(self) -> Any:
+        """About how many pixels a cell covers, 0 where it has no part in what is drawn."""
+        return self.rows(self.ends())[2]
+
+    def points(self) -> Any:
+        """By how many points a cell is drawn, 0 where it has no part in what is drawn."""
+        be = backend()
+        dr = be.dr
+        across, down = self.points_along()
+        _, factors, _, folds = self.ends()
+        far = _WANDER * (self.high[0] - self.low[0] + self.high[1] - self.low[1]) + 2
+        near = (self.high[0] > -far) & (self.low[0] < self.width + far)
+        near &= (self.high[1] > -far) & (self.low[1] < self.height + far)
+        lit = self.valid & folds & (_most(*factors) > 0) & (_most(*(c[3] for c in self.corners)) > EDGE_LOW)
+        return be.UInt32(dr.select(lit & near, across * down, 0))
+
+    def points_along(self) -> tuple[Any, Any]:
+        """Points along either side that are no farther apart than pixels."""
+        dr = backend().dr
+        a, b, c, d = self.corners
+        (xu, xv), (yu, yv) = self.bends()
+        out = []
+        for sides, bends in ((((a, b), (d, c)), (xu, yu)), (((a, d), (b, c)), (xv, yv))):
+            longest = _most(*(dr.abs(q[k] - p[k]) for p, q in sides for k in (0, 1)))
+            # a bow of second difference s adds s / 2 to the steps at its ends
+            bow = dr.maximum(*(_most(*(dr.abs(s) for s in bent)) for bent in bends))
+            out.append(dr.clip(dr.ceil(longest + 0.5 * bow), 1, _POINTS))
+        return out[0], out[1]
+
+    def bends(self) -> tuple[tuple[list[Any], list[Any]], tuple[list[Any], list[Any]]]:
+        """Second differences of x and of y along rows and along columns at the corners, pixels."""
+        be = backend()
+        dr = be.dr
+        (xu, xv), (yu, yv) = (
+            [[dr.gather(be.Float, v, at) for at in self.rays] for v in pair]
+            for pair in self.lattice.traced.bends_mm
+        )
+        cos, sin = (dr.opaque(be.Float, v) * self.scale for v in self.lattice.turn)
+        x_bends = tuple([x * cos - y * sin for x, y in zip(*of, strict=True)] for of in ((xu, yu), (xv, yv)))
+        y_bends = tuple([x * sin + y * cos for x, y in zip(*of, strict=True)] for of in ((xu, yu), (xv, yv)))
+        return x_bends, y_bends  # type: ignore[return-value]
+
+    def profile(self) -> Any:
+        """Light across a soft edge of the cell's bundle, as a function of the margin."""
+        be = backend()
+        dr = be.dr
+        table = be.Float(edge_profiles().ravel())
+        edge = self.given(self.lattice.placement.kind * _EDGE_NODES, be.UInt32)
+        nodes = (_EDGE_NODES - 1) / (EDGE_HIGH - EDGE_LOW)
+
+        def at(margin: Any) -> Any:
+            node = be.UInt32(dr.clip(dr.fma(margin, nodes, 0.5 - EDGE_LOW * nodes), 0, _EDGE_NODES - 1))
+            return dr.gather(be.Float, table, edge + node)
+
+        return at
+
+    def rows(self, ends: tuple[Any, ...]) -> tuple[Any, Any, Any]:
         """First and last row of pixels whose centres may lie in a cell, and about how many pixels; no row where a
-        cell has no part in the light that is drawn."""
+        cell has no part in the light that is drawn, or folds."""
+        _, factors, offsets, folds = ends
         be = backend()
         dr = be.dr
         margins = [corner[3] for corner in self.corners]
@@ -377,7 +538,7 @@ class _Cells:
             dr.select(plain, dr.abs(factor + offset), dr.maximum(dr.abs(factor), dr.abs(offset)))
             for factor, offset in zip(factors, offsets, strict=True)
         ]
-        lit = self.valid & (_most(*drawn) > 0) & (_most(*margins) > EDGE_LOW)
+        lit = self.valid & ~folds & (_most(*drawn) > 0) & (_most(*margins) > EDGE_LOW)
         lit &= (self.high[0] > 0) & (self.low[0] < self.width)
         start = dr.select(self.small, dr.floor(self.middle[1] - 0.5), dr.ceil(self.low[1] - 0.5))
         last = dr.select(self.small, start + 1, dr.floor(self.high[1] - 0.5))
@@ -402,16 +563,16 @@ class _Cells:
         last = dr.select(self.small, start + 1, dr.floor(high - 0.499))
         return dr.maximum(start, 0), dr.minimum(last, self.width - 1)
 
-    def ends(self) -> tuple[list[Any], list[Any], list[Any]]:
+    def ends(self) -> tuple[list[Any], list[Any], list[Any], Any]:
         """At the four corners irradiance without edges, and how much of the part drawn is light with an edge's
-        profile (factor) and without (offset)."""
+        profile (factor) and without (offset); and whether a rough cell folds, and should be drawn by points."""
         dr, placement = backend().dr, self.lattice.placement
         per_ramp, even = self.given(1 / placement.ramp), self.given(2.0 * ~placement.rough)
         inner = (self.lattice.per_mm * 2.0 ** (placement.level - placement.inner_level)) ** 2
         per_inner, per_usual = self.given(inner / _COARSE_PX), self.given(1 / self.lattice.usual_mm2)
         energy = self.energy / (self.scale * self.scale)
         rest, with_calm, with_rise = (self.given(column) for column in _SHARES[placement.part].T)
-        densities, factors, offsets = [], [], []
+        densities, factors, offsets, leasts = [], [], [], []
         for corner, (sx, sy) in zip(self.corners, _OUTWARDS, strict=True):
             mean, least, most = self._around(sx, sy)
             densities.append(corner[2] * energy / dr.maximum(mean, 1e-12))
@@ -425,7 +586,10 @@ class _Cells:
             rise = rise * rise * (3 - 2 * rise)
             factors.append(dr.fma(with_calm, calm, rest))
             offsets.append(with_rise * calm * rise)
-        return densities, factors, offsets
+            leasts.append(least)
+        size = dr.maximum(self.high[0] - self.low[0], self.high[1] - self.low[1])
+        folds = (rest > 0) & (_least(*leasts) < 0) & (size < _POINTS)
+        return densities, factors, offsets, folds
 
     def _around(self, sx: int, sy: int) -> tuple[Any, Any, Any]:
         """Mean size of the cells that meet in a corner, and the least and the largest of their areas, counted
@@ -439,7 +603,9 @@ class _Cells:
         for dx, dy in ((sx, 0), (0, sy), (sx, sy)):
             jx, jy = Int32(self.ix) + dx, Int32(self.iy) + dy
             inside = (jx >= 0) & (jy >= 0) & (jx < side) & (jy < side)
-            near = dr.gather(be.Float, self.lattice.area_mm2, self.first_cell + UInt32(jy * side + jx), inside)
+            near = dr.gather(
+                be.Float, self.lattice.traced.area_mm2, self.first_cell + UInt32(jy * side + jx), inside
+            )
             inside &= near != _NO_AREA
             total, number = total + dr.select(inside, dr.abs(near), 0), number + dr.select(inside, 1, 0)
             least = dr.select(inside, dr.minimum(least, near * sign), least)
