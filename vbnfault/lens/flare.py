@@ -26,16 +26,17 @@ F64 = NDArray[np.float64]
 
 MODELS = ("traced", "paraxial")
 _ACROSS = 37  # rays across a ghost
-_ACROSS_UNEVEN = 73  # and across one of which more than the share _UNEVEN is magnified unevenly
-_UNEVEN = 0.3
-_ACROSS_FOCUSED = 17
+_UNEVEN = 0.3  # share of it that is magnified unevenly above which there are twice as many
+_ACROSS_FOCUSED = 25
 _SUBDIVISIONS = 8  # of the interval between two bands, where colours part
 _APART_PX = 2.0  # of a ghost's level: colours farther apart than this take more wavelengths
 _FOCUSED = 0.35  # width of an edge in radii of its rim above which the disc is sampled
 _DISC_RINGS = 3
+_LARGE_PX = 150.0  # radius of a rim's picture
 _PLAIN = 0.03  # edges of this contrast are drawn in full; of a quarter of it a level coarser, and so on
 _RAMP, _RAMP_PX = 7.0, 24.0  # how far from an edge, in its widths and in pixels at least, details are drawn
-_SPREAD = 0.25, 4.0  # bounds of how much larger than to first order pictures of rims are taken to be
+_SPREAD = 0.25, 256.0  # bounds of how much larger than to first order pictures of rims are taken to be
+_SPREAD_SHARP = 4.0  # and for how sharp they are
 _LEAST = 1e-10  # irradiance over the Sun's below which a ghost is left out
 
 
@@ -172,8 +173,8 @@ class FlareModel:
     diffraction
         Whether edges ring as Fresnel's do.
     across
-        Rays across a ghost either way: its light converges with them, to some 1 % with the default, ghosts that
-        are flung far apart to some 4 %.
+        Rays across a typical ghost either way: its light converges with them, to some 1 % with the default, ghosts
+        that are flung far apart to some 4 %.
     """
 
     def __init__(
@@ -235,7 +236,9 @@ class FlareModel:
         t, least = self._tracer, self._least
         route = np.repeat(np.arange(len(t.routes)), np.diff(t.first_step))
         px = self._px * spread[route]
-        blur_px = np.hypot(self._sun[least], self._fresnel[least]) * px[least]
+        # parts of a picture are less spread than most of it, and as sharp as they are
+        sharp = np.minimum(spread, _SPREAD_SHARP)
+        blur_px = np.hypot(self._sun[least], self._fresnel[least]) * self._px[least] * sharp
         # the disc's samples lie about a third of its radius apart
         sun_px = self.sun_radius_rad * np.abs(t.matrix[:, 0, 1]) / self.canvas.pitch_mm
         blur_px = np.where(self._sampled, 0.3 * sun_px, blur_px)
@@ -246,18 +249,20 @@ class FlareModel:
         edge = np.minimum(level(blur_px / 1.5) + coarser, LEVELS - 1)
         steady = np.hypot(self._sun, 0.5 * 2.0 ** edge[route] / px)
         width = np.clip(np.hypot(steady, self._fresnel), 1e-4, 0.5)
-        one_px = width[least] * px[least]
+        one_px = width[least] * self._px[least] * sharp
         ramp = np.maximum(_RAMP, _RAMP_PX * 2.0**coarser / one_px)
         return _Detail(
             level=edge,
             # pixels a quarter of the ramp wide for what lies within
-            inner_level=np.clip(level(ramp * one_px / spread / 4), edge, LEVELS - 1),
-            # a fold is as sharp as the Sun's disc, of twice the radius, lets it be
-            rough_level=np.minimum(np.minimum(level(1.3 * sun_px), edge) + coarser, LEVELS - 1),
+            inner_level=np.clip(level(ramp * one_px / sharp / 4), edge, LEVELS - 1),
+            # a fold is as sharp as the Sun's disc, of twice the radius, lets it be; of a large ghost to two pixels
+            rough_level=np.minimum(
+                np.minimum(np.maximum(level(1.3 * sun_px), px[least] > _LARGE_PX), edge) + coarser, LEVELS - 1
+            ),
             ramp=ramp,
             kind=edge_kind(steady[least], self._fresnel[least]),
             width=width,
-            magnification=np.abs(t.matrix[:, 0, 0]) * spread,
+            magnification=np.abs(t.matrix[:, 0, 0]) * sharp,
         )
 
     def _spread(self, arrivals: Arrivals, route: NDArray[np.int64]) -> F64:
@@ -286,7 +291,7 @@ class FlareModel:
         detail = self._details(self._fainter(rays, arrivals), self._spread(arrivals, rays.route))
         sums = Sums(self.canvas)
         cosine = float(np.cos(np.radians(sun_deg)))
-        across = np.where(arrivals.uneven > _UNEVEN, max(self._across, _ACROSS_UNEVEN), self._across)
+        across = np.where(arrivals.uneven > _UNEVEN, 2 * self._across - 1, self._across)
         sampled = self._sampled[rays.route]
         for chosen in (~sampled, sampled):
             if not chosen.any():

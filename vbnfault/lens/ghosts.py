@@ -87,8 +87,9 @@ def boxes(
     route = np.tile(np.arange(count), 2)
     arrivals = Arrivals.none(count)
     edges = np.full(len(made.rows), _SHARP) if width is None else width
-    for _ in range(2):
-        box, arrivals = _narrowed(made, route, box, direction, edges, reach_mm)
+    last = len(made.wavelength_nm) - 1
+    for ends in ((last // 2,), (0, last)):
+        box, arrivals = _narrowed(made, route, ends, box, direction, edges, reach_mm)
         route = np.flatnonzero(np.isfinite(box[:, 0]))
         box = box[route]
         if not len(route):
@@ -121,24 +122,31 @@ def _paraxial_boxes(made: Tracer, tangent: float, reach: float) -> F64:
 
 
 def _narrowed(
-    made: Tracer, route: NDArray[np.int64], box: F64, direction: F64, width: F64, reach_mm: float
+    made: Tracer,
+    route: NDArray[np.int64],
+    wavelength: tuple[int, ...],
+    box: F64,
+    direction: F64,
+    width: F64,
+    reach_mm: float,
 ) -> tuple[F64, Arrivals]:
-    """The boxes of what gets through the given ones, nan where nothing does, and the arrivals, by route."""
-    ends = np.array([0, len(made.wavelength_nm) - 1])
+    """Boxes of what gets through the given ones, nan where nothing does, and by route the arrivals: of the first
+    wavelength, and how far they lie from those of the last."""
+    count = len(wavelength)
     rays = Rays(
-        route=np.tile(route, 2),
-        wavelength=np.repeat(ends, len(route)),
-        box_mm=np.tile(box, (2, 1)),
-        direction=np.tile(direction, (2 * len(route), 1)),
+        route=np.tile(route, count),
+        wavelength=np.repeat(np.array(wavelength), len(route)),
+        box_mm=np.tile(box, (count, 1)),
+        direction=np.tile(direction, (count * len(route), 1)),
     )
     spots = made.trace(rays, _COARSE, width)
     margin, x, y, share = (
-        v.numpy().reshape(2, len(route), _COARSE, _COARSE)
+        v.numpy().reshape(count, len(route), _COARSE, _COARSE)
         for v in (spots.margin, spots.x_mm, spots.y_mm, spots.share)
     )
     passes = (margin > -1).any(axis=0)
     near = (margin > -1).all(axis=0) & (np.hypot(x[0], y[0]) < reach_mm)
-    apart = np.where(near, np.hypot(x[1] - x[0], y[1] - y[0]), np.nan).reshape(len(route), -1)
+    apart = np.where(near, np.hypot(x[-1] - x[0], y[-1] - y[0]), np.nan).reshape(len(route), -1)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # a bundle of which nothing arrives near
         move = np.nan_to_num(np.nanpercentile(apart, 80, axis=1))

@@ -35,11 +35,12 @@ _CALM_SIGMA = 0.8  # pixels of a coarser level by which it is smoothed
 _SMALL = 0.5  # cells below this many pixels are splatted
 EDGE_LOW, EDGE_HIGH = -1.0, 5.0  # of the soft edge's profile
 _EDGE_NODES = 2049
-_UNLIKE, _ALIKE = 0.05, 0.3  # ratio of neighbouring areas from which, and above which, no fold is near
+_UNLIKE = 0.05  # ratio of neighbouring areas below which a fold is near
+_SMOOTH = 0.5  # change of irradiance over a pixel that still looks smooth
 _LANES = 16  # of a vector unit
+_NARROW_PX = 1.5
 _POINTS = 64  # along either side of a cell that is drawn by points
 _WANDER = 1.0  # sizes of a cell by which its points may lie beyond its corners
-_COARSE_PX = 6.0  # cells of so many pixels of what lies within show it smooth, however unlike they are
 _EDGE_KINDS = 9
 
 
@@ -137,16 +138,18 @@ class Sums:
 
     def draw(self, spots: Spots, placement: Placement, azimuth_rad: float) -> None:
         """Add bundles of rays on lattices, turned by the Sun's azimuth."""
-        traced = _Traced(spots)
-        everything = np.ones(len(placement.part), dtype=bool)
-        rough = placement.part == ROUGH
-        for chosen, count, add in ((everything, _Cells.pixels, self._fill), (rough, _Cells.points, self._splat)):
-            if not chosen.any():
-                continue
-            lattice = _Lattice(self.canvas, traced, placement.take(chosen), azimuth_rad)
-            order = _shared_out(count(lattice.cells()).numpy())
+        UInt32 = backend().UInt32
+        lattice = _Lattice(self.canvas, _Traced(spots), placement, azimuth_rad)
+        number, folds = (v.numpy() for v in lattice.cells().pixels())
+        order = _shared_out(number, np.flatnonzero(number))
+        if len(order):
+            self._fill(lattice.cells(UInt32(order)))
+        folded = np.flatnonzero(folds).astype(np.uint32)
+        if len(folded):
+            number = lattice.cells(UInt32(folded)).points().numpy()
+            order = folded[_shared_out(number, np.flatnonzero(number))]
             if len(order):
-                add(lattice.cells(backend().UInt32(order)))
+                self._splat(lattice.cells(UInt32(order)))
 
     def _fill(self, cells: _Cells) -> None:
         be = backend()
@@ -293,11 +296,11 @@ class Sums:
         return out
 
 
-def _shared_out(work: NDArray[np.uint32]) -> NDArray[np.uint32]:
-    """Lanes in which there is work, those with as much of it side by side, for neighbours in the vector unit wait
-    for one another; groups of them in an order that gives every thread its share of the large ones."""
-    size = np.minimum(work, 65535).astype(np.uint16)
-    order = np.argsort(size, kind="stable")[np.count_nonzero(size == 0) :].astype(np.uint32)
+def _shared_out(work: NDArray[np.uint32], chosen: NDArray[np.int64]) -> NDArray[np.uint32]:
+    """Some lanes in order: those with as much work side by side, for neighbours in the vector unit wait for one
+    another; groups of them such that every thread gets its share of the large ones."""
+    size = np.minimum(work[chosen], 65535).astype(np.uint16)
+    order = chosen[np.argsort(size, kind="stable")].astype(np.uint32)
     groups = len(order) // _LANES
     golden = np.argsort(np.arange(groups) * ((np.sqrt(5) - 1) / 2) % 1)
     rest = order[groups * _LANES :]
@@ -342,6 +345,7 @@ def _edge(p: tuple[Any, ...], q: tuple[Any, ...]) -> tuple[Any, ...]:
 
 _CORNERS = ((0, 0), (1, 0), (1, 1), (0, 1))
 _NO_AREA = 3e38
+_MISSED = 1e3  # radius of rays that are lost, but not at a rim
 _WHOLE = -1e5  # margins below are those of lost rays
 _OUTWARDS = ((-1, -1), (1, -1), (1, 1), (-1, 1))
 
@@ -440,22 +444,24 @@ class _Cells:
         middle_x, middle_y = (self.given(v) for v in lattice.middle)
         self.energy = self.given(lattice.energy)
         self.height, self.width = (self.given(lattice.sides[:, k]) for k in (0, 1))
-        self.corners = []
-        for at in self.rays:
-            x, y, share, margin = (
-                dr.gather(Float, v, at)
-                for v in (lattice.spots.x_mm, lattice.spots.y_mm, lattice.spots.share, lattice.spots.margin)
+        x, y, share, margin, radius = (
+            [dr.gather(Float, v, at) for at in self.rays]
+            for v in (
+                lattice.spots.x_mm,
+                lattice.spots.y_mm,
+                lattice.spots.share,
+                lattice.spots.margin,
+                lattice.spots.radius,
             )
-            self.corners.append(
-                (
-                    dr.fma(x * cos - y * sin, scale, middle_x),
-                    dr.fma(x * sin + y * cos, scale, middle_y),
-                    share,
-                    margin,
-                )
-            )
-        (xa, ya, _, ma), (xb, yb, _, mb), (xc, yc, _, mc), (xd, yd, _, md) = self.corners
-        self.valid = _least(ma, mb, mc, md) > _WHOLE
+        )
+        self.valid = _least(*margin) > _WHOLE
+        margin = _to_the_rim(margin, radius)
+        x, y = (
+            [dr.fma(a * cos + b * sin, scale, middle_x) for a, b in zip(x, [-v for v in y], strict=True)],
+            [dr.fma(a * sin + b * cos, scale, middle_y) for a, b in zip(x, y, strict=True)],
+        )
+        self.corners = list(zip(x, y, share, margin, strict=True))
+        (xa, xb, xc, xd), (ya, yb, yc, yd) = x, y
         self.own_mm2 = dr.gather(Float, lattice.traced.area_mm2, self.first_cell + self.iy * self.side + self.ix)
         self.low = _least(xa, xb, xc, xd), _least(ya, yb, yc, yd)
         self.high = _most(xa, xb, xc, xd), _most(ya, yb, yc, yd)
@@ -469,9 +475,13 @@ class _Cells:
         dtype = np.float32 if kind is be.Float else np.uint32
         return be.dr.gather(kind, kind(np.ascontiguousarray(values, dtype=dtype)), self.bundle)
 
-    def pixels(self) -> Any:
-        """About how many pixels a cell covers, 0 where it has no part in what is drawn."""
-        return self.rows(self.ends())[2]
+    def pixels(self) -> tuple[Any, Any]:
+        """About how many pixels a cell covers, 0 where it has no part in what is drawn or is drawn by points; and
+        whether it is."""
+        dr, ends = backend().dr, self.ends()
+        number, folds = self.rows(ends)[2], ends[3] & self.valid
+        dr.eval(number, folds)
+        return number, folds
 
     def points(self) -> Any:
         """By how many points a cell is drawn, 0 where it has no part in what is drawn."""
@@ -567,28 +577,30 @@ class _Cells:
         """At the four corners irradiance without edges, and how much of the part drawn is light with an edge's
         profile (factor) and without (offset); and whether a rough cell folds, and should be drawn by points."""
         dr, placement = backend().dr, self.lattice.placement
-        per_ramp, even = self.given(1 / placement.ramp), self.given(2.0 * ~placement.rough)
-        inner = (self.lattice.per_mm * 2.0 ** (placement.level - placement.inner_level)) ** 2
-        per_inner, per_usual = self.given(inner / _COARSE_PX), self.given(1 / self.lattice.usual_mm2)
+        per_ramp, even = self.given(1 / placement.ramp), self.given(~placement.rough)
+        # how unlike cells of the usual width may be, times their width, to look smooth in pixels of the first part
+        inner_mm = 2.0 ** (placement.inner_level - placement.level) / self.lattice.per_mm
+        usual = self.lattice.usual_mm2
+        coarse, per_usual = self.given(inner_mm * np.sqrt(usual) / _SMOOTH), self.given(1 / usual)
         energy = self.energy / (self.scale * self.scale)
         rest, with_calm, with_rise = (self.given(column) for column in _SHARES[placement.part].T)
         densities, factors, offsets, leasts = [], [], [], []
         for corner, (sx, sy) in zip(self.corners, _OUTWARDS, strict=True):
             mean, least, most = self._around(sx, sy)
             densities.append(corner[2] * energy / dr.maximum(mean, 1e-12))
-            # areas of one sign and of like size, or large: no fold near
+            # calm: areas of one sign, alike over a pixel, and magnified half as much as is usual or more
             ratio = least / dr.maximum(most, 1e-18)
-            large = dr.minimum(least * per_inner - 1, ratio / _UNLIKE)
-            calm = dr.maximum((ratio - _UNLIKE) / (_ALIKE - _UNLIKE), large)
-            # magnified half as much as is usual, or more: not crowded
-            calm = dr.clip(dr.minimum(calm, 4 * dr.sqrt(mean * per_usual) - 1) + even, 0, 1)
+            calm = dr.minimum(2 - (1 - ratio) * coarse / dr.maximum(least, 1e-18), ratio / _UNLIKE)
+            calm = dr.clip(dr.minimum(calm, 4 * dr.sqrt(mean * per_usual) - 1), even, 1)
             rise = dr.clip(corner[3] * per_ramp, 0, 1)
             rise = rise * rise * (3 - 2 * rise)
             factors.append(dr.fma(with_calm, calm, rest))
             offsets.append(with_rise * calm * rise)
             leasts.append(least)
         size = dr.maximum(self.high[0] - self.low[0], self.high[1] - self.low[1])
-        folds = (rest > 0) & (_least(*leasts) < 0) & (size < _POINTS)
+        # so should narrow cells, whose edges fall anyhow between pixels
+        narrow = dr.abs(self.own_mm2) * self.scale * self.scale < _NARROW_PX * size
+        folds = (rest > 0) & (size < _POINTS) & ((_least(*leasts) < 0) | narrow)
         return densities, factors, offsets, folds
 
     def _around(self, sx: int, sy: int) -> tuple[Any, Any, Any]:
@@ -611,6 +623,24 @@ class _Cells:
             least = dr.select(inside, dr.minimum(least, near * sign), least)
             most = dr.select(inside, dr.maximum(most, dr.abs(near)), most)
         return total / number, least, most
+
+
+def _to_the_rim(margin: list[Any], radius: list[Any]) -> list[Any]:
+    """Margins at the corners of a cell, those beyond the rim such that light ends where the radius is 1: they are
+    of whatever rim is missed most by a ray that is already off its way, in widths of that rim's edge."""
+    dr = backend().dr
+    inside = [m > EDGE_LOW for m in margin]
+    number = sum(dr.select(i, 1.0, 0.0) for i in inside)
+    per_number = dr.rcp(dr.maximum(number, 1))
+    within = sum(dr.select(i, m, 0) for i, m in zip(inside, margin, strict=True)) * per_number
+    room = 1 - sum(dr.select(i, r, 0) for i, r in zip(inside, radius, strict=True)) * per_number
+    per_room = dr.rcp(dr.maximum(room, 1e-6))
+    out = []
+    for i, m, r in zip(inside, margin, radius, strict=True):
+        # of a ray that is lost otherwise nothing is known but that it is
+        beyond = dr.select(r < _MISSED, dr.clip((r - 1) * per_room, 0.05, 20), 1)
+        out.append(dr.select(i | (number == 0), m, dr.maximum(m, -dr.maximum(beyond * within, -EDGE_LOW))))
+    return out
 
 
 def _least(*values: Any) -> Any:

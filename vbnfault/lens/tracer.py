@@ -28,6 +28,7 @@ F64 = NDArray[np.float64]
 
 _COSINES = 256  # nodes of the reflectance tables
 _LOST, _FAR = -1e6, -1e4
+_BEYOND_EDGE = -1.0  # margin at which no light is left of a soft edge
 _LIMIT_SHARPNESS = 100.0  # of the edge where a limit other than a rim ends the light
 _LEAST_SLOPE = 1e-3  # of a ray against the sensor's plane, once it is lost
 
@@ -474,8 +475,9 @@ class Tracer:
                 beyond = dr.select(at.stop, blade * blade, beyond)
             out.append(dr.maximum(radius, dr.select(room < 0, 1e6, beyond)))
             if soft:
-                limit = room * _LIMIT_SHARPNESS
-                out.append(dr.minimum(margin[0], dr.minimum((1 - beyond) * (0.5 * at.sharpness), limit)))
+                here = dr.minimum((1 - beyond) * (0.5 * at.sharpness), room * _LIMIT_SHARPNESS)
+                # where a ray is lost it is off its way: what comes behind does not tell where the edge lies
+                out.append(dr.select(margin[0] < _BEYOND_EDGE, margin[0], dr.minimum(margin[0], here)))
         return x, y, z, dx, dy, dz, share, *out
 
     def _start(self, rays: Rays, across: NDArray[np.int64], centred: bool, even: bool) -> Any:
