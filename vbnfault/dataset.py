@@ -15,6 +15,8 @@ from typing import Any
 from . import __version__, build, config, llvm, pipeline, plan, resources, store, world
 from .config import SceneConfig
 from .errors import VbnfaultError
+from .record import proposal
+from .sample import mask_any_faults, stored_layers
 from .store import StoreSpec
 
 # Libraries whose version may change a pixel.
@@ -87,7 +89,7 @@ def store_spec(session: pipeline.Session, blocks: Sequence[int]) -> StoreSpec:
     """The store of a scene, planned in `blocks`. Raises InputError for layers this world cannot give."""
     scene = session.scene
     dataset, camera = scene.dataset, session.base_camera  # first of all: a lens that cannot be had is told here
-    layers = tuple(name for name in pipeline.stored_layers(scene, session.faults) if name != "clean")
+    layers = tuple(name for name in stored_layers(scene, session.faults) if name != "clean")
     identity = scene_identity(session)
     attributes: dict[str, Any] = {
         "title": scene.title,
@@ -106,7 +108,7 @@ def store_spec(session: pipeline.Session, blocks: Sequence[int]) -> StoreSpec:
         height=camera.height_px,
         width=camera.width_px,
         faults=tuple(session.faults),
-        mask_any_faults=pipeline.mask_any_faults(scene, session.faults),
+        mask_any_faults=mask_any_faults(scene, session.faults),
         localised_faults=tuple(name for name, fault in session.faults.items() if fault.localised),
         wavelength_nm=tuple(float(w) for w in world.wavelengths_nm(scene)),
         layers=layers,
@@ -141,7 +143,7 @@ def planned(attributes: Mapping[str, Any], faults: Sequence[str]) -> Callable[[i
             "stratum": int(table.stratum[index]),
             "site": int(table.site[index]),
             "split": int(table.split[index]),
-            "proposal": pipeline.proposal(scene, table, index),
+            "proposal": proposal(scene, table, index),
             "injected": table.injected[index],
         }
 
