@@ -19,6 +19,7 @@ from .errors import InputError
 from .faults import FaultContext, registry
 from .lens import Prescription, ThinLens, first_order
 from .lens.paraxial import Ghost, mean_ghost, paraxial_ghosts
+from .quantities import Electrons
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -152,8 +153,6 @@ def _textures(view: View) -> F32:
     fault = registry()["straylight"]["texture"]()
     params = fault.draw(context, config.rng(0, 0, "flare", "texture"))
     black = np.zeros((view.pixels, view.pixels, 3), dtype=np.float32)
-    from .quantities import Electrons
-
     drawn = fault.apply(Electrons(array=black, white_e=detector.white_e), params, context)
     return np.ascontiguousarray(np.moveaxis(drawn.array / detector.white_e, -1, 0))
 
