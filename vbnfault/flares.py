@@ -97,16 +97,17 @@ def layers(view: View) -> dict[str, F32]:
     return {"sun": sun, "ghosts": found.ghosts, "starburst": found.starburst, "glare": found.glare}
 
 
-def ghosts(view: View, progress: Callable[[float], None] | None = None) -> tuple[Ghost, ...]:
-    """Every ghost of a point Sun; over several bands, means weighted by the Sun's spectrum."""
+def ghosts(view: View, progress: Callable[[int], None] | None = None) -> tuple[Ghost, ...]:
+    """Every ghost of a point Sun; over several bands, means weighted by the Sun's spectrum. `progress` is told of
+    each wavelength that is done, by a 1."""
     weight = spectra.solar_band_irradiance_W_m2_nm(view.wavelength_nm, 1.0)
     weight = weight / weight.sum()
     found: dict[tuple[int, ...], list[tuple[float, Ghost]]] = {}
-    for k, (nm, share) in enumerate(zip(view.wavelength_nm, weight, strict=True)):
+    for nm, share in zip(view.wavelength_nm, weight, strict=True):
         for ghost in _ghosts_at(view, float(nm), alone=len(weight) == 1):
             found.setdefault(ghost.pair, []).append((float(share), ghost))
         if progress is not None:
-            progress((k + 1) / len(weight))
+            progress(1)
     return tuple(mean_ghost(rows) for _, rows in sorted(found.items()))
 
 
