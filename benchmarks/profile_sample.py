@@ -13,20 +13,23 @@ import pstats
 from workload import clock, medians
 
 from vbnfault import config, pipeline
-from vbnfault.pipeline import Frame, SampleSpec
+from vbnfault.exposure import render_frame
+from vbnfault.pose import resolve
+from vbnfault.record import to_sample
+from vbnfault.sample import Frame, SampleSpec
 
 
 def stages(spec: SampleSpec, profile: cProfile.Profile | None = None) -> dict[str, float]:
     """Seconds per stage of one sample, the render's among them; `profile` sees the stages after it."""
     frame, seconds = Frame(spec=spec), {}
     for stage in pipeline.STAGES:
-        after = profile is not None and stage not in (pipeline.resolve, pipeline.render_frame)
+        after = profile is not None and stage not in (resolve, render_frame)
         if after:
             profile.enable()
         seconds[stage.__name__], _ = clock(lambda stage=stage: stage(frame))
         if after:
             profile.disable()
-    seconds["to_sample"], _ = clock(lambda: pipeline.to_sample(frame))
+    seconds["to_sample"], _ = clock(lambda: to_sample(frame))
     return seconds
 
 

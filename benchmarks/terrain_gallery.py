@@ -13,9 +13,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vbnfault import config, frames, pipeline, render
+from vbnfault import config, exposure, frames, render
 from vbnfault.body import EMBEDDED
-from vbnfault.pipeline import Frame, Pose, Session
+from vbnfault.pipeline import Session
+from vbnfault.sample import Frame, Pose
 from vbnfault.scene import Sunlight
 
 SUNS_DEG = {"low": 12.0, "high": 50.0}
@@ -78,8 +79,8 @@ def picture(session: Session, site: int, pose: Pose) -> NDArray:
     """uint8[y, x, 3], as the scene's camera takes it without faults or noise, gamma 2.2 for the eye."""
     frame = Frame(spec=session.spec(int(np.flatnonzero(session.plan.site == site)[0])))
     frame.pose = pose
-    pipeline.render_frame(frame)
-    pipeline.meter(frame)
+    exposure.render_frame(frame)
+    exposure.meter(frame)
     exposed = frame.rate.with_array(frame.rate.array * np.float32(frame.camera.exposure_s))
     image = frame.camera.detector.develop(exposed, frame.camera.exposure_s, None).array[..., 2::-1]
     return np.round(255 * (image / 255.0) ** (1 / GAMMA)).astype(np.uint8)

@@ -13,13 +13,17 @@ import numpy as np
 
 from vbnfault import config, dataset, frames, photometry, pipeline, render, spectra, store, world
 from vbnfault.body import Patch
+from vbnfault.exposure import describe, meter
 from vbnfault.lens import load_lens, scaled_to_focal_length
 from vbnfault.lens.flare import FlareModel
-from vbnfault.pipeline import Frame, Pose, SampleSpec
+from vbnfault.pictures import photograph
+from vbnfault.pose import resolve
 from vbnfault.quantities import Sample
+from vbnfault.record import label, to_sample
 from vbnfault.render.emitter import SunDisc
 from vbnfault.render.runtime import dr, mi
 from vbnfault.render.sampling import Optics, Pixels, Strata
+from vbnfault.sample import Frame, Pose, SampleSpec, Terrain
 from vbnfault.scene import Scene
 
 SCENE = "paper_example"  # its six faults; the view is our own
@@ -68,9 +72,9 @@ class Workload:
         if facet_m is not None:
             overrides |= {"patch.facet_m": facet_m, "patch.min_boulder_m": 4 * facet_m}
         session = pipeline.Session(config.load_scene(SCENE, overrides))
-        patch = session._patch(session.sites[0])
+        patch = session.patch(session.sites[0])
         surface = session.surface(patch)
-        terrain = pipeline.Terrain(body=session.body, site=patch.site, surface=surface)
+        terrain = Terrain(body=session.body, site=patch.site, surface=surface)
         spec = SampleSpec(index=0, scene=session.scene, plan=session.plan, faults=session.faults, terrain=terrain)
         return cls(session, patch, spec, _pose(surface))
 
@@ -84,7 +88,7 @@ class Workload:
         frame.pose = self.pose
         frame.camera = self.session.base_camera
         frame.sunlight = world.sunlight(self.spec.scene, self.pose.sun_L)
-        return frame, pipeline.describe(frame)
+        return frame, describe(frame)
 
     def bound(self) -> None:
         """As fast as tracing gets: the render's own rays in its order, a closest hit and a shadow ray each.
@@ -113,11 +117,11 @@ class Workload:
         """
         seconds: dict[str, float] = {}
         surface = self.spec.terrain.surface
-        seconds["resolve"], _ = clock(lambda: pipeline.resolve(Frame(spec=self.spec)))
+        seconds["resolve"], _ = clock(lambda: resolve(Frame(spec=self.spec)))
         frame, scene = self._placed()
         seconds["render"], frame.radiance = clock(lambda: render.radiance(surface, scene))
         seconds["truth"], frame.truth = clock(lambda: render.truth(surface, scene.view, scene.sun))
-        for stage in (pipeline.meter, pipeline.photograph, pipeline.label):
+        for stage in (meter, photograph, label):
             seconds[stage.__name__], _ = clock(lambda stage=stage: stage(frame))
         # the same view as the physical scenes have it; not part of the sample
         physical = replace(scene, photometry=photometry.hapke_at(scene.wavelength_nm))
@@ -125,7 +129,7 @@ class Workload:
         lit = replace(physical, bounces=1)
         seconds["bounce"], _ = clock(lambda: render.radiance(surface, lit, frame.truth))
         seconds["flare"], _ = clock(self.flare)
-        seconds["to_sample"], sample = clock(lambda: pipeline.to_sample(frame))
+        seconds["to_sample"], sample = clock(lambda: to_sample(frame))
         shard, _ = clock(lambda: write_shard(folder, sample))
         seconds["store"] = shard / SHARD_SAMPLES
         return seconds, frame

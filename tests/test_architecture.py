@@ -23,7 +23,9 @@ EVERYWHERE = {"errors", "resources", "__init__"}
 FOUNDATION = {"llvm", "spectra", "quantities", "config", "frames", "photometry", "spice"}
 GEOMETRY = FOUNDATION | {"body", "plan", "scene"}
 CAMERA = {"spectra", "quantities", "llvm", "lens", "detector", "camera"}
-PIPELINE = GEOMETRY | CAMERA | {"sky", "spacecraft", "world", "render", "faults", "labels", "pipeline"}
+WORLD = GEOMETRY | CAMERA | {"sky", "spacecraft", "render"}
+STAGES = {"pose", "exposure", "pictures", "record"}
+PIPELINE = WORLD | STAGES | {"world", "faults", "labels", "sample", "pipeline"}
 DATASET = PIPELINE | {"store", "build", "dataset"}
 MAY_IMPORT: dict[str, set[str]] = {
     "__init__": set(),
@@ -48,7 +50,12 @@ MAY_IMPORT: dict[str, set[str]] = {
     "faults": CAMERA,
     "flares": FOUNDATION | CAMERA | {"faults"},
     "labels": GEOMETRY | CAMERA | {"faults"},
-    "world": PIPELINE - {"pipeline"},
+    "world": WORLD,
+    "sample": GEOMETRY | CAMERA | {"spacecraft", "render", "faults"},
+    "pose": GEOMETRY | {"world", "render", "sample"},
+    "exposure": GEOMETRY | CAMERA | {"world", "render", "faults", "sample"},
+    "pictures": CAMERA | {"faults", "labels", "sample"},
+    "record": GEOMETRY | CAMERA | {"world", "labels", "sample", "pictures"},
     "pipeline": PIPELINE,
     "store": {"quantities", "config", "plan"},
     "build": PIPELINE | {"store"},
@@ -153,7 +160,7 @@ def test_the_walk_reads_every_form_of_import() -> None:
     assert ("plan", "vbnfault.errors", True) in found  # from .errors import InputError
     assert ("faults.base", "vbnfault.camera", True) in found  # from ..camera import Camera
     assert ("body.patch", "vbnfault.body.noise", True) in found  # from vbnfault.body.noise import …
-    assert ("pipeline", "vbnfault.render", False) in found  # within a function
+    assert ("pose", "vbnfault.render", False) in found  # within a function
     assert ("render.runtime", "mitsuba", True) in found  # import mitsuba as mi
     assert len(sources()) > 30
 

@@ -18,7 +18,8 @@ import numpy as np
 import pytest
 from conftest import small_scene
 
-from vbnfault import build, cli, store
+from vbnfault import build, cli, flares, store
+from vbnfault.lens import load_lens
 
 ENVIRONMENT = {**os.environ, "PYTHONWARNINGS": "error::UserWarning"}
 
@@ -361,6 +362,29 @@ def test_list_schema_doctor_and_dry_run(
     assert run(monkeypatch, "build", scene, "--out", tmp_path / "x.zarr", "--dry-run") == 0
     assert "16 samples" in capsys.readouterr().out
     assert not (tmp_path / "x.zarr").exists()
+
+
+def test_a_flare_is_a_table_and_a_picture(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    picture, ghosts = tmp_path / "flare.png", tmp_path / "ghosts.json"
+    options = ("--sun-deg", 12, "--model", "paraxial", "--pixels", 64, "--out", picture, "--json", ghosts)
+    assert run(monkeypatch, "flare", "tessar_50_f2p8", *options) == 0
+    said = capsys.readouterr()
+    assert said.err == "ghosts and picture\n"  # without a terminal a line, no bar
+    table = json.loads(ghosts.read_text())
+    assert f"{len(table['ghosts'])} ghosts hold" in said.out
+    assert len(table["wavelength_nm"]) == 8
+    assert picture.stat().st_size > 1000
+
+
+def test_a_flares_progress_is_told_by_wavelengths() -> None:
+    told: list[int] = []
+    view = flares.View(
+        lens=load_lens("tessar_50_f2p8"), sun_deg=12.0, wavelength_nm=flares.wavelengths_nm(), model="paraxial"
+    )
+    assert flares.ghosts(view, told.append) == flares.ghosts(view)
+    assert told == [1] * 8
 
 
 def test_help_is_quick() -> None:

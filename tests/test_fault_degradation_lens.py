@@ -159,7 +159,7 @@ def test_against_a_sum_over_all_pixels() -> None:
     array[20, 9] *= 200  # beyond white, it has no mirror image
     params = NONE | {"haze": 0.2, "scratches": [scratch(30.0)]}
     found = applied(source.with_array(array), params, where)
-    frame = degradation_lens._frame(where.camera)
+    frame = where.frame
     kernel = degradation_lens.kernel(params, frame, (2 * size, 2 * size)).astype(np.float64)
     world = np.pad(np.minimum(array, source.white_e), ((16, 16), (16, 16), (0, 0)), mode="symmetric")
     world[16:48, 16:48] = array
@@ -181,7 +181,7 @@ def test_cells_of_several_pixels_tell_as_much(monkeypatch: pytest.MonkeyPatch) -
     exact = applied(quantity, params, where)  # two pixels to a cell
     monkeypatch.setattr(degradation_lens, "_CELLS", 96)
     coarse = applied(quantity, params, where)
-    assert degradation_lens._cell_px(degradation_lens._frame(where.camera)) == 4
+    assert degradation_lens._cell_px(where.frame) == 4
     # a core of 10 px is smoothed by one of 4: at the steps of the scene, where the haze changes by half of it over
     # the core, by a few per cent of the haze
     assert np.abs(coarse - exact).max() < 0.04 * 0.32 * scene.max()
@@ -276,7 +276,7 @@ def test_colours_weigh_bands_as_the_detector_does() -> None:
     lit = replace(where, wavelength_nm=nodes, sun_irradiance_W_m2_nm=sun)
     params = NONE | {"dose_krad": 2000.0}
     passes = browned(
-        degradation_lens._frame(where.camera).real_lens("").prescription,
+        where.frame.real_lens("").prescription,
         nodes,
         dose_krad=2000.0,
         per_mm_krad=7e-4,

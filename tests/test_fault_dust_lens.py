@@ -306,6 +306,22 @@ def test_the_lens_is_the_cameras_own_or_the_one_named() -> None:
     assert real_pupil_diameter_mm(wide.prescription) == pytest.approx(7.0 / 2.8, rel=0.01)
 
 
+def test_a_closed_stop_keeps_its_blades() -> None:
+    lens = load_lens("tessar_50_f2p8")
+    rim = replace(lens.surfaces[lens.stop], blades=6, blade_rounding=0.2, rotation_deg=10.0)
+    surfaces = list(lens.surfaces)
+    surfaces[lens.stop] = rim
+    bladed = replace(lens, surfaces=tuple(surfaces))
+    assert stopped_down(bladed, 1.0) is bladed
+    closed = stopped_down(bladed, 8.0)
+    smaller = closed.surfaces[closed.stop]
+    assert smaller == replace(rim, semi_diameter_mm=smaller.semi_diameter_mm)
+    # its area is that of a round stop closed as far
+    assert closed.with_round_stop().surfaces[lens.stop].semi_diameter_mm == pytest.approx(
+        stopped_down(lens, 8.0).surfaces[lens.stop].semi_diameter_mm, rel=1e-9
+    )
+
+
 # --- glow --------------------------------------------------------------------------------------------------------
 
 
@@ -439,7 +455,7 @@ def test_behind_the_front_only_the_suns_own_beam_lights_grains() -> None:
 
 def test_draws_keep_to_their_keys() -> None:
     context = make_context(256, fov_deg=65.0)
-    own = dust_lens._frame(context.camera).real_lens("").prescription
+    own = context.frame.real_lens("").prescription
     keys = {"count": 400, "diameter_um": [50, 300], "transmission": [0.1, 0.2], "size_exponent": 2.0}
     params = make("dust_on_optics", model="defocused", surface=3, **keys).draw(context, rng(1))
     assert json.loads(json.dumps(params)) == params

@@ -106,6 +106,22 @@ def test_a_sun_outside_the_field_still_gives_ghosts() -> None:
     assert added.max() > 0
 
 
+def test_a_slow_camera_closes_the_stop() -> None:
+    where = context((SIZE / 2, SIZE / 2))
+
+    def at(f_number: float) -> tuple[Any, dict[tuple[int, ...], float]]:
+        camera = replace(where.camera, lens=replace(where.camera.lens, f_number=f_number))
+        added, params = light("traced", replace(where, camera=camera), coating="none")
+        return added, {tuple(g["pair"]): g["rms_radius_px"] for g in params["ghosts"]}
+
+    (added, wide), (again, _), (_, narrow) = (at(n) for n in (2.0, 1.4, 8.0))
+    np.testing.assert_array_equal(added, again)  # the stop opens no farther than the f/2.8 of the prescription
+    shared = wide.keys() & narrow.keys()
+    assert len(shared) >= 10
+    # to first order a ghost is the stop's image; some are bound by other rims, or all but in focus
+    assert np.median([narrow[pair] / wide[pair] for pair in shared]) == pytest.approx(2.8 / 8, rel=0.1)
+
+
 def test_the_lens_is_the_cameras_own_or_the_one_named() -> None:
     where = context()
     default, _ = light("traced", where, coating="as_prescribed")

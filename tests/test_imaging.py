@@ -35,6 +35,7 @@ from vbnfault.lens.coating import design, mean_reflectance
 from vbnfault.lens.glass import C_NM, D_NM, F_NM
 from vbnfault.lens.trace import real_pupil_diameter_mm, trace
 from vbnfault.quantities import BODY, SUN, Radiance
+from vbnfault.record import to_sample
 from vbnfault.scene import View
 
 F64 = NDArray[np.float64]
@@ -571,7 +572,7 @@ def test_samples_of_a_scene_with_a_lens() -> None:
     assert isinstance(lens, RealLens)
     assert frame.rendered is not None
     assert frame.rendered.array.shape[1:] == (112 + 2 * c.guard_px[1], 128 + 2 * c.guard_px[0])
-    sample = pipeline.to_sample(frame)
+    sample = to_sample(frame)
     for name, layer in sample.layers.items():
         assert (112, 128) in (layer.shape[:2], layer.shape[1:3], layer.shape[-2:]), name
     np.testing.assert_array_equal(sample.scalars["distortion"], c.distortion)

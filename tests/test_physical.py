@@ -11,11 +11,14 @@ from scipy.spatial.transform import Rotation
 from test_light import scene
 from test_render import NODES, UP, join, plane, sun, view
 
-from vbnfault import config, frames, pipeline, render, sky, world
+from vbnfault import config, exposure, frames, render, sky, world
 from vbnfault.errors import InputError
 from vbnfault.photometry import hapke_at
-from vbnfault.pipeline import Frame, Session
+from vbnfault.pipeline import STAGES, Session
+from vbnfault.quantities import BODY, SKY
+from vbnfault.record import to_sample
 from vbnfault.render.detail import _LEVELS, _SIDE, _UNIT, _pyramid
+from vbnfault.sample import Frame
 
 TRUTH = ["depth_m", "normal", "semantic", "point_T_m", "incidence_deg", "emission_deg", "phase_deg", "albedo"]
 
@@ -53,9 +56,9 @@ def test_surface_points_reproject_onto_their_pixels(samples: tuple[Session, list
     s, all_frames = samples
     seen = 0
     for frame in all_frames:
-        sample = pipeline.to_sample(frame)
+        sample = to_sample(frame)
         points = sample.layers["point_T_m"].reshape(-1, 3)
-        body = sample.layers["semantic"].ravel() == pipeline.BODY
+        body = sample.layers["semantic"].ravel() == BODY
         seen += body.sum()
         C_from_T = rotation(sample.scalars["camera_from_T"])
         in_C = (points[body] - sample.scalars["camera_position_T_m"]) @ C_from_T.T
@@ -63,15 +66,15 @@ def test_surface_points_reproject_onto_their_pixels(samples: tuple[Session, list
         xy = np.column_stack([in_C[:, 0] / in_C[:, 2] * fx + cx, in_C[:, 1] / in_C[:, 2] * fy + cy])
         rows, columns = np.divmod(np.flatnonzero(body), s.scene.camera.width_px)
         np.testing.assert_allclose(xy, np.column_stack([columns, rows]) + 0.5, atol=0.01)
-        assert np.isnan(points[sample.layers["semantic"].ravel() == pipeline.SKY]).all()
+        assert np.isnan(points[sample.layers["semantic"].ravel() == SKY]).all()
     assert seen > 5000
 
 
 def test_truth_angles_are_those_of_the_points(samples: tuple[Session, list[Frame]]) -> None:
     _, all_frames = samples
     for frame in all_frames:
-        sample = pipeline.to_sample(frame)
-        on = sample.layers["semantic"] == pipeline.BODY
+        sample = to_sample(frame)
+        on = sample.layers["semantic"] == BODY
         if not on.any():
             continue
         C_from_T = rotation(sample.scalars["camera_from_T"])
@@ -109,7 +112,7 @@ def test_spacecraft_is_in_its_own_pictures(samples: tuple[Session, list[Frame]])
         np.testing.assert_array_equal(frame.truth.semantic == 3, blocked & (frame.truth.semantic == 3))
         # ground may lie before a footpad, nothing else may hide one
         hidden = blocked & (frame.truth.semantic != 3)
-        assert (frame.truth.semantic[hidden] == pipeline.BODY).all()
+        assert (frame.truth.semantic[hidden] == BODY).all()
 
 
 def test_spacecraft_casts_its_shadow() -> None:
@@ -141,7 +144,7 @@ def test_stars_fall_where_the_catalogue_says() -> None:
     checked = 0
     for i in range(8):
         frame = s.frame(i)
-        sample = pipeline.to_sample(frame)
+        sample = to_sample(frame)
         J_from_C = sample.scalars["T_from_J"].T @ rotation(sample.scalars["camera_from_T"]).T
         bright = sky.load_catalogue().brighter_than(2.0)
         in_C = bright.direction_J(s.scene.sun.julian_date) @ J_from_C
@@ -152,7 +155,7 @@ def test_stars_fall_where_the_catalogue_says() -> None:
             if not (4 <= column < 252 and 4 <= row < 252):
                 continue
             window = np.s_[row - 3 : row + 4, column - 3 : column + 4]
-            if (frame.truth.semantic[window] != pipeline.SKY).any():
+            if (frame.truth.semantic[window] != SKY).any():
                 continue
             light = frame.radiance.array[4][window].astype(float)
             y, x = np.mgrid[-3:4, -3:4] + 0.5
@@ -174,11 +177,11 @@ def test_noise_of_sampling_stays_below_the_sensors() -> None:
     judged = 0
     for i in range(10):
         frame = Frame(spec=s.spec(i))
-        for stage in (pipeline.resolve, pipeline.render_frame, pipeline.meter):
+        for stage in STAGES[:3]:
             stage(frame)
-        described = dataclasses.replace(pipeline.describe(frame), samples_per_pixel=4096, key=99)
+        described = dataclasses.replace(exposure.describe(frame), samples_per_pixel=4096, key=99)
         converged, _ = render.direct(frame.spec.terrain.surface, described)
-        to_e = frame.camera.exposure_s * pipeline._green_per_second(frame)
+        to_e = frame.camera.exposure_s * exposure.green_per_second(frame)
         signal, error = (np.einsum("b,byx->yx", to_e, a) for a in (converged.array, frame.radiance.array))
         detector = frame.camera.detector
         sensor = np.sqrt(

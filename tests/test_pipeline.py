@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,10 @@ from conftest import ALL_FAULTS, small_scene
 
 from vbnfault import config, frames, labels, pipeline, plan, resources
 from vbnfault.faults.straylight import flare_centres_px
-from vbnfault.pipeline import Frame, Session
+from vbnfault.pictures import develop, effect_of
+from vbnfault.pipeline import Session
+from vbnfault.record import to_sample
+from vbnfault.sample import Frame, SampleSpec
 
 _SESSIONS: dict[str, Session] = {}
 
@@ -43,7 +47,7 @@ def test_masks_of_defects_lie_exactly_on_their_pixels(frames_: list[Frame]) -> N
                 assert not frame.mask[k].any()
                 continue
             seen.add(name)
-            effect = pipeline.effect_of(frame, name)
+            effect = effect_of(frame, name)
             assert effect.any(), f"{name} is claimed and not in the pixels"
             if name == "straylight":
                 assert np.array_equal(frame.mask[k], effect)
@@ -99,17 +103,17 @@ def test_the_image_without_a_class_equals_the_one_of_a_scene_that_lacks_it(frame
     # switching a class off leaves every other draw, the noise and the exposure unchanged
     for dropped in ("dust_on_optics", "broken_lines"):
         faults = {name: {} for name in ALL_FAULTS if name != dropped}
-        other = session(dataset={"layers": ["clean"]})
         lacking = Session(config.parse_scene({**small_scene(), "faults": faults}, source="test"))
-        lacking._terrain = other._terrain
         i = next(f.spec.index for f in frames_ if dropped in f.drawn)
         # the same fault matrix for the other classes: take it from the full plan
         columns = [k for k, name in enumerate(ALL_FAULTS) if name != dropped]
         full = frames_[i].spec.plan
-        object.__setattr__(lacking.plan, "injected", full.injected[:, columns])
-        object.__setattr__(lacking.plan, "stratum", full.stratum)
-        object.__setattr__(lacking.plan, "variables", full.variables)
-        frame = lacking.frame(i)
+        planned = replace(
+            lacking.plan, injected=full.injected[:, columns], stratum=full.stratum, variables=full.variables
+        )
+        frame = pipeline.develop_frame(
+            replace(frames_[i].spec, scene=lacking.scene, plan=planned, faults=lacking.faults)
+        )
         assert np.array_equal(frame.images["clean"].array, frames_[i].images["clean"].array)
         want = frames_[i].images[f"without_{dropped}"].array
         assert np.array_equal(frame.images["image"].array, want)
@@ -131,7 +135,7 @@ def test_geometry_scalars_agree_with_one_another(frames_: list[Frame]) -> None:
     from scipy.spatial.transform import Rotation
 
     for frame in frames_:
-        sample = pipeline.to_sample(frame)
+        sample = to_sample(frame)
         s = sample.scalars
         w, x, y, z = s["camera_from_T"]
         camera_from_T = Rotation.from_quat([x, y, z, w]).as_matrix()
@@ -249,10 +253,10 @@ def test_every_packaged_scene_makes_a_sample(name: str) -> None:
     coarse = max(scene.patch.facet_m, 15.0)
     scene = config.load_scene(name, {**shrink, "patch.facet_m": coarse, "patch.radius_m": 60.0})
     s = Session(scene)
+    terrain = s.terrain(int(s.plan.site[0]))
     # the first sample and the last: both strata where the scene has both
     for i in (0, scene.dataset.samples - 1):
-        s._terrain = s.terrain(int(s.plan.site[0]))
-        spec = pipeline.SampleSpec(index=i, scene=scene, plan=s.plan, faults=s.faults, terrain=s._terrain)
+        spec = SampleSpec(index=i, scene=scene, plan=s.plan, faults=s.faults, terrain=terrain)
         sample = pipeline.simulate(spec)
         assert sample.layers["image"].shape == (64, 64, 4)
         assert sample.layers["image"].dtype == np.uint8
@@ -261,7 +265,7 @@ def test_every_packaged_scene_makes_a_sample(name: str) -> None:
 def test_the_paper_example_has_the_papers_parameters() -> None:
     shrink = {"camera.width_px": 256, "camera.height_px": 256, "patch.facet_m": 8.0}
     s = Session(config.load_scene("paper_example", shrink))
-    parameters = pipeline.to_sample(s.frame(0)).scalars["parameters"]
+    parameters = to_sample(s.frame(0)).scalars["parameters"]
     assert len(parameters["dust_on_optics"]["x_px"]) == 50
     assert parameters["broken_pixels"]["sensor"] == "ccd"
     assert parameters["broken_pixels"]["line_direction"] == "right"
@@ -283,7 +287,8 @@ def test_the_paper_example_has_the_papers_parameters() -> None:
 def test_the_effect_by_rows_equals_the_effect_of_whole_pictures(frames_: list[Frame]) -> None:
     # the pipeline develops only the rows whose signal changes
     for frame in frames_:
-        whole = pipeline._develop(frame, frame.drawn, None).array
+        whole = develop(frame, frame.drawn, None).array
         for name in frame.drawn:
-            other = pipeline._develop(frame, pipeline._but(frame.drawn, name), None).array
-            assert np.array_equal(pipeline.effect_of(frame, name), (whole != other).any(axis=-1))
+            others = {n: params for n, params in frame.drawn.items() if n != name}
+            other = develop(frame, others, None).array
+            assert np.array_equal(effect_of(frame, name), (whole != other).any(axis=-1))

@@ -7,8 +7,9 @@ import pytest
 from conftest import small_scene
 from scipy import stats
 
-from vbnfault import config, frames, pipeline, plan, render, world
-from vbnfault.pipeline import Frame, SampleSpec, Session
+from vbnfault import config, frames, plan, pose, render, world
+from vbnfault.pipeline import Session
+from vbnfault.sample import Frame, SampleSpec
 
 N = 2000
 
@@ -22,7 +23,7 @@ def resolved() -> tuple[Session, list[Frame]]:
     for i in range(N):
         spec = SampleSpec(index=i, scene=session.scene, plan=session.plan, faults=session.faults, terrain=terrain)
         frame = Frame(spec=spec)
-        pipeline.resolve(frame)
+        pose.resolve(frame)
         out.append(frame)
     return session, out
 

@@ -6,26 +6,28 @@ import numpy as np
 import pytest
 from conftest import small_scene
 
-from vbnfault import config, frames, pipeline, render
+from vbnfault import config, frames, render
+from vbnfault.pipeline import Session
 from vbnfault.render.runtime import dr
 from vbnfault.render.sampling import Optics
+from vbnfault.sample import Terrain
 from vbnfault.scene import View
 
 VIEWS, SIDE = 200, 48
 
 
 @pytest.fixture(scope="module")
-def terrain() -> tuple[pipeline.Terrain, np.ndarray]:
+def terrain() -> tuple[Terrain, np.ndarray]:
     """A patch whose facets grow from 2 m to the model's own, and the geometric normals of its facets."""
     table = small_scene(patch={"facet_m": 2.0, "radius_m": 30.0, "min_boulder_m": 2.0})
-    session = pipeline.Session(config.parse_scene(table, source="test"))
-    patch = session._patch(session.sites[1])
+    session = Session(config.parse_scene(table, source="test"))
+    patch = session.patch(session.sites[1])
     a, b, c = (patch.vertices_L_m[patch.faces[:, k]].astype(np.float64) for k in range(3))
     normal = np.cross(b - a, c - a)
     return session.terrain(1), normal / np.maximum(np.linalg.norm(normal, axis=1), 1e-30)[:, None]
 
 
-def test_no_ray_ever_sees_the_inside(terrain: tuple[pipeline.Terrain, np.ndarray]) -> None:
+def test_no_ray_ever_sees_the_inside(terrain: tuple[Terrain, np.ndarray]) -> None:
     ground, normals = terrain
     rng = np.random.default_rng(7)
     x, y = rng.uniform(-150, 150, size=(2, VIEWS))
@@ -58,7 +60,7 @@ def test_no_ray_ever_sees_the_inside(terrain: tuple[pipeline.Terrain, np.ndarray
     assert behind == 0
 
 
-def test_depth_and_normals_run_on_where_facets_change_size(terrain: tuple[pipeline.Terrain, np.ndarray]) -> None:
+def test_depth_and_normals_run_on_where_facets_change_size(terrain: tuple[Terrain, np.ndarray]) -> None:
     """Along lines over the ground, height and normal between neighbouring rays change no more where the facets'
     size changes (beyond 30 m) than within: no step, no crack."""
     ground, _ = terrain

@@ -293,8 +293,12 @@ def flare(
         roughness_nm=roughness_nm,
         cleanliness_level=cleanliness_level,
     )
-    if model != "texture":
-        found = flares.ghosts(view)
+    bands = 0 if model == "texture" else len(view.wavelength_nm)
+    with typer.progressbar(length=bands + 1, label="ghosts and picture", file=sys.stderr) as bar:
+        found = flares.ghosts(view, bar.update) if bands else ()
+        light = flares.layers(view)
+        bar.update(1)
+    if bands:
         total = sum(ghost.flux_fraction for ghost in found)
         typer.echo(f"{prescription.name}: {len(found)} ghosts hold {total:.3e} of the light that enters the pupil")
         brightest = sorted(found, key=lambda g: -g.peak_irradiance_fraction)[:10]
@@ -307,10 +311,10 @@ def flare(
             )
     if json_ is not None:
         with _written(json_):
-            flares.write_table(view, () if model == "texture" else found, json_)
+            flares.write_table(view, found, json_)
         typer.echo(str(json_))
     with _written(out):
-        flares.write_picture(view, flares.layers(view), out)
+        flares.write_picture(view, light, out)
     typer.echo(str(out))
 
 

@@ -15,6 +15,8 @@ from typing import Any
 from . import __version__, build, config, llvm, pipeline, plan, resources, store, world
 from .config import SceneConfig
 from .errors import VbnfaultError
+from .record import proposal
+from .sample import mask_any_faults, stored_layers
 from .store import StoreSpec
 
 # Libraries whose version may change a pixel.
@@ -45,29 +47,28 @@ def scene_identity(session: pipeline.Session) -> dict[str, Any]:
     scene["faults"] = {name: fault.to_dict() for name, fault in session.faults.items()}
     for table in scene["faults"].values():
         if table.get("texture_file"):
-            data = Path(table["texture_file"]).read_bytes()
-            table["texture_file"] = f"sha256:{hashlib.sha256(data).hexdigest()}"
+            table["texture_file"] = _digest(table["texture_file"])
         if table.get("lens"):
-            data = resources.find("scenes/lenses", table["lens"]).read_bytes()
-            table["lens"] = f"sha256:{hashlib.sha256(data).hexdigest()}"
+            table["lens"] = _digest(resources.find("scenes/lenses", table["lens"]))
     _contents_of_files(scene, session.scene)
     if "straylight" in session.faults:
         textures = sorted(resources.data_dir("textures").glob("*.png"))
-        scene["textures_sha256"] = hashlib.sha256(b"".join(p.read_bytes() for p in textures)).hexdigest()
+        scene["textures_sha256"] = _digest(*textures).removeprefix("sha256:")
     del scene["dataset"]["samples"]  # a block more makes no other scene
     return scene
 
 
+def _digest(*paths: str | Path) -> str:
+    """`sha256:` and the digest of the files' contents, one after the other."""
+    return f"sha256:{hashlib.sha256(b''.join(Path(p).read_bytes() for p in paths)).hexdigest()}"
+
+
 def _contents_of_files(identity: dict[str, Any], scene: SceneConfig) -> None:
     """Put the sha256 of what lens, spacecraft, kernels and stars are read from in the place of paths."""
-
-    def digest(path: str | Path) -> str:
-        return f"sha256:{hashlib.sha256(Path(path).read_bytes()).hexdigest()}"
-
     if scene.camera.lens:
-        identity["camera"]["lens"] = digest(resources.find("scenes/lenses", scene.camera.lens))
+        identity["camera"]["lens"] = _digest(resources.find("scenes/lenses", scene.camera.lens))
     if scene.spacecraft.model not in ("none", "default"):
-        identity["spacecraft"]["model"] = digest(scene.spacecraft.model)
+        identity["spacecraft"]["model"] = _digest(scene.spacecraft.model)
     if scene.spice.kernels:
         # a meta-kernel only names others: what follows from them all says more than its own text
         sun_J_au, T_from_J = world.ephemeris(scene)
@@ -80,14 +81,14 @@ def _contents_of_files(identity: dict[str, Any], scene: SceneConfig) -> None:
         identity["spice"]["kernels"] = [f"ephemeris:{numbers}"]
         identity["spice"]["spiceypy"] = importlib.metadata.version("spiceypy")
     if scene.sky.stars != "off":
-        identity["sky"]["catalogue"] = digest(resources.data_dir("catalogues") / "stars.npz")
+        identity["sky"]["catalogue"] = _digest(resources.data_dir("catalogues") / "stars.npz")
 
 
 def store_spec(session: pipeline.Session, blocks: Sequence[int]) -> StoreSpec:
     """The store of a scene, planned in `blocks`. Raises InputError for layers this world cannot give."""
     scene = session.scene
     dataset, camera = scene.dataset, session.base_camera  # first of all: a lens that cannot be had is told here
-    layers = tuple(name for name in pipeline.stored_layers(scene, session.faults) if name != "clean")
+    layers = tuple(name for name in stored_layers(scene, session.faults) if name != "clean")
     identity = scene_identity(session)
     attributes: dict[str, Any] = {
         "title": scene.title,
@@ -106,7 +107,7 @@ def store_spec(session: pipeline.Session, blocks: Sequence[int]) -> StoreSpec:
         height=camera.height_px,
         width=camera.width_px,
         faults=tuple(session.faults),
-        mask_any_faults=pipeline.mask_any_faults(scene, session.faults),
+        mask_any_faults=mask_any_faults(scene, session.faults),
         localised_faults=tuple(name for name, fault in session.faults.items() if fault.localised),
         wavelength_nm=tuple(float(w) for w in world.wavelengths_nm(scene)),
         layers=layers,
@@ -141,7 +142,7 @@ def planned(attributes: Mapping[str, Any], faults: Sequence[str]) -> Callable[[i
             "stratum": int(table.stratum[index]),
             "site": int(table.site[index]),
             "split": int(table.split[index]),
-            "proposal": pipeline.proposal(scene, table, index),
+            "proposal": proposal(scene, table, index),
             "injected": table.injected[index],
         }
 

@@ -11,10 +11,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from . import labels, pipeline, report
+from . import labels, report
 from .errors import VbnfaultError
-from .pipeline import Frame
 from .quantities import Sample
+from .record import to_sample
+from .sample import Frame
 
 _MARKED_GHOSTS = 10
 
@@ -28,7 +29,7 @@ def write_frame(frame: Frame, folder: Path) -> list[Path]:
     `parameters.json` with every scalar of the dataset.
     Raises VbnfaultError where a file cannot be written.
     """
-    sample = pipeline.to_sample(frame)
+    sample = to_sample(frame)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         files = [_write_exr(frame, folder / "sample.exr")]

@@ -19,6 +19,7 @@ from .errors import InputError
 from .faults import FaultContext, registry
 from .lens import Prescription, ThinLens, first_order
 from .lens.paraxial import Ghost, mean_ghost, paraxial_ghosts
+from .quantities import Electrons
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -96,16 +97,17 @@ def layers(view: View) -> dict[str, F32]:
     return {"sun": sun, "ghosts": found.ghosts, "starburst": found.starburst, "glare": found.glare}
 
 
-def ghosts(view: View, progress: Callable[[float], None] | None = None) -> tuple[Ghost, ...]:
-    """Every ghost of a point Sun; over several bands, means weighted by the Sun's spectrum."""
+def ghosts(view: View, progress: Callable[[int], None] | None = None) -> tuple[Ghost, ...]:
+    """Every ghost of a point Sun; over several bands, means weighted by the Sun's spectrum. `progress` is told of
+    each wavelength that is done, by a 1."""
     weight = spectra.solar_band_irradiance_W_m2_nm(view.wavelength_nm, 1.0)
     weight = weight / weight.sum()
     found: dict[tuple[int, ...], list[tuple[float, Ghost]]] = {}
-    for k, (nm, share) in enumerate(zip(view.wavelength_nm, weight, strict=True)):
+    for nm, share in zip(view.wavelength_nm, weight, strict=True):
         for ghost in _ghosts_at(view, float(nm), alone=len(weight) == 1):
             found.setdefault(ghost.pair, []).append((float(share), ghost))
         if progress is not None:
-            progress((k + 1) / len(weight))
+            progress(1)
     return tuple(mean_ghost(rows) for _, rows in sorted(found.items()))
 
 
@@ -152,8 +154,6 @@ def _textures(view: View) -> F32:
     fault = registry()["straylight"]["texture"]()
     params = fault.draw(context, config.rng(0, 0, "flare", "texture"))
     black = np.zeros((view.pixels, view.pixels, 3), dtype=np.float32)
-    from .quantities import Electrons
-
     drawn = fault.apply(Electrons(array=black, white_e=detector.white_e), params, context)
     return np.ascontiguousarray(np.moveaxis(drawn.array / detector.white_e, -1, 0))
 

@@ -19,6 +19,8 @@ from numpy.typing import NDArray
 
 from ..camera import Camera
 from ..errors import InputError
+from ..lens import load_lens
+from ..lens.footprint import DEFAULT_LENS, Frame
 from ..quantities import RGBI, Electrons
 
 Params = dict[str, Any]
@@ -135,6 +137,16 @@ class FaultContext:
         """Factor from the pixels of a 1024 px wide image to this camera's."""
         return self.camera.width_px / REFERENCE_WIDTH_PX
 
+    @property
+    def frame(self) -> Frame:
+        """The camera as beams through its lens know it."""
+        return Frame(
+            lens=self.camera.lens,
+            width_px=self.camera.width_px,
+            height_px=self.camera.height_px,
+            pixel_pitch_um=self.camera.detector.pixel_pitch_um,
+        )
+
     def once(self, name: str, params: Params, make: Callable[[], T]) -> T:
         """`make()` once per (name, params object) and sample: apply and footprint share what it costs."""
         key = (name, id(params))
@@ -210,6 +222,21 @@ class Fault:
             if value is not None:  # TOML has no null: a number left out stays out
                 plain[f.name] = value
         return plain
+
+
+@dataclass(frozen=True, kw_only=True)
+class LensFault(Fault):
+    """Base of the models that follow light through a prescription: the faults of a frame share its lens."""
+
+    lens: str = text(
+        "",
+        doc="path of a prescription or name of a packaged lens, scaled to the camera's focal length and closed to "
+        f"its f-number; default: the camera's own, or {DEFAULT_LENS} where that is a thin lens",
+    )
+
+    def validate(self) -> None:
+        if self.lens:
+            load_lens(self.lens)
 
 
 _REGISTRY: dict[str, dict[str, type[Fault]]] = {}

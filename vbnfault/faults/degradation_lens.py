@@ -33,12 +33,11 @@ from numpy.typing import NDArray
 from scipy import fft
 
 from .. import spectra
-from ..camera import Camera
-from ..lens import Prescription, load_lens
+from ..lens import Prescription
 from ..lens.coating import mean_reflectance
 from ..lens.footprint import Frame
 from ..lens.scatter import Harvey
-from .base import Fault, FaultContext, Interval, Params, bounds, choice, number, text
+from .base import FaultContext, Interval, LensFault, Params, bounds, choice, number
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -52,7 +51,7 @@ _FINE = 8  # samples each way of a cell near the middle of a kernel
 
 
 @dataclass(frozen=True, kw_only=True)
-class Contamination(Fault):
+class Contamination(LensFault):
     """Haze, scratches, browning and lost coatings of a lens."""
 
     fault = "optics_degradation"
@@ -60,11 +59,6 @@ class Contamination(Fault):
     step = "electrons"
     localised = False
 
-    lens: str = text(
-        "",
-        doc="path of a prescription or name of a packaged lens, scaled to the camera's focal length; default: the "
-        "camera's own, or nikkor_35_f2p8 where that is a thin lens",
-    )
     coating: str = choice(
         "mgf2", ("as_prescribed", "none", "mgf2", "v", "bbar"), doc="of surfaces between glass and air, when whole"
     )
@@ -90,14 +84,10 @@ class Contamination(Fault):
     )
     coating_loss: Interval = bounds(0.0, 0.3, limits=(0, 1), doc="share of the coatings' area that is gone")
 
-    def validate(self) -> None:
-        if self.lens:
-            load_lens(self.lens)
-
     def draw(self, context: FaultContext, rng: np.random.Generator) -> Params:
         """Lens and coating; the haze; of each scratch the direction from +x towards +y, width and share of the
         beam; dose, coefficients and loss."""
-        frame = _frame(context.camera)
+        frame = context.frame
         beam_mm = frame.lens.focal_length_mm / frame.lens.f_number
         params: Params = {"lens": self.lens, "coating": self.coating}
         for name in ("haze", "haze_knee", "haze_slope", "dose_krad", "coating_loss"):
@@ -121,22 +111,13 @@ class Contamination(Fault):
         lost = params["haze"] + sum(s["share"] for s in params["scratches"])
         out = cv2.multiply(quantity.array, (*(passes * (1 - lost)).tolist(), 0.0))
         if lost:
-            strewn = _strewn(quantity.array, quantity.white_e, params, _frame(context.camera))
+            strewn = _strewn(quantity.array, quantity.white_e, params, context.frame)
             out = cv2.add(out, cv2.multiply(strewn, (*passes.tolist(), 0.0)))
         return quantity.with_array(out)
 
     def footprint(self, params: Params, context: FaultContext) -> NDArray[np.bool_]:
         """bool[y, x]: the whole image."""
         return np.ones(context.shape, dtype=bool)
-
-
-def _frame(camera: Camera) -> Frame:
-    return Frame(
-        lens=camera.lens,
-        width_px=camera.width_px,
-        height_px=camera.height_px,
-        pixel_pitch_um=camera.detector.pixel_pitch_um,
-    )
 
 
 # --- what passes -----------------------------------------------------------------------------------------------
@@ -193,7 +174,7 @@ def colours(params: Params, context: FaultContext) -> F64:
     if nodes is None or sun is None:
         nodes = spectra.band_nodes_nm(400.0, 700.0, 8)
         sun = spectra.solar_band_irradiance_W_m2_nm(nodes, 1.0)
-    lens = _coated(_frame(context.camera).real_lens(params["lens"]).prescription, params["coating"])
+    lens = context.frame.prescription(params["lens"], params["coating"])
     passes = worn(lens, nodes, params["coating_loss"]) * browned(
         lens,
         nodes,
@@ -203,11 +184,6 @@ def colours(params: Params, context: FaultContext) -> F64:
     )
     weights = context.camera.detector.electron_rate_weights(nodes) * sun
     return np.asarray(weights @ passes / weights.sum(axis=1))
-
-
-@lru_cache(maxsize=8)
-def _coated(lens: Prescription, coating: str) -> Prescription:
-    return lens if coating == "as_prescribed" else lens.coated(coating)
 
 
 # --- what is scattered -----------------------------------------------------------------------------------------

@@ -31,7 +31,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import j1
 
-from ..camera import Camera
 from ..lens import RealLens, load_lens
 from ..lens.coating import reflect_transmit
 from ..lens.footprint import Footprint, Frame
@@ -39,7 +38,7 @@ from ..lens.glass import D_NM
 from ..lens.paraxial import along
 from ..lens.scatter import DUST_INDEX
 from ..lens.trace import forward
-from .base import Fault, FaultContext, Interval, Params, bounds, number, text
+from .base import FaultContext, Interval, LensFault, Params, bounds, number
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -55,7 +54,7 @@ _SMOOTH = 30.0  # k a sin θ from which on a lobe falls evenly
 
 
 @dataclass(frozen=True, kw_only=True)
-class DefocusedDust(Fault):
+class DefocusedDust(LensFault):
     """Shadows of grains far out of focus, and their glow in the Sun."""
 
     fault = "dust_on_optics"
@@ -63,11 +62,6 @@ class DefocusedDust(Fault):
     step = "electrons"
     localised = False
 
-    lens: str = text(
-        "",
-        doc="path of a prescription or name of a packaged lens, scaled to the camera's focal length and closed to "
-        "its f-number; default: the camera's own, or nikkor_35_f2p8 where that is a thin lens",
-    )
     surface: int = number(
         0,
         limits=(_WINDOW, 99),
@@ -97,7 +91,7 @@ class DefocusedDust(Fault):
     def draw(self, context: FaultContext, rng: np.random.Generator) -> Params:
         """Lens, row, height of the window, and columns of grains: `on_window`, place on the surface in mm from the
         axis (x to the right, y down, as their shadows on the window lie), diameter in µm, transmission."""
-        frame = _frame(context.camera)
+        frame = context.frame
         surfaces = frame.real_lens(self.lens).prescription.surfaces
         row = min(max(int(self.surface), 0), len(surfaces) - 1)
         count = self.count.integer(rng)
@@ -148,15 +142,6 @@ def _power_law(uniform: F64, diameter_um: Interval, exponent: float) -> F64:
 # --- geometry --------------------------------------------------------------------------------------------------
 
 
-def _frame(camera: Camera) -> Frame:
-    return Frame(
-        lens=camera.lens,
-        width_px=camera.width_px,
-        height_px=camera.height_px,
-        pixel_pitch_um=camera.detector.pixel_pitch_um,
-    )
-
-
 @lru_cache(maxsize=8)
 def _footprint(frame: Frame, name: str, row: int, height_mm: float) -> Footprint:
     """On a row, or with a height in that plane above the sensor."""
@@ -197,7 +182,7 @@ def _shadows_once(params: Params, context: FaultContext) -> _Shadows:
 
 
 def _shadows(params: Params, context: FaultContext) -> _Shadows:
-    frame = _frame(context.camera)
+    frame = context.frame
     total: F32 | None = None
     seen: F32 | None = None
     for on_window in (False, True):
@@ -325,7 +310,7 @@ def _sun(context: FaultContext) -> _Sun | None:
 
 def _in_suns_beam(params: Params, context: FaultContext, grains: _Grains, sun: _Sun) -> F64:
     """Share of each grain on the row that lies in the beam of the Sun's image, float64[grain]."""
-    footprint = _footprint(_frame(context.camera), params["lens"], params["surface"], 0.0)
+    footprint = _footprint(context.frame, params["lens"], params["surface"], 0.0)
     if np.hypot(*sun.slope) > footprint.slope[-1]:
         return np.zeros(len(grains.x_mm))
     places = footprint.places(*sun.slope.reshape(2, 1, 1))
@@ -389,7 +374,7 @@ def _glow(params: Params, context: FaultContext) -> F32 | None:
     if seen is None or sun is None:
         return None
     camera = context.camera
-    lens = _frame(camera).real_lens(params["lens"])
+    lens = context.frame.real_lens(params["lens"])
     grains = _grains(params, on_window=False)
     lit = _lit(params, context, grains)
     assert lit is not None
@@ -404,7 +389,7 @@ def _glow(params: Params, context: FaultContext) -> F32 | None:
     pixel_rad = camera.detector.pixel_pitch_um * 1e-3 / camera.lens.focal_length_mm
     sun = sun._replace(radius_rad=float(np.hypot(sun.radius_rad, pixel_rad / np.sqrt(np.pi))))
     own, factor, common, reflected = _lobes(grains.radius_mm, core, sun, _stretch(lens, params["surface"]))
-    return _painted(to_e @ own, (to_e @ factor, to_e.sum(axis=1)), (common, reflected), seen, sun, camera)
+    return _painted(to_e @ own, (to_e @ factor, to_e.sum(axis=1)), (common, reflected), seen, sun, context.frame)
 
 
 def _stretch(lens: RealLens, row: int) -> float:
@@ -467,11 +452,11 @@ def _field(frame: Frame) -> tuple[F32, F32 | None]:
 
 
 def _painted(
-    own_e: F64, factors_e: tuple[F64, F64], lobes: tuple[F64, F64], seen: F32, sun: _Sun, camera: Camera
+    own_e: F64, factors_e: tuple[F64, F64], lobes: tuple[F64, F64], seen: F32, sun: _Sun, frame: Frame
 ) -> F32:
     """`own_e` float64[colour, offset], plus each of the two lobes, float64[offset], times its factor for the colour
     and its layer of `seen`; electrons float32[y, x, 3]."""
-    directions, density = _field(_frame(camera))
+    directions, density = _field(frame)
     square = np.zeros_like(directions[0])
     for component, at in zip(directions, sun.direction, strict=True):
         away = component - np.float32(at)

@@ -11,7 +11,6 @@ prescription), `flux_fraction`, `x_px`, `y_px`, `rms_radius_px`, the brightest f
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Any
 
 import cv2
@@ -19,29 +18,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .. import spectra
-from ..lens import Prescription, load_lens, scaled_to_focal_length
 from ..quantities import Irradiance
-from .base import Fault, FaultContext, Interval, Params, bounds, choice, number, text
+from .base import FaultContext, Interval, LensFault, Params, bounds, choice, number
 
 F32 = NDArray[np.float32]
 
-_DEFAULT_LENS = "nikkor_35_f2p8"
 _MOST_GHOSTS = 24
 _LEAST_SUN_RAD = 1e-5
 
 
 @dataclass(frozen=True, kw_only=True)
-class _LensStraylight(Fault):
+class _LensStraylight(LensFault):
     fault = "straylight"
     step = "electrons"
     needs_sun = True
     effect_mask = True
 
-    lens: str = text(
-        "",
-        doc="path of a prescription or name of a packaged lens, scaled to the camera's focal length; default: the "
-        f"camera's own, or {_DEFAULT_LENS} where that is a thin lens",
-    )
     coating: str = choice(
         "bbar",
         ("as_prescribed", "none", "mgf2", "v", "bbar"),
@@ -62,8 +54,7 @@ class _LensStraylight(Fault):
     )
 
     def validate(self) -> None:
-        if self.lens:
-            load_lens(self.lens)
+        super().validate()
         if self.reflections not in (2, 4):
             raise ValueError(f"reflections = {self.reflections}: must be 2 or 4")
         if self.baffle_length_mm and not self.baffle_radius_mm:
@@ -114,7 +105,7 @@ class _LensStraylight(Fault):
         middle = np.array([camera.width_px / 2, camera.height_px / 2])
         x, y = (np.asarray(context.sun_xy_px) - middle) * pitch_mm
         found = straylight(
-            _lens(params["lens"], params["coating"], camera.lens),
+            context.frame.prescription(params["lens"], params["coating"]),
             model=self.model,
             wavelength_nm=nodes,
             shape=context.shape,
@@ -141,7 +132,7 @@ class _LensStraylight(Fault):
         camera = context.camera
         pitch_mm = camera.detector.pixel_pitch_um * 1e-3
         made = flare_model(
-            _lens(params["lens"], params["coating"], camera.lens),
+            context.frame.prescription(params["lens"], params["coating"]),
             tuple(float(v) for v in _sunlight(context)[0]),
             context.shape,
             pitch_mm,
@@ -201,16 +192,3 @@ def _sunlight(context: FaultContext) -> tuple[NDArray[np.float64], NDArray[np.fl
 def _sun_radius_rad(context: FaultContext) -> float:
     found = context.sun_angular_radius_rad
     return spectra.sun_angular_radius_rad(1.0) if found is None else max(float(found), _LEAST_SUN_RAD)
-
-
-def _lens(name: str, coating: str, own: Any) -> Prescription:
-    mine = getattr(own, "prescription", None)
-    if mine is not None and not name:
-        return mine if coating == "as_prescribed" else mine.coated(coating)
-    return _scaled(name or _DEFAULT_LENS, coating, own.focal_length_mm)
-
-
-@lru_cache(maxsize=8)
-def _scaled(name: str, coating: str, focal_length_mm: float) -> Prescription:
-    lens = scaled_to_focal_length(load_lens(name), focal_length_mm)
-    return lens if coating == "as_prescribed" else lens.coated(coating)

@@ -23,10 +23,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..camera import Camera
-from ..lens import RealLens, load_lens
+from ..lens import RealLens
 from ..lens.footprint import Beams, Frame
-from .base import Fault, FaultContext, Interval, Params, bounds, number, text
+from .base import FaultContext, Interval, LensFault, Params, bounds, number
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -38,7 +37,7 @@ _TOGETHER = 2048  # places at a time, for the memory's sake
 
 
 @dataclass(frozen=True, kw_only=True)
-class LensVignetting(Fault):
+class LensVignetting(LensFault):
     """Light lost at a slipped ring and a moved hood, and with a thin lens in the lens itself."""
 
     fault = "vignetting"
@@ -46,11 +45,6 @@ class LensVignetting(Fault):
     step = "electrons"
     localised = False
 
-    lens: str = text(
-        "",
-        doc="path of a prescription or name of a packaged lens, scaled to the camera's focal length and closed to "
-        "its f-number; default: the camera's own, or nikkor_35_f2p8 where that is a thin lens",
-    )
     decentre: Interval = bounds(
         0.0,
         0.3,
@@ -75,13 +69,9 @@ class LensVignetting(Fault):
     )
     mask_loss: float = number(0.1, limits=(0, 1), doc="the mask holds the pixels that lose at least this fraction")
 
-    def validate(self) -> None:
-        if self.lens:
-            load_lens(self.lens)
-
     def draw(self, context: FaultContext, rng: np.random.Generator) -> Params:
         """Lens; slip of the ring; the hood's distance, radius and place, in mm, x to the right and y down."""
-        frame = _frame(context.camera)
+        frame = context.frame
         beams = frame.beams(self.lens)
         distance = frame.lens.focal_length_mm if self.hood_distance_mm is None else float(self.hood_distance_mm)
         radius = _clear_radius_mm(beams, distance) if self.hood_radius_mm is None else float(self.hood_radius_mm)
@@ -107,17 +97,8 @@ class LensVignetting(Fault):
         return np.asarray(_factor_once(params, context) <= np.float32(1 - params["mask_loss"]))
 
 
-def _frame(camera: Camera) -> Frame:
-    return Frame(
-        lens=camera.lens,
-        width_px=camera.width_px,
-        height_px=camera.height_px,
-        pixel_pitch_um=camera.detector.pixel_pitch_um,
-    )
-
-
 def _factor_once(params: Params, context: FaultContext) -> F32:
-    return context.once("vignetting.factor", params, lambda: factor(params, _frame(context.camera)))
+    return context.once("vignetting.factor", params, lambda: factor(params, context.frame))
 
 
 def factor(params: Params, frame: Frame) -> F32:

@@ -77,6 +77,11 @@ class Frame:
             return _scaled(name, own.focal_length_mm, 0.0, self) if name else own
         return _scaled(name or DEFAULT_LENS, own.focal_length_mm, own.f_number, self)
 
+    def prescription(self, name: str, coating: str) -> Prescription:
+        """That lens, every surface between glass and air with the named coating, or all `as_prescribed`."""
+        lens = self.real_lens(name).prescription
+        return lens if coating == "as_prescribed" else _coated(lens, coating)
+
     def beams(self, name: str) -> Beams:
         """The beams of that lens, to a little beyond the frame's corners."""
         slope = np.hypot(*self.slopes(np.array([self.width_px]), np.array([self.height_px])))
@@ -95,18 +100,23 @@ def _scaled(name: str, focal_length_mm: float, f_number: float, frame: Frame) ->
     )
 
 
+@lru_cache(maxsize=8)
+def _coated(lens: Prescription, coating: str) -> Prescription:
+    return lens.coated(coating)
+
+
 def stopped_down(lens: Prescription, f_number: float) -> Prescription:
     """The lens with its stop closed until the real beam along the axis is EFL / f_number wide; as it is where that
-    is not narrower. Blades become round."""
-    lens = lens.with_round_stop()
-    wanted = first_order(lens).efl_mm / f_number
-    if wanted >= real_pupil_diameter_mm(lens):
+    is not narrower. Blades keep their shape, with a beam of that area."""
+    as_round = lens.with_round_stop()
+    wanted = first_order(as_round).efl_mm / f_number
+    if wanted >= real_pupil_diameter_mm(as_round):
         return lens
-    found = trace(lens, [[wanted / 2, 0.0, -1.0]], [[0.0, 0.0, 1.0]])
-    surfaces = list(lens.surfaces)
-    surfaces[lens.stop] = replace(
-        surfaces[lens.stop], semi_diameter_mm=float(abs(found.points_mm[1 + lens.stop, 0, 0]))
-    )
+    found = trace(as_round, [[wanted / 2, 0.0, -1.0]], [[0.0, 0.0, 1.0]])
+    surfaces, stop = list(lens.surfaces), lens.stop
+    corner = surfaces[stop].semi_diameter_mm / as_round.surfaces[stop].semi_diameter_mm
+    closed_mm = float(abs(found.points_mm[1 + stop, 0, 0]))
+    surfaces[stop] = replace(surfaces[stop], semi_diameter_mm=corner * closed_mm)
     return replace(lens, surfaces=tuple(surfaces))
 
 

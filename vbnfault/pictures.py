@@ -1,0 +1,222 @@
+"""The pictures of a sample: its faults are drawn, and the camera takes image, clean twin and `without_<fault>`.
+
+All share radiance, exposure and noise, so they differ by the faults alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from . import labels
+from .camera import Camera
+from .detector import Noise
+from .faults import Params, physical_order
+from .quantities import RGBI, Electrons
+from .sample import Frame, stored_layers
+
+_DRAW_TRIES = 8
+# A step's own change of this many DN survives every later optical step of the paper's tables (cos⁴ at 255 → 105
+# keeps 41 %), so the fault needs no full comparison to be called present.
+_CLEARLY_VISIBLE_DN = 6.0
+
+
+def photograph(frame: Frame) -> None:
+    """Draw the commanded faults and take the pictures: `clean`, `image` and the twins the scene asks for.
+
+    A drawn fault that does not show is drawn again a few times, then left out, so that `frame.drawn` holds what
+    is in the pixels and labels never claim more.
+    """
+    spec = frame.spec
+    commanded = [name for name in spec.faults if spec.plan.injects(name)[spec.index]]
+    if not frame.pose.resolved:
+        commanded = [name for name in commanded if not spec.faults[name].needs_sun]
+    # noise and the clean picture need one core, the faults' optics another
+    undisturbed = _signal(frame, {}, [])
+    with ThreadPoolExecutor(1) as aside:
+        exposed = aside.submit(_expose_clean, frame, undisturbed)
+        _draw(frame, commanded, attempt=0)
+        optical = _in_order(frame, frame.drawn, "electrons")
+        _signal(frame, frame.drawn, optical)
+        for name in [n for n in optical if spec.faults[n].effect_mask]:
+            _signal(frame, frame.drawn, [n for n in optical if n != name])
+        noise, frame.images["clean"] = exposed.result()
+    frame.pictures[frame.camera, (), False] = frame.images["clean"]
+    for attempt in range(1, _DRAW_TRIES + 1):
+        invisible = _invisible(frame, noise)
+        # the rejected are kept, or a new draw could take over the identity of an old one
+        frame.rejected += [frame.drawn.pop(name) for name in invisible]
+        if not invisible or attempt == _DRAW_TRIES:
+            break
+        _draw(frame, commanded, attempt)
+    frame.images["image"] = develop(frame, frame.drawn, noise)
+    twins = [layer for layer in stored_layers(spec.scene, spec.faults) if layer.startswith("without_")]
+    for layer in twins:
+        name = layer.removeprefix("without_")
+        if name in frame.drawn:
+            frame.images[layer] = develop(frame, _but(frame.drawn, name), noise)
+        else:
+            frame.images[layer] = frame.images["image"]
+
+
+def _expose_clean(frame: Frame, signal: Electrons) -> tuple[Noise, RGBI]:
+    spec, camera = frame.spec, frame.camera
+    noise = Noise.draw(frame.context.shape, spec.rng("detector", "shot"), spec.rng("detector", "read"))
+    return noise, camera.detector.develop(signal, camera.exposure_s, noise)
+
+
+def _draw(frame: Frame, commanded: Sequence[str], attempt: int) -> None:
+    """Draw the commanded faults that are not drawn yet."""
+    for name in commanded:
+        if name not in frame.drawn:
+            generator = frame.spec.rng("fault", f"{name}/{attempt}")
+            frame.drawn[name] = frame.spec.faults[name].draw(frame.context, generator)
+
+
+def _but(drawn: Mapping[str, Params], left_out: str) -> dict[str, Params]:
+    return {name: params for name, params in drawn.items() if name != left_out}
+
+
+def _in_order(frame: Frame, drawn: Mapping[str, Params], step: str) -> list[str]:
+    return [name for name in physical_order(drawn) if frame.spec.faults[name].step == step]
+
+
+def _altered(frame: Frame, drawn: Mapping[str, Params]) -> Camera:
+    """The camera as the drawn faults alter it."""
+    camera = frame.camera
+    for name in physical_order(drawn):
+        camera = frame.spec.faults[name].alter(camera, drawn[name])
+    return camera
+
+
+def _key(drawn: Mapping[str, Params], names: Sequence[str]) -> tuple[tuple[str, int], ...]:
+    return tuple((name, id(drawn[name])) for name in names)
+
+
+def _signal(frame: Frame, drawn: Mapping[str, Params], names: Sequence[str]) -> Electrons:
+    """Expected electrons with the optical faults `names`, of those drawn; twins share what they have in common."""
+    camera = _altered(frame, drawn)
+    if camera != frame.camera:
+        cached: dict[Any, Electrons] = {}  # another instrument: not to be mixed with the others
+    else:
+        cached = frame.signals
+    key = _key(drawn, names)
+    if key not in cached:
+        if names:
+            *before, last = names
+            signal = _signal(frame, drawn, before)
+            cached[key] = frame.spec.faults[last].apply(signal, drawn[last], frame.context)
+        else:
+            if camera == frame.camera:
+                signal = frame.rate.with_array(frame.rate.array * np.float32(camera.exposure_s))
+            else:
+                signal = camera.detector.electrons_expected(camera.lens.image(frame.imaged), camera.exposure_s)
+            cached[key] = signal
+    return cached[key]
+
+
+def develop(frame: Frame, drawn: Mapping[str, Params], noise: Noise | None) -> RGBI:
+    """The finished picture with the faults `drawn`; noise-free without `noise`."""
+    optical = _in_order(frame, drawn, "electrons")
+    camera = _altered(frame, drawn)
+    key = (camera, _key(drawn, optical), noise is None)
+    if key not in frame.pictures:
+        signal = _signal(frame, drawn, optical)
+        frame.pictures[key] = camera.detector.develop(signal, camera.exposure_s, noise)
+    return _read_out(frame, frame.pictures[key], drawn)
+
+
+def _read_out(frame: Frame, picture: RGBI, drawn: Mapping[str, Params]) -> RGBI:
+    """The picture with the drawn readout faults."""
+    for name in _in_order(frame, drawn, "rgbi"):
+        picture = frame.spec.faults[name].apply(picture, drawn[name], frame.context)
+    return picture
+
+
+# --- what shows --------------------------------------------------------------------------------------------
+
+
+def _invisible(frame: Frame, noise: Noise) -> list[str]:
+    """Drawn faults without any effect on the noise-free picture."""
+    doubtful = sorted(_doubtful(frame, noise))
+    return [n for n in doubtful if not (_shows_on_some_rows(frame, n) or effect_of(frame, n).any())]
+
+
+def _shows_on_some_rows(frame: Frame, name: str) -> bool:
+    """Whether every eighth row of the noise-free picture is enough to see an optical fault."""
+    faults, drawn = frame.spec.faults, frame.drawn
+    optical, readout = (_in_order(frame, drawn, step) for step in ("electrons", "rgbi"))
+    if name not in optical or _altered(frame, drawn) != frame.camera:
+        return False
+    rows = slice(frame.context.shape[0] // 32, None, 8)
+    detector, exposure = frame.camera.detector, frame.camera.exposure_s
+    pictures = []
+    for names in (optical, [n for n in optical if n != name]):
+        signal = _signal(frame, drawn, names)
+        some = signal.with_array(np.ascontiguousarray(signal.array[rows]))
+        pictures.append(detector.develop(some, exposure, None).array)
+    seen = labels.effect(*pictures)
+    for other in readout:
+        over = faults[other].footprint(drawn[other], frame.context)
+        if over is not None:
+            seen &= ~over[rows]
+    return bool(seen.any())
+
+
+def effect_of(frame: Frame, name: str) -> NDArray[np.bool_]:
+    """bool[y, x]: where the noise-free picture changes when one of the drawn faults is switched off."""
+    drawn, others = frame.drawn, _but(frame.drawn, name)
+    optical = _in_order(frame, drawn, "electrons")
+    if name not in optical or _altered(frame, drawn) != frame.camera:
+        return labels.effect(develop(frame, drawn, None).array, develop(frame, others, None).array)
+    # only rows whose signal changes can change: the others need not be developed
+    signals = [_signal(frame, d, [n for n in optical if n in d]) for d in (drawn, others)]
+    height = frame.context.shape[0]
+    changed = np.flatnonzero((signals[0].array != signals[1].array).reshape(height, -1).any(axis=1))
+    if not len(changed):
+        return np.zeros(frame.context.shape, dtype=bool)
+    # with a margin: a broken pixel's neighbours look two pixels far
+    rows = slice(max(changed[0] - 2, 0), changed[-1] + 3)
+    pictures = []
+    for signal in signals:
+        part = frame.camera.detector.develop(signal.with_array(signal.array[rows]), frame.camera.exposure_s, None)
+        whole = np.zeros((*frame.context.shape, 4), dtype=np.uint8)
+        whole[rows] = part.array
+        pictures.append(_read_out(frame, RGBI(array=whole), others).array)
+    return labels.effect(*pictures)
+
+
+def _doubtful(frame: Frame, noise: Noise) -> set[str]:
+    """Drawn faults that a cheap look does not show to be plainly visible."""
+    faults, drawn = frame.spec.faults, frame.drawn
+    if _altered(frame, drawn) != frame.camera:
+        return set(drawn)
+    out = {name for name in drawn if faults[name].effect_mask}
+    optical, readout = (_in_order(frame, drawn, step) for step in ("electrons", "rgbi"))
+    # pixels enough to see what is plainly visible; the rest of the doubt is settled by `effect_of`
+    some = (slice(frame.context.shape[0] // 32, None, 16), slice(None, None, 4))
+    for k, name in enumerate(optical):
+        a, b = (
+            np.minimum(q.array[some], q.white_e) * (255 / q.white_e)
+            for q in (_signal(frame, drawn, optical[:k]), _signal(frame, drawn, optical[: k + 1]))
+        )
+        if np.abs(b - a).max(initial=0) < _CLEARLY_VISIBLE_DN:
+            out.add(name)
+    picture = develop(frame, {name: drawn[name] for name in optical}, noise)
+    touched = []
+    for name in readout:
+        after = faults[name].apply(picture, drawn[name], frame.context)
+        where = np.flatnonzero(labels.effect(after.array, picture.array))
+        a, b = (q.array.reshape(-1, 4)[where].astype(np.int16) for q in (picture, after))
+        touched.append((name, where[(np.abs(b - a) >= _CLEARLY_VISIBLE_DN).any(axis=1)]))
+        picture = after
+    overwritten = np.zeros(frame.context.shape[0] * frame.context.shape[1], dtype=bool)
+    for name, where in reversed(touched):  # what a later fault overwrites does not count
+        if overwritten[where].all():
+            out.add(name)
+        overwritten[where] = True
+    return out

@@ -1,0 +1,112 @@
+"""What a sample is while it is made: its terrain, pose and specification, and the frame that the stages fill."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from . import config, plan
+from .body import Body, Site
+from .camera import Camera
+from .config import SceneConfig
+from .faults import Fault, FaultContext, Params
+from .quantities import RGBI, Electrons, Radiance, Truth
+from .scene import Sunlight
+from .spacecraft import SpacecraftMesh
+
+if TYPE_CHECKING:
+    from .render import Surface
+
+F64 = NDArray[np.float64]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Terrain:
+    """A site with its patch and the renderer's copy of it, and the spacecraft above it, if there is one."""
+
+    body: Body
+    site: Site
+    surface: Surface
+    vehicle: SpacecraftMesh | None = None
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Pose:
+    """The outcome of `resolve`: where the camera and the Sun are. `tries` counts the proposals drawn."""
+
+    position_L_m: F64
+    L_from_C: F64
+    sun_L: F64
+    sun_azimuth_deg: float
+    sun_elevation_deg: float
+    sun_visible_fraction: float
+    tries: int
+    resolved: bool
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SampleSpec:
+    """One sample of a plan, with all that `simulate` needs."""
+
+    index: int
+    scene: SceneConfig
+    plan: plan.Plan
+    faults: Mapping[str, Fault]
+    terrain: Terrain
+
+    @property
+    def seed(self) -> int:
+        return self.scene.dataset.seed
+
+    def rng(self, stage: str, name: str) -> np.random.Generator:
+        """The generator of this sample for (stage, name)."""
+        return config.rng(self.seed, self.index, stage, name)
+
+
+@dataclass(kw_only=True, eq=False)
+class Frame:
+    """What the stages add to, one after the other."""
+
+    spec: SampleSpec
+    pose: Pose = field(init=False)
+    camera: Camera = field(init=False)
+    sunlight: Sunlight = field(init=False)
+    radiance: Radiance = field(init=False)
+    # what was rendered and where it shows open sky, guard band included, where the picture has another grid
+    rendered: Radiance | None = None
+    open_sky: NDArray[np.bool_] | None = None
+    truth: Truth = field(init=False)
+    context: FaultContext = field(init=False)
+    rate: Electrons = field(init=False)
+    drawn: dict[str, Params] = field(default_factory=dict)
+    rejected: list[Params] = field(default_factory=list)
+    images: dict[str, RGBI] = field(default_factory=dict)
+    signals: dict[Any, Electrons] = field(default_factory=dict)
+    pictures: dict[Any, RGBI] = field(default_factory=dict)
+    samples_per_pixel: float = float("nan")
+    noise_fraction_p99: float = float("nan")
+    mask: NDArray[np.bool_] = field(init=False)
+    effects: dict[str, NDArray[np.bool_]] = field(default_factory=dict)
+
+    @property
+    def imaged(self) -> Radiance:
+        """What the lens takes: radiance on the grid of the render."""
+        return self.radiance if self.rendered is None else self.rendered
+
+
+def stored_layers(scene: SceneConfig, faults: Mapping[str, Fault]) -> tuple[str, ...]:
+    """The optional layers of the scene; the default asks for a twin without straylight, which a scene that has
+    no straylight does without."""
+    idle = "without_straylight" if plan.STRAYLIGHT not in faults else None
+    return tuple(layer for layer in scene.dataset.layers if layer != idle)
+
+
+def mask_any_faults(scene: SceneConfig, faults: Mapping[str, Fault]) -> tuple[str, ...]:
+    """The classes united in mask_any: as configured, else the localised ones."""
+    if scene.dataset.mask_any is not None:
+        return scene.dataset.mask_any
+    return tuple(name for name, fault in faults.items() if fault.localised)
