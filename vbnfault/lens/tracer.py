@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from itertools import combinations
 from types import SimpleNamespace
 from typing import Any
@@ -225,6 +225,7 @@ class Tracer:
             "absorption": be.Float(absorption[:, medium].astype(np.float32).ravel()),
             "aspheric": [be.Float(c.astype(np.float32)) for c in aspheric],
         }
+        self._last_gap_mm = float(last[0]) if last else 0.0
         self._special = bool(most) or any(c != 1 for c in conic)
         self._bladed = bool(lens.surfaces[lens.stop].blades)
         self._numbers = {
@@ -299,12 +300,10 @@ class Tracer:
         ray = (start.x, start.y, none, start.dx, start.dy, start.dz, one, *(rim * sides))
         if len(self.routes) == len(self.wavelength_nm) == 1:
             # one path, one wavelength: every number is known, and nothing need be fetched
-            onward = 1.0
-            for step in range(len(self.rows)):
-                at = self._known(step, per_width, light, onward)
-                ray = self._meet(at, soft, *ray)
-                onward = -onward if at.mirror else onward
-            last: Any = float(t["last"].numpy()[0])
+            for at, sharpness in zip(self._known, per_width.tolist(), strict=True):
+                at.sharpness = sharpness
+                ray = self._meet(at, soft, *ray, light=light)
+            last: Any = self._last_gap_mm
         else:
             edge = be.UInt64(_paired(per_width, self._look_up_word.view(np.float32)))
             wavelength = start.wavelength * dr.opaque(be.UInt32, len(self.rows))
@@ -370,35 +369,52 @@ class Tracer:
             passed=passed,
         )
 
-    def _known(self, step: int, per_width: NDArray[np.float32], light: bool, onward: float) -> Any:
-        """What a step of the only path is made of, as numbers."""
+    @cached_property
+    def _known(self) -> list[Any]:
+        """What the steps of the only path are made of, as numbers."""
         be, n = backend(), self._numbers
         dr = be.dr
-        word, row = int(self._look_up_word[step]), int(self.rows[step])
+        onward, out = 1.0, []
+        for step, row in enumerate(self.rows.tolist()):
+            word = int(self._look_up_word[step])
 
-        def passed(cosine: Any) -> Any:
-            at = cosine * (_COSINES - 1)
-            node = dr.minimum(be.UInt32(at), _COSINES - 2)
-            low, rise = _unpaired(self._tables["share"], (word >> 1) + node)
-            return dr.fma(at - be.Float(node), rise, low)
+            def passed(cosine: Any, word: int = word) -> Any:
+                at = cosine * (_COSINES - 1)
+                node = dr.minimum(be.UInt32(at), _COSINES - 2)
+                low, rise = _unpaired(self._tables["share"], (word >> 1) + node)
+                return dr.fma(at - be.Float(node), rise, low)
 
-        return SimpleNamespace(
-            gap=float(n["gap"][step]),
-            curvature=float(n["curvature"][step]),
-            eta=float(n["eta"][0, step]),
-            per_rim=float(n["per_rim"][step]),
-            sharpness=float(per_width[step]),
-            mirror=bool(word & 1),
-            onward=onward,
-            stop=row == self.lens.stop,
-            conic=float(n["conic"][row]),
-            aspheric=[float(a[row]) for a in n["aspheric"]],
-            absorption=float(n["absorption"][0, step]) if self._absorbs else None,
-            passed=passed if light else None,
-        )
+            out.append(
+                SimpleNamespace(
+                    gap=float(n["gap"][step]),
+                    curvature=float(n["curvature"][step]),
+                    eta=float(n["eta"][0, step]),
+                    per_rim=float(n["per_rim"][step]),
+                    mirror=bool(word & 1),
+                    onward=onward,
+                    stop=row == self.lens.stop,
+                    conic=float(n["conic"][row]),
+                    aspheric=[float(a[row]) for a in n["aspheric"]],
+                    absorption=float(n["absorption"][0, step]) if self._absorbs else None,
+                    passed=passed,
+                )
+            )
+            onward = -onward if word & 1 else onward
+        return out
 
     def _meet(
-        self, at: Any, soft: bool, x: Any, y: Any, z: Any, dx: Any, dy: Any, dz: Any, share: Any, *rims: Any
+        self,
+        at: Any,
+        soft: bool,
+        x: Any,
+        y: Any,
+        z: Any,
+        dx: Any,
+        dy: Any,
+        dz: Any,
+        share: Any,
+        *rims: Any,
+        light: bool = True,
     ) -> tuple[Any, ...]:
         """On to the next surface of the path, and off it: refracted or reflected. `rims` are the square of the
         largest radius so far and, where edges are soft, the margin; those of the mirrored ray follow if they
@@ -441,12 +457,12 @@ class Tracer:
             length = e / dr.fma(sense, cosine, b)
             x, y, z = dr.fma(length, dx, x), dr.fma(length, dy, y), dr.fma(length, dz, z)
             facing = sense
-        if at.absorption is not None:
+        if light and at.absorption is not None:
             share = share * dr.exp(-at.absorption * dr.abs(length))
         # what the angle's cosine squared leaves on the other side
         left = dr.fma(eta * eta, cosine * cosine, 1 - eta * eta)
         out_cosine = real(left)
-        if at.passed is not None:
+        if light:
             passed = at.passed(dr.clip(dr.select(eta > 1, out_cosine, cosine), 0, 1))
             share = share * dr.select((left < 0) & mirror, 1, passed)
         turn = facing * dr.select(mirror, 2 * cosine, dr.fma(eta, cosine, -out_cosine))
