@@ -108,6 +108,7 @@ class FirstOrderTracer(Tracer):
         )
         _, radius, margin = dr.while_loop(first, on, body, mode="symbolic")
         spots = Spots(
+            rays=rays,
             across=side,
             x_mm=dr.fma(m00, x, m01 * sx),
             y_mm=dr.fma(m00, y, m01 * sy),
@@ -392,7 +393,6 @@ class FlareModel:
             weight=drawn.weight,
             strength=strength[drawn.source],
             kind=detail.kind[route],
-            box_mm=bundles.box_mm[drawn.source],
             ramp=detail.ramp[route],
             rough=drawn.rough,
             magnification=detail.magnification[route],

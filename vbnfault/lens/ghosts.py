@@ -74,8 +74,8 @@ def boxes(
 ) -> tuple[Rays, Arrivals]:
     """The box of every route that lets light through from a Sun at azimuth 0, and where it arrives.
 
-    Rays of one bundle a route, at the first wavelength; boxes lie evenly about the plane of axis and Sun. Within
-    `reach_mm` of the axis is near.
+    Rays of one bundle a route, at the first wavelength; boxes lie evenly about the plane of axis and Sun, and hold
+    the ellipse that all light passes. Within `reach_mm` of the axis is near.
     """
     tangent = np.tan(np.radians(sun_deg))
     direction = np.array([np.sin(np.radians(sun_deg)), 0.0, np.cos(np.radians(sun_deg))])
@@ -84,14 +84,14 @@ def boxes(
     count = len(made.routes)
     everywhere = np.tile([0.0, 0.0, reach, reach], (count, 1))
     box = np.concatenate([everywhere, _paraxial_boxes(made, tangent, reach)])
-    route = np.tile(np.arange(count), 2)
+    route, disc = np.tile(np.arange(count), 2), np.zeros(count)
     arrivals = Arrivals.none(count)
     edges = np.full(len(made.rows), _SHARP) if width is None else width
     last = len(made.wavelength_nm) - 1
     for ends in ((last // 2,), (0, last)):
-        box, arrivals = _narrowed(made, route, ends, box, direction, edges, reach_mm)
+        box, disc, arrivals = _narrowed(made, route, ends, box, direction, edges, reach_mm)
         route = np.flatnonzero(np.isfinite(box[:, 0]))
-        box = box[route]
+        box, disc = box[route], disc[route]
         if not len(route):
             break
     rays = Rays(
@@ -99,6 +99,7 @@ def boxes(
         wavelength=np.zeros(len(route), dtype=np.int64),
         box_mm=box,
         direction=np.tile(direction, (len(route), 1)),
+        disc=disc,
     )
     return rays, arrivals.take(route)
 
@@ -129,9 +130,9 @@ def _narrowed(
     direction: F64,
     width: F64,
     reach_mm: float,
-) -> tuple[F64, Arrivals]:
-    """Boxes of what gets through the given ones, nan where nothing does, and by route the arrivals: of the first
-    wavelength, and how far they lie from those of the last."""
+) -> tuple[F64, F64, Arrivals]:
+    """Boxes of what gets through the given ones, nan where nothing does, their discs, and the arrivals: of the
+    first wavelength, and how far they lie from those of the last."""
     count = len(wavelength)
     rays = Rays(
         route=np.tile(route, count),
@@ -160,6 +161,7 @@ def _narrowed(
     out, told = np.full((len(made.routes), 4), np.nan), Arrivals.none(len(made.routes))
     low, high = np.full((len(out), 2), np.inf), np.full((len(out), 2), -np.inf)
     spacing = np.zeros((len(out), 2))
+    passing: dict[int, tuple[F64, NDArray[np.bool_]]] = {}
     for k in np.flatnonzero(passes.any(axis=(1, 2))):
         r = route[k]
         columns, rows = np.flatnonzero(passes[k].any(axis=0)), np.flatnonzero(passes[k].any(axis=1))
@@ -170,7 +172,7 @@ def _narrowed(
         if np.isfinite(low[r, 0]) and (spacing[r] < step).all() and (here_high - here_low < 3 * step).any():
             continue
         low[r], high[r] = np.minimum(low[r], here_low - step), np.maximum(high[r], here_high + step)
-        spacing[r] = step
+        spacing[r], passing[r] = step, (box[k], passes[k])
         if inside[k].any():
             told.least_mm[r] = np.minimum(told.least_mm[r], least[k])
             told.most_mm[r] = np.maximum(told.most_mm[r], most[k])
@@ -183,7 +185,13 @@ def _narrowed(
     out[good, 2] = np.maximum((high[good, 0] - low[good, 0]) / 2, 1e-6)
     # even about the plane of axis and Sun, so that one side tells of the other
     out[good, 1], out[good, 3] = 0.0, np.maximum(np.maximum(high[good, 1], -low[good, 1]), 1e-6)
-    return out, told
+    disc = np.zeros(len(out))
+    for r, (of, passed) in passing.items():
+        ys, xs = np.nonzero(passed)
+        u, v = ((of[i] + of[2 + i] * lattice[n] - out[r, i]) / out[r, 2 + i] for i, n in ((0, xs), (1, ys)))
+        # a cell beyond those that pass
+        disc[r] = np.hypot(u, v).max() + 0.5 * (spacing[r] / out[r, 2:]).sum()
+    return out, np.clip(disc, 1, np.sqrt(2)), told
 
 
 def _spread(

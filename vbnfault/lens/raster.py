@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from .tracer import Spots, backend, lattice_places
+from .tracer import Spots, backend, lattice_places, rounded
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -69,7 +69,7 @@ class Placement:
 
     `source`: which of the traced bundles. Of each its `level`; two bands with their weights, int64 and
     float64[bundle, 2]; `strength`, irradiance for a share of 1 where nothing is magnified; the `kind` of its edges;
-    `box_mm` of its rays; `ramp`, in widths of its edge; whether it is `rough`, folded or unevenly magnified; the
+    `ramp`, in widths of its edge; whether it is `rough`, folded or unevenly magnified; the
     `magnification` of lengths that its levels are made for; and `inner_level`, that of the first of three parts of
     the light that add up. `part`, an index of `PARTS`, says which: `inner` rises smoothly over the ramp from the
     rims, `edge` is the rest, but near folds and where light is crowded all is `rough`.
@@ -81,7 +81,6 @@ class Placement:
     weight: F64
     strength: F64
     kind: NDArray[np.int64]
-    box_mm: F64
     ramp: F64
     rough: NDArray[np.bool_]
     magnification: F64
@@ -170,7 +169,7 @@ class Sums:
             return dr.fma(profile(margin), factor, offset)
 
         margins = [corner[3] for corner in cells.corners]
-        splat = sum(corner[2] for corner in cells.corners) * 0.25 * cells.energy
+        splat = sum(corner[2] for corner in cells.corners) * 0.25 * cells.light
         splat = splat * shade(*(sum(four) * 0.25 for four in (margins, factors, offsets)))
         add, width, small = self._adder(cells), UInt32(cells.width), cells.small
 
@@ -205,7 +204,7 @@ class Sums:
         number, columns = UInt32(across * down), UInt32(across)
         profile, add, width = cells.profile(), self._adder(cells), UInt32(cells.width)
         _, factors, _, _ = cells.ends()
-        light = cells.energy / (across * down)
+        light = cells.light / (across * down)
         (xa, ya, sa, ma), (xb, yb, sb, mb), (xc, yc, sc, mc), (xd, yd, sd, md) = cells.corners
         fa, fb, fc, fd = factors
         bends = cells.bends()
@@ -345,13 +344,12 @@ def _edge(p: tuple[Any, ...], q: tuple[Any, ...]) -> tuple[Any, ...]:
 
 _CORNERS = ((0, 0), (1, 0), (1, 1), (0, 1))
 _NO_AREA = 3e38
-_MISSED = 1e3  # radius of rays that are lost, but not at a rim
 _WHOLE = -1e5  # margins below are those of lost rays
 _OUTWARDS = ((-1, -1), (1, -1), (1, 1), (-1, 1))
 
 
 class _Traced:
-    """Lattices of rays on the sensor, whatever is drawn of them: areas of their cells, and how they bend."""
+    """Lattices of rays on the sensor, whatever is drawn of them: how cells are magnified, and how they bend."""
 
     def __init__(self, spots: Spots) -> None:
         be = backend()
@@ -359,19 +357,31 @@ class _Traced:
         rays, cells = self.across**2, (self.across - 1) ** 2
         self.first_ray, self.first_cell = np.cumsum(rays) - rays, np.cumsum(cells) - cells
         self._first_ray = be.UInt32(self.first_ray.astype(np.uint32))
-        self.area_mm2 = self._areas()
+        # of the mean cell
+        self.entrance_mm2 = 4 * spots.rays.box_mm[:, 2:].prod(axis=1) / (self.across - 1) ** 2
+        self.magnified = self._magnified()
 
-    def _areas(self) -> Any:
-        """Signed area of every cell, `_NO_AREA` where a ray was lost."""
+    def entrance(self, bundle: Any, ix: Any, iy: Any, side: Any) -> Any:
+        """Area of cells at the entrance over that of a rectangular lattice's."""
+        be = backend()
+        dr, disc = be.dr, self.spots.rays.disc
+        if disc is None:
+            return dr.full(be.Float, 1, dr.width(ix))
+        of = dr.gather(be.Float, be.Float(disc.astype(np.float32)), bundle)
+        step = 2 / be.Float(side)
+        at = [rounded((be.Float(ix) + dx) * step - 1, (be.Float(iy) + dy) * step - 1, of) for dx, dy in _CORNERS]
+        return _area(*at) / (step * step)
+
+    def _magnified(self) -> Any:
+        """Signed area of every cell on the sensor over that at the entrance, `_NO_AREA` where a ray was lost."""
         be = backend()
         dr, spots = be.dr, self.spots
         bundle, ix, iy, side = lattice_places(self.across - 1, self.across - 1)
         first = dr.gather(be.UInt32, self._first_ray, bundle) + iy * (side + 1) + ix
         at = [first + dx + dy * (side + 1) for dx, dy in _CORNERS]
-        (xa, xb, xc, xd), (ya, yb, yc, yd), margins = (
-            [dr.gather(be.Float, v, k) for k in at] for v in (spots.x_mm, spots.y_mm, spots.margin)
-        )
-        area = ((xc - xa) * (yd - yb) - (yc - ya) * (xd - xb)) * 0.5
+        x, y, margins = ([dr.gather(be.Float, v, k) for k in at] for v in (spots.x_mm, spots.y_mm, spots.margin))
+        mean = dr.gather(be.Float, be.Float(self.entrance_mm2.astype(np.float32)), bundle)
+        area = _area(*zip(x, y, strict=True)) / (mean * dr.maximum(self.entrance(bundle, ix, iy, side), 1e-6))
         out = dr.select(_least(*margins) > _WHOLE, area, _NO_AREA)
         dr.eval(out)
         return out
@@ -411,11 +421,9 @@ class _Lattice:
         self.across, self.first_ray, self.first_cell = (
             v[placement.source] for v in (traced.across, traced.first_ray, traced.first_cell)
         )
-        # light of a cell for a share of 1, in irradiance times pixels of the level
-        at_entrance = placement.box_mm[:, 2] * placement.box_mm[:, 3] * 4 / (self.across - 1) ** 2
-        self.energy = at_entrance * placement.strength * self.per_mm**2
-        # area of a cell as the levels are made for, mm²
-        self.usual_mm2 = np.maximum(at_entrance * placement.magnification**2, 1e-12)
+        # light of a mean cell for a share of 1, in irradiance times pixels of the level
+        self.entrance_mm2 = traced.entrance_mm2[placement.source]
+        self.light = self.entrance_mm2 * placement.strength * self.per_mm**2
         self.places = lattice_places(self.across - 1, self.across - 1)
 
     def cells(self, index: Any = None) -> _Cells:
@@ -442,27 +450,23 @@ class _Cells:
         cos, sin = (dr.opaque(Float, v) for v in lattice.turn)
         scale = self.scale = self.given(lattice.per_mm)
         middle_x, middle_y = (self.given(v) for v in lattice.middle)
-        self.energy = self.given(lattice.energy)
+        source = self.given(lattice.placement.source, UInt32)
+        self.light = self.given(lattice.light) * lattice.traced.entrance(source, self.ix, self.iy, self.side)
         self.height, self.width = (self.given(lattice.sides[:, k]) for k in (0, 1))
-        x, y, share, margin, radius = (
+        spots = lattice.spots
+        x, y, share, margin = (
             [dr.gather(Float, v, at) for at in self.rays]
-            for v in (
-                lattice.spots.x_mm,
-                lattice.spots.y_mm,
-                lattice.spots.share,
-                lattice.spots.margin,
-                lattice.spots.radius,
-            )
+            for v in (spots.x_mm, spots.y_mm, spots.share, spots.margin)
         )
         self.valid = _least(*margin) > _WHOLE
-        margin = _to_the_rim(margin, radius)
         x, y = (
-            [dr.fma(a * cos + b * sin, scale, middle_x) for a, b in zip(x, [-v for v in y], strict=True)],
+            [dr.fma(a * cos - b * sin, scale, middle_x) for a, b in zip(x, y, strict=True)],
             [dr.fma(a * sin + b * cos, scale, middle_y) for a, b in zip(x, y, strict=True)],
         )
         self.corners = list(zip(x, y, share, margin, strict=True))
         (xa, xb, xc, xd), (ya, yb, yc, yd) = x, y
-        self.own_mm2 = dr.gather(Float, lattice.traced.area_mm2, self.first_cell + self.iy * self.side + self.ix)
+        self.area = dr.abs(_area(*zip(x, y, strict=True)))
+        self.own = dr.gather(Float, lattice.traced.magnified, self.first_cell + self.iy * self.side + self.ix)
         self.low = _least(xa, xb, xc, xd), _least(ya, yb, yc, yd)
         self.high = _most(xa, xb, xc, xd), _most(ya, yb, yc, yd)
         self.small = dr.maximum(self.high[0] - self.low[0], self.high[1] - self.low[1]) < _SMALL
@@ -555,9 +559,7 @@ class _Cells:
         start, last = dr.maximum(start, 0), dr.minimum(last, self.height - 1)
         lit &= last >= start
         wide = dr.minimum(self.high[0], self.width) - dr.maximum(self.low[0], 0)
-        about = (last - start + 1) * (
-            1 + dr.minimum(wide, dr.abs(self.own_mm2) * self.scale**2 / (self.high[1] - self.low[1] + 1))
-        )
+        about = (last - start + 1) * (1 + dr.minimum(wide, self.area / (self.high[1] - self.low[1] + 1)))
         return start, dr.select(lit, last, -1), be.UInt32(dr.select(lit, dr.minimum(about, 60000), 0))
 
     def columns(self, row: Any) -> tuple[Any, Any]:
@@ -580,14 +582,14 @@ class _Cells:
         per_ramp, even = self.given(1 / placement.ramp), self.given(~placement.rough)
         # how unlike cells of the usual width may be, times their width, to look smooth in pixels of the first part
         inner_mm = 2.0 ** (placement.inner_level - placement.level) / self.lattice.per_mm
-        usual = self.lattice.usual_mm2
-        coarse, per_usual = self.given(inner_mm * np.sqrt(usual) / _SMOOTH), self.given(1 / usual)
-        energy = self.energy / (self.scale * self.scale)
+        usual = np.maximum(placement.magnification, 1e-6)
+        coarse = self.given(inner_mm * usual / np.sqrt(self.lattice.entrance_mm2) / _SMOOTH)
+        per_usual, strength = self.given(1 / usual**2), self.given(placement.strength)
         rest, with_calm, with_rise = (self.given(column) for column in _SHARES[placement.part].T)
         densities, factors, offsets, leasts = [], [], [], []
         for corner, (sx, sy) in zip(self.corners, _OUTWARDS, strict=True):
             mean, least, most = self._around(sx, sy)
-            densities.append(corner[2] * energy / dr.maximum(mean, 1e-12))
+            densities.append(corner[2] * strength / dr.maximum(mean, 1e-9))
             # calm: areas of one sign, alike over a pixel, and magnified half as much as is usual or more
             ratio = least / dr.maximum(most, 1e-18)
             calm = dr.minimum(2 - (1 - ratio) * coarse / dr.maximum(least, 1e-18), ratio / _UNLIKE)
@@ -599,16 +601,16 @@ class _Cells:
             leasts.append(least)
         size = dr.maximum(self.high[0] - self.low[0], self.high[1] - self.low[1])
         # so should narrow cells, whose edges fall anyhow between pixels
-        narrow = dr.abs(self.own_mm2) * self.scale * self.scale < _NARROW_PX * size
+        narrow = self.area < _NARROW_PX * size
         folds = (rest > 0) & (size < _POINTS) & ((_least(*leasts) < 0) | narrow)
         return densities, factors, offsets, folds
 
     def _around(self, sx: int, sy: int) -> tuple[Any, Any, Any]:
-        """Mean size of the cells that meet in a corner, and the least and the largest of their areas, counted
-        positive where they have this cell's sign, mm²."""
+        """Mean size of the magnifications of area of the cells that meet in a corner, and the least and the largest
+        of them, counted positive where they have this cell's sign."""
         be = backend()
         dr, Int32, UInt32 = be.dr, be.Int32, be.UInt32
-        own = dr.select(self.valid, self.own_mm2, 0)
+        own = dr.select(self.valid, self.own, 0)
         sign = dr.select(own < 0, -1.0, 1.0)
         total, number, side = dr.abs(own), be.Float(1), Int32(self.side)
         least, most = dr.abs(own), dr.abs(own)
@@ -616,7 +618,7 @@ class _Cells:
             jx, jy = Int32(self.ix) + dx, Int32(self.iy) + dy
             inside = (jx >= 0) & (jy >= 0) & (jx < side) & (jy < side)
             near = dr.gather(
-                be.Float, self.lattice.traced.area_mm2, self.first_cell + UInt32(jy * side + jx), inside
+                be.Float, self.lattice.traced.magnified, self.first_cell + UInt32(jy * side + jx), inside
             )
             inside &= near != _NO_AREA
             total, number = total + dr.select(inside, dr.abs(near), 0), number + dr.select(inside, 1, 0)
@@ -625,22 +627,10 @@ class _Cells:
         return total / number, least, most
 
 
-def _to_the_rim(margin: list[Any], radius: list[Any]) -> list[Any]:
-    """Margins at the corners of a cell, those beyond the rim such that light ends where the radius is 1: they are
-    of whatever rim is missed most by a ray that is already off its way, in widths of that rim's edge."""
-    dr = backend().dr
-    inside = [m > EDGE_LOW for m in margin]
-    number = sum(dr.select(i, 1.0, 0.0) for i in inside)
-    per_number = dr.rcp(dr.maximum(number, 1))
-    within = sum(dr.select(i, m, 0) for i, m in zip(inside, margin, strict=True)) * per_number
-    room = 1 - sum(dr.select(i, r, 0) for i, r in zip(inside, radius, strict=True)) * per_number
-    per_room = dr.rcp(dr.maximum(room, 1e-6))
-    out = []
-    for i, m, r in zip(inside, margin, radius, strict=True):
-        # of a ray that is lost otherwise nothing is known but that it is
-        beyond = dr.select(r < _MISSED, dr.clip((r - 1) * per_room, 0.05, 20), 1)
-        out.append(dr.select(i | (number == 0), m, dr.maximum(m, -dr.maximum(beyond * within, -EDGE_LOW))))
-    return out
+def _area(*corners: tuple[Any, Any]) -> Any:
+    """Signed area of quadrilaterals."""
+    (xa, ya), (xb, yb), (xc, yc), (xd, yd) = corners
+    return ((xc - xa) * (yd - yb) - (yc - ya) * (xd - xb)) * 0.5
 
 
 def _least(*values: Any) -> Any:

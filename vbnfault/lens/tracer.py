@@ -58,13 +58,16 @@ class Rays:
     """Which rays to trace: for each bundle its path, wavelength, box in the plane of the first vertex, direction.
 
     `route` and `wavelength` index those of the tracer, int[bundle]; `box_mm` float64[bundle, 4] is centre x, y and
-    half width x, y; `direction` float64[bundle, 3] unit vectors, with the Sun's azimuth at 0.
+    half width x, y; `direction` float64[bundle, 3] unit vectors, with the Sun's azimuth at 0. `disc`
+    float64[bundle] rounds lattices to the ellipse of so many half widths, so that their outer rays go along a rim;
+    0 leaves them rectangular.
     """
 
     route: NDArray[np.int64]
     wavelength: NDArray[np.int64]
     box_mm: F64
     direction: F64
+    disc: F64 | None = None
 
     def __len__(self) -> int:
         return len(self.route)
@@ -76,6 +79,7 @@ class Rays:
             wavelength=self.wavelength[chosen],
             box_mm=self.box_mm[chosen],
             direction=self.direction[chosen],
+            disc=None if self.disc is None else self.disc[chosen],
         )
 
 
@@ -83,11 +87,13 @@ class Rays:
 class Spots:
     """Where rays arrive: device arrays, bundle after bundle, rows of the grid along x within one.
 
-    `across` int64[bundle] rays span each lattice; `x_mm`, `y_mm` on the sensor, `share` of the light, `radius`: the
-    largest distance from the axis over the rim's on the way, and, where edges have a width, `margin`: the least of
-    (1 - radius) over the width of the rim's soft edge; a ray that misses a surface has a radius of 1e6.
+    Of `rays` `across` int64[bundle] span each lattice; `x_mm`, `y_mm` on the sensor, `share` of the light,
+    `radius`: the largest distance from the axis over the rim's on the way, and, where edges have a width, `margin`:
+    the least of (1 - radius) over the width of the rim's soft edge; a ray that misses a surface has a radius of
+    1e6.
     """
 
+    rays: Rays
     across: NDArray[np.int64]
     x_mm: Any
     y_mm: Any
@@ -146,6 +152,14 @@ def lattice_places(across: NDArray[np.int64], rows: NDArray[np.int64]) -> tuple[
     # exact: half a cell off a whole number is far more than rounding
     iy = be.UInt32((be.Float(cell) + 0.5) / be.Float(side))
     return bundle, cell - iy * side, iy, side
+
+
+def rounded(u: Any, v: Any, disc: Any) -> tuple[Any, Any]:
+    """Points of a square from -1 to 1 on an ellipse of `disc` half widths, smoothly; unmoved where that is 0."""
+    dr = backend().dr
+    wide = dr.select(disc > 0, disc * dr.sqrt(1 - 0.5 * v * v), 1)
+    high = dr.select(disc > 0, disc * dr.sqrt(1 - 0.5 * u * u), 1)
+    return u * wide, v * high
 
 
 class Tracer:
@@ -280,7 +294,7 @@ class Tracer:
             float64[step]: of the soft edge of the rim at each step of each route, in radii of the rim. Without it
             no margins are told, and rays that are lost end there.
         centred
-            Rays in the middles of the box's cells, else on its lattice, edges included.
+            Rays in the middles of the box's cells, else on its lattice, edges included, and rounded if it is.
         light
             Without it, a tracer of one path and wavelength leaves `share` at 1.
         halved
@@ -330,13 +344,13 @@ class Tracer:
         told += [(margin[0], margin[-1])] if soft else []
         dr.eval(told)
         if not even:
-            return Spots(side, *(one for one, _ in told))
+            return Spots(rays, side, *(one for one, _ in told))
         whole = [dr.empty(be.Float, int((side**2).sum())) for _ in told]
         for out, (here, there) in zip(whole, told, strict=True):
             dr.scatter(out, here, start.ray)
             dr.scatter(out, there, start.mirrored)
         dr.eval(whole)
-        return Spots(side, *whole)
+        return Spots(rays, side, *whole)
 
     def _fetched(self, step: Any, edge: Any, wavelength: Any, shares: Any) -> Any:
         """What a step of every lane's own path is made of, from the tables."""
@@ -519,9 +533,12 @@ class Tracer:
         first = whole(np.cumsum(across**2) - across**2)
         x, y, half_x, half_y = (given(c) for c in rays.box_mm.T)
         dx, dy, dz = (given(c) for c in rays.direction.T)
+        u, v = (be.Float(ix) + offset) * spacing - 1, (be.Float(iy) + offset) * spacing - 1
+        if rays.disc is not None and not centred:
+            u, v = rounded(u, v, given(rays.disc))
         return SimpleNamespace(
-            x=dr.fma(half_x, (be.Float(ix) + offset) * spacing - 1, x),
-            y=dr.fma(half_y, (be.Float(iy) + offset) * spacing - 1, y),
+            x=dr.fma(half_x, u, x),
+            y=dr.fma(half_y, v, y),
             dx=dx,
             dy=dy,
             dz=dz,
