@@ -13,6 +13,9 @@ from vbnfault import llvm, spectra
 from vbnfault.errors import InputError, VbnfaultError
 from vbnfault.faults import FaultContext, from_dict, registry
 from vbnfault.lens import first_order, load_lens, scaled_to_focal_length
+from vbnfault.lens.coating import mean_reflectance
+from vbnfault.lens.paraxial import transmittance
+from vbnfault.lens.trace import ghost
 
 try:
     llvm.find()
@@ -53,10 +56,10 @@ def test_ghosts_lie_on_the_line_from_the_sun_through_the_centre(model: str) -> N
     middle = np.array([SIZE / 2, SIZE / 2])
     along = (np.array(SUN) - middle) / np.hypot(*(np.array(SUN) - middle))
     across = np.array([-along[1], along[0]])
-    for ghost in params["ghosts"]:
-        place = np.array([ghost["x_px"], ghost["y_px"]]) - middle
+    for g in params["ghosts"]:
+        place = np.array([g["x_px"], g["y_px"]]) - middle
         # a ghost's rays are symmetrical about the line; of wide ones, to some parts in a thousand
-        assert abs(place @ across) < 0.05 + 0.004 * ghost["rms_radius_px"]
+        assert abs(place @ across) < 0.05 + 0.004 * g["rms_radius_px"]
     # so is the whole picture: mirrored about that line it is itself, but for resampling
     y, x = np.mgrid[:SIZE, :SIZE] + 0.5
     side = np.stack([x - middle[0], y - middle[1]], axis=-1)
@@ -138,3 +141,42 @@ def test_the_lens_is_the_cameras_own_or_the_one_named() -> None:
         from_dict("straylight", {"model": "traced", "baffle_length_mm": 5.0}, source="scene.toml")
     with pytest.raises(InputError, match="reflections = 3"):
         from_dict("straylight", {"model": "traced", "reflections": 3}, source="scene.toml")
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_worn_coatings_raise_ghosts(model: str) -> None:
+    """Mirrors reflect the mean of coated and bare; what passes stays as it was."""
+    where = context((0.52 * SIZE, 0.5 * SIZE))
+    worn = from_dict("optics_degradation", {"model": "contamination"}, source="test").inform(
+        where, {"coating_loss": 0.5}
+    )
+    fluxes = []
+    for there, coating in ((where, "mgf2"), (worn, "mgf2"), (where, "none"), (worn, "none")):
+        added, params = light(model, there, coating=coating, roughness_nm=0)
+        ghosts = {tuple(g["pair"]): g["flux_fraction"] for g in params["ghosts"]}
+        fluxes.append((added, ghosts))
+    (coated, a), (half, b), (bare, c), (again, d) = fluxes
+    np.testing.assert_array_equal(bare, again)
+    assert c == d
+    shared = set(a) & set(b) & set(c)
+    assert len(shared) >= 8
+    lens = where.frame.prescription("", "mgf2")
+    assert where.wavelength_nm is not None
+    gains = []
+    for pair in shared:
+        assert a[pair] < b[pair] < 1.02 * c[pair] / 0.7**2
+        before, after = 0.0, 0.0
+        for nm in where.wavelength_nm:
+            index = lens.indices(nm)
+            one, other = (
+                np.array(
+                    [mean_reflectance(f, *index[k : k + 2], 1.0, nm) for k, f in zip(pair, films, strict=True)]
+                )
+                for films in ([lens.surfaces[k].coating for k in pair], [(), ()])
+            )
+            share = transmittance(lens, ghost(lens, *pair), float(nm))
+            before, after = before + share, after + share * np.prod(0.5 * (1 + other / one))
+        gains.append(b[pair] / a[pair] / (after / before))
+    # of the Sun's light near the axis, told at normal incidence
+    assert np.median(gains) == pytest.approx(1, abs=0.02)
+    assert coated.sum() < half.sum()

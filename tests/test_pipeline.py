@@ -119,6 +119,36 @@ def test_the_image_without_a_class_equals_the_one_of_a_scene_that_lacks_it(frame
         assert np.array_equal(frame.images["image"].array, want)
 
 
+def test_worn_coatings_raise_the_ghosts_of_the_same_picture_alone() -> None:
+    faults = {
+        "straylight": {"model": "traced", "coating": "mgf2"},
+        "optics_degradation": {"model": "contamination", "coating": "mgf2", "haze": 0.0, "scratches": 0}
+        | {"dose_krad": 0.0, "coating_loss": 0.5},
+    }
+
+    def of(names: set[str], layers: list[str]) -> Session:
+        chosen = {name: faults[name] for name in faults if name in names}
+        scene = {**small_scene(dataset={"layers": layers}), "faults": chosen}
+        return Session(config.parse_scene(scene, source="test"))
+
+    s = of(set(faults), ["clean", "without_optics_degradation"])
+    i = next(i for i in range(16) if all(s.plan.injects(name)[i] for name in faults))
+    frame = s.frame(i)
+    assert len(frame.drawn) == 2
+    alone = of({"straylight"}, ["clean"])
+    planned = replace(
+        alone.plan,
+        injected=s.plan.injected[:, [list(s.faults).index("straylight")]],
+        stratum=s.plan.stratum,
+        variables=s.plan.variables,
+    )
+    lacking = pipeline.develop_frame(replace(frame.spec, scene=alone.scene, plan=planned, faults=alone.faults))
+    assert np.array_equal(frame.images["without_optics_degradation"].array, lacking.images["image"].array)
+    worn, whole = (sum(g["flux_fraction"] for g in f.drawn["straylight"]["ghosts"]) for f in (frame, lacking))
+    assert worn > 1.5 * whole
+    assert frame.images["image"].array.mean() > frame.images["without_optics_degradation"].array.mean()
+
+
 def test_clean_twin_differs_only_where_faults_are(frames_: list[Frame]) -> None:
     local = [ALL_FAULTS.index(n) for n in ("dust_on_optics", "broken_pixels", "broken_lines")]
     checked = 0

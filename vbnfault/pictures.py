@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from . import labels
 from .camera import Camera
 from .detector import Noise
-from .faults import Params, physical_order
+from .faults import Fault, FaultContext, Params, physical_order
 from .quantities import RGBI, Electrons
 from .sample import Frame, stored_layers
 
@@ -45,7 +45,7 @@ def photograph(frame: Frame) -> None:
         for name in [n for n in optical if spec.faults[n].effect_mask]:
             _signal(frame, frame.drawn, [n for n in optical if n != name])
         noise, frame.images["clean"] = exposed.result()
-    frame.pictures[frame.camera, (), False] = frame.images["clean"]
+    frame.pictures[frame.camera, (), (), False] = frame.images["clean"]
     for attempt in range(1, _DRAW_TRIES + 1):
         invisible = _invisible(frame, noise)
         # the rejected are kept, or a new draw could take over the identity of an old one
@@ -70,11 +70,12 @@ def _expose_clean(frame: Frame, signal: Electrons) -> tuple[Noise, RGBI]:
 
 
 def _draw(frame: Frame, commanded: Sequence[str], attempt: int) -> None:
-    """Draw the commanded faults that are not drawn yet."""
-    for name in commanded:
+    """Draw the commanded faults that are not drawn yet, those first of which others should know."""
+    faults = frame.spec.faults
+    for name in sorted(commanded, key=lambda n: type(faults[n]).inform is Fault.inform):
         if name not in frame.drawn:
             generator = frame.spec.rng("fault", f"{name}/{attempt}")
-            frame.drawn[name] = frame.spec.faults[name].draw(frame.context, generator)
+            frame.drawn[name] = faults[name].draw(_context(frame, frame.drawn)[1], generator)
 
 
 def _but(drawn: Mapping[str, Params], left_out: str) -> dict[str, Params]:
@@ -93,6 +94,19 @@ def _altered(frame: Frame, drawn: Mapping[str, Params]) -> Camera:
     return camera
 
 
+def _context(frame: Frame, drawn: Mapping[str, Params]) -> tuple[Any, FaultContext]:
+    """What the drawn faults know of one another, under a key."""
+    faults = frame.spec.faults
+    informing = [name for name in drawn if type(faults[name]).inform is not Fault.inform]
+    key = _key(drawn, informing)
+    if key and key not in frame.contexts:
+        context = frame.context
+        for name in informing:
+            context = faults[name].inform(context, drawn[name])
+        frame.contexts[key] = context
+    return key, frame.contexts[key] if key else frame.context
+
+
 def _key(drawn: Mapping[str, Params], names: Sequence[str]) -> tuple[tuple[str, int], ...]:
     return tuple((name, id(drawn[name])) for name in names)
 
@@ -104,12 +118,13 @@ def _signal(frame: Frame, drawn: Mapping[str, Params], names: Sequence[str]) -> 
         cached: dict[Any, Electrons] = {}  # another instrument: not to be mixed with the others
     else:
         cached = frame.signals
-    key = _key(drawn, names)
+    state, context = _context(frame, drawn)
+    key = state if names else (), _key(drawn, names)
     if key not in cached:
         if names:
             *before, last = names
             signal = _signal(frame, drawn, before)
-            cached[key] = frame.spec.faults[last].apply(signal, drawn[last], frame.context)
+            cached[key] = frame.spec.faults[last].apply(signal, drawn[last], context)
         else:
             if camera == frame.camera:
                 signal = frame.rate.with_array(frame.rate.array * np.float32(camera.exposure_s))
@@ -123,7 +138,7 @@ def develop(frame: Frame, drawn: Mapping[str, Params], noise: Noise | None) -> R
     """The finished picture with the faults `drawn`; noise-free without `noise`."""
     optical = _in_order(frame, drawn, "electrons")
     camera = _altered(frame, drawn)
-    key = (camera, _key(drawn, optical), noise is None)
+    key = (camera, _context(frame, drawn)[0], _key(drawn, optical), noise is None)
     if key not in frame.pictures:
         signal = _signal(frame, drawn, optical)
         frame.pictures[key] = camera.detector.develop(signal, camera.exposure_s, noise)

@@ -114,7 +114,8 @@ class FaultContext:
     `sun_xy_px` float64[2], the pixel position of the Sun's centre (it may lie outside the frame; None behind
     the camera), `sun_direction_C` unit float64[3], `sun_irradiance_W_m2_nm` float64[band] at the camera,
     with `wavelength_nm` its nodes, `sun_visible_fraction` in [0, 1], `sun_angular_radius_rad` of its disc. All None
-    where a user's own image is injected.
+    where a user's own image is injected. `coating_loss` is the share of the coatings' area that is gone, if another
+    fault of the sample has worn them.
     """
 
     camera: Camera
@@ -124,6 +125,7 @@ class FaultContext:
     wavelength_nm: NDArray[np.float64] | None = None
     sun_visible_fraction: float | None = None
     sun_angular_radius_rad: float | None = None
+    coating_loss: float = 0.0
     # not an init field: `dataclasses.replace` must not hand results for one frame to another
     _memo: dict[Any, Any] = field(default_factory=dict, init=False, repr=False)
 
@@ -198,6 +200,10 @@ class Fault:
     def alter(self, camera: Camera, params: Params) -> Camera:
         """The camera with this fault, where the fault is an instrument parameter."""
         return camera
+
+    def inform(self, context: FaultContext, params: Params) -> FaultContext:
+        """What other faults of the sample know of it, where this one changes what they meet."""
+        return context
 
     def apply(self, quantity: Q, params: Params, context: FaultContext) -> Q:
         """The quantity of `step` with this fault; the input is not modified."""

@@ -13,7 +13,8 @@
   show (half of the light gone in 10 mm at 400 nm after 100 krad); in glasses stabilised with cerium, whose names
   have a G and a number behind their type as in BK7G18, and in silica, they are a hundredth of that. Recovery is
   left out.
-- Where a share of the coatings is gone, a surface reflects the mean of coated and bare, and the image loses that.
+- Where a share of the coatings is gone, a surface reflects the mean of coated and bare, and the image loses that;
+  straylight's ghosts gain.
 
 T_c is the mean of what passes over the colour's response to sunlight. Light is the true light: the Sun in the
 frame, 10⁵ times white, floods it at a haze of a few per cent, as it would. What lies beyond the frame is taken to
@@ -23,7 +24,7 @@ mirror it, without what is brighter than white; light that goes farther than a f
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
 
@@ -104,6 +105,10 @@ class Contamination(LensFault):
         for name in ("scratch_bend_deg", "browning_per_mm_krad", "browning_exponent"):
             params[name] = float(getattr(self, name))
         return params
+
+    def inform(self, context: FaultContext, params: Params) -> FaultContext:
+        """Worn coatings raise ghosts."""
+        return replace(context, coating_loss=float(params["coating_loss"]))
 
     def apply(self, quantity: Any, params: Params, context: FaultContext) -> Any:
         """Expected electrons, scattered and darkened."""

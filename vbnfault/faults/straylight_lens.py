@@ -5,7 +5,8 @@ Two models of the ghosts, everything else alike: `traced` follows exact rays alo
 added to what the scene gives, as irradiance on the sensor, from the Sun's irradiance at the camera.
 
 The parameters of a sample hold the ghosts in the frame, as they would be without each other: `pair` (rows of the
-prescription), `flux_fraction`, `x_px`, `y_px`, `rms_radius_px`, the brightest first.
+prescription), `flux_fraction`, `x_px`, `y_px`, `rms_radius_px`, the brightest first. Coatings worn off by another
+fault raise them.
 """
 
 from __future__ import annotations
@@ -117,6 +118,7 @@ class _LensStraylight(LensFault):
             cleanliness=Cleanliness(roughness_nm=params["roughness_nm"], level=params["cleanliness_level"]),
             baffle=Baffle(length_mm=params["baffle_mm"][0], radius_mm=params["baffle_mm"][1]),
             reflections=params["reflections"],
+            coating_loss=context.coating_loss,
         )
         visible = 1.0 if context.sun_visible_fraction is None else float(context.sun_visible_fraction)
         light = found.total * (irradiance * visible).astype(np.float32)[:, None, None]
@@ -140,7 +142,9 @@ class _LensStraylight(LensFault):
             self.model,
             params["reflections"],
         )
-        ghosts = sorted(made.ghosts(*sun), key=lambda g: -g.peak_irradiance_fraction)[:_MOST_GHOSTS]
+        ghosts = sorted(made.worn(context.coating_loss).ghosts(*sun), key=lambda g: -g.peak_irradiance_fraction)[
+            :_MOST_GHOSTS
+        ]
         return [
             {
                 "pair": list(g.pair),

@@ -7,6 +7,7 @@ its own. Where the Sun itself is nearly in focus, its disc is sampled instead.
 
 from __future__ import annotations
 
+import copy
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
@@ -51,17 +52,16 @@ class FirstOrderTracer(Tracer):
         found = [along(lens, path, self.wavelength_nm) for path in self._paths]
         whole = np.stack([m for m, _ in found])  # route, wavelength
         met = np.concatenate([m for _, m in found])  # step, wavelength
-        index = np.stack([np.append(lens.indices(w), 1.0) for w in self.wavelength_nm])
-        passed = self._shares(index)[:, :, :, -1].reshape(len(index), -1)
-        shares = np.ones(whole.shape[:2])
-        look_up = self._look_up
-        for k, (first, last) in enumerate(zip(self.first_step[:-1], self.first_step[1:], strict=True)):
-            shares[k] = passed[:, look_up[first:last]].prod(axis=1)
         self._first_order = {
             "whole": be.Float(whole[:, :, 0, :].transpose(1, 0, 2).astype(np.float32).ravel()),
             "met": be.Float(met[:, :, 0, :].transpose(1, 0, 2).astype(np.float32).ravel()),
-            "share": be.Float(shares.T.astype(np.float32).ravel()),
         }
+
+    def _share_tables(self, share: F64) -> dict[str, Any]:
+        """As `Tracer` has them, and of every route at normal incidence."""
+        normal = share[:, :, :, -1].reshape(len(share), -1)[:, self._look_up]
+        routes_ = np.multiply.reduceat(normal, self.first_step[:-1], axis=1) if len(self.routes) else normal
+        return super()._share_tables(share) | {"shares": backend().Float(routes_.astype(np.float32).ravel())}
 
     def trace(
         self,
@@ -112,7 +112,7 @@ class FirstOrderTracer(Tracer):
             across=side,
             x_mm=dr.fma(m00, x, m01 * sx),
             y_mm=dr.fma(m00, y, m01 * sy),
-            share=dr.select(radius >= 0, dr.gather(be.Float, f["share"], of), 0),  # one a ray
+            share=dr.select(radius >= 0, dr.gather(be.Float, t["shares"], of), 0),  # one a ray
             radius=radius,
             margin=margin,
         )
@@ -272,6 +272,14 @@ class FlareModel:
         first = np.abs(self._tracer.matrix[route, 0, 0])
         out[route] = np.clip(arrivals.magnification / np.maximum(first, 1e-9), *_SPREAD)
         return out
+
+    def worn(self, coating_loss: float) -> FlareModel:
+        """The same model with a share of the coatings' area gone: mirrors reflect the mean of coated and bare."""
+        if not coating_loss:
+            return self
+        other = copy.copy(self)
+        other._tracer = self._tracer.worn(coating_loss)
+        return other
 
     def image(self, sun_deg: float, azimuth_deg: float = 0.0, *, only: tuple[int, int] | None = None) -> F32:
         """Ghosts of a Sun at an angle from the axis, towards an azimuth: its direct image lies at +f tan θ there

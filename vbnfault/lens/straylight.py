@@ -67,6 +67,7 @@ def straylight(
     cleanliness: Cleanliness | None = None,
     baffle: Baffle | None = None,
     reflections: int = 2,
+    coating_loss: float = 0.0,
 ) -> Straylight:
     """Straylight of a Sun at an angle from the axis and an azimuth (0: +x, right; 90°: +y, down).
 
@@ -80,6 +81,9 @@ def straylight(
         float64[band], nodes of the bands.
     sun_xy_mm
         The Sun's own image; default: f tan θ along the azimuth.
+    coating_loss
+        Share of the coatings' area that is gone, in [0, 1]: it raises ghosts. What the light straight through loses
+        is left to whoever darkens the image by it.
 
     Raises InputError.
     """
@@ -113,7 +117,7 @@ def straylight(
     passed = np.array([transmittance(lens, forward(lens), w) for w in nodes], dtype=np.float32)
     rays *= (lit * passed)[:, None, None].astype(np.float32)
     return Straylight(
-        ghosts=made.image(sun_deg, azimuth_deg) * np.float32(lit),
+        ghosts=made.worn(coating_loss).image(sun_deg, azimuth_deg) * np.float32(lit),
         starburst=rays,
         glare=glare.image(sun_xy_mm, shape, pitch_mm) * np.float32(lit),
     )

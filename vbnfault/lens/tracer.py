@@ -7,6 +7,7 @@ has just met. Where both sides of the plane of axis and Sun are alike, one side 
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
@@ -222,15 +223,13 @@ class Tracer:
         ratio = index[:, medium] / index[:, other]
         # a ray's step asks for few but wide records: fetching is what takes the time
         curvature, per_rim = (np.array(flat)[rows], (1 / self.rims_mm)[rows])
-        share = self._shares(index)
-        rise = np.diff(share, axis=-1, append=share[..., -1:])
+        self._index = index
         self._look_up_word = ((rows * 3 + use) * _COSINES * 2 + np.array(mirror, dtype=np.int64)).astype(np.uint32)
         tables = {
             "row": be.UInt32(rows),
             "stop": be.UInt32((rows == lens.stop).astype(np.uint32)),
             "place": be.UInt64(_paired(np.array(gap), curvature)),
             "bend": be.UInt64(_paired(ratio, np.broadcast_to(per_rim, (len(index), count)))),
-            "share": be.UInt64(_paired(share, rise)),
             "end": be.UInt32(self.first_step[1:].astype(np.uint32)),
             "start": be.UInt32(self.first_step[:-1].astype(np.uint32)),
             "last": be.Float(np.array(last, dtype=np.float32)),
@@ -251,10 +250,33 @@ class Tracer:
             "aspheric": aspheric,
             "absorption": absorption[:, medium],
         }
+        tables |= self._share_tables(self._shares(index))
         be.dr.eval(tables)
         return tables
 
-    def _shares(self, index: F64) -> F64:
+    def _share_tables(self, share: F64) -> dict[str, Any]:
+        """What surfaces do to light, on the device."""
+        rise = np.diff(share, axis=-1, append=share[..., -1:])
+        return {"share": backend().UInt64(_paired(share, rise))}
+
+    def worn(self, coating_loss: float) -> Tracer:
+        """The same tracer with a share of the coatings' area gone: mirrors reflect the mean of coated and bare."""
+        share = self._coated.copy()
+        share[:, :, :2] += coating_loss * (self._bare - self._coated)[:, :, :2]
+        other = copy.copy(self)
+        other._tables = self._tables | other._share_tables(share)
+        other.__dict__.pop("_known", None)
+        return other
+
+    @cached_property
+    def _coated(self) -> F64:
+        return self._shares(self._index)
+
+    @cached_property
+    def _bare(self) -> F64:
+        return self._shares(self._index, bare=True)
+
+    def _shares(self, index: F64, bare: bool = False) -> F64:
         """What each surface reflects from the front, from behind, and passes, float64[wavelength, row, 3, cosine]:
         over the cosine in the thinner of its two media, mean of both polarisations."""
         lens = self.lens
@@ -266,7 +288,7 @@ class Tracer:
             # the cosine on either side; the square root is of what the denser side has left
             thin = np.minimum(front, back)
             at_front, at_back = (np.sqrt(1 - (thin / n) ** 2 * (1 - cosine**2)) for n in (front, back))
-            films = surface.coating
+            films = () if bare else surface.coating
             rs, rp, ts, tp = reflect_transmit(films, front, back, at_front, wavelength)
             out[:, k, 0], out[:, k, 2] = (rs + rp) / 2, (ts + tp) / 2
             rs, rp, _, _ = reflect_transmit(films[::-1], back, front, at_back, wavelength)
@@ -563,8 +585,7 @@ class Tracer:
     def turned(self, azimuth_rad: float) -> Tracer:
         """The same tracer for a Sun at an azimuth: rays are traced with the Sun at azimuth 0, and the stop's blades
         turned back instead."""
-        other = type(self).__new__(type(self))
-        other.__dict__.update(self.__dict__)
+        other = copy.copy(self)
         rim = self.lens.surfaces[self.lens.stop]
         other._stop_turn_rad = float(np.radians(rim.rotation_deg) - azimuth_rad)
         return other
