@@ -23,8 +23,8 @@ from numpy.typing import NDArray
 from scipy.special import ndtr, ndtri
 from scipy.stats import poisson
 
-from . import spectra
-from .quantities import LUMINANCE, RGBI, Electrons, Irradiance, RawDN
+from .. import spectra
+from ..quantities import LUMINANCE, RGBI, Electrons, Irradiance, RawDN
 
 F32 = NDArray[np.float32]
 
