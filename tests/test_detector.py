@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from vbnfault import detector as module
 from vbnfault import spectra
 from vbnfault.detector import Detector, Noise, poisson_quantile
+from vbnfault.detector import three_colour as module
 from vbnfault.quantities import Electrons, Irradiance, RawDN
 
 SHORT_S = 1e-3
