@@ -112,7 +112,7 @@ def ghosts(view: View, progress: Callable[[int], None] | None = None) -> tuple[G
 
 
 def _ghosts_at(view: View, wavelength_nm: float, *, alone: bool) -> tuple[Ghost, ...]:
-    from .lens.ghosts import FINE, traced_ghosts
+    from .lens.ghosts import traced_ghosts
 
     if view.model == "paraxial":
         return paraxial_ghosts(view.lens, view.sun_deg, azimuth_deg=view.azimuth_deg, wavelength_nm=wavelength_nm)
@@ -122,7 +122,7 @@ def _ghosts_at(view: View, wavelength_nm: float, *, alone: bool) -> tuple[Ghost,
         azimuth_deg=view.azimuth_deg,
         wavelength_nm=wavelength_nm,
         reflections=view.reflections,
-        across=FINE if alone else _ACROSS_SPECTRUM,
+        across=None if alone else _ACROSS_SPECTRUM,
     )
 
 

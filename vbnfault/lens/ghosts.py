@@ -25,6 +25,7 @@ F64 = NDArray[np.float64]
 
 _COARSE = 25  # rays across a box while boxes are sought
 FINE = 768  # rays across a box where flux and place are told
+FINE_OF_FOUR = 192
 _STEEP = 0.3  # rise of the radius over a cell
 _PEAK = 64  # rays across where the peak is sought
 _TOGETHER = 1 << 22  # rays at a time there, for the memory's sake
@@ -244,12 +245,13 @@ def traced_ghosts(
     azimuth_deg: float = 0.0,
     wavelength_nm: float = D_NM,
     reflections: int = 2,
-    across: int = FINE,
+    across: int | None = None,
     only: Collection[tuple[int, ...]] | None = None,
 ) -> tuple[Ghost, ...]:
     """Ghosts of a far point source by exact rays, as `paraxial.paraxial_ghosts` tells them.
 
-    `across` rays span each ghost's box either way; `only` these, by their names: the pair of rows, the smaller
+    `across` rays span each ghost's box either way (default: `FINE`, `FINE_OF_FOUR` for ghosts of four reflections,
+    of which there are many, and all faint); `only` these, by their names: the pair of rows, the smaller
     first. The peak is the largest irradiance of a cell of a coarser grid.
     """
     turn = np.radians(azimuth_deg)
@@ -259,7 +261,12 @@ def traced_ghosts(
         rays = rays.take(named(made, rays, only))
     if not len(rays):
         return ()
-    return told(made, rays, sun_deg, turn, across)
+    if across is not None:
+        return told(made, rays, sun_deg, turn, across)
+    four = np.array([len(made.routes[r]) > 2 for r in rays.route])
+    found = [(rays.take(~four), FINE), (rays.take(four), FINE_OF_FOUR)]
+    ghosts = [ghost for some, count in found for ghost in told(made, some, sun_deg, turn, count)]
+    return tuple(sorted(ghosts, key=lambda g: g.pair))
 
 
 def named(made: Tracer, rays: Rays, names: Collection[tuple[int, ...]]) -> NDArray[np.bool_]:
