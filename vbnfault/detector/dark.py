@@ -227,12 +227,17 @@ class HotPixelGrowth:
     """Growth of hot pixels in number: D = 10^log10_scale S^size_power ISO^iso_power, per year and mm², S in µm.
 
     Chapman, Leung, Koren and Koren's fits to consumer cameras on the ground (Chapman et al. 2013, Leung et al.
-    2009): not rates in space.
+    2009): not rates in space. The last two are from -10 to 10 and 0.01 to 5; InputError otherwise.
     """
 
     log10_scale: float
     size_power: float
     iso_power: float
+
+    def __post_init__(self) -> None:
+        checked("log10_scale", self.log10_scale, -20.0, 20.0)
+        checked("size_power", self.size_power, -10.0, 10.0)
+        checked("iso_power", self.iso_power, 0.01, 5.0)
 
     def per_yr_mm2(self, pixel_pitch_um: float, iso: float) -> float:
         """Defects a year and mm². Pitch 0.1 to 100 µm, ISO 1 to 1e7. Raises InputError outside the ranges."""
@@ -257,7 +262,8 @@ def hot_pixel_signal(
     The gain is proportional to the ISO setting. Every argument is at least 0; they broadcast.
     """
     rate = np.asarray(photo_e_s, dtype=np.float64) + np.asarray(dark_e_s, dtype=np.float64)
-    return np.asarray(gain * (rate * np.asarray(exposure_s, dtype=np.float64) + offset_e))
+    charge = rate * np.asarray(exposure_s, dtype=np.float64) + np.asarray(offset_e, dtype=np.float64)
+    return np.asarray(gain * charge)
 
 
 # --- random telegraph signals -----------------------------------------------------------------------------------
