@@ -1,0 +1,529 @@
+"""One sensor as an individual: what a seed fixes for life, and what age and radiation add to it.
+
+Every property has its own random stream, keyed by (seed, name), and every defect its place in an endless list in
+order of birth, of which age shows the beginning. So more hot pixels leave the gain map alone, and an older sensor
+keeps each defect of its youth.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import InputError
+from .dark import (
+    APS_GROWTH,
+    WEEK_S,
+    HotPixelGrowth,
+    RadiationDamage,
+    Telegraph,
+    arrhenius_factor,
+    checked,
+    rate_e_s,
+    silicon_factor,
+)
+
+F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
+I32 = NDArray[np.int32]
+
+_LOW_FREQUENCY_CELLS = 6  # across the sensor, of the slowly varying gain
+_BIRTHS = 1 << 15  # drawn at a time; part of what a seed means
+_MOST_DEFECTS = 2e8  # of one kind: seconds of drawing
+
+# assumed but for the range of energies of silicon's traps: switching in a defect is slower to freeze than it
+# generates
+_RTS_TIME_EV = 0.9
+_RTS_REFERENCE_K = 294.15
+
+
+@dataclass(frozen=True, kw_only=True)
+class IndividualSpec:
+    """What individuals of one sensor type, age and dose have in common. Numbers marked * are assumed.
+
+    Rates hold at `reference_K`; signals are in electrons (e); shares are of all pixels. InputError outside the
+    ranges given.
+
+    Attributes
+    ----------
+    prnu, prnu_row, prnu_column, prnu_low
+        Standard deviation of the gain about 1, 0 to 0.5: of pixels*, rows, columns, slow variation.
+    dsnu_e, dsnu_row_e, dsnu_column_e
+        Standard deviation of the offset, 0 to 1e5 e: of pixels*, rows, columns.
+    dark_current_e_s, dark_nonuniformity
+        Mean dark current of undamaged pixels, 0 to 1e8 e/s, and its spread* over the mean, 0 to 1.
+    reference_K
+        Temperature of these rates, 80 to 400 K.
+    dose_TeV_g, depletion_depth_um, anneal_s
+        As in `RadiationDamage`; the depleted volume of a pixel is the depth*, 0 to 100 µm, times its area.
+    years, hot_growth, iso
+        Age, 0 to 100 years, and the growth of hot pixels; None leaves them out. They are displacement damage
+        too: with a dose from the same years, damage counts twice.
+    hot_rate_e_s
+        Least and largest rate* of a hot pixel, above 0 to 1e8 e/s. Between them the share above a rate R falls as
+        R^-iso_power: then the number above a threshold that falls as 1/ISO grows as the law of growth has it.
+    hot_offset_share, hot_offset_e
+        Share of hot pixels with an offset (over 0.4: Chapman et al. 2013), and its mean*, 0 to 1e6 e
+        (exponential).
+    hot_clustered_share
+        Share of hot pixels born beside an earlier one, 0 to 1.
+    dead_share, dead_share_yr, stuck_share, stuck_share_yr
+        Dead* and stuck pixels at delivery and their growth, 0 to 0.1 (per year).
+    rts_share, rts_per_interaction
+        Pixels with telegraph signals at delivery, and more per interaction of radiation*; 0 to 1.
+    rts_amplitude_nA_cm2
+        Mean amplitude at 294 K (exponential), 0 to 100. In proton-irradiated CCDs at 21 °C many have up to 0.1
+        nA/cm² and one in 1000 up to 0.4 (Hopkins & Hopkinson 1993, doi 10.1109/23.273552): 0.4/ln 1000.
+    rts_time_s
+        Shortest and longest mean time* in a level at `reference_K` (log-uniform), 1e-3 to 1e9 s.
+    trap_share, trap_share_TeV_g, trap_depth_e
+        CCD traps at delivery, and more per TeV/g, 0 to 0.1; their mean depth*, 0 to 1e6 e (exponential).
+    """
+
+    prnu: float = 0.01
+    prnu_row: float = 0.0
+    prnu_column: float = 0.0
+    prnu_low: float = 0.0
+    dsnu_e: float = 2.0
+    dsnu_row_e: float = 0.0
+    dsnu_column_e: float = 0.0
+    dark_current_e_s: float = 15.0
+    dark_nonuniformity: float = 0.1
+    reference_K: float = 298.15
+    dose_TeV_g: float = 0.0
+    depletion_depth_um: float = 3.0
+    anneal_s: float = WEEK_S
+    years: float = 0.0
+    hot_growth: HotPixelGrowth | None = APS_GROWTH
+    iso: float = 400.0
+    hot_rate_e_s: tuple[float, float] = (100.0, 1e5)
+    hot_offset_share: float = 0.45
+    hot_offset_e: float = 500.0
+    hot_clustered_share: float = 0.0
+    dead_share: float = 1e-6
+    dead_share_yr: float = 0.0
+    stuck_share: float = 0.0
+    stuck_share_yr: float = 0.0
+    rts_share: float = 0.0
+    rts_per_interaction: float = 0.05
+    rts_amplitude_nA_cm2: float = 0.4 / math.log(1000)
+    rts_time_s: tuple[float, float] = (1.0, 1e4)
+    trap_share: float = 0.0
+    trap_share_TeV_g: float = 0.0
+    trap_depth_e: float = 200.0
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            if field.name == "hot_growth":
+                continue
+            value = getattr(self, field.name)
+            low, high = _RANGES[field.name]
+            for number in value if isinstance(value, tuple) else (value,):
+                checked(field.name, number, low, high)
+            if isinstance(value, tuple) and (len(value) != 2 or value[0] > value[1]):
+                raise InputError(f"{field.name} = {value}: must be two numbers, the smaller first")
+
+    def radiation(self, pixel_pitch_um: float) -> RadiationDamage:
+        """The damage of this dose to a pixel."""
+        volume = self.depletion_depth_um * pixel_pitch_um**2
+        return RadiationDamage(dose_TeV_g=self.dose_TeV_g, depletion_volume_um3=volume, anneal_s=self.anneal_s)
+
+
+_RANGES: dict[str, tuple[float, float]] = {
+    **dict.fromkeys(("prnu", "prnu_row", "prnu_column", "prnu_low"), (0.0, 0.5)),
+    **dict.fromkeys(("dsnu_e", "dsnu_row_e", "dsnu_column_e"), (0.0, 1e5)),
+    "dark_current_e_s": (0.0, 1e8),
+    "dark_nonuniformity": (0.0, 1.0),
+    "reference_K": (80.0, 400.0),
+    "dose_TeV_g": (0.0, 1e6),
+    "depletion_depth_um": (0.0, 100.0),
+    "anneal_s": (0.0, 1e12),
+    "years": (0.0, 100.0),
+    "iso": (1.0, 1e7),
+    "hot_rate_e_s": (1e-9, 1e8),
+    "hot_offset_e": (0.0, 1e6),
+    **dict.fromkeys(("hot_offset_share", "hot_clustered_share", "rts_share", "rts_per_interaction"), (0.0, 1.0)),
+    **dict.fromkeys(("dead_share", "dead_share_yr", "stuck_share", "stuck_share_yr"), (0.0, 0.1)),
+    "rts_amplitude_nA_cm2": (0.0, 100.0),
+    "rts_time_s": (1e-3, 1e9),
+    **dict.fromkeys(("trap_share", "trap_share_TeV_g"), (0.0, 0.1)),
+    "trap_depth_e": (0.0, 1e6),
+}
+
+
+def _freeze(holder: Any) -> None:
+    for field in fields(holder):
+        value = getattr(holder, field.name)
+        if isinstance(value, np.ndarray):
+            value.flags.writeable = False
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Defects:
+    """Pixels, int32[n] each, in order of birth. Two defects can share a pixel."""
+
+    row: I32
+    column: I32
+
+    def __post_init__(self) -> None:
+        _freeze(self)
+
+    def __len__(self) -> int:
+        return len(self.row)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class HotPixels(Defects):
+    """Hot pixels: `rate_e_s` at the reference temperature and `offset_e` in electrons, float64[n]; `born_yr`,
+    the sensor's age at their birth."""
+
+    rate_e_s: F64
+    offset_e: F64
+    born_yr: F64
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class DeadPixels(Defects):
+    """Dead pixels: `response`, float64[n] in 0 to below 1, multiplies their gain."""
+
+    response: F64
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class StuckPixels(Defects):
+    """Stuck pixels: `level`, float64[n] in 0 to 1, the share of full scale that they always show."""
+
+    level: F64
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class RtsPixels(Defects):
+    """Pixels with telegraph signals: amplitude and mean times in the levels, float64[n], at `reference_K`."""
+
+    amplitude_e_s: F64
+    high_s: F64
+    low_s: F64
+    reference_K: float
+
+    def at(self, temperature_K: float) -> Telegraph:
+        """The signals at a temperature of 80 to 400 K: both the amplitudes and the jumps are faster in the heat.
+
+        Activation energies: 0.63 eV of the amplitudes, as other bulk damage; 0.9 eV of the times (both assumed).
+        Raises InputError outside the range.
+        """
+        slower = 1 / arrhenius_factor(temperature_K, self.reference_K, _RTS_TIME_EV)
+        return Telegraph(
+            amplitude_e_s=self.amplitude_e_s * arrhenius_factor(temperature_K, self.reference_K),
+            high_s=self.high_s * slower,
+            low_s=self.low_s * slower,
+        )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Traps(Defects):
+    """CCD traps: `depth_e`, float64[n], electrons that one holds."""
+
+    depth_e: F64
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Individual:
+    """One sensor for life. Maps are float32[y, x], read-only; rates hold at `spec.reference_K`.
+
+    Attributes
+    ----------
+    gain
+        Response over the mean one, at least 0, dead pixels aside.
+    dsnu_e
+        Fixed offset, electrons, either sign, hot pixels aside.
+    dark_e_s
+        Dark current of undamaged silicon.
+    damage_e_s
+        Dark current of bulk damage: radiation and hot pixels.
+    """
+
+    spec: IndividualSpec
+    seed: int
+    pixel_pitch_um: float
+    gain: F32
+    dsnu_e: F32
+    dark_e_s: F32
+    damage_e_s: F32
+    hot: HotPixels
+    dead: DeadPixels
+    stuck: StuckPixels
+    rts: RtsPixels
+    traps: Traps
+
+    def __post_init__(self) -> None:
+        _freeze(self)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        height, width = self.gain.shape
+        return height, width
+
+
+def make_individual(
+    spec: IndividualSpec, shape: tuple[int, int], *, pixel_pitch_um: float, seed: int
+) -> Individual:
+    """The sensor of (height, width) pixels that a seed of at least 0 stands for, at the spec's age and dose.
+
+    Raises InputError for a sensor without pixels, a pitch outside 0.1 to 100 µm, a negative seed, and a spec that
+    makes more than 2e8 defects of a kind.
+    """
+    if min(shape) < 1:
+        raise InputError(f"shape = {shape}: must be at least 1 pixel high and wide")
+    if seed < 0:
+        raise InputError(f"seed = {seed}: must be at least 0")
+    checked("pixel_pitch_um", pixel_pitch_um, 0.1, 100.0)
+    # one generator for each pattern, whether its part is switched on or not
+    gain = _pattern(seed, "prnu", shape, spec.prnu, spec.prnu_row, spec.prnu_column)
+    if spec.prnu_low > 0:
+        gain += _slow(seed, shape) * np.float32(spec.prnu_low)
+    gain += np.float32(1)
+    np.maximum(gain, 0, out=gain)
+    dark = _pattern(seed, "dark", shape, spec.dark_nonuniformity)
+    dark += np.float32(1)
+    np.maximum(dark, 0, out=dark)
+    dark *= np.float32(spec.dark_current_e_s)
+    hot = _hot(spec, shape, pixel_pitch_um, seed)
+    return Individual(
+        spec=spec,
+        seed=seed,
+        pixel_pitch_um=pixel_pitch_um,
+        gain=gain,
+        dsnu_e=_pattern(seed, "dsnu", shape, spec.dsnu_e, spec.dsnu_row_e, spec.dsnu_column_e),
+        dark_e_s=dark,
+        damage_e_s=_damage(spec, shape, pixel_pitch_um, seed, hot),
+        hot=hot,
+        dead=_dead(spec, shape, seed),
+        stuck=_stuck(spec, shape, seed),
+        rts=_rts(spec, shape, pixel_pitch_um, seed),
+        traps=_traps(spec, shape, seed),
+    )
+
+
+def aged(
+    individual: Individual,
+    *,
+    dose_TeV_g: float | None = None,
+    years: float | None = None,
+    anneal_s: float | None = None,
+) -> Individual:
+    """The same sensor at a later age, dose (both at least those it has) or time since the irradiation.
+
+    Equal, bit for bit, to `make_individual` with such a spec. No defect is lost; annealing lowers the rates of
+    the radiation's. Raises InputError for an earlier age or a lower dose.
+    """
+    spec = individual.spec
+    new = replace(
+        spec,
+        dose_TeV_g=spec.dose_TeV_g if dose_TeV_g is None else dose_TeV_g,
+        years=spec.years if years is None else years,
+        anneal_s=spec.anneal_s if anneal_s is None else anneal_s,
+    )
+    checked("years", new.years, spec.years, _RANGES["years"][1])
+    checked("dose_TeV_g", new.dose_TeV_g, spec.dose_TeV_g, _RANGES["dose_TeV_g"][1])
+    shape, pitch, seed = individual.shape, individual.pixel_pitch_um, individual.seed
+    hot = _hot(new, shape, pitch, seed)
+    return replace(
+        individual,
+        spec=new,
+        damage_e_s=_damage(new, shape, pitch, seed, hot),
+        hot=hot,
+        dead=_dead(new, shape, seed),
+        stuck=_stuck(new, shape, seed),
+        rts=_rts(new, shape, pitch, seed),
+        traps=_traps(new, shape, seed),
+    )
+
+
+def dark_rate_e_s(individual: Individual, temperature_K: float) -> F32:
+    """Dark current of each pixel, e/s, float32[y, x], at 80 to 400 K, telegraph signals aside.
+
+    Raises InputError outside the range.
+    """
+    reference_K = individual.spec.reference_K
+    silicon = silicon_factor(temperature_K, reference_K)
+    bulk = arrhenius_factor(temperature_K, reference_K)
+    return np.asarray(cv2.addWeighted(individual.dark_e_s, silicon, individual.damage_e_s, bulk, 0.0))
+
+
+def offset_e(individual: Individual) -> F32:
+    """Offset of each pixel, electrons, float32[y, x]: its DSNU and, of hot pixels, b."""
+    out = individual.dsnu_e.copy()
+    np.add.at(out, (individual.hot.row, individual.hot.column), individual.hot.offset_e)
+    return out
+
+
+def response(individual: Individual) -> F32:
+    """Response of each pixel over the mean one, float32[y, x], at least 0: its gain and whether it is dead."""
+    out = individual.gain.copy()
+    np.multiply.at(out, (individual.dead.row, individual.dead.column), individual.dead.response)
+    return out
+
+
+# --- draws ------------------------------------------------------------------------------------------------------
+
+
+def _stream(seed: int, name: str) -> np.random.Generator:
+    return np.random.Generator(np.random.SFC64(np.random.SeedSequence([seed, *name.encode()])))
+
+
+def _pattern(
+    seed: int, name: str, shape: tuple[int, int], pixel: float, row: float = 0.0, column: float = 0.0
+) -> F32:
+    """Normal variates of mean 0: white, and constant along rows and columns."""
+    if pixel > 0:
+        out = _stream(seed, name).standard_normal(shape, dtype=np.float32)
+        out *= np.float32(pixel)
+    else:
+        out = np.zeros(shape, dtype=np.float32)
+    if row > 0:
+        out += _stream(seed, f"{name} row").standard_normal((shape[0], 1), dtype=np.float32) * np.float32(row)
+    if column > 0:
+        out += _stream(seed, f"{name} column").standard_normal((1, shape[1]), dtype=np.float32) * np.float32(column)
+    return out
+
+
+def _slow(seed: int, shape: tuple[int, int]) -> F32:
+    """A smooth field of mean 0 and standard deviation 1: the same nodes at any resolution."""
+    nodes = _stream(seed, "prnu low").standard_normal(
+        (_LOW_FREQUENCY_CELLS, _LOW_FREQUENCY_CELLS), dtype=np.float32
+    )
+    field = cv2.resize(nodes, shape[::-1], interpolation=cv2.INTER_CUBIC)
+    mean, deviation = cv2.meanStdDev(field)
+    return np.asarray((field - np.float32(mean[0, 0])) / np.float32(max(deviation[0, 0], 1e-6)), dtype=np.float32)
+
+
+def _birth_blocks(rng: np.random.Generator, expected: float) -> Iterator[F64]:
+    """Births of a Poisson process of rate 1 in [0, expected], in order: a larger `expected` appends to the same."""
+    now = 0.0
+    while now < expected:
+        births = now + np.cumsum(rng.standard_exponential(_BIRTHS))
+        now = float(births[-1])
+        yield births if now <= expected else births[: np.searchsorted(births, expected, side="right")]
+
+
+def _births(seed: int, name: str, expected: float) -> F64:
+    checked(f"expected number of {name} pixels", expected, 0.0, _MOST_DEFECTS)
+    return np.concatenate([np.zeros(0), *_birth_blocks(_stream(seed, f"{name} birth"), expected)])
+
+
+def _uniform(seed: int, name: str, count: int) -> F64:
+    """The first of an endless list: more of them begin with the same."""
+    return _stream(seed, name).random(count)
+
+
+def _places(seed: int, name: str, count: int, shape: tuple[int, int]) -> tuple[I32, I32]:
+    row = _uniform(seed, f"{name} row", count) * shape[0]
+    column = _uniform(seed, f"{name} column", count) * shape[1]
+    return row.astype(np.int32), column.astype(np.int32)
+
+
+def _damage(spec: IndividualSpec, shape: tuple[int, int], pixel_pitch_um: float, seed: int, hot: HotPixels) -> F32:
+    radiation = spec.radiation(pixel_pitch_um)
+    pixels = shape[0] * shape[1]
+    expected = checked("expected number of interactions", radiation.interactions * pixels, 0.0, _MOST_DEFECTS)
+    births, places, sizes = (_stream(seed, f"radiation {name}") for name in ("birth", "place", "size"))
+    steps = np.zeros(pixels, dtype=np.float32)
+    for born in _birth_blocks(births, expected):
+        place = (places.random(len(born)) * pixels).astype(np.intp)
+        np.add.at(steps, place, sizes.standard_exponential(len(born)).astype(np.float32))
+    # scaled from 300 K by the one activation energy
+    damage = steps.reshape(shape)
+    damage *= np.float32(radiation.step_e_s(spec.reference_K))
+    np.add.at(damage, (hot.row, hot.column), hot.rate_e_s.astype(np.float32))
+    return damage
+
+
+def _hot(spec: IndividualSpec, shape: tuple[int, int], pixel_pitch_um: float, seed: int) -> HotPixels:
+    growth = spec.hot_growth
+    per_yr = 0.0 if growth is None else growth.expected(1.0, shape, pixel_pitch_um, spec.iso)
+    born = _births(seed, "hot", per_yr * spec.years)
+    count = len(born)
+    row, column = _clustered(*_places(seed, "hot", count, shape), spec.hot_clustered_share, shape, seed)
+    # inverse of a power law cut off at both ends
+    least, most = spec.hot_rate_e_s
+    power = 1.0 if growth is None else growth.iso_power
+    rate = least * (1 - _uniform(seed, "hot rate", count) * (1 - (least / most) ** power)) ** (-1 / power)
+    sticks = _uniform(seed, "hot sticks", count) < spec.hot_offset_share
+    offset = -np.log1p(-_uniform(seed, "hot offset", count)) * spec.hot_offset_e
+    return HotPixels(
+        row=row,
+        column=column,
+        rate_e_s=rate,
+        offset_e=np.where(sticks, offset, 0.0),
+        born_yr=born / max(per_yr, 1e-300),
+    )
+
+
+def _clustered(row: I32, column: I32, share: float, shape: tuple[int, int], seed: int) -> tuple[I32, I32]:
+    """A share of the places moved beside one of those before them that were not moved."""
+    count = len(row)
+    moved = _uniform(seed, "hot clustered", count) < share
+    alone = np.flatnonzero(~moved)
+    before = np.cumsum(~moved)  # of a moved one: how many stand before it
+    moved &= before > 0
+    which = np.flatnonzero(moved)
+    parent = alone[(_uniform(seed, "hot parent", count)[which] * before[which]).astype(np.intp)]
+    side = (_uniform(seed, "hot side", count)[which] * 8).astype(np.intp)
+    neighbours = np.array([(-1, -1), (-1, 0), (-1, 1), (0, -1), (0, 1), (1, -1), (1, 0), (1, 1)])[side]
+    out = []
+    for place, step, size in zip((row, column), neighbours.T, shape, strict=True):
+        to = place[parent] + step
+        to = np.where((to < 0) | (to >= size), place[parent] - step, to)  # at an edge, the other side
+        place[which] = np.clip(to, 0, size - 1)
+        out.append(place)
+    return out[0], out[1]
+
+
+def _expected(spec: IndividualSpec, shape: tuple[int, int], share: float, share_yr: float) -> float:
+    return (share + share_yr * spec.years) * shape[0] * shape[1]
+
+
+def _dead(spec: IndividualSpec, shape: tuple[int, int], seed: int) -> DeadPixels:
+    count = len(_births(seed, "dead", _expected(spec, shape, spec.dead_share, spec.dead_share_yr)))
+    row, column = _places(seed, "dead", count, shape)
+    return DeadPixels(row=row, column=column, response=_uniform(seed, "dead response", count))
+
+
+def _stuck(spec: IndividualSpec, shape: tuple[int, int], seed: int) -> StuckPixels:
+    count = len(_births(seed, "stuck", _expected(spec, shape, spec.stuck_share, spec.stuck_share_yr)))
+    row, column = _places(seed, "stuck", count, shape)
+    return StuckPixels(row=row, column=column, level=_uniform(seed, "stuck level", count))
+
+
+def _rts(spec: IndividualSpec, shape: tuple[int, int], pixel_pitch_um: float, seed: int) -> RtsPixels:
+    interactions = spec.radiation(pixel_pitch_um).interactions
+    expected = (spec.rts_share + spec.rts_per_interaction * interactions) * shape[0] * shape[1]
+    count = len(_births(seed, "rts", expected))
+    row, column = _places(seed, "rts", count, shape)
+    mean = rate_e_s(spec.rts_amplitude_nA_cm2, pixel_pitch_um) * arrhenius_factor(
+        spec.reference_K, _RTS_REFERENCE_K
+    )
+    shortest, longest = spec.rts_time_s
+    return RtsPixels(
+        row=row,
+        column=column,
+        amplitude_e_s=-np.log1p(-_uniform(seed, "rts amplitude", count)) * mean,
+        high_s=shortest * (longest / shortest) ** _uniform(seed, "rts high", count),
+        low_s=shortest * (longest / shortest) ** _uniform(seed, "rts low", count),
+        reference_K=spec.reference_K,
+    )
+
+
+def _traps(spec: IndividualSpec, shape: tuple[int, int], seed: int) -> Traps:
+    expected = (spec.trap_share + spec.trap_share_TeV_g * spec.dose_TeV_g) * shape[0] * shape[1]
+    count = len(_births(seed, "trap", expected))
+    row, column = _places(seed, "trap", count, shape)
+    return Traps(
+        row=row, column=column, depth_e=-np.log1p(-_uniform(seed, "trap depth", count)) * spec.trap_depth_e
+    )
