@@ -16,7 +16,6 @@ from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import lru_cache
-from itertools import pairwise
 
 import cv2
 import numpy as np
@@ -33,8 +32,7 @@ DIRECTIONS = ("up", "down", "left", "right")
 # Constant CTI: the part of a packet that trails further than the last pixel computed.
 _TRAIL_LEFT_OUT = 1e-9
 
-_ROWS_PER_BLOCK = 16
-_COLUMNS_PER_BLOCK = 256
+_ROWS_PER_BLOCK = 32
 
 
 # ------------------------------------------------------------------------------------------------------ smear
@@ -117,38 +115,46 @@ def bloom(signal_e: F32, *, full_well_e: float, antiblooming: float = 0.0, direc
     """
     _above_0(full_well_e=full_well_e)
     _share(antiblooming=antiblooming)
+    _known(direction)
+    if signal_e.size == 0 or signal_e.max() <= full_well_e:
+        return signal_e.copy()
     image = _facing(signal_e, direction)
     columns = np.flatnonzero(image.max(axis=0) > full_well_e)
-    for start in range(0, len(columns), _COLUMNS_PER_BLOCK):
-        some = columns[start : start + _COLUMNS_PER_BLOCK]
-        excess = np.take(image, some, axis=1).astype(np.float64)
-        excess -= full_well_e
-        # both orders side by side: the current to the last row comes first in the left part, last in the right
-        excess = np.concatenate([excess, excess[::-1]], axis=1)
-        half = np.maximum(excess, 0)
-        half *= (1.0 - antiblooming) / 2
-        room = np.maximum(np.negative(excess, out=excess), 0, out=excess)
-        _absorb(half, room)
-        _absorb(half[::-1], room[::-1])
-        left = room[:, : len(some)] + room[::-1, len(some) :]
-        # rounding may leave a bit less than no room
-        image[:, some] = full_well_e - np.maximum(left, 0, out=left) / 2
+    count = len(columns)
+    # both orders side by side: the current to the last row comes first in the left part, last in the right one
+    excess = np.empty((len(image), 2 * count))
+    np.subtract(np.take(image, columns, axis=1), full_well_e, out=excess[:, :count])
+    excess[:, count:] = excess[::-1, :count]
+    np.multiply(excess, (1.0 - antiblooming) / 2, out=excess, where=excess > 0)
+    _run_over(excess, first=True)
+    _run_over(excess[::-1], first=False)
+    left = excess[:, :count]
+    left += excess[::-1, count:]
+    left *= 0.5
+    left += full_well_e
+    image[:, columns] = left
     return _facing(image, direction, back=True)
 
 
-def _absorb(source: F64, room: F64) -> None:
-    """A current runs from row 0 to the last: each row gives it `source` and takes up to `room`, which shrinks.
+def _run_over(excess: F64, *, first: bool) -> None:
+    """A current runs from row 0 to the last: what is above 0 joins it, what is below takes from it, in place.
 
-    The current behind a row is max(0, before + source − room): Lindley's recursion, as of a queue.
+    With one current after the other to come, what joins stays marked for the second; afterwards only the free
+    room is left, as numbers up to 0. The current behind a row is max(0, before + excess): Lindley's recursion,
+    as of a queue. Row by row: no large array is made, and a row stays in the cache.
     """
-    current = source - room
-    np.maximum(current[0], 0, out=current[0])
-    for before, here in pairwise(current):
-        here += before
-        np.maximum(here, 0, out=here)
-    room -= source
-    room += current
-    room[1:] -= current[:-1]
+    current = np.zeros(excess.shape[1])
+    room = np.empty_like(current)
+    zero = np.zeros_like(current)  # twice as fast as a Python number
+    for row in excess:
+        current += row
+        if first:
+            np.minimum(current, zero, out=room)
+            np.maximum(row, zero, out=row)
+            row += room
+        else:
+            np.minimum(current, zero, out=row)
+        np.maximum(current, zero, out=current)
 
 
 # ------------------------------------------------------------------------------------------------------ CTI
@@ -245,7 +251,7 @@ def cti(
     )
     per_cloud = (passes / most).astype(np.float32)[:, None]
     for _ in range(passes):
-        image = _clocked(image, cloud, weights, per_cloud)
+        _clock(image, cloud, weights, per_cloud)
     return _facing(image, direction, back=True)
 
 
@@ -270,8 +276,8 @@ def _trap_weights(
     return np.where(behind >= 0, weights, 0).astype(np.float32)
 
 
-def _clocked(image: F32, cloud: ChargeCloud, weights: F32, per_cloud: F32) -> F32:
-    """One pass of `cti` towards row 0, block by block of rows."""
+def _clock(image: F32, cloud: ChargeCloud, weights: F32, per_cloud: F32) -> None:
+    """One pass of `cti` towards row 0, in place, block by block of rows."""
     height, window = len(image), len(weights)
     volume = np.empty(image.shape, dtype=np.float32)
     held = np.empty(image.shape, dtype=np.float32)
@@ -282,21 +288,26 @@ def _clocked(image: F32, cloud: ChargeCloud, weights: F32, per_cloud: F32) -> F3
     def hold(rows: slice) -> None:
         start, stop = rows.start, rows.stop
         largest = volume[rows].copy()
-        total = largest * weights[0, rows, None]
+        total = np.multiply(largest, weights[0, rows, None], out=held[rows])
         scratch = np.empty_like(largest)
         for j in range(1, min(window, stop)):
-            at = max(start, j)  # rows above have no packet j rows ahead
-            part, work = largest[at - start :], scratch[at - start :]
-            np.maximum(part, volume[at - j : stop - j], out=part)
-            np.multiply(part, weights[j, at:stop, None], out=work)
-            total[at - start :] += work
-        held[rows] = total
+            skip = max(j - start, 0)  # rows that have no packet j rows ahead
+            part, work = (largest, scratch) if not skip else (largest[skip:], scratch[skip:])
+            np.maximum(part, volume[start + skip - j : stop - j], out=part)
+            np.multiply(part, weights[j, start + skip : stop, None], out=work)
+            total[skip:] += work
 
-    _by_rows(fill, height)
-    _by_rows(hold, height)
-    out = image - held
-    out[1:] += held[:-1]
-    return np.maximum(out, 0, out=out)  # rounding alone
+    def leave(rows: slice) -> None:
+        part = image[rows]
+        part -= held[rows]
+        if rows.start == 0:
+            part[1:] += held[: rows.stop - 1]
+        else:
+            part += held[rows.start - 1 : rows.stop - 1]
+        cv2.max(part, 0.0, dst=part)  # rounding alone
+
+    for step in (fill, hold, leave):
+        _by_rows(step, height)
 
 
 def cti_constant(signal_e: F32, *, inefficiency: float, direction: str = "up", transfers_before: int = 0) -> F32:
@@ -385,8 +396,7 @@ def lag(signal_e: F32, former_e: F32, *, fraction: float) -> F32:
 
 def _facing(image: F32, direction: str, *, back: bool = False) -> F32:
     """A contiguous copy of the image, turned so that charge moves to row 0, or turned `back`."""
-    if direction not in DIRECTIONS:
-        raise InputError(f"direction = {direction!r}: must be one of {', '.join(DIRECTIONS)}")
+    _known(direction)
     sideways = direction in ("left", "right")
     if direction == "up":
         return image if back else image.copy()
@@ -410,6 +420,11 @@ def _pool() -> ThreadPoolExecutor:
 
 if hasattr(os, "register_at_fork"):  # threads do not live on in a forked process, such as a data loader's
     os.register_at_fork(after_in_child=_pool.cache_clear)
+
+
+def _known(direction: str) -> None:
+    if direction not in DIRECTIONS:
+        raise InputError(f"direction = {direction!r}: must be one of {', '.join(DIRECTIONS)}")
 
 
 def _at_least_0(**values: float) -> None:
