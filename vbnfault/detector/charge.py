@@ -244,7 +244,8 @@ def cti(
     image = _facing(signal_e, direction)
     if not species or image.shape[0] == 0:
         return signal_e.copy()
-    weights = _trap_weights(species, transfer_s, image.shape[0], transfers_before, trail_left_out) / passes
+    weights = _trap_weights(species, transfer_s, len(image), transfers_before, trail_left_out)
+    weights *= np.float32(1 / passes)
     # all the traps a packet meets
     most = np.arange(1 + transfers_before, 1 + transfers_before + len(image)) * sum(
         s.density_per_px for s in species
@@ -348,7 +349,7 @@ def row_wait_s(height_px: int, *, row_period_s: float, direction: str = "up") ->
         raise InputError(f"height_px = {height_px}: must be at least 1")
     if direction not in ("up", "down"):
         raise InputError(f"direction = {direction!r}: must be up or down: rows are read one by one")
-    wait = np.arange(height_px) * row_period_s
+    wait: F64 = np.arange(height_px) * np.float64(row_period_s)
     return wait if direction == "up" else wait[::-1].copy()
 
 
