@@ -1,0 +1,323 @@
+"""Cosmic rays: straight tracks of ionisation through a sensor's sensitive layer.
+
+Coordinates: x_px, y_px as in images (origin at the top left corner, pixel centres at +0.5) and the depth in µm
+behind the face that collects charge. A track starts at a point and runs along theta, from the inward normal, and
+phi, from +x towards +y. A particle from behind draws the same line, so all tracks start at the collecting face.
+
+What is drawn once is kept as plain numbers; the charge in each pixel follows from them alone: the fluctuations
+along a track come from a hash of its stored seed.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, fields
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import ndtr, ndtri
+
+from ..errors import InputError
+
+F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
+I64 = NDArray[np.int64]
+
+# Protons, all directions, per cm² of a sphere's cross-section: CREME96 at the Sun-Earth point L2, behind nothing
+# and behind 11 mm of aluminium.
+FLUX_UNSHIELDED_CM2_S = 4.67
+FLUX_BEHIND_11_MM_AL_CM2_S = 4.32
+
+PAIR_ENERGY_EV = 3.65  # mean energy per electron-hole pair in silicon at 300 K
+
+# Landau's width parameter per length: ξ = ½ K (Z/A) ρ / β², K = 0.307075 MeV cm² mol⁻¹ (Particle Data Group,
+# "Passage of particles through matter"), silicon Z/A = 14/28.0855 mol/g, ρ = 2.329 g/cm³, β = 1.
+XI_EV_PER_UM = 0.5 * 0.307075e6 * (14 / 28.0855) * 2.329 * 1e-4
+XI_E_PER_UM = XI_EV_PER_UM / PAIR_ENERGY_EV  # 4.88
+
+MOYAL_MEAN = float(np.euler_gamma) + math.log(2)  # of the standard Moyal distribution
+
+# Secondary electrons: energies considered, assumed. Slower ones stop within a µm; faster ones are rare.
+SECONDARY_MIN_KEV, SECONDARY_MAX_KEV = 10.0, 100.0
+
+_SIGMAS = 4.0  # of diffusion that are followed
+_STEPS_PER_PIXEL = 4  # when charge diffuses: a track is cut at least so fine …
+_STEPS_PER_DEPTH = 8  # … and so fine in depth, where the spread changes
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class CosmicRays:
+    """Tracks of one exposure, each field [n], float64 but for `seed`.
+
+    Start (x_px, y_px, depth_um), direction (theta_deg 0 … 180, phi_deg 0 … 360), length_um within the layer,
+    electrons set free along it, and the seed (uint32) of their fluctuations along the track.
+    """
+
+    x_px: F64
+    y_px: F64
+    depth_um: F64
+    theta_deg: F64
+    phi_deg: F64
+    length_um: F64
+    electrons: F64
+    seed: NDArray[np.uint32]
+
+    def __len__(self) -> int:
+        return len(self.x_px)
+
+    @property
+    def params(self) -> list[dict[str, float]]:
+        """One dict of plain numbers per track, for JSON; `from_params` restores every bit."""
+        columns = {name: value.tolist() for name, value in vars(self).items()}
+        return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
+
+    @classmethod
+    def from_params(cls, params: Sequence[Mapping[str, Any]]) -> CosmicRays:
+        """Tracks from the list that `params` gave. Raises InputError where a key is missing."""
+        names = [f.name for f in fields(cls)]
+        for number, row in enumerate(params):
+            missing = [name for name in names if name not in row]
+            if missing:
+                raise InputError(f"cosmic_rays[{number}]: {missing[0]} is missing; needed are {', '.join(names)}")
+        columns: dict[str, Any] = {
+            name: np.array([row[name] for row in params], dtype=np.uint32 if name == "seed" else np.float64)
+            for name in names
+        }
+        return cls(**columns)
+
+
+@dataclass(frozen=True, kw_only=True)
+class CosmicRayModel:
+    """Rate, geometry and ionisation.
+
+    `flux_per_cm2_s` is omnidirectional, per cross-section of a sphere: a plane sees half of it, both sides
+    together. `pixel_pitch_um` and `thickness_um` of the sensitive layer, above 0. `electrons_per_um` is the mean
+    of a track; a track's total fluctuates by Moyal's distribution (Moyal 1955, Phil. Mag. 46, 263), the usual
+    closed form for Landau's with a lighter tail, of width `width_e_per_um` × length, and so does every pixel's
+    part before the parts are scaled to the total. Below some 50 µm of silicon real distributions are wider.
+    `diffusion_um` is the Gaussian σ of charge from the far face when it is collected; from depth z it is
+    √(z/thickness) of that, drift in a constant field. 0 turns it off. `secondaries` adds knock-on electrons of
+    10 to 100 keV, straight and square to their track (assumed), 1/T² in energy, with the range of Everhart & Hoff
+    1971 (J. Appl. Phys. 42, 5837); they come on top of the mean, at most 14 % of it.
+
+    The thickness default is assumed. Raises InputError outside the ranges.
+    """
+
+    pixel_pitch_um: float
+    thickness_um: float = 10.0
+    flux_per_cm2_s: float = FLUX_UNSHIELDED_CM2_S
+    electrons_per_um: float = 80.0
+    width_e_per_um: float = XI_E_PER_UM
+    diffusion_um: float = 0.0
+    secondaries: bool = False
+
+    def __post_init__(self) -> None:
+        for key, value in asdict(self).items():
+            above = key in ("pixel_pitch_um", "thickness_um", "electrons_per_um")
+            if not (0 < value < math.inf if above else 0 <= value < math.inf):
+                raise InputError(f"{key} = {value:g}: must be finite and {'above' if above else 'at least'} 0")
+        # the least that Moyal's distribution gives, in practice, must be charge
+        if self.width_e_per_um > 0.15 * self.electrons_per_um:
+            raise InputError(
+                f"width_e_per_um = {self.width_e_per_um:g}: must be at most 0.15 electrons_per_um = "
+                f"{0.15 * self.electrons_per_um:g}"
+            )
+
+    def expected_count(self, shape: tuple[int, int], exposure_s: float) -> float:
+        """Mean number of tracks on a (height, width) sensor: flux/2 × area × time."""
+        if not 0 <= exposure_s < math.inf:
+            raise InputError(f"exposure_s = {exposure_s:g}: must be finite and at least 0")
+        area_cm2 = shape[0] * shape[1] * (self.pixel_pitch_um * 1e-4) ** 2
+        return 0.5 * self.flux_per_cm2_s * area_cm2 * exposure_s
+
+    def draw(self, shape: tuple[int, int], exposure_s: float, rng: np.random.Generator) -> CosmicRays:
+        """Tracks of one exposure (and, if wanted, readout) of `exposure_s` on a (height, width) sensor.
+
+        Their number is Poisson. Through a plane pass directions of density ∝ cosθ sinθ, uniform in azimuth and
+        place. Lengths are thickness/cosθ, or up to the sensor's edge. Tracks that enter through the narrow sides
+        are left out. Raises InputError unless exposure_s is finite and at least 0.
+        """
+        count = int(rng.poisson(self.expected_count(shape, exposure_s)))
+        x, y, sin2, turn = rng.random((count, 4)).T
+        moyal = -np.log(np.maximum(rng.standard_normal(count) ** 2, 1e-15))
+        seed = rng.integers(2**32, size=count, dtype=np.uint32)
+        x, y = x * shape[1], y * shape[0]
+        theta, phi = np.arcsin(np.sqrt(sin2)), 2 * np.pi * turn
+        length = self._inside(shape, x, y, np.zeros(count), theta, phi, np.full(count, np.inf))
+        rays = CosmicRays(
+            x_px=x,
+            y_px=y,
+            depth_um=np.zeros(count),
+            theta_deg=np.degrees(theta),
+            phi_deg=np.degrees(phi),
+            length_um=length,
+            electrons=length * (self.electrons_per_um + self.width_e_per_um * (moyal - MOYAL_MEAN)),
+            seed=seed,
+        )
+        return self._with_secondaries(rays, shape, rng) if self.secondaries else rays
+
+    def deposit(self, rays: CosmicRays, shape: tuple[int, int]) -> tuple[I64, F32]:
+        """Charge per pixel: flat indices y · width + x, int64[m], rising, and electrons, float32[m].
+
+        A track is cut where it crosses pixel borders, so each pixel has its exact chord. Depends on nothing
+        but the arguments. What falls outside the sensor is left out.
+        """
+        height, width = shape
+        theta, phi = np.radians(rays.theta_deg), np.radians(rays.phi_deg)
+        start = np.stack([rays.x_px, rays.y_px])
+        across = rays.length_um * np.sin(theta) / self.pixel_pitch_um
+        step = np.stack([across * np.cos(phi), across * np.sin(phi)])
+        end = self._inside(shape, rays.x_px, rays.y_px, rays.depth_um, theta, phi, rays.length_um)
+        end = np.divide(end, rays.length_um, out=np.zeros_like(end), where=rays.length_um > 0)
+
+        track, a, b = _pieces(start, step, end)
+        chord_um = (b - a) * rays.length_um[track]
+        weight = chord_um * self._local_e_per_um(rays.seed[track], _rank(track))
+        total = np.bincount(track, weight, minlength=len(rays))
+        electrons = weight * (rays.electrons * end / np.where(total > 0, total, 1))[track]
+        if not self.diffusion_um:
+            x, y = start[:, track] + step[:, track] * (a + b) / 2
+            # rounding may put a middle on the far border
+            column = np.clip(np.floor(x).astype(np.int64), 0, width - 1)
+            row = np.clip(np.floor(y).astype(np.int64), 0, height - 1)
+            return _gather(row * width + column, electrons)
+
+        slant = (rays.length_um * np.cos(theta))[track]
+        moved = np.hypot(*step[:, track]) * (b - a)
+        parts = np.ceil(
+            np.maximum(moved * _STEPS_PER_PIXEL, np.abs(slant) * (b - a) / self.thickness_um * _STEPS_PER_DEPTH)
+        )
+        parts = np.maximum(parts, 1).astype(np.int64)
+        piece = np.repeat(np.arange(len(track)), parts)
+        middle = (a + (b - a) / parts * 0.5)[piece] + ((b - a) / parts)[piece] * _rank(piece)
+        track = track[piece]
+        x, y = start[:, track] + step[:, track] * middle
+        depth = np.clip(rays.depth_um[track] + slant[piece] * middle, 0, self.thickness_um)
+        sigma = self.diffusion_um / self.pixel_pitch_um * np.sqrt(depth / self.thickness_um)
+        return _spread(x, y, sigma, (electrons / parts)[piece], shape)
+
+    def image(self, rays: CosmicRays, shape: tuple[int, int]) -> F32:
+        """The electrons of `deposit` as an image, float32[y, x]."""
+        out = np.zeros(shape, dtype=np.float32)
+        index, electrons = self.deposit(rays, shape)
+        out.ravel()[index] = electrons
+        return out
+
+    def _inside(
+        self, shape: tuple[int, int], x: F64, y: F64, depth: F64, theta: F64, phi: F64, length_um: F64
+    ) -> F64:
+        """How far, in µm, a track runs before it leaves the layer or the sensor, or ends."""
+        sine = np.sin(theta) / self.pixel_pitch_um
+        end = length_um
+        for at, rate, far in (
+            (x, sine * np.cos(phi), shape[1]),
+            (y, sine * np.sin(phi), shape[0]),
+            (depth, np.cos(theta), self.thickness_um),
+        ):
+            wall = np.where(rate > 0, far - at, -at)
+            room = np.divide(wall, rate, out=np.full(len(at), np.inf), where=rate != 0)
+            end = np.minimum(end, np.maximum(room, 0))
+        return end
+
+    def _local_e_per_um(self, seed: NDArray[np.uint32], number: I64) -> F64:
+        """Ionisation of a track's n-th piece, not yet scaled to the track's total."""
+        u = _hash_uniform((seed.astype(np.uint64) << np.uint64(32)) + number.astype(np.uint64))
+        moyal = -2 * np.log(-ndtri(u / 2))  # −ln z², z a standard normal variate
+        return self.electrons_per_um + self.width_e_per_um * (moyal - MOYAL_MEAN)
+
+    def _with_secondaries(self, rays: CosmicRays, shape: tuple[int, int], rng: np.random.Generator) -> CosmicRays:
+        low, high = SECONDARY_MIN_KEV, SECONDARY_MAX_KEV
+        # ∫ ξ/T² dT per length, ξ in keV/µm
+        number = rng.poisson(rays.length_um * XI_EV_PER_UM * 1e-3 * (1 / low - 1 / high))
+        parent = np.repeat(np.arange(len(rays)), number)
+        along, energy, turn = rng.random((len(parent), 3)).T
+        seed = rng.integers(2**32, size=len(parent), dtype=np.uint32)
+        energy_kev = low / (1 - energy * (1 - low / high))
+        range_um = 0.0398 / 2.329 * energy_kev**1.75
+        theta, phi = np.radians(rays.theta_deg[parent]), np.radians(rays.phi_deg[parent])
+        length = along * rays.length_um[parent]
+        across = length * np.sin(theta) / self.pixel_pitch_um
+        # square to (sinθ cosφ, sinθ sinφ, cosθ): (cosθ cosφ, cosθ sinφ, −sinθ) and (−sinφ, cosφ, 0)
+        turn = 2 * np.pi * turn
+        dx = np.cos(turn) * np.cos(theta) * np.cos(phi) - np.sin(turn) * np.sin(phi)
+        dy = np.cos(turn) * np.cos(theta) * np.sin(phi) + np.sin(turn) * np.cos(phi)
+        dz = -np.cos(turn) * np.sin(theta)
+        x = rays.x_px[parent] + across * np.cos(phi)
+        y = rays.y_px[parent] + across * np.sin(phi)
+        depth = rays.depth_um[parent] + length * np.cos(theta)
+        theta, phi = np.arccos(np.clip(dz, -1, 1)), np.arctan2(dy, dx) % (2 * np.pi)
+        length = self._inside(shape, x, y, depth, theta, phi, range_um)
+        new: dict[str, Any] = {
+            "x_px": x,
+            "y_px": y,
+            "depth_um": depth,
+            "theta_deg": np.degrees(theta),
+            "phi_deg": np.degrees(phi),
+            "length_um": length,
+            "electrons": energy_kev * 1e3 / PAIR_ENERGY_EV * length / range_um,
+            "seed": seed,
+        }
+        return CosmicRays(**{name: np.concatenate([old, new[name]]) for name, old in vars(rays).items()})
+
+
+def _rank(group: I64) -> I64:
+    """Number of each entry within its group; equal groups stand together."""
+    at = np.arange(len(group))
+    first = np.ones(len(group), dtype=bool)
+    first[1:] = group[1:] != group[:-1]
+    return at - np.maximum.accumulate(np.where(first, at, 0))
+
+
+def _pieces(start: F64, step: F64, end: F64) -> tuple[I64, F64, F64]:
+    """Pieces of tracks within one pixel each: the track and both ends, as fractions of its length; `start` and
+    `step` float64[2, n] in pixels, `end` float64[n] the fraction of each track to cut."""
+    tracks = np.arange(len(end))
+    groups, cuts = [tracks, tracks], [np.zeros(len(end)), end]
+    for at, rate in zip(start, step, strict=True):
+        here, there = np.floor(at).astype(np.int64), np.floor(at + rate * end).astype(np.int64)
+        group = np.repeat(tracks, np.abs(there - here))
+        # borders are crossed one by one: upwards from the one after, downwards from the one at hand
+        rank = _rank(group)
+        border = here[group] + np.where(rate[group] > 0, 1 + rank, -rank)
+        groups.append(group)
+        cuts.append(np.clip((border - at[group]) / rate[group], 0, end[group]))
+    track, cut = np.concatenate(groups), np.concatenate(cuts)
+    order = np.lexsort((cut, track))
+    track, cut = track[order], cut[order]
+    kept = (track[1:] == track[:-1]) & (cut[1:] > cut[:-1])
+    return track[1:][kept], cut[:-1][kept], cut[1:][kept]
+
+
+def _hash_uniform(key: NDArray[np.uint64]) -> F64:
+    """Uniform numbers in (0, 1), 24 bit, from keys: the output function of SplitMix64 (Steele, Lea & Flood 2014,
+    doi 10.1145/2660193.2660195)."""
+    z = (key + np.uint64(1)) * np.uint64(0x9E3779B97F4A7C15)
+    z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    z ^= z >> np.uint64(31)
+    return ((z >> np.uint64(40)).astype(np.float64) + 0.5) * 2.0**-24
+
+
+def _gather(index: I64, electrons: F64) -> tuple[I64, F32]:
+    """Sums of the electrons of equal indices, these rising."""
+    unique, place = np.unique(index, return_inverse=True)
+    return unique, np.bincount(place, electrons, minlength=len(unique)).astype(np.float32)
+
+
+def _spread(x: F64, y: F64, sigma_px: F64, electrons: F64, shape: tuple[int, int]) -> tuple[I64, F32]:
+    """Points of charge as Gaussians integrated over pixels; beyond `_SIGMAS` they are cut and scaled to keep
+    their charge."""
+    reach = math.ceil(_SIGMAS * float(sigma_px.max(initial=0.0)))
+    offset = np.arange(-reach, reach + 2)
+    parts = []
+    for at in (x, y):
+        border = np.floor(at)[:, None] + offset - at[:, None]
+        share = np.diff(ndtr(border / np.maximum(sigma_px, 1e-6)[:, None]), axis=1)
+        parts.append(share / share.sum(axis=1, keepdims=True))
+    pixels = [np.floor(at).astype(np.int64)[:, None] + offset[:-1] for at in (x, y)]
+    charge = electrons[:, None, None] * parts[1][:, :, None] * parts[0][:, None, :]
+    column, row = pixels[0][:, None, :], pixels[1][:, :, None]
+    inside = (column >= 0) & (column < shape[1]) & (row >= 0) & (row < shape[0])
+    return _gather((row * shape[1] + column)[inside], charge[inside])
