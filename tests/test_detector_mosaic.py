@@ -89,13 +89,13 @@ def test_bad_patterns_are_told_in_a_sentence() -> None:
         (lambda: Pattern(name="a", channels=("R", "G"), tile=((0, 0),)), "every index 0 to 1"),
         (lambda: sample(np.zeros((8, 8, 2), np.float32), pattern("rggb")), r"shape \(8, 8, 2\)"),
         (lambda: interpolate(np.zeros((8, 8)), pattern("rggb"), "W"), "channel is 'W'"),
-        (lambda: demosaic(np.zeros((8, 8)), pattern("rggb"), "linear"), "demosaic method is 'linear'"),  # type: ignore[arg-type]
+        (lambda: demosaic(np.zeros((8, 8)), pattern("rggb"), "linear"), "demosaic method is 'linear'"),
         (lambda: demosaic(np.zeros((8, 8)), pattern("rgbw"), "menon"), "no Bayer pattern: use bilinear"),
         (lambda: footprint(np.zeros((8, 8), bool), pattern("mono"), "malvar"), "no Bayer pattern: use bilinear"),
         (lambda: demosaic(np.zeros((5, 8)), pattern("rggb")), "at least 6 × 6"),
         (lambda: demosaic(np.zeros((8, 8, 3)), pattern("rggb")), r"must be \[y, x\]"),
         (lambda: correct_defects(np.zeros((8, 8)), np.zeros((8, 7), bool), pattern("rggb")), r"shape \(8, 7\)"),
-        (lambda: correct_defects(np.zeros((8, 8)), np.zeros((8, 8), bool), pattern("rggb"), "mode"), "'mode'"),  # type: ignore[arg-type]
+        (lambda: correct_defects(np.zeros((8, 8)), np.zeros((8, 8), bool), pattern("rggb"), "mode"), "'mode'"),
     ):
         with pytest.raises(InputError, match=sentence):
             bad()
@@ -152,7 +152,7 @@ def test_bayer_methods_agree_with_colour_demosaicing(oracle: ModuleType, name: s
         "malvar": oracle.demosaicing_CFA_Bayer_Malvar2004,
         "menon": oracle.demosaicing_CFA_Bayer_Menon2007,
     }[method](padded, name)[16:-16, 16:-16]
-    ours = demosaic(raw, pattern(name), method)  # type: ignore[arg-type]
+    ours = demosaic(raw, pattern(name), method)
     # halves, quarters and sixteenths of 16 bit integers are exact in float32; Menon's thirds are not: its three
     # steps in thirds of numbers below 2^18 err by 2^-24 of them each, some 0.05 in all
     assert np.abs(ours - theirs).max() <= (0.05 if method == "menon" else 0)
@@ -164,7 +164,7 @@ def test_a_flat_colour_stays_flat_up_to_the_borders(name: str, method: str) -> N
     colour = np.array([100, 200, 48, 350][: len(p.channels)], np.float32)
     for shape in ((20, 22), (21, 23), (70, 6)):
         raw = sample(np.broadcast_to(colour, (*shape, len(colour))).copy(), p)
-        rgb = demosaic(raw, p, method)  # type: ignore[arg-type]
+        rgb = demosaic(raw, p, method)
         expected = np.full(3, 100) if name == "mono" else colour[:3]
         # a mean of n float32 numbers by way of weights and their reciprocal: some 1e-6
         np.testing.assert_allclose(rgb, np.broadcast_to(expected, rgb.shape), rtol=2e-6)
@@ -189,7 +189,7 @@ def test_menon_interpolates_along_edges(name: str, axis: int) -> None:
     profile = np.random.default_rng(5).integers(0, 1000, 40).astype(np.float32)
     grey = np.broadcast_to(profile[:, None] if axis == 0 else profile, (40, 40))
     raw = sample(np.repeat(grey[..., None], 3, axis=2), pattern(name))
-    error = {m: np.abs(demosaic(raw, pattern(name), m) - grey[..., None]).max() for m in METHODS}  # type: ignore[arg-type]
+    error = {m: np.abs(demosaic(raw, pattern(name), m) - grey[..., None]).max() for m in METHODS}
     assert error["menon"] < 1e-3
     assert error["bilinear"] > 100
     assert error["malvar"] > 100
@@ -200,7 +200,7 @@ def test_measured_values_stay_and_the_mosaic_is_not_edited(name: str, method: st
     p = pattern(name)
     raw = random_raw()
     before = raw.copy()
-    rgb = demosaic(raw, p, method)  # type: ignore[arg-type]
+    rgb = demosaic(raw, p, method)
     np.testing.assert_array_equal(raw, before)
     own = channel_of(p, raw.shape)
     for index, channel in enumerate(p.channels):
@@ -243,7 +243,7 @@ def test_interpolated_bayer_channels_are_the_bilinear_ones_inside(name: str) -> 
 
 def changed(raw: np.ndarray, mask: np.ndarray, p: Pattern, method: str, value: float) -> np.ndarray:
     other = np.where(mask, value, raw)
-    out = (demosaic(raw, p, method) != demosaic(other, p, method)).any(axis=2)  # type: ignore[arg-type]
+    out = (demosaic(raw, p, method) != demosaic(other, p, method)).any(axis=2)
     for channel in set(p.channels) - set("RGB"):
         out |= interpolate(raw, p, channel) != interpolate(other, p, channel)
     return out
@@ -257,8 +257,8 @@ def test_footprint_of_linear_methods_is_what_changes(name: str, method: str) -> 
     mask[::12, ::11] = True  # corners and borders; every filter; far apart, so that no two changes cancel
     mask[-1, -1] = True
     mask[31, 30] = True
-    np.testing.assert_array_equal(footprint(mask, p, method), changed(raw, mask, p, method, 3e5))  # type: ignore[arg-type]
-    assert not footprint(np.zeros_like(mask), p, method).any()  # type: ignore[arg-type]
+    np.testing.assert_array_equal(footprint(mask, p, method), changed(raw, mask, p, method, 3e5))
+    assert not footprint(np.zeros_like(mask), p, method).any()
 
 
 @pytest.mark.parametrize("name", BAYER)
@@ -293,7 +293,7 @@ def test_a_defect_takes_its_same_coloured_neighbours_value(how: str) -> None:
     raw = random_raw((12, 12))
     bad = np.zeros(raw.shape, bool)
     bad[4, 4] = bad[4, 5] = bad[4, 6] = True
-    got = correct_defects(raw, bad, pattern("rggb"), how)  # type: ignore[arg-type]
+    got = correct_defects(raw, bad, pattern("rggb"), how)
     middle = getattr(np, how)
     red = [raw[y, x] for y in (2, 4, 6) for x in (2, 4, 6) if (y, x) not in ((4, 4), (4, 6))]
     green = [raw[y, x] for y in range(2, 7) for x in range(3, 8) if (y + x) % 2 == 1 and (y, x) != (4, 5)]

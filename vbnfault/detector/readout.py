@@ -330,8 +330,7 @@ def clip_full_well(electrons: F32, full_well_e: float) -> F32:
 
 def banding_e(shape: tuple[int, int], spec: ReadoutSpec) -> F32:
     """The interference in electrons, float32[y, x]: A sin(2π f t + φ) at the time t of each pixel."""
-    wave, across = _waves(shape, spec)
-    return wave @ across
+    return _product(*_waves(shape, spec))
 
 
 def _picture(array: F32) -> F32:
@@ -341,12 +340,19 @@ def _picture(array: F32) -> F32:
 
 
 def _waves(shape: tuple[int, int], spec: ReadoutSpec) -> tuple[F32, F32]:
-    # sin(a + b) of a line's and a pixel's phase: products [y, 2] @ [2, x], without a sine per pixel
+    # sin(a + b) of a line's and a pixel's phase: two products [y] × [x], without a sine per pixel
     line_s, pixel_s = readout_time_s(shape, spec)
     turn = 2 * math.pi * spec.banding_frequency_hz
     line, pixel = turn * line_s + spec.banding_phase_rad, turn * pixel_s
     wave = spec.banding_seen_e * np.stack([np.sin(line), np.cos(line)], axis=1)
     return wave.astype(np.float32), np.stack([np.cos(pixel), np.sin(pixel)]).astype(np.float32)
+
+
+def _product(wave: F32, across: F32) -> F32:
+    # not BLAS, whose sums may depend on the size of the block
+    out = wave[:, :1] * across[0]
+    out += wave[:, 1:] * across[1]
+    return out
 
 
 class _Chain:
@@ -397,7 +403,7 @@ class _Chain:
         if row_e is not None:
             out += row_e[:, None]
         if wave is not None:
-            out += wave @ self.across
+            out += _product(wave, self.across)
         if read is not None:
             out += read * np.float32(self.spec.noise_e_rms)
         # a block may lie in both halves
