@@ -1,0 +1,383 @@
+"""From a mosaic to full planes of R, G, B, and the defects that on-board software corrects first.
+
+All methods keep linear signals in their unit and never clip. Beyond its borders a Bayer mosaic is mirrored about
+its outermost pixels (… c b a b c …), which keeps the order of the filters, so a flat field stays flat there.
+What is interpolated by normalised convolution takes the pixels there are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import lru_cache, partial
+from typing import Any, Literal, get_args
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import InputError
+from .mosaic import Pattern, channel_of, plane_of
+from .three_colour import _pool
+
+F32 = NDArray[np.float32]
+Mask = NDArray[np.bool_]
+
+Method = Literal["bilinear", "malvar", "menon"]
+
+_MIRROR = cv2.BORDER_REFLECT_101
+
+# Rows of a mosaic and pixels of border around it: even, so that blocks begin with the same filters.
+_ROWS_PER_BLOCK = 64
+_HALO_PX = {"bilinear": 2, "malvar": 2, "menon": 8}
+
+# Bilinear: what a pixel gives to its neighbours of its own plane (Losson, Macaire & Yang 2010, Advances in
+# Imaging and Electron Physics 162, doi 10.1016/S1076-5670(10)62005-8). The first is [½ 1 ½]ᵀ [½ 1 ½].
+BILINEAR_RED_BLUE = np.array([[1, 2, 1], [2, 4, 2], [1, 2, 1]], dtype=np.float32) / 4
+BILINEAR_GREEN = np.array([[0, 1, 0], [1, 4, 1], [0, 1, 0]], dtype=np.float32) / 4
+_TENT = np.array([0.5, 1, 0.5], dtype=np.float32)
+
+# Malvar, He & Cutler 2004, ICASSP, doi 10.1109/ICASSP.2004.1326587, figure 2: all symmetric, in eighths.
+MALVAR_GREEN = np.array(
+    [[0, 0, -1, 0, 0], [0, 0, 2, 0, 0], [-1, 2, 4, 2, -1], [0, 0, 2, 0, 0], [0, 0, -1, 0, 0]], dtype=np.float32
+) / np.float32(8)
+# a colour at green pixels of the rows that hold it; in the columns that hold it: the transpose
+MALVAR_ALONG_ROW = np.array(
+    [[0, 0, 0.5, 0, 0], [0, -1, 0, -1, 0], [-1, 4, 5, 4, -1], [0, -1, 0, -1, 0], [0, 0, 0.5, 0, 0]],
+    dtype=np.float32,
+) / np.float32(8)
+# red at blue and blue at red
+MALVAR_ACROSS = np.array(
+    [[0, 0, -1.5, 0, 0], [0, 2, 0, 2, 0], [-1.5, 0, 6, 0, -1.5], [0, 2, 0, 2, 0], [0, 0, -1.5, 0, 0]],
+    dtype=np.float32,
+) / np.float32(8)
+
+# Bad pixels mended together: bounds the memory of their neighbours.
+_PIXELS_AT_ONCE = 4096
+
+_SUM = np.ones((1, 3), dtype=np.float32)
+
+# Menon 2007: colour differences two pixels apart, summed around a pixel to tell how rough a direction is.
+_ROUGHNESS = np.array(
+    [[1, 0, 1, 0, 0], [0, 1, 0, 0, 0], [3, 0, 3, 0, 0], [0, 1, 0, 0, 0], [1, 0, 1, 0, 0]], dtype=np.float32
+)
+
+
+def demosaic(raw: NDArray[Any], pattern: Pattern, method: Method = "bilinear") -> F32:
+    """Full-resolution R, G, B, float32[y, x, 3], of a mosaic [y, x] (any real dtype), in the mosaic's unit.
+
+    `malvar` (Malvar, He & Cutler 2004) and `menon` (DDFAPD: Menon, Andriani & Calvagno 2007, IEEE Trans. Image
+    Process. 16, 132, doi 10.1109/TIP.2006.884928, with its refining step) are made for Bayer patterns;
+    `bilinear` serves all. A monochrome mosaic gives R = G = B. W and NIR pixels are left out of R, G, B: see
+    `interpolate`. Measured values stay as they are.
+    Sums of 16 bit integers are exact in float32, so Menon's choice of direction is free of rounding for raw DN.
+    InputError for an unknown method, one that does not fit the pattern, or a mosaic below 6 × 6 pixels.
+    """
+    if method not in get_args(Method):
+        raise InputError(f"demosaic method is '{method}', but must be one of {', '.join(get_args(Method))}")
+    signal = _checked(raw)
+    if pattern.is_bayer:
+        return _in_blocks(
+            {"bilinear": _bilinear, "malvar": _malvar, "menon": _menon}[method], signal, pattern, method
+        )
+    if method != "bilinear":
+        raise InputError(
+            f"demosaic method is '{method}', but pattern '{pattern.name}' is no Bayer pattern: use bilinear"
+        )
+    if pattern.channels == ("W",):
+        return cv2.merge([signal] * 3)
+    return cv2.merge([_normalised(signal, pattern, colour) for colour in "RGB"])
+
+
+def interpolate(raw: NDArray[Any], pattern: Pattern, channel: str) -> F32:
+    """One channel of a mosaic [y, x] at every pixel, float32[y, x], bilinearly: W of an RGBW mosaic is its
+    intensity. InputError where the pattern lacks the channel."""
+    return _normalised(_checked(raw), pattern, channel)
+
+
+def footprint(mask: Mask, pattern: Pattern, method: Method = "bilinear") -> Mask:
+    """bool[y, x]: pixels whose R, G, B (or W, NIR) may depend on the mosaic's pixels of `mask` bool[y, x].
+
+    Exact for the linear methods: the support of their kernels. Menon's method decides by the signal, so there it
+    is the union over all decisions, up to 8 pixels away, of which one picture shows a part.
+    """
+    ones = _checked(mask)
+    if method == "menon" and pattern.is_bayer:
+        return cv2.dilate(np.ascontiguousarray(mask, dtype=np.uint8), _menon_support()).view(np.bool_)
+    if method == "malvar" and pattern.is_bayer:
+        touched = _in_blocks(partial(_malvar, absolute=True), ones, pattern, method)
+        return cv2.transform(touched, _SUM).reshape(mask.shape) > 0
+    touched = demosaic(ones, pattern, method)
+    out = cv2.transform(touched, _SUM).reshape(mask.shape) > 0
+    for channel in set(pattern.channels) - set("RGB"):
+        out |= interpolate(ones, pattern, channel) > 0
+    return out
+
+
+def correct_defects(
+    raw: NDArray[Any], bad: Mask, pattern: Pattern, how: Literal["median", "mean"] = "median"
+) -> NDArray[Any]:
+    """On-board defect correction: each pixel of `bad` bool[y, x] takes the median or mean of its good neighbours
+    of the same channel; a new array of the shape and dtype of `raw` [y, x].
+
+    Neighbours lie within one tile (Bayer: 5 × 5 pixels, so 8 for red or blue, 12 for green; RGBW: 9 × 9;
+    monochrome: 3 × 3). Where none is good, four times as far is looked, and where none is good there either the
+    pixel is left. Integers round half to even.
+    """
+    if how not in ("median", "mean"):
+        raise InputError(f"correction is by '{how}', but must be by median or mean")
+    if raw.ndim != 2 or bad.shape != raw.shape:
+        raise InputError(f"bad pixels have shape {bad.shape}, but the mosaic [y, x] has {raw.shape}")
+    out = raw.copy()
+    whole = np.issubdtype(raw.dtype, np.integer)
+    channels = channel_of(pattern, (raw.shape[0], raw.shape[1]))
+    at = np.argwhere(bad)
+    for reach in (max(pattern.shape), 4 * max(pattern.shape)):
+        near = _in_reach(~bad, channels, reach)[at[:, 0], at[:, 1]] if len(at) > _PIXELS_AT_ONCE else slice(None)
+        later = []
+        for some in np.array_split(at[near], len(at[near]) // _PIXELS_AT_ONCE + 1):
+            value, found = _from_neighbours(raw, bad, channels, some, reach, how)
+            y, x = some[found].T
+            out[y, x] = np.rint(value[found]) if whole else value[found]
+            later.append(some[~found])
+        at = np.concatenate([at[~near] if isinstance(near, np.ndarray) else at[:0], *later])
+    return out
+
+
+def _in_reach(good: Mask, channels: NDArray[np.uint8], reach: int) -> Mask:
+    """bool[y, x]: whether a good pixel of a pixel's own channel lies within `reach` rows and columns."""
+    out = np.zeros(good.shape, dtype=np.bool_)
+    square = np.ones((2 * reach + 1, 2 * reach + 1), dtype=np.uint8)
+    for channel in range(int(channels.max()) + 1):
+        own = channels == channel
+        out |= own & cv2.dilate((good & own).view(np.uint8), square).view(np.bool_)
+    return out
+
+
+def _from_neighbours(
+    raw: NDArray[Any], bad: Mask, channels: NDArray[np.uint8], at: NDArray[np.intp], reach: int, how: str
+) -> tuple[NDArray[np.float64], Mask]:
+    """Median or mean of the good neighbours of each pixel `at` [n, 2], and whether there are any."""
+    offset = np.arange(-reach, reach + 1)
+    dy, dx = (d.ravel() for d in np.meshgrid(offset, offset, indexing="ij"))
+    y, x = at[:, :1] + dy, at[:, 1:] + dx
+    inside = (y >= 0) & (y < raw.shape[0]) & (x >= 0) & (x < raw.shape[1])
+    y, x = np.where(inside, y, 0), np.where(inside, x, 0)
+    good = inside & ~bad[y, x] & (channels[y, x] == channels[at[:, 0], at[:, 1]][:, None])
+    count = good.sum(axis=1)
+    some = np.maximum(count, 1)
+    if how == "mean":
+        return np.where(good, raw[y, x], 0.0).sum(axis=1) / some, count > 0
+    values = np.where(good, raw[y, x], np.inf)
+    values.sort(axis=1)  # what is not good is infinite and goes last
+    row = np.arange(len(at))
+    return (values[row, (some - 1) // 2] + values[row, some // 2]) / 2, count > 0
+
+
+def _checked(raw: NDArray[Any]) -> F32:
+    if raw.ndim != 2 or min(raw.shape) < 6:
+        raise InputError(f"the mosaic has shape {raw.shape}, but must be [y, x] of at least 6 × 6 pixels")
+    return np.ascontiguousarray(raw, dtype=np.float32)
+
+
+def _in_blocks(step: Callable[[F32, Pattern], Sequence[F32]], raw: F32, pattern: Pattern, method: Method) -> F32:
+    """R, G, B, float32[y, x, 3], of blocks of rows with a mirrored halo, in two threads: blocks fit the cache."""
+    halo = _HALO_PX[method]
+    padded = cv2.copyMakeBorder(raw, halo, halo, halo, halo, _MIRROR)
+    out = np.empty((*raw.shape, 3), dtype=np.float32)
+
+    def one(start: int) -> None:
+        block = out[start : start + _ROWS_PER_BLOCK]
+        planes = step(padded[start : start + len(block) + 2 * halo], pattern)
+        cv2.merge([plane[halo:-halo, halo:-halo] for plane in planes], block)
+
+    list(_pool().map(one, range(0, len(raw), _ROWS_PER_BLOCK)))
+    return out
+
+
+# -------------------------------------------------------------------------------------------------- bilinear
+
+
+def _bilinear(raw: F32, pattern: Pattern) -> list[F32]:
+    red, green, blue = (plane_of(raw, pattern, colour) for colour in "RGB")
+    return [
+        cv2.sepFilter2D(red, -1, _TENT, _TENT),
+        cv2.filter2D(green, -1, BILINEAR_GREEN),
+        cv2.sepFilter2D(blue, -1, _TENT, _TENT),
+    ]
+
+
+def _normalised(raw: F32, pattern: Pattern, channel: str) -> F32:
+    plane = plane_of(raw, pattern, channel)
+    index = pattern.index(channel)
+    reach, scale = _normaliser(pattern, raw.shape, index)
+    if reach == 0:
+        return plane
+    tent = _tent(reach)
+    out = cv2.sepFilter2D(plane, -1, tent, tent, borderType=cv2.BORDER_CONSTANT)
+    out *= scale
+    rows, columns = pattern.shape
+    for y in range(rows):
+        for x in range(columns):
+            if pattern.tile[y][x] == index:  # what is measured stays
+                out[y::rows, x::columns] = raw[y::rows, x::columns]
+    return out
+
+
+def _tent(reach: int) -> F32:
+    return (1 - np.abs(np.arange(1 - reach, reach)) / reach).astype(np.float32)
+
+
+@lru_cache(maxsize=32)
+def _normaliser(pattern: Pattern, shape: tuple[int, ...], index: int) -> tuple[int, F32]:
+    """Half-width of the narrowest tent that reaches every pixel from those of a channel (0: it is everywhere),
+    and the reciprocal of the weights it finds (Knutsson & Westin 1993, normalised convolution)."""
+    mask = (channel_of(pattern, (shape[0], shape[1])) == index).astype(np.float32)
+    if mask.all():
+        return 0, mask
+    reach = 2
+    while True:
+        tent = _tent(reach)
+        weight = cv2.sepFilter2D(mask, -1, tent, tent, borderType=cv2.BORDER_CONSTANT)
+        if weight.min() > 1e-3:
+            break
+        reach += 1
+    weight = np.reciprocal(weight)
+    weight.flags.writeable = False
+    return reach, weight
+
+
+# --------------------------------------------------------------------------------------------- Bayer: Malvar
+
+
+def _sites(pattern: Pattern) -> tuple[tuple[int, int], tuple[int, int]]:
+    """Row and column of the tile's red pixel and of its blue one."""
+    flat = [pattern.channels[i] for row in pattern.tile for i in row]
+    red, blue = flat.index("R"), flat.index("B")
+    return (red // 2, red % 2), (blue // 2, blue % 2)
+
+
+def _malvar(raw: F32, pattern: Pattern, *, absolute: bool = False) -> list[F32]:
+    """R, G, B; with `absolute` the kernels lose their signs, which shows what depends on what."""
+
+    def filtered(kernel: F32) -> F32:
+        return cv2.filter2D(raw, -1, np.abs(kernel) if absolute else kernel)
+
+    (ry, rx), (by, bx) = _sites(pattern)
+    red_rows, red_columns = slice(ry, None, 2), slice(rx, None, 2)
+    blue_rows, blue_columns = slice(by, None, 2), slice(bx, None, 2)
+    green = filtered(MALVAR_GREEN)
+    for rows, columns in ((red_rows, blue_columns), (blue_rows, red_columns)):
+        green[rows, columns] = raw[rows, columns]
+    # each starts as what the green pixels of one kind of row need; the other three kinds are put in
+    along_row, along_column = filtered(MALVAR_ALONG_ROW), filtered(np.ascontiguousarray(MALVAR_ALONG_ROW.T))
+    across = filtered(MALVAR_ACROSS)
+    red, blue = along_row, along_column
+    red_at_blue_row_green = along_column[blue_rows, red_columns].copy()
+    blue[blue_rows, red_columns] = along_row[blue_rows, red_columns]
+    red[blue_rows, red_columns] = red_at_blue_row_green
+    red[red_rows, red_columns] = raw[red_rows, red_columns]
+    red[blue_rows, blue_columns] = across[blue_rows, blue_columns]
+    blue[blue_rows, blue_columns] = raw[blue_rows, blue_columns]
+    blue[red_rows, red_columns] = across[red_rows, red_columns]
+    return [red, green, blue]
+
+
+# ---------------------------------------------------------------------------------------------- Bayer: Menon
+
+
+def _row(*weights: float) -> F32:
+    return np.array([weights], dtype=np.float32)
+
+
+_BESIDE = _row(0.5, 0, 0.5)
+_THIRDS = _row(1 / 3, 1 / 3, 1 / 3)
+_TWO_APART = _row(0, 0, 1, 0, -1)
+# raw minus green as interpolated from green neighbours and the curvature of the pixel's own colour (eq. 1)
+_COLOUR_DIFFERENCE = _row(0.25, -0.5, 0.5, -0.5, 0.25)
+
+
+def _menon(raw: F32, pattern: Pattern) -> list[F32]:
+    """R, G, B, by way of colour differences: K, red minus green at red pixels and blue minus green at blue ones,
+    and L, red minus blue. `rough` picks the direction along which they vary less."""
+    (ry, rx), (by, bx) = _sites(pattern)
+    red, blue = (slice(ry, None, 2), slice(rx, None, 2)), (slice(by, None, 2), slice(bx, None, 2))
+    # green pixels of the red rows and of the blue rows
+    green_r, green_b = (red[0], blue[1]), (blue[0], red[1])
+
+    def along_row(array: F32, kernel: F32) -> F32:
+        return cv2.filter2D(array, -1, kernel)
+
+    def along_column(array: F32, kernel: F32) -> F32:
+        return cv2.filter2D(array, -1, np.ascontiguousarray(kernel.T))
+
+    def clear_green(array: F32) -> F32:
+        array[green_r] = 0
+        array[green_b] = 0
+        return array
+
+    def roughness(difference: F32, along: Any, kernel: F32) -> F32:
+        step = along(difference, _TWO_APART)
+        np.abs(step, out=step)
+        return cv2.filter2D(step, -1, kernel)
+
+    k_row, k_column = (clear_green(along(raw, _COLOUR_DIFFERENCE)) for along in (along_row, along_column))
+    rough_row = roughness(k_row, along_row, _ROUGHNESS)
+    rough_column = roughness(k_column, along_column, np.ascontiguousarray(_ROUGHNESS.T))
+    take_row = cv2.compare(rough_column, rough_row, cv2.CMP_GE)
+
+    def chosen(row: F32, column: F32) -> F32:
+        return cv2.copyTo(row, take_row, column)  # into `column`
+
+    def beside(k: F32) -> tuple[F32, F32]:
+        return along_row(k, _BESIDE), along_column(k, _BESIDE)
+
+    def red_minus_blue(row: F32, column: F32) -> F32:
+        # at green pixels of a red row the red ones lie along it, the blue ones across
+        out = np.zeros_like(raw)
+        np.subtract(row[green_r], column[green_r], out=out[green_r])
+        np.subtract(column[green_b], row[green_b], out=out[green_b])
+        return out
+
+    k = chosen(k_row, k_column)
+    row, column = beside(k)
+    between = red_minus_blue(row, column)
+    l_first = chosen(*beside(between))  # at red and blue pixels
+
+    # refining: green from the mean of three colour differences along the chosen direction
+    for full in (row, column):
+        full[red], full[blue] = k[red], k[blue]
+    k = clear_green(chosen(along_row(row, _THIRDS), along_column(column, _THIRDS)))
+    green = raw - k
+    row, column = beside(k)
+    l_all = red_minus_blue(row, column)
+    l_all[red], l_all[blue] = l_first[red], l_first[blue]
+    l_all = chosen(along_row(l_all, _THIRDS), along_column(l_all, _THIRDS))
+
+    out_red, out_blue = np.empty_like(raw), np.empty_like(raw)
+    out_red[red], out_blue[blue] = raw[red], raw[blue]
+    np.add(raw[blue], l_all[blue], out=out_red[blue])
+    np.subtract(raw[red], l_all[red], out=out_blue[red])
+    for at, of_red, of_blue in ((green_r, row, column), (green_b, column, row)):
+        np.add(raw[at], of_red[at], out=out_red[at])
+        np.add(raw[at], of_blue[at], out=out_blue[at])
+    return [out_red, green, out_blue]
+
+
+@lru_cache(maxsize=1)
+def _menon_support() -> NDArray[np.uint8]:
+    """Which pixels around one may feel it, uint8[17, 17].
+
+    Green feels the decision's 9 × 5 and 5 × 9 pixels; the refined colour differences, green along an axis by up
+    to 2; red and blue, those within 2 steps.
+    """
+    point = np.zeros((17, 17), dtype=np.uint8)
+    point[8, 8] = 1
+    cross = np.array([[0, 1, 0], [1, 1, 1], [0, 1, 0]], dtype=np.uint8)
+    axes = np.zeros((5, 5), dtype=np.uint8)
+    axes[2, :] = axes[:, 2] = 1
+    decision = np.zeros((9, 9), dtype=np.uint8)
+    decision[2:7, :] = decision[:, 2:7] = 1
+    for element in (cross, cross, axes, decision):
+        point = cv2.dilate(point, element, borderValue=0)
+    point.flags.writeable = False
+    return point

@@ -1,0 +1,137 @@
+"""Colour filter arrays: which filter sits over which pixel.
+
+A pattern is a small tile of channel indices, repeated from pixel (0, 0), the top left. "W" is a pixel without a
+colour filter; a monochrome sensor has nothing else.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import InputError
+from .three_colour import _pool
+
+F32 = NDArray[np.float32]
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Pattern:
+    """A colour filter array: `tile[y][x]` is an index into `channels`, repeated over the sensor."""
+
+    name: str
+    channels: tuple[str, ...]
+    tile: tuple[tuple[int, ...], ...]
+
+    def __post_init__(self) -> None:
+        if len({len(row) for row in self.tile}) != 1 or not self.tile[0]:
+            raise InputError(
+                f"the tile of pattern '{self.name}' is {self.tile}, but its rows must be of one length"
+            )
+        if {i for row in self.tile for i in row} != set(range(len(self.channels))):
+            raise InputError(
+                f"the tile of pattern '{self.name}' is {self.tile}, but must hold every index "
+                f"0 to {len(self.channels) - 1} of its channels {self.channels}"
+            )
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns of the tile."""
+        return len(self.tile), len(self.tile[0])
+
+    @property
+    def is_bayer(self) -> bool:
+        """Two green pixels on one diagonal, red and blue on the other."""
+        name = "".join(self.channels[i] for row in self.tile for i in row)
+        return self.shape == (2, 2) and name in BAYER
+
+    def index(self, channel: str) -> int:
+        """Index of a channel by its name; InputError where the pattern has none of that name."""
+        if channel not in self.channels:
+            raise InputError(f"channel is '{channel}', but pattern '{self.name}' has {self.channels}")
+        return self.channels.index(channel)
+
+
+def _pattern(name: str, channels: str, *rows: str) -> Pattern:
+    names = tuple(channels.split())
+    tile = tuple(tuple(names.index(cell) for cell in row.split()) for row in rows)
+    return Pattern(name=name, channels=names, tile=tile)
+
+
+BAYER = ("RGGB", "BGGR", "GRBG", "GBRG")
+
+# RGBW is the 4×4 unit of Compton & Hamilton, US 2007/0024931 (Kodak): half of the pixels are W, in a
+# chequerboard; green lies on one diagonal, red and blue share the other. RGB+NIR is RGGB with the second
+# green replaced by a pixel that passes the near infrared only.
+PATTERNS: dict[str, Pattern] = {
+    **{f.lower(): _pattern(f.lower(), "R G B", f"{f[0]} {f[1]}", f"{f[2]} {f[3]}") for f in BAYER},
+    "rgbw": _pattern("rgbw", "R G B W", "W G W R", "G W R W", "W B W G", "B W G W"),
+    "rgb_nir": _pattern("rgb_nir", "R G B NIR", "R G", "NIR B"),
+    "mono": _pattern("mono", "W", "W"),
+}
+
+
+def pattern(name: str) -> Pattern:
+    """The colour filter array of that name in `PATTERNS`, upper or lower case; else InputError."""
+    if name.lower() not in PATTERNS:
+        raise InputError(f"pattern is '{name}', but must be one of {', '.join(PATTERNS)}")
+    return PATTERNS[name.lower()]
+
+
+def channel_of(pattern: Pattern, shape: tuple[int, int]) -> NDArray[np.uint8]:
+    """Index of each pixel's channel, uint8[y, x], on a sensor of (height, width)."""
+    rows, columns = (np.arange(n) % size for n, size in zip(shape, pattern.shape, strict=True))
+    return np.asarray(pattern.tile, dtype=np.uint8)[rows[:, None], columns]
+
+
+def channel_mask(pattern: Pattern, shape: tuple[int, int], channel: str) -> Mask:
+    """bool[y, x]: the pixels of one channel."""
+    return channel_of(pattern, shape) == pattern.index(channel)
+
+
+def sample(planes: F32, pattern: Pattern) -> F32:
+    """What the mosaic sees, float32[y, x], of full-resolution planes float32[y, x, channel] in any unit.
+
+    The planes are in the order of `pattern.channels`; InputError where their number differs.
+    """
+    if planes.ndim != 3 or planes.shape[2] != len(pattern.channels):
+        raise InputError(
+            f"planes have shape {planes.shape}, but must be [y, x, channel] with the channels {pattern.channels} "
+            f"of pattern '{pattern.name}'"
+        )
+    out = np.empty(planes.shape[:2], dtype=np.float32)
+    rows, columns = pattern.shape
+
+    def fill(start: int) -> None:
+        block = slice(start, start + 64)  # a multiple of every tile
+        for y in range(rows):
+            for x in range(columns):
+                out[block][y::rows, x::columns] = planes[block][y::rows, x::columns, pattern.tile[y][x]]
+
+    # numpy releases the interpreter lock while it copies
+    list(_pool().map(fill, range(0, len(out), 64 if 64 % rows == 0 else len(out))))
+    return out
+
+
+def plane_of(raw: NDArray[Any], pattern: Pattern, channel: str) -> F32:
+    """One channel of a mosaic [y, x] as float32[y, x], 0 at the other channels' pixels."""
+    out = np.zeros(raw.shape, dtype=np.float32)
+    index = pattern.index(channel)
+    rows, columns = pattern.shape
+    for y in range(rows):
+        for x in range(columns):
+            if pattern.tile[y][x] == index:
+                out[y::rows, x::columns] = raw[y::rows, x::columns]
+    return out
+
+
+def separate(raw: NDArray[Any], pattern: Pattern) -> F32:
+    """A mosaic [y, x] as sparse planes float32[y, x, channel]: 0 where a pixel has another filter.
+
+    `sample` takes them back to the mosaic.
+    """
+    return np.stack([plane_of(raw, pattern, channel) for channel in pattern.channels], axis=-1)

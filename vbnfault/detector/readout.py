@@ -1,0 +1,690 @@
+"""From collected electrons to raw digital numbers, and what goes wrong on the way.
+
+    full well → row and column pattern, row noise, banding → read noise → gain and offset of the node
+    → non-linearity → converter → stuck bits
+
+Every pixel is read once, by one of 1, 2 or 4 output nodes. All functions are pure: noise, patterns and the places
+of faults are passed in. Raw pictures are uint16[y, x].
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import InputError
+from .three_colour import _blockwise, _normal_field
+
+F32 = NDArray[np.float32]
+Raw = NDArray[np.uint16]
+Mask = NDArray[np.bool_]
+
+Axis = Literal["row", "column"]
+Fill = Literal["zero", "previous"]
+
+# The cubic u(1-u)(1-2u) has its extremes, ±√3/18, at u = (3 ∓ √3)/6: this makes them ±1.
+_CUBIC_SCALE = 6 * math.sqrt(3)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReadoutSpec:
+    """The signal chain of a sensor. Electrons are those at the pixel, digital numbers (DN) at the converter.
+
+    bits                     of the converter, 1 to 16
+    full_well_e              > 0; clips before all that follows
+    bias_dn                  level of no light, 0 to the top code
+    gain_dn_per_e            system gain K of EMVA 1288; None: the full well reaches the top code
+    read_noise_e_rms         temporal, at the output, correlated double sampling (CDS) included
+    reset_noise_e_rms        kTC noise of the sense node; removed whole by CDS
+    cds, cds_interval_s      whether the reset level is subtracted, and how long before the signal it is sampled.
+                             Interference at frequency f passes by |2 sin(π f interval)|
+    nodes                    1, 2 (left, right) or 4 (quadrants: top left, top right, bottom left, bottom right)
+    node_gains               relative gain of each node, > 0; empty: all 1
+    node_offsets_dn          added to the bias of each node; empty: all 0
+    row_pattern_e_rms, column_pattern_e_rms    fixed pattern, from sensor to sensor
+    row_noise_e_rms          one value per row and exposure
+    banding_amplitude_e, banding_frequency_hz, banding_phase_rad    sinusoidal interference over the readout time
+    pixel_time_s             between two pixels of a line at one node; 0 where a line is converted at once
+    line_time_s              between two lines; None: the pixels of a node's line take all of it
+    inl_quadratic_dn         integral non-linearity: an arc of this height at half range
+    inl_cubic_dn             … and an S, extreme at (3 ∓ √3)/6 of the range, of this sign in its lower half
+    dnl_lsb_rms              differential non-linearity: spread of the code widths, from sensor to sensor
+    missing_codes            never given; their range goes to the next code below (above, where there is none)
+    stuck_bits               (bit, value) pairs: bit 0 is the least significant, value 0 or 1
+
+    The defaults of the noise, node, pattern, interference and converter terms are those of an ideal chain; the
+    100 ns of a pixel and the 1 µs of CDS are assumed.
+    """
+
+    bits: int = 12
+    full_well_e: float = 13_500.0
+    bias_dn: int = 64
+    gain_dn_per_e: float | None = None
+    read_noise_e_rms: float = 13.0
+    reset_noise_e_rms: float = 0.0
+    cds: bool = True
+    cds_interval_s: float = 1e-6
+    nodes: int = 1
+    node_gains: tuple[float, ...] = ()
+    node_offsets_dn: tuple[float, ...] = ()
+    row_pattern_e_rms: float = 0.0
+    column_pattern_e_rms: float = 0.0
+    row_noise_e_rms: float = 0.0
+    banding_amplitude_e: float = 0.0
+    banding_frequency_hz: float = 0.0
+    banding_phase_rad: float = 0.0
+    pixel_time_s: float = 1e-7
+    line_time_s: float | None = None
+    inl_quadratic_dn: float = 0.0
+    inl_cubic_dn: float = 0.0
+    dnl_lsb_rms: float = 0.0
+    missing_codes: tuple[int, ...] = ()
+    stuck_bits: tuple[tuple[int, int], ...] = ()
+
+    def __post_init__(self) -> None:
+        _within("bits", self.bits, 1, 16)
+        _within("bias_dn", self.bias_dn, 0, self.top_dn)
+        for name in (
+            "read_noise_e_rms",
+            "reset_noise_e_rms",
+            "cds_interval_s",
+            "row_pattern_e_rms",
+            "column_pattern_e_rms",
+            "row_noise_e_rms",
+            "banding_amplitude_e",
+            "banding_frequency_hz",
+            "pixel_time_s",
+            "dnl_lsb_rms",
+        ):
+            _within(name, getattr(self, name), 0, math.inf)
+        _positive("full_well_e", self.full_well_e)
+        if self.gain_dn_per_e is not None:
+            _positive("gain_dn_per_e", self.gain_dn_per_e)
+        elif self.bias_dn == self.top_dn:
+            raise InputError(
+                f"bias_dn is {self.bias_dn}, the top code, but must lie below it where gain_dn_per_e is not given"
+            )
+        if self.line_time_s is not None:
+            _within("line_time_s", self.line_time_s, 0, math.inf)
+        if self.nodes not in (1, 2, 4):
+            raise InputError(f"nodes is {self.nodes}, but must be 1, 2 or 4")
+        for name in ("node_gains", "node_offsets_dn"):
+            if len(getattr(self, name)) not in (0, self.nodes):
+                raise InputError(f"{name} is {getattr(self, name)}, but must hold {self.nodes} values or none")
+        for gain in self.node_gains:
+            _positive("node_gains", gain)
+        # a falling curve would give one code for two signals
+        steepest = 4 * abs(self.inl_quadratic_dn) + _CUBIC_SCALE * abs(self.inl_cubic_dn)
+        if steepest and not steepest < self.top_dn - self.bias_dn:
+            raise InputError(
+                f"inl_quadratic_dn is {self.inl_quadratic_dn} and inl_cubic_dn is {self.inl_cubic_dn}, but "
+                f"4·|quadratic| + 10.4·|cubic| must stay below the {self.top_dn - self.bias_dn} DN of the range"
+            )
+        for code in self.missing_codes:
+            _within("missing_codes", code, 0, self.top_dn)
+        if len(set(self.missing_codes)) > self.top_dn:
+            raise InputError(f"missing_codes are all {self.top_dn + 1} codes, but one must be left")
+        _check_bits(self.stuck_bits, self.bits)
+
+    @property
+    def top_dn(self) -> int:
+        """The highest code."""
+        return 2**self.bits - 1
+
+    @property
+    def system_gain_dn_per_e(self) -> float:
+        """K of EMVA 1288, before the mismatch of the nodes."""
+        if self.gain_dn_per_e is not None:
+            return self.gain_dn_per_e
+        return (self.top_dn - self.bias_dn) / self.full_well_e
+
+    @property
+    def noise_e_rms(self) -> float:
+        """Temporal noise of a dark pixel, row noise and quantisation aside: read noise, and kTC without CDS."""
+        return math.hypot(self.read_noise_e_rms, 0.0 if self.cds else self.reset_noise_e_rms)
+
+    @property
+    def banding_seen_e(self) -> float:
+        """Amplitude of the interference in the picture: what the difference of two samples leaves of it."""
+        if not self.cds:
+            return self.banding_amplitude_e
+        return self.banding_amplitude_e * abs(
+            2 * math.sin(math.pi * self.banding_frequency_hz * self.cds_interval_s)
+        )
+
+    @cached_property
+    def codes(self) -> Raw:
+        """What comes out for each code, uint16[2^bits]: missing codes, then stuck bits."""
+        codes = np.arange(self.top_dn + 1)
+        if self.missing_codes:
+            there = np.setdiff1d(codes, self.missing_codes)
+            codes = there[np.maximum(np.searchsorted(there, codes, side="right") - 1, 0)]
+        out = _stuck(codes.astype(np.uint16), self.stuck_bits)
+        out.flags.writeable = False
+        return out
+
+
+def _within(name: str, value: float, low: float, high: float) -> None:
+    if not low <= value <= high or math.isinf(value):
+        allowed = f"at least {low}" if math.isinf(high) else f"in {low} to {high}"
+        raise InputError(f"{name} is {value}, but must be {allowed}")
+
+
+def _positive(name: str, value: float) -> None:
+    if not 0 < value < math.inf:
+        raise InputError(f"{name} is {value}, but must be above 0")
+
+
+# ----------------------------------------------------------------------------------------- what is passed in
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ReadoutNoise:
+    """Variates of one exposure, standard normal: `read` float32[y, x] and `row` float32[y]."""
+
+    read: F32
+    row: F32
+
+    @classmethod
+    def draw(cls, shape: tuple[int, int], read: np.random.Generator, row: np.random.Generator) -> ReadoutNoise:
+        """For a (height, width) sensor: as many variates whatever the signal and the spec."""
+        return cls(read=_normal_field(shape, read), row=row.standard_normal(shape[0], dtype=np.float32))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ReadoutIndividual:
+    """What makes one sensor's chain differ from another's of its kind; None where it does not.
+
+    `row_e` float32[y] and `column_e` float32[x]: fixed pattern, in electrons. `transitions_dn`
+    float32[2^bits - 1], rising: the converter gives code k from transition k - 1 to transition k.
+    """
+
+    row_e: F32 | None = None
+    column_e: F32 | None = None
+    transitions_dn: F32 | None = None
+
+    @classmethod
+    def draw(cls, shape: tuple[int, int], spec: ReadoutSpec, rng: np.random.Generator) -> ReadoutIndividual:
+        """Normal patterns of the spec's spreads: one variate a row, a column and a code, whatever the spreads."""
+        row, column = (rng.standard_normal(n, dtype=np.float32) for n in shape)
+        widths = rng.standard_normal(spec.top_dn + 1, dtype=np.float32)
+        return cls(
+            row_e=row * np.float32(spec.row_pattern_e_rms),
+            column_e=column * np.float32(spec.column_pattern_e_rms),
+            transitions_dn=transitions_dn(widths * spec.dnl_lsb_rms) if spec.dnl_lsb_rms else None,
+        )
+
+
+def transitions_dn(dnl_lsb: NDArray[np.floating]) -> F32:
+    """Transition levels, float32[2^bits - 1], of a converter whose codes are 1 + dnl_lsb[2^bits] wide.
+
+    A width below 0 counts as 0: that code is missing. Widths are scaled so that the first transition stays at
+    half a code and the last at half a code below the top, as an end-point fit has it; the widths of the outermost
+    codes, which have one transition only, do not matter.
+    """
+    widths = np.maximum(1.0 + np.asarray(dnl_lsb, dtype=np.float64)[1:-1], 0.0)
+    if widths.size and widths.sum() > 0:
+        widths *= widths.size / widths.sum()
+    return np.concatenate([[0.5], 0.5 + np.cumsum(widths)]).astype(np.float32)
+
+
+# ------------------------------------------------------------------------------------------ where and when
+
+
+def node_of(shape: tuple[int, int], nodes: int) -> NDArray[np.uint8]:
+    """Which output node reads each pixel, uint8[y, x]: 0; 0 left, 1 right; or the quadrants in reading order.
+
+    The middle row or column of an odd number belongs to the top or left.
+    """
+    down, right = _halves(shape, nodes)
+    return (2 * down[:, None] + right).astype(np.uint8)
+
+
+def _halves(shape: tuple[int, int], nodes: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """0 or 1 for each row and each column: the half it is in, where the sensor is read in halves."""
+    if nodes not in (1, 2, 4):
+        raise InputError(f"nodes is {nodes}, but must be 1, 2 or 4")
+    down, right = ((np.arange(n) >= (n + 1) // 2).astype(np.intp) for n in shape)
+    return down * (nodes == 4), right * (nodes > 1)
+
+
+def readout_steps(shape: tuple[int, int], nodes: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """How many lines, int[y], and pixels, int[x], are read before each at its node.
+
+    Nodes sit in the sensor's corners, the first at the top left (assumed), and are read at the same time.
+    """
+    down, right = _halves(shape, nodes)
+    y, x = (np.arange(n) for n in shape)
+    return np.where(down, shape[0] - 1 - y, y), np.where(right, shape[1] - 1 - x, x)
+
+
+def readout_time_s(shape: tuple[int, int], spec: ReadoutSpec) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """When each line is reached, float64[y], and how much later each of its pixels, float64[x], in seconds."""
+    lines, pixels = readout_steps(shape, spec.nodes)
+    line_time_s = spec.line_time_s
+    if line_time_s is None:
+        line_time_s = spec.pixel_time_s * (int(pixels.max()) + 1)
+    return lines * np.float64(line_time_s), pixels * np.float64(spec.pixel_time_s)
+
+
+def transmission_order(shape: tuple[int, int], nodes: int) -> NDArray[np.intp]:
+    """Flat indices of the pixels, int[y·x], in the order they leave the sensor: at each step one pixel of every
+    node, in the nodes' order. With one node this is row by row."""
+    if nodes == 1:
+        return np.arange(shape[0] * shape[1])
+    lines, pixels = readout_steps(shape, nodes)
+    step = lines[:, None] * shape[1] + pixels
+    return np.argsort((step * nodes + node_of(shape, nodes)).ravel(), kind="stable")
+
+
+# ------------------------------------------------------------------------------------------------- the chain
+
+
+def read_out(
+    electrons: F32,
+    spec: ReadoutSpec,
+    noise: ReadoutNoise | None = None,
+    individual: ReadoutIndividual | None = None,
+) -> Raw:
+    """Raw DN, uint16[y, x], of collected electrons float32[y, x]; noise-free without `noise`, without fixed
+    pattern or differential non-linearity without `individual`. The whole chain at once, in blocks of rows."""
+    transitions = None if individual is None else individual.transitions_dn
+    chain = _Chain(electrons.shape, spec, noise, individual)
+    convert = _Converter(spec, transitions)
+    return _blockwise(
+        lambda e, row_e, half, wave, read: convert(chain.amplify(e, row_e, half, wave, read)),
+        _picture(electrons),
+        *chain.of_rows,
+    )
+
+
+def analogue_dn(
+    electrons: F32,
+    spec: ReadoutSpec,
+    noise: ReadoutNoise | None = None,
+    individual: ReadoutIndividual | None = None,
+) -> F32:
+    """What reaches the converter, float32[y, x], in DN, neither rounded nor clipped to its range."""
+    chain = _Chain(electrons.shape, spec, noise, individual)
+    return _blockwise(chain.amplify, _picture(electrons), *chain.of_rows)
+
+
+def convert(analogue: F32, spec: ReadoutSpec, transitions_dn: F32 | None = None) -> Raw:
+    """The converter: code, uint16[y, x], of a level float32[y, x] in DN; half codes round to even.
+
+    With `transitions_dn` (see `ReadoutIndividual`) a code begins at its transition.
+    """
+    return _blockwise(_Converter(spec, transitions_dn), _picture(analogue))
+
+
+def clip_full_well(electrons: F32, full_well_e: float) -> F32:
+    """Electrons that a pixel holds, float32 of any shape, at most its full well."""
+    return np.minimum(electrons, np.float32(full_well_e))
+
+
+def banding_e(shape: tuple[int, int], spec: ReadoutSpec) -> F32:
+    """The interference in electrons, float32[y, x]: A sin(2π f t + φ) at the time t of each pixel."""
+    return _product(*_waves(shape, spec))
+
+
+def _picture(array: F32) -> F32:
+    if array.ndim != 2:
+        raise InputError(f"the picture has shape {array.shape}, but must be [y, x]")
+    return np.asarray(array, dtype=np.float32)
+
+
+def _waves(shape: tuple[int, int], spec: ReadoutSpec) -> tuple[F32, F32]:
+    # sin(a + b) of a line's and a pixel's phase: two products [y] × [x], without a sine per pixel
+    line_s, pixel_s = readout_time_s(shape, spec)
+    turn = 2 * math.pi * spec.banding_frequency_hz
+    line, pixel = turn * line_s + spec.banding_phase_rad, turn * pixel_s
+    wave = spec.banding_seen_e * np.stack([np.sin(line), np.cos(line)], axis=1)
+    return wave.astype(np.float32), np.stack([np.cos(pixel), np.sin(pixel)]).astype(np.float32)
+
+
+def _product(wave: F32, across: F32) -> F32:
+    # not BLAS, whose sums may depend on the size of the block
+    out = wave[:, :1] * across[0]
+    out += wave[:, 1:] * across[1]
+    return out
+
+
+class _Chain:
+    """The analogue chain of one exposure, made ready for blocks of rows."""
+
+    def __init__(
+        self,
+        shape: tuple[int, ...],
+        spec: ReadoutSpec,
+        noise: ReadoutNoise | None,
+        individual: ReadoutIndividual | None,
+    ) -> None:
+        if len(shape) != 2:
+            raise InputError(f"the picture has shape {shape}, but must be [y, x]")
+        height, width = shape
+        self.spec = spec
+        self.full_well_e = spec.full_well_e
+        rows = np.zeros(height, dtype=np.float32)
+        self.column_e: F32 | None = None
+        if individual is not None:
+            _fits("row_e", individual.row_e, (height,))
+            _fits("column_e", individual.column_e, (width,))
+            if individual.row_e is not None:
+                rows = rows + individual.row_e
+            self.column_e = individual.column_e
+        if noise is not None:
+            _fits("read", noise.read, (height, width))
+            _fits("row", noise.row, (height,))
+            rows = rows + noise.row * np.float32(spec.row_noise_e_rms)
+        wave: F32 | None = None
+        if spec.banding_seen_e:
+            wave, self.across = _waves((height, width), spec)
+        down, right = _halves((height, width), spec.nodes)
+        gains = np.array(spec.node_gains or (1.0,) * spec.nodes) * spec.system_gain_dn_per_e
+        offsets = np.array(spec.node_offsets_dn or (0.0,) * spec.nodes) + spec.bias_dn
+        # of the upper and the lower half: float32[2, x]
+        table = np.array([[0, 1], [2, 3]]) if spec.nodes == 4 else np.array([[0, 1]] * 2)
+        by_column = np.minimum(table[:, right], spec.nodes - 1)
+        self.gains, self.offsets = (v[by_column].astype(np.float32) for v in (gains, offsets))
+        self.of_rows = (rows if rows.any() else None, down, wave, None if noise is None else noise.read)
+
+    def amplify(
+        self, electrons: F32, row_e: F32 | None, half: NDArray[np.intp], wave: F32 | None, read: F32 | None
+    ) -> F32:
+        out = clip_full_well(electrons, self.full_well_e)
+        if self.column_e is not None:
+            out += self.column_e
+        if row_e is not None:
+            out += row_e[:, None]
+        if wave is not None:
+            out += _product(wave, self.across)
+        if read is not None:
+            out += read * np.float32(self.spec.noise_e_rms)
+        # a block may lie in both halves
+        for lower in (0, 1):
+            rows = half == lower
+            if rows.all():
+                out *= self.gains[lower]
+                out += self.offsets[lower]
+            elif rows.any():
+                out[rows] = out[rows] * self.gains[lower] + self.offsets[lower]
+        return self._bend(out)
+
+    def _bend(self, dn: F32) -> F32:
+        """Integral non-linearity: no deviation at the bias and at the top code."""
+        spec = self.spec
+        if not (spec.inl_quadratic_dn or spec.inl_cubic_dn):
+            return dn
+        u = (dn - np.float32(spec.bias_dn)) * np.float32(1 / (spec.top_dn - spec.bias_dn))
+        # beyond the range, where the polynomials run away, the curve goes on straight
+        np.clip(u, 0, 1, out=u)
+        arc = u * (1 - u)
+        s = 4 * spec.inl_quadratic_dn + _CUBIC_SCALE * spec.inl_cubic_dn
+        dn += arc * (np.float32(s) - np.float32(2 * _CUBIC_SCALE * spec.inl_cubic_dn) * u)
+        return dn
+
+
+def _fits(name: str, array: F32 | None, shape: tuple[int, ...]) -> None:
+    if array is not None and array.shape != shape:
+        raise InputError(f"{name} has shape {array.shape}, but must have {shape}")
+
+
+class _Converter:
+    """Levels to codes, with tables made once."""
+
+    def __init__(self, spec: ReadoutSpec, transitions: F32 | None) -> None:
+        self.top = spec.top_dn
+        self.table = spec.codes if spec.missing_codes or spec.stuck_bits else None
+        self.transitions = transitions
+        if transitions is not None:
+            _fits("transitions_dn", transitions, (self.top,))
+            # levels whose whole part is k have at least low[k] transitions at or below them, and at most `more`
+            low = np.searchsorted(transitions, np.arange(self.top + 2), side="right")
+            self.low = low.astype(np.int32)
+            self.more = int(np.diff(low).max(initial=0))
+            self.padded = np.append(transitions, np.float32(np.inf))
+
+    def __call__(self, level: F32) -> Raw:
+        level = np.clip(level, 0, self.top)
+        if self.transitions is None:
+            code = np.rint(level).astype(np.uint16)
+        else:
+            count = self.low.take(level.astype(np.int32))
+            for _ in range(self.more):
+                count += self.padded.take(count) <= level
+            code = count.astype(np.uint16)
+        return code if self.table is None else self.table.take(code)
+
+
+def _check_bits(stuck_bits: Sequence[tuple[int, int]], bits: int) -> None:
+    for bit, value in stuck_bits:
+        if not 0 <= bit < bits or value not in (0, 1):
+            raise InputError(
+                f"stuck_bits holds ({bit}, {value}), but must be (bit, value), bit in 0 to {bits - 1}, value 0 or 1"
+            )
+
+
+def _stuck(raw: Raw, stuck_bits: Sequence[tuple[int, int]]) -> Raw:
+    high = sum(1 << bit for bit, value in dict(stuck_bits).items() if value)
+    low = sum(1 << bit for bit, value in dict(stuck_bits).items() if not value)
+    return (raw | np.uint16(high)) & np.uint16(0xFFFF ^ low)
+
+
+# ------------------------------------------------------------------------------------- faults of the readout
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Damaged:
+    """A raw picture after a fault: `raw` uint16[y, x]; `region` bool[y, x], where the fault acted; `changed`
+    bool[y, x], the pixels of other value than before, which are a part of it."""
+
+    raw: Raw
+    region: Mask
+    changed: Mask
+
+
+def _damaged(before: Raw, after: Raw, region: Mask) -> Damaged:
+    return Damaged(raw=after, region=region, changed=after != before)
+
+
+def _checked(raw: Raw) -> Raw:
+    if raw.ndim != 2 or raw.dtype != np.uint16:
+        raise InputError(f"the raw picture is {raw.dtype} of shape {raw.shape}, but must be uint16[y, x]")
+    return raw
+
+
+def _indices(name: str, values: Sequence[int] | NDArray[np.integer], count: int) -> NDArray[np.intp]:
+    found = np.unique(np.asarray(values, dtype=np.intp))
+    for value in found[(found < 0) | (found >= count)]:
+        raise InputError(f"{name} holds {value}, but must be in 0 to {count - 1}")
+    return found
+
+
+def _along(array: NDArray, axis: Axis) -> NDArray:
+    """The array with lines of `axis` as its first index."""
+    if axis not in ("row", "column"):
+        raise InputError(f"axis is '{axis}', but must be row or column")
+    return array if axis == "row" else array.T
+
+
+def _last_before(lost: NDArray[np.intp]) -> NDArray[np.intp]:
+    """The nearest index below each of the rising `lost` that is none of them; -1 where there is none."""
+    run_begins = np.append(True, np.diff(lost) > 1)
+    return (lost[run_begins] - 1)[np.cumsum(run_begins) - 1] if len(lost) else lost
+
+
+def _with_lines(
+    raw: Raw, lines: Sequence[int] | NDArray[np.integer], axis: Axis, name: str
+) -> tuple[Raw, Mask, NDArray[np.intp]]:
+    """A copy, an empty region, and the checked line numbers."""
+    at = _indices(name, lines, len(_along(_checked(raw), axis)))
+    region = np.zeros(raw.shape, dtype=np.bool_)
+    _along(region, axis)[at] = True
+    return raw.copy(), region, at
+
+
+def dead_lines(
+    raw: Raw, lines: Sequence[int] | NDArray[np.integer], axis: Axis = "column", level_dn: int = 0
+) -> Damaged:
+    """Rows or columns that give one level, such as 0 or the bias."""
+    _within("level_dn", level_dn, 0, 65535)
+    out, region, at = _with_lines(raw, lines, axis, "lines")
+    _along(out, axis)[at] = level_dn
+    return _damaged(raw, out, region)
+
+
+def saturated_lines(
+    raw: Raw, lines: Sequence[int] | NDArray[np.integer], axis: Axis = "column", bits: int = 12
+) -> Damaged:
+    """Rows or columns at the top code."""
+    _within("bits", bits, 1, 16)
+    return dead_lines(raw, lines, axis, 2**bits - 1)
+
+
+def duplicated_lines(raw: Raw, lines: Sequence[int] | NDArray[np.integer], axis: Axis = "row") -> Damaged:
+    """Rows or columns that repeat the one before: an address that fails to advance. A run of them repeats the
+    last line before the run; at the border, where there is none, lines stay."""
+    out, region, at = _with_lines(raw, lines, axis, "lines")
+    source = _last_before(at)
+    at, source = at[source >= 0], source[source >= 0]
+    _along(out, axis)[at] = _along(raw, axis)[source]
+    return _damaged(raw, out, region)
+
+
+def shifted_lines(
+    raw: Raw,
+    lines: Sequence[int] | NDArray[np.integer],
+    axis: Axis = "row",
+    shift_px: int = 1,
+    fill_dn: int | None = 0,
+) -> Damaged:
+    """Rows or columns moved along themselves by `shift_px` towards larger indices (negative: smaller), as after
+    a lost or added clock. Vacated pixels take `fill_dn`; None wraps the line round."""
+    if fill_dn is not None:
+        _within("fill_dn", fill_dn, 0, 65535)
+    out, region, at = _with_lines(raw, lines, axis, "lines")
+    length = raw.shape[1] if axis == "row" else raw.shape[0]
+    moved = np.roll(_along(raw, axis)[at], shift_px, axis=1)
+    if fill_dn is not None:
+        from_pixel = np.arange(length) - shift_px
+        moved[:, (from_pixel < 0) | (from_pixel >= length)] = fill_dn
+    _along(out, axis)[at] = moved
+    return _damaged(raw, out, region)
+
+
+def lost_node(raw: Raw, nodes: int, node: int, level_dn: int = 0) -> Damaged:
+    """The whole share of one output node (see `node_of`) at one level."""
+    _within("level_dn", level_dn, 0, 65535)
+    _indices("node", [node], nodes)
+    region = node_of(_checked(raw).shape, nodes) == node  # type: ignore[arg-type]
+    return _damaged(raw, np.where(region, np.uint16(level_dn), raw), region)
+
+
+def stick_bits(
+    raw: Raw, stuck_bits: Sequence[tuple[int, int]], bits: int = 12, where: Mask | None = None
+) -> Damaged:
+    """(bit, value) pairs held at 0 or 1, in the whole picture or in the pixels of `where` bool[y, x], such as
+    those of one node."""
+    _within("bits", bits, 1, 16)
+    _check_bits(stuck_bits, bits)
+    region = np.ones(_checked(raw).shape, dtype=np.bool_) if where is None else np.array(where, dtype=np.bool_)
+    return _damaged(raw, np.where(region, _stuck(raw, stuck_bits), raw), region)
+
+
+# -------------------------------------------------------------------------------------- faults of the downlink
+
+
+def packet_count(shape: tuple[int, int], packet_px: int) -> int:
+    """How many packets of `packet_px` pixels carry a picture; the last may be short."""
+    if packet_px < 1:
+        raise InputError(f"packet_px is {packet_px}, but must be at least 1")
+    return -(-shape[0] * shape[1] // packet_px)
+
+
+def _stream(
+    raw: Raw, packets: Sequence[int] | NDArray[np.integer], packet_px: int, order: NDArray[np.intp] | None
+) -> tuple[Raw, NDArray[np.intp], NDArray[np.intp]]:
+    """The pixels in the order they are sent, the checked packets, and their places in the stream
+    int[packet, packet_px], those beyond the end of a short last packet included."""
+    at = _indices("packets", packets, packet_count(_checked(raw).shape, packet_px))  # type: ignore[arg-type]
+    if order is not None and order.shape != (raw.size,):
+        raise InputError(f"order has shape {order.shape}, but must have ({raw.size},)")
+    stream = raw.ravel() if order is None else raw.ravel()[order]
+    return stream.copy(), at, at[:, None] * packet_px + np.arange(packet_px)
+
+
+def _received(raw: Raw, stream: Raw, hit: NDArray[np.intp], order: NDArray[np.intp] | None) -> Damaged:
+    region, out = np.zeros(raw.size, dtype=np.bool_), stream
+    if order is None:
+        region[hit] = True
+    else:
+        region[order[hit]] = True
+        out = np.empty_like(stream)
+        out[order] = stream
+    return _damaged(raw, out.reshape(raw.shape), region.reshape(raw.shape))
+
+
+def lost_packets(
+    raw: Raw,
+    packets: Sequence[int] | NDArray[np.integer],
+    packet_px: int,
+    fill: Fill = "zero",
+    order: NDArray[np.intp] | None = None,
+) -> Damaged:
+    """Packets that never arrive: runs of `packet_px` pixels in the order sent (row by row, or flat indices
+    `order` as of `transmission_order`). Filled by 0 or by the last packet that did arrive (0 where none did)."""
+    stream, at, places = _stream(raw, packets, packet_px, order)
+    there = places < raw.size
+    value = np.zeros(places.shape, dtype=np.uint16)
+    if _checked_fill(fill) == "previous":
+        source = _last_before(at)
+        held = source >= 0
+        value[held] = stream[source[held, None] * packet_px + np.arange(packet_px)]
+    stream[places[there]] = value[there]
+    return _received(raw, stream, places[there], order)
+
+
+def corrupted_packets(
+    raw: Raw,
+    packets: Sequence[int] | NDArray[np.integer],
+    packet_px: int,
+    bit_error_rate: float,
+    rng: np.random.Generator,
+    bits: int = 12,
+    order: NDArray[np.intp] | None = None,
+) -> Damaged:
+    """Packets whose bits flip, each of the `bits` of a pixel with probability `bit_error_rate`, without
+    memory. One uniform variate a bit, whatever the signal and the rate."""
+    _within("bit_error_rate", bit_error_rate, 0, 1)
+    _within("bits", bits, 1, 16)
+    stream, _, places = _stream(raw, packets, packet_px, order)
+    flips = np.zeros(places.shape, dtype=np.uint16)
+    for bit in range(bits):
+        flips |= (rng.random(places.shape) < bit_error_rate).astype(np.uint16) << np.uint16(bit)
+    there = places < raw.size
+    stream[places[there]] ^= flips[there]
+    return _received(raw, stream, places[there], order)
+
+
+def lost_lines(
+    raw: Raw, lines: Sequence[int] | NDArray[np.integer], axis: Axis = "row", fill: Fill = "zero"
+) -> Damaged:
+    """Rows or columns that never arrive, filled by 0 or by the last that did (0 where none did)."""
+    out, region, at = _with_lines(raw, lines, axis, "lines")
+    _along(out, axis)[at] = 0
+    if _checked_fill(fill) == "previous":
+        source = _last_before(at)
+        _along(out, axis)[at[source >= 0]] = _along(raw, axis)[source[source >= 0]]
+    return _damaged(raw, out, region)
+
+
+def _checked_fill(fill: Fill) -> Fill:
+    if fill not in ("zero", "previous"):
+        raise InputError(f"fill is '{fill}', but must be zero or previous")
+    return fill
