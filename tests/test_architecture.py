@@ -47,6 +47,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "lens": {"spectra", "quantities", "llvm"},
     "detector": {"spectra", "quantities"},
     "camera": {"lens", "detector"},
+    "characterise": {"spectra", "detector"},
     "faults": CAMERA,
     "flares": FOUNDATION | CAMERA | {"faults"},
     "labels": GEOMETRY | CAMERA | {"faults"},
@@ -64,7 +65,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "report": DATASET,
     "export": DATASET | {"report"},
     "inject": DATASET,
-    "cli": DATASET | {"flares", "study", "report", "export", "inject"},
+    "cli": DATASET | {"flares", "characterise", "study", "report", "export", "inject"},
     "__main__": {"cli"},
 }
 

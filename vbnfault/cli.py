@@ -318,6 +318,57 @@ def flare(
     typer.echo(str(out))
 
 
+@app.command()
+def detector(
+    detector: Annotated[str, typer.Argument(metavar="{detector}", help="path, or name of a packaged detector")],
+    out: Annotated[Path, typer.Option(help="folder for the report and its plots")],
+    seed: Annotated[int, typer.Option(min=0, help="which individual of the sensor")] = 1,
+    pixels: Annotated[
+        int, typer.Option(min=64, help="side of the part that is measured, at most the sensor")
+    ] = 512,
+    wavelength_nm: Annotated[
+        float | None, typer.Option(min=300, max=1100, help="of the light; default: each channel's best")
+    ] = None,
+    temperature_k: Annotated[
+        float | None, typer.Option(min=100, max=400, help="of the sensor; default: its file's")
+    ] = None,
+    points: Annotated[int, typer.Option(min=8, help="exposures of the photon transfer")] = 40,
+    stack: Annotated[int, typer.Option(min=2, help="pictures for DSNU, PRNU and spectra")] = 24,
+) -> None:
+    """EMVA 1288 characterisation of a virtual detector, with plots."""
+    from . import characterise
+    from .detector.chain import Device
+    from .detector.sensor import load_sensor
+
+    sensor = load_sensor(detector)
+    shape = min(pixels, sensor.height_px), min(pixels, sensor.width_px)
+    camera = characterise.VirtualCamera(
+        Device(sensor, seed, shape=shape, temperature_K=temperature_k), wavelength_nm=wavelength_nm
+    )
+    settings = characterise.Settings(points=points, stack=stack)
+    with typer.progressbar(length=characterise.pictures(settings), label="pictures", file=sys.stderr) as bar:
+        found = characterise.characterise(
+            camera,
+            sites=camera.sites,
+            photons_at_saturation=camera.photons_at_saturation,
+            settings=settings,
+            progress=bar.update,
+        )
+    title = f"{sensor.name}, individual {seed}, {camera.device.temperature_K:g} K"
+    if wavelength_nm is not None:
+        title += f", {wavelength_nm:g} nm"
+    with _written(out):
+        out.mkdir(parents=True, exist_ok=True)
+        report = {"detector": sensor.name, "individual": seed, "temperature_K": camera.device.temperature_K}
+        report |= {"wavelength_nm": wavelength_nm, "channels": [one.to_dict() for one in found.values()]}
+        (out / "emva1288.json").write_text(json.dumps(report, indent=1), encoding="utf-8")
+        characterise.draw(found, title, out / "emva1288.png")
+    typer.echo(title)
+    for line in characterise.table(found):
+        typer.echo(line)
+    typer.echo(str(out / "emva1288.png"))
+
+
 @contextlib.contextmanager
 def _written(path: Path) -> Iterator[None]:
     try:

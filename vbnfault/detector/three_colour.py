@@ -105,7 +105,7 @@ class Detector:
     @property
     def white_balance(self) -> F32:
         """Gain of R, G, B, float32[3], at least 1, that makes a grey surface in sunlight grey."""
-        return _white_balance(self.response, self.quantum_efficiency_peak)
+        return white_balance(self.response, self.quantum_efficiency_peak)
 
     @property
     def white_e(self) -> F32:
@@ -199,7 +199,7 @@ class Detector:
 
 
 @lru_cache(maxsize=8)
-def _white_balance(response: str, quantum_efficiency_peak: float) -> F32:
+def white_balance(response: str, quantum_efficiency_peak: float) -> F32:
     nodes = spectra.band_nodes_nm(400.0, 700.0, 31)
     sun = spectra.solar_band_irradiance_W_m2_nm(nodes, 1.0)
     grey = spectra.band_weights(response, quantum_efficiency_peak, nodes) @ sun

@@ -1,0 +1,169 @@
+"""A device's chain, and what a characterisation by EMVA 1288 tells of it, against what it was made from."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from vbnfault import resources
+from vbnfault.characterise import Settings, VirtualCamera, characterise
+from vbnfault.cli import app
+from vbnfault.detector.chain import Device, MosaicNoise, by_channel
+from vbnfault.detector.individual import IndividualSpec
+from vbnfault.detector.mosaic import pattern
+from vbnfault.detector.readout import ReadoutSpec
+from vbnfault.detector.sensor import Sensor, Transfer, load_sensor, parse_sensor
+from vbnfault.errors import InputError
+
+SHAPE = (256, 256)
+
+
+def sensor(**more: Any) -> Sensor:
+    settings: dict[str, Any] = {
+        "name": "test",
+        "pattern": pattern("mono"),
+        "temperature_K": 293.0,
+        "individual": IndividualSpec(
+            prnu=0.012,
+            dsnu_e=9.0,
+            dark_current_e_s=40.0,
+            dark_nonuniformity=0.0,
+            reference_K=293.0,
+            hot_growth=None,
+            dead_share=0.0,
+        ),
+        "readout": ReadoutSpec(bits=12, full_well_e=15_000.0, bias_dn=80, read_noise_e_rms=11.0),
+    }
+    return Sensor(**(settings | more))
+
+
+def noise(seed: int, shape: tuple[int, int] = SHAPE) -> MosaicNoise:
+    return MosaicNoise.draw(shape, *(np.random.default_rng([seed, k]) for k in range(3)))
+
+
+def test_characterisation_finds_what_the_sensor_was_made_from() -> None:
+    """65 536 pixels: variances from pairs are known to √(2/65536) = 0.55 %, gain from 14 of them to 0.2 %, noise to
+    half of that; spatial variances to 0.55 %, and PRNU to what 24 pictures leave of shot noise at half the well."""
+    made = sensor()
+    camera = VirtualCamera(Device(made, 3, shape=SHAPE))
+    found = characterise(
+        camera,
+        sites=camera.sites,
+        photons_at_saturation=camera.photons_at_saturation,
+        settings=Settings(points=20, stack=24, dark_exposures_s=(1.0, 4.0, 8.0)),
+    )
+    (result,) = (one.result for one in found.values())
+    spec = made.readout
+    assert result.gain_dn_per_e == pytest.approx(spec.system_gain_dn_per_e, rel=0.01)
+    assert result.quantum_efficiency == pytest.approx(made.quantum_efficiency_peak, rel=0.01)
+    assert result.dark_noise_e == pytest.approx(spec.read_noise_e_rms, rel=0.01)
+    assert result.full_well_e == pytest.approx(spec.full_well_e, rel=0.01)
+    assert result.dark_current_mean_e_s == pytest.approx(40.0, rel=0.01)
+    assert result.dark_current_variance_e_s == pytest.approx(40.0, rel=0.05)
+    assert result.prnu_percent == pytest.approx(1.2, rel=0.03)
+    assert result.dsnu_e == pytest.approx(9.0, rel=0.03)
+    assert result.linearity_error_percent < 0.2
+    assert result.black_level_dn == pytest.approx(80 + 40 * 0.01 * spec.system_gain_dn_per_e, abs=0.1)
+
+
+def test_zero_light_gives_the_black_level_and_saturation_the_top_code() -> None:
+    dark = replace(sensor().individual, dsnu_e=0.0, dark_current_e_s=0.0)
+    device = Device(sensor(individual=dark), 1, shape=SHAPE)
+    none = np.zeros(SHAPE, dtype=np.float32)
+    assert (device.raw(none, 0.01) == 80).all()
+    assert device.raw(none, 0.01, noise(1)).mean() == pytest.approx(80, abs=0.1)
+    full = device.raw(none + 1e6, 0.01, noise(1))
+    assert full.max() == 4095
+    # the well clips before the read noise: saturated pixels still have it, below the top
+    assert full.std() > 0.3 * 11 * device.sensor.readout.system_gain_dn_per_e
+
+
+def test_a_seed_is_a_device_and_noise_is_not() -> None:
+    made = sensor()
+    light = np.full(SHAPE, 4000.0, dtype=np.float32)
+    one, same, other = (Device(made, seed, shape=SHAPE) for seed in (5, 5, 6))
+    np.testing.assert_array_equal(one.raw(light, 0.01, noise(1)), same.raw(light, 0.01, noise(1)))
+    assert (one.raw(light, 0.01, noise(1)) != other.raw(light, 0.01, noise(1))).mean() > 0.5
+    # twins share noise: a brighter patch changes no pixel elsewhere
+    brighter = light.copy()
+    brighter[40:60, 100:120] *= 1.5
+    changed = one.raw(light, 0.01, noise(2)) != one.raw(brighter, 0.01, noise(2))
+    assert changed[40:60, 100:120].all()
+    assert changed.sum() == 400
+
+
+def test_a_ccds_bright_spot_blooms_smears_and_trails() -> None:
+    move = Transfer(row_transfer_s=1e-5, row_readout_s=1e-3)
+    made = sensor(architecture="frame_transfer_ccd", transfer=move)
+    clean = replace(made, individual=replace(made.individual, prnu=0.0, dsnu_e=0.0, dark_current_e_s=0.0))
+    light = np.zeros(SHAPE, dtype=np.float32)
+    light[100, 50] = 60_000
+    charge = Device(clean, 1, shape=SHAPE, direction="up").collected_e(light, 0.01)
+    # rows behind the spot pass under it: τ · rate
+    np.testing.assert_allclose(charge[140:, 50], 1e-5 * 6e6, rtol=1e-4)
+    assert charge[:90, 50].max() == 0
+    assert (charge[99:102, 50] == 15_000).all()
+    assert np.delete(charge, 50, axis=1).max() == 0
+    assert charge.sum() == pytest.approx(60_000 + 60 * (255 - 100), rel=1e-4)
+
+
+def test_colours_come_back_from_the_mosaic() -> None:
+    made = sensor(pattern=pattern("rggb"), demosaic="bilinear")
+    device = Device(made, 2, shape=SHAPE)
+    grey = by_channel(made, SHAPE, [4000.0 / g for g in device.white_balance])
+    picture = device.rgbi(device.raw(grey, 0.01), 0.01).array
+    assert picture.shape == (*SHAPE, 4)
+    level = picture[8:-8, 8:-8].reshape(-1, 4).mean(axis=0)
+    np.testing.assert_allclose(level, 255 * 4000 / 15_000, atol=1.0)
+
+
+# --- files ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", sorted(resources.packaged("scenes/detectors")))
+def test_every_packaged_detector_takes_a_picture(name: str) -> None:
+    made = load_sensor(name)
+    assert made.sources
+    device = Device(made, 1, shape=(64, 64))
+    raw = device.raw(np.full((64, 64), 500.0, dtype=np.float32), 0.01, noise(1, (64, 64)))
+    assert raw.mean() > made.readout.bias_dn
+    assert device.rgbi(raw, 0.01).array.shape == (64, 64, 4)
+
+
+@pytest.mark.parametrize(
+    ("table", "words"),
+    [
+        ({"readout": {"bits": 12}}, ["d.toml: sources", "readout.bits"]),
+        ({"sources": {"readout.bits": "x"}}, ["d.toml: sources: readout.bits", "no such number"]),
+        ({"architecture": "cathode_ray"}, ["d.toml: architecture = 'cathode_ray'", "cmos"]),
+        ({"colour": "red"}, ["d.toml: colour: unknown key", "pattern"]),
+        ({"pattern": "plaid"}, ["d.toml", "plaid", "rggb"]),
+        ({"readout": {"bits": 20}, "sources": {"readout.bits": "x"}}, ["d.toml: readout", "bits", "20", "16"]),
+        ({"readout": {"bits": "12"}}, ["d.toml: readout: bits = '12'", "wrong type"]),
+        ({"pixel_pitch_um": 0.0, "sources": {"pixel_pitch_um": "x"}}, ["d.toml: pixel_pitch_um = 0", "0.5 to 100"]),
+    ],
+)
+def test_bad_files_are_refused_in_a_sentence(table: dict[str, Any], words: list[str]) -> None:
+    with pytest.raises(InputError) as caught:
+        parse_sensor(table, source="d.toml")
+    for word in words:
+        assert word in str(caught.value)
+
+
+def test_the_command_writes_report_and_plots(tmp_path: Path) -> None:
+    out = tmp_path / "report"
+    run = CliRunner().invoke(
+        app, ["detector", "generic_cmos", "--out", str(out), "--pixels", "64", "--points", "12", "--stack", "4"]
+    )
+    assert run.exit_code == 0, run.output
+    report = json.loads((out / "emva1288.json").read_text())
+    assert [one["channel"] for one in report["channels"]] == ["R", "G", "B"]
+    assert report["channels"][0]["gain_dn_per_e"] == pytest.approx(0.2986, rel=0.1)
+    assert (out / "emva1288.png").read_bytes()[:4] == b"\x89PNG"
+    assert "quantum_efficiency" in run.output

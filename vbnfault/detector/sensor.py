@@ -1,0 +1,173 @@
+"""A sensor as a file describes it: every number with its source, or marked as assumed.
+
+[sources] names, for each numeric key of the file, where the number comes from; `assumed` where from nowhere.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, get_type_hints
+
+from .. import resources, spectra
+from ..errors import InputError
+from .charge import ChargeCloud, TrapSpecies
+from .individual import IndividualSpec
+from .mosaic import Pattern
+from .mosaic import pattern as pattern_of
+from .readout import ReadoutSpec
+
+ARCHITECTURES = ("full_frame_ccd", "frame_transfer_ccd", "interline_ccd", "cmos")
+DEMOSAICS = ("bilinear", "malvar", "menon")
+SHUTTERS = ("global", "rolling", "mechanical")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Transfer:
+    """Charge on its way: times in s of a row's transfer to the store or register, of a row's clearing before the
+    exposure (0: at once), and of a pixel's in the register; the share of light that leaks into a covered register
+    (interline) or store (global shutter, a second); the share of the excess that an antiblooming drain takes; traps
+    in columns and in the register, with the cloud that meets them."""
+
+    row_transfer_s: float = 0.0
+    row_clear_s: float = 0.0
+    pixel_transfer_s: float = 0.0
+    row_readout_s: float = 0.0
+    leak: float = 0.0
+    antiblooming: float = 0.0
+    parallel_traps: tuple[TrapSpecies, ...] = ()
+    serial_traps: tuple[TrapSpecies, ...] = ()
+    cloud: ChargeCloud | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sensor:
+    """A type of sensor; `individual` says how devices of it differ, `readout` what happens from charge to numbers.
+
+    Lengths in µm, temperatures in K, signals in electrons (e). `response` names relative colour curves of
+    `spectra.RESPONSES`, which `quantum_efficiency_peak` scales.
+    """
+
+    name: str
+    source: str = ""
+    architecture: str = "cmos"
+    shutter: str = "global"
+    width_px: int = 1024
+    height_px: int = 1024
+    pixel_pitch_um: float = 5.5
+    pattern: Pattern = field(default_factory=lambda: pattern_of("rggb"))
+    response: str = "nikon_5100"
+    quantum_efficiency_peak: float = 0.5
+    temperature_K: float = 293.0
+    demosaic: str = "malvar"
+    correct_defects: bool = False
+    individual: IndividualSpec = field(default_factory=IndividualSpec)
+    readout: ReadoutSpec = field(default_factory=ReadoutSpec)
+    transfer: Transfer = field(default_factory=Transfer)
+    sources: Mapping[str, str] = field(default_factory=dict, hash=False)
+
+    def __post_init__(self) -> None:
+        _one_of("architecture", self.architecture, ARCHITECTURES)
+        _one_of("shutter", self.shutter, SHUTTERS)
+        _one_of("response", self.response, tuple(spectra.RESPONSES))
+        _one_of("demosaic", self.demosaic, DEMOSAICS)
+        for key, low, high in (
+            ("width_px", 16, 16384),
+            ("height_px", 16, 16384),
+            ("pixel_pitch_um", 0.5, 100.0),
+            ("quantum_efficiency_peak", 1e-3, 1.0),
+            ("temperature_K", 100.0, 400.0),
+        ):
+            value = getattr(self, key)
+            if not low <= value <= high:
+                raise InputError(f"{key} = {value:g}: must be from {low:g} to {high:g}")
+
+
+def load_sensor(name_or_path: str | Path) -> Sensor:
+    """A sensor by path or packaged name. Raises InputError naming file, key, value and allowed range."""
+    path = resources.find("scenes/detectors", name_or_path)
+    return parse_sensor(resources.read_toml(path), source=str(path))
+
+
+def parse_sensor(table: Mapping[str, Any], *, source: str) -> Sensor:
+    """A sensor from plain data. Raises InputError in a sentence that names `source`, key and value."""
+    plain = dict(table)
+    sources = plain.pop("sources", {})
+    if not isinstance(sources, dict) or not all(isinstance(v, str) for v in sources.values()):
+        raise InputError(f"{source}: sources: must be a table of texts")
+    numbers = _numbers(plain)
+    for key in numbers:
+        if key not in sources:
+            raise InputError(f'{source}: sources: {key} has none; name one, or say "assumed"')
+    for key in sources:
+        if key not in numbers:
+            raise InputError(f"{source}: sources: {key}: the file gives no such number")
+    plain.setdefault("name", Path(source).stem)
+    if isinstance(plain.get("pattern"), str):
+        try:
+            plain["pattern"] = pattern_of(plain["pattern"])
+        except InputError as error:
+            raise InputError(f"{source}: {error}") from None
+    sensor: Sensor = _build(Sensor, plain, source)
+    return dataclasses.replace(sensor, sources=dict(sources))
+
+
+def _numbers(table: Mapping[str, Any], before: str = "") -> list[str]:
+    """Keys of all numbers, those in tables as `table.key`; of lists of tables, and of numbers, the list's key."""
+    out = []
+    for key, value in table.items():
+        name = f"{before}{key}"
+        if isinstance(value, dict):
+            out += _numbers(value, f"{name}.")
+        elif (isinstance(value, int | float) and not isinstance(value, bool)) or (
+            isinstance(value, list) and not all(isinstance(v, str) for v in value)
+        ):
+            out.append(name)
+    return out
+
+
+def _build(cls: Any, table: Mapping[str, Any], where: str) -> Any:
+    """A dataclass from a table, and those within it."""
+    kinds = get_type_hints(cls)
+    known = [f.name for f in dataclasses.fields(cls) if f.name != "sources"]
+    found = {}
+    for key, value in table.items():
+        if key not in known:
+            raise InputError(f"{where}: {key}: unknown key; known: {', '.join(known)}")
+        found[key] = _value(kinds[key], value, f"{where}: {key}")
+    try:
+        return cls(**found)
+    except InputError as error:
+        raise InputError(f"{where}: {error}") from None
+    except TypeError as error:
+        raise InputError(f"{where}: {error}") from None
+
+
+def _value(kind: Any, value: Any, where: str) -> Any:
+    """A value of a field's type."""
+    options = [k for k in getattr(kind, "__args__", ()) if k is not type(None)]
+    inner = (
+        kind if dataclasses.is_dataclass(kind) else next((k for k in options if dataclasses.is_dataclass(k)), None)
+    )
+    if inner is not None and isinstance(value, dict):
+        return _build(inner, value, where)
+    if isinstance(value, list):
+        if inner is not None:
+            return tuple(_build(inner, row, f"{where} {k}") for k, row in enumerate(value))
+        return tuple(value)
+    for plain in (bool, int, float, str):
+        if kind is plain or plain in options:
+            if plain is float and isinstance(value, int) and not isinstance(value, bool):
+                return float(value)
+            if isinstance(value, plain) and not (plain is not bool and isinstance(value, bool)):
+                return value
+    if isinstance(inner, type) and isinstance(value, inner):
+        return value
+    raise InputError(f"{where} = {value!r}: is of the wrong type")
+
+
+def _one_of(key: str, value: str, allowed: tuple[str, ...]) -> None:
+    if value not in allowed:
+        raise InputError(f"{key} = {value!r}: must be one of {', '.join(allowed)}")
