@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from .detector import Detector
+from .detector import Detector, MosaicDetector
 from .lens import RealLens, ThinLens
 
 ARCHITECTURES = ("full_frame_ccd", "frame_transfer_ccd", "interline_ccd", "cmos")
@@ -23,7 +23,7 @@ class Camera:
     """
 
     lens: ThinLens | RealLens
-    detector: Detector
+    detector: Detector | MosaicDetector
     architecture: str = "full_frame_ccd"
     readout_direction: str = "right"
     exposure_s: float = 1e-3

@@ -280,6 +280,19 @@ class SpacecraftTable(Table):
     pose: dict[str, PoseTable] = Field(default_factory=dict, description="by part")
 
 
+_OF_THE_DETECTOR = (
+    "pixel_pitch_um",
+    "full_well_e",
+    "read_noise_e_rms",
+    "dark_current_e_s",
+    "adc_bits",
+    "bias_dn",
+    "response",
+    "quantum_efficiency_peak",
+    "architectures",
+)
+
+
 class CameraTable(Table):
     """Camera and exposure."""
 
@@ -299,6 +312,15 @@ class CameraTable(Table):
     f_number: float = Field(4.0, ge=0.5, le=200, description="of the thin lens; a prescription has its own")
     transmission: float = Field(0.9, gt=0, le=1, description="of the thin lens; a prescription has its own")
     focus_distance_m: float | None = Field(None, gt=0, description="default: infinity")
+    detector: str = Field(
+        "",
+        description="a packaged detector or a sensor's TOML, with a mosaic; its numbers are those of the keys from "
+        "pixel_pitch_um to quantum_efficiency_peak; default: three colours in every pixel, from these keys",
+    )
+    individuals: int = Field(
+        1, ge=1, le=10_000, description="devices of the detector that the samples are taken with"
+    )
+    detector_temperature_K: float | None = Field(None, ge=100, le=400, description="default: the detector's own")
     pixel_pitch_um: float = Field(5.5, ge=0.5, le=100)
     full_well_e: float = Field(13_500.0, ge=10, le=1e8)
     read_noise_e_rms: float = Field(13.0, ge=0, le=1e5)
@@ -334,6 +356,14 @@ class CameraTable(Table):
             value = getattr(self, key)
             if not self.lens and value not in ("", "paraxial"):
                 raise ValueError(f"{key} = {value!r}: needs lens")
+        if self.detector:
+            for key in _OF_THE_DETECTOR:
+                if key in self.model_fields_set:
+                    raise ValueError(f"{key} = {getattr(self, key)!r}: the detector has its own; leave one out")
+        else:
+            for key in ("individuals", "detector_temperature_K"):
+                if key in self.model_fields_set:
+                    raise ValueError(f"{key} = {getattr(self, key)!r}: needs detector")
         if self.exposure_min_s > self.exposure_max_s:
             raise ValueError(
                 f"exposure_min_s = {self.exposure_min_s:g}, "

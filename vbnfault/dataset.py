@@ -67,6 +67,8 @@ def _contents_of_files(identity: dict[str, Any], scene: SceneConfig) -> None:
     """Put the sha256 of what lens, spacecraft, kernels and stars are read from in the place of paths."""
     if scene.camera.lens:
         identity["camera"]["lens"] = _digest(resources.find("scenes/lenses", scene.camera.lens))
+    if scene.camera.detector:
+        identity["camera"]["detector"] = _digest(resources.find("scenes/detectors", scene.camera.detector))
     if scene.spacecraft.model not in ("none", "default"):
         identity["spacecraft"]["model"] = _digest(scene.spacecraft.model)
     if scene.spice.kernels:
@@ -89,6 +91,7 @@ def store_spec(session: pipeline.Session, blocks: Sequence[int]) -> StoreSpec:
     scene = session.scene
     dataset, camera = scene.dataset, session.base_camera  # first of all: a lens that cannot be had is told here
     layers = tuple(name for name in stored_layers(scene, session.faults) if name != "clean")
+    individuals = scene.camera.individuals
     identity = scene_identity(session)
     attributes: dict[str, Any] = {
         "title": scene.title,
@@ -114,7 +117,9 @@ def store_spec(session: pipeline.Session, blocks: Sequence[int]) -> StoreSpec:
         site_names=tuple(f"site_{k:05d}" for k in range(dataset.sites)),
         lens_names=(camera.lens_name,),
         distortion_residual_px=camera.distortion_residual_px,
-        detector_names=(camera.detector.name,),
+        detector_names=tuple(f"{camera.detector.name} {k}" for k in range(individuals))
+        if individuals > 1
+        else (camera.detector.name,),
         radiance_dtype="float32",
         shard_samples=dataset.shard_samples,
         attributes=attributes,

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from . import labels
 from .camera import Camera
-from .detector import Noise
+from .detector import MosaicDetector
 from .faults import Fault, FaultContext, Params, physical_order
 from .quantities import RGBI, Electrons
 from .sample import Frame, stored_layers
@@ -54,6 +54,8 @@ def photograph(frame: Frame) -> None:
             break
         _draw(frame, commanded, attempt)
     frame.images["image"] = develop(frame, frame.drawn, noise)
+    if "raw" in spec.scene.dataset.layers:
+        frame.raw = _raw(frame, noise)
     twins = [layer for layer in stored_layers(spec.scene, spec.faults) if layer.startswith("without_")]
     for layer in twins:
         name = layer.removeprefix("without_")
@@ -63,9 +65,9 @@ def photograph(frame: Frame) -> None:
             frame.images[layer] = frame.images["image"]
 
 
-def _expose_clean(frame: Frame, signal: Electrons) -> tuple[Noise, RGBI]:
+def _expose_clean(frame: Frame, signal: Electrons) -> tuple[Any, RGBI]:
     spec, camera = frame.spec, frame.camera
-    noise = Noise.draw(frame.context.shape, spec.rng("detector", "shot"), spec.rng("detector", "read"))
+    noise = camera.detector.draw_noise(frame.context.shape, lambda name: spec.rng("detector", name))
     return noise, camera.detector.develop(signal, camera.exposure_s, noise)
 
 
@@ -134,7 +136,7 @@ def _signal(frame: Frame, drawn: Mapping[str, Params], names: Sequence[str]) -> 
     return cached[key]
 
 
-def develop(frame: Frame, drawn: Mapping[str, Params], noise: Noise | None) -> RGBI:
+def develop(frame: Frame, drawn: Mapping[str, Params], noise: Any) -> RGBI:
     """The finished picture with the faults `drawn`; noise-free without `noise`."""
     optical = _in_order(frame, drawn, "electrons")
     camera = _altered(frame, drawn)
@@ -143,6 +145,14 @@ def develop(frame: Frame, drawn: Mapping[str, Params], noise: Noise | None) -> R
         signal = _signal(frame, drawn, optical)
         frame.pictures[key] = camera.detector.develop(signal, camera.exposure_s, noise)
     return _read_out(frame, frame.pictures[key], drawn)
+
+
+def _raw(frame: Frame, noise: Any) -> NDArray[np.uint16]:
+    """The raw mosaic of the picture, before the faults of the finished picture."""
+    camera = _altered(frame, frame.drawn)
+    assert isinstance(camera.detector, MosaicDetector)
+    signal = _signal(frame, frame.drawn, _in_order(frame, frame.drawn, "electrons"))
+    return camera.detector.raw(signal, camera.exposure_s, noise)
 
 
 def _read_out(frame: Frame, picture: RGBI, drawn: Mapping[str, Params]) -> RGBI:
@@ -155,7 +165,7 @@ def _read_out(frame: Frame, picture: RGBI, drawn: Mapping[str, Params]) -> RGBI:
 # --- what shows --------------------------------------------------------------------------------------------
 
 
-def _invisible(frame: Frame, noise: Noise) -> list[str]:
+def _invisible(frame: Frame, noise: Any) -> list[str]:
     """Drawn faults without any effect on the noise-free picture."""
     doubtful = sorted(_doubtful(frame, noise))
     return [n for n in doubtful if not (_shows_on_some_rows(frame, n) or effect_of(frame, n).any())]
@@ -165,7 +175,7 @@ def _shows_on_some_rows(frame: Frame, name: str) -> bool:
     """Whether every eighth row of the noise-free picture is enough to see an optical fault."""
     faults, drawn = frame.spec.faults, frame.drawn
     optical, readout = (_in_order(frame, drawn, step) for step in ("electrons", "rgbi"))
-    if name not in optical or _altered(frame, drawn) != frame.camera:
+    if name not in optical or _altered(frame, drawn) != frame.camera or not frame.camera.detector.local:
         return False
     rows = slice(frame.context.shape[0] // 32, None, 8)
     detector, exposure = frame.camera.detector, frame.camera.exposure_s
@@ -186,7 +196,7 @@ def effect_of(frame: Frame, name: str) -> NDArray[np.bool_]:
     """bool[y, x]: where the noise-free picture changes when one of the drawn faults is switched off."""
     drawn, others = frame.drawn, _but(frame.drawn, name)
     optical = _in_order(frame, drawn, "electrons")
-    if name not in optical or _altered(frame, drawn) != frame.camera:
+    if name not in optical or _altered(frame, drawn) != frame.camera or not frame.camera.detector.local:
         return labels.effect(develop(frame, drawn, None).array, develop(frame, others, None).array)
     # only rows whose signal changes can change: the others need not be developed
     signals = [_signal(frame, d, [n for n in optical if n in d]) for d in (drawn, others)]
@@ -205,7 +215,7 @@ def effect_of(frame: Frame, name: str) -> NDArray[np.bool_]:
     return labels.effect(*pictures)
 
 
-def _doubtful(frame: Frame, noise: Noise) -> set[str]:
+def _doubtful(frame: Frame, noise: Any) -> set[str]:
     """Drawn faults that a cheap look does not show to be plainly visible."""
     faults, drawn = frame.spec.faults, frame.drawn
     if _altered(frame, drawn) != frame.camera:

@@ -42,7 +42,7 @@ def to_sample(frame: Frame) -> Sample:
         "emission_deg": frame.truth.emission_deg,
         "phase_deg": frame.truth.phase_deg,
     }
-    layers = {
+    layers: dict[str, Any] = {
         "image": frame.images["image"].array,
         "clean": frame.images["clean"].array,
         "mask": frame.mask,
@@ -54,6 +54,8 @@ def to_sample(frame: Frame) -> Sample:
         elif name == "mask_effect":
             empty = np.zeros(frame.context.shape, dtype=bool)
             layers[name] = np.stack([frame.effects.get(f, empty) for f in names])
+        elif name == "raw":
+            layers[name] = frame.raw
         elif name == "radiance":
             layers[name] = frame.radiance.array
         elif name == "albedo" and frame.truth.dust is not None:
@@ -97,7 +99,7 @@ def to_sample(frame: Frame) -> Sample:
         "stratum": int(spec.plan.stratum[i]),
         "site": int(spec.plan.site[i]),
         "lens": 0,
-        "detector_individual": 0,
+        "detector_individual": world.individual_of(spec.scene, i),
         "split": int(spec.plan.split[i]),
         "parameters": {
             name: {"model": spec.faults[name].model, **params} for name, params in sorted(frame.drawn.items())
@@ -132,6 +134,8 @@ def proposal(scene: SceneConfig, table: plan.Plan, index: int) -> dict[str, Any]
     return {
         **{name: float(values[index]) for name, values in table.variables.items()},
         "injected": [name for name in table.faults if table.injects(name)[index]],
-        "architecture": camera.architectures[int(table.architecture[index])],
+        "architecture": world.mosaic_sensor(camera).architecture
+        if camera.detector
+        else camera.architectures[int(table.architecture[index])],
         "readout_direction": camera.readout_directions[int(table.readout_direction[index])],
     }

@@ -85,6 +85,7 @@ class Frame:
     drawn: dict[str, Params] = field(default_factory=dict)
     rejected: list[Params] = field(default_factory=list)
     images: dict[str, RGBI] = field(default_factory=dict)
+    raw: NDArray[np.uint16] | None = None
     contexts: dict[Any, FaultContext] = field(default_factory=dict)
     signals: dict[Any, Electrons] = field(default_factory=dict)
     pictures: dict[Any, RGBI] = field(default_factory=dict)

@@ -159,8 +159,13 @@ def _response_table(name: str) -> tuple[F64, F64]:
 RESPONSES = {"nikon_5100": "Nikon 5100 (NPL)", "sigma_sd_merrill": "Sigma SDMerill (NPL)"}
 
 
+FLAT = "flat"  # no filters: every channel responds to all light alike
+
+
 def response(name: str, wavelength_nm: F64, quantum_efficiency_peak: float) -> F64:
     """Quantum efficiency of R, G, B at `wavelength_nm`, float64[3, n], in [0, quantum_efficiency_peak]."""
+    if name == FLAT:
+        return np.full((3, len(wavelength_nm)), quantum_efficiency_peak)
     nodes, values = _response_table(RESPONSES[name])
     return quantum_efficiency_peak * np.stack(
         [np.interp(wavelength_nm, nodes, column, left=0.0, right=0.0) for column in values.T]

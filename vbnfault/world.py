@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -10,11 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from . import camera as cameras
-from . import frames, photometry, sky, spectra, spice
+from . import config, frames, photometry, sky, spectra, spice
 from .body import Body, Site, load_body, site_at
 from .camera import Camera
 from .config import BodyTable, CameraTable, OrbitTable, PoseTable, SceneConfig, SpiceTable, SunTable
-from .detector import Detector
+from .detector import Detector, MosaicDetector, Sensor, load_sensor
 from .errors import InputError
 from .lens import RealLens, ThinLens, coating, load_lens, scaled_to_focal_length
 from .photometry import Photometry
@@ -209,31 +210,80 @@ def ellipsoid(semi_axes_m: tuple[float, float, float]) -> tuple[F64, NDArray[np.
 # --- camera and spacecraft ----------------------------------------------------------------------------------
 
 
-def base_camera(scene: SceneConfig, *, architecture: int = 0, readout_direction: int = 0) -> Camera:
+def base_camera(
+    scene: SceneConfig, *, architecture: int = 0, readout_direction: int = 0, individual: int = 0
+) -> Camera:
     """The scene's camera without exposure; the integers index its lists of options."""
     c = scene.camera
+    direction = c.readout_directions[readout_direction]
+    if c.detector:
+        sensor = mosaic_sensor(c)
+        detector: Detector | MosaicDetector = _detector_of(scene, sensor, individual, direction)
+        pitch_um, which = sensor.pixel_pitch_um, sensor.architecture
+    else:
+        detector, pitch_um, which = _three_colours(c), c.pixel_pitch_um, c.architectures[architecture]
     return Camera(
-        lens=real_lens(c) if c.lens else _thin_lens(c),
-        detector=Detector(
-            width_px=c.width_px,
-            height_px=c.height_px,
-            pixel_pitch_um=c.pixel_pitch_um,
-            full_well_e=c.full_well_e,
-            read_noise_e_rms=c.read_noise_e_rms,
-            dark_current_e_s=c.dark_current_e_s,
-            adc_bits=c.adc_bits,
-            bias_dn=c.bias_dn,
-            response=c.response,
-            quantum_efficiency_peak=c.quantum_efficiency_peak,
-        ),
-        architecture=c.architectures[architecture],
-        readout_direction=c.readout_directions[readout_direction],
+        lens=real_lens(c, pitch_um) if c.lens else _thin_lens(c, pitch_um),
+        detector=detector,
+        architecture=which,
+        readout_direction=direction,
     )
 
 
-def _thin_lens(c: CameraTable) -> ThinLens:
+def _three_colours(c: CameraTable) -> Detector:
+    return Detector(
+        width_px=c.width_px,
+        height_px=c.height_px,
+        pixel_pitch_um=c.pixel_pitch_um,
+        full_well_e=c.full_well_e,
+        read_noise_e_rms=c.read_noise_e_rms,
+        dark_current_e_s=c.dark_current_e_s,
+        adc_bits=c.adc_bits,
+        bias_dn=c.bias_dn,
+        response=c.response,
+        quantum_efficiency_peak=c.quantum_efficiency_peak,
+    )
+
+
+@lru_cache(maxsize=4)
+def mosaic_sensor(c: CameraTable) -> Sensor:
+    """The sensor that a camera names, at the camera's temperature. Raises InputError."""
+    try:
+        sensor = load_sensor(c.detector)
+    except InputError as error:
+        raise InputError(f"camera.detector: {error}") from None
+    if c.detector_temperature_K is not None:
+        sensor = replace(sensor, temperature_K=c.detector_temperature_K)
+    return sensor
+
+
+def _detector_of(scene: SceneConfig, sensor: Sensor, individual: int, direction: str) -> MosaicDetector:
+    # CCDs are read towards an end of their columns
+    towards = direction if direction in ("up", "down") else "up"
+    seed = int(config.rng(scene.dataset.seed, individual, "detector", "device").integers(2**31))
+    try:
+        return MosaicDetector(
+            sensor=sensor,
+            seed=seed,
+            width_px=scene.camera.width_px,
+            height_px=scene.camera.height_px,
+            direction=towards,
+        )
+    except InputError as error:
+        raise InputError(f"camera.detector: {error}") from None
+
+
+def individual_of(scene: SceneConfig, sample: int) -> int:
+    """Which device takes a sample."""
+    count = scene.camera.individuals
+    if count == 1:
+        return 0
+    return int(config.rng(scene.dataset.seed, sample, "detector", "individual").integers(count))
+
+
+def _thin_lens(c: CameraTable, pixel_pitch_um: float) -> ThinLens:
     return ThinLens(
-        focal_length_mm=cameras.focal_length_mm(c.fov_deg, c.width_px, c.pixel_pitch_um),
+        focal_length_mm=cameras.focal_length_mm(c.fov_deg, c.width_px, pixel_pitch_um),
         f_number=c.f_number,
         transmission=c.transmission,
         focus_distance_m=float("inf") if c.focus_distance_m is None else c.focus_distance_m,
@@ -241,7 +291,7 @@ def _thin_lens(c: CameraTable) -> ThinLens:
 
 
 @lru_cache(maxsize=4)
-def real_lens(c: CameraTable) -> RealLens:
+def real_lens(c: CameraTable, pixel_pitch_um: float) -> RealLens:
     """The prescription that a camera names, scaled to its field of view. Raises InputError."""
     try:
         prescription = load_lens(c.lens)
@@ -252,12 +302,12 @@ def real_lens(c: CameraTable) -> RealLens:
             known = ", ".join(coating.NAMES)
             raise InputError(f"camera.lens_coating = {c.lens_coating!r}: must be one of {known}")
         prescription = prescription.coated(c.lens_coating)
-    thin = _thin_lens(c)
+    thin = _thin_lens(c, pixel_pitch_um)
     return RealLens(
         prescription=scaled_to_focal_length(prescription, thin.focal_length_mm),
         width_px=c.width_px,
         height_px=c.height_px,
-        pixel_pitch_um=c.pixel_pitch_um,
+        pixel_pitch_um=pixel_pitch_um,
         focus=c.focus,
         focus_distance_m=thin.focus_distance_m,
     )

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Any
 
 import cv2
@@ -195,7 +194,7 @@ class Device:
             mosaic = correct_defects(raw, bad, sensor.pattern)
         method: Any = sensor.demosaic if sensor.pattern.is_bayer else "bilinear"
         black = self.black_dn(exposure_s)
-        gains = np.ones(3) if len(sensor.pattern.channels) == 1 else self.white_balance
+        gains = self.white_balance
         scale = 255.0 / max(sensor.readout.top_dn - black, 1.0) * gains
         linear = demosaic(mosaic, sensor.pattern, method)
         rgb = cv2.multiply(
@@ -217,13 +216,8 @@ class Device:
     @property
     def white_balance(self) -> NDArray[np.float32]:
         """Gain of R, G, B, float32[3], at least 1, that makes a grey surface in sunlight grey."""
-        return white_balance(self.sensor.response, self.sensor.quantum_efficiency_peak)
-
-
-@lru_cache(maxsize=4)
-def device(sensor: Sensor, seed: int, direction: str = "up") -> Device:
-    """A device, made once."""
-    return Device(sensor, seed, direction=direction)
+        name = self.sensor.response if len(self.sensor.pattern.channels) > 1 else "flat"
+        return white_balance(name, self.sensor.quantum_efficiency_peak)
 
 
 def channel_sites(sensor: Sensor) -> dict[str, tuple[slice, slice]]:

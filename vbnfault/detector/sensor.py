@@ -71,7 +71,7 @@ class Sensor:
     def __post_init__(self) -> None:
         _one_of("architecture", self.architecture, ARCHITECTURES)
         _one_of("shutter", self.shutter, SHUTTERS)
-        _one_of("response", self.response, tuple(spectra.RESPONSES))
+        _one_of("response", self.response, (*spectra.RESPONSES, spectra.FLAT))
         _one_of("demosaic", self.demosaic, DEMOSAICS)
         for key, low, high in (
             ("width_px", 16, 16384),

@@ -15,7 +15,7 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
+from typing import Any, ClassVar
 
 import cv2
 import numpy as np
@@ -93,6 +93,13 @@ class Detector:
     response: str = "nikon_5100"
     quantum_efficiency_peak: float = 0.5
 
+    # a pixel of the picture depends on no other
+    local: ClassVar[bool] = True
+
+    def draw_noise(self, shape: tuple[int, int], rng: Callable[[str], np.random.Generator]) -> Noise:
+        """Variates of one exposure, by the generators of their names."""
+        return Noise.draw(shape, rng("shot"), rng("read"))
+
     @property
     def adc_max_dn(self) -> int:
         return 2**self.adc_bits - 1
@@ -151,9 +158,9 @@ class Detector:
         show = self._shower(exposure_s)
         return RGBI(array=_blockwise(lambda dn: show(dn.astype(np.float32)), raw.array))
 
-    def develop(self, expected: Electrons, exposure_s: float, noise: Noise | None) -> RGBI:
+    def develop(self, expected: Electrons, exposure_s: float, noise: Any) -> RGBI:
         """The 8 bit image of expected photo-electrons: all later steps at once, block by block, so that what
-        lies between never leaves the cache. Noise-free without `noise`."""
+        lies between never leaves the cache. Noise-free without `noise`, which is what `draw_noise` gives."""
         collect, show = self._collector(exposure_s), self._shower(exposure_s)
 
         def step(signal: F32, shot: F32 | None, read: F32 | None) -> NDArray[np.uint8]:
