@@ -300,6 +300,11 @@ def test_clusters() -> None:
     # whoever is not moved stays
     same = (paired.hot.row == lone.hot.row) & (paired.hot.column == lone.hot.column)
     assert abs(same.mean() - 0.7) < 4 * math.sqrt(0.21 / n)
+    # and whoever is, stands beside one who was there before and stayed
+    row, column = paired.hot.row, paired.hot.column
+    for child in np.flatnonzero(~same)[:500]:
+        apart = np.maximum(abs(row[:child] - row[child]), abs(column[:child] - column[child]))
+        assert (same[:child] & (apart == 1)).any()
     tiny = sensor(replace(BUSY, hot_clustered_share=1.0, years=100.0), shape=(3, 7), pitch=30.0).hot
     assert len(tiny) == 0 or (tiny.row.max() < 3 and tiny.column.max() < 7 and tiny.row.min() >= 0)
 
@@ -333,6 +338,12 @@ def test_exposures_of_telegraph_signals(high_s: float, low_s: float, exposure_s:
         assert abs(later.mean() - p) < 4 * math.sqrt(p * (1 - p) / n)
         memory = ((state - p) * (later - p)).mean() / (p * (1 - p))
         assert abs(memory - math.exp(-exposure_s / tau)) < 4 * max(p / (1 - p), (1 - p) / p) / math.sqrt(n)
+    # over one correlation time, many of them
+    many = telegraph(high_s, low_s, 400_000)
+    state_many = many.start(rng)
+    later = many.later(state_many, tau, rng)
+    memory = ((state_many - p) * (later - p)).mean() / (p * (1 - p))
+    assert abs(memory - math.exp(-1)) < 4 * max(p / (1 - p), (1 - p) / p) / math.sqrt(400_000)
     # those that never switch: each level's own exponential times
     for level, mean_s, all_of_it in ((True, high_s, 1.0), (False, low_s, 0.0)):
         here = state == level
