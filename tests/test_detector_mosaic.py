@@ -46,8 +46,10 @@ def test_bayer_patterns_are_read_row_by_row_from_the_top_left(name: str) -> None
 
 
 def test_rgbw_is_half_white_in_a_chequerboard_a_quarter_green() -> None:
-    # US 2007/0024931: panchromatic pixels touch each other at their corners only
     rgbw = pattern("RGBW")
+    letters = np.array(rgbw.channels)[channel_of(rgbw, (4, 4))]
+    assert ["".join(row) for row in letters] == ["WBWG", "BWGW", "WGWR", "GWRW"]
+    # panchromatic pixels touch each other at their corners only
     white = channel_mask(rgbw, (8, 8), "W")
     np.testing.assert_array_equal(white, np.indices((8, 8)).sum(axis=0) % 2 == 0)
     assert [channel_mask(rgbw, (8, 8), c).mean() for c in "RGB"] == [1 / 8, 1 / 4, 1 / 8]
