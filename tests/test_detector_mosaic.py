@@ -46,8 +46,10 @@ def test_bayer_patterns_are_read_row_by_row_from_the_top_left(name: str) -> None
 
 
 def test_rgbw_is_half_white_in_a_chequerboard_a_quarter_green() -> None:
-    # US 2007/0024931: panchromatic pixels touch each other at their corners only
     rgbw = pattern("RGBW")
+    letters = np.array(rgbw.channels)[channel_of(rgbw, (4, 4))]
+    assert ["".join(row) for row in letters] == ["WBWG", "BWGW", "WGWR", "GWRW"]
+    # panchromatic pixels touch each other at their corners only
     white = channel_mask(rgbw, (8, 8), "W")
     np.testing.assert_array_equal(white, np.indices((8, 8)).sum(axis=0) % 2 == 0)
     assert [channel_mask(rgbw, (8, 8), c).mean() for c in "RGB"] == [1 / 8, 1 / 4, 1 / 8]
@@ -82,6 +84,9 @@ def test_sample_takes_each_pixels_own_filter(name: str, shape: tuple[int, int]) 
     np.testing.assert_array_equal(np.sum(masks, axis=0), 1)
 
 
+LONG = Pattern(name="long", channels=("R", "W"), tile=((0,),) * 8 + ((1,),))
+
+
 def test_bad_patterns_are_told_in_a_sentence() -> None:
     for bad, sentence in (
         (lambda: pattern("RGBG"), "pattern is 'RGBG', but must be one of rggb"),
@@ -94,6 +99,7 @@ def test_bad_patterns_are_told_in_a_sentence() -> None:
         (lambda: footprint(np.zeros((8, 8), bool), pattern("mono"), "malvar"), "no Bayer pattern: use bilinear"),
         (lambda: demosaic(np.zeros((5, 8)), pattern("rggb")), "at least 6 × 6"),
         (lambda: demosaic(np.zeros((8, 8, 3)), pattern("rggb")), r"must be \[y, x\]"),
+        (lambda: interpolate(np.zeros((8, 8)), LONG, "W"), r"must hold the \(9, 1\) tile"),
         (lambda: correct_defects(np.zeros((8, 8)), np.zeros((8, 7), bool), pattern("rggb")), r"shape \(8, 7\)"),
         (lambda: correct_defects(np.zeros((8, 8)), np.zeros((8, 8), bool), pattern("rggb"), "mode"), "'mode'"),
     ):
@@ -142,10 +148,13 @@ def oracle() -> ModuleType:
 
 @pytest.mark.parametrize("name", BAYER)
 @pytest.mark.parametrize("method", METHODS)
-def test_bayer_methods_agree_with_colour_demosaicing(oracle: ModuleType, name: str, method: str) -> None:
+@pytest.mark.parametrize("levels", [65536, 3])  # with three levels, directions are often equally rough
+def test_bayer_methods_agree_with_colour_demosaicing(
+    oracle: ModuleType, name: str, method: str, levels: int
+) -> None:
     # the package mirrors with the outermost pixel repeated, which swaps the filters at the border: it gets
     # the mosaic already mirrored as is done here. A height of 131 is two blocks of rows and 3 rows more
-    raw = random_raw((131, 75))
+    raw = np.random.default_rng(1).integers(0, levels, (131, 75)).astype(np.uint16)
     padded = np.pad(raw.astype(np.float64), 16, mode="reflect")
     theirs = {
         "bilinear": oracle.demosaicing_CFA_Bayer_bilinear,

@@ -69,6 +69,7 @@ def demosaic(raw: NDArray[Any], pattern: Pattern, method: Method = "bilinear") -
     Process. 16, 132, doi 10.1109/TIP.2006.884928, with its refining step) are made for Bayer patterns;
     `bilinear` serves all. A monochrome mosaic gives R = G = B. W and NIR pixels are left out of R, G, B: see
     `interpolate`. Measured values stay as they are.
+
     Sums of 16 bit integers are exact in float32, so Menon's choice of direction is free of rounding for raw DN.
     InputError for an unknown method, one that does not fit the pattern, or a mosaic below 6 × 6 pixels.
     """
@@ -227,13 +228,17 @@ def _tent(reach: int) -> F32:
     return (1 - np.abs(np.arange(1 - reach, reach)) / reach).astype(np.float32)
 
 
-@lru_cache(maxsize=32)
+@lru_cache(maxsize=8)  # a picture each
 def _normaliser(pattern: Pattern, shape: tuple[int, ...], index: int) -> tuple[int, F32]:
     """Half-width of the narrowest tent that reaches every pixel from those of a channel (0: it is everywhere),
     and the reciprocal of the weights it finds (Knutsson & Westin 1993, normalised convolution)."""
     mask = (channel_of(pattern, (shape[0], shape[1])) == index).astype(np.float32)
     if mask.all():
         return 0, mask
+    if not mask.any():
+        raise InputError(
+            f"the mosaic has shape {shape}, but must hold the {pattern.shape} tile of '{pattern.name}'"
+        )
     reach = 2
     while True:
         tent = _tent(reach)
@@ -298,7 +303,7 @@ _COLOUR_DIFFERENCE = _row(0.25, -0.5, 0.5, -0.5, 0.25)
 
 def _menon(raw: F32, pattern: Pattern) -> list[F32]:
     """R, G, B, by way of colour differences: K, red minus green at red pixels and blue minus green at blue ones,
-    and L, red minus blue. `rough` picks the direction along which they vary less."""
+    and L, red minus blue. The direction along which K varies less is the one to interpolate along."""
     (ry, rx), (by, bx) = _sites(pattern)
     red, blue = (slice(ry, None, 2), slice(rx, None, 2)), (slice(by, None, 2), slice(bx, None, 2))
     # green pixels of the red rows and of the blue rows

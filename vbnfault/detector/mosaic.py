@@ -64,12 +64,12 @@ def _pattern(name: str, channels: str, *rows: str) -> Pattern:
 
 BAYER = ("RGGB", "BGGR", "GRBG", "GBRG")
 
-# RGBW is the 4×4 unit of Compton & Hamilton, US 2007/0024931 (Kodak): half of the pixels are W, in a
-# chequerboard; green lies on one diagonal, red and blue share the other. RGB+NIR is RGGB with the second
-# green replaced by a pixel that passes the near infrared only.
+# RGBW is Kodak's TrueSense sparse array (Compton & Hamilton, US 2007/0024931): half of the pixels are W, in a
+# chequerboard; green lies on one diagonal, blue and red share the other. RGB+NIR is RGGB with the second green
+# replaced by a pixel that passes the near infrared only.
 PATTERNS: dict[str, Pattern] = {
     **{f.lower(): _pattern(f.lower(), "R G B", f"{f[0]} {f[1]}", f"{f[2]} {f[3]}") for f in BAYER},
-    "rgbw": _pattern("rgbw", "R G B W", "W G W R", "G W R W", "W B W G", "B W G W"),
+    "rgbw": _pattern("rgbw", "R G B W", "W B W G", "B W G W", "W G W R", "G W R W"),
     "rgb_nir": _pattern("rgb_nir", "R G B NIR", "R G", "NIR B"),
     "mono": _pattern("mono", "W", "W"),
 }

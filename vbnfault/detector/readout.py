@@ -45,7 +45,7 @@ class ReadoutSpec:
     cds, cds_interval_s      whether the reset level is subtracted, and how long before the signal it is sampled.
                              Interference at frequency f passes by |2 sin(π f interval)|
     nodes                    1, 2 (left, right) or 4 (quadrants: top left, top right, bottom left, bottom right)
-    node_gains               relative gain of each node, > 0; empty: all 1
+    node_gains               relative gain of each node, > 0; empty: all 1. A full well below 1 misses the top code
     node_offsets_dn          added to the bias of each node; empty: all 0
     row_pattern_e_rms, column_pattern_e_rms    fixed pattern, from sensor to sensor
     row_noise_e_rms          one value per row and exposure
@@ -296,9 +296,9 @@ def read_out(
     pattern or differential non-linearity without `individual`. The whole chain at once, in blocks of rows."""
     transitions = None if individual is None else individual.transitions_dn
     chain = _Chain(electrons.shape, spec, noise, individual)
-    convert = _Converter(spec, transitions)
+    code_of = _Converter(spec, transitions)
     return _blockwise(
-        lambda e, row_e, half, wave, read: convert(chain.amplify(e, row_e, half, wave, read)),
+        lambda e, row_e, half, wave, read: code_of(chain.amplify(e, row_e, half, wave, read)),
         _picture(electrons),
         *chain.of_rows,
     )
