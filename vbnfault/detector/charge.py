@@ -123,7 +123,7 @@ def bloom(signal_e: F32, *, full_well_e: float, antiblooming: float = 0.0, direc
     count = len(columns)
     # both orders side by side: the current to the last row comes first in the left part, last in the right one
     excess = np.empty((len(image), 2 * count))
-    np.subtract(np.take(image, columns, axis=1), full_well_e, out=excess[:, :count])
+    np.subtract(np.take(image, columns, axis=1), full_well_e, out=excess[:, :count], dtype=np.float64)
     excess[:, count:] = excess[::-1, :count]
     np.multiply(excess, (1.0 - antiblooming) / 2, out=excess, where=excess > 0)
     _run_over(excess, first=True)

@@ -1,0 +1,333 @@
+"""Cosmic rays: their rate, directions, lengths and charge against closed forms; chords by hand; what is kept."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from vbnfault.detector.cosmic import (
+    FLUX_UNSHIELDED_CM2_S,
+    MOYAL_MEAN,
+    SECONDARY_MAX_KEV,
+    SECONDARY_MIN_KEV,
+    XI_E_PER_UM,
+    CosmicRayModel,
+    CosmicRays,
+)
+from vbnfault.errors import InputError
+
+SHAPE = (1000, 1000)
+MODEL = CosmicRayModel(pixel_pitch_um=10.0, thickness_um=20.0)  # 1 cm²
+EVEN = replace(MODEL, width_e_per_um=0.0)
+
+# p-values: fixed seeds, 1e-3 shared by the comparisons of a test
+N = 20_000
+
+
+def many(model: CosmicRayModel = MODEL, seed: int = 1) -> CosmicRays:
+    return model.draw(SHAPE, N / model.expected_count(SHAPE, 1.0), np.random.default_rng(seed))
+
+
+def one(**kwargs: float) -> CosmicRays:
+    """A single track; 80 electrons per µm."""
+    track = {"x_px": 0.5, "y_px": 0.5, "depth_um": 0.0, "theta_deg": 0.0, "phi_deg": 0.0, "length_um": 20.0}
+    track |= kwargs
+    return CosmicRays.from_params([{"electrons": 80 * track["length_um"], "seed": 7, **track}])
+
+
+# -------------------------------------------------------------------------------------------- what is drawn
+
+
+def test_the_rate_is_half_the_flux_through_a_plane() -> None:
+    assert MODEL.expected_count(SHAPE, 100.0) == pytest.approx(FLUX_UNSHIELDED_CM2_S / 2 * 100, rel=1e-12)
+    assert FLUX_UNSHIELDED_CM2_S == 4.67
+
+
+def test_counts_are_poisson() -> None:
+    mean, exposures = 9.34, 1000
+    rng = np.random.default_rng(2)
+    counts = np.array([len(MODEL.draw(SHAPE, 4.0, rng)) for _ in range(exposures)])
+    edges = np.array([5, 6, 7, 8, 9, 10, 11, 12, 13])
+    expected = exposures * np.diff(np.concatenate([[0], stats.poisson.cdf(edges, mean), [1]]))
+    observed = np.bincount(np.searchsorted(edges, counts), minlength=len(expected))
+    assert stats.chisquare(observed, expected).pvalue > 1e-3
+
+
+def test_directions_follow_the_cosine_law_and_places_are_even() -> None:
+    rays = many()
+    assert len(rays) == pytest.approx(N, abs=4 * np.sqrt(N))
+    # density 2 sinθ cosθ: distribution sin²θ
+    assert stats.kstest(np.sin(np.radians(rays.theta_deg)) ** 2, "uniform").pvalue > 1e-3 / 4
+    assert stats.kstest(rays.phi_deg / 360, "uniform").pvalue > 1e-3 / 4
+    assert stats.kstest(rays.x_px / SHAPE[1], "uniform").pvalue > 1e-3 / 4
+    assert stats.kstest(rays.y_px / SHAPE[0], "uniform").pvalue > 1e-3 / 4
+    assert np.all(rays.depth_um == 0)
+
+
+def test_lengths_follow_from_the_cosine_law() -> None:
+    rays = many()
+    # P(length > l) = P(cosθ < t/l) = (t/l)²; the sensor's edge, 1 cm off, cuts fewer than one in a thousand
+    assert stats.kstest(rays.length_um, lambda length: np.maximum(1 - (20.0 / length) ** 2, 0)).pvalue > 1e-3
+    whole = 20.0 / np.cos(np.radians(rays.theta_deg))
+    cut = rays.length_um < whole * (1 - 1e-9)
+    assert 0 < cut.mean() < 5e-3
+    np.testing.assert_allclose(rays.length_um[~cut], whole[~cut], rtol=1e-9)
+    # those that are cut end on the edge
+    end = rays.x_px + rays.length_um * np.sin(np.radians(rays.theta_deg)) * np.cos(np.radians(rays.phi_deg)) / 10
+    far = rays.y_px + rays.length_um * np.sin(np.radians(rays.theta_deg)) * np.sin(np.radians(rays.phi_deg)) / 10
+    off = np.min(np.abs([end, end - 1000, far, far - 1000]), axis=0)
+    np.testing.assert_allclose(off[cut], 0, atol=1e-6)
+
+
+def test_charge_is_moyals_with_80_electrons_per_um() -> None:
+    rays = many()
+    per_um = rays.electrons / rays.length_um
+    # standard deviation of Moyal's distribution: π/√2 widths
+    assert per_um.mean() == pytest.approx(80, abs=4 * np.pi / np.sqrt(2) * XI_E_PER_UM / np.sqrt(N))
+    location = 80 - XI_E_PER_UM * MOYAL_MEAN
+    assert stats.kstest(per_um, stats.moyal(loc=location, scale=XI_E_PER_UM).cdf).pvalue > 1e-3
+    assert stats.moyal.mean() == pytest.approx(MOYAL_MEAN)
+    # ½ · 0.307 MeV cm²/mol · 0.498 mol/g · 2.33 g/cm³ = 178 keV/cm; 3.65 eV a pair
+    assert 17.8 / 3.65 == pytest.approx(XI_E_PER_UM, rel=2e-3)
+    assert per_um.min() > 40
+
+
+def test_no_time_no_tracks() -> None:
+    rays = MODEL.draw(SHAPE, 0.0, np.random.default_rng(0))
+    assert len(rays) == 0
+    assert rays.params == []
+    assert len(CosmicRays.from_params([])) == 0
+    for model in (MODEL, replace(MODEL, diffusion_um=3.0), replace(MODEL, secondaries=True)):
+        assert not model.image(model.draw((5, 7), 0.0, np.random.default_rng(0)), (5, 7)).any()
+
+
+# ----------------------------------------------------------------------------------------- charge in pixels
+
+
+def test_chords_by_hand() -> None:
+    # along +x at 45°: 20 µm deep, so 20 µm or two pixels far, from the middle of a pixel
+    got = EVEN.image(one(x_px=3.5, y_px=2.5, theta_deg=45.0, length_um=20 * np.sqrt(2)), (6, 8))
+    expected = np.zeros((6, 8))
+    expected[2, 3:6] = 80 * np.sqrt(2) * np.array([5, 10, 5])
+    np.testing.assert_allclose(got, expected, rtol=1e-6, atol=1e-9)
+    # the same towards +y, -x, -y
+    for phi, x, y, picture in (
+        (90.0, 2.5, 3.5, expected.T),
+        (180.0, 4.5, 2.5, expected[:, ::-1]),
+        (270.0, 2.5, 4.5, expected[:, ::-1].T),
+    ):
+        ray = one(x_px=x, y_px=y, theta_deg=45.0, phi_deg=phi, length_um=20 * np.sqrt(2))
+        np.testing.assert_allclose(EVEN.image(ray, picture.shape), picture, rtol=1e-6, atol=1e-9)
+    # straight down: one pixel
+    got = EVEN.image(one(x_px=3.25, y_px=1.75), (6, 8))
+    assert got[1, 3] == 1600
+    assert np.count_nonzero(got) == 1
+
+
+@pytest.mark.parametrize("model", [EVEN, MODEL], ids=["even", "fluctuating"])
+def test_chords_against_points_along_the_track(model: CosmicRayModel) -> None:
+    rng = np.random.default_rng(4)
+    points = 20_001
+    for _ in range(20):
+        ray = one(
+            x_px=rng.uniform(8, 22),
+            y_px=rng.uniform(8, 22),
+            theta_deg=rng.uniform(0, 75),
+            phi_deg=rng.uniform(0, 360),
+            length_um=60.0,
+        )
+        index, electrons = replace(model, thickness_um=60.0).deposit(ray, (30, 30))
+        s = (np.arange(points) + 0.5) / points * 6.0 * np.sin(np.radians(ray.theta_deg[0]))
+        x = np.floor(ray.x_px[0] + s * np.cos(np.radians(ray.phi_deg[0]))).astype(int)
+        y = np.floor(ray.y_px[0] + s * np.sin(np.radians(ray.phi_deg[0]))).astype(int)
+        share = np.bincount(y * 30 + x, minlength=900) / points
+        chord_um = 60.0 * share[index]
+        assert set(np.flatnonzero(share)) <= set(index)
+        assert electrons.sum(dtype=np.float64) == pytest.approx(4800, rel=1e-6)
+        if model is EVEN:
+            # each end of a chord is known to one of the points
+            np.testing.assert_allclose(electrons, 80 * chord_um, rtol=0, atol=80 * 60 * 2 / points)
+        elif len(index) > 2:
+            assert np.abs(electrons - 80 * chord_um).max() > 10
+
+
+def test_pixels_fluctuate_as_moyals_distribution_does() -> None:
+    # 20 pixels each: the scale to the total takes one of 20 degrees of freedom
+    rays = many()
+    row = np.arange(500.0)
+    track = {
+        "depth_um": 0.0,
+        "theta_deg": 90.0,
+        "phi_deg": 0.0,
+        "length_um": 200.0,
+        "electrons": 16_000.0,
+        "x_px": 0.0,
+    }
+    params = [{**track, "y_px": y + 0.5, "seed": int(seed)} for y, seed in zip(row, rays.seed, strict=False)]
+    image = MODEL.image(CosmicRays.from_params(params), (500, 20)).astype(np.float64)
+    np.testing.assert_allclose(image.sum(axis=1), 16_000, rtol=1e-6)
+    per_um = image / 10
+    sigma = np.pi / np.sqrt(2) * XI_E_PER_UM
+    # excess kurtosis 4: the variance of 10,000 is known to √(6/10,000) = 2.4 % of itself; dividing by the mean of
+    # the same 20 pixels takes 5 % and, being skewed, a little more
+    assert per_um.var() == pytest.approx(0.95 * sigma**2, rel=0.1)
+    assert stats.skew(per_um.ravel()) == pytest.approx(1.5, abs=0.4)
+    # neither from pixel to pixel (but for that division: −1/19) nor from track to track
+    along = np.corrcoef(image[:, 1:].ravel(), image[:, :-1].ravel())[0, 1]
+    across = np.corrcoef(image[1:].ravel(), image[:-1].ravel())[0, 1]
+    assert along == pytest.approx(-1 / 19, abs=4 / 100)
+    assert across == pytest.approx(0, abs=4 / 100)
+
+
+def test_image_holds_what_was_drawn() -> None:
+    rays = many()
+    image = MODEL.image(rays, SHAPE)
+    assert image.dtype == np.float32
+    assert image.shape == SHAPE
+    # sums in float64, then one rounding a pixel
+    assert image.sum(dtype=np.float64) == pytest.approx(rays.electrons.sum(), rel=1e-6)
+    index, electrons = MODEL.deposit(rays, SHAPE)
+    assert np.all(np.diff(index) > 0)
+    np.testing.assert_array_equal(image.ravel()[index], electrons)
+    assert np.count_nonzero(image) == np.count_nonzero(electrons)
+
+
+def test_a_smaller_sensor_sees_its_part_of_a_track() -> None:
+    ray = one(x_px=1.0, y_px=0.5, theta_deg=90.0, length_um=100.0)
+    got = EVEN.image(ray, (1, 5))
+    np.testing.assert_allclose(got, [[0, 800, 800, 800, 800]], rtol=1e-6)
+
+
+# ----------------------------------------------------------------------------------------------- what is kept
+
+
+@pytest.mark.parametrize("diffusion_um", [0.0, 4.0])
+def test_params_restore_the_image_bit_for_bit(diffusion_um: float) -> None:
+    model = replace(MODEL, diffusion_um=diffusion_um, secondaries=True)
+    rays = model.draw((200, 300), 500.0, np.random.default_rng(5))
+    assert len(rays) > 30
+    again = CosmicRays.from_params(json.loads(json.dumps(rays.params)))
+    np.testing.assert_array_equal(model.image(again, (200, 300)), model.image(rays, (200, 300)))
+    twin = model.draw((200, 300), 500.0, np.random.default_rng(5))
+    assert twin.params == rays.params
+    other = CosmicRays.from_params([{**row, "seed": row["seed"] ^ 1} for row in rays.params])
+    assert (model.image(other, (200, 300)) != model.image(rays, (200, 300))).any()
+
+
+def test_tracks_do_not_know_each_other() -> None:
+    rays = MODEL.draw((100, 100), 3000.0, np.random.default_rng(6))
+    alone = sum(MODEL.image(CosmicRays.from_params([row]), (100, 100)).astype(np.float64) for row in rays.params)
+    # sums of a few float32 per pixel
+    np.testing.assert_allclose(MODEL.image(rays, (100, 100)), alone, rtol=1e-6, atol=1e-9)
+
+
+def test_missing_params_are_named() -> None:
+    row = one().params[0]
+    del row["seed"]
+    with pytest.raises(InputError, match=r"cosmic_rays\[1\]: seed is missing"):
+        CosmicRays.from_params([one().params[0], row])
+
+
+# --------------------------------------------------------------------------------- diffusion and secondaries
+
+
+def test_diffusion_spreads_charge_by_its_depth() -> None:
+    model = CosmicRayModel(pixel_pitch_um=1.0, thickness_um=20.0, diffusion_um=3.0, width_e_per_um=0.0)
+    image = model.image(one(x_px=30.5, y_px=25.5), (51, 61)).astype(np.float64)
+    assert image.sum() == pytest.approx(1600, rel=1e-6)
+    for axis, centre in ((0, 30.5), (1, 25.5)):
+        profile = image.sum(axis=axis) / 1600
+        at = np.arange(len(profile)) + 0.5
+        # σ² ∝ depth: its mean is half of 9 µm²; a pixel adds 1/12. Eight steps of depth are exact for it; cut at
+        # 4 σ of the far face, a Gaussian loses at most 0.1 % of its variance
+        assert (profile * at).sum() == pytest.approx(centre, abs=1e-6)
+        assert (profile * (at - centre) ** 2).sum() == pytest.approx(4.5 + 1 / 12, rel=2e-3)
+    shallow = model.image(one(x_px=30.5, y_px=25.5, length_um=0.1), (51, 61))
+    assert shallow[25, 30] > 0.9 * shallow.sum()  # σ is 0.15 µm there
+    deep = model.image(one(x_px=30.5, y_px=25.5, depth_um=19.9, length_um=0.1), (51, 61))
+    assert deep[25, 30] < 0.05 * deep.sum()
+
+
+def test_little_diffusion_is_none() -> None:
+    rays = MODEL.draw(SHAPE, 500.0, np.random.default_rng(9))
+    sharp, soft = EVEN.image(rays, SHAPE), replace(EVEN, diffusion_um=1e-6).image(rays, SHAPE)
+    # steps of a quarter of a pixel lie within one piece, so nothing is moved
+    np.testing.assert_allclose(soft, sharp, rtol=1e-5, atol=1e-3)
+
+
+def test_charge_that_diffuses_over_the_edge_is_lost() -> None:
+    model = replace(EVEN, diffusion_um=5.0)
+    inside = model.image(one(x_px=5.0, y_px=5.0), (10, 10)).sum(dtype=np.float64)
+    corner = model.image(one(x_px=0.0, y_px=0.0), (10, 10)).sum(dtype=np.float64)
+    assert inside == pytest.approx(1600, rel=1e-6)
+    assert corner == pytest.approx(400, rel=1e-4)  # of the 6e-5 beyond 4 σ
+
+
+def test_secondaries_are_off_unless_asked_for() -> None:
+    assert not MODEL.secondaries
+    plain, more = many(), many(replace(MODEL, secondaries=True))
+    assert len(more) > len(plain)
+    assert more.params[: len(plain)] == plain.params  # the tracks themselves are the same
+
+
+def test_secondaries_follow_their_rate_and_stay_in_the_layer() -> None:
+    model = replace(MODEL, secondaries=True)
+    rays = many(model)
+    tracks = len(many())
+    # ξ (1/T_min − 1/T_max) per µm
+    low, high = SECONDARY_MIN_KEV, SECONDARY_MAX_KEV
+    expected = rays.length_um[:tracks].sum() * 17.825e-3 * (1 / low - 1 / high)
+    assert len(rays) - tracks == pytest.approx(expected, abs=4 * np.sqrt(expected))
+    young = {name: value[tracks:] for name, value in vars(rays).items()}
+    end = young["depth_um"] + young["length_um"] * np.cos(np.radians(young["theta_deg"]))
+    for depth in (young["depth_um"], end):
+        assert depth.min() > -1e-9
+        assert depth.max() < 20 + 1e-9
+    # 10 keV go 0.96 µm: 2740 electrons if they stop inside
+    assert young["electrons"].max() < high * 1e3 / 3.65
+    stopped = young["electrons"] >= low * 1e3 / 3.65
+    assert stopped.mean() > 0.7
+    slowest = young["electrons"].argsort()[np.count_nonzero(~stopped)]
+    assert young["length_um"][slowest] == pytest.approx(0.0398 / 2.329 * 10**1.75, rel=0.02)
+    # on top of the mean, at most ξ ln(T_max/T_min): 14 % of 80
+    share = young["electrons"].sum() / rays.electrons[:tracks].sum()
+    assert 0.05 < share < XI_E_PER_UM * np.log(high / low) / 80
+    assert model.image(rays, SHAPE).sum(dtype=np.float64) == pytest.approx(rays.electrons.sum(), rel=1e-5)
+
+
+def test_secondaries_leave_square_to_their_track() -> None:
+    # every track the same way, so that each secondary's parent is known
+    parents = one(x_px=500.0, y_px=500.0, theta_deg=50.0, phi_deg=30.0, length_um=30.0)
+    crowd = CosmicRays(**{name: np.repeat(value, 5000) for name, value in vars(parents).items()})
+    rays = MODEL._with_secondaries(crowd, SHAPE, np.random.default_rng(8))
+    theta, phi = np.radians(rays.theta_deg), np.radians(rays.phi_deg)
+    way = np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)])
+    assert len(rays) > 5100
+    np.testing.assert_allclose(way[:, 0] @ way[:, 5000:], 0, atol=1e-7)
+
+
+# ----------------------------------------------------------------------------------------------------- errors
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: replace(MODEL, pixel_pitch_um=0.0), "pixel_pitch_um = 0: must be finite and above 0"),
+        (lambda: replace(MODEL, thickness_um=-1.0), "thickness_um = -1: must be finite and above 0"),
+        (
+            lambda: replace(MODEL, flux_per_cm2_s=float("nan")),
+            "flux_per_cm2_s = nan: must be finite and at least 0",
+        ),
+        (lambda: replace(MODEL, diffusion_um=-1.0), "diffusion_um = -1"),
+        (lambda: replace(MODEL, width_e_per_um=20.0), "width_e_per_um = 20: must be at most 0.15 .* = 12"),
+        (lambda: MODEL.draw(SHAPE, -1.0, np.random.default_rng(0)), "exposure_s = -1: must be finite"),
+    ],
+)
+def test_bad_numbers_are_refused_in_a_sentence(call: Callable[[], object], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        call()
