@@ -356,14 +356,10 @@ class CameraTable(Table):
             value = getattr(self, key)
             if not self.lens and value not in ("", "paraxial"):
                 raise ValueError(f"{key} = {value!r}: needs lens")
-        if self.detector:
-            for key in _OF_THE_DETECTOR:
-                if key in self.model_fields_set:
-                    raise ValueError(f"{key} = {getattr(self, key)!r}: the detector has its own; leave one out")
-        else:
-            for key in ("individuals", "detector_temperature_K"):
-                if key in self.model_fields_set:
-                    raise ValueError(f"{key} = {getattr(self, key)!r}: needs detector")
+        for key in _OF_THE_DETECTOR if self.detector else ("individuals", "detector_temperature_K"):
+            if getattr(self, key) != CameraTable.model_fields[key].default:
+                why = "the detector has its own; leave one out" if self.detector else "needs detector"
+                raise ValueError(f"{key} = {getattr(self, key)!r}: {why}")
         if self.exposure_min_s > self.exposure_max_s:
             raise ValueError(
                 f"exposure_min_s = {self.exposure_min_s:g}, "

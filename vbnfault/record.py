@@ -134,8 +134,7 @@ def proposal(scene: SceneConfig, table: plan.Plan, index: int) -> dict[str, Any]
     return {
         **{name: float(values[index]) for name, values in table.variables.items()},
         "injected": [name for name in table.faults if table.injects(name)[index]],
-        "architecture": world.mosaic_sensor(camera).architecture
-        if camera.detector
-        else camera.architectures[int(table.architecture[index])],
+        # a detector has its own
+        **({} if camera.detector else {"architecture": camera.architectures[int(table.architecture[index])]}),
         "readout_direction": camera.readout_directions[int(table.readout_direction[index])],
     }
