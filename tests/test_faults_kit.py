@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from vbnfault.camera import Camera, focal_length_mm
-from vbnfault.detector import Detector
+from vbnfault.detector import Detector, MosaicDetector, load_sensor
 from vbnfault.faults import Fault, FaultContext, from_dict
 from vbnfault.lens import ThinLens
-from vbnfault.quantities import RGBI, Electrons
+from vbnfault.quantities import RGBI, Charge, Electrons, Quantity, RawMosaic
 
 FOV_DEG = 40.0
 
@@ -31,6 +32,31 @@ def make_context(
         sun_xy_px=None if sun is None else np.array(sun),
         sun_visible_fraction=None if sun is None else visible,
     )
+
+
+def with_mosaic(context: FaultContext, **sensor: Any) -> FaultContext:
+    """The same with a mosaic detector, a CCD where the camera's architecture is one; `sensor` changes its keys."""
+    camera = context.camera
+    made = load_sensor("generic_ccd" if camera.is_ccd else "generic_cmos")
+    made = replace(made, architecture=camera.architecture, **sensor)
+    height, width = context.shape
+    direction = camera.readout_direction if camera.readout_direction in ("up", "down") else "up"
+    detector = MosaicDetector(sensor=made, seed=3, width_px=width, height_px=height, direction=direction)
+    return replace(context, camera=replace(camera, detector=detector))
+
+
+def noisy(step: str, context: FaultContext, seed: int = 0) -> Quantity:
+    """A quantity of a fault's step, random over all that it may be."""
+    if step == "electrons":
+        return noisy_electrons(context, seed)
+    if step == "rgbi":
+        return noisy_rgbi(context, seed)
+    detector = context.camera.detector
+    assert isinstance(detector, MosaicDetector)
+    generator, readout = np.random.default_rng(seed), detector.sensor.readout
+    if step == "raw":
+        return RawMosaic(array=generator.integers(0, readout.top_dn + 1, context.shape, dtype=np.uint16))
+    return Charge(array=generator.uniform(0, 2 * readout.full_well_e, context.shape).astype(np.float32))
 
 
 def flat_electrons(context: FaultContext, share: float = 0.5) -> Electrons:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +28,11 @@ class Camera:
     architecture: str = "full_frame_ccd"
     readout_direction: str = "right"
     exposure_s: float = 1e-3
+
+    @property
+    def optics(self) -> tuple[Any, ...]:
+        """What the electrons expected in its pixels depend on: cameras that share it share them."""
+        return self.lens, self.exposure_s, self.detector.optics_key
 
     @property
     def width_px(self) -> int:

@@ -5,7 +5,7 @@ All share radiance, exposure and noise, so they differ by the faults alone.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from . import labels
 from .camera import Camera
 from .detector import MosaicDetector
-from .faults import Fault, FaultContext, Params, physical_order
+from .faults import MOSAIC_STEPS, QUANTITIES, Fault, FaultContext, Params, physical_order
 from .quantities import RGBI, Electrons
 from .sample import Frame, stored_layers
 
@@ -116,7 +116,8 @@ def _key(drawn: Mapping[str, Params], names: Sequence[str]) -> tuple[tuple[str, 
 def _signal(frame: Frame, drawn: Mapping[str, Params], names: Sequence[str]) -> Electrons:
     """Expected electrons with the optical faults `names`, of those drawn; twins share what they have in common."""
     camera = _altered(frame, drawn)
-    if camera != frame.camera:
+    same = camera.optics == frame.camera.optics
+    if not same:
         cached: dict[Any, Electrons] = {}  # another instrument: not to be mixed with the others
     else:
         cached = frame.signals
@@ -128,7 +129,7 @@ def _signal(frame: Frame, drawn: Mapping[str, Params], names: Sequence[str]) -> 
             signal = _signal(frame, drawn, before)
             cached[key] = frame.spec.faults[last].apply(signal, drawn[last], context)
         else:
-            if camera == frame.camera:
+            if same:
                 signal = frame.rate.with_array(frame.rate.array * np.float32(camera.exposure_s))
             else:
                 signal = camera.detector.electrons_expected(camera.lens.image(frame.imaged), camera.exposure_s)
@@ -139,11 +140,12 @@ def _signal(frame: Frame, drawn: Mapping[str, Params], names: Sequence[str]) -> 
 def develop(frame: Frame, drawn: Mapping[str, Params], noise: Any) -> RGBI:
     """The finished picture with the faults `drawn`; noise-free without `noise`."""
     optical = _in_order(frame, drawn, "electrons")
+    inside = [name for step in MOSAIC_STEPS for name in _in_order(frame, drawn, step)]
     camera = _altered(frame, drawn)
-    key = (camera, _context(frame, drawn)[0], _key(drawn, optical), noise is None)
+    key = (camera, _context(frame, drawn)[0], _key(drawn, [*optical, *inside]), noise is None)
     if key not in frame.pictures:
-        signal = _signal(frame, drawn, optical)
-        frame.pictures[key] = camera.detector.develop(signal, camera.exposure_s, noise)
+        signal, acts = _signal(frame, drawn, optical), _acts(frame, drawn)
+        frame.pictures[key] = camera.detector.develop(signal, camera.exposure_s, noise, acts)
     return _read_out(frame, frame.pictures[key], drawn)
 
 
@@ -152,7 +154,19 @@ def _raw(frame: Frame, noise: Any) -> NDArray[np.uint16]:
     camera = _altered(frame, frame.drawn)
     assert isinstance(camera.detector, MosaicDetector)
     signal = _signal(frame, frame.drawn, _in_order(frame, frame.drawn, "electrons"))
-    return camera.detector.raw(signal, camera.exposure_s, noise)
+    return camera.detector.raw(signal, camera.exposure_s, noise, _acts(frame, frame.drawn))
+
+
+def _acts(frame: Frame, drawn: Mapping[str, Params]) -> dict[str, list[Callable[[Any], Any]]]:
+    """What the drawn faults do inside a detector with a mosaic, by its steps."""
+    context = _context(frame, drawn)[1]
+
+    def act(name: str) -> Callable[[Any], Any]:
+        fault = frame.spec.faults[name]
+        kind = QUANTITIES[fault.step]
+        return lambda array: fault.apply(kind(array=array), drawn[name], context).array  # type: ignore[type-var]
+
+    return {step: [act(name) for name in _in_order(frame, drawn, step)] for step in MOSAIC_STEPS}
 
 
 def _read_out(frame: Frame, picture: RGBI, drawn: Mapping[str, Params]) -> RGBI:
@@ -220,7 +234,7 @@ def _doubtful(frame: Frame, noise: Any) -> set[str]:
     faults, drawn = frame.spec.faults, frame.drawn
     if _altered(frame, drawn) != frame.camera:
         return set(drawn)
-    out = {name for name in drawn if faults[name].effect_mask}
+    out = {name for name in drawn if faults[name].effect_mask or faults[name].step in MOSAIC_STEPS}
     optical, readout = (_in_order(frame, drawn, step) for step in ("electrons", "rgbi"))
     # pixels enough to see what is plainly visible; the rest of the doubt is settled by `effect_of`
     some = (slice(frame.context.shape[0] // 32, None, 16), slice(None, None, 4))

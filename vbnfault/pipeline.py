@@ -65,6 +65,12 @@ def configure_faults(scene: SceneConfig, source: str = "scene") -> dict[str, Fau
             f"{source}: faults.vignetting.model = 'cos4': with camera.lens = {scene.camera.lens!r} pictures fall "
             "off as its rays do, and cos⁴ would count that twice; use model 'lens'"
         )
+    for name, fault in faults.items():
+        if fault.needs_mosaic and not scene.camera.detector:
+            raise InputError(
+                f"{source}: faults.{name}.model = {fault.model!r}: acts inside a detector with a mosaic; name a "
+                "camera.detector"
+            )
     for layer in scene.dataset.layers:
         if layer.startswith("without_") and layer != "without_straylight" and layer[8:] not in faults:
             raise InputError(f"{source}: dataset.layers: {layer!r}: the scene has no such fault")

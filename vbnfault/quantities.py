@@ -81,6 +81,23 @@ class RawDN(Quantity):
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
+class Charge(Quantity):
+    """Electrons in each pixel of a mosaic: expected, or collected."""
+
+    unit = "e-"
+    axes = ("y", "x")
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class RawMosaic(Quantity):
+    """Digital numbers of a mosaic, bias included."""
+
+    unit = "DN"
+    axes = ("y", "x")
+    dtype = np.uint16
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
 class RGBI(Quantity):
     """The 8 bit image: R, G, B and intensity."""
 

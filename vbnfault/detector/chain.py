@@ -10,8 +10,9 @@ pixels) are no charge: they have no shot noise.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import cv2
@@ -21,7 +22,7 @@ from numpy.typing import NDArray
 from ..quantities import LUMINANCE, RGBI
 from .charge import ChargeCloud, bloom, cti, parasitic_light, smear, smear_interline
 from .demosaic import correct_defects, demosaic, interpolate
-from .individual import Individual, dark_rate_e_s, make_individual, offset_e, response
+from .individual import Individual, IndividualSpec, dark_rate_e_s, make_individual, offset_e, response
 from .mosaic import channel_of
 from .readout import ReadoutIndividual, ReadoutNoise, read_out
 from .sensor import Sensor
@@ -29,6 +30,12 @@ from .three_colour import _normal_field, poisson_quantile, white_balance
 
 F32 = NDArray[np.float32]
 Raw = NDArray[np.uint16]
+
+# What may act on a picture under way, and where: on the electrons expected in each pixel, before shot noise; on
+# those collected; on the raw numbers.
+STEPS = ("pixels", "charge", "raw")
+Acts = Mapping[str, Sequence[Callable[[Any], Any]]]
+_NOTHING: Acts = {}
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -79,9 +86,7 @@ class Device:
         self.sensor, self.direction = sensor, direction
         self.shape = (sensor.height_px, sensor.width_px) if shape is None else shape
         self.temperature_K = sensor.temperature_K if temperature_K is None else temperature_K
-        self.individual: Individual = make_individual(
-            sensor.individual, self.shape, pixel_pitch_um=sensor.pixel_pitch_um, seed=seed
-        )
+        self.individual = individual(sensor.individual, self.shape, sensor.pixel_pitch_um, seed)
         self.readout_individual = ReadoutIndividual.draw(
             self.shape, sensor.readout, np.random.default_rng(np.random.SeedSequence([seed, *b"readout"]))
         )
@@ -121,17 +126,19 @@ class Device:
         return np.asarray(cv2.scaleAdd(self.dark_rate_e_s, exposure_s, light))
 
     def collected_e(
-        self, photo_e: F32, exposure_s: float, noise: MosaicNoise | None = None, particles_e: F32 | None = None
+        self, photo_e: F32, exposure_s: float, noise: MosaicNoise | None = None, acts: Acts = _NOTHING
     ) -> F32:
         """Charge at the output, float32[y, x] in e, before offsets and the readout."""
         sensor, move = self.sensor, self.sensor.transfer
         charge = self.expected_e(photo_e, exposure_s)
         if len(self.individual.rts):
             self._add_telegraph(charge, exposure_s, None if noise is None else noise.telegraph_seed)
+        for act in acts.get("pixels", ()):
+            charge = act(charge)
         if noise is not None:
             charge = poisson_quantile(charge, noise.shot)
-        if particles_e is not None:
-            charge = cv2.add(charge, particles_e)
+        for act in acts.get("charge", ()):
+            charge = act(charge)
         if sensor.architecture != "cmos":
             charge = bloom(
                 charge,
@@ -154,11 +161,9 @@ class Device:
                 )
         return charge
 
-    def raw(
-        self, photo_e: F32, exposure_s: float, noise: MosaicNoise | None = None, particles_e: F32 | None = None
-    ) -> Raw:
-        """Raw DN, uint16[y, x]; noise-free without `noise`."""
-        charge = cv2.add(self.collected_e(photo_e, exposure_s, noise, particles_e), self.offset_e)
+    def raw(self, photo_e: F32, exposure_s: float, noise: MosaicNoise | None = None, acts: Acts = _NOTHING) -> Raw:
+        """Raw DN, uint16[y, x]; noise-free without `noise`. `acts` are what faults do at the `STEPS`."""
+        charge = cv2.add(self.collected_e(photo_e, exposure_s, noise, acts), self.offset_e)
         stuck = self.individual.stuck
         raw = read_out(
             charge,
@@ -168,6 +173,8 @@ class Device:
         )
         if len(stuck):
             raw[stuck.row, stuck.column] = np.rint(stuck.level * self.sensor.readout.top_dn)
+        for act in acts.get("raw", ()):
+            raw = act(raw)
         return raw
 
     def _add_telegraph(self, charge: F32, exposure_s: float, seed: int | None) -> None:
@@ -192,11 +199,10 @@ class Device:
         mosaic: NDArray[Any] = raw
         if bad is not None and sensor.correct_defects:
             mosaic = correct_defects(raw, bad, sensor.pattern)
-        method: Any = sensor.demosaic if sensor.pattern.is_bayer else "bilinear"
         black = self.black_dn(exposure_s)
         gains = self.white_balance
         scale = 255.0 / max(sensor.readout.top_dn - black, 1.0) * gains
-        linear = demosaic(mosaic, sensor.pattern, method)
+        linear = demosaic(mosaic, sensor.pattern, sensor.method)
         rgb = cv2.multiply(
             cv2.subtract(linear, (black, black, black, 0.0)), (*scale.tolist(), 0.0), dtype=cv2.CV_8U
         )
@@ -218,6 +224,12 @@ class Device:
         """Gain of R, G, B, float32[3], at least 1, that makes a grey surface in sunlight grey."""
         name = self.sensor.response if len(self.sensor.pattern.channels) > 1 else "flat"
         return white_balance(name, self.sensor.quantum_efficiency_peak)
+
+
+@lru_cache(maxsize=4)
+def individual(spec: IndividualSpec, shape: tuple[int, int], pixel_pitch_um: float, seed: int) -> Individual:
+    """An individual, made once."""
+    return make_individual(spec, shape, pixel_pitch_um=pixel_pitch_um, seed=seed)
 
 
 def channel_sites(sensor: Sensor) -> dict[str, tuple[slice, slice]]:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..quantities import RGBI, Electrons, Irradiance
-from .chain import Device, MosaicNoise
+from .chain import Acts, Device, MosaicNoise
 from .dark import silicon_factor
 from .mosaic import sample
 from .sensor import Sensor
@@ -105,18 +105,27 @@ class MosaicDetector:
         """Variates of one exposure, by the generators of their names."""
         return MosaicNoise.draw(shape, rng("shot"), rng("read"), rng("row"))
 
-    def raw(self, expected: Electrons, exposure_s: float, noise: Any) -> NDArray[np.uint16]:
-        """Raw mosaic, uint16[y, x]; noise-free without `noise`, which is what `draw_noise` gives."""
+    def raw(
+        self, expected: Electrons, exposure_s: float, noise: Any, acts: Acts | None = None
+    ) -> NDArray[np.uint16]:
+        """Raw mosaic, uint16[y, x]; noise-free without `noise`, which is what `draw_noise` gives. `acts` are what
+        faults do on the way (`chain.STEPS`)."""
         pattern = self.sensor.pattern
         mosaic = sample(expected.array, pattern) if pattern.is_bayer else expected.array[..., 0]
-        return self._device.raw(np.ascontiguousarray(mosaic), exposure_s, noise)
+        return self.device.raw(np.ascontiguousarray(mosaic), exposure_s, noise, acts or {})
 
-    def develop(self, expected: Electrons, exposure_s: float, noise: Any) -> RGBI:
+    def develop(self, expected: Electrons, exposure_s: float, noise: Any, acts: Acts | None = None) -> RGBI:
         """The 8 bit picture of expected photo-electrons."""
-        return self._device.rgbi(self.raw(expected, exposure_s, noise), exposure_s)
+        return self.device.rgbi(self.raw(expected, exposure_s, noise, acts), exposure_s)
 
     @property
-    def _device(self) -> Device:
+    def optics_key(self) -> Any:
+        """What the electrons expected behind the filters depend on."""
+        return self._planes
+
+    @property
+    def device(self) -> Device:
+        """The device at work."""
         return _device(self.sensor, self.seed, (self.height_px, self.width_px), self.direction)
 
 

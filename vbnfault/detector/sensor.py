@@ -9,11 +9,12 @@ import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, get_type_hints
+from typing import Any, cast, get_type_hints
 
 from .. import resources, spectra
 from ..errors import InputError
 from .charge import ChargeCloud, TrapSpecies
+from .demosaic import Method
 from .individual import IndividualSpec
 from .mosaic import Pattern
 from .mosaic import pattern as pattern_of
@@ -83,6 +84,11 @@ class Sensor:
             value = getattr(self, key)
             if not low <= value <= high:
                 raise InputError(f"{key} = {value:g}: must be from {low:g} to {high:g}")
+
+    @property
+    def method(self) -> Method:
+        """How its mosaics are interpolated: other patterns than Bayer's bilinearly."""
+        return cast(Method, self.demosaic) if self.pattern.is_bayer else "bilinear"
 
 
 def load_sensor(name_or_path: str | Path) -> Sensor:

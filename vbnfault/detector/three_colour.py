@@ -158,7 +158,12 @@ class Detector:
         show = self._shower(exposure_s)
         return RGBI(array=_blockwise(lambda dn: show(dn.astype(np.float32)), raw.array))
 
-    def develop(self, expected: Electrons, exposure_s: float, noise: Any) -> RGBI:
+    @property
+    def optics_key(self) -> Any:
+        """What the electrons expected depend on."""
+        return self
+
+    def develop(self, expected: Electrons, exposure_s: float, noise: Any, acts: Any = None) -> RGBI:
         """The 8 bit image of expected photo-electrons: all later steps at once, block by block, so that what
         lies between never leaves the cache. Noise-free without `noise`, which is what `draw_noise` gives."""
         collect, show = self._collector(exposure_s), self._shower(exposure_s)

@@ -2,7 +2,10 @@
 
 from .base import (
     FAULT_AXIS,
+    MOSAIC_STEPS,
     PHYSICAL_ORDER,
+    QUANTITIES,
+    STEPS,
     Fault,
     FaultContext,
     Interval,
@@ -16,7 +19,10 @@ from .base import (
 
 __all__ = [
     "FAULT_AXIS",
+    "MOSAIC_STEPS",
     "PHYSICAL_ORDER",
+    "QUANTITIES",
+    "STEPS",
     "Fault",
     "FaultContext",
     "Interval",

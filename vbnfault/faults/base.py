@@ -18,10 +18,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..camera import Camera
+from ..detector.chain import STEPS as MOSAIC_STEPS
 from ..errors import InputError
 from ..lens import load_lens
 from ..lens.footprint import DEFAULT_LENS, Frame
-from ..quantities import RGBI, Electrons
+from ..quantities import RGBI, Charge, Electrons, Quantity, RawMosaic
 
 Params = dict[str, Any]
 T = TypeVar("T")
@@ -45,7 +46,14 @@ PHYSICAL_ORDER = (
     "optics_degradation",
     "vignetting",
     "broken_pixels",
+    "smear",
+    "cosmic_rays",
+    "blooming",
+    "cti",
+    "banding",
+    "adc",
     "broken_lines",
+    "transmission",
 )
 
 REFERENCE_WIDTH_PX = 1024
@@ -159,7 +167,17 @@ class FaultContext:
         return result
 
 
-Q = TypeVar("Q", Electrons, RGBI)
+Q = TypeVar("Q", Electrons, Charge, RawMosaic, RGBI)
+
+# Where a fault may act. The steps between the first and the last are those of a detector with a mosaic.
+STEPS = ("electrons", *MOSAIC_STEPS, "rgbi")
+QUANTITIES: dict[str, type[Quantity]] = {
+    "electrons": Electrons,
+    "pixels": Charge,
+    "charge": Charge,
+    "raw": RawMosaic,
+    "rgbi": RGBI,
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -167,7 +185,9 @@ class Fault:
     """Base of all fault models; every hook is the identity by default.
 
     Class attributes of a model: `fault` (its class), `model`, `step` (what `apply` receives: `electrons`, the
-    expected photo-electrons on the sensor, or `rgbi`), `localised` (False where the footprint is about the
+    expected photo-electrons on the sensor; of a mosaic `pixels`, the electrons expected in each pixel, `charge`,
+    those collected, or `raw`; or `rgbi`), `needs_mosaic` (also True where `alter` changes such a detector),
+    `localised` (False where the footprint is about the
     whole frame), `needs_sun`, `effect_mask` (True: the mask is the effect rule, not the footprint).
     """
 
@@ -176,6 +196,7 @@ class Fault:
     step: ClassVar[str]
     localised: ClassVar[bool] = True
     needs_sun: ClassVar[bool] = False
+    needs_mosaic: ClassVar[bool] = False
     effect_mask: ClassVar[bool] = False
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
