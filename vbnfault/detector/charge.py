@@ -246,11 +246,9 @@ def cti(
         return signal_e.copy()
     weights = _trap_weights(species, transfer_s, len(image), transfers_before, trail_left_out)
     weights *= np.float32(1 / passes)
-    # all the traps a packet meets
-    most = np.arange(1 + transfers_before, 1 + transfers_before + len(image)) * sum(
-        s.density_per_px for s in species
-    )
-    per_cloud = (passes / most).astype(np.float32)[:, None]
+    density = sum(s.density_per_px for s in species)
+    met = density * (np.arange(len(image)) + 1.0 + transfers_before)  # all the traps a packet passes
+    per_cloud = (passes / met).astype(np.float32)[:, None]
     for _ in range(passes):
         _clock(image, cloud, weights, per_cloud)
     return _facing(image, direction, back=True)
@@ -271,9 +269,8 @@ def _trap_weights(
     row = np.arange(height)
     behind = row - j  # packets before the window
     weights = f[:-1, None] + (f[:-1] - f[1:])[:, None] * (behind + before)
-    weights += np.where(
-        behind == 0, before * f[1:, None], 0
-    )  # ahead of the image, the first packet finds traps empty
+    # in the pixels ahead, the first packet finds empty traps
+    weights += np.where(behind == 0, before * f[1:, None], 0)
     return np.where(behind >= 0, weights, 0).astype(np.float32)
 
 
