@@ -345,6 +345,8 @@ def test_cloud_volume_is_its_formula() -> None:
         cloud = ChargeCloud(full_well_e=84_700.0, notch_e=96.5, fill_power=power)
         expected = np.clip((signal.astype(np.float64) - 96.5) / (84_700 - 96.5), 0, 1) ** power
         np.testing.assert_allclose(cloud.volume(signal), expected, rtol=1e-5)
+        columns = np.repeat(signal, 3, axis=0).T  # any layout
+        np.testing.assert_array_equal(cloud.volume(columns), np.repeat(cloud.volume(signal), 3, axis=0).T)
 
 
 def clocked_constant(column: np.ndarray, inefficiency: float, before: int) -> np.ndarray:

@@ -193,7 +193,7 @@ class ChargeCloud:
 
     def volume(self, signal_e: F32) -> F32:
         """Share of the well filled, float32 in [0, 1], shape kept."""
-        share = signal_e - np.float32(self.notch_e)
+        share = np.ascontiguousarray(signal_e) - np.float32(self.notch_e)
         share *= np.float32(1 / (self.full_well_e - self.notch_e))
         # OpenCV clips and takes powers several times faster than numpy
         cv2.max(share, 0.0, dst=share)
@@ -227,7 +227,7 @@ def cti(
     f(j) = Σ ρ exp(−j t/τ), the traps hold after packet i Σ_j V_j [f(j) + (f(j) − f(j+1)) (i − j)] electrons, and
     packet i leaves with its charge and the change of that sum. `passes` cuts the transfers into that many equal
     parts, each with the clouds that the former left: the error is of second order in the loss, and falls as
-    1/passes. A packet never gives more than it has. Trails end where `trail_left_out` of the trapped charge is
+    1/passes, until float32 rounds more (some 16). A packet never gives more than it has. Trails end where `trail_left_out` of the trapped charge is
     left: f is lowered by a constant to reach 0 there and scaled to keep f(0), so that nothing is lost; the cost
     rises with the longest release time. Sums are kept but for charge still trapped when the last row has left.
 
