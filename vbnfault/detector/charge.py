@@ -227,9 +227,11 @@ def cti(
     f(j) = Σ ρ exp(−j t/τ), the traps hold after packet i Σ_j V_j [f(j) + (f(j) − f(j+1)) (i − j)] electrons, and
     packet i leaves with its charge and the change of that sum. `passes` cuts the transfers into that many equal
     parts, each with the clouds that the former left: the error is of second order in the loss, and falls as
-    1/passes, until float32 rounds more (some 16). A packet never gives more than it has. Trails end where `trail_left_out` of the trapped charge is
-    left: f is lowered by a constant to reach 0 there and scaled to keep f(0), so that nothing is lost; the cost
-    rises with the longest release time. Sums are kept but for charge still trapped when the last row has left.
+    1/passes, until float32 rounds more (beyond some 16). A packet never gives more than it has.
+
+    Trails end where `trail_left_out` of the trapped charge is left: f is lowered by a constant to reach 0 there
+    and scaled to keep f(0), so that nothing is lost; the cost rises with the longest release time. Sums are kept
+    but for charge still trapped when the last row has left.
 
     Raises InputError unless transfer_s > 0, transfers_before ≥ 0, passes ≥ 1, 0 < trail_left_out < 1.
     """
