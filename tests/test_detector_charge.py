@@ -80,6 +80,16 @@ def test_lines_do_not_know_each_other(effect: str) -> None:
     assert (got[:, 4] != twin[:, 4]).mean() > 0.5
 
 
+@pytest.mark.parametrize("direction", ["up", "left", "right"])
+@pytest.mark.parametrize("effect", EFFECTS)
+def test_read_only_planes_of_a_mosaic_are_taken(effect: str, direction: str) -> None:
+    mosaic = scene(1, (2 * SHAPE[0], 2 * SHAPE[1]))
+    mosaic.flags.writeable = False
+    for plane in (mosaic[::2, 1::2], mosaic.T[:, ::3], mosaic[:1, :1], mosaic[:1], mosaic[:, :1]):
+        expected = EFFECTS[effect](plane.copy("C"), direction)
+        np.testing.assert_array_equal(EFFECTS[effect](plane, direction), expected)
+
+
 def test_charge_moves_where_the_direction_says() -> None:
     image = np.zeros((9, 9), np.float32)
     image[4, 4] = 1000.0
@@ -335,6 +345,8 @@ def test_cloud_volume_is_its_formula() -> None:
         cloud = ChargeCloud(full_well_e=84_700.0, notch_e=96.5, fill_power=power)
         expected = np.clip((signal.astype(np.float64) - 96.5) / (84_700 - 96.5), 0, 1) ** power
         np.testing.assert_allclose(cloud.volume(signal), expected, rtol=1e-5)
+        columns = np.repeat(signal, 3, axis=0).T  # any layout
+        np.testing.assert_array_equal(cloud.volume(columns), np.repeat(cloud.volume(signal), 3, axis=0).T)
 
 
 def clocked_constant(column: np.ndarray, inefficiency: float, before: int) -> np.ndarray:

@@ -93,7 +93,11 @@ def test_charge_is_moyals_with_80_electrons_per_um() -> None:
     assert stats.kstest(per_um, stats.moyal(loc=location, scale=XI_E_PER_UM).cdf).pvalue > 1e-3
     assert stats.moyal.mean() == pytest.approx(MOYAL_MEAN)
     # ½ · 0.307 MeV cm²/mol · 0.498 mol/g · 2.33 g/cm³ = 178 keV/cm; 3.65 eV a pair
+<<<<<<< HEAD
     assert pytest.approx(17.8 / 3.65, rel=2e-3) == XI_E_PER_UM
+=======
+    assert abs(XI_E_PER_UM - 17.8 / 3.65) < 0.01
+>>>>>>> det-hc
     assert per_um.min() > 40
 
 
@@ -158,8 +162,6 @@ def test_chords_against_points_along_the_track(model: CosmicRayModel) -> None:
 
 def test_pixels_fluctuate_as_moyals_distribution_does() -> None:
     # 20 pixels each: the scale to the total takes one of 20 degrees of freedom
-    rays = many()
-    row = np.arange(500.0)
     track = {
         "depth_um": 0.0,
         "theta_deg": 90.0,
@@ -168,7 +170,7 @@ def test_pixels_fluctuate_as_moyals_distribution_does() -> None:
         "electrons": 16_000.0,
         "x_px": 0.0,
     }
-    params = [{**track, "y_px": y + 0.5, "seed": int(seed)} for y, seed in zip(row, rays.seed, strict=False)]
+    params = [{**track, "y_px": row + 0.5, "seed": row} for row in range(500)]
     image = MODEL.image(CosmicRays.from_params(params), (500, 20)).astype(np.float64)
     np.testing.assert_allclose(image.sum(axis=1), 16_000, rtol=1e-6)
     per_um = image / 10
@@ -179,9 +181,9 @@ def test_pixels_fluctuate_as_moyals_distribution_does() -> None:
     assert stats.skew(per_um.ravel()) == pytest.approx(1.5, abs=0.4)
     # neither from pixel to pixel (but for that division: −1/19) nor from track to track
     along = np.corrcoef(image[:, 1:].ravel(), image[:, :-1].ravel())[0, 1]
-    across = np.corrcoef(image[1:].ravel(), image[:-1].ravel())[0, 1]
     assert along == pytest.approx(-1 / 19, abs=4 / 100)
-    assert across == pytest.approx(0, abs=4 / 100)
+    for other, same in ((image[1:], image[:-1]), (image[1:, :-1], image[:-1, 1:])):  # seeds that follow each other
+        assert np.corrcoef(other.ravel(), same.ravel())[0, 1] == pytest.approx(0, abs=4 / 100)
 
 
 def test_image_holds_what_was_drawn() -> None:
@@ -247,6 +249,11 @@ def test_diffusion_spreads_charge_by_its_depth() -> None:
         # 4 σ of the far face, a Gaussian loses at most 0.1 % of its variance
         assert (profile * at).sum() == pytest.approx(centre, abs=1e-6)
         assert (profile * (at - centre) ** 2).sum() == pytest.approx(4.5 + 1 / 12, rel=2e-3)
+    aside = model.image(one(x_px=33.5, y_px=25.0), (51, 61))
+    np.testing.assert_allclose(aside[:, 3:].sum(axis=0), image[:, :-3].sum(axis=0), rtol=1e-4, atol=1e-3)
+    rows = aside[:50].sum(axis=1)  # the track on the border of two rows
+    np.testing.assert_allclose(rows, rows[::-1], rtol=1e-4, atol=0.1)
+    assert rows[24] > 1.001 * rows[23]
     shallow = model.image(one(x_px=30.5, y_px=25.5, length_um=0.1), (51, 61))
     assert shallow[25, 30] > 0.9 * shallow.sum()  # σ is 0.15 µm there
     deep = model.image(one(x_px=30.5, y_px=25.5, depth_um=19.9, length_um=0.1), (51, 61))

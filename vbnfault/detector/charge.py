@@ -32,7 +32,7 @@ DIRECTIONS = ("up", "down", "left", "right")
 # Constant CTI: the part of a packet that trails further than the last pixel computed.
 _TRAIL_LEFT_OUT = 1e-9
 
-_ROWS_PER_BLOCK = 32
+_ROWS_PER_BLOCK = 64
 
 
 # ------------------------------------------------------------------------------------------------------ smear
@@ -118,7 +118,7 @@ def bloom(signal_e: F32, *, full_well_e: float, antiblooming: float = 0.0, direc
     _known(direction)
     if signal_e.size == 0 or signal_e.max() <= full_well_e:
         return signal_e.copy()
-    image = _facing(signal_e, direction)
+    image = _facing(signal_e.copy() if direction == "up" else signal_e, direction)
     columns = np.flatnonzero(image.max(axis=0) > full_well_e)
     count = len(columns)
     # both orders side by side: the current to the last row comes first in the left part, last in the right one
@@ -193,7 +193,7 @@ class ChargeCloud:
 
     def volume(self, signal_e: F32) -> F32:
         """Share of the well filled, float32 in [0, 1], shape kept."""
-        share = signal_e - np.float32(self.notch_e)
+        share = np.ascontiguousarray(signal_e) - np.float32(self.notch_e)
         share *= np.float32(1 / (self.full_well_e - self.notch_e))
         # OpenCV clips and takes powers several times faster than numpy
         cv2.max(share, 0.0, dst=share)
@@ -227,9 +227,11 @@ def cti(
     f(j) = Σ ρ exp(−j t/τ), the traps hold after packet i Σ_j V_j [f(j) + (f(j) − f(j+1)) (i − j)] electrons, and
     packet i leaves with its charge and the change of that sum. `passes` cuts the transfers into that many equal
     parts, each with the clouds that the former left: the error is of second order in the loss, and falls as
-    1/passes. A packet never gives more than it has. Trails end where `trail_left_out` of the trapped charge is
-    left: f is lowered by a constant to reach 0 there and scaled to keep f(0), so that nothing is lost; the cost
-    rises with the longest release time. Sums are kept but for charge still trapped when the last row has left.
+    1/passes, until float32 rounds more (beyond some 16). A packet never gives more than it has.
+
+    Trails end where `trail_left_out` of the trapped charge is left: f is lowered by a constant to reach 0 there
+    and scaled to keep f(0), so that nothing is lost; the cost rises with the longest release time. Sums are kept
+    but for charge still trapped when the last row has left.
 
     Raises InputError unless transfer_s > 0, transfers_before ≥ 0, passes ≥ 1, 0 < trail_left_out < 1.
     """
@@ -241,47 +243,39 @@ def cti(
     if not 0 < trail_left_out < 1:
         raise InputError(f"trail_left_out = {trail_left_out:g}: must be between 0 and 1")
     species = [s for s in species if s.density_per_px > 0]
-    image = _facing(signal_e, direction)
+    image = _facing(signal_e.copy() if direction == "up" else signal_e, direction)
     if not species or image.shape[0] == 0:
         return signal_e.copy()
-    weights = _trap_weights(species, transfer_s, len(image), transfers_before, trail_left_out)
-    weights *= np.float32(1 / passes)
-    # all the traps a packet meets
-    most = np.arange(1 + transfers_before, 1 + transfers_before + len(image)) * sum(
-        s.density_per_px for s in species
-    )
-    per_cloud = (passes / most).astype(np.float32)[:, None]
+    trapped = _trapped(species, transfer_s, len(image), trail_left_out) / passes
+    density = sum(s.density_per_px for s in species)
+    met = density * (np.arange(len(image)) + 1.0 + transfers_before)  # all the traps a packet passes
+    per_cloud = (passes / met).astype(np.float32)[:, None]
     for _ in range(passes):
-        _clock(image, cloud, weights, per_cloud)
+        _clock(image, cloud, per_cloud, trapped, transfers_before)
     return _facing(image, direction, back=True)
 
 
-def _trap_weights(
-    species: Iterable[TrapSpecies], transfer_s: float, height: int, before: int, left_out: float
-) -> F32:
-    """float32[j, y]: electrons held after row y per unit of the largest cloud of the rows y−j … y (see `cti`)."""
+def _trapped(species: Iterable[TrapSpecies], transfer_s: float, height: int, left_out: float) -> F64:
+    """f of `cti`, float64[j]: electrons that the traps of a pixel within a cloud hold j transfers after it."""
     f = np.zeros(height + 1)
     for s in species:
         f += s.density_per_px * np.exp(-np.arange(height + 1) * (transfer_s / s.release_time_s))
     window = 1 + int(np.count_nonzero(f[1:] > left_out * f[0]))
     if window < height:
         f = (f[: window + 1] - f[window]) * (f[0] / (f[0] - f[window]))
-    window = len(f) - 1
-    j = np.arange(window)[:, None]
-    row = np.arange(height)
-    behind = row - j  # packets before the window
-    weights = f[:-1, None] + (f[:-1] - f[1:])[:, None] * (behind + before)
-    weights += np.where(
-        behind == 0, before * f[1:, None], 0
-    )  # ahead of the image, the first packet finds traps empty
-    return np.where(behind >= 0, weights, 0).astype(np.float32)
+    return f
 
 
-def _clock(image: F32, cloud: ChargeCloud, weights: F32, per_cloud: F32) -> None:
-    """One pass of `cti` towards row 0, in place, block by block of rows."""
-    height, window = len(image), len(weights)
+def _clock(image: F32, cloud: ChargeCloud, per_cloud: F32, trapped: F64, before: int) -> None:
+    """One pass of `cti` towards row 0, in place, block by block of rows.
+
+    `per_cloud` float32[y, 1] bounds a cloud to what its packet can give.
+    """
+    height = len(image)
     volume = np.empty(image.shape, dtype=np.float32)
     held = np.empty(image.shape, dtype=np.float32)
+    released = (trapped[:-1] - trapped[1:]).tolist()
+    f = trapped.tolist()
 
     def fill(rows: slice) -> None:
         cv2.min(cloud.volume(image[rows]), image[rows] * per_cloud[rows], dst=volume[rows])
@@ -289,14 +283,20 @@ def _clock(image: F32, cloud: ChargeCloud, weights: F32, per_cloud: F32) -> None
     def hold(rows: slice) -> None:
         start, stop = rows.start, rows.stop
         largest = volume[rows].copy()
-        total = np.multiply(largest, weights[0, rows, None], out=held[rows])
-        scratch = np.empty_like(largest)
-        for j in range(1, min(window, stop)):
+        total = held[rows]
+        total[:] = 0
+        slope = np.zeros_like(largest)  # a lag's weight is linear in the row: two numbers, counted from `start`
+        for j in range(min(len(released), stop)):
             skip = max(j - start, 0)  # rows that have no packet j rows ahead
-            part, work = (largest, scratch) if not skip else (largest[skip:], scratch[skip:])
-            np.maximum(part, volume[start + skip - j : stop - j], out=part)
-            np.multiply(part, weights[j, start + skip : stop, None], out=work)
-            total[skip:] += work
+            part = largest[skip:]
+            if j:
+                np.maximum(part, volume[start + skip - j : stop - j], out=part)
+            if j >= start:  # in the pixels ahead, the first packet finds empty traps
+                total[skip] += part[0] * np.float32(before * f[j + 1])
+            cv2.scaleAdd(part, f[j] + released[j] * (start - j + before), total[skip:], dst=total[skip:])
+            cv2.scaleAdd(part, released[j], slope[skip:], dst=slope[skip:])
+        slope *= np.arange(stop - start, dtype=np.float32)[:, None]
+        total += slope
 
     def leave(rows: slice) -> None:
         part = image[rows]
@@ -396,11 +396,11 @@ def lag(signal_e: F32, former_e: F32, *, fraction: float) -> F32:
 
 
 def _facing(image: F32, direction: str, *, back: bool = False) -> F32:
-    """A contiguous copy of the image, turned so that charge moves to row 0, or turned `back`."""
+    """The image turned so that charge moves to row 0, or turned `back`; contiguous, a copy unless "up"."""
     _known(direction)
     sideways = direction in ("left", "right")
     if direction == "up":
-        return image if back else image.copy()
+        return np.ascontiguousarray(image)
     if sideways and not back:
         image = cv2.transpose(image)  # much faster than numpy's
     if direction in ("down", "right"):

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from ..detector.chain import Device, individual
 from ..detector.demosaic import footprint
-from ..detector.individual import dark_rate_e_s, offset_e, response
+from ..detector.individual import dark_rate_e_s, offset_e
 from .base import Fault, FaultContext, Interval, Params, bounds, number
 
 F32 = NDArray[np.float32]
@@ -48,8 +48,8 @@ class HotPixels(Fault):
     dead_per_year: float = number(
         2e-7, limits=(0, 1e-3), unit="1/yr", doc="share of pixels that die in a year on the ground; assumed"
     )
-    mask_level_dn: float = number(
-        0.5, limits=(0.01, 255), unit="DN of 255", doc="the footprint holds what is moved by at least this much"
+    least_dn: float = number(
+        0.5, limits=(0.001, 255), unit="DN of 255", doc="defects that add less at this exposure are left out"
     )
 
     def draw(self, context: FaultContext, rng: np.random.Generator) -> Params:
@@ -60,10 +60,10 @@ class HotPixels(Fault):
             "dose_TeV_g": self.dose_TeV_g.uniform(rng),
             "clustered_share": float(self.clustered_share),
             "dead_per_year": float(self.dead_per_year),
-            "mask_level_dn": float(self.mask_level_dn),
+            "least_dn": float(self.least_dn),
         }
         extra, kept = _damage(params, context)
-        changed = np.flatnonzero((extra.ravel() >= 1) | (kept.ravel() < 1))
+        changed = np.flatnonzero((extra.ravel() > 0) | (kept.ravel() < 1))
         order = changed[np.argsort(-extra.ravel()[changed], kind="stable")][:_MOST_LISTED]
         width = context.shape[1]
         params["count"] = len(changed)
@@ -78,12 +78,10 @@ class HotPixels(Fault):
         return quantity.with_array(quantity.array * kept + extra)
 
     def footprint(self, params: Params, context: FaultContext) -> NDArray[np.bool_]:
-        """bool[y, x]: pixels of the picture that a defect of at least `mask_level_dn` can reach."""
+        """bool[y, x]: pixels of the picture that a defect can reach."""
         extra, kept = _damage_once(params, context)
         detector: Any = context.camera.detector
-        level = detector.full_well_e / 255 * params["mask_level_dn"]
-        sensor = detector.sensor
-        return footprint((extra >= level) | (kept < 1), sensor.pattern, sensor.method)
+        return footprint((extra > 0) | (kept < 1), detector.sensor.pattern, detector.sensor.method)
 
 
 def _damage_once(params: Params, context: FaultContext) -> tuple[F32, F32]:
@@ -110,6 +108,10 @@ def _damage(params: Params, context: FaultContext) -> tuple[F32, F32]:
     old = individual(spec, device.shape, own.pixel_pitch_um, own.seed)
     exposure_s = context.camera.exposure_s
     rate = dark_rate_e_s(old, device.temperature_K) - device.dark_rate_e_s
-    extra = np.maximum(rate * np.float32(exposure_s) + (offset_e(old) - device.offset_e), 0)
-    kept = response(old) / np.maximum(device.response, np.float32(1e-6))
-    return extra.astype(np.float32), np.minimum(kept, 1).astype(np.float32)
+    extra = rate * np.float32(exposure_s) + (offset_e(old) - device.offset_e)
+    extra[extra < detector.full_well_e / 255 * params["least_dn"]] = 0
+    kept = np.ones(device.shape, dtype=np.float32)
+    np.multiply.at(kept, (old.dead.row, old.dead.column), old.dead.response)
+    was = own.dead
+    kept[was.row, was.column] = 1
+    return extra.astype(np.float32), kept
