@@ -93,11 +93,7 @@ def test_charge_is_moyals_with_80_electrons_per_um() -> None:
     assert stats.kstest(per_um, stats.moyal(loc=location, scale=XI_E_PER_UM).cdf).pvalue > 1e-3
     assert stats.moyal.mean() == pytest.approx(MOYAL_MEAN)
     # ½ · 0.307 MeV cm²/mol · 0.498 mol/g · 2.33 g/cm³ = 178 keV/cm; 3.65 eV a pair
-<<<<<<< HEAD
-    assert pytest.approx(17.8 / 3.65, rel=2e-3) == XI_E_PER_UM
-=======
     assert abs(XI_E_PER_UM - 17.8 / 3.65) < 0.01
->>>>>>> det-hc
     assert per_um.min() > 40
 
 
