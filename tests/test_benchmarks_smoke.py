@@ -32,6 +32,8 @@ def test_benchmarks_print_every_stage_and_ratio(tmp_path: Path) -> None:
             "pytest",
             "benchmarks",
             "--benchmark-only",
+            "-n",
+            "0",
             "-p",
             "no:cacheprovider",
             *options,

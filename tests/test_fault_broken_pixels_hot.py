@@ -53,12 +53,14 @@ def test_age_and_dose_keep_what_is_there() -> None:
     where = context(0.1)
     young, old = (added(where, drawn(where, years=y, least_dn=0.01)) for y in (2.0, 8.0))
     assert (young > 0).sum() < (old > 0).sum()
-    np.testing.assert_allclose(old[young > 0], young[young > 0], rtol=1e-5)
-    hit = added(where, drawn(where, dose_TeV_g=0.5, least_dn=0.01))
-    assert (hit > 0).sum() > 2 * (old > 0).sum()
+    # a later defect may fall on an earlier one
+    assert (old[young > 0] > 0.99999 * young[young > 0]).all()
+    assert np.mean(old[young > 0] < 1.00001 * young[young > 0]) > 0.9
+    hit, unhurt = (added(where, drawn(where, growth_factor=1.0, dose_TeV_g=d, least_dn=0.01)) for d in (20.0, 0.0))
+    assert (hit > 0).sum() > (unhurt > 0).sum() + 100
     cold = replace(where.camera.detector, sensor=replace(where.camera.detector.sensor, temperature_K=253.0))  # type: ignore[union-attr, type-var]
     frozen = replace(where, camera=replace(where.camera, detector=cold))
-    params = drawn(where, dose_TeV_g=0.5, growth_factor=1.0, least_dn=0.001)
+    params = drawn(where, dose_TeV_g=20.0, growth_factor=1.0, least_dn=0.001)
     # 0.63 eV from 293 to 253 K, in all pixels whose damage shows in both: a factor of 51.6
     warm, less = added(where, params), added(frozen, params)
     both = (warm > 0) & (less > 0)
@@ -67,7 +69,8 @@ def test_age_and_dose_keep_what_is_there() -> None:
 
 def test_defects_stay_in_their_mask_when_the_mosaic_spreads_them() -> None:
     where = context(0.1)
-    fault = make("broken_pixels", model="hot_pixels", **KEYS, dead_per_year=1e-5, least_dn=2.0)
+    keys = KEYS | {"growth_factor": 2e3, "dead_per_year": 1e-6, "least_dn": 2.0}
+    fault = make("broken_pixels", model="hot_pixels", **keys)
     params = fault.draw(where, rng(2))
     assert 0 < params["count"] < 400
     detector: Any = where.camera.detector

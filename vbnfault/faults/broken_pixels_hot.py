@@ -26,6 +26,7 @@ from .base import Fault, FaultContext, Interval, Params, bounds, number
 F32 = NDArray[np.float32]
 
 _MOST_LISTED = 256
+_MOST_DEAD = 0.1  # share of pixels that die in a year, at most
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -103,7 +104,7 @@ def _damage(params: Params, context: FaultContext) -> tuple[F32, F32]:
         if growth is None
         else replace(growth, log10_scale=growth.log10_scale + float(np.log10(factor))),
         hot_clustered_share=params["clustered_share"],
-        dead_share_yr=params["dead_per_year"] * factor,
+        dead_share_yr=min(params["dead_per_year"] * factor, _MOST_DEAD),
     )
     old = individual(spec, device.shape, own.pixel_pitch_um, own.seed)
     exposure_s = context.camera.exposure_s
