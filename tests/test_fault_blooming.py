@@ -58,7 +58,7 @@ def test_a_lost_drain() -> None:
     params = fault.draw(c, rng())
     assert (params["full_well_e"], params["antiblooming"]) == (FULL_WELL_E, 0.0)
     light = np.zeros(c.shape, np.float32)
-    light[30, 10] = 3 * FULL_WELL_E
+    light[30, 10] = 3.5 * FULL_WELL_E
     acts = {"charge": [lambda a: fault.apply(Charge(array=a), params, c).array]}
     drained, lost = (detector.device.collected_e(light, 0.01, None, a) for a in ({}, acts))
     assert drained[29, 10] < 10

@@ -93,7 +93,7 @@ def test_nothing_where_there_is_no_transfer(architecture: str, transfer: dict[st
 
 def test_it_shows_in_a_picture() -> None:
     c = context("frame_transfer_ccd")
-    fault = make("cti", parallel_per_px=8)
+    fault = make("cti", parallel_per_px=100)  # over 64 rows as 6 over 1024
     camera = fault.alter(c.camera, fault.draw(c, rng()))
     white = camera.detector.white_e
     light = np.zeros((*c.shape, 3), np.float32)
@@ -104,6 +104,6 @@ def test_it_shows_in_a_picture() -> None:
         for k in (c.camera, camera)
     )
     change = (after - before)[:, 26:38].mean(axis=1)
-    assert change[42] > 0.3  # a trail below
-    assert change[24] < -0.3  # the first row of the square lost most
-    assert np.abs(change[:20]).max() < 0.5
+    assert change[40] > 3  # the first of the trail below
+    assert change[24] < -2  # the first row of the square lost most
+    assert np.abs(change[:20]).max() < 1
