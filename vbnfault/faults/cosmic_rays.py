@@ -1,0 +1,144 @@
+"""Cosmic rays: tracks of charged particles through the sensitive layer, as in a solar particle event.
+
+Quiet time at L2 is 4.67 protons per cm² s (CREME96): hardly a track in a picture of milliseconds. Events of NOAA's
+scale S2, 100 particles per cm² s sr above 10 MeV, are 1.3e3 over all directions; that of 14 July 2000, 24 000, is
+3e5 (recalled). What a housing stops is for the flux to leave out.
+
+A minimum-ionising particle sets some 80 e/µm free in silicon, a proton of 50 MeV 630 (Bethe's formula, 3.65 eV per
+pair); one value holds for all tracks of a picture (assumed). The spread of a track's charge grows in proportion:
+both go as 1/β², the logarithm aside.
+
+Charge comes after the shot noise, with which it has nothing to do, and before wells overflow and traps take it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+from ..detector.cosmic import XI_E_PER_UM, CosmicRayModel, CosmicRays
+from ..detector.demosaic import footprint
+from .base import Fault, FaultContext, Interval, Params, bounds, number
+
+F32 = NDArray[np.float32]
+
+_MINIMUM_E_PER_UM = 80.0  # the mean to which XI_E_PER_UM belongs
+_LEAST_READOUT_S = 0.05  # assumed
+_ASSUMED_DEPTH_UM = 3.0  # where a sensor's file has none
+_TRACKS_AT_ONCE = 256  # bounds the memory of what diffuses
+
+
+@dataclass(frozen=True, kw_only=True)
+class Tracks(Fault):
+    """Straight tracks: Poisson in number, at least one; directions by the cosine law (`detector.cosmic`)."""
+
+    fault = "cosmic_rays"
+    model = "tracks"
+    step = "charge"
+    needs_mosaic = True
+
+    flux_per_cm2_s: Interval = bounds(
+        1e3, 3e5, limits=(0.01, 1e7), unit="1/(cm² s)", doc="of particles from all directions; in quiet time 4.67"
+    )
+    electrons_per_um: Interval = bounds(
+        80.0, 630.0, limits=(40, 3000), unit="e/µm", doc="mean ionisation: 80 is the least, 630 a proton of 50 MeV"
+    )
+    readout_s: float | None = number(
+        None,
+        limits=(0, 3600),
+        unit="s",
+        doc="for which charge waits and is hit too; default: of all rows, at least 0.05 (assumed)",
+    )
+    thickness_um: float | None = number(
+        None,
+        limits=(0.1, 500),
+        unit="µm",
+        doc="of the layer whose charge is collected; default: the depleted depth",
+    )
+    diffusion_um: float = number(
+        1.0, limits=(0, 5), unit="µm", doc="σ of charge from the far face when it is collected; assumed"
+    )
+    most_tracks: int = number(
+        4000, limits=(1, 20_000), integer=True, doc="in one picture: what a larger draw has more is left out"
+    )
+    least_dn: float = number(
+        1.0, limits=(0.001, 255), unit="DN of 255", doc="pixels that gain less are left as they are"
+    )
+
+    def draw(self, context: FaultContext, rng: np.random.Generator) -> Params:
+        """The layer, the mean number of tracks, their number, and every track (`CosmicRays.params`)."""
+        detector: Any = context.camera.detector
+        sensor = detector.sensor
+        wait_s = max(sensor.transfer.row_readout_s * context.shape[0], _LEAST_READOUT_S)
+        depth_um = sensor.individual.depletion_depth_um or _ASSUMED_DEPTH_UM
+        params: Params = {
+            "flux_per_cm2_s": self.flux_per_cm2_s.uniform(rng),
+            "electrons_per_um": self.electrons_per_um.uniform(rng),
+            "time_s": float(context.camera.exposure_s + (wait_s if self.readout_s is None else self.readout_s)),
+            "thickness_um": float(depth_um if self.thickness_um is None else self.thickness_um),
+            "diffusion_um": float(self.diffusion_um),
+            "least_dn": float(self.least_dn),
+        }
+        model = _model(params, context)
+        mean = model.expected_count(context.shape, params["time_s"])
+        count = min(_poisson_above_0(mean, rng), int(self.most_tracks))
+        params["mean_count"], params["count"] = float(mean), count
+        params["tracks"] = _tracks(model, context.shape, count, rng).params
+        return params
+
+    def apply(self, quantity: Any, params: Params, context: FaultContext) -> Any:
+        """Collected electrons with those of the tracks."""
+        return quantity.with_array(quantity.array + _charge_once(params, context))
+
+    def footprint(self, params: Params, context: FaultContext) -> NDArray[np.bool_]:
+        """bool[y, x]: pixels of the picture that the tracks' charge can reach through the demosaic."""
+        detector: Any = context.camera.detector
+        return footprint(_charge_once(params, context) > 0, detector.sensor.pattern, detector.sensor.method)
+
+
+def _model(params: Params, context: FaultContext) -> CosmicRayModel:
+    mean = params["electrons_per_um"]
+    return CosmicRayModel(
+        pixel_pitch_um=context.camera.detector.pixel_pitch_um,
+        thickness_um=params["thickness_um"],
+        flux_per_cm2_s=params["flux_per_cm2_s"],
+        electrons_per_um=mean,
+        width_e_per_um=XI_E_PER_UM * mean / _MINIMUM_E_PER_UM,
+        diffusion_um=params["diffusion_um"],
+    )
+
+
+def _poisson_above_0(mean: float, rng: np.random.Generator) -> int:
+    """A Poisson variate, given that it is not 0: its upper tail, cut at the chance of 1 or more."""
+    chance = -np.expm1(-mean) * (1 - rng.random())
+    return max(int(stats.poisson.isf(chance, mean)), 1)
+
+
+def _tracks(model: CosmicRayModel, shape: tuple[int, int], count: int, rng: np.random.Generator) -> CosmicRays:
+    """The first `count` of a draw that has so many: tracks know nothing of one another."""
+    time_s = (count + 10 * np.sqrt(count) + 10) / model.expected_count(shape, 1.0)
+    while len(rays := model.draw(shape, time_s, rng)) < count:
+        pass
+    # rounded, so that thousands of them stay short as text; seeds stay whole
+    return CosmicRays(**{name: np.round(column[:count], 4) for name, column in vars(rays).items()})
+
+
+def _charge_once(params: Params, context: FaultContext) -> F32:
+    return context.once("cosmic_rays.charge", params, lambda: _charge(params, context))
+
+
+def _charge(params: Params, context: FaultContext) -> F32:
+    """Electrons that pixels gain, float32[y, x]; 0 where they are too few to show."""
+    model, tracks = _model(params, context), params["tracks"]
+    out = np.zeros(context.shape[0] * context.shape[1], dtype=np.float32)
+    for start in range(0, len(tracks), _TRACKS_AT_ONCE):
+        some = CosmicRays.from_params(tracks[start : start + _TRACKS_AT_ONCE])
+        index, electrons = model.deposit(some, context.shape)
+        out[index] += electrons
+    detector: Any = context.camera.detector
+    out[out < detector.full_well_e / 255 * params["least_dn"]] = 0
+    return out.reshape(context.shape)

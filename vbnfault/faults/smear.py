@@ -1,0 +1,97 @@
+"""Smear: light that falls on charge under way, where the vertical clocks or what keeps the light out have failed.
+
+Sᵢ = t Iᵢ + τ_row Σ_{k<i} I_k + τ_clear Σ_{k>i} I_k (`detector.charge.smear`), by architecture and cause:
+- frame-transfer CCD, `clock`: charge goes to the store more slowly, under light; `clear`: the image is no longer
+  cleared at once but shifted out, so that packets come through the rows behind.
+- interline CCD, `shield`: the light shield over the registers lets more through. A packet waits a row's readout
+  time in each pixel of its register.
+- full-frame CCD, `shutter`: the shutter stays ajar, and light falls during the readout: the formula of the
+  frame transfer, with the row's readout time by the share of light as τ_row.
+- CMOS: none.
+
+The sums are of the light on a column, so a bright spot draws a line and the dark side of the sky fills up.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from ..camera import Camera
+from .base import Fault, FaultContext, Interval, Params, bounds, choice
+
+CAUSES = {
+    "frame_transfer_ccd": ("clock", "clear"),
+    "interline_ccd": ("shield",),
+    "full_frame_ccd": ("shutter",),
+    "cmos": (),
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class FrameTransferSmear(Fault):
+    """Slower clocks, no fast clear, a leaking shield or a shutter ajar: another transfer of the same sensor."""
+
+    fault = "smear"
+    model = "frame_transfer"
+    step = "pixels"
+    needs_mosaic = True
+    localised = False
+    effect_mask = True
+
+    cause: str = choice(
+        "any",
+        ("any", "clock", "clear", "shield", "shutter"),
+        doc="what has failed; any: drawn from what the sensor's architecture has. Else nothing happens there",
+    )
+    row_transfer_s: Interval = bounds(
+        2e-6,
+        1e-5,
+        limits=(0, 1),
+        unit="s",
+        doc="of a row by failing clocks, where the sensor's is shorter; assumed",
+    )
+    leak: Interval = bounds(
+        1e-3, 1e-2, limits=(0, 1), doc="share of light through the shield of an interline CCD; assumed"
+    )
+    shutter_share: Interval = bounds(
+        2e-3, 2e-2, limits=(0, 1), doc="share of light past the shutter of a full-frame CCD; 1: it is open; assumed"
+    )
+
+    def draw(self, context: FaultContext, rng: np.random.Generator) -> Params:
+        """The cause, and what of the sensor's transfer it changes; empty where it cannot occur."""
+        detector: Any = context.camera.detector
+        sensor = detector.sensor
+        move = sensor.transfer
+        # as many variates whatever the sensor
+        row_s, leak, share = (v.uniform(rng) for v in (self.row_transfer_s, self.leak, self.shutter_share))
+        which = rng.random()
+        causes = [c for c in CAUSES[sensor.architecture] if self.cause in ("any", c)]
+        if not causes:
+            return {}
+        cause = causes[int(which * len(causes))]
+        changes = {
+            "clock": {"row_transfer_s": max(row_s, move.row_transfer_s)},
+            "clear": {"row_clear_s": max(row_s, move.row_clear_s)},
+            "shield": {
+                "leak": max(leak, move.leak),
+                "row_transfer_s": max(move.row_transfer_s, move.row_readout_s),
+            },
+            "shutter": {"row_transfer_s": share * move.row_readout_s, "row_clear_s": 0.0},
+        }
+        return {"cause": cause} | {key: float(value) for key, value in changes[cause].items()}
+
+    def alter(self, camera: Camera, params: Params) -> Camera:
+        """The camera with that transfer."""
+        if not params:
+            return camera
+        detector: Any = camera.detector
+        sensor = detector.sensor
+        changes = {key: value for key, value in params.items() if key != "cause"}
+        sensor = replace(sensor, transfer=replace(sensor.transfer, **changes))
+        if params["cause"] == "shutter":
+            # nothing else in the chain tells the two apart
+            sensor = replace(sensor, architecture="frame_transfer_ccd")
+        return replace(camera, detector=replace(detector, sensor=sensor))
