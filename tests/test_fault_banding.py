@@ -58,13 +58,14 @@ def test_pixel_by_pixel_the_stripes_are_slanted() -> None:
     params = PARAMS | {"frequency_hz": 1e5, "pixel_time_s": 1e-6, "line_time_s": 1.3e-4, "phase_rad": 0.0}
     added = stripes(where, params)
     time_s = np.arange(SIZE)[:, None] * 1.3e-4 + np.arange(SIZE) * 1e-6
-    # what the demosaic's codes round to: 10.0 e each; blooming and traps do not act on it
+    # two roundings to codes of 10.0 e
     np.testing.assert_allclose(added, 500 * np.sin(2 * math.pi * 1e5 * time_s), atol=10.5)
 
 
 def test_draws_are_within_bounds_and_follow_the_sensor() -> None:
     fault = make("banding")
-    draws = [fault.draw(context(), rng(seed)) for seed in range(200)]
+    where = context()
+    draws = [fault.draw(where, rng(seed)) for seed in range(200)]
     frequency = np.array([p["frequency_hz"] for p in draws])
     assert frequency.min() >= 500
     assert frequency.max() <= 200e3
