@@ -1,7 +1,7 @@
 """How fast a labelled sample is made, against the tracing bound and against Blender Cycles.
 
-    python -m pytest benchmarks --benchmark-only
-    python -m pytest benchmarks --benchmark-only --picture pair.png     (look whether both show the same)
+    python -m pytest benchmarks --benchmark-only -n 0
+    python -m pytest benchmarks --benchmark-only -n 0 --picture pair.png     (look whether both show the same)
 
 1024×1024 pixels, 16 samples per pixel, direct light, 1.2 million triangles that fill the frame, one run.
 Every round times bound, render, truth, the stages after it and the store in turn, so that whatever else the

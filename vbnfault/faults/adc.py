@@ -1,0 +1,102 @@
+"""A converter that fails: stuck bits, codes that never come, and steps that are no longer even.
+
+A bit of the output stuck at 0 or 1 folds the scale (a stuck most significant bit halves it); a run of missing codes
+makes a step, its signals at the code below; integral and differential non-linearity (IEEE 1241) grow with dose.
+Differential non-linearity is the device's own pattern, larger. Sizes are shares of the converter's range, so that
+they mean the same for 8 and 14 bits; all of them are assumed.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from ..camera import Camera
+from ..detector.readout import ReadoutSpec
+from .banding import with_readout
+from .base import Fault, FaultContext, Interval, Params, bounds
+
+# Non-linearity may use this share of what keeps the curve rising: 4 |quadratic| + 6√3 |cubic| below the range.
+_STEEPEST = 0.9
+
+
+@dataclass(frozen=True, kw_only=True)
+class ConverterFault(Fault):
+    """Stuck bits, missing codes and non-linearity of the converter."""
+
+    fault = "adc"
+    model = "converter"
+    step = "raw"
+    needs_mosaic = True
+    localised = False
+    effect_mask = True
+
+    stuck_count: Interval = bounds(
+        0, 1, limits=(0, 16), integer=True, doc="number of bits stuck at 0 or 1, with equal chance; assumed"
+    )
+    stuck_place: Interval = bounds(
+        1, 5, limits=(0, 15), integer=True, doc="which bits: 0 is the most significant, the next 1, …; assumed"
+    )
+    missing_share: Interval = bounds(
+        0.0, 0.05, limits=(0, 0.5), doc="share of the codes that are missing, in one run; assumed"
+    )
+    inl_share: Interval = bounds(
+        0.005, 0.03, limits=(0, 0.2), doc="height of the arc of integral non-linearity, of either sign; assumed"
+    )
+    inl_cubic_share: Interval = bounds(0.0, 0.01, limits=(0, 0.1), doc="height of its S, of either sign; assumed")
+    dnl_lsb_rms: Interval = bounds(
+        0.0, 0.5, limits=(0, 10), unit="LSB", doc="differential non-linearity beside the device's; assumed"
+    )
+
+    def draw(self, context: FaultContext, rng: np.random.Generator) -> Params:
+        """`stuck_bits` (bit, value), the run of missing codes, and what the non-linearities gain."""
+        detector: Any = context.camera.detector
+        readout: ReadoutSpec = detector.sensor.readout
+        # a converter of few bits has none of the less significant ones
+        low, high = (min(int(p), readout.bits - 1) for p in self.stuck_place)
+        places = rng.permutation(np.arange(low, high + 1))[: self.stuck_count.integer(rng)]
+        values = rng.integers(0, 2, len(places))
+        codes = readout.top_dn + 1
+        missing = min(round(self.missing_share.uniform(rng) * codes), codes // 2)
+        range_dn = readout.top_dn - readout.bias_dn
+        signs = np.where(rng.random(2) < 0.5, -1.0, 1.0)
+        heights = np.array([self.inl_share.uniform(rng), self.inl_cubic_share.uniform(rng)]) * range_dn * signs
+        before = _steepness(readout.inl_quadratic_dn, readout.inl_cubic_dn)
+        room = max(_STEEPEST * range_dn - before, 0.0)
+        heights *= min(1.0, room / max(_steepness(*heights), 1e-9))
+        return {
+            "stuck_bits": [
+                [readout.bits - 1 - int(place), int(value)] for place, value in zip(places, values, strict=True)
+            ],
+            "missing_from": int(rng.integers(0, codes - missing, endpoint=True)),
+            "missing_count": int(missing),
+            "inl_quadratic_dn": float(heights[0]),
+            "inl_cubic_dn": float(heights[1]),
+            "dnl_lsb_rms": self.dnl_lsb_rms.uniform(rng),
+        }
+
+    def alter(self, camera: Camera, params: Params) -> Camera:
+        """The camera with this converter."""
+        detector: Any = camera.detector
+        readout: ReadoutSpec = detector.sensor.readout
+        first = params["missing_from"]
+        missing = range(first, first + params["missing_count"])
+        stuck = dict(readout.stuck_bits) | dict(params["stuck_bits"])
+        return with_readout(
+            camera,
+            replace(
+                readout,
+                stuck_bits=tuple(sorted(stuck.items())),
+                missing_codes=tuple(sorted({*readout.missing_codes, *missing})),
+                inl_quadratic_dn=readout.inl_quadratic_dn + params["inl_quadratic_dn"],
+                inl_cubic_dn=readout.inl_cubic_dn + params["inl_cubic_dn"],
+                dnl_lsb_rms=math.hypot(readout.dnl_lsb_rms, params["dnl_lsb_rms"]),
+            ),
+        )
+
+
+def _steepness(quadratic: float, cubic: float) -> float:
+    return 4 * abs(quadratic) + 6 * math.sqrt(3) * abs(cubic)
