@@ -16,8 +16,7 @@ import numpy as np
 
 from ..camera import Camera
 from ..detector.readout import ReadoutSpec
-from .banding import with_readout
-from .base import Fault, FaultContext, Interval, Params, bounds
+from .base import Fault, FaultContext, Interval, Params, bounds, with_sensor
 
 # Non-linearity may use this share of what keeps the curve rising: 4 |quadratic| + 6√3 |cubic| below the range.
 _STEEPEST = 0.9
@@ -85,9 +84,9 @@ class ConverterFault(Fault):
         first = params["missing_from"]
         missing = range(first, first + params["missing_count"])
         stuck = dict(readout.stuck_bits) | dict(params["stuck_bits"])
-        return with_readout(
+        return with_sensor(
             camera,
-            replace(
+            readout=replace(
                 readout,
                 stuck_bits=tuple(sorted(stuck.items())),
                 missing_codes=tuple(sorted({*readout.missing_codes, *missing})),

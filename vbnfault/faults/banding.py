@@ -17,7 +17,7 @@ import numpy as np
 
 from ..camera import Camera
 from ..detector.readout import ReadoutSpec
-from .base import Fault, FaultContext, Interval, Params, bounds, flag, number
+from .base import Fault, FaultContext, Interval, Params, bounds, flag, number, with_sensor
 
 # Of what double sampling leaves: below it, the amplitude before it is not made any larger.
 _LEAST_PASSED = 1e-3
@@ -88,9 +88,9 @@ class InterferenceBanding(Fault):
         detector: Any = camera.detector
         readout: ReadoutSpec = detector.sensor.readout
         passed = replace(readout, banding_amplitude_e=1.0, banding_frequency_hz=params["frequency_hz"])
-        return with_readout(
+        return with_sensor(
             camera,
-            replace(
+            readout=replace(
                 passed,
                 banding_amplitude_e=params["amplitude_e"] / max(passed.banding_seen_e, _LEAST_PASSED),
                 banding_phase_rad=params["phase_rad"],
@@ -99,9 +99,3 @@ class InterferenceBanding(Fault):
                 line_time_s=params["line_time_s"],
             ),
         )
-
-
-def with_readout(camera: Camera, readout: ReadoutSpec) -> Camera:
-    """The camera with another readout behind its mosaic."""
-    detector: Any = camera.detector
-    return replace(camera, detector=replace(detector, sensor=replace(detector.sensor, readout=readout)))

@@ -447,3 +447,11 @@ def scale_by_intensity(rgbi: NDArray[np.uint8], intensity: NDArray[np.float32]) 
         np.rint(value, out=value)
         out[..., channel] = np.clip(value, 0, 255, out=value)
     return out
+
+
+def with_sensor(camera: Camera, **changes: Any) -> Camera:
+    """The camera with a sensor that differs, for faults that are numbers of a detector with a mosaic."""
+    detector: Any = camera.detector
+    return dataclasses.replace(
+        camera, detector=dataclasses.replace(detector, sensor=dataclasses.replace(detector.sensor, **changes))
+    )

@@ -16,7 +16,7 @@ import numpy as np
 
 from ..camera import Camera
 from ..detector.charge import TrapSpecies
-from .base import Fault, FaultContext, Interval, Params, bounds
+from .base import Fault, FaultContext, Interval, Params, bounds, with_sensor
 
 RELEASE_TRANSFERS = (0.5, 2.0, 8.0)
 
@@ -66,5 +66,4 @@ class RadiationTraps(Fault):
             f"{name}_traps": getattr(move, f"{name}_traps") + tuple(TrapSpecies(**row) for row in species)
             for name, species in params.items()
         }
-        sensor = replace(detector.sensor, transfer=replace(move, **more))
-        return replace(camera, detector=replace(detector, sensor=sensor))
+        return with_sensor(camera, transfer=replace(move, **more))

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from ..camera import Camera
-from .base import Fault, FaultContext, Interval, Params, bounds, choice
+from .base import Fault, FaultContext, Interval, Params, bounds, choice, with_sensor
 
 CAUSES = {
     "frame_transfer_ccd": ("clock", "clear"),
@@ -88,10 +88,9 @@ class FrameTransferSmear(Fault):
         if not params:
             return camera
         detector: Any = camera.detector
-        sensor = detector.sensor
         changes = {key: value for key, value in params.items() if key != "cause"}
-        sensor = replace(sensor, transfer=replace(sensor.transfer, **changes))
+        more: dict[str, Any] = {"transfer": replace(detector.sensor.transfer, **changes)}
         if params["cause"] == "shutter":
             # nothing else in the chain tells the two apart
-            sensor = replace(sensor, architecture="frame_transfer_ccd")
-        return replace(camera, detector=replace(detector, sensor=sensor))
+            more["architecture"] = "frame_transfer_ccd"
+        return with_sensor(camera, **more)
