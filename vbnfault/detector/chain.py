@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Any
 
 import cv2
@@ -193,12 +193,21 @@ class Device:
         readout = self.sensor.readout
         return readout.bias_dn + readout.system_gain_dn_per_e * float(self.dark_rate_e_s.mean()) * exposure_s
 
-    def rgbi(self, raw: Raw, exposure_s: float, bad: NDArray[np.bool_] | None = None) -> RGBI:
-        """The 8 bit picture of a raw mosaic: pixels `bad` corrected first, I from W where there is one."""
+    @cached_property
+    def bad(self) -> NDArray[np.bool_]:
+        """Pixels that a map of defects would name: hot, dead and stuck ones, bool[y, x]."""
+        out = np.zeros(self.shape, dtype=bool)
+        for defects in (self.individual.hot, self.individual.dead, self.individual.stuck):
+            out[defects.row, defects.column] = True
+        return out
+
+    def rgbi(self, raw: Raw, exposure_s: float) -> RGBI:
+        """The 8 bit picture of a raw mosaic: bad pixels corrected first if the sensor does so, I from W where there
+        is one."""
         sensor = self.sensor
         mosaic: NDArray[Any] = raw
-        if bad is not None and sensor.correct_defects:
-            mosaic = correct_defects(raw, bad, sensor.pattern)
+        if sensor.correct_defects:
+            mosaic = correct_defects(raw, self.bad, sensor.pattern)
         black = self.black_dn(exposure_s)
         gains = self.white_balance
         scale = 255.0 / max(sensor.readout.top_dn - black, 1.0) * gains

@@ -2,8 +2,9 @@
 
 The cells of a bundle's lattice tile its picture; folds overlap and add. Each cell is two triangles whose
 irradiance and rim margin are interpolated between corners, so that edges stay crisp between rays; cells smaller
-than half a pixel are splatted. Pictures with soft edges go to coarser levels of a pyramid. Sums are of integers:
-the bits do not depend on the order in which threads add.
+than half a pixel are splatted, and where light folds cells are drawn by points on a cubic surface. Pictures with
+soft edges go to coarser levels of a pyramid. Sums are of integers: the bits do not depend on the order in which
+threads add.
 """
 
 from __future__ import annotations
@@ -25,7 +26,6 @@ F64 = NDArray[np.float64]
 
 LEVELS = 6
 PARTS = ("inner", "edge", "rough")
-ROUGH = PARTS.index("rough")
 # of each part: the share of light with an edge's profile is a + b × calm, that without c × calm × rise
 _SHARES = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, -1.0], [1.0, -1.0, 0.0]])
 _MARGIN = 4  # pixels around each level, for what lies half outside
@@ -86,10 +86,6 @@ class Placement:
     magnification: F64
     inner_level: NDArray[np.int64]
     part: NDArray[np.int64]
-
-    def take(self, chosen: NDArray[Any]) -> Placement:
-        """Some of the bundles."""
-        return Placement(**{name: values[chosen] for name, values in vars(self).items()})
 
 
 @lru_cache(maxsize=1)
