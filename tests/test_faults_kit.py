@@ -62,13 +62,13 @@ def noisy(step: str, context: FaultContext, seed: int = 0) -> Quantity:
 def flat_electrons(context: FaultContext, share: float = 0.5) -> Electrons:
     """Every pixel at `share` of white."""
     white = context.camera.detector.white_e
-    return Electrons(array=np.full((*context.shape, 3), share, np.float32) * white, white_e=white)
+    return Electrons(array=np.full((*context.shape, len(white)), share, np.float32) * white, white_e=white)
 
 
 def noisy_electrons(context: FaultContext, seed: int = 0) -> Electrons:
     """Random signal from 0 to twice white."""
     white = context.camera.detector.white_e
-    share = np.random.default_rng(seed).uniform(0, 2, (*context.shape, 3)).astype(np.float32)
+    share = np.random.default_rng(seed).uniform(0, 2, (*context.shape, len(white))).astype(np.float32)
     return Electrons(array=share * white, white_e=white)
 
 

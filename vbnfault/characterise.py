@@ -15,7 +15,6 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from . import spectra
 from .detector.chain import Device, MosaicNoise, by_channel, channel_sites
 from .errors import InputError
 
@@ -297,12 +296,8 @@ class VirtualCamera:
         self.device, self.seed = device, seed
         sensor = device.sensor
         nodes = np.arange(300.0, 1100.0) if wavelength_nm is None else np.array([wavelength_nm])
-        curves = spectra.response(sensor.response, nodes, sensor.quantum_efficiency_peak)
-        colours = dict(zip("RGB", curves.max(axis=1), strict=True))
-        # without a colour filter a pixel has the peak of all of them
-        self.efficiency = {
-            name: float(colours.get(name, sensor.quantum_efficiency_peak)) for name in sensor.pattern.channels
-        }
+        peaks = sensor.efficiency.at(nodes).max(axis=1)
+        self.efficiency = {name: float(v) for name, v in zip(sensor.pattern.channels, peaks, strict=True)}
         self.sites = {name: site for name, site in channel_sites(sensor).items() if self.efficiency[name] > 0}
         if not self.sites:
             raise InputError(f"wavelength_nm = {wavelength_nm}: no channel of {sensor.name} responds to it")

@@ -7,6 +7,7 @@ picture is metered for.
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import reduce
 
 import cv2
 import numpy as np
@@ -228,9 +229,8 @@ def _metered_exposure_s(frame: Frame, rate: Electrons) -> float:
 
 
 def _brightness(electrons: NDArray[np.float32], white_e: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Greatest of R, G, B per pixel as a fraction of white, float32[y, x]."""
-    r, g, b = np.moveaxis(electrons / white_e, -1, 0)
-    return np.asarray(np.maximum(np.maximum(r, g), b))
+    """Greatest of a pixel's channels as a fraction of white, float32[y, x]."""
+    return np.asarray(reduce(np.maximum, np.moveaxis(electrons / white_e, -1, 0)))
 
 
 def _rate(frame: Frame, radiance: Radiance) -> Electrons:

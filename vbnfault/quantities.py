@@ -60,9 +60,9 @@ class Irradiance(Quantity):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Electrons(Quantity):
-    """Electrons per pixel and colour, R, G, B.
+    """Electrons per pixel and channel: R, G, B, or those of the detector's mosaic, each at every pixel.
 
-    `white_e` float32[3]: the signal of each colour that the 8 bit image shows as 255. Expected (noise-free)
+    `white_e` float32[channel]: the signal of each channel that the 8 bit image shows as 255. Expected (noise-free)
     photo-electrons may lie above it; saturation belongs to the detector.
     """
 

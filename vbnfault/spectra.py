@@ -11,7 +11,7 @@ lines of the solar spectrum S, and free of spectral noise. Sources are integrate
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import lru_cache
 
 import numpy as np
@@ -173,15 +173,20 @@ def response(name: str, wavelength_nm: F64, quantum_efficiency_peak: float) -> F
 
 
 def band_weights(name: str, quantum_efficiency_peak: float, nodes_nm: F64) -> F64:
-    """Weights float64[3, band], in electrons nm / J: electrons = weights · energy per band (J m⁻² nm⁻¹ × m²).
+    """`electron_weights` of R, G, B, float64[3, band]."""
+    return electron_weights(lambda nm: response(name, nm, quantum_efficiency_peak), nodes_nm)
 
-    ∫ QE(λ) S(λ) h_b(λ) λ/(hc) dλ / S_b of the module's docstring.
+
+def electron_weights(efficiency: Callable[[F64], F64], nodes_nm: F64) -> F64:
+    """Weights float64[channel, band], in electrons nm / J: electrons = weights · energy per band (J m⁻² nm⁻¹ × m²).
+
+    `efficiency` gives QE, float64[channel, n], at wavelengths in nm. ∫ QE(λ) S(λ) h_b(λ) λ/(hc) dλ / S_b of the
+    module's docstring.
     """
     fine = _fine_nm(nodes_nm)
     hats = _hats(nodes_nm, fine)
     sun = solar_irradiance_W_m2_nm(fine)
     per_photon = fine * 1e-9 / (PLANCK_J_S * LIGHT_SPEED_M_S)
-    efficiency = response(name, fine, quantum_efficiency_peak)
     mean = np.trapezoid(hats * sun, fine, axis=1) / np.trapezoid(hats, fine, axis=1)
-    integrand = efficiency[:, None, :] * (hats * sun * per_photon)[None]
+    integrand = efficiency(fine)[:, None, :] * (hats * sun * per_photon)[None]
     return np.asarray(np.trapezoid(integrand, fine, axis=2) / mean)

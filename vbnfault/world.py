@@ -262,7 +262,7 @@ def _detector_of(scene: SceneConfig, sensor: Sensor, individual: int, direction:
     towards = direction if direction in ("up", "down") else "up"
     seed = int(config.rng(scene.dataset.seed, individual, "detector", "device").integers(2**31))
     try:
-        return MosaicDetector(
+        made = MosaicDetector(
             sensor=sensor,
             seed=seed,
             width_px=scene.camera.width_px,
@@ -271,6 +271,14 @@ def _detector_of(scene: SceneConfig, sensor: Sensor, individual: int, direction:
         )
     except InputError as error:
         raise InputError(f"camera.detector: {error}") from None
+    for channel, row in zip(made.channels, made.electron_rate_weights(wavelengths_nm(scene)), strict=True):
+        if not row.any():
+            low, high = scene.render.band_min_nm, scene.render.band_max_nm
+            raise InputError(
+                f"render.band_min_nm = {low:g}, band_max_nm = {high:g}: the {channel} pixels of camera.detector = "
+                f"{scene.camera.detector!r} see no such light"
+            )
+    return made
 
 
 def individual_of(scene: SceneConfig, sample: int) -> int:

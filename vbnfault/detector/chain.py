@@ -22,11 +22,12 @@ from numpy.typing import NDArray
 from ..quantities import LUMINANCE, RGBI
 from .charge import ChargeCloud, bloom, cti, parasitic_light, smear, smear_interline
 from .demosaic import correct_defects, demosaic, interpolate
+from .efficiency import white_balance
 from .individual import Individual, IndividualSpec, dark_rate_e_s, make_individual, offset_e, response
 from .mosaic import channel_of
 from .readout import ReadoutIndividual, ReadoutNoise, read_out
 from .sensor import Sensor
-from .three_colour import _normal_field, poisson_quantile, white_balance
+from .three_colour import _normal_field, poisson_quantile
 
 F32 = NDArray[np.float32]
 Raw = NDArray[np.uint16]
@@ -209,19 +210,17 @@ class Device:
         if sensor.correct_defects:
             mosaic = correct_defects(raw, self.bad, sensor.pattern)
         black = self.black_dn(exposure_s)
-        gains = self.white_balance
-        scale = 255.0 / max(sensor.readout.top_dn - black, 1.0) * gains
+        full = 255.0 / max(sensor.readout.top_dn - black, 1.0)
+        scale = {
+            name: full * float(gain) for name, gain in zip(sensor.pattern.channels, self.white_balance, strict=True)
+        }
+        shown = [scale.get(colour, scale.get("W", full)) for colour in "RGB"]
         linear = demosaic(mosaic, sensor.pattern, sensor.method)
-        rgb = cv2.multiply(
-            cv2.subtract(linear, (black, black, black, 0.0)), (*scale.tolist(), 0.0), dtype=cv2.CV_8U
-        )
+        rgb = cv2.multiply(cv2.subtract(linear, (black, black, black, 0.0)), (*shown, 0.0), dtype=cv2.CV_8U)
         out = np.empty((*raw.shape, 4), dtype=np.uint8)
         if "W" in sensor.pattern.channels:
             white = interpolate(mosaic, sensor.pattern, "W")
-            intensity = np.clip(
-                np.rint((white - black) * (255.0 / max(sensor.readout.top_dn - black, 1.0))), 0, 255
-            )
-            intensity = intensity.astype(np.uint8)
+            intensity = cv2.multiply(cv2.subtract(white, black), scale["W"], dtype=cv2.CV_8U)
         else:
             intensity = cv2.transform(rgb, LUMINANCE.reshape(1, 3).astype(np.float64))
         intensity = intensity.reshape(*raw.shape, 1)
@@ -230,9 +229,8 @@ class Device:
 
     @property
     def white_balance(self) -> NDArray[np.float32]:
-        """Gain of R, G, B, float32[3], at least 1, that makes a grey surface in sunlight grey."""
-        name = self.sensor.response if len(self.sensor.pattern.channels) > 1 else "flat"
-        return white_balance(name, self.sensor.quantum_efficiency_peak)
+        """Gain of each channel, float32[channel], as `efficiency.white_balance`."""
+        return white_balance(self.sensor.efficiency)
 
 
 @lru_cache(maxsize=4)

@@ -14,9 +14,10 @@ from ..errors import InputError
 from ..quantities import RGBI, Electrons, Irradiance
 from .chain import Acts, Device, MosaicNoise
 from .dark import silicon_factor
+from .efficiency import white_balance
 from .mosaic import sample
 from .sensor import Sensor
-from .three_colour import Detector
+from .three_colour import electron_rate_weights, electrons_of
 
 F32 = NDArray[np.float32]
 
@@ -36,11 +37,6 @@ class MosaicDetector:
 
     def __post_init__(self) -> None:
         sensor = self.sensor
-        if not (sensor.pattern.is_bayer or len(sensor.pattern.channels) == 1):
-            raise InputError(
-                f"{sensor.name}: pattern = {sensor.pattern.name!r}: scenes have light for R, G and B; must be "
-                "a Bayer pattern or mono"
-            )
         for key in ("width_px", "height_px"):
             if getattr(self, key) > getattr(sensor, key):
                 raise InputError(
@@ -70,36 +66,28 @@ class MosaicDetector:
         return spec.dark_current_e_s * silicon_factor(self.sensor.temperature_K, spec.reference_K)
 
     @property
-    def _planes(self) -> Detector:
-        """A detector with all colours in every pixel, for what happens before the mosaic."""
-        sensor = self.sensor
-        return Detector(
-            name=sensor.name,
-            width_px=self.width_px,
-            height_px=self.height_px,
-            pixel_pitch_um=sensor.pixel_pitch_um,
-            full_well_e=sensor.readout.full_well_e,
-            response=sensor.response if sensor.pattern.is_bayer else "flat",
-            quantum_efficiency_peak=sensor.quantum_efficiency_peak,
-        )
+    def channels(self) -> tuple[str, ...]:
+        """Channels of its pattern: planes of the light on it, before the mosaic."""
+        return self.sensor.pattern.channels
 
     @property
     def white_balance(self) -> F32:
-        """Gain of R, G, B, float32[3], at least 1, that makes a grey surface in sunlight grey."""
-        return self._planes.white_balance
+        """Gain of each channel, float32[channel], at least 1, that makes a grey surface in sunlight grey."""
+        return white_balance(self.sensor.efficiency)
 
     @property
     def white_e(self) -> F32:
-        """Signal of R, G, B, in electrons, that the 8 bit image shows as 255."""
-        return self._planes.white_e
+        """Signal of each channel, float32[channel] in electrons, that the 8 bit image shows as 255."""
+        return np.asarray(self.full_well_e / self.white_balance, dtype=np.float32)
 
     def electron_rate_weights(self, wavelength_nm: NDArray[np.float64]) -> F32:
-        """float32[3, band]: electrons per second and pixel for 1 W m⁻² nm⁻¹ in a band, behind each filter."""
-        return self._planes.electron_rate_weights(wavelength_nm)
+        """float32[channel, band]: electrons per second and pixel for 1 W m⁻² nm⁻¹ in a band, behind each filter."""
+        return electron_rate_weights(self.sensor.efficiency, self.pixel_pitch_um, wavelength_nm)
 
     def electrons_expected(self, irradiance: Irradiance, exposure_s: float) -> Electrons:
         """Expected photo-electrons per pixel behind each filter, noise-free, not clipped."""
-        return self._planes.electrons_expected(irradiance, exposure_s)
+        weights = self.electron_rate_weights(irradiance.wavelength_nm) * np.float32(exposure_s)
+        return Electrons(array=electrons_of(irradiance, weights), white_e=self.white_e)
 
     def draw_noise(self, shape: tuple[int, int], rng: Callable[[str], np.random.Generator]) -> MosaicNoise:
         """Variates of one exposure, by the generators of their names."""
@@ -110,9 +98,7 @@ class MosaicDetector:
     ) -> NDArray[np.uint16]:
         """Raw mosaic, uint16[y, x]; noise-free without `noise`, which is what `draw_noise` gives. `acts` are what
         faults do on the way (`chain.STEPS`)."""
-        pattern = self.sensor.pattern
-        mosaic = sample(expected.array, pattern) if pattern.is_bayer else expected.array[..., 0]
-        return self.device.raw(np.ascontiguousarray(mosaic), exposure_s, noise, acts or {})
+        return self.device.raw(sample(expected.array, self.sensor.pattern), exposure_s, noise, acts or {})
 
     def develop(self, expected: Electrons, exposure_s: float, noise: Any, acts: Acts | None = None) -> RGBI:
         """The 8 bit picture of expected photo-electrons."""
@@ -121,7 +107,7 @@ class MosaicDetector:
     @property
     def optics_key(self) -> Any:
         """What the electrons expected behind the filters depend on."""
-        return self._planes
+        return self.sensor.efficiency, self.full_well_e, self.pixel_pitch_um, self.width_px, self.height_px
 
     @property
     def device(self) -> Device:

@@ -15,6 +15,7 @@ from .. import resources, spectra
 from ..errors import InputError
 from .charge import ChargeCloud, TrapSpecies
 from .demosaic import Method
+from .efficiency import Curve, QuantumEfficiency
 from .individual import IndividualSpec
 from .mosaic import Pattern
 from .mosaic import pattern as pattern_of
@@ -47,8 +48,9 @@ class Transfer:
 class Sensor:
     """A type of sensor; `individual` says how devices of it differ, `readout` what happens from charge to numbers.
 
-    Lengths in µm, temperatures in K, signals in electrons (e). `response` names relative colour curves of
-    `spectra.RESPONSES`, which `quantum_efficiency_peak` scales.
+    Lengths in µm, temperatures in K, signals in electrons (e). `quantum_efficiency` gives the QE of channels; those
+    without have the relative colour curves that `response` names (`spectra.RESPONSES`), scaled by
+    `quantum_efficiency_peak`.
     """
 
     name: str
@@ -61,6 +63,7 @@ class Sensor:
     pattern: Pattern = field(default_factory=lambda: pattern_of("rggb"))
     response: str = "nikon_5100"
     quantum_efficiency_peak: float = 0.5
+    quantum_efficiency: tuple[Curve, ...] = ()
     temperature_K: float = 293.0
     demosaic: str = "malvar"
     correct_defects: bool = False
@@ -84,6 +87,19 @@ class Sensor:
             value = getattr(self, key)
             if not low <= value <= high:
                 raise InputError(f"{key} = {value:g}: must be from {low:g} to {high:g}")
+
+        for curve in self.quantum_efficiency:
+            _one_of("quantum_efficiency: channel", curve.channel, self.pattern.channels)
+
+    @property
+    def efficiency(self) -> QuantumEfficiency:
+        """Electrons per photon behind each filter."""
+        return QuantumEfficiency(
+            channels=self.pattern.channels,
+            response=self.response,
+            peak=self.quantum_efficiency_peak,
+            curves=self.quantum_efficiency,
+        )
 
     @property
     def method(self) -> Method:

@@ -23,8 +23,8 @@ from numpy.typing import NDArray
 from scipy.special import ndtr, ndtri
 from scipy.stats import poisson
 
-from .. import spectra
 from ..quantities import LUMINANCE, RGBI, Electrons, Irradiance, RawDN
+from .efficiency import QuantumEfficiency, white_balance
 
 F32 = NDArray[np.float32]
 
@@ -95,6 +95,7 @@ class Detector:
 
     # a pixel of the picture depends on no other
     local: ClassVar[bool] = True
+    channels: ClassVar[tuple[str, ...]] = ("R", "G", "B")
 
     def draw_noise(self, shape: tuple[int, int], rng: Callable[[str], np.random.Generator]) -> Noise:
         """Variates of one exposure, by the generators of their names."""
@@ -110,9 +111,14 @@ class Detector:
         return (self.adc_max_dn - self.bias_dn) / self.full_well_e
 
     @property
+    def efficiency(self) -> QuantumEfficiency:
+        """Electrons per photon in R, G, B."""
+        return QuantumEfficiency(response=self.response, peak=self.quantum_efficiency_peak)
+
+    @property
     def white_balance(self) -> F32:
         """Gain of R, G, B, float32[3], at least 1, that makes a grey surface in sunlight grey."""
-        return white_balance(self.response, self.quantum_efficiency_peak)
+        return white_balance(self.efficiency)
 
     @property
     def white_e(self) -> F32:
@@ -121,27 +127,12 @@ class Detector:
 
     def electron_rate_weights(self, wavelength_nm: NDArray[np.float64]) -> F32:
         """float32[3, band]: electrons per second and pixel for 1 W m⁻² nm⁻¹ in a band."""
-        area_m2 = (self.pixel_pitch_um * 1e-6) ** 2
-        weights = spectra.band_weights(self.response, self.quantum_efficiency_peak, wavelength_nm)
-        return np.asarray(weights * area_m2, dtype=np.float32)
+        return electron_rate_weights(self.efficiency, self.pixel_pitch_um, wavelength_nm)
 
     def electrons_expected(self, irradiance: Irradiance, exposure_s: float) -> Electrons:
         """Expected photo-electrons per pixel and colour, noise-free, not clipped."""
         weights = self.electron_rate_weights(irradiance.wavelength_nm) * np.float32(exposure_s)
-
-        # a matrix product over the bands, in the cache: BLAS is slow at 3 × 8
-        def step(energy: F32) -> F32:
-            energy = np.moveaxis(energy, 1, 0)
-            colours = []
-            for row in weights:
-                total = energy[0] * row[0]
-                for band, weight in zip(energy[1:], row[1:], strict=True):
-                    total += band * weight
-                colours.append(total)
-            return cv2.merge(colours)
-
-        rows_first = np.moveaxis(irradiance.array, 0, 1)
-        return Electrons(array=_blockwise(step, rows_first), white_e=self.white_e)
+        return Electrons(array=electrons_of(irradiance, weights), white_e=self.white_e)
 
     def electrons(self, expected: Electrons, exposure_s: float, noise: Noise | None) -> Electrons:
         """Collected electrons: dark current added, shot noise, clipped at the full well."""
@@ -210,12 +201,29 @@ class Detector:
         return show
 
 
-@lru_cache(maxsize=8)
-def white_balance(response: str, quantum_efficiency_peak: float) -> F32:
-    nodes = spectra.band_nodes_nm(400.0, 700.0, 31)
-    sun = spectra.solar_band_irradiance_W_m2_nm(nodes, 1.0)
-    grey = spectra.band_weights(response, quantum_efficiency_peak, nodes) @ sun
-    return np.asarray(grey.max() / grey, dtype=np.float32)
+def electron_rate_weights(
+    efficiency: QuantumEfficiency, pixel_pitch_um: float, wavelength_nm: NDArray[np.float64]
+) -> F32:
+    """float32[channel, band]: electrons per second and pixel for 1 W m⁻² nm⁻¹ in a band."""
+    area_m2 = (pixel_pitch_um * 1e-6) ** 2
+    return np.asarray(efficiency.electron_weights(wavelength_nm) * area_m2, dtype=np.float32)
+
+
+def electrons_of(irradiance: Irradiance, weights: F32) -> F32:
+    """Electrons per pixel and channel, float32[y, x, channel], by weights float32[channel, band]."""
+
+    # a matrix product over the bands, in the cache: BLAS is slow at 3 × 8
+    def step(energy: F32) -> F32:
+        energy = np.moveaxis(energy, 1, 0)
+        colours = []
+        for row in weights:
+            total = energy[0] * row[0]
+            for band, weight in zip(energy[1:], row[1:], strict=True):
+                total += band * weight
+            colours.append(total)
+        return cv2.merge(colours).reshape(*colours[0].shape, len(colours))
+
+    return np.asarray(_blockwise(step, np.moveaxis(irradiance.array, 0, 1)))
 
 
 def poisson_quantile(mean: F32, normal: F32) -> F32:

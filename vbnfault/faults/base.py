@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import Any, ClassVar, NamedTuple, TypeVar
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -165,6 +166,21 @@ class FaultContext:
             self._memo[key] = (params, make())
         result: T = self._memo[key][1]
         return result
+
+
+def times(array: NDArray[np.float32], factor: NDArray[Any]) -> NDArray[np.float32]:
+    """Planes float32[y, x, channel] times a factor for each channel [channel], or for each pixel [y, x]."""
+    if factor.ndim == 1:
+        # OpenCV wants a number for each of four
+        out = cv2.multiply(array, (*factor.tolist(), 0.0, 0.0, 0.0)[:4])
+    else:
+        out = cv2.multiply(array, cv2.merge([factor] * array.shape[2]))
+    return np.asarray(out).reshape(array.shape)
+
+
+def plus(array: NDArray[np.float32], other: NDArray[np.float32]) -> NDArray[np.float32]:
+    """The sum of planes float32[y, x, channel] of one shape."""
+    return np.asarray(cv2.add(array, other)).reshape(array.shape)
 
 
 Q = TypeVar("Q", Electrons, Charge, RawMosaic, RGBI)

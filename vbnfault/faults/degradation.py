@@ -83,7 +83,7 @@ def _blur(
     array: NDArray[np.float32], white_e: NDArray[np.float32], kernel: NDArray[np.float32]
 ) -> NDArray[np.float32]:
     height, width = array.shape[:2]
-    white_row = np.tile(white_e, width)  # rows of 3·width values: far faster than broadcasting three
+    white_row = np.tile(white_e, width)  # rows of channels · width values: far faster than broadcasting
     reach = len(kernel) // 2
     out = np.empty_like(array)
 
@@ -92,9 +92,9 @@ def _blur(
             return
         # with `reach` more rows on either side a part comes out as it does in the whole image
         lo, hi = max(0, start - reach), min(height, stop + reach)
-        clipped = np.minimum(array[lo:hi].reshape(hi - lo, -1), white_row).reshape(hi - lo, width, 3)
+        clipped = np.minimum(array[lo:hi].reshape(hi - lo, -1), white_row).reshape(hi - lo, width, -1)
         blurred = cv2.sepFilter2D(clipped, -1, kernel, kernel, borderType=cv2.BORDER_REFLECT_101)
-        out[start:stop] = blurred[start - lo : stop - lo]
+        out[start:stop] = blurred[start - lo : stop - lo].reshape(stop - start, width, -1)
 
     # OpenCV filters in one thread. Halves need rows enough to be mirrored at the frame's edge.
     middle = height // 2 if height // 2 > reach else 0

@@ -38,7 +38,7 @@ from ..lens import Prescription
 from ..lens.coating import mean_reflectance
 from ..lens.footprint import Frame
 from ..lens.scatter import Harvey
-from .base import FaultContext, Interval, LensFault, Params, bounds, choice, number
+from .base import FaultContext, Interval, LensFault, Params, bounds, choice, number, times
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -114,10 +114,10 @@ class Contamination(LensFault):
         """Expected electrons, scattered and darkened."""
         passes = colours(params, context)
         lost = params["haze"] + sum(s["share"] for s in params["scratches"])
-        out = cv2.multiply(quantity.array, (*(passes * (1 - lost)).tolist(), 0.0))
+        out = times(quantity.array, passes * (1 - lost))
         if lost:
             strewn = _strewn(quantity.array, quantity.white_e, params, context.frame)
-            out = cv2.add(out, cv2.multiply(strewn, (*passes.tolist(), 0.0)))
+            out += times(strewn, passes)
         return quantity.with_array(out)
 
     def footprint(self, params: Params, context: FaultContext) -> NDArray[np.bool_]:
@@ -174,7 +174,7 @@ def worn(lens: Prescription, wavelength_nm: F64, coating_loss: float) -> F64:
 
 
 def colours(params: Params, context: FaultContext) -> F64:
-    """What passes of red, green and blue sunlight, float64[3]."""
+    """What passes of sunlight in each of the detector's channels, float64[channel]."""
     nodes, sun = context.wavelength_nm, context.sun_irradiance_W_m2_nm
     if nodes is None or sun is None:
         nodes = spectra.band_nodes_nm(400.0, 700.0, 8)
@@ -188,7 +188,7 @@ def colours(params: Params, context: FaultContext) -> F64:
         exponent=params["browning_exponent"],
     )
     weights = context.camera.detector.electron_rate_weights(nodes) * sun
-    return np.asarray(weights @ passes / weights.sum(axis=1))
+    return np.asarray(weights @ passes / np.maximum(weights.sum(axis=1), 1e-300))
 
 
 # --- what is scattered -----------------------------------------------------------------------------------------
@@ -254,12 +254,12 @@ def kernel(params: Params, frame: Frame, shape: tuple[int, int]) -> F32:
 
 
 def _strewn(array: F32, white_e: F32, params: Params, frame: Frame) -> F32:
-    """Scattered light, float32[y, x, 3]."""
+    """Scattered light, float32[y, x, channel]."""
     step = _cell_px(frame)
-    height, width = array.shape[:2]
+    height, width, channels = array.shape
     rows, columns = -(-height // step), -(-width // step)
     whole = cv2.copyMakeBorder(array, 0, rows * step - height, 0, columns * step - width, cv2.BORDER_REPLICATE)
-    cells = cv2.resize(whole, (columns, rows), interpolation=cv2.INTER_AREA)
+    cells = cv2.resize(whole, (columns, rows), interpolation=cv2.INTER_AREA).reshape(rows, columns, channels)
     # twice the frame: no two of its cells meet around the grid's far side
     shape = (fft.next_fast_len(2 * rows, real=True), fft.next_fast_len(2 * columns, real=True))
     top, left = (shape[0] - rows) // 2, (shape[1] - columns) // 2
@@ -270,7 +270,7 @@ def _strewn(array: F32, white_e: F32, params: Params, frame: Frame) -> F32:
         left,
         shape[1] - columns - left,
         cv2.BORDER_REFLECT,
-    )
+    ).reshape(*shape, channels)
     around[top : top + rows, left : left + columns] = cells
     planes = np.ascontiguousarray(np.moveaxis(around, -1, 0))
     spread = fft.irfft2(fft.rfft2(planes) * fft.rfft2(kernel(params, frame, shape)), s=shape)
@@ -279,4 +279,5 @@ def _strewn(array: F32, white_e: F32, params: Params, frame: Frame) -> F32:
     if step == 1:
         return np.ascontiguousarray(inner[1:-1, 1:-1])
     finer = cv2.resize(inner, ((columns + 2) * step, (rows + 2) * step), interpolation=cv2.INTER_LINEAR)
+    finer = finer.reshape(*finer.shape[:2], channels)
     return np.ascontiguousarray(finer[step : step + height, step : step + width])

@@ -104,7 +104,7 @@ class GaussianDust(Fault):
         """Expected electrons times the transmission of all grains."""
         at, factor = context.once("dust.grains", params, lambda: _grains(_transmission_once(params, context)))
         out = quantity.array.copy()
-        pixels = out.reshape(-1, 3)
+        pixels = out.reshape(-1, out.shape[2])
         pixels[at] *= factor
         return quantity.with_array(out)
 

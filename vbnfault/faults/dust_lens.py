@@ -38,7 +38,7 @@ from ..lens.glass import D_NM
 from ..lens.paraxial import along
 from ..lens.scatter import DUST_INDEX
 from ..lens.trace import forward
-from .base import FaultContext, Interval, LensFault, Params, bounds, number
+from .base import FaultContext, Interval, LensFault, Params, bounds, number, plus, times
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -120,9 +120,9 @@ class DefocusedDust(LensFault):
     def apply(self, quantity: Any, params: Params, context: FaultContext) -> Any:
         """Expected electrons times the transmission of all grains, plus their glow."""
         factor = _shadows_once(params, context).transmission
-        out = cv2.multiply(quantity.array, cv2.merge([factor, factor, factor]))
+        out = times(quantity.array, factor)
         light = context.once("dust.glow", params, lambda: _glow(params, context))
-        return quantity.with_array(out if light is None else cv2.add(out, light))
+        return quantity.with_array(out if light is None else plus(out, light))
 
     def footprint(self, params: Params, context: FaultContext) -> NDArray[np.bool_]:
         """bool[y, x]: where the loss reaches `mask_loss`."""
@@ -365,7 +365,7 @@ def _lobe_table(x: F64) -> F64:
 
 
 def _glow(params: Params, context: FaultContext) -> F32 | None:
-    """Light that grains send astray, electrons float32[y, x, 3].
+    """Light that grains send astray, electrons float32[y, x, channel].
 
     Beyond their cores the lobes of all grains fall alike, as a / (π k sin³θ), and there a sum over the grains in a
     pixel's beam is enough. Near the Sun each has a lobe of its own, but there the pixels' beams are the Sun's.
@@ -455,7 +455,7 @@ def _painted(
     own_e: F64, factors_e: tuple[F64, F64], lobes: tuple[F64, F64], seen: F32, sun: _Sun, frame: Frame
 ) -> F32:
     """`own_e` float64[colour, offset], plus each of the two lobes, float64[offset], times its factor for the colour
-    and its layer of `seen`; electrons float32[y, x, 3]."""
+    and its layer of `seen`; electrons float32[y, x, channel]."""
     directions, density = _field(frame)
     square = np.zeros_like(directions[0])
     for component, at in zip(directions, sun.direction, strict=True):
@@ -482,4 +482,4 @@ def _painted(
         if density is not None:
             light *= density
         colours.append(cv2.max(light, 0))
-    return np.asarray(cv2.merge(colours))
+    return np.asarray(cv2.merge(colours)).reshape(*square.shape, len(colours))

@@ -33,8 +33,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import VbnfaultError
+from ..quantities import LUMINANCE
 from ..resources import data_dir
-from .base import Fault, FaultContext, Interval, Params, bounds, number, rows
+from .base import Fault, FaultContext, Interval, Params, bounds, number, plus, rows
 from .flare_textures import FILL
 
 CLOSE = (1, 2, 3, 4, 5)
@@ -43,6 +44,10 @@ GLARES = (1, 2)
 MAX_DRAWS = 256
 
 Window = tuple[slice, slice]
+
+# What of a texture's R, G, B a channel sees. Textures know nothing of the near infrared: red stands in (assumed).
+_COLOURS = dict(zip("RGB", np.eye(3, dtype=np.float32), strict=True))
+_COLOURS |= {"W": LUMINANCE, "NIR": _COLOURS["R"]}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -137,7 +142,7 @@ class TextureStraylight(Fault):
     def apply(self, quantity: Any, params: Params, context: FaultContext) -> Any:
         """Expected electrons plus flares and glare."""
         layer = _layer_once(params, context, quantity.white_e)
-        return quantity if layer is None else quantity.with_array(cv2.add(quantity.array, layer))
+        return quantity if layer is None else quantity.with_array(plus(quantity.array, layer))
 
     def footprint(self, params: Params, context: FaultContext) -> NDArray[np.bool_]:
         """bool[y, x]: where any colour gains at least `mask_level_dn`."""
@@ -147,7 +152,7 @@ class TextureStraylight(Fault):
             return np.zeros(context.shape, dtype=bool)
         level = white * np.float32(params["mask_level_dn"] / 255)
         below = tuple(map(float, np.nextafter(level, np.float32(0))))
-        return cv2.inRange(layer, (-1.0,) * 3, below) == 0
+        return cv2.inRange(layer, (-1.0,) * len(below), below) == 0
 
 
 def flare_centres_px(params: Params, sun_xy_px: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -180,7 +185,7 @@ def _layer_once(params: Params, context: FaultContext, white_e: NDArray[np.float
 
 
 def _layer(params: Params, context: FaultContext, white_e: NDArray[np.float32]) -> NDArray[np.float32] | None:
-    """All flares and the glare, electrons float32[y, x, 3]; None where there is nothing to add."""
+    """All flares and the glare, electrons float32[y, x, channel]; None where there is nothing to add."""
     visible = 1.0 if context.sun_visible_fraction is None else float(context.sun_visible_fraction)
     if context.sun_xy_px is None or visible <= 0:
         return None
@@ -195,16 +200,17 @@ def _layer(params: Params, context: FaultContext, white_e: NDArray[np.float32]) 
     ]
     if params["glare"]:
         stamps.append((f"glare_{params['glare']['index']}", sun, params["glare"]))
+    colours = np.stack([_COLOURS[channel] for channel in context.camera.detector.channels])
     layer = None
     for name, centre, f in stamps:
         gain = white_e * np.float32(visible * f["brightness"])
-        placed = _stamp(name, centre, f["radius"] * width, angle, gain, context.shape)
+        placed = _stamp(name, centre, f["radius"] * width, angle, colours * gain[:, None], context.shape)
         if placed is None:
             continue
         if layer is None:
-            layer = np.zeros((height, width, 3), dtype=np.float32)
+            layer = np.zeros((height, width, len(white_e)), dtype=np.float32)
         window, stamp = placed
-        cv2.add(layer[window], stamp, layer[window])
+        layer[window] += stamp
     return layer
 
 
@@ -213,10 +219,11 @@ def _stamp(
     centre: NDArray[np.float64],
     radius_px: float,
     angle: float,
-    gain: NDArray[np.float32],
+    weights: NDArray[np.float32],
     shape: tuple[int, int],
 ) -> tuple[Window, NDArray[np.float32]] | None:
-    """A texture times `gain` (per colour), resampled onto the pixels it covers; None outside the frame.
+    """A texture resampled onto the pixels it covers, in channels that hold its colours by `weights`
+    float32[channel, 3]; None outside the frame.
 
     `angle` in radians turns the texture's +x towards image +y. With pixel centres at +0.5 on both sides, the
     pixel of index i shows the texel of index S/2 - 0.5 + Rᵀ(i + 0.5 - centre) / s, s pixels wide being a
@@ -241,14 +248,14 @@ def _stamp(
         dtype=np.float64,
     )
     stamp = cv2.warpAffine(
-        level * gain,
+        cv2.transform(level, weights),
         matrix,
         (x1 - x0, y1 - y0),
         flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
         borderMode=cv2.BORDER_CONSTANT,
         borderValue=0,
     )
-    return (slice(y0, y1), slice(x0, x1)), np.asarray(stamp, dtype=np.float32)
+    return (slice(y0, y1), slice(x0, x1)), np.asarray(stamp, dtype=np.float32).reshape(*stamp.shape[:2], -1)
 
 
 @lru_cache(maxsize=16)

@@ -14,13 +14,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from .. import spectra
 from ..quantities import Irradiance
-from .base import FaultContext, Interval, LensFault, Params, bounds, choice, number
+from .base import FaultContext, Interval, LensFault, Params, bounds, choice, number, plus
 
 F32 = NDArray[np.float32]
 
@@ -78,7 +77,7 @@ class _LensStraylight(LensFault):
     def apply(self, quantity: Any, params: Params, context: FaultContext) -> Any:
         """Expected electrons plus what the lens sends astray."""
         layer = self._layer_once(params, context)
-        return quantity if layer is None else quantity.with_array(cv2.add(quantity.array, layer))
+        return quantity if layer is None else quantity.with_array(plus(quantity.array, layer))
 
     def footprint(self, params: Params, context: FaultContext) -> NDArray[np.bool_]:
         """bool[y, x]: where any colour gains at least `mask_level_dn`."""
@@ -92,7 +91,7 @@ class _LensStraylight(LensFault):
         return context.once("straylight.lens", params, lambda: self._layer(params, context))
 
     def _layer(self, params: Params, context: FaultContext) -> F32 | None:
-        """All straylight, electrons float32[y, x, 3]; None without a Sun in front of the camera."""
+        """All straylight, electrons float32[y, x, channel]; None without a Sun in front of the camera."""
         from ..lens.straylight import Baffle, Cleanliness, straylight
 
         sun = _sun(context)

@@ -43,9 +43,9 @@ class Cos4Vignetting(Fault):
 
     def apply(self, quantity: Any, params: Params, context: FaultContext) -> Any:
         """Expected electrons times the factor of each pixel."""
-        cos4 = _cos4_rgb(context.shape, context.camera.focal_length_px)
+        cos4 = _cos4_planes(context.shape, context.camera.focal_length_px, quantity.array.shape[2])
         e0 = params["on_axis_illuminance_dn"] / 255
-        return quantity.with_array(cv2.multiply(quantity.array, cos4, scale=e0))
+        return quantity.with_array(cv2.multiply(quantity.array, cos4, scale=e0).reshape(cos4.shape))
 
     def footprint(self, params: Params, context: FaultContext) -> NDArray[np.bool_]:
         """bool[y, x]: where the loss reaches `mask_loss`."""
@@ -67,8 +67,8 @@ def cos4_map(shape: tuple[int, int], focal_length_px: float) -> NDArray[np.float
 
 
 @lru_cache(maxsize=2)
-def _cos4_rgb(shape: tuple[int, int], focal_length_px: float) -> NDArray[np.float32]:
-    # three equal planes, kept for all samples of a camera: one fast product in place of a broadcast
-    out = np.repeat(cos4_map(shape, focal_length_px)[..., None], 3, axis=2)
+def _cos4_planes(shape: tuple[int, int], focal_length_px: float, channels: int) -> NDArray[np.float32]:
+    # equal planes, kept for all samples of a camera: one fast product in place of a broadcast
+    out = np.repeat(cos4_map(shape, focal_length_px)[..., None], channels, axis=2)
     out.flags.writeable = False
     return out

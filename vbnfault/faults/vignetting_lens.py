@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from ..lens import RealLens
 from ..lens.footprint import Beams, Frame
-from .base import FaultContext, Interval, LensFault, Params, bounds, number
+from .base import FaultContext, Interval, LensFault, Params, bounds, number, times
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -90,7 +90,7 @@ class LensVignetting(LensFault):
     def apply(self, quantity: Any, params: Params, context: FaultContext) -> Any:
         """Expected electrons times the factor of each pixel."""
         factor = _factor_once(params, context)
-        return quantity.with_array(cv2.multiply(quantity.array, cv2.merge([factor, factor, factor])))
+        return quantity.with_array(times(quantity.array, factor))
 
     def footprint(self, params: Params, context: FaultContext) -> NDArray[np.bool_]:
         """bool[y, x]: where the loss reaches `mask_loss`."""

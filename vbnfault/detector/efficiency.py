@@ -1,0 +1,87 @@
+"""Quantum efficiency of a sensor's channels: electrons per photon behind each of its filters."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .. import spectra
+from ..errors import InputError
+
+F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
+
+# A long pass before the pixels of the near infrared, where a sensor's file gives no curve: assumed.
+_NIR_EDGE_NM = (700.0, 750.0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Curve:
+    """QE of one channel, in 0 to 1, at rising wavelengths; linear between them, none beyond."""
+
+    channel: str
+    wavelength_nm: tuple[float, ...]
+    value: tuple[float, ...]
+
+    def __post_init__(self) -> None:
+        if len(self.wavelength_nm) != len(self.value) or len(self.value) < 2:
+            raise InputError(
+                f"{len(self.wavelength_nm)} wavelengths for {len(self.value)} values: must be as many, at least 2"
+            )
+        if any(a >= b for a, b in itertools.pairwise(self.wavelength_nm)):
+            raise InputError(f"wavelength_nm = {list(self.wavelength_nm)}: must increase")
+        for value in self.value:
+            if not 0 <= value <= 1:
+                raise InputError(f"value holds {value:g}: must be from 0 to 1")
+
+
+@dataclass(frozen=True, kw_only=True)
+class QuantumEfficiency:
+    """QE of `channels`.
+
+    A channel without a curve of its own has, of R, G and B, the relative curve `response` names
+    (`spectra.RESPONSES`) times `peak`; of W, which has no filter, `peak` at all wavelengths; of NIR the same behind
+    a long pass (both assumed).
+    """
+
+    channels: tuple[str, ...] = ("R", "G", "B")
+    response: str = "nikon_5100"
+    peak: float = 0.5
+    curves: tuple[Curve, ...] = ()
+
+    def at(self, wavelength_nm: F64) -> F64:
+        """QE at wavelengths, float64[channel, n]."""
+        own = {curve.channel: curve for curve in self.curves}
+        known: dict[str, F64] = {}
+        if (set(self.channels) - set(own)) & set("RGB"):
+            colours = spectra.response(self.response, wavelength_nm, self.peak)
+            known = dict(zip("RGB", colours, strict=True))
+        known["W"] = np.full(len(wavelength_nm), self.peak)
+        known["NIR"] = self.peak * np.interp(wavelength_nm, _NIR_EDGE_NM, (0.0, 1.0))
+        for name, curve in own.items():
+            known[name] = np.interp(wavelength_nm, curve.wavelength_nm, curve.value, left=0.0, right=0.0)
+        return np.stack([known[name] for name in self.channels])
+
+    def electron_weights(self, nodes_nm: F64) -> F64:
+        """`spectra.electron_weights` of the channels, float64[channel, band]."""
+        return spectra.electron_weights(self.at, nodes_nm)
+
+
+@lru_cache(maxsize=16)
+def white_balance(efficiency: QuantumEfficiency) -> F32:
+    """Gain of each channel, float32[channel], at least 1, that makes a grey surface in sunlight as bright in all
+    that are seen; 1 for NIR, which is not."""
+    nodes = spectra.band_nodes_nm(400.0, 700.0, 31)
+    grey = efficiency.electron_weights(nodes) @ spectra.solar_band_irradiance_W_m2_nm(nodes, 1.0)
+    out = np.ones(len(grey))
+    seen = np.array([name != "NIR" for name in efficiency.channels])
+    if (grey[seen] <= 0).any():
+        raise InputError(f"no sunlight of 400 to 700 nm reaches one of the channels {efficiency.channels}")
+    out[seen] = grey[seen].max() / grey[seen]
+    gains: F32 = out.astype(np.float32)
+    gains.flags.writeable = False
+    return gains
