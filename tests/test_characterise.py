@@ -15,11 +15,13 @@ from vbnfault import resources
 from vbnfault.characterise import Settings, VirtualCamera, characterise
 from vbnfault.cli import app
 from vbnfault.detector.chain import Device, MosaicNoise, by_channel
+from vbnfault.detector.charge import TrapSpecies
 from vbnfault.detector.individual import IndividualSpec
 from vbnfault.detector.mosaic import pattern
 from vbnfault.detector.readout import ReadoutSpec
 from vbnfault.detector.sensor import Sensor, Transfer, load_sensor, parse_sensor
 from vbnfault.errors import InputError
+from vbnfault.quantities import TRAP
 
 SHAPE = (256, 256)
 
@@ -135,6 +137,73 @@ def test_a_sensor_that_corrects_its_defects_hides_them() -> None:
     # what is left is the pixels' own response: 1.2 % of 51 DN, five times
     assert worst[0] > 50
     assert worst[1] < 6
+
+
+# --- charge of a CCD under way ---------------------------------------------------------------------------------
+
+
+def ccd(architecture: str, nodes: int = 1, **transfer: Any) -> Sensor:
+    spec = replace(sensor().individual, dark_current_e_s=1000.0, dsnu_e=0.0, prnu=0.0)
+    return sensor(
+        architecture=architecture,
+        individual=spec,
+        readout=replace(sensor().readout, nodes=nodes),
+        transfer=Transfer(row_readout_s=1e-3, **transfer),
+    )
+
+
+@pytest.mark.parametrize("architecture", ["full_frame_ccd", "frame_transfer_ccd", "interline_ccd"])
+def test_charge_gathers_dark_current_until_its_row_is_read(architecture: str) -> None:
+    """1000 e/s for a ms a row on top of the exposure's; and the picture's black level follows it."""
+    device = Device(ccd(architecture), 1, shape=(64, 64))
+    got = device.expected_e(np.zeros((64, 64), np.float32), 0.01)
+    np.testing.assert_allclose(got, np.repeat(10.0 + np.arange(64)[:, None], 64, axis=1), rtol=1e-5)
+    assert not device.rgbi(device.raw(np.zeros((64, 64), np.float32), 0.01), 0.01).array.any()
+    full = device.rgbi(np.full((64, 64), device.sensor.readout.top_dn, np.uint16), 0.01).array
+    assert (full == 255).all()
+
+
+def test_four_nodes_read_each_half_to_its_own_side() -> None:
+    made = ccd("full_frame_ccd", nodes=4)
+    device = Device(made, 1, shape=(64, 64))
+    got = device.expected_e(np.zeros((64, 64), np.float32), 0.01)[:, 5]
+    np.testing.assert_allclose(got, 10.0 + np.minimum(np.arange(64), 63 - np.arange(64)), rtol=1e-5)
+    traps = (TrapSpecies(density_per_px=20.0, release_time_s=1e-3),)
+    move = replace(made.transfer, parallel_traps=traps, serial_traps=traps, pixel_transfer_s=1e-3)
+    cold = replace(made, transfer=move, individual=replace(made.individual, dark_current_e_s=0.0))
+    light = np.zeros((64, 64), np.float32)
+    light[[20, 43], [20, 43]] = 9000.0
+    charge = Device(cold, 1, shape=(64, 64)).collected_e(light, 0.01)
+    # trails lead to the middle, from where charge comes
+    assert charge[21, 20] > 10 < charge[42, 43]
+    assert charge[20, 21] > 10 < charge[43, 42]
+    assert charge[19, 20] == charge[44, 43] == charge[20, 19] == charge[43, 44] == 0
+
+
+def test_a_shutter_that_lets_light_through_smears() -> None:
+    light = np.zeros((64, 64), np.float32)
+    light[20, 30] = 5000.0
+    device = Device(ccd("full_frame_ccd", shutter_transmission=0.02), 1, shape=(64, 64))
+    dark = device.expected_e(0 * light, 0.01)
+    got = device.expected_e(light, 0.01) - dark
+    np.testing.assert_allclose(got[21:, 30], 5000 / 0.01 * 1e-3 * 0.02, rtol=1e-3)
+    np.testing.assert_allclose(got[:20, 30], 0, atol=1e-3)
+
+
+def test_a_device_has_traps_for_life() -> None:
+    made = ccd("full_frame_ccd")
+    spec = replace(made.individual, trap_share=3e-3, trap_depth_e=400.0, dark_current_e_s=0.0)
+    device = Device(replace(made, individual=spec), 5, shape=(64, 64))
+    traps = device.individual.traps
+    assert 4 < len(traps) < 25
+    light = np.full((64, 64), 100.0, np.float32)
+    lost = light - device.collected_e(light, 0.01)
+    # what they hold, but for what the last row saves
+    assert lost.sum() == pytest.approx(traps.depth_e.sum(), rel=0.3)
+    assert set(np.flatnonzero(lost.any(axis=0))) <= set(traps.column.tolist())
+    drawn = noise(2, (64, 64))
+    kinds = device.defects(0.01, drawn)
+    assert set(zip(*np.nonzero(kinds & TRAP), strict=True)) == set(zip(traps.row, traps.column, strict=True))
 
 
 # --- files ------------------------------------------------------------------------------------------------------

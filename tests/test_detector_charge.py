@@ -13,11 +13,9 @@ from vbnfault.detector.charge import (
     ChargeCloud,
     TrapSpecies,
     bloom,
+    capture,
     cti,
-    cti_constant,
-    lag,
     parasitic_light,
-    rolling_shutter_exposure,
     row_wait_s,
     smear,
     smear_interline,
@@ -51,7 +49,6 @@ EFFECTS: dict[str, Callable[..., np.ndarray]] = {
     ),
     "bloom": lambda image, d: bloom(image, full_well_e=5000.0, antiblooming=0.2, direction=d),
     "cti": lambda image, d: cti(image, TRAPS, cloud=CLOUD, transfer_s=1.0, direction=d),
-    "constant": lambda image, d: cti_constant(image, inefficiency=1e-3, direction=d),
 }
 
 
@@ -96,7 +93,6 @@ def test_charge_moves_where_the_direction_says() -> None:
     for direction, trail in {"up": (5, 4), "down": (3, 4), "left": (4, 5), "right": (4, 3)}.items():
         for got in (
             smear(image, exposure_s=1.0, row_transfer_s=0.01, direction=direction),
-            cti_constant(image, inefficiency=0.01, direction=direction),
             cti(image, TRAPS, cloud=CLOUD, transfer_s=1.0, direction=direction),
         ):
             assert got[trail] > 0.01  # behind, away from the register
@@ -311,7 +307,7 @@ def test_cti_of_a_linear_cloud_is_the_constant_one_to_first_order() -> None:
     cloud = ChargeCloud(full_well_e=1e6, fill_power=1.0)
     species = [TrapSpecies(density_per_px=100.0, release_time_s=1e-3)]
     got = cti(image, species, cloud=cloud, transfer_s=1.0)
-    classic = cti_constant(image, inefficiency=1e-4)
+    classic = np.transpose([clocked_constant(c, 1e-4, 0) for c in image.T])
     assert np.abs(classic - image).max() > 20
     # what the first order leaves out: (P ε)² of a packet and of those before it
     reach = (SHAPE[0] * 1e-4) ** 2 * image.max()
@@ -334,7 +330,6 @@ def test_cti_of_nothing_changes_nothing() -> None:
     np.testing.assert_array_equal(cti(image, [], cloud=CLOUD, transfer_s=1.0), image)
     none = [TrapSpecies(density_per_px=0.0, release_time_s=1.0)]
     np.testing.assert_array_equal(cti(image, none, cloud=CLOUD, transfer_s=1.0), image)
-    np.testing.assert_array_equal(cti_constant(image, inefficiency=0.0), image)
     below = np.full(SHAPE, 96.0, np.float32)  # within the notch
     np.testing.assert_array_equal(cti(below, TRAPS, cloud=CLOUD, transfer_s=1.0), below)
 
@@ -361,23 +356,42 @@ def clocked_constant(column: np.ndarray, inefficiency: float, before: int) -> np
     return np.array(out[before:])
 
 
-@pytest.mark.parametrize(("inefficiency", "before"), [(1e-5, 0), (1e-3, 40), (0.05, 5)])
-def test_constant_cti_against_a_clocked_register(inefficiency: float, before: int) -> None:
-    image = scene(7)
-    got = cti_constant(image, inefficiency=inefficiency, transfers_before=before)
-    truth = np.transpose([clocked_constant(c, inefficiency, before) for c in image.T])
-    # sums of float32 of both signs of none: a few roundings, and the 1e-9 left out
-    np.testing.assert_allclose(got, truth, rtol=1e-5, atol=1e-8 * image.max())
+# ------------------------------------------------------------------------------------------------- single traps
 
 
-# ---------------------------------------------------------------------------------------- shutters, waiting, lag
+def test_a_trap_takes_the_first_electrons_that_come_by() -> None:
+    image = np.full((6, 3), 30.0, np.float32)
+    got = capture(image, np.array([2]), np.array([1]), np.array([70.0]))
+    # packets of rows 2, 3, 4 pass it in turn; the first two lose all, the third ten
+    np.testing.assert_allclose(got[:, 1], [30, 30, 0, 0, 20, 30])
+    np.testing.assert_array_equal(got[:, [0, 2]], image[:, [0, 2]])
+    down = capture(image, np.array([2]), np.array([1]), np.array([70.0]), direction="down")
+    np.testing.assert_allclose(down[:, 1], [20, 0, 0, 30, 30, 30])
 
 
-def test_rows_are_read_and_exposed_one_after_the_other() -> None:
+def test_traps_of_a_column_are_met_one_after_the_other() -> None:
+    """Against a register clocked packet by packet."""
+    generator = np.random.default_rng(4)
+    image = generator.gamma(1.0, 40.0, (40, 5)).astype(np.float32)
+    row, column = generator.integers(40, size=12), generator.integers(5, size=12)
+    depth = generator.exponential(150.0, 12)
+    left, truth = depth.copy(), image.astype(np.float64)
+    for y in range(40):
+        for trap in sorted(range(12), key=lambda k: -row[k]):
+            if row[trap] <= y:
+                x = column[trap]
+                taken = min(truth[y, x], left[trap])
+                truth[y, x] -= taken
+                left[trap] -= taken
+    np.testing.assert_allclose(capture(image, row, column, depth), truth, atol=1e-4)
+
+
+# ---------------------------------------------------------------------------------------- shutters, waiting
+
+
+def test_rows_are_read_one_after_the_other() -> None:
     np.testing.assert_array_equal(row_wait_s(4, row_period_s=0.5), [0, 0.5, 1, 1.5])
     np.testing.assert_array_equal(row_wait_s(4, row_period_s=0.5, direction="down"), [1.5, 1, 0.5, 0])
-    window = rolling_shutter_exposure(3, exposure_s=2.0, row_period_s=0.25, direction="down")
-    np.testing.assert_array_equal(window, [[0.5, 2.5], [0.25, 2.25], [0, 2]])
 
 
 def test_waiting_charge_gathers_light() -> None:
@@ -389,12 +403,6 @@ def test_waiting_charge_gathers_light() -> None:
     upside_down = parasitic_light(signal, rate, sensitivity=1.0, row_period_s=1.0, direction="down")
     np.testing.assert_array_equal(upside_down[-1], signal[-1])
     assert (upside_down[0] > signal[0]).all()
-
-
-def test_lag_hands_charge_to_the_next_frame() -> None:
-    first, second = scene(8), scene(9)
-    np.testing.assert_allclose(lag(second, first, fraction=0.25), 0.75 * second + 0.25 * first, rtol=2.0**-22)
-    np.testing.assert_array_equal(lag(second, first, fraction=0.0), second)
 
 
 # ----------------------------------------------------------------------------------------------------- errors
@@ -425,12 +433,13 @@ ONE = [TrapSpecies(density_per_px=1.0, release_time_s=1.0)]
         (lambda: cti(IMAGE, ONE, cloud=CLOUD, transfer_s=1.0, passes=0), "passes = 0: must be at least 1"),
         (lambda: cti(IMAGE, ONE, cloud=CLOUD, transfer_s=1.0, transfers_before=-1), "transfers_before = -1"),
         (lambda: cti(IMAGE, ONE, cloud=CLOUD, transfer_s=1.0, trail_left_out=0.0), "trail_left_out = 0"),
-        (lambda: cti_constant(IMAGE, inefficiency=1.0), "inefficiency = 1: must be at least 0, below 1"),
-        (lambda: cti_constant(IMAGE, inefficiency=0.1, transfers_before=-1), "transfers_before = -1"),
+        (
+            lambda: capture(IMAGE, *np.zeros((3, 1), int), direction="left"),
+            "direction = 'left': must be up or down",
+        ),
         (lambda: row_wait_s(0, row_period_s=1.0), "height_px = 0"),
         (lambda: row_wait_s(3, row_period_s=1.0, direction="left"), "direction = 'left': must be up or down"),
         (lambda: parasitic_light(IMAGE, IMAGE, sensitivity=2.0, row_period_s=1.0), "sensitivity = 2"),
-        (lambda: lag(IMAGE, IMAGE, fraction=-1.0), "fraction = -1"),
     ],
 )
 def test_bad_numbers_are_refused_in_a_sentence(call: Callable[[], object], message: str) -> None:

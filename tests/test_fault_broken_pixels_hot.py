@@ -14,14 +14,21 @@ from vbnfault import config
 from vbnfault.errors import InputError
 from vbnfault.faults import FaultContext
 from vbnfault.pipeline import Session
-from vbnfault.quantities import Charge
+from vbnfault.quantities import RTS, RTS_HIGH, STUCK, Charge
 
 SIZE = 128
-KEYS: dict[str, Any] = {"years": 5.0, "growth_factor": 2e4, "dose_TeV_g": 0.0, "clustered_share": 0.0}
+KEYS: dict[str, Any] = {
+    "years": 5.0,
+    "growth_factor": 2e4,
+    "dose_TeV_g": 0.0,
+    "anneal_days": 7.0,
+    "clustered_share": 0.0,
+    "stuck_per_year": 0.0,
+}
 
 
-def context(exposure_s: float = 0.02, **sensor: Any) -> FaultContext:
-    made = with_mosaic(make_context(SIZE, architecture="cmos"), **sensor)
+def context(exposure_s: float = 0.02, architecture: str = "cmos", up: str = "up", **sensor: Any) -> FaultContext:
+    made = with_mosaic(make_context(SIZE, architecture=architecture, readout_direction=up), **sensor)
     return replace(made, camera=replace(made.camera, exposure_s=exposure_s))
 
 
@@ -65,6 +72,82 @@ def test_age_and_dose_keep_what_is_there() -> None:
     warm, less = added(where, params), added(frozen, params)
     both = (warm > 0) & (less > 0)
     assert np.median(warm[both] / less[both]) == pytest.approx(51.6, rel=0.02)
+
+
+def test_damage_anneals() -> None:
+    """Rates fall by the law of Srour & Lo from 7 to 58 days, 1.00 to 0.72, of radiation's defects alone."""
+    where = context(0.1)
+    keys = {"growth_factor": 1e-3, "dose_TeV_g": 20.0, "least_dn": 0.001}
+    week, later = (added(where, drawn(where, **(keys | {"anneal_days": d}))) for d in (7.0, 58.0))
+    both = (week > 0) & (later > 0)
+    assert np.median(later[both] / week[both]) == pytest.approx(0.7207, rel=0.01)
+
+
+def test_stuck_pixels_show_their_level_whatever_the_light() -> None:
+    where = context(0.01)
+    keys = {"growth_factor": 1e3, "years": 10.0, "stuck_per_year": 1e-6, "dead_per_year": 0.0}
+    fault = make("broken_pixels", model="hot_pixels", **(KEYS | keys))
+    params = fault.draw(where, rng(1))
+    stuck = (fault.defects(params, where) & STUCK) > 0  # type: ignore[operator]
+    assert 90 < stuck.sum() < 240  # 1e-6 · 1e3 · 10 · 128² = 164
+    shown = [
+        fault.apply(Charge(array=np.full(where.shape, e, dtype=np.float32)), params, where).array[stuck]
+        for e in (0.0, 5000.0)
+    ]
+    np.testing.assert_array_equal(*shown)
+    level = shown[0] / where.camera.detector.full_well_e
+    assert 0.4 < level.mean() < 0.6
+    assert 0 <= level.min() < level.max() <= 1
+
+
+def test_telegraph_signals_are_recorded_in_their_state() -> None:
+    """New with the dose; what they add is their amplitude for the share of the exposure that they are high."""
+    quiet = replace(context(1.0).camera.detector.sensor.individual, rts_per_interaction=0.0)  # type: ignore[union-attr]
+    keys = {"growth_factor": 1e-3, "dose_TeV_g": 50.0, "least_dn": 0.001}
+    where, without = context(1.0), context(1.0, individual=quiet)
+    params = drawn(where, **keys)
+    jumps = added(where, params) - added(without, drawn(without, **keys))
+    listed = params["rts"]
+    assert len(listed) > 30
+    expected = np.zeros(where.shape)
+    for one in listed:
+        expected[one["y"], one["x"]] += one["amplitude_e_s"] * one["high_share"]
+    assert len(listed) < 256  # all of them
+    np.testing.assert_allclose(jumps, expected, atol=0.05)
+    shares = np.array([one["high_share"] for one in listed])
+    # mean times from 1 s to 3 h: in a second most are in one state throughout, some change
+    assert {0.0, 1.0} <= set(shares)
+    kinds = make("broken_pixels", model="hot_pixels", **(KEYS | keys)).defects(params, where)
+    assert kinds is not None
+    assert ((kinds & RTS) > 0).sum() == len({(one["x"], one["y"]) for one in listed})
+    assert ((kinds & RTS_HIGH) > 0).sum() == len({(o["x"], o["y"]) for o in listed if o["high_share"] > 0.5})
+
+
+@pytest.mark.parametrize("direction", ["up", "down"])
+def test_a_hot_pixel_of_a_ccd_draws_a_line_behind_it(direction: str) -> None:
+    """Each packet that is clocked past it waits a row's readout time in it: R τ in all rows behind, none before."""
+    where = context(0.05, "full_frame_ccd", direction)
+    params = drawn(where, growth_factor=1000.0, least_dn=0.001)
+    shot = added(where, params)
+    assert params["count"] > 3
+    sensor: Any = where.camera.detector.sensor  # type: ignore[union-attr]
+    facing = shot if direction == "up" else shot[::-1]
+    lines = 0
+    for column in range(SIZE):
+        hot = np.flatnonzero(np.diff(facing[:, column], prepend=0) > 1.0)
+        if len(hot) != 1:
+            continue
+        row = int(hot[0])
+        assert facing[:row, column].max(initial=0.0) == 0
+        behind = facing[row + 1 :, column]
+        if len(behind) > 1 and behind[0] > 0:
+            lines += 1
+            np.testing.assert_allclose(behind, behind[0], rtol=1e-4)
+            # at most: what is not its offset grew for the exposure at the same rate
+            assert behind[0] / sensor.transfer.row_readout_s <= facing[row, column] / 0.05 * 1.001
+    assert lines >= 3
+    with_cmos = added(context(0.05), drawn(context(0.05), growth_factor=1000.0, least_dn=0.001))
+    assert ((with_cmos > 0).sum(axis=0) <= 4).all()  # no lines
 
 
 def test_defects_stay_in_their_mask_when_the_mosaic_spreads_them() -> None:

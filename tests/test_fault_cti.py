@@ -19,7 +19,12 @@ SIZE = 64
 def context(architecture: str = "full_frame_ccd", direction: str = "up", **transfer: Any) -> FaultContext:
     c = with_mosaic(make_context(SIZE, architecture=architecture, readout_direction=direction, exposure_s=0.01))
     detector: Any = c.camera.detector
-    sensor = replace(detector.sensor, transfer=replace(detector.sensor.transfer, **transfer))
+    # without the dark current of charge under way, which fills traps before light does
+    sensor = replace(
+        detector.sensor,
+        transfer=replace(detector.sensor.transfer, **transfer),
+        individual=replace(detector.sensor.individual, dark_current_e_s=0.0),
+    )
     return replace(c, camera=replace(c.camera, detector=replace(detector, sensor=sensor)))
 
 
@@ -65,7 +70,7 @@ def test_parallel_traps_take_and_trail(direction: str) -> None:
     assert taken * kept * 0.9 < lost <= taken * 1.01
     behind = change[41:, 30] if direction == "up" else change[39::-1, 30]
     ahead = change[:40, 30] if direction == "up" else change[41:, 30]
-    assert behind[0] > behind[1] > behind[4] > 0
+    assert behind[0] > behind[1] > behind[2] > 0
     assert behind[:2].sum() > 0.1 * lost
     assert np.abs(ahead).max() < 1  # the dark charge alone
 

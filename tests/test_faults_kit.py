@@ -38,6 +38,8 @@ def with_mosaic(context: FaultContext, **sensor: Any) -> FaultContext:
     """The same with a mosaic detector, a CCD where the camera's architecture is one; `sensor` changes its keys."""
     camera = context.camera
     made = load_sensor("generic_ccd" if camera.is_ccd else "generic_cmos")
+    if camera.architecture == "frame_transfer_ccd":
+        made = replace(made, transfer=replace(made.transfer, row_transfer_s=1e-6))
     made = replace(made, architecture=camera.architecture, **sensor)
     height, width = context.shape
     direction = camera.readout_direction if camera.readout_direction in ("up", "down") else "up"

@@ -153,7 +153,7 @@ def test_a_mosaic_detector_takes_raw_pictures_with_its_own_device() -> None:
     faults = {"broken_pixels": {"model": "hot_pixels", "growth_factor": 1e5, "years": 10.0}, "broken_lines": {}}
     camera = {"width_px": 96, "height_px": 80, "detector": "generic_cmos", "individuals": 4}
     scene = {
-        **small_scene(camera=camera, dataset={"layers": ["clean", "raw", "without_broken_pixels"]}),
+        **small_scene(camera=camera, dataset={"layers": ["clean", "raw", "defects", "without_broken_pixels"]}),
         "faults": faults,
     }
     s = Session(config.parse_scene(scene, source="test"))
@@ -164,6 +164,15 @@ def test_a_mosaic_detector_takes_raw_pictures_with_its_own_device() -> None:
         raw = sample.layers["raw"]
         assert (raw.shape, raw.dtype) == ((80, 96), np.uint16)
         detector: Any = frame.camera.detector
+        kinds = sample.layers["defects"]
+        assert (kinds.shape, kinds.dtype) == ((80, 96), np.uint8)
+        own = detector.device.bad
+        assert (kinds[own] > 0).all()
+        if "broken_pixels" in frame.drawn:
+            named = frame.drawn["broken_pixels"]
+            assert (kinds[named["y"], named["x"]] > 0).all()
+        else:
+            assert not (kinds[~own] & 7).any()
         assert devices.setdefault(int(sample.scalars["detector_individual"]), detector.seed) == detector.seed
         if "broken_pixels" in frame.drawn:
             changed = (frame.images["image"].array != frame.images["without_broken_pixels"].array).any(axis=2)

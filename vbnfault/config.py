@@ -25,7 +25,7 @@ from .errors import InputError
 Architecture = Literal["full_frame_ccd", "frame_transfer_ccd", "interline_ccd", "cmos"]
 Direction = Literal["up", "down", "left", "right"]
 _LAYERS = (
-    "clean|depth_m|normal|semantic|raw|radiance|mask_effect|"
+    "clean|depth_m|normal|semantic|raw|defects|radiance|mask_effect|"
     "point_T_m|incidence_deg|emission_deg|phase_deg|albedo|without_[a-z_]+"
 )
 # What names no file.

@@ -56,6 +56,8 @@ def photograph(frame: Frame) -> None:
     frame.images["image"] = develop(frame, frame.drawn, noise)
     if "raw" in spec.scene.dataset.layers:
         frame.raw = _raw(frame, noise)
+    if "defects" in spec.scene.dataset.layers:
+        frame.defects = _defects(frame, noise)
     twins = [layer for layer in stored_layers(spec.scene, spec.faults) if layer.startswith("without_")]
     for layer in twins:
         name = layer.removeprefix("without_")
@@ -155,6 +157,18 @@ def _raw(frame: Frame, noise: Any) -> NDArray[np.uint16]:
     assert isinstance(camera.detector, MosaicDetector)
     signal = _signal(frame, frame.drawn, _in_order(frame, frame.drawn, "electrons"))
     return camera.detector.raw(signal, camera.exposure_s, noise, _acts(frame, frame.drawn))
+
+
+def _defects(frame: Frame, noise: Any) -> NDArray[np.uint8]:
+    """What is wrong with the mosaic's pixels: of the device itself, and by the drawn faults."""
+    detector, context = frame.camera.detector, _context(frame, frame.drawn)[1]
+    assert isinstance(detector, MosaicDetector)
+    out = detector.device.defects(frame.camera.exposure_s, noise)
+    for name, params in frame.drawn.items():
+        more = frame.spec.faults[name].defects(params, context)
+        if more is not None:
+            out |= more
+    return out
 
 
 def _acts(frame: Frame, drawn: Mapping[str, Params]) -> dict[str, list[Callable[[Any], Any]]]:

@@ -74,8 +74,9 @@ def configure_faults(scene: SceneConfig, source: str = "scene") -> dict[str, Fau
     for layer in scene.dataset.layers:
         if layer.startswith("without_") and layer != "without_straylight" and layer[8:] not in faults:
             raise InputError(f"{source}: dataset.layers: {layer!r}: the scene has no such fault")
-    if "raw" in scene.dataset.layers and not scene.camera.detector:
-        raise InputError(f"{source}: dataset.layers: 'raw' needs a mosaic: name a camera.detector")
+    for layer in ("raw", "defects"):
+        if layer in scene.dataset.layers and not scene.camera.detector:
+            raise InputError(f"{source}: dataset.layers: {layer!r} needs a mosaic: name a camera.detector")
     for name in scene.dataset.mask_any or ():
         if name not in faults:
             raise InputError(f"{source}: dataset.mask_any: {name!r}: the scene has no such fault")

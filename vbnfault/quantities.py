@@ -110,6 +110,12 @@ class RGBI(Quantity):
 SKY, BODY, SUN, SPACECRAFT = 0, 1, 2, 3
 
 
+# What may be wrong with a pixel of a mosaic, as bits. `rts`: it has a telegraph signal; `rts_high`: one that was in
+# its upper level for more than half of the exposure.
+HOT, DEAD, STUCK, RTS, RTS_HIGH, TRAP = (np.uint8(1 << k) for k in range(6))
+DEFECTS = ("hot", "dead", "stuck", "rts", "rts_high", "trap")
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Truth:
     """Noise-free truth of the pixel centres.

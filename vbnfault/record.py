@@ -54,8 +54,8 @@ def to_sample(frame: Frame) -> Sample:
         elif name == "mask_effect":
             empty = np.zeros(frame.context.shape, dtype=bool)
             layers[name] = np.stack([frame.effects.get(f, empty) for f in names])
-        elif name == "raw":
-            layers[name] = frame.raw
+        elif name in ("raw", "defects"):
+            layers[name] = getattr(frame, name)
         elif name == "radiance":
             layers[name] = frame.radiance.array
         elif name == "albedo" and frame.truth.dust is not None:

@@ -86,6 +86,7 @@ class Frame:
     rejected: list[Params] = field(default_factory=list)
     images: dict[str, RGBI] = field(default_factory=dict)
     raw: NDArray[np.uint16] | None = None
+    defects: NDArray[np.uint8] | None = None
     contexts: dict[Any, FaultContext] = field(default_factory=dict)
     signals: dict[Any, Electrons] = field(default_factory=dict)
     pictures: dict[Any, RGBI] = field(default_factory=dict)

@@ -1,8 +1,8 @@
 """One device of a sensor at work: from photo-electrons expected in its mosaic to raw numbers and to a picture.
 
     expected photo-electrons → response of each pixel (PRNU, dead pixels) → smear, parasitic light → dark current,
-    telegraph signals → shot noise → particles → blooming → traps → offsets → full well, nodes, noise, converter
-    (`readout`) → raw → black level, defect correction, demosaic, white balance → RGBI
+    that of charge under way, telegraph signals → shot noise → particles → blooming → traps → offsets → full well,
+    nodes, noise, converter (`readout`) → raw → defect correction, black level, demosaic, white balance → RGBI
 
 Smear is light that falls on charge under way, so it comes before the shot noise. Offsets (DSNU, "partially stuck"
 pixels) are no charge: they have no shot noise.
@@ -12,15 +12,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property, lru_cache, partial
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..quantities import LUMINANCE, RGBI
-from .charge import ChargeCloud, bloom, cti, parasitic_light, smear, smear_interline
+from ..quantities import DEAD, HOT, LUMINANCE, RGBI, RTS, RTS_HIGH, STUCK, TRAP
+from .charge import ChargeCloud, bloom, capture, cti, parasitic_light, smear, smear_interline
+from .dark import Telegraph
 from .demosaic import correct_defects, demosaic, interpolate
 from .efficiency import white_balance
 from .individual import Individual, IndividualSpec, dark_rate_e_s, make_individual, offset_e, response
@@ -37,6 +38,8 @@ Raw = NDArray[np.uint16]
 STEPS = ("pixels", "charge", "raw")
 Acts = Mapping[str, Sequence[Callable[[Any], Any]]]
 _NOTHING: Acts = {}
+
+_LEAST_BLACK_DN = 0.05
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -94,6 +97,7 @@ class Device:
         self.response = response(self.individual)
         self.offset_e = offset_e(self.individual)
         self.dark_rate_e_s = dark_rate_e_s(self.individual, self.temperature_K)
+        self.transfer_dark_e = transfer_dark_e(sensor, self.dark_rate_e_s, direction)
         self._telegraph = self.individual.rts.at(self.temperature_K)
 
     # --- light to numbers -----------------------------------------------------------------------------------------
@@ -105,26 +109,36 @@ class Device:
         light = cv2.multiply(photo_e, self.response)
         rate = light * np.float32(1 / exposure_s) if exposure_s > 0 else 0 * light
         if sensor.architecture == "frame_transfer_ccd" and (move.row_transfer_s or move.row_clear_s):
-            light = smear(
+            light = self._along_columns(
+                partial(
+                    smear,
+                    exposure_s=exposure_s,
+                    row_transfer_s=move.row_transfer_s,
+                    row_clear_s=move.row_clear_s,
+                ),
                 rate,
-                exposure_s=exposure_s,
-                row_transfer_s=move.row_transfer_s,
-                row_clear_s=move.row_clear_s,
-                direction=self.direction,
+            )
+        elif sensor.architecture == "full_frame_ccd" and move.shutter_transmission:
+            light = self._along_columns(
+                partial(
+                    smear,
+                    exposure_s=exposure_s,
+                    row_transfer_s=move.row_readout_s,
+                    shutter_transmission=move.shutter_transmission,
+                ),
+                rate,
             )
         elif sensor.architecture == "interline_ccd" and move.leak:
-            light = smear_interline(
+            light = self._along_columns(
+                partial(smear_interline, exposure_s=exposure_s, row_transfer_s=move.row_transfer_s, leak=move.leak),
                 rate,
-                exposure_s=exposure_s,
-                row_transfer_s=move.row_transfer_s,
-                leak=move.leak,
-                direction=self.direction,
             )
         elif sensor.architecture == "cmos" and sensor.shutter == "global" and move.leak:
             light = parasitic_light(
                 light, rate, sensitivity=move.leak, row_period_s=move.row_readout_s, direction=self.direction
             )
-        return np.asarray(cv2.scaleAdd(self.dark_rate_e_s, exposure_s, light))
+        out = np.asarray(cv2.scaleAdd(self.dark_rate_e_s, exposure_s, light))
+        return out if self.transfer_dark_e is None else cv2.add(out, self.transfer_dark_e)
 
     def collected_e(
         self, photo_e: F32, exposure_s: float, noise: MosaicNoise | None = None, acts: Acts = _NOTHING
@@ -147,19 +161,15 @@ class Device:
                 antiblooming=move.antiblooming,
                 direction=self.direction,
             )
+            if len(self.individual.traps):
+                charge = self._along_columns(self._captured, charge)
             cloud = ChargeCloud(full_well_e=sensor.readout.full_well_e) if move.cloud is None else move.cloud
             if move.parallel_traps:
-                charge = cti(
-                    charge,
-                    move.parallel_traps,
-                    cloud=cloud,
-                    transfer_s=move.row_readout_s,
-                    direction=self.direction,
-                )
+                clock = partial(cti, species=move.parallel_traps, cloud=cloud, transfer_s=move.row_readout_s)
+                charge = self._along_columns(clock, charge)
             if move.serial_traps:
-                charge = cti(
-                    charge, move.serial_traps, cloud=cloud, transfer_s=move.pixel_transfer_s, direction="left"
-                )
+                clock = partial(cti, species=move.serial_traps, cloud=cloud, transfer_s=move.pixel_transfer_s)
+                charge = self._along_registers(clock, charge)
         return charge
 
     def raw(self, photo_e: F32, exposure_s: float, noise: MosaicNoise | None = None, acts: Acts = _NOTHING) -> Raw:
@@ -178,28 +188,75 @@ class Device:
             raw = act(raw)
         return raw
 
+    def _captured(self, charge: F32, *, direction: str) -> F32:
+        traps = self.individual.traps
+        # of a half, the rows that are read this way
+        first = len(self.response) - len(charge) if direction == "down" else 0
+        here = (traps.row >= first) & (traps.row < first + len(charge))
+        return capture(
+            charge, traps.row[here] - first, traps.column[here], traps.depth_e[here], direction=direction
+        )
+
+    def _along_columns(self, step: Callable[..., F32], image: F32) -> F32:
+        return along_columns(self.sensor, self.direction, step, image)
+
+    def _along_registers(self, step: Callable[..., F32], image: F32) -> F32:
+        """The same along rows: towards the left, or each half to its own side with two nodes or four."""
+        if self.sensor.readout.nodes == 1:
+            return step(image, direction="left")
+        middle = (image.shape[1] + 1) // 2
+        return np.concatenate(
+            [step(image[:, :middle], direction="left"), step(image[:, middle:], direction="right")], axis=1
+        )
+
     def _add_telegraph(self, charge: F32, exposure_s: float, seed: int | None) -> None:
-        signals, pixels = self._telegraph, self.individual.rts
-        if seed is None:
-            share: Any = signals.duty
-        else:
-            rng = np.random.default_rng(seed)
-            share, _ = signals.expose(signals.start(rng), exposure_s, rng)
-        np.add.at(charge, (pixels.row, pixels.column), signals.amplitude_e_s * share * exposure_s)
+        pixels = self.individual.rts
+        share = self._telegraph.duty if seed is None else upper_share(self._telegraph, exposure_s, seed)
+        np.add.at(charge, (pixels.row, pixels.column), self._telegraph.amplitude_e_s * share * exposure_s)
 
     # --- numbers to a picture -------------------------------------------------------------------------------------
 
     def black_dn(self, exposure_s: float) -> float:
-        """Level of no light: bias and mean dark signal, as a camera's covered pixels tell it."""
+        """Level of no light: bias and mean dark signal, as a camera's covered pixels tell it; that of charge under
+        way aside, which is for each row another."""
         readout = self.sensor.readout
         return readout.bias_dn + readout.system_gain_dn_per_e * float(self.dark_rate_e_s.mean()) * exposure_s
 
     @cached_property
+    def row_black_dn(self) -> F32 | None:
+        """What each row's level of no light is higher for the dark current of its charge under way, float32[y, 1];
+        None where that is too little to matter."""
+        if self.transfer_dark_e is None:
+            return None
+        rows = np.median(self.transfer_dark_e, axis=1, keepdims=True) * self.sensor.readout.system_gain_dn_per_e
+        return rows.astype(np.float32) if rows.max() > _LEAST_BLACK_DN else None
+
+    @cached_property
     def bad(self) -> NDArray[np.bool_]:
         """Pixels that a map of defects would name: hot, dead and stuck ones, bool[y, x]."""
-        out = np.zeros(self.shape, dtype=bool)
-        for defects in (self.individual.hot, self.individual.dead, self.individual.stuck):
-            out[defects.row, defects.column] = True
+        return (self._kinds & (HOT | DEAD | STUCK)) > 0
+
+    def defects(self, exposure_s: float, noise: MosaicNoise) -> NDArray[np.uint8]:
+        """What is wrong with each pixel of the mosaic in one exposure, uint8[y, x]: bits of
+        `quantities.DEFECTS`."""
+        out = self._kinds.copy()
+        pixels = self.individual.rts
+        high = upper_share(self._telegraph, exposure_s, noise.telegraph_seed) > 0.5
+        out[pixels.row[high], pixels.column[high]] |= RTS_HIGH
+        return out
+
+    @cached_property
+    def _kinds(self) -> NDArray[np.uint8]:
+        out = np.zeros(self.shape, dtype=np.uint8)
+        one = self.individual
+        for value, some in (
+            (HOT, one.hot),
+            (DEAD, one.dead),
+            (STUCK, one.stuck),
+            (RTS, one.rts),
+            (TRAP, one.traps),
+        ):
+            out[some.row, some.column] |= value
         return out
 
     def rgbi(self, raw: Raw, exposure_s: float) -> RGBI:
@@ -209,8 +266,11 @@ class Device:
         mosaic: NDArray[Any] = raw
         if sensor.correct_defects:
             mosaic = correct_defects(raw, self.bad, sensor.pattern)
-        black = self.black_dn(exposure_s)
-        full = 255.0 / max(sensor.readout.top_dn - black, 1.0)
+        black, highest = self.black_dn(exposure_s), 0.0
+        if self.row_black_dn is not None:
+            mosaic, highest = mosaic - self.row_black_dn, float(self.row_black_dn.max())
+        # what is left above the highest black level is white: a saturated pixel stays so
+        full = 255.0 / max(sensor.readout.top_dn - black - highest, 1.0)
         scale = {
             name: full * float(gain) for name, gain in zip(sensor.pattern.channels, self.white_balance, strict=True)
         }
@@ -237,6 +297,51 @@ class Device:
 def individual(spec: IndividualSpec, shape: tuple[int, int], pixel_pitch_um: float, seed: int) -> Individual:
     """An individual, made once."""
     return make_individual(spec, shape, pixel_pitch_um=pixel_pitch_um, seed=seed)
+
+
+def transfer_dark_e(sensor: Sensor, dark_rate_e_s: F32, direction: str) -> F32 | None:
+    """Electrons that packets of a CCD gather from dark current on their way, float32[y, x]; None on CMOS.
+
+    A full-frame CCD clocks a packet through all pixels between its own and the register, a row's readout time in
+    each, so that a hot pixel draws a line behind it. In the store of a frame-transfer CCD and the registers of an
+    interline one packets wait as long, in pixels as the median one of the image (assumed); on its quick way to the
+    store a packet of the former passes the image's.
+    """
+    move = sensor.transfer
+    if sensor.architecture == "cmos" or not (move.row_readout_s or move.row_transfer_s):
+        return None
+    if sensor.architecture == "full_frame_ccd":
+        return passing_dark_e(sensor, dark_rate_e_s, direction)
+    even = np.full_like(dark_rate_e_s, np.median(dark_rate_e_s))
+    waiting = partial(smear, exposure_s=0.0, row_transfer_s=move.row_readout_s)
+    return along_columns(sensor, direction, waiting, even) + passing_dark_e(sensor, dark_rate_e_s, direction)
+
+
+def passing_dark_e(sensor: Sensor, dark_rate_e_s: F32, direction: str) -> F32:
+    """The part of `transfer_dark_e` that comes from the image's own pixels, float32[y, x]: linear in their rate."""
+    period_s = {
+        "full_frame_ccd": sensor.transfer.row_readout_s,
+        "frame_transfer_ccd": sensor.transfer.row_transfer_s,
+    }.get(sensor.architecture, 0.0)
+    if not period_s:
+        return np.zeros_like(dark_rate_e_s)
+    gather = partial(smear, exposure_s=0.0, row_transfer_s=period_s)
+    return along_columns(sensor, direction, gather, dark_rate_e_s)
+
+
+def along_columns(sensor: Sensor, direction: str, step: Callable[..., F32], image: F32) -> F32:
+    """`step(part, direction=…)` for what is read towards one register: all rows, or each half of them where four
+    nodes sit in the corners."""
+    if sensor.readout.nodes < 4:
+        return step(image, direction=direction)
+    middle = (len(image) + 1) // 2
+    return np.concatenate([step(image[:middle], direction="up"), step(image[middle:], direction="down")])
+
+
+def upper_share(signals: Telegraph, exposure_s: float, seed: int) -> NDArray[np.float64]:
+    """The share of an exposure that telegraph signals spend in their upper level, float64[n], by a seed."""
+    rng = np.random.default_rng(seed)
+    return signals.expose(signals.start(rng), exposure_s, rng)[0]
 
 
 def channel_sites(sensor: Sensor) -> dict[str, tuple[slice, slice]]:

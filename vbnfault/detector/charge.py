@@ -2,7 +2,7 @@
 
 Every function takes one plane of electrons (a mosaic), float32[y, x], row 0 at the top, and returns a new one.
 Physical order: light falls during the frame transfer (`smear`) or on waiting charge (`parasitic_light`); wells
-overflow (`bloom`); packets lose charge to traps on their way (`cti`, first parallel, then serial).
+overflow (`bloom`); packets lose charge to traps on their way (`capture`, `cti`; first parallel, then serial).
 
 A direction ("up", "down", "left", "right") is the way in which charge moves: "up" has its register above row 0,
 so that row 0 is read first. Effects along one line never depend on other lines.
@@ -20,7 +20,6 @@ from functools import lru_cache
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import nbinom
 
 from ..errors import InputError
 
@@ -28,9 +27,6 @@ F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
 DIRECTIONS = ("up", "down", "left", "right")
-
-# Constant CTI: the part of a packet that trails further than the last pixel computed.
-_TRAIL_LEFT_OUT = 1e-9
 
 _ROWS_PER_BLOCK = 64
 
@@ -311,31 +307,41 @@ def _clock(image: F32, cloud: ChargeCloud, per_cloud: F32, trapped: F64, before:
         _by_rows(step, height)
 
 
-def cti_constant(signal_e: F32, *, inefficiency: float, direction: str = "up", transfers_before: int = 0) -> F32:
-    """Image after readout where each transfer leaves the fraction `inefficiency` of a packet to the next one.
+def capture(
+    signal_e: F32,
+    row: NDArray[np.integer],
+    column: NDArray[np.integer],
+    depth_e: NDArray[np.floating],
+    *,
+    direction: str = "up",
+) -> F32:
+    """Image after readout past deep single traps, float32[y, x] in e: each takes the first `depth_e` electrons that
+    come by and keeps them beyond the picture.
 
-    Exact for that rule: a charge of row i needs P = i + 1 + `transfers_before` moves and misses m clocks on the
-    way with the negative binomial probability C(P+m−1, m) ε^m (1−ε)^P, and is then read m rows late.
-    float32[y, x] in e; charge later than the last row is lost. Raises InputError unless 0 ≤ ε < 1 and
-    transfers_before ≥ 0.
+    A trap, empty when readout starts, sits in a pixel (row, column, int[n]); it is passed first by the packet of
+    its own pixel, then by those behind. A packet meets the traps farthest from the register first. `direction` is
+    "up" or "down". Raises InputError for other directions.
     """
-    if not 0 <= inefficiency < 1:
-        raise InputError(f"inefficiency = {inefficiency:g}: must be at least 0, below 1")
-    if transfers_before < 0:
-        raise InputError(f"transfers_before = {transfers_before}: must be at least 0")
-    height = _facing(signal_e, direction).shape[0]
-    moves = np.arange(height) + 1 + transfers_before
-    late = 0 if height == 0 else min(int(nbinom.isf(_TRAIL_LEFT_OUT, moves[-1], 1 - inefficiency)), height - 1)
-    chance = nbinom.pmf(np.arange(late + 1)[:, None], moves, 1 - inefficiency).astype(np.float32)
+    if direction not in ("up", "down"):
+        raise InputError(f"direction = {direction!r}: must be up or down: traps sit in columns")
+    out = signal_e.copy()
+    image = out if direction == "up" else out[::-1]
+    at = row if direction == "up" else len(image) - 1 - row
+    order = np.lexsort((-at, column))
+    at, column, depth = at[order], column[order], np.asarray(depth_e, dtype=np.float64)[order]
+    # of every column the farthest trap, then the next: a few rounds
+    first = np.flatnonzero(np.append(True, np.diff(column) != 0)) if len(column) else column
+    rank = np.arange(len(column)) - np.repeat(first, np.diff(np.append(first, len(column))))
+    rows = np.arange(len(image))[:, None]
+    for turn in range(int(rank.max(initial=-1)) + 1):
+        now = rank == turn
+        packets = image[:, column[now]].astype(np.float64)
+        taken = np.minimum(np.cumsum(np.where(rows >= at[now], packets, 0), axis=0), depth[now])
+        image[:, column[now]] = packets - np.diff(taken, axis=0, prepend=0.0)
+    return out
 
-    image = _facing(signal_e, direction)
-    out = image * chance[0, :, None]
-    for m in range(1, late + 1):
-        out[m:] += image[:-m] * chance[m, :-m, None]
-    return _facing(out, direction, back=True)
 
-
-# ------------------------------------------------------------------------------------ shutters, waiting, lag
+# ------------------------------------------------------------------------------------ shutters, waiting
 
 
 def row_wait_s(height_px: int, *, row_period_s: float, direction: str = "up") -> F64:
@@ -351,19 +357,6 @@ def row_wait_s(height_px: int, *, row_period_s: float, direction: str = "up") ->
         raise InputError(f"direction = {direction!r}: must be up or down: rows are read one by one")
     wait: F64 = np.arange(height_px) * np.float64(row_period_s)
     return wait if direction == "up" else wait[::-1].copy()
-
-
-def rolling_shutter_exposure(
-    height_px: int, *, exposure_s: float, row_period_s: float, direction: str = "up"
-) -> F64:
-    """Start and end of every row's exposure, float64[y, 2] in s after the first row's start.
-
-    A rolling shutter exposes all rows equally long, each `row_period_s` after the one before; where and how the
-    scene moved in the meantime is for the caller to see to. Errors as in `row_wait_s`, and exposure_s < 0.
-    """
-    _at_least_0(exposure_s=exposure_s)
-    start = row_wait_s(height_px, row_period_s=row_period_s, direction=direction)
-    return np.stack([start, start + exposure_s], axis=1)
 
 
 def parasitic_light(
@@ -382,14 +375,6 @@ def parasitic_light(
     _share(sensitivity=sensitivity)
     wait = row_wait_s(len(signal_e), row_period_s=row_period_s, direction=direction)
     return signal_e + rate_e_s * (sensitivity * wait).astype(np.float32)[:, None]
-
-
-def lag(signal_e: F32, former_e: F32, *, fraction: float) -> F32:
-    """Image lag, float32[y, x] in e: the fraction of the former frame's charge that its transfer left behind is
-    read with this one, which leaves its own behind. Raises InputError unless fraction is in [0, 1].
-    """
-    _share(fraction=fraction)
-    return signal_e * np.float32(1 - fraction) + former_e * np.float32(fraction)
 
 
 # ---------------------------------------------------------------------------------------------------- helpers

@@ -122,7 +122,7 @@ def annealing_factor(anneal_s: float) -> float:
     """Damage left after `anneal_s` at room temperature over that after a week, falling with log time.
 
     Line through Srour & Lo 2000 (doi 10.1109/23.903792), measured from 1e4 to 5e6 s; times beyond are taken as
-    the nearer end: 1.54 and 0.70.
+    the nearer end: 1.54 and 0.72.
     """
     t = min(max(anneal_s, _ANNEAL_S[0]), _ANNEAL_S[1])
     return (-0.3965 * math.log10(t) + 3.5948) / 1.3024

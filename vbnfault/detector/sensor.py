@@ -30,7 +30,8 @@ SHUTTERS = ("global", "rolling", "mechanical")
 class Transfer:
     """Charge on its way: times in s of a row's transfer to the store or register, of a row's clearing before the
     exposure (0: at once), and of a pixel's in the register; the share of light that leaks into a covered register
-    (interline) or store (global shutter, a second); the share of the excess that an antiblooming drain takes; traps
+    (interline) or store (global shutter, a second), and that a shutter lets through while a full frame is read; the
+    share of the excess that an antiblooming drain takes; traps
     in columns and in the register, with the cloud that meets them."""
 
     row_transfer_s: float = 0.0
@@ -38,6 +39,7 @@ class Transfer:
     pixel_transfer_s: float = 0.0
     row_readout_s: float = 0.0
     leak: float = 0.0
+    shutter_transmission: float = 0.0
     antiblooming: float = 0.0
     parallel_traps: tuple[TrapSpecies, ...] = ()
     serial_traps: tuple[TrapSpecies, ...] = ()

@@ -250,6 +250,11 @@ class Fault:
         """bool[y, x], where the fault sits; None where the class has no footprint."""
         return None
 
+    def defects(self, params: Params, context: FaultContext) -> NDArray[np.uint8] | None:
+        """Kinds of defects in a mosaic's pixels, uint8[y, x]: bits of `quantities.DEFECTS`; None where it makes
+        none."""
+        return None
+
     def validate(self) -> None:
         """Raise ValueError with one sentence where fields contradict each other."""
 

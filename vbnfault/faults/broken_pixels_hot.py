@@ -1,10 +1,12 @@
 """Broken pixels by physics: the camera's own device, older and more irradiated than its file says.
 
 A device's defects come from its seed and only ever grow (`detector.individual`), so that samples of one individual
-share them; the fault draws an age and a dose and adds what the device has by then and did not have before: bulk
-damage of displaced atoms (Srour & Lo 2000; Belloir 2016; Le Roch 2019), hot pixels with an offset (Chapman et al.:
-I = m (R T + b)) and dead pixels. All of it is in electrons of the mosaic, before shot noise, and spreads over
-neighbours because the demosaic does.
+share them; the fault draws an age, a dose and the time since, and adds what the device has by then and did not
+have before: bulk damage of displaced atoms (Srour & Lo 2000; Belloir 2016; Le Roch 2019), hot pixels with an offset
+(Chapman et al.: I = m (R T + b)), dead and stuck pixels, and random telegraph signals in the state that they are
+in. All of it is in electrons of the mosaic, before shot noise, and spreads over neighbours because the demosaic
+does. In a CCD charge is clocked past its defects: behind a hot pixel, away from the register, it draws a line
+(`detector.chain.passing_dark_e`).
 
 Pixels are as warm as the sensor: at short exposures and in the cold most damage does not show, as on real ones.
 The growth laws are of cameras on the ground; `growth_factor` says how much faster it goes in space (assumed).
@@ -18,15 +20,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..detector.chain import Device, individual
+from ..detector.chain import Device, individual, passing_dark_e, upper_share
 from ..detector.demosaic import footprint
-from ..detector.individual import dark_rate_e_s, offset_e
+from ..detector.individual import IndividualSpec, RtsPixels, dark_rate_e_s, offset_e
+from ..quantities import DEAD, HOT, RTS, RTS_HIGH, STUCK
 from .base import Fault, FaultContext, Interval, Params, bounds, number
 
 F32 = NDArray[np.float32]
 
 _MOST_LISTED = 256
-_MOST_DEAD = 0.1  # share of pixels that die in a year, at most
+_MOST_A_YEAR = 0.1  # share of pixels that die or stick in a year, at most
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,74 +48,149 @@ class HotPixels(Fault):
     dose_TeV_g: Interval = bounds(
         0.0, 0.02, limits=(0, 100), unit="TeV/g", doc="displacement damage dose more than the device's own"
     )
+    anneal_days: Interval = bounds(
+        7.0, 58.0, limits=(0, 1e4), unit="d", doc="since that dose; beyond 58 days damage stays as it is"
+    )
     clustered_share: float = number(0.1, limits=(0, 1), doc="share of hot pixels born beside another")
     dead_per_year: float = number(
         2e-7, limits=(0, 1e-3), unit="1/yr", doc="share of pixels that die in a year on the ground; assumed"
+    )
+    stuck_per_year: float = number(
+        1e-7, limits=(0, 1e-3), unit="1/yr", doc="share of pixels that stick in a year on the ground; assumed"
     )
     least_dn: float = number(
         0.5, limits=(0.001, 255), unit="DN of 255", doc="defects that add less at this exposure are left out"
     )
 
     def draw(self, context: FaultContext, rng: np.random.Generator) -> Params:
-        """Age and dose, how many defects they bring, and the strongest: x, y and electrons at this exposure."""
+        """Age and dose, how many pixels they change, and the strongest: x, y, electrons at this exposure and share
+        of light kept; `rts`: the strongest telegraph signals, with their amplitude and the share of the exposure
+        that they are high."""
         params: Params = {
             "years": self.years.uniform(rng),
             "growth_factor": self.growth_factor.uniform(rng),
             "dose_TeV_g": self.dose_TeV_g.uniform(rng),
+            "anneal_days": self.anneal_days.uniform(rng),
             "clustered_share": float(self.clustered_share),
             "dead_per_year": float(self.dead_per_year),
+            "stuck_per_year": float(self.stuck_per_year),
             "least_dn": float(self.least_dn),
+            "telegraph_seed": int(rng.integers(2**63)),
         }
-        extra, kept = _damage(params, context)
-        changed = np.flatnonzero((extra.ravel() > 0) | (kept.ravel() < 1))
-        order = changed[np.argsort(-extra.ravel()[changed], kind="stable")][:_MOST_LISTED]
+        damage = _damage(params, context)
+        extra, kept = damage.extra_e.ravel(), damage.kept.ravel()
+        changed = np.flatnonzero(damage.changed.ravel())
+        order = changed[np.argsort(-extra[changed], kind="stable")][:_MOST_LISTED]
         width = context.shape[1]
         params["count"] = len(changed)
         params["x"], params["y"] = (order % width).tolist(), (order // width).tolist()
-        params["electrons"] = [round(float(v), 1) for v in extra.ravel()[order]]
-        params["response"] = [round(float(v), 4) for v in kept.ravel()[order]]
+        params["electrons"] = [round(float(v), 1) for v in extra[order]]
+        params["response"] = [round(float(v), 4) for v in kept[order]]
+        params["rts"] = damage.listed()
         return params
 
     def apply(self, quantity: Any, params: Params, context: FaultContext) -> Any:
-        """Expected electrons with what the defects add, and dead pixels' light left out."""
-        extra, kept = _damage_once(params, context)
-        return quantity.with_array(quantity.array * kept + extra)
+        """Expected electrons with what the defects add, and without the light of dead and stuck pixels."""
+        damage = _damage_once(params, context)
+        return quantity.with_array(quantity.array * damage.kept + damage.extra_e)
 
     def footprint(self, params: Params, context: FaultContext) -> NDArray[np.bool_]:
         """bool[y, x]: pixels of the picture that a defect can reach."""
-        extra, kept = _damage_once(params, context)
         detector: Any = context.camera.detector
-        return footprint((extra > 0) | (kept < 1), detector.sensor.pattern, detector.sensor.method)
+        return footprint(_damage_once(params, context).changed, detector.sensor.pattern, detector.sensor.method)
+
+    def defects(self, params: Params, context: FaultContext) -> NDArray[np.uint8]:
+        """Kinds of the mosaic's defects that show, uint8[y, x]: bits of `quantities.DEFECTS`."""
+        return _damage_once(params, context).kinds
 
 
-def _damage_once(params: Params, context: FaultContext) -> tuple[F32, F32]:
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Damage:
+    """`extra_e`: electrons that defects add at this exposure, `kept`: the share of their light that pixels keep,
+    float32[y, x]; `kinds` uint8[y, x]; the telegraph signals and the share of the exposure that each is high."""
+
+    extra_e: F32
+    kept: F32
+    kinds: NDArray[np.uint8]
+    rts: RtsPixels
+    amplitude_e_s: NDArray[np.float64]
+    high: NDArray[np.float64]
+
+    @property
+    def changed(self) -> NDArray[np.bool_]:
+        return (self.extra_e > 0) | (self.kept < 1)
+
+    def listed(self) -> list[dict[str, Any]]:
+        strongest = np.argsort(-self.amplitude_e_s, kind="stable")[:_MOST_LISTED]
+        return [
+            {
+                "x": int(self.rts.column[k]),
+                "y": int(self.rts.row[k]),
+                "amplitude_e_s": round(float(self.amplitude_e_s[k]), 3),
+                "high_share": round(float(self.high[k]), 4),
+            }
+            for k in strongest
+        ]
+
+
+def _damage_once(params: Params, context: FaultContext) -> _Damage:
     return context.once("broken_pixels.damage", params, lambda: _damage(params, context))
 
 
-def _damage(params: Params, context: FaultContext) -> tuple[F32, F32]:
-    """Electrons that defects add at this exposure, and the share of their light that pixels keep, float32[y, x]."""
+def _damage(params: Params, context: FaultContext) -> _Damage:
     detector: Any = context.camera.detector
     device: Device = detector.device
     own = device.individual
-    growth = own.spec.hot_growth
-    factor = params["growth_factor"]
-    spec = replace(
-        own.spec,
-        years=own.spec.years + params["years"],
-        dose_TeV_g=own.spec.dose_TeV_g + params["dose_TeV_g"],
+    old = individual(_aged(own.spec, params), device.shape, own.pixel_pitch_um, own.seed)
+    exposure_s = context.camera.exposure_s
+
+    # defects are born in order: the device's own come first
+    columns = {k: v for k, v in vars(old.rts).items() if k != "reference_K"}
+    new = {name: column[len(own.rts) :] for name, column in columns.items()}
+    rts = RtsPixels(**new, reference_K=old.rts.reference_K)
+    signals = rts.at(device.temperature_K)
+    high = upper_share(signals, exposure_s, params["telegraph_seed"]) if len(rts) else np.zeros(0)
+    more = dark_rate_e_s(old, device.temperature_K) - device.dark_rate_e_s
+    np.maximum(more, 0, out=more)  # a dose that anneals takes none of the device's own away
+    jumps = np.zeros(device.shape, dtype=np.float32)
+    np.add.at(jumps, (rts.row, rts.column), signals.amplitude_e_s * high)
+    extra = (more + jumps) * np.float32(exposure_s) + (offset_e(old) - device.offset_e)
+
+    least_e = np.float32(detector.full_well_e / 255 * params["least_dn"])
+    kinds = np.where(extra >= least_e, HOT, np.uint8(0))
+    extra += passing_dark_e(device.sensor, more + jumps, device.direction)
+    extra[extra < least_e] = 0
+    kept = np.ones(device.shape, dtype=np.float32)
+    np.multiply.at(kept, (old.dead.row, old.dead.column), old.dead.response)
+    kept[own.dead.row, own.dead.column] = 1
+    stuck = slice(len(own.stuck), None)
+    at = old.stuck.row[stuck], old.stuck.column[stuck]
+    kept[at], extra[at] = 0, old.stuck.level[stuck] * detector.full_well_e
+    for kind, some in ((DEAD, old.dead), (STUCK, old.stuck), (RTS, rts)):
+        kinds[some.row, some.column] |= kind
+    kinds[rts.row[high > 0.5], rts.column[high > 0.5]] |= RTS_HIGH
+    return _Damage(
+        extra_e=extra.astype(np.float32),
+        kept=kept,
+        kinds=kinds,
+        rts=rts,
+        amplitude_e_s=signals.amplitude_e_s,
+        high=high,
+    )
+
+
+def _aged(own: IndividualSpec, params: Params) -> IndividualSpec:
+    """The device's kind at the later age and dose."""
+    growth, factor = own.hot_growth, params["growth_factor"]
+    return replace(
+        own,
+        years=own.years + params["years"],
+        dose_TeV_g=own.dose_TeV_g + params["dose_TeV_g"],
+        anneal_s=params["anneal_days"] * 86400.0,
         hot_growth=None
         if growth is None
         else replace(growth, log10_scale=growth.log10_scale + float(np.log10(factor))),
         hot_clustered_share=params["clustered_share"],
-        dead_share_yr=min(params["dead_per_year"] * factor, _MOST_DEAD),
+        dead_share_yr=min(own.dead_share_yr + params["dead_per_year"] * factor, _MOST_A_YEAR),
+        stuck_share_yr=min(own.stuck_share_yr + params["stuck_per_year"] * factor, _MOST_A_YEAR),
     )
-    old = individual(spec, device.shape, own.pixel_pitch_um, own.seed)
-    exposure_s = context.camera.exposure_s
-    rate = dark_rate_e_s(old, device.temperature_K) - device.dark_rate_e_s
-    extra = rate * np.float32(exposure_s) + (offset_e(old) - device.offset_e)
-    extra[extra < detector.full_well_e / 255 * params["least_dn"]] = 0
-    kept = np.ones(device.shape, dtype=np.float32)
-    np.multiply.at(kept, (old.dead.row, old.dead.column), old.dead.response)
-    was = own.dead
-    kept[was.row, was.column] = 1
-    return extra.astype(np.float32), kept

@@ -79,7 +79,7 @@ class FrameTransferSmear(Fault):
                 "leak": max(leak, move.leak),
                 "row_transfer_s": max(move.row_transfer_s, move.row_readout_s),
             },
-            "shutter": {"row_transfer_s": share * move.row_readout_s, "row_clear_s": 0.0},
+            "shutter": {"shutter_transmission": max(share, move.shutter_transmission)},
         }
         return {"cause": cause} | {key: float(value) for key, value in changes[cause].items()}
 
@@ -89,8 +89,4 @@ class FrameTransferSmear(Fault):
             return camera
         detector: Any = camera.detector
         changes = {key: value for key, value in params.items() if key != "cause"}
-        more: dict[str, Any] = {"transfer": replace(detector.sensor.transfer, **changes)}
-        if params["cause"] == "shutter":
-            # nothing else in the chain tells the two apart
-            more["architecture"] = "frame_transfer_ccd"
-        return with_sensor(camera, **more)
+        return with_sensor(camera, transfer=replace(detector.sensor.transfer, **changes))

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..plan import SPLITS, STRATA
-from ..quantities import CHANNELS
+from ..quantities import CHANNELS, DEFECTS
 
 FORMAT_VERSION = 1
 SEMANTIC = ("sky", "body", "sun", "spacecraft")
@@ -35,7 +35,8 @@ class Array:
     dtype: str
     units: str
     long_name: str
-    names: tuple[str, ...] = ()  # CF flag meanings
+    names: tuple[str, ...] = ()  # CF flag meanings …
+    bits: bool = False  # … of values, or of bits
     ratio: float = 1.0
 
     @property
@@ -63,6 +64,9 @@ LAYERS: dict[str, Array] = {
     # optional from here on; `without_<fault>` follows the pattern of the straylight one
     "mask_effect": Array("sample fault y x", "bool", "1", "noise-free change of 1 DN or more", ratio=0.02),
     "raw": Array("sample y x", "uint16", "DN", "raw mosaic of the analogue-to-digital converter", ratio=0.6),
+    "defects": Array(
+        "sample y x", "uint8", "1", "what is wrong with a pixel of the mosaic", DEFECTS, bits=True, ratio=0.01
+    ),
     "depth_m": Array("sample y x", "float32", "m", "depth along the boresight, inf on the sky", ratio=0.5),
     "normal": Array("sample y x xyz", "float16", "1", "surface normal in C, 0 on the sky", ratio=0.55),
     "semantic": Array("sample y x", "uint8", "1", "what a pixel shows", SEMANTIC, ratio=0.01),
@@ -263,7 +267,8 @@ class StoreSpec:
             sharded = name in self.pixel_layers
             attributes: dict[str, Any] = {"long_name": row.long_name, "units": row.units}
             if row.names:
-                attributes["flag_values"] = list(range(len(row.names)))
+                values = [1 << k if row.bits else k for k in range(len(row.names))]
+                attributes["flag_masks" if row.bits else "flag_values"] = values
                 attributes["flag_meanings"] = " ".join(row.names)
             members[name] = Member(
                 shape=(samples, *shape),
