@@ -425,6 +425,30 @@ def test_no_site_is_in_two_splits_and_splits_are_not_the_first_sites() -> None:
     assert not np.array_equal(by_site, np.sort(by_site))
 
 
+@given(st.integers(1, 40), st.integers(1, 40), st.integers(0, 100), st.integers(0, 100), st.integers(0, 2**32))
+@settings(deadline=None)
+def test_no_device_is_in_two_splits(individuals: int, sites: int, a: int, b: int, seed: int) -> None:
+    lo, hi = sorted((a, b))
+    fractions = {"train": lo / 100, "val": (hi - lo) / 100, "test": 1 - hi / 100}
+    table = {"sites": sites, "seed": seed, "split": fractions, "samples": 2000, "shard_samples": 1}
+    p = make(dataset=table, camera={"detector": "generic_cmos", "individuals": individuals})
+    assert p.individual.min() >= 0
+    assert p.individual.max() < individuals
+    used = set(p.split.tolist())
+    if individuals >= 3:
+        for device in range(individuals):
+            assert len(set(p.split[p.individual == device])) <= 1
+    elif individuals < len(used):
+        assert len(set(p.individual[p.split == min(used)])) == individuals
+
+
+def test_devices_are_shared_out_as_sites_are() -> None:
+    p = make(dataset={"samples": N, "sites": 32}, camera={"detector": "generic_cmos", "individuals": 20})
+    devices = [len(set(p.individual[p.split == k])) for k in range(3)]
+    assert devices == [14, 3, 3]  # 0.7, 0.15, 0.15 of 20
+    assert not make(dataset={"samples": 64}).individual.any()
+
+
 # ------------------------------------------------------------------------------------------------------ speed
 
 

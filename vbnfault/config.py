@@ -318,7 +318,11 @@ class CameraTable(Table):
         "pixel_pitch_um to quantum_efficiency_peak; default: three colours in every pixel, from these keys",
     )
     individuals: int = Field(
-        1, ge=1, le=10_000, description="devices of the detector that the samples are taken with"
+        1,
+        ge=1,
+        le=10_000,
+        description="devices of the detector that the samples are taken with; each is in one split only, if there "
+        "are as many as splits",
     )
     detector_temperature_K: float | None = Field(None, ge=100, le=400, description="default: the detector's own")
     pixel_pitch_um: float = Field(5.5, ge=0.5, le=100)

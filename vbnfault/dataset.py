@@ -147,6 +147,7 @@ def planned(attributes: Mapping[str, Any], faults: Sequence[str]) -> Callable[[i
             "stratum": int(table.stratum[index]),
             "site": int(table.site[index]),
             "split": int(table.split[index]),
+            "detector_individual": int(table.individual[index]),
             "proposal": proposal(scene, table, index),
             "injected": table.injected[index],
         }

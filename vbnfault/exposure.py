@@ -76,7 +76,7 @@ def render_frame(frame: Frame) -> None:
         spec.scene,
         architecture=int(spec.plan.architecture[i]),
         readout_direction=int(spec.plan.readout_direction[i]),
-        individual=world.individual_of(spec.scene, i),
+        individual=int(spec.plan.individual[i]),
     )
     frame.sunlight = world.sunlight(spec.scene, frame.pose.sun_L)
     frame.samples_per_pixel = float(spec.scene.render.samples_per_pixel)

@@ -39,8 +39,9 @@ _MAX_ATTITUDE_TRIES = 1000
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Plan:
     """One row a sample. `variables` float64[n] by the names of VARIABLES, the proposals; `injected`
-    bool[n, fault] in the order of `faults`; `stratum`, `site`, `split`, `architecture`, `readout_direction`
-    integer[n]; `attitude_tries` int32[n], draws of the attitude until the Sun was out of view.
+    bool[n, fault] in the order of `faults`; `stratum`, `site`, `split`, `architecture`, `readout_direction`,
+    `individual` (device of the detector) integer[n]; `attitude_tries` int32[n], draws of the attitude until the Sun
+    was out of view.
     """
 
     faults: tuple[str, ...]
@@ -51,6 +52,7 @@ class Plan:
     split: NDArray[np.uint8]
     architecture: NDArray[np.uint8]
     readout_direction: NDArray[np.uint8]
+    individual: NDArray[np.int32]
     attitude_tries: NDArray[np.int32]
 
     def __len__(self) -> int:
@@ -79,15 +81,17 @@ def make_plan(scene: SceneConfig, faults: Sequence[str], blocks: Sequence[int] |
     variables = propose(scene, samples, stratum)
     tries = _keep_sun_out_of_view(scene, samples, stratum, variables)
     site = _sites(scene, samples)
+    split = site_split(scene)[site]
     return Plan(
         faults=tuple(faults),
         variables=variables,
         injected=injected,
         stratum=stratum,
         site=site,
-        split=site_split(scene)[site],
+        split=split,
         architecture=_pick(seed, samples, "architecture", len(scene.camera.architectures)),
         readout_direction=_pick(seed, samples, "readout_direction", len(scene.camera.readout_directions)),
+        individual=_individuals(scene, samples, split),
         attitude_tries=tries,
     )
 
@@ -236,11 +240,46 @@ def _sites(scene: SceneConfig, samples: NDArray[np.int64]) -> NDArray[np.int32]:
 
 def site_split(scene: SceneConfig) -> NDArray[np.uint8]:
     """Split of every site, uint8[sites]: whole sites only, so that no terrain is in two splits."""
-    sites, split = scene.dataset.sites, scene.dataset.split
-    edges = np.rint(np.cumsum([split.train, split.val]) * sites).astype(int)
-    order = config.rng(scene.dataset.seed, 0, "plan", "split").permutation(sites)
-    out = np.empty(sites, dtype=np.uint8)
-    out[order] = np.searchsorted(edges, np.arange(sites), side="right")
+    return _shares(scene, scene.dataset.sites, "split")
+
+
+def individual_split(scene: SceneConfig) -> NDArray[np.uint8] | None:
+    """Split of every device of the detector, uint8[individuals]: no device is in two splits, and each split that
+    has sites has one; None where there are too few for that, and all splits share them."""
+    used = np.unique(site_split(scene))
+    count = scene.camera.individuals
+    if count < len(used):
+        return None
+    out = _shares(scene, count, "individual split")
+    for missing in used[~np.isin(used, out)]:
+        # from a split without sites, else from the one that has most
+        idle = np.flatnonzero(~np.isin(out, used))
+        donors = idle if len(idle) else np.flatnonzero(out == np.bincount(out).argmax())
+        out[donors[-1]] = missing
+    return out
+
+
+def _shares(scene: SceneConfig, count: int, name: str) -> NDArray[np.uint8]:
+    """Splits of `count` things by the scene's fractions, shuffled."""
+    split = scene.dataset.split
+    edges = np.rint(np.cumsum([split.train, split.val]) * count).astype(int)
+    order = config.rng(scene.dataset.seed, 0, "plan", name).permutation(count)
+    out = np.empty(count, dtype=np.uint8)
+    out[order] = np.searchsorted(edges, np.arange(count), side="right")
+    return out
+
+
+def _individuals(scene: SceneConfig, samples: NDArray[np.int64], split: NDArray[np.uint8]) -> NDArray[np.int32]:
+    """Which device takes each sample, of those of its split."""
+    of_split = individual_split(scene)
+    u = config.keyed_uniform(scene.dataset.seed, samples, "plan", "individual")
+    if of_split is None:
+        return (u * scene.camera.individuals).astype(np.int32)
+    out = np.zeros(len(samples), dtype=np.int32)
+    for s in np.unique(split):
+        devices = np.flatnonzero(of_split == s)
+        here = split == s
+        out[here] = devices[(u[here] * len(devices)).astype(np.intp)]
     return out
 
 

@@ -99,7 +99,7 @@ def to_sample(frame: Frame) -> Sample:
         "stratum": int(spec.plan.stratum[i]),
         "site": int(spec.plan.site[i]),
         "lens": 0,
-        "detector_individual": world.individual_of(spec.scene, i),
+        "detector_individual": int(spec.plan.individual[i]),
         "split": int(spec.plan.split[i]),
         "parameters": {
             name: {"model": spec.faults[name].model, **params} for name, params in sorted(frame.drawn.items())

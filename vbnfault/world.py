@@ -281,14 +281,6 @@ def _detector_of(scene: SceneConfig, sensor: Sensor, individual: int, direction:
     return made
 
 
-def individual_of(scene: SceneConfig, sample: int) -> int:
-    """Which device takes a sample."""
-    count = scene.camera.individuals
-    if count == 1:
-        return 0
-    return int(config.rng(scene.dataset.seed, sample, "detector", "individual").integers(count))
-
-
 def _thin_lens(c: CameraTable, pixel_pitch_um: float) -> ThinLens:
     return ThinLens(
         focal_length_mm=cameras.focal_length_mm(c.fov_deg, c.width_px, pixel_pitch_um),
