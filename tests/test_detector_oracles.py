@@ -2,7 +2,7 @@
 and ESA's simulator `pyxel`.
 
 `pyxel-sim` is no part of the extra 'test', because it brings 86 packages of 660 MB: without the extra 'oracles' its
-tests skip. It has no model of smear.
+tests skip. It has no model of smear, and its PRNU, 1 + a log-normal variate, is no spread about 1.
 """
 
 from __future__ import annotations
@@ -152,6 +152,7 @@ def test_emva1288_finds_what_the_sensor_was_made_from(analysed: SimpleNamespace,
     K: 14 such variances at signals 1 … 14 to 0.55 % · √Σk⁴ / Σk² = 0.19 %; 1 % is five times that.
     Dark noise: half of 0.55 %, or, where 22 variances of 196 … 526 e² are brought back to no exposure,
     2 · 0.55 % · 370 e² / √22 = 0.9 e², 0.22 % of the noise; with K 0.34 %, of which 1 % is three.
+    Dark current adds 0.15 % in 0.01 s.
     Dark current: each mean to √(500/131 072) = 0.06 e of 330 e: K decides. From the variance: the slope to
     0.55 % · 370 e² √12 / (5.25 s √22) = 0.29 of 60 e/s, and twice that of K: 0.6 %; 3 % is five.
     PRNU, DSNU: 1/√(2 · 65 536) = 0.28 %, and what 24 pictures leave of temporal noise (20 of 140 e, 3 of 12 e) adds
@@ -232,7 +233,7 @@ def test_shot_noise_of_dark_current(pyxel: Any, mean_e: float) -> None:
     assert same_distribution(ours, theirs.charge.array)
 
 
-@pytest.mark.parametrize(("temperature_K", "weeks", "dose_TeV_g"), [(300.0, 1.0, 120.0), (263.0, 4.0, 500.0)])
+@pytest.mark.parametrize(("temperature_K", "weeks", "dose_TeV_g"), [(300.0, 1.0, 120.0), (213.0, 4.0, 500.0)])
 def test_hot_pixels_of_radiation(pyxel: Any, temperature_K: float, weeks: float, dose_TeV_g: float) -> None:
     from pyxel.models.charge_generation import radiation_induced_dark_current
 
@@ -245,7 +246,7 @@ def test_hot_pixels_of_radiation(pyxel: Any, temperature_K: float, weeks: float,
     )
     made = make_individual(spec, SHAPE, pixel_pitch_um=PITCH_UM, seed=5)
     ours = dark_rate_e_s(made, temperature_K)
-    exposure_s = 100.0
+    exposure_s = 1e5
     theirs = detector(pyxel, SHAPE, temperature_K=temperature_K, exposure_s=exposure_s)
     radiation_induced_dark_current(
         theirs,
@@ -255,7 +256,7 @@ def test_hot_pixels_of_radiation(pyxel: Any, temperature_K: float, weeks: float,
         shot_noise=False,
         seed=6,
     )
-    # Rounded to electrons, of which a step has 2e4 and more; the few pixels with the most steps of all get none of
+    # Rounded to electrons, of which a step has 3e4 and more; the few pixels with the most steps of all get none of
     # them in Pyxel 3.0.2 (its loop ends one short). Both move the distribution by less than 1e-4, and the test
     # sees 1.1e-2.
     assert same_distribution(ours * np.float32(exposure_s), theirs.charge.array)
