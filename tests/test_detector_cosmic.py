@@ -12,12 +12,14 @@ from scipy import stats
 
 from vbnfault.detector.cosmic import (
     FLUX_UNSHIELDED_CM2_S,
+    LEAST_MEV_CM2_G,
     MOYAL_MEAN,
     SECONDARY_MAX_KEV,
     SECONDARY_MIN_KEV,
     XI_E_PER_UM,
     CosmicRayModel,
     CosmicRays,
+    stopping_power_MeV_cm2_g,
 )
 from vbnfault.errors import InputError
 
@@ -95,6 +97,18 @@ def test_charge_is_moyals_with_80_electrons_per_um() -> None:
     # ½ · 0.307 MeV cm²/mol · 0.498 mol/g · 2.33 g/cm³ = 178 keV/cm; 3.65 eV a pair
     assert abs(XI_E_PER_UM - 17.8 / 3.65) < 0.01
     assert per_um.min() > 40
+
+
+def test_stopping_power_is_bethes() -> None:
+    """Minimum ionisation of silicon, 1.664 MeV cm²/g at βγ = 3.4 or so (Particle Data Group), and its slopes: a
+    fall before, and a slow rise above."""
+    energy = np.geomspace(1.0, 1e5, 2000)
+    power = stopping_power_MeV_cm2_g(energy)
+    assert power.min() == pytest.approx(LEAST_MEV_CM2_G, rel=2e-3)
+    gamma = 1 + energy[power.argmin()] / 938.272
+    assert np.sqrt(gamma**2 - 1) == pytest.approx(3.4, abs=0.3)
+    assert np.all(np.diff(power[: power.argmin()]) < 0)
+    assert 1 < power[-1] / power.min() < 1.5
 
 
 def test_no_time_no_tracks() -> None:

@@ -8,8 +8,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy import stats
 from test_faults_kit import flat_electrons, make, make_context, noisy, rng, with_mosaic
 
+from vbnfault.detector.cosmic import stopping_power_MeV_cm2_g
 from vbnfault.faults import FaultContext
 from vbnfault.faults.cosmic_rays import _poisson_above_0
 from vbnfault.quantities import Charge
@@ -22,7 +24,7 @@ def context(architecture: str = "cmos", size: int = 96, **sensor: Any) -> FaultC
 def one_track(**keys: float) -> dict[str, Any]:
     """Straight down through pixel x 30, y 20, 300 e."""
     track = {"x_px": 30.5, "y_px": 20.5, "depth_um": 0.0, "theta_deg": 0.0, "phi_deg": 0.0, "length_um": 3.0}
-    params = {"flux_per_cm2_s": 1.0, "electrons_per_um": 100.0, "thickness_um": 3.0, "diffusion_um": 0.0}
+    params = {"flux_per_cm2_s": 1.0, "thickness_um": 3.0, "diffusion_um": 0.0}
     return params | {"least_dn": 1.0, "tracks": [track | {"electrons": 300.0, "seed": 7}]} | keys
 
 
@@ -67,6 +69,21 @@ def test_number_of_tracks() -> None:
     assert np.mean(counts) == pytest.approx(expected, abs=5 * np.sqrt(mean / 40))
     assert len(make("cosmic_rays", flux_per_cm2_s=0.01).draw(c, rng())["tracks"]) == 1
     assert make("cosmic_rays", flux_per_cm2_s=1e7, most_tracks=50).draw(c, rng())["count"] == 50
+
+
+def test_slower_protons_leave_more_charge() -> None:
+    """80 e/µm of minimum ionisation by Bethe's formula; energies by their power law, as its distribution has it."""
+    c = context(size=256)
+    fault = make("cosmic_rays", flux_per_cm2_s=3e6, energy_MeV=[50, 1000], spectral_index=2.0)
+    tracks = fault.draw(c, rng(3))["tracks"]
+    assert len(tracks) > 1000
+    energy, electrons, length = (np.array([t[k] for t in tracks]) for k in ("energy_MeV", "electrons", "length_um"))
+    # above E: (1/E − 1/1000)/(1/50 − 1/1000)
+    found = stats.kstest(energy, lambda e: 1 - (1 / e - 1e-3) / (1 / 50 - 1e-3))
+    assert found.pvalue > 1e-3
+    expected = 80 * stopping_power_MeV_cm2_g(energy) / 1.664
+    # each track's total has Moyal's deviation of π/√2 · 4.88/80 of its mean
+    assert np.mean(electrons / length / expected) == pytest.approx(1, abs=4 * 0.136 / np.sqrt(len(tracks)))
 
 
 def test_poisson_above_0() -> None:

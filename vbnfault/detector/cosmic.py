@@ -16,7 +16,7 @@ from dataclasses import asdict, dataclass, fields
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.special import ndtr, ndtri
 
 from ..errors import InputError
@@ -37,6 +37,12 @@ PAIR_ENERGY_EV = 3.65  # mean energy per electron-hole pair in silicon at 300 K
 XI_EV_PER_UM = 0.5 * 0.307075e6 * (14 / 28.0855) * 2.329 * 1e-4
 XI_E_PER_UM = XI_EV_PER_UM / PAIR_ENERGY_EV  # 4.88
 
+PROTON_MEV, ELECTRON_MEV = 938.27209, 0.51099895  # rest energies, CODATA 2018
+
+# Silicon, of the Particle Data Group's table of the density effect (Sternheimer, Berger & Seltzer 1984).
+_EXCITATION_EV = 173.0
+_STERNHEIMER = {"x0": 0.2015, "x1": 2.8716, "c": 4.4355, "a": 0.14921, "k": 3.2546}
+
 MOYAL_MEAN = float(np.euler_gamma) + math.log(2)  # of the standard Moyal distribution
 
 # Secondary electrons: energies considered, assumed. Slower ones stop within a µm; faster ones are rare.
@@ -45,6 +51,24 @@ SECONDARY_MIN_KEV, SECONDARY_MAX_KEV = 10.0, 100.0
 _SIGMAS = 4.0  # of diffusion that are followed
 _STEPS_PER_PIXEL = 4  # when charge diffuses: a track is cut at least so fine …
 _STEPS_PER_DEPTH = 8  # … and so fine in depth, where the spread changes
+
+
+def stopping_power_MeV_cm2_g(energy_MeV: ArrayLike) -> F64:
+    """Mean energy that a proton of a kinetic energy from 1 MeV to 100 GeV leaves in silicon, per g/cm²: Bethe's
+    formula with the density effect (Particle Data Group, "Passage of particles through matter")."""
+    gamma = 1 + np.asarray(energy_MeV, dtype=np.float64) / PROTON_MEV
+    square = 1 - gamma**-2  # β²
+    p2 = square * gamma**2
+    ratio = ELECTRON_MEV / PROTON_MEV
+    most_MeV = 2 * ELECTRON_MEV * p2 / (1 + 2 * gamma * ratio + ratio**2)  # to one electron
+    s, x = _STERNHEIMER, np.log10(p2) / 2
+    density = np.where(x < s["x0"], 0.0, 2 * math.log(10) * x - s["c"])
+    density += np.where((x >= s["x0"]) & (x < s["x1"]), s["a"] * np.maximum(s["x1"] - x, 0) ** s["k"], 0.0)
+    bracket = np.log(2 * ELECTRON_MEV * p2 * most_MeV / (_EXCITATION_EV * 1e-6) ** 2) / 2 - square - density / 2
+    return np.asarray(0.307075 * (14 / 28.0855) / square * bracket)
+
+
+LEAST_MEV_CM2_G = 1.664  # of any energy: minimum ionisation, some 2.5 GeV (Particle Data Group)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -1,12 +1,11 @@
 """Cosmic rays: tracks of charged particles through the sensitive layer, as in a solar particle event.
 
-Quiet time at L2 is 4.67 protons per cm² s (CREME96): hardly a track in a picture of milliseconds. Events of NOAA's
-scale S2, 100 particles per cm² s sr above 10 MeV, are 1.3e3 over all directions; that of 14 July 2000, 24 000, is
-3e5 (recalled). What a housing stops is for the flux to leave out.
+Quiet time at L2 is 4.67 protons per cm² s (CREME96): hardly a track in a picture of milliseconds. What reaches a
+sensor in an event is what its housing lets through. In that of 14 July 2000 some 400 protons above 100 MeV came per
+cm² s sr, 5e3 over all directions, and 24 000 above 10 MeV, which a few mm of aluminium stop (recalled).
 
-A minimum-ionising particle sets some 80 e/µm free in silicon, a proton of 50 MeV 630 (Bethe's formula, 3.65 eV per
-pair); one value holds for all tracks of a picture (assumed). The spread of a track's charge grows in proportion:
-both go as 1/β², the logarithm aside.
+A minimum-ionising particle sets some 80 e/µm free in silicon, slower ones more, as Bethe's formula has it: a proton
+of 50 MeV 480. The spread of a track's charge grows in proportion: both go as 1/β², the logarithm aside.
 
 Charge comes after the shot noise, with which it has nothing to do, and before wells overflow and traps take it.
 """
@@ -20,13 +19,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from ..detector.cosmic import XI_E_PER_UM, CosmicRayModel, CosmicRays
+from ..detector.cosmic import LEAST_MEV_CM2_G, CosmicRayModel, CosmicRays, stopping_power_MeV_cm2_g
 from ..detector.demosaic import footprint
 from .base import Fault, FaultContext, Interval, Params, bounds, number
 
 F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
 
-_MINIMUM_E_PER_UM = 80.0  # the mean to which XI_E_PER_UM belongs
 _LEAST_READOUT_S = 0.05  # assumed
 _ASSUMED_DEPTH_UM = 3.0  # where a sensor's file has none
 _TRACKS_AT_ONCE = 256  # bounds the memory of what diffuses
@@ -42,10 +41,17 @@ class Tracks(Fault):
     needs_mosaic = True
 
     flux_per_cm2_s: Interval = bounds(
-        1e3, 3e5, limits=(0.01, 1e7), unit="1/(cm² s)", doc="of particles from all directions; in quiet time 4.67"
+        10.0,
+        5e3,
+        limits=(0.01, 1e7),
+        unit="1/(cm² s)",
+        doc="of protons from all directions that reach the sensor; in quiet time 4.67",
     )
-    electrons_per_um: Interval = bounds(
-        80.0, 630.0, limits=(40, 3000), unit="e/µm", doc="mean ionisation: 80 is the least, 630 a proton of 50 MeV"
+    energy_MeV: Interval = bounds(
+        50.0, 1000.0, limits=(1, 1e5), unit="MeV", doc="kinetic energies: slower protons leave more charge"
+    )
+    spectral_index: float = number(
+        2.0, limits=(0, 10), doc="their spectrum falls with the energy to this power; assumed"
     )
     readout_s: float | None = number(
         None,
@@ -70,14 +76,13 @@ class Tracks(Fault):
     )
 
     def draw(self, context: FaultContext, rng: np.random.Generator) -> Params:
-        """The layer, the mean number of tracks, their number, and every track (`CosmicRays.params`)."""
+        """The layer, the mean number of tracks, their number; each track: `CosmicRays.params` and its energy."""
         detector: Any = context.camera.detector
         sensor = detector.sensor
         wait_s = max(sensor.transfer.row_readout_s * context.shape[0], _LEAST_READOUT_S)
         depth_um = sensor.individual.depletion_depth_um or _ASSUMED_DEPTH_UM
         params: Params = {
             "flux_per_cm2_s": self.flux_per_cm2_s.uniform(rng),
-            "electrons_per_um": self.electrons_per_um.uniform(rng),
             "time_s": float(context.camera.exposure_s + (wait_s if self.readout_s is None else self.readout_s)),
             "thickness_um": float(depth_um if self.thickness_um is None else self.thickness_um),
             "diffusion_um": float(self.diffusion_um),
@@ -87,7 +92,9 @@ class Tracks(Fault):
         mean = model.expected_count(context.shape, params["time_s"])
         count = min(_poisson_above_0(mean, rng), int(self.most_tracks))
         params["mean_count"], params["count"] = float(mean), count
-        params["tracks"] = _tracks(model, context.shape, count, rng).params
+        energy = np.round(_power_law(rng.random(count), self.energy_MeV, self.spectral_index), 2)
+        tracks = _tracks(model, context.shape, count, energy, rng).params
+        params["tracks"] = [track | {"energy_MeV": e} for track, e in zip(tracks, energy.tolist(), strict=True)]
         return params
 
     def apply(self, quantity: Any, params: Params, context: FaultContext) -> Any:
@@ -101,15 +108,21 @@ class Tracks(Fault):
 
 
 def _model(params: Params, context: FaultContext) -> CosmicRayModel:
-    mean = params["electrons_per_um"]
     return CosmicRayModel(
         pixel_pitch_um=context.camera.detector.pixel_pitch_um,
         thickness_um=params["thickness_um"],
         flux_per_cm2_s=params["flux_per_cm2_s"],
-        electrons_per_um=mean,
-        width_e_per_um=XI_E_PER_UM * mean / _MINIMUM_E_PER_UM,
         diffusion_um=params["diffusion_um"],
     )
+
+
+def _power_law(u: F64, bounds: Interval, index: float) -> F64:
+    """Values within bounds whose density falls with the power `index`, of uniform numbers."""
+    low, high = bounds
+    if abs(index - 1) < 1e-9:
+        return np.asarray(low * (high / low) ** u)
+    a, b = low ** (1 - index), high ** (1 - index)
+    return np.asarray((a + u * (b - a)) ** (1 / (1 - index)))
 
 
 def _poisson_above_0(mean: float, rng: np.random.Generator) -> int:
@@ -118,13 +131,17 @@ def _poisson_above_0(mean: float, rng: np.random.Generator) -> int:
     return max(int(stats.poisson.isf(chance, mean)), 1)
 
 
-def _tracks(model: CosmicRayModel, shape: tuple[int, int], count: int, rng: np.random.Generator) -> CosmicRays:
+def _tracks(
+    model: CosmicRayModel, shape: tuple[int, int], count: int, energy_MeV: F64, rng: np.random.Generator
+) -> CosmicRays:
     """The first `count` of a draw that has so many: tracks know nothing of one another."""
     time_s = (count + 10 * np.sqrt(count) + 10) / model.expected_count(shape, 1.0)
     while len(rays := model.draw(shape, time_s, rng)) < count:
         pass
+    columns = {name: column[:count] for name, column in vars(rays).items()}
+    columns["electrons"] = columns["electrons"] * (stopping_power_MeV_cm2_g(energy_MeV) / LEAST_MEV_CM2_G)
     # rounded, so that thousands of them stay short as text; seeds stay whole
-    return CosmicRays(**{name: np.round(column[:count], 4) for name, column in vars(rays).items()})
+    return CosmicRays(**{name: np.round(column, 3) for name, column in columns.items()})
 
 
 def _charge_once(params: Params, context: FaultContext) -> F32:
