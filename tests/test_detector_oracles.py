@@ -78,7 +78,7 @@ def emva_results(shots: Sequence[Shot], folder: Path) -> Any:
     lines = ["v 4.0", f"n {SENSOR.readout.bits} {SHAPE[1]} {SHAPE[0]}"]
     for (photons, exposure_s), run in groupby(shots, key=lambda shot: shot[:2]):
         exposure = f"{exposure_s * 1e9:.0f}"  # ns
-        lines.append(f"b {exposure} {photons!r}" if photons else f"d {exposure}")
+        lines.append(f"b {exposure} {float(photons)!r}" if photons else f"d {exposure}")
         for *_, picture in run:
             name = f"{len(lines)}.png"
             Image.fromarray(picture).save(folder / name, compress_level=1)
