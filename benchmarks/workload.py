@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from detector_chain import Chain, speckled
 
 from vbnfault import config, dataset, frames, photometry, pipeline, render, spectra, store, world
 from vbnfault.body import Patch
@@ -129,6 +130,8 @@ class Workload:
         lit = replace(physical, bounces=1)
         seconds["bounce"], _ = clock(lambda: render.radiance(surface, lit, frame.truth))
         seconds["flare"], _ = clock(self.flare)
+        for name, chain in self.chains.items():
+            seconds[name], _ = clock(chain.expose)
         seconds["to_sample"], sample = clock(lambda: to_sample(frame))
         shard, _ = clock(lambda: write_shard(folder, sample))
         seconds["store"] = shard / SHARD_SAMPLES
@@ -150,6 +153,15 @@ class Workload:
     def flare(self) -> np.ndarray:
         """A full flare frame: irradiance of all ghosts, float32[band, y, x]."""
         return self.flares.image(FLARE_SUN_DEG, 30.0)
+
+    @cached_property
+    def chains(self) -> dict[str, Chain]:
+        """Sensors with every effect of the chain."""
+        light = speckled(self.session.base_camera.width_px)
+        return {
+            "chain_ccd": Chain.of("frame_transfer_ccd", "malvar", light),
+            "chain_cmos": Chain.of("cmos", "malvar", light),
+        }
 
     def empty_store(self, path: Path) -> store.Store:
         """A store for one shard of samples."""

@@ -1,0 +1,165 @@
+"""The detector's chain with every effect on, as the benchmarks time it.
+
+python benchmarks/detector_chain.py      (milliseconds of each sensor and demosaic, 1024×1024, medians of five)
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import cv2
+import numpy as np
+
+from vbnfault.camera import Camera
+from vbnfault.detector import MosaicDetector, load_sensor
+from vbnfault.detector.charge import TrapSpecies
+from vbnfault.detector.sensor import Sensor
+from vbnfault.faults import MOSAIC_STEPS, QUANTITIES, Fault, FaultContext, from_dict
+from vbnfault.lens import ThinLens
+from vbnfault.quantities import Electrons
+
+KINDS = ("full_frame_ccd", "frame_transfer_ccd", "interline_ccd", "cmos")
+DEMOSAICS = ("malvar", "menon")
+EXPOSURE_S = 0.02
+# What happens inside the mosaic, every class; those of a transfer act through the sensor below.
+FAULTS = (
+    "broken_pixels/hot_pixels",
+    "cosmic_rays",
+    "blooming",
+    "banding",
+    "adc",
+    "broken_lines/readout",
+    "transmission",
+)
+
+
+def busy_sensor(architecture: str, demosaic: str) -> Sensor:
+    """A sensor that leaves no effect out."""
+    sensor = load_sensor("generic_cmos" if architecture == "cmos" else "generic_ccd")
+    individual = replace(
+        sensor.individual,
+        **dict.fromkeys(("prnu_row", "prnu_column", "prnu_low"), 0.002),
+        **dict.fromkeys(("dsnu_row_e", "dsnu_column_e"), 2.0),
+        dark_nonuniformity=0.2,
+        years=5.0,
+        dose_TeV_g=0.05,
+        hot_clustered_share=0.1,
+        dead_share=1e-5,
+        stuck_share=1e-5,
+        rts_share=1e-3,
+        trap_share=1e-4,
+    )
+    readout = replace(
+        sensor.readout,
+        nodes=4,
+        node_gains=(1.0, 1.01, 0.99, 1.02),
+        node_offsets_dn=(0.0, 3.0, -2.0, 1.0),
+        row_noise_e_rms=1.0,
+        row_pattern_e_rms=2.0,
+        column_pattern_e_rms=2.0,
+        banding_amplitude_e=3.0,
+        banding_frequency_hz=1e4,
+        inl_quadratic_dn=4.0,
+        inl_cubic_dn=1.0,
+        dnl_lsb_rms=0.05,
+        missing_codes=(1000, 2000),
+    )
+    transfer = sensor.transfer
+    if architecture != "cmos":
+        parallel, serial = (
+            tuple(TrapSpecies(density_per_px=0.5, release_time_s=t * period) for t in (0.5, 2.0, 8.0))
+            for period in (transfer.row_readout_s, transfer.pixel_transfer_s)
+        )
+        transfer = replace(
+            transfer,
+            row_transfer_s=1e-6,
+            row_clear_s=1e-6,
+            leak=1e-3,
+            shutter_transmission=1e-3,
+            antiblooming=0.5,
+            parallel_traps=parallel,
+            serial_traps=serial,
+        )
+    return replace(
+        sensor,
+        architecture=architecture,
+        individual=individual,
+        readout=readout,
+        transfer=transfer,
+        demosaic=demosaic,
+        correct_defects=True,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Chain:
+    """Pictures of one scene with one sensor: noise, every effect, demosaic."""
+
+    context: FaultContext
+    light: Electrons
+    faults: Mapping[str, tuple[Fault, dict[str, Any]]]
+
+    @classmethod
+    def of(cls, architecture: str, demosaic: str, light: np.ndarray) -> Chain:
+        """Under `light`, float32[y, x, colour], shares of white."""
+        sensor = busy_sensor(architecture, demosaic)
+        height, width = light.shape[:2]
+        detector = MosaicDetector(sensor=sensor, seed=1, width_px=width, height_px=height)
+        lens = ThinLens(focal_length_mm=10.0, f_number=4.0)
+        camera = Camera(
+            lens=lens,
+            detector=detector,
+            architecture=architecture,
+            readout_direction="up",
+            exposure_s=EXPOSURE_S,
+        )
+        context, rng = FaultContext(camera=camera), np.random.default_rng(0)
+        faults = {}
+        for entry in FAULTS:
+            name, _, model = entry.partition("/")
+            fault = from_dict(name, {"model": model} if model else {}, source="benchmark")
+            faults[name] = fault, fault.draw(context, rng)
+        white = detector.white_e
+        return cls(context, Electrons(array=(light * white).astype(np.float32), white_e=white), faults)
+
+    def expose(self, number: int = 0) -> np.ndarray:
+        """One picture, uint8[y, x, channel]: noise drawn, tracks and defects laid out, everything applied."""
+        context = replace(self.context)  # nothing kept from the picture before
+
+        def act(fault: Fault, params: dict[str, Any]) -> Callable[[Any], Any]:
+            kind: Any = QUANTITIES[fault.step]
+            return lambda array: fault.apply(kind(array=array), params, context).array
+
+        acts = {s: [act(f, p) for f, p in self.faults.values() if f.step == s] for s in MOSAIC_STEPS}
+        detector = self.context.camera.detector
+        noise = detector.draw_noise(context.shape, lambda name: np.random.default_rng([number, *name.encode()]))
+        return detector.develop(self.light, EXPOSURE_S, noise, acts).array
+
+
+def speckled(size_px: int) -> np.ndarray:
+    """A contrasty scene, some of it beyond the full well, float32[y, x, 3] in shares of white."""
+    grains = np.random.default_rng(0).gamma(0.5, 1.0, (size_px, size_px, 3)).astype(np.float32)
+    smooth = cv2.GaussianBlur(grains, (0, 0), 3)
+    smooth *= 0.4 / smooth.mean()
+    at = size_px // 3
+    smooth[at : at + size_px // 50, at : at + size_px // 25] *= 6
+    return smooth
+
+
+def main() -> None:
+    light = speckled(1024)
+    for architecture in KINDS:
+        for demosaic in DEMOSAICS:
+            chain, seconds = Chain.of(architecture, demosaic, light), []
+            for number in range(6):
+                start = time.perf_counter()
+                chain.expose(number)
+                seconds.append(time.perf_counter() - start)
+            print(f"{architecture:<20}{demosaic:<8}{1e3 * float(np.median(seconds[1:])):7.0f} ms", flush=True)
+
+
+if __name__ == "__main__":
+    main()
