@@ -14,6 +14,7 @@ from typing import Any, cast, get_type_hints
 from .. import resources, spectra
 from ..errors import InputError
 from .charge import ChargeCloud, TrapSpecies
+from .dark import CCD_GROWTH
 from .demosaic import Method
 from .efficiency import Curve, QuantumEfficiency
 from .individual import IndividualSpec
@@ -116,7 +117,8 @@ def load_sensor(name_or_path: str | Path) -> Sensor:
 
 
 def parse_sensor(table: Mapping[str, Any], *, source: str) -> Sensor:
-    """A sensor from plain data. Raises InputError in a sentence that names `source`, key and value."""
+    """A sensor from plain data; hot pixels of CCDs grow by their own law unless the data have another. Raises
+    InputError in a sentence that names `source`, key and value."""
     plain = dict(table)
     sources = plain.pop("sources", {})
     if not isinstance(sources, dict) or not all(isinstance(v, str) for v in sources.values()):
@@ -135,6 +137,10 @@ def parse_sensor(table: Mapping[str, Any], *, source: str) -> Sensor:
         except InputError as error:
             raise InputError(f"{source}: {error}") from None
     sensor: Sensor = _build(Sensor, plain, source)
+    own = plain.get("individual")
+    if sensor.architecture != "cmos" and not (isinstance(own, Mapping) and "hot_growth" in own):
+        grows = dataclasses.replace(sensor.individual, hot_growth=CCD_GROWTH)
+        sensor = dataclasses.replace(sensor, individual=grows)
     return dataclasses.replace(sensor, sources=dict(sources))
 
 

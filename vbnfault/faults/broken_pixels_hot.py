@@ -46,17 +46,21 @@ class HotPixels(Fault):
         20.0, 200.0, limits=(1e-3, 1e5), doc="growth of hot and dead pixels over that on the ground; assumed"
     )
     dose_TeV_g: Interval = bounds(
-        0.0, 0.02, limits=(0, 100), unit="TeV/g", doc="displacement damage dose more than the device's own"
+        0.0,
+        1.0,
+        limits=(0, 100),
+        unit="TeV/g",
+        doc="displacement damage dose more than the device's own; 1e9 protons of 50 MeV per cm² are 4 (assumed)",
     )
     anneal_days: Interval = bounds(
         7.0, 58.0, limits=(0, 1e4), unit="d", doc="since that dose; beyond 58 days damage stays as it is"
     )
     clustered_share: float = number(0.1, limits=(0, 1), doc="share of hot pixels born beside another")
     dead_per_year: float = number(
-        2e-7, limits=(0, 1e-3), unit="1/yr", doc="share of pixels that die in a year on the ground; assumed"
+        5e-8, limits=(0, 1e-3), unit="1/yr", doc="share of pixels that die in a year on the ground; assumed"
     )
     stuck_per_year: float = number(
-        1e-7, limits=(0, 1e-3), unit="1/yr", doc="share of pixels that stick in a year on the ground; assumed"
+        2e-8, limits=(0, 1e-3), unit="1/yr", doc="share of pixels that stick in a year on the ground; assumed"
     )
     least_dn: float = number(
         0.5, limits=(0.001, 255), unit="DN of 255", doc="defects that add less at this exposure are left out"

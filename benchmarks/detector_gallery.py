@@ -1,0 +1,96 @@
+"""Every fault inside a detector, alone, on a scene and in the dark, at full size with its mask: to be looked at.
+
+    python benchmarks/detector_gallery.py --out gallery
+    python benchmarks/detector_gallery.py --out gallery --scene physical67p --sample 401
+    python benchmarks/detector_gallery.py --out gallery --set camera.detector=generic_ccd --dark-s 5
+
+Of each class: CLASS_scene.png and CLASS_dark.png; on the right the difference from the clean picture, eight times
+as strong about grey, with the mask in green.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from vbnfault import labels
+from vbnfault.config import load_scene
+from vbnfault.faults import registry
+from vbnfault.pictures import develop, effect_of
+from vbnfault.pipeline import Session
+from vbnfault.sample import Frame
+
+MODELS = {"broken_pixels": "hot_pixels", "broken_lines": "readout"}
+CLASSES = [name for name, models in registry().items() for m in models.values() if m.needs_mosaic]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--scene", default="navcam67p")
+    parser.add_argument("--sample", type=int, default=24)
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE")
+    parser.add_argument("--dark-s", type=float, default=1.0, help="exposure of the dark pictures")
+    parser.add_argument("--only", nargs="*", default=CLASSES)
+    given = parser.parse_args()
+    overrides = {key: _value(value) for key, _, value in (entry.partition("=") for entry in given.set)}
+    scene = load_scene(given.scene, {**overrides, "plan.faulty_fraction": 0.0, "dataset.layers": ["clean"]})
+    faults = {name: {"model": MODELS[name]} if name in MODELS else {} for name in CLASSES}
+    session = Session(scene.model_copy(update={"faults": faults}))
+    frame = session.frame(given.sample)
+    given.out.mkdir(parents=True, exist_ok=True)
+    for kind in ("scene", "dark"):
+        if kind == "dark":
+            frame = _dark(frame, given.dark_s)
+        noise = frame.camera.detector.draw_noise(frame.context.shape, partial(frame.spec.rng, "detector"))
+        clean = develop(frame, {}, noise).array
+        for name in given.only:
+            fault = frame.spec.faults[name]
+            params = fault.draw(frame.context, frame.spec.rng("fault", f"{name}/0"))
+            frame.drawn = {name: params}
+            image = develop(frame, frame.drawn, noise).array
+            effects = {name: effect_of(frame, name)}
+            mask = labels.mask_layers({name: fault}, frame.drawn, frame.context, effects)[0]
+            cv2.imwrite(
+                str(given.out / f"{name}_{kind}.png"), np.hstack([image[..., 2::-1], _seen(image, clean, mask)])
+            )
+            short = {k: v for k, v in params.items() if not isinstance(v, list | dict)}
+            print(f"{kind} {name}: mask {mask.mean():.4f}", json.dumps(short), flush=True)
+
+
+def _value(text: str) -> object:
+    try:
+        return json.loads(text)
+    except json.JSONDecodeError:
+        return text
+
+
+def _dark(frame: Frame, exposure_s: float) -> Frame:
+    """The same camera with its cap on."""
+    out = Frame(spec=frame.spec)
+    out.pose, out.sunlight, out.radiance, out.truth = frame.pose, frame.sunlight, frame.radiance, frame.truth
+    out.camera = replace(frame.camera, exposure_s=exposure_s)
+    out.context = replace(frame.context, camera=out.camera)
+    out.rate = frame.rate.with_array(np.zeros_like(frame.rate.array))
+    out.rendered, out.open_sky = frame.rendered, frame.open_sky
+    out.radiance = frame.radiance.with_array(np.zeros_like(frame.radiance.array))
+    if out.rendered is not None:
+        out.rendered = out.rendered.with_array(np.zeros_like(out.rendered.array))
+    return out
+
+
+def _seen(image: np.ndarray, clean: np.ndarray, mask: np.ndarray) -> np.ndarray:
+    change = 8 * (image[..., 2::-1].astype(np.int16) - clean[..., 2::-1]) + 96
+    out = np.clip(change, 0, 255).astype(np.uint8)
+    out[mask] = (0.75 * out[mask] + 0.25 * np.array([0, 255, 0])).astype(np.uint8)
+    return out
+
+
+if __name__ == "__main__":
+    main()
