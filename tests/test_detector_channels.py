@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 from dataclasses import replace
 from typing import Any
 
@@ -11,7 +12,7 @@ import pytest
 from conftest import small_scene
 from test_faults_kit import make, make_context, noisy_electrons, rng, with_mosaic
 
-from vbnfault import spectra
+from vbnfault import dataset, spectra
 from vbnfault.config import parse_scene
 from vbnfault.detector import Detector, MosaicDetector, load_sensor
 from vbnfault.detector.efficiency import Curve, QuantumEfficiency, white_balance
@@ -193,3 +194,15 @@ def test_near_infrared_pixels_need_light_that_they_see(tmp_path: Any) -> None:
     assert frame.raw is not None
     lit = frame.truth.semantic[1::2, ::2] == 1
     assert np.median(frame.raw[1::2, ::2][lit]) > np.median(frame.raw[::2, ::2][lit])  # NIR over the red beside it
+
+
+def test_stores_say_what_a_user_of_raw_pictures_must_know(tmp_path: Any) -> None:
+    session = Session(parse_scene(scene(with_pattern(tmp_path, "rgbw")), source="x"))
+    attributes = dataset.store_spec(session, [4]).attributes
+    assert attributes["intensity_channel"] == "pixels without a colour filter"
+    sensor = json.loads(json.dumps(attributes["detector"]))
+    assert sensor["mosaic"][0] == ["W", "B", "W", "G"]
+    assert (sensor["bits"], sensor["bias_dn"], sensor["full_well_e"]) == (12, 64, 13500.0)
+    assert sensor["gain_dn_per_e"] == pytest.approx((4095 - 64) / 13500)
+    plain = Session(parse_scene(small_scene(), source="x"))
+    assert dataset.store_spec(plain, [4]).attributes["intensity_channel"].startswith("luminance")

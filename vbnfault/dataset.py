@@ -14,6 +14,7 @@ from typing import Any
 
 from . import __version__, build, config, llvm, pipeline, plan, resources, store, world
 from .config import SceneConfig
+from .detector import Detector, MosaicDetector
 from .errors import VbnfaultError
 from .record import proposal
 from .sample import mask_any_faults, stored_layers
@@ -103,7 +104,8 @@ def store_spec(session: pipeline.Session, blocks: Sequence[int]) -> StoreSpec:
         "versions": versions(),
         "licence": dataset.licence,
         "citation": dataset.citation,
-        "intensity_channel": "luminance of RGB, Rec. 709 weights",
+        "intensity_channel": _intensity(camera.detector),
+        "detector": _detector(camera.detector),
         "fault_models": {name: fault.model for name, fault in session.faults.items()},
     }
     return StoreSpec(
@@ -124,6 +126,41 @@ def store_spec(session: pipeline.Session, blocks: Sequence[int]) -> StoreSpec:
         shard_samples=dataset.shard_samples,
         attributes=attributes,
     )
+
+
+def _intensity(detector: Detector | MosaicDetector) -> str:
+    if "W" in detector.channels:
+        return "pixels without a colour filter"
+    return "luminance of RGB, Rec. 709 weights"
+
+
+def _detector(detector: Detector | MosaicDetector) -> dict[str, Any]:
+    """What a user of the raw mosaic, or of noise, must know of the sensor."""
+    plain: dict[str, Any] = {
+        "name": detector.name,
+        "pixel_pitch_um": detector.pixel_pitch_um,
+        "full_well_e": detector.full_well_e,
+        "read_noise_e_rms": detector.read_noise_e_rms,
+    }
+    if isinstance(detector, Detector):
+        return plain | {
+            "bits": detector.adc_bits,
+            "bias_dn": detector.bias_dn,
+            "gain_dn_per_e": detector.gain_dn_per_e,
+        }
+    sensor = detector.sensor
+    readout, tile = sensor.readout, sensor.pattern.tile
+    return plain | {
+        "architecture": sensor.architecture,
+        "shutter": sensor.shutter,
+        "mosaic": [[sensor.pattern.channels[k] for k in row] for row in tile],
+        "bits": readout.bits,
+        "bias_dn": readout.bias_dn,
+        "gain_dn_per_e": readout.system_gain_dn_per_e,
+        "temperature_K": sensor.temperature_K,
+        "row_readout_s": sensor.transfer.row_readout_s,
+        "demosaic": sensor.method,
+    }
 
 
 def planned(attributes: Mapping[str, Any], faults: Sequence[str]) -> Callable[[int], dict[str, Any]]:
