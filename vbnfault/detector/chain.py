@@ -105,40 +105,38 @@ class Device:
     def expected_e(self, photo_e: F32, exposure_s: float) -> F32:
         """Electrons expected in each pixel, float32[y, x], telegraph signals aside, of photo-electrons expected
         there if all pixels responded alike."""
-        sensor, move = self.sensor, self.sensor.transfer
-        light = cv2.multiply(photo_e, self.response)
-        rate = light * np.float32(1 / exposure_s) if exposure_s > 0 else 0 * light
-        if sensor.architecture == "frame_transfer_ccd" and (move.row_transfer_s or move.row_clear_s):
-            light = self._along_columns(
-                partial(
-                    smear,
-                    exposure_s=exposure_s,
-                    row_transfer_s=move.row_transfer_s,
-                    row_clear_s=move.row_clear_s,
-                ),
-                rate,
-            )
-        elif sensor.architecture == "full_frame_ccd" and move.shutter_transmission:
-            light = self._along_columns(
-                partial(
-                    smear,
-                    exposure_s=exposure_s,
-                    row_transfer_s=move.row_readout_s,
-                    shutter_transmission=move.shutter_transmission,
-                ),
-                rate,
-            )
-        elif sensor.architecture == "interline_ccd" and move.leak:
-            light = self._along_columns(
-                partial(smear_interline, exposure_s=exposure_s, row_transfer_s=move.row_transfer_s, leak=move.leak),
-                rate,
-            )
-        elif sensor.architecture == "cmos" and sensor.shutter == "global" and move.leak:
-            light = parasitic_light(
-                light, rate, sensitivity=move.leak, row_period_s=move.row_readout_s, direction=self.direction
-            )
+        light = self._smeared(cv2.multiply(photo_e, self.response), exposure_s)
         out = np.asarray(cv2.scaleAdd(self.dark_rate_e_s, exposure_s, light))
         return out if self.transfer_dark_e is None else cv2.add(out, self.transfer_dark_e)
+
+    def _smeared(self, light: F32, exposure_s: float) -> F32:
+        """Electrons with those of the light that falls on charge under way, or waiting."""
+        sensor, move = self.sensor, self.sensor.transfer
+        steps = {
+            "frame_transfer_ccd": (
+                move.row_transfer_s + move.row_clear_s,
+                partial(smear, row_transfer_s=move.row_transfer_s, row_clear_s=move.row_clear_s),
+            ),
+            "full_frame_ccd": (
+                move.row_readout_s * move.shutter_transmission,
+                partial(smear, row_transfer_s=move.row_readout_s, shutter_transmission=move.shutter_transmission),
+            ),
+            "interline_ccd": (
+                move.row_transfer_s * move.leak,
+                partial(smear_interline, row_transfer_s=move.row_transfer_s, leak=move.leak),
+            ),
+            # the store of a global shutter; a rolling one reads at once
+            "cmos": (move.row_readout_s * move.leak * (sensor.shutter == "global"), None),
+        }
+        weight, step = steps[sensor.architecture]
+        if not weight or exposure_s <= 0:
+            return light
+        rate = light * np.float32(1 / exposure_s)
+        if step is None:
+            return parasitic_light(
+                light, rate, sensitivity=move.leak, row_period_s=move.row_readout_s, direction=self.direction
+            )
+        return self._along_columns(partial(step, exposure_s=exposure_s), rate)
 
     def collected_e(
         self, photo_e: F32, exposure_s: float, noise: MosaicNoise | None = None, acts: Acts = _NOTHING

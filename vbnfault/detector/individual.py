@@ -293,7 +293,6 @@ def make_individual(
     dark += np.float32(1)
     np.maximum(dark, 0, out=dark)
     dark *= np.float32(spec.dark_current_e_s)
-    hot = _hot(spec, shape, pixel_pitch_um, seed)
     return Individual(
         spec=spec,
         seed=seed,
@@ -301,12 +300,7 @@ def make_individual(
         gain=gain,
         dsnu_e=_pattern(seed, "dsnu", shape, spec.dsnu_e, spec.dsnu_row_e, spec.dsnu_column_e),
         dark_e_s=dark,
-        damage_e_s=_damage(spec, shape, pixel_pitch_um, seed, hot),
-        hot=hot,
-        dead=_dead(spec, shape, seed),
-        stuck=_stuck(spec, shape, seed),
-        rts=_rts(spec, shape, pixel_pitch_um, seed),
-        traps=_traps(spec, shape, seed),
+        **_defects(spec, shape, pixel_pitch_um, seed),
     )
 
 
@@ -331,18 +325,21 @@ def aged(
     )
     checked("years", new.years, spec.years, _RANGES["years"][1])
     checked("dose_TeV_g", new.dose_TeV_g, spec.dose_TeV_g, _RANGES["dose_TeV_g"][1])
-    shape, pitch, seed = individual.shape, individual.pixel_pitch_um, individual.seed
-    hot = _hot(new, shape, pitch, seed)
-    return replace(
-        individual,
-        spec=new,
-        damage_e_s=_damage(new, shape, pitch, seed, hot),
-        hot=hot,
-        dead=_dead(new, shape, seed),
-        stuck=_stuck(new, shape, seed),
-        rts=_rts(new, shape, pitch, seed),
-        traps=_traps(new, shape, seed),
-    )
+    changed = _defects(new, individual.shape, individual.pixel_pitch_um, individual.seed)
+    return replace(individual, spec=new, **changed)
+
+
+def _defects(spec: IndividualSpec, shape: tuple[int, int], pixel_pitch_um: float, seed: int) -> dict[str, Any]:
+    """What of an individual depends on its age and dose."""
+    hot = _hot(spec, shape, pixel_pitch_um, seed)
+    return {
+        "damage_e_s": _damage(spec, shape, pixel_pitch_um, seed, hot),
+        "hot": hot,
+        "dead": _dead(spec, shape, seed),
+        "stuck": _stuck(spec, shape, seed),
+        "rts": _rts(spec, shape, pixel_pitch_um, seed),
+        "traps": _traps(spec, shape, seed),
+    }
 
 
 def dark_rate_e_s(individual: Individual, temperature_K: float) -> F32:
