@@ -495,6 +495,12 @@ def test_ageing_keeps_every_earlier_defect() -> None:
         one, two = arrays(getattr(old, kind)), arrays(getattr(made, kind))
         for name in one:
             np.testing.assert_array_equal(one[name], two[name])
+    # clustering from now on moves none of those there were
+    apart = aged(young, years=20.0, hot_clustered_share=0.0)
+    np.testing.assert_array_equal(apart.hot.row[: len(young.hot)], young.hot.row)
+    assert (apart.hot.row[len(young.hot) :] != old.hot.row[len(young.hot) : len(apart.hot)]).any()
+    with pytest.raises(InputError, match="prnu: does not age"):
+        aged(young, prnu=0.1)
     for backwards in ({"years": 4.0}, {"dose_TeV_g": 90.0}):
         with pytest.raises(InputError, match="must be from"):
             aged(young, **backwards)

@@ -304,34 +304,47 @@ def make_individual(
     )
 
 
-def aged(
-    individual: Individual,
-    *,
-    dose_TeV_g: float | None = None,
-    years: float | None = None,
-    anneal_s: float | None = None,
-) -> Individual:
-    """The same sensor at a later age, dose (both at least those it has) or time since the irradiation.
+_AGEING = (
+    "years",
+    "dose_TeV_g",
+    "anneal_s",
+    "hot_growth",
+    "hot_clustered_share",
+    "dead_share_yr",
+    "stuck_share_yr",
+)
 
-    Equal, bit for bit, to `make_individual` with such a spec. No defect is lost; annealing lowers the rates of
-    the radiation's. Raises InputError for an earlier age or a lower dose.
+
+def aged(individual: Individual, **changes: Any) -> Individual:
+    """The same sensor at a later age (`years`), dose (`dose_TeV_g`) or time since the irradiation (`anneal_s`), or
+    with another growth since.
+
+    Defects stay where they are; annealing lowers the rates of the radiation's. Equal, bit for bit, to
+    `make_individual` with such a spec, unless `hot_clustered_share` changes, which holds for new hot pixels only.
+    Raises InputError for other keys, an earlier age or a lower dose.
     """
     spec = individual.spec
-    new = replace(
-        spec,
-        dose_TeV_g=spec.dose_TeV_g if dose_TeV_g is None else dose_TeV_g,
-        years=spec.years if years is None else years,
-        anneal_s=spec.anneal_s if anneal_s is None else anneal_s,
-    )
+    for key in changes:
+        if key not in _AGEING:
+            raise InputError(f"{key}: does not age; must be one of {', '.join(_AGEING)}")
+    new = replace(spec, **changes)
     checked("years", new.years, spec.years, _RANGES["years"][1])
     checked("dose_TeV_g", new.dose_TeV_g, spec.dose_TeV_g, _RANGES["dose_TeV_g"][1])
-    changed = _defects(new, individual.shape, individual.pixel_pitch_um, individual.seed)
+    earlier = len(individual.hot), spec.hot_clustered_share
+    changed = _defects(new, individual.shape, individual.pixel_pitch_um, individual.seed, earlier)
     return replace(individual, spec=new, **changed)
 
 
-def _defects(spec: IndividualSpec, shape: tuple[int, int], pixel_pitch_um: float, seed: int) -> dict[str, Any]:
-    """What of an individual depends on its age and dose."""
-    hot = _hot(spec, shape, pixel_pitch_um, seed)
+def _defects(
+    spec: IndividualSpec,
+    shape: tuple[int, int],
+    pixel_pitch_um: float,
+    seed: int,
+    earlier: tuple[int, float] = (0, 0.0),
+) -> dict[str, Any]:
+    """What of an individual depends on its age and dose; `earlier`: how many hot pixels were placed before, and the
+    share of them that was clustered."""
+    hot = _hot(spec, shape, pixel_pitch_um, seed, earlier)
     return {
         "damage_e_s": _damage(spec, shape, pixel_pitch_um, seed, hot),
         "hot": hot,
@@ -441,12 +454,15 @@ def _damage(spec: IndividualSpec, shape: tuple[int, int], pixel_pitch_um: float,
     return damage
 
 
-def _hot(spec: IndividualSpec, shape: tuple[int, int], pixel_pitch_um: float, seed: int) -> HotPixels:
+def _hot(
+    spec: IndividualSpec, shape: tuple[int, int], pixel_pitch_um: float, seed: int, earlier: tuple[int, float]
+) -> HotPixels:
     growth = spec.hot_growth
     per_yr = 0.0 if growth is None else growth.expected(1.0, shape, pixel_pitch_um, spec.iso)
     born = _births(seed, "hot", per_yr * spec.years)
     count = len(born)
-    row, column = _clustered(*_places(seed, "hot", count, shape), spec.hot_clustered_share, shape, seed)
+    share = np.where(np.arange(count) < earlier[0], earlier[1], spec.hot_clustered_share)
+    row, column = _clustered(*_places(seed, "hot", count, shape), share, shape, seed)
     # inverse of a power law cut off at both ends
     least, most = spec.hot_rate_e_s
     power = 1.0 if growth is None else growth.iso_power
@@ -462,8 +478,8 @@ def _hot(spec: IndividualSpec, shape: tuple[int, int], pixel_pitch_um: float, se
     )
 
 
-def _clustered(row: I32, column: I32, share: float, shape: tuple[int, int], seed: int) -> tuple[I32, I32]:
-    """A share of the places moved beside one of those before them that were not moved."""
+def _clustered(row: I32, column: I32, share: F64, shape: tuple[int, int], seed: int) -> tuple[I32, I32]:
+    """Places moved, by their chance, beside one of those before them that were not moved."""
     count = len(row)
     moved = _uniform(seed, "hot clustered", count) < share
     alone = np.flatnonzero(~moved)

@@ -15,14 +15,15 @@ The growth laws are of cameras on the ground; `growth_factor` says how much fast
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..detector.chain import Device, individual, passing_dark_e, upper_share
+from ..detector.chain import Device, passing_dark_e, upper_share
 from ..detector.demosaic import footprint
-from ..detector.individual import IndividualSpec, RtsPixels, dark_rate_e_s, offset_e
+from ..detector.individual import Individual, IndividualSpec, RtsPixels, aged, dark_rate_e_s, offset_e
 from ..quantities import DEAD, HOT, RTS, RTS_HIGH, STUCK
 from .base import Fault, FaultContext, Interval, Params, bounds, number
 
@@ -145,7 +146,7 @@ def _damage(params: Params, context: FaultContext) -> _Damage:
     detector: Any = context.camera.detector
     device: Device = detector.device
     own = device.individual
-    old = individual(_aged(own.spec, params), device.shape, own.pixel_pitch_um, own.seed)
+    old = _older(own, _ageing(own.spec, params))
     exposure_s = context.camera.exposure_s
 
     # defects are born in order: the device's own come first
@@ -183,18 +184,29 @@ def _damage(params: Params, context: FaultContext) -> _Damage:
     )
 
 
-def _aged(own: IndividualSpec, params: Params) -> IndividualSpec:
-    """The device's kind at the later age and dose."""
-    growth, factor = own.hot_growth, params["growth_factor"]
-    return replace(
-        own,
-        years=own.years + params["years"],
-        dose_TeV_g=own.dose_TeV_g + params["dose_TeV_g"],
-        anneal_s=params["anneal_days"] * 86400.0,
-        hot_growth=None
-        if growth is None
-        else replace(growth, log10_scale=growth.log10_scale + float(np.log10(factor))),
-        hot_clustered_share=params["clustered_share"],
-        dead_share_yr=min(own.dead_share_yr + params["dead_per_year"] * factor, _MOST_A_YEAR),
-        stuck_share_yr=min(own.stuck_share_yr + params["stuck_per_year"] * factor, _MOST_A_YEAR),
+@lru_cache(maxsize=4)
+def _older(own: Individual, changes: tuple[tuple[str, Any], ...]) -> Individual:
+    return aged(own, **dict(changes))
+
+
+def _ageing(own: IndividualSpec, params: Params) -> tuple[tuple[str, Any], ...]:
+    """What changes of the device with its later age and dose. Until now it grew by its own laws."""
+    years, factor = own.years + params["years"], params["growth_factor"]
+
+    def since(share_yr: float, more_yr: float) -> float:
+        mean = (share_yr * own.years + (share_yr + more_yr * factor) * params["years"]) / max(years, 1e-9)
+        return float(min(mean, _MOST_A_YEAR))
+
+    growth = own.hot_growth
+    if growth is not None:
+        mean = (own.years + factor * params["years"]) / max(years, 1e-9)
+        growth = replace(growth, log10_scale=growth.log10_scale + float(np.log10(max(mean, 1e-9))))
+    return (
+        ("years", years),
+        ("dose_TeV_g", own.dose_TeV_g + params["dose_TeV_g"]),
+        ("anneal_s", params["anneal_days"] * 86400.0),
+        ("hot_growth", growth),
+        ("hot_clustered_share", params["clustered_share"]),
+        ("dead_share_yr", since(own.dead_share_yr, params["dead_per_year"])),
+        ("stuck_share_yr", since(own.stuck_share_yr, params["stuck_per_year"])),
     )
