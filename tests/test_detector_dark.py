@@ -528,6 +528,17 @@ def test_dark_rate_over_temperature() -> None:
     assert rate[hottest] == pytest.approx(by_hand, rel=1e-6)
 
 
+def test_a_data_sheets_doubling_temperature() -> None:
+    """k T² ln 2/ΔT: 6.5 K at 298.15 K, to second order about it."""
+    energy = 8.617333e-5 * 298.15**2 * math.log(2) / 6.5
+    assert energy == pytest.approx(0.816, abs=1e-3)
+    made = sensor(IndividualSpec(dark_activation_eV=energy, hot_growth=None))
+    up, down = (float(dark_rate_e_s(made, t).mean()) for t in (298.15 + 3.25, 298.15 - 3.25))
+    assert up / down == pytest.approx(2, rel=1e-3)
+    with pytest.raises(InputError, match=r"dark_activation_eV = 3: must be from 0\.1 to 2"):
+        IndividualSpec(dark_activation_eV=3.0)
+
+
 def test_dead_pixels_and_axes() -> None:
     shape = (40, 900)
     made = sensor(replace(BUSY, dead_share=0.02), shape=shape)

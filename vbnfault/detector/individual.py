@@ -58,6 +58,9 @@ class IndividualSpec:
         Standard deviation of the offset, 0 to 1e5 e: of pixels*, rows, columns.
     dark_current_e_s, dark_nonuniformity
         Mean dark current of undamaged pixels, 0 to 1e8 e/s, and its spread* over the mean, 0 to 1.
+    dark_activation_eV
+        Energy with which it rises, 0.1 to 2 eV, as a data sheet's doubling temperature ΔT has it: k T² ln 2/ΔT;
+        None is silicon's band gap (`dark.silicon_factor`).
     reference_K
         Temperature of these rates, 80 to 400 K.
     dose_TeV_g, depletion_depth_um, anneal_s
@@ -95,6 +98,7 @@ class IndividualSpec:
     dsnu_column_e: float = 0.0
     dark_current_e_s: float = 15.0
     dark_nonuniformity: float = 0.1
+    dark_activation_eV: float | None = None
     reference_K: float = 298.15
     dose_TeV_g: float = 0.0
     depletion_depth_um: float = 3.0
@@ -120,14 +124,20 @@ class IndividualSpec:
 
     def __post_init__(self) -> None:
         for field in fields(self):
-            if field.name == "hot_growth":
-                continue
             value = getattr(self, field.name)
+            if field.name == "hot_growth" or value is None:
+                continue
             low, high = _RANGES[field.name]
             for number in value if isinstance(value, tuple) else (value,):
                 checked(field.name, number, low, high)
             if isinstance(value, tuple) and (len(value) != 2 or value[0] > value[1]):
                 raise InputError(f"{field.name} = {value}: must be two numbers, the smaller first")
+
+    def dark_factor(self, temperature_K: float) -> float:
+        """Dark current of undamaged pixels over that at the reference temperature."""
+        if self.dark_activation_eV is None:
+            return silicon_factor(temperature_K, self.reference_K)
+        return arrhenius_factor(temperature_K, self.reference_K, self.dark_activation_eV)
 
     def radiation(self, pixel_pitch_um: float) -> RadiationDamage:
         """The damage of this dose to a pixel."""
@@ -140,6 +150,7 @@ _RANGES: dict[str, tuple[float, float]] = {
     **dict.fromkeys(("dsnu_e", "dsnu_row_e", "dsnu_column_e"), (0.0, 1e5)),
     "dark_current_e_s": (0.0, 1e8),
     "dark_nonuniformity": (0.0, 1.0),
+    "dark_activation_eV": (0.1, 2.0),
     "reference_K": (80.0, 400.0),
     "dose_TeV_g": (0.0, 1e6),
     "depletion_depth_um": (0.0, 100.0),
@@ -360,9 +371,8 @@ def dark_rate_e_s(individual: Individual, temperature_K: float) -> F32:
 
     Raises InputError outside the range.
     """
-    reference_K = individual.spec.reference_K
-    silicon = silicon_factor(temperature_K, reference_K)
-    bulk = arrhenius_factor(temperature_K, reference_K)
+    silicon = individual.spec.dark_factor(temperature_K)
+    bulk = arrhenius_factor(temperature_K, individual.spec.reference_K)
     return np.asarray(cv2.addWeighted(individual.dark_e_s, silicon, individual.damage_e_s, bulk, 0.0))
 
 

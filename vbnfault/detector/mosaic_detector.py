@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from ..errors import InputError
 from ..quantities import RGBI, Electrons, Irradiance
 from .chain import Acts, Device, MosaicNoise
-from .dark import silicon_factor
 from .efficiency import white_balance
 from .mosaic import sample
 from .sensor import Sensor
@@ -63,7 +62,7 @@ class MosaicDetector:
     def dark_current_e_s(self) -> float:
         """Of undamaged pixels at the sensor's temperature."""
         spec = self.sensor.individual
-        return spec.dark_current_e_s * silicon_factor(self.sensor.temperature_K, spec.reference_K)
+        return spec.dark_current_e_s * spec.dark_factor(self.sensor.temperature_K)
 
     @property
     def channels(self) -> tuple[str, ...]:
