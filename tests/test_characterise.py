@@ -228,7 +228,9 @@ def test_every_packaged_detector_takes_a_picture(name: str) -> None:
         ({"colour": "red"}, ["d.toml: colour: unknown key", "pattern"]),
         ({"pattern": "plaid"}, ["d.toml", "plaid", "rggb"]),
         ({"readout": {"bits": 20}, "sources": {"readout.bits": "x"}}, ["d.toml: readout", "bits", "20", "16"]),
-        ({"readout": {"bits": "12"}}, ["d.toml: readout: bits = '12'", "wrong type"]),
+        ({"readout": {"bits": "12"}}, ["d.toml: readout: bits = '12'", "whole number"]),
+        ({"individual": {"prnuu": 0.1}}, ["d.toml: individual: prnuu: unknown key", "did you mean prnu?"]),
+        ({"readout": {"bits": 12}, "sources": {"readout.bits": " "}}, ["d.toml: sources", "readout.bits"]),
         ({"pixel_pitch_um": 0.0, "sources": {"pixel_pitch_um": "x"}}, ["d.toml: pixel_pitch_um = 0", "0.5 to 100"]),
     ],
 )

@@ -202,6 +202,9 @@ def test_stores_say_what_a_user_of_raw_pictures_must_know(tmp_path: Any) -> None
     assert attributes["intensity_channel"] == "pixels without a colour filter"
     sensor = json.loads(json.dumps(attributes["detector"]))
     assert sensor["mosaic"][0] == ["W", "B", "W", "G"]
+    assert sensor["nodes"] == 1
+    assert set(sensor["white_balance"]) == {"R", "G", "B", "W"}
+    assert min(sensor["white_balance"].values()) == 1
     assert (sensor["bits"], sensor["bias_dn"], sensor["full_well_e"]) == (12, 64, 13500.0)
     assert sensor["gain_dn_per_e"] == pytest.approx((4095 - 64) / 13500)
     plain = Session(parse_scene(small_scene(), source="x"))

@@ -7,6 +7,7 @@ analysis knows nothing of how pictures are made: a `Camera` takes them, `Virtual
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
@@ -322,6 +323,7 @@ def draw(found: Mapping[str, Characterisation], title: str, path: Path) -> None:
     """A PNG of photon transfer, response, dark signal, spectra and histograms."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
+    from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
     figure = Figure(figsize=(15, 9), layout="constrained")
     FigureCanvasAgg(figure)
@@ -356,7 +358,7 @@ def draw(found: Mapping[str, Characterisation], title: str, path: Path) -> None:
             (axes[1, 1], one.dsnu_map_dn / r.gain_dn_per_e, f"DSNU {r.dsnu_e:.3g} e"),
             (axes[1, 2], 100 * one.prnu_map, f"PRNU {r.prnu_percent:.3g} %"),
         ):
-            count, edge = np.histogram(values, bins=200)
+            count, edge = np.histogram(values, bins=_bins(values))
             ax.semilogy(
                 (edge[1:] + edge[:-1]) / 2, np.maximum(count, 0.5), color=colour, lw=0.8, label=f"{name}: {unit}"
             )
@@ -370,11 +372,30 @@ def draw(found: Mapping[str, Characterisation], title: str, path: Path) -> None:
     )
     top = max(float(one.transfer.variance_dn2.max()) for one in found.values())
     axes[0, 0].set_ylim(top * 1e-4, top * 2)
+    axes[0, 0].xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axes[0, 0].xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:.0f}"))
+    axes[0, 0].xaxis.set_minor_formatter(NullFormatter())
+    axes[0, 1].xaxis.set_major_locator(MaxNLocator(6))
+    axes[0, 2].ticklabel_format(useOffset=False)
+    for formatter in (axes[1, 0].yaxis.set_major_formatter, axes[1, 0].yaxis.set_minor_formatter):
+        formatter(FuncFormatter(lambda value, _: f"{value:.3g}"))
     for ax, (head, x, y) in zip(axes.ravel(), labels, strict=True):
         ax.set(title=head, xlabel=x, ylabel=y)
         ax.grid(alpha=0.3)
         ax.legend(fontsize=7)
     figure.savefig(path, dpi=100)
+
+
+def _bins(values: F64) -> F64:
+    """Edges of about 200 bins, each as wide as a whole number of the steps in which averages of integers come."""
+    levels = np.unique(values)
+    extent = float(levels[-1] - levels[0])
+    if extent == 0:
+        return np.asarray([levels[0] - 0.5, levels[0] + 0.5])
+    apart = np.diff(levels)
+    step = float(apart[apart > 1e-5 * extent].min())
+    width = step * math.ceil(extent / step / 200)
+    return np.asarray(levels[0] - step / 2 + width * np.arange(math.ceil((extent + step) / width) + 1))
 
 
 _COLOURS = {"R": "tab:red", "G": "tab:green", "B": "tab:blue", "N": "tab:brown", "W": "0.4", "M": "0.2"}

@@ -320,7 +320,7 @@ def flare(
 
 @app.command()
 def detector(
-    detector: Annotated[str, typer.Argument(metavar="{detector}", help="path, or name of a packaged detector")],
+    detector: Annotated[str, typer.Argument(help="path, or name of a packaged detector")],
     out: Annotated[Path, typer.Option(help="folder for the report and its plots")],
     seed: Annotated[int, typer.Option(min=0, help="which individual of the sensor")] = 1,
     pixels: Annotated[

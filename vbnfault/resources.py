@@ -60,7 +60,7 @@ def find(kind: str, name_or_path: str | Path) -> Path:
     if path.suffix or path.exists():
         if path.is_file():
             return path
-        raise InputError(f"{path}: no such file")
+        raise InputError(f"{path}: no such file{', but a folder' if path.is_dir() else ''}")
     known = packaged(kind)
     if str(name_or_path) in known:
         return known[str(name_or_path)]

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import dataclasses
+import difflib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -25,6 +26,7 @@ from .readout import ReadoutSpec
 ARCHITECTURES = ("full_frame_ccd", "frame_transfer_ccd", "interline_ccd", "cmos")
 DEMOSAICS = ("bilinear", "malvar", "menon")
 SHUTTERS = ("global", "rolling", "mechanical")
+_KINDS = ((bool, "true or false"), (int, "a whole number"), (float, "a number"), (str, "a text"))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -124,19 +126,20 @@ def parse_sensor(table: Mapping[str, Any], *, source: str) -> Sensor:
     if not isinstance(sources, dict) or not all(isinstance(v, str) for v in sources.values()):
         raise InputError(f"{source}: sources: must be a table of texts")
     numbers = _numbers(plain)
-    for key in numbers:
-        if key not in sources:
-            raise InputError(f'{source}: sources: {key} has none; name one, or say "assumed"')
-    for key in sources:
-        if key not in numbers:
-            raise InputError(f"{source}: sources: {key}: the file gives no such number")
     plain.setdefault("name", Path(source).stem)
     if isinstance(plain.get("pattern"), str):
         try:
             plain["pattern"] = pattern_of(plain["pattern"])
         except InputError as error:
             raise InputError(f"{source}: {error}") from None
+    # a misspelt key before its source
     sensor: Sensor = _build(Sensor, plain, source)
+    for key in numbers:
+        if not sources.get(key, "").strip():
+            raise InputError(f'{source}: sources: {key} has none; name one, or say "assumed"')
+    for key in sources:
+        if key not in numbers:
+            raise InputError(f"{source}: sources: {key}: the file gives no such number")
     own = plain.get("individual")
     if sensor.architecture != "cmos" and not (isinstance(own, Mapping) and "hot_growth" in own):
         grows = dataclasses.replace(sensor.individual, hot_growth=CCD_GROWTH)
@@ -165,7 +168,9 @@ def _build(cls: Any, table: Mapping[str, Any], where: str) -> Any:
     found = {}
     for key, value in table.items():
         if key not in known:
-            raise InputError(f"{where}: {key}: unknown key; known: {', '.join(known)}")
+            near = difflib.get_close_matches(key, known, n=1)
+            told = f" (did you mean {near[0]}?)" if near else f"; known: {', '.join(known)}"
+            raise InputError(f"{where}: {key}: unknown key{told}")
         found[key] = _value(kinds[key], value, f"{where}: {key}")
     try:
         return cls(**found)
@@ -195,7 +200,8 @@ def _value(kind: Any, value: Any, where: str) -> Any:
                 return value
     if isinstance(inner, type) and isinstance(value, inner):
         return value
-    raise InputError(f"{where} = {value!r}: is of the wrong type")
+    wanted = next((word for plain, word in _KINDS if kind is plain or plain in options), "a table or a list")
+    raise InputError(f"{where} = {value!r}: must be {wanted}")
 
 
 def _one_of(key: str, value: str, allowed: tuple[str, ...]) -> None:
