@@ -25,6 +25,7 @@ from vbnfault.faults import registry
 from vbnfault.pictures import develop, effect_of
 from vbnfault.pipeline import Session
 from vbnfault.sample import Frame
+from vbnfault.world import mosaic_sensor
 
 MODELS = {"broken_pixels": "hot_pixels", "broken_lines": "readout"}
 CLASSES = [name for name, models in registry().items() for m in models.values() if m.needs_mosaic]
@@ -41,7 +42,9 @@ def main() -> None:
     given = parser.parse_args()
     overrides = {key: _value(value) for key, _, value in (entry.partition("=") for entry in given.set)}
     scene = load_scene(given.scene, {**overrides, "plan.faulty_fraction": 0.0, "dataset.layers": ["clean"]})
-    faults = {name: {"model": MODELS[name]} if name in MODELS else {} for name in CLASSES}
+    cmos = mosaic_sensor(scene.camera).architecture == "cmos"
+    possible = [name for name in given.only if not (cmos and next(iter(registry()[name].values())).needs_ccd)]
+    faults = {name: {"model": MODELS[name]} if name in MODELS else {} for name in possible}
     session = Session(scene.model_copy(update={"faults": faults}))
     frame = session.frame(given.sample)
     given.out.mkdir(parents=True, exist_ok=True)
@@ -50,7 +53,7 @@ def main() -> None:
             frame = _dark(frame, given.dark_s)
         noise = frame.camera.detector.draw_noise(frame.context.shape, partial(frame.spec.rng, "detector"))
         clean = develop(frame, {}, noise).array
-        for name in given.only:
+        for name in possible:
             fault = frame.spec.faults[name]
             params = fault.draw(frame.context, frame.spec.rng("fault", f"{name}/0"))
             frame.drawn = {name: params}

@@ -405,7 +405,10 @@ def _list_faults() -> None:
     for name, models in faults.json_schema()["properties"].items():
         for model in models.get("anyOf", [models]):
             keys = dict(model["properties"])
-            typer.echo(f"{name} / {keys.pop('model')['const']}")
+            model = keys.pop("model")["const"]
+            kind = faults.registry()[name][model]
+            needs = " (needs camera.detector, a CCD)" if kind.needs_ccd else " (needs camera.detector)"
+            typer.echo(f"{name} / {model}{needs if kind.needs_mosaic else ''}")
             for key, value in keys.items():
                 default = json.dumps(value.get("default"))
                 typer.echo(f"    {key} = {default}    {value['description']}")

@@ -280,7 +280,7 @@ class SpacecraftTable(Table):
     pose: dict[str, PoseTable] = Field(default_factory=dict, description="by part")
 
 
-_OF_THE_DETECTOR = (
+OF_THE_DETECTOR = (
     "pixel_pitch_um",
     "full_well_e",
     "read_noise_e_rms",
@@ -360,7 +360,7 @@ class CameraTable(Table):
             value = getattr(self, key)
             if not self.lens and value not in ("", "paraxial"):
                 raise ValueError(f"{key} = {value!r}: needs lens")
-        for key in _OF_THE_DETECTOR if self.detector else ("individuals", "detector_temperature_K"):
+        for key in OF_THE_DETECTOR if self.detector else ("individuals", "detector_temperature_K"):
             if getattr(self, key) != CameraTable.model_fields[key].default:
                 why = "the detector has its own; leave one out" if self.detector else "needs detector"
                 raise ValueError(f"{key} = {getattr(self, key)!r}: {why}")
@@ -497,7 +497,7 @@ def load_scene(name_or_path: str | Path, overrides: Mapping[str, Any] | None = N
         node = table
         if isinstance(value, str) and (
             key.endswith(".texture_file")
-            or (key.endswith(".lens") and Path(value).suffix)
+            or (key.endswith((".lens", ".detector")) and Path(value).suffix)
             or (key == "body.shape" and value not in _SHAPES)
             or (key == "spacecraft.model" and value not in _VEHICLES)
         ):
@@ -540,20 +540,21 @@ def _anchor_paths(table: dict[str, Any], folder: Path) -> None:
         if isinstance(node, dict) and isinstance(node.get(key), str) and node[key] not in ("", *built_in):
             node[key] = anchored(node[key])
 
-    def anchor_lens(node: Any) -> None:
-        if isinstance(node, dict) and isinstance(node.get("lens"), str) and Path(node["lens"]).suffix:
-            anchor(node, "lens")  # without a suffix it is the name of a packaged one
+    def anchor_file(node: Any, key: str = "lens") -> None:
+        if isinstance(node, dict) and isinstance(node.get(key), str) and Path(node[key]).suffix:
+            anchor(node, key)  # without a suffix it is the name of a packaged one
 
     anchor(table.get("body"), "shape", _SHAPES)
     anchor(table.get("spacecraft"), "model", _VEHICLES)
-    anchor_lens(table.get("camera"))
+    anchor_file(table.get("camera"))
+    anchor_file(table.get("camera"), "detector")
     kernels = table.get("spice")
     if isinstance(kernels, dict) and isinstance(kernels.get("kernels"), list):
         kernels["kernels"] = [anchored(k) if isinstance(k, str) and k else k for k in kernels["kernels"]]
     faults = table.get("faults")
     for fault in faults.values() if isinstance(faults, dict) else ():
         anchor(fault, "texture_file")
-        anchor_lens(fault)
+        anchor_file(fault)
 
 
 def _sentence(error: ValidationError) -> str:

@@ -6,6 +6,7 @@ import contextlib
 import dataclasses
 import hashlib
 import importlib.metadata
+import json
 import os
 import platform
 from collections.abc import Callable, Mapping, Sequence
@@ -45,6 +46,9 @@ def scene_identity(session: pipeline.Session) -> dict[str, Any]:
     scene["body"]["shape_sha256"] = session.body.content_hash
     if session.scene.body.shape not in ("embedded", "ellipsoid"):
         scene["body"]["shape"] = Path(session.scene.body.shape).name
+    if session.scene.camera.detector:
+        for key in config.OF_THE_DETECTOR:
+            del scene["camera"][key]  # the detector has its own
     scene["faults"] = {name: fault.to_dict() for name, fault in session.faults.items()}
     for table in scene["faults"].values():
         if table.get("texture_file"):
@@ -164,6 +168,8 @@ def _detector(detector: Detector | MosaicDetector) -> dict[str, Any]:
         "temperature_K": sensor.temperature_K,
         "row_readout_s": sensor.transfer.row_readout_s,
         "demosaic": sensor.method,
+        # the whole file, with the sources of its numbers
+        "sensor": json.loads(json.dumps(dataclasses.asdict(sensor))),
     }
 
 

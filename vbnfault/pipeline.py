@@ -71,6 +71,11 @@ def configure_faults(scene: SceneConfig, source: str = "scene") -> dict[str, Fau
                 f"{source}: faults.{name}.model = {fault.model!r}: acts inside a detector with a mosaic; name a "
                 "camera.detector"
             )
+        if fault.needs_ccd and world.mosaic_sensor(scene.camera).architecture == "cmos":
+            raise InputError(
+                f"{source}: faults.{name}: acts on charge that a CCD moves, and camera.detector = "
+                f"{scene.camera.detector!r} is a CMOS sensor; leave the fault out, or name a CCD"
+            )
     for layer in scene.dataset.layers:
         if layer.startswith("without_") and layer != "without_straylight" and layer[8:] not in faults:
             raise InputError(f"{source}: dataset.layers: {layer!r}: the scene has no such fault")

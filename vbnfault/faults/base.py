@@ -203,7 +203,7 @@ class Fault:
     Class attributes of a model: `fault` (its class), `model`, `step` (what `apply` receives: `electrons`, the
     expected photo-electrons on the sensor; of a mosaic `pixels`, the electrons expected in each pixel, `charge`,
     those collected, or `raw`; or `rgbi`), `needs_mosaic` (also True where `alter` changes such a detector),
-    `localised` (False where the footprint is about the
+    `needs_ccd` (True: no effect on CMOS), `localised` (False where the footprint is about the
     whole frame), `needs_sun`, `effect_mask` (True: the mask is the effect rule, not the footprint).
     """
 
@@ -213,6 +213,7 @@ class Fault:
     localised: ClassVar[bool] = True
     needs_sun: ClassVar[bool] = False
     needs_mosaic: ClassVar[bool] = False
+    needs_ccd: ClassVar[bool] = False
     effect_mask: ClassVar[bool] = False
 
     def __init_subclass__(cls, **kwargs: Any) -> None:

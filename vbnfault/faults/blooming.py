@@ -27,6 +27,7 @@ class Overflow(Fault):
     model = "overflow"
     step = "charge"
     needs_mosaic = True
+    needs_ccd = True
     effect_mask = True
 
     full_well_share: Interval = bounds(

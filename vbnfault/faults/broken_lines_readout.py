@@ -79,6 +79,10 @@ class ReadoutBrokenLines(Fault):
     )
     node_chance: float = number(0.1, limits=(0, 1), doc="chance that one of several output nodes is lost; assumed")
 
+    def validate(self) -> None:
+        if not any(getattr(self, f"{kind}_weight") for kind in KINDS):
+            raise ValueError("the weights of all kinds of lines are 0: at least one must be above")
+
     def draw(self, context: FaultContext, rng: np.random.Generator) -> Params:
         """`lines`: each with axis, index, kind, shift_px, and where it begins: half of the sensor and rows from
         its register (half -1: the whole line); `register`: node and first pixel lost, or None; lost `node`, or -1.

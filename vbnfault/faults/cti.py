@@ -29,6 +29,7 @@ class RadiationTraps(Fault):
     model = "radiation"
     step = "charge"
     needs_mosaic = True
+    needs_ccd = True
     localised = False
     effect_mask = True
 

@@ -38,6 +38,7 @@ class FrameTransferSmear(Fault):
     model = "frame_transfer"
     step = "pixels"
     needs_mosaic = True
+    needs_ccd = True
     localised = False
     effect_mask = True
 
