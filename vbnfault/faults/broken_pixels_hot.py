@@ -21,14 +21,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..detector.chain import Device, individual, passing_dark_e, upper_share
-from ..detector.demosaic import footprint
-from ..detector.individual import IndividualSpec, RtsPixels, dark_rate_e_s, offset_e
+from ..detector.individual import IndividualSpec, RtsPixels, dark_rate_e_s
 from ..quantities import DEAD, HOT, RTS, RTS_HIGH, STUCK
 from .base import Fault, FaultContext, Interval, Params, bounds, number
 
 F32 = NDArray[np.float32]
 
 _MOST_LISTED = 256
+_OLDEST_YR = 100.0  # that a device's kind may be: what is older grows as many defects in that time
 _MOST_A_YEAR = 0.1  # share of pixels that die or stick in a year, at most
 
 
@@ -101,7 +101,8 @@ class HotPixels(Fault):
     def footprint(self, params: Params, context: FaultContext) -> NDArray[np.bool_]:
         """bool[y, x]: pixels of the picture that a defect can reach."""
         detector: Any = context.camera.detector
-        return footprint(_damage_once(params, context).changed, detector.sensor.pattern, detector.sensor.method)
+        reached: NDArray[np.bool_] = detector.footprint(_damage_once(params, context).changed)
+        return reached
 
     def defects(self, params: Params, context: FaultContext) -> NDArray[np.uint8]:
         """Kinds of the mosaic's defects that show, uint8[y, x]: bits of `quantities.DEFECTS`."""
@@ -154,13 +155,21 @@ def _damage(params: Params, context: FaultContext) -> _Damage:
     rts = RtsPixels(**new, reference_K=old.rts.reference_K)
     signals = rts.at(device.temperature_K)
     high = upper_share(signals, exposure_s, params["telegraph_seed"]) if len(rts) else np.zeros(0)
-    more = dark_rate_e_s(old, device.temperature_K) - device.dark_rate_e_s
+    # with another share of clusters the first ones would stand elsewhere: the device's own stay where they are
+    first, fresh = slice(0, len(own.hot)), slice(len(own.hot), None)
+    damage_e_s, offset_e = old.damage_e_s.copy(), np.zeros(device.shape, dtype=np.float32)
+    moved = (old.hot.row[first] != own.hot.row) | (old.hot.column[first] != own.hot.column)
+    for hot, sign in ((old.hot, -1.0), (own.hot, 1.0)):
+        places = hot.row[first][moved], hot.column[first][moved]
+        np.add.at(damage_e_s, places, (sign * own.hot.rate_e_s[moved]).astype(np.float32))
+    np.add.at(offset_e, (old.hot.row[fresh], old.hot.column[fresh]), old.hot.offset_e[fresh])
+    more = dark_rate_e_s(replace(old, damage_e_s=damage_e_s), device.temperature_K) - device.dark_rate_e_s
     np.maximum(more, 0, out=more)  # a dose that anneals takes none of the device's own away
     jumps = np.zeros(device.shape, dtype=np.float32)
     np.add.at(jumps, (rts.row, rts.column), signals.amplitude_e_s * high)
-    extra = (more + jumps) * np.float32(exposure_s) + (offset_e(old) - device.offset_e)
+    extra = (more + jumps) * np.float32(exposure_s) + offset_e
 
-    least_e = np.float32(detector.full_well_e / 255 * params["least_dn"])
+    least_e = np.float32(detector.step_e * params["least_dn"])
     kinds = np.where(extra >= least_e, HOT, np.uint8(0))
     extra += passing_dark_e(device.sensor, more + jumps, device.direction)
     extra[extra < least_e] = 0
@@ -184,17 +193,21 @@ def _damage(params: Params, context: FaultContext) -> _Damage:
 
 
 def _aged(own: IndividualSpec, params: Params) -> IndividualSpec:
-    """The device's kind at the later age and dose."""
-    growth, factor = own.hot_growth, params["growth_factor"]
+    """The device's kind at the later age and dose. Only the years that the fault adds grow by its factor."""
+    growth, factor, years = own.hot_growth, params["growth_factor"], params["years"]
+    total = min(own.years + years, _OLDEST_YR)
+    more = (own.years + factor * years) / total if total > 0 else 1.0
+    # of a year on the ground by what the fault adds, in shares of all the years
+    added = factor * years / total if total > 0 else 0.0
     return replace(
         own,
-        years=own.years + params["years"],
+        years=total,
         dose_TeV_g=own.dose_TeV_g + params["dose_TeV_g"],
         anneal_s=params["anneal_days"] * 86400.0,
         hot_growth=None
         if growth is None
-        else replace(growth, log10_scale=growth.log10_scale + float(np.log10(factor))),
+        else replace(growth, log10_scale=growth.log10_scale + float(np.log10(more))),
         hot_clustered_share=params["clustered_share"],
-        dead_share_yr=min(own.dead_share_yr + params["dead_per_year"] * factor, _MOST_A_YEAR),
-        stuck_share_yr=min(own.stuck_share_yr + params["stuck_per_year"] * factor, _MOST_A_YEAR),
+        dead_share_yr=min(own.dead_share_yr + params["dead_per_year"] * added, _MOST_A_YEAR),
+        stuck_share_yr=min(own.stuck_share_yr + params["stuck_per_year"] * added, _MOST_A_YEAR),
     )
