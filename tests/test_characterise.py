@@ -14,6 +14,7 @@ from typer.testing import CliRunner
 from vbnfault import resources
 from vbnfault.characterise import Settings, VirtualCamera, characterise
 from vbnfault.cli import app
+from vbnfault.detector import MosaicDetector
 from vbnfault.detector.chain import Device, MosaicNoise, by_channel
 from vbnfault.detector.charge import TrapSpecies
 from vbnfault.detector.individual import IndividualSpec
@@ -219,6 +220,38 @@ def test_every_packaged_detector_takes_a_picture(name: str) -> None:
     assert device.rgbi(raw, 0.01).array.shape == (64, 64, 4)
 
 
+def _one(table: str, key: str, value: Any) -> dict[str, Any]:
+    return {table: {key: value}, "sources": {f"{table}.{key}": "x"}}
+
+
+def test_lists_of_a_file_become_parts_of_a_device() -> None:
+    """Nested ones too: a sensor is a key of what is made once."""
+    pattern_table = {"name": "own", "channels": ["R", "G", "B"], "tile": [[1, 0], [2, 1]]}
+    table = {
+        "pattern": pattern_table,
+        "readout": {"stuck_bits": [[2, 0], [0, 1]]},
+        "sources": {"pattern.tile": "x", "readout.stuck_bits": "x"},
+    }
+    made = parse_sensor(table, source="d.toml")
+    assert made.pattern.is_bayer
+    device = MosaicDetector(sensor=made, width_px=32, height_px=32).device
+    raw = device.raw(np.full((32, 32), 3000.0, np.float32), 0.01, noise(1, (32, 32)))
+    assert (raw & 5 == 1).all()
+
+
+@pytest.mark.parametrize("gain", [0.05, None, 4.0])
+def test_a_saturated_pixel_is_white_whatever_the_gain(gain: float | None) -> None:
+    """Also where the full well misses the top code, or the top code comes before the full well."""
+    made = sensor(readout=replace(sensor().readout, gain_dn_per_e=gain, full_well_e=15_000.0))
+    detector = MosaicDetector(sensor=made, width_px=64, height_px=64)
+    white = float(detector.white_e[0])
+    assert white == pytest.approx(min(15_000.0, np.inf if gain is None else 4015 / gain))
+    device = Device(replace(made, individual=replace(made.individual, prnu=0.0, dsnu_e=0.0)), 1, shape=(64, 64))
+    for light, shown in ((2e4, 255), (0.99 * white, 252), (white / 2, 127)):
+        picture = device.rgbi(device.raw(np.full((64, 64), light, np.float32), 0.01), 0.01).array
+        np.testing.assert_allclose(picture.astype(int), shown, atol=1)
+
+
 @pytest.mark.parametrize(
     ("table", "words"),
     [
@@ -230,6 +263,25 @@ def test_every_packaged_detector_takes_a_picture(name: str) -> None:
         ({"readout": {"bits": 20}, "sources": {"readout.bits": "x"}}, ["d.toml: readout", "bits", "20", "16"]),
         ({"readout": {"bits": "12"}}, ["d.toml: readout: bits = '12'", "wrong type"]),
         ({"pixel_pitch_um": 0.0, "sources": {"pixel_pitch_um": "x"}}, ["d.toml: pixel_pitch_um = 0", "0.5 to 100"]),
+        ({"individual": []}, ["d.toml: individual = []", "wrong type"]),
+        ({"pattern": []}, ["d.toml: pattern = []", "wrong type"]),
+        ({"correct_defects": ["yes"]}, ["d.toml: correct_defects = ['yes']", "wrong type"]),
+        (_one("individual", "years", [1.0, 2.0]), ["d.toml: individual: years = [1.0, 2.0]", "wrong type"]),
+        (_one("individual", "rts_time_s", 3.0), ["d.toml: individual: rts_time_s = 3.0", "wrong type"]),
+        (_one("readout", "stuck_bits", [["x"]]), ["d.toml: readout: stuck_bits 0", "wrong type"]),
+        (_one("readout", "node_offsets_dn", [float("nan")]), ["d.toml: readout: node_offsets_dn 0", "finite"]),
+        (_one("transfer", "leak", 3.5), ["d.toml: transfer: leak = 3.5", "from 0 to 1"]),
+        (_one("transfer", "row_transfer_s", -1.0), ["d.toml: transfer: row_transfer_s = -1", "at least 0"]),
+        (_one("transfer", "parallel_traps", [3]), ["d.toml: transfer: parallel_traps 0 = 3", "wrong type"]),
+        (
+            {"architecture": "full_frame_ccd"}
+            | _one("transfer", "serial_traps", [{"density_per_px": 1.0, "release_time_s": 1.0}]),
+            ["d.toml: transfer.pixel_transfer_s = 0", "above 0", "serial_traps"],
+        ),
+        (
+            {"pattern": {"name": "p", "channels": ["R", "X"], "tile": [[0, 1]]}, "sources": {"pattern.tile": "x"}},
+            ["d.toml: pattern", "'X'", "NIR"],
+        ),
     ],
 )
 def test_bad_files_are_refused_in_a_sentence(table: dict[str, Any], words: list[str]) -> None:
