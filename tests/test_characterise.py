@@ -16,7 +16,7 @@ from vbnfault.characterise import Settings, VirtualCamera, characterise
 from vbnfault.cli import app
 from vbnfault.detector import MosaicDetector
 from vbnfault.detector.chain import Device, MosaicNoise, by_channel
-from vbnfault.detector.charge import TrapSpecies
+from vbnfault.detector.charge import ChargeCloud, TrapSpecies, bloom, cti
 from vbnfault.detector.individual import IndividualSpec
 from vbnfault.detector.mosaic import pattern
 from vbnfault.detector.readout import ReadoutSpec
@@ -189,6 +189,52 @@ def test_a_shutter_that_lets_light_through_smears() -> None:
     got = device.expected_e(light, 0.01) - dark
     np.testing.assert_allclose(got[21:, 30], 5000 / 0.01 * 1e-3 * 0.02, rtol=1e-3)
     np.testing.assert_allclose(got[:20, 30], 0, atol=1e-3)
+
+
+def test_a_global_shutter_lets_light_onto_charge_that_waits() -> None:
+    """leak × rate × i row times, from the first row read on; none of it with a rolling shutter."""
+    light = np.full((64, 64), 5000.0, np.float32)
+    still = replace(sensor().individual, prnu=0.0)
+    move = Transfer(leak=1e-2, row_readout_s=1e-3)
+    for shutter, leak in (("global", 1e-2), ("rolling", 0.0)):
+        device = Device(sensor(individual=still, shutter=shutter, transfer=move), 1, shape=(64, 64))
+        gained = device.expected_e(light, 0.05) - light - 40.0 * 0.05
+        wanted = 5000 / 0.05 * leak * 1e-3 * np.arange(64)[:, None]
+        np.testing.assert_allclose(gained, np.repeat(wanted, 64, axis=1), atol=1e-2)
+
+
+def test_a_devices_lines_have_their_pattern() -> None:
+    readout = replace(sensor().readout, column_pattern_e_rms=50.0, row_pattern_e_rms=20.0, full_well_e=4000.0)
+    device = Device(sensor(readout=readout), 1, shape=SHAPE)
+    raw = device.raw(np.full(SHAPE, 2000.0, np.float32), 0.01) / readout.system_gain_dn_per_e
+    assert raw.mean(axis=0).std() == pytest.approx(50.0, rel=0.2)
+    assert raw.mean(axis=1).std() == pytest.approx(20.0, rel=0.2)
+
+
+def test_the_chain_is_in_physical_order() -> None:
+    """What a fault adds to expected electrons has shot noise, what it adds to charge has none; offsets have none;
+    wells overflow before traps take charge, so that trails lie beside full wells."""
+    dark = replace(sensor().individual, dark_current_e_s=0.0, dsnu_e=0.0)
+    device = Device(sensor(individual=dark), 1, shape=SHAPE)
+    none, more = np.zeros(SHAPE, np.float32), lambda charge: charge + np.float32(400)
+    noisy = device.collected_e(none, 0.01, noise(4), {"pixels": [more]})
+    assert noisy.mean() == pytest.approx(400, abs=0.5)
+    assert noisy.std() == pytest.approx(20, rel=0.02)
+    assert (device.collected_e(none, 0.01, noise(4), {"charge": [more]}) == 400).all()
+    uneven = Device(sensor(individual=replace(dark, dsnu_e=400.0)), 1, shape=SHAPE)
+    assert (uneven.collected_e(none, 0.01, noise(4)) == 0).all()
+    assert uneven.raw(none + 4000, 0.01).std() == pytest.approx(400 * 4015 / 15_000, rel=0.05)
+
+    traps = (TrapSpecies(density_per_px=20.0, release_time_s=1e-3),)
+    made = replace(ccd("full_frame_ccd", parallel_traps=traps), individual=replace(dark, prnu=0.0))
+    spot = np.zeros((64, 64), np.float32)
+    spot[30, 20] = 6e4
+    got = Device(made, 1, shape=(64, 64)).collected_e(spot, 0.01)
+    full = made.readout.full_well_e
+    spilt = bloom(spot, full_well_e=full)
+    np.testing.assert_allclose(
+        got, cti(spilt, traps, cloud=ChargeCloud(full_well_e=full), transfer_s=1e-3), rtol=1e-5
+    )
 
 
 def test_a_device_has_traps_for_life() -> None:
