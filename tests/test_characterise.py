@@ -237,6 +237,33 @@ def test_the_chain_is_in_physical_order() -> None:
     )
 
 
+def test_telegraph_signals_of_a_device_are_in_its_charge() -> None:
+    spec = replace(sensor().individual, rts_share=0.05, dark_current_e_s=0.0)
+    device = Device(sensor(individual=spec), 1, shape=(64, 64))
+    signals = device.individual.rts.at(293.0)
+    dark = device.collected_e(np.zeros((64, 64), np.float32), 10.0)
+    assert dark.sum() == pytest.approx(10 * (signals.amplitude_e_s * signals.duty).sum(), rel=1e-4)
+
+
+def test_smear_follows_the_direction_of_readout() -> None:
+    light = np.zeros((64, 64), np.float32)
+    light[20, 30] = 5000.0
+    made = sensor(architecture="frame_transfer_ccd", transfer=Transfer(row_transfer_s=1e-5))
+    for direction, behind in (("up", slice(21, None)), ("down", slice(0, 20))):
+        got = Device(made, 1, shape=(64, 64), direction=direction).expected_e(light, 0.01)[:, 30] - 0.4
+        assert got[behind].min() > 4
+        assert np.delete(got, np.r_[np.arange(64)[behind], 20]).max() < 0.1
+
+
+def test_intensity_is_what_pixels_without_a_filter_see() -> None:
+    made = sensor(pattern=pattern("rgbw"), demosaic="bilinear")
+    device = Device(made, 2, shape=(64, 64))
+    red = by_channel(made, (64, 64), [4000.0, 0.0, 0.0, 7500.0])
+    picture = device.rgbi(device.raw(red, 0.01), 0.01).array
+    scale = float(device.white_balance[made.pattern.index("W")])
+    assert picture[8:-8, 8:-8, 3].mean() == pytest.approx(min(255 * 7500 * scale / 15_000, 255), abs=1.5)
+
+
 def test_a_device_has_traps_for_life() -> None:
     made = ccd("full_frame_ccd")
     spec = replace(made.individual, trap_share=3e-3, trap_depth_e=400.0, dark_current_e_s=0.0)
