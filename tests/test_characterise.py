@@ -14,8 +14,9 @@ from typer.testing import CliRunner
 from vbnfault import resources
 from vbnfault.characterise import Settings, VirtualCamera, characterise
 from vbnfault.cli import app
+from vbnfault.detector import MosaicDetector
 from vbnfault.detector.chain import Device, MosaicNoise, by_channel
-from vbnfault.detector.charge import TrapSpecies
+from vbnfault.detector.charge import ChargeCloud, TrapSpecies, bloom, cti
 from vbnfault.detector.individual import IndividualSpec
 from vbnfault.detector.mosaic import pattern
 from vbnfault.detector.readout import ReadoutSpec
@@ -190,6 +191,79 @@ def test_a_shutter_that_lets_light_through_smears() -> None:
     np.testing.assert_allclose(got[:20, 30], 0, atol=1e-3)
 
 
+def test_a_global_shutter_lets_light_onto_charge_that_waits() -> None:
+    """leak × rate × i row times, from the first row read on; none of it with a rolling shutter."""
+    light = np.full((64, 64), 5000.0, np.float32)
+    still = replace(sensor().individual, prnu=0.0)
+    move = Transfer(leak=1e-2, row_readout_s=1e-3)
+    for shutter, leak in (("global", 1e-2), ("rolling", 0.0)):
+        device = Device(sensor(individual=still, shutter=shutter, transfer=move), 1, shape=(64, 64))
+        gained = device.expected_e(light, 0.05) - light - 40.0 * 0.05
+        wanted = 5000 / 0.05 * leak * 1e-3 * np.arange(64)[:, None]
+        np.testing.assert_allclose(gained, np.repeat(wanted, 64, axis=1), atol=1e-2)
+
+
+def test_a_devices_lines_have_their_pattern() -> None:
+    readout = replace(sensor().readout, column_pattern_e_rms=50.0, row_pattern_e_rms=20.0, full_well_e=4000.0)
+    device = Device(sensor(readout=readout), 1, shape=SHAPE)
+    raw = device.raw(np.full(SHAPE, 2000.0, np.float32), 0.01) / readout.system_gain_dn_per_e
+    assert raw.mean(axis=0).std() == pytest.approx(50.0, rel=0.2)
+    assert raw.mean(axis=1).std() == pytest.approx(20.0, rel=0.2)
+
+
+def test_the_chain_is_in_physical_order() -> None:
+    """What a fault adds to expected electrons has shot noise, what it adds to charge has none; offsets have none;
+    wells overflow before traps take charge, so that trails lie beside full wells."""
+    dark = replace(sensor().individual, dark_current_e_s=0.0, dsnu_e=0.0)
+    device = Device(sensor(individual=dark), 1, shape=SHAPE)
+    none, more = np.zeros(SHAPE, np.float32), lambda charge: charge + np.float32(400)
+    noisy = device.collected_e(none, 0.01, noise(4), {"pixels": [more]})
+    assert noisy.mean() == pytest.approx(400, abs=0.5)
+    assert noisy.std() == pytest.approx(20, rel=0.02)
+    assert (device.collected_e(none, 0.01, noise(4), {"charge": [more]}) == 400).all()
+    uneven = Device(sensor(individual=replace(dark, dsnu_e=400.0)), 1, shape=SHAPE)
+    assert (uneven.collected_e(none, 0.01, noise(4)) == 0).all()
+    assert uneven.raw(none + 4000, 0.01).std() == pytest.approx(400 * 4015 / 15_000, rel=0.05)
+
+    traps = (TrapSpecies(density_per_px=20.0, release_time_s=1e-3),)
+    made = replace(ccd("full_frame_ccd", parallel_traps=traps), individual=replace(dark, prnu=0.0))
+    spot = np.zeros((64, 64), np.float32)
+    spot[30, 20] = 6e4
+    got = Device(made, 1, shape=(64, 64)).collected_e(spot, 0.01)
+    full = made.readout.full_well_e
+    spilt = bloom(spot, full_well_e=full)
+    np.testing.assert_allclose(
+        got, cti(spilt, traps, cloud=ChargeCloud(full_well_e=full), transfer_s=1e-3), rtol=1e-5
+    )
+
+
+def test_telegraph_signals_of_a_device_are_in_its_charge() -> None:
+    spec = replace(sensor().individual, rts_share=0.05, dark_current_e_s=0.0)
+    device = Device(sensor(individual=spec), 1, shape=(64, 64))
+    signals = device.individual.rts.at(293.0)
+    dark = device.collected_e(np.zeros((64, 64), np.float32), 10.0)
+    assert dark.sum() == pytest.approx(10 * (signals.amplitude_e_s * signals.duty).sum(), rel=1e-4)
+
+
+def test_smear_follows_the_direction_of_readout() -> None:
+    light = np.zeros((64, 64), np.float32)
+    light[20, 30] = 5000.0
+    made = sensor(architecture="frame_transfer_ccd", transfer=Transfer(row_transfer_s=1e-5))
+    for direction, behind in (("up", slice(21, None)), ("down", slice(0, 20))):
+        got = Device(made, 1, shape=(64, 64), direction=direction).expected_e(light, 0.01)[:, 30] - 0.4
+        assert got[behind].min() > 4
+        assert np.delete(got, np.r_[np.arange(64)[behind], 20]).max() < 0.1
+
+
+def test_intensity_is_what_pixels_without_a_filter_see() -> None:
+    made = sensor(pattern=pattern("rgbw"), demosaic="bilinear")
+    device = Device(made, 2, shape=(64, 64))
+    red = by_channel(made, (64, 64), [4000.0, 0.0, 0.0, 7500.0])
+    picture = device.rgbi(device.raw(red, 0.01), 0.01).array
+    scale = float(device.white_balance[made.pattern.index("W")])
+    assert picture[8:-8, 8:-8, 3].mean() == pytest.approx(min(255 * 7500 * scale / 15_000, 255), abs=1.5)
+
+
 def test_a_device_has_traps_for_life() -> None:
     made = ccd("full_frame_ccd")
     spec = replace(made.individual, trap_share=3e-3, trap_depth_e=400.0, dark_current_e_s=0.0)
@@ -219,6 +293,38 @@ def test_every_packaged_detector_takes_a_picture(name: str) -> None:
     assert device.rgbi(raw, 0.01).array.shape == (64, 64, 4)
 
 
+def _one(table: str, key: str, value: Any) -> dict[str, Any]:
+    return {table: {key: value}, "sources": {f"{table}.{key}": "x"}}
+
+
+def test_lists_of_a_file_become_parts_of_a_device() -> None:
+    """Nested ones too: a sensor is a key of what is made once."""
+    pattern_table = {"name": "own", "channels": ["R", "G", "B"], "tile": [[1, 0], [2, 1]]}
+    table = {
+        "pattern": pattern_table,
+        "readout": {"stuck_bits": [[2, 0], [0, 1]]},
+        "sources": {"pattern.tile": "x", "readout.stuck_bits": "x"},
+    }
+    made = parse_sensor(table, source="d.toml")
+    assert made.pattern.is_bayer
+    device = MosaicDetector(sensor=made, width_px=32, height_px=32).device
+    raw = device.raw(np.full((32, 32), 3000.0, np.float32), 0.01, noise(1, (32, 32)))
+    assert (raw & 5 == 1).all()
+
+
+@pytest.mark.parametrize("gain", [0.05, None, 4.0])
+def test_a_saturated_pixel_is_white_whatever_the_gain(gain: float | None) -> None:
+    """Also where the full well misses the top code, or the top code comes before the full well."""
+    made = sensor(readout=replace(sensor().readout, gain_dn_per_e=gain, full_well_e=15_000.0))
+    detector = MosaicDetector(sensor=made, width_px=64, height_px=64)
+    white = float(detector.white_e[0])
+    assert white == pytest.approx(min(15_000.0, np.inf if gain is None else 4015 / gain))
+    device = Device(replace(made, individual=replace(made.individual, prnu=0.0, dsnu_e=0.0)), 1, shape=(64, 64))
+    for light, shown in ((2e4, 255), (0.99 * white, 252), (white / 2, 127)):
+        picture = device.rgbi(device.raw(np.full((64, 64), light, np.float32), 0.01), 0.01).array
+        np.testing.assert_allclose(picture.astype(int), shown, atol=1)
+
+
 @pytest.mark.parametrize(
     ("table", "words"),
     [
@@ -232,6 +338,25 @@ def test_every_packaged_detector_takes_a_picture(name: str) -> None:
         ({"individual": {"prnuu": 0.1}}, ["d.toml: individual: prnuu: unknown key", "did you mean prnu?"]),
         ({"readout": {"bits": 12}, "sources": {"readout.bits": " "}}, ["d.toml: sources", "readout.bits"]),
         ({"pixel_pitch_um": 0.0, "sources": {"pixel_pitch_um": "x"}}, ["d.toml: pixel_pitch_um = 0", "0.5 to 100"]),
+        ({"individual": []}, ["d.toml: individual = []", "must be"]),
+        ({"pattern": []}, ["d.toml: pattern = []", "must be"]),
+        ({"correct_defects": ["yes"]}, ["d.toml: correct_defects = ['yes']", "must be"]),
+        (_one("individual", "years", [1.0, 2.0]), ["d.toml: individual: years = [1.0, 2.0]", "must be"]),
+        (_one("individual", "rts_time_s", 3.0), ["d.toml: individual: rts_time_s = 3.0", "must be"]),
+        (_one("readout", "stuck_bits", [["x"]]), ["d.toml: readout: stuck_bits 0", "must be"]),
+        (_one("readout", "node_offsets_dn", [float("nan")]), ["d.toml: readout: node_offsets_dn 0", "finite"]),
+        (_one("transfer", "leak", 3.5), ["d.toml: transfer: leak = 3.5", "from 0 to 1"]),
+        (_one("transfer", "row_transfer_s", -1.0), ["d.toml: transfer: row_transfer_s = -1", "at least 0"]),
+        (_one("transfer", "parallel_traps", [3]), ["d.toml: transfer: parallel_traps 0 = 3", "must be"]),
+        (
+            {"architecture": "full_frame_ccd"}
+            | _one("transfer", "serial_traps", [{"density_per_px": 1.0, "release_time_s": 1.0}]),
+            ["d.toml: transfer.pixel_transfer_s = 0", "above 0", "serial_traps"],
+        ),
+        (
+            {"pattern": {"name": "p", "channels": ["R", "X"], "tile": [[0, 1]]}, "sources": {"pattern.tile": "x"}},
+            ["d.toml: pattern", "'X'", "NIR"],
+        ),
     ],
 )
 def test_bad_files_are_refused_in_a_sentence(table: dict[str, Any], words: list[str]) -> None:

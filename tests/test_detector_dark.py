@@ -367,8 +367,13 @@ def test_telegraph_signals_at_their_limits() -> None:
     none = telegraph(1.0, 1.0, 0)
     share, end = none.expose(none.start(rng), 1.0, rng)
     assert len(share) == len(end) == 0
-    with pytest.raises(InputError, match="exposure_s = 1000: must be from 0 to 100"):
-        telegraph(1e-3, 1.0, 2).expose(np.ones(2, dtype=bool), 1000.0, rng)
+    # far more switches than anyone can draw, as in the heat: the mean over many memories
+    share, end = telegraph(1e-4, 3e-4, 20_000).expose(np.ones(20_000, dtype=bool), 1000.0, rng)
+    assert share.mean() == pytest.approx(0.25, rel=1e-5)
+    assert share.std() == pytest.approx(math.sqrt(2 * 0.1875 * 0.75e-4 / 1000), rel=0.03)
+    assert end.mean() == pytest.approx(0.25, abs=0.015)
+    with pytest.raises(InputError, match="exposure_s = inf: must be from 0"):
+        none.expose(none.start(rng), math.inf, rng)
     with pytest.raises(InputError, match="gap_s = -1: must be from 0"):
         none.later(none.start(rng), -1.0, rng)
 

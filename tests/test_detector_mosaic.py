@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from vbnfault.detector import demosaic as module
-from vbnfault.detector.demosaic import correct_defects, demosaic, footprint, interpolate
+from vbnfault.detector.demosaic import correct_defects, demosaic, footprint, interpolate, mended_from
 from vbnfault.detector.mosaic import (
     BAYER,
     PATTERNS,
@@ -339,3 +339,19 @@ def test_what_lies_too_far_from_any_good_pixel_is_left() -> None:
     everything = np.ones_like(bad)
     np.testing.assert_array_equal(correct_defects(raw, everything, p), raw)
     np.testing.assert_array_equal(correct_defects(raw, ~everything, p), raw)
+
+
+@pytest.mark.parametrize("name", PATTERNS)
+def test_mended_pixels_know_what_they_are_made_of(name: str) -> None:
+    p = pattern(name)
+    rng = np.random.default_rng(3)
+    raw = rng.integers(0, 4096, (64, 64)).astype(np.uint16)
+    bad = rng.random(raw.shape) < 0.1
+    bad[20:50, 30:52] = True  # those inside look four times as far
+    changed = rng.random(raw.shape) < 0.01
+    other = np.where(changed, raw ^ 2048, raw).astype(np.uint16)
+    differs = correct_defects(raw, bad, p, "mean") != correct_defects(other, bad, p, "mean")
+    told = mended_from(changed, bad, p)
+    assert not (differs & bad & ~told & ~changed).any()
+    assert (differs & told).sum() > 0.5 * told.sum()
+    assert not mended_from(np.zeros_like(bad), bad, p).any()

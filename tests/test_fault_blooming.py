@@ -46,7 +46,7 @@ def test_nothing_exceeds_the_full_well_and_charge_is_kept() -> None:
     charge = np.zeros(c.shape, np.float32)
     charge[20:24, 5:9] = rng(2).uniform(0, 2 * FULL_WELL_E, (4, 4))
     out = fault.apply(Charge(array=charge), params, c).array
-    assert 0.4 * FULL_WELL_E <= params["full_well_e"] <= 0.8 * FULL_WELL_E
+    assert 0.7 * FULL_WELL_E <= params["full_well_e"] <= 0.95 * FULL_WELL_E
     assert out.max() <= params["full_well_e"] * (1 + 1e-6)
     assert out.sum(dtype=float) == pytest.approx(charge.sum(dtype=float), rel=1e-6)
 

@@ -179,3 +179,40 @@ def test_a_scene_without_a_mosaic_refuses_it() -> None:
         InputError, match=r"faults\.broken_pixels\.model = 'hot_pixels': .* name a camera\.detector"
     ):
         Session(config.parse_scene(scene, source="test"), source="test")
+
+
+def test_the_years_that_a_device_has_do_not_grow_by_the_faults_factor() -> None:
+    """Nor do its own defects move where the fault clusters: no years and no dose are no fault."""
+    old = replace(context().camera.detector.sensor.individual, years=20.0, hot_clustered_share=0.0)  # type: ignore[union-attr]
+    old = replace(old, hot_growth=replace(old.hot_growth, log10_scale=3.0), dead_share_yr=1e-5)
+    where = context(0.1, individual=old)
+    device: Any = where.camera.detector.device  # type: ignore[union-attr]
+    assert len(device.individual.hot) > 100
+    keys = {"growth_factor": 50.0, "clustered_share": 0.5, "stuck_per_year": 1e-6, "least_dn": 0.01}
+    none = drawn(where, years=0.0, **keys)
+    assert none["count"] == 0
+    # one year that counts for fifty: what a device of 70 years has more
+    added_ = drawn(where, years=1.0, growth_factor=50.0, dead_per_year=0.0, least_dn=0.001)
+    per_yr = len(device.individual.hot) / 20
+    assert added_["count"] == pytest.approx(50 * per_yr, rel=0.25)
+    # a device may be at most 100 years old; the fault's years count all the same
+    oldest = drawn(where, years=100.0, growth_factor=1.0, dead_per_year=0.0, least_dn=0.001)
+    assert oldest["count"] == pytest.approx(100 * per_yr, rel=0.25)
+
+
+def test_the_mask_holds_what_the_camera_mends_with_a_defect() -> None:
+    """A pixel that the camera corrects takes its value from neighbours two pixels away."""
+    own = replace(context().camera.detector.sensor.individual, stuck_share=0.05, years=0.0)  # type: ignore[union-attr]
+    where = context(0.1, individual=own, correct_defects=True)
+    fault = make("broken_pixels", model="hot_pixels", **(KEYS | {"least_dn": 1.0}))
+    params = fault.draw(where, rng(2))
+    assert params["count"] > 5
+    detector: Any = where.camera.detector
+    signal = flat_electrons(where, 0.4)
+    acts = {"pixels": [lambda array: fault.apply(Charge(array=array), params, where).array]}
+    before, after = (detector.develop(signal, 0.1, None, a).array for a in ({}, acts))
+    changed, mask = (before != after).any(axis=2), fault.footprint(params, where)
+    assert mask is not None
+    assert changed.any()
+    assert not (changed & ~mask).any()
+    assert mask.mean() < 0.5

@@ -62,6 +62,7 @@ class Labelled:
 
     effect_mask: bool = False
     has_footprint: bool = True
+    step: str = "electrons"
 
     def footprint(self, params: dict[str, Any], context: Any) -> np.ndarray | None:
         assert not self.effect_mask, "a class labelled by its effect has its footprint asked for"
@@ -144,3 +145,14 @@ def test_outline_is_the_part_of_the_mask_with_a_neighbour_outside(mask: np.ndarr
     padded = np.pad(mask, 1, constant_values=True)
     for y, x in np.ndindex(6, 7):
         assert got[y, x] == (mask[y, x] and not padded[y : y + 3, x : x + 3].all())
+
+
+def test_in_a_ccd_charge_that_runs_out_of_a_footprint_is_labelled_too() -> None:
+    fault, seen = {"rays": Labelled(step="charge")}, np.zeros(SHAPE, bool)
+    seen[:, 2] = True
+    for ccd in (True, False):
+        context: Any = SimpleNamespace(shape=SHAPE, camera=SimpleNamespace(is_ccd=ccd))
+        effects = {"rays": seen} if ccd else {}
+        (mask,) = labels.mask_layers(fault, {"rays": {"row": 1}}, context, effects)  # type: ignore[arg-type]
+        assert mask[1].all()
+        assert mask[:, 2].all() == ccd

@@ -305,8 +305,8 @@ class VirtualCamera:
 
     @property
     def photons_at_saturation(self) -> float:
-        """Photons a pixel that fill the wells of the channel that responds most."""
-        return self.device.sensor.readout.full_well_e / max(self.efficiency.values())
+        """Photons a pixel that saturate the channel that responds most."""
+        return self.device.sensor.readout.white_e / max(self.efficiency.values())
 
     def take(self, photons: float, exposure_s: float, number: int) -> NDArray[np.uint16]:
         """As `Camera` has it."""

@@ -37,9 +37,16 @@ def mask_layers(
         if name not in drawn:
             continue
         mask = effects[name] if fault.effect_mask else fault.footprint(drawn[name], context)
+        if mask is not None and spreads(fault, context):
+            mask = mask | effects[name]
         if mask is not None:
             out[k] = mask
     return out
+
+
+def spreads(fault: Fault, context: FaultContext) -> bool:
+    """Whether a fault's charge may leave its footprint: in a CCD it overflows along columns, and traps trail it."""
+    return fault.step in ("pixels", "charge") and context.camera.is_ccd
 
 
 def union(masks: Mask, faults: Iterable[str], members: Iterable[str]) -> Mask:

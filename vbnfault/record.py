@@ -24,7 +24,9 @@ def label(frame: Frame) -> None:
     frame.effects = {
         name: effect_of(frame, name)
         for name in frame.drawn
-        if spec.faults[name].effect_mask or "mask_effect" in wanted
+        if spec.faults[name].effect_mask
+        or labels.spreads(spec.faults[name], frame.context)
+        or "mask_effect" in wanted
     }
     frame.mask = labels.mask_layers(spec.faults, frame.drawn, frame.context, frame.effects)
 

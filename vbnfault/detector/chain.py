@@ -267,8 +267,10 @@ class Device:
         black, highest = self.black_dn(exposure_s), 0.0
         if self.row_black_dn is not None:
             mosaic, highest = mosaic - self.row_black_dn, float(self.row_black_dn.max())
-        # what is left above the highest black level is white: a saturated pixel stays so
-        full = 255.0 / max(sensor.readout.top_dn - black - highest, 1.0)
+        # what is left above the highest black level is white: a saturated pixel stays so, also where its full well
+        # falls short of the top code
+        white = sensor.readout.bias_dn + sensor.readout.system_gain_dn_per_e * sensor.readout.white_e
+        full = 255.0 / max(white - black - highest, 1.0)
         scale = {
             name: full * float(gain) for name, gain in zip(sensor.pattern.channels, self.white_balance, strict=True)
         }
@@ -277,8 +279,8 @@ class Device:
         rgb = cv2.multiply(cv2.subtract(linear, (black, black, black, 0.0)), (*shown, 0.0), dtype=cv2.CV_8U)
         out = np.empty((*raw.shape, 4), dtype=np.uint8)
         if "W" in sensor.pattern.channels:
-            white = interpolate(mosaic, sensor.pattern, "W")
-            intensity = cv2.multiply(cv2.subtract(white, black), scale["W"], dtype=cv2.CV_8U)
+            unfiltered = interpolate(mosaic, sensor.pattern, "W")
+            intensity = cv2.multiply(cv2.subtract(unfiltered, black), scale["W"], dtype=cv2.CV_8U)
         else:
             intensity = cv2.transform(rgb, LUMINANCE.reshape(1, 3).astype(np.float64))
         intensity = intensity.reshape(*raw.shape, 1)

@@ -9,6 +9,7 @@ ISO); random telegraph signals, rates that jump between two levels.
 from __future__ import annotations
 
 import math
+import sys
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -270,6 +271,7 @@ def hot_pixel_signal(
 # --- random telegraph signals -----------------------------------------------------------------------------------
 
 _SWITCHES = 32  # drawn at a time
+_MOST_CYCLES = 1e4  # that are drawn one by one
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -311,16 +313,17 @@ class Telegraph:
     ) -> tuple[F64, NDArray[np.bool_]]:
         """(share of the exposure in the upper level, float64[n] in 0 to 1; states at its end).
 
-        Exact: the switching times are drawn. An exposure of 0 s gives the states. Raises InputError for an
-        exposure below 0 or beyond 1e5 times the shortest mean time.
+        Exact: the switching times are drawn. Of signals with over 1e4 cycles in the exposure, as in the heat, the
+        share is normal about the duty, and the end a state of its own. An exposure of 0 s gives the states. Raises
+        InputError unless the exposure is finite and at least 0.
         """
         n = len(state)
-        quickest = min(float(self.high_s.min(initial=math.inf)), float(self.low_s.min(initial=math.inf)))
-        checked("exposure_s", exposure_s, 0.0, 1e5 * quickest)
+        checked("exposure_s", exposure_s, 0.0, sys.float_info.max)
         if exposure_s == 0:
             return state.astype(np.float64), state.copy()
         high_total, end = np.zeros(n), state.copy()
-        left, now = np.arange(n), np.zeros(n)
+        quick = exposure_s > _MOST_CYCLES * (self.high_s + self.low_s)
+        left, now = np.flatnonzero(~quick), np.zeros(np.count_nonzero(~quick))
         while len(left):
             # the times have no memory: what has passed of the first dwell does not matter
             first = state[left, None] ^ (np.arange(_SWITCHES) % 2 == 1)
@@ -333,4 +336,11 @@ class Telegraph:
             passed = np.count_nonzero(switch < exposure_s, axis=1)
             end[left[done]] = state[left[done]] ^ (passed[done] % 2 == 1)
             left, now = left[~done], switch[~done, -1]
-        return np.minimum(high_total / exposure_s, 1.0), end
+        share = np.minimum(high_total / exposure_s, 1.0)
+        if quick.any():
+            # what a correlation exp(-t/τ) leaves of the variance of one instant in the mean of the exposure
+            duty, memory = self.duty[quick], self.correlation_s[quick] / exposure_s
+            spread = np.sqrt(2 * memory * duty * (1 - duty))
+            share[quick] = np.clip(duty + spread * rng.standard_normal(len(duty)), 0, 1)
+            end[quick] = rng.random(len(duty)) < duty
+        return share, end

@@ -144,6 +144,15 @@ def correct_defects(
     return out
 
 
+def mended_from(changed: Mask, bad: Mask, pattern: Pattern) -> Mask:
+    """bool[y, x]: pixels of `bad` bool[y, x] that `correct_defects` mends with values of `changed` bool[y, x]."""
+    channels = channel_of(pattern, (bad.shape[0], bad.shape[1]))
+    near, far = max(pattern.shape), 4 * max(pattern.shape)
+    alone = ~_in_reach(~bad, channels, near)
+    source = changed & ~bad
+    return bad & (_in_reach(source, channels, near) | (alone & _in_reach(source, channels, far)))
+
+
 def _in_reach(good: Mask, channels: NDArray[np.uint8], reach: int) -> Mask:
     """bool[y, x]: whether a good pixel of a pixel's own channel lies within `reach` rows and columns."""
     out = np.zeros(good.shape, dtype=np.bool_)

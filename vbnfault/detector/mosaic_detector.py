@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from ..errors import InputError
 from ..quantities import RGBI, Electrons, Irradiance
 from .chain import Acts, Device, MosaicNoise
+from .demosaic import footprint, mended_from
 from .efficiency import white_balance
 from .mosaic import sample
 from .sensor import Sensor
@@ -77,7 +78,7 @@ class MosaicDetector:
     @property
     def white_e(self) -> F32:
         """Signal of each channel, float32[channel] in electrons, that the 8 bit image shows as 255."""
-        return np.asarray(self.full_well_e / self.white_balance, dtype=np.float32)
+        return np.asarray(self.sensor.readout.white_e / self.white_balance, dtype=np.float32)
 
     def electron_rate_weights(self, wavelength_nm: NDArray[np.float64]) -> F32:
         """float32[channel, band]: electrons per second and pixel for 1 W m⁻² nm⁻¹ in a band, behind each filter."""
@@ -104,9 +105,27 @@ class MosaicDetector:
         return self.device.rgbi(self.raw(expected, exposure_s, noise, acts), exposure_s)
 
     @property
+    def step_e(self) -> float:
+        """Electrons of one DN of 255 in a channel whose white balance is 1."""
+        return self.sensor.readout.white_e / 255
+
+    def footprint(self, changed: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """bool[y, x]: pixels of the picture that pixels of the mosaic, bool[y, x], can reach."""
+        sensor = self.sensor
+        if sensor.correct_defects:
+            changed = changed | mended_from(changed, self.device.bad, sensor.pattern)
+        return footprint(changed, sensor.pattern, sensor.method)
+
+    @property
     def optics_key(self) -> Any:
         """What the electrons expected behind the filters depend on."""
-        return self.sensor.efficiency, self.full_well_e, self.pixel_pitch_um, self.width_px, self.height_px
+        return (
+            self.sensor.efficiency,
+            self.sensor.readout.white_e,
+            self.pixel_pitch_um,
+            self.width_px,
+            self.height_px,
+        )
 
     @property
     def device(self) -> Device:

@@ -103,6 +103,9 @@ class ReadoutSpec:
             "dnl_lsb_rms",
         ):
             _within(name, getattr(self, name), 0, math.inf)
+        for number in (self.banding_phase_rad, *self.node_offsets_dn):
+            if not math.isfinite(number):
+                raise InputError(f"banding_phase_rad or node_offsets_dn holds {number}, but must be finite")
         _positive("full_well_e", self.full_well_e)
         if self.gain_dn_per_e is not None:
             _positive("gain_dn_per_e", self.gain_dn_per_e)
@@ -143,6 +146,11 @@ class ReadoutSpec:
         if self.gain_dn_per_e is not None:
             return self.gain_dn_per_e
         return (self.top_dn - self.bias_dn) / self.full_well_e
+
+    @property
+    def white_e(self) -> float:
+        """The largest signal that is told: a full well, or less where the top code comes first."""
+        return min(self.full_well_e, max(self.top_dn - self.bias_dn, 1) / self.system_gain_dn_per_e)
 
     @property
     def noise_e_rms(self) -> float:

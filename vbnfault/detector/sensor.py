@@ -7,10 +7,12 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
+import math
+import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, cast, get_type_hints
+from typing import Any, cast, get_args, get_origin, get_type_hints
 
 from .. import resources, spectra
 from ..errors import InputError
@@ -47,6 +49,12 @@ class Transfer:
     parallel_traps: tuple[TrapSpecies, ...] = ()
     serial_traps: tuple[TrapSpecies, ...] = ()
     cloud: ChargeCloud | None = None
+
+    def __post_init__(self) -> None:
+        for key in ("row_transfer_s", "row_clear_s", "pixel_transfer_s", "row_readout_s"):
+            _in_range(key, getattr(self, key), 0.0, math.inf)
+        for key in ("leak", "shutter_transmission", "antiblooming"):
+            _in_range(key, getattr(self, key), 0.0, 1.0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -89,12 +97,20 @@ class Sensor:
             ("quantum_efficiency_peak", 1e-3, 1.0),
             ("temperature_K", 100.0, 400.0),
         ):
-            value = getattr(self, key)
-            if not low <= value <= high:
-                raise InputError(f"{key} = {value:g}: must be from {low:g} to {high:g}")
-
+            _in_range(key, getattr(self, key), low, high)
         for curve in self.quantum_efficiency:
             _one_of("quantum_efficiency: channel", curve.channel, self.pattern.channels)
+        own = {curve.channel for curve in self.quantum_efficiency}
+        for channel in set(self.pattern.channels) - own:
+            _one_of("pattern: without a quantum_efficiency of its own, channel", channel, (*"RGBW", "NIR"))
+        if self.pattern.channels != ("W",) and not set("RGB") <= set(self.pattern.channels):
+            raise InputError(
+                f"pattern: channels = {self.pattern.channels}: must be W alone, or R, G and B among them"
+            )
+        if self.architecture != "cmos":
+            for traps, clock in (("parallel_traps", "row_readout_s"), ("serial_traps", "pixel_transfer_s")):
+                if getattr(self.transfer, traps) and not getattr(self.transfer, clock) > 0:
+                    raise InputError(f"transfer.{clock} = 0: must be above 0 where there are {traps}")
 
     @property
     def efficiency(self) -> QuantumEfficiency:
@@ -181,27 +197,36 @@ def _build(cls: Any, table: Mapping[str, Any], where: str) -> Any:
 
 
 def _value(kind: Any, value: Any, where: str) -> Any:
-    """A value of a field's type."""
-    options = [k for k in getattr(kind, "__args__", ()) if k is not type(None)]
-    inner = (
-        kind if dataclasses.is_dataclass(kind) else next((k for k in options if dataclasses.is_dataclass(k)), None)
-    )
-    if inner is not None and isinstance(value, dict):
-        return _build(inner, value, where)
-    if isinstance(value, list):
-        if inner is not None:
-            return tuple(_build(inner, row, f"{where} {k}") for k, row in enumerate(value))
-        return tuple(value)
-    for plain in (bool, int, float, str):
-        if kind is plain or plain in options:
-            if plain is float and isinstance(value, int) and not isinstance(value, bool):
-                return float(value)
-            if isinstance(value, plain) and not (plain is not bool and isinstance(value, bool)):
-                return value
-    if isinstance(inner, type) and isinstance(value, inner):
+    """A value of a field's type: a number, a text, a table or a list of them, all the way down."""
+    kinds = get_args(kind)
+    if get_origin(kind) is tuple:
+        if isinstance(value, list):
+            each = kinds[:1] * len(value) if kinds[-1] is Ellipsis else kinds
+            if len(each) == len(value):
+                return tuple(_value(k, v, f"{where} {n}") for n, (k, v) in enumerate(zip(each, value, strict=True)))
+    elif kinds:  # or None, which a file leaves out
+        return _value(kinds[0], value, where)
+    elif dataclasses.is_dataclass(kind):
+        if isinstance(value, dict):
+            return _build(kind, value, where)
+        if isinstance(value, cast(type, kind)):
+            return value
+    elif kind is float and type(value) in (int, float):
+        # of whole numbers too: one of 400 digits is no float
+        if abs(value) <= sys.float_info.max:
+            return float(value)
+        raise InputError(f"{where} = {value!r}: must be finite")
+    elif type(value) is kind:  # not isinstance: true and false are whole numbers to Python
         return value
-    wanted = next((word for plain, word in _KINDS if kind is plain or plain in options), "a table or a list")
+    other = "a table" if dataclasses.is_dataclass(kind) else "a list of the right length"
+    wanted = next((word for plain, word in _KINDS if kind is plain), other)
     raise InputError(f"{where} = {value!r}: must be {wanted}")
+
+
+def _in_range(key: str, value: float, low: float, high: float) -> None:
+    if not low <= value <= high or math.isinf(value):
+        allowed = f"finite and at least {low:g}" if math.isinf(high) else f"from {low:g} to {high:g}"
+        raise InputError(f"{key} = {value:g}: must be {allowed}")
 
 
 def _one_of(key: str, value: str, allowed: tuple[str, ...]) -> None:

@@ -39,7 +39,7 @@ class InterferenceBanding(Fault):
         15.0,
         limits=(0, 255),
         unit="DN of 255",
-        doc="amplitude as it shows, in shares of the full well; assumed",
+        doc="amplitude as it shows, in shares of white; assumed",
     )
     frequency_hz: Interval = bounds(
         500.0, 200e3, limits=(1, 1e9), unit="Hz", doc="of the interference, drawn evenly in its logarithm; assumed"
@@ -65,7 +65,7 @@ class InterferenceBanding(Fault):
         """Amplitude and row noise in electrons as they show, frequency, phase, and the times of pixel and line."""
         detector: Any = context.camera.detector
         sensor, readout = detector.sensor, detector.sensor.readout
-        dn_e = readout.full_well_e / 255
+        dn_e = readout.white_e / 255
         amplitude_e = self.amplitude_dn.uniform(rng) * dn_e
         low, high = math.log(self.frequency_hz.lo), math.log(self.frequency_hz.hi)
         frequency_hz = min(max(math.exp(rng.uniform(low, high)), self.frequency_hz.lo), self.frequency_hz.hi)

@@ -22,7 +22,6 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from ..detector.demosaic import footprint
 from ..detector.readout import (
     Axis,
     dead_lines,
@@ -168,7 +167,8 @@ class ReadoutBrokenLines(Fault):
             region |= _behind(params["register"], context)
         if params["node"] >= 0:
             region |= node_of(context.shape, sensor.readout.nodes) == params["node"]
-        return footprint(region, sensor.pattern, sensor.method)
+        reached: Mask = detector.footprint(region)
+        return reached
 
 
 def _of(params: Params, kind: str, axis: str) -> list[dict[str, Any]]:

@@ -8,6 +8,8 @@ in. All of it is in electrons of the mosaic, before shot noise, and spreads over
 does. In a CCD charge is clocked past its defects: behind a hot pixel, away from the register, it draws a line
 (`detector.chain.passing_dark_e`).
 
+As charge in the mosaic, all of it has shot noise, offsets and stuck pixels included.
+
 Pixels are as warm as the sensor: at short exposures and in the cold most damage does not show, as on real ones.
 The growth laws are of cameras on the ground; `growth_factor` says how much faster it goes in space (assumed).
 """
@@ -22,7 +24,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..detector.chain import Device, passing_dark_e, upper_share
-from ..detector.demosaic import footprint
 from ..detector.individual import Individual, IndividualSpec, RtsPixels, aged, dark_rate_e_s, offset_e
 from ..quantities import DEAD, HOT, RTS, RTS_HIGH, STUCK
 from .base import Fault, FaultContext, Interval, Params, bounds, number
@@ -30,6 +31,7 @@ from .base import Fault, FaultContext, Interval, Params, bounds, number
 F32 = NDArray[np.float32]
 
 _MOST_LISTED = 256
+_OLDEST_YR = 100.0  # that a device's kind may be: what is older grows as many defects in that time
 _MOST_A_YEAR = 0.1  # share of pixels that die or stick in a year, at most
 
 
@@ -102,7 +104,8 @@ class HotPixels(Fault):
     def footprint(self, params: Params, context: FaultContext) -> NDArray[np.bool_]:
         """bool[y, x]: pixels of the picture that a defect can reach."""
         detector: Any = context.camera.detector
-        return footprint(_damage_once(params, context).changed, detector.sensor.pattern, detector.sensor.method)
+        reached: NDArray[np.bool_] = detector.footprint(_damage_once(params, context).changed)
+        return reached
 
     def defects(self, params: Params, context: FaultContext) -> NDArray[np.uint8]:
         """Kinds of the mosaic's defects that show, uint8[y, x]: bits of `quantities.DEFECTS`."""
@@ -161,7 +164,7 @@ def _damage(params: Params, context: FaultContext) -> _Damage:
     np.add.at(jumps, (rts.row, rts.column), signals.amplitude_e_s * high)
     extra = (more + jumps) * np.float32(exposure_s) + (offset_e(old) - device.offset_e)
 
-    least_e = np.float32(detector.full_well_e / 255 * params["least_dn"])
+    least_e = np.float32(detector.step_e * params["least_dn"])
     kinds = np.where(extra >= least_e, HOT, np.uint8(0))
     extra += passing_dark_e(device.sensor, more + jumps, device.direction)
     extra[extra < least_e] = 0
@@ -190,23 +193,20 @@ def _older(own: Individual, changes: tuple[tuple[str, Any], ...]) -> Individual:
 
 
 def _ageing(own: IndividualSpec, params: Params) -> tuple[tuple[str, Any], ...]:
-    """What changes of the device with its later age and dose. Until now it grew by its own laws."""
-    years, factor = own.years + params["years"], params["growth_factor"]
-
-    def since(share_yr: float, more_yr: float) -> float:
-        mean = (share_yr * own.years + (share_yr + more_yr * factor) * params["years"]) / max(years, 1e-9)
-        return float(min(mean, _MOST_A_YEAR))
-
-    growth = own.hot_growth
+    """What changes of the device with its later age and dose. Only the years that are added grow by the factor."""
+    growth, factor, years = own.hot_growth, params["growth_factor"], params["years"]
+    total = min(own.years + years, _OLDEST_YR)
+    more = (own.years + factor * years) / total if total > 0 else 1.0
+    # of a year on the ground by what the fault adds, in shares of all the years
+    added = factor * years / total if total > 0 else 0.0
     if growth is not None:
-        mean = (own.years + factor * params["years"]) / max(years, 1e-9)
-        growth = replace(growth, log10_scale=growth.log10_scale + float(np.log10(max(mean, 1e-9))))
+        growth = replace(growth, log10_scale=growth.log10_scale + float(np.log10(more)))
     return (
-        ("years", years),
+        ("years", total),
         ("dose_TeV_g", own.dose_TeV_g + params["dose_TeV_g"]),
         ("anneal_s", params["anneal_days"] * 86400.0),
         ("hot_growth", growth),
         ("hot_clustered_share", params["clustered_share"]),
-        ("dead_share_yr", since(own.dead_share_yr, params["dead_per_year"])),
-        ("stuck_share_yr", since(own.stuck_share_yr, params["stuck_per_year"])),
+        ("dead_share_yr", min(own.dead_share_yr + params["dead_per_year"] * added, _MOST_A_YEAR)),
+        ("stuck_share_yr", min(own.stuck_share_yr + params["stuck_per_year"] * added, _MOST_A_YEAR)),
     )

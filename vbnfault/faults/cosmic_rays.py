@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from ..detector.cosmic import LEAST_MEV_CM2_G, CosmicRayModel, CosmicRays, stopping_power_MeV_cm2_g
-from ..detector.demosaic import footprint
 from .base import Fault, FaultContext, Interval, Params, bounds, number
 
 F32 = NDArray[np.float32]
@@ -104,7 +103,8 @@ class Tracks(Fault):
     def footprint(self, params: Params, context: FaultContext) -> NDArray[np.bool_]:
         """bool[y, x]: pixels of the picture that the tracks' charge can reach through the demosaic."""
         detector: Any = context.camera.detector
-        return footprint(_charge_once(params, context) > 0, detector.sensor.pattern, detector.sensor.method)
+        reached: NDArray[np.bool_] = detector.footprint(_charge_once(params, context) > 0)
+        return reached
 
 
 def _model(params: Params, context: FaultContext) -> CosmicRayModel:
@@ -157,5 +157,5 @@ def _charge(params: Params, context: FaultContext) -> F32:
         index, electrons = model.deposit(some, context.shape)
         out[index] += electrons
     detector: Any = context.camera.detector
-    out[out < detector.full_well_e / 255 * params["least_dn"]] = 0
+    out[out < detector.step_e * params["least_dn"]] = 0
     return out.reshape(context.shape)

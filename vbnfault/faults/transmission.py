@@ -17,7 +17,6 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from ..detector.demosaic import footprint
 from ..detector.readout import (
     Fill,
     corrupted_packets,
@@ -94,7 +93,8 @@ class PacketTransmission(Fault):
         detector: Any = context.camera.detector
         # which bits flip does not depend on the signal
         _, region = _arrived(np.zeros(context.shape, dtype=np.uint16), params)
-        return footprint(region, detector.sensor.pattern, detector.sensor.method)
+        reached: Mask = detector.footprint(region)
+        return reached
 
 
 def _arrived(raw: Raw, params: Params) -> tuple[Raw, Mask]:
