@@ -366,6 +366,18 @@ def test_bad_files_are_refused_in_a_sentence(table: dict[str, Any], words: list[
         assert word in str(caught.value)
 
 
+@pytest.mark.parametrize("key", ["architecture", "pixel_pitch_um", "bits", "full_well_e"])
+def test_files_must_say_what_no_default_can(key: str, tmp_path: Path) -> None:
+    text = resources.find("scenes/detectors", "generic_cmos").read_text()
+    kept = [line for line in text.splitlines() if not line.startswith((f"{key} =", f'"readout.{key}"'))]
+    path = tmp_path / "own.toml"
+    path.write_text("\n".join(kept))
+    with pytest.raises(InputError, match=rf"own\.toml: (readout\.)?{key}: is missing"):
+        load_sensor(path)
+    with pytest.raises(InputError, match="shutter = 'rolling': must be global or mechanical"):
+        sensor(architecture="full_frame_ccd", shutter="rolling")
+
+
 def test_the_command_writes_report_and_plots(tmp_path: Path) -> None:
     out = tmp_path / "report"
     run = CliRunner().invoke(

@@ -202,7 +202,9 @@ def _channel(
     # saturation: where the variance is largest (section 6.6)
     last = int(np.argmax(variance))
     if last < 3:
-        raise InputError(f"channel {name}: it saturates within the first three exposures; take fewer photons")
+        raise InputError(
+            f"channel {name}: it saturates within the first three exposures, so that no line can be fitted"
+        )
     linear = mean - dark_mean <= _LINEAR_SHARE * (mean[last] - dark_mean)
     linear &= np.arange(len(mean)) <= last
     signal, noise = (mean - dark_mean)[linear], (variance - dark_variance)[linear]

@@ -341,6 +341,8 @@ def detector(
     from .detector.sensor import load_sensor
 
     sensor = load_sensor(detector)
+    with _written(out):  # before the work
+        out.mkdir(parents=True, exist_ok=True)
     shape = min(pixels, sensor.height_px), min(pixels, sensor.width_px)
     camera = characterise.VirtualCamera(
         Device(sensor, seed, shape=shape, temperature_K=temperature_k), wavelength_nm=wavelength_nm
@@ -358,7 +360,6 @@ def detector(
     if wavelength_nm is not None:
         title += f", {wavelength_nm:g} nm"
     with _written(out):
-        out.mkdir(parents=True, exist_ok=True)
         report = {"detector": sensor.name, "individual": seed, "temperature_K": camera.device.temperature_K}
         report |= {"wavelength_nm": wavelength_nm, "channels": [one.to_dict() for one in found.values()]}
         (out / "emva1288.json").write_text(json.dumps(report, indent=1), encoding="utf-8")

@@ -28,6 +28,8 @@ from .readout import ReadoutSpec
 ARCHITECTURES = ("full_frame_ccd", "frame_transfer_ccd", "interline_ccd", "cmos")
 DEMOSAICS = ("bilinear", "malvar", "menon")
 SHUTTERS = ("global", "rolling", "mechanical")
+# Of a file: what no default could stand for.
+_REQUIRED = ("architecture", "pixel_pitch_um", "readout.bits", "readout.full_well_e")
 _KINDS = ((bool, "true or false"), (int, "a whole number"), (float, "a number"), (str, "a text"))
 
 
@@ -88,6 +90,8 @@ class Sensor:
     def __post_init__(self) -> None:
         _one_of("architecture", self.architecture, ARCHITECTURES)
         _one_of("shutter", self.shutter, SHUTTERS)
+        if self.shutter == "rolling" and self.architecture != "cmos":
+            raise InputError("shutter = 'rolling': must be global or mechanical, as the architecture is a CCD")
         _one_of("response", self.response, (*spectra.RESPONSES, spectra.FLAT))
         _one_of("demosaic", self.demosaic, DEMOSAICS)
         for key, low, high in (
@@ -131,7 +135,15 @@ class Sensor:
 def load_sensor(name_or_path: str | Path) -> Sensor:
     """A sensor by path or packaged name. Raises InputError naming file, key, value and allowed range."""
     path = resources.find("scenes/detectors", name_or_path)
-    return parse_sensor(resources.read_toml(path), source=str(path))
+    table = resources.read_toml(path)
+    for key in _REQUIRED:
+        *parents, leaf = key.split(".")
+        node: Any = table
+        for parent in parents:
+            node = node.get(parent, {})
+        if isinstance(node, dict) and leaf not in node:
+            raise InputError(f"{path}: {key}: is missing")
+    return parse_sensor(table, source=str(path))
 
 
 def parse_sensor(table: Mapping[str, Any], *, source: str) -> Sensor:
