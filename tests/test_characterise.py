@@ -224,6 +224,13 @@ def test_the_chain_is_in_physical_order() -> None:
     uneven = Device(sensor(individual=replace(dark, dsnu_e=400.0)), 1, shape=SHAPE)
     assert (uneven.collected_e(none, 0.01, noise(4)) == 0).all()
     assert uneven.raw(none + 4000, 0.01).std() == pytest.approx(400 * 4015 / 15_000, rel=0.05)
+    # no well limits them: full ones keep their spread, as far as the converter goes
+    low = Device(
+        sensor(individual=replace(dark, dsnu_e=400.0), readout=replace(uneven.sensor.readout, gain_dn_per_e=0.2)),
+        1,
+        shape=SHAPE,
+    )
+    assert low.raw(none + 5e4, 0.01).std() == pytest.approx(400 * 0.2, rel=0.05)
 
     traps = (TrapSpecies(density_per_px=20.0, release_time_s=1e-3),)
     made = replace(ccd("full_frame_ccd", parallel_traps=traps), individual=replace(dark, prnu=0.0))

@@ -1,7 +1,7 @@
 """One device of a sensor at work: from photo-electrons expected in its mosaic to raw numbers and to a picture.
 
     expected photo-electrons → response of each pixel (PRNU, dead pixels) → smear, parasitic light → dark current,
-    that of charge under way, telegraph signals → shot noise → particles → blooming → traps → offsets → full well,
+    that of charge under way, telegraph signals → shot noise → particles → blooming → traps → full well → offsets,
     nodes, noise, converter (`readout`) → raw → defect correction, black level, demosaic, white balance → RGBI
 
 Smear is light that falls on charge under way, so it comes before the shot noise. Offsets (DSNU, "partially stuck"
@@ -11,7 +11,7 @@ pixels) are no charge: they have no shot noise.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache, partial
 from typing import Any
 
@@ -91,11 +91,12 @@ class Device:
         self.shape = (sensor.height_px, sensor.width_px) if shape is None else shape
         self.temperature_K = sensor.temperature_K if temperature_K is None else temperature_K
         self.individual = individual(sensor.individual, self.shape, sensor.pixel_pitch_um, seed)
-        self.readout_individual = ReadoutIndividual.draw(
-            self.shape, sensor.readout, np.random.default_rng(np.random.SeedSequence([seed, *b"readout"]))
-        )
         self.response = response(self.individual)
         self.offset_e = offset_e(self.individual)
+        drawn = ReadoutIndividual.draw(
+            self.shape, sensor.readout, np.random.default_rng(np.random.SeedSequence([seed, *b"readout"]))
+        )
+        self.readout_individual = replace(drawn, pixel_e=self.offset_e)
         self.dark_rate_e_s = dark_rate_e_s(self.individual, self.temperature_K)
         self.transfer_dark_e = transfer_dark_e(sensor, self.dark_rate_e_s, direction)
         self._telegraph = self.individual.rts.at(self.temperature_K)
@@ -172,7 +173,7 @@ class Device:
 
     def raw(self, photo_e: F32, exposure_s: float, noise: MosaicNoise | None = None, acts: Acts = _NOTHING) -> Raw:
         """Raw DN, uint16[y, x]; noise-free without `noise`. `acts` are what faults do at the `STEPS`."""
-        charge = cv2.add(self.collected_e(photo_e, exposure_s, noise, acts), self.offset_e)
+        charge = self.collected_e(photo_e, exposure_s, noise, acts)
         stuck = self.individual.stuck
         raw = read_out(
             charge,

@@ -209,12 +209,14 @@ class ReadoutNoise:
 class ReadoutIndividual:
     """What makes one sensor's chain differ from another's of its kind; None where it does not.
 
-    `row_e` float32[y] and `column_e` float32[x]: fixed pattern, in electrons. `transitions_dn`
-    float32[2^bits - 1], rising: the converter gives code k from transition k - 1 to transition k.
+    `row_e` float32[y], `column_e` float32[x] and `pixel_e` float32[y, x]: fixed pattern, in electrons, which no
+    well limits. `transitions_dn` float32[2^bits - 1], rising: the converter gives code k from transition k - 1 to
+    transition k.
     """
 
     row_e: F32 | None = None
     column_e: F32 | None = None
+    pixel_e: F32 | None = None
     transitions_dn: F32 | None = None
 
     @classmethod
@@ -306,7 +308,7 @@ def read_out(
     chain = _Chain(electrons.shape, spec, noise, individual)
     code_of = _Converter(spec, transitions)
     return _blockwise(
-        lambda e, row_e, half, wave, read: code_of(chain.amplify(e, row_e, half, wave, read)),
+        lambda *block: code_of(chain.amplify(*block)),
         _picture(electrons),
         *chain.of_rows,
     )
@@ -386,6 +388,7 @@ class _Chain:
             if individual.row_e is not None:
                 rows = rows + individual.row_e
             self.column_e = individual.column_e
+            _fits("pixel_e", individual.pixel_e, (height, width))
         if noise is not None:
             _fits("read", noise.read, (height, width))
             _fits("row", noise.row, (height,))
@@ -400,12 +403,21 @@ class _Chain:
         table = np.array([[0, 1], [2, 3]]) if spec.nodes == 4 else np.array([[0, 1]] * 2)
         by_column = np.minimum(table[:, right], spec.nodes - 1)
         self.gains, self.offsets = (v[by_column].astype(np.float32) for v in (gains, offsets))
-        self.of_rows = (rows if rows.any() else None, down, wave, None if noise is None else noise.read)
+        pixel_e = None if individual is None else individual.pixel_e
+        self.of_rows = (rows if rows.any() else None, down, wave, None if noise is None else noise.read, pixel_e)
 
     def amplify(
-        self, electrons: F32, row_e: F32 | None, half: NDArray[np.intp], wave: F32 | None, read: F32 | None
+        self,
+        electrons: F32,
+        row_e: F32 | None,
+        half: NDArray[np.intp],
+        wave: F32 | None,
+        read: F32 | None,
+        pixel_e: F32 | None,
     ) -> F32:
         out = clip_full_well(electrons, self.full_well_e)
+        if pixel_e is not None:
+            out += pixel_e
         if self.column_e is not None:
             out += self.column_e
         if row_e is not None:
