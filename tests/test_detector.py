@@ -434,3 +434,19 @@ if not child:
 raise SystemExit(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
 """
     assert subprocess.run([sys.executable, "-W", "ignore", "-c", script], check=False).returncode == 0
+
+
+def test_the_paper_worlds_detector_is_what_it_was() -> None:
+    """Block means of a picture of fixed light and noise, as first published: the sensor with a mosaic must not change
+    the one without. A block has 256 pixels, of which five may round otherwise on another processor."""
+    d = Detector(width_px=64, height_px=64)
+    ramp = np.linspace(0, 1.2, 64, dtype=np.float32)
+    light = np.stack([np.tile(ramp, (64, 1)), np.tile(ramp[:, None], (1, 64)), np.full((64, 64), 0.05)], axis=-1)
+    expected = Electrons(array=(light * d.white_e).astype(np.float32), white_e=d.white_e)
+    noise = d.draw_noise((64, 64), lambda name: np.random.default_rng([7, *name.encode()]))
+    image = d.develop(expected, 0.02, noise).array.astype(float)
+    blocks = image.reshape(4, 16, 4, 16, 4).mean(axis=(1, 3))
+    np.testing.assert_allclose(blocks[0, :, 0], [36.34, 114.18, 191.83, 251.25], atol=0.02)
+    np.testing.assert_allclose(blocks[:, 1, 1], [36.38, 114.29, 191.95, 251.06], atol=0.02)
+    np.testing.assert_allclose(blocks[2, 2], [191.71, 191.56, 12.82, 178.70], atol=0.02)
+    np.testing.assert_allclose(d.white_balance, [1.4293662, 1.0, 1.3485727], rtol=1e-6)
