@@ -437,7 +437,7 @@ raise SystemExit(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
 
 
 def test_the_paper_worlds_detector_is_what_it_was() -> None:
-    """Block means of a picture of fixed light and noise, as first published: the sensor with a mosaic must not change
+    """Block means of a picture of fixed light and noise, as first published: sensors with a mosaic must not change
     the one without. A block has 256 pixels, of which five may round otherwise on another processor."""
     d = Detector(width_px=64, height_px=64)
     ramp = np.linspace(0, 1.2, 64, dtype=np.float32)
