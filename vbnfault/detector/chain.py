@@ -200,7 +200,7 @@ class Device:
         return along_columns(self.sensor, self.direction, step, image)
 
     def _along_registers(self, step: Callable[..., F32], image: F32) -> F32:
-        """The same along rows: towards the left, or each half to its own side with two nodes or four."""
+        """As `along_columns`, along rows: to the left, or each half to its own side with two nodes or four."""
         if self.sensor.readout.nodes == 1:
             return step(image, direction="left")
         middle = (image.shape[1] + 1) // 2

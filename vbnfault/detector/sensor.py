@@ -38,8 +38,8 @@ class Transfer:
     """Charge on its way: times in s of a row's transfer to the store or register, of a row's clearing before the
     exposure (0: at once), and of a pixel's in the register; the share of light that leaks into a covered register
     (interline) or store (global shutter, a second), and that a shutter lets through while a full frame is read; the
-    share of the excess that an antiblooming drain takes; traps
-    in columns and in the register, with the cloud that meets them."""
+    share of the excess that an antiblooming drain takes; traps in columns and in the register, with the cloud that
+    meets them."""
 
     row_transfer_s: float = 0.0
     row_clear_s: float = 0.0

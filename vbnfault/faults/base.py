@@ -71,6 +71,13 @@ class Interval(NamedTuple):
         value = rng.uniform(self.lo, self.hi, size)
         return float(value) if size is None else value
 
+    def power_law(self, uniform: NDArray[np.float64], exponent: float) -> NDArray[np.float64]:
+        """Values in [lo, hi], of uniform numbers in [0, 1], of which the number above v falls as v^-exponent."""
+        if abs(exponent) < 1e-9:
+            return np.asarray(self.lo * (self.hi / self.lo) ** uniform)
+        a, b = self.lo**-exponent, self.hi**-exponent
+        return np.asarray((a + (b - a) * uniform) ** (-1 / exponent))
+
     def integer(self, rng: np.random.Generator) -> int:
         """A uniform integer in lo … hi, both included."""
         return int(rng.integers(int(self.lo), int(self.hi), endpoint=True))

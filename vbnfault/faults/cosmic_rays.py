@@ -91,7 +91,7 @@ class Tracks(Fault):
         mean = model.expected_count(context.shape, params["time_s"])
         count = min(_poisson_above_0(mean, rng), int(self.most_tracks))
         params["mean_count"], params["count"] = float(mean), count
-        energy = np.round(_power_law(rng.random(count), self.energy_MeV, self.spectral_index), 2)
+        energy = np.round(self.energy_MeV.power_law(rng.random(count), self.spectral_index - 1), 2)
         tracks = _tracks(model, context.shape, count, energy, rng).params
         params["tracks"] = [track | {"energy_MeV": e} for track, e in zip(tracks, energy.tolist(), strict=True)]
         return params
@@ -114,15 +114,6 @@ def _model(params: Params, context: FaultContext) -> CosmicRayModel:
         flux_per_cm2_s=params["flux_per_cm2_s"],
         diffusion_um=params["diffusion_um"],
     )
-
-
-def _power_law(u: F64, bounds: Interval, index: float) -> F64:
-    """Values within bounds whose density falls with the power `index`, of uniform numbers."""
-    low, high = bounds
-    if abs(index - 1) < 1e-9:
-        return np.asarray(low * (high / low) ** u)
-    a, b = low ** (1 - index), high ** (1 - index)
-    return np.asarray((a + u * (b - a)) ** (1 / (1 - index)))
 
 
 def _poisson_above_0(mean: float, rng: np.random.Generator) -> int:

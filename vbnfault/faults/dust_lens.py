@@ -110,9 +110,7 @@ class DefocusedDust(LensFault):
             "on_window": on_window.tolist(),
             "x_mm": np.round(x, 5).tolist(),
             "y_mm": np.round(y, 5).tolist(),
-            "diameter_um": np.round(
-                _power_law(rng.random(count), self.diameter_um, self.size_exponent), 3
-            ).tolist(),
+            "diameter_um": np.round(self.diameter_um.power_law(rng.random(count), self.size_exponent), 3).tolist(),
             "transmission": np.round(self.transmission.uniform(rng, count), 4).tolist(),
             "mask_loss": float(self.mask_loss),
         }
@@ -128,15 +126,6 @@ class DefocusedDust(LensFault):
         """bool[y, x]: where the loss reaches `mask_loss`."""
         factor = _shadows_once(params, context).transmission
         return np.asarray(factor <= np.float32(1 - params["mask_loss"]))
-
-
-def _power_law(uniform: F64, diameter_um: Interval, exponent: float) -> F64:
-    """Diameters of which the number above D falls as D^-exponent, between the bounds."""
-    lo, hi = diameter_um
-    if exponent < 1e-9:
-        return np.asarray(lo * (hi / lo) ** uniform)
-    a, b = lo**-exponent, hi**-exponent
-    return np.asarray((a + (b - a) * uniform) ** (-1 / exponent))
 
 
 # --- geometry --------------------------------------------------------------------------------------------------
