@@ -26,7 +26,7 @@ CAMERA = {"spectra", "quantities", "llvm", "lens", "detector", "camera"}
 WORLD = GEOMETRY | CAMERA | {"sky", "spacecraft", "render"}
 STAGES = {"pose", "exposure", "pictures", "record"}
 PIPELINE = WORLD | STAGES | {"world", "faults", "labels", "sample", "pipeline"}
-DATASET = PIPELINE | {"store", "build", "dataset"}
+DATASET = PIPELINE | {"store", "jobs", "build", "dataset"}
 MAY_IMPORT: dict[str, set[str]] = {
     "__init__": set(),
     "errors": set(),
@@ -59,7 +59,8 @@ MAY_IMPORT: dict[str, set[str]] = {
     "record": GEOMETRY | CAMERA | {"world", "labels", "sample", "pictures"},
     "pipeline": PIPELINE,
     "store": {"quantities", "config", "plan"},
-    "build": PIPELINE | {"store"},
+    "jobs": PIPELINE | {"store"},
+    "build": PIPELINE | {"store", "jobs"},
     "dataset": DATASET,
     "study": DATASET,
     "report": DATASET,
@@ -74,8 +75,8 @@ ONLY = {  # distribution → the one unit that imports it
     "drjit": {"body", "render", "lens"},
     "zarr": {"store"},
     "numcodecs": {"store"},
-    "dask": {"build"},
-    "distributed": {"build"},
+    "dask": {"jobs"},
+    "distributed": {"jobs"},
     "typer": {"cli"},
     "spiceypy": {"spice"},
 }

@@ -25,6 +25,7 @@ from test_store import fake_sample, flip, make_spec
 from vbnfault import build as bd
 from vbnfault import store as st
 from vbnfault.errors import InputError, VbnfaultError
+from vbnfault.jobs import dask, lock, progress, tasks
 from vbnfault.quantities import Sample
 from vbnfault.store import codec
 
@@ -307,18 +308,18 @@ def test_paths_that_cannot_be_used_are_bad_input(tmp_path: Path) -> None:
 @pytest.mark.skipif(sys.platform == "win32", reason="no folder locks there")
 def test_two_builds_at_once_are_refused(tmp_path: Path) -> None:
     run(tmp_path / "s.zarr")
-    with bd._locked(tmp_path / "s.zarr"), pytest.raises(VbnfaultError, match="another build is writing"):
+    with lock.locked(tmp_path / "s.zarr"), pytest.raises(VbnfaultError, match="another build is writing"):
         run(tmp_path / "s.zarr")
 
 
 def test_sites_are_worked_through_one_after_another(tmp_path: Path) -> None:
     store = st.create(tmp_path / "s.zarr", make_spec(), 40)
-    plan = bd._Run(store, np.arange(40) // 4 % 3, bd._Progress(40, shown=False))
+    plan = tasks.Run(store, np.arange(40) // 4 % 3, progress.Progress(40, shown=False))
     order, last = [], None
     while (last := plan.next_shard(last)) is not None:
         order.append(plan.lead(last))
     assert order == [0] * 4 + [1] * 3 + [2] * 3
-    plan = bd._Run(store, np.arange(40) // 4 % 3, bd._Progress(40, shown=False))
+    plan = tasks.Run(store, np.arange(40) // 4 % 3, progress.Progress(40, shown=False))
     first = plan.next_shard()
     assert first is not None
     second = plan.next_shard(None, [first])
@@ -329,7 +330,7 @@ def test_sites_are_worked_through_one_after_another(tmp_path: Path) -> None:
 def test_progress_without_a_terminal_is_plain_lines(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(bd, "_SECONDS_BETWEEN_LINES", 0.0)
+    monkeypatch.setattr(progress, "_SECONDS_BETWEEN_LINES", 0.0)
     run(tmp_path / "s.zarr", Session(seconds=0.01), progress=True)
     lines = capsys.readouterr().err.splitlines()
     assert len(lines) >= SAMPLES
@@ -357,10 +358,10 @@ def test_a_scheduler_is_told_from_a_worker() -> None:
     with distributed.LocalCluster(
         n_workers=1, processes=False, protocol="tcp://", dashboard_address=None
     ) as cluster:
-        bd._check_scheduler(cluster.scheduler_address)
+        dask.check_scheduler(cluster.scheduler_address)
         (worker,) = cluster.scheduler_info["workers"]
         with pytest.raises(InputError, match="a Dask worker listens there, no scheduler"):
-            bd._check_scheduler(worker)
+            dask.check_scheduler(worker)
 
 
 def test_without_dask_the_sentence_says_how_to_get_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -421,7 +422,7 @@ def test_what_is_no_dask_scheduler_is_one_sentence(
     tmp_path: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, reply: bytes | None
 ) -> None:
     pytest.importorskip("distributed")
-    monkeypatch.setattr(bd, "_SECONDS_TO_ANSWER", 2.0)
+    monkeypatch.setattr(dask, "_SECONDS_TO_ANSWER", 2.0)
     with listening(reply) as address:
         began = time.monotonic()
         with pytest.raises(InputError) as e:

@@ -1,0 +1,21 @@
+"""How a build ends early."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from ..errors import VbnfaultError
+
+
+class Interrupted(VbnfaultError):
+    """Stopped by the user or the system; the same command resumes."""
+
+    exit_code = 130
+
+
+class BuildFailed(VbnfaultError):
+    """Some samples could not be made. `failures`: sample → traceback, or what happened to its worker."""
+
+    def __init__(self, sentence: str, failures: Mapping[int, str] | None = None) -> None:
+        super().__init__(sentence)
+        self.failures = dict(failures or {})

@@ -1,0 +1,82 @@
+"""How far a build is: a bar, or plain lines."""
+
+from __future__ import annotations
+
+import sys
+import time
+from typing import Any
+
+_SECONDS_BETWEEN_LINES = 5.0
+
+
+def size_text(count: float) -> str:
+    for unit in ("B", "kB", "MB", "GB"):
+        if count < 1000:
+            return f"{count:.3g} {unit}"
+        count /= 1000
+    return f"{count:.3g} TB"
+
+
+def duration_text(seconds: float) -> str:
+    minutes, hours = seconds / 60, seconds / 3600
+    return f"{seconds:.0f} s" if seconds < 100 else f"{minutes:.0f} min" if minutes < 100 else f"{hours:.1f} h"
+
+
+class Progress:
+    """Samples done, rate and time left: a bar on a terminal, a line every few seconds elsewhere."""
+
+    def __init__(self, total: int, *, shown: bool) -> None:
+        self._total, self._shown = total, shown
+        self._done = self._built = 0
+        self._began = self._last_line = time.monotonic()
+        self._bar: Any = None
+        self._task: Any = None
+
+    def __enter__(self) -> Progress:
+        if self._shown and sys.stderr.isatty():
+            from rich.console import Console
+            from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
+
+            columns = (
+                BarColumn(bar_width=None),
+                MofNCompleteColumn(),
+                TextColumn("samples, {task.description}"),
+            )
+            self._bar = Progress(*columns, console=Console(stderr=True))
+            self._task = self._bar.add_task("checking", total=self._total)
+            self._bar.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._bar is not None:
+            self._bar.stop()
+        elif self._shown and self._built:
+            print(self._line(), file=sys.stderr, flush=True)
+
+    def _pace(self) -> str:
+        seconds = time.monotonic() - self._began
+        if not self._built or seconds <= 0:
+            return "checking"
+        rate = self._built / seconds
+        unit = f"{rate:.2f} samples/s" if rate >= 0.1 else f"{1 / rate:.0f} s/sample"
+        return f"{unit}, {duration_text((self._total - self._done) / rate)} left"
+
+    def _line(self) -> str:
+        return f"{self._done}/{self._total} samples, {self._pace()}"
+
+    def advance(self, built: bool) -> None:
+        """One sample further."""
+        self._done += 1
+        self._built += built
+        if self._bar is not None:
+            self._bar.update(self._task, advance=1, description=self._pace())
+        elif self._shown and time.monotonic() - self._last_line > _SECONDS_BETWEEN_LINES:
+            self._last_line = time.monotonic()
+            print(self._line(), file=sys.stderr, flush=True)
+
+    def say(self, text: str) -> None:
+        """A line beside the bar."""
+        if self._bar is not None:
+            self._bar.console.print(text, highlight=False, markup=False)
+        elif self._shown:
+            print(text, file=sys.stderr, flush=True)

@@ -1,0 +1,194 @@
+"""A task is a shard: what it lacks is made and written. Tasks are handed out by site, so that a worker loads a
+site's terrain once.
+"""
+
+from __future__ import annotations
+
+import traceback
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .. import store as store_module
+from ..errors import VbnfaultError
+from ..quantities import Sample
+from ..store import Encoded, Store
+from .errors import BuildFailed
+from .progress import Progress
+
+_HOPELESS = 32  # so many failed samples and not one success: the rest would fail as well
+
+
+class Session(Protocol):
+    """What makes samples; it keeps between samples what is costly to make, such as the terrain of a site."""
+
+    def simulate(self, index: int) -> Sample:
+        """The sample of this index, the same whatever was simulated before."""
+        ...
+
+
+SessionFactory = Callable[[], Session]
+
+
+# sample; "kept", "begun", "built" or "failed"; where it failed one line, then the traceback
+Tick = Callable[[int, str, str], None]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Task:
+    """Complete one shard. `sites`: of its samples. `skip`: not to be tried. `careful`: write every sample at
+    once, because the process may die at the next one."""
+
+    shard: int
+    sites: tuple[int, ...]
+    skip: frozenset[int] = frozenset()
+    careful: bool = False
+
+
+def work(simulate: Callable[[int], Sample], store: Store, task: Task, tick: Tick) -> None:
+    """Do a task; a sample that fails is reported and left out.
+
+    What was made is written also where an interrupt ends the task early, but not where `tick` finds that
+    nobody listens any more: another build may have begun.
+    """
+    wanted = {i for problem in store_module.check_shard(store, task.shard) for i in problem.samples}
+    samples = store.shard(task.shard)
+    made: dict[int, Encoded] = {}
+    try:
+        for i in samples:
+            if i not in wanted:
+                tick(i, "kept", "")
+        for i in sorted(wanted - task.skip, key=lambda i: (task.sites[i - samples.start], i)):
+            tick(i, "begun", "")
+            try:
+                made[i] = store_module.encode(store.spec, simulate(i))
+            except Exception as error:
+                tick(i, "failed", describe(error))
+                continue
+            if task.careful:
+                store.write_shard(task.shard, {i: made.pop(i)})
+            tick(i, "built", "")
+    except OSError:
+        made.clear()
+        raise
+    finally:
+        if made:
+            store.write_shard(task.shard, made)
+
+
+def describe(error: Exception) -> str:
+    """One line, then the traceback."""
+    frame = traceback.extract_tb(error.__traceback__)[-1]
+    if isinstance(error, VbnfaultError):
+        line = str(error)
+    else:
+        line = f"{type(error).__name__}: {error} ({Path(frame.filename).name}:{frame.lineno})"
+    return " ".join(line.split()) + "\n" + "".join(traceback.format_exception(error))
+
+
+class Run:
+    """The tasks of a build, handed out by site, and what came of them."""
+
+    def __init__(self, store: Store, sites: NDArray[np.int64], progress: Progress) -> None:
+        self.store, self.sites, self.progress = store, sites, progress
+        self.built = 0
+        self.failures: dict[int, str] = {}
+        self._outcome: dict[int, str] = {}
+        self._by_site: dict[int, deque[int]] = {}
+        for shard in range(store.shards):
+            self._by_site.setdefault(self.lead(shard), deque()).append(shard)
+
+    def lead(self, shard: int) -> int:
+        """The site a shard is handed out with: that of its first sample."""
+        return int(self.sites[self.store.shard(shard).start])
+
+    def task(self, shard: int, skip: frozenset[int] = frozenset(), *, careful: bool = False) -> Task:
+        """The task that completes a shard."""
+        samples = self.store.shard(shard)
+        sites = tuple(int(s) for s in self.sites[samples.start : samples.stop])
+        return Task(shard=shard, sites=sites, skip=skip, careful=careful)
+
+    def next_shard(self, last: int | None = None, busy: Sequence[int] = ()) -> int | None:
+        """What a worker does after the shard `last`: a shard of the same site if one is left, else of the
+        site where the fewest of the `busy` shards are, then of the one with the most left."""
+        left = {site: queue for site, queue in self._by_site.items() if queue}
+        if not left:
+            return None
+        site = None if last is None else self.lead(last)
+        if site is None or site not in left:
+            taken = [self.lead(shard) for shard in busy]
+            site = min(left, key=lambda s: (taken.count(s), -len(left[s]), s))
+        return left[site].popleft()
+
+    def tick(self, sample: int, what: str, text: str) -> None:
+        """Note what became of a sample. Raises BuildFailed where nothing succeeds."""
+        if what == "begun":
+            return
+        before = self._outcome.get(sample)
+        self._outcome[sample] = what
+        self.built += (what == "built") - (before == "built")
+        if what == "failed":
+            self.failures[sample] = text
+            self.progress.say(f"sample {sample} failed: {text.splitlines()[0]}")
+        else:
+            self.failures.pop(sample, None)
+        if before is None:
+            self.progress.advance(what == "built")
+        if self.built == 0 and len(self.failures) >= _HOPELESS:
+            self.raise_failures(" before any succeeded, so the build was stopped")
+
+    def raise_failures(self, why: str = "") -> None:
+        """Raise BuildFailed that names the failed samples, if any."""
+        if not self.failures:
+            return
+        failed = sorted(self.failures)
+        first = self.failures[failed[0]].splitlines()[0]
+        names = ", ".join(map(str, failed[:8])) + (", ..." if len(failed) > 8 else "")
+        many = f"sample {names}" if len(failed) == 1 else f"{len(failed)} samples ({names})"
+        raise BuildFailed(
+            f"{self.store.path}: {many} failed{why}, the first with: {first}; "
+            f"all others are kept, and the same command tries the failed ones again",
+            self.failures,
+        )
+
+
+class Lazy:
+    """A session made when the first sample needs it: a shard that is whole needs none."""
+
+    def __init__(self, factory: SessionFactory) -> None:
+        self._factory = factory
+        self._session: Session | None = None
+
+    def simulate(self, index: int) -> Sample:
+        if self._session is None:
+            try:
+                self._session = self._factory()
+            except VbnfaultError as error:
+                raise Fatal(error) from error
+            except Exception as error:
+                raise Fatal(VbnfaultError(describe(error).splitlines()[0])) from error
+        return self._session.simulate(index)
+
+
+class Fatal(BaseException):
+    """Carries what ends the whole build, past the handling of a single sample's failure."""
+
+    def __init__(self, error: VbnfaultError) -> None:
+        super().__init__(error)
+        self.error = error
+
+
+def run_here(factory: SessionFactory, run: Run) -> None:
+    session = Lazy(factory)
+    shard = run.next_shard()
+    while shard is not None:
+        try:
+            work(session.simulate, run.store, run.task(shard), run.tick)
+        except Fatal as fatal:
+            raise fatal.error from fatal
+        shard = run.next_shard(shard)
