@@ -289,9 +289,35 @@ def test_sites_lie_on_gentle_ground_and_keep_when_the_list_grows() -> None:
         assert site.T_from_L[2, 0] >= 0  # north leans towards the pole
 
 
+def test_a_site_is_drawn_when_it_is_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A session of 10,000 sites starts at once: gravity is evaluated for the sites that are visited alone."""
+    body, points = load_body(), 0
+    evaluate = body.gravity.evaluate
+
+    def counted(points_m: np.ndarray) -> object:
+        nonlocal points
+        points += len(np.atleast_2d(points_m))
+        return evaluate(points_m)
+
+    monkeypatch.setattr(body.gravity, "evaluate", counted)
+    sites = choose_sites(body, 10_000, seed=0)
+    assert (len(sites), points) == (10_000, 0)
+    site = sites[9_876]
+    drawn = points
+    assert drawn > 0
+    assert sites[9_876] is site
+    assert points == drawn  # kept
+    alone = choose_sites(load_body(), 9_877, seed=0)[-1]
+    np.testing.assert_array_equal(alone.position_T_m, site.position_T_m)
+    np.testing.assert_array_equal(alone.T_from_L, site.T_from_L)
+    assert [s.index for s in sites[3:6]] == [3, 4, 5]
+    with pytest.raises(IndexError):
+        sites[10_000]
+
+
 def test_site_bounds() -> None:
     body = load_body()
-    assert choose_sites(body, 0, seed=0) == ()
+    assert len(choose_sites(body, 0, seed=0)) == 0
     for arguments, key in (((-1, 0), "sites"), ((1, -1), "seed")):
         with pytest.raises(InputError, match=key):
             choose_sites(body, *arguments)

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from . import config, plan, world
-from .body import Body, Patch, Site, cached_patch, choose_sites
+from .body import Body, Patch, Site, Sites, cached_patch, choose_sites
 from .body.refine import GROWTH_POWER
 from .camera import Camera
 from .config import SceneConfig
@@ -125,8 +125,8 @@ class Session:
         return world.spacecraft(self.scene)
 
     @cached_property
-    def sites(self) -> tuple[Site, ...]:
-        """All sites of the scene."""
+    def sites(self) -> Sites:
+        """Return the sites of the scene, each drawn when it is first asked for."""
         if self.scene.spice.spacecraft:
             return world.way_sites(self.scene, self.body)
         return choose_sites(self.body, self.scene.dataset.sites, self.scene.dataset.seed)

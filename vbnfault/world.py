@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from . import camera as cameras
 from . import config, frames, photometry, sky, spectra, spice
-from .body import Body, Site, load_body, site_at
+from .body import Body, Site, Sites, load_body, site_at
 from .camera import Camera
 from .config import BodyTable, CameraTable, OrbitTable, PoseTable, SceneConfig, SpiceTable, SunTable
 from .detector import Detector, MosaicDetector, Sensor, load_sensor
@@ -98,14 +98,15 @@ def spacecraft_pose(scene: SceneConfig, julian_date: float) -> spice.Pose:
     return _spacecraft_pose(scene.spice, julian_date)
 
 
-def way_sites(scene: SceneConfig, body: Body) -> tuple[Site, ...]:
-    """The sites of a scene on a spacecraft's way: the ground in the middle of the picture, half-way through each
-    site's time; where the camera looks past the body, the ground nearest to the line of sight."""
-    sites = []
-    for k in range(scene.dataset.sites):
-        pose = spacecraft_pose(scene, epoch_jd(scene, k, 0.5))
-        sites.append(site_at(body, k, looked_at(body, pose.camera_position_T_m, pose.T_from_C[:, 2])))
-    return tuple(sites)
+def way_sites(scene: SceneConfig, body: Body) -> Sites:
+    """Return the sites of a scene on a spacecraft's trajectory: the ground in the middle of the image, half-way
+    through each site's time; where the camera looks past the body, the ground nearest to the line of sight."""
+
+    def site(index: int) -> Site:
+        pose = spacecraft_pose(scene, epoch_jd(scene, index, 0.5))
+        return site_at(body, index, looked_at(body, pose.camera_position_T_m, pose.T_from_C[:, 2]))
+
+    return Sites(scene.dataset.sites, site)
 
 
 def looked_at(body: Body, origin_T_m: F64, direction_T: F64) -> F64:

@@ -17,7 +17,7 @@ from vbnfault.body.nucleus import embedded_nucleus
 from vbnfault.body.patch import Patch, build_patch
 from vbnfault.body.roughness import Roughness, model_roughness
 from vbnfault.body.shape import Float64, Int32, Unit, check_mesh, load_shape, signed_volume
-from vbnfault.body.sites import Site, choose_sites, local_level, site_at
+from vbnfault.body.sites import Site, Sites, choose_sites, local_level, site_at
 from vbnfault.errors import InputError
 
 __all__ = [
@@ -25,6 +25,7 @@ __all__ = [
     "Patch",
     "PolyhedronGravity",
     "Site",
+    "Sites",
     "build_patch",
     "cached_patch",
     "check_mesh",

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, overload
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -40,6 +41,41 @@ class Site:
     T_from_L: Float64
 
 
+class Sites(Sequence[Site]):
+    """The sites of a scene, each computed when it is first asked for and then kept.
+
+    A site costs some 9 ms on a shape of 20,000 facets, and a worker process visits few of them.
+
+    Parameters
+    ----------
+    count
+        Number of sites, >= 0.
+    make
+        Returns the site of an index, the same one whatever was asked for before.
+    """
+
+    def __init__(self, count: int, make: Callable[[int], Site]) -> None:
+        self._count, self._make = count, make
+        self._made: dict[int, Site] = {}
+
+    def __len__(self) -> int:
+        return self._count
+
+    @overload
+    def __getitem__(self, index: int) -> Site: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> tuple[Site, ...]: ...
+
+    def __getitem__(self, index: int | slice) -> Site | tuple[Site, ...]:
+        if isinstance(index, slice):
+            return tuple(self[k] for k in range(self._count)[index])
+        number = range(self._count)[index]
+        if number not in self._made:
+            self._made[number] = self._make(number)
+        return self._made[number]
+
+
 def local_level(effective_gravity_m_s2: ArrayLike) -> Float64:
     """T_from_L, float64[3, 3], from effective gravity float64[3] in T.
 
@@ -73,10 +109,11 @@ def site_at(body: Body, index: int, position_T_m: ArrayLike) -> Site:
     return Site(index=index, position_T_m=position, T_from_L=local_level(gravity))
 
 
-def choose_sites(body: Body, count: int, seed: int, *, max_slope_deg: float = MAX_SLOPE_DEG) -> tuple[Site, ...]:
-    """Random sites, uniform over the surface area that is no steeper than `max_slope_deg`.
+def choose_sites(body: Body, count: int, seed: int, *, max_slope_deg: float = MAX_SLOPE_DEG) -> Sites:
+    """Return random sites, uniform over the surface area that is no steeper than `max_slope_deg`.
 
-    Site k depends on (body, seed, k, max_slope_deg) only, so a longer list begins with the shorter one.
+    A site is drawn when it is first asked for. Site k depends on (body, seed, k, max_slope_deg) only, so a longer
+    list begins with the shorter one.
 
     Parameters
     ----------
@@ -91,7 +128,7 @@ def choose_sites(body: Body, count: int, seed: int, *, max_slope_deg: float = MA
     Raises
     ------
     InputError
-        A parameter out of range, or no place found in 1000 draws.
+        A parameter out of range; when a site is asked for, no place found in 1000 draws.
     """
     if count < 0:
         raise InputError(f"sites: must be 0 or more; got {count}.")
@@ -102,7 +139,7 @@ def choose_sites(body: Body, count: int, seed: int, *, max_slope_deg: float = MA
     normals, areas = face_normals_areas(body.vertices_m, body.faces)
     cumulative = np.cumsum(areas)
     cos_bound = np.cos(np.radians(max_slope_deg))
-    return tuple(_draw(body, index, seed, normals, cumulative, cos_bound) for index in range(count))
+    return Sites(count, lambda index: _draw(body, index, seed, normals, cumulative, cos_bound))
 
 
 def _draw(body: Body, index: int, seed: int, normals: Float64, cumulative: Float64, cos_bound: float) -> Site:
