@@ -30,6 +30,9 @@ NUMPY = SimpleNamespace(
 # slightly under the horizon of a facet that it does see.
 _LEAST_COSINE = 1e-4
 _TINY = 1e-30
+# Plain Python numbers: a numpy scalar times a drjit array is a numpy array.
+_DECAY_PER_MAG = float(0.4 * np.log(10))
+_DEG_PER_HALF = float(np.degrees(2.0))  # degrees of an angle over radians of its half
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -72,8 +75,7 @@ class Diffuse:
                 share = m.maximum(1 + a * (-0.019 + a * (2.42e-4 - a * 1.46e-6)), 0)
                 value = share * seeliger + (1 - share) * lit
         if self.phase_slope_mag_deg:
-            decay = 0.4 * np.log(10) * self.phase_slope_mag_deg
-            value = value * m.exp(-decay * _phase_deg(m, light, view))
+            value = value * m.exp(-_DECAY_PER_MAG * self.phase_slope_mag_deg * _phase_deg(m, light, view))
         return [value]
 
 
@@ -165,7 +167,7 @@ def _tan_half_phase(m: Any, light: Triple, view: Triple) -> Any:
 
 
 def _phase_deg(m: Any, light: Triple, view: Triple) -> Any:
-    return np.degrees(2.0) * m.atan(_tan_half_phase(m, light, view))
+    return _DEG_PER_HALF * m.atan(_tan_half_phase(m, light, view))
 
 
 def _henyey_greenstein(m: Any, g: float, cos_phase: Any) -> Any:

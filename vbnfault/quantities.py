@@ -120,7 +120,8 @@ DEFECTS = ("hot", "dead", "stuck", "rts", "rts_high", "trap")
 class Truth:
     """Noise-free truth of the pixel centres.
 
-    `depth_m` float32[y, x], along the boresight, inf on the sky; `normal` float16[y, x, 3] in C, 0 on the sky;
+    `depth_m` float32[y, x], along the boresight, inf on the sky; `normal` float16[y, x, 3] in C, 0 on the sky: the
+    surface's own, interpolated over its facet, at the limb no further from the camera than at right angles to it;
     `semantic` uint8[y, x]: 0 sky, 1 body, 2 Sun, 3 spacecraft. Where asked for, float32[y, x], NaN on the sky:
     `incidence_deg` and `emission_deg` from the normal to the Sun and to the camera, `phase_deg` between the two,
     and `dust`, how far the ground is covered, in [0, 1].

@@ -13,7 +13,7 @@ import numpy as np
 from ..photometry import HAPKE_TABLES, Hapke, hapke_at
 from ..scene import Scene
 from .runtime import dr, mi
-from .surface import Surface
+from .surface import Surface, facing
 
 
 def has_bands(surface: Surface, scene: Scene) -> bool:
@@ -28,7 +28,7 @@ class Reflection:
     def __init__(self, surface: Surface, scene: Scene, hit: Any, normal: Any, view: Any, *, banded: bool) -> None:
         self._scene, self._hit, self._banded = scene, hit, banded
         self._vehicle = surface.vehicle
-        self._frame = mi.Frame3f(normal)
+        self._frame = mi.Frame3f(facing(normal, view))
         self._view = _triple(self._frame.to_local(view))
 
     def terms(self, light: Any) -> list[Any]:

@@ -11,7 +11,7 @@ from ..scene import Sunlight, View
 from .emitter import SunDisc
 from .runtime import dr, mi
 from .sampling import Optics
-from .surface import Surface
+from .surface import Surface, facing
 
 
 def truth(surface: Surface, view: View, sun: Sunlight, *, angles: bool = False) -> Truth:
@@ -22,7 +22,7 @@ def truth(surface: Surface, view: View, sun: Sunlight, *, angles: bool = False) 
     hit = surface.seen_from(view).intersect(rays)
     boresight = optics.axes[2]
     depth = dr.select(hit.valid, hit.distance_m * dr.dot(rays.d, boresight), dr.inf)
-    normal = hit.normal
+    normal = facing(hit.normal, -rays.d)
     in_camera = [dr.select(hit.valid, dr.dot(normal, axis), 0) for axis in optics.axes]
     # a pixel shows the Sun if its centre lies within half a pixel of the disc
     half_pixel = 0.5 / float(view.intrinsics[0])
@@ -49,4 +49,5 @@ def truth(surface: Surface, view: View, sun: Sunlight, *, angles: bool = False) 
 
 def _angle_deg(a: Any, b: Any) -> Any:
     """Angle between unit vectors, exact near 0 and 180°, where an arccosine is not."""
-    return np.degrees(2.0) * dr.atan2(dr.norm(a - b), dr.norm(a + b))
+    # a plain float: a numpy scalar would make a float64 numpy array of it
+    return float(np.degrees(2.0)) * dr.atan2(dr.norm(a - b), dr.norm(a + b))

@@ -24,6 +24,9 @@ from .vehicle import Vehicle, World
 # unit, so eight of them clear the facet without visibly moving the shadow (1 mm at 1 km).
 _OFFSET = 8 * 2.0**-23
 
+# Of a normal that faces the viewer: half precision, as truth is stored, moves a cosine by up to √3 · 2⁻¹².
+_LEAST_COSINE = 2.0**-11
+
 
 class Surface:
     """A triangle mesh in L. `vertices_m` float32[n, 3], `faces` int32[m, 3], `flat` bool[m]: facets shaded with
@@ -115,6 +118,18 @@ class Hit:
             lift += corner.xyz * (weight * dr.maximum(corner.w - dr.dot(point, corner.xyz), 0))
         offset = _OFFSET * (dr.max(dr.abs(point)) + self.distance_m) + 1e-6
         return mi.Ray3f(mi.Point3f(point + lift + self.normal * offset), direction)
+
+
+def facing(normal: Any, view: Any) -> Any:
+    """Return unit normals that face the viewer: those given, or the nearest ones that a surface in view can have.
+
+    An interpolated normal, or one turned by fine relief, may point away from who sees its facet, which no visible
+    surface element does. It is turned within the plane of the two, no further than to the tangent plane of the line
+    of sight. `view`: unit vectors from the surface to the viewer.
+    """
+    cosine = dr.dot(normal, view)
+    turned = dr.normalize(dr.fma(view, _LEAST_COSINE - cosine, normal))
+    return dr.select(cosine < _LEAST_COSINE, turned, normal)
 
 
 def _with_a_fourth(three: NDArray[np.float32]) -> NDArray[np.float32]:
