@@ -46,7 +46,8 @@ TITLE = 'title = "t"\n'
 @pytest.mark.parametrize(
     ("text", "must_say"),
     [
-        ("", ["title", "missing"]),
+        ("", ["scene file is empty"]),
+        ("\n", ["title", "missing"]),
         ("[camera]\nfov_deg = 30", ["title", "missing"]),
         ("title = 3", ["title = 3", "string"]),
         # unknown keys, with a hint where one is close

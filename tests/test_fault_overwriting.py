@@ -76,7 +76,7 @@ def test_16_bit_and_stretching(tmp_path: Path) -> None:
 def test_bad_files_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"faults\.pixel_overwriting: texture_file is missing"):
         make("pixel_overwriting")
-    with pytest.raises(InputError, match=r"texture_file = '.*nowhere\.png': no such file"):
+    with pytest.raises(InputError, match=r"texture_file = '.*nowhere\.png': texture file not found"):
         make("pixel_overwriting", texture_file=str(tmp_path / "nowhere.png"))
     junk = tmp_path / "junk.png"
     junk.write_text("no image")

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from . import photometry, resources, spectra
-from .errors import InputError
+from .errors import InputError, shown
 
 Architecture = Literal["full_frame_ccd", "frame_transfer_ccd", "interline_ccd", "cmos"]
 Direction = Literal["up", "down", "left", "right"]
@@ -501,13 +501,17 @@ def load_scene(name_or_path: str | Path, overrides: Mapping[str, Any] | None = N
             or (key == "body.shape" and value not in _SHAPES)
             or (key == "spacecraft.model" and value not in _VEHICLES)
         ):
+            resources.check_path(value, key)
             value = str(Path(value).resolve())  # a path on the command line is taken from the working folder
         for parent in parents:
             node = node.setdefault(parent, {})
             if not isinstance(node, dict):
-                raise InputError(f"{path}: {key} = {value!r}: {parent} is a value, not a table")
+                raise InputError(f"{path}: {key} = {shown(value)}: {parent} is a value, not a table")
         node[leaf] = value
-    _anchor_paths(table, path.parent)
+    try:
+        _anchor_paths(table, path.parent)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
     return parse_scene(table, source=str(path), overrides=tuple(overrides or ()))
 
 
@@ -516,6 +520,7 @@ def parse_scene(table: Mapping[str, Any], *, source: str, overrides: Sequence[st
 
     `overrides`: dotted keys that did not come from `source` but were set in its place, to be named as such.
     """
+    resources.check_plain(table, source)
     try:
         # JSON mode: strict about types, yet arrays become tuples; TOML's dates suit no key, as lists they fail
         return SceneConfig.model_validate_json(json.dumps(table, default=lambda date: [str(date)]), strict=True)
@@ -532,29 +537,37 @@ def parse_scene(table: Mapping[str, Any], *, source: str, overrides: Sequence[st
 def _anchor_paths(table: dict[str, Any], folder: Path) -> None:
     """Relative paths are taken from the scene file's folder, or the working folder where nothing lies there."""
 
-    def anchored(path: str) -> str:
+    def anchored(path: str, where: str) -> str:
+        resources.check_path(path, where)
         beside = folder / path
-        return str((beside if beside.exists() else Path(path)).resolve())
+        try:
+            return str((Path(path) if resources.file_status(beside) is None else beside).resolve())
+        except (OSError, RuntimeError):  # links in a circle, a working folder that is gone
+            raise InputError(f"{where} = {shown(path)}: no such file") from None
 
-    def anchor(node: Any, key: str, built_in: tuple[str, ...] = ()) -> None:
+    def anchor(node: Any, where: str, built_in: tuple[str, ...] = ()) -> None:
+        key = where.rsplit(".", 1)[-1]
         if isinstance(node, dict) and isinstance(node.get(key), str) and node[key] not in ("", *built_in):
-            node[key] = anchored(node[key])
+            node[key] = anchored(node[key], where)
 
-    def anchor_file(node: Any, key: str = "lens") -> None:
+    def anchor_file(node: Any, where: str) -> None:
+        key = where.rsplit(".", 1)[-1]
         if isinstance(node, dict) and isinstance(node.get(key), str) and Path(node[key]).suffix:
-            anchor(node, key)  # without a suffix it is the name of a packaged one
+            anchor(node, where)  # without a suffix it is the name of a packaged one
 
-    anchor(table.get("body"), "shape", _SHAPES)
-    anchor(table.get("spacecraft"), "model", _VEHICLES)
-    anchor_file(table.get("camera"))
-    anchor_file(table.get("camera"), "detector")
+    anchor(table.get("body"), "body.shape", _SHAPES)
+    anchor(table.get("spacecraft"), "spacecraft.model", _VEHICLES)
+    anchor_file(table.get("camera"), "camera.lens")
+    anchor_file(table.get("camera"), "camera.detector")
     kernels = table.get("spice")
     if isinstance(kernels, dict) and isinstance(kernels.get("kernels"), list):
-        kernels["kernels"] = [anchored(k) if isinstance(k, str) and k else k for k in kernels["kernels"]]
+        kernels["kernels"] = [
+            anchored(k, "spice.kernels") if isinstance(k, str) and k else k for k in kernels["kernels"]
+        ]
     faults = table.get("faults")
-    for fault in faults.values() if isinstance(faults, dict) else ():
-        anchor(fault, "texture_file")
-        anchor_file(fault)
+    for name, fault in faults.items() if isinstance(faults, dict) else ():
+        anchor(fault, f"faults.{name}.texture_file")
+        anchor_file(fault, f"faults.{name}.lens")
 
 
 def _sentence(error: ValidationError) -> str:
@@ -576,11 +589,11 @@ def _sentence(error: ValidationError) -> str:
 
 
 def _dotted(keys: Sequence[int | str]) -> str:
-    return ".".join(k if str(k).isprintable() else repr(k) for k in map(str, keys))
+    return ".".join(map(resources.shown_path, map(str, keys)))
 
 
 def _shown(value: Any) -> str:
-    return "" if isinstance(value, dict | BaseModel) else f" = {value!r}"
+    return "" if isinstance(value, dict | BaseModel) else f" = {shown(value)}"
 
 
 def _wanted(schema: Mapping[str, Any], message: str) -> str:

@@ -1,42 +1,228 @@
-"""Where the packaged scenes and textures lie, and the first look at a file that a user names."""
+"""The one loader of every file that a user names, and where the packaged scenes and textures lie.
+
+A file is read once, by `read_input`, which refuses all that is no regular file of a reasonable size: nothing that
+a user names can block, or fill the memory, before the first byte is parsed. What has to be read by a library that
+takes only paths (SPICE's kernels) goes through `check_input`.
+"""
 
 from __future__ import annotations
 
+import hashlib
+import os
+import stat
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
-from .errors import InputError
+from .errors import InputError, shown
 
 _PACKAGE = Path(__file__).resolve().parent
 
+MIB = 1 << 20
+# Kind of file → the most bytes it may have: of a shape as text, some 12 million facets; of the others, ten times
+# what the largest files in use have.
+LIMIT_BYTES: dict[str, int] = {
+    "scene": 4 * MIB,
+    "lens": 4 * MIB,
+    "detector": 4 * MIB,
+    "shape": 1024 * MIB,
+    "spacecraft": 512 * MIB,
+    "texture": 256 * MIB,
+    "SPICE kernel": 64 << 30,
+}
+_DEEPEST_TABLE = 24
+_LONGEST_NAME_BYTES = 255
+_LONGEST_PATH_BYTES = 4095
+_READ_BYTES = 16 * MIB
 
-def input_file(path: Path, what: str, types: Sequence[str]) -> str:
-    """Suffix, in lower case, of a user's file of one of `types`; `what` names it in errors.
 
-    Raises InputError for a file that is missing, no file, of another type, or empty.
+def read_input(path: str | Path, what: str, *, types: Sequence[str] = (), limit_bytes: int | None = None) -> bytes:
+    """Return the bytes of a file that a user names, read once.
+
+    Parameters
+    ----------
+    path
+        Of a regular file; a link to one is followed.
+    what
+        Kind of file, which names it in errors and gives its limit: a key of `LIMIT_BYTES`.
+    types
+        Suffixes in lower case; where some are given, the file has one of them.
+    limit_bytes
+        Most bytes of the file; default: that of its kind.
+
+    Raises
+    ------
+    InputError
+        The file is missing, unreadable, empty or too large, no regular file (a folder, a device, a pipe) or of
+        another type.
     """
-    if not path.exists():
-        raise InputError(f"{path}: {what} file not found.")
-    if not path.is_file():
-        raise InputError(f"{path}: {what} is not a file.")
-    suffix = path.suffix.lower()
-    if suffix not in types:
-        raise InputError(f"{path}: unsupported {what} type {suffix!r}; allowed are {', '.join(types)}.")
-    if path.stat().st_size == 0:
-        raise InputError(f"{path}: {what} file is empty.")
-    return suffix
+    limit = LIMIT_BYTES[what] if limit_bytes is None else limit_bytes
+    with _opened(Path(path), what, types, limit) as file:
+        try:
+            data = file.read(limit + 1)  # one more than allowed: its size may have been a lie, or grown
+        except OSError as error:
+            raise InputError(f"{path}: {what} file cannot be read: {error.strerror}.") from None
+    if len(data) > limit:
+        raise _too_large(Path(path), what, len(data), limit)
+    return data
 
 
-def read_toml(path: Path) -> dict[str, Any]:
-    """A TOML file as plain data. Raises InputError."""
+def check_input(path: str | Path, what: str, *, types: Sequence[str] = ()) -> None:
+    """Check a file that a library will read by its path, as `read_input` does. Raises InputError."""
+    with _opened(Path(path), what, types, LIMIT_BYTES[what]):
+        pass
+
+
+def sha256(data: bytes) -> str:
+    """Return the SHA-256 (hex) of a file's bytes as `read_input` gave them."""
+    return hashlib.sha256(data).hexdigest()
+
+
+def sha256_of_input(path: str | Path, what: str) -> str:
+    """Return the SHA-256 (hex) of a file that is too large to be kept in memory. Raises InputError."""
+    digest = hashlib.sha256()
+    with _opened(Path(path), what, (), LIMIT_BYTES[what]) as file:
+        while data := file.read(_READ_BYTES):
+            digest.update(data)
+    return digest.hexdigest()
+
+
+def _opened(path: Path, what: str, types: Sequence[str], limit_bytes: int) -> BinaryIO:
+    """An open file that is regular, of one of `types` and neither empty nor too large."""
+    status = file_status(path)
+    if status is None:
+        raise InputError(f"{shown_path(path)}: {what} file not found.")
+    if not stat.S_ISREG(status.st_mode):  # before opening: to open a device may already act on it
+        raise InputError(f"{path}: {what} is not a file{_kind(status)}.")
+    if types and path.suffix.lower() not in types:
+        raise InputError(
+            f"{path}: unsupported {what} type {path.suffix.lower()!r}; allowed are {', '.join(types)}."
+        )
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: not a TOML file: {error}") from None
+        # Without waiting: the name may have become a pipe's in between.
+        flags = (
+            os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0) | getattr(os, "O_CLOEXEC", 0)
+        )
+        file = os.fdopen(os.open(path, flags), "rb")
     except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror}") from None
+        raise InputError(f"{path}: {what} file cannot be read: {error.strerror}.") from None
+    try:
+        status = os.fstat(file.fileno())
+        if not stat.S_ISREG(status.st_mode):
+            raise InputError(f"{path}: {what} is not a file{_kind(status)}.")
+        if status.st_size == 0:
+            raise InputError(f"{path}: {what} file is empty.")
+        if status.st_size > limit_bytes:
+            raise _too_large(path, what, status.st_size, limit_bytes)
+    except BaseException:
+        file.close()
+        raise
+    return file
+
+
+def _too_large(path: Path, what: str, size_bytes: int, limit_bytes: int) -> InputError:
+    return InputError(
+        f"{path}: {what} file has {size_bytes / MIB:.3g} MiB or more; at most {limit_bytes / MIB:g} MiB are read."
+    )
+
+
+def _kind(status: os.stat_result) -> str:
+    kinds = {
+        stat.S_IFDIR: "a folder",
+        stat.S_IFIFO: "a pipe",
+        stat.S_IFCHR: "a device",
+        stat.S_IFBLK: "a device",
+        stat.S_IFSOCK: "a socket",
+    }
+    kind = kinds.get(stat.S_IFMT(status.st_mode))
+    return f" but {kind}" if kind else ""
+
+
+def file_status(path: str | Path) -> os.stat_result | None:
+    """Return what the file system says of a path; None where it has nothing of that name, or could have nothing."""
+    try:
+        return os.stat(path)
+    except (OSError, ValueError):  # ValueError: a NUL, or characters that no file system takes
+        return None
+
+
+def check_path(path: str, where: str) -> None:
+    """Check that a path can be one. Raises InputError whose sentence begins with `where`, the key that names it."""
+    try:
+        name = os.fsencode(path)
+    except UnicodeEncodeError:
+        raise InputError(f"{where} = {shown(path)}: must be a path, without lone surrogates") from None
+    if b"\0" in name:
+        raise InputError(f"{where} = {shown(path)}: must be a path, without NUL characters")
+    longest = max(map(len, name.replace(os.sep.encode(), b"/").split(b"/")))
+    if longest > _LONGEST_NAME_BYTES or len(name) > _LONGEST_PATH_BYTES:
+        raise InputError(
+            f"{where} = {shown(path)}: must be a path of at most {_LONGEST_PATH_BYTES} bytes, and each of its names of "
+            f"at most {_LONGEST_NAME_BYTES}"
+        )
+
+
+def shown_path(path: str | Path) -> str:
+    """Return a path as an error sentence begins with it: as given, or shortened and quoted where it is long or
+    cannot be printed."""
+    text = str(path)
+    return text if len(text) <= 500 and text.isprintable() else shown(text)
+
+
+def read_toml(path: Path, what: str = "scene") -> dict[str, Any]:
+    """Return a TOML file as plain data; `what` is its kind. Raises InputError."""
+    data = read_input(path, what)
+    try:
+        return parse_toml(data.decode("utf-8-sig"), str(path))
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: not a TOML file: {error.reason} at byte {error.start}") from None
+
+
+def parse_toml(text: str, source: str) -> dict[str, Any]:
+    """Return a TOML text as plain data, nested at most 24 deep, its whole numbers of at most 64 bits.
+
+    Raises InputError in a sentence that begins with `source`; `tomllib.TOMLDecodeError` never leaves it.
+    """
+    try:
+        table = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise InputError(f"{source}: not a TOML file: {error}") from None
+    except RecursionError:
+        raise InputError(f"{source}: nested deeper than {_DEEPEST_TABLE} tables or lists") from None
+    except ValueError:  # Python's own limit on the digits of a number, dates that no calendar has
+        raise InputError(
+            f"{source}: not a TOML file: a number or date is out of range; whole numbers have at most 64 bits"
+        ) from None
+    check_plain(table, source)
+    return table
+
+
+def check_plain(table: Mapping[str, Any], source: str) -> None:
+    """Check that plain data are nested at most 24 deep and hold no whole number beyond 64 bits.
+
+    Raises InputError in a sentence that begins with `source`.
+    """
+    level: list[tuple[str, Any]] = [("", table)]
+    for _ in range(_DEEPEST_TABLE):
+        below: list[tuple[str, Any]] = []
+        for where, node in level:
+            items = node.items() if isinstance(node, Mapping) else enumerate(node)
+            for key, value in items:
+                if isinstance(value, Mapping | list | tuple):
+                    below.append((f"{where}{_key(key)}.", value))
+                elif isinstance(value, int) and not -(2**63) <= value < 2**64:
+                    at = f"{where}{_key(key)}"
+                    raise InputError(f"{source}: {at} = {shown(value)}: must be a whole number of at most 64 bits")
+        level = below
+        if not level:
+            return
+    where = level[0][0].rstrip(".")
+    raise InputError(f"{source}: {where}: nested deeper than {_DEEPEST_TABLE} tables or lists")
+
+
+def _key(key: object) -> str:
+    return str(key) if isinstance(key, int) else shown_path(str(key))
 
 
 def data_dir(kind: str) -> Path:
@@ -57,12 +243,14 @@ def packaged(kind: str) -> dict[str, Path]:
 def find(kind: str, name_or_path: str | Path) -> Path:
     """A path as given, or the packaged file of that name. Raises InputError listing the packaged names."""
     path = Path(name_or_path)
-    if path.suffix or path.exists():
-        if path.is_file():
+    what = kind.rsplit("/", 1)[-1]
+    check_path(str(name_or_path), what)
+    status = file_status(path)
+    if path.suffix or status:
+        if status and stat.S_ISREG(status.st_mode):
             return path
-        raise InputError(f"{path}: no such file{', but a folder' if path.is_dir() else ''}")
+        raise InputError(f"{shown_path(path)}: no such file{',' + _kind(status) if status else ''}")
     known = packaged(kind)
     if str(name_or_path) in known:
         return known[str(name_or_path)]
-    what = kind.rsplit("/", 1)[-1]
-    raise InputError(f"{name_or_path}: neither a file nor a packaged name; {what}: {', '.join(known)}")
+    raise InputError(f"{shown_path(name_or_path)}: neither a file nor a packaged name; {what}: {', '.join(known)}")

@@ -365,12 +365,13 @@ def load_spacecraft(
 
 
 def _read(path: Path) -> list[_Piece]:
-    suffix = resources.input_file(path, "spacecraft", FILE_TYPES)
+    data = resources.read_input(path, "spacecraft", types=FILE_TYPES)
+    suffix = path.suffix.lower()
     try:
         # numpy warns on NaN while the readers work; the check below reports it as an error
         with warnings.catch_warnings(), np.errstate(all="ignore"):
             warnings.simplefilter("ignore")
-            pieces = _read_obj(path) if suffix == ".obj" else _read_gltf(path)
+            pieces = _read_obj(data, path.stem) if suffix == ".obj" else _read_gltf(path)
     except Exception as error:  # the readers raise whatever their parsers raise
         kind, what = suffix[1:].upper(), type(error).__name__
         raise InputError(f"{path}: is unreadable as {kind} ({what} while parsing)") from None
@@ -387,14 +388,17 @@ _ORNAMENT = re.compile(r"^[ \t]*(?:mtllib|s|vt|vn)\b.*$", re.MULTILINE)
 _ORNAMENT_OF_A_CORNER = re.compile(r"(?<=\d)/[-\d/]*")
 
 
-def _read_obj(path: Path) -> list[_Piece]:
-    """trimesh keeps an OBJ's names only in part, so every stretch of faces gets a number for its name first."""
-    text = path.read_text(encoding="utf-8", errors="replace").replace("\\\n", " ")
+def _read_obj(data: bytes, stem: str) -> list[_Piece]:
+    """Return the pieces of an OBJ; faces outside of objects and groups are named `stem`.
+
+    trimesh keeps an OBJ's names only in part, so every stretch of faces gets a number for its name first.
+    """
+    text = data.decode("utf-8", errors="replace").replace("\r\n", "\n").replace("\\\n", " ")
     now = {"o": "", "g": "", "usemtl": ""}
     stretches: list[tuple[str, str]] = []
 
     def header() -> str:
-        name = "/".join(piece for piece in (now["o"], now["g"]) if piece) or path.stem
+        name = "/".join(piece for piece in (now["o"], now["g"]) if piece) or stem
         stretches.append((name, now["usemtl"]))
         return f"o {len(stretches) - 1}"
 

@@ -53,8 +53,8 @@ class RawShape:
     unit: Literal["km"] | None = None
 
 
-def read_shape(path: Path) -> RawShape:
-    """Read a file of one of `SUFFIXES`, whose content says which reader it needs.
+def read_shape(path: Path, data: bytes) -> RawShape:
+    """Return the mesh of a file of one of `SUFFIXES`, whose content `data` says which reader it needs.
 
     Raises
     ------
@@ -62,13 +62,11 @@ def read_shape(path: Path) -> RawShape:
         The file is of none of the formats, malformed, or a DSK and spiceypy is not installed.
     """
     source = str(path)
-    with path.open("rb") as file:
-        head = file.read(65536)
+    head = data[:65536]
     if head.startswith((b"DAS/DSK", b"NAIF/DAS")):
         return RawShape(*read_dsk(path), unit="km")
     if path.suffix.lower() == ".bds":
         raise InputError(f"{source}: line 1: expected the mark 'DAS/DSK' of a NAIF DSK, found {_shown(head)}.")
-    data = path.read_bytes()
     if b"\0" in data:
         raise InputError(f"{source}: line {_line(data, data.index(0))}: expected text, found binary data.")
     if re.match(rb"\s*#VRML", data) or path.suffix.lower() == ".wrl":

@@ -59,13 +59,14 @@ def load_shape(path: str | Path, unit: Unit = "auto") -> tuple[Float64, Int32]:
     path = Path(path)
     if unit not in ("auto", "m", "km"):
         raise InputError(f"{path}: unit must be one of auto, m, km; got {unit!r}.")
-    suffix = resources.input_file(path, "shape", FILE_TYPES)
+    data = resources.read_input(path, "shape", types=FILE_TYPES)
+    suffix = path.suffix.lower()
     native: Unit | None = None
     if suffix in formats.SUFFIXES:
-        raw = formats.read_shape(path)
+        raw = formats.read_shape(path, data)
         vertices, faces, native = raw.vertices, raw.faces, raw.unit
     else:
-        vertices, faces = _read_with_trimesh(path)
+        vertices, faces = _read_with_trimesh(path, data)
     _check_arrays(vertices, faces, str(path))
     if unit == "auto":
         extent = float(np.ptp(vertices, axis=0).max())
@@ -77,7 +78,7 @@ def load_shape(path: str | Path, unit: Unit = "auto") -> tuple[Float64, Int32]:
     return check_mesh(vertices, faces, str(path))
 
 
-def _read_with_trimesh(path: Path) -> tuple[Float64, NDArray[np.int64]]:
+def _read_with_trimesh(path: Path, data: bytes) -> tuple[Float64, NDArray[np.int64]]:
     try:
         # numpy warns on NaN while the readers normalise; the check below reports it as an error.
         with warnings.catch_warnings(), np.errstate(all="ignore"):

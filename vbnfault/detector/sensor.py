@@ -135,7 +135,7 @@ class Sensor:
 def load_sensor(name_or_path: str | Path) -> Sensor:
     """A sensor by path or packaged name. Raises InputError naming file, key, value and allowed range."""
     path = resources.find("scenes/detectors", name_or_path)
-    table = resources.read_toml(path)
+    table = resources.read_toml(path, "detector")
     for key in _REQUIRED:
         *parents, leaf = key.split(".")
         node: Any = table

@@ -16,19 +16,22 @@ above 0 (add), below 255 (multiply) or any (replace, mixture).
 
 from __future__ import annotations
 
-import hashlib
+import struct
 from dataclasses import dataclass
 from functools import lru_cache
-from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import InputError
+from .. import resources
+from ..errors import InputError, shown
 from ..quantities import CHANNELS, LUMINANCE
 from .base import Fault, FaultContext, Params, choice, number, scale_by_intensity, text
+
+# A decoded texture takes 32 bytes a pixel or more on its way: 24 megapixel, as of a photograph, take 0.8 GB.
+LARGEST_TEXTURE_PIXELS = 25_000_000
 
 BLENDS = ("replace", "add", "multiply", "mixture")
 
@@ -49,8 +52,6 @@ class TextureOverwriting(Fault):
     def validate(self) -> None:
         if not self.texture_file:
             raise ValueError("texture_file is missing: name a PNG or TIFF texture")
-        if not Path(self.texture_file).is_file():
-            raise ValueError(f"texture_file = {self.texture_file!r}: no such file")
         try:
             load(self.texture_file)
         except InputError as error:
@@ -61,12 +62,9 @@ class TextureOverwriting(Fault):
 
     def draw(self, context: FaultContext, rng: np.random.Generator) -> Params:
         """Nothing is random: the settings, and the SHA-256 of the texture file."""
-        path = Path(self.texture_file)
-        if not path.is_file():
-            raise InputError(f"faults.{self.fault}.texture_file = {self.texture_file!r}: no such file")
         return {
             "texture_file": self.texture_file,
-            "sha256": hashlib.sha256(path.read_bytes()).hexdigest(),
+            "sha256": resources.sha256(resources.read_input(self.texture_file, "texture")),
             "channels": self.channels,
             "blend": self.blend,
             "strength": float(self.strength),
@@ -142,14 +140,22 @@ def load(path: str, sha256: str | None = None) -> tuple[NDArray[np.float32], NDA
 
     Raises InputError where it is missing, is no such image, or its content is not that of `sha256`.
     """
-    where = f"faults.pixel_overwriting.texture_file = {path!r}"
+    where = f"faults.pixel_overwriting.texture_file = {shown(path)}"
     try:
-        data = Path(path).read_bytes()
-    except OSError as error:
-        raise InputError(f"{where}: cannot be read ({error.strerror})") from None
-    if sha256 and hashlib.sha256(data).hexdigest() != sha256:
+        data = resources.read_input(path, "texture")
+    except InputError as error:
+        raise InputError(f"{where}: {str(error).removeprefix(f'{path}: ')}") from None
+    if sha256 and resources.sha256(data) != sha256:
         raise InputError(f"{where}: its content has changed since the parameters were drawn")
-    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if data else None
+    width_px, height_px = _size_px(data)
+    if width_px * height_px > LARGEST_TEXTURE_PIXELS:  # before it is unpacked: a small file can hold a vast image
+        raise InputError(
+            f"{where}: has {width_px} × {height_px} pixels; must have at most {LARGEST_TEXTURE_PIXELS} in all"
+        )
+    try:
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if width_px else None
+    except cv2.error:  # more than OpenCV takes
+        image = None
     if image is None or image.dtype not in (np.uint8, np.uint16):
         raise InputError(f"{where}: must be a PNG or TIFF image of 8 or 16 bits")
     full = 255 if image.dtype == np.uint8 else 65535
@@ -160,3 +166,24 @@ def load(path: str, sha256: str | None = None) -> tuple[NDArray[np.float32], NDA
     rgb = plain[..., 2::-1] if plain.shape[2] >= 3 else np.repeat(plain[..., :1], 3, axis=2)
     intensity = rgb @ LUMINANCE if plain.shape[2] >= 3 else plain[..., 0]
     return np.concatenate([rgb, intensity[..., None]], axis=2) * np.float32(255), alpha
+
+
+def _size_px(data: bytes) -> tuple[int, int]:
+    """Width and height that the header of a PNG or TIFF file states; (0, 0) where it is neither."""
+    if data[:8] == b"\x89PNG\r\n\x1a\n" and len(data) >= 24:
+        width_px, height_px = struct.unpack(">II", data[16:24])
+        return width_px, height_px
+    if data[:4] not in (b"II*\0", b"MM\0*"):
+        return 0, 0
+    order = "<" if data[:1] == b"I" else ">"
+    try:
+        (start,) = struct.unpack_from(f"{order}I", data, 4)
+        (count,) = struct.unpack_from(f"{order}H", data, start)
+        sides: dict[int, int] = {}
+        for k in range(count):
+            tag, kind, _ = struct.unpack_from(f"{order}HHI", data, start + 2 + 12 * k)
+            (value,) = struct.unpack_from(f"{order}{'H' if kind == 3 else 'I'}", data, start + 10 + 12 * k)
+            sides[tag] = value
+    except struct.error:  # cut short
+        return 0, 0
+    return sides.get(256, 0), sides.get(257, 0)

@@ -180,7 +180,7 @@ class Prescription:
 def load_lens(name_or_path: str | Path) -> Prescription:
     """A prescription by path or packaged name. Raises InputError naming file, surface and value."""
     path = resources.find("scenes/lenses", name_or_path)
-    return parse_lens(resources.read_toml(path), source=str(path))
+    return parse_lens(resources.read_toml(path, "lens"), source=str(path))
 
 
 def parse_lens(table: Mapping[str, Any], *, source: str) -> Prescription:
