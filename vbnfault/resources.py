@@ -158,8 +158,8 @@ def check_path(path: str, where: str) -> None:
     longest = max(map(len, name.replace(os.sep.encode(), b"/").split(b"/")))
     if longest > _LONGEST_NAME_BYTES or len(name) > _LONGEST_PATH_BYTES:
         raise InputError(
-            f"{where} = {shown(path)}: must be a path of at most {_LONGEST_PATH_BYTES} bytes, and each of its names of "
-            f"at most {_LONGEST_NAME_BYTES}"
+            f"{where} = {shown(path)}: must be a path of at most {_LONGEST_PATH_BYTES} bytes and each of its "
+            f"names of at most {_LONGEST_NAME_BYTES}"
         )
 
 
