@@ -73,7 +73,19 @@ def test_a_build_is_whole_and_labelled(
     built: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert run(monkeypatch, "verify", built) == 0
-    assert "16 samples, whole, labelled and as planned" in capsys.readouterr().out
+    said = capsys.readouterr()
+    assert "16 samples, whole, labelled and as planned" in said.out
+    assert said.err.startswith("samples\n")  # without a terminal a line, no bar
+    # the counts are those of the arrays, not those of the plan
+    opened = store.open_store(built)
+    injected = opened.read("injected")
+    rows = {line.split()[0]: line.split() for line in said.out.splitlines() if line}
+    for k, fault in enumerate(opened.spec.faults):
+        assert int(rows[fault][2]) == injected[:, k].sum()
+    assert run(monkeypatch, "digest", built) == 0
+    digest = capsys.readouterr().out.strip()
+    assert digest == store.digest(built)
+    assert f"digest {digest}" in said.out
 
 
 def test_xarray_shows_labelled_axes(built: Path) -> None:

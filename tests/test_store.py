@@ -20,7 +20,7 @@ from vbnfault.config import parse_scene
 from vbnfault.errors import InputError, VbnfaultError
 from vbnfault.plan import make_plan
 from vbnfault.quantities import Sample
-from vbnfault.store import codec, group, metadata
+from vbnfault.store import check, codec, group, metadata
 
 FAULTS = ("dust_on_optics", "broken_pixels", "straylight", "vignetting")
 LOCALISED = FAULTS[:3]
@@ -62,7 +62,7 @@ def fake_sample(spec: st.StoreSpec, index: int, site: int | None = None) -> Samp
         "image": image,
         "clean": clean,
         "mask": mask,
-        "without_straylight": clean,
+        "without_straylight": clean if dict(zip(spec.faults, injected, strict=True)).get("straylight") else image,
         "mask_effect": mask,
         "raw": rng.integers(0, 4096, (h, w), dtype=np.uint16),
         "depth_m": np.where(y > 0.4, 100 / (y + 0.1), np.inf).astype(np.float32),
@@ -390,6 +390,73 @@ def test_labels_that_contradict_each_other_are_found(whole: st.Store) -> None:
     assert relabelled(whole, 1) == []
 
 
+def test_pictures_and_effects_that_contradict_the_labels_are_found(whole: st.Store) -> None:
+    """`injected` is what the pixels hold: a picture or an effect that says otherwise is a problem."""
+    sample = next(s for i in range(10) if not (s := fake_sample(whole.spec, i)).scalars["injected"][2])
+    i, off = sample.index, sample.scalars["injected"].argmin()
+    on = sample.scalars["injected"].argmax()
+    wrong = sample.layers["without_straylight"].copy()
+    wrong[2, 3, 1] ^= 1
+    (sentence,) = relabelled(whole, i, without_straylight=wrong)
+    assert sentence == f"sample {i}: without_straylight differs from image, although straylight is not injected"
+    effect = sample.layers["mask_effect"].copy()
+    effect[off, 3, 3] = True
+    (sentence,) = relabelled(whole, i, mask_effect=effect)
+    assert sentence == f"sample {i}: mask_effect of {FAULTS[off]} is not empty, although it is not injected"
+    effect = sample.layers["mask_effect"].copy()
+    effect[on] = False
+    (sentence,) = relabelled(whole, i, mask_effect=effect)
+    assert sentence == f"sample {i}: mask_effect of {FAULTS[on]} is empty, although it is injected"
+    none = {name: np.zeros_like(sample.layers[name]) for name in ("mask", "mask_effect")}
+    nothing = {**none, "injected": np.zeros(4, bool), "parameters": {}, "without_straylight": wrong, "image": wrong}
+    (sentence,) = relabelled(whole, i, **nothing, clean=sample.layers["image"])
+    assert sentence == f"sample {i}: image differs from clean, although no fault is injected"
+    assert relabelled(whole, i, **nothing, clean=wrong) == []
+
+
+def test_one_pass_gives_problems_digest_and_counts(whole: st.Store, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each chunk is decompressed once, for checksums, labels and digest together."""
+    decoded: list[int] = []
+    decompress = check.decompress
+    monkeypatch.setattr(check, "decompress", lambda data: (decoded.append(1), decompress(data))[1])
+    commanded = np.array([fake_sample(whole.spec, i).scalars["injected"] for i in range(10)])
+    realised = commanded.sum(axis=0)
+    i, off = (int(n[0]) for n in np.nonzero(~commanded))
+    commanded[i, off] = True
+    told: list[int] = []
+    report = st.examine(whole, expected=lambda i: {"injected": commanded[i]}, progress=told.append)
+    assert len(decoded) == 10 * len(whole.spec.pixel_layers)
+    assert told == [4, 4, 2]
+    assert report.problems == []
+    assert report.digest == st.digest(whole)
+    assert [report.counts.realised(f) for f in FAULTS] == realised.tolist()
+    assert [report.counts.planned(f) for f in FAULTS] == commanded.sum(axis=0).tolist()
+    assert report.counts.missing == {FAULTS[off]: 1}
+    # sites of three samples take the splits in turn
+    splits = [("train", "val", "test")[i // 3 % 3] for i in range(10)]
+    assert report.counts.samples == {s: splits.count(s) for s in splits}
+    for split in report.counts.samples:
+        rows = [k for k, s in enumerate(splits) if s == split]
+        for k, fault in enumerate(FAULTS):
+            assert report.counts.planned(fault, split) == commanded[rows, k].sum()
+    row = next(line for line in report.counts.lines() if line.startswith(FAULTS[off]))
+    here = commanded[[k for k, s in enumerate(splits) if s == splits[i]], off].sum()
+    assert f"{here - 1} of {here}" in row
+    (sentence,) = st.verify(whole, expected=lambda i: {"injected": commanded[i]}, exact=True)
+    assert sentence == f"sample {i}: {FAULTS[off]} is not injected, although the plan commands it"
+
+
+def test_an_unfinished_or_damaged_store_has_no_digest_in_its_report(whole: st.Store) -> None:
+    want = st.digest(whole)
+    added = st.append_samples(whole, 1)
+    assert st.examine(added).digest is None
+    assert st.digest(added) != want  # of what is there
+    flip(added.file("image", 1), 20)
+    assert st.examine(added).digest is None
+    with pytest.raises(VbnfaultError, match=r"sample \d+: image .*; the build command mends it"):
+        st.digest(added)
+
+
 def test_verify_compares_with_the_plan(whole: st.Store) -> None:
     def plan(i: int) -> dict:
         scalars = fake_sample(whole.spec, i).scalars
@@ -411,7 +478,7 @@ def test_a_fault_that_was_not_commanded_is_found(whole: st.Store) -> None:
     off = int(np.flatnonzero(~commanded[1])[0])
     injected, mask = commanded[1].copy(), sample.layers["mask"].copy()
     injected[off] = mask[off, 3, 3] = True
-    changes = {"injected": injected, "mask": mask, "mask_any": mask[:3].any(0)}
+    changes = {"injected": injected, "mask": mask, "mask_effect": mask, "mask_any": mask[:3].any(0)}
     parameters = {**sample.scalars["parameters"], FAULTS[off]: {"amplitude": 0.1}}
     assert relabelled(whole, 1, **changes, parameters=parameters) == []
     (sentence,) = st.verify(whole, expected=lambda i: {"injected": commanded[i]})

@@ -140,14 +140,37 @@ def verify(store: StoreArgument) -> None:
     from . import store as stores
 
     opened = stores.open_store(store)
-    expected = dataset.planned(opened.spec.attributes, opened.spec.faults)
-    problems = stores.verify(opened, expected=expected)
-    for problem in problems:
+    attributes = opened.spec.attributes
+    with typer.progressbar(length=opened.samples, label="samples", file=sys.stderr) as bar:
+        report = stores.examine(
+            opened,
+            expected=dataset.planned(attributes, opened.spec.faults),
+            exact=dataset.is_exact(attributes),
+            progress=bar.update,
+        )
+    for problem in report.problems:
         typer.echo(f"{store}: {problem}", err=True)
-    if problems:
-        typer.echo(f"vbnfault: {store}: {len(problems)} problems; the build command mends them", err=True)
+    for line in report.counts.lines():
+        typer.echo(line)
+    if report.problems:
+        many = f"{len(report.problems)} problems" if len(report.problems) > 1 else "1 problem"
+        typer.echo(f"vbnfault: {store}: {many}; the build command mends them", err=True)
         raise typer.Exit(1)
+    if report.counts.missing:
+        few = ", ".join(f"{name} {count}" for name, count in report.counts.missing.items())
+        typer.echo(f"planned, but without effect and not injected: {few}")
     typer.echo(f"{store}: {opened.samples} samples, whole, labelled and as planned")
+    typer.echo(f"digest {report.digest}")
+
+
+@app.command()
+def digest(store: StoreArgument) -> None:
+    """Print the digest of a store's decoded arrays: equal for equal datasets, however they were built."""
+    from . import store as stores
+
+    opened = stores.open_store(store)
+    with typer.progressbar(length=opened.samples, label="samples", file=sys.stderr) as bar:
+        typer.echo(stores.digest(opened, progress=bar.update))
 
 
 @app.command()

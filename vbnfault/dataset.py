@@ -173,6 +173,11 @@ def _detector(detector: Detector | MosaicDetector) -> dict[str, Any]:
     }
 
 
+def is_exact(attributes: Mapping[str, Any]) -> bool:
+    """Return whether the plan of a stored scene is met exactly: every commanded fault is injected."""
+    return bool(attributes["scene"].get("plan", {}).get("on_invisible") == "redraw_view")
+
+
 def planned(attributes: Mapping[str, Any], faults: Sequence[str]) -> Callable[[int], dict[str, Any]]:
     """What the plan of a stored scene says of a sample: the scalars that rendering cannot change, and the
     commanded faults as `injected`."""

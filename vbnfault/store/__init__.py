@@ -13,8 +13,19 @@ The only importer of zarr. How a store survives what happens to it:
   exactly the samples concerned are rebuilt.
 """
 
-from .check import Problem, check_shard, digest, problem_samples, verify
+from .check import (
+    Problem,
+    Report,
+    SampleDigests,
+    check_shard,
+    digest,
+    examine,
+    examine_shard,
+    problem_samples,
+    verify,
+)
 from .codec import Encoded, encode, mask_union
+from .counts import FaultCounts, split_name
 from .group import Store, create, is_store, open_store, write_samples
 from .metadata import append_samples, recover
 from .schema import (
@@ -42,8 +53,11 @@ __all__ = [
     "VOLATILE_ATTRIBUTES",
     "Array",
     "Encoded",
+    "FaultCounts",
     "Member",
     "Problem",
+    "Report",
+    "SampleDigests",
     "Store",
     "StoreSpec",
     "append_samples",
@@ -51,11 +65,14 @@ __all__ = [
     "create",
     "digest",
     "encode",
+    "examine",
+    "examine_shard",
     "is_store",
     "mask_union",
     "open_store",
     "problem_samples",
     "recover",
+    "split_name",
     "verify",
     "write_samples",
 ]

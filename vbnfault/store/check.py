@@ -13,21 +13,42 @@ import google_crc32c
 import numpy as np
 from numpy.typing import NDArray
 
-from .codec import crc_of_scalars, decompress, mask_union, threads
+from ..errors import VbnfaultError
+from .codec import DIGEST_BYTES, crc_of_scalars, decompress, mask_union, sample_digest, threads
+from .counts import FaultCounts, split_name
 from .group import Store, open_store
 from .metadata import metadata_problems, short
 from .schema import SCALARS, VOLATILE_ATTRIBUTES, StoreSpec
 
 
 class Problem(NamedTuple):
-    """What is wrong with some samples, in one sentence."""
+    """What is wrong with some samples, in one sentence. `unfinished`: they were not made yet, no more."""
 
     samples: tuple[int, ...]
     sentence: str
+    unfinished: bool = False
+
+
+class ShardCheck(NamedTuple):
+    """What was read of a shard: its problems; of sound samples the scalars, the digest of each (`sample_digest`),
+    and what contradicts in their labels, where that was asked for."""
+
+    problems: list[Problem]
+    scalars: dict[int, dict[str, Any]]
+    digests: dict[int, bytes]
+    contradictions: dict[int, list[str]]
 
 
 def check_shard(store: Store, number: int) -> list[Problem]:
     """What is unfinished, missing or damaged in one shard; every finished layer is decoded and compared."""
+    return examine_shard(store, number).problems
+
+
+def examine_shard(store: Store, number: int, *, labels: bool = False) -> ShardCheck:
+    """Read one shard once: decode every finished layer, compare it with its checksum, take its digest.
+
+    With `labels` the samples' labels are compared with their pixels as well.
+    """
     samples = store.shard(number)
     columns: dict[str, NDArray[Any]] = {}
     unreadable = {}
@@ -40,56 +61,93 @@ def check_shard(store: Store, number: int) -> list[Problem]:
         except (OSError, ValueError):
             unreadable[name] = f"cannot be decoded, {where} is damaged"
         if name == "done" and unreadable and store.file("image", number).exists():
-            return [Problem(tuple(samples), f"done of samples {_spans(samples)}: {unreadable[name]}")]
+            problem = Problem(tuple(samples), f"done of samples {_spans(samples)}: {unreadable[name]}")
+            return ShardCheck([problem], {}, {}, {})
         if name == "done" and unreadable:
             break
     finished = [i for i in samples if "done" in columns and columns["done"][i - samples.start]]
     missing = tuple(i for i in samples if i not in finished)
-    problems = [Problem(missing, f"samples {_spans(missing)}: not finished")] if missing else []
+    problems = [Problem(missing, f"samples {_spans(missing)}: not finished", True)] if missing else []
     if not finished:
-        return problems
+        return ShardCheck(problems, {}, {}, {})
     many = f"of samples {_spans(finished)}"
     problems += [Problem(tuple(finished), f"{name} {many}: {why}") for name, why in unreadable.items()]
     if "crc32c" not in columns:
-        return problems
+        return ShardCheck(problems, {}, {}, {})
+    scalars: dict[int, dict[str, Any]] = {}
     if not unreadable:
+        scalars = {i: {name: columns[name][i - samples.start] for name in SCALARS} for i in finished}
         for i in finished:
-            k = i - samples.start
-            if crc_of_scalars({n: columns[n][k] for n in SCALARS}) != columns["crc32c"][k, -1]:
+            if crc_of_scalars(scalars[i]) != columns["crc32c"][i - samples.start, -1]:
                 problems.append(Problem((i,), f"sample {i}: its scalars do not match their crc32c"))
 
+    chunks, lost = _chunks(store, number, finished)
     crcs = {i: columns["crc32c"][i - samples.start] for i in finished}
+    broken = {i for problem in problems + lost for i in problem.samples}
+
+    def look(i: int) -> tuple[list[tuple[int, Problem]], bytes, list[str]]:
+        found, layers = _layers(store, number, i, chunks, crcs[i])
+        if found or i in broken:
+            return found, b"", []
+        says = list(_check_labels(store.spec, i, scalars[i], layers, crcs[i])) if labels else []
+        hashes = {name: hashlib.sha256(data).digest() for name, data in layers.items()}
+        return [], sample_digest(hashes, scalars[i]), says
+
     with ThreadPoolExecutor(threads()) as pool:
-        for found in pool.map(lambda name: _check_layer(store, name, number, crcs), store.spec.pixel_layers):
-            problems += found
-    return problems
+        looked = dict(zip(finished, pool.map(look, finished), strict=True))
+    problems += lost
+    # by array, then by sample
+    of_layers = [(k, problem) for found, _, _ in looked.values() for k, problem in found]
+    problems += [problem for _, problem in sorted(of_layers, key=lambda entry: (entry[0], entry[1].samples))]
+    sound = [i for i, (_, leaf, _) in looked.items() if leaf]
+    return ShardCheck(
+        problems=problems,
+        scalars={i: scalars[i] for i in sound},
+        digests={i: looked[i][1] for i in sound},
+        contradictions={i: looked[i][2] for i in sound},
+    )
 
 
-def _check_layer(store: Store, name: str, number: int, crcs: Mapping[int, NDArray[np.uint32]]) -> list[Problem]:
-    if store.spec.empty(name):
-        return []
-    file, column = store.file(name, number), store.spec.checked.index(name)
-    where, many = file.relative_to(store.path), f"{name} of samples {_spans(crcs)}"
-    try:
-        chunks = store.chunk(name, number)
-    except FileNotFoundError:
-        return [Problem(tuple(crcs), f"{many}: the shard file {where} is missing")]
-    except (OSError, ValueError) as error:
-        return [Problem(tuple(crcs), f"{many}: the shard file {where} is damaged: {error}")]
+def _chunks(store: Store, number: int, finished: list[int]) -> tuple[dict[str, dict[int, bytes]], list[Problem]]:
+    """Layer → sample → compressed chunk of a shard, and which files cannot be read."""
+    chunks: dict[str, dict[int, bytes]] = {}
     problems = []
-    for i, stored in crcs.items():
-        wrong = ""
-        if i not in chunks:
+    for name in store.spec.pixel_layers:
+        if store.spec.empty(name):
+            continue
+        where, many = store.file(name, number).relative_to(store.path), f"{name} of samples {_spans(finished)}"
+        try:
+            chunks[name] = store.chunk(name, number)
+        except FileNotFoundError:
+            problems.append(Problem(tuple(finished), f"{many}: the shard file {where} is missing"))
+        except (OSError, ValueError) as error:
+            problems.append(Problem(tuple(finished), f"{many}: the shard file {where} is damaged: {error}"))
+    return chunks, problems
+
+
+def _layers(
+    store: Store, number: int, i: int, chunks: Mapping[str, Mapping[int, bytes]], crcs: NDArray[np.uint32]
+) -> tuple[list[tuple[int, Problem]], dict[str, bytes]]:
+    """The decoded layers of a sample, and what is wrong with them, with the place of the layer among its like."""
+    problems, layers = [], {}
+    for k, name in enumerate(store.spec.pixel_layers):
+        if store.spec.empty(name):
+            layers[name] = b""
+        if name not in chunks:
+            continue
+        where, wrong = store.file(name, number).relative_to(store.path), ""
+        if i not in chunks[name]:
             wrong = f"has no chunk in {where}"
         else:
             try:
-                if google_crc32c.value(decompress(chunks[i])) != stored[column]:
+                layers[name] = decompress(chunks[name][i])
+                if google_crc32c.value(layers[name]) != crcs[k]:
                     wrong = f"in {where} does not match its stored crc32c"
             except ValueError:
                 wrong = f"cannot be decoded, its chunk in {where} is damaged"
         if wrong:
-            problems.append(Problem((i,), f"sample {i}: {name} {wrong}"))
-    return problems
+            problems.append((k, Problem((i,), f"sample {i}: {name} {wrong}")))
+    return problems, layers
 
 
 def _spans(indices: Iterable[int]) -> str:
@@ -109,57 +167,81 @@ def problem_samples(store: str | os.PathLike[str] | Store) -> list[int]:
     return sorted({i for n in range(store.shards) for p in check_shard(store, n) for i in p.samples})
 
 
+class Report(NamedTuple):
+    """What `examine` found: problems, one sentence each; the digest, None where a sample is missing or damaged;
+    and how often each fault class is planned and in the pixels."""
+
+    problems: list[str]
+    digest: str | None
+    counts: FaultCounts
+
+
 def verify(
     path: str | os.PathLike[str] | Store,
     *,
     expected: Callable[[int], Mapping[str, Any]] | None = None,
+    exact: bool = False,
     progress: Callable[[int], None] | None = None,
 ) -> list[str]:
-    """Every problem of a store, one sentence each that names the array, the sample and the file.
+    """Return the problems that `examine` finds."""
+    return examine(path, expected=expected, exact=exact, progress=progress).problems
+
+
+def examine(
+    path: str | os.PathLike[str] | Store,
+    *,
+    expected: Callable[[int], Mapping[str, Any]] | None = None,
+    exact: bool = False,
+    progress: Callable[[int], None] | None = None,
+) -> Report:
+    """Read a store once and return every problem, its digest and its counts of faults.
 
     Checks that every array is there with its layout, attributes and coordinates, and as the consolidated
     metadata say; where an array of samples is not, samples are not looked at. Checks that each sample is whole
-    (`check_shard`) and labelled: masks, `injected` and `parameters` agree, a site lies in one split.
-    `expected(sample)` gives the scalars as planned, compared exactly, except for `injected`: there it gives the
-    commanded faults, of which some may have had no effect. `progress` is called with the number of samples just
-    checked. Raises InputError where there is no store.
+    (`check_shard`) and labelled: masks, `injected`, `parameters` and pictures agree, a site lies in one split.
+
+    Parameters
+    ----------
+    expected
+        Gives the scalars of a sample as planned, compared exactly, except for `injected`: there it gives the
+        commanded faults.
+    exact
+        Whether a commanded fault that is not injected is a problem; no other may be injected in either case.
+    progress
+        Is called with the number of samples just checked.
+
+    Raises
+    ------
+    InputError
+        Where there is no store.
     """
     store = open_store(path)
+    counts = FaultCounts(store.spec.faults)
     problems, hopeless = metadata_problems(store)
     if hopeless:
-        return problems
+        return Report(problems, None, counts)
+    digests = SampleDigests(store.samples)
     split_of: dict[int, tuple[int, int]] = {}
     for number in range(store.shards):
-        damage = check_shard(store, number)
-        problems += [p.sentence for p in damage]
-        broken = {i for p in damage for i in p.samples}
-        sound = [i for i in store.shard(number) if i not in broken]
-        if sound:
-            start = store.shard(number).start
-            columns = {name: store.column(name, number) for name in SCALARS}
-            masks = {name: store.chunk(name, number) for name in ("mask", "mask_any")}
-            for i in sound:
-                scalars = {name: column[i - start] for name, column in columns.items()}
-                layers = {name: _decode(store.spec, name, chunks[i]) for name, chunks in masks.items()}
-                problems += _check_labels(store.spec, i, scalars, layers)
-                problems += _check_split(store, i, scalars, split_of)
-                problems += _check_plan(store.spec, i, scalars, expected(i) if expected else {})
+        found = examine_shard(store, number, labels=True)
+        problems += [p.sentence for p in found.problems]
+        digests.add(found.digests)
+        for i, scalars in found.scalars.items():
+            planned = expected(i) if expected else {}
+            problems += found.contradictions[i]
+            problems += _check_split(store, i, scalars, split_of)
+            problems += _check_plan(store.spec, i, scalars, planned, exact)
+            counts.add(split_name(scalars["split"]), planned.get("injected"), scalars["injected"])
         if progress:
             progress(len(store.shard(number)))
-    return problems
-
-
-def _decode(spec: StoreSpec, name: str, chunk: bytes) -> NDArray[Any]:
-    row = spec.pixel_layers[name]
-    if spec.empty(name):
-        return np.zeros(spec.shape(row), dtype=row.dtype)
-    return np.frombuffer(decompress(chunk), dtype=row.dtype).reshape(spec.shape(row))
+    return Report(problems, digests.of(store) if digests.complete else None, counts)
 
 
 def _check_labels(
-    spec: StoreSpec, i: int, scalars: Mapping[str, Any], layers: Mapping[str, NDArray[Any]]
+    spec: StoreSpec, i: int, scalars: Mapping[str, Any], layers: Mapping[str, bytes], crcs: NDArray[np.uint32]
 ) -> Iterator[str]:
-    injected, mask = scalars["injected"], layers["mask"]
+    """What a sample's labels say that its pixels, or its other labels, do not."""
+    injected = scalars["injected"]
     parameters = json.loads(str(scalars["parameters"]) or "{}")
     for fault, is_in in zip(spec.faults, injected.tolist(), strict=True):
         drawn = parameters.get(fault)
@@ -167,13 +249,45 @@ def _check_labels(
         if listed != is_in:
             says = "has no parameters, although" if is_in else "has parameters, although not"
             yield f"sample {i}: {fault} {says} marked in injected"
-    for k, fault in enumerate(spec.faults):
-        if not injected[k] and mask[k].any():
-            yield f"sample {i}: mask of {fault} is not empty, although it is not injected"
-        if injected[k] and fault in (spec.localised_faults or ()) and not mask[k].any():
-            yield f"sample {i}: mask of {fault} is empty, although it is injected"
-    if not np.array_equal(layers["mask_any"], mask_union(spec, mask)):
+    mask = _array(spec, "mask", layers)
+    yield from _check_masks(i, spec.faults, "mask", mask, injected, spec.localised_faults or ())
+    if "mask_effect" in layers:
+        # an injected fault is one that changes the noise-free picture somewhere
+        effect = _array(spec, "mask_effect", layers)
+        yield from _check_masks(i, spec.faults, "mask_effect", effect, injected, spec.faults)
+    if not np.array_equal(_array(spec, "mask_any", layers), mask_union(spec, mask)):
         yield f"sample {i}: mask_any is not the union of the masks of {', '.join(spec.mask_any_faults)}"
+    # equal checksums stand for equal pictures: both have just been compared with their pixels
+    crc = dict(zip(spec.pixel_layers, crcs.tolist(), strict=False))
+    if not injected.any() and crc["image"] != crc["clean"]:
+        yield f"sample {i}: image differs from clean, although no fault is injected"
+    for name in layers:
+        fault = name.removeprefix("without_")
+        if fault != name and not injected[spec.faults.index(fault)] and crc[name] != crc["image"]:
+            yield f"sample {i}: {name} differs from image, although {fault} is not injected"
+
+
+def _check_masks(
+    i: int,
+    faults: Iterable[str],
+    name: str,
+    masks: NDArray[np.bool_],
+    injected: Iterable[bool],
+    seen: Iterable[str],
+) -> Iterator[str]:
+    """Which masks claim a fault that is not injected, or do not show one that is and must be `seen`."""
+    seen = set(seen)
+    for fault, mask, is_in in zip(faults, masks, injected, strict=True):
+        marks = bool(mask.any())
+        if marks and not is_in:
+            yield f"sample {i}: {name} of {fault} is not empty, although it is not injected"
+        if is_in and not marks and fault in seen:
+            yield f"sample {i}: {name} of {fault} is empty, although it is injected"
+
+
+def _array(spec: StoreSpec, name: str, layers: Mapping[str, bytes]) -> NDArray[Any]:
+    row = spec.pixel_layers[name]
+    return np.frombuffer(layers[name], dtype=row.dtype).reshape(spec.shape(row))
 
 
 def _check_split(
@@ -187,13 +301,17 @@ def _check_split(
         yield f"sample {i}: split = {split}, but sample {first} of the same site {named} has {before}"
 
 
-def _check_plan(spec: StoreSpec, i: int, scalars: Mapping[str, Any], expected: Mapping[str, Any]) -> Iterator[str]:
+def _check_plan(
+    spec: StoreSpec, i: int, scalars: Mapping[str, Any], expected: Mapping[str, Any], exact: bool
+) -> Iterator[str]:
     for name, planned in expected.items():
         stored = scalars[name]
         if name == "injected":  # a commanded fault may have no effect, but no other may be there
             for fault, is_in, commanded in zip(spec.faults, stored, planned, strict=True):
                 if is_in and not commanded:
                     yield f"sample {i}: {fault} is injected, but the plan does not command it"
+                if exact and commanded and not is_in:
+                    yield f"sample {i}: {fault} is not injected, although the plan commands it"
             continue
         if SCALARS[name].is_text:
             planned = json.loads(planned) if isinstance(planned, str) else json.loads(json.dumps(planned))
@@ -205,24 +323,46 @@ def _check_plan(spec: StoreSpec, i: int, scalars: Mapping[str, Any], expected: M
             yield f"sample {i}: {name} = {short(stored)} is not as planned ({short(planned)})"
 
 
-def digest(path: str | os.PathLike[str] | Store) -> str:
-    """sha256 (hex) of what a store holds: root attributes, and decoded arrays with dims and dtypes.
+class SampleDigests:
+    """The digests of a store's samples, collected in any order, and the digest of the store that follows."""
 
-    Time of creation, sharding and compression are no part of it. Raises VbnfaultError for damaged chunks.
+    def __init__(self, samples: int) -> None:
+        self._digests = np.zeros((samples, DIGEST_BYTES), dtype=np.uint8)
+
+    def add(self, digests: Mapping[int, bytes]) -> None:
+        """Note the digests of some samples."""
+        for i, one in digests.items():
+            self._digests[i] = np.frombuffer(one, dtype=np.uint8)
+
+    @property
+    def complete(self) -> bool:
+        """Whether every sample has its digest."""
+        return bool(self._digests.any(axis=1).all())
+
+    def of(self, store: Store) -> str:
+        """sha256 (hex) of the root attributes, the schema and the samples; one without a digest is unfinished."""
+        attributes = {k: v for k, v in store.attributes.items() if k not in VOLATILE_ATTRIBUTES}
+        plain = {k: v for k, v in store.spec.plain().items() if k != "shard_samples"}
+        rows = [[name, row.dims, row.dtype] for name, row in sorted(store.spec.arrays.items())]
+        total = hashlib.sha256(json.dumps([attributes, plain, store.samples, rows], sort_keys=True).encode())
+        total.update(self._digests.data)
+        return total.hexdigest()
+
+
+def digest(path: str | os.PathLike[str] | Store, *, progress: Callable[[int], None] | None = None) -> str:
+    """Return the sha256 (hex) of what a store holds: root attributes, schema, and decoded arrays of its samples.
+
+    Time of creation, sharding and compression are no part of it. A store is read shard by shard, once;
+    `progress` is called with the number of samples just read. Raises VbnfaultError for damaged chunks.
     """
     store = open_store(path)
-    total = hashlib.sha256()
-    attributes = {k: v for k, v in store.attributes.items() if k not in VOLATILE_ATTRIBUTES}
-    plain = {k: v for k, v in store.spec.plain().items() if k != "shard_samples"}
-    total.update(json.dumps([attributes, plain, store.samples], sort_keys=True).encode())
-    for name, row in sorted(store.spec.arrays.items()):
-        total.update(json.dumps([name, row.dims, row.dtype]).encode())
-        step = max(1, 2**26 // max(1, store.spec.layer_bytes(name))) if name in store.spec.pixel_layers else 4096
-        for start in range(0, store.samples, step):
-            values = store.read(name, start, min(start + step, store.samples))
-            if row.is_text:
-                for text in values.tolist():
-                    total.update(json.dumps(text).encode())
-            else:
-                total.update(np.ascontiguousarray(values).data)
-    return total.hexdigest()
+    digests = SampleDigests(store.samples)
+    for number in range(store.shards):
+        found = examine_shard(store, number)
+        for problem in found.problems:
+            if not problem.unfinished:
+                raise VbnfaultError(f"{store.path}: {problem.sentence}; the build command mends it")
+        digests.add(found.digests)
+        if progress:
+            progress(len(store.shard(number)))
+    return digests.of(store)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import struct
@@ -81,12 +82,14 @@ def split_shard(data: bytes, count: int) -> dict[int, bytes]:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Encoded:
-    """A sample with its layers compressed: what a task keeps until its shard is complete."""
+    """A sample with its layers compressed: what a task keeps until its shard is complete. `digest`: of
+    `sample_digest`."""
 
     index: int
     chunks: Mapping[str, bytes]
     scalars: Mapping[str, Any]
     crc32c: NDArray[np.uint32]
+    digest: bytes
 
 
 def encode(spec: StoreSpec, sample: Sample) -> Encoded:
@@ -101,24 +104,26 @@ def encode(spec: StoreSpec, sample: Sample) -> Encoded:
     _same_names(sample.index, "layer", layers, spec.pixel_layers)
     _same_names(sample.index, "scalar", sample.scalars, SCALARS)
 
-    def pack(name: str) -> tuple[bytes, int]:
+    def pack(name: str) -> tuple[bytes, int, bytes]:
         row, array = spec.pixel_layers[name], np.ascontiguousarray(layers[name])
         if array.shape != spec.shape(row) or array.dtype != np.dtype(row.dtype):
             raise ValueError(
                 f"sample {sample.index}: {name} is {array.dtype}{list(array.shape)}, "
                 f"not {row.dtype}{list(spec.shape(row))}"
             )
-        return (compress(array), crc32c(array)) if array.size else (b"", 0)
+        digest = hashlib.sha256(array.data if array.size else b"").digest()
+        return (compress(array), crc32c(array), digest) if array.size else (b"", 0, digest)
 
     with ThreadPoolExecutor(threads()) as pool:
         packed = dict(zip(spec.pixel_layers, pool.map(pack, spec.pixel_layers), strict=True))
     scalars = {name: _scalar(spec, sample.index, name, sample.scalars[name]) for name in SCALARS}
-    crcs = [crc for _, crc in packed.values()]
+    crcs = [crc for _, crc, _ in packed.values()]
     return Encoded(
         index=sample.index,
-        chunks={name: chunk for name, (chunk, _) in packed.items()},
+        chunks={name: chunk for name, (chunk, _, _) in packed.items()},
         scalars=scalars,
         crc32c=np.array([*crcs, crc_of_scalars(scalars)], dtype=np.uint32),
+        digest=sample_digest({name: digest for name, (_, _, digest) in packed.items()}, scalars),
     )
 
 
@@ -151,8 +156,24 @@ def _scalar(spec: StoreSpec, index: int, name: str, value: Any) -> Any:
 
 def crc_of_scalars(scalars: Mapping[str, Any]) -> int:
     """One checksum over all scalars of a sample, in the order of the schema."""
+    return int(google_crc32c.value(_packed(scalars)))
+
+
+DIGEST_BYTES = hashlib.sha256().digest_size
+
+
+def sample_digest(layers: Mapping[str, bytes], scalars: Mapping[str, Any]) -> bytes:
+    """sha256 of a sample, of the sha256 of the decoded bytes of each layer by name, and of its scalars."""
+    total = hashlib.sha256()
+    for name, layer in sorted(layers.items()):
+        total.update(name.encode() + b"\0" + layer)
+    total.update(_packed(scalars))
+    return total.digest()
+
+
+def _packed(scalars: Mapping[str, Any]) -> bytes:
     parts = []
     for name, row in SCALARS.items():
         data = scalars[name].encode() if row.is_text else np.asarray(scalars[name]).astype(row.dtype).tobytes()
         parts.append(struct.pack("<Q", len(data)) + data)
-    return int(google_crc32c.value(b"".join(parts)))
+    return b"".join(parts)

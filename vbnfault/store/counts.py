@@ -1,0 +1,75 @@
+"""How often each fault class is planned and how often it is in the pixels, by split."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+from .schema import SPLITS
+
+
+def split_name(value: Any) -> str:
+    """The name of a stored split: the string itself, or that of an index."""
+    return str(value) if isinstance(value, str) else SPLITS[int(value)]
+
+
+class FaultCounts:
+    """Samples that a fault class is planned for and injected in, by split. `add` takes them one by one."""
+
+    def __init__(self, faults: Sequence[str]) -> None:
+        self.faults = tuple(faults)
+        self.samples: Counter[str] = Counter()
+        self._planned: Counter[tuple[str, str]] = Counter()
+        self._realised: Counter[tuple[str, str]] = Counter()
+        self._has_plan = True
+
+    def add(self, split: str, planned: Iterable[bool] | None, injected: Iterable[bool]) -> None:
+        """Count a sample: its split, the faults commanded (None where no plan is known) and those injected."""
+        self.samples[split] += 1
+        self._has_plan &= planned is not None
+        for which, flags in ((self._planned, planned), (self._realised, injected)):
+            for fault, is_in in zip(self.faults, flags if flags is not None else (), strict=False):
+                which[split, fault] += bool(is_in)
+
+    def planned(self, fault: str, split: str | None = None) -> int:
+        """Samples that a fault is planned for, in a split or in all."""
+        return sum(n for (s, f), n in self._planned.items() if f == fault and split in (None, s))
+
+    def realised(self, fault: str, split: str | None = None) -> int:
+        """Samples that a fault is injected in, in a split or in all."""
+        return sum(n for (s, f), n in self._realised.items() if f == fault and split in (None, s))
+
+    @property
+    def missing(self) -> dict[str, int]:
+        """Fault → how many fewer samples hold it than are planned, of those faults where that is not 0."""
+        if not self._has_plan:
+            return {}
+        differences = {f: self.planned(f) - self.realised(f) for f in self.faults}
+        return {fault: n for fault, n in differences.items() if n}
+
+    def lines(self) -> list[str]:
+        """The table in words, a line a fault class: realised and planned samples, in all and by split."""
+        if not self.faults or not self.samples:
+            return []
+        known = [s for s in SPLITS if s in self.samples]
+        splits = [*known, *sorted(set(self.samples) - set(known))]
+        head = ["fault", "planned", "realised", *splits]
+        if not self._has_plan:
+            head.remove("planned")
+        table = [head]
+        for fault in self.faults:
+            row = [fault, str(self.planned(fault)), str(self.realised(fault))]
+            for split in splits:
+                planned, realised = self.planned(fault, split), self.realised(fault, split)
+                same = planned == realised or not self._has_plan
+                row.append(str(realised) if same else f"{realised} of {planned}")
+            table.append(row if self._has_plan else [row[0], *row[2:]])
+        totals = ["samples", *[""] * (len(head) - len(splits) - 2), str(self.samples.total())]
+        table.append([*totals, *(str(self.samples[s]) for s in splits)])
+        widths = [max(len(row[k]) for row in table) for k in range(len(head))]
+        lines = []
+        for row in table:
+            cells = [row[0].ljust(widths[0]), *(c.rjust(w) for c, w in zip(row[1:], widths[1:], strict=True))]
+            lines.append("  ".join(cells).rstrip())
+        return lines
