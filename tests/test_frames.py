@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from conftest import small_scene
 from hypothesis import assume, given
 from hypothesis import strategies as st
+from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation as Reference
 
-from vbnfault import frames
+from vbnfault import config, frames, world
+from vbnfault.errors import InputError
 
 ROTATION_67P = frames.Rotation(
     pole_ra_deg=69.54, pole_dec_deg=64.11, prime_meridian_deg=114.69, period_h=24 * 360 / 696.543884683
@@ -285,6 +288,89 @@ def test_orbit_obeys_keplers_laws() -> None:
         assert node == pytest.approx(ORBIT.node_deg, abs=1e-3)
 
 
+@pytest.mark.parametrize(
+    "eccentricity", [0.0, 0.3, 0.9, 0.99, 0.996, 0.9999, 1 - 1e-9, 1.0, 1 + 1e-9, 1.0001, 1.2, 3.0]
+)
+def test_any_conic_follows_newtons_law(eccentricity: float) -> None:
+    """Positions from 50 years before perihelion to 50 years after, against an integration of the motion."""
+    q, k = 0.5, 0.01720209895
+    orbit = frames.Orbit(
+        eccentricity=eccentricity,
+        perihelion_au=q,
+        inclination_deg=0.0,
+        node_deg=0.0,
+        argument_deg=0.0,
+        perihelion_jd=2457000.0,
+    )
+    days = 365.25 * np.array([0.0, 0.003, 0.02, 0.1, 0.3, 1.0, 3.0, 10.0, 25.0, 50.0])
+
+    def motion(_: float, state: np.ndarray) -> np.ndarray:
+        return np.concatenate([state[2:], -(k**2) * state[:2] / np.hypot(*state[:2]) ** 3])
+
+    # vis-viva at perihelion
+    start = [q, 0.0, 0.0, k * np.sqrt((1 + eccentricity) / q)]
+    found = solve_ivp(motion, (0, days[-1]), start, method="DOP853", rtol=1e-12, atol=1e-13, t_eval=days)
+    ecliptic = frames.rx(np.radians(-frames.OBLIQUITY_DEG))
+    after, before = (
+        np.array([ecliptic @ orbit.position_J_au(2457000.0 + sign * day) for day in days]) for sign in (1, -1)
+    )
+    # the integration's own error of the phase grows with the square of the revolutions: 141 of them at e = 0
+    np.testing.assert_allclose(after[:, :2], found.y[:2].T, atol=3e-7)
+    np.testing.assert_allclose(after[:, 2], 0, atol=1e-12)
+    # an orbit is its own mirror image in time
+    np.testing.assert_allclose(before, after * [1, -1, 1], atol=1e-9)
+
+
+@pytest.mark.parametrize("eccentricity", [0.0, 0.5, 0.9967, 1.0, 1.5, 100.0])
+@pytest.mark.parametrize("perihelion_au", [0.02, 30.0])
+def test_any_conic_is_solved_to_rounding(eccentricity: float, perihelion_au: float) -> None:
+    """The time that a position stands for, by the textbook's three equations, is the date asked for."""
+    e, q, k = eccentricity, perihelion_au, 0.01720209895
+    orbit = frames.Orbit(
+        eccentricity=e,
+        perihelion_au=q,
+        inclination_deg=0.0,
+        node_deg=0.0,
+        argument_deg=0.0,
+        perihelion_jd=2457000.0,
+    )
+    ecliptic = frames.rx(np.radians(-frames.OBLIQUITY_DEG))
+    limit = np.pi * (q / (1 - e)) ** 1.5 / k if e < 1 else np.inf
+
+    def days_at(half: float) -> float:
+        """Days since perihelion where tan(ν/2) is `half`: Kepler's equation, Barker's, and the hyperbolic one."""
+        if e == 1:
+            return np.sqrt(2 * q**3) / k * (half + half**3 / 3)
+        scale = abs(q / (1 - e)) ** 1.5 / k
+        anomaly = np.sqrt(abs(1 - e) / (1 + e)) * half
+        if e < 1:
+            eccentric = 2 * np.arctan(anomaly)
+            return scale * (eccentric - e * np.sin(eccentric))
+        hyperbolic = 2 * np.arctanh(anomaly)
+        return scale * (e * np.sinh(hyperbolic) - hyperbolic)
+
+    for days in (0.03125, 1.0, 32.0, 1024.0, 2.0**16, 2.0**21):
+        if days > limit:
+            break
+        x, y, _ = ecliptic @ orbit.position_J_au(2457000.0 + days)
+        r = np.hypot(x, y)
+        half = y / (r + x) if x > 0 else (r - x) / y
+        # what rounding of the position and of the two frames means in time, and of the textbook's own difference
+        # of nearly equal anomalies near perihelion
+        slack = 1e-13 * half
+        loss = abs(days_at(half - slack) - days_at(half + slack)) + 1e-15 * abs(q / (1 - e or np.inf)) ** 1.5 / k
+        assert days_at(half) == pytest.approx(days, abs=loss + 1e-12 * days)
+
+
+def test_a_parabola_has_no_mean_motion() -> None:
+    table = {"eccentricity": 1.0, "perihelion_au": 1.0, "inclination_deg": 0.0, "node_deg": 0.0}
+    table |= {"argument_deg": 0.0, "perihelion_jd": 2457000.0}
+    scene = config.parse_scene(small_scene(orbit=table), source="test")
+    assert np.isfinite(world.ephemeris(scene)[0]).all()
+    with pytest.raises(InputError, match=r"orbit: mean_motion_deg_day = 0.1: a parabola .* has none"):
+        config.parse_scene(small_scene(orbit={**table, "mean_motion_deg_day": 0.1}), source="test")
+
+
 def test_pole_and_prime_meridian_of_67p() -> None:
     for date in (2451545.0, 2456974.25):
         J_from_T = ROTATION_67P.J_from_T(date)
@@ -352,10 +438,6 @@ def test_commanded_where_it_already_is_changes_nothing() -> None:
 def test_a_bodys_own_orbit() -> None:
     """Elements of 67P written down give the built-in Sun; Kepler's third law gives the mean motion."""
     from dataclasses import asdict
-
-    from conftest import small_scene
-
-    from vbnfault import config, world
 
     elements = asdict(frames.ORBIT_67P)
     built_in = world.ephemeris(config.parse_scene(small_scene(), source="test"))[0]

@@ -206,13 +206,24 @@ class SunTable(Table):
 class OrbitTable(Table):
     """The body's two-body orbit about the Sun, ecliptic and equinox J2000; default: 67P's of 2015."""
 
-    eccentricity: float = Field(ge=0, lt=1)
+    eccentricity: float = Field(ge=0, le=100, description="1: a parabola, above: a hyperbola")
     perihelion_au: float = Field(gt=0.01, le=1000)
     inclination_deg: float = Field(ge=0, le=180)
     node_deg: float = Field(ge=-360, le=360)
     argument_deg: float = Field(ge=-360, le=360, description="of perihelion")
     perihelion_jd: float = Field(ge=1_000_000, le=5_000_000, description="TDB")
-    mean_motion_deg_day: float | None = Field(None, gt=0, le=1000, description="default: Kepler's third law")
+    mean_motion_deg_day: float | None = Field(
+        None, gt=0, le=1000, description="of the mean anomaly; default: Kepler's third law; a parabola has none"
+    )
+
+    @model_validator(mode="after")
+    def _parabola(self) -> OrbitTable:
+        if self.eccentricity == 1 and self.mean_motion_deg_day is not None:
+            raise ValueError(
+                f"mean_motion_deg_day = {self.mean_motion_deg_day:g}: a parabola (eccentricity = 1) has "
+                "none; leave it out"
+            )
+        return self
 
 
 class SpiceTable(Table):

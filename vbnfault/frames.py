@@ -13,6 +13,7 @@ Matrices are named TargetFromSource and act on column vectors; float64 throughou
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import factorial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +23,10 @@ F64 = NDArray[np.float64]
 J2000_JD = 2451545.0
 GAUSS_DEG_DAY = np.degrees(0.01720209895)  # mean motion at 1 au: Gauss's constant
 OBLIQUITY_DEG = 23.4392911  # ecliptic → ICRF, IAU 1976 at J2000
+
+# Taylor coefficients of Stumpff's functions in -z: 1/(2k + 2)! and 1/(2k + 3)!.
+_STUMPFF_C = np.array([1 / factorial(2 * k + 2) for k in range(11)])
+_STUMPFF_S = np.array([1 / factorial(2 * k + 3) for k in range(11)])
 
 
 def rx(angle_rad: float) -> F64:
@@ -114,7 +119,12 @@ def minimal_rotation(source: F64, target: F64) -> F64:
 
 @dataclass(frozen=True, kw_only=True)
 class Orbit:
-    """Two-body heliocentric orbit, ecliptic and equinox J2000. Angles in degrees, times as TDB Julian dates."""
+    """Two-body heliocentric orbit, ecliptic and equinox J2000. Angles in degrees, times as TDB Julian dates.
+
+    `eccentricity` below 1 is an ellipse, 1 a parabola, above 1 a hyperbola. `mean_motion_deg_day`: rate of the mean
+    anomaly of an ellipse or a hyperbola; None follows Kepler's third law, k |q / (1 - e)|^-3/2, and is all that a
+    parabola can have.
+    """
 
     eccentricity: float
     perihelion_au: float
@@ -122,23 +132,58 @@ class Orbit:
     node_deg: float
     argument_deg: float
     perihelion_jd: float
-    mean_motion_deg_day: float
+    mean_motion_deg_day: float | None = None
 
     def position_J_au(self, julian_date: float) -> F64:
         """Heliocentric position in ICRF axes, au, float64[3]."""
-        e = self.eccentricity
-        mean = np.radians(self.mean_motion_deg_day * (julian_date - self.perihelion_jd))
-        mean = (mean + np.pi) % (2 * np.pi) - np.pi
-        anomaly = mean + e * np.sin(mean)
-        for _ in range(50):  # Newton; quadratic, a handful of steps for e < 0.9
-            step = (anomaly - e * np.sin(anomaly) - mean) / (1 - e * np.cos(anomaly))
-            anomaly -= step
-            if abs(step) < 1e-14:
-                break
-        a = self.perihelion_au / (1 - e)
-        plane = np.array([a * (np.cos(anomaly) - e), a * np.sqrt(1 - e * e) * np.sin(anomaly), 0.0])
         node, inclination, argument = np.radians([self.node_deg, self.inclination_deg, self.argument_deg])
+        plane = np.array([*self._in_plane_au(julian_date - self.perihelion_jd), 0.0])
         return rx(np.radians(OBLIQUITY_DEG)) @ rz(node) @ rx(inclination) @ rz(argument) @ plane
+
+    def _in_plane_au(self, days: float) -> tuple[float, float]:
+        """Position in the orbit's plane that many days after perihelion, x towards perihelion, y along its motion.
+
+        Kepler's equation in universal variables (Bate, Mueller and White 1971, Fundamentals of Astrodynamics,
+        chapter 4), started at perihelion: k t = q χ + e χ³ S(α χ²) with α = (1 - e) / q. It has no singularity at
+        e = 1, and as a sum of positive terms it loses no digits near it. Its left side rises, and is convex, up to
+        half a period: Newton's steps from above the root descend to it and cannot leave the bracket.
+        """
+        e, q = self.eccentricity, self.perihelion_au
+        alpha = (1 - e) / q
+        gauss = float(np.radians(GAUSS_DEG_DAY))
+        if self.mean_motion_deg_day is not None and alpha:
+            gauss = float(np.radians(self.mean_motion_deg_day)) * abs(alpha) ** -1.5
+        half = np.pi / (gauss * alpha**1.5) if alpha > 0 else np.inf
+        if abs(days) > half:  # not else: beside half a period of 10¹⁵ days a date loses its hours
+            days = float((days + half) % (2 * half) - half)
+        kt = gauss * abs(days)
+        # S is at least 1/6 on open orbits, and 1/π² within half a period; a hyperbola's e sinh H - H is at least
+        # (e - 1) sinh H
+        chi = min(kt / q, np.cbrt((np.pi**2 if alpha > 0 else 6.0) * kt / max(e, 1e-300)))
+        if alpha > 0:
+            chi = min(chi, np.pi * alpha**-0.5)
+        elif alpha < 0:
+            chi = min(chi, float(np.arcsinh(kt * (-alpha) ** 0.5 / q)) * (-alpha) ** -0.5)
+        for _ in range(100):
+            c, s = _stumpff(alpha * chi * chi)
+            step = (chi * (q + e * chi * chi * s) - kt) / (q + e * chi * chi * c)
+            chi -= step
+            if step <= 1e-15 * chi:  # rounding turns the steps round when nothing is left
+                break
+        c, s = _stumpff(alpha * chi * chi)
+        y = float(np.sqrt(q * (1 + e))) * chi * (1 - alpha * chi * chi * s)
+        return q - chi * chi * c, float(np.copysign(y, days))
+
+
+def _stumpff(z: float) -> tuple[float, float]:
+    """C(z) = (1 - cos √z) / z and S(z) = (√z - sin √z) / √z³, continued to z <= 0."""
+    root = np.sqrt(abs(z))
+    if abs(z) < 1:  # both as series: the closed forms lose their digits
+        terms = (-z) ** np.arange(11)
+        return float(terms @ _STUMPFF_C), float(terms @ _STUMPFF_S)
+    if z > 0:
+        return float(2 * np.sin(root / 2) ** 2 / z), float((root - np.sin(root)) / root**3)
+    return float(-2 * np.sinh(root / 2) ** 2 / z), float((np.sinh(root) - root) / root**3)
 
 
 # 67P/Churyumov-Gerasimenko, JPL K213/6, epoch JD 2457305.5 TDB; good for ±1.5 years around it.

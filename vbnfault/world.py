@@ -70,13 +70,7 @@ def ephemeris(scene: SceneConfig) -> tuple[F64, F64]:
 
 
 def _orbit(table: OrbitTable | None) -> frames.Orbit:
-    if table is None:
-        return frames.ORBIT_67P
-    elements = table.model_dump()
-    if table.mean_motion_deg_day is None:
-        semi_major_au = table.perihelion_au / (1 - table.eccentricity)
-        elements["mean_motion_deg_day"] = frames.GAUSS_DEG_DAY * semi_major_au**-1.5
-    return frames.Orbit(**elements)
+    return frames.ORBIT_67P if table is None else frames.Orbit(**table.model_dump())
 
 
 def epoch_jd(scene: SceneConfig, site: int, share: float) -> float:
