@@ -39,7 +39,7 @@ GROUPS: dict[str, tuple[list[str], list[str]]] = {
     "store": (["vbnfault/store/*.py"], ["tests/test_store*.py"]),
     "faults": (["vbnfault/faults/*.py"], ["tests/test_fault_{stem}*.py", "tests/test_faults_*.py"]),
 }
-_ALWAYS = "-x -q -n 0 -p no:cacheprovider".split()
+_ALWAYS = ["-x", "-q", "-n", "0", "-p", "no:cacheprovider"]
 # of mutations that would rarely tell anything: annotations hold `|`, and decorators make dataclasses
 _LEFT_OUT = ("BitOr", "RemoveDecorator", "VariableInserter", "VariableReplacer")
 
