@@ -7,6 +7,7 @@ integration itself runs.
 
 from __future__ import annotations
 
+import itertools
 import re
 import shlex
 import sys
@@ -54,7 +55,7 @@ def commands() -> list[list[str]]:
 def smaller(words: list[str]) -> list[str]:
     """The command on small images, with few samples."""
     out = list(words)
-    for k, (option, value) in enumerate(zip(words, words[1:], strict=False)):
+    for k, (option, value) in enumerate(itertools.pairwise(words)):
         out[k + 1] = _FEWER.get(option, {}).get(value, value)
     return out + _SMALLER.get(words[1], [])
 
@@ -84,7 +85,7 @@ def test_commands_and_python_blocks_run_in_order(
             cli.main()
         said = capsys.readouterr()
         assert not ended.value.code, f"{shlex.join(arguments)}: {said.err}"
-        for option, value in zip(arguments, arguments[1:], strict=False):
+        for option, value in itertools.pairwise(arguments):
             if option in ("--out", "--json", "--toml"):
                 assert Path(value).exists(), f"{shlex.join(arguments)} wrote no {value}"
     for code in blocks("python"):
