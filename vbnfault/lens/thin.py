@@ -19,6 +19,16 @@ class ThinLens:
     focus_distance_m: float = float("inf")
 
     @property
+    def figures(self) -> dict[str, str | float]:
+        """What the lens is: name, focal length, f-number, transmission."""
+        return {
+            "name": "thin lens",
+            "efl_mm": self.focal_length_mm,
+            "f_number": self.f_number,
+            "transmission": self.transmission,
+        }
+
+    @property
     def aperture_radius_m(self) -> float:
         """Radius of the entrance pupil, f / 2N, in metres."""
         return self.focal_length_mm * 1e-3 / (2 * self.f_number)
