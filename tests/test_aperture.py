@@ -2,22 +2,37 @@
 
 from __future__ import annotations
 
+import json
 import math
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from conftest import small_scene
 from test_faults_kit import flat_electrons
+from typer.testing import CliRunner
 
 from vbnfault import config, dataset, resources, world
+from vbnfault.cli import app
 from vbnfault.errors import InputError
 from vbnfault.faults import FaultContext, from_dict
-from vbnfault.lens import Prescription, RealLens, first_order, load_lens, open_f_number, stopped_down
+from vbnfault.lens import (
+    Prescription,
+    RealLens,
+    first_order,
+    load_lens,
+    open_f_number,
+    parse_lens,
+    scaled_to_focal_length,
+    stopped_down,
+)
+from vbnfault.lens.family import to_table
 from vbnfault.lens.glass import D_NM
 from vbnfault.lens.imaging import point_spreads
 from vbnfault.lens.paraxial import paraxial_ghosts
+from vbnfault.lens.scatter import veiling_glare
 from vbnfault.lens.starburst import starburst
 from vbnfault.lens.trace import trace
 
@@ -55,14 +70,12 @@ def test_the_marginal_ray_is_that_of_the_f_number(name: str, f_number: float) ->
 
 @pytest.mark.parametrize("name", LENSES)
 def test_light_on_the_axis_falls_with_the_square_of_the_f_number(name: str) -> None:
-    nodes = np.array([450.0, D_NM, 650.0])
-    for n in (5.6, 16.0, 100.0):
+    nodes = np.array([D_NM])
+    for n in (5.6, 100.0):
         lens = real(name, n)
-        # π T / (4 N²); the beam's area is a midpoint rule over 32 azimuths of a rim found to some 1e-6. Off the d
-        # line the slope of the map shifts by the colour of the focal length, below 1 %
+        # π T / (4 N²); the beam's area is a midpoint rule over 32 azimuths of a rim known to some 1e-6
         found = lens.axial_solid_angle_sr(nodes) / lens.transmittance(nodes) * 4 * n**2 / math.pi
-        assert found[1] == pytest.approx(1, rel=1e-5)
-        np.testing.assert_allclose(found, 1, rtol=0.02)
+        assert found == pytest.approx(1, rel=1e-5)
         assert lens.f_number == pytest.approx(n, rel=1e-5)
         assert lens.aperture_radius_m == pytest.approx(lens.focal_length_mm / n / 2e3, rel=1e-5)
 
@@ -178,3 +191,78 @@ def test_ghosts_and_starburst_follow_the_stop() -> None:
     assert (ratio > 0.97 * area).sum() > 0.3 * len(ratio)
     bursts = [starburst(lens, sun_radius_rad=4.65e-3).pupil_radius_mm for lens in lenses]
     assert bursts[0] / bursts[1] == pytest.approx(math.sqrt(area), rel=1e-9)
+
+
+def test_a_build_tells_how_a_lens_was_scaled(tmp_path: Path) -> None:
+    settings = scene(lens="nikkor_35_f2p8", f_number=5.6, fov_deg=40.0).model_copy(
+        update={"faults": {"dust_on_optics": {"model": "defocused"}}}
+    )
+    summary = dataset.build_scene(settings, tmp_path / "x.zarr", source="test", dry_run=True)
+    focal = SIDE_PX * 88e-3 / 2 / math.tan(math.radians(20))
+    assert f"Nikkor 35 mm f/2.8, scaled by {focal / 35.9993:.4g} to {focal:.4g} mm, f/5.6" in "\n".join(
+        summary.lines()
+    )
+    runner = CliRunner()
+    made = tmp_path / "lens.json"
+    given = ["--focal-length-mm", "7", "--f-number", "5.6", "--out", str(tmp_path / "x.png"), "--json", str(made)]
+    assert runner.invoke(app, ["lens", "nikkor_35_f2p8", *given]).exit_code == 0
+    table = json.loads(made.read_text())
+    assert (table["efl_mm"], table["real_f_number"]) == (pytest.approx(7.0), pytest.approx(5.6, rel=1e-6))
+    assert table["scale"] == pytest.approx(7.0 / first_order(load_lens("nikkor_35_f2p8")).efl_mm)
+    # the same scale and stop by the field that the sensor spans
+    by_field = ["--fov-deg", "40", "--sensor-width-mm", str(SIDE_PX * 88e-3), "--f-number", "5.6", *given[4:]]
+    assert runner.invoke(app, ["lens", "nikkor_35_f2p8", *by_field]).exit_code == 0
+    assert json.loads(made.read_text())["scale"] == pytest.approx(focal / 35.9993, rel=1e-5)
+    refused = runner.invoke(app, ["lens", "nikkor_35_f2p8", "--f-number", "1.2"])
+    assert "--f-number = 1.2: must be from 2.79" in str(refused.exception)
+
+
+# --- what scaling keeps -----------------------------------------------------------------------------------------
+
+
+def test_scaling_keeps_films_roughness_and_grains_and_lengthens_paths_in_glass() -> None:
+    rows = to_table(load_lens("tessar_50_f2p8").coated("bbar"))
+    for row in rows["surface"]:
+        if "nd" in row:
+            row["internal_transmittance_10mm"] = 0.9
+    lens = parse_lens(rows, source="test")
+    small = scaled_to_focal_length(lens, 5.0)
+    factor = 5.0 / first_order(lens).efl_mm
+    assert small.scale == pytest.approx(factor, rel=1e-12)
+    assert small.scaled(2.0).scale == pytest.approx(2 * factor, rel=1e-12)
+    for before, after in zip(lens.surfaces, small.surfaces, strict=True):
+        assert after.coating == before.coating
+        assert after.thickness_mm == pytest.approx(before.thickness_mm * factor)
+    figures = [first_order(v) for v in (lens, small)]
+    assert figures[1].f_number == pytest.approx(figures[0].f_number, rel=1e-12)
+    # absorption per mm: the glass's share to the power of the scale; reflections as before
+    clear = [
+        replace(v, surfaces=tuple(replace(s, internal_transmittance_10mm=((D_NM,), (1.0,))) for s in v.surfaces))
+        for v in (lens, small)
+    ]
+
+    def taken(v: Prescription) -> float:
+        return RealLens(prescription=v, width_px=64, height_px=64, pixel_pitch_um=5.0).transmission
+
+    assert taken(clear[0]) == pytest.approx(taken(clear[1]), rel=1e-12)
+    assert taken(small) / taken(clear[1]) == pytest.approx((taken(lens) / taken(clear[0])) ** factor, rel=1e-9)
+    glass_mm = sum(s.thickness_mm for s in lens.surfaces if s.medium.nd > 1)
+    assert taken(lens) / taken(clear[0]) == pytest.approx(0.9 ** (glass_mm / 10), rel=1e-9)
+    # roughness of 2 nm and particles of a level scatter the same share of the light, over the same angles
+    glare = [
+        veiling_glare(v, sun_deg=10.0, wavelength_nm=np.array([D_NM]), roughness_nm=2.0, cleanliness_level=300.0)
+        for v in (lens, small)
+    ]
+    shape, pitch = (32, 32), 1.0
+    at = [(f.efl_mm * math.tan(math.radians(10)), 0.0) for f in figures]
+    images = [g.image(xy, shape, pitch * scale) for g, xy, scale in zip(glare, at, (1.0, factor), strict=True)]
+    # irradiance over the Sun's: of a lens f-number for f-number alike, at places in focal lengths alike
+    np.testing.assert_allclose(images[1], images[0], rtol=2e-3)
+    # grains: as many µm at either scale
+    grains = []
+    for focal in (40.0, 20.0):
+        fault = from_dict("dust_on_optics", {"model": "defocused", "diameter_um": [80, 80]}, source="test")
+        lens_at = real("tessar_50_f2p8", fov_deg=2 * math.degrees(math.atan(SIDE_PX * 88e-3 / 2 / focal)))
+        grains.append(fault.draw(context(lens_at), np.random.default_rng(1)))
+    assert grains[0]["diameter_um"] == grains[1]["diameter_um"]
+    assert set(grains[0]["diameter_um"]) == {80.0}

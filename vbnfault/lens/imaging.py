@@ -295,15 +295,18 @@ class RealLens:
     @property
     def figures(self) -> dict[str, str | float]:
         """What the lens is after scaling and stopping down: name, scale over the prescription's file, EFL, f-number
-        of the real beam, diameter of the stop, transmission on the axis at the d line."""
+        of the real beam, diameter of the stop, transmission on the axis at the d line; `summary` says so."""
         lens = self.prescription
+        efl_mm = first_order(lens).efl_mm
         return {
             "name": lens.name,
             "scale": lens.scale,
-            "efl_mm": first_order(lens).efl_mm,
+            "efl_mm": efl_mm,
             "f_number": self.f_number,
             "stop_diameter_mm": 2 * lens.surfaces[lens.stop].semi_diameter_mm,
             "transmission": self.transmission,
+            "summary": f"{lens.name}, scaled by {lens.scale:.4g} to {efl_mm:.4g} mm, f/{self.f_number:.3g}; "
+            "coatings, roughness and grains keep their size",
         }
 
     @property

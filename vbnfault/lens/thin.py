@@ -20,12 +20,13 @@ class ThinLens:
 
     @property
     def figures(self) -> dict[str, str | float]:
-        """What the lens is: name, focal length, f-number, transmission."""
+        """What the lens is: name, focal length, f-number, transmission; `summary` says so."""
         return {
             "name": "thin lens",
             "efl_mm": self.focal_length_mm,
             "f_number": self.f_number,
             "transmission": self.transmission,
+            "summary": f"thin lens of {self.focal_length_mm:.4g} mm, f/{self.f_number:.3g}",
         }
 
     @property
