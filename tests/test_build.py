@@ -127,6 +127,33 @@ def test_damage_is_repaired_by_building_exactly_the_samples_concerned(
     assert not list(out.rglob("*.partial"))
 
 
+@pytest.mark.parametrize("workers", [1, 2])
+def test_samples_that_are_not_as_planned_or_labelled_are_built_again(
+    reference: tuple[Path, str], tmp_path: Path, workers: int
+) -> None:
+    """Their checksums are right: another plan, or another program, wrote them."""
+    out = shutil.copytree(reference[0], tmp_path / "s.zarr")
+    spec = make_spec()
+
+    def planned(index: int) -> dict:
+        scalars = fake_sample(spec, index, site=int(site_of(index + 1)[-1])).scalars
+        return {name: scalars[name] for name in ("site", "split", "proposal", "roll_deg", "injected")}
+
+    wrong = {3: {"split": 2}, 6: {"proposal": "{}"}, 11: {"roll_deg": 1.5}, 12: {"site": 2}}
+    samples = [fake_sample(spec, i, site=int(site_of(i + 1)[-1])) for i in (*wrong, 16)]
+    for sample, changes in zip(samples, wrong.values(), strict=False):
+        sample.scalars.update(changes)  # type: ignore[attr-defined]
+    samples[-1].layers["mask_any"] = ~samples[-1].layers["mask"].any(0)  # type: ignore[index]
+    st.write_samples(out, samples)
+    assert len(st.verify(out, expected=planned)) >= 5
+    log = tmp_path / "log"
+    assert run(out, Session(log=str(log)), workers=workers, expected=planned).built == 5
+    assert sorted(int(line.split()[1]) for line in log.read_text().splitlines()) == [*wrong, 16]
+    assert st.verify(out, expected=planned) == []
+    assert st.digest(out) == reference[1]
+    assert run(out, workers=workers, expected=planned).built == 0
+
+
 def start(out: Path, *arguments: str) -> subprocess.Popen[str]:
     """This file as a program, see the end."""
     path = os.pathsep.join([str(HERE.parent), str(HERE)])

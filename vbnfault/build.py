@@ -59,7 +59,6 @@ class Summary:
     estimated_bytes: int
     free_bytes: int
     fault_counts: Mapping[str, int] = field(default_factory=dict)
-    optics: str = ""
     built: int = 0
     seconds: float = 0.0
 
@@ -68,8 +67,6 @@ class Summary:
         head = f"{self.path}: {self.samples} samples at {self.sites} sites in {self.shards} shards"
         size = f"about {size_text(self.estimated_bytes)}, {size_text(self.free_bytes)} free"
         lines = [f"{head}, {size}; {self.finished} of them were finished before"]
-        if self.optics:
-            lines.append(f"lens: {self.optics}")
         if self.fault_counts:
             lines.append("faults: " + ", ".join(f"{k} {v}" for k, v in self.fault_counts.items()))
         if self.built:
@@ -118,6 +115,8 @@ def build(
     dry_run: bool = False,
     progress: bool = True,
     fault_counts: Mapping[str, int] | None = None,
+    expected: store_module.Planned | None = None,
+    exact: bool = False,
     recycle_shards: int = RECYCLE_SHARDS,
 ) -> Summary:
     """Build, resume, repair or extend the store at `out`; see the module.
@@ -126,6 +125,7 @@ def build(
     blocks. `blocks`: from `planned_blocks`; one block by default. `workers` processes on this machine (1: in
     this process), each with `threads` threads (an equal share of the cores by default; VBNFAULT_THREADS and
     OMP_NUM_THREADS in its environment), or the Dask cluster at `scheduler`, whose workers must see `out`.
+    `expected` and `exact`: as of `store.examine`; finished samples that are not as planned are built again.
 
     Raises InputError where `out` holds another scene or nothing answers at `scheduler`, BuildFailed where
     samples failed (all others are built), Interrupted after Ctrl-C or SIGTERM, VbnfaultError where the disk
@@ -152,7 +152,6 @@ def build(
         estimated_bytes=spec.estimated_sample_bytes * len(sites),
         free_bytes=_free_bytes(path),
         fault_counts=dict(fault_counts or {}),
-        optics=spec.attributes.get("optics", {}).get("summary", ""),
     )
     if dry_run:
         return summary
@@ -170,7 +169,7 @@ def build(
             if store.samples < len(sites):
                 added = len(sites) - store.samples
                 store = store_module.append_samples(store, added, {"blocks": list(blocks)})
-            run = Run(store, sites, Progress(len(sites), shown=progress))
+            run = Run(store, sites, Progress(len(sites), shown=progress), expected, exact=exact)
             with run.progress:
                 if scheduler is not None:
                     run_on_dask(session_factory, run, scheduler)

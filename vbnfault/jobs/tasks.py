@@ -4,8 +4,9 @@ site's terrain once.
 
 from __future__ import annotations
 
+import heapq
 import traceback
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,7 +18,7 @@ from numpy.typing import NDArray
 from .. import store as store_module
 from ..errors import VbnfaultError
 from ..quantities import Sample
-from ..store import Encoded, Store
+from ..store import Encoded, Planned, Store
 from .errors import BuildFailed
 from .progress import Progress
 
@@ -41,11 +42,12 @@ Tick = Callable[[int, str, str], None]
 
 @dataclass(frozen=True, kw_only=True)
 class Task:
-    """Complete one shard. `sites`: of its samples. `skip`: not to be tried. `careful`: write every sample at
-    once, because the process may die at the next one."""
+    """Complete one shard. `sites`: of its samples. `unplanned`: finished, but not as planned, so to be built again.
+    `skip`: not to be tried. `careful`: write every sample at once, because the process may die at the next one."""
 
     shard: int
     sites: tuple[int, ...]
+    unplanned: frozenset[int] = frozenset()
     skip: frozenset[int] = frozenset()
     careful: bool = False
 
@@ -56,9 +58,16 @@ def work(simulate: Callable[[int], Sample], store: Store, task: Task, tick: Tick
     What was made is written also where an interrupt ends the task early, but not where `tick` finds that
     nobody listens any more: another build may have begun.
     """
-    wanted = {i for problem in store_module.check_shard(store, task.shard) for i in problem.samples}
+    wanted = store_module.examine_shard(store, task.shard, labels=True).wanted | task.unplanned
     samples = store.shard(task.shard)
     made: dict[int, Encoded] = {}
+    pending = set(wanted)
+    lost: set[int] = set()
+
+    def write(given: dict[int, Encoded]) -> None:
+        lost.update(store.write_shard(task.shard, given, damaged=pending - set(given)))
+        pending.difference_update(given)
+
     try:
         for i in samples:
             if i not in wanted:
@@ -71,14 +80,20 @@ def work(simulate: Callable[[int], Sample], store: Store, task: Task, tick: Tick
                 tick(i, "failed", describe(error))
                 continue
             if task.careful:
-                store.write_shard(task.shard, {i: made.pop(i)})
+                write({i: made.pop(i)})
             tick(i, "built", "")
     except OSError:
         made.clear()
         raise
     finally:
         if made:
-            store.write_shard(task.shard, made)
+            write(made)
+    if lost:
+        named = ", ".join(map(str, sorted(lost)))
+        raise VbnfaultError(
+            f"{store.path}: the files of sample {named} were whole and no longer are; the same command builds "
+            "what is lost again"
+        )
 
 
 def describe(error: Exception) -> str:
@@ -94,14 +109,27 @@ def describe(error: Exception) -> str:
 class Run:
     """The tasks of a build, handed out by site, and what came of them."""
 
-    def __init__(self, store: Store, sites: NDArray[np.int64], progress: Progress) -> None:
+    def __init__(
+        self,
+        store: Store,
+        sites: NDArray[np.int64],
+        progress: Progress,
+        expected: Planned | None = None,
+        *,
+        exact: bool = False,
+    ) -> None:
         self.store, self.sites, self.progress = store, sites, progress
+        self._expected, self._exact = expected, exact
         self.built = 0
         self.failures: dict[int, str] = {}
         self._outcome: dict[int, str] = {}
         self._by_site: dict[int, deque[int]] = {}
         for shard in range(store.shards):
             self._by_site.setdefault(self.lead(shard), deque()).append(shard)
+        self._begun = frozenset(store.begun())
+        # sites with the most shards left first; brought up to date when an entry is taken out
+        self._longest = [(-len(queue), site) for site, queue in self._by_site.items()]
+        heapq.heapify(self._longest)
 
     def lead(self, shard: int) -> int:
         """The site a shard is handed out with: that of its first sample."""
@@ -111,19 +139,35 @@ class Run:
         """The task that completes a shard."""
         samples = self.store.shard(shard)
         sites = tuple(int(s) for s in self.sites[samples.start : samples.stop])
-        return Task(shard=shard, sites=sites, skip=skip, careful=careful)
+        unplanned: set[int] = set()
+        if self._expected is not None and shard in self._begun:
+            unplanned = store_module.unplanned_samples(self.store, shard, self._expected, exact=self._exact)
+        return Task(shard=shard, sites=sites, unplanned=frozenset(unplanned), skip=skip, careful=careful)
 
     def next_shard(self, last: int | None = None, busy: Sequence[int] = ()) -> int | None:
         """What a worker does after the shard `last`: a shard of the same site if one is left, else of the
         site where the fewest of the `busy` shards are, then of the one with the most left."""
-        left = {site: queue for site, queue in self._by_site.items() if queue}
-        if not left:
-            return None
-        site = None if last is None else self.lead(last)
-        if site is None or site not in left:
-            taken = [self.lead(shard) for shard in busy]
-            site = min(left, key=lambda s: (taken.count(s), -len(left[s]), s))
-        return left[site].popleft()
+        if last is None or not self._by_site[self.lead(last)]:
+            site = self._next_site(Counter(self.lead(shard) for shard in busy))
+        else:
+            site = self.lead(last)
+        return None if site is None else self._by_site[site].popleft()
+
+    def _next_site(self, taken: Counter[int]) -> int | None:
+        """Return the site with shards left where the fewest are `taken`, of those the one with the most left."""
+        passed: list[tuple[int, int]] = []
+        while self._longest:
+            length, site = heapq.heappop(self._longest)
+            left = len(self._by_site[site])
+            if left and left != -length:
+                heapq.heappush(self._longest, (-left, site))
+            elif left:
+                passed.append((length, site))
+                if not taken[site]:
+                    break
+        for entry in passed:
+            heapq.heappush(self._longest, entry)
+        return min(passed, key=lambda entry: (taken[entry[1]], *entry))[1] if passed else None
 
     def tick(self, sample: int, what: str, text: str) -> None:
         """Note what became of a sample. Raises BuildFailed where nothing succeeds."""

@@ -4,8 +4,11 @@ The only importer of zarr. How a store survives what happens to it:
 
 - Chunk files are encoded here, not by zarr, which would drop a chunk of zeros (an absent one reads as zeros
   too) and recompress the neighbours of a sample that is built again. Reads go through zarr, as a user's do.
-- Every file is written beside its place and renamed into it, so it is either the old or the new one.
-  `create` builds the whole group that way. A kill leaves `*.partial` files, which `recover` removes.
+- Every file is written beside its place, flushed to the device, and renamed into it, so it is either the old or
+  the new one, also after a loss of power (`disk`). `create` makes the whole group that way. A kill leaves
+  `*.partial` files, which `recover` removes.
+- Metadata follow from the root attributes alone (`layout`), so whatever differs is found and mended. The root
+  attributes hold a checksum, and the group `spare` holds a copy, written before the root.
 - A per-pixel layer is sharded: a chunk is one sample, a file holds `shard_samples` of them. One task owns a
   shard. Whoever rewrites it copies the compressed chunks of the samples it does not rebuild, untouched.
 - `crc32c` holds a checksum of every layer and of all scalars of a sample, over decoded bytes; a chunk carries
@@ -14,6 +17,7 @@ The only importer of zarr. How a store survives what happens to it:
 """
 
 from .check import (
+    Planned,
     Problem,
     Report,
     SampleDigests,
@@ -22,6 +26,7 @@ from .check import (
     examine,
     examine_shard,
     problem_samples,
+    unplanned_samples,
     verify,
 )
 from .codec import Encoded, encode, mask_union
@@ -55,6 +60,7 @@ __all__ = [
     "Encoded",
     "FaultCounts",
     "Member",
+    "Planned",
     "Problem",
     "Report",
     "SampleDigests",
@@ -73,6 +79,7 @@ __all__ = [
     "problem_samples",
     "recover",
     "split_name",
+    "unplanned_samples",
     "verify",
     "write_samples",
 ]

@@ -29,6 +29,10 @@ class Problem(NamedTuple):
     unfinished: bool = False
 
 
+Planned = Callable[[int], Mapping[str, Any]]  # sample → scalars as planned
+_MOST_RANGES = 16  # of samples, in a sentence
+
+
 class ShardCheck(NamedTuple):
     """What was read of a shard: its problems; of sound samples the scalars, the digest of each (`sample_digest`),
     and what contradicts in their labels, where that was asked for."""
@@ -37,6 +41,12 @@ class ShardCheck(NamedTuple):
     scalars: dict[int, dict[str, Any]]
     digests: dict[int, bytes]
     contradictions: dict[int, list[str]]
+
+    @property
+    def wanted(self) -> set[int]:
+        """The samples that have to be built, or built again."""
+        wrong = {i for i, sentences in self.contradictions.items() if sentences}
+        return wrong.union(*(problem.samples for problem in self.problems))
 
 
 def check_shard(store: Store, number: int) -> list[Problem]:
@@ -58,8 +68,10 @@ def examine_shard(store: Store, number: int, *, labels: bool = False) -> ShardCh
             columns[name] = store.column(name, number)
         except FileNotFoundError:
             unreadable[name] = f"the chunk file {where} is missing"
-        except (OSError, ValueError):
+        except ValueError:
             unreadable[name] = f"cannot be decoded, {where} is damaged"
+        except OSError as error:
+            unreadable[name] = f"cannot be read, {where} is damaged: {error.strerror}"
         if name == "done" and unreadable and store.file("image", number).exists():
             problem = Problem(tuple(samples), f"done of samples {_spans(samples)}: {unreadable[name]}")
             return ShardCheck([problem], {}, {}, {})
@@ -121,7 +133,8 @@ def _chunks(store: Store, number: int, finished: list[int]) -> tuple[dict[str, d
         except FileNotFoundError:
             problems.append(Problem(tuple(finished), f"{many}: the shard file {where} is missing"))
         except (OSError, ValueError) as error:
-            problems.append(Problem(tuple(finished), f"{many}: the shard file {where} is damaged: {error}"))
+            why = error.strerror if isinstance(error, OSError) else error
+            problems.append(Problem(tuple(finished), f"{many}: the shard file {where} is damaged: {why}"))
     return chunks, problems
 
 
@@ -161,10 +174,40 @@ def _spans(indices: Iterable[int]) -> str:
     return ", ".join(str(a) if a == b else f"{a}-{b}" for a, b in runs)
 
 
+def _not_built(samples: list[int]) -> Iterator[str]:
+    """Yield one sentence for all samples that are not built yet, with their first ranges."""
+    if samples:
+        ranges = _spans(samples).split(", ")
+        more = f" and {len(ranges) - _MOST_RANGES} ranges more" if len(ranges) > _MOST_RANGES else ""
+        many = (
+            f"samples {', '.join(ranges[:_MOST_RANGES])}{more} are"
+            if len(samples) > 1
+            else f"sample {ranges[0]} is"
+        )
+        yield f"{many} not built yet"
+
+
 def problem_samples(store: str | os.PathLike[str] | Store) -> list[int]:
     """Samples that have to be built, or built again: unfinished, missing or damaged ones."""
     store = open_store(store)
-    return sorted({i for n in range(store.shards) for p in check_shard(store, n) for i in p.samples})
+    begun = store.begun()
+    wanted = {i for n in begun for p in check_shard(store, n) for i in p.samples}
+    return sorted(wanted.union(*(store.shard(n) for n in {*range(store.shards)}.difference(begun))))
+
+
+def unplanned_samples(store: Store, number: int, expected: Planned, *, exact: bool = False) -> set[int]:
+    """Return the finished samples of a shard whose stored scalars are not as `expected`; none where the scalars
+    cannot be read, which `check_shard` finds. For the parameters see `examine`."""
+    finished = [i for i, done in store.done(number).items() if done]
+    try:
+        columns = {name: store.column(name, number) for name in SCALARS} if finished else {}
+    except (OSError, ValueError):
+        return set()
+    scalars = {
+        i: {name: column[i - number * store.spec.shard_samples] for name, column in columns.items()}
+        for i in finished
+    }
+    return {i for i in finished if any(_check_plan(store.spec, i, scalars[i], expected(i), exact))}
 
 
 class Report(NamedTuple):
@@ -179,7 +222,7 @@ class Report(NamedTuple):
 def verify(
     path: str | os.PathLike[str] | Store,
     *,
-    expected: Callable[[int], Mapping[str, Any]] | None = None,
+    expected: Planned | None = None,
     exact: bool = False,
     progress: Callable[[int], None] | None = None,
 ) -> list[str]:
@@ -190,7 +233,7 @@ def verify(
 def examine(
     path: str | os.PathLike[str] | Store,
     *,
-    expected: Callable[[int], Mapping[str, Any]] | None = None,
+    expected: Planned | None = None,
     exact: bool = False,
     progress: Callable[[int], None] | None = None,
 ) -> Report:
@@ -222,9 +265,15 @@ def examine(
         return Report(problems, None, counts)
     digests = SampleDigests(store.samples)
     split_of: dict[int, tuple[int, int]] = {}
+    not_built: list[int] = []
+    begun = set(store.begun())
     for number in range(store.shards):
+        if number not in begun:
+            not_built += store.shard(number)
+            continue
         found = examine_shard(store, number, labels=True)
-        problems += [p.sentence for p in found.problems]
+        problems += [p.sentence for p in found.problems if not p.unfinished]
+        not_built += [i for p in found.problems if p.unfinished for i in p.samples]
         digests.add(found.digests)
         for i, scalars in found.scalars.items():
             planned = expected(i) if expected else {}
@@ -234,6 +283,9 @@ def examine(
             counts.add(split_name(scalars["split"]), planned.get("injected"), scalars["injected"])
         if progress:
             progress(len(store.shard(number)))
+    if progress and len(begun) < store.shards:
+        progress(sum(len(store.shard(n)) for n in range(store.shards) if n not in begun))
+    problems += _not_built(not_built)
     return Report(problems, digests.of(store) if digests.complete else None, counts)
 
 
@@ -357,7 +409,7 @@ def digest(path: str | os.PathLike[str] | Store, *, progress: Callable[[int], No
     """
     store = open_store(path)
     digests = SampleDigests(store.samples)
-    for number in range(store.shards):
+    for number in store.begun():
         found = examine_shard(store, number)
         for problem in found.problems:
             if not problem.unfinished:

@@ -5,58 +5,53 @@ from __future__ import annotations
 import contextlib
 import json
 import os
-import shutil
+import re
 import uuid
 import warnings
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import zarr
-from numcodecs import VLenUTF8
 from numpy.typing import NDArray
-from zarr.codecs import ZstdCodec
 
 from ..errors import InputError, VbnfaultError
 from ..quantities import Sample
-from .codec import ZSTD_LEVEL, Encoded, compress, decompress, encode, join_shard, split_shard
-from .schema import FORMAT_VERSION, SCALARS, Member, StoreSpec, spec_from_plain
+from . import disk
+from .codec import Encoded, crc32c, crc_of_scalars, encode, join_shard, split_shard
+from .layout import (
+    CHECKSUM,
+    DOCUMENT,
+    OWN_ATTRIBUTES,
+    SPARE,
+    array_documents,
+    coordinate_chunks,
+    decode_values,
+    encode_values,
+    group_document,
+    is_sealed,
+    root_attributes,
+    sealed,
+    to_bytes,
+)
+from .schema import FORMAT_VERSION, SCALARS, StoreSpec, spec_from_plain
 
-
-@contextlib.contextmanager
-def disk(path: Path, doing: str) -> Iterator[None]:
-    """Turn what the operating system refuses into one sentence; what was finished stays as it is."""
-    try:
-        yield
-    except OSError as error:
-        raise VbnfaultError(
-            f"{path}: {error.strerror or error} while {doing}; finished samples stay, "
-            f"and the same command resumes once that is mended"
-        ) from error
-
-
-def put(path: Path, data: bytes) -> None:
-    """Write a file that is either the old or the whole new one at any moment."""
-    partial = path.with_name(f"{path.name}.{uuid.uuid4().hex}.partial")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    try:
-        partial.write_bytes(data)
-        os.replace(partial, path)
-    except BaseException:
-        partial.unlink(missing_ok=True)
-        raise
+# what a damaged file gives, unlike one that the system does not let us read just now
+_DAMAGE = (ValueError, FileNotFoundError, NotADirectoryError, disk.Misplaced)
+_READS = 5  # of a sample that is being rewritten, before it counts as damaged
 
 
 class Store:
     """An open store. `open_store` makes one; reads go through zarr, as a user's do."""
 
-    def __init__(self, path: Path, group: zarr.Group, attributes: dict[str, Any]) -> None:
+    def __init__(self, path: Path, attributes: dict[str, Any], mode: str) -> None:
         self.path = path
-        self.attributes = {k: v for k, v in attributes.items() if k not in ("store", "samples", "coordinates")}
+        self.root_attributes = attributes
+        self.attributes = {k: v for k, v in attributes.items() if k not in OWN_ATTRIBUTES}
         self.samples = int(attributes["samples"])
         self.spec = spec_from_plain(attributes["store"], self.attributes)
-        self._group = group
+        self._mode: Any = mode
         self._arrays: dict[str, zarr.Array[Any]] = {}
 
     @property
@@ -73,22 +68,19 @@ class Store:
         """The zarr array. Raises VbnfaultError where it is missing or its metadata cannot be read."""
         if name not in self._arrays:
             try:
-                array = self._group[name]
-            except Exception:  # zarr raises many kinds for metadata that it cannot parse
-                array = None
-            if not isinstance(array, zarr.Array):
-                raise VbnfaultError(f"{self.path}: {self.why_closed(name)}; the build command re-creates it")
-            self._arrays[name] = array
+                self._arrays[name] = zarr.open_array(self.path / name, mode=self._mode, zarr_format=3)
+            except Exception as error:  # zarr raises many kinds for metadata that it cannot parse
+                raise VbnfaultError(
+                    f"{self.path}: {self.why_closed(name)}; the build command re-creates it"
+                ) from error
         return self._arrays[name]
 
-    def make_array(self, name: str, member: Member) -> None:
-        """Make an array whose metadata is not there; data files that exist stay."""
-        self._arrays.pop(name, None)
-        _create_array(self._group, name, member)
-
     def update_attributes(self, values: Mapping[str, Any]) -> None:
-        """Change root attributes on disk; who opens the store again sees them."""
-        self._group.update_attributes(dict(values))
+        """Change root attributes on disk, the spare first; who opens the store again sees them."""
+        self.root_attributes = sealed({**self.root_attributes, **json.loads(json.dumps(values))})
+        arrays = array_documents(self.spec.members(self.samples))
+        disk.write(self.path, [(f"{SPARE}/{DOCUMENT}", to_bytes(group_document(self.root_attributes)))])
+        disk.write(self.path, [(DOCUMENT, to_bytes(group_document(self.root_attributes, arrays)))])
 
     def why_closed(self, name: str) -> str:
         """What is wrong with an array that `array` cannot open."""
@@ -111,16 +103,26 @@ class Store:
         return np.asarray(values)
 
     def read_sample(self, index: int) -> Sample:
-        """One sample as it was written. Raises InputError where it does not exist or is not finished."""
+        """Return one sample as it was written, compared with its checksums; while it is rewritten, the old or the
+        new one.
+
+        Raises InputError where it does not exist or is not finished, VbnfaultError where it is damaged.
+        """
         if not 0 <= index < self.samples:
             raise InputError(f"{self.path}: sample {index} does not exist; the range is 0 to {self.samples - 1}")
-        if not self.read("done", index, index + 1)[0]:
-            raise InputError(f"{self.path}: sample {index} is not finished yet; the build command resumes")
-        one = {name: self.read(name, index, index + 1)[0] for name in (*self.spec.pixel_layers, *SCALARS)}
-        return Sample(
-            index=index,
-            layers={name: one[name] for name in self.spec.pixel_layers},
-            scalars={name: str(one[name]) if row.is_text else one[name] for name, row in SCALARS.items()},
+        names = (*self.spec.pixel_layers, *SCALARS)
+        for _ in range(_READS):
+            if not self.read("done", index, index + 1)[0]:
+                raise InputError(f"{self.path}: sample {index} is not finished yet; the build command resumes")
+            crcs = self.read("crc32c", index, index + 1)[0].tolist()
+            one = {name: self.read(name, index, index + 1)[0] for name in names}
+            found = [crc32c(one[name]) if one[name].size else 0 for name in self.spec.pixel_layers]
+            scalars = {name: str(one[name]) if row.is_text else one[name] for name, row in SCALARS.items()}
+            if [*found, crc_of_scalars(scalars)] == crcs:
+                layers = {name: one[name] for name in self.spec.pixel_layers}
+                return Sample(index=index, layers=layers, scalars=scalars)
+        raise VbnfaultError(
+            f"{self.path}: sample {index} does not match its stored crc32c; the build command repairs it"
         )
 
     def column(self, name: str, number: int) -> NDArray[Any]:
@@ -128,19 +130,16 @@ class Store:
         row, size = self.spec.arrays[name], self.spec.shard_samples
         if self.spec.empty(name):
             return np.zeros((len(self.shard(number)), *self.spec.shape(row)), dtype=row.dtype)
-        data = decompress(self.file(name, number).read_bytes())
-        values = VLenUTF8().decode(data) if row.is_text else np.frombuffer(data, dtype=row.dtype)
+        values = decode_values(disk.read(self.file(name, number)), row.dtype)
         return values.reshape(size, *self.spec.shape(row))[: len(self.shard(number))]
 
-    def _put_column(self, name: str, number: int, values: Mapping[int, Any]) -> None:
-        if self.spec.empty(name):
-            return
+    def _column_bytes(self, name: str, number: int, values: Mapping[int, Any]) -> bytes:
         row, first = self.spec.arrays[name], self.shard(number).start
         dtype = object if row.is_text else row.dtype
         column = np.full((self.spec.shard_samples, *self.spec.shape(row)), row.fill, dtype=dtype)
         for i, value in values.items():
             column[i - first] = value
-        put(self.file(name, number), compress(VLenUTF8().encode(column) if row.is_text else column))
+        return encode_values(column)
 
     def done(self, number: int) -> dict[int, bool]:
         """Sample → is it finished; none of the shard is where that cannot be read."""
@@ -150,56 +149,116 @@ class Store:
         except (OSError, ValueError):
             return dict.fromkeys(samples, False)
 
+    def begun(self) -> list[int]:
+        """Return the shards of which there are files, in order; of the others no sample is built yet."""
+        listed = {*disk.names(self.path / "done" / "c"), *disk.names(self.path / "image" / "c")}
+        numbers = {int(name) for name in listed if name.isascii() and name.isdecimal()}
+        return sorted(n for n in numbers if n < self.shards)
+
     def finished(self) -> int:
         """How many samples say that they are finished."""
-        return sum(sum(self.done(n).values()) for n in range(self.shards))
+        return sum(sum(self.done(n).values()) for n in self.begun())
+
+    def file_name(self, name: str, number: int) -> str:
+        """Return the name below the store of the file of a shard: of a layer its chunks, of a scalar its one
+        chunk."""
+        return "/".join([name, "c", str(number), *("0" for _ in self.spec.arrays[name].dims[1:])])
 
     def file(self, name: str, number: int) -> Path:
-        """The file of a shard: of a layer its chunks, of a scalar its one chunk."""
-        row = self.spec.arrays[name]
-        return self.path.joinpath(name, "c", str(number), *("0" for _ in row.dims[1:]))
+        """Return the path of the file of a shard."""
+        return self.path / self.file_name(name, number)
 
     def chunk(self, name: str, number: int) -> dict[int, bytes]:
         """Sample → compressed bytes of a layer's shard. Raises ValueError or OSError where it is damaged."""
         if self.spec.empty(name):
             return dict.fromkeys(self.shard(number), b"")
         size = self.spec.shard_samples
-        chunks = split_shard(self.file(name, number).read_bytes(), size)
+        chunks = split_shard(disk.read(self.file(name, number)), size)
         return {number * size + i: chunk for i, chunk in chunks.items()}
 
-    def write_shard(self, number: int, given: Mapping[int, Encoded]) -> None:
+    def write_shard(self, number: int, given: Mapping[int, Encoded], damaged: Collection[int] = ()) -> set[int]:
         """Write a shard: the `given` samples, and those that were finished before, unchanged.
 
-        `done` comes last. Raises VbnfaultError where the disk refuses.
+        `damaged` samples are not kept. `done` comes last.
+
+        Returns
+        -------
+        set of int
+            Samples that said they were finished, but could not be kept because their files are damaged.
+
+        Raises
+        ------
+        VbnfaultError
+            The disk refuses.
         """
-        samples, size = self.shard(number), self.spec.shard_samples
-        first, last = samples.start, samples.stop - 1
-        with disk(self.path, f"writing samples {first}-{last}"):
-            done = self.done(number)
-            if any(done[i] for i in given):
-                self._put_column("done", number, {i: done[i] and i not in given for i in samples})
-            kept = {i for i in samples if done[i] and i not in given}
-            for name in self.spec.pixel_layers:
-                if self.spec.empty(name):
-                    continue
-                old: dict[int, bytes] = {}
-                if kept:
-                    with contextlib.suppress(ValueError, FileNotFoundError):
-                        old = self.chunk(name, number)
-                kept &= set(old)
-                chunks = {i: given[i].chunks[name] if i in given else old[i] for i in {*given, *kept}}
-                shard = join_shard({i - first: chunk for i, chunk in chunks.items()}, size)
-                put(self.file(name, number), shard)
-            for name in (*SCALARS, "crc32c"):
+        samples = self.shard(number)
+        others = {i for i in samples if i not in given and i not in damaged}
+        with disk.explained(self.path, f"writing samples {samples.start}-{samples.stop - 1}"):
+            finished = self._finished(number, strict=bool(others))
+            wished = finished & others
+            if finished - wished:
+                self._write_done(number, wished)
+            kept, chunks, columns = self._kept(number, wished)
+            disk.write(self.path, self._shard_files(number, given, kept, chunks, columns))
+            self._write_done(number, {*given, *kept})
+        return wished - kept
+
+    def _finished(self, number: int, *, strict: bool) -> set[int]:
+        """Return the samples of a shard that say they are finished; all where that cannot be read, or, if `strict`,
+        raise OSError: to take them for unfinished could lose them."""
+        samples = self.shard(number)
+        try:
+            column = self.column("done", number).astype(bool)
+        except FileNotFoundError:
+            return set()
+        except _DAMAGE:
+            return set() if strict else set(samples)
+        except OSError:
+            if strict:
+                raise
+            return set(samples)
+        return {i for i, done in zip(samples, column.tolist(), strict=True) if done}
+
+    def _write_done(self, number: int, finished: set[int]) -> None:
+        data = self._column_bytes("done", number, {i: i in finished for i in self.shard(number)})
+        disk.write(self.path, [(self.file_name("done", number), data)])
+
+    def _kept(
+        self, number: int, wished: set[int]
+    ) -> tuple[set[int], dict[str, dict[int, bytes]], dict[str, NDArray[Any]]]:
+        """Return which of the `wished` samples can be kept, their chunks by layer, and the columns of scalars."""
+        chunks: dict[str, dict[int, bytes]] = {}
+        columns: dict[str, NDArray[Any]] = {}
+        try:
+            for name in (*SCALARS, "crc32c") if wished else ():
+                columns[name] = self.column(name, number)
+            for name in self.spec.pixel_layers if wished else ():
+                chunks[name] = self.chunk(name, number)
+                wished = wished & set(chunks[name])
+        except _DAMAGE:
+            return set(), {}, {}
+        return wished, chunks, columns
+
+    def _shard_files(
+        self,
+        number: int,
+        given: Mapping[int, Encoded],
+        kept: set[int],
+        chunks: Mapping[str, Mapping[int, bytes]],
+        columns: Mapping[str, NDArray[Any]],
+    ) -> Iterator[tuple[str, bytes]]:
+        """Yield every file of a shard but `done`."""
+        first = self.shard(number).start
+        for name in self.spec.pixel_layers:
+            if not self.spec.empty(name):
+                held = {i: e.chunks[name] for i, e in given.items()} | {i: chunks[name][i] for i in kept}
+                shard = join_shard({i - first: chunk for i, chunk in held.items()}, self.spec.shard_samples)
+                yield self.file_name(name, number), shard
+        for name in (*SCALARS, "crc32c"):
+            if not self.spec.empty(name):
                 values = {i: e.crc32c if name == "crc32c" else e.scalars[name] for i, e in given.items()}
-                if kept:
-                    try:
-                        column = self.column(name, number)
-                    except (OSError, ValueError):
-                        kept = set()
-                    values |= {i: column[i - first] for i in kept}
-                self._put_column(name, number, values)
-            self._put_column("done", number, {i: i in given or i in kept for i in samples})
+                values |= {i: columns[name][i - first] for i in kept}
+                yield self.file_name(name, number), self._column_bytes(name, number, values)
 
 
 # --- create, open, write ----------------------------------------------------------------------------------
@@ -222,106 +281,199 @@ def create(path: str | os.PathLike[str], spec: StoreSpec, samples: int, *, overw
     above = next(p for p in target.absolute().parents if p.exists())
     if not above.is_dir():
         raise InputError(f"{target}: no store can be created here: {above} is a file, not a folder")
-    hidden = target.absolute().parent / f".{target.name}.{uuid.uuid4().hex}.partial"
     try:
-        hidden.parent.mkdir(parents=True, exist_ok=True)
-        for leftover in hidden.parent.glob(f".{target.name}.*.partial"):
-            shutil.rmtree(leftover, ignore_errors=True)
-        _create_group(hidden, spec, samples)
-        if old:
-            retired = hidden.with_name(f".{target.name}.{uuid.uuid4().hex}.partial")
-            os.replace(target, retired)
-            os.replace(hidden, target)
-            shutil.rmtree(retired, ignore_errors=True)
-        else:
-            if target.is_dir():
-                target.rmdir()
-            os.replace(hidden, target)
+        target.absolute().parent.mkdir(parents=True, exist_ok=True)
+        _remove_abandoned(target.absolute())
+        with _hidden_folder(target.absolute()) as hidden:
+            disk.write(hidden, _group_files(spec, samples))
+            _replace(hidden, target.absolute(), old=old)
     except OSError as error:
-        shutil.rmtree(hidden, ignore_errors=True)
         raise InputError(f"{target}: no store can be created here: {error.strerror or error}") from error
     return open_store(target, "r+")
 
 
-def _create_group(path: Path, spec: StoreSpec, samples: int) -> None:
-    attributes = {
-        **json.loads(json.dumps(spec.attributes)),
-        "format": "vbnfault",
-        "format_version": FORMAT_VERSION,
-        "store": json.loads(json.dumps(spec.plain())),
-        "samples": samples,
-        "coordinates": "wavelength_nm",  # makes xarray show it as a coordinate of `band`
-    }
-    group = zarr.open_group(path, mode="w-", zarr_format=3, attributes=attributes)
-    for name, member in spec.members(samples).items():
-        _create_array(group, name, member)
-    consolidate(path)
+def _group_files(spec: StoreSpec, samples: int) -> Iterator[tuple[str, bytes]]:
+    """Yield every file of an empty store, the root last."""
+    members, attributes = spec.members(samples), root_attributes(spec, samples)
+    arrays = array_documents(members)
+    for name, member in members.items():
+        yield f"{name}/{DOCUMENT}", to_bytes(arrays[name])
+        for chunk, values in coordinate_chunks(member):
+            yield f"{name}/{chunk}", encode_values(values)
+    yield f"{SPARE}/{DOCUMENT}", to_bytes(group_document(attributes))
+    yield DOCUMENT, to_bytes(group_document(attributes, arrays))
 
 
-def _create_array(group: zarr.Group, name: str, member: Member) -> None:
-    """Write the metadata of an array, and the values of a coordinate; data files that exist stay."""
-    array = group.create_array(
-        name,
-        shape=member.shape,
-        chunks=member.chunks,
-        shards=member.shards,
-        dtype=str if member.dtype == "str" else member.dtype,
-        fill_value=member.fill,
-        compressors=ZstdCodec(level=ZSTD_LEVEL, checksum=True),
-        dimension_names=member.dims,
-        attributes=dict(member.attributes),
-    )
-    if member.values is not None and len(member.values):
-        array[:] = member.values if isinstance(member.values, np.ndarray) else list(member.values)
-
-
-def consolidate(path: Path) -> None:
-    """Gather all metadata in the root, where xarray looks first (it warns where there is none)."""
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", message="Consolidated metadata", category=UserWarning)
-        zarr.consolidate_metadata(path, zarr_format=3)
-
-
-def consolidated_metadata(path: Path) -> dict[str, Any] | None:
-    """Array name → what the root says its metadata are; None where the root does not say, or says nonsense."""
+def _replace(hidden: Path, target: Path, *, old: bool) -> None:
+    """Give a new store its name, durably; an `old` one makes way, and comes back where that fails."""
+    if not old:
+        if target.is_dir():
+            target.rmdir()
+        disk.rename(hidden, target)
+        return
+    retired = _hidden_name(target)
+    disk.rename(target, retired)
     try:
-        entries = json.loads((path / "zarr.json").read_text())["consolidated_metadata"]["metadata"]
-    except (OSError, ValueError, KeyError, TypeError):
-        return None
-    return entries if isinstance(entries, dict) else None
+        disk.rename(hidden, target)
+    except OSError:
+        if not target.exists():
+            disk.rename(retired, target)
+        raise
+    with contextlib.suppress(OSError):
+        disk.remove_tree(retired)
 
 
-def _root(path: Path) -> dict[str, Any] | None:
-    """Root attributes of a vbnfault store, None where there is none."""
+# --- folders in which a store is created before it has its name --------------------------------------------
+#
+# Whoever works in one holds a lock on it, which ends with the process: one that can be locked is abandoned. Where
+# the file system has no locks, nobody can tell, and they are left alone.
+
+
+def _hidden_name(target: Path) -> Path:
+    return target.with_name(f".{target.name}.{uuid.uuid4().hex}{disk.PARTIAL}")
+
+
+@contextlib.contextmanager
+def _hidden_folder(target: Path) -> Iterator[Path]:
+    """Give a new, locked folder beside `target`; what is still there at the end is removed."""
+    while True:
+        folder = _hidden_name(target)
+        os.mkdir(folder)
+        lock = _lock_folder(folder, wait=True)
+        if folder.is_dir():  # else another process took it for abandoned before it was locked
+            break
+        _unlock_folder(lock)
     try:
-        meta = json.loads((path / "zarr.json").read_text())
-        attributes = meta["attributes"]
-    except (OSError, ValueError, KeyError, TypeError):
+        yield folder
+    finally:
+        with contextlib.suppress(OSError):
+            disk.remove_tree(folder)
+        _unlock_folder(lock)
+
+
+def _remove_abandoned(target: Path) -> None:
+    """Remove the folders of killed processes that were creating a store of this name."""
+    own = re.compile(rf"\.{re.escape(target.name)}\.[0-9a-f]{{32}}{re.escape(disk.PARTIAL)}")
+    for name in disk.names(target.parent):
+        folder = target.with_name(name)
+        if own.fullmatch(name) and folder.is_dir() and not folder.is_symlink():
+            lock = _lock_folder(folder, wait=False)
+            if lock is not None:
+                with contextlib.suppress(OSError):
+                    disk.remove_tree(folder)
+                _unlock_folder(lock)
+
+
+def _lock_folder(folder: Path, *, wait: bool) -> int | None:
+    """Return what `_unlock_folder` takes; None where another process holds it, or where there are no locks."""
+    try:
+        import fcntl
+
+        lock = os.open(folder, os.O_RDONLY)
+    except (ImportError, OSError):
         return None
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
+    except OSError:
+        os.close(lock)
+        return None
+    return lock
+
+
+def _unlock_folder(lock: int | None) -> None:
+    if lock is not None:
+        os.close(lock)
+
+
+# --- the root and its spare --------------------------------------------------------------------------------
+
+
+class Root(NamedTuple):
+    """The root attributes of a store, and what is wrong with the files that hold them."""
+
+    attributes: dict[str, Any]
+    problems: tuple[str, ...]
+
+
+def read_document(path: Path) -> dict[str, Any] | None:
+    """Return the JSON object in a file, None where there is none that can be read."""
+    try:
+        document = json.loads(disk.read(path))
+    except (OSError, ValueError, RecursionError):
+        return None
+    return document if isinstance(document, dict) else None
+
+
+def _attributes_in(path: Path) -> dict[str, Any] | None:
+    """Return the root attributes that a group's document holds, sealed or not; None where it holds none."""
+    attributes = (read_document(path) or {}).get("attributes")
     return attributes if isinstance(attributes, dict) and attributes.get("format") == "vbnfault" else None
+
+
+def read_root(path: Path) -> Root | None:
+    """Return the root attributes of the store at `path`; None where there is none that can be believed.
+
+    The spare is believed where it is whole: it is written before the root, and so is the later one.
+    """
+    files = {DOCUMENT: path / DOCUMENT, f"{SPARE}/{DOCUMENT}": path / SPARE / DOCUMENT}
+    attributes = {name: _attributes_in(file) for name, file in files.items()}
+    whole = {name: value for name, value in attributes.items() if value is not None and is_sealed(value)}
+    if not whole:
+        # made before there were checksums
+        root = attributes[DOCUMENT]
+        if root is None or CHECKSUM in root or (path / SPARE).exists():
+            return None
+        return Root(root, (f"{DOCUMENT} has no checksum and no spare copy",))
+    problems = [
+        f"{name} is {'damaged' if os.path.lexists(files[name]) else 'missing'}; {other} has the same attributes"
+        for name, other in (tuple(files), tuple(reversed(files)))
+        if name not in whole
+    ]
+    if len(whole) == 2 and len({value[CHECKSUM] for value in whole.values()}) == 2:
+        problems.append(f"{DOCUMENT} is older than {SPARE}/{DOCUMENT}: a change of the attributes was interrupted")
+    return Root(whole.get(f"{SPARE}/{DOCUMENT}") or whole[DOCUMENT], tuple(problems))
 
 
 def is_store(path: str | os.PathLike[str]) -> bool:
     """Is there a vbnfault store at this path?"""
-    return _root(Path(path)) is not None
+    return read_root(Path(path)) is not None
 
 
 def open_store(path: str | os.PathLike[str] | Store, mode: str = "r") -> Store:
-    """Open a store, `r` or `r+`. Raises InputError where the path holds none, or one of a newer format."""
+    """Open a store, `r` or `r+`; where its root is damaged, by the spare, with a warning.
+
+    Raises InputError where the path holds none, or one of a newer format.
+    """
     if isinstance(path, Store):
         return path
     path = Path(path)
-    attributes = _root(path)
-    if attributes is None:
-        what = "is no vbnfault store" if path.exists() else "no such store"
-        raise InputError(f"{path}: {what}")
-    if attributes["format_version"] > FORMAT_VERSION:
+    root = read_root(path)
+    if root is None:
+        raise InputError(f"{path}: {_why_no_store(path)}")
+    try:
+        version = int(root.attributes["format_version"])
+        store = Store(path, root.attributes, mode)
+    except (KeyError, TypeError, ValueError, VbnfaultError) as error:
+        raise InputError(f"{path}: is no vbnfault store: its root attributes are not those of one") from error
+    if version > FORMAT_VERSION:
         raise InputError(
-            f"{path}: format_version = {attributes['format_version']}: "
-            f"this vbnfault reads up to {FORMAT_VERSION}; install a newer one"
+            f"{path}: format_version = {version}: this vbnfault reads up to {FORMAT_VERSION}; install a newer one"
         )
-    group = zarr.open_group(path, mode="r+" if mode == "r+" else "r", zarr_format=3, use_consolidated=False)
-    return Store(path, group, attributes)
+    if mode == "r":
+        for problem in root.problems:
+            warnings.warn(f"{path}: {problem}; the build command mends it", UserWarning, stacklevel=2)
+    return store
+
+
+def _why_no_store(path: Path) -> str:
+    if not path.exists():
+        return "no such store"
+    if (path / SPARE / DOCUMENT).exists():
+        return (
+            f"{DOCUMENT} and its copy {SPARE}/{DOCUMENT} are both damaged; put a copy of either in its place, "
+            "or choose another --out"
+        )
+    return "is no vbnfault store"
 
 
 def write_samples(store: str | os.PathLike[str] | Store, samples: Iterable[Sample | Encoded]) -> None:

@@ -4,102 +4,129 @@ from __future__ import annotations
 
 import json
 import os
-import shutil
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import zarr
+from numpy.typing import NDArray
 
-from ..errors import InputError, VbnfaultError
-from .group import Store, consolidate, consolidated_metadata, disk, open_store
+from ..errors import InputError
+from . import disk
+from .group import Store, open_store, read_document, read_root
+from .layout import (
+    DOCUMENT,
+    SPARE,
+    array_documents,
+    canonical,
+    coordinate_chunks,
+    decode_values,
+    encode_values,
+    group_document,
+    sealed,
+    to_bytes,
+)
 from .schema import Member
 
 
 def metadata_problems(store: Store) -> tuple[list[str], bool]:
-    """What of the arrays' layout, attributes and coordinates is not as the spec says, one sentence each; and
-    whether samples cannot be looked at before that is mended."""
-    problems: list[str] = []
-    sound: list[str] = []
+    """Return what of the root, the arrays' metadata and the coordinates is not as the schema says, one sentence
+    each; and whether samples cannot be looked at before that is mended."""
+    root = read_root(store.path)
+    problems = list(root.problems) if root is not None else [f"{DOCUMENT} and {SPARE}/{DOCUMENT} are damaged"]
     hopeless = False
-    for name, member in store.spec.members(store.samples).items():
-        try:
-            array = store.array(name)
-        except VbnfaultError:
+    members = store.spec.members(store.samples)
+    documents = array_documents(members)
+    sound = {}
+    for name, member in members.items():
+        is_coordinate = member.values is not None
+        stored = read_document(store.path / name / DOCUMENT)
+        if stored is None:
             problems.append(store.why_closed(name))
-            hopeless |= member.values is None
+            hopeless |= not is_coordinate
             continue
-        misshapen = list(_misshapen(array, member))
-        if member.values is None and not misshapen and array.shape != member.shape:
+        found = list(_differences(stored, documents[name]))
+        if not is_coordinate and _samples_of(stored) not in (None, store.samples):
             problems.append(
-                f"{name} holds {array.shape[0]} samples, not {store.samples}: appending was interrupted, "
+                f"{name} holds {_samples_of(stored)} samples, not {store.samples}: appending was interrupted, "
                 f"the build command resumes it"
             )
-            hopeless = True
-        hopeless |= member.values is None and bool(misshapen)
-        found = misshapen + [*_misnamed(array, member)] + ([] if misshapen else [*_misvalued(array, member)])
-        problems += [f"array {name}: {what}" for what in found]
+        else:
+            problems += [f"array {name}: {what}" for what in found]
+        # of other attributes the data files know nothing
+        hopeless |= not is_coordinate and any(not what.startswith("its attribute") for what in found)
         if not found:
-            sound.append(name)
-    return problems + list(_misconsolidated(store, sound)), hopeless
+            sound[name] = documents[name]
+            problems += [f"array {name}: {what}" for what in _misvalued(store.path / name, member)]
+    return problems + list(_root_differences(store, sound, documents)), hopeless
 
 
-def _misshapen(array: zarr.Array[Any], member: Member) -> Iterator[str]:
-    """What of an array's layout is not as it must be, the number of samples left out."""
-    is_text = array.dtype.kind in "OTU"
-    layout: dict[str, tuple[Any, Any]] = {
-        "dims": (tuple(getattr(array.metadata, "dimension_names", None) or ()), member.dims),
-        "dtype": ("str" if is_text else array.dtype.name, member.dtype),
-    }
-    if member.values is None:
-        layout["shape of a sample"] = array.shape[1:], member.shape[1:]
-        layout["chunks"] = array.chunks, member.chunks
-        layout["shards"] = array.shards, member.shards
-    for what, (stored, wanted) in layout.items():
-        if stored != wanted:
-            yield f"its {what} = {short(stored)}, not {short(wanted)}"
+def _samples_of(document: Mapping[str, Any]) -> int | None:
+    """Return the number of samples of an array's document, None where it does not say."""
+    shape = document.get("shape")
+    return shape[0] if isinstance(shape, list) and shape and type(shape[0]) is int else None
 
 
-def _misnamed(array: zarr.Array[Any], member: Member) -> Iterator[str]:
-    """Which attributes that carry meaning are not as they must be."""
-    for key, wanted in member.attributes.items():
-        stored = array.attrs.get(key)
-        if key != "long_name" and stored != wanted:
-            yield f"its attribute {key} = {short(stored)}, not {short(wanted)}"
+def _differences(stored: Mapping[str, Any], wanted: Mapping[str, Any]) -> Iterator[str]:
+    """Yield which keys, and which attributes, of an array's document are not as they must be."""
+    for key in {**wanted, **stored}:
+        a, b = stored.get(key, _ABSENT), wanted.get(key, _ABSENT)
+        if isinstance(a, dict) and isinstance(b, dict) and key == "attributes":
+            for name in {**b, **a}:
+                if _differ(a.get(name, _ABSENT), b.get(name, _ABSENT)):
+                    yield f"its attribute {name} = {short(a.get(name))}, not {short(b.get(name))}"
+        elif _differ(a, b):
+            yield f"its {key} = {short(a)}, not {short(b)}"
 
 
-def _misvalued(array: zarr.Array[Any], member: Member) -> Iterator[str]:
-    """What of a coordinate's values is not as it must be."""
-    if member.values is None:
-        return
+_ABSENT = "absent"
+
+
+def _differ(a: Any, b: Any) -> bool:
+    return canonical(a) != canonical(b)
+
+
+def _misvalued(folder: Path, member: Member) -> Iterator[str]:
+    """Yield what of a coordinate's values is not as it must be."""
+    for chunk, wanted in coordinate_chunks(member):
+        stored = _values_in(folder / chunk, member.dtype)
+        if stored is None or stored.shape != wanted.shape:
+            yield f"its values in {folder.name}/{chunk} are missing or cannot be decoded"
+        elif not np.array_equal(stored, wanted):
+            first = next(i for i, (a, b) in enumerate(zip(stored, wanted, strict=True)) if a != b)
+            number = int(chunk.removeprefix("c/")) * member.chunks[0] + first
+            yield f"its value {number} is {short(stored[first])}, not {short(wanted[first])}"
+
+
+def _values_in(file: Path, dtype: str) -> NDArray[Any] | None:
     try:
-        stored = np.asarray(array[:])
-    except Exception:  # zarr raises many kinds for chunks that it cannot decode
-        yield "its values cannot be decoded"
-        return
-    if stored.shape != member.shape:
-        yield f"it has the shape {list(stored.shape)}, not {list(member.shape)}"
-    elif not np.array_equal(stored, np.asarray(member.values, dtype=stored.dtype)):
-        first = next(i for i, (a, b) in enumerate(zip(stored, member.values, strict=True)) if a != b)
-        yield f"its value {first} is {short(stored[first])}, not {short(member.values[first])}"
+        return decode_values(disk.read(file), dtype)
+    except (OSError, ValueError):
+        return None
 
 
-def _misconsolidated(store: Store, names: list[str]) -> Iterator[str]:
-    """What the consolidated metadata say of the arrays `names`, or of arrays outside the schema, that the arrays
-    themselves do not say: readers look into the consolidated ones first."""
-    consolidated = consolidated_metadata(store.path)
-    if consolidated is None:
-        yield "zarr.json holds no consolidated metadata"
+def _root_differences(
+    store: Store, sound: Mapping[str, Any], documents: Mapping[str, Mapping[str, Any]]
+) -> Iterator[str]:
+    """Yield what the root's document says, beside attributes, that it must not say: readers look into its
+    consolidated metadata first. Arrays that are not `sound` have a sentence of their own."""
+    root = read_document(store.path / DOCUMENT)
+    if root is None:
         return
-    foreign = consolidated.keys() - store.spec.members(store.samples).keys()
-    for name in (*names, *sorted(foreign)):
-        try:
-            own = json.loads((store.path / name / "zarr.json").read_text())
-        except (OSError, ValueError):
-            own = None
-        if own is None or consolidated.get(name) != own:
-            yield f"array {name}: the consolidated metadata in zarr.json differ from {name}/zarr.json"
+    wanted = group_document(root.get("attributes") or {}, documents)
+    consolidated = root.get("consolidated_metadata")
+    entries = consolidated.get("metadata") if isinstance(consolidated, dict) else None
+    if not isinstance(entries, dict):
+        yield f"{DOCUMENT} holds no consolidated metadata"
+        return
+    for name in (*sound, *sorted(entries.keys() - documents.keys())):
+        if name not in documents or name not in entries or _differ(entries[name], documents[name]):
+            yield f"array {name}: the consolidated metadata in {DOCUMENT} differ from {name}/{DOCUMENT}"
+    for document in (root, wanted):
+        del document["consolidated_metadata"]["metadata"]
+    for key in {**wanted, **root}:
+        if _differ(root.get(key, _ABSENT), wanted.get(key, _ABSENT)):
+            yield f"{DOCUMENT}: its {key} = {short(root.get(key))}, not {short(wanted.get(key))}"
 
 
 def short(value: Any) -> str:
@@ -113,54 +140,59 @@ def append_samples(
 ) -> Store:
     """Grow a store by `count` unfinished samples, with further root attributes, and open it again.
 
-    Earlier samples keep their bits. A kill half-way is mended by `recover`.
+    Earlier samples keep their bits. The arrays grow first: a kill before the spare is written leaves the store as
+    it was, one after that leaves it grown, once it is recovered.
     """
     store = open_store(store, "r+")
     if count < 1:
         raise InputError(f"append = {count}: must be at least 1")
-    with disk(store.path, f"adding {count} samples"):
-        store.update_attributes({**(attributes or {}), "samples": store.samples + count})
-    return recover(store.path)
+    values = json.loads(json.dumps(attributes or {}))
+    with disk.explained(store.path, f"adding {count} samples"):
+        _bring_to(store, {**store.root_attributes, **values, "samples": store.samples + count})
+    return open_store(store.path, "r+")
 
 
 def recover(path: str | os.PathLike[str]) -> Store:
     """Open a store for writing after whatever happened to it; only while nothing else writes to it.
 
-    Removes the `*.partial` files of a killed process and brings every array to the length that the root says,
-    its layout and attributes and all coordinates to what the root's spec says. Arrays that are missing are made
-    again, unwritten.
+    Removes the `*.partial` files of a killed process, and brings root, spare, the metadata of every array and all
+    coordinates to what the attributes say. Arrays that are missing are made again, unwritten.
     """
     store = open_store(path, "r+")
-    with disk(store.path, "recovering the store"):
-        for folder, _, files in os.walk(store.path):
-            for name in files:
-                if name.endswith(".partial"):
-                    Path(folder, name).unlink(missing_ok=True)
-        for name, member in store.spec.members(store.samples).items():
-            _mend(store, name, member)
-        consolidate(store.path)
+    with disk.explained(store.path, "recovering the store"):
+        disk.remove_partials(store.path)
+        _bring_to(store, store.root_attributes)
     return open_store(store.path, "r+")
 
 
-def _mend(store: Store, name: str, member: Member) -> None:
-    """Bring the metadata of an array, and the values of a coordinate, to what they must be."""
-    folder = store.path / name
-    try:
-        array: zarr.Array[Any] | None = store.array(name)
-    except VbnfaultError:
-        array = None
-    if array is not None:
-        sound = not any(_misshapen(array, member)) and not any(_misvalued(array, member))
-        if sound and any(_misnamed(array, member)):
-            array.update_attributes(member.attributes)
-        if sound and array.shape != member.shape:
-            array.resize(member.shape)
-        if sound:
-            return
-    if not folder.is_dir():
-        folder.unlink(missing_ok=True)
-    elif member.values is not None:
-        shutil.rmtree(folder)
-    else:
-        (folder / "zarr.json").unlink(missing_ok=True)
-    store.make_array(name, member)
+def _bring_to(store: Store, attributes: Mapping[str, Any]) -> None:
+    """Write what differs of the metadata and the coordinates: arrays, then spare, then root."""
+    attributes = sealed(attributes)
+    members = store.spec.members(int(attributes["samples"]))
+    documents = array_documents(members)
+    disk.write(store.path, _outdated_arrays(store.path, members, documents))
+    for name, document in (
+        (f"{SPARE}/{DOCUMENT}", group_document(attributes)),
+        (DOCUMENT, group_document(attributes, documents)),
+    ):
+        disk.write(store.path, _outdated(store.path, {name: document}))
+
+
+def _outdated_arrays(
+    path: Path, members: Mapping[str, Member], documents: Mapping[str, Mapping[str, Any]]
+) -> Iterator[tuple[str, bytes]]:
+    """Yield the files of arrays and coordinates that are not as they must be."""
+    for name, member in members.items():
+        for chunk, wanted in coordinate_chunks(member):
+            stored = _values_in(path / name / chunk, member.dtype)
+            if stored is None or not np.array_equal(stored, wanted):
+                yield f"{name}/{chunk}", encode_values(wanted)
+        yield from _outdated(path, {f"{name}/{DOCUMENT}": documents[name]})
+
+
+def _outdated(path: Path, documents: Mapping[str, Mapping[str, Any]]) -> Iterator[tuple[str, bytes]]:
+    """Yield the files of documents that are not as they must be."""
+    for name, wanted in documents.items():
+        stored = read_document(path / name)
+        if stored is None or _differ(stored, wanted):
+            yield name, to_bytes(wanted)

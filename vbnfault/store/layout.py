@@ -1,0 +1,150 @@
+"""The metadata of a store as JSON documents, and the values of its coordinates as chunk files.
+
+Made from the schema alone, so that every key of every `zarr.json` can be compared with what it must be, and mended.
+The documents follow the Zarr v3 specification and are what zarr 3.1 writes. Nothing here touches a file.
+
+The root attributes hold `attributes_sha256`, a checksum over themselves. Readers that damage must not stop find the
+same attributes in the group `spare`, which the consolidated metadata leave out: it holds no data.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import numpy as np
+from numcodecs import VLenUTF8
+from numpy.typing import NDArray
+
+from .codec import ZSTD_LEVEL, compress, decompress
+from .schema import FORMAT_VERSION, Member, StoreSpec
+
+DOCUMENT = "zarr.json"
+SPARE = "spare"
+CHECKSUM = "attributes_sha256"
+# root attributes that are the store's own, not the user's
+OWN_ATTRIBUTES = ("store", "samples", "coordinates", CHECKSUM)
+
+_ZSTD = {"name": "zstd", "configuration": {"level": ZSTD_LEVEL, "checksum": True}}
+_LITTLE_ENDIAN = {"name": "bytes", "configuration": {"endian": "little"}}
+
+
+def canonical(value: Any) -> str:
+    """Return JSON that is the same for equal values, however they were written: 1, 1.0 and true differ."""
+    return json.dumps(value, sort_keys=True, separators=(",", ":"))
+
+
+def to_bytes(document: Mapping[str, Any]) -> bytes:
+    """Return the content of the file of a document."""
+    return json.dumps(document, indent=2).encode()
+
+
+def sealed(attributes: Mapping[str, Any]) -> dict[str, Any]:
+    """Return root attributes with the checksum over them."""
+    plain = {key: value for key, value in attributes.items() if key != CHECKSUM}
+    return {**plain, CHECKSUM: hashlib.sha256(canonical(plain).encode()).hexdigest()}
+
+
+def is_sealed(attributes: Mapping[str, Any]) -> bool:
+    """Return whether root attributes match the checksum that they hold."""
+    return attributes.get(CHECKSUM) == sealed(attributes)[CHECKSUM]
+
+
+def root_attributes(spec: StoreSpec, samples: int) -> dict[str, Any]:
+    """Return the attributes of the root of a new store."""
+    return sealed(
+        {
+            **json.loads(json.dumps(spec.attributes)),
+            "format": "vbnfault",
+            "format_version": FORMAT_VERSION,
+            "store": json.loads(json.dumps(spec.plain())),
+            "samples": samples,
+            "coordinates": "wavelength_nm",  # makes xarray show it as a coordinate of `band`
+        }
+    )
+
+
+def array_documents(members: Mapping[str, Member]) -> dict[str, dict[str, Any]]:
+    """Return array name → the content of its `zarr.json`."""
+    return {name: _array_document(member) for name, member in members.items()}
+
+
+def _array_document(member: Member) -> dict[str, Any]:
+    is_text = member.dtype == "str"
+    wide = not is_text and np.dtype(member.dtype).itemsize > 1
+    values = (
+        {"name": "vlen-utf8", "configuration": {}} if is_text else _LITTLE_ENDIAN if wide else {"name": "bytes"}
+    )
+    codecs: list[dict[str, Any]] = [values, _ZSTD]
+    if member.shards is not None:
+        sharding = {
+            "chunk_shape": list(member.chunks),
+            "codecs": codecs,
+            "index_codecs": [_LITTLE_ENDIAN, {"name": "crc32c"}],
+            "index_location": "end",
+        }
+        codecs = [{"name": "sharding_indexed", "configuration": sharding}]
+    document = {
+        "shape": list(member.shape),
+        "data_type": "string" if is_text else member.dtype,
+        "chunk_grid": {"name": "regular", "configuration": {"chunk_shape": list(member.shards or member.chunks)}},
+        "chunk_key_encoding": {"name": "default", "configuration": {"separator": "/"}},
+        "fill_value": _fill_value(member),
+        "codecs": codecs,
+        "attributes": json.loads(json.dumps(member.attributes)),
+        "dimension_names": list(member.dims),
+        "zarr_format": 3,
+        "node_type": "array",
+        "storage_transformers": [],
+    }
+    return json.loads(json.dumps(document))  # no part shared with another document
+
+
+def _fill_value(member: Member) -> Any:
+    if member.dtype == "str":
+        return str(member.fill)
+    plain = np.dtype(member.dtype).type(member.fill).item()
+    return "NaN" if plain != plain else plain
+
+
+def group_document(
+    attributes: Mapping[str, Any], arrays: Mapping[str, Mapping[str, Any]] | None = None
+) -> dict[str, Any]:
+    """Return the content of a group's `zarr.json`; of the root with the documents of all `arrays`, where zarr and
+    xarray look first."""
+    document: dict[str, Any] = {"attributes": dict(attributes), "zarr_format": 3}
+    if arrays is not None:
+        metadata = {name: arrays[name] for name in sorted(arrays)}
+        document["consolidated_metadata"] = {"kind": "inline", "must_understand": False, "metadata": metadata}
+    return {**document, "node_type": "group"}
+
+
+def coordinate_chunks(member: Member) -> Iterator[tuple[str, NDArray[Any]]]:
+    """Yield the name below its array's folder, and the values, of each chunk of a coordinate."""
+    if member.values is None or not len(member.values):
+        return
+    (size,) = member.chunks
+    is_text = member.dtype == "str"
+    for number, start in enumerate(range(0, len(member.values), size)):
+        part = member.values[start : start + size]
+        values = np.full(size, member.fill, dtype=object if is_text else member.dtype)
+        values[: len(part)] = part
+        yield f"c/{number}", values
+
+
+def encode_values(values: NDArray[Any]) -> bytes:
+    """Return the chunk file of numbers, or of texts (dtype object)."""
+    return compress(VLenUTF8().encode(values) if values.dtype == object else values)
+
+
+def decode_values(data: bytes, dtype: str) -> NDArray[Any]:
+    """Return the values, flat, of a chunk file. Raises ValueError where it is damaged."""
+    plain = decompress(data)
+    if dtype != "str":
+        return np.frombuffer(plain, dtype=dtype)
+    try:
+        return np.asarray(VLenUTF8().decode(plain))
+    except Exception as error:  # the codec raises many kinds for lengths that cannot be
+        raise ValueError(str(error)) from error
