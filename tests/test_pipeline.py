@@ -11,7 +11,6 @@ import pytest
 from conftest import ALL_FAULTS, small_scene
 
 from vbnfault import config, frames, labels, pipeline, plan, resources
-from vbnfault.faults.straylight import flare_centres_px
 from vbnfault.pictures import develop, effect_of
 from vbnfault.pipeline import Session
 from vbnfault.record import to_sample
@@ -75,17 +74,58 @@ def test_broken_lines_are_whole_lines_of_their_value(frames_: list[Frame]) -> No
 
 
 def test_flares_lie_on_the_line_from_the_sun_through_the_centre(frames_: list[Frame]) -> None:
+    # the light itself is looked at, one flare at a time, and the line comes from the pose alone
     checked = 0
     for frame in frames_:
         if "straylight" not in frame.drawn:
             continue
-        sun, centre = frame.context.sun_xy_px, np.array([48.0, 40.0])
+        pose, fault, params = frame.pose, frame.spec.faults["straylight"], frame.drawn["straylight"]
+        fx, fy, cx, cy = frame.camera.intrinsics
+        x, y, z = pose.L_from_C.T @ pose.sun_L
+        sun, centre = np.array([fx * x / z + cx, fy * y / z + cy]), np.array([48.0, 40.0])
         along = (centre - sun) / np.linalg.norm(centre - sun)
-        centres = flare_centres_px(frame.drawn["straylight"], sun)
-        offset = (centres - sun) @ np.array([-along[1], along[0]])
-        np.testing.assert_allclose(offset, 0, atol=0.5)
-        checked += 1
+        dark = frame.rate.with_array(np.zeros_like(frame.rate.array))
+        for flare in params["flares"]:
+            alone = {**params, "flares": [flare], "glare": None}
+            light = fault.apply(dark, alone, frame.context).array[..., 1].astype(float)
+            rows, columns = np.nonzero(light > 1e-3 * max(light.max(), 1e-30))
+            if len(rows) < 20 or rows.min() == 0 or columns.min() == 0 or rows.max() == 79 or columns.max() == 95:
+                continue  # cut by the frame, so that its centroid is not its centre
+            total = light.sum()
+            row, column = np.mgrid[:80, :96] + 0.5
+            centroid = np.array([(light * column).sum(), (light * row).sum()]) / total
+            across = (centroid - centre) @ np.array([-along[1], along[0]])
+            # textures are symmetric about the line; sampling a disc of 3 px radius moves its centroid by 0.1 px
+            assert abs(across) < 0.2
+            # the side on which it lies: position 0 is the Sun, 1 the centre, 2 its mirror image
+            position = (centroid - sun) @ along / np.linalg.norm(centre - sun)
+            assert abs(position - flare["position"]) * np.linalg.norm(centre - sun) < 0.5 * flare["radius"] * 96
+            checked += 1
     assert checked >= 4
+
+
+def test_optical_faults_act_in_the_stated_order(frames_: list[Frame]) -> None:
+    # by hand, in the order of the design document: a flare is blurred and vignetted, a defect is neither
+    order = [
+        "straylight",
+        "dust_on_optics",
+        "optics_degradation",
+        "vignetting",
+    ]
+    both = 0
+    for frame in frames_:
+        drawn, faults, camera = frame.drawn, frame.spec.faults, frame.camera
+        light = frame.rate.with_array(frame.rate.array * np.float32(camera.exposure_s))
+        for name in order:
+            if name in drawn:
+                light = faults[name].apply(light, drawn[name], frame.context)
+        picture = camera.detector.develop(light, camera.exposure_s, None)
+        for name in ("broken_pixels", "broken_lines"):
+            if name in drawn:
+                picture = faults[name].apply(picture, drawn[name], frame.context)
+        assert np.array_equal(develop(frame, drawn, None).array, picture.array)
+        both += "straylight" in drawn and "optics_degradation" in drawn
+    assert both >= 1  # else the order of these two would not be seen
 
 
 def test_sun_is_whole_and_a_flare_is_in_the_frame_where_straylight_is(frames_: list[Frame]) -> None:
@@ -265,16 +305,25 @@ def test_surface_points_reproject_to_their_pixels(frames_: list[Frame]) -> None:
     assert checked >= 2
 
 
-def test_cameras_are_above_ground_and_clear(frames_: list[Frame]) -> None:
+def test_cameras_are_above_ground_and_clear() -> None:
+    # close to the ground, where three proposals in four come nearer than the clearance
+    from scipy.spatial import cKDTree
+
     from vbnfault import render
 
-    for frame in frames_:
+    low = session(geometry={"height_m": [0.0, 40.0], "clearance_m": 30.0}, dataset={"sites": 1})
+    vertices = low.patch(low.sites[0]).vertices_L_m
+    tree = cKDTree(vertices)
+    for i in range(16):
+        frame = Frame(spec=low.spec(i))
+        pipeline.STAGES[0](frame)
+        assert frame.pose.resolved
         p = frame.pose.position_L_m
-        surface = frame.spec.terrain.surface
-        ground = render.ground_height_m(surface, p[:1], p[1:2], 500.0)[0]
-        lo, hi = frame.spec.scene.geometry.height_m
-        assert lo - 1e-3 <= -p[2] - ground <= hi + 1e-3
-        assert render.is_clear(surface, p[None], frame.spec.scene.geometry.clearance_m)[0]
+        # no vertex is nearer than the surface; clearance is measured along 64 directions, one of which lies within
+        # 14 degrees of the normal of any plane: 1 / cos 14° = 1.03 (5 % for uneven ground)
+        assert tree.query(p)[0] >= 0.95 * 30.0
+        ground = render.ground_height_m(frame.spec.terrain.surface, p[:1], p[1:2], 500.0)[0]
+        assert -1e-3 <= -p[2] - ground <= 40 + 1e-3
 
 
 def test_metered_exposure_puts_the_percentile_at_its_level() -> None:
@@ -298,9 +347,16 @@ def test_metered_exposure_puts_the_percentile_at_its_level() -> None:
 
 
 def test_a_fixed_exposure_is_kept_and_scales_the_signal() -> None:
-    s = session(camera={"exposure_s": 0.004})
-    frame = s.frame(3)
-    assert frame.camera.exposure_s == 0.004
+    compared = 0
+    for i in range(8, 12):
+        short, long = (session(camera={"exposure_s": t}).frame(i) for t in (0.002, 0.004))
+        assert (short.camera.exposure_s, long.camera.exposure_s) == (0.002, 0.004)
+        one, two = (develop(frame, {}, None).array.astype(int) for frame in (short, long))
+        shown = (two < 255) & (one > 0)
+        # both are rounded to whole numbers, 2 · 0.5 + 0.5, after the converter rounded them to finer ones
+        assert not shown.any() or np.abs(two - 2 * one)[shown].max() <= 2
+        compared += np.count_nonzero(shown & (one > 20))
+    assert compared > 1000
 
 
 def test_black_lines_on_black_sky_are_not_claimed() -> None:
