@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import gc
+import json
 import os
 import pickle
+import platform
 import re
 import shutil
 import signal
@@ -13,13 +16,13 @@ import socket
 import subprocess
 import sys
 import threading
-import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pytest
+import victim
 from test_store import fake_sample, flip, make_spec
 
 from vbnfault import build as bd
@@ -30,7 +33,6 @@ from vbnfault.quantities import Sample
 from vbnfault.store import codec
 
 SAMPLES = 18
-HERE = Path(__file__).resolve().parent
 
 
 def site_of(samples: int = SAMPLES) -> np.ndarray:
@@ -40,9 +42,8 @@ def site_of(samples: int = SAMPLES) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Session:
-    """Makes fake samples slowly; may raise, die or write down what it was asked for."""
+    """Makes fake samples; may raise, die or write down what it was asked for."""
 
-    seconds: float = 0.0
     raises: frozenset[int] = frozenset()
     dies: frozenset[int] = frozenset()
     dies_once: str = ""  # a file that is made at the first death
@@ -61,7 +62,6 @@ class Session:
             if self.dies_once:
                 Path(self.dies_once).touch()
             os.kill(os.getpid(), signal.SIGKILL)
-        time.sleep(self.seconds)
         return fake_sample(make_spec(), index, site=int(site_of(index + 1)[-1]))
 
 
@@ -90,7 +90,7 @@ def reference(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
 
 def test_two_workers_make_the_same_bits_and_share_the_work(reference: tuple[Path, str], tmp_path: Path) -> None:
     log = tmp_path / "log"
-    run(tmp_path / "s.zarr", Session(log=str(log), seconds=0.05), workers=2, recycle_shards=2)
+    run(tmp_path / "s.zarr", Session(log=str(log)), workers=2, recycle_shards=2)
     assert st.digest(tmp_path / "s.zarr") == reference[1]
     calls = [line.split() for line in log.read_text().splitlines()]
     assert sorted(int(i) for _, i in calls) == list(range(SAMPLES))
@@ -154,63 +154,66 @@ def test_samples_that_are_not_as_planned_or_labelled_are_built_again(
     assert run(out, workers=workers, expected=planned).built == 0
 
 
-def start(out: Path, *arguments: str) -> subprocess.Popen[str]:
-    """This file as a program, see the end."""
-    path = os.pathsep.join([str(HERE.parent), str(HERE)])
-    return subprocess.Popen(
-        [sys.executable, __file__, str(out), *arguments],
-        env={**os.environ, "PYTHONPATH": path},
-        stderr=subprocess.PIPE,
-        text=True,
-    )
+def build_elsewhere(
+    out: Path, workers: int = 1, *, main: Sequence[dict] = (), worker: Sequence[dict] = (), samples: int = SAMPLES
+) -> subprocess.CompletedProcess[str]:
+    """A build of made-up samples in a process that follows a plan of signals; see `victim`."""
+    return victim.run(["build", out, workers, samples], main=main, worker=worker)
 
 
-@pytest.mark.parametrize(("workers", "kills"), [("1", 4), ("2", 3)])
-def test_kill_9_at_any_moment_then_resuming_makes_the_same_bits(
-    reference: tuple[Path, str], tmp_path: Path, workers: str, kills: int
+@pytest.mark.parametrize(("workers", "kills", "samples"), [(1, 4, SAMPLES), (2, 2, 40)])
+def test_kill_9_at_any_operation_then_resuming_makes_the_same_bits(
+    tmp_path: Path, workers: int, kills: int, samples: int
 ) -> None:
-    out, log = tmp_path / "s.zarr", tmp_path / "log"
-    log.touch()
-    progress = [0]
-    for moment in np.random.default_rng(int(workers)).uniform(0.0, 0.6, kills):
-        before = log.stat().st_size
-        process = start(out, workers, "0.07", str(log))
-        deadline = time.monotonic() + 20
-        while log.stat().st_size == before and time.monotonic() < deadline:
-            time.sleep(0.005)
-        time.sleep(moment)
-        process.kill()
-        process.communicate()
-        assert process.returncode == -signal.SIGKILL
+    out, progress = tmp_path / "s.zarr", [0]
+    for count in np.random.default_rng(workers).integers(1, 60, kills).tolist():
+        # after the first shard that is new, so that each kill finds a store further on
+        plan = [victim.step("write", text="done/c/", number="SIGCONT")]
+        plan += [victim.step("write", count=count, to="self" if workers == 1 else "parent", torn=True)]
+        done = build_elsewhere(out, workers, samples=samples, **{"main" if workers == 1 else "worker": plan})
+        assert done.returncode == -signal.SIGKILL, done.stderr
+        assert "Traceback" not in done.stderr
         progress.append(st.open_store(out).finished())
         assert progress[-1] >= progress[-2]
-    assert 0 < progress[-1] < SAMPLES, progress  # else the kills tested nothing
-    assert run(out).built == SAMPLES - progress[-1]
+    assert 0 < progress[-1] < samples, progress  # else the kills tested nothing
+    assert run(out, samples=samples).built == samples - progress[-1]
     assert st.verify(out) == []
-    assert st.digest(out) == reference[1]
-    assert not list(tmp_path.rglob("*.partial"))
+    run(tmp_path / "whole.zarr", samples=samples)
+    assert st.digest(out) == st.digest(tmp_path / "whole.zarr")
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["s.zarr", "whole.zarr"]
+    assert not list(out.rglob("*.partial"))
 
 
-@pytest.mark.parametrize(("workers", "number"), [("1", signal.SIGINT), ("1", signal.SIGTERM), ("2", signal.SIGINT)])
+@pytest.mark.parametrize(("workers", "number"), [(1, "SIGINT"), (1, "SIGTERM"), (2, "SIGHUP"), (2, "SIGINT")])
 def test_an_interrupt_keeps_what_was_made(
-    reference: tuple[Path, str], tmp_path: Path, workers: str, number: signal.Signals
+    reference: tuple[Path, str], tmp_path: Path, workers: int, number: str
 ) -> None:
-    out, log = tmp_path / "s.zarr", tmp_path / "log"
-    process = start(out, workers, "0.2", str(log))
-    deadline = time.monotonic() + 30
-    while (not log.exists() or len(log.read_text().splitlines()) < 3) and time.monotonic() < deadline:
-        time.sleep(0.02)
-    process.send_signal(number)
-    _, errors = process.communicate(timeout=30)
-    assert process.returncode == 130, errors
-    assert "Traceback" not in errors
-    match = re.search(r"interrupted; (\d+) of 18 samples are finished, and the same command resumes", errors)
-    assert match, errors
+    out = tmp_path / "s.zarr"
+    # while the second shard is written, by a process that made others of it before
+    step = victim.step("write", text="done/c/", number=number, to="group" if number != "SIGTERM" else "self")
+    done = build_elsewhere(out, workers, **{"main" if workers == 1 else "worker": [step]})
+    assert done.returncode == 128 + getattr(signal, number), done.stderr
+    assert "Traceback" not in done.stderr
+    match = re.fullmatch(
+        r".*interrupted; (\d+) of 18 samples are finished, and the same command resumes\n", done.stderr
+    )
+    assert match, done.stderr
     finished = int(match[1])
-    assert 1 <= finished < SAMPLES  # the shard in work was kept as well
+    assert 1 <= finished < SAMPLES  # the shard in work was kept
     assert st.open_store(out).finished() == finished
     assert run(out).built == SAMPLES - finished
     assert st.digest(out) == reference[1]
+    assert [p.name for p in tmp_path.iterdir()] == ["s.zarr"]
+
+
+def test_ctrl_c_as_workers_start_twice_leaves_nobody(tmp_path: Path) -> None:
+    # the second one while the first is obeyed: as it kills the workers, which have done nothing yet
+    twice = [victim.step("start", count=2, number="SIGINT", to="group")]
+    twice += [victim.step("kill", number="SIGINT", to="group")]
+    done = build_elsewhere(tmp_path / "s.zarr", 3, main=twice)
+    assert done.returncode == 130
+    assert re.fullmatch(r".*interrupted; 0 of 18 samples .*\n", done.stderr), done.stderr
+    assert run(tmp_path / "s.zarr").built == SAMPLES
 
 
 def test_samples_that_fail_are_named_and_all_others_are_built(reference: tuple[Path, str], tmp_path: Path) -> None:
@@ -332,11 +335,88 @@ def test_paths_that_cannot_be_used_are_bad_input(tmp_path: Path) -> None:
         run(tmp_path / "s.zarr", workers=0)
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="no folder locks there")
-def test_two_builds_at_once_are_refused(tmp_path: Path) -> None:
-    run(tmp_path / "s.zarr")
-    with lock.locked(tmp_path / "s.zarr"), pytest.raises(VbnfaultError, match="another build is writing"):
-        run(tmp_path / "s.zarr")
+@pytest.mark.skipif(sys.platform == "win32", reason="no such locks there")
+def test_two_builds_at_once_are_refused_also_where_the_store_is_replaced(tmp_path: Path) -> None:
+    out, log = tmp_path / "s.zarr", tmp_path / "log"
+    run(out)
+    before = st.digest(out)
+
+    @dataclass
+    class Second:
+        """Begins another build of the same store from within the first one."""
+
+        refused: str = ""
+
+        def __call__(self) -> Second:
+            return self
+
+        def simulate(self, index: int) -> Sample:
+            if not self.refused:
+                with pytest.raises(VbnfaultError, match="another build is writing") as e:
+                    run(out, Session(log=str(log)), overwrite=True)
+                self.refused = str(e.value)
+            return Session().simulate(index)
+
+    first = Second()
+    run(out, first, overwrite=True)
+    assert f"process {os.getpid()} on" in first.refused
+    assert not log.exists()
+    assert st.digest(out) == before
+    assert [p.name for p in tmp_path.iterdir()] == ["s.zarr"]
+
+
+@pytest.mark.parametrize("kind", ["flock refuses", "no flock at all"])
+def test_where_a_file_system_has_no_locks_a_file_names_the_owner(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str
+) -> None:
+    def refuse(*_: object) -> None:
+        raise OSError(errno.ENOLCK, "No locks available")
+
+    monkeypatch.setattr(lock, "_SECONDS_BETWEEN_BEATS", 1e-3)
+    if kind == "no flock at all":
+        monkeypatch.setattr(lock, "fcntl", None)
+    else:
+        monkeypatch.setattr(lock.fcntl, "flock", refuse)
+    out, owner = tmp_path / "s.zarr", tmp_path / ".s.zarr.owner"
+    run(out)
+    assert [p.name for p in tmp_path.iterdir()] == ["s.zarr"]
+    with lock.locked(out):
+        os.utime(owner, (0, 0))
+        while owner.stat().st_mtime == 0:  # until the next heart-beat
+            pass
+        with pytest.raises(VbnfaultError, match=rf"another build .*\(process {os.getpid()} on .*delete .*owner if"):
+            run(out)
+    with lock.locked(out):  # another's file in the place of one's own is left alone
+        owner.unlink()
+        owner.write_text(json.dumps({"host": "elsewhere", "pid": os.getpid(), "started": 1.0}))
+    with pytest.raises(VbnfaultError, match=r"process .* on elsewhere"):
+        run(out, overwrite=True)
+    # killed on this host: a process that is no more, or another one with its number
+    dead = subprocess.Popen([sys.executable, "-c", ""])
+    dead.wait()
+    for pid in (dead.pid, os.getpid()):
+        owner.write_text(json.dumps({"host": platform.node(), "pid": pid, "started": 1.0}))
+        assert run(out).finished == SAMPLES
+        assert not owner.exists()
+    owner.write_text("nonsense")
+    with pytest.raises(VbnfaultError, match="another build"):
+        run(out)
+
+
+def test_workers_run_no_python_files_of_the_working_folder(
+    reference: tuple[Path, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / "data"
+    folder.mkdir()
+    for name in ("random", "signal", "struct", "tempfile", "numpy", "zarr", "numcodecs"):
+        (folder / f"{name}.py").write_text(f"open({str(tmp_path / 'run')!r}, 'a').write('{name} ')")
+    monkeypatch.chdir(folder)
+    monkeypatch.setattr(sys, "path", ["", *sys.path])  # as at the prompt, and under python -m
+    run(tmp_path / "s.zarr", workers=2)
+    assert not (tmp_path / "run").exists(), (tmp_path / "run").read_text()
+    assert st.digest(tmp_path / "s.zarr") == reference[1]
+    assert sys.path[0] == ""
+    assert "PYTHONSAFEPATH" not in os.environ
 
 
 def test_sites_are_worked_through_one_after_another(tmp_path: Path) -> None:
@@ -358,7 +438,7 @@ def test_progress_without_a_terminal_is_plain_lines(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(progress, "_SECONDS_BETWEEN_LINES", 0.0)
-    run(tmp_path / "s.zarr", Session(seconds=0.01), progress=True)
+    run(tmp_path / "s.zarr", Session(), progress=True)
     lines = capsys.readouterr().err.splitlines()
     assert len(lines) >= SAMPLES
     assert all(re.fullmatch(r"\d+/18 samples, [\d.]+ samples/s, \d+ s left", line) for line in lines), lines
@@ -450,25 +530,19 @@ def test_what_is_no_dask_scheduler_is_one_sentence(
 ) -> None:
     pytest.importorskip("distributed")
     monkeypatch.setattr(dask, "_SECONDS_TO_ANSWER", 2.0)
-    with listening(reply) as address:
-        began = time.monotonic()
-        with pytest.raises(InputError) as e:
-            run(tmp_path / "s.zarr", scheduler=address)
-        assert time.monotonic() - began < 20
+    with listening(reply) as address, pytest.raises(InputError) as e:
+        run(tmp_path / "s.zarr", scheduler=address)
     assert str(e.value) == f"--scheduler {address}: what listens there does not answer as a Dask scheduler does"
     assert not (tmp_path / "s.zarr").exists()
     gc.collect()
     assert capfd.readouterr().err == ""
 
 
-def main(out: str, workers: str, seconds: str, log: str = "") -> int:
+def main(out: str, workers: str, samples: str) -> int:
+    """A program; `victim` is how it is started."""
     try:
-        run(Path(out), Session(seconds=float(seconds), log=log), workers=int(workers))
+        run(Path(out), workers=int(workers), samples=int(samples))
     except VbnfaultError as error:
         print(error, file=sys.stderr)
         return error.exit_code
     return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main(*sys.argv[1:]))

@@ -4,21 +4,21 @@ from __future__ import annotations
 
 import json
 import os
-import random
 import re
 import signal
 import socket
 import subprocess
 import sys
-import time
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import victim
 from conftest import small_scene
 
-from vbnfault import build, cli, flares, store
+from vbnfault import cli, flares, store
+from vbnfault.jobs import dask
 from vbnfault.lens import load_lens
 
 ENVIRONMENT = {**os.environ, "PYTHONWARNINGS": "error::UserWarning"}
@@ -114,31 +114,21 @@ def test_the_digest_depends_on_no_workers_or_threads(
     assert store.digest(out) == store.digest(built)
 
 
-def test_the_digest_survives_five_kills(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """kill -9 at random moments while the terrain is made, rendered or written, five times before the end."""
-    # Eight shards, each with a site of its own: terrain takes longer than the pictures of it, so shards land
-    # one by one, and killing at the latest when the next one lands leaves three of them at the fifth kill.
-    sites, out, log = tmp_path / "sites.toml", tmp_path / "killed.zarr", tmp_path / "log"
-    sites.write_text(toml(small_scene(dataset={"shard_samples": 2, "sites": 8})))
-    dice = random.Random(5)
-
-    def finished() -> int:
-        return store.open_store(out).finished() if store.is_store(out) else 0
-
-    seconds_to_land = 120.0  # at most; the first kill waits for a shard and measures it
-    for kill in range(5):
-        before, began = finished(), time.monotonic()
-        patience = seconds_to_land * (dice.uniform(0.4, 1.2) if kill else 1)
-        with log.open("w") as errors:
-            process = subprocess.Popen(command("build", sites, "--out", out), env=ENVIRONMENT, stderr=errors)
-        while finished() == before and time.monotonic() - began < patience:
-            assert process.poll() is None, log.read_text()
-            time.sleep(0.01)
-        if kill == 0:
-            seconds_to_land = time.monotonic() - began
-        process.kill()
-        assert process.wait() == -signal.SIGKILL, log.read_text()
-        assert 0 < finished() < 16
+def test_the_digest_survives_kills(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """kill -9 while the terrain is kept, rendered or written: at the n-th file operation after the last kill."""
+    sites, out = tmp_path / "sites.toml", tmp_path / "killed.zarr"
+    sites.write_text(toml(small_scene(dataset={"samples": 8, "shard_samples": 2, "sites": 4})))
+    finished = 0
+    for count in np.random.default_rng(5).integers(1, 120, 3).tolist():
+        # every operation after the first shard that is new: so that each kill finds a store further on
+        landed = [victim.step("write", text="done/c/", number="SIGCONT")]
+        done = victim.run(["cli", "build", sites, "--out", out], main=[*landed, victim.step("write", count=count)])
+        if done.returncode == 0:
+            break
+        assert done.returncode == -signal.SIGKILL, done.stderr
+        assert store.open_store(out).finished() >= finished
+        finished = store.open_store(out).finished()
+    assert finished > 0
     assert run(monkeypatch, "build", sites, "--out", out) == 0
     assert store.verify(out) == []
     assert not list(out.rglob("*.partial"))
@@ -218,24 +208,17 @@ def test_append_keeps_earlier_bits(
         assert a.scalars["parameters"] == b.scalars["parameters"]
 
 
-def test_ctrl_c_stops_cleanly_and_resumes(scene: Path, built: Path, tmp_path: Path) -> None:
+def test_ctrl_c_stops_cleanly_and_resumes(
+    scene: Path, built: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     out = tmp_path / "stopped.zarr"
-    process = subprocess.Popen(
-        command("build", scene, "--out", out),
-        env=ENVIRONMENT,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-    deadline = time.monotonic() + 120
-    while not (store.is_store(out) and store.open_store(out).finished()) and time.monotonic() < deadline:
-        time.sleep(0.02)
-    process.send_signal(signal.SIGINT)
-    _, said = process.communicate(timeout=60)
-    assert process.returncode in (0, 130)
-    assert "Traceback" not in said
-    again = subprocess.run(command("build", scene, "--out", out), env=ENVIRONMENT, capture_output=True, text=True)
-    assert again.returncode == 0, again.stderr
+    landed = victim.step("write", text="done/c/", number="SIGINT")
+    stopped = victim.run(["cli", "build", scene, "--out", out], main=[landed])
+    assert stopped.returncode == 130, stopped.stderr
+    last = stopped.stderr.splitlines()[-1]
+    assert last.endswith("interrupted; 4 of 16 samples are finished, and the same command resumes")
+    assert "Traceback" not in stopped.stderr
+    assert run(monkeypatch, "build", scene, "--out", out) == 0
     assert store.digest(out) == store.digest(built)
 
 
@@ -332,7 +315,7 @@ def test_a_port_where_no_scheduler_answers_is_one_sentence(
     scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     pytest.importorskip("distributed")
-    monkeypatch.setattr(build, "_SECONDS_TO_ANSWER", 1.0)
+    monkeypatch.setattr(dask, "_SECONDS_TO_ANSWER", 1.0)
     with socket.create_server(("127.0.0.1", 0)) as silent:  # connections wait in its queue for ever
         address = f"tcp://127.0.0.1:{silent.getsockname()[1]}"
         code = run(monkeypatch, "build", scene, "--out", tmp_path / "x.zarr", "--scheduler", address)

@@ -8,7 +8,6 @@ no trace in the arrays.
 
 from __future__ import annotations
 
-import contextlib
 import json
 import os
 import shutil
@@ -24,9 +23,9 @@ from numpy.typing import ArrayLike
 
 from . import store as store_module
 from .errors import InputError, VbnfaultError
+from .interrupts import Stopped, exit_code, finishing, interruptible
 from .jobs.dask import check_scheduler, run_on_dask
 from .jobs.errors import BuildFailed, Interrupted
-from .jobs.interrupts import interruptible
 from .jobs.lock import locked
 from .jobs.processes import Pool
 from .jobs.progress import Progress, duration_text, size_text
@@ -139,20 +138,23 @@ def build(
         raise InputError(f"--workers {workers}: must be at least 1")
     path = Path(out)
     spec = _with_attributes(spec, blocks)
-    existing = store_module.is_store(path) and not overwrite
-    if existing:
-        _same_scene(store_module.open_store(path), spec, blocks)
-    finished = store_module.open_store(path).finished() if existing else 0
-    summary = Summary(
-        path=path,
-        samples=len(sites),
-        shards=-(-len(sites) // spec.shard_samples),
-        sites=len(np.unique(sites)),
-        finished=finished,
-        estimated_bytes=spec.estimated_sample_bytes * len(sites),
-        free_bytes=_free_bytes(path),
-        fault_counts=dict(fault_counts or {}),
-    )
+
+    def outlook() -> Summary:
+        existing = store_module.is_store(path) and not overwrite
+        if existing:
+            _same_scene(store_module.open_store(path), spec, blocks)
+        return Summary(
+            path=path,
+            samples=len(sites),
+            shards=-(-len(sites) // spec.shard_samples),
+            sites=len(np.unique(sites)),
+            finished=store_module.open_store(path).finished() if existing else 0,
+            estimated_bytes=spec.estimated_sample_bytes * len(sites),
+            free_bytes=_free_bytes(path),
+            fault_counts=dict(fault_counts or {}),
+        )
+
+    summary = outlook()
     if dry_run:
         return summary
     _check_room(summary, spec)
@@ -160,28 +162,31 @@ def build(
         check_scheduler(scheduler)
 
     began = time.monotonic()
-    with interruptible(), contextlib.ExitStack() as stack:
+    with interruptible():
         try:
-            if not existing:
-                store_module.create(path, spec, len(sites), overwrite=overwrite)
-            stack.enter_context(locked(path))
-            store = store_module.recover(path)
-            if store.samples < len(sites):
-                added = len(sites) - store.samples
-                store = store_module.append_samples(store, added, {"blocks": list(blocks)})
-            run = Run(store, sites, Progress(len(sites), shown=progress), expected, exact=exact)
-            with run.progress:
-                if scheduler is not None:
-                    run_on_dask(session_factory, run, scheduler)
-                elif workers == 1:
-                    run_here(session_factory, run)
-                else:
-                    share = max(1, (os.cpu_count() or 1) // workers)
-                    Pool(session_factory, run, threads or share, recycle_shards).work(workers)
-        except KeyboardInterrupt as stop:
-            done = store_module.open_store(path).finished() if store_module.is_store(path) else 0
+            with locked(path):
+                summary = outlook()  # another build may have ended just now
+                if overwrite or not store_module.is_store(path):
+                    store_module.create(path, spec, len(sites), overwrite=overwrite)
+                store = store_module.recover(path)
+                if store.samples < len(sites):
+                    added = len(sites) - store.samples
+                    store = store_module.append_samples(store, added, {"blocks": list(blocks)})
+                run = Run(store, sites, Progress(len(sites), shown=progress), expected, exact=exact)
+                with run.progress:
+                    if scheduler is not None:
+                        run_on_dask(session_factory, run, scheduler)
+                    elif workers == 1:
+                        run_here(session_factory, run)
+                    else:
+                        share = max(1, (os.cpu_count() or 1) // workers)
+                        Pool(session_factory, run, threads or share, recycle_shards).work(workers)
+        except (Stopped, KeyboardInterrupt) as stop:
+            with finishing():
+                done = store_module.open_store(path).finished() if store_module.is_store(path) else 0
             raise Interrupted(
-                f"{path}: interrupted; {done} of {len(sites)} samples are finished, and the same command resumes"
+                f"{path}: interrupted; {done} of {len(sites)} samples are finished, and the same command resumes",
+                exit_code(stop),
             ) from stop
         run.raise_failures()
     return Summary(**{**vars(summary), "built": run.built, "seconds": time.monotonic() - began})

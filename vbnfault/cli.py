@@ -1,6 +1,7 @@
 """The command line. It parses, calls and prints; no physics here, and nothing heavy is imported before its use.
 
-Exit codes: 0 done, 1 a failed run, 2 bad input, 130 interrupted. A user's mistake never shows a traceback.
+Exit codes: 0 done, 1 a failed run, 2 bad input, 130 interrupted by Ctrl-C (143 by SIGTERM, 129 by SIGHUP). A user's
+mistake never shows a traceback.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from . import __version__
+from . import __version__, interrupts
 from .errors import InputError, VbnfaultError
 
 if TYPE_CHECKING:
@@ -43,22 +44,35 @@ SeedOption = Annotated[int | None, typer.Option(min=0, help="replace the scene's
 def main() -> None:
     """Entry point: turns errors into one sentence and an exit code."""
     warnings.showwarning = lambda message, *_, **__: typer.echo(f"warning: {message}", err=True)
+    with interrupts.interruptible():
+        try:
+            code, stopped = _exit_code(), False
+        except (interrupts.Stopped, KeyboardInterrupt, typer.Abort) as stop:
+            with interrupts.finishing():
+                typer.echo("vbnfault: interrupted; what was written stays; repeat the command to go on", err=True)
+            code, stopped = interrupts.exit_code(stop), True
+    if stopped:
+        interrupts.ignore()  # a second Ctrl-C while Python ends
+    sys.exit(code)
+
+
+def _exit_code() -> int:
+    """Run the command of the command line, and turn its errors into a sentence."""
     try:
         code = app(standalone_mode=False)  # a command's typer.Exit comes back as its exit code
     except VbnfaultError as error:
         typer.echo(f"vbnfault: {error}", err=True)
-        sys.exit(error.exit_code)
-    except (KeyboardInterrupt, typer.Abort):
-        typer.echo("vbnfault: interrupted; the same command resumes where it stopped", err=True)
-        sys.exit(130)
+        return error.exit_code
+    except typer.Abort:
+        raise
     except Exception as error:
         # click's own usage errors (bad option, missing argument) know how to print themselves
         show = getattr(error, "show", None)
         if show is None:
             raise
         show()
-        sys.exit(getattr(error, "exit_code", 2))
-    sys.exit(code if isinstance(code, int) else 0)
+        return int(getattr(error, "exit_code", 2))
+    return code if isinstance(code, int) else 0
 
 
 def _version(show: bool) -> None:

@@ -8,9 +8,11 @@ from ..errors import VbnfaultError
 
 
 class Interrupted(VbnfaultError):
-    """Stopped by the user or the system; the same command resumes."""
+    """Stopped by the user or the system; the same command resumes. `exit_code`: 128 + the signal's number."""
 
-    exit_code = 130
+    def __init__(self, sentence: str, exit_code: int = 130) -> None:
+        super().__init__(sentence)
+        self.exit_code = exit_code
 
 
 class BuildFailed(VbnfaultError):

@@ -6,27 +6,27 @@ import contextlib
 import multiprocessing
 import os
 import signal
+import sys
 import threading
 from collections import Counter, deque
 from collections.abc import Callable, Iterator
-from multiprocessing import connection
+from multiprocessing import connection, resource_tracker
 from pathlib import Path
 from typing import Any
 
+from .. import interrupts
 from .. import store as store_module
 from ..errors import VbnfaultError
-from .interrupts import raise_interrupt
 from .tasks import Fatal, Lazy, Run, SessionFactory, Task, work
 
-_SECONDS_TO_STOP = 15.0
+_SECONDS_TO_STOP = 60.0  # for the samples in hand to be written; a second Ctrl-C waits no longer
 
 
 def _worker(factory: SessionFactory, path: Path, pipe: connection.Connection) -> None:
     """A worker process: tasks come in by the pipe, ticks go out. It does not outlive its parent."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides
-    signal.signal(signal.SIGTERM, raise_interrupt)
-    threading.Thread(target=_die_with_parent, daemon=True).start()
-    with contextlib.suppress(EOFError, OSError, KeyboardInterrupt):
+    with contextlib.suppress(EOFError, OSError, interrupts.Stopped):
+        interrupts.obey_parent()
+        threading.Thread(target=_die_with_parent, daemon=True).start()
         session, store = Lazy(factory), store_module.open_store(path, "r+")
         while True:
             task = pipe.recv()
@@ -54,9 +54,17 @@ class _Process:
         context = multiprocessing.get_context("spawn")
         self.pipe, theirs = context.Pipe()
         self.process = context.Process(target=_worker, args=(factory, path, theirs), daemon=True)
-        with _environment(threads):
-            self.process.start()
+        try:
+            with _environment(threads), _without_working_folder():
+                resource_tracker.ensure_running()  # else the start would do it, and let signals through
+                with interrupts.held():
+                    self.process.start()
+        except BaseException:
+            if self.process.pid is not None:
+                self.process.kill()  # nobody else knows of it
+            raise
         theirs.close()
+        self.heard = False  # has it said anything yet
         self.shards = 0
         self.shard = -1
         self.sample: int | None = None  # in work
@@ -70,7 +78,9 @@ class _Process:
 
     def stop(self, *, at_once: bool = False) -> None:
         """Let it end: after its task, or at once, with time to write what it has."""
-        if at_once:
+        if at_once and not self.heard:
+            self.process.kill()  # it has nothing to write
+        elif at_once:
             self.process.terminate()
         self.pipe.close()
 
@@ -91,16 +101,39 @@ class _Process:
 
 @contextlib.contextmanager
 def _environment(threads: int) -> Iterator[None]:
-    """Cap the threads of processes started within: libraries read these variables when they load."""
+    """Cap the threads of processes started within, and keep Python from importing out of their working folder.
+
+    Libraries and Python read these variables when they load.
+    """
     names = ("VBNFAULT_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-    before = {name: os.environ[name] for name in names if name in os.environ}
-    os.environ.update(dict.fromkeys(names, str(threads)))
+    values = dict.fromkeys(names, str(threads)) | {"PYTHONSAFEPATH": "1"}
+    before = {name: os.environ[name] for name in values if name in os.environ}
+    os.environ.update(values)
     try:
         yield
     finally:
-        for name in names:
+        for name in values:
             del os.environ[name]
         os.environ.update(before)
+
+
+@contextlib.contextmanager
+def _without_working_folder() -> Iterator[None]:
+    """Keep the working folder out of the import path of processes started within.
+
+    They get this process's path, in which Python puts the working folder first under `python -m` and at the prompt:
+    a file `random.py` of the user's data would be run. PYTHONSAFEPATH does the same for what they import before.
+    """
+    here, package = os.path.realpath(os.getcwd()), str(Path(__file__).resolve().parents[2])
+    wanted = {os.path.realpath(p) for p in os.environ.get("PYTHONPATH", "").split(os.pathsep) if p}
+    before = sys.path.copy()
+    sys.path[:] = [p for p in before if os.path.realpath(p or here) != here or here in wanted]
+    if here == os.path.realpath(package) and package not in sys.path:
+        sys.path.append(package)  # vbnfault itself lies here, but nothing here goes before other libraries
+    try:
+        yield
+    finally:
+        sys.path[:] = before
 
 
 class Pool:
@@ -128,10 +161,15 @@ class Pool:
                 for pipe in connection.wait(list(by_pipe)):
                     self._hear(by_pipe[pipe])
         finally:
-            for worker in self._workers:
-                worker.stop(at_once=True)
-            for worker in self._workers:
-                worker.join()
+            with interrupts.finishing(self._kill):
+                for worker in self._workers:
+                    worker.stop(at_once=True)
+                for worker in self._workers:
+                    worker.join()
+
+    def _kill(self) -> None:
+        for worker in self._workers:
+            worker.process.kill()
 
     def _next(self, worker: _Process | None, last: int | None) -> None:
         """Hand the next task to a worker, or to a new one; without a task it retires."""
@@ -153,6 +191,7 @@ class Pool:
     def _hear(self, worker: _Process) -> None:
         try:
             sample, what, payload = worker.pipe.recv()
+            worker.heard = True
         except (EOFError, OSError):
             self._mourn(worker)
             return

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from .. import store as store_module
 from ..errors import VbnfaultError
+from ..interrupts import finishing
 from ..quantities import Sample
 from ..store import Encoded, Planned, Store
 from .errors import BuildFailed
@@ -86,8 +87,9 @@ def work(simulate: Callable[[int], Sample], store: Store, task: Task, tick: Tick
         made.clear()
         raise
     finally:
-        if made:
-            write(made)
+        with finishing():
+            if made:
+                write(made)
     if lost:
         named = ", ".join(map(str, sorted(lost)))
         raise VbnfaultError(
