@@ -21,12 +21,14 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationErr
 
 from . import photometry, resources, spectra
 from .errors import InputError, shown
+from .quantities import SOFT_KINDS
 
 Architecture = Literal["full_frame_ccd", "frame_transfer_ccd", "interline_ccd", "cmos"]
 Direction = Literal["up", "down", "left", "right"]
 _LAYERS = (
     "clean|depth_m|normal|semantic|raw|defects|radiance|mask_effect|"
-    "point_T_m|incidence_deg|emission_deg|phase_deg|albedo|without_[a-z_]+"
+    "point_T_m|incidence_deg|emission_deg|phase_deg|albedo|without_[a-z0-9_]+|"
+    + "|".join(f"[a-z0-9_]+_{kind}" for kind in SOFT_KINDS)
 )
 # What names no file.
 _SHAPES = ("embedded", "ellipsoid")
@@ -74,9 +76,17 @@ class DatasetTable(Table):
     shard_samples: int = Field(
         8, ge=1, le=16, description="samples a shard, all of one site: what a kill can lose at most"
     )
-    layers: tuple[Layer, ...] = ("clean", "without_straylight", "depth_m", "normal", "semantic")
+    layers: tuple[Layer, ...] = (
+        "clean",
+        "without_straylight",
+        "mask_effect",
+        "depth_m",
+        "normal",
+        "semantic",
+    )
     mask_any: tuple[str, ...] | None = Field(
-        None, description="classes united in mask_any; default: the localised ones of the scene"
+        None,
+        description="classes of the scene whose masks mask_any unites; []: none; default: the localised ones",
     )
     split: SplitTable = SplitTable()
     licence: str = "CC-BY-4.0"

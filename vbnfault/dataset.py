@@ -13,10 +13,11 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from . import __version__, build, config, llvm, pipeline, plan, resources, store, world
+from . import __version__, build, config, labels, llvm, pipeline, plan, resources, store, world
 from .config import SceneConfig
 from .detector import Detector, MosaicDetector
 from .errors import VbnfaultError
+from .faults import Fault
 from .record import proposal
 from .sample import mask_any_faults, stored_layers
 from .store import StoreSpec
@@ -97,6 +98,7 @@ def store_spec(session: pipeline.Session, blocks: Sequence[int]) -> StoreSpec:
     dataset, camera = scene.dataset, session.base_camera  # first of all: a lens that cannot be had is told here
     layers = tuple(name for name in stored_layers(scene, session.faults) if name != "clean")
     individuals = scene.camera.individuals
+    kinds = tuple(labels.kind(fault, is_ccd=camera.is_ccd) for fault in session.faults.values())
     identity = scene_identity(session)
     attributes: dict[str, Any] = {
         "title": scene.title,
@@ -118,6 +120,11 @@ def store_spec(session: pipeline.Session, blocks: Sequence[int]) -> StoreSpec:
         faults=tuple(session.faults),
         mask_any_faults=mask_any_faults(scene, session.faults),
         localised_faults=tuple(name for name, fault in session.faults.items() if fault.localised),
+        mask_kinds=kinds,
+        mask_rules=tuple(
+            _mask_rule(kind, fault) for kind, fault in zip(kinds, session.faults.values(), strict=True)
+        ),
+        soft_layers=tuple(fault.soft_layer for fault in session.faults.values()),
         wavelength_nm=tuple(float(w) for w in world.wavelengths_nm(scene)),
         layers=layers,
         site_names=tuple(f"site_{k:05d}" for k in range(dataset.sites)),
@@ -130,6 +137,13 @@ def store_spec(session: pipeline.Session, blocks: Sequence[int]) -> StoreSpec:
         shard_samples=dataset.shard_samples,
         attributes=attributes,
     )
+
+
+def _mask_rule(kind: str, fault: Fault) -> str:
+    if kind == "effect":
+        return store.EFFECT_RULE
+    rule = labels.footprint_rule(fault)
+    return f"{rule}; or {store.EFFECT_RULE}" if "effect" in kind else rule
 
 
 def _intensity(detector: Detector | MosaicDetector) -> str:

@@ -7,6 +7,7 @@ change by at least one digital number, noise-free, when the fault is switched of
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterable, Mapping
 
 import cv2
@@ -17,12 +18,32 @@ from .faults import Fault, FaultContext, Params
 
 Mask = NDArray[np.bool_]
 
+# Steps of a detector with a mosaic at which charge may still leave the pixels that a fault acts on.
+_MOVES = ("pixels", "charge")
+
 
 def effect(image: NDArray[np.uint8], without: NDArray[np.uint8]) -> Mask:
     """bool[y, x]: pixels of two noise-free 8 bit images that differ in any channel."""
     # four 8 bit channels compare as one 32 bit word
     a, b = (np.ascontiguousarray(x).view(np.uint32)[..., 0] for x in (image, without))
     return a != b
+
+
+def kind(fault: Fault, *, is_ccd: bool) -> str:
+    """Return what the mask of a fault is: `footprint`, `effect`, or both united."""
+    if fault.effect_mask:
+        return "effect"
+    return "footprint and effect" if is_ccd and fault.step in _MOVES else "footprint"
+
+
+def footprint_rule(fault: Fault) -> str:
+    """Return which pixels a fault's footprint holds, with the thresholds of the fault: its fields mask_*."""
+    thresholds = [f for f in dataclasses.fields(fault) if f.name.startswith("mask_")]
+    rules = []
+    for f in thresholds:
+        unit = f.metadata.get("unit", "")
+        rules.append(f"{f.metadata['doc']}: {f.name} = {getattr(fault, f.name):g}{unit and ' ' + unit}")
+    return "; ".join(rules) or "the pixels that the fault acts on"
 
 
 def mask_layers(
@@ -46,7 +67,7 @@ def mask_layers(
 
 def spreads(fault: Fault, context: FaultContext) -> bool:
     """Whether a fault's charge may leave its footprint: in a CCD it overflows along columns, and traps trail it."""
-    return fault.step in ("pixels", "charge") and context.camera.is_ccd
+    return fault.step in _MOVES and kind(fault, is_ccd=context.camera.is_ccd) == "footprint and effect"
 
 
 def union(masks: Mask, faults: Iterable[str], members: Iterable[str]) -> Mask:

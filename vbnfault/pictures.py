@@ -16,7 +16,7 @@ from . import labels
 from .camera import Camera
 from .detector import MosaicDetector
 from .faults import MOSAIC_STEPS, QUANTITIES, Fault, FaultContext, Params, physical_order
-from .quantities import RGBI, Electrons
+from .quantities import RGBI, Electrons, soft_kind
 from .sample import Frame, stored_layers
 
 _DRAW_TRIES = 8
@@ -46,13 +46,13 @@ def photograph(frame: Frame) -> None:
             _signal(frame, frame.drawn, [n for n in optical if n != name])
         noise, frame.images["clean"] = exposed.result()
     frame.pictures[frame.camera, (), (), False] = frame.images["clean"]
-    for attempt in range(1, _DRAW_TRIES + 1):
-        invisible = _invisible(frame, noise)
+    attempt = 0
+    while invisible := _invisible(frame, noise):
         # the rejected are kept, or a new draw could take over the identity of an old one
         frame.rejected += [frame.drawn.pop(name) for name in invisible]
-        if not invisible or attempt == _DRAW_TRIES:
-            break
-        _draw(frame, commanded, attempt)
+        attempt += 1
+        if attempt < _DRAW_TRIES:
+            _draw(frame, commanded, attempt)
     frame.images["image"] = develop(frame, frame.drawn, noise)
     if "raw" in spec.scene.dataset.layers:
         frame.raw = _raw(frame, noise)
@@ -141,6 +141,18 @@ def _signal(frame: Frame, drawn: Mapping[str, Params], names: Sequence[str]) -> 
 
 def develop(frame: Frame, drawn: Mapping[str, Params], noise: Any) -> RGBI:
     """The finished picture with the faults `drawn`; noise-free without `noise`."""
+    readout = _key(drawn, _in_order(frame, drawn, "rgbi"))
+    picture = _before_readout(frame, drawn, noise)
+    if not readout:
+        return picture
+    key = id(picture), readout
+    if key not in frame.pictures:
+        frame.pictures[key] = _read_out(frame, picture, drawn)
+    return frame.pictures[key]
+
+
+def _before_readout(frame: Frame, drawn: Mapping[str, Params], noise: Any) -> RGBI:
+    """The picture with the faults `drawn` but for those of the readout."""
     optical = _in_order(frame, drawn, "electrons")
     inside = [name for step in MOSAIC_STEPS for name in _in_order(frame, drawn, step)]
     camera = _altered(frame, drawn)
@@ -148,7 +160,7 @@ def develop(frame: Frame, drawn: Mapping[str, Params], noise: Any) -> RGBI:
     if key not in frame.pictures:
         signal, acts = _signal(frame, drawn, optical), _acts(frame, drawn)
         frame.pictures[key] = camera.detector.develop(signal, camera.exposure_s, noise, acts)
-    return _read_out(frame, frame.pictures[key], drawn)
+    return frame.pictures[key]
 
 
 def _raw(frame: Frame, noise: Any) -> NDArray[np.uint16]:
@@ -196,7 +208,12 @@ def _read_out(frame: Frame, picture: RGBI, drawn: Mapping[str, Params]) -> RGBI:
 def _invisible(frame: Frame, noise: Any) -> list[str]:
     """Drawn faults without any effect on the noise-free picture."""
     doubtful = sorted(_doubtful(frame, noise))
-    return [n for n in doubtful if not (_shows_on_some_rows(frame, n) or effect_of(frame, n).any())]
+    invisible = [n for n in doubtful if not (_shows_on_some_rows(frame, n) or effect_of(frame, n).any())]
+    if not invisible and "mask_effect" in frame.spec.scene.dataset.layers:
+        # what will be stored has the last word
+        frame.effects = {name: effect_of(frame, name) for name in frame.drawn}
+        invisible = [name for name, effect in frame.effects.items() if not effect.any()]
+    return invisible
 
 
 def _shows_on_some_rows(frame: Frame, name: str) -> bool:
@@ -226,21 +243,31 @@ def effect_of(frame: Frame, name: str) -> NDArray[np.bool_]:
     optical = _in_order(frame, drawn, "electrons")
     if name not in optical or _altered(frame, drawn) != frame.camera or not frame.camera.detector.local:
         return labels.effect(develop(frame, drawn, None).array, develop(frame, others, None).array)
-    # only rows whose signal changes can change: the others need not be developed
-    signals = [_signal(frame, d, [n for n in optical if n in d]) for d in (drawn, others)]
-    height = frame.context.shape[0]
-    changed = np.flatnonzero((signals[0].array != signals[1].array).reshape(height, -1).any(axis=1))
+    # only pixels whose signal changes can change: the others need not be developed
+    whole, part = (_signal(frame, d, [n for n in optical if n in d]) for d in (drawn, others))
+    differ = whole.array != part.array
+    changed = np.flatnonzero(np.logical_or.reduce([differ[..., k] for k in range(differ.shape[2])]))
     if not len(changed):
         return np.zeros(frame.context.shape, dtype=bool)
-    # with a margin: a broken pixel's neighbours look two pixels far
-    rows = slice(max(changed[0] - 2, 0), changed[-1] + 3)
-    pictures = []
-    for signal in signals:
-        part = frame.camera.detector.develop(signal.with_array(signal.array[rows]), frame.camera.exposure_s, None)
-        whole = np.zeros((*frame.context.shape, 4), dtype=np.uint8)
-        whole[rows] = part.array
-        pictures.append(_read_out(frame, RGBI(array=whole), others).array)
-    return labels.effect(*pictures)
+    with_it = develop(frame, drawn, None).array
+    array = _before_readout(frame, drawn, None).array.copy()
+    # as rows of a picture, of which the last is filled up
+    width = frame.context.shape[1]
+    filled = np.resize(changed, (-(-len(changed) // width), width))
+    pixels = part.array.reshape(-1, part.array.shape[2])[filled]
+    developed = frame.camera.detector.develop(part.with_array(pixels), frame.camera.exposure_s, None).array
+    array.reshape(-1, 4)[changed] = developed.reshape(-1, 4)[: len(changed)]
+    return labels.effect(with_it, _read_out(frame, RGBI(array=array), others).array)
+
+
+def soft_layer(frame: Frame, name: str) -> NDArray[Any]:
+    """Return how strongly a fault acts on each pixel, [y, x] of the data type of its soft layer."""
+    fault = frame.spec.faults[name]
+    kind = soft_kind(fault.soft_layer)
+    if name not in frame.drawn:
+        return np.full(frame.context.shape, kind.neutral, dtype=kind.dtype)
+    strength = fault.soft(frame.drawn[name], _context(frame, frame.drawn)[1])
+    return np.asarray(strength).astype(kind.dtype)
 
 
 def _doubtful(frame: Frame, noise: Any) -> set[str]:

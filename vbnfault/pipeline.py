@@ -24,7 +24,7 @@ from .exposure import meter, render_frame
 from .faults import Fault, dataset_order, from_dict
 from .pictures import photograph
 from .pose import resolve
-from .quantities import Sample
+from .quantities import SOFT_KINDS, Sample
 from .record import label, to_sample
 from .sample import Frame, SampleSpec, Terrain
 from .spacecraft import SpacecraftMesh
@@ -76,15 +76,22 @@ def configure_faults(scene: SceneConfig, source: str = "scene") -> dict[str, Fau
                 f"{source}: faults.{name}: acts on charge that a CCD moves, and camera.detector = "
                 f"{scene.camera.detector!r} is a CMOS sensor; leave the fault out, or name a CCD"
             )
+    soft = [fault.soft_layer for fault in faults.values() if fault.soft_layer]
     for layer in scene.dataset.layers:
         if layer.startswith("without_") and layer != "without_straylight" and layer[8:] not in faults:
             raise InputError(f"{source}: dataset.layers: {layer!r}: the scene has no such fault")
+        if layer.endswith(tuple(f"_{kind}" for kind in SOFT_KINDS)) and layer not in soft:
+            known = ", ".join(soft) or "none"
+            raise InputError(
+                f"{source}: dataset.layers: {layer!r}: no fault of the scene has this layer; theirs: {known}"
+            )
     for layer in ("raw", "defects"):
         if layer in scene.dataset.layers and not scene.camera.detector:
             raise InputError(f"{source}: dataset.layers: {layer!r} needs a mosaic: name a camera.detector")
     for name in scene.dataset.mask_any or ():
         if name not in faults:
-            raise InputError(f"{source}: dataset.mask_any: {name!r}: the scene has no such fault")
+            known = ", ".join(faults) or "none"
+            raise InputError(f"{source}: dataset.mask_any: {name!r}: the scene has no such fault; it has: {known}")
     return faults
 
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -114,6 +114,34 @@ SKY, BODY, SUN, SPACECRAFT = 0, 1, 2, 3
 # its upper level for more than half of the exposure.
 HOT, DEAD, STUCK, RTS, RTS_HIGH, TRAP = (np.uint8(1 << k) for k in range(6))
 DEFECTS = ("hot", "dead", "stuck", "rts", "rts_high", "trap")
+
+
+class SoftKind(NamedTuple):
+    """A kind of layer that says how strongly a fault acts on each pixel: its `units`, the value `neutral` where the
+    fault is not injected, its `dtype`, and what it holds."""
+
+    units: str
+    neutral: float
+    dtype: str
+    meaning: str
+
+
+# By the ending of a layer's name, as in dust_opacity.
+SOFT_KINDS = {
+    "opacity": SoftKind("1", 0.0, "float16", "fraction of the light that is lost"),
+    "factor": SoftKind("1", 1.0, "float16", "factor on the light, 1 where nothing is lost"),
+    "added": SoftKind(
+        "DN",
+        0.0,
+        "float32",
+        "light added before any other fault, as intensity, linear and not clipped: 255 is white",
+    ),
+}
+
+
+def soft_kind(layer: str) -> SoftKind:
+    """Return the kind of a soft layer. Raises KeyError where its name does not end as one of `SOFT_KINDS`."""
+    return SOFT_KINDS[layer.rpartition("_")[2]]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

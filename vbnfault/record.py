@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from . import frames, labels, plan, world
 from .config import SceneConfig
 from .lens import RealLens
-from .pictures import effect_of
+from .pictures import effect_of, soft_layer
 from .quantities import Sample
 from .sample import Frame, mask_any_faults, stored_layers
 
@@ -21,13 +21,11 @@ def label(frame: Frame) -> None:
     """Masks of every class, by footprint or by effect."""
     spec = frame.spec
     wanted = stored_layers(spec.scene, spec.faults)
-    frame.effects = {
-        name: effect_of(frame, name)
-        for name in frame.drawn
-        if spec.faults[name].effect_mask
-        or labels.spreads(spec.faults[name], frame.context)
-        or "mask_effect" in wanted
-    }
+    for name in frame.drawn:
+        fault = spec.faults[name]
+        needed = "mask_effect" in wanted or fault.effect_mask or labels.spreads(fault, frame.context)
+        if needed and name not in frame.effects:
+            frame.effects[name] = effect_of(frame, name)
     frame.mask = labels.mask_layers(spec.faults, frame.drawn, frame.context, frame.effects)
 
 
@@ -44,6 +42,7 @@ def to_sample(frame: Frame) -> Sample:
         "emission_deg": frame.truth.emission_deg,
         "phase_deg": frame.truth.phase_deg,
     }
+    soft = {fault.soft_layer: name for name, fault in spec.faults.items() if fault.soft_layer}
     layers: dict[str, Any] = {
         "image": frame.images["image"].array,
         "clean": frame.images["clean"].array,
@@ -56,6 +55,8 @@ def to_sample(frame: Frame) -> Sample:
         elif name == "mask_effect":
             empty = np.zeros(frame.context.shape, dtype=bool)
             layers[name] = np.stack([frame.effects.get(f, empty) for f in names])
+        elif name in soft:
+            layers[name] = soft_layer(frame, soft[name])
         elif name in ("raw", "defects"):
             layers[name] = getattr(frame, name)
         elif name == "radiance":

@@ -109,7 +109,8 @@ def stored_layers(scene: SceneConfig, faults: Mapping[str, Fault]) -> tuple[str,
 
 
 def mask_any_faults(scene: SceneConfig, faults: Mapping[str, Fault]) -> tuple[str, ...]:
-    """The classes united in mask_any: as configured, else the localised ones."""
-    if scene.dataset.mask_any is not None:
-        return scene.dataset.mask_any
+    """Return the classes united in mask_any, in dataset order: those configured, else the localised ones."""
+    chosen = scene.dataset.mask_any
+    if chosen is not None:
+        return tuple(name for name in faults if name in chosen)
     return tuple(name for name, fault in faults.items() if fault.localised)

@@ -23,7 +23,7 @@ from ..detector.chain import STEPS as MOSAIC_STEPS
 from ..errors import InputError
 from ..lens import load_lens
 from ..lens.footprint import DEFAULT_LENS, Frame
-from ..quantities import RGBI, Charge, Electrons, Quantity, RawMosaic
+from ..quantities import LUMINANCE, RGBI, Charge, Electrons, Quantity, RawMosaic, soft_kind
 
 Params = dict[str, Any]
 T = TypeVar("T")
@@ -211,7 +211,8 @@ class Fault:
     expected photo-electrons on the sensor; of a mosaic `pixels`, the electrons expected in each pixel, `charge`,
     those collected, or `raw`; or `rgbi`), `needs_mosaic` (also True where `alter` changes such a detector),
     `needs_ccd` (True: no effect on CMOS), `localised` (False where the footprint is about the
-    whole frame), `needs_sun`, `effect_mask` (True: the mask is the effect rule, not the footprint).
+    whole frame), `needs_sun`, `effect_mask` (True: the mask is the effect rule, not the footprint), `soft_layer`
+    (the name of the optional layer that `soft` gives, which ends as one of `quantities.SOFT_KINDS`; "": none).
     """
 
     fault: ClassVar[str]
@@ -222,11 +223,14 @@ class Fault:
     needs_mosaic: ClassVar[bool] = False
     needs_ccd: ClassVar[bool] = False
     effect_mask: ClassVar[bool] = False
+    soft_layer: ClassVar[str] = ""
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
         if "model" not in cls.__dict__:
             return  # an intermediate base
+        if cls.soft_layer:
+            soft_kind(cls.soft_layer)
         known = _REGISTRY.setdefault(cls.fault, {})
         if cls.model in known and known[cls.model].__qualname__ != cls.__qualname__:
             raise TypeError(f"fault model {cls.fault}/{cls.model} is defined twice")
@@ -258,6 +262,10 @@ class Fault:
         """bool[y, x], where the fault sits; None where the class has no footprint."""
         return None
 
+    def soft(self, params: Params, context: FaultContext) -> NDArray[np.float32]:
+        """Return how strongly the fault acts, float32[y, x], in the unit of its `soft_layer`."""
+        raise NotImplementedError(f"{self.fault}/{self.model} has no soft layer")
+
     def defects(self, params: Params, context: FaultContext) -> NDArray[np.uint8] | None:
         """Kinds of defects in a mosaic's pixels, uint8[y, x]: bits of `quantities.DEFECTS`; None where it makes
         none."""
@@ -278,6 +286,21 @@ class Fault:
             if value is not None:  # TOML has no null: a number left out stays out
                 plain[f.name] = value
         return plain
+
+
+def intensity_dn(electrons: NDArray[np.float32], camera: Camera) -> NDArray[np.float32]:
+    """Return the intensity of electrons float32[y, x, channel], float32[y, x]: linear, 255 is white, nothing clips.
+
+    It is that of the pixels without a colour filter where the camera has such, else the luminance of R, G and B.
+    """
+    channels, white_e = camera.detector.channels, np.asarray(camera.detector.white_e, dtype=np.float32)
+    if "W" in channels:
+        weights = np.array([channel == "W" for channel in channels], dtype=np.float32)
+    else:
+        luminance = dict(zip("RGB", LUMINANCE, strict=True))
+        weights = np.array([luminance.get(channel, 0) for channel in channels], dtype=np.float32)
+        weights /= weights.sum()
+    return np.asarray(electrons @ (weights * 255 / white_e), dtype=np.float32)
 
 
 @dataclass(frozen=True, kw_only=True)

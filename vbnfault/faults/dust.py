@@ -37,6 +37,7 @@ class GaussianDust(Fault):
     fault = "dust_on_optics"
     model = "gaussian"
     step = "electrons"
+    soft_layer = "dust_opacity"
 
     count: Interval = bounds(30, 100, limits=(0, 10_000), integer=True, doc="number of grains in the image")
     peak_dn: Interval = bounds(
@@ -111,6 +112,10 @@ class GaussianDust(Fault):
     def footprint(self, params: Params, context: FaultContext) -> NDArray[np.bool_]:
         """bool[y, x]: where a grain darkens by more than `mask_level_dn`."""
         return _transmission_once(params, context) < 1
+
+    def soft(self, params: Params, context: FaultContext) -> NDArray[np.float32]:
+        """Return the fraction of the light that the grains take, float32[y, x]."""
+        return np.float32(1) - _transmission_once(params, context)
 
 
 def _grains(factor: NDArray[np.float32]) -> tuple[NDArray[np.int64], NDArray[np.float32]]:

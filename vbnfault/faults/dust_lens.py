@@ -61,6 +61,7 @@ class DefocusedDust(LensFault):
     model = "defocused"
     step = "electrons"
     localised = False
+    soft_layer = "dust_opacity"
 
     surface: int = number(
         0,
@@ -126,6 +127,10 @@ class DefocusedDust(LensFault):
         """bool[y, x]: where the loss reaches `mask_loss`."""
         factor = _shadows_once(params, context).transmission
         return np.asarray(factor <= np.float32(1 - params["mask_loss"]))
+
+    def soft(self, params: Params, context: FaultContext) -> F32:
+        """Return the fraction of the light that the grains take, float32[y, x]; their glow is no part of it."""
+        return np.float32(1) - _shadows_once(params, context).transmission
 
 
 # --- geometry --------------------------------------------------------------------------------------------------

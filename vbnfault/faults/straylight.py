@@ -35,7 +35,7 @@ from numpy.typing import NDArray
 from ..errors import VbnfaultError
 from ..quantities import LUMINANCE
 from ..resources import data_dir
-from .base import Fault, FaultContext, Interval, Params, bounds, number, plus, rows
+from .base import Fault, FaultContext, Interval, Params, bounds, intensity_dn, number, plus, rows
 from .flare_textures import FILL
 
 CLOSE = (1, 2, 3, 4, 5)
@@ -59,6 +59,7 @@ class TextureStraylight(Fault):
     step = "electrons"
     needs_sun = True
     effect_mask = True
+    soft_layer = "straylight_added"
 
     count: Interval = bounds(1, 10, limits=(0, 10), integer=True, doc="number of flares, at most one per texture")
     index: Interval = bounds(
@@ -153,6 +154,11 @@ class TextureStraylight(Fault):
         level = white * np.float32(params["mask_level_dn"] / 255)
         below = tuple(map(float, np.nextafter(level, np.float32(0))))
         return cv2.inRange(layer, (-1.0,) * len(below), below) == 0
+
+    def soft(self, params: Params, context: FaultContext) -> NDArray[np.float32]:
+        """Return the intensity of flares and glare, float32[y, x] in DN of 255."""
+        layer = _layer_once(params, context, context.camera.detector.white_e)
+        return np.zeros(context.shape, np.float32) if layer is None else intensity_dn(layer, context.camera)
 
 
 def flare_centres_px(params: Params, sun_xy_px: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from .. import spectra
 from ..quantities import Irradiance
-from .base import FaultContext, Interval, LensFault, Params, bounds, choice, number, plus
+from .base import FaultContext, Interval, LensFault, Params, bounds, choice, intensity_dn, number, plus
 
 F32 = NDArray[np.float32]
 
@@ -33,6 +33,7 @@ class _LensStraylight(LensFault):
     step = "electrons"
     needs_sun = True
     effect_mask = True
+    soft_layer = "straylight_added"
 
     coating: str = choice(
         "bbar",
@@ -86,6 +87,11 @@ class _LensStraylight(LensFault):
             return np.zeros(context.shape, dtype=bool)
         white = context.camera.detector.white_e
         return np.asarray((layer >= white * np.float32(params["mask_level_dn"] / 255)).any(axis=2))
+
+    def soft(self, params: Params, context: FaultContext) -> F32:
+        """Return the intensity of what the lens sends astray, float32[y, x] in DN of 255."""
+        layer = self._layer_once(params, context)
+        return np.zeros(context.shape, np.float32) if layer is None else intensity_dn(layer, context.camera)
 
     def _layer_once(self, params: Params, context: FaultContext) -> F32 | None:
         return context.once("straylight.lens", params, lambda: self._layer(params, context))

@@ -28,6 +28,7 @@ class Cos4Vignetting(Fault):
     model = "cos4"
     step = "electrons"
     localised = False
+    soft_layer = "vignetting_factor"
 
     on_axis_illuminance_dn: Interval = bounds(
         105, 255, limits=(0, 255), unit="DN of 255", doc="E0: 255 leaves the centre as it is"
@@ -49,9 +50,12 @@ class Cos4Vignetting(Fault):
 
     def footprint(self, params: Params, context: FaultContext) -> NDArray[np.bool_]:
         """bool[y, x]: where the loss reaches `mask_loss`."""
+        return self.soft(params, context) <= np.float32(1 - params["mask_loss"])
+
+    def soft(self, params: Params, context: FaultContext) -> NDArray[np.float32]:
+        """Return the factor on the light, float32[y, x]."""
         e0 = np.float32(params["on_axis_illuminance_dn"] / 255)
-        factor = e0 * cos4_map(context.shape, context.camera.focal_length_px)
-        return factor <= np.float32(1 - params["mask_loss"])
+        return e0 * cos4_map(context.shape, context.camera.focal_length_px)
 
 
 @lru_cache(maxsize=2)

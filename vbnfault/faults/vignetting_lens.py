@@ -44,6 +44,7 @@ class LensVignetting(LensFault):
     model = "lens"
     step = "electrons"
     localised = False
+    soft_layer = "vignetting_factor"
 
     decentre: Interval = bounds(
         0.0,
@@ -95,6 +96,10 @@ class LensVignetting(LensFault):
     def footprint(self, params: Params, context: FaultContext) -> NDArray[np.bool_]:
         """bool[y, x]: where the loss reaches `mask_loss`."""
         return np.asarray(_factor_once(params, context) <= np.float32(1 - params["mask_loss"]))
+
+    def soft(self, params: Params, context: FaultContext) -> F32:
+        """Return the factor on the light, float32[y, x]."""
+        return _factor_once(params, context)
 
 
 def _factor_once(params: Params, context: FaultContext) -> F32:

@@ -34,6 +34,7 @@ from .counts import FaultCounts, split_name
 from .group import Store, create, is_store, open_store, write_samples
 from .metadata import append_samples, recover
 from .schema import (
+    EFFECT_RULE,
     FORMAT_VERSION,
     LAYERS,
     REQUIRED_LAYERS,
@@ -48,6 +49,7 @@ from .schema import (
 )
 
 __all__ = [
+    "EFFECT_RULE",
     "FORMAT_VERSION",
     "LAYERS",
     "REQUIRED_LAYERS",

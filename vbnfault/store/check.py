@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import VbnfaultError
+from ..quantities import soft_kind
 from .codec import DIGEST_BYTES, crc_of_scalars, decompress, mask_union, sample_digest, threads
 from .counts import FaultCounts, split_name
 from .group import Store, open_store
@@ -303,12 +304,20 @@ def _check_labels(
             yield f"sample {i}: {fault} {says} marked in injected"
     mask = _array(spec, "mask", layers)
     yield from _check_masks(i, spec.faults, "mask", mask, injected, spec.localised_faults or ())
+    effect: Any = ()
     if "mask_effect" in layers:
         # an injected fault is one that changes the noise-free picture somewhere
         effect = _array(spec, "mask_effect", layers)
         yield from _check_masks(i, spec.faults, "mask_effect", effect, injected, spec.faults)
     if not np.array_equal(_array(spec, "mask_any", layers), mask_union(spec, mask)):
-        yield f"sample {i}: mask_any is not the union of the masks of {', '.join(spec.mask_any_faults)}"
+        members = ", ".join(spec.mask_any_faults) or "no class"
+        yield f"sample {i}: mask_any is not the union of the masks of {members}"
+    for fault, name, is_in in zip(spec.faults, spec.soft_layers, injected, strict=False):
+        if name in layers and not is_in and (_array(spec, name, layers) != soft_kind(name).neutral).any():
+            yield f"sample {i}: {name} is not {soft_kind(name).neutral:g}, although {fault} is not injected"
+    for fault, kind, one, other in zip(spec.faults, spec.mask_kinds, mask, effect, strict=False):
+        if kind == "effect" and not np.array_equal(one, other):
+            yield f"sample {i}: mask of {fault} is not its effect, as mask_effect has it"
     # equal checksums stand for equal pictures: both have just been compared with their pixels
     crc = dict(zip(spec.pixel_layers, crcs.tolist(), strict=False))
     if not injected.any() and crc["image"] != crc["clean"]:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..plan import SPLITS, STRATA
-from ..quantities import CHANNELS, DEFECTS
+from ..quantities import CHANNELS, DEFECTS, soft_kind
 
 FORMAT_VERSION = 1
 SEMANTIC = ("sky", "body", "sun", "spacecraft")
@@ -58,11 +58,11 @@ _IMAGE = "sample y x channel"
 # The schema. Per-pixel layers: one chunk a sample, sharded.
 LAYERS: dict[str, Array] = {
     "image": Array(_IMAGE, "uint8", "DN", "image with faults", ratio=0.45),
-    "mask": Array("sample fault y x", "bool", "1", "footprint of each fault", ratio=0.005),
-    "mask_any": Array("sample y x", "bool", "1", "union over the faults named here", ratio=0.005),
+    "mask": Array("sample fault y x", "bool", "1", "where each fault is, by its kind", ratio=0.005),
+    "mask_any": Array("sample y x", "bool", "1", "union of mask over the faults named here", ratio=0.005),
     "clean": Array(_IMAGE, "uint8", "DN", "same camera, exposure and noise, no fault", ratio=0.45),
     # optional from here on; `without_<fault>` follows the pattern of the straylight one
-    "mask_effect": Array("sample fault y x", "bool", "1", "noise-free change of 1 DN or more", ratio=0.02),
+    "mask_effect": Array("sample fault y x", "bool", "1", "where each fault changes the image", ratio=0.02),
     "raw": Array("sample y x", "uint16", "DN", "raw mosaic of the analogue-to-digital converter", ratio=0.6),
     "defects": Array(
         "sample y x", "uint8", "1", "what is wrong with a pixel of the mosaic", DEFECTS, bits=True, ratio=0.01
@@ -79,6 +79,13 @@ LAYERS: dict[str, Array] = {
     ),
     "radiance": Array("sample band y x", "float16", "W m-2 sr-1 nm-1", "radiance at the camera", ratio=0.7),
 }
+# What `mask_effect` is, and the mask of a class that is labelled by effect.
+EFFECT_DN = 1
+EFFECT_RULE = (
+    f"a channel of the noise-free 8 bit image changes by {EFFECT_DN} DN or more when the fault is switched off "
+    "and the others are kept"
+)
+MASK_ANY_RULE = "union of the masks of the classes in the attribute faults, which dataset.mask_any chose"
 REQUIRED_LAYERS = ("image", "mask", "mask_any", "clean")
 
 # Scalars and small vectors: a chunk is a shard, so that a task writes whole chunks.
@@ -163,7 +170,9 @@ class StoreSpec:
 
     `faults`: the fault axis in dataset order. `mask_any_faults`: the union that `mask_any` is.
     `localised_faults`: those whose mask is not empty where they are injected (default: `mask_any_faults`).
-    `layers`: the optional layers, of `LAYERS` or `without_<fault>`. `shard_samples` 0 chooses the most, up to
+    `mask_kinds`, `mask_rules`: what the mask of each of `faults` is, and by which rule. `soft_layers`: the soft
+    layer of each of `faults`, "" where it has none. `layers`: the optional layers, of `LAYERS`, `soft_layers` or
+    `without_<fault>`. `shard_samples` 0 chooses the most, up to
     16, that keeps the largest array of a shard within 1 GiB and all of them within 2 GiB; a larger one is
     lowered to its largest divisor that does. `attributes`: JSON-able root attributes. Raises InputError for
     names that do not exist. `distortion_residual_px`: root mean square and largest deviation of the coefficients
@@ -177,6 +186,9 @@ class StoreSpec:
     wavelength_nm: tuple[float, ...] = ()
     layers: tuple[str, ...] = ()
     localised_faults: tuple[str, ...] | None = None
+    mask_kinds: tuple[str, ...] = ()
+    mask_rules: tuple[str, ...] = ()
+    soft_layers: tuple[str, ...] = ()
     site_names: tuple[str, ...] = ()
     lens_names: tuple[str, ...] = ()
     distortion_residual_px: tuple[float, float] = (0.0, 0.0)
@@ -186,7 +198,7 @@ class StoreSpec:
     attributes: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        allowed = {*LAYERS, *(f"without_{f}" for f in self.faults)}
+        allowed = {*LAYERS, *(f"without_{f}" for f in self.faults), *filter(None, self.soft_layers)}
         for name in self.layers:
             if name not in allowed:
                 raise InputError(f"layers: {name!r} is no layer; known: {', '.join(sorted(allowed))}")
@@ -212,6 +224,9 @@ class StoreSpec:
                 rows[name] = replace(LAYERS[name], dtype=self.radiance_dtype)
             elif name in LAYERS:
                 rows[name] = LAYERS[name]
+            elif name in self.soft_layers:
+                kind, fault = soft_kind(name), self.faults[self.soft_layers.index(name)]
+                rows[name] = Array("sample y x", kind.dtype, kind.units, f"{fault}: {kind.meaning}", ratio=0.4)
             else:
                 without = name.removeprefix("without_")
                 rows[name] = Array(_IMAGE, "uint8", "DN", f"the image without {without}", ratio=0.45)
@@ -248,7 +263,9 @@ class StoreSpec:
     def members(self, samples: int) -> dict[str, Member]:
         """Name → what it must be, for every array of a group of `samples` samples, coordinates last."""
         extra: dict[str, dict[str, Any]] = {
-            "mask_any": {"faults": list(self.mask_any_faults)},
+            "mask": {"kinds": list(self.mask_kinds), "rules": list(self.mask_rules)} if self.mask_kinds else {},
+            "mask_effect": {"threshold_dn": EFFECT_DN, "rule": EFFECT_RULE},
+            "mask_any": {"faults": list(self.mask_any_faults), "rule": MASK_ANY_RULE},
             "site": {"names": list(self.site_names)},
             "lens": {"names": list(self.lens_names)},
             "distortion": {
