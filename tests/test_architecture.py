@@ -20,7 +20,7 @@ ROOT = Path(vbnfault.__file__).parent
 # Unit (module or package of vbnfault) → the units it may import, besides itself and EVERYWHERE. Data flows
 # one way; a new unit has to be given its place here.
 EVERYWHERE = {"errors", "resources", "interrupts", "__init__"}
-FOUNDATION = {"llvm", "spectra", "quantities", "config", "frames", "photometry", "spice"}
+FOUNDATION = {"llvm", "spectra", "quantities", "config", "frames", "photometry", "spice", "meshes"}
 GEOMETRY = FOUNDATION | {"body", "plan", "scene"}
 CAMERA = {"spectra", "quantities", "llvm", "lens", "detector", "camera"}
 WORLD = GEOMETRY | CAMERA | {"sky", "spacecraft", "render"}
@@ -38,12 +38,13 @@ MAY_IMPORT: dict[str, set[str]] = {
     "photometry": set(),
     "frames": set(),
     "spice": {"frames"},
+    "meshes": set(),
     "config": {"photometry", "spectra", "quantities"},
     "body": FOUNDATION,
     "plan": FOUNDATION | {"body"},
     "scene": FOUNDATION | {"body", "plan"},
     "sky": {"spectra", "quantities", "frames"},
-    "spacecraft": {"frames"},
+    "spacecraft": {"frames", "meshes"},
     "render": {"scene", "llvm", "photometry", "quantities"},  # quantities: what it returns
     "lens": {"spectra", "quantities", "llvm"},
     "detector": {"spectra", "quantities"},

@@ -19,8 +19,8 @@ from vbnfault.camera import Camera
 from vbnfault.detector import Detector
 from vbnfault.errors import InputError
 from vbnfault.faults import FaultContext, dust_lens
-from vbnfault.lens import RealLens, ThinLens, first_order, load_lens, scaled_to_field
-from vbnfault.lens.footprint import Frame, beams, disc_overlap, stopped_down
+from vbnfault.lens import RealLens, ThinLens, first_order, load_lens, scaled_to_field, stopped_down
+from vbnfault.lens.footprint import Frame, beams, disc_overlap
 from vbnfault.lens.trace import real_pupil_diameter_mm, trace
 
 F64 = NDArray[np.float64]

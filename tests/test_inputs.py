@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import base64
+import json
 import os
+import re
 import struct
 import zlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from vbnfault import config, resources
 from vbnfault.body import load_shape
+from vbnfault.body.shape import signed_volume
 from vbnfault.detector.sensor import load_sensor
 from vbnfault.errors import InputError, VbnfaultError, shown
 from vbnfault.faults import from_dict
@@ -169,3 +174,150 @@ def test_vast_textures_are_refused_unread(data: bytes, tmp_path: Path) -> None:
     path = tmp_path / "bomb.png"
     path.write_bytes(data)
     assert "30000 × 30000 pixels" in refused(texture, path)
+
+
+# ------------------------------------------------------------------------------------ meshes
+
+CUBE_V = np.array([[x, y, z] for x in (0.0, 1.0) for y in (0.0, 1.0) for z in (0.0, 1.0)])
+SQUARES = np.array([[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]])
+CUBE_F = SQUARES[:, [[0, 1, 2], [0, 2, 3]]].reshape(-1, 3)
+BOTH = pytest.mark.parametrize("load", [load_shape, load_spacecraft])
+
+
+def obj(faces: np.ndarray, head: str = "# cube\n") -> str:
+    rows = [f"v {x} {y} {z}" for x, y, z in 200 * CUBE_V] + [f"f {a} {b} {c}" for a, b, c in faces]
+    return head + "\n".join(rows) + "\n"
+
+
+def cube_of(load: Callable[[Path], Any], path: Path) -> tuple[np.ndarray, np.ndarray]:
+    if load is load_shape:
+        vertices, faces = load_shape(path)
+    else:
+        mesh = load_spacecraft(path, unit="cm").merged()
+        vertices, faces = 100 * mesh.vertices_B_m, mesh.faces
+    return vertices, faces
+
+
+@BOTH
+def test_an_obj_that_counts_from_zero_is_refused_by_line(load: Callable[[Path], Any], tmp_path: Path) -> None:
+    path = tmp_path / "cube.obj"
+    path.write_text(obj(CUBE_F))
+    assert "line 10: expected vertex numbers from 1 to 8, found 0" in refused(load, path)
+
+
+@BOTH
+def test_objs_in_other_words_are_the_same_body(load: Callable[[Path], Any], tmp_path: Path) -> None:
+    path = tmp_path / "cube.obj"
+    path.write_text(obj(CUBE_F + 1))
+    vertices, faces = cube_of(load, path)
+    np.testing.assert_allclose(vertices, 200 * CUBE_V)
+    np.testing.assert_array_equal(faces, CUBE_F)
+    for text in (
+        obj(CUBE_F - 8),  # counted back from the last vertex
+        obj(CUBE_F + 1, "mtllib a.mtl\r\nvn 0 0 1\nvt 0 0\n").replace("\nf 1 2 4", "\nf 1/1/1 2//1 4/1"),
+        obj(CUBE_F + 1).replace("\nf 1 2 4", "\nf 1 2 \\\n4"),
+        obj(CUBE_F + 1).replace("0.0\n", "0.0 # a corner\n"),
+        obj(CUBE_F[:0]) + "".join(f"f {a + 1} {b + 1} {c + 1} {d + 1}\n" for a, b, c, d in SQUARES),
+    ):
+        path.write_text(text)
+        again = cube_of(load, path)
+        np.testing.assert_allclose(again[0], vertices)
+        assert len(again[1]) == 12
+        assert signed_volume(*again) == pytest.approx(200.0**3, rel=1e-6)
+
+
+@BOTH
+def test_vertices_of_an_obj_have_three_numbers(load: Callable[[Path], Any], tmp_path: Path) -> None:
+    path = tmp_path / "cube.obj"
+    for bad in ("v 200.0 0.0", "v 200.0 0.0 x", "v 1 nan 1", "v 1 2 3 4 5", "v 1e400 0 0"):
+        path.write_text(obj(CUBE_F + 1).replace("v 200.0 0.0 0.0", bad, 1))
+        assert f"line 6: expected 'v x y z', finite numbers, found {bad[2:]!r}" in refused(load, path)
+
+
+def glb(nodes: list[dict[str, Any]], *, roots: list[Any] | None = None, **more: Any) -> bytes:
+    """A GLB of the cube as mesh 0; what `more` holds replaces parts of its JSON."""
+    blob = (200 * CUBE_V).astype("<f4").tobytes() + CUBE_F.astype("<u2").tobytes()
+    table: dict[str, Any] = {
+        "asset": {"version": "2.0"},
+        "scenes": [{"nodes": [0] if roots is None else roots}],
+        "nodes": nodes,
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 0}, "indices": 1}]}],
+        "accessors": [
+            {"bufferView": 0, "componentType": 5126, "type": "VEC3", "count": 8},
+            {"bufferView": 1, "componentType": 5123, "type": "SCALAR", "count": 36},
+        ],
+        "bufferViews": [
+            {"buffer": 0, "byteOffset": 0, "byteLength": 96},
+            {"buffer": 0, "byteOffset": 96, "byteLength": 72},
+        ],
+        "buffers": [{"byteLength": len(blob)}],
+    }
+    text = json.dumps(table | more).encode()
+    text += b" " * (-len(text) % 4)
+    chunks = struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(blob), b"BIN\0") + blob
+    return b"glTF" + struct.pack("<II", 2, 12 + len(chunks)) + chunks
+
+
+@BOTH
+def test_a_glb_is_read_through_its_nodes(load: Callable[[Path], Any], tmp_path: Path) -> None:
+    path = tmp_path / "cube.glb"
+    half = np.sqrt(0.5)
+    nodes = [
+        {"children": [1]},
+        {"mesh": 0, "rotation": [0, 0, half, half], "scale": [1, 1, -1]},
+    ]  # turned, mirrored
+    path.write_bytes(glb(nodes))
+    vertices, faces = cube_of(load, path)
+    assert signed_volume(vertices, faces) == pytest.approx(200.0**3, rel=1e-6)
+    np.testing.assert_allclose(vertices.min(axis=0), [-200, 0, -200], atol=1e-4)
+    np.testing.assert_allclose(vertices.max(axis=0), [0, 200, 0], atol=1e-4)
+
+
+@BOTH
+@pytest.mark.parametrize(
+    ("data", "says"),
+    [
+        (glb([{"children": [1]}, {"children": [0], "mesh": 0}]), "below itself"),
+        (glb([{"children": [0]}]), "below itself"),
+        (glb([{"children": [k + 1]} for k in range(5000)] + [{"mesh": 0}]), "more than 64 nodes"),
+        (glb([{"mesh": 0}] * 20_000, roots=list(range(20_000))), "10000 parts"),
+        # each level has the next one twice: 2^40 cubes
+        (glb([{"children": [k + 1, k + 1]} for k in range(40)] + [{"mesh": 0}]), "below two nodes"),
+        (glb([{"mesh": 7}]), "mesh = 7"),
+        (glb([{"mesh": 0}], roots=[-1]), "node = -1"),
+        (glb([{"mesh": 0, "scale": [1e300, 1, 1]}]), "scale"),
+        (
+            glb(
+                [{"mesh": 0}], accessors=[{"bufferView": 0, "componentType": 5126, "type": "VEC3", "count": 10**9}]
+            ),
+            "count",
+        ),
+        (glb([{"mesh": 0}], bufferViews=[{"buffer": 0, "byteLength": 10**12}] * 2), "byteLength"),
+        (glb([{"mesh": 0}], buffers=[{"uri": "/etc/passwd", "byteLength": 168}]), "in the folder of the"),
+        (glb([{"mesh": 0}], buffers=[{"uri": "../cube.bin", "byteLength": 168}]), "in the folder of the"),
+        (glb([{"mesh": 0}], extensionsRequired=["KHR_draco_mesh_compression"]), "KHR_draco_mesh_compression"),
+        (glb([{"mesh": 0}], meshes=[[[[]]]]), r"meshes\[0\]"),
+        (glb([{"mesh": 0}], meshes=7), "meshes = 7"),
+    ],
+    ids=lambda value: "" if isinstance(value, bytes) else value,
+)
+def test_broken_glbs_name_what_is_wrong(
+    load: Callable[[Path], Any], data: bytes, says: str, tmp_path: Path
+) -> None:
+    path = tmp_path / "cube.glb"
+    path.write_bytes(data)
+    assert re.search(says, refused(load, path))
+
+
+@BOTH
+def test_images_of_a_glb_are_never_unpacked(load: Callable[[Path], Any], tmp_path: Path) -> None:
+    image = base64.b64encode(png(60_000, 60_000)).decode()  # 3.6 gigapixel
+    textured = {
+        "images": [{"uri": f"data:image/png;base64,{image}"}],
+        "textures": [{"source": 0}],
+        "materials": [{"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}}],
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 0}, "indices": 1, "material": 0}]}],
+    }
+    path = tmp_path / "cube.glb"
+    path.write_bytes(glb([{"mesh": 0}], **textured))
+    assert len(cube_of(load, path)[1]) == 12

@@ -178,14 +178,14 @@ def test_placement(obj: Path) -> None:
         (CORNERS, "has no faces"),
         (
             CORNERS.replace("1 1 0", "1 nan 0") + "o wing\nf 1 2 3\n",
-            "part 'wing' has vertices with NaN or infinite",
+            "line 3: expected 'v x y z', finite numbers, found '1 nan 0'",
         ),
         (
             CORNERS.replace("1 1 0", "1 inf 0") + "o wing\nf 1 2 3\n",
-            "part 'wing' has vertices with NaN or infinite",
+            "line 3: expected 'v x y z', finite numbers, found '1 inf 0'",
         ),
-        (CORNERS + "f 1 2 9\n", "is unreadable as OBJ"),
-        (CORNERS + "f 1 2 x\n", "is unreadable as OBJ"),
+        (CORNERS + "f 1 2 9\n", "line 8: expected vertex numbers from 1 to 7, found 9"),
+        (CORNERS + "f 1 2 x\n", "line 8: expected 'f a b c', three vertex numbers or more, found '1 2 x'"),
         (CORNERS + "f 1 1 2\nf 3 3 3\n", "no face has an area"),
         ("v 0 0 0\nv 900 0 0\nv 0 800 0\nf 1 2 3\n", "measures 900 m in the unit 'm'"),
     ],
@@ -198,16 +198,13 @@ def test_malformed_obj(tmp_path: Path, text: str, says: str) -> None:
     assert "\n" not in str(caught.value)
 
 
-def test_a_nan_that_no_face_names_does_no_harm(tmp_path: Path) -> None:
-    vehicle = load_spacecraft(write(tmp_path, CORNERS + "v nan 0 0\nf 1 2 3\n"))
-    assert np.isfinite(vehicle.merged().vertices_B_m).all()
-
-
-@pytest.mark.parametrize("content", [b"\0", b"glTF\2\0\0\0" + b"\xff" * 40, b"solid nothing"])
+@pytest.mark.parametrize("content", [b"\0", b"glTF\2\0\0\0" + b"\xff" * 40, b"solid nothing", b"glTF\1\0\0\0"])
 def test_malformed_glb(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "vehicle.glb"
     path.write_bytes(content)
-    with pytest.raises(InputError, match="is unreadable as GLB"):
+    with pytest.raises(
+        InputError, match=r"its JSON is unreadable|is cut short: a chunk of \d+ bytes|a GLB of version 2"
+    ):
         load_spacecraft(path)
 
 

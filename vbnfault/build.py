@@ -58,6 +58,7 @@ class Summary:
     estimated_bytes: int
     free_bytes: int
     fault_counts: Mapping[str, int] = field(default_factory=dict)
+    optics: str = ""
     built: int = 0
     seconds: float = 0.0
 
@@ -66,6 +67,8 @@ class Summary:
         head = f"{self.path}: {self.samples} samples at {self.sites} sites in {self.shards} shards"
         size = f"about {size_text(self.estimated_bytes)}, {size_text(self.free_bytes)} free"
         lines = [f"{head}, {size}; {self.finished} of them were finished before"]
+        if self.optics:
+            lines.append(f"lens: {self.optics}")
         if self.fault_counts:
             lines.append("faults: " + ", ".join(f"{k} {v}" for k, v in self.fault_counts.items()))
         if self.built:
@@ -152,6 +155,7 @@ def build(
             estimated_bytes=spec.estimated_sample_bytes * len(sites),
             free_bytes=_free_bytes(path),
             fault_counts=dict(fault_counts or {}),
+            optics=spec.attributes.get("optics", {}).get("summary", ""),
         )
 
     summary = outlook()

@@ -238,8 +238,20 @@ def lens(
         float, typer.Option(help="of the relative's curvatures, thicknesses and rims, as a share of each")
     ] = 0.03,
     toml: Annotated[Path | None, typer.Option(help="write the prescription, such as a relative's")] = None,
+    focal_length_mm: Annotated[
+        float | None, typer.Option(min=0.01, max=1e5, help="scale it to this focal length [default: as prescribed]")
+    ] = None,
+    fov_deg: Annotated[
+        float | None, typer.Option(min=0.01, max=140, help="scale it to this field; needs --sensor-width-mm")
+    ] = None,
+    sensor_width_mm: Annotated[
+        float | None, typer.Option(min=1e-3, max=1e4, help="width that --fov-deg spans")
+    ] = None,
+    f_number: Annotated[
+        float | None, typer.Option(max=200, help="close its stop to this f-number [default: as prescribed]")
+    ] = None,
 ) -> None:
-    """First-order table of a lens (EFL, BFD, f-number, pupils) and a drawing of its layout."""
+    """First-order table of a lens (EFL, BFD, f-number, pupils), scaled and stopped down if asked, and a drawing."""
     from dataclasses import asdict
 
     import numpy as np
@@ -251,7 +263,19 @@ def lens(
     prescription = optics.load_lens(lens)
     if vary_seed is not None:
         prescription = relative(prescription, np.random.default_rng(vary_seed), spread=spread)
-    figures = asdict(optics.first_order(prescription))
+    if (fov_deg is None) != (sensor_width_mm is None):
+        given = f"--fov-deg {fov_deg}" if sensor_width_mm is None else f"--sensor-width-mm {sensor_width_mm}"
+        raise InputError(f"{given}: --fov-deg and --sensor-width-mm go together")
+    if focal_length_mm is not None and fov_deg is not None:
+        raise InputError(f"--focal-length-mm {focal_length_mm:g}: leave it out, or --fov-deg")
+    if focal_length_mm is not None:
+        prescription = optics.scaled_to_focal_length(prescription, focal_length_mm)
+    if fov_deg is not None and sensor_width_mm is not None:
+        prescription = optics.scaled_to_field(prescription, fov_deg, sensor_width_mm)
+    if f_number is not None:
+        prescription = optics.closed_to(prescription, f_number, "--f-number")
+    real = optics.open_f_number(prescription)
+    figures = asdict(optics.first_order(prescription)) | {"real_f_number": real, "scale": prescription.scale}
     path = Path(f"{Path(lens).stem}.png") if out is None else out
     if path.suffix.lower() != ".png" or not path.absolute().parent.is_dir():
         raise InputError(f"--out {path}: must be a .png in a folder that exists")

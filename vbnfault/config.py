@@ -301,6 +301,8 @@ class SpacecraftTable(Table):
     pose: dict[str, PoseTable] = Field(default_factory=dict, description="by part")
 
 
+# Of a camera without a prescription, where the scene names no other.
+THIN_LENS = {"f_number": 4.0, "transmission": 0.9}
 OF_THE_DETECTOR = (
     "pixel_pitch_um",
     "full_well_e",
@@ -330,8 +332,18 @@ class CameraTable(Table):
     focus: Literal["paraxial", "best"] = Field(
         "paraxial", description="where its sensor stands: best has the smallest spots over the frame"
     )
-    f_number: float = Field(4.0, ge=0.5, le=200, description="of the thin lens; a prescription has its own")
-    transmission: float = Field(0.9, gt=0, le=1, description="of the thin lens; a prescription has its own")
+    f_number: float | None = Field(
+        None,
+        ge=0.5,
+        le=200,
+        description="default: 4 of a thin lens, a prescription's own; a larger one than that closes its stop",
+    )
+    transmission: float | None = Field(
+        None,
+        gt=0,
+        le=1,
+        description="of a thin lens, default 0.9; a prescription's follows from glass and coatings",
+    )
     focus_distance_m: float | None = Field(None, gt=0, description="default: infinity")
     detector: str = Field(
         "",
@@ -370,6 +382,18 @@ class CameraTable(Table):
         ("full_frame_ccd", "frame_transfer_ccd", "interline_ccd", "cmos"), min_length=1
     )
     readout_directions: tuple[Direction, ...] = Field(("up", "down", "left", "right"), min_length=1)
+
+    @model_validator(mode="after")
+    def _of_the_lens(self) -> CameraTable:
+        if self.lens and self.transmission is not None:
+            raise ValueError(
+                f"transmission = {self.transmission:g}: the lens has its own, of glass and coatings; leave one out"
+            )
+        if not self.lens:  # a scene with a prescription keeps None: its own f-number
+            for key, value in THIN_LENS.items():
+                if getattr(self, key) is None:
+                    object.__setattr__(self, key, value)
+        return self
 
     @model_validator(mode="after")
     def _known(self) -> CameraTable:

@@ -111,6 +111,7 @@ def store_spec(session: pipeline.Session, blocks: Sequence[int]) -> StoreSpec:
         "licence": dataset.licence,
         "citation": dataset.citation,
         "intensity_channel": _intensity(camera.detector),
+        "optics": camera.lens.figures,
         "detector": _detector(camera.detector),
         "fault_models": {name: fault.model for name, fault in session.faults.items()},
     }
@@ -200,6 +201,10 @@ def planned(attributes: Mapping[str, Any], faults: Sequence[str]) -> Callable[[i
     # what is added to the tables of a scene's identity is no key of a scene
     for name, added in (("sky", "catalogue"), ("spice", "spiceypy")):
         stored[name] = {key: value for key, value in stored.get(name, {}).items() if key != added}
+    if stored["camera"].get("lens"):
+        # earlier versions stored those of a thin lens here, which did nothing; no plan depends on them
+        unused = ("f_number", "transmission")
+        stored["camera"] = {key: value for key, value in stored["camera"].items() if key not in unused}
     stored["dataset"] = {**stored["dataset"], "samples": attributes["blocks"][0]}
     scene = config.parse_scene(stored, source="the store's own scene")
     table = plan.make_plan(scene, faults, attributes["blocks"])

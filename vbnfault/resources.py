@@ -30,6 +30,7 @@ LIMIT_BYTES: dict[str, int] = {
     "spacecraft": 512 * MIB,
     "texture": 256 * MIB,
     "SPICE kernel": 64 << 30,
+    "SPICE text kernel": 256 * MIB,
 }
 _DEEPEST_TABLE = 24
 _LONGEST_NAME_BYTES = 255

@@ -7,9 +7,6 @@ such a path, a leading piece of it, or any single name along it, and holds for a
 
 from __future__ import annotations
 
-import io
-import re
-import warnings
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
@@ -21,9 +18,10 @@ import trimesh
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from . import resources
+from . import meshes, resources
 from .errors import InputError
 from .frames import rx, ry, rz
+from .meshes import MeshPart
 
 F64 = NDArray[np.float64]
 Unit = Literal["m", "cm", "mm"]
@@ -32,6 +30,8 @@ METRES_PER: dict[str, float] = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 FILE_TYPES = (".obj", ".glb", ".gltf")
 # No vehicle near a comet is larger (Rosetta: 32 m from tip to tip); a file in millimetres read as metres is.
 LARGEST_EXTENT_M = 200.0
+# In the file's unit: a vehicle of 200 m in millimetres, far from its origin.
+_FARTHEST = 1e9
 # Relative to the squared extent: below it a face's normal is rounding noise in float64.
 _DEGENERATE_AREA_FRACTION = 1e-16
 
@@ -280,16 +280,6 @@ def _refuse_unknown(table: Iterable[str], known: Iterable[str], what: str) -> No
 # ------------------------------------------------------------------------------------ files
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Piece:
-    """What a file holds under one name and one material's name (empty if it gives none)."""
-
-    name: str
-    material: str
-    vertices: F64
-    faces: NDArray[np.int64]
-
-
 def load_spacecraft(
     path: str | Path,
     *,
@@ -345,7 +335,7 @@ def load_spacecraft(
     _refuse_unknown(settings, known, "material")
     otherwise = make_material(default_material)
 
-    def material_of(piece: _Piece) -> Material:
+    def material_of(piece: MeshPart) -> Material:
         for key in (*_keys(piece.name), piece.material):
             if key in settings:
                 return settings[key]
@@ -364,110 +354,26 @@ def load_spacecraft(
     return Spacecraft(parts=parts).posed(poses or {})
 
 
-def _read(path: Path) -> list[_Piece]:
+def _read(path: Path) -> list[MeshPart]:
     data = resources.read_input(path, "spacecraft", types=FILE_TYPES)
-    suffix = path.suffix.lower()
-    try:
-        # numpy warns on NaN while the readers work; the check below reports it as an error
-        with warnings.catch_warnings(), np.errstate(all="ignore"):
-            warnings.simplefilter("ignore")
-            pieces = _read_obj(data, path.stem) if suffix == ".obj" else _read_gltf(path)
-    except Exception as error:  # the readers raise whatever their parsers raise
-        kind, what = suffix[1:].upper(), type(error).__name__
-        raise InputError(f"{path}: is unreadable as {kind} ({what} while parsing)") from None
+    if path.suffix.lower() == ".obj":
+        pieces = meshes.read_obj(data, str(path), name=path.stem)
+    else:
+        pieces = meshes.read_gltf(data, str(path), folder=path.parent)
+    pieces = [piece for piece in pieces if len(piece.faces)]
     if not pieces:
         raise InputError(f"{path}: spacecraft has no faces")
     for piece in pieces:
         if not np.isfinite(piece.vertices[piece.faces]).all():
             raise InputError(f"{path}: part {piece.name!r} has vertices with NaN or infinite coordinates")
-    return pieces
-
-
-_DIRECTIVE = re.compile(r"^[ \t]*(o|g|usemtl)(?:[ \t]+(.*?))?[ \t\r]*$", re.MULTILINE)
-_ORNAMENT = re.compile(r"^[ \t]*(?:mtllib|s|vt|vn)\b.*$", re.MULTILINE)
-_ORNAMENT_OF_A_CORNER = re.compile(r"(?<=\d)/[-\d/]*")
-
-
-def _read_obj(data: bytes, stem: str) -> list[_Piece]:
-    """Return the pieces of an OBJ; faces outside of objects and groups are named `stem`.
-
-    trimesh keeps an OBJ's names only in part, so every stretch of faces gets a number for its name first.
-    """
-    text = data.decode("utf-8", errors="replace").replace("\r\n", "\n").replace("\\\n", " ")
-    now = {"o": "", "g": "", "usemtl": ""}
-    stretches: list[tuple[str, str]] = []
-
-    def header() -> str:
-        name = "/".join(piece for piece in (now["o"], now["g"]) if piece) or stem
-        stretches.append((name, now["usemtl"]))
-        return f"o {len(stretches) - 1}"
-
-    def numbered(match: re.Match[str]) -> str:
-        now[match[1]] = (match[2] or "").strip()
-        if match[1] == "o":
-            now["g"] = ""
-        return header()
-
-    text = header() + "\n" + _DIRECTIVE.sub(numbered, _ORNAMENT.sub("", text))
-    text = _ORNAMENT_OF_A_CORNER.sub("", text)
-    scene: Any = trimesh.load(
-        io.BytesIO(text.encode()),
-        file_type="obj",
-        force="scene",
-        process=False,
-        split_objects=True,
-        group_material=False,
-    )
-    # older releases of trimesh drop the name of a single object: it is the last one before the first face
-    single = re.findall(r"^o (\d+)$", text[: text.find("\nf") + 1], re.MULTILINE)[-1:]
-    pieces: dict[tuple[str, str], list[trimesh.Trimesh]] = {}
-    meshes = {k: mesh for k, mesh in scene.geometry.items() if isinstance(mesh, trimesh.Trimesh)}
-    for number, mesh in sorted((int(k if k.isdigit() else single[0]), mesh) for k, mesh in meshes.items()):
-        pieces.setdefault(stretches[number], []).append(mesh)
-    return [_joined(*stretch, found) for stretch, found in pieces.items()]
-
-
-def _joined(name: str, material: str, meshes: list[trimesh.Trimesh]) -> _Piece:
-    first = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
-    return _Piece(
-        name=name,
-        material=material,
-        vertices=np.concatenate([np.asarray(mesh.vertices, dtype=np.float64) for mesh in meshes]),
-        faces=np.concatenate(
-            [np.asarray(m.faces, dtype=np.int64) + i for m, i in zip(meshes, first, strict=False)]
-        ),
-    )
-
-
-def _read_gltf(path: Path) -> list[_Piece]:
-    scene: Any = trimesh.load(path, force="scene", process=False)
-    parents = scene.graph.transforms.parents
-    pieces = []
-    for node in scene.graph.nodes_geometry:
-        V_from_node, geometry = scene.graph[node]
-        mesh = scene.geometry[geometry]
-        if not isinstance(mesh, trimesh.Trimesh):
-            continue
-        names = [str(node)]
-        while (above := parents.get(node)) is not None and above != scene.graph.base_frame:
-            names.append(str(above))
-            node = above
-        faces = np.array(mesh.faces, dtype=np.int64)
-        if np.linalg.det(V_from_node[:3, :3]) < 0:  # a mirrored node
-            faces = faces[:, ::-1]
-        material = getattr(getattr(mesh.visual, "material", None), "name", None)
-        pieces.append(
-            _Piece(
-                name="/".join(name.replace("/", "_") for name in reversed(names)),
-                material=str(material or ""),
-                vertices=np.asarray(mesh.vertices, dtype=np.float64) @ V_from_node[:3, :3].T + V_from_node[:3, 3],
-                faces=faces,
+        if (far := np.abs(piece.vertices).max()) > _FARTHEST:
+            raise InputError(
+                f"{path}: part {piece.name!r} has vertices with coordinates such as {far:g}; at most {_FARTHEST:g}"
             )
-        )
     return pieces
 
 
-def _without_degenerate_faces(piece: _Piece) -> _Piece:
+def _without_degenerate_faces(piece: MeshPart) -> MeshPart:
     """Without faces of no area, and without the vertices that no face names."""
     a, b, c = (piece.vertices[piece.faces[:, k]] for k in range(3))
     area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)

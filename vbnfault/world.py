@@ -17,7 +17,14 @@ from .camera import Camera
 from .config import BodyTable, CameraTable, OrbitTable, PoseTable, SceneConfig, SpiceTable, SunTable
 from .detector import Detector, MosaicDetector, Sensor, load_sensor
 from .errors import InputError
-from .lens import RealLens, ThinLens, coating, load_lens, scaled_to_focal_length
+from .lens import (
+    RealLens,
+    ThinLens,
+    closed_to,
+    coating,
+    load_lens,
+    scaled_to_focal_length,
+)
 from .photometry import Photometry
 from .quantities import Radiance
 from .scene import Sunlight, View
@@ -276,18 +283,25 @@ def _detector_of(scene: SceneConfig, sensor: Sensor, individual: int, direction:
     return made
 
 
+def _focus_distance_m(c: CameraTable) -> float:
+    return float("inf") if c.focus_distance_m is None else c.focus_distance_m
+
+
 def _thin_lens(c: CameraTable, pixel_pitch_um: float) -> ThinLens:
     return ThinLens(
         focal_length_mm=cameras.focal_length_mm(c.fov_deg, c.width_px, pixel_pitch_um),
-        f_number=c.f_number,
-        transmission=c.transmission,
-        focus_distance_m=float("inf") if c.focus_distance_m is None else c.focus_distance_m,
+        f_number=config.THIN_LENS["f_number"] if c.f_number is None else c.f_number,
+        transmission=config.THIN_LENS["transmission"] if c.transmission is None else c.transmission,
+        focus_distance_m=_focus_distance_m(c),
     )
 
 
 @lru_cache(maxsize=4)
 def real_lens(c: CameraTable, pixel_pitch_um: float) -> RealLens:
-    """The prescription that a camera names, scaled to its field of view. Raises InputError."""
+    """Return the prescription that a camera names, scaled to its field of view and closed to its f-number.
+
+    Raises InputError for a file that is no lens, and for an f-number that it does not reach.
+    """
     try:
         prescription = load_lens(c.lens)
     except InputError as error:
@@ -297,14 +311,17 @@ def real_lens(c: CameraTable, pixel_pitch_um: float) -> RealLens:
             known = ", ".join(coating.NAMES)
             raise InputError(f"camera.lens_coating = {c.lens_coating!r}: must be one of {known}")
         prescription = prescription.coated(c.lens_coating)
-    thin = _thin_lens(c, pixel_pitch_um)
+    focal_length_mm = cameras.focal_length_mm(c.fov_deg, c.width_px, pixel_pitch_um)
+    prescription = scaled_to_focal_length(prescription, focal_length_mm)
+    if c.f_number is not None:
+        prescription = closed_to(prescription, c.f_number, "camera.f_number")
     return RealLens(
-        prescription=scaled_to_focal_length(prescription, thin.focal_length_mm),
+        prescription=prescription,
         width_px=c.width_px,
         height_px=c.height_px,
         pixel_pitch_um=pixel_pitch_um,
         focus=c.focus,
-        focus_distance_m=thin.focus_distance_m,
+        focus_distance_m=_focus_distance_m(c),
     )
 
 

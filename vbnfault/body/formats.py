@@ -1,6 +1,6 @@
 """Readers of the shape formats of small-body science: plate tables, Gaskell's ICQ, VRML, NAIF's DSK.
 
-Each reader takes a file's bytes (the DSK reader its path) and the name to use in messages, and returns the
+Each reader takes a file's bytes and the name to use in messages, and returns the
 file's own mesh: vertices float64[n, 3] in the file's unit, faces int64[m, 3] counted from 0, indices within range.
 What the mesh bounds is for `shape.check_mesh` to say. A malformed file raises InputError with the line.
 """
@@ -18,6 +18,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from vbnfault import spice
 from vbnfault.errors import InputError
 
 Float64 = NDArray[np.float64]
@@ -64,7 +65,7 @@ def read_shape(path: Path, data: bytes) -> RawShape:
     source = str(path)
     head = data[:65536]
     if head.startswith((b"DAS/DSK", b"NAIF/DAS")):
-        return RawShape(*read_dsk(path), unit="km")
+        return RawShape(*spice.read_dsk(path), unit="km")
     if path.suffix.lower() == ".bds":
         raise InputError(f"{source}: line 1: expected the mark 'DAS/DSK' of a NAIF DSK, found {_shown(head)}.")
     if b"\0" in data:
@@ -246,7 +247,7 @@ def read_vrml(data: bytes, source: str) -> Mesh:
             f"{source}: line 1: expected '#VRML V1.0 ascii' or '#VRML V2.0 utf8', found {_shown(data)}."
         )
     # Strings and comments are blanked, not cut, so that places keep their line.
-    text = re.sub(rb'"(?:\\.|[^"\\])*"|#[^\r\n]*', lambda m: re.sub(rb"[^\r\n]", b" ", m[0]), data)
+    text = re.sub(rb'"(?:\\.|[^"\\])*(?:"|\Z)|#[^\r\n]*', lambda m: re.sub(rb"[^\r\n]", b" ", m[0]), data)
     vertices: list[Float64] = []
     faces: list[Int64] = []
     base = 0
@@ -264,49 +265,6 @@ def read_vrml(data: bytes, source: str) -> Mesh:
     if not faces:
         end = _line(data, len(data.rstrip()))
         raise InputError(f"{source}: line {end}: expected an IndexedFaceSet, found none before the end.")
-    return np.concatenate(vertices), np.concatenate(faces)
-
-
-def read_dsk(path: Path) -> Mesh:
-    """The plates of a NAIF DSK, all type 2 segments of its one body and surface.
-
-    Vertices are in kilometres by definition; the body-fixed frame the segments name is the file's own.
-
-    Raises
-    ------
-    InputError
-        spiceypy is not installed, the file is no DSK, or holds no segment of type 2 or those of several surfaces.
-    """
-    from vbnfault import spice  # spiceypy is an optional extra
-
-    source = str(path)
-    vertices: list[Float64] = []
-    faces: list[Int64] = []
-    surfaces: set[tuple[int, int]] = set()
-    base = 0
-    with spice.reported(source) as spiceypy:
-        handle = spiceypy.dasopr(source)
-        try:
-            with spiceypy.no_found_check():
-                segment, found = spiceypy.dlabfs(handle)
-                while found:
-                    about = spiceypy.dskgd(handle, segment)
-                    if about.dtype == 2:
-                        vertices_n, faces_n = spiceypy.dskz02(handle, segment)
-                        vertices.append(np.array(spiceypy.dskv02(handle, segment, 1, vertices_n), dtype=np.float64))
-                        faces.append(
-                            np.array(spiceypy.dskp02(handle, segment, 1, faces_n), dtype=np.int64) - 1 + base
-                        )
-                        base += vertices_n
-                        surfaces.add((about.center, about.surfce))
-                    segment, found = spiceypy.dlafns(handle, segment)
-        finally:
-            spiceypy.dascls(handle)
-    if not faces:
-        raise InputError(f"{source}: expected a DSK segment of type 2 (triangular plates), found none.")
-    if len(surfaces) > 1:
-        listed = ", ".join(f"body {body} surface {surface}" for body, surface in sorted(surfaces))
-        raise InputError(f"{source}: expected the segments of one surface, found {listed}.")
     return np.concatenate(vertices), np.concatenate(faces)
 
 

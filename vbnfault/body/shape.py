@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import warnings
 from pathlib import Path
 from typing import Literal
@@ -10,7 +11,7 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from vbnfault import resources
+from vbnfault import meshes, resources
 from vbnfault.body import formats
 from vbnfault.errors import InputError
 
@@ -27,6 +28,8 @@ FILE_TYPES = (".obj", ".ply", ".stl", ".glb", ".gltf", *formats.SUFFIXES)
 # welding mends nothing worth a warning.
 _SPLIT_VERTEX_TYPES = (".stl", ".glb", ".gltf", *formats.SUFFIXES)
 _LARGEST_HOLE_EDGES = 8
+# In the file's unit: beyond any body, and such that areas and volumes stay numbers.
+_FARTHEST = 1e12
 # Relative to the squared extent: below it a facet's normal is rounding noise in float64.
 _DEGENERATE_AREA_FRACTION = 1e-16
 
@@ -65,6 +68,10 @@ def load_shape(path: str | Path, unit: Unit = "auto") -> tuple[Float64, Int32]:
     if suffix in formats.SUFFIXES:
         raw = formats.read_shape(path, data)
         vertices, faces, native = raw.vertices, raw.faces, raw.unit
+    elif suffix == ".obj":
+        vertices, faces = meshes.joined(meshes.read_obj(data, str(path)))
+    elif suffix in (".glb", ".gltf"):
+        vertices, faces = meshes.joined(meshes.read_gltf(data, str(path), folder=path.parent))
     else:
         vertices, faces = _read_with_trimesh(path, data)
     _check_arrays(vertices, faces, str(path))
@@ -83,7 +90,7 @@ def _read_with_trimesh(path: Path, data: bytes) -> tuple[Float64, NDArray[np.int
         # numpy warns on NaN while the readers normalise; the check below reports it as an error.
         with warnings.catch_warnings(), np.errstate(all="ignore"):
             warnings.simplefilter("ignore")
-            mesh = trimesh.load(path, process=False, force="mesh")
+            mesh = trimesh.load(io.BytesIO(data), file_type=path.suffix[1:].lower(), process=False, force="mesh")
             vertices = np.array(getattr(mesh, "vertices", np.empty((0, 3))), dtype=np.float64)
             faces = np.array(getattr(mesh, "faces", np.empty((0, 3))), dtype=np.int64)
     except Exception as error:  # the readers raise whatever their parsers raise
@@ -201,6 +208,12 @@ def _check_arrays(vertices: NDArray, faces: NDArray, source: str) -> None:
     bad = int((~np.isfinite(vertices)).any(axis=1).sum())
     if bad:
         raise InputError(f"{source}: mesh has {bad} vertices with NaN or infinite coordinates.")
+    far = np.abs(vertices).max(axis=1)
+    if far.max() > _FARTHEST:
+        n = int((far > _FARTHEST).sum())
+        raise InputError(
+            f"{source}: mesh has {n} vertices with coordinates such as {far.max():g}; at most {_FARTHEST:g}."
+        )
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise InputError(f"{source}: mesh has faces that name vertices outside 0..{len(vertices) - 1}.")
 

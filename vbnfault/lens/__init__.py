@@ -1,5 +1,6 @@
 """The optics: from scene radiance to irradiance on the sensor plane."""
 
+from .aperture import closed_to, open_f_number, stopped_down
 from .first_order import FirstOrder, first_order, scaled_to_field, scaled_to_focal_length
 from .imaging import RealLens
 from .prescription import Prescription, Surface, load_lens, parse_lens
@@ -11,9 +12,12 @@ __all__ = [
     "RealLens",
     "Surface",
     "ThinLens",
+    "closed_to",
     "first_order",
     "load_lens",
+    "open_f_number",
     "parse_lens",
     "scaled_to_field",
     "scaled_to_focal_length",
+    "stopped_down",
 ]

@@ -94,10 +94,11 @@ def first_order(lens: Prescription, wavelength_nm: float = D_NM) -> FirstOrder:
 
 
 def scaled_to_focal_length(lens: Prescription, efl_mm: float) -> Prescription:
-    """The lens scaled to a focal length at the d line."""
+    """Return the lens scaled to a focal length at the d line; see `Prescription.scaled` for what keeps its size."""
     return lens.scaled(efl_mm / first_order(lens).efl_mm)
 
 
 def scaled_to_field(lens: Prescription, fov_deg: float, sensor_mm: float) -> Prescription:
-    """The lens scaled so that a sensor of that width sees the full field `fov_deg`, distortion left out."""
+    """Return the lens scaled so that a sensor of that width sees the full field `fov_deg`, distortion left out; see
+    `Prescription.scaled` for what keeps its size."""
     return scaled_to_focal_length(lens, sensor_mm / 2 / float(np.tan(np.radians(fov_deg / 2))))

@@ -10,7 +10,7 @@ towards +x. All at the d line.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property, lru_cache
 
 import cv2
@@ -19,11 +19,12 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import fft
 from scipy.interpolate import PchipInterpolator
 
-from .first_order import first_order, scaled_to_focal_length
+from .aperture import stopped_down
+from .first_order import scaled_to_focal_length
 from .imaging import RealLens
 from .prescription import Prescription, load_lens
 from .thin import ThinLens
-from .trace import Path, real_pupil_diameter_mm, trace
+from .trace import Path, trace
 
 F64 = NDArray[np.float64]
 F32 = NDArray[np.float32]
@@ -70,11 +71,12 @@ class Frame:
         return x * stretch, y * stretch
 
     def real_lens(self, name: str) -> RealLens:
-        """The camera's own lens, if it is real and none is named; else the named one, `DEFAULT_LENS` by default,
-        scaled to the camera's focal length, its stop closed to the f-number of a thin lens that is slower."""
+        """Return the camera's own lens, if it is real and none is named; else the named one, `DEFAULT_LENS` by
+        default, scaled to the camera's focal length, its stop closed to the camera's f-number where that is larger
+        than its own."""
         own = self.lens
-        if isinstance(own, RealLens):
-            return _scaled(name, own.focal_length_mm, 0.0, self) if name else own
+        if isinstance(own, RealLens) and not name:
+            return own
         return _scaled(name or DEFAULT_LENS, own.focal_length_mm, own.f_number, self)
 
     def prescription(self, name: str, coating: str) -> Prescription:
@@ -93,7 +95,7 @@ class Frame:
 def _scaled(name: str, focal_length_mm: float, f_number: float, frame: Frame) -> RealLens:
     lens = scaled_to_focal_length(load_lens(name), focal_length_mm)
     return RealLens(
-        prescription=stopped_down(lens, f_number) if f_number else lens,
+        prescription=stopped_down(lens, f_number),
         width_px=frame.width_px,
         height_px=frame.height_px,
         pixel_pitch_um=frame.pixel_pitch_um,
@@ -103,21 +105,6 @@ def _scaled(name: str, focal_length_mm: float, f_number: float, frame: Frame) ->
 @lru_cache(maxsize=8)
 def _coated(lens: Prescription, coating: str) -> Prescription:
     return lens.coated(coating)
-
-
-def stopped_down(lens: Prescription, f_number: float) -> Prescription:
-    """The lens with its stop closed until the real beam along the axis is EFL / f_number wide; as it is where that
-    is not narrower. Blades keep their shape, with a beam of that area."""
-    as_round = lens.with_round_stop()
-    wanted = first_order(as_round).efl_mm / f_number
-    if wanted >= real_pupil_diameter_mm(as_round):
-        return lens
-    found = trace(as_round, [[wanted / 2, 0.0, -1.0]], [[0.0, 0.0, 1.0]])
-    surfaces, stop = list(lens.surfaces), lens.stop
-    corner = surfaces[stop].semi_diameter_mm / as_round.surfaces[stop].semi_diameter_mm
-    closed_mm = float(abs(found.points_mm[1 + stop, 0, 0]))
-    surfaces[stop] = replace(surfaces[stop], semi_diameter_mm=corner * closed_mm)
-    return replace(lens, surfaces=tuple(surfaces))
 
 
 # --- beams -----------------------------------------------------------------------------------------------------

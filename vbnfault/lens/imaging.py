@@ -32,6 +32,7 @@ from scipy.special import ndtr
 
 from ..errors import InputError
 from ..quantities import Irradiance, Radiance
+from .aperture import axial_beam_diameter_mm
 from .coating import mean_reflectance
 from .first_order import first_order
 from .glass import D_NM
@@ -50,6 +51,7 @@ _ANGLES = 65  # field angles of the tables
 _BEYOND = 1.6  # of the frame's corner, as a tangent: how far the tables reach
 _STEEPNESS = (0.3, 3.0)  # of the map of the field beyond its last chief ray: dh/dt in focal lengths
 _HEIGHTS = 129  # of a meridional fan
+_RAYS_OF_BEAM = 4  # of them that the beam along the axis takes at least
 _SECANT_STEPS = 7
 _AZIMUTHS = 32  # of half a bundle
 _RADII = 33  # samples along which a bundle's rim is sought, then
@@ -152,6 +154,12 @@ def _beams(lens: Prescription, slope: F64) -> _Beams:
     heights = _fan_heights_mm(lens, slope)
     outside = beyond(heights, np.zeros(1))
     at = np.arange(len(slope))
+    # the beam of a stop closed far fits between two rays of the fan: narrower fans about the ray nearest to passing
+    beam_mm = axial_beam_diameter_mm(lens)
+    while beam_mm > 0 and (step := float((heights[:, 1] - heights[:, 0]).max())) > beam_mm / _RAYS_OF_BEAM:
+        middle = heights[at, np.argmin(outside, axis=1)][:, None]
+        heights = middle + 2 * max(step, beam_mm) * np.linspace(-1, 1, _HEIGHTS)
+        outside = beyond(heights, np.zeros(1))
     centre = heights[at, np.argmin(outside, axis=1)]
     passing = outside <= 1
     width = passing.sum(axis=1) * (heights[:, 1] - heights[:, 0])
@@ -283,6 +291,23 @@ class RealLens:
         """EFL over the diameter of the real beam along the axis (of a disc of the same area)."""
         area = float(self._beams.area_mm2[0])
         return float(first_order(self._round).efl_mm / (2 * np.sqrt(area / np.pi)))
+
+    @property
+    def figures(self) -> dict[str, str | float]:
+        """What the lens is after scaling and stopping down: name, scale over the prescription's file, EFL, f-number
+        of the real beam, diameter of the stop, transmission on the axis at the d line; `summary` says so."""
+        lens = self.prescription
+        efl_mm = first_order(lens).efl_mm
+        return {
+            "name": lens.name,
+            "scale": lens.scale,
+            "efl_mm": efl_mm,
+            "f_number": self.f_number,
+            "stop_diameter_mm": 2 * lens.surfaces[lens.stop].semi_diameter_mm,
+            "transmission": self.transmission,
+            "summary": f"{lens.name}, scaled by {lens.scale:.4g} to {efl_mm:.4g} mm, f/{self.f_number:.3g}; "
+            "coatings, roughness and grains keep their size",
+        }
 
     @property
     def aperture_radius_m(self) -> float:

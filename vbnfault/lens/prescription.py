@@ -120,12 +120,14 @@ class Surface:
 class Prescription:
     """A lens as its rows, front to back, air in front and behind. The sensor stands at the paraxial focus at the
     d line, not where the last row's thickness ends; it reflects `sensor_reflectance` of the light, at all angles.
+    `scale` is the factor by which it was scaled since it was read.
     """
 
     name: str
     source: str
     surfaces: tuple[Surface, ...]
     sensor_reflectance: float = 0.0
+    scale: float = 1.0
 
     @property
     def stop(self) -> int:
@@ -142,7 +144,15 @@ class Prescription:
         return np.array([1.0, *(float(s.medium.index(wavelength_nm)) for s in self.surfaces)])
 
     def scaled(self, factor: float) -> Prescription:
-        """The lens with every length multiplied."""
+        """Return the lens with every length of its drawing multiplied.
+
+        These are radii, thicknesses (of elements, gaps and plates), rims, stop and aspheric coefficients.
+
+        What a maker or the environment puts on or into the glass keeps its physical size: films of coatings in nm,
+        and so their reflectance; roughness in nm; grains of dust in µm and the particles of a cleanliness level per
+        area; the glass's absorption per mm, so that the longer path through a larger lens takes more. Field angles,
+        f-numbers and the paths of ghosts in units of the focal length are unchanged.
+        """
         surfaces = tuple(
             replace(
                 s,
@@ -153,7 +163,7 @@ class Prescription:
             )
             for s in self.surfaces
         )
-        return replace(self, surfaces=surfaces)
+        return replace(self, surfaces=surfaces, scale=self.scale * factor)
 
     def with_round_stop(self) -> Prescription:
         """Blades replaced by a round stop of the same area, for what knows no azimuth."""

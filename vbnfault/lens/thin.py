@@ -19,6 +19,17 @@ class ThinLens:
     focus_distance_m: float = float("inf")
 
     @property
+    def figures(self) -> dict[str, str | float]:
+        """What the lens is: name, focal length, f-number, transmission; `summary` says so."""
+        return {
+            "name": "thin lens",
+            "efl_mm": self.focal_length_mm,
+            "f_number": self.f_number,
+            "transmission": self.transmission,
+            "summary": f"thin lens of {self.focal_length_mm:.4g} mm, f/{self.f_number:.3g}",
+        }
+
+    @property
     def aperture_radius_m(self) -> float:
         """Radius of the entrance pupil, f / 2N, in metres."""
         return self.focal_length_mm * 1e-3 / (2 * self.f_number)

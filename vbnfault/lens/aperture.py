@@ -1,0 +1,95 @@
+"""The aperture of a prescription: its f-number by exact marginal rays, and a stop closed to another.
+
+The f-number is the focal length over the diameter of the beam along the axis that passes all rims (ISO 517), by
+real rays: the irradiance on the axis is π T L / (4 N²) with it, exactly. The paraxial f-number of `first_order`
+differs by the aberration of the pupil, some percent for fast lenses.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import InputError
+from .first_order import first_order
+from .glass import D_NM
+from .prescription import Prescription
+from .trace import trace
+
+F64 = NDArray[np.float64]
+
+LARGEST_F_NUMBER = 200.0
+
+_RAYS = 513  # of a fan, then
+_ROUNDS = 5  # fans within the interval that holds the rim: 512⁻⁵ of the first surface's radius in all
+
+
+def axial_beam_diameter_mm(lens: Prescription, wavelength_nm: float = D_NM) -> float:
+    """Return the diameter of the beam along the axis that passes every rim, stop included.
+
+    A stop with blades counts as a round one of its area.
+    """
+    lens = lens.with_round_stop()
+    low, high = 0.0, lens.surfaces[0].semi_diameter_mm
+    for _ in range(_ROUNDS):
+        height = np.linspace(low, high, _RAYS)
+        lost = ~_passes(lens, height, wavelength_nm)
+        if not lost.any():
+            return 2 * high
+        first = int(np.argmax(lost))
+        if first == 0:
+            return 2 * low
+        low, high = float(height[first - 1]), float(height[first])
+    return low + high
+
+
+def _passes(lens: Prescription, height_mm: F64, wavelength_nm: float) -> NDArray[np.bool_]:
+    nothing = np.zeros_like(height_mm)
+    origins = np.column_stack(
+        [height_mm, nothing, nothing - abs(float(lens.surfaces[0].sag_mm(height_mm[-1]))) - 1]
+    )
+    along = np.tile([0.0, 0.0, 1.0], (len(height_mm), 1))
+    return trace(lens, origins, along, wavelength_nm=wavelength_nm).arrives
+
+
+def open_f_number(lens: Prescription) -> float:
+    """Return the focal length over the diameter of the real beam along the axis, the stop as prescribed."""
+    return first_order(lens).efl_mm / axial_beam_diameter_mm(lens)
+
+
+def stopped_down(lens: Prescription, f_number: float) -> Prescription:
+    """Return the lens with its stop closed until the real beam along the axis is EFL / f_number wide.
+
+    The lens is returned as it is where that beam is not narrower than its own.
+
+    The stop takes the height at which the marginal ray of that beam crosses it, so that any number of rays agrees.
+    Blades keep their shape, with a beam of that area.
+    """
+    as_round = lens.with_round_stop()
+    wanted = first_order(as_round).efl_mm / f_number
+    if wanted >= axial_beam_diameter_mm(as_round):
+        return lens
+    found = trace(as_round, [[wanted / 2, 0.0, -1.0]], [[0.0, 0.0, 1.0]])
+    surfaces, stop = list(lens.surfaces), lens.stop
+    corner = surfaces[stop].semi_diameter_mm / as_round.surfaces[stop].semi_diameter_mm
+    closed_mm = float(abs(found.points_mm[1 + stop, 0, 0]))
+    surfaces[stop] = replace(surfaces[stop], semi_diameter_mm=corner * closed_mm)
+    return replace(lens, surfaces=tuple(surfaces))
+
+
+def closed_to(lens: Prescription, f_number: float, key: str) -> Prescription:
+    """Return the lens stopped down to an f-number that a user asks for; `key` names it in errors.
+
+    Raises InputError for an f-number outside what the lens reaches: from its own, rounded down to two decimals as
+    users read and write it, to 200.
+    """
+    least = math.floor(100 * open_f_number(lens)) / 100
+    if not least <= f_number <= LARGEST_F_NUMBER:
+        raise InputError(
+            f"{key} = {f_number:g}: must be from {least:g}, at which {lens.name} is fully open, "
+            f"to {LARGEST_F_NUMBER:g}"
+        )
+    return stopped_down(lens, f_number)

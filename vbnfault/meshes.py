@@ -1,0 +1,493 @@
+"""Readers of Wavefront OBJ and glTF 2.0 meshes: what shapes of bodies and spacecraft are made from.
+
+Only names, positions, faces and transforms are read: images, colours and normals never leave the file, so that no
+image can fill the memory. Whatever a file says of its own sizes is checked before memory is taken for it.
+"""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import json
+import re
+import struct
+import warnings
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from urllib.parse import unquote
+
+import numpy as np
+from numpy.typing import NDArray
+
+from . import resources
+from .errors import InputError, shown
+
+F64 = NDArray[np.float64]
+I64 = NDArray[np.int64]
+
+MAX_FACES = 20_000_000
+MAX_NODES = 100_000
+MAX_PARTS = 10_000
+MAX_NODE_DEPTH = 64
+_LONGEST_NAME = 100
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class MeshPart:
+    """The faces that a file holds under one name and one name of a material (empty where it gives none).
+
+    `vertices` float64[n, 3] in the file's unit and axes, `faces` int64[m, 3], indices of them.
+    """
+
+    name: str
+    material: str
+    vertices: F64
+    faces: I64
+
+
+def joined(parts: list[MeshPart]) -> tuple[F64, I64]:
+    """Return the vertices and faces of all parts as one mesh."""
+    first = np.cumsum([0, *(len(part.vertices) for part in parts)])
+    vertices = np.concatenate([np.empty((0, 3)), *(part.vertices for part in parts)])
+    faces = [part.faces + start for part, start in zip(parts, first, strict=False)]
+    return vertices, np.concatenate([np.empty((0, 3), dtype=np.int64), *faces])
+
+
+# --- Wavefront OBJ -----------------------------------------------------------------------------------------
+
+_DIRECTIVE = re.compile(rb"^[ \t]*(o|g|usemtl)(?![^ \t\r\n])([^\r\n]*)", re.MULTILINE)
+_VERTEX = re.compile(rb"^[ \t]*v[ \t]+([^\r\n#]*)", re.MULTILINE)
+_FACE = re.compile(rb"^[ \t]*f[ \t]+([^\r\n#]*)", re.MULTILINE)
+_CORNER = re.compile(rb"[+-]?[0-9]+(?:/[+-]?[0-9]*){0,2}")
+_TEXTURE_AND_NORMAL = re.compile(rb"/[-+0-9/]*")
+# x y z, with a weight, with colours, with both
+_VERTEX_WIDTHS = (3, 4, 6, 7)
+
+
+def read_obj(data: bytes, source: str, *, name: str = "") -> list[MeshPart]:
+    """Return the faces of an OBJ file, one part for every object, group and material.
+
+    Parameters
+    ----------
+    data, source
+        The file's bytes, and what to call it in errors.
+    name
+        Of faces that lie outside of every object and group.
+
+    Returns
+    -------
+    parts
+        Named `object/group`. Polygons are split into fans; vertices that no face of a part names are left out.
+
+    Raises
+    ------
+    InputError
+        With the line: a vertex without three finite numbers, a face without three corners, a corner that is no
+        vertex number (they count from 1, or from -1 backwards), more than 20 million triangles.
+    """
+    text = re.sub(rb"\\\r?\n", lambda end: b" " * len(end[0]), data)  # lines that go on; offsets stay
+
+    def line(pattern: re.Pattern[bytes], row: int) -> int:
+        offset = next(match.start() for k, match in enumerate(pattern.finditer(text)) if k == row)
+        return data.count(b"\n", 0, offset) + 1
+
+    def error(pattern: re.Pattern[bytes], row: int, expected: str, found: object) -> InputError:
+        return InputError(f"{source}: line {line(pattern, row)}: expected {expected}, found {found}.")
+
+    rows = _VERTEX.findall(text)
+    values, ends = _values(rows)
+    width = np.diff(ends, prepend=-1) - 1
+    sound = len(ends) == len(rows) and bool(np.isin(width, _VERTEX_WIDTHS).all())
+    first = ends - width
+    vertices = values[first[:, None] + np.arange(3)] if sound and len(rows) else np.empty((0, 3))
+    if rows and not (sound and np.isfinite(vertices).all()):
+        for k, row in enumerate(rows):
+            one, end = _values([row])
+            if len(end) != 1 or end[0] not in _VERTEX_WIDTHS or not np.isfinite(one[:3]).all():
+                what = row.decode("utf-8", "replace").strip()
+                raise error(_VERTEX, k, "'v x y z', finite numbers", shown(what))
+
+    stretches: dict[tuple[str, str], list[bytes]] = {}
+    faces: dict[tuple[str, str], list[int]] = {}  # number of each face in the file
+    count = 0
+    for key, piece in _stretches(text, name):
+        found = _FACE.findall(piece)
+        if found:
+            stretches.setdefault(key, []).extend(found)
+            faces.setdefault(key, []).extend(range(count, count + len(found)))
+            count += len(found)
+    if len(stretches) > MAX_PARTS:
+        raise InputError(f"{source}: has {len(stretches)} objects and groups; at most {MAX_PARTS} are read.")
+    before: I64 | None = None
+    parts = []
+    triangles_n = 0
+    for key, found in stretches.items():
+        number = np.array(faces[key])
+        corners, corner_ends = _values([_TEXTURE_AND_NORMAL.sub(b"", row) if b"/" in row else row for row in found])
+        lengths = np.diff(corner_ends, prepend=-1) - 1
+        if len(corner_ends) != len(found) or (lengths < 3).any() or (corners % 1 > 0).any():
+            for k, row in enumerate(found):
+                tokens = row.split()
+                if len(tokens) < 3 or not all(map(_CORNER.fullmatch, tokens)):
+                    what = shown(row.decode("utf-8", "replace").strip())
+                    raise error(_FACE, int(number[k]), "'f a b c', three vertex numbers or more", what)
+        face = np.repeat(number, lengths)
+        index = np.delete(corners, corner_ends)
+        if (index < 0).any():  # counted back from the last vertex above the face
+            if before is None:
+                above = np.array([match.start() for match in _VERTEX.finditer(text)])
+                before = np.searchsorted(above, [match.start() for match in _FACE.finditer(text)])
+            index = np.where(index < 0, before[face] + index + 1, index)
+        outside = ~((index >= 1) & (index <= len(rows)))
+        if outside.any():
+            k = int(np.argmax(outside))
+            what = f"{np.delete(corners, corner_ends)[k]:g}"
+            raise error(_FACE, int(face[k]), f"vertex numbers from 1 to {len(rows)}", what)
+        triangles = _fans(index.astype(np.int64) - 1, lengths)
+        triangles_n += len(triangles)
+        if triangles_n > MAX_FACES:
+            raise InputError(f"{source}: has {triangles_n} triangles or more; at most {MAX_FACES} are read.")
+        used, compact = np.unique(triangles, return_inverse=True)
+        parts.append(
+            MeshPart(
+                name=key[0], material=key[1], vertices=vertices[used], faces=compact.reshape(-1, 3).astype(np.int64)
+            )
+        )
+    return parts
+
+
+def _stretches(text: bytes, name: str) -> Iterator[tuple[tuple[str, str], bytes]]:
+    """(name, material) of each stretch of an OBJ between two statements that name things, and its text."""
+    now = {b"o": "", b"g": "", b"usemtl": ""}
+    start = 0
+
+    def key() -> tuple[str, str]:
+        return "/".join(piece for piece in (now[b"o"], now[b"g"]) if piece) or name, now[b"usemtl"]
+
+    for match in _DIRECTIVE.finditer(text):
+        yield key(), text[start : match.start()]
+        start = match.end()
+        now[match[1]] = match[2].decode("utf-8", "replace").strip()
+        if match[1] == b"o":
+            now[b"g"] = ""
+    yield key(), text[start:]
+
+
+def _values(rows: list[bytes]) -> tuple[F64, I64]:
+    """All numbers of rows of text, float64[n], a NaN after each row; the places of these NaNs. None of either where
+    something else is in the text; a "nan" of the file itself shows as one place more."""
+    if not rows:
+        return np.empty(0), np.empty(0, dtype=np.int64)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")  # numpy has both warned and raised here
+            values = np.fromstring(b" nan\n".join([*rows, b""]), dtype=np.float64, sep=" ")  # type: ignore[call-overload]
+    except (ValueError, DeprecationWarning):
+        return np.empty(0), np.empty(0, dtype=np.int64)
+    return values, np.flatnonzero(np.isnan(values))
+
+
+def _fans(index: I64, corners: I64) -> I64:
+    """Polygons of the given numbers of corners as triangles int64[m, 3] that start in the first corner of each."""
+    starts = np.cumsum(corners) - corners
+    triangles = corners - 2
+    first = np.repeat(starts, triangles)
+    step = np.arange(triangles.sum()) - np.repeat(np.cumsum(triangles) - triangles, triangles) + 1
+    return np.stack([index[first], index[first + step], index[first + step + 1]], axis=1)
+
+
+# --- glTF 2.0 ----------------------------------------------------------------------------------------------
+
+_COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
+_TRIANGLES, _STRIP, _FAN = 4, 5, 6
+# Extensions that put the geometry elsewhere; all others change what is not read.
+_NOT_READ = ("KHR_draco_mesh_compression", "EXT_meshopt_compression", "EXT_mesh_gpu_instancing")
+
+
+def read_gltf(data: bytes, source: str, *, folder: Path | None = None) -> list[MeshPart]:
+    """Return the triangles of a glTF 2.0 file's scene, GLB or JSON, in its axes.
+
+    Parameters
+    ----------
+    data, source
+        The file's bytes, and what to call it in errors.
+    folder
+        Where the files lie that hold the buffers of a .gltf.
+
+    Returns
+    -------
+    parts
+        Named by the path of their node; those of one mesh have a material each.
+
+    Raises
+    ------
+    InputError
+        Naming the node, mesh or accessor: the file is not glTF 2.0, a number in it lies outside its allowed range,
+        nodes form a circle, or the whole has more than 20 million triangles.
+    """
+    file = _Gltf(source, *_chunks(data, source), folder)
+    extensions = file.table.get("extensionsRequired", [])
+    for name in extensions if isinstance(extensions, list) else ():
+        if name in _NOT_READ:
+            raise InputError(f"{source}: extensionsRequired = {shown(name)}: is not read; export without it.")
+    parts: list[MeshPart] = []
+    triangles_n = vertices_n = 0
+    for path, mesh, V_from_node in file.instances():
+        for vertices, faces, material in file.primitives(mesh):
+            triangles_n += len(faces)
+            vertices_n += len(vertices)
+            if max(triangles_n, vertices_n) > MAX_FACES or len(parts) >= MAX_PARTS:
+                raise InputError(
+                    f"{source}: has more than {MAX_FACES} triangles or vertices, or {MAX_PARTS} parts, in all."
+                )
+            mirrored = np.linalg.det(V_from_node[:3, :3]) < 0
+            with np.errstate(over="ignore", invalid="ignore"):  # told by whoever checks the mesh
+                placed = vertices @ V_from_node[:3, :3].T + V_from_node[:3, 3]
+            parts.append(
+                MeshPart(name=path, material=material, vertices=placed, faces=faces[:, ::-1] if mirrored else faces)
+            )
+    return parts
+
+
+def _chunks(data: bytes, source: str) -> tuple[Any, bytes]:
+    """The JSON of a glTF file, as plain data, and the binary chunk of a GLB."""
+    text, binary = data, b""
+    if data[:4] == b"glTF":
+        if len(data) < 20 or struct.unpack_from("<I", data, 4)[0] != 2:
+            raise InputError(f"{source}: must be a GLB of version 2.")
+        offset = 12
+        chunks: dict[bytes, bytes] = {}
+        while offset + 8 <= len(data):
+            (length,), kind = struct.unpack_from("<I", data, offset), data[offset + 4 : offset + 8]
+            if offset + 8 + length > len(data):
+                raise InputError(f"{source}: is cut short: a chunk of {length} bytes begins at byte {offset}.")
+            chunks.setdefault(kind, data[offset + 8 : offset + 8 + length])
+            offset += 8 + length + -length % 4
+        text, binary = chunks.get(b"JSON", b""), chunks.get(b"BIN\0", b"")
+    try:
+        table = json.loads(text)
+    except RecursionError:
+        raise InputError(f"{source}: its JSON is nested too deep.") from None
+    except ValueError as error:  # text that is not UTF-8, too
+        raise InputError(f"{source}: its JSON is unreadable: {error}.") from None
+    if not isinstance(table, dict):
+        raise InputError(f"{source}: its JSON must be a table; found {shown(table)}.")
+    return table, binary
+
+
+class _Gltf:
+    """A glTF file while it is read: every look-up checks what it finds."""
+
+    def __init__(self, source: str, table: Mapping[str, Any], binary: bytes, folder: Path | None) -> None:
+        self.source, self.table, self.binary, self.folder = source, table, binary, folder
+        self.meshes: dict[int, list[tuple[F64, I64, str]]] = {}
+        self.buffers: dict[int, bytes] = {}
+
+    def error(self, where: str, value: object, allowed: str) -> InputError:
+        return InputError(f"{self.source}: {where} = {shown(value)}: must be {allowed}.")
+
+    def item(self, kind: str, index: Any, where: str) -> Mapping[str, Any]:
+        """Table number `index` of the list `kind`, which `where` names."""
+        rows = self.table.get(kind, [])
+        if not isinstance(rows, list):
+            raise self.error(kind, rows, "a list")
+        if type(index) is not int or not 0 <= index < len(rows):
+            raise self.error(where, index, f"a number of {kind}, from 0 to {len(rows) - 1}")
+        if not isinstance(rows[index], dict):
+            raise self.error(f"{kind}[{index}]", rows[index], "a table")
+        return rows[index]
+
+    def whole(self, table: Mapping[str, Any], key: str, where: str, high: int, default: int | None = None) -> int:
+        value = table.get(key, default)
+        if type(value) is not int or not 0 <= value <= high:
+            raise self.error(f"{where}.{key}", value, f"a whole number from 0 to {high}")
+        return value
+
+    def reals(self, value: Any, count: int, where: str) -> F64:
+        if not isinstance(value, list) or len(value) != count or not all(type(v) in (int, float) for v in value):
+            raise self.error(where, value, f"a list of {count} numbers")
+        if not all(abs(v) < 1e30 for v in value):  # nan fails too
+            raise self.error(where, value, f"{count} finite numbers below 1e30")
+        return np.array(value, dtype=np.float64)
+
+    def instances(self) -> Iterator[tuple[str, int, F64]]:
+        """Path, mesh and V_from_node float64[4, 4] of each node with a mesh."""
+        nodes = self.table.get("nodes", [])
+        if not isinstance(nodes, list) or len(nodes) > MAX_NODES:
+            found = f"{len(nodes)} nodes" if isinstance(nodes, list) else nodes
+            raise self.error("nodes", found, f"a list of at most {MAX_NODES}")
+        if self.table.get("scenes"):
+            roots = self.item("scenes", self.table.get("scene", 0), "scene").get("nodes", [])
+        else:
+            below = {
+                c for node in nodes if isinstance(node, dict) for c in _list(node.get("children")) if type(c) is int
+            }
+            roots = [k for k in range(len(nodes)) if k not in below]
+        base = ""  # the node that some writers put above all others, which tells nothing
+        seen: set[int] = set()
+        waiting = [(k, "", np.eye(4), 0) for k in reversed(_list(roots))]
+        only = len(waiting) == 1
+        while waiting:
+            k, path, V_from_above, depth = waiting.pop()
+            node = self.item("nodes", k, "node")
+            where = f"nodes[{k}]"
+            if k in seen:
+                raise InputError(f"{self.source}: {where}: is below two nodes, or below itself.")
+            if depth > MAX_NODE_DEPTH:
+                raise InputError(f"{self.source}: {where}: lies below more than {MAX_NODE_DEPTH} nodes.")
+            seen.add(k)
+            name = str(node.get("name", f"node_{k}"))[:_LONGEST_NAME].replace("/", "_")
+            children = node.get("children", [])
+            if not isinstance(children, list):
+                raise self.error(f"{where}.children", children, "a list")
+            if only and depth == 0 and name == "world" and "mesh" not in node:
+                own = base
+            else:
+                own = f"{path}/{name}" if path else name
+            with np.errstate(over="ignore", invalid="ignore"):
+                V_from_node = V_from_above @ self.transform(node, where)
+            if "mesh" in node:
+                yield own, node["mesh"], V_from_node
+            waiting += [(c, own, V_from_node, depth + 1) for c in reversed(children)]
+
+    def transform(self, node: Mapping[str, Any], where: str) -> F64:
+        """Matrix float64[4, 4] from a node's axes to those of the node above."""
+        if "matrix" in node:
+            return self.reals(node["matrix"], 16, f"{where}.matrix").reshape(4, 4).T  # stored by columns
+        x, y, z, w = self.reals(node.get("rotation", [0, 0, 0, 1]), 4, f"{where}.rotation")
+        scale = self.reals(node.get("scale", [1, 1, 1]), 3, f"{where}.scale")
+        matrix = np.eye(4)
+        turn = np.array(
+            [
+                [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+                [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+                [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+            ]
+        )
+        matrix[:3, :3] = turn * scale
+        matrix[:3, 3] = self.reals(node.get("translation", [0, 0, 0]), 3, f"{where}.translation")
+        return matrix
+
+    def primitives(self, mesh: Any) -> list[tuple[F64, I64, str]]:
+        """Vertices, triangles and name of the material of each of a mesh's primitives that has triangles."""
+        table = self.item("meshes", mesh, "mesh")
+        if mesh in self.meshes:
+            return self.meshes[mesh]
+        found = []
+        for k, primitive in enumerate(_list(table.get("primitives"))):
+            where = f"meshes[{mesh}].primitives[{k}]"
+            if not isinstance(primitive, dict):
+                raise self.error(where, primitive, "a table")
+            mode = self.whole(primitive, "mode", where, _FAN, _TRIANGLES)
+            attributes = primitive.get("attributes", {})
+            if mode < _TRIANGLES or not isinstance(attributes, dict) or "POSITION" not in attributes:
+                continue  # points and lines
+            vertices = self.accessor(attributes["POSITION"], "VEC3", f"{where}.attributes.POSITION")
+            if "indices" in primitive:
+                index = self.accessor(primitive["indices"], "SCALAR", f"{where}.indices")[:, 0].astype(np.int64)
+            else:
+                index = np.arange(len(vertices))
+            if len(index) and index.max() >= len(vertices):
+                raise self.error(f"{where}.indices", int(index.max()), f"from 0 to {len(vertices) - 1}")
+            material = ""
+            if "material" in primitive:
+                material = str(self.item("materials", primitive["material"], f"{where}.material").get("name") or "")
+            faces = _triangles(index, mode)
+            found.append((np.asarray(vertices, dtype=np.float64), faces, material[:_LONGEST_NAME]))
+        self.meshes[mesh] = found
+        return found
+
+    def accessor(self, index: Any, kind: str, where: str) -> NDArray[Any]:
+        """Numbers of an accessor, [count, 1 or 3]."""
+        table = self.item("accessors", index, where)
+        at = f"accessors[{index}]"
+        width = {"SCALAR": 1, "VEC3": 3}[kind]
+        component = table.get("componentType")
+        if table.get("type") != kind:
+            raise self.error(f"{at}.type", table.get("type"), kind)
+        if type(component) is not int or component not in _COMPONENTS:
+            raise self.error(f"{at}.componentType", component, f"one of {', '.join(map(str, _COMPONENTS))}")
+        dtype = np.dtype(_COMPONENTS[component])
+        count = self.whole(table, "count", at, 3 * MAX_FACES)
+        if "bufferView" in table:
+            values = self.view(table, at, dtype, count, width)
+        elif "sparse" in table:
+            values = np.zeros((count, width), dtype=dtype)
+        else:
+            raise self.error(f"{at}.bufferView", None, "given")
+        sparse = table.get("sparse")
+        if isinstance(sparse, dict):
+            values = values.copy()
+            n = self.whole(sparse, "count", f"{at}.sparse", count)
+            places, changes = sparse.get("indices"), sparse.get("values")
+            if not (isinstance(places, dict) and isinstance(changes, dict)):
+                raise self.error(f"{at}.sparse", sparse, "a table with indices and values")
+            kind_of_place = places.get("componentType")
+            if kind_of_place not in (5121, 5123, 5125):
+                raise self.error(f"{at}.sparse.indices.componentType", kind_of_place, "5121, 5123 or 5125")
+            rows = self.view(places, f"{at}.sparse.indices", np.dtype(_COMPONENTS[kind_of_place]), n, 1)[:, 0]
+            if n and rows.max() >= count:
+                raise self.error(f"{at}.sparse.indices", int(rows.max()), f"from 0 to {count - 1}")
+            values[rows.astype(np.int64)] = self.view(changes, f"{at}.sparse.values", dtype, n, width)
+        if table.get("normalized") is True and dtype.kind != "f":
+            return np.maximum(values / float(np.iinfo(dtype).max), -1.0)
+        return values
+
+    def view(self, table: Mapping[str, Any], where: str, dtype: np.dtype, count: int, width: int) -> NDArray[Any]:
+        """Numbers [count, width] of the buffer view that a table names."""
+        number = table.get("bufferView")
+        view = self.item("bufferViews", number, f"{where}.bufferView")
+        at = f"bufferViews[{number}]"
+        buffer = self.buffer(view.get("buffer"), f"{at}.buffer")
+        start = self.whole(view, "byteOffset", at, len(buffer), 0)
+        length = self.whole(view, "byteLength", at, len(buffer) - start)
+        offset = self.whole(table, "byteOffset", where, length, 0)
+        element = dtype.itemsize * width
+        stride = self.whole(view, "byteStride", at, 252, element) or element
+        end = offset + stride * (count - 1) + element if count else offset
+        if end > length:
+            raise self.error(f"{where}.count", count, f"at most what the {length} bytes of {at} hold")
+        return np.ndarray((count, width), dtype, buffer, offset=start + offset, strides=(stride, dtype.itemsize))
+
+    def buffer(self, index: Any, where: str) -> bytes:
+        """Bytes of a buffer: of the GLB, of a data URI, or of a file beside the .gltf."""
+        table = self.item("buffers", index, where)
+        if index in self.buffers:
+            return self.buffers[index]
+        uri = table.get("uri")
+        at = f"buffers[{index}].uri"
+        if uri is None:
+            data = self.binary
+        elif not isinstance(uri, str):
+            raise self.error(at, uri, "a text")
+        elif uri.startswith("data:"):
+            try:
+                data = base64.b64decode(uri.partition(",")[2], validate=True)
+            except (binascii.Error, ValueError):
+                raise self.error(at, uri, "base64 after its comma") from None
+        else:
+            name = Path(unquote(uri))
+            if self.folder is None or name.is_absolute() or ".." in name.parts:
+                raise self.error(at, uri, "a file in the folder of the .gltf")
+            resources.check_path(str(name), f"{self.source}: {at}")
+            data = resources.read_input(self.folder / name, "spacecraft")
+        self.buffers[index] = data
+        return data
+
+
+def _list(value: Any) -> list[Any]:
+    return value if isinstance(value, list) else []
+
+
+def _triangles(index: I64, mode: int) -> I64:
+    """Triangles int64[m, 3] of a list, strip or fan of corners."""
+    if mode == _TRIANGLES:
+        return index[: len(index) // 3 * 3].reshape(-1, 3)
+    n = max(len(index) - 2, 0)
+    k = np.arange(n)
+    if mode == _FAN:
+        return np.stack([np.broadcast_to(index[:1], (n,)), index[k + 1], index[k + 2]], axis=1)
+    turned = k % 2  # every other triangle of a strip runs the other way
+    return np.stack([index[k], index[k + 1 + turned], index[k + 2 - turned]], axis=1)
