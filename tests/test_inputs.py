@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from vbnfault import config, resources
+from vbnfault import config, resources, spice
 from vbnfault.body import load_shape
 from vbnfault.body.shape import signed_volume
 from vbnfault.detector.sensor import load_sensor
@@ -321,3 +321,31 @@ def test_images_of_a_glb_are_never_unpacked(load: Callable[[Path], Any], tmp_pat
     path = tmp_path / "cube.glb"
     path.write_bytes(glb([{"mesh": 0}], **textured))
     assert len(cube_of(load, path)[1]) == 12
+
+
+# ------------------------------------------------------------------------------------ SPICE
+
+
+def test_a_kernel_that_aborts_native_code_is_refused(tmp_path: Path) -> None:
+    from test_formats import lumpy, write_dsk
+
+    path = write_dsk(tmp_path / "body.bds", *lumpy(1))
+    load_shape(path)
+    data = bytearray(path.read_bytes())
+    data[1053] ^= 26  # in the first directory of the file: CSPICE's dlabfs aborts on it
+    path.write_bytes(data)
+    assert "SPICE" in refused(load_shape, path)
+
+
+def test_a_meta_kernel_that_names_a_pipe_does_not_block(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe.tls")
+    meta = tmp_path / "all.tm"
+    meta.write_text(
+        "KPL/MK\n\\begindata\nPATH_VALUES = ( '" + str(tmp_path) + "' )\nPATH_SYMBOLS = ( 'K' )\n"
+        "KERNELS_TO_LOAD = ( '$K/pi+', 'pe.tls' )\n\\begintext\n"
+    )
+    with pytest.raises(InputError, match=r"pipe\.tls: SPICE kernel is not a file but a pipe"), spice.kernels(meta):
+        pass
+    meta.write_text("KPL/MK\n\\begindata\nKERNELS_TO_LOAD = ( '" + str(meta) + "' )\n")  # itself
+    with pytest.raises(InputError, match=r"all\.tm: "), spice.kernels(meta):
+        pass

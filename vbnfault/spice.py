@@ -105,8 +105,13 @@ def kernels(*paths: str | Path) -> Iterator[None]:
         before = int(_ask("SPICE kernels", "loaded"))
         reader = _reader
         try:
-            for path in paths:
-                _ask(str(path), "load", str(path), os.getcwd())
+            try:
+                for path in paths:
+                    _ask(str(path), "load", str(path), os.getcwd())
+            except InputError:
+                if before == 0:  # SPICE keeps records of a file that it refused: begin again
+                    _end()
+                raise
             yield
         finally:
             if reader is _reader is not None:  # else it has ended, and its pool with it
@@ -140,7 +145,11 @@ def read_dsk(path: str | Path) -> tuple[F64, NDArray[np.int64]]:
     _check_installed(str(path))
     size = resources.file_status(path)
     more_s = 0.0 if size is None else size.st_size / _DSK_BYTES_PER_S
-    vertices_km, faces = _ask(str(path), "dsk", os.path.abspath(path), cpu_s=_CPU_S + more_s)
+    reader = _Reader()  # of its own, since SPICE keeps records of a file that it refused
+    try:
+        vertices_km, faces = _answer(reader, str(path), "dsk", os.path.abspath(path), cpu_s=_CPU_S + more_s)
+    finally:
+        reader.close()
     return vertices_km, faces
 
 
@@ -356,15 +365,22 @@ def _ask(purpose: str, name: str, *arguments: Any, cpu_s: float = _CPU_S) -> Any
         if _reader is None or _reader.owner != os.getpid():  # after a fork the pipes are the parent's
             _reader = _Reader()
         try:
-            kind, answer = _reader.ask((name, arguments, cpu_s))
-        except (EOFError, OSError, pickle.UnpicklingError):
-            ended, _reader = _reader, None
-            raise InputError(f"{purpose}: SPICE {_cause(ended.close())}: a kernel is damaged.") from None
-        except BaseException:  # interrupted between question and answer: the next one would get this answer
-            _reader.process.kill()
-            _reader.close()
-            _reader = None
-            raise
+            return _answer(_reader, purpose, name, *arguments, cpu_s=cpu_s)
+        finally:
+            if _reader.process.returncode is not None:
+                _reader = None
+
+
+def _answer(reader: _Reader, purpose: str, name: str, *arguments: Any, cpu_s: float) -> Any:
+    """The answer of a process to one question; where there is none, the process has ended."""
+    try:
+        kind, answer = reader.ask((name, arguments, cpu_s))
+    except (EOFError, OSError, pickle.UnpicklingError):
+        raise InputError(f"{purpose}: SPICE {_cause(reader.close())}: a kernel is damaged.") from None
+    except BaseException:  # interrupted between question and answer: the next one would get this answer
+        reader.process.kill()
+        reader.close()
+        raise
     if kind == "refused":
         raise InputError(f"{purpose}: {answer}.")
     return answer
@@ -457,7 +473,6 @@ def _dsk(spiceypy: Any, path: str) -> tuple[F64, NDArray[np.int64]]:
                 base += vertices_n
                 surfaces.add((about.center, about.surfce))
             segment, found = spiceypy.dlafns(handle, segment)
-    spiceypy.dascls(handle)
     if not faces:
         raise InputError("expected a DSK segment of type 2 (triangular plates), found none")
     if len(surfaces) > 1:
