@@ -75,13 +75,22 @@ class Camera:
         return np.array([cx + fx * x / z, cy + fy * y / z])
 
     @property
+    def seen_slopes(self) -> NDArray[np.float64]:
+        """Tangents x/z and y/z of the directions in C that the pixels' centres see, float64[y, x, 2]."""
+        if isinstance(self.lens, RealLens):
+            return self.lens.seen_slopes
+        fx, fy, cx, cy = self.intrinsics
+        x, y = (np.arange(self.width_px) + 0.5 - cx) / fx, (np.arange(self.height_px) + 0.5 - cy) / fy
+        return np.stack(np.meshgrid(x, y), axis=-1)
+
+    @property
     def lens_name(self) -> str:
         return self.lens.name if isinstance(self.lens, RealLens) else "thin lens"
 
     @property
     def distortion(self) -> NDArray[np.float64]:
-        """OpenCV's k1, k2, p1, p2, k3, float64[5]; zeros for a thin lens."""
-        return np.array(self.lens.distortion) if isinstance(self.lens, RealLens) else np.zeros(5)
+        """OpenCV's k1, k2, p1, p2, k3, k4, k5, k6, float64[8]; zeros for a thin lens."""
+        return np.array(self.lens.distortion) if isinstance(self.lens, RealLens) else np.zeros(8)
 
     @property
     def distortion_residual_px(self) -> tuple[float, float]:

@@ -66,8 +66,8 @@ def render_frame(frame: Frame) -> None:
     """Radiance of every band, and truth.
 
     The renderer knows pinhole cameras only. Behind a prescription `rendered` is what it gives, guard band included;
-    `radiance` is the same on the picture's own grid, distorted, before any of it is lost or blurred, and truth is
-    that of the rendered pixel nearest to what a pixel's centre sees, less than a pixel away.
+    `radiance` is the same on the picture's own grid, distorted, before any of it is lost or blurred. Truth follows
+    the chief rays of the pixels' centres.
     """
     from . import render
 
@@ -83,11 +83,16 @@ def render_frame(frame: Frame) -> None:
     scene = describe(frame)
     surface = spec.terrain.surface
     angles = bool(_ANGLE_LAYERS & set(spec.scene.dataset.layers))
-    guide = render.truth(surface, scene.view, scene.sun, angles=angles)
-    lens = frame.camera.lens
-    frame.truth = guide
-    if isinstance(lens, RealLens):
-        frame.truth, frame.open_sky = _at_pixels(guide, lens.nearest_pixels), guide.semantic == SKY
+    guide: Truth | None
+    if isinstance(frame.camera.lens, RealLens):
+        slopes = frame.camera.seen_slopes
+        frame.truth = render.truth(surface, scene.view, scene.sun, angles=angles, slopes=slopes)
+        # on the render's own grid where that is asked for: light between surfaces, and stars
+        needed = scene.bounces or spec.scene.sky.stars != "off"
+        guide = render.truth(surface, scene.view, scene.sun) if needed else None
+        frame.open_sky = None if guide is None else guide.semantic == SKY
+    else:
+        frame.truth = guide = render.truth(surface, scene.view, scene.sun, angles=angles)
     if spec.scene.render.noise_fraction is None:
         _keep(frame, render.radiance(surface, scene, guide))
     else:
@@ -102,14 +107,7 @@ def _keep(frame: Frame, radiance: Radiance) -> None:
     frame.radiance = radiance
 
 
-def _at_pixels(truth: Truth, pixels: NDArray[np.int32]) -> Truth:
-    """The truth of pixels by their number, on the grid of those numbers."""
-    layers = {name: getattr(truth, name) for name in truth.__dataclass_fields__}
-    flat = {name: a.reshape(-1, *a.shape[2:]) for name, a in layers.items() if a is not None}
-    return replace(truth, **{name: a[pixels] for name, a in flat.items()})
-
-
-def _render_to_the_noise(frame: Frame, scene: Scene, guide: Truth, fraction: float) -> None:
+def _render_to_the_noise(frame: Frame, scene: Scene, guide: Truth | None, fraction: float) -> None:
     """Render with more samples where chance would show: up to `fraction` of the sensor's own noise.
 
     The error of a pixel is judged by two halves of its samples, over 3×3 pixels; those that err too much are
@@ -122,7 +120,9 @@ def _render_to_the_noise(frame: Frame, scene: Scene, guide: Truth, fraction: flo
     lens_and_sensor = green_per_second(frame)
     found, halves = render.direct(surface, scene, lens_and_sensor)
     array = found.array.copy()
-    once_more = render.indirect(surface, scene, guide) if scene.bounces else np.zeros_like(array)
+    once_more = (
+        np.zeros_like(array) if guide is None or not scene.bounces else render.indirect(surface, scene, guide)
+    )
     whole = found.with_array(array + once_more)
     exposure = _exposure_s(frame, _rate(frame, whole))
     error_e = np.abs(halves) * exposure

@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 
 from . import frames, labels, plan, world
 from .config import SceneConfig
-from .lens import RealLens
 from .pictures import effect_of, soft_layer
 from .quantities import Sample
 from .sample import Frame, mask_any_faults, stored_layers
@@ -114,16 +113,9 @@ def to_sample(frame: Frame) -> Sample:
 
 def _points_T_m(frame: Frame) -> F64:
     """Surface points that truth belongs to, of the pixel centres, in T, float64[y, x, 3] metres, NaN on the sky."""
-    fx, fy, cx, cy = frame.camera.intrinsics
-    height, width = frame.context.shape
-    rows, columns = np.ogrid[:height, :width]
-    lens, (guard_x, guard_y) = frame.camera.lens, frame.camera.guard_px
-    if isinstance(lens, RealLens):
-        rows, columns = np.divmod(lens.nearest_pixels, width + 2 * guard_x)
-        rows, columns = rows - guard_y, columns - guard_x
-    x, y = (columns + 0.5 - cx) / fx, (rows + 0.5 - cy) / fy
     depth = np.where(np.isfinite(frame.truth.depth_m), frame.truth.depth_m.astype(np.float64), np.nan)
-    seen_C = np.stack([x * depth, y * depth, depth], axis=-1)
+    slopes = frame.camera.seen_slopes
+    seen_C = np.stack([slopes[..., 0] * depth, slopes[..., 1] * depth, depth], axis=-1)
     site, pose = frame.spec.terrain.site, frame.pose
     T_from_C = site.T_from_L @ pose.L_from_C
     camera_T_m = site.position_T_m + site.T_from_L @ pose.position_L_m

@@ -32,6 +32,7 @@ from scipy.special import ndtr
 
 from ..errors import InputError
 from ..quantities import Irradiance, Radiance
+from . import distortion
 from .aperture import axial_beam_diameter_mm
 from .coating import mean_reflectance
 from .first_order import first_order
@@ -47,6 +48,7 @@ REACH_PX = 7
 # A point spread with a smaller root-mean-square radius leaves a pixel's light where it is.
 _SHARP_PX = 0.3
 
+_FITTED = 256  # distances at which the coefficients of distortion are fitted
 _ANGLES = 65  # field angles of the tables
 _BEYOND = 1.6  # of the frame's corner, as a tangent: how far the tables reach
 _STEEPNESS = (0.3, 3.0)  # of the map of the field beyond its last chief ray: dh/dt in focal lengths
@@ -351,32 +353,39 @@ class RealLens:
         return self._map(wavelength_nm).slope_at(distance * self.focal_length_mm)
 
     @cached_property
-    def distortion(self) -> tuple[float, float, float, float, float]:
-        """OpenCV's k1, k2, p1, p2, k3 at the d line, fitted over the lit part of the frame; p1 = p2 = 0."""
-        return self._distortion[0]
+    def distortion(self) -> F64:
+        """OpenCV's k1, k2, p1, p2, k3, k4, k5, k6 at the d line, float64[8], fitted over the lit part of the frame;
+        p1 = p2 = 0."""
+        farthest = self._distances[self._lit].max()
+        distance = np.linspace(0, farthest, _FITTED + 1)[1:]
+        return distortion.fitted(self.undistorted(distance), distance, self.focal_length_px)
 
     @cached_property
     def distortion_residual_px(self) -> tuple[float, float]:
-        """What `distortion` leaves of the exact map: root mean square and largest, pixels over the frame."""
-        return self._distortion[1]
+        """What `distortion` leaves of the exact map: root mean square and largest, pixels over the lit frame."""
+        distance = self._distances[self._lit]
+        left = (distortion.distances(self.distortion, self.undistorted(distance)) - distance) * self.focal_length_px
+        return float(np.sqrt(np.mean(left**2))), float(np.abs(left).max())
 
     @cached_property
-    def _distortion(self) -> tuple[tuple[float, float, float, float, float], tuple[float, float]]:
+    def _distances(self) -> F64:
+        """Distances from the axis in focal lengths of places all over the frame, float64[place]."""
         x, y = (np.linspace(0, size / 2 / self.focal_length_px, 65) for size in (self.width_px, self.height_px))
-        distance = np.hypot(x[None, :], y[:, None]).ravel()
-        slope = self.undistorted(distance)
-        lit = (self.relative_illumination(distance) > 0) & (slope > 0)
-        slope, distance = slope[lit], distance[lit]
-        most = slope.max()
-        powers = slope[:, None] * (slope[:, None] / most) ** [2, 4, 6] * self.focal_length_px
-        aim = (distance - slope) * self.focal_length_px
-        # sums in one order, which a threaded product would not keep: stores are the same bit for bit
-        normal, right = np.einsum("ni,nj->ij", powers, powers), np.einsum("ni,n->i", powers, aim)
-        found = np.linalg.solve(normal, right)
-        left = np.einsum("ni,i->n", powers, found) - aim
-        k1, k2, k3 = found / most ** np.array([2, 4, 6])
-        residual = float(np.sqrt(np.mean(left**2))), float(np.abs(left).max())
-        return (float(k1), float(k2), 0.0, 0.0, float(k3)), residual
+        return np.asarray(np.hypot(x[None, :], y[:, None]).ravel())
+
+    @cached_property
+    def _lit(self) -> NDArray[np.bool_]:
+        """Which of `_distances` light reaches."""
+        return np.asarray(self.relative_illumination(self._distances) > 0)
+
+    @cached_property
+    def seen_slopes(self) -> F64:
+        """Tangents x/z and y/z of the directions that the pixels' centres see at the d line, float64[y, x, 2], by
+        chief rays."""
+        x, y = ((np.arange(n) + 0.5 - n / 2) / self.focal_length_px for n in (self.width_px, self.height_px))
+        distance = np.maximum(np.hypot(x[None, :], y[:, None]), 1e-12)
+        stretch = self.undistorted(distance) / distance
+        return np.stack([x * stretch, y[:, None] * stretch], axis=-1)
 
     @property
     def focal_length_px(self) -> float:
@@ -509,22 +518,6 @@ class RealLens:
 
         with ThreadPoolExecutor(2) as pool:
             return radiance.with_array(np.stack(list(pool.map(one, range(len(radiance.array))))))
-
-    @cached_property
-    def nearest_pixels(self) -> NDArray[np.int32]:
-        """For each pixel of the picture the number of the render's pixel, row after row, that its centre sees at
-        the d line, int32[y, x]."""
-        gx, gy = self.guard_px
-        width, height = self.width_px + 2 * gx, self.height_px + 2 * gy
-        x, y = (np.arange(n) + 0.5 - n / 2 for n in (self.width_px, self.height_px))
-        distance = np.hypot(x[None, :], y[:, None]) / self.focal_length_px
-        stretch = self.undistorted(distance) / np.maximum(distance, 1e-12)
-        stretch[distance < 1e-9] = 1
-        column, row = (
-            np.clip(np.floor(v + n / 2).astype(np.int32), 0, n - 1)
-            for v, n in ((x[None, :] * stretch, width), (y[:, None] * stretch, height))
-        )
-        return np.asarray(row * width + column)
 
     def _check(self, radiance: Radiance) -> None:
         gx, gy = self.guard_px

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..quantities import BODY, SKY, SPACECRAFT, SUN, Truth
 from ..scene import Sunlight, View
@@ -14,11 +15,17 @@ from .sampling import Optics
 from .surface import Surface, facing
 
 
-def truth(surface: Surface, view: View, sun: Sunlight, *, angles: bool = False) -> Truth:
-    """Depth, normal and semantic class of every pixel centre, from one pinhole ray each; with `angles` also those
-    of incidence, emission and phase, and the dust."""
-    optics, shape = Optics(view), (view.height_px, view.width_px)
-    rays = optics.centre_rays()
+def truth(
+    surface: Surface, view: View, sun: Sunlight, *, angles: bool = False, slopes: NDArray[np.float64] | None = None
+) -> Truth:
+    """Depth, normal and semantic class of every pixel centre, from one ray each; with `angles` also those of
+    incidence, emission and phase, and the dust.
+
+    `slopes`: tangents x/z and y/z of the rays in C, float64[y, x, 2]; default: those of the view's pinhole.
+    """
+    optics = Optics(view)
+    shape = (view.height_px, view.width_px) if slopes is None else slopes.shape[:2]
+    rays = optics.centre_rays() if slopes is None else optics.rays_of(slopes)
     hit = surface.seen_from(view).intersect(rays)
     boresight = optics.axes[2]
     depth = dr.select(hit.valid, hit.distance_m * dr.dot(rays.d, boresight), dr.inf)

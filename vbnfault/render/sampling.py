@@ -180,6 +180,12 @@ class Optics:
         y = mi.Float(pixel // self.width) + 0.5
         return mi.Ray3f(*self.direction(x, y))
 
+    def rays_of(self, slopes: NDArray[np.float64]) -> Any:
+        """One ray from the centre of the lens for each of the tangents x/z and y/z in C, float64[y, x, 2]."""
+        across, down = (mi.Float(np.ascontiguousarray(slopes[..., k], np.float32).ravel()) for k in (0, 1))
+        ax, ay, az = self.axes
+        return mi.Ray3f(self.origin, dr.normalize(across * ax + down * ay + az))
+
 
 def opaque_vector(kind: Any, values: np.ndarray) -> Any:
     """A drjit vector whose entries are runtime values, not constants of the kernel."""

@@ -137,7 +137,7 @@ _LABELS = {  # coordinates of the short axes
     "xy": ("x", "y"),
     "quaternion": ("w", "x", "y", "z"),
     "intrinsic": ("fx", "fy", "cx", "cy"),
-    "coefficient": ("k1", "k2", "p1", "p2", "k3"),
+    "coefficient": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
 }
 
 
