@@ -48,7 +48,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "render": {"scene", "llvm", "photometry", "quantities"},  # quantities: what it returns
     "lens": {"spectra", "quantities", "llvm"},
     "detector": {"spectra", "quantities"},
-    "camera": {"lens", "detector"},
+    "camera": {"lens", "detector", "quantities"},  # quantities: what it is exposed to, and what it collects
     "characterise": {"spectra", "detector"},
     "faults": CAMERA,
     "flares": FOUNDATION | CAMERA | {"faults"},

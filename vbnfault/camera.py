@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from .detector import Detector, MosaicDetector
 from .lens import RealLens, ThinLens
+from .quantities import Electrons, Irradiance, Radiance
 
 ARCHITECTURES = ("full_frame_ccd", "frame_transfer_ccd", "interline_ccd", "cmos")
 READOUT_DIRECTIONS = ("up", "down", "left", "right")
@@ -33,6 +34,21 @@ class Camera:
     def optics(self) -> tuple[Any, ...]:
         """What the electrons expected in its pixels depend on: cameras that share it share them."""
         return self.lens, self.exposure_s, self.detector.optics_key
+
+    def expose(self, radiance: Radiance, exposure_s: float) -> Electrons:
+        """Return the electrons expected of a radiance: the scene's, and past the rims those of the Sun's disc."""
+
+        def electrons(on_sensor: Irradiance) -> Electrons:
+            return self.detector.electrons_expected(on_sensor, exposure_s)
+
+        if radiance.sun is None:
+            return electrons(self.lens.image(radiance))
+        # the Sun's own rounding errors are as bright as the scene
+        scene = replace(radiance, array=np.maximum(radiance.array - radiance.sun, 0), sun=None)
+        sun = replace(radiance, array=radiance.sun, sun=None)
+        found = electrons(self.lens.image(scene))
+        direct = electrons(self.lens.image_of_sun(sun, self.detector.pixel_pitch_um))
+        return replace(found, past_rims=direct.array)
 
     @property
     def width_px(self) -> int:

@@ -322,6 +322,9 @@ def flare(
     cleanliness_level: Annotated[
         float, typer.Option(min=0, max=2000, help="particles on the surfaces, IEST-STD-CC1246; 0: none")
     ] = 0.0,
+    veil_fraction: Annotated[
+        float, typer.Option(min=0, max=0.5, help="of the light, that mount, barrel and edges scatter as a veil")
+    ] = 0.01,
 ) -> None:
     """Ghosts, starburst and glare of the Sun through a lens: a picture, and a table of every ghost."""
     if out.suffix.lower() not in (".png", ".exr") or not out.absolute().parent.is_dir():
@@ -353,6 +356,7 @@ def flare(
         reflections=reflections,
         roughness_nm=roughness_nm,
         cleanliness_level=cleanliness_level,
+        veil_fraction=veil_fraction,
     )
     bands = 0 if model == "texture" else len(view.wavelength_nm)
     with typer.progressbar(length=bands + 1, label="ghosts and picture", file=sys.stderr) as bar:

@@ -119,12 +119,12 @@ def _render_to_the_noise(frame: Frame, scene: Scene, guide: Truth | None, fracti
     surface, settings = frame.spec.terrain.surface, frame.spec.scene.render
     lens_and_sensor = green_per_second(frame)
     found, halves = render.direct(surface, scene, lens_and_sensor)
-    array = found.array.copy()
+    array, sun = found.array.copy(), None if found.sun is None else found.sun.copy()
     once_more = (
         np.zeros_like(array) if guide is None or not scene.bounces else render.indirect(surface, scene, guide)
     )
     whole = found.with_array(array + once_more)
-    exposure = _exposure_s(frame, _rate(frame, whole))
+    exposure = _exposure_s(frame, _rate(frame, whole).merged)
     error_e = np.abs(halves) * exposure
     signal_e = np.einsum("b,byx->yx", lens_and_sensor * exposure, whole.array)
     detector = frame.camera.detector
@@ -149,9 +149,11 @@ def _render_to_the_noise(frame: Frame, scene: Scene, guide: Truth | None, fracti
             again = replace(scene, samples_per_pixel=4 * int(samples), key=key)
             more, halves = render.direct(surface, again, lens_and_sensor, chosen)
             array.reshape(len(array), -1)[:, chosen] = more.array[:, 0]
+            if sun is not None:
+                sun.reshape(len(sun), -1)[:, chosen] = 0 if more.sun is None else more.sun[:, 0]
             error_e.ravel()[chosen] = np.abs(halves[0]) * exposure
         spent[noisy] *= 4
-    _keep(frame, found.with_array(array + once_more))
+    _keep(frame, replace(found, array=array + once_more, sun=sun))
     frame.samples_per_pixel = float(spent.mean())
     frame.noise_fraction_p99 = float(np.percentile(share[lit], 99)) if lit.any() else 0.0
 
@@ -168,7 +170,7 @@ def green_per_second(frame: Frame) -> F64:
 
 def meter(frame: Frame) -> None:
     """Exposure: fixed, or metered once on the noise-free, fault-free frame; all twins share it."""
-    frame.rate = _rate(frame, frame.imaged)
+    _expose(frame)
     frame.camera = replace(frame.camera, exposure_s=_exposure_s(frame, frame.rate))
     _add_stars(frame)
     direction_C = frame.pose.L_from_C.T @ frame.pose.sun_L
@@ -203,7 +205,7 @@ def _add_stars(frame: Frame) -> None:
         starry = world.with_stars(scene, before, frame.camera, J_from_C, frame.open_sky, describe(frame).view)
     if starry is not before:
         _keep(frame, starry)
-        frame.rate = _rate(frame, starry)
+        _expose(frame)
 
 
 def _metered_exposure_s(frame: Frame, rate: Electrons) -> float:
@@ -233,10 +235,15 @@ def _brightness(electrons: NDArray[np.float32], white_e: NDArray[np.float32]) ->
     return np.asarray(reduce(np.maximum, np.moveaxis(electrons / white_e, -1, 0)))
 
 
+def _expose(frame: Frame) -> None:
+    """Expected electrons after one second of the imaged radiance: all of them, and with the Sun's apart."""
+    found = _rate(frame, frame.imaged)
+    frame.rate, frame.rate_apart = found.merged, None if found.past_rims is None else found
+
+
 def _rate(frame: Frame, radiance: Radiance) -> Electrons:
     """Expected electrons after one second."""
-    camera = frame.camera
-    return camera.detector.electrons_expected(camera.lens.image(radiance), 1.0)
+    return frame.camera.expose(radiance, 1.0)
 
 
 def _rate_on_axis(frame: Frame, radiance: Radiance) -> Electrons:

@@ -18,7 +18,8 @@ from .detector import Detector
 from .errors import InputError
 from .faults import FaultContext, registry
 from .lens import Prescription, ThinLens, first_order
-from .lens.paraxial import Ghost, mean_ghost, paraxial_ghosts
+from .lens.paraxial import Ghost, axial_transmittance, mean_ghost, paraxial_ghosts
+from .lens.straylight import VEIL_FRACTION, Cleanliness, straylight
 from .quantities import Electrons
 
 F32 = NDArray[np.float32]
@@ -49,6 +50,7 @@ class View:
     reflections: int = 2
     roughness_nm: float = 1.0
     cleanliness_level: float = 0.0
+    veil_fraction: float = VEIL_FRACTION
 
     @property
     def pitch_mm(self) -> float:
@@ -75,10 +77,12 @@ def wavelengths_nm(one: float | None = None) -> F64:
 
 
 def layers(view: View) -> dict[str, F32]:
-    """Irradiance over the Sun's at the entrance, float32[band, y, x] each: `sun`, `ghosts`, `starburst`, `glare`;
-    of model texture `sun` and `texture`, in units of white."""
-    from .lens.straylight import Cleanliness, straylight
+    """Irradiance over the Sun's at the entrance, float32[band, y, x] each: `sun`, `ghosts`, `starburst`, `glare`,
+    `veil`; of model texture `sun` and `texture`, in units of white.
 
+    `sun` is the direct image: what the lens transmits of the light that enters the pupil, less what starburst,
+    glare and veil take from it (`lens.straylight`). The textures take nothing.
+    """
     sun = _direct_image(view)
     if view.model == "texture":
         return {"sun": sun, "texture": _textures(view)}
@@ -93,8 +97,16 @@ def layers(view: View) -> dict[str, F32]:
         sun_radius_rad=spectra.sun_angular_radius_rad(view.sun_distance_au),
         cleanliness=Cleanliness(roughness_nm=view.roughness_nm, level=view.cleanliness_level),
         reflections=view.reflections,
+        veil_fraction=view.veil_fraction,
     )
-    return {"sun": sun, "ghosts": found.ghosts, "starburst": found.starburst, "glare": found.glare}
+    sun *= found.direct_fraction[:, None, None].astype(np.float32)
+    return {
+        "sun": sun,
+        "ghosts": found.ghosts,
+        "starburst": found.starburst,
+        "glare": found.glare,
+        "veil": found.veil,
+    }
 
 
 def ghosts(view: View, progress: Callable[[int], None] | None = None) -> tuple[Ghost, ...]:
@@ -127,18 +139,27 @@ def _ghosts_at(view: View, wavelength_nm: float, *, alone: bool) -> tuple[Ghost,
 
 
 def _direct_image(view: View) -> F32:
-    """The Sun's own image: a uniform disc, at least a pixel wide."""
-    out = np.zeros((len(view.wavelength_nm), view.pixels, view.pixels), dtype=np.float32)
+    """Return the Sun's own image, a uniform disc at least a pixel wide, float32[band, y, x].
+
+    Its power over the Sun's irradiance is T(λ) A cos θ: the transmittance of the image path, and the area of the
+    paraxial entrance pupil, by which the ghosts' fluxes are counted too.
+    """
     optics = first_order(view.lens)
     radius_px = max(
         optics.efl_mm * spectra.sun_angular_radius_rad(view.sun_distance_au) / view.pitch_mm, np.sqrt(1 / np.pi)
     )
     x, y = (v / view.pitch_mm + view.pixels / 2 for v in view.sun_xy_mm)
-    axis = np.arange(view.pixels) + 0.5
-    distance = np.hypot(axis[None, :] - x, axis[:, None] - y)
-    cover = np.clip(radius_px - distance + 0.5, 0, 1)
-    gathered = np.pi / 4 * optics.entrance_pupil_diameter_mm**2 * np.cos(np.radians(view.sun_deg))
-    out[:] = cover * gathered / (np.pi * (radius_px * view.pitch_mm) ** 2)
+    # the whole disc first, so that its sum is known wherever the frame cuts it
+    reach = int(np.ceil(radius_px)) + 1
+    columns, rows = (int(np.floor(v)) + np.arange(-reach, reach + 1) for v in (x, y))
+    cover = np.clip(radius_px - np.hypot(columns[None, :] + 0.5 - x, rows[:, None] + 0.5 - y) + 0.5, 0, 1)
+    cover /= cover.sum() * view.pitch_mm**2
+    inside = [(v >= 0) & (v < view.pixels) for v in (rows, columns)]
+    out = np.zeros((len(view.wavelength_nm), view.pixels, view.pixels), dtype=np.float32)
+    power = axial_transmittance(view.lens, view.wavelength_nm) * np.cos(np.radians(view.sun_deg))
+    power *= np.pi / 4 * optics.entrance_pupil_diameter_mm**2
+    within = cover[np.ix_(*inside)]
+    out[:, rows[inside[0]][:, None], columns[inside[1]]] = power[:, None, None] * within
     return out
 
 
@@ -179,7 +200,7 @@ def picture(view: View, found: dict[str, F32], white: float | None = None) -> ND
     else:
         linear = colours(view, sum(found.values(), np.zeros_like(found["sun"])))
         if white is None:
-            ghosts_ = colours(view, found["ghosts"] + found["glare"]).max(axis=2)
+            ghosts_ = colours(view, found["ghosts"] + found["glare"] + found["veil"]).max(axis=2)
             white = max(float(np.percentile(ghosts_, _SHOWN_PERCENTILE)), 1e-30)
     level = np.clip(linear / np.float32(white), 0, 1)
     shown = np.where(level <= 0.0031308, 12.92 * level, 1.055 * level ** (1 / 2.4) - 0.055)

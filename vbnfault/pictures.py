@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from . import labels
 from .camera import Camera
 from .detector import MosaicDetector
-from .faults import MOSAIC_STEPS, QUANTITIES, Fault, FaultContext, Params, physical_order
+from .faults import MOSAIC_STEPS, QUANTITIES, Fault, FaultContext, Params, act, physical_order
 from .quantities import RGBI, Electrons, soft_kind
 from .sample import Frame, stored_layers
 
@@ -32,8 +32,8 @@ def photograph(frame: Frame) -> None:
     is in the pixels and labels never claim more.
     """
     spec = frame.spec
-    commanded = list(spec.commanded)
-    if not frame.pose.resolved or frame.pose.sun_visible_fraction == 0:
+    commanded = [name for name in spec.faults if spec.plan.injects(name)[spec.index]]
+    if not frame.pose.resolved:
         commanded = [name for name in commanded if not spec.faults[name].needs_sun]
     # noise and the clean picture need one core, the faults' optics another
     undisturbed = _signal(frame, {}, [])
@@ -70,16 +70,12 @@ def photograph(frame: Frame) -> None:
 def _expose_clean(frame: Frame, signal: Electrons) -> tuple[Any, RGBI]:
     spec, camera = frame.spec, frame.camera
     noise = camera.detector.draw_noise(frame.context.shape, lambda name: spec.rng("detector", name))
-    return noise, camera.detector.develop(signal, camera.exposure_s, noise)
+    return noise, camera.detector.develop(signal.merged, camera.exposure_s, noise)
 
 
 def _draw(frame: Frame, commanded: Sequence[str], attempt: int) -> None:
-    """Draw the commanded faults that are not drawn yet, those first of which others should know.
-
-    Another view of the sample goes on with other draws: what cannot show in one need not be tried in the next.
-    """
+    """Draw the commanded faults that are not drawn yet, those first of which others should know."""
     faults = frame.spec.faults
-    attempt += (frame.views - 1) * _DRAW_TRIES
     for name in sorted(commanded, key=lambda n: type(faults[n]).inform is Fault.inform):
         if name not in frame.drawn:
             generator = frame.spec.rng("fault", f"{name}/{attempt}")
@@ -133,12 +129,12 @@ def _signal(frame: Frame, drawn: Mapping[str, Params], names: Sequence[str]) -> 
         if names:
             *before, last = names
             signal = _signal(frame, drawn, before)
-            cached[key] = frame.spec.faults[last].apply(signal, drawn[last], context)
+            cached[key] = act(frame.spec.faults[last], signal, drawn[last], context)
         else:
             if same:
-                signal = frame.rate.with_array(frame.rate.array * np.float32(camera.exposure_s))
+                signal = (frame.rate_apart or frame.rate).scaled(camera.exposure_s)
             else:
-                signal = camera.detector.electrons_expected(camera.lens.image(frame.imaged), camera.exposure_s)
+                signal = camera.expose(frame.imaged, camera.exposure_s)
             cached[key] = signal
     return cached[key]
 
@@ -163,7 +159,7 @@ def _before_readout(frame: Frame, drawn: Mapping[str, Params], noise: Any) -> RG
     key = (camera, _context(frame, drawn)[0], _key(drawn, [*optical, *inside]), noise is None)
     if key not in frame.pictures:
         signal, acts = _signal(frame, drawn, optical), _acts(frame, drawn)
-        frame.pictures[key] = camera.detector.develop(signal, camera.exposure_s, noise, acts)
+        frame.pictures[key] = camera.detector.develop(signal.merged, camera.exposure_s, noise, acts)
     return frame.pictures[key]
 
 
@@ -171,7 +167,7 @@ def _raw(frame: Frame, noise: Any) -> NDArray[np.uint16]:
     """The raw mosaic of the picture, before the faults of the finished picture."""
     camera = _altered(frame, frame.drawn)
     assert isinstance(camera.detector, MosaicDetector)
-    signal = _signal(frame, frame.drawn, _in_order(frame, frame.drawn, "electrons"))
+    signal = _signal(frame, frame.drawn, _in_order(frame, frame.drawn, "electrons")).merged
     return camera.detector.raw(signal, camera.exposure_s, noise, _acts(frame, frame.drawn))
 
 
@@ -230,7 +226,7 @@ def _shows_on_some_rows(frame: Frame, name: str) -> bool:
     detector, exposure = frame.camera.detector, frame.camera.exposure_s
     pictures = []
     for names in (optical, [n for n in optical if n != name]):
-        signal = _signal(frame, drawn, names)
+        signal = _signal(frame, drawn, names).merged
         some = signal.with_array(np.ascontiguousarray(signal.array[rows]))
         pictures.append(detector.develop(some, exposure, None).array)
     seen = labels.effect(*pictures)
@@ -248,7 +244,7 @@ def effect_of(frame: Frame, name: str) -> NDArray[np.bool_]:
     if name not in optical or _altered(frame, drawn) != frame.camera or not frame.camera.detector.local:
         return labels.effect(develop(frame, drawn, None).array, develop(frame, others, None).array)
     # only pixels whose signal changes can change: the others need not be developed
-    whole, part = (_signal(frame, d, [n for n in optical if n in d]) for d in (drawn, others))
+    whole, part = (_signal(frame, d, [n for n in optical if n in d]).merged for d in (drawn, others))
     differ = whole.array != part.array
     changed = np.flatnonzero(np.logical_or.reduce([differ[..., k] for k in range(differ.shape[2])]))
     if not len(changed):
@@ -286,7 +282,7 @@ def _doubtful(frame: Frame, noise: Any) -> set[str]:
     for k, name in enumerate(optical):
         a, b = (
             np.minimum(q.array[some], q.white_e) * (255 / q.white_e)
-            for q in (_signal(frame, drawn, optical[:k]), _signal(frame, drawn, optical[: k + 1]))
+            for q in (_signal(frame, drawn, optical[:k]).merged, _signal(frame, drawn, optical[: k + 1]).merged)
         )
         if np.abs(b - a).max(initial=0) < _CLEARLY_VISIBLE_DN:
             out.add(name)

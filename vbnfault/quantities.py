@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any, ClassVar, NamedTuple, Self
 
 import numpy as np
@@ -42,9 +43,13 @@ class Quantity:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Radiance(Quantity):
-    """Spectral radiance at the camera, per band node; `wavelength_nm` float64[band]."""
+    """Spectral radiance at the camera, per band node; `wavelength_nm` float64[band].
+
+    `sun` is the part of `array` that is the Sun's own disc, float32[band, y, x]; None where it is not in view.
+    """
 
     wavelength_nm: NDArray[np.float64]
+    sun: NDArray[np.float32] | None = None
     unit = "W m-2 sr-1 nm-1"
     axes = ("band", "y", "x")
 
@@ -64,11 +69,27 @@ class Electrons(Quantity):
 
     `white_e` float32[channel]: the signal of each channel that the 8 bit image shows as 255. Expected (noise-free)
     photo-electrons may lie above it; saturation belongs to the detector.
+
+    `past_rims` float32[y, x, channel] is light beside that of `array` which has met the lens's pupil and rims
+    already: the Sun's direct image and its traced straylight. Vignetting leaves it as it is. None: there is none.
     """
 
     white_e: NDArray[np.float32]
+    past_rims: NDArray[np.float32] | None = None
     unit = "e-"
     axes = ("y", "x", "channel")
+
+    @cached_property
+    def merged(self) -> Electrons:
+        """All light in one array, as the detector takes it."""
+        if self.past_rims is None:
+            return self
+        return replace(self, array=self.array + self.past_rims, past_rims=None)
+
+    def scaled(self, factor: float) -> Electrons:
+        """All light times a factor."""
+        past = None if self.past_rims is None else self.past_rims * np.float32(factor)
+        return replace(self, array=self.array * np.float32(factor), past_rims=past)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

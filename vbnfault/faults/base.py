@@ -10,7 +10,7 @@ from __future__ import annotations
 import dataclasses
 import difflib
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import Any, ClassVar, NamedTuple, TypeVar
 
@@ -213,6 +213,11 @@ class Fault:
     `needs_ccd` (True: no effect on CMOS), `localised` (False where the footprint is about the
     whole frame), `needs_sun`, `effect_mask` (True: the mask is the effect rule, not the footprint), `soft_layer`
     (the name of the optional layer that `soft` gives, which ends as one of `quantities.SOFT_KINDS`; "": none).
+
+    Which light has met the lens's rims is told by two more, for models of the step `electrons`. `adds_past_rims`
+    (True: the light it adds has met them; `apply` puts it into `Electrons.past_rims` where the quantity has that
+    plane, and into `array` where it has not). `at_rims` (True: it acts at the rims, so that light past them stays
+    as it is). All other models act on all light alike (`act`).
     """
 
     fault: ClassVar[str]
@@ -224,6 +229,8 @@ class Fault:
     needs_ccd: ClassVar[bool] = False
     effect_mask: ClassVar[bool] = False
     soft_layer: ClassVar[str] = ""
+    adds_past_rims: ClassVar[bool] = False
+    at_rims: ClassVar[bool] = False
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
@@ -301,6 +308,24 @@ def intensity_dn(electrons: NDArray[np.float32], camera: Camera) -> NDArray[np.f
         weights = np.array([luminance.get(channel, 0) for channel in channels], dtype=np.float32)
         weights /= weights.sum()
     return np.asarray(electrons @ (weights * 255 / white_e), dtype=np.float32)
+
+
+def act(fault: Fault, light: Electrons, params: Params, context: FaultContext) -> Electrons:
+    """Return the light after an optical fault, with what has met the lens's rims kept apart.
+
+    A fault that acts on all light alike, which may clip or blur it, gives the plane past the rims what it makes of
+    all light less what it makes of the rest.
+    """
+    if fault.adds_past_rims:
+        past = np.zeros_like(light.array) if light.past_rims is None else light.past_rims
+        return fault.apply(replace(light, past_rims=past), params, context)
+    if light.past_rims is None:
+        return fault.apply(light, params, context)
+    rest = fault.apply(replace(light, past_rims=None), params, context)
+    if fault.at_rims:
+        return replace(rest, past_rims=light.past_rims)
+    whole = fault.apply(light.merged, params, context)
+    return replace(rest, past_rims=np.maximum(whole.array - rest.array, 0))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -2,7 +2,13 @@
 
 Two models of the ghosts, everything else alike: `traced` follows exact rays along every path of two reflections
 (Hullin et al. 2011), `paraxial` draws each path's first-order image of the stop (Lee & Eisemann 2013). The light is
-added to what the scene gives, as irradiance on the sensor, from the Sun's irradiance at the camera.
+added as irradiance on the sensor, from the Sun's irradiance at the camera. Starburst, glare and veil are taken from
+the light that they are part of (`lens.straylight`): from the Sun's direct image, and of the scene's image the
+fraction that is scattered, which returns as a veil over the whole frame.
+
+Rays that reach the sensor have met the pupil and all rims on their way. Both models add to the light past the rims
+(`quantities.Electrons.past_rims`), which vignetting leaves as it is. In a picture that does not tell the Sun's
+direct image from the scene, the scene's rule holds for all of it.
 
 The parameters of a sample hold the ghosts in the frame, as they would be without each other: `pair` (rows of the
 prescription), `flux_fraction`, `x_px`, `y_px`, `rms_radius_px`, the brightest first. Coatings worn off by another
@@ -11,20 +17,31 @@ fault raise them.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .. import spectra
+from ..lens.straylight import Baffle, Cleanliness, scene_veil_fraction, straylight, veil_of
 from ..quantities import Irradiance
-from .base import FaultContext, Interval, LensFault, Params, bounds, choice, intensity_dn, number, plus
+from .base import FaultContext, Interval, LensFault, Params, bounds, choice, intensity_dn, number, plus, times
 
 F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
 
 _MOST_GHOSTS = 24
 _LEAST_SUN_RAD = 1e-5
+
+
+class _Light(NamedTuple):
+    """Straylight of the Sun, electrons float32[y, x, channel]; the fraction left of its direct image, and the
+    fraction that the scene's image loses to the veil, float64[channel] each."""
+
+    added: F32
+    direct_left: F64
+    scene_lost: F64
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,15 +51,23 @@ class _LensStraylight(LensFault):
     needs_sun = True
     effect_mask = True
     soft_layer = "straylight_added"
+    adds_past_rims = True
 
     coating: str = choice(
-        "bbar",
+        "as_prescribed",
         ("as_prescribed", "none", "mgf2", "v", "bbar"),
-        doc="of every surface between glass and air",
+        doc="of every surface between glass and air; as_prescribed: the lens's own",
     )
     roughness_nm: Interval = bounds(0.2, 1.0, limits=(0, 100), unit="nm", doc="rms roughness of the surfaces")
     cleanliness_level: Interval = bounds(
         20, 100, limits=(0, 2000), doc="of particles on the surfaces, IEST-STD-CC1246; 0: none"
+    )
+    veil_fraction: Interval = bounds(
+        0.005,
+        0.02,
+        limits=(0, 0.5),
+        doc="fraction of the light that mount, barrel and edges scatter over the sensor: their veiling glare index "
+        "(ISO 9358)",
     )
     reflections: int = number(2, limits=(2, 4), integer=True, doc="of the ghosts: 2, or 4 for those of four too")
     baffle_length_mm: float = number(0.0, limits=(0, 1e4), unit="mm", doc="of a tube in front of the lens")
@@ -68,6 +93,7 @@ class _LensStraylight(LensFault):
             "coating": self.coating,
             "roughness_nm": self.roughness_nm.uniform(rng),
             "cleanliness_level": self.cleanliness_level.uniform(rng),
+            "veil_fraction": self.veil_fraction.uniform(rng),
             "reflections": int(self.reflections),
             "baffle_mm": [float(self.baffle_length_mm), float(self.baffle_radius_mm)],
             "mask_level_dn": float(self.mask_level_dn),
@@ -76,30 +102,41 @@ class _LensStraylight(LensFault):
         return params
 
     def apply(self, quantity: Any, params: Params, context: FaultContext) -> Any:
-        """Expected electrons plus what the lens sends astray."""
-        layer = self._layer_once(params, context)
-        return quantity if layer is None else quantity.with_array(plus(quantity.array, layer))
+        """Expected electrons plus what the lens sends astray, less what that is taken from."""
+        found = self._light_once(params, context)
+        if found is None:
+            return quantity
+        flux = quantity.array.sum(axis=(0, 1), dtype=np.float64) * found.scene_lost
+        scene = times(quantity.array, 1 - found.scene_lost)
+        veil = veil_of(flux, context.shape, context.camera.focal_length_px)
+        added = plus(found.added, veil)
+        if quantity.past_rims is None:
+            return quantity.with_array(plus(scene, added))
+        past = plus(times(quantity.past_rims, found.direct_left), added)
+        return replace(quantity, array=scene, past_rims=past)
 
     def footprint(self, params: Params, context: FaultContext) -> NDArray[np.bool_]:
-        """bool[y, x]: where any colour gains at least `mask_level_dn`."""
-        layer = self._layer_once(params, context)
-        if layer is None:
+        """bool[y, x]: where any colour gains at least `mask_level_dn` of the Sun's light."""
+        found = self._light_once(params, context)
+        if found is None:
             return np.zeros(context.shape, dtype=bool)
         white = context.camera.detector.white_e
-        return np.asarray((layer >= white * np.float32(params["mask_level_dn"] / 255)).any(axis=2))
+        return np.asarray((found.added >= white * np.float32(params["mask_level_dn"] / 255)).any(axis=2))
 
     def soft(self, params: Params, context: FaultContext) -> F32:
-        """Return the intensity of what the lens sends astray, float32[y, x] in DN of 255."""
-        layer = self._layer_once(params, context)
-        return np.zeros(context.shape, np.float32) if layer is None else intensity_dn(layer, context.camera)
+        """Return the intensity of what the lens sends astray of the Sun's light, float32[y, x] in DN of 255."""
+        found = self._light_once(params, context)
+        return np.zeros(context.shape, np.float32) if found is None else intensity_dn(found.added, context.camera)
 
-    def _layer_once(self, params: Params, context: FaultContext) -> F32 | None:
-        return context.once("straylight.lens", params, lambda: self._layer(params, context))
+    def mask_least_dn(self, params: Params) -> float:
+        """`mask_level_dn`."""
+        return float(params["mask_level_dn"])
 
-    def _layer(self, params: Params, context: FaultContext) -> F32 | None:
-        """All straylight, electrons float32[y, x, channel]; None without a Sun in front of the camera."""
-        from ..lens.straylight import Baffle, Cleanliness, straylight
+    def _light_once(self, params: Params, context: FaultContext) -> _Light | None:
+        return context.once("straylight.lens", params, lambda: self._light(params, context))
 
+    def _light(self, params: Params, context: FaultContext) -> _Light | None:
+        """The Sun's straylight; None without a Sun in front of the camera."""
         sun = _sun(context)
         if sun is None:
             return None
@@ -110,8 +147,12 @@ class _LensStraylight(LensFault):
         assert context.sun_xy_px is not None
         middle = np.array([camera.width_px / 2, camera.height_px / 2])
         x, y = (np.asarray(context.sun_xy_px) - middle) * pitch_mm
+        lens = context.frame.prescription(params["lens"], params["coating"])
+        passed = camera.lens.transmittance(nodes)
+        area_mm2, axial_mm2 = camera.lens.pupil_area_mm2([np.tan(np.radians(theta)), 0.0])
+        cleanliness = Cleanliness(roughness_nm=params["roughness_nm"], level=params["cleanliness_level"])
         found = straylight(
-            context.frame.prescription(params["lens"], params["coating"]),
+            lens,
             model=self.model,
             wavelength_nm=nodes,
             shape=context.shape,
@@ -120,15 +161,27 @@ class _LensStraylight(LensFault):
             azimuth_deg=azimuth,
             sun_radius_rad=_sun_radius_rad(context),
             sun_xy_mm=(float(x), float(y)),
-            cleanliness=Cleanliness(roughness_nm=params["roughness_nm"], level=params["cleanliness_level"]),
+            cleanliness=cleanliness,
             baffle=Baffle(length_mm=params["baffle_mm"][0], radius_mm=params["baffle_mm"][1]),
             reflections=params["reflections"],
             coating_loss=context.coating_loss,
+            veil_fraction=params["veil_fraction"],
+            transmittance=passed,
+            admitted_mm2=float(area_mm2 * np.cos(np.radians(theta))),
+            beam_fraction=float(area_mm2 / axial_mm2),
         )
         visible = 1.0 if context.sun_visible_fraction is None else float(context.sun_visible_fraction)
         light = found.total * (irradiance * visible).astype(np.float32)[:, None, None]
         on_sensor = Irradiance(array=light, wavelength_nm=nodes)
-        return camera.detector.electrons_expected(on_sensor, camera.exposure_s).array
+        # both the scene and the Sun's image have the Sun's spectrum, as the lens passes it
+        weights = camera.detector.electron_rate_weights(nodes) * irradiance * passed
+        weights /= np.maximum(weights.sum(axis=1, keepdims=True), 1e-300)
+        lost = scene_veil_fraction(lens, nodes, cleanliness=cleanliness, veil_fraction=params["veil_fraction"])
+        return _Light(
+            added=camera.detector.electrons_expected(on_sensor, camera.exposure_s).array,
+            direct_left=weights @ found.direct_fraction,
+            scene_lost=weights @ lost,
+        )
 
     def _ghosts(self, params: Params, context: FaultContext) -> list[dict[str, Any]]:
         from ..lens.flare import flare_model

@@ -17,6 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ..lens.thin import cos4_map
 from .base import Fault, FaultContext, Interval, Params, bounds, number
 
 
@@ -29,6 +30,7 @@ class Cos4Vignetting(Fault):
     step = "electrons"
     localised = False
     soft_layer = "vignetting_factor"
+    at_rims = True
 
     on_axis_illuminance_dn: Interval = bounds(
         105, 255, limits=(0, 255), unit="DN of 255", doc="E0: 255 leaves the centre as it is"
@@ -56,18 +58,6 @@ class Cos4Vignetting(Fault):
         """Return the factor on the light, float32[y, x]."""
         e0 = np.float32(params["on_axis_illuminance_dn"] / 255)
         return e0 * cos4_map(context.shape, context.camera.focal_length_px)
-
-
-@lru_cache(maxsize=2)
-def cos4_map(shape: tuple[int, int], focal_length_px: float) -> NDArray[np.float32]:
-    """cos⁴ of the off-axis angle of every pixel's centre, float32[y, x] in (0, 1], read-only."""
-    height, width = shape
-    x2 = ((np.arange(width) + 0.5 - width / 2) / focal_length_px) ** 2
-    y2 = ((np.arange(height) + 0.5 - height / 2) / focal_length_px) ** 2
-    cos2 = 1 / (1 + x2[None, :] + y2[:, None])
-    out = (cos2 * cos2).astype(np.float32)
-    out.flags.writeable = False
-    return out
 
 
 @lru_cache(maxsize=2)

@@ -45,6 +45,7 @@ class LensVignetting(LensFault):
     step = "electrons"
     localised = False
     soft_layer = "vignetting_factor"
+    at_rims = True
 
     decentre: Interval = bounds(
         0.0,

@@ -21,12 +21,12 @@ a round one of the same area.
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import CubicSpline, PchipInterpolator
 from scipy.special import ndtr
 
@@ -34,9 +34,9 @@ from ..errors import InputError
 from ..quantities import Irradiance, Radiance
 from . import distortion
 from .aperture import axial_beam_diameter_mm
-from .coating import mean_reflectance
 from .first_order import first_order
 from .glass import D_NM
+from .paraxial import axial_transmittance
 from .prescription import Prescription
 from .trace import Path, trace
 
@@ -323,15 +323,12 @@ class RealLens:
 
     def transmittance(self, wavelength_nm: F64) -> F64:
         """Share of the light along the axis that coatings and glass let pass, float64[band]."""
-        share = np.ones(len(wavelength_nm))
-        surfaces = self.prescription.surfaces
-        for k, wavelength in enumerate(wavelength_nm.tolist()):
-            index = self.prescription.indices(wavelength)
-            for front, back, surface in zip(index[:-1], index[1:], surfaces, strict=True):
-                if front != back or surface.coating:
-                    share[k] *= 1 - float(mean_reflectance(surface.coating, front, back, 1.0, wavelength))
-            share[k] *= np.exp(-sum(s.thickness_mm * s.absorption_per_mm(wavelength) for s in surfaces[:-1]))
-        return share
+        return axial_transmittance(self.prescription, wavelength_nm)
+
+    def pupil_area_mm2(self, slope: ArrayLike) -> F64:
+        """Return the area of the beam that passes all rims, in the plane of the first vertex, for tangents of field
+        angles; float64 alike. Beyond the traced field it stays as at the field's end."""
+        return np.asarray(np.interp(np.asarray(slope, dtype=np.float64), self._beams.slope, self._beams.area_mm2))
 
     def axial_solid_angle_sr(self, wavelength_nm: F64) -> F64:
         """Irradiance over radiance on the axis, T A / f², float64[band]: π T / (4 N²) at the paraxial focus."""
@@ -507,6 +504,11 @@ class RealLens:
             list(pool.map(one, range(len(array))))
         return Irradiance(array=array, wavelength_nm=radiance.wavelength_nm)
 
+    def image_of_sun(self, radiance: Radiance, pixel_pitch_um: float) -> Irradiance:
+        """Return the irradiance of the Sun's direct image: `image`, whose beams hold the pupil's cosine already, so
+        that its power is E☉ T A(θ) cos θ."""
+        return self.image(radiance)
+
     def on_frame(self, radiance: Radiance) -> Radiance:
         """A render with its guard band on the picture's own grid: distortion and lateral colour alone, no light
         lost and nothing blurred."""
@@ -517,7 +519,8 @@ class RealLens:
             return self._resampled(radiance.array[band], tables.stretch[band], None)[_INSIDE]
 
         with ThreadPoolExecutor(2) as pool:
-            return radiance.with_array(np.stack(list(pool.map(one, range(len(radiance.array))))))
+            array = np.stack(list(pool.map(one, range(len(radiance.array)))))
+        return replace(radiance, array=array, sun=None)
 
     def _check(self, radiance: Radiance) -> None:
         gx, gy = self.guard_px
@@ -556,6 +559,9 @@ class RealLens:
             top = int(np.clip(row.min() // 2 - 1, 0, len(band) - 2))
             bottom = int(np.clip(row.max() // 2 + 3, top + 2, len(band)))
             row -= np.float32(2 * top)
+            if not band[top:bottom].any():  # most of a Sun's own image is dark
+                out[rows] = 0
+                continue
             source = finer(band[top:bottom])
             light = cv2.remap(source, column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
             if solid_angle_sr is not None:

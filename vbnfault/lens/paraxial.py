@@ -18,7 +18,7 @@ from .coating import mean_reflectance
 from .first_order import first_order
 from .glass import D_NM
 from .prescription import Prescription
-from .trace import ghost
+from .trace import forward, ghost
 
 F64 = NDArray[np.float64]
 
@@ -109,6 +109,20 @@ def transmittance(lens: Prescription, path: Sequence[tuple[int, bool]], waveleng
         reflected = float(mean_reflectance(films, index[row], index[row + 1], 1.0, wavelength_nm))
         share *= reflected if mirror else 1 - reflected
     return share
+
+
+def axial_transmittance(lens: Prescription, wavelength_nm: ArrayLike) -> F64:
+    """Return the fraction of the light along the axis that coatings and glass transmit, float64[band].
+
+    It multiplies the image of a scene and the direct image of the Sun alike. Reflected light is not in it: ghosts,
+    which are part of the reflected light, are therefore not taken from the direct image once more.
+    """
+    nodes = np.atleast_1d(np.asarray(wavelength_nm, dtype=np.float64))
+    path = forward(lens)
+    reflected = np.array([transmittance(lens, path, float(nm)) for nm in nodes])
+    glass = lens.surfaces[:-1]
+    depth = np.array([sum(s.thickness_mm * s.absorption_per_mm(float(nm)) for s in glass) for nm in nodes])
+    return np.asarray(reflected * np.exp(-depth))
 
 
 def paraxial_ghosts(

@@ -18,8 +18,9 @@ from ..errors import InputError
 from .coating import reflect_transmit
 from .first_order import first_order
 from .glass import D_NM, RANGE_NM
-from .paraxial import along, mirrors, transmittance
+from .paraxial import along, axial_transmittance, mirrors
 from .prescription import Prescription
+from .thin import beyond_frame
 from .trace import forward
 
 F32 = NDArray[np.float32]
@@ -39,9 +40,10 @@ _MIE_LARGEST = 500.0  # size parameter; beyond, diffraction and geometrical opti
 _BIN = 0.01  # of ln(size parameter)
 _ANGLES = 321
 _LOOKUP = 1 << 16
-_OFFSETS = np.geomspace(1e-6, 2.0, 1025)
+_OFFSETS: F64 = np.geomspace(1e-6, 2.0, 1025)
 _STEEPEST_DEG = 89.9
 _DISC = 65  # points across a beam
+_AROUND = 360  # directions about the source in which light misses the frame
 
 
 def _check(name: str, value: ArrayLike, low: float, high: float) -> F64:
@@ -315,6 +317,22 @@ class VeilingGlare:
             np.take(row, index, out=band, mode="clip")
         return out
 
+    @property
+    def kept_of_single(self) -> F64:
+        """Return what several scatterings leave of the sum of the single ones, (1 - e^-Σ) / Σ, float64[band]."""
+        return np.asarray(exprel(-self.glare_total_fraction))
+
+    def beyond_mm2(self, sun_xy_mm: tuple[float, float], shape: tuple[int, int], pitch_mm: float) -> F64:
+        """Return the flux on the unbounded sensor plane outside of the frame, over the source's irradiance at the
+        entrance, float64[band] in mm²; with the cos⁴ of the field angle that `image` leaves out."""
+        slope = np.asarray(sun_xy_mm, dtype=np.float64) / self.efl_mm
+        angle = np.linspace(0, 2 * np.pi, _AROUND, endpoint=False, dtype=np.float64)
+        half_slope = (shape[1] / 2 * pitch_mm / self.efl_mm, shape[0] / 2 * pitch_mm / self.efl_mm)
+        missing = beyond_frame(slope, self.offset, angle, half_slope).mean(axis=1)
+        # E dA = E(β) cos⁴θ dA = E(β) f² d²β
+        rings = 2 * np.pi * (self.efl_mm * self.offset) ** 2 * missing
+        return np.asarray(np.trapezoid(self.irradiance * rings, x=np.log(self.offset), axis=1))
+
 
 @dataclass(frozen=True, kw_only=True)
 class _Surfaces:
@@ -358,7 +376,7 @@ def _surfaces(
     marginal = np.abs(along(lens, path, wavelength_nm)[1][rows, 0, 0])
     aperture = figures.entrance_pupil_diameter_mm / (2 * figures.efl_mm)
     return _Surfaces(
-        scale=float(np.pi * aperture**2 * transmittance(lens, path, wavelength_nm)),
+        scale=float(np.pi * aperture**2 * axial_transmittance(lens, wavelength_nm)[0]),
         stretch=1 / np.maximum(marginal, 1e-6),
         roughness=tuple(
             Harvey.of_roughness(
@@ -433,6 +451,26 @@ def veiling_glare(
         efl_mm=first_order(lens).efl_mm,
         glare_total_fraction=np.array([band.tis for band in bands]),
     )
+
+
+def scattered_fraction(
+    lens: Prescription,
+    wavelength_nm: ArrayLike,
+    *,
+    roughness_nm: float = ROUGHNESS_NM,
+    cleanliness_level: float = 0.0,
+    L: float = KNEE,
+    S: float = SLOPE,
+) -> F64:
+    """Return the fraction of the light passing a lens that its surfaces scatter, 1 - exp(-Σ TIS), float64[band].
+    Parameters as in `veiling_glare`."""
+    single = np.array(
+        [
+            _surfaces(lens, float(nm), roughness_nm, cleanliness_level, L, S).tis
+            for nm in np.atleast_1d(_check("wavelength_nm", wavelength_nm, *RANGE_NM))
+        ]
+    )
+    return np.asarray(-np.expm1(-single))
 
 
 def point_source_transmittance(

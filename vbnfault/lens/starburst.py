@@ -30,6 +30,7 @@ some spikes come out too wide by up to 1 / cos θ_sun, and too faint, for the sa
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
 from typing import Any
@@ -40,6 +41,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..errors import InputError
 from .first_order import first_order
 from .prescription import Prescription, Surface
+from .thin import beyond_frame
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -61,6 +63,7 @@ _HAT_POINTS = 17  # of either side
 _HANKEL_POINTS = 4096
 _DISC_POINTS = 32
 _GRAIN_POINTS = 2048
+_OUTER_STEPS = 16  # of the table's angles that are taken together outside of the frame
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -250,6 +253,34 @@ class Starburst:
                     for layer, share in zip(layers[1:], rest, strict=True):
                         cv2.scaleAdd(layer, float(share), band, dst=band)
         return out
+
+    def beyond_mm2(
+        self,
+        sun_xy_mm: ArrayLike,
+        wavelength_nm: F64,
+        shape: tuple[int, int],
+        pitch_mm: float,
+        *,
+        half_width_nm: float | None = None,
+    ) -> F64:
+        """Return the flux on the unbounded sensor plane outside of the frame, over the Sun's irradiance at the
+        entrance and for a transmission of 1, float64[band] in mm². Parameters as in `image`."""
+        wavelength_nm = np.atleast_1d(np.asarray(wavelength_nm, dtype=np.float64))
+        tables, mix = self._tables(wavelength_nm, pitch_mm, half_width_nm)
+        sine = self._sines(pitch_mm)
+        slope = np.asarray(sun_xy_mm, dtype=np.float64) / self.efl_mm
+        half = self.angles // math.gcd(self.angles, _OUTER_STEPS)
+        # means over steps of the angle: spikes are narrower than these, but not so the frame
+        means = tables[..., :-1].reshape(len(tables), len(sine), half, -1).mean(axis=-1, dtype=np.float64)
+        angle = (np.arange(2 * half) + 0.5) * np.pi / half
+        half_slope = (shape[1] / 2 * pitch_mm / self.efl_mm, shape[0] / 2 * pitch_mm / self.efl_mm)
+        missing = beyond_frame(slope, sine, angle, half_slope)
+        missing_half = (missing[:, :half].astype(np.float64) + missing[:, half:]) * (np.pi / half)
+        per_radius = np.einsum("tra,ra->tr", means, missing_half) / (sine**2 - self.sun_radius_rad**2)
+        flux = np.trapezoid(per_radius * sine**2, x=np.log(sine), axis=1)
+        # within the nearest radius the image is constant
+        flux += per_radius[:, 0] * sine[0] ** 2 / 2
+        return np.asarray(mix @ flux / np.sqrt(1 + slope @ slope))
 
     def _sines(self, pitch_mm: float) -> F64:
         """Rows of the table: |u - u_sun|, float64[radius]."""

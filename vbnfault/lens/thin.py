@@ -1,12 +1,29 @@
-"""The ideal thin lens: a rectilinear image, no distortion, no ghosts, finite depth of field."""
+"""The ideal thin lens: a rectilinear image, no distortion, no ghosts, finite depth of field.
+
+The nominal camera of the paper has no cos⁴: an extended scene gets the irradiance π T L / (4 N²) at every field
+angle, and natural vignetting is a fault of its own. The Sun is a source of known flux, though, and a pupil of the
+area A admits E☉ A cos θ of it. The Sun's direct image therefore follows the pupil,
+
+    ∫ E dA = E☉ · T · A · cos θ        at every angle θ,
+
+which is cos⁴θ times what the scene's rule would give, since the image of a disc far off the axis covers 1 / cos³θ
+of its area on the axis. Ghosts, starburst and veiling glare are fractions of the same flux. All of them have met
+the pupil, so that vignetting, which adds the cos⁴ to the scene, does not dim them a second time
+(`quantities.Electrons.past_rims`).
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from ..quantities import Irradiance, Radiance
+
+F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,6 +51,14 @@ class ThinLens:
         """Radius of the entrance pupil, f / 2N, in metres."""
         return self.focal_length_mm * 1e-3 / (2 * self.f_number)
 
+    def transmittance(self, wavelength_nm: F64) -> F64:
+        """Return the fraction of the light that the lens transmits, float64[band]: the same at every wavelength."""
+        return np.full(len(wavelength_nm), float(self.transmission))
+
+    def pupil_area_mm2(self, slope: ArrayLike) -> F64:
+        """Return the area of the beam that passes the pupil, π (f / 2N)², for any tangent of the field angle."""
+        return np.full(np.shape(slope), np.pi * (self.focal_length_mm / (2 * self.f_number)) ** 2)
+
     def image(self, radiance: Radiance) -> Irradiance:
         """Irradiance on the sensor plane, E = π T L / (4 N²), per band.
 
@@ -42,3 +67,56 @@ class ThinLens:
         """
         factor = np.float32(np.pi * self.transmission / (4 * self.f_number**2))
         return Irradiance(array=radiance.array * factor, wavelength_nm=radiance.wavelength_nm)
+
+    def image_of_sun(self, radiance: Radiance, pixel_pitch_um: float) -> Irradiance:
+        """Return the irradiance of the Sun's direct image, π T L cos⁴θ / (4 N²), per band.
+
+        Its power is E☉ T A cos θ at every field angle: what the pupil admits.
+        """
+        found = self.image(radiance)
+        shape = found.array.shape[1:]
+        cos4 = cos4_map((int(shape[0]), int(shape[1])), self.focal_length_mm * 1e3 / pixel_pitch_um)
+        return Irradiance(array=found.array * cos4, wavelength_nm=radiance.wavelength_nm)
+
+
+# --- a rectilinear frame -----------------------------------------------------------------------------------------
+
+
+@lru_cache(maxsize=2)
+def cos4_map(shape: tuple[int, int], focal_length_px: float) -> F32:
+    """cos⁴ of the off-axis angle of every pixel's centre, float32[y, x] in (0, 1], read-only."""
+    height, width = shape
+    x2 = ((np.arange(width) + 0.5 - width / 2) / focal_length_px) ** 2
+    y2 = ((np.arange(height) + 0.5 - height / 2) / focal_length_px) ** 2
+    cos2 = 1 / (1 + x2[None, :] + y2[:, None])
+    out = (cos2 * cos2).astype(np.float32)
+    out.flags.writeable = False
+    return out
+
+
+def beyond_frame(
+    sun_slope: ArrayLike, sine: F64, angle_rad: F64, half_slope: tuple[float, float]
+) -> NDArray[np.bool_]:
+    """Return which directions at a distance from the Sun come from in front of the lens but miss the frame.
+
+    Parameters
+    ----------
+    sun_slope
+        float64[2], tangents of the Sun's direction along x and y.
+    sine, angle_rad
+        float64[radius] and float64[angle]: polar coordinates of directions about the Sun, as direction cosines.
+    half_slope
+        Tangents at the frame's right and lower edges.
+
+    Returns
+    -------
+    bool[radius, angle]
+    """
+    sun = np.asarray(sun_slope, dtype=np.float64)
+    sun = sun / np.sqrt(1 + sun @ sun)
+    u = sun[0] + sine[:, None] * np.cos(angle_rad)
+    v = sun[1] + sine[:, None] * np.sin(angle_rad)
+    cos2 = 1 - u * u - v * v
+    forward = cos2 > 0
+    inside = (u * u <= half_slope[0] ** 2 * cos2) & (v * v <= half_slope[1] ** 2 * cos2)
+    return np.asarray(forward & ~inside)

@@ -43,10 +43,11 @@ def direct(
     """
     view = scene.view
     wanted = Pixels(view.width_px * view.height_px) if pixels is None else Pixels(len(pixels), listed=pixels)
-    out, halves = _Direct(surface, scene).image(wanted, weights)
+    out, sun, halves = _Direct(surface, scene).image(wanted, weights)
     shape = (view.height_px, view.width_px) if pixels is None else (1, len(pixels))
-    array = out.reshape(len(scene.wavelength_nm), *shape)
-    return Radiance(array=array, wavelength_nm=scene.wavelength_nm), halves.reshape(shape)
+    array, disc = (None if a is None else a.reshape(len(scene.wavelength_nm), *shape) for a in (out, sun))
+    assert array is not None
+    return Radiance(array=array, wavelength_nm=scene.wavelength_nm, sun=disc), halves.reshape(shape)
 
 
 class Light:
@@ -89,16 +90,19 @@ class _Direct(Light):
         else:
             self.weights = self.limb.weights * (model.weights[0] * sun.irradiance_W_m2_nm)
         self.sun_in_view = _may_see(scene.view, sun)
+        self.first_of_sun = len(self.weights)  # of the terms
         if self.sun_in_view:
             self.weights = np.vstack([self.weights, self.limb.weights * sun.radiance_W_m2_sr_nm])
 
     def image(
         self, pixels: Pixels, signal: NDArray[np.float64] | None
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """float32[band, pixel], and float32[pixel]: half the difference of the samples' halves, as a signal."""
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32] | None, NDArray[np.float32]]:
+        """float32[band, pixel]; of it the Sun's disc, float32[band, pixel], None where no sample sees it; and
+        float32[pixel]: half the difference of the samples' halves, as a signal."""
         spp = self.scene.samples_per_pixel
         weights = (self.weights / spp).astype(np.float32)
         out = np.zeros((weights.shape[1], pixels.count), dtype=np.float32)
+        sun: NDArray[np.float32] | None = None
         halves = np.zeros(pixels.count, dtype=np.float32)
         done = 0
         for part in pixels.parts(max(1, WAVEFRONT // (spp * len(weights)))):
@@ -115,15 +119,20 @@ class _Direct(Light):
             dr.eval(*sums)
             span = slice(done, done + part.count)
             done += part.count
-            for row, total in zip(weights, sums, strict=False):
+            for k, (row, total) in enumerate(zip(weights, sums, strict=False)):
                 values = total.numpy()
                 if not values.any():
                     continue
+                if k >= self.first_of_sun and sun is None:
+                    sun = np.zeros_like(out)
                 for band in np.flatnonzero(row):
-                    out[band, span] += values * row[band]
+                    light = values * row[band]
+                    out[band, span] += light
+                    if sun is not None and k >= self.first_of_sun:
+                        sun[band, span] += light
             if signal is not None:
                 halves[span] = sums[-1].numpy()
-        return out, halves
+        return out, sun, halves
 
     def terms(self, strata: Strata) -> list[Any]:
         rays = self.optics.camera_rays(strata)

@@ -30,7 +30,7 @@ from .check import (
     verify,
 )
 from .codec import Encoded, encode, mask_union
-from .counts import FaultCounts
+from .counts import FaultCounts, split_name
 from .group import Store, create, is_store, open_store, write_samples
 from .metadata import append_samples, recover
 from .schema import (
@@ -80,6 +80,7 @@ __all__ = [
     "open_store",
     "problem_samples",
     "recover",
+    "split_name",
     "unplanned_samples",
     "verify",
     "write_samples",
