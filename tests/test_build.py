@@ -26,6 +26,7 @@ import victim
 from test_store import fake_sample, flip, make_spec
 
 from vbnfault import build as bd
+from vbnfault import stages
 from vbnfault import store as st
 from vbnfault.errors import InputError, VbnfaultError
 from vbnfault.jobs import dask, lock, progress, tasks
@@ -48,6 +49,7 @@ class Session:
     dies: frozenset[int] = frozenset()
     dies_once: str = ""  # a file that is made at the first death
     log: str = ""
+    stage: str = ""  # told before every sample
 
     def __call__(self) -> Session:
         return self
@@ -56,6 +58,8 @@ class Session:
         if self.log:
             with open(self.log, "a") as log:
                 log.write(f"{os.getpid()} {index}\n")
+        if self.stage:
+            stages.begin(f"{self.stage} {index}")
         if index in self.raises:
             raise KeyError(f"no terrain for {index}")
         if index in self.dies and not (self.dies_once and Path(self.dies_once).exists()):
@@ -85,13 +89,15 @@ def reference(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
     summary = run(out)
     assert (summary.built, summary.finished, summary.shards, summary.sites) == (SAMPLES, 0, 5, 3)
     assert st.verify(out) == []
+    assert summary.digest == st.digest(out)
     return out, st.digest(out)
 
 
 def test_two_workers_make_the_same_bits_and_share_the_work(reference: tuple[Path, str], tmp_path: Path) -> None:
     log = tmp_path / "log"
-    run(tmp_path / "s.zarr", Session(log=str(log)), workers=2, recycle_shards=2)
+    summary = run(tmp_path / "s.zarr", Session(log=str(log)), workers=2, recycle_shards=2)
     assert st.digest(tmp_path / "s.zarr") == reference[1]
+    assert summary.digest == reference[1]
     calls = [line.split() for line in log.read_text().splitlines()]
     assert sorted(int(i) for _, i in calls) == list(range(SAMPLES))
     # 5 shards by processes that end after 2 each: at least 3 processes, none of them this one
@@ -120,7 +126,8 @@ def test_damage_is_repaired_by_building_exactly_the_samples_concerned(
     del chunks[9]
     store.file("clean", 2).write_bytes(codec.join_shard({i - 8: c for i, c in chunks.items()}, 4))
     (out / "image" / "c" / "0.1f.partial").write_bytes(b"half")
-    assert run(out, Session(log=str(log))).built == 6
+    summary = run(out, Session(log=str(log)))
+    assert (summary.built, summary.digest) == (6, reference[1])  # of samples kept and samples made again
     assert sorted(int(line.split()[1]) for line in log.read_text().splitlines()) == [4, 9, 12, 13, 14, 15]
     assert st.verify(out) == []
     assert st.digest(out) == reference[1]
@@ -310,7 +317,49 @@ def test_dry_run_touches_nothing(tmp_path: Path) -> None:
     summary = run(tmp_path / "s.zarr", dry_run=True, fault_counts={"straylight": 9})
     assert not (tmp_path / "s.zarr").exists()
     assert summary.lines()[0].startswith(f"{tmp_path / 's.zarr'}: 18 samples at 3 sites in 5 shards, about ")
-    assert summary.lines()[1] == "faults: straylight 9"
+    assert summary.lines()[1] == "planned faults: straylight 9"
+    summary = run(tmp_path / "s.zarr", dry_run=True, estimated_seconds=7200.0)
+    assert summary.lines()[1].startswith("estimated time: 2.0 h, ")
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_the_work_is_announced_and_stages_are_named(
+    workers: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Samples, sites, bytes and time come first; a stage of any process is a line where there is no terminal."""
+    session = Session(stage="terrain of site", raises=frozenset({5}))
+    options = {"workers": workers, "progress": True, "estimated_seconds": 90.0, "samples": 8}
+    with pytest.raises(bd.BuildFailed):
+        run(tmp_path / "s.zarr", session, **options)
+    lines = capsys.readouterr().err.splitlines()
+    assert lines[0].startswith(f"{tmp_path / 's.zarr'}: 8 samples at 3 sites in 2 shards, about ")
+    assert lines[1].startswith("estimated time: 90 s, ")
+    assert sorted(line for line in lines if line.startswith("terrain")) == [
+        f"terrain of site {i}" for i in range(8)
+    ]
+    # what is left of the time is that of the samples left
+    with pytest.raises(bd.BuildFailed):
+        run(tmp_path / "s.zarr", session, **options)
+    lines = capsys.readouterr().err.splitlines()
+    assert lines[1].startswith("estimated time: 11 s, ")
+    assert [line for line in lines if line.startswith("terrain")] == ["terrain of site 5"]
+
+
+def test_the_summary_counts_what_is_in_the_store(tmp_path: Path) -> None:
+    """A fault that is planned and not injected is not counted as realised: 49 planned, 44 realised."""
+    injected = np.array([fake_sample(make_spec(), i).scalars["injected"] for i in range(SAMPLES)])
+    planned = injected.copy()
+    i, off = (int(n[0]) for n in np.nonzero(~planned))
+    planned[i, off] = True
+    summary = run(tmp_path / "s.zarr", planned_faults=planned)
+    assert summary.counts is not None
+    faults = make_spec().faults
+    assert [summary.counts.realised(f) for f in faults] == injected.sum(axis=0).tolist()
+    assert [summary.counts.planned(f) for f in faults] == planned.sum(axis=0).tolist()
+    assert summary.counts.missing == {faults[off]: 1}
+    said = "\n".join(summary.lines())
+    assert f"planned, but without effect and not injected: {faults[off]} 1" in said
+    assert f"digest {st.digest(tmp_path / 's.zarr')}" in said
 
 
 def test_too_little_room_is_said_before_the_first_sample(
@@ -440,12 +489,15 @@ def test_progress_without_a_terminal_is_plain_lines(
     monkeypatch.setattr(progress, "_SECONDS_BETWEEN_LINES", 0.0)
     run(tmp_path / "s.zarr", Session(), progress=True)
     lines = capsys.readouterr().err.splitlines()
+    assert re.match(r".*: 18 samples at 3 sites in 5 shards, about .* free; 0 of them", lines.pop(0))
     assert len(lines) >= SAMPLES
     assert all(re.fullmatch(r"\d+/18 samples, [\d.]+ samples/s, \d+ s left", line) for line in lines), lines
 
 
 @pytest.mark.filterwarnings("default")
-def test_a_dask_cluster_makes_the_same_bits(reference: tuple[Path, str], tmp_path: Path) -> None:
+def test_a_dask_cluster_makes_the_same_bits(
+    reference: tuple[Path, str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     distributed = pytest.importorskip("distributed")
     out = tmp_path / "s.zarr"
     with distributed.LocalCluster(
@@ -453,9 +505,11 @@ def test_a_dask_cluster_makes_the_same_bits(reference: tuple[Path, str], tmp_pat
     ) as cluster:
         with pytest.raises(bd.BuildFailed, match=r"sample 5 failed.*KeyError"):
             run(out, Session(raises=frozenset({5})), scheduler=cluster.scheduler_address)
-        assert run(out, scheduler=cluster.scheduler_address).built == 1
+        summary = run(out, Session(stage="terrain of"), scheduler=cluster.scheduler_address, progress=True)
+        assert (summary.built, summary.digest) == (1, reference[1])
         with pytest.raises(VbnfaultError, match="no such mesh"):
             run(tmp_path / "t.zarr", Broken(), scheduler=cluster.scheduler_address)
+    assert capsys.readouterr().err.splitlines().count("terrain of 5") == 1
     assert st.digest(out) == reference[1]
 
 

@@ -66,6 +66,13 @@ def built(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
         command("build", scene, "--out", out, "--threads", 2), env=ENVIRONMENT, capture_output=True, text=True
     )
     assert done.returncode == 0, done.stderr
+    said = done.stderr.splitlines()
+    assert said[0].startswith(f"{out}: 16 samples at 4 sites in 4 shards, about ")
+    assert any(line.startswith("estimated time: ") for line in said)
+    for stage in ("shape of the body", "compiling of kernels, with the first sample"):
+        assert said.count(stage) == 1
+    assert {f"terrain of site {k} (new patch)" for k in range(4)} <= set(said)
+    assert done.stdout.splitlines()[-1] == f"digest {store.digest(out)}"
     return out
 
 
@@ -80,7 +87,9 @@ def test_a_build_is_whole_and_labelled(
     opened = store.open_store(built)
     injected = opened.read("injected")
     rows = {line.split()[0]: line.split() for line in said.out.splitlines() if line}
+    proposals = [json.loads(str(text))["injected"] for text in opened.read("proposal")]
     for k, fault in enumerate(opened.spec.faults):
+        assert int(rows[fault][1]) == sum(fault in names for names in proposals)
         assert int(rows[fault][2]) == injected[:, k].sum()
     assert run(monkeypatch, "digest", built) == 0
     digest = capsys.readouterr().out.strip()

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from . import store as store_module
 from .errors import InputError, VbnfaultError
@@ -30,7 +30,7 @@ from .jobs.lock import locked
 from .jobs.processes import Pool
 from .jobs.progress import Progress, duration_text, size_text
 from .jobs.tasks import Run, Session, SessionFactory, run_here
-from .store import Store, StoreSpec
+from .store import FaultCounts, Store, StoreSpec
 
 __all__ = [
     "RECYCLE_SHARDS",
@@ -48,7 +48,10 @@ RECYCLE_SHARDS = 32  # a worker process is replaced after so many: long LLVM run
 
 @dataclass(frozen=True, kw_only=True)
 class Summary:
-    """What a build would do, or did. `finished` samples were there before; `built` ones were made now."""
+    """What a build would do, or did. `finished` samples were there before; `built` ones were made now.
+
+    `estimated_seconds`: of the whole work, None where unknown. `counts` and `digest`: of the store at the end.
+    """
 
     path: Path
     samples: int
@@ -61,18 +64,36 @@ class Summary:
     optics: str = ""
     built: int = 0
     seconds: float = 0.0
+    estimated_seconds: float | None = None
+    counts: FaultCounts | None = None
+    digest: str | None = None
 
-    def lines(self) -> list[str]:
-        """The summary in words."""
+    def outlook(self) -> list[str]:
+        """What there is to do, in words."""
         head = f"{self.path}: {self.samples} samples at {self.sites} sites in {self.shards} shards"
         size = f"about {size_text(self.estimated_bytes)}, {size_text(self.free_bytes)} free"
         lines = [f"{head}, {size}; {self.finished} of them were finished before"]
         if self.optics:
             lines.append(f"lens: {self.optics}")
+        if self.estimated_seconds is not None and self.finished < self.samples:
+            left = self.estimated_seconds * (self.samples - self.finished) / self.samples
+            lines.append(f"estimated time: {duration_text(left)}, which the progress corrects as samples get done")
         if self.fault_counts:
-            lines.append("faults: " + ", ".join(f"{k} {v}" for k, v in self.fault_counts.items()))
+            lines.append("planned faults: " + ", ".join(f"{k} {v}" for k, v in self.fault_counts.items()))
+        return lines
+
+    def lines(self) -> list[str]:
+        """The summary in words: of what was done, or else of what there is to do."""
+        if self.counts is None:
+            return self.outlook()
+        lines = [f"{self.path}: {self.samples} samples, {self.finished} of them finished before"]
         if self.built:
             lines.append(f"{self.built} samples built in {duration_text(self.seconds)}")
+        lines += self.counts.lines()
+        if self.counts.missing:
+            lines.append(self.counts.missing_text())
+        if self.digest is not None:
+            lines.append(f"digest {self.digest}")
         return lines
 
 
@@ -117,6 +138,8 @@ def build(
     dry_run: bool = False,
     progress: bool = True,
     fault_counts: Mapping[str, int] | None = None,
+    planned_faults: NDArray[np.bool_] | None = None,
+    estimated_seconds: float | None = None,
     expected: store_module.Planned | None = None,
     exact: bool = False,
     recycle_shards: int = RECYCLE_SHARDS,
@@ -127,6 +150,7 @@ def build(
     blocks. `blocks`: from `planned_blocks`; one block by default. `workers` processes on this machine (1: in
     this process), each with `threads` threads (an equal share of the cores by default; VBNFAULT_THREADS and
     OMP_NUM_THREADS in its environment), or the Dask cluster at `scheduler`, whose workers must see `out`.
+    `planned_faults` bool[sample, fault] are counted beside those injected; `estimated_seconds` is announced.
     `expected` and `exact`: as of `store.examine`; finished samples that are not as planned are built again.
 
     Raises InputError where `out` holds another scene or nothing answers at `scheduler`, BuildFailed where
@@ -155,6 +179,7 @@ def build(
             estimated_bytes=spec.estimated_sample_bytes * len(sites),
             free_bytes=_free_bytes(path),
             fault_counts=dict(fault_counts or {}),
+            estimated_seconds=estimated_seconds,
             optics=spec.attributes.get("optics", {}).get("summary", ""),
         )
 
@@ -178,6 +203,8 @@ def build(
                     store = store_module.append_samples(store, added, {"blocks": list(blocks)})
                 run = Run(store, sites, Progress(len(sites), shown=progress), expected, exact=exact)
                 with run.progress:
+                    for line in summary.outlook():
+                        run.progress.say(line)
                     if scheduler is not None:
                         run_on_dask(session_factory, run, scheduler)
                     elif workers == 1:
@@ -193,7 +220,15 @@ def build(
                 exit_code(stop),
             ) from stop
         run.raise_failures()
-    return Summary(**{**vars(summary), "built": run.built, "seconds": time.monotonic() - began})
+        store = store_module.open_store(path)
+        results = {
+            "built": run.built,
+            "seconds": time.monotonic() - began,
+            "counts": store_module.count_faults(store, planned_faults),
+            # every sample was read or made just now, so nothing has to be read again
+            "digest": run.digests.of(store) if run.digests.complete else None,
+        }
+    return Summary(**{**vars(summary), **results})
 
 
 def _with_attributes(spec: StoreSpec, blocks: tuple[int, ...]) -> StoreSpec:

@@ -171,8 +171,7 @@ def verify(store: StoreArgument) -> None:
         typer.echo(f"vbnfault: {store}: {many}; the build command mends them", err=True)
         raise typer.Exit(1)
     if report.counts.missing:
-        few = ", ".join(f"{name} {count}" for name, count in report.counts.missing.items())
-        typer.echo(f"planned, but without effect and not injected: {few}")
+        typer.echo(report.counts.missing_text())
     typer.echo(f"{store}: {opened.samples} samples, whole, labelled and as planned")
     typer.echo(f"digest {report.digest}")
 

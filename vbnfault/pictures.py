@@ -207,13 +207,11 @@ def _read_out(frame: Frame, picture: RGBI, drawn: Mapping[str, Params]) -> RGBI:
 
 def _invisible(frame: Frame, noise: Any) -> list[str]:
     """Drawn faults without any effect on the noise-free picture."""
-    doubtful = sorted(_doubtful(frame, noise))
-    invisible = [n for n in doubtful if not (_shows_on_some_rows(frame, n) or effect_of(frame, n).any())]
-    if not invisible and "mask_effect" in frame.spec.scene.dataset.layers:
-        # what will be stored has the last word
+    if "mask_effect" in frame.spec.scene.dataset.layers:  # all effects are stored, so no cheaper look is needed
         frame.effects = {name: effect_of(frame, name) for name in frame.drawn}
-        invisible = [name for name, effect in frame.effects.items() if not effect.any()]
-    return invisible
+        return [name for name, effect in frame.effects.items() if not effect.any()]
+    doubtful = sorted(_doubtful(frame, noise))
+    return [n for n in doubtful if not (_shows_on_some_rows(frame, n) or effect_of(frame, n).any())]
 
 
 def _shows_on_some_rows(frame: Frame, name: str) -> bool:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from . import config, plan, world
+from . import config, plan, stages, world
 from .body import Body, Patch, Site, Sites, cached_patch, choose_sites
 from .body.refine import GROWTH_POWER
 from .camera import Camera
@@ -115,6 +115,7 @@ class Session:
         self.plan = plan.make_plan(scene, list(self.faults), blocks)
         self._threads = threads
         self._terrain: Terrain | None = None
+        self._compiled = False  # kernels are made for the first sample
 
     @cached_property
     def base_camera(self) -> Camera:
@@ -124,6 +125,7 @@ class Session:
     @cached_property
     def body(self) -> Body:
         """The body, loaded when first asked for."""
+        stages.begin("shape of the body")
         return world.make_body(self.scene)
 
     @cached_property
@@ -146,7 +148,9 @@ class Session:
             if self._threads is not None:
                 render.set_threads(self._threads)
             self._terrain = None  # let go of the old one first: two do not fit a small machine
+            stages.begin(f"terrain of site {site}")
             patch = self.patch(self.sites[site])
+            stages.begin(f"terrain of site {site} (search tree)")
             surface = self.surface(patch)
             self._terrain = Terrain(body=self.body, site=patch.site, surface=surface, vehicle=self.vehicle)
         return self._terrain
@@ -206,7 +210,12 @@ class Session:
 
     def simulate(self, index: int) -> Sample:
         """One finished sample."""
-        return simulate(self.spec(index))
+        spec = self.spec(index)
+        if not self._compiled:
+            stages.begin("compiling of kernels, with the first sample")
+        sample = simulate(spec)
+        self._compiled = True
+        return sample
 
     def frame(self, index: int) -> Frame:
         """One sample with all that lies between radiance and labels."""

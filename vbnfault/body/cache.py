@@ -25,6 +25,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from vbnfault import stages
 from vbnfault.body.patch import Patch, build_patch
 from vbnfault.body.sites import Site
 from vbnfault.errors import InputError
@@ -72,16 +73,21 @@ def cached_patch(body: Body, site: Site, **parameters: Any) -> Patch:
     """
     limit = cache_limit_bytes()
     if limit == 0:
-        return build_patch(body, site, **parameters)
+        return _new_patch(body, site, parameters)
     try:
         path = cache_folder() / f"patch-{patch_key(body, site, **parameters)}.npz"
     except (RuntimeError, OSError):  # no home folder
-        return build_patch(body, site, **parameters)
+        return _new_patch(body, site, parameters)
     patch = _read(path, site)
     if patch is None:
-        patch = build_patch(body, site, **parameters)
+        patch = _new_patch(body, site, parameters)
         _write(path, patch, limit)
     return patch
+
+
+def _new_patch(body: Body, site: Site, parameters: dict[str, Any]) -> Patch:
+    stages.begin(f"terrain of site {site.index} (new patch)")
+    return build_patch(body, site, **parameters)
 
 
 def patch_key(body: Body, site: Site, **parameters: Any) -> str:

@@ -6,6 +6,7 @@ import asyncio
 import pickle
 import socket
 import threading
+import uuid
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -24,16 +25,29 @@ _cluster_lock = threading.Lock()
 _cluster_session: dict[bytes, Lazy] = {}
 
 
-def _work_on_cluster(pickled: bytes, path: Path, task: Task) -> list[tuple[int, str, Any]]:
-    """A task on a Dask worker. Its threads share one session and take turns."""
+def _work_on_cluster(pickled: bytes, path: Path, task: Task, topic: str) -> list[tuple[int, str, Any]]:
+    """A task on a Dask worker. Its threads share one session and take turns.
+
+    Stages are told at once, under `topic` of the cluster's log; the other events are returned.
+    """
+    import distributed
+
     events: list[tuple[int, str, Any]] = []
+    worker = distributed.get_worker()
+
+    def tick(sample: int, what: str, text: str) -> None:
+        if what == "stage":
+            worker.log_event(topic, text)
+        else:
+            events.append((sample, what, text))
+
     with _cluster_lock:
         if pickled not in _cluster_session:
             _cluster_session.clear()
             _cluster_session[pickled] = Lazy(pickle.loads(pickled))
         session = _cluster_session[pickled]
         try:
-            work(session.simulate, store_module.open_store(path, "r+"), task, lambda *e: events.append(e))
+            work(session.simulate, store_module.open_store(path, "r+"), task, tick)
         except Fatal as fatal:
             events.append((-1, "fatal", fatal.error))
         except VbnfaultError as error:
@@ -93,13 +107,17 @@ def run_on_dask(factory: SessionFactory, run: Run, scheduler: str) -> None:
     except (OSError, ValueError) as error:
         raise VbnfaultError(f"--scheduler {scheduler}: cannot connect: {error}") from error
     path, pickled = run.store.path.absolute(), pickle.dumps(factory)
+    topic = f"vbnfault-{uuid.uuid4().hex}"
     with client:
+        client.subscribe_topic(topic, lambda event: run.progress.stage(str(event[1])))
         futures: dict[Any, int] = {}
         shard = run.next_shard()
         while shard is not None:
             task = run.task(shard)
             priority = -len(futures)  # in the order of the sites
-            futures[client.submit(_work_on_cluster, pickled, path, task, pure=False, priority=priority)] = shard
+            futures[client.submit(_work_on_cluster, pickled, path, task, topic, pure=False, priority=priority)] = (
+                shard
+            )
             shard = run.next_shard(shard)
         try:
             for future in distributed.as_completed(list(futures), loop=client.loop):

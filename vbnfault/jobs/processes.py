@@ -200,7 +200,7 @@ class Pool:
         if what == "finished":
             self._next(worker, worker.shard)
         else:
-            worker.sample = sample if what == "begun" else None
+            worker.sample = sample if what in ("begun", "stage") else None
             self._run.tick(sample, what, payload)
 
     def _mourn(self, worker: _Process) -> None:

@@ -23,7 +23,7 @@ def duration_text(seconds: float) -> str:
 
 
 class Progress:
-    """Samples done, rate and time left: a bar on a terminal, a line every few seconds elsewhere."""
+    """Samples done, rate and time left, and the stage at work: a bar on a terminal, plain lines elsewhere."""
 
     def __init__(self, total: int, *, shown: bool) -> None:
         self._total, self._shown = total, shown
@@ -73,6 +73,13 @@ class Progress:
         elif self._shown and time.monotonic() - self._last_line > _SECONDS_BETWEEN_LINES:
             self._last_line = time.monotonic()
             print(self._line(), file=sys.stderr, flush=True)
+
+    def stage(self, text: str) -> None:
+        """A stage that may take seconds begins: beside the bar's rate until the next sample is done, or a line."""
+        if self._bar is not None:
+            self._bar.update(self._task, description=f"{self._pace()}; {text}")
+        else:
+            self.say(text)
 
     def say(self, text: str) -> None:
         """A line beside the bar."""

@@ -4,6 +4,7 @@ site's terrain once.
 
 from __future__ import annotations
 
+import functools
 import heapq
 import traceback
 from collections import Counter, deque
@@ -15,11 +16,12 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from .. import stages
 from .. import store as store_module
 from ..errors import VbnfaultError
 from ..interrupts import finishing
 from ..quantities import Sample
-from ..store import Encoded, Planned, Store
+from ..store import Encoded, Planned, SampleDigests, Store
 from .errors import BuildFailed
 from .progress import Progress
 
@@ -37,7 +39,8 @@ class Session(Protocol):
 SessionFactory = Callable[[], Session]
 
 
-# sample; "kept", "begun", "built" or "failed"; where it failed one line, then the traceback
+# sample; what: "begun", "stage", "kept", "built" or "failed"; text: of a stage its name, of a sample that is kept
+# or built its digest (hex), of one that failed a line and then the traceback
 Tick = Callable[[int, str, str], None]
 
 
@@ -59,7 +62,8 @@ def work(simulate: Callable[[int], Sample], store: Store, task: Task, tick: Tick
     What was made is written also where an interrupt ends the task early, but not where `tick` finds that
     nobody listens any more: another build may have begun.
     """
-    wanted = store_module.examine_shard(store, task.shard, labels=True).wanted | task.unplanned
+    checked = store_module.examine_shard(store, task.shard, labels=True)
+    wanted = checked.wanted | task.unplanned
     samples = store.shard(task.shard)
     made: dict[int, Encoded] = {}
     pending = set(wanted)
@@ -72,17 +76,19 @@ def work(simulate: Callable[[int], Sample], store: Store, task: Task, tick: Tick
     try:
         for i in samples:
             if i not in wanted:
-                tick(i, "kept", "")
+                tick(i, "kept", checked.digests[i].hex())
         for i in sorted(wanted - task.skip, key=lambda i: (task.sites[i - samples.start], i)):
             tick(i, "begun", "")
             try:
-                made[i] = store_module.encode(store.spec, simulate(i))
+                with stages.told_to(functools.partial(tick, i, "stage")):
+                    encoded = store_module.encode(store.spec, simulate(i))
             except Exception as error:
                 tick(i, "failed", describe(error))
                 continue
+            made[i] = encoded
             if task.careful:
                 write({i: made.pop(i)})
-            tick(i, "built", "")
+            tick(i, "built", encoded.digest.hex())
     except OSError:
         made.clear()
         raise
@@ -123,6 +129,7 @@ class Run:
         self.store, self.sites, self.progress = store, sites, progress
         self._expected, self._exact = expected, exact
         self.built = 0
+        self.digests = SampleDigests(store.samples)
         self.failures: dict[int, str] = {}
         self._outcome: dict[int, str] = {}
         self._by_site: dict[int, deque[int]] = {}
@@ -175,6 +182,9 @@ class Run:
         """Note what became of a sample. Raises BuildFailed where nothing succeeds."""
         if what == "begun":
             return
+        if what == "stage":
+            self.progress.stage(text)
+            return
         before = self._outcome.get(sample)
         self._outcome[sample] = what
         self.built += (what == "built") - (before == "built")
@@ -183,6 +193,7 @@ class Run:
             self.progress.say(f"sample {sample} failed: {text.splitlines()[0]}")
         else:
             self.failures.pop(sample, None)
+            self.digests.add({sample: bytes.fromhex(text)})
         if before is None:
             self.progress.advance(what == "built")
         if self.built == 0 and len(self.failures) >= _HOPELESS:

@@ -290,6 +290,22 @@ def examine(
     return Report(problems, digests.of(store) if digests.complete else None, counts)
 
 
+def count_faults(store: Store, planned: NDArray[np.bool_] | None = None) -> FaultCounts:
+    """Return how often each fault is injected in the finished samples, beside how often it is planned,
+    bool[sample, fault]; only the arrays `done`, `split` and `injected` are read."""
+    counts = FaultCounts(store.spec.faults)
+    for number in range(store.shards):
+        finished = [i for i, done in store.done(number).items() if done]
+        if not finished:
+            continue
+        start = store.shard(number).start
+        split, injected = store.column("split", number), store.column("injected", number)
+        for i in finished:
+            commanded = None if planned is None else planned[i]
+            counts.add(split_name(split[i - start]), commanded, injected[i - start])
+    return counts
+
+
 def _check_labels(
     spec: StoreSpec, i: int, scalars: Mapping[str, Any], layers: Mapping[str, bytes], crcs: NDArray[np.uint32]
 ) -> Iterator[str]:

@@ -48,6 +48,11 @@ class FaultCounts:
         differences = {f: self.planned(f) - self.realised(f) for f in self.faults}
         return {fault: n for fault, n in differences.items() if n}
 
+    def missing_text(self) -> str:
+        """Return `missing` in words."""
+        few = ", ".join(f"{name} {count}" for name, count in self.missing.items())
+        return f"planned, but without effect and not injected: {few}"
+
     def lines(self) -> list[str]:
         """The table in words, a line a fault class: realised and planned samples, in all and by split."""
         if not self.faults or not self.samples:
