@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from test_light import ball
 from test_render import UP, sun, view
 
-from vbnfault import config, dataset, render, store
+from vbnfault import config, dataset, frames, render, store
 from vbnfault.camera import Camera
 from vbnfault.detector import Detector
 from vbnfault.lens import RealLens, load_lens, scaled_to_field
@@ -31,6 +31,8 @@ def built(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFacto
         camera={"width_px": SIDE_PX, "height_px": SIDE_PX, "detector": "cmv4000", "fov_deg": 70.0},
         body={"photometry": {"model": "mcewen", "phase_slope_mag_deg": 0.047, "dust_contrast": 0.16}},
         render={"samples_per_pixel": 4, "bounces": 1},
+        geometry={"sun_averted": {"reference": "nadir", "roll_deg": [-40, 40], "pitch_deg": [-40, 40]}},
+        plan={"faulty_fraction": 0.5},
         spacecraft={"model": "default"},
     )
     table["camera"]["lens"] = request.param
@@ -79,6 +81,25 @@ def test_points_reproject_through_what_is_stored(built: zarr.Group) -> None:
     assert len(found) > 0.3 * SIDE_PX**2
     assert np.sqrt(np.mean(found**2)) <= 0.02
     assert found.max() <= 0.05
+
+
+def test_roll_and_pitch_count_from_what_their_attribute_names(built: zarr.Group) -> None:
+    references = built["roll_deg"].attrs["reference"]
+    assert references == {"sun-facing": "sun", "sun-averted": "nadir"}
+    assert built["pitch_deg"].attrs["reference"] == built["yaw_deg"].attrs["reference"] == references
+    names = built["stratum"].attrs["flag_meanings"].split()
+    seen = set()
+    for i in range(built["stratum"].shape[0]):
+        stratum = names[built["stratum"][i]]
+        seen.add(stratum)
+        T_from_L = built["T_from_L"][i]
+        sun_L = T_from_L.T @ built["sun_direction_T"][i]
+        reference = sun_L if references[stratum] == "sun" else np.array([0.0, 0.0, 1.0])
+        w, x, y, z = built["camera_from_T"][i]
+        L_from_C = T_from_L.T @ Rotation.from_quat([x, y, z, w]).as_matrix().T
+        angles = (built[name][i] for name in ("roll_deg", "pitch_deg", "yaw_deg"))
+        np.testing.assert_allclose(L_from_C, frames.L_from_C(reference, *angles), atol=1e-9)
+    assert seen == set(names)
 
 
 @pytest.mark.parametrize(

@@ -133,6 +133,7 @@ def store_spec(session: pipeline.Session, blocks: Sequence[int]) -> StoreSpec:
         site_names=tuple(f"site_{k:05d}" for k in range(dataset.sites)),
         lens_names=(camera.lens_name,),
         distortion_residual_px=camera.distortion_residual_px,
+        attitude_references=world.attitude_references(scene),
         detector_names=tuple(f"{camera.detector.name} {k}" for k in range(individuals))
         if individuals > 1
         else (camera.detector.name,),

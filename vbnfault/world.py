@@ -150,6 +150,16 @@ def target_attitude(scene: SceneConfig, sun_T: F64) -> F64:
     return frames.T_from_J_commanded(own, frames.unit(sun_J_au), sun_T)
 
 
+def attitude_references(scene: SceneConfig) -> tuple[str, str]:
+    """Return what attitudes count from in the Sun-facing and the Sun-averted stratum, "sun" or "nadir"."""
+    if scene.spice.spacecraft:  # the attitude is that of the kernels, expressed from the Sun
+        return "sun", "sun"
+    facing, averted = scene.geometry.sun_facing, scene.geometry.sun_averted
+    assert facing is not None
+    assert averted is not None
+    return facing.reference, averted.reference
+
+
 # --- ground -------------------------------------------------------------------------------------------------
 
 

@@ -106,9 +106,9 @@ SCALARS: dict[str, Array] = {
     ),
     "sun_azimuth_deg": Array("sample", "float64", "deg", "Sun azimuth in L, from north towards east"),
     "sun_elevation_deg": Array("sample", "float64", "deg", "Sun elevation in L, up"),
-    "roll_deg": Array("sample", "float64", "deg", "tilt of the boresight from the Sun about x"),
-    "pitch_deg": Array("sample", "float64", "deg", "tilt of the boresight from the Sun about y"),
-    "yaw_deg": Array("sample", "float64", "deg", "turn about the boresight"),
+    "roll_deg": Array("sample", "float64", "deg", "tilt of the boresight from its stratum's reference about x"),
+    "pitch_deg": Array("sample", "float64", "deg", "tilt of the boresight from its stratum's reference about y"),
+    "yaw_deg": Array("sample", "float64", "deg", "turn about the boresight, from that reference"),
     "sun_xy_px": Array("sample xy", "float64", "px", "Sun centre in the image, NaN behind the camera"),
     "sun_visible_fraction": Array("sample", "float64", "1", "part of the solar disc that is not occluded"),
     "exposure_s": Array("sample", "float64", "s", "exposure time"),
@@ -176,7 +176,8 @@ class StoreSpec:
     16, that keeps the largest array of a shard within 1 GiB and all of them within 2 GiB; a larger one is
     lowered to its largest divisor that does. `attributes`: JSON-able root attributes. Raises InputError for
     names that do not exist. `distortion_residual_px`: root mean square and largest deviation of the coefficients
-    of distortion from the lens's own map, over the frame.
+    of distortion from the lens's own map, over the frame. `attitude_references`: the direction that roll, pitch and
+    yaw count from in each of `STRATA`, "sun" or "nadir".
     """
 
     height: int
@@ -192,6 +193,7 @@ class StoreSpec:
     site_names: tuple[str, ...] = ()
     lens_names: tuple[str, ...] = ()
     distortion_residual_px: tuple[float, float] = (0.0, 0.0)
+    attitude_references: tuple[str, ...] = ("sun", "sun")
     detector_names: tuple[str, ...] = ()
     radiance_dtype: str = "float16"
     shard_samples: int = 0
@@ -271,6 +273,10 @@ class StoreSpec:
             "distortion": {
                 "residual_px_rms": self.distortion_residual_px[0],
                 "residual_px_max": self.distortion_residual_px[1],
+            },
+            **{
+                name: {"reference": dict(zip(STRATA, self.attitude_references, strict=True))}
+                for name in ("roll_deg", "pitch_deg", "yaw_deg")
             },
             "detector_individual": {"names": list(self.detector_names)},
             "split": {"names": list(SPLITS)},
