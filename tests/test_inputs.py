@@ -3,24 +3,27 @@
 from __future__ import annotations
 
 import base64
+import dataclasses
 import json
 import os
 import re
 import struct
+import subprocess
+import sys
 import zlib
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args, get_type_hints
 
 import numpy as np
 import pytest
 
-from vbnfault import config, resources, spice
+from vbnfault import cli, config, resources, spice
 from vbnfault.body import load_shape
 from vbnfault.body.shape import signed_volume
 from vbnfault.detector.sensor import load_sensor
 from vbnfault.errors import InputError, VbnfaultError, shown
-from vbnfault.faults import from_dict
+from vbnfault.faults import from_dict, registry
 from vbnfault.lens import load_lens
 from vbnfault.spacecraft import load_spacecraft
 
@@ -349,3 +352,141 @@ def test_a_meta_kernel_that_names_a_pipe_does_not_block(tmp_path: Path) -> None:
     meta.write_text("KPL/MK\n\\begindata\nKERNELS_TO_LOAD = ( '" + str(meta) + "' )\n")  # itself
     with pytest.raises(InputError, match=r"all\.tm: "), spice.kernels(meta):
         pass
+
+
+# ------------------------------------------------------------------------------------ the command line
+
+
+def command(*arguments: str, **more: Any) -> subprocess.CompletedProcess[str]:
+    """The program run with arguments; no traceback whatever happens."""
+    given = [sys.executable, "-m", "vbnfault.cli", *arguments]
+    done = subprocess.run(given, text=True, check=False, **{"capture_output": True, **more})
+    assert "Traceback" not in (done.stderr or ""), done.stderr
+    return done
+
+
+def test_a_full_disk_and_a_lost_folder_are_told_in_a_sentence(tmp_path: Path) -> None:
+    with open("/dev/full", "w") as full:
+        done = command("list", "lenses", capture_output=False, stdout=full, stderr=subprocess.PIPE)
+    assert done.returncode == 1
+    assert done.stderr == "vbnfault: standard output: No space left on device\n"
+    done = command("lens", "tessar_50_f2p8", "--json", "/dev/full", "--out", str(tmp_path / "a.png"))
+    assert done.returncode == 2
+    assert "/dev/full" in done.stderr
+    gone = tmp_path / "gone"
+    gone.mkdir()
+    script = (
+        "import os, sys; from vbnfault.cli import main; os.rmdir(os.getcwd()); sys.argv[1:] = ['list', 'lenses']; "
+    )
+    path = os.pathsep.join([str(Path(resources.__file__).parents[1]), os.environ.get("PYTHONPATH", "")])
+    done = subprocess.run(
+        [sys.executable, "-c", script + "main()"],
+        cwd=gone,
+        env={**os.environ, "PYTHONPATH": path},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 2
+    assert done.stderr == "vbnfault: the working folder does not exist any more; change to another one\n"
+
+
+def numeric_options() -> list[tuple[str, str, Any, set[type]]]:
+    """(command, parameter, its option, its types) of every option that takes a number."""
+    found = []
+    for one in cli.app.registered_commands:
+        for name, hint in get_type_hints(one.callback, include_extras=True).items():
+            kind, option = get_args(hint) if hasattr(hint, "__metadata__") else (hint, None)
+            kinds = {kind, *get_args(kind), *(k for part in get_args(kind) for k in get_args(part))}
+            if {int, float} & kinds:
+                found.append((str(one.callback.__name__), name, option, kinds))
+    assert len(found) > 20
+    return found
+
+
+def test_every_number_of_the_command_line_has_both_limits() -> None:
+    for name, parameter, option, kinds in numeric_options():
+        assert option.min is not None, (name, parameter)
+        assert option.max is not None, (name, parameter)
+        # click finds nan within any limits
+        assert int in kinds or option.callback is cli._finite, (name, parameter)
+
+
+@pytest.mark.parametrize("value", ["nan", "inf", "-inf", "1e400", "361"])
+def test_angles_that_are_none_are_refused(value: str, tmp_path: Path) -> None:
+    arguments = [
+        "flare",
+        "tessar_50_f2p8",
+        "--out",
+        str(tmp_path / "f.png"),
+        "--sun-deg",
+        "10",
+        "--azimuth-deg",
+        value,
+    ]
+    done = command(*arguments, "--pixels", "16")
+    assert done.returncode == 2
+    assert "--azimuth-deg" in done.stderr
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("text", ["abc", "-1", "1.5", "9" * 400, "٣"])
+def test_a_number_of_threads_that_is_none_is_refused(text: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    from vbnfault.store import codec
+
+    monkeypatch.setenv("VBNFAULT_THREADS", text)
+    with pytest.raises(InputError, match=r"VBNFAULT_THREADS = .*: must be a whole number from 0 to 4096"):
+        codec.threads()
+
+
+# ------------------------------------------------------------------------------------ keys and their ranges
+
+
+def numbers_of_faults() -> list[tuple[str, str, dataclasses.Field[Any]]]:
+    """(class, model, field) of every numeric key of every fault."""
+    return [
+        (fault, model, f)
+        for fault, models in registry().items()
+        for model, cls in models.items()
+        for f in dataclasses.fields(cls)
+        if f.metadata["kind"] in ("number", "bounds")
+    ]
+
+
+def test_whole_numbers_beyond_floats_are_refused_in_every_fault_key() -> None:
+    tried = 0
+    for fault, model, f in numbers_of_faults():
+        for value in (10**400, -(10**400), 10**5000, [0, 10**400]):
+            with pytest.raises(InputError, match=rf"faults\.{fault}\.{f.name} = .*: must be one|a .*number"):
+                from_dict(fault, {"model": model, f.name: value}, source="scene.toml")
+            tried += 1
+    assert tried > 400
+
+
+def test_every_number_of_a_scene_has_both_limits() -> None:
+    root = config.SceneConfig.model_json_schema()
+
+    def walk(node: dict[str, Any], at: str) -> None:
+        if "$ref" in node:
+            walk(root["$defs"][node["$ref"].rsplit("/", 1)[-1]], at)
+        if node.get("type") in ("number", "integer"):
+            low, high = ("minimum", "exclusiveMinimum"), ("maximum", "exclusiveMaximum")
+            if not (any(k in node for k in low) and any(k in node for k in high)):
+                without.append(at)
+        for key, value in node.get("properties", {}).items():
+            walk(value, f"{at}.{key}")
+        for value in [*node.get("anyOf", ()), *node.get("allOf", ()), *node.get("prefixItems", ())]:
+            walk(value, at)
+        for key in ("items", "additionalProperties"):
+            if isinstance(node.get(key), dict):
+                walk(node[key], at)
+
+    without: list[str] = []
+    walk(root, "")
+    assert set(without) == {".camera.exposure_s"}  # beside 'auto'; its own check tells the range
+
+
+def test_frames_that_no_memory_holds_are_refused() -> None:
+    table = {"title": "t", "camera": {"width_px": 16384, "height_px": 16384}, "render": {"bands": 64}}
+    with pytest.raises(InputError, match=r"camera\.width_px = 16384, .*render\.bands = 64: .*at most 268435456"):
+        config.parse_scene(table, source="scene.toml")

@@ -7,7 +7,9 @@ mistake never shows a traceback.
 from __future__ import annotations
 
 import contextlib
+import io
 import json
+import math
 import os
 import sys
 import tomllib
@@ -19,7 +21,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from . import __version__, interrupts
-from .errors import InputError, VbnfaultError
+from .errors import InputError, VbnfaultError, shown
 
 if TYPE_CHECKING:
     from .config import SceneConfig
@@ -38,11 +40,24 @@ SetOption = Annotated[
     list[str] | None,
     typer.Option("--set", metavar="KEY=VALUE", help="replace a value of the scene, e.g. body.shape=comet.obj"),
 ]
-SeedOption = Annotated[int | None, typer.Option(min=0, help="replace the scene's seed")]
+MOST_SAMPLES = 10_000_000
+MOST_PROCESSES = 1024
+MOST_SEED = 2**63 - 1
+SeedOption = Annotated[int | None, typer.Option(min=0, max=MOST_SEED, help="replace the scene's seed")]
+
+
+def _finite(value: float | None) -> float | None:
+    """An option's number. `nan` lies within any minimum and maximum to click."""
+    if value is not None and not math.isfinite(value):
+        raise typer.BadParameter(f"{value} is not a finite number")
+    return value
 
 
 def main() -> None:
     """Entry point: turns errors into one sentence and an exit code."""
+    for stream in (sys.stdout, sys.stderr):  # a file's name may have bytes that are no text
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
     warnings.showwarning = lambda message, *_, **__: typer.echo(f"warning: {message}", err=True)
     with interrupts.interruptible():
         try:
@@ -65,6 +80,11 @@ def _exit_code() -> int:
         return error.exit_code
     except typer.Abort:
         raise
+    except OSError as error:  # of what no command expects: a full disk under standard output, a terminal that left
+        return _cannot_write(error)
+    except MemoryError:
+        typer.echo("vbnfault: not enough memory", err=True)
+        return 1
     except Exception as error:
         # click's own usage errors (bad option, missing argument) know how to print themselves
         show = getattr(error, "show", None)
@@ -73,6 +93,15 @@ def _exit_code() -> int:
         show()
         return int(getattr(error, "exit_code", 2))
     return code if isinstance(code, int) else 0
+
+
+def _cannot_write(error: OSError) -> int:
+    """Say that a file, or standard output, cannot be written, and leave no more of the output to be written."""
+    with contextlib.suppress(OSError):
+        typer.echo(f"vbnfault: {error.filename or 'standard output'}: {error.strerror or error}", err=True)
+    with contextlib.suppress(OSError, ValueError):  # else Python itself complains when it ends
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    return 1
 
 
 def _version(show: bool) -> None:
@@ -88,6 +117,10 @@ def _options(
     ] = False,
 ) -> None:
     """Labelled, fault-injected camera images for vision-based navigation near comets."""
+    try:
+        os.getcwd()
+    except OSError:
+        raise InputError("the working folder does not exist any more; change to another one") from None
 
 
 def _overrides(settings: list[str] | None, **named: Any) -> dict[str, Any]:
@@ -95,11 +128,13 @@ def _overrides(settings: list[str] | None, **named: Any) -> dict[str, Any]:
     for setting in settings or ():
         key, equals, text = setting.partition("=")
         if not equals or not key.strip():
-            raise InputError(f"--set {setting}: must be KEY=VALUE, such as body.shape=comet.obj")
+            raise InputError(f"--set {shown(setting)}: must be KEY=VALUE, such as body.shape=comet.obj")
         try:
             values[key.strip()] = tomllib.loads(f"value = {text}")["value"]
         except tomllib.TOMLDecodeError:
             values[key.strip()] = text.strip()  # a bare word or path
+        except (ValueError, RecursionError):  # a number of thousands of digits; lists within lists
+            raise InputError(f"--set {shown(setting)}: the value is out of range or nested too deep") from None
     return values | {key.replace("__", "."): value for key, value in named.items() if value is not None}
 
 
@@ -113,14 +148,19 @@ def _scene(name: str, settings: list[str] | None, **named: Any) -> SceneConfig:
 def build(
     scene: SceneArgument,
     out: Annotated[Path, typer.Option(help="path of the Zarr store to make, or to resume")],
-    samples: Annotated[int | None, typer.Option(min=1, help="number of samples, in place of the scene's")] = None,
+    samples: Annotated[
+        int | None, typer.Option(min=1, max=MOST_SAMPLES, help="number of samples, in place of the scene's")
+    ] = None,
     seed: SeedOption = None,
-    workers: Annotated[int, typer.Option(min=1, help="processes on this machine")] = 1,
+    workers: Annotated[int, typer.Option(min=1, max=MOST_PROCESSES, help="processes on this machine")] = 1,
     threads: Annotated[
-        int | None, typer.Option(min=1, help="render threads a worker; default: the cores shared out")
+        int | None,
+        typer.Option(min=1, max=MOST_PROCESSES, help="render threads a worker; default: the cores shared out"),
     ] = None,
     scheduler: Annotated[str | None, typer.Option(help="address of a Dask scheduler to run on")] = None,
-    append: Annotated[int | None, typer.Option(min=1, help="add a block of M samples to the store")] = None,
+    append: Annotated[
+        int | None, typer.Option(min=1, max=MOST_SAMPLES, help="add a block of M samples to the store")
+    ] = None,
     overwrite: Annotated[bool, typer.Option(help="delete an existing store first")] = False,
     dry_run: Annotated[bool, typer.Option(help="plan and print, render nothing")] = False,
     settings: SetOption = None,
@@ -190,7 +230,7 @@ def digest(store: StoreArgument) -> None:
 def preview(
     store: StoreArgument,
     out: Annotated[Path, typer.Option(help="PNG to write")],
-    samples: Annotated[int, typer.Option(min=1, help="at most this many samples")] = 16,
+    samples: Annotated[int, typer.Option(min=1, max=400, help="at most this many samples")] = 16,
     masks: Annotated[bool, typer.Option(help="overlay the masks")] = True,
 ) -> None:
     """Contact sheet of a store, masks overlaid."""
@@ -204,9 +244,11 @@ def preview(
 def render(
     scene: SceneArgument,
     out: Annotated[Path, typer.Option(help="folder to write to")],
-    sample: Annotated[int, typer.Option(min=0, help="index of the sample")] = 0,
-    samples: Annotated[int | None, typer.Option(min=1, help="number of samples planned")] = None,
-    append: Annotated[list[int] | None, typer.Option(min=1, help="blocks appended to the store, in order")] = None,
+    sample: Annotated[int, typer.Option(min=0, max=100 * MOST_SAMPLES, help="index of the sample")] = 0,
+    samples: Annotated[int | None, typer.Option(min=1, max=MOST_SAMPLES, help="number of samples planned")] = None,
+    append: Annotated[
+        list[int] | None, typer.Option(min=1, max=MOST_SAMPLES, help="blocks appended to the store, in order")
+    ] = None,
     seed: SeedOption = None,
     settings: SetOption = None,
 ) -> None:
@@ -231,23 +273,37 @@ def lens(
     out: Annotated[Path | None, typer.Option(help="PNG of the layout [default: the lens's name, here]")] = None,
     json_: Annotated[Path | None, typer.Option("--json", help="the table as JSON")] = None,
     vary_seed: Annotated[
-        int | None, typer.Option(min=0, help="a random relative of the lens in its place, by this seed")
+        int | None,
+        typer.Option(min=0, max=MOST_SEED, help="a random relative of the lens in its place, by this seed"),
     ] = None,
     spread: Annotated[
-        float, typer.Option(help="of the relative's curvatures, thicknesses and rims, as a share of each")
+        float,
+        typer.Option(
+            callback=_finite,
+            min=0,
+            max=0.5,
+            help="of the relative's curvatures, thicknesses and rims, as a share of each",
+        ),
     ] = 0.03,
     toml: Annotated[Path | None, typer.Option(help="write the prescription, such as a relative's")] = None,
     focal_length_mm: Annotated[
-        float | None, typer.Option(min=0.01, max=1e5, help="scale it to this focal length [default: as prescribed]")
+        float | None,
+        typer.Option(
+            callback=_finite, min=0.01, max=1e5, help="scale it to this focal length [default: as prescribed]"
+        ),
     ] = None,
     fov_deg: Annotated[
-        float | None, typer.Option(min=0.01, max=140, help="scale it to this field; needs --sensor-width-mm")
+        float | None,
+        typer.Option(callback=_finite, min=0.01, max=140, help="scale it to this field; needs --sensor-width-mm"),
     ] = None,
     sensor_width_mm: Annotated[
-        float | None, typer.Option(min=1e-3, max=1e4, help="width that --fov-deg spans")
+        float | None, typer.Option(callback=_finite, min=1e-3, max=1e4, help="width that --fov-deg spans")
     ] = None,
     f_number: Annotated[
-        float | None, typer.Option(max=200, help="close its stop to this f-number [default: as prescribed]")
+        float | None,
+        typer.Option(
+            callback=_finite, min=0.1, max=200, help="close its stop to this f-number [default: as prescribed]"
+        ),
     ] = None,
 ) -> None:
     """First-order table of a lens (EFL, BFD, f-number, pupils), scaled and stopped down if asked, and a drawing."""
@@ -298,28 +354,47 @@ def lens(
 def flare(
     lens: Annotated[str, typer.Argument(help="path of a prescription, or the name of a packaged lens")],
     out: Annotated[Path, typer.Option(help="picture: .png, or .exr with every band")],
-    sun_deg: Annotated[float, typer.Option(help="angle of the Sun from the axis, 0 to below 90")],
-    azimuth_deg: Annotated[float, typer.Option(help="of the Sun in the picture: 0 to the right, 90 down")] = 0.0,
+    sun_deg: Annotated[
+        float, typer.Option(callback=_finite, min=0, max=90, help="angle of the Sun from the axis, 0 to below 90")
+    ],
+    azimuth_deg: Annotated[
+        float,
+        typer.Option(
+            callback=_finite, min=-360, max=360, help="of the Sun in the picture: 0 to the right, 90 down"
+        ),
+    ] = 0.0,
     model: Annotated[str, typer.Option(help="of the ghosts: traced, paraxial or texture")] = "traced",
     wavelength_nm: Annotated[
-        float | None, typer.Option(help="one wavelength [default: the Sun's spectrum in the camera's bands]")
+        float | None,
+        typer.Option(
+            callback=_finite,
+            min=250,
+            max=2500,
+            help="one wavelength [default: the Sun's spectrum in the camera's bands]",
+        ),
     ] = None,
     json_: Annotated[Path | None, typer.Option("--json", help="every ghost as JSON")] = None,
     coating: Annotated[
         str | None, typer.Option(help="of all surfaces in air: none, mgf2, v or bbar [default: as prescribed]")
     ] = None,
     focal_length_mm: Annotated[
-        float | None, typer.Option(help="scale the lens to it [default: as prescribed]")
+        float | None,
+        typer.Option(callback=_finite, min=0.01, max=1e5, help="scale the lens to it [default: as prescribed]"),
     ] = None,
-    fov_deg: Annotated[float, typer.Option(min=0.1, max=140, help="across the picture's width")] = 65.0,
-    pixels: Annotated[int, typer.Option(min=16, max=8192, help="width and height of the picture")] = 1024,
+    fov_deg: Annotated[
+        float, typer.Option(callback=_finite, min=0.1, max=140, help="across the picture's width")
+    ] = 65.0,
+    pixels: Annotated[int, typer.Option(min=16, max=4096, help="width and height of the picture")] = 1024,
     sun_distance_au: Annotated[
-        float, typer.Option(min=0.01, max=1000, help="sets the size of the Sun's disc")
+        float, typer.Option(callback=_finite, min=0.01, max=1000, help="sets the size of the Sun's disc")
     ] = 1.0,
-    reflections: Annotated[int, typer.Option(help="of a ghost: 2, or 4 for those of four too")] = 2,
-    roughness_nm: Annotated[float, typer.Option(min=0, max=100, help="rms roughness of the surfaces")] = 1.0,
+    reflections: Annotated[int, typer.Option(min=2, max=4, help="of a ghost: 2, or 4 for those of four too")] = 2,
+    roughness_nm: Annotated[
+        float, typer.Option(callback=_finite, min=0, max=100, help="rms roughness of the surfaces")
+    ] = 1.0,
     cleanliness_level: Annotated[
-        float, typer.Option(min=0, max=2000, help="particles on the surfaces, IEST-STD-CC1246; 0: none")
+        float,
+        typer.Option(callback=_finite, min=0, max=2000, help="particles on the surfaces, IEST-STD-CC1246; 0: none"),
     ] = 0.0,
     veil_fraction: Annotated[
         float, typer.Option(min=0, max=0.5, help="of the light, that mount, barrel and edges scatter as a veil")
@@ -328,12 +403,10 @@ def flare(
     """Ghosts, starburst and glare of the Sun through a lens: a picture, and a table of every ghost."""
     if out.suffix.lower() not in (".png", ".exr") or not out.absolute().parent.is_dir():
         raise InputError(f"--out {out}: must be a .png or .exr in a folder that exists")
-    if not 0 <= sun_deg < 90:
+    if sun_deg == 90:
         raise InputError(f"--sun-deg {sun_deg:g}: must be from 0 to below 90")
     if reflections not in (2, 4):
         raise InputError(f"--reflections {reflections}: must be 2 or 4")
-    if focal_length_mm is not None and not 0.01 <= focal_length_mm <= 1e5:
-        raise InputError(f"--focal-length-mm {focal_length_mm:g}: must be from 0.01 to 1e5")
     from . import flares
     from . import lens as optics
 
@@ -386,18 +459,19 @@ def flare(
 def detector(
     detector: Annotated[str, typer.Argument(help="path, or name of a packaged detector")],
     out: Annotated[Path, typer.Option(help="folder for the report and its plots")],
-    seed: Annotated[int, typer.Option(min=0, help="which individual of the sensor")] = 1,
+    seed: Annotated[int, typer.Option(min=0, max=MOST_SEED, help="which individual of the sensor")] = 1,
     pixels: Annotated[
-        int, typer.Option(min=64, help="side of the part that is measured, at most the sensor")
+        int, typer.Option(min=64, max=4096, help="side of the part that is measured, at most the sensor")
     ] = 512,
     wavelength_nm: Annotated[
-        float | None, typer.Option(min=300, max=1100, help="of the light; default: each channel's best")
+        float | None,
+        typer.Option(callback=_finite, min=300, max=1100, help="of the light; default: each channel's best"),
     ] = None,
     temperature_k: Annotated[
-        float | None, typer.Option(min=100, max=400, help="of the sensor; default: its file's")
+        float | None, typer.Option(callback=_finite, min=100, max=400, help="of the sensor; default: its file's")
     ] = None,
-    points: Annotated[int, typer.Option(min=8, help="exposures of the photon transfer")] = 40,
-    stack: Annotated[int, typer.Option(min=2, help="pictures for DSNU, PRNU and spectra")] = 24,
+    points: Annotated[int, typer.Option(min=8, max=2000, help="exposures of the photon transfer")] = 40,
+    stack: Annotated[int, typer.Option(min=2, max=2000, help="pictures for DSNU, PRNU and spectra")] = 24,
 ) -> None:
     """EMVA 1288 characterisation of a virtual detector, with plots."""
     from . import characterise

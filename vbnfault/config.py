@@ -47,6 +47,16 @@ def _pair(lo: float, hi: float) -> Any:
     return Annotated[tuple[value, value], AfterValidator(_ordered)]
 
 
+# Of a frame's pixels and bands, 4 bytes each: some ten such arrays are held at a time.
+_MOST_RADIANCES = 2**28
+# What no table of a scene has more of: rows of a spectrum, kernels, layers.
+_MOST_ROWS = 10_000
+Wavelength = Annotated[float, Field(gt=0, le=1e5)]
+SemiAxis = Annotated[float, Field(gt=0, le=1e9)]
+Cosine = Annotated[float, Field(ge=-1, le=1)]
+Offset = Annotated[float, Field(ge=-1e4, le=1e4)]
+
+
 class Table(BaseModel):
     """A table of the scene file: frozen, strict, no unknown keys."""
 
@@ -96,8 +106,8 @@ class DatasetTable(Table):
 class SpectrumTable(Table):
     """Values at wavelengths, interpolated linearly, constant beyond the ends."""
 
-    wavelength_nm: tuple[Annotated[float, Field(gt=0, le=1e5)], ...] = Field(min_length=1)
-    value: tuple[Annotated[float, Field(ge=0, le=1)], ...] = Field(min_length=1)
+    wavelength_nm: tuple[Wavelength, ...] = Field(min_length=1, max_length=_MOST_ROWS)
+    value: tuple[Annotated[float, Field(ge=0, le=1)], ...] = Field(min_length=1, max_length=_MOST_ROWS)
 
     @model_validator(mode="after")
     def _paired(self) -> SpectrumTable:
@@ -131,7 +141,10 @@ class PhotometryTable(Table):
     )
     parameters: str = Field("67p_fornasier2015", description="a named set of Hapke's parameters")
     hapke: tuple[HapkeRow, ...] | None = Field(
-        None, min_length=1, description="Hapke's parameters at wavelengths of one's own, in place of a named set"
+        None,
+        min_length=1,
+        max_length=_MOST_ROWS,
+        description="Hapke's parameters at wavelengths of one's own, in place of a named set",
     )
     dust_contrast: float = Field(
         0.0, ge=-0.9, le=4, description="how much brighter dust-covered ground is at 649 nm: 0.2 for 20 %"
@@ -163,7 +176,9 @@ class BodyTable(Table):
         description="'embedded', 'ellipsoid', or a shape file: OBJ, PLY, STL, GLB, PDS TAB, ICQ, WRL, BDS",
     )
     unit: Literal["auto", "m", "km"] = "auto"
-    semi_axes_m: tuple[float, float, float] = Field((1000.0, 1000.0, 1000.0), description="of an 'ellipsoid'")
+    semi_axes_m: tuple[SemiAxis, SemiAxis, SemiAxis] = Field(
+        (1000.0, 1000.0, 1000.0), description="of an 'ellipsoid'"
+    )
     density_kg_m3: float = Field(537.8, gt=0, le=30_000)
     rotation_period_h: float = Field(
         24 * 360 / 696.543884683, gt=0.01, le=1e5, description="67P before perihelion 2015: 12.4041 h"
@@ -181,8 +196,6 @@ class BodyTable(Table):
         if isinstance(self.reflectance, str) and self.reflectance not in spectra.REFLECTANCES:
             known = ", ".join(spectra.REFLECTANCES)
             raise ValueError(f"reflectance = {self.reflectance!r}: must be a grey value 0 to 1 or one of {known}")
-        if min(self.semi_axes_m) <= 0 or max(self.semi_axes_m) > 1e9:
-            raise ValueError(f"semi_axes_m = {list(self.semi_axes_m)}: each must be above 0 and at most 1e9")
         return self
 
 
@@ -243,12 +256,14 @@ class SpiceTable(Table):
     out among themselves: `[geometry]` and the Sun's bounds do not count.
     """
 
-    kernels: tuple[str, ...] = Field((), description="kernels or meta-kernels; needs the extra 'spice'")
+    kernels: tuple[str, ...] = Field(
+        (), max_length=_MOST_ROWS, description="kernels or meta-kernels; needs the extra 'spice'"
+    )
     target: str = Field("CHURYUMOV-GERASIMENKO", description="SPICE name or number")
     frame: str = Field("", description="body-fixed frame; default: pole and period of [body]")
     spacecraft: str = Field("", description="SPICE name or number of what carries the camera")
     camera_frame: str = Field("", description="the camera's frame, such as ROS_NAVCAM-A")
-    camera_axes: tuple[float, float, float, float, float, float, float, float, float] | None = Field(
+    camera_axes: tuple[Cosine, Cosine, Cosine, Cosine, Cosine, Cosine, Cosine, Cosine, Cosine] | None = Field(
         None, description="rows of the rotation from image axes (x right, y down, z boresight) to camera_frame"
     )
     until_julian_date: float | None = Field(
@@ -279,8 +294,8 @@ class SkyTable(Table):
 class PoseTable(Table):
     """A turn of a part about its hinge, in the camera's axes B."""
 
-    hinge_m: tuple[float, float, float] | None = None
-    axis: tuple[float, float, float] | None = None
+    hinge_m: tuple[Offset, Offset, Offset] | None = None
+    axis: tuple[Offset, Offset, Offset] | None = None
     angle_deg: float = Field(0.0, ge=-360, le=360)
 
 
@@ -295,7 +310,7 @@ class SpacecraftTable(Table):
     roll_deg: float = Field(0.0, ge=-360, le=360)
     pitch_deg: float = Field(0.0, ge=-360, le=360)
     yaw_deg: float = Field(0.0, ge=-360, le=360)
-    translation_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    translation_m: tuple[Offset, Offset, Offset] = (0.0, 0.0, 0.0)
     default_material: Paint = Field(0.3, description="a named material, a grey value, or a table")
     materials: dict[str, Paint] = Field(default_factory=dict, description="by part or material of the file")
     pose: dict[str, PoseTable] = Field(default_factory=dict, description="by part")
@@ -344,7 +359,7 @@ class CameraTable(Table):
         le=1,
         description="of a thin lens, default 0.9; a prescription's follows from glass and coatings",
     )
-    focus_distance_m: float | None = Field(None, gt=0, description="default: infinity")
+    focus_distance_m: float | None = Field(None, gt=0, le=1e12, description="default: infinity")
     detector: str = Field(
         "",
         description="a packaged detector or a sensor's TOML, with a mosaic; its numbers are those of the keys from "
@@ -506,6 +521,16 @@ class SceneConfig(Table):
     geometry: GeometryTable = GeometryTable()
     plan: PlanTable = PlanTable()
     faults: dict[str, dict[str, Any]] = Field(default_factory=dict)
+
+    @model_validator(mode="after")
+    def _fits(self) -> SceneConfig:
+        width_px, height_px, bands = self.camera.width_px, self.camera.height_px, self.render.bands
+        if width_px * height_px * bands > _MOST_RADIANCES:
+            raise ValueError(
+                f"camera.width_px = {width_px}, camera.height_px = {height_px}, render.bands = {bands}: a frame "
+                f"has {width_px * height_px * bands} radiances; must be at most {_MOST_RADIANCES}, 1 GiB"
+            )
+        return self
 
     @model_validator(mode="after")
     def _strata(self) -> SceneConfig:

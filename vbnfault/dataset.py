@@ -7,7 +7,6 @@ import dataclasses
 import hashlib
 import importlib.metadata
 import json
-import os
 import platform
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -238,7 +237,7 @@ class SessionFactory:
     threads: int | None = None
 
     def __call__(self) -> pipeline.Session:
-        threads = self.threads or int(os.environ.get("VBNFAULT_THREADS", "0")) or None
+        threads = self.threads or resources.environment_whole("VBNFAULT_THREADS", resources.MOST_THREADS) or None
         return pipeline.Session(self.scene, blocks=self.blocks, threads=threads)
 
 

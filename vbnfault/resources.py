@@ -36,6 +36,8 @@ _DEEPEST_TABLE = 24
 _LONGEST_NAME_BYTES = 255
 _LONGEST_PATH_BYTES = 4095
 _READ_BYTES = 16 * MIB
+# What an environment variable or option may ask for: more than any machine has.
+MOST_THREADS = 4096
 
 
 def read_input(path: str | Path, what: str, *, types: Sequence[str] = (), limit_bytes: int | None = None) -> bytes:
@@ -138,6 +140,15 @@ def _kind(status: os.stat_result) -> str:
     }
     kind = kinds.get(stat.S_IFMT(status.st_mode))
     return f" but {kind}" if kind else ""
+
+
+def environment_whole(name: str, high: int) -> int:
+    """Return the whole number of an environment variable, 0 where it is not set. Raises InputError outside 0 to
+    `high`."""
+    text = os.environ.get(name, "").strip() or "0"
+    if not (text.isascii() and text.isdigit() and len(text) < 20 and int(text) <= high):
+        raise InputError(f"{name} = {shown(text)}: must be a whole number from 0 to {high}")
+    return int(text)
 
 
 def file_status(path: str | Path) -> os.stat_result | None:

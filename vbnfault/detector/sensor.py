@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, cast, get_args, get_origin, get_type_hints
 
 from .. import resources, spectra
-from ..errors import InputError
+from ..errors import InputError, shown
 from .charge import ChargeCloud, TrapSpecies
 from .dark import CCD_GROWTH
 from .demosaic import Method
@@ -227,12 +227,12 @@ def _value(kind: Any, value: Any, where: str) -> Any:
         # of whole numbers too: one of 400 digits is no float
         if abs(value) <= sys.float_info.max:
             return float(value)
-        raise InputError(f"{where} = {value!r}: must be finite")
+        raise InputError(f"{where} = {shown(value)}: must be finite")
     elif type(value) is kind:  # not isinstance: true and false are whole numbers to Python
         return value
     other = "a table" if dataclasses.is_dataclass(kind) else "a list of the right length"
     wanted = next((word for plain, word in _KINDS if kind is plain), other)
-    raise InputError(f"{where} = {value!r}: must be {wanted}")
+    raise InputError(f"{where} = {shown(value)}: must be {wanted}")
 
 
 def _in_range(key: str, value: float, low: float, high: float) -> None:
@@ -243,4 +243,4 @@ def _in_range(key: str, value: float, low: float, high: float) -> None:
 
 def _one_of(key: str, value: str, allowed: tuple[str, ...]) -> None:
     if value not in allowed:
-        raise InputError(f"{key} = {value!r}: must be one of {', '.join(allowed)}")
+        raise InputError(f"{key} = {shown(value)}: must be one of {', '.join(allowed)}")

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
@@ -20,7 +21,7 @@ from numpy.typing import NDArray
 
 from ..camera import Camera
 from ..detector.chain import STEPS as MOSAIC_STEPS
-from ..errors import InputError
+from ..errors import InputError, shown
 from ..lens import load_lens
 from ..lens.footprint import DEFAULT_LENS, Frame
 from ..quantities import LUMINANCE, RGBI, Charge, Electrons, Quantity, RawMosaic, soft_kind
@@ -396,7 +397,7 @@ def from_dict(fault_class: str, table: Mapping[str, Any], *, source: str) -> Fau
         raise InputError(f"{where}: no such fault class{_hint(fault_class, registry())}")
     name = table.get("model", next(iter(models)))
     if not isinstance(name, str) or name not in models:
-        raise InputError(f"{where}.model = {name!r}: must be one of {', '.join(models)}")
+        raise InputError(f"{where}.model = {shown(name)}: must be one of {', '.join(models)}")
     cls = models[name]
     fields = {f.name: f for f in dataclasses.fields(cls)}
     values: dict[str, Any] = {}
@@ -420,7 +421,12 @@ def _hint(word: str, known: Any) -> str:
 
 
 def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and bool(np.isfinite(value))
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return False
+    try:
+        return math.isfinite(value)
+    except OverflowError:  # a whole number beyond the range of floats
+        return False
 
 
 def _parse(value: Any, f: dataclasses.Field[Any], where: str) -> Any:
@@ -430,15 +436,15 @@ def _parse(value: Any, f: dataclasses.Field[Any], where: str) -> Any:
         return None
     if kind == "flag":
         if not isinstance(value, bool):
-            raise InputError(f"{where} = {value!r}: must be true or false")
+            raise InputError(f"{where} = {shown(value)}: must be true or false")
         return value
     if kind == "choice":
-        if value not in meta["options"]:
-            raise InputError(f"{where} = {value!r}: must be one of {', '.join(meta['options'])}")
+        if not isinstance(value, str) or value not in meta["options"]:
+            raise InputError(f"{where} = {shown(value)}: must be one of {', '.join(meta['options'])}")
         return value
     if kind == "text":
         if not isinstance(value, str):
-            raise InputError(f"{where} = {value!r}: must be a string")
+            raise InputError(f"{where} = {shown(value)}: must be a string")
         return value
     if kind == "rows":
         return _parse_rows(value, meta["columns"], where)
@@ -447,29 +453,29 @@ def _parse(value: Any, f: dataclasses.Field[Any], where: str) -> Any:
     if kind == "number":
         fits = _is_number(value) and lo <= value <= hi and (not whole or float(value).is_integer())
         if not fits:
-            raise InputError(f"{where} = {value!r}: must be a{whole} number from {lo:g} to {hi:g}")
+            raise InputError(f"{where} = {shown(value)}: must be a{whole} number from {lo:g} to {hi:g}")
         return value
     pair = value if isinstance(value, list | tuple) else [value, value]
     ok = len(pair) == 2 and all(_is_number(v) and (not whole or float(v).is_integer()) for v in pair)
     if not ok or not (lo <= pair[0] and pair[1] <= hi):
         raise InputError(
-            f"{where} = {value!r}: must be one{whole} number, or [lower, upper]{whole} bounds, "
+            f"{where} = {shown(value)}: must be one{whole} number, or [lower, upper]{whole} bounds, "
             f"from {lo:g} to {hi:g}"
         )
     if pair[0] > pair[1]:
-        raise InputError(f"{where} = {value!r}: bounds reversed, the lower one comes first")
+        raise InputError(f"{where} = {shown(value)}: bounds reversed, the lower one comes first")
     return Interval(*pair)
 
 
 def _parse_rows(value: Any, columns: Mapping[str, tuple[float, float]], where: str) -> tuple[Any, ...]:
     if not isinstance(value, list | tuple):
-        raise InputError(f"{where} = {value!r}: must be a list of tables with keys {', '.join(columns)}")
+        raise InputError(f"{where} = {shown(value)}: must be a list of tables with keys {', '.join(columns)}")
     for i, row in enumerate(value):
         if not isinstance(row, Mapping) or set(row) != set(columns):
-            raise InputError(f"{where}[{i}] = {row!r}: must be a table with the keys {', '.join(columns)}")
+            raise InputError(f"{where}[{i}] = {shown(row)}: must be a table with the keys {', '.join(columns)}")
         for key, (lo, hi) in columns.items():
             if not _is_number(row[key]) or not lo <= row[key] <= hi:
-                raise InputError(f"{where}[{i}].{key} = {row[key]!r}: must be a number from {lo:g} to {hi:g}")
+                raise InputError(f"{where}[{i}].{key} = {shown(row[key])}: must be a number from {lo:g} to {hi:g}")
     return tuple(dict(row) for row in value)
 
 

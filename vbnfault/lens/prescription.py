@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .. import resources
-from ..errors import InputError
+from ..errors import InputError, shown
 from .coating import DESIGN_NM, Layer, design
 from .glass import AIR, D_NM, Glass, from_abbe, from_coefficients, named
 
@@ -231,7 +231,7 @@ def _sensor(row: Mapping[str, Any], where: str) -> float:
     """Reflectance of the sensor, whose row is the last one."""
     _known_keys(row, where)
     if row["sensor"] is not True:
-        raise InputError(f"{where}: sensor = {row['sensor']!r}: must be true or false")
+        raise InputError(f"{where}: sensor = {shown(row['sensor'])}: must be true or false")
     for key in row:
         if key not in ("sensor", "reflectance"):
             raise InputError(f"{where}: {key}: the sensor takes reflectance alone: it is a plane at the focus")
@@ -241,24 +241,24 @@ def _sensor(row: Mapping[str, Any], where: str) -> float:
 def _surface(row: Mapping[str, Any], front: Glass, where: str, *, last: bool) -> Surface:
     _known_keys(row, where)
     if row.get("sensor", False) is not False:
-        raise InputError(f"{where}: sensor = {row['sensor']!r}: only the last surface can be the sensor")
+        raise InputError(f"{where}: sensor = {shown(row['sensor'])}: only the last surface can be the sensor")
     if "reflectance" in row:
         raise InputError(f"{where}: reflectance: only the sensor has one; elsewhere coating and glass give it")
     stop = row.get("stop", False)
     if not isinstance(stop, bool):
-        raise InputError(f"{where}: stop = {stop!r}: must be true or false")
+        raise InputError(f"{where}: stop = {shown(stop)}: must be true or false")
     radius = _number(row, "radius_mm", where, math.inf if stop else None, low=-math.inf, high=math.inf)
     for key in _STOP_KEYS:
         if key in row and not stop:
             raise InputError(f"{where}: {key}: only the stop has it")
     blades = _number(row, "blades", where, 0, low=0, high=64)
     if blades in (1, 2) or not blades.is_integer():
-        raise InputError(f"{where}: blades = {row['blades']!r}: must be 0, for a round stop, or from 3 to 64")
+        raise InputError(f"{where}: blades = {shown(row['blades'])}: must be 0, for a round stop, or from 3 to 64")
     if radius == 0:
         raise InputError(f"{where}: radius_mm = 0: must not be 0; a plane has inf")
     coefficients = row.get("aspheric_mm", [])
     if not isinstance(coefficients, list):
-        raise InputError(f"{where}: aspheric_mm = {coefficients!r}: must be a list of numbers")
+        raise InputError(f"{where}: aspheric_mm = {shown(coefficients)}: must be a list of numbers")
     medium = _medium(row, where)
     surface = Surface(
         radius_mm=radius,
@@ -294,7 +294,7 @@ def _medium(row: Mapping[str, Any], where: str) -> Glass:
         elif isinstance(glass, dict):
             medium = from_coefficients(str(glass.get("formula")), list(glass.get("coefficients", [])))
         elif glass is not None:
-            raise InputError(f"glass = {glass!r}: must be a name or a table of formula and coefficients")
+            raise InputError(f"glass = {shown(glass)}: must be a name or a table of formula and coefficients")
         elif "nd" in row:
             nd = _number(row, "nd", "", None, low=_INDEX_RANGE[0], high=_INDEX_RANGE[1])
             vd = _number(row, "vd", "", 0.0, low=5.0, high=200.0) if "vd" in row else None
@@ -335,10 +335,10 @@ def _coating(given: object, front: Glass, back: Glass, where: str) -> tuple[Laye
         return tuple(_layer(film, f"{where}: coating[{k}]") for k, film in enumerate(given))
     try:
         if not isinstance(given, str):
-            raise InputError(f"coating = {given!r}: must be a name or a list of layers")
+            raise InputError(f"coating = {shown(given)}: must be a name or a list of layers")
         films = _facing_air(given, front, back)
         if films and 1.0 not in (front.nd, back.nd):
-            raise InputError(f"coating = {given!r}: is made for a surface in air, not between two glasses")
+            raise InputError(f"coating = {shown(given)}: is made for a surface in air, not between two glasses")
     except InputError as error:
         raise InputError(f"{where}: {error}") from None
     return films
@@ -366,14 +366,13 @@ def _number(
     value = table.get(key, default)
     if value is None:
         raise InputError(f"{where}: {key}: missing")
-    if (
-        isinstance(value, bool)
-        or not isinstance(value, int | float)
-        or math.isnan(value)
-        or not low <= value <= high
-    ):
-        raise InputError(f"{where}: {key} = {value!r}: must be a number from {low:g} to {high:g}")
-    return float(value)
+    try:
+        number = math.nan if isinstance(value, bool) or not isinstance(value, int | float) else float(value)
+    except OverflowError:  # a whole number beyond the range of floats
+        number = math.nan
+    if not low <= number <= high:
+        raise InputError(f"{where}: {key} = {shown(value)}: must be a number from {low:g} to {high:g}")
+    return number
 
 
 def _check(lens: Prescription, source: str) -> None:

@@ -16,6 +16,7 @@ import numpy as np
 from numcodecs import Zstd
 from numpy.typing import NDArray
 
+from .. import resources
 from ..quantities import Sample
 from .schema import SCALARS, StoreSpec
 
@@ -26,7 +27,8 @@ _ABSENT = 2**64 - 1  # how a shard's index says that it has no such chunk
 
 def threads() -> int:
     """How many threads compress or check the layers of a sample."""
-    return max(1, min(4, int(os.environ.get("VBNFAULT_THREADS", "0")) or os.cpu_count() or 1))
+    given = resources.environment_whole("VBNFAULT_THREADS", resources.MOST_THREADS)
+    return max(1, min(4, given or os.cpu_count() or 1))
 
 
 def crc32c(array: NDArray[Any]) -> int:
