@@ -258,6 +258,43 @@ def test_a_bad_mesh_is_refused_in_one_sentence(
     assert not (tmp_path / "x.zarr").exists()
 
 
+@pytest.mark.filterwarnings("default")
+def test_a_shape_of_another_body_is_told_what_it_has_of_67p(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    import trimesh
+
+    mesh = tmp_path / "bennu.obj"
+    trimesh.creation.icosphere(subdivisions=3, radius=0.245).export(mesh)
+    build = ("build", "paper67p", "--out", tmp_path / "x.zarr", "--dry-run", "--set", f"body.shape={mesh}")
+    assert run(monkeypatch, *build) == 0
+    warned = capsys.readouterr().err
+    assert warned.count("warning:") == 1
+    for key in (
+        "name",
+        "density_kg_m3 = 537.8",
+        "rotation_period_h = 12.4041",
+        "pole_ra_deg",
+        "reflectance = '67p'",
+    ):
+        assert f"body.{key}" in warned
+    assert "'bennu.obj' has 0.06" in warned
+    assert "[orbit]" in warned
+    own = {"name": "'Bennu'", "density_kg_m3": 1190, "rotation_period_h": 4.3, "reflectance": 0.044}
+    own |= {"pole_ra_deg": 85.65, "pole_dec_deg": -60.17, "prime_meridian_deg": 126.0}
+    settings = [word for key, value in own.items() for word in ("--set", f"body.{key}={value}")]
+    assert run(monkeypatch, *build, *settings, "--set", "sun.distance_au=1.1") == 0
+    assert "warning:" not in capsys.readouterr().err
+
+
+def test_the_real_shape_is_67ps(real_shape: Path) -> None:
+    from vbnfault import config, world
+
+    for settings in ({}, {"body.shape": str(real_shape)}):
+        scene = config.load_scene("quickstart", settings)
+        assert world.assumed_of_67p(scene, world.make_body(scene)) == ""
+
+
 @pytest.mark.parametrize(
     ("setting", "expected"),
     [

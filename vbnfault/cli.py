@@ -263,6 +263,7 @@ def render(
     from . import export, pipeline
 
     session = pipeline.Session(source, blocks=blocks, source=scene)
+    session.warn_of_assumptions()
     for path in export.write_frame(session.frame(sample), out):
         typer.echo(str(path))
 

@@ -284,6 +284,7 @@ def build_scene(
         samples = int(store.open_store(out).attributes["blocks"][0])
     blocks = build.planned_blocks(out, samples, append=append or 0, overwrite=overwrite)
     session = pipeline.Session(scene, blocks=blocks, source=source)
+    session.warn_of_assumptions()
     counts = {name: int(session.plan.injects(name).sum()) for name in session.faults}
     spec = store_spec(session, blocks)
     return build.build(

@@ -7,6 +7,7 @@ One expensive render serves every twin. A `Session` runs the stages for any samp
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import cached_property
@@ -127,6 +128,12 @@ class Session:
         """The body, loaded when first asked for."""
         stages.begin("shape of the body")
         return world.make_body(self.scene)
+
+    def warn_of_assumptions(self) -> None:
+        """Warn, in one sentence, of what a body that is not 67P takes from it for want of a value."""
+        sentence = world.assumed_of_67p(self.scene, self.body)
+        if sentence:
+            warnings.warn(sentence, stacklevel=2)
 
     @cached_property
     def vehicle(self) -> SpacecraftMesh | None:

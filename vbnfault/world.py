@@ -211,6 +211,42 @@ def make_body(scene: SceneConfig) -> Body:
     return load_body(table.shape, unit=table.unit, name=table.name, **physical)
 
 
+# 67P: volume, and length of its longest extent (Preusker et al. 2015, A&A 583, A33); a shape that differs by more
+# than these shares is another body's.
+_67P_VOLUME_M3, _67P_LENGTH_M = 18.7e9, 5.0e3
+_VOLUME_SHARE, _LENGTH_SHARE = 0.25, 0.2
+
+
+def assumed_of_67p(scene: SceneConfig, body: Body) -> str:
+    """Return one sentence on the values of 67P that a body of another size has, left in place or set, or ""."""
+    length_m = float(np.ptp(body.vertices_m, axis=0).max())
+    if (
+        abs(body.volume_m3 / _67P_VOLUME_M3 - 1) <= _VOLUME_SHARE
+        and abs(length_m / _67P_LENGTH_M - 1) <= _LENGTH_SHARE
+    ):
+        return ""
+    table = scene.body
+    keys = ["name", "density_kg_m3", "rotation_period_h"]
+    keys += [] if scene.spice.frame else ["pole_ra_deg", "pole_dec_deg", "prime_meridian_deg"]
+    keys += [] if table.photometry.model == "hapke" else ["reflectance"]
+    # not by what was left unset: a packaged scene of 67P whose shape is replaced says its values itself
+    values = [
+        (key, getattr(table, key)) for key in keys if getattr(table, key) == BodyTable.model_fields[key].default
+    ]
+    assumed = [f"body.{key} = {v:.6g}" if isinstance(v, float) else f"body.{key} = {v!r}" for key, v in values]
+    if table.photometry.model == "hapke" and table.photometry.hapke is None:
+        assumed.append(f"body.photometry.parameters = {table.photometry.parameters!r}")
+    # with a distance of its own the orbit only turns the stars
+    if scene.orbit is None and not scene.spice.kernels and scene.sun.distance_au is None:
+        assumed.append("[orbit]")
+    if not assumed:
+        return ""
+    return (
+        f"body.shape = {Path(table.shape).name!r} has {body.volume_m3 * 1e-9:.3g} km³ and is {length_m * 1e-3:.3g} "
+        f"km long: not 67P, whose values it has for {', '.join(assumed)}; give the body's own"
+    )
+
+
 def ellipsoid(semi_axes_m: tuple[float, float, float]) -> tuple[F64, NDArray[np.int32]]:
     """A triaxial ellipsoid as a closed mesh of 82,000 triangles: vertices float64[n, 3] in m, faces int32."""
     import trimesh
