@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import hashlib
 import importlib.metadata
 import json
 import os
@@ -20,6 +19,7 @@ from .config import SceneConfig
 from .detector import Detector, MosaicDetector
 from .errors import VbnfaultError
 from .faults import Fault
+from .quantities import Sample
 from .record import proposal
 from .sample import mask_any_faults, stored_layers
 from .store import StoreSpec
@@ -48,37 +48,42 @@ def scene_identity(session: pipeline.Session) -> dict[str, Any]:
     scene = session.scene.resolved()
     scene["body"]["shape_sha256"] = session.body.content_hash
     if session.scene.body.shape not in ("embedded", "ellipsoid"):
-        scene["body"]["shape"] = Path(session.scene.body.shape).name
+        scene["body"]["shape"] = _digest(session.scene.body.shape, "shape")
     if session.scene.camera.detector:
         for key in config.OF_THE_DETECTOR:
             del scene["camera"][key]  # the detector has its own
     scene["faults"] = {name: fault.to_dict() for name, fault in session.faults.items()}
     for table in scene["faults"].values():
         if table.get("texture_file"):
-            table["texture_file"] = _digest(table["texture_file"])
+            table["texture_file"] = _digest(table["texture_file"], "texture")
         if table.get("lens"):
-            table["lens"] = _digest(resources.find("scenes/lenses", table["lens"]))
+            table["lens"] = _digest(resources.find("scenes/lenses", table["lens"]), "lens")
     _contents_of_files(scene, session.scene)
     if "straylight" in session.faults:
         textures = sorted(resources.data_dir("textures").glob("*.png"))
-        scene["textures_sha256"] = _digest(*textures).removeprefix("sha256:")
+        data = b"".join(resources.read_input(path, "texture") for path in textures)
+        scene["textures_sha256"] = resources.sha256(data)
     del scene["dataset"]["samples"]  # a block more makes no other scene
     return scene
 
 
-def _digest(*paths: str | Path) -> str:
-    """`sha256:` and the digest of the files' contents, one after the other."""
-    return f"sha256:{hashlib.sha256(b''.join(Path(p).read_bytes() for p in paths)).hexdigest()}"
+def _digest(path: str | Path, what: str) -> str:
+    """`sha256:` and the digest of a file's contents, which stand for its name: renamed, it is the same."""
+    return f"sha256:{resources.sha256(resources.read_input(path, what))}"
 
 
 def _contents_of_files(identity: dict[str, Any], scene: SceneConfig) -> None:
     """Put the sha256 of what lens, spacecraft, kernels and stars are read from in the place of paths."""
     if scene.camera.lens:
-        identity["camera"]["lens"] = _digest(resources.find("scenes/lenses", scene.camera.lens))
+        identity["camera"]["lens"] = _digest(resources.find("scenes/lenses", scene.camera.lens), "lens")
     if scene.camera.detector:
-        identity["camera"]["detector"] = _digest(resources.find("scenes/detectors", scene.camera.detector))
+        identity["camera"]["detector"] = _digest(
+            resources.find("scenes/detectors", scene.camera.detector), "detector"
+        )
     if scene.spacecraft.model not in ("none", "default"):
-        identity["spacecraft"]["model"] = _digest(scene.spacecraft.model)
+        with resources.noting() as digests:  # a glTF names files beside it
+            world.spacecraft(scene)
+        identity["spacecraft"]["model"] = f"sha256:{'+'.join(digests)}"
     if scene.spice.kernels:
         # a meta-kernel only names others: what follows from them all says more than its own text
         sun_J_au, T_from_J = world.ephemeris(scene)
@@ -91,7 +96,7 @@ def _contents_of_files(identity: dict[str, Any], scene: SceneConfig) -> None:
         identity["spice"]["kernels"] = [f"ephemeris:{numbers}"]
         identity["spice"]["spiceypy"] = importlib.metadata.version("spiceypy")
     if scene.sky.stars != "off":
-        identity["sky"]["catalogue"] = _digest(resources.data_dir("catalogues") / "stars.npz")
+        identity["sky"]["catalogue"] = _digest(resources.data_dir("catalogues") / "stars.npz", "star catalogue")
 
 
 def store_spec(session: pipeline.Session, blocks: Sequence[int]) -> StoreSpec:
@@ -236,10 +241,24 @@ class SessionFactory:
     scene: SceneConfig
     blocks: tuple[int, ...]
     threads: int | None = None
+    contents: resources.Contents = dataclasses.field(default_factory=resources.Contents)
 
-    def __call__(self) -> pipeline.Session:
+    def __call__(self) -> build.Session:
         threads = self.threads or resources.environment_whole("VBNFAULT_THREADS", resources.MOST_THREADS) or None
-        return pipeline.Session(self.scene, blocks=self.blocks, threads=threads)
+        with self.contents.in_use():
+            return _Session(pipeline.Session(self.scene, blocks=self.blocks, threads=threads), self.contents)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Session:
+    """A session whose files have to hold what they held when the build was planned."""
+
+    session: pipeline.Session
+    contents: resources.Contents
+
+    def simulate(self, index: int) -> Sample:
+        with self.contents.in_use():
+            return self.session.simulate(index)
 
 
 def estimated_seconds(session: pipeline.Session) -> float:
@@ -283,12 +302,15 @@ def build_scene(
     if append and not samples_given and store.is_store(out):
         samples = int(store.open_store(out).attributes["blocks"][0])
     blocks = build.planned_blocks(out, samples, append=append or 0, overwrite=overwrite)
-    session = pipeline.Session(scene, blocks=blocks, source=source)
-    session.warn_of_assumptions()
-    counts = {name: int(session.plan.injects(name).sum()) for name in session.faults}
-    spec = store_spec(session, blocks)
+    contents = resources.Contents()
+    with contents.in_use():
+        session = pipeline.Session(scene, blocks=blocks, source=source)
+        session.warn_of_assumptions()
+        counts = {name: int(session.plan.injects(name).sum()) for name in session.faults}
+        spec = store_spec(session, blocks)
+    contents.complete()
     return build.build(
-        SessionFactory(scene, blocks, threads),
+        SessionFactory(scene, blocks, threads, contents),
         spec,
         out,
         site=session.plan.site,

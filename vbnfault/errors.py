@@ -23,6 +23,10 @@ class InputError(VbnfaultError):
     exit_code = 2
 
 
+class InputChanged(VbnfaultError):
+    """A file that a run reads again no longer holds what it held when the run began."""
+
+
 def shown(value: object) -> str:
     """Return a value as an error sentence shows it: its `repr`, without the middle where that is long."""
     if isinstance(value, int) and value.bit_length() > 4096:  # Python refuses to write such a number

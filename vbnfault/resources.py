@@ -7,15 +7,18 @@ takes only paths (SPICE's kernels) goes through `check_input`.
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import os
 import stat
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextvars import ContextVar
+from functools import lru_cache, wraps
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, TypeVar
 
-from .errors import InputError, shown
+from .errors import InputChanged, InputError, shown
 
 _PACKAGE = Path(__file__).resolve().parent
 
@@ -30,6 +33,7 @@ LIMIT_BYTES: dict[str, int] = {
     "spacecraft": 512 * MIB,
     "texture": 256 * MIB,
     "SPICE kernel": 64 << 30,
+    "star catalogue": 64 * MIB,
     "SPICE text kernel": 256 * MIB,
 }
 _DEEPEST_TABLE = 24
@@ -68,13 +72,14 @@ def read_input(path: str | Path, what: str, *, types: Sequence[str] = (), limit_
             raise InputError(f"{path}: {what} file cannot be read: {error.strerror}.") from None
     if len(data) > limit:
         raise _too_large(Path(path), what, len(data), limit)
+    _check_contents(path, what, lambda: sha256(data))
     return data
 
 
 def check_input(path: str | Path, what: str, *, types: Sequence[str] = ()) -> None:
     """Check a file that a library will read by its path, as `read_input` does. Raises InputError."""
-    with _opened(Path(path), what, types, LIMIT_BYTES[what]):
-        pass
+    with _opened(Path(path), what, types, LIMIT_BYTES[what]) as file:
+        _check_contents(path, what, lambda: _sha256_of(file), os.fstat(file.fileno()))
 
 
 def sha256(data: bytes) -> str:
@@ -84,15 +89,29 @@ def sha256(data: bytes) -> str:
 
 def sha256_of_input(path: str | Path, what: str) -> str:
     """Return the SHA-256 (hex) of a file that is too large to be kept in memory. Raises InputError."""
-    digest = hashlib.sha256()
     with _opened(Path(path), what, (), LIMIT_BYTES[what]) as file:
-        while data := file.read(_READ_BYTES):
-            digest.update(data)
+        return _sha256_of(file)
+
+
+def _sha256_of(file: BinaryIO) -> str:
+    digest = hashlib.sha256()
+    while data := file.read(_READ_BYTES):
+        digest.update(data)
     return digest.hexdigest()
 
 
 def _opened(path: Path, what: str, types: Sequence[str], limit_bytes: int) -> BinaryIO:
     """An open file that is regular, of one of `types` and neither empty nor too large."""
+    try:
+        return _opened_now(path, what, types, limit_bytes)
+    except InputError as error:
+        contents = _in_use.get()
+        if contents is not None and contents.knows(path):
+            raise _changed(f"{error}", path, what) from None
+        raise
+
+
+def _opened_now(path: Path, what: str, types: Sequence[str], limit_bytes: int) -> BinaryIO:
     status = file_status(path)
     if status is None:
         raise InputError(f"{shown_path(path)}: {what} file not found.")
@@ -122,6 +141,119 @@ def _opened(path: Path, what: str, types: Sequence[str], limit_bytes: int) -> Bi
         file.close()
         raise
     return file
+
+
+# --- what files held when a run was planned -------------------------------------------------------------------
+
+
+class Contents:
+    """What the files that a run reads hold: the first reading counts, every later one is compared with it.
+
+    One object serves a run from its planning to its last worker process; pickled, it carries the digests along.
+    Once `complete`, a file that was not read before is refused as well, except where it belongs to vbnfault.
+    """
+
+    def __init__(self) -> None:
+        self._sha256: dict[str, str] = {}
+        self._status: dict[str, tuple[int, ...]] = {}  # of files too large to be hashed at every reading
+        self._complete = False
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**vars(self), "_status": {}}  # another machine's
+
+    def complete(self) -> None:
+        """Note that the run is planned: all its files have been read."""
+        self._complete = True
+
+    def knows(self, path: str | Path) -> bool:
+        """Whether the file has been read before."""
+        return _key(path) in self._sha256
+
+    @contextlib.contextmanager
+    def in_use(self) -> Iterator[None]:
+        """Compare what is read within a block, in this thread."""
+        before = _in_use.set(self)
+        try:
+            yield
+        finally:
+            _in_use.reset(before)
+
+    def check(self, path: str | Path, what: str, digest: Callable[[], str], status: os.stat_result | None) -> None:
+        """Check what a file holds. Raises InputChanged."""
+        key = _key(path)
+        now = None if status is None else (status.st_dev, status.st_ino, status.st_size, status.st_mtime_ns)
+        if now is not None and self._status.get(key) == now:
+            return
+        found = digest()
+        if key not in self._sha256 and self._complete and not key.startswith(_OWN):
+            raise _changed(f"{path}: {what} file was not there, or not used, when the build began", path, what)
+        if self._sha256.setdefault(key, found) != found:
+            raise _changed(f"{path}: {what} file has changed since the build began", path, what)
+        if now is not None:
+            self._status[key] = now
+
+
+_in_use: ContextVar[Contents | None] = ContextVar("contents", default=None)
+_noted: ContextVar[list[str] | None] = ContextVar("noted", default=None)
+_OWN = "vbnfault:"
+
+
+def _key(path: str | Path) -> str:
+    """What a file is called on every machine: vbnfault's own ones lie elsewhere on each."""
+    absolute = os.path.abspath(path)
+    for root in (_PACKAGE, _PACKAGE.parent):
+        for kind in ("scenes", "textures", "catalogues"):
+            if absolute.startswith(f"{root / kind}{os.sep}"):
+                return _OWN + os.path.relpath(absolute, root)
+    return absolute
+
+
+def _changed(sentence: str, path: str | Path, what: str) -> InputChanged:
+    return InputChanged(
+        f"{sentence.rstrip('.')}; finished samples stay: put the {what} file of before back and repeat the "
+        "command, or build the changed scene elsewhere"
+    )
+
+
+def _check_contents(
+    path: str | Path, what: str, digest: Callable[[], str], status: os.stat_result | None = None
+) -> None:
+    contents, noted = _in_use.get(), _noted.get()
+    if contents is not None:
+        contents.check(path, what, digest, status)
+    if noted is not None:
+        noted.append(digest())
+
+
+@contextlib.contextmanager
+def noting() -> Iterator[list[str]]:
+    """Give a list that grows by the SHA-256 of every file that is read within a block, in order."""
+    digests: list[str] = []
+    before = _noted.set(digests)
+    try:
+        yield digests
+    finally:
+        _noted.reset(before)
+
+
+_R = TypeVar("_R")
+
+
+def cached_with_contents(maxsize: int) -> Callable[[Callable[..., _R]], Callable[..., _R]]:
+    """Return a decorator like `lru_cache` for functions of a file's name: what one run has read serves no other."""
+
+    def decorate(function: Callable[..., _R]) -> Callable[..., _R]:
+        @lru_cache(maxsize=maxsize)
+        def cached(_contents: Contents | None, /, *args: Any) -> _R:
+            return function(*args)
+
+        @wraps(function)
+        def wrapper(*args: Any) -> _R:
+            return cached(_in_use.get(), *args)
+
+        return wrapper
+
+    return decorate
 
 
 def _too_large(path: Path, what: str, size_bytes: int, limit_bytes: int) -> InputError:
@@ -222,9 +354,9 @@ def check_plain(table: Mapping[str, Any], source: str) -> None:
             items = node.items() if isinstance(node, Mapping) else enumerate(node)
             for key, value in items:
                 if isinstance(value, Mapping | list | tuple):
-                    below.append((f"{where}{_key(key)}.", value))
+                    below.append((f"{where}{_shown_key(key)}.", value))
                 elif isinstance(value, int) and not -(2**63) <= value < 2**64:
-                    at = f"{where}{_key(key)}"
+                    at = f"{where}{_shown_key(key)}"
                     raise InputError(f"{source}: {at} = {shown(value)}: must be a whole number of at most 64 bits")
         level = below
         if not level:
@@ -233,7 +365,7 @@ def check_plain(table: Mapping[str, Any], source: str) -> None:
     raise InputError(f"{source}: {where}: nested deeper than {_DEEPEST_TABLE} tables or lists")
 
 
-def _key(key: object) -> str:
+def _shown_key(key: object) -> str:
     return str(key) if isinstance(key, int) else shown_path(str(key))
 
 

@@ -8,9 +8,9 @@ A double star that Hipparcos lists as one entry is one point with the light of b
 
 from __future__ import annotations
 
+import io
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -94,14 +94,15 @@ class StarCatalogue:
         return np.asarray(moved / np.linalg.norm(moved, axis=1, keepdims=True))
 
 
-@lru_cache(maxsize=1)
+@resources.cached_with_contents(maxsize=1)
 def load_catalogue() -> StarCatalogue:
     """The packaged catalogue: every star of Hipparcos (ESA 1997) with V ≤ 7.0, 15 thousand of them.
 
     Steps of the table: 1 mas, 1 mas/year, 0.01 mag in V, 0.001 mag in B−V. Raises InputError where the
     installation lacks the file.
     """
-    with np.load(resources.data_dir("catalogues") / "stars.npz") as table:
+    data = resources.read_input(resources.data_dir("catalogues") / "stars.npz", "star catalogue")
+    with np.load(io.BytesIO(data)) as table:
         columns = {name: table[name].astype(np.float64) for name in table.files}
     return StarCatalogue(
         right_ascension_deg=columns["right_ascension_mas"] / 3.6e6,

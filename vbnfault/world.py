@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from . import camera as cameras
-from . import config, frames, photometry, sky, spectra, spice
+from . import config, frames, photometry, resources, sky, spectra, spice
 from .body import Body, Site, Sites, load_body, site_at
 from .camera import Camera
 from .config import BodyTable, CameraTable, OrbitTable, PoseTable, SceneConfig, SpiceTable, SunTable
@@ -45,7 +44,7 @@ _STAR_SIGMA_PX = 0.6
 # --- Sun and ephemeris --------------------------------------------------------------------------------------
 
 
-@lru_cache(maxsize=8)
+@resources.cached_with_contents(maxsize=8)
 def _ephemeris(
     sun: SunTable, body: BodyTable, orbit: OrbitTable | None, kernels: SpiceTable
 ) -> tuple[tuple[float, ...], tuple[float, ...]]:
@@ -86,7 +85,7 @@ def epoch_jd(scene: SceneConfig, site: int, share: float) -> float:
     return start if end is None else start + (end - start) * (site + share) / scene.dataset.sites
 
 
-@lru_cache(maxsize=256)
+@resources.cached_with_contents(maxsize=256)
 def _spacecraft_pose(table: SpiceTable, julian_date: float) -> spice.Pose:
     axes = None if table.camera_axes is None else np.array(table.camera_axes).reshape(3, 3)
     with spice.kernels(*table.kernels):
@@ -293,7 +292,7 @@ def _three_colours(c: CameraTable) -> Detector:
     )
 
 
-@lru_cache(maxsize=4)
+@resources.cached_with_contents(maxsize=4)
 def mosaic_sensor(c: CameraTable) -> Sensor:
     """The sensor that a camera names, at the camera's temperature. Raises InputError."""
     try:
@@ -342,7 +341,7 @@ def _thin_lens(c: CameraTable, pixel_pitch_um: float) -> ThinLens:
     )
 
 
-@lru_cache(maxsize=4)
+@resources.cached_with_contents(maxsize=4)
 def real_lens(c: CameraTable, pixel_pitch_um: float) -> RealLens:
     """Return the prescription that a camera names, scaled to its field of view and closed to its f-number.
 

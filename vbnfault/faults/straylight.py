@@ -25,7 +25,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Any
 
 import cv2
@@ -34,7 +33,7 @@ from numpy.typing import NDArray
 
 from ..errors import VbnfaultError
 from ..quantities import LUMINANCE
-from ..resources import data_dir
+from ..resources import cached_with_contents, data_dir, read_input
 from .base import Fault, FaultContext, Interval, Params, bounds, intensity_dn, number, plus, rows
 from .flare_textures import FILL
 
@@ -264,11 +263,11 @@ def _stamp(
     return (slice(y0, y1), slice(x0, x1)), np.asarray(stamp, dtype=np.float32).reshape(*stamp.shape[:2], -1)
 
 
-@lru_cache(maxsize=16)
+@cached_with_contents(maxsize=16)
 def pyramid(name: str) -> tuple[NDArray[np.float32], ...]:
     """A packaged texture, RGB float32[y, x, 3] in [0, 1], and its halvings by 2×2 means; read-only."""
     path = data_dir("textures") / f"{name}.png"
-    image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    image = cv2.imdecode(np.frombuffer(read_input(path, "texture"), np.uint8), cv2.IMREAD_UNCHANGED)
     if image is None or image.dtype != np.uint16 or image.ndim != 3:
         raise VbnfaultError(f"{path}: missing or damaged; install vbnfault again")
     levels = [np.ascontiguousarray(image[..., ::-1], dtype=np.float32) / np.float32(65535)]

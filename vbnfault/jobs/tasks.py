@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from .. import stages
 from .. import store as store_module
-from ..errors import VbnfaultError
+from ..errors import InputChanged, VbnfaultError
 from ..interrupts import finishing
 from ..quantities import Sample
 from ..store import Encoded, Planned, SampleDigests, Store
@@ -229,7 +229,10 @@ class Lazy:
                 raise Fatal(error) from error
             except Exception as error:
                 raise Fatal(VbnfaultError(describe(error).splitlines()[0])) from error
-        return self._session.simulate(index)
+        try:
+            return self._session.simulate(index)
+        except InputChanged as error:  # no other sample would be any better
+            raise Fatal(error) from error
 
 
 class Fatal(BaseException):

@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import fft
 from scipy.interpolate import PchipInterpolator
 
+from .. import resources
 from .aperture import stopped_down
 from .first_order import scaled_to_focal_length
 from .imaging import RealLens
@@ -91,7 +92,7 @@ class Frame:
         return beams(lens.prescription, _MARGIN * float(slope[0, 0]), lens.sensor_mm)
 
 
-@lru_cache(maxsize=8)
+@resources.cached_with_contents(maxsize=8)
 def _scaled(name: str, focal_length_mm: float, f_number: float, frame: Frame) -> RealLens:
     lens = scaled_to_focal_length(load_lens(name), focal_length_mm)
     return RealLens(
