@@ -87,12 +87,8 @@ def test_a_worker_refuses_a_file_that_is_not_the_planned_one(files: dict[str, Pa
         LOADED[kind](there().session)
     change(kind, files[kind])
     late = pickle.loads(pickle.dumps(there))
-    with (
-        late.contents.in_use(),
-        pytest.raises(
-            InputChanged, match=rf"{files[kind].name}: \w+ file has changed since the build began; .*back"
-        ),
-    ):
+    sentence = rf"{files[kind].name}: \w+ file has changed since the build began; .*back"
+    with late.contents.in_use(), pytest.raises(InputChanged, match=sentence):
         LOADED[kind](late().session)
     files[kind].unlink()
     with late.contents.in_use(), pytest.raises((InputChanged, InputError), match=files[kind].name):
@@ -110,15 +106,15 @@ def test_kernels_are_those_of_the_plan_also_where_a_meta_kernel_names_them(tmp_p
     contents.complete()
     late = pickle.loads(pickle.dumps(contents))
     kernel.write_text(KERNEL.format(2))
+    sentence = r"one.tpc: SPICE .*kernel file has changed since"
     for one in (contents, late):
-        with one.in_use(), pytest.raises(InputChanged, match="one.tpc: SPICE .*kernel file has changed since"):
-            with spice.kernels(meta):
-                pass
+        with one.in_use(), pytest.raises(InputChanged, match=sentence), spice.kernels(meta):
+            pass
     other = tmp_path / "two.tpc"
     other.write_text(KERNEL.format(1))
-    with late.in_use(), pytest.raises(InputChanged, match="two.tpc: .* was not there, or not used, when the build"):
-        with spice.kernels(other):
-            pass
+    sentence = r"two.tpc: .* was not there, or not used, when the build"
+    with late.in_use(), pytest.raises(InputChanged, match=sentence), spice.kernels(other):
+        pass
 
 
 @pytest.mark.parametrize("workers", [1, 2])
@@ -137,7 +133,7 @@ def test_a_mesh_replaced_during_a_build_ends_it_with_nothing_wrong_written(
         dataset.build_scene(scene_of(files), out, source="test", workers=workers)
     assert e.value.exit_code == 1
     assert store.open_store(out).finished() == 0
-    with pytest.raises(InputError, match="holds another dataset: scene.body.shape"):
+    with pytest.raises(InputError, match=r"holds another dataset: scene.body.shape"):
         dataset.build_scene(scene_of(files), out, source="test")
 
 

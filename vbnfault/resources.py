@@ -11,6 +11,7 @@ import contextlib
 import hashlib
 import os
 import stat
+import sys
 import tomllib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextvars import ContextVar
@@ -367,6 +368,18 @@ def check_plain(table: Mapping[str, Any], source: str) -> None:
 
 def _shown_key(key: object) -> str:
     return str(key) if isinstance(key, int) else shown_path(str(key))
+
+
+def import_path() -> list[str]:
+    """Return the import path for a process that this one starts: its own, without the working folder.
+
+    Python puts the working folder first under `python -m` and at the prompt: a file `random.py` among a user's data
+    would be run. It stays where PYTHONPATH names it, and last where vbnfault itself lies in it.
+    """
+    here, package = os.path.realpath(os.getcwd()), os.path.realpath(_PACKAGE.parent)
+    wanted = {os.path.realpath(p) for p in os.environ.get("PYTHONPATH", "").split(os.pathsep) if p}
+    path = [p for p in sys.path if isinstance(p, str) and (os.path.realpath(p or here) != here or here in wanted)]
+    return [*path, package] if here == package and here not in wanted else path
 
 
 def data_dir(kind: str) -> Path:

@@ -314,7 +314,7 @@ class _Reader:
 
     def __init__(self) -> None:
         self.owner = os.getpid()
-        paths = [path for path in sys.path if isinstance(path, str)]
+        paths = resources.import_path()
         self.process = subprocess.Popen(
             [
                 sys.executable,

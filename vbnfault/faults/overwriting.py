@@ -63,7 +63,6 @@ class TextureOverwriting(Fault):
     def draw(self, context: FaultContext, rng: np.random.Generator) -> Params:
         """Nothing is random: the settings, and the SHA-256 of the texture file."""
         return {
-            "texture_file": self.texture_file,
             "sha256": resources.sha256(resources.read_input(self.texture_file, "texture")),
             "channels": self.channels,
             "blend": self.blend,
@@ -72,7 +71,7 @@ class TextureOverwriting(Fault):
 
     def apply(self, quantity: Any, params: Params, context: FaultContext) -> Any:
         """The image with the texture blended in."""
-        texture, alpha = _fitted(params, context)
+        texture, alpha = self._fitted(params, context)
         where = np.flatnonzero(self._mask(params, context))
         out = quantity.array.copy()
         flat = out.reshape(-1, 4)
@@ -93,12 +92,12 @@ class TextureOverwriting(Fault):
         mask: NDArray[np.bool_] = self._mask(params, context).copy()
         return mask
 
+    def _fitted(self, params: Params, context: FaultContext) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        # the parameters hold the texture's content, not its name: a renamed file gives the same dataset
+        return _stretch(self.texture_file, params["sha256"], context.shape)
+
     def _mask(self, params: Params, context: FaultContext) -> NDArray[np.bool_]:
-        return context.once("overwriting.mask", params, lambda: _mask(params, *_fitted(params, context)))
-
-
-def _fitted(params: Params, context: FaultContext) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    return _stretch(params["texture_file"], params["sha256"], context.shape)
+        return context.once("overwriting.mask", params, lambda: _mask(params, *self._fitted(params, context)))
 
 
 def _mask(params: Params, texture: NDArray[np.float32], alpha: NDArray[np.float32]) -> NDArray[np.bool_]:

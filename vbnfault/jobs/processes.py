@@ -17,6 +17,7 @@ from typing import Any
 from .. import interrupts
 from .. import store as store_module
 from ..errors import VbnfaultError
+from ..resources import import_path
 from .tasks import Fatal, Lazy, Run, SessionFactory, Task, work
 
 _SECONDS_TO_STOP = 60.0  # for the samples in hand to be written; a second Ctrl-C waits no longer
@@ -121,15 +122,10 @@ def _environment(threads: int) -> Iterator[None]:
 def _without_working_folder() -> Iterator[None]:
     """Keep the working folder out of the import path of processes started within.
 
-    They get this process's path, in which Python puts the working folder first under `python -m` and at the prompt:
-    a file `random.py` of the user's data would be run. PYTHONSAFEPATH does the same for what they import before.
+    PYTHONSAFEPATH does the same for what they import before they have it.
     """
-    here, package = os.path.realpath(os.getcwd()), str(Path(__file__).resolve().parents[2])
-    wanted = {os.path.realpath(p) for p in os.environ.get("PYTHONPATH", "").split(os.pathsep) if p}
     before = sys.path.copy()
-    sys.path[:] = [p for p in before if os.path.realpath(p or here) != here or here in wanted]
-    if here == os.path.realpath(package) and package not in sys.path:
-        sys.path.append(package)  # vbnfault itself lies here, but nothing here goes before other libraries
+    sys.path[:] = import_path()
     try:
         yield
     finally:
