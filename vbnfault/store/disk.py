@@ -110,6 +110,8 @@ def write(root: Path, files: Iterable[tuple[str, bytes]]) -> None:
             flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0)
             opened.append(os.open(partial, flags, 0o666))
             _write_all(opened[-1], content)
+        if not written:
+            return
         _at_once(_flush, opened)
         while opened:
             os.close(opened.pop())

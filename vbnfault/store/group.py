@@ -39,7 +39,7 @@ from .schema import FORMAT_VERSION, SCALARS, StoreSpec, spec_from_plain
 
 # what a damaged file gives, unlike one that the system does not let us read just now
 _DAMAGE = (ValueError, FileNotFoundError, NotADirectoryError, disk.Misplaced)
-_READS = 5  # of a sample that is being rewritten, before it counts as damaged
+_READS = 3  # that do not match their checksums while nothing is rewritten: then a sample counts as damaged
 
 
 class Store:
@@ -111,7 +111,10 @@ class Store:
         if not 0 <= index < self.samples:
             raise InputError(f"{self.path}: sample {index} does not exist; the range is 0 to {self.samples - 1}")
         names = (*self.spec.pixel_layers, *SCALARS)
-        for _ in range(_READS):
+        file = self.file("done", index // self.spec.shard_samples)
+        mismatches = 0
+        while mismatches < _READS:
+            stamp = _stamp(file)
             if not self.read("done", index, index + 1)[0]:
                 raise InputError(f"{self.path}: sample {index} is not finished yet; the build command resumes")
             crcs = self.read("crc32c", index, index + 1)[0].tolist()
@@ -121,6 +124,8 @@ class Store:
             if [*found, crc_of_scalars(scalars)] == crcs:
                 layers = {name: one[name] for name in self.spec.pixel_layers}
                 return Sample(index=index, layers=layers, scalars=scalars)
+            # whoever rewrites the sample replaces the file of `done` first
+            mismatches += _stamp(file) == stamp
         raise VbnfaultError(
             f"{self.path}: sample {index} does not match its stored crc32c; the build command repairs it"
         )
@@ -156,8 +161,18 @@ class Store:
         return sorted(n for n in numbers if n < self.shards)
 
     def finished(self) -> int:
-        """How many samples say that they are finished."""
-        return sum(sum(self.done(n).values()) for n in self.begun())
+        """Return how many samples say that they are finished."""
+        total, whole = 0, self.samples // self.spec.shard_samples
+        counts: dict[bytes, int] = {}  # most files are alike: 125,000 of them take 4 s
+        for number in self.begun():
+            try:
+                data = disk.read(self.file("done", number))
+                if data not in counts or number >= whole:
+                    counts[data] = sum(self.done(number).values())
+            except OSError:
+                continue
+            total += counts[data]
+        return total
 
     def file_name(self, name: str, number: int) -> str:
         """Return the name below the store of the file of a shard: of a layer its chunks, of a scalar its one
@@ -259,6 +274,15 @@ class Store:
                 values = {i: e.crc32c if name == "crc32c" else e.scalars[name] for i, e in given.items()}
                 values |= {i: columns[name][i - first] for i in kept}
                 yield self.file_name(name, number), self._column_bytes(name, number, values)
+
+
+def _stamp(file: Path) -> tuple[int, int] | None:
+    """Return what changes when a file is replaced, None where there is none."""
+    try:
+        status = os.stat(file)
+    except OSError:
+        return None
+    return status.st_ino, status.st_mtime_ns
 
 
 # --- create, open, write ----------------------------------------------------------------------------------

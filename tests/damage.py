@@ -1,0 +1,348 @@
+"""Flip single bits of stores and of cached terrain, at random: each flip is found and mended, or is harmless.
+
+    python tests/damage.py --count 2000 [--seed 0]
+    python tests/damage.py --operations         every operation of the disk fails once, instead
+
+A flip is found where `verify` reports a problem (of a cached patch: where the patch is built again), harmless where
+nothing that a reader sees has changed. Whatever is found, the build command mends: then all is as it was. The exit
+code is 1 where a flip was neither.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import errno
+import io
+import json
+import os
+import sys
+import tempfile
+import threading
+import types
+import warnings
+from collections import Counter
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+import zarr
+from test_store import fake_sample, make_spec
+
+from vbnfault import build as bd
+from vbnfault import store as st
+from vbnfault.body import Body, cache, choose_sites
+from vbnfault.body.patch import build_patch
+from vbnfault.errors import VbnfaultError
+from vbnfault.quantities import Sample
+from vbnfault.store import disk
+
+SAMPLES = 4
+COARSE = {"seed": 3, "facet_m": 20.0, "radius_m": 60.0, "min_boulder_m": 8.0, "max_triangles": 60_000}
+
+
+def spec() -> st.StoreSpec:
+    """A small spec, two samples a shard."""
+    return make_spec(16, layers=("depth_m",), shard_samples=2)
+
+
+def sample(index: int) -> Sample:
+    """A sample of the small spec; all are of one site."""
+    return fake_sample(spec(), index, site=0)
+
+
+@dataclass(frozen=True)
+class Session:
+    """Makes the samples of the store, without rendering."""
+
+    def __call__(self) -> Session:
+        return self
+
+    def simulate(self, index: int) -> Sample:
+        return sample(index)
+
+
+def build(path: Path) -> None:
+    """Build the store, or mend it."""
+    bd.build(Session(), spec(), path, site=np.zeros(SAMPLES, dtype=int), progress=False)
+
+
+def mend(path: Path, samples: int = SAMPLES) -> None:
+    """Do what the build command does, without lock, progress and processes."""
+    store = st.recover(path)
+    if store.samples < samples:
+        store = st.append_samples(store, samples - store.samples, {"blocks": [SAMPLES, samples - SAMPLES]})
+    st.write_samples(store, [sample(i) for i in st.problem_samples(store)])
+
+
+def seen(path: Path) -> dict[str, Any]:
+    """Return all that a reader sees of a store: metadata, coordinates, and the decoded samples as their digest."""
+    documents = {str(p.relative_to(path)): json.loads(p.read_bytes()) for p in sorted(path.rglob("zarr.json"))}
+    spec = st.open_store(path).spec
+    names = spec.coordinates(SAMPLES)
+    coordinates = {name: zarr.open_array(path / name, mode="r")[:].tolist() for name in names}
+    return {
+        "documents": json.dumps(documents, sort_keys=True),
+        "coordinates": coordinates,
+        "digest": st.digest(path),
+    }
+
+
+@contextlib.contextmanager
+def flipped(file: Path, place: int, bit: int) -> Iterator[None]:
+    """Flip a bit of a file; whoever leaves its content alone finds it as it was afterwards."""
+    good = file.read_bytes()
+    wrong = bytearray(good)
+    wrong[place] ^= 1 << bit
+    file.write_bytes(wrong)
+    yield
+    if file.is_file() and file.read_bytes() == wrong:
+        file.write_bytes(good)
+
+
+def flip_in_store(path: Path, before: dict[str, Any], rng: np.random.Generator) -> str:
+    """Flip a bit of a random file of the store and say what came of it."""
+    files = sorted(p for p in path.rglob("*") if p.is_file() and p.stat().st_size)
+    size = np.array([p.stat().st_size for p in files], dtype=float)
+    # every file as likely, or every byte: small files are many, large ones few
+    chance = size / size.sum() if rng.random() < 0.5 else np.full(len(files), 1 / len(files))
+    file = files[int(rng.choice(len(files), p=chance))]
+    place, bit = int(rng.integers(file.stat().st_size)), int(rng.integers(8))
+    where = f"{file.relative_to(path)}: byte {place}, bit {bit}"
+    with flipped(file, place, bit):
+        if not st.verify(path):
+            return "harmless" if seen(path) == before else f"MISSED {where}"
+        build(path)
+        problems = st.verify(path)
+        if problems or seen(path) != before:
+            return f"NOT MENDED {where}: {problems}"
+    return "found and mended"
+
+
+def flip_in_cache(folder: Path, read: Callable[[], tuple[bool, bool]], rng: np.random.Generator) -> str:
+    """Flip a bit of the cached patch and say what came of it."""
+    (file,) = folder.glob("patch-*.patch")
+    place, bit = int(rng.integers(file.stat().st_size)), int(rng.integers(8))
+    with flipped(file, place, bit):
+        same, was_built = read()
+        if not same:
+            return f"MISSED {file.name}: byte {place}, bit {bit}"
+        if not was_built:
+            return "harmless"
+        if read() != (True, False):
+            return f"NOT MENDED {file.name}: byte {place}, bit {bit}"
+    return "found and mended"
+
+
+def terrain(folder: Path) -> Callable[[], tuple[bool, bool]]:
+    """Fill a cache with one patch; return what reads it: is it the same, and was it built again?"""
+    ball = trimesh.creation.icosphere(subdivisions=3, radius=900.0)
+    body = Body(name="ball", vertices_m=np.array(ball.vertices), faces=np.array(ball.faces))
+    site = choose_sites(body, 1, seed=0)[0]
+    patch = build_patch(body, site, **COARSE)
+    key = cache.patch_key(body, site, **COARSE)
+    file = folder / f"patch-{key}.patch"
+    cache._write(file, key, patch, 2**30)
+
+    def read() -> tuple[bool, bool]:
+        try:
+            got, was_built = cache._read(file, key, site), False
+        except (OSError, ValueError):
+            got, was_built = patch, True
+            cache._write(file, key, patch, 2**30)
+        names = cache._ARRAYS
+        return all(np.array_equal(getattr(got, name), getattr(patch, name)) for name in names), was_built
+
+    return read
+
+
+def damage(count: int, seed: int, folder: Path) -> Counter[str]:
+    """Flip `count` bits, nine in ten of them in a store, the others in a cached patch; return what came of them."""
+    rng = np.random.default_rng(seed)
+    path, caches = folder / "s.zarr", folder / "cache"
+    caches.mkdir()
+    outcomes: Counter[str] = Counter()
+    with warnings.catch_warnings(), contextlib.redirect_stderr(io.StringIO()):
+        warnings.simplefilter("ignore", UserWarning)  # that the root was read from its spare
+        build(path)
+        before = seen(path)
+        read = terrain(caches)
+        for k in range(count):
+            outcomes[flip_in_cache(caches, read, rng) if k % 10 == 9 else flip_in_store(path, before, rng)] += 1
+    return outcomes
+
+
+# --- a disk that fails at its n-th operation --------------------------------------------------------------
+
+
+class FailingSystem(types.ModuleType):
+    """Stands for `os` in the store: the operation number `fails_at` raises, or writes less than asked for."""
+
+    OPERATIONS = (
+        "open",
+        "close",
+        "read",
+        "write",
+        "fsync",
+        "replace",
+        "mkdir",
+        "unlink",
+        "rmdir",
+        "scandir",
+        "stat",
+        "lstat",
+        "fstat",
+        "listdir",
+    )
+
+    def __init__(self, fails_at: int = -1, code: int = errno.EIO, short: bool = False) -> None:
+        super().__init__("os")
+        self.fails_at, self.code, self.short = fails_at, code, short
+        self.count = 0
+        self.failed = ""
+        self._lock = threading.Lock()  # flushes run in threads
+
+    def __getattr__(self, name: str) -> Any:
+        real = getattr(os, name)
+        if name not in self.OPERATIONS:
+            return real
+
+        def operation(*arguments: Any, **options: Any) -> Any:
+            with self._lock:
+                number, self.count = self.count, self.count + 1
+            if self.short and name == "write":
+                return real(arguments[0], arguments[1][: max(1, len(arguments[1]) // 2)])
+            if number != self.fails_at:
+                result = real(*arguments, **options)
+                self.noted(name, arguments, result)
+                return result
+            self.failed = name
+            if name == "close":
+                real(*arguments)
+            if name == "write":  # part of it is on the disk
+                real(arguments[0], arguments[1][: len(arguments[1]) // 2])
+            raise OSError(self.code, os.strerror(self.code))
+
+        return operation
+
+    def noted(self, name: str, arguments: tuple[Any, ...], result: Any) -> None:
+        """Is told of each operation that succeeded."""
+
+
+def create(path: Path) -> None:
+    st.create(path, spec(), SAMPLES)
+
+
+def write(path: Path) -> None:
+    """One sample of a shard whose other sample is finished: that one is kept."""
+    st.write_samples(path, [sample(2)])
+
+
+def append(path: Path) -> None:
+    st.append_samples(path, 1, {"blocks": [SAMPLES, 1]})
+
+
+def recover(path: Path) -> None:
+    st.recover(path)
+
+
+def damaged(path: Path) -> None:
+    """Something for `recover` to mend."""
+    (path / "zarr.json").write_bytes(b"{")
+    (path / "x" / "c" / "0").unlink()
+    (path / "image" / "zarr.json").unlink()
+    (path / "done" / "c" / f"0.1{disk.PARTIAL}").write_bytes(b"x")
+
+
+COMMANDS = (create, write, append, recover)
+
+
+def _prepare(command: Callable[[Path], None], folder: Path) -> Path:
+    """Make what a command works on: nothing for `create`, else a finished store."""
+    folder.mkdir()
+    path = folder / "s.zarr"
+    if command is not create:
+        create(path)
+        mend(path)
+    if command is recover:
+        damaged(path)
+    return path
+
+
+def _with(system: FailingSystem, command: Callable[[Path], None], path: Path) -> None:
+    disk.os = system  # type: ignore[assignment]
+    try:
+        command(path)
+    finally:
+        disk.os = os
+
+
+def operations(command: Callable[[Path], None], folder: Path) -> int:
+    """Return how many operations of the disk a command takes."""
+    path, system = _prepare(command, folder), FailingSystem()
+    _with(system, command, path)
+    return system.count
+
+
+def fails_at(number: int, code: int, command: Callable[[Path], None], folder: Path) -> str:
+    """Let one operation of a command fail, then run what mends; return what is wrong after that, if anything."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        path, system = _prepare(command, folder), FailingSystem(number, code)
+        with contextlib.suppress(VbnfaultError):
+            _with(system, command, path)
+        lost = set()
+        if command is not create:
+            st.open_store(path)
+            lost = set(st.problem_samples(path)) if command is write else set()
+        if not path.exists():
+            create(path)
+        samples = SAMPLES + (command is append)
+        mend(path, samples)
+        wrong = [f"also lost: {sorted(lost - {2})}"] if lost - {2} else []
+        wrong += st.verify(path)
+        for i in range(samples):
+            layers = st.open_store(path).read_sample(i).layers
+            if any(layers[name].tobytes() != array.tobytes() for name, array in sample(i).layers.items()):
+                wrong.append(f"sample {i} is another")
+        wrong += [f"left over: {p}" for p in folder.rglob(f"*{disk.PARTIAL}")]
+    return f"{command.__name__}, {system.failed} {number}: {'; '.join(wrong)}" if wrong else ""
+
+
+def every_operation() -> int:
+    """Let each operation of each command fail once, with each kind of error; return 1 where anything is lost."""
+    failed = 0
+    for command in COMMANDS:
+        with tempfile.TemporaryDirectory() as above:
+            count = operations(command, Path(above, "count"))
+        for code in (errno.EIO, errno.ENOSPC, errno.EACCES):
+            for number in range(count):
+                with tempfile.TemporaryDirectory() as above:
+                    wrong = fails_at(number, code, command, Path(above, "s"))
+                failed += bool(wrong)
+                if wrong:
+                    print(f"{errno.errorcode[code]}: {wrong}")
+        print(f"{command.__name__}: {count} operations, each failed with 3 errors")
+    return int(failed > 0)
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--count", type=int, default=2000, help="number of bits to flip, one after the other")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--operations", action="store_true", help="let every operation of the disk fail instead")
+    arguments = parser.parse_args()
+    if arguments.operations:
+        return every_operation()
+    with tempfile.TemporaryDirectory() as folder:
+        outcomes = damage(arguments.count, arguments.seed, Path(folder))
+    for outcome, many in outcomes.most_common():
+        print(f"{many:6d} {outcome}")
+    return int(any(outcome.startswith(("MISSED", "NOT MENDED")) for outcome in outcomes))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
