@@ -1,0 +1,53 @@
+"""The fuzz command itself: that it notices what it looks for."""
+
+from __future__ import annotations
+
+import random
+from pathlib import Path
+
+import fuzz
+import pytest
+
+from vbnfault import cli
+from vbnfault.errors import InputError
+
+
+def outcome(monkeypatch: pytest.MonkeyPatch, folder: Path, main: object) -> str:
+    """The problem that the command finds with a case in which the program does as `main`."""
+    monkeypatch.setattr(fuzz, "CASES", {"scene": (lambda seeds, rng, here: (["list", "scenes"], {}), 1)})
+    monkeypatch.setattr(cli, "main", main)
+    seeds = object.__new__(fuzz.Seeds)
+    seeds.folder = folder
+    return str(fuzz.attempt(seeds, "s", 0)["problem"])
+
+
+def test_tracebacks_silence_and_endless_messages_are_noticed(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    def refuse(text: str) -> None:
+        raise InputError(text)
+
+    def endless() -> None:
+        cli.typer.echo("x" * 10_000, err=True)
+        raise SystemExit(2)
+
+    assert outcome(monkeypatch, tmp_path, lambda: None) == ""
+    assert outcome(monkeypatch, tmp_path, lambda: 1 / 0) == "exit code -1"
+    assert outcome(monkeypatch, tmp_path, lambda: refuse("a bug: main did not catch it")) == "exit code -1"
+    assert (
+        outcome(monkeypatch, tmp_path, lambda: (_ for _ in ()).throw(SystemExit(2))) == "exit code 2 without a word"
+    )
+    assert "characters" in outcome(monkeypatch, tmp_path, endless)
+
+
+def test_damage_is_keyed_and_never_nothing() -> None:
+    table = {"a": {"b": [1, 2.5, "text"]}, "c": True}
+    differ = 0
+    for number in range(200):
+        one, same = (fuzz.changed(table, random.Random(f"s/{number}")) for _ in range(2))
+        assert fuzz.toml_value(one) == fuzz.toml_value(same)
+        differ += fuzz.toml_value(one) != fuzz.toml_value(table)
+    assert differ > 180
+    assert table == {"a": {"b": [1, 2.5, "text"]}, "c": True}
+    data = bytes(range(256))
+    assert sum(fuzz.flipped(data, random.Random(k), data) != data for k in range(200)) > 180
