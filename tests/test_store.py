@@ -80,7 +80,8 @@ def fake_sample(spec: st.StoreSpec, index: int, site: int | None = None) -> Samp
         "tries": 1,
         "stratum": index % 2,
         "site": site,
-        "split": site % 3,
+        "split": st.SPLITS[site % 3],
+        "resolved": True,
         "parameters": {
             f: {"amplitude": 0.5, "x": index} for f, on in zip(spec.faults, injected, strict=True) if on
         },
@@ -381,8 +382,8 @@ def test_labels_that_contradict_each_other_are_found(whole: st.Store) -> None:
     fewer = {k: v for k, v in sample.scalars["parameters"].items() if k != FAULTS[on]}
     (sentence,) = relabelled(whole, 1, parameters=fewer)
     assert sentence == f"sample 1: {FAULTS[on]} has no parameters, although marked in injected"
-    (sentence,) = relabelled(whole, 1, split=2)
-    assert sentence == "sample 1: split = 2, but sample 0 of the same site site-0 has 0"
+    (sentence,) = relabelled(whole, 1, split="test")
+    assert sentence == "sample 1: split = test, but sample 0 of the same site site-0 has train"
     assert relabelled(whole, 1) == []
 
 
@@ -420,7 +421,7 @@ def test_one_pass_gives_problems_digest_and_counts(whole: st.Store, monkeypatch:
     i, off = (int(n[0]) for n in np.nonzero(~commanded))
     commanded[i, off] = True
     told: list[int] = []
-    report = st.examine(whole, expected=lambda i: {"injected": commanded[i]}, progress=told.append)
+    report = st.examine(whole, expected=lambda i, _: {"injected": commanded[i]}, progress=told.append)
     assert len(decoded) == 10 * len(whole.spec.pixel_layers)
     assert told == [4, 4, 2]
     assert report.problems == []
@@ -438,7 +439,7 @@ def test_one_pass_gives_problems_digest_and_counts(whole: st.Store, monkeypatch:
     row = next(line for line in report.counts.lines() if line.startswith(FAULTS[off]))
     here = commanded[[k for k, s in enumerate(splits) if s == splits[i]], off].sum()
     assert f"{here - 1} of {here}" in row
-    (sentence,) = st.verify(whole, expected=lambda i: {"injected": commanded[i]}, exact=True)
+    (sentence,) = st.verify(whole, expected=lambda i, _: {"injected": commanded[i]}, exact=True)
     assert sentence == f"sample {i}: {FAULTS[off]} is not injected, although the plan commands it"
 
 
@@ -454,14 +455,14 @@ def test_an_unfinished_or_damaged_store_has_no_digest_in_its_report(whole: st.St
 
 
 def test_verify_compares_with_the_plan(whole: st.Store) -> None:
-    def plan(i: int) -> dict:
+    def plan(i: int, tries: int = 0) -> dict:
         scalars = fake_sample(whole.spec, i).scalars
         return {name: scalars[name] for name in ("site", "proposal", "sun_xy_px", "julian_date", "injected")}
 
     assert st.verify(whole, expected=plan) == []
-    (sentence,) = st.verify(whole, expected=lambda i: plan(i) | ({"site": 2} if i == 3 else {}))
+    (sentence,) = st.verify(whole, expected=lambda i, _: plan(i) | ({"site": 2} if i == 3 else {}))
     assert sentence == "sample 3: site = 1 is not as planned (2)"
-    (sentence,) = st.verify(whole, expected=lambda i: plan(i) | ({"proposal": "{}"} if i == 3 else {}))
+    (sentence,) = st.verify(whole, expected=lambda i, _: plan(i) | ({"proposal": "{}"} if i == 3 else {}))
     assert sentence.startswith('sample 3: proposal = {"sun_elevation_deg": 0.3} is not as planned')
 
 
@@ -469,7 +470,7 @@ def test_a_fault_that_was_not_commanded_is_found(whole: st.Store) -> None:
     """The sample is labelled soundly in itself, its checksums are right: the plan alone says that it is wrong."""
     commanded = {i: fake_sample(whole.spec, i).scalars["injected"] for i in range(10)}
     commanded[4] = np.ones(4, bool)  # what had no effect is not injected, and that is no problem
-    assert st.verify(whole, expected=lambda i: {"injected": commanded[i]}) == []
+    assert st.verify(whole, expected=lambda i, _: {"injected": commanded[i]}) == []
     sample = fake_sample(whole.spec, 1)
     off = int(np.flatnonzero(~commanded[1])[0])
     injected, mask = commanded[1].copy(), sample.layers["mask"].copy()
@@ -477,7 +478,7 @@ def test_a_fault_that_was_not_commanded_is_found(whole: st.Store) -> None:
     changes = {"injected": injected, "mask": mask, "mask_effect": mask, "mask_any": mask[:3].any(0)}
     parameters = {**sample.scalars["parameters"], FAULTS[off]: {"amplitude": 0.1}}
     assert relabelled(whole, 1, **changes, parameters=parameters) == []
-    (sentence,) = st.verify(whole, expected=lambda i: {"injected": commanded[i]})
+    (sentence,) = st.verify(whole, expected=lambda i, _: {"injected": commanded[i]})
     assert sentence == f"sample 1: {FAULTS[off]} is injected, but the plan does not command it"
 
 

@@ -475,6 +475,9 @@ class StratumTable(Table):
     pitch_deg: _pair(-360, 720) | None = None  # type: ignore[valid-type]
     yaw_deg: _pair(-360, 720) | None = None  # type: ignore[valid-type]
     reference: Literal["sun", "nadir"] = Field("sun", description="where the boresight points at zero angles")
+    min_lit_fraction: Annotated[float, Field(ge=0, le=1)] | None = Field(
+        None, description="default: that of [geometry]"
+    )
 
 
 class GeometryTable(Table):
@@ -483,8 +486,25 @@ class GeometryTable(Table):
     x_m: _pair(-1e9, 1e9) = (-150.0, 150.0)  # type: ignore[valid-type]
     y_m: _pair(-1e9, 1e9) = (-150.0, 150.0)  # type: ignore[valid-type]
     height_m: _pair(0, 1e12) = (0.0, 100.0)  # type: ignore[valid-type]
+    height_reference: Literal["local_ground", "site"] = Field(
+        "local_ground", description="height_m counts from the ground below the camera, or from the site's level"
+    )
     clearance_m: float = Field(0.5, ge=0, le=1e9, description="least distance to any surface, else drawn again")
-    max_tries: int = Field(256, ge=1, le=100_000)
+    sun_visibility: Literal["required", "as_drawn"] = Field(
+        "required",
+        description="of the Sun in samples with straylight: required whole and before the camera, else the view is "
+        "drawn again; or left as drawn, and straylight is not injected where the Sun is hidden",
+    )
+    min_lit_fraction: float = Field(
+        0.0,
+        ge=0,
+        le=1,
+        description="least fraction of the frame that shows sunlit ground, by a grid of rays, else drawn again; "
+        "not for cameras that SPICE places",
+    )
+    max_tries: int = Field(
+        256, ge=1, le=100_000, description="views drawn until one meets all conditions; the sample fails after them"
+    )
     sun_facing: StratumTable | None = None
     sun_averted: StratumTable | None = None
 
@@ -500,6 +520,17 @@ class PlanTable(Table):
     ] = (1, 6)
     sun_facing_nominal_fraction: float = Field(
         0.0, ge=0, le=1, description="share of all samples that face the Sun without straylight"
+    )
+    on_invisible: Literal["redraw_view", "drop"] = Field(
+        "redraw_view",
+        description="where a commanded fault cannot show in a view: another view is drawn and rendered, or the "
+        "fault is recorded as not injected; where SPICE places the camera there is no other view",
+    )
+    max_views: int = Field(16, ge=1, le=1000, description="views rendered for a sample; it fails after them")
+    pair_strata: bool = Field(
+        False,
+        description="Sun-facing and Sun-averted samples share a target attitude in pairs, as in the paper; needs "
+        "geometry.sun_visibility = 'as_drawn', since the Sun of a pair is not drawn again",
     )
 
 
@@ -536,7 +567,7 @@ class SceneConfig(Table):
     def _strata(self) -> SceneConfig:
         half, full = self.camera.fov_deg / 2, 360.0
         near, far, turn = (-half, half), (half, full - half), (0.0, full)
-        paper = {
+        paper: dict[str, dict[str, Any]] = {
             "sun_facing": {"sun_elevation_deg": (-30.0, 30.0), "roll_deg": near, "pitch_deg": near},
             "sun_averted": {"sun_elevation_deg": (-30.0, 90.0), "roll_deg": far, "pitch_deg": far},
         }
@@ -544,9 +575,15 @@ class SceneConfig(Table):
         for name, bounds in paper.items():
             given = getattr(self.geometry, name) or StratumTable()
             bounds |= {"sun_azimuth_deg": turn, "yaw_deg": turn}
+            bounds["min_lit_fraction"] = self.geometry.min_lit_fraction
             unset = {key: value for key, value in bounds.items() if getattr(given, key) is None}
             strata[name] = given.model_copy(update=unset)
         object.__setattr__(self, "geometry", self.geometry.model_copy(update=strata))
+        if self.plan.pair_strata and self.geometry.sun_visibility != "as_drawn":
+            raise ValueError(
+                f"plan.pair_strata = true: needs geometry.sun_visibility = 'as_drawn', not "
+                f"{self.geometry.sun_visibility!r}: the Sun of a pair is not drawn again"
+            )
         return self
 
     def resolved(self) -> dict[str, Any]:

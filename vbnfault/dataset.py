@@ -197,13 +197,20 @@ def _detector(detector: Detector | MosaicDetector) -> dict[str, Any]:
 
 
 def is_exact(attributes: Mapping[str, Any]) -> bool:
-    """Return whether the plan of a stored scene is met exactly: every commanded fault is injected."""
-    return bool(attributes["scene"].get("plan", {}).get("on_invisible") == "redraw_view")
+    """Return whether the plan of a stored scene is met exactly: every commanded fault is injected.
+
+    It is not where another view may not be taken: as `plan.on_invisible` says, where SPICE places the camera, and
+    where the Sun stays as drawn.
+    """
+    scene = attributes["scene"]
+    redraws = scene.get("plan", {}).get("on_invisible") == "redraw_view"
+    as_drawn = scene.get("geometry", {}).get("sun_visibility") == "as_drawn"
+    return bool(redraws and not as_drawn and not scene.get("spice", {}).get("spacecraft"))
 
 
-def planned(attributes: Mapping[str, Any], faults: Sequence[str]) -> Callable[[int], dict[str, Any]]:
-    """What the plan of a stored scene says of a sample: the scalars that rendering cannot change, and the
-    commanded faults as `injected`."""
+def planned(attributes: Mapping[str, Any], faults: Sequence[str]) -> Callable[[int, int], dict[str, Any]]:
+    """What the plan of a stored scene says of a sample that kept the view of so many `tries`: the scalars that
+    rendering cannot change, and the commanded faults as `injected`."""
     stored = {key: value for key, value in attributes["scene"].items() if key != "textures_sha256"}
     stored["body"] = {key: value for key, value in stored["body"].items() if key != "shape_sha256"}
     # what is added to the tables of a scene's identity is no key of a scene
@@ -217,17 +224,18 @@ def planned(attributes: Mapping[str, Any], faults: Sequence[str]) -> Callable[[i
     scene = config.parse_scene(stored, source="the store's own scene")
     table = plan.make_plan(scene, faults, attributes["blocks"])
 
-    def expected(index: int) -> dict[str, Any]:
-        drawn = {name: float(table.variables[name][index]) for name in plan.VARIABLES}
+    def expected(index: int, tries: int) -> dict[str, Any]:
+        drawn = table.view(scene, index, tries - 1)
         # where SPICE places camera and Sun, they are not the plan's
-        angles = () if scene.spice.spacecraft else ("sun_azimuth_deg", "roll_deg", "pitch_deg", "yaw_deg")
+        names = ("sun_azimuth_deg", "sun_elevation_deg", "roll_deg", "pitch_deg", "yaw_deg")
+        angles = () if scene.spice.spacecraft else names
         return {
             **{name: drawn[name] for name in angles},
             "stratum": int(table.stratum[index]),
             "site": int(table.site[index]),
-            "split": int(table.split[index]),
+            "split": plan.SPLITS[table.split[index]],
             "detector_individual": int(table.individual[index]),
-            "proposal": proposal(scene, table, index),
+            "proposal": proposal(scene, table, index, drawn),
             "injected": table.injected[index],
         }
 

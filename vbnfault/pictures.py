@@ -32,8 +32,8 @@ def photograph(frame: Frame) -> None:
     is in the pixels and labels never claim more.
     """
     spec = frame.spec
-    commanded = [name for name in spec.faults if spec.plan.injects(name)[spec.index]]
-    if not frame.pose.resolved:
+    commanded = list(spec.commanded)
+    if not frame.pose.resolved or frame.pose.sun_visible_fraction == 0:
         commanded = [name for name in commanded if not spec.faults[name].needs_sun]
     # noise and the clean picture need one core, the faults' optics another
     undisturbed = _signal(frame, {}, [])
@@ -74,8 +74,12 @@ def _expose_clean(frame: Frame, signal: Electrons) -> tuple[Any, RGBI]:
 
 
 def _draw(frame: Frame, commanded: Sequence[str], attempt: int) -> None:
-    """Draw the commanded faults that are not drawn yet, those first of which others should know."""
+    """Draw the commanded faults that are not drawn yet, those first of which others should know.
+
+    Another view of the sample goes on with other draws: what cannot show in one need not be tried in the next.
+    """
     faults = frame.spec.faults
+    attempt += (frame.views - 1) * _DRAW_TRIES
     for name in sorted(commanded, key=lambda n: type(faults[n]).inform is Fault.inform):
         if name not in frame.drawn:
             generator = frame.spec.rng("fault", f"{name}/{attempt}")

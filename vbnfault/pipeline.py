@@ -2,7 +2,8 @@
 
     resolve ▶ render ▶ meter ▶ photograph ▶ label
 
-One expensive render serves every twin. A `Session` runs the stages for any sample of a scene.
+One expensive render serves every twin. Where a commanded fault cannot show, the first four are done again with
+another view. A `Session` runs the stages for any sample of a scene.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from .body import Body, Patch, Site, Sites, cached_patch, choose_sites
 from .body.refine import GROWTH_POWER
 from .camera import Camera
 from .config import SceneConfig
-from .errors import InputError
+from .errors import InputError, VbnfaultError
 from .exposure import meter, render_frame
 from .faults import Fault, dataset_order, from_dict
 from .pictures import photograph
@@ -36,8 +37,9 @@ if TYPE_CHECKING:
 # Slope an octave of the finest relief: steeper would be a wall of needles.
 _STEEPEST_DETAIL = 0.12
 
-# The stages, in physical order.
-STAGES = (resolve, render_frame, meter, photograph, label)
+# The stages, in physical order: of a view, and then of the one that is kept.
+VIEW_STAGES = (resolve, render_frame, meter, photograph)
+STAGES = (*VIEW_STAGES, label)
 
 
 def simulate(spec: SampleSpec) -> Sample:
@@ -46,11 +48,40 @@ def simulate(spec: SampleSpec) -> Sample:
 
 
 def develop_frame(spec: SampleSpec) -> Frame:
-    """All stages, everything between radiance and labels kept."""
+    """All stages, everything between radiance and labels kept.
+
+    A view in which a commanded fault cannot show is left for the sample's next one, up to `plan.max_views` views.
+    Raises VbnfaultError that names the sample and the faults where none of them will do.
+    """
     frame = Frame(spec=spec)
-    for stage in STAGES:
-        stage(frame)
-    return frame
+    while True:
+        for stage in VIEW_STAGES:
+            stage(frame)
+        unseen = _asking_for_another_view(frame)
+        if not unseen:
+            label(frame)
+            return frame
+        if frame.views == spec.scene.plan.max_views:
+            raise VbnfaultError(
+                f"sample {spec.index}: {', '.join(unseen)} cannot be seen in the last of plan.max_views = "
+                f"{frame.views} views that were rendered; change the bounds of the fault or of [geometry], raise "
+                f"max_views, or set plan.on_invisible = 'drop'"
+            )
+        frame = Frame(spec=spec, views=frame.views + 1, first_try=frame.pose.tries)
+
+
+def _asking_for_another_view(frame: Frame) -> list[str]:
+    """The commanded faults that are not in the image, although another view of the sample might show them."""
+    spec, scene = frame.spec, frame.spec.scene
+    if scene.plan.on_invisible == "drop" or scene.spice.spacecraft:
+        return []
+    # a Sun that stays where it was drawn may be hidden
+    as_drawn = scene.geometry.sun_visibility == "as_drawn"
+    return [
+        name
+        for name in spec.commanded
+        if name not in frame.drawn and not (as_drawn and spec.faults[name].needs_sun)
+    ]
 
 
 # --- a session: many samples of one scene ------------------------------------------------------------------

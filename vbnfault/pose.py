@@ -1,93 +1,187 @@
-"""Where a sample's camera and Sun are: what the plan proposes, settled against the terrain."""
+"""Where a sample's camera and Sun are: the plan's views, tried against the terrain until one can be used."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from . import frames, plan, world
-from .config import SceneConfig
+from .errors import VbnfaultError
 from .sample import Frame, Pose, SampleSpec
+from .scene import Sunlight
 
 F64 = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 
-_RESOLVE_BATCH = 8
+# Views are tried so many at a time: batches of one size share one kernel.
+_BATCH = 8
+# Rays each way over the frame that look for sunlit ground: 576, so 5 % of the frame is told to 0.9 %.
+_LIT_GRID = 24
 
 
 def resolve(frame: Frame) -> None:
-    """Settle height and Sun elevation against the terrain, by keyed tries of the proposal.
+    """Take the first of the sample's views, in the plan's order, that meets every condition.
 
-    A try is accepted when nothing lies within the clearance, when the spacecraft does not reach into the ground,
-    when a Sun-averted camera does not look at the Sun and when a straylight sample sees the whole of it. If none
-    is, the last clear one is taken. A spacecraft that SPICE places stays where it is.
+    Nothing lies within the clearance, camera and spacecraft are above the ground, a Sun-averted camera does not
+    look at the Sun, a sample whose faults need the Sun sees the whole of it, and enough of the frame is sunlit
+    ground (`geometry`). A spacecraft that SPICE places stays where it is. Raises VbnfaultError that names the
+    sample and what could not be met.
     """
+    if frame.spec.scene.spice.spacecraft:
+        frame.pose = _on_the_trajectory(frame.spec)
+        return
+    most = frame.spec.scene.geometry.max_tries
+    unmet: dict[str, int] = {}
+    for start in range(frame.first_try, frame.first_try + most, _BATCH):
+        views = _Views.of(frame.spec, start)
+        count = min(_BATCH, frame.first_try + most - start)
+        chosen = _first_usable(frame.spec, views, count, unmet)
+        if chosen is not None:
+            frame.pose = views.pose(chosen, start)
+            return
+    spec = frame.spec
+    conditions = "; ".join(f"{text} ({n} of {most} tries did not)" for text, n in unmet.items())
+    stratum = plan.STRATA[spec.plan.stratum[spec.index]]
+    raise VbnfaultError(
+        f"sample {spec.index} ({stratum}, site {spec.plan.site[spec.index]}): no view met every condition in "
+        f"geometry.max_tries = {most} tries: {conditions}; widen the bounds of [geometry], relax the condition, or "
+        f"raise max_tries"
+    )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Views:
+    """A batch of views: the plan's `variables`, and what follows from them, float64[view, ...]."""
+
+    variables: list[dict[str, float]]
+    ground_m: F64
+    height_m: F64
+    position_L_m: F64
+    L_from_C: F64
+    suns: list[Sunlight]
+    sun_visible: F64 = field(default_factory=lambda: np.ones(_BATCH))
+
+    @staticmethod
+    def of(spec: SampleSpec, start: int) -> _Views:
+        """Return the views of the tries from `start` on."""
+        from . import render
+
+        scene = spec.scene
+        drawn = [spec.plan.view(scene, spec.index, start + k) for k in range(_BATCH)]
+        x, y, height = (np.array([d[name] for d in drawn]) for name in ("x_m", "y_m", "height_m"))
+        above = max(300.0, 2 * float(np.hypot(x, y).max()))
+        ground = render.ground_height_m(spec.terrain.surface, x, y, above)
+        if scene.geometry.height_reference == "local_ground":
+            height = ground + height
+        directions = [frames.direction_L(d["sun_azimuth_deg"], d["sun_elevation_deg"]) for d in drawn]
+        light = world.sunlight(scene, directions[0])
+        suns = [replace(light, direction_L=direction) for direction in directions]
+        to_the_sun = plan.strata(scene)[spec.plan.stratum[spec.index]].reference == "sun"
+        down = np.array([0.0, 0.0, 1.0])
+        axes = [
+            frames.L_from_C(sun if to_the_sun else down, d["roll_deg"], d["pitch_deg"], d["yaw_deg"])
+            for sun, d in zip(directions, drawn, strict=True)
+        ]
+        position = np.column_stack([x, y, -height])
+        visible = render.sun_visible_fraction(spec.terrain.surface, position, suns)
+        if spec.terrain.vehicle is not None:
+            sun_B = np.stack([a.T @ d for a, d in zip(axes, directions, strict=True)])
+            visible = np.where(spec.terrain.vehicle.blocked(sun_B), 0.0, visible)
+        return _Views(
+            variables=drawn,
+            ground_m=ground,
+            height_m=height,
+            position_L_m=position,
+            L_from_C=np.stack(axes),
+            suns=suns,
+            sun_visible=visible,
+        )
+
+    def sun_angle_deg(self) -> F64:
+        """Return the angle between boresight and Sun."""
+        cosine = [axes[:, 2] @ sun.direction_L for axes, sun in zip(self.L_from_C, self.suns, strict=True)]
+        return np.asarray(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
+
+    def pose(self, k: int, start: int) -> Pose:
+        """Return one of the views as the pose of its sample."""
+        return Pose(
+            position_L_m=self.position_L_m[k],
+            L_from_C=self.L_from_C[k],
+            sun_L=self.suns[k].direction_L,
+            sun_azimuth_deg=self.variables[k]["sun_azimuth_deg"],
+            sun_elevation_deg=self.variables[k]["sun_elevation_deg"],
+            sun_visible_fraction=float(self.sun_visible[k]),
+            tries=start + k + 1,
+            variables=self.variables[k],
+            resolved=True,
+        )
+
+
+def _first_usable(spec: SampleSpec, views: _Views, count: int, unmet: dict[str, int]) -> int | None:
+    """The first of `count` views that meets every condition; else None, and `unmet` counts what failed."""
     from . import render
 
-    spec = frame.spec
-    if spec.scene.spice.spacecraft:
-        frame.pose = _on_the_way(spec)
-        return
-    scene, i = spec.scene, spec.index
-    samples, stratum = np.full(1, i), spec.plan.stratum[i : i + 1]
-    fixed = {name: float(values[i]) for name, values in spec.plan.variables.items()}
-    geometry = scene.geometry
-    start = max(300.0, 2 * float(np.hypot(fixed["x_m"], fixed["y_m"])))
-    surface = spec.terrain.surface
-    ground = float(render.ground_height_m(surface, np.array([fixed["x_m"]]), np.array([fixed["y_m"]]), start)[0])
-    needs_sun = bool(spec.plan.injects(plan.STRAYLIGHT)[i])
-    least = plan.least_sun_angle_deg(scene)
-    fallback: Pose | None = None
-    for first in range(0, geometry.max_tries, _RESOLVE_BATCH):
-        attempts = range(first, min(first + _RESOLVE_BATCH, geometry.max_tries))
-        tries = [
-            plan.propose(scene, samples, stratum, ("sun_elevation_deg", "height_m"), attempt)
-            for attempt in attempts
-        ]
-        # the first try is the proposal itself, and a batch has a fixed size: one kernel for all
-        elevation = np.array([float(t["sun_elevation_deg"][0]) for t in tries])
-        height = np.array([float(t["height_m"][0]) for t in tries])
-        position = np.column_stack(
-            [np.full(len(tries), fixed["x_m"]), np.full(len(tries), fixed["y_m"]), -(ground + height)]
-        )
-        suns = [world.sunlight(scene, frames.direction_L(fixed["sun_azimuth_deg"], e)) for e in elevation]
-        clear = render.is_clear(surface, position, geometry.clearance_m)
-        visible = render.sun_visible_fraction(surface, position, suns)
-        for k, attempt in enumerate(attempts):
-            axes = _attitude(scene, int(stratum[0]), suns[k].direction_L, fixed)
-            angle = np.degrees(np.arccos(np.clip(axes[:, 2] @ suns[k].direction_L, -1, 1)))
-            averted_ok = stratum[0] != plan.SUN_AVERTED or angle >= least
-            vehicle = spec.terrain.vehicle
-            if vehicle is not None:
-                if vehicle.blocked((axes.T @ suns[k].direction_L)[None])[0]:
-                    visible[k] = 0.0
-                if clear[k]:
-                    parts = position[k] + vehicle.outline_B_m @ axes.T
-                    clear[k] = not render.is_between(surface, position[k], parts)
-            good = bool(clear[k] and averted_ok and (not needs_sun or visible[k] == 1.0))
-            pose = Pose(
-                position_L_m=position[k],
-                L_from_C=axes,
-                sun_L=suns[k].direction_L,
-                sun_azimuth_deg=fixed["sun_azimuth_deg"],
-                sun_elevation_deg=float(elevation[k]),
-                sun_visible_fraction=float(visible[k]),
-                tries=attempt + 1,
-                resolved=good,
-            )
-            if good:
-                frame.pose = pose
-                return
-            if fallback is None or clear[k]:
-                fallback = pose
-    assert fallback is not None
-    frame.pose = replace(fallback, tries=geometry.max_tries)
+    scene, surface, vehicle = spec.scene, spec.terrain.surface, spec.terrain.vehicle
+    geometry, stratum = scene.geometry, int(spec.plan.stratum[spec.index])
+    clearance = f"geometry.clearance_m = {geometry.clearance_m:g} m to any surface"
+    met: dict[str, Mask] = {
+        "the camera above the ground": views.height_m >= views.ground_m,
+        clearance: render.is_clear(surface, views.position_L_m, geometry.clearance_m),
+    }
+    if stratum == plan.SUN_AVERTED:
+        least = plan.least_sun_angle_deg(scene)
+        met[f"the Sun at least {least:.1f} deg from the boresight"] = views.sun_angle_deg() >= least
+    if geometry.sun_visibility == "required" and any(spec.faults[name].needs_sun for name in spec.commanded):
+        # behind the camera it makes no straylight: known before anything is rendered
+        seen = (views.sun_visible == 1.0) & (views.sun_angle_deg() < 90)
+        met["the whole Sun visible before the camera, as straylight needs it"] = seen
+    good = np.logical_and.reduce(list(met.values()))
+    lit_fraction = plan.strata(scene)[stratum].min_lit_fraction
+    if lit_fraction and good[:count].any():
+        enough = _lit_fraction(spec, views) >= lit_fraction
+        met[f"geometry.min_lit_fraction = {lit_fraction:g} of the frame sunlit ground"] = enough | ~good
+        good = good & enough
+    for k in np.flatnonzero(good[:count]):
+        if vehicle is None:
+            return int(k)
+        parts = views.position_L_m[k] + vehicle.outline_B_m @ views.L_from_C[k].T
+        if not render.is_between(surface, views.position_L_m[k], parts):
+            return int(k)
+        met.setdefault("the spacecraft above the ground", np.ones(len(good), dtype=bool))[k] = False
+    for text, each in met.items():
+        failed = int(np.count_nonzero(~each[:count]))
+        if failed:
+            unmet[text] = unmet.get(text, 0) + failed
+    return None
 
 
-def _on_the_way(spec: SampleSpec) -> Pose:
-    """Camera and Sun where SPICE has them at the sample's epoch, which is its scene's."""
+def _lit_fraction(spec: SampleSpec, views: _Views) -> F64:
+    """Return the fraction of each view's frame that shows sunlit ground, by a grid of rays of a pinhole camera."""
+    from . import render
+
+    camera, vehicle = spec.scene.camera, spec.terrain.vehicle
+    at = (np.arange(_LIT_GRID) + 0.5) / _LIT_GRID * 2 - 1
+    slope = np.tan(np.radians(camera.fov_deg) / 2)
+    x, y = np.meshgrid(slope * at, slope * camera.height_px / camera.width_px * at)
+    rays_C = np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3)
+    rays_C /= np.linalg.norm(rays_C, axis=1, keepdims=True)
+    rays_L = np.einsum("vij,nj->vni", views.L_from_C, rays_C)
+    sun_L = np.stack([sun.direction_L for sun in views.suns])
+    lit = render.sunlit_ground(spec.terrain.surface, views.position_L_m, rays_L, sun_L)
+    if vehicle is not None:
+        lit &= ~vehicle.blocked(rays_C)
+    return np.asarray(lit.mean(axis=1))
+
+
+def _on_the_trajectory(spec: SampleSpec) -> Pose:
+    """Camera and Sun where SPICE has them at the sample's epoch, which is its scene's.
+
+    Such a pose is what was flown, so none is drawn in its place. A camera within the clearance of the ground means
+    that kernels and shape do not belong together: VbnfaultError. Where the Sun is hidden or behind the camera of a
+    sample whose faults need it, those are not injected, and the pose is marked as not resolved.
+    """
     from . import render
 
     scene, site, surface = spec.scene, spec.terrain.site, spec.terrain.surface
@@ -100,7 +194,14 @@ def _on_the_way(spec: SampleSpec) -> Pose:
     if spec.terrain.vehicle is not None and spec.terrain.vehicle.blocked((axes.T @ sun_L)[None])[0]:
         visible = 0.0
     azimuth, elevation = frames.azimuth_elevation_deg(sun_L)
-    clear = bool(render.is_clear(surface, position[None], scene.geometry.clearance_m)[0])
+    clearance = scene.geometry.clearance_m
+    if not render.is_clear(surface, position[None], clearance)[0]:
+        raise VbnfaultError(
+            f"sample {spec.index}: at Julian date {scene.sun.julian_date:.6f} spice.spacecraft = "
+            f"{scene.spice.spacecraft!r} is within geometry.clearance_m = {clearance:g} m of the ground; choose "
+            f"other dates, or the body.shape that the kernels were made for"
+        )
+    needs_sun = any(spec.faults[name].needs_sun for name in spec.commanded)
     return Pose(
         position_L_m=position,
         L_from_C=axes,
@@ -109,11 +210,6 @@ def _on_the_way(spec: SampleSpec) -> Pose:
         sun_elevation_deg=elevation,
         sun_visible_fraction=visible,
         tries=1,
-        resolved=clear and (visible == 1.0 or not spec.plan.injects(plan.STRAYLIGHT)[spec.index]),
+        variables=spec.plan.view(scene, spec.index, 0),
+        resolved=not needs_sun or (visible == 1.0 and float(axes[:, 2] @ sun_L) > 0),
     )
-
-
-def _attitude(scene: SceneConfig, stratum: int, sun_L: F64, fixed: Mapping[str, float]) -> F64:
-    down = np.array([0.0, 0.0, 1.0])
-    reference = sun_L if plan.strata(scene)[stratum].reference == "sun" else down
-    return frames.L_from_C(reference, fixed["roll_deg"], fixed["pitch_deg"], fixed["yaw_deg"])

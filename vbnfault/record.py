@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -70,8 +71,7 @@ def to_sample(frame: Frame) -> Sample:
     T_from_C = T_from_L @ pose.L_from_C
     sun_T = T_from_L @ pose.sun_L
     sun_xy = frame.context.sun_xy_px
-    fixed = {name: float(values[i]) for name, values in spec.plan.variables.items()}
-    angles = fixed["roll_deg"], fixed["pitch_deg"], fixed["yaw_deg"]
+    angles = tuple(pose.variables[name] for name in ("roll_deg", "pitch_deg", "yaw_deg"))
     if spec.scene.spice.spacecraft:
         angles = frames.roll_pitch_yaw_deg(pose.sun_L, pose.L_from_C)
     scalars: dict[str, Any] = {
@@ -97,16 +97,18 @@ def to_sample(frame: Frame) -> Sample:
         "exposure_s": frame.camera.exposure_s,
         "samples_per_pixel": frame.samples_per_pixel,
         "noise_fraction_p99": frame.noise_fraction_p99,
-        "tries": pose.tries + int(spec.plan.attitude_tries[i]) - 1,
+        "tries": pose.tries,
+        "views": frame.views,
+        "resolved": pose.resolved,
         "stratum": int(spec.plan.stratum[i]),
         "site": int(spec.plan.site[i]),
         "lens": 0,
         "detector_individual": int(spec.plan.individual[i]),
-        "split": int(spec.plan.split[i]),
+        "split": plan.SPLITS[spec.plan.split[i]],
         "parameters": {
             name: {"model": spec.faults[name].model, **params} for name, params in sorted(frame.drawn.items())
         },
-        "proposal": proposal(spec.scene, spec.plan, i),
+        "proposal": proposal(spec.scene, spec.plan, i, pose.variables),
     }
     return Sample(index=i, layers=layers, scalars=scalars)
 
@@ -122,13 +124,12 @@ def _points_T_m(frame: Frame) -> F64:
     return np.asarray(seen_C @ T_from_C.T + camera_T_m)
 
 
-def proposal(scene: SceneConfig, table: plan.Plan, index: int) -> dict[str, Any]:
-    """What the plan proposed for a sample, before `resolve`; plain data. Where the Sun-averted attitude was
-    drawn again, the one that was kept (`tries` counts it)."""
+def proposal(scene: SceneConfig, table: plan.Plan, index: int, variables: Mapping[str, float]) -> dict[str, Any]:
+    """Return what the plan says of a sample and of the view that was kept, whose `variables` are given."""
     camera = scene.camera
     return {
-        **{name: float(values[index]) for name, values in table.variables.items()},
-        "injected": [name for name in table.faults if table.injects(name)[index]],
+        **variables,
+        "injected": list(table.commanded(index)),
         # a detector has its own
         **({} if camera.detector else {"architecture": camera.architectures[int(table.architecture[index])]}),
         "readout_direction": camera.readout_directions[int(table.readout_direction[index])],

@@ -36,7 +36,12 @@ class Terrain:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Pose:
-    """The outcome of `resolve`: where the camera and the Sun are. `tries` counts the proposals drawn."""
+    """The outcome of `resolve`: where the camera and the Sun are.
+
+    `tries` counts the views drawn, of which this is the last; `variables` are the plan's for it, by the names of
+    `plan.VARIABLES`. `resolved`: every condition is met; False only where SPICE places a camera whose sample has a
+    fault that needs the Sun, and the Sun is hidden.
+    """
 
     position_L_m: F64
     L_from_C: F64
@@ -45,6 +50,7 @@ class Pose:
     sun_elevation_deg: float
     sun_visible_fraction: float
     tries: int
+    variables: Mapping[str, float]
     resolved: bool
 
 
@@ -62,6 +68,11 @@ class SampleSpec:
     def seed(self) -> int:
         return self.scene.dataset.seed
 
+    @property
+    def commanded(self) -> tuple[str, ...]:
+        """Return the faults that the sample is commanded to carry, in dataset order."""
+        return self.plan.commanded(self.index)
+
     def rng(self, stage: str, name: str) -> np.random.Generator:
         """The generator of this sample for (stage, name)."""
         return config.rng(self.seed, self.index, stage, name)
@@ -69,9 +80,15 @@ class SampleSpec:
 
 @dataclass(kw_only=True, eq=False)
 class Frame:
-    """What the stages add to, one after the other."""
+    """What the stages add to, one after the other.
+
+    `views` counts the views of the sample that were photographed, this one included; `first_try` is the number of
+    views that were drawn before it.
+    """
 
     spec: SampleSpec
+    views: int = 1
+    first_try: int = 0
     pose: Pose = field(init=False)
     camera: Camera = field(init=False)
     sunlight: Sunlight = field(init=False)

@@ -5,7 +5,7 @@ from .detail import FineRelief
 from .integrate import radiance
 from .layers import truth
 from .light import direct
-from .resolve import ground_height_m, is_between, is_clear, sun_visible_fraction
+from .resolve import ground_height_m, is_between, is_clear, sun_visible_fraction, sunlit_ground
 from .runtime import set_threads
 from .surface import Surface
 from .vehicle import Vehicle
@@ -56,5 +56,6 @@ __all__ = [
     "self_test",
     "set_threads",
     "sun_visible_fraction",
+    "sunlit_ground",
     "truth",
 ]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -76,6 +78,30 @@ def sun_visible_fraction(surface: Surface, position_L_m: F64, suns: list[Sunligh
         d = axis + offset
         directions.append(d / np.linalg.norm(d, axis=1, keepdims=True))
     return 1 - _any_hit(surface, position_L_m, np.stack(directions), np.inf).mean(axis=1)
+
+
+def sunlit_ground(surface: Surface, position_L_m: F64, rays_L: F64, sun_L: F64) -> NDArray[np.bool_]:
+    """Return whether rays meet ground in direct sunlight, bool[view, ray].
+
+    Parameters
+    ----------
+    surface : Surface
+        The terrain; a spacecraft is not looked at.
+    position_L_m, rays_L, sun_L : float64[view, 3], float64[view, ray, 3], float64[view, 3]
+        Where each view's rays start, their unit directions, and the unit direction of its Sun.
+    """
+    views, count = rays_L.shape[:2]
+
+    def each(vectors: F64) -> Any:
+        rows = np.broadcast_to(vectors, (views, count, 3)).reshape(-1, 3).astype(np.float32)
+        return [mi.Float(np.ascontiguousarray(column)) for column in rows.T]
+
+    sun = mi.Vector3f(*each(sun_L[:, None]))
+    rays = mi.Ray3f(mi.Point3f(*each(position_L_m[:, None])), mi.Vector3f(*each(rays_L)))
+    hit = surface.intersect(rays, coherent=False)
+    facing = hit.valid & (dr.dot(hit.normal, sun) > 0)
+    lit = facing & ~surface.occluded(hit.shadow_rays(sun), facing, coherent=False)
+    return np.asarray(lit.numpy().astype(bool).reshape(views, count))
 
 
 def _any_hit(surface: Surface, position: F64, directions: F64, reach_m: float | F64) -> NDArray[np.bool_]:

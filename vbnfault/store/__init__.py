@@ -31,7 +31,7 @@ from .check import (
     verify,
 )
 from .codec import Encoded, encode, mask_union
-from .counts import FaultCounts, split_name
+from .counts import FaultCounts
 from .group import Store, create, is_store, open_store, write_samples
 from .metadata import append_samples, recover
 from .schema import (
@@ -82,7 +82,6 @@ __all__ = [
     "open_store",
     "problem_samples",
     "recover",
-    "split_name",
     "unplanned_samples",
     "verify",
     "write_samples",

@@ -4,14 +4,8 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Sequence
-from typing import Any
 
 from .schema import SPLITS
-
-
-def split_name(value: Any) -> str:
-    """The name of a stored split: the string itself, or that of an index."""
-    return str(value) if isinstance(value, str) else SPLITS[int(value)]
 
 
 class FaultCounts:
