@@ -50,7 +50,7 @@ def refuse(*args: object, **kwargs: object) -> Patch:
 def test_read_is_what_was_built(body: Body, site: Site, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     built = cached_patch(body, site, **COARSE)
     assert same(built, build_patch(body, site, **COARSE))
-    assert [path.suffix for path in folder.iterdir()] == [".npz"]
+    assert [path.suffix for path in folder.iterdir()] == [".patch"]
     monkeypatch.setattr(cache, "build_patch", _same_signature(refuse))
     read = cached_patch(body, site, **COARSE)
     assert same(read, built)
@@ -82,17 +82,73 @@ def test_key_tells_apart_what_builds_differently(body: Body, site: Site) -> None
     assert patch_key(body, site, **COARSE, relief=1) == keys[0]
 
 
-@pytest.mark.parametrize("damage", ["cut", "flip", "empty", "text"])
-def test_damaged_file_is_built_again(body: Body, site: Site, folder: Path, damage: str) -> None:
+class Built(Exception):
+    """Raised in place of building a patch."""
+
+
+def instead(*args: object, **kwargs: object) -> Patch:
+    raise Built
+
+
+def test_any_damage_means_that_the_patch_is_built_again(
+    body: Body, site: Site, folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     built = cached_patch(body, site, **COARSE)
     (path,) = folder.iterdir()
-    data = bytearray(path.read_bytes())
-    if damage == "flip":
-        data[len(data) // 2] ^= 1
-    path.write_bytes({"cut": data[: len(data) // 2], "flip": data, "empty": b"", "text": b"no zip"}[damage])
+    good = path.read_bytes()
+    other = cached_patch(body, site, **{**COARSE, "seed": 4})
+    other_file = next(p for p in folder.iterdir() if p != path)
+    assert not same(other, built)
+    capsys.readouterr()
+
+    def damaged() -> bool:
+        """Whether the patch would be built again; then the user has been told."""
+        try:
+            read = cached_patch(body, site, **COARSE)
+        except Built:
+            told = capsys.readouterr().err
+            assert told.startswith(f"note: {path}: the terrain kept there is damaged (")
+            assert len(told.splitlines()) == 1
+            return True
+        assert same(read, built)
+        return False
+
+    with monkeypatch.context() as patch:
+        patch.setattr(cache, "build_patch", _same_signature(instead))
+        assert not damaged()
+        # every bit of the header and of the checksum, and some of each array
+        rng = np.random.default_rng(1)
+        places = [*range(0, 900, 3), *rng.integers(0, len(good), 300), *range(len(good) - 40, len(good))]
+        for place in places:
+            data = bytearray(good)
+            data[place] ^= 1 << int(rng.integers(8))
+            path.write_bytes(data)
+            assert damaged(), place
+        for data in (b"", good[:-1], good[: len(good) // 2], good + b"x", b"no patch", bytes(len(good))):
+            path.write_bytes(data)
+            assert damaged()
+        path.write_bytes(other_file.read_bytes())  # whole, but another site's
+        assert damaged()
+    for make in (path.mkdir, lambda: os.mkfifo(path), lambda: path.symlink_to(folder)):
+        path.unlink() if path.is_file() else None
+        make()
+        assert same(cached_patch(body, site, **COARSE), built)
+        assert "is damaged" in capsys.readouterr().err
+        assert path.read_bytes() == good  # and written again
+        assert not path.is_symlink()
+
+
+def test_a_cache_that_cannot_be_read_is_built_again(
+    body: Body, site: Site, folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    built = cached_patch(body, site, **COARSE)
+
+    def refuse_to_read(*args: object, **kwargs: object) -> np.ndarray:
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(np, "fromfile", refuse_to_read)
     assert same(cached_patch(body, site, **COARSE), built)
-    assert path.stat().st_size == len(data)  # and written again
-    assert cache._read(path, site) is not None
+    assert "is damaged (Permission denied)" in capsys.readouterr().err
 
 
 def test_unwritable_folder_costs_nothing_but_time(
@@ -103,11 +159,11 @@ def test_unwritable_folder_costs_nothing_but_time(
     monkeypatch.setenv(cache.FOLDER_VARIABLE, str(blocked / "below"))
     patch = cached_patch(body, site, **COARSE)  # -W error: no warning either
 
-    def full(*args: object, **kwargs: object) -> None:
+    def full(*args: object, **kwargs: object) -> bytes:
         raise OSError(28, "No space left on device")
 
     monkeypatch.setenv(cache.FOLDER_VARIABLE, str(tmp_path / "full"))
-    monkeypatch.setattr(np, "savez", full)
+    monkeypatch.setattr(cache, "_parts", full)
     assert same(cached_patch(body, site, **COARSE), patch)
     assert list((tmp_path / "full").iterdir()) == []
 
@@ -123,7 +179,7 @@ def test_used_longest_ago_goes_first(body: Body, site: Site, folder: Path, monke
     cached_patch(body, site, **COARSE)  # read: now used last
     cached_patch(body, site, **{**COARSE, "seed": 5})
     left = {p.name for p in folder.iterdir()}
-    assert left == {f"patch-{patch_key(body, site, **{**COARSE, 'seed': k})}.npz" for k in (3, 5)}
+    assert left == {f"patch-{patch_key(body, site, **{**COARSE, 'seed': k})}.patch" for k in (3, 5)}
     assert same(cached_patch(body, site, **COARSE), first)
 
 
@@ -152,15 +208,13 @@ def test_size_of_zero_keeps_nothing_and_nonsense_is_refused(
 
 def test_two_at_once_write_one_whole_file(body: Body, site: Site, folder: Path) -> None:
     patch = build_patch(body, site, **COARSE)
-    path = folder / "patch-race.npz"
-    writers = [threading.Thread(target=cache._write, args=(path, patch, 2**30)) for _ in range(4)]
+    path = folder / "patch-race.patch"
+    writers = [threading.Thread(target=cache._write, args=(path, "race", patch, 2**30)) for _ in range(4)]
     for writer in writers:
         writer.start()
     for writer in writers:
         writer.join()
-    read = cache._read(path, site)
-    assert read is not None
-    assert same(read, patch)
+    assert same(cache._read(path, "race", site), patch)
     assert [p.name for p in folder.iterdir()] == [path.name]
 
 

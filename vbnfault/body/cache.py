@@ -1,8 +1,9 @@
 """Patches kept on disk, by content: what took many seconds to build is read in a fraction of one.
 
 A file's name is a hash over all that decides its content: the body, the site, every parameter, the sources of the
-terrain code and the versions of the libraries that compute it. A file that is cut short or altered fails zip's
-own checksum and is built again; a folder that cannot be written only costs the time.
+terrain code and the versions of the libraries that compute it. The file holds that hash and ends with a checksum
+over all of it: one that is damaged in any way is built again, and the user is told. A folder that cannot be written
+only costs the time.
 """
 
 from __future__ import annotations
@@ -14,11 +15,13 @@ import inspect
 import json
 import os
 import platform
+import shutil
+import stat
+import struct
 import sys
 import tempfile
 import time
-import zipfile
-import zlib
+from collections.abc import Iterator
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -39,6 +42,10 @@ DEFAULT_GIB = 4.0
 _SOURCES = ("fields", "noise", "refine", "relief", "roughness", "boulders", "patch", "gravity", "shape")
 _LIBRARIES = ("numpy", "scipy", "drjit")
 _ARRAYS = tuple(name for name in Patch.__dataclass_fields__ if name != "site")
+_SUFFIX = ".patch"
+_MAGIC = b"vbnfault patch 1"
+_HEADER = struct.Struct("<16sQ")  # magic, bytes of the table that follows
+_ALIGNED_BYTES = 64  # each array begins at a multiple
 _STALE_S = 3600.0  # an unfinished file that old belongs to no one
 
 
@@ -74,14 +81,22 @@ def cached_patch(body: Body, site: Site, **parameters: Any) -> Patch:
     limit = cache_limit_bytes()
     if limit == 0:
         return _new_patch(body, site, parameters)
+    key = patch_key(body, site, **parameters)
     try:
-        path = cache_folder() / f"patch-{patch_key(body, site, **parameters)}.npz"
+        path = cache_folder() / f"patch-{key}{_SUFFIX}"
     except (RuntimeError, OSError):  # no home folder
         return _new_patch(body, site, parameters)
-    patch = _read(path, site)
+    try:
+        patch = _read(path, key, site)
+    except (FileNotFoundError, NotADirectoryError):
+        patch = None
+    except (OSError, ValueError, MemoryError) as error:
+        why = error.strerror if isinstance(error, OSError) else error
+        print(f"note: {path}: the terrain kept there is damaged ({why}); it is built again", file=sys.stderr)
+        patch = None
     if patch is None:
         patch = _new_patch(body, site, parameters)
-        _write(path, patch, limit)
+        _write(path, key, patch, limit)
     return patch
 
 
@@ -118,27 +133,63 @@ def _code_hash() -> str:
     return parts.hexdigest()
 
 
-def _read(path: Path, site: Site) -> Patch | None:
-    try:
-        # Opened here: numpy leaves a file open that is no zip.
-        with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
-            # numbers come back as arrays without axes
-            arrays = {name: archive[name][()] for name in _ARRAYS}
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error, NotImplementedError):
-        return None
+def _read(path: Path, key: str, site: Site) -> Patch:
+    """Return the patch in a file. Raises ValueError where the file is damaged or another key's, OSError where it
+    cannot be read."""
+    if not stat.S_ISREG(path.stat().st_mode):
+        raise ValueError("not a regular file")
+    data = np.fromfile(path, dtype=np.uint8)
+    checksum = hashlib.sha256().digest_size
+    if len(data) < _HEADER.size + checksum:
+        raise ValueError("cut short")
+    content = data[:-checksum]
+    if hashlib.sha256(content.data).digest() != data[-checksum:].tobytes():
+        raise ValueError("its checksum does not match")
+    magic, length = _HEADER.unpack(data[: _HEADER.size].tobytes())
+    if magic != _MAGIC:
+        raise ValueError("another format")
+    table = json.loads(data[_HEADER.size : _HEADER.size + length].tobytes())
+    if table["key"] != key:
+        raise ValueError("the terrain of another site or scene")
+    arrays, start = {}, _aligned(_HEADER.size + length)
+    for name, dtype, shape in table["arrays"]:
+        count = int(np.prod(shape, dtype=np.int64)) * np.dtype(dtype).itemsize
+        # numbers come back as arrays without axes
+        arrays[name] = data[start : start + count].view(dtype).reshape(shape)[()]
+        start += _aligned(count)
     with contextlib.suppress(OSError):
         os.utime(path)  # used last: evicted last
     return Patch(site=site, **arrays)
 
 
-def _write(path: Path, patch: Patch, limit_bytes: int) -> None:
+def _parts(key: str, patch: Patch) -> Iterator[bytes]:
+    """Yield the content of a patch's file, in parts, the checksum last."""
+    arrays = {name: np.asarray(getattr(patch, name)) for name in _ARRAYS}
+    rows = [[name, array.dtype.str, array.shape] for name, array in arrays.items()]
+    table = json.dumps({"key": key, "arrays": rows}).encode()
+    total = hashlib.sha256()
+    for part in (_HEADER.pack(_MAGIC, len(table)) + table, *(array.tobytes() for array in arrays.values())):
+        padded = part.ljust(_aligned(len(part)), b"\0")
+        total.update(padded)
+        yield padded
+    yield total.digest()
+
+
+def _aligned(count: int) -> int:
+    return -(-count // _ALIGNED_BYTES) * _ALIGNED_BYTES
+
+
+def _write(path: Path, key: str, patch: Patch, limit_bytes: int) -> None:
     """Write under another name, then rename: whoever reads finds a whole file or none."""
     unfinished = None
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.NamedTemporaryFile(dir=path.parent, prefix="patch-", suffix=".part", delete=False) as file:
             unfinished = Path(file.name)
-            np.savez(file, **{name: getattr(patch, name) for name in _ARRAYS})
+            for part in _parts(key, patch):
+                file.write(part)
+        if path.is_dir() and not path.is_symlink():
+            shutil.rmtree(path)
         os.replace(unfinished, path)
         unfinished = None
         _evict(path.parent, limit_bytes)
@@ -156,7 +207,7 @@ def _evict(folder: Path, limit_bytes: int) -> None:
     for path in folder.glob("patch-*"):
         with contextlib.suppress(OSError):  # another worker may evict as well
             status = path.stat()
-            if path.suffix == ".npz":
+            if path.suffix in (_SUFFIX, ".npz"):  # .npz: of versions before
                 kept.append((status.st_mtime, status.st_size, path))
             elif path.suffix == ".part" and time.time() - status.st_mtime > _STALE_S:
                 path.unlink()

@@ -306,7 +306,7 @@ def count_faults(store: Store, planned: NDArray[np.bool_] | None = None) -> Faul
         split, injected = store.column("split", number), store.column("injected", number)
         for i in finished:
             commanded = None if planned is None else planned[i]
-            counts.add(split_name(split[i - start]), commanded, injected[i - start])
+            counts.add(str(split[i - start]), commanded, injected[i - start])
     return counts
 
 
