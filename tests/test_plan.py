@@ -464,6 +464,20 @@ def test_packaged_scenes_have_every_class_in_every_split(name: str) -> None:
         assert {bool(v) for v in p.injected[here].any(axis=1)} == {True, False}  # and samples without a fault
 
 
+@pytest.mark.parametrize(
+    "name",
+    [
+        *("quickstart", "physical67p", "landing", "sssb_exploration"),
+        *("earth_observation", "interplanetary", "flares", "navcam67p"),
+    ],
+)
+def test_packaged_scenes_ask_for_lit_ground_in_four_of_five_views(name: str) -> None:
+    s = config.load_scene(name)
+    p = plan.make_plan(s, list(s.faults))
+    asked = np.array([table.min_lit_fraction for table in plan.strata(s)])[p.stratum]
+    assert (asked >= 0.01).mean() >= 0.8
+
+
 @given(st.integers(24, 300), st.integers(3, 12), st.integers(1, 8), st.sampled_from(["per_class", "per_sample"]))
 @settings(deadline=None, max_examples=40)
 def test_no_split_is_empty_and_classes_are_dealt_evenly(samples: int, sites: int, shard: int, mode: str) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +12,7 @@ from . import frames, plan, world
 from .errors import VbnfaultError
 from .sample import Frame, Pose, SampleSpec
 from .scene import Sunlight
+from .spacecraft import SpacecraftMesh
 
 F64 = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -162,17 +164,28 @@ def _lit_fraction(spec: SampleSpec, views: _Views) -> F64:
     from . import render
 
     camera, vehicle = spec.scene.camera, spec.terrain.vehicle
-    at = (np.arange(_LIT_GRID) + 0.5) / _LIT_GRID * 2 - 1
-    slope = np.tan(np.radians(camera.fov_deg) / 2)
-    x, y = np.meshgrid(slope * at, slope * camera.height_px / camera.width_px * at)
-    rays_C = np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3)
-    rays_C /= np.linalg.norm(rays_C, axis=1, keepdims=True)
+    rays_C = _grid_rays_C(camera.fov_deg, camera.height_px / camera.width_px)
     rays_L = np.einsum("vij,nj->vni", views.L_from_C, rays_C)
     sun_L = np.stack([sun.direction_L for sun in views.suns])
     lit = render.sunlit_ground(spec.terrain.surface, views.position_L_m, rays_L, sun_L)
     if vehicle is not None:
-        lit &= ~vehicle.blocked(rays_C)
+        lit &= ~_hidden_by(vehicle, camera.fov_deg, camera.height_px / camera.width_px)
     return np.asarray(lit.mean(axis=1))
+
+
+def _grid_rays_C(fov_deg: float, height_over_width: float) -> F64:
+    """Unit directions through the centres of a grid of cells over the frame, float64[ray, 3]."""
+    at = (np.arange(_LIT_GRID) + 0.5) / _LIT_GRID * 2 - 1
+    slope = np.tan(np.radians(fov_deg) / 2)
+    x, y = np.meshgrid(slope * at, slope * height_over_width * at)
+    rays = np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3)
+    return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))
+
+
+@lru_cache(maxsize=4)
+def _hidden_by(vehicle: SpacecraftMesh, fov_deg: float, height_over_width: float) -> Mask:
+    """Which rays of the grid meet the spacecraft, bool[ray]: the same in every view."""
+    return vehicle.blocked(_grid_rays_C(fov_deg, height_over_width))
 
 
 def _on_the_trajectory(spec: SampleSpec) -> Pose:
