@@ -142,11 +142,11 @@ def test_samples_that_are_not_as_planned_or_labelled_are_built_again(
     out = shutil.copytree(reference[0], tmp_path / "s.zarr")
     spec = make_spec()
 
-    def planned(index: int) -> dict:
+    def planned(index: int, tries: int) -> dict:
         scalars = fake_sample(spec, index, site=int(site_of(index + 1)[-1])).scalars
         return {name: scalars[name] for name in ("site", "split", "proposal", "roll_deg", "injected")}
 
-    wrong = {3: {"split": 2}, 6: {"proposal": "{}"}, 11: {"roll_deg": 1.5}, 12: {"site": 2}}
+    wrong = {3: {"split": "test"}, 6: {"proposal": "{}"}, 11: {"roll_deg": 1.5}, 12: {"site": 2}}
     samples = [fake_sample(spec, i, site=int(site_of(i + 1)[-1])) for i in (*wrong, 16)]
     for sample, changes in zip(samples, wrong.values(), strict=False):
         sample.scalars.update(changes)  # type: ignore[attr-defined]
