@@ -56,7 +56,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "labels": GEOMETRY | CAMERA | {"faults"},
     "world": WORLD,
     "sample": GEOMETRY | CAMERA | {"spacecraft", "render", "faults"},
-    "pose": GEOMETRY | {"world", "render", "sample"},
+    "pose": GEOMETRY | {"world", "render", "sample", "spacecraft"},
     "exposure": GEOMETRY | CAMERA | {"world", "render", "faults", "sample"},
     "pictures": CAMERA | {"faults", "labels", "sample"},
     "record": GEOMETRY | CAMERA | {"world", "labels", "sample", "pictures"},
