@@ -391,14 +391,17 @@ def flare(
     ] = 1.0,
     reflections: Annotated[int, typer.Option(min=2, max=4, help="of a ghost: 2, or 4 for those of four too")] = 2,
     roughness_nm: Annotated[
-        float, typer.Option(callback=_finite, min=0, max=100, help="rms roughness of the surfaces")
+        float, typer.Option(callback=_finite, min=0, max=50, help="rms roughness of the surfaces")
     ] = 1.0,
     cleanliness_level: Annotated[
         float,
-        typer.Option(callback=_finite, min=0, max=2000, help="particles on the surfaces, IEST-STD-CC1246; 0: none"),
+        typer.Option(callback=_finite, min=0, max=1000, help="particles on the surfaces, IEST-STD-CC1246; 0: none"),
     ] = 0.0,
     veil_fraction: Annotated[
-        float, typer.Option(min=0, max=0.5, help="of the light, that mount, barrel and edges scatter as a veil")
+        float,
+        typer.Option(
+            callback=_finite, min=0, max=0.5, help="of the light, that mount, barrel and edges scatter as a veil"
+        ),
     ] = 0.01,
 ) -> None:
     """Ghosts, starburst and glare of the Sun through a lens: a picture, and a table of every ghost."""

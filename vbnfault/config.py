@@ -608,8 +608,7 @@ def load_scene(name_or_path: str | Path, overrides: Mapping[str, Any] | None = N
             or (key == "body.shape" and value not in _SHAPES)
             or (key == "spacecraft.model" and value not in _VEHICLES)
         ):
-            resources.check_path(value, key)
-            value = str(Path(value).resolve())  # a path on the command line is taken from the working folder
+            value = resources.absolute(value, key)  # a path on the command line is taken from the working folder
         for parent in parents:
             node = node.setdefault(parent, {})
             if not isinstance(node, dict):
@@ -647,10 +646,7 @@ def _anchor_paths(table: dict[str, Any], folder: Path) -> None:
     def anchored(path: str, where: str) -> str:
         resources.check_path(path, where)
         beside = folder / path
-        try:
-            return str((Path(path) if resources.file_status(beside) is None else beside).resolve())
-        except (OSError, RuntimeError):  # links in a circle, a working folder that is gone
-            raise InputError(f"{where} = {shown(path)}: no such file") from None
+        return resources.absolute(path if resources.file_status(beside) is None else beside, where)
 
     def anchor(node: Any, where: str, built_in: tuple[str, ...] = ()) -> None:
         key = where.rsplit(".", 1)[-1]

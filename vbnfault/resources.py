@@ -308,6 +308,15 @@ def check_path(path: str, where: str) -> None:
         )
 
 
+def absolute(path: str | Path, where: str) -> str:
+    """Return a path from the root, links followed. Raises InputError whose sentence begins with the key `where`."""
+    check_path(str(path), where)
+    try:
+        return str(Path(path).resolve())
+    except (OSError, RuntimeError):  # links in a circle, a working folder that is gone
+        raise InputError(f"{where} = {shown(str(path))}: no such file") from None
+
+
 def shown_path(path: str | Path) -> str:
     """Return a path as an error sentence begins with it: as given, or shortened and quoted where it is long or
     cannot be printed."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import logging
 import warnings
 from pathlib import Path
 from typing import Literal
@@ -86,6 +87,9 @@ def load_shape(path: str | Path, unit: Unit = "auto") -> tuple[Float64, Int32]:
 
 
 def _read_with_trimesh(path: Path, data: bytes) -> tuple[Float64, NDArray[np.int64]]:
+    logger = logging.getLogger("trimesh")
+    level = logger.level
+    logger.setLevel(logging.CRITICAL + 1)  # it logs what it cannot read, tracebacks and all
     try:
         # numpy warns on NaN while the readers normalise; the check below reports it as an error.
         with warnings.catch_warnings(), np.errstate(all="ignore"):
@@ -96,6 +100,8 @@ def _read_with_trimesh(path: Path, data: bytes) -> tuple[Float64, NDArray[np.int
     except Exception as error:  # the readers raise whatever their parsers raise
         kind, what = path.suffix[1:].upper(), type(error).__name__
         raise InputError(f"{path}: is unreadable as {kind} ({what} while parsing).") from None
+    finally:
+        logger.setLevel(level)
     return vertices, faces
 
 

@@ -24,6 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .. import spectra
+from ..lens.scatter import CLEANLINESS_LIMITS, ROUGHNESS_NM_LIMITS
 from ..lens.straylight import Baffle, Cleanliness, scene_veil_fraction, straylight, veil_of
 from ..quantities import Irradiance
 from .base import FaultContext, Interval, LensFault, Params, bounds, choice, intensity_dn, number, plus, times
@@ -58,9 +59,11 @@ class _LensStraylight(LensFault):
         ("as_prescribed", "none", "mgf2", "v", "bbar"),
         doc="of every surface between glass and air; as_prescribed: the lens's own",
     )
-    roughness_nm: Interval = bounds(0.2, 1.0, limits=(0, 100), unit="nm", doc="rms roughness of the surfaces")
+    roughness_nm: Interval = bounds(
+        0.2, 1.0, limits=ROUGHNESS_NM_LIMITS, unit="nm", doc="rms roughness of the surfaces"
+    )
     cleanliness_level: Interval = bounds(
-        20, 100, limits=(0, 2000), doc="of particles on the surfaces, IEST-STD-CC1246; 0: none"
+        20, 100, limits=CLEANLINESS_LIMITS, doc="of particles on the surfaces, IEST-STD-CC1246; 0: none"
     )
     veil_fraction: Interval = bounds(
         0.005,

@@ -27,6 +27,9 @@ F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
 REFERENCE_NM = 550.0  # what roughness and the Harvey knee are quoted at
+# What the models hold for: beyond, a surface is not smooth to light, and dust covers it whole.
+ROUGHNESS_NM_LIMITS = (0.0, 50.0)
+CLEANLINESS_LIMITS = (0.0, 1000.0)
 ROUGHNESS_NM, KNEE, SLOPE = 1.0, 0.01, -1.5  # assumed: a good polish, and usual values of its scatter
 
 # Assumed. Mineral dusts are estimated at 1.5 to 1.7 and 1e-5 to 1e-3 (Amsterdam-Granada Light Scattering Database,
@@ -89,7 +92,7 @@ class Harvey:
 
         A mirror's Δn is 2. Raises InputError outside 0 to 50 nm, L outside 1e-5 to 1 and S outside -4 to 0.
         """
-        sigma = float(_check("roughness_nm", roughness_nm, 0.0, 50.0))
+        sigma = float(_check("roughness_nm", roughness_nm, *ROUGHNESS_NM_LIMITS))
         L, S = float(_check("L", L, 1e-5, 1.0)), float(_check("S", S, -4.0, 0.0))
         total = (2 * np.pi * index_step * sigma / wavelength_nm) ** 2
         return cls(b0=float(total / cls(b0=1.0, L=L, S=S).tis), L=L, S=S)
@@ -130,7 +133,7 @@ def particle_count(level: float, diameter_um: ArrayLike) -> F64:
 def obscured_fraction(cleanliness_level: float) -> float:
     """Share of a surface that spheres of the standard's sizes cover, from 1 µm to `cleanliness_level`, in µm, of
     which 0.1 m² has one larger."""
-    level = float(_check("cleanliness_level", cleanliness_level, 0.0, 1000.0))
+    level = float(_check("cleanliness_level", cleanliness_level, *CLEANLINESS_LIMITS))
     if level <= _SMALLEST_UM:
         return 0.0
     # ∫ π/4 D² (-dN/dD) dD with N = exp(c (U² - u²)), u = ln D: by parts, then the square completed
@@ -238,7 +241,7 @@ def particle_bsdf(
     Spheres of the sizes of IEST-STD-CC1246 from 1 µm to `cleanliness_level` µm, lit along the normal, each alone.
     Raises InputError for a level outside 0 (clean) to 1000, and a wavelength outside 250 to 2500 nm.
     """
-    level = float(_check("cleanliness_level", cleanliness_level, 0.0, 1000.0))
+    level = float(_check("cleanliness_level", cleanliness_level, *CLEANLINESS_LIMITS))
     intensity, _ = _dust(level, float(_check("wavelength_nm", wavelength_nm, *RANGE_NM)), index)
     b = np.abs(np.asarray(beta, dtype=np.float64))
     if level <= _SMALLEST_UM:
@@ -255,7 +258,7 @@ def particle_scatter_fraction(
     cleanliness_level: float, wavelength_nm: float, *, index: complex = DUST_INDEX
 ) -> float:
     """Share of light that the particles of `particle_bsdf` scatter forwards."""
-    level = float(_check("cleanliness_level", cleanliness_level, 0.0, 1000.0))
+    level = float(_check("cleanliness_level", cleanliness_level, *CLEANLINESS_LIMITS))
     return _dust(level, float(_check("wavelength_nm", wavelength_nm, *RANGE_NM)), index)[1]
 
 
@@ -369,7 +372,7 @@ class _Surfaces:
 def _surfaces(
     lens: Prescription, wavelength_nm: float, roughness_nm: float, level: float, knee: float, slope: float
 ) -> _Surfaces:
-    level = float(_check("cleanliness_level", level, 0.0, 1000.0))
+    level = float(_check("cleanliness_level", level, *CLEANLINESS_LIMITS))
     figures, path = first_order(lens, wavelength_nm), forward(lens)
     rows = list(mirrors(lens))
     index = lens.indices(wavelength_nm)
