@@ -313,6 +313,46 @@ def test_another_scene_is_refused_and_says_what_differs(tmp_path: Path) -> None:
     assert st.digest(out) != before
 
 
+def test_a_store_of_other_versions_is_completed_on_request_and_says_by_whom(
+    tmp_path: Path, reference: tuple[Path, str]
+) -> None:
+    out = tmp_path / "s.zarr"
+
+    def made_with(number: str, accept: bool = False, session: Session | None = None) -> bd.Summary:
+        versions = {"numpy": number, "machine": "x"}
+        attributes = {**make_spec().attributes, "versions": versions, "scene_hash": number}
+        return run(out, session, spec=make_spec(attributes=attributes), accept_versions=accept)
+
+    def noted() -> dict[str, list[list[int]]]:
+        entries = st.open_store(out).attributes.get("versions_of_samples", [])
+        return {entry["versions"]["numpy"]: entry["samples"] for entry in entries}
+
+    with pytest.raises(bd.BuildFailed):
+        made_with("1", session=Session(raises=frozenset({5, 9, 10})))
+    with pytest.raises(InputError, match=r"made with other versions: numpy 1 \(now 2\); --accept-versions") as e:
+        made_with("2")
+    assert "machine" not in str(e.value)
+    assert noted() == {}
+    with pytest.raises(bd.BuildFailed):
+        made_with("2", accept=True, session=Session(raises=frozenset({10})))
+    assert noted() == {"2": [[5, 5], [9, 10]]}
+    assert made_with("2").built == 1  # accepted once
+    flip(st.open_store(out).file("image", 1), 20)  # sample 4
+    assert made_with("3", accept=True).built == 1
+    assert noted() == {"2": [[5, 5], [9, 10]], "3": [[4, 4]]}
+    flip(st.open_store(out).file("image", 2), 20)  # sample 8, of the first versions
+    st.open_store(out).file("depth_m", 1).unlink()  # 4 to 7
+    assert made_with("1").built == 5
+    assert noted() == {"2": [[9, 10]]}
+    assert st.verify(out) == []
+    assert st.open_store(out).attributes["versions"]["numpy"] == "1"
+    for i in range(SAMPLES):
+        a, b = st.open_store(out).read_sample(i), st.open_store(reference[0]).read_sample(i)
+        assert all(a.layers[name].tobytes() == b.layers[name].tobytes() for name in a.layers)
+    with pytest.raises(InputError, match="holds another dataset: height"):
+        run(out, spec=make_spec(32, width=32), accept_versions=True)
+
+
 def test_dry_run_touches_nothing(tmp_path: Path) -> None:
     summary = run(tmp_path / "s.zarr", dry_run=True, fault_counts={"straylight": 9})
     assert not (tmp_path / "s.zarr").exists()

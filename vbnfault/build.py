@@ -24,6 +24,7 @@ from numpy.typing import ArrayLike, NDArray
 from . import store as store_module
 from .errors import InputError, VbnfaultError
 from .interrupts import Stopped, exit_code, finishing, interruptible
+from .jobs import versions
 from .jobs.dask import check_scheduler, run_on_dask
 from .jobs.errors import BuildFailed, Interrupted
 from .jobs.lock import locked
@@ -142,6 +143,7 @@ def build(
     estimated_seconds: float | None = None,
     expected: store_module.Planned | None = None,
     exact: bool = False,
+    accept_versions: bool = False,
     recycle_shards: int = RECYCLE_SHARDS,
 ) -> Summary:
     """Build, resume, repair or extend the store at `out`; see the module.
@@ -152,6 +154,8 @@ def build(
     OMP_NUM_THREADS in its environment), or the Dask cluster at `scheduler`, whose workers must see `out`.
     `planned_faults` bool[sample, fault] are counted beside those injected; `estimated_seconds` is announced.
     `expected` and `exact`: as of `store.examine`; finished samples that are not as planned are built again.
+    `accept_versions`: a store made with other versions of the libraries is completed all the same, and its root
+    attribute `versions_of_samples` says with which ones.
 
     Raises InputError where `out` holds another scene or nothing answers at `scheduler`, BuildFailed where
     samples failed (all others are built), Interrupted after Ctrl-C or SIGTERM, VbnfaultError where the disk
@@ -169,7 +173,7 @@ def build(
     def outlook() -> Summary:
         existing = store_module.is_store(path) and not overwrite
         if existing:
-            _same_scene(store_module.open_store(path), spec, blocks)
+            _same_scene(store_module.open_store(path), spec, blocks, accept_versions=accept_versions)
         return Summary(
             path=path,
             samples=len(sites),
@@ -201,6 +205,7 @@ def build(
                 if store.samples < len(sites):
                     added = len(sites) - store.samples
                     store = store_module.append_samples(store, added, {"blocks": list(blocks)})
+                store = _with_versions_noted(store, spec, expected, exact=exact)
                 run = Run(store, sites, Progress(len(sites), shown=progress), expected, exact=exact)
                 with run.progress:
                     for line in summary.outlook():
@@ -236,9 +241,34 @@ def _with_attributes(spec: StoreSpec, blocks: tuple[int, ...]) -> StoreSpec:
     return StoreSpec(**values)
 
 
-def _same_scene(store: Store, spec: StoreSpec, blocks: tuple[int, ...]) -> None:
+def _with_versions_noted(
+    store: Store, spec: StoreSpec, expected: store_module.Planned | None, *, exact: bool
+) -> Store:
+    """Note in a store which samples are about to be made with other versions; before they are, whatever happens."""
+    now = spec.attributes.get("versions", {})
+    if versions.known(store.attributes) == [now]:
+        return store
+    wanted = set(store_module.problem_samples(store))
+    if expected is not None:
+        shards = range(store.shards)
+        wanted |= {i for n in shards for i in store_module.unplanned_samples(store, n, expected, exact=exact)}
+    made = versions.made_now(store.attributes, now, wanted)
+    if made == store.attributes.get(versions.VERSIONS_OF_SAMPLES, []):
+        return store
+    store.update_attributes({versions.VERSIONS_OF_SAMPLES: made})
+    return store_module.open_store(store.path, "r+")
+
+
+def _same_scene(store: Store, spec: StoreSpec, blocks: tuple[int, ...], *, accept_versions: bool = False) -> None:
     """Raise InputError that says what differs between a store and what is to be built into it."""
-    ignored = {"blocks", "shard_samples", "format", "format_version", *store_module.VOLATILE_ATTRIBUTES}
+    ignored = {
+        "blocks",
+        versions.VERSIONS_OF_SAMPLES,
+        "shard_samples",
+        "format",
+        "format_version",
+        *store_module.VOLATILE_ATTRIBUTES,
+    }
 
     def flat(a_spec: StoreSpec) -> dict[str, Any]:
         everything = json.loads(json.dumps({**a_spec.attributes, **a_spec.plain()}))
@@ -247,6 +277,15 @@ def _same_scene(store: Store, spec: StoreSpec, blocks: tuple[int, ...]) -> None:
     old, new = flat(store.spec), flat(spec)
     absent = object()
     differing = [k for k in {**new, **old} if old.get(k, absent) != new.get(k, absent)]
+    if differing and all(k.startswith("versions.") or k == "scene_hash" for k in differing):
+        if not accept_versions and spec.attributes.get("versions") not in versions.known(store.attributes):
+            which = versions.differences(store.attributes, spec.attributes)
+            raise InputError(
+                f"{store.path}: was made with other versions: {which}; "
+                "--accept-versions completes it with those of now and notes which samples they made, or choose "
+                "another --out"
+            )
+        differing = []
     if differing:
         # a scene's keys say more than the hash that follows from them
         differing.sort(key=lambda k: (not k.startswith("scene."), "hash" in k, k))

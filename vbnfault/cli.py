@@ -163,6 +163,9 @@ def build(
     ] = None,
     overwrite: Annotated[bool, typer.Option(help="delete an existing store first")] = False,
     dry_run: Annotated[bool, typer.Option(help="plan and print, render nothing")] = False,
+    accept_versions: Annotated[
+        bool, typer.Option(help="complete a store that other versions of the libraries made, and note it there")
+    ] = False,
     settings: SetOption = None,
 ) -> None:
     """Build a dataset, or resume one: a store of the same scene is completed and mended where it is damaged."""
@@ -181,6 +184,7 @@ def build(
         append=append,
         overwrite=overwrite,
         dry_run=dry_run,
+        accept_versions=accept_versions,
         samples_given=samples is not None,
     )
     for line in summary.lines():

@@ -94,7 +94,6 @@ def _contents_of_files(identity: dict[str, Any], scene: SceneConfig) -> None:
                 follows += [*pose.camera_position_T_m.tolist(), *pose.T_from_C.ravel().tolist()]
         numbers = config.content_hash(follows)
         identity["spice"]["kernels"] = [f"ephemeris:{numbers}"]
-        identity["spice"]["spiceypy"] = importlib.metadata.version("spiceypy")
     if scene.sky.stars != "off":
         identity["sky"]["catalogue"] = _digest(resources.data_dir("catalogues") / "stars.npz", "star catalogue")
 
@@ -106,15 +105,17 @@ def store_spec(session: pipeline.Session, blocks: Sequence[int]) -> StoreSpec:
     layers = tuple(name for name in stored_layers(scene, session.faults) if name != "clean")
     individuals = scene.camera.individuals
     kinds = tuple(labels.kind(fault, is_ccd=camera.is_ccd) for fault in session.faults.values())
-    identity = scene_identity(session)
+    identity, made_with = scene_identity(session), versions()
+    if scene.spice.kernels:
+        made_with["spiceypy"] = importlib.metadata.version("spiceypy")
     attributes: dict[str, Any] = {
         "title": scene.title,
         "description": scene.description,
         "scene": identity,
-        "scene_hash": config.content_hash(identity, versions()),
+        "scene_hash": config.content_hash(identity, made_with),
         "seed": dataset.seed,
         "blocks": list(blocks),
-        "versions": versions(),
+        "versions": made_with,
         "licence": dataset.licence,
         "citation": dataset.citation,
         "intensity_channel": _intensity(camera.detector),
@@ -214,7 +215,7 @@ def planned(attributes: Mapping[str, Any], faults: Sequence[str]) -> Callable[[i
     stored = {key: value for key, value in attributes["scene"].items() if key != "textures_sha256"}
     stored["body"] = {key: value for key, value in stored["body"].items() if key != "shape_sha256"}
     # what is added to the tables of a scene's identity is no key of a scene
-    for name, added in (("sky", "catalogue"), ("spice", "spiceypy")):
+    for name, added in (("sky", "catalogue"),):
         stored[name] = {key: value for key, value in stored.get(name, {}).items() if key != added}
     if stored["camera"].get("lens"):
         # earlier versions stored those of a thin lens here, which did nothing; no plan depends on them
@@ -300,6 +301,7 @@ def build_scene(
     append: int | None = None,
     overwrite: bool = False,
     dry_run: bool = False,
+    accept_versions: bool = False,
     samples_given: bool = True,
 ) -> build.Summary:
     """Build, resume, mend or extend the store of a scene at `out`; see `build.build` for what is raised.
@@ -328,6 +330,7 @@ def build_scene(
         threads=threads,
         overwrite=overwrite,
         dry_run=dry_run,
+        accept_versions=accept_versions,
         fault_counts=counts,
         planned_faults=session.plan.injected,
         estimated_seconds=estimated_seconds(session),

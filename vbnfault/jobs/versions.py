@@ -1,0 +1,54 @@
+"""Which versions of the libraries made which samples of a store."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Mapping
+from typing import Any
+
+# Root attribute: a list of tables, each `versions` and the `samples` that they made, as [first, last] ranges. All
+# other samples were made with the versions of the root attribute `versions`.
+VERSIONS_OF_SAMPLES = "versions_of_samples"
+
+
+def known(attributes: Mapping[str, Any]) -> list[dict[str, str]]:
+    """Return all versions that made samples of a store, or were accepted to."""
+    return [attributes.get("versions", {}), *(entry["versions"] for entry in _entries(attributes))]
+
+
+def differences(stored: Mapping[str, Any], now: Mapping[str, Any]) -> str:
+    """Return in words which versions differ between two sets of root attributes."""
+    old, new = stored.get("versions", {}), now.get("versions", {})
+    names = [name for name in {**new, **old} if old.get(name) != new.get(name)]
+    return ", ".join(f"{name} {old.get(name, 'absent')} (now {new.get(name, 'absent')})" for name in names)
+
+
+def made_now(
+    attributes: Mapping[str, Any], now: Mapping[str, str], samples: Collection[int]
+) -> list[dict[str, Any]]:
+    """Return the attribute `versions_of_samples` of a store whose `samples` are about to be made with versions
+    `now`."""
+    entries = [(entry["versions"], _samples(entry) - set(samples)) for entry in _entries(attributes)]
+    if now != attributes.get("versions", {}):
+        made = next((made for versions, made in entries if versions == now), None)
+        if made is None:
+            entries.append((dict(now), made := set()))
+        made.update(samples)
+    return [{"versions": versions, "samples": _ranges(made)} for versions, made in entries if made]
+
+
+def _entries(attributes: Mapping[str, Any]) -> list[dict[str, Any]]:
+    return list(attributes.get(VERSIONS_OF_SAMPLES, ()))
+
+
+def _samples(entry: Mapping[str, Any]) -> set[int]:
+    return {i for first, last in entry["samples"] for i in range(first, last + 1)}
+
+
+def _ranges(samples: Iterable[int]) -> list[list[int]]:
+    ranges: list[list[int]] = []
+    for i in sorted(samples):
+        if ranges and i == ranges[-1][1] + 1:
+            ranges[-1][1] = i
+        else:
+            ranges.append([i, i])
+    return ranges
