@@ -152,7 +152,8 @@ def test_a_rendered_sample_equals_the_stored_one(
     import cv2
     import OpenEXR
 
-    assert run(monkeypatch, "render", scene, "--sample", 5, "--out", tmp_path) == 0
+    layers = 'dataset.layers=["clean", "dust_opacity"]'
+    assert run(monkeypatch, "render", scene, "--sample", 5, "--out", tmp_path, "--set", layers) == 0
     stored = store.open_store(built).read_sample(5)
     image = cv2.imread(str(tmp_path / "image.png"))[..., ::-1]
     assert np.array_equal(image, stored.layers["image"][..., :3])
@@ -160,7 +161,8 @@ def test_a_rendered_sample_equals_the_stored_one(
         cv2.imread(str(tmp_path / "image_intensity.png"), cv2.IMREAD_UNCHANGED),
         stored.layers["image"][..., 3],
     )
-    for k, name in enumerate(store.open_store(built).spec.faults):
+    names = store.open_store(built).spec.faults
+    for k, name in enumerate(names):
         mask = cv2.imread(str(tmp_path / f"mask_{name}.png"), cv2.IMREAD_UNCHANGED) > 0
         assert np.array_equal(mask, stored.layers["mask"][k])
     scalars = json.loads((tmp_path / "parameters.json").read_text())
@@ -169,6 +171,9 @@ def test_a_rendered_sample_equals_the_stored_one(
         channels = exr.channels()
         assert np.array_equal(channels["depth.Z"].pixels, stored.layers["depth_m"])
         assert sum(name.startswith("radiance.") for name in channels) == 8
+        assert channels["dust_opacity"].pixels.dtype == np.float16
+        dusty = dict(zip(names, stored.scalars["injected"], strict=True))["dust_on_optics"]
+        assert channels["dust_opacity"].pixels.any() == dusty
 
 
 def test_damage_is_named_and_exactly_mended(

@@ -23,8 +23,8 @@ _MARKED_GHOSTS = 10
 def write_frame(frame: Frame, folder: Path) -> list[Path]:
     """Write one simulated frame to `folder` (made if missing); returns the files.
 
-    `sample.exr`: `radiance.<wavelength>nm` (W m⁻² sr⁻¹ nm⁻¹), `depth.Z` (m), `normal.X/Y/Z` (C frame) and
-    `semantic`; `image.png`, `clean.png`, `without_<fault>.png` as RGB, each with its intensity channel beside it;
+    `sample.exr`: `radiance.<wavelength>nm` (W m⁻² sr⁻¹ nm⁻¹), `depth.Z` (m), `normal.X/Y/Z` (C frame),
+    `semantic`, and the soft layers of the scene; `image.png`, `clean.png`, `without_<fault>.png` as RGB, each with its intensity channel beside it;
     `mask_<fault>.png`, `mask_any.png`; `annotated_<fault>.png`, the image with a class pointed out;
     `parameters.json` with every scalar of the dataset.
     Raises VbnfaultError where a file cannot be written.
@@ -32,7 +32,7 @@ def write_frame(frame: Frame, folder: Path) -> list[Path]:
     sample = to_sample(frame)
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        files = [_write_exr(frame, folder / "sample.exr")]
+        files = [_write_exr(frame, sample, folder / "sample.exr")]
         for name, layer in sample.layers.items():
             if layer.ndim == 3 and layer.shape[-1] == 4:
                 files.append(_write_png(folder / f"{name}.png", layer[..., 2::-1]))
@@ -114,7 +114,7 @@ def _write_png(path: Path, array: NDArray[np.uint8]) -> Path:
     return path
 
 
-def _write_exr(frame: Frame, path: Path) -> Path:
+def _write_exr(frame: Frame, sample: Sample, path: Path) -> Path:
     import OpenEXR
 
     truth = frame.truth
@@ -126,6 +126,8 @@ def _write_exr(frame: Frame, path: Path) -> Path:
     normal = truth.normal.astype(np.float32)
     channels |= {f"normal.{axis}": np.ascontiguousarray(normal[..., k]) for k, axis in enumerate("XYZ")}
     channels["semantic"] = truth.semantic.astype(np.uint32)
+    soft = [fault.soft_layer for fault in frame.spec.faults.values()]
+    channels |= {name: sample.layers[name] for name in soft if name in sample.layers}
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     # OpenEXR takes writeable arrays only
     OpenEXR.File(header, {name: array.copy() for name, array in channels.items()}).write(str(path))

@@ -188,7 +188,6 @@ class Session:
             self._terrain = None  # let go of the old one first: two do not fit a small machine
             stages.begin(f"terrain of site {site}")
             patch = self.patch(self.sites[site])
-            stages.begin(f"terrain of site {site} (search tree)")
             surface = self.surface(patch)
             self._terrain = Terrain(body=self.body, site=patch.site, surface=surface, vehicle=self.vehicle)
         return self._terrain
