@@ -24,7 +24,8 @@ def write_frame(frame: Frame, folder: Path) -> list[Path]:
     """Write one simulated frame to `folder` (made if missing); returns the files.
 
     `sample.exr`: `radiance.<wavelength>nm` (W m⁻² sr⁻¹ nm⁻¹), `depth.Z` (m), `normal.X/Y/Z` (C frame),
-    `semantic`, and the soft layers of the scene; `image.png`, `clean.png`, `without_<fault>.png` as RGB, each with its intensity channel beside it;
+    `semantic`, and the soft layers of the scene; `image.png`, `clean.png`, `without_<fault>.png` as RGB, each with
+    its intensity channel beside it;
     `mask_<fault>.png`, `mask_any.png`; `annotated_<fault>.png`, the image with a class pointed out;
     `parameters.json` with every scalar of the dataset.
     Raises VbnfaultError where a file cannot be written.
