@@ -294,3 +294,66 @@ def test_scale_by_intensity() -> None:
     assert scale_by_intensity(pixels, wanted).tolist() == expected
     unchanged = scale_by_intensity(pixels[[0, 3]], np.array([60, 100], np.float32))
     assert np.array_equal(unchanged, pixels[[0, 3]])
+
+
+LIMITS = [
+    (fault, model, f.name, limit)
+    for fault, model in MODELS
+    if (fault, model) not in SLOW
+    for f in dataclasses.fields(registry()[fault][model])
+    if f.metadata["kind"] in ("bounds", "number")
+    for limit in f.metadata["limits"]
+]
+
+
+@pytest.mark.parametrize(("name", "model"), sorted({(name, model) for name, model, *_ in LIMITS}))
+def test_every_number_serves_at_both_ends_of_its_limits(
+    name: str, model: str, required: dict[str, dict[str, Any]]
+) -> None:
+    """What is read is never refused sample by sample: ranges of keys are what the physics takes."""
+    small = make_context(32, sun=(10.0, 12.0), architecture="frame_transfer_ccd")
+    beam = np.array([-0.1, -0.05, 1.0])
+    context = dataclasses.replace(
+        with_mosaic(small) if registry()[name][model].needs_mosaic else small,
+        sun_direction_C=beam / np.linalg.norm(beam),
+        sun_irradiance_W_m2_nm=np.ones(4),
+        wavelength_nm=np.linspace(420.0, 680.0, 4),
+        sun_angular_radius_rad=0.0046,
+    )
+    served = 0
+    for _, _, key, limit in (row for row in LIMITS if row[:2] == (name, model)):
+        table = required.get(name, {}) | {"model": model, key: limit}
+        try:
+            fault = from_dict(name, table, source="test.toml")
+        except InputError as error:
+            # two keys that contradict each other are named when the file is read
+            assert not str(error).startswith(f"test.toml: faults.{name}.{key} = "), error
+            continue
+        params = fault.draw(context, np.random.default_rng(1))
+        met = dataclasses.replace(context, camera=fault.alter(context.camera, params))
+        with np.errstate(invalid="raise", divide="raise", over="raise"):
+            result = fault.apply(noisy(fault.step, met), params, met)
+            fault.footprint(params, met)
+        assert np.isfinite(result.array).all(), (key, limit)
+        served += 1
+    assert served
+
+
+@pytest.mark.parametrize("model", ["traced", "paraxial"])
+def test_limits_of_straylight_are_those_of_scatter(model: str) -> None:
+    """Scattering serves at both ends of the declared limits; it and the reader refuse what lies beyond."""
+    from vbnfault.lens import scatter
+
+    fields = registry()["straylight"][model].__dataclass_fields__
+    for key, physics in (
+        ("roughness_nm", lambda value: scatter.Harvey.of_roughness(roughness_nm=value, index_step=0.5).b0),
+        ("cleanliness_level", scatter.obscured_fraction),
+        ("cleanliness_level", lambda value: scatter.particle_scatter_fraction(value, 550.0)),
+    ):
+        low, high = fields[key].metadata["limits"]
+        assert np.isfinite([physics(low), physics(high)]).all()
+        for beyond in (low - 1e-6, high * (1 + 1e-6)):
+            with pytest.raises(InputError, match=key):
+                physics(beyond)
+            with pytest.raises(InputError, match=rf"faults\.straylight\.{key} = "):
+                from_dict("straylight", {"model": model, key: beyond}, source="test.toml")

@@ -490,3 +490,37 @@ def test_frames_that_no_memory_holds_are_refused() -> None:
     table = {"title": "t", "camera": {"width_px": 16384, "height_px": 16384}, "render": {"bands": 64}}
     with pytest.raises(InputError, match=r"camera\.width_px = 16384, .*render\.bands = 64: .*at most 268435456"):
         config.parse_scene(table, source="scene.toml")
+
+
+def test_every_enumerated_key_of_a_scene_takes_each_of_its_options() -> None:
+    """... as itself, and nothing else."""
+    root = config.SceneConfig.model_json_schema()
+    tried = 0
+
+    def walk(node: dict[str, Any], path: tuple[str, ...]) -> None:
+        nonlocal tried
+        if "$ref" in node:
+            node = root["$defs"][node["$ref"].rsplit("/", 1)[-1]]
+        for key, value in node.get("properties", {}).items():
+            walk(value, (*path, key))
+        many = node.get("type") == "array"
+        options = (node.get("items", {}) if many else node).get("enum", ())
+        for option in (*options, *(("no such word",) if options else ())):
+            table: dict[str, Any] = {"title": "t"}
+            inner = table
+            for key in path[:-1]:
+                inner = inner.setdefault(key, {})
+            inner[path[-1]] = [option] if many else option
+            table.setdefault("camera", {})["lens"] = "tessar_50_f2p8"  # which some options need
+            if option == "no such word":
+                with pytest.raises(InputError, match=rf"{path[-1]}.* = 'no such word': must be "):
+                    config.parse_scene(table, source="scene.toml")
+                continue
+            found: Any = config.parse_scene(table, source="scene.toml")
+            for key in path:
+                found = getattr(found, key)
+            assert found == ((option,) if many else option)
+            tried += 1
+
+    walk(root, ())
+    assert tried >= 20
