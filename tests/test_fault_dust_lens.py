@@ -498,6 +498,21 @@ def test_mask_holds_what_loses_enough(tmp_path: Path) -> None:
         assert 0 < mask.sum() < mask.size  # type: ignore[union-attr]
 
 
+def test_mask_holds_the_glow_too(tmp_path: Path) -> None:
+    """Outside the mask a black picture gains less than the level; the mask holds glow where no shadow is."""
+    context = lit(thin_context(), 0.02, 0.0)
+    context = replace(context, camera=replace(context.camera, exposure_s=1.0))
+    # so small that it takes less than the mask's level of any beam, and scatters sunlight widely
+    params = grains(window_lens(tmp_path, distance=20.0, pupil=4.0), (-0.3, 0.1, 0.2))
+    fault = make("dust_on_optics", model="defocused")
+    mask = fault.footprint(params | {"mask_loss": 0.01}, context)
+    assert mask is not None
+    gained = (glow(params, context) / np.asarray(context.camera.detector.white_e)).max(axis=2)
+    assert gained.max() > 0.05
+    assert gained[~mask].max() < 0.01
+    assert (transmission(params, context)[mask] > 0.99).any()
+
+
 def test_rows_that_a_lens_lacks_are_refused() -> None:
     with pytest.raises(InputError, match=r"surface = 40: nikkor_35_f2p8 has rows 0 to"):
         make("dust_on_optics", model="defocused", lens="nikkor_35_f2p8", surface=40)

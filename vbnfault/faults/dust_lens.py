@@ -82,7 +82,9 @@ class DefocusedDust(LensFault):
         0.3, 1.0, limits=(1e-3, 100), unit="mm", doc="of the window's dusty side above the sensor"
     )
     mask_loss: float = number(
-        0.01, limits=(1e-4, 1), doc="the mask holds the pixels that lose at least this fraction"
+        0.01,
+        limits=(1e-4, 1),
+        doc="the mask holds the pixels that lose at least this fraction of their light, or gain as much of white",
     )
 
     def validate(self) -> None:
@@ -120,13 +122,17 @@ class DefocusedDust(LensFault):
         """Expected electrons times the transmission of all grains, plus their glow."""
         factor = _shadows_once(params, context).transmission
         out = times(quantity.array, factor)
-        light = context.once("dust.glow", params, lambda: _glow(params, context))
+        light = _glow_once(params, context)
         return quantity.with_array(out if light is None else plus(out, light))
 
     def footprint(self, params: Params, context: FaultContext) -> NDArray[np.bool_]:
-        """bool[y, x]: where the loss reaches `mask_loss`."""
-        factor = _shadows_once(params, context).transmission
-        return np.asarray(factor <= np.float32(1 - params["mask_loss"]))
+        """bool[y, x]: where the loss reaches `mask_loss`, or the glow that fraction of white in any channel."""
+        dark = _shadows_once(params, context).transmission <= np.float32(1 - params["mask_loss"])
+        light = _glow_once(params, context)
+        if light is None:
+            return np.asarray(dark)
+        white = np.asarray(context.camera.detector.white_e, dtype=np.float32)
+        return np.asarray(dark | (light >= np.float32(params["mask_loss"]) * white).any(axis=2))
 
     def soft(self, params: Params, context: FaultContext) -> F32:
         """Return the fraction of the light that the grains take, float32[y, x]; their glow is no part of it."""
@@ -356,6 +362,10 @@ def _lobe_table(x: F64) -> F64:
     far = x >= _SMOOTH
     out[far] = values[-1] * (_SMOOTH / x[far]) ** 3
     return out
+
+
+def _glow_once(params: Params, context: FaultContext) -> F32 | None:
+    return context.once("dust.glow", params, lambda: _glow(params, context))
 
 
 def _glow(params: Params, context: FaultContext) -> F32 | None:
