@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from conftest import ALL_FAULTS, small_scene
 
-from vbnfault import config, frames, labels, pipeline, plan, resources
+from vbnfault import config, frames, labels, pipeline, plan
 from vbnfault.pictures import develop, effect_of
 from vbnfault.pipeline import Session
 from vbnfault.record import to_sample
-from vbnfault.sample import Frame, SampleSpec
+from vbnfault.sample import Frame
 
 _SESSIONS: dict[str, Session] = {}
 
@@ -382,24 +382,6 @@ def test_black_lines_on_black_sky_are_not_claimed() -> None:
     assert not sample.layers["mask"].any()
     assert sample.scalars["parameters"] == {}
     assert sample.scalars["proposal"]["injected"] == ["broken_lines", "vignetting"]
-
-
-@pytest.mark.parametrize("name", sorted(resources.packaged("scenes")))
-def test_every_packaged_scene_makes_a_sample(name: str) -> None:
-    shrink = {"camera.width_px": 64, "camera.height_px": 64, "render.samples_per_pixel": 4}
-    # a corner of a sensor may have no defect that could show in any view
-    shrink |= {"plan.on_invisible": "drop"}
-    scene = config.load_scene(name, shrink)
-    coarse = max(scene.patch.facet_m, 15.0)
-    scene = config.load_scene(name, {**shrink, "patch.facet_m": coarse, "patch.radius_m": 60.0})
-    s = Session(scene)
-    terrain = s.terrain(int(s.plan.site[0]))
-    # the first sample and the last: both strata where the scene has both
-    for i in (0, scene.dataset.samples - 1):
-        spec = SampleSpec(index=i, scene=scene, plan=s.plan, faults=s.faults, terrain=terrain)
-        sample = pipeline.simulate(spec)
-        assert sample.layers["image"].shape == (64, 64, 4)
-        assert sample.layers["image"].dtype == np.uint8
 
 
 def test_the_paper_example_has_the_papers_parameters() -> None:
