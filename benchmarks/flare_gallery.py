@@ -54,7 +54,7 @@ def sheet(name: str, coating: str, models: tuple[str, ...], pixels: int) -> tupl
             )
             found = flares.layers(view)
             if white is None:  # one exposure for the sheet
-                ghosts = flares.colours(view, found["ghosts"]).max(axis=2)
+                ghosts = flares.colours(view, found["ghosts"] + found["veil"]).max(axis=2)
                 white = float(np.percentile(ghosts, 99)) * 2
             cells.append(flares.picture(view, found, white))
             light.append(flares.colours(view, found["ghosts"])[..., 1])

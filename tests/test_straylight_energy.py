@@ -336,6 +336,38 @@ def test_the_sun_in_a_build_is_vignetted_once() -> None:
     assert dimmed.array[0].sum() < plain.array[0].sum() or not plain.array[0].any()
 
 
+def test_the_mask_level_is_that_of_the_mask() -> None:
+    """The mask holds the pixels that change by `mask_level_dn` or more, the effect all that change."""
+    from conftest import small_scene
+
+    from vbnfault import config
+    from vbnfault.dataset import store_spec
+    from vbnfault.pictures import develop
+    from vbnfault.pipeline import Session
+
+    table = small_scene(
+        camera={"width_px": 48, "height_px": 48},
+        plan={"faulty_fraction": 1.0, "mode": "per_class"},
+        dataset={"layers": ["clean", "mask_effect"]},
+    )
+    table["faults"] = {"straylight": {"model": "texture", "mask_level_dn": 40}}
+    session = Session(config.parse_scene(table, source="test"))
+    seen = 0
+    for index in range(8):
+        frame = session.frame(index)
+        if "straylight" not in frame.drawn:
+            continue
+        with_it, without = (develop(frame, drawn, None).array.astype(int) for drawn in (frame.drawn, {}))
+        change = np.abs(with_it - without).max(axis=2)
+        np.testing.assert_array_equal(frame.mask[0], change >= 40)
+        np.testing.assert_array_equal(frame.effects["straylight"], change >= 1)
+        seen += (frame.mask[0] != frame.effects["straylight"]).any()
+    assert seen
+    spec = store_spec(session, [16])
+    assert spec.mask_kinds == ("strong effect",)
+    assert "mask_level_dn = 40 DN" in spec.mask_rules[0]
+
+
 # --- the veil ----------------------------------------------------------------------------------------------------
 
 
@@ -350,6 +382,6 @@ def test_every_packaged_lens_has_the_veil_of_real_ones() -> None:
     veil_table = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(veil_table)
     for name in resources.packaged("scenes/lenses"):
-        parts = veil_table.index_of(load_lens(name).coated("mgf2"), veil_fraction=0.01)
+        parts = veil_table.index_of(load_lens(name).coated("mgf2"), veil_fraction=0.01, cleanliness_level=0.0)
         assert 0.005 < sum(parts.values()) < 0.05, name
         assert parts["veil"] == pytest.approx(0.01, rel=0.02)

@@ -153,6 +153,8 @@ def _mask_rule(kind: str, fault: Fault) -> str:
     if kind == "effect":
         return store.EFFECT_RULE
     rule = labels.footprint_rule(fault)
+    if kind == "strong effect":
+        return rule
     return f"{rule}; or {store.EFFECT_RULE}" if "effect" in kind else rule
 
 

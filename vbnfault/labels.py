@@ -1,7 +1,8 @@
 """Masks: where a fault sits, and where it shows.
 
 The mask of a class is its *footprint*, except for classes that label by *effect* (straylight): the pixels that
-change by at least one digital number, noise-free, when the fault is switched off. Whatever overwrites a flare
+change by at least `Fault.effect_level_dn` digital numbers (one by default), noise-free, when the fault is switched
+off. Whatever overwrites a flare
 (a broken line, saturation) therefore drops out of its mask.
 """
 
@@ -22,22 +23,25 @@ Mask = NDArray[np.bool_]
 _MOVES = ("pixels", "charge")
 
 
-def effect(image: NDArray[np.uint8], without: NDArray[np.uint8]) -> Mask:
-    """bool[y, x]: pixels of two noise-free 8 bit images that differ in any channel."""
+def effect(image: NDArray[np.uint8], without: NDArray[np.uint8], least_dn: float = 1.0) -> Mask:
+    """bool[y, x]: pixels of two noise-free 8 bit images that differ by `least_dn` or more in any channel."""
+    if least_dn > 1:
+        return np.asarray((cv2.absdiff(image, without) >= least_dn).any(axis=2))
     # four 8 bit channels compare as one 32 bit word
     a, b = (np.ascontiguousarray(x).view(np.uint32)[..., 0] for x in (image, without))
     return a != b
 
 
 def kind(fault: Fault, *, is_ccd: bool) -> str:
-    """Return what the mask of a fault is: `footprint`, `effect`, or both united."""
+    """Return what the mask of a fault is: `footprint`, `effect`, both united, or `strong effect`: the effect from
+    more than one digital number on."""
     if fault.effect_mask:
-        return "effect"
+        return "effect" if fault.effect_level_dn <= 1 else "strong effect"
     return "footprint and effect" if is_ccd and fault.step in _MOVES else "footprint"
 
 
 def footprint_rule(fault: Fault) -> str:
-    """Return which pixels a fault's footprint holds, with the thresholds of the fault: its fields mask_*."""
+    """Return which pixels the mask of a fault holds, with the thresholds of the fault: its fields mask_*."""
     thresholds = [f for f in dataclasses.fields(fault) if f.name.startswith("mask_")]
     rules = []
     for f in thresholds:

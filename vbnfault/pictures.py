@@ -213,9 +213,9 @@ def _invisible(frame: Frame, noise: Any) -> list[str]:
     """Drawn faults without any effect on the noise-free picture."""
     if "mask_effect" in frame.spec.scene.dataset.layers:  # all effects are stored, so no cheaper look is needed
         frame.effects = {name: effect_of(frame, name) for name in frame.drawn}
-        return [name for name, effect in frame.effects.items() if not effect.any()]
+        return [name for name in frame.drawn if not mask_effect_of(frame, name).any()]
     doubtful = sorted(_doubtful(frame, noise))
-    return [n for n in doubtful if not (_shows_on_some_rows(frame, n) or effect_of(frame, n).any())]
+    return [n for n in doubtful if not (_shows_on_some_rows(frame, n) or mask_effect_of(frame, n).any())]
 
 
 def _shows_on_some_rows(frame: Frame, name: str) -> bool:
@@ -231,7 +231,7 @@ def _shows_on_some_rows(frame: Frame, name: str) -> bool:
         signal = _signal(frame, drawn, names).merged
         some = signal.with_array(np.ascontiguousarray(signal.array[rows]))
         pictures.append(detector.develop(some, exposure, None).array)
-    seen = labels.effect(*pictures)
+    seen = labels.effect(pictures[0], pictures[1], faults[name].effect_level_dn)
     for other in readout:
         over = faults[other].footprint(drawn[other], frame.context)
         if over is not None:
@@ -239,12 +239,21 @@ def _shows_on_some_rows(frame: Frame, name: str) -> bool:
     return bool(seen.any())
 
 
-def effect_of(frame: Frame, name: str) -> NDArray[np.bool_]:
-    """bool[y, x]: where the noise-free picture changes when one of the drawn faults is switched off."""
+def mask_effect_of(frame: Frame, name: str) -> NDArray[np.bool_]:
+    """bool[y, x]: where the change is as large as the fault's mask by effect asks for."""
+    least_dn = frame.spec.faults[name].effect_level_dn
+    if least_dn > 1:
+        return effect_of(frame, name, least_dn)
+    return frame.effects[name] if name in frame.effects else effect_of(frame, name)
+
+
+def effect_of(frame: Frame, name: str, least_dn: float = 1.0) -> NDArray[np.bool_]:
+    """bool[y, x]: where the noise-free picture changes, by `least_dn` or more, when one of the drawn faults is
+    switched off."""
     drawn, others = frame.drawn, _but(frame.drawn, name)
     optical = _in_order(frame, drawn, "electrons")
     if name not in optical or _altered(frame, drawn) != frame.camera or not frame.camera.detector.local:
-        return labels.effect(develop(frame, drawn, None).array, develop(frame, others, None).array)
+        return labels.effect(develop(frame, drawn, None).array, develop(frame, others, None).array, least_dn)
     # only pixels whose signal changes can change: the others need not be developed
     whole, part = (_signal(frame, d, [n for n in optical if n in d]).merged for d in (drawn, others))
     differ = whole.array != part.array
@@ -259,7 +268,7 @@ def effect_of(frame: Frame, name: str) -> NDArray[np.bool_]:
     pixels = part.array.reshape(-1, part.array.shape[2])[filled]
     developed = frame.camera.detector.develop(part.with_array(pixels), frame.camera.exposure_s, None).array
     array.reshape(-1, 4)[changed] = developed.reshape(-1, 4)[: len(changed)]
-    return labels.effect(with_it, _read_out(frame, RGBI(array=array), others).array)
+    return labels.effect(with_it, _read_out(frame, RGBI(array=array), others).array, least_dn)
 
 
 def soft_layer(frame: Frame, name: str) -> NDArray[Any]:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from . import frames, labels, plan, world
 from .config import SceneConfig
-from .pictures import effect_of, soft_layer
+from .pictures import effect_of, mask_effect_of, soft_layer
 from .quantities import Sample
 from .sample import Frame, mask_any_faults, stored_layers
 
@@ -26,7 +26,8 @@ def label(frame: Frame) -> None:
         needed = "mask_effect" in wanted or fault.effect_mask or labels.spreads(fault, frame.context)
         if needed and name not in frame.effects:
             frame.effects[name] = effect_of(frame, name)
-    frame.mask = labels.mask_layers(spec.faults, frame.drawn, frame.context, frame.effects)
+    shown = frame.effects | {name: mask_effect_of(frame, name) for name in frame.effects}
+    frame.mask = labels.mask_layers(spec.faults, frame.drawn, frame.context, shown)
 
 
 def to_sample(frame: Frame) -> Sample:

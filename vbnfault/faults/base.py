@@ -282,6 +282,11 @@ class Fault:
     def validate(self) -> None:
         """Raise ValueError with one sentence where fields contradict each other."""
 
+    @property
+    def effect_level_dn(self) -> float:
+        """The change of the noise-free 8 bit image, in DN, from which a pixel counts for a mask by effect."""
+        return 1.0
+
     def to_dict(self) -> dict[str, Any]:
         """Plain data that `from_dict` turns back into an equal fault."""
         plain: dict[str, Any] = {"model": self.model}

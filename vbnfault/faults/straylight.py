@@ -80,12 +80,17 @@ class TextureStraylight(Fault):
         1.0,
         limits=(0.01, 255),
         unit="DN of 255",
-        doc="the footprint holds the pixels that gain at least this much",
+        doc="the mask holds the pixels that the noise-free image changes in by at least this much",
     )
     flares: tuple[Mapping[str, float], ...] = rows(
         {"index": (1, 10), "position": (-20, 20), "radius": (1e-3, 5), "brightness": (0, 1000)},
         doc="the flares themselves, in place of a draw of count, index, position, radius and brightness",
     )
+
+    @property
+    def effect_level_dn(self) -> float:
+        """`mask_level_dn`."""
+        return float(self.mask_level_dn)
 
     def validate(self) -> None:
         choices = int(self.index.hi) - int(self.index.lo) + 1

@@ -79,7 +79,7 @@ class _LensStraylight(LensFault):
         1.0,
         limits=(0.01, 255),
         unit="DN of 255",
-        doc="the footprint holds the pixels that gain at least this much",
+        doc="the mask holds the pixels that the noise-free image changes in by at least this much",
     )
 
     def validate(self) -> None:
@@ -131,9 +131,10 @@ class _LensStraylight(LensFault):
         found = self._light_once(params, context)
         return np.zeros(context.shape, np.float32) if found is None else intensity_dn(found.added, context.camera)
 
-    def mask_least_dn(self, params: Params) -> float:
+    @property
+    def effect_level_dn(self) -> float:
         """`mask_level_dn`."""
-        return float(params["mask_level_dn"])
+        return float(self.mask_level_dn)
 
     def _light_once(self, params: Params, context: FaultContext) -> _Light | None:
         return context.once("straylight.lens", params, lambda: self._light(params, context))

@@ -153,7 +153,8 @@ def straylight(
                 sun_deg,
                 length_mm=baffle.length_mm,
                 radius_mm=baffle.radius_mm,
-                entrance_radius_mm=lens.surfaces[0].semi_diameter_mm,
+                # of a tube narrower than the lens, its own opening is the entrance
+                entrance_radius_mm=min(lens.surfaces[0].semi_diameter_mm, baffle.radius_mm),
             )
         )
     own = axial_transmittance(lens, nodes)

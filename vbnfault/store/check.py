@@ -338,6 +338,8 @@ def _check_labels(
     for fault, kind, one, other in zip(spec.faults, spec.mask_kinds, mask, effect, strict=False):
         if kind == "effect" and not np.array_equal(one, other):
             yield f"sample {i}: mask of {fault} is not its effect, as mask_effect has it"
+        if kind == "strong effect" and (one & ~other).any():
+            yield f"sample {i}: mask of {fault} holds pixels outside of its effect, as mask_effect has it"
     # equal checksums stand for equal pictures: both have just been compared with their pixels
     crc = dict(zip(spec.pixel_layers, crcs.tolist(), strict=False))
     if not injected.any() and crc["image"] != crc["clean"]:

@@ -1,0 +1,167 @@
+"""Every declared key of every fault model acts: on the pixels, or on the mask."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from test_faults_kit import make_context, noisy, with_mosaic
+
+from vbnfault import labels, spectra
+from vbnfault.detector import MosaicDetector
+from vbnfault.errors import InputError
+from vbnfault.faults import Fault, FaultContext, act, from_dict, registry
+from vbnfault.quantities import Electrons
+
+SIZE = 64
+KEYS = [
+    (fault, model, f.name)
+    for fault, models in registry().items()
+    for model, cls in models.items()
+    for f in dataclasses.fields(cls)
+]
+# What keys need beside them to be seen: other keys of the class, or of one key, that give it something to do.
+COMPANIONS: dict[tuple[str, str], dict[str, Any]] = {
+    ("straylight", "baffle_length_mm"): {"baffle_radius_mm": 1.0},
+    ("straylight", "baffle_radius_mm"): {"baffle_length_mm": 30.0},
+    ("dust_on_optics", "window_height_mm"): {"surface": -2},
+    ("dust_on_optics", "mask_loss"): {"diameter_um": 20.0},
+    ("broken_pixels", "clustered_share"): {"years": 20.0},
+    ("optics_degradation", "filter_size_px"): {"scale_with_resolution": False},
+    ("broken_lines", "saturated_weight"): {"count": 20},
+    ("broken_lines", "duplicated_weight"): {"count": 20},
+    ("pixel_overwriting", "strength"): {"blend": "mixture"},
+}
+# A packet is by default half of the small picture.
+CLASS_KEYS: dict[str, dict[str, Any]] = {"transmission": {"packet_px": 64}}
+ARCHITECTURES = {
+    "leak": "interline_ccd",
+    "shutter_share": "full_frame_ccd",
+    "lines_at_once": "cmos",
+    "saturated_weight": "cmos",
+    "duplicated_weight": "cmos",
+}
+# Of few surfaces, so that all paths are soon traced.
+SINGLET = """
+surface = [
+  { radius_mm = 60.0, thickness_mm = 4.0, nd = 1.6, vd = 45.0, diameter_mm = 16.0 },
+  { radius_mm = -60.0, thickness_mm = 2.0, diameter_mm = 16.0 },
+  { stop = true, thickness_mm = 0.0, diameter_mm = 10.0 },
+]
+"""
+
+
+def values(f: dataclasses.Field[Any], files: list[str]) -> list[Any]:
+    """Values of a key to compare, the most usual first, from its declaration alone."""
+    meta = f.metadata
+    kind = meta["kind"]
+    if kind == "flag":
+        return [True, False]
+    if kind == "choice":
+        return list(meta["options"])
+    if kind == "text":
+        return {"channels": ["RGBI", "R"], "lens": [files[2], "tessar_50_f2p8"]}.get(f.name, files[:2])
+    if kind == "rows":
+        return [[], [{k: float(np.ceil(lo + 0.05 * (hi - lo))) for k, (lo, hi) in meta["columns"].items()}]]
+    lo, hi = meta["limits"]
+    if kind == "bounds":
+        a, b = f.default  # type: ignore[misc]
+        found = [a, b, a + 1e-4 * (hi - a), hi]
+    else:
+        first = lo if f.default is None else f.default
+        found = [first, 0.5 * first, first + 1, first + 2, lo, 30 * first, hi]
+    found = [v for v in found if lo <= v <= hi]
+    return list(dict.fromkeys(int(v) for v in found)) if meta["integer"] else list(dict.fromkeys(found))
+
+
+def context(fault: Fault, key: str) -> FaultContext:
+    architecture = ARCHITECTURES.get(key, "frame_transfer_ccd")
+    made = make_context(SIZE, sun=(40.0, 24.0), exposure_s=1e-3, architecture=architecture)
+    nodes = spectra.band_nodes_nm(400.0, 700.0, 3)
+    made = replace(
+        made,
+        sun_direction_C=np.array([0.091, -0.091, 0.9917]),
+        wavelength_nm=nodes,
+        sun_irradiance_W_m2_nm=spectra.solar_band_irradiance_W_m2_nm(nodes, 1.0),
+        sun_angular_radius_rad=spectra.sun_angular_radius_rad(1.0),
+    )
+    # long enough for dark current
+    if not fault.needs_mosaic:
+        return made
+    made = with_mosaic(replace(made, camera=replace(made.camera, exposure_s=20.0)))
+    assert isinstance(made.camera.detector, MosaicDetector)
+    sensor = made.camera.detector.sensor
+    # a key may need several nodes, or a drain that can fail
+    readout = replace(sensor.readout, nodes=2 if key == "node_chance" else sensor.readout.nodes)
+    transfer = replace(sensor.transfer, antiblooming=0.5 if made.camera.is_ccd else 0.0)
+    detector = replace(made.camera.detector, sensor=replace(sensor, readout=readout, transfer=transfer))
+    return replace(made, camera=replace(made.camera, detector=detector))
+
+
+def outcome(table: dict[str, Any], name: str, key: str) -> list[NDArray[Any]]:
+    """What a key may act on: the quantity, the altered camera's device, masks and defects."""
+    fault = from_dict(name, table, source="test.toml")
+    where = context(fault, key)
+    params = fault.draw(where, np.random.default_rng(5))
+    camera = fault.alter(where.camera, params)
+    where = fault.inform(where, params)
+    before: Any = noisy(fault.step, where)
+    after: Any
+    if isinstance(before, Electrons):
+        after = act(fault, before, params, where).merged
+    else:
+        after = fault.apply(before, params, where)
+    found = [after.array]
+    if camera != where.camera and isinstance(camera.detector, MosaicDetector):
+        found.append(np.frombuffer(repr(camera.detector).encode(), dtype=np.uint8))
+    if fault.effect_mask and isinstance(before, Electrons):
+        one, other = (where.camera.detector.develop(q, 1e-3, None).array for q in (after, before))
+        found.append(labels.effect(one, other, fault.effect_level_dn))
+    else:
+        mask = fault.footprint(params, where)
+        found.append(np.zeros(0) if mask is None else mask)
+    defects = fault.defects(params, where)
+    return [*found, np.zeros(0) if defects is None else defects]
+
+
+def same(one: list[NDArray[Any]], other: list[NDArray[Any]]) -> bool:
+    return len(one) == len(other) and all(np.array_equal(a, b) for a, b in zip(one, other, strict=True))
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
+    """Two different textures, and a lens."""
+    folder = tmp_path_factory.mktemp("files")
+    lens = folder / "singlet.toml"
+    lens.write_text(SINGLET, encoding="utf-8")
+    paths: list[Path] = [folder / f"{k}.png" for k in range(2)]
+    for k, path in enumerate(paths):
+        picture = np.random.default_rng(k).integers(0, 256, (40, 50, 4), dtype=np.uint8)
+        picture[:20, :, 3] = 0
+        assert cv2.imwrite(str(path), picture)
+    return [str(path) for path in (*paths, lens)]
+
+
+@pytest.mark.parametrize(("name", "model", "key"), KEYS)
+def test_every_key_acts_on_pixels_or_masks(name: str, model: str, key: str, files: list[str]) -> None:
+    fields = {f.name: f for f in dataclasses.fields(registry()[name][model])}
+    base = {"model": model, "texture_file": files[0], "lens": files[2]}
+    base |= CLASS_KEYS.get(name, {}) | COMPANIONS.get((name, key), {})
+    base = {k: v for k, v in base.items() if k in fields or k == "model"}
+    first: list[NDArray[Any]] | None = None
+    tried = values(fields[key], files)
+    for value in tried:
+        try:
+            found = outcome(base | {key: value}, name, key)
+        except InputError:  # it contradicts another key
+            continue
+        if first is not None and not same(first, found):
+            return
+        first = found if first is None else first
+    pytest.fail(f"{name}.{key}: all of {tried!r} give the same pixels and masks")
