@@ -72,8 +72,9 @@ def mirrors(lens: Prescription) -> tuple[int, ...]:
 
 
 def pairs(lens: Prescription) -> tuple[tuple[int, int], ...]:
-    """All pairs of reflecting rows, n (n - 1) / 2 of them."""
-    return tuple(combinations(mirrors(lens), 2))
+    """Return all pairs of reflecting rows, n (n - 1) / 2 of them; a sensor that reflects is one behind the last."""
+    rows = (*mirrors(lens), *((len(lens.surfaces),) if lens.sensor_reflectance else ()))
+    return tuple(combinations(rows, 2))
 
 
 def along(lens: Prescription, path: Sequence[tuple[int, bool]], wavelength_nm: ArrayLike = D_NM) -> tuple[F64, F64]:
@@ -105,6 +106,9 @@ def transmittance(lens: Prescription, path: Sequence[tuple[int, bool]], waveleng
     index = lens.indices(wavelength_nm)
     share = 1.0
     for row, mirror in path:
+        if row == len(lens.surfaces):
+            share *= lens.sensor_reflectance
+            continue
         films = lens.surfaces[row].coating
         reflected = float(mean_reflectance(films, index[row], index[row + 1], 1.0, wavelength_nm))
         share *= reflected if mirror else 1 - reflected
@@ -139,7 +143,9 @@ def paraxial_ghosts(
     for pair in pairs(lens):
         path = ghost(lens, *pair)
         matrix, met = along(lens, path, wavelength_nm)
-        rims = np.array([lens.surfaces[row].semi_diameter_mm for row, _ in path])
+        # the sensor has no rim
+        radii = [*(s.semi_diameter_mm for s in lens.surfaces), np.inf]
+        rims = np.array([radii[row] for row, _ in path])
         with np.errstate(divide="ignore"):
             radius = rims / np.abs(met[:, 0, 0])
         least = int(np.argmin(radius))
