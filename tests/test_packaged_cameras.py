@@ -1,0 +1,120 @@
+"""Every packaged lens and detector takes pictures; noise hides the steps of converters; NAVCAM is as published."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import small_scene
+
+from vbnfault import config, dataset, llvm, photometry, resources, spectra, store, world
+from vbnfault.detector import MosaicDetector
+from vbnfault.detector.readout import ReadoutNoise, analogue_dn, read_out
+from vbnfault.detector.sensor import load_sensor
+from vbnfault.errors import VbnfaultError
+from vbnfault.lens import ThinLens, load_lens
+
+LENSES = sorted(resources.packaged("scenes/lenses"))
+DETECTORS = sorted(resources.packaged("scenes/detectors"))
+
+
+@pytest.mark.parametrize("number", range(max(len(LENSES), len(DETECTORS))))
+def test_every_lens_and_detector_makes_a_store(number: int, tmp_path: Path) -> None:
+    """A small store of every lens, with one detector after the other: built, verified, read back."""
+    try:
+        llvm.find()
+    except VbnfaultError as error:
+        pytest.skip(f"no usable LLVM: {error}")
+    lens, detector = LENSES[number % len(LENSES)], DETECTORS[number % len(DETECTORS)]
+    table = small_scene(
+        dataset={"samples": 1, "seed": 3, "sites": 1, "shard_samples": 1, "layers": ["clean", "raw"]},
+        camera={
+            "width_px": 40,
+            "height_px": 32,
+            "lens": lens,
+            "detector": detector,
+            "fov_deg": 30.0,
+            "f_number": 5.6,
+        },
+        plan={"faulty_fraction": 0.0},
+        geometry={"height_m": [100.0, 200.0]},
+    )
+    table["faults"] = {"dust_on_optics": {"model": "defocused"}}
+    scene = config.parse_scene(table, source="test")
+    dataset.build_scene(scene, tmp_path / "store.zarr", source="test")
+    made = store.open_store(tmp_path / "store.zarr")
+    expected = dataset.planned(made.spec.attributes, made.spec.faults)
+    assert not store.verify(made, expected=expected)
+    assert made.attributes["optics"]["name"] == load_lens(lens).name
+    assert made.attributes["optics"]["f_number"] == pytest.approx(5.6, rel=1e-4)
+    assert made.attributes["detector"]["name"] == load_sensor(detector).name
+    raw = made.read("raw")
+    bias = load_sensor(detector).readout.bias_dn
+    assert raw.shape == (1, 32, 40)
+    # ground is in the picture, metered to three quarters of white
+    assert raw.max() > 2 * bias + 100
+
+
+# --- the converter's steps ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", DETECTORS)
+def test_noise_hides_the_steps_of_the_converter(name: str) -> None:
+    """The mean of many pixels follows levels between two codes."""
+    spec = load_sensor(name).readout
+    sigma = spec.noise_e_rms * spec.system_gain_dn_per_e
+    assert sigma >= 0.5
+    shape = (256, 512)
+    noise = ReadoutNoise.draw(shape, np.random.default_rng([7, 1]), np.random.default_rng([7, 2]))
+    noise = ReadoutNoise(read=noise.read, row=np.zeros_like(noise.row))
+    # a Gaussian of σ steps before a rounding leaves exp(-2 π² σ²) / π of a sine over the step in the mean
+    # (Widrow & Kollár 2008, Quantization Noise, 4.3), 0.2 % of a step at σ = 0.5; and five standard errors of the
+    # mean, of noise and of the rounding's own 1/12
+    chance = math.sqrt((sigma**2 + 1 / 12) / math.prod(shape))
+    allowed = math.exp(-2 * math.pi**2 * sigma**2) / math.pi + 5 * chance
+    for part in np.linspace(0, 1, 11):
+        electrons = np.full(shape, (20 + part) / spec.system_gain_dn_per_e, np.float32)
+        level = analogue_dn(electrons, spec).mean(dtype=np.float64) + sigma * noise.read.mean(dtype=np.float64)
+        assert read_out(electrons, spec, noise).mean(dtype=np.float64) == pytest.approx(level, abs=allowed)
+
+
+# --- Rosetta's navigation camera ---------------------------------------------------------------------------------
+
+
+def test_the_navigation_camera_is_the_published_one() -> None:
+    """NSSDCA 2004-006A-17: 152.5 mm; 70 mm, f/2.2; behind the attenuator 30 mm, f/5.1, and 580 times less light."""
+    scene = config.load_scene("navcam67p")
+    camera = world.base_camera(scene)
+    lens = camera.lens
+    assert isinstance(lens, ThinLens)
+    # the published figures have two to four digits
+    assert lens.focal_length_mm == pytest.approx(152.5, abs=0.5)
+    assert lens.focal_length_mm / lens.f_number == pytest.approx(30.0, rel=0.01)
+    light, whole = (n_t[1] / n_t[0] ** 2 for n_t in ((lens.f_number, lens.transmission), (2.2, 0.9)))
+    assert whole / light == pytest.approx(580, rel=0.01)
+    assert (camera.width_px, camera.height_px, camera.detector.pixel_pitch_um) == (1024, 1024, 13.0)
+
+
+def test_the_navigation_camera_sees_to_1000_nm() -> None:
+    scene = config.load_scene("navcam67p")
+    nodes = world.wavelengths_nm(scene)
+    assert (nodes[0], nodes[-1]) == (400.0, 1000.0)
+    detector = world.base_camera(scene).detector
+    assert isinstance(detector, MosaicDetector)
+    efficiency = detector.sensor.efficiency.at(np.array([400.0, 450.0, 650.0, 900.0, 1000.0]))[0]
+    assert (efficiency > 0.03).all()
+    assert efficiency[4] < 0.1 < efficiency[3] < 0.4 < efficiency[2] < 0.8
+    # 67P's own light in all of it: sunlight of ASTM G173 at 1000 nm is 0.74 W/m²/nm at 1 au
+    assert spectra.solar_irradiance_W_m2_nm(np.array([1000.0]))[0] == pytest.approx(0.74, rel=0.03)
+    sun = spectra.solar_band_irradiance_W_m2_nm(nodes, 1.0)
+    albedo = photometry.geometric_albedo(world.photometric_model(scene))
+    # Fornasier et al. 2015: 11 to 16 % per 100 nm in the visible; 0.0820 at 989 nm, 0.0677 at 649 nm, 5 % each
+    near, red = (float(np.interp(nm, nodes, albedo)) for nm in (989.0, 649.0))
+    assert near / red == pytest.approx(0.0820 / 0.0677, rel=0.1)
+    slope = (np.interp(743.0, nodes, albedo) / np.interp(535.0, nodes, albedo) - 1) / 2.08
+    assert 0.10 < slope < 0.17
+    electrons = detector.electron_rate_weights(nodes)[0] * sun * albedo
+    # an eye-like camera would lose that share
+    assert 0.25 < electrons[nodes > 700].sum() / electrons.sum() < 0.55
