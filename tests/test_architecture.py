@@ -26,7 +26,7 @@ CAMERA = {"spectra", "quantities", "llvm", "lens", "detector", "camera"}
 WORLD = GEOMETRY | CAMERA | {"sky", "spacecraft", "render"}
 STAGES = {"pose", "exposure", "pictures", "record"}
 PIPELINE = WORLD | STAGES | {"world", "faults", "labels", "sample", "pipeline"}
-DATASET = PIPELINE | {"store", "jobs", "build", "dataset"}
+DATASET = PIPELINE | {"store", "jobs", "build", "describe", "dataset"}
 MAY_IMPORT: dict[str, set[str]] = {
     "__init__": set(),
     "errors": set(),
@@ -64,6 +64,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "store": {"quantities", "config", "plan"},
     "jobs": PIPELINE | {"store"},
     "build": PIPELINE | {"store", "jobs"},
+    "describe": PIPELINE | {"jobs"},
     "dataset": DATASET,
     "study": DATASET,
     "report": DATASET,

@@ -50,6 +50,7 @@ RECYCLE_SHARDS = 32  # a worker process is replaced after so many: long LLVM run
 @dataclass(frozen=True, kw_only=True)
 class Summary:
     """What a build would do, or did. `finished` samples were there before; `built` ones were made now.
+    `description`: what the scene will photograph, a line each.
 
     `estimated_seconds`: of the whole work, None where unknown. `counts` and `digest`: of the store at the end.
     """
@@ -68,6 +69,7 @@ class Summary:
     estimated_seconds: float | None = None
     counts: FaultCounts | None = None
     digest: str | None = None
+    description: tuple[str, ...] = ()
 
     def outlook(self) -> list[str]:
         """What there is to do, in words."""
@@ -86,7 +88,7 @@ class Summary:
     def lines(self) -> list[str]:
         """The summary in words: of what was done, or else of what there is to do."""
         if self.counts is None:
-            return self.outlook()
+            return [*self.outlook(), *self.description]
         lines = [f"{self.path}: {self.samples} samples, {self.finished} of them finished before"]
         if self.built:
             lines.append(f"{self.built} samples built in {duration_text(self.seconds)}")

@@ -192,6 +192,23 @@ def build(
 
 
 @app.command()
+def describe(
+    scene: SceneArgument,
+    samples: Annotated[
+        int | None, typer.Option(min=1, max=MOST_SAMPLES, help="number of samples, in place of the scene's")
+    ] = None,
+    seed: SeedOption = None,
+    settings: SetOption = None,
+) -> None:
+    """Say what a scene will photograph: samples by class and split, geometry, camera, size and time."""
+    from . import dataset
+
+    source = _scene(scene, settings, dataset__samples=samples, dataset__seed=seed)
+    for line in dataset.describe_scene(source, source=scene):
+        typer.echo(line)
+
+
+@app.command()
 def verify(store: StoreArgument) -> None:
     """Check a store: exit code 0 only if every sample is whole, labelled and as planned."""
     from . import dataset

@@ -8,13 +8,14 @@ import importlib.metadata
 import json
 import os
 import platform
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from . import __version__, build, config, labels, llvm, pipeline, plan, resources, store, world
+from . import __version__, build, config, describe, labels, llvm, pipeline, plan, resources, store, world
 from .config import SceneConfig
 from .detector import Detector, MosaicDetector
 from .errors import VbnfaultError
@@ -320,8 +321,16 @@ def build_scene(
         session.warn_of_assumptions()
         counts = {name: int(session.plan.injects(name).sum()) for name in session.faults}
         spec = store_spec(session, blocks)
+        description: list[str] = []
+        if dry_run:
+            description = describe.describe(
+                session, sample_bytes=spec.estimated_sample_bytes, seconds=estimated_seconds(session)
+            )
     contents.complete()
-    return build.build(
+    if not dry_run:
+        for sentence in plan.shortcomings(scene, session.plan):
+            print(f"warning: {sentence}", file=sys.stderr)
+    summary = build.build(
         SessionFactory(scene, blocks, threads, contents),
         spec,
         out,
@@ -339,3 +348,11 @@ def build_scene(
         expected=planned(spec.attributes, spec.faults),
         exact=is_exact(spec.attributes),
     )
+    return dataclasses.replace(summary, description=tuple(description))
+
+
+def describe_scene(scene: SceneConfig, *, source: str) -> list[str]:
+    """Return what a scene will photograph, as lines; nothing is rendered. `source` names it in errors."""
+    session = pipeline.Session(scene, source=source)
+    spec = store_spec(session, (scene.dataset.samples,))
+    return describe.describe(session, sample_bytes=spec.estimated_sample_bytes, seconds=estimated_seconds(session))

@@ -14,6 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from . import photometry, world
+from .camera import Camera
+from .config import SceneConfig
 from .faults import FaultContext
 from .lens import RealLens
 from .quantities import BODY, SKY, Electrons, Radiance, Truth
@@ -162,7 +164,7 @@ def green_per_second(frame: Frame) -> F64:
     """Electrons per second of the green pixels for a unit of radiance in each band, float64[band]."""
     nodes = world.wavelengths_nm(frame.spec.scene)
     unit = Radiance(array=np.eye(len(nodes), dtype=np.float32)[:, :, None], wavelength_nm=nodes)
-    return np.asarray(_rate_on_axis(frame, unit).array[:, 0, 1], dtype=np.float64)
+    return np.asarray(_rate_on_axis(frame.camera, unit).array[:, 0, 1], dtype=np.float64)
 
 
 # --- meter -------------------------------------------------------------------------------------------------
@@ -208,16 +210,21 @@ def _add_stars(frame: Frame) -> None:
         _expose(frame)
 
 
-def _metered_exposure_s(frame: Frame, rate: Electrons) -> float:
-    settings, scene = frame.spec.scene.camera, frame.spec.scene
-    # as a facet whose normal is 45 degrees from the Sun would be exposed
+def reference_exposure_s(scene: SceneConfig, camera: Camera) -> float:
+    """Return the exposure that puts ground whose normal is 45 degrees from the Sun at the metering level."""
     half = np.sqrt(0.5)
     lit = photometry.radiance_factor(world.photometric_model(scene), [0, half, half], [half, 0, half])[:, 0] / np.pi
-    facet = (lit * frame.sunlight.irradiance_W_m2_nm).astype(np.float32).reshape(-1, 1, 1)
+    sunlight = world.sunlight(scene, np.array([0.0, 0.0, -1.0]))  # of any direction
+    facet = (lit * sunlight.irradiance_W_m2_nm).astype(np.float32).reshape(-1, 1, 1)
     wavelength = world.wavelengths_nm(scene)
-    per_second = _rate_on_axis(frame, Radiance(array=facet, wavelength_nm=wavelength))
+    per_second = _rate_on_axis(camera, Radiance(array=facet, wavelength_nm=wavelength))
     facet_brightness = float(_brightness(per_second.array, per_second.white_e).max())
-    reference = settings.metering_level / max(facet_brightness, 1e-30)
+    return float(scene.camera.metering_level / max(facet_brightness, 1e-30))
+
+
+def _metered_exposure_s(frame: Frame, rate: Electrons) -> float:
+    settings = frame.spec.scene.camera
+    reference = reference_exposure_s(frame.spec.scene, frame.camera)
     # every other pixel each way is sample enough for a percentile
     body = frame.truth.semantic[::2, ::2] == BODY
     shown = _brightness(rate.array[::2, ::2], rate.white_e)[body]
@@ -246,8 +253,8 @@ def _rate(frame: Frame, radiance: Radiance) -> Electrons:
     return frame.camera.expose(radiance, 1.0)
 
 
-def _rate_on_axis(frame: Frame, radiance: Radiance) -> Electrons:
+def _rate_on_axis(camera: Camera, radiance: Radiance) -> Electrons:
     """Expected electrons after one second of radiance of any shape, as if all of it were seen along the axis."""
-    lens = frame.camera.lens
+    lens = camera.lens
     irradiance = lens.on_axis(radiance) if isinstance(lens, RealLens) else lens.image(radiance)
-    return frame.camera.detector.electrons_expected(irradiance, 1.0)
+    return camera.detector.electrons_expected(irradiance, 1.0)

@@ -1,0 +1,51 @@
+"""What a scene will photograph, before a build: counts of the plan, geometry, warnings."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from vbnfault import cli, config, dataset, plan
+
+
+def described(*settings: str, scene: str = "quickstart") -> list[str]:
+    told = CliRunner().invoke(cli.app, ["describe", scene, *(part for s in settings for part in ("--set", s))])
+    assert told.exit_code == 0, told.output
+    return told.output.splitlines()
+
+
+def test_describe_counts_what_is_planned_by_class_stratum_and_split() -> None:
+    scene = config.load_scene("quickstart")
+    table = plan.make_plan(scene, list(scene.faults))
+    lines = described()
+    rows = {line.split()[0]: [int(n) for n in re.findall(r"\d+", line)] for line in lines if line.startswith("  ")}
+    for fault in scene.faults:
+        per_split = [int((table.injects(fault) & (table.split == k)).sum()) for k in range(3)]
+        assert rows[fault] == [sum(per_split), *per_split]
+    assert rows["samples"] == [16, *np.bincount(table.split)]
+    assert not [line for line in lines if line.startswith("warning")]
+
+
+def test_describe_says_what_the_frame_shows() -> None:
+    text = "\n".join(described("geometry.height_m=[10, 100]", "camera.fov_deg=90", "sun.distance_au=2"))
+    # 90 degrees across: twice the height, over 512 pixels
+    assert "0.0391 to 0.391 m a pixel, footprint 20 to 200 m across" in text
+    assert "Sun: 2 au" in text
+    assert "at least 5% sunlit ground" in text
+    faint = next(line for line in described("sun.distance_au=2") if "exposure" in line)
+    bright = next(line for line in described("sun.distance_au=1") if "exposure" in line)
+    times = [float(re.search(r"about ([0-9.e-]+) s", line)[1]) for line in (faint, bright)]  # type: ignore[index]
+    assert times[0] / times[1] == pytest.approx(4, rel=0.01)  # inverse square, three digits each
+
+
+def test_a_dry_run_and_describe_say_the_same_and_warn_of_missing_classes(tmp_path: Path) -> None:
+    scene = config.load_scene("quickstart", {"dataset.samples": 4})
+    lines = dataset.describe_scene(scene, source="quickstart")
+    assert [line for line in lines if line.startswith("warning: split val has no samples")]
+    summary = dataset.build_scene(scene, tmp_path / "none.zarr", source="quickstart", dry_run=True)
+    assert summary.lines()[-len(lines) :] == lines
+    assert not (tmp_path / "none.zarr").exists()
