@@ -34,6 +34,7 @@ from vbnfault.quantities import Sample
 from vbnfault.store import codec
 
 SAMPLES = 18
+HERE = Path(__file__).resolve().parent
 
 
 def site_of(samples: int = SAMPLES) -> np.ndarray:
@@ -189,6 +190,13 @@ def test_kill_9_at_any_operation_then_resuming_makes_the_same_bits(
     assert st.digest(out) == st.digest(tmp_path / "whole.zarr")
     assert sorted(p.name for p in tmp_path.iterdir()) == ["s.zarr", "whole.zarr"]
     assert not list(out.rglob("*.partial"))
+
+
+def test_the_command_that_kills_builds_finds_none_that_fails() -> None:
+    command = [sys.executable, "-m", "tests.kills", "--count", "3", "--seed", "3"]
+    done = subprocess.run(command, cwd=HERE.parent, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert re.search(r"[3-6] kills in \d rounds, rendering off: 0 failures", done.stdout), done.stdout
 
 
 @pytest.mark.parametrize(("workers", "number"), [(1, "SIGINT"), (1, "SIGTERM"), (2, "SIGHUP"), (2, "SIGINT")])
@@ -417,7 +425,8 @@ def test_too_little_room_is_said_before_the_first_sample(
 
 def test_paths_that_cannot_be_used_are_bad_input(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("x")
-    for out in (tmp_path / "file", tmp_path / "file" / "s.zarr", Path("/proc/none/s.zarr")):
+    long = tmp_path / ("x" * 300)
+    for out in (tmp_path / "file", tmp_path / "file" / "s.zarr", Path("/proc/none/s.zarr"), long, long / "s.zarr"):
         with pytest.raises(InputError, match=str(out)):
             run(out)
     with pytest.raises(InputError, match="--workers 0"):

@@ -324,9 +324,13 @@ def _list(values: Sequence[int]) -> str:
 
 
 def _free_bytes(path: Path) -> int:
-    existing = next(p for p in (path, *path.absolute().parents) if p.exists())
-    usage = shutil.disk_usage(existing)
-    return usage.free if usage.total else sys.maxsize  # some mounts do not say
+    for folder in (path, *path.absolute().parents):
+        try:
+            usage = shutil.disk_usage(folder)
+        except (OSError, ValueError):  # not there yet, not to be looked into, or a name that none can have
+            continue
+        return usage.free if usage.total else sys.maxsize  # some mounts do not say
+    return sys.maxsize
 
 
 def _check_room(summary: Summary, spec: StoreSpec) -> None:

@@ -47,7 +47,7 @@ def locked(path: Path) -> Iterator[None]:
     try:
         beside.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        above = next((p for p in path.absolute().parents if p.is_file()), None)
+        above = next((p for p in path.absolute().parents if os.path.isfile(p)), None)
         why = f"{above} is a file, not a folder" if above else error.strerror
         raise InputError(f"{path}: no store can be created here: {why}") from None
     with contextlib.ExitStack() as stack:
@@ -63,7 +63,7 @@ def _lock_file(path: Path, file: Path, stack: contextlib.ExitStack) -> bool:
         try:
             handle = os.open(file, os.O_RDWR | os.O_CREAT, 0o666)
         except OSError as error:
-            if not path.is_dir():
+            if not os.path.isdir(path):
                 raise InputError(f"{path}: no store can be created here: {error.strerror}") from None
             # a store in a folder that its owner may not write to is never replaced: its own folder serves
             handle = os.open(path, os.O_RDONLY)

@@ -1,0 +1,162 @@
+"""Kill builds at random file operations, resume them, and compare with an undisturbed build.
+
+    python -m tests.kills --count 500 --rendering off
+
+Each round kills one build up to three times (SIGKILL, half of them leaving half a file, or SIGTERM), at operations
+drawn by `--seed`, with one worker and, in one round of eight, with two. The store is then completed in peace: its
+digest has to be that of a build that nothing disturbed, `verify` finds nothing, no temporary file is left, and no
+finished sample is lost by a kill. Every build runs in a process forked from this one, which opens no store.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import shutil
+import signal
+import sys
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+sys.path.insert(0, str(Path(__file__).resolve().parent))
+
+import numpy as np
+import victim
+from conftest import small_scene
+
+# The child processes of a build import this file anew, as `__mp_main__`.
+if __name__ == "__mp_main__":
+    victim.follow_the_environment("worker")
+
+
+def synthetic(out: Path, workers: int) -> None:
+    """Build 18 made-up samples."""
+    import test_build
+
+    test_build.run(out, workers=workers)
+
+
+def rendered(out: Path, workers: int) -> None:
+    """Build 6 rendered samples."""
+    from vbnfault import config, dataset
+
+    table = small_scene(dataset={"samples": 6, "shard_samples": 2, "sites": 2}, camera={"width_px": 48})
+    dataset.build_scene(config.parse_scene(table, source="kills"), out, source="kills", workers=workers)
+
+
+def report(out: Path) -> dict[str, Any]:
+    """What there is of a store."""
+    from vbnfault import store
+
+    if not store.is_store(out):
+        return {"finished": 0}
+    opened = store.open_store(out)
+    finished = opened.finished()
+    whole = finished == opened.samples
+    return {"finished": finished, "digest": store.digest(out) if whole else "", "problems": store.verify(out)}
+
+
+def forked(action: Callable[[], Any]) -> tuple[int, Any]:
+    """Run an action in a forked process: its exit code, negative for a signal, and what it returned."""
+    reader, writer = os.pipe()
+    pid = os.fork()
+    if pid == 0:
+        code = 0
+        try:
+            answer = action()
+        except BaseException as error:
+            code, answer = getattr(error, "exit_code", 1), str(error)
+        with os.fdopen(writer, "w") as pipe:
+            json.dump(answer, pipe)
+        os._exit(code)
+    os.close(writer)
+    with os.fdopen(reader) as pipe:
+        text = pipe.read()
+    return os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]), json.loads(text or "null")
+
+
+def main() -> int:
+    """Run the rounds; the exit code says whether one failed."""
+    options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    options.add_argument("--count", type=int, default=500, help="kills in all")
+    options.add_argument("--rendering", choices=("on", "off"), default="off")
+    options.add_argument("--seed", type=int, default=0)
+    given = options.parse_args()
+    build = rendered if given.rendering == "on" else synthetic
+    os.environ.pop("VICTIM_PLAN", None)
+    folder = Path(tempfile.mkdtemp(prefix="kills-"))
+    os.environ.setdefault("VBNFAULT_CACHE_DIR", str(folder / "cache"))
+
+    def whole() -> list[int]:
+        counted = [0]
+
+        def count(kind: str, _text: str) -> None:
+            counted[0] += kind == "write"
+
+        build(folder / "warm.zarr", 1)
+        victim.follow([], count)
+        build(folder / "whole.zarr", 1)
+        return counted
+
+    code, answer = forked(whole)
+    assert code == 0, answer
+    operations = answer[0]
+    wanted = forked(lambda: report(folder / "whole.zarr"))[1]
+    kills, failures, round_ = 0, 0, 0
+    while kills < given.count:
+        dice = np.random.default_rng([given.seed, round_])
+        workers = 2 if round_ % 8 == 7 else 1
+        out = folder / f"{round_}.zarr"
+        wrong, finished, ended = [], 0, []
+        for _ in range(int(dice.integers(1, 4))):
+            term = dice.random() < 0.25
+            step = victim.step(
+                "write",
+                count=int(dice.integers(1, operations // workers)),
+                number="SIGTERM" if term else "SIGKILL",
+                torn=bool(dice.random() < 0.5) and not term,
+                to="self" if workers == 1 else "parent",
+            )
+
+            def disturbed(step: dict = step, out: Path = out, workers: int = workers) -> None:
+                if workers == 1:
+                    victim.follow([step])
+                else:
+                    os.environ["VICTIM_PLAN"] = json.dumps({"worker": [step]})
+                build(out, workers)
+
+            code, said = forked(disturbed)
+            ended.append(code)
+            if code not in (0, 143, -signal.SIGKILL):
+                wrong.append(f"exit code {code}: {said}")
+            kills += code != 0
+            state = forked(lambda out=out: report(out))[1]
+            if state["finished"] < finished:
+                wrong.append(f"{finished} samples were finished, {state['finished']} are")
+            finished = state["finished"]
+        code, said = forked(lambda out=out, workers=workers: build(out, workers))
+        if code:
+            wrong.append(f"resuming ends with {code}: {said}")
+        state = forked(lambda out=out: report(out))[1]
+        if state != wanted:
+            wrong.append(f"{state} in place of {wanted}")
+        left = [p.name for p in folder.glob(f".{out.name}*")] + [p.name for p in out.rglob("*.partial")]
+        if left:
+            wrong.append(f"left behind: {left}")
+        if wrong:
+            failures += 1
+            print(f"round {round_}, {workers} workers, ended with {ended}: {'; '.join(wrong)}", flush=True)
+        shutil.rmtree(out, ignore_errors=True)
+        round_ += 1
+        if round_ % 10 == 0:
+            print(f"{kills} kills in {round_} rounds, {failures} failures so far", flush=True)
+    shutil.rmtree(folder, ignore_errors=True)
+    print(f"{kills} kills in {round_} rounds, rendering {given.rendering}: {failures} failures", flush=True)
+    return int(failures > 0)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
