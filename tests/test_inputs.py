@@ -340,6 +340,15 @@ def test_a_kernel_that_aborts_native_code_is_refused(tmp_path: Path) -> None:
     assert "SPICE" in refused(load_shape, path)
 
 
+def test_a_vast_kernel_without_a_mark_is_not_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "vast.tls"
+    path.touch()
+    os.truncate(path, 1 << 32)  # a text, as its head says, of holes
+    monkeypatch.setattr(resources, "_sha256_of", lambda _: pytest.fail("4 GiB are read"))
+    with pytest.raises(InputError, match=r"SPICE text kernel file has 4\.1e[+]03 MiB or more"), spice.kernels(path):
+        pass
+
+
 def test_a_meta_kernel_that_names_a_pipe_does_not_block(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe.tls")
     meta = tmp_path / "all.tm"
@@ -373,6 +382,9 @@ def test_a_full_disk_and_a_lost_folder_are_told_in_a_sentence(tmp_path: Path) ->
     done = command("lens", "tessar_50_f2p8", "--json", "/dev/full", "--out", str(tmp_path / "a.png"))
     assert done.returncode == 2
     assert "/dev/full" in done.stderr
+    done = command("list", "--help", env={**os.environ, "COLUMNS": str(2**31)})
+    assert done.returncode == 0
+    assert len(done.stdout) < 100_000
     gone = tmp_path / "gone"
     gone.mkdir()
     script = (

@@ -58,6 +58,8 @@ def main() -> None:
     for stream in (sys.stdout, sys.stderr):  # a file's name may have bytes that are no text
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
+    if len(os.environ.get("COLUMNS", "")) > 4:  # no terminal is that wide; tables would fill the memory with blanks
+        del os.environ["COLUMNS"]
     warnings.showwarning = lambda message, *_, **__: typer.echo(f"warning: {message}", err=True)
     with interrupts.interruptible():
         try:

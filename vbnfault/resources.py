@@ -33,7 +33,7 @@ LIMIT_BYTES: dict[str, int] = {
     "shape": 1024 * MIB,
     "spacecraft": 512 * MIB,
     "texture": 256 * MIB,
-    "SPICE kernel": 64 << 30,
+    "SPICE kernel": 8192 * MIB,
     "star catalogue": 64 * MIB,
     "SPICE text kernel": 256 * MIB,
 }
@@ -81,6 +81,12 @@ def check_input(path: str | Path, what: str, *, types: Sequence[str] = ()) -> No
     """Check a file that a library will read by its path, as `read_input` does. Raises InputError."""
     with _opened(Path(path), what, types, LIMIT_BYTES[what]) as file:
         _check_contents(path, what, lambda: _sha256_of(file), os.fstat(file.fileno()))
+
+
+def head_of_input(path: str | Path, what: str, size_bytes: int) -> bytes:
+    """Return the first bytes of a file that a user names, which tell how to read it. Raises InputError."""
+    with _opened(Path(path), what, (), LIMIT_BYTES[what]) as file:
+        return file.read(size_bytes)
 
 
 def sha256(data: bytes) -> str:

@@ -272,10 +272,8 @@ def _check_installed(purpose: str) -> None:
 def _check_kernel(path: Path, depth: int = 0) -> None:
     """Check that a kernel, and what a meta-kernel names, are regular files: SPICE would wait at a pipe."""
     resources.check_path(str(path), "SPICE kernel")
-    resources.check_input(path, "SPICE kernel")
-    with path.open("rb") as file:
-        head = file.read(8)
-    if head.startswith(_BINARY):
+    if resources.head_of_input(path, "SPICE kernel", 8).startswith(_BINARY):
+        resources.check_input(path, "SPICE kernel")
         return
     text = resources.read_input(path, "SPICE text kernel")
     values: dict[bytes, list[str]] = {}
