@@ -165,3 +165,36 @@ def test_every_key_acts_on_pixels_or_masks(name: str, model: str, key: str, file
             return
         first = found if first is None else first
     pytest.fail(f"{name}.{key}: all of {tried!r} give the same pixels and masks")
+
+
+@pytest.mark.parametrize("model", ["traced", "paraxial"])
+def test_keys_of_straylight_work_together(model: str, files: list[str], tmp_path: Path) -> None:
+    """Reflections, coatings, a baffle and a sensor that reflects: no failure, and light as physics orders it."""
+    mirror = tmp_path / "mirror.toml"
+    mirror.write_text(SINGLET.replace("\n]", "\n  { sensor = true, reflectance = 0.1 },\n]"), encoding="utf-8")
+
+    def ghosts(**keys: Any) -> float:
+        fault = from_dict(
+            "straylight",
+            {"model": model, "veil_fraction": 0.0, "roughness_nm": 0.0, "cleanliness_level": 0.0} | keys,
+            source="test.toml",
+        )
+        where = context(fault, "")
+        params = fault.draw(where, np.random.default_rng(0))
+        black = Electrons(array=np.zeros((SIZE, SIZE, 3), np.float32), white_e=where.camera.detector.white_e)
+        light = act(fault, black, params, where)
+        assert np.isfinite(light.merged.array).all()
+        assert (light.merged.array >= 0).all()
+        return float(light.merged.array.sum(dtype=np.float64))
+
+    two = {c: ghosts(lens=files[2], coating=c) for c in ("as_prescribed", "none", "mgf2", "v", "bbar")}
+    assert two["as_prescribed"] == two["none"]  # the file names no coating
+    assert max(two["mgf2"], two["v"], two["bbar"]) < two["none"]
+    four = {c: ghosts(lens=files[2], coating=c, reflections=4) for c in ("none", "mgf2")}
+    assert all(four[c] >= two[c] for c in four)
+    # the singlet sends the sensor's ghosts of this Sun past the frame: no light is lost
+    assert ghosts(lens=str(mirror), coating="none") >= two["none"]
+    assert ghosts(lens=str(mirror), coating="mgf2", reflections=4) >= two["mgf2"]
+    # of a tube as wide as the lens, and of one that is narrower
+    assert ghosts(lens=files[2], baffle_length_mm=1e4, baffle_radius_mm=1.0) < 1e-3 * two["none"]
+    assert ghosts(lens=files[2], baffle_length_mm=1e4, baffle_radius_mm=1e-3) < 1e-3 * two["none"]
