@@ -626,9 +626,12 @@ def attempt(seeds: Seeds, seed: str, number: int, keep: Path | None = None) -> d
     arguments, variables = CASES[kind][0](seeds, rng, here)
     before = dict(os.environ)
     os.environ.update(variables)
+    folder = os.getcwd()
+    os.chdir(here)  # commands write where they are run
     try:
         code, errors, _ = run(arguments)
     finally:
+        os.chdir(folder)
         os.environ.clear()
         os.environ.update(before)
         if keep is None:
