@@ -1,0 +1,150 @@
+"""Builds, kills, damage, appending, replacing and verifying, in any order: what must hold after each of them.
+
+A state machine (Hypothesis) drives one store of made-up samples; `VBNFAULT_STATE_STEPS=2000` asks for 2,000 steps.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import shutil
+import tempfile
+from pathlib import Path
+
+import pytest
+from hypothesis import HealthCheck, settings
+from hypothesis import strategies as st
+from hypothesis.stateful import RuleBasedStateMachine, initialize, precondition, rule
+from test_build import Session, site_of
+from test_store import flip, make_spec
+
+from vbnfault import build, store
+from vbnfault.store import disk
+
+STEPS = int(os.environ.get("VBNFAULT_STATE_STEPS", "40"))
+STEPS_A_RUN = 20
+FIRST, BLOCK, SCENES = 10, 3, 2
+_references: dict[tuple[int, int], str] = {}
+
+
+class Killed(BaseException):
+    """Stands for the end of the process; what cleans up behind it still runs. `tests.kills` kills in earnest."""
+
+
+def spec_of(scene: int) -> store.StoreSpec:
+    return make_spec(attributes={**make_spec().attributes, "seed": scene})
+
+
+def make(out: Path, scene: int, samples: int, *, overwrite: bool = False) -> build.Summary:
+    blocks = (FIRST, *([BLOCK] * ((samples - FIRST) // BLOCK)))
+    return build.build(
+        Session(), spec_of(scene), out, site=site_of(samples), blocks=blocks, progress=False, overwrite=overwrite
+    )
+
+
+def reference(scene: int, samples: int) -> str:
+    """The digest of a store that nothing ever disturbed."""
+    if (scene, samples) not in _references:
+        with tempfile.TemporaryDirectory() as folder:
+            for grown in range(FIRST, samples + 1, BLOCK):
+                make(Path(folder) / "s.zarr", scene, grown)
+            _references[scene, samples] = store.digest(Path(folder) / "s.zarr")
+    return _references[scene, samples]
+
+
+class Builds(RuleBasedStateMachine):
+    """`scene`, `samples`: of the store on disk; `sound`: samples finished and undamaged since."""
+
+    @initialize()
+    def begin(self) -> None:
+        self.folder = Path(tempfile.mkdtemp(prefix="vbnfault-states-"))
+        self.out = self.folder / "s.zarr"
+        self.scene, self.samples = 0, FIRST
+        self.sound: set[int] = set()
+        make(self.out, self.scene, self.samples)
+        self.whole()
+
+    def teardown(self) -> None:
+        shutil.rmtree(self.folder, ignore_errors=True)
+
+    def whole(self) -> None:
+        assert store.digest(self.out) == reference(self.scene, self.samples)
+        assert store.verify(self.out) == []
+        assert [p.name for p in self.folder.iterdir()] == ["s.zarr"]
+        assert not list(self.out.rglob(f"*{disk.PARTIAL}"))
+        self.sound = set(range(self.samples))
+
+    @rule()
+    def resume(self) -> None:
+        summary = make(self.out, self.scene, self.samples)
+        assert summary.built <= self.samples - len(self.sound)  # nothing that is sound is made again
+        self.whole()
+
+    @precondition(lambda self: self.samples < FIRST + 3 * BLOCK)
+    @rule(writes=st.none() | st.integers(1, 40))
+    def append(self, writes: int | None) -> None:
+        self.samples += BLOCK
+        self.disturbed(writes, overwrite=False)
+
+    @rule(scene=st.integers(0, SCENES - 1), writes=st.none() | st.integers(1, 40))
+    def overwrite(self, scene: int, writes: int | None) -> None:
+        before = self.scene, self.samples, self.sound
+        self.scene, self.samples, self.sound = scene, FIRST, set()
+        if self.disturbed(writes, overwrite=True):
+            return
+        # the store is the old one, untouched, or the new one; never a mixture
+        stored = store.open_store(self.out)
+        if (stored.attributes["seed"], stored.samples) == before[:2] != (scene, FIRST):
+            self.scene, self.samples, self.sound = before
+        else:
+            assert (stored.attributes["seed"], stored.samples) == (scene, FIRST)
+
+    @rule(writes=st.integers(1, 60))
+    def kill(self, writes: int) -> None:
+        self.disturbed(writes, overwrite=False)
+
+    def disturbed(self, writes: int | None, *, overwrite: bool) -> bool:
+        """Build, and end at the n-th rename where that comes first; whether it came to its end."""
+        left, rename = [writes], os.replace
+
+        def counted(*args: object, **kwargs: object) -> None:
+            if left[0] is not None:
+                left[0] -= 1
+                if left[0] <= 0:
+                    raise Killed
+            rename(*args, **kwargs)  # type: ignore[arg-type]
+
+        with pytest.MonkeyPatch.context() as patch, contextlib.suppress(Killed):
+            patch.setattr(os, "replace", counted)
+            make(self.out, self.scene, self.samples, overwrite=overwrite)
+            self.whole()
+            return True
+        return False
+
+    @rule(data=st.data())
+    def damage(self, data: st.DataObject) -> None:
+        opened = store.open_store(self.out)
+        files = sorted(p for p in self.out.rglob("c/**/*") if p.is_file() and p.stat().st_size)
+        if not files:
+            return
+        file = files[data.draw(st.integers(0, len(files) - 1))]
+        how = data.draw(st.sampled_from(["flip", "remove", "truncate"]))
+        if how == "flip":
+            flip(file, data.draw(st.integers(0, file.stat().st_size - 1)))
+        elif how == "remove":
+            file.unlink()
+        else:
+            os.truncate(file, file.stat().st_size // 2)
+        array, _, number, *_ = file.relative_to(self.out).parts
+        if array in opened.spec.pixel_layers or array in store.SCALARS or array in ("done", "crc32c"):
+            self.sound -= set(opened.shard(int(number)))
+
+
+Builds.TestCase.settings = settings(
+    max_examples=max(1, STEPS // STEPS_A_RUN),
+    stateful_step_count=STEPS_A_RUN,
+    deadline=None,
+    derandomize=STEPS <= 40,
+    suppress_health_check=list(HealthCheck),
+)
+TestBuilds = Builds.TestCase
