@@ -10,7 +10,14 @@ import numpy as np
 import pytest
 
 from vbnfault.detector import demosaic as module
-from vbnfault.detector.demosaic import correct_defects, demosaic, footprint, interpolate, mended_from
+from vbnfault.detector.demosaic import (
+    correct_defects,
+    demosaic,
+    footprint,
+    interpolate,
+    mended_from,
+    without_undershoot,
+)
 from vbnfault.detector.mosaic import (
     BAYER,
     PATTERNS,
@@ -247,12 +254,40 @@ def test_interpolated_bayer_channels_are_the_bilinear_ones_inside(name: str) -> 
         np.testing.assert_allclose(plane[2:-2, 2:-2], rgb[2:-2, 2:-2, index], rtol=2e-6)
 
 
+@pytest.mark.parametrize(("name", "method"), FITTING)
+def test_the_dark_side_of_a_hard_edge_stays_as_dark_as_it_is(name: str, method: str) -> None:
+    # 10,000:1, as a sunlit foot before shaded ground: straight, slanted, a corner, a thin bright line
+    p, (y, x) = pattern(name), np.mgrid[:40, :44]
+    black, dark, lowest = 64.0, 1.0, np.inf
+    for bright in (x > 20, y + 2 * x > 60, (x > 15) & (y > 17), x == 20, (x == 20) & (y == 20)):
+        raw = (black + np.where(bright, 1e4 * dark, dark)).astype(np.float32)
+        published = demosaic(raw, p, method)
+        kept = without_undershoot(published.copy(), raw, p, method, black, 0.5)
+        assert kept.min() >= black + dark * (1 - 1e-3)
+        # nothing else is touched
+        assert np.array_equal(kept[published >= black + dark], published[published >= black + dark])
+        lowest = min(lowest, float(published.min()))
+    assert (lowest < black - 100 * dark) == (method != "bilinear")  # so there is something to mend
+
+
+@pytest.mark.parametrize(("name", "method"), FITTING)
+def test_noise_without_edges_is_demosaiced_as_published(name: str, method: str) -> None:
+    # darkness and light of a flat field: a bound from below alone would brighten them
+    p, rng = pattern(name), np.random.default_rng(5)
+    for level in (0.0, 30.0, 3000.0):
+        raw = (64 + level + rng.normal(0, np.hypot(3.0, np.sqrt(level)), (120, 120))).astype(np.float32)
+        published = demosaic(raw, p, method)
+        assert np.array_equal(without_undershoot(published.copy(), raw, p, method, 64.0, 3.0), published)
+
+
 # ------------------------------------------------------------------------------------------------- footprints
 
 
 def changed(raw: np.ndarray, mask: np.ndarray, p: Pattern, method: str, value: float) -> np.ndarray:
     other = np.where(mask, value, raw)
-    out = (demosaic(raw, p, method) != demosaic(other, p, method)).any(axis=2)
+    # as a detector shows them, bounded at hard edges
+    one, two = (without_undershoot(demosaic(a, p, method), a, p, method, 0.0, 1.0) for a in (raw, other))  # type: ignore[arg-type]
+    out = (one != two).any(axis=2)
     for channel in set(p.channels) - set("RGB"):
         out |= interpolate(raw, p, channel) != interpolate(other, p, channel)
     return out

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from ..quantities import DEAD, HOT, LUMINANCE, RGBI, RTS, RTS_HIGH, STUCK, TRAP
 from .charge import ChargeCloud, bloom, capture, cti, parasitic_light, smear, smear_interline
 from .dark import Telegraph
-from .demosaic import correct_defects, demosaic, interpolate
+from .demosaic import correct_defects, demosaic, interpolate, without_undershoot
 from .efficiency import white_balance
 from .individual import Individual, IndividualSpec, dark_rate_e_s, make_individual, offset_e, response
 from .mosaic import channel_of
@@ -277,6 +277,8 @@ class Device:
         }
         shown = [scale.get(colour, scale.get("W", full)) for colour in "RGB"]
         linear = demosaic(mosaic, sensor.pattern, sensor.method)
+        noise_dn = sensor.readout.read_noise_e_rms * sensor.readout.system_gain_dn_per_e
+        linear = without_undershoot(linear, mosaic, sensor.pattern, sensor.method, black, noise_dn)
         rgb = cv2.multiply(cv2.subtract(linear, (black, black, black, 0.0)), (*shown, 0.0), dtype=cv2.CV_8U)
         out = np.empty((*raw.shape, 4), dtype=np.uint8)
         if "W" in sensor.pattern.channels:

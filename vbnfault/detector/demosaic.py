@@ -89,6 +89,49 @@ def demosaic(raw: NDArray[Any], pattern: Pattern, method: Method = "bilinear") -
     return cv2.merge([_normalised(signal, pattern, colour) for colour in "RGB"])
 
 
+def without_undershoot(
+    rgb: F32, raw: NDArray[Any], pattern: Pattern, method: Method, black: float, noise: float
+) -> F32:
+    """Return demosaiced planes in which no hard edge makes its dark side darker than it was measured.
+
+    The kernels of Malvar and Menon have negative weights, which sharpen; beside an edge of 10,000:1 they turn the
+    dark side negative by a quarter of the bright one. A value there is raised to the least of its own colour's
+    measured values within one pixel, but only where those around span more than noise can (16 standard deviations)
+    and more than 8:1 above black: elsewhere a bound from below alone would be a bias of noise.
+
+    Parameters
+    ----------
+    rgb
+        float32[y, x, 3], from `demosaic` of `raw` with `method`; changed in place.
+    raw
+        The mosaic [y, x], in the same unit.
+    black
+        Black level of `raw`.
+    noise
+        Standard deviation of the noise in the dark, in the unit of `raw`.
+
+    Returns
+    -------
+    F32
+        `rgb`. Only values that `demosaic` computed from the same pixels decide, so `footprint` holds for it too.
+    """
+    if method == "bilinear" or not pattern.is_bayer:
+        return rgb
+    signal = _checked(raw)
+    if method == "malvar":
+        most = _in_blocks(partial(_malvar, filtered=_most), signal, pattern, method)
+    else:
+        most = np.repeat(cv2.dilate(signal, np.ones((5, 5), np.uint8))[..., None], 3, axis=2)
+    channels = channel_of(pattern, (signal.shape[0], signal.shape[1]))
+    for k, colour in enumerate("RGB"):
+        own = np.where(channels == pattern.index(colour), signal, np.float32(np.inf))
+        least = cv2.erode(own, np.ones((3, 3), np.uint8))
+        span = most[..., k] - least
+        edge = (span > 16 * noise) & (span > 7 * (least - black)) & (rgb[..., k] < least)
+        np.copyto(rgb[..., k], least, where=edge)
+    return rgb
+
+
 def interpolate(raw: NDArray[Any], pattern: Pattern, channel: str) -> F32:
     """One channel of a mosaic [y, x] at every pixel, float32[y, x], bilinearly: W of an RGBW mosaic is its
     intensity. InputError where the pattern lacks the channel."""
@@ -105,7 +148,7 @@ def footprint(mask: Mask, pattern: Pattern, method: Method = "bilinear") -> Mask
     if method == "menon" and pattern.is_bayer:
         return cv2.dilate(np.ascontiguousarray(mask, dtype=np.uint8), _menon_support()).view(np.bool_)
     if method == "malvar" and pattern.is_bayer:
-        touched = _in_blocks(partial(_malvar, absolute=True), ones, pattern, method)
+        touched = _in_blocks(partial(_malvar, filtered=_unsigned), ones, pattern, method)
         return cv2.transform(touched, _SUM).reshape(mask.shape) > 0
     touched = demosaic(ones, pattern, method)
     out = cv2.transform(touched, _SUM).reshape(mask.shape) > 0
@@ -270,21 +313,33 @@ def _sites(pattern: Pattern) -> tuple[tuple[int, int], tuple[int, int]]:
     return (red // 2, red % 2), (blue // 2, blue % 2)
 
 
-def _malvar(raw: F32, pattern: Pattern, *, absolute: bool = False) -> list[F32]:
-    """R, G, B; with `absolute` the kernels lose their signs, which shows what depends on what."""
+def _signed(raw: F32, kernel: F32) -> F32:
+    """The sum that the method prescribes."""
+    return cv2.filter2D(raw, -1, kernel)
 
-    def filtered(kernel: F32) -> F32:
-        return cv2.filter2D(raw, -1, np.abs(kernel) if absolute else kernel)
 
+def _unsigned(raw: F32, kernel: F32) -> F32:
+    """The sum of absolute weights, which shows what depends on what."""
+    return cv2.filter2D(raw, -1, np.abs(kernel))
+
+
+def _most(raw: F32, kernel: F32) -> F32:
+    """The greatest value that enters the sum."""
+    return cv2.dilate(raw, (kernel != 0).astype(np.uint8))
+
+
+def _malvar(raw: F32, pattern: Pattern, *, filtered: Callable[[F32, F32], F32] = _signed) -> list[F32]:
+    """R, G, B at every pixel, each by `filtered` with the kernel that Malvar's method has there."""
     (ry, rx), (by, bx) = _sites(pattern)
     red_rows, red_columns = slice(ry, None, 2), slice(rx, None, 2)
     blue_rows, blue_columns = slice(by, None, 2), slice(bx, None, 2)
-    green = filtered(MALVAR_GREEN)
+    green = filtered(raw, MALVAR_GREEN)
     for rows, columns in ((red_rows, blue_columns), (blue_rows, red_columns)):
         green[rows, columns] = raw[rows, columns]
     # each starts as what the green pixels of one kind of row need; the other three kinds are put in
-    along_row, along_column = filtered(MALVAR_ALONG_ROW), filtered(np.ascontiguousarray(MALVAR_ALONG_ROW.T))
-    across = filtered(MALVAR_ACROSS)
+    along_row = filtered(raw, MALVAR_ALONG_ROW)
+    along_column = filtered(raw, np.ascontiguousarray(MALVAR_ALONG_ROW.T))
+    across = filtered(raw, MALVAR_ACROSS)
     red, blue = along_row, along_column
     red_at_blue_row_green = along_column[blue_rows, red_columns].copy()
     blue[blue_rows, red_columns] = along_row[blue_rows, red_columns]
