@@ -121,7 +121,7 @@ def without_undershoot(
     if method == "malvar":
         most = _in_blocks(partial(_malvar, filtered=_most), signal, pattern, method)
     else:
-        most = np.repeat(cv2.dilate(signal, np.ones((5, 5), np.uint8))[..., None], 3, axis=2)
+        most = np.repeat(cv2.dilate(signal, _menon_support())[..., None], 3, axis=2)
     channels = channel_of(pattern, (signal.shape[0], signal.shape[1]))
     for k, colour in enumerate("RGB"):
         own = np.where(channels == pattern.index(colour), signal, np.float32(np.inf))
