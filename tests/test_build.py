@@ -19,6 +19,7 @@ import threading
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -190,6 +191,29 @@ def test_kill_9_at_any_operation_then_resuming_makes_the_same_bits(
     assert st.digest(out) == st.digest(tmp_path / "whole.zarr")
     assert sorted(p.name for p in tmp_path.iterdir()) == ["s.zarr", "whole.zarr"]
     assert not list(out.rglob("*.partial"))
+
+
+@pytest.mark.parametrize("before", ["unlink", "mkdir"])
+def test_a_folder_that_another_worker_makes_at_the_same_time_is_used(
+    reference: tuple[Path, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, before: str
+) -> None:
+    # two workers write their first shards of an array: the other one is always a moment earlier
+    slower = getattr(os, before)
+    made = []
+
+    def late(path: Any, *args: Any, **kwargs: Any) -> None:
+        if Path(path).name == "c" and Path(path).parent.is_dir() and not Path(path).exists():
+            os.makedirs(Path(path).parent / "c2")
+            os.rename(Path(path).parent / "c2", path)
+            made.append(path)
+        slower(path, *args, **kwargs)
+
+    out = tmp_path / "s.zarr"
+    st.create(out, make_spec(attributes={**make_spec().attributes, "blocks": [SAMPLES]}), SAMPLES)
+    monkeypatch.setattr(os, before, late)
+    run(out)
+    assert made
+    assert st.digest(out) == reference[1]
 
 
 def test_the_command_that_kills_builds_finds_none_that_fails() -> None:

@@ -156,9 +156,13 @@ def _make_folders(root: Path, folder: Path, changed: dict[Path, None]) -> None:
     if is_folder:
         return
     _make_folders(root, folder.parent, changed)
-    with contextlib.suppress(FileNotFoundError):
-        os.unlink(folder)
-    os.mkdir(folder)
+    try:
+        with contextlib.suppress(FileNotFoundError):
+            os.unlink(folder)
+        os.mkdir(folder)
+    except OSError:
+        if not folder.is_dir():  # else another worker has just made it
+            raise
     changed[folder.parent] = changed[folder] = None
 
 
