@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vbnfault import config, exposure, frames, render
+from vbnfault import config, exposure, frames, plan, render
 from vbnfault.body import EMBEDDED
 from vbnfault.pipeline import Session
 from vbnfault.sample import Frame, Pose
@@ -51,6 +51,7 @@ def pose_at(
         sun_elevation_deg=sun[1],
         sun_visible_fraction=1.0,
         tries=1,
+        variables=dict.fromkeys(plan.VARIABLES, 0.0),  # placed by hand, not drawn
         resolved=True,
     )
 

@@ -70,7 +70,8 @@ def _ghosts_sr(lens: Prescription, wavelength_nm: float) -> float:
         whole, met = along(lens, path, wavelength_nm)
         # rays that arrive in the middle: θ = -r M00 / M01
         height = np.abs(met[:, 0, 0] - met[:, 0, 1] * whole[0, 0] / whole[0, 1])
-        rims = np.array([lens.surfaces[row].semi_diameter_mm for row, _ in path])
+        # the last row may be the sensor, a mirror without a rim
+        rims = np.array([lens.surfaces[r].semi_diameter_mm if r < len(lens.surfaces) else np.inf for r, _ in path])
         most = float((rims / np.maximum(height, 1e-12)).min())
         total += transmittance(lens, path, wavelength_nm) * np.pi * (most / whole[0, 1]) ** 2
     return total

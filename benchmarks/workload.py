@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from detector_chain import Chain, speckled
 
-from vbnfault import config, dataset, frames, photometry, pipeline, render, spectra, store, world
+from vbnfault import config, dataset, frames, photometry, pipeline, plan, render, spectra, store, world
 from vbnfault.body import Patch
 from vbnfault.exposure import describe, meter
 from vbnfault.lens import load_lens, scaled_to_focal_length
@@ -186,6 +186,7 @@ def _pose(surface: render.Surface) -> Pose:
         sun_elevation_deg=SUN_ELEVATION_DEG,
         sun_visible_fraction=1.0,
         tries=1,
+        variables=dict.fromkeys(plan.VARIABLES, 0.0),  # placed by hand, not drawn
         resolved=True,
     )
 
