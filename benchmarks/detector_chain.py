@@ -6,7 +6,7 @@ python benchmarks/detector_chain.py      (milliseconds of each sensor and demosa
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -17,7 +17,7 @@ from vbnfault.camera import Camera
 from vbnfault.detector import MosaicDetector, load_sensor
 from vbnfault.detector.charge import TrapSpecies
 from vbnfault.detector.sensor import Sensor
-from vbnfault.faults import MOSAIC_STEPS, QUANTITIES, Fault, FaultContext, from_dict
+from vbnfault.faults import MOSAIC_STEPS, Fault, FaultContext, from_dict
 from vbnfault.lens import ThinLens
 from vbnfault.quantities import Electrons
 
@@ -128,12 +128,10 @@ class Chain:
     def expose(self, number: int = 0) -> np.ndarray:
         """One picture, uint8[y, x, channel]: noise drawn, tracks and defects laid out, everything applied."""
         context = replace(self.context)  # nothing kept from the picture before
-
-        def act(fault: Fault, params: dict[str, Any]) -> Callable[[Any], Any]:
-            kind: Any = QUANTITIES[fault.step]
-            return lambda array: fault.apply(kind(array=array), params, context).array
-
-        acts = {s: [act(f, p) for f, p in self.faults.values() if f.step == s] for s in MOSAIC_STEPS}
+        acts = {
+            step: [fault.act_at(step, p, context) for fault, p in self.faults.values() if step in fault.steps]
+            for step in MOSAIC_STEPS
+        }
         detector = self.context.camera.detector
         noise = detector.draw_noise(context.shape, lambda name: np.random.default_rng([number, *name.encode()]))
         return detector.develop(self.light, EXPOSURE_S, noise, acts).array

@@ -8,13 +8,15 @@ from typing import Any
 import numpy as np
 import pytest
 from conftest import small_scene
-from test_faults_kit import flat_electrons, make, make_context, rng, with_mosaic
+from test_faults_kit import flat_electrons, inside, make, make_context, rng, with_mosaic
 
 from vbnfault import config
+from vbnfault.detector.chain import MosaicNoise
+from vbnfault.detector.individual import offset_e
 from vbnfault.errors import InputError
 from vbnfault.faults import FaultContext
 from vbnfault.pipeline import Session
-from vbnfault.quantities import RTS, RTS_HIGH, STUCK, Charge
+from vbnfault.quantities import RTS, RTS_HIGH, STUCK, Charge, Offset, RawMosaic
 
 SIZE = 128
 KEYS: dict[str, Any] = {
@@ -33,9 +35,10 @@ def context(exposure_s: float = 0.02, architecture: str = "cmos", up: str = "up"
 
 
 def added(where: FaultContext, params: dict[str, Any]) -> Any:
-    """Electrons that the defects add to a dark mosaic, float64[y, x]."""
-    dark = Charge(array=np.zeros(where.shape, dtype=np.float32))
-    return make("broken_pixels", model="hot_pixels").apply(dark, params, where).array.astype(np.float64)
+    """Electrons that the defects add to a dark mosaic, as charge and as offsets, float64[y, x]."""
+    none, fault = np.zeros(where.shape, dtype=np.float32), make("broken_pixels", model="hot_pixels")
+    charge = fault.apply_at("pixels", Charge(array=none), params, where).array.astype(np.float64)
+    return charge + fault.apply_at("offsets", Offset(array=none), params, where).array
 
 
 def drawn(where: FaultContext, **keys: Any) -> dict[str, Any]:
@@ -90,14 +93,18 @@ def test_stuck_pixels_show_their_level_whatever_the_light() -> None:
     params = fault.draw(where, rng(1))
     stuck = (fault.defects(params, where) & STUCK) > 0  # type: ignore[operator]
     assert 90 < stuck.sum() < 240  # 1e-6 · 1e3 · 10 · 128² = 164
-    shown = [
-        fault.apply(Charge(array=np.full(where.shape, e, dtype=np.float32)), params, where).array[stuck]
-        for e in (0.0, 5000.0)
-    ]
+    top_dn = where.camera.detector.sensor.readout.top_dn  # type: ignore[union-attr]
+    shown = []
+    for dn in (0, top_dn):
+        before = RawMosaic(array=np.full(where.shape, dn, dtype=np.uint16))
+        after = fault.apply_at("raw", before, params, where).array
+        assert (after[~stuck] == dn).all()
+        shown.append(after[stuck])
     np.testing.assert_array_equal(*shown)
-    level = shown[0] / where.camera.detector.full_well_e
+    level = shown[0] / top_dn
     assert 0.4 < level.mean() < 0.6
     assert 0 <= level.min() < level.max() <= 1
+    assert {(s["x"], s["y"]) for s in params["stuck"]} == set(zip(*np.nonzero(stuck.T), strict=True))
 
 
 def test_telegraph_signals_are_recorded_in_their_state() -> None:
@@ -159,10 +166,7 @@ def test_defects_stay_in_their_mask_when_the_mosaic_spreads_them() -> None:
     detector: Any = where.camera.detector
     signal = flat_electrons(where, 0.4)
 
-    def act(array: Any) -> Any:
-        return fault.apply(Charge(array=array), params, where).array
-
-    before, after = (detector.develop(signal, 0.1, None, acts).array for acts in ({}, {"pixels": [act]}))
+    before, after = (detector.develop(signal, 0.1, None, acts).array for acts in ({}, inside(fault, params, where)))
     changed = (before != after).any(axis=2)
     mask = fault.footprint(params, where)
     assert mask is not None
@@ -209,10 +213,93 @@ def test_the_mask_holds_what_the_camera_mends_with_a_defect() -> None:
     assert params["count"] > 5
     detector: Any = where.camera.detector
     signal = flat_electrons(where, 0.4)
-    acts = {"pixels": [lambda array: fault.apply(Charge(array=array), params, where).array]}
-    before, after = (detector.develop(signal, 0.1, None, a).array for a in ({}, acts))
+    before, after = (detector.develop(signal, 0.1, None, a).array for a in ({}, inside(fault, params, where)))
     changed, mask = (before != after).any(axis=2), fault.footprint(params, where)
     assert mask is not None
     assert changed.any()
     assert not (changed & ~mask).any()
     assert mask.mean() < 0.5
+
+
+@pytest.mark.parametrize("architecture", ["cmos", "full_frame_ccd"])
+def test_a_defect_is_the_same_whether_the_devices_own_or_the_faults(architecture: str) -> None:
+    """Mean and variance of raw numbers, of each class of defect, against a device that has them of its own.
+
+    Noise of the two is independent, so they differ by standard errors, which the spread of the frames tells.
+    """
+    frames, exposure_s, years = 300, 0.1, 10.0
+    made = make_context(64, architecture=architecture, readout_direction="up")
+    young = with_mosaic(made).camera.detector.sensor  # type: ignore[union-attr]
+    growth = young.individual.hot_growth
+    own = replace(
+        young.individual,
+        # charge without light, of which a dead pixel loses nothing
+        dark_current_e_s=3e4,
+        years=2.0,
+        hot_growth=replace(growth, log10_scale=2.6),  # type: ignore[type-var]
+        hot_rate_e_s=(1e3, 1e5),
+        hot_offset_e=1500.0,
+        dead_share_yr=1e-3,
+        stuck_share_yr=1e-3,
+        rts_share=0.0,
+        rts_per_interaction=0.2,
+    )
+    # the fault's rates hold for its own years only
+    older = replace(
+        own,
+        years=2.0 + years,
+        dose_TeV_g=20.0,
+        dead_share_yr=1e-3 + 1e-3 * years / (2.0 + years),
+        stuck_share_yr=1e-3 + 1e-3 * years / (2.0 + years),
+    )
+    # a well that does not reach the top code: offsets show above it
+    readout = replace(young.readout, gain_dn_per_e=0.6 * young.readout.system_gain_dn_per_e)
+    where, aged = (
+        replace(c, camera=replace(c.camera, exposure_s=exposure_s))
+        for c in (with_mosaic(made, individual=spec, readout=readout) for spec in (own, older))
+    )
+    keys = {"years": years, "growth_factor": 1.0, "dose_TeV_g": 20.0, "anneal_days": 7.0, "clustered_share": 0.0}
+    fault = make(
+        "broken_pixels", model="hot_pixels", dead_per_year=1e-3, stuck_per_year=1e-3, least_dn=0.001, **keys
+    )
+    params = fault.draw(where, rng(1))
+    device, with_own = (c.camera.detector.device for c in (where, aged))  # type: ignore[union-attr]
+    photo_e = np.full(where.shape, 0.3 * young.readout.full_well_e, dtype=np.float32)
+    photo_e[:, 48:] *= 5  # saturated
+
+    def noise(*key: int) -> MosaicNoise:
+        return MosaicNoise.draw(where.shape, *(np.random.default_rng([*key, k]) for k in range(3)))
+
+    stacks = np.empty((2, frames, *where.shape))
+    for k in range(frames):
+        stacks[0, k] = with_own.raw(photo_e, exposure_s, noise(k, 0))
+        shot, now = params | {"telegraph_seed": k}, replace(where)
+        stacks[1, k] = device.raw(photo_e, exposure_s, noise(k, 1), inside(fault, shot, now))
+
+    # with the same noise, rounding of float32 may move a number over a code's edge; telegraph signals are random
+    once = device.raw(photo_e, exposure_s, noise(0, 0), inside(fault, params, where))
+    calm = np.ones(where.shape, dtype=bool)
+    calm[with_own.individual.rts.row, with_own.individual.rts.column] = False
+    assert np.abs(once - stacks[0, 0])[calm].max() <= 1
+
+    # pixels of the new defects, each of one class only
+    sets, new = {}, with_own.individual
+    for name in ("hot", "dead", "stuck", "rts"):
+        some, first = getattr(new, name), len(getattr(device.individual, name))
+        sets[name] = np.zeros(where.shape, dtype=bool)
+        sets[name][some.row[first:], some.column[first:]] = True
+    sets["offset"] = sets["hot"] & (offset_e(new) - device.offset_e > 100)
+    sets["hot"] &= ~sets["offset"]
+    kinds = np.sum(list(sets.values()), axis=0)
+    classes = {name: one & (kinds == 1) for name, one in sets.items()} | {"whole": kinds == 0}
+
+    off = stacks - stacks.mean(axis=1, keepdims=True)
+    for name, one in classes.items():
+        assert one.sum() >= 20, name
+        # of each frame, so that what pixels share, such as noise of rows, is in the standard errors
+        for what in (stacks, off**2):
+            device_has, fault_makes = what[..., one].mean(axis=2)
+            error = np.hypot(device_has.std(), fault_makes.std()) / np.sqrt(frames)
+            # five standard errors: a chance of 6e-7 a comparison
+            assert abs(device_has.mean() - fault_makes.mean()) <= 5 * error, name
+    assert not off[..., classes["stuck"]].any()

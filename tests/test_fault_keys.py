@@ -115,9 +115,9 @@ def outcome(table: dict[str, Any], name: str, key: str) -> list[NDArray[Any]]:
     after: Any
     if isinstance(before, Electrons):
         after = act(fault, before, params, where).merged
+        found = [after.array]
     else:
-        after = fault.apply(before, params, where)
-    found = [after.array]
+        found = [fault.apply_at(step, noisy(step, where), params, where).array for step in fault.steps]  # type: ignore[type-var]
     if camera != where.camera and isinstance(camera.detector, MosaicDetector):
         found.append(np.frombuffer(repr(camera.detector).encode(), dtype=np.uint8))
     if fault.effect_mask and isinstance(before, Electrons):

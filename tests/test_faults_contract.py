@@ -128,10 +128,15 @@ def keeps_the_contract(name: str, model: str, required: dict[str, dict[str, Any]
     if fault.needs_mosaic:
         context = with_mosaic(context)
     key = data.draw(st.integers(0, 2**32 - 1))
+    for step in fault.steps:
+        keeps_the_contract_at(step, fault, context, key)
+
+
+def keeps_the_contract_at(step: str, fault: Fault, context: FaultContext, key: int) -> None:
     params = fault.draw(context, np.random.default_rng(key))
-    quantity: Any = noisy(fault.step, context)
+    quantity: Any = noisy(step, context)
     before = quantity.array.tobytes()
-    result = fault.apply(quantity, params, context)
+    result = fault.apply_at(step, quantity, params, context)
     mask = fault.footprint(params, context)
 
     assert quantity.array.tobytes() == before, "input modified"
@@ -139,19 +144,19 @@ def keeps_the_contract(name: str, model: str, required: dict[str, dict[str, Any]
     assert result.unit == quantity.unit
     assert result.array.shape == quantity.array.shape
     assert result.array.dtype == quantity.array.dtype
-    if fault.step in ("electrons", "pixels", "charge"):
+    if step in ("electrons", "light", "pixels", "charge", "offsets"):
         assert np.isfinite(result.array).all()
-        assert (result.array >= 0).all()
+        assert (result.array >= 0).all() or step == "offsets"
 
     # the same key gives the same parameters and the same image, from an empty memo
     again = fault.draw(fresh(context), np.random.default_rng(key))
     assert again == params
-    assert fault.apply(quantity, again, fresh(context)).array.tobytes() == result.array.tobytes()
+    assert fault.apply_at(step, quantity, again, fresh(context)).array.tobytes() == result.array.tobytes()
 
     # what the store keeps is enough to draw the fault again, by the bits
     stored = json.loads(json.dumps(params, allow_nan=False))
     assert stored == params
-    assert fault.apply(quantity, stored, fresh(context)).array.tobytes() == result.array.tobytes()
+    assert fault.apply_at(step, quantity, stored, fresh(context)).array.tobytes() == result.array.tobytes()
 
     if mask is not None:
         assert mask.shape == context.shape
@@ -177,8 +182,9 @@ def test_round_trips(name: str, model: str, required: dict[str, dict[str, Any]],
 def test_defaults_are_within_limits(name: str, model: str, required: dict[str, dict[str, Any]]) -> None:
     fault = from_dict(name, required.get(name, {}) | {"model": model}, source="test.toml")
     assert (fault.fault, fault.model) == (name, model)
-    assert fault.step in STEPS
-    assert fault.needs_mosaic >= (fault.step in MOSAIC_STEPS)
+    assert fault.steps[0] == fault.step
+    assert set(fault.steps) <= set(STEPS)
+    assert fault.needs_mosaic >= bool(set(fault.steps) & set(MOSAIC_STEPS))
     for f in dataclasses.fields(fault):
         assert f.metadata["doc"]
 
@@ -230,6 +236,16 @@ def test_params_are_plain(name: str, model: str, required: dict[str, dict[str, A
     fault = from_dict(name, required.get(name, {}) | {"model": model}, source="test.toml")
     context = make_context(96, sun=(30.0, 20.0))
     check(fault.draw(with_mosaic(context) if fault.needs_mosaic else context, np.random.default_rng(0)))
+
+
+@pytest.mark.parametrize(
+    ("first", "later"),
+    [("pixels", ("light",)), ("pixels", ("pixels",)), ("electrons", ("pixels",)), ("raw", ("rgbi",)), ("dark", ())],
+)
+def test_several_steps_come_in_order_and_inside_the_mosaic(first: str, later: tuple[str, ...]) -> None:
+    with pytest.raises(TypeError, match="fault model steps_of_a_test/one"):
+        type("Wrong", (Fault,), {"fault": "steps_of_a_test", "model": "one", "step": first, "later_steps": later})
+    assert "steps_of_a_test" not in registry()
 
 
 def test_orders() -> None:
@@ -334,9 +350,9 @@ def test_every_number_serves_at_both_ends_of_its_limits(
         params = fault.draw(context, np.random.default_rng(1))
         met = dataclasses.replace(context, camera=fault.alter(context.camera, params))
         with np.errstate(invalid="raise", divide="raise", over="raise"):
-            result = fault.apply(noisy(fault.step, met), params, met)
+            results = [fault.apply_at(step, noisy(step, met), params, met) for step in fault.steps]  # type: ignore[type-var]
             fault.footprint(params, met)
-        assert np.isfinite(result.array).all(), (key, limit)
+        assert all(np.isfinite(result.array).all() for result in results), (key, limit)
         served += 1
     assert served
 

@@ -11,7 +11,7 @@ from vbnfault.camera import Camera, focal_length_mm
 from vbnfault.detector import Detector, MosaicDetector, load_sensor
 from vbnfault.faults import Fault, FaultContext, from_dict
 from vbnfault.lens import ThinLens
-from vbnfault.quantities import RGBI, Charge, Electrons, Quantity, RawMosaic
+from vbnfault.quantities import RGBI, Charge, Electrons, Offset, Quantity, RawMosaic
 
 FOV_DEG = 40.0
 
@@ -58,7 +58,14 @@ def noisy(step: str, context: FaultContext, seed: int = 0) -> Quantity:
     generator, readout = np.random.default_rng(seed), detector.sensor.readout
     if step == "raw":
         return RawMosaic(array=generator.integers(0, readout.top_dn + 1, context.shape, dtype=np.uint16))
+    if step == "offsets":
+        return Offset(array=generator.normal(0, 100, context.shape).astype(np.float32))
     return Charge(array=generator.uniform(0, 2 * readout.full_well_e, context.shape).astype(np.float32))
+
+
+def inside(fault: Fault, params: dict[str, Any], context: FaultContext) -> dict[str, Any]:
+    """What a fault does inside a detector with a mosaic, at all its steps."""
+    return {step: [fault.act_at(step, params, context)] for step in fault.steps}
 
 
 def flat_electrons(context: FaultContext, share: float = 0.5) -> Electrons:

@@ -62,7 +62,7 @@ class Labelled:
 
     effect_mask: bool = False
     has_footprint: bool = True
-    step: str = "electrons"
+    steps: tuple[str, ...] = ("electrons",)
 
     def footprint(self, params: dict[str, Any], context: Any) -> np.ndarray | None:
         assert not self.effect_mask, "a class labelled by its effect has its footprint asked for"
@@ -148,7 +148,7 @@ def test_outline_is_the_part_of_the_mask_with_a_neighbour_outside(mask: np.ndarr
 
 
 def test_in_a_ccd_charge_that_runs_out_of_a_footprint_is_labelled_too() -> None:
-    fault, seen = {"rays": Labelled(step="charge")}, np.zeros(SHAPE, bool)
+    fault, seen = {"rays": Labelled(steps=("light", "raw"))}, np.zeros(SHAPE, bool)
     seen[:, 2] = True
     for ccd in (True, False):
         context: Any = SimpleNamespace(shape=SHAPE, camera=SimpleNamespace(is_ccd=ccd))

@@ -72,7 +72,7 @@ def test_every_optional_layer_is_built_verified_and_read_back(world: str, tmp_pa
         for k, name in enumerate(data["fault"].values):
             fault = registry()[name][faults[name].get("model", next(iter(registry()[name])))]
             kind = data["mask"].attrs["kinds"][k]
-            moves = fault.step in ("pixels", "charge") and bool(detector)
+            moves = bool({"light", "pixels", "charge"} & set(fault.steps)) and bool(detector)
             assert kind == ("effect" if fault.effect_mask else "footprint and effect" if moves else "footprint")
             rule = data["mask"].attrs["rules"][k]
             assert ("1 DN" in rule) == ("effect" in kind)

@@ -20,7 +20,7 @@ from .faults import Fault, FaultContext, Params
 Mask = NDArray[np.bool_]
 
 # Steps of a detector with a mosaic at which charge may still leave the pixels that a fault acts on.
-_MOVES = ("pixels", "charge")
+_MOVES = {"light", "pixels", "charge"}
 
 
 def effect(image: NDArray[np.uint8], without: NDArray[np.uint8], least_dn: float = 1.0) -> Mask:
@@ -37,7 +37,11 @@ def kind(fault: Fault, *, is_ccd: bool) -> str:
     more than one digital number on."""
     if fault.effect_mask:
         return "effect" if fault.effect_level_dn <= 1 else "strong effect"
-    return "footprint and effect" if is_ccd and fault.step in _MOVES else "footprint"
+    return "footprint and effect" if is_ccd and _moves(fault) else "footprint"
+
+
+def _moves(fault: Fault) -> bool:
+    return not _MOVES.isdisjoint(fault.steps)
 
 
 def footprint_rule(fault: Fault) -> str:
@@ -71,7 +75,7 @@ def mask_layers(
 
 def spreads(fault: Fault, context: FaultContext) -> bool:
     """Whether a fault's charge may leave its footprint: in a CCD it overflows along columns, and traps trail it."""
-    return fault.step in _MOVES and kind(fault, is_ccd=context.camera.is_ccd) == "footprint and effect"
+    return _moves(fault) and kind(fault, is_ccd=context.camera.is_ccd) == "footprint and effect"
 
 
 def union(masks: Mask, faults: Iterable[str], members: Iterable[str]) -> Mask:

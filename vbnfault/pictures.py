@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from . import labels
 from .camera import Camera
 from .detector import MosaicDetector
-from .faults import MOSAIC_STEPS, QUANTITIES, Fault, FaultContext, Params, act, physical_order
+from .faults import MOSAIC_STEPS, Fault, FaultContext, Params, act, physical_order
 from .quantities import RGBI, Electrons, soft_kind
 from .sample import Frame, stored_layers
 
@@ -91,7 +91,7 @@ def _but(drawn: Mapping[str, Params], left_out: str) -> dict[str, Params]:
 
 
 def _in_order(frame: Frame, drawn: Mapping[str, Params], step: str) -> list[str]:
-    return [name for name in physical_order(drawn) if frame.spec.faults[name].step == step]
+    return [name for name in physical_order(drawn) if step in frame.spec.faults[name].steps]
 
 
 def _altered(frame: Frame, drawn: Mapping[str, Params]) -> Camera:
@@ -191,12 +191,10 @@ def _acts(frame: Frame, drawn: Mapping[str, Params]) -> dict[str, list[Callable[
     """What the drawn faults do inside a detector with a mosaic, by its steps."""
     context = _context(frame, drawn)[1]
 
-    def act(name: str) -> Callable[[Any], Any]:
-        fault = frame.spec.faults[name]
-        kind = QUANTITIES[fault.step]
-        return lambda array: fault.apply(kind(array=array), drawn[name], context).array  # type: ignore[type-var]
-
-    return {step: [act(name) for name in _in_order(frame, drawn, step)] for step in MOSAIC_STEPS}
+    return {
+        step: [frame.spec.faults[name].act_at(step, drawn[name], context) for name in _in_order(frame, drawn, step)]
+        for step in MOSAIC_STEPS
+    }
 
 
 def _read_out(frame: Frame, picture: RGBI, drawn: Mapping[str, Params]) -> RGBI:
@@ -286,7 +284,9 @@ def _doubtful(frame: Frame, noise: Any) -> set[str]:
     faults, drawn = frame.spec.faults, frame.drawn
     if _altered(frame, drawn) != frame.camera:
         return set(drawn)
-    out = {name for name in drawn if faults[name].effect_mask or faults[name].step in MOSAIC_STEPS}
+    out = {
+        name for name in drawn if faults[name].effect_mask or not set(MOSAIC_STEPS).isdisjoint(faults[name].steps)
+    }
     optical, readout = (_in_order(frame, drawn, step) for step in ("electrons", "rgbi"))
     # pixels enough to see what is plainly visible; the rest of the doubt is settled by `effect_of`
     some = (slice(frame.context.shape[0] // 32, None, 16), slice(None, None, 4))

@@ -110,6 +110,14 @@ class Charge(Quantity):
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
+class Offset(Quantity):
+    """What each pixel of a mosaic reads above its charge, electrons of either sign: no charge, so without noise."""
+
+    unit = "e-"
+    axes = ("y", "x")
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
 class RawMosaic(Quantity):
     """Digital numbers of a mosaic, bias included."""
 

@@ -5,7 +5,7 @@
     nodes, noise, converter (`readout`) → raw → defect correction, black level, demosaic, white balance → RGBI
 
 Smear is light that falls on charge under way, so it comes before the shot noise. Offsets (DSNU, "partially stuck"
-pixels) are no charge: they have no shot noise.
+pixels) are no charge: they have no shot noise, and no well limits them. A stuck pixel shows its level as it is.
 """
 
 from __future__ import annotations
@@ -24,7 +24,15 @@ from .charge import ChargeCloud, bloom, capture, cti, parasitic_light, smear, sm
 from .dark import Telegraph
 from .demosaic import correct_defects, demosaic, interpolate, without_undershoot
 from .efficiency import white_balance
-from .individual import Individual, IndividualSpec, dark_rate_e_s, make_individual, offset_e, response
+from .individual import (
+    Individual,
+    IndividualSpec,
+    StuckPixels,
+    dark_rate_e_s,
+    make_individual,
+    offset_e,
+    response,
+)
 from .mosaic import channel_of
 from .readout import ReadoutIndividual, ReadoutNoise, read_out
 from .sensor import Sensor
@@ -33,9 +41,10 @@ from .three_colour import _normal_field, poisson_quantile
 F32 = NDArray[np.float32]
 Raw = NDArray[np.uint16]
 
-# What may act on a picture under way, and where: on the electrons expected in each pixel, before shot noise; on
-# those collected; on the raw numbers.
-STEPS = ("pixels", "charge", "raw")
+# What may act on a picture under way, and where: on the photo-electrons to which each pixel responds, before smear
+# and dark current; on all electrons expected in each pixel, before shot noise; on those collected; on the offsets
+# that are added to them; on the raw numbers.
+STEPS = ("light", "pixels", "charge", "offsets", "raw")
 Acts = Mapping[str, Sequence[Callable[[Any], Any]]]
 _NOTHING: Acts = {}
 
@@ -103,10 +112,13 @@ class Device:
 
     # --- light to numbers -----------------------------------------------------------------------------------------
 
-    def expected_e(self, photo_e: F32, exposure_s: float) -> F32:
-        """Electrons expected in each pixel, float32[y, x], telegraph signals aside, of photo-electrons expected
-        there if all pixels responded alike."""
-        light = self._smeared(cv2.multiply(photo_e, self.response), exposure_s)
+    def expected_e(self, photo_e: F32, exposure_s: float, acts: Acts = _NOTHING) -> F32:
+        """Return the electrons expected in each pixel, float32[y, x], telegraph signals aside, of photo-electrons
+        expected there if all pixels responded alike; `acts` as in `raw`."""
+        light: F32 = np.asarray(cv2.multiply(photo_e, self.response))
+        for act in acts.get("light", ()):
+            light = act(light)
+        light = self._smeared(light, exposure_s)
         out = np.asarray(cv2.scaleAdd(self.dark_rate_e_s, exposure_s, light))
         return out if self.transfer_dark_e is None else cv2.add(out, self.transfer_dark_e)
 
@@ -144,7 +156,7 @@ class Device:
     ) -> F32:
         """Charge at the output, float32[y, x] in e, before offsets and the readout."""
         sensor, move = self.sensor, self.sensor.transfer
-        charge = self.expected_e(photo_e, exposure_s)
+        charge = self.expected_e(photo_e, exposure_s, acts)
         if len(self.individual.rts):
             self._add_telegraph(charge, exposure_s, None if noise is None else noise.telegraph_seed)
         for act in acts.get("pixels", ()):
@@ -174,15 +186,11 @@ class Device:
     def raw(self, photo_e: F32, exposure_s: float, noise: MosaicNoise | None = None, acts: Acts = _NOTHING) -> Raw:
         """Raw DN, uint16[y, x]; noise-free without `noise`. `acts` are what faults do at the `STEPS`."""
         charge = self.collected_e(photo_e, exposure_s, noise, acts)
-        stuck = self.individual.stuck
-        raw = read_out(
-            charge,
-            self.sensor.readout,
-            None if noise is None else noise.readout,
-            self.readout_individual,
-        )
-        if len(stuck):
-            raw[stuck.row, stuck.column] = np.rint(stuck.level * self.sensor.readout.top_dn)
+        chain = self.readout_individual
+        for act in acts.get("offsets", ()):
+            chain = replace(chain, pixel_e=act(chain.pixel_e))
+        raw = read_out(charge, self.sensor.readout, None if noise is None else noise.readout, chain)
+        show_stuck(raw, self.individual.stuck, self.sensor.readout.top_dn)
         for act in acts.get("raw", ()):
             raw = act(raw)
         return raw
@@ -211,7 +219,12 @@ class Device:
     def _add_telegraph(self, charge: F32, exposure_s: float, seed: int | None) -> None:
         pixels = self.individual.rts
         share = self._telegraph.duty if seed is None else upper_share(self._telegraph, exposure_s, seed)
-        np.add.at(charge, (pixels.row, pixels.column), self._telegraph.amplitude_e_s * share * exposure_s)
+        high_e_s = self._telegraph.amplitude_e_s * share
+        np.add.at(charge, (pixels.row, pixels.column), high_e_s * exposure_s)
+        if self.transfer_dark_e is not None:  # charge under way waits in these pixels, too
+            rate = np.zeros_like(charge)
+            np.add.at(rate, (pixels.row, pixels.column), high_e_s)
+            charge += passing_dark_e(self.sensor, rate, self.direction)
 
     # --- numbers to a picture -------------------------------------------------------------------------------------
 
@@ -339,6 +352,11 @@ def along_columns(sensor: Sensor, direction: str, step: Callable[..., F32], imag
         return step(image, direction=direction)
     middle = (len(image) + 1) // 2
     return np.concatenate([step(image[:middle], direction="up"), step(image[middle:], direction="down")])
+
+
+def show_stuck(raw: Raw, stuck: StuckPixels, top_dn: int) -> None:
+    """Set stuck pixels of a raw mosaic, uint16[y, x], to their levels, in place; of two in one pixel the later."""
+    raw[stuck.row, stuck.column] = np.rint(stuck.level * top_dn)
 
 
 def upper_share(signals: Telegraph, exposure_s: float, seed: int) -> NDArray[np.float64]:

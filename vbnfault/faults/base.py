@@ -24,7 +24,7 @@ from ..detector.chain import STEPS as MOSAIC_STEPS
 from ..errors import InputError, shown
 from ..lens import load_lens
 from ..lens.footprint import DEFAULT_LENS, Frame
-from ..quantities import LUMINANCE, RGBI, Charge, Electrons, Quantity, RawMosaic, soft_kind
+from ..quantities import LUMINANCE, RGBI, Charge, Electrons, Offset, Quantity, RawMosaic, soft_kind
 
 Params = dict[str, Any]
 T = TypeVar("T")
@@ -191,14 +191,16 @@ def plus(array: NDArray[np.float32], other: NDArray[np.float32]) -> NDArray[np.f
     return np.asarray(cv2.add(array, other)).reshape(array.shape)
 
 
-Q = TypeVar("Q", Electrons, Charge, RawMosaic, RGBI)
+Q = TypeVar("Q", Electrons, Charge, Offset, RawMosaic, RGBI)
 
 # Where a fault may act. The steps between the first and the last are those of a detector with a mosaic.
 STEPS = ("electrons", *MOSAIC_STEPS, "rgbi")
 QUANTITIES: dict[str, type[Quantity]] = {
     "electrons": Electrons,
+    "light": Charge,
     "pixels": Charge,
     "charge": Charge,
+    "offsets": Offset,
     "raw": RawMosaic,
     "rgbi": RGBI,
 }
@@ -209,11 +211,13 @@ class Fault:
     """Base of all fault models; every hook is the identity by default.
 
     Class attributes of a model: `fault` (its class), `model`, `step` (what `apply` receives: `electrons`, the
-    expected photo-electrons on the sensor; of a mosaic `pixels`, the electrons expected in each pixel, `charge`,
-    those collected, or `raw`; or `rgbi`), `needs_mosaic` (also True where `alter` changes such a detector),
-    `needs_ccd` (True: no effect on CMOS), `localised` (False where the footprint is about the
-    whole frame), `needs_sun`, `effect_mask` (True: the mask is the effect rule, not the footprint), `soft_layer`
-    (the name of the optional layer that `soft` gives, which ends as one of `quantities.SOFT_KINDS`; "": none).
+    expected photo-electrons on the sensor; of a mosaic `light`, the photo-electrons to which each pixel responds,
+    `pixels`, all electrons expected in it, `charge`, those collected, `offsets`, what is added to them, or `raw`;
+    or `rgbi`), `later_steps` (of a mosaic: others at which it acts too, in order, by `apply_at`), `needs_mosaic`
+    (also True where `alter` changes such a detector), `needs_ccd` (True: no effect on CMOS), `localised` (False
+    where the footprint is about the whole frame), `needs_sun`, `effect_mask` (True: the mask is the effect rule,
+    not the footprint), `soft_layer` (the name of the optional layer that `soft` gives, which ends as one of
+    `quantities.SOFT_KINDS`; "": none).
 
     Which light has met the lens's rims is told by two more, for models of the step `electrons`. `adds_past_rims`
     (True: the light it adds has met them; `apply` puts it into `Electrons.past_rims` where the quantity has that
@@ -224,6 +228,8 @@ class Fault:
     fault: ClassVar[str]
     model: ClassVar[str]
     step: ClassVar[str]
+    later_steps: ClassVar[tuple[str, ...]] = ()
+    steps: ClassVar[tuple[str, ...]]
     localised: ClassVar[bool] = True
     needs_sun: ClassVar[bool] = False
     needs_mosaic: ClassVar[bool] = False
@@ -237,6 +243,12 @@ class Fault:
         super().__init_subclass__(**kwargs)
         if "model" not in cls.__dict__:
             return  # an intermediate base
+        cls.steps = (cls.step, *cls.later_steps)
+        if cls.steps != tuple(step for step in STEPS if step in cls.steps):
+            raise TypeError(f"fault model {cls.fault}/{cls.model} acts at {cls.steps}, not in the order of {STEPS}")
+        # light and finished pictures have paths of their own, which know of one step of a fault
+        if cls.later_steps and not set(MOSAIC_STEPS).issuperset(cls.steps):
+            raise TypeError(f"fault model {cls.fault}/{cls.model}: only steps of a mosaic may be several")
         if cls.soft_layer:
             soft_kind(cls.soft_layer)
         known = _REGISTRY.setdefault(cls.fault, {})
@@ -265,6 +277,19 @@ class Fault:
     def apply(self, quantity: Q, params: Params, context: FaultContext) -> Q:
         """The quantity of `step` with this fault; the input is not modified."""
         return quantity
+
+    def apply_at(self, step: str, quantity: Q, params: Params, context: FaultContext) -> Q:
+        """Return the quantity of one of `steps` with this fault; a model with `later_steps` overrides it."""
+        return self.apply(quantity, params, context)
+
+    def act_at(self, step: str, params: Params, context: FaultContext) -> Callable[[Any], Any]:
+        """Return a function of the array of a step inside a detector with a mosaic: what the fault makes of it."""
+        kind: Any = QUANTITIES[step]
+
+        def act(array: Any) -> Any:
+            return self.apply_at(step, kind(array=array), params, context).array
+
+        return act
 
     def footprint(self, params: Params, context: FaultContext) -> NDArray[np.bool_] | None:
         """bool[y, x], where the fault sits; None where the class has no footprint."""

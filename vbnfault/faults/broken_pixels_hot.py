@@ -4,11 +4,12 @@ A device's defects come from its seed and only ever grow (`detector.individual`)
 share them; the fault draws an age, a dose and the time since, and adds what the device has by then and did not
 have before: bulk damage of displaced atoms (Srour & Lo 2000; Belloir 2016; Le Roch 2019), hot pixels with an offset
 (Chapman et al.: I = m (R T + b)), dead and stuck pixels, and random telegraph signals in the state that they are
-in. All of it is in electrons of the mosaic, before shot noise, and spreads over neighbours because the demosaic
-does. In a CCD charge is clocked past its defects: behind a hot pixel, away from the register, it draws a line
-(`detector.chain.passing_dark_e`).
+in. They spread over neighbours because the demosaic does. In a CCD charge is clocked past its defects: behind a hot
+pixel, away from the register, it draws a line (`detector.chain.passing_dark_e`).
 
-As charge in the mosaic, all of it has shot noise, offsets and stuck pixels included.
+Each defect acts where the device's own of its kind does (`detector.chain`): dead pixels keep less of the light, and
+all their dark current; dark current and telegraph signals are charge, with shot noise; offsets are added after it,
+without noise; a stuck pixel shows its level, whatever it holds.
 
 Pixels are as warm as the sensor: at short exposures and in the cold most damage does not show, as on real ones.
 The growth laws are of cameras on the ground; `growth_factor` says how much faster it goes in space (assumed).
@@ -23,8 +24,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..detector.chain import Device, passing_dark_e, upper_share
-from ..detector.individual import Individual, IndividualSpec, RtsPixels, aged, dark_rate_e_s, offset_e
+from ..detector.chain import Device, passing_dark_e, show_stuck, upper_share
+from ..detector.individual import (
+    Individual,
+    IndividualSpec,
+    RtsPixels,
+    StuckPixels,
+    aged,
+    dark_rate_e_s,
+    offset_e,
+)
 from ..quantities import DEAD, HOT, RTS, RTS_HIGH, STUCK
 from .base import Fault, FaultContext, Interval, Params, bounds, number
 
@@ -41,7 +50,8 @@ class HotPixels(Fault):
 
     fault = "broken_pixels"
     model = "hot_pixels"
-    step = "pixels"
+    step = "light"
+    later_steps = ("pixels", "offsets", "raw")
     needs_mosaic = True
 
     years: Interval = bounds(2.0, 10.0, limits=(0, 100), unit="yr", doc="of age more than the device's own")
@@ -70,9 +80,10 @@ class HotPixels(Fault):
     )
 
     def draw(self, context: FaultContext, rng: np.random.Generator) -> Params:
-        """Age and dose, how many pixels they change, and the strongest: x, y, electrons at this exposure and share
-        of light kept; `rts`: the strongest telegraph signals, with their amplitude and the share of the exposure
-        that they are high."""
+        """Return age and dose, how many pixels they change, and the strongest: x, y, electrons at this exposure,
+        offset included, the offset alone and the share of light kept; `stuck`: x, y and level, the share of the top
+        code; `rts`: the strongest telegraph signals, with their amplitude and the share of the exposure that they
+        are high."""
         params: Params = {
             "years": self.years.uniform(rng),
             "growth_factor": self.growth_factor.uniform(rng),
@@ -85,21 +96,37 @@ class HotPixels(Fault):
             "telegraph_seed": int(rng.integers(2**63)),
         }
         damage = _damage(params, context)
-        extra, kept = damage.extra_e.ravel(), damage.kept.ravel()
+        offset, kept = damage.offset_e.ravel(), damage.kept.ravel()
+        extra = damage.charge_e.ravel() + offset
         changed = np.flatnonzero(damage.changed.ravel())
         order = changed[np.argsort(-extra[changed], kind="stable")][:_MOST_LISTED]
         width = context.shape[1]
         params["count"] = len(changed)
         params["x"], params["y"] = (order % width).tolist(), (order // width).tolist()
         params["electrons"] = [round(float(v), 1) for v in extra[order]]
+        params["offset_e"] = [round(float(v), 1) for v in offset[order]]
         params["response"] = [round(float(v), 4) for v in kept[order]]
+        params["stuck"] = damage.listed_stuck()
         params["rts"] = damage.listed()
         return params
 
     def apply(self, quantity: Any, params: Params, context: FaultContext) -> Any:
-        """Expected electrons with what the defects add, and without the light of dead and stuck pixels."""
+        """Return the light to which pixels respond without what dead ones lose of it."""
+        return quantity.with_array(quantity.array * _damage_once(params, context).kept)
+
+    def apply_at(self, step: str, quantity: Any, params: Params, context: FaultContext) -> Any:
+        """Return the quantity of a step with the defects that act there: dead, hot and telegraph, offset, stuck."""
         damage = _damage_once(params, context)
-        return quantity.with_array(quantity.array * damage.kept + damage.extra_e)
+        if step == "pixels":
+            return quantity.with_array(quantity.array + damage.charge_e)
+        if step == "offsets":
+            return quantity.with_array(quantity.array + damage.offset_e)
+        if step == "raw":
+            detector: Any = context.camera.detector
+            raw = quantity.array.copy()
+            show_stuck(raw, damage.stuck, detector.sensor.readout.top_dn)
+            return quantity.with_array(raw)
+        return self.apply(quantity, params, context)
 
     def footprint(self, params: Params, context: FaultContext) -> NDArray[np.bool_]:
         """bool[y, x]: pixels of the picture that a defect can reach."""
@@ -114,19 +141,32 @@ class HotPixels(Fault):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Damage:
-    """`extra_e`: electrons that defects add at this exposure, `kept`: the share of their light that pixels keep,
-    float32[y, x]; `kinds` uint8[y, x]; the telegraph signals and the share of the exposure that each is high."""
+    """What defects add at this exposure, `charge_e` with shot noise and `offset_e` without, and `kept`: the share
+    of their light that pixels keep, float32[y, x]; `kinds` uint8[y, x]; stuck pixels; the telegraph signals and the
+    share of the exposure that each is high."""
 
-    extra_e: F32
+    charge_e: F32
+    offset_e: F32
     kept: F32
     kinds: NDArray[np.uint8]
+    stuck: StuckPixels
     rts: RtsPixels
     amplitude_e_s: NDArray[np.float64]
     high: NDArray[np.float64]
 
     @property
     def changed(self) -> NDArray[np.bool_]:
-        return (self.extra_e > 0) | (self.kept < 1)
+        out = (self.charge_e > 0) | (self.offset_e > 0) | (self.kept < 1)
+        out[self.stuck.row, self.stuck.column] = True
+        return out
+
+    def listed_stuck(self) -> list[dict[str, Any]]:
+        stuck = self.stuck
+        strongest = np.argsort(-stuck.level, kind="stable")[:_MOST_LISTED]
+        return [
+            {"x": int(stuck.column[k]), "y": int(stuck.row[k]), "level": round(float(stuck.level[k]), 6)}
+            for k in strongest
+        ]
 
     def listed(self) -> list[dict[str, Any]]:
         strongest = np.argsort(-self.amplitude_e_s, kind="stable")[:_MOST_LISTED]
@@ -162,25 +202,27 @@ def _damage(params: Params, context: FaultContext) -> _Damage:
     np.maximum(more, 0, out=more)  # a dose that anneals takes none of the device's own away
     jumps = np.zeros(device.shape, dtype=np.float32)
     np.add.at(jumps, (rts.row, rts.column), signals.amplitude_e_s * high)
-    extra = (more + jumps) * np.float32(exposure_s) + (offset_e(old) - device.offset_e)
+    charge = np.asarray((more + jumps) * np.float32(exposure_s), dtype=np.float32)
+    offset = np.asarray(offset_e(old) - device.offset_e, dtype=np.float32)
 
     least_e = np.float32(detector.step_e * params["least_dn"])
-    kinds = np.where(extra >= least_e, HOT, np.uint8(0))
-    extra += passing_dark_e(device.sensor, more + jumps, device.direction)
-    extra[extra < least_e] = 0
+    kinds = np.where(charge + offset >= least_e, HOT, np.uint8(0))
+    charge += passing_dark_e(device.sensor, more + jumps, device.direction)
+    faint = charge + offset < least_e
+    charge[faint], offset[faint] = 0, 0
     kept = np.ones(device.shape, dtype=np.float32)
-    np.multiply.at(kept, (old.dead.row, old.dead.column), old.dead.response)
-    kept[own.dead.row, own.dead.column] = 1
+    dead = slice(len(own.dead), None)
+    np.multiply.at(kept, (old.dead.row[dead], old.dead.column[dead]), old.dead.response[dead])
     stuck = slice(len(own.stuck), None)
-    at = old.stuck.row[stuck], old.stuck.column[stuck]
-    kept[at], extra[at] = 0, old.stuck.level[stuck] * detector.full_well_e
     for kind, some in ((DEAD, old.dead), (STUCK, old.stuck), (RTS, rts)):
         kinds[some.row, some.column] |= kind
     kinds[rts.row[high > 0.5], rts.column[high > 0.5]] |= RTS_HIGH
     return _Damage(
-        extra_e=extra.astype(np.float32),
+        charge_e=charge,
+        offset_e=offset,
         kept=kept,
         kinds=kinds,
+        stuck=StuckPixels(row=old.stuck.row[stuck], column=old.stuck.column[stuck], level=old.stuck.level[stuck]),
         rts=rts,
         amplitude_e_s=signals.amplitude_e_s,
         high=high,
