@@ -563,15 +563,25 @@ def test_samples_of_a_scene_with_a_lens() -> None:
     faults = settings.faults | {"vignetting": {"model": "lens"}}
     # pixels of half a degree: fewer rays might all miss a Sun of a fifth of that
     render = settings.render.model_copy(update={"samples_per_pixel": 64})
-    session = pipeline.Session(settings.model_copy(update={"faults": faults, "render": render}))
+    towards = settings.geometry.sun_facing.model_copy(update={"min_lit_fraction": 0.2})  # type: ignore[union-attr]
+    geometry = settings.geometry.model_copy(update={"sun_facing": towards})
+    session = pipeline.Session(
+        settings.model_copy(update={"faults": faults, "render": render, "geometry": geometry})
+    )
     c = session.base_camera
     spec = dataset.store_spec(session, [16])
     assert spec.lens_names == ("AF Nikkor 28 mm f/2.8D",)
     members = spec.members(16)
     assert members["distortion"].attributes["residual_px_max"] == c.distortion_residual_px[1] > 0
-    facing = (int(i) for i in np.flatnonzero(session.plan.stratum == plan.SUN_FACING))
-    seen = (session.frame(i) for i in facing)
-    frame = next(f for f in seen if (f.context.sun_xy_px > 5).all() and (f.context.sun_xy_px < (123, 107)).all())
+    # Sun and ground in one frame
+    frames_ = (session.frame(int(i)) for i in np.flatnonzero(session.plan.stratum == plan.SUN_FACING))
+    frame = next(
+        f
+        for f in frames_
+        if (f.context.sun_xy_px > 5).all()
+        and (f.context.sun_xy_px < (123, 107)).all()
+        and 0.2 < (f.truth.semantic == BODY).mean() < 0.9
+    )
     lens = frame.camera.lens
     assert isinstance(lens, RealLens)
     assert frame.rendered is not None
