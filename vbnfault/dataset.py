@@ -263,7 +263,7 @@ class SessionFactory:
 
 @dataclasses.dataclass(frozen=True)
 class _Session:
-    """A session whose files have to hold what they held when the build was planned."""
+    """Run a session whose input files must hold what they held when the build was planned."""
 
     session: pipeline.Session
     contents: resources.Contents

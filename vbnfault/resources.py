@@ -154,7 +154,7 @@ def _opened_now(path: Path, what: str, types: Sequence[str], limit_bytes: int) -
 
 
 class Contents:
-    """What the files that a run reads hold: the first reading counts, every later one is compared with it.
+    """Record the digests of the files that a run reads, and compare every later reading with the first.
 
     One object serves a run from its planning to its last worker process; pickled, it carries the digests along.
     Once `complete`, a file that was not read before is refused as well, except where it belongs to vbnfault.

@@ -314,17 +314,17 @@ def _sites(pattern: Pattern) -> tuple[tuple[int, int], tuple[int, int]]:
 
 
 def _signed(raw: F32, kernel: F32) -> F32:
-    """The sum that the method prescribes."""
+    """Return the weighted sum that the method prescribes."""
     return cv2.filter2D(raw, -1, kernel)
 
 
 def _unsigned(raw: F32, kernel: F32) -> F32:
-    """The sum of absolute weights, which shows what depends on what."""
+    """Return the sum with absolute weights: positive wherever the result depends on a marked pixel."""
     return cv2.filter2D(raw, -1, np.abs(kernel))
 
 
 def _most(raw: F32, kernel: F32) -> F32:
-    """The greatest value that enters the sum."""
+    """Return the greatest value among the pixels that have a weight in the kernel."""
     return cv2.dilate(raw, (kernel != 0).astype(np.uint8))
 
 
