@@ -212,9 +212,8 @@ def is_exact(attributes: Mapping[str, Any]) -> bool:
     return bool(redraws and not as_drawn and not scene.get("spice", {}).get("spacecraft"))
 
 
-def planned(attributes: Mapping[str, Any], faults: Sequence[str]) -> Callable[[int, int], dict[str, Any]]:
-    """What the plan of a stored scene says of a sample that kept the view of so many `tries`: the scalars that
-    rendering cannot change, and the commanded faults as `injected`."""
+def stored_scene(attributes: Mapping[str, Any]) -> SceneConfig:
+    """Return the scene that a store was planned from, without the contents of the files that it names."""
     stored = {key: value for key, value in attributes["scene"].items() if key != "textures_sha256"}
     stored["body"] = {key: value for key, value in stored["body"].items() if key != "shape_sha256"}
     # what is added to the tables of a scene's identity is no key of a scene
@@ -225,7 +224,13 @@ def planned(attributes: Mapping[str, Any], faults: Sequence[str]) -> Callable[[i
         unused = ("f_number", "transmission")
         stored["camera"] = {key: value for key, value in stored["camera"].items() if key not in unused}
     stored["dataset"] = {**stored["dataset"], "samples": attributes["blocks"][0]}
-    scene = config.parse_scene(stored, source="the store's own scene")
+    return config.parse_scene(stored, source="the store's own scene")
+
+
+def planned(attributes: Mapping[str, Any], faults: Sequence[str]) -> Callable[[int, int], dict[str, Any]]:
+    """What the plan of a stored scene says of a sample that kept the view of so many `tries`: the scalars that
+    rendering cannot change, and the commanded faults as `injected`."""
+    scene = stored_scene(attributes)
     table = plan.make_plan(scene, faults, attributes["blocks"])
 
     def expected(index: int, tries: int) -> dict[str, Any]:

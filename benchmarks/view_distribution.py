@@ -1,0 +1,170 @@
+"""Plot the views of a store beside the bounds of its scene's table: the first ones, and those drawn again.
+
+    vbnfault build paper67p --out paper.zarr --samples 2000 --set camera.width_px=128 --set camera.height_px=128 \
+        --set patch.max_triangles=200000
+    python benchmarks/view_distribution.py paper.zarr --out views.png
+
+A view is drawn again where the geometry of the scene does not allow it (the camera below the ground, the Sun hidden
+from a sample with straylight), and where a commanded fault cannot show in it. The kept views follow the table's
+distribution, given that they can be used. Three comparisons by the Kolmogorov-Smirnov test, for each stratum and
+each variable, say what that does:
+
+- `first`: the first views of all samples with the table. They must agree.
+- `kept`: the views of the store with the table. They differ by what the conditions exclude; `shift` is the
+  difference of the means over the width of the table's bounds.
+- `again`: the views kept at a later try with those kept at the first, of samples that carry a fault. They must
+  agree, or drawing again prefers some of the views that can be used.
+
+The table's distribution is that of the first views of a plan with 200,000 samples and another seed: uniform within
+the bounds, less the attitudes of Sun-averted samples that look at the Sun.
+"""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+from vbnfault import dataset, plan, store
+
+VARIABLES = ("height_m", "roll_deg", "pitch_deg", "yaw_deg", "sun_elevation_deg", "sun_azimuth_deg")
+TABLE_SAMPLES = 200_000
+BINS = 20
+
+F64 = NDArray[np.float64]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Views:
+    """The views of one stratum: values of each variable, float64[sample], and its bounds.
+
+    `table` are draws of the table; `first` and `kept` the first and the kept views of the samples; `again` says
+    which samples kept a later view, and `faulty` which are commanded to carry a fault, bool[sample].
+    """
+
+    stratum: str
+    bounds: dict[str, tuple[float, float]]
+    table: dict[str, F64]
+    first: dict[str, F64]
+    kept: dict[str, F64]
+    again: NDArray[np.bool_]
+    faulty: NDArray[np.bool_]
+
+    def tests(self, variable: str) -> dict[str, Any]:
+        """Return the results of the three tests for a variable, and `shift`."""
+        table, first, kept = (of[variable] for of in (self.table, self.first, self.kept))
+        low, high = self.bounds[variable]
+        early, late = kept[~self.again & self.faulty], kept[self.again & self.faulty]
+        return {
+            "first": stats.ks_2samp(first, table),
+            "kept": stats.ks_2samp(kept, table),
+            "again": stats.ks_2samp(late, early) if len(late) and len(early) else None,
+            "shift": float(kept.mean() - table.mean()) / ((high - low) or 1.0),
+        }
+
+
+def views_of(path: Path) -> list[Views]:
+    """Return the views of a store's finished samples, by stratum. Strata without samples are left out."""
+    opened = store.open_store(path)
+    scene = dataset.stored_scene(opened.attributes)
+    made = plan.make_plan(scene, opened.spec.faults, opened.attributes["blocks"])
+    large = {"samples": TABLE_SAMPLES, "seed": scene.dataset.seed + 1}
+    many = scene.model_copy(update={"dataset": scene.dataset.model_copy(update=large)})
+    table = plan.make_plan(many, opened.spec.faults)
+    whole = np.flatnonzero(np.asarray(opened.read("done")))
+    tries = np.asarray(opened.read("tries"))[whole]
+    kept = [made.view(scene, int(i), int(k) - 1) for i, k in zip(whole, tries, strict=True)]
+    out = []
+    for code, name in enumerate(plan.STRATA):
+        here = made.stratum[whole] == code
+        if not here.any():
+            continue
+        out.append(
+            Views(
+                stratum=name,
+                bounds={v: tuple(float(b[code]) for b in plan.bounds(scene, v)) for v in VARIABLES},
+                table={v: table.variables[v][table.stratum == code] for v in VARIABLES},
+                first={v: made.variables[v][whole][here] for v in VARIABLES},
+                kept={v: np.array([view[v] for view in kept])[here] for v in VARIABLES},
+                again=tries[here] > 1,
+                faulty=made.injected[whole][here].any(axis=1),
+            )
+        )
+    return out
+
+
+def lines(views: Views) -> list[str]:
+    """Return the results of a stratum as lines."""
+    out = [
+        f"{views.stratum}: {len(views.again)} samples, {int(views.again.sum())} kept a later view",
+        f"  {'':<18}{'bounds':>18}  {'first: D':>9}{'p':>8}  {'kept: D':>9}{'p':>9}{'shift':>8}  "
+        f"{'again: D':>9}{'p':>8}",
+    ]
+    for variable in VARIABLES:
+        found = views.tests(variable)
+        low, high = views.bounds[variable]
+        first, kept, again = found["first"], found["kept"], found["again"]
+        tail = f"{again.statistic:9.3f}{again.pvalue:8.3f}" if again else f"{'-':>9}{'-':>8}"
+        out.append(
+            f"  {variable:<18}{f'{low:g} to {high:g}':>18}  {first.statistic:9.3f}{first.pvalue:8.3f}  "
+            f"{kept.statistic:9.3f}{kept.pvalue:9.1e}{found['shift']:+8.3f}  {tail}"
+        )
+    return out
+
+
+def plot(strata: list[Views], title: str, path: Path) -> None:
+    """Write histograms of every variable, a row a stratum, as a PNG."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    figure, grid = plt.subplots(
+        len(strata), len(VARIABLES), figsize=(3 * len(VARIABLES), 3 * len(strata)), squeeze=False
+    )
+    for row, views in zip(grid, strata, strict=True):
+        for axes, variable in zip(row, VARIABLES, strict=True):
+            low, high = views.bounds[variable]
+            edges = np.linspace(low, high if high > low else low + 1, BINS + 1)
+            kept = views.kept[variable]
+            axes.hist(views.table[variable], edges, density=True, color="0.85", label="table")
+            for values, label in (
+                (views.first[variable], f"first views, {len(kept)}"),
+                (kept, f"kept views, {len(kept)}"),
+                (kept[views.again], f"drawn again, {int(views.again.sum())}"),
+            ):
+                axes.hist(values, edges, density=True, histtype="step", lw=1.4, label=label)
+            for bound in (low, high):
+                axes.axvline(bound, color="k", ls=":", lw=1)
+            found = views.tests(variable)
+            again = "" if found["again"] is None else f", again p = {found['again'].pvalue:.2g}"
+            axes.set_title(f"kept D = {found['kept'].statistic:.3f}{again}", fontsize=8)
+            axes.set_xlabel(variable)
+            axes.set_yticks([])
+        row[0].set_ylabel(views.stratum)
+        row[0].legend(fontsize=7)
+    figure.suptitle(title)
+    figure.tight_layout()
+    figure.savefig(path, dpi=70)
+
+
+def main() -> None:
+    """Print the tests, and write the plot."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("store", type=Path, help="store whose views are looked at")
+    parser.add_argument("--out", type=Path, required=True, help="PNG to write")
+    given = parser.parse_args()
+    strata = views_of(given.store)
+    for views in strata:
+        print("\n".join(lines(views)))
+    total = sum(len(views.again) for views in strata)
+    plot(strata, f"{given.store.name}: views of {total} samples", given.out)
+
+
+if __name__ == "__main__":
+    main()
