@@ -4,17 +4,30 @@ from __future__ import annotations
 
 import os
 import signal
+import sys
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
+from hypothesis import HealthCheck, settings
 
 from vbnfault.faults import FAULT_AXIS
 
 # A shell that starts the tests in the background makes them, and every process they start, deaf to Ctrl-C;
 # with a handler here, processes that are started begin with the default again.
 signal.signal(signal.SIGINT, signal.default_int_handler)
+
+# A loaded machine is slow at everything: no example fails for the seconds that it or its drawing took. What cannot
+# be drawn for other reasons (too much is filtered out) still fails, and a failure prints what repeats it.
+settings.register_profile(
+    "vbnfault",
+    deadline=None,
+    suppress_health_check=[HealthCheck.too_slow, HealthCheck.function_scoped_fixture],
+    print_blob=True,
+)
+settings.load_profile("vbnfault")
 
 REAL_SHAPE = Path(__file__).resolve().parents[2] / "shared/data/shapes/67p_18k.obj"
 
@@ -31,6 +44,22 @@ def real_shape() -> Path:
     if not REAL_SHAPE.is_file():
         pytest.skip(f"the real shape model is not part of the project: no file {REAL_SHAPE}")
     return REAL_SHAPE
+
+
+def calls_of(action: Callable[[], Any]) -> int:
+    """Return how many functions, Python's and built-in ones, an action calls: loops, without a clock."""
+    calls, before = 0, sys.getprofile()
+
+    def count(_frame: Any, event: str, _argument: Any) -> None:
+        nonlocal calls
+        calls += event in ("call", "c_call")
+
+    sys.setprofile(count)
+    try:
+        action()
+    finally:
+        sys.setprofile(before)
+    return calls
 
 
 def small_scene(**tables: dict[str, Any]) -> dict[str, Any]:

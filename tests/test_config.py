@@ -199,7 +199,7 @@ def test_every_number_is_accepted_at_its_bounds() -> None:
                 assert getattr(getattr(scene, table), key) == value
 
 
-@settings(max_examples=60, deadline=None)  # the first example loads what the faults need
+@settings(max_examples=60)  # the first example loads what the faults need
 @given(
     st.dictionaries(
         st.sampled_from(["title", "camera", "geometry", "dataset", "faults", "body", "x"]),

@@ -428,7 +428,7 @@ rngs = [np.random.default_rng(k) for k in (1, 2)]
 Noise.draw((64, 64), *rngs)
 child = os.fork()
 if not child:
-    signal.alarm(2)
+    signal.alarm(600)  # it guards against a test that hangs
     Noise.draw((64, 64), *rngs)
     os._exit(0)
 raise SystemExit(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))

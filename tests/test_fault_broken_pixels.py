@@ -103,7 +103,7 @@ def test_zero_offset_is_no_line() -> None:
     assert FAULT.footprint(params, context).sum() == 5
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(st.data())
 def test_against_the_plain_reading_in_any_order(data: st.DataObject) -> None:
     # a crowded frame: neighbours shared, lines over defects, edges, corners

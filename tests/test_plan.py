@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import pytest
+from conftest import calls_of
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
@@ -326,7 +326,7 @@ def assert_same_rows(a: plan.Plan, b: plan.Plan, rows: slice, *, faults: bool = 
     st.integers(0, 2**63 - 1),
     st.sampled_from(["per_class", "per_sample"]),
 )
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 def test_appending_a_block_leaves_earlier_rows_alone(first: int, more: int, seed: int, mode: str) -> None:
     s = scene(dataset={"samples": first, "seed": seed}, plan={"mode": mode})
     short, long = (plan.make_plan(s, FAULT_AXIS, blocks) for blocks in ([first], [first, more]))
@@ -399,7 +399,6 @@ def test_rounds_of_sites_are_shuffled() -> None:
 
 
 @given(st.integers(1, 400), st.integers(0, 100), st.integers(0, 100), st.integers(0, 2**32))
-@settings(deadline=None)
 def test_splits_are_whole_sites_in_proportion(sites: int, a: int, b: int, seed: int) -> None:
     lo, hi = sorted((a, b))
     fractions = {"train": lo / 100, "val": (hi - lo) / 100, "test": 1 - hi / 100}
@@ -425,7 +424,7 @@ def test_no_site_is_in_two_splits_and_splits_are_not_the_first_sites() -> None:
 
 
 @given(st.integers(1, 40), st.integers(1, 40), st.integers(0, 100), st.integers(0, 100), st.integers(0, 2**32))
-@settings(deadline=None, max_examples=30)
+@settings(max_examples=30)
 def test_no_device_is_in_two_splits(individuals: int, sites: int, a: int, b: int, seed: int) -> None:
     lo, hi = sorted((a, b))
     fractions = {"train": lo / 100, "val": (hi - lo) / 100, "test": 1 - hi / 100}
@@ -479,7 +478,7 @@ def test_packaged_scenes_ask_for_lit_ground_in_four_of_five_views(name: str) -> 
 
 
 @given(st.integers(24, 300), st.integers(3, 12), st.integers(1, 8), st.sampled_from(["per_class", "per_sample"]))
-@settings(deadline=None, max_examples=40)
+@settings(max_examples=40)
 def test_no_split_is_empty_and_classes_are_dealt_evenly(samples: int, sites: int, shard: int, mode: str) -> None:
     s = scene(dataset={"samples": samples, "sites": sites, "shard_samples": shard}, plan={"mode": mode})
     p = plan.make_plan(s, FAULT_AXIS)
@@ -538,11 +537,14 @@ def test_planning_looks_at_every_sample_a_bounded_number_of_times(
 
 
 @pytest.mark.parametrize("mode", ["per_class", "per_sample"])
-def test_100_000_samples_are_planned_in_seconds(mode: str) -> None:
-    s = scene(dataset={"samples": 100_000}, plan={"mode": mode})
-    start = time.process_time()
+def test_100_000_samples_are_planned_without_a_loop_over_samples(mode: str) -> None:
+    plan.make_plan(scene(dataset={"samples": 1000}), FAULT_AXIS)  # what is made once
+    calls = []
+    for samples in (1000, 100_000):
+        s = scene(dataset={"samples": samples}, plan={"mode": mode})
+        calls.append(calls_of(lambda s=s: plan.make_plan(s, FAULT_AXIS)))
+    assert calls[1] < 2 * calls[0] < 4000  # 825 and 742; rare samples need redraws, which few scenes have
     p = plan.make_plan(s, FAULT_AXIS)
-    assert time.process_time() - start < 10
     assert len(p) == 100_000
     far = p.stratum == FAR
     assert sun_angle_deg(p)[far].min() >= 32.5 * np.sqrt(2)

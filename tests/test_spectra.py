@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from colour.characterisation.datasets.cameras.dslr.sensitivities import MSDS_CAMERA_SENSITIVITIES_DSLR
 from colour.plotting.datasets.astm_g_173 import DATA_ASTMG173_ETR
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from vbnfault import spectra
@@ -127,7 +127,6 @@ def test_nodes() -> None:
     np.testing.assert_array_equal(spectra.band_nodes_nm(400, 700, 1), [550])
 
 
-@settings(deadline=None)
 @given(
     st.integers(2, 16).flatmap(lambda n: st.lists(st.floats(0, 1), min_size=n, max_size=n)),
     st.sampled_from([(400.0, 700.0), (420.0, 680.0), (450.0, 900.0)]),

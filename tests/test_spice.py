@@ -241,8 +241,24 @@ def test_meta_kernels(folder: Path, tmp_path: Path) -> None:
     assert spice.loaded() == 0
 
 
-def test_threads_take_turns(folder: Path) -> None:
+def test_threads_take_turns(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     entered: list[int] = []
+    waits = threading.Event()
+
+    class Noted:
+        """The lock of the pool, which says that a thread has come and found it taken."""
+
+        lock = spice._pool
+
+        def __enter__(self) -> None:
+            if not self.lock.acquire(blocking=False):
+                waits.set()
+                self.lock.acquire()
+
+        def __exit__(self, *_: object) -> None:
+            self.lock.release()
+
+    monkeypatch.setattr(spice, "_pool", Noted())
 
     def load() -> None:
         with spice.kernels(folder / "a.tls"):
@@ -251,9 +267,9 @@ def test_threads_take_turns(folder: Path) -> None:
     thread = threading.Thread(target=load)
     with spice.kernels(folder / "a.tpc"):
         thread.start()
-        thread.join(0.2)
+        assert waits.wait(600)  # it guards against a test that hangs
         assert entered == []
-    thread.join(10)
+    thread.join(600)
     assert entered == [1]
 
 

@@ -15,8 +15,9 @@ from .. import store as store_module
 from ..errors import InputError, VbnfaultError
 from .tasks import Fatal, Lazy, Run, SessionFactory, Task, describe, work
 
-_SECONDS_TO_CONNECT = 5.0
-_SECONDS_TO_ANSWER = 15.0  # a busy scheduler takes its time
+# For what listens nowhere, or is no scheduler: a scheduler of a cluster at work may answer after many seconds.
+_SECONDS_TO_CONNECT = 30.0
+_SECONDS_TO_ANSWER = 60.0
 
 
 _cluster_lock = threading.Lock()
@@ -103,7 +104,7 @@ def run_on_dask(factory: SessionFactory, run: Run, scheduler: str) -> None:
     import distributed
 
     try:
-        client = distributed.Client(scheduler, timeout="10s", set_as_default=False)
+        client = distributed.Client(scheduler, timeout=_SECONDS_TO_ANSWER, set_as_default=False)
     except (OSError, ValueError) as error:
         raise VbnfaultError(f"--scheduler {scheduler}: cannot connect: {error}") from error
     path, pickled = run.store.path.absolute(), pickle.dumps(factory)
