@@ -1,0 +1,126 @@
+"""Draw the figures beside the scene files again, to be looked at.
+
+    python benchmarks/scene_pictures.py --out scenes
+    python benchmarks/scene_pictures.py --out scenes landing flares
+
+Contact sheets show samples of a dataset with their masks. They are built with 512 pixels across, over terrain as
+coarse as quickstart's, and shrunk. The figures of `flares`, `navcam67p`, `paper_example` and `physical67p` show
+single samples at the scene's own size, shrunk.
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from vbnfault import config, dataset, report
+from vbnfault.export import annotated
+from vbnfault.pipeline import Session
+from vbnfault.sample import Frame
+
+U8 = NDArray[np.uint8]
+
+# Samples of each contact sheet.
+SHEETS = {"earth_observation": 12, "interplanetary": 12, "landing": 12, "quickstart": 16, "sssb_exploration": 12}
+SHEET_PX = 512
+SHEET_TRIANGLES = 800_000
+SHEET_WIDTH_PX = 1080
+# Samples with many classes, and several of one site: its terrain is built once.
+FLARES, NAVCAM, PHYSICAL = (1, 2, 3), (5, 6, 12, 15), (7, 4)
+
+
+def frames(scene: str, samples: tuple[int, ...], overrides: dict[str, Any] | None = None) -> list[Frame]:
+    """Return finished samples of a packaged scene."""
+    session = Session(config.load_scene(scene, overrides or {}))
+    return [session.frame(index) for index in samples]
+
+
+def rgb(frame: Frame, name: str) -> U8:
+    """Return one of a sample's images as uint8[y, x, 3] R, G, B."""
+    return np.asarray(frame.images[name].array[..., :3])
+
+
+def mask(frame: Frame, *classes: str) -> U8:
+    """Return the union of the masks of some classes in white, uint8[y, x, 3]."""
+    chosen = [name in classes for name in frame.spec.faults]
+    return np.repeat(frame.mask[chosen].any(axis=0)[..., None].astype(np.uint8) * 255, 3, axis=2)
+
+
+def grid(rows: list[list[U8]], tile_px: int) -> U8:
+    """Return images in rows, each shrunk to a square tile, uint8[y, x, 3]."""
+    size = (tile_px, tile_px)
+    shrunk = [[cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in row] for row in rows]
+    return np.vstack([np.hstack(row) for row in shrunk])
+
+
+def flares() -> U8:
+    """Three samples by the three models of straylight, a row a model."""
+    models = ("traced", "paraxial", "texture")
+    rows = [frames("flares", FLARES, {"faults.straylight.model": model}) for model in models]
+    return grid([[rgb(frame, "image") for frame in row] for row in rows], 360)
+
+
+def navcam67p() -> U8:
+    """Four samples of a dataset of 16."""
+    images = [rgb(frame, "image") for frame in frames("navcam67p", NAVCAM, {"dataset.samples": 16})]
+    return grid([images[:2], images[2:]], 540)
+
+
+def paper_example() -> U8:
+    """The image, without straylight, with its flares marked; masks of straylight, dust, pixels, lines and all."""
+    (frame,) = frames("paper_example", (0,))
+    local = ("straylight", "dust_on_optics", "broken_pixels", "broken_lines")
+    masks = [mask(frame, name) for name in local]
+    pictures = [rgb(frame, "image"), rgb(frame, "without_straylight"), annotated(frame, "straylight")]
+    return grid([[*pictures, masks[0]], [*masks[1:], mask(frame, *local)]], 400)
+
+
+def physical67p() -> U8:
+    """Two samples, each with its faults and without."""
+    taken = frames("physical67p", PHYSICAL)
+    return grid([[rgb(frame, "image"), rgb(frame, "clean")] for frame in taken], 540)
+
+
+SINGLE = {"flares": flares, "navcam67p": navcam67p, "paper_example": paper_example, "physical67p": physical67p}
+
+
+def sheet(scene: str) -> U8:
+    """Return the contact sheet of a scene, shrunk to SHEET_WIDTH_PX."""
+    own = config.load_scene(scene)
+    small = {
+        "dataset.samples": SHEETS[scene],
+        "camera.width_px": SHEET_PX,
+        "camera.height_px": SHEET_PX,
+        "patch.max_triangles": min(SHEET_TRIANGLES, own.patch.max_triangles),
+    }
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / f"{scene}.zarr"
+        dataset.build_scene(config.load_scene(scene, small), path, source=scene)
+        report.preview(path, path.with_suffix(".png"))
+        whole = cv2.imread(str(path.with_suffix(".png")))[..., ::-1]
+    size = (SHEET_WIDTH_PX, round(SHEET_WIDTH_PX * whole.shape[0] / whole.shape[1]))
+    return np.asarray(cv2.resize(whole, size, interpolation=cv2.INTER_AREA))
+
+
+def main() -> None:
+    """Write the figures that are asked for."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, required=True, help="folder for SCENE.png")
+    known = sorted([*SHEETS, *SINGLE])
+    parser.add_argument("scenes", nargs="*", metavar="SCENE", help=f"of {', '.join(known)} [default: all]")
+    given = parser.parse_args()
+    for scene in given.scenes or known:
+        path = given.out / f"{scene}.png"
+        figure = sheet(scene) if scene in SHEETS else SINGLE[scene]()
+        cv2.imwrite(str(path), figure[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 9])
+        print(f"{path}: {path.stat().st_size / 1e3:.0f} kB", flush=True)
+
+
+if __name__ == "__main__":
+    main()
