@@ -15,7 +15,7 @@ statement run, the shortest first. What runs in the set-up of a test counts for 
 while modules are imported for all tests. Tests marked `slow` are left out.
 
 Mutations that cannot change what the program does are left out where that can be told from their position alone:
-type annotations, decorators of dataclasses, conditions on `TYPE_CHECKING`, the text of errors.
+type annotations, decorators, conditions on `TYPE_CHECKING`, the text of errors, and what is no Python at all.
 """
 
 from __future__ import annotations
@@ -30,6 +30,8 @@ import shutil
 import subprocess
 import sys
 import tempfile
+import warnings
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -40,7 +42,10 @@ ROOT = Path(__file__).resolve().parents[1]
 GROUPS: dict[str, tuple[list[str], list[str]]] = {
     "plan": (["vbnfault/plan.py"], ["tests/test_plan.py"]),
     "splits": (["vbnfault/plan.py"], ["tests/test_plan.py"]),
-    "pose": (["vbnfault/pose.py"], ["tests/test_resolve.py", "tests/test_views.py", "tests/test_pipeline.py"]),
+    "pose": (
+        ["vbnfault/pose.py"],
+        ["tests/test_resolve.py", "tests/test_views.py", "tests/test_pipeline.py", "tests/test_spice.py"],
+    ),
     "labels": (["vbnfault/labels.py", "vbnfault/record.py"], ["tests/test_labels.py", "tests/test_pipeline.py"]),
     "pictures": (["vbnfault/pictures.py"], ["tests/test_pipeline.py", "tests/test_labels.py"]),
     "exposure": (["vbnfault/exposure.py"], ["tests/test_pipeline.py", "tests/test_physical.py"]),
@@ -93,8 +98,13 @@ def executing(mutation: dict[str, Any], traces: list[dict[str, Any]]) -> dict[st
 # ------------------------------------------------------------------------------------ mutations
 
 
+def _decorated(node: ast.AST) -> Iterator[int]:
+    for decorator in getattr(node, "decorator_list", ()):
+        yield from range(decorator.lineno, decorator.end_lineno + 1)
+
+
 def statements(path: Path) -> dict[int, tuple[int, int, str, bool]]:
-    """Return for each line of a module its statement's first and last line, its function, whether it raises."""
+    """Return for each line of a module first and last line of its statement, its function, if it is left out."""
     found: dict[int, tuple[int, int, str, bool]] = {}
 
     def visit(node: ast.AST, function: str) -> None:
@@ -106,6 +116,8 @@ def statements(path: Path) -> dict[int, tuple[int, int, str, bool]]:
                 last = max(child.lineno, last or child.lineno)
                 for line in range(child.lineno, last + 1):
                     found[line] = (child.lineno, last, function, isinstance(child, ast.Raise))
+                for line in _decorated(child):
+                    found[line] = (line, line, function, True)
                 if isinstance(child, ast.FunctionDef | ast.ClassDef):
                     inner = f"{function}.{child.name}".lstrip(".")
             visit(child, inner)
@@ -127,8 +139,8 @@ def positions(path: Path) -> list[dict[str, Any]]:
         operator = kind()
         places = [p for node in ast_nodes(tree) for p in operator.mutation_positions(node)]
         for k, (start, _) in enumerate(places):
-            first, last, function, raises = by_line.get(start[0], (start[0], start[0], "", False))
-            if not raises:
+            first, last, function, left_out = by_line.get(start[0], (start[0], start[0], "", False))
+            if not left_out:
                 where = {"path": str(path.relative_to(ROOT)), "line": start[0], "at": start, "function": function}
                 out.append({**where, "operator": name, "occurrence": k, "statement": (first, last)})
     return out
@@ -145,8 +157,29 @@ def drawn(group: str, count: int, seed: int) -> list[dict[str, Any]]:
             if function in PARTS[group] if group in PARTS else function not in apart:
                 by_place.setdefault((mutation["path"], *mutation["at"]), []).append(mutation)
     chance = random.Random(f"{group} {seed}")
-    places = chance.sample(sorted(by_place), min(count, len(by_place)))
-    return [chance.choice(by_place[place]) | {"group": group} for place in places]
+    out: list[dict[str, Any]] = []
+    for place in chance.sample(sorted(by_place), len(by_place)):
+        mutation = chance.choice(by_place[place])
+        if _compiles(mutation):
+            out.append(mutation | {"group": group})
+        if len(out) >= count:
+            break
+    return out
+
+
+def _compiles(mutation: dict[str, Any]) -> bool:
+    import cosmic_ray.plugins
+    from cosmic_ray.mutating import mutate_code
+
+    text = (ROOT / mutation["path"]).read_text(encoding="utf-8")
+    changed = mutate_code(text, cosmic_ray.plugins.get_operator(mutation["operator"])(), mutation["occurrence"])
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # `is` with a number
+            compile(changed or "", mutation["path"], "exec")
+    except SyntaxError:
+        return False
+    return changed is not None
 
 
 def tests_of(mutation: dict[str, Any], root: Path) -> list[str]:
