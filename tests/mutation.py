@@ -40,15 +40,21 @@ ROOT = Path(__file__).resolve().parents[1]
 
 # group → (modules, tests that are meant to notice their mutations)
 GROUPS: dict[str, tuple[list[str], list[str]]] = {
-    "plan": (["vbnfault/plan.py"], ["tests/test_plan.py"]),
-    "splits": (["vbnfault/plan.py"], ["tests/test_plan.py"]),
+    "plan": (["vbnfault/plan.py"], ["tests/test_plan.py", "tests/test_views.py"]),
+    "splits": (["vbnfault/plan.py"], ["tests/test_plan.py", "tests/test_views.py"]),
     "pose": (
         ["vbnfault/pose.py"],
         ["tests/test_resolve.py", "tests/test_views.py", "tests/test_pipeline.py", "tests/test_spice.py"],
     ),
-    "labels": (["vbnfault/labels.py", "vbnfault/record.py"], ["tests/test_labels.py", "tests/test_pipeline.py"]),
+    "labels": (
+        ["vbnfault/labels.py", "vbnfault/record.py"],
+        ["tests/test_labels.py", "tests/test_pipeline.py", "tests/test_truth.py"],
+    ),
     "pictures": (["vbnfault/pictures.py"], ["tests/test_pipeline.py", "tests/test_labels.py"]),
-    "exposure": (["vbnfault/exposure.py"], ["tests/test_pipeline.py", "tests/test_physical.py"]),
+    "exposure": (
+        ["vbnfault/exposure.py"],
+        ["tests/test_exposure.py", "tests/test_pipeline.py", "tests/test_physical.py"],
+    ),
     "store": (["vbnfault/store/*.py"], ["tests/test_store*.py"]),
     "faults": (["vbnfault/faults/*.py"], ["tests/test_fault_{stem}*.py", "tests/test_faults_*.py"]),
 }

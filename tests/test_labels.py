@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from types import SimpleNamespace
 from typing import Any
 
@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from vbnfault import labels
+from vbnfault import labels, record
 
 images = arrays(np.uint8, (3, 5, 4), elements=st.sampled_from([0, 1, 128, 254, 255]))
 SHAPE = (4, 6)
@@ -156,3 +156,75 @@ def test_in_a_ccd_charge_that_runs_out_of_a_footprint_is_labelled_too() -> None:
         (mask,) = labels.mask_layers(fault, {"rays": {"row": 1}}, context, effects)  # type: ignore[arg-type]
         assert mask[1].all()
         assert mask[:, 2].all() == ccd
+
+
+# ------------------------------------------------------------------------------------ rules in words
+
+
+@given(images, images, st.sampled_from([1.5, 2.0, 126.0, 127.0, 254.0, 255.0]))
+def test_strong_effect_is_any_channel_differing_by_its_level(a: np.ndarray, b: np.ndarray, least_dn: float) -> None:
+    expected = (np.abs(a.astype(int) - b) >= least_dn).any(axis=2)
+    np.testing.assert_array_equal(labels.effect(a, b, least_dn), expected)
+
+
+@pytest.mark.parametrize(
+    ("effect_mask", "level_dn", "steps", "of_a_ccd", "of_cmos"),
+    [
+        (True, 1.0, ("electrons",), "effect", "effect"),
+        (True, 0.5, ("electrons",), "effect", "effect"),
+        (True, 2.0, ("electrons",), "strong effect", "strong effect"),
+        (False, 1.0, ("electrons", "rgbi"), "footprint", "footprint"),
+        (False, 1.0, ("rgbi", "charge"), "footprint and effect", "footprint"),
+        (False, 1.0, ("light",), "footprint and effect", "footprint"),
+    ],
+)
+def test_kind_of_a_mask(
+    effect_mask: bool, level_dn: float, steps: tuple[str, ...], of_a_ccd: str, of_cmos: str
+) -> None:
+    fault: Any = SimpleNamespace(effect_mask=effect_mask, effect_level_dn=level_dn, steps=steps)
+    for is_ccd, kind in ((True, of_a_ccd), (False, of_cmos)):
+        assert labels.kind(fault, is_ccd=is_ccd) == kind
+        where: Any = SimpleNamespace(camera=SimpleNamespace(is_ccd=is_ccd))
+        assert labels.spreads(fault, where) == (kind == "footprint and effect")
+
+
+@dataclass(frozen=True)
+class Thresholds:
+    """Two thresholds, of which one has a unit, and a field that is none."""
+
+    mask_loss: float = field(default=0.25, metadata={"doc": "loss of light"})
+    mask_level: float = field(default=3.0, metadata={"doc": "least change", "unit": "dn"})
+    strength: float = field(default=1.0, metadata={"doc": "strength", "unit": "dn"})
+
+
+def test_footprint_rule_names_every_threshold_its_value_and_unit() -> None:
+    rule = labels.footprint_rule(Thresholds())  # type: ignore[arg-type]
+    assert rule == "loss of light: mask_loss = 0.25; least change: mask_level = 3 dn"
+    assert "mask" not in labels.footprint_rule(Labelled())  # type: ignore[arg-type]
+
+
+# ------------------------------------------------------------------------------------ points of truth
+
+
+def test_points_of_truth_lie_at_their_depth_along_their_rays() -> None:
+    """A plane that is z = 5 m before the camera: x = 5 u, y = 5 v in C, then turned by hand and moved to T."""
+    u, v = np.meshgrid([-0.5, 0.0, 1.0], [-0.25, 0.75])
+    depth = np.full((2, 3), 5.0, dtype=np.float32)
+    depth[0, 1] = np.inf  # sky
+    # C's x, y, z are L's y, z, x; L's are T's -x, -y, z
+    L_from_C = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+    frame: Any = SimpleNamespace(
+        truth=SimpleNamespace(depth_m=depth),
+        camera=SimpleNamespace(seen_slopes=np.stack([u, v], axis=-1)),
+        spec=SimpleNamespace(
+            terrain=SimpleNamespace(
+                site=SimpleNamespace(
+                    T_from_L=np.diag([-1.0, -1.0, 1.0]), position_T_m=np.array([100.0, 200.0, 300.0])
+                )
+            )
+        ),
+        pose=SimpleNamespace(L_from_C=L_from_C, position_L_m=np.array([7.0, 8.0, 9.0])),
+    )
+    want = np.stack([100 - (7 + 5 + 0 * u), 200 - (8 + 5 * u), 300 + (9 + 5 * v)], axis=-1)
+    want[0, 1] = np.nan
+    np.testing.assert_allclose(record._points_T_m(frame), want, rtol=1e-14)

@@ -501,6 +501,34 @@ def test_no_split_is_empty_and_classes_are_dealt_evenly(samples: int, sites: int
         assert abs((p.stratum[here] == NEAR).sum() - facing) <= shards + 6
 
 
+@pytest.mark.parametrize(
+    ("theirs", "gains"),
+    [
+        (["A", "AB"], True),  # B for A and B: the first split wins A, and B stays in both
+        (["A", "A", "B"], False),  # B for A: the first split would lose B, its only one
+        (["B", "B"], False),  # nobody has what it lacks
+        (["A", "AC", "B", "C"], False),  # C is too rare to matter, and A costs B
+    ],
+)
+def test_rows_are_exchanged_where_a_split_wins_a_class_and_loses_none(theirs: list[str], gains: bool) -> None:
+    """The first split has one sample, with class B alone; the second has those of `theirs`."""
+    rows = ["B", *theirs]
+    traits = np.array([[name in row for name in "ABC"] for row in rows])
+    split = np.array([0] + [2] * len(theirs), dtype=np.uint8)
+    present = np.unique(split)
+    enough = np.array([traits[:, k].sum() >= 2 for k in range(2)] + [False])
+    pair = plan._exchange(traits, split, present, enough)
+    assert (pair is not None) == gains
+    if pair is None:
+        return
+    one, other = pair
+    assert (split[one], split[other]) == (0, 2)
+    after = traits.copy()
+    after[[one, other]] = traits[[other, one]]
+    for s in present:
+        assert after[split == s][:, enough].any(axis=0).all()
+
+
 def test_splits_that_cannot_hold_every_class_are_told() -> None:
     few = scene(dataset={"samples": 16, "sites": 2, "shard_samples": 8})
     (sentence,) = plan.shortcomings(few, plan.make_plan(few, FAULT_AXIS))

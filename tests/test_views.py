@@ -307,3 +307,20 @@ def test_a_flown_pose_is_kept_with_its_sun_hidden_and_refused_within_the_ground(
     assert not at(500.0, [0, 0.1, 1], down).pose.resolved  # behind the body
     with pytest.raises(VbnfaultError, match=r"sample 0: .* is within geometry.clearance_m = 0.5 m of the ground"):
         at(float(render.ground_height_m(terrain.surface, np.zeros(1), np.zeros(1), 300.0)[0]) + 0.1, [0, 0, -1], up)
+
+
+@pytest.mark.parametrize(("fov_deg", "height_over_width"), [(90.0, 1.0), (40.0, 0.5), (65.0, 1.5)])
+def test_rays_that_look_for_lit_ground_cover_the_frame(fov_deg: float, height_over_width: float) -> None:
+    """Unit directions through the centres of equal cells: their slopes are symmetric, evenly spaced, row by row."""
+    rays = pose._grid_rays_C(fov_deg, height_over_width)
+    n = round(np.sqrt(len(rays)))
+    assert rays.shape == (n * n, 3)
+    np.testing.assert_allclose(np.linalg.norm(rays, axis=1), 1, rtol=1e-14)
+    assert (rays[:, 2] > 0).all()
+    slopes = (rays[:, :2] / rays[:, 2:]).reshape(n, n, 2)
+    half = np.tan(np.radians(fov_deg / 2))
+    cells = half * (2 * np.arange(n) + 1 - n) / n
+    np.testing.assert_allclose(slopes[..., 0], np.broadcast_to(cells, (n, n)), atol=1e-12)
+    np.testing.assert_allclose(
+        slopes[..., 1], np.broadcast_to(height_over_width * cells[:, None], (n, n)), atol=1e-12
+    )

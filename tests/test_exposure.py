@@ -1,0 +1,106 @@
+"""Exposure: the reference against a frame of one radiance, metering against its percentile and its limits."""
+
+from __future__ import annotations
+
+import dataclasses
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from conftest import small_scene
+
+from vbnfault import config, exposure, spectra, world
+from vbnfault.camera import Camera
+from vbnfault.config import SceneConfig
+from vbnfault.quantities import BODY, SKY, Electrons, Radiance
+
+SIZE = {"width_px": 32, "height_px": 32}
+
+
+def parsed(**tables: Any) -> SceneConfig:
+    scene = small_scene(**{**tables, "camera": {**SIZE, **tables.get("camera", {})}})
+    return config.parse_scene(scene, source="test")
+
+
+def facet(scene: SceneConfig) -> Radiance:
+    """A frame full of Lambert's ground whose normal is 45 degrees from the Sun: L = rho E cos(45) / pi."""
+    wavelength = world.wavelengths_nm(scene)
+    sun = world.sunlight(scene, np.array([0.0, 0.0, -1.0])).irradiance_W_m2_nm
+    table = scene.body.reflectance
+    rho = spectra.reflectance(table if isinstance(table, str | float) else table.model_dump(), wavelength)
+    light = (rho * sun * np.cos(np.radians(45)) / np.pi).astype(np.float32)
+    return Radiance(array=np.tile(light[:, None, None], (1, 32, 32)), wavelength_nm=wavelength)
+
+
+@pytest.mark.parametrize("level", [0.3, 0.6])
+def test_the_reference_exposure_puts_a_facet_at_45_degrees_at_the_metering_level(level: float) -> None:
+    scene = parsed(camera={"metering_level": level})
+    camera = world.base_camera(scene)
+    found = camera.expose(facet(scene), exposure.reference_exposure_s(scene, camera))
+    # the four pixels about the axis: natural vignetting takes 1 - cos⁴ of half a pixel's diagonal, 2e-3
+    brightness = (found.array / found.white_e).max(axis=-1)[15:17, 15:17]
+    np.testing.assert_allclose(brightness, level, rtol=3e-3)
+
+
+def metered(scene: SceneConfig, brightness: np.ndarray, semantic: np.ndarray) -> tuple[float, float]:
+    """Return the metered exposure of a frame of given brightness after one second, and the reference."""
+    camera: Camera = world.base_camera(scene)
+    white = np.ones(4, dtype=np.float32)
+    rate = Electrons(array=np.tile(brightness[..., None].astype(np.float32), (1, 1, 4)), white_e=white)
+    frame: Any = SimpleNamespace(
+        spec=SimpleNamespace(scene=scene), camera=camera, truth=SimpleNamespace(semantic=semantic)
+    )
+    return exposure._metered_exposure_s(frame, rate), exposure.reference_exposure_s(scene, camera)
+
+
+def test_metering_puts_the_percentile_of_the_lit_body_at_its_level_within_its_range() -> None:
+    scene = parsed(camera={"metering_level": 0.5, "metering_percentile": 90.0})
+    body = np.full((32, 32), BODY, dtype=np.uint8)
+    body[:, 16:] = SKY
+    _, reference = metered(scene, np.ones((32, 32)), body)
+    facet_rate = 0.5 / reference  # what a facet of the reference gives in a second
+    rng = np.random.default_rng(3)
+    lit = facet_rate * rng.uniform(0.5, 2.0, (32, 32))
+    lit[:, 16:] = 100 * facet_rate  # the sky is not metered
+    lit[:16:2, :16] = 1e-3 * facet_rate  # and shadow neither
+    measured = lit[::2, :16:2]
+    want = 0.5 / np.percentile(measured[measured > 0.02 / reference].astype(np.float32), 90)
+    assert metered(scene, lit, body)[0] == pytest.approx(want, rel=1e-5)
+    # grazing light alone raises the exposure eightfold at most, glints lower it to a quarter at least
+    for factor, limit in ((0.06, 8.0), (50.0, 0.25)):
+        assert metered(scene, np.full((32, 32), factor * facet_rate), body)[0] == pytest.approx(limit * reference)
+
+
+def test_fewer_than_64_lit_pixels_are_not_metered() -> None:
+    scene = parsed(camera={"metering_level": 0.5})
+    body = np.full((32, 32), BODY, dtype=np.uint8)
+    _, reference = metered(scene, np.ones((32, 32)), body)
+    for count, want in ((63, reference), (64, 0.5 * reference)):
+        lit = np.zeros((16, 16))
+        lit.ravel()[:count] = 2 * 0.5 / reference  # twice the reference facet's
+        assert metered(scene, np.kron(lit, np.ones((2, 2))), body)[0] == pytest.approx(want)
+
+
+def test_the_exposure_stays_within_the_cameras_limits() -> None:
+    scene = parsed()
+    body = np.full((32, 32), BODY, dtype=np.uint8)
+    _, reference = metered(scene, np.ones((32, 32)), body)
+    for limits, want in (
+        ({"exposure_max_s": reference / 3}, reference / 3),
+        ({"exposure_min_s": 3 * reference, "exposure_max_s": 9 * reference}, 3 * reference),
+    ):
+        limited = scene.model_copy(update={"camera": scene.camera.model_copy(update=limits)})
+        # black: the reference's exposure
+        assert metered(limited, np.zeros((32, 32)), body)[0] == pytest.approx(want)
+
+
+def test_electrons_of_a_second_are_the_rate() -> None:
+    scene = parsed()
+    camera = world.base_camera(scene)
+    light = facet(scene)
+    rate = exposure._rate(SimpleNamespace(camera=camera), light)  # type: ignore[arg-type]
+    # by the lens's irradiance and the detector's exposure of a quarter of a second, apart from Camera.expose
+    quarter = camera.detector.electrons_expected(camera.lens.image(light), 0.25)
+    np.testing.assert_allclose(quarter.array, 0.25 * rate.array, rtol=1e-6)
+    assert dataclasses.replace(camera, exposure_s=9.0).expose(light, 0.25).array.max() == quarter.array.max()
