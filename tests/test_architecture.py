@@ -22,7 +22,7 @@ ROOT = Path(vbnfault.__file__).parent
 EVERYWHERE = {"errors", "resources", "interrupts", "stages", "__init__"}
 FOUNDATION = {"llvm", "spectra", "quantities", "config", "frames", "photometry", "spice", "meshes"}
 GEOMETRY = FOUNDATION | {"body", "plan", "scene"}
-CAMERA = {"spectra", "quantities", "llvm", "lens", "detector", "camera"}
+CAMERA = {"spectra", "quantities", "llvm", "sundisc", "lens", "detector", "camera"}
 WORLD = GEOMETRY | CAMERA | {"sky", "spacecraft", "render"}
 STAGES = {"pose", "exposure", "pictures", "record"}
 PIPELINE = WORLD | STAGES | {"world", "faults", "labels", "sample", "pipeline"}
@@ -37,6 +37,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "spectra": set(),
     "quantities": set(),
     "photometry": set(),
+    "sundisc": {"quantities"},
     "frames": set(),
     "spice": {"frames"},
     "meshes": set(),
@@ -46,10 +47,15 @@ MAY_IMPORT: dict[str, set[str]] = {
     "scene": FOUNDATION | {"body", "plan"},
     "sky": {"spectra", "quantities", "frames"},
     "spacecraft": {"frames", "meshes"},
-    "render": {"scene", "llvm", "photometry", "quantities"},  # quantities: what it returns
-    "lens": {"spectra", "quantities", "llvm"},
+    "render": {"scene", "llvm", "photometry", "sundisc", "quantities"},  # quantities: what it returns
+    "lens": {"spectra", "quantities", "sundisc", "llvm"},
     "detector": {"spectra", "quantities"},
-    "camera": {"lens", "detector", "quantities"},  # quantities: what it is exposed to, and what it collects
+    "camera": {
+        "lens",
+        "detector",
+        "sundisc",
+        "quantities",
+    },  # quantities: what it is exposed to, and what it collects
     "characterise": {"spectra", "detector"},
     "faults": CAMERA,
     "flares": FOUNDATION | CAMERA | {"faults"},

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from .detector import Detector, MosaicDetector
 from .lens import RealLens, ThinLens
 from .quantities import Electrons, Irradiance, Radiance
+from .sundisc import Pinhole, Projection
 
 ARCHITECTURES = ("full_frame_ccd", "frame_transfer_ccd", "interline_ccd", "cmos")
 READOUT_DIRECTIONS = ("up", "down", "left", "right")
@@ -44,7 +45,7 @@ class Camera:
         if radiance.sun is None:
             return electrons(self.lens.image(radiance))
         # the Sun's own rounding errors are as bright as the scene
-        scene = replace(radiance, array=np.maximum(radiance.array - radiance.sun, 0), sun=None)
+        scene = replace(radiance, array=np.maximum(radiance.array - radiance.sun, 0), sun=None, disc=None)
         sun = replace(radiance, array=radiance.sun, sun=None)
         found = electrons(self.lens.image(scene))
         direct = electrons(self.lens.image_of_sun(sun, self.detector.pixel_pitch_um))
@@ -91,13 +92,16 @@ class Camera:
         return np.array([cx + fx * x / z, cy + fy * y / z])
 
     @property
+    def projection(self) -> Projection:
+        """Where the pixels look: by chief rays at the d line, or as a rectilinear camera."""
+        return self.lens.projection() if isinstance(self.lens, RealLens) else Pinhole(self.intrinsics)
+
+    @property
     def seen_slopes(self) -> NDArray[np.float64]:
         """Tangents x/z and y/z of the directions in C that the pixels' centres see, float64[y, x, 2]."""
         if isinstance(self.lens, RealLens):
             return self.lens.seen_slopes
-        fx, fy, cx, cy = self.intrinsics
-        x, y = (np.arange(self.width_px) + 0.5 - cx) / fx, (np.arange(self.height_px) + 0.5 - cy) / fy
-        return np.stack(np.meshgrid(x, y), axis=-1)
+        return self.projection.slopes_at(np.arange(self.width_px) + 0.5, np.arange(self.height_px) + 0.5)
 
     @property
     def lens_name(self) -> str:

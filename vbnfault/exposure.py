@@ -87,8 +87,15 @@ def render_frame(frame: Frame) -> None:
     angles = bool(_ANGLE_LAYERS & set(spec.scene.dataset.layers))
     guide: Truth | None
     if isinstance(frame.camera.lens, RealLens):
-        slopes = frame.camera.seen_slopes
-        frame.truth = render.truth(surface, scene.view, scene.sun, angles=angles, slopes=slopes)
+        camera = frame.camera
+        frame.truth = render.truth(
+            surface,
+            scene.view,
+            scene.sun,
+            angles=angles,
+            slopes=camera.seen_slopes,
+            projection=camera.projection,
+        )
         # on the render's own grid where that is asked for: light between surfaces, and stars
         needed = scene.bounces or spec.scene.sky.stars != "off"
         guide = render.truth(surface, scene.view, scene.sun) if needed else None

@@ -5,7 +5,7 @@ Radiance ─ lens ─▶ Irradiance ─ detector ─▶ Electrons ─▶ RawDN �
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, ClassVar, NamedTuple, Self
@@ -42,14 +42,41 @@ class Quantity:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
+class SunInView:
+    """The Sun's disc as a camera sees it, before any pixels.
+
+    `direction_C` float64[3] and `angular_radius_rad` say where it is, `radiance_W_m2_sr_nm` float64[band] is the
+    mean of the disc, `limb_darkening` float64[band, 6] its profile (`spectra.limb_darkening`; None: uniform).
+    `visible` float32[n, n] in [0, 1] is the fraction that body and spacecraft leave of cells of the square about
+    the disc: columns along the first of the disc's axes (`sundisc.axes`), rows along the second. `blur_slope`:
+    radius of the circle that defocus makes of a point, as a tangent.
+    """
+
+    direction_C: NDArray[np.float64]
+    angular_radius_rad: float
+    radiance_W_m2_sr_nm: NDArray[np.float64]
+    limb_darkening: NDArray[np.float64] | None = None
+    visible: NDArray[np.float32] = field(default_factory=lambda: np.ones((1, 1), np.float32))
+    blur_slope: float = 0.0
+
+    def profiles(self, bands: Sequence[int]) -> NDArray[np.float64]:
+        """Return the polynomials of the radiance over the disc's mean in μ, float64[band, k]."""
+        if self.limb_darkening is None:
+            return np.ones((len(bands), 1))
+        return self.limb_darkening[list(bands)]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Radiance(Quantity):
     """Spectral radiance at the camera, per band node; `wavelength_nm` float64[band].
 
     `sun` is the part of `array` that is the Sun's own disc, float32[band, y, x]; None where it is not in view.
+    `disc` is the disc that it shows, for a lens with a grid of its own; None where it is not known.
     """
 
     wavelength_nm: NDArray[np.float64]
     sun: NDArray[np.float32] | None = None
+    disc: SunInView | None = None
     unit = "W m-2 sr-1 nm-1"
     axes = ("band", "y", "x")
 

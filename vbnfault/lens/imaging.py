@@ -32,6 +32,7 @@ from scipy.special import ndtr
 
 from ..errors import InputError
 from ..quantities import Irradiance, Radiance
+from ..sundisc import Floats, add_mean, pixel_sums
 from . import distortion
 from .aperture import axial_beam_diameter_mm
 from .first_order import first_order
@@ -375,14 +376,15 @@ class RealLens:
         """Which of `_distances` light reaches."""
         return np.asarray(self.relative_illumination(self._distances) > 0)
 
+    def projection(self, wavelength_nm: float = D_NM, margin_px: int = 0) -> ChiefRays:
+        """Return where the pixels of the frame, with a margin around it, look at one wavelength."""
+        return ChiefRays(lens=self, wavelength_nm=wavelength_nm, margin_px=margin_px)
+
     @cached_property
     def seen_slopes(self) -> F64:
         """Tangents x/z and y/z of the directions that the pixels' centres see at the d line, float64[y, x, 2], by
         chief rays."""
-        x, y = ((np.arange(n) + 0.5 - n / 2) / self.focal_length_px for n in (self.width_px, self.height_px))
-        distance = np.maximum(np.hypot(x[None, :], y[:, None]), 1e-12)
-        stretch = self.undistorted(distance) / distance
-        return np.stack([x * stretch, y[:, None] * stretch], axis=-1)
+        return self.projection().slopes_at(np.arange(self.width_px) + 0.5, np.arange(self.height_px) + 0.5)
 
     @property
     def focal_length_px(self) -> float:
@@ -470,17 +472,23 @@ class RealLens:
 
     def _solid_angle_sr(self, mapped: _Map) -> F64:
         """Irradiance over radiance without losses, float64 like `mapped.slope`."""
-        beams, slope = self._beams, mapped.slope
+        slope = mapped.slope
+        area = self._beam_mm2(slope)
+        stretch = np.empty_like(slope)
+        stretch[1:] = slope[1:] / mapped.height_mm[1:]
+        stretch[0] = 1 / mapped.rise_mm[0]
+        return np.asarray(area / (1 + slope**2) ** 2 * stretch / mapped.rise_mm)
+
+    def _beam_mm2(self, slope: F64) -> F64:
+        """Area of the beam that passes all rims, float64 like `slope`, which rises."""
+        beams = self._beams
         area = np.maximum(PchipInterpolator(beams.slope, beams.area_mm2, extrapolate=True)(slope), 0)
         dark = beams.area_mm2 == 0
         if dark.any():  # the last of the light goes linearly
             first = int(np.argmax(dark))
             fades = slope > beams.slope[first - 1]
             area[fades] = np.interp(slope[fades], beams.slope, beams.area_mm2)
-        stretch = np.empty_like(slope)
-        stretch[1:] = slope[1:] / mapped.height_mm[1:]
-        stretch[0] = 1 / mapped.rise_mm[0]
-        return np.asarray(area / (1 + slope**2) ** 2 * stretch / mapped.rise_mm)
+        return np.asarray(area)
 
     # --- pictures
 
@@ -505,22 +513,51 @@ class RealLens:
         return Irradiance(array=array, wavelength_nm=radiance.wavelength_nm)
 
     def image_of_sun(self, radiance: Radiance, pixel_pitch_um: float) -> Irradiance:
-        """Return the irradiance of the Sun's direct image: `image`, whose beams hold the pupil's cosine already, so
-        that its power is E☉ T A(θ) cos θ."""
-        return self.image(radiance)
+        """Return the irradiance of the Sun's direct image, whose power is E☉ T A(θ) cos θ: the beams hold the
+        pupil's cosine already.
+
+        The disc itself is imaged where it is known: a render's pixels, resampled, would not keep the power of a
+        disc that is hardly larger than they are.
+        """
+        if radiance.disc is None:
+            return self.image(radiance)
+        bands, disc = _key(radiance.wavelength_nm), radiance.disc
+        spreads = _spreads(self, bands)
+        passes = self.transmittance(radiance.wavelength_nm)
+        array = np.zeros((len(bands), self.height_px, self.width_px), dtype=np.float32)
+        shape = self.height_px + 2 * REACH_PX, self.width_px + 2 * REACH_PX
+        pixel_mm2 = (self.pixel_pitch_um * 1e-3) ** 2
+
+        def one(band: int) -> None:
+            rays = self.projection(bands[band], REACH_PX)
+            found = pixel_sums(disc, rays, shape, disc.profiles([band]), rays.beam_mm2)
+            if found is not None:
+                light = found.on(shape)[0] * (disc.radiance_W_m2_sr_nm[band] * passes[band] / pixel_mm2)
+                array[band] = spreads.applied(light.astype(np.float32), band)[_INSIDE]
+
+        with ThreadPoolExecutor(2) as pool:
+            list(pool.map(one, range(len(array))))
+        return Irradiance(array=array, wavelength_nm=radiance.wavelength_nm)
 
     def on_frame(self, radiance: Radiance) -> Radiance:
         """A render with its guard band on the picture's own grid: distortion and lateral colour alone, no light
         lost and nothing blurred."""
         self._check(radiance)
-        tables = _tables(self, _key(radiance.wavelength_nm))
+        bands, disc = _key(radiance.wavelength_nm), radiance.disc
+        tables = _tables(self, bands)
+        source = radiance.array
+        if disc is not None and radiance.sun is not None:
+            source = np.maximum(source - radiance.sun, 0)
 
         def one(band: int) -> F32:
-            return self._resampled(radiance.array[band], tables.stretch[band], None)[_INSIDE]
+            out = self._resampled(source[band], tables.stretch[band], None)[_INSIDE]
+            if disc is not None:
+                add_mean(out[None], disc, self.projection(bands[band]), [band])
+            return out
 
         with ThreadPoolExecutor(2) as pool:
             array = np.stack(list(pool.map(one, range(len(radiance.array)))))
-        return replace(radiance, array=array, sun=None)
+        return replace(radiance, array=array, sun=None, disc=None)
 
     def _check(self, radiance: Radiance) -> None:
         gx, gy = self.guard_px
@@ -568,6 +605,46 @@ class RealLens:
                 light *= np.take(solid_angle_sr, steps, mode="clip")
             out[rows] = light
         return out
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ChiefRays:
+    """Where pixels look behind a lens at one wavelength, by chief rays; the frame has a margin all around."""
+
+    lens: RealLens
+    wavelength_nm: float
+    margin_px: int
+
+    @property
+    def _centre_px(self) -> F64:
+        return np.array([self.lens.width_px, self.lens.height_px]) / 2 + self.margin_px
+
+    def pixel_of(self, slopes: F64) -> F64:
+        """Return pixel positions x, y, float64[..., 2], of tangents x/z and y/z in C."""
+        slope = np.maximum(np.hypot(slopes[..., 0], slopes[..., 1]), 1e-12)
+        stretch = self.lens.distorted(slope, self.wavelength_nm) / slope
+        return np.asarray(slopes * stretch[..., None] * self.lens.focal_length_px + self._centre_px)
+
+    def slopes_at(self, x_px: Floats, y_px: Floats) -> F64:
+        """Return tangents x/z and y/z in C, float64[y, x, 2], seen at the positions of a grid."""
+        x, y = ((v - c) / self.lens.focal_length_px for v, c in zip((x_px, y_px), self._centre_px, strict=True))
+        distance = np.maximum(np.hypot(x[None, :], y[:, None]), 1e-12)
+        stretch = self.lens.undistorted(distance, self.wavelength_nm) / distance
+        return np.stack([x * stretch, y[:, None] * stretch], axis=-1)
+
+    def solid_angle_sr(self, slopes: F64) -> F64:
+        """Return the projected solid angle of a pixel, cos⁴θ · t / (h dh/dt) times its area, float64[...]."""
+        mapped = self.lens._map(self.wavelength_nm)
+        slope = np.maximum(np.hypot(slopes[..., 0], slopes[..., 1]), 1e-12)
+        rise = np.interp(slope, mapped.slope, mapped.rise_mm)
+        pixel_mm2 = (self.lens.pixel_pitch_um * 1e-3) ** 2
+        return np.asarray(pixel_mm2 * slope / (mapped.height(slope) * rise * (1 + slope**2) ** 2))
+
+    def beam_mm2(self, slopes: F64) -> F64:
+        """Return the area of the beam that passes all rims, float64[...]: 0 beyond the traced field."""
+        mapped = self.lens._map(self.wavelength_nm)
+        slope = np.hypot(slopes[..., 0], slopes[..., 1])
+        return np.asarray(np.interp(slope, mapped.slope, self.lens._beam_mm2(mapped.slope), right=0.0))
 
 
 def _key(wavelength_nm: F64) -> tuple[float, ...]:

@@ -7,21 +7,33 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..quantities import BODY, SKY, SPACECRAFT, SUN, Truth
+from ..quantities import BODY, SKY, SPACECRAFT, SUN, SunInView, Truth
 from ..scene import Sunlight, View
+from ..sundisc import Pinhole, Projection, bounds_px, pixel_sums
 from .emitter import SunDisc
+from .light import sun_in_view
 from .runtime import dr, mi
 from .sampling import Optics
 from .surface import Surface, facing
 
 
 def truth(
-    surface: Surface, view: View, sun: Sunlight, *, angles: bool = False, slopes: NDArray[np.float64] | None = None
+    surface: Surface,
+    view: View,
+    sun: Sunlight,
+    *,
+    angles: bool = False,
+    slopes: NDArray[np.float64] | None = None,
+    projection: Projection | None = None,
 ) -> Truth:
     """Depth, normal and semantic class of every pixel centre, from one ray each; with `angles` also those of
     incidence, emission and phase, and the dust.
 
-    `slopes`: tangents x/z and y/z of the rays in C, float64[y, x, 2]; default: those of the view's pinhole.
+    Of the pixels whose centres see the sky, those that hold any of the visible Sun have its class. A Sun smaller
+    than a pixel also gives it to the one where its centre is seen, whatever the pixel's own centre sees.
+
+    `slopes`: tangents x/z and y/z of the rays in C, float64[y, x, 2], and `projection`, which says the same of
+    every position in those pixels; default: those of the view's pinhole.
     """
     optics = Optics(view)
     shape = (view.height_px, view.width_px) if slopes is None else slopes.shape[:2]
@@ -31,12 +43,8 @@ def truth(
     depth = dr.select(hit.valid, hit.distance_m * dr.dot(rays.d, boresight), dr.inf)
     normal = facing(hit.normal, -rays.d)
     in_camera = [dr.select(hit.valid, dr.dot(normal, axis), 0) for axis in optics.axes]
-    # a pixel shows the Sun if its centre lies within half a pixel of the disc
-    half_pixel = 0.5 / float(view.intrinsics[0])
-    chord = dr.opaque(mi.Float, 2 * np.sin((sun.angular_radius_rad + half_pixel) / 2))
     centre = SunDisc(sun).direction
-    in_disc = ~hit.valid & (dr.norm(rays.d - centre) < chord)
-    semantic = dr.select(hit.valid, mi.UInt32(BODY), dr.select(in_disc, mi.UInt32(SUN), mi.UInt32(SKY)))
+    semantic = dr.select(hit.valid, mi.UInt32(BODY), mi.UInt32(SKY))
     if hit.material is not None:
         semantic = dr.select(hit.on_vehicle, mi.UInt32(SPACECRAFT), semantic)
     found = {"semantic": semantic, "depth": depth}
@@ -46,12 +54,33 @@ def truth(
         found["dust"] = dr.select(hit.valid, hit.dust, dr.nan)
     dr.eval(*in_camera, *found.values())
     more = {"incidence": "incidence_deg", "emission": "emission_deg", "phase": "phase_deg", "dust": "dust"}
+    classes = semantic.numpy().astype(np.uint8).reshape(shape)
+    disc = sun_in_view(surface, view, sun)
+    if disc is not None:
+        _mark_sun(classes, disc, Pinhole(view.intrinsics) if projection is None else projection)
     return Truth(
         depth_m=depth.numpy().reshape(shape),
         normal=np.stack([c.numpy() for c in in_camera], axis=-1).astype(np.float16).reshape(*shape, 3),
-        semantic=semantic.numpy().astype(np.uint8).reshape(shape),
+        semantic=classes,
         **{to: found[name].numpy().reshape(shape) for name, to in more.items() if name in found},
     )
+
+
+def _mark_sun(classes: NDArray[np.uint8], disc: SunInView, projection: Projection) -> None:
+    """Give the pixels that hold any of the disc their class, uint8[y, x], in place."""
+    found, bounds = pixel_sums(disc, projection, (classes.shape[0], classes.shape[1])), bounds_px(disc, projection)
+    if found is None or bounds is None:
+        return
+    holds = found.values[0] > 0
+    part = classes[found.rows, found.columns]
+    part[holds & (part == SKY)] = SUN
+    x, y, z = disc.direction_C
+    column, row = np.floor(projection.pixel_of(np.array([x / z, y / z]))).astype(int)
+    middle = disc.visible.shape[0] // 2
+    small = bool((bounds[1] - bounds[0] < 1).all())
+    inside = 0 <= row < classes.shape[0] and 0 <= column < classes.shape[1]
+    if small and inside and disc.visible[middle, middle] > 0:
+        classes[row, column] = SUN
 
 
 def _angle_deg(a: Any, b: Any) -> Any:

@@ -1,18 +1,23 @@
 """Direct light: primary ray, one sample of the Sun's disc, photometry, every band on the same ray.
 
+The pixels' rays would miss a disc smaller than a pixel. Its direct image is therefore computed by `sundisc`, and
+rays from the pupil to all of the disc say which parts of it are hidden.
+
 All bands of a sample share its geometry, so spectral sampling adds no noise at all; the bands are the fixed
 quadrature that `spectra` defines. There is no film: the samples of a pixel are summed as a block.
 """
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..quantities import Radiance
+from ..quantities import Radiance, SunInView
 from ..scene import Scene, Sunlight, View
+from ..sundisc import Pinhole, add_mean, axes, bounds_px
 from .bsdf import Reflection, has_bands
 from .detail import Detail
 from .emitter import Limb, SunDisc, mu, polynomial
@@ -27,6 +32,13 @@ WAVEFRONT = 1 << 23
 # Dimensions of a sample's random numbers: the Sun's disc; the lens takes 1, bounces the later ones.
 SUN_DIMENSION = 0
 
+# Cells each way of the grid over the Sun's disc that rays ask for what hides it, at least and at most.
+_CELLS = (128, 1024)
+# Points of the pupil that each of the fewest cells is asked from: parts of a spacecraft a metre away blur.
+_PUPIL_POINTS = 4
+# Powers of the inverse of the root of x⁵ = x + 1: steps of a sequence that stays even in four dimensions.
+_KRONECKER = 1.1673039782614187 ** -np.arange(1.0, 5.0)
+
 
 def direct(
     surface: Surface,
@@ -38,16 +50,78 @@ def direct(
 
     The second array holds for every pixel half the difference between two halves of its samples, as a signal: the
     bands' sum with `weights` float64[band], signed; zeros without weights. Its variance is that of the pixel's own
-    error, or a little more, since half as many strata each leave more to chance. `pixels`: numbers of the pixels
-    wanted, row after row; the arrays are then [band, 1, pixel] and [1, pixel].
+    error, or a little more, since half as many strata each leave more to chance. The Sun's disc is exact. `pixels`:
+    numbers of the pixels wanted, row after row; the arrays are then [band, 1, pixel] and [1, pixel].
     """
     view = scene.view
     wanted = Pixels(view.width_px * view.height_px) if pixels is None else Pixels(len(pixels), listed=pixels)
-    out, sun, halves = _Direct(surface, scene).image(wanted, weights)
-    shape = (view.height_px, view.width_px) if pixels is None else (1, len(pixels))
-    array, disc = (None if a is None else a.reshape(len(scene.wavelength_nm), *shape) for a in (out, sun))
-    assert array is not None
-    return Radiance(array=array, wavelength_nm=scene.wavelength_nm, sun=disc), halves.reshape(shape)
+    out, halves = _Direct(surface, scene).image(wanted, weights)
+    bands, frame = len(scene.wavelength_nm), (view.height_px, view.width_px)
+    disc = sun_in_view(surface, view, scene.sun)
+    sun: NDArray[np.float32] | None = None
+    if disc is not None:
+        sun = np.zeros((bands, *frame), dtype=np.float32)
+        if add_mean(sun, disc, Pinhole(view.intrinsics), range(bands)) is None:
+            sun = None
+    if sun is not None:
+        out += sun.reshape(bands, -1) if pixels is None else sun.reshape(bands, -1)[:, pixels]
+    shape = frame if pixels is None else (1, len(pixels))
+    if sun is not None and pixels is not None:
+        sun = sun.reshape(bands, 1, -1)[:, :, pixels]
+    found = Radiance(
+        array=out.reshape(bands, *shape),
+        wavelength_nm=scene.wavelength_nm,
+        sun=sun,
+        disc=None if sun is None else disc,
+    )
+    return found, halves.reshape(shape)
+
+
+def sun_in_view(surface: Surface, view: View, sun: Sunlight) -> SunInView | None:
+    """Return the Sun's disc as the camera sees it, and which parts are hidden; None where it is not in the frame.
+
+    Rays go from the pupil to points of the disc, one or more in each cell of a grid: an edge across the disc is
+    then known to a cell's width, and the area on one side of it to 1e-3 of the disc.
+    """
+    if not _may_see(view, sun):
+        return None
+    disc = SunInView(
+        direction_C=view.L_from_C.T @ sun.direction_L,
+        angular_radius_rad=sun.angular_radius_rad,
+        radiance_W_m2_sr_nm=sun.radiance_W_m2_sr_nm,
+        limb_darkening=sun.limb_darkening,
+        blur_slope=view.aperture_radius_m / view.focus_distance_m,
+    )
+    bounds = bounds_px(disc, Pinhole(view.intrinsics))
+    if bounds is None:
+        return None
+    # two cells a pixel of a disc that the frame resolves
+    wanted = 2 * float((bounds[1] - bounds[0]).max())
+    side = int(np.clip(2.0 ** np.ceil(np.log2(max(wanted, 1.0))), _CELLS[0], _CELLS[1]))
+    several = _PUPIL_POINTS if view.aperture_radius_m > 0 and side == _CELLS[0] else 1
+    count = side * side * several
+    index = np.arange(count)
+    # a sequence in four dimensions, even in each two (Roberts 2018, after Kronecker): place in the cell, and pupil
+    u = (0.5 + index[None, :] * _KRONECKER[:, None]) % 1
+    cell = index // several
+    place = 2 * (np.stack([cell % side, cell // side]) + u[:2]) / side - 1
+    place /= np.maximum(np.hypot(*place), 1.0)  # of cells beyond the rim
+    sine = np.sin(sun.angular_radius_rad)
+    across = sine * place
+    along = np.sqrt(1 - (across**2).sum(axis=0))
+    towards_L = np.stack([*across, along], axis=1) @ axes(disc.direction_C) @ view.L_from_C.T
+    radius, turn = view.aperture_radius_m * np.sqrt(u[2]), 2 * np.pi * u[3]
+    start_L = (
+        view.position_L_m + np.column_stack([radius * np.cos(turn), radius * np.sin(turn)]) @ view.L_from_C.T[:2]
+    )
+    rays = mi.Ray3f(mi.Point3f(*_columns(start_L)), mi.Vector3f(*_columns(towards_L)))
+    hidden = surface.seen_from(view).occluded(rays, mi.Bool(True)).numpy().astype(bool)
+    visible = 1 - hidden.reshape(side, side, several).mean(axis=2)
+    return replace(disc, visible=visible.astype(np.float32))
+
+
+def _columns(rows: NDArray[np.float64]) -> list[Any]:
+    return [mi.Float(np.ascontiguousarray(column, np.float32)) for column in rows.T]
 
 
 class Light:
@@ -89,20 +163,14 @@ class _Direct(Light):
             self.weights = np.diag(sun.irradiance_W_m2_nm)
         else:
             self.weights = self.limb.weights * (model.weights[0] * sun.irradiance_W_m2_nm)
-        self.sun_in_view = _may_see(scene.view, sun)
-        self.first_of_sun = len(self.weights)  # of the terms
-        if self.sun_in_view:
-            self.weights = np.vstack([self.weights, self.limb.weights * sun.radiance_W_m2_sr_nm])
 
     def image(
         self, pixels: Pixels, signal: NDArray[np.float64] | None
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32] | None, NDArray[np.float32]]:
-        """float32[band, pixel]; of it the Sun's disc, float32[band, pixel], None where no sample sees it; and
-        float32[pixel]: half the difference of the samples' halves, as a signal."""
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """float32[band, pixel]; and float32[pixel]: half the difference of the samples' halves, as a signal."""
         spp = self.scene.samples_per_pixel
         weights = (self.weights / spp).astype(np.float32)
         out = np.zeros((weights.shape[1], pixels.count), dtype=np.float32)
-        sun: NDArray[np.float32] | None = None
         halves = np.zeros(pixels.count, dtype=np.float32)
         done = 0
         for part in pixels.parts(max(1, WAVEFRONT // (spp * len(weights)))):
@@ -119,20 +187,15 @@ class _Direct(Light):
             dr.eval(*sums)
             span = slice(done, done + part.count)
             done += part.count
-            for k, (row, total) in enumerate(zip(weights, sums, strict=False)):
+            for row, total in zip(weights, sums, strict=False):
                 values = total.numpy()
                 if not values.any():
                     continue
-                if k >= self.first_of_sun and sun is None:
-                    sun = np.zeros_like(out)
                 for band in np.flatnonzero(row):
-                    light = values * row[band]
-                    out[band, span] += light
-                    if sun is not None and k >= self.first_of_sun:
-                        sun[band, span] += light
+                    out[band, span] += values * row[band]
             if signal is not None:
                 halves[span] = sums[-1].numpy()
-        return out, sun, halves
+        return out, halves
 
     def terms(self, strata: Strata) -> list[Any]:
         rays = self.optics.camera_rays(strata)
@@ -144,11 +207,7 @@ class _Direct(Light):
             terms = [terms[0] * profile for profile in self.limb.terms(mu(point))]
         elif self.limb.profiles is not None:
             terms = [t * polynomial(c, mu(point)) for t, c in zip(terms, self.limb.profiles, strict=True)]
-        terms = [dr.select(lit, term, 0) for term in terms]
-        if self.sun_in_view:
-            inside, mu_seen = self.sun.seen(rays.d)
-            terms += [dr.select(~hit.valid & inside, t, mi.Float(0)) for t in self.limb.terms(mu_seen)]
-        return terms
+        return [dr.select(lit, term, 0) for term in terms]
 
 
 def _may_see(view: View, sun: Sunlight) -> bool:

@@ -1,0 +1,293 @@
+"""The Sun's direct image: how much of its disc each pixel of a frame sees, whatever the size of the pixels.
+
+Rays through the pixels would miss a disc that is smaller than a pixel. The disc is therefore divided into cells, at
+least 128 across it, none across a pixel's border, and each cell's projected solid angle is added to its pixel. No
+random number is drawn, and the sum over all pixels is that of the whole disc,
+
+    Σ S_b = ∫ p_b(μ) cos θ dω = π sin²α cos θ,
+
+with α the angular radius and p_b the radiance of band b over the disc's mean, to which the cells are normalised.
+Cells that the rim cuts count by the area of the rectangle that the rim's tangent leaves.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .quantities import SunInView
+
+F64 = NDArray[np.float64]
+Floats = NDArray[np.floating[Any]]
+Frame = tuple[int, int]
+
+# Cells across the disc, at least: those of the rim then err by less than 1e-3 of a darkened disc's light.
+_ACROSS = 128
+_RIM = 64  # points of the rim that bound its image: between two of them it reaches 1 - cos(π / 64) = 0.12 % further
+_MOST_CELLS = 1 << 20  # at once, so that memory stays bounded
+_SHARP_PX = 0.05  # a smaller circle of defocus leaves the disc as it is
+_LEAST_Z = 1e-3  # cosine to the boresight of the rim, below which a plane holds no image of it
+
+
+class Projection(Protocol):
+    """The map between directions and the plane of the pixels, at one wavelength."""
+
+    def pixel_of(self, slopes: F64) -> F64:
+        """Return pixel positions x, y, float64[..., 2], of tangents x/z and y/z in C."""
+
+    def slopes_at(self, x_px: Floats, y_px: Floats) -> F64:
+        """Return tangents x/z and y/z in C, float64[y, x, 2], seen at the positions of a grid."""
+
+    def solid_angle_sr(self, slopes: F64) -> F64:
+        """Return the projected solid angle that a pixel would see there, d(cos θ ω) / d(x y), float64[...]."""
+
+
+@dataclass(frozen=True)
+class Pinhole:
+    """The map of a rectilinear camera; `intrinsics` fx, fy, cx, cy in pixels."""
+
+    intrinsics: F64
+
+    def pixel_of(self, slopes: F64) -> F64:
+        """As `Projection`."""
+        return np.asarray(slopes * self.intrinsics[:2] + self.intrinsics[2:])
+
+    def slopes_at(self, x_px: Floats, y_px: Floats) -> F64:
+        """As `Projection`."""
+        fx, fy, cx, cy = self.intrinsics
+        return np.stack(np.meshgrid((x_px - cx) / fx, (y_px - cy) / fy), axis=-1)
+
+    def solid_angle_sr(self, slopes: F64) -> F64:
+        """As `Projection`: cos⁴θ / (fx fy)."""
+        fx, fy = self.intrinsics[:2]
+        return np.asarray(1 / (fx * fy * (1 + (slopes**2).sum(axis=-1)) ** 2))
+
+
+@dataclass(frozen=True)
+class PixelSums:
+    """What pixels of a part of the frame see of the disc: `rows`, `columns` of the part, and `values`
+    float64[profile, y, x] in sr, or in sr times the unit of the gain."""
+
+    rows: slice
+    columns: slice
+    values: F64
+
+    def on(self, shape: Frame) -> F64:
+        """Return them as a whole frame, float64[profile, y, x]."""
+        out = np.zeros((len(self.values), *shape))
+        out[:, self.rows, self.columns] = self.values
+        return out
+
+
+def axes(direction: F64) -> F64:
+    """Return the disc's own axes as rows, float64[3, 3]: two across it, and its unit direction."""
+    z = direction / np.linalg.norm(direction)
+    x = np.cross(z, np.eye(3)[np.argmin(np.abs(z))])
+    x /= np.linalg.norm(x)
+    return np.stack([x, np.cross(z, x), z])
+
+
+def bounds_px(disc: SunInView, projection: Projection) -> F64 | None:
+    """Return the least and the greatest pixel position of the disc's image, float64[2, 2], or None where some of
+    the disc is beside or behind the camera."""
+    turn = np.arange(_RIM) * 2 * np.pi / _RIM
+    s, c = np.sin(disc.angular_radius_rad), np.cos(disc.angular_radius_rad)
+    rim = np.column_stack([s * np.cos(turn), s * np.sin(turn), np.full(_RIM, c)]) @ axes(disc.direction_C)
+    if (rim[:, 2] < _LEAST_Z).any():
+        return None
+    at = projection.pixel_of(rim[:, :2] / rim[:, 2:])
+    low, high = at.min(axis=0), at.max(axis=0)
+    more = 0.01 * (high - low)
+    return np.stack([low - more, high + more])
+
+
+def pixel_sums(
+    disc: SunInView,
+    projection: Projection,
+    shape: Frame,
+    profiles: F64 | None = None,
+    gain: Callable[[F64], F64] | None = None,
+) -> PixelSums | None:
+    """Return what each pixel of a frame sees of the disc, or None where it sees nothing of it.
+
+    Parameters
+    ----------
+    disc
+        The disc and how much of it is hidden.
+    projection
+        Where the pixels look.
+    shape
+        Height and width of the frame in pixels.
+    profiles
+        float64[profile, k], Σ c_k μᵏ: radiance over the disc's mean. Default: one uniform profile.
+    gain
+        A factor on the light, of its tangents float64[y, x, 2].
+
+    Returns
+    -------
+    PixelSums
+        Projected solid angle times profile, gain and the fraction that is not hidden.
+    """
+    bounds = bounds_px(disc, projection)
+    if bounds is None or not disc.visible.any():
+        return None
+    profiles = np.ones((1, 1)) if profiles is None else profiles
+    radius_px = (bounds[1] - bounds[0]).max() / 2
+    blur_px = disc.blur_slope * radius_px / np.tan(disc.angular_radius_rad)
+    shifts = np.zeros((1, 2))
+    if blur_px > _SHARP_PX:  # a point of the Sun is a disc of its own: as many points of the lens as fill it
+        count = int(np.clip(16 * (1 + blur_px / max(radius_px, 0.5)) ** 2, 16, 1024))
+        shifts = blur_px * sunflower(count)
+    total: F64 | None = None
+    frame = np.array(shape[::-1])
+    low = np.clip(np.floor(bounds[0] + shifts.min(axis=0)), 0, frame).astype(int)
+    high = np.clip(np.ceil(bounds[1] + shifts.max(axis=0)), 0, frame).astype(int)
+    if (high <= low).any():
+        return None
+    for shift in shifts:
+        found = _sums(disc, projection, bounds, shift, (low, high), profiles, gain)
+        total = found if total is None else total + found
+    assert total is not None
+    if not total.any():
+        return None
+    return PixelSums(slice(low[1], high[1]), slice(low[0], high[0]), total / len(shifts))
+
+
+def add_mean(
+    radiance: NDArray[np.float32], disc: SunInView, projection: Projection, bands: Sequence[int]
+) -> tuple[slice, slice] | None:
+    """Add the disc to a frame's radiance, float32[band, y, x], in place; return its rows and columns, or None.
+
+    A pixel's mean is its power over the projected solid angle that a pixel sees at its centre.
+    """
+    shape = (int(radiance.shape[1]), int(radiance.shape[2]))
+    found = pixel_sums(disc, projection, shape, disc.profiles(bands))
+    if found is None:
+        return None
+    y, x = (np.arange(s.start, s.stop) + 0.5 for s in (found.rows, found.columns))
+    solid = projection.solid_angle_sr(projection.slopes_at(x, y))
+    light = found.values * (disc.radiance_W_m2_sr_nm[list(bands)][:, None, None] / solid)
+    radiance[:, found.rows, found.columns] += light.astype(np.float32)
+    return found.rows, found.columns
+
+
+def sunflower(count: int) -> F64:
+    """Return points of the unit disc that stand for equal areas, float64[point, 2]."""
+    k = np.arange(count) + 0.5
+    radius, turn = np.sqrt(k / count), k * np.pi * (3 - np.sqrt(5))
+    return np.column_stack([radius * np.cos(turn), radius * np.sin(turn)])
+
+
+def _cells(low: float, high: float, first: int, last: int) -> tuple[F64, F64, NDArray[np.int64]]:
+    """Return centres and widths of cells from `low` to `high`, none across a pixel's border, and each one's pixel
+    counted from `first`: -1 outside of pixels `first` to `last`."""
+    inner = np.arange(max(first, np.floor(low) + 1), min(last, np.ceil(high) - 1) + 1)
+    knots = np.unique(np.concatenate([[low], inner, [high]]))
+    length = np.diff(knots)
+    count = np.maximum(np.ceil(length * (_ACROSS / (high - low))), 1).astype(int)
+    width = np.repeat(length / count, count)
+    step = np.arange(len(width)) - np.repeat(np.cumsum(count) - count, count)
+    centre = np.repeat(knots[:-1], count) + (step + 0.5) * width
+    pixel = np.floor(centre).astype(int) - first
+    pixel[(pixel < 0) | (pixel >= last - first)] = -1
+    return centre, width, pixel
+
+
+def _sums(
+    disc: SunInView,
+    projection: Projection,
+    bounds: F64,
+    shift: F64,
+    window: tuple[NDArray[np.int64], NDArray[np.int64]],
+    profiles: F64,
+    gain: Callable[[F64], F64] | None,
+) -> F64:
+    """Return the sums of a window's pixels, float64[profile, y, x], of a disc that defocus moves by `shift`."""
+    (left, top), (right, bottom) = window
+    # cells about the disc in its own place: the shift moves the pixels instead
+    x, dx, column = _cells(bounds[0, 0] + shift[0], bounds[1, 0] + shift[0], left, right)
+    y, dy, row = _cells(bounds[0, 1] + shift[1], bounds[1, 1] + shift[1], top, bottom)
+    x, y = x - shift[0], y - shift[1]
+    across, down, z = axes(disc.direction_C)
+    sine = np.sin(disc.angular_radius_rad)
+
+    def on_disc(slopes: F64) -> F64:
+        """Places on the unit disc, float64[y, x, 2]: the disc seen along its own direction."""
+        length = np.sqrt(1 + (slopes**2).sum(axis=-1))
+        places = [(slopes[..., 0] * a[0] + slopes[..., 1] * a[1] + a[2]) / (sine * length) for a in (across, down)]
+        return np.stack(places, axis=-1)
+
+    middle, quarter = bounds.mean(axis=0), (bounds[1] - bounds[0]) / 4
+    near = on_disc(
+        projection.slopes_at(*(m + q * np.array([-1.0, 1.0]) for m, q in zip(middle, quarter, strict=True)))
+    )
+    # of a place on the disc, per pixel: along x and along y
+    per_x = (near[:, 1] - near[:, 0]).mean(axis=0) / (2 * quarter[0])
+    per_y = (near[1] - near[0]).mean(axis=0) / (2 * quarter[1])
+    out = np.zeros((len(profiles), bottom - top, right - left))
+    whole = np.zeros(len(profiles))
+    starts = np.flatnonzero(np.diff(column, prepend=-2))
+    of_frame = column[starts] >= 0
+    strips = max(1, _MOST_CELLS // len(x))
+    for first in range(0, len(y), strips):
+        rows = slice(first, first + strips)
+        slopes = projection.slopes_at(x, y[rows])
+        place = on_disc(slopes)
+        r = np.maximum(np.hypot(place[..., 0], place[..., 1]), 1e-12)
+        a = np.abs(place @ per_x) / r * dx
+        b = np.abs(place @ per_y) / r * dy[rows, None]
+        covered = _covered(1 - r, a, b)
+        # mean depth within the rim of what a cell holds of the disc
+        depth = np.where(covered < 1, covered * (a + b) / 2, 1 - r)
+        mu = np.sqrt(np.clip(1 - (1 - depth) ** 2, 0, 1))
+        weight = covered * projection.solid_angle_sr(slopes) * dx * dy[rows, None]
+        shown = weight * _visible(disc.visible, place)
+        if gain is not None:
+            shown = shown * gain(slopes)
+        inside = row[rows] >= 0
+        for k, coefficients in enumerate(profiles):
+            profile = np.polynomial.polynomial.polyval(mu, coefficients)
+            whole[k] += (weight * profile).sum()
+            of_columns = np.add.reduceat((shown * profile)[inside], starts, axis=1)[:, of_frame]
+            for_rows = np.zeros((bottom - top, int(of_frame.sum())))
+            np.add.at(for_rows, row[rows][inside], of_columns)
+            out[k][:, column[starts][of_frame]] += for_rows
+    mean = profiles @ (2 / (np.arange(profiles.shape[1]) + 2))  # of a profile over the disc
+    return np.asarray(out * (np.pi * sine**2 * z[2] * mean / whole)[:, None, None])
+
+
+def _covered(depth: F64, a: F64, b: F64) -> F64:
+    """Return the fraction of a rectangle on one side of a line, float64[...] in [0, 1].
+
+    `depth`: distance of its centre from the line; `a`, `b`: its sides' extents across the line.
+    """
+    least = 1e-4 * (a + b) + 1e-300
+    a, b = np.maximum(a, least), np.maximum(b, least)
+
+    def square(v: F64) -> F64:
+        return np.asarray(np.maximum(v, 0) ** 2)
+
+    s, d = (a + b) / 2, (a - b) / 2
+    area = square(depth + s) - square(depth + d) - square(depth - d) + square(depth - s)
+    return np.where(depth >= s, 1.0, np.clip(area / (2 * a * b), 0, 1))
+
+
+def _visible(table: NDArray[np.float32], place: F64) -> F64 | float:
+    """Return the visible fraction at places of the unit disc, float64[...], linear between the cells' centres: the
+    nearest cell would shift a straight edge along the grid by up to half a cell."""
+    if table.min() == table.max():
+        return float(table[0, 0])
+    n = len(table)
+    values = np.zeros(place.shape[:-1])
+    at = [np.clip((place[..., k] + 1) * (n / 2) - 0.5, 0, n - 1) for k in (0, 1)]
+    first = [np.minimum(v.astype(int), n - 2) for v in at]
+    part = [v - k for v, k in zip(at, first, strict=True)]
+    for down in (0, 1):
+        for right in (0, 1):
+            weight = np.abs(1 - right - part[0]) * np.abs(1 - down - part[1])
+            values += weight * table[first[1] + down, first[0] + right]
+    return values
