@@ -1,13 +1,12 @@
 """The command line. It parses, calls and prints; no physics here, and nothing heavy is imported before its use.
 
-Exit codes: 0 done, 1 a failed run, 2 bad input, 130 interrupted by Ctrl-C (143 by SIGTERM, 129 by SIGHUP). A user's
-mistake never shows a traceback.
+Exit codes: 0 done, 1 a failed run, 2 bad input, 130 interrupted by Ctrl-C (143 by SIGTERM, 129 by SIGHUP), 141
+where the reader of standard output left. A user's mistake never shows a traceback.
 """
 
 from __future__ import annotations
 
 import contextlib
-import io
 import json
 import math
 import os
@@ -20,7 +19,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from . import __version__, interrupts
+from . import __version__, interrupts, streams
 from .errors import InputError, VbnfaultError, shown
 
 if TYPE_CHECKING:
@@ -40,6 +39,7 @@ SetOption = Annotated[
     list[str] | None,
     typer.Option("--set", metavar="KEY=VALUE", help="replace a value of the scene, e.g. body.shape=comet.obj"),
 ]
+_INTERRUPTED = "interrupted; what was written stays; repeat the command to go on"
 MOST_SAMPLES = 10_000_000
 MOST_PROCESSES = 1024
 MOST_SEED = 2**63 - 1
@@ -55,19 +55,17 @@ def _finite(value: float | None) -> float | None:
 
 def main() -> None:
     """Entry point: turns errors into one sentence and an exit code."""
-    for stream in (sys.stdout, sys.stderr):  # a file's name may have bytes that are no text
-        if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors="backslashreplace")
     if len(os.environ.get("COLUMNS", "")) > 4:  # no terminal is that wide; tables would fill the memory with blanks
         del os.environ["COLUMNS"]
     warnings.showwarning = lambda message, *_, **__: typer.echo(f"warning: {message}", err=True)
-    with interrupts.interruptible():
+    with streams.steady(), interrupts.interruptible():
         try:
             code, stopped = _exit_code(), False
         except (interrupts.Stopped, KeyboardInterrupt, typer.Abort) as stop:
-            with interrupts.finishing():
-                typer.echo("vbnfault: interrupted; what was written stays; repeat the command to go on", err=True)
-            code, stopped = interrupts.exit_code(stop), True
+            code, stopped = interrupts.exit_code(stop), not streams.is_unread(stop)
+            if stopped:
+                with interrupts.finishing():
+                    typer.echo(f"vbnfault: {_INTERRUPTED}", err=True)
     if stopped:
         interrupts.ignore()  # a second Ctrl-C while Python ends
     sys.exit(code)
@@ -82,8 +80,10 @@ def _exit_code() -> int:
         return error.exit_code
     except typer.Abort:
         raise
-    except OSError as error:  # of what no command expects: a full disk under standard output, a terminal that left
-        return _cannot_write(error)
+    except OSError as error:  # of what no command expects, such as a full disk under standard output
+        where = f"{error.filename}: " if error.filename else ""
+        typer.echo(f"vbnfault: {where}{error.strerror or error}", err=True)
+        return 1
     except MemoryError:
         typer.echo("vbnfault: not enough memory", err=True)
         return 1
@@ -95,15 +95,6 @@ def _exit_code() -> int:
         show()
         return int(getattr(error, "exit_code", 2))
     return code if isinstance(code, int) else 0
-
-
-def _cannot_write(error: OSError) -> int:
-    """Say that a file, or standard output, cannot be written, and leave no more of the output to be written."""
-    with contextlib.suppress(OSError):
-        typer.echo(f"vbnfault: {error.filename or 'standard output'}: {error.strerror or error}", err=True)
-    with contextlib.suppress(OSError, ValueError):  # else Python itself complains when it ends
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-    return 1
 
 
 def _version(show: bool) -> None:

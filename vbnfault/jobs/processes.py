@@ -14,7 +14,7 @@ from multiprocessing import connection, resource_tracker
 from pathlib import Path
 from typing import Any
 
-from .. import interrupts
+from .. import interrupts, streams
 from .. import store as store_module
 from ..errors import VbnfaultError
 from ..resources import import_path
@@ -25,7 +25,7 @@ _SECONDS_TO_STOP = 60.0  # for the samples in hand to be written; a second Ctrl-
 
 def _worker(factory: SessionFactory, path: Path, pipe: connection.Connection) -> None:
     """A worker process: tasks come in by the pipe, ticks go out. It does not outlive its parent."""
-    with contextlib.suppress(EOFError, OSError, interrupts.Stopped):
+    with contextlib.suppress(EOFError, OSError, interrupts.Stopped), streams.steady():
         interrupts.obey_parent()
         threading.Thread(target=_die_with_parent, daemon=True).start()
         session, store = Lazy(factory), store_module.open_store(path, "r+")
