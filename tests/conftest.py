@@ -18,6 +18,9 @@ from vbnfault.faults import FAULT_AXIS
 # A shell that starts the tests in the background makes them, and every process they start, deaf to Ctrl-C;
 # with a handler here, processes that are started begin with the default again.
 signal.signal(signal.SIGINT, signal.default_int_handler)
+# So does `nohup` for the hang-up of a terminal: handled here, it is ignored by the tests alone.
+if hasattr(signal, "SIGHUP") and signal.getsignal(signal.SIGHUP) is signal.SIG_IGN:
+    signal.signal(signal.SIGHUP, lambda *_: None)
 
 # A loaded machine is slow at everything: no example fails for the seconds that it or its drawing took. What cannot
 # be drawn for other reasons (too much is filtered out) still fails, and a failure prints what repeats it.

@@ -1,7 +1,10 @@
 """Flip single bits of stores and of cached terrain, at random: each flip is found and mended, or is harmless.
 
     python tests/damage.py --count 2000 [--seed 0]
-    python tests/damage.py --operations         every operation of the disk fails once, instead
+    python tests/damage.py --operations [--count 500] [--seed 0]    operations of the disk fail, instead
+
+With `--operations` each operation of the disk of each command fails once with each of three errors, in an order
+drawn by the seed; `--count` ends after so many of them.
 
 A flip is found where `verify` reports a problem (of a cached patch: where the patch is built again), harmless where
 nothing that a reader sees has changed. Whatever is found, the build command mends: then all is as it was. The exit
@@ -12,13 +15,17 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import dataclasses
 import errno
+import functools
 import io
 import json
 import os
+import shutil
 import sys
 import tempfile
 import threading
+import time
 import types
 import warnings
 from collections import Counter
@@ -159,8 +166,41 @@ def terrain(folder: Path) -> Callable[[], tuple[bool, bool]]:
     return read
 
 
-def damage(count: int, seed: int, folder: Path) -> Counter[str]:
-    """Flip `count` bits, nine in ten of them in a store, the others in a cached patch; return what came of them."""
+@dataclass
+class Progress:
+    """Counts cases and failures, and prints them with their rate, every 50 cases."""
+
+    total: int
+    ended: int = 0
+    failures: int = 0
+    began: float = dataclasses.field(default_factory=time.monotonic)
+
+    def advance(self, failure: str) -> None:
+        """Count one case; `failure` says what went wrong, if anything."""
+        self.ended += 1
+        self.failures += bool(failure)
+        if failure:
+            print(failure, flush=True)
+        if self.ended % 50 == 0:
+            print(self, flush=True)
+
+    def __str__(self) -> str:
+        minutes = (time.monotonic() - self.began) / 60
+        return f"{self.ended} of {self.total}, {self.ended / minutes:.0f} a minute: {self.failures} failures"
+
+
+def is_failure(outcome: str) -> bool:
+    """Whether a flip was neither harmless nor found and mended."""
+    return outcome.startswith(("MISSED", "NOT MENDED"))
+
+
+def damage(
+    count: int, seed: int, folder: Path, ended: Callable[[str], None] = lambda failure: None
+) -> Counter[str]:
+    """Flip `count` bits, nine in ten of them in a store, the others in a cached patch; return what came of them.
+
+    `ended` is called after each flip with what went wrong, "" where nothing did.
+    """
     rng = np.random.default_rng(seed)
     path, caches = folder / "s.zarr", folder / "cache"
     caches.mkdir()
@@ -171,7 +211,9 @@ def damage(count: int, seed: int, folder: Path) -> Counter[str]:
         before = seen(path)
         read = terrain(caches)
         for k in range(count):
-            outcomes[flip_in_cache(caches, read, rng) if k % 10 == 9 else flip_in_store(path, before, rng)] += 1
+            outcome = flip_in_cache(caches, read, rng) if k % 10 == 9 else flip_in_store(path, before, rng)
+            outcomes[outcome] += 1
+            ended(outcome if is_failure(outcome) else "")
     return outcomes
 
 
@@ -260,13 +302,21 @@ def damaged(path: Path) -> None:
 COMMANDS = (create, write, append, recover)
 
 
+@functools.cache
+def _finished() -> tempfile.TemporaryDirectory[str]:
+    """Return a folder with a finished store, made once."""
+    folder = tempfile.TemporaryDirectory(prefix="vbnfault-damage-")
+    create(Path(folder.name, "s.zarr"))
+    mend(Path(folder.name, "s.zarr"))
+    return folder
+
+
 def _prepare(command: Callable[[Path], None], folder: Path) -> Path:
     """Make what a command works on: nothing for `create`, else a finished store."""
     folder.mkdir()
     path = folder / "s.zarr"
     if command is not create:
-        create(path)
-        mend(path)
+        shutil.copytree(Path(_finished().name, "s.zarr"), path)
     if command is recover:
         damaged(path)
     return path
@@ -312,36 +362,50 @@ def fails_at(number: int, code: int, command: Callable[[Path], None], folder: Pa
     return f"{command.__name__}, {system.failed} {number}: {'; '.join(wrong)}" if wrong else ""
 
 
-def every_operation() -> int:
-    """Let each operation of each command fail once, with each kind of error; return 1 where anything is lost."""
-    failed = 0
-    for command in COMMANDS:
-        with tempfile.TemporaryDirectory() as above:
-            count = operations(command, Path(above, "count"))
-        for code in (errno.EIO, errno.ENOSPC, errno.EACCES):
-            for number in range(count):
-                with tempfile.TemporaryDirectory() as above:
-                    wrong = fails_at(number, code, command, Path(above, "s"))
-                failed += bool(wrong)
-                if wrong:
-                    print(f"{errno.errorcode[code]}: {wrong}")
-        print(f"{command.__name__}: {count} operations, each failed with 3 errors")
-    return int(failed > 0)
+def failing_operations(count: int | None, seed: int) -> Progress:
+    """Let operations of each command fail, with each kind of error; return the counts.
+
+    Parameters
+    ----------
+    count
+        How many of all (command, operation, error) are drawn, each at most once; all of them where it is None.
+    seed
+        Gives the order.
+    """
+    cases: list[tuple[Callable[[Path], None], int, int]] = []
+    with tempfile.TemporaryDirectory(prefix="vbnfault-damage-") as above:
+        for command in COMMANDS:
+            numbers = operations(command, Path(above, command.__name__))
+            print(f"{command.__name__}: {numbers} operations")
+            cases += [
+                (command, k, code) for k in range(numbers) for code in (errno.EIO, errno.ENOSPC, errno.EACCES)
+            ]
+    order = np.random.default_rng(seed).permutation(len(cases))[:count].tolist()
+    progress = Progress(len(order))
+    for k in order:
+        command, number, code = cases[k]
+        with tempfile.TemporaryDirectory(prefix="vbnfault-damage-") as above:
+            wrong = fails_at(number, code, command, Path(above, "s"))
+        progress.advance(f"{errno.errorcode[code]}: {wrong}" if wrong else "")
+    print(f"operations that failed, of {len(cases)}, seed {seed}: {progress}")
+    return progress
 
 
 def main() -> int:
+    """Flip bits, or let operations fail; the exit code says whether something was lost or missed."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--count", type=int, default=2000, help="number of bits to flip, one after the other")
+    parser.add_argument("--count", type=int, help="flips [default: 2000], or operations that fail [default: all]")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--operations", action="store_true", help="let every operation of the disk fail instead")
+    parser.add_argument("--operations", action="store_true", help="let operations of the disk fail instead")
     arguments = parser.parse_args()
     if arguments.operations:
-        return every_operation()
-    with tempfile.TemporaryDirectory() as folder:
-        outcomes = damage(arguments.count, arguments.seed, Path(folder))
-    for outcome, many in outcomes.most_common():
-        print(f"{many:6d} {outcome}")
-    return int(any(outcome.startswith(("MISSED", "NOT MENDED")) for outcome in outcomes))
+        return int(failing_operations(arguments.count, arguments.seed).failures > 0)
+    progress = Progress(2000 if arguments.count is None else arguments.count)
+    with tempfile.TemporaryDirectory(prefix="vbnfault-damage-") as folder:
+        outcomes = damage(progress.total, arguments.seed, Path(folder), progress.advance)
+    counts = ", ".join(f"{many} {outcome}" for outcome, many in outcomes.most_common())
+    print(f"flips, seed {arguments.seed}: {progress}; {counts}")
+    return int(progress.failures > 0)
 
 
 if __name__ == "__main__":

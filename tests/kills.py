@@ -5,7 +5,8 @@
 Each round kills one build up to three times (SIGKILL, half of them leaving half a file, or SIGTERM), at operations
 drawn by `--seed`, with one worker and, in one round of eight, with two. The store is then completed in peace: its
 digest has to be that of a build that nothing disturbed, `verify` finds nothing, no temporary file is left, and no
-finished sample is lost by a kill. Every build runs in a process forked from this one, which opens no store.
+finished sample is lost by a kill. Every build runs in a process forked from this one, which imports what a build
+needs, without rendering, and opens no store.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ import shutil
 import signal
 import sys
 import tempfile
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -30,6 +32,13 @@ from conftest import small_scene
 # The child processes of a build import this file anew, as `__mp_main__`.
 if __name__ == "__mp_main__":
     victim.follow_the_environment("worker")
+
+
+def import_all() -> None:
+    """Import what builds and reports need, all but the renderer, whose threads no forked process would have."""
+    import test_build  # noqa: F401
+
+    from vbnfault import config, dataset, store  # noqa: F401
 
 
 def synthetic(out: Path, workers: int) -> None:
@@ -47,16 +56,19 @@ def rendered(out: Path, workers: int) -> None:
     dataset.build_scene(config.parse_scene(table, source="kills"), out, source="kills", workers=workers)
 
 
-def report(out: Path) -> dict[str, Any]:
-    """What there is of a store."""
+def finished(out: Path) -> int:
+    """Return how many samples of a store are finished; 0 where there is none."""
     from vbnfault import store
 
-    if not store.is_store(out):
-        return {"finished": 0}
-    opened = store.open_store(out)
-    finished = opened.finished()
-    whole = finished == opened.samples
-    return {"finished": finished, "digest": store.digest(out) if whole else "", "problems": store.verify(out)}
+    return store.open_store(out).finished() if store.is_store(out) else 0
+
+
+def report(out: Path) -> dict[str, Any]:
+    """Return what there is of a store."""
+    from vbnfault import store
+
+    problems = store.verify(out)
+    return {"finished": finished(out), "digest": "" if problems else store.digest(out), "problems": problems}
 
 
 def forked(action: Callable[[], Any]) -> tuple[int, Any]:
@@ -101,16 +113,18 @@ def main() -> int:
         build(folder / "whole.zarr", 1)
         return counted
 
+    import_all()
     code, answer = forked(whole)
     assert code == 0, answer
     operations = answer[0]
     wanted = forked(lambda: report(folder / "whole.zarr"))[1]
     kills, failures, round_ = 0, 0, 0
+    began = time.monotonic()
     while kills < given.count:
         dice = np.random.default_rng([given.seed, round_])
         workers = 2 if round_ % 8 == 7 else 1
         out = folder / f"{round_}.zarr"
-        wrong, finished, ended = [], 0, []
+        wrong, before, ended = [], 0, []
         for _ in range(int(dice.integers(1, 4))):
             term = dice.random() < 0.25
             step = victim.step(
@@ -133,10 +147,11 @@ def main() -> int:
             if code not in (0, 143, -signal.SIGKILL):
                 wrong.append(f"exit code {code}: {said}")
             kills += code != 0
-            state = forked(lambda out=out: report(out))[1]
-            if state["finished"] < finished:
-                wrong.append(f"{finished} samples were finished, {state['finished']} are")
-            finished = state["finished"]
+            after = forked(lambda out=out: finished(out))[1]
+            if type(after) is not int or after < before:
+                wrong.append(f"{before} samples were finished, then {after}")
+            else:
+                before = after
         code, said = forked(lambda out=out, workers=workers: build(out, workers))
         if code:
             wrong.append(f"resuming ends with {code}: {said}")
@@ -152,9 +167,15 @@ def main() -> int:
         shutil.rmtree(out, ignore_errors=True)
         round_ += 1
         if round_ % 10 == 0:
-            print(f"{kills} kills in {round_} rounds, {failures} failures so far", flush=True)
+            rate = kills / (time.monotonic() - began) * 60
+            print(f"{kills} kills in {round_} rounds, {rate:.0f} a minute, {failures} failures so far", flush=True)
     shutil.rmtree(folder, ignore_errors=True)
-    print(f"{kills} kills in {round_} rounds, rendering {given.rendering}: {failures} failures", flush=True)
+    minutes = (time.monotonic() - began) / 60
+    print(
+        f"{kills} kills in {round_} rounds, rendering {given.rendering}, seed {given.seed}, {minutes:.1f} minutes: "
+        f"{failures} failures",
+        flush=True,
+    )
     return int(failures > 0)
 
 

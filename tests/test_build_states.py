@@ -1,6 +1,8 @@
 """Builds, kills, damage, appending, replacing and verifying, in any order: what must hold after each of them.
 
-A state machine (Hypothesis) drives one store of made-up samples; `VBNFAULT_STATE_STEPS=2000` asks for 2,000 steps.
+A state machine (Hypothesis) drives one store of made-up samples. More steps, with their rate, are asked for by
+
+    VBNFAULT_STATE_STEPS=2000 python -m pytest -n 0 -s tests/test_build_states.py
 """
 
 from __future__ import annotations
@@ -9,12 +11,13 @@ import contextlib
 import os
 import shutil
 import tempfile
+import time
 from pathlib import Path
 
 import pytest
 from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
-from hypothesis.stateful import RuleBasedStateMachine, initialize, precondition, rule
+from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 from test_build import Session, site_of
 from test_store import flip, make_spec
 
@@ -55,6 +58,9 @@ def reference(scene: int, samples: int) -> str:
 class Builds(RuleBasedStateMachine):
     """`scene`, `samples`: of the store on disk; `sound`: samples finished and undamaged since."""
 
+    began = time.monotonic()
+    runs = steps = 0
+
     @initialize()
     def begin(self) -> None:
         self.folder = Path(tempfile.mkdtemp(prefix="vbnfault-states-"))
@@ -66,6 +72,14 @@ class Builds(RuleBasedStateMachine):
 
     def teardown(self) -> None:
         shutil.rmtree(self.folder, ignore_errors=True)
+        Builds.runs += 1
+        if STEPS > 40 and Builds.runs % 5 == 0:
+            rate = Builds.steps / (time.monotonic() - Builds.began) * 60
+            print(f"{Builds.steps} steps in {Builds.runs} runs, {rate:.0f} a minute", flush=True)
+
+    @invariant()
+    def counted(self) -> None:
+        Builds.steps += 1
 
     def whole(self) -> None:
         assert store.digest(self.out) == reference(self.scene, self.samples)

@@ -127,7 +127,13 @@ def test_the_digest_depends_on_no_workers_or_threads(
 def test_the_digest_survives_kills(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """kill -9 while the terrain is kept, rendered or written: at the n-th file operation after the last kill."""
     sites, out = tmp_path / "sites.toml", tmp_path / "killed.zarr"
-    sites.write_text(toml(small_scene(dataset={"samples": 8, "shard_samples": 2, "sites": 4})))
+    sites.write_text(
+        toml(
+            small_scene(
+                dataset={"samples": 6, "shard_samples": 2, "sites": 3}, camera={"width_px": 64, "height_px": 56}
+            )
+        )
+    )
     finished = 0
     for count in np.random.default_rng(5).integers(1, 120, 3).tolist():
         # every operation after the first shard that is new: so that each kill finds a store further on
