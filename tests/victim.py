@@ -66,6 +66,7 @@ def follow(steps: Sequence[dict[str, Any]], count: Callable[[str, str], None] | 
     """Follow a plan in this process, from now on; `count` is called with every event."""
     left = [dict(one) for one in steps]
     inside = [False]
+    parent = os.getppid()
 
     def seen(kind: str, text: str, write_to: str = "") -> None:
         if inside[0]:
@@ -79,7 +80,7 @@ def follow(steps: Sequence[dict[str, Any]], count: Callable[[str, str], None] | 
                 now = left.pop(0)
                 if now.get("torn") and write_to:
                     Path(write_to).write_bytes(b"half a file of nonsense")
-                _send(getattr(signal, now["signal"]), now.get("to", "self"))
+                _send(getattr(signal, now["signal"]), now.get("to", "self"), parent)
                 inside[0] = False
 
     def hook(event: str, args: tuple[Any, ...]) -> None:
@@ -112,11 +113,13 @@ def follow(steps: Sequence[dict[str, Any]], count: Callable[[str, str], None] | 
     multiprocessing.process.BaseProcess.start = counted_start  # type: ignore[method-assign]
 
 
-def _send(number: int, to: str) -> None:
+def _send(number: int, to: str, parent: int) -> None:
     if to == "group":
         os.killpg(os.getpgid(0), number)
-    else:
-        os.kill(os.getppid() if to == "parent" else os.getpid(), number)
+    elif to == "self":
+        os.kill(os.getpid(), number)
+    elif os.getppid() == parent:  # an orphan has another parent, which is none of a build's processes
+        os.kill(parent, number)
 
 
 def follow_the_environment(role: str) -> None:
