@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import xarray
 import zarr
 from conftest import small_scene
 
@@ -583,9 +584,33 @@ def test_paths_that_hold_no_store_are_one_sentence(tmp_path: Path, whole: st.Sto
         st.verify(tmp_path / "other.zarr")
     with pytest.raises(InputError, match=r"no store can be created here: .*file is a file, not a folder"):
         st.create(tmp_path / "file" / "s.zarr", make_spec(), 3)
-    whole.update_attributes({"format_version": 99})
-    with pytest.raises(InputError, match="format_version = 99"):
-        st.open_store(whole.path)
+
+
+@pytest.mark.parametrize(
+    ("version", "sentence"),
+    [
+        (st.FORMAT_VERSION + 1, f"reads {st.FORMAT_VERSION}; install a newer one$"),
+        (st.FORMAT_VERSION - 1, f"an earlier vbnfault made it.* reads {st.FORMAT_VERSION}; open it with xarray"),
+        (0, "is no vbnfault store"),
+        ("2", "is no vbnfault store"),
+        (True, "is no vbnfault store"),
+        (None, "is no vbnfault store"),
+    ],
+)
+def test_a_store_of_another_format_is_refused_and_left_as_it_is(
+    whole: st.Store, version: object, sentence: str
+) -> None:
+    whole.update_attributes({"format_version": version})
+    before = {p: p.read_bytes() for p in whole.path.rglob("*") if p.is_file()}
+    for use in (st.open_store, st.verify, st.digest, st.recover, lambda path: st.append_samples(path, 2)):
+        with pytest.raises(InputError, match=sentence):
+            use(whole.path)
+    assert {p: p.read_bytes() for p in whole.path.rglob("*") if p.is_file()} == before
+    with xarray.open_zarr(whole.path) as data:  # as the sentence says
+        assert data.sizes["sample"] == whole.samples
+    # --overwrite replaces it
+    st.create(whole.path, whole.spec, whole.samples, overwrite=True)
+    assert st.open_store(whole.path).finished() == 0
 
 
 def test_a_full_disk_is_one_sentence_and_what_was_done_stays(

@@ -466,7 +466,7 @@ def is_store(path: str | os.PathLike[str]) -> bool:
 def open_store(path: str | os.PathLike[str] | Store, mode: str = "r") -> Store:
     """Open a store, `r` or `r+`; where its root is damaged, by the spare, with a warning.
 
-    Raises InputError where the path holds none, or one of a newer format.
+    Raises InputError where the path holds none, or one of another format.
     """
     if isinstance(path, Store):
         return path
@@ -474,19 +474,33 @@ def open_store(path: str | os.PathLike[str] | Store, mode: str = "r") -> Store:
     root = read_root(path)
     if root is None:
         raise InputError(f"{path}: {_why_no_store(path)}")
+    _check_format(path, root.attributes.get("format_version"))
     try:
-        version = int(root.attributes["format_version"])
         store = Store(path, root.attributes, mode)
     except (KeyError, TypeError, ValueError, VbnfaultError) as error:
-        raise InputError(f"{path}: is no vbnfault store: its root attributes are not those of one") from error
-    if version > FORMAT_VERSION:
-        raise InputError(
-            f"{path}: format_version = {version}: this vbnfault reads up to {FORMAT_VERSION}; install a newer one"
-        )
+        raise InputError(f"{path}: {_NO_STORE}") from error
     if mode == "r":
         for problem in root.problems:
             warnings.warn(f"{path}: {problem}; the build command mends it", UserWarning, stacklevel=2)
     return store
+
+
+_NO_STORE = "is no vbnfault store: its root attributes are not those of one"
+
+
+def _check_format(path: Path, version: Any) -> None:
+    """Raise InputError where a store is of another format."""
+    if type(version) is not int or version < 1:
+        raise InputError(f"{path}: {_NO_STORE}")
+    if version > FORMAT_VERSION:
+        raise InputError(
+            f"{path}: format_version = {version}: this vbnfault reads {FORMAT_VERSION}; install a newer one"
+        )
+    if version < FORMAT_VERSION:
+        raise InputError(
+            f"{path}: format_version = {version}: an earlier vbnfault made it, and this one reads "
+            f"{FORMAT_VERSION}; open it with xarray, or build it again with another --out or --overwrite"
+        )
 
 
 def _why_no_store(path: Path) -> str:

@@ -14,7 +14,9 @@ from ..errors import InputError
 from ..plan import SPLITS, STRATA
 from ..quantities import CHANNELS, DEFECTS, soft_kind
 
-FORMAT_VERSION = 1
+# 2: the spare and the checksum of the root, eight coefficients of `distortion`, further arrays. A store of another
+# format is refused: nothing here could tell its arrays from damaged ones.
+FORMAT_VERSION = 2
 SEMANTIC = ("sky", "body", "sun", "spacecraft")
 
 # Root attributes that say when or how a store was written, not what it holds: no part of the digest.
