@@ -9,15 +9,37 @@ import numpy as np
 import pytest
 from conftest import small_scene
 
-from vbnfault import config, dataset, llvm, photometry, resources, spectra, store, world
+from vbnfault import config, dataset, llvm, photometry, pipeline, resources, spectra, store, world
 from vbnfault.detector import MosaicDetector
 from vbnfault.detector.readout import ReadoutNoise, analogue_dn, read_out
 from vbnfault.detector.sensor import load_sensor
 from vbnfault.errors import VbnfaultError
 from vbnfault.lens import ThinLens, load_lens
+from vbnfault.quantities import Irradiance
 
 LENSES = sorted(resources.packaged("scenes/lenses"))
 DETECTORS = sorted(resources.packaged("scenes/detectors"))
+
+
+@pytest.mark.parametrize("name", sorted(resources.packaged("scenes")))
+def test_the_sun_in_the_field_does_not_saturate_a_packaged_scene(name: str) -> None:
+    """The veil of the largest fraction that a scene draws, at its longest exposure, by its closed form.
+
+    The flux Φ = E☉ T π f² / (4 N²) gives v Φ / (π f²) in the middle of the frame; towards the corners it falls with
+    cos⁴. At most 60 % of white, so that ground, ghosts and glare still show on top of it.
+    """
+    scene = config.load_scene(name)
+    fault = pipeline.configure_faults(scene).get("straylight")
+    if fault is None or "veil_fraction" not in fault.to_dict():
+        assert fault is None or fault.model == "texture"  # no veil
+        return
+    camera, nodes = world.base_camera(scene), world.wavelengths_nm(scene)
+    sun = world.sunlight(scene, np.array([0.0, 0.0, -1.0])).irradiance_W_m2_nm
+    veil = max(fault.to_dict()["veil_fraction"]) * sun * camera.lens.transmittance(nodes)
+    veil /= 4 * camera.lens.f_number**2
+    on_sensor = Irradiance(array=veil.astype(np.float32)[:, None, None], wavelength_nm=nodes)
+    electrons = camera.detector.electrons_expected(on_sensor, scene.camera.exposure_max_s)
+    assert (electrons.array / electrons.white_e).max() < 0.6
 
 
 @pytest.mark.parametrize("number", range(max(len(LENSES), len(DETECTORS))))
