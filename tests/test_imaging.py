@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import itertools
 import math
+import shutil
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -32,6 +33,7 @@ from vbnfault.lens import (
     scaled_to_field,
 )
 from vbnfault.lens.coating import design, mean_reflectance
+from vbnfault.lens.footprint import DEFAULT_LENS
 from vbnfault.lens.glass import C_NM, D_NM, F_NM
 from vbnfault.lens.trace import real_pupil_diameter_mm, trace
 from vbnfault.quantities import BODY, SUN, Radiance
@@ -498,6 +500,34 @@ def test_a_lens_beside_the_scene_file_is_found_and_told_by_its_contents(tmp_path
     assert identities[0]["camera"] == identities[1]["camera"]
     assert identities[0]["camera"]["lens"].startswith("sha256:")
     assert world.base_camera(named).lens is world.base_camera(named).lens  # its tables are made once
+
+
+def test_the_lens_of_a_thin_camera_is_told_by_its_contents(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Another prescription under the name of `DEFAULT_LENS` makes another scene, where light passes that lens."""
+    scenes = tmp_path / "scenes"
+    shutil.copytree(resources.data_dir("scenes"), scenes)
+    find = resources.data_dir
+    monkeypatch.setattr(resources, "data_dir", lambda kind: scenes if kind == "scenes" else find(kind))
+
+    def identity(faults: dict[str, object], **camera: object) -> dict[str, object]:
+        table = small_scene(camera={"width_px": 64, "height_px": 64, **camera})
+        table["faults"] = faults
+        return dataset.scene_identity(pipeline.Session(config.parse_scene(table, source="test")))
+
+    cases = [
+        ({"straylight": {"model": "traced"}}, {}, True),
+        ({"vignetting": {"model": "lens"}}, {}, True),
+        ({"straylight": {"model": "traced", "lens": "tessar_50_f2p8"}}, {}, False),
+        ({"straylight": {"model": "traced"}}, {"lens": "tessar_50_f2p8"}, False),
+        ({"straylight": {"model": "texture"}}, {}, False),
+    ]
+    before = [identity(faults, **camera) for faults, camera, _ in cases]
+    named = identity({"straylight": {"model": "traced", "lens": DEFAULT_LENS}})
+    assert named == before[0]
+    lens = scenes / "lenses" / f"{DEFAULT_LENS}.toml"
+    lens.write_text(lens.read_text() + "\n")
+    for (faults, camera, other), was in zip(cases, before, strict=True):
+        assert (identity(faults, **camera) != was) == other, (faults, camera)
 
 
 def test_stars_go_through_the_lens() -> None:

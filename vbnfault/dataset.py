@@ -54,11 +54,12 @@ def scene_identity(session: pipeline.Session) -> dict[str, Any]:
         for key in config.OF_THE_DETECTOR:
             del scene["camera"][key]  # the detector has its own
     scene["faults"] = {name: fault.to_dict() for name, fault in session.faults.items()}
-    for table in scene["faults"].values():
+    for name, table in scene["faults"].items():
         if table.get("texture_file"):
             table["texture_file"] = _digest(table["texture_file"], "texture")
-        if table.get("lens"):
-            table["lens"] = _digest(resources.find("scenes/lenses", table["lens"]), "lens")
+        lens = table.get("lens") or ("" if session.scene.camera.lens else session.faults[name].lens_of_thin_camera)
+        if lens:
+            table["lens"] = _digest(resources.find("scenes/lenses", lens), "lens")
     _contents_of_files(scene, session.scene)
     if "straylight" in session.faults:
         textures = sorted(resources.data_dir("textures").glob("*.png"))

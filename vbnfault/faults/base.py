@@ -217,7 +217,8 @@ class Fault:
     (also True where `alter` changes such a detector), `needs_ccd` (True: no effect on CMOS), `localised` (False
     where the footprint is about the whole frame), `needs_sun`, `effect_mask` (True: the mask is the effect rule,
     not the footprint), `soft_layer` (the name of the optional layer that `soft` gives, which ends as one of
-    `quantities.SOFT_KINDS`; "": none).
+    `quantities.SOFT_KINDS`; "": none), `lens_of_thin_camera` (the packaged lens that it follows light through
+    where the camera has a thin lens and no other is named: its contents belong to the scene's identity; "": none).
 
     Which light has met the lens's rims is told by two more, for models of the step `electrons`. `adds_past_rims`
     (True: the light it adds has met them; `apply` puts it into `Electrons.past_rims` where the quantity has that
@@ -238,6 +239,7 @@ class Fault:
     soft_layer: ClassVar[str] = ""
     adds_past_rims: ClassVar[bool] = False
     at_rims: ClassVar[bool] = False
+    lens_of_thin_camera: ClassVar[str] = ""
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
@@ -362,6 +364,8 @@ def act(fault: Fault, light: Electrons, params: Params, context: FaultContext) -
 @dataclass(frozen=True, kw_only=True)
 class LensFault(Fault):
     """Base of the models that follow light through a prescription: the faults of a frame share its lens."""
+
+    lens_of_thin_camera: ClassVar[str] = DEFAULT_LENS
 
     lens: str = text(
         "",
