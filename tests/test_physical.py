@@ -15,7 +15,7 @@ from vbnfault import config, exposure, frames, render, sky, world
 from vbnfault.errors import InputError
 from vbnfault.photometry import hapke_at
 from vbnfault.pipeline import STAGES, Session
-from vbnfault.quantities import BODY, SKY
+from vbnfault.quantities import BODY, SKY, SPACECRAFT
 from vbnfault.record import to_sample
 from vbnfault.render.detail import _LEVELS, _SIDE, _UNIT, _pyramid
 from vbnfault.sample import Frame
@@ -113,6 +113,33 @@ def test_spacecraft_is_in_its_own_pictures(samples: tuple[Session, list[Frame]])
         # ground may lie before a footpad, nothing else may hide one
         hidden = blocked & (frame.truth.semantic != 3)
         assert (frame.truth.semantic[hidden] == BODY).all()
+
+
+def test_albedo_on_the_spacecraft_is_that_of_its_material(samples: tuple[Session, list[Frame]]) -> None:
+    """The reflectance of the facet that each pixel's ray meets first, by a float64 search over all facets."""
+    s, all_frames = samples
+    mesh = s.vehicle
+    assert mesh is not None
+    sample = next(to_sample(f) for f in all_frames if (f.truth.semantic == SPACECRAFT).any())
+    rows, columns = np.nonzero(sample.layers["semantic"] == SPACECRAFT)
+    fx, fy, cx, cy = sample.scalars["intrinsics"]
+    rays = np.column_stack([(columns + 0.5 - cx) / fx, (rows + 0.5 - cy) / fy, np.ones(len(rows))])
+    corners = mesh.vertices_B_m[mesh.faces].astype(float)
+    a, b, c = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    across = np.cross(rays[:, None], c[None])
+    det = np.einsum("fk,rfk->rf", b, across)
+    with np.errstate(divide="ignore", invalid="ignore"):  # facets seen edge on
+        u = np.einsum("fk,rfk->rf", -a, across) / det
+        v = np.einsum("rk,fk->rf", rays, np.cross(-a, b)) / det
+        z = np.einsum("fk,fk->f", c, np.cross(-a, b)) / det
+    z[~((u >= 0) & (v >= 0) & (u + v <= 1) & (z > 0))] = np.inf
+    nodes = world.wavelengths_nm(s.scene)
+    near = int(np.argmin(np.abs(nodes - 649.0)))
+    expected = mesh.reflectance(nodes)[mesh.face_material[z.argmin(axis=1)], near]
+    got = sample.layers["albedo"][rows, columns]
+    # the layer is float32; a ray on the border of two parts may fall to either
+    assert (np.abs(got - expected) < 1e-6).mean() > 0.98
+    assert len(np.unique(got)) > 1
 
 
 def test_spacecraft_casts_its_shadow() -> None:

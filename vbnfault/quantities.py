@@ -208,7 +208,8 @@ class Truth:
     surface's own, interpolated over its facet, at the limb no further from the camera than at right angles to it;
     `semantic` uint8[y, x]: 0 sky, 1 body, 2 Sun, 3 spacecraft. Where asked for, float32[y, x], NaN on the sky:
     `incidence_deg` and `emission_deg` from the normal to the Sun and to the camera, `phase_deg` between the two,
-    and `dust`, how far the ground is covered, in [0, 1].
+    and `dust`, how far the ground is covered, in [0, 1]; with a spacecraft also `material` int32[y, x], which
+    of its materials a pixel shows, -1 where none.
     """
 
     depth_m: NDArray[np.float32]
@@ -218,6 +219,7 @@ class Truth:
     emission_deg: NDArray[np.float32] | None = None
     phase_deg: NDArray[np.float32] | None = None
     dust: NDArray[np.float32] | None = None
+    material: NDArray[np.int32] | None = None
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

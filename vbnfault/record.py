@@ -63,7 +63,8 @@ def to_sample(frame: Frame) -> Sample:
         elif name == "radiance":
             layers[name] = frame.radiance.array
         elif name == "albedo" and frame.truth.dust is not None:
-            layers[name] = world.normal_albedo(spec.scene, frame.truth.dust)
+            dust, material = frame.truth.dust, frame.truth.material
+            layers[name] = world.normal_albedo(spec.scene, dust, material, spec.terrain.vehicle)
         elif name == "point_T_m":
             layers[name] = _points_T_m(frame)
         elif name in available:

@@ -189,12 +189,33 @@ def dust_contrast(scene: SceneConfig) -> F64 | None:
     return contrast if np.any(contrast) else None
 
 
-def normal_albedo(scene: SceneConfig, dust: NDArray[np.float32]) -> NDArray[np.float32]:
-    """I/F at normal incidence and emission, at the band node nearest to 649 nm, of ground covered with `dust`."""
-    band = int(np.argmin(np.abs(wavelengths_nm(scene) - photometry.REFERENCE_NM)))
+def normal_albedo(
+    scene: SceneConfig,
+    dust: NDArray[np.float32],
+    material: NDArray[np.int32] | None = None,
+    vehicle: SpacecraftMesh | None = None,
+) -> NDArray[np.float32]:
+    """Return I/F at normal incidence and emission, at the band node nearest to 649 nm, float32 like `dust`.
+
+    Parameters
+    ----------
+    dust
+        How far the ground is covered, in [0, 1]; NaN where there is nothing.
+    material
+        The spacecraft's material in each place, -1 where that is none: a Lambert surface, whose I/F is its
+        reflectance. Default: none anywhere.
+    vehicle
+        The spacecraft with these materials.
+    """
+    nodes = wavelengths_nm(scene)
+    band = int(np.argmin(np.abs(nodes - photometry.REFERENCE_NM)))
     contrast = dust_contrast(scene)
     bare = photometry.radiance_factor(photometric_model(scene), [0, 0, 1], [0, 0, 1])[band, 0]
-    return np.asarray(bare * (1 + (0 if contrast is None else contrast[band]) * dust), dtype=np.float32)
+    ground = np.asarray(bare * (1 + (0 if contrast is None else contrast[band]) * dust), dtype=np.float32)
+    if material is None or vehicle is None:
+        return ground
+    reflectance = vehicle.reflectance(nodes)[:, band].astype(np.float32)
+    return np.where(material >= 0, reflectance[material], ground)
 
 
 def make_body(scene: SceneConfig) -> Body:

@@ -27,7 +27,7 @@ def truth(
     projection: Projection | None = None,
 ) -> Truth:
     """Depth, normal and semantic class of every pixel centre, from one ray each; with `angles` also those of
-    incidence, emission and phase, and the dust.
+    incidence, emission and phase, the dust and the spacecraft's materials.
 
     Of the pixels whose centres see the sky, those that hold any of the visible Sun have its class. A Sun smaller
     than a pixel also gives it to the one where its centre is seen, whatever the pixel's own centre sees.
@@ -52,8 +52,11 @@ def truth(
         pairs = {"incidence": (normal, centre), "emission": (normal, -rays.d), "phase": (centre, -rays.d)}
         found |= {name: dr.select(hit.valid, _angle_deg(*pair), dr.nan) for name, pair in pairs.items()}
         found["dust"] = dr.select(hit.valid, hit.dust, dr.nan)
+        if hit.material is not None:
+            found["material"] = dr.select(hit.on_vehicle, mi.Int32(hit.material), mi.Int32(-1))
     dr.eval(*in_camera, *found.values())
-    more = {"incidence": "incidence_deg", "emission": "emission_deg", "phase": "phase_deg", "dust": "dust"}
+    more = {"incidence": "incidence_deg", "emission": "emission_deg", "phase": "phase_deg"}
+    more |= {"dust": "dust", "material": "material"}
     classes = semantic.numpy().astype(np.uint8).reshape(shape)
     disc = sun_in_view(surface, view, sun)
     if disc is not None:

@@ -77,7 +77,11 @@ LAYERS: dict[str, Array] = {
     "emission_deg": Array("sample y x", "float32", "deg", "normal to camera, NaN on the sky", ratio=0.8),
     "phase_deg": Array("sample y x", "float32", "deg", "Sun to camera at the surface, NaN on the sky", ratio=0.7),
     "albedo": Array(
-        "sample y x", "float32", "1", "I/F at i = e = phase = 0 near 649 nm, NaN on the sky", ratio=0.4
+        "sample y x",
+        "float32",
+        "1",
+        "I/F at i = e = phase = 0 near 649 nm, spacecraft included, NaN on the sky",
+        ratio=0.4,
     ),
     "radiance": Array("sample band y x", "float16", "W m-2 sr-1 nm-1", "radiance at the camera", ratio=0.7),
 }
