@@ -235,6 +235,27 @@ def test_ground_height_clearance_and_occlusion() -> None:
     assert fractions[2] == 1.0
 
 
+def test_clearance_is_the_distance_to_the_nearest_facet() -> None:
+    """Faces, edges and corners of a cube: it is clear up to a millimetre less than its distance, no further."""
+    rng = np.random.default_rng(11)
+    corner = np.array([40.0, 0.0, -10.0])
+    cube = join(box(corner, 10.0))
+    away = rng.normal(size=(60, 3))
+    away /= np.linalg.norm(away, axis=1)[:, None]
+    points = corner + 40.0 * away
+    outside = np.maximum(np.abs(points - corner) - 10.0, 0)  # of a cube: its faces, edges and corners
+    for point, distance in zip(points, np.linalg.norm(outside, axis=1), strict=True):
+        clear = [bool(render.is_clear(cube, point[None], distance + d)[0]) for d in (-1e-3, 1e-3)]
+        assert clear == [True, False]
+    # needles thinner than the angle between any directions that one would look along
+    needle = (np.array([[0, 0, -5.0], [1e-3, 0, 0], [0, 1e-3, 0]]), np.array([[0, 1, 2]], np.int32))
+    surface = render.Surface(needle[0], needle[1], np.ones(1, bool))
+    positions = np.array([[0.0, 0.0, -6.0], [0.5, 0.5, -6.0]])
+    assert render.is_clear(surface, positions, 0.999).tolist() == [True, True]
+    assert render.is_clear(surface, positions, 1.001).tolist() == [False, True]
+    assert render.is_clear(surface, positions, 0.0).all()
+
+
 def test_overhang_does_not_count_as_ground_from_below() -> None:
     # the start lies inside the cube: its bottom faces down, the plane below is the ground
     surface = join(plane(), box(np.array([0.0, 0.0, -300.0]), 20.0))

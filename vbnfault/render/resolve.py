@@ -14,7 +14,7 @@ from .surface import Surface
 F64 = NDArray[np.float64]
 
 _SUN_SAMPLES = 64
-_DIRECTIONS = 64
+_FACETS = 1 << 16  # whose distance is measured at a time, for the memory's sake
 _GROUND_HITS = 4
 
 
@@ -45,12 +45,39 @@ def ground_height_m(surface: Surface, x_m: F64, y_m: F64, start_height_m: float)
 
 
 def is_clear(surface: Surface, position_L_m: F64, clearance_m: float) -> NDArray[np.bool_]:
-    """bool[n]: no surface within `clearance_m` of positions float64[n, 3], along 64 directions."""
-    k = np.arange(_DIRECTIONS) + 0.5  # spherical Fibonacci points
-    z, turn = 1 - 2 * k / _DIRECTIONS, k * np.pi * (3 - np.sqrt(5))
-    r = np.sqrt(1 - z * z)
-    directions = np.column_stack([r * np.cos(turn), r * np.sin(turn), z])
-    return np.asarray(~_any_hit(surface, position_L_m, directions[None], clearance_m).any(axis=1))
+    """Return which positions float64[n, 3] are at least `clearance_m` from every facet, bool[n], by exact distance.
+
+    Boxes about runs of neighbouring facets leave few to be measured.
+    """
+    clear = np.ones(len(position_L_m), dtype=bool)
+    for k, position in enumerate(np.asarray(position_L_m, dtype=np.float64)):
+        near = surface.facets_near(position, clearance_m)
+        for start in range(0, len(near), _FACETS):
+            corners = surface.corners_m(near[start : start + _FACETS])
+            if (_distance_m(corners - position) < clearance_m).any():
+                clear[k] = False
+                break
+    return clear
+
+
+def _distance_m(corners: F64) -> F64:
+    """Return the distance of the origin from triangles float64[n, corner, 3], float64[n].
+
+    It is that of the plane where the origin's foot lies within the triangle, else that of the nearest edge.
+    """
+    nearest = np.full(len(corners), np.inf)
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    within = np.ones(len(corners), dtype=bool)
+    for k in range(3):
+        a, edge = corners[:, k], corners[:, (k + 1) % 3] - corners[:, k]
+        length2 = np.maximum(np.einsum("ni,ni->n", edge, edge), 1e-300)
+        along = np.clip(-np.einsum("ni,ni->n", a, edge) / length2, 0, 1)
+        nearest = np.minimum(nearest, np.linalg.norm(a + along[:, None] * edge, axis=1))
+        within &= np.einsum("ni,ni->n", np.cross(edge, -a), normal) >= 0
+    area = np.linalg.norm(normal, axis=1)
+    within &= area > 0
+    plane = np.abs(np.einsum("ni,ni->n", corners[:, 0], normal)) / np.maximum(area, 1e-300)
+    return np.where(within, plane, nearest)
 
 
 def is_between(surface: Surface, origin_L_m: F64, points_L_m: F64) -> bool:

@@ -23,6 +23,15 @@ from .vehicle import Vehicle, World
 # Float32 resolves 2⁻²³ of a coordinate; hit distance, ray direction and vertex rounding each err by about one
 # unit, so eight of them clear the facet without visibly moving the shadow (1 mm at 1 km).
 _OFFSET = 8 * 2.0**-23
+_RUN = 64  # facets in a box that tells how far they can be
+# By which the 21 bits of a number are spread out to every third bit: shift, and the bits that are kept.
+_SPREAD = (
+    (32, 0x1F00000000FFFF),
+    (16, 0x1F0000FF0000FF),
+    (8, 0x100F00F00F00F00F),
+    (4, 0x10C30C30C30C30C3),
+    (2, 0x1249249249249249),
+)
 
 # Of a normal that faces the viewer: half precision, as truth is stored, moves a cosine by up to √3 · 2⁻¹².
 _LEAST_COSINE = 2.0**-11
@@ -51,6 +60,31 @@ class Surface:
         self._dust = mi.Float(0.0 if dust is None else np.ascontiguousarray(_with_a_fourth(dust[faces])).ravel())
         dr.eval(self._corners, self._dust)
         self.vehicle, self.fine = vehicle, fine
+        self._vertices_m, self._faces = vertices_m, faces
+
+    def corners_m(self, facets: NDArray[np.intp]) -> NDArray[np.float64]:
+        """Return the corners of facets, float64[facet, corner, 3] in L."""
+        return self._vertices_m[self._faces[facets]].astype(np.float64)
+
+    def facets_near(self, position_L_m: NDArray[np.float64], reach_m: float) -> NDArray[np.intp]:
+        """Return the indices of all facets within `reach_m` of a position, among others: those of every run of
+        facets whose box reaches there."""
+        order, low, high = self._boxes_m
+        away = np.maximum(np.maximum(low - position_L_m, position_L_m - high), 0)
+        runs = np.flatnonzero(np.einsum("ri,ri->r", away, away) <= reach_m**2)
+        places = (runs[:, None] * _RUN + np.arange(_RUN)).ravel()
+        return order[places[places < len(order)]]
+
+    @cached_property
+    def _boxes_m(self) -> tuple[NDArray[np.intp], NDArray[np.float64], NDArray[np.float64]]:
+        """The facets in an order in which neighbours follow one another, and lower and upper corners of the boxes
+        about runs of `_RUN` of them, float64[run, 3] each."""
+        order = np.argsort(_morton(self._vertices_m[self._faces[:, 0]]), kind="stable")
+        starts = np.arange(0, len(order), _RUN)
+        corners = [self._vertices_m[self._faces[order, k]] for k in range(3)]
+        low = np.minimum.reduceat(np.minimum.reduce(corners), starts)
+        high = np.maximum.reduceat(np.maximum.reduce(corners), starts)
+        return order, low.astype(np.float64), high.astype(np.float64)
 
     def seen_from(self, view: View) -> Surface | World:
         """What a camera sees: the terrain, and its own spacecraft if there is one."""
@@ -71,6 +105,20 @@ class Surface:
     def occluded(self, rays: Any, active: Any, *, coherent: bool = True) -> Any:
         """Whether anything lies along the rays; `coherent` where neighbours run alike."""
         return self.scene.ray_test(rays, coherent, active)
+
+
+def _morton(points_m: NDArray[np.float32]) -> NDArray[np.uint64]:
+    """Return the place of points float32[n, 3] along a curve that keeps neighbours together, uint64[n]: the bits of
+    their coordinates, 21 each, interleaved (Morton 1966)."""
+    low = points_m.min(axis=0)
+    cells = (points_m - low) * (np.float32(2**21 - 1) / max(float((points_m - low).max()), 1e-30))
+    code = np.zeros(len(points_m), dtype=np.uint64)
+    for k in range(3):
+        bits = cells[:, k].astype(np.uint64)
+        for shift, kept in _SPREAD:
+            bits = (bits | (bits << np.uint64(shift))) & np.uint64(kept)
+        code |= bits << np.uint64(k)
+    return code
 
 
 class Hit:
