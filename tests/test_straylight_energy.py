@@ -290,6 +290,44 @@ def test_light_that_has_met_the_rims_is_not_vignetted_again(model: str, vignetti
         np.testing.assert_allclose(apart.merged.array, whole.array, rtol=1e-5)
 
 
+@pytest.mark.parametrize("moved", [{"hood_offset": 0.6}, {"decentre": 0.7}, {"hood_offset": 0.4, "decentre": 0.4}])
+def test_a_moved_hood_or_ring_takes_of_the_sun_what_it_takes_of_its_beam(moved: dict[str, float]) -> None:
+    """All light past the rims loses the fraction that the scene loses by the fault at the Sun's pixel."""
+    where = thin_context(12.0)
+    assert where.sun_xy_px is not None
+    x, y = (int(v) for v in where.sun_xy_px)
+    stray = from_dict("straylight", {"model": "paraxial"}, source="test")
+    before, _ = direct_sun(where, 12.0)
+    lit = act(stray, before, stray.draw(where, np.random.default_rng(1)), where)
+    assert lit.past_rims is not None
+    maps, past = [], []
+    for keys in ({}, moved):
+        rims = from_dict("vignetting", {"model": "lens", "decentre": 0.0, "hood_offset": 0.0} | keys, source="test")
+        params = rims.draw(where, np.random.default_rng(5))
+        # to the right, where the Sun is: its beam comes in from the left
+        params["hood_offset_mm"] = [float(np.hypot(*params["hood_offset_mm"])), 0.0]
+        maps.append(rims.soft(params, where))
+        after = act(rims, lit, params, where).past_rims
+        assert after is not None
+        past.append(after)
+    np.testing.assert_array_equal(past[0], lit.past_rims)
+    expected = float(maps[1][y, x] / maps[0][y, x])
+    assert expected < 0.95
+    # the Sun lies within half a pixel of that pixel's centre, where the map changes by less than 1 %
+    np.testing.assert_allclose(past[1], past[0] * np.float32(expected), rtol=0.01)
+
+
+def test_a_hood_in_front_of_the_sun_leaves_none_of_its_light() -> None:
+    where = thin_context(12.0)
+    stray = from_dict("straylight", {"model": "paraxial"}, source="test")
+    before, _ = direct_sun(where, 12.0)
+    lit = act(stray, before, stray.draw(where, np.random.default_rng(1)), where)
+    rims = from_dict("vignetting", {"model": "lens", "hood_offset": 10.0}, source="test")
+    after = act(rims, lit, rims.draw(where, np.random.default_rng(2)), where).past_rims
+    assert after is not None
+    np.testing.assert_array_equal(after, 0)
+
+
 def test_the_sun_in_a_build_is_vignetted_once() -> None:
     """From scene file to electrons: behind a thin lens, cos⁴ falls on the scene and not on the Sun again."""
     from conftest import small_scene

@@ -152,6 +152,17 @@ class FaultContext:
         return self.camera.height_px, self.camera.width_px
 
     @property
+    def sun_before_camera(self) -> NDArray[np.float64] | None:
+        """Return a vector towards the Sun in C with z > 0, float64[3]; of a picture without a pose, by the Sun's
+        pixel. None where the Sun is behind the camera or unknown."""
+        direction = self.sun_direction_C
+        if direction is None and self.sun_xy_px is not None:
+            fx, fy, cx, cy = self.camera.intrinsics
+            x, y = self.sun_xy_px
+            direction = np.array([(x - cx) / fx, (y - cy) / fy, 1.0])
+        return direction if direction is not None and direction[2] > 0 else None
+
+    @property
     def scale(self) -> float:
         """Factor from the pixels of a 1024 px wide image to this camera's."""
         return self.camera.width_px / REFERENCE_WIDTH_PX
@@ -222,8 +233,8 @@ class Fault:
 
     Which light has met the lens's rims is told by two more, for models of the step `electrons`. `adds_past_rims`
     (True: the light it adds has met them; `apply` puts it into `Electrons.past_rims` where the quantity has that
-    plane, and into `array` where it has not). `at_rims` (True: it acts at the rims, so that light past them stays
-    as it is). All other models act on all light alike (`act`).
+    plane, and into `array` where it has not). `at_rims` (True: it acts at the rims, so that light past them loses
+    only what `passed_to_sun` says). All other models act on all light alike (`act`).
     """
 
     fault: ClassVar[str]
@@ -293,6 +304,11 @@ class Fault:
 
         return act
 
+    def passed_to_sun(self, params: Params, context: FaultContext) -> float:
+        """Return the fraction of the light past the rims that a fault `at_rims` lets pass: of the Sun's beam, what
+        clears the openings that the fault has moved. The rims have had their part of that light before."""
+        return 1.0
+
     def footprint(self, params: Params, context: FaultContext) -> NDArray[np.bool_] | None:
         """bool[y, x], where the fault sits; None where the class has no footprint."""
         return None
@@ -356,7 +372,7 @@ def act(fault: Fault, light: Electrons, params: Params, context: FaultContext) -
         return fault.apply(light, params, context)
     rest = fault.apply(replace(light, past_rims=None), params, context)
     if fault.at_rims:
-        return replace(rest, past_rims=light.past_rims)
+        return replace(rest, past_rims=light.past_rims * np.float32(fault.passed_to_sun(params, context)))
     whole = fault.apply(light.merged, params, context)
     return replace(rest, past_rims=np.maximum(whole.array - rest.array, 0))
 

@@ -238,11 +238,9 @@ def _sun(context: FaultContext) -> tuple[float, float] | None:
     """The Sun's angle from the axis and azimuth in the picture, degrees; None where it gives no light."""
     if context.sun_xy_px is None or context.sun_visible_fraction == 0:
         return None
-    direction = context.sun_direction_C
-    if direction is None:  # a picture without a pose
-        fx, fy, cx, cy = context.camera.intrinsics
-        x, y = context.sun_xy_px
-        direction = np.array([(x - cx) / fx, (y - cy) / fy, 1.0])
+    direction = context.sun_before_camera
+    if direction is None:
+        return None
     theta = float(np.degrees(np.arctan2(np.hypot(direction[0], direction[1]), direction[2])))
     return (theta, float(np.degrees(np.arctan2(direction[1], direction[0])))) if theta < 89.9 else None
 

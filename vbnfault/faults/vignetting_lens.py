@@ -11,6 +11,10 @@ each ray for the area that it comes through in the plane of the first vertex. It
 Where the camera has a prescription the image is already formed by it, and only this share is applied. A thin lens
 has no vignetting: there the relative illumination E(θ) / E(0) of the named lens comes with it, natural and
 mechanical vignetting and distortion in one (`lens.imaging`); no cos⁴ falls on top. Both are those of the d line.
+
+The Sun's direct image and its straylight have met the lens's rims already, but neither the slipped ring nor the
+moved hood: they lose what the Sun's beam loses there, and no more. That one fraction stands for all ghosts, by
+whichever part of the front they enter, and for the veil of the scene, some hundredths of the scene's light.
 """
 
 from __future__ import annotations
@@ -94,6 +98,12 @@ class LensVignetting(LensFault):
         factor = _factor_once(params, context)
         return quantity.with_array(times(quantity.array, factor))
 
+    def passed_to_sun(self, params: Params, context: FaultContext) -> float:
+        """Return the fraction of the Sun's beam that clears ring and hood: direct image and straylight enter with
+        that beam."""
+        sun = context.sun_before_camera
+        return 1.0 if sun is None else share_left(params, context.frame, np.asarray(sun[:2] / sun[2]))
+
     def footprint(self, params: Params, context: FaultContext) -> NDArray[np.bool_]:
         """bool[y, x]: where the loss reaches `mask_loss`."""
         return np.asarray(_factor_once(params, context) <= np.float32(1 - params["mask_loss"]))
@@ -111,6 +121,15 @@ def factor(params: Params, frame: Frame) -> F32:
     """What is left of the light, float32[y, x] in [0, 1]."""
     left = _share_left(params, frame)
     return left if isinstance(frame.lens, RealLens) else left * _illumination(frame, params["lens"])
+
+
+def share_left(params: Params, frame: Frame, slope: F64) -> float:
+    """Return the fraction of one direction's beam that clears ring and hood; `slope` float64[2], its tangents to
+    the right and down, which may lie outside of the frame."""
+    beams = frame.beams(params["lens"])
+    stop_mm = beams.lens.surfaces[beams.lens.stop].semi_diameter_mm
+    x, y = np.asarray(slope, dtype=np.float64)[:, None]
+    return float(_left_of(params, beams, stop_mm, x, y)[0])
 
 
 @lru_cache(maxsize=2)
