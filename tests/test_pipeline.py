@@ -265,6 +265,7 @@ def test_geometry_scalars_agree_with_one_another(frames_: list[Frame]) -> None:
     for frame in frames_:
         sample = to_sample(frame)
         s = sample.scalars
+        assert s["lens"] == 0  # the index in a list of one name
         w, x, y, z = s["camera_from_T"]
         camera_from_T = Rotation.from_quat([x, y, z, w]).as_matrix()
         sun_C = camera_from_T @ s["sun_direction_T"]

@@ -506,6 +506,7 @@ def test_no_split_is_empty_and_classes_are_dealt_evenly(samples: int, sites: int
     [
         (["A", "AB"], True),  # B for A and B: the first split wins A, and B stays in both
         (["A", "A", "B"], False),  # B for A: the first split would lose B, its only one
+        (["A", "A", "B", "B"], False),  # nor does it matter that the other one has B to spare
         (["B", "B"], False),  # nobody has what it lacks
         (["A", "AC", "B", "C"], False),  # C is too rare to matter, and A costs B
     ],

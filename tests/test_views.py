@@ -302,7 +302,9 @@ def test_a_flown_pose_is_kept_with_its_sun_hidden_and_refused_within_the_ground(
         return frame
 
     up, down = np.array([0.0, 0.0, -1.0]), np.array([0.0, 0.0, 1.0])
-    assert at(500.0, [0, 0.1, -1], up).pose.resolved
+    seen = at(500.0, [0, 0.1, -1], up).pose
+    assert seen.resolved
+    assert seen.tries == 1  # nothing is drawn in its place
     assert not at(500.0, [0, 0.1, -1], down).pose.resolved  # behind the camera
     assert not at(500.0, [0, 0.1, 1], down).pose.resolved  # behind the body
     with pytest.raises(VbnfaultError, match=r"sample 0: .* is within geometry.clearance_m = 0.5 m of the ground"):
