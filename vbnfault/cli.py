@@ -75,6 +75,7 @@ def _exit_code() -> int:
     """Run the command of the command line, and turn its errors into a sentence."""
     try:
         code = app(standalone_mode=False)  # a command's typer.Exit comes back as its exit code
+        interrupts.check()
     except VbnfaultError as error:
         typer.echo(f"vbnfault: {error}", err=True)
         return error.exit_code
@@ -88,6 +89,7 @@ def _exit_code() -> int:
         typer.echo("vbnfault: not enough memory", err=True)
         return 1
     except Exception as error:
+        interrupts.check()
         # click's own usage errors (bad option, missing argument) know how to print themselves
         show = getattr(error, "show", None)
         if show is None:

@@ -19,6 +19,8 @@ _SIGNALS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP
 _OF_THE_TERMINAL = tuple(number for number in _SIGNALS if number != signal.SIGTERM)
 
 _winding_up: list[finishing] = []
+# Signals that were raised and have not ended the program yet: code in C may put another exception in their place.
+_raised: list[int] = []
 
 
 class Stopped(BaseException):
@@ -40,18 +42,37 @@ def exit_code(stop: BaseException) -> int:
 def raise_stopped(number: int, _frame: Any = None) -> None:
     """Handle a signal: raise `Stopped`, or make haste where the work is being wound up already."""
     if not _winding_up:
+        _raised.append(number)
         raise Stopped(number)
     for block in _winding_up:
         block.arrived(number)
+
+
+def check() -> None:
+    """Raise `Stopped` again where a signal was raised before.
+
+    To be called between steps of long work, and where any other exception is handled: it may be one that code in C
+    made of `Stopped`.
+    """
+    if _raised and threading.current_thread() is threading.main_thread():
+        raise Stopped(_raised[-1])
 
 
 @contextlib.contextmanager
 def interruptible() -> Iterator[None]:
     """Raise `Stopped` on a signal for the length of a block, where this is the main thread.
 
-    A signal that is ignored, as SIGHUP is under `nohup`, stays ignored.
+    A signal that is ignored, as SIGHUP is under `nohup`, stays ignored. One that arrives where Python drops every
+    exception, such as in a destructor, is raised at the next `check`.
     """
     before: dict[int, Any] = {}
+    unraisable, raised = sys.unraisablehook, _raised.copy()
+
+    def report(dropped: sys.UnraisableHookArgs) -> None:
+        if not isinstance(dropped.exc_value, Stopped):
+            unraisable(dropped)
+
+    sys.unraisablehook = report
     if threading.current_thread() is threading.main_thread():
         for number in _SIGNALS:
             if signal.getsignal(number) not in (signal.SIG_IGN, None, raise_stopped):
@@ -59,6 +80,8 @@ def interruptible() -> Iterator[None]:
     try:
         yield
     finally:
+        sys.unraisablehook = unraisable
+        _raised[:] = raised
         for number, handler in before.items():
             signal.signal(number, handler)
 

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from .. import stages
 from .. import store as store_module
 from ..errors import InputChanged, VbnfaultError
-from ..interrupts import finishing
+from ..interrupts import check, finishing
 from ..quantities import Sample
 from ..store import Encoded, Planned, SampleDigests, Store
 from .errors import BuildFailed
@@ -78,11 +78,13 @@ def work(simulate: Callable[[int], Sample], store: Store, task: Task, tick: Tick
             if i not in wanted:
                 tick(i, "kept", checked.digests[i].hex())
         for i in sorted(wanted - task.skip, key=lambda i: (task.sites[i - samples.start], i)):
+            check()
             tick(i, "begun", "")
             try:
                 with stages.told_to(functools.partial(tick, i, "stage")):
                     encoded = store_module.encode(store.spec, simulate(i))
             except Exception as error:
+                check()
                 tick(i, "failed", describe(error))
                 continue
             made[i] = encoded
@@ -228,6 +230,7 @@ class Lazy:
             except VbnfaultError as error:
                 raise Fatal(error) from error
             except Exception as error:
+                check()
                 raise Fatal(VbnfaultError(describe(error).splitlines()[0])) from error
         try:
             return self._session.simulate(index)

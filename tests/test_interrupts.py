@@ -1,0 +1,95 @@
+"""Signals that arrive in odd moments end a command all the same: with one sentence, and nothing half written."""
+
+from __future__ import annotations
+
+import signal
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+from test_build import SAMPLES, Session
+from test_build import run as build
+from test_cli import run
+
+from vbnfault import resources, store
+from vbnfault.jobs.errors import Interrupted
+from vbnfault.quantities import Sample
+
+SENTENCE = "vbnfault: interrupted; what was written stays; repeat the command to go on\n"
+NUMBERS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+
+
+@pytest.fixture(autouse=True)
+def handlers() -> Iterator[None]:
+    """A command that is interrupted leaves the terminal's signals ignored, which here would last."""
+    before = [signal.getsignal(number) for number in NUMBERS]
+    yield
+    for number, handler in zip(NUMBERS, before, strict=True):
+        signal.signal(number, handler)
+
+
+def in_a_destructor(number: int) -> None:
+    """Python reports and drops what a destructor raises."""
+
+    class Passing:
+        def __del__(self) -> None:
+            signal.raise_signal(number)
+
+    Passing()
+
+
+def replaced(number: int) -> None:
+    """Code in C replaces exceptions, as matplotlib's Agg does while it draws a lens."""
+    try:
+        signal.raise_signal(number)
+    except BaseException:
+        raise ValueError("Invalid bounding box") from None
+
+
+@pytest.mark.parametrize("number", NUMBERS)
+@pytest.mark.parametrize("arrive", [signal.raise_signal, in_a_destructor, replaced])
+def test_a_signal_ends_a_command_wherever_it_arrives(
+    arrive: Callable[[int], None],
+    number: int,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    signal.signal(number, signal.default_int_handler)  # also where the tests run under nohup
+
+    def interrupted(_: str) -> dict[str, Path]:
+        arrive(number)
+        return {}
+
+    hook = sys.unraisablehook
+    monkeypatch.setattr(resources, "packaged", interrupted)
+    assert run(monkeypatch, "list", "lenses") == 128 + number
+    assert capsys.readouterr().err == SENTENCE
+    assert sys.unraisablehook is hook
+    # and it is forgotten
+    monkeypatch.setattr(resources, "packaged", lambda _: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        run(monkeypatch, "list", "lenses")
+
+
+@pytest.mark.parametrize("arrive", [in_a_destructor, replaced])
+def test_a_sample_never_fails_of_a_signal(
+    arrive: Callable[[int], None], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    simulate = Session.simulate
+
+    def interrupted(self: Session, index: int) -> Sample:
+        if index == 6:
+            arrive(signal.SIGTERM)
+        return simulate(self, index)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Session, "simulate", interrupted)
+        with pytest.raises(Interrupted, match=r"interrupted; \d+ of 18 samples are finished") as stopped:
+            build(tmp_path / "s.zarr")
+    assert stopped.value.exit_code == 128 + signal.SIGTERM
+    finished = store.open_store(tmp_path / "s.zarr").finished()
+    assert f" {finished} of 18 samples" in str(stopped.value)
+    assert 2 <= finished < SAMPLES  # 4 and 5 at least: of the first shard, as sites come
+    assert build(tmp_path / "s.zarr").built == SAMPLES - finished
+    assert not list((tmp_path / "s.zarr").rglob("*.partial"))
