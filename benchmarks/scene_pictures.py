@@ -61,8 +61,12 @@ def grid(rows: list[list[U8]], tile_px: int) -> U8:
 
 def flares() -> U8:
     """Three samples by the three models of straylight, a row a model."""
-    models = ("traced", "paraxial", "texture")
-    rows = [frames("flares", FLARES, {"faults.straylight.model": model}) for model in models]
+    models: list[dict[str, Any]] = [
+        {},  # traced
+        {"faults.straylight.model": "paraxial"},
+        {"faults.straylight": {"model": "texture"}},  # which has no coating
+    ]
+    rows = [frames("flares", FLARES, model) for model in models]
     return grid([[rgb(frame, "image") for frame in row] for row in rows], 360)
 
 
