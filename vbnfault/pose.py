@@ -87,10 +87,7 @@ class _Views:
             for sun, d in zip(directions, drawn, strict=True)
         ]
         position = np.column_stack([x, y, -height])
-        visible = render.sun_visible_fraction(spec.terrain.surface, position, suns)
-        if spec.terrain.vehicle is not None:
-            sun_B = np.stack([a.T @ d for a, d in zip(axes, directions, strict=True)])
-            visible = np.where(spec.terrain.vehicle.blocked(sun_B), 0.0, visible)
+        visible = render.sun_visible_fraction(spec.terrain.surface, position, suns, np.stack(axes))
         return _Views(
             variables=drawn,
             ground_m=ground,
@@ -203,9 +200,8 @@ def _on_the_trajectory(spec: SampleSpec) -> Pose:
     L_from_T = site.T_from_L.T
     position = L_from_T @ (placed.camera_position_T_m - site.position_T_m)
     axes, sun_L = L_from_T @ placed.T_from_C, L_from_T @ T_from_J @ frames.unit(sun_J_au)
-    visible = float(render.sun_visible_fraction(surface, position[None], [world.sunlight(scene, sun_L)])[0])
-    if spec.terrain.vehicle is not None and spec.terrain.vehicle.blocked((axes.T @ sun_L)[None])[0]:
-        visible = 0.0
+    light = world.sunlight(scene, sun_L)
+    visible = float(render.sun_visible_fraction(surface, position[None], [light], axes[None])[0])
     azimuth, elevation = frames.azimuth_elevation_deg(sun_L)
     clearance = scene.geometry.clearance_m
     if not render.is_clear(surface, position[None], clearance)[0]:

@@ -50,6 +50,10 @@ class Vehicle:
         record = dr.gather(mi.Vector4f, self._facets, index, active)
         return mi.Vector3f(record.xyz), mi.UInt32(record.w)
 
+    def occluded(self, rays: Any, active: Any, *, coherent: bool = True) -> Any:
+        """Return whether any part lies along rays in B."""
+        return self.scene.ray_test(rays, coherent, active)
+
     def albedo(self, material: Any, active: Any) -> list[Any]:
         """Reflectance per band."""
         return [dr.gather(mi.Float, band, material, active) for band in self._reflectance]
@@ -83,7 +87,7 @@ class World:
 
     def occluded(self, rays: Any, active: Any, *, coherent: bool = True) -> Any:
         """Whether anything lies along the rays."""
-        behind = self.vehicle.scene.ray_test(self._in_B(rays), coherent, active)
+        behind = self.vehicle.occluded(self._in_B(rays), active, coherent=coherent)
         return behind | self.surface.occluded(rays, active & ~behind, coherent=coherent)
 
     def _in_B(self, rays: Any) -> Any:
