@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import itertools
+import shlex
 from pathlib import Path
 
 import numpy as np
 import pytest
 import xarray
 
-from vbnfault import config, dataset, resources, store
+from vbnfault import cli, config, dataset, pipeline, resources, store
 
 # Small images over coarse ground: the scene's own camera, faults and bounds of geometry stay.
 _SMALL = {"camera.width_px": 64, "camera.height_px": 64, "render.samples_per_pixel": 4, "dataset.sites": 1}
@@ -38,3 +40,14 @@ def test_every_packaged_scene_builds_a_store_that_verifies(name: str, tmp_path: 
         assert np.asarray(data["done"].values).all()
         for variable in data.data_vars.values():
             variable.load()
+
+
+@pytest.mark.parametrize("name", sorted(resources.packaged("scenes")))
+def test_the_commands_in_a_scenes_comments_are_accepted(name: str) -> None:
+    """Each `--set` that a scene file shows names keys and values that its faults take."""
+    text = (resources.data_dir("scenes") / f"{name}.toml").read_text(encoding="utf-8")
+    shown = [shlex.split(line.lstrip("# ")) for line in text.splitlines() if line.startswith("#     vbnfault ")]
+    for words in shown:
+        assert words[2] == name
+        settings = [value for option, value in itertools.pairwise(words) if option == "--set"]
+        pipeline.configure_faults(cli._scene(name, settings), name)
