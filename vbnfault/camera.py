@@ -114,7 +114,7 @@ class Camera:
 
     @property
     def distortion_residual_px(self) -> tuple[float, float]:
-        """What those leave of the lens's own map over the frame: root mean square and largest."""
+        """How far those lie from the lens's chief rays over the lit frame: root mean square and largest."""
         return self.lens.distortion_residual_px if isinstance(self.lens, RealLens) else (0.0, 0.0)
 
     @property

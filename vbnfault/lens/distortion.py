@@ -10,6 +10,8 @@ k1, k2, p1, p2, k3, k4, k5, k6. Lenses here have rotational symmetry: p1 = p2 = 
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -18,55 +20,119 @@ F64 = NDArray[np.float64]
 COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 
 # A denominator of lower degree is kept where it leaves no more than this: its coefficients are better determined.
-_ENOUGH_PX = 0.005
-# The denominator stays above this, up to that many times the widest slope: a pole near the field would throw points
-# just outside the frame across it.
+_ENOUGH_PX = 0.001
+# Where no model follows the lens's own heights and goes on without folding, the outermost of them count less, until
+# the others are met to this.
+_FOLLOWED_PX = 0.01
+_FOLLOWED = tuple(k / 16 for k in range(16, 7, -1))  # fractions of the angle of the last height
+_WEIGHTS = (1.0, 0.1, 0.01, 1e-3, 1e-4, 1e-5)  # of heights that count less
+# The denominator stays above this, and distances rise, up to that many times the widest slope: points just outside
+# the frame must not be thrown across it.
 _LEAST_DENOMINATOR = 0.1
 _BEYOND = 1.1
+# Range of d ln d / d ln t. Below 0 the image folds; from 2 on the iteration t ← d0 / (d(t) / t), by which
+# `cv2.undistortPoints` inverts the model, does not converge: its error grows by the factor 1 - d ln d / d ln t.
+_EXPONENTS = (0.1, 1.9)
+_CHECKED = 513
 _STEPS = 12
 
 
-def distances(coefficients: F64, slope: F64) -> F64:
-    """Return distances from the axis in focal lengths, float64 like `slope`, of tangents of field angles.
+@dataclass(frozen=True, kw_only=True, eq=False)
+class RadialModel:
+    """The model with its coefficients, float64[8] as OpenCV orders them, from the axis to the slope `end`."""
 
-    `coefficients` float64[8] as OpenCV orders them.
+    coefficients: F64
+    end: float
+
+    def distance(self, slope: F64) -> F64:
+        """Return distances from the axis in focal lengths, float64 like `slope`, of tangents of field angles."""
+        above, below = self._parts
+        square = slope * slope
+        return np.asarray(slope * _polynomial(above, square) / _polynomial(below, square))
+
+    def rise(self, slope: F64) -> F64:
+        """Return the derivative of `distance`, float64 like `slope`."""
+        square = slope * slope
+        (n, dn), (d, dd) = ((_polynomial(c, square), _derivative(c, square)) for c in self._parts)
+        return np.asarray(n / d + 2 * square * (dn * d - n * dd) / (d * d))
+
+    def reaches(self, distance: float) -> bool:
+        """Return whether the model goes out to a distance from the axis in focal lengths without a pole or a fold,
+        and can be inverted by iteration on the way."""
+        slope = np.linspace(0, _BEYOND * self.end, _CHECKED)[1:]
+        if not _polynomial(self._parts[1], slope * slope).min() >= _LEAST_DENOMINATOR:
+            return False
+        found, rise, inside = self.distance(slope), self.rise(slope), slope <= self.end
+        exponent = slope[inside] * rise[inside] / found[inside]
+        return bool(
+            found.min() > 0
+            and rise.min() > 0
+            and _EXPONENTS[0] <= exponent.min() <= exponent.max() <= _EXPONENTS[1]
+            and self.distance(np.array(self.end)) >= distance
+        )
+
+    @property
+    def _parts(self) -> tuple[F64, F64]:
+        """Coefficients of numerator and denominator."""
+        k = self.coefficients
+        return k[[0, 1, 4]], k[5:]
+
+
+def fitted(slope: F64, distance: F64, focal_length_px: float, *, known: int, reach: float) -> RadialModel | None:
+    """Return the model that comes nearest to the distances of the slopes given and can be inverted; None where none
+    does.
+
+    Parameters
+    ----------
+    slope, distance
+        float64[n], rising, above 0: tangents of field angles, and distances from the axis in focal lengths.
+    known
+        How many of them, at least 8, are the lens's own; the others say how the model may go on.
+    reach
+        Distance that the model must reach, in focal lengths; at most the last of `distance`.
     """
-    k1, k2, _, _, k3, *below = coefficients
-    square = slope * slope
-    return np.asarray(slope * _polynomial((k1, k2, k3), square) / _polynomial(below, square))
+    angle, order = np.arctan(slope), np.arange(len(slope))
+    spare = None
+    for followed in _FOLLOWED:
+        inner = (order < known) & (angle <= followed * angle[known - 1])
+        found = []
+        for degree in range(4):
+            for weight in _WEIGHTS[: 1 if inner.all() else None]:
+                coefficients = _of_degree(slope, distance, degree, np.where(inner, 1.0, weight))
+                if coefficients is None:
+                    continue
+                model = RadialModel(coefficients=coefficients, end=float(slope[-1]))
+                if not model.reaches(reach):
+                    continue
+                off_px = np.abs(model.distance(slope) - distance)[:known] * focal_length_px
+                entry = max(float(off_px.max()), _ENOUGH_PX), degree, -weight, model
+                if off_px[inner[:known]].max() <= _FOLLOWED_PX:
+                    found.append(entry)
+                spare = entry if spare is None else min(spare, entry, key=lambda e: e[:3])
+        if found:
+            return min(found, key=lambda e: e[:3])[3]
+    return spare[3] if spare else None
 
 
-def fitted(slope: F64, distance: F64, focal_length_px: float) -> F64:
-    """Return the coefficients, float64[8], that come nearest to the distances of the slopes given.
-
-    `slope`, `distance` float64[n], n at least 8, rising, above 0: tangents of field angles, and distances from the
-    axis in focal lengths.
-    """
-    found = []
-    for degree in range(4):
-        coefficients = _of_degree(slope, distance, degree)
-        if coefficients is None:
-            continue
-        square = np.linspace(0, (_BEYOND * slope[-1]) ** 2, 257)
-        if degree and not _polynomial(coefficients[5:], square).min() >= _LEAST_DENOMINATOR:
-            continue
-        left = float(np.abs(distances(coefficients, slope) - distance).max()) * focal_length_px
-        if left <= _ENOUGH_PX:
-            return coefficients
-        found.append((left, degree, coefficients))
-    return min(found, key=lambda entry: entry[:2])[2]
-
-
-def _polynomial(coefficients: tuple[float, ...] | list[float] | F64, square: F64) -> F64:
-    """1 + Σ c_k squareᵏ."""
+def _polynomial(coefficients: F64, square: F64) -> F64:
+    """Return 1 + Σ c_k squareᵏ."""
     total = np.zeros_like(square)
     for c in coefficients[::-1]:
         total = (total + c) * square
     return np.asarray(1 + total)
 
 
-def _of_degree(slope: F64, distance: F64, degree: int) -> F64 | None:
-    """The least squares of the model with a denominator of that degree in t²; None where it is not determined.
+def _derivative(coefficients: F64, square: F64) -> F64:
+    """Return Σ k c_k squareᵏ⁻¹."""
+    total = np.zeros_like(square)
+    for k, c in reversed(list(enumerate(coefficients, 1))):
+        total = total * square + k * c
+    return np.asarray(total)
+
+
+def _of_degree(slope: F64, distance: F64, degree: int, weight: F64) -> F64 | None:
+    """Return coefficients by weighted least squares, the denominator of that degree in t²; None where they are not
+    determined.
 
     Linear in the coefficients once it is multiplied by the denominator; the weights take that back, step by step
     (Sanathanan and Koerner 1963, IEEE Trans. Automatic Control 8, 56).
@@ -77,7 +143,7 @@ def _of_degree(slope: F64, distance: F64, degree: int) -> F64 | None:
     below = np.ones_like(slope)
     solution = np.zeros(3 + degree)
     for _ in range(_STEPS if degree else 1):
-        found = _least_squares(columns / below[:, None], (distance - slope) / below)
+        found = _least_squares(columns * (weight / below)[:, None], (distance - slope) * weight / below)
         if found is None:
             return None
         solution = found

@@ -4,7 +4,7 @@ A render on the grid of a pinhole camera, with a guard band around the frame, be
 
     radiance ─ resampled, each band where it lands ─ × transmission and solid angle ─ ∗ point spread ─▶ irradiance
 
-- Chief rays, through the middle of the real stop, give the height of the image h(θ, λ).
+- Chief rays, through the middle of the real stop, give the height of the image h(θ, λ); see `mapping`.
 - The bundle that passes all rims gives the light. A field of radiance L at the angle θ sends L A cos θ dΩ through
   the area A that the bundle takes in the plane of the first vertex, and it lands on dA = h dh dφ: with t = tan θ
 
@@ -27,19 +27,19 @@ from functools import cached_property, lru_cache
 import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.interpolate import CubicSpline, PchipInterpolator
+from scipy.interpolate import PchipInterpolator
 from scipy.special import ndtr
 
 from ..errors import InputError
 from ..quantities import Irradiance, Radiance
 from ..sundisc import Floats, add_mean, pixel_sums
-from . import distortion
 from .aperture import axial_beam_diameter_mm
+from .distortion import RadialModel
 from .first_order import first_order
 from .glass import D_NM
+from .mapping import ChiefHeights, FieldMap, camera_model, chief_heights, fan_heights_mm, field_map, inclined_rays
 from .paraxial import axial_transmittance
 from .prescription import Prescription
-from .trace import Path, trace
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -49,13 +49,10 @@ REACH_PX = 7
 # A point spread with a smaller root-mean-square radius leaves a pixel's light where it is.
 _SHARP_PX = 0.3
 
-_FITTED = 256  # distances at which the coefficients of distortion are fitted
 _ANGLES = 65  # field angles of the tables
 _BEYOND = 1.6  # of the frame's corner, as a tangent: how far the tables reach
-_STEEPNESS = (0.3, 3.0)  # of the map of the field beyond its last chief ray: dh/dt in focal lengths
-_HEIGHTS = 129  # of a meridional fan
+_HEIGHTS = 129  # of a narrower meridional fan
 _RAYS_OF_BEAM = 4  # of them that the beam along the axis takes at least
-_SECANT_STEPS = 7
 _AZIMUTHS = 32  # of half a bundle
 _RADII = 33  # samples along which a bundle's rim is sought, then
 _FINE_RADII = 9  # within the interval found
@@ -75,55 +72,6 @@ _DIRECT_TAPS = 121  # OpenCV filters with more by Fourier transforms, which spre
 
 
 # --- rays ------------------------------------------------------------------------------------------------------
-
-
-def _rays(
-    lens: Prescription, slope: F64, x: F64, y: F64, wavelength_nm: float, sensor_mm: float
-) -> tuple[Path, tuple[int, ...]]:
-    """Rays that cross the first vertex's plane at (x, y) with the slope dx/dz; and the arguments' common shape."""
-    slope, x, y = np.broadcast_arrays(slope, x, y)
-    nothing = np.zeros(x.size)
-    found = trace(
-        lens,
-        np.column_stack([x.ravel(), y.ravel(), nothing]),
-        np.column_stack([slope.ravel(), nothing, nothing + 1]),
-        wavelength_nm=wavelength_nm,
-        sensor_mm=sensor_mm,
-    )
-    return found, x.shape
-
-
-def _fan_heights_mm(lens: Prescription, slope: F64) -> F64:
-    """Heights in the first vertex's plane, float64[angle, height], of which some meet all of the first surface."""
-    first = lens.surfaces[0]
-    reach = first.semi_diameter_mm + np.abs(first.sag_mm(first.semi_diameter_mm)) * slope
-    return np.asarray(reach[:, None] * np.linspace(-1, 1, _HEIGHTS))
-
-
-def chief_heights_mm(lens: Prescription, slope: F64, *, wavelength_nm: float, sensor_mm: float) -> F64:
-    """Where chief rays meet the sensor, float64[n] mm from the axis; nan where there is none.
-
-    `slope` float64[n]: tangents of the field angles. A chief ray passes the middle of the stop; it is found in a
-    fan of exact rays and then by the secant method, and may itself be beyond a rim.
-    """
-    heights = _fan_heights_mm(lens, slope)
-    row = 1 + lens.stop
-    found, shape = _rays(lens, slope[:, None], heights, np.zeros(1), wavelength_nm, sensor_mm)
-    off = np.where(np.isfinite(found.points_mm[-1, :, 0]), found.points_mm[row, :, 0], np.nan).reshape(shape)
-    outside = found.relative_radius.reshape(shape)
-    with np.errstate(invalid="ignore"):
-        through = off[:, :-1] * off[:, 1:] <= 0
-    k = np.argmin(np.where(through, outside[:, :-1], np.inf), axis=1)
-    at = np.arange(len(slope))
-    a, b, off_a, off_b = heights[at, k], heights[at, k + 1], off[at, k], off[at, k + 1]
-    for _ in range(_SECANT_STEPS):
-        with np.errstate(invalid="ignore", divide="ignore"):
-            next_ = np.where(off_b == off_a, b, b - off_b * (b - a) / (off_b - off_a))
-        found, _ = _rays(lens, slope, next_, np.zeros(1), wavelength_nm, sensor_mm)
-        a, off_a, b, off_b = b, off_b, next_, found.points_mm[row, :, 0]
-    # what has not settled is no ray through the middle
-    settled = through.any(axis=1) & (np.abs(off_b) < 1e-6 * lens.surfaces[lens.stop].semi_diameter_mm)
-    return np.where(settled, found.points_mm[-1, :, 0], np.nan)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -150,11 +98,11 @@ def _beams(lens: Prescription, slope: F64) -> _Beams:
     sensor = first_order(lens).bfd_mm
 
     def beyond(x: F64, y: F64) -> F64:
-        found, shape = _rays(lens, slope.reshape(-1, *(1,) * (x.ndim - 1)), x, y, D_NM, sensor)
+        found, shape = inclined_rays(lens, slope.reshape(-1, *(1,) * (x.ndim - 1)), x, y, D_NM, sensor)
         lost = ~np.isfinite(found.points_mm[-1, :, 0])
         return np.where(lost, np.inf, found.relative_radius).reshape(shape)
 
-    heights = _fan_heights_mm(lens, slope)
+    heights = fan_heights_mm(lens, slope)
     outside = beyond(heights, np.zeros(1))
     at = np.arange(len(slope))
     # the beam of a stop closed far fits between two rays of the fan: narrower fans about the ray nearest to passing
@@ -216,7 +164,7 @@ def _spots(lens: Prescription, beams: _Beams, wavelength_nm: float, sensor_mm: f
     distance = (beams.rim_mm[:, :, None] * ring).reshape(len(beams.slope), -1)
     turn = np.repeat(azimuth, _RINGS)
     x, y = beams.centre_mm[:, None] + distance * np.cos(turn), distance * np.sin(turn)
-    found, shape = _rays(lens, beams.slope[:, None], x, y, wavelength_nm, sensor_mm)
+    found, shape = inclined_rays(lens, beams.slope[:, None], x, y, wavelength_nm, sensor_mm)
     weight = np.repeat(beams.rim_mm**2, _RINGS, axis=1)
     lost = ~np.isfinite(found.points_mm[-1, :, 0]).reshape(shape)
     slope = found.directions[:, :2] / found.directions[:, 2:]
@@ -228,24 +176,6 @@ def _spots(lens: Prescription, beams: _Beams, wavelength_nm: float, sensor_mm: f
 
 
 # --- the lens --------------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Map:
-    """Heights of the image over the slope of the field at one wavelength, dense; straight on beyond the table."""
-
-    slope: F64
-    height_mm: F64
-    rise_mm: F64  # dh/dt
-    end: float  # slope of the last chief ray
-
-    def height(self, slope: F64) -> F64:
-        beyond = np.maximum(slope - self.slope[-1], 0)
-        return np.asarray(np.interp(slope, self.slope, self.height_mm) + beyond * self.rise_mm[-1])
-
-    def slope_at(self, height_mm: F64) -> F64:
-        beyond = np.maximum(height_mm - self.height_mm[-1], 0)
-        return np.asarray(np.interp(height_mm, self.height_mm, self.slope) + beyond / self.rise_mm[-1])
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -287,7 +217,7 @@ class RealLens:
         """Image height over the tangent of the field angle near the axis, at the d line: the EFL where the sensor
         stands at the paraxial focus."""
         efl = first_order(self._round).efl_mm
-        return efl if self.focus == "paraxial" else float(self._map(D_NM).rise_mm[0])
+        return efl if self.focus == "paraxial" else float(self._chief_rays.rise_mm(np.zeros(1))[0])
 
     @cached_property
     def f_number(self) -> float:
@@ -350,20 +280,21 @@ class RealLens:
         """Tangents of the field angles seen at distances from the axis in focal lengths; float64 alike."""
         return self._map(wavelength_nm).slope_at(distance * self.focal_length_mm)
 
-    @cached_property
+    @property
     def distortion(self) -> F64:
-        """OpenCV's k1, k2, p1, p2, k3, k4, k5, k6 at the d line, float64[8], fitted over the lit part of the frame;
-        p1 = p2 = 0."""
-        farthest = self._distances[self._lit].max()
-        distance = np.linspace(0, farthest, _FITTED + 1)[1:]
-        return distortion.fitted(self.undistorted(distance), distance, self.focal_length_px)
+        """OpenCV's k1, k2, p1, p2, k3, k4, k5, k6 at the d line, float64[8]; p1 = p2 = 0. They are the map between
+        field angles and the frame: `distorted` and `undistorted` follow them."""
+        return self._model.coefficients
 
     @cached_property
     def distortion_residual_px(self) -> tuple[float, float]:
-        """What `distortion` leaves of the exact map: root mean square and largest, pixels over the lit frame."""
-        distance = self._distances[self._lit]
-        left = (distortion.distances(self.distortion, self.undistorted(distance)) - distance) * self.focal_length_px
-        return float(np.sqrt(np.mean(left**2))), float(np.abs(left).max())
+        """How far `distortion` lies from the lens's chief rays: root mean square and largest, pixels over as much
+        of the lit frame as has chief rays."""
+        slope = self.undistorted(self._distances[self._lit])
+        slope = slope[slope <= self._chief_rays.end]
+        apart = self._model.distance(slope) - self._chief_rays.height_mm(slope) / self.focal_length_mm
+        off_px = np.abs(apart) * self.focal_length_px
+        return float(np.sqrt(np.mean(off_px**2))), float(off_px.max())
 
     @cached_property
     def _distances(self) -> F64:
@@ -403,8 +334,9 @@ class RealLens:
         focal length: for light from outside that distortion and point spread bring in. Raises InputError for a lens
         that sees much more than the render of a pinhole camera of its focal length can hold."""
         mapped = self._map(D_NM)
-        if self._beams.area_mm2[-1] > 0 and mapped.height_mm[-1] < self._corner * self.focal_length_mm:
-            angle = np.degrees(np.arctan(mapped.slope[-1]))
+        farthest = self._slopes[-1]
+        if self._beams.area_mm2[-1] > 0 and mapped.height(farthest) < self._corner * self.focal_length_mm:
+            angle = np.degrees(np.arctan(farthest))
             raise InputError(
                 f"{self.name}: camera.fov_deg: barrel distortion brings light from beyond {angle:.0f} degrees into "
                 "the corners, which the render has not; it must be smaller"
@@ -467,10 +399,32 @@ class RealLens:
         together, alone = (spots.mean((v * slope).sum(axis=-1)) for v in (place, slope))
         return float(-(light @ together) / (light @ alone))
 
-    def _map(self, wavelength_nm: float) -> _Map:
+    @cached_property
+    def _chief_rays(self) -> ChiefHeights:
+        """Those of the d line."""
+        return self._chief_rays_at(D_NM)
+
+    def _chief_rays_at(self, wavelength_nm: float, within: float = np.inf) -> ChiefHeights:
+        lens = self._round
+        return chief_heights(
+            lens,
+            self._slopes,
+            wavelength_nm=wavelength_nm,
+            sensor_mm=self.sensor_mm,
+            efl_mm=first_order(lens).efl_mm,
+            within=within,
+        )
+
+    @cached_property
+    def _model(self) -> RadialModel:
+        """Distortion of the frame, point spread's reach included."""
+        pixels = self.focal_length_px
+        return camera_model(self._chief_rays, self.focal_length_mm, self._most_px / pixels, pixels, self.name)
+
+    def _map(self, wavelength_nm: float) -> FieldMap:
         return _map(self, float(wavelength_nm))
 
-    def _solid_angle_sr(self, mapped: _Map) -> F64:
+    def _solid_angle_sr(self, mapped: FieldMap) -> F64:
         """Irradiance over radiance without losses, float64 like `mapped.slope`."""
         slope = mapped.slope
         area = self._beam_mm2(slope)
@@ -482,7 +436,8 @@ class RealLens:
     def _beam_mm2(self, slope: F64) -> F64:
         """Area of the beam that passes all rims, float64 like `slope`, which rises."""
         beams = self._beams
-        area = np.maximum(PchipInterpolator(beams.slope, beams.area_mm2, extrapolate=True)(slope), 0)
+        traced = np.clip(slope, beams.slope[0], beams.slope[-1])
+        area = np.maximum(PchipInterpolator(beams.slope, beams.area_mm2)(traced), 0)
         dark = beams.area_mm2 == 0
         if dark.any():  # the last of the light goes linearly
             first = int(np.argmax(dark))
@@ -652,32 +607,12 @@ def _key(wavelength_nm: F64) -> tuple[float, ...]:
 
 
 @lru_cache(maxsize=64)
-def _map(lens: RealLens, wavelength_nm: float) -> _Map:
-    slope = lens._slopes
-    height = chief_heights_mm(lens._round, slope, wavelength_nm=wavelength_nm, sensor_mm=lens.sensor_mm)
-    efl = first_order(lens._round).efl_mm
-    with np.errstate(invalid="ignore"):
-        good = np.diff(height) > _STEEPNESS[0] * efl * np.diff(slope)
-    # no chief ray, or one that turns back: a lens beyond its field. Colours go on side by side.
-    last = len(slope) - 1 if good.all() else int(np.argmin(good))
-    main = None if wavelength_nm == D_NM else lens._map(D_NM)
-    end = slope[last] if main is None else min(slope[last], main.end)
-    last = int(np.searchsorted(slope, end))
-    if last < 3:
-        angle = np.degrees(np.arctan(end))
-        raise InputError(
-            f"{lens.name}: no ray through the middle of the stop comes from beyond {angle:.2g} degrees"
-        )
-    # h / t is even in t
-    ratio = CubicSpline(slope[: last + 1], height[: last + 1] / slope[: last + 1], bc_type=((1, 0.0), "not-a-knot"))
-    dense = np.linspace(0, slope[-1], _DENSE)
-    known = np.minimum(dense, end)
-    rise = ratio(known) + known * ratio(known, 1)
-    onward = np.clip(rise[-1], _STEEPNESS[0] * efl, _STEEPNESS[1] * efl) if main is None else main.rise_mm[-1]
-    rise[dense > end] = onward
-    return _Map(
-        slope=dense, height_mm=known * ratio(known) + (dense - known) * onward, rise_mm=rise, end=float(end)
-    )
+def _map(lens: RealLens, wavelength_nm: float) -> FieldMap:
+    main = lens._chief_rays
+    if wavelength_nm != D_NM:
+        return lens._map(D_NM).shifted(lens._chief_rays_at(wavelength_nm, within=main.end), main)
+    slope = np.linspace(0, max(lens._slopes[-1], lens._model.end), _DENSE)
+    return field_map(slope, main, lens._model, lens.focal_length_mm)
 
 
 @lru_cache(maxsize=8)

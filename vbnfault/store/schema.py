@@ -183,9 +183,9 @@ class StoreSpec:
     `without_<fault>`. `shard_samples` 0 chooses the most, up to
     16, that keeps the largest array of a shard within 1 GiB and all of them within 2 GiB; a larger one is
     lowered to its largest divisor that does. `attributes`: JSON-able root attributes. Raises InputError for
-    names that do not exist. `distortion_residual_px`: root mean square and largest deviation of the coefficients
-    of distortion from the lens's own map, over the frame. `attitude_references`: the direction that roll, pitch and
-    yaw count from in each of `STRATA`, "sun" or "nadir".
+    names that do not exist. `distortion_residual_px`: root mean square and largest deviation of the
+    coefficients of distortion from the lens's chief rays, over the lit frame. `attitude_references`: the
+    direction that roll, pitch and yaw count from in each of `STRATA`, "sun" or "nadir".
     """
 
     height: int

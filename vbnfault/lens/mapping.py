@@ -1,0 +1,205 @@
+"""The map from field angles to heights in the image, from chief rays, and the camera's model fitted to it.
+
+A chief ray passes through the middle of the stop. Chief rays end where one misses a surface or is totally
+reflected. Near that end their heights may rise without limit or turn back, which those of the light that passes
+the rims do not. So a camera's geometry at the d line is the model of `distortion`, fitted to the chief rays and
+continued smoothly past them to the frame's corners: light, truth and the stored coefficients then agree wherever a
+pixel is. Outside the frame, and for the shift of one colour against another, chief rays count as they are.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
+
+from ..errors import InputError
+from .distortion import RadialModel, fitted
+from .prescription import Prescription
+from .trace import Path, trace
+
+F64 = NDArray[np.float64]
+
+_STEEPNESS = 0.3  # of the heights of chief rays over the slope, in focal lengths: below it they turn back
+_ONWARD = (0.3, 1.5)  # range of that steepness past the last chief ray
+_HEIGHTS = 129  # of a meridional fan
+_SECANT_STEPS = 7
+_KNOWN, _CONTINUED = 192, 64  # field angles of the fit with and without a chief ray
+_PAST_CORNER = 1.02  # of the corner's distance from the axis: how far the model is fitted
+
+
+def inclined_rays(
+    lens: Prescription, slope: F64, x: F64, y: F64, wavelength_nm: float, sensor_mm: float
+) -> tuple[Path, tuple[int, ...]]:
+    """Trace rays that cross the first vertex's plane at (x, y) mm with the slope dx/dz; return their paths and the
+    arguments' common shape."""
+    slope, x, y = np.broadcast_arrays(slope, x, y)
+    nothing = np.zeros(x.size)
+    path = trace(
+        lens,
+        np.column_stack([x.ravel(), y.ravel(), nothing]),
+        np.column_stack([slope.ravel(), nothing, nothing + 1]),
+        wavelength_nm=wavelength_nm,
+        sensor_mm=sensor_mm,
+    )
+    return path, x.shape
+
+
+def fan_heights_mm(lens: Prescription, slope: F64) -> F64:
+    """Return heights in the first vertex's plane, float64[angle, height] mm, of rays that between them meet all of
+    the first surface."""
+    first = lens.surfaces[0]
+    reach = first.semi_diameter_mm + np.abs(first.sag_mm(first.semi_diameter_mm)) * slope
+    return np.asarray(reach[:, None] * np.linspace(-1, 1, _HEIGHTS))
+
+
+def chief_heights_mm(lens: Prescription, slope: F64, *, wavelength_nm: float, sensor_mm: float) -> F64:
+    """Return where chief rays meet the sensor, float64[n] mm from the axis; nan where there is none.
+
+    `slope` float64[n]: tangents of the field angles. A chief ray passes the middle of the stop; it is sought in a
+    fan of exact rays and then by the secant method, and may itself be beyond a rim.
+    """
+    heights = fan_heights_mm(lens, slope)
+    row = 1 + lens.stop
+    path, shape = inclined_rays(lens, slope[:, None], heights, np.zeros(1), wavelength_nm, sensor_mm)
+    off = np.where(np.isfinite(path.points_mm[-1, :, 0]), path.points_mm[row, :, 0], np.nan).reshape(shape)
+    outside = path.relative_radius.reshape(shape)
+    with np.errstate(invalid="ignore"):
+        through = off[:, :-1] * off[:, 1:] <= 0
+    k = np.argmin(np.where(through, outside[:, :-1], np.inf), axis=1)
+    at = np.arange(len(slope))
+    a, b, off_a, off_b = heights[at, k], heights[at, k + 1], off[at, k], off[at, k + 1]
+    for _ in range(_SECANT_STEPS):
+        with np.errstate(invalid="ignore", divide="ignore"):
+            next_ = np.where(off_b == off_a, b, b - off_b * (b - a) / (off_b - off_a))
+        path, _ = inclined_rays(lens, slope, next_, np.zeros(1), wavelength_nm, sensor_mm)
+        a, off_a, b, off_b = b, off_b, next_, path.points_mm[row, :, 0]
+    # what has not settled is no ray through the middle
+    settled = through.any(axis=1) & (np.abs(off_b) < 1e-6 * lens.surfaces[lens.stop].semi_diameter_mm)
+    return np.where(settled, path.points_mm[-1, :, 0], np.nan)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ChiefHeights:
+    """Heights in the image of the chief rays of one wavelength, up to the slope `end` of the last one, and from
+    there straight on with the derivative `onward_mm`. `ratio`: height over slope, mm."""
+
+    ratio: CubicSpline
+    end: float
+    onward_mm: float
+
+    def height_mm(self, slope: F64) -> F64:
+        """Return heights in the image, float64 like `slope`."""
+        known = np.minimum(slope, self.end)
+        return np.asarray(known * self.ratio(known) + (slope - known) * self.onward_mm)
+
+    def rise_mm(self, slope: F64) -> F64:
+        """Return derivatives of the heights by the slope, float64 like `slope`."""
+        known = np.minimum(slope, self.end)
+        return np.where(slope > self.end, self.onward_mm, self.ratio(known) + known * self.ratio(known, 1))
+
+
+def chief_heights(
+    lens: Prescription,
+    slope: F64,
+    *,
+    wavelength_nm: float,
+    sensor_mm: float,
+    efl_mm: float,
+    within: float = np.inf,
+) -> ChiefHeights:
+    """Return the chief rays of a lens, traced at the slopes given, up to the last before which none is missing or
+    turns back, and to the slope `within` at most.
+
+    Raises
+    ------
+    InputError
+        There are none but next to the axis.
+    """
+    height = chief_heights_mm(lens, slope, wavelength_nm=wavelength_nm, sensor_mm=sensor_mm)
+    with np.errstate(invalid="ignore"):
+        good = np.diff(height) > _STEEPNESS * efl_mm * np.diff(slope)
+    last = len(slope) - 1 if good.all() else int(np.argmin(good))
+    end = min(float(slope[last]), within)
+    last = int(np.searchsorted(slope, end))
+    if last < 3:
+        angle = np.degrees(np.arctan(end))
+        raise InputError(
+            f"{lens.name}: no ray through the middle of the stop comes from beyond {angle:.2g} degrees"
+        )
+    # h / t is even in t
+    ratio = CubicSpline(slope[: last + 1], height[: last + 1] / slope[: last + 1], bc_type=((1, 0.0), "not-a-knot"))
+    onward = np.clip(ratio(end) + end * ratio(end, 1), _ONWARD[0] * efl_mm, _ONWARD[1] * efl_mm)
+    return ChiefHeights(ratio=ratio, end=end, onward_mm=float(onward))
+
+
+def camera_model(
+    chief: ChiefHeights, focal_length_mm: float, corner: float, pixels: float, name: str
+) -> RadialModel:
+    """Return the model of distortion of a frame: fitted to the chief rays, and past them to a smooth continuation.
+
+    `corner`: distance of the frame's corner from the axis in focal lengths; `pixels`: focal length in pixels;
+    `name`: the lens's.
+
+    Raises
+    ------
+    InputError
+        No model found reaches the corner without folding.
+    """
+    reach = _PAST_CORNER * corner * focal_length_mm
+    missing = reach - float(chief.height_mm(np.array(chief.end)))
+    if missing <= 0:
+        slope = np.linspace(0, chief.end, 16 * _KNOWN + 1)
+        most = float(np.interp(reach, chief.height_mm(slope), slope))
+        slope, known = np.linspace(0, most, _KNOWN + _CONTINUED + 1)[1:], _KNOWN + _CONTINUED
+    else:
+        most, known = chief.end + missing / chief.onward_mm, _KNOWN
+        slope = np.concatenate(
+            [np.linspace(0, chief.end, _KNOWN + 1)[1:], np.linspace(chief.end, most, _CONTINUED + 1)[1:]]
+        )
+    model = fitted(slope, chief.height_mm(slope) / focal_length_mm, pixels, known=known, reach=corner)
+    if model is None:
+        angle = np.degrees(np.arctan(chief.end))
+        raise InputError(
+            f"{name}: camera.fov_deg: the lens images {angle:.3g} degrees from its axis, and no model of "
+            "distortion goes on from there to the corners of the frame without folding; it must be smaller"
+        )
+    return model
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FieldMap:
+    """Heights of the image over the slope of the field at one wavelength, dense; straight on beyond the table."""
+
+    slope: F64
+    height_mm: F64
+    rise_mm: F64  # dh/dt
+
+    def height(self, slope: F64) -> F64:
+        """Return heights in the image in mm, float64 like `slope`."""
+        beyond = np.maximum(slope - self.slope[-1], 0)
+        return np.asarray(np.interp(slope, self.slope, self.height_mm) + beyond * self.rise_mm[-1])
+
+    def slope_at(self, height_mm: F64) -> F64:
+        """Return tangents of the field angles seen at heights in the image, float64 like `height_mm`."""
+        beyond = np.maximum(height_mm - self.height_mm[-1], 0)
+        return np.asarray(np.interp(height_mm, self.height_mm, self.slope) + beyond / self.rise_mm[-1])
+
+    def shifted(self, chief: ChiefHeights, main: ChiefHeights) -> FieldMap:
+        """Return the map of another wavelength: its chief rays may lie apart from those of this map, `main`, as far
+        as both are known; past that they go on side by side."""
+        known = np.minimum(self.slope, chief.end)
+        apart = chief.height_mm(known) - main.height_mm(known)
+        steeper = np.where(self.slope > chief.end, 0, chief.rise_mm(known) - main.rise_mm(known))
+        return replace(self, height_mm=self.height_mm + apart, rise_mm=self.rise_mm + steeper)
+
+
+def field_map(slope: F64, chief: ChiefHeights, model: RadialModel, focal_length_mm: float) -> FieldMap:
+    """Return the map of the d line at the slopes given: the model as far as it is fitted, from there on as chief
+    rays go."""
+    within = np.minimum(slope, model.end)
+    height = focal_length_mm * model.distance(within) + chief.height_mm(slope) - chief.height_mm(within)
+    rise = np.where(slope > model.end, chief.rise_mm(slope), focal_length_mm * model.rise(within))
+    return FieldMap(slope=slope, height_mm=height, rise_mm=rise)
