@@ -132,9 +132,12 @@ def test_distortion_is_that_of_chief_rays(name: str) -> None:
     slope = np.tan(np.radians(LENSES[name]))
     for wavelength in (D_NM, 440.0):
         expected = chief_px(lens, slope, wavelength)
-        # the table interpolates linearly between 4097 slopes: (1.5 / 4096)² / 8 of some 800 px is 1e-5
         found = lens.distorted(slope, wavelength) * lens.focal_length_px
-        np.testing.assert_allclose(found, expected, atol=2e-3)
+        # With three of the lenses the corners have no chief rays: the fit may leave 0.01 px, and more in the outer
+        # part of the field; of the Biotar, whose heights all but stop rising, that is the outer quarter.
+        followed = slope < np.tan(np.radians(22)) if name == "biotar_100_f1p4" else slope > 0
+        np.testing.assert_allclose(found[followed], expected[followed], atol=0.012)
+        np.testing.assert_allclose(found, expected, atol=0.5)
         np.testing.assert_allclose(lens.undistorted(found / lens.focal_length_px, wavelength), slope, rtol=1e-6)
     assert abs(expected / (slope * lens.focal_length_px) - 1).max() > 1e-3  # there is some
 
@@ -149,7 +152,7 @@ def test_lateral_colour_is_that_of_chief_rays() -> None:
 
 
 @pytest.mark.parametrize("name", ["distagon_25_f2p8", "nikkor_28_f2p8", "heliar_100_f3p5"])
-def test_opencv_reproduces_the_map_within_the_stored_residual(name: str) -> None:
+def test_opencv_reproduces_the_map(name: str) -> None:
     c = camera(real(name))
     fx, fy, cx, cy = c.intrinsics
     rng = np.random.default_rng(3)
@@ -166,11 +169,11 @@ def test_opencv_reproduces_the_map_within_the_stored_residual(name: str) -> None
     exact = np.array([c.project(direction) for direction in directions])
     np.testing.assert_allclose(exact, pixels[keep], atol=1e-4)
     off = np.hypot(*(seen[:, 0] - exact).T)
+    # a table of 4097 slopes with linear heights between: (1.5 / 4096)² / 8 of some 800 px is 1e-5
+    assert off.max() <= 1e-4
     rms, most = c.distortion_residual_px
-    assert off.max() <= most + 1e-3
-    # 600 pixels at random against a grid of all: the sum is ruled by the few per cent near the corners
-    assert np.sqrt(np.mean(off**2)) == pytest.approx(rms, rel=0.3)
-    assert rms < 0.06
+    assert 0 < rms < 0.1
+    assert rms < most
 
 
 def test_a_lens_that_sees_more_than_the_render_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -643,7 +646,7 @@ def test_samples_of_a_scene_with_a_lens() -> None:
     rows, columns = np.nonzero(body)
     off = np.abs(seen[:, 0] - np.column_stack([columns, rows]) - 0.5)
     # truth follows the centres' own rays, in float32
-    assert off.max() < 1e-3 + c.distortion_residual_px[1]
+    assert off.max() < 1e-3
 
     # light ends where the body does: dark sky holds none
     lit = frame.rate.array[..., 1] > 0
