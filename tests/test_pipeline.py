@@ -116,9 +116,15 @@ def test_optical_faults_act_in_the_stated_order(frames_: list[Frame]) -> None:
     for frame in frames_:
         drawn, faults, camera = frame.drawn, frame.spec.faults, frame.camera
         light = frame.rate.with_array(frame.rate.array * np.float32(camera.exposure_s))
+        # the Sun's direct image has met the lens's rims already, and is not vignetted again
+        apart = (frame.rate_apart or frame.rate).array * np.float32(camera.exposure_s)
+        rest = light.with_array(apart)
         for name in order:
             if name in drawn:
-                light = faults[name].apply(light, drawn[name], frame.context)
+                sun = np.maximum(light.array - rest.array, 0)
+                light, rest = (faults[name].apply(q, drawn[name], frame.context) for q in (light, rest))
+                if name == "vignetting":
+                    light = light.with_array(rest.array + sun)
         picture = camera.detector.develop(light, camera.exposure_s, None)
         for name in ("broken_pixels", "broken_lines"):
             if name in drawn:
