@@ -54,7 +54,7 @@ class Cycles:
     """A Blender process that holds one scene; a context manager.
 
     `vertices_m` float32[n, 3] and `faces` int32[m, 3] in L, `flat` bool[m]; position, attitude and Sun
-    as in `vbnfault.scene`.
+    as in `vbnfault.render.description`.
     """
 
     def __init__(

@@ -14,12 +14,12 @@ import cv2
 import numpy as np
 
 from vbnfault.camera import Camera
+from vbnfault.core.quantities import Electrons
 from vbnfault.detector import MosaicDetector, load_sensor
 from vbnfault.detector.charge import TrapSpecies
 from vbnfault.detector.sensor import Sensor
 from vbnfault.faults import MOSAIC_STEPS, Fault, FaultContext, from_dict
 from vbnfault.lens import ThinLens
-from vbnfault.quantities import Electrons
 
 KINDS = ("full_frame_ccd", "frame_transfer_ccd", "interline_ccd", "cmos")
 DEMOSAICS = ("malvar", "menon")

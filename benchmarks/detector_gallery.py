@@ -19,13 +19,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from vbnfault import labels
-from vbnfault.config import load_scene
 from vbnfault.faults import registry
-from vbnfault.pictures import develop, effect_of
-from vbnfault.pipeline import Session
-from vbnfault.sample import Frame
-from vbnfault.world import mosaic_sensor
+from vbnfault.pipeline import Session, labels
+from vbnfault.pipeline.photograph import develop, effect_of
+from vbnfault.pipeline.spec import Frame
+from vbnfault.scene.config import load_scene
+from vbnfault.world.assemble import mosaic_sensor
 
 MODELS = {"broken_pixels": "hot_pixels", "broken_lines": "readout"}
 CLASSES = [name for name, models in registry().items() for m in models.values() if m.needs_mosaic]

@@ -17,8 +17,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from vbnfault import flares, resources
+from vbnfault.core import resources
 from vbnfault.lens import load_lens
+from vbnfault.output import flare_images
 
 ANGLES_DEG = (0.0, 8.0, 16.0, 24.0, 34.0)
 AZIMUTH_DEG = 30.0
@@ -42,24 +43,24 @@ def sheet(name: str, coating: str, models: tuple[str, ...], pixels: int) -> tupl
     for angle in ANGLES_DEG:
         cells, light = [], []
         for model in models:
-            view = flares.View(
+            view = flare_images.View(
                 lens=lens,
                 sun_deg=angle,
                 azimuth_deg=AZIMUTH_DEG,
                 fov_deg=FOV_DEG,
                 pixels=pixels,
-                wavelength_nm=flares.wavelengths_nm(),
+                wavelength_nm=flare_images.wavelengths_nm(),
                 sun_distance_au=3.0,
                 model=model,
             )
-            found = flares.layers(view)
+            found = flare_images.layers(view)
             if white is None:  # one exposure for the sheet
-                ghosts = flares.colours(view, found["ghosts"] + found["veil"]).max(axis=2)
+                ghosts = flare_images.colours(view, found["ghosts"] + found["veil"]).max(axis=2)
                 white = float(np.percentile(ghosts, 99)) * 2
-            cells.append(flares.picture(view, found, white))
-            light.append(flares.colours(view, found["ghosts"])[..., 1])
-            one = replace(view, wavelength_nm=flares.wavelengths_nm(550.0))
-            told = flares.ghosts(one)
+            cells.append(flare_images.picture(view, found, white))
+            light.append(flare_images.colours(view, found["ghosts"])[..., 1])
+            one = replace(view, wavelength_nm=flare_images.wavelengths_nm(550.0))
+            told = flare_images.ghosts(one)
             energy.append([name, coating, model, angle, len(told), sum(g.flux_fraction for g in told)])
         if len(models) == 2:
             cells.append(part(light[0], light[1]))

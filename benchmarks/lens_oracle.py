@@ -18,8 +18,8 @@ from optiland.physical_apertures import RadialAperture
 from optiland.rays import RealRays
 
 from vbnfault.lens import Prescription, first_order, load_lens
-from vbnfault.lens.ghosts import surface_interactions_per_second
 from vbnfault.lens.glass import D_NM
+from vbnfault.lens.straylight.ghosts import surface_interactions_per_second
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 import sequential_oracle as oracle

@@ -12,11 +12,12 @@ import pstats
 
 from workload import clock, medians
 
-from vbnfault import config, pipeline
-from vbnfault.exposure import render_frame
-from vbnfault.pose import resolve
-from vbnfault.record import to_sample
-from vbnfault.sample import Frame, SampleSpec
+from vbnfault import pipeline
+from vbnfault.pipeline.expose import render_frame
+from vbnfault.pipeline.record import to_sample
+from vbnfault.pipeline.resolve import resolve
+from vbnfault.pipeline.spec import Frame, SampleSpec
+from vbnfault.scene import config
 
 
 def stages(spec: SampleSpec, profile: cProfile.Profile | None = None) -> dict[str, float]:

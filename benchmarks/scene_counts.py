@@ -22,7 +22,10 @@ from pathlib import Path
 
 import numpy as np
 
-from vbnfault import config, dataset, report, resources, store
+from vbnfault import dataset, store
+from vbnfault.core import resources
+from vbnfault.output import contact_sheet
+from vbnfault.scene import config
 
 HEAD = ("scene", "pixels", "samples", "planned", "realised", "redrawn", "views", "verify")
 
@@ -52,7 +55,7 @@ class Counts:
 
     def cells(self) -> tuple[str, ...]:
         """Return the row of the table, by HEAD."""
-        short = report.abbreviations(list(self.planned))
+        short = contact_sheet.abbreviations(list(self.planned))
         planned, realised = (
             " ".join(f"{short[name]} {n}" for name, n in counts.items()) for counts in (self.planned, self.realised)
         )
@@ -73,7 +76,7 @@ def settings(scene: str, *, pixels: int, triangles: int) -> dict[str, object]:
 def counts(scene: str, path: Path, *, samples: int, given: Sequence[str]) -> Counts:
     """Build a scene's store at `path` with the settings `given`, verify it and return its counts."""
     most = config.load_scene(scene).dataset.samples
-    command = [sys.executable, "-m", "vbnfault.cli", "build", scene, "--out", str(path)]
+    command = [sys.executable, "-m", "vbnfault", "build", scene, "--out", str(path)]
     command += ["--samples", str(min(samples, most))]
     for setting in given:
         command += ["--set", setting]

@@ -20,7 +20,8 @@ from pathlib import Path
 
 import numpy as np
 
-from vbnfault import resources, store
+from vbnfault import store
+from vbnfault.core import resources
 
 _PIXELS = ("image", "clean", "mask")
 
@@ -35,7 +36,7 @@ def digests(scene: str, *, samples: int, pixels: int, folder: Path) -> dict[str,
         "dataset.shard_samples": max(1, samples // 2),
         "patch.max_triangles": 100_000,
     }
-    command = [sys.executable, "-m", "vbnfault.cli", "build", scene, "--out", str(path), "--samples", str(samples)]
+    command = [sys.executable, "-m", "vbnfault", "build", scene, "--out", str(path), "--samples", str(samples)]
     if scene == "paper_example":
         settings["dataset.sites"] = settings["dataset.shard_samples"] = 1
         command[-1] = "1"

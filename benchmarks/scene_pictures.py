@@ -19,10 +19,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vbnfault import config, dataset, report
-from vbnfault.export import annotated
+from vbnfault import dataset
+from vbnfault.output import contact_sheet
+from vbnfault.output.sample_files import annotated
 from vbnfault.pipeline import Session
-from vbnfault.sample import Frame
+from vbnfault.pipeline.spec import Frame
+from vbnfault.scene import config
 
 U8 = NDArray[np.uint8]
 
@@ -106,7 +108,7 @@ def sheet(scene: str) -> U8:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / f"{scene}.zarr"
         dataset.build_scene(config.load_scene(scene, small), path, source=scene)
-        report.preview(path, path.with_suffix(".png"))
+        contact_sheet.preview(path, path.with_suffix(".png"))
         whole = cv2.imread(str(path.with_suffix(".png")))[..., ::-1]
     size = (SHEET_WIDTH_PX, round(SHEET_WIDTH_PX * whole.shape[0] / whole.shape[1]))
     return np.asarray(cv2.resize(whole, size, interpolation=cv2.INTER_AREA))

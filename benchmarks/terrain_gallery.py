@@ -13,11 +13,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vbnfault import config, exposure, frames, plan, render
+from vbnfault import render
 from vbnfault.body import EMBEDDED
-from vbnfault.pipeline import Session
-from vbnfault.sample import Frame, Pose
-from vbnfault.scene import Sunlight
+from vbnfault.core import frames
+from vbnfault.pipeline import Session, expose
+from vbnfault.pipeline.spec import Frame, Pose
+from vbnfault.render.description import Sunlight
+from vbnfault.scene import config, plan
 
 SUNS_DEG = {"low": 12.0, "high": 50.0}
 # name → height above ground in m, degrees below the horizon
@@ -80,8 +82,8 @@ def picture(session: Session, site: int, pose: Pose) -> NDArray:
     """uint8[y, x, 3], as the scene's camera takes it without faults or noise, gamma 2.2 for the eye."""
     frame = Frame(spec=session.spec(int(np.flatnonzero(session.plan.site == site)[0])))
     frame.pose = pose
-    exposure.render_frame(frame)
-    exposure.meter(frame)
+    expose.render_frame(frame)
+    expose.meter(frame)
     exposed = frame.rate.with_array(frame.rate.array * np.float32(frame.camera.exposure_s))
     image = frame.camera.detector.develop(exposed, frame.camera.exposure_s, None).array[..., 2::-1]
     return np.round(255 * (image / 255.0) ** (1 / GAMMA)).astype(np.uint8)

@@ -22,7 +22,7 @@ from blender_cycles import Cycles, Unavailable, interpreter
 from report import SAMPLE, targets
 from workload import Workload, clock, medians
 
-from vbnfault.sample import Frame
+from vbnfault.pipeline.spec import Frame
 
 
 @pytest.fixture(scope="session")

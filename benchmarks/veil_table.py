@@ -20,13 +20,13 @@ import argparse
 
 import numpy as np
 
-from vbnfault import resources
+from vbnfault.core import resources
 from vbnfault.lens import Prescription, first_order, load_lens
 from vbnfault.lens.glass import D_NM
-from vbnfault.lens.paraxial import along, axial_transmittance, pairs, transmittance
-from vbnfault.lens.scatter import ROUGHNESS_NM, point_source_transmittance
-from vbnfault.lens.straylight import VEIL_FRACTION
-from vbnfault.lens.trace import ghost
+from vbnfault.lens.rays import ghost
+from vbnfault.lens.straylight.paraxial import along, axial_transmittance, pairs, transmittance
+from vbnfault.lens.straylight.scatter import ROUGHNESS_NM, point_source_transmittance
+from vbnfault.lens.straylight.total import VEIL_FRACTION
 
 SPOT_DEG = 2.0
 ANGLES_DEG = np.concatenate([np.geomspace(SPOT_DEG, 10, 24)[:-1], np.linspace(10, 89.9, 64)])

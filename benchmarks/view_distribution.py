@@ -30,7 +30,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from vbnfault import dataset, plan, store
+from vbnfault import dataset, store
+from vbnfault.scene import plan
 
 VARIABLES = ("height_m", "roll_deg", "pitch_deg", "yaw_deg", "sun_elevation_deg", "sun_azimuth_deg")
 TABLE_SAMPLES = 200_000

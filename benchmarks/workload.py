@@ -12,20 +12,23 @@ from typing import Any
 import numpy as np
 from detector_chain import Chain, speckled
 
-from vbnfault import config, dataset, frames, photometry, pipeline, plan, render, spectra, store, world
+from vbnfault import dataset, pipeline, render, store
 from vbnfault.body import Patch
-from vbnfault.exposure import describe, meter
+from vbnfault.core import frames, photometry, spectra
+from vbnfault.core.quantities import Sample
 from vbnfault.lens import load_lens, scaled_to_focal_length
-from vbnfault.lens.flare import FlareModel
-from vbnfault.pictures import photograph
-from vbnfault.pose import resolve
-from vbnfault.quantities import Sample
-from vbnfault.record import label, to_sample
+from vbnfault.lens.straylight.irradiance import FlareModel
+from vbnfault.pipeline.expose import describe, meter
+from vbnfault.pipeline.photograph import photograph
+from vbnfault.pipeline.record import label, to_sample
+from vbnfault.pipeline.resolve import resolve
+from vbnfault.pipeline.spec import Frame, Pose, SampleSpec, Terrain
+from vbnfault.render.description import Scene
 from vbnfault.render.emitter import SunDisc
 from vbnfault.render.runtime import dr, mi
 from vbnfault.render.sampling import Optics, Pixels, Strata
-from vbnfault.sample import Frame, Pose, SampleSpec, Terrain
-from vbnfault.scene import Scene
+from vbnfault.scene import config, plan
+from vbnfault.world import assemble
 
 SCENE = "paper_example"  # its six faults; the view is our own
 SHARD_SAMPLES = 8
@@ -88,7 +91,7 @@ class Workload:
         frame = Frame(spec=self.spec)
         frame.pose = self.pose
         frame.camera = self.session.base_camera
-        frame.sunlight = world.sunlight(self.spec.scene, self.pose.sun_L)
+        frame.sunlight = assemble.sunlight(self.spec.scene, self.pose.sun_L)
         return frame, describe(frame)
 
     def bound(self) -> None:

@@ -39,12 +39,12 @@ import trimesh
 import zarr
 from test_store import fake_sample, make_spec
 
-from vbnfault import build as bd
 from vbnfault import store as st
 from vbnfault.body import Body, cache, choose_sites
 from vbnfault.body.patch import build_patch
-from vbnfault.errors import VbnfaultError
-from vbnfault.quantities import Sample
+from vbnfault.core.errors import VbnfaultError
+from vbnfault.core.quantities import Sample
+from vbnfault.dataset import build as bd
 from vbnfault.store import disk
 
 SAMPLES = 4

@@ -38,7 +38,8 @@ def import_all() -> None:
     """Import what builds and reports need, all but the renderer, whose threads no forked process would have."""
     import test_build  # noqa: F401
 
-    from vbnfault import config, dataset, store  # noqa: F401
+    from vbnfault import dataset, store  # noqa: F401
+    from vbnfault.scene import config
 
 
 def synthetic(out: Path, workers: int) -> None:
@@ -50,7 +51,8 @@ def synthetic(out: Path, workers: int) -> None:
 
 def rendered(out: Path, workers: int) -> None:
     """Build 6 rendered samples."""
-    from vbnfault import config, dataset
+    from vbnfault import dataset
+    from vbnfault.scene import config
 
     table = small_scene(dataset={"samples": 6, "shard_samples": 2, "sites": 2}, camera={"width_px": 48})
     dataset.build_scene(config.parse_scene(table, source="kills"), out, source="kills", workers=workers)

@@ -40,19 +40,19 @@ ROOT = Path(__file__).resolve().parents[1]
 
 # group → (modules, tests that are meant to notice their mutations)
 GROUPS: dict[str, tuple[list[str], list[str]]] = {
-    "plan": (["vbnfault/plan.py"], ["tests/test_plan.py", "tests/test_views.py"]),
-    "splits": (["vbnfault/plan.py"], ["tests/test_plan.py", "tests/test_views.py"]),
+    "plan": (["vbnfault/scene/plan.py"], ["tests/test_plan.py", "tests/test_views.py"]),
+    "splits": (["vbnfault/scene/plan.py"], ["tests/test_plan.py", "tests/test_views.py"]),
     "pose": (
-        ["vbnfault/pose.py"],
+        ["vbnfault/pipeline/resolve.py"],
         ["tests/test_resolve.py", "tests/test_views.py", "tests/test_pipeline.py", "tests/test_spice.py"],
     ),
     "labels": (
-        ["vbnfault/labels.py", "vbnfault/record.py"],
+        ["vbnfault/pipeline/labels.py", "vbnfault/pipeline/record.py"],
         ["tests/test_labels.py", "tests/test_pipeline.py", "tests/test_truth.py"],
     ),
-    "pictures": (["vbnfault/pictures.py"], ["tests/test_pipeline.py", "tests/test_labels.py"]),
+    "pictures": (["vbnfault/pipeline/photograph.py"], ["tests/test_pipeline.py", "tests/test_labels.py"]),
     "exposure": (
-        ["vbnfault/exposure.py"],
+        ["vbnfault/pipeline/expose.py"],
         ["tests/test_exposure.py", "tests/test_pipeline.py", "tests/test_physical.py"],
     ),
     "store": (["vbnfault/store/*.py"], ["tests/test_store*.py"]),

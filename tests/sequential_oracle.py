@@ -4,7 +4,7 @@ Only a prescription's numbers are taken from vbnfault: optiland finds the inters
 Fresnel's equations are written out here once more. A ghost is laid out as one sequence of surfaces in the order
 that light meets them, each at its own place on the axis, the two reflecting ones as mirrors.
 
-Axes as in vbnfault.lens.trace: z from the first vertex backwards, x and y across; mm.
+Axes as in vbnfault.lens.rays: z from the first vertex backwards, x and y across; mm.
 """
 
 from __future__ import annotations
@@ -228,7 +228,7 @@ def ghost_truth(
     wavelength_nm: float = D_NM,
     grid: int = 32,
 ) -> tuple[float, tuple[float, float], float]:
-    """Flux fraction, centroid (x, y) in mm and r.m.s. radius in mm of a ghost, as in vbnfault.lens.paraxial.Ghost.
+    """Flux fraction, centroid (x, y) in mm and r.m.s. radius in mm of a ghost, as in vbnfault.lens.straylight.paraxial.Ghost.
 
     `grid`² cells fill the smallest box that holds the rays that pass, rays run through the middles of their
     quarters, and a quarter becomes a cell as long as that changes what it adds: edges, and rays near a critical

@@ -14,9 +14,10 @@ from conftest import small_scene
 from test_faults_kit import flat_electrons
 from typer.testing import CliRunner
 
-from vbnfault import config, dataset, resources, world
+from vbnfault import dataset
 from vbnfault.cli import app
-from vbnfault.errors import InputError
+from vbnfault.core import resources
+from vbnfault.core.errors import InputError
 from vbnfault.faults import FaultContext, from_dict
 from vbnfault.lens import (
     Prescription,
@@ -31,10 +32,12 @@ from vbnfault.lens import (
 from vbnfault.lens.family import to_table
 from vbnfault.lens.glass import D_NM
 from vbnfault.lens.imaging import point_spreads
-from vbnfault.lens.paraxial import paraxial_ghosts
-from vbnfault.lens.scatter import veiling_glare
-from vbnfault.lens.starburst import starburst
-from vbnfault.lens.trace import trace
+from vbnfault.lens.rays import trace
+from vbnfault.lens.straylight.paraxial import paraxial_ghosts
+from vbnfault.lens.straylight.scatter import veiling_glare
+from vbnfault.lens.straylight.starburst import starburst
+from vbnfault.scene import config
+from vbnfault.world import assemble
 
 LENSES = sorted(resources.packaged("scenes/lenses"))
 SIDE_PX = 64
@@ -46,7 +49,9 @@ def scene(**keys: Any) -> config.SceneConfig:
 
 
 def real(name: str, f_number: float | None = None, **keys: Any) -> RealLens:
-    lens = world.base_camera(scene(lens=name, **keys, **({} if f_number is None else {"f_number": f_number}))).lens
+    lens = assemble.base_camera(
+        scene(lens=name, **keys, **({} if f_number is None else {"f_number": f_number}))
+    ).lens
     assert isinstance(lens, RealLens)
     return lens
 
@@ -97,13 +102,13 @@ def test_an_unset_f_number_survives_the_store() -> None:
         first = scene(**keys)
         again = config.parse_scene(first.resolved(), source="again")
         assert again == first
-        assert world.base_camera(again).lens == world.base_camera(first).lens
+        assert assemble.base_camera(again).lens == assemble.base_camera(first).lens
     assert scene().camera.f_number == 4.0
     assert scene().camera.transmission == 0.9
     assert scene(lens="tessar_50_f2p8").camera.f_number is None
     with pytest.raises(InputError, match=r"camera.*transmission = 0\.5: the lens has its own"):
         scene(lens="tessar_50_f2p8", transmission=0.5)
-    assert world.base_camera(scene(f_number=8.0, transmission=0.5)).lens.transmission == 0.5
+    assert assemble.base_camera(scene(f_number=8.0, transmission=0.5)).lens.transmission == 0.5
 
 
 def test_the_store_says_what_the_lens_became() -> None:
@@ -123,7 +128,7 @@ def test_the_store_says_what_the_lens_became() -> None:
 
 
 def context(lens: RealLens) -> FaultContext:
-    camera = replace(world.base_camera(scene()), lens=lens)
+    camera = replace(assemble.base_camera(scene()), lens=lens)
     return FaultContext(camera=camera)
 
 

@@ -169,9 +169,9 @@ def imports() -> tuple[Import, ...]:
 
 def test_the_walk_reads_every_form_of_import() -> None:
     found = {(i.module, i.target, i.at_load) for i in imports()}
-    assert ("plan", "vbnfault.config", True) in found  # from . import config
-    assert ("plan", "vbnfault.errors", True) in found  # from .errors import InputError
-    assert ("faults.base", "vbnfault.camera", True) in found  # from ..camera import Camera
+    assert ("plan", "vbnfault.scene.config", True) in found  # from . import config
+    assert ("plan", "vbnfault.core.errors", True) in found  # from .errors import InputError
+    assert ("faults.base", "vbnfault.camera.camera", True) in found  # from ..camera import Camera
     assert ("body.patch", "vbnfault.body.noise", True) in found  # from vbnfault.body.noise import …
     assert ("pose", "vbnfault.render", False) in found  # within a function
     assert ("render.runtime", "mitsuba", True) in found  # import mitsuba as mi

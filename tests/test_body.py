@@ -9,18 +9,10 @@ import numpy as np
 import pytest
 import trimesh
 
-from vbnfault.body import (
-    Body,
-    check_mesh,
-    choose_sites,
-    embedded_nucleus,
-    load_body,
-    load_shape,
-    local_level,
-)
+from vbnfault.body import Body, check_mesh, choose_sites, embedded_nucleus, load_body, load_shape, local_level
 from vbnfault.body.noise import gradient_noise
 from vbnfault.body.shape import face_normals_areas, signed_volume
-from vbnfault.errors import InputError
+from vbnfault.core.errors import InputError
 
 REAL_SHAPE = Path(__file__).parents[2] / "shared/data/shapes/67p_18k.obj"
 CUBE = """v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nv 0 0 1\nv 1 0 1\nv 1 1 1\nv 0 1 1

@@ -12,7 +12,7 @@ from scipy import stats
 from vbnfault.body import Body, Patch, Site, build_patch, choose_sites, load_body
 from vbnfault.body.boulders import SizeLaw, scatter, smallest_at
 from vbnfault.body.shape import check_mesh, signed_volume
-from vbnfault.errors import InputError
+from vbnfault.core.errors import InputError
 
 REAL_SHAPE = Path(__file__).parents[2] / "shared/data/shapes/67p_18k.obj"
 QUICK = {"facet_m": 4.0, "radius_m": 150.0, "min_boulder_m": 0.8, "max_triangles": 1_200_000}

@@ -26,12 +26,12 @@ import pytest
 import victim
 from test_store import fake_sample, flip, make_spec
 
-from vbnfault import build as bd
-from vbnfault import stages
 from vbnfault import store as st
-from vbnfault.errors import InputError, VbnfaultError
-from vbnfault.jobs import dask, lock, progress, tasks
-from vbnfault.quantities import Sample
+from vbnfault.core import activity
+from vbnfault.core.errors import InputError, VbnfaultError
+from vbnfault.core.quantities import Sample
+from vbnfault.dataset import build as bd
+from vbnfault.dataset import dask, lock, progress, tasks
 from vbnfault.store import codec
 
 SAMPLES = 18
@@ -61,7 +61,7 @@ class Session:
             with open(self.log, "a") as log:
                 log.write(f"{os.getpid()} {index}\n")
         if self.stage:
-            stages.begin(f"{self.stage} {index}")
+            activity.begin(f"{self.stage} {index}")
         if index in self.raises:
             raise KeyError(f"no terrain for {index}")
         if index in self.dies and not (self.dies_once and Path(self.dies_once).exists()):

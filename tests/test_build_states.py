@@ -28,7 +28,8 @@ from hypothesis.stateful import (
 from test_build import Session, site_of
 from test_store import flip, make_spec
 
-from vbnfault import build, store
+from vbnfault import store
+from vbnfault.dataset import build
 from vbnfault.store import disk
 
 STEPS = int(os.environ.get("VBNFAULT_STATE_STEPS", "40"))

@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from vbnfault import llvm
-from vbnfault.errors import VbnfaultError
+from vbnfault.core import llvm
+from vbnfault.core.errors import VbnfaultError
 from vbnfault.lens import RealLens, first_order, load_lens, scaled_to_field
-from vbnfault.lens.straylight import straylight
+from vbnfault.lens.straylight.total import straylight
 
 LENSES = ("nikkor_28_f2p8", "nikkor_35_f2p8")
 SENSOR_MM = 5.632  # 1024 pixels of 5.5 µm

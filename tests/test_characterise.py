@@ -11,9 +11,11 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from vbnfault import resources
-from vbnfault.characterise import Settings, VirtualCamera, characterise
+from vbnfault.camera.characterise import Settings, VirtualCamera, characterise
 from vbnfault.cli import app
+from vbnfault.core import resources
+from vbnfault.core.errors import InputError
+from vbnfault.core.quantities import TRAP
 from vbnfault.detector import MosaicDetector
 from vbnfault.detector.chain import Device, MosaicNoise, by_channel
 from vbnfault.detector.charge import ChargeCloud, TrapSpecies, bloom, cti
@@ -21,8 +23,6 @@ from vbnfault.detector.individual import IndividualSpec
 from vbnfault.detector.mosaic import pattern
 from vbnfault.detector.readout import ReadoutSpec
 from vbnfault.detector.sensor import Sensor, Transfer, load_sensor, parse_sensor
-from vbnfault.errors import InputError
-from vbnfault.quantities import TRAP
 
 SHAPE = (256, 256)
 

@@ -18,9 +18,10 @@ import pytest
 import victim
 from conftest import small_scene
 
-from vbnfault import cli, flares, store
-from vbnfault.jobs import dask
+from vbnfault import cli, store
+from vbnfault.dataset import dask
 from vbnfault.lens import load_lens
+from vbnfault.output import flare_images
 
 ENVIRONMENT = {**os.environ, "PYTHONWARNINGS": "error::UserWarning"}
 
@@ -56,7 +57,7 @@ def run(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
 
 
 def command(*arguments: object) -> list[str]:
-    return [sys.executable, "-m", "vbnfault.cli", *map(str, arguments)]
+    return [sys.executable, "-m", "vbnfault", *map(str, arguments)]
 
 
 @pytest.fixture(scope="module")
@@ -300,11 +301,12 @@ def test_a_shape_of_another_body_is_told_what_it_has_of_67p(
 
 
 def test_the_real_shape_is_67ps(real_shape: Path) -> None:
-    from vbnfault import config, world
+    from vbnfault.scene import config
+    from vbnfault.world import assemble
 
     for settings in ({}, {"body.shape": str(real_shape)}):
         scene = config.load_scene("quickstart", settings)
-        assert world.assumed_of_67p(scene, world.make_body(scene)) == ""
+        assert assemble.assumed_of_67p(scene, assemble.make_body(scene)) == ""
 
 
 @pytest.mark.parametrize(
@@ -433,10 +435,13 @@ def test_a_flare_is_a_table_and_a_picture(
 
 def test_a_flares_progress_is_told_by_wavelengths() -> None:
     told: list[int] = []
-    view = flares.View(
-        lens=load_lens("tessar_50_f2p8"), sun_deg=12.0, wavelength_nm=flares.wavelengths_nm(), model="paraxial"
+    view = flare_images.View(
+        lens=load_lens("tessar_50_f2p8"),
+        sun_deg=12.0,
+        wavelength_nm=flare_images.wavelengths_nm(),
+        model="paraxial",
     )
-    assert flares.ghosts(view, told.append) == flares.ghosts(view)
+    assert flare_images.ghosts(view, told.append) == flare_images.ghosts(view)
     assert told == [1] * 8
 
 
@@ -457,7 +462,7 @@ def test_help_imports_little() -> None:
     heavy = {imported.get(name, name) for name in declared} - {"typer", "rich"}
     assert {"numpy", "mitsuba", "zarr", "cv2", "matplotlib", "pydantic"} <= heavy
     assert not heavy & {package.lower() for package in packages}
-    assert "vbnfault.config" not in modules
+    assert "vbnfault.scene.config" not in modules
     assert len(modules) < 700  # 420 today
 
 

@@ -13,9 +13,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from vbnfault import config, faults, resources
-from vbnfault.config import SceneConfig, load_scene, parse_scene
-from vbnfault.errors import InputError
+from vbnfault import faults
+from vbnfault.core import resources
+from vbnfault.core.errors import InputError
+from vbnfault.scene import config
+from vbnfault.scene.config import SceneConfig, load_scene, parse_scene
 
 PACKAGED = sorted(resources.packaged("scenes"))
 

@@ -13,8 +13,11 @@ import pytest
 import trimesh
 from conftest import small_scene
 
-from vbnfault import build, config, dataset, pipeline, resources, spice, store
-from vbnfault.errors import InputChanged, InputError
+from vbnfault import dataset, pipeline, store
+from vbnfault.core import resources, spice
+from vbnfault.core.errors import InputChanged, InputError
+from vbnfault.dataset import build
+from vbnfault.scene import config
 
 KERNEL = "\\begindata\nTEXT_VALUE = ( {} )\n\\begintext\n"
 

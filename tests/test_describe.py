@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from vbnfault import cli, config, dataset, plan
+from vbnfault import cli, dataset
+from vbnfault.scene import config, plan
 
 
 def described(*settings: str, scene: str = "quickstart") -> list[str]:

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from vbnfault import spectra
+from vbnfault.core import spectra
+from vbnfault.core.quantities import Electrons, Irradiance, RawDN
 from vbnfault.detector import Detector, Noise, poisson_quantile
 from vbnfault.detector import three_colour as module
-from vbnfault.quantities import Electrons, Irradiance, RawDN
 
 SHORT_S = 1e-3
 NODES = spectra.band_nodes_nm(400, 700, 8)

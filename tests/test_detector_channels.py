@@ -12,15 +12,16 @@ import pytest
 from conftest import small_scene
 from test_faults_kit import make, make_context, noisy_electrons, rng, with_mosaic
 
-from vbnfault import dataset, spectra
-from vbnfault.config import parse_scene
+from vbnfault import dataset
+from vbnfault.core import spectra
+from vbnfault.core.errors import InputError
+from vbnfault.core.quantities import Irradiance
 from vbnfault.detector import Detector, MosaicDetector, load_sensor
 from vbnfault.detector.efficiency import Curve, QuantumEfficiency, white_balance
 from vbnfault.detector.mosaic import pattern
 from vbnfault.detector.sensor import parse_sensor
-from vbnfault.errors import InputError
 from vbnfault.pipeline import Session
-from vbnfault.quantities import Irradiance
+from vbnfault.scene.config import parse_scene
 
 NODES = spectra.band_nodes_nm(400.0, 1000.0, 13)
 
@@ -161,7 +162,7 @@ def with_pattern(tmp_path: Any, name: str) -> str:
 
 
 def load_text(name: str) -> str:
-    from vbnfault import resources
+    from vbnfault.core import resources
 
     return resources.find("scenes/detectors", name).read_text()
 

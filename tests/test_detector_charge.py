@@ -7,6 +7,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
+from vbnfault.core.errors import InputError
 from vbnfault.detector import charge
 from vbnfault.detector.charge import (
     DIRECTIONS,
@@ -20,7 +21,6 @@ from vbnfault.detector.charge import (
     smear,
     smear_interline,
 )
-from vbnfault.errors import InputError
 
 # more rows than a block, and no multiple of one
 SHAPE = (2 * charge._ROWS_PER_BLOCK + 7, 11)

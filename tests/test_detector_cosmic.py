@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from vbnfault.core.errors import InputError
 from vbnfault.detector.cosmic import (
     FLUX_UNSHIELDED_CM2_S,
     LEAST_MEV_CM2_G,
@@ -21,7 +22,6 @@ from vbnfault.detector.cosmic import (
     CosmicRays,
     stopping_power_MeV_cm2_g,
 )
-from vbnfault.errors import InputError
 
 SHAPE = (1000, 1000)
 MODEL = CosmicRayModel(pixel_pitch_um=10.0, thickness_um=20.0)  # 1 cm²

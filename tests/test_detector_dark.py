@@ -12,6 +12,7 @@ from scipy import stats
 from scipy.integrate import quad
 from scipy.special import ive
 
+from vbnfault.core.errors import InputError
 from vbnfault.detector import dark
 from vbnfault.detector.dark import (
     APS_GROWTH,
@@ -36,7 +37,6 @@ from vbnfault.detector.individual import (
     offset_e,
     response,
 )
-from vbnfault.errors import InputError
 
 SHAPE = (256, 256)
 PIXELS = SHAPE[0] * SHAPE[1]

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
+from vbnfault.core.errors import InputError
 from vbnfault.detector import demosaic as module
 from vbnfault.detector.demosaic import (
     correct_defects,
@@ -18,17 +19,7 @@ from vbnfault.detector.demosaic import (
     mended_from,
     without_undershoot,
 )
-from vbnfault.detector.mosaic import (
-    BAYER,
-    PATTERNS,
-    Pattern,
-    channel_mask,
-    channel_of,
-    pattern,
-    sample,
-    separate,
-)
-from vbnfault.errors import InputError
+from vbnfault.detector.mosaic import BAYER, PATTERNS, Pattern, channel_mask, channel_of, pattern, sample, separate
 
 METHODS = ("bilinear", "malvar", "menon")
 FITTING = [(f, m) for f in map(str.lower, BAYER) for m in METHODS]

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from scipy import stats
 
-from vbnfault.characterise import Settings, VirtualCamera, characterise
+from vbnfault.camera.characterise import Settings, VirtualCamera, characterise
 from vbnfault.detector.chain import Device, MosaicNoise
 from vbnfault.detector.charge import ChargeCloud, TrapSpecies, cti
 from vbnfault.detector.dark import dark_current_e_s

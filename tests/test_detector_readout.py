@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from vbnfault.core.errors import InputError
 from vbnfault.detector.readout import (
     ReadoutIndividual,
     ReadoutNoise,
@@ -33,7 +34,6 @@ from vbnfault.detector.readout import (
     transitions_dn,
     transmission_order,
 )
-from vbnfault.errors import InputError
 
 IDEAL = ReadoutSpec(read_noise_e_rms=0)
 

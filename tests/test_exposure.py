@@ -10,10 +10,13 @@ import numpy as np
 import pytest
 from conftest import small_scene
 
-from vbnfault import config, exposure, spectra, world
 from vbnfault.camera import Camera
-from vbnfault.config import SceneConfig
-from vbnfault.quantities import BODY, SKY, Electrons, Radiance
+from vbnfault.core import spectra
+from vbnfault.core.quantities import BODY, SKY, Electrons, Radiance
+from vbnfault.pipeline import expose
+from vbnfault.scene import config
+from vbnfault.scene.config import SceneConfig
+from vbnfault.world import assemble
 
 SIZE = {"width_px": 32, "height_px": 32}
 
@@ -25,8 +28,8 @@ def parsed(**tables: Any) -> SceneConfig:
 
 def facet(scene: SceneConfig) -> Radiance:
     """A frame full of Lambert's ground whose normal is 45 degrees from the Sun: L = rho E cos(45) / pi."""
-    wavelength = world.wavelengths_nm(scene)
-    sun = world.sunlight(scene, np.array([0.0, 0.0, -1.0])).irradiance_W_m2_nm
+    wavelength = assemble.wavelengths_nm(scene)
+    sun = assemble.sunlight(scene, np.array([0.0, 0.0, -1.0])).irradiance_W_m2_nm
     table = scene.body.reflectance
     rho = spectra.reflectance(table if isinstance(table, str | float) else table.model_dump(), wavelength)
     light = (rho * sun * np.cos(np.radians(45)) / np.pi).astype(np.float32)
@@ -38,8 +41,8 @@ def test_the_reference_exposure_puts_a_facet_at_45_degrees_at_the_metering_level
     level: float, slope_mag_deg: float
 ) -> None:
     scene = parsed(camera={"metering_level": level}, body={"photometry": {"phase_slope_mag_deg": slope_mag_deg}})
-    camera = world.base_camera(scene)
-    found = camera.expose(facet(scene), exposure.reference_exposure_s(scene, camera))
+    camera = assemble.base_camera(scene)
+    found = camera.expose(facet(scene), expose.reference_exposure_s(scene, camera))
     # a facet that light meets and leaves at 45 degrees in planes at right angles has a phase of 60 degrees
     dimmed = 10 ** (-0.4 * slope_mag_deg * 60)
     # the four pixels about the axis: natural vignetting takes 1 - cos⁴ of half a pixel's diagonal, 2e-3
@@ -49,13 +52,13 @@ def test_the_reference_exposure_puts_a_facet_at_45_degrees_at_the_metering_level
 
 def metered(scene: SceneConfig, brightness: np.ndarray, semantic: np.ndarray) -> tuple[float, float]:
     """Return the metered exposure of a frame of given brightness after one second, and the reference."""
-    camera: Camera = world.base_camera(scene)
+    camera: Camera = assemble.base_camera(scene)
     white = np.ones(4, dtype=np.float32)
     rate = Electrons(array=np.tile(brightness[..., None].astype(np.float32), (1, 1, 4)), white_e=white)
     frame: Any = SimpleNamespace(
         spec=SimpleNamespace(scene=scene), camera=camera, truth=SimpleNamespace(semantic=semantic)
     )
-    return exposure._metered_exposure_s(frame, rate), exposure.reference_exposure_s(scene, camera)
+    return expose._metered_exposure_s(frame, rate), expose.reference_exposure_s(scene, camera)
 
 
 def test_metering_puts_the_percentile_of_the_lit_body_at_its_level_within_its_range() -> None:
@@ -101,9 +104,9 @@ def test_the_exposure_stays_within_the_cameras_limits() -> None:
 
 def test_electrons_of_a_second_are_the_rate() -> None:
     scene = parsed()
-    camera = world.base_camera(scene)
+    camera = assemble.base_camera(scene)
     light = facet(scene)
-    rate = exposure._rate(SimpleNamespace(camera=camera), light)  # type: ignore[arg-type]
+    rate = expose._rate(SimpleNamespace(camera=camera), light)  # type: ignore[arg-type]
     # by the lens's irradiance and the detector's exposure of a quarter of a second, apart from Camera.expose
     quarter = camera.detector.electrons_expected(camera.lens.image(light), 0.25)
     np.testing.assert_allclose(quarter.array, 0.25 * rate.array, rtol=1e-6)

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from test_faults_kit import flat_electrons, make, make_context, noisy, rng, with_mosaic
 
+from vbnfault.core.quantities import Charge, Electrons
 from vbnfault.faults import FaultContext
-from vbnfault.quantities import Charge, Electrons
 
 FULL_WELL_E = 40_000.0
 

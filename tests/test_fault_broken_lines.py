@@ -7,7 +7,7 @@ import pytest
 from test_faults_kit import flat_rgbi, make, make_context, rng
 
 from vbnfault.camera import ARCHITECTURES
-from vbnfault.errors import InputError
+from vbnfault.core.errors import InputError
 from vbnfault.faults.broken_lines import TextureBrokenLines
 
 

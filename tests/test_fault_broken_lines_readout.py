@@ -10,11 +10,11 @@ import pytest
 from test_faults_kit import flat_electrons, make, make_context, noisy, rng, with_mosaic
 
 from vbnfault.camera import ARCHITECTURES
+from vbnfault.core.quantities import RawMosaic
 from vbnfault.detector import load_sensor
 from vbnfault.detector.readout import node_of
 from vbnfault.faults import FaultContext
 from vbnfault.faults.broken_lines_readout import ONE_WAY, POSSIBLE
-from vbnfault.quantities import RawMosaic
 
 SIZE = 64
 NOTHING: dict[str, Any] = {"lines": [], "register": None, "node": -1}

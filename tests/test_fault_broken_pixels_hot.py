@@ -10,13 +10,13 @@ import pytest
 from conftest import small_scene
 from test_faults_kit import flat_electrons, inside, make, make_context, rng, with_mosaic
 
-from vbnfault import config
+from vbnfault.core.errors import InputError
+from vbnfault.core.quantities import RTS, RTS_HIGH, STUCK, Charge, Offset, RawMosaic
 from vbnfault.detector.chain import MosaicNoise
 from vbnfault.detector.individual import offset_e
-from vbnfault.errors import InputError
 from vbnfault.faults import FaultContext
 from vbnfault.pipeline import Session
-from vbnfault.quantities import RTS, RTS_HIGH, STUCK, Charge, Offset, RawMosaic
+from vbnfault.scene import config
 
 SIZE = 128
 KEYS: dict[str, Any] = {

@@ -11,10 +11,10 @@ import pytest
 from scipy import stats
 from test_faults_kit import flat_electrons, make, make_context, noisy, rng, with_mosaic
 
+from vbnfault.core.quantities import Charge
 from vbnfault.detector.cosmic import stopping_power_MeV_cm2_g
 from vbnfault.faults import FaultContext
 from vbnfault.faults.cosmic_rays import _poisson_above_0
-from vbnfault.quantities import Charge
 
 
 def context(architecture: str = "cmos", size: int = 96, **sensor: Any) -> FaultContext:

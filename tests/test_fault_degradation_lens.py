@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 from scipy.integrate import quad
 from test_faults_kit import flat_electrons, make, make_context, rng
 
-from vbnfault import spectra
-from vbnfault.errors import InputError
+from vbnfault.core import spectra
+from vbnfault.core.errors import InputError
+from vbnfault.core.quantities import Electrons
 from vbnfault.faults import FaultContext, degradation_lens
 from vbnfault.faults.degradation_lens import browned, colours, haze_kernel, scratch_kernel, stabilised, worn
 from vbnfault.lens import load_lens, parse_lens
-from vbnfault.quantities import Electrons
 
 F64 = NDArray[np.float64]
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from test_faults_kit import flat_electrons, make, make_context, rng
 
-from vbnfault.errors import InputError
+from vbnfault.core.errors import InputError
 from vbnfault.faults.dust import GaussianDust, transmission
 
 # The paper's figure of four grains.

@@ -14,14 +14,14 @@ from numpy.typing import NDArray
 from scipy.special import j0, j1
 from test_faults_kit import flat_electrons, make, make_context, rng
 
-from vbnfault import spectra
 from vbnfault.camera import Camera
+from vbnfault.core import spectra
+from vbnfault.core.errors import InputError
 from vbnfault.detector import Detector
-from vbnfault.errors import InputError
 from vbnfault.faults import FaultContext, dust_lens
 from vbnfault.lens import RealLens, ThinLens, first_order, load_lens, scaled_to_field, stopped_down
 from vbnfault.lens.footprint import Frame, beams, disc_overlap
-from vbnfault.lens.trace import real_pupil_diameter_mm, trace
+from vbnfault.lens.rays import real_pupil_diameter_mm, trace
 
 F64 = NDArray[np.float64]
 

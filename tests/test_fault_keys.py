@@ -13,11 +13,12 @@ import pytest
 from numpy.typing import NDArray
 from test_faults_kit import make_context, noisy, with_mosaic
 
-from vbnfault import labels, spectra
+from vbnfault.core import spectra
+from vbnfault.core.errors import InputError
+from vbnfault.core.quantities import Electrons
 from vbnfault.detector import MosaicDetector
-from vbnfault.errors import InputError
 from vbnfault.faults import Fault, FaultContext, act, from_dict, registry
-from vbnfault.quantities import Electrons
+from vbnfault.pipeline import labels
 
 SIZE = 64
 KEYS = [

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from test_faults_kit import flat_rgbi, make, make_context, rng
 
-from vbnfault.errors import InputError
+from vbnfault.core.errors import InputError
 
 
 def save(path: Path, array: np.ndarray) -> str:

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from test_faults_kit import make, make_context, rng, with_mosaic
 
+from vbnfault.core.quantities import Electrons
 from vbnfault.faults import FaultContext
-from vbnfault.quantities import Electrons
 
 EXPOSURE_S = 0.01
 SIZE = 64

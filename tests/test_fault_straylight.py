@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from test_faults_kit import flat_electrons, make, make_context, rng
 
-from vbnfault.errors import InputError
+from vbnfault.core.errors import InputError
+from vbnfault.core.resources import data_dir
 from vbnfault.faults.flare_textures import STEP, TEXTURES
 from vbnfault.faults.flare_textures import make as make_texture
 from vbnfault.faults.straylight import CLOSE, FAR, flare_centres_px, pyramid
-from vbnfault.resources import data_dir
 
 # The paper's table of the parameters of its full example.
 PAPER_EXAMPLE = [

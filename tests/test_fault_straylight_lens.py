@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from test_faults_kit import flat_electrons, make_context
 
-from vbnfault import llvm, spectra
-from vbnfault.errors import InputError, VbnfaultError
+from vbnfault.core import llvm, spectra
+from vbnfault.core.errors import InputError, VbnfaultError
 from vbnfault.faults import FaultContext, from_dict, registry
 from vbnfault.lens import first_order, load_lens, scaled_to_focal_length
 from vbnfault.lens.coating import mean_reflectance
-from vbnfault.lens.paraxial import transmittance
-from vbnfault.lens.trace import ghost
+from vbnfault.lens.rays import ghost
+from vbnfault.lens.straylight.paraxial import transmittance
 
 try:
     llvm.find()

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from test_faults_kit import flat_electrons, make, make_context, noisy, rng, with_mosaic
 
+from vbnfault.core.quantities import RawMosaic
 from vbnfault.detector import load_sensor
 from vbnfault.detector.readout import transmission_order
 from vbnfault.faults import FaultContext
-from vbnfault.quantities import RawMosaic
 
 SIZE = 64
 PARAMS: dict[str, Any] = {

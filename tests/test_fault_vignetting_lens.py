@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 from test_faults_kit import flat_electrons, make, make_context, rng
 
 from vbnfault.camera import Camera
+from vbnfault.core.errors import InputError
 from vbnfault.detector import Detector
-from vbnfault.errors import InputError
 from vbnfault.faults import FaultContext
 from vbnfault.lens import RealLens, ThinLens, first_order, load_lens, scaled_to_field
-from vbnfault.lens.trace import real_pupil_diameter_mm, trace
+from vbnfault.lens.rays import real_pupil_diameter_mm, trace
 
 F64 = NDArray[np.float64]
 

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from test_faults_kit import make_context, noisy, with_mosaic
 
 from vbnfault.camera import ARCHITECTURES, READOUT_DIRECTIONS
-from vbnfault.errors import InputError
+from vbnfault.core.errors import InputError
 from vbnfault.faults import (
     FAULT_AXIS,
     MOSAIC_STEPS,
@@ -360,7 +360,7 @@ def test_every_number_serves_at_both_ends_of_its_limits(
 @pytest.mark.parametrize("model", ["traced", "paraxial"])
 def test_limits_of_straylight_are_those_of_scatter(model: str) -> None:
     """Scattering serves at both ends of the declared limits; it and the reader refuse what lies beyond."""
-    from vbnfault.lens import scatter
+    from vbnfault.lens.straylight import scatter
 
     fields = registry()["straylight"][model].__dataclass_fields__
     for key, physics in (

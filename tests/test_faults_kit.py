@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 
 from vbnfault.camera import Camera, focal_length_mm
+from vbnfault.core.quantities import RGBI, Charge, Electrons, Offset, Quantity, RawMosaic
 from vbnfault.detector import Detector, MosaicDetector, load_sensor
 from vbnfault.faults import Fault, FaultContext, from_dict
 from vbnfault.lens import ThinLens
-from vbnfault.quantities import RGBI, Charge, Electrons, Offset, Quantity, RawMosaic
 
 FOV_DEG = 40.0
 

@@ -14,10 +14,10 @@ from conftest import calls_of
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vbnfault import spice
 from vbnfault.body import formats, load_shape
 from vbnfault.body.shape import signed_volume
-from vbnfault.errors import InputError
+from vbnfault.core import spice
+from vbnfault.core.errors import InputError
 
 REAL_SHAPE = Path(__file__).parents[2] / "shared/data/shapes/67p_18k.obj"
 Arrays = tuple[np.ndarray, np.ndarray]

@@ -9,7 +9,7 @@ import fuzz
 import pytest
 
 from vbnfault import cli
-from vbnfault.errors import InputError
+from vbnfault.core.errors import InputError
 
 
 def outcome(monkeypatch: pytest.MonkeyPatch, folder: Path, main: object) -> str:

@@ -9,23 +9,23 @@ import numpy as np
 import pytest
 from test_lens import BACK, GLASS, STOP
 
-from vbnfault import llvm
-from vbnfault.errors import InputError, VbnfaultError
+from vbnfault.core import llvm
+from vbnfault.core.errors import InputError, VbnfaultError
 from vbnfault.lens import first_order, load_lens, parse_lens, scaled_to_focal_length
 from vbnfault.lens.glass import D_NM
-from vbnfault.lens.paraxial import paraxial_ghosts
 from vbnfault.lens.prescription import Prescription
-from vbnfault.lens.trace import path_of, trace
+from vbnfault.lens.rays import path_of, trace
+from vbnfault.lens.straylight.paraxial import paraxial_ghosts
 
 try:
     llvm.find()
 except VbnfaultError as error:
     pytest.skip(f"no usable LLVM: {error}", allow_module_level=True)
 
-from vbnfault.lens.flare import FlareModel, disc_samples
-from vbnfault.lens.ghosts import boxes, traced_ghosts
-from vbnfault.lens.raster import _EDGE_NODES, EDGE_HIGH, EDGE_LOW, edge_profiles
-from vbnfault.lens.tracer import Rays, Tracer, backend, name_of, routes
+from vbnfault.lens.straylight.bundles import Rays, Tracer, backend, name_of, routes
+from vbnfault.lens.straylight.ghosts import boxes, traced_ghosts
+from vbnfault.lens.straylight.irradiance import FlareModel, disc_samples
+from vbnfault.lens.straylight.raster import _EDGE_NODES, EDGE_HIGH, EDGE_LOW, edge_profiles
 
 LENSES = (
     "nikkor_35_f2p8",

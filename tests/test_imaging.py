@@ -19,26 +19,21 @@ from numpy.typing import NDArray
 from scipy.signal import convolve2d
 from scipy.special import ndtr
 
-from vbnfault import config, dataset, pipeline, plan, resources, sky, world
+from vbnfault import dataset, pipeline
 from vbnfault.camera import Camera
+from vbnfault.core import resources
+from vbnfault.core.errors import InputError
+from vbnfault.core.quantities import BODY, SUN, Radiance
 from vbnfault.detector import Detector
-from vbnfault.errors import InputError
-from vbnfault.lens import (
-    RealLens,
-    ThinLens,
-    first_order,
-    imaging,
-    load_lens,
-    parse_lens,
-    scaled_to_field,
-)
+from vbnfault.lens import RealLens, ThinLens, first_order, imaging, load_lens, parse_lens, scaled_to_field
 from vbnfault.lens.coating import design, mean_reflectance
 from vbnfault.lens.footprint import DEFAULT_LENS
 from vbnfault.lens.glass import C_NM, D_NM, F_NM
-from vbnfault.lens.trace import real_pupil_diameter_mm, trace
-from vbnfault.quantities import BODY, SUN, Radiance
-from vbnfault.record import to_sample
-from vbnfault.scene import View
+from vbnfault.lens.rays import real_pupil_diameter_mm, trace
+from vbnfault.pipeline.record import to_sample
+from vbnfault.render.description import View
+from vbnfault.scene import config, plan
+from vbnfault.world import assemble, sky
 
 F64 = NDArray[np.float64]
 
@@ -483,9 +478,9 @@ def test_bad_lenses_are_told_in_a_sentence(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"camera.*focus = 'best': needs lens"):
         scene(focus="best")
     with pytest.raises(InputError, match=r"camera\.lens: no_such: .*nikkor_35_f2p8"):
-        world.base_camera(scene(lens="no_such"))
+        assemble.base_camera(scene(lens="no_such"))
     with pytest.raises(InputError, match=r"camera\.lens_coating = 'gold': must be one of none, mgf2"):
-        world.base_camera(scene(lens="tessar_50_f2p8", lens_coating="gold"))
+        assemble.base_camera(scene(lens="tessar_50_f2p8", lens_coating="gold"))
 
 
 def test_a_lens_beside_the_scene_file_is_found_and_told_by_its_contents(tmp_path: Path) -> None:
@@ -494,7 +489,7 @@ def test_a_lens_beside_the_scene_file_is_found_and_told_by_its_contents(tmp_path
     (tmp_path / "scene.toml").write_text('title = "x"\n[camera]\nlens = "own.toml"\nlens_coating = "v"\n')
     found = config.load_scene(tmp_path / "scene.toml")
     assert found.camera.lens == str((tmp_path / "own.toml").resolve())
-    lens = world.base_camera(found).lens
+    lens = assemble.base_camera(found).lens
     assert isinstance(lens, RealLens)
     assert lens.prescription.surfaces[0].coating
     named = config.load_scene(tmp_path / "scene.toml", {"camera.lens": "tessar_50_f2p8"})
@@ -502,7 +497,7 @@ def test_a_lens_beside_the_scene_file_is_found_and_told_by_its_contents(tmp_path
     identities = [dataset.scene_identity(pipeline.Session(s)) for s in (found, named)]
     assert identities[0]["camera"] == identities[1]["camera"]
     assert identities[0]["camera"]["lens"].startswith("sha256:")
-    assert world.base_camera(named).lens is world.base_camera(named).lens  # its tables are made once
+    assert assemble.base_camera(named).lens is assemble.base_camera(named).lens  # its tables are made once
 
 
 def test_the_lens_of_a_thin_camera_is_told_by_its_contents(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -541,7 +536,7 @@ def test_stars_go_through_the_lens() -> None:
         render={"bands": 3, "band_min_nm": 550.0, "band_max_nm": 620.0},
     )
     stars = config.parse_scene(table, source="test")
-    c, nodes, date = world.base_camera(stars), world.wavelengths_nm(stars), stars.sun.julian_date
+    c, nodes, date = assemble.base_camera(stars), assemble.wavelengths_nm(stars), stars.sun.julian_date
     lens = c.lens
     assert isinstance(lens, RealLens)
     gx, gy = c.guard_px
@@ -553,7 +548,7 @@ def test_stars_go_through_the_lens() -> None:
         height_px=256 + 2 * gy,
     )
     dark = Radiance(array=np.zeros((3, view.height_px, view.width_px), np.float32), wavelength_nm=nodes)
-    seen = world.with_stars(stars, dark, c, np.eye(3), np.ones(dark.array.shape[1:], dtype=bool), view)
+    seen = assemble.with_stars(stars, dark, c, np.eye(3), np.ones(dark.array.shape[1:], dtype=bool), view)
     image = lens.image(seen)
     catalogue = sky.load_catalogue().brighter_than(2.5)
     found = [
@@ -581,7 +576,7 @@ def test_stars_go_through_the_lens() -> None:
 
 
 def test_a_thin_lens_has_neither_distortion_nor_guard_band() -> None:
-    thin = world.base_camera(scene())
+    thin = assemble.base_camera(scene())
     assert isinstance(thin.lens, ThinLens)
     assert thin.guard_px == (0, 0)
     assert thin.lens_name == "thin lens"

@@ -18,14 +18,16 @@ from typing import Any, get_args, get_type_hints
 import numpy as np
 import pytest
 
-from vbnfault import cli, config, resources, spice
+from vbnfault import cli
 from vbnfault.body import load_shape
 from vbnfault.body.shape import signed_volume
+from vbnfault.core import resources, spice
+from vbnfault.core.errors import InputError, VbnfaultError, shown
 from vbnfault.detector.sensor import load_sensor
-from vbnfault.errors import InputError, VbnfaultError, shown
 from vbnfault.faults import from_dict, registry
 from vbnfault.lens import load_lens
-from vbnfault.spacecraft import load_spacecraft
+from vbnfault.scene import config
+from vbnfault.world.spacecraft import load_spacecraft
 
 TITLE = 'title = "t"\n'
 
@@ -368,7 +370,7 @@ def test_a_meta_kernel_that_names_a_pipe_does_not_block(tmp_path: Path) -> None:
 
 def command(*arguments: str, **more: Any) -> subprocess.CompletedProcess[str]:
     """The program run with arguments; no traceback whatever happens."""
-    given = [sys.executable, "-m", "vbnfault.cli", *arguments]
+    given = [sys.executable, "-m", "vbnfault", *arguments]
     done = subprocess.run(given, text=True, check=False, **{"capture_output": True, **more})
     assert "Traceback" not in (done.stderr or ""), done.stderr
     return done

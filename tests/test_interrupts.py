@@ -12,9 +12,10 @@ from test_build import SAMPLES, Session
 from test_build import run as build
 from test_cli import run
 
-from vbnfault import resources, store
-from vbnfault.jobs.errors import Interrupted
-from vbnfault.quantities import Sample
+from vbnfault import store
+from vbnfault.core import resources
+from vbnfault.core.quantities import Sample
+from vbnfault.dataset.errors import Interrupted
 
 SENTENCE = "vbnfault: interrupted; what was written stays; repeat the command to go on\n"
 NUMBERS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)

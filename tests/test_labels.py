@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from vbnfault import labels, record
+from vbnfault.pipeline import labels, record
 
 images = arrays(np.uint8, (3, 5, 4), elements=st.sampled_from([0, 1, 128, 254, 255]))
 SHAPE = (4, 6)

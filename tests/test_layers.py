@@ -13,11 +13,12 @@ from conftest import small_scene
 from test_faults_contract import MODELS
 from test_faults_kit import flat_electrons, make_context, with_mosaic
 
-from vbnfault import config, dataset, store
-from vbnfault.errors import InputError
+from vbnfault import dataset, store
+from vbnfault.core.errors import InputError
+from vbnfault.core.quantities import SOFT_KINDS, soft_kind
 from vbnfault.faults import Fault, from_dict, registry
 from vbnfault.pipeline import Session
-from vbnfault.quantities import SOFT_KINDS, soft_kind
+from vbnfault.scene import config
 
 # The names of layers that the scene file takes; the patterns of names are filled in below.
 PATTERN = next(m.pattern for m in typing.get_args(config.Layer)[1].metadata if hasattr(m, "pattern"))

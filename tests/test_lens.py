@@ -11,15 +11,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from vbnfault import resources
-from vbnfault.errors import InputError
-from vbnfault.lens import first_order, load_lens, paraxial, parse_lens, scaled_to_field, scaled_to_focal_length
-from vbnfault.lens import trace as trace_module
+from vbnfault.core import resources
+from vbnfault.core.errors import InputError
+from vbnfault.lens import first_order, load_lens, parse_lens, scaled_to_field, scaled_to_focal_length
+from vbnfault.lens import rays as trace_module
 from vbnfault.lens.coating import NAMES, Layer, design, mean_reflectance, reflect_transmit
-from vbnfault.lens.first_order import gap, refraction, system
+from vbnfault.lens.gaussian import gap, refraction, system
 from vbnfault.lens.glass import AIR, GLASSES, from_abbe
 from vbnfault.lens.prescription import Surface
-from vbnfault.lens.trace import ghost, real_pupil_diameter_mm, trace
+from vbnfault.lens.rays import ghost, real_pupil_diameter_mm, trace
+from vbnfault.lens.straylight import paraxial
 
 # (EFL, BFD, f-number by the paraxial pupil), the patents' rows recomputed
 PUBLISHED = {

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from test_lens import PUBLISHED
 
-from vbnfault.errors import InputError
+from vbnfault.core.errors import InputError
 from vbnfault.lens import first_order, load_lens
 from vbnfault.lens.family import relative, to_table, write_lens
 

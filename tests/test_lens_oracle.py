@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 from test_lens import BACK, GLASS, STOP
 
-from vbnfault import llvm
-from vbnfault.errors import VbnfaultError
+from vbnfault.core import llvm
+from vbnfault.core.errors import VbnfaultError
 from vbnfault.lens import Prescription, first_order, load_lens, parse_lens
 from vbnfault.lens.coating import mean_reflectance
 from vbnfault.lens.glass import D_NM, F_NM, from_abbe
-from vbnfault.lens.paraxial import paraxial_ghosts, transmittance
-from vbnfault.lens.trace import ghost, trace
+from vbnfault.lens.rays import ghost, trace
+from vbnfault.lens.straylight.paraxial import paraxial_ghosts, transmittance
 
 pytest.importorskip("optiland", reason="optiland (of the extra 'test') is not installed")
 
@@ -304,7 +304,7 @@ def test_traced_ghosts_against_the_sequential_trace(name: str, sun_deg: float) -
         llvm.find()
     except VbnfaultError as error:
         pytest.skip(f"no usable LLVM: {error}")
-    from vbnfault.lens.ghosts import traced_ghosts
+    from vbnfault.lens.straylight.ghosts import traced_ghosts
 
     lens, wavelength = load_lens(name), WAVELENGTH_NM.get(name, D_NM)
     traced = traced_ghosts(lens, sun_deg, azimuth_deg=AZIMUTH_DEG, wavelength_nm=wavelength, only=PAIRS[name])
@@ -376,7 +376,7 @@ def test_traced_ghosts_off_the_sensor() -> None:
         llvm.find()
     except VbnfaultError as error:
         pytest.skip(f"no usable LLVM: {error}")
-    from vbnfault.lens.ghosts import traced_ghosts
+    from vbnfault.lens.straylight.ghosts import traced_ghosts
 
     lens = load_lens("nikkor_28_f2p8_camera").coated("none")
     rows = len(lens.surfaces)

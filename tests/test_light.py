@@ -10,11 +10,12 @@ import pytest
 from test_photometry import SETS, by_angles, directions
 from test_render import NODES, UP, join, plane, sun, view
 
-from vbnfault import frames, photometry, render, spectra
-from vbnfault.photometry import HAPKE_TABLES, Diffuse, Photometry, hapke_at
+from vbnfault import render
+from vbnfault.core import frames, photometry, spectra
+from vbnfault.core.photometry import HAPKE_TABLES, Diffuse, Photometry, hapke_at
+from vbnfault.render.description import Scene, Sunlight, View
 from vbnfault.render.runtime import dr, mi
 from vbnfault.render.sampling import disc_sets
-from vbnfault.scene import Scene, Sunlight, View
 
 
 def scene(a_view: View, light: Sunlight, ground: Photometry | float, spp: int = 16, **more: object) -> Scene:
@@ -86,7 +87,7 @@ def test_every_band_has_its_own_phase_function() -> None:
 
 
 def _columns() -> tuple[str, ...]:
-    from vbnfault.photometry import COLUMNS
+    from vbnfault.core.photometry import COLUMNS
 
     return COLUMNS
 

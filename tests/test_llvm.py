@@ -14,8 +14,8 @@ from pathlib import Path
 import numpy._core._multiarray_umath as some_library
 import pytest
 
-from vbnfault import llvm
-from vbnfault.errors import InputError, VbnfaultError
+from vbnfault.core import llvm
+from vbnfault.core.errors import InputError, VbnfaultError
 
 NOT_LLVM = Path(some_library.__file__)  # a shared library of every system these tests run on
 

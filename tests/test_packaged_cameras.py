@@ -9,13 +9,16 @@ import numpy as np
 import pytest
 from conftest import small_scene
 
-from vbnfault import config, dataset, llvm, photometry, pipeline, resources, spectra, store, world
+from vbnfault import dataset, pipeline, store
+from vbnfault.core import llvm, photometry, resources, spectra
+from vbnfault.core.errors import VbnfaultError
+from vbnfault.core.quantities import Irradiance
 from vbnfault.detector import MosaicDetector
 from vbnfault.detector.readout import ReadoutNoise, analogue_dn, read_out
 from vbnfault.detector.sensor import load_sensor
-from vbnfault.errors import VbnfaultError
 from vbnfault.lens import ThinLens, load_lens
-from vbnfault.quantities import Irradiance
+from vbnfault.scene import config
+from vbnfault.world import assemble
 
 LENSES = sorted(resources.packaged("scenes/lenses"))
 DETECTORS = sorted(resources.packaged("scenes/detectors"))
@@ -33,8 +36,8 @@ def test_the_sun_in_the_field_does_not_saturate_a_packaged_scene(name: str) -> N
     if fault is None or "veil_fraction" not in fault.to_dict():
         assert fault is None or fault.model == "texture"  # no veil
         return
-    camera, nodes = world.base_camera(scene), world.wavelengths_nm(scene)
-    sun = world.sunlight(scene, np.array([0.0, 0.0, -1.0])).irradiance_W_m2_nm
+    camera, nodes = assemble.base_camera(scene), assemble.wavelengths_nm(scene)
+    sun = assemble.sunlight(scene, np.array([0.0, 0.0, -1.0])).irradiance_W_m2_nm
     veil = max(fault.to_dict()["veil_fraction"]) * sun * camera.lens.transmittance(nodes)
     veil /= 4 * camera.lens.f_number**2
     on_sensor = Irradiance(array=veil.astype(np.float32)[:, None, None], wavelength_nm=nodes)
@@ -108,7 +111,7 @@ def test_noise_hides_the_steps_of_the_converter(name: str) -> None:
 def test_the_navigation_camera_is_the_published_one() -> None:
     """NSSDCA 2004-006A-17: 152.5 mm; 70 mm, f/2.2; behind the attenuator 30 mm, f/5.1, and 580 times less light."""
     scene = config.load_scene("navcam67p")
-    camera = world.base_camera(scene)
+    camera = assemble.base_camera(scene)
     lens = camera.lens
     assert isinstance(lens, ThinLens)
     # the published figures have two to four digits
@@ -121,9 +124,9 @@ def test_the_navigation_camera_is_the_published_one() -> None:
 
 def test_the_navigation_camera_sees_to_1000_nm() -> None:
     scene = config.load_scene("navcam67p")
-    nodes = world.wavelengths_nm(scene)
+    nodes = assemble.wavelengths_nm(scene)
     assert (nodes[0], nodes[-1]) == (400.0, 1000.0)
-    detector = world.base_camera(scene).detector
+    detector = assemble.base_camera(scene).detector
     assert isinstance(detector, MosaicDetector)
     efficiency = detector.sensor.efficiency.at(np.array([400.0, 450.0, 650.0, 900.0, 1000.0]))[0]
     assert (efficiency > 0.03).all()
@@ -131,7 +134,7 @@ def test_the_navigation_camera_sees_to_1000_nm() -> None:
     # 67P's own light in all of it: sunlight of ASTM G173 at 1000 nm is 0.74 W/m²/nm at 1 au
     assert spectra.solar_irradiance_W_m2_nm(np.array([1000.0]))[0] == pytest.approx(0.74, rel=0.03)
     sun = spectra.solar_band_irradiance_W_m2_nm(nodes, 1.0)
-    albedo = photometry.geometric_albedo(world.photometric_model(scene))
+    albedo = photometry.geometric_albedo(assemble.photometric_model(scene))
     # Fornasier et al. 2015: 11 to 16 % per 100 nm in the visible; 0.0820 at 989 nm, 0.0677 at 649 nm, 5 % each
     near, red = (float(np.interp(nm, nodes, albedo)) for nm in (989.0, 649.0))
     assert near / red == pytest.approx(0.0820 / 0.0677, rel=0.1)

@@ -8,8 +8,8 @@ import math
 import numpy as np
 import pytest
 
-from vbnfault import photometry
-from vbnfault.photometry import COLUMNS, HAPKE_TABLES, Diffuse, Hapke, hapke_at, radiance_factor
+from vbnfault.core import photometry
+from vbnfault.core.photometry import COLUMNS, HAPKE_TABLES, Diffuse, Hapke, hapke_at, radiance_factor
 
 # w, g, B0, h_s, B_C0, h_c, roughness (deg), K
 SETS = {

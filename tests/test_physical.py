@@ -11,14 +11,17 @@ from scipy.spatial.transform import Rotation
 from test_light import scene
 from test_render import NODES, UP, join, plane, sun, view
 
-from vbnfault import config, exposure, frames, render, sky, world
-from vbnfault.errors import InputError
-from vbnfault.photometry import hapke_at
-from vbnfault.pipeline import STAGES, Session
-from vbnfault.quantities import BODY, SKY, SPACECRAFT
-from vbnfault.record import to_sample
+from vbnfault import render
+from vbnfault.core import frames
+from vbnfault.core.errors import InputError
+from vbnfault.core.photometry import hapke_at
+from vbnfault.core.quantities import BODY, SKY, SPACECRAFT
+from vbnfault.pipeline import STAGES, Session, expose
+from vbnfault.pipeline.record import to_sample
+from vbnfault.pipeline.spec import Frame
 from vbnfault.render.detail import _LEVELS, _SIDE, _UNIT, _pyramid
-from vbnfault.sample import Frame
+from vbnfault.scene import config
+from vbnfault.world import assemble, sky
 
 TRUTH = ["depth_m", "normal", "semantic", "point_T_m", "incidence_deg", "emission_deg", "phase_deg", "albedo"]
 
@@ -93,7 +96,7 @@ def test_truth_angles_are_those_of_the_points(samples: tuple[Session, list[Frame
             atol = 1e-3 if name == "phase_deg" else 0.1
             np.testing.assert_allclose(sample.layers[name][on], expected, atol=atol)
         albedo = sample.layers["albedo"][on]
-        bare = world.normal_albedo(frame.spec.scene, np.zeros(1, np.float32))[0]
+        bare = assemble.normal_albedo(frame.spec.scene, np.zeros(1, np.float32))[0]
         assert albedo.min() >= bare * (1 - 1e-5)
         assert albedo.max() <= bare * 1.16 * (1 + 1e-5)
 
@@ -133,7 +136,7 @@ def test_albedo_on_the_spacecraft_is_that_of_its_material(samples: tuple[Session
         v = np.einsum("rk,fk->rf", rays, np.cross(-a, b)) / det
         z = np.einsum("fk,fk->f", c, np.cross(-a, b)) / det
     z[~((u >= 0) & (v >= 0) & (u + v <= 1) & (z > 0))] = np.inf
-    nodes = world.wavelengths_nm(s.scene)
+    nodes = assemble.wavelengths_nm(s.scene)
     near = int(np.argmin(np.abs(nodes - 649.0)))
     expected = mesh.reflectance(nodes)[mesh.face_material[z.argmin(axis=1)], near]
     got = sample.layers["albedo"][rows, columns]
@@ -206,9 +209,9 @@ def test_noise_of_sampling_stays_below_the_sensors() -> None:
         frame = Frame(spec=s.spec(i))
         for stage in STAGES[:3]:
             stage(frame)
-        described = dataclasses.replace(exposure.describe(frame), samples_per_pixel=4096, key=99)
+        described = dataclasses.replace(expose.describe(frame), samples_per_pixel=4096, key=99)
         converged, _ = render.direct(frame.spec.terrain.surface, described)
-        to_e = frame.camera.exposure_s * exposure.green_per_second(frame)
+        to_e = frame.camera.exposure_s * expose.green_per_second(frame)
         signal, error = (np.einsum("b,byx->yx", to_e, a) for a in (converged.array, frame.radiance.array))
         detector = frame.camera.detector
         sensor = np.sqrt(
@@ -281,8 +284,8 @@ def test_bad_worlds_are_told_in_a_sentence(tables: dict[str, dict[str, object]],
     scene_ = config.parse_scene(physical(**tables), source="test")
 
     def whole() -> None:
-        world.spacecraft(scene_)
-        world.ephemeris(scene_)
+        assemble.spacecraft(scene_)
+        assemble.ephemeris(scene_)
 
     with pytest.raises(InputError) as told:
         whole()

@@ -10,11 +10,13 @@ import numpy as np
 import pytest
 from conftest import ALL_FAULTS, small_scene
 
-from vbnfault import config, frames, labels, pipeline, plan
-from vbnfault.pictures import develop, effect_of
-from vbnfault.pipeline import Session
-from vbnfault.record import to_sample
-from vbnfault.sample import Frame
+from vbnfault import pipeline
+from vbnfault.core import frames
+from vbnfault.pipeline import Session, labels
+from vbnfault.pipeline.photograph import develop, effect_of
+from vbnfault.pipeline.record import to_sample
+from vbnfault.pipeline.spec import Frame
+from vbnfault.scene import config, plan
 
 _SESSIONS: dict[str, Session] = {}
 

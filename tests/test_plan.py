@@ -12,10 +12,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from vbnfault import config, frames, plan
-from vbnfault.config import SceneConfig, parse_scene
-from vbnfault.errors import InputError
+from vbnfault.core import frames
+from vbnfault.core.errors import InputError
 from vbnfault.faults import FAULT_AXIS
+from vbnfault.scene import config, plan
+from vbnfault.scene.config import SceneConfig, parse_scene
 
 N = 2000
 FAR = plan.SUN_AVERTED

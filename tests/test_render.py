@@ -7,12 +7,13 @@ import dataclasses
 import numpy as np
 import pytest
 
-from vbnfault import frames, render, spectra
+from vbnfault import render
+from vbnfault.core import frames, spectra
+from vbnfault.core.photometry import Diffuse
 from vbnfault.detector import Detector
 from vbnfault.lens import ThinLens
-from vbnfault.photometry import Diffuse
+from vbnfault.render.description import Scene, Sunlight, View
 from vbnfault.render.runtime import dr
-from vbnfault.scene import Scene, Sunlight, View
 
 UP = np.array([0.0, 0.0, -1.0])
 NODES = spectra.band_nodes_nm(400.0, 700.0, 8)

@@ -7,9 +7,12 @@ import pytest
 from conftest import small_scene
 from scipy import stats
 
-from vbnfault import config, frames, plan, pose, render, world
-from vbnfault.pipeline import Session
-from vbnfault.sample import Frame, SampleSpec
+from vbnfault import render
+from vbnfault.core import frames
+from vbnfault.pipeline import Session, resolve
+from vbnfault.pipeline.spec import Frame, SampleSpec
+from vbnfault.scene import config, plan
+from vbnfault.world import assemble
 
 N = 2000
 
@@ -23,7 +26,7 @@ def resolved() -> tuple[Session, list[Frame]]:
     for i in range(N):
         spec = SampleSpec(index=i, scene=session.scene, plan=session.plan, faults=session.faults, terrain=terrain)
         frame = Frame(spec=spec)
-        pose.resolve(frame)
+        resolve.resolve(frame)
         out.append(frame)
     return session, out
 
@@ -91,7 +94,7 @@ def test_redrawn_samples_follow_the_conditional_distribution(resolved: tuple[Ses
     ground = render.ground_height_m(surface, x, y, 424.3)
     position = np.column_stack([x, y, -(ground + height)])
     suns = [
-        world.sunlight(session.scene, frames.direction_L(a, b)) for a, b in zip(azimuth, elevation, strict=True)
+        assemble.sunlight(session.scene, frames.direction_L(a, b)) for a, b in zip(azimuth, elevation, strict=True)
     ]
     good = render.is_clear(surface, position, session.scene.geometry.clearance_m)
     good &= render.sun_visible_fraction(surface, position, suns) == 1.0

@@ -15,11 +15,13 @@ from numpy.typing import NDArray
 from scipy.integrate import quad
 from scipy.special import j1
 
-from vbnfault.errors import InputError
-from vbnfault.lens import Prescription, first_order, load_lens, parse_lens, scatter
-from vbnfault.lens.first_order import gap, refraction, system
-from vbnfault.lens.paraxial import mirrors, transmittance
-from vbnfault.lens.scatter import (
+from vbnfault.core.errors import InputError
+from vbnfault.lens import Prescription, first_order, load_lens, parse_lens
+from vbnfault.lens.gaussian import gap, refraction, system
+from vbnfault.lens.rays import forward
+from vbnfault.lens.straylight import scatter
+from vbnfault.lens.straylight.paraxial import mirrors, transmittance
+from vbnfault.lens.straylight.scatter import (
     DUST_INDEX,
     Harvey,
     baffle_transmission,
@@ -31,7 +33,6 @@ from vbnfault.lens.scatter import (
     scattered_intensity,
     veiling_glare,
 )
-from vbnfault.lens.trace import forward
 
 F64 = NDArray[np.float64]
 
@@ -206,7 +207,7 @@ def test_particles_grow_with_the_level_and_vanish_when_clean() -> None:
 
 def test_nothing_heavy_is_imported() -> None:
     script = (
-        "import sys, vbnfault.lens.scatter as s; heavy = {'miepython', 'numba', 'matplotlib'}; "
+        "import sys, vbnfault.lens.straylight.scatter as s; heavy = {'miepython', 'numba', 'matplotlib'}; "
         "assert not heavy & set(sys.modules); s.scattered_intensity(3.0, 1.0); "
         "assert 'numba' not in sys.modules, 'compiled'"
     )

@@ -10,7 +10,9 @@ import numpy as np
 import pytest
 import xarray
 
-from vbnfault import cli, config, dataset, pipeline, resources, store
+from vbnfault import cli, dataset, pipeline, store
+from vbnfault.core import resources
+from vbnfault.scene import config
 
 # Small images over coarse ground: the scene's own camera, faults and bounds of geometry stay.
 _SMALL = {"camera.width_px": 64, "camera.height_px": 64, "render.samples_per_pixel": 4, "dataset.sites": 1}

@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 from scipy import constants
 
-from vbnfault import resources, sky, spectra
+from vbnfault.core import resources, spectra
+from vbnfault.core.frames import J2000_JD, minimal_rotation, rx, ry
+from vbnfault.core.quantities import Radiance
 from vbnfault.detector import Detector
-from vbnfault.frames import J2000_JD, minimal_rotation, rx, ry
 from vbnfault.lens import ThinLens
-from vbnfault.quantities import Radiance
+from vbnfault.world import sky
 
 NODES_NM = spectra.band_nodes_nm(400.0, 700.0, 8)
 WIDTH, HEIGHT, FOCAL_PX = 96, 64, 120.0

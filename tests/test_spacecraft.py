@@ -14,9 +14,10 @@ import trimesh
 from trimesh.visual import TextureVisuals
 from trimesh.visual.material import PBRMaterial
 
-from vbnfault import spacecraft, spectra
-from vbnfault.errors import InputError
-from vbnfault.spacecraft import Material, Part, Placement, Pose, Spacecraft, load_spacecraft
+from vbnfault.core import spectra
+from vbnfault.core.errors import InputError
+from vbnfault.world import spacecraft
+from vbnfault.world.spacecraft import Material, Part, Placement, Pose, Spacecraft, load_spacecraft
 
 CORNERS = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nv 0 0 1\nv 1 0 1\nv 1 1 1\n"
 OBJ = (

@@ -9,9 +9,9 @@ from colour.plotting.datasets.astm_g_173 import DATA_ASTMG173_ETR
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vbnfault import spectra
+from vbnfault.core import spectra
+from vbnfault.core.quantities import LUMINANCE, Irradiance
 from vbnfault.detector import Detector
-from vbnfault.quantities import LUMINANCE, Irradiance
 
 NODES = spectra.band_nodes_nm(400, 700, 8)
 TABLE_NM = np.array(list(DATA_ASTMG173_ETR))

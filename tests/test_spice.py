@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from vbnfault import frames, spice
-from vbnfault.errors import InputError
+from vbnfault.core import frames, spice
+from vbnfault.core.errors import InputError
 
 spiceypy: Any = pytest.importorskip("spiceypy", reason="spiceypy (the extra 'spice') is not installed")
 
@@ -334,8 +334,8 @@ def test_a_scene_on_a_spacecrafts_way(
     from conftest import small_scene
     from test_cli import run, toml
 
-    from vbnfault import config
     from vbnfault.pipeline import Session
+    from vbnfault.scene import config
 
     far = np.linalg.norm(POSITION_T_M)
     # the bus holds an attitude of no importance: mount the camera so that it looks at the body's centre
@@ -399,7 +399,7 @@ def test_a_scene_on_a_spacecrafts_way(
 def test_a_way_needs_all_its_keys(table: dict[str, Any], words: str) -> None:
     from conftest import small_scene
 
-    from vbnfault import config
+    from vbnfault.scene import config
 
     with pytest.raises(InputError, match=words):
         config.parse_scene(small_scene(spice=table), source="test")

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 from scipy.special import j0, j1
 
-from vbnfault.errors import InputError
+from vbnfault.core.errors import InputError
 from vbnfault.lens import Prescription, first_order, load_lens, parse_lens, scaled_to_focal_length
-from vbnfault.lens.starburst import StopDefects, fraunhofer_psf, starburst
+from vbnfault.lens.straylight.starburst import StopDefects, fraunhofer_psf, starburst
 
 F64 = NDArray[np.float64]
 

@@ -17,10 +17,10 @@ import zarr
 from conftest import small_scene
 
 from vbnfault import store as st
-from vbnfault.config import parse_scene
-from vbnfault.errors import InputError, VbnfaultError
-from vbnfault.plan import make_plan
-from vbnfault.quantities import Sample
+from vbnfault.core.errors import InputError, VbnfaultError
+from vbnfault.core.quantities import Sample
+from vbnfault.scene.config import parse_scene
+from vbnfault.scene.plan import make_plan
 from vbnfault.store import check, codec
 
 FAULTS = ("dust_on_optics", "broken_pixels", "straylight", "vignetting")

@@ -19,7 +19,7 @@ import zarr
 from damage import SAMPLES, mend, sample, spec
 
 from vbnfault import store as st
-from vbnfault.errors import InputError, VbnfaultError
+from vbnfault.core.errors import InputError, VbnfaultError
 from vbnfault.store import disk
 from vbnfault.store.metadata import metadata_problems
 

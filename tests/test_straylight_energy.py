@@ -11,15 +11,16 @@ import pytest
 from numpy.typing import NDArray
 from test_faults_kit import make_context
 
-from vbnfault import flares, llvm, resources, spectra
 from vbnfault.camera import Camera
+from vbnfault.core import llvm, resources, spectra
+from vbnfault.core.errors import VbnfaultError
+from vbnfault.core.quantities import Electrons, Radiance
 from vbnfault.detector import Detector
-from vbnfault.errors import VbnfaultError
 from vbnfault.faults import FaultContext, act, from_dict, registry
 from vbnfault.lens import Prescription, RealLens, ThinLens, first_order, load_lens, parse_lens, scaled_to_field
 from vbnfault.lens.coating import mean_reflectance
-from vbnfault.lens.straylight import Cleanliness, straylight
-from vbnfault.quantities import Electrons, Radiance
+from vbnfault.lens.straylight.total import Cleanliness, straylight
+from vbnfault.output import flare_images
 
 try:
     llvm.find()
@@ -73,14 +74,14 @@ def transmitted(lens: Prescription) -> F64:
 def test_a_flares_direct_image_has_the_lens_transmission(sun_deg: float) -> None:
     """What the pupil admits and the lens transmits: starburst, glare and veil are in it, ghosts are not."""
     lens = parse_lens(ABSORBING, source="test")
-    view = flares.View(
+    view = flare_images.View(
         lens=lens, sun_deg=sun_deg, azimuth_deg=20.0, fov_deg=60.0, pixels=96, wavelength_nm=NODES, model="paraxial"
     )
     pupil = np.pi / 4 * first_order(lens).entrance_pupil_diameter_mm ** 2 * np.cos(np.radians(sun_deg))
-    direct = flux(flares.layers(replace(view, model="texture"))["sun"], view.pitch_mm)
+    direct = flux(flare_images.layers(replace(view, model="texture"))["sun"], view.pitch_mm)
     assert transmitted(lens).max() / transmitted(lens).min() > 1.2  # bands differ
     np.testing.assert_allclose(direct, pupil * transmitted(lens), rtol=1e-5)  # sums of float32
-    left = flux(flares.layers(view)["sun"], view.pitch_mm)
+    left = flux(flare_images.layers(view)["sun"], view.pitch_mm)
     assert (left < direct).all()
     assert (left > 0.93 * direct).all()
 
@@ -332,12 +333,12 @@ def test_the_sun_in_a_build_is_vignetted_once() -> None:
     """From scene file to electrons: behind a thin lens, cos⁴ falls on the scene and not on the Sun again."""
     from conftest import small_scene
 
-    from vbnfault import config
-    from vbnfault.exposure import meter, render_frame
-    from vbnfault.pictures import _draw, _signal
     from vbnfault.pipeline import Session
-    from vbnfault.pose import resolve
-    from vbnfault.sample import Frame
+    from vbnfault.pipeline.expose import meter, render_frame
+    from vbnfault.pipeline.photograph import _draw, _signal
+    from vbnfault.pipeline.resolve import resolve
+    from vbnfault.pipeline.spec import Frame
+    from vbnfault.scene import config
 
     table = small_scene(
         camera={"width_px": 64, "height_px": 64, "fov_deg": 2.0},
@@ -378,10 +379,10 @@ def test_the_mask_level_is_that_of_the_mask() -> None:
     """The mask holds the pixels that change by `mask_level_dn` or more, the effect all that change."""
     from conftest import small_scene
 
-    from vbnfault import config
     from vbnfault.dataset import store_spec
-    from vbnfault.pictures import develop
     from vbnfault.pipeline import Session
+    from vbnfault.pipeline.photograph import develop
+    from vbnfault.scene import config
 
     table = small_scene(
         camera={"width_px": 48, "height_px": 48},

@@ -15,7 +15,8 @@ import pytest
 from test_build import run as build
 from test_cli import run
 
-from vbnfault import cli, store, streams
+from vbnfault import cli, store
+from vbnfault.core import streams
 
 # of every command, arguments with which it prints something and takes a moment
 COMMANDS = {
@@ -69,8 +70,8 @@ def full() -> Iterator[TextIO]:
 @pytest.fixture(autouse=True)
 def plan_of_made_up_samples(monkeypatch: pytest.MonkeyPatch) -> None:
     """Their scene is none that could be planned."""
-    monkeypatch.setattr("vbnfault.dataset.planned", lambda *_: None)
-    monkeypatch.setattr("vbnfault.dataset.is_exact", lambda *_: False)
+    monkeypatch.setattr("vbnfault.dataset.identity.planned", lambda *_: None)
+    monkeypatch.setattr("vbnfault.dataset.identity.is_exact", lambda *_: False)
 
 
 def test_every_command_is_tried() -> None:

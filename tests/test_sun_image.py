@@ -9,13 +9,14 @@ import numpy as np
 import pytest
 from test_render import UP, join, plane, scene, sun, view
 
-from vbnfault import frames, render, spectra
+from vbnfault import render
 from vbnfault.camera import Camera
+from vbnfault.core import frames, spectra
+from vbnfault.core.quantities import SUN, Radiance, SunInView
+from vbnfault.core.sundisc import Pinhole, add_mean, pixel_sums
 from vbnfault.detector import Detector
 from vbnfault.lens import RealLens, ThinLens, load_lens
-from vbnfault.quantities import SUN, Radiance, SunInView
-from vbnfault.scene import Sunlight, View
-from vbnfault.sundisc import Pinhole, add_mean, pixel_sums
+from vbnfault.render.description import Sunlight, View
 
 
 @pytest.fixture(scope="module")

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 import trimesh
 
-from vbnfault import llvm
 from vbnfault.body import Body, Patch, Site, build_patch, choose_sites, load_body, relief, site_at
 from vbnfault.body.fields import GRADIENT_STD, Points
 from vbnfault.body.patch import _roughness
 from vbnfault.body.roughness import Roughness, deviogram, mean_edge_m, model_roughness
 from vbnfault.body.shape import vertex_normals
+from vbnfault.core import llvm
 
 FINE = {"seed": 7, "facet_m": 0.5, "radius_m": 40.0, "min_boulder_m": 0.8, "max_triangles": 400_000}
 

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 import trimesh
 
-from vbnfault import stages
 from vbnfault.body import Body, Patch, Site, cache, choose_sites
 from vbnfault.body.cache import cache_folder, cached_patch, patch_key
 from vbnfault.body.patch import build_patch
-from vbnfault.errors import InputError
+from vbnfault.core import activity
+from vbnfault.core.errors import InputError
 
 COARSE = {"seed": 3, "facet_m": 20.0, "radius_m": 60.0, "min_boulder_m": 8.0, "max_triangles": 60_000}
 
@@ -50,13 +50,13 @@ def refuse(*args: object, **kwargs: object) -> Patch:
 
 def test_read_is_what_was_built(body: Body, site: Site, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     told: list[str] = []
-    with stages.told_to(told.append):
+    with activity.told_to(told.append):
         built = cached_patch(body, site, **COARSE)
     assert told == ["terrain of site 0 (new patch)"]
     assert same(built, build_patch(body, site, **COARSE))
     assert [path.suffix for path in folder.iterdir()] == [".patch"]
     monkeypatch.setattr(cache, "build_patch", _same_signature(refuse))
-    with stages.told_to(told.append):
+    with activity.told_to(told.append):
         read = cached_patch(body, site, **COARSE)
     assert len(told) == 1
     assert same(read, built)

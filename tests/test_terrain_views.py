@@ -6,12 +6,14 @@ import numpy as np
 import pytest
 from conftest import small_scene
 
-from vbnfault import config, frames, render
+from vbnfault import render
+from vbnfault.core import frames
 from vbnfault.pipeline import Session
+from vbnfault.pipeline.spec import Terrain
+from vbnfault.render.description import View
 from vbnfault.render.runtime import dr
 from vbnfault.render.sampling import Optics
-from vbnfault.sample import Terrain
-from vbnfault.scene import View
+from vbnfault.scene import config
 
 VIEWS, SIDE = 200, 48
 

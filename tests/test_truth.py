@@ -14,8 +14,9 @@ from scipy.spatial.transform import Rotation
 from test_light import ball
 from test_render import UP, sun, view
 
-from vbnfault import config, dataset, frames, render, store
+from vbnfault import dataset, render, store
 from vbnfault.camera import Camera
+from vbnfault.core import frames
 from vbnfault.detector import Detector
 from vbnfault.lens import RealLens, load_lens, scaled_to_field
 from vbnfault.lens.aperture import stopped_down
@@ -23,6 +24,7 @@ from vbnfault.lens.distortion import fitted
 from vbnfault.lens.glass import D_NM
 from vbnfault.lens.mapping import chief_heights_mm
 from vbnfault.lens.prescription import Prescription
+from vbnfault.scene import config
 
 F64 = NDArray[np.float64]
 

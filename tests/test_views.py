@@ -9,11 +9,13 @@ import numpy as np
 import pytest
 from conftest import small_scene
 
-from vbnfault import config, dataset, frames, pipeline, plan, pose, render
-from vbnfault.errors import InputError, VbnfaultError
-from vbnfault.pipeline import Session
-from vbnfault.record import to_sample
-from vbnfault.sample import Frame, Pose, SampleSpec, Terrain
+from vbnfault import dataset, pipeline, render
+from vbnfault.core import frames
+from vbnfault.core.errors import InputError, VbnfaultError
+from vbnfault.pipeline import Session, resolve
+from vbnfault.pipeline.record import to_sample
+from vbnfault.pipeline.spec import Frame, Pose, SampleSpec, Terrain
+from vbnfault.scene import config, plan
 
 SAMPLES = {"samples": 24, "sites": 1, "shard_samples": 8, "layers": ["clean"]}
 
@@ -37,7 +39,7 @@ def spec(s: Session, terrain: Terrain, index: int) -> SampleSpec:
 
 def resolved(s: Session, terrain: Terrain, index: int, first_try: int = 0) -> Pose:
     frame = Frame(spec=spec(s, terrain, index), first_try=first_try)
-    pose.resolve(frame)
+    resolve.resolve(frame)
     return frame.pose
 
 
@@ -143,8 +145,8 @@ def test_the_fraction_of_sunlit_ground_agrees_with_the_renderers_angles(terrain:
         for stage in pipeline.VIEW_STAGES[:2]:
             stage(frame)
         lit = (frame.radiance.array.sum(axis=0) > 0) & (frame.truth.semantic == 1)
-        views = pose._Views.of(frame.spec, frame.pose.tries - 1)
-        told = pose._lit_fraction(frame.spec, views)[0]
+        views = resolve._Views.of(frame.spec, frame.pose.tries - 1)
+        told = resolve._lit_fraction(frame.spec, views)[0]
         assert told >= 0.05
         # 576 rays against 7680 pixels of four samples each: a border of shadow through the frame crosses at most
         # 2 · 24 of the grid's cells, each told wrong by half of it
@@ -163,8 +165,8 @@ def test_views_without_lit_ground_are_drawn_again_and_the_strata_may_differ(terr
         tries[stratum].append(more - few)
         if stratum == plan.SUN_AVERTED:
             frame = Frame(spec=spec(asked, terrain, index))
-            pose.resolve(frame)
-            assert pose._lit_fraction(frame.spec, pose._Views.of(frame.spec, frame.pose.tries - 1))[0] >= 0.3
+            resolve.resolve(frame)
+            assert resolve._lit_fraction(frame.spec, resolve._Views.of(frame.spec, frame.pose.tries - 1))[0] >= 0.3
     assert not any(tries[plan.SUN_FACING])
     assert sum(tries[plan.SUN_AVERTED]) > 5
 
@@ -283,7 +285,8 @@ def test_a_flown_pose_is_kept_with_its_sun_hidden_and_refused_within_the_ground(
     terrain: Terrain, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Poses of SPICE are what was flown: straylight without a Sun is not injected, and the sample says so."""
-    from vbnfault import spice, world
+    from vbnfault.core import spice
+    from vbnfault.world import assemble
 
     s = session({"straylight": {}}, plan=EVERY)
     spice_table = s.scene.spice.model_copy(update={"spacecraft": "X", "kernels": ("k",), "frame": "F"})
@@ -295,10 +298,10 @@ def test_a_flown_pose_is_kept_with_its_sun_hidden_and_refused_within_the_ground(
         position = site.position_T_m + site.T_from_L @ np.array([0.0, 0.0, -height_m])
         placed = spice.Pose(camera_position_T_m=position, T_from_C=site.T_from_L @ frames.L_from_C0(boresight))
         sun_T = site.T_from_L @ frames.unit(np.array(sun_L))
-        monkeypatch.setattr(world, "spacecraft_pose", lambda *_: placed)
-        monkeypatch.setattr(world, "ephemeris", lambda *_: (3.0 * sun_T, np.eye(3)))
+        monkeypatch.setattr(assemble, "spacecraft_pose", lambda *_: placed)
+        monkeypatch.setattr(assemble, "ephemeris", lambda *_: (3.0 * sun_T, np.eye(3)))
         frame = Frame(spec=SampleSpec(index=0, scene=scene, plan=flown, faults=s.faults, terrain=terrain))
-        pose.resolve(frame)
+        resolve.resolve(frame)
         return frame
 
     up, down = np.array([0.0, 0.0, -1.0]), np.array([0.0, 0.0, 1.0])
@@ -314,7 +317,7 @@ def test_a_flown_pose_is_kept_with_its_sun_hidden_and_refused_within_the_ground(
 @pytest.mark.parametrize(("fov_deg", "height_over_width"), [(90.0, 1.0), (40.0, 0.5), (65.0, 1.5)])
 def test_rays_that_look_for_lit_ground_cover_the_frame(fov_deg: float, height_over_width: float) -> None:
     """Unit directions through the centres of equal cells: their slopes are symmetric, evenly spaced, row by row."""
-    rays = pose._grid_rays_C(fov_deg, height_over_width)
+    rays = resolve._grid_rays_C(fov_deg, height_over_width)
     n = round(np.sqrt(len(rays)))
     assert rays.shape == (n * n, 3)
     np.testing.assert_allclose(np.linalg.norm(rays, axis=1), 1, rtol=1e-14)

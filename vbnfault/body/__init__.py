@@ -11,14 +11,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
-from vbnfault.body.cache import cached_patch
-from vbnfault.body.gravity import PolyhedronGravity
-from vbnfault.body.nucleus import embedded_nucleus
-from vbnfault.body.patch import Patch, build_patch
-from vbnfault.body.roughness import Roughness, model_roughness
-from vbnfault.body.shape import Float64, Int32, Unit, check_mesh, load_shape, signed_volume
-from vbnfault.body.sites import Site, Sites, choose_sites, local_level, site_at
-from vbnfault.errors import InputError
+from ..core.errors import InputError
+from .cache import cached_patch
+from .gravity import PolyhedronGravity
+from .nucleus import embedded_nucleus
+from .patch import Patch, build_patch
+from .roughness import Roughness, model_roughness
+from .shape import Float64, Int32, Unit, check_mesh, load_shape, signed_volume
+from .sites import Site, Sites, choose_sites, local_level, site_at
 
 __all__ = [
     "Body",

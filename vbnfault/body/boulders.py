@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
-from vbnfault.body.fields import GRADIENT_STD, Points
-from vbnfault.body.noise import noise_key
-from vbnfault.body.refine import split
-from vbnfault.body.shape import Float64, Int32, face_normals_areas
+from .fields import GRADIENT_STD, Points
+from .noise import noise_key
+from .refine import split
+from .shape import Float64, Int32, face_normals_areas
 
 PER_KM2 = 98.0  # N(>= 7 m): 3546 boulders on 36.4 km², Pajola et al. 2015, A&A 583, A37
 INDEX = 3.6

@@ -28,13 +28,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vbnfault import stages
-from vbnfault.body.patch import Patch, build_patch
-from vbnfault.body.sites import Site
-from vbnfault.errors import InputError
+from ..core import activity
+from ..core.errors import InputError
+from .patch import Patch, build_patch
+from .sites import Site
 
 if TYPE_CHECKING:
-    from vbnfault.body import Body
+    from . import Body
 
 FOLDER_VARIABLE = "VBNFAULT_CACHE_DIR"
 SIZE_VARIABLE = "VBNFAULT_CACHE_GIB"
@@ -101,7 +101,7 @@ def cached_patch(body: Body, site: Site, **parameters: Any) -> Patch:
 
 
 def _new_patch(body: Body, site: Site, parameters: dict[str, Any]) -> Patch:
-    stages.begin(f"terrain of site {site.index} (new patch)")
+    activity.begin(f"terrain of site {site.index} (new patch)")
     return build_patch(body, site, **parameters)
 
 

@@ -14,9 +14,9 @@ from typing import Any
 
 import numpy as np
 
-from vbnfault import llvm
-from vbnfault.body.noise import Float32, seed_word
-from vbnfault.body.shape import Float64
+from ..core import llvm
+from .noise import Float32, seed_word
+from .shape import Float64
 
 # The same noise at each octave would line its cells up at the origin of every power of two.
 _TURN_AXIS = (0.26726124, 0.53452248, 0.80178373)

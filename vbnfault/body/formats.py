@@ -18,8 +18,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from vbnfault import spice
-from vbnfault.errors import InputError
+from ..core import spice
+from ..core.errors import InputError
 
 Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]

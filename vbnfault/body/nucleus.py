@@ -15,8 +15,8 @@ import scipy.sparse.csgraph
 import skimage.measure
 from numpy.typing import NDArray
 
-from vbnfault.body.noise import fractal_noise, gradient_noise
-from vbnfault.body.shape import Float64, Int32, check_mesh, vertex_normals
+from .noise import fractal_noise, gradient_noise
+from .shape import Float64, Int32, check_mesh, vertex_normals
 
 _SEED = 67
 _SPACING_KM = 0.066

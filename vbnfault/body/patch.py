@@ -19,17 +19,17 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from vbnfault.body import boulders as rocks
-from vbnfault.body.noise import Float32
-from vbnfault.body.refine import EdgeLimit, affordable, refine
-from vbnfault.body.relief import LONGEST_EDGES, add_relief
-from vbnfault.body.roughness import Roughness, mean_edge_m
-from vbnfault.body.shape import Int32, vertex_normals
-from vbnfault.body.sites import Site
-from vbnfault.errors import InputError
+from ..core.errors import InputError
+from . import boulders as rocks
+from .noise import Float32
+from .refine import EdgeLimit, affordable, refine
+from .relief import LONGEST_EDGES, add_relief
+from .roughness import Roughness, mean_edge_m
+from .shape import Int32, vertex_normals
+from .sites import Site
 
 if TYPE_CHECKING:
-    from vbnfault.body import Body
+    from . import Body
 
 _GROUND_SHARE = 0.66  # of the triangles; the rest is left to the boulders
 _BOULDER_STREAM = 0xB0D

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from vbnfault.body.shape import Float64, Int32
+from .shape import Float64, Int32
 
 # Splitting halves an edge, so lengths end between half the limit and the limit; their mean is then near 1.
 LIMIT_PER_TARGET = 1.6

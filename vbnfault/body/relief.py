@@ -19,14 +19,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from vbnfault.body.fields import GRADIENT_STD, Points
-from vbnfault.body.noise import Float32, noise_key
-from vbnfault.body.roughness import Roughness, deviogram
-from vbnfault.body.shape import Float64, Int32, vertex_normals
-from vbnfault.body.sites import Site
+from .fields import GRADIENT_STD, Points
+from .noise import Float32, noise_key
+from .roughness import Roughness, deviogram
+from .shape import Float64, Int32, vertex_normals
+from .sites import Site
 
 if TYPE_CHECKING:
-    from vbnfault.body import Body
+    from . import Body
 
 # A field fades in between facets of 1/1.6 and 1/2.8 of its wavelength.
 _FADE = (1.6, 2.8)

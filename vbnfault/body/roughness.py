@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from vbnfault.body.shape import Float64, vertex_normals
+from .shape import Float64, vertex_normals
 
 if TYPE_CHECKING:
-    from vbnfault.body import Body
+    from . import Body
 
 _WINDOWS = 120  # places looked at, spread over the points
 _MOST_POINTS = 300  # of a window: more add little but time

@@ -12,9 +12,9 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from vbnfault import meshes, resources
-from vbnfault.body import formats
-from vbnfault.errors import InputError
+from ..core import meshes, resources
+from ..core.errors import InputError
+from . import formats
 
 Unit = Literal["auto", "m", "km"]
 Float64 = NDArray[np.float64]

@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, overload
 import numpy as np
 from numpy.typing import ArrayLike
 
-from vbnfault.body.shape import Float64, face_normals_areas
-from vbnfault.errors import InputError
+from ..core.errors import InputError
+from .shape import Float64, face_normals_areas
 
 if TYPE_CHECKING:
-    from vbnfault.body import Body
+    from . import Body
 
 MAX_SLOPE_DEG = 35.0
 _ATTEMPTS = 1000

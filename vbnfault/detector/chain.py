@@ -19,20 +19,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..quantities import DEAD, HOT, LUMINANCE, RGBI, RTS, RTS_HIGH, STUCK, TRAP
+from ..core.quantities import DEAD, HOT, LUMINANCE, RGBI, RTS, RTS_HIGH, STUCK, TRAP
 from .charge import ChargeCloud, bloom, capture, cti, parasitic_light, smear, smear_interline
 from .dark import Telegraph
 from .demosaic import correct_defects, demosaic, interpolate, without_undershoot
 from .efficiency import white_balance
-from .individual import (
-    Individual,
-    IndividualSpec,
-    StuckPixels,
-    dark_rate_e_s,
-    make_individual,
-    offset_e,
-    response,
-)
+from .individual import Individual, IndividualSpec, StuckPixels, dark_rate_e_s, make_individual, offset_e, response
 from .mosaic import channel_of
 from .readout import ReadoutIndividual, ReadoutNoise, read_out
 from .sensor import Sensor

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import ndtr, ndtri
 
-from ..errors import InputError
+from ..core.errors import InputError
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]

@@ -19,7 +19,7 @@ from scipy.optimize import brentq
 from scipy.special import gammaincc
 from scipy.stats import poisson
 
-from ..errors import InputError
+from ..core.errors import InputError
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import InputError
+from ..core.errors import InputError
 from .mosaic import Pattern, channel_of, plane_of
 from .three_colour import _pool
 

@@ -9,8 +9,8 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from .. import spectra
-from ..errors import InputError
+from ..core import spectra
+from ..core.errors import InputError
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]

@@ -10,8 +10,8 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import InputError
-from ..quantities import RGBI, Electrons, Irradiance
+from ..core.errors import InputError
+from ..core.quantities import RGBI, Electrons, Irradiance
 from .chain import Acts, Device, MosaicNoise
 from .demosaic import footprint, mended_from
 from .efficiency import white_balance

@@ -18,7 +18,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import InputError
+from ..core.errors import InputError
 from .three_colour import _blockwise, _normal_field
 
 F32 = NDArray[np.float32]

@@ -14,8 +14,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, cast, get_args, get_origin, get_type_hints
 
-from .. import resources, spectra
-from ..errors import InputError, shown
+from ..core import resources, spectra
+from ..core.errors import InputError, shown
 from .charge import ChargeCloud, TrapSpecies
 from .dark import CCD_GROWTH
 from .demosaic import Method

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from scipy.special import ndtr, ndtri
 from scipy.stats import poisson
 
-from ..quantities import LUMINANCE, RGBI, Electrons, Irradiance, RawDN
+from ..core.quantities import LUMINANCE, RGBI, Electrons, Irradiance, RawDN
 from .efficiency import QuantumEfficiency, white_balance
 
 F32 = NDArray[np.float32]

@@ -20,11 +20,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..camera import Camera
+from ..core.errors import InputError, shown
+from ..core.quantities import LUMINANCE, RGBI, Charge, Electrons, Offset, Quantity, RawMosaic, soft_kind
 from ..detector.chain import STEPS as MOSAIC_STEPS
-from ..errors import InputError, shown
 from ..lens import load_lens
 from ..lens.footprint import DEFAULT_LENS, Frame
-from ..quantities import LUMINANCE, RGBI, Charge, Electrons, Offset, Quantity, RawMosaic, soft_kind
 
 Params = dict[str, Any]
 T = TypeVar("T")

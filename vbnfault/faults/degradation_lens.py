@@ -33,11 +33,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
-from .. import spectra
+from ..core import spectra
 from ..lens import Prescription
 from ..lens.coating import mean_reflectance
 from ..lens.footprint import Frame
-from ..lens.scatter import Harvey
+from ..lens.straylight.scatter import Harvey
 from .base import FaultContext, Interval, LensFault, Params, bounds, choice, number, times
 
 F32 = NDArray[np.float32]

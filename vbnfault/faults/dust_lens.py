@@ -35,9 +35,9 @@ from ..lens import RealLens, load_lens
 from ..lens.coating import reflect_transmit
 from ..lens.footprint import Footprint, Frame
 from ..lens.glass import D_NM
-from ..lens.paraxial import along
-from ..lens.scatter import DUST_INDEX
-from ..lens.trace import forward
+from ..lens.rays import forward
+from ..lens.straylight.paraxial import along
+from ..lens.straylight.scatter import DUST_INDEX
 from .base import FaultContext, Interval, LensFault, Params, bounds, number, plus, times
 
 F32 = NDArray[np.float32]

@@ -25,9 +25,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from .. import resources
-from ..errors import InputError, shown
-from ..quantities import CHANNELS, LUMINANCE
+from ..core import resources
+from ..core.errors import InputError, shown
+from ..core.quantities import CHANNELS, LUMINANCE
 from .base import Fault, FaultContext, Params, choice, number, scale_by_intensity, text
 
 # A decoded texture takes 32 bytes a pixel or more on its way: 24 megapixel, as of a photograph, take 0.8 GB.

@@ -31,9 +31,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import VbnfaultError
-from ..quantities import LUMINANCE
-from ..resources import cached_with_contents, data_dir, read_input
+from ..core.errors import VbnfaultError
+from ..core.quantities import LUMINANCE
+from ..core.resources import cached_with_contents, data_dir, read_input
 from .base import Fault, FaultContext, Interval, Params, bounds, intensity_dn, number, plus, rows
 from .flare_textures import FILL
 

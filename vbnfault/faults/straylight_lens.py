@@ -23,10 +23,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from .. import spectra
-from ..lens.scatter import CLEANLINESS_LIMITS, ROUGHNESS_NM_LIMITS
-from ..lens.straylight import Baffle, Cleanliness, scene_veil_fraction, straylight, veil_of
-from ..quantities import Irradiance
+from ..core import spectra
+from ..core.quantities import Irradiance
+from ..lens.straylight.scatter import CLEANLINESS_LIMITS, ROUGHNESS_NM_LIMITS
+from ..lens.straylight.total import Baffle, Cleanliness, scene_veil_fraction, straylight, veil_of
 from .base import FaultContext, Interval, LensFault, Params, bounds, choice, intensity_dn, number, plus, times
 
 F32 = NDArray[np.float32]
@@ -188,7 +188,7 @@ class _LensStraylight(LensFault):
         )
 
     def _ghosts(self, params: Params, context: FaultContext) -> list[dict[str, Any]]:
-        from ..lens.flare import flare_model
+        from ..lens.straylight.irradiance import flare_model
 
         sun = _sun(context)
         if sun is None:

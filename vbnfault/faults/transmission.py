@@ -17,14 +17,7 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from ..detector.readout import (
-    Fill,
-    corrupted_packets,
-    lost_lines,
-    lost_packets,
-    packet_count,
-    transmission_order,
-)
+from ..detector.readout import Fill, corrupted_packets, lost_lines, lost_packets, packet_count, transmission_order
 from .base import Fault, FaultContext, Interval, Params, bounds, choice
 
 Raw = NDArray[np.uint16]

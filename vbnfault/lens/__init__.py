@@ -1,7 +1,7 @@
 """The optics: from scene radiance to irradiance on the sensor plane."""
 
 from .aperture import closed_to, open_f_number, stopped_down
-from .first_order import FirstOrder, first_order, scaled_to_field, scaled_to_focal_length
+from .gaussian import FirstOrder, first_order, scaled_to_field, scaled_to_focal_length
 from .imaging import RealLens
 from .prescription import Prescription, Surface, load_lens, parse_lens
 from .thin import ThinLens

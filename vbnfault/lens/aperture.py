@@ -13,11 +13,11 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import InputError
-from .first_order import first_order
+from ..core.errors import InputError
+from .gaussian import first_order
 from .glass import D_NM
 from .prescription import Prescription
-from .trace import trace
+from .rays import trace
 
 F64 = NDArray[np.float64]
 

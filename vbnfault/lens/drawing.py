@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
-from .first_order import first_order
+from .gaussian import first_order
 from .prescription import Prescription
-from .trace import real_pupil_diameter_mm, trace
+from .rays import real_pupil_diameter_mm, trace
 
 _FIELDS = (0.0, 0.5, 1.0)  # shares of the half field
 _COLOURS = ("#2f6fb3", "#3c9a5f", "#c4632f")

@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import InputError
-from .first_order import first_order, scaled_to_focal_length
+from ..core.errors import InputError
+from .gaussian import first_order, scaled_to_focal_length
 from .glass import GLASSES, Glass
 from .prescription import Prescription, Surface, parse_lens
-from .trace import real_pupil_diameter_mm
+from .rays import real_pupil_diameter_mm
 
 _TRIES = 200
 

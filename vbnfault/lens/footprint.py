@@ -19,13 +19,13 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import fft
 from scipy.interpolate import PchipInterpolator
 
-from .. import resources
+from ..core import resources
 from .aperture import stopped_down
-from .first_order import scaled_to_focal_length
+from .gaussian import scaled_to_focal_length
 from .imaging import RealLens
 from .prescription import Prescription, load_lens
+from .rays import Path, trace
 from .thin import ThinLens
-from .trace import Path, trace
 
 F64 = NDArray[np.float64]
 F32 = NDArray[np.float32]

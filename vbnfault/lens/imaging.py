@@ -30,16 +30,16 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import PchipInterpolator
 from scipy.special import ndtr
 
-from ..errors import InputError
-from ..quantities import Irradiance, Radiance
-from ..sundisc import Floats, add_mean, pixel_sums
+from ..core.errors import InputError
+from ..core.quantities import Irradiance, Radiance
+from ..core.sundisc import Floats, add_mean, pixel_sums
 from .aperture import axial_beam_diameter_mm
 from .distortion import RadialModel
-from .first_order import first_order
+from .gaussian import first_order
 from .glass import D_NM
 from .mapping import ChiefHeights, FieldMap, camera_model, chief_heights, fan_heights_mm, field_map, inclined_rays
-from .paraxial import axial_transmittance
 from .prescription import Prescription
+from .straylight.paraxial import axial_transmittance
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]

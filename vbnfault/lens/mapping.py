@@ -15,10 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
-from ..errors import InputError
+from ..core.errors import InputError
 from .distortion import RadialModel, fitted
 from .prescription import Prescription
-from .trace import Path, trace
+from .rays import Path, trace
 
 F64 = NDArray[np.float64]
 

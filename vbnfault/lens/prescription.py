@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .. import resources
-from ..errors import InputError, shown
+from ..core import resources
+from ..core.errors import InputError, shown
 from .coating import DESIGN_NM, Layer, design
 from .glass import AIR, D_NM, Glass, from_abbe, from_coefficients, named
 

@@ -20,7 +20,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..quantities import Irradiance, Radiance
+from ..core.quantities import Irradiance, Radiance
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]

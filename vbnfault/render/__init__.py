@@ -15,8 +15,8 @@ def self_test() -> str:
     """Render a Lambert square facing the Sun and compare its radiance with ρE/π; a sentence for `doctor`."""
     import numpy as np
 
-    from ..photometry import Diffuse
-    from ..scene import Scene, Sunlight, View
+    from ..core.photometry import Diffuse
+    from .description import Scene, Sunlight, View
 
     square = np.array([[-9, -9, 0], [9, -9, 0], [9, 9, 0], [-9, 9, 0]], dtype=np.float32)
     faces = np.array([[0, 2, 1], [0, 3, 2]], dtype=np.int32)

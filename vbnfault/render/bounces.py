@@ -16,9 +16,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..quantities import Truth
-from ..scene import Scene
+from ..core.quantities import Truth
 from .bsdf import has_bands
+from .description import Scene
 from .light import SUN_DIMENSION, WAVEFRONT, Light
 from .runtime import dr, mi
 from .sampling import Optics, Pixels, Strata

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from ..photometry import HAPKE_TABLES, Hapke, hapke_at
-from ..scene import Scene
+from ..core.photometry import HAPKE_TABLES, Hapke, hapke_at
+from .description import Scene
 from .runtime import dr, mi
 from .surface import Surface, facing
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from ..scene import Sunlight
+from .description import Sunlight
 from .runtime import dr, mi
 from .sampling import opaque_vector
 

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from ..quantities import Radiance, Truth
-from ..scene import Scene
+from ..core.quantities import Radiance, Truth
 from .bounces import indirect
+from .description import Scene
 from .layers import truth
 from .light import direct
 from .surface import Surface

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..quantities import BODY, SKY, SPACECRAFT, SUN, SunInView, Truth
-from ..scene import Sunlight, View
-from ..sundisc import Pinhole, Projection, bounds_px, pixel_sums
+from ..core.quantities import BODY, SKY, SPACECRAFT, SUN, SunInView, Truth
+from ..core.sundisc import Pinhole, Projection, bounds_px, pixel_sums
+from .description import Sunlight, View
 from .emitter import SunDisc
 from .light import sun_in_view
 from .runtime import dr, mi

@@ -15,10 +15,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..quantities import Radiance, SunInView
-from ..scene import Scene, Sunlight, View
-from ..sundisc import Pinhole, add_mean, axes, bounds_px
+from ..core.quantities import Radiance, SunInView
+from ..core.sundisc import Pinhole, add_mean, axes, bounds_px
 from .bsdf import Reflection, has_bands
+from .description import Scene, Sunlight, View
 from .detail import Detail
 from .emitter import Limb, SunDisc, mu, polynomial
 from .runtime import dr, mi

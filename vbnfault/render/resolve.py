@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..scene import Sunlight
-from ..sundisc import axes, sunflower
+from ..core.sundisc import axes, sunflower
+from .description import Sunlight
 from .runtime import dr, mi
 from .surface import Surface
 from .vehicle import Vehicle

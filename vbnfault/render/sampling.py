@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..scene import View
+from .description import View
 from .runtime import dr, mi
 
 _TO_UNIT = 2.0**-32

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..scene import View
+from .description import View
 from .detail import Detail, FineRelief
 from .mesh import mesh_scene
 from .runtime import dr, mi

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..scene import View
+from .description import View
 from .detail import Detail
 from .mesh import mesh_scene
 from .runtime import dr, mi

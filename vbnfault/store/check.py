@@ -13,8 +13,8 @@ import google_crc32c
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import VbnfaultError
-from ..quantities import soft_kind
+from ..core.errors import VbnfaultError
+from ..core.quantities import soft_kind
 from .codec import DIGEST_BYTES, crc_of_scalars, decompress, mask_union, sample_digest, threads
 from .counts import FaultCounts
 from .group import Store, open_store

@@ -16,8 +16,8 @@ import numpy as np
 from numcodecs import Zstd
 from numpy.typing import NDArray
 
-from .. import resources
-from ..quantities import Sample
+from ..core import resources
+from ..core.quantities import Sample
 from .schema import SCALARS, StoreSpec
 
 # Level 1: 16 ms for a noisy 1024 px RGBI image; level 3 takes three times as long and saves a sixth.

@@ -17,7 +17,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import TypeVar
 
-from ..errors import VbnfaultError
+from ..core.errors import VbnfaultError
 
 PARTIAL = ".partial"
 # at once: of the 42 files and 90 folders of a shard, on ext4, one after the other take 45-600 ms, eight 15-35 ms

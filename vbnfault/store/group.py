@@ -16,8 +16,8 @@ import numpy as np
 import zarr
 from numpy.typing import NDArray
 
-from ..errors import InputError, VbnfaultError
-from ..quantities import Sample
+from ..core.errors import InputError, VbnfaultError
+from ..core.quantities import Sample
 from . import disk
 from .codec import Encoded, crc32c, crc_of_scalars, encode, join_shard, split_shard
 from .layout import (

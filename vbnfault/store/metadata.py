@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import InputError
+from ..core.errors import InputError
 from . import disk
 from .group import Store, open_store, read_document, read_root
 from .layout import (

@@ -10,9 +10,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import InputError
-from ..plan import SPLITS, STRATA
-from ..quantities import CHANNELS, DEFECTS, soft_kind
+from ..core.errors import InputError
+from ..core.quantities import CHANNELS, DEFECTS, soft_kind
+from ..scene.plan import SPLITS, STRATA
 
 # 2: the spare and the checksum of the root, eight coefficients of `distortion`, further arrays. A store of another
 # format is refused: nothing here could tell its arrays from damaged ones.

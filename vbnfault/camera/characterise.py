@@ -1,0 +1,413 @@
+"""A camera characterised as EMVA 1288 (release 4.0, linear model) asks: what its raw pictures tell of it.
+
+From pairs of flat and dark pictures over exposures: system gain K, quantum efficiency, temporal dark noise, dark
+current, saturation, linearity; from stacks: DSNU, PRNU and the spectra of what varies over the picture. The
+analysis knows nothing of how pictures are made: a `Camera` takes them, `VirtualCamera` those of a sensor's device.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core.errors import InputError
+from ..detector.chain import Device, MosaicNoise, by_channel, channel_sites
+
+F64 = NDArray[np.float64]
+Site = tuple[slice, slice]
+
+_QUANTISATION_DN2 = 1 / 12  # variance of rounding, EMVA 1288 eq. 11
+_LINEAR_SHARE = 0.7  # of saturation up to which gain and response are told (section 6.6)
+_LINEARITY_RANGE = 0.05, 0.95  # of saturation over which linearity is told (section 6.7)
+
+
+class Camera(Protocol):
+    """What is characterised: raw pictures of evenly lit pixels."""
+
+    def take(self, photons: float, exposure_s: float, number: int) -> NDArray[np.uint16]:
+        """Raw picture uint16[y, x] of a mean of `photons` a pixel; `number` counts pictures, each has its own
+        noise."""
+        ...
+
+
+@dataclass(frozen=True, kw_only=True)
+class Settings:
+    """How much is measured: `points` exposures of flats, `stack` pictures for what varies over the picture."""
+
+    points: int = 40
+    stack: int = 24
+    exposure_s: float = 0.01
+    dark_exposures_s: tuple[float, ...] = (0.01, 0.5, 1.0, 2.0)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Transfer:
+    """Photon transfer: means and temporal variances, in DN and DN², of flats and of darks at the same exposure."""
+
+    photons: F64
+    mean_dn: F64
+    variance_dn2: F64
+    dark_mean_dn: float
+    dark_variance_dn2: float
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Spectrum:
+    """Spectra along rows and along columns of stacks of flats at half saturation and of darks: the root of the
+    mean power, as DN rms per frequency; frequency in cycles a pixel of the channel."""
+
+    frequency: dict[str, F64]
+    flat_dn: dict[str, F64]
+    dark_dn: dict[str, F64]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Result:
+    """What EMVA 1288 calls the camera's parameters; electrons (e), digital numbers (DN), seconds. `saturation_e` is
+    the signal of the largest variance, `full_well_e` the largest one."""
+
+    gain_dn_per_e: float
+    quantum_efficiency: float
+    dark_noise_e: float
+    dark_noise_dn: float
+    saturation_e: float
+    full_well_e: float
+    saturation_photons: float
+    snr_max: float
+    dynamic_range: float
+    linearity_error_percent: float
+    dark_current_mean_e_s: float
+    dark_current_variance_e_s: float
+    dsnu_e: float
+    prnu_percent: float
+    black_level_dn: float
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Characterisation:
+    """Of one colour channel: its result and the data behind it."""
+
+    channel: str
+    result: Result
+    transfer: Transfer
+    dark_mean_dn: F64
+    dark_variance_dn2: F64
+    dark_exposure_s: F64
+    spectrum: Spectrum
+    dsnu_map_dn: F64
+    prnu_map: F64
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain data: the result and the photon transfer."""
+        transfer = {k: np.asarray(v).tolist() for k, v in vars(self.transfer).items()}
+        return {"channel": self.channel, **asdict(self.result), "photon_transfer": transfer}
+
+
+def characterise(
+    camera: Camera,
+    *,
+    sites: Mapping[str, Site],
+    photons_at_saturation: float,
+    settings: Settings | None = None,
+    progress: Callable[[int], None] | None = None,
+) -> dict[str, Characterisation]:
+    """Characterise the channels of a camera.
+
+    Parameters
+    ----------
+    sites
+        Of each channel, the regular grid of its pixels: slices of rows and of columns.
+    photons_at_saturation
+        About how many photons a pixel saturate the channel that does so first; flats go to 1.25 times as many.
+    progress
+        Told of each picture taken, by a 1.
+    """
+    use = Settings() if settings is None else settings
+    if use.points < 8 or use.stack < 2 or len(use.dark_exposures_s) < 2:
+        raise InputError(
+            f"points = {use.points}, stack = {use.stack}, {len(use.dark_exposures_s)} dark exposures: must be at "
+            "least 8, 2 and 2"
+        )
+    number = 0
+
+    def take(photons: float, exposure_s: float) -> F64:
+        nonlocal number
+        picture = camera.take(photons, exposure_s, number).astype(np.float64)
+        number += 1
+        if progress is not None:
+            progress(1)
+        return picture
+
+    photons = np.linspace(0, 1.25 * photons_at_saturation, use.points + 1)[1:]
+    flats = [_pair(take, p, use.exposure_s, sites) for p in photons]
+    darks = [_pair(take, 0.0, t, sites) for t in (use.exposure_s, *use.dark_exposures_s)]
+    half = _half_saturation(photons, flats, next(iter(sites)))
+    stacks = {"flat": _stack(take, half, use), "dark": _stack(take, 0.0, use)}
+    return {name: _channel(name, site, photons, flats, darks, stacks, use) for name, site in sites.items()}
+
+
+def pictures(settings: Settings) -> int:
+    """How many pictures `characterise` takes."""
+    return 2 * (settings.points + 1 + len(settings.dark_exposures_s)) + 2 * settings.stack
+
+
+Pair = dict[str, tuple[float, float]]
+Take = Callable[[float, float], F64]
+
+
+def _pair(take: Take, photons: float, exposure_s: float, sites: Mapping[str, Site]) -> Pair:
+    """Mean and temporal variance of each channel from two pictures (eq. 12-14: what varies over the picture cancels
+    in their difference)."""
+    one, other = take(photons, exposure_s), take(photons, exposure_s)
+    out = {}
+    for name, site in sites.items():
+        a, b = one[site], other[site]
+        step = a.mean() - b.mean()
+        out[name] = (float((a.mean() + b.mean()) / 2), float(np.mean((a - b) ** 2) / 2 - step**2 / 2))
+    return out
+
+
+def _half_saturation(photons: F64, flats: list[Pair], channel: str) -> float:
+    variance = np.array([pair[channel][1] for pair in flats])
+    return float(photons[int(np.argmax(variance))] / 2)
+
+
+def _stack(take: Take, photons: float, use: Settings) -> tuple[F64, F64]:
+    """Mean picture, and the variance in time of each pixel, over a stack."""
+    total = square = np.zeros(())
+    for _ in range(use.stack):
+        picture = take(photons, use.exposure_s)
+        total, square = total + picture, square + picture * picture
+    mean = total / use.stack
+    return mean, np.maximum(square / use.stack - mean * mean, 0) * use.stack / (use.stack - 1)
+
+
+def _channel(
+    name: str,
+    site: Site,
+    photons: F64,
+    flats: list[Pair],
+    darks: list[Pair],
+    stacks: dict[str, tuple[F64, F64]],
+    use: Settings,
+) -> Characterisation:
+    mean, variance = (np.array([pair[name][k] for pair in flats]) for k in (0, 1))
+    (dark_mean, dark_variance), *later = (pair[name] for pair in darks)
+    # saturation: where the variance is largest (section 6.6)
+    last = int(np.argmax(variance))
+    if last < 3:
+        raise InputError(
+            f"channel {name}: it saturates within the first three exposures, so that no line can be fitted"
+        )
+    linear = mean - dark_mean <= _LINEAR_SHARE * (mean[last] - dark_mean)
+    linear &= np.arange(len(mean)) <= last
+    signal, noise = (mean - dark_mean)[linear], (variance - dark_variance)[linear]
+    gain = float(signal @ noise / (signal @ signal))
+    response = float(photons[linear] @ signal / (photons[linear] @ photons[linear]))
+    efficiency = response / gain
+    dark_noise_dn = float(np.sqrt(max(dark_variance, 0.24)))  # below that rounding hides it (eq. 56)
+    dark_noise_e = float(np.sqrt(max(dark_variance - _QUANTISATION_DN2, 0.0)) / gain)
+    saturation_photons = float(photons[last])
+    saturation_e = efficiency * saturation_photons
+    least = (np.sqrt(dark_noise_e**2 + _QUANTISATION_DN2 / gain**2 + 0.25) + 0.5) / efficiency
+    exposure = np.array([use.exposure_s, *use.dark_exposures_s])
+    dark_means, dark_variances = (np.array([darks[0][name][k], *(p[k] for p in later)]) for k in (0, 1))
+    slope_mean, slope_variance = (np.polyfit(exposure, v, 1)[0] for v in (dark_means, dark_variances))
+    (flat, flat_var), (dark, dark_var) = ((v[site] for v in stacks[kind]) for kind in ("flat", "dark"))
+    spatial = [
+        max(float(v.var(ddof=1) - in_time.mean() / use.stack), 0.0)
+        for v, in_time in ((flat, flat_var), (dark, dark_var))
+    ]
+    gain_of_light = flat.mean() - dark.mean()
+    prnu = np.sqrt(max(spatial[0] - spatial[1], 0.0)) / gain_of_light
+    spectra = {kind: _spectra(stacks[kind][0][site]) for kind in ("flat", "dark")}
+    return Characterisation(
+        channel=name,
+        result=Result(
+            gain_dn_per_e=gain,
+            quantum_efficiency=efficiency,
+            dark_noise_e=dark_noise_e,
+            dark_noise_dn=dark_noise_dn,
+            saturation_e=saturation_e,
+            full_well_e=float((mean.max() - dark_mean) / gain),
+            saturation_photons=saturation_photons,
+            snr_max=float(np.sqrt(saturation_e)),
+            dynamic_range=float(saturation_photons / least),
+            linearity_error_percent=_linearity(photons, mean - dark_mean, last),
+            dark_current_mean_e_s=float(slope_mean / gain),
+            dark_current_variance_e_s=float(slope_variance / gain**2),
+            dsnu_e=float(np.sqrt(spatial[1]) / gain),
+            prnu_percent=float(100 * prnu),
+            black_level_dn=float(dark_mean),
+        ),
+        transfer=Transfer(
+            photons=photons,
+            mean_dn=mean,
+            variance_dn2=variance,
+            dark_mean_dn=float(dark_mean),
+            dark_variance_dn2=float(dark_variance),
+        ),
+        dark_mean_dn=dark_means,
+        dark_variance_dn2=dark_variances,
+        dark_exposure_s=exposure,
+        spectrum=Spectrum(
+            frequency={
+                k: np.asarray(np.fft.rfftfreq(flat.shape[axis]), dtype=np.float64)
+                for k, axis in (("rows", 1), ("columns", 0))
+            },
+            flat_dn=spectra["flat"],
+            dark_dn=spectra["dark"],
+        ),
+        dsnu_map_dn=dark - dark.mean(),
+        prnu_map=(flat - dark) / gain_of_light - 1,
+    )
+
+
+def _linearity(photons: F64, signal: F64, last: int) -> float:
+    """Mean relative deviation from the line that fits best relative to the signal, in % (section 6.7)."""
+    low, high = (share * signal[last] for share in _LINEARITY_RANGE)
+    chosen = (signal >= low) & (signal <= high) & (np.arange(len(signal)) <= last)
+    p, y = photons[chosen], signal[chosen]
+    slope, offset = np.polyfit(p, y, 1, w=1 / y)
+    return float(100 * np.mean(np.abs(y - (offset + slope * p)) / (offset + slope * p)))
+
+
+def _spectra(picture: F64) -> dict[str, F64]:
+    """Root of the mean power over the rows, and over the columns (section 8.6)."""
+    flat = picture - picture.mean()
+    out = {}
+    for name, along in (("rows", flat), ("columns", flat.T)):
+        power = np.abs(np.fft.rfft(along, axis=1)) ** 2 / along.shape[1]
+        out[name] = np.sqrt(power.mean(axis=0))
+    return out
+
+
+# --- a sensor's device -------------------------------------------------------------------------------------------
+
+
+class VirtualCamera:
+    """Takes raw pictures with a device under even light of one wavelength, or with as many photons for each channel
+    of the wavelength that it responds to most."""
+
+    def __init__(self, device: Device, wavelength_nm: float | None = None, seed: int = 0) -> None:
+        self.device, self.seed = device, seed
+        sensor = device.sensor
+        nodes = np.arange(300.0, 1100.0) if wavelength_nm is None else np.array([wavelength_nm])
+        peaks = sensor.efficiency.at(nodes).max(axis=1)
+        self.efficiency = {name: float(v) for name, v in zip(sensor.pattern.channels, peaks, strict=True)}
+        self.sites = {name: site for name, site in channel_sites(sensor).items() if self.efficiency[name] > 0}
+        if not self.sites:
+            raise InputError(f"wavelength_nm = {wavelength_nm}: no channel of {sensor.name} responds to it")
+
+    @property
+    def photons_at_saturation(self) -> float:
+        """Photons a pixel that saturate the channel that responds most."""
+        return self.device.sensor.readout.white_e / max(self.efficiency.values())
+
+    def take(self, photons: float, exposure_s: float, number: int) -> NDArray[np.uint16]:
+        """As `Camera` has it."""
+        shape = self.device.shape
+        light = by_channel(self.device.sensor, shape, [photons * eta for eta in self.efficiency.values()])
+        shot, read, row = (np.random.default_rng([self.seed, number, k]) for k in range(3))
+        return self.device.raw(light, exposure_s, MosaicNoise.draw(shape, shot, read, row))
+
+
+# --- as a picture ------------------------------------------------------------------------------------------------
+
+
+def draw(found: Mapping[str, Characterisation], title: str, path: Path) -> None:
+    """A PNG of photon transfer, response, dark signal, spectra and histograms."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+    from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
+
+    figure = Figure(figsize=(15, 9), layout="constrained")
+    FigureCanvasAgg(figure)
+    figure.suptitle(f"{title}: EMVA 1288")
+    axes = figure.subplots(2, 3)
+    for name, one in found.items():
+        colour = _COLOURS.get(name[0], "0.3")
+        t, r = one.transfer, one.result
+        signal, noise = t.mean_dn - t.dark_mean_dn, np.maximum(t.variance_dn2 - t.dark_variance_dn2, 1e-3)
+        axes[0, 0].loglog(signal, noise, ".", color=colour, label=f"{name}: K = {r.gain_dn_per_e:.4g} DN/e")
+        axes[0, 0].loglog(signal, r.gain_dn_per_e * signal, "-", lw=0.8, color=colour)
+        axes[0, 1].plot(
+            t.photons, signal, ".-", lw=0.6, color=colour, label=f"{name}: η = {r.quantum_efficiency:.3f}"
+        )
+        axes[0, 2].plot(
+            one.dark_exposure_s,
+            one.dark_mean_dn,
+            ".-",
+            color=colour,
+            label=f"{name}: {r.dark_current_mean_e_s:.3g} e/s",
+        )
+        for k, kind in enumerate(("rows", "columns")):
+            axes[1, 0].semilogy(
+                one.spectrum.frequency[kind],
+                one.spectrum.dark_dn[kind],
+                ("-", ":")[k],
+                lw=0.7,
+                color=colour,
+                label=f"{name}, along {kind}",
+            )
+        for ax, values, unit in (
+            (axes[1, 1], one.dsnu_map_dn / r.gain_dn_per_e, f"DSNU {r.dsnu_e:.3g} e"),
+            (axes[1, 2], 100 * one.prnu_map, f"PRNU {r.prnu_percent:.3g} %"),
+        ):
+            count, edge = np.histogram(values, bins=_bins(values))
+            ax.semilogy(
+                (edge[1:] + edge[:-1]) / 2, np.maximum(count, 0.5), color=colour, lw=0.8, label=f"{name}: {unit}"
+            )
+    labels = (
+        ("photon transfer", "signal, DN", "temporal variance, DN²"),
+        ("response", "photons a pixel", "signal, DN"),
+        ("dark signal", "exposure, s", "mean, DN"),
+        ("spectra of dark pictures", "cycles a pixel", "DN rms"),
+        ("dark signal of pixels", "from the mean, e", "pixels"),
+        ("response of pixels", "from the mean, %", "pixels"),
+    )
+    top = max(float(one.transfer.variance_dn2.max()) for one in found.values())
+    axes[0, 0].set_ylim(top * 1e-4, top * 2)
+    axes[0, 0].xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axes[0, 0].xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:.0f}"))
+    axes[0, 0].xaxis.set_minor_formatter(NullFormatter())
+    axes[0, 1].xaxis.set_major_locator(MaxNLocator(6))
+    axes[0, 2].ticklabel_format(useOffset=False)
+    for formatter in (axes[1, 0].yaxis.set_major_formatter, axes[1, 0].yaxis.set_minor_formatter):
+        formatter(FuncFormatter(lambda value, _: f"{value:.3g}"))
+    for ax, (head, x, y) in zip(axes.ravel(), labels, strict=True):
+        ax.set(title=head, xlabel=x, ylabel=y)
+        ax.grid(alpha=0.3)
+        ax.legend(fontsize=7)
+    figure.savefig(path, dpi=100)
+
+
+def _bins(values: F64) -> F64:
+    """Edges of about 200 bins, each as wide as a whole number of the steps in which averages of integers come."""
+    levels = np.unique(values)
+    extent = float(levels[-1] - levels[0])
+    if extent == 0:
+        return np.asarray([levels[0] - 0.5, levels[0] + 0.5])
+    apart = np.diff(levels)
+    step = float(apart[apart > 1e-5 * extent].min())
+    width = step * math.ceil(extent / step / 200)
+    return np.asarray(levels[0] - step / 2 + width * np.arange(math.ceil((extent + step) / width) + 1))
+
+
+_COLOURS = {"R": "tab:red", "G": "tab:green", "B": "tab:blue", "N": "tab:brown", "W": "0.4", "M": "0.2"}
+
+
+def table(found: Mapping[str, Characterisation]) -> list[str]:
+    """Lines of text: a row a parameter, a column a channel."""
+    names = list(found)
+    lines = [f"{'':<30}" + "".join(f"{name:>12}" for name in names)]
+    for field in fields(Result):
+        values = (getattr(found[name].result, field.name) for name in names)
+        lines.append(f"{field.name:<30}" + "".join(f"{value:>12.5g}" for value in values))
+    return lines

@@ -1,0 +1,1 @@
+"""Words that every other package shares: errors, physical quantities, frames, spectra, files."""

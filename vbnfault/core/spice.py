@@ -1,0 +1,502 @@
+"""SPICE kernels: where the Sun, the target's axes and a spacecraft's camera are at an epoch.
+
+The only importer of spiceypy, an optional extra (`pip install 'vbnfault[spice]'`). Frames as in `frames`:
+J international celestial (SPICE's "J2000"), T target body-fixed, C camera; matrices are named TargetFromSource.
+Positions are geometric, without light time or aberration, as those of the built-in two-body ephemeris.
+
+SPICE runs in a process of its own, started with the first kernel: a damaged kernel can end CSPICE in native code,
+and then ends that process alone. The calling program's own kernels, if it uses spiceypy too, are not seen here and
+stay as they are. The process keeps its kernels in one pool, so they are loaded for the length of a `with` block:
+
+    with kernels("mission.tm"):
+        et_s = et_s_from_utc("2014-08-06T00:00:00")
+        sun_J_au = sun_position_J_au("CHURYUMOV-GERASIMENKO", et_s)
+        T_from_J = J_from_T("67P/C-G_CK", et_s).T
+"""
+
+from __future__ import annotations
+
+import atexit
+import importlib.util
+import math
+import os
+import pickle
+import re
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from . import resources
+from .errors import InputError
+from .frames import J2000_JD
+
+F64 = NDArray[np.float64]
+
+KM_PER_AU = 149597870.7  # IAU 2012 Resolution B2, exact
+METRES_PER_KM = 1000.0
+SECONDS_PER_DAY = 86400.0
+J_FRAME = "J2000"  # SPICE's name of the ICRF axes
+
+# CSPICE is not thread-safe, and two threads would see each other's kernels.
+_pool = threading.RLock()
+
+# SPICE short message → what it means here; the others are given in SPICE's own words.
+_MEANINGS = {
+    "SPICE(SPKINSUFFDATA)": "the kernels hold no position at that epoch",
+    "SPICE(NOLOADEDFILES)": "no kernel with positions is loaded",
+    "SPICE(NOFRAMECONNECT)": "the kernels hold no attitude at that epoch",
+    "SPICE(FRAMEDATANOTFOUND)": "the kernels do not define that frame in full",
+    "SPICE(KERNELVARNOTFOUND)": "a constant of that body is missing from the kernels",
+    "SPICE(UNKNOWNFRAME)": "the kernels define no such frame",
+    "SPICE(IDCODENOTFOUND)": "the kernels know no body of that name",
+    "SPICE(NOLEAPSECONDS)": "no leap-second kernel is loaded",
+    "SPICE(MISSINGTIMEINFO)": "no leap-second kernel is loaded",
+}
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Pose:
+    """A camera's place and attitude in the target's body-fixed frame.
+
+    Attributes
+    ----------
+    camera_position_T_m
+        float64[3], metres from the target's centre, frame T.
+    T_from_C
+        float64[3, 3], camera axes (x image right, y image down, z boresight) in T.
+    """
+
+    camera_position_T_m: F64
+    T_from_C: F64
+
+
+@contextmanager
+def kernels(*paths: str | Path) -> Iterator[None]:
+    """Load kernels for the length of a block, in the order given; later ones take precedence.
+
+    Parameters
+    ----------
+    paths
+        Kernels of any type, meta-kernels among them. SPICE reads the relative paths within a meta-kernel from the
+        folder the program runs in, unless its PATH_VALUES say otherwise. Kernels of an outer block stay loaded
+        after this one; other threads that use this module wait until it ends.
+
+    Raises
+    ------
+    InputError
+        spiceypy is not installed, no path is given, or a kernel (or one that a meta-kernel names) is missing or
+        unreadable.
+    """
+    if not paths:
+        raise InputError("SPICE kernels: at least one path is needed.")
+    _check_installed("SPICE kernels")
+    for path in paths:
+        _check_kernel(Path(path))
+    with _pool:
+        before = int(_ask("SPICE kernels", "loaded"))
+        reader = _reader
+        try:
+            try:
+                for path in paths:
+                    _ask(str(path), "load", str(path), os.getcwd())
+            except InputError:
+                if before == 0:  # SPICE keeps records of a file that it refused: begin again
+                    _end()
+                raise
+            yield
+        finally:
+            if reader is _reader is not None:  # else it has ended, and its pool with it
+                _ask("SPICE kernels", "unload", before)
+
+
+def loaded() -> int:
+    """Return the number of kernels loaded at present."""
+    return int(_ask("SPICE kernels", "loaded"))
+
+
+def read_dsk(path: str | Path) -> tuple[F64, NDArray[np.int64]]:
+    """Return the plates of a NAIF DSK, all type 2 segments of its one body and surface.
+
+    Parameters
+    ----------
+    path
+        Of the file, already checked by `resources.read_input`.
+
+    Returns
+    -------
+    vertices_km, faces
+        float64[n, 3] in the body-fixed frame that the segments name, int64[m, 3] counted from 0.
+
+    Raises
+    ------
+    InputError
+        spiceypy is not installed, the file is no DSK or damaged, or holds no segment of type 2 or those of several
+        surfaces.
+    """
+    _check_installed(str(path))
+    size = resources.file_status(path)
+    more_s = 0.0 if size is None else size.st_size / _DSK_BYTES_PER_S
+    reader = _Reader()  # of its own, since SPICE keeps records of a file that it refused
+    try:
+        vertices_km, faces = _answer(reader, str(path), "dsk", os.path.abspath(path), cpu_s=_CPU_S + more_s)
+    finally:
+        reader.close()
+    return vertices_km, faces
+
+
+def et_s_from_julian_date(julian_date: float) -> float:
+    """Ephemeris time, seconds TDB past J2000.0, of a TDB Julian date."""
+    return (julian_date - J2000_JD) * SECONDS_PER_DAY
+
+
+def julian_date_from_et_s(et_s: float) -> float:
+    """TDB Julian date of an ephemeris time: the inverse of `et_s_from_julian_date`."""
+    return J2000_JD + et_s / SECONDS_PER_DAY
+
+
+def et_s_from_utc(utc: str) -> float:
+    """Ephemeris time, seconds TDB past J2000.0, of a UTC text such as "2014-08-06T12:00:00".
+
+    Raises
+    ------
+    InputError
+        No leap-second kernel is loaded, or the text is no time.
+    """
+    return float(_ask(f"UTC {utc!r}", "str2et", utc))
+
+
+def sun_position_J_au(target: str, et_s: float) -> F64:
+    """Geometric position of the Sun from the target's centre, float64[3] au, frame J.
+
+    The opposite of `frames.Orbit.position_J_au`, which is the target's position from the Sun.
+
+    Parameters
+    ----------
+    target
+        SPICE name or number of the body.
+    et_s
+        Ephemeris time, seconds TDB past J2000.0.
+
+    Raises
+    ------
+    InputError
+        Unknown body, or no position at the epoch.
+    """
+    purpose = f"Sun from {target} at {_epoch(et_s)}"
+    position_km = _ask(purpose, "position_km", "SUN", et_s, J_FRAME, str(target))
+    return np.asarray(position_km, dtype=np.float64) / KM_PER_AU
+
+
+def J_from_T(frame: str, et_s: float) -> F64:
+    """Attitude of a body-fixed frame, float64[3, 3]: T to ICRF axes; its transpose is T_from_J.
+
+    Parameters
+    ----------
+    frame
+        SPICE name of the body-fixed frame, such as "IAU_EROS" or "67P/C-G_CK"; its axes have to be the shape's.
+    et_s
+        Ephemeris time, seconds TDB past J2000.0.
+
+    Raises
+    ------
+    InputError
+        Unknown frame, or no attitude at the epoch.
+    """
+    return np.asarray(_ask(f"frame {frame} at {_epoch(et_s)}", "pxform", frame, J_FRAME, et_s), dtype=np.float64)
+
+
+def pose_T(
+    spacecraft: str, target: str, frame: str, camera_frame: str, et_s: float, K_from_C: F64 | None = None
+) -> Pose:
+    """Where a spacecraft's camera is and where it looks, in the target's body-fixed frame.
+
+    Parameters
+    ----------
+    spacecraft, target
+        SPICE names or numbers of the spacecraft (or camera) and of the body.
+    frame, camera_frame
+        SPICE names of the body-fixed frame T and of the camera's frame K, such as "ROS_NAVCAM-A".
+    et_s
+        Ephemeris time, seconds TDB past J2000.0.
+    K_from_C
+        float64[3, 3], a rotation: axes of C (x image right, y image down, z boresight) in K, as the instrument's
+        frame kernel describes them; default: K is C.
+
+    Raises
+    ------
+    InputError
+        Unknown body or frame, no position or attitude at the epoch, or K_from_C is no rotation.
+    """
+    mounting = np.eye(3) if K_from_C is None else np.asarray(K_from_C, dtype=np.float64)
+    if mounting.shape != (3, 3) or not (
+        np.allclose(mounting @ mounting.T, np.eye(3), atol=1e-9) and np.linalg.det(mounting) > 0
+    ):
+        raise InputError(f"camera frame {camera_frame}: K_from_C must be a 3 × 3 rotation matrix.")
+    purpose = f"{spacecraft} from {target} in frame {frame} at {_epoch(et_s)}"
+    position_km = _ask(purpose, "position_km", str(spacecraft), et_s, frame, str(target))
+    purpose = f"frame {camera_frame} in {frame} at {_epoch(et_s)}"
+    T_from_K = np.asarray(_ask(purpose, "pxform", camera_frame, frame, et_s), dtype=np.float64)
+    return Pose(
+        camera_position_T_m=np.asarray(position_km, dtype=np.float64) * METRES_PER_KM,
+        T_from_C=T_from_K @ mounting,
+    )
+
+
+def _epoch(et_s: float) -> str:
+    return f"JD {julian_date_from_et_s(et_s):.6f} TDB"
+
+
+# --- the files ------------------------------------------------------------------------------------------------
+
+_BINARY = (b"DAF/", b"DAS/", b"NAIF/")
+_DATA = re.compile(rb"\\begindata(.*?)(?:\\begintext|\Z)", re.DOTALL)
+_ASSIGNED = re.compile(rb"([A-Za-z0-9_/$.-]+)[ \t]*\+?=\s*(\((?:'(?:[^'\n]|'')*'|[^()'])*\)|'(?:[^'\n]|'')*')")
+_TEXT = re.compile(rb"'((?:[^'\n]|'')*)'")
+_DEEPEST_META_KERNEL = 8
+
+
+def _check_installed(purpose: str) -> None:
+    if importlib.util.find_spec("spiceypy") is None:
+        raise InputError(f"{purpose}: needs spiceypy: pip install 'vbnfault[spice]'.")
+
+
+def _check_kernel(path: Path, depth: int = 0) -> None:
+    """Check that a kernel, and what a meta-kernel names, are regular files: SPICE would wait at a pipe."""
+    resources.check_path(str(path), "SPICE kernel")
+    if resources.head_of_input(path, "SPICE kernel", 8).startswith(_BINARY):
+        resources.check_input(path, "SPICE kernel")
+        return
+    text = resources.read_input(path, "SPICE text kernel")
+    values: dict[bytes, list[str]] = {}
+    for data in _DATA.findall(text):
+        for name, value in _ASSIGNED.findall(data):
+            texts = (os.fsdecode(t.replace(b"''", b"'")) for t in _TEXT.findall(value))
+            values.setdefault(name.upper(), []).extend(texts)
+    symbols = dict(zip(values.get(b"PATH_SYMBOLS", ()), values.get(b"PATH_VALUES", ()), strict=False))
+    named = ""
+    for piece in values.get(b"KERNELS_TO_LOAD", ()):
+        named += piece.removesuffix("+")
+        if piece.endswith("+"):  # goes on in the next text
+            continue
+        for symbol in sorted(symbols, key=len, reverse=True):
+            named = named.replace(f"${symbol}", symbols[symbol])
+        status = resources.file_status(named)
+        if status is not None:  # a missing file SPICE names better
+            if depth == _DEEPEST_META_KERNEL:
+                raise InputError(f"{path}: names meta-kernels more than {_DEEPEST_META_KERNEL} deep.")
+            _check_kernel(Path(named), depth + 1)
+        named = ""
+
+
+# --- the process that SPICE runs in ---------------------------------------------------------------------------
+
+# Of computing time, for one question: all that a sound kernel takes many times over.
+_CPU_S = 15.0
+_DSK_BYTES_PER_S = 5e6
+_ADDRESS_SPACE_BYTES = 6 << 30
+_DSK_MOST_SEGMENTS = 10_000
+_PLATE_BYTES, _VERTEX_BYTES = 12, 24  # of a DSK of type 2, at least
+
+
+class _Reader:
+    """A process that answers questions to SPICE, one after the other."""
+
+    def __init__(self) -> None:
+        self.owner = os.getpid()
+        paths = resources.import_path()
+        self.process = subprocess.Popen(
+            [
+                sys.executable,
+                "-c",
+                f"import sys; sys.path[:] = {paths!r}; from vbnfault import spice; spice.serve()",
+            ],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            start_new_session=True,  # Ctrl-C is for this process to act on; the other ends with its questions
+        )
+
+    def ask(self, question: tuple[Any, ...]) -> Any:
+        """The answer; raises EOFError or OSError where the process ends over it."""
+        assert self.process.stdin is not None
+        assert self.process.stdout is not None
+        pickle.dump(question, self.process.stdin)
+        self.process.stdin.flush()
+        return pickle.load(self.process.stdout)
+
+    def close(self) -> int:
+        """End the process and return its exit code, that of a signal negative."""
+        assert self.process.stdin is not None
+        assert self.process.stdout is not None
+        with suppress(OSError):
+            self.process.stdin.close()
+        code = self.process.wait()
+        self.process.stdout.close()
+        return code
+
+
+_reader: _Reader | None = None
+
+
+@atexit.register
+def _end() -> None:
+    global _reader
+    if _reader is not None and _reader.owner == os.getpid():
+        _reader.close()
+    _reader = None
+
+
+def _ask(purpose: str, name: str, *arguments: Any, cpu_s: float = _CPU_S) -> Any:
+    """What SPICE answers to a question of `_QUESTIONS`; raises InputError whose sentence begins with `purpose`."""
+    global _reader
+    _check_installed(purpose)
+    with _pool:
+        if _reader is None or _reader.owner != os.getpid():  # after a fork the pipes are the parent's
+            _reader = _Reader()
+        try:
+            return _answer(_reader, purpose, name, *arguments, cpu_s=cpu_s)
+        finally:
+            if _reader.process.returncode is not None:
+                _reader = None
+
+
+def _answer(reader: _Reader, purpose: str, name: str, *arguments: Any, cpu_s: float) -> Any:
+    """The answer of a process to one question; where there is none, the process has ended."""
+    try:
+        kind, answer = reader.ask((name, arguments, cpu_s))
+    except (EOFError, OSError, pickle.UnpicklingError):
+        raise InputError(f"{purpose}: SPICE {_cause(reader.close())}: a kernel is damaged.") from None
+    except BaseException:  # interrupted between question and answer: the next one would get this answer
+        reader.process.kill()
+        reader.close()
+        raise
+    if kind == "refused":
+        raise InputError(f"{purpose}: {answer}.")
+    return answer
+
+
+def _cause(code: int) -> str:
+    if -code == getattr(signal, "SIGXCPU", 0):
+        return "does not come to an end"
+    name = signal.Signals(-code).name if code < 0 else f"exit code {code}"
+    return f"aborted ({name})"
+
+
+def serve() -> None:
+    """Answer the questions that arrive on standard input, until it ends: the whole of the process for SPICE."""
+    answers = os.fdopen(os.dup(1), "wb")
+    os.dup2(2, 1)  # what CSPICE prints is no answer
+    questions = sys.stdin.buffer
+    try:
+        import resource
+    except ImportError:  # Windows has no such limits
+        resource = None  # type: ignore[assignment]
+    if resource is not None:
+        for limit, value in ((resource.RLIMIT_CORE, 0), (resource.RLIMIT_AS, _ADDRESS_SPACE_BYTES)):
+            hard = resource.getrlimit(limit)[1]
+            resource.setrlimit(limit, (value if hard == resource.RLIM_INFINITY else min(value, hard), hard))
+    import spiceypy
+
+    while True:
+        try:
+            name, arguments, cpu_s = pickle.load(questions)
+        except EOFError:
+            return
+        if resource is not None:
+            used = resource.getrusage(resource.RUSAGE_SELF)
+            until = math.ceil(used.ru_utime + used.ru_stime + cpu_s)
+            hard = resource.getrlimit(resource.RLIMIT_CPU)[1]
+            resource.setrlimit(
+                resource.RLIMIT_CPU, (until if hard == resource.RLIM_INFINITY else min(until, hard), hard)
+            )
+        try:
+            answer = "done", _QUESTIONS[name](spiceypy, *arguments)
+        except InputError as error:
+            answer = "refused", str(error)
+        except spiceypy.utils.exceptions.SpiceyError as error:
+            answer = "refused", _meaning(error)
+        except MemoryError:
+            answer = "refused", "takes more memory than a kernel may"
+        except Exception as error:  # spiceypy's own, on texts and numbers that C has no room for
+            answer = "refused", f"SPICE refuses it ({type(error).__name__})"
+        pickle.dump(answer, answers)
+        answers.flush()
+
+
+def _load(spiceypy: Any, path: str, folder: str) -> None:
+    os.chdir(folder)  # from which a meta-kernel's relative paths are taken
+    spiceypy.furnsh(path)
+
+
+def _unload(spiceypy: Any, before: int) -> None:
+    """Unload all but the first `before` kernels; a meta-kernel that failed half-way leaves what it had loaded."""
+    for index in range(spiceypy.ktotal("ALL") - 1, before - 1, -1):
+        with suppress(spiceypy.utils.exceptions.SpiceyError):
+            spiceypy.unload(spiceypy.kdata(index, "ALL")[0])
+
+
+def _dsk(spiceypy: Any, path: str) -> tuple[F64, NDArray[np.int64]]:
+    vertices: list[F64] = []
+    faces: list[NDArray[np.int64]] = []
+    surfaces: set[tuple[int, int]] = set()
+    base = segments = 0
+    room = os.path.getsize(path)
+    handle = spiceypy.dasopr(path)
+    with spiceypy.no_found_check():
+        segment, found = spiceypy.dlabfs(handle)
+        while found:
+            segments += 1
+            if segments > _DSK_MOST_SEGMENTS:
+                raise InputError(f"has more than {_DSK_MOST_SEGMENTS} segments")
+            about = spiceypy.dskgd(handle, segment)
+            if about.dtype == 2:
+                vertices_n, faces_n = spiceypy.dskz02(handle, segment)
+                room -= _VERTEX_BYTES * vertices_n + _PLATE_BYTES * faces_n
+                if min(vertices_n, faces_n) < 0 or room < 0:
+                    raise InputError(f"has no room for the {vertices_n} vertices and {faces_n} plates it names")
+                vertices.append(np.array(spiceypy.dskv02(handle, segment, 1, vertices_n), dtype=np.float64))
+                plates = np.array(spiceypy.dskp02(handle, segment, 1, faces_n), dtype=np.int64)
+                if faces_n and not (plates.min() >= 1 and plates.max() <= vertices_n):
+                    raise InputError(f"has plates that name vertices outside 1 to {vertices_n}")
+                faces.append(plates - 1 + base)
+                base += vertices_n
+                surfaces.add((about.center, about.surfce))
+            segment, found = spiceypy.dlafns(handle, segment)
+    if not faces:
+        raise InputError("expected a DSK segment of type 2 (triangular plates), found none")
+    if len(surfaces) > 1:
+        listed = ", ".join(f"body {body} surface {surface}" for body, surface in sorted(surfaces))
+        raise InputError(f"expected the segments of one surface, found {listed}")
+    return np.concatenate(vertices), np.concatenate(faces)
+
+
+_QUESTIONS: dict[str, Callable[..., Any]] = {
+    "load": _load,
+    "unload": _unload,
+    "loaded": lambda spiceypy: spiceypy.ktotal("ALL"),
+    "str2et": lambda spiceypy, utc: spiceypy.str2et(utc),
+    "position_km": lambda spiceypy, body, et_s, frame, target: np.asarray(
+        spiceypy.spkpos(body, et_s, frame, "NONE", target)[0], dtype=np.float64
+    ),
+    "pxform": lambda spiceypy, frame, other, et_s: np.asarray(spiceypy.pxform(frame, other, et_s)),
+    "dsk": _dsk,
+}
+
+
+def _meaning(error: Any) -> str:
+    """One clause, without a full stop, for an error of spiceypy."""
+    short = str(getattr(error, "short", ""))
+    if short in _MEANINGS:
+        return _MEANINGS[short]
+    # SPICE explains over several sentences; the first says what went wrong.
+    words = " ".join(str(getattr(error, "long", "") or error).split())
+    return f"SPICE says: {words.split('. ')[0].rstrip('.')}"

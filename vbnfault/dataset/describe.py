@@ -1,0 +1,134 @@
+"""What a scene will photograph, in words and before any render: `vbnfault describe` and `build --dry-run`."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..pipeline import Session
+from ..pipeline.expose import reference_exposure_s
+from ..scene import plan
+from ..world import assemble
+from .progress import duration_text, size_text
+
+
+def describe(session: Session, *, sample_bytes: int, seconds: float) -> list[str]:
+    """Return the lines that say what the samples of a session are; warnings come last.
+
+    Parameters
+    ----------
+    session : Session
+        The scene with its plan; neither terrain nor renderer is needed.
+    sample_bytes : int
+        About what a sample takes on disk.
+    seconds : float
+        About how long the build takes on this machine.
+    """
+    lines = [f"{session.scene.title}: {session.scene.description}".rstrip(": ")]
+    lines += _samples(session)
+    lines += _geometry(session)
+    lines += _camera(session)
+    total = sample_bytes * len(session.plan)
+    lines.append(f"size: about {size_text(total)}; time on this machine: about {duration_text(seconds)}")
+    return lines + [f"warning: {text}" for text in plan.shortcomings(session.scene, session.plan)]
+
+
+def _samples(session: Session) -> list[str]:
+    scene, table = session.scene, session.plan
+    per_site = np.bincount(table.site)
+    per_site = per_site[per_site > 0]
+    lines = [
+        f"samples: {len(table)} at {len(per_site)} of {scene.dataset.sites} sites, "
+        f"{_range(per_site.min(), per_site.max())} at each"
+    ]
+    if scene.camera.individuals > 1:
+        per_device = np.bincount(table.individual, minlength=scene.camera.individuals)
+        each = _range(per_device.min(), per_device.max())
+        lines[0] += f"; {len(per_device)} devices of the detector, {each} samples each"
+    rows: dict[str, NDArray[np.bool_]] = {"samples": np.ones(len(table), dtype=bool)}
+    rows |= {name: np.asarray(table.stratum == k) for k, name in enumerate(plan.STRATA)}
+    rows["no fault"] = np.asarray(~table.injected.any(axis=1))
+    rows |= {name: table.injects(name) for name in table.faults}
+    splits = {name: table.split == k for k, name in enumerate(plan.SPLITS)}
+    wide = max(map(len, rows))
+    lines.append(f"  {'planned':<{wide}}{'all':>9}" + "".join(f"{name:>9}" for name in splits))
+    for name, row in rows.items():
+        counts = [int(row.sum()), *(int((row & split).sum()) for split in splits.values())]
+        lines.append(f"  {name:<{wide}}" + "".join(f"{count:>9}" for count in counts))
+    return lines
+
+
+def _geometry(session: Session) -> list[str]:
+    scene, table = session.scene, session.plan
+    geometry, camera = scene.geometry, scene.camera
+    sun = f"Sun: {assemble.sun_distance_au(scene):.4g} au away"
+    if scene.spice.spacecraft:
+        until = scene.spice.until_julian_date or scene.sun.julian_date
+        return [
+            f"trajectory: {scene.spice.spacecraft} from Julian date {scene.sun.julian_date:.5f} to {until:.5f}; "
+            "poses are kept, and faults that cannot show are recorded as not injected",
+            sun,
+        ]
+    low, high = geometry.height_m
+    above = "the ground below the camera" if geometry.height_reference == "local_ground" else "the site"
+    across = 2 * np.tan(np.radians(camera.fov_deg) / 2)
+    # no camera is closer than the clearance
+    nearest = max(low, min(geometry.clearance_m, high))
+    lines = [
+        f"heights: {low:g} to {high:g} m above {above}, x {_bounds(geometry.x_m)} m, y {_bounds(geometry.y_m)} m",
+        f"straight down: {_span(across * nearest / camera.width_px, across * high / camera.width_px)} m a pixel, "
+        f"footprint {_span(across * nearest, across * high)} m across",
+        f"{sun}, date {scene.sun.julian_date:.1f} TDB",
+    ]
+    for k, stratum in enumerate(plan.strata(scene)):
+        if not (table.stratum == k).any():
+            continue
+        towards = "the Sun" if stratum.reference == "sun" else "straight down"
+        lit = f"at least {stratum.min_lit_fraction:.0%} sunlit ground" if stratum.min_lit_fraction else "any ground"
+        lines.append(
+            f"  {plan.STRATA[k]}: Sun elevation {_bounds(stratum.sun_elevation_deg)}, azimuth "
+            f"{_bounds(stratum.sun_azimuth_deg)} deg; camera from {towards} by roll {_bounds(stratum.roll_deg)}, "
+            f"pitch {_bounds(stratum.pitch_deg)}, yaw {_bounds(stratum.yaw_deg)} deg; {lit}"
+        )
+    hidden = "is drawn again" if geometry.sun_visibility == "required" else "is kept, without straylight"
+    unseen = f"gets another view, of {scene.plan.max_views} at most"
+    if scene.plan.on_invisible == "drop":
+        unseen = "is recorded as not injected"
+    lines.append(
+        f"views: nothing within {geometry.clearance_m:g} m; a straylight view whose Sun is hidden {hidden}; a "
+        f"fault that cannot show {unseen}"
+    )
+    return lines
+
+
+def _camera(session: Session) -> list[str]:
+    scene, camera = session.scene, session.base_camera
+    settings = scene.camera
+    if settings.exposure_s == "auto":
+        about = reference_exposure_s(scene, camera)
+        clipped = float(np.clip(about, settings.exposure_min_s, settings.exposure_max_s))
+        exposure = (
+            f"metered, about {clipped:.3g} s for ground lit at 45 deg, from {settings.exposure_min_s:g} to "
+            f"{settings.exposure_max_s:g} s"
+        )
+    else:
+        exposure = f"{settings.exposure_s:g} s"
+    architectures = (camera.architecture,) if settings.detector else settings.architectures
+    return [
+        f"camera: {camera.width_px} x {camera.height_px} px, {settings.fov_deg:g} deg across; "
+        f"lens: {camera.lens.figures['summary']}",
+        f"detector: {camera.detector.name}, {', '.join(architectures)}; exposure: {exposure}",
+    ]
+
+
+def _range(low: float, high: float) -> str:
+    return f"{low:g}" if low == high else f"{low:g} to {high:g}"
+
+
+def _span(low: float, high: float) -> str:
+    return _range(float(f"{low:.3g}"), float(f"{high:.3g}"))
+
+
+def _bounds(pair: tuple[float, float] | None) -> str:
+    assert pair is not None
+    return _range(*pair)

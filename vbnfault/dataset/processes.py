@@ -1,0 +1,220 @@
+"""Worker processes on this machine, replaced before they grow too large and when they die."""
+
+from __future__ import annotations
+
+import contextlib
+import multiprocessing
+import os
+import signal
+import sys
+import threading
+from collections import Counter, deque
+from collections.abc import Callable, Iterator
+from multiprocessing import connection, resource_tracker
+from pathlib import Path
+from typing import Any
+
+from .. import store as store_module
+from ..core import interrupts, streams
+from ..core.errors import VbnfaultError
+from ..core.resources import import_path
+from .tasks import Fatal, Lazy, Run, SessionFactory, Task, work
+
+_SECONDS_TO_STOP = 60.0  # for the samples in hand to be written; a second Ctrl-C waits no longer
+
+
+def _worker(factory: SessionFactory, path: Path, pipe: connection.Connection) -> None:
+    """A worker process: tasks come in by the pipe, ticks go out. It does not outlive its parent."""
+    with contextlib.suppress(EOFError, OSError, interrupts.Stopped), streams.steady():
+        interrupts.obey_parent()
+        threading.Thread(target=_die_with_parent, daemon=True).start()
+        session, store = Lazy(factory), store_module.open_store(path, "r+")
+        while True:
+            task = pipe.recv()
+            try:
+                work(session.simulate, store, task, lambda *event: pipe.send(event))
+            except Fatal as fatal:
+                pipe.send((-1, "fatal", fatal.error))
+            except VbnfaultError as error:  # the disk refused
+                pipe.send((-1, "fatal", error))
+            else:
+                pipe.send((-1, "finished", ""))
+
+
+def _die_with_parent() -> None:
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
+
+
+class _Process:
+    """A worker process as its parent sees it."""
+
+    def __init__(self, factory: SessionFactory, path: Path, threads: int) -> None:
+        context = multiprocessing.get_context("spawn")
+        self.pipe, theirs = context.Pipe()
+        self.process = context.Process(target=_worker, args=(factory, path, theirs), daemon=True)
+        try:
+            with _environment(threads), _without_working_folder():
+                resource_tracker.ensure_running()  # else the start would do it, and let signals through
+                with interrupts.held():
+                    self.process.start()
+        except BaseException:
+            if self.process.pid is not None:
+                self.process.kill()  # nobody else knows of it
+            raise
+        theirs.close()
+        self.heard = False  # has it said anything yet
+        self.shards = 0
+        self.shard = -1
+        self.sample: int | None = None  # in work
+
+    def give(self, task: Task) -> None:
+        """Hand it a task."""
+        self.shard, self.sample = task.shard, None
+        self.shards += 1
+        with contextlib.suppress(OSError):  # it died: the next wait notices
+            self.pipe.send(task)
+
+    def stop(self, *, at_once: bool = False) -> None:
+        """Let it end: after its task, or at once, with time to write what it has."""
+        if at_once and not self.heard:
+            self.process.kill()  # it has nothing to write
+        elif at_once:
+            self.process.terminate()
+        self.pipe.close()
+
+    def join(self) -> None:
+        """Wait for its end, but not for ever."""
+        self.process.join(_SECONDS_TO_STOP)
+        if self.process.is_alive():
+            self.process.kill()
+            self.process.join()
+
+    def obituary(self) -> str:
+        """How it ended."""
+        code = self.process.exitcode or 0
+        if code == -signal.SIGKILL:
+            return "was killed (signal 9, as the system does when memory runs out)"
+        return f"was killed by signal {-code}" if code < 0 else f"ended with exit code {code}"
+
+
+@contextlib.contextmanager
+def _environment(threads: int) -> Iterator[None]:
+    """Cap the threads of processes started within, and keep Python from importing out of their working folder.
+
+    Libraries and Python read these variables when they load.
+    """
+    names = ("VBNFAULT_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+    values = dict.fromkeys(names, str(threads)) | {"PYTHONSAFEPATH": "1"}
+    before = {name: os.environ[name] for name in values if name in os.environ}
+    os.environ.update(values)
+    try:
+        yield
+    finally:
+        for name in values:
+            del os.environ[name]
+        os.environ.update(before)
+
+
+@contextlib.contextmanager
+def _without_working_folder() -> Iterator[None]:
+    """Keep the working folder out of the import path of processes started within.
+
+    PYTHONSAFEPATH does the same for what they import before they have it.
+    """
+    before = sys.path.copy()
+    sys.path[:] = import_path()
+    try:
+        yield
+    finally:
+        sys.path[:] = before
+
+
+class Pool:
+    """Worker processes that are replaced after `recycle` shards, or when they die.
+
+    A sample during which a process died is tried once more, in a new one, then given up; the others of its
+    shard are written one by one, so that a crash costs that sample alone.
+    """
+
+    def __init__(self, factory: SessionFactory, run: Run, threads: int, recycle: int) -> None:
+        self._new: Callable[[], _Process] = lambda: _Process(factory, run.store.path, threads)
+        self._run, self._recycle = run, recycle
+        self._workers: list[_Process] = []
+        self._again: deque[int] = deque()
+        self._deaths: Counter[int | None] = Counter()
+        self._given_up: dict[int, frozenset[int]] = {}  # shard → samples; its keys are worked carefully
+
+    def work(self, workers: int) -> None:
+        """Do all tasks."""
+        try:
+            for _ in range(min(workers, self._run.store.shards)):
+                self._next(None, None)
+            while self._workers:
+                by_pipe: dict[Any, _Process] = {worker.pipe: worker for worker in self._workers}
+                for pipe in connection.wait(list(by_pipe)):
+                    self._hear(by_pipe[pipe])
+        finally:
+            with interrupts.finishing(self._kill):
+                for worker in self._workers:
+                    worker.stop(at_once=True)
+                for worker in self._workers:
+                    worker.join()
+
+    def _kill(self) -> None:
+        for worker in self._workers:
+            worker.process.kill()
+
+    def _next(self, worker: _Process | None, last: int | None) -> None:
+        """Hand the next task to a worker, or to a new one; without a task it retires."""
+        busy = [w.shard for w in self._workers if w is not worker]
+        shard = self._again.popleft() if self._again else self._run.next_shard(last, busy)
+        if worker is not None and (shard is None or worker.shards >= self._recycle):
+            self._workers.remove(worker)
+            worker.stop()
+            worker.join()
+            worker = None
+        if shard is None:
+            return
+        if worker is None:
+            worker = self._new()
+            self._workers.append(worker)
+        careful = shard in self._given_up
+        worker.give(self._run.task(shard, self._given_up.get(shard, frozenset()), careful=careful))
+
+    def _hear(self, worker: _Process) -> None:
+        try:
+            sample, what, payload = worker.pipe.recv()
+            worker.heard = True
+        except (EOFError, OSError):
+            self._mourn(worker)
+            return
+        if what == "fatal":
+            raise payload
+        if what == "finished":
+            self._next(worker, worker.shard)
+        else:
+            worker.sample = sample if what in ("begun", "stage") else None
+            self._run.tick(sample, what, payload)
+
+    def _mourn(self, worker: _Process) -> None:
+        self._workers.remove(worker)
+        worker.stop()
+        worker.join()
+        sample, shard, how = worker.sample, worker.shard, f"its worker process {worker.obituary()}"
+        self._deaths[sample] += 1
+        given_up = self._given_up.setdefault(shard, frozenset())
+        if self._deaths[sample] == 1:
+            self._run.progress.say(f"sample {sample}: {how}; trying again in a new one")
+        elif sample is None:
+            raise VbnfaultError(
+                f"{self._run.store.path}: a worker process ended before it made anything ({how}); "
+                f"finished samples stay, and the same command resumes"
+            )
+        else:
+            self._run.tick(sample, "failed", f"{how}, twice")
+            self._given_up[shard] = given_up | {sample}
+        self._again.append(shard)
+        self._next(None, None)

@@ -1,0 +1,169 @@
+"""Exact rays through a prescription, in double precision: forward, or along any path of reflections.
+
+Axes of the lens: z from the first vertex backwards along the axis, x and y across. The reference that faster
+tracers are judged by, and what drawings show.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from .gaussian import first_order
+from .glass import D_NM
+from .prescription import Prescription, Surface
+
+F64 = NDArray[np.float64]
+
+_NEWTON_STEPS = 12
+
+
+@dataclass(frozen=True, kw_only=True)
+class Path:
+    """What n rays did on their way.
+
+    Attributes
+    ----------
+    points_mm
+        float64[step + 2, n, 3]: where they started, met each surface of the path, and met the sensor's plane; nan
+        after a surface that was missed or reflected all light.
+    directions
+        float64[n, 3]: unit, as they arrive.
+    relative_radius
+        float64[n]: the largest distance from the axis on the way, in semi-diameters of the surface met; above 1 the
+        ray was lost at a rim, inf where it missed a surface.
+    rows
+        Which surface each step met.
+    """
+
+    points_mm: F64
+    directions: F64
+    relative_radius: F64
+    rows: tuple[int, ...]
+
+    @property
+    def arrives(self) -> NDArray[np.bool_]:
+        """bool[n]: not lost, and on the way to the sensor at the end."""
+        there = np.isfinite(self.points_mm[-1, :, 0]) & (self.directions[:, 2] > 0)
+        return np.asarray(there & (self.relative_radius <= 1))
+
+
+def path_of(lens: Prescription, route: Sequence[int] = ()) -> tuple[tuple[int, bool], ...]:
+    """(row, whether it reflects) in the order met, for the rows that reflect, in that order: back, forward, and so
+    on; the sensor is the row behind the last."""
+    out: list[tuple[int, bool]] = []
+    at, onward = -1, True
+    for row in route:
+        between = range(at + 1, row) if onward else range(at - 1, row, -1)
+        out += [*((k, False) for k in between), (row, True)]
+        at, onward = row, not onward
+    return (*out, *((k, False) for k in range(at + 1, len(lens.surfaces))))
+
+
+def forward(lens: Prescription) -> tuple[tuple[int, bool], ...]:
+    """The path of the image: every row once, none as a mirror."""
+    return path_of(lens)
+
+
+def ghost(lens: Prescription, first: int, second: int) -> tuple[tuple[int, bool], ...]:
+    """The path of a ghost: back at row `second`, forward again at row `first` < `second`."""
+    return path_of(lens, (second, first))
+
+
+def trace(
+    lens: Prescription,
+    origins_mm: ArrayLike,
+    directions: ArrayLike,
+    *,
+    path: Sequence[tuple[int, bool]] | None = None,
+    wavelength_nm: float = D_NM,
+    sensor_mm: float | None = None,
+) -> Path:
+    """Trace rays in order along a path.
+
+    Parameters
+    ----------
+    origins_mm, directions
+        float64[n, 3], in front of the lens; directions need not have length 1.
+    path
+        (row, whether it reflects) in the order met; default: straight through.
+    sensor_mm
+        The sensor's plane behind the last vertex; default: the paraxial focus at the d line.
+    """
+    steps = forward(lens) if path is None else tuple(path)
+    vertex, index = lens.vertices_mm, lens.indices(wavelength_nm)
+    sensor = first_order(lens).bfd_mm if sensor_mm is None else sensor_mm
+    p = np.array(origins_mm, dtype=np.float64).reshape(-1, 3)
+    d = np.array(directions, dtype=np.float64).reshape(-1, 3)
+    d /= np.linalg.norm(d, axis=1, keepdims=True)
+    points, radius = [p], np.zeros(len(p))
+    onward = True
+    for row, mirror in steps:
+        surface, at = lens.surfaces[row], np.array([0.0, 0.0, vertex[row]])
+        p, normal = _meet(surface, p - at, d)
+        beyond = np.hypot(p[:, 0], p[:, 1]) / surface.semi_diameter_mm
+        radius = np.maximum(radius, np.where(np.isnan(beyond), np.inf, beyond))
+        p = p + at
+        points.append(p)
+        normal = np.where(np.einsum("ni,ni->n", normal, d)[:, None] > 0, -normal, normal)
+        cosine = -np.einsum("ni,ni->n", normal, d)[:, None]
+        if mirror:
+            d, onward = d + 2 * cosine * normal, not onward
+            continue
+        eta = index[row] / index[row + 1] if onward else index[row + 1] / index[row]
+        with np.errstate(invalid="ignore"):
+            d = eta * d + (eta * cosine - np.sqrt(1 - eta * eta * (1 - cosine * cosine))) * normal
+    away = (vertex[-1] + sensor - p[:, 2]) / d[:, 2]
+    points.append(p + away[:, None] * d)
+    return Path(
+        points_mm=np.stack(points), directions=d, relative_radius=radius, rows=tuple(row for row, _ in steps)
+    )
+
+
+def _meet(surface: Surface, p: F64, d: F64) -> tuple[F64, F64]:
+    """Where rays meet a surface with its vertex at the origin, and its normals there; nan where they miss it."""
+    c, k = surface.curvature_per_mm, 1 + surface.conic
+    p = p - (p[:, 2] / d[:, 2])[:, None] * d  # to the plane of the vertex
+    a = c * (d[:, 0] ** 2 + d[:, 1] ** 2 + k * d[:, 2] ** 2)
+    b = c * (p[:, 0] * d[:, 0] + p[:, 1] * d[:, 1]) - d[:, 2]
+    e = c * (p[:, 0] ** 2 + p[:, 1] ** 2)
+    with np.errstate(invalid="ignore"):
+        t = e / (-b + np.sign(d[:, 2]) * np.sqrt(b * b - a * e))
+    hit = p + t[:, None] * d
+    if not surface.aspheric_mm:
+        normal = np.column_stack([c * hit[:, 0], c * hit[:, 1], c * k * hit[:, 2] - 1])
+        return hit, normal / np.linalg.norm(normal, axis=1, keepdims=True)
+    for _ in range(_NEWTON_STEPS):
+        normal = _slope(surface, hit)
+        off = surface.sag_mm(np.hypot(hit[:, 0], hit[:, 1])) - hit[:, 2]
+        hit = hit - (off / np.einsum("ni,ni->n", normal, d))[:, None] * d
+    normal = _slope(surface, hit)
+    return hit, normal / np.linalg.norm(normal, axis=1, keepdims=True)
+
+
+def _slope(surface: Surface, hit: F64) -> F64:
+    """Gradient of sag - z at points of an asphere."""
+    c, k = surface.curvature_per_mm, 1 + surface.conic
+    r2 = hit[:, 0] ** 2 + hit[:, 1] ** 2
+    with np.errstate(invalid="ignore"):
+        per_r = c / np.sqrt(1 - k * c * c * r2)
+    for n, coefficient in enumerate(surface.aspheric_mm):
+        per_r = per_r + (2 * n + 4) * coefficient * r2 ** (n + 1)
+    return np.column_stack([per_r * hit[:, 0], per_r * hit[:, 1], -np.ones(len(hit))])
+
+
+def real_pupil_diameter_mm(lens: Prescription, wavelength_nm: float = D_NM) -> float:
+    """Diameter of the beam along the axis that fills the stop: that of a real ray, not of the paraxial pupil."""
+    most = lens.surfaces[0].semi_diameter_mm
+    height = np.linspace(0, most, 513)
+    stop = lens.stop
+    rays = np.column_stack([height, np.zeros_like(height), np.full_like(height, -1.0)])
+    found = trace(lens, rays, np.tile([0.0, 0.0, 1.0], (len(height), 1)), wavelength_nm=wavelength_nm)
+    at_stop = np.abs(found.points_mm[1 + stop, :, 0])
+    # rays far outside the beam come back to the axis, or nowhere
+    outwards = np.concatenate([[True], np.diff(at_stop) > 0])
+    usable = len(height) if outwards.all() else int(np.argmin(outwards))
+    return float(2 * np.interp(lens.surfaces[stop].semi_diameter_mm, at_stop[:usable], height[:usable]))

@@ -1,0 +1,653 @@
+"""Rays through a lens along many paths of reflections at once: all ghosts, all wavelengths, one kernel.
+
+A path is a table of steps, so that rays of all ghosts run side by side through one loop (Hullin et al. 2011). Rays
+start on a grid in the plane of the first vertex. Single precision: a ray's place is kept relative to the vertex it
+has just met. Where both sides of the plane of axis and Sun are alike, one side is traced.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from itertools import combinations
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...core.errors import InputError
+from ..coating import reflect_transmit
+from ..gaussian import first_order
+from ..prescription import Prescription
+from ..rays import path_of
+from .paraxial import along, mirrors
+
+F64 = NDArray[np.float64]
+
+_COSINES = 256  # nodes of the reflectance tables
+_LOST, _FAR = -1e6, -1e4
+_BEYOND_EDGE = -1.0  # margin at which no light is left of a soft edge
+_LIMIT_SHARPNESS = 100.0  # of the edge where a limit other than a rim ends the light
+_LEAST_SLOPE = 1e-3  # of a ray against the sensor's plane, once it is lost
+
+
+@lru_cache(maxsize=1)
+def backend() -> Any:
+    """drjit with its array types, on a usable LLVM."""
+    from ...core import llvm
+
+    llvm.prepare()
+    import drjit
+    import drjit.llvm as types
+
+    return SimpleNamespace(
+        dr=drjit,
+        Float=types.Float,
+        UInt32=types.UInt,
+        Int32=types.Int,
+        UInt64=types.UInt64,
+        Int64=types.Int64,
+        Double=types.Float64,
+    )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Rays:
+    """Which rays to trace: for each bundle its path, wavelength, box in the plane of the first vertex, direction.
+
+    `route` and `wavelength` index those of the tracer, int[bundle]; `box_mm` float64[bundle, 4] is centre x, y and
+    half width x, y; `direction` float64[bundle, 3] unit vectors, with the Sun's azimuth at 0. `disc`
+    float64[bundle] rounds lattices to the ellipse of so many half widths, so that their outer rays go along a rim;
+    0 leaves them rectangular.
+    """
+
+    route: NDArray[np.int64]
+    wavelength: NDArray[np.int64]
+    box_mm: F64
+    direction: F64
+    disc: F64 | None = None
+
+    def __len__(self) -> int:
+        return len(self.route)
+
+    def take(self, chosen: NDArray[Any]) -> Rays:
+        """Some of the bundles."""
+        return Rays(
+            route=self.route[chosen],
+            wavelength=self.wavelength[chosen],
+            box_mm=self.box_mm[chosen],
+            direction=self.direction[chosen],
+            disc=None if self.disc is None else self.disc[chosen],
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Spots:
+    """Where rays arrive: device arrays, bundle after bundle, rows of the grid along x within one.
+
+    Of `rays` `across` int64[bundle] span each lattice; `x_mm`, `y_mm` on the sensor, `share` of the light,
+    `radius`: the largest distance from the axis over the rim's on the way, and, where edges have a width, `margin`:
+    the least of (1 - radius) over the width of the rim's soft edge; a ray that misses a surface has a radius of
+    1e6.
+    """
+
+    rays: Rays
+    across: NDArray[np.int64]
+    x_mm: Any
+    y_mm: Any
+    share: Any
+    radius: Any
+    margin: Any = None
+
+
+def _paired(first: NDArray[Any], second: NDArray[Any]) -> NDArray[np.uint64]:
+    """Two arrays of numbers in single precision as one of words."""
+    pair = np.stack([np.asarray(first, dtype=np.float32), np.asarray(second, dtype=np.float32)], axis=-1)
+    return np.ascontiguousarray(pair).view(np.uint64).ravel()
+
+
+def _unpaired(words: Any, index: Any) -> tuple[Any, Any]:
+    """What `_paired` put together."""
+    be = backend()
+    word = be.dr.gather(be.UInt64, words, index)
+    halves = be.UInt32(word), be.UInt32(word >> 32)
+    return tuple(be.dr.reinterpret_array(be.Float, half) for half in halves)  # type: ignore[return-value]
+
+
+def routes(lens: Prescription, reflections: int = 2) -> tuple[tuple[int, ...], ...]:
+    """Sequences of reflecting rows in the order met: back, forward, and with four reflections back, forward."""
+    rows = (*mirrors(lens), *((len(lens.surfaces),) if lens.sensor_reflectance else ()))
+    two = [(b, a) for a, b in combinations(rows, 2)]
+    if reflections == 2:
+        return tuple(two)
+    if reflections != 4:
+        raise InputError(f"reflections = {reflections}: must be 2 or 4")
+    return (*two, *(first + second for first in two for second in two if second[0] > first[1]))
+
+
+def name_of(route: Sequence[int]) -> tuple[int, ...]:
+    """What a ghost is called: of each reflection back and the one forward that follows, the row of the one forward
+    first, since it is the row nearer the front."""
+    return tuple(row for back, forth in zip(route[::2], route[1::2], strict=True) for row in (forth, back))
+
+
+def lattice_places(across: NDArray[np.int64], rows: NDArray[np.int64]) -> tuple[Any, Any, Any, Any]:
+    """Bundle, column, row and `across` for the first rows of every bundle's lattice, one a lane."""
+    be = backend()
+    dr = be.dr
+    sizes = across * rows
+    each = dr.arange(be.UInt32, int(sizes.sum()))
+    if (across == across[0]).all() and (rows == rows[0]).all():
+        # whole divisions by a number that the kernel knows are cheap, by others they take longer than a surface
+        side, size = int(across[0]), int(sizes[0])
+        bundle = each // size
+        cell = each - bundle * size
+        iy = cell // side
+        return bundle, cell - iy * side, iy, be.UInt32(side)
+    bundle = be.UInt32(np.repeat(np.arange(len(across), dtype=np.uint32), sizes))
+    side = dr.gather(be.UInt32, be.UInt32(across.astype(np.uint32)), bundle)
+    cell = each - dr.gather(be.UInt32, be.UInt32((np.cumsum(sizes) - sizes).astype(np.uint32)), bundle)
+    # exact: half a cell off a whole number is far more than rounding
+    iy = be.UInt32((be.Float(cell) + 0.5) / be.Float(side))
+    return bundle, cell - iy * side, iy, side
+
+
+def rounded(u: Any, v: Any, disc: Any) -> tuple[Any, Any]:
+    """Points of a square from -1 to 1 on an ellipse of `disc` half widths, smoothly; unmoved where that is 0."""
+    dr = backend().dr
+    wide = dr.select(disc > 0, disc * dr.sqrt(1 - 0.5 * v * v), 1)
+    high = dr.select(disc > 0, disc * dr.sqrt(1 - 0.5 * u * u), 1)
+    return u * wide, v * high
+
+
+class Tracer:
+    """A lens made ready for tracing: tables of its paths, indices and reflectances at wavelengths, made once.
+
+    `reflections`: 2, or 4 for the paths of four reflections too.
+    """
+
+    def __init__(
+        self, lens: Prescription, wavelength_nm: F64, *, reflections: int = 2, routes_: Any = None
+    ) -> None:
+        self.lens = lens
+        self.wavelength_nm = np.atleast_1d(np.asarray(wavelength_nm, dtype=np.float64))
+        self.routes = routes(lens, reflections) if routes_ is None else tuple(routes_)
+        self.sensor_mm = first_order(lens).bfd_mm
+        self._paths = [path_of(lens, route) for route in self.routes]
+        self.first_step = np.concatenate([[0], np.cumsum([len(path) for path in self._paths])])
+        middle = float(np.median(self.wavelength_nm))
+        pairs_of = [along(lens, path, middle) for path in self._paths]
+        self.matrix = np.stack([m for m, _ in pairs_of]) if pairs_of else np.zeros((0, 2, 2))
+        self.met = np.concatenate([met for _, met in pairs_of]) if pairs_of else np.zeros((0, 2, 2))
+        self._tables = self._upload()
+        self._recorded: dict[Any, Any] = {}
+
+    def _upload(self) -> dict[str, Any]:
+        be, lens = backend(), self.lens
+        vertex = np.append(lens.vertices_mm, lens.vertices_mm[-1] + self.sensor_mm)
+        sensor = len(lens.surfaces)
+        row, mirror, medium, other, gap = [], [], [], [], []
+        last = []
+        for path in self._paths:
+            onward, before = True, 0
+            for k, reflects in path:
+                row.append(k)
+                mirror.append(reflects)
+                medium.append(k if onward else k + 1)
+                other.append(k + 1 if onward else k)
+                gap.append(vertex[before] - vertex[k])
+                before, onward = k, onward ^ reflects
+            last.append(vertex[before] - vertex[sensor])
+        index = np.stack([np.append(lens.indices(w), 1.0) for w in self.wavelength_nm])
+        absorption = np.zeros_like(index)
+        for k, surface in enumerate(lens.surfaces):
+            absorption[:, k + 1] = [surface.absorption_per_mm(w) for w in self.wavelength_nm]
+        self._absorbs = bool(absorption.any())
+        rows = np.array(row, dtype=np.uint32)
+        # by what the reflectance is looked up: 0 from the front, 1 from behind, 2 what passes
+        use = np.where(mirror, np.array(medium, dtype=np.int64) != rows, 2)
+        self.rows = rows
+        self._look_up = rows.astype(np.int64) * 3 + use
+        middle = lens.indices(float(np.median(self.wavelength_nm)))
+        self.medium_index = np.append(middle, 1.0)[medium]
+        self.rims_mm = np.array([s.semi_diameter_mm for s in lens.surfaces] + [np.inf])
+        most = max((len(s.aspheric_mm) for s in lens.surfaces), default=0)
+        aspheric = np.zeros((most, sensor + 1))
+        for k, s in enumerate(lens.surfaces):
+            aspheric[: len(s.aspheric_mm), k] = s.aspheric_mm
+        flat = [s.curvature_per_mm for s in lens.surfaces] + [0.0]
+        conic = [1 + s.conic for s in lens.surfaces] + [1.0]
+        count = len(rows)
+        ratio = index[:, medium] / index[:, other]
+        # a ray's step asks for few but wide records: fetching is what takes the time
+        curvature, per_rim = (np.array(flat)[rows], (1 / self.rims_mm)[rows])
+        self._index = index
+        self._look_up_word = ((rows * 3 + use) * _COSINES * 2 + np.array(mirror, dtype=np.int64)).astype(np.uint32)
+        tables = {
+            "row": be.UInt32(rows),
+            "stop": be.UInt32((rows == lens.stop).astype(np.uint32)),
+            "place": be.UInt64(_paired(np.array(gap), curvature)),
+            "bend": be.UInt64(_paired(ratio, np.broadcast_to(per_rim, (len(index), count)))),
+            "end": be.UInt32(self.first_step[1:].astype(np.uint32)),
+            "start": be.UInt32(self.first_step[:-1].astype(np.uint32)),
+            "last": be.Float(np.array(last, dtype=np.float32)),
+            "conic": be.Float(np.array(conic, dtype=np.float32)),
+            "per_rim": be.Float(per_rim.astype(np.float32)),
+            "absorption": be.Float(absorption[:, medium].astype(np.float32).ravel()),
+            "aspheric": [be.Float(c.astype(np.float32)) for c in aspheric],
+        }
+        self._last_gap_mm = float(last[0]) if last else 0.0
+        self._special = bool(most) or any(c != 1 for c in conic)
+        self._bladed = bool(lens.surfaces[lens.stop].blades)
+        self._numbers = {
+            "gap": np.array(gap),
+            "curvature": curvature,
+            "eta": ratio,
+            "per_rim": per_rim,
+            "conic": conic,
+            "aspheric": aspheric,
+            "absorption": absorption[:, medium],
+        }
+        tables |= self._share_tables(self._shares(index))
+        be.dr.eval(tables)
+        return tables
+
+    def _share_tables(self, share: F64) -> dict[str, Any]:
+        """What surfaces do to light, on the device."""
+        rise = np.diff(share, axis=-1, append=share[..., -1:])
+        return {"share": backend().UInt64(_paired(share, rise))}
+
+    def worn(self, coating_loss: float) -> Tracer:
+        """The same tracer with a share of the coatings' area gone: mirrors reflect the mean of coated and bare."""
+        share = self._coated.copy()
+        share[:, :, :2] += coating_loss * (self._bare - self._coated)[:, :, :2]
+        other = copy.copy(self)
+        other._tables = self._tables | other._share_tables(share)
+        other.__dict__.pop("_known", None)
+        other._recorded = {}
+        return other
+
+    @cached_property
+    def _coated(self) -> F64:
+        return self._shares(self._index)
+
+    @cached_property
+    def _bare(self) -> F64:
+        return self._shares(self._index, bare=True)
+
+    def _shares(self, index: F64, bare: bool = False) -> F64:
+        """What each surface reflects from the front, from behind, and passes, float64[wavelength, row, 3, cosine]:
+        over the cosine in the thinner of its two media, mean of both polarisations."""
+        lens = self.lens
+        cosine = np.maximum(np.linspace(0, 1, _COSINES), 1e-6)[None, :]
+        out = np.zeros((len(index), len(lens.surfaces) + 1, 3, _COSINES))
+        wavelength = self.wavelength_nm[:, None]
+        for k, surface in enumerate(lens.surfaces):
+            front, back = index[:, k, None], index[:, k + 1, None]
+            # the cosine on either side; the square root is of what the denser side has left
+            thin = np.minimum(front, back)
+            at_front, at_back = (np.sqrt(1 - (thin / n) ** 2 * (1 - cosine**2)) for n in (front, back))
+            films = () if bare else surface.coating
+            rs, rp, ts, tp = reflect_transmit(films, front, back, at_front, wavelength)
+            out[:, k, 0], out[:, k, 2] = (rs + rp) / 2, (ts + tp) / 2
+            rs, rp, _, _ = reflect_transmit(films[::-1], back, front, at_back, wavelength)
+            out[:, k, 1] = (rs + rp) / 2
+        out[:, -1, :2] = lens.sensor_reflectance
+        return out
+
+    def trace(
+        self,
+        rays: Rays,
+        across: int | NDArray[np.int64],
+        width: F64 | None = None,
+        *,
+        centred: bool = False,
+        light: bool = True,
+        halved: bool = True,
+    ) -> Spots:
+        """Trace a lattice of rays of every bundle.
+
+        Parameters
+        ----------
+        across
+            Rays along either side of the lattice, of all bundles or int64[bundle].
+        width
+            float64[step]: of the soft edge of the rim at each step of each route, in radii of the rim. Without it
+            no margins are told, and rays that are lost end there.
+        centred
+            Rays in the middles of the box's cells, else on its lattice, edges included, and rounded if it is.
+        light
+            Without it, a tracer of one path and wavelength leaves `share` at 1.
+        halved
+            Trace one side of the plane of axis and Sun where boxes lie evenly on both.
+        """
+        be, t = backend(), self._tables
+        dr = be.dr
+        even = halved and not rays.direction[:, 1].any() and not rays.box_mm[:, 1].any()
+        side = np.broadcast_to(np.asarray(across, dtype=np.int64), len(rays))
+        single = len(self.routes) == len(self.wavelength_nm) == len(rays) == 1
+        plain = width is None and not light and not even and not self._bladed
+        if single and plain and (centred or rays.disc is None):
+            return self._alone(rays, side, centred)
+        start = self._start(rays, side, centred, even)
+        count, route = dr.width(start.x), start.route
+        soft = width is not None
+        per_width = (np.zeros(len(self.rows)) if width is None else 1 / width).astype(np.float32)
+        sides = 2 if even and self._bladed else 1
+        none, one = dr.zeros(be.Float, count), dr.full(be.Float, 1, count)
+        rim = (none, dr.full(be.Float, 1e6, count)) if soft else (none,)
+        ray = (start.x, start.y, none, start.dx, start.dy, start.dz, one, *(rim * sides))
+        if len(self.routes) == len(self.wavelength_nm) == 1:
+            # one path, one wavelength: every number is known, and nothing need be fetched
+            for at, sharpness in zip(self._known, per_width.tolist(), strict=True):
+                at.sharpness = sharpness
+                ray = self._meet(at, soft, *ray, light=light)
+            last: Any = self._last_gap_mm
+        else:
+            edge = be.UInt64(_paired(per_width, self._look_up_word.view(np.float32)))
+            wavelength = start.wavelength * dr.opaque(be.UInt32, len(self.rows))
+            shares = start.wavelength * dr.opaque(be.UInt32, 3 * _COSINES * (len(self.lens.surfaces) + 1))
+            end = dr.gather(be.UInt32, t["end"], route)
+
+            def on(step: Any, *_: Any) -> Any:
+                return step < end
+
+            def body(step: Any, *ray: Any) -> Any:
+                return step + 1, *self._meet(self._fetched(step, edge, wavelength, shares), soft, *ray)
+
+            first = dr.gather(be.UInt32, t["start"], route)
+            _, *ray = dr.while_loop((first, *ray), on, body, mode="symbolic")
+            last = dr.gather(be.Float, t["last"], route)
+        x, y, z, dx, dy, dz, share, *rims = ray
+        away = -(z + last) / dz
+        x, y = dr.fma(away, dx, x), dr.fma(away, dy, y)
+        found = dr.isfinite(x + y + rims[0]) & (dr.abs(x) + dr.abs(y) < 1e9)
+        x, y, share = (dr.select(found, v, 0) for v in (x, y, share))
+        radius = [dr.select(found, dr.sqrt(r), -_LOST) for r in (rims[::2] if soft else rims)]
+        margin = [dr.select(found, dr.maximum(m, _FAR), _LOST) for m in (rims[1::2] if soft else ())]
+        told = [(x, x), (y, -y), (share, share), (radius[0], radius[-1])]
+        told += [(margin[0], margin[-1])] if soft else []
+        dr.eval(told)
+        if not even:
+            return Spots(rays, side, *(one for one, _ in told))
+        whole = [dr.empty(be.Float, int((side**2).sum())) for _ in told]
+        for out, (here, there) in zip(whole, told, strict=True):
+            dr.scatter(out, here, start.ray)
+            dr.scatter(out, there, start.mirrored)
+        dr.eval(whole)
+        return Spots(rays, side, *whole)
+
+    def _alone(self, rays: Rays, side: NDArray[np.int64], centred: bool) -> Spots:
+        """`trace` of the one bundle of the only path without its light, recorded once and replayed: for some 10⁵
+        rays, telling drjit what to do takes as long as doing it."""
+        be = backend()
+        dr = be.dr
+        key = int(side[0]), centred
+        if key not in self._recorded:
+
+            def run(x: Any, y: Any, half_x: Any, half_y: Any, dx: Any, dy: Any, dz: Any) -> Any:
+                _, ix, iy, _ = lattice_places(side, side)
+                offset, spacing = (0.5, 2 / int(side[0])) if centred else (0.0, 2 / (int(side[0]) - 1))
+                count = dr.width(ix)
+                none, one = dr.zeros(be.Float, count), dr.full(be.Float, 1, count)
+                x = dr.fma(half_x, (be.Float(ix) + offset) * spacing - 1, x)
+                y = dr.fma(half_y, (be.Float(iy) + offset) * spacing - 1, y)
+                ray: tuple[Any, ...] = (x, y, none, dx + none, dy + none, dz + none, one, none)
+                for at in self._known:
+                    ray = self._meet(at, False, *ray, light=False)
+                x, y, z, dx, dy, dz, share, rim = ray
+                away = -(z + self._last_gap_mm) / dz
+                x, y = dr.fma(away, dx, x), dr.fma(away, dy, y)
+                found = dr.isfinite(x + y + rim) & (dr.abs(x) + dr.abs(y) < 1e9)
+                return (
+                    *(dr.select(found, v, 0) for v in (x, y, share)),
+                    dr.select(found, dr.sqrt(rim), -_LOST),
+                )
+
+            self._recorded[key] = dr.freeze(run)
+        given = [dr.opaque(be.Float, float(v)) for v in (*rays.box_mm[0], *rays.direction[0])]
+        told = self._recorded[key](*given)
+        dr.eval(told)
+        return Spots(rays, side, *told)
+
+    def _fetched(self, step: Any, edge: Any, wavelength: Any, shares: Any) -> Any:
+        """What a step of every lane's own path is made of, from the tables."""
+        be, t = backend(), self._tables
+        dr = be.dr
+        gap, curvature = _unpaired(t["place"], step)
+        eta, per_rim = _unpaired(t["bend"], wavelength + step)
+        sharpness, word = _unpaired(edge, step)
+        word = dr.reinterpret_array(be.UInt32, word)
+        row = dr.gather(be.UInt32, t["row"], step) if self._special else None
+
+        def passed(cosine: Any) -> Any:
+            at = cosine * (_COSINES - 1)
+            node = dr.minimum(be.UInt32(at), _COSINES - 2)
+            low, rise = _unpaired(t["share"], (word >> 1) + shares + node)
+            return dr.fma(at - be.Float(node), rise, low)
+
+        return SimpleNamespace(
+            gap=gap,
+            curvature=curvature,
+            eta=eta,
+            per_rim=per_rim,
+            sharpness=sharpness,
+            mirror=(word & 1) == 1,
+            onward=None,
+            stop=dr.gather(be.UInt32, t["stop"], step) == 1 if self._bladed else False,
+            conic=dr.gather(be.Float, t["conic"], row) if self._special else 1.0,
+            aspheric=[dr.gather(be.Float, a, row) for a in t["aspheric"]],
+            absorption=dr.gather(be.Float, t["absorption"], wavelength + step) if self._absorbs else None,
+            passed=passed,
+        )
+
+    @cached_property
+    def _known(self) -> list[Any]:
+        """What the steps of the only path are made of, as numbers."""
+        be, n = backend(), self._numbers
+        dr = be.dr
+        onward, out = 1.0, []
+        for step, row in enumerate(self.rows.tolist()):
+            word = int(self._look_up_word[step])
+
+            def passed(cosine: Any, word: int = word) -> Any:
+                at = cosine * (_COSINES - 1)
+                node = dr.minimum(be.UInt32(at), _COSINES - 2)
+                low, rise = _unpaired(self._tables["share"], (word >> 1) + node)
+                return dr.fma(at - be.Float(node), rise, low)
+
+            out.append(
+                SimpleNamespace(
+                    gap=float(n["gap"][step]),
+                    curvature=float(n["curvature"][step]),
+                    eta=float(n["eta"][0, step]),
+                    per_rim=float(n["per_rim"][step]),
+                    mirror=bool(word & 1),
+                    onward=onward,
+                    stop=row == self.lens.stop,
+                    conic=float(n["conic"][row]),
+                    aspheric=[float(a[row]) for a in n["aspheric"]],
+                    absorption=float(n["absorption"][0, step]) if self._absorbs else None,
+                    passed=passed,
+                )
+            )
+            onward = -onward if word & 1 else onward
+        return out
+
+    def _meet(
+        self,
+        at: Any,
+        soft: bool,
+        x: Any,
+        y: Any,
+        z: Any,
+        dx: Any,
+        dy: Any,
+        dz: Any,
+        share: Any,
+        *rims: Any,
+        light: bool = True,
+    ) -> tuple[Any, ...]:
+        """On to the next surface of the path, and off it: refracted or reflected. `rims` are the square of the
+        largest radius so far and, where edges are soft, the margin; those of the mirrored ray follow if they
+        differ."""
+        dr = backend().dr
+        c, eta, mirror = at.curvature, at.eta, at.mirror
+        sense = dr.copysign(1, dz) if at.onward is None else at.onward
+
+        def real(square: Any) -> Any:
+            # softly lost rays go on along the limit; others are nan from here
+            return dr.sqrt(dr.maximum(square, 0) if soft else square)
+
+        z = z + at.gap
+        if self._special:
+            # to the plane of the vertex, then to the surface
+            to_plane = -z / dz
+            x, y = dr.fma(to_plane, dx, x), dr.fma(to_plane, dy, y)
+            a = c * (dx * dx + dy * dy + at.conic * dz * dz)
+            b = c * (x * dx + y * dy) - dz
+            e = c * (x * x + y * y)
+            under = b * b - a * e
+            t_hit = e / (sense * real(under) - b)
+            x, y, z = dr.fma(t_hit, dx, x), dr.fma(t_hit, dy, y), t_hit * dz
+            length = t_hit + to_plane
+            nx, ny, nz = c * x, c * y, c * at.conic * z - 1
+            if at.aspheric:
+                x, y, z, nx, ny, nz, more = self._to_asphere(at, x, y, z, dx, dy, dz)
+                length = length + more
+            norm = dr.rsqrt(nx * nx + ny * ny + nz * nz)
+            along_normal = (nx * dx + ny * dy + nz * dz) * norm
+            # the normal towards where the ray comes from
+            facing = dr.select(along_normal > 0, -norm, norm)
+            cosine = dr.minimum(dr.abs(along_normal), 1)
+        else:
+            # a sphere: its normal has length 1, and the root is the angle's cosine
+            b = dr.fma(-c, dr.fma(x, dx, dr.fma(y, dy, z * dz)), dz)
+            e = dr.fma(c, dr.fma(x, x, dr.fma(y, y, z * z)), -2 * z)
+            under = dr.fma(b, b, -c * e)
+            cosine = real(under)
+            length = e / dr.fma(sense, cosine, b)
+            x, y, z = dr.fma(length, dx, x), dr.fma(length, dy, y), dr.fma(length, dz, z)
+            facing = sense
+        if light and at.absorption is not None:
+            share = share * dr.exp(-at.absorption * dr.abs(length))
+        # what the angle's cosine squared leaves on the other side
+        left = dr.fma(eta * eta, cosine * cosine, 1 - eta * eta)
+        out_cosine = real(left)
+        if light:
+            passed = at.passed(dr.clip(dr.select(eta > 1, out_cosine, cosine), 0, 1))
+            share = share * dr.select((left < 0) & mirror, 1, passed)
+        turn = facing * dr.select(mirror, 2 * cosine, dr.fma(eta, cosine, -out_cosine))
+        keep = dr.select(mirror, 1, eta)
+        onward = dr.select(mirror, -sense, sense)
+        if self._special:
+            dx, dy, dz = dr.fma(turn, nx, keep * dx), dr.fma(turn, ny, keep * dy), dr.fma(turn, nz, keep * dz)
+        else:
+            bend = turn * c
+            dx, dy, dz = dr.fma(bend, x, keep * dx), dr.fma(bend, y, keep * dy), dr.fma(keep, dz, -turn)
+            dz = dr.fma(bend, z, dz)
+        # lost too: a surface missed, light all reflected, a ray turned back; softly lost it goes on along the
+        # limit, so that between rays it is known where that began
+        room = ahead = dz * onward
+        if soft:
+            room = dr.minimum(dr.minimum(under, dr.select(mirror, 1, left)), 4 * ahead)
+            dz = onward * dr.maximum(ahead, _LEAST_SLOPE)
+        sides = 2 if len(rims) > 1 + soft else 1
+        out: list[Any] = []
+        for k in range(sides):
+            radius, *margin = rims[k * len(rims) // sides : (k + 1) * len(rims) // sides]
+            # the square of what lies beyond a rim grows by twice as much
+            beyond = dr.fma(x, x, y * y) * (at.per_rim * at.per_rim)
+            if self._bladed and at.stop is not False:
+                blade = self._within_blades(x, -y if k else y)
+                beyond = dr.select(at.stop, blade * blade, beyond)
+            out.append(dr.maximum(radius, dr.select(room < 0, 1e6, beyond)))
+            if soft:
+                here = dr.minimum((1 - beyond) * (0.5 * at.sharpness), room * _LIMIT_SHARPNESS)
+                # where a ray is lost it is off its way: what comes behind does not tell where the edge lies
+                out.append(dr.select(margin[0] < _BEYOND_EDGE, margin[0], dr.minimum(margin[0], here)))
+        return x, y, z, dx, dy, dz, share, *out
+
+    def _start(self, rays: Rays, across: NDArray[np.int64], centred: bool, even: bool) -> Any:
+        """Place, direction, route and wavelength of every ray on the device, of one side alone if both are even,
+        with its number and that of the ray on the other side."""
+        be = backend()
+        dr = be.dr
+        alone = len(rays) == 1
+        bundle, ix, iy, side = lattice_places(across, -(-across // 2) if even else across)
+        offset = dr.opaque(be.Float, 0.5 if centred else 0.0)
+        spacing = 2 / be.Float(side if centred else side - 1)
+
+        def given(values: F64) -> Any:
+            if alone:
+                return dr.opaque(be.Float, float(values[0]))
+            return dr.gather(be.Float, be.Float(np.ascontiguousarray(values, dtype=np.float32)), bundle)
+
+        def whole(values: NDArray[Any]) -> Any:
+            if alone:
+                return dr.opaque(be.UInt32, int(values[0]))
+            return dr.gather(be.UInt32, be.UInt32(np.ascontiguousarray(values, dtype=np.uint32)), bundle)
+
+        first = whole(np.cumsum(across**2) - across**2)
+        x, y, half_x, half_y = (given(c) for c in rays.box_mm.T)
+        dx, dy, dz = (given(c) for c in rays.direction.T)
+        u, v = (be.Float(ix) + offset) * spacing - 1, (be.Float(iy) + offset) * spacing - 1
+        if rays.disc is not None and not centred:
+            u, v = rounded(u, v, given(rays.disc))
+        return SimpleNamespace(
+            x=dr.fma(half_x, u, x),
+            y=dr.fma(half_y, v, y),
+            dx=dx,
+            dy=dy,
+            dz=dz,
+            route=whole(rays.route),
+            wavelength=whole(rays.wavelength),
+            ray=first + iy * side + ix,
+            mirrored=first + (side - 1 - iy) * side + ix,
+        )
+
+    def _within_blades(self, x: Any, y: Any) -> Any:
+        """Distance from the axis over that of the stop's rim in the same direction (`Surface.rim_mm`)."""
+        be, rim = backend(), self.lens.surfaces[self.lens.stop]
+        dr = be.dr
+        half = float(np.pi / rim.blades)
+        angle = (dr.atan2(y, x) - dr.opaque(be.Float, self._stop_turn_rad)) * (0.5 / half)
+        beside = (angle - dr.floor(angle)) * (2 * half) - half
+        edge = float(np.cos(half)) / dr.cos(beside)
+        return dr.sqrt(x * x + y * y) / (rim.semi_diameter_mm * (edge + (1 - edge) * rim.blade_rounding))
+
+    _stop_turn_rad = 0.0
+
+    def turned(self, azimuth_rad: float) -> Tracer:
+        """The same tracer for a Sun at an azimuth: rays are traced with the Sun at azimuth 0, and the stop's blades
+        turned back instead."""
+        other = copy.copy(self)
+        other._recorded = {}
+        rim = self.lens.surfaces[self.lens.stop]
+        other._stop_turn_rad = float(np.radians(rim.rotation_deg) - azimuth_rad)
+        return other
+
+    def _to_asphere(self, at: Any, x: Any, y: Any, z: Any, dx: Any, dy: Any, dz: Any) -> tuple[Any, ...]:
+        """From a conic to the asphere beside it, by Newton's method: place, normal, and how far it was."""
+        be = backend()
+        dr = be.dr
+        c, conic, terms = at.curvature, at.conic, at.aspheric
+        way = 0 * x
+        for k in range(5):
+            r2 = x * x + y * y
+            root = dr.sqrt(dr.maximum(1 - conic * c * c * r2, 1e-6))
+            sag, slope, power = c * r2 / (1 + root), c / root, r2
+            for n, term in enumerate(terms):
+                slope = slope + (2 * n + 4) * term * power
+                sag = sag + term * power * r2
+                power = power * r2
+            nx, ny = slope * x, slope * y
+            if k == 4:
+                return x, y, z, nx, ny, 0 * x - 1, way
+            step = (z - sag) / (nx * dx + ny * dy - dz)
+            x, y, z = dr.fma(step, dx, x), dr.fma(step, dy, y), dr.fma(step, dz, z)
+            way = way + step
+        raise AssertionError("unreachable")

@@ -1,0 +1,448 @@
+"""Ghosts of the Sun as an irradiance picture: by exact rays or to first order, per band, on its disc.
+
+A ghost is an image of the openings on its way. The Sun's disc and diffraction soften the edges of that image by
+known widths (the first-order shift over the disc's radius, and Fresnel's of a straight edge), which each rim has of
+its own. Where the Sun itself is nearly in focus, its disc is sampled instead.
+"""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...core.errors import InputError
+from ..prescription import Prescription
+from .bundles import Rays, Spots, Tracer, backend
+from .ghosts import Arrivals, boxes, named, told
+from .paraxial import Ghost, along, mean_ghost
+from .raster import LEVELS, PARTS, Canvas, Placement, Sums, edge_kind
+
+F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
+
+MODELS = ("traced", "paraxial")
+_ACROSS = 37  # rays across a ghost
+_UNEVEN = 0.3  # share of it that is magnified unevenly above which there are twice as many
+_ACROSS_FOCUSED = 25
+_SUBDIVISIONS = 8  # of the interval between two bands, where colours part
+_APART_PX = 2.0  # of a ghost's level: colours farther apart than this take more wavelengths
+_FOCUSED = 0.35  # width of an edge in radii of its rim above which the disc is sampled
+_DISC_RINGS = 3
+_LARGE_PX = 150.0  # radius of a rim's picture
+_PLAIN = 0.03  # edges of this contrast are drawn in full; of a quarter of it a level coarser, and so on
+_RAMP, _RAMP_PX = 7.0, 24.0  # how far from an edge, in its widths and in pixels at least, details are drawn
+_SPREAD = 0.25, 256.0  # bounds of how much larger than to first order pictures of rims are taken to be
+_SPREAD_SHARP = 4.0  # and for how sharp they are
+_LEAST = 1e-10  # irradiance over the Sun's below which a ghost is left out
+
+
+class FirstOrderTracer(Tracer):
+    """Rays by matrices instead of surfaces: Lee & Eisemann's model, in the same tables."""
+
+    def __init__(
+        self, lens: Prescription, wavelength_nm: F64, *, reflections: int = 2, routes_: Any = None
+    ) -> None:
+        super().__init__(lens, wavelength_nm, reflections=reflections, routes_=routes_)
+        be = backend()
+        found = [along(lens, path, self.wavelength_nm) for path in self._paths]
+        whole = np.stack([m for m, _ in found])  # route, wavelength
+        met = np.concatenate([m for _, m in found])  # step, wavelength
+        self._first_order = {
+            "whole": be.Float(whole[:, :, 0, :].transpose(1, 0, 2).astype(np.float32).ravel()),
+            "met": be.Float(met[:, :, 0, :].transpose(1, 0, 2).astype(np.float32).ravel()),
+        }
+
+    def _share_tables(self, share: F64) -> dict[str, Any]:
+        """As `Tracer` has them, and of every route at normal incidence."""
+        normal = share[:, :, :, -1].reshape(len(share), -1)[:, self._look_up]
+        routes_ = np.multiply.reduceat(normal, self.first_step[:-1], axis=1) if len(self.routes) else normal
+        return super()._share_tables(share) | {"shares": backend().Float(routes_.astype(np.float32).ravel())}
+
+    def trace(
+        self,
+        rays: Rays,
+        across: int | NDArray[np.int64],
+        width: F64 | None = None,
+        *,
+        centred: bool = False,
+        light: bool = True,
+        halved: bool = True,
+    ) -> Spots:
+        """As `Tracer.trace`, to first order; the Sun's slope is its tangent."""
+        be, t, f = backend(), self._tables, self._first_order
+        dr = be.dr
+        side = np.broadcast_to(np.asarray(across, dtype=np.int64), len(rays))
+        start = self._start(rays, side, centred, False)
+        per_width = be.Float((np.zeros(len(self.rows)) if width is None else 1 / width).astype(np.float32))
+        rim = self.lens.surfaces[self.lens.stop]
+        x, y = start.x, start.y
+        sx, sy = start.dx / start.dz, start.dy / start.dz
+        of = start.wavelength * dr.opaque(be.UInt32, len(self.routes)) + start.route
+        m00, m01 = (dr.gather(be.Float, f["whole"], 2 * of + k) for k in (0, 1))
+        steps = start.wavelength * dr.opaque(be.UInt32, len(self.rows))
+        end = dr.gather(be.UInt32, t["end"], start.route)
+
+        def on(step: Any, *_: Any) -> Any:
+            return step < end
+
+        def body(step: Any, radius: Any, margin: Any) -> Any:
+            a, b = (dr.gather(be.Float, f["met"], 2 * (steps + step) + k) for k in (0, 1))
+            hx, hy = dr.fma(a, x, b * sx), dr.fma(a, y, b * sy)
+            beyond = dr.sqrt(hx * hx + hy * hy) * dr.gather(be.Float, t["per_rim"], step)
+            if rim.blades:
+                blade = self._within_blades(hx, hy)
+                beyond = dr.select(dr.gather(be.UInt32, t["stop"], step) == 1, blade, beyond)
+            margin = dr.minimum(margin, (1 - beyond) * dr.gather(be.Float, per_width, step))
+            return step + 1, dr.maximum(radius, beyond), margin
+
+        count = dr.width(x)
+        first = (
+            dr.gather(be.UInt32, t["start"], start.route),
+            dr.zeros(be.Float, count),
+            dr.full(be.Float, 1e6, count),
+        )
+        _, radius, margin = dr.while_loop(first, on, body, mode="symbolic")
+        spots = Spots(
+            rays=rays,
+            across=side,
+            x_mm=dr.fma(m00, x, m01 * sx),
+            y_mm=dr.fma(m00, y, m01 * sy),
+            share=dr.select(radius >= 0, dr.gather(be.Float, t["shares"], of), 0),  # one a ray
+            radius=radius,
+            margin=margin,
+        )
+        dr.eval(spots.x_mm, spots.y_mm, spots.share, spots.radius, spots.margin)
+        return spots
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Detail:
+    """How finely routes are drawn: `Placement`'s columns by route, and the width of each step's rim's edge."""
+
+    level: NDArray[np.int64]
+    inner_level: NDArray[np.int64]
+    rough_level: NDArray[np.int64]
+    ramp: F64
+    kind: NDArray[np.int64]
+    width: F64
+    magnification: F64
+
+
+@dataclass(frozen=True, eq=False)
+class _Drawn:
+    """What is drawn: bundles, two bands of each with their weights, whether it is rough, and which part of it."""
+
+    source: NDArray[np.int64]
+    band: NDArray[np.int64]
+    weight: F64
+    rough: NDArray[np.bool_]
+    part: NDArray[np.int64]
+
+    def of(self, each: NDArray[np.int64]) -> _Drawn:
+        """The same of bundles that stand for others: `each` for which, in order."""
+        count = np.bincount(each)
+        first = np.cumsum(count) - count
+        many = count[self.source]
+        rows = np.repeat(np.arange(len(many)), many)
+        within = np.arange(len(rows)) - np.repeat(np.cumsum(many) - many, many)
+        source = first[self.source][rows] + within
+        return _Drawn(source, self.band[rows], self.weight[rows], self.rough[rows], self.part[rows])
+
+
+class FlareModel:
+    """Ghosts of one lens on one sensor, made once; `image` for every position of the Sun.
+
+    Parameters
+    ----------
+    lens
+        At its final size.
+    wavelength_nm
+        float64[band]: nodes of the bands; one node is one wavelength.
+    shape, pitch_mm
+        Pixels (height, width) of the sensor and their pitch.
+    sun_radius_rad
+        Of the Sun's disc; 0 is a point.
+    model
+        'traced' or 'paraxial'.
+    reflections
+        2, or 4 for ghosts of four reflections too.
+    diffraction
+        Whether edges ring as Fresnel's do.
+    across
+        Rays across a typical ghost either way: its light converges with them, to some 1 % with the default, ghosts
+        that are flung far apart to some 4 %.
+    """
+
+    def __init__(
+        self,
+        lens: Prescription,
+        wavelength_nm: F64,
+        *,
+        shape: tuple[int, int],
+        pitch_mm: float,
+        sun_radius_rad: float,
+        model: str = "traced",
+        reflections: int = 2,
+        diffraction: bool = True,
+        across: int = _ACROSS,
+    ) -> None:
+        if model not in MODELS:
+            raise InputError(f"model = {model!r}: must be one of {', '.join(MODELS)}")
+        self.lens = lens
+        self.nodes_nm = np.atleast_1d(np.asarray(wavelength_nm, dtype=np.float64))
+        self.canvas = Canvas(shape=shape, pitch_mm=pitch_mm, bands=len(self.nodes_nm))
+        self.sun_radius_rad = sun_radius_rad
+        kind = Tracer if model == "traced" else FirstOrderTracer
+        at = np.arange((len(self.nodes_nm) - 1) * _SUBDIVISIONS + 1) / _SUBDIVISIONS
+        self._fine = np.interp(at, np.arange(len(self.nodes_nm)), self.nodes_nm)
+        self._tracer = kind(lens, self._fine, reflections=reflections)
+        self._diffraction, self._across = diffraction, across
+        self._reach_mm = float(np.hypot(*shape) / 2 * pitch_mm)
+        self._soften()
+
+    def _soften(self) -> None:
+        """Widths of the rims' soft edges for every step, the level and the edge's kind of every route."""
+        t = self._tracer
+        counts = np.diff(t.first_step)
+        route = np.repeat(np.arange(len(t.routes)), counts)
+        whole, met = t.matrix[route], t.met
+        a, b = met[:, 0, 0], met[:, 0, 1]
+        a = np.where(np.abs(a) < 1e-9, 1e-9, a)
+        m00 = np.where(np.abs(whole[:, 0, 0]) < 1e-9, 1e-9, whole[:, 0, 0])
+        rim = t.rims_mm[t.rows]
+        # at one place of the sensor, how far the ray at this rim moves with the Sun
+        self._sun = self.sun_radius_rad * np.abs(b - a * whole[:, 0, 1] / m00) / rim
+        # phase over the rim's plane: π (Δy)² m / (λ B), Fresnel's variable is Δy √(2 m / (λ B))
+        onwards = np.einsum("kij,kjl->kil", whole, np.linalg.inv(met))
+        in_air = onwards[:, 0, 1] / t.medium_index
+        nm = float(np.median(self.nodes_nm))
+        fresnel = np.sqrt(nm * 1e-6 * np.abs(in_air * a / m00) / 2) / rim
+        self._fresnel = fresnel if self._diffraction else 0 * fresnel
+        self._px = rim * np.abs(m00 / a) / self.canvas.pitch_mm  # pixels a radius of the rim
+        disc = np.abs(rim / a)
+        bounds = zip(t.first_step[:-1], t.first_step[1:], strict=True)
+        self._least = np.array([first + int(np.argmin(disc[first:last])) for first, last in bounds], dtype=np.int64)
+        self._sampled = self._sun[self._least] > _FOCUSED
+        self._sun[self._sampled[route]] = 0
+        self._detail = self._details(np.zeros(len(t.routes), dtype=np.int64), np.ones(len(t.routes)))
+
+    def _details(self, coarser: NDArray[np.int64], spread: F64) -> _Detail:
+        """Levels and edges of every route, `coarser` by so many levels than its edges ask for; the picture of its
+        rim is larger by `spread` than to first order."""
+        t, least = self._tracer, self._least
+        route = np.repeat(np.arange(len(t.routes)), np.diff(t.first_step))
+        px = self._px * spread[route]
+        # parts of a picture are less spread than most of it, and as sharp as they are
+        sharp = np.minimum(spread, _SPREAD_SHARP)
+        blur_px = np.hypot(self._sun[least], self._fresnel[least]) * self._px[least] * sharp
+        # the disc's samples lie about a third of its radius apart
+        sun_px = self.sun_radius_rad * np.abs(t.matrix[:, 0, 1]) / self.canvas.pitch_mm
+        blur_px = np.where(self._sampled, 0.3 * sun_px, blur_px)
+
+        def level(px_: F64) -> NDArray[np.int64]:
+            return np.floor(np.log2(np.maximum(px_, 1.0))).astype(np.int64)
+
+        edge = np.minimum(level(blur_px / 1.5) + coarser, LEVELS - 1)
+        steady = np.hypot(self._sun, 0.5 * 2.0 ** edge[route] / px)
+        width = np.clip(np.hypot(steady, self._fresnel), 1e-4, 0.5)
+        one_px = width[least] * self._px[least] * sharp
+        ramp = np.maximum(_RAMP, _RAMP_PX * 2.0**coarser / one_px)
+        return _Detail(
+            level=edge,
+            # pixels a quarter of the ramp wide for what lies within
+            inner_level=np.clip(level(ramp * one_px / sharp / 4), edge, LEVELS - 1),
+            # a fold is as sharp as the Sun's disc, of twice the radius, lets it be; of a large ghost to two pixels
+            rough_level=np.minimum(
+                np.minimum(np.maximum(level(1.3 * sun_px), px[least] > _LARGE_PX), edge) + coarser, LEVELS - 1
+            ),
+            ramp=ramp,
+            kind=edge_kind(steady[least], self._fresnel[least]),
+            width=width,
+            magnification=np.abs(t.matrix[:, 0, 0]) * sharp,
+        )
+
+    def _spread(self, arrivals: Arrivals, route: NDArray[np.int64]) -> F64:
+        """How much larger than to first order the pictures of the rims are, float64[route]."""
+        out = np.ones(len(self._tracer.routes))
+        first = np.abs(self._tracer.matrix[route, 0, 0])
+        out[route] = np.clip(arrivals.magnification / np.maximum(first, 1e-9), *_SPREAD)
+        return out
+
+    def worn(self, coating_loss: float) -> FlareModel:
+        """The same model with a share of the coatings' area gone: mirrors reflect the mean of coated and bare."""
+        if not coating_loss:
+            return self
+        other = copy.copy(self)
+        other._tracer = self._tracer.worn(coating_loss)
+        return other
+
+    def image(self, sun_deg: float, azimuth_deg: float = 0.0, *, only: tuple[int, int] | None = None) -> F32:
+        """Ghosts of a Sun at an angle from the axis, towards an azimuth: its direct image lies at +f tan θ there
+        (azimuth 0: +x, right; 90°: +y, down). Returns irradiance over the Sun's own at the entrance,
+        float32[band, y, x]. `only` keeps one pair of reflecting rows.
+
+        Raises InputError for an angle of 90° or more.
+        """
+        if not 0 <= sun_deg < 90:
+            raise InputError(f"sun_deg = {sun_deg:g}: must be from 0 to below 90")
+        turn = float(np.radians(azimuth_deg))
+        made = self._tracer.turned(turn)
+        rays, arrivals = boxes(made, sun_deg, self._detail.width, self._reach_mm)
+        shown = self._in_frame(arrivals) & (arrivals.peak > _LEAST)
+        if only is not None:
+            shown &= named(made, rays, [only])
+        rays, arrivals = rays.take(shown), arrivals.take(shown)
+        detail = self._details(self._fainter(rays, arrivals), self._spread(arrivals, rays.route))
+        sums = Sums(self.canvas)
+        cosine = float(np.cos(np.radians(sun_deg)))
+        across = np.where(arrivals.uneven > _UNEVEN, 2 * self._across - 1, self._across)
+        sampled = self._sampled[rays.route]
+        for chosen in (~sampled, sampled):
+            if not chosen.any():
+                continue
+            each, bundles, drawn = self._coloured(rays.take(chosen), arrivals.take(chosen), detail)
+            strength, side = np.full(len(bundles), cosine), across[chosen][each]
+            if chosen is sampled:
+                each, bundles, strength = self._over_disc(bundles, sun_deg)
+                drawn, side = drawn.of(each), np.full(len(bundles), _ACROSS_FOCUSED)
+            spots = made.trace(bundles, side, detail.width)
+            sums.draw(spots, self._place(detail, bundles, drawn, strength), turn)
+        return sums.irradiance()
+
+    def ghosts(self, sun_deg: float, azimuth_deg: float = 0.0, *, across: int = 48) -> tuple[Ghost, ...]:
+        """The ghosts of a point Sun that reach the frame, the mean of all bands."""
+        turn = float(np.radians(azimuth_deg))
+        made = self._tracer.turned(turn)
+        rays, arrivals = boxes(made, sun_deg, self._detail.width, self._reach_mm)
+        rays = rays.take(self._in_frame(arrivals) & (arrivals.peak > _LEAST))
+        found: dict[tuple[int, ...], list[tuple[float, Ghost]]] = {}
+        for node in range(0, len(self._fine), _SUBDIVISIONS):
+            at = replace(rays, wavelength=np.full(len(rays), node))
+            for ghost in told(made, at, sun_deg, turn, across):
+                found.setdefault(ghost.pair, []).append((1 / len(self.nodes_nm), ghost))
+        return tuple(mean_ghost(rows) for _, rows in sorted(found.items()))
+
+    def _fainter(self, rays: Rays, arrivals: Arrivals) -> NDArray[np.int64]:
+        """Levels by which routes may be drawn coarser: their edges are too faint against the sum of all to show."""
+        height, width = (n / 2 * self.canvas.pitch_mm for n in self.canvas.shape)
+        frame = np.hypot(height, width)
+        across = np.clip(np.minimum(arrivals.most_mm, frame) - np.maximum(arrivals.least_mm, -frame), 0, None)
+        total = (arrivals.peak * np.minimum(across.prod(axis=1) / (4 * height * width), 1)).sum()
+        out = np.zeros(len(self._tracer.routes), dtype=np.int64)
+        faint = np.log(_PLAIN * total / np.maximum(arrivals.peak, 1e-300)) / np.log(4)
+        out[rays.route] = np.clip(np.ceil(faint), 0, 1)
+        return out
+
+    def _in_frame(self, arrivals: Arrivals) -> NDArray[np.bool_]:
+        beyond = np.maximum(np.maximum(arrivals.least_mm, -arrivals.most_mm), 0)
+        soft = 8 * 2.0**LEVELS * self.canvas.pitch_mm
+        return np.asarray(np.hypot(beyond[:, 0], beyond[:, 1]) < self._reach_mm + soft)
+
+    def _coloured(self, rays: Rays, arrivals: Arrivals, detail: _Detail) -> tuple[NDArray[np.int64], Rays, _Drawn]:
+        """One bundle a wavelength, more of them where the colours of a ghost part by more than a pixel: of which
+        ghost each is, the bundles, and from which of them each part of the light is drawn: what lies within is
+        smooth, and takes the bands' nodes alone."""
+        bands = len(self.nodes_nm)
+        apart = arrivals.move_mm / max(bands - 1, 1) / self.canvas.pitch_mm
+
+        def divided(level: NDArray[np.int64]) -> NDArray[np.int64]:
+            wanted = apart / 2.0 ** level[rays.route] / _APART_PX
+            return 2 ** np.clip(np.ceil(np.log2(np.maximum(wanted, 1))), 0, 3).astype(np.int64)
+
+        divisions = {"inner": np.ones(len(rays), dtype=np.int64), "edge": divided(detail.level)}
+        rough = arrivals.folded | (arrivals.uneven > 0)
+        divisions["rough"] = np.where(rough, divided(detail.rough_level), 0)
+        most = np.maximum.reduce(list(divisions.values()))
+        at = np.arange(len(self._fine))
+        taken = at[None, :] % (_SUBDIVISIONS // most)[:, None] == 0
+        which, wavelength = np.nonzero(taken)
+        bundles = replace(rays.take(which), wavelength=wavelength)
+        hats = np.maximum(1 - np.abs(at[:, None] / _SUBDIVISIONS - np.arange(bands)), 0)
+        first = np.minimum(at // _SUBDIVISIONS, bands - 1)
+        second = np.minimum(first + 1, bands - 1)
+        band = np.column_stack([first, second])
+        parts = []
+        for part, name in enumerate(PARTS):
+            divided_ = divisions[name]
+            step = _SUBDIVISIONS // np.maximum(divided_, 1)
+            source = np.flatnonzero((divided_ > 0)[which] & (wavelength % step[which] == 0))
+            # the hats of the wavelengths taken add up to one in every band
+            total = np.stack([hats[::n].sum(axis=0) for n in range(1, _SUBDIVISIONS + 1)])
+            rows = wavelength[source]
+            weight = np.take_along_axis(hats[rows] / total[step[which[source]] - 1], band[rows], axis=1)
+            weight[:, 1] *= band[rows, 1] > band[rows, 0]
+            of = np.full(len(source), part)
+            parts.append((source, band[rows], weight, rough[which[source]], of))
+        return which, bundles, _Drawn(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
+
+    def _over_disc(self, rays: Rays, sun_deg: float) -> tuple[NDArray[np.int64], Rays, F64]:
+        """The bundles from every sample of the Sun's disc: of which each is one, and its strength."""
+        samples = disc_samples(_DISC_RINGS) * self.sun_radius_rad
+        count = len(samples)
+        theta = np.radians(sun_deg) + samples[:, 0]
+        direction = np.column_stack([np.sin(theta), np.sin(samples[:, 1]), np.cos(theta)])
+        direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+        each = np.repeat(np.arange(len(rays)), count)
+        which = np.tile(np.arange(count), len(rays))
+        return each, replace(rays.take(each), direction=direction[which]), direction[which, 2] / count
+
+    def _place(self, detail: _Detail, bundles: Rays, drawn: _Drawn, strength: F64) -> Placement:
+        route = bundles.route[drawn.source]
+        levels = np.stack([detail.inner_level, detail.level, detail.rough_level])
+        return Placement(
+            source=drawn.source,
+            level=levels[drawn.part, route],
+            band=drawn.band,
+            weight=drawn.weight,
+            strength=strength[drawn.source],
+            kind=detail.kind[route],
+            ramp=detail.ramp[route],
+            rough=drawn.rough,
+            magnification=detail.magnification[route],
+            inner_level=detail.inner_level[route],
+            part=drawn.part,
+        )
+
+
+def disc_samples(rings: int) -> F64:
+    """Points of a unit disc, float64[n, 2], each for the same share of its area: one, and 6 k on ring k."""
+    points = [np.zeros((1, 2))]
+    total = 1 + 3 * rings * (rings + 1)
+    inner = 1
+    for k in range(1, rings + 1):
+        n = 6 * k
+        radius = np.sqrt((inner + n / 2) / total)
+        angle = 2 * np.pi * (np.arange(n) + 0.5 * (k % 2)) / n
+        points.append(radius * np.column_stack([np.cos(angle), np.sin(angle)]))
+        inner += n
+    return np.concatenate(points)
+
+
+@lru_cache(maxsize=4)
+def flare_model(
+    lens: Prescription,
+    nodes_nm: tuple[float, ...],
+    shape: tuple[int, int],
+    pitch_mm: float,
+    sun_radius_rad: float,
+    model: str,
+    reflections: int = 2,
+) -> FlareModel:
+    """A model, made once for what it depends on."""
+    return FlareModel(
+        lens,
+        np.array(nodes_nm),
+        shape=shape,
+        pitch_mm=pitch_mm,
+        sun_radius_rad=sun_radius_rad,
+        model=model,
+        reflections=reflections,
+    )
+
+
+__all__ = ["MODELS", "FlareModel", "disc_samples", "flare_model"]

@@ -1,0 +1,170 @@
+"""Ghosts to first order: every path of two reflections is one matrix (Lee & Eisemann 2013, CGF 32, 1).
+
+A ray of a ghost leaves the first vertex's plane at height r with the slope θ of the Sun, meets every surface of its
+path at A_k r + B_k θ, and the sensor at M₀₀ r + M₀₁ θ; slopes are unfolded, so heights keep their sign. The rays
+that pass all rims are those within discs of the entrance plane, and the ghost is their overlap, magnified.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..coating import mean_reflectance
+from ..gaussian import first_order
+from ..glass import D_NM
+from ..prescription import Prescription
+from ..rays import forward, ghost
+
+F64 = NDArray[np.float64]
+
+_GRID = 129  # points across the smallest disc
+
+
+@dataclass(frozen=True, kw_only=True)
+class Ghost:
+    """One ghost of a far point source.
+
+    Attributes
+    ----------
+    pair
+        The reflecting rows, the one nearer the front first.
+    flux_fraction
+        Flux on the unbounded sensor plane over source irradiance × cos(angle) × area of the paraxial entrance
+        pupil at the d line.
+    centroid_mm, rms_radius_mm
+        On the sensor, from the axis, and about the centroid.
+    peak_irradiance_fraction
+        Over the source's irradiance at the entrance.
+    """
+
+    pair: tuple[int, int]
+    flux_fraction: float
+    centroid_mm: tuple[float, float]
+    rms_radius_mm: float
+    peak_irradiance_fraction: float
+
+
+def mean_ghost(rows: Sequence[tuple[float, Ghost]]) -> Ghost:
+    """One ghost at several wavelengths, each with its share of the light that enters."""
+    share = np.array([weight for weight, _ in rows])
+    flux = share * [ghost.flux_fraction for _, ghost in rows]
+    place = np.array([ghost.centroid_mm for _, ghost in rows])
+    centre = flux @ place / flux.sum()
+    square = [g.rms_radius_mm**2 + float(((p - centre) ** 2).sum()) for (_, g), p in zip(rows, place, strict=True)]
+    return replace(
+        rows[0][1],
+        flux_fraction=float(flux.sum()),
+        centroid_mm=(float(centre[0]), float(centre[1])),
+        rms_radius_mm=float(np.sqrt(flux @ square / flux.sum())),
+        peak_irradiance_fraction=float(share @ [ghost.peak_irradiance_fraction for _, ghost in rows]),
+    )
+
+
+def mirrors(lens: Prescription) -> tuple[int, ...]:
+    """Rows that reflect: the stop does not, nor does a surface with the same medium on both sides."""
+    index = lens.indices()
+    return tuple(k for k in range(len(lens.surfaces)) if index[k] != index[k + 1])
+
+
+def pairs(lens: Prescription) -> tuple[tuple[int, int], ...]:
+    """Return all pairs of reflecting rows, n (n - 1) / 2 of them; a sensor that reflects is one behind the last."""
+    rows = (*mirrors(lens), *((len(lens.surfaces),) if lens.sensor_reflectance else ()))
+    return tuple(combinations(rows, 2))
+
+
+def along(lens: Prescription, path: Sequence[tuple[int, bool]], wavelength_nm: ArrayLike = D_NM) -> tuple[F64, F64]:
+    """The matrix from the first vertex's plane to the sensor, float64[..., 2, 2], and that to each surface met,
+    float64[step, ..., 2, 2]; ... is the shape of `wavelength_nm`. The sensor is the row behind the last."""
+    wavelength = np.asarray(wavelength_nm, dtype=np.float64)
+    index = np.stack([np.ones(wavelength.shape), *(s.medium.index(wavelength) for s in lens.surfaces)])
+    sensor_mm = first_order(lens).bfd_mm
+    vertex = np.append(lens.vertices_mm, lens.vertices_mm[-1] + sensor_mm)
+    height, slope = (np.broadcast_to(row, (*wavelength.shape, 2)).copy() for row in np.eye(2))
+    met, onward, before = [], True, 0
+    for row, mirror in path:
+        height = height + abs(vertex[row] - vertex[before]) * slope
+        met.append(np.stack([height, slope], axis=-2))
+        curvature = lens.surfaces[row].curvature_per_mm if row < len(lens.surfaces) else 0.0
+        sense = curvature if onward else -curvature
+        if mirror:
+            slope, onward = slope + 2 * sense * height, not onward
+        else:
+            into, out = (index[row], index[row + 1]) if onward else (index[row + 1], index[row])
+            slope = ((into - out) * sense / out)[..., None] * height + (into / out)[..., None] * slope
+        before = row
+    height = height + (vertex[-1] - vertex[before]) * slope
+    return np.stack([height, slope], axis=-2), np.stack(met)
+
+
+def transmittance(lens: Prescription, path: Sequence[tuple[int, bool]], wavelength_nm: float = D_NM) -> float:
+    """Share of the light that takes a path, at normal incidence on every surface."""
+    index = lens.indices(wavelength_nm)
+    share = 1.0
+    for row, mirror in path:
+        if row == len(lens.surfaces):
+            share *= lens.sensor_reflectance
+            continue
+        films = lens.surfaces[row].coating
+        reflected = float(mean_reflectance(films, index[row], index[row + 1], 1.0, wavelength_nm))
+        share *= reflected if mirror else 1 - reflected
+    return share
+
+
+def axial_transmittance(lens: Prescription, wavelength_nm: ArrayLike) -> F64:
+    """Return the fraction of the light along the axis that coatings and glass transmit, float64[band].
+
+    It multiplies the image of a scene and the direct image of the Sun alike. Reflected light is not in it: ghosts,
+    which are part of the reflected light, are therefore not taken from the direct image once more.
+    """
+    nodes = np.atleast_1d(np.asarray(wavelength_nm, dtype=np.float64))
+    path = forward(lens)
+    reflected = np.array([transmittance(lens, path, float(nm)) for nm in nodes])
+    glass = lens.surfaces[:-1]
+    depth = np.array([sum(s.thickness_mm * s.absorption_per_mm(float(nm)) for s in glass) for nm in nodes])
+    return np.asarray(reflected * np.exp(-depth))
+
+
+def paraxial_ghosts(
+    lens: Prescription, sun_deg: float, *, azimuth_deg: float = 0.0, wavelength_nm: float = D_NM
+) -> tuple[Ghost, ...]:
+    """Ghosts of a far point source at an angle from the axis, towards an azimuth (0: +x); those that no ray takes
+    are left out."""
+    turn = np.radians(azimuth_deg)
+    slope = np.tan(np.radians(sun_deg)) * np.array([np.cos(turn), np.sin(turn)])
+    pupil = np.pi / 4 * first_order(lens).entrance_pupil_diameter_mm ** 2
+    side = (np.arange(_GRID) + 0.5) / _GRID * 2 - 1
+    square = np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2)
+    found = []
+    for pair in pairs(lens):
+        path = ghost(lens, *pair)
+        matrix, met = along(lens, path, wavelength_nm)
+        # the sensor has no rim
+        radii = [*(s.semi_diameter_mm for s in lens.surfaces), np.inf]
+        rims = np.array([radii[row] for row, _ in path])
+        with np.errstate(divide="ignore"):
+            radius = rims / np.abs(met[:, 0, 0])
+        least = int(np.argmin(radius))
+        middle = -met[least, 0, 1] / met[least, 0, 0] * slope
+        places = middle + radius[least] * square
+        heights = met[:, 0, 0, None, None] * places + met[:, 0, 1, None, None] * slope
+        passing = places[(np.einsum("knc,knc->kn", heights, heights) <= rims[:, None] ** 2).all(axis=0)]
+        if not len(passing):
+            continue
+        on_sensor = matrix[0, 0] * passing + matrix[0, 1] * slope
+        centroid = on_sensor.mean(axis=0)
+        share = transmittance(lens, path, wavelength_nm)
+        found.append(
+            Ghost(
+                pair=pair,
+                flux_fraction=share * len(passing) * (2 * radius[least] / _GRID) ** 2 / pupil,
+                centroid_mm=(float(centroid[0]), float(centroid[1])),
+                rms_radius_mm=float(np.sqrt(np.mean(np.sum((on_sensor - centroid) ** 2, axis=1)))),
+                peak_irradiance_fraction=float(share * np.cos(np.radians(sun_deg)) / matrix[0, 0] ** 2),
+            )
+        )
+    return tuple(found)

@@ -1,0 +1,639 @@
+"""Bundles of rays on the sensor, as irradiance: grid cells drawn as quadrilaterals, at the resolution they need.
+
+The cells of a bundle's lattice tile its picture; folds overlap and add. Each cell is two triangles whose
+irradiance and rim margin are interpolated between corners, so that edges stay crisp between rays; cells smaller
+than half a pixel are splatted, and where light folds cells are drawn by points on a cubic surface. Pictures with
+soft edges go to coarser levels of a pyramid. Sums are of integers: the bits do not depend on the order in which
+threads add.
+"""
+
+from __future__ import annotations
+
+import itertools
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from .bundles import Spots, backend, lattice_places, rounded
+
+F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
+
+LEVELS = 6
+PARTS = ("inner", "edge", "rough")
+# of each part: the share of light with an edge's profile is a + b × calm, that without c × calm × rise
+_SHARES = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, -1.0], [1.0, -1.0, 0.0]])
+_MARGIN = 4  # pixels around each level, for what lies half outside
+_UNITS = 2.0**36  # of the integer sums, per unit of irradiance
+_MOST = 1e5  # irradiance that one ghost may add to a pixel: far beyond white
+_CALM_SIGMA = 0.8  # pixels of a coarser level by which it is smoothed
+_SMALL = 0.5  # cells below this many pixels are splatted
+EDGE_LOW, EDGE_HIGH = -1.0, 5.0  # of the soft edge's profile
+_EDGE_NODES = 2049
+_UNLIKE = 0.05  # ratio of neighbouring areas below which a fold is near
+_SMOOTH = 0.5  # change of irradiance over a pixel that still looks smooth
+_LANES = 16  # of a vector unit
+_NARROW_PX = 1.5
+_POINTS = 64  # along either side of a cell that is drawn by points
+_WANDER = 1.0  # sizes of a cell by which its points may lie beyond its corners
+_EDGE_KINDS = 9
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Canvas:
+    """A sensor of `shape` (height, width) pixels of `pitch_mm`, its middle on the axis, in `bands` bands."""
+
+    shape: tuple[int, int]
+    pitch_mm: float
+    bands: int
+
+    @property
+    def sizes(self) -> NDArray[np.int64]:
+        """Height and width of each level with its margins, int64[level, 2]."""
+        return np.array([[-(-n // 2**k) + 2 * _MARGIN for n in self.shape] for k in range(LEVELS)])
+
+    @property
+    def starts(self) -> NDArray[np.int64]:
+        """Where each level's bands begin, and the end."""
+        return np.concatenate([[0], np.cumsum(self.sizes.prod(axis=1) * self.bands)])
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Placement:
+    """Which bundles are drawn, and how.
+
+    `source`: which of the traced bundles. Of each its `level`; two bands with their weights, int64 and
+    float64[bundle, 2]; `strength`, irradiance for a share of 1 where nothing is magnified; the `kind` of its edges;
+    `ramp`, in widths of its edge; whether it is `rough`, folded or unevenly magnified; the
+    `magnification` of lengths that its levels are made for; and `inner_level`, that of the first of three parts of
+    the light that add up. `part`, an index of `PARTS`, says which: `inner` rises smoothly over the ramp from the
+    rims, `edge` is the rest, but near folds and where light is crowded all is `rough`.
+    """
+
+    source: NDArray[np.int64]
+    level: NDArray[np.int64]
+    band: NDArray[np.int64]
+    weight: F64
+    strength: F64
+    kind: NDArray[np.int64]
+    ramp: F64
+    rough: NDArray[np.bool_]
+    magnification: F64
+    inner_level: NDArray[np.int64]
+    part: NDArray[np.int64]
+
+
+@lru_cache(maxsize=1)
+def edge_profiles() -> F32:
+    """Light across a soft edge, float32[kind, node]: node from `EDGE_LOW` to `EDGE_HIGH` widths into the light.
+
+    The width is the root of the squares of the Sun's (its disc's radius) and of Fresnel's; kind k of 8 has their
+    ratio's arc tangent at k / 8 of 90°: 0 is the share of a uniform disc, 8 the pattern of a straight edge,
+    I = ((C + ½)² + (S + ½)²) / 2.
+    """
+    from scipy.special import fresnel
+
+    s = np.linspace(EDGE_LOW, EDGE_HIGH, _EDGE_NODES)
+    # points of the disc, by chords of equal weight
+    ring = np.cos(np.pi * (np.arange(512) + 0.5) / 512)
+    chord = np.sqrt(1 - ring**2)
+    weight = chord * np.sqrt(1 - ring**2)
+    weight /= weight.sum()
+    fade = np.clip((EDGE_HIGH - s) / (EDGE_HIGH - 3), 0, 1)
+    out = np.empty((_EDGE_KINDS, len(s)))
+    inside = np.clip(s, -1, 1)
+    out[0] = 0.5 + (inside * np.sqrt(1 - inside**2) + np.arcsin(inside)) / np.pi
+    for k in range(1, _EDGE_KINDS):
+        angle = k / (_EDGE_KINDS - 1) * np.pi / 2
+        v = (s[:, None] - np.cos(angle) * ring) / np.sin(angle)
+        sine, cosine = fresnel(v)
+        # the last rings fade: they are those that a band's width washes out
+        out[k] = 1 + ((((cosine + 0.5) ** 2 + (sine + 0.5) ** 2) / 2) @ weight - 1) * fade
+    out[:, 0], out[:, -1] = 0, 1  # beyond the table's ends
+    return out.astype(np.float32)
+
+
+def edge_kind(sun: F64, fresnel_: F64) -> NDArray[np.int64]:
+    """The profile for a ratio of widths."""
+    return np.rint(np.arctan2(fresnel_, sun) / (np.pi / 2) * (_EDGE_KINDS - 1)).astype(np.int64)
+
+
+class Sums:
+    """Integer sums of all levels and bands."""
+
+    def __init__(self, canvas: Canvas) -> None:
+        self.canvas = canvas
+        be = backend()
+        self._total = be.dr.zeros(be.UInt64, int(canvas.starts[-1]))
+
+    def draw(self, spots: Spots, placement: Placement, azimuth_rad: float) -> None:
+        """Add bundles of rays on lattices, turned by the Sun's azimuth."""
+        UInt32 = backend().UInt32
+        lattice = _Lattice(self.canvas, _Traced(spots), placement, azimuth_rad)
+        number, folds = (v.numpy() for v in lattice.cells().pixels())
+        order = _shared_out(number, np.flatnonzero(number))
+        if len(order):
+            self._fill(lattice.cells(UInt32(order)))
+        folded = np.flatnonzero(folds).astype(np.uint32)
+        if len(folded):
+            number = lattice.cells(UInt32(folded)).points().numpy()
+            order = folded[_shared_out(number, np.flatnonzero(number))]
+            if len(order):
+                self._splat(lattice.cells(UInt32(order)))
+
+    def _fill(self, cells: _Cells) -> None:
+        be = backend()
+        dr, Float, Int32, UInt32 = be.dr, be.Float, be.Int32, be.UInt32
+        ends = cells.ends()
+        densities, factors, offsets, _ = ends
+        first, last, _ = cells.rows(ends)
+        a, b, c, d = (
+            (x, y, density, margin, factor, offset)
+            for (x, y, _, margin), density, factor, offset in zip(
+                cells.corners, densities, factors, offsets, strict=True
+            )
+        )
+        triangles = (_Triangle(a, b, c), _Triangle(a, c, d))
+        profile = cells.profile()
+
+        def shade(margin: Any, factor: Any, offset: Any) -> Any:
+            return dr.fma(profile(margin), factor, offset)
+
+        margins = [corner[3] for corner in cells.corners]
+        splat = sum(corner[2] for corner in cells.corners) * 0.25 * cells.light
+        splat = splat * shade(*(sum(four) * 0.25 for four in (margins, factors, offsets)))
+        add, width, small = self._adder(cells), UInt32(cells.width), cells.small
+
+        def more(_x: Any, y: Any, _end: Any) -> Any:
+            return y <= last
+
+        def pixel(x: Any, y: Any, end: Any) -> Any:
+            here = x <= end
+            found = [Float(0), Float(EDGE_LOW), Float(0), Float(0)]
+            for triangle in triangles:
+                inside, *values = triangle.at(x + 0.5, y + 0.5)
+                found = [dr.select(inside, new, old) for new, old in zip(values, found, strict=True)]
+            tent = dr.maximum(1 - dr.abs(x + 0.5 - cells.middle[0]), 0)
+            tent = tent * dr.maximum(1 - dr.abs(y + 0.5 - cells.middle[1]), 0)
+            value = dr.select(small, tent * splat, found[0] * shade(*found[1:]))
+            at, shown = UInt32(Int32(y)) * width + UInt32(Int32(x)), here & (value != 0)
+            add(value, at, shown)
+            down = x >= end
+            y = dr.select(down, y + 1, y)
+            low, high = cells.columns(y)
+            return dr.select(down, low, x + 1), y, dr.select(down, high, end)
+
+        low, high = cells.columns(first)
+        dr.while_loop((low, first, high), more, pixel, mode="symbolic")
+        dr.eval(self._total)
+
+    def _splat(self, cells: _Cells) -> None:
+        """Points of a cell, closer than pixels: where light folds its surface is not that of its corners."""
+        be = backend()
+        dr, Float, Int32, UInt32 = be.dr, be.Float, be.Int32, be.UInt32
+        across, down = cells.points_along()
+        number, columns = UInt32(across * down), UInt32(across)
+        profile, add, width = cells.profile(), self._adder(cells), UInt32(cells.width)
+        _, factors, _, _ = cells.ends()
+        light = cells.light / (across * down)
+        (xa, ya, sa, ma), (xb, yb, sb, mb), (xc, yc, sc, mc), (xd, yd, sd, md) = cells.corners
+        fa, fb, fc, fd = factors
+        bends = cells.bends()
+
+        def on(point: Any) -> Any:
+            return point < number
+
+        def one(point: Any) -> Any:
+            row = UInt32((Float(point) + 0.5) / across)
+            u, v = (Float(point - row * columns) + 0.5) / across, (Float(row) + 0.5) / down
+
+            def between(a: Any, b: Any, c: Any, d: Any) -> Any:
+                return dr.lerp(dr.lerp(a, b, u), dr.lerp(d, c, u), v)
+
+            # Lagrange's cubic along either side
+            along = [u * (1 - u) * (-1 / 6) * k for k in (2 - u, 1 + u)]
+            aside = [v * (1 - v) * (-1 / 6) * k for k in (2 - v, 1 + v)]
+            place = []
+            for corners, (bent_u, bent_v) in zip(((xa, xb, xc, xd), (ya, yb, yc, yd)), bends, strict=True):
+                a, b, c, d = bent_u
+                bow = dr.fma(along[0], dr.lerp(a, d, v), along[1] * dr.lerp(b, c, v))
+                a, b, c, d = bent_v
+                bow = bow + dr.fma(aside[0], dr.lerp(a, b, u), aside[1] * dr.lerp(d, c, u))
+                place.append(between(*corners) + bow - 0.5)
+            value = light * between(sa, sb, sc, sd) * between(fa, fb, fc, fd) * profile(between(ma, mb, mc, md))
+            x, y = (dr.clip(p, -10, 1e5) for p in place)
+            left, top = dr.floor(x), dr.floor(y)
+            right_share, low_share = x - left, y - top
+            for dx, dy in _CORNERS:
+                share = (right_share if dx else 1 - right_share) * (low_share if dy else 1 - low_share)
+                px, py = left + dx, top + dy
+                inside = (px >= 0) & (py >= 0) & (px < cells.width) & (py < cells.height) & (value != 0)
+                add(value * share, UInt32(Int32(py)) * width + UInt32(Int32(px)), inside)
+            return (point + 1,)
+
+        dr.while_loop((dr.zeros(UInt32, dr.width(number)),), on, one, mode="symbolic")
+        dr.eval(self._total)
+
+    def _adder(self, cells: _Cells) -> Any:
+        """Adds irradiance to a pixel of the level of a cell's bundle, in its bands."""
+        be = backend()
+        dr, lattice, placement, total = be.dr, cells.lattice, cells.lattice.placement, self._total
+        bands = [
+            (
+                cells.given(lattice.start + placement.band[:, k] * lattice.size, be.UInt32),
+                cells.given(placement.weight[:, k] * _UNITS),
+            )
+            for k in (0, 1)
+            if (placement.weight[:, k] > 0).any()
+        ]
+
+        def add(value: Any, at: Any, shown: Any) -> None:
+            for start, share in bands:
+                # negative numbers wrap around, and back when read
+                units = be.UInt64(be.Int64(dr.round(dr.clip(value, -_MOST, _MOST) * share)))
+                dr.scatter_add(total, units, start + at, shown & (share > 0), mode=dr.ReduceMode.Auto)
+
+        return add
+
+    def irradiance(self) -> F32:
+        """float32[band, y, x]: the levels laid over one another."""
+        canvas, total = self.canvas, self._total.numpy().view(np.int64)
+        out = np.empty((canvas.bands, *canvas.shape), dtype=np.float32)
+
+        def one(band: int) -> None:
+            below: F32 | None = None
+            for level in range(LEVELS - 1, -1, -1):
+                height, width = (int(v) for v in canvas.sizes[level])
+                first = canvas.starts[level] + band * height * width
+                part = total[first : first + height * width].reshape(height, width)
+                here = np.multiply(part, 1 / _UNITS, dtype=np.float32)
+                if below is not None:
+                    # folds end in steps, which a lattice of pixel centres samples unevenly
+                    calm = cv2.GaussianBlur(below, (3, 3), _CALM_SIGMA)
+                    bigger = cv2.resize(calm, None, fx=2, fy=2, interpolation=cv2.INTER_LINEAR)
+                    # a level's pixel 0 covers the pixels -M·2 + M and the next one of the finer level
+                    here += bigger[_MARGIN : _MARGIN + height, _MARGIN : _MARGIN + width]
+                below = here
+            assert below is not None
+            rows, columns = (slice(_MARGIN, _MARGIN + n) for n in canvas.shape)
+            # the parts that add up meet on lattices of their own: where little is left of much it may be below
+            # nothing
+            np.maximum(below[rows, columns], 0, out=out[band])
+
+        # numpy and OpenCV let go of the interpreter
+        with ThreadPoolExecutor(backend().dr.thread_count()) as pool:
+            list(pool.map(one, range(canvas.bands)))
+        return out
+
+
+def _shared_out(work: NDArray[np.uint32], chosen: NDArray[np.int64]) -> NDArray[np.uint32]:
+    """Some lanes in order: those with as much work side by side, for neighbours in the vector unit wait for one
+    another; groups of them such that every thread gets its share of the large ones."""
+    size = np.minimum(work[chosen], 65535).astype(np.uint16)
+    order = chosen[np.argsort(size, kind="stable")].astype(np.uint32)
+    groups = len(order) // _LANES
+    golden = np.argsort(np.arange(groups) * ((np.sqrt(5) - 1) / 2) % 1)
+    rest = order[groups * _LANES :]
+    return np.concatenate([order[: groups * _LANES].reshape(groups, _LANES)[golden].ravel(), rest])
+
+
+class _Triangle:
+    """A triangle with values at its corners, each of which is (x, y, *values)."""
+
+    def __init__(self, *corners: tuple[Any, ...]) -> None:
+        dr = backend().dr
+        self._corners = corners
+        a, b, c = corners
+        twice = (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
+        self._sign = dr.select(twice >= 0, 1.0, -1.0)
+        self._per_area = dr.rcp(dr.maximum(dr.abs(twice), 1e-12))
+        self._edges = tuple(_edge(p, q) for p, q in ((b, c), (c, a), (a, b)))
+
+    def at(self, x: Any, y: Any) -> tuple[Any, ...]:
+        """Whether a point lies inside, and the values there."""
+        dr = backend().dr
+        inside, values = None, [0.0] * (len(self._corners[0]) - 2)
+        for (ox, oy, ux, uy, flip), corner in zip(self._edges, self._corners, strict=True):
+            share = (ux * (y - oy) - uy * (x - ox)) * (flip * self._sign)
+            # a point on an edge belongs to the side that the edge, always read the same way, has on its left
+            here = (share > 0) | ((share == 0) & (flip * self._sign > 0))
+            inside = here if inside is None else inside & here
+            # of a sliver's area little but rounding may be left
+            weight = dr.clip(share * self._per_area, 0, 1)
+            values = [dr.fma(weight, more, value) for value, more in zip(values, corner[2:], strict=True)]
+        return inside, *values
+
+
+def _edge(p: tuple[Any, ...], q: tuple[Any, ...]) -> tuple[Any, ...]:
+    """An edge read from its lesser end, so that two triangles judge it by the same numbers; the sign for p → q."""
+    dr = backend().dr
+    ordered = (p[0] < q[0]) | ((p[0] == q[0]) & (p[1] < q[1]))
+    ox, oy = dr.select(ordered, p[0], q[0]), dr.select(ordered, p[1], q[1])
+    ex, ey = dr.select(ordered, q[0], p[0]), dr.select(ordered, q[1], p[1])
+    return ox, oy, ex - ox, ey - oy, dr.select(ordered, 1.0, -1.0)
+
+
+_CORNERS = ((0, 0), (1, 0), (1, 1), (0, 1))
+_NO_AREA = 3e38
+_WHOLE = -1e5  # margins below are those of lost rays
+_OUTWARDS = ((-1, -1), (1, -1), (1, 1), (-1, 1))
+
+
+class _Traced:
+    """Lattices of rays on the sensor, whatever is drawn of them: how cells are magnified, and how they bend."""
+
+    def __init__(self, spots: Spots) -> None:
+        be = backend()
+        self.spots, self.across = spots, spots.across
+        rays, cells = self.across**2, (self.across - 1) ** 2
+        self.first_ray, self.first_cell = np.cumsum(rays) - rays, np.cumsum(cells) - cells
+        self._first_ray = be.UInt32(self.first_ray.astype(np.uint32))
+        # of the mean cell
+        self.entrance_mm2 = 4 * spots.rays.box_mm[:, 2:].prod(axis=1) / (self.across - 1) ** 2
+        self.magnified = self._magnified()
+
+    def entrance(self, bundle: Any, ix: Any, iy: Any, side: Any) -> Any:
+        """Area of cells at the entrance over that of a rectangular lattice's."""
+        be = backend()
+        dr, disc = be.dr, self.spots.rays.disc
+        if disc is None:
+            return dr.full(be.Float, 1, dr.width(ix))
+        of = dr.gather(be.Float, be.Float(disc.astype(np.float32)), bundle)
+        step = 2 / be.Float(side)
+        at = [rounded((be.Float(ix) + dx) * step - 1, (be.Float(iy) + dy) * step - 1, of) for dx, dy in _CORNERS]
+        return _area(*at) / (step * step)
+
+    def _magnified(self) -> Any:
+        """Signed area of every cell on the sensor over that at the entrance, `_NO_AREA` where a ray was lost."""
+        be = backend()
+        dr, spots = be.dr, self.spots
+        bundle, ix, iy, side = lattice_places(self.across - 1, self.across - 1)
+        first = dr.gather(be.UInt32, self._first_ray, bundle) + iy * (side + 1) + ix
+        at = [first + dx + dy * (side + 1) for dx, dy in _CORNERS]
+        x, y, margins = ([dr.gather(be.Float, v, k) for k in at] for v in (spots.x_mm, spots.y_mm, spots.margin))
+        mean = dr.gather(be.Float, be.Float(self.entrance_mm2.astype(np.float32)), bundle)
+        area = _area(*zip(x, y, strict=True)) / (mean * dr.maximum(self.entrance(bundle, ix, iy, side), 1e-6))
+        out = dr.select(_least(*margins) > _WHOLE, area, _NO_AREA)
+        dr.eval(out)
+        return out
+
+    @cached_property
+    def bends_mm(self) -> tuple[tuple[Any, Any], tuple[Any, Any]]:
+        """Second differences at every ray: of x along rows and columns, and of y; 0 beside a lattice's end or a ray
+        that was lost."""
+        be = backend()
+        dr, spots = be.dr, self.spots
+        _, ix, iy, side = lattice_places(self.across, self.across)
+        here = dr.arange(be.UInt32, int((self.across**2).sum()))
+        found: list[list[Any]] = [[], []]
+        for at, step in ((ix, be.UInt32(1)), (iy, side)):
+            inside = (at > 0) & (at < side - 1)
+            before, behind = (dr.select(inside, k, here) for k in (here - step, here + step))
+            kept = [dr.gather(be.Float, spots.margin, k) > _WHOLE for k in (before, here, behind)]
+            for of, values in zip(found, (spots.x_mm, spots.y_mm), strict=True):
+                one, two, three = (dr.gather(be.Float, values, k) for k in (before, here, behind))
+                of.append(dr.select(inside & kept[0] & kept[1] & kept[2], one - 2 * two + three, 0))
+        dr.eval(found)
+        return (found[0][0], found[0][1]), (found[1][0], found[1][1])
+
+
+class _Lattice:
+    """The cells of bundles that are drawn, in pixels of their level."""
+
+    def __init__(self, canvas: Canvas, traced: _Traced, placement: Placement, azimuth_rad: float) -> None:
+        self.traced, self.spots, self.placement = traced, traced.spots, placement
+        self.turn = np.cos(azimuth_rad), np.sin(azimuth_rad)
+        step = 2.0**placement.level
+        self.per_mm = 1 / (canvas.pitch_mm * step)
+        self.middle = [n / 2 / step + _MARGIN for n in canvas.shape[::-1]]
+        self.sides = canvas.sizes[placement.level]
+        self.size = self.sides.prod(axis=1)
+        self.start = canvas.starts[placement.level]
+        self.across, self.first_ray, self.first_cell = (
+            v[placement.source] for v in (traced.across, traced.first_ray, traced.first_cell)
+        )
+        # light of a mean cell for a share of 1, in irradiance times pixels of the level
+        self.entrance_mm2 = traced.entrance_mm2[placement.source]
+        self.light = self.entrance_mm2 * placement.strength * self.per_mm**2
+        self.places = lattice_places(self.across - 1, self.across - 1)
+
+    def cells(self, index: Any = None) -> _Cells:
+        """All cells, or some."""
+        return _Cells(self, index)
+
+
+class _Cells:
+    """Some cells, one a lane: corners (x, y, share, margin), area, and what their bundle says of them."""
+
+    def __init__(self, lattice: _Lattice, index: Any) -> None:
+        be = backend()
+        dr, Float, UInt32 = be.dr, be.Float, be.UInt32
+        self.lattice = lattice
+        places = lattice.places
+        if index is not None:
+            dr.eval(*places)
+            places = tuple(dr.gather(UInt32, v, index) if dr.width(v) > 1 else v for v in places)
+        self.bundle, self.ix, self.iy, self.side = places
+        across = self.side + 1
+        first = self.given(lattice.first_ray, UInt32) + self.iy * across + self.ix
+        self.rays = [first + dx + (across if dy else 0) for dx, dy in _CORNERS]
+        self.first_cell = self.given(lattice.first_cell, UInt32)
+        cos, sin = (dr.opaque(Float, v) for v in lattice.turn)
+        scale = self.scale = self.given(lattice.per_mm)
+        middle_x, middle_y = (self.given(v) for v in lattice.middle)
+        source = self.given(lattice.placement.source, UInt32)
+        self.light = self.given(lattice.light) * lattice.traced.entrance(source, self.ix, self.iy, self.side)
+        self.height, self.width = (self.given(lattice.sides[:, k]) for k in (0, 1))
+        spots = lattice.spots
+        x, y, share, margin = (
+            [dr.gather(Float, v, at) for at in self.rays]
+            for v in (spots.x_mm, spots.y_mm, spots.share, spots.margin)
+        )
+        self.valid = _least(*margin) > _WHOLE
+        x, y = (
+            [dr.fma(a * cos - b * sin, scale, middle_x) for a, b in zip(x, y, strict=True)],
+            [dr.fma(a * sin + b * cos, scale, middle_y) for a, b in zip(x, y, strict=True)],
+        )
+        self.corners = list(zip(x, y, share, margin, strict=True))
+        (xa, xb, xc, xd), (ya, yb, yc, yd) = x, y
+        self.area = dr.abs(_area(*zip(x, y, strict=True)))
+        self.own = dr.gather(Float, lattice.traced.magnified, self.first_cell + self.iy * self.side + self.ix)
+        self.low = _least(xa, xb, xc, xd), _least(ya, yb, yc, yd)
+        self.high = _most(xa, xb, xc, xd), _most(ya, yb, yc, yd)
+        self.small = dr.maximum(self.high[0] - self.low[0], self.high[1] - self.low[1]) < _SMALL
+        self.middle = (xa + xb + xc + xd) * 0.25, (ya + yb + yc + yd) * 0.25
+
+    def given(self, values: Any, kind: Any = None) -> Any:
+        """What each cell's bundle has."""
+        be = backend()
+        kind = be.Float if kind is None else kind
+        dtype = np.float32 if kind is be.Float else np.uint32
+        return be.dr.gather(kind, kind(np.ascontiguousarray(values, dtype=dtype)), self.bundle)
+
+    def pixels(self) -> tuple[Any, Any]:
+        """About how many pixels a cell covers, 0 where it has no part in what is drawn or is drawn by points; and
+        whether it is."""
+        dr, ends = backend().dr, self.ends()
+        number, folds = self.rows(ends)[2], ends[3] & self.valid
+        dr.eval(number, folds)
+        return number, folds
+
+    def points(self) -> Any:
+        """By how many points a cell is drawn, 0 where it has no part in what is drawn."""
+        be = backend()
+        dr = be.dr
+        across, down = self.points_along()
+        _, factors, _, folds = self.ends()
+        far = _WANDER * (self.high[0] - self.low[0] + self.high[1] - self.low[1]) + 2
+        near = (self.high[0] > -far) & (self.low[0] < self.width + far)
+        near &= (self.high[1] > -far) & (self.low[1] < self.height + far)
+        lit = self.valid & folds & (_most(*factors) > 0) & (_most(*(c[3] for c in self.corners)) > EDGE_LOW)
+        return be.UInt32(dr.select(lit & near, across * down, 0))
+
+    def points_along(self) -> tuple[Any, Any]:
+        """Points along either side that are no farther apart than pixels."""
+        dr = backend().dr
+        a, b, c, d = self.corners
+        (xu, xv), (yu, yv) = self.bends()
+        out = []
+        for sides, bends in ((((a, b), (d, c)), (xu, yu)), (((a, d), (b, c)), (xv, yv))):
+            longest = _most(*(dr.abs(q[k] - p[k]) for p, q in sides for k in (0, 1)))
+            # a bow of second difference s adds s / 2 to the steps at its ends
+            bow = dr.maximum(*(_most(*(dr.abs(s) for s in bent)) for bent in bends))
+            out.append(dr.clip(dr.ceil(longest + 0.5 * bow), 1, _POINTS))
+        return out[0], out[1]
+
+    def bends(self) -> tuple[tuple[list[Any], list[Any]], tuple[list[Any], list[Any]]]:
+        """Second differences of x and of y along rows and along columns at the corners, pixels."""
+        be = backend()
+        dr = be.dr
+        (xu, xv), (yu, yv) = (
+            [[dr.gather(be.Float, v, at) for at in self.rays] for v in pair]
+            for pair in self.lattice.traced.bends_mm
+        )
+        cos, sin = (dr.opaque(be.Float, v) * self.scale for v in self.lattice.turn)
+        x_bends = tuple([x * cos - y * sin for x, y in zip(*of, strict=True)] for of in ((xu, yu), (xv, yv)))
+        y_bends = tuple([x * sin + y * cos for x, y in zip(*of, strict=True)] for of in ((xu, yu), (xv, yv)))
+        return x_bends, y_bends  # type: ignore[return-value]
+
+    def profile(self) -> Any:
+        """Light across a soft edge of the cell's bundle, as a function of the margin."""
+        be = backend()
+        dr = be.dr
+        table = be.Float(edge_profiles().ravel())
+        edge = self.given(self.lattice.placement.kind * _EDGE_NODES, be.UInt32)
+        nodes = (_EDGE_NODES - 1) / (EDGE_HIGH - EDGE_LOW)
+
+        def at(margin: Any) -> Any:
+            node = be.UInt32(dr.clip(dr.fma(margin, nodes, 0.5 - EDGE_LOW * nodes), 0, _EDGE_NODES - 1))
+            return dr.gather(be.Float, table, edge + node)
+
+        return at
+
+    def rows(self, ends: tuple[Any, ...]) -> tuple[Any, Any, Any]:
+        """First and last row of pixels whose centres may lie in a cell, and about how many pixels; no row where a
+        cell has no part in the light that is drawn, or folds."""
+        _, factors, offsets, folds = ends
+        be = backend()
+        dr = be.dr
+        margins = [corner[3] for corner in self.corners]
+        # beyond an edge's ringing its profile is 1, and what factor and offset add to is all there is
+        plain = _least(*margins) > EDGE_HIGH
+        drawn = [
+            dr.select(plain, dr.abs(factor + offset), dr.maximum(dr.abs(factor), dr.abs(offset)))
+            for factor, offset in zip(factors, offsets, strict=True)
+        ]
+        lit = self.valid & ~folds & (_most(*drawn) > 0) & (_most(*margins) > EDGE_LOW)
+        lit &= (self.high[0] > 0) & (self.low[0] < self.width)
+        start = dr.select(self.small, dr.floor(self.middle[1] - 0.5), dr.ceil(self.low[1] - 0.5))
+        last = dr.select(self.small, start + 1, dr.floor(self.high[1] - 0.5))
+        start, last = dr.maximum(start, 0), dr.minimum(last, self.height - 1)
+        lit &= last >= start
+        wide = dr.minimum(self.high[0], self.width) - dr.maximum(self.low[0], 0)
+        about = (last - start + 1) * (1 + dr.minimum(wide, self.area / (self.high[1] - self.low[1] + 1)))
+        return start, dr.select(lit, last, -1), be.UInt32(dr.select(lit, dr.minimum(about, 60000), 0))
+
+    def columns(self, row: Any) -> tuple[Any, Any]:
+        """First and last column whose pixel centres may lie in a cell, in a row of pixels."""
+        dr = backend().dr
+        y = row + 0.5
+        low, high = 1e9, -1e9
+        for (px, py, *_), (qx, qy, *_) in itertools.pairwise((*self.corners, self.corners[0])):
+            crossed = (dr.minimum(py, qy) <= y) & (dr.maximum(py, qy) >= y)
+            x = dr.fma((y - py) / dr.select(py == qy, 1, qy - py), qx - px, px)
+            low, high = dr.minimum(low, dr.select(crossed, x, 1e9)), dr.maximum(high, dr.select(crossed, x, -1e9))
+        start = dr.select(self.small, dr.floor(self.middle[0] - 0.5), dr.ceil(low - 0.501))
+        last = dr.select(self.small, start + 1, dr.floor(high - 0.499))
+        return dr.maximum(start, 0), dr.minimum(last, self.width - 1)
+
+    def ends(self) -> tuple[list[Any], list[Any], list[Any], Any]:
+        """At the four corners irradiance without edges, and how much of the part drawn is light with an edge's
+        profile (factor) and without (offset); and whether a rough cell folds, and should be drawn by points."""
+        dr, placement = backend().dr, self.lattice.placement
+        per_ramp, even = self.given(1 / placement.ramp), self.given(~placement.rough)
+        # how unlike cells of the usual width may be, times their width, to look smooth in pixels of the first part
+        inner_mm = 2.0 ** (placement.inner_level - placement.level) / self.lattice.per_mm
+        usual = np.maximum(placement.magnification, 1e-6)
+        coarse = self.given(inner_mm * usual / np.sqrt(self.lattice.entrance_mm2) / _SMOOTH)
+        per_usual, strength = self.given(1 / usual**2), self.given(placement.strength)
+        rest, with_calm, with_rise = (self.given(column) for column in _SHARES[placement.part].T)
+        densities, factors, offsets, leasts = [], [], [], []
+        for corner, (sx, sy) in zip(self.corners, _OUTWARDS, strict=True):
+            mean, least, most = self._around(sx, sy)
+            densities.append(corner[2] * strength / dr.maximum(mean, 1e-9))
+            # calm: areas of one sign, alike over a pixel, and magnified half as much as is usual or more
+            ratio = least / dr.maximum(most, 1e-18)
+            calm = dr.minimum(2 - (1 - ratio) * coarse / dr.maximum(least, 1e-18), ratio / _UNLIKE)
+            calm = dr.clip(dr.minimum(calm, 4 * dr.sqrt(mean * per_usual) - 1), even, 1)
+            rise = dr.clip(corner[3] * per_ramp, 0, 1)
+            rise = rise * rise * (3 - 2 * rise)
+            factors.append(dr.fma(with_calm, calm, rest))
+            offsets.append(with_rise * calm * rise)
+            leasts.append(least)
+        size = dr.maximum(self.high[0] - self.low[0], self.high[1] - self.low[1])
+        # so should narrow cells, whose edges fall anyhow between pixels
+        narrow = self.area < _NARROW_PX * size
+        folds = (rest > 0) & (size < _POINTS) & ((_least(*leasts) < 0) | narrow)
+        return densities, factors, offsets, folds
+
+    def _around(self, sx: int, sy: int) -> tuple[Any, Any, Any]:
+        """Mean size of the magnifications of area of the cells that meet in a corner, and the least and the largest
+        of them, counted positive where they have this cell's sign."""
+        be = backend()
+        dr, Int32, UInt32 = be.dr, be.Int32, be.UInt32
+        own = dr.select(self.valid, self.own, 0)
+        sign = dr.select(own < 0, -1.0, 1.0)
+        total, number, side = dr.abs(own), be.Float(1), Int32(self.side)
+        least, most = dr.abs(own), dr.abs(own)
+        for dx, dy in ((sx, 0), (0, sy), (sx, sy)):
+            jx, jy = Int32(self.ix) + dx, Int32(self.iy) + dy
+            inside = (jx >= 0) & (jy >= 0) & (jx < side) & (jy < side)
+            near = dr.gather(
+                be.Float, self.lattice.traced.magnified, self.first_cell + UInt32(jy * side + jx), inside
+            )
+            inside &= near != _NO_AREA
+            total, number = total + dr.select(inside, dr.abs(near), 0), number + dr.select(inside, 1, 0)
+            least = dr.select(inside, dr.minimum(least, near * sign), least)
+            most = dr.select(inside, dr.maximum(most, dr.abs(near)), most)
+        return total / number, least, most
+
+
+def _area(*corners: tuple[Any, Any]) -> Any:
+    """Signed area of quadrilaterals."""
+    (xa, ya), (xb, yb), (xc, yc), (xd, yd) = corners
+    return ((xc - xa) * (yd - yb) - (yc - ya) * (xd - xb)) * 0.5
+
+
+def _least(*values: Any) -> Any:
+    dr = backend().dr
+    return dr.minimum(dr.minimum(values[0], values[1]), dr.minimum(values[2], values[3]))
+
+
+def _most(*values: Any) -> Any:
+    dr = backend().dr
+    return dr.maximum(dr.maximum(values[0], values[1]), dr.maximum(values[2], values[3]))

@@ -1,0 +1,533 @@
+"""Veiling glare of a far bright source: light that rough and dusty lens surfaces scatter, and a baffle against it.
+
+Scatter of one surface is a BSDF over β, the distance of two directions as sines, taken in air: a surface of spatial
+frequency f turns light by β = λ f in every medium. Integrated over the disc β < 1 of sines it is the share of light
+scattered forwards, the total integrated scatter (TIS).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.special import erf, exprel, j1
+
+from ...core.errors import InputError
+from ..coating import reflect_transmit
+from ..gaussian import first_order
+from ..glass import D_NM, RANGE_NM
+from ..prescription import Prescription
+from ..rays import forward
+from ..thin import beyond_frame
+from .paraxial import along, axial_transmittance, mirrors
+
+F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
+
+REFERENCE_NM = 550.0  # what roughness and the Harvey knee are quoted at
+# What the models hold for: beyond, a surface is not smooth to light, and dust covers it whole.
+ROUGHNESS_NM_LIMITS = (0.0, 50.0)
+CLEANLINESS_LIMITS = (0.0, 1000.0)
+ROUGHNESS_NM, KNEE, SLOPE = 1.0, 0.01, -1.5  # assumed: a good polish, and usual values of its scatter
+
+# Assumed. Mineral dusts are estimated at 1.5 to 1.7 and 1e-5 to 1e-3 (Amsterdam-Granada Light Scattering Database,
+# Muñoz et al. 2012, JQSRT 113, 565).
+DUST_INDEX = 1.53 + 0.0005j
+
+_CC1246_SLOPE = 0.926
+_CC1246_AREA_UM2 = 0.1e12  # 0.1 m²
+_SMALLEST_UM = 1.0  # where the standard's distribution begins
+_MIE_LARGEST = 500.0  # size parameter; beyond, diffraction and geometrical optics
+_BIN = 0.01  # of ln(size parameter)
+_ANGLES = 321
+_LOOKUP = 1 << 16
+_OFFSETS: F64 = np.geomspace(1e-6, 2.0, 1025)
+_STEEPEST_DEG = 89.9
+_DISC = 65  # points across a beam
+_AROUND = 360  # directions about the source in which light misses the frame
+
+
+def _check(name: str, value: ArrayLike, low: float, high: float) -> F64:
+    array = np.asarray(value, dtype=np.float64)
+    wrong = ~((array >= low) & (array <= high))
+    if wrong.any():
+        raise InputError(f"{name} = {array[wrong].flat[0]:g}: must be from {low:g} to {high:g}")
+    return array
+
+
+# --- roughness --------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, kw_only=True)
+class Harvey:
+    """Scatter of a polished surface: BSDF = b0 [1 + (β/L)²]^(S/2), per steradian (Harvey 1976).
+
+    Attributes
+    ----------
+    b0
+        Towards the unscattered light, 1/sr.
+    L
+        β where the fall begins, about 1e-4 to 1e-2.
+    S
+        Slope of the fall in double logarithms, about -0.5 to -2.5.
+    """
+
+    b0: float
+    L: float
+    S: float
+
+    @classmethod
+    def of_roughness(
+        cls,
+        *,
+        roughness_nm: float,
+        index_step: float,
+        wavelength_nm: float = REFERENCE_NM,
+        L: float = KNEE,
+        S: float = SLOPE,
+    ) -> Harvey:
+        """The one with TIS = (2π Δn σ/λ)², σ the rms roughness of spatial frequencies up to 1/λ.
+
+        A mirror's Δn is 2. Raises InputError outside 0 to 50 nm, L outside 1e-5 to 1 and S outside -4 to 0.
+        """
+        sigma = float(_check("roughness_nm", roughness_nm, *ROUGHNESS_NM_LIMITS))
+        L, S = float(_check("L", L, 1e-5, 1.0)), float(_check("S", S, -4.0, 0.0))
+        total = (2 * np.pi * index_step * sigma / wavelength_nm) ** 2
+        return cls(b0=float(total / cls(b0=1.0, L=L, S=S).tis), L=L, S=S)
+
+    def bsdf(self, beta: ArrayLike) -> F64:
+        """1/sr, float64 like `beta`; 0 from β = 1 on, where no light goes."""
+        b = np.abs(np.asarray(beta, dtype=np.float64))
+        return np.where(b < 1, self.b0 * (1 + (b / self.L) ** 2) ** (self.S / 2), 0.0)
+
+    @property
+    def tis(self) -> float:
+        """Share of light scattered: 2π b0 L²/(S+2) [(1+L⁻²)^((S+2)/2) - 1], and π b0 L² ln(1+L⁻²) for S = -2."""
+        wide = np.log1p(self.L**-2)
+        return float(np.pi * self.b0 * self.L**2 * wide * exprel((self.S / 2 + 1) * wide))
+
+    def at(self, wavelength_nm: float, *, known_at_nm: float = REFERENCE_NM) -> Harvey:
+        """The same surface at another wavelength, its index apart: L ∝ λ, b0 ∝ λ⁻⁴, S kept.
+
+        A smooth surface's BSDF is (2π Δn)² λ⁻⁴ PSD(β/λ), and the PSD is the surface's own (generalised
+        Harvey-Shack theory: Krywonos, Harvey & Choi 2011, JOSA A 28, 1121). Hence TIS ∝ λ⁻² σ², σ the roughness up
+        to frequency 1/λ: TIS ∝ λ⁻² where S is well below -2, and nearly λ^-(4+S) where it is above.
+        """
+        ratio = wavelength_nm / known_at_nm
+        return Harvey(b0=self.b0 / ratio**4, L=self.L * ratio, S=self.S)
+
+
+# --- particles --------------------------------------------------------------------------------------------------
+
+
+def particle_count(level: float, diameter_um: ArrayLike) -> F64:
+    """Particles larger than a diameter on 0.1 m², float64 like `diameter_um` (IEST-STD-CC1246); 0 below level 1."""
+    log = np.log10(np.asarray(diameter_um, dtype=np.float64))
+    if level < 1:
+        return np.zeros(log.shape)
+    return np.asarray(10 ** (_CC1246_SLOPE * (np.log10(level) ** 2 - log**2)))
+
+
+def obscured_fraction(cleanliness_level: float) -> float:
+    """Share of a surface that spheres of the standard's sizes cover, from 1 µm to `cleanliness_level`, in µm, of
+    which 0.1 m² has one larger."""
+    level = float(_check("cleanliness_level", cleanliness_level, *CLEANLINESS_LIMITS))
+    if level <= _SMALLEST_UM:
+        return 0.0
+    # ∫ π/4 D² (-dN/dD) dD with N = exp(c (U² - u²)), u = ln D: by parts, then the square completed
+    c, top = _CC1246_SLOPE / np.log(10), np.log(level)
+    root = np.sqrt(c)
+    inner = np.sqrt(np.pi) / (2 * root) * np.exp(1 / c + c * top**2)
+    inner *= erf(root * (top - 1 / c)) + erf(1 / root)
+    covered = np.exp(c * top**2) - np.exp(2 * top) + 2 * inner
+    return float(np.pi / 4 * covered / _CC1246_AREA_UM2)
+
+
+def scattered_intensity(size_parameter: ArrayLike, cosine: ArrayLike, *, index: complex = DUST_INDEX) -> F64:
+    """k² dσ/dΩ of spheres for unpolarised light, float64[size, angle].
+
+    By Mie's series up to a size parameter π D/λ of 500, its coefficients from miepython; beyond as the sum of
+    Fraunhofer diffraction and the rays reflected outside and refracted twice, without their interference: that is
+    within 8 % of Mie's mean over sizes to 70°, and a fifth below it at 90°.
+    """
+    x, mu = np.atleast_1d(np.asarray(size_parameter, float)), np.atleast_1d(np.asarray(cosine, float))
+    small = x <= _MIE_LARGEST
+    found = np.empty((len(x), len(mu)))
+    found[small] = _mie(x[small], mu, index)
+    found[~small] = _large(x[~small], mu, index)
+    return found
+
+
+def _mie(x: F64, mu: F64, index: complex) -> F64:
+    """Bohren & Huffman 1983, chapter 4: one matrix product for all sizes and angles."""
+    if not len(x):
+        return np.empty((0, len(mu)))
+    import miepython
+
+    # its sign of absorption is the other one
+    series = [miepython.coefficients(np.conj(index), float(size)) for size in x]
+    orders = max(s.shape[1] for s in series)
+    pi, tau = np.zeros((2, orders + 1, len(mu)))
+    pi[1] = 1
+    for n in range(1, orders + 1):
+        if n > 1:
+            pi[n] = ((2 * n - 1) * mu * pi[n - 1] - n * pi[n - 2]) / (n - 1)
+        tau[n] = n * mu * pi[n] - (n + 1) * pi[n - 1]
+    a, b = np.zeros((2, len(x), orders), complex)
+    for row, s in enumerate(series):
+        a[row, : s.shape[1]], b[row, : s.shape[1]] = s
+    order = np.arange(1, orders + 1)
+    a, b = ((2 * order + 1) / (order * (order + 1)) * c for c in (a, b))
+    plus = (a + b) @ (pi + tau)[1:]
+    minus = (a - b) @ (pi - tau)[1:]
+    # S1 and S2 are half the sum and half the difference of the two
+    return (np.abs(plus) ** 2 + np.abs(minus) ** 2) / 4
+
+
+def _large(x: F64, mu: F64, index: complex) -> F64:
+    n, size = index.real, x[:, None]
+    sine = np.sqrt(np.maximum(1 - mu * mu, 0))
+    # the disc that diffracts is wider by the edge's share of extinction (Nussenzveig & Wiscombe 1980, PRL 45, 1490)
+    disc = size * np.sqrt(1 + 0.9962 * size ** (-2 / 3))
+    across = disc * np.maximum(sine, 1e-12)
+    diffracted = np.where(mu > 0, disc**4 * (j1(across) / across) ** 2, 0)
+    # the ray reflected outside turns by π - 2i, the one refracted twice by 2(i - r)
+    rs, rp, _, _ = reflect_transmit((), 1.0, n, np.maximum(np.sqrt((1 - mu) / 2), 1e-9), D_NM)
+    reflected = (rs + rp) / 8
+    half, turn = np.arccos(mu) / 2, np.maximum(np.arccos(mu), 1e-6)
+    i = np.arctan2(n * np.sin(turn / 2), n * np.cos(half) - 1)
+    passes = (n * np.cos(half) > 1) & (i < np.pi / 2)
+    i = np.where(passes, i, 0.5)
+    r = np.arcsin(np.sin(i) / n)
+    _, _, ts, tp = reflect_transmit((), 1.0, n, np.cos(i), D_NM)
+    spread = np.sin(i) * np.cos(i) / (np.sin(turn) * 2 * (1 - np.cos(i) / (n * np.cos(r))))
+    refracted = np.where(passes, (ts**2 + tp**2) / 2 * spread, 0)
+    return np.asarray(diffracted + size**2 * (reflected + refracted * np.exp(-4 * size * index.imag * np.cos(r))))
+
+
+@lru_cache(maxsize=4)
+def _intensities(index: complex) -> tuple[F64, F64, F64]:
+    """Scattered intensity over all sizes and forward angles: bin edges of the size parameter, angles in rad, and
+    float64[bin, angle]. One table serves all wavelengths: the index is a constant."""
+    largest = np.pi * 1e3 * 1000.0 / RANGE_NM[0]
+    edges = np.exp(np.arange(0.0, np.log(largest) + _BIN, _BIN))
+    angles = np.geomspace(1e-5, np.pi / 2, _ANGLES)
+    table = scattered_intensity(np.sqrt(edges[1:] * edges[:-1]), np.cos(angles), index=index)
+    for array in (edges, angles, table):
+        array.setflags(write=False)
+    return edges, angles, table
+
+
+@lru_cache(maxsize=256)
+def _dust(level: float, wavelength_nm: float, index: complex) -> tuple[F64, float]:
+    """Intensity over irradiance of a dusty surface, 1/sr, float64[angle], and its integral over the hemisphere."""
+    edges, angles, table = _intensities(index)
+    wavelength_um = 1e-3 * wavelength_nm
+    diameters = np.clip(edges * wavelength_um / np.pi, _SMALLEST_UM, max(level, _SMALLEST_UM))
+    bins = -np.diff(particle_count(level, diameters)) / _CC1246_AREA_UM2
+    intensity = bins @ table / (2 * np.pi / wavelength_um) ** 2
+    intensity.setflags(write=False)
+    share = np.trapezoid(2 * np.pi * np.sin(angles) * angles * intensity, x=np.log(angles))
+    return intensity, float(share)
+
+
+def particle_bsdf(
+    cleanliness_level: float, wavelength_nm: float, beta: ArrayLike, *, index: complex = DUST_INDEX
+) -> F64:
+    """Forward scatter of particles on a surface, 1/sr, float64 like `beta`; 0 from β = 1 on.
+
+    Spheres of the sizes of IEST-STD-CC1246 from 1 µm to `cleanliness_level` µm, lit along the normal, each alone.
+    Raises InputError for a level outside 0 (clean) to 1000, and a wavelength outside 250 to 2500 nm.
+    """
+    level = float(_check("cleanliness_level", cleanliness_level, *CLEANLINESS_LIMITS))
+    intensity, _ = _dust(level, float(_check("wavelength_nm", wavelength_nm, *RANGE_NM)), index)
+    b = np.abs(np.asarray(beta, dtype=np.float64))
+    if level <= _SMALLEST_UM:
+        return np.zeros(b.shape)
+    angles = _intensities(index)[1]
+    angle = np.arcsin(np.clip(b, np.sin(angles[0]), 1))
+    found = np.exp(np.interp(np.log(angle), np.log(angles), np.log(intensity)))
+    # radiance is intensity over cosine; beyond 84° the mean over that ring, which keeps the flux
+    cosine = np.where(b * b < 0.99, np.sqrt(np.maximum(1 - b * b, 0)), 0.05)
+    return np.where(b < 1, found / cosine, 0.0)
+
+
+def particle_scatter_fraction(
+    cleanliness_level: float, wavelength_nm: float, *, index: complex = DUST_INDEX
+) -> float:
+    """Share of light that the particles of `particle_bsdf` scatter forwards."""
+    level = float(_check("cleanliness_level", cleanliness_level, *CLEANLINESS_LIMITS))
+    return _dust(level, float(_check("wavelength_nm", wavelength_nm, *RANGE_NM)), index)[1]
+
+
+# --- a lens -----------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class VeilingGlare:
+    """Scattered light of a far source on a sensor.
+
+    Attributes
+    ----------
+    offset
+        float64[sample], rising: distance between the directions of source and pixel, as sines; near the axis the
+        distance from the source's image over the focal length.
+    irradiance
+        float64[band, sample], on the sensor over the source's at the entrance, across its rays.
+    efl_mm
+        Focal length, by which places on the sensor become directions.
+    glare_total_fraction
+        float64[band], Σ TIS of all surfaces: share of the light passing that is scattered.
+    """
+
+    offset: F64
+    irradiance: F64
+    efl_mm: float
+    glare_total_fraction: F64
+
+    @cached_property
+    def _lookup(self) -> tuple[float, float, F32]:
+        """Irradiance at equal steps of ln(offset²), of 4e-4: no step shows in an image."""
+        steps = np.linspace(2 * np.log(self.offset[0]), 2 * np.log(self.offset[-1]), _LOOKUP)
+        rows = [np.interp(steps, 2 * np.log(self.offset), row) for row in self.irradiance]
+        return steps[0], float(steps[1] - steps[0]), np.array(rows, dtype=np.float32)
+
+    def image(self, sun_xy_mm: tuple[float, float], shape: tuple[int, int], pitch_mm: float) -> F32:
+        """Irradiance over the source's at the entrance, float32[band, y, x].
+
+        The sensor's middle is the frame's, x to the right, y down; the source's image `sun_xy_mm` may lie outside.
+        At the source's own place the value is finite and means nothing: the direct image outshines it. No cos⁴ of
+        the pixel's field angle falls here.
+        """
+        start, step, table = self._lookup
+        height, width = shape
+        x = ((np.arange(width) - (width - 1) / 2) * pitch_mm / self.efl_mm).astype(np.float32)
+        y = ((np.arange(height) - (height - 1) / 2) * pitch_mm / self.efl_mm).astype(np.float32)[:, None]
+        sun = np.asarray(sun_xy_mm, dtype=np.float64) / self.efl_mm
+        sine = (sun / np.sqrt(1 + sun @ sun)).astype(np.float32)
+        per_length = 1 / np.sqrt(1 + x * x + y * y)
+        position = (x * per_length - sine[0]) ** 2
+        position += (y * per_length - sine[1]) ** 2
+        np.log(np.maximum(position, np.float32(self.offset[0] ** 2), out=position), out=position)
+        position -= np.float32(start)
+        position *= np.float32(1 / step)
+        position += np.float32(0.5)
+        index = position.astype(np.intp)
+        out = np.empty((len(table), height, width), dtype=np.float32)
+        for row, band in zip(table, out, strict=True):
+            np.take(row, index, out=band, mode="clip")
+        return out
+
+    @property
+    def kept_of_single(self) -> F64:
+        """Return what several scatterings leave of the sum of the single ones, (1 - e^-Σ) / Σ, float64[band]."""
+        return np.asarray(exprel(-self.glare_total_fraction))
+
+    def beyond_mm2(self, sun_xy_mm: tuple[float, float], shape: tuple[int, int], pitch_mm: float) -> F64:
+        """Return the flux on the unbounded sensor plane outside of the frame, over the source's irradiance at the
+        entrance, float64[band] in mm²; with the cos⁴ of the field angle that `image` leaves out."""
+        slope = np.asarray(sun_xy_mm, dtype=np.float64) / self.efl_mm
+        angle = np.linspace(0, 2 * np.pi, _AROUND, endpoint=False, dtype=np.float64)
+        half_slope = (shape[1] / 2 * pitch_mm / self.efl_mm, shape[0] / 2 * pitch_mm / self.efl_mm)
+        missing = beyond_frame(slope, self.offset, angle, half_slope).mean(axis=1)
+        # E dA = E(β) cos⁴θ dA = E(β) f² d²β
+        rings = 2 * np.pi * (self.efl_mm * self.offset) ** 2 * missing
+        return np.asarray(np.trapezoid(self.irradiance * rings, x=np.log(self.offset), axis=1))
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Surfaces:
+    """What a lens's surfaces scatter at a wavelength: stretch = a_ent / a_j."""
+
+    scale: float  # π NA² T
+    stretch: F64
+    roughness: tuple[Harvey, ...]
+    dusty: NDArray[np.bool_]
+    level: float
+    wavelength_nm: float
+
+    def irradiance(self, offset: F64, share: F64) -> F64:
+        """float64[sample], over the source's, for a share[surface, sample] of each beam that is lit.
+
+        Surface j scatters the radiance E_ent T (a_ent/a_j)² BSDF, which fills the cone of the image: × π NA².
+        Lagrange's invariant n_j a_j θ = NA r makes β = NA r / a_j, which with NA = a_ent / f is (a_ent/a_j) r / f.
+        (Form of Peterson 2004, Proc. SPIE 5178, 184.)
+        """
+        total = np.zeros(offset.shape)
+        for stretch, harvey, dusty, lit in zip(self.stretch, self.roughness, self.dusty, share, strict=True):
+            bsdf = harvey.bsdf(stretch * offset)
+            if dusty:
+                bsdf = bsdf + particle_bsdf(self.level, self.wavelength_nm, stretch * offset)
+            total += lit * stretch**2 * bsdf
+        return self.scale * total
+
+    @property
+    def tis(self) -> float:
+        dust = particle_scatter_fraction(self.level, self.wavelength_nm) if self.dusty.any() else 0.0
+        return sum(harvey.tis for harvey in self.roughness) + dust * int(self.dusty.sum())
+
+
+def _surfaces(
+    lens: Prescription, wavelength_nm: float, roughness_nm: float, level: float, knee: float, slope: float
+) -> _Surfaces:
+    level = float(_check("cleanliness_level", level, *CLEANLINESS_LIMITS))
+    figures, path = first_order(lens, wavelength_nm), forward(lens)
+    rows = list(mirrors(lens))
+    index = lens.indices(wavelength_nm)
+    marginal = np.abs(along(lens, path, wavelength_nm)[1][rows, 0, 0])
+    aperture = figures.entrance_pupil_diameter_mm / (2 * figures.efl_mm)
+    return _Surfaces(
+        scale=float(np.pi * aperture**2 * axial_transmittance(lens, wavelength_nm)[0]),
+        stretch=1 / np.maximum(marginal, 1e-6),
+        roughness=tuple(
+            Harvey.of_roughness(
+                roughness_nm=roughness_nm, index_step=float(index[k + 1] - index[k]), L=knee, S=slope
+            ).at(wavelength_nm)
+            for k in rows
+        ),
+        # a cemented surface gathers no dust
+        dusty=np.array([level > 0 and 1.0 in (index[k], index[k + 1]) for k in rows]),
+        level=level,
+        wavelength_nm=wavelength_nm,
+    )
+
+
+def _lit(lens: Prescription, sun_deg: float) -> F64:
+    """Share of the beam at each scattering surface that a source at an angle lights past the rims so far,
+    float64[surface], to first order.
+
+    Before the stop it is the beam that the field's middle sees there; behind the stop, what is lit is seen.
+    """
+    _, met = along(lens, forward(lens))
+    height, slope = met[:, 0, 0], met[:, 0, 1]
+    radius = first_order(lens).entrance_pupil_diameter_mm / 2
+    # rims do not cut the beam on the axis: the stop does, though a paraxial one may be wider than a real one
+    rims = np.maximum([s.semi_diameter_mm for s in lens.surfaces], radius * np.abs(height))
+    side = (np.arange(_DISC) + 0.5) / _DISC * 2 - 1
+    disc = np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2)
+    disc = disc[np.einsum("nc,nc->n", disc, disc) <= 1]
+    lean = np.array([np.tan(np.radians(sun_deg)), 0.0])
+    shares = []
+    for row in mirrors(lens):
+        k = min(row, lens.stop)
+        entrance = radius * disc - slope[k] / height[k] * lean
+        reached = height[: row + 1, None, None] * entrance + slope[: row + 1, None, None] * lean
+        inside = np.einsum("knc,knc->kn", reached, reached) <= rims[: row + 1, None] ** 2 * (1 + 1e-9)
+        shares.append(inside.all(axis=0).mean())
+    return np.array(shares)
+
+
+def veiling_glare(
+    lens: Prescription,
+    *,
+    sun_deg: float,
+    wavelength_nm: ArrayLike,
+    roughness_nm: float = ROUGHNESS_NM,
+    cleanliness_level: float = 0.0,
+    L: float = KNEE,
+    S: float = SLOPE,
+) -> VeilingGlare:
+    """Light of a far point source that a lens's surfaces scatter onto the sensor.
+
+    Parameters
+    ----------
+    sun_deg
+        Angle of the source from the axis, 0 to 89.9.
+    wavelength_nm
+        float64[band].
+    roughness_nm, L, S
+        Rms roughness and Harvey's knee and slope at 550 nm of every surface (assumed values by default).
+    cleanliness_level
+        Particles on every surface in air, by IEST-STD-CC1246; 0: none.
+    """
+    bands = [
+        _surfaces(lens, float(nm), roughness_nm, cleanliness_level, L, S)
+        for nm in np.atleast_1d(_check("wavelength_nm", wavelength_nm, *RANGE_NM))
+    ]
+    angle = float(_check("sun_deg", sun_deg, 0.0, _STEEPEST_DEG))
+    share = np.cos(np.radians(angle)) * _lit(lens, angle)[:, None]
+    return VeilingGlare(
+        offset=_OFFSETS,
+        irradiance=np.stack([band.irradiance(_OFFSETS, share) for band in bands]),
+        efl_mm=first_order(lens).efl_mm,
+        glare_total_fraction=np.array([band.tis for band in bands]),
+    )
+
+
+def scattered_fraction(
+    lens: Prescription,
+    wavelength_nm: ArrayLike,
+    *,
+    roughness_nm: float = ROUGHNESS_NM,
+    cleanliness_level: float = 0.0,
+    L: float = KNEE,
+    S: float = SLOPE,
+) -> F64:
+    """Return the fraction of the light passing a lens that its surfaces scatter, 1 - exp(-Σ TIS), float64[band].
+    Parameters as in `veiling_glare`."""
+    single = np.array(
+        [
+            _surfaces(lens, float(nm), roughness_nm, cleanliness_level, L, S).tis
+            for nm in np.atleast_1d(_check("wavelength_nm", wavelength_nm, *RANGE_NM))
+        ]
+    )
+    return np.asarray(-np.expm1(-single))
+
+
+def point_source_transmittance(
+    lens: Prescription,
+    sun_deg: ArrayLike,
+    *,
+    wavelength_nm: ArrayLike,
+    roughness_nm: float = ROUGHNESS_NM,
+    cleanliness_level: float = 0.0,
+    L: float = KNEE,
+    S: float = SLOPE,
+) -> F64:
+    """Scattered irradiance at the sensor's middle over a far source's at the entrance, float64[band, angle].
+
+    For angles in the field and outside, 0 to 89.9°: outside, only the surfaces count that the source's rays
+    still reach past the rims. Ghosts, the mount and a baffle are not in it. Parameters as in `veiling_glare`.
+    """
+    angles = np.atleast_1d(_check("sun_deg", sun_deg, 0.0, _STEEPEST_DEG))
+    share = np.stack([np.cos(np.radians(a)) * _lit(lens, float(a)) for a in angles], axis=1)
+    bands = [
+        _surfaces(lens, float(nm), roughness_nm, cleanliness_level, L, S)
+        for nm in np.atleast_1d(_check("wavelength_nm", wavelength_nm, *RANGE_NM))
+    ]
+    return np.stack([band.irradiance(np.sin(np.radians(angles)), share) for band in bands])
+
+
+# --- a baffle ---------------------------------------------------------------------------------------------------
+
+
+def baffle_transmission(
+    sun_deg: ArrayLike,
+    *,
+    length_mm: float = 0.0,
+    radius_mm: float = np.inf,
+    entrance_radius_mm: float,
+    vane_attenuation: float = 1e-6,
+) -> F64:
+    """Share of a lens's entrance that a far source lights through a tube in front, float64 like `sun_deg`.
+
+    The overlap of the entrance with the tube's mouth, moved by length × tan(angle), never below
+    `vane_attenuation`: 1e-6 is assumed; good two-stage baffles reach 1e-9 (Haghshenas & Johari 2014, Proc. SPIE
+    9264, 92641R). Without length there is no baffle. Raises InputError for a tube narrower than the entrance.
+    """
+    angle = _check("sun_deg", sun_deg, 0.0, 180.0)
+    length = float(_check("length_mm", length_mm, 0.0, 1e6))
+    small = float(_check("entrance_radius_mm", entrance_radius_mm, 1e-6, 1e6))
+    large = float(_check("radius_mm", radius_mm, small, np.inf))
+    least = float(_check("vane_attenuation", vane_attenuation, 0.0, 1.0))
+    if length == 0 or np.isinf(large):
+        return np.ones(angle.shape)
+    away = length * np.tan(np.radians(np.minimum(angle, 90.0)))
+    d = np.clip(away, large - small + 1e-12 * small, large + small)
+    # two circular segments, on either side of the chord through both rims' crossings
+    to_small = np.arccos(np.clip((d * d + small**2 - large**2) / (2 * d * small), -1, 1))
+    to_large = np.arccos(np.clip((d * d + large**2 - small**2) / (2 * d * large), -1, 1))
+    area = small**2 * (to_small - np.sin(2 * to_small) / 2) + large**2 * (to_large - np.sin(2 * to_large) / 2)
+    return np.clip(area / (np.pi * small**2), least, 1.0)

@@ -1,0 +1,575 @@
+"""Starburst: the Sun through the stop by Fraunhofer diffraction, point by point and averaged over its disc.
+
+A far source of wave number k₀ = 2π/λ gives at the direction cosines u the irradiance, over its own at the entrance,
+
+    E / E_sun = cos θ_sun · cos⁴θ / f² · |A(k₀ (u - u_sun))|² / λ²,      A(k) = ∫ exp(-i k·x) dx
+
+over the entrance pupil (Goodman, Introduction to Fourier Optics, chapter 4). |A|² / (λ² area) is the point spread
+function per unit of u, and cos⁴θ / f² = |d²u / d²x| for an image without distortion; near the axis u - u_sun is
+(x - x_sun) / f.
+
+Averaging over a disc of angular radius σ multiplies the pupil's autocorrelation at the shift ξ by the disc's
+coherence 2 J₁(y) / y, y = σ k₀ ξ (van Cittert and Zernike; Born & Wolf, Principles of Optics, 10.4). That leaves
+shifts of some λ / σ, 0.1 mm at 1 au, and where this is small against the stop the first powers of ξ are enough:
+
+- ξ¹, the rim. A length ds sends 2π ds / k² along its normal, both ways: a straight edge is a line spike, a bent one
+  a fan of 2πρ / k³ at its radius of curvature ρ, a circle 4πa / k³, the mean of Airy's rings. Over the disc, with θ
+  the distance |u - u_sun| and t that across the normal,
+
+      |A|² = 4 √(σ² - t²) / (σ² k₀³ (θ² - σ²)) · ds,
+
+  and a rim is its length per angle of the normal, convolved with this.
+- ξ², the corners. The edges' ends at a corner are one point, so they add as amplitudes: |A|² = (cot ψ₁ - cot ψ₂)² /
+  k⁴ with the angles from their normals. Across a normal cot² is Hadamard's finite part, which takes from the spike
+  what its wings hold, and at the end of a bent edge Fresnel's integral, which joins light and dark.
+
+Corners and edges add as powers: their fringes, λ over their distance, are finer than the disc. The disc is taken as
+even, and as a circle in u although it is foreshortened by cos θ_sun on the line to the axis, so that off the axis
+some spikes come out too wide by up to 1 / cos θ_sun, and too faint, for the same flux.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ...core.errors import InputError
+from ..gaussian import first_order
+from ..prescription import Prescription, Surface
+from ..thin import beyond_frame
+
+F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
+
+_EDGE_POINTS = 2049  # along one blade, or round the whole rim
+_SUPERSAMPLING = 4  # of a sample, along either side
+_GOLDEN_RAD = np.pi * (3 - np.sqrt(5))
+_FARTHEST = 2.0  # two sines are no farther apart
+_SHARE_LOST = 3e-3  # of the mean of the bands
+_STRIP = 64  # rows of a frame at a time
+_ROW_BLUR = 0.5  # of fringes, in steps of the table
+_NARROW = 1 / 8  # disc over distance from which a sine is its angle
+_WING_SUNS = 12.0  # distance from an edge's normal, in radii of the disc, from which cot² needs no average
+_WING_STEP, _WING_POINTS, _WING_PLACES = 0.05, 1200, 241
+_STRAIGHT_PER_MM = 1e-9
+_LEAST_CORNER_RAD = 1e-3
+_LONE_BAND_NM = 150.0  # half width of what a single band stands for, as in vbnfault.core.spectra
+_HAT_POINTS = 17  # of either side
+_HANKEL_POINTS = 4096
+_DISC_POINTS = 32
+_GRAIN_POINTS = 2048
+_OUTER_STEPS = 16  # of the table's angles that are taken together outside of the frame
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class StopDefects:
+    """Opaque dust and scratches on the stop, float64 arrays in mm of its own plane: grains' diameters, and
+    scratches' lengths, widths and directions from +x towards +y. Raises InputError where they do not fit."""
+
+    grain_diameter_mm: F64 = field(default_factory=lambda: np.zeros(0))
+    scratch_length_mm: F64 = field(default_factory=lambda: np.zeros(0))
+    scratch_width_mm: F64 = field(default_factory=lambda: np.zeros(0))
+    scratch_angle_rad: F64 = field(default_factory=lambda: np.zeros(0))
+
+    def __post_init__(self) -> None:
+        for f in fields(self):
+            values = np.asarray(getattr(self, f.name), dtype=np.float64)
+            object.__setattr__(self, f.name, values)
+            least = -np.inf if f.name.endswith("rad") else 0.0
+            if values.ndim != 1 or not np.isfinite(values).all() or not (values > least).all():
+                raise InputError(f"{f.name} = {values.tolist()}: must be a list of finite numbers above {least:g}")
+        count = len(self.scratch_length_mm)
+        for name in ("scratch_width_mm", "scratch_angle_rad"):
+            if len(getattr(self, name)) != count:
+                found = len(getattr(self, name))
+                raise InputError(f"{name}: {found} values: must be as many as scratch_length_mm, {count}")
+
+    def scaled(self, factor: float) -> StopDefects:
+        """With every length multiplied."""
+        return StopDefects(
+            grain_diameter_mm=self.grain_diameter_mm * factor,
+            scratch_length_mm=self.scratch_length_mm * factor,
+            scratch_width_mm=self.scratch_width_mm * factor,
+            scratch_angle_rad=self.scratch_angle_rad,
+        )
+
+
+# --- a point source ---------------------------------------------------------------------------------------------
+
+
+def fraunhofer_psf(
+    stop: Surface,
+    entrance_diameter_mm: float,
+    focal_length_mm: float,
+    wavelength_nm: float,
+    *,
+    samples: int = 1024,
+    across: int = 256,
+    defects: StopDefects | None = None,
+) -> tuple[F64, float]:
+    """Point spread function of a stop, sum 1, float64[samples, samples], and its pitch on the sensor in mm.
+
+    x to the right, y down, the middle at [samples // 2, samples // 2]. `across` samples span the entrance pupil, so
+    the pitch is λ f `across` / (`samples` · diameter), and the frame reaches `across` / 2 times λ f / diameter from
+    the middle. Defects, in mm of the stop's plane, are spread evenly over it.
+    """
+    if not 8 <= across <= samples:
+        raise InputError(f"across = {across}: must be from 8 to samples = {samples}")
+    fine = across * _SUPERSAMPLING
+    pitch = 2.0 / fine  # in semi-diameters of the stop
+    side = (np.arange(fine) + 0.5) * pitch - 1
+    x, y = side[None, :], side[:, None]
+    open_ = (np.hypot(x, y) * stop.semi_diameter_mm <= stop.rim_mm(np.arctan2(y, x))).astype(np.float64)
+    if defects is not None:
+        _block(open_, x, y, defects.scaled(1 / stop.semi_diameter_mm), pitch)
+    mask = np.zeros((samples, samples))
+    mask[:across, :across] = open_.reshape(across, _SUPERSAMPLING, across, _SUPERSAMPLING).mean(axis=(1, 3))
+    # the mean over a sample has dimmed the far field
+    turn = np.pi * np.fft.fftshift(np.fft.fftfreq(samples)) + 1e-12
+    mean = np.sin(turn) / (_SUPERSAMPLING * np.sin(turn / _SUPERSAMPLING))
+    power = np.abs(np.fft.fftshift(np.fft.fft2(mask)) / (mean * mean[:, None])) ** 2
+    return power / power.sum(), wavelength_nm * 1e-6 * focal_length_mm * across / (samples * entrance_diameter_mm)
+
+
+def _block(open_: F64, x: NDArray[Any], y: NDArray[Any], defects: StopDefects, pitch: float) -> None:
+    """Close what defects cover, with shares of a sample at their rims."""
+
+    def within(half: float, distance: F64) -> F64:
+        inside = np.minimum(distance + pitch / 2, half) - np.maximum(distance - pitch / 2, -half)
+        return np.clip(inside / pitch, 0, 1)
+
+    grains, scratches = defects.grain_diameter_mm, defects.scratch_length_mm
+    count = len(grains) + len(scratches)
+    # a sunflower's seeds keep clear of each other and of the rim, the longest in the middle
+    seed = np.argsort(np.argsort(-np.concatenate([grains, scratches]), kind="stable"), kind="stable")
+    radius = 0.85 * np.sqrt(seed / max(count, 1))
+    places = radius * np.cos(seed * _GOLDEN_RAD), radius * np.sin(seed * _GOLDEN_RAD)
+    for k, (px, py) in enumerate(zip(*places, strict=True)):
+        if k < len(grains):
+            cover = within(grains[k] / 2, np.hypot(x - px, y - py))
+        else:
+            s = k - len(grains)
+            c, n = np.cos(defects.scratch_angle_rad[s]), np.sin(defects.scratch_angle_rad[s])
+            along, beside = c * (x - px) + n * (y - py), c * (y - py) - n * (x - px)
+            cover = within(scratches[s] / 2, along) * within(defects.scratch_width_mm[s] / 2, beside)
+        open_ *= 1 - cover
+
+
+# --- the Sun's disc ---------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Starburst:
+    """What diffraction at the stop of a lens spreads over the sensor, averaged over the Sun's disc.
+
+    Holds from an Airy radius beyond the limb on, for a σ of 3 λ / entrance pupil or more (against the transform of
+    the sampled pupil: means 1 %, spikes 2 %). Tables for a set of wavelengths and a pitch are made at the first
+    frame that asks for them, in some tenths of a second, and kept for the next frames.
+
+    Attributes
+    ----------
+    efl_mm, pupil_radius_mm
+        Of the lens, the radius that of the paraxial entrance pupil's circle.
+    sun_radius_rad
+        Angular radius of the disc.
+    stop, defects
+        The stop's outline, and what lies on it in mm of the entrance pupil.
+    radii, angles
+        Size of the polar table: logarithmic in the sine of the distance from the Sun up to 2, and over half a turn,
+        since |A(-k)| = |A(k)|.
+    """
+
+    efl_mm: float
+    pupil_radius_mm: float
+    sun_radius_rad: float
+    stop: Surface
+    defects: StopDefects
+    radii: int
+    angles: int
+    _memo: dict[Any, tuple[F32, F32]] = field(default_factory=dict, init=False, repr=False)
+
+    def image(
+        self,
+        sun_xy_mm: ArrayLike,
+        wavelength_nm: F64,
+        shape: tuple[int, int],
+        pitch_mm: float,
+        *,
+        half_width_nm: float | None = None,
+    ) -> F32:
+        """Irradiance on the sensor over the Sun's at the entrance, for a transmission of 1, float32[band, y, x].
+
+        Parameters
+        ----------
+        sun_xy_mm
+            Image of the Sun's centre, from the middle of the frame, x to the right and y down (the lens's own x and
+            y); it may lie outside the frame. Within the Sun's own image the value is that next to it: the direct
+            image, which is drawn elsewhere, outshines it.
+        wavelength_nm
+            Band nodes, float64[band], rising. A band is a hat that ends at its neighbours.
+        shape, pitch_mm
+            (height, width) of the frame in pixels, and their pitch.
+        half_width_nm
+            Of the hats; None: up to the neighbours, and 150 nm, flat, for a single band; 0: monochromatic.
+        """
+        import cv2
+
+        wavelength_nm = np.atleast_1d(np.asarray(wavelength_nm, dtype=np.float64))
+        tables, mix = self._tables(wavelength_nm, pitch_mm, half_width_nm)
+        height, width = shape
+        f, sigma, nearest = self.efl_mm, self.sun_radius_rad, self._sines(pitch_mm)[0]
+        sun = np.asarray(sun_xy_mm, dtype=np.float64) / f
+        sun_cos = float(1 / np.sqrt(1 + sun @ sun))
+        sun_u, sun_v = (np.float32(s * sun_cos) for s in sun)
+        per_log = np.float32(0.5 * (self.radii - 1) / np.log(_FARTHEST / nearest))
+        x = ((np.arange(width) - (width - 1) / 2) * pitch_mm / f).astype(np.float32)[None, :]
+        out = np.empty((len(mix), height, width), dtype=np.float32)
+        part = np.empty((len(tables), min(_STRIP, height), width), dtype=np.float32)
+        for top in range(0, height, _STRIP):  # what a strip needs stays in the cache
+            strip = out[:, top : top + _STRIP]
+            rows = np.arange(top, top + strip.shape[1])
+            y = ((rows - (height - 1) / 2) * pitch_mm / f).astype(np.float32)[:, None]
+            cosine = 1 / np.sqrt((1 + x * x) + y * y)
+            du, dv = x * cosine - sun_u, y * cosine - sun_v
+            apart = du * du + dv * dv
+            # next to a foreshortened Sun u can lie within the circle that the table takes for the disc
+            apart = np.maximum(apart, np.float32(nearest**2))
+            cosine *= cosine
+            gain = cosine * cosine * np.float32(sun_cos / f**2) / (apart - np.float32(sigma**2))
+            angle = np.arctan2(np.abs(dv), np.copysign(du, du * dv)) * np.float32(self.angles / np.pi)
+            row = (np.log(apart) - np.float32(2 * np.log(nearest))) * per_log
+            layers = part[:, : strip.shape[1]] if len(tables) < len(mix) else strip
+            for layer, table in zip(layers, tables, strict=True):
+                cv2.remap(table, angle, row, cv2.INTER_LINEAR, dst=layer, borderMode=cv2.BORDER_REPLICATE)
+                layer *= gain
+            if len(tables) < len(mix):
+                for band, (first, *rest) in zip(strip, mix, strict=True):
+                    np.multiply(layers[0], first, out=band)
+                    for layer, share in zip(layers[1:], rest, strict=True):
+                        cv2.scaleAdd(layer, float(share), band, dst=band)
+        return out
+
+    def beyond_mm2(
+        self,
+        sun_xy_mm: ArrayLike,
+        wavelength_nm: F64,
+        shape: tuple[int, int],
+        pitch_mm: float,
+        *,
+        half_width_nm: float | None = None,
+    ) -> F64:
+        """Return the flux on the unbounded sensor plane outside of the frame, over the Sun's irradiance at the
+        entrance and for a transmission of 1, float64[band] in mm². Parameters as in `image`."""
+        wavelength_nm = np.atleast_1d(np.asarray(wavelength_nm, dtype=np.float64))
+        tables, mix = self._tables(wavelength_nm, pitch_mm, half_width_nm)
+        sine = self._sines(pitch_mm)
+        slope = np.asarray(sun_xy_mm, dtype=np.float64) / self.efl_mm
+        half = self.angles // math.gcd(self.angles, _OUTER_STEPS)
+        # means over steps of the angle: spikes are narrower than these, but not so the frame
+        means = tables[..., :-1].reshape(len(tables), len(sine), half, -1).mean(axis=-1, dtype=np.float64)
+        angle = (np.arange(2 * half) + 0.5) * np.pi / half
+        half_slope = (shape[1] / 2 * pitch_mm / self.efl_mm, shape[0] / 2 * pitch_mm / self.efl_mm)
+        missing = beyond_frame(slope, sine, angle, half_slope)
+        missing_half = (missing[:, :half].astype(np.float64) + missing[:, half:]) * (np.pi / half)
+        per_radius = np.einsum("tra,ra->tr", means, missing_half) / (sine**2 - self.sun_radius_rad**2)
+        flux = np.trapezoid(per_radius * sine**2, x=np.log(sine), axis=1)
+        # within the nearest radius the image is constant
+        flux += per_radius[:, 0] * sine[0] ** 2 / 2
+        return np.asarray(mix @ flux / np.sqrt(1 + slope @ slope))
+
+    def _sines(self, pitch_mm: float) -> F64:
+        """Rows of the table: |u - u_sun|, float64[radius]."""
+        nearest = self.sun_radius_rad + 0.9 * pitch_mm / self.efl_mm
+        return np.asarray(np.geomspace(nearest, _FARTHEST, self.radii))
+
+    def _tables(self, wavelength_nm: F64, pitch_mm: float, half_width_nm: float | None) -> tuple[F32, F32]:
+        """(θ² - σ²) |A|² / λ² in mm², float32[table, radius, angle + 1], the last angle that of the first, and the
+        share of each table in each band, float32[band, table]."""
+        key = (tuple(wavelength_nm), pitch_mm, half_width_nm)
+        tables = self._memo.get(key)
+        if tables is None:
+            if not (wavelength_nm > 0).all() or not (np.diff(wavelength_nm) > 0).all():
+                raise InputError(f"wavelength_nm = {wavelength_nm.tolist()}: must be above 0 and rise")
+            bands = _hats(wavelength_nm, half_width_nm)
+            tables = _fewest(_polar(self, self._sines(pitch_mm), bands, pitch_mm / self.efl_mm / np.sqrt(12)))
+            self._memo.clear()
+            self._memo[key] = tables
+        return tables
+
+
+def starburst(
+    lens: Prescription,
+    *,
+    sun_radius_rad: float,
+    defects: StopDefects | None = None,
+    radii: int = 224,
+    angles: int = 4096,
+) -> Starburst:
+    """The starburst of a lens, with `defects` in mm of the stop's plane.
+
+    `radii` × `angles` is the size of its tables; the default serves frames up to 1500 pixels wide. Raises
+    InputError.
+    """
+    if not 0 < sun_radius_rad < 0.5:
+        raise InputError(f"sun_radius_rad = {sun_radius_rad!r}: must be above 0 and below 0.5")
+    if radii < 16 or angles < 64 or angles % 2:
+        raise InputError(f"radii = {radii}, angles = {angles}: must be 16 or more, and even and 64 or more")
+    stop, paraxial = lens.surfaces[lens.stop], first_order(lens)
+    radius = paraxial.entrance_pupil_diameter_mm / 2
+    return Starburst(
+        efl_mm=paraxial.efl_mm,
+        pupil_radius_mm=radius,
+        sun_radius_rad=sun_radius_rad,
+        stop=stop,
+        defects=(defects or StopDefects()).scaled(radius / stop.semi_diameter_mm),
+        radii=radii,
+        angles=angles,
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Edge:
+    """One blade's edge of the pupil, or the whole of a round rim: lengths and directions of normals of its pieces
+    from the edge's middle, the normal's turn from there to its end, and the curvature there."""
+
+    count: int
+    length_mm: F64
+    normal_rad: F64
+    end_rad: float
+    end_curvature_per_mm: float
+
+
+def _edge(stop: Surface, pupil_radius_mm: float) -> _Edge:
+    count = max(stop.blades, 1)
+    half = np.pi / count
+    angle = np.linspace(-half, half, _EDGE_POINTS)
+    radius = stop.rim_mm(angle + np.radians(stop.rotation_deg) + half) * pupil_radius_mm / stop.semi_diameter_mm
+    dx, dy = np.diff(radius * np.cos(angle)), np.diff(radius * np.sin(angle))
+    length, normal = np.hypot(dx, dy), np.unwrap(np.arctan2(-dx, dy))
+    turn = (normal[-1] - normal[-2]) / length[-1]
+    return _Edge(
+        count=count,
+        length_mm=length,
+        normal_rad=normal,
+        end_rad=float(normal[-1] + turn * length[-1] / 2),
+        end_curvature_per_mm=float(turn),
+    )
+
+
+def _hats(nodes_nm: F64, half_width_nm: float | None) -> tuple[tuple[F64, F64], ...]:
+    """Wavelengths and weights, of sum 1, that stand for each band."""
+    if half_width_nm is None and len(nodes_nm) == 1:
+        nm = np.linspace(nodes_nm[0] - _LONE_BAND_NM, nodes_nm[0] + _LONE_BAND_NM, 2 * _HAT_POINTS)
+        return ((nm, np.full(len(nm), 1 / len(nm))),)
+    if half_width_nm == 0:
+        return tuple((np.array([node]), np.ones(1)) for node in nodes_nm)
+    bands = []
+    for k, node in enumerate(nodes_nm):
+        if half_width_nm is None:
+            low, high = nodes_nm[max(k - 1, 0)], nodes_nm[min(k + 1, len(nodes_nm) - 1)]
+        else:
+            low, high = node - half_width_nm, node + half_width_nm
+        share = (np.arange(_HAT_POINTS) + 0.5) / _HAT_POINTS
+        nm = np.concatenate([low + (node - low) * share, high + (node - high) * share])
+        weight = np.concatenate([(node - low) * share, (high - node) * share])
+        bands.append((nm, weight / weight.sum()))
+    return tuple(bands)
+
+
+def _polar(burst: Starburst, sine: F64, bands: Sequence[tuple[F64, F64]], pixel_rad: float) -> F32:
+    """(θ² - σ²) |A|² / λ², float32[band, radius, angle + 1]; `pixel_rad` is the rms width of a pixel."""
+    edge = _edge(burst.stop, burst.pupil_radius_mm)
+    order = 2 * np.arange(burst.angles // 2 + 1)  # of the angle; the odd ones of both ends of a normal cancel
+    excess = sine**2 - burst.sun_radius_rad**2
+    chord = _chord(sine, burst.sun_radius_rad, pixel_rad, burst.angles)
+    grains = _grains(burst, sine, bands, pixel_rad)
+    mm = np.array([nm @ weight for nm, weight in bands]) * 1e-6
+    square = np.array([nm**2 @ weight for nm, weight in bands]) * 1e-12
+
+    first_corner = np.radians(burst.stop.rotation_deg)
+    repeats = order % edge.count == 0 if burst.stop.blades else order == 0
+    turn = edge.normal_rad + first_corner + np.pi / edge.count
+    rim = edge.count / np.pi * np.exp(-1j * order[repeats, None] * turn) @ edge.length_mm
+    nodes, corners = mm[:1], np.zeros((1, len(sine), int(repeats.sum())), dtype=np.complex128)
+    opening = np.pi / edge.count - edge.end_rad
+    if burst.stop.blades and opening > _LEAST_CORNER_RAD:
+        # all that the wavelength changes in a corner is the width of Fresnel's integral
+        if edge.end_curvature_per_mm > _STRAIGHT_PER_MM:
+            nodes = np.linspace(mm[0], mm[-1], min(len(mm), 3))
+        powers = _corner(burst, sine, opening, edge.end_curvature_per_mm, nodes, pixel_rad)
+        turn = np.exp(-1j * order[repeats] * first_corner) * _blur(burst.angles)[repeats]
+        corners = np.fft.rfft(powers, norm="forward")[:, :, repeats] * edge.count * turn
+        corners /= 16 * np.pi**4 * excess[:, None]  # the mean of 1/θ⁴ over the disc is 1 / (θ² - σ²)²
+
+    out = np.empty((len(bands), len(sine), burst.angles + 1), dtype=np.float32)
+    for k in range(len(bands)):
+        total = np.zeros((len(sine), len(order)), dtype=np.complex128)
+        total[:, repeats] = mm[k] / (4 * np.pi**2) * chord[:, repeats] * rim
+        for node, corner in zip(nodes, corners, strict=True):  # Lagrange's polynomials
+            others = nodes[nodes != node]
+            total[:, repeats] += square[k] * np.prod((mm[k] - others) / (node - others)) * corner
+        total[:, 0] += excess * grains[k]
+        out[k, :, :-1] = np.fft.irfft(total, n=burst.angles, norm="forward")
+    _add_scratches(out, chord, burst, sine, bands, pixel_rad)
+    out[..., -1] = out[..., 0]
+    return np.asarray(np.maximum(out, 0, out=out))
+
+
+def _fewest(tables: F32) -> tuple[F32, F32]:
+    """As few tables as will do, and the share of each in each band: a rim goes with λ and corners with λ², so bands
+    differ in more only where defects show fringes."""
+    sample = tables[:, ::2, ::5].reshape(len(tables), -1).astype(np.float64)
+    sample /= np.maximum(sample.mean(axis=0), 1e-30)
+    _, mix = np.linalg.eigh(sample @ sample.T)
+    mix = mix[:, ::-1]
+    for count in range(1, len(tables) // 2):  # with more it is no gain
+        kept = mix[:, :count]
+        if np.abs(sample - kept @ (kept.T @ sample)).max() < _SHARE_LOST:
+            return np.tensordot(kept.T.astype(np.float32), tables, 1), kept.astype(np.float32)
+    return tables, np.eye(len(tables), dtype=np.float32)
+
+
+def _chord(sine: F64, sun_rad: float, pixel_rad: float, angles: int) -> F64:
+    """Fourier coefficients over the angle, of even order, of (2 / π σ²) √(σ² - θ² sin²u), float64[radius, order]:
+    a spike's cross profile, blurred by a pixel and by a step of the table."""
+    from scipy.special import j1
+
+    step = np.pi / angles
+    order = 2.0 * np.arange(angles // 2 + 1)
+    z = order * sun_rad / sine[:, None]
+    with np.errstate(invalid="ignore"):
+        out = np.where(z > 0, 2 * j1(z) / z, 1.0) / sine[:, None]
+    near = sine * _NARROW < sun_rad
+    across = sine[near, None] * np.sin(step * np.arange(angles))
+    profile = 2 / (np.pi * sun_rad**2) * np.sqrt(np.maximum(sun_rad**2 - across**2, 0))
+    out[near] = np.fft.rfft(profile).real * step
+    return np.asarray(out * np.exp(-((order * pixel_rad / sine[:, None]) ** 2) / 2) * _blur(angles))
+
+
+def _blur(angles: int) -> F64:
+    """Coefficients of a blur by (1, 2, 1) / 4, float64[order]: what is narrower than a step must not ring."""
+    return np.asarray(np.cos(np.arange(angles // 2 + 1) * np.pi / angles) ** 2)
+
+
+def _corner(
+    burst: Starburst, sine: F64, opening: float, curvature_per_mm: float, wavelength_mm: F64, pixel_rad: float
+) -> F64:
+    """k⁴ |A|² of one corner less what its edges' normals send, float64[wavelength, radius, angle], the angle from
+    the corner's direction; the normals of its two edges lie `opening` to either side.
+
+    cot ψ and cot² ψ, with the Fresnel integral where edges are bent, are integrals over the coherence y of the disc
+    and a pixel of radius σ' together: with q = θ sin ψ / σ', τ = θ / (2 ρ σ'² k₀) and δ = q₁ + q₂,
+
+        1/q → ∫ μ(y) sin(qy + τy²) / (1 + 2τy/δ) dy,     1/q² → -∫ μ(y) [sin(qy + τy²) - sin(qy)] / (τy) dy;
+
+    where the corner closes, δ → 0, the former cancels the latter.
+    """
+    from scipy.special import j1
+
+    radius = float(np.hypot(burst.sun_radius_rad, 2 * pixel_rad))
+    per_radius = sine[:, None] / radius
+    y = (np.arange(_WING_POINTS) + 0.5) * _WING_STEP
+    q = np.linspace(0, _WING_SUNS, _WING_PLACES)
+    s = y * burst.sun_radius_rad / radius
+    # without the last factor, a twentieth of a radius, the limb would leave a cusp
+    coherence = 2 * j1(s) / s * np.exp(-((y * pixel_rad / radius) ** 2 + (0.05 * y) ** 2) / 2) * _WING_STEP
+    sines, cosines = np.sin(y[:, None] * q), np.cos(y[:, None] * q)
+
+    def integral(of: NDArray[Any]) -> F64:
+        """Im ∫ μ(y) of(y) exp(iqy) dy at -q and q."""
+        odd, even = (coherence * of.real) @ sines, (coherence * of.imag) @ cosines
+        return np.concatenate([(even - odd)[..., :0:-1], even + odd], axis=-1)
+
+    if curvature_per_mm > _STRAIGHT_PER_MM:
+        tau = (curvature_per_mm * sine * wavelength_mm[:, None] / (4 * np.pi * radius**2))[..., None]
+        chirp = np.exp(1j * tau * y**2)
+        square = -integral((chirp - 1) / (tau * y))
+        single = integral(chirp / (1 + tau * y / (per_radius * np.sin(opening))))
+    else:
+        square, single = -integral(1j * y[None, None]), integral(np.ones((1, 1, len(y)), dtype=np.complex128))
+    places = (len(wavelength_mm), len(sine), 2 * len(q) - 1)
+    kernels = [np.ascontiguousarray(np.broadcast_to(kernel, places)) for kernel in (single, square)]
+
+    angle = np.arange(burst.angles // 2 + 1) * np.pi / burst.angles  # the other half is its mirror image
+    total = np.full((len(wavelength_mm), len(sine), len(angle)), 2.0)
+    for psi in (opening - angle, opening + angle):
+        psi = np.mod(psi + np.pi / 2, np.pi) - np.pi / 2
+        at = per_radius * np.sin(psi)
+        near = np.nonzero(np.abs(at) < _WING_SUNS)
+        place = (at[near] + _WING_SUNS) * ((len(q) - 1) / _WING_SUNS)
+        below = np.minimum(place.astype(np.intp), 2 * len(q) - 3)
+        part = place - below
+        with np.errstate(divide="ignore"):
+            inverse = 1 / at
+        cot_scale = np.cos(psi) * per_radius
+        scales = 2 / np.tan(2 * opening) * cot_scale, cot_scale**2
+        for power, scale, kernel in zip((1, 2), scales, kernels, strict=True):
+            for out, table in zip(total, kernel, strict=True):
+                mean = inverse**power
+                mean[near] = table[near[0], below] * (1 - part) + table[near[0], below + 1] * part
+                out += scale * mean
+    return np.concatenate([total, total[..., -2:0:-1]], axis=-1)
+
+
+def _add_scratches(
+    tables: F32, chord: F64, burst: Starburst, sine: F64, bands: Sequence[tuple[F64, F64]], pixel_rad: float
+) -> None:
+    """Add scratches to the tables of `_polar`. A scratch is two edges, and their fringes 4 sin²(kw / 2) =
+    2 - 2 cos(kw) are wide enough to be seen; its spike is widened by its length, whose autocorrelation is a
+    triangle."""
+    defects = burst.defects
+    order = 2 * np.arange(burst.angles // 2 + 1)
+    blur = _ROW_BLUR * np.log(sine[1] / sine[0])
+    mean_k0_per_mm = 2e6 * np.pi / np.mean([nm @ weight for nm, weight in bands])
+    # Gauss's points of the disc seen from its side, weighted by 1/k² there
+    turn = np.arange(1, _DISC_POINTS + 1) * np.pi / (_DISC_POINTS + 1)
+    offset = burst.sun_radius_rad * np.cos(turn)
+    share = np.sin(turn) ** 2 / (sine[:, None] + offset) ** 2
+    share /= share.sum(axis=1, keepdims=True)
+    for length, width, angle in zip(
+        defects.scratch_length_mm, defects.scratch_width_mm, defects.scratch_angle_rad, strict=True
+    ):
+        triangle = np.maximum(1 - order / (sine[:, None] * mean_k0_per_mm * length), 0)
+        spike = chord * triangle * np.exp(-1j * order * (angle + np.pi / 2))
+        spike = np.fft.irfft(spike, n=burst.angles, norm="forward").astype(np.float32)
+        for table, (nm, weight) in zip(tables, bands, strict=True):
+            per_rad = 2e6 * np.pi / nm * width
+            wave = np.exp(1j * sine[:, None] * per_rad) * (share @ np.exp(1j * offset[:, None] * per_rad))
+            wave *= np.exp(-((sine[:, None] * per_rad * blur) ** 2 + (per_rad * pixel_rad) ** 2) / 2)
+            strength = 2 * length / np.pi * ((1 - wave.real) @ (weight * nm)) * (1e-6 / (4 * np.pi**2))
+            table[:, :-1] += strength.astype(np.float32)[:, None] * spike
+
+
+def _grains(burst: Starburst, sine: F64, bands: Sequence[tuple[F64, F64]], pixel_rad: float) -> F64:
+    """|A|² / λ² of all grains, float64[band, radius]: the Hankel transform of their autocorrelations, averaged over
+    the band, times the coherence of the disc."""
+    from scipy.fft import fht
+    from scipy.ndimage import gaussian_filter1d
+    from scipy.special import j1
+
+    diameter = burst.defects.grain_diameter_mm
+    out = np.zeros((len(bands), len(sine)))
+    if not len(diameter):
+        return out
+    share = np.geomspace(1e-6, 1.0, _GRAIN_POINTS)
+    lag_mm = share * diameter.max()
+    autocorrelation = np.zeros(len(lag_mm))
+    for d, count in zip(*np.unique(diameter, return_counts=True), strict=True):
+        x = np.minimum(lag_mm / d, 1)
+        autocorrelation += count * d**2 / 2 * (np.arccos(x) - x * np.sqrt(1 - x * x))
+    y = np.geomspace(1e-4, 1e8, _HANKEL_POINTS)
+    step = np.log(y[1] / y[0])
+    s = y * burst.sun_radius_rad
+    coherence = 2 * j1(s) / s * np.exp(-((y * pixel_rad) ** 2) / 2)
+    for k, (nm, weight) in enumerate(bands):
+        lags = np.log(y)[:, None] + np.log(nm * (1e-6 / (2 * np.pi)))
+        mean = np.interp(lags, np.log(lag_mm), autocorrelation, right=0.0) @ weight
+        spectrum = fht(mean * coherence * y, step, mu=0.0)
+        spectrum = gaussian_filter1d(spectrum, _ROW_BLUR * np.log(sine[1] / sine[0]) / step)
+        out[k] = np.interp(np.log(sine), -np.log(y[::-1]), spectrum * y[::-1]) / (2 * np.pi)
+    return out

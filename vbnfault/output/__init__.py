@@ -1,0 +1,1 @@
+"""How people look at a dataset, a sample or a flare, and take it elsewhere."""

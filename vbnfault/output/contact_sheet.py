@@ -1,0 +1,208 @@
+"""Pictures of a dataset: the contact sheet of `vbnfault preview`."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core.errors import InputError, VbnfaultError
+from ..store import STRATA, Store, open_store
+
+U8 = NDArray[np.uint8]
+
+# R, G, B: distinct on dark images and for colour-blind eyes (after Okabe and Ito), in dataset order.
+COLOURS = (
+    (240, 228, 66),
+    (86, 200, 255),
+    (255, 94, 77),
+    (255, 160, 20),
+    (0, 190, 140),
+    (204, 121, 200),
+    (190, 200, 210),
+    (120, 140, 255),
+    (150, 230, 60),
+    (255, 130, 190),
+    (0, 205, 215),
+    (200, 150, 100),
+    (165, 95, 255),
+    (250, 250, 250),
+)
+_BACKGROUND, _PANEL, _TEXT, _FAINT = (18, 20, 24), (30, 33, 39), (225, 228, 232), (150, 156, 166)
+_TILE_PX = 320  # longer side of a tile
+_GAP_PX, _CAPTION_PX, _LINE_PX = 14, 46, 24
+_FILL = 0.30  # opacity of a mask
+_WHOLE_FRAME = 0.98  # a mask that covers so much is a frame around the tile, not a veil over it
+
+
+def preview(
+    store: str | os.PathLike[str] | Store,
+    out_png: str | os.PathLike[str],
+    *,
+    max_samples: int = 16,
+    masks: bool = True,
+) -> int:
+    """Write a contact sheet of up to `max_samples` finished samples, spread evenly over the store.
+
+    Each tile shows the image with the mask of every injected fault in its colour; the caption gives sample,
+    stratum, site and faults. Returns the number of tiles. Raises InputError where there is no store, no
+    finished sample or no such folder to write to.
+    """
+    store = open_store(store)
+    if max_samples < 1:
+        raise InputError(f"max_samples = {max_samples}: must be at least 1")
+    done = [i for number in range(store.shards) for i, whole in store.done(number).items() if whole]
+    if not done:
+        raise InputError(f"{store.path}: no sample is finished yet, so there is nothing to show")
+    chosen = [done[k] for k in np.unique(np.linspace(0, len(done) - 1, max_samples).round().astype(int))]
+    short = abbreviations(store.spec.faults)
+    tiles = [_tile(store, i, short, masks) for i in chosen]
+    columns = min(len(tiles), max(1, round(np.sqrt(len(tiles) * 1.25))))
+    body = _grid(tiles, columns)
+    name = f"{store.path.name}: {len(chosen)} of {store.samples} samples"
+    sheet = np.vstack([_header(name, store.spec.faults, short, body.shape[1]), body])
+    _write_png(Path(out_png), sheet)
+    return len(tiles)
+
+
+def abbreviations(faults: Sequence[str]) -> dict[str, str]:
+    """Initials of the words of each fault's name (`dust_on_optics` → DO), lengthened where two are equal."""
+    short: dict[str, str] = {}
+    for fault in faults:
+        words = [w for w in fault.split("_") if w not in ("on", "of", "the")]
+        for n in range(1, len(fault) + 1):
+            candidate = "".join(w[:1] for w in words[:-1]).upper() + words[-1][:n].capitalize()
+            if n == 1:
+                candidate = candidate.upper() if len(words) > 1 else words[0][:2].capitalize()
+            if candidate not in short.values():
+                break
+        short[fault] = candidate
+    return short
+
+
+def overlay(rgb: U8, mask: NDArray[np.bool_], injected: Sequence[bool]) -> U8:
+    """RGB uint8[y, x, 3] with the masks bool[fault, y, x] of injected faults: a veil and an outline each.
+
+    A mask that covers nearly everything is drawn as a border, one beside the other, so that the image and
+    the local masks stay visible.
+    """
+    out = rgb.copy()
+    height, width = rgb.shape[:2]
+    line = max(1, round(max(height, width) / 300))
+    borders = 0
+    for k in sorted(np.flatnonzero(injected).tolist(), key=lambda k: -int(mask[k].sum())):
+        colour = COLOURS[k % len(COLOURS)]
+        if mask[k].mean() > _WHOLE_FRAME:
+            inset = borders * 3 * line + line
+            cv2.rectangle(out, (inset, inset), (width - 1 - inset, height - 1 - inset), colour, 2 * line)
+            borders += 1
+            continue
+        veil = out[mask[k]] * (1 - _FILL) + np.array(colour) * _FILL
+        out[mask[k]] = veil.astype(np.uint8)
+        contours, _ = cv2.findContours(mask[k].astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
+        cv2.drawContours(out, contours, -1, colour, line, cv2.LINE_AA)
+    return out
+
+
+def _tile(store: Store, index: int, short: Mapping[str, str], masks: bool) -> U8:
+    spec = store.spec
+
+    def one(name: str) -> Any:
+        return store.read(name, index, index + 1)[0]
+
+    scale = _TILE_PX / max(spec.height, spec.width)
+    size = (max(1, round(spec.width * scale)), max(1, round(spec.height * scale)))
+    # masks are enlarged by nearest neighbour and shrunk by "any of it": a lone broken pixel stays visible
+    rgb = _resized(one("image")[..., :3], size)
+    injected = one("injected").astype(bool)
+    if masks:
+        small = np.stack([_resized_mask(m, size) for m in one("mask")])
+        rgb = overlay(rgb, small, injected.tolist())
+    tile = np.full((size[1] + _CAPTION_PX, size[0], 3), _PANEL, np.uint8)
+    tile[: size[1]] = rgb
+    site = int(one("site"))
+    place = spec.site_names[site] if 0 <= site < len(spec.site_names) else f"site {site}"
+    _write(tile, f"#{index}", (8, size[1] + 19), _TEXT, 0.48)
+    right = f"{STRATA[int(one('stratum'))]}  {place}"
+    _write(tile, right, (size[0] - 8 - _text_width(right, 0.4), size[1] + 19), _FAINT, 0.4)
+    x = 8
+    for k in np.flatnonzero(injected):
+        fault = spec.faults[k]
+        cv2.circle(tile, (x + 4, size[1] + 34), 4, COLOURS[k % len(COLOURS)], -1, cv2.LINE_AA)
+        _write(tile, short[fault], (x + 12, size[1] + 38), _TEXT, 0.4)
+        x += 22 + _text_width(short[fault], 0.4)
+    if not injected.any():
+        _write(tile, "no fault", (8, size[1] + 38), _FAINT, 0.4)
+    return tile
+
+
+def _resized(image: U8, size: tuple[int, int]) -> U8:
+    shrinks = size[0] <= image.shape[1]
+    how = cv2.INTER_AREA if shrinks else cv2.INTER_NEAREST
+    return np.asarray(cv2.resize(np.ascontiguousarray(image), size, interpolation=how), dtype=np.uint8)
+
+
+def _resized_mask(mask: NDArray[np.bool_], size: tuple[int, int]) -> NDArray[np.bool_]:
+    """True where any pixel of the mask falls into the new one."""
+    if size[0] > mask.shape[1]:
+        return cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST).astype(bool)
+    return cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 1e-6
+
+
+def _grid(tiles: Sequence[U8], columns: int) -> U8:
+    height, width = tiles[0].shape[:2]
+    rows = -(-len(tiles) // columns)
+    shape = (rows * (height + _GAP_PX) + _GAP_PX, columns * (width + _GAP_PX) + _GAP_PX, 3)
+    sheet = np.full(shape, _BACKGROUND, np.uint8)
+    for k, tile in enumerate(tiles):
+        y = (k // columns) * (height + _GAP_PX) + _GAP_PX
+        x = (k % columns) * (width + _GAP_PX) + _GAP_PX
+        sheet[y : y + height, x : x + width] = tile
+    return sheet
+
+
+def _header(name: str, faults: Sequence[str], short: Mapping[str, str], width: int) -> U8:
+    """Name of the store, and the legend in as many lines as it takes."""
+    entries = [(k, f"{short[f]}  {f.replace('_', ' ')}") for k, f in enumerate(faults)]
+    places, x, line = [], _GAP_PX, 0
+    for _, text in entries:
+        needed = _text_width(text, 0.42) + 38
+        if x > _GAP_PX and x + needed > width - _GAP_PX:
+            x, line = _GAP_PX, line + 1
+        places.append((x, line))
+        x += needed
+    header = np.full((46 + (line + 1) * _LINE_PX, width, 3), _BACKGROUND, np.uint8)
+    _write(header, name, (_GAP_PX, 30), _TEXT, 0.6)
+    for (k, text), (x, line) in zip(entries, places, strict=True):
+        y, colour = 44 + line * _LINE_PX, COLOURS[k % len(COLOURS)]
+        veil = tuple(int(c * 0.55) for c in colour)
+        cv2.rectangle(header, (x, y), (x + 14, y + 14), veil, -1)
+        cv2.rectangle(header, (x, y), (x + 14, y + 14), colour, 1, cv2.LINE_AA)
+        _write(header, text, (x + 22, y + 12), _TEXT, 0.42)
+    return header
+
+
+def _write(image: U8, text: str, at: tuple[int, int], colour: tuple[int, int, int], scale: float) -> None:
+    plain = text.encode("ascii", "replace").decode()  # the font has no more
+    cv2.putText(image, plain, at, cv2.FONT_HERSHEY_SIMPLEX, scale, colour, 1, cv2.LINE_AA)
+
+
+def _text_width(text: str, scale: float) -> int:
+    return int(cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, scale, 1)[0][0])
+
+
+def _write_png(path: Path, rgb: U8) -> None:
+    if path.suffix.lower() != ".png":
+        raise InputError(f"{path}: the sheet is a PNG, so its name must end in .png")
+    encoded = cv2.imencode(".png", np.ascontiguousarray(rgb[..., ::-1]))[1]
+    try:
+        path.write_bytes(encoded.tobytes())
+    except (FileNotFoundError, NotADirectoryError, PermissionError) as error:
+        raise InputError(f"{path}: cannot be written: {error.strerror}") from error
+    except OSError as error:
+        raise VbnfaultError(f"{path}: cannot be written: {error.strerror}") from error

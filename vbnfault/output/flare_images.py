@@ -1,0 +1,252 @@
+"""Straylight of a lens by itself: a picture on black, and a table of every ghost."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ..camera import Camera
+from ..core import spectra
+from ..core.errors import InputError
+from ..core.quantities import Electrons
+from ..detector import Detector
+from ..faults import FaultContext, registry
+from ..lens import Prescription, ThinLens, first_order
+from ..lens.straylight.paraxial import Ghost, axial_transmittance, mean_ghost, paraxial_ghosts
+from ..lens.straylight.total import VEIL_FRACTION, Cleanliness, straylight
+from ..scene import config
+
+F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
+
+MODELS = ("traced", "paraxial", "texture")
+_BANDS = 8
+_ACROSS_SPECTRUM = 192
+_SHOWN_PERCENTILE = 99.7
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class View:
+    """A lens and where the Sun is; the picture's middle lies on the axis.
+
+    Angles in degrees, azimuth 0 to the right, 90 down; `fov_deg` across the picture's width; `wavelength_nm`
+    float64[band].
+    """
+
+    lens: Prescription
+    sun_deg: float
+    azimuth_deg: float = 0.0
+    fov_deg: float = 65.0
+    pixels: int = 1024
+    wavelength_nm: F64
+    sun_distance_au: float = 1.0
+    model: str = "traced"
+    reflections: int = 2
+    roughness_nm: float = 1.0
+    cleanliness_level: float = 0.0
+    veil_fraction: float = VEIL_FRACTION
+
+    @property
+    def pitch_mm(self) -> float:
+        """Of the picture's pixels."""
+        return 2 * first_order(self.lens).efl_mm * float(np.tan(np.radians(self.fov_deg / 2))) / self.pixels
+
+    @property
+    def sun_xy_mm(self) -> tuple[float, float]:
+        """The Sun's own image, f tan θ from the axis."""
+        radius, turn = (
+            first_order(self.lens).efl_mm * np.tan(np.radians(self.sun_deg)),
+            np.radians(self.azimuth_deg),
+        )
+        return float(radius * np.cos(turn)), float(radius * np.sin(turn))
+
+
+def wavelengths_nm(one: float | None = None) -> F64:
+    """A single wavelength, or the nodes of the cameras' default bands. Raises InputError."""
+    if one is None:
+        return spectra.band_nodes_nm(400.0, 700.0, _BANDS)
+    if not 250 <= one <= 2500:
+        raise InputError(f"--wavelength-nm {one:g}: must be from 250 to 2500")
+    return np.array([float(one)])
+
+
+def layers(view: View) -> dict[str, F32]:
+    """Irradiance over the Sun's at the entrance, float32[band, y, x] each: `sun`, `ghosts`, `starburst`, `glare`,
+    `veil`; of model texture `sun` and `texture`, in units of white.
+
+    `sun` is the direct image: what the lens transmits of the light that enters the pupil, less what starburst,
+    glare and veil take from it (`lens.straylight`). The textures take nothing.
+    """
+    sun = _direct_image(view)
+    if view.model == "texture":
+        return {"sun": sun, "texture": _textures(view)}
+    found = straylight(
+        view.lens,
+        model=view.model,
+        wavelength_nm=view.wavelength_nm,
+        shape=(view.pixels, view.pixels),
+        pitch_mm=view.pitch_mm,
+        sun_deg=view.sun_deg,
+        azimuth_deg=view.azimuth_deg,
+        sun_radius_rad=spectra.sun_angular_radius_rad(view.sun_distance_au),
+        cleanliness=Cleanliness(roughness_nm=view.roughness_nm, level=view.cleanliness_level),
+        reflections=view.reflections,
+        veil_fraction=view.veil_fraction,
+    )
+    sun *= found.direct_fraction[:, None, None].astype(np.float32)
+    return {
+        "sun": sun,
+        "ghosts": found.ghosts,
+        "starburst": found.starburst,
+        "glare": found.glare,
+        "veil": found.veil,
+    }
+
+
+def ghosts(view: View, progress: Callable[[int], None] | None = None) -> tuple[Ghost, ...]:
+    """Every ghost of a point Sun; over several bands, means weighted by the Sun's spectrum. `progress` is told of
+    each wavelength that is done, by a 1."""
+    weight = spectra.solar_band_irradiance_W_m2_nm(view.wavelength_nm, 1.0)
+    weight = weight / weight.sum()
+    found: dict[tuple[int, ...], list[tuple[float, Ghost]]] = {}
+    for nm, share in zip(view.wavelength_nm, weight, strict=True):
+        for ghost in _ghosts_at(view, float(nm), alone=len(weight) == 1):
+            found.setdefault(ghost.pair, []).append((float(share), ghost))
+        if progress is not None:
+            progress(1)
+    return tuple(mean_ghost(rows) for _, rows in sorted(found.items()))
+
+
+def _ghosts_at(view: View, wavelength_nm: float, *, alone: bool) -> tuple[Ghost, ...]:
+    from ..lens.straylight.ghosts import traced_ghosts
+
+    if view.model == "paraxial":
+        return paraxial_ghosts(view.lens, view.sun_deg, azimuth_deg=view.azimuth_deg, wavelength_nm=wavelength_nm)
+    return traced_ghosts(
+        view.lens,
+        view.sun_deg,
+        azimuth_deg=view.azimuth_deg,
+        wavelength_nm=wavelength_nm,
+        reflections=view.reflections,
+        across=None if alone else _ACROSS_SPECTRUM,
+    )
+
+
+def _direct_image(view: View) -> F32:
+    """Return the Sun's own image, a uniform disc at least a pixel wide, float32[band, y, x].
+
+    Its power over the Sun's irradiance is T(λ) A cos θ: the transmittance of the image path, and the area of the
+    paraxial entrance pupil, by which the ghosts' fluxes are counted too.
+    """
+    optics = first_order(view.lens)
+    radius_px = max(
+        optics.efl_mm * spectra.sun_angular_radius_rad(view.sun_distance_au) / view.pitch_mm, np.sqrt(1 / np.pi)
+    )
+    x, y = (v / view.pitch_mm + view.pixels / 2 for v in view.sun_xy_mm)
+    # the whole disc first, so that its sum is known wherever the frame cuts it
+    reach = int(np.ceil(radius_px)) + 1
+    columns, rows = (int(np.floor(v)) + np.arange(-reach, reach + 1) for v in (x, y))
+    cover = np.clip(radius_px - np.hypot(columns[None, :] + 0.5 - x, rows[:, None] + 0.5 - y) + 0.5, 0, 1)
+    cover /= cover.sum() * view.pitch_mm**2
+    inside = [(v >= 0) & (v < view.pixels) for v in (rows, columns)]
+    out = np.zeros((len(view.wavelength_nm), view.pixels, view.pixels), dtype=np.float32)
+    power = axial_transmittance(view.lens, view.wavelength_nm) * np.cos(np.radians(view.sun_deg))
+    power *= np.pi / 4 * optics.entrance_pupil_diameter_mm**2
+    within = cover[np.ix_(*inside)]
+    out[:, rows[inside[0]][:, None], columns[inside[1]]] = power[:, None, None] * within
+    return out
+
+
+def _textures(view: View) -> F32:
+    """One draw of the texture model with the Sun in the same place, R, G, B in units of white, float32[3, y, x]."""
+    focal_px = first_order(view.lens).efl_mm / view.pitch_mm
+    detector = Detector(width_px=view.pixels, height_px=view.pixels)
+    lens = ThinLens(focal_length_mm=focal_px * detector.pixel_pitch_um * 1e-3, f_number=4.0)
+    x, y = (v / view.pitch_mm + view.pixels / 2 for v in view.sun_xy_mm)
+    context = FaultContext(
+        camera=Camera(lens=lens, detector=detector), sun_xy_px=np.array([x, y]), sun_visible_fraction=1.0
+    )
+    fault = registry()["straylight"]["texture"]()
+    params = fault.draw(context, config.rng(0, 0, "flare", "texture"))
+    black = np.zeros((view.pixels, view.pixels, 3), dtype=np.float32)
+    drawn = fault.apply(Electrons(array=black, white_e=detector.white_e), params, context)
+    return np.ascontiguousarray(np.moveaxis(drawn.array / detector.white_e, -1, 0))
+
+
+def colours(view: View, irradiance: F32) -> F32:
+    """Linear R, G, B as the default detector sees sunlight of that irradiance, float32[y, x, 3]; a single
+    wavelength is shown grey."""
+    if len(view.wavelength_nm) == 1:
+        return np.repeat(irradiance[0][..., None], 3, axis=2)
+    detector = Detector()
+    sun = spectra.solar_band_irradiance_W_m2_nm(view.wavelength_nm, 1.0)
+    weight = detector.electron_rate_weights(view.wavelength_nm) * sun
+    weight = weight / weight.sum(axis=1, keepdims=True)
+    return np.asarray(np.einsum("cb,byx->yxc", weight, irradiance), dtype=np.float32)
+
+
+def picture(view: View, found: dict[str, F32], white: float | None = None) -> NDArray[np.uint8]:
+    """The layers as a picture, uint8[y, x, 3] R, G, B, sRGB; `white`: irradiance shown as white, else that of a
+    bright ghost."""
+    if "texture" in found:
+        linear = np.moveaxis(found["texture"], 0, -1) + 1e3 * (colours(view, found["sun"]) > 0)
+        white = 1.0 if white is None else white
+    else:
+        linear = colours(view, sum(found.values(), np.zeros_like(found["sun"])))
+        if white is None:
+            ghosts_ = colours(view, found["ghosts"] + found["glare"] + found["veil"]).max(axis=2)
+            white = max(float(np.percentile(ghosts_, _SHOWN_PERCENTILE)), 1e-30)
+    level = np.clip(linear / np.float32(white), 0, 1)
+    shown = np.where(level <= 0.0031308, 12.92 * level, 1.055 * level ** (1 / 2.4) - 0.055)
+    return np.asarray(np.rint(255 * shown), dtype=np.uint8)
+
+
+def write_picture(view: View, found: dict[str, F32], path: Path) -> None:
+    """Write the layers: `.png`, or `.exr` with R, G, B and `<layer>.<wavelength>nm` of every band."""
+    if path.suffix.lower() == ".png":
+        ok, data = cv2.imencode(".png", picture(view, found)[..., ::-1])
+        assert ok
+        path.write_bytes(data.tobytes())
+        return
+    import OpenEXR
+
+    channels: dict[str, Any] = {}
+    for name, layer in found.items():
+        labels = "RGB" if name == "texture" else [f"{nm:.1f}nm" for nm in view.wavelength_nm]
+        channels |= {f"{name}.{label}": band.copy() for label, band in zip(labels, layer, strict=True)}
+    if "texture" in found:
+        rgb = np.moveaxis(found["texture"], 0, -1)
+    else:
+        rgb = colours(view, sum(found.values(), np.zeros_like(found["sun"])))
+    channels |= {c: np.ascontiguousarray(rgb[..., k]) for k, c in enumerate("RGB")}
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    OpenEXR.File(header, channels).write(str(path))
+
+
+def table(view: View, found: tuple[Ghost, ...]) -> dict[str, Any]:
+    """The ghosts as plain data."""
+    optics = first_order(view.lens)
+    return {
+        "lens": view.lens.name,
+        "model": view.model,
+        "sun_deg": view.sun_deg,
+        "azimuth_deg": view.azimuth_deg,
+        "wavelength_nm": [float(nm) for nm in view.wavelength_nm],
+        "efl_mm": optics.efl_mm,
+        "entrance_pupil_diameter_mm": optics.entrance_pupil_diameter_mm,
+        "sun_xy_mm": list(view.sun_xy_mm),
+        "total_flux_fraction": float(sum(ghost.flux_fraction for ghost in found)),
+        "ghosts": [asdict(ghost) for ghost in found],
+    }
+
+
+def write_table(view: View, found: tuple[Ghost, ...], path: Path) -> None:
+    """Write `table` as JSON."""
+    path.write_text(json.dumps(table(view, found), indent=2) + "\n", encoding="utf-8")

@@ -1,0 +1,136 @@
+"""One sample as files a person can open: EXR for radiance and truth, PNG for pictures and masks, JSON."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core.errors import VbnfaultError
+from ..core.quantities import Sample
+from ..pipeline import labels
+from ..pipeline.record import to_sample
+from ..pipeline.spec import Frame
+from . import contact_sheet
+
+_MARKED_GHOSTS = 10
+
+
+def write_frame(frame: Frame, folder: Path) -> list[Path]:
+    """Write one simulated frame to `folder` (made if missing); returns the files.
+
+    `sample.exr`: `radiance.<wavelength>nm` (W m⁻² sr⁻¹ nm⁻¹), `depth.Z` (m), `normal.X/Y/Z` (C frame),
+    `semantic`, and the soft layers of the scene; `image.png`, `clean.png`, `without_<fault>.png` as RGB, each with
+    its intensity channel beside it;
+    `mask_<fault>.png`, `mask_any.png`; `annotated_<fault>.png`, the image with a class pointed out;
+    `parameters.json` with every scalar of the dataset.
+    Raises VbnfaultError where a file cannot be written.
+    """
+    sample = to_sample(frame)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        files = [_write_exr(frame, sample, folder / "sample.exr")]
+        for name, layer in sample.layers.items():
+            if layer.ndim == 3 and layer.shape[-1] == 4:
+                files.append(_write_png(folder / f"{name}.png", layer[..., 2::-1]))
+                files.append(_write_png(folder / f"{name}_intensity.png", layer[..., 3]))
+        for layer_name, prefix in (("mask", "mask_"), ("mask_effect", "mask_effect_")):
+            for fault, mask in zip(frame.spec.faults, sample.layers.get(layer_name, ()), strict=False):
+                files.append(_write_png(folder / f"{prefix}{fault}.png", mask.astype(np.uint8) * 255))
+        union = sample.layers["mask_any"].astype(np.uint8) * 255
+        files.append(_write_png(folder / "mask_any.png", union))
+        for name in frame.drawn:
+            files.append(_write_png(folder / f"annotated_{name}.png", annotated(frame, name)[..., ::-1]))
+        path = folder / "parameters.json"
+        path.write_text(json.dumps(_plain(sample), indent=2) + "\n")
+        return [*files, path]
+    except OSError as error:
+        raise VbnfaultError(f"{error.filename or folder}: cannot be written: {error.strerror}") from None
+
+
+def annotated(frame: Frame, fault: str) -> NDArray[np.uint8]:
+    """The image with one class pointed out, uint8[y, x, 3] R, G, B: the outline of its mask and, for straylight,
+    the line from the Sun through the centre with every flare's or bright ghost's centre and radius on it."""
+    names = list(frame.spec.faults)
+    colour = contact_sheet.COLOURS[names.index(fault) % len(contact_sheet.COLOURS)]
+    picture = np.ascontiguousarray(frame.images["image"].array[..., :3])
+    picture[labels.outline(frame.mask[names.index(fault)])] = colour
+    params, sun = frame.drawn[fault], frame.context.sun_xy_px
+    marks = _marks(params, sun, frame.camera.width_px, frame.camera.height_px)
+    if marks and sun is not None:
+        centre = np.array([frame.camera.width_px / 2, frame.camera.height_px / 2])
+
+        def at(point: NDArray[np.float64]) -> tuple[int, int]:
+            # a pixel's centre lies at +0.5 here and at 0 in OpenCV, whose points have 1/16 px with shift = 4
+            return round(float(point[0] - 0.5) * 16), round(float(point[1] - 0.5) * 16)
+
+        far = sun + 2.2 * (centre - sun)
+        cv2.line(picture, at(sun), at(far), (255, 255, 255), 1, cv2.LINE_AA, 4)
+        cv2.circle(picture, at(sun), 10 * 16, (255, 255, 255), 1, cv2.LINE_AA, 4)
+        for name, middle, radius in marks:
+            cv2.circle(picture, at(middle), round(radius * 16), colour, 1, cv2.LINE_AA, 4)
+            x, y = (round(float(v) - 0.5) for v in middle)
+            cv2.drawMarker(picture, (x, y), colour, cv2.MARKER_CROSS, 13, 1)
+            cv2.putText(picture, name, (x + 8, y - 6), cv2.FONT_HERSHEY_SIMPLEX, 0.5, colour, 1)
+    return picture
+
+
+def _marks(
+    params: Mapping[str, Any], sun: NDArray[np.float64] | None, width: int, height: int
+) -> list[tuple[str, NDArray[np.float64], float]]:
+    """Name, place and radius in pixels of what straylight has drawn: textures, or a lens's brightest ghosts, whose
+    radius is that of a disc with their spread."""
+    if sun is None:
+        return []
+    centre = np.array([width / 2, height / 2])
+    marks = [
+        (str(flare["index"]), sun + flare["position"] * (centre - sun), flare["radius"] * width)
+        for flare in params.get("flares", ())
+    ]
+    for ghost in params.get("ghosts", ())[:_MARKED_GHOSTS]:
+        place = np.array([ghost["x_px"], ghost["y_px"]])
+        if np.abs(place - centre).max() < width and ghost["rms_radius_px"] < width:
+            marks.append(("-".join(map(str, ghost["pair"])), place, np.sqrt(2) * ghost["rms_radius_px"]))
+    return marks
+
+
+def _plain(sample: Sample) -> dict[str, Any]:
+    def plain(value: Any) -> Any:
+        if isinstance(value, np.ndarray):
+            return [None if isinstance(v, float) and np.isnan(v) else v for v in value.ravel().tolist()]
+        return value
+
+    return {"sample": sample.index, **{name: plain(value) for name, value in sample.scalars.items()}}
+
+
+def _write_png(path: Path, array: NDArray[np.uint8]) -> Path:
+    ok, data = cv2.imencode(".png", np.ascontiguousarray(array))
+    if not ok:
+        raise VbnfaultError(f"{path}: PNG encoding failed")
+    path.write_bytes(data.tobytes())
+    return path
+
+
+def _write_exr(frame: Frame, sample: Sample, path: Path) -> Path:
+    import OpenEXR
+
+    truth = frame.truth
+    channels: dict[str, NDArray[Any]] = {
+        f"radiance.{wavelength:.1f}nm": np.ascontiguousarray(band)
+        for wavelength, band in zip(frame.radiance.wavelength_nm, frame.radiance.array, strict=True)
+    }
+    channels["depth.Z"] = truth.depth_m
+    normal = truth.normal.astype(np.float32)
+    channels |= {f"normal.{axis}": np.ascontiguousarray(normal[..., k]) for k, axis in enumerate("XYZ")}
+    channels["semantic"] = truth.semantic.astype(np.uint32)
+    soft = [fault.soft_layer for fault in frame.spec.faults.values()]
+    channels |= {name: sample.layers[name] for name in soft if name in sample.layers}
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    # OpenEXR takes writeable arrays only
+    OpenEXR.File(header, {name: array.copy() for name, array in channels.items()}).write(str(path))
+    return path

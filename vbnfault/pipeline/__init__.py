@@ -1,0 +1,5 @@
+"""What happens to one sample, in order: resolve, render, meter, photograph, label."""
+
+from .session import STAGES, VIEW_STAGES, Session, develop_frame
+
+__all__ = ["STAGES", "VIEW_STAGES", "Session", "develop_frame"]

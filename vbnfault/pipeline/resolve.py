@@ -1,0 +1,226 @@
+"""Where a sample's camera and Sun are: the plan's views, tried against the terrain until one can be used."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core import frames
+from ..core.errors import VbnfaultError
+from ..render.description import Sunlight
+from ..scene import plan
+from ..world import assemble
+from ..world.spacecraft import SpacecraftMesh
+from .spec import Frame, Pose, SampleSpec
+
+F64 = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+# Views are tried so many at a time: batches of one size share one kernel.
+_BATCH = 8
+# Rays each way over the frame that look for sunlit ground: 576, so 5 % of the frame is told to 0.9 %.
+_LIT_GRID = 24
+
+
+def resolve(frame: Frame) -> None:
+    """Take the first of the sample's views, in the plan's order, that meets every condition.
+
+    Nothing lies within the clearance, camera and spacecraft are above the ground, a Sun-averted camera does not
+    look at the Sun, a sample whose faults need the Sun sees the whole of it, and enough of the frame is sunlit
+    ground (`geometry`). A spacecraft that SPICE places stays where it is. Raises VbnfaultError that names the
+    sample and what could not be met.
+    """
+    if frame.spec.scene.spice.spacecraft:
+        frame.pose = _on_the_trajectory(frame.spec)
+        return
+    most = frame.spec.scene.geometry.max_tries
+    unmet: dict[str, int] = {}
+    for start in range(frame.first_try, frame.first_try + most, _BATCH):
+        views = _Views.of(frame.spec, start)
+        count = min(_BATCH, frame.first_try + most - start)
+        chosen = _first_usable(frame.spec, views, count, unmet)
+        if chosen is not None:
+            frame.pose = views.pose(chosen, start)
+            return
+    spec = frame.spec
+    conditions = "; ".join(f"{text} ({n} of {most} tries did not)" for text, n in unmet.items())
+    stratum = plan.STRATA[spec.plan.stratum[spec.index]]
+    raise VbnfaultError(
+        f"sample {spec.index} ({stratum}, site {spec.plan.site[spec.index]}): no view met every condition in "
+        f"geometry.max_tries = {most} tries: {conditions}; widen the bounds of [geometry], relax the condition, or "
+        f"raise max_tries"
+    )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Views:
+    """A batch of views: the plan's `variables`, and what follows from them, float64[view, ...]."""
+
+    variables: list[dict[str, float]]
+    ground_m: F64
+    height_m: F64
+    position_L_m: F64
+    L_from_C: F64
+    suns: list[Sunlight]
+    sun_visible: F64 = field(default_factory=lambda: np.ones(_BATCH))
+
+    @staticmethod
+    def of(spec: SampleSpec, start: int) -> _Views:
+        """Return the views of the tries from `start` on."""
+        from .. import render
+
+        scene = spec.scene
+        drawn = [spec.plan.view(scene, spec.index, start + k) for k in range(_BATCH)]
+        x, y, height = (np.array([d[name] for d in drawn]) for name in ("x_m", "y_m", "height_m"))
+        above = max(300.0, 2 * float(np.hypot(x, y).max()))
+        ground = render.ground_height_m(spec.terrain.surface, x, y, above)
+        if scene.geometry.height_reference == "local_ground":
+            height = ground + height
+        directions = [frames.direction_L(d["sun_azimuth_deg"], d["sun_elevation_deg"]) for d in drawn]
+        light = assemble.sunlight(scene, directions[0])
+        suns = [replace(light, direction_L=direction) for direction in directions]
+        to_the_sun = plan.strata(scene)[spec.plan.stratum[spec.index]].reference == "sun"
+        down = np.array([0.0, 0.0, 1.0])
+        axes = [
+            frames.L_from_C(sun if to_the_sun else down, d["roll_deg"], d["pitch_deg"], d["yaw_deg"])
+            for sun, d in zip(directions, drawn, strict=True)
+        ]
+        position = np.column_stack([x, y, -height])
+        visible = render.sun_visible_fraction(spec.terrain.surface, position, suns, np.stack(axes))
+        return _Views(
+            variables=drawn,
+            ground_m=ground,
+            height_m=height,
+            position_L_m=position,
+            L_from_C=np.stack(axes),
+            suns=suns,
+            sun_visible=visible,
+        )
+
+    def sun_angle_deg(self) -> F64:
+        """Return the angle between boresight and Sun."""
+        cosine = [axes[:, 2] @ sun.direction_L for axes, sun in zip(self.L_from_C, self.suns, strict=True)]
+        return np.asarray(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
+
+    def pose(self, k: int, start: int) -> Pose:
+        """Return one of the views as the pose of its sample."""
+        return Pose(
+            position_L_m=self.position_L_m[k],
+            L_from_C=self.L_from_C[k],
+            sun_L=self.suns[k].direction_L,
+            sun_azimuth_deg=self.variables[k]["sun_azimuth_deg"],
+            sun_elevation_deg=self.variables[k]["sun_elevation_deg"],
+            sun_visible_fraction=float(self.sun_visible[k]),
+            tries=start + k + 1,
+            variables=self.variables[k],
+            resolved=True,
+        )
+
+
+def _first_usable(spec: SampleSpec, views: _Views, count: int, unmet: dict[str, int]) -> int | None:
+    """The first of `count` views that meets every condition; else None, and `unmet` counts what failed."""
+    from .. import render
+
+    scene, surface, vehicle = spec.scene, spec.terrain.surface, spec.terrain.vehicle
+    geometry, stratum = scene.geometry, int(spec.plan.stratum[spec.index])
+    clearance = f"geometry.clearance_m = {geometry.clearance_m:g} m to any surface"
+    met: dict[str, Mask] = {
+        "the camera above the ground": views.height_m >= views.ground_m,
+        clearance: render.is_clear(surface, views.position_L_m, geometry.clearance_m),
+    }
+    if stratum == plan.SUN_AVERTED:
+        least = plan.least_sun_angle_deg(scene)
+        met[f"the Sun at least {least:.1f} deg from the boresight"] = views.sun_angle_deg() >= least
+    if geometry.sun_visibility == "required" and any(spec.faults[name].needs_sun for name in spec.commanded):
+        # behind the camera it makes no straylight: known before anything is rendered
+        seen = (views.sun_visible == 1.0) & (views.sun_angle_deg() < 90)
+        met["the whole Sun visible before the camera, as straylight needs it"] = seen
+    good = np.logical_and.reduce(list(met.values()))
+    lit_fraction = plan.strata(scene)[stratum].min_lit_fraction
+    if lit_fraction and good[:count].any():
+        enough = _lit_fraction(spec, views) >= lit_fraction
+        met[f"geometry.min_lit_fraction = {lit_fraction:g} of the frame sunlit ground"] = enough | ~good
+        good = good & enough
+    for k in np.flatnonzero(good[:count]):
+        if vehicle is None:
+            return int(k)
+        parts = views.position_L_m[k] + vehicle.outline_B_m @ views.L_from_C[k].T
+        if not render.is_between(surface, views.position_L_m[k], parts):
+            return int(k)
+        met.setdefault("the spacecraft above the ground", np.ones(len(good), dtype=bool))[k] = False
+    for text, each in met.items():
+        failed = int(np.count_nonzero(~each[:count]))
+        if failed:
+            unmet[text] = unmet.get(text, 0) + failed
+    return None
+
+
+def _lit_fraction(spec: SampleSpec, views: _Views) -> F64:
+    """Return the fraction of each view's frame that shows sunlit ground, by a grid of rays of a pinhole camera."""
+    from .. import render
+
+    camera, vehicle = spec.scene.camera, spec.terrain.vehicle
+    rays_C = _grid_rays_C(camera.fov_deg, camera.height_px / camera.width_px)
+    rays_L = np.einsum("vij,nj->vni", views.L_from_C, rays_C)
+    sun_L = np.stack([sun.direction_L for sun in views.suns])
+    lit = render.sunlit_ground(spec.terrain.surface, views.position_L_m, rays_L, sun_L)
+    if vehicle is not None:
+        lit &= ~_hidden_by(vehicle, camera.fov_deg, camera.height_px / camera.width_px)
+    return np.asarray(lit.mean(axis=1))
+
+
+def _grid_rays_C(fov_deg: float, height_over_width: float) -> F64:
+    """Unit directions through the centres of a grid of cells over the frame, float64[ray, 3]."""
+    at = (np.arange(_LIT_GRID) + 0.5) / _LIT_GRID * 2 - 1
+    slope = np.tan(np.radians(fov_deg) / 2)
+    x, y = np.meshgrid(slope * at, slope * height_over_width * at)
+    rays = np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3)
+    return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))
+
+
+@lru_cache(maxsize=4)
+def _hidden_by(vehicle: SpacecraftMesh, fov_deg: float, height_over_width: float) -> Mask:
+    """Which rays of the grid meet the spacecraft, bool[ray]: the same in every view."""
+    return vehicle.blocked(_grid_rays_C(fov_deg, height_over_width))
+
+
+def _on_the_trajectory(spec: SampleSpec) -> Pose:
+    """Camera and Sun where SPICE has them at the sample's epoch, which is its scene's.
+
+    Such a pose is what was flown, so none is drawn in its place. A camera within the clearance of the ground means
+    that kernels and shape do not belong together: VbnfaultError. Where the Sun is hidden or behind the camera of a
+    sample whose faults need it, those are not injected, and the pose is marked as not resolved.
+    """
+    from .. import render
+
+    scene, site, surface = spec.scene, spec.terrain.site, spec.terrain.surface
+    placed = assemble.spacecraft_pose(scene, scene.sun.julian_date)
+    sun_J_au, T_from_J = assemble.ephemeris(scene)
+    L_from_T = site.T_from_L.T
+    position = L_from_T @ (placed.camera_position_T_m - site.position_T_m)
+    axes, sun_L = L_from_T @ placed.T_from_C, L_from_T @ T_from_J @ frames.unit(sun_J_au)
+    light = assemble.sunlight(scene, sun_L)
+    visible = float(render.sun_visible_fraction(surface, position[None], [light], axes[None])[0])
+    azimuth, elevation = frames.azimuth_elevation_deg(sun_L)
+    clearance = scene.geometry.clearance_m
+    if not render.is_clear(surface, position[None], clearance)[0]:
+        raise VbnfaultError(
+            f"sample {spec.index}: at Julian date {scene.sun.julian_date:.6f} spice.spacecraft = "
+            f"{scene.spice.spacecraft!r} is within geometry.clearance_m = {clearance:g} m of the ground; choose "
+            f"other dates, or the body.shape that the kernels were made for"
+        )
+    needs_sun = any(spec.faults[name].needs_sun for name in spec.commanded)
+    return Pose(
+        position_L_m=position,
+        L_from_C=axes,
+        sun_L=sun_L,
+        sun_azimuth_deg=azimuth,
+        sun_elevation_deg=elevation,
+        sun_visible_fraction=visible,
+        tries=1,
+        variables=spec.plan.view(scene, spec.index, 0),
+        resolved=not needs_sun or (visible == 1.0 and float(axes[:, 2] @ sun_L) > 0),
+    )

@@ -1,0 +1,261 @@
+"""From one planned sample to one labelled sample, in physical order.
+
+    resolve ▶ render ▶ meter ▶ photograph ▶ label
+
+One expensive render serves every twin. Where a commanded fault cannot show, the first four are done again with
+another view. A `Session` runs the stages for any sample of a scene.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ..body import Body, Patch, Site, Sites, cached_patch, choose_sites
+from ..body.refine import GROWTH_POWER
+from ..camera import Camera
+from ..core import activity
+from ..core.errors import InputError, VbnfaultError
+from ..core.quantities import SOFT_KINDS, Sample
+from ..faults import Fault, dataset_order, from_dict
+from ..scene import config, plan
+from ..scene.config import SceneConfig
+from ..world import assemble
+from ..world.spacecraft import SpacecraftMesh
+from .expose import meter, render_frame
+from .photograph import photograph
+from .record import label, to_sample
+from .resolve import resolve
+from .spec import Frame, SampleSpec, Terrain
+
+if TYPE_CHECKING:
+    from ..render import Surface
+
+# Slope an octave of the finest relief: steeper would be a wall of needles.
+_STEEPEST_DETAIL = 0.12
+
+# The stages, in physical order: of a view, and then of the one that is kept.
+VIEW_STAGES = (resolve, render_frame, meter, photograph)
+STAGES = (*VIEW_STAGES, label)
+
+
+def simulate(spec: SampleSpec) -> Sample:
+    """One finished sample, every stage in order."""
+    return to_sample(develop_frame(spec))
+
+
+def develop_frame(spec: SampleSpec) -> Frame:
+    """All stages, everything between radiance and labels kept.
+
+    A view in which a commanded fault cannot show is left for the sample's next one, up to `plan.max_views` views.
+    Raises VbnfaultError that names the sample and the faults where none of them will do.
+    """
+    frame = Frame(spec=spec)
+    while True:
+        for stage in VIEW_STAGES:
+            stage(frame)
+        unseen = _asking_for_another_view(frame)
+        if not unseen:
+            label(frame)
+            return frame
+        if frame.views == spec.scene.plan.max_views:
+            raise VbnfaultError(
+                f"sample {spec.index}: {', '.join(unseen)} cannot be seen in the last of plan.max_views = "
+                f"{frame.views} views that were rendered; change the bounds of the fault or of [geometry], raise "
+                f"max_views, or set plan.on_invisible = 'drop'"
+            )
+        frame = Frame(spec=spec, views=frame.views + 1, first_try=frame.pose.tries)
+
+
+def _asking_for_another_view(frame: Frame) -> list[str]:
+    """The commanded faults that are not in the image, although another view of the sample might show them."""
+    spec, scene = frame.spec, frame.spec.scene
+    if scene.plan.on_invisible == "drop" or scene.spice.spacecraft:
+        return []
+    # a Sun that stays where it was drawn may be hidden
+    as_drawn = scene.geometry.sun_visibility == "as_drawn"
+    return [
+        name
+        for name in spec.commanded
+        if name not in frame.drawn and not (as_drawn and spec.faults[name].needs_sun)
+    ]
+
+
+# --- a session: many samples of one scene ------------------------------------------------------------------
+
+
+def configure_faults(scene: SceneConfig, source: str = "scene") -> dict[str, Fault]:
+    """The scene's faults in dataset order. Raises InputError."""
+    for name in scene.faults:
+        from_dict(name, scene.faults[name], source=source)  # unknown classes first: they cannot be ordered
+    faults = {n: from_dict(n, scene.faults[n], source=source) for n in dataset_order(scene.faults)}
+    if scene.camera.lens and "vignetting" in faults and faults["vignetting"].model == "cos4":
+        raise InputError(
+            f"{source}: faults.vignetting.model = 'cos4': with camera.lens = {scene.camera.lens!r} pictures fall "
+            "off as its rays do, and cos⁴ would count that twice; use model 'lens'"
+        )
+    for name, fault in faults.items():
+        if fault.needs_mosaic and not scene.camera.detector:
+            raise InputError(
+                f"{source}: faults.{name}.model = {fault.model!r}: acts inside a detector with a mosaic; name a "
+                "camera.detector"
+            )
+        if fault.needs_ccd and assemble.mosaic_sensor(scene.camera).architecture == "cmos":
+            raise InputError(
+                f"{source}: faults.{name}: acts on charge that a CCD moves, and camera.detector = "
+                f"{scene.camera.detector!r} is a CMOS sensor; leave the fault out, or name a CCD"
+            )
+    soft = [fault.soft_layer for fault in faults.values() if fault.soft_layer]
+    for layer in scene.dataset.layers:
+        if layer.startswith("without_") and layer != "without_straylight" and layer[8:] not in faults:
+            raise InputError(f"{source}: dataset.layers: {layer!r}: the scene has no such fault")
+        if layer.endswith(tuple(f"_{kind}" for kind in SOFT_KINDS)) and layer not in soft:
+            known = ", ".join(soft) or "none"
+            raise InputError(
+                f"{source}: dataset.layers: {layer!r}: no fault of the scene has this layer; theirs: {known}"
+            )
+    for layer in ("raw", "defects"):
+        if layer in scene.dataset.layers and not scene.camera.detector:
+            raise InputError(f"{source}: dataset.layers: {layer!r} needs a mosaic: name a camera.detector")
+    for name in scene.dataset.mask_any or ():
+        if name not in faults:
+            known = ", ".join(faults) or "none"
+            raise InputError(f"{source}: dataset.mask_any: {name!r}: the scene has no such fault; it has: {known}")
+    return faults
+
+
+class Session:
+    """A scene with its plan, and the terrain of the site at work: `simulate` for any sample, in any order.
+
+    `blocks`: sizes of the planned blocks (default: one of `dataset.samples`); `threads`: render threads of this
+    process. Raises InputError for a scene that cannot be used.
+    """
+
+    def __init__(
+        self,
+        scene: SceneConfig,
+        *,
+        blocks: Sequence[int] | None = None,
+        threads: int | None = None,
+        source: str = "scene",
+    ) -> None:
+        self.scene = scene
+        self.faults = configure_faults(scene, source)
+        self.plan = plan.make_plan(scene, list(self.faults), blocks)
+        self._threads = threads
+        self._terrain: Terrain | None = None
+        self._compiled = False  # kernels are made for the first sample
+
+    @cached_property
+    def base_camera(self) -> Camera:
+        """The camera before a sample's exposure, architecture and readout direction."""
+        return assemble.base_camera(self.scene)
+
+    @cached_property
+    def body(self) -> Body:
+        """The body, loaded when first asked for."""
+        activity.begin("shape of the body")
+        return assemble.make_body(self.scene)
+
+    def warn_of_assumptions(self) -> None:
+        """Warn, in one sentence, of what a body that is not 67P takes from it for want of a value."""
+        sentence = assemble.assumed_of_67p(self.scene, self.body)
+        if sentence:
+            warnings.warn(sentence, stacklevel=2)
+
+    @cached_property
+    def vehicle(self) -> SpacecraftMesh | None:
+        """The spacecraft that carries the camera, if the scene has one."""
+        return assemble.spacecraft(self.scene)
+
+    @cached_property
+    def sites(self) -> Sites:
+        """Return the sites of the scene, each drawn when it is first asked for."""
+        if self.scene.spice.spacecraft:
+            return assemble.way_sites(self.scene, self.body)
+        return choose_sites(self.body, self.scene.dataset.sites, self.scene.dataset.seed)
+
+    def terrain(self, site: int) -> Terrain:
+        """The terrain of a site; the one used last is kept."""
+        if self._terrain is None or self._terrain.site.index != site:
+            from .. import render
+
+            if self._threads is not None:
+                render.set_threads(self._threads)
+            self._terrain = None  # let go of the old one first: two do not fit a small machine
+            activity.begin(f"terrain of site {site}")
+            patch = self.patch(self.sites[site])
+            surface = self.surface(patch)
+            self._terrain = Terrain(body=self.body, site=patch.site, surface=surface, vehicle=self.vehicle)
+        return self._terrain
+
+    def surface(self, patch: Patch) -> Surface:
+        """The renderer's copy of a patch, with relief finer than its facets and the scene's spacecraft."""
+        from .. import render
+
+        vehicle = None if self.vehicle is None else assemble.render_vehicle(self.scene, self.vehicle)
+        fine = render.FineRelief(
+            slope=0.0,
+            facet_m=patch.facet_m,
+            radius_m=patch.radius_m,
+            growth=GROWTH_POWER,
+            hurst=self.body.roughness.hurst,
+        )
+        # slopes of an octave of wavelength λ are 0.44 times the deviation over λ/4 a length of λ/4, for a
+        # self-affine surface of Hurst exponent 0.85: the ratio of the integrals of its spectrum
+        length = fine.longest_m / 4
+        slope = 0.44 * float(self.body.roughness.deviation_at(length)) / length
+        slope = min(slope, _STEEPEST_DETAIL) * self.scene.patch.relief
+        return render.Surface(
+            patch.vertices_L_m,
+            patch.faces,
+            patch.face_is_flat,
+            dust=patch.dust,
+            vehicle=vehicle,
+            fine=replace(fine, slope=slope),
+        )
+
+    def patch(self, site: Site) -> Patch:
+        """The ground of a site, from the cache where it was built before."""
+        table = self.scene.patch
+        return cached_patch(
+            self.body,
+            site,
+            seed=self.scene.dataset.seed,
+            facet_m=table.facet_m,
+            radius_m=table.radius_m,
+            relief=table.relief,
+            hurst=table.hurst,
+            craters_per_km2=table.craters_per_km2,
+            min_boulder_m=table.min_boulder_m if table.boulders else 1e6,
+            boulder_index=table.boulder_index,
+            boulders_per_km2=table.boulders_per_km2,
+            max_triangles=max(table.max_triangles, 2 * len(self.body.faces)),
+        )
+
+    def spec(self, index: int) -> SampleSpec:
+        """What `simulate` needs for one sample. On a spacecraft's way every sample has a date of its own."""
+        scene, site = self.scene, int(self.plan.site[index])
+        if scene.spice.spacecraft:
+            share = float(config.keyed_uniform(scene.dataset.seed, np.array([index]), "plan", "epoch")[0])
+            sun = scene.sun.model_copy(update={"julian_date": assemble.epoch_jd(scene, site, share)})
+            scene = scene.model_copy(update={"sun": sun})
+        return SampleSpec(index=index, scene=scene, plan=self.plan, faults=self.faults, terrain=self.terrain(site))
+
+    def simulate(self, index: int) -> Sample:
+        """One finished sample."""
+        spec = self.spec(index)
+        if not self._compiled:
+            activity.begin("compiling of kernels, with the first sample")
+        sample = simulate(spec)
+        self._compiled = True
+        return sample
+
+    def frame(self, index: int) -> Frame:
+        """One sample with all that lies between radiance and labels."""
+        return develop_frame(self.spec(index))

@@ -1,0 +1,1 @@
+"""What the user asked for: the scene file, checked, and the plan of its samples."""

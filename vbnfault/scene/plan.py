@@ -1,0 +1,482 @@
+"""The plan: which sample sees what, and which faults it carries. A plain table, drawn before any rendering.
+
+Stratified sampling after Gallon et al.: samples with straylight face the Sun, the others are averted
+(`sun_facing_nominal_fraction` adds Sun-facing samples without straylight). The rows of the fault matrix are dealt
+over the shards, so that every site and every split holds every class. Every number is keyed by its sample, so a
+plan of more samples does not change those of a shorter one within a block, except for the fault matrix, which is
+balanced over its whole block.
+
+A sample's view (position, Sun, attitude) is a function of (sample, try): where a view cannot be used, the whole of
+it is drawn again within the same bounds, so the views that are kept follow the table's distribution, given that
+they can be used.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core import frames
+from ..core.errors import InputError
+from . import config
+from .config import SceneConfig, StratumTable
+
+STRATA = ("sun-facing", "sun-averted")
+SPLITS = ("train", "val", "test")
+SUN_FACING, SUN_AVERTED = 0, 1
+STRAYLIGHT = "straylight"
+
+_SUN = ("sun_azimuth_deg", "sun_elevation_deg")
+_POSITION = ("x_m", "y_m", "height_m")
+VARIABLES = (*_SUN, "roll_deg", "pitch_deg", "yaw_deg", *_POSITION)
+_MAX_ATTITUDE_TRIES = 1000
+# Of the search for rows to exchange between splits: rows looked at on each side, and exchanges at most.
+_ROWS_COMPARED = 128
+_MAX_EXCHANGES = 200
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Plan:
+    """One row a sample. `variables` float64[n] by the names of VARIABLES, the first proposals; `injected`
+    bool[n, fault] in the order of `faults`; `stratum`, `site`, `split` (index in SPLITS), `architecture`,
+    `readout_direction`, `individual` (device of the detector) integer[n]; `light` int64[n], the sample whose Sun
+    each one has: its own, unless strata are paired, and `paired` bool[n].
+    """
+
+    faults: tuple[str, ...]
+    variables: dict[str, NDArray[np.float64]]
+    injected: NDArray[np.bool_]
+    stratum: NDArray[np.uint8]
+    site: NDArray[np.int32]
+    split: NDArray[np.uint8]
+    architecture: NDArray[np.uint8]
+    readout_direction: NDArray[np.uint8]
+    individual: NDArray[np.int32]
+    light: NDArray[np.int64]
+    paired: NDArray[np.bool_]
+
+    def __len__(self) -> int:
+        return len(self.stratum)
+
+    def injects(self, fault: str) -> NDArray[np.bool_]:
+        """bool[n]: samples commanded to carry the fault; all False where the scene does not have it."""
+        if fault not in self.faults:
+            return np.zeros(len(self), dtype=bool)
+        column: NDArray[np.bool_] = self.injected[:, self.faults.index(fault)]
+        return column
+
+    def commanded(self, index: int) -> tuple[str, ...]:
+        """Return the faults that a sample is commanded to carry, in the order of `faults`."""
+        return tuple(name for name, has in zip(self.faults, self.injected[index], strict=True) if has)
+
+    def view(self, scene: SceneConfig, index: int, attempt: int) -> dict[str, float]:
+        """Return the variables of a sample's view at a try, counted from 0, by the names of VARIABLES.
+
+        `scene` is the one that the plan was made from. The stratum, the site and the device stay the sample's own.
+        """
+        if attempt == 0:
+            return {name: float(values[index]) for name, values in self.variables.items()}
+        one = slice(index, index + 1)
+        drawn = _views(
+            scene, np.array([index]), self.stratum[one], self.light[one], self.paired[one], attempt=attempt
+        )
+        return {name: float(values[0]) for name, values in drawn.items()}
+
+
+def make_plan(scene: SceneConfig, faults: Sequence[str], blocks: Sequence[int] | None = None) -> Plan:
+    """Draw the plan of all blocks (default: one of `dataset.samples`), each with its own fault matrix.
+
+    Raises InputError where the fractions leave no room (`sun_facing_nominal_fraction`), and where the bounds of a
+    stratum cannot be met.
+    """
+    sizes = [scene.dataset.samples] if blocks is None else list(blocks)
+    seed = scene.dataset.seed
+    starts = np.cumsum([0, *sizes])
+    samples = np.arange(int(starts[-1]), dtype=np.int64)
+    shard = samples // scene.dataset.shard_samples
+    site = _shard_sites(scene, int(shard[-1]) + 1)[shard]
+    split = site_split(scene)[site]
+    parts = []
+    for b, (start, end) in enumerate(itertools.pairwise(starts.tolist())):
+        rows = slice(start, end)
+        parts.append(_block(scene, tuple(faults), b, start, shard[rows], split[rows]))
+    injected = np.concatenate([p[0] for p in parts])
+    stratum = np.concatenate([p[1] for p in parts])
+    light, paired = _pairs(scene, samples, stratum, shard)
+    return Plan(
+        faults=tuple(faults),
+        variables=_views(scene, samples, stratum, light, paired),
+        injected=injected,
+        stratum=stratum,
+        site=site,
+        split=split,
+        architecture=_pick(seed, samples, "architecture", len(scene.camera.architectures)),
+        readout_direction=_pick(seed, samples, "readout_direction", len(scene.camera.readout_directions)),
+        individual=_individuals(scene, samples, split),
+        light=light,
+        paired=paired,
+    )
+
+
+def shortcomings(scene: SceneConfig, table: Plan) -> list[str]:
+    """Return a sentence for every split without samples, and for every class that is missing in a split."""
+    out = []
+    fractions = scene.dataset.split.model_dump()
+    for code, name in enumerate(SPLITS):
+        here = table.split == code
+        if not here.any():
+            if fractions[name] > 0:
+                out.append(
+                    f"split {name} has no samples: {len(np.unique(table.site))} sites are in use "
+                    f"(dataset.sites = {scene.dataset.sites}, one for each {scene.dataset.shard_samples} samples), "
+                    "and a site belongs to one split"
+                )
+            continue
+        lacking = table.injected.any(axis=0) & ~table.injected[here].any(axis=0)
+        classes = [fault for fault, lacks in zip(table.faults, lacking, strict=True) if lacks]
+        if classes:
+            out.append(f"split {name} has no sample with {', '.join(classes)}")
+    return out
+
+
+def least_sun_angle_deg(scene: SceneConfig) -> float:
+    """Sun-averted boresights stay farther than this from the Sun: √2·FoV/2 as the paper's square frame has it,
+    and the half diagonal of a frame that is higher than wide."""
+    camera = scene.camera
+    diagonal = np.hypot(1.0, camera.height_px / camera.width_px) * np.tan(np.radians(camera.fov_deg) / 2)
+    return float(max(np.sqrt(2) * camera.fov_deg / 2, np.degrees(np.arctan(diagonal))))
+
+
+def strata(scene: SceneConfig) -> tuple[StratumTable, StratumTable]:
+    """The bounds of the Sun-facing and the Sun-averted stratum, defaults filled in."""
+    facing, averted = scene.geometry.sun_facing, scene.geometry.sun_averted
+    assert facing is not None
+    assert averted is not None
+    return facing, averted
+
+
+# --- views --------------------------------------------------------------------------------------------------
+
+
+def bounds(scene: SceneConfig, name: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the lower and the upper bounds of a variable, float64[stratum] each."""
+    tables = (scene.geometry, scene.geometry) if name in _POSITION else strata(scene)
+    lo, hi = zip(*(getattr(t, name) for t in tables), strict=True)
+    return np.array(lo), np.array(hi)
+
+
+def _views(
+    scene: SceneConfig,
+    samples: NDArray[np.int64],
+    stratum: NDArray[np.uint8],
+    light: NDArray[np.int64],
+    paired: NDArray[np.bool_],
+    *,
+    attempt: int = 0,
+) -> dict[str, NDArray[np.float64]]:
+    """Uniform draws within the bounds of each sample's stratum, float64[n]; `attempt` > 0 are the redraws.
+
+    Paired samples draw the Sun within both strata's bounds, with the key of one of the two, and keep it.
+    """
+    drawn = {}
+    for name in VARIABLES:
+        low, high = bounds(scene, name)
+        lo, hi = low[stratum], high[stratum]
+        if name in _SUN and scene.plan.pair_strata:
+            lo, hi = np.where(paired, low.max(), lo), np.where(paired, high.min(), hi)
+            u = config.keyed_uniform(scene.dataset.seed, light, "plan", f"{name}/0")
+        else:
+            u = config.keyed_uniform(scene.dataset.seed, samples, "plan", f"{name}/{attempt}")
+        drawn[name] = lo + u * (hi - lo)
+    _keep_sun_out_of_view(scene, samples, stratum, drawn, attempt)
+    return drawn
+
+
+def _keep_sun_out_of_view(
+    scene: SceneConfig,
+    samples: NDArray[np.int64],
+    stratum: NDArray[np.uint8],
+    variables: dict[str, NDArray[np.float64]],
+    attempt: int,
+) -> None:
+    # The literal bounds leave 8 % of the Sun-averted draws looking at the Sun: roll and pitch both near half a
+    # turn. Where the angles count from the Sun, it is a matter of roll and pitch alone and is settled here.
+    if strata(scene)[SUN_AVERTED].reference != "sun":
+        return
+    names = ("roll_deg", "pitch_deg")
+    least = least_sun_angle_deg(scene)
+    lo, hi = (np.array(b)[:, SUN_AVERTED] for b in zip(*(bounds(scene, name) for name in names), strict=True))
+    again = np.flatnonzero(stratum == SUN_AVERTED)
+    for k in range(1, _MAX_ATTITUDE_TRIES):
+        angle = frames.boresight_angle_deg(*(variables[name][again] for name in names))
+        again = again[angle < least]
+        if not len(again):
+            return
+        for j, name in enumerate(names):
+            u = config.keyed_uniform(scene.dataset.seed, samples[again], "plan", f"{name}/{attempt}.{k}")
+            variables[name][again] = lo[j] + u * (hi[j] - lo[j])
+    raise InputError(
+        f"geometry.sun_averted: its roll_deg and pitch_deg keep the Sun within {least:.1f} deg of the boresight; "
+        "widen them"
+    )
+
+
+def _pair(low: NDArray[np.float64], high: NDArray[np.float64], stratum: int) -> list[float]:
+    return [float(low[stratum]), float(high[stratum])]
+
+
+def _pairs(
+    scene: SceneConfig, samples: NDArray[np.int64], stratum: NDArray[np.uint8], shard: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    """Whose Sun each sample has, int64[n], and whether another one has it too, bool[n].
+
+    The k-th Sun-facing and the k-th Sun-averted sample of a shard are a pair: they share the site, so that the same
+    Sun in L is the same attitude of the target.
+    """
+    light, paired = samples.copy(), np.zeros(len(samples), dtype=bool)
+    if not scene.plan.pair_strata:
+        return light, paired
+    for name in _SUN:
+        low, high = bounds(scene, name)
+        if low.max() > high.min():
+            raise InputError(
+                f"plan.pair_strata = true: geometry.sun_facing.{name} = {_pair(low, high, SUN_FACING)} and "
+                f"geometry.sun_averted.{name} = {_pair(low, high, SUN_AVERTED)} must overlap"
+            )
+    by_place = np.lexsort((samples, stratum, shard))
+    group = shard[by_place] * 2 + stratum[by_place]
+    first = np.searchsorted(group, group, side="left")
+    rank = np.arange(len(samples)) - first
+    # (shard, rank) of the Sun-facing ones, looked up for the averted ones
+    width = scene.dataset.shard_samples
+    key = shard[by_place] * width + rank
+    facing = stratum[by_place] == SUN_FACING
+    _, one, other = np.intersect1d(key[facing], key[~facing], assume_unique=True, return_indices=True)
+    leads, follows = by_place[facing][one], by_place[~facing][other]
+    light[follows] = samples[leads]
+    paired[leads] = paired[follows] = True
+    return light, paired
+
+
+# --- fault matrix -------------------------------------------------------------------------------------------
+
+
+def _block(
+    scene: SceneConfig,
+    faults: tuple[str, ...],
+    block: int,
+    start: int,
+    shard: NDArray[np.int64],
+    split: NDArray[np.uint8],
+) -> tuple[NDArray[np.bool_], NDArray[np.uint8]]:
+    n = len(shard)
+    rng = config.rng(scene.dataset.seed, start, "plan", f"fault_matrix/{block}")
+    make = fault_matrix_per_class if scene.plan.mode == "per_class" else fault_matrix_per_sample
+    lo, hi = scene.plan.classes_per_sample
+    injected = make(n, faults, scene.plan.faulty_fraction, rng, (lo, hi))
+    straylight = int(injected[:, faults.index(STRAYLIGHT)].sum()) if STRAYLIGHT in faults else 0
+    nominal = round(scene.plan.sun_facing_nominal_fraction * n)
+    if straylight + nominal > n:
+        raise InputError(
+            f"plan.sun_facing_nominal_fraction = {scene.plan.sun_facing_nominal_fraction:g}: with {straylight} of "
+            f"{n} samples in straylight it must be at most {(n - straylight) / n:g}"
+        )
+    stratum = np.full(n, SUN_AVERTED, dtype=np.uint8)
+    stratum[: straylight + nominal] = SUN_FACING
+    order = _dealt(injected, stratum, shard, split, rng)
+    return injected[order], stratum[order]
+
+
+def fault_matrix_per_class(
+    n: int, faults: tuple[str, ...], p: float, rng: np.random.Generator, sizes: tuple[int, int] = (1, 6)
+) -> NDArray[np.bool_]:
+    """bool[n, fault]: every class in exactly round(p·n) samples, straylight in the first of them."""
+    count = round(p * n)
+    matrix = np.zeros((n, len(faults)), dtype=bool)
+    for f, name in enumerate(faults):
+        rows = np.arange(count) if name == STRAYLIGHT else rng.permutation(n)[:count]
+        matrix[rows, f] = True
+    return matrix
+
+
+def fault_matrix_per_sample(
+    n: int, faults: tuple[str, ...], p: float, rng: np.random.Generator, sizes: tuple[int, int] = (1, 6)
+) -> NDArray[np.bool_]:
+    """bool[n, fault]: exactly round(p·n) faulty samples, each with a non-empty subset of the classes.
+
+    Subset sizes are uniform in `sizes` (at most the number of classes). Subsets of a size are alike in chance, but
+    for what it takes to make the counts of any two classes differ by at most one. Rows with straylight come first.
+    """
+    classes = len(faults)
+    matrix = np.zeros((n, classes), dtype=bool)
+    faulty = round(p * n)
+    if classes == 0 or faulty == 0:
+        return matrix
+    lo, hi = (min(s, classes) for s in sizes)
+    size = rng.integers(lo, hi, faulty, endpoint=True)
+    # the `size` smallest of random keys are a random subset of that size
+    rank = np.argsort(np.argsort(rng.random((faulty, classes), dtype=np.float32), axis=1), axis=1)
+    rows = rank < size[:, None]
+    _level(rows, rng)
+    first = rows[:, faults.index(STRAYLIGHT)] if STRAYLIGHT in faults else np.zeros(faulty, dtype=bool)
+    with_straylight = int(first.sum())
+    matrix[:with_straylight] = rows[first]
+    places = with_straylight + rng.permutation(n - with_straylight)[: faulty - with_straylight]
+    matrix[places] = rows[~first]
+    return matrix
+
+
+def _level(rows: NDArray[np.bool_], rng: np.random.Generator) -> None:
+    """Exchange classes in random rows until the counts of any two classes differ by at most one; in place."""
+    classes = rows.shape[1]
+    count = rows.sum(axis=0)
+    share, extra = divmod(int(count.sum()), classes)
+    wanted = np.full(classes, share)
+    wanted[rng.permutation(classes)[:extra]] += 1
+    while (count != wanted).any():
+        most, least = int(np.argmax(count - wanted)), int(np.argmin(count - wanted))
+        number = min(count[most] - wanted[most], wanted[least] - count[least])
+        # rows with the one and without the other are at least as many as the counts' difference, which is at least
+        # the sum of excess and lack less one, and so at least `number`
+        chosen = rng.permutation(np.flatnonzero(rows[:, most] & ~rows[:, least]))[:number]
+        rows[chosen, most], rows[chosen, least] = False, True
+        count[most] -= number
+        count[least] += number
+
+
+# --- sites and splits ---------------------------------------------------------------------------------------
+
+
+def _dealt(
+    injected: NDArray[np.bool_],
+    stratum: NDArray[np.uint8],
+    shard: NDArray[np.int64],
+    split: NDArray[np.uint8],
+    rng: np.random.Generator,
+) -> NDArray[np.int64]:
+    """Which row of the fault matrix each sample of a block takes, int64[n].
+
+    Rows of the same classes are neighbours in a line that is dealt over the shards, one round after the other; then
+    rows are exchanged between splits where a split lacks a class that the block has often enough.
+    """
+    n = len(shard)
+    traits = np.column_stack([stratum == SUN_FACING, injected, ~injected.any(axis=1)])
+    bits = np.uint64(1) << np.arange(traits.shape[1], dtype=np.uint64)[::-1]
+    kind = (traits * bits).sum(axis=1, dtype=np.uint64)
+    line = np.lexsort((rng.random(n), kind))
+    turn = np.arange(n) - np.searchsorted(shard, shard, side="left")
+    order = np.empty(n, dtype=np.int64)
+    order[np.lexsort((rng.random(n), turn))] = line
+    present = np.unique(split)
+    enough = traits.sum(axis=0) >= len(present)
+    for _ in range(_MAX_EXCHANGES):
+        pair = _exchange(traits[order], split, present, enough)
+        if pair is None:
+            break
+        order[list(pair)] = order[list(pair[::-1])]
+    return order
+
+
+def _exchange(
+    traits: NDArray[np.bool_], split: NDArray[np.uint8], present: NDArray[np.uint8], enough: NDArray[np.bool_]
+) -> tuple[int, int] | None:
+    """Two samples whose exchange leaves fewer (split, trait) without a sample; None where there is no such pair."""
+    count = np.stack([traits[split == s].sum(axis=0) for s in present])
+    for s, trait in np.argwhere((count == 0) & enough):
+        mine = np.flatnonzero(split == present[s])[:_ROWS_COMPARED]
+        theirs = np.flatnonzero((split != present[s]) & traits[:, trait])[:_ROWS_COMPARED]
+        gain = traits[theirs][None].astype(int) - traits[mine][:, None]  # what split s would win
+        other = np.searchsorted(present, split[theirs])
+        after = [count[s] + gain, count[other][None] - gain]
+        before = [np.broadcast_to(count[s], gain.shape), np.broadcast_to(count[other][None], gain.shape)]
+        change = sum(
+            ((a[..., enough] == 0).sum(axis=-1) - (b[..., enough] == 0).sum(axis=-1))
+            for a, b in zip(after, before, strict=True)
+        )
+        a, b = np.unravel_index(np.argmin(change), change.shape)
+        if change[a, b] < 0:
+            return int(mine[a]), int(theirs[b])
+    return None
+
+
+def _shard_sites(scene: SceneConfig, shards: int) -> NDArray[np.int32]:
+    """Site of each shard, int32[shards]: all samples of a shard share a site, so that a task loads one patch.
+
+    Sites come in shuffled rounds, so they are used evenly. In the first one they come in an order in which every
+    split has its turn as early as can be.
+    """
+    sites = scene.dataset.sites
+    rounds = -(-shards // sites)
+    key = config.keyed_uniform(scene.dataset.seed, np.arange(rounds * sites, dtype=np.int64), "plan", "sites")
+    order = np.argsort(key.reshape(rounds, sites), axis=1, kind="stable")
+    order[0] = _site_order(scene)
+    return order.ravel()[:shards].astype(np.int32)
+
+
+def _site_order(scene: SceneConfig) -> NDArray[np.int64]:
+    return config.rng(scene.dataset.seed, 0, "plan", "split").permutation(scene.dataset.sites)
+
+
+def site_split(scene: SceneConfig) -> NDArray[np.uint8]:
+    """Split of every site, uint8[sites]: whole sites only, so that no terrain is in two splits. No split with a
+    fraction above 0 is empty, where there are as many sites."""
+    out = np.empty(scene.dataset.sites, dtype=np.uint8)
+    out[_site_order(scene)] = _in_turn(scene, scene.dataset.sites, np.arange(len(SPLITS)))
+    return out
+
+
+def individual_split(scene: SceneConfig) -> NDArray[np.uint8] | None:
+    """Split of every device of the detector, uint8[individuals]: no device is in two splits, and each split that
+    has sites has one; None where there are too few for that, and all splits share them."""
+    used = np.unique(site_split(scene))
+    count = scene.camera.individuals
+    if count < len(used):
+        return None
+    out = np.empty(count, dtype=np.uint8)
+    order = config.rng(scene.dataset.seed, 0, "plan", "individual split").permutation(count)
+    out[order] = _in_turn(scene, count, used)
+    return out
+
+
+def _in_turn(scene: SceneConfig, count: int, used: NDArray[Any]) -> NDArray[np.uint8]:
+    """Splits of `count` things in a line, any beginning of which keeps to the scene's fractions: uint8[count].
+
+    The first things go to one split each, the largest first. After them, the k-th of a split comes at
+    (k + ½) / fraction, as seats are given after Sainte-Laguë.
+    """
+    table = scene.dataset.split
+    fraction = np.array([table.train, table.val, table.test])
+    codes = [code for code in used if fraction[code] > 0]
+    fraction = fraction / fraction[codes].sum()
+    when, whose = [], []
+    for code in codes:
+        k = np.arange(int(np.ceil(fraction[code] * count)) + 2)
+        turn = (k + 0.5) / fraction[code]
+        turn[0] = -fraction[code]
+        when.append(turn)
+        whose.append(np.full(len(k), code, dtype=np.uint8))
+    line = np.concatenate(whose)[np.argsort(np.concatenate(when), kind="stable")]
+    return line[:count]
+
+
+def _individuals(scene: SceneConfig, samples: NDArray[np.int64], split: NDArray[np.uint8]) -> NDArray[np.int32]:
+    """Which device takes each sample, of those of its split."""
+    of_split = individual_split(scene)
+    u = config.keyed_uniform(scene.dataset.seed, samples, "plan", "individual")
+    if of_split is None:
+        return (u * scene.camera.individuals).astype(np.int32)
+    out = np.zeros(len(samples), dtype=np.int32)
+    for s in np.unique(split):
+        devices = np.flatnonzero(of_split == s)
+        here = split == s
+        out[here] = devices[(u[here] * len(devices)).astype(np.intp)]
+    return out
+
+
+def _pick(seed: int, samples: NDArray[np.int64], name: str, options: int) -> NDArray[np.uint8]:
+    return (config.keyed_uniform(seed, samples, "plan", name) * options).astype(np.uint8)

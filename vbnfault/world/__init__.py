@@ -1,0 +1,1 @@
+"""What is out there: Sun and orbit, stars, spacecraft, the body under them."""

@@ -1,0 +1,327 @@
+"""The stars: a catalogue to magnitude 7 and the radiance that it adds to a frame.
+
+Positions and proper motions refer to ICRF axes (frame J). Ignored are stellar aberration, up to 24″ for a camera
+that moves with 67P at perihelion (34 km/s: a pixel of 1024 across 7°), parallax (3″ at most, α Centauri from
+3.6 au), and variability. Planets, the Moon and nebulae are absent.
+A double star that Hipparcos lists as one entry is one point with the light of both.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.special import ndtr
+
+from ..core import resources, spectra
+from ..core.frames import J2000_JD
+from ..core.quantities import Radiance
+
+F64 = NDArray[np.float64]
+I64 = NDArray[np.int64]
+
+BOLTZMANN_J_K = 1.380649e-23  # SI, exact
+DAYS_PER_YEAR = 365.25
+
+# Spectral irradiance of V = 0, mean over the V passband, outside the atmosphere: Bessell, Castelli & Plez 1998
+# (A&A 333, 231), table A2, 363.1e-11 erg cm⁻² s⁻¹ Å⁻¹.
+ZERO_POINT_V_W_M2_NM = 3.631e-11
+
+# Bessell 1990 (PASP 102, 1181), table 2: V passband, 470 to 700 nm in steps of 10 nm, peak 1. Read as response
+# to energy; read per photon instead, the light of no star would change by more than 2.5 %.
+PASSBAND_V_NM = np.arange(470.0, 701.0, 10.0)
+PASSBAND_V = np.array(
+    [
+        *(0.000, 0.030, 0.163, 0.458, 0.780, 0.967, 1.000, 0.973, 0.898, 0.792, 0.684, 0.574),
+        *(0.461, 0.359, 0.270, 0.197, 0.135, 0.081, 0.045, 0.025, 0.017, 0.013, 0.009, 0.000),
+    ]
+)
+
+# Outside, Ballesteros' formula turns steep (its pole lies at -0.67) or has no star to stand on.
+COLOUR_RANGE_BV = (-0.4, 4.0)
+
+# The point spread is cut where 6e-7 of a star's light is left on either axis.
+REACH_SIGMA = 5.0
+SIGMA_MAX_PX = 16.0
+
+# The sky's brightest star, Sirius, has V = -1.44: fainter limits than this show something.
+BRIGHTEST_V = -1.5
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class StarCatalogue:
+    """Stars from the brightest to the faintest; every field float64[n], ICRF, epoch J2000.0.
+
+    `proper_motion_ra_mas_year` is μα cos δ. `magnitude_V` and `colour_BV` are Johnson magnitudes.
+    """
+
+    right_ascension_deg: F64
+    declination_deg: F64
+    proper_motion_ra_mas_year: F64
+    proper_motion_dec_mas_year: F64
+    magnitude_V: F64
+    colour_BV: F64
+
+    def __len__(self) -> int:
+        return len(self.magnitude_V)
+
+    def select(self, keep: NDArray[np.bool_] | slice) -> StarCatalogue:
+        """The stars that a mask bool[n] or a slice keeps."""
+        return replace(self, **{name: getattr(self, name)[keep] for name in self.__dataclass_fields__})
+
+    def brighter_than(self, magnitude_V: float) -> StarCatalogue:
+        """The stars with V below `magnitude_V`."""
+        return self.select(slice(int(np.searchsorted(self.magnitude_V, magnitude_V))))
+
+    def direction_J(self, julian_date: float = J2000_JD) -> F64:
+        """Unit vectors in J, float64[n, 3], moved along great circles from J2000.0 to a TDB Julian date."""
+        ra, dec = np.radians(self.right_ascension_deg), np.radians(self.declination_deg)
+        zero = np.zeros_like(ra)
+        radial = np.stack([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)], axis=1)
+        east = np.stack([-np.sin(ra), np.cos(ra), zero], axis=1)
+        north = np.stack([-np.sin(dec) * np.cos(ra), -np.sin(dec) * np.sin(ra), np.cos(dec)], axis=1)
+        rad_per_mas = np.radians(1 / 3.6e6)
+        years = (julian_date - J2000_JD) / DAYS_PER_YEAR
+        moved = (
+            radial
+            + (self.proper_motion_ra_mas_year * rad_per_mas * years)[:, None] * east
+            + (self.proper_motion_dec_mas_year * rad_per_mas * years)[:, None] * north
+        )
+        return np.asarray(moved / np.linalg.norm(moved, axis=1, keepdims=True))
+
+
+@resources.cached_with_contents(maxsize=1)
+def load_catalogue() -> StarCatalogue:
+    """The packaged catalogue: every star of Hipparcos (ESA 1997) with V ≤ 7.0, 15 thousand of them.
+
+    Steps of the table: 1 mas, 1 mas/year, 0.01 mag in V, 0.001 mag in B−V. Raises InputError where the
+    installation lacks the file.
+    """
+    data = resources.read_input(resources.data_dir("catalogues") / "stars.npz", "star catalogue")
+    with np.load(io.BytesIO(data)) as table:
+        columns = {name: table[name].astype(np.float64) for name in table.files}
+    return StarCatalogue(
+        right_ascension_deg=columns["right_ascension_mas"] / 3.6e6,
+        declination_deg=columns["declination_mas"] / 3.6e6,
+        proper_motion_ra_mas_year=columns["proper_motion_ra_mas_year"],
+        proper_motion_dec_mas_year=columns["proper_motion_dec_mas_year"],
+        magnitude_V=columns["magnitude_V_hundredths"] / 100,
+        colour_BV=columns["colour_BV_thousandths"] / 1000,
+    )
+
+
+HIPPARCOS_EPOCH_YEAR = 1991.25
+TYPICAL_COLOUR_BV = 0.543  # median of the stars with V ≤ 7
+
+
+def pack_hipparcos(lines: Iterable[str], faintest_V: float = 7.0) -> dict[str, NDArray[np.generic]]:
+    """Columns of the packaged table from lines of `hip_main.dat` (CDS I/239), brightest first.
+
+    Positions go from J1991.25 to J2000.0. Where Hipparcos has no astrometric solution (7 stars of V ≤ 7) the
+    sexagesimal position stands, without proper motion; without B−V (13 stars) the median of the others.
+    """
+    rows = [line.split("|") for line in lines]
+    rows = [row for row in rows if row[5].strip() and float(row[5]) <= faintest_V]
+
+    def number(row: list[str], column: int, otherwise: float) -> float:
+        return float(row[column]) if row[column].strip() else otherwise
+
+    def angle(sexagesimal: str) -> float:
+        degrees, minutes, seconds = (float(part) for part in sexagesimal.replace("-", " ").split())
+        return (-1.0 if "-" in sexagesimal else 1.0) * (degrees + minutes / 60 + seconds / 3600)
+
+    dec = np.array([number(row, 9, angle(row[4])) for row in rows])
+    ra = np.array([number(row, 8, 15 * angle(row[3])) for row in rows])
+    pm_ra, pm_dec = (np.array([number(row, column, 0.0) for row in rows]) for column in (12, 13))
+    magnitude = np.array([float(row[5]) for row in rows])
+    colour = np.array([number(row, 37, TYPICAL_COLOUR_BV) for row in rows])
+    years = 2000.0 - HIPPARCOS_EPOCH_YEAR
+    columns: dict[str, tuple[F64, type]] = {
+        "right_ascension_mas": ((ra * 3.6e6 + pm_ra * years / np.cos(np.radians(dec))) % 1.296e9, np.int32),
+        "declination_mas": (dec * 3.6e6 + pm_dec * years, np.int32),
+        "proper_motion_ra_mas_year": (pm_ra, np.int16),
+        "proper_motion_dec_mas_year": (pm_dec, np.int16),
+        "magnitude_V_hundredths": (100 * magnitude, np.int16),
+        "colour_BV_thousandths": (1000 * colour, np.int16),
+    }
+    order = np.argsort(magnitude, kind="stable")
+    return {name: np.rint(values[order]).astype(dtype) for name, (values, dtype) in columns.items()}
+
+
+def colour_temperature_K(colour_BV: F64 | float) -> F64:
+    """Temperature of the black body of a colour B−V, kelvin, float64: Ballesteros 2012 (EPL 97, 34008), eq. 14.
+
+    The colour is held within `COLOUR_RANGE_BV`.
+    """
+    colour = 0.92 * np.clip(np.asarray(colour_BV, dtype=np.float64), *COLOUR_RANGE_BV)
+    return np.asarray(4600.0 * (1 / (colour + 1.7) + 1 / (colour + 0.62)))
+
+
+def _planck(wavelength_nm: F64, temperature_K: F64) -> F64:
+    """Shape of the black body's spectrum per nm, float64[n, wavelength]; the scale is left out."""
+    hc_k = spectra.PLANCK_J_S * spectra.LIGHT_SPEED_M_S / BOLTZMANN_J_K
+    exponent = hc_k / (wavelength_nm[None] * 1e-9 * temperature_K[:, None])
+    return np.asarray((550.0 / wavelength_nm[None]) ** 5 / np.expm1(exponent))
+
+
+def star_spectrum_W_m2_nm(magnitude_V: F64 | float, colour_BV: F64 | float, wavelength_nm: F64) -> F64:
+    """Spectral irradiance at the aperture, across the star's direction, W m⁻² nm⁻¹, float64[n, wavelength].
+
+    A black body of the colour temperature, its mean over the V passband set to the star's magnitude. Right in
+    B and V by construction; lines and the Balmer jump are missing, which costs white stars up to 20 % at
+    400 nm.
+    """
+    temperature = np.atleast_1d(colour_temperature_K(colour_BV))
+    level = ZERO_POINT_V_W_M2_NM * 10 ** (-0.4 * np.atleast_1d(np.asarray(magnitude_V, dtype=np.float64)))
+    mean_V = _planck(PASSBAND_V_NM, temperature) @ (PASSBAND_V / PASSBAND_V.sum())
+    return np.asarray(_planck(wavelength_nm, temperature) * (level / mean_V)[:, None])
+
+
+def star_irradiance_W_m2_nm(magnitude_V: F64 | float, colour_BV: F64 | float, wavelength_nm: F64) -> F64:
+    """The spectrum of `star_spectrum_W_m2_nm` at band nodes, hat-weighted as the solar one: float64[n, band].
+
+    `wavelength_nm` float64[band] are the nodes of `spectra.band_nodes_nm`.
+    """
+    fine = spectra._fine_nm(wavelength_nm)
+    hats = spectra._hats(wavelength_nm, fine)
+    spectrum = star_spectrum_W_m2_nm(magnitude_V, colour_BV, fine)
+    rule = np.gradient(fine) * np.where((fine == fine[0]) | (fine == fine[-1]), 0.5, 1.0)  # trapezoidal
+    return np.asarray(spectrum @ (hats * rule).T / (hats @ rule))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class StarRadiance:
+    """What the stars add: `radiance` float32[band, n], W m⁻² sr⁻¹ nm⁻¹, at pixels `rows`, `columns` int64[n].
+
+    No pixel comes twice; they are in the frame's order, row by row.
+    """
+
+    rows: I64
+    columns: I64
+    radiance: NDArray[np.float32]
+
+    def added_to(self, radiance: Radiance, where: NDArray[np.bool_] | None = None) -> Radiance:
+        """`radiance` with the stars added, at the pixels of bool[y, x] `where` alone if that is given."""
+        keep = slice(None) if where is None else where[self.rows, self.columns]
+        array = radiance.array.copy()
+        array[:, self.rows[keep], self.columns[keep]] += self.radiance[:, keep]
+        return radiance.with_array(array)
+
+
+def star_radiance(
+    catalogue: StarCatalogue,
+    *,
+    J_from_C: F64,
+    intrinsics: F64,
+    width_px: int,
+    height_px: int,
+    wavelength_nm: F64,
+    sigma_px: float,
+    julian_date: float = J2000_JD,
+    sky: NDArray[np.bool_] | None = None,
+    lens_falloff: bool = False,
+) -> StarRadiance:
+    """Radiance that the stars add to each pixel, averaged over the pixel and summed over the stars.
+
+    A star of irradiance E at the angle θ from the boresight sends T E A cos θ through an aperture of area
+    A = π (f/2N)², while a pixel of radiance L receives π T L / (4N²) times its own area from `lens.ThinLens`,
+    which has no falloff. Equal flux makes the radiances of a star add up to
+
+        Σ L = E fx fy cos θ          (`lens_falloff` False: the lens adds no factor)
+        Σ L = E fx fy / cos³ θ       (True: a lens or a later stage multiplies by cos⁴ θ)
+
+    the second being E over the pixel's solid angle. The electrons are the star's either way.
+
+    Parameters
+    ----------
+    J_from_C, intrinsics
+        Camera axes in J, float64[3, 3]; fx, fy, cx, cy in pixels, float64[4], pixel centres at +0.5.
+    wavelength_nm
+        Band nodes, float64[band].
+    sigma_px
+        Standard deviation of the Gaussian point spread, pixels, in [0, 16]. It is integrated over the pixels, cut
+        at 5 σ. With 0 a star lights the one pixel it falls on. The frame must not be blurred by it again.
+    julian_date
+        TDB, for proper motion.
+    sky
+        bool[y, x], pixels whose centre sees no body. A star whose place in the frame is not sky is hidden, and
+        the light of the others spreads over sky and body alike. Without it no star is hidden: then add the
+        result where there is sky.
+
+    Raises
+    ------
+    ValueError
+        `sigma_px` out of range, or `sky` not of the frame's shape.
+    """
+    if not 0 <= sigma_px <= SIGMA_MAX_PX:
+        raise ValueError(f"sigma_px = {sigma_px:g}: must be in [0, {SIGMA_MAX_PX:g}]")
+    if sky is not None and sky.shape != (height_px, width_px):
+        raise ValueError(f"sky has shape {sky.shape}, the frame {(height_px, width_px)}")
+    direction = catalogue.direction_J(julian_date) @ np.asarray(J_from_C, dtype=np.float64)
+    ahead = np.flatnonzero(direction[:, 2] > 1e-6)
+    slope = direction[ahead, :2] / direction[ahead, 2:]
+    fx, fy, cx, cy = (float(v) for v in intrinsics)
+    place = slope * (fx, fy) + (cx, cy)
+    size = np.array([width_px, height_px])
+    reach = REACH_SIGMA * sigma_px
+    inside = np.asarray(((place >= -reach) & (place < size + reach)).all(axis=1))
+    if sky is not None:
+        column, row = np.clip(np.floor(place[inside]).astype(np.int64), 0, size - 1).T
+        outside = ((place[inside] < 0) | (place[inside] >= size)).any(axis=1)
+        inside[inside] = outside | sky[row, column]
+    place, stars = place[inside], ahead[inside]
+
+    cosine = direction[stars, 2]
+    irradiance = star_irradiance_W_m2_nm(catalogue.magnitude_V[stars], catalogue.colour_BV[stars], wavelength_nm)
+    total = irradiance * (fx * fy * (cosine**-3 if lens_falloff else cosine))[:, None]
+
+    window = max(1, int(np.ceil(reach)))
+    offset = np.arange(-window, window + 1)
+    pixel = np.floor(place).astype(np.int64)[:, :, None] + offset  # [star, axis, window]
+    edges = np.concatenate([pixel, pixel[:, :, -1:] + 1], axis=2) - place[:, :, None]
+    # a point is a very narrow Gaussian: of a star right on an edge either side gets half
+    share = np.diff(ndtr(edges / max(sigma_px, 1e-9)), axis=2)
+    share = np.where((pixel >= 0) & (pixel < size[:, None]), share, 0.0)
+
+    weight = (share[:, 1, :, None] * share[:, 0, None, :]).ravel()
+    index = (pixel[:, 1, :, None] * width_px + pixel[:, 0, None, :]).ravel()
+    star = np.repeat(np.arange(len(stars)), len(offset) ** 2)
+    lit = weight > 0
+    lit_pixels, target = np.unique(index[lit], return_inverse=True)
+    spread = coo_array((weight[lit], (target, star[lit])), shape=(len(lit_pixels), len(stars))).tocsr()
+    return StarRadiance(
+        rows=lit_pixels // width_px,
+        columns=lit_pixels % width_px,
+        radiance=np.ascontiguousarray((spread @ total).T, dtype=np.float32),
+    )
+
+
+def limiting_magnitude(
+    *,
+    electron_rate_weights: NDArray[np.floating],
+    wavelength_nm: F64,
+    irradiance_per_radiance: float,
+    focal_length_px: float,
+    exposure_s: float,
+    sigma_px: float,
+    threshold_e: float,
+    colour_BV: float = 0.6,
+) -> float:
+    """V of the star on the axis, centred on a pixel, whose brightest pixel and colour collect `threshold_e`.
+
+    `electron_rate_weights` float[colour, band] are those of `Detector`, electrons per second for 1 W m⁻² nm⁻¹ on
+    a pixel; `irradiance_per_radiance` is the lens's π T / (4N²), sr. Below `BRIGHTEST_V` the exposure hides every
+    star. -inf where no light is collected. Raises ValueError for a threshold that is not above 0.
+    """
+    if not threshold_e > 0:
+        raise ValueError(f"threshold_e = {threshold_e:g}: must be above 0")
+    half = 0.5 / max(sigma_px, 1e-9)
+    share = float(ndtr(half) - ndtr(-half)) ** 2
+    irradiance = star_irradiance_W_m2_nm(0.0, colour_BV, wavelength_nm)[0] * focal_length_px**2
+    rate = float((np.asarray(electron_rate_weights, dtype=np.float64) @ irradiance).max())
+    collected = rate * irradiance_per_radiance * exposure_s * share
+    return float(2.5 * np.log10(collected / threshold_e)) if collected > 0 else float("-inf")

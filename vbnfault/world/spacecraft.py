@@ -1,0 +1,500 @@
+"""The spacecraft around the camera: parts with a material each, some of which can be posed.
+
+Everything is in B, metres: the camera's entrance pupil is the origin, x image right, y image down, z along the
+boresight. A part's name is its path, `solar_array_left/panel`; a key of a user's table (a pose, a material) is
+such a path, a leading piece of it, or any single name along it, and holds for all parts below.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property, lru_cache
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from ..core import meshes, resources
+from ..core.errors import InputError
+from ..core.frames import rx, ry, rz
+from ..core.meshes import MeshPart
+
+F64 = NDArray[np.float64]
+Unit = Literal["m", "cm", "mm"]
+
+METRES_PER: dict[str, float] = {"m": 1.0, "cm": 0.01, "mm": 0.001}
+FILE_TYPES = (".obj", ".glb", ".gltf")
+# No vehicle near a comet is larger (Rosetta: 32 m from tip to tip); a file in millimetres read as metres is.
+LARGEST_EXTENT_M = 200.0
+# In the file's unit: a vehicle of 200 m in millimetres, far from its origin.
+_FARTHEST = 1e9
+# Relative to the squared extent: below it a face's normal is rounding noise in float64.
+_DEGENERATE_AREA_FRACTION = 1e-16
+
+_NM = (350.0, 400.0, 450.0, 500.0, 550.0, 600.0, 650.0, 700.0, 800.0, 900.0)
+
+# Hemispherical reflectance, used as that of a Lambert surface. The level of each follows from the solar
+# absorptance α, 1 − α within 0.03, of Fortescue, Swinerd & Stark 2011, Spacecraft Systems Engineering, 4th ed.,
+# table 11.3; the course over wavelength is assumed.
+_FORTESCUE = "1 - α of Fortescue, Swinerd & Stark 2011, table 11.3 (α = {}, {}); spectral course assumed"
+NAMED_REFLECTANCES: dict[str, tuple[tuple[float, ...], tuple[float, ...], str]] = {
+    "white_paint": (
+        _NM,
+        (0.45, 0.80, 0.87, 0.89, 0.90, 0.90, 0.90, 0.90, 0.90, 0.90),
+        _FORTESCUE.format(0.12, "white silicate paint"),
+    ),
+    "black_paint": ((350.0, 900.0), (0.05, 0.05), _FORTESCUE.format(0.95, "black epoxy paint")),
+    "gold_mli": (
+        _NM,  # the absorption edge of Kapton near 480 nm
+        (0.04, 0.06, 0.12, 0.34, 0.54, 0.65, 0.72, 0.75, 0.78, 0.79),
+        _FORTESCUE.format(0.40, "aluminised Kapton, Kapton outside"),
+    ),
+    "silver_mli": ((350.0, 900.0), (0.86, 0.86), _FORTESCUE.format(0.14, "aluminised Kapton, aluminium outside")),
+    "black_mli": ((350.0, 900.0), (0.07, 0.07), "assumed: carbon-loaded Kapton, α = 0.93"),
+    "aluminium": (
+        _NM,  # the dip of aluminium near 825 nm
+        (0.77, 0.785, 0.80, 0.80, 0.80, 0.79, 0.785, 0.78, 0.755, 0.80),
+        _FORTESCUE.format(0.21, "aluminium tape"),
+    ),
+    "solar_cell": (
+        _NM,  # blue under its antireflection coating, bright again beyond the band gap
+        (0.20, 0.14, 0.09, 0.06, 0.05, 0.05, 0.05, 0.05, 0.07, 0.20),
+        _FORTESCUE.format(0.88, "GaAs solar cells"),
+    ),
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Material:
+    """A Lambert surface. `reflectance` in [0, 1] at `wavelength_nm` (increasing), linear between its nodes and
+    constant beyond them; `source` says where the numbers are from."""
+
+    name: str
+    wavelength_nm: tuple[float, ...]
+    reflectance: tuple[float, ...]
+    source: str = ""
+
+    def at(self, wavelength_nm: F64) -> F64:
+        """Reflectance at `wavelength_nm`, float64[band]."""
+        return np.interp(wavelength_nm, self.wavelength_nm, self.reflectance)
+
+
+def make_material(setting: str | float | Mapping[str, Any], name: str = "default") -> Material:
+    """A material from a scene file's value: a name of `NAMED_REFLECTANCES`, a grey number in [0, 1], or a table
+    with `wavelength_nm` and `value`. Raises InputError, which calls the setting by `name`."""
+    where = f"spacecraft material {name!r}"
+    if isinstance(setting, str):
+        if setting not in NAMED_REFLECTANCES:
+            known = ", ".join(NAMED_REFLECTANCES)
+            raise InputError(f"{where} = {setting!r}: must be a grey value 0 to 1, a table, or one of {known}")
+        wavelength, value, source = NAMED_REFLECTANCES[setting]
+        return Material(name=setting, wavelength_nm=wavelength, reflectance=value, source=source)
+    if isinstance(setting, Mapping):
+        if set(setting) != {"wavelength_nm", "value"}:
+            raise InputError(f"{where}: the table needs the keys wavelength_nm and value, got {', '.join(setting)}")
+        try:
+            nm, values = (np.array(setting[key], dtype=np.float64) for key in ("wavelength_nm", "value"))
+        except (TypeError, ValueError):
+            raise InputError(f"{where}: wavelength_nm and value must be lists of numbers") from None
+        if nm.ndim != 1 or nm.shape != values.shape or len(nm) == 0:
+            raise InputError(f"{where}: wavelength_nm and value must be lists of equal length, at least 1")
+        if not (np.isfinite(nm).all() and (nm > 0).all() and (np.diff(nm) > 0).all()):
+            raise InputError(f"{where}: wavelength_nm = {nm.tolist()}: must be above 0 and increase")
+        if not ((values >= 0) & (values <= 1)).all():
+            raise InputError(f"{where}: value = {values.tolist()}: must be 0 to 1")
+        table = tuple(nm.tolist()), tuple(values.tolist())
+        return Material(name=name, wavelength_nm=table[0], reflectance=table[1], source="the user's table")
+    if isinstance(setting, bool) or not isinstance(setting, int | float) or not 0 <= setting <= 1:
+        raise InputError(f"{where} = {setting!r}: a grey value must be 0 to 1")
+    grey = float(setting)
+    return Material(name=f"grey_{grey:g}", wavelength_nm=(550.0,), reflectance=(grey,), source="the user's grey")
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Part:
+    """Faces of one material. `vertices_B_m` float64[n, 3], `faces` int64[m, 3], outward winding where the file
+    has it; the mesh need not be closed."""
+
+    name: str
+    vertices_B_m: F64
+    faces: NDArray[np.int64]
+    material: Material
+
+
+@dataclass(frozen=True, kw_only=True)
+class Pose:
+    """A turn of a part by `angle_deg` about the axis through `hinge_B_m`, right-handed; `axis_B` of any length.
+
+    Hinge and axis are those of the vehicle at rest, before any pose: where a parent turns, its children's hinges
+    turn with it.
+    """
+
+    hinge_B_m: tuple[float, float, float]
+    axis_B: tuple[float, float, float]
+    angle_deg: float = 0.0
+
+    def __post_init__(self) -> None:
+        numbers = (*self.hinge_B_m, *self.axis_B, self.angle_deg)
+        if len(numbers) != 7 or not np.isfinite(numbers).all():
+            raise InputError(f"pose: hinge_m, axis and angle_deg must be 3, 3 and 1 finite numbers, got {numbers}")
+        if np.linalg.norm(self.axis_B) == 0:
+            raise InputError("pose: axis = [0, 0, 0]: must have a length")
+
+    def moved(self, points_B_m: F64) -> F64:
+        """The points, float64[n, 3], turned."""
+        hinge, axis = np.array(self.hinge_B_m, dtype=float), np.array(self.axis_B, dtype=float)
+        turn = Rotation.from_rotvec(np.radians(self.angle_deg) * axis / np.linalg.norm(axis))
+        return np.asarray(turn.apply(points_B_m - hinge) + hinge)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Placement:
+    """Where a file's axes V lie in B: p_B = Rx(roll) · Ry(pitch) · Rz(yaw) · p_V + translation, the order of
+    angles of `frames.L_from_C`. GLB files are by convention y up, z forward, x left: yaw_deg = 180 makes that B."""
+
+    roll_deg: float = 0.0
+    pitch_deg: float = 0.0
+    yaw_deg: float = 0.0
+    translation_B_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    @property
+    def B_from_V(self) -> F64:
+        """Rotation matrix, float64[3, 3]."""
+        roll, pitch, yaw = np.radians([self.roll_deg, self.pitch_deg, self.yaw_deg])
+        return np.asarray(rx(roll) @ ry(pitch) @ rz(yaw))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SpacecraftMesh:
+    """All parts as one mesh, what the renderer takes.
+
+    `vertices_B_m` float32[n, 3], `faces` int32[m, 3], `face_material` int32[m], an index into `materials`.
+    """
+
+    vertices_B_m: NDArray[np.float32]
+    faces: NDArray[np.int32]
+    face_material: NDArray[np.int32]
+    materials: tuple[Material, ...]
+
+    def reflectance(self, wavelength_nm: F64) -> F64:
+        """Lambert reflectance, float64[material, band]."""
+        return np.stack([material.at(wavelength_nm) for material in self.materials])
+
+    @cached_property
+    def outline_B_m(self) -> F64:
+        """Vertices that tell how far the vehicle reaches, float64[256, 3]: every n-th, or some more than once."""
+        n = len(self.vertices_B_m)
+        return self.vertices_B_m[np.linspace(0, n - 1, 256).astype(int)].astype(np.float64)
+
+    def blocked(self, directions_B: F64) -> NDArray[np.bool_]:
+        """Which of the rays from the pupil's centre along `directions_B`, float64[n, 3], meet the vehicle."""
+        corner = self.vertices_B_m.astype(np.float64)[self.faces]
+        a, b, c = corner[:, 0], corner[:, 1], corner[:, 2]
+        normal = np.cross(b - a, c - a)
+        height = np.einsum("ij,ij->i", a, normal)
+        sides = np.stack([np.cross(a, b), np.cross(b, c), np.cross(c, a)])
+        hit = np.zeros(len(directions_B), dtype=bool)
+        step = max(1, 4_000_000 // max(1, len(self.faces)))  # rays at a time: 100 MB
+        for start in range(0, len(directions_B), step):
+            some = directions_B[start : start + step]
+            # inside the cone that a triangle spans from the origin, on the side it lies on
+            turn = some @ sides.transpose(0, 2, 1)
+            within = (turn >= 0).all(axis=0) | (turn <= 0).all(axis=0)
+            hit[start : start + step] = (within & ((some @ normal.T) * height > 0)).any(axis=1)
+        return hit
+
+    def blocked_fraction(self, fov_deg: float, side: int = 64) -> float:
+        """Share of a square image of the full field `fov_deg`, boresight in its middle, that the vehicle covers,
+        from `side`² rays."""
+        at = (np.arange(side) + 0.5) / side * 2 - 1
+        slope = np.tan(np.radians(fov_deg) / 2) * at
+        x, y = np.meshgrid(slope, slope)
+        return float(self.blocked(np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3)).mean())
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Spacecraft:
+    """A vehicle: its parts, at rest or posed, and the `hinges` that its maker knows of, by name, at angle 0."""
+
+    parts: tuple[Part, ...]
+    hinges: Mapping[str, Pose] = field(default_factory=dict)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Every name a table may use: the paths of parts, their leading pieces, and single names in them."""
+        keys = dict.fromkeys(key for part in self.parts for key in _keys(part.name))
+        return tuple(keys)
+
+    def posed(self, poses: Mapping[str, Pose]) -> Spacecraft:
+        """The vehicle with the named parts turned, sub-parts with them. Of nested poses the inner acts first.
+
+        Raises InputError for a name that no part has.
+        """
+        _refuse_unknown(poses, self.names, "pose")
+
+        def turned(part: Part) -> Part:
+            vertices = part.vertices_B_m
+            done: set[str] = set()
+            for key in _keys(part.name):
+                if key in poses and key not in done:
+                    vertices = poses[key].moved(vertices)
+                    done.add(key)
+            return replace(part, vertices_B_m=vertices) if done else part
+
+        return replace(self, parts=tuple(turned(part) for part in self.parts))
+
+    def merged(self) -> SpacecraftMesh:
+        """All parts as one mesh; equal materials are joined, in the order in which they come first."""
+        materials = tuple(dict.fromkeys(part.material for part in self.parts))
+        first = np.cumsum([0, *(len(part.vertices_B_m) for part in self.parts)])
+        return SpacecraftMesh(
+            vertices_B_m=np.concatenate([part.vertices_B_m for part in self.parts]).astype(np.float32),
+            faces=np.concatenate([p.faces + i for p, i in zip(self.parts, first, strict=False)]).astype(np.int32),
+            face_material=np.repeat(
+                [materials.index(part.material) for part in self.parts], [len(part.faces) for part in self.parts]
+            ).astype(np.int32),
+            materials=materials,
+        )
+
+
+def _keys(name: str) -> list[str]:
+    """Names that a part of this path goes by, the innermost first: of `a/b` these are `a/b`, `b`, `a`."""
+    pieces = name.split("/")
+    keys: list[str] = []
+    for depth in range(len(pieces), 0, -1):
+        keys += ["/".join(pieces[:depth]), pieces[depth - 1]]
+    return list(dict.fromkeys(keys))
+
+
+def _refuse_unknown(table: Iterable[str], known: Iterable[str], what: str) -> None:
+    names = sorted(set(known))
+    for key in table:
+        if key not in names:
+            raise InputError(f"spacecraft {what} {key!r}: no such name; the vehicle has {', '.join(names)}")
+
+
+# ------------------------------------------------------------------------------------ files
+
+
+def load_spacecraft(
+    path: str | Path,
+    *,
+    unit: Unit = "m",
+    placement: Placement | None = None,
+    materials: Mapping[str, str | float | Mapping[str, Any]] | None = None,
+    poses: Mapping[str, Pose] | None = None,
+    default_material: str | float | Mapping[str, Any] = 0.3,
+) -> Spacecraft:
+    """Read a vehicle, place it in B, give its parts their materials and turn them.
+
+    Parameters
+    ----------
+    path
+        OBJ, GLB or GLTF. Parts are an OBJ's objects (`o`) and the groups within (`g`), named `object/group`, or
+        the nodes of a GLB, named by their path; each is split by material (`usemtl`). Polygons are triangulated.
+        Textures, colours and .mtl files are not read.
+    unit
+        Unit of the file: "m", "cm" or "mm". GLB is in metres by its standard.
+    placement
+        The file's axes and origin in B; by default they are B's.
+    materials
+        By part or by the file's material, `make_material`'s settings. The first that is named holds: the part's
+        path, its name, its parents' from the nearest on, the file's material. Next comes a material of the file
+        that is itself named in `NAMED_REFLECTANCES`, then `default_material`.
+    poses
+        By part, in B after the placement: see `Spacecraft.posed`.
+
+    Raises
+    ------
+    InputError
+        The file is missing, unreadable, of another type, empty or larger than 200 m; has a NaN; or a table names
+        no part of it. Faces without area are dropped in silence.
+    """
+    path = Path(path)
+    if unit not in METRES_PER:
+        raise InputError(f"{path}: unit must be one of {', '.join(METRES_PER)}; got {unit!r}")
+    placement = placement or Placement()
+    if not np.isfinite((placement.B_from_V.sum(), *placement.translation_B_m)).all():
+        raise InputError(f"{path}: placement has numbers that are not finite")
+    pieces = [piece for piece in map(_without_degenerate_faces, _read(path)) if len(piece.faces)]
+    if not pieces:
+        raise InputError(f"{path}: no face has an area")
+
+    extent_m = METRES_PER[unit] * float(np.ptp(np.concatenate([p.vertices for p in pieces]), axis=0).max())
+    if extent_m > LARGEST_EXTENT_M:
+        raise InputError(
+            f"{path}: the vehicle measures {extent_m:g} m in the unit {unit!r}; it must be at most"
+            f" {LARGEST_EXTENT_M:g} m, so give the file's own unit: {', '.join(METRES_PER)}"
+        )
+    settings = {key: make_material(value, key) for key, value in (materials or {}).items()}
+    known = [key for piece in pieces for key in (*_keys(piece.name), piece.material) if key]
+    _refuse_unknown(settings, known, "material")
+    otherwise = make_material(default_material)
+
+    def material_of(piece: MeshPart) -> Material:
+        for key in (*_keys(piece.name), piece.material):
+            if key in settings:
+                return settings[key]
+        return make_material(piece.material) if piece.material in NAMED_REFLECTANCES else otherwise
+
+    B_from_V, translation = placement.B_from_V, np.array(placement.translation_B_m, dtype=np.float64)
+    parts = tuple(
+        Part(
+            name=piece.name,
+            vertices_B_m=METRES_PER[unit] * piece.vertices @ B_from_V.T + translation,
+            faces=piece.faces,
+            material=material_of(piece),
+        )
+        for piece in pieces
+    )
+    return Spacecraft(parts=parts).posed(poses or {})
+
+
+def _read(path: Path) -> list[MeshPart]:
+    data = resources.read_input(path, "spacecraft", types=FILE_TYPES)
+    if path.suffix.lower() == ".obj":
+        pieces = meshes.read_obj(data, str(path), name=path.stem)
+    else:
+        pieces = meshes.read_gltf(data, str(path), folder=path.parent)
+    pieces = [piece for piece in pieces if len(piece.faces)]
+    if not pieces:
+        raise InputError(f"{path}: spacecraft has no faces")
+    for piece in pieces:
+        if not np.isfinite(piece.vertices[piece.faces]).all():
+            raise InputError(f"{path}: part {piece.name!r} has vertices with NaN or infinite coordinates")
+        if (far := np.abs(piece.vertices).max()) > _FARTHEST:
+            raise InputError(
+                f"{path}: part {piece.name!r} has vertices with coordinates such as {far:g}; at most {_FARTHEST:g}"
+            )
+    return pieces
+
+
+def _without_degenerate_faces(piece: MeshPart) -> MeshPart:
+    """Without faces of no area, and without the vertices that no face names."""
+    a, b, c = (piece.vertices[piece.faces[:, k]] for k in range(3))
+    area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    corners = piece.vertices[np.unique(piece.faces)]
+    sound = area > _DEGENERATE_AREA_FRACTION * float(np.ptp(corners, axis=0).max()) ** 2
+    used, index = np.unique(piece.faces[sound], return_inverse=True)
+    return replace(piece, vertices=piece.vertices[used], faces=index.reshape(-1, 3).astype(np.int64))
+
+
+# ------------------------------------------------------------------------------------ the default vehicle
+
+# The bus, metres: its front panel lies 6 cm behind the pupil, which looks out of a short barrel.
+BUS_SIZE_M = (1.2, 1.0, 1.2)
+BUS_CENTRE_M = (0.0, 0.0, -0.66)
+BARREL_RADIUS_M = 0.05
+ARRAY_HINGE_Z_M = -0.7
+
+_CORNERS = {
+    "front_left": (-1.0, 1.0),
+    "front_right": (1.0, 1.0),
+    "back_left": (-1.0, -1.0),
+    "back_right": (1.0, -1.0),
+}
+
+
+@lru_cache(maxsize=1)
+def _default_at_rest() -> Spacecraft:
+    hinges: dict[str, Pose] = {}
+    parts: list[Part] = []
+
+    def add(name: str, mesh: trimesh.Trimesh, material: str) -> None:
+        parts.append(
+            Part(
+                name=name,
+                vertices_B_m=np.array(mesh.vertices, dtype=np.float64),
+                faces=np.array(mesh.faces, dtype=np.int64),
+                material=make_material(material),
+            )
+        )
+
+    def box(centre: tuple[float, ...], size: tuple[float, ...]) -> trimesh.Trimesh:
+        return trimesh.creation.box(size, trimesh.transformations.translation_matrix(centre))
+
+    def rod(start: tuple[float, ...], end: tuple[float, ...], radius: float, sections: int = 20) -> trimesh.Trimesh:
+        return trimesh.creation.cylinder(radius, segment=np.array([start, end]), sections=sections)
+
+    def revolved(
+        profile: list[tuple[float, float]], apex: tuple[float, ...], towards: tuple[float, ...]
+    ) -> trimesh.Trimesh:
+        mesh = trimesh.creation.revolve(np.array(profile), sections=32)
+        mesh.apply_transform(trimesh.geometry.align_vectors((0, 0, 1), np.array(towards) / np.linalg.norm(towards)))
+        return mesh.apply_translation(apex)
+
+    add("bus/body", box(BUS_CENTRE_M, BUS_SIZE_M), "gold_mli")
+    add("bus/radiator", box((0.0, -0.25, -0.055), (0.9, 0.35, 0.02)), "white_paint")
+    add("bus/camera_barrel", rod((0, 0, -0.08), (0, 0, -0.01), BARREL_RADIUS_M, 32), "black_paint")
+    # a bell that opens downwards, its wall 1 cm thick
+    bell = [(0.0, 0.0), (0.06, 0.0), (0.21, 0.3), (0.2, 0.3), (0.05, 0.01), (0.0, 0.01)]
+    add("bus/engine", revolved(bell, (0.0, 0.48, -0.66), (0, 1, 0)), "black_paint")
+
+    for side, sign in (("left", -1.0), ("right", 1.0)):
+        wing = f"solar_array_{side}"
+        hinges[wing] = Pose(hinge_B_m=(sign * 0.6, 0.0, ARRAY_HINGE_Z_M), axis_B=(1.0, 0.0, 0.0))
+        add(
+            f"{wing}/yoke",
+            rod((sign * 0.58, 0, ARRAY_HINGE_Z_M), (sign * 0.96, 0, ARRAY_HINGE_Z_M), 0.025),
+            "aluminium",
+        )
+        # cells face up, -y, in the rest position; a sheet on the panel
+        add(f"{wing}/panel", box((sign * 1.95, 0, ARRAY_HINGE_Z_M), (2.0, 0.02, 0.9)), "black_paint")
+        add(f"{wing}/cells", box((sign * 1.95, -0.011, ARRAY_HINGE_Z_M), (1.96, 0.006, 0.86)), "solar_cell")
+
+    for name, (x, z) in _CORNERS.items():
+        leg = f"leg_{name}"
+        # the front pads stand forward, so that they show in the lower corners of a wide field
+        pad = (0.8 * x, 0.95, 1.5) if z > 0 else (0.95 * x, 0.95, -1.75)
+        hip_z = -0.12 if z > 0 else -1.2
+        hip = (0.58 * x, 0.46, hip_z)
+        hinges[leg] = Pose(hinge_B_m=hip, axis_B=(1.0, 0.0, 0.0))
+        add(f"{leg}/strut", rod(hip, (pad[0], pad[1] - 0.02, pad[2]), 0.025), "aluminium")
+        brace = tuple(0.45 * h + 0.55 * p for h, p in zip(hip, pad, strict=True))
+        add(f"{leg}/brace", rod((0.3 * x, 0.48, hip_z), brace, 0.015), "aluminium")
+        add(f"{leg}/footpad", rod((pad[0], pad[1] - 0.04, pad[2]), pad, 0.14, 32), "black_mli")
+
+    hinges["antenna"] = Pose(hinge_B_m=(0.0, -0.75, -0.95), axis_B=(1.0, 0.0, 0.0))
+    add("antenna_mast", rod((0.0, -0.48, -0.95), (0.0, -0.75, -0.95), 0.03), "aluminium")
+    radius = np.linspace(0.0, 0.45, 10)
+    bowl = [(float(r), float(r**2)) for r in radius]  # focal length 0.25 m
+    dish = [*bowl, *((r, h + 0.01) for r, h in reversed(bowl))]
+    up_and_back = (0.0, -1.0, -0.35)
+    add("antenna/dish", revolved(dish, (0.0, -0.74, -0.95), up_and_back), "white_paint")
+    axis = np.array(up_and_back) / np.linalg.norm(up_and_back)
+    feed = np.array((0.0, -0.74, -0.95)) + np.outer((0.005, 0.26), axis)
+    add("antenna/feed", rod(tuple(feed[0]), tuple(feed[1]), 0.02), "black_paint")
+    return Spacecraft(parts=tuple(parts), hinges=hinges)
+
+
+def default_spacecraft(
+    *, solar_array_deg: float = 0.0, leg_fold_deg: float = 0.0, antenna_deg: float = 0.0
+) -> Spacecraft:
+    """A lander whose camera looks out of its front panel, in B; every part is a closed mesh.
+
+    A box of 1.2 × 1.0 × 1.2 m in gold foil behind the pupil (z from -1.26 to -0.06 m), two solar arrays of
+    2.0 × 0.9 m to the sides, an antenna dish of 0.9 m on top (-y), an engine and four legs below (+y). The two
+    front footpads, 1.5 m ahead, are all that the camera sees: in the lower corners of a field of 65°, 1.7 % of a
+    square image; nothing within 35° of the boresight. Folding the legs takes them through the field's sides.
+
+    Parameters
+    ----------
+    solar_array_deg
+        Turn of both arrays about +x: at 0 the cells face up (-y), at -90 ahead (+z), at 90 back (-z).
+    leg_fold_deg
+        Turn of the legs about +x from the deployed position, front legs forwards and up, hind legs backwards and
+        up.
+    antenna_deg
+        Turn of the dish about +x.
+
+    The poses of single parts: `default_spacecraft().posed({name: replace(hinges[name], angle_deg=…)})`.
+    """
+    vehicle = _default_at_rest()
+    angle = {"antenna": antenna_deg}
+    angle |= dict.fromkeys(("solar_array_left", "solar_array_right"), solar_array_deg)
+    angle |= {f"leg_{name}": np.sign(z) * leg_fold_deg for name, (_, z) in _CORNERS.items()}
+    return vehicle.posed({key: replace(vehicle.hinges[key], angle_deg=float(angle[key])) for key in angle})
