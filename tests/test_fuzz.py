@@ -7,6 +7,7 @@ from pathlib import Path
 
 import fuzz
 import pytest
+import typer
 
 from vbnfault import cli
 from vbnfault.core.errors import InputError
@@ -30,7 +31,7 @@ def test_tracebacks_silence_and_endless_messages_are_noticed(
         raise InputError(text)
 
     def endless() -> None:
-        cli.typer.echo("x" * 10_000, err=True)
+        typer.echo("x" * 10_000, err=True)
         raise SystemExit(2)
 
     assert outcome(monkeypatch, tmp_path, lambda: None) == ""

@@ -19,6 +19,7 @@ import numpy as np
 import pytest
 
 from vbnfault import cli
+from vbnfault.cli import commands
 from vbnfault.body import load_shape
 from vbnfault.body.shape import signed_volume
 from vbnfault.core import resources, spice
@@ -392,7 +393,7 @@ def test_a_full_disk_and_a_lost_folder_are_told_in_a_sentence(tmp_path: Path) ->
     script = (
         "import os, sys; from vbnfault.cli import main; os.rmdir(os.getcwd()); sys.argv[1:] = ['list', 'lenses']; "
     )
-    path = os.pathsep.join([str(Path(resources.__file__).parents[1]), os.environ.get("PYTHONPATH", "")])
+    path = os.pathsep.join([str(Path(resources.__file__).parents[2]), os.environ.get("PYTHONPATH", "")])
     done = subprocess.run(
         [sys.executable, "-c", script + "main()"],
         cwd=gone,
@@ -423,7 +424,7 @@ def test_every_number_of_the_command_line_has_both_limits() -> None:
         assert option.min is not None, (name, parameter)
         assert option.max is not None, (name, parameter)
         # click finds nan within any limits
-        assert int in kinds or option.callback is cli._finite, (name, parameter)
+        assert int in kinds or option.callback is commands._finite, (name, parameter)
 
 
 @pytest.mark.parametrize("value", ["nan", "inf", "-inf", "1e400", "361"])

@@ -289,7 +289,7 @@ def test_a_damaged_library_never_ends_the_process(kind: str, tmp_path: Path) -> 
         "cut_short": lambda: NOT_LLVM.read_bytes()[: NOT_LLVM.stat().st_size // 4],
     }[kind]()
     path.write_bytes(data)
-    script = "from vbnfault import llvm; c = next(llvm.candidates()); assert not c.usable; print(c.problem)"
+    script = "from vbnfault.core import llvm; c = next(llvm.candidates()); assert not c.usable; print(c.problem)"
     done = subprocess.run(
         [sys.executable, "-W", "error", "-c", script],
         env={**os.environ, llvm.VARIABLE: str(path)},
@@ -303,7 +303,7 @@ def test_a_damaged_library_never_ends_the_process(kind: str, tmp_path: Path) -> 
 
 def test_looking_does_not_load_mitsuba() -> None:
     script = (
-        "import sys; from vbnfault import llvm; list(llvm.candidates());"
+        "import sys; from vbnfault.core import llvm; list(llvm.candidates());"
         "assert not {'mitsuba', 'drjit'} & set(sys.modules)"
     )
     subprocess.run([sys.executable, "-W", "error", "-c", script], check=True)

@@ -70,8 +70,8 @@ def full() -> Iterator[TextIO]:
 @pytest.fixture(autouse=True)
 def plan_of_made_up_samples(monkeypatch: pytest.MonkeyPatch) -> None:
     """Their scene is none that could be planned."""
-    monkeypatch.setattr("vbnfault.dataset.identity.planned", lambda *_: None)
-    monkeypatch.setattr("vbnfault.dataset.identity.is_exact", lambda *_: False)
+    monkeypatch.setattr("vbnfault.dataset.planned", lambda *_: None)
+    monkeypatch.setattr("vbnfault.dataset.is_exact", lambda *_: False)
 
 
 def test_every_command_is_tried() -> None:
@@ -129,7 +129,8 @@ def test_no_file_takes_the_number_of_a_closed_stream(closed: tuple[int, ...]) ->
     # what a library writes to its standard error would land in the file
     program = (
         "import os, sys, stat\n"
-        "from vbnfault import cli, resources\n"
+        "from vbnfault import cli\n"
+        "from vbnfault.core import resources\n"
         "was, kinds = resources.packaged, []\n"
         "def looked_at(kind):\n"
         "    kinds.extend(stat.S_ISREG(os.fstat(n).st_mode) for n in range(3))\n"

@@ -21,7 +21,7 @@ from typing import Any, BinaryIO, TypeVar
 
 from .errors import InputChanged, InputError, shown
 
-_PACKAGE = Path(__file__).resolve().parent
+_PACKAGE = Path(__file__).resolve().parents[1]
 
 MIB = 1 << 20
 # Kind of file → the most bytes it may have: of a shape as text, some 12 million facets; of the others, ten times

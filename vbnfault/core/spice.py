@@ -317,7 +317,7 @@ class _Reader:
             [
                 sys.executable,
                 "-c",
-                f"import sys; sys.path[:] = {paths!r}; from vbnfault import spice; spice.serve()",
+                f"import sys; sys.path[:] = {paths!r}; from vbnfault.core import spice; spice.serve()",
             ],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,

@@ -1,14 +1,47 @@
-"""Rendering with Mitsuba 3 (LLVM, spectral). The only package that imports it; importing this loads it."""
+"""Rendering with Mitsuba 3 (LLVM, spectral): the only package that imports it.
 
-from .bounces import indirect
-from .detail import FineRelief
-from .integrate import radiance
-from .layers import truth
-from .light import direct
-from .resolve import ground_height_m, is_between, is_clear, sun_visible_fraction, sunlit_ground
-from .runtime import set_threads
-from .surface import Surface
-from .vehicle import Vehicle
+Mitsuba loads with the first name taken from here. `description` holds what a render is asked for, as plain data,
+and loads without it.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from .bounces import indirect
+    from .detail import FineRelief
+    from .integrate import radiance
+    from .layers import truth
+    from .light import direct
+    from .resolve import ground_height_m, is_between, is_clear, sun_visible_fraction, sunlit_ground
+    from .runtime import set_threads
+    from .surface import Surface
+    from .vehicle import Vehicle
+
+_HOME = {
+    "FineRelief": "detail",
+    "Surface": "surface",
+    "Vehicle": "vehicle",
+    "direct": "light",
+    "ground_height_m": "resolve",
+    "indirect": "bounces",
+    "is_between": "resolve",
+    "is_clear": "resolve",
+    "radiance": "integrate",
+    "set_threads": "runtime",
+    "sun_visible_fraction": "resolve",
+    "sunlit_ground": "resolve",
+    "truth": "layers",
+}
+
+
+def __getattr__(name: str) -> Any:
+    """Return a public name from the module that defines it, which loads Mitsuba."""
+    if name not in _HOME:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(importlib.import_module(f".{_HOME[name]}", __name__), name)
 
 
 def self_test() -> str:
@@ -17,6 +50,8 @@ def self_test() -> str:
 
     from ..core.photometry import Diffuse
     from .description import Scene, Sunlight, View
+    from .integrate import radiance
+    from .surface import Surface
 
     square = np.array([[-9, -9, 0], [9, -9, 0], [9, 9, 0], [-9, 9, 0]], dtype=np.float32)
     faces = np.array([[0, 2, 1], [0, 3, 2]], dtype=np.int32)
