@@ -43,7 +43,7 @@ def sheet(name: str, coating: str, models: tuple[str, ...], pixels: int) -> tupl
     for angle in ANGLES_DEG:
         cells, light = [], []
         for model in models:
-            view = flare_images.View(
+            view = flare_images.FlareRequest(
                 lens=lens,
                 sun_deg=angle,
                 azimuth_deg=AZIMUTH_DEG,

@@ -36,7 +36,7 @@ GAMMA = 2.2
 
 
 def pose_at(
-    surface: render.Surface, height_m: float, below_deg: float, azimuth_deg: float, sun: tuple[float, float]
+    surface: render.TerrainMesh, height_m: float, below_deg: float, azimuth_deg: float, sun: tuple[float, float]
 ) -> Pose:
     """A level camera that height above the ground, moved off the site against its heading."""
     heading = frames.direction_L(azimuth_deg, 0.0)
@@ -58,7 +58,7 @@ def pose_at(
     )
 
 
-def sunlit_azimuth(surface: render.Surface) -> float:
+def sunlit_azimuth(surface: render.TerrainMesh) -> float:
     """From where a low Sun reaches most of the ground around the site."""
     x, y = (axis.ravel() for axis in np.meshgrid(np.linspace(-40, 40, 7), np.linspace(-40, 40, 7)))
     height = render.ground_height_m(surface, x, y, 400.0) + 0.5

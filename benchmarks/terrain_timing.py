@@ -44,7 +44,7 @@ def main() -> None:
             times.append(time.perf_counter())
             patch = cached_patch(body, site, seed=7)
             times.append(time.perf_counter())
-            surface = render.Surface(patch.vertices_L_m, patch.faces, patch.face_is_flat, patch.dust)
+            surface = render.TerrainMesh(patch.vertices_L_m, patch.faces, patch.face_is_flat, patch.dust)
             render.ground_height_m(surface, np.zeros(1), np.zeros(1), 400.0)
             times.append(time.perf_counter())
             built, read, surfaced = np.diff(times)

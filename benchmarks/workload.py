@@ -23,7 +23,7 @@ from vbnfault.pipeline.photograph import photograph
 from vbnfault.pipeline.record import label, to_sample
 from vbnfault.pipeline.resolve import resolve
 from vbnfault.pipeline.spec import Frame, Pose, SampleSpec, Terrain
-from vbnfault.render.description import Scene
+from vbnfault.render.description import RenderInput
 from vbnfault.render.emitter import SunDisc
 from vbnfault.render.runtime import dr, mi
 from vbnfault.render.sampling import Optics, Pixels, Strata
@@ -83,11 +83,11 @@ class Workload:
         return cls(session, patch, spec, _pose(surface))
 
     @cached_property
-    def scene(self) -> Scene:
+    def scene(self) -> RenderInput:
         """What the renderer is given."""
         return self._placed()[1]
 
-    def _placed(self) -> tuple[Frame, Scene]:
+    def _placed(self) -> tuple[Frame, RenderInput]:
         frame = Frame(spec=self.spec)
         frame.pose = self.pose
         frame.camera = self.session.base_camera
@@ -176,7 +176,7 @@ def write_shard(folder: store.Store, sample: Sample) -> None:
     store.write_samples(folder, (replace(sample, index=i) for i in range(SHARD_SAMPLES)))
 
 
-def _pose(surface: render.Surface) -> Pose:
+def _pose(surface: render.TerrainMesh) -> Pose:
     ground = float(render.ground_height_m(surface, np.zeros(1), np.zeros(1), 300.0)[0])
     z = frames.direction_L(CAMERA_AZIMUTH_DEG, -CAMERA_BELOW_HORIZON_DEG)
     x = np.cross([0.0, 0.0, 1.0], z)  # level: y of the image points down

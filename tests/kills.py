@@ -39,7 +39,6 @@ def import_all() -> None:
     import test_build  # noqa: F401
 
     from vbnfault import dataset, store  # noqa: F401
-    from vbnfault.scene import config
 
 
 def synthetic(out: Path, workers: int) -> None:

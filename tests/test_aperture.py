@@ -43,7 +43,7 @@ LENSES = sorted(resources.packaged("scenes/lenses"))
 SIDE_PX = 64
 
 
-def scene(**keys: Any) -> config.SceneConfig:
+def scene(**keys: Any) -> config.Scene:
     camera = {"width_px": SIDE_PX, "height_px": SIDE_PX, "pixel_pitch_um": 88.0, **keys}
     return config.parse_scene(small_scene(camera=camera), source="test")
 

@@ -435,7 +435,7 @@ def test_a_flare_is_a_table_and_a_picture(
 
 def test_a_flares_progress_is_told_by_wavelengths() -> None:
     told: list[int] = []
-    view = flare_images.View(
+    view = flare_images.FlareRequest(
         lens=load_lens("tessar_50_f2p8"),
         sun_deg=12.0,
         wavelength_nm=flare_images.wavelengths_nm(),

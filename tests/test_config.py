@@ -17,7 +17,7 @@ from vbnfault import faults
 from vbnfault.core import resources
 from vbnfault.core.errors import InputError
 from vbnfault.scene import config
-from vbnfault.scene.config import SceneConfig, load_scene, parse_scene
+from vbnfault.scene.config import Scene, load_scene, parse_scene
 
 PACKAGED = sorted(resources.packaged("scenes"))
 
@@ -146,7 +146,7 @@ def test_a_key_with_a_newline_still_makes_one_line(tmp_path: Path) -> None:
 
 def schema_numbers() -> list[tuple[str, str, dict[str, Any]]]:
     """(table, key, schema) of every plain number of the scene file, from its JSON schema."""
-    root = SceneConfig.model_json_schema()
+    root = Scene.model_json_schema()
     found = []
     for table, node in root["properties"].items():
         definition = root["$defs"].get(node.get("$ref", "").rsplit("/", 1)[-1], {})
@@ -432,7 +432,7 @@ def test_json_schema_describes_the_scene_file() -> None:
     assert schema["$schema"].endswith("2020-12/schema")
     assert schema["required"] == ["title"]
     assert schema["additionalProperties"] is False
-    assert set(schema["properties"]) == set(SceneConfig.model_fields)
+    assert set(schema["properties"]) == set(Scene.model_fields)
     assert set(schema["properties"]["faults"]["properties"]) == set(faults.registry())
     fov = schema["$defs"]["CameraTable"]["properties"]["fov_deg"]
     assert (fov["type"], fov["minimum"], fov["maximum"], fov["default"]) == ("number", 0.01, 140, 65)

@@ -48,7 +48,7 @@ def files(tmp_path: Path) -> dict[str, Path]:
     return made
 
 
-def scene_of(files: dict[str, Path], **tables: dict[str, Any]) -> config.SceneConfig:
+def scene_of(files: dict[str, Path], **tables: dict[str, Any]) -> config.Scene:
     table = small_scene(
         dataset={"samples": 4, "sites": 2},
         body={"shape": str(files["shape"]), "unit": "m"},
@@ -142,7 +142,7 @@ def test_a_mesh_replaced_during_a_build_ends_it_with_nothing_wrong_written(
 
 
 def test_a_second_plan_in_one_process_reads_anew(files: dict[str, Path]) -> None:
-    def lens_of(scene: config.SceneConfig) -> Any:
+    def lens_of(scene: config.Scene) -> Any:
         with resources.Contents().in_use():
             return pipeline.Session(scene).base_camera.lens.prescription
 

@@ -15,18 +15,18 @@ from vbnfault.core import spectra
 from vbnfault.core.quantities import BODY, SKY, Electrons, Radiance
 from vbnfault.pipeline import expose
 from vbnfault.scene import config
-from vbnfault.scene.config import SceneConfig
+from vbnfault.scene.config import Scene
 from vbnfault.world import assemble
 
 SIZE = {"width_px": 32, "height_px": 32}
 
 
-def parsed(**tables: Any) -> SceneConfig:
+def parsed(**tables: Any) -> Scene:
     scene = small_scene(**{**tables, "camera": {**SIZE, **tables.get("camera", {})}})
     return config.parse_scene(scene, source="test")
 
 
-def facet(scene: SceneConfig) -> Radiance:
+def facet(scene: Scene) -> Radiance:
     """A frame full of Lambert's ground whose normal is 45 degrees from the Sun: L = rho E cos(45) / pi."""
     wavelength = assemble.wavelengths_nm(scene)
     sun = assemble.sunlight(scene, np.array([0.0, 0.0, -1.0])).irradiance_W_m2_nm
@@ -50,7 +50,7 @@ def test_the_reference_exposure_puts_a_facet_at_45_degrees_at_the_metering_level
     np.testing.assert_allclose(brightness * dimmed, level, rtol=3e-3)
 
 
-def metered(scene: SceneConfig, brightness: np.ndarray, semantic: np.ndarray) -> tuple[float, float]:
+def metered(scene: Scene, brightness: np.ndarray, semantic: np.ndarray) -> tuple[float, float]:
     """Return the metered exposure of a frame of given brightness after one second, and the reference."""
     camera: Camera = assemble.base_camera(scene)
     white = np.ones(4, dtype=np.float32)

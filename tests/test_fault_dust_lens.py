@@ -20,7 +20,7 @@ from vbnfault.core.errors import InputError
 from vbnfault.detector import Detector
 from vbnfault.faults import FaultContext, dust_lens
 from vbnfault.lens import RealLens, ThinLens, first_order, load_lens, scaled_to_field, stopped_down
-from vbnfault.lens.footprint import Frame, beams, disc_overlap
+from vbnfault.lens.footprint import ImageFrame, beams, disc_overlap
 from vbnfault.lens.rays import real_pupil_diameter_mm, trace
 
 F64 = NDArray[np.float64]
@@ -295,14 +295,14 @@ def test_beams_are_those_of_the_imaging_lens() -> None:
 def test_the_lens_is_the_cameras_own_or_the_one_named() -> None:
     own = real_context("nikkor_28_f2p8").camera.lens
     frame = {"width_px": 256, "height_px": 256, "pixel_pitch_um": 22.0}
-    assert Frame(lens=own, **frame).real_lens("") is own
-    named = Frame(lens=own, **frame).real_lens("tessar_50_f2p8")
+    assert ImageFrame(lens=own, **frame).real_lens("") is own
+    named = ImageFrame(lens=own, **frame).real_lens("tessar_50_f2p8")
     assert first_order(named.prescription).efl_mm == pytest.approx(own.focal_length_mm)
-    thin = Frame(lens=ThinLens(focal_length_mm=7.0, f_number=5.6), **frame).real_lens("")
+    thin = ImageFrame(lens=ThinLens(focal_length_mm=7.0, f_number=5.6), **frame).real_lens("")
     assert first_order(thin.prescription).efl_mm == pytest.approx(7.0)
     # the ray at the beam's rim is traced exactly; its width is told on a grid of heights, within 1e-3
     assert real_pupil_diameter_mm(thin.prescription) == pytest.approx(7.0 / 5.6, rel=1e-3)
-    wide = Frame(lens=ThinLens(focal_length_mm=7.0, f_number=1.0), **frame).real_lens("")
+    wide = ImageFrame(lens=ThinLens(focal_length_mm=7.0, f_number=1.0), **frame).real_lens("")
     assert real_pupil_diameter_mm(wide.prescription) == pytest.approx(7.0 / 2.8, rel=0.01)
 
 

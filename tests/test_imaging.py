@@ -466,7 +466,7 @@ def test_the_best_focus_has_the_least_spots() -> None:
 # --- scenes ----------------------------------------------------------------------------------------------------
 
 
-def scene(tmp: Path | None = None, **keys: Any) -> config.SceneConfig:
+def scene(tmp: Path | None = None, **keys: Any) -> config.Scene:
     table = small_scene(camera={"width_px": 128, "height_px": 112, "pixel_pitch_um": 44.0, **keys})
     table["dataset"] |= {"layers": ["clean", "depth_m", "semantic", "normal", "radiance", "point_T_m"]}
     return config.parse_scene(table, source="test")

@@ -19,9 +19,9 @@ import numpy as np
 import pytest
 
 from vbnfault import cli
-from vbnfault.cli import commands
 from vbnfault.body import load_shape
 from vbnfault.body.shape import signed_volume
+from vbnfault.cli import commands
 from vbnfault.core import resources, spice
 from vbnfault.core.errors import InputError, VbnfaultError, shown
 from vbnfault.detector.sensor import load_sensor
@@ -479,7 +479,7 @@ def test_whole_numbers_beyond_floats_are_refused_in_every_fault_key() -> None:
 
 
 def test_every_number_of_a_scene_has_both_limits() -> None:
-    root = config.SceneConfig.model_json_schema()
+    root = config.Scene.model_json_schema()
 
     def walk(node: dict[str, Any], at: str) -> None:
         if "$ref" in node:
@@ -509,7 +509,7 @@ def test_frames_that_no_memory_holds_are_refused() -> None:
 
 def test_every_enumerated_key_of_a_scene_takes_each_of_its_options() -> None:
     """... as itself, and nothing else."""
-    root = config.SceneConfig.model_json_schema()
+    root = config.Scene.model_json_schema()
     tried = 0
 
     def walk(node: dict[str, Any], path: tuple[str, ...]) -> None:

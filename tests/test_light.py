@@ -13,16 +13,16 @@ from test_render import NODES, UP, join, plane, sun, view
 from vbnfault import render
 from vbnfault.core import frames, photometry, spectra
 from vbnfault.core.photometry import HAPKE_TABLES, Diffuse, Photometry, hapke_at
-from vbnfault.render.description import Scene, Sunlight, View
+from vbnfault.render.description import RenderInput, Sunlight, View
 from vbnfault.render.runtime import dr, mi
 from vbnfault.render.sampling import disc_sets
 
 
-def scene(a_view: View, light: Sunlight, ground: Photometry | float, spp: int = 16, **more: object) -> Scene:
+def scene(a_view: View, light: Sunlight, ground: Photometry | float, spp: int = 16, **more: object) -> RenderInput:
     """A scene with the photometry given, or Lambert's of a grey value."""
     if isinstance(ground, float):
         ground = Diffuse(reflectance=np.full(len(NODES), ground))
-    return Scene(
+    return RenderInput(
         view=a_view,
         sun=light,
         wavelength_nm=NODES,
@@ -33,11 +33,11 @@ def scene(a_view: View, light: Sunlight, ground: Photometry | float, spp: int = 
     )
 
 
-def ball(radius_m: float = 100.0, subdivisions: int = 7) -> render.Surface:
+def ball(radius_m: float = 100.0, subdivisions: int = 7) -> render.TerrainMesh:
     import trimesh
 
     mesh = trimesh.creation.icosphere(subdivisions=subdivisions, radius=radius_m)
-    return render.Surface(
+    return render.TerrainMesh(
         mesh.vertices.astype(np.float32), mesh.faces.astype(np.int32), np.zeros(len(mesh.faces), bool)
     )
 
@@ -217,7 +217,7 @@ def test_penumbra_of_a_straight_edge(distance_au: float, *, darkened: bool) -> N
     assert width(got) == pytest.approx(width(expected), rel=0.02)
 
 
-def wall_and_floor(height_m: float = 10.0) -> tuple[render.Surface, Sunlight]:
+def wall_and_floor(height_m: float = 10.0) -> tuple[render.TerrainMesh, Sunlight]:
     """A wall in the plane x = 0 facing +x, lit, on a floor that the Sun does not reach."""
     floor = plane(60.0)
     z, reach = -height_m, 60.0
@@ -259,7 +259,7 @@ def _strip_factor(d: float, h: float, half_length: float) -> float:
 
 def test_dust_colours_its_ground() -> None:
     vertices, faces = plane()
-    surface = render.Surface(vertices, faces, np.ones(2, bool), dust=np.ones(4, np.float32))
+    surface = render.TerrainMesh(vertices, faces, np.ones(2, bool), dust=np.ones(4, np.float32))
     a_view, light = view(10 * UP, -UP, width=16), sun(frames.direction_L(0, 50))
     contrast = np.linspace(0.1, 0.3, len(NODES))
     for ground in (Diffuse(reflectance=np.full(len(NODES), 0.06)), hapke_at(NODES)):
@@ -278,7 +278,7 @@ def test_a_plane_has_the_radiance_of_its_model(disc: str, phase_slope_mag_deg: f
     """Every model, with dust and without, with bounces and without: radiance_factor · E / π at every pixel."""
     vertices, faces = plane()
     dust = np.full(4, 0.5, np.float32)
-    surface = render.Surface(vertices, faces, np.ones(2, bool), dust=dust)
+    surface = render.TerrainMesh(vertices, faces, np.ones(2, bool), dust=dust)
     a_view = view(np.array([0.0, 0.0, -10.0]), np.array([0.5, 0.2, 1.0]), width=8, fov_deg=2.0)
     light = dataclasses.replace(sun(frames.direction_L(40, 35)), angular_radius_rad=1e-5)
     ground: Photometry = hapke_at(NODES)

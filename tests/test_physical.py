@@ -150,7 +150,7 @@ def test_spacecraft_casts_its_shadow() -> None:
     faces = np.array([[0, 1, 2], [0, 2, 3]], np.int32)
     vehicle = render.Vehicle(plate, faces, np.zeros(2, np.int32), np.full((1, len(NODES)), 0.5))
     vertices, ground = plane()
-    surface = render.Surface(vertices, ground, np.ones(2, bool), vehicle=vehicle)
+    surface = render.TerrainMesh(vertices, ground, np.ones(2, bool), vehicle=vehicle)
     # looking straight down from 10 m with the Sun at the zenith: the plate's shadow is its own size, 2 m
     a_view, light = view(10 * UP, -UP, width=128, fov_deg=40.0), sun(UP, 2.0)
     image = render.radiance(surface, scene(a_view, light, 0.06)).array[4]
@@ -259,7 +259,7 @@ def test_finest_relief_has_its_slopes_and_fades_into_the_pixel() -> None:
     spread = []
     for height in (2.0, 400.0):
         a_view = view(height * UP, -UP, width=64, fov_deg=30.0)
-        rough = render.Surface(vertices, faces, np.ones(2, bool), fine=render.FineRelief(slope=0.08))
+        rough = render.TerrainMesh(vertices, faces, np.ones(2, bool), fine=render.FineRelief(slope=0.08))
         image = render.radiance(rough, scene(a_view, light, 0.06)).array[4]
         flat = render.radiance(join(plane()), scene(a_view, light, 0.06)).array[4]
         # slopes to all sides cancel in the mean, up to the curvature of the cosine: tilt² / 2, 3 %

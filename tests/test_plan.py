@@ -16,7 +16,7 @@ from vbnfault.core import frames
 from vbnfault.core.errors import InputError
 from vbnfault.faults import FAULT_AXIS
 from vbnfault.scene import config, plan
-from vbnfault.scene.config import SceneConfig, parse_scene
+from vbnfault.scene.config import Scene, parse_scene
 
 N = 2000
 FAR = plan.SUN_AVERTED
@@ -27,7 +27,7 @@ NEAR = plan.SUN_FACING
 LEVEL = 1e-3 / 30
 
 
-def scene(**tables: dict[str, Any]) -> SceneConfig:
+def scene(**tables: dict[str, Any]) -> Scene:
     dataset = {"samples": N, "seed": 20} | tables.pop("dataset", {})
     return parse_scene({"title": "t", "dataset": dataset, **tables}, source="here")
 

@@ -12,7 +12,7 @@ from vbnfault.core import frames, spectra
 from vbnfault.core.photometry import Diffuse
 from vbnfault.detector import Detector
 from vbnfault.lens import ThinLens
-from vbnfault.render.description import Scene, Sunlight, View
+from vbnfault.render.description import RenderInput, Sunlight, View
 from vbnfault.render.runtime import dr
 
 UP = np.array([0.0, 0.0, -1.0])
@@ -32,14 +32,14 @@ def box(centre: np.ndarray, half_m: float) -> tuple[np.ndarray, np.ndarray]:
     return (mesh.vertices + centre).astype(np.float32), mesh.faces.astype(np.int32)
 
 
-def join(*parts: tuple[np.ndarray, np.ndarray]) -> render.Surface:
+def join(*parts: tuple[np.ndarray, np.ndarray]) -> render.TerrainMesh:
     offset, vertices, faces = 0, [], []
     for v, f in parts:
         vertices.append(v)
         faces.append(f + offset)
         offset += len(v)
     all_faces = np.concatenate(faces).astype(np.int32)
-    return render.Surface(np.concatenate(vertices), all_faces, np.ones(len(all_faces), bool))
+    return render.TerrainMesh(np.concatenate(vertices), all_faces, np.ones(len(all_faces), bool))
 
 
 def sun(direction: np.ndarray, distance_au: float = 1.0) -> Sunlight:
@@ -64,8 +64,10 @@ def view(position: np.ndarray, look: np.ndarray, width: int = 64, fov_deg: float
     )
 
 
-def scene(a_view: View, light: Sunlight, spp: int = 16, reflectance: float | str = 0.06, key: int = 5) -> Scene:
-    return Scene(
+def scene(
+    a_view: View, light: Sunlight, spp: int = 16, reflectance: float | str = 0.06, key: int = 5
+) -> RenderInput:
+    return RenderInput(
         view=a_view,
         sun=light,
         wavelength_nm=NODES,
@@ -92,7 +94,7 @@ def test_lambert_sphere_integrates_to_its_geometric_albedo() -> None:
     import trimesh
 
     ball = trimesh.creation.icosphere(subdivisions=6, radius=100.0)
-    surface = render.Surface(
+    surface = render.TerrainMesh(
         ball.vertices.astype(np.float32), ball.faces.astype(np.int32), np.zeros(len(ball.faces), bool)
     )
     # from 1e5 radii away, so that the outline is the great circle to 1e-10
@@ -202,7 +204,7 @@ def test_a_lit_sphere_far_away_has_no_acne() -> None:
     ball = trimesh.creation.icosphere(subdivisions=5, radius=1500.0)
     centre = np.array([4000.0, 1000.0, 500.0])
     vertices, faces = (ball.vertices + centre).astype(np.float32), ball.faces.astype(np.int32)
-    surface = render.Surface(vertices, faces, np.ones(len(faces), bool))
+    surface = render.TerrainMesh(vertices, faces, np.ones(len(faces), bool))
     light = sun(np.array([-0.3, 1.0, -0.5]))
     a_view = view(np.zeros(3), centre, width=256, fov_deg=50.0)
     image = render.radiance(surface, scene(a_view, light, spp=1)).array[0]
@@ -250,7 +252,7 @@ def test_clearance_is_the_distance_to_the_nearest_facet() -> None:
         assert clear == [True, False]
     # needles thinner than the angle between any directions that one would look along
     needle = (np.array([[0, 0, -5.0], [1e-3, 0, 0], [0, 1e-3, 0]]), np.array([[0, 1, 2]], np.int32))
-    surface = render.Surface(needle[0], needle[1], np.ones(1, bool))
+    surface = render.TerrainMesh(needle[0], needle[1], np.ones(1, bool))
     positions = np.array([[0.0, 0.0, -6.0], [0.5, 0.5, -6.0]])
     assert render.is_clear(surface, positions, 0.999).tolist() == [True, True]
     assert render.is_clear(surface, positions, 1.001).tolist() == [False, True]

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 import xarray
 
-from vbnfault.cli import commands
 from vbnfault import dataset, pipeline, store
+from vbnfault.cli import commands
 from vbnfault.core import resources
 from vbnfault.scene import config
 

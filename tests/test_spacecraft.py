@@ -17,7 +17,7 @@ from trimesh.visual.material import PBRMaterial
 from vbnfault.core import spectra
 from vbnfault.core.errors import InputError
 from vbnfault.world import spacecraft
-from vbnfault.world.spacecraft import Material, Part, Placement, Pose, Spacecraft, load_spacecraft
+from vbnfault.world.spacecraft import HingePose, Material, ModelPlacement, Part, Spacecraft, load_spacecraft
 
 CORNERS = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nv 0 0 1\nv 1 0 1\nv 1 1 1\n"
 OBJ = (
@@ -158,13 +158,13 @@ def test_units(obj: Path, unit: Any, metres: float) -> None:
 
 def test_placement(obj: Path) -> None:
     placed = load_spacecraft(
-        obj, unit="cm", placement=Placement(roll_deg=90, yaw_deg=90, translation_B_m=(0.0, 0.5, -2.0))
+        obj, unit="cm", placement=ModelPlacement(roll_deg=90, yaw_deg=90, translation_B_m=(0.0, 0.5, -2.0))
     )
     # Rx(90) Rz(90): x -> y -> z, y -> -x, z -> -y
     x, y, z = load_spacecraft(obj).merged().vertices_B_m.T * 0.01
     expected = np.stack([-y, -z + 0.5, x - 2.0], axis=1)
     np.testing.assert_allclose(placed.merged().vertices_B_m, expected, atol=1e-6)
-    upright = Placement(yaw_deg=180).B_from_V  # the convention of GLB: y up, z forward, x left
+    upright = ModelPlacement(yaw_deg=180).B_from_V  # the convention of GLB: y up, z forward, x left
     np.testing.assert_allclose(upright, np.diag([-1.0, -1.0, 1.0]), atol=1e-15)
 
 
@@ -239,12 +239,12 @@ def test_wrong_files(tmp_path: Path) -> None:
         ({"materials": {"wing": {"wavelength_nm": [400], "value": [1.2]}}}, r"value = \[1.2\]: must be 0 to 1"),
         ({"materials": {"wing": {"wavelength_nm": ["red"], "value": [1]}}}, "must be lists of numbers"),
         (
-            {"poses": {"leg": Pose(hinge_B_m=(0, 0, 0), axis_B=(1, 0, 0))}},
+            {"poses": {"leg": HingePose(hinge_B_m=(0, 0, 0), axis_B=(1, 0, 0))}},
             "spacecraft pose 'leg': no such name; the vehicle has bus, panel, wing, wing/panel, wing/yoke, yoke",
         ),
-        ({"placement": Placement(yaw_deg=float("inf"))}, "placement has numbers that are not finite"),
+        ({"placement": ModelPlacement(yaw_deg=float("inf"))}, "placement has numbers that are not finite"),
         (
-            {"placement": Placement(translation_B_m=(0, 0, float("nan")))},
+            {"placement": ModelPlacement(translation_B_m=(0, 0, float("nan")))},
             "placement has numbers that are not finite",
         ),
     ],
@@ -256,11 +256,11 @@ def test_refused_settings(obj: Path, settings: dict[str, Any], says: str) -> Non
 
 def test_refused_poses() -> None:
     with pytest.raises(InputError, match=r"axis = \[0, 0, 0\]"):
-        Pose(hinge_B_m=(0, 0, 0), axis_B=(0, 0, 0))
+        HingePose(hinge_B_m=(0, 0, 0), axis_B=(0, 0, 0))
     with pytest.raises(InputError, match="finite numbers"):
-        Pose(hinge_B_m=(0, 0, 0), axis_B=(0, 0, 1), angle_deg=float("nan"))
+        HingePose(hinge_B_m=(0, 0, 0), axis_B=(0, 0, 1), angle_deg=float("nan"))
     with pytest.raises(InputError, match="finite numbers"):
-        Pose(hinge_B_m=(0, 0), axis_B=(0, 0, 1))  # type: ignore[arg-type]
+        HingePose(hinge_B_m=(0, 0), axis_B=(0, 0, 1))  # type: ignore[arg-type]
 
 
 # ------------------------------------------------------------------------------------ poses
@@ -268,7 +268,7 @@ def test_refused_poses() -> None:
 
 def test_a_quarter_turn_about_a_hinge(obj: Path) -> None:
     at_rest = load_spacecraft(obj)
-    hinge = Pose(hinge_B_m=(1.0, 2.0, 0.0), axis_B=(0.0, 0.0, 3.0), angle_deg=90.0)
+    hinge = HingePose(hinge_B_m=(1.0, 2.0, 0.0), axis_B=(0.0, 0.0, 3.0), angle_deg=90.0)
     posed = load_spacecraft(obj, poses={"wing": hinge})
     for before, after in zip(at_rest.parts, posed.parts, strict=True):
         x, y, z = before.vertices_B_m.T
@@ -281,7 +281,7 @@ def test_a_quarter_turn_about_a_hinge(obj: Path) -> None:
 
 def test_any_turn_follows_rodrigues(obj: Path) -> None:
     axis, point, angle = np.array([1.0, -2.0, 0.5]), np.array([0.3, 0.1, -0.7]), 37.0
-    pose = Pose(hinge_B_m=tuple(point), axis_B=tuple(axis), angle_deg=angle)
+    pose = HingePose(hinge_B_m=tuple(point), axis_B=tuple(axis), angle_deg=angle)
     k, t = axis / np.linalg.norm(axis), np.radians(angle)
     v = load_spacecraft(obj).parts[0].vertices_B_m - point
     turned = v * np.cos(t) + np.cross(k, v) * np.sin(t) + np.outer(v @ k, k) * (1 - np.cos(t)) + point
@@ -290,8 +290,8 @@ def test_any_turn_follows_rodrigues(obj: Path) -> None:
 
 def test_nested_poses_turn_the_inner_first(obj: Path) -> None:
     # hinges are those at rest: the panel turns on the wing, and its hinge goes along as the wing turns
-    outer = Pose(hinge_B_m=(0.0, 0.0, 0.0), axis_B=(0.0, 0.0, 1.0), angle_deg=90.0)
-    inner = Pose(hinge_B_m=(0.0, 1.0, 0.0), axis_B=(1.0, 0.0, 0.0), angle_deg=180.0)
+    outer = HingePose(hinge_B_m=(0.0, 0.0, 0.0), axis_B=(0.0, 0.0, 1.0), angle_deg=90.0)
+    inner = HingePose(hinge_B_m=(0.0, 1.0, 0.0), axis_B=(1.0, 0.0, 0.0), angle_deg=180.0)
     rest = {part.name: part for part in load_spacecraft(obj).parts}
     both = {part.name: part for part in load_spacecraft(obj, poses={"wing": outer, "panel": inner}).parts}
     x, y, z = rest["wing/panel"].vertices_B_m.T
@@ -303,7 +303,7 @@ def test_nested_poses_turn_the_inner_first(obj: Path) -> None:
 def test_posing_leaves_the_vehicle_as_it_was(obj: Path) -> None:
     vehicle = load_spacecraft(obj)
     before = [part.vertices_B_m.copy() for part in vehicle.parts]
-    vehicle.posed({"wing": Pose(hinge_B_m=(0, 0, 0), axis_B=(1, 0, 0), angle_deg=50)})
+    vehicle.posed({"wing": HingePose(hinge_B_m=(0, 0, 0), axis_B=(1, 0, 0), angle_deg=50)})
     for part, vertices in zip(vehicle.parts, before, strict=True):
         np.testing.assert_array_equal(part.vertices_B_m, vertices)
 

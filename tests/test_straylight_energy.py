@@ -74,7 +74,7 @@ def transmitted(lens: Prescription) -> F64:
 def test_a_flares_direct_image_has_the_lens_transmission(sun_deg: float) -> None:
     """What the pupil admits and the lens transmits: starburst, glare and veil are in it, ghosts are not."""
     lens = parse_lens(ABSORBING, source="test")
-    view = flare_images.View(
+    view = flare_images.FlareRequest(
         lens=lens, sun_deg=sun_deg, azimuth_deg=20.0, fov_deg=60.0, pixels=96, wavelength_nm=NODES, model="paraxial"
     )
     pupil = np.pi / 4 * first_order(lens).entrance_pupil_diameter_mm ** 2 * np.cos(np.radians(sun_deg))

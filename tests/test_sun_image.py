@@ -20,7 +20,7 @@ from vbnfault.render.description import Sunlight, View
 
 
 @pytest.fixture(scope="module")
-def surface() -> render.Surface:
+def surface() -> render.TerrainMesh:
     return join(plane(1.0))
 
 
@@ -40,7 +40,7 @@ def power(radiance: np.ndarray, a_view: View) -> np.ndarray:
 
 @pytest.mark.parametrize("samples", [1, 4])
 @pytest.mark.parametrize("width", [16, 61, 128, 1024])
-def test_power_of_the_disc(surface: render.Surface, width: int, samples: int) -> None:
+def test_power_of_the_disc(surface: render.TerrainMesh, width: int, samples: int) -> None:
     darkened = dataclasses.replace(
         sun(frames.direction_L(40, 35)), limb_darkening=spectra.limb_darkening(np.linspace(420, 880, 8))
     )
@@ -54,7 +54,7 @@ def test_power_of_the_disc(surface: render.Surface, width: int, samples: int) ->
         np.testing.assert_array_equal(found.array >= found.sun, True)
 
 
-def test_the_rays_of_the_pixels_leave_the_disc_alone(surface: render.Surface) -> None:
+def test_the_rays_of_the_pixels_leave_the_disc_alone(surface: render.TerrainMesh) -> None:
     light = sun(frames.direction_L(40, 35))
     a_view = looking(light, 64, 30.0, (3.0, 4.0))
     one, other = (
@@ -93,7 +93,7 @@ def test_a_resolved_disc_is_the_mean_over_each_pixel() -> None:
     np.testing.assert_allclose(got[inner], expected[inner], rtol=1e-3)
 
 
-def test_a_border_cuts_the_disc(surface: render.Surface) -> None:
+def test_a_border_cuts_the_disc(surface: render.TerrainMesh) -> None:
     """The part of a disc that the frame's border leaves is a circle's segment."""
     light = sun(frames.direction_L(40, 35))
     for inside in (0.5, 0.13):  # of the radius, within the border from the centre's side
@@ -141,7 +141,7 @@ def test_a_horizon_hides_a_part(above: float, width: int) -> None:
     assert visible == pytest.approx(got, abs=5e-3)
 
 
-def test_a_small_sun_owns_its_pixel(surface: render.Surface) -> None:
+def test_a_small_sun_owns_its_pixel(surface: render.TerrainMesh) -> None:
     light = sun(frames.direction_L(40, 35))
     a_view = looking(light, 16, 60.0, (11.0, -17.0))
     truth = render.truth(surface, a_view, light)
@@ -204,7 +204,7 @@ def test_a_part_of_the_spacecraft_hides_a_half(aperture_m: float) -> None:
         corners, np.array([[0, 1, 2], [0, 2, 3]], np.int32), np.zeros(2, np.int32), np.full((1, 8), 0.3)
     )
     ground, faces = plane(1.0)
-    surface = render.Surface(ground, faces, np.ones(2, bool), vehicle=plate)
+    surface = render.TerrainMesh(ground, faces, np.ones(2, bool), vehicle=plate)
     light = sun(frames.direction_L(40, 35))
     a_view = dataclasses.replace(looking(light, 32, 20.0, (0.0, 0.0)), aperture_radius_m=aperture_m)
     found = render.radiance(surface, scene(a_view, light, spp=1)).sun

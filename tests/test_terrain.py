@@ -227,7 +227,7 @@ def test_boulders_rest_in_the_ground(patches: list[Patch]) -> None:
     held = shown = total = 0
     for patch in patches[:2]:
         points, faces = ground_of(patch)
-        ground = render.Surface(points.astype(np.float32), faces, np.zeros(len(faces), dtype=bool))
+        ground = render.TerrainMesh(points.astype(np.float32), faces, np.zeros(len(faces), dtype=bool))
         rocks = trimesh.Trimesh(patch.vertices_L_m, patch.faces[patch.face_is_boulder], process=False)
         label = trimesh.graph.connected_component_labels(rocks.face_adjacency, node_count=len(rocks.faces))
         rock = np.zeros(len(patch.vertices_L_m), dtype=np.int64)

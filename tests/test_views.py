@@ -296,7 +296,9 @@ def test_a_flown_pose_is_kept_with_its_sun_hidden_and_refused_within_the_ground(
 
     def at(height_m: float, sun_L: list[float], boresight: np.ndarray) -> Frame:
         position = site.position_T_m + site.T_from_L @ np.array([0.0, 0.0, -height_m])
-        placed = spice.Pose(camera_position_T_m=position, T_from_C=site.T_from_L @ frames.L_from_C0(boresight))
+        placed = spice.SpacecraftState(
+            camera_position_T_m=position, T_from_C=site.T_from_L @ frames.L_from_C0(boresight)
+        )
         sun_T = site.T_from_L @ frames.unit(np.array(sun_L))
         monkeypatch.setattr(assemble, "spacecraft_pose", lambda *_: placed)
         monkeypatch.setattr(assemble, "ephemeris", lambda *_: (3.0 * sun_T, np.eye(3)))

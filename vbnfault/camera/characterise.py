@@ -2,7 +2,8 @@
 
 From pairs of flat and dark pictures over exposures: system gain K, quantum efficiency, temporal dark noise, dark
 current, saturation, linearity; from stacks: DSNU, PRNU and the spectra of what varies over the picture. The
-analysis knows nothing of how pictures are made: a `Camera` takes them, `VirtualCamera` those of a sensor's device.
+analysis knows nothing of how pictures are made: a `MeasuredCamera` takes them, and `VirtualCamera` is one for the
+device of a sensor.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ _LINEAR_SHARE = 0.7  # of saturation up to which gain and response are told (sec
 _LINEARITY_RANGE = 0.05, 0.95  # of saturation over which linearity is told (section 6.7)
 
 
-class Camera(Protocol):
+class MeasuredCamera(Protocol):
     """What is characterised: raw pictures of evenly lit pixels."""
 
     def take(self, photons: float, exposure_s: float, number: int) -> NDArray[np.uint16]:
@@ -47,7 +48,7 @@ class Settings:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Transfer:
+class PhotonTransfer:
     """Photon transfer: means and temporal variances, in DN and DN², of flats and of darks at the same exposure."""
 
     photons: F64
@@ -95,7 +96,7 @@ class Characterisation:
 
     channel: str
     result: Result
-    transfer: Transfer
+    transfer: PhotonTransfer
     dark_mean_dn: F64
     dark_variance_dn2: F64
     dark_exposure_s: F64
@@ -110,7 +111,7 @@ class Characterisation:
 
 
 def characterise(
-    camera: Camera,
+    camera: MeasuredCamera,
     *,
     sites: Mapping[str, Site],
     photons_at_saturation: float,
@@ -246,7 +247,7 @@ def _channel(
             prnu_percent=float(100 * prnu),
             black_level_dn=float(dark_mean),
         ),
-        transfer=Transfer(
+        transfer=PhotonTransfer(
             photons=photons,
             mean_dn=mean,
             variance_dn2=variance,
@@ -311,7 +312,7 @@ class VirtualCamera:
         return self.device.sensor.readout.white_e / max(self.efficiency.values())
 
     def take(self, photons: float, exposure_s: float, number: int) -> NDArray[np.uint16]:
-        """As `Camera` has it."""
+        """As `MeasuredCamera` has it."""
         shape = self.device.shape
         light = by_channel(self.device.sensor, shape, [photons * eta for eta in self.efficiency.values()])
         shot, read, row = (np.random.default_rng([self.seed, number, k]) for k in range(3))

@@ -24,7 +24,7 @@ from ..core import interrupts, streams
 from ..core.errors import InputError, VbnfaultError, shown
 
 if TYPE_CHECKING:
-    from ..scene.config import SceneConfig
+    from ..scene.config import Scene
 
 app = typer.Typer(
     name="vbnfault",
@@ -134,7 +134,7 @@ def _overrides(settings: list[str] | None, **named: Any) -> dict[str, Any]:
     return values | {key.replace("__", "."): value for key, value in named.items() if value is not None}
 
 
-def _scene(name: str, settings: list[str] | None, **named: Any) -> SceneConfig:
+def _scene(name: str, settings: list[str] | None, **named: Any) -> Scene:
     from ..scene import config
 
     return config.load_scene(name, _overrides(settings, **named))
@@ -439,7 +439,7 @@ def flare(
     if focal_length_mm is not None:
         prescription = optics.scaled_to_focal_length(prescription, focal_length_mm)
     optics.first_order(prescription)  # refuses a lens that no ray passes
-    view = flare_images.View(
+    view = flare_images.FlareRequest(
         lens=prescription if coating is None else prescription.coated(coating),
         sun_deg=sun_deg,
         azimuth_deg=azimuth_deg,

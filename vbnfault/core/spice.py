@@ -64,7 +64,7 @@ _MEANINGS = {
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Pose:
+class SpacecraftState:
     """A camera's place and attitude in the target's body-fixed frame.
 
     Attributes
@@ -216,7 +216,7 @@ def J_from_T(frame: str, et_s: float) -> F64:
 
 def pose_T(
     spacecraft: str, target: str, frame: str, camera_frame: str, et_s: float, K_from_C: F64 | None = None
-) -> Pose:
+) -> SpacecraftState:
     """Where a spacecraft's camera is and where it looks, in the target's body-fixed frame.
 
     Parameters
@@ -245,7 +245,7 @@ def pose_T(
     position_km = _ask(purpose, "position_km", str(spacecraft), et_s, frame, str(target))
     purpose = f"frame {camera_frame} in {frame} at {_epoch(et_s)}"
     T_from_K = np.asarray(_ask(purpose, "pxform", camera_frame, frame, et_s), dtype=np.float64)
-    return Pose(
+    return SpacecraftState(
         camera_position_T_m=np.asarray(position_km, dtype=np.float64) * METRES_PER_KM,
         T_from_C=T_from_K @ mounting,
     )

@@ -31,13 +31,13 @@ from .errors import BuildFailed, Interrupted
 from .lock import locked
 from .processes import Pool
 from .progress import Progress, duration_text, size_text
-from .tasks import Run, Session, SessionFactory, run_here
+from .tasks import Run, SampleMaker, SessionFactory, run_here
 
 __all__ = [
     "RECYCLE_SHARDS",
     "BuildFailed",
     "Interrupted",
-    "Session",
+    "SampleMaker",
     "SessionFactory",
     "Summary",
     "build",

@@ -25,7 +25,7 @@ from ..pipeline import labels
 from ..pipeline.record import proposal
 from ..pipeline.spec import mask_any_faults, stored_layers
 from ..scene import config, plan
-from ..scene.config import SceneConfig
+from ..scene.config import Scene
 from ..store import StoreSpec
 from ..world import assemble
 from . import build, describe
@@ -79,7 +79,7 @@ def _digest(path: str | Path, what: str) -> str:
     return f"sha256:{resources.sha256(resources.read_input(path, what))}"
 
 
-def _contents_of_files(identity: dict[str, Any], scene: SceneConfig) -> None:
+def _contents_of_files(identity: dict[str, Any], scene: Scene) -> None:
     """Put the sha256 of what lens, spacecraft, kernels and stars are read from in the place of paths."""
     if scene.camera.lens:
         identity["camera"]["lens"] = _digest(resources.find("scenes/lenses", scene.camera.lens), "lens")
@@ -218,7 +218,7 @@ def is_exact(attributes: Mapping[str, Any]) -> bool:
     return bool(redraws and not as_drawn and not scene.get("spice", {}).get("spacecraft"))
 
 
-def stored_scene(attributes: Mapping[str, Any]) -> SceneConfig:
+def stored_scene(attributes: Mapping[str, Any]) -> Scene:
     """Return the scene that a store was planned from, without the contents of the files that it names."""
     stored = {key: value for key, value in attributes["scene"].items() if key != "textures_sha256"}
     stored["body"] = {key: value for key, value in stored["body"].items() if key != "shape_sha256"}
@@ -261,12 +261,12 @@ def planned(attributes: Mapping[str, Any], faults: Sequence[str]) -> Callable[[i
 class SessionFactory:
     """Makes the session of a scene in a worker; picklable. `threads`: render threads of that worker."""
 
-    scene: SceneConfig
+    scene: Scene
     blocks: tuple[int, ...]
     threads: int | None = None
     contents: resources.Contents = dataclasses.field(default_factory=resources.Contents)
 
-    def __call__(self) -> build.Session:
+    def __call__(self) -> build.SampleMaker:
         threads = self.threads or resources.environment_whole("VBNFAULT_THREADS", resources.MOST_THREADS) or None
         with self.contents.in_use():
             return _Session(pipeline.Session(self.scene, blocks=self.blocks, threads=threads), self.contents)
@@ -305,7 +305,7 @@ def estimated_seconds(session: pipeline.Session) -> float:
 
 
 def build_scene(
-    scene: SceneConfig,
+    scene: Scene,
     out: Path,
     *,
     source: str,
@@ -362,7 +362,7 @@ def build_scene(
     return dataclasses.replace(summary, description=tuple(description))
 
 
-def describe_scene(scene: SceneConfig, *, source: str) -> list[str]:
+def describe_scene(scene: Scene, *, source: str) -> list[str]:
     """Return what a scene will photograph, as lines; nothing is rendered. `source` names it in errors."""
     session = pipeline.Session(scene, source=source)
     spec = store_spec(session, (scene.dataset.samples,))

@@ -28,7 +28,7 @@ from .progress import Progress
 _HOPELESS = 32  # so many failed samples and not one success: the rest would fail as well
 
 
-class Session(Protocol):
+class SampleMaker(Protocol):
     """What makes samples; it keeps between samples what is costly to make, such as the terrain of a site."""
 
     def simulate(self, index: int) -> Sample:
@@ -36,7 +36,7 @@ class Session(Protocol):
         ...
 
 
-SessionFactory = Callable[[], Session]
+SessionFactory = Callable[[], SampleMaker]
 
 
 # sample; what: "begun", "stage", "kept", "built" or "failed"; text: of a stage its name, of a sample that is kept
@@ -221,7 +221,7 @@ class Lazy:
 
     def __init__(self, factory: SessionFactory) -> None:
         self._factory = factory
-        self._session: Session | None = None
+        self._session: SampleMaker | None = None
 
     def simulate(self, index: int) -> Sample:
         if self._session is None:

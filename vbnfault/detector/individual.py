@@ -190,7 +190,7 @@ class Defects:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class HotPixels(Defects):
+class HotPixelTable(Defects):
     """Hot pixels: `rate_e_s` at the reference temperature and `offset_e` in electrons, float64[n]; `born_yr`,
     the sensor's age at their birth."""
 
@@ -266,7 +266,7 @@ class Individual:
     dsnu_e: F32
     dark_e_s: F32
     damage_e_s: F32
-    hot: HotPixels
+    hot: HotPixelTable
     dead: DeadPixels
     stuck: StuckPixels
     rts: RtsPixels
@@ -448,7 +448,9 @@ def _places(seed: int, name: str, count: int, shape: tuple[int, int]) -> tuple[I
     return row.astype(np.int32), column.astype(np.int32)
 
 
-def _damage(spec: IndividualSpec, shape: tuple[int, int], pixel_pitch_um: float, seed: int, hot: HotPixels) -> F32:
+def _damage(
+    spec: IndividualSpec, shape: tuple[int, int], pixel_pitch_um: float, seed: int, hot: HotPixelTable
+) -> F32:
     radiation = spec.radiation(pixel_pitch_um)
     pixels = shape[0] * shape[1]
     expected = checked("expected number of interactions", radiation.interactions * pixels, 0.0, _MOST_DEFECTS)
@@ -466,7 +468,7 @@ def _damage(spec: IndividualSpec, shape: tuple[int, int], pixel_pitch_um: float,
 
 def _hot(
     spec: IndividualSpec, shape: tuple[int, int], pixel_pitch_um: float, seed: int, earlier: tuple[int, float]
-) -> HotPixels:
+) -> HotPixelTable:
     growth = spec.hot_growth
     per_yr = 0.0 if growth is None else growth.expected(1.0, shape, pixel_pitch_um, spec.iso)
     born = _births(seed, "hot", per_yr * spec.years)
@@ -479,7 +481,7 @@ def _hot(
     rate = least * (1 - _uniform(seed, "hot rate", count) * (1 - (least / most) ** power)) ** (-1 / power)
     sticks = _uniform(seed, "hot sticks", count) < spec.hot_offset_share
     offset = -np.log1p(-_uniform(seed, "hot offset", count)) * spec.hot_offset_e
-    return HotPixels(
+    return HotPixelTable(
         row=row,
         column=column,
         rate_e_s=rate,

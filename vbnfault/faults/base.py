@@ -24,7 +24,7 @@ from ..core.errors import InputError, shown
 from ..core.quantities import LUMINANCE, RGBI, Charge, Electrons, Offset, Quantity, RawMosaic, soft_kind
 from ..detector.chain import STEPS as MOSAIC_STEPS
 from ..lens import load_lens
-from ..lens.footprint import DEFAULT_LENS, Frame
+from ..lens.footprint import DEFAULT_LENS, ImageFrame
 
 Params = dict[str, Any]
 T = TypeVar("T")
@@ -168,9 +168,9 @@ class FaultContext:
         return self.camera.width_px / REFERENCE_WIDTH_PX
 
     @property
-    def frame(self) -> Frame:
+    def frame(self) -> ImageFrame:
         """The camera as beams through its lens know it."""
-        return Frame(
+        return ImageFrame(
             lens=self.camera.lens,
             width_px=self.camera.width_px,
             height_px=self.camera.height_px,

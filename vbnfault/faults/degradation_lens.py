@@ -36,7 +36,7 @@ from scipy import fft
 from ..core import spectra
 from ..lens import Prescription
 from ..lens.coating import mean_reflectance
-from ..lens.footprint import Frame
+from ..lens.footprint import ImageFrame
 from ..lens.straylight.scatter import Harvey
 from .base import FaultContext, Interval, LensFault, Params, bounds, choice, number, times
 
@@ -219,11 +219,11 @@ def scratch_kernel(
     return fan
 
 
-def _cell_px(frame: Frame) -> int:
+def _cell_px(frame: ImageFrame) -> int:
     return max(1, round(max(frame.width_px, frame.height_px) / _CELLS))
 
 
-def kernel(params: Params, frame: Frame, shape: tuple[int, int]) -> F32:
+def kernel(params: Params, frame: ImageFrame, shape: tuple[int, int]) -> F32:
     """Shares of the light of a cell that scatter to the cells of a periodic grid, float32[y, x], its own first."""
     cell = _cell_px(frame) * frame.pixel_pitch_um * 1e-3 / frame.lens.focal_length_mm
     y, x = (fft.fftfreq(n, 1 / n).astype(np.float32) * np.float32(cell) for n in shape)
@@ -253,7 +253,7 @@ def kernel(params: Params, frame: Frame, shape: tuple[int, int]) -> F32:
     return out.astype(np.float32)
 
 
-def _strewn(array: F32, white_e: F32, params: Params, frame: Frame) -> F32:
+def _strewn(array: F32, white_e: F32, params: Params, frame: ImageFrame) -> F32:
     """Scattered light, float32[y, x, channel]."""
     step = _cell_px(frame)
     height, width, channels = array.shape

@@ -33,7 +33,7 @@ from scipy.special import j1
 
 from ..lens import RealLens, load_lens
 from ..lens.coating import reflect_transmit
-from ..lens.footprint import Footprint, Frame
+from ..lens.footprint import Footprint, ImageFrame
 from ..lens.glass import D_NM
 from ..lens.rays import forward
 from ..lens.straylight.paraxial import along
@@ -143,7 +143,7 @@ class DefocusedDust(LensFault):
 
 
 @lru_cache(maxsize=8)
-def _footprint(frame: Frame, name: str, row: int, height_mm: float) -> Footprint:
+def _footprint(frame: ImageFrame, name: str, row: int, height_mm: float) -> Footprint:
     """On a row, or with a height in that plane above the sensor."""
     found = frame.beams(name)
     return found.above_sensor(height_mm) if height_mm else found.on_row(row)
@@ -201,7 +201,7 @@ def _shadows(params: Params, context: FaultContext) -> _Shadows:
     return _Shadows(total, seen)
 
 
-def _step_px(grains: _Grains, footprint: Footprint, frame: Frame) -> int:
+def _step_px(grains: _Grains, footprint: Footprint, frame: ImageFrame) -> int:
     """Distance of the places where shadows are told, a power of two, and linear between: the soft edge of a shadow
     is as wide as the grain, or the beam if that is narrower."""
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -216,7 +216,7 @@ def _step_px(grains: _Grains, footprint: Footprint, frame: Frame) -> int:
 
 
 def _sums(
-    grains: _Grains, footprint: Footprint, frame: Frame, on_window: bool, lit: F64 | None
+    grains: _Grains, footprint: Footprint, frame: ImageFrame, on_window: bool, lit: F64 | None
 ) -> tuple[F32, F32 | None]:
     """Σ of shares taken, float32[y, x], and `seen` of `_Shadows`."""
     height, width = frame.height_px, frame.width_px
@@ -251,7 +251,7 @@ def _sums(
 
 
 def _windows(
-    grains: _Grains, footprint: Footprint, frame: Frame, x_px: NDArray, y_px: NDArray
+    grains: _Grains, footprint: Footprint, frame: ImageFrame, x_px: NDArray, y_px: NDArray
 ) -> list[tuple[int, int, int, int]]:
     """Rows and columns, start and stop each, outside of which a grain touches no footprint."""
     x, y = (np.linspace(v[0], v[-1], min(_NODES, len(v))) for v in (x_px, y_px))
@@ -435,7 +435,7 @@ def _over_disc(radius_rad: float) -> F64:
 
 
 @lru_cache(maxsize=2)
-def _field(frame: Frame) -> tuple[F32, F32 | None]:
+def _field(frame: ImageFrame) -> tuple[F32, F32 | None]:
     """Directions of all pixels, float32[3, y, x]; and of a real lens the solid angle that it has on an area of the
     sensor over that on the axis."""
     lens = frame.lens
@@ -452,7 +452,7 @@ def _field(frame: Frame) -> tuple[F32, F32 | None]:
 
 
 def _painted(
-    own_e: F64, factors_e: tuple[F64, F64], lobes: tuple[F64, F64], seen: F32, sun: _Sun, frame: Frame
+    own_e: F64, factors_e: tuple[F64, F64], lobes: tuple[F64, F64], seen: F32, sun: _Sun, frame: ImageFrame
 ) -> F32:
     """`own_e` float64[colour, offset], plus each of the two lobes, float64[offset], times its factor for the colour
     and its layer of `seen`; electrons float32[y, x, channel]."""

@@ -28,7 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..lens import RealLens
-from ..lens.footprint import Beams, Frame
+from ..lens.footprint import Beams, ImageFrame
 from .base import FaultContext, Interval, LensFault, Params, bounds, number, times
 
 F32 = NDArray[np.float32]
@@ -117,13 +117,13 @@ def _factor_once(params: Params, context: FaultContext) -> F32:
     return context.once("vignetting.factor", params, lambda: factor(params, context.frame))
 
 
-def factor(params: Params, frame: Frame) -> F32:
+def factor(params: Params, frame: ImageFrame) -> F32:
     """What is left of the light, float32[y, x] in [0, 1]."""
     left = _share_left(params, frame)
     return left if isinstance(frame.lens, RealLens) else left * _illumination(frame, params["lens"])
 
 
-def share_left(params: Params, frame: Frame, slope: F64) -> float:
+def share_left(params: Params, frame: ImageFrame, slope: F64) -> float:
     """Return the fraction of one direction's beam that clears ring and hood; `slope` float64[2], its tangents to
     the right and down, which may lie outside of the frame."""
     beams = frame.beams(params["lens"])
@@ -133,7 +133,7 @@ def share_left(params: Params, frame: Frame, slope: F64) -> float:
 
 
 @lru_cache(maxsize=2)
-def _illumination(frame: Frame, name: str) -> F32:
+def _illumination(frame: ImageFrame, name: str) -> F32:
     """E(θ) / E(0) of a lens at the field angles of a thin lens's pixels, float32[y, x]."""
     lens = frame.real_lens(name)
     slope = np.hypot(*frame.slopes(np.arange(frame.width_px) + 0.5, np.arange(frame.height_px) + 0.5))
@@ -169,7 +169,7 @@ def _lines(beams: Beams) -> tuple[F64, F64]:
     return begin, np.concatenate([to_rim, below], axis=3)
 
 
-def _share_left(params: Params, frame: Frame) -> F32:
+def _share_left(params: Params, frame: ImageFrame) -> F32:
     """Of the beams' light, what clears the slipped ring and the hood, float32[y, x] in [0, 1]."""
     beams = frame.beams(params["lens"])
     stop_mm = beams.lens.surfaces[beams.lens.stop].semi_diameter_mm

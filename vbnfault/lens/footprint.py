@@ -49,7 +49,7 @@ _SHADOW = 64  # cells across a disc's shadow
 
 
 @dataclass(frozen=True, kw_only=True)
-class Frame:
+class ImageFrame:
     """A camera as far as beams know of it: its lens, and its picture about the axis."""
 
     lens: ThinLens | RealLens
@@ -93,7 +93,7 @@ class Frame:
 
 
 @resources.cached_with_contents(maxsize=8)
-def _scaled(name: str, focal_length_mm: float, f_number: float, frame: Frame) -> RealLens:
+def _scaled(name: str, focal_length_mm: float, f_number: float, frame: ImageFrame) -> RealLens:
     lens = scaled_to_focal_length(load_lens(name), focal_length_mm)
     return RealLens(
         prescription=stopped_down(lens, f_number),

@@ -33,7 +33,7 @@ _SHOWN_PERCENTILE = 99.7
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class View:
+class FlareRequest:
     """A lens and where the Sun is; the picture's middle lies on the axis.
 
     Angles in degrees, azimuth 0 to the right, 90 down; `fov_deg` across the picture's width; `wavelength_nm`
@@ -77,7 +77,7 @@ def wavelengths_nm(one: float | None = None) -> F64:
     return np.array([float(one)])
 
 
-def layers(view: View) -> dict[str, F32]:
+def layers(view: FlareRequest) -> dict[str, F32]:
     """Irradiance over the Sun's at the entrance, float32[band, y, x] each: `sun`, `ghosts`, `starburst`, `glare`,
     `veil`; of model texture `sun` and `texture`, in units of white.
 
@@ -110,7 +110,7 @@ def layers(view: View) -> dict[str, F32]:
     }
 
 
-def ghosts(view: View, progress: Callable[[int], None] | None = None) -> tuple[Ghost, ...]:
+def ghosts(view: FlareRequest, progress: Callable[[int], None] | None = None) -> tuple[Ghost, ...]:
     """Every ghost of a point Sun; over several bands, means weighted by the Sun's spectrum. `progress` is told of
     each wavelength that is done, by a 1."""
     weight = spectra.solar_band_irradiance_W_m2_nm(view.wavelength_nm, 1.0)
@@ -124,7 +124,7 @@ def ghosts(view: View, progress: Callable[[int], None] | None = None) -> tuple[G
     return tuple(mean_ghost(rows) for _, rows in sorted(found.items()))
 
 
-def _ghosts_at(view: View, wavelength_nm: float, *, alone: bool) -> tuple[Ghost, ...]:
+def _ghosts_at(view: FlareRequest, wavelength_nm: float, *, alone: bool) -> tuple[Ghost, ...]:
     from ..lens.straylight.ghosts import traced_ghosts
 
     if view.model == "paraxial":
@@ -139,7 +139,7 @@ def _ghosts_at(view: View, wavelength_nm: float, *, alone: bool) -> tuple[Ghost,
     )
 
 
-def _direct_image(view: View) -> F32:
+def _direct_image(view: FlareRequest) -> F32:
     """Return the Sun's own image, a uniform disc at least a pixel wide, float32[band, y, x].
 
     Its power over the Sun's irradiance is T(λ) A cos θ: the transmittance of the image path, and the area of the
@@ -164,7 +164,7 @@ def _direct_image(view: View) -> F32:
     return out
 
 
-def _textures(view: View) -> F32:
+def _textures(view: FlareRequest) -> F32:
     """One draw of the texture model with the Sun in the same place, R, G, B in units of white, float32[3, y, x]."""
     focal_px = first_order(view.lens).efl_mm / view.pitch_mm
     detector = Detector(width_px=view.pixels, height_px=view.pixels)
@@ -180,7 +180,7 @@ def _textures(view: View) -> F32:
     return np.ascontiguousarray(np.moveaxis(drawn.array / detector.white_e, -1, 0))
 
 
-def colours(view: View, irradiance: F32) -> F32:
+def colours(view: FlareRequest, irradiance: F32) -> F32:
     """Linear R, G, B as the default detector sees sunlight of that irradiance, float32[y, x, 3]; a single
     wavelength is shown grey."""
     if len(view.wavelength_nm) == 1:
@@ -192,7 +192,7 @@ def colours(view: View, irradiance: F32) -> F32:
     return np.asarray(np.einsum("cb,byx->yxc", weight, irradiance), dtype=np.float32)
 
 
-def picture(view: View, found: dict[str, F32], white: float | None = None) -> NDArray[np.uint8]:
+def picture(view: FlareRequest, found: dict[str, F32], white: float | None = None) -> NDArray[np.uint8]:
     """The layers as a picture, uint8[y, x, 3] R, G, B, sRGB; `white`: irradiance shown as white, else that of a
     bright ghost."""
     if "texture" in found:
@@ -208,7 +208,7 @@ def picture(view: View, found: dict[str, F32], white: float | None = None) -> ND
     return np.asarray(np.rint(255 * shown), dtype=np.uint8)
 
 
-def write_picture(view: View, found: dict[str, F32], path: Path) -> None:
+def write_picture(view: FlareRequest, found: dict[str, F32], path: Path) -> None:
     """Write the layers: `.png`, or `.exr` with R, G, B and `<layer>.<wavelength>nm` of every band."""
     if path.suffix.lower() == ".png":
         ok, data = cv2.imencode(".png", picture(view, found)[..., ::-1])
@@ -230,7 +230,7 @@ def write_picture(view: View, found: dict[str, F32], path: Path) -> None:
     OpenEXR.File(header, channels).write(str(path))
 
 
-def table(view: View, found: tuple[Ghost, ...]) -> dict[str, Any]:
+def table(view: FlareRequest, found: tuple[Ghost, ...]) -> dict[str, Any]:
     """The ghosts as plain data."""
     optics = first_order(view.lens)
     return {
@@ -247,6 +247,6 @@ def table(view: View, found: tuple[Ghost, ...]) -> dict[str, Any]:
     }
 
 
-def write_table(view: View, found: tuple[Ghost, ...], path: Path) -> None:
+def write_table(view: FlareRequest, found: tuple[Ghost, ...], path: Path) -> None:
     """Write `table` as JSON."""
     path.write_text(json.dumps(table(view, found), indent=2) + "\n", encoding="utf-8")

@@ -18,8 +18,8 @@ from ..core import photometry
 from ..core.quantities import BODY, SKY, Electrons, Radiance, Truth
 from ..faults import FaultContext
 from ..lens import RealLens
-from ..render.description import Scene, View
-from ..scene.config import SceneConfig
+from ..render.description import RenderInput, View
+from ..scene.config import Scene
 from ..world import assemble
 from .spec import Frame
 
@@ -38,7 +38,7 @@ _ANGLE_LAYERS = {"incidence_deg", "emission_deg", "phase_deg", "albedo"}
 # --- render ------------------------------------------------------------------------------------------------
 
 
-def describe(frame: Frame) -> Scene:
+def describe(frame: Frame) -> RenderInput:
     """The sample as the renderer takes it."""
     spec, camera = frame.spec, frame.camera
     scene = spec.scene
@@ -53,7 +53,7 @@ def describe(frame: Frame) -> Scene:
         focus_distance_m=camera.lens.focus_distance_m,
     )
     wavelength = assemble.wavelengths_nm(scene)
-    return Scene(
+    return RenderInput(
         view=view,
         sun=frame.sunlight,
         wavelength_nm=wavelength,
@@ -117,7 +117,7 @@ def _keep(frame: Frame, radiance: Radiance) -> None:
     frame.radiance = radiance
 
 
-def _render_to_the_noise(frame: Frame, scene: Scene, guide: Truth | None, fraction: float) -> None:
+def _render_to_the_noise(frame: Frame, scene: RenderInput, guide: Truth | None, fraction: float) -> None:
     """Render with more samples where chance would show: up to `fraction` of the sensor's own noise.
 
     The error of a pixel is judged by two halves of its samples, over 3×3 pixels; those that err too much are
@@ -218,7 +218,7 @@ def _add_stars(frame: Frame) -> None:
         _expose(frame)
 
 
-def reference_exposure_s(scene: SceneConfig, camera: Camera) -> float:
+def reference_exposure_s(scene: Scene, camera: Camera) -> float:
     """Return the exposure that puts ground whose normal is 45 degrees from the Sun at the metering level."""
     half = np.sqrt(0.5)
     lit = (

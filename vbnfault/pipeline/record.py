@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ..core import frames
 from ..core.quantities import Sample
 from ..scene import plan
-from ..scene.config import SceneConfig
+from ..scene.config import Scene
 from ..world import assemble
 from . import labels
 from .photograph import effect_of, mask_effect_of, soft_layer
@@ -129,7 +129,7 @@ def _points_T_m(frame: Frame) -> F64:
     return np.asarray(seen_C @ T_from_C.T + camera_T_m)
 
 
-def proposal(scene: SceneConfig, table: plan.Plan, index: int, variables: Mapping[str, float]) -> dict[str, Any]:
+def proposal(scene: Scene, table: plan.Plan, index: int, variables: Mapping[str, float]) -> dict[str, Any]:
     """Return what the plan says of a sample and of the view that was kept, whose `variables` are given."""
     camera = scene.camera
     return {

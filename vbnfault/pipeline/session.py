@@ -24,7 +24,7 @@ from ..core.errors import InputError, VbnfaultError
 from ..core.quantities import SOFT_KINDS, Sample
 from ..faults import Fault, dataset_order, from_dict
 from ..scene import config, plan
-from ..scene.config import SceneConfig
+from ..scene.config import Scene
 from ..world import assemble
 from ..world.spacecraft import SpacecraftMesh
 from .expose import meter, render_frame
@@ -34,7 +34,7 @@ from .resolve import resolve
 from .spec import Frame, SampleSpec, Terrain
 
 if TYPE_CHECKING:
-    from ..render import Surface
+    from ..render import TerrainMesh
 
 # Slope an octave of the finest relief: steeper would be a wall of needles.
 _STEEPEST_DETAIL = 0.12
@@ -89,7 +89,7 @@ def _asking_for_another_view(frame: Frame) -> list[str]:
 # --- a session: many samples of one scene ------------------------------------------------------------------
 
 
-def configure_faults(scene: SceneConfig, source: str = "scene") -> dict[str, Fault]:
+def configure_faults(scene: Scene, source: str = "scene") -> dict[str, Fault]:
     """The scene's faults in dataset order. Raises InputError."""
     for name in scene.faults:
         from_dict(name, scene.faults[name], source=source)  # unknown classes first: they cannot be ordered
@@ -138,7 +138,7 @@ class Session:
 
     def __init__(
         self,
-        scene: SceneConfig,
+        scene: Scene,
         *,
         blocks: Sequence[int] | None = None,
         threads: int | None = None,
@@ -194,7 +194,7 @@ class Session:
             self._terrain = Terrain(body=self.body, site=patch.site, surface=surface, vehicle=self.vehicle)
         return self._terrain
 
-    def surface(self, patch: Patch) -> Surface:
+    def surface(self, patch: Patch) -> TerrainMesh:
         """The renderer's copy of a patch, with relief finer than its facets and the scene's spacecraft."""
         from .. import render
 
@@ -211,7 +211,7 @@ class Session:
         length = fine.longest_m / 4
         slope = 0.44 * float(self.body.roughness.deviation_at(length)) / length
         slope = min(slope, _STEEPEST_DETAIL) * self.scene.patch.relief
-        return render.Surface(
+        return render.TerrainMesh(
             patch.vertices_L_m,
             patch.faces,
             patch.face_is_flat,

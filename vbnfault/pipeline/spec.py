@@ -15,11 +15,11 @@ from ..core.quantities import RGBI, Electrons, Radiance, Truth
 from ..faults import Fault, FaultContext, Params
 from ..render.description import Sunlight
 from ..scene import config, plan
-from ..scene.config import SceneConfig
+from ..scene.config import Scene
 from ..world.spacecraft import SpacecraftMesh
 
 if TYPE_CHECKING:
-    from ..render import Surface
+    from ..render import TerrainMesh
 
 F64 = NDArray[np.float64]
 
@@ -30,7 +30,7 @@ class Terrain:
 
     body: Body
     site: Site
-    surface: Surface
+    surface: TerrainMesh
     vehicle: SpacecraftMesh | None = None
 
 
@@ -59,7 +59,7 @@ class SampleSpec:
     """One sample of a plan, with all that `simulate` needs."""
 
     index: int
-    scene: SceneConfig
+    scene: Scene
     plan: plan.Plan
     faults: Mapping[str, Fault]
     terrain: Terrain
@@ -120,14 +120,14 @@ class Frame:
         return self.radiance if self.rendered is None else self.rendered
 
 
-def stored_layers(scene: SceneConfig, faults: Mapping[str, Fault]) -> tuple[str, ...]:
+def stored_layers(scene: Scene, faults: Mapping[str, Fault]) -> tuple[str, ...]:
     """The optional layers of the scene; the default asks for a twin without straylight, which a scene that has
     no straylight does without."""
     idle = "without_straylight" if plan.STRAYLIGHT not in faults else None
     return tuple(layer for layer in scene.dataset.layers if layer != idle)
 
 
-def mask_any_faults(scene: SceneConfig, faults: Mapping[str, Fault]) -> tuple[str, ...]:
+def mask_any_faults(scene: Scene, faults: Mapping[str, Fault]) -> tuple[str, ...]:
     """Return the classes united in mask_any, in dataset order: those configured, else the localised ones."""
     chosen = scene.dataset.mask_any
     if chosen is not None:

@@ -17,12 +17,12 @@ if TYPE_CHECKING:
     from .light import direct
     from .resolve import ground_height_m, is_between, is_clear, sun_visible_fraction, sunlit_ground
     from .runtime import set_threads
-    from .surface import Surface
+    from .surface import TerrainMesh
     from .vehicle import Vehicle
 
 _HOME = {
     "FineRelief": "detail",
-    "Surface": "surface",
+    "TerrainMesh": "surface",
     "Vehicle": "vehicle",
     "direct": "light",
     "ground_height_m": "resolve",
@@ -49,9 +49,9 @@ def self_test() -> str:
     import numpy as np
 
     from ..core.photometry import Diffuse
-    from .description import Scene, Sunlight, View
+    from .description import RenderInput, Sunlight, View
     from .integrate import radiance
-    from .surface import Surface
+    from .surface import TerrainMesh
 
     square = np.array([[-9, -9, 0], [9, -9, 0], [9, 9, 0], [-9, 9, 0]], dtype=np.float32)
     faces = np.array([[0, 2, 1], [0, 3, 2]], dtype=np.int32)
@@ -64,7 +64,7 @@ def self_test() -> str:
         width_px=16,
         height_px=16,
     )
-    scene = Scene(
+    scene = RenderInput(
         view=view,
         sun=sun,
         wavelength_nm=np.array([550.0]),
@@ -72,7 +72,7 @@ def self_test() -> str:
         samples_per_pixel=4,
         key=0,
     )
-    got = float(radiance(Surface(square, faces, np.ones(2, dtype=bool)), scene).array.mean())
+    got = float(radiance(TerrainMesh(square, faces, np.ones(2, dtype=bool)), scene).array.mean())
     want = 0.06 * 1.5 / np.pi
     verdict = "as it should be" if abs(got / want - 1) < 1e-3 else "WRONG"
     return f"radiance {got:.6f} W m-2 sr-1 nm-1, expected {want:.6f}: {verdict}"
@@ -80,7 +80,7 @@ def self_test() -> str:
 
 __all__ = [
     "FineRelief",
-    "Surface",
+    "TerrainMesh",
     "Vehicle",
     "direct",
     "ground_height_m",

@@ -18,11 +18,11 @@ from numpy.typing import NDArray
 
 from ..core.quantities import Truth
 from .bsdf import has_bands
-from .description import Scene
+from .description import RenderInput
 from .light import SUN_DIMENSION, WAVEFRONT, Light
 from .runtime import dr, mi
 from .sampling import Optics, Pixels, Strata
-from .surface import Surface
+from .surface import TerrainMesh
 
 Image = NDArray[np.float32]
 
@@ -37,7 +37,7 @@ _STRIDES = (1, 2, 4)
 _COLOUR_PX = 12  # standard deviation: colour varies less than brightness, so it is averaged more widely
 
 
-def indirect(surface: Surface, scene: Scene, truth: Truth, *, smooth: bool = True) -> Image:
+def indirect(surface: TerrainMesh, scene: RenderInput, truth: Truth, *, smooth: bool = True) -> Image:
     """Radiance after `scene.bounces` more reflections, float32[band, y, x]; `truth` of the same view guides the
     filter, which `smooth` switches off."""
     found = _Indirect(surface, scene).image()
@@ -45,7 +45,7 @@ def indirect(surface: Surface, scene: Scene, truth: Truth, *, smooth: bool = Tru
 
 
 class _Indirect(Light):
-    def __init__(self, surface: Surface, scene: Scene) -> None:
+    def __init__(self, surface: TerrainMesh, scene: RenderInput) -> None:
         super().__init__(surface, scene, banded=scene.bounces > 1 or has_bands(surface, scene))
         self.samples_per_pixel = max(1, scene.samples_per_pixel // _SHARE)
         sun, model = scene.sun, scene.photometry
@@ -167,7 +167,7 @@ def _reversed(three_bits: Any) -> Any:
     return ((three_bits & 1) << 2) | (three_bits & 2) | (three_bits >> 2)
 
 
-def _smoothed(found: Image, scene: Scene, truth: Truth) -> Image:
+def _smoothed(found: Image, scene: RenderInput, truth: Truth) -> Image:
     """Brightness filtered along surfaces, colour over a wider window."""
     brightness = found.sum(axis=0)
     if not brightness.any():
@@ -192,7 +192,7 @@ def _coarse(band: Image) -> Image:
 class _Guide:
     """Normals and depths that say which neighbours lie on the same surface."""
 
-    def __init__(self, scene: Scene, truth: Truth) -> None:
+    def __init__(self, scene: RenderInput, truth: Truth) -> None:
         self.optics = Optics(scene.view)
         self.width, self.height = scene.view.width_px, scene.view.height_px
         record = np.concatenate([truth.normal.astype(np.float32), truth.depth_m[..., None]], axis=2)

@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 
 from ..core.photometry import HAPKE_TABLES, Hapke, hapke_at
-from .description import Scene
+from .description import RenderInput
 from .runtime import dr, mi
-from .surface import Surface, facing
+from .surface import TerrainMesh, facing
 
 
-def has_bands(surface: Surface, scene: Scene) -> bool:
+def has_bands(surface: TerrainMesh, scene: RenderInput) -> bool:
     """Whether bands differ by more than a factor, so that each needs a term of its own."""
     return scene.photometry.terms > 1 or scene.dust_contrast is not None or surface.vehicle is not None
 
@@ -25,7 +25,9 @@ class Reflection:
     """Reflection at `hit` with unit `normal`, seen along unit `view` (away from the surface): a term a band if
     `banded`, with the model's weights in it, else the model's single term."""
 
-    def __init__(self, surface: Surface, scene: Scene, hit: Any, normal: Any, view: Any, *, banded: bool) -> None:
+    def __init__(
+        self, surface: TerrainMesh, scene: RenderInput, hit: Any, normal: Any, view: Any, *, banded: bool
+    ) -> None:
         self._scene, self._hit, self._banded = scene, hit, banded
         self._vehicle = surface.vehicle
         self._frame = mi.Frame3f(facing(normal, view))

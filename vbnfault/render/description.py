@@ -47,7 +47,7 @@ class Sunlight:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Scene:
+class RenderInput:
     """A view of a sunlit surface: `wavelength_nm` float64[band] and how the surface reflects there.
 
     `dust_contrast` float64[band]: reflectance of dust-covered ground over that of bare ground, minus 1.

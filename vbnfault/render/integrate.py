@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from ..core.quantities import Radiance, Truth
 from .bounces import indirect
-from .description import Scene
+from .description import RenderInput
 from .layers import truth
 from .light import direct
-from .surface import Surface
+from .surface import TerrainMesh
 
 
-def radiance(surface: Surface, scene: Scene, guide: Truth | None = None) -> Radiance:
+def radiance(surface: TerrainMesh, scene: RenderInput, guide: Truth | None = None) -> Radiance:
     """Radiance per band at the camera, box-filtered over each pixel; `guide` is the view's `truth` where it is
     known, for light between surfaces."""
     found, _ = direct(surface, scene)

@@ -14,11 +14,11 @@ from .emitter import SunDisc
 from .light import sun_in_view
 from .runtime import dr, mi
 from .sampling import Optics
-from .surface import Surface, facing
+from .surface import TerrainMesh, facing
 
 
 def truth(
-    surface: Surface,
+    surface: TerrainMesh,
     view: View,
     sun: Sunlight,
     *,

@@ -18,12 +18,12 @@ from numpy.typing import NDArray
 from ..core.quantities import Radiance, SunInView
 from ..core.sundisc import Pinhole, add_mean, axes, bounds_px
 from .bsdf import Reflection, has_bands
-from .description import Scene, Sunlight, View
+from .description import RenderInput, Sunlight, View
 from .detail import Detail
 from .emitter import Limb, SunDisc, mu, polynomial
 from .runtime import dr, mi
 from .sampling import Optics, Pixels, Strata
-from .surface import Surface
+from .surface import TerrainMesh
 
 # Values kept at once, samples × terms; larger images are cut into parts, so that memory stays bounded and what is
 # summed is still near the processor.
@@ -41,8 +41,8 @@ _KRONECKER = 1.1673039782614187 ** -np.arange(1.0, 5.0)
 
 
 def direct(
-    surface: Surface,
-    scene: Scene,
+    surface: TerrainMesh,
+    scene: RenderInput,
     weights: NDArray[np.float64] | None = None,
     pixels: NDArray[np.uint32] | None = None,
 ) -> tuple[Radiance, NDArray[np.float32]]:
@@ -77,7 +77,7 @@ def direct(
     return found, halves.reshape(shape)
 
 
-def sun_in_view(surface: Surface, view: View, sun: Sunlight) -> SunInView | None:
+def sun_in_view(surface: TerrainMesh, view: View, sun: Sunlight) -> SunInView | None:
     """Return the Sun's disc as the camera sees it, and which parts are hidden; None where it is not in the frame.
 
     Rays go from the pupil to points of the disc, one or more in each cell of a grid: an edge across the disc is
@@ -127,7 +127,7 @@ def _columns(rows: NDArray[np.float64]) -> list[Any]:
 class Light:
     """Rays of a view over terrain, and sunlight that reaches where they end."""
 
-    def __init__(self, surface: Surface, scene: Scene, *, banded: bool) -> None:
+    def __init__(self, surface: TerrainMesh, scene: RenderInput, *, banded: bool) -> None:
         self.surface, self.scene, self.banded = surface, scene, banded
         self.world = surface.seen_from(scene.view)
         self.optics, self.sun = Optics(scene.view), SunDisc(scene.sun)
@@ -155,7 +155,7 @@ class Light:
 class _Direct(Light):
     """Samples of pixels, and the sum of their terms; `weights` [term, band]: radiance of a unit of each term."""
 
-    def __init__(self, surface: Surface, scene: Scene) -> None:
+    def __init__(self, surface: TerrainMesh, scene: RenderInput) -> None:
         super().__init__(surface, scene, banded=has_bands(surface, scene))
         sun, model = scene.sun, scene.photometry
         self.limb = Limb(sun)

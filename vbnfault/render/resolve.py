@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from ..core.sundisc import axes, sunflower
 from .description import Sunlight
 from .runtime import dr, mi
-from .surface import Surface
+from .surface import TerrainMesh
 from .vehicle import Vehicle
 
 F64 = NDArray[np.float64]
@@ -20,7 +20,7 @@ _FACETS = 1 << 16  # whose distance is measured at a time, for the memory's sake
 _GROUND_HITS = 4
 
 
-def ground_height_m(surface: Surface, x_m: F64, y_m: F64, start_height_m: float) -> F64:
+def ground_height_m(surface: TerrainMesh, x_m: F64, y_m: F64, start_height_m: float) -> F64:
     """Height (up, −z of L) of the ground at positions in L, float64 like `x_m`; 0 where there is none.
 
     The first surface that faces up below `start_height_m`: a start inside an overhang first leaves the body.
@@ -46,7 +46,7 @@ def ground_height_m(surface: Surface, x_m: F64, y_m: F64, start_height_m: float)
     return height
 
 
-def is_clear(surface: Surface, position_L_m: F64, clearance_m: float) -> NDArray[np.bool_]:
+def is_clear(surface: TerrainMesh, position_L_m: F64, clearance_m: float) -> NDArray[np.bool_]:
     """Return which positions float64[n, 3] are at least `clearance_m` from every facet, bool[n], by exact distance.
 
     Boxes about runs of neighbouring facets leave few to be measured.
@@ -82,7 +82,7 @@ def _distance_m(corners: F64) -> F64:
     return np.where(within, plane, nearest)
 
 
-def is_between(surface: Surface, origin_L_m: F64, points_L_m: F64) -> bool:
+def is_between(surface: TerrainMesh, origin_L_m: F64, points_L_m: F64) -> bool:
     """Whether any surface lies between `origin_L_m`, float64[3], and any of the points, float64[n, 3]."""
     way = points_L_m - origin_L_m
     length = np.maximum(np.linalg.norm(way, axis=1), 1e-9)
@@ -90,7 +90,7 @@ def is_between(surface: Surface, origin_L_m: F64, points_L_m: F64) -> bool:
 
 
 def sun_visible_fraction(
-    surface: Surface, position_L_m: F64, suns: list[Sunlight], L_from_C: F64 | None = None
+    surface: TerrainMesh, position_L_m: F64, suns: list[Sunlight], L_from_C: F64 | None = None
 ) -> F64:
     """Return the fraction of the Sun's disc that is not hidden, float64[n], from 1024 points of the disc each.
 
@@ -109,7 +109,7 @@ def sun_visible_fraction(
     return np.asarray(1 - hidden.mean(axis=1))
 
 
-def sunlit_ground(surface: Surface, position_L_m: F64, rays_L: F64, sun_L: F64) -> NDArray[np.bool_]:
+def sunlit_ground(surface: TerrainMesh, position_L_m: F64, rays_L: F64, sun_L: F64) -> NDArray[np.bool_]:
     """Return whether rays meet ground in direct sunlight, bool[view, ray].
 
     Parameters
@@ -133,7 +133,9 @@ def sunlit_ground(surface: Surface, position_L_m: F64, rays_L: F64, sun_L: F64) 
     return np.asarray(lit.numpy().astype(bool).reshape(views, count))
 
 
-def _any_hit(surface: Surface | Vehicle, position: F64, directions: F64, reach_m: float | F64) -> NDArray[np.bool_]:
+def _any_hit(
+    surface: TerrainMesh | Vehicle, position: F64, directions: F64, reach_m: float | F64
+) -> NDArray[np.bool_]:
     """bool[n, k] for positions float64[n, 3] and directions float64[n or 1, k, 3], as far as `reach_m`, which may
     be one number for each of the n · k."""
     n, k = len(position), directions.shape[1]

@@ -37,7 +37,7 @@ _SPREAD = (
 _LEAST_COSINE = 2.0**-11
 
 
-class Surface:
+class TerrainMesh:
     """A triangle mesh in L. `vertices_m` float32[n, 3], `faces` int32[m, 3], `flat` bool[m]: facets shaded with
     their own normal, such as boulders; the others with normals interpolated from their vertices. `dust` float32[n]
     in [0, 1]: how far each vertex is covered (default: none is). `vehicle`: the spacecraft with the camera.
@@ -86,7 +86,7 @@ class Surface:
         high = np.maximum.reduceat(np.maximum.reduce(corners), starts)
         return order, low.astype(np.float64), high.astype(np.float64)
 
-    def seen_from(self, view: View) -> Surface | World:
+    def seen_from(self, view: View) -> TerrainMesh | World:
         """What a camera sees: the terrain, and its own spacecraft if there is one."""
         return self if self.vehicle is None else World(self, self.vehicle, view)
 
@@ -128,7 +128,7 @@ class Hit:
     material: Any = None
     on_vehicle: Any = None
 
-    def __init__(self, surface: Surface, rays: Any, found: Any) -> None:
+    def __init__(self, surface: TerrainMesh, rays: Any, found: Any) -> None:
         self.valid = found.is_valid()
         self.distance_m = found.t
         self._surface, self._first = surface, found.prim_index

@@ -19,7 +19,7 @@ from .runtime import dr, mi
 from .sampling import opaque_vector
 
 if TYPE_CHECKING:
-    from .surface import Hit, Surface
+    from .surface import Hit, TerrainMesh
 
 # Metres off a facet where shadow rays start: far above float32's resolution at 1 km, far below a part's size.
 _OFFSET_M = 5e-4
@@ -62,7 +62,7 @@ class Vehicle:
 class World:
     """Terrain and a vehicle in its place: intersected as one."""
 
-    def __init__(self, surface: Surface, vehicle: Vehicle, view: View) -> None:
+    def __init__(self, surface: TerrainMesh, vehicle: Vehicle, view: View) -> None:
         self.surface, self.vehicle = surface, vehicle
         self._origin = opaque_vector(mi.Point3f, view.position_L_m)
         self._axes = [opaque_vector(mi.Vector3f, view.L_from_C[:, k]) for k in range(3)]  # B coincides with C

@@ -534,7 +534,7 @@ class PlanTable(Table):
     )
 
 
-class SceneConfig(Table):
+class Scene(Table):
     """A whole scene file, defaults filled in."""
 
     title: str
@@ -554,7 +554,7 @@ class SceneConfig(Table):
     faults: dict[str, dict[str, Any]] = Field(default_factory=dict)
 
     @model_validator(mode="after")
-    def _fits(self) -> SceneConfig:
+    def _fits(self) -> Scene:
         width_px, height_px, bands = self.camera.width_px, self.camera.height_px, self.render.bands
         if width_px * height_px * bands > _MOST_RADIANCES:
             raise ValueError(
@@ -564,7 +564,7 @@ class SceneConfig(Table):
         return self
 
     @model_validator(mode="after")
-    def _strata(self) -> SceneConfig:
+    def _strata(self) -> Scene:
         half, full = self.camera.fov_deg / 2, 360.0
         near, far, turn = (-half, half), (half, full - half), (0.0, full)
         paper: dict[str, dict[str, Any]] = {
@@ -592,7 +592,7 @@ class SceneConfig(Table):
         return plain
 
 
-def load_scene(name_or_path: str | Path, overrides: Mapping[str, Any] | None = None) -> SceneConfig:
+def load_scene(name_or_path: str | Path, overrides: Mapping[str, Any] | None = None) -> Scene:
     """Load a scene by path or packaged name; `overrides` maps dotted keys to values that replace the file's.
 
     A relative path in the file (mesh, texture) is taken from the file's folder. Raises InputError.
@@ -621,7 +621,7 @@ def load_scene(name_or_path: str | Path, overrides: Mapping[str, Any] | None = N
     return parse_scene(table, source=str(path), overrides=tuple(overrides or ()))
 
 
-def parse_scene(table: Mapping[str, Any], *, source: str, overrides: Sequence[str] = ()) -> SceneConfig:
+def parse_scene(table: Mapping[str, Any], *, source: str, overrides: Sequence[str] = ()) -> Scene:
     """Check plain data as a scene; raises InputError with one sentence naming `source`, key and value.
 
     `overrides`: dotted keys that did not come from `source` but were set in its place, to be named as such.
@@ -629,7 +629,7 @@ def parse_scene(table: Mapping[str, Any], *, source: str, overrides: Sequence[st
     resources.check_plain(table, source)
     try:
         # JSON mode: strict about types, yet arrays become tuples; TOML's dates suit no key, as lists they fail
-        return SceneConfig.model_validate_json(json.dumps(table, default=lambda date: [str(date)]), strict=True)
+        return Scene.model_validate_json(json.dumps(table, default=lambda date: [str(date)]), strict=True)
     except ValidationError as error:
         at = ".".join(map(str, error.errors()[0]["loc"]))
         given = (
@@ -733,7 +733,7 @@ def _wanted(schema: Mapping[str, Any], message: str) -> str:
 
 def _locate(loc: tuple[int | str, ...]) -> tuple[list[str], dict[str, Any]]:
     """The keys of an error's location without pydantic's union tags, and the schema found there."""
-    root = SceneConfig.model_json_schema()
+    root = Scene.model_json_schema()
 
     def plain(node: dict[str, Any]) -> dict[str, Any]:
         while "$ref" in node or "allOf" in node:
@@ -761,7 +761,7 @@ def _locate(loc: tuple[int | str, ...]) -> tuple[list[str], dict[str, Any]]:
 
 def json_schema(faults: Mapping[str, Any]) -> dict[str, Any]:
     """JSON Schema of the scene file; `faults` is the schema of the fault registry."""
-    schema = SceneConfig.model_json_schema()
+    schema = Scene.model_json_schema()
     schema["$schema"] = "https://json-schema.org/draft/2020-12/schema"
     schema["properties"]["faults"] = dict(faults)
     return schema

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from ..core import frames
 from ..core.errors import InputError
 from . import config
-from .config import SceneConfig, StratumTable
+from .config import Scene, StratumTable
 
 STRATA = ("sun-facing", "sun-averted")
 SPLITS = ("train", "val", "test")
@@ -74,7 +74,7 @@ class Plan:
         """Return the faults that a sample is commanded to carry, in the order of `faults`."""
         return tuple(name for name, has in zip(self.faults, self.injected[index], strict=True) if has)
 
-    def view(self, scene: SceneConfig, index: int, attempt: int) -> dict[str, float]:
+    def view(self, scene: Scene, index: int, attempt: int) -> dict[str, float]:
         """Return the variables of a sample's view at a try, counted from 0, by the names of VARIABLES.
 
         `scene` is the one that the plan was made from. The stratum, the site and the device stay the sample's own.
@@ -88,7 +88,7 @@ class Plan:
         return {name: float(values[0]) for name, values in drawn.items()}
 
 
-def make_plan(scene: SceneConfig, faults: Sequence[str], blocks: Sequence[int] | None = None) -> Plan:
+def make_plan(scene: Scene, faults: Sequence[str], blocks: Sequence[int] | None = None) -> Plan:
     """Draw the plan of all blocks (default: one of `dataset.samples`), each with its own fault matrix.
 
     Raises InputError where the fractions leave no room (`sun_facing_nominal_fraction`), and where the bounds of a
@@ -123,7 +123,7 @@ def make_plan(scene: SceneConfig, faults: Sequence[str], blocks: Sequence[int] |
     )
 
 
-def shortcomings(scene: SceneConfig, table: Plan) -> list[str]:
+def shortcomings(scene: Scene, table: Plan) -> list[str]:
     """Return a sentence for every split without samples, and for every class that is missing in a split."""
     out = []
     fractions = scene.dataset.split.model_dump()
@@ -144,7 +144,7 @@ def shortcomings(scene: SceneConfig, table: Plan) -> list[str]:
     return out
 
 
-def least_sun_angle_deg(scene: SceneConfig) -> float:
+def least_sun_angle_deg(scene: Scene) -> float:
     """Sun-averted boresights stay farther than this from the Sun: √2·FoV/2 as the paper's square frame has it,
     and the half diagonal of a frame that is higher than wide."""
     camera = scene.camera
@@ -152,7 +152,7 @@ def least_sun_angle_deg(scene: SceneConfig) -> float:
     return float(max(np.sqrt(2) * camera.fov_deg / 2, np.degrees(np.arctan(diagonal))))
 
 
-def strata(scene: SceneConfig) -> tuple[StratumTable, StratumTable]:
+def strata(scene: Scene) -> tuple[StratumTable, StratumTable]:
     """The bounds of the Sun-facing and the Sun-averted stratum, defaults filled in."""
     facing, averted = scene.geometry.sun_facing, scene.geometry.sun_averted
     assert facing is not None
@@ -163,7 +163,7 @@ def strata(scene: SceneConfig) -> tuple[StratumTable, StratumTable]:
 # --- views --------------------------------------------------------------------------------------------------
 
 
-def bounds(scene: SceneConfig, name: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def bounds(scene: Scene, name: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the lower and the upper bounds of a variable, float64[stratum] each."""
     tables = (scene.geometry, scene.geometry) if name in _POSITION else strata(scene)
     lo, hi = zip(*(getattr(t, name) for t in tables), strict=True)
@@ -171,7 +171,7 @@ def bounds(scene: SceneConfig, name: str) -> tuple[NDArray[np.float64], NDArray[
 
 
 def _views(
-    scene: SceneConfig,
+    scene: Scene,
     samples: NDArray[np.int64],
     stratum: NDArray[np.uint8],
     light: NDArray[np.int64],
@@ -198,7 +198,7 @@ def _views(
 
 
 def _keep_sun_out_of_view(
-    scene: SceneConfig,
+    scene: Scene,
     samples: NDArray[np.int64],
     stratum: NDArray[np.uint8],
     variables: dict[str, NDArray[np.float64]],
@@ -231,7 +231,7 @@ def _pair(low: NDArray[np.float64], high: NDArray[np.float64], stratum: int) -> 
 
 
 def _pairs(
-    scene: SceneConfig, samples: NDArray[np.int64], stratum: NDArray[np.uint8], shard: NDArray[np.int64]
+    scene: Scene, samples: NDArray[np.int64], stratum: NDArray[np.uint8], shard: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
     """Whose Sun each sample has, int64[n], and whether another one has it too, bool[n].
 
@@ -267,7 +267,7 @@ def _pairs(
 
 
 def _block(
-    scene: SceneConfig,
+    scene: Scene,
     faults: tuple[str, ...],
     block: int,
     start: int,
@@ -404,7 +404,7 @@ def _exchange(
     return None
 
 
-def _shard_sites(scene: SceneConfig, shards: int) -> NDArray[np.int32]:
+def _shard_sites(scene: Scene, shards: int) -> NDArray[np.int32]:
     """Site of each shard, int32[shards]: all samples of a shard share a site, so that a task loads one patch.
 
     Sites come in shuffled rounds, so they are used evenly. In the first one they come in an order in which every
@@ -418,11 +418,11 @@ def _shard_sites(scene: SceneConfig, shards: int) -> NDArray[np.int32]:
     return order.ravel()[:shards].astype(np.int32)
 
 
-def _site_order(scene: SceneConfig) -> NDArray[np.int64]:
+def _site_order(scene: Scene) -> NDArray[np.int64]:
     return config.rng(scene.dataset.seed, 0, "plan", "split").permutation(scene.dataset.sites)
 
 
-def site_split(scene: SceneConfig) -> NDArray[np.uint8]:
+def site_split(scene: Scene) -> NDArray[np.uint8]:
     """Split of every site, uint8[sites]: whole sites only, so that no terrain is in two splits. No split with a
     fraction above 0 is empty, where there are as many sites."""
     out = np.empty(scene.dataset.sites, dtype=np.uint8)
@@ -430,7 +430,7 @@ def site_split(scene: SceneConfig) -> NDArray[np.uint8]:
     return out
 
 
-def individual_split(scene: SceneConfig) -> NDArray[np.uint8] | None:
+def individual_split(scene: Scene) -> NDArray[np.uint8] | None:
     """Split of every device of the detector, uint8[individuals]: no device is in two splits, and each split that
     has sites has one; None where there are too few for that, and all splits share them."""
     used = np.unique(site_split(scene))
@@ -443,7 +443,7 @@ def individual_split(scene: SceneConfig) -> NDArray[np.uint8] | None:
     return out
 
 
-def _in_turn(scene: SceneConfig, count: int, used: NDArray[Any]) -> NDArray[np.uint8]:
+def _in_turn(scene: Scene, count: int, used: NDArray[Any]) -> NDArray[np.uint8]:
     """Splits of `count` things in a line, any beginning of which keeps to the scene's fractions: uint8[count].
 
     The first things go to one split each, the largest first. After them, the k-th of a split comes at
@@ -464,7 +464,7 @@ def _in_turn(scene: SceneConfig, count: int, used: NDArray[Any]) -> NDArray[np.u
     return line[:count]
 
 
-def _individuals(scene: SceneConfig, samples: NDArray[np.int64], split: NDArray[np.uint8]) -> NDArray[np.int32]:
+def _individuals(scene: Scene, samples: NDArray[np.int64], split: NDArray[np.uint8]) -> NDArray[np.int32]:
     """Which device takes each sample, of those of its split."""
     of_split = individual_split(scene)
     u = config.keyed_uniform(scene.dataset.seed, samples, "plan", "individual")

@@ -20,9 +20,9 @@ from ..detector import Detector, MosaicDetector, Sensor, load_sensor
 from ..lens import RealLens, ThinLens, closed_to, coating, load_lens, scaled_to_focal_length
 from ..render.description import Sunlight, View
 from ..scene import config
-from ..scene.config import BodyTable, CameraTable, OrbitTable, PoseTable, SceneConfig, SpiceTable, SunTable
+from ..scene.config import BodyTable, CameraTable, OrbitTable, PoseTable, Scene, SpiceTable, SunTable
 from . import sky
-from .spacecraft import Placement, Pose, Spacecraft, SpacecraftMesh, default_spacecraft, load_spacecraft
+from .spacecraft import HingePose, ModelPlacement, Spacecraft, SpacecraftMesh, default_spacecraft, load_spacecraft
 
 if TYPE_CHECKING:
     from ..render import Vehicle
@@ -60,7 +60,7 @@ def _ephemeris(
     return tuple(sun_J_au), tuple(own.T.ravel())
 
 
-def ephemeris(scene: SceneConfig) -> tuple[F64, F64]:
+def ephemeris(scene: Scene) -> tuple[F64, F64]:
     """The Sun seen from the target in J, float64[3] in au, and the target's own T_from_J, float64[3, 3].
 
     From SPICE kernels where the scene names some, else from the two-body `[orbit]` (67P's by default) and the pole
@@ -74,26 +74,26 @@ def _orbit(table: OrbitTable | None) -> frames.Orbit:
     return frames.ORBIT_67P if table is None else frames.Orbit(**table.model_dump())
 
 
-def epoch_jd(scene: SceneConfig, site: int, share: float) -> float:
+def epoch_jd(scene: Scene, site: int, share: float) -> float:
     """TDB Julian date at that share, 0 to 1, of the time that a site has on the spacecraft's way."""
     start, end = scene.sun.julian_date, scene.spice.until_julian_date
     return start if end is None else start + (end - start) * (site + share) / scene.dataset.sites
 
 
 @resources.cached_with_contents(maxsize=256)
-def _spacecraft_pose(table: SpiceTable, julian_date: float) -> spice.Pose:
+def _spacecraft_pose(table: SpiceTable, julian_date: float) -> spice.SpacecraftState:
     axes = None if table.camera_axes is None else np.array(table.camera_axes).reshape(3, 3)
     with spice.kernels(*table.kernels):
         et_s = spice.et_s_from_julian_date(julian_date)
         return spice.pose_T(table.spacecraft, table.target, table.frame, table.camera_frame, et_s, axes)
 
 
-def spacecraft_pose(scene: SceneConfig, julian_date: float) -> spice.Pose:
+def spacecraft_pose(scene: Scene, julian_date: float) -> spice.SpacecraftState:
     """Where SPICE has the scene's spacecraft and its camera. Raises InputError for kernels that do not serve."""
     return _spacecraft_pose(scene.spice, julian_date)
 
 
-def way_sites(scene: SceneConfig, body: Body) -> Sites:
+def way_sites(scene: Scene, body: Body) -> Sites:
     """Return the sites of a scene on a spacecraft's trajectory: the ground in the middle of the image, half-way
     through each site's time; where the camera looks past the body, the ground nearest to the line of sight."""
 
@@ -120,14 +120,14 @@ def looked_at(body: Body, origin_T_m: F64, direction_T: F64) -> F64:
     return np.asarray(body.vertices_m[np.argmin(np.linalg.norm(away - along[:, None] * direction_T, axis=1))])
 
 
-def sun_distance_au(scene: SceneConfig) -> float:
+def sun_distance_au(scene: Scene) -> float:
     """The body's distance from the Sun: as given, or by the ephemeris at the Julian date."""
     if scene.sun.distance_au is not None:
         return scene.sun.distance_au
     return float(np.linalg.norm(ephemeris(scene)[0]))
 
 
-def sunlight(scene: SceneConfig, direction_L: F64) -> Sunlight:
+def sunlight(scene: Scene, direction_L: F64) -> Sunlight:
     """The Sun at the scene's distance in a direction of L."""
     distance = sun_distance_au(scene)
     return Sunlight(
@@ -138,13 +138,13 @@ def sunlight(scene: SceneConfig, direction_L: F64) -> Sunlight:
     )
 
 
-def target_attitude(scene: SceneConfig, sun_T: F64) -> F64:
+def target_attitude(scene: Scene, sun_T: F64) -> F64:
     """T_from_J of the target under the commanded Sun: the attitude nearest to the body's own at the date."""
     sun_J_au, own = ephemeris(scene)
     return frames.T_from_J_commanded(own, frames.unit(sun_J_au), sun_T)
 
 
-def attitude_references(scene: SceneConfig) -> tuple[str, str]:
+def attitude_references(scene: Scene) -> tuple[str, str]:
     """Return what attitudes count from in the Sun-facing and the Sun-averted stratum, "sun" or "nadir"."""
     if scene.spice.spacecraft:  # the attitude is that of the kernels, expressed from the Sun
         return "sun", "sun"
@@ -157,13 +157,13 @@ def attitude_references(scene: SceneConfig) -> tuple[str, str]:
 # --- ground -------------------------------------------------------------------------------------------------
 
 
-def wavelengths_nm(scene: SceneConfig) -> F64:
+def wavelengths_nm(scene: Scene) -> F64:
     """Band nodes of the scene."""
     r = scene.render
     return spectra.band_nodes_nm(r.band_min_nm, r.band_max_nm, r.bands)
 
 
-def photometric_model(scene: SceneConfig) -> Photometry:
+def photometric_model(scene: Scene) -> Photometry:
     """How the scene's ground reflects, at its band nodes."""
     table, wavelength = scene.body.photometry, wavelengths_nm(scene)
     if table.model == "hapke":
@@ -176,7 +176,7 @@ def photometric_model(scene: SceneConfig) -> Photometry:
     )
 
 
-def dust_contrast(scene: SceneConfig) -> F64 | None:
+def dust_contrast(scene: Scene) -> F64 | None:
     """Reflectance of dust-covered over bare ground, minus 1, float64[band]; None where they are alike."""
     table, wavelength = scene.body.photometry, wavelengths_nm(scene)
     slope = table.dust_slope_per_100nm * (wavelength - photometry.REFERENCE_NM) / 100
@@ -185,7 +185,7 @@ def dust_contrast(scene: SceneConfig) -> F64 | None:
 
 
 def normal_albedo(
-    scene: SceneConfig,
+    scene: Scene,
     dust: NDArray[np.float32],
     material: NDArray[np.int32] | None = None,
     vehicle: SpacecraftMesh | None = None,
@@ -213,7 +213,7 @@ def normal_albedo(
     return np.where(material >= 0, reflectance[material], ground)
 
 
-def make_body(scene: SceneConfig) -> Body:
+def make_body(scene: Scene) -> Body:
     """The scene's body. Raises InputError."""
     table = scene.body
     physical = {
@@ -232,7 +232,7 @@ _67P_VOLUME_M3, _67P_LENGTH_M = 18.7e9, 5.0e3
 _VOLUME_SHARE, _LENGTH_SHARE = 0.25, 0.2
 
 
-def assumed_of_67p(scene: SceneConfig, body: Body) -> str:
+def assumed_of_67p(scene: Scene, body: Body) -> str:
     """Return one sentence on the values of 67P that a body of another size has, left in place or set, or ""."""
     length_m = float(np.ptp(body.vertices_m, axis=0).max())
     if (
@@ -273,9 +273,7 @@ def ellipsoid(semi_axes_m: tuple[float, float, float]) -> tuple[F64, NDArray[np.
 # --- camera and spacecraft ----------------------------------------------------------------------------------
 
 
-def base_camera(
-    scene: SceneConfig, *, architecture: int = 0, readout_direction: int = 0, individual: int = 0
-) -> Camera:
+def base_camera(scene: Scene, *, architecture: int = 0, readout_direction: int = 0, individual: int = 0) -> Camera:
     """The scene's camera without exposure; the integers index its lists of options."""
     c = scene.camera
     direction = c.readout_directions[readout_direction]
@@ -320,7 +318,7 @@ def mosaic_sensor(c: CameraTable) -> Sensor:
     return sensor
 
 
-def _detector_of(scene: SceneConfig, sensor: Sensor, individual: int, direction: str) -> MosaicDetector:
+def _detector_of(scene: Scene, sensor: Sensor, individual: int, direction: str) -> MosaicDetector:
     # CCDs are read towards an end of their columns
     towards = direction if direction in ("up", "down") else "up"
     seed = int(config.rng(scene.dataset.seed, individual, "detector", "device").integers(2**31))
@@ -386,7 +384,7 @@ def real_lens(c: CameraTable, pixel_pitch_um: float) -> RealLens:
     )
 
 
-def spacecraft(scene: SceneConfig) -> SpacecraftMesh | None:
+def spacecraft(scene: Scene) -> SpacecraftMesh | None:
     """The vehicle that carries the camera, in B; None where the scene has none. Raises InputError."""
     table = scene.spacecraft
     if table.model == "none":
@@ -401,7 +399,7 @@ def spacecraft(scene: SceneConfig) -> SpacecraftMesh | None:
     return load_spacecraft(
         Path(table.model),
         unit=table.unit,
-        placement=Placement(
+        placement=ModelPlacement(
             roll_deg=table.roll_deg,
             pitch_deg=table.pitch_deg,
             yaw_deg=table.yaw_deg,
@@ -417,16 +415,16 @@ def _plain(material: object) -> Any:
     return material.model_dump() if hasattr(material, "model_dump") else material
 
 
-def _pose(name: str, table: PoseTable, vehicle: Spacecraft | None) -> Pose:
+def _pose(name: str, table: PoseTable, vehicle: Spacecraft | None) -> HingePose:
     hinge = None if vehicle is None else vehicle.hinges[name]
     at = table.hinge_m or (hinge.hinge_B_m if hinge else None)
     axis = table.axis or (hinge.axis_B if hinge else None)
     if at is None or axis is None:
         raise InputError(f"spacecraft.pose.{name}: hinge_m and axis are missing")
-    return Pose(hinge_B_m=at, axis_B=axis, angle_deg=table.angle_deg)
+    return HingePose(hinge_B_m=at, axis_B=axis, angle_deg=table.angle_deg)
 
 
-def render_vehicle(scene: SceneConfig, mesh: SpacecraftMesh) -> Vehicle:
+def render_vehicle(scene: Scene, mesh: SpacecraftMesh) -> Vehicle:
     """The renderer's copy of the spacecraft."""
     from .. import render
 
@@ -439,7 +437,7 @@ def render_vehicle(scene: SceneConfig, mesh: SpacecraftMesh) -> Vehicle:
 
 
 def with_stars(
-    scene: SceneConfig,
+    scene: Scene,
     radiance: Radiance,
     camera: Camera,
     J_from_C: F64,

@@ -126,7 +126,7 @@ class Part:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Pose:
+class HingePose:
     """A turn of a part by `angle_deg` about the axis through `hinge_B_m`, right-handed; `axis_B` of any length.
 
     Hinge and axis are those of the vehicle at rest, before any pose: where a parent turns, its children's hinges
@@ -152,7 +152,7 @@ class Pose:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Placement:
+class ModelPlacement:
     """Where a file's axes V lie in B: p_B = Rx(roll) · Ry(pitch) · Rz(yaw) · p_V + translation, the order of
     angles of `frames.L_from_C`. GLB files are by convention y up, z forward, x left: yaw_deg = 180 makes that B."""
 
@@ -221,7 +221,7 @@ class Spacecraft:
     """A vehicle: its parts, at rest or posed, and the `hinges` that its maker knows of, by name, at angle 0."""
 
     parts: tuple[Part, ...]
-    hinges: Mapping[str, Pose] = field(default_factory=dict)
+    hinges: Mapping[str, HingePose] = field(default_factory=dict)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -229,7 +229,7 @@ class Spacecraft:
         keys = dict.fromkeys(key for part in self.parts for key in _keys(part.name))
         return tuple(keys)
 
-    def posed(self, poses: Mapping[str, Pose]) -> Spacecraft:
+    def posed(self, poses: Mapping[str, HingePose]) -> Spacecraft:
         """The vehicle with the named parts turned, sub-parts with them. Of nested poses the inner acts first.
 
         Raises InputError for a name that no part has.
@@ -284,9 +284,9 @@ def load_spacecraft(
     path: str | Path,
     *,
     unit: Unit = "m",
-    placement: Placement | None = None,
+    placement: ModelPlacement | None = None,
     materials: Mapping[str, str | float | Mapping[str, Any]] | None = None,
-    poses: Mapping[str, Pose] | None = None,
+    poses: Mapping[str, HingePose] | None = None,
     default_material: str | float | Mapping[str, Any] = 0.3,
 ) -> Spacecraft:
     """Read a vehicle, place it in B, give its parts their materials and turn them.
@@ -317,7 +317,7 @@ def load_spacecraft(
     path = Path(path)
     if unit not in METRES_PER:
         raise InputError(f"{path}: unit must be one of {', '.join(METRES_PER)}; got {unit!r}")
-    placement = placement or Placement()
+    placement = placement or ModelPlacement()
     if not np.isfinite((placement.B_from_V.sum(), *placement.translation_B_m)).all():
         raise InputError(f"{path}: placement has numbers that are not finite")
     pieces = [piece for piece in map(_without_degenerate_faces, _read(path)) if len(piece.faces)]
@@ -401,7 +401,7 @@ _CORNERS = {
 
 @lru_cache(maxsize=1)
 def _default_at_rest() -> Spacecraft:
-    hinges: dict[str, Pose] = {}
+    hinges: dict[str, HingePose] = {}
     parts: list[Part] = []
 
     def add(name: str, mesh: trimesh.Trimesh, material: str) -> None:
@@ -436,7 +436,7 @@ def _default_at_rest() -> Spacecraft:
 
     for side, sign in (("left", -1.0), ("right", 1.0)):
         wing = f"solar_array_{side}"
-        hinges[wing] = Pose(hinge_B_m=(sign * 0.6, 0.0, ARRAY_HINGE_Z_M), axis_B=(1.0, 0.0, 0.0))
+        hinges[wing] = HingePose(hinge_B_m=(sign * 0.6, 0.0, ARRAY_HINGE_Z_M), axis_B=(1.0, 0.0, 0.0))
         add(
             f"{wing}/yoke",
             rod((sign * 0.58, 0, ARRAY_HINGE_Z_M), (sign * 0.96, 0, ARRAY_HINGE_Z_M), 0.025),
@@ -452,13 +452,13 @@ def _default_at_rest() -> Spacecraft:
         pad = (0.8 * x, 0.95, 1.5) if z > 0 else (0.95 * x, 0.95, -1.75)
         hip_z = -0.12 if z > 0 else -1.2
         hip = (0.58 * x, 0.46, hip_z)
-        hinges[leg] = Pose(hinge_B_m=hip, axis_B=(1.0, 0.0, 0.0))
+        hinges[leg] = HingePose(hinge_B_m=hip, axis_B=(1.0, 0.0, 0.0))
         add(f"{leg}/strut", rod(hip, (pad[0], pad[1] - 0.02, pad[2]), 0.025), "aluminium")
         brace = tuple(0.45 * h + 0.55 * p for h, p in zip(hip, pad, strict=True))
         add(f"{leg}/brace", rod((0.3 * x, 0.48, hip_z), brace, 0.015), "aluminium")
         add(f"{leg}/footpad", rod((pad[0], pad[1] - 0.04, pad[2]), pad, 0.14, 32), "black_mli")
 
-    hinges["antenna"] = Pose(hinge_B_m=(0.0, -0.75, -0.95), axis_B=(1.0, 0.0, 0.0))
+    hinges["antenna"] = HingePose(hinge_B_m=(0.0, -0.75, -0.95), axis_B=(1.0, 0.0, 0.0))
     add("antenna_mast", rod((0.0, -0.48, -0.95), (0.0, -0.75, -0.95), 0.03), "aluminium")
     radius = np.linspace(0.0, 0.45, 10)
     bowl = [(float(r), float(r**2)) for r in radius]  # focal length 0.25 m

@@ -20,7 +20,7 @@ from ..prescription import Prescription
 from .bundles import Rays, Spots, Tracer, backend
 from .ghosts import Arrivals, boxes, named, told
 from .paraxial import Ghost, along, mean_ghost
-from .raster import LEVELS, PARTS, Canvas, Placement, Sums, edge_kind
+from .raster import LEVELS, PARTS, BundleDrawing, Canvas, Sums, edge_kind
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -122,7 +122,7 @@ class FirstOrderTracer(Tracer):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Detail:
-    """How finely routes are drawn: `Placement`'s columns by route, and the width of each step's rim's edge."""
+    """How finely routes are drawn: `BundleDrawing`'s columns by route, and the width of each step's rim's edge."""
 
     level: NDArray[np.int64]
     inner_level: NDArray[np.int64]
@@ -391,10 +391,10 @@ class FlareModel:
         which = np.tile(np.arange(count), len(rays))
         return each, replace(rays.take(each), direction=direction[which]), direction[which, 2] / count
 
-    def _place(self, detail: _Detail, bundles: Rays, drawn: _Drawn, strength: F64) -> Placement:
+    def _place(self, detail: _Detail, bundles: Rays, drawn: _Drawn, strength: F64) -> BundleDrawing:
         route = bundles.route[drawn.source]
         levels = np.stack([detail.inner_level, detail.level, detail.rough_level])
-        return Placement(
+        return BundleDrawing(
             source=drawn.source,
             level=levels[drawn.part, route],
             band=drawn.band,

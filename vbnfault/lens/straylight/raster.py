@@ -64,7 +64,7 @@ class Canvas:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Placement:
+class BundleDrawing:
     """Which bundles are drawn, and how.
 
     `source`: which of the traced bundles. Of each its `level`; two bands with their weights, int64 and
@@ -131,7 +131,7 @@ class Sums:
         be = backend()
         self._total = be.dr.zeros(be.UInt64, int(canvas.starts[-1]))
 
-    def draw(self, spots: Spots, placement: Placement, azimuth_rad: float) -> None:
+    def draw(self, spots: Spots, placement: BundleDrawing, azimuth_rad: float) -> None:
         """Add bundles of rays on lattices, turned by the Sun's azimuth."""
         UInt32 = backend().UInt32
         lattice = _Lattice(self.canvas, _Traced(spots), placement, azimuth_rad)
@@ -405,7 +405,7 @@ class _Traced:
 class _Lattice:
     """The cells of bundles that are drawn, in pixels of their level."""
 
-    def __init__(self, canvas: Canvas, traced: _Traced, placement: Placement, azimuth_rad: float) -> None:
+    def __init__(self, canvas: Canvas, traced: _Traced, placement: BundleDrawing, azimuth_rad: float) -> None:
         self.traced, self.spots, self.placement = traced, traced.spots, placement
         self.turn = np.cos(azimuth_rad), np.sin(azimuth_rad)
         step = 2.0**placement.level
