@@ -1,1 +1,1 @@
-"""Words that every other package shares: errors, physical quantities, frames, spectra, files."""
+"""Define what every other package shares: errors, physical quantities, frames, spectra, files."""

@@ -1,4 +1,7 @@
-"""What a process is doing between two samples: named stages, such as the terrain of a site."""
+"""Report which stage a process works on between two samples, such as the terrain of a site.
+
+Code that may take seconds names its stage with `begin`; a caller receives these names through `told_to`.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +13,7 @@ _listener: ContextVar[Callable[[str], None] | None] = ContextVar("listener", def
 
 
 def begin(stage: str) -> None:
-    """Tell whoever listens in this context that a stage begins that may take seconds."""
+    """Report to the listener of this context, if it has one, that a stage of some seconds begins."""
     listener = _listener.get()
     if listener is not None:
         listener(stage)
@@ -18,7 +21,7 @@ def begin(stage: str) -> None:
 
 @contextlib.contextmanager
 def told_to(listener: Callable[[str], None]) -> Iterator[None]:
-    """Let `listener` hear of the stages that begin within."""
+    """Call `listener` with the name of every stage that begins within a block."""
     token = _listener.set(listener)
     try:
         yield

@@ -1,14 +1,18 @@
-"""Errors a user can cause or meet. One sentence each; they carry plain strings, so they pickle."""
+"""Define the errors that a user can cause or meet.
+
+Each message is one sentence. The errors hold plain strings only, so that they can be pickled.
+"""
 
 from __future__ import annotations
 
-# Of a message: enough for any key, value and allowed range; what a user's file adds beyond that is cut out.
+# Characters that a message and a value may have: enough for any key, value and allowed range. A longer text, which
+# only a user's file can cause, loses its middle.
 _LONGEST_MESSAGE = 2000
 _LONGEST_VALUE = 120
 
 
 class VbnfaultError(Exception):
-    """A run that failed for a stated reason. Command-line exit code 1."""
+    """A run failed for the reason that the message states. The command line exits with code 1."""
 
     exit_code = 1
 
@@ -18,35 +22,36 @@ class VbnfaultError(Exception):
 
 
 class InputError(VbnfaultError):
-    """Bad input: the sentence names the file, the key, the value and the allowed range. Exit code 2."""
+    """The input is bad: the message names the file, the key, the value and the allowed range. Exit code 2."""
 
     exit_code = 2
 
 
 class InputChanged(VbnfaultError):
-    """A file that a run reads again no longer holds what it held when the run began."""
+    """A file has changed since the run that reads it began."""
 
 
 def shown(value: object) -> str:
-    """Return a value as an error sentence shows it: its `repr`, without the middle where that is long."""
-    if isinstance(value, int) and value.bit_length() > 4096:  # Python refuses to write such a number
+    """Return the `repr` of a value for an error message, without its middle where it is long."""
+    if isinstance(value, int) and value.bit_length() > 4096:  # Python writes at most 4300 digits
         return f"a whole number of {int(value.bit_length() * 0.30103)} digits"
     if isinstance(value, str | bytes | list | tuple) and len(value) > 4 * _LONGEST_VALUE:
-        # so that the whole is never written out
+        # `repr` of the whole could take long and fill the memory
         half = 2 * _LONGEST_VALUE
         return _without_middle(f"{shown_whole(value[:half])} … {shown_whole(value[-half:])}", _LONGEST_VALUE)
     return _without_middle(shown_whole(value), _LONGEST_VALUE)
 
 
 def shown_whole(value: object) -> str:
-    """Return `repr` of a value, or of its type where Python cannot write it."""
+    """Return the `repr` of a value, or "a" and its type where Python cannot write it."""
     try:
         return repr(value)
-    except (ValueError, RecursionError):  # a whole number of thousands of digits within; lists within lists
+    except (ValueError, RecursionError):  # it holds too long a number, or is nested too deep
         return f"a {type(value).__name__}"
 
 
 def _without_middle(text: str, length: int) -> str:
+    """Return a text; where it is longer than `length`, cut out its middle and state its length."""
     if len(text) <= length:
         return text
     return f"{text[: length * 2 // 3]} … {text[-length // 3 :]} ({len(text)} characters)"

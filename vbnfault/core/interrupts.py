@@ -1,7 +1,7 @@
-"""Signals that end a program: the first one stops the work, what was made is still written.
+"""Handle the signals that end a program: the first one stops the work, and finished results are still written.
 
-Ctrl-C (SIGINT), SIGTERM and SIGHUP are raised as `Stopped` in the main thread, wherever it is. While the work is
-wound up (`finishing`) another one only makes haste: it never cuts that short.
+Within `interruptible`, Ctrl-C (SIGINT), SIGTERM and SIGHUP raise `Stopped` in the main thread. Within `finishing`,
+a signal only speeds up the final steps; it never interrupts them.
 """
 
 from __future__ import annotations
@@ -15,18 +15,18 @@ from typing import Any
 
 # Windows has no SIGHUP.
 _SIGNALS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
-# Those that a terminal sends to every process of a command: of a build, its first process decides for all.
+# A terminal sends these to every process of a command; the first process of a build acts on them for all.
 _OF_THE_TERMINAL = tuple(number for number in _SIGNALS if number != signal.SIGTERM)
 
 _winding_up: list[finishing] = []
-# Signals that were raised and have not ended the program yet: code in C may put another exception in their place.
+# Signals that were raised and have not ended the program yet: C code may replace `Stopped` by another exception.
 _raised: list[int] = []
 
 
 class Stopped(BaseException):
-    """A signal asked the program to end. `number`: of the signal.
+    """A signal asked the program to end; `number` is the signal's number.
 
-    No KeyboardInterrupt: typer would end the program in silence on one.
+    This is not a KeyboardInterrupt, because typer ends the program without a message on that one.
     """
 
     def __init__(self, number: int = signal.SIGINT) -> None:
@@ -35,12 +35,12 @@ class Stopped(BaseException):
 
 
 def exit_code(stop: BaseException) -> int:
-    """Return the exit code of a program that a signal ended, 128 + its number; 130 for any other interrupt."""
+    """Return the exit code of an interrupted program: 128 + the signal's number, or 130 for any other interrupt."""
     return 128 + (stop.number if isinstance(stop, Stopped) else signal.SIGINT)
 
 
 def raise_stopped(number: int, _frame: Any = None) -> None:
-    """Handle a signal: raise `Stopped`, or make haste where the work is being wound up already."""
+    """Handle a signal: raise `Stopped`, or pass the number to the `finishing` blocks that are running."""
     if not _winding_up:
         _raised.append(number)
         raise Stopped(number)
@@ -51,8 +51,8 @@ def raise_stopped(number: int, _frame: Any = None) -> None:
 def check() -> None:
     """Raise `Stopped` again where a signal was raised before.
 
-    To be called between steps of long work, and where any other exception is handled: it may be one that code in C
-    made of `Stopped`.
+    Call this between the steps of long work, and where any other exception is handled: C code may have replaced
+    `Stopped` by that exception.
     """
     if _raised and threading.current_thread() is threading.main_thread():
         raise Stopped(_raised[-1])
@@ -60,10 +60,10 @@ def check() -> None:
 
 @contextlib.contextmanager
 def interruptible() -> Iterator[None]:
-    """Raise `Stopped` on a signal for the length of a block, where this is the main thread.
+    """Raise `Stopped` when a signal arrives within a block, if this is the main thread.
 
-    A signal that is ignored, as SIGHUP is under `nohup`, stays ignored. One that arrives where Python drops every
-    exception, such as in a destructor, is raised at the next `check`.
+    An ignored signal, such as SIGHUP under `nohup`, stays ignored. Python drops every exception of a destructor;
+    a signal that arrives there is raised at the next `check`.
     """
     before: dict[int, Any] = {}
     unraisable, raised = sys.unraisablehook, _raised.copy()
@@ -87,10 +87,11 @@ def interruptible() -> Iterator[None]:
 
 
 class finishing:
-    """Wind up without being interrupted: a signal that arrives within the block is raised at its end.
+    """Finish work without interruption: a signal that arrives within the block is raised at its end.
 
-    Where the block belongs to the handling of an interrupt, it is not: the program ends anyway. `hasten` is called
-    at every signal that arrives. Only the main thread receives any, so elsewhere this does nothing.
+    Where the block runs while an interrupt is handled, the signal is not raised, because the program ends anyway.
+    Every signal that arrives calls `hasten`. Only the main thread receives signals, so in other threads this class
+    does nothing.
     """
 
     def __init__(self, hasten: Callable[[], None] = lambda: None) -> None:
@@ -104,7 +105,7 @@ class finishing:
             _winding_up.append(self)
 
     def arrived(self, number: int) -> None:
-        """Note a signal, and make haste."""
+        """Record a signal and call `hasten`."""
         self._arrived = number
         self._hasten()
 
@@ -117,7 +118,7 @@ class finishing:
 
 @contextlib.contextmanager
 def held() -> Iterator[None]:
-    """Hold all signals back for the length of a block; a process that is started within holds them back too."""
+    """Hold all signals back within a block. A process that is started within it holds them back too."""
     if not hasattr(signal, "pthread_sigmask"):
         yield
         return
@@ -135,8 +136,11 @@ def ignore() -> None:
 
 
 def obey_parent() -> None:
-    """In a process that was started while signals were `held`: leave those of the terminal to the parent, and let
-    SIGTERM, which the parent sends, raise `Stopped`."""
+    """Set up the signals of a process that was started within `held`.
+
+    The parent acts on the terminal's signals, so this process ignores them. SIGTERM, which the parent sends,
+    raises `Stopped`.
+    """
     ignore()
     signal.signal(signal.SIGTERM, raise_stopped)
     if hasattr(signal, "pthread_sigmask"):

@@ -1,10 +1,11 @@
-"""Find a libLLVM that Mitsuba's LLVM backend can use, before drjit or mitsuba load.
+"""Find a libLLVM that Mitsuba's LLVM backend can use, before drjit or mitsuba is imported.
 
 Mitsuba does not ship LLVM. Versions 14 and 15, the defaults of Debian 12, abort the whole process inside the
-first render ("Cannot select … fminimum"), so anything below 16 is refused here with a sentence. The C function
-`LLVMGetVersion` is exported from 16 on: a library without it is too old.
+first render ("Cannot select … fminimum"), so versions below 16 are refused here with an error message. The C
+function `LLVMGetVersion` is exported from version 16 on; a library without it is too old.
 
-Order: `DRJIT_LIBLLVM_PATH` if usable, the wheel `karellen-llvm-core`, then the system's libraries, newest first.
+The search order is: `DRJIT_LIBLLVM_PATH` if usable, the wheel `karellen-llvm-core`, then the system's libraries,
+newest first.
 """
 
 from __future__ import annotations
@@ -45,7 +46,10 @@ _SYSTEM_PATTERNS = {
 
 @dataclass(frozen=True, kw_only=True)
 class Candidate:
-    """One library that was looked at. `version` is (major, minor, patch), None where it could not be told."""
+    """Describe one library that was inspected.
+
+    `version` is (major, minor, patch), or None where it is unknown. `problem` is empty for a usable library.
+    """
 
     path: Path
     origin: str
@@ -58,7 +62,7 @@ class Candidate:
 
 
 def candidates() -> Iterator[Candidate]:
-    """Every library found, in the order of preference, each with its version and what is wrong with it."""
+    """Yield every library in the order of preference, each with its version and its problem."""
     seen: set[Path] = set()
     for origin, path in _paths():
         resolved = path.resolve()
@@ -69,7 +73,7 @@ def candidates() -> Iterator[Candidate]:
 
 
 def find() -> Candidate:
-    """The first usable library. Raises VbnfaultError with a sentence that says what was found instead."""
+    """Return the first usable library. Raises VbnfaultError, which lists the unusable ones and their problems."""
     looked_at = []
     for candidate in candidates():
         if candidate.usable:
@@ -84,13 +88,14 @@ def find() -> Candidate:
 
 @functools.lru_cache(maxsize=1)
 def prepare() -> Candidate:
-    """Point drjit to a usable library; call before drjit or mitsuba are imported. Raises VbnfaultError."""
+    """Point drjit to a usable library. Call this before drjit or mitsuba is imported. Raises VbnfaultError."""
     found = find()
     os.environ[VARIABLE] = str(found.path)
     return found
 
 
 def _paths() -> Iterator[tuple[str, Path]]:
+    """Yield the origin and the path of every library file to inspect, in the order of preference."""
     if os.environ.get(VARIABLE):
         yield VARIABLE, Path(os.environ[VARIABLE])
     yield from ((_WHEEL, path) for path in _wheel_files("libLLVM.so"))
@@ -101,7 +106,7 @@ def _paths() -> Iterator[tuple[str, Path]]:
 
 
 def _wheel_files(stem: str) -> list[Path]:
-    """Files of the wheel whose name begins with `stem`; real files, not the links a start-up hook makes."""
+    """Return the wheel's files whose names begin with `stem`, without the links that its start-up hook makes."""
     try:
         files = importlib.metadata.files(_WHEEL) or []
     except importlib.metadata.PackageNotFoundError:
@@ -111,15 +116,17 @@ def _wheel_files(stem: str) -> list[Path]:
 
 
 def _name_version(path: Path) -> tuple[int, ...]:
+    """Return the numbers in a path, which sort libraries by version; the 64 of an architecture is left out."""
     numbers = re.findall(r"\d+", str(path).replace("x86_64", "").replace("64", ""))
     return tuple(int(n) for n in numbers)
 
 
 def _inspect(path: Path, origin: str) -> Candidate:
+    """Return a library with its version and, where it is unusable, its problem."""
     if not path.is_file():
         return Candidate(path=path, origin=origin, version=None, problem="no such file")
     by_name = re.search(r"libLLVM[.-](?:so\.)?(\d+)", path.resolve().name)
-    if by_name and int(by_name[1]) < OLDEST_USABLE:  # told by the name alone: do not load it
+    if by_name and int(by_name[1]) < OLDEST_USABLE:  # the name gives the version: do not load the library
         version = (int(by_name[1]), 0, 0)
         return Candidate(path=path, origin=origin, version=version, problem=_too_old(version))
     if _is_cut_short(path):
@@ -145,7 +152,7 @@ def _inspect(path: Path, origin: str) -> Candidate:
 
 
 def _is_cut_short(path: Path) -> bool:
-    """Whether a 64 bit ELF file ends before its segments do: loading such a file kills the process."""
+    """Return whether a 64-bit ELF file ends before its segments do: loading such a file kills the process."""
     with path.open("rb") as file:
         header = file.read(64)
         if len(header) < 64 or header[:5] != b"\x7fELF\x02":
@@ -169,13 +176,14 @@ def _too_old(version: tuple[int, int, int]) -> str:
 
 
 def _load(path: Path, origin: str) -> ctypes.CDLL:
+    """Load a library. Where the wheel's library fails, load its dependencies first and try again."""
     try:
         return ctypes.CDLL(str(path))
     except OSError:
         if _WHEEL not in (origin, _origin_of(path)):
             raise
-    # Where site-packages is read-only the wheel's start-up hook could not link libc++.so.1; with the real
-    # files loaded first, and globally, the loader finds the names.
+    # Where site-packages is read-only, the wheel's start-up hook cannot link libc++.so.1. If the real files are
+    # loaded globally first, the loader resolves their names.
     for stem in ("libunwind.so.1", "libc++abi.so.1", "libc++.so.1"):
         for dependency in _wheel_files(stem)[:1]:
             ctypes.CDLL(str(dependency), mode=ctypes.RTLD_GLOBAL)
@@ -183,4 +191,5 @@ def _load(path: Path, origin: str) -> ctypes.CDLL:
 
 
 def _origin_of(path: Path) -> str:
+    """Return whether a library belongs to the wheel or to the system."""
     return _WHEEL if path.resolve() in _wheel_files("libLLVM.so") else "system"

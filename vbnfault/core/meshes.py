@@ -1,7 +1,7 @@
-"""Readers of Wavefront OBJ and glTF 2.0 meshes: what shapes of bodies and spacecraft are made from.
+"""Read Wavefront OBJ and glTF 2.0 meshes, which give the shapes of bodies and spacecraft.
 
-Only names, positions, faces and transforms are read: images, colours and normals never leave the file, so that no
-image can fill the memory. Whatever a file says of its own sizes is checked before memory is taken for it.
+The readers use names, positions, faces and transforms only. They never decode images, colours or normals, so no
+image can fill the memory. They check every size that a file states before they allocate memory for it.
 """
 
 from __future__ import annotations
@@ -36,9 +36,9 @@ _LONGEST_NAME = 100
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class MeshPart:
-    """The faces that a file holds under one name and one name of a material (empty where it gives none).
+    """Hold the faces that a file lists under one name and one material; `material` is empty without one.
 
-    `vertices` float64[n, 3] in the file's unit and axes, `faces` int64[m, 3], indices of them.
+    `vertices` is float64[n, 3] in the file's unit and axes, `faces` is int64[m, 3] with indices into `vertices`.
     """
 
     name: str
@@ -62,7 +62,7 @@ _VERTEX = re.compile(rb"^[ \t]*v[ \t]+([^\r\n#]*)", re.MULTILINE)
 _FACE = re.compile(rb"^[ \t]*f[ \t]+([^\r\n#]*)", re.MULTILINE)
 _CORNER = re.compile(rb"[+-]?[0-9]+(?:/[+-]?[0-9]*){0,2}")
 _TEXTURE_AND_NORMAL = re.compile(rb"/[-+0-9/]*")
-# x y z, with a weight, with colours, with both
+# numbers of a vertex: x y z, with a weight, with a colour, with both
 _VERTEX_WIDTHS = (3, 4, 6, 7)
 
 
@@ -72,22 +72,24 @@ def read_obj(data: bytes, source: str, *, name: str = "") -> list[MeshPart]:
     Parameters
     ----------
     data, source
-        The file's bytes, and what to call it in errors.
+        The file's bytes, and its name in error messages.
     name
-        Of faces that lie outside of every object and group.
+        Name of the part that holds the faces outside every object and group.
 
     Returns
     -------
     parts
-        Named `object/group`. Polygons are split into fans; vertices that no face of a part names are left out.
+        Each part is named `object/group`. Polygons are split into triangle fans. A part holds only the vertices
+        that its faces use.
 
     Raises
     ------
     InputError
-        With the line: a vertex without three finite numbers, a face without three corners, a corner that is no
-        vertex number (they count from 1, or from -1 backwards), more than 20 million triangles.
+        A vertex has no three finite numbers, a face has fewer than three corners, or a corner is no vertex number
+        (numbers count from 1, or backwards from -1); the message gives the line. Or the file has more than 20
+        million triangles or 10,000 parts.
     """
-    text = re.sub(rb"\\\r?\n", lambda end: b" " * len(end[0]), data)  # lines that go on; offsets stay
+    text = re.sub(rb"\\\r?\n", lambda end: b" " * len(end[0]), data)  # join continued lines; offsets stay
 
     def line(pattern: re.Pattern[bytes], row: int) -> int:
         offset = next(match.start() for k, match in enumerate(pattern.finditer(text)) if k == row)
@@ -110,7 +112,7 @@ def read_obj(data: bytes, source: str, *, name: str = "") -> list[MeshPart]:
                 raise error(_VERTEX, k, "'v x y z', finite numbers", shown(what))
 
     stretches: dict[tuple[str, str], list[bytes]] = {}
-    faces: dict[tuple[str, str], list[int]] = {}  # number of each face in the file
+    faces: dict[tuple[str, str], list[int]] = {}  # index of each face in the file
     count = 0
     for key, piece in _stretches(text, name):
         found = _FACE.findall(piece)
@@ -159,7 +161,7 @@ def read_obj(data: bytes, source: str, *, name: str = "") -> list[MeshPart]:
 
 
 def _stretches(text: bytes, name: str) -> Iterator[tuple[tuple[str, str], bytes]]:
-    """(name, material) of each stretch of an OBJ between two statements that name things, and its text."""
+    """Yield (name, material) and the text of each stretch of an OBJ between two naming statements."""
     now = {b"o": "", b"g": "", b"usemtl": ""}
     start = 0
 
@@ -176,13 +178,15 @@ def _stretches(text: bytes, name: str) -> Iterator[tuple[tuple[str, str], bytes]
 
 
 def _values(rows: list[bytes]) -> tuple[F64, I64]:
-    """All numbers of rows of text, float64[n], a NaN after each row; the places of these NaNs. None of either where
-    something else is in the text; a "nan" of the file itself shows as one place more."""
+    """Return all numbers of text rows, float64[n], with a NaN after each row, and the indices of these NaNs.
+
+    Both are empty where the text holds anything but numbers. A "nan" in the text shows as an additional index.
+    """
     if not rows:
         return np.empty(0), np.empty(0, dtype=np.int64)
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("error")  # numpy has both warned and raised here
+            warnings.simplefilter("error")  # some versions of numpy warn here, others raise
             values = np.fromstring(b" nan\n".join([*rows, b""]), dtype=np.float64, sep=" ")  # type: ignore[call-overload]
     except (ValueError, DeprecationWarning):
         return np.empty(0), np.empty(0, dtype=np.int64)
@@ -190,7 +194,7 @@ def _values(rows: list[bytes]) -> tuple[F64, I64]:
 
 
 def _fans(index: I64, corners: I64) -> I64:
-    """Polygons of the given numbers of corners as triangles int64[m, 3] that start in the first corner of each."""
+    """Return polygons with the given numbers of corners as triangles int64[m, 3], fans about each first corner."""
     starts = np.cumsum(corners) - corners
     triangles = corners - 2
     first = np.repeat(starts, triangles)
@@ -202,30 +206,31 @@ def _fans(index: I64, corners: I64) -> I64:
 
 _COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _TRIANGLES, _STRIP, _FAN = 4, 5, 6
-# Extensions that put the geometry elsewhere; all others change what is not read.
+# These extensions store the geometry in another form; all others concern data that is not read.
 _NOT_READ = ("KHR_draco_mesh_compression", "EXT_meshopt_compression", "EXT_mesh_gpu_instancing")
 
 
 def read_gltf(data: bytes, source: str, *, folder: Path | None = None) -> list[MeshPart]:
-    """Return the triangles of a glTF 2.0 file's scene, GLB or JSON, in its axes.
+    """Return the triangles of the scene in a glTF 2.0 file (GLB or JSON), in the axes of that scene.
 
     Parameters
     ----------
     data, source
-        The file's bytes, and what to call it in errors.
+        The file's bytes, and its name in error messages.
     folder
-        Where the files lie that hold the buffers of a .gltf.
+        Folder of the files that hold the buffers of a .gltf.
 
     Returns
     -------
     parts
-        Named by the path of their node; those of one mesh have a material each.
+        One part per primitive of a mesh, with one material, named by the path of its node.
 
     Raises
     ------
     InputError
-        Naming the node, mesh or accessor: the file is not glTF 2.0, a number in it lies outside its allowed range,
-        nodes form a circle, or the whole has more than 20 million triangles.
+        The file is not glTF 2.0, needs an extension that is not read, holds a number outside its allowed range (the
+        message names the node, mesh or accessor), has a node below two nodes or below itself, or has more than 20
+        million triangles or vertices or 10,000 parts.
     """
     file = _Gltf(source, *_chunks(data, source), folder)
     extensions = file.table.get("extensionsRequired", [])
@@ -243,7 +248,7 @@ def read_gltf(data: bytes, source: str, *, folder: Path | None = None) -> list[M
                     f"{source}: has more than {MAX_FACES} triangles or vertices, or {MAX_PARTS} parts, in all."
                 )
             mirrored = np.linalg.det(V_from_node[:3, :3]) < 0
-            with np.errstate(over="ignore", invalid="ignore"):  # told by whoever checks the mesh
+            with np.errstate(over="ignore", invalid="ignore"):  # the check of the mesh reports it
                 placed = vertices @ V_from_node[:3, :3].T + V_from_node[:3, 3]
             parts.append(
                 MeshPart(name=path, material=material, vertices=placed, faces=faces[:, ::-1] if mirrored else faces)
@@ -252,7 +257,7 @@ def read_gltf(data: bytes, source: str, *, folder: Path | None = None) -> list[M
 
 
 def _chunks(data: bytes, source: str) -> tuple[Any, bytes]:
-    """The JSON of a glTF file, as plain data, and the binary chunk of a GLB."""
+    """Return the JSON of a glTF file as plain data, and the binary chunk of a GLB, empty without one."""
     text, binary = data, b""
     if data[:4] == b"glTF":
         if len(data) < 20 or struct.unpack_from("<I", data, 4)[0] != 2:
@@ -278,7 +283,7 @@ def _chunks(data: bytes, source: str) -> tuple[Any, bytes]:
 
 
 class _Gltf:
-    """A glTF file while it is read: every look-up checks what it finds."""
+    """Look up items of a glTF file, and check each item that is looked up."""
 
     def __init__(self, source: str, table: Mapping[str, Any], binary: bytes, folder: Path | None) -> None:
         self.source, self.table, self.binary, self.folder = source, table, binary, folder
@@ -286,10 +291,11 @@ class _Gltf:
         self.buffers: dict[int, bytes] = {}
 
     def error(self, where: str, value: object, allowed: str) -> InputError:
+        """Return the error that names a key, its value and what is allowed."""
         return InputError(f"{self.source}: {where} = {shown(value)}: must be {allowed}.")
 
     def item(self, kind: str, index: Any, where: str) -> Mapping[str, Any]:
-        """Table number `index` of the list `kind`, which `where` names."""
+        """Return table `index` of the list `kind`; `where` is the key that refers to it."""
         rows = self.table.get(kind, [])
         if not isinstance(rows, list):
             raise self.error(kind, rows, "a list")
@@ -300,12 +306,14 @@ class _Gltf:
         return rows[index]
 
     def whole(self, table: Mapping[str, Any], key: str, where: str, high: int, default: int | None = None) -> int:
+        """Return the whole number of a key, from 0 to `high`."""
         value = table.get(key, default)
         if type(value) is not int or not 0 <= value <= high:
             raise self.error(f"{where}.{key}", value, f"a whole number from 0 to {high}")
         return value
 
     def reals(self, value: Any, count: int, where: str) -> F64:
+        """Return a list of `count` finite numbers as float64[count]."""
         if not isinstance(value, list) or len(value) != count or not all(type(v) in (int, float) for v in value):
             raise self.error(where, value, f"a list of {count} numbers")
         if not all(abs(v) < 1e30 for v in value):  # nan fails too
@@ -313,7 +321,7 @@ class _Gltf:
         return np.array(value, dtype=np.float64)
 
     def instances(self) -> Iterator[tuple[str, int, F64]]:
-        """Path, mesh and V_from_node float64[4, 4] of each node with a mesh."""
+        """Yield path, mesh index and V_from_node float64[4, 4] of each node with a mesh; V has the scene's axes."""
         nodes = self.table.get("nodes", [])
         if not isinstance(nodes, list) or len(nodes) > MAX_NODES:
             found = f"{len(nodes)} nodes" if isinstance(nodes, list) else nodes
@@ -325,7 +333,7 @@ class _Gltf:
                 c for node in nodes if isinstance(node, dict) for c in _list(node.get("children")) if type(c) is int
             }
             roots = [k for k in range(len(nodes)) if k not in below]
-        base = ""  # the node that some writers put above all others, which tells nothing
+        base = ""  # path of the root node "world", which some writers add without need
         seen: set[int] = set()
         waiting = [(k, "", np.eye(4), 0) for k in reversed(_list(roots))]
         only = len(waiting) == 1
@@ -353,7 +361,7 @@ class _Gltf:
             waiting += [(c, own, V_from_node, depth + 1) for c in reversed(children)]
 
     def transform(self, node: Mapping[str, Any], where: str) -> F64:
-        """Matrix float64[4, 4] from a node's axes to those of the node above."""
+        """Return the matrix float64[4, 4] from a node's axes to those of the node above."""
         if "matrix" in node:
             return self.reals(node["matrix"], 16, f"{where}.matrix").reshape(4, 4).T  # stored by columns
         x, y, z, w = self.reals(node.get("rotation", [0, 0, 0, 1]), 4, f"{where}.rotation")
@@ -371,7 +379,7 @@ class _Gltf:
         return matrix
 
     def primitives(self, mesh: Any) -> list[tuple[F64, I64, str]]:
-        """Vertices, triangles and name of the material of each of a mesh's primitives that has triangles."""
+        """Return vertices, triangles and material name of each of a mesh's primitives that has triangles."""
         table = self.item("meshes", mesh, "mesh")
         if mesh in self.meshes:
             return self.meshes[mesh]
@@ -400,7 +408,7 @@ class _Gltf:
         return found
 
     def accessor(self, index: Any, kind: str, where: str) -> NDArray[Any]:
-        """Numbers of an accessor, [count, 1 or 3]."""
+        """Return the numbers of an accessor, [count, 1] for SCALAR or [count, 3] for VEC3."""
         table = self.item("accessors", index, where)
         at = f"accessors[{index}]"
         width = {"SCALAR": 1, "VEC3": 3}[kind]
@@ -436,7 +444,7 @@ class _Gltf:
         return values
 
     def view(self, table: Mapping[str, Any], where: str, dtype: np.dtype, count: int, width: int) -> NDArray[Any]:
-        """Numbers [count, width] of the buffer view that a table names."""
+        """Return the numbers [count, width] of the buffer view that a table names."""
         number = table.get("bufferView")
         view = self.item("bufferViews", number, f"{where}.bufferView")
         at = f"bufferViews[{number}]"
@@ -452,7 +460,7 @@ class _Gltf:
         return np.ndarray((count, width), dtype, buffer, offset=start + offset, strides=(stride, dtype.itemsize))
 
     def buffer(self, index: Any, where: str) -> bytes:
-        """Bytes of a buffer: of the GLB, of a data URI, or of a file beside the .gltf."""
+        """Return the bytes of a buffer, from the GLB, a data URI or a file in the folder of the .gltf."""
         table = self.item("buffers", index, where)
         if index in self.buffers:
             return self.buffers[index]
@@ -478,16 +486,17 @@ class _Gltf:
 
 
 def _list(value: Any) -> list[Any]:
+    """Return the value where it is a list, else an empty list."""
     return value if isinstance(value, list) else []
 
 
 def _triangles(index: I64, mode: int) -> I64:
-    """Triangles int64[m, 3] of a list, strip or fan of corners."""
+    """Return the triangles int64[m, 3] of a list, strip or fan of corners."""
     if mode == _TRIANGLES:
         return index[: len(index) // 3 * 3].reshape(-1, 3)
     n = max(len(index) - 2, 0)
     k = np.arange(n)
     if mode == _FAN:
         return np.stack([np.broadcast_to(index[:1], (n,)), index[k + 1], index[k + 2]], axis=1)
-    turned = k % 2  # every other triangle of a strip runs the other way
+    turned = k % 2  # every second triangle of a strip has its corners in reverse order
     return np.stack([index[k], index[k + 1 + turned], index[k + 2 - turned]], axis=1)

@@ -1,12 +1,12 @@
-"""How the ground reflects: photometric models and their parameters per wavelength.
+"""Define how the ground reflects: photometric models and their parameters per wavelength.
 
-Every model gives the bidirectional reflectance r in sr⁻¹, radiance over the irradiance of a beam on a plane normal
-to it (BRDF · cos i), so that I/F = πr. The formulas are written once, over an array namespace: `evaluate` takes
-numpy arrays (float64) or drjit arrays (float32, in the renderer) alike.
+Every model gives the bidirectional reflectance r in sr⁻¹, so that I/F = πr. r is the radiance over the irradiance
+of the beam on a plane normal to the beam (r = BRDF · cos i). Each formula is written once, over an array namespace:
+`evaluate` takes numpy arrays (float64) and drjit arrays (float32, in the renderer).
 
-Directions are unit vectors in the local frame of the surface, z along its normal: `light` towards the Sun, `view`
-towards the camera, each a triple of arrays. Angles are never taken by arccos: in float32 that errs the opposition
-surge by 0.4 % at small phase angles (physics of Hapke 2012 needs tan(α/2) alone).
+Directions are unit vectors in the local frame of the surface, with z along its normal. `light` points towards the
+Sun and `view` towards the camera; each is a triple of arrays. No angle is computed by arccos: in float32 this gives
+the opposition surge an error of 0.4 % at small phase angles. Hapke's model of 2012 needs only tan(α/2).
 """
 
 from __future__ import annotations
@@ -26,43 +26,44 @@ NUMPY = SimpleNamespace(
     exp=np.exp, log=np.log, sqrt=np.sqrt, atan=np.arctan, maximum=np.maximum, minimum=np.minimum, select=np.where
 )
 
-# Below this cosine a direction counts as grazing along the surface: an interpolated normal may put the camera
-# slightly under the horizon of a facet that it does see.
+# Below this cosine a direction counts as grazing. An interpolated normal may put the camera slightly below the
+# horizon of a facet that the camera does see.
 _LEAST_COSINE = 1e-4
 _TINY = 1e-30
-# Plain Python numbers: a numpy scalar times a drjit array is a numpy array.
+# Plain Python numbers: a numpy scalar times a drjit array would be a numpy array.
 _DECAY_PER_MAG = float(0.4 * np.log(10))
-_DEG_PER_HALF = float(np.degrees(2.0))  # degrees of an angle over radians of its half
+_DEG_PER_HALF = float(np.degrees(2.0))  # degrees of an angle per radian of its half
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Diffuse:
-    """A disc function times a phase function times a reflectance: r = (A/π) D(i, e, α) 10^(-0.4 β α).
+    """Model reflectance, disc function and phase function as a product: r = (A/π) D(i, e, α) 10^(-0.4 β α).
 
-    `reflectance` float64[band] in [0, 1], the normal reflectance A at zero phase; D is 1 at i = e = α = 0:
+    `reflectance` float64[band] in [0, 1] is the normal reflectance A at zero phase. `disc` names the disc function
+    D, which is 1 at i = e = α = 0:
 
     - `lambert`: cos i
     - `lommel_seeliger`: 2 cos i / (cos i + cos e)
     - `mcewen`: 2 L cos i / (cos i + cos e) + (1 - L) cos i, the lunar-Lambert function of McEwen (1991, Icarus
       92, 298), with L(α) = 1 - 0.019 α + 2.42e-4 α² - 1.46e-6 α³, α in degrees, at least 0 (McEwen 1996, LPSC 27).
 
-    `phase_slope_mag_deg` β in magnitudes per degree; 67P has 0.047 in 1.3-54° (Fornasier et al. 2015).
+    `phase_slope_mag_deg` is β in magnitudes per degree; 67P has 0.047 at 1.3-54° (Fornasier et al. 2015).
     """
 
     reflectance: F64
     disc: Literal["lambert", "lommel_seeliger", "mcewen"] = "lambert"
     phase_slope_mag_deg: float = 0.0
 
-    # one shape for all wavelengths: a single term, weighted per band
+    # all wavelengths have the same shape: a single term with a weight per band
     terms: ClassVar[int] = 1
 
     @property
     def weights(self) -> F64:
-        """float64[1, band]: what a unit of the term adds to each band."""
+        """Return the reflectance r of each band per unit of the term, float64[1, band]."""
         return self.reflectance[None, :] / np.pi
 
     def evaluate(self, m: Any, light: Triple, view: Triple) -> list[Any]:
-        """The term: π r / A, 0 where the light comes from below."""
+        """Return the single term π r / A; it is 0 where the light comes from below the surface."""
         mu0, mu = light[2], m.maximum(view[2], _LEAST_COSINE)
         lit = m.maximum(mu0, 0)
         if self.disc == "lambert":
@@ -81,16 +82,16 @@ class Diffuse:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Hapke:
-    """Hapke's model with opposition surges, roughness and porosity (Hapke 2002, Icarus 157, 523; 2012, Theory of
-    Reflectance and Emittance Spectroscopy, 2nd ed., chapters 9 and 12).
+    """Model the reflectance after Hapke, with opposition surges, roughness and porosity.
 
-    float64[band] each:
+    The sources are Hapke 2002, Icarus 157, 523, and Hapke 2012, Theory of Reflectance and Emittance Spectroscopy,
+    2nd ed., chapters 9 and 12. Each parameter is float64[band]:
 
     - `single_scattering_albedo` w in [0, 1]
-    - `asymmetry` g in (-1, 1) of the Henyey-Greenstein function; negative scatters back
+    - `asymmetry` g in (-1, 1) of the Henyey-Greenstein function; a negative g scatters back
     - `shadow_hiding_amplitude` B0 >= 0 and `shadow_hiding_width` h_s > 0 (dimensionless, not an angle)
     - `coherent_amplitude` B_C0 >= 0 and `coherent_width` h_c > 0
-    - `roughness_deg` mean slope angle, 0 to 60, of relief below a pixel
+    - `roughness_deg` mean slope angle, 0 to 60, of the relief that is smaller than a pixel
     - `porosity_factor` K >= 1
     """
 
@@ -105,16 +106,16 @@ class Hapke:
 
     @property
     def terms(self) -> int:
-        """The shape changes with wavelength: a term a band."""
+        """Return the number of terms: one per band, since the shape changes with wavelength."""
         return len(self.single_scattering_albedo)
 
     @cached_property
     def weights(self) -> F64:
-        """float64[band, band]: each term goes to its own band."""
+        """Return the identity, float64[band, band]: each term is the reflectance of its own band."""
         return np.eye(self.terms)
 
     def evaluate(self, m: Any, light: Triple, view: Triple) -> list[Any]:
-        """r per band, 0 where the light comes from below."""
+        """Return r per band; it is 0 where the light comes from below the surface."""
         lit = light[2] > 0
         light = (light[0], light[1], m.maximum(light[2], _TINY))
         view = (view[0], view[1], m.maximum(view[2], _LEAST_COSINE))
@@ -149,7 +150,7 @@ Photometry = Diffuse | Hapke
 
 
 def radiance_factor(model: Photometry, light: ArrayLike, view: ArrayLike) -> F64:
-    """I/F = πr, float64[band, n], for unit directions float64[n, 3] in the surface's frame (z its normal)."""
+    """Return I/F = πr, float64[band, n], for unit directions float64[n, 3] in the surface's frame (z: normal)."""
     triples = [tuple(np.atleast_2d(np.asarray(d, dtype=np.float64)).T) for d in (light, view)]
     with np.errstate(under="ignore"):
         terms = np.stack(np.broadcast_arrays(*model.evaluate(NUMPY, *triples)))
@@ -160,38 +161,39 @@ def radiance_factor(model: Photometry, light: ArrayLike, view: ArrayLike) -> F64
 
 
 def _tan_half_phase(m: Any, light: Triple, view: Triple) -> Any:
-    """tan(α/2) = |l - v| / |l + v|."""
+    """Return tan(α/2) = |l - v| / |l + v| of the phase angle α."""
     apart = sum((a - b) * (a - b) for a, b in zip(light, view, strict=True))
     together = sum((a + b) * (a + b) for a, b in zip(light, view, strict=True))
     return m.sqrt(apart / m.maximum(together, 1e-12))
 
 
 def _phase_deg(m: Any, light: Triple, view: Triple) -> Any:
+    """Return the phase angle in degrees."""
     return _DEG_PER_HALF * m.atan(_tan_half_phase(m, light, view))
 
 
 def _henyey_greenstein(m: Any, g: float, cos_phase: Any) -> Any:
-    """P(α) = (1 - g²) / (1 + 2 g cos α + g²)^(3/2)."""
+    """Return P(α) = (1 - g²) / (1 + 2 g cos α + g²)^(3/2)."""
     base = 1 + g * g + 2 * g * cos_phase
     return (1 - g * g) / (base * m.sqrt(base))
 
 
 def _chandrasekhar(w: float, x: Any, log: Any) -> Any:
-    """H(x) (Hapke 2002, eq. 13), with log = ln((1 + x) / x)."""
+    """Return H(x) (Hapke 2002, eq. 13); `log` is ln((1 + x) / x)."""
     gamma = np.sqrt(1 - w)
     r0 = float((1 - gamma) / (1 + gamma))
     return 1 / (1 - w * x * (r0 + (0.5 - r0 * x) * log))
 
 
 def _coherent(m: Any, z: Any) -> Any:
-    """[1 + (1 - e^-z) / z] / [2 (1 + z)²], the coherent-backscatter surge (Hapke 2002, eq. 32)."""
-    # the series where the difference has lost its digits
+    """Return the coherent-backscatter surge [1 + (1 - e^-z) / z] / [2 (1 + z)²] (Hapke 2002, eq. 32)."""
+    # a series for small z, where 1 - e^-z loses its digits
     share = m.select(z < 1e-2, 1 - z * (0.5 - z * (1 / 6)), (1 - m.exp(-z)) / m.maximum(z, 1e-2))
     return (1 + share) / (2 * (1 + z) * (1 + z))
 
 
 def _rough(m: Any, light: Triple, view: Triple, theta: float) -> tuple[Any, Any, Any]:
-    """Effective cosines and shadowing S of a rough surface (Hapke 1984, Icarus 59, 41)."""
+    """Return the effective cosines and the shadowing S of a rough surface (Hapke 1984, Icarus 59, 41)."""
     mu0, mu = light[2], view[2]
     if theta == 0:
         return mu0, mu, 1.0
@@ -199,7 +201,7 @@ def _rough(m: Any, light: Triple, view: Triple, theta: float) -> tuple[Any, Any,
     chi = float(1 / np.sqrt(1 + np.pi * tan * tan))
     sin_i = m.sqrt(light[0] * light[0] + light[1] * light[1])
     sin_e = m.sqrt(view[0] * view[0] + view[1] * view[1])
-    # azimuth ψ between the two from the tangent vectors; where one vanishes ψ drops out of all that follows
+    # Azimuth ψ between the two directions from their tangent vectors; where one vanishes, ψ has no effect below.
     lx, ly = (light[k] / m.maximum(sin_i, 1e-15) for k in (0, 1))
     vx, vy = (view[k] / m.maximum(sin_e, 1e-15) for k in (0, 1))
     sin2 = 0.25 * ((lx - vx) * (lx - vx) + (ly - vy) * (ly - vy))
@@ -220,7 +222,7 @@ def _rough(m: Any, light: Triple, view: Triple, theta: float) -> tuple[Any, Any,
     e1_far, e1_near = m.select(high, e1_e, e1_i), m.select(high, e1_i, e1_e)
     e2_far, e2_near = m.select(high, e2_e, e2_i), m.select(high, e2_i, e2_e)
     scale = tan / (2 - e1_far - psi_share * e1_near)
-    near = (cos_psi * e2_far + sin2 * e2_near) * scale  # of the direction nearer to the normal
+    near = (cos_psi * e2_far + sin2 * e2_near) * scale  # for the direction nearer to the normal
     far = (e2_far - sin2 * e2_near) * scale
     mu0_e = chi * (mu0 + sin_i * m.select(high, near, far))
     mu_e = chi * (mu + sin_e * m.select(high, far, near))
@@ -231,7 +233,7 @@ def _rough(m: Any, light: Triple, view: Triple, theta: float) -> tuple[Any, Any,
 
 # --- parameters ---------------------------------------------------------------------------------------------
 
-# Contrasts between terrains are given at this wavelength, the reference of Fornasier et al. 2015.
+# Contrasts between terrains refer to this wavelength, the reference of Fornasier et al. 2015.
 REFERENCE_NM = 649.0
 
 COLUMNS = tuple(f.name for f in fields(Hapke))
@@ -248,22 +250,23 @@ HAPKE_TABLES: dict[str, tuple[tuple[float, ...], ...]] = {
         (882.0, 0.052, -0.40, 2.08, 0.027, 0.0, 1.0, 15.0, 1.0),
         (989.0, 0.066, -0.35, 2.07, 0.032, 0.0, 1.0, 15.0, 1.0),
     ),
-    # disc-resolved at 649 nm (the same paper, table 4); w follows the disc-integrated spectrum at other wavelengths
+    # disc-resolved at 649 nm (the same paper, table 4); at other wavelengths w follows the disc-integrated spectrum
     "67p_hapke2002": ((649.0, 0.042, -0.37, 2.5, 0.079, 0.188, 0.017, 15.0, 1.0),),
     "67p_hapke2012": ((649.0, 0.034, -0.42, 2.25, 0.061, 0.0, 1.0, 28.0, 1.20),),
 }
 
 
 def hapke_at(wavelength_nm: ArrayLike, table: str | tuple[tuple[float, ...], ...] = "67p_fornasier2015") -> Hapke:
-    """Hapke's parameters at wavelengths float64[band] in nm, interpolated linearly, constant beyond the ends.
+    """Return Hapke's parameters at wavelengths float64[band] in nm.
 
-    `table` names one of `HAPKE_TABLES` or gives rows (wavelength in nm, then the columns of `Hapke` in order).
-    The single-wavelength sets of 67P take the relative spectrum of w from the disc-integrated table.
+    They are interpolated linearly and are constant beyond the ends of the table. `table` names one of
+    `HAPKE_TABLES` or gives rows (wavelength in nm, then the columns of `Hapke` in order). The single-wavelength sets
+    of 67P take the relative spectrum of w from the disc-integrated table.
 
     Raises
     ------
     KeyError
-        No table of that name.
+        No table has this name.
     """
     wanted = np.asarray(wavelength_nm, dtype=np.float64)
     rows = np.array(HAPKE_TABLES[table] if isinstance(table, str) else table, dtype=np.float64)
@@ -277,15 +280,16 @@ def hapke_at(wavelength_nm: ArrayLike, table: str | tuple[tuple[float, ...], ...
 
 
 def porosity_factor(filling: float) -> float:
-    """K of the filling factor φ, 0 < φ < 0.75 (Hapke 2008, Icarus 195, 918): 1 for a dilute medium."""
+    """Return K for a filling factor φ, 0 < φ < 0.75 (Hapke 2008, Icarus 195, 918); a dilute medium has K = 1."""
     x = 1.209 * filling ** (2 / 3)
     return float(-np.log(1 - x) / x)
 
 
 def geometric_albedo(model: Hapke) -> F64:
-    """float64[band]: A_geo of a smooth sphere (Hapke 2012, eq. 11.34 with K = 1): the published tables' own check.
+    """Return the geometric albedo A_geo of a smooth sphere, float64[band] (Hapke 2012, eq. 11.34 with K = 1).
 
-    r0/2 + r0²/6 + (w/8) [(1 + B0) P(0) - 1]; roughness lowers it by less than 1 % at 15°.
+    A_geo = r0/2 + r0²/6 + (w/8) [(1 + B0) P(0) - 1]. The published tables list it too, so it checks them. A
+    roughness of 15° lowers it by less than 1 %.
     """
     w, g = model.single_scattering_albedo, model.asymmetry
     gamma = np.sqrt(1 - w)

@@ -1,4 +1,4 @@
-"""The quantities that flow through the pipeline: an array, its unit and its axes, frozen.
+"""Define the quantities that flow through the pipeline; each is a frozen array with its unit and its axes.
 
 Radiance ─ lens ─▶ Irradiance ─ detector ─▶ Electrons ─▶ RawDN ─▶ RGBI ─▶ Sample
 """
@@ -15,13 +15,13 @@ from numpy.typing import NDArray
 
 CHANNELS = ("R", "G", "B", "I")
 
-# Rec. 709 luminance of linear RGB; the intensity channel of a camera without a W pixel.
+# Rec. 709 luminance of linear RGB: the intensity channel of a camera without W pixels.
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722], dtype=np.float32)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Quantity:
-    """Base of all quantities. Arrays are made read-only: a step returns a new quantity, never edits one."""
+    """Hold an array with its unit and axes. The array becomes read-only: a step returns a new quantity."""
 
     array: NDArray[Any]
 
@@ -37,19 +37,20 @@ class Quantity:
         self.array.flags.writeable = False
 
     def with_array(self, array: NDArray[Any]) -> Self:
-        """The same quantity with another array of the same axes."""
+        """Return the same quantity with another array of the same axes."""
         return replace(self, array=array)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SunInView:
-    """The Sun's disc as a camera sees it, before any pixels.
+    """Describe the Sun's disc as a camera sees it, independent of any pixels.
 
-    `direction_C` float64[3] and `angular_radius_rad` say where it is, `radiance_W_m2_sr_nm` float64[band] is the
-    mean of the disc, `limb_darkening` float64[band, 6] its profile (`spectra.limb_darkening`; None: uniform).
-    `visible` float32[n, n] in [0, 1] is the fraction that body and spacecraft leave of cells of the square about
-    the disc: columns along the first of the disc's axes (`sundisc.axes`), rows along the second. `blur_slope`:
-    radius of the circle that defocus makes of a point, as a tangent.
+    - `direction_C` float64[3] points to its centre; `angular_radius_rad` is its radius.
+    - `radiance_W_m2_sr_nm` float64[band] is the mean radiance of the disc.
+    - `limb_darkening` float64[band, 6] is the disc's profile (`spectra.limb_darkening`); None: uniform.
+    - `visible` float32[n, n] in [0, 1] is the fraction that body and spacecraft leave visible, for each cell of the
+      square around the disc. Columns run along the first axis of `sundisc.axes`, rows along the second.
+    - `blur_slope` is the radius of the blur circle that defocus makes of a point, as a tangent.
     """
 
     direction_C: NDArray[np.float64]
@@ -60,7 +61,7 @@ class SunInView:
     blur_slope: float = 0.0
 
     def profiles(self, bands: Sequence[int]) -> NDArray[np.float64]:
-        """Return the polynomials of the radiance over the disc's mean in μ, float64[band, k]."""
+        """Return the coefficients of polynomials in μ for the radiance over the disc's mean, float64[band, k]."""
         if self.limb_darkening is None:
             return np.ones((len(bands), 1))
         return self.limb_darkening[list(bands)]
@@ -68,10 +69,10 @@ class SunInView:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Radiance(Quantity):
-    """Spectral radiance at the camera, per band node; `wavelength_nm` float64[band].
+    """Hold the spectral radiance at the camera at the band nodes `wavelength_nm` float64[band].
 
-    `sun` is the part of `array` that is the Sun's own disc, float32[band, y, x]; None where it is not in view.
-    `disc` is the disc that it shows, for a lens with a grid of its own; None where it is not known.
+    `sun` float32[band, y, x] is the part of `array` that comes from the Sun's disc; None where the Sun is not in
+    view. `disc` describes this disc, for a lens that images it on its own grid; None where it is not known.
     """
 
     wavelength_nm: NDArray[np.float64]
@@ -83,7 +84,7 @@ class Radiance(Quantity):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Irradiance(Quantity):
-    """Spectral irradiance on the sensor plane, per band node; `wavelength_nm` float64[band]."""
+    """Hold the spectral irradiance on the sensor plane at the band nodes `wavelength_nm` float64[band]."""
 
     wavelength_nm: NDArray[np.float64]
     unit = "W m-2 nm-1"
@@ -92,13 +93,14 @@ class Irradiance(Quantity):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Electrons(Quantity):
-    """Electrons per pixel and channel: R, G, B, or those of the detector's mosaic, each at every pixel.
+    """Hold electrons per pixel and channel; every pixel has all channels, R, G, B or those of the mosaic.
 
-    `white_e` float32[channel]: the signal of each channel that the 8 bit image shows as 255. Expected (noise-free)
-    photo-electrons may lie above it; saturation belongs to the detector.
+    `white_e` float32[channel] is the signal of each channel that the 8-bit image shows as 255. Expected
+    (noise-free) photo-electrons may lie above it, since the detector applies saturation later.
 
-    `past_rims` float32[y, x, channel] is light beside that of `array` which has met the lens's pupil and rims
-    already: the Sun's direct image and its traced straylight. Vignetting leaves it as it is. None: there is none.
+    `past_rims` float32[y, x, channel] is additional light, not contained in `array`, whose losses at the lens's
+    pupil and rims are included already: the Sun's direct image and its traced straylight. Vignetting does not
+    change it. None: there is no such light.
     """
 
     white_e: NDArray[np.float32]
@@ -108,20 +110,20 @@ class Electrons(Quantity):
 
     @cached_property
     def merged(self) -> Electrons:
-        """All light in one array, as the detector takes it."""
+        """Return all light in one array, as the detector needs it."""
         if self.past_rims is None:
             return self
         return replace(self, array=self.array + self.past_rims, past_rims=None)
 
     def scaled(self, factor: float) -> Electrons:
-        """All light times a factor."""
+        """Return all light multiplied by a factor."""
         past = None if self.past_rims is None else self.past_rims * np.float32(factor)
         return replace(self, array=self.array * np.float32(factor), past_rims=past)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class RawDN(Quantity):
-    """Digital numbers of the analogue-to-digital converter, bias included, per colour R, G, B."""
+    """Hold the digital numbers of the analogue-to-digital converter, bias included, per colour R, G, B."""
 
     unit = "DN"
     axes = ("y", "x", "channel")
@@ -130,7 +132,7 @@ class RawDN(Quantity):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Charge(Quantity):
-    """Electrons in each pixel of a mosaic: expected, or collected."""
+    """Hold the electrons in each pixel of a mosaic, either expected or collected."""
 
     unit = "e-"
     axes = ("y", "x")
@@ -138,7 +140,7 @@ class Charge(Quantity):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Offset(Quantity):
-    """What each pixel of a mosaic reads above its charge, electrons of either sign: no charge, so without noise."""
+    """Hold the readout offset of each mosaic pixel in electrons, of either sign, which has no shot noise."""
 
     unit = "e-"
     axes = ("y", "x")
@@ -146,7 +148,7 @@ class Offset(Quantity):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class RawMosaic(Quantity):
-    """Digital numbers of a mosaic, bias included."""
+    """Hold the digital numbers of a mosaic, bias included."""
 
     unit = "DN"
     axes = ("y", "x")
@@ -155,7 +157,7 @@ class RawMosaic(Quantity):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class RGBI(Quantity):
-    """The 8 bit image: R, G, B and intensity."""
+    """Hold the 8-bit image: R, G, B and intensity."""
 
     unit = "DN"
     axes = ("y", "x", "channel")
@@ -166,15 +168,17 @@ class RGBI(Quantity):
 SKY, BODY, SUN, SPACECRAFT = 0, 1, 2, 3
 
 
-# What may be wrong with a pixel of a mosaic, as bits. `rts`: it has a telegraph signal; `rts_high`: one that was in
+# Defects of a mosaic pixel, as bits. `rts`: the pixel has a random telegraph signal; `rts_high`: this signal was at
 # its upper level for more than half of the exposure.
 HOT, DEAD, STUCK, RTS, RTS_HIGH, TRAP = (np.uint8(1 << k) for k in range(6))
 DEFECTS = ("hot", "dead", "stuck", "rts", "rts_high", "trap")
 
 
 class SoftKind(NamedTuple):
-    """A kind of layer that says how strongly a fault acts on each pixel: its `units`, the value `neutral` where the
-    fault is not injected, its `dtype`, and what it holds."""
+    """Describe a kind of soft layer, which gives the strength of a fault in each pixel.
+
+    `neutral` is the layer's value where the fault is not injected; `meaning` says what the layer holds.
+    """
 
     units: str
     neutral: float
@@ -182,7 +186,7 @@ class SoftKind(NamedTuple):
     meaning: str
 
 
-# By the ending of a layer's name, as in dust_opacity.
+# The keys are the endings of the layers' names, as in dust_opacity.
 SOFT_KINDS = {
     "opacity": SoftKind("1", 0.0, "float16", "fraction of the light that is lost"),
     "factor": SoftKind("1", 1.0, "float16", "factor on the light, 1 where nothing is lost"),
@@ -196,20 +200,24 @@ SOFT_KINDS = {
 
 
 def soft_kind(layer: str) -> SoftKind:
-    """Return the kind of a soft layer. Raises KeyError where its name does not end as one of `SOFT_KINDS`."""
+    """Return the kind of a soft layer. Raises KeyError where its name has no ending of `SOFT_KINDS`."""
     return SOFT_KINDS[layer.rpartition("_")[2]]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Truth:
-    """Noise-free truth of the pixel centres.
+    """Hold the noise-free truth at the pixel centres.
 
-    `depth_m` float32[y, x], along the boresight, inf on the sky; `normal` float16[y, x, 3] in C, 0 on the sky: the
-    surface's own, interpolated over its facet, at the limb no further from the camera than at right angles to it;
-    `semantic` uint8[y, x]: 0 sky, 1 body, 2 Sun, 3 spacecraft. Where asked for, float32[y, x], NaN on the sky:
-    `incidence_deg` and `emission_deg` from the normal to the Sun and to the camera, `phase_deg` between the two,
-    and `dust`, how far the ground is covered, in [0, 1]; with a spacecraft also `material` int32[y, x], which
-    of its materials a pixel shows, -1 where none.
+    - `depth_m` float32[y, x]: depth along the boresight, inf on the sky.
+    - `normal` float16[y, x, 3]: surface normal in C, interpolated over the facet, 0 on the sky. At the limb it is
+      turned where needed, so that it makes at most a right angle with the direction to the camera.
+    - `semantic` uint8[y, x]: 0 sky, 1 body, 2 Sun, 3 spacecraft.
+    - `incidence_deg`, `emission_deg` float32[y, x]: angles from the normal to the Sun and to the camera.
+    - `phase_deg` float32[y, x]: angle between the directions to the Sun and to the camera.
+    - `dust` float32[y, x]: fraction in [0, 1] of the ground that dust covers.
+    - `material` int32[y, x]: index of the spacecraft's material that a pixel shows, -1 where there is none.
+
+    The angles and `dust` are NaN on the sky and None unless asked for; `material` is None without a spacecraft.
     """
 
     depth_m: NDArray[np.float32]
@@ -224,9 +232,9 @@ class Truth:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Sample:
-    """One finished sample: the layers and scalars that the store holds, by the names of its arrays.
+    """Hold one finished sample: the layers and scalars that the store holds, under the names of its arrays.
 
-    `layers` maps array name to ndarray; `scalars` maps array name to number, small vector or string.
+    `layers` maps an array's name to an ndarray; `scalars` maps it to a number, a small vector or a string.
     """
 
     index: int
