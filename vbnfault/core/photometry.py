@@ -260,8 +260,8 @@ def hapke_at(wavelength_nm: ArrayLike, table: str | tuple[tuple[float, ...], ...
     """Return Hapke's parameters at wavelengths float64[band] in nm.
 
     They are interpolated linearly and are constant beyond the ends of the table. `table` names one of
-    `HAPKE_TABLES` or gives rows (wavelength in nm, then the columns of `Hapke` in order). The single-wavelength sets
-    of 67P take the relative spectrum of w from the disc-integrated table.
+    `HAPKE_TABLES` or gives rows (wavelength in nm, then the columns of `Hapke` in order). The single-wavelength
+    sets of 67P take the relative spectrum of w from the disc-integrated table.
 
     Raises
     ------

@@ -1,8 +1,8 @@
-"""The one loader of every file that a user names, and where the packaged scenes and textures lie.
+"""Load every file that a user names, and find the packaged scenes and textures.
 
-A file is read once, by `read_input`, which refuses all that is no regular file of a reasonable size: nothing that
-a user names can block, or fill the memory, before the first byte is parsed. What has to be read by a library that
-takes only paths (SPICE's kernels) goes through `check_input`.
+`read_input` reads a file once. It refuses everything but a regular file of reasonable size, so that no file can
+block the program or fill the memory before the first byte is parsed. `check_input` checks a file that a library must
+read by its path, such as a SPICE kernel.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ from .errors import InputChanged, InputError, shown
 _PACKAGE = Path(__file__).resolve().parents[1]
 
 MIB = 1 << 20
-# Kind of file → the most bytes it may have: of a shape as text, some 12 million facets; of the others, ten times
-# what the largest files in use have.
+# Kind of file → the most bytes it may have. A shape as text then has some 12 million facets; the other limits are
+# ten times the size of the largest files in use.
 LIMIT_BYTES: dict[str, int] = {
     "scene": 4 * MIB,
     "lens": 4 * MIB,
@@ -41,7 +41,7 @@ _DEEPEST_TABLE = 24
 _LONGEST_NAME_BYTES = 255
 _LONGEST_PATH_BYTES = 4095
 _READ_BYTES = 16 * MIB
-# What an environment variable or option may ask for: more than any machine has.
+# The most threads that an environment variable or option may ask for: more than any machine has.
 MOST_THREADS = 4096
 
 
@@ -51,24 +51,26 @@ def read_input(path: str | Path, what: str, *, types: Sequence[str] = (), limit_
     Parameters
     ----------
     path
-        Of a regular file; a link to one is followed.
+        Path of a regular file, or of a link to one.
     what
-        Kind of file, which names it in errors and gives its limit: a key of `LIMIT_BYTES`.
+        Kind of file, a key of `LIMIT_BYTES`. Error messages name it.
     types
-        Suffixes in lower case; where some are given, the file has one of them.
+        Allowed suffixes in lower case; empty: all.
     limit_bytes
-        Most bytes of the file; default: that of its kind.
+        The most bytes that the file may have; default: the limit of its kind.
 
     Raises
     ------
     InputError
-        The file is missing, unreadable, empty or too large, no regular file (a folder, a device, a pipe) or of
+        The file is missing, unreadable, empty or too large, is no regular file (a folder, a device, a pipe), or has
         another type.
+    InputChanged
+        The file has changed since the build began (`Contents`).
     """
     limit = LIMIT_BYTES[what] if limit_bytes is None else limit_bytes
     with _opened(Path(path), what, types, limit) as file:
         try:
-            data = file.read(limit + 1)  # one more than allowed: its size may have been a lie, or grown
+            data = file.read(limit + 1)  # one more than allowed: the size may be wrong, or have grown
         except OSError as error:
             raise InputError(f"{path}: {what} file cannot be read: {error.strerror}.") from None
     if len(data) > limit:
@@ -78,29 +80,30 @@ def read_input(path: str | Path, what: str, *, types: Sequence[str] = (), limit_
 
 
 def check_input(path: str | Path, what: str, *, types: Sequence[str] = ()) -> None:
-    """Check a file that a library will read by its path, as `read_input` does. Raises InputError."""
+    """Check a file, as `read_input` does, that a library will read by its path. Raises InputError, InputChanged."""
     with _opened(Path(path), what, types, LIMIT_BYTES[what]) as file:
         _check_contents(path, what, lambda: _sha256_of(file), os.fstat(file.fileno()))
 
 
 def head_of_input(path: str | Path, what: str, size_bytes: int) -> bytes:
-    """Return the first bytes of a file that a user names, which tell how to read it. Raises InputError."""
+    """Return the first bytes of a file that a user names, such as those that show its format. Raises InputError."""
     with _opened(Path(path), what, (), LIMIT_BYTES[what]) as file:
         return file.read(size_bytes)
 
 
 def sha256(data: bytes) -> str:
-    """Return the SHA-256 (hex) of a file's bytes as `read_input` gave them."""
+    """Return the SHA-256 (hex) of a file's bytes, as `read_input` returns them."""
     return hashlib.sha256(data).hexdigest()
 
 
 def sha256_of_input(path: str | Path, what: str) -> str:
-    """Return the SHA-256 (hex) of a file that is too large to be kept in memory. Raises InputError."""
+    """Return the SHA-256 (hex) of a file that is too large for the memory. Raises InputError."""
     with _opened(Path(path), what, (), LIMIT_BYTES[what]) as file:
         return _sha256_of(file)
 
 
 def _sha256_of(file: BinaryIO) -> str:
+    """Return the SHA-256 (hex) of an open file, read in pieces."""
     digest = hashlib.sha256()
     while data := file.read(_READ_BYTES):
         digest.update(data)
@@ -108,7 +111,7 @@ def _sha256_of(file: BinaryIO) -> str:
 
 
 def _opened(path: Path, what: str, types: Sequence[str], limit_bytes: int) -> BinaryIO:
-    """An open file that is regular, of one of `types` and neither empty nor too large."""
+    """Return an open, regular file of one of `types`, neither empty nor too large. Raises InputError."""
     try:
         return _opened_now(path, what, types, limit_bytes)
     except InputError as error:
@@ -119,17 +122,18 @@ def _opened(path: Path, what: str, types: Sequence[str], limit_bytes: int) -> Bi
 
 
 def _opened_now(path: Path, what: str, types: Sequence[str], limit_bytes: int) -> BinaryIO:
+    """Return the open file as `_opened` does, but without comparing it with an earlier reading."""
     status = file_status(path)
     if status is None:
         raise InputError(f"{shown_path(path)}: {what} file not found.")
-    if not stat.S_ISREG(status.st_mode):  # before opening: to open a device may already act on it
+    if not stat.S_ISREG(status.st_mode):  # before opening: opening a device may already act on it
         raise InputError(f"{path}: {what} is not a file{_kind(status)}.")
     if types and path.suffix.lower() not in types:
         raise InputError(
             f"{path}: unsupported {what} type {path.suffix.lower()!r}; allowed are {', '.join(types)}."
         )
     try:
-        # Without waiting: the name may have become a pipe's in between.
+        # O_NONBLOCK, since the name may belong to a pipe by now, which would block.
         flags = (
             os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0) | getattr(os, "O_CLOEXEC", 0)
         )
@@ -150,35 +154,35 @@ def _opened_now(path: Path, what: str, types: Sequence[str], limit_bytes: int) -
     return file
 
 
-# --- what files held when a run was planned -------------------------------------------------------------------
+# --- contents of files when a run was planned -------------------------------------------------------------------
 
 
 class Contents:
     """Record the digests of the files that a run reads, and compare every later reading with the first.
 
-    One object serves a run from its planning to its last worker process; pickled, it carries the digests along.
-    Once `complete`, a file that was not read before is refused as well, except where it belongs to vbnfault.
+    One object serves a run from its planning to its last worker process; pickling keeps the digests. After
+    `complete`, a file that was not read before is refused too, unless it belongs to vbnfault.
     """
 
     def __init__(self) -> None:
         self._sha256: dict[str, str] = {}
-        self._status: dict[str, tuple[int, ...]] = {}  # of files too large to be hashed at every reading
+        self._status: dict[str, tuple[int, ...]] = {}  # of files too large to hash at every reading
         self._complete = False
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**vars(self), "_status": {}}  # another machine's
+        return {**vars(self), "_status": {}}  # it holds on one machine only
 
     def complete(self) -> None:
-        """Note that the run is planned: all its files have been read."""
+        """Record that the run is planned, and so that all its files have been read."""
         self._complete = True
 
     def knows(self, path: str | Path) -> bool:
-        """Whether the file has been read before."""
+        """Return whether the file has been read before."""
         return _key(path) in self._sha256
 
     @contextlib.contextmanager
     def in_use(self) -> Iterator[None]:
-        """Compare what is read within a block, in this thread."""
+        """Compare every file that this thread reads within a block."""
         before = _in_use.set(self)
         try:
             yield
@@ -186,7 +190,10 @@ class Contents:
             _in_use.reset(before)
 
     def check(self, path: str | Path, what: str, digest: Callable[[], str], status: os.stat_result | None) -> None:
-        """Check what a file holds. Raises InputChanged."""
+        """Compare a file's digest with its first one. Raises InputChanged.
+
+        `status` is given for a large file: its digest is then computed only where the status has changed.
+        """
         key = _key(path)
         now = None if status is None else (status.st_dev, status.st_ino, status.st_size, status.st_mtime_ns)
         if now is not None and self._status.get(key) == now:
@@ -206,7 +213,7 @@ _OWN = "vbnfault:"
 
 
 def _key(path: str | Path) -> str:
-    """What a file is called on every machine: vbnfault's own ones lie elsewhere on each."""
+    """Return the absolute path, or for vbnfault's own files a relative one that is the same on every machine."""
     absolute = os.path.abspath(path)
     for root in (_PACKAGE, _PACKAGE.parent):
         for kind in ("scenes", "textures", "catalogues"):
@@ -216,6 +223,7 @@ def _key(path: str | Path) -> str:
 
 
 def _changed(sentence: str, path: str | Path, what: str) -> InputChanged:
+    """Return the error that says what changed, and what to do next."""
     return InputChanged(
         f"{sentence.rstrip('.')}; finished samples stay: put the {what} file of before back and repeat the "
         "command, or build the changed scene elsewhere"
@@ -225,6 +233,7 @@ def _changed(sentence: str, path: str | Path, what: str) -> InputChanged:
 def _check_contents(
     path: str | Path, what: str, digest: Callable[[], str], status: os.stat_result | None = None
 ) -> None:
+    """Pass the digest of a file to the `Contents` in use and to `noting`, where they are active."""
     contents, noted = _in_use.get(), _noted.get()
     if contents is not None:
         contents.check(path, what, digest, status)
@@ -234,7 +243,7 @@ def _check_contents(
 
 @contextlib.contextmanager
 def noting() -> Iterator[list[str]]:
-    """Give a list that grows by the SHA-256 of every file that is read within a block, in order."""
+    """Yield a list to which every file that is read within a block appends its SHA-256 (hex), in order."""
     digests: list[str] = []
     before = _noted.set(digests)
     try:
@@ -247,7 +256,7 @@ _R = TypeVar("_R")
 
 
 def cached_with_contents(maxsize: int) -> Callable[[Callable[..., _R]], Callable[..., _R]]:
-    """Return a decorator like `lru_cache` for functions of a file's name: what one run has read serves no other."""
+    """Return a decorator like `lru_cache` for functions of file names; each run (`Contents`) has its own results."""
 
     def decorate(function: Callable[..., _R]) -> Callable[..., _R]:
         @lru_cache(maxsize=maxsize)
@@ -264,12 +273,14 @@ def cached_with_contents(maxsize: int) -> Callable[[Callable[..., _R]], Callable
 
 
 def _too_large(path: Path, what: str, size_bytes: int, limit_bytes: int) -> InputError:
+    """Return the error that states a file's size and its limit."""
     return InputError(
         f"{path}: {what} file has {size_bytes / MIB:.3g} MiB or more; at most {limit_bytes / MIB:g} MiB are read."
     )
 
 
 def _kind(status: os.stat_result) -> str:
+    """Return " but a folder" or the like for something that is no regular file, empty for other things."""
     kinds = {
         stat.S_IFDIR: "a folder",
         stat.S_IFIFO: "a pipe",
@@ -282,8 +293,10 @@ def _kind(status: os.stat_result) -> str:
 
 
 def environment_whole(name: str, high: int) -> int:
-    """Return the whole number of an environment variable, 0 where it is not set. Raises InputError outside 0 to
-    `high`."""
+    """Return the whole number in an environment variable, 0 where it is unset or empty.
+
+    Raises InputError unless it is a whole number from 0 to `high`.
+    """
     text = os.environ.get(name, "").strip() or "0"
     if not (text.isascii() and text.isdigit() and len(text) < 20 and int(text) <= high):
         raise InputError(f"{name} = {shown(text)}: must be a whole number from 0 to {high}")
@@ -291,15 +304,15 @@ def environment_whole(name: str, high: int) -> int:
 
 
 def file_status(path: str | Path) -> os.stat_result | None:
-    """Return what the file system says of a path; None where it has nothing of that name, or could have nothing."""
+    """Return the file system's status of a path; None where nothing exists there or the path is impossible."""
     try:
         return os.stat(path)
-    except (OSError, ValueError):  # ValueError: a NUL, or characters that no file system takes
+    except (OSError, ValueError):  # ValueError: the path holds a NUL, or lone surrogates
         return None
 
 
 def check_path(path: str, where: str) -> None:
-    """Check that a path can be one. Raises InputError whose sentence begins with `where`, the key that names it."""
+    """Check that a path is possible. Raises InputError; its message begins with `where`, the key of the path."""
     try:
         name = os.fsencode(path)
     except UnicodeEncodeError:
@@ -315,7 +328,7 @@ def check_path(path: str, where: str) -> None:
 
 
 def absolute(path: str | Path, where: str) -> str:
-    """Return a path from the root, links followed. Raises InputError whose sentence begins with the key `where`."""
+    """Return the absolute path with links resolved. Raises InputError; its message begins with the key `where`."""
     check_path(str(path), where)
     try:
         return str(Path(path).resolve())
@@ -324,14 +337,16 @@ def absolute(path: str | Path, where: str) -> str:
 
 
 def shown_path(path: str | Path) -> str:
-    """Return a path as an error sentence begins with it: as given, or shortened and quoted where it is long or
-    cannot be printed."""
+    """Return a path for the beginning of an error message.
+
+    The path is unchanged, or shortened and quoted where it is long or cannot be printed.
+    """
     text = str(path)
     return text if len(text) <= 500 and text.isprintable() else shown(text)
 
 
 def read_toml(path: Path, what: str = "scene") -> dict[str, Any]:
-    """Return a TOML file as plain data; `what` is its kind. Raises InputError."""
+    """Return a TOML file as plain data; `what` is its kind, a key of `LIMIT_BYTES`. Raises InputError."""
     data = read_input(path, what)
     try:
         return parse_toml(data.decode("utf-8-sig"), str(path))
@@ -340,9 +355,9 @@ def read_toml(path: Path, what: str = "scene") -> dict[str, Any]:
 
 
 def parse_toml(text: str, source: str) -> dict[str, Any]:
-    """Return a TOML text as plain data, nested at most 24 deep, its whole numbers of at most 64 bits.
+    """Return a TOML text as plain data, nested at most 24 deep and with whole numbers of at most 64 bits.
 
-    Raises InputError in a sentence that begins with `source`; `tomllib.TOMLDecodeError` never leaves it.
+    Raises InputError, never `tomllib.TOMLDecodeError`; the message begins with `source`.
     """
     try:
         table = tomllib.loads(text)
@@ -350,7 +365,7 @@ def parse_toml(text: str, source: str) -> dict[str, Any]:
         raise InputError(f"{source}: not a TOML file: {error}") from None
     except RecursionError:
         raise InputError(f"{source}: nested deeper than {_DEEPEST_TABLE} tables or lists") from None
-    except ValueError:  # Python's own limit on the digits of a number, dates that no calendar has
+    except ValueError:  # a number of too many digits for Python, or a date that does not exist
         raise InputError(
             f"{source}: not a TOML file: a number or date is out of range; whole numbers have at most 64 bits"
         ) from None
@@ -359,9 +374,9 @@ def parse_toml(text: str, source: str) -> dict[str, Any]:
 
 
 def check_plain(table: Mapping[str, Any], source: str) -> None:
-    """Check that plain data are nested at most 24 deep and hold no whole number beyond 64 bits.
+    """Check that plain data is nested at most 24 deep and holds no whole number of more than 64 bits.
 
-    Raises InputError in a sentence that begins with `source`.
+    Raises InputError; the message begins with `source`.
     """
     level: list[tuple[str, Any]] = [("", table)]
     for _ in range(_DEEPEST_TABLE):
@@ -382,14 +397,16 @@ def check_plain(table: Mapping[str, Any], source: str) -> None:
 
 
 def _shown_key(key: object) -> str:
+    """Return a key, or the index of a list, for an error message."""
     return str(key) if isinstance(key, int) else shown_path(str(key))
 
 
 def import_path() -> list[str]:
-    """Return the import path for a process that this one starts: its own, without the working folder.
+    """Return the import path for a process that this one starts: this one's path without the working folder.
 
-    Python puts the working folder first under `python -m` and at the prompt: a file `random.py` among a user's data
-    would be run. It stays where PYTHONPATH names it, and last where vbnfault itself lies in it.
+    Under `python -m` and at the prompt, Python puts the working folder first, so that it would run a file
+    `random.py` among a user's data. The working folder stays in the path where PYTHONPATH names it; where it holds
+    vbnfault itself, it moves to the end.
     """
     here, package = os.path.realpath(os.getcwd()), os.path.realpath(_PACKAGE.parent)
     wanted = {os.path.realpath(p) for p in os.environ.get("PYTHONPATH", "").split(os.pathsep) if p}
@@ -398,7 +415,7 @@ def import_path() -> list[str]:
 
 
 def data_dir(kind: str) -> Path:
-    """The folder `scenes` or `textures`; raises InputError where the installation lacks it."""
+    """Return the folder `scenes` or `textures`. Raises InputError where the installation lacks it."""
     for candidate in (_PACKAGE / kind, _PACKAGE.parent / kind):
         if candidate.is_dir():
             return candidate
@@ -406,14 +423,14 @@ def data_dir(kind: str) -> Path:
 
 
 def packaged(kind: str) -> dict[str, Path]:
-    """Name → path of every packaged TOML of a kind: `scenes`, `scenes/lenses`, `scenes/detectors`."""
+    """Return name → path of every packaged TOML of a kind: `scenes`, `scenes/lenses`, `scenes/detectors`."""
     top, *rest = kind.split("/")
     folder = data_dir(top).joinpath(*rest)
     return {p.stem: p for p in sorted(folder.glob("*.toml"))}
 
 
 def find(kind: str, name_or_path: str | Path) -> Path:
-    """A path as given, or the packaged file of that name. Raises InputError listing the packaged names."""
+    """Return the path as given, or the packaged file of that name. Raises InputError, which lists these names."""
     path = Path(name_or_path)
     what = kind.rsplit("/", 1)[-1]
     check_path(str(name_or_path), what)

@@ -1,12 +1,12 @@
-"""Wavelengths, the Sun's spectrum, reflectances, sensor responses, constants.
+"""Provide band nodes, the Sun's spectrum and limb darkening, reflectances, sensor responses and constants.
 
-The film records spectral radiance at *band nodes*. Between two nodes the ratio of radiance to sunlight is
-taken as linear, so a sensor response R becomes the weights
+The film records spectral radiance at *band nodes*. The ratio of radiance to sunlight is assumed to be linear
+between two nodes, so that a sensor response R becomes the weights
 
     W[c, b] = ∫ R_c(λ) S(λ) h_b(λ) dλ / S_b,      S_b = ∫ S h_b dλ / ∫ h_b dλ,
 
-h_b being the hat function of node b: exact for every reflectance that is linear between nodes, whatever the
-lines of the solar spectrum S, and free of spectral noise. Sources are integrated on a 1 nm grid.
+where h_b is the hat function of node b and S the solar spectrum. The weights are exact for every reflectance that
+is linear between nodes, whatever lines S has, and they add no spectral noise. All integrals use a 1 nm grid.
 """
 
 from __future__ import annotations
@@ -29,23 +29,24 @@ F64 = NDArray[np.float64]
 ALBEDO_67P_WAVELENGTH_NM = np.array([325.0, 480.0, 535.0, 649.0, 700.0, 743.0, 882.0, 989.0])
 ALBEDO_67P_GEOMETRIC = np.array([0.0316, 0.0554, 0.0589, 0.0677, 0.0720, 0.0766, 0.0780, 0.0820])
 
-# Named reflectances of the scene file: wavelength nodes in nm, and Lambert reflectance. A geometric albedo
-# stands in as Lambert reflectance (2/3 of it would keep the disk-integrated flux of a sphere at zero phase);
-# automatic exposure makes the level immaterial, the colour is what counts until the Hapke surface is chosen.
+# Named reflectances of the scene file: wavelength nodes in nm, and Lambert reflectance. The geometric albedo of 67P
+# serves as Lambert reflectance (3/2 of it would keep the disc-integrated flux of a sphere at zero phase). Automatic
+# exposure removes the level, so only the colour counts, until the scene selects Hapke's model.
 REFLECTANCES: dict[str, tuple[F64, F64]] = {
     "67p": (ALBEDO_67P_WAVELENGTH_NM, ALBEDO_67P_GEOMETRIC),
 }
 
 
 def band_nodes_nm(minimum_nm: float, maximum_nm: float, bands: int) -> F64:
-    """Equally spaced band nodes, float64[bands], both ends included; one band sits in the middle."""
+    """Return equally spaced band nodes, float64[bands], with both ends; a single node is the middle."""
     if bands == 1:
         return np.array([(minimum_nm + maximum_nm) / 2])
     return np.linspace(minimum_nm, maximum_nm, bands)
 
 
 def _fine_nm(nodes_nm: F64) -> F64:
-    if len(nodes_nm) == 1:  # one band stands for the visible range around it
+    """Return the wavelengths of the grid for integrals over the bands, float64[n], about 1 nm apart."""
+    if len(nodes_nm) == 1:  # one band covers 300 nm around its node
         lo, hi = nodes_nm[0] - 150.0, nodes_nm[0] + 150.0
     else:
         lo, hi = nodes_nm[0], nodes_nm[-1]
@@ -53,6 +54,7 @@ def _fine_nm(nodes_nm: F64) -> F64:
 
 
 def _hats(nodes_nm: F64, fine_nm: F64) -> F64:
+    """Return the hat functions of the nodes, float64[band, n]; a single band has a constant 1."""
     if len(nodes_nm) == 1:
         return np.ones((1, len(fine_nm)))
     return np.stack([np.interp(fine_nm, nodes_nm, row) for row in np.eye(len(nodes_nm))])
@@ -60,16 +62,16 @@ def _hats(nodes_nm: F64, fine_nm: F64) -> F64:
 
 @lru_cache(maxsize=1)
 def _astm_g173() -> tuple[F64, F64]:
-    # colour-science carries the extraterrestrial column of ASTM G173-03, in W m-2 nm-1
+    """Return wavelengths in nm and the extraterrestrial irradiance of ASTM G173-03 in W m⁻² nm⁻¹."""
     from colour.plotting.datasets.astm_g_173 import DATA_ASTMG173_ETR as table
 
     return np.array(list(table.keys())), np.array(list(table.values()))
 
 
 def solar_irradiance_W_m2_nm(wavelength_nm: F64, distance_au: float = 1.0) -> F64:
-    """Extraterrestrial solar spectral irradiance (ASTM G173-03), W m⁻² nm⁻¹, float64 like `wavelength_nm`.
+    """Return the extraterrestrial solar spectral irradiance (ASTM G173-03), W m⁻² nm⁻¹, float64.
 
-    Defined from 280 to 4000 nm; scales with the inverse square of the distance.
+    The table covers 280 to 4000 nm. The irradiance scales with the inverse square of the distance.
     """
     wavelength, irradiance = _astm_g173()
     return np.interp(wavelength_nm, wavelength, irradiance) / distance_au**2
@@ -77,6 +79,7 @@ def solar_irradiance_W_m2_nm(wavelength_nm: F64, distance_au: float = 1.0) -> F6
 
 @lru_cache(maxsize=16)
 def _band_irradiance(nodes: tuple[float, ...]) -> F64:
+    """Return S_b of the module docstring at 1 au, W m⁻² nm⁻¹, float64[band]."""
     nodes_nm = np.array(nodes)
     fine = _fine_nm(nodes_nm)
     hats = _hats(nodes_nm, fine)
@@ -85,12 +88,12 @@ def _band_irradiance(nodes: tuple[float, ...]) -> F64:
 
 
 def solar_band_irradiance_W_m2_nm(nodes_nm: F64, distance_au: float) -> F64:
-    """S_b of the module's docstring: hat-weighted mean solar irradiance per band node, W m⁻² nm⁻¹."""
+    """Return S_b of the module docstring, the hat-weighted mean solar irradiance per band node, W m⁻² nm⁻¹."""
     return _band_irradiance(tuple(float(v) for v in nodes_nm)) / distance_au**2
 
 
 def sun_angular_radius_rad(distance_au: float) -> float:
-    """Angular radius of the solar disc, asin(R☉ / r)."""
+    """Return the angular radius of the solar disc, asin(R☉ / r)."""
     return float(np.arcsin(SUN_RADIUS_M / (distance_au * AU_M)))
 
 
@@ -120,21 +123,24 @@ _LIMB_NM_AND_A = np.array(
 
 
 def limb_darkening(wavelength_nm: F64) -> F64:
-    """Coefficients float64[band, 6] of Σ c_k μᵏ, the Sun's radiance over the mean of its disc.
+    """Return the coefficients c_k, float64[band, 6], of Σ c_k μᵏ, the Sun's radiance over the mean of its disc.
 
-    μ is the cosine of the angle from the local vertical, √(1 - ρ²) at a fraction ρ of the disc's radius. Linear
-    between the tabulated wavelengths, constant beyond them (402 to 949 nm).
+    μ is the cosine of the angle to the local vertical, √(1 - ρ²) at a fraction ρ of the disc's radius. The
+    coefficients are linear between the tabulated wavelengths (402 to 949 nm) and constant beyond them.
     """
     nodes, a = _LIMB_NM_AND_A[:, 0], _LIMB_NM_AND_A[:, 1:]
-    a = a / a.sum(axis=1, keepdims=True)  # the table's sums are 1 to its five digits
+    a = a / a.sum(axis=1, keepdims=True)  # the sums of the table are 1 to five digits only
     at = np.column_stack([np.interp(wavelength_nm, nodes, column) for column in a.T])
-    mean = at @ (2 / (np.arange(6) + 2))  # of μᵏ over the disc
+    mean = at @ (2 / (np.arange(6) + 2))  # μᵏ has the mean 2 / (k + 2) over the disc
     return np.asarray(at / mean[:, None])
 
 
 def reflectance(spec: str | float | Mapping[str, tuple[float, ...]], wavelength_nm: F64) -> F64:
-    """Lambert reflectance at `wavelength_nm`, float64: a name of `REFLECTANCES`, a grey value, or a table
-    with `wavelength_nm` and `value`, interpolated linearly and held constant beyond its ends."""
+    """Return the Lambert reflectance at `wavelength_nm`, float64[n].
+
+    `spec` is a name of `REFLECTANCES`, a grey value, or a table with `wavelength_nm` and `value`. A table is
+    interpolated linearly and is constant beyond its ends.
+    """
     if isinstance(spec, str):
         nodes, values = REFLECTANCES[spec]
     elif isinstance(spec, Mapping):
@@ -146,7 +152,7 @@ def reflectance(spec: str | float | Mapping[str, tuple[float, ...]], wavelength_
 
 @lru_cache(maxsize=8)
 def _response_table(name: str) -> tuple[F64, F64]:
-    """Relative response of R, G, B: wavelength_nm float64[n], value float64[n, 3] with peak 1."""
+    """Return wavelengths in nm float64[n] and the relative responses of R, G, B float64[n, 3], each with peak 1."""
     from colour.characterisation.datasets.cameras.dslr.sensitivities import (
         MSDS_CAMERA_SENSITIVITIES_DSLR as table,
     )
@@ -159,11 +165,11 @@ def _response_table(name: str) -> tuple[F64, F64]:
 RESPONSES = {"nikon_5100": "Nikon 5100 (NPL)", "sigma_sd_merrill": "Sigma SDMerill (NPL)"}
 
 
-FLAT = "flat"  # no filters: every channel responds to all light alike
+FLAT = "flat"  # no filters: every channel has the peak efficiency at all wavelengths
 
 
 def response(name: str, wavelength_nm: F64, quantum_efficiency_peak: float) -> F64:
-    """Quantum efficiency of R, G, B at `wavelength_nm`, float64[3, n], in [0, quantum_efficiency_peak]."""
+    """Return the QE of R, G, B at `wavelength_nm`, float64[3, n], from 0 to `quantum_efficiency_peak`."""
     if name == FLAT:
         return np.full((3, len(wavelength_nm)), quantum_efficiency_peak)
     nodes, values = _response_table(RESPONSES[name])
@@ -173,15 +179,15 @@ def response(name: str, wavelength_nm: F64, quantum_efficiency_peak: float) -> F
 
 
 def band_weights(name: str, quantum_efficiency_peak: float, nodes_nm: F64) -> F64:
-    """`electron_weights` of R, G, B, float64[3, band]."""
+    """Return `electron_weights` of R, G, B for a named response, float64[3, band]."""
     return electron_weights(lambda nm: response(name, nm, quantum_efficiency_peak), nodes_nm)
 
 
 def electron_weights(efficiency: Callable[[F64], F64], nodes_nm: F64) -> F64:
-    """Weights float64[channel, band], in electrons nm / J: electrons = weights · energy per band (J m⁻² nm⁻¹ × m²).
+    """Return weights float64[channel, band] in electrons nm / J: electrons = weights · energy per band in J / nm.
 
-    `efficiency` gives QE, float64[channel, n], at wavelengths in nm. ∫ QE(λ) S(λ) h_b(λ) λ/(hc) dλ / S_b of the
-    module's docstring.
+    The weights are ∫ QE(λ) S(λ) h_b(λ) λ/(hc) dλ / S_b with the symbols of the module docstring. `efficiency`
+    returns QE, float64[channel, n], at wavelengths in nm.
     """
     fine = _fine_nm(nodes_nm)
     hats = _hats(nodes_nm, fine)

@@ -1,12 +1,13 @@
-"""SPICE kernels: where the Sun, the target's axes and a spacecraft's camera are at an epoch.
+"""Read SPICE kernels: the Sun's position, the target's attitude and the pose of a spacecraft's camera at an epoch.
 
-The only importer of spiceypy, an optional extra (`pip install 'vbnfault[spice]'`). Frames as in `frames`:
-J international celestial (SPICE's "J2000"), T target body-fixed, C camera; matrices are named TargetFromSource.
-Positions are geometric, without light time or aberration, as those of the built-in two-body ephemeris.
+This is the only module that imports spiceypy, an optional extra (`pip install 'vbnfault[spice]'`). Frames are as in
+`frames`: J international celestial (SPICE's "J2000"), T target body-fixed, C camera; matrices are named
+TargetFromSource. Positions are geometric, without light time or aberration, like those of the built-in two-body
+ephemeris.
 
-SPICE runs in a process of its own, started with the first kernel: a damaged kernel can end CSPICE in native code,
-and then ends that process alone. The calling program's own kernels, if it uses spiceypy too, are not seen here and
-stay as they are. The process keeps its kernels in one pool, so they are loaded for the length of a `with` block:
+SPICE runs in a separate process, which starts with the first kernel. A damaged kernel can crash CSPICE in native
+code; it then ends only that process. If the calling program uses spiceypy too, its kernels are not visible here and
+do not change. The process keeps all kernels in one pool, so they are loaded only within a `with` block:
 
     with kernels("mission.tm"):
         et_s = et_s_from_utc("2014-08-06T00:00:00")
@@ -44,12 +45,12 @@ F64 = NDArray[np.float64]
 KM_PER_AU = 149597870.7  # IAU 2012 Resolution B2, exact
 METRES_PER_KM = 1000.0
 SECONDS_PER_DAY = 86400.0
-J_FRAME = "J2000"  # SPICE's name of the ICRF axes
+J_FRAME = "J2000"  # SPICE's name for the ICRF axes
 
-# CSPICE is not thread-safe, and two threads would see each other's kernels.
+# CSPICE is not thread-safe, and threads would share their kernels.
 _pool = threading.RLock()
 
-# SPICE short message → what it means here; the others are given in SPICE's own words.
+# SPICE short message → its meaning here; other errors keep SPICE's words.
 _MEANINGS = {
     "SPICE(SPKINSUFFDATA)": "the kernels hold no position at that epoch",
     "SPICE(NOLOADEDFILES)": "no kernel with positions is loaded",
@@ -65,7 +66,7 @@ _MEANINGS = {
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SpacecraftState:
-    """A camera's place and attitude in the target's body-fixed frame.
+    """Hold a camera's position and attitude in the target's body-fixed frame.
 
     Attributes
     ----------
@@ -81,20 +82,21 @@ class SpacecraftState:
 
 @contextmanager
 def kernels(*paths: str | Path) -> Iterator[None]:
-    """Load kernels for the length of a block, in the order given; later ones take precedence.
+    """Load kernels for a block, in the order given; later kernels take precedence.
+
+    Kernels of an outer block stay loaded after this block. Other threads that use this module wait until it ends.
 
     Parameters
     ----------
     paths
-        Kernels of any type, meta-kernels among them. SPICE reads the relative paths within a meta-kernel from the
-        folder the program runs in, unless its PATH_VALUES say otherwise. Kernels of an outer block stay loaded
-        after this one; other threads that use this module wait until it ends.
+        Kernels of any type, also meta-kernels. SPICE resolves the relative paths in a meta-kernel from the working
+        folder, unless the meta-kernel's PATH_VALUES say otherwise.
 
     Raises
     ------
     InputError
-        spiceypy is not installed, no path is given, or a kernel (or one that a meta-kernel names) is missing or
-        unreadable.
+        spiceypy is not installed, no path is given, or a kernel (or a kernel that a meta-kernel names) is missing
+        or unreadable.
     """
     if not paths:
         raise InputError("SPICE kernels: at least one path is needed.")
@@ -109,43 +111,43 @@ def kernels(*paths: str | Path) -> Iterator[None]:
                 for path in paths:
                     _ask(str(path), "load", str(path), os.getcwd())
             except InputError:
-                if before == 0:  # SPICE keeps records of a file that it refused: begin again
+                if before == 0:  # SPICE keeps records of a refused file: start afresh
                     _end()
                 raise
             yield
         finally:
-            if reader is _reader is not None:  # else it has ended, and its pool with it
+            if reader is _reader is not None:  # otherwise it has ended, and its pool is gone
                 _ask("SPICE kernels", "unload", before)
 
 
 def loaded() -> int:
-    """Return the number of kernels loaded at present."""
+    """Return the number of kernels that are loaded now."""
     return int(_ask("SPICE kernels", "loaded"))
 
 
 def read_dsk(path: str | Path) -> tuple[F64, NDArray[np.int64]]:
-    """Return the plates of a NAIF DSK, all type 2 segments of its one body and surface.
+    """Return the plates of a NAIF DSK: all type 2 segments, which must belong to one body and surface.
 
     Parameters
     ----------
     path
-        Of the file, already checked by `resources.read_input`.
+        Path of the file, already checked by `resources.read_input`.
 
     Returns
     -------
     vertices_km, faces
-        float64[n, 3] in the body-fixed frame that the segments name, int64[m, 3] counted from 0.
+        float64[n, 3] in the body-fixed frame that the segments name, and int64[m, 3] counted from 0.
 
     Raises
     ------
     InputError
-        spiceypy is not installed, the file is no DSK or damaged, or holds no segment of type 2 or those of several
-        surfaces.
+        spiceypy is not installed, the file is no DSK or is damaged, or it holds no segment of type 2 or segments of
+        several surfaces.
     """
     _check_installed(str(path))
     size = resources.file_status(path)
     more_s = 0.0 if size is None else size.st_size / _DSK_BYTES_PER_S
-    reader = _Reader()  # of its own, since SPICE keeps records of a file that it refused
+    reader = _Reader()  # a separate process, since SPICE keeps records of a refused file
     try:
         vertices_km, faces = _answer(reader, str(path), "dsk", os.path.abspath(path), cpu_s=_CPU_S + more_s)
     finally:
@@ -154,30 +156,30 @@ def read_dsk(path: str | Path) -> tuple[F64, NDArray[np.int64]]:
 
 
 def et_s_from_julian_date(julian_date: float) -> float:
-    """Ephemeris time, seconds TDB past J2000.0, of a TDB Julian date."""
+    """Return the ephemeris time, seconds TDB past J2000.0, of a TDB Julian date."""
     return (julian_date - J2000_JD) * SECONDS_PER_DAY
 
 
 def julian_date_from_et_s(et_s: float) -> float:
-    """TDB Julian date of an ephemeris time: the inverse of `et_s_from_julian_date`."""
+    """Return the TDB Julian date of an ephemeris time. This inverts `et_s_from_julian_date`."""
     return J2000_JD + et_s / SECONDS_PER_DAY
 
 
 def et_s_from_utc(utc: str) -> float:
-    """Ephemeris time, seconds TDB past J2000.0, of a UTC text such as "2014-08-06T12:00:00".
+    """Return the ephemeris time, seconds TDB past J2000.0, of a UTC text such as "2014-08-06T12:00:00".
 
     Raises
     ------
     InputError
-        No leap-second kernel is loaded, or the text is no time.
+        No leap-second kernel is loaded, or the text does not state a time.
     """
     return float(_ask(f"UTC {utc!r}", "str2et", utc))
 
 
 def sun_position_J_au(target: str, et_s: float) -> F64:
-    """Geometric position of the Sun from the target's centre, float64[3] au, frame J.
+    """Return the geometric position of the Sun from the target's centre, float64[3] au, frame J.
 
-    The opposite of `frames.Orbit.position_J_au`, which is the target's position from the Sun.
+    `frames.Orbit.position_J_au` has the opposite direction: it is the target's position from the Sun.
 
     Parameters
     ----------
@@ -189,7 +191,7 @@ def sun_position_J_au(target: str, et_s: float) -> F64:
     Raises
     ------
     InputError
-        Unknown body, or no position at the epoch.
+        The body is unknown, or the kernels hold no position at the epoch.
     """
     purpose = f"Sun from {target} at {_epoch(et_s)}"
     position_km = _ask(purpose, "position_km", "SUN", et_s, J_FRAME, str(target))
@@ -197,19 +199,19 @@ def sun_position_J_au(target: str, et_s: float) -> F64:
 
 
 def J_from_T(frame: str, et_s: float) -> F64:
-    """Attitude of a body-fixed frame, float64[3, 3]: T to ICRF axes; its transpose is T_from_J.
+    """Return the attitude of a body-fixed frame, float64[3, 3], from T to ICRF axes; its transpose is T_from_J.
 
     Parameters
     ----------
     frame
-        SPICE name of the body-fixed frame, such as "IAU_EROS" or "67P/C-G_CK"; its axes have to be the shape's.
+        SPICE name of the body-fixed frame, such as "IAU_EROS" or "67P/C-G_CK"; its axes must be those of the shape.
     et_s
         Ephemeris time, seconds TDB past J2000.0.
 
     Raises
     ------
     InputError
-        Unknown frame, or no attitude at the epoch.
+        The frame is unknown, or the kernels hold no attitude at the epoch.
     """
     return np.asarray(_ask(f"frame {frame} at {_epoch(et_s)}", "pxform", frame, J_FRAME, et_s), dtype=np.float64)
 
@@ -217,7 +219,7 @@ def J_from_T(frame: str, et_s: float) -> F64:
 def pose_T(
     spacecraft: str, target: str, frame: str, camera_frame: str, et_s: float, K_from_C: F64 | None = None
 ) -> SpacecraftState:
-    """Where a spacecraft's camera is and where it looks, in the target's body-fixed frame.
+    """Return the position and attitude of a spacecraft's camera in the target's body-fixed frame.
 
     Parameters
     ----------
@@ -228,13 +230,14 @@ def pose_T(
     et_s
         Ephemeris time, seconds TDB past J2000.0.
     K_from_C
-        float64[3, 3], a rotation: axes of C (x image right, y image down, z boresight) in K, as the instrument's
-        frame kernel describes them; default: K is C.
+        Rotation float64[3, 3] from C (x image right, y image down, z boresight) to K, as the instrument's frame
+        kernel describes it; default: K is C.
 
     Raises
     ------
     InputError
-        Unknown body or frame, no position or attitude at the epoch, or K_from_C is no rotation.
+        A body or frame is unknown, the kernels hold no position or attitude at the epoch, or K_from_C is no
+        rotation.
     """
     mounting = np.eye(3) if K_from_C is None else np.asarray(K_from_C, dtype=np.float64)
     if mounting.shape != (3, 3) or not (
@@ -252,6 +255,7 @@ def pose_T(
 
 
 def _epoch(et_s: float) -> str:
+    """Return an ephemeris time as a Julian date for an error message."""
     return f"JD {julian_date_from_et_s(et_s):.6f} TDB"
 
 
@@ -265,12 +269,13 @@ _DEEPEST_META_KERNEL = 8
 
 
 def _check_installed(purpose: str) -> None:
+    """Raise InputError, whose message begins with `purpose`, where spiceypy is not installed."""
     if importlib.util.find_spec("spiceypy") is None:
         raise InputError(f"{purpose}: needs spiceypy: pip install 'vbnfault[spice]'.")
 
 
 def _check_kernel(path: Path, depth: int = 0) -> None:
-    """Check that a kernel, and what a meta-kernel names, are regular files: SPICE would wait at a pipe."""
+    """Check that a kernel, and those that a meta-kernel names, are regular files: a pipe would block SPICE."""
     resources.check_path(str(path), "SPICE kernel")
     if resources.head_of_input(path, "SPICE kernel", 8).startswith(_BINARY):
         resources.check_input(path, "SPICE kernel")
@@ -285,12 +290,12 @@ def _check_kernel(path: Path, depth: int = 0) -> None:
     named = ""
     for piece in values.get(b"KERNELS_TO_LOAD", ()):
         named += piece.removesuffix("+")
-        if piece.endswith("+"):  # goes on in the next text
+        if piece.endswith("+"):  # the name continues in the next text
             continue
         for symbol in sorted(symbols, key=len, reverse=True):
             named = named.replace(f"${symbol}", symbols[symbol])
         status = resources.file_status(named)
-        if status is not None:  # a missing file SPICE names better
+        if status is not None:  # for a missing file, SPICE's message is better
             if depth == _DEEPEST_META_KERNEL:
                 raise InputError(f"{path}: names meta-kernels more than {_DEEPEST_META_KERNEL} deep.")
             _check_kernel(Path(named), depth + 1)
@@ -299,16 +304,16 @@ def _check_kernel(path: Path, depth: int = 0) -> None:
 
 # --- the process that SPICE runs in ---------------------------------------------------------------------------
 
-# Of computing time, for one question: all that a sound kernel takes many times over.
+# CPU time for one question: many times what an undamaged kernel needs.
 _CPU_S = 15.0
 _DSK_BYTES_PER_S = 5e6
 _ADDRESS_SPACE_BYTES = 6 << 30
 _DSK_MOST_SEGMENTS = 10_000
-_PLATE_BYTES, _VERTEX_BYTES = 12, 24  # of a DSK of type 2, at least
+_PLATE_BYTES, _VERTEX_BYTES = 12, 24  # the least that a DSK of type 2 needs
 
 
 class _Reader:
-    """A process that answers questions to SPICE, one after the other."""
+    """Run a process that answers questions to SPICE, one after the other."""
 
     def __init__(self) -> None:
         self.owner = os.getpid()
@@ -322,11 +327,11 @@ class _Reader:
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
-            start_new_session=True,  # Ctrl-C is for this process to act on; the other ends with its questions
+            start_new_session=True,  # only this process acts on Ctrl-C; the other ends with its input
         )
 
     def ask(self, question: tuple[Any, ...]) -> Any:
-        """The answer; raises EOFError or OSError where the process ends over it."""
+        """Return the answer to a question. Raises EOFError or OSError where the process ends before it answers."""
         assert self.process.stdin is not None
         assert self.process.stdout is not None
         pickle.dump(question, self.process.stdin)
@@ -334,7 +339,7 @@ class _Reader:
         return pickle.load(self.process.stdout)
 
     def close(self) -> int:
-        """End the process and return its exit code, that of a signal negative."""
+        """End the process. Return its exit code, which is negative after a signal."""
         assert self.process.stdin is not None
         assert self.process.stdout is not None
         with suppress(OSError):
@@ -349,6 +354,7 @@ _reader: _Reader | None = None
 
 @atexit.register
 def _end() -> None:
+    """End the shared process, if this process started it."""
     global _reader
     if _reader is not None and _reader.owner == os.getpid():
         _reader.close()
@@ -356,7 +362,7 @@ def _end() -> None:
 
 
 def _ask(purpose: str, name: str, *arguments: Any, cpu_s: float = _CPU_S) -> Any:
-    """What SPICE answers to a question of `_QUESTIONS`; raises InputError whose sentence begins with `purpose`."""
+    """Return SPICE's answer to a question of `_QUESTIONS`. Raises InputError; its message begins with `purpose`."""
     global _reader
     _check_installed(purpose)
     with _pool:
@@ -370,12 +376,12 @@ def _ask(purpose: str, name: str, *arguments: Any, cpu_s: float = _CPU_S) -> Any
 
 
 def _answer(reader: _Reader, purpose: str, name: str, *arguments: Any, cpu_s: float) -> Any:
-    """The answer of a process to one question; where there is none, the process has ended."""
+    """Return the answer of a process to one question. Raises InputError where it refuses, or has ended."""
     try:
         kind, answer = reader.ask((name, arguments, cpu_s))
     except (EOFError, OSError, pickle.UnpicklingError):
         raise InputError(f"{purpose}: SPICE {_cause(reader.close())}: a kernel is damaged.") from None
-    except BaseException:  # interrupted between question and answer: the next one would get this answer
+    except BaseException:  # after an interrupt, the next question would get this answer
         reader.process.kill()
         reader.close()
         raise
@@ -385,6 +391,7 @@ def _answer(reader: _Reader, purpose: str, name: str, *arguments: Any, cpu_s: fl
 
 
 def _cause(code: int) -> str:
+    """Return, for an error message, why the process ended with an exit code."""
     if -code == getattr(signal, "SIGXCPU", 0):
         return "does not come to an end"
     name = signal.Signals(-code).name if code < 0 else f"exit code {code}"
@@ -392,9 +399,9 @@ def _cause(code: int) -> str:
 
 
 def serve() -> None:
-    """Answer the questions that arrive on standard input, until it ends: the whole of the process for SPICE."""
+    """Answer questions from standard input until it ends. This is the whole program of the process for SPICE."""
     answers = os.fdopen(os.dup(1), "wb")
-    os.dup2(2, 1)  # what CSPICE prints is no answer
+    os.dup2(2, 1)  # text that CSPICE prints must not mix with the answers
     questions = sys.stdin.buffer
     try:
         import resource
@@ -426,25 +433,30 @@ def serve() -> None:
             answer = "refused", _meaning(error)
         except MemoryError:
             answer = "refused", "takes more memory than a kernel may"
-        except Exception as error:  # spiceypy's own, on texts and numbers that C has no room for
+        except Exception as error:  # spiceypy raises it for texts and numbers too large for C
             answer = "refused", f"SPICE refuses it ({type(error).__name__})"
         pickle.dump(answer, answers)
         answers.flush()
 
 
 def _load(spiceypy: Any, path: str, folder: str) -> None:
-    os.chdir(folder)  # from which a meta-kernel's relative paths are taken
+    """Load a kernel; a meta-kernel's relative paths start from `folder`."""
+    os.chdir(folder)
     spiceypy.furnsh(path)
 
 
 def _unload(spiceypy: Any, before: int) -> None:
-    """Unload all but the first `before` kernels; a meta-kernel that failed half-way leaves what it had loaded."""
+    """Unload all but the first `before` kernels, also those that a failed meta-kernel had loaded."""
     for index in range(spiceypy.ktotal("ALL") - 1, before - 1, -1):
         with suppress(spiceypy.utils.exceptions.SpiceyError):
             spiceypy.unload(spiceypy.kdata(index, "ALL")[0])
 
 
 def _dsk(spiceypy: Any, path: str) -> tuple[F64, NDArray[np.int64]]:
+    """Return the vertices in km and the faces of a DSK (`read_dsk`).
+
+    A damaged file may state any number of plates, so that the numbers are checked against the size of the file.
+    """
     vertices: list[F64] = []
     faces: list[NDArray[np.int64]] = []
     surfaces: set[tuple[int, int]] = set()
@@ -493,7 +505,7 @@ _QUESTIONS: dict[str, Callable[..., Any]] = {
 
 
 def _meaning(error: Any) -> str:
-    """One clause, without a full stop, for an error of spiceypy."""
+    """Return one clause, without a full stop, for an error of spiceypy."""
     short = str(getattr(error, "short", ""))
     if short in _MEANINGS:
         return _MEANINGS[short]

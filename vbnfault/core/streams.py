@@ -1,8 +1,8 @@
-"""Standard input, output and error as a command may rely on them: open, and harmless where nobody reads them.
+"""Make standard input, output and error safe for a command: open, and harmless when their reader has left.
 
-The reader of standard output may leave (`vbnfault list faults | head -1`): that ends a command as SIGPIPE ends
-other Unix tools, without a word. The reader of standard error may leave as well: messages are then dropped, and the
-work goes on, since what is made matters more than what is said about it.
+When the reader of standard output leaves (`vbnfault list faults | head -1`), the command ends without a message, as
+SIGPIPE ends other Unix tools. When the reader of standard error leaves, messages are dropped and the work goes on,
+because the results matter more than the messages.
 """
 
 from __future__ import annotations
@@ -22,11 +22,12 @@ _SIGPIPE = int(getattr(signal, "SIGPIPE", 13))  # Windows has none
 
 @contextlib.contextmanager
 def steady() -> Iterator[None]:
-    """Make the standard streams fit to be used within a block.
+    """Make the standard streams safe to use within a block.
 
-    A closed one leads to the null device: else the next file that is opened would get its number, and whatever a
-    library prints would be written into that file. Bytes that are no text are escaped. A standard output that
-    nobody reads raises `Stopped`, one that is full an OSError that names it; standard error raises nothing.
+    A closed stream is connected to the null device. Otherwise the next opened file would get its number, and the
+    text that a library prints would be written into that file. Bytes that are no text are escaped. Standard output
+    raises `Stopped` when nobody reads it, and an OSError that names it when its disk is full. Standard error raises
+    nothing.
     """
     for number in range(3):
         with contextlib.suppress(OSError):
@@ -35,7 +36,7 @@ def steady() -> Iterator[None]:
         out = sys.stdout or stack.enter_context(open(os.devnull, "w"))
         error = sys.stderr or stack.enter_context(open(os.devnull, "w"))
         for stream in (out, error):
-            if isinstance(stream, io.TextIOWrapper):  # a file's name may have bytes that are no text
+            if isinstance(stream, io.TextIOWrapper):  # a file name may hold bytes that are no text
                 stream.reconfigure(errors="backslashreplace")
         stack.enter_context(contextlib.redirect_stdout(cast(TextIO, _Output(out))))
         stack.enter_context(contextlib.redirect_stderr(cast(TextIO, _Messages(error))))
@@ -43,30 +44,31 @@ def steady() -> Iterator[None]:
 
 
 def is_unread(stop: BaseException) -> bool:
-    """Return whether a program ends because whoever read its standard output left."""
+    """Return whether a program ends because the reader of its standard output left."""
     return isinstance(stop, Stopped) and stop.number == _SIGPIPE
 
 
 def _open_if_closed(number: int) -> None:
+    """Connect a file descriptor to the null device if it is closed."""
     try:
         os.fstat(number)
     except OSError:
-        null = os.open(os.devnull, os.O_RDWR)  # the lowest free number: this one, if those below are open
+        null = os.open(os.devnull, os.O_RDWR)  # gets the lowest free number, which may be another
         if null != number:
             os.dup2(null, number)
             os.close(null)
 
 
 class _Stream:
-    """A text stream that meets its write errors with `_failed`, and leads to the null device from then on."""
+    """Wrap a text stream: at a write error, send all later text to the null device and call `_failed`."""
 
     def __init__(self, stream: TextIO) -> None:
         self._stream = stream
 
     def write(self, text: str) -> int:
-        """Write text. Returns the number of its characters."""
+        """Write text. Return the number of its characters."""
         try:
-            if text == "":  # click tries what a stream takes, and hides the error of a full disk
+            if text == "":  # click writes this as a test and would hide the error of a full disk
                 return 0
             return self._stream.write(text)
         except OSError as error:
@@ -75,7 +77,7 @@ class _Stream:
             return len(text)
 
     def flush(self) -> None:
-        """Write what is still held back."""
+        """Write the buffered text."""
         try:
             self._stream.flush()
         except OSError as error:
@@ -83,13 +85,14 @@ class _Stream:
             self._failed(error)
 
     def _give_up(self) -> None:
-        """Send the rest nowhere, also what libraries and other processes write: else Python complains at exit."""
+        """Send all later text, also that of libraries, to the null device. Else Python reports an error at exit."""
         with contextlib.suppress(OSError, ValueError):
             null = os.open(os.devnull, os.O_WRONLY)
             os.dup2(null, self._stream.fileno())
             os.close(null)
 
     def _failed(self, error: OSError) -> None:
+        """React to a write error."""
         raise NotImplementedError
 
     def __getattr__(self, name: str) -> Any:
@@ -98,6 +101,7 @@ class _Stream:
 
 class _Output(_Stream):
     def _failed(self, error: OSError) -> None:
+        """Raise `Stopped` where the reader left, else the error with the stream's name."""
         if isinstance(error, BrokenPipeError):
             raise Stopped(_SIGPIPE) from error
         raise OSError(error.errno, error.strerror, "standard output") from error
@@ -105,4 +109,4 @@ class _Output(_Stream):
 
 class _Messages(_Stream):
     def _failed(self, error: OSError) -> None:
-        """Go on: a message that nobody reads is no reason to end the work."""
+        """Do nothing: a lost message does not end the work."""

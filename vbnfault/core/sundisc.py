@@ -1,13 +1,15 @@
-"""The Sun's direct image: how much of its disc each pixel of a frame sees, whatever the size of the pixels.
+"""Compute the Sun's direct image: how much of its disc each pixel of a frame sees, for any size of the pixels.
 
 Rays through the pixels would miss a disc that is smaller than a pixel. The disc is therefore divided into cells, at
-least 128 across it, none across a pixel's border, and each cell's projected solid angle is added to its pixel. No
-random number is drawn, and the sum over all pixels is that of the whole disc,
+least 128 across the disc. No cell crosses a pixel's border. The projected solid angle of each cell is added to its
+pixel. No random numbers are used. The cells are normalised so that the sum over all pixels is that of the whole
+disc,
 
     Σ S_b = ∫ p_b(μ) cos θ dω = π sin²α cos θ,
 
-with α the angular radius and p_b the radiance of band b over the disc's mean, to which the cells are normalised.
-Cells that the rim cuts count by the area of the rectangle that the rim's tangent leaves.
+where α is the angular radius, p_b the radiance of band b over the mean of the disc, and θ the angle of the disc's
+centre from the boresight. A cell that the disc's rim cuts counts by the part of its area on the inner side of the
+rim's tangent.
 """
 
 from __future__ import annotations
@@ -25,66 +27,70 @@ F64 = NDArray[np.float64]
 Floats = NDArray[np.floating[Any]]
 Frame = tuple[int, int]
 
-# Cells across the disc, at least: those of the rim then err by less than 1e-3 of a darkened disc's light.
+# The least number of cells across the disc: the error of the cells at the rim is then below 1e-3 of the light of a
+# limb-darkened disc.
 _ACROSS = 128
-_RIM = 64  # points of the rim that bound its image: between two of them it reaches 1 - cos(π / 64) = 0.12 % further
-_MOST_CELLS = 1 << 20  # at once, so that memory stays bounded
-_SHARP_PX = 0.05  # a smaller circle of defocus leaves the disc as it is
-_LEAST_Z = 1e-3  # cosine to the boresight of the rim, below which a plane holds no image of it
+_RIM = 64  # points of the rim that bound its image; between two points it extends 1 - cos(π / 64) = 0.12 % further
+_MOST_CELLS = 1 << 20  # processed at once, to bound the memory
+_SHARP_PX = 0.05  # a smaller blur circle of defocus is ignored
+_LEAST_Z = 1e-3  # below this z of a rim point in C, a plane cannot hold its image
 
 
 class Projection(Protocol):
-    """The map between directions and the plane of the pixels, at one wavelength."""
+    """Map between directions and the plane of the pixels, at one wavelength."""
 
     def pixel_of(self, slopes: F64) -> F64:
-        """Return pixel positions x, y, float64[..., 2], of tangents x/z and y/z in C."""
+        """Return pixel positions x and y, float64[..., 2], of tangents x/z and y/z in C."""
 
     def slopes_at(self, x_px: Floats, y_px: Floats) -> F64:
-        """Return tangents x/z and y/z in C, float64[y, x, 2], seen at the positions of a grid."""
+        """Return the tangents x/z and y/z in C that the positions of a grid see, float64[y, x, 2]."""
 
     def solid_angle_sr(self, slopes: F64) -> F64:
-        """Return the projected solid angle that a pixel would see there, d(cos θ ω) / d(x y), float64[...]."""
+        """Return the projected solid angle per pixel at given tangents, cos θ dω / (dx dy), in sr, float64[...]."""
 
 
 @dataclass(frozen=True)
 class Pinhole:
-    """The map of a rectilinear camera; `intrinsics` fx, fy, cx, cy in pixels."""
+    """Map directions as a rectilinear camera does; `intrinsics` are fx, fy, cx, cy in pixels."""
 
     intrinsics: F64
 
     def pixel_of(self, slopes: F64) -> F64:
-        """As `Projection`."""
+        """Return pixel positions as `Projection` defines."""
         return np.asarray(slopes * self.intrinsics[:2] + self.intrinsics[2:])
 
     def slopes_at(self, x_px: Floats, y_px: Floats) -> F64:
-        """As `Projection`."""
+        """Return tangents as `Projection` defines."""
         fx, fy, cx, cy = self.intrinsics
         return np.stack(np.meshgrid((x_px - cx) / fx, (y_px - cy) / fy), axis=-1)
 
     def solid_angle_sr(self, slopes: F64) -> F64:
-        """As `Projection`: cos⁴θ / (fx fy)."""
+        """Return cos⁴θ / (fx fy), as `Projection` defines."""
         fx, fy = self.intrinsics[:2]
         return np.asarray(1 / (fx * fy * (1 + (slopes**2).sum(axis=-1)) ** 2))
 
 
 @dataclass(frozen=True)
 class PixelSums:
-    """What pixels of a part of the frame see of the disc: `rows`, `columns` of the part, and `values`
-    float64[profile, y, x] in sr, or in sr times the unit of the gain."""
+    """Hold what the pixels in a window of the frame see of the disc.
+
+    `rows` and `columns` bound the window. `values` float64[profile, y, x] are in sr, or in sr times the unit of the
+    gain.
+    """
 
     rows: slice
     columns: slice
     values: F64
 
     def on(self, shape: Frame) -> F64:
-        """Return them as a whole frame, float64[profile, y, x]."""
+        """Return the values in a whole frame, float64[profile, y, x]."""
         out = np.zeros((len(self.values), *shape))
         out[:, self.rows, self.columns] = self.values
         return out
 
 
 def axes(direction: F64) -> F64:
-    """Return the disc's own axes as rows, float64[3, 3]: two across it, and its unit direction."""
+    """Return the disc's axes as rows, float64[3, 3]: two in the plane of the disc, then its unit direction."""
     z = direction / np.linalg.norm(direction)
     x = np.cross(z, np.eye(3)[np.argmin(np.abs(z))])
     x /= np.linalg.norm(x)
@@ -92,8 +98,10 @@ def axes(direction: F64) -> F64:
 
 
 def bounds_px(disc: SunInView, projection: Projection) -> F64 | None:
-    """Return the least and the greatest pixel position of the disc's image, float64[2, 2], or None where some of
-    the disc is beside or behind the camera."""
+    """Return the least and the greatest pixel position of the disc's image, float64[2, 2].
+
+    The result is None where a part of the disc is beside or behind the camera.
+    """
     turn = np.arange(_RIM) * 2 * np.pi / _RIM
     s, c = np.sin(disc.angular_radius_rad), np.cos(disc.angular_radius_rad)
     rim = np.column_stack([s * np.cos(turn), s * np.sin(turn), np.full(_RIM, c)]) @ axes(disc.direction_C)
@@ -112,25 +120,26 @@ def pixel_sums(
     profiles: F64 | None = None,
     gain: Callable[[F64], F64] | None = None,
 ) -> PixelSums | None:
-    """Return what each pixel of a frame sees of the disc, or None where it sees nothing of it.
+    """Return what each pixel of a frame sees of the disc, or None where no pixel sees it.
 
     Parameters
     ----------
     disc
-        The disc and how much of it is hidden.
+        The disc and its visible fraction.
     projection
-        Where the pixels look.
+        The directions that the pixels see.
     shape
         Height and width of the frame in pixels.
     profiles
-        float64[profile, k], Σ c_k μᵏ: radiance over the disc's mean. Default: one uniform profile.
+        Coefficients c_k, float64[profile, k], of Σ c_k μᵏ, the radiance over the disc's mean. Default: one uniform
+        profile.
     gain
-        A factor on the light, of its tangents float64[y, x, 2].
+        Function that returns a factor on the light for tangents float64[y, x, 2].
 
     Returns
     -------
     PixelSums
-        Projected solid angle times profile, gain and the fraction that is not hidden.
+        Projected solid angle times profile, gain and visible fraction.
     """
     bounds = bounds_px(disc, projection)
     if bounds is None or not disc.visible.any():
@@ -139,7 +148,7 @@ def pixel_sums(
     radius_px = (bounds[1] - bounds[0]).max() / 2
     blur_px = disc.blur_slope * radius_px / np.tan(disc.angular_radius_rad)
     shifts = np.zeros((1, 2))
-    if blur_px > _SHARP_PX:  # a point of the Sun is a disc of its own: as many points of the lens as fill it
+    if blur_px > _SHARP_PX:  # defocus spreads each point of the Sun over a circle: fill it with points
         count = int(np.clip(16 * (1 + blur_px / max(radius_px, 0.5)) ** 2, 16, 1024))
         shifts = blur_px * sunflower(count)
     total: F64 | None = None
@@ -160,9 +169,9 @@ def pixel_sums(
 def add_mean(
     radiance: NDArray[np.float32], disc: SunInView, projection: Projection, bands: Sequence[int]
 ) -> tuple[slice, slice] | None:
-    """Add the disc to a frame's radiance, float32[band, y, x], in place; return its rows and columns, or None.
+    """Add the disc to a frame's radiance, float32[band, y, x], in place. Return its rows and columns, or None.
 
-    A pixel's mean is its power over the projected solid angle that a pixel sees at its centre.
+    The mean radiance of a pixel is its power over the projected solid angle of a pixel at its centre.
     """
     shape = (int(radiance.shape[1]), int(radiance.shape[2]))
     found = pixel_sums(disc, projection, shape, disc.profiles(bands))
@@ -176,15 +185,18 @@ def add_mean(
 
 
 def sunflower(count: int) -> F64:
-    """Return points of the unit disc that stand for equal areas, float64[point, 2]."""
+    """Return points that represent equal areas of the unit disc, float64[point, 2]."""
     k = np.arange(count) + 0.5
     radius, turn = np.sqrt(k / count), k * np.pi * (3 - np.sqrt(5))
     return np.column_stack([radius * np.cos(turn), radius * np.sin(turn)])
 
 
 def _cells(low: float, high: float, first: int, last: int) -> tuple[F64, F64, NDArray[np.int64]]:
-    """Return centres and widths of cells from `low` to `high`, none across a pixel's border, and each one's pixel
-    counted from `first`: -1 outside of pixels `first` to `last`."""
+    """Return the centre, the width and the pixel of each cell from `low` to `high`, along one axis.
+
+    No cell crosses a pixel's border. Pixels count from `first`; -1 marks a cell outside the pixels from `first` to
+    below `last`.
+    """
     inner = np.arange(max(first, np.floor(low) + 1), min(last, np.ceil(high) - 1) + 1)
     knots = np.unique(np.concatenate([[low], inner, [high]]))
     length = np.diff(knots)
@@ -206,9 +218,9 @@ def _sums(
     profiles: F64,
     gain: Callable[[F64], F64] | None,
 ) -> F64:
-    """Return the sums of a window's pixels, float64[profile, y, x], of a disc that defocus moves by `shift`."""
+    """Return the sums of a window's pixels, float64[profile, y, x], for a disc moved by `shift` (defocus)."""
     (left, top), (right, bottom) = window
-    # cells about the disc in its own place: the shift moves the pixels instead
+    # the cells stay around the unmoved disc: the shift moves the pixels instead
     x, dx, column = _cells(bounds[0, 0] + shift[0], bounds[1, 0] + shift[0], left, right)
     y, dy, row = _cells(bounds[0, 1] + shift[1], bounds[1, 1] + shift[1], top, bottom)
     x, y = x - shift[0], y - shift[1]
@@ -216,7 +228,7 @@ def _sums(
     sine = np.sin(disc.angular_radius_rad)
 
     def on_disc(slopes: F64) -> F64:
-        """Places on the unit disc, float64[y, x, 2]: the disc seen along its own direction."""
+        """Return positions on the unit disc, float64[y, x, 2]: the disc seen along its own direction."""
         length = np.sqrt(1 + (slopes**2).sum(axis=-1))
         places = [(slopes[..., 0] * a[0] + slopes[..., 1] * a[1] + a[2]) / (sine * length) for a in (across, down)]
         return np.stack(places, axis=-1)
@@ -225,7 +237,7 @@ def _sums(
     near = on_disc(
         projection.slopes_at(*(m + q * np.array([-1.0, 1.0]) for m, q in zip(middle, quarter, strict=True)))
     )
-    # of a place on the disc, per pixel: along x and along y
+    # change of the position on the disc per pixel, along x and along y
     per_x = (near[:, 1] - near[:, 0]).mean(axis=0) / (2 * quarter[0])
     per_y = (near[1] - near[0]).mean(axis=0) / (2 * quarter[1])
     out = np.zeros((len(profiles), bottom - top, right - left))
@@ -241,7 +253,7 @@ def _sums(
         a = np.abs(place @ per_x) / r * dx
         b = np.abs(place @ per_y) / r * dy[rows, None]
         covered = _covered(1 - r, a, b)
-        # mean depth within the rim of what a cell holds of the disc
+        # mean distance from the rim of the cell's part inside the disc
         depth = np.where(covered < 1, covered * (a + b) / 2, 1 - r)
         mu = np.sqrt(np.clip(1 - (1 - depth) ** 2, 0, 1))
         weight = covered * projection.solid_angle_sr(slopes) * dx * dy[rows, None]
@@ -256,14 +268,15 @@ def _sums(
             for_rows = np.zeros((bottom - top, int(of_frame.sum())))
             np.add.at(for_rows, row[rows][inside], of_columns)
             out[k][:, column[starts][of_frame]] += for_rows
-    mean = profiles @ (2 / (np.arange(profiles.shape[1]) + 2))  # of a profile over the disc
+    mean = profiles @ (2 / (np.arange(profiles.shape[1]) + 2))  # of each profile over the disc
     return np.asarray(out * (np.pi * sine**2 * z[2] * mean / whole)[:, None, None])
 
 
 def _covered(depth: F64, a: F64, b: F64) -> F64:
     """Return the fraction of a rectangle on one side of a line, float64[...] in [0, 1].
 
-    `depth`: distance of its centre from the line; `a`, `b`: its sides' extents across the line.
+    `depth` is the signed distance of the rectangle's centre from the line. `a` and `b` are the extents of its sides
+    across the line.
     """
     least = 1e-4 * (a + b) + 1e-300
     a, b = np.maximum(a, least), np.maximum(b, least)
@@ -277,8 +290,10 @@ def _covered(depth: F64, a: F64, b: F64) -> F64:
 
 
 def _visible(table: NDArray[np.float32], place: F64) -> F64 | float:
-    """Return the visible fraction at places of the unit disc, float64[...], linear between the cells' centres: the
-    nearest cell would shift a straight edge along the grid by up to half a cell."""
+    """Return the visible fraction at positions on the unit disc, float64[...], linear between the cells' centres.
+
+    The nearest cell's value would shift a straight edge along the grid by up to half a cell.
+    """
     if table.min() == table.max():
         return float(table[0, 0])
     n = len(table)
