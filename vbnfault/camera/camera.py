@@ -1,4 +1,4 @@
-"""The camera: lens, detector, sensor architecture, readout direction and exposure, frozen together."""
+"""Define the camera: lens, detector, sensor architecture, readout direction and exposure, frozen together."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ READOUT_DIRECTIONS = ("up", "down", "left", "right")
 
 @dataclass(frozen=True, kw_only=True)
 class Camera:
-    """One camera as it takes one picture.
+    """Hold a camera in the state in which it takes one image.
 
-    `architecture` and `readout_direction` (one of the module's tuples) are drawn once per sample and shared by
-    broken pixels and broken lines. `exposure_s` > 0.
+    `architecture` (one of ARCHITECTURES) and `readout_direction` (one of READOUT_DIRECTIONS) are drawn once per
+    sample, and broken pixels and broken lines share them. `exposure_s` is above 0.
     """
 
     lens: ThinLens | RealLens
@@ -33,18 +33,18 @@ class Camera:
 
     @property
     def optics(self) -> tuple[Any, ...]:
-        """What the electrons expected in its pixels depend on: cameras that share it share them."""
+        """Return all that the expected electrons depend on: cameras with equal values have equal electrons."""
         return self.lens, self.exposure_s, self.detector.optics_key
 
     def expose(self, radiance: Radiance, exposure_s: float) -> Electrons:
-        """Return the electrons expected of a radiance: the scene's, and past the rims those of the Sun's disc."""
+        """Return the electrons expected from a radiance; `Electrons.past_rims` holds those of the Sun's disc."""
 
         def electrons(on_sensor: Irradiance) -> Electrons:
             return self.detector.electrons_expected(on_sensor, exposure_s)
 
         if radiance.sun is None:
             return electrons(self.lens.image(radiance))
-        # the Sun's own rounding errors are as bright as the scene
+        # the rounding errors of the Sun's radiance may be as large as the radiance of the scene
         scene = replace(radiance, array=np.maximum(radiance.array - radiance.sun, 0), sun=None, disc=None)
         sun = replace(radiance, array=radiance.sun, sun=None)
         found = electrons(self.lens.image(scene))
@@ -65,22 +65,22 @@ class Camera:
 
     @property
     def focal_length_px(self) -> float:
-        """Focal length in pixels, of the image near the axis: the OpenCV intrinsics fx = fy."""
+        """Return the focal length in pixels, for the image near the axis: the OpenCV intrinsics fx = fy."""
         return self.lens.focal_length_mm * 1e3 / self.detector.pixel_pitch_um
 
     @property
     def intrinsics(self) -> NDArray[np.float64]:
-        """fx, fy, cx, cy in pixels, float64[4]; pixel centres lie at +0.5, the axis at the frame's middle."""
+        """Return fx, fy, cx, cy in pixels, float64[4]. Pixel centres lie at +0.5, the axis in the frame's middle."""
         f = self.focal_length_px
         return np.array([f, f, self.width_px / 2, self.height_px / 2])
 
     @property
     def fov_deg(self) -> float:
-        """Full field of view across the width, degrees, distortion left out."""
+        """Return the full field of view across the width in degrees, without distortion."""
         return float(np.degrees(2 * np.arctan(self.width_px / 2 / self.focal_length_px)))
 
     def project(self, direction_C: NDArray[np.float64]) -> NDArray[np.float64] | None:
-        """Pixel x, y (float64[2]) of a direction in C; None where it points behind the camera."""
+        """Return pixel x and y of a direction in C, float64[2]; None where it does not point to the front."""
         x, y, z = direction_C
         if z <= 1e-9:
             return None
@@ -93,12 +93,12 @@ class Camera:
 
     @property
     def projection(self) -> Projection:
-        """Where the pixels look: by chief rays at the d line, or as a rectilinear camera."""
+        """Return the map of directions to pixels: by chief rays at the d line, or of a rectilinear camera."""
         return self.lens.projection() if isinstance(self.lens, RealLens) else Pinhole(self.intrinsics)
 
     @property
     def seen_slopes(self) -> NDArray[np.float64]:
-        """Tangents x/z and y/z of the directions in C that the pixels' centres see, float64[y, x, 2]."""
+        """Return the tangents x/z and y/z in C of the directions that the pixel centres see, float64[y, x, 2]."""
         if isinstance(self.lens, RealLens):
             return self.lens.seen_slopes
         return self.projection.slopes_at(np.arange(self.width_px) + 0.5, np.arange(self.height_px) + 0.5)
@@ -109,20 +109,20 @@ class Camera:
 
     @property
     def distortion(self) -> NDArray[np.float64]:
-        """OpenCV's k1, k2, p1, p2, k3, k4, k5, k6, float64[8]; zeros for a thin lens."""
+        """Return OpenCV's k1, k2, p1, p2, k3, k4, k5, k6, float64[8]; zeros for a thin lens."""
         return np.array(self.lens.distortion) if isinstance(self.lens, RealLens) else np.zeros(8)
 
     @property
     def distortion_residual_px(self) -> tuple[float, float]:
-        """How far those lie from the lens's chief rays over the lit frame: root mean square and largest."""
+        """Return the RMS and largest distance of `distortion` from the lens's chief rays over the lit frame."""
         return self.lens.distortion_residual_px if isinstance(self.lens, RealLens) else (0.0, 0.0)
 
     @property
     def guard_px(self) -> tuple[int, int]:
-        """Pixels of a render beyond either side of the frame, in x and in y, that its lens draws on."""
+        """Return how many pixels beyond each side of the frame, in x and in y, the lens needs from a render."""
         return self.lens.guard_px if isinstance(self.lens, RealLens) else (0, 0)
 
 
 def focal_length_mm(fov_deg: float, width_px: int, pixel_pitch_um: float) -> float:
-    """Focal length that gives the full field of view across the width of the sensor."""
+    """Return the focal length in mm that gives a full field of view across the width of the sensor."""
     return width_px * pixel_pitch_um * 1e-3 / 2 / float(np.tan(np.radians(fov_deg) / 2))

@@ -1,9 +1,9 @@
-"""A camera characterised as EMVA 1288 (release 4.0, linear model) asks: what its raw pictures tell of it.
+"""Characterise a camera from its raw images as EMVA 1288 (release 4.0, linear model) defines.
 
-From pairs of flat and dark pictures over exposures: system gain K, quantum efficiency, temporal dark noise, dark
-current, saturation, linearity; from stacks: DSNU, PRNU and the spectra of what varies over the picture. The
-analysis knows nothing of how pictures are made: a `MeasuredCamera` takes them, and `VirtualCamera` is one for the
-device of a sensor.
+Pairs of flat and dark images at several exposures give the system gain K, quantum efficiency, temporal dark noise,
+dark current, saturation and linearity. Stacks of images give DSNU, PRNU and the spectra of the spatial variation.
+The analysis does not depend on how the images are made: a `MeasuredCamera` takes them. `VirtualCamera` takes them
+with a device of a simulated sensor.
 """
 
 from __future__ import annotations
@@ -24,22 +24,24 @@ F64 = NDArray[np.float64]
 Site = tuple[slice, slice]
 
 _QUANTISATION_DN2 = 1 / 12  # variance of rounding, EMVA 1288 eq. 11
-_LINEAR_SHARE = 0.7  # of saturation up to which gain and response are told (section 6.6)
-_LINEARITY_RANGE = 0.05, 0.95  # of saturation over which linearity is told (section 6.7)
+_LINEAR_SHARE = 0.7  # fraction of saturation up to which gain and response are fitted (section 6.6)
+_LINEARITY_RANGE = 0.05, 0.95  # fractions of saturation that bound the test of linearity (section 6.7)
 
 
 class MeasuredCamera(Protocol):
-    """What is characterised: raw pictures of evenly lit pixels."""
+    """Take raw images of evenly lit pixels, for a characterisation."""
 
     def take(self, photons: float, exposure_s: float, number: int) -> NDArray[np.uint16]:
-        """Raw picture uint16[y, x] of a mean of `photons` a pixel; `number` counts pictures, each has its own
-        noise."""
+        """Return a raw image uint16[y, x] for a mean of `photons` per pixel.
+
+        `number` counts the images, each of which has its own noise.
+        """
         ...
 
 
 @dataclass(frozen=True, kw_only=True)
 class Settings:
-    """How much is measured: `points` exposures of flats, `stack` pictures for what varies over the picture."""
+    """Set the extent of the measurement: `points` levels of flats, `stack` images for the spatial variation."""
 
     points: int = 40
     stack: int = 24
@@ -49,7 +51,7 @@ class Settings:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PhotonTransfer:
-    """Photon transfer: means and temporal variances, in DN and DN², of flats and of darks at the same exposure."""
+    """Hold the photon transfer: means and temporal variances of flats, and of darks at the same exposure."""
 
     photons: F64
     mean_dn: F64
@@ -60,8 +62,11 @@ class PhotonTransfer:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Spectrum:
-    """Spectra along rows and along columns of stacks of flats at half saturation and of darks: the root of the
-    mean power, as DN rms per frequency; frequency in cycles a pixel of the channel."""
+    """Hold spectra along rows and columns of the mean flat at half saturation and of the mean dark.
+
+    The spectra are the root of the mean power, in DN rms per frequency. Frequencies are in cycles per pixel of the
+    channel.
+    """
 
     frequency: dict[str, F64]
     flat_dn: dict[str, F64]
@@ -70,8 +75,10 @@ class Spectrum:
 
 @dataclass(frozen=True, kw_only=True)
 class Result:
-    """What EMVA 1288 calls the camera's parameters; electrons (e), digital numbers (DN), seconds. `saturation_e` is
-    the signal of the largest variance, `full_well_e` the largest one."""
+    """Hold the camera's parameters as EMVA 1288 defines them, in electrons (e), digital numbers (DN) and seconds.
+
+    `saturation_e` is the signal at the largest variance, `full_well_e` the largest signal.
+    """
 
     gain_dn_per_e: float
     quantum_efficiency: float
@@ -92,7 +99,7 @@ class Result:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Characterisation:
-    """Of one colour channel: its result and the data behind it."""
+    """Hold the result of one colour channel and the data behind the result."""
 
     channel: str
     result: Result
@@ -105,7 +112,7 @@ class Characterisation:
     prnu_map: F64
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain data: the result and the photon transfer."""
+        """Return the result and the photon transfer as plain data."""
         transfer = {k: np.asarray(v).tolist() for k, v in vars(self.transfer).items()}
         return {"channel": self.channel, **asdict(self.result), "photon_transfer": transfer}
 
@@ -122,12 +129,27 @@ def characterise(
 
     Parameters
     ----------
+    camera
+        The camera that takes the images.
     sites
-        Of each channel, the regular grid of its pixels: slices of rows and of columns.
+        Slices of rows and columns that select the regular grid of each channel's pixels.
     photons_at_saturation
-        About how many photons a pixel saturate the channel that does so first; flats go to 1.25 times as many.
+        About the number of photons per pixel at which the first channel saturates; flats go to 1.25 times as many.
+    settings
+        Extent of the measurement; default: `Settings()`.
     progress
-        Told of each picture taken, by a 1.
+        Function that is called with 1 after each image.
+
+    Returns
+    -------
+    characterisations
+        One for each channel of `sites`.
+
+    Raises
+    ------
+    InputError
+        `settings` has fewer than 8 points, 2 images in a stack or 2 dark exposures, or a channel saturates within
+        the first three levels.
     """
     use = Settings() if settings is None else settings
     if use.points < 8 or use.stack < 2 or len(use.dark_exposures_s) < 2:
@@ -154,7 +176,7 @@ def characterise(
 
 
 def pictures(settings: Settings) -> int:
-    """How many pictures `characterise` takes."""
+    """Return how many images `characterise` takes."""
     return 2 * (settings.points + 1 + len(settings.dark_exposures_s)) + 2 * settings.stack
 
 
@@ -163,8 +185,10 @@ Take = Callable[[float, float], F64]
 
 
 def _pair(take: Take, photons: float, exposure_s: float, sites: Mapping[str, Site]) -> Pair:
-    """Mean and temporal variance of each channel from two pictures (eq. 12-14: what varies over the picture cancels
-    in their difference)."""
+    """Return mean and temporal variance of each channel from two images (eq. 12-14).
+
+    The spatial variation cancels in the difference of the two images.
+    """
     one, other = take(photons, exposure_s), take(photons, exposure_s)
     out = {}
     for name, site in sites.items():
@@ -175,12 +199,13 @@ def _pair(take: Take, photons: float, exposure_s: float, sites: Mapping[str, Sit
 
 
 def _half_saturation(photons: F64, flats: list[Pair], channel: str) -> float:
+    """Return half the number of photons at which the variance of a channel is largest."""
     variance = np.array([pair[channel][1] for pair in flats])
     return float(photons[int(np.argmax(variance))] / 2)
 
 
 def _stack(take: Take, photons: float, use: Settings) -> tuple[F64, F64]:
-    """Mean picture, and the variance in time of each pixel, over a stack."""
+    """Return the mean image of a stack, and the temporal variance of each pixel."""
     total = square = np.zeros(())
     for _ in range(use.stack):
         picture = take(photons, use.exposure_s)
@@ -198,6 +223,7 @@ def _channel(
     stacks: dict[str, tuple[F64, F64]],
     use: Settings,
 ) -> Characterisation:
+    """Return the characterisation of one channel from the pairs and stacks of images."""
     mean, variance = (np.array([pair[name][k] for pair in flats]) for k in (0, 1))
     (dark_mean, dark_variance), *later = (pair[name] for pair in darks)
     # saturation: where the variance is largest (section 6.6)
@@ -212,7 +238,7 @@ def _channel(
     gain = float(signal @ noise / (signal @ signal))
     response = float(photons[linear] @ signal / (photons[linear] @ photons[linear]))
     efficiency = response / gain
-    dark_noise_dn = float(np.sqrt(max(dark_variance, 0.24)))  # below that rounding hides it (eq. 56)
+    dark_noise_dn = float(np.sqrt(max(dark_variance, 0.24)))  # below this, rounding hides the noise (eq. 56)
     dark_noise_e = float(np.sqrt(max(dark_variance - _QUANTISATION_DN2, 0.0)) / gain)
     saturation_photons = float(photons[last])
     saturation_e = efficiency * saturation_photons
@@ -271,7 +297,7 @@ def _channel(
 
 
 def _linearity(photons: F64, signal: F64, last: int) -> float:
-    """Mean relative deviation from the line that fits best relative to the signal, in % (section 6.7)."""
+    """Return the mean relative deviation from the line with the best relative fit, in % (section 6.7)."""
     low, high = (share * signal[last] for share in _LINEARITY_RANGE)
     chosen = (signal >= low) & (signal <= high) & (np.arange(len(signal)) <= last)
     p, y = photons[chosen], signal[chosen]
@@ -280,7 +306,7 @@ def _linearity(photons: F64, signal: F64, last: int) -> float:
 
 
 def _spectra(picture: F64) -> dict[str, F64]:
-    """Root of the mean power over the rows, and over the columns (section 8.6)."""
+    """Return the root of the mean power spectrum over the rows, and over the columns (section 8.6)."""
     flat = picture - picture.mean()
     out = {}
     for name, along in (("rows", flat), ("columns", flat.T)):
@@ -293,8 +319,11 @@ def _spectra(picture: F64) -> dict[str, F64]:
 
 
 class VirtualCamera:
-    """Takes raw pictures with a device under even light of one wavelength, or with as many photons for each channel
-    of the wavelength that it responds to most."""
+    """Take raw images with a device under even light.
+
+    The light has one wavelength. With None, each channel gets the same number of photons at the wavelength to which
+    it responds most. Raises InputError where no channel responds to the light.
+    """
 
     def __init__(self, device: Device, wavelength_nm: float | None = None, seed: int = 0) -> None:
         self.device, self.seed = device, seed
@@ -308,22 +337,22 @@ class VirtualCamera:
 
     @property
     def photons_at_saturation(self) -> float:
-        """Photons a pixel that saturate the channel that responds most."""
+        """Return the photons per pixel that saturate the channel with the highest quantum efficiency."""
         return self.device.sensor.readout.white_e / max(self.efficiency.values())
 
     def take(self, photons: float, exposure_s: float, number: int) -> NDArray[np.uint16]:
-        """As `MeasuredCamera` has it."""
+        """Return a raw image, as `MeasuredCamera` defines."""
         shape = self.device.shape
         light = by_channel(self.device.sensor, shape, [photons * eta for eta in self.efficiency.values()])
         shot, read, row = (np.random.default_rng([self.seed, number, k]) for k in range(3))
         return self.device.raw(light, exposure_s, MosaicNoise.draw(shape, shot, read, row))
 
 
-# --- as a picture ------------------------------------------------------------------------------------------------
+# --- output as figure and text -----------------------------------------------------------------------------------
 
 
 def draw(found: Mapping[str, Characterisation], title: str, path: Path) -> None:
-    """A PNG of photon transfer, response, dark signal, spectra and histograms."""
+    """Write a PNG figure of photon transfer, response, dark signal, spectra and histograms."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
     from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
@@ -390,7 +419,10 @@ def draw(found: Mapping[str, Characterisation], title: str, path: Path) -> None:
 
 
 def _bins(values: F64) -> F64:
-    """Edges of about 200 bins, each as wide as a whole number of the steps in which averages of integers come."""
+    """Return the edges of at most about 200 bins for a histogram.
+
+    Averages of integers are multiples of a step. Each bin is a whole number of these steps wide.
+    """
     levels = np.unique(values)
     extent = float(levels[-1] - levels[0])
     if extent == 0:
@@ -405,7 +437,7 @@ _COLOURS = {"R": "tab:red", "G": "tab:green", "B": "tab:blue", "N": "tab:brown",
 
 
 def table(found: Mapping[str, Characterisation]) -> list[str]:
-    """Lines of text: a row a parameter, a column a channel."""
+    """Return lines of text with a row per parameter and a column per channel."""
     names = list(found)
     lines = [f"{'':<30}" + "".join(f"{name:>12}" for name in names)]
     for field in fields(Result):

@@ -1,8 +1,8 @@
 """Load every file that a user names, and find the packaged scenes and textures.
 
 `read_input` reads a file once. It refuses everything but a regular file of reasonable size, so that no file can
-block the program or fill the memory before the first byte is parsed. `check_input` checks a file that a library must
-read by its path, such as a SPICE kernel.
+block the program or fill the memory before the first byte is parsed. `check_input` checks a file that a library
+must read by its path, such as a SPICE kernel.
 """
 
 from __future__ import annotations
@@ -154,7 +154,7 @@ def _opened_now(path: Path, what: str, types: Sequence[str], limit_bytes: int) -
     return file
 
 
-# --- contents of files when a run was planned -------------------------------------------------------------------
+# --- contents of files when a run was planned -----------------------------------------------------------------
 
 
 class Contents:
@@ -256,7 +256,7 @@ _R = TypeVar("_R")
 
 
 def cached_with_contents(maxsize: int) -> Callable[[Callable[..., _R]], Callable[..., _R]]:
-    """Return a decorator like `lru_cache` for functions of file names; each run (`Contents`) has its own results."""
+    """Return a decorator like `lru_cache` for functions of file names; each run (`Contents`) has its own cache."""
 
     def decorate(function: Callable[..., _R]) -> Callable[..., _R]:
         @lru_cache(maxsize=maxsize)

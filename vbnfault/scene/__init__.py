@@ -1,1 +1,1 @@
-"""What the user asked for: the scene file, checked, and the plan of its samples."""
+"""Check the scene file, which says what the user asks for, and plan its samples."""

@@ -1,8 +1,8 @@
-"""The scene file: one TOML that says everything a dataset is made from. Strict, units in names.
+"""Read and check the scene file: one TOML file that defines a whole dataset. Units are in the names of the keys.
 
-Unknown keys, wrong types, reversed bounds and values out of range are refused in one sentence that names the
-file, the key, the value and the allowed range. The tables under `[faults]` are checked against the registry by
-`faults.from_dict`, since every fault model brings its own keys.
+Unknown keys, wrong types, reversed bounds and values out of range are refused. The error is one sentence that names
+the file, the key, the value and the allowed range. `faults.from_dict` checks the tables under `[faults]`, since
+every fault model has its own keys.
 """
 
 from __future__ import annotations
@@ -30,26 +30,28 @@ _LAYERS = (
     "point_T_m|incidence_deg|emission_deg|phase_deg|albedo|without_[a-z0-9_]+|"
     + "|".join(f"[a-z0-9_]+_{kind}" for kind in SOFT_KINDS)
 )
-# What names no file.
+# Values of body.shape and of spacecraft.model that do not name a file.
 _SHAPES = ("embedded", "ellipsoid")
 _VEHICLES = ("none", "default")
 Layer = Annotated[str, Field(pattern=f"^({_LAYERS})$")]
 
 
 def _ordered(pair: tuple[float, float]) -> tuple[float, float]:
+    """Return a pair of bounds. Raises ValueError where they are reversed."""
     if pair[0] > pair[1]:
         raise ValueError("bounds reversed, the lower one comes first")
     return pair
 
 
 def _pair(lo: float, hi: float) -> Any:
+    """Return the type of a pair of bounds within `lo` and `hi`, the lower one first."""
     value = Annotated[float, Field(ge=lo, le=hi)]
     return Annotated[tuple[value, value], AfterValidator(_ordered)]
 
 
-# Of a frame's pixels and bands, 4 bytes each: some ten such arrays are held at a time.
+# The most radiances of a frame (pixels × bands), 4 bytes each. About ten such arrays are in memory at a time.
 _MOST_RADIANCES = 2**28
-# What no table of a scene has more of: rows of a spectrum, kernels, layers.
+# The most rows of a spectrum or of Hapke's parameters, and the most SPICE kernels.
 _MOST_ROWS = 10_000
 Wavelength = Annotated[float, Field(gt=0, le=1e5)]
 SemiAxis = Annotated[float, Field(gt=0, le=1e9)]
@@ -58,13 +60,13 @@ Offset = Annotated[float, Field(ge=-1e4, le=1e4)]
 
 
 class Table(BaseModel):
-    """A table of the scene file: frozen, strict, no unknown keys."""
+    """Check a table of the scene file: it is frozen and strict, and refuses unknown keys."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, validate_default=True)
 
 
 class SplitTable(Table):
-    """Fractions of the sites in each split."""
+    """Set the fraction of the sites in each split."""
 
     train: float = Field(0.7, ge=0, le=1)
     val: float = Field(0.15, ge=0, le=1)
@@ -78,7 +80,7 @@ class SplitTable(Table):
 
 
 class DatasetTable(Table):
-    """What is stored."""
+    """Set the size of the dataset and what it stores."""
 
     samples: int = Field(16, ge=1, le=10_000_000)
     seed: int = Field(1, ge=0, le=2**63 - 1)
@@ -104,7 +106,7 @@ class DatasetTable(Table):
 
 
 class SpectrumTable(Table):
-    """Values at wavelengths, interpolated linearly, constant beyond the ends."""
+    """Give values at wavelengths. They are interpolated linearly and are constant beyond the ends."""
 
     wavelength_nm: tuple[Wavelength, ...] = Field(min_length=1, max_length=_MOST_ROWS)
     value: tuple[Annotated[float, Field(ge=0, le=1)], ...] = Field(min_length=1, max_length=_MOST_ROWS)
@@ -119,7 +121,7 @@ class SpectrumTable(Table):
 
 
 class HapkeRow(Table):
-    """Hapke's parameters at one wavelength (Hapke 2002, 2012)."""
+    """Give Hapke's parameters at one wavelength (Hapke 2002, 2012)."""
 
     wavelength_nm: float = Field(gt=0, le=1e5)
     single_scattering_albedo: float = Field(ge=0, le=1, description="w")
@@ -133,7 +135,7 @@ class HapkeRow(Table):
 
 
 class PhotometryTable(Table):
-    """How the ground reflects. All models but Hapke's scale `body.reflectance`."""
+    """Set how the ground reflects. All models except Hapke's scale `body.reflectance`."""
 
     model: Literal["lambert", "lommel_seeliger", "mcewen", "hapke"] = "lambert"
     phase_slope_mag_deg: float = Field(
@@ -161,14 +163,14 @@ class PhotometryTable(Table):
         return self
 
     def rows(self) -> tuple[tuple[float, ...], ...]:
-        """`hapke` as `photometry.hapke_at` takes it."""
+        """Return `hapke` as rows for `photometry.hapke_at`."""
         return tuple(
             (row.wavelength_nm, *(getattr(row, name) for name in photometry.COLUMNS)) for row in self.hapke or ()
         )
 
 
 class BodyTable(Table):
-    """The target body, in its body-fixed frame T."""
+    """Describe the target body in its body-fixed frame T."""
 
     name: str = "67P/Churyumov-Gerasimenko"
     shape: str = Field(
@@ -200,7 +202,7 @@ class BodyTable(Table):
 
 
 class PatchTable(Table):
-    """Terrain around a site: how far and how fine the model is refined."""
+    """Set how far and how finely the terrain around a site is refined."""
 
     facet_m: float = Field(0.12, ge=0.05, le=1e6, description="edge length aimed at within radius_m of the site")
     radius_m: float = Field(40.0, ge=1, le=1e8, description="beyond, facets grow with the distance")
@@ -219,7 +221,7 @@ class PatchTable(Table):
 
 
 class SunTable(Table):
-    """Where the Sun is: from the ephemeris of 67P at a Julian date, unless a distance is given."""
+    """Set the date of the ephemeris, and the Sun's distance where the ephemeris shall not give it."""
 
     julian_date: float = Field(2456974.0, ge=1_000_000, le=5_000_000, description="TDB; sets the body's attitude")
     distance_au: float | None = Field(None, gt=0.01, le=1000)
@@ -227,7 +229,7 @@ class SunTable(Table):
 
 
 class OrbitTable(Table):
-    """The body's two-body orbit about the Sun, ecliptic and equinox J2000; default: 67P's of 2015."""
+    """Describe the body's two-body orbit about the Sun (ecliptic, equinox J2000); default: 67P's orbit of 2015."""
 
     eccentricity: float = Field(ge=0, le=100, description="1: a parabola, above: a hyperbola")
     perihelion_au: float = Field(gt=0.01, le=1000)
@@ -250,10 +252,11 @@ class OrbitTable(Table):
 
 
 class SpiceTable(Table):
-    """SPICE kernels for the Sun's place, the target's attitude and a spacecraft's pose; without, the built-in 67P.
+    """Name SPICE kernels for the Sun's position, the target's attitude and a spacecraft's pose.
 
-    With a spacecraft, samples lie on its way from `sun.julian_date` to `until_julian_date`, which the sites share
-    out among themselves: `[geometry]` and the Sun's bounds do not count.
+    Without kernels, `[orbit]` and `[body]` give the Sun's position and the attitude. With a spacecraft, samples lie
+    on its trajectory from `sun.julian_date` to `until_julian_date`. This time is divided equally among the sites;
+    `[geometry]`, with its bounds of the Sun, does not apply.
     """
 
     kernels: tuple[str, ...] = Field(
@@ -284,7 +287,7 @@ class SpiceTable(Table):
 
 
 class SkyTable(Table):
-    """Stars: hidden by the exposure of a sunlit comet, so off unless asked for."""
+    """Set which stars the sky shows. An exposure for a sunlit comet hides stars, so the default is none."""
 
     stars: Literal["off", "auto", "on"] = Field("off", description="auto: those that the exposure can show")
     limiting_magnitude: float = Field(7.0, ge=-2, le=7)
@@ -292,7 +295,7 @@ class SkyTable(Table):
 
 
 class PoseTable(Table):
-    """A turn of a part about its hinge, in the camera's axes B."""
+    """Turn a part about its hinge, in the camera's axes B."""
 
     hinge_m: tuple[Offset, Offset, Offset] | None = None
     axis: tuple[Offset, Offset, Offset] | None = None
@@ -303,7 +306,7 @@ Paint = str | Annotated[float, Field(ge=0, le=1)] | SpectrumTable
 
 
 class SpacecraftTable(Table):
-    """The spacecraft that carries the camera, in the camera's axes B (x right, y down, z boresight)."""
+    """Describe the spacecraft that carries the camera, in the camera's axes B (x right, y down, z boresight)."""
 
     model: str = Field("none", description="'none', 'default' (a lander), or an OBJ or GLB file")
     unit: Literal["m", "cm", "mm"] = "m"
@@ -316,8 +319,9 @@ class SpacecraftTable(Table):
     pose: dict[str, PoseTable] = Field(default_factory=dict, description="by part")
 
 
-# Of a camera without a prescription, where the scene names no other.
+# Values of a camera without a prescription, where the scene gives none.
 THIN_LENS = {"f_number": 4.0, "transmission": 0.9}
+# Keys that a named detector sets itself.
 OF_THE_DETECTOR = (
     "pixel_pitch_um",
     "full_well_e",
@@ -332,7 +336,7 @@ OF_THE_DETECTOR = (
 
 
 class CameraTable(Table):
-    """Camera and exposure."""
+    """Describe the camera and its exposure."""
 
     fov_deg: float = Field(65.0, ge=0.01, le=140, description="full field of view across the width")
     width_px: int = Field(1024, ge=16, le=16384)
@@ -404,7 +408,7 @@ class CameraTable(Table):
             raise ValueError(
                 f"transmission = {self.transmission:g}: the lens has its own, of glass and coatings; leave one out"
             )
-        if not self.lens:  # a scene with a prescription keeps None: its own f-number
+        if not self.lens:  # with a prescription, None stays and means the prescription's own f-number
             for key, value in THIN_LENS.items():
                 if getattr(self, key) is None:
                     object.__setattr__(self, key, value)
@@ -433,7 +437,7 @@ class CameraTable(Table):
 
 
 class RenderTable(Table):
-    """Spectral bands and sampling."""
+    """Set the spectral bands and the sampling."""
 
     band_min_nm: float = Field(400.0, ge=280, le=3900)
     band_max_nm: float = Field(700.0, ge=290, le=4000)
@@ -463,10 +467,10 @@ class RenderTable(Table):
 
 
 class StratumTable(Table):
-    """Bounds of one stratum of the sampling (Gallon et al., Table of bounds). Angles in degrees.
+    """Set the bounds of one stratum of the sampling (Gallon et al., Table of bounds). Angles are in degrees.
 
-    Roll and pitch tilt the boresight away from the reference direction, yaw turns the camera about it. The
-    site's own elevation of the Sun counts from the horizon upwards, azimuth from north towards east.
+    Roll and pitch tilt the boresight away from the reference direction; yaw turns the camera about the boresight.
+    At the site, the Sun's elevation counts from the horizon upwards and its azimuth from north towards east.
     """
 
     sun_azimuth_deg: _pair(-360, 720) | None = None  # type: ignore[valid-type]
@@ -481,7 +485,7 @@ class StratumTable(Table):
 
 
 class GeometryTable(Table):
-    """Where the camera is and looks. Unset bounds follow the paper's table for the camera's field of view."""
+    """Set where the camera is and looks. Unset bounds follow the paper's table for the camera's field of view."""
 
     x_m: _pair(-1e9, 1e9) = (-150.0, 150.0)  # type: ignore[valid-type]
     y_m: _pair(-1e9, 1e9) = (-150.0, 150.0)  # type: ignore[valid-type]
@@ -510,7 +514,7 @@ class GeometryTable(Table):
 
 
 class PlanTable(Table):
-    """The fault matrix."""
+    """Set the fault matrix and the choice of views."""
 
     mode: Literal["per_class", "per_sample"] = "per_sample"
     faulty_fraction: float = Field(0.5, ge=0, le=1, description="the paper's percentage p")
@@ -535,7 +539,7 @@ class PlanTable(Table):
 
 
 class Scene(Table):
-    """A whole scene file, defaults filled in."""
+    """Hold a whole scene file with all defaults filled in."""
 
     title: str
     description: str = ""
@@ -587,15 +591,17 @@ class Scene(Table):
         return self
 
     def resolved(self) -> dict[str, Any]:
-        """The whole scene as plain JSON-able data."""
+        """Return the whole scene as plain JSON-able data."""
         plain: dict[str, Any] = json.loads(self.model_dump_json())
         return plain
 
 
 def load_scene(name_or_path: str | Path, overrides: Mapping[str, Any] | None = None) -> Scene:
-    """Load a scene by path or packaged name; `overrides` maps dotted keys to values that replace the file's.
+    """Load a scene by its path or packaged name. Raises InputError.
 
-    A relative path in the file (mesh, texture) is taken from the file's folder. Raises InputError.
+    `overrides` maps dotted keys to values that replace those of the file. A relative path in the file (such as a
+    mesh or a texture) starts from the file's folder, or from the working folder where nothing lies there. A path in
+    `overrides` starts from the working folder.
     """
     path = resources.find("scenes", name_or_path)
     table = resources.read_toml(path)
@@ -608,7 +614,7 @@ def load_scene(name_or_path: str | Path, overrides: Mapping[str, Any] | None = N
             or (key == "body.shape" and value not in _SHAPES)
             or (key == "spacecraft.model" and value not in _VEHICLES)
         ):
-            value = resources.absolute(value, key)  # a path on the command line is taken from the working folder
+            value = resources.absolute(value, key)  # a path on the command line starts from the working folder
         for parent in parents:
             node = node.setdefault(parent, {})
             if not isinstance(node, dict):
@@ -622,13 +628,13 @@ def load_scene(name_or_path: str | Path, overrides: Mapping[str, Any] | None = N
 
 
 def parse_scene(table: Mapping[str, Any], *, source: str, overrides: Sequence[str] = ()) -> Scene:
-    """Check plain data as a scene; raises InputError with one sentence naming `source`, key and value.
+    """Return plain data as a checked scene. Raises InputError; its one sentence names `source`, key and value.
 
-    `overrides`: dotted keys that did not come from `source` but were set in its place, to be named as such.
+    `overrides` are the dotted keys that replaced values of `source`; the message marks them.
     """
     resources.check_plain(table, source)
     try:
-        # JSON mode: strict about types, yet arrays become tuples; TOML's dates suit no key, as lists they fail
+        # JSON mode is strict about types, but makes tuples of arrays. No key takes a date of TOML: a list fails.
         return Scene.model_validate_json(json.dumps(table, default=lambda date: [str(date)]), strict=True)
     except ValidationError as error:
         at = ".".join(map(str, error.errors()[0]["loc"]))
@@ -641,7 +647,7 @@ def parse_scene(table: Mapping[str, Any], *, source: str, overrides: Sequence[st
 
 
 def _anchor_paths(table: dict[str, Any], folder: Path) -> None:
-    """Relative paths are taken from the scene file's folder, or the working folder where nothing lies there."""
+    """Make relative paths absolute, from the scene file's folder, else from the working folder."""
 
     def anchored(path: str, where: str) -> str:
         resources.check_path(path, where)
@@ -656,7 +662,7 @@ def _anchor_paths(table: dict[str, Any], folder: Path) -> None:
     def anchor_file(node: Any, where: str) -> None:
         key = where.rsplit(".", 1)[-1]
         if isinstance(node, dict) and isinstance(node.get(key), str) and Path(node[key]).suffix:
-            anchor(node, where)  # without a suffix it is the name of a packaged one
+            anchor(node, where)  # without a suffix it is a packaged name
 
     anchor(table.get("body"), "body.shape", _SHAPES)
     anchor(table.get("spacecraft"), "spacecraft.model", _VEHICLES)
@@ -674,6 +680,7 @@ def _anchor_paths(table: dict[str, Any], folder: Path) -> None:
 
 
 def _sentence(error: ValidationError) -> str:
+    """Return the first error as a clause that names the key, the value and what is allowed."""
     first = error.errors()[0]
     keys, schema = _locate(first["loc"])
     value, message = first.get("input"), str(first.get("ctx", {}).get("error", first["msg"]))
@@ -692,15 +699,17 @@ def _sentence(error: ValidationError) -> str:
 
 
 def _dotted(keys: Sequence[int | str]) -> str:
+    """Return keys as one dotted key for an error message."""
     return ".".join(map(resources.shown_path, map(str, keys)))
 
 
 def _shown(value: Any) -> str:
+    """Return " = value" for an error message, empty for a table."""
     return "" if isinstance(value, dict | BaseModel) else f" = {shown(value)}"
 
 
 def _wanted(schema: Mapping[str, Any], message: str) -> str:
-    """What a key takes, in words, from its JSON schema; else what pydantic says."""
+    """Return in words which values a key takes, from its JSON schema, or else from pydantic's message."""
     items = schema.get("prefixItems")
     if items:
         each = _wanted(items[0], "a value").removeprefix("a ")
@@ -732,7 +741,7 @@ def _wanted(schema: Mapping[str, Any], message: str) -> str:
 
 
 def _locate(loc: tuple[int | str, ...]) -> tuple[list[str], dict[str, Any]]:
-    """The keys of an error's location without pydantic's union tags, and the schema found there."""
+    """Return the keys of an error's location without pydantic's union tags, and the schema at that location."""
     root = Scene.model_json_schema()
 
     def plain(node: dict[str, Any]) -> dict[str, Any]:
@@ -760,7 +769,7 @@ def _locate(loc: tuple[int | str, ...]) -> tuple[list[str], dict[str, Any]]:
 
 
 def json_schema(faults: Mapping[str, Any]) -> dict[str, Any]:
-    """JSON Schema of the scene file; `faults` is the schema of the fault registry."""
+    """Return the JSON Schema of the scene file; `faults` is the schema of the fault registry."""
     schema = Scene.model_json_schema()
     schema["$schema"] = "https://json-schema.org/draft/2020-12/schema"
     schema["properties"]["faults"] = dict(faults)
@@ -768,7 +777,7 @@ def json_schema(faults: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def content_hash(*parts: Any) -> str:
-    """sha256 (hex) over JSON-able parts and bytes, order-sensitive; dictionaries by sorted key."""
+    """Return the SHA-256 (hex) over JSON-able parts and bytes in order; the keys of a dictionary are sorted."""
     digest = hashlib.sha256()
     for part in parts:
         data = part if isinstance(part, bytes) else json.dumps(part, sort_keys=True).encode()
@@ -778,19 +787,20 @@ def content_hash(*parts: Any) -> str:
 
 
 def rng(seed: int, sample: int, stage: str, name: str) -> np.random.Generator:
-    """The generator keyed by (seed, sample, stage, name): never by the order of execution.
+    """Return the generator keyed by (seed, sample, stage, name), independent of the order of execution.
 
-    Switching one fault off, or simulating samples in another order, leaves every other draw unchanged.
+    Without one of the faults, or with the samples in another order, every other draw stays the same.
     """
     key = hashlib.sha256(f"{seed}\0{sample}\0{stage}\0{name}".encode()).digest()
     return np.random.Generator(np.random.SFC64(np.random.SeedSequence(list(np.frombuffer(key, np.uint32)))))
 
 
 def keyed_uniform(seed: int, samples: NDArray[np.int64], stage: str, name: str) -> NDArray[np.float64]:
-    """Uniform numbers in [0, 1), float64 like `samples`, each keyed by (seed, its sample, stage, name).
+    """Return uniform numbers in [0, 1), float64[n], each keyed by (seed, its sample, stage, name).
 
-    The vectorised sibling of `rng` for one number a sample: the splitmix64 finaliser (Steele et al. 2014,
-    doi 10.1145/2660193.2660195) over the sample number, its start given by a hash of the other keys.
+    This is the vectorised counterpart of `rng` for one number per sample. It applies the splitmix64 finaliser
+    (Steele et al. 2014, doi 10.1145/2660193.2660195) twice to the sample's number, offset by a hash of the other
+    keys.
     """
     start = int.from_bytes(hashlib.sha256(f"{seed}\0{stage}\0{name}".encode()).digest()[:8], "little")
     x = np.asarray(samples).astype(np.uint64) * np.uint64(0x9E3779B97F4A7C15) + np.uint64(start)

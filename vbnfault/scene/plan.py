@@ -1,14 +1,14 @@
-"""The plan: which sample sees what, and which faults it carries. A plain table, drawn before any rendering.
+"""Draw the plan: a plain table, made before any rendering, of what each sample sees and which faults it carries.
 
-Stratified sampling after Gallon et al.: samples with straylight face the Sun, the others are averted
-(`sun_facing_nominal_fraction` adds Sun-facing samples without straylight). The rows of the fault matrix are dealt
-over the shards, so that every site and every split holds every class. Every number is keyed by its sample, so a
-plan of more samples does not change those of a shorter one within a block, except for the fault matrix, which is
-balanced over its whole block.
+The sampling is stratified after Gallon et al.: samples with straylight face the Sun, the others look away from it
+(`sun_facing_nominal_fraction` adds Sun-facing samples without straylight). The rows of the fault matrix are
+distributed over the shards, so that every site and every split holds every class where the counts allow. Every
+number is keyed by its sample, so a longer block keeps the numbers of a shorter one. The exceptions are the fault
+matrix, which is balanced over the whole block, and the strata and bounds that follow from it.
 
-A sample's view (position, Sun, attitude) is a function of (sample, try): where a view cannot be used, the whole of
-it is drawn again within the same bounds, so the views that are kept follow the table's distribution, given that
-they can be used.
+A sample's view (position, Sun, attitude) is a function of (sample, try). Where a view cannot be used, the whole
+view is drawn again within the same bounds. The views that are kept therefore follow the table's distribution, under
+the condition that they can be used.
 """
 
 from __future__ import annotations
@@ -35,17 +35,22 @@ _SUN = ("sun_azimuth_deg", "sun_elevation_deg")
 _POSITION = ("x_m", "y_m", "height_m")
 VARIABLES = (*_SUN, "roll_deg", "pitch_deg", "yaw_deg", *_POSITION)
 _MAX_ATTITUDE_TRIES = 1000
-# Of the search for rows to exchange between splits: rows looked at on each side, and exchanges at most.
+# Limits of the search for rows to exchange between splits: rows compared on each side, and exchanges.
 _ROWS_COMPARED = 128
 _MAX_EXCHANGES = 200
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Plan:
-    """One row a sample. `variables` float64[n] by the names of VARIABLES, the first proposals; `injected`
-    bool[n, fault] in the order of `faults`; `stratum`, `site`, `split` (index in SPLITS), `architecture`,
-    `readout_direction`, `individual` (device of the detector) integer[n]; `light` int64[n], the sample whose Sun
-    each one has: its own, unless strata are paired, and `paired` bool[n].
+    """Hold the plan of n samples.
+
+    - `variables` maps the names of VARIABLES to float64[n], the values of each sample's first view.
+    - `injected` bool[n, fault], in the order of `faults`, is the fault matrix.
+    - `stratum`, `site` and `split` (index in SPLITS) are integers[n].
+    - `architecture` and `readout_direction` integers[n] are indices into the scene's lists of allowed values.
+    - `individual` integers[n] is the device of the detector.
+    - `light` int64[n] is the sample whose Sun each sample has: itself, or the leading sample of its pair.
+    - `paired` bool[n] marks the samples of pairs (`plan.pair_strata`).
     """
 
     faults: tuple[str, ...]
@@ -64,7 +69,7 @@ class Plan:
         return len(self.stratum)
 
     def injects(self, fault: str) -> NDArray[np.bool_]:
-        """bool[n]: samples commanded to carry the fault; all False where the scene does not have it."""
+        """Return which samples are commanded to carry a fault, bool[n]; all False where the scene lacks it."""
         if fault not in self.faults:
             return np.zeros(len(self), dtype=bool)
         column: NDArray[np.bool_] = self.injected[:, self.faults.index(fault)]
@@ -75,9 +80,9 @@ class Plan:
         return tuple(name for name, has in zip(self.faults, self.injected[index], strict=True) if has)
 
     def view(self, scene: Scene, index: int, attempt: int) -> dict[str, float]:
-        """Return the variables of a sample's view at a try, counted from 0, by the names of VARIABLES.
+        """Return the variables of a sample's view at a try, counted from 0, under the names of VARIABLES.
 
-        `scene` is the one that the plan was made from. The stratum, the site and the device stay the sample's own.
+        `scene` is the scene of the plan. The stratum, the site and the device of the sample do not change.
         """
         if attempt == 0:
             return {name: float(values[index]) for name, values in self.variables.items()}
@@ -89,10 +94,10 @@ class Plan:
 
 
 def make_plan(scene: Scene, faults: Sequence[str], blocks: Sequence[int] | None = None) -> Plan:
-    """Draw the plan of all blocks (default: one of `dataset.samples`), each with its own fault matrix.
+    """Draw the plan of all blocks, each with its own fault matrix; default: one block of `dataset.samples`.
 
-    Raises InputError where the fractions leave no room (`sun_facing_nominal_fraction`), and where the bounds of a
-    stratum cannot be met.
+    Raises InputError where `sun_facing_nominal_fraction` and the samples with straylight exceed all samples, and
+    where the bounds of a stratum cannot be met.
     """
     sizes = [scene.dataset.samples] if blocks is None else list(blocks)
     seed = scene.dataset.seed
@@ -124,7 +129,7 @@ def make_plan(scene: Scene, faults: Sequence[str], blocks: Sequence[int] | None 
 
 
 def shortcomings(scene: Scene, table: Plan) -> list[str]:
-    """Return a sentence for every split without samples, and for every class that is missing in a split."""
+    """Return a sentence for every split without samples, and for every split in which a class is missing."""
     out = []
     fractions = scene.dataset.split.model_dump()
     for code, name in enumerate(SPLITS):
@@ -145,15 +150,18 @@ def shortcomings(scene: Scene, table: Plan) -> list[str]:
 
 
 def least_sun_angle_deg(scene: Scene) -> float:
-    """Sun-averted boresights stay farther than this from the Sun: √2·FoV/2 as the paper's square frame has it,
-    and the half diagonal of a frame that is higher than wide."""
+    """Return the least angle between a Sun-averted boresight and the Sun.
+
+    It is √2·FoV/2, as for the paper's square frame, or the frame's half diagonal where that is larger: in a frame
+    that is higher than wide.
+    """
     camera = scene.camera
     diagonal = np.hypot(1.0, camera.height_px / camera.width_px) * np.tan(np.radians(camera.fov_deg) / 2)
     return float(max(np.sqrt(2) * camera.fov_deg / 2, np.degrees(np.arctan(diagonal))))
 
 
 def strata(scene: Scene) -> tuple[StratumTable, StratumTable]:
-    """The bounds of the Sun-facing and the Sun-averted stratum, defaults filled in."""
+    """Return the bounds of the Sun-facing and of the Sun-averted stratum, with all defaults filled in."""
     facing, averted = scene.geometry.sun_facing, scene.geometry.sun_averted
     assert facing is not None
     assert averted is not None
@@ -179,9 +187,10 @@ def _views(
     *,
     attempt: int = 0,
 ) -> dict[str, NDArray[np.float64]]:
-    """Uniform draws within the bounds of each sample's stratum, float64[n]; `attempt` > 0 are the redraws.
+    """Return uniform draws of all variables within the bounds of each sample's stratum, float64[n] each.
 
-    Paired samples draw the Sun within both strata's bounds, with the key of one of the two, and keep it.
+    `attempt` counts from 0; later attempts are redraws. Paired samples draw the Sun within the bounds of both
+    strata, with the key of one of the two. They keep this Sun at every attempt.
     """
     drawn = {}
     for name in VARIABLES:
@@ -204,8 +213,12 @@ def _keep_sun_out_of_view(
     variables: dict[str, NDArray[np.float64]],
     attempt: int,
 ) -> None:
-    # The literal bounds leave 8 % of the Sun-averted draws looking at the Sun: roll and pitch both near half a
-    # turn. Where the angles count from the Sun, it is a matter of roll and pitch alone and is settled here.
+    """Draw roll and pitch of Sun-averted samples again, in place, until the Sun is out of view.
+
+    The paper's bounds leave 8 % of the Sun-averted draws looking at the Sun, where roll and pitch are both near
+    half a turn. Where the angles count from the Sun, only roll and pitch decide this. Raises InputError where the
+    bounds keep the Sun in view.
+    """
     if strata(scene)[SUN_AVERTED].reference != "sun":
         return
     names = ("roll_deg", "pitch_deg")
@@ -227,16 +240,17 @@ def _keep_sun_out_of_view(
 
 
 def _pair(low: NDArray[np.float64], high: NDArray[np.float64], stratum: int) -> list[float]:
+    """Return the bounds of one stratum for an error message."""
     return [float(low[stratum]), float(high[stratum])]
 
 
 def _pairs(
     scene: Scene, samples: NDArray[np.int64], stratum: NDArray[np.uint8], shard: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-    """Whose Sun each sample has, int64[n], and whether another one has it too, bool[n].
+    """Return the sample whose Sun each sample has, int64[n], and whether the sample is paired, bool[n].
 
-    The k-th Sun-facing and the k-th Sun-averted sample of a shard are a pair: they share the site, so that the same
-    Sun in L is the same attitude of the target.
+    The k-th Sun-facing and the k-th Sun-averted sample of a shard are a pair. They share the site, so the same Sun
+    in L means the same attitude of the target.
     """
     light, paired = samples.copy(), np.zeros(len(samples), dtype=bool)
     if not scene.plan.pair_strata:
@@ -252,7 +266,7 @@ def _pairs(
     group = shard[by_place] * 2 + stratum[by_place]
     first = np.searchsorted(group, group, side="left")
     rank = np.arange(len(samples)) - first
-    # (shard, rank) of the Sun-facing ones, looked up for the averted ones
+    # match the Sun-facing and the Sun-averted samples by (shard, rank)
     width = scene.dataset.shard_samples
     key = shard[by_place] * width + rank
     facing = stratum[by_place] == SUN_FACING
@@ -274,6 +288,7 @@ def _block(
     shard: NDArray[np.int64],
     split: NDArray[np.uint8],
 ) -> tuple[NDArray[np.bool_], NDArray[np.uint8]]:
+    """Return the fault matrix bool[n, fault] and the strata uint8[n] of a block whose first sample is `start`."""
     n = len(shard)
     rng = config.rng(scene.dataset.seed, start, "plan", f"fault_matrix/{block}")
     make = fault_matrix_per_class if scene.plan.mode == "per_class" else fault_matrix_per_sample
@@ -295,7 +310,7 @@ def _block(
 def fault_matrix_per_class(
     n: int, faults: tuple[str, ...], p: float, rng: np.random.Generator, sizes: tuple[int, int] = (1, 6)
 ) -> NDArray[np.bool_]:
-    """bool[n, fault]: every class in exactly round(p·n) samples, straylight in the first of them."""
+    """Return bool[n, fault] with every class in exactly round(p·n) rows; straylight is in the first rows."""
     count = round(p * n)
     matrix = np.zeros((n, len(faults)), dtype=bool)
     for f, name in enumerate(faults):
@@ -307,10 +322,11 @@ def fault_matrix_per_class(
 def fault_matrix_per_sample(
     n: int, faults: tuple[str, ...], p: float, rng: np.random.Generator, sizes: tuple[int, int] = (1, 6)
 ) -> NDArray[np.bool_]:
-    """bool[n, fault]: exactly round(p·n) faulty samples, each with a non-empty subset of the classes.
+    """Return bool[n, fault] with exactly round(p·n) faulty rows, each with a non-empty subset of the classes.
 
-    Subset sizes are uniform in `sizes` (at most the number of classes). Subsets of a size are alike in chance, but
-    for what it takes to make the counts of any two classes differ by at most one. Rows with straylight come first.
+    Subset sizes are uniform in `sizes` (at most the number of classes). All subsets of one size have the same
+    probability, until some are changed so that the counts of any two classes differ by at most one. Rows with
+    straylight come first.
     """
     classes = len(faults)
     matrix = np.zeros((n, classes), dtype=bool)
@@ -319,7 +335,7 @@ def fault_matrix_per_sample(
         return matrix
     lo, hi = (min(s, classes) for s in sizes)
     size = rng.integers(lo, hi, faulty, endpoint=True)
-    # the `size` smallest of random keys are a random subset of that size
+    # the classes with the `size` smallest random keys are a random subset of that size
     rank = np.argsort(np.argsort(rng.random((faulty, classes), dtype=np.float32), axis=1), axis=1)
     rows = rank < size[:, None]
     _level(rows, rng)
@@ -341,8 +357,8 @@ def _level(rows: NDArray[np.bool_], rng: np.random.Generator) -> None:
     while (count != wanted).any():
         most, least = int(np.argmax(count - wanted)), int(np.argmin(count - wanted))
         number = min(count[most] - wanted[most], wanted[least] - count[least])
-        # rows with the one and without the other are at least as many as the counts' difference, which is at least
-        # the sum of excess and lack less one, and so at least `number`
+        # There are enough rows with `most` and without `least`: at least as many as the difference of the two
+        # counts, which is at least excess + lack - 1, and so at least `number`.
         chosen = rng.permutation(np.flatnonzero(rows[:, most] & ~rows[:, least]))[:number]
         rows[chosen, most], rows[chosen, least] = False, True
         count[most] -= number
@@ -359,10 +375,10 @@ def _dealt(
     split: NDArray[np.uint8],
     rng: np.random.Generator,
 ) -> NDArray[np.int64]:
-    """Which row of the fault matrix each sample of a block takes, int64[n].
+    """Return which row of the fault matrix each sample of a block takes, int64[n].
 
-    Rows of the same classes are neighbours in a line that is dealt over the shards, one round after the other; then
-    rows are exchanged between splits where a split lacks a class that the block has often enough.
+    The rows are sorted by their classes and distributed over the shards, one row per shard and round. Then rows are
+    exchanged between splits where a split lacks a class that the block has often enough.
     """
     n = len(shard)
     traits = np.column_stack([stratum == SUN_FACING, injected, ~injected.any(axis=1)])
@@ -385,12 +401,12 @@ def _dealt(
 def _exchange(
     traits: NDArray[np.bool_], split: NDArray[np.uint8], present: NDArray[np.uint8], enough: NDArray[np.bool_]
 ) -> tuple[int, int] | None:
-    """Two samples whose exchange leaves fewer (split, trait) without a sample; None where there is no such pair."""
+    """Return two samples whose exchange leaves fewer (split, trait) pairs empty, or None without such samples."""
     count = np.stack([traits[split == s].sum(axis=0) for s in present])
     for s, trait in np.argwhere((count == 0) & enough):
         mine = np.flatnonzero(split == present[s])[:_ROWS_COMPARED]
         theirs = np.flatnonzero((split != present[s]) & traits[:, trait])[:_ROWS_COMPARED]
-        gain = traits[theirs][None].astype(int) - traits[mine][:, None]  # what split s would win
+        gain = traits[theirs][None].astype(int) - traits[mine][:, None]  # what split s would gain
         other = np.searchsorted(present, split[theirs])
         after = [count[s] + gain, count[other][None] - gain]
         before = [np.broadcast_to(count[s], gain.shape), np.broadcast_to(count[other][None], gain.shape)]
@@ -405,10 +421,10 @@ def _exchange(
 
 
 def _shard_sites(scene: Scene, shards: int) -> NDArray[np.int32]:
-    """Site of each shard, int32[shards]: all samples of a shard share a site, so that a task loads one patch.
+    """Return the site of each shard, int32[shards]. All samples of a shard share it, so a task loads one patch.
 
-    Sites come in shuffled rounds, so they are used evenly. In the first one they come in an order in which every
-    split has its turn as early as can be.
+    Sites come in shuffled rounds, so they are used evenly. In the order of the first round, every split comes as
+    early as possible.
     """
     sites = scene.dataset.sites
     rounds = -(-shards // sites)
@@ -419,20 +435,27 @@ def _shard_sites(scene: Scene, shards: int) -> NDArray[np.int32]:
 
 
 def _site_order(scene: Scene) -> NDArray[np.int64]:
+    """Return the sites in the random order in which splits are assigned to them, int64[sites]."""
     return config.rng(scene.dataset.seed, 0, "plan", "split").permutation(scene.dataset.sites)
 
 
 def site_split(scene: Scene) -> NDArray[np.uint8]:
-    """Split of every site, uint8[sites]: whole sites only, so that no terrain is in two splits. No split with a
-    fraction above 0 is empty, where there are as many sites."""
+    """Return the split of every site, uint8[sites].
+
+    A site belongs to one split, so that no terrain is in two splits. No split with a fraction above 0 is empty if
+    there are as many sites as such splits.
+    """
     out = np.empty(scene.dataset.sites, dtype=np.uint8)
     out[_site_order(scene)] = _in_turn(scene, scene.dataset.sites, np.arange(len(SPLITS)))
     return out
 
 
 def individual_split(scene: Scene) -> NDArray[np.uint8] | None:
-    """Split of every device of the detector, uint8[individuals]: no device is in two splits, and each split that
-    has sites has one; None where there are too few for that, and all splits share them."""
+    """Return the split of every device of the detector, uint8[individuals], or None.
+
+    No device is in two splits, and each split that has sites has a device. The result is None where there are too
+    few devices for this; all splits then share all devices.
+    """
     used = np.unique(site_split(scene))
     count = scene.camera.individuals
     if count < len(used):
@@ -444,10 +467,10 @@ def individual_split(scene: Scene) -> NDArray[np.uint8] | None:
 
 
 def _in_turn(scene: Scene, count: int, used: NDArray[Any]) -> NDArray[np.uint8]:
-    """Splits of `count` things in a line, any beginning of which keeps to the scene's fractions: uint8[count].
+    """Return the splits of `count` ordered items, uint8[count]; every initial part keeps to the scene's fractions.
 
-    The first things go to one split each, the largest first. After them, the k-th of a split comes at
-    (k + ½) / fraction, as seats are given after Sainte-Laguë.
+    The first items go to one split each, the largest split first. After these, the k-th item of a split comes at
+    (k + ½) / fraction, as in the Sainte-Laguë method of seat allocation.
     """
     table = scene.dataset.split
     fraction = np.array([table.train, table.val, table.test])
@@ -465,7 +488,7 @@ def _in_turn(scene: Scene, count: int, used: NDArray[Any]) -> NDArray[np.uint8]:
 
 
 def _individuals(scene: Scene, samples: NDArray[np.int64], split: NDArray[np.uint8]) -> NDArray[np.int32]:
-    """Which device takes each sample, of those of its split."""
+    """Return the device that takes each sample, from the devices of its split, int32[n]."""
     of_split = individual_split(scene)
     u = config.keyed_uniform(scene.dataset.seed, samples, "plan", "individual")
     if of_split is None:
@@ -479,4 +502,5 @@ def _individuals(scene: Scene, samples: NDArray[np.int64], split: NDArray[np.uin
 
 
 def _pick(seed: int, samples: NDArray[np.int64], name: str, options: int) -> NDArray[np.uint8]:
+    """Return a uniform choice of one of `options` for each sample, uint8[n] from 0."""
     return (config.keyed_uniform(seed, samples, "plan", name) * options).astype(np.uint8)
