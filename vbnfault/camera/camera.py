@@ -70,7 +70,7 @@ class Camera:
 
     @property
     def intrinsics(self) -> NDArray[np.float64]:
-        """Return fx, fy, cx, cy in pixels, float64[4]. Pixel centres lie at +0.5, the axis in the frame's middle."""
+        """Return fx, fy, cx, cy in pixels, float64[4]. Pixel centres lie at +0.5, the axis in the middle."""
         f = self.focal_length_px
         return np.array([f, f, self.width_px / 2, self.height_px / 2])
 
@@ -80,7 +80,7 @@ class Camera:
         return float(np.degrees(2 * np.arctan(self.width_px / 2 / self.focal_length_px)))
 
     def project(self, direction_C: NDArray[np.float64]) -> NDArray[np.float64] | None:
-        """Return pixel x and y of a direction in C, float64[2]; None where it does not point to the front."""
+        """Return pixel x and y of a direction in C, float64[2]; None where it points sideways or backwards."""
         x, y, z = direction_C
         if z <= 1e-9:
             return None

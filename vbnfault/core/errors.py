@@ -5,8 +5,8 @@ Each message is one sentence. The errors hold plain strings only, so that they c
 
 from __future__ import annotations
 
-# Characters that a message and a value may have: enough for any key, value and allowed range. A longer text, which
-# only a user's file can cause, loses its middle.
+# The most characters of a message and of a value: enough for any key, value and allowed range. A longer text, such
+# as a value in a user's file, loses its middle.
 _LONGEST_MESSAGE = 2000
 _LONGEST_VALUE = 120
 
@@ -33,7 +33,7 @@ class InputChanged(VbnfaultError):
 
 def shown(value: object) -> str:
     """Return the `repr` of a value for an error message, without its middle where it is long."""
-    if isinstance(value, int) and value.bit_length() > 4096:  # Python writes at most 4300 digits
+    if isinstance(value, int) and value.bit_length() > 4096:  # by default Python writes at most 4300 digits
         return f"a whole number of {int(value.bit_length() * 0.30103)} digits"
     if isinstance(value, str | bytes | list | tuple) and len(value) > 4 * _LONGEST_VALUE:
         # `repr` of the whole could take long and fill the memory

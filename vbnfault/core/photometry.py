@@ -47,7 +47,8 @@ class Diffuse:
     - `mcewen`: 2 L cos i / (cos i + cos e) + (1 - L) cos i, the lunar-Lambert function of McEwen (1991, Icarus
       92, 298), with L(α) = 1 - 0.019 α + 2.42e-4 α² - 1.46e-6 α³, α in degrees, at least 0 (McEwen 1996, LPSC 27).
 
-    `phase_slope_mag_deg` is β in magnitudes per degree; 67P has 0.047 at 1.3-54° (Fornasier et al. 2015).
+    `phase_slope_mag_deg` is β in magnitudes per degree; 67P has 0.047 at phase angles of 1.3-54° (Fornasier et al.
+    2015).
     """
 
     reflectance: F64

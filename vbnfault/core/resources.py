@@ -173,7 +173,7 @@ class Contents:
         return {**vars(self), "_status": {}}  # it holds on one machine only
 
     def complete(self) -> None:
-        """Record that the run is planned, and so that all its files have been read."""
+        """Record that the run is planned: by now, all its files have been read."""
         self._complete = True
 
     def knows(self, path: str | Path) -> bool:
@@ -182,7 +182,7 @@ class Contents:
 
     @contextlib.contextmanager
     def in_use(self) -> Iterator[None]:
-        """Compare every file that this thread reads within a block."""
+        """Compare every file that this thread reads within a block with the first reading."""
         before = _in_use.set(self)
         try:
             yield

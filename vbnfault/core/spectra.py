@@ -25,7 +25,7 @@ GRAVITATION_SI = 6.67430e-11  # CODATA 2018
 
 F64 = NDArray[np.float64]
 
-# Geometric albedo of 67P per filter: Fornasier et al. 2015 (A&A 583, A30), disk-integrated Hapke fit.
+# Geometric albedo of 67P per filter: Fornasier et al. 2015 (A&A 583, A30), disc-integrated Hapke fit.
 ALBEDO_67P_WAVELENGTH_NM = np.array([325.0, 480.0, 535.0, 649.0, 700.0, 743.0, 882.0, 989.0])
 ALBEDO_67P_GEOMETRIC = np.array([0.0316, 0.0554, 0.0589, 0.0677, 0.0720, 0.0766, 0.0780, 0.0820])
 

@@ -455,7 +455,7 @@ def _unload(spiceypy: Any, before: int) -> None:
 def _dsk(spiceypy: Any, path: str) -> tuple[F64, NDArray[np.int64]]:
     """Return the vertices in km and the faces of a DSK (`read_dsk`).
 
-    A damaged file may state any number of plates, so that the numbers are checked against the size of the file.
+    A damaged file may state any number of plates, so the numbers are checked against the size of the file.
     """
     vertices: list[F64] = []
     faces: list[NDArray[np.int64]] = []

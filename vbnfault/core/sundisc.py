@@ -273,10 +273,10 @@ def _sums(
 
 
 def _covered(depth: F64, a: F64, b: F64) -> F64:
-    """Return the fraction of a rectangle on one side of a line, float64[...] in [0, 1].
+    """Return the fraction of a rectangle on the inner side of a line, float64[...] in [0, 1].
 
-    `depth` is the signed distance of the rectangle's centre from the line. `a` and `b` are the extents of its sides
-    across the line.
+    `depth` is the distance of the rectangle's centre from the line, positive on the inner side. `a` and `b` are the
+    extents of its sides across the line.
     """
     least = 1e-4 * (a + b) + 1e-300
     a, b = np.maximum(a, least), np.maximum(b, least)

@@ -221,7 +221,7 @@ class PatchTable(Table):
 
 
 class SunTable(Table):
-    """Set the date of the ephemeris, and the Sun's distance where the ephemeris shall not give it."""
+    """Set the date of the ephemeris, the Sun's distance (default: from the ephemeris) and its limb darkening."""
 
     julian_date: float = Field(2456974.0, ge=1_000_000, le=5_000_000, description="TDB; sets the body's attitude")
     distance_au: float | None = Field(None, gt=0.01, le=1000)
@@ -634,7 +634,7 @@ def parse_scene(table: Mapping[str, Any], *, source: str, overrides: Sequence[st
     """
     resources.check_plain(table, source)
     try:
-        # JSON mode is strict about types, but makes tuples of arrays. No key takes a date of TOML: a list fails.
+        # JSON mode is strict about types, but accepts arrays as tuples. No key takes a TOML date: as a list it fails.
         return Scene.model_validate_json(json.dumps(table, default=lambda date: [str(date)]), strict=True)
     except ValidationError as error:
         at = ".".join(map(str, error.errors()[0]["loc"]))

@@ -49,7 +49,7 @@ class Plan:
     - `stratum`, `site` and `split` (index in SPLITS) are integers[n].
     - `architecture` and `readout_direction` integers[n] are indices into the scene's lists of allowed values.
     - `individual` integers[n] is the device of the detector.
-    - `light` int64[n] is the sample whose Sun each sample has: itself, or the leading sample of its pair.
+    - `light` int64[n] is the sample whose Sun each sample has: itself, or the Sun-facing sample of its pair.
     - `paired` bool[n] marks the samples of pairs (`plan.pair_strata`).
     """
 
@@ -216,8 +216,8 @@ def _keep_sun_out_of_view(
     """Draw roll and pitch of Sun-averted samples again, in place, until the Sun is out of view.
 
     The paper's bounds leave 8 % of the Sun-averted draws looking at the Sun, where roll and pitch are both near
-    half a turn. Where the angles count from the Sun, only roll and pitch decide this. Raises InputError where the
-    bounds keep the Sun in view.
+    half a turn. Where the angles count from the Sun, only roll and pitch decide this. Where they count from the
+    nadir, the function does nothing. Raises InputError where the bounds keep the Sun in view.
     """
     if strata(scene)[SUN_AVERTED].reference != "sun":
         return
