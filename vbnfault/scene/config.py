@@ -634,7 +634,7 @@ def parse_scene(table: Mapping[str, Any], *, source: str, overrides: Sequence[st
     """
     resources.check_plain(table, source)
     try:
-        # JSON mode is strict about types, but accepts arrays as tuples. No key takes a TOML date: as a list it fails.
+        # JSON mode is strict about types, but accepts arrays as tuples. No key takes a TOML date: a list fails.
         return Scene.model_validate_json(json.dumps(table, default=lambda date: [str(date)]), strict=True)
     except ValidationError as error:
         at = ".".join(map(str, error.errors()[0]["loc"]))
