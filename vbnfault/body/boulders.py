@@ -116,7 +116,7 @@ def add_boulders(
     detail = facet_m[faces[face, 0]]
     edge = _EDGE_FACETS * detail * np.maximum(diameter / 0.5, 1.0) ** _EDGE_POWER
     edge *= np.clip(distance[face] / _CLOSE_M, _CLOSEST, 1.0)
-    # Coarser rocks are better than fewer rocks. `finest` limits a single rock to 6 % of the triangles.
+    # Coarser rocks are better than fewer rocks. `finest` limits a single rock to 6 % of the budget.
     finest = min(_LEVELS, max(1, int(np.log2(max(0.06 * budget / 20, 1.0)) / 2)))
     for coarser in _COARSER:
         level = np.clip(np.ceil(np.log2(0.53 * diameter / (coarser * edge))), 0, finest).astype(np.int64)
@@ -294,8 +294,7 @@ def _rocks(
     count = len(diameter)
     planes = _unit(rng.normal(size=(count, _PLANES, 3)))
     depth = rng.uniform(0.45, 0.80, size=(count, _PLANES))
-    # Joints in rock are parallel or perpendicular: plane 1 is opposite to plane 0, and plane 2 is perpendicular to
-    # it.
+    # Joints in rock are parallel or perpendicular: plane 1 is opposite to plane 0, plane 2 perpendicular to it.
     planes[:, 1] = _unit(-planes[:, 0] + 0.15 * rng.normal(size=(count, 3)))
     planes[:, 2] = _unit(np.cross(planes[:, 0], planes[:, 3]) + 0.1 * rng.normal(size=(count, 3)))
     radius = np.ones((count, len(sphere)))
@@ -312,8 +311,8 @@ def _rocks(
     )
     rock = radius[:, :, None] * sphere * semi[:, None, :]
     normal = _ground_normal(at, normal, 0.5 * diameter, ground, tree)
-    # The third, most squeezed axis lies near the ground's normal, so that rocks rest on their broad side. The
-    # heading is random.
+    # The third axis, usually the shortest, lies near the ground's normal, so that rocks rest on their broad side.
+    # The heading is random.
     up = _unit(normal + 0.25 * rng.normal(size=(count, 3)))
     side = _unit(np.cross(up, rng.normal(size=(count, 3))))
     rock = np.einsum("nvk,nki->nvi", rock, np.stack([side, np.cross(up, side), up], axis=1))

@@ -1,8 +1,9 @@
 """Read the shape formats of small-body science: plate tables, v/f lines, Gaskell's ICQ, VRML and NAIF's DSK.
 
-Each reader takes a file's bytes and the name for messages. It returns the mesh as stored: vertices float64[n, 3] in
-the file's unit, and faces int64[m, 3], counted from 0, with all indices in range. `shape.check_mesh` then checks
-whether the mesh bounds a solid. A malformed file raises InputError with the line number.
+Each reader here takes a file's bytes and the name for messages (`core.spice` reads DSKs). It returns the mesh as
+stored: vertices float64[n, 3] in the file's unit, and faces int64[m, 3], counted from 0, with all indices in range.
+`shape.check_mesh` then checks whether the mesh bounds a solid. A malformed file raises InputError with the line
+number.
 """
 
 from __future__ import annotations
@@ -242,9 +243,8 @@ def read_vrml(data: bytes, source: str) -> Mesh:
     Raises
     ------
     InputError
-        With the line: a transform other than the identity, or geometry used again, since both would change the
-        shape silently; a list that is not closed, contains something else than numbers, or names points that do not
-        exist.
+        With the line: a transform is not the identity or geometry is used again, which would change the shape
+        silently; or a list is not closed, holds anything but numbers, or names points that do not exist.
     """
     if not re.match(rb"\s*#VRML", data):
         raise InputError(
@@ -303,9 +303,9 @@ def _without_comments(data: bytes) -> bytes:
 
 
 def _clean(data: bytes) -> bytes:
-    """Return the text with E exponents, without commas, and with a blank before each minus sign.
+    """Return the text with E exponents, without commas, and with blanks between numbers.
 
-    Fortran's fixed columns may lack that blank.
+    In Fortran's fixed columns, the blank before a minus sign may be missing.
     """
     return _GLUED.sub(b" -", data.translate(_FORTRAN))
 

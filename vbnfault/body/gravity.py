@@ -5,8 +5,8 @@ The formulas are those of Werner & Scheeres 1996, Celest. Mech. Dyn. Astron. 65,
     U = ½ Gρ (Σ_e L_e r_e·E_e·r_e - Σ_f ω_f r_f·F_f·r_f)
     ∇U = -Gρ (Σ_e L_e E_e·r_e - Σ_f ω_f F_f·r_f)
 
-The sums run over edges e and faces f; r points from the field point to the edge or face. E and F are dyads of
-normals, L_e is the logarithmic term of an edge, and ω_f is the solid angle of a face.
+The sums run over edges e and faces f; r points from the field point to any point of the edge or
+face. E and F are dyads of normals, L_e is the logarithmic term of an edge, and ω_f is the solid angle of a face.
 """
 
 from __future__ import annotations

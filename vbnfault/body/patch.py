@@ -108,14 +108,15 @@ def build_patch(
         1.1 until it reaches the facets of the global model. It is increased if the ground alone would take more
         than 66 % of `max_triangles`.
     radius_m
-        1 to 1e8 m.
+        Radius around the site within which facets have that size, 1 to 1e8 m.
     relief
         Factor on the heights added to the model, 0 to 10; 0 leaves the interpolated model.
     min_boulder_m
         Diameter of the smallest boulder near the site, 0.05 to 1e6 m. It grows with the distance beyond 20 m, and
         where boulders would cover the ground.
     max_triangles
-        Upper bound, at least twice the model's. To keep it, the smallest boulders (in angle) are left out.
+        Upper bound, at least twice the number of the model's faces. To keep it, the smallest boulders (in angle)
+        are left out.
     boulder_index, boulders_per_km2
         The cumulative size law N(>= D) = boulders_per_km2 · (D / 7 m)^-boulder_index over the whole patch, with an
         index of 0.5 to 6 and a density of 0 to 1e5. Defaults: 67P (Pajola et al. 2015).

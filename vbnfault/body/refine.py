@@ -13,7 +13,7 @@ from .shape import Float64, Int32
 # target, their mean is near the target.
 LIMIT_PER_TARGET = 1.6
 # Beyond the radius, the limit grows as this power of the distance, a little faster than the width of a pixel. The
-# number of triangles then falls as the distance to the power -0.2, until the body ends.
+# number of triangles per octave of distance then falls as the distance to the power -0.2, until the body ends.
 GROWTH_POWER = 1.1
 _PROBE = 4.0  # the number of triangles is predicted with facets coarser by this factor, which is much faster
 # A midpoint may leave the chord by at most this fraction of the edge, so that cliffs do not bulge.

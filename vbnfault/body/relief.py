@@ -96,8 +96,8 @@ def add_relief(
     Parameters
     ----------
     mesh
-        Points float64[n, 3] in metres relative to the site in T axes, unit normals float64[n, 3], faces int32[m,
-        3].
+        Points float64[n, 3] in metres relative to the site in T axes, unit normals float64[n, 3], and faces
+        int32[m, 3].
     facet_m
         float64[n]: the facets' size at each vertex. Wavelengths shorter than about two facets are left out.
     scale

@@ -74,7 +74,7 @@ class Detail:
         self._pixel = dr.opaque(mi.Float, pixel_rad)
         self._inverse_radius2 = dr.opaque(mi.Float, relief.radius_m**-2)
         self._growth = dr.opaque(mi.Float, relief.growth)
-        # the two tiles' scales differ by 2 near the site
+        # near the site, the scales of the two tiles differ by a factor of 2
         self._per_m = dr.opaque(mi.Float, _LONGEST_M * np.sqrt(2) / relief.longest_m)
         self._fall = dr.opaque(mi.Float, relief.hurst - 1)
         self._pyramid = _pyramid()

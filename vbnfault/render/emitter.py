@@ -14,8 +14,8 @@ from .sampling import opaque_vector
 class SunDisc:
     """Compute directions towards points of the disc.
 
-    Directions are offsets from the direction of the centre, because the cosine of a quarter of a degree differs
-    from 1 by a few significant bits only in float32.
+    Directions are offsets from the direction of the centre. In float32, the cosine of a quarter of a degree would
+    keep only a few significant bits of its difference from 1.
     """
 
     def __init__(self, sun: Sunlight) -> None:

@@ -35,8 +35,8 @@ SUN_DIMENSION = 0
 # Least and greatest number of cells along each side of the grid over the Sun's disc; rays to each cell show whether
 # it is hidden.
 _CELLS = (128, 1024)
-# Points of the pupil per cell, if the grid has the least number of cells: parts of a spacecraft a metre away are
-# out of focus.
+# Points of the pupil per cell, if the grid has the least number of cells. Several are needed because parts of a
+# spacecraft a metre away are out of focus.
 _PUPIL_POINTS = 4
 # Steps of a sequence that is even in four dimensions: powers of 1/x, where x is the root of x⁵ = x + 1.
 _KRONECKER = 1.1673039782614187 ** -np.arange(1.0, 5.0)
@@ -62,9 +62,9 @@ def direct(
     Radiance
         Array [band, y, x], or [band, 1, pixel] for listed pixels.
     error
-        float32[y, x] or [1, pixel]: half the signed difference between the signals of two halves of the pixel's
-        samples. Its variance is that of the pixel's own error or slightly larger, because half as many strata leave
-        more to chance. The Sun's disc is exact.
+        float32[y, x] or [1, pixel]: half the signed difference between the mean signals of two halves of the
+        pixel's samples. Its variance is that of the pixel's own error or slightly larger, because half as many
+        strata leave more to chance. The Sun's disc is exact.
     """
     view = scene.view
     wanted = Pixels(view.width_px * view.height_px) if pixels is None else Pixels(len(pixels), listed=pixels)

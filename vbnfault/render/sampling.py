@@ -116,9 +116,9 @@ def disc_sets(samples: int, dimension: int) -> NDArray[np.float64]:
     Each set has one point in each ring, one in each sector, and one in each tile of a few rings and sectors
     (Hammersley's points under random digit shifts).
 
-    The radius in a ring is where the cosine to the Sun's vertical has the ring's mean. Limb darkening is a
-    polynomial of that cosine and therefore adds no noise where the whole disc is visible. The parity of the digits'
-    sum divides rings and sectors evenly between the two halves of a chessboard over the samples.
+    The point of a ring lies where the cosine to the Sun's vertical has the ring's mean. Limb darkening is a
+    polynomial of that cosine and therefore adds no noise where the whole disc is visible. The parity of the sum of
+    digits divides rings and sectors evenly between the two halves of a chessboard over the samples.
     """
     rng = np.random.Generator(np.random.Philox(np.random.SeedSequence((samples, dimension))))
     if samples == 1:

@@ -33,8 +33,8 @@ _SPREAD = (
     (2, 0x1249249249249249),
 )
 
-# Least cosine between a normal and the direction to the viewer. Truth is stored in half precision, which moves a
-# cosine by up to √3 · 2⁻¹².
+# Least cosine between a normal and the direction to the viewer. Truth stores normals in half precision,
+# which moves a cosine by up to √3 · 2⁻¹².
 _LEAST_COSINE = 2.0**-11
 
 
@@ -206,8 +206,8 @@ def facing(normal: Any, view: Any) -> Any:
     """Return unit normals that face the viewer: those given, or the nearest ones that a visible surface can have.
 
     An interpolated normal, or one turned by fine relief, may point away from a viewer who sees its facet. No
-    visible surface element has such a normal. It is turned in the plane of normal and line of sight, no further
-    than to the tangent plane of the line of sight. `view` holds unit vectors from the surface to the viewer.
+    visible surface element has such a normal. The normal is turned in the plane of normal and line of sight, no
+    further than perpendicular to the line of sight. `view` holds unit vectors from the surface to the viewer.
     """
     cosine = dr.dot(normal, view)
     turned = dr.normalize(dr.fma(view, _LEAST_COSINE - cosine, normal))
@@ -224,8 +224,8 @@ def _corner_records(
 ) -> Any:
     """Return four floats per corner of each facet: its unit normal, and the distance of its tangent plane from 0.
 
-    The normal is the facet's own if the facet is flat, else that of the vertex. The order is [facet, corner,
-    float]. drjit fetches four floats, a power of two, in one packet.
+    The normal is the facet's own if the facet is flat, else that of the vertex. The order is
+    [facet, corner, float]. drjit fetches four floats, a power of two, in one packet.
     """
     corner = dr.arange(mi.UInt32, 3 * len(faces))
     facet = corner // 3
