@@ -1,4 +1,7 @@
-"""The body: its shape, gravity, sites and terrain. The T frame is the shape file's own body-fixed axes."""
+"""Describe the target body: its shape, gravity, sites and terrain.
+
+Frame T is fixed to the body. It has the origin and the axes of the shape file, and the body rotates about +z.
+"""
 
 from __future__ import annotations
 
@@ -38,24 +41,24 @@ __all__ = [
 ]
 
 DENSITY_67P_KG_M3 = 537.8  # Preusker et al. 2017, A&A 607, L1
-ROTATION_PERIOD_67P_S = 44654.8  # 12.4041 h, before perihelion: Scholten, Cheops frame document
+ROTATION_PERIOD_67P_S = 44654.8  # 12.4041 h, before perihelion (Scholten, Cheops frame document)
 EMBEDDED = "embedded"
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Body:
-    """A homogeneous, uniformly turning body.
+    """Describe a homogeneous body that rotates at a constant rate.
 
     Attributes
     ----------
     name
-        Free text.
+        Free text; it names the body in messages.
     vertices_m
-        float64[n, 3], metres, frame T: the file's own body-fixed axes, +z the pole, about which it turns.
+        float64[n, 3] in metres, frame T. The pole, about which the body rotates, is +z.
     faces
         int32[m, 3], closed, outward winding.
     density_kg_m3, rotation_period_s
-        Bulk density and sidereal period; the defaults are 67P's.
+        Bulk density and sidereal rotation period, both > 0. The defaults are those of 67P.
     """
 
     name: str
@@ -76,29 +79,31 @@ class Body:
 
     @cached_property
     def content_hash(self) -> str:
-        """sha256 (hex) of the vertices' little-endian float64 bytes and the faces' int32 bytes."""
+        """Return the sha256 (hex) of the vertices' little-endian float64 bytes and the faces' int32 bytes."""
         return hashlib.sha256(self.vertices_m.tobytes() + self.faces.tobytes()).hexdigest()
 
     @cached_property
     def volume_m3(self) -> float:
+        """Return the volume that the mesh encloses."""
         return signed_volume(self.vertices_m, self.faces)
 
     @cached_property
     def gravity(self) -> PolyhedronGravity:
+        """Return the gravity field of the body's polyhedron."""
         return PolyhedronGravity(self.vertices_m, self.faces, self.density_kg_m3)
 
     @cached_property
     def roughness(self) -> Roughness:
-        """The law that continues the shape's own roughness below its facets."""
+        """Return the law that continues the roughness of the shape below its facets."""
         return model_roughness(self)
 
     @property
     def omega_rad_s(self) -> float:
-        """Spin about T's +z."""
+        """Return the rotation rate about T's +z axis."""
         return 2.0 * math.pi / self.rotation_period_s
 
     def effective_gravity(self, points_T_m: ArrayLike) -> Float64:
-        """Attraction and centrifugal term, float64[k, 3] m/s², at float64[k, 3] or [3] metres in T."""
+        """Return attraction plus centrifugal term, float64[k, 3] in m/s², at float64[k, 3] or [3] metres in T."""
         return self.gravity.effective(points_T_m, self.omega_rad_s)
 
 
@@ -110,10 +115,19 @@ def load_body(
     density_kg_m3: float = DENSITY_67P_KG_M3,
     rotation_period_s: float = ROTATION_PERIOD_67P_S,
 ) -> Body:
-    """The packaged procedural nucleus ("embedded") or a shape file (see `load_shape`).
+    """Load the packaged procedural nucleus ("embedded") or a shape file.
 
-    Frame T is the file's own: its origin, its axes, +z the pole. For 67P models in the Cheops frame (SHAP5,
-    SHAP7) that is 67P/C-G_FIXED; the embedded nucleus is laid out in the same axes.
+    Frame T takes its origin and axes from the file; +z is the pole. For 67P models in the Cheops frame (SHAP5,
+    SHAP7), T is 67P/C-G_FIXED. The embedded nucleus uses the same axes.
+
+    Parameters
+    ----------
+    shape
+        "embedded" or the path of a shape file.
+    unit
+        Unit of the file, see `load_shape`; not used for the embedded nucleus.
+    name
+        Default: "embedded" or the file's name without its suffix.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Boulders: how many of which size lie where, their shapes, and how they rest on the ground."""
+"""Place boulders on the terrain: draw their sizes and positions, shape them and set them into the ground."""
 
 from __future__ import annotations
 
@@ -14,42 +14,47 @@ from .noise import noise_key
 from .refine import split
 from .shape import Float64, Int32, face_normals_areas
 
-PER_KM2 = 98.0  # N(>= 7 m): 3546 boulders on 36.4 km², Pajola et al. 2015, A&A 583, A37
+PER_KM2 = 98.0  # N(>= 7 m): 3546 boulders on 36.4 km² (Pajola et al. 2015, A&A 583, A37)
 INDEX = 3.6
 REFERENCE_M = 7.0
 LARGEST_M = 45.0
-NEAR_M = 20.0  # up to there the smallest are drawn; beyond, those that look as small as there
-# The law with its steep index would pave the ground many times over at a few decimetres. Where boulders cover
-# this share of it (more than 1: heaps), smaller ones are left out.
+# Up to this distance the smallest drawn diameter is constant. Beyond, it grows with the distance, so that its
+# angular size is constant.
+NEAR_M = 20.0
+# The steep size law, continued to a few decimetres, would cover the ground many times over. Where boulders cover
+# this fraction of the ground (above 1 they form heaps), smaller ones are left out.
 _MOST_COVER = 1.2
 _MOST_DRAWN = 150_000
 
-_PLANES = 18  # flat sides; deep cuts, or rocks look like eggs
-_LEVELS = 6  # of detail: 20 · 4^level triangles
-_EDGE_FACETS = 2.4  # edges of a rock of half a metre, in facets of the ground around it; of larger ones less
+_PLANES = 18  # flat sides of a rock; without deep cuts, rocks look like eggs
+_LEVELS = 6  # highest level of detail; level k has 20 · 4^k triangles
+# Edges of rocks up to half a metre, in edges of the ground around them. For larger rocks this number falls as the
+# diameter to the power `_EDGE_POWER`.
+_EDGE_FACETS = 2.4
 _EDGE_POWER = -0.3
-_CLOSE_M, _CLOSEST = 50.0, 0.45  # nearer, edges are shorter in proportion, down to that share
-_COARSER = (1.0, 1.2, 1.45, 1.75, 2.1)
-_FLAT_LEVELS = 2  # up to that level faces are the rock's own fracture planes
-_RING = 12  # directions in which the ground around a rock is looked at
+# Within this distance of the site, edges shrink in proportion to the distance, but not below this fraction.
+_CLOSE_M, _CLOSEST = 50.0, 0.45
+_COARSER = (1.0, 1.2, 1.45, 1.75, 2.1)  # factors on the edge length, tried until the triangles fit the budget
+_FLAT_LEVELS = 2  # up to this level, triangles are the rock's fracture planes and are shaded flat
+_RING = 12  # directions in which the ground around a rock is sampled
 _LOWEST_CORNERS = 8
-_BURIED = (0.10, 0.40)  # of its height, below the lowest ground around
+_BURIED = (0.10, 0.40)  # fraction of a rock's height that lies below the lowest ground around it
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Boulders:
-    """All boulders of a patch: closed meshes, and what was drawn.
+    """Hold all boulders of a patch: closed meshes and the values drawn for them.
 
     Attributes
     ----------
     vertices_m, faces
         float64[n, 3] in L and int32[m, 3], outward winding; boulder after boulder.
     flat
-        bool[m]: shaded with the face's own normal.
+        bool[m]: the face is shaded with its own normal.
     diameter_m, position_m
-        float64[k] the largest diameters and float64[k, 3] the centres.
+        float64[k] largest diameters, and float64[k, 3] centres in L.
     smallest_m
-        float64[k]: where each lies, the law was drawn from this diameter on.
+        float64[k]: smallest diameter for which the size law was drawn at each boulder's position.
     """
 
     vertices_m: Float64
@@ -61,7 +66,7 @@ class Boulders:
 
 
 def smallest_at(distance_m: Float64, min_boulder_m: float) -> Float64:
-    """Smallest diameter drawn at that distance from the site, metres."""
+    """Return the smallest diameter drawn at a distance from the site, metres."""
     return min_boulder_m * np.maximum(np.asarray(distance_m) / NEAR_M, 1.0)
 
 
@@ -80,9 +85,21 @@ def add_boulders(
     index: float,
     budget: int,
 ) -> Boulders:
-    """Scatter boulders over the ground, `budget` triangles at most; beyond, the smallest (in angle) are left out.
+    """Scatter boulders over the ground with at most `budget` triangles.
 
-    `points` float64[n, 3] in L and `facet_m`, `dust`, `talus`, `place_T_m` (body-fixed) at each of them.
+    If the boulders exceed the budget, their meshes first become coarser. If they still exceed it, the boulders that
+    are smallest in proportion to the smallest drawn diameter (nearly: smallest in angle) are left out.
+
+    Parameters
+    ----------
+    points, faces
+        float64[n, 3] in L, metres, and int32[m, 3]: the ground.
+    facet_m, dust, talus, place_T_m
+        Edge length, dust and talus in [0, 1], and body-fixed position at each of the points.
+    rng, seed
+        `rng` draws the boulders; `seed` selects the noise fields by which they cluster.
+    min_boulder_m, per_km2, index
+        The size law, as in `patch.build_patch`.
     """
     normals, _ = face_normals_areas(points, faces)
     centre = points[faces].mean(axis=1)
@@ -99,13 +116,13 @@ def add_boulders(
     detail = facet_m[faces[face, 0]]
     edge = _EDGE_FACETS * detail * np.maximum(diameter / 0.5, 1.0) ** _EDGE_POWER
     edge *= np.clip(distance[face] / _CLOSE_M, _CLOSEST, 1.0)
-    # Rather coarser rocks than fewer, and none that takes a large part of the triangles.
+    # Coarser rocks are better than fewer rocks. `finest` limits a single rock to 6 % of the budget.
     finest = min(_LEVELS, max(1, int(np.log2(max(0.06 * budget / 20, 1.0)) / 2)))
     for coarser in _COARSER:
         level = np.clip(np.ceil(np.log2(0.53 * diameter / (coarser * edge))), 0, finest).astype(np.int64)
         if np.sum(20 * 4**level) <= budget:
             break
-    # Cut at one multiple of the smallest everywhere, the law holds above that.
+    # The cut is at the same multiple of the smallest diameter everywhere, so the size law holds above it.
     order = np.argsort(-diameter / least, kind="stable")
     fits = np.cumsum(20 * 4 ** level[order]) <= budget
     kept = order[: int(np.argmin(fits)) if not fits.all() else len(order)]
@@ -141,14 +158,14 @@ def add_boulders(
 def _favour(
     normals: Float64, dust: NDArray, talus: NDArray, seed: int, place_T_m: Float64, faces: Int32
 ) -> Float64:
-    """How much likelier than elsewhere a boulder lies on each face."""
+    """Return the relative density of boulders on each face, float64[m]."""
     place = Points(place_T_m[faces].mean(axis=1))
     count = len(faces)
     broad = place.gradient(110.0, noise_key(seed, 9001), count) / GRADIENT_STD
     close = place.gradient(23.0, noise_key(seed, 9002), count) / GRADIENT_STD
     cluster = np.exp(1.0 * broad.astype(np.float64) + 0.6 * close)
     ground = 0.15 + 0.6 * (1 - dust.mean(axis=1)) + 7.0 * talus.mean(axis=1)
-    # None stay on steep ground.
+    # Boulders do not stay on steep ground.
     lie = np.clip((-normals[:, 2] - 0.70) / (0.84 - 0.70), 0, 1)
     return np.asarray(cluster * ground * lie, dtype=np.float64)
 
@@ -158,23 +175,26 @@ def _favour(
 
 @dataclass(frozen=True, kw_only=True)
 class SizeLaw:
-    """N(>= D) = per_m2 · (D / 7 m)^-index boulders per square metre, none above 45 m."""
+    """Describe the size law N(>= D) = per_m2 · (D / 7 m)^-index boulders per m², cut off above 45 m."""
 
     per_m2: float = 1e-6 * PER_KM2
     index: float = INDEX
 
     def above(self, diameter_m: ArrayLike) -> Float64:
-        """Cumulative number per square metre from that diameter up to the largest, 0 beyond."""
+        """Return the number per square metre from `diameter_m` up to the largest diameter; 0 beyond that."""
         d = np.minimum(np.asarray(diameter_m, dtype=np.float64), LARGEST_M)
         return self.per_m2 * ((d / REFERENCE_M) ** -self.index - (LARGEST_M / REFERENCE_M) ** -self.index)
 
     def draw(self, smallest_m: Float64, u: Float64) -> Float64:
-        """Diameters at quantiles u in [0, 1) of the law from `smallest_m` to 45 m."""
+        """Return the diameters at quantiles u in [0, 1) of the law from `smallest_m` to 45 m."""
         truncated = 1.0 - (smallest_m / LARGEST_M) ** self.index
         return np.asarray(smallest_m * (1.0 - u * truncated) ** (-1.0 / self.index))
 
     def paved_m(self, share: Float64) -> Float64:
-        """The diameter from which on boulders `share` times as dense as the law cover the most they may."""
+        """Return the diameter above which boulders cover the fraction `_MOST_COVER` of the ground.
+
+        `share` is the density of boulders on this ground, relative to the law's.
+        """
         index = max(self.index, 2.05)
         unit = np.pi / 4 * index / (index - 2) * self.per_m2 * REFERENCE_M**index
         return np.asarray((np.maximum(share, 0.0) * unit / _MOST_COVER) ** (1.0 / (index - 2)))
@@ -188,24 +208,26 @@ def scatter(
     law: SizeLaw,
     rng: np.random.Generator,
 ) -> tuple[Float64, NDArray[np.int64], Float64, Float64]:
-    """Draw boulders after a size law.
+    """Draw boulders from a size law.
 
     Parameters
     ----------
+    points, faces
+        float64[n, 3] in metres and int32[m, 3]: the ground.
     favour
-        float64[m], how much likelier than elsewhere a boulder lies on each face; only ratios count.
+        float64[m]: relative density of boulders on each face; only ratios count.
     smallest_m
-        float64[m], the smallest diameter drawn there; raised where boulders would pave the ground, and
-        everywhere where they would be too many.
+        float64[m]: smallest diameter drawn on each face. It is raised where boulders would cover the ground, and
+        raised everywhere if there would be too many boulders.
 
     Returns
     -------
     diameter_m, face, at, smallest_m
-        float64[n], int[n], float64[n, 3] and float64[n]: how large, on which face, where on it, and from which
-        diameter on the law was drawn there.
+        float64[n] diameters, int64[n] indices of the faces they lie on, float64[n, 3] positions on these faces, and
+        float64[n] smallest diameters for which the law was drawn there.
     """
     area = face_normals_areas(points, faces)[1]
-    # Normalised by area, so that clustering and bare slopes leave the mean density as published.
+    # Normalising by area keeps the mean density at its published value, whatever the clusters and empty slopes.
     share = favour / max(float(np.sum(favour * area) / np.sum(area)), 1e-12)
     least = np.maximum(smallest_m, law.paved_m(share))
     expected = share * area * law.above(least)
@@ -227,12 +249,12 @@ def scatter(
 
 @lru_cache(maxsize=8)
 def _icosphere(level: int) -> tuple[Float64, Int32]:
-    """Unit sphere of 20 · 4^level triangles, outward winding."""
+    """Return a unit sphere of 20 · 4^level triangles with outward winding."""
     t = (1.0 + np.sqrt(5.0)) / 2.0
     corners = np.array([(s, r * t, 0.0) for r in (1, -1) for s in (-1, 1)])
     points = np.concatenate([np.roll(corners, shift, axis=1) for shift in (0, 1, 2)])
     points /= np.linalg.norm(points, axis=1)[:, None]
-    # Neighbours on the icosahedron are 63.4° apart, the next nearest 116.6°.
+    # Neighbouring vertices of the icosahedron are 63.4° apart, the next nearest 116.6°.
     near = np.einsum("ik,jk->ij", points, points) > 0.4
     faces = np.array(
         [
@@ -251,6 +273,7 @@ def _icosphere(level: int) -> tuple[Float64, Int32]:
 
 
 def _unit(v: Float64) -> Float64:
+    """Return vectors scaled to unit length."""
     return v / np.maximum(np.sqrt(np.einsum("...i,...i->...", v, v)), 1e-12)[..., None]
 
 
@@ -263,17 +286,19 @@ def _rocks(
     tree: cKDTree,
     rng: np.random.Generator,
 ) -> tuple[Float64, Int32, Float64]:
-    """Rocks of one level of detail, float64[k, v, 3], the faces they share and their centres float64[k, 3]:
-    spheres cut by random planes, squeezed, turned and set into the ground."""
+    """Return rocks of one level of detail: float64[k, v, 3], their common faces and their centres float64[k, 3].
+
+    Each rock is a sphere that is cut by random planes, squeezed, turned and set into the ground.
+    """
     sphere, faces = _icosphere(level)
     count = len(diameter)
     planes = _unit(rng.normal(size=(count, _PLANES, 3)))
     depth = rng.uniform(0.45, 0.80, size=(count, _PLANES))
-    # Joints come in families: some planes face the opposite or a perpendicular way of the first.
+    # Joints in rock are parallel or perpendicular: plane 1 is opposite to plane 0, plane 2 perpendicular to it.
     planes[:, 1] = _unit(-planes[:, 0] + 0.15 * rng.normal(size=(count, 3)))
     planes[:, 2] = _unit(np.cross(planes[:, 0], planes[:, 3]) + 0.1 * rng.normal(size=(count, 3)))
     radius = np.ones((count, len(sphere)))
-    for k in range(_PLANES):  # plane by plane: all at once would take a gigabyte
+    for k in range(_PLANES):  # one plane at a time, because all at once would take a gigabyte
         cosine = np.einsum("ni,vi->nv", planes[:, k], sphere)
         radius = np.minimum(radius, depth[:, k, None] / np.maximum(cosine, 0.05))
     radius /= radius.max(axis=1, keepdims=True)
@@ -286,7 +311,8 @@ def _rocks(
     )
     rock = radius[:, :, None] * sphere * semi[:, None, :]
     normal = _ground_normal(at, normal, 0.5 * diameter, ground, tree)
-    # The squeezed axis lies near the ground's normal, heading at random: rocks rest on their broad side.
+    # The third axis, usually the shortest, lies near the ground's normal, so that rocks rest on their broad side.
+    # The heading is random.
     up = _unit(normal + 0.25 * rng.normal(size=(count, 3)))
     side = _unit(np.cross(up, rng.normal(size=(count, 3))))
     rock = np.einsum("nvk,nki->nvi", rock, np.stack([side, np.cross(up, side), up], axis=1))
@@ -296,7 +322,7 @@ def _rocks(
     lowest = _lowest_ground(at, normal, 0.5 * diameter, ground, tree)
     lift = lowest - low - rng.uniform(*_BURIED, count) * (high - low)
     centre = at + lift[:, None] * normal
-    for _ in range(3):  # down, until the lowest corners are in the ground beside them
+    for _ in range(3):  # lower the rock until its lowest corners are in the ground beside them
         corners = rock + centre[:, None, :]
         lowest_few = np.argsort(-corners[..., 2], axis=1, kind="stable")[:, :_LOWEST_CORNERS]
         corners = np.take_along_axis(corners, lowest_few[..., None], axis=1)
@@ -307,7 +333,7 @@ def _rocks(
 
 
 def _ground_normal(at: Float64, normal: Float64, radius: Float64, ground: Float64, tree: cKDTree) -> Float64:
-    """The ground's normal on the scale of a rock, float64[n, 3]: that of a ring around it."""
+    """Return the ground's unit normal at the scale of a rock, float64[n, 3], from a ring of points."""
     across, other = _tangents(normal)
     ring = [
         ground[tree.query(at + radius[:, None] * (np.cos(turn) * across + np.sin(turn) * other))[1]] - at
@@ -322,13 +348,14 @@ def _ground_normal(at: Float64, normal: Float64, radius: Float64, ground: Float6
 
 
 def _tangents(normal: Float64) -> tuple[Float64, Float64]:
+    """Return two unit vectors that are perpendicular to each normal and to each other."""
     axis = np.where(np.abs(normal[:, :1]) < 0.7, np.array([1.0, 0.0, 0.0]), np.array([0.0, 1.0, 0.0]))
     across = _unit(np.cross(axis, normal))
     return across, np.cross(normal, across)
 
 
 def _weathered(sphere: Float64, level: int, count: int, rng: np.random.Generator) -> Float64:
-    """Factors on the radius, float64[count, v]: lumps, pits and roughness, finer with each level."""
+    """Return factors on the radius, float64[count, v], for lumps and pits that become finer with each level."""
     origin = rng.uniform(-1e5, 1e5, size=(count, 1, 3))
     field = Points((origin + sphere[None]).reshape(-1, 3))
     size = count * len(sphere)
@@ -340,7 +367,7 @@ def _weathered(sphere: Float64, level: int, count: int, rng: np.random.Generator
 
 
 def _lowest_ground(at: Float64, normal: Float64, radius: Float64, ground: Float64, tree: cKDTree) -> Float64:
-    """Height of the lowest ground within a rock's reach, along the normal, float64[n] metres; at most 0."""
+    """Return the height along the normal of the lowest ground within a rock's reach, float64[n] m, at most 0."""
     across, other = _tangents(normal)
     lowest = np.zeros(len(at))
     for reach in (0.5, 1.0):

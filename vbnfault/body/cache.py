@@ -1,9 +1,9 @@
-"""Patches kept on disk, by content: what took many seconds to build is read in a fraction of one.
+"""Keep built patches on disk: to build one takes many seconds, to read one takes a fraction of a second.
 
-A file's name is a hash over all that decides its content: the body, the site, every parameter, the sources of the
-terrain code and the versions of the libraries that compute it. The file holds that hash and ends with a checksum
-over all of it: one that is damaged in any way is built again, and the user is told. A folder that cannot be written
-only costs the time.
+A file's name is a hash of everything that determines its content: the body, the site, all parameters, the sources
+of the terrain code, and the versions of the libraries that compute it. The file holds the same hash and ends with a
+checksum of all its bytes. A damaged file is reported to the user and the patch is built again. If the folder cannot
+be written, only time is lost.
 """
 
 from __future__ import annotations
@@ -44,13 +44,13 @@ _LIBRARIES = ("numpy", "scipy", "drjit")
 _ARRAYS = tuple(name for name in Patch.__dataclass_fields__ if name != "site")
 _SUFFIX = ".patch"
 _MAGIC = b"vbnfault patch 1"
-_HEADER = struct.Struct("<16sQ")  # magic, bytes of the table that follows
-_ALIGNED_BYTES = 64  # each array begins at a multiple
-_STALE_S = 3600.0  # an unfinished file that old belongs to no one
+_HEADER = struct.Struct("<16sQ")  # magic, and the number of bytes of the table that follows
+_ALIGNED_BYTES = 64  # each array begins at a multiple of this
+_STALE_S = 3600.0  # an unfinished file older than this belongs to no running process
 
 
 def cache_folder() -> Path:
-    """Where patches are kept: $VBNFAULT_CACHE_DIR, or vbnfault in the user's cache folder."""
+    """Return the folder for patches: $VBNFAULT_CACHE_DIR, or a folder vbnfault in the user's cache folder."""
     given = os.environ.get(FOLDER_VARIABLE)
     if given:
         return Path(given)
@@ -62,7 +62,13 @@ def cache_folder() -> Path:
 
 
 def cache_limit_bytes() -> int:
-    """How much may be kept: $VBNFAULT_CACHE_GIB (4 by default); 0 keeps nothing. Raises InputError."""
+    """Return the size limit of the cache from $VBNFAULT_CACHE_GIB (default 4); 0 keeps nothing.
+
+    Raises
+    ------
+    InputError
+        The variable is not a number from 0 to 1e6.
+    """
     text = os.environ.get(SIZE_VARIABLE, "")
     try:
         gib = float(text) if text else DEFAULT_GIB
@@ -74,9 +80,10 @@ def cache_limit_bytes() -> int:
 
 
 def cached_patch(body: Body, site: Site, **parameters: Any) -> Patch:
-    """`build_patch` with the same arguments, read from disk where it was built before; the same bits either way.
+    """Return what `build_patch` returns for the same arguments, from disk if it was built before.
 
-    Raises what `build_patch` raises, and InputError for an unusable $VBNFAULT_CACHE_GIB.
+    The patch is the same bit for bit in both cases. Raises what `build_patch` raises, and InputError if
+    $VBNFAULT_CACHE_GIB is unusable.
     """
     limit = cache_limit_bytes()
     if limit == 0:
@@ -101,19 +108,20 @@ def cached_patch(body: Body, site: Site, **parameters: Any) -> Patch:
 
 
 def _new_patch(body: Body, site: Site, parameters: dict[str, Any]) -> Patch:
+    """Build a patch and report the activity."""
     activity.begin(f"terrain of site {site.index} (new patch)")
     return build_patch(body, site, **parameters)
 
 
 def patch_key(body: Body, site: Site, **parameters: Any) -> str:
-    """sha256 (hex) of all that decides a patch: parameters left out count with their defaults."""
+    """Return the sha256 (hex) of all that determines a patch; omitted parameters count with their defaults."""
     bound = inspect.signature(build_patch).bind(body, site, **parameters)
     bound.apply_defaults()
     content = {
         "code": _code_hash(),
         "body": [body.content_hash, body.density_kg_m3, body.rotation_period_s],
         "site": [site.index, site.position_T_m.tolist(), site.T_from_L.tolist()],
-        # Numbers alike in value are alike: 1 and 1.0 build the same patch.
+        # Equal numbers give equal keys: 1 and 1.0 build the same patch.
         "parameters": {
             key: value if value is None else int(value) if key == "seed" else float(value)
             for key, value in bound.arguments.items()
@@ -125,6 +133,7 @@ def patch_key(body: Body, site: Site, **parameters: Any) -> str:
 
 @lru_cache(maxsize=1)
 def _code_hash() -> str:
+    """Return the sha256 (hex) of the terrain sources, the library versions and the platform."""
     parts = hashlib.sha256()
     for name in _SOURCES:
         parts.update(Path(__file__).with_name(f"{name}.py").read_bytes())
@@ -134,8 +143,10 @@ def _code_hash() -> str:
 
 
 def _read(path: Path, key: str, site: Site) -> Patch:
-    """Return the patch in a file. Raises ValueError where the file is damaged or another key's, OSError where it
-    cannot be read."""
+    """Return the patch in a file.
+
+    Raises ValueError if the file is damaged or has another key, and OSError if it cannot be read.
+    """
     if not stat.S_ISREG(path.stat().st_mode):
         raise ValueError("not a regular file")
     data = np.fromfile(path, dtype=np.uint8)
@@ -154,16 +165,16 @@ def _read(path: Path, key: str, site: Site) -> Patch:
     arrays, start = {}, _aligned(_HEADER.size + length)
     for name, dtype, shape in table["arrays"]:
         count = int(np.prod(shape, dtype=np.int64)) * np.dtype(dtype).itemsize
-        # numbers come back as arrays without axes
+        # `[()]` turns an array without axes into a number
         arrays[name] = data[start : start + count].view(dtype).reshape(shape)[()]
         start += _aligned(count)
     with contextlib.suppress(OSError):
-        os.utime(path)  # used last: evicted last
+        os.utime(path)  # marks the file as just used, so that it is evicted last
     return Patch(site=site, **arrays)
 
 
 def _parts(key: str, patch: Patch) -> Iterator[bytes]:
-    """Yield the content of a patch's file, in parts, the checksum last."""
+    """Yield the content of a patch's file in parts; the checksum is the last part."""
     arrays = {name: np.asarray(getattr(patch, name)) for name in _ARRAYS}
     rows = [[name, array.dtype.str, array.shape] for name, array in arrays.items()]
     table = json.dumps({"key": key, "arrays": rows}).encode()
@@ -176,11 +187,12 @@ def _parts(key: str, patch: Patch) -> Iterator[bytes]:
 
 
 def _aligned(count: int) -> int:
+    """Return a byte count rounded up to the alignment."""
     return -(-count // _ALIGNED_BYTES) * _ALIGNED_BYTES
 
 
 def _write(path: Path, key: str, patch: Patch, limit_bytes: int) -> None:
-    """Write under another name, then rename: whoever reads finds a whole file or none."""
+    """Write the patch under another name, then rename it, so that a reader sees the whole file or none."""
     unfinished = None
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -193,7 +205,8 @@ def _write(path: Path, key: str, patch: Patch, limit_bytes: int) -> None:
         os.replace(unfinished, path)
         unfinished = None
         _evict(path.parent, limit_bytes)
-    except OSError:  # read-only, full, or another worker's file in use: the patch is built, and that is enough
+    # The folder is read-only or full, or another worker uses the file. The patch is built all the same.
+    except OSError:
         pass
     finally:
         if unfinished is not None:
@@ -202,12 +215,12 @@ def _write(path: Path, key: str, patch: Patch, limit_bytes: int) -> None:
 
 
 def _evict(folder: Path, limit_bytes: int) -> None:
-    """Remove what was used longest ago until the rest fits, and what a killed process left unfinished."""
+    """Remove the least recently used files until the rest fits, and old unfinished files of killed processes."""
     kept = []
     for path in folder.glob("patch-*"):
-        with contextlib.suppress(OSError):  # another worker may evict as well
+        with contextlib.suppress(OSError):  # another worker may evict at the same time
             status = path.stat()
-            if path.suffix in (_SUFFIX, ".npz"):  # .npz: of versions before
+            if path.suffix in (_SUFFIX, ".npz"):  # .npz files are from earlier versions
                 kept.append((status.st_mtime, status.st_size, path))
             elif path.suffix == ".part" and time.time() - status.st_mtime > _STALE_S:
                 path.unlink()

@@ -1,8 +1,9 @@
-"""Random fields at a million points at once: drjit, on the LLVM backend, loaded when first used.
+"""Evaluate random fields at a million points at once, with drjit on the LLVM backend (loaded at first use).
 
-Each field is a function of body-fixed position and a key alone. Positions are float64 on the device; a cell is
-their integer part, hashed, and what is left is float32, so that kilometres from the body's centre lose nothing.
-Every point is worked on by itself, in the same order of operations: no thread count or neighbour changes a bit.
+Each field is a function of body-fixed position and a key alone. Positions are float64 on the device. The integer
+part of a position names a cell and is hashed; the remaining fraction is float32. Kilometres from the body's centre
+therefore cost no precision. Each point is evaluated by itself in the same order of operations, so that neither the
+number of threads nor the neighbouring points change a bit.
 """
 
 from __future__ import annotations
@@ -18,17 +19,19 @@ from ..core import llvm
 from .noise import Float32, seed_word
 from .shape import Float64
 
-# The same noise at each octave would line its cells up at the origin of every power of two.
+# The axes of each octave are turned about this axis and shifted. Otherwise the cells of all octaves would align at
+# the origin.
 _TURN_AXIS = (0.26726124, 0.53452248, 0.80178373)
 _TURN_RAD = 1.3
 _OFFSET_CELLS = 0.37
 
-# The noises' standard deviation per unit of amplitude, measured over a million points.
+# Standard deviation of `Points.gradient`, measured over a million points.
 GRADIENT_STD = 0.191
 
 
 @lru_cache(maxsize=1)
 def _device() -> Any:
+    """Import drjit and return it with the array types used here."""
     llvm.prepare()
     import drjit
     import drjit.llvm as backend
@@ -43,7 +46,7 @@ def _device() -> Any:
 
 
 def octave_rotation(number: int) -> Float64:
-    """float64[3, 3]: how the axes of an octave are turned."""
+    """Return the rotation of an octave's axes, float64[3, 3]."""
     angle = _TURN_RAD * (number % 997)
     k = np.array(_TURN_AXIS)
     cross = np.array([[0, -k[2], k[1]], [k[2], 0, -k[0]], [-k[1], k[0], 0]])
@@ -51,7 +54,13 @@ def octave_rotation(number: int) -> Float64:
 
 
 class Points:
-    """Places in body-fixed metres, float64[n, 3], on the device; fields are asked for leading parts of them."""
+    """Hold body-fixed positions on the device and evaluate fields at the first `count` of them.
+
+    Parameters
+    ----------
+    place_m
+        float64[n, 3], metres.
+    """
 
     def __init__(self, place_m: Float64) -> None:
         d = _device()
@@ -59,41 +68,44 @@ class Points:
         self._axes = [d.Float64(np.ascontiguousarray(place_m[:, k])) for k in range(3)]
 
     def gradient(self, wavelength_m: float, key: int, count: int) -> Float32:
-        """Gradient noise of one cycle per 1-2 wavelengths, float32[count], mean 0, within ±1.3."""
+        """Return gradient noise of one cycle per 1-2 wavelengths, float32[count], mean 0, within ±1.3."""
         (value,) = self._run(_gradient, wavelength_m, key, count)
         return value
 
     def blocks(self, width_m: float, key: int, count: int) -> tuple[Float32, Float32, Float32]:
-        """Space cut into cells about one width across, each with a level and a tilt of its own.
+        """Evaluate a pattern of cells about one width across; each cell has its own random level and tilt.
 
-        Returns float32[count] each: the cell's plane (standard deviation about 0.4), the next nearest cell's,
-        and how far the border between them is, in metres.
+        Returns three arrays, float32[count]: the value of the cell's tilted plane (standard deviation about 0.4),
+        that of the second nearest cell, and the distance to the border between the two in metres.
         """
         level, other, gap = self._run(_blocks, width_m, key, count)
         return level, other, np.float32(width_m) * gap
 
     def craters(self, width_m: float, key: int, count: int, share: float) -> Float32:
-        """Bowls with rims, one at most in a cell of that width: float32[count], metres, negative inside.
+        """Return the height of bowls with rims, float32[count] in metres, negative inside.
 
-        `share` of the cells hold one. Diameters run from a third to two thirds of the width with a cumulative
-        index of 2, over all widths if each step of two has the same share.
+        A cell of this width holds at most one crater, and the fraction `share` of the cells holds one. Diameters
+        are a third to two thirds of the width, with a cumulative index of 2. The same index holds over several
+        widths if each is half of the one before and all have the same `share` of cells.
         """
         (value,) = self._run(_craters, width_m, key, count, share)
         return np.float32(width_m) * value
 
     def clods(self, width_m: float, key: int, count: int, share: float) -> Float32:
-        """Stones half in the ground, one at most in a cell of that width: float32[count], metres above it.
+        """Return the height above the ground of half-buried stones, float32[count] in metres.
 
-        `share` of the cells hold one; diameters are 0.3 to 0.65 of the width.
+        A cell of this width holds at most one stone, and the fraction `share` of the cells holds one. Diameters are
+        0.3 to 0.65 of the width.
         """
         (value,) = self._run(_clods, width_m, key, count, share)
         return np.float32(width_m) * value
 
     def _run(self, kernel: Callable, unit_m: float, key: int, count: int, *more: float) -> tuple[Float32, ...]:
+        """Evaluate a kernel at the first `count` positions, in units of `unit_m`, on the axes of its octave."""
         d = _device()
         if count == 0:
             return tuple(np.zeros(0, dtype=np.float32) for _ in range(3))[: 3 if kernel is _blocks else 1]
-        # Opaque: one compiled kernel serves all octaves.
+        # With opaque values, one compiled kernel serves all octaves.
         matrix = octave_rotation(key & 0xFFFF) / unit_m
         rows = [[d.dr.opaque(d.Float64, float(v)) for v in row] for row in matrix]
         shift = d.dr.opaque(d.Float64, _OFFSET_CELLS)
@@ -108,7 +120,7 @@ class Points:
 
 
 def _mix(d: Any, h: Any) -> Any:
-    """As `noise`'s: the lowbias32 finaliser (C. Wellons, public domain)."""
+    """Return mixed hash words, as in `noise`: the lowbias32 finaliser (C. Wellons, public domain)."""
     h = h ^ (h >> 16)
     h = h * d.UInt32(0x7FEB352D)
     h = h ^ (h >> 15)
@@ -117,7 +129,7 @@ def _mix(d: Any, h: Any) -> Any:
 
 
 def _split(d: Any, q: list[Any]) -> tuple[list[list[Any]], list[Any]]:
-    """Hash words of the cell below and above on each axis, and the float32 fraction."""
+    """Return hash words of the lower and the upper cell on each axis, and the float32 fraction."""
     words, fractions = [], []
     for x, prime in zip(q, (0x8DA6B343, 0xD8163841, 0xCB1AB31F), strict=True):
         floor = d.dr.floor(x)
@@ -128,17 +140,19 @@ def _split(d: Any, q: list[Any]) -> tuple[list[list[Any]], list[Any]]:
 
 
 def _corners(words: list[list[Any]], word: Any) -> list[tuple[int, int, int, Any]]:
+    """Return offsets and combined hash word of the eight cells around each point."""
     return [
         (i, j, k, words[0][i] ^ words[1][j] ^ words[2][k] ^ word) for i in (0, 1) for j in (0, 1) for k in (0, 1)
     ]
 
 
 def _unit(d: Any, h: Any, shift: int) -> Any:
-    """Ten bits of a hash as a number in [0, 1)."""
+    """Return ten bits of a hash as a number in [0, 1)."""
     return d.Float((h >> shift) & 1023) * (1.0 / 1024)
 
 
 def _gradient(d: Any, q: list[Any], word: Any) -> tuple[Any, ...]:
+    """Return gradient noise at positions in cells."""
     words, f = _split(d, q)
     fade = [x * x * x * (x * (x * 6 - 15) + 10) for x in f]
     total = d.Float(0)
@@ -147,7 +161,8 @@ def _gradient(d: Any, q: list[Any], word: Any) -> tuple[Any, ...]:
         dot = d.Float(0)
         weight = d.Float(1)
         for axis, step in enumerate((i, j, k)):
-            # Components spread evenly over ±1: lengths differ, which makes the noise a little patchy.
+            # The components are uniform over ±1. The gradients' lengths differ, which makes the noise slightly
+            # patchy.
             dot = dot + (2 * _unit(d, h, 10 * axis) - (1 - 1 / 1024)) * (f[axis] - step)
             weight = weight * (fade[axis] if step else 1 - fade[axis])
         total = total + weight * dot
@@ -155,6 +170,7 @@ def _gradient(d: Any, q: list[Any], word: Any) -> tuple[Any, ...]:
 
 
 def _blocks(d: Any, q: list[Any], word: Any) -> tuple[Any, ...]:
+    """Return the planes of the two nearest cells and the distance to their border, in cells."""
     words, f = _split(d, [x - 0.5 for x in q])
     nearest, second = d.Float(9), d.Float(9)
     level, other = d.Float(0), d.Float(0)
@@ -163,8 +179,8 @@ def _blocks(d: Any, q: list[Any], word: Any) -> tuple[Any, ...]:
     for i, j, k, h in _corners(words, word):
         h = _mix(d, h)
         g = _mix(d, h + 0x9E3779B9)
-        # Jitter of ±0.35 about the cell's centre: the nearest point is then nearly always among the eight
-        # cells looked at, and a miss only moves a fracture.
+        # With a jitter of ±0.35 about the cell's centre, the nearest point is nearly always in one of these eight
+        # cells. A miss only moves a fracture.
         offset = [f[axis] - (step + 0.15 + 0.7 * _unit(d, h, 10 * axis)) for axis, step in enumerate((i, j, k))]
         distance = offset[0] * offset[0] + offset[1] * offset[1] + offset[2] * offset[2]
         plane = d.Float(h >> 24) * (1.0 / 255) - 0.5
@@ -180,12 +196,13 @@ def _blocks(d: Any, q: list[Any], word: Any) -> tuple[Any, ...]:
         nearest = d.dr.select(closer, distance, nearest)
     between = [a - b for a, b in zip(near, far, strict=True)]
     apart = d.dr.sqrt(between[0] * between[0] + between[1] * between[1] + between[2] * between[2])
-    # Distance to the plane half way between the two centres.
+    # This is the distance to the plane midway between the two centres.
     gap = 0.5 * (second - nearest) / d.dr.maximum(apart, 1e-4)
     return level, other, gap
 
 
 def _craters(d: Any, q: list[Any], word: Any, share: Any) -> tuple[Any, ...]:
+    """Return the sum of the craters' heights at positions in cells."""
     words, f = _split(d, [x - 0.5 for x in q])
     total = d.Float(0)
     for i, j, k, h in _corners(words, word):
@@ -193,7 +210,7 @@ def _craters(d: Any, q: list[Any], word: Any, share: Any) -> tuple[Any, ...]:
         g = _mix(d, h + 0x9E3779B9)
         offset = [f[axis] - (step + _unit(d, h, 10 * axis)) for axis, step in enumerate((i, j, k))]
         distance = d.dr.sqrt(offset[0] * offset[0] + offset[1] * offset[1] + offset[2] * offset[2])
-        # Inverse of N(>= D) ~ D^-2. The rim's skirt ends at 1.5 radii, within the eight cells.
+        # The radius inverts N(>= D) ~ D^-2. The outer slope of the rim ends at 1.5 radii, within the eight cells.
         radius = (1.0 / 6) / d.dr.sqrt(1 - 0.75 * _unit(d, g, 0))
         x = distance / radius
         present = (_unit(d, g, 10) < share) & (x < 1.5)
@@ -208,6 +225,7 @@ def _craters(d: Any, q: list[Any], word: Any, share: Any) -> tuple[Any, ...]:
 
 
 def _clods(d: Any, q: list[Any], word: Any, share: Any) -> tuple[Any, ...]:
+    """Return the height of the highest stone at positions in cells."""
     words, f = _split(d, [x - 0.5 for x in q])
     highest = d.Float(0)
     for i, j, k, h in _corners(words, word):
@@ -216,7 +234,7 @@ def _clods(d: Any, q: list[Any], word: Any, share: Any) -> tuple[Any, ...]:
         offset = [f[axis] - (step + _unit(d, h, 10 * axis)) for axis, step in enumerate((i, j, k))]
         square = offset[0] * offset[0] + offset[1] * offset[1] + offset[2] * offset[2]
         radius = 0.15 + 0.175 * _unit(d, g, 0) * _unit(d, g, 0)
-        # Flat-topped, with a steep side: 1 - x^4 rather than a sphere's profile.
+        # 1 - (distance / radius)^4 has a flatter top and steeper sides than a sphere.
         x = square / (radius * radius)
         dome = radius * (0.35 + 0.5 * _unit(d, g, 10)) * (1 - x * x)
         highest = d.dr.maximum(highest, d.dr.select(_unit(d, g, 20) < share, dome, 0))

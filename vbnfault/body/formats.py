@@ -1,8 +1,9 @@
-"""Readers of the shape formats of small-body science: plate tables, Gaskell's ICQ, VRML, NAIF's DSK.
+"""Read the shape formats of small-body science: plate tables, v/f lines, Gaskell's ICQ, VRML and NAIF's DSK.
 
-Each reader takes a file's bytes and the name to use in messages, and returns the
-file's own mesh: vertices float64[n, 3] in the file's unit, faces int64[m, 3] counted from 0, indices within range.
-What the mesh bounds is for `shape.check_mesh` to say. A malformed file raises InputError with the line.
+Each reader here takes a file's bytes and the name for messages (`core.spice` reads DSKs). It returns the mesh as
+stored: vertices float64[n, 3] in the file's unit, and faces int64[m, 3], counted from 0, with all indices in range.
+`shape.check_mesh` then checks whether the mesh bounds a solid. A malformed file raises InputError with the line
+number.
 """
 
 from __future__ import annotations
@@ -33,20 +34,21 @@ _NUMBER = rb"[+-]?" + _UNSIGNED
 _NOT_A_NUMBER = re.compile(rb"(?<!\S)(?!" + _NUMBER + rb"(?:-" + _UNSIGNED + rb")*(?!\S))\S+")
 _FORTRAN = bytes.maketrans(b"Dd,", b"Ee ")
 _GLUED = re.compile(rb"(?<=[0-9.])-")
-# Gaskell's faces are stored with their common edges twice, rounded alike; more than this apart they do not meet.
+# An ICQ stores the common edges of its six faces twice, rounded alike. If the two copies differ by more than this
+# fraction of the extent, the edges do not meet.
 _ICQ_GAP_FRACTION = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
 class RawShape:
-    """A mesh as its file has it.
+    """Hold a mesh as its file stores it.
 
     Attributes
     ----------
     vertices, faces
         float64[n, 3] in the file's unit, int64[m, 3] from 0.
     unit
-        "km" where the format defines it, else None.
+        "km" if the format defines it, else None.
     """
 
     vertices: Float64
@@ -55,12 +57,12 @@ class RawShape:
 
 
 def read_shape(path: Path, data: bytes) -> RawShape:
-    """Return the mesh of a file of one of `SUFFIXES`, whose content `data` says which reader it needs.
+    """Return the mesh in a file; the content `data` and the suffix (one of `SUFFIXES`) select the reader.
 
     Raises
     ------
     InputError
-        The file is of none of the formats, malformed, or a DSK and spiceypy is not installed.
+        The file has none of these formats or is malformed, or it is a DSK and spiceypy is not installed.
     """
     source = str(path)
     head = data[:65536]
@@ -83,17 +85,18 @@ def read_shape(path: Path, data: bytes) -> RawShape:
 
 
 def read_plate_table(data: bytes, source: str) -> Mesh:
-    """A table of vertices and one of triangular plates, as in the PDS Small Bodies Node's models.
+    """Read a table of vertices and a table of triangular plates, as in the PDS Small Bodies Node's models.
 
-    The number of vertices, then of plates, both first or each above its table. A vertex is `x y z`, a plate three
-    vertex numbers; either may be preceded by its own number, or, as in OSIRIS's .ver, a plate by the count 3.
-    Numbers are counted from 1, or from 0 where a 0 occurs. Fixed or free format, commas, D exponents.
+    The numbers of vertices and plates stand at the start of the file, or each above its table. A vertex is `x y z`,
+    a plate is three vertex numbers. Each may be preceded by its own number; a plate may instead be preceded by the
+    count 3, as in OSIRIS's .ver files. Vertex numbers are counted from 1, or from 0 if a 0 occurs. Fixed and free
+    format, commas and D exponents are accepted.
 
     Raises
     ------
     InputError
-        With the line: no number where one is due, counts that the tables do not keep, numbers out of range, or
-        vertices given as latitude, longitude and radius.
+        With the line: a token is not a number, a table differs from its count, a vertex number is out of range, or
+        the vertices are given as latitude, longitude and radius.
     """
     table = _numbers(data, source)
     first = table[0]
@@ -111,11 +114,12 @@ def read_plate_table(data: bytes, source: str) -> Mesh:
     faces = table[face_at : face_at + face_width * faces_n].reshape(-1, face_width)[:, -3:]
 
     def line(row: int) -> int:
+        """Return the line of a plate."""
         return _token_line(data, face_at + face_width * row + face_width - 3)
 
     mesh = _from_one(vertices, faces, source, line)
     x, y, z = mesh[0].T
-    # A body-centred Cartesian model has vertices on both sides of the equator.
+    # A Cartesian model centred on the body has vertices on both sides of the equator, so z is not always positive.
     if z.min() > 0 and np.abs(x).max() <= 90 and np.ptp(x) > 150 and y.min() >= -180 and np.ptp(y) > 300:
         at = _token_line(data, vertex_at)
         raise InputError(
@@ -126,10 +130,10 @@ def read_plate_table(data: bytes, source: str) -> Mesh:
 
 
 def read_vertex_facet_letters(data: bytes, source: str) -> Mesh:
-    """Lines `v x y z` and `f a b c`, as in the PDS's radar shapes and early models of Eros.
+    """Read lines `v x y z` and `f a b c`, as in the PDS's radar shapes and early models of Eros.
 
-    Numbers are counted from 1, or from 0 where a 0 occurs; polygons are split into fans; whatever follows the
-    coordinates on a line, or a slash, is left out, as are the other statements of an OBJ file.
+    Vertex numbers are counted from 1, or from 0 if a 0 occurs. Polygons are split into fans. The reader ignores
+    anything after the coordinates or after a slash, and the other statements of an OBJ file.
 
     Raises
     ------
@@ -160,18 +164,18 @@ def read_vertex_facet_letters(data: bytes, source: str) -> Mesh:
 
 
 def read_icq(data: bytes, source: str) -> Mesh:
-    """Gaskell's implicitly connected quadrilaterals: Q, then 6(Q + 1)² vertices on the faces of a cube.
+    """Read Gaskell's implicitly connected quadrilaterals: Q, then 6(Q + 1)² vertices on the faces of a cube.
 
-    The six faces are joined at their edges and each quadrilateral is split along its shorter diagonal; wound
-    outwards. A column after the coordinates (albedo) is left out.
+    The six faces are joined at their edges. Each quadrilateral is split along its shorter diagonal and wound
+    outwards. A fourth column (albedo) is ignored.
 
     Source: Gaskell, "The Implicitly Connected Quadrilateral Format", document icqmodel of the PDS data set
-    HAY-A-AMICA-5-ITOKAWASHAPE-V1.0, which gives the order of the vertices and which of them coincide.
+    HAY-A-AMICA-5-ITOKAWASHAPE-V1.0. It gives the order of the vertices and says which of them coincide.
 
     Raises
     ------
     InputError
-        With the line: no number where one is due, another number of vertices than Q tells, edges that do not meet.
+        With the line: a token is not a number, the number of vertices does not fit Q, or edges do not meet.
     """
     table = _numbers(data, source)
     q = int(table[0]) if 1 <= table[0] < 2**15 and table[0] == np.floor(table[0]) else 0
@@ -187,8 +191,8 @@ def read_icq(data: bytes, source: str) -> Mesh:
         )
     rows = table[1:].reshape(count, -1)[:, :3]
 
-    # Where the vertex (i, j) of each face lies on a cube of side Q, laid out so that just those vertices meet
-    # which the format says are the same; i runs fastest.
+    # Positions of the vertices (i, j) of each face on a cube of side Q; i runs fastest. Exactly those vertices
+    # coincide that the format declares to be the same.
     j, i = np.meshgrid(np.arange(q + 1), np.arange(q + 1), indexing="ij")
     zero, full = np.zeros_like(i), np.full_like(i, q)
     cube = np.stack(
@@ -226,27 +230,27 @@ def read_icq(data: bytes, source: str) -> Mesh:
         ]
     )
     corners = vertices[faces]
-    if np.sum(corners[:, 0] * np.cross(corners[:, 1], corners[:, 2])) < 0:  # six times the volume
+    if np.sum(corners[:, 0] * np.cross(corners[:, 1], corners[:, 2])) < 0:  # six times the signed volume
         faces = faces[:, ::-1]
     return vertices, faces.astype(np.int64)
 
 
 def read_vrml(data: bytes, source: str) -> Mesh:
-    """All IndexedFaceSets of a VRML 1 or 2 file, polygons split into fans.
+    """Read all IndexedFaceSets of a VRML 1 or 2 file; polygons are split into fans.
 
-    Node names (DEF) of coordinates may be used again (USE).
+    Named coordinates (DEF) may be used again (USE).
 
     Raises
     ------
     InputError
-        With the line: what would change the shape unseen (transforms other than the identity, geometry used
-        again), lists that are not closed, are no numbers, or name points that do not exist.
+        With the line: a transform is not the identity or geometry is used again, which would change the shape
+        silently; or a list is not closed, holds anything but numbers, or names points that do not exist.
     """
     if not re.match(rb"\s*#VRML", data):
         raise InputError(
             f"{source}: line 1: expected '#VRML V1.0 ascii' or '#VRML V2.0 utf8', found {_shown(data)}."
         )
-    # Strings and comments are blanked, not cut, so that places keep their line.
+    # Strings and comments are overwritten with blanks, not removed, so that line numbers stay correct.
     text = re.sub(rb'"(?:\\.|[^"\\])*(?:"|\Z)|#[^\r\n]*', lambda m: re.sub(rb"[^\r\n]", b" ", m[0]), data)
     vertices: list[Float64] = []
     faces: list[Int64] = []
@@ -272,15 +276,17 @@ def read_vrml(data: bytes, source: str) -> Mesh:
 
 
 def _line(data: bytes, offset: int) -> int:
+    """Return the line number of a byte offset."""
     return data.count(b"\n", 0, offset) + 1
 
 
 def _shown(data: bytes) -> str:
+    """Return the first characters of some bytes, for a message."""
     return repr(data.strip()[:24].split(b"\n")[0].decode("ascii", "replace"))
 
 
 def _token_line(data: bytes, token: int) -> int:
-    """Line of the token-th number (from 0). For messages only: slow."""
+    """Return the line of a number, counted from 0. This is slow and serves messages only."""
     data = _clean(data)
     start = 0
     for count, match in enumerate(re.finditer(rb"\S+", data)):
@@ -291,22 +297,26 @@ def _token_line(data: bytes, token: int) -> int:
 
 
 def _without_comments(data: bytes) -> bytes:
+    """Return the text without # comments and without blanks at its end."""
     data = data.rstrip(b"\x1a\r\n\t ")
     return re.sub(rb"#[^\r\n]*", b"", data) if b"#" in data else data
 
 
 def _clean(data: bytes) -> bytes:
-    """Exponents with E, no commas, and the blank that Fortran's fixed columns may lack before a minus sign."""
+    """Return the text with E exponents, without commas, and with blanks between numbers.
+
+    In Fortran's fixed columns, the blank before a minus sign may be missing.
+    """
     return _GLUED.sub(b" -", data.translate(_FORTRAN))
 
 
 def _parsed(data: bytes) -> Float64 | None:
-    """All numbers of a text, None where something else is in it; "nan" and overflows are let through."""
+    """Return all numbers of a text, or None if anything else is in it; "nan" and overflows are accepted."""
     text = data.translate(_FORTRAN)
     if not text.strip():
         return np.empty(0)
     with warnings.catch_warnings():
-        warnings.simplefilter("error")  # numpy has both warned and raised here
+        warnings.simplefilter("error")  # some versions of numpy warn here, others raise
         for clean in (lambda: text, lambda: _clean(text)):  # few files need the search for glued numbers
             try:
                 return np.fromstring(clean(), dtype=np.float64, sep=" ")  # type: ignore[call-overload]
@@ -316,11 +326,11 @@ def _parsed(data: bytes) -> Float64 | None:
 
 
 def _numbers(data: bytes, source: str, lines: Lines = lambda line: line) -> Float64:
-    """All numbers of a text, float64[n], finite. `lines`: line of the file from a line of the text."""
+    """Return all numbers of a text, float64[n], finite. `lines` maps a line of the text to a line of the file."""
     values = _parsed(data)
     if values is not None and np.isfinite(values).all():
         return values
-    wrong = _NOT_A_NUMBER.search(data.translate(_FORTRAN))  # as long as the text it shows a piece of
+    wrong = _NOT_A_NUMBER.search(data.translate(_FORTRAN))  # both texts are equally long, so offsets agree
     if wrong is None:
         at = 1 if values is None else _token_line(data, int(np.argmin(np.isfinite(values))))
         raise InputError(f"{source}: line {lines(at)}: expected a number, found one that is too large.")
@@ -329,7 +339,7 @@ def _numbers(data: bytes, source: str, lines: Lines = lambda line: line) -> Floa
 
 
 def _from_one(vertices: Float64, faces: Float64, source: str, line: Lines) -> Mesh:
-    """Facets counted from 1, or from 0 where a 0 occurs, to indices; `line` gives that of a row of `faces`."""
+    """Convert vertex numbers from 1 (or from 0 if a 0 occurs) to indices; `line` maps rows of `faces` to lines."""
     broken = (faces != np.floor(faces)).any(axis=1)
     if broken.any():
         row = int(np.argmax(broken))
@@ -347,6 +357,7 @@ def _from_one(vertices: Float64, faces: Float64, source: str, line: Lines) -> Me
 
 
 def _listed(values: Float64) -> str:
+    """Return numbers as text, for a message."""
     return " ".join(f"{value:g}" for value in values)
 
 
@@ -354,13 +365,13 @@ def _listed(values: Float64) -> str:
 
 
 def _is_icq(data: bytes) -> bool:
-    """Whether a lone number is an ICQ's Q rather than a plate table's number of vertices."""
+    """Return whether a lone number in the first line is the Q of an ICQ, not the vertex count of a plate table."""
     rows = re.finditer(rb"\S[^\n]*", data)
     header = next(rows)[0].strip()
     if not re.fullmatch(rb"[0-9]{1,9}", header):
         return False
-    # A closed plate table of n vertices has 3n rows or fewer, an ICQ 6(Q + 1)²; and after its n vertices the plate
-    # table has the number of facets on a line of its own.
+    # A closed plate table of n vertices has at most 3n rows, an ICQ has 6(Q + 1)². The plate table also has the
+    # number of facets on a separate line after its n vertices.
     if data.count(b"\n") <= 4 * int(header):
         return False
     after = next(islice(rows, int(header), None), None)
@@ -368,11 +379,15 @@ def _is_icq(data: bytes) -> bool:
 
 
 def _counted(column: Float64) -> bool:
+    """Return whether a column counts rows from 0 or from 1."""
     return bool((column == np.arange(len(column)) + column[0]).all() and column[0] in (0, 1))
 
 
 def _layout(table: Float64) -> tuple[int, int, int, int, int] | None:
-    """Start and width of the vertices, start, width and number of the facets: the first that fits the whole."""
+    """Return the first layout that fits the whole table, or None.
+
+    The layout is start and width of the vertices, then start, width and number of the facets.
+    """
     vertices_n = int(table[0])
     for both_first in (True, False):
         for vertex_width in (4, 3):
@@ -399,7 +414,7 @@ def _layout(table: Float64) -> tuple[int, int, int, int, int] | None:
 
 
 def _table_error(data: bytes, table: Float64, source: str) -> InputError:
-    """Why no layout fits: the first line that is not as the counts and the first rows say."""
+    """Return the error for a table without a layout, with the first line that contradicts the counts."""
 
     def error(line: int, expected: str, found: str) -> InputError:
         return InputError(f"{source}: line {line}: expected {expected}, found {found}.")
@@ -446,11 +461,13 @@ def _table_error(data: bytes, table: Float64, source: str) -> InputError:
 
 
 def _not_a_statement(data: bytes, offset: int, source: str) -> InputError:
+    """Return the error for a line that is neither a vertex nor a facet."""
     found = _shown(data[offset : offset + 80])
     return InputError(f"{source}: line {_line(data, offset)}: expected 'v x y z' or 'f a b c', found {found}.")
 
 
 def _letter_line(data: bytes, letter: bytes, row: int) -> int:
+    """Return the line of the statement with this letter and row number."""
     for count, match in enumerate(re.finditer(rb"(?m)^[ \t]*" + letter + rb"[ \t]+", data)):
         if count == row:
             return _line(data, match.end())
@@ -458,8 +475,8 @@ def _letter_line(data: bytes, letter: bytes, row: int) -> int:
 
 
 def _rows(rows: list[bytes], form: str, source: str, line: Lines) -> Float64:
-    """Rows of numbers, all of the first one's width (at least 3), float64[n, width]."""
-    # One NaN as a mark at every row's end: a short row followed by a long one must not pass.
+    """Return rows of numbers, float64[n, width]; all are as wide as the first (at least 3 numbers)."""
+    # A NaN marks the end of every row. Without it, a short row followed by a long one would pass.
     marked = _parsed(b" nan\n".join([*rows, b""]))
     width = len(_clean(rows[0]).split())
     if (
@@ -485,7 +502,7 @@ def _rows(rows: list[bytes], form: str, source: str, line: Lines) -> Float64:
 _TOKEN = re.compile(rb"\[[^\[\]{}]*\]|[\[\]{}]|[^\s,\[\]{}]+")
 _IDENTITY = {
     b"translation": (0.0, 0.0, 0.0),
-    b"center": None,  # of a rotation and scale that are none
+    b"center": None,  # without effect, since rotation and scale must be the identity
     b"scale": (1.0, 1.0, 1.0),
     b"scaleFactor": (1.0, 1.0, 1.0),
     b"scaleOrientation": None,
@@ -497,7 +514,7 @@ Match = re.Match[bytes]
 
 @dataclass
 class _Node:
-    """A node while its braces are open."""
+    """Hold a VRML node while its braces are open."""
 
     kind: bytes
     name: bytes | None
@@ -509,11 +526,11 @@ class _Node:
 
 
 def _face_sets(text: bytes, source: str) -> Iterator[tuple[Match, Match]]:
-    """The lists of points and of indices of every IndexedFaceSet, in order."""
+    """Yield the lists of points and of indices of every IndexedFaceSet, in order."""
     stack = [_Node(b"", None, 0)]
     named: dict[bytes, Match | None] = {}
     shapes: set[bytes] = set()
-    current: Match | None = None  # VRML 1: the last Coordinate3 holds for what follows
+    current: Match | None = None  # in VRML 1, the last Coordinate3 applies to what follows
     before = [b"", b"", b""]
     key = b""
 
@@ -575,6 +592,7 @@ def _face_sets(text: bytes, source: str) -> Iterator[tuple[Match, Match]]:
 
 
 def _check_identity(node: _Node, text: bytes, source: str) -> None:
+    """Raise InputError if a transform node changes coordinates."""
     for key, values in node.values.items():
         if key == b"rotation":
             same = len(values) == 4 and values[3] == 0
@@ -589,12 +607,13 @@ def _check_identity(node: _Node, text: bytes, source: str) -> None:
 
 
 def _list_numbers(text: bytes, found: Match, source: str) -> Float64:
+    """Return the numbers in a bracketed list."""
     start = _line(text, found.start())
     return _numbers(found[0][1:-1], source, lambda line: start + line - 1)
 
 
 def _fans(values: Float64, points: int, text: bytes, found: Match, source: str) -> Int64:
-    """Polygons ended by -1, from `values` float64[n], as triangles int64[m, 3] that start in the first corner."""
+    """Split polygons, each ended by -1 in `values` float64[n], into fans of triangles int64[m, 3]."""
 
     def error(at: int, what: str) -> InputError:
         line = _line(text, found.start()) + _token_line(found[0][1:-1], at) - 1

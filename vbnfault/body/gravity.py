@@ -1,4 +1,13 @@
-"""Gravity of a homogeneous polyhedron: Werner & Scheeres 1996, Celest. Mech. Dyn. Astron. 65, 313-344."""
+"""Compute the gravity of a homogeneous polyhedron.
+
+The formulas are those of Werner & Scheeres 1996, Celest. Mech. Dyn. Astron. 65, 313-344:
+
+    U = ½ Gρ (Σ_e L_e r_e·E_e·r_e - Σ_f ω_f r_f·F_f·r_f)
+    ∇U = -Gρ (Σ_e L_e E_e·r_e - Σ_f ω_f F_f·r_f)
+
+The sums run over edges e and faces f; r points from the field point to any point of the edge or
+face. E and F are dyads of normals, L_e is the logarithmic term of an edge, and ω_f is the solid angle of a face.
+"""
 
 from __future__ import annotations
 
@@ -13,18 +22,18 @@ GRAVITATIONAL_CONSTANT = 6.67430e-11  # m³ kg⁻¹ s⁻², CODATA 2018
 
 
 class GravityField(NamedTuple):
-    """Potential (positive, U = GM/r far away) and acceleration (its gradient) at k points."""
+    """Hold the potential (positive, U = GM/r far away) and the acceleration (its gradient) at k points."""
 
     potential_m2_s2: Float64
     acceleration_m_s2: Float64
 
 
 class PolyhedronGravity:
-    """A polyhedron's field, with the dyads of its edges and faces computed once.
+    """Compute the field of a polyhedron; the dyads of its edges and faces are prepared once.
 
-    Valid inside, outside and on the surface (at an edge itself the logarithm is cut off, where its factor
-    vanishes). Each point's value is independent of the other points asked for with it, to the bit: sums run
-    over the mesh alone, outside BLAS, whose order of summation changes with threads and shapes.
+    The field is valid inside, outside and on the surface. At an edge itself, where its factor vanishes, the
+    logarithm is limited. The value at a point does not depend, to the bit, on the other points of the call: all
+    sums run over the mesh alone and avoid BLAS, whose order of summation changes with threads and shapes.
 
     Parameters
     ----------
@@ -38,7 +47,8 @@ class PolyhedronGravity:
 
     def __init__(self, vertices_m: NDArray, faces: NDArray, density_kg_m3: float) -> None:
         self.density_kg_m3 = float(density_kg_m3)
-        # About the centre of the box: the terms below cancel, and do so the better the smaller they are.
+        # Coordinates refer to the centre of the bounding box. The terms below nearly cancel, and smaller terms lose
+        # fewer digits.
         self._centre_m: Float64 = 0.5 * (vertices_m.max(axis=0) + vertices_m.min(axis=0)).astype(np.float64)
         self._vertices_m: Float64 = np.asarray(vertices_m, dtype=np.float64) - self._centre_m
         self._faces = np.asarray(faces, dtype=np.int64)
@@ -52,7 +62,8 @@ class PolyhedronGravity:
         owner = np.tile(np.arange(len(self._faces)), 3)
         along = self._vertices_m[directed[:, 1]] - self._vertices_m[directed[:, 0]]
         length = np.linalg.norm(along, axis=1)
-        # In the face's plane, square to the edge, pointing out of the face (counter-clockwise winding).
+        # These unit vectors lie in the face's plane, perpendicular to the edge, and point out of the face
+        # (counter-clockwise winding).
         outward = np.cross(along / length[:, None], normals[owner])
         half_dyad = np.einsum("ei,ej->eij", normals[owner], outward)
         key = directed.min(axis=1) * len(self._vertices_m) + directed.max(axis=1)
@@ -65,7 +76,7 @@ class PolyhedronGravity:
         self._edge_start_m: Float64 = self._vertices_m[self._edges[:, 0]]
 
     def evaluate(self, points_m: ArrayLike) -> GravityField:
-        """Potential and acceleration of the attraction alone.
+        """Return the potential and the acceleration of the attraction alone.
 
         Parameters
         ----------
@@ -80,18 +91,20 @@ class PolyhedronGravity:
         points = np.atleast_2d(np.asarray(points_m, dtype=np.float64)) - self._centre_m
         potential = np.empty(len(points))
         acceleration = np.empty((len(points), 3))
-        # One point at a time: tens of thousands of edges fill the vector units, and memory stays at one mesh.
+        # One point at a time is fast enough: tens of thousands of edges fill the vector units. Memory stays that of
+        # one mesh.
         for k, point in enumerate(points):
             potential[k], acceleration[k] = self._at(point)
         return GravityField(potential, acceleration)
 
     def _at(self, point: Float64) -> tuple[float, Float64]:
+        """Return the potential and the acceleration at one point, given relative to the centre of the box."""
         to_vertex = self._vertices_m - point
         distance = np.sqrt(np.einsum("vi,vi->v", to_vertex, to_vertex))
 
         to_edge = self._edge_start_m - point
         ends = distance[self._edges[:, 0]] + distance[self._edges[:, 1]]
-        # ln((a+b+e)/(a+b−e)) loses digits far away; as an inverse tanh it does not.
+        # ln((a+b+e)/(a+b−e)) loses digits far away. The equal 2 artanh(e/(a+b)) does not.
         ratio = np.minimum(self._edge_length_m / np.maximum(ends, 1e-300), 1.0 - 1e-16)
         log_term = 2.0 * np.arctanh(ratio)
         edge_vector = np.einsum("eij,ej->ei", self._edge_dyad, to_edge) * log_term[:, None]
@@ -115,7 +128,7 @@ class PolyhedronGravity:
         return float(potential), acceleration
 
     def effective(self, points_m: ArrayLike, omega_rad_s: float) -> Float64:
-        """Attraction plus the centrifugal term of a spin `omega_rad_s` about +z: float64[k, 3] in m/s²."""
+        """Return attraction plus the centrifugal term of a rotation about +z, float64[k, 3] in m/s²."""
         points = np.atleast_2d(np.asarray(points_m, dtype=np.float64))
         acceleration = self.evaluate(points).acceleration_m_s2
         acceleration[:, :2] += omega_rad_s**2 * points[:, :2]
@@ -123,17 +136,17 @@ class PolyhedronGravity:
 
 
 def polyhedron_gravity(vertices_m: NDArray, faces: NDArray, density_kg_m3: float, points_m: ArrayLike) -> Float64:
-    """Acceleration float64[k, 3] in m/s² at `points_m` float64[k, 3]; see `PolyhedronGravity`."""
+    """Return the acceleration float64[k, 3] in m/s² at `points_m` float64[k, 3]; see `PolyhedronGravity`."""
     return PolyhedronGravity(vertices_m, faces, density_kg_m3).evaluate(points_m).acceleration_m_s2
 
 
 def polyhedron_potential(vertices_m: NDArray, faces: NDArray, density_kg_m3: float, points_m: ArrayLike) -> Float64:
-    """Potential float64[k] in m²/s², positive, at `points_m` float64[k, 3]; see `PolyhedronGravity`."""
+    """Return the potential float64[k] in m²/s², positive, at `points_m` float64[k, 3]; see `PolyhedronGravity`."""
     return PolyhedronGravity(vertices_m, faces, density_kg_m3).evaluate(points_m).potential_m2_s2
 
 
 def effective_gravity(
     vertices_m: NDArray, faces: NDArray, density_kg_m3: float, points_m: ArrayLike, *, omega_rad_s: float
 ) -> Float64:
-    """Acceleration float64[k, 3] in m/s² felt by a body turning with the polyhedron about +z."""
+    """Return attraction plus centrifugal term, float64[k, 3] in m/s², of a polyhedron that rotates about +z."""
     return PolyhedronGravity(vertices_m, faces, density_kg_m3).effective(points_m, omega_rad_s)

@@ -1,4 +1,7 @@
-"""Hash-based noise in three dimensions: a function of position and seed alone, the same on every call."""
+"""Compute hash-based noise in three dimensions with numpy.
+
+The noise is a function of position and seed alone, so that every call returns the same values.
+"""
 
 from __future__ import annotations
 
@@ -10,13 +13,13 @@ from numpy.typing import NDArray
 Float32 = NDArray[np.float32]
 UInt32 = NDArray[np.uint32]
 
-_CHUNK = 32_768  # points at once: the temporaries stay in the cache, which more than halves the time
+_CHUNK = 32_768  # points at once; the temporaries then fit the processor's cache, which more than halves the time
 _PRIMES = tuple(np.uint32(p) for p in (0x8DA6B343, 0xD8163841, 0xCB1AB31F))
 _MIX = (np.uint32(0x7FEB352D), np.uint32(0x846CA68B))
 
 
 def _mix(h: UInt32) -> UInt32:
-    """The lowbias32 finaliser (C. Wellons, public domain): each input bit reaches each output bit."""
+    """Return mixed hash words by the lowbias32 finaliser (C. Wellons, public domain); each bit affects all bits."""
     h = h ^ (h >> np.uint32(16))
     h = h * _MIX[0]
     h = h ^ (h >> np.uint32(15))
@@ -25,7 +28,7 @@ def _mix(h: UInt32) -> UInt32:
 
 
 def _sphere_table() -> Float32:
-    """256 nearly even directions: a Fibonacci sphere."""
+    """Return 256 nearly even directions on a Fibonacci sphere, float32[256, 3]."""
     k = np.arange(256) + 0.5
     z = 1.0 - 2.0 * k / 256
     azimuth = np.pi * (1.0 + np.sqrt(5.0)) * k
@@ -37,21 +40,26 @@ _GRADIENTS = _sphere_table()
 
 
 def _axis_hashes(cell: NDArray[np.int64]) -> list[tuple[UInt32, UInt32]]:
-    low = cell.astype(np.uint32)  # wraps: negative cells are as good as any
+    """Return hash words of the lower and the upper cell on each axis."""
+    low = cell.astype(np.uint32)  # negative cells wrap around, which does no harm
     return [(low[:, k] * _PRIMES[k], (low[:, k] + np.uint32(1)) * _PRIMES[k]) for k in range(3)]
 
 
 def seed_word(seed: int) -> UInt32:
-    """uint32[1]: a seed's low 64 bits, mixed."""
+    """Return the low 64 bits of a seed, mixed into uint32[1]."""
     return _mix(_mix(np.array([seed & 0xFFFFFFFF], dtype=np.uint32)) ^ np.uint32((seed >> 32) & 0xFFFFFFFF))
 
 
 def noise_key(seed: int, stream: int) -> int:
-    """A noise seed for one use (`stream`, below 65536) of a run's seed: no two pairs share one below 2^48."""
+    """Return the noise seed of one use (`stream`, below 65536) of a run's seed.
+
+    Two different pairs never share a noise seed if the run's seeds are below 2^48.
+    """
     return (seed << 16) + stream
 
 
 def _by_chunks(kernel: Callable[[NDArray, UInt32], Float32], points: NDArray, seed: int, columns: int) -> Float32:
+    """Apply a noise kernel to chunks of the points, float32[n, columns]."""
     out = np.empty((len(points), columns), dtype=np.float32)
     word = seed_word(seed)
     for start in range(0, len(points), _CHUNK):
@@ -60,6 +68,7 @@ def _by_chunks(kernel: Callable[[NDArray, UInt32], Float32], points: NDArray, se
 
 
 def _gradient_kernel(points: NDArray, word: UInt32) -> Float32:
+    """Return gradient noise at points in units of the wavelength, float32[n, 1]."""
     floor = np.floor(points)
     f = (points - floor).astype(np.float32)
     fade = f * f * f * (f * (f * np.float32(6) - np.float32(15)) + np.float32(10))
@@ -80,13 +89,13 @@ def _gradient_kernel(points: NDArray, word: UInt32) -> Float32:
 
 
 def gradient_noise(points: NDArray, seed: int) -> Float32:
-    """Gradient noise with one cycle per 1-2 units: float32[n], mean 0, standard deviation 0.22, within ±1.
+    """Return gradient noise with one cycle per 1-2 units: float32[n], mean 0, standard deviation 0.22, within ±1.
 
     Parameters
     ----------
     points
-        float64[n, 3] in units of the wavelength. Float64, so that kilometres in units of a metre keep their
-        fraction.
+        float64[n, 3] in units of the wavelength. Float32 would lose the fraction of a kilometre in units of a
+        metre.
     seed
         Any integer; its low 64 bits count.
     """
@@ -94,7 +103,7 @@ def gradient_noise(points: NDArray, seed: int) -> Float32:
 
 
 def fractal_noise(points_m: NDArray, seed: int, wavelengths_m: NDArray, amplitudes_m: NDArray) -> Float32:
-    """Sum of gradient-noise octaves, float32[n] in the unit of the amplitudes."""
+    """Return a sum of gradient-noise octaves, float32[n] in the unit of the amplitudes."""
     total = np.zeros(len(points_m), dtype=np.float32)
     for octave, (wavelength, amplitude) in enumerate(zip(wavelengths_m, amplitudes_m, strict=True)):
         total += np.float32(amplitude) * gradient_noise(points_m / wavelength, seed + 7919 * octave)

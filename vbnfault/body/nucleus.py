@@ -1,8 +1,8 @@
-"""A procedural bilobed nucleus with 67P's published dimensions, so that everything works without a download.
+"""Generate a two-lobed nucleus with the published dimensions of 67P, so that everything works without a download.
 
-Dimensions and volume from Jorda et al. 2016 (Icarus 277), lobe centres from Preusker et al. 2015 (Table 4),
-in the axes of 67P/C-G_FIXED. The lobes' attitudes, and all relief, are made up to resemble 67P: smooth
-neck, layered cliffs, flat-floored plains, steep-walled pits.
+Dimensions and volume are from Jorda et al. 2016 (Icarus 277), the lobe centres from Preusker et al. 2015 (Table 4),
+in the axes of 67P/C-G_FIXED. The orientation of the lobes and all relief are invented to resemble 67P: a smooth
+neck, layered cliffs, plains with flat floors, and pits with steep walls.
 """
 
 from __future__ import annotations
@@ -20,20 +20,21 @@ from .shape import Float64, Int32, check_mesh, vertex_normals
 
 _SEED = 67
 _SPACING_KM = 0.066
-_BAND_KM = 0.45  # beyond the deepest relief from the smooth lobes there is nothing to draw
+_BAND_KM = 0.45  # relief is computed within this distance of the smooth lobes; none is deeper
 _METRES_PER_KM = 1000.0
 
-# Semi-axes in km, centre in km, and the directions of the short and the long axis (made orthogonal below).
+# Semi-axes in km, centre in km, and directions of the short and the long axis (`_axes` makes them orthogonal).
 _BIG = ((0.815, 1.76, 2.05), (-0.42, 0.26, -0.06), (0.71, -0.58, 0.41), (0.69, 0.70, -0.20))
 _SMALL = ((0.82, 1.07, 1.25), (1.48, -0.34, 0.25), (0.91, -0.34, 0.22), (0.31, 0.94, 0.16))
 _NECK_CENTRE_KM = (0.66, -0.20, -0.30)
 _NECK_RADIUS_KM = 0.72
-_SPUR_CENTRE_KM = (-1.35, -0.42, 0.10)  # the big lobe's blunt end, which no ellipsoid has
+_SPUR_CENTRE_KM = (-1.35, -0.42, 0.10)  # the blunt end of the big lobe, which an ellipsoid lacks
 _SPUR_RADIUS_KM = 0.95
-_GROWTH_KM = -0.035  # grows the body evenly; set so that the volume is 67P's
+_GROWTH_KM = -0.035  # even outward displacement of the surface, set so that the volume is 67P's
 
-# Flat faces meeting in blunt edges: the lobes, grown by this factor, are cut by planes at the given fraction
-# of the way to the grown surface. The first of each lobe is its great plain.
+# Planes cut the lobes into flat faces with blunt edges. Each plane has a direction, and a distance from the lobe's
+# centre as a fraction of that to the surface of the lobe grown by this factor. The first plane of each lobe is its
+# great plain.
 _GROWN = 1.08
 _CUTS = (
     (((-0.75, 0.55, -0.38), 0.86), ((-0.30, -0.80, 0.45), 0.87), ((-0.20, 0.25, 0.95), 0.80),
@@ -66,6 +67,7 @@ _PITS = (
 
 
 def _axes(short: tuple[float, ...], long: tuple[float, ...]) -> Float64:
+    """Return a lobe's unit axes as rows, float64[3, 3]: short, middle, long."""
     a = np.array(short) / np.linalg.norm(short)
     c = np.array(long) - np.dot(long, a) * a
     c /= np.linalg.norm(c)
@@ -73,7 +75,7 @@ def _axes(short: tuple[float, ...], long: tuple[float, ...]) -> Float64:
 
 
 def _lobe(points: Float64, lobe: tuple, cuts: tuple) -> Float64:
-    """First-order signed distance to the cut ellipsoid in km, negative inside."""
+    """Return the first-order signed distance to the cut ellipsoid in km, negative inside."""
     semi = _GROWN * np.array(lobe[0])
     axes = _axes(lobe[2], lobe[3])
     offset = points - np.array(lobe[1])
@@ -89,36 +91,38 @@ def _lobe(points: Float64, lobe: tuple, cuts: tuple) -> Float64:
 
 
 def _smooth_min(a: NDArray, b: NDArray, width: float) -> NDArray:
+    """Return the minimum, rounded where a and b differ by less than `width`."""
     h = np.maximum(width - np.abs(a - b), 0.0) / width
     return np.minimum(a, b) - h**3 * width / 6.0
 
 
 def _smooth_step(low: float, high: float, x: NDArray) -> NDArray:
+    """Return a smooth step from 0 at `low` to 1 at `high`."""
     t = np.clip((x - low) / (high - low), 0.0, 1.0)
     return t * t * (3.0 - 2.0 * t)
 
 
 def _terraces(height: NDArray, step: float) -> NDArray:
-    """Turns slopes into treads and risers of the given step: the layering's cliffs."""
+    """Return heights with slopes turned into treads and risers of the given step, like layered cliffs."""
     k = height / step
     base = np.floor(k)
     return step * (base + _smooth_step(0.62, 0.98, k - base))
 
 
 def _smooth_body(points: Float64) -> tuple[Float64, Float64]:
-    """Signed distance of lobes and neck in km, and how much a point belongs to the neck (0-1)."""
+    """Return the signed distance to lobes and neck in km, and how far each point belongs to the neck (0-1)."""
     big, small = _lobe(points, _BIG, _CUTS[0]), _lobe(points, _SMALL, _CUTS[1])
     neck = np.linalg.norm((points - np.array(_NECK_CENTRE_KM)) / np.array([0.75, 1.0, 1.0]), axis=-1)
     neck = neck - _NECK_RADIUS_KM
     spur = np.linalg.norm(points - np.array(_SPUR_CENTRE_KM), axis=-1) - _SPUR_RADIUS_KM
     distance = _smooth_min(_smooth_min(_smooth_min(big, spur, 0.5), small, 0.30), neck, 0.35)
-    # Hapi: the saddle as far from one lobe's surface as from the other's.
+    # The region Hapi is the saddle, where both lobes' surfaces are about equally far.
     saddle = 1.0 - _smooth_step(0.10, 0.42, np.maximum(np.abs(big - small), 0.8 * np.maximum(big, small)))
     return distance, saddle
 
 
 def _pits(points: Float64) -> tuple[Float64, Float64]:
-    """Depth cut (km, positive inwards, rims negative) and how flat the ground there is (0-1)."""
+    """Return the depth of the pits (km, positive inwards, rims negative) and the flatness of their floors (0-1)."""
     depth = np.zeros(len(points))
     flat = np.zeros(len(points))
     wobble = 0.16 * gradient_noise(points / 0.25, _SEED + 5) + 0.10 * gradient_noise(points / 0.1, _SEED + 6)
@@ -128,7 +132,8 @@ def _pits(points: Float64) -> tuple[Float64, Float64]:
         unit = np.array(direction) / np.linalg.norm(direction)
         reach = 1.0 / np.linalg.norm((axes @ unit) / np.array(semi))
         offset = points - (np.array(centre) + reach * unit)
-        # Across the pit's axis only, within reach along it: walls come out steep on curved ground.
+        # The profile depends on the distance across the pit's axis alone, within a limit along the axis. Walls are
+        # then steep on curved ground, too.
         normal = axes.T @ ((axes @ unit) / np.array(semi) ** 2)
         normal /= np.linalg.norm(normal)
         along = np.einsum("ni,i->n", offset, normal)
@@ -144,7 +149,7 @@ def _pits(points: Float64) -> tuple[Float64, Float64]:
 
 
 def _relief(points: Float64, saddle: Float64) -> Float64:
-    """Outward displacement in km."""
+    """Return the outward displacement in km."""
     warp = np.column_stack([gradient_noise(points / 0.7, _SEED + 11 + k) for k in range(3)])
     p = points + 0.18 * warp
     broad = fractal_noise(p, _SEED, np.array([1.7, 0.85]), np.array([0.36, 0.17]))
@@ -158,7 +163,7 @@ def _relief(points: Float64, saddle: Float64) -> Float64:
 
 
 def _umbrella(faces: Int32, count: int) -> scipy.sparse.csr_matrix:
-    """Averages a vertex's neighbours."""
+    """Return the matrix that averages the neighbours of each vertex."""
     i = np.concatenate([faces[:, [0, 1, 2]].ravel(), faces[:, [1, 2, 0]].ravel()])
     j = np.concatenate([faces[:, [1, 2, 0]].ravel(), faces[:, [0, 1, 2]].ravel()])
     matrix = scipy.sparse.csr_matrix((np.ones(len(i)), (i, j)), shape=(count, count))
@@ -167,9 +172,9 @@ def _umbrella(faces: Int32, count: int) -> scipy.sparse.csr_matrix:
 
 @lru_cache(maxsize=1)
 def embedded_nucleus() -> tuple[Float64, Int32]:
-    """The procedural nucleus: float64[n, 3] in metres and int32[m, 3], closed, outward winding, read-only.
+    """Return the procedural nucleus: float64[n, 3] in metres and int32[m, 3], closed, wound outwards, read-only.
 
-    Deterministic; made once in a process (about two seconds).
+    The result is deterministic and is made once per process (about two seconds).
     """
     low, high = np.array([-2.95, -2.25, -2.15]), np.array([2.95, 2.35, 2.10])
     shape = np.ceil((high - low) / _SPACING_KM).astype(int) + 1
@@ -186,7 +191,8 @@ def embedded_nucleus() -> tuple[Float64, Int32]:
     used, index = np.unique(faces, return_inverse=True)
     vertices, faces = vertices[used], index.reshape(-1, 3).astype(np.int32)
 
-    # Marching cubes leaves slivers and stair-steps: a little plain smoothing, then along the surface only.
+    # Marching cubes leaves slivers and steps. The first step smooths in all directions, the others only along the
+    # surface.
     average = _umbrella(faces, len(vertices))
     for step in range(6):
         move = average @ vertices - vertices
@@ -201,6 +207,7 @@ def embedded_nucleus() -> tuple[Float64, Int32]:
 
 
 def _largest_piece(faces: Int32, count: int) -> Int32:
+    """Return the faces of the connected piece that has the most faces."""
     ones = np.ones(len(faces) * 2)
     rows, columns = faces[:, [0, 1]].ravel(), faces[:, [1, 2]].ravel()
     graph = scipy.sparse.csr_matrix((ones, (rows, columns)), shape=(count, count))

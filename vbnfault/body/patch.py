@@ -1,13 +1,15 @@
-"""Terrain: the whole body as one closed mesh, refined and roughened around a site, with boulders on it.
+"""Build the terrain: the whole body as one closed mesh, refined and roughened around a site, with boulders on it.
 
-The global model's facets are tens of metres wide; a camera within a hundred metres of the ground needs relief
-down to its pixels. Three steps, the first two functions of body-fixed position and seed, so that neighbouring
-sites see the same ground:
+The facets of the global model are tens of metres wide. A camera within a hundred metres of the ground needs relief
+down to its pixels. Three steps provide it:
 
-1. edges near the site are split until they meet a target length, new points on the curved surface that the
-   model's points and normals suggest (`refine`);
-2. relief is added along the normal, its spectrum continuing the model's below its own facets (`relief`);
-3. boulders, closed meshes of their own, are set partly buried into the ground (`boulders`).
+1. `refine` splits the edges near the site until they meet a target length. New points lie on the curved surface
+   that the model's points and normals suggest.
+2. `relief` adds heights along the normal. Their spectrum continues that of the model below its facets.
+3. `boulders` sets boulders, which are closed meshes of their own, partly into the ground.
+
+The fields of the relief are functions of body-fixed position and seed, so that neighbouring sites see the same
+ground.
 """
 
 from __future__ import annotations
@@ -31,34 +33,34 @@ from .sites import Site
 if TYPE_CHECKING:
     from . import Body
 
-_GROUND_SHARE = 0.66  # of the triangles; the rest is left to the boulders
+_GROUND_SHARE = 0.66  # fraction of the triangles; the rest is left to the boulders
 _BOULDER_STREAM = 0xB0D
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Patch:
-    """The body as seen from one site.
+    """Hold the body's surface as built for one site.
 
     Attributes
     ----------
     site
-        Where; the origin of the coordinates.
+        The site, which is the origin of the coordinates.
     vertices_L_m
         float32[n, 3], metres from the site, L axes (x north, y east, z down).
     faces
-        int32[m, 3], outward winding: first the body, one closed surface, then boulders, each closed.
+        int32[m, 3], outward winding: first the body, one closed surface, then the boulders, each closed.
     face_is_boulder
         bool[m].
     face_is_flat
-        bool[m]: shaded with the face's own normal (small boulders); the others are smooth.
+        bool[m]: the face is shaded with its own normal (small boulders); the others are smooth.
     dust
         float32[n] in [0, 1] at each vertex: 1 where dust covers the ground, 0 on bare ground and boulders.
     boulder_diameter_m, boulder_position_L_m
         float32[k] largest diameter, and float32[k, 3] centre of each boulder.
     boulder_smallest_m
-        float32[k]: the diameter from which on the size law was drawn at the boulder's place.
+        float32[k]: smallest diameter for which the size law was drawn at the boulder's position.
     facet_m, radius_m
-        Mean edge length of the ground up to that distance from the site; beyond, it grows as the distance to the
+        Mean edge length of the ground within this distance of the site. Beyond, it grows as the distance to the
         power `GROWTH_POWER`.
     """
 
@@ -76,6 +78,7 @@ class Patch:
 
     @property
     def triangles(self) -> int:
+        """Return the number of triangles."""
         return len(self.faces)
 
 
@@ -94,37 +97,39 @@ def build_patch(
     craters_per_km2: float = 60.0,
     hurst: float | None = None,
 ) -> Patch:
-    """Build the terrain around a site; deterministic in (body, site, seed and the parameters).
+    """Build the terrain around a site; the result is deterministic in body, site, seed and the other parameters.
 
     Parameters
     ----------
     seed
         Non-negative integer.
     facet_m
-        Mean edge length within `radius_m` of the site, 0.05 to 1e6 m; beyond, it grows as the distance to the
-        power 1.1 until the global model's facets are reached. Coarsened where the ground alone would take more
+        Mean edge length within `radius_m` of the site, 0.05 to 1e6 m. Beyond, it grows as the distance to the power
+        1.1 until it reaches the facets of the global model. It is increased if the ground alone would take more
         than 66 % of `max_triangles`.
     radius_m
-        1 to 1e8 m.
+        Radius around the site within which facets have that size, 1 to 1e8 m.
     relief
-        Scales the heights added to the model, 0 to 10; 0 leaves the interpolated model.
+        Factor on the heights added to the model, 0 to 10; 0 leaves the interpolated model.
     min_boulder_m
-        Smallest boulder's diameter near the site, 0.05 to 1e6 m; grows with the distance beyond 25 m, and where
-        boulders would pave the ground.
+        Diameter of the smallest boulder near the site, 0.05 to 1e6 m. It grows with the distance beyond 20 m, and
+        where boulders would cover the ground.
     max_triangles
-        Upper bound, at least twice the model's; the smallest boulders (in angle) are left out beyond it.
+        Upper bound, at least twice the number of the model's faces. To keep it, the smallest boulders (in angle)
+        are left out.
     boulder_index, boulders_per_km2
-        The cumulative size law N(>= D) = boulders_per_km2 · (D / 7 m)^-boulder_index over the whole patch; 0.5 to
-        6, and 0 to 1e5. Defaults: 67P, Pajola et al. 2015.
+        The cumulative size law N(>= D) = boulders_per_km2 · (D / 7 m)^-boulder_index over the whole patch, with an
+        index of 0.5 to 6 and a density of 0 to 1e5. Defaults: 67P (Pajola et al. 2015).
     craters_per_km2
-        Pits and craters of 10 m diameter or more, cumulative index 2, 3 to 48 m; 0 to 600.
+        Number of pits and craters with a diameter of at least 10 m, 0 to 600. Diameters are 3 to 48 m with a
+        cumulative index of 2.
     hurst
-        Exponent of the roughness below the model's facets, 0.3 to 1.2; None: measured on the model.
+        Exponent of the roughness below the model's facets, 0.3 to 1.2. None: the exponent measured on the model.
 
     Raises
     ------
     InputError
-        A parameter out of its range.
+        A parameter is out of its range.
     """
     for key, value, low, high in (
         ("facet_m", facet_m, 0.05, 1e6),
@@ -202,5 +207,5 @@ def build_patch(
 
 @lru_cache(maxsize=4)
 def _roughness(body: Body) -> tuple[Roughness, float]:
-    """The model's law and mean edge: once a body, not once a site."""
+    """Return the model's roughness law and mean edge, computed once per body and not once per site."""
     return body.roughness, mean_edge_m(body.vertices_m, body.faces)

@@ -1,4 +1,4 @@
-"""Splitting a mesh's edges near a place until they meet a length, with no seam anywhere."""
+"""Split the edges of a mesh near a site until they meet a length limit, without any seam."""
 
 from __future__ import annotations
 
@@ -9,42 +9,47 @@ from numpy.typing import NDArray
 
 from .shape import Float64, Int32
 
-# Splitting halves an edge, so lengths end between half the limit and the limit; their mean is then near 1.
+# Splitting halves an edge, so final lengths lie between half the limit and the limit. With this ratio of limit to
+# target, their mean is near the target.
 LIMIT_PER_TARGET = 1.6
-# Beyond the radius the limit grows as this power of the distance: a little faster than a pixel's width does, so
-# that the triangles, which then fall off as distance to the -0.2, end with the body.
+# Beyond the radius, the limit grows as this power of the distance, a little faster than the width of a pixel. The
+# number of triangles per octave of distance then falls as the distance to the power -0.2, until the body ends.
 GROWTH_POWER = 1.1
-_PROBE = 4.0  # the triangle count is foretold with facets coarser by this, in a fraction of the time
-# A midpoint may leave the chord by at most this fraction of the edge: cliffs stay cliffs instead of bulging.
+_PROBE = 4.0  # the number of triangles is predicted with facets coarser by this factor, which is much faster
+# A midpoint may leave the chord by at most this fraction of the edge, so that cliffs do not bulge.
 _MAX_BULGE = 0.06
 
 
 @dataclass(frozen=True)
 class EdgeLimit:
-    """Longest edge left unsplit, in metres, at points given relative to the site."""
+    """Compute the longest edge that is left unsplit, in metres, at points relative to the site."""
 
     facet_m: float
     radius_m: float
 
     def facet_at(self, points: Float64) -> Float64:
-        """Mean edge length in metres aimed at there."""
+        """Return the target mean edge length at the points, metres."""
         return self(points) / LIMIT_PER_TARGET
 
     def __call__(self, points: Float64) -> Float64:
         return self._at(np.sqrt(np.einsum("...i,...i->...", points, points)))
 
     def along(self, a: Float64, b: Float64) -> Float64:
-        """At the point nearest the site on each edge a-b: a long one can pass it between two far ends."""
+        """Return the limit at the point of each edge a-b that is nearest the site.
+
+        A long edge can pass the site between two far ends. The point is kept within the middle half of the edge.
+        """
         edge = b - a
         at = np.einsum("...i,...i->...", -a, edge) / np.maximum(np.einsum("...i,...i->...", edge, edge), 1e-30)
         return self(a + np.clip(at, 0.25, 0.75)[..., None] * edge)
 
     def _at(self, distance: Float64) -> Float64:
+        """Return the limit at a distance from the site."""
         return LIMIT_PER_TARGET * self.facet_m * np.maximum(distance / self.radius_m, 1.0) ** GROWTH_POWER
 
 
 def affordable(limit: EdgeLimit, model: tuple[Float64, Float64, Int32], budget: int) -> EdgeLimit:
-    """The limit itself, or a coarser one with which the ground stays within about `budget` triangles."""
+    """Return the limit itself, or a coarser one that keeps the ground within about `budget` triangles."""
     coarse = EdgeLimit(_PROBE * limit.facet_m, limit.radius_m)
     before = len(model[2])
     added = (len(refine(*model, coarse)[2]) - before) * _PROBE**2
@@ -56,9 +61,11 @@ def affordable(limit: EdgeLimit, model: tuple[Float64, Float64, Int32], budget: 
 def refine(points: Float64, normals: Float64, faces: Int32, limit: EdgeLimit) -> tuple[Float64, Float64, Int32]:
     """Split every edge longer than its limit, the longest first.
 
-    Whether an edge is split depends on its own two ends alone, so the triangles on both sides always agree
-    and the mesh stays conforming with no neighbour search. Taking lengths in steps of sqrt 2, longest first,
-    splits each triangle across its longest edge, which keeps the angles from degenerating.
+    Whether an edge is split depends on its own two ends alone. The triangles on both sides therefore agree, and the
+    mesh stays conforming without a search for neighbours. Lengths are treated in steps of sqrt 2, the longest
+    first. Each triangle is thereby split across its longest edge, which prevents degenerate angles.
+
+    Returns points, normals and faces.
     """
     done: list[NDArray] = []
     active = faces.astype(np.int64)
@@ -82,7 +89,7 @@ def refine(points: Float64, normals: Float64, faces: Int32, limit: EdgeLimit) ->
 def split(
     points: Float64, normals: Float64, faces: NDArray[np.int64], marked: NDArray[np.bool_], length: Float64
 ) -> tuple[Float64, Float64, NDArray[np.int64]]:
-    """One pass: insert the marked edges' midpoints and cut triangles with one, two or three of them."""
+    """Insert the midpoints of the marked edges, and cut the triangles that have one, two or three of them."""
     ends = faces[:, [[1, 2], [2, 0], [0, 1]]][marked]
     low, high = ends.min(axis=1), ends.max(axis=1)
     count = len(points)
@@ -100,8 +107,8 @@ def split(
     out += [np.column_stack([f[:, 0], f[:, 1], m[:, 0]]), np.column_stack([f[:, 0], m[:, 0], f[:, 2]])]
 
     two = how_many == 2
-    # Turned so that edge 0 is the unsplit one: corner 0 is cut off, the rest is a quadrilateral whose
-    # diagonal starts at the middle of its longer side, as repeated longest-edge bisection would have it.
+    # Corners are renumbered so that edge 0 is the unsplit one. Corner 0 is cut off. The diagonal of the remaining
+    # quadrilateral starts at the middle of its longer side, as in repeated longest-edge bisection.
     turn = np.argmin(marked[two], axis=1)
     f, m = _turn(faces[two], middle[two], turn)
     side = np.take_along_axis(length[two], (turn[:, None] + np.arange(3)) % 3, axis=1)
@@ -129,7 +136,7 @@ def _turn(faces: NDArray, middle: NDArray, first: NDArray) -> tuple[NDArray, NDA
 
 
 def _midpoints(p: Float64, q: Float64, n_p: Float64, n_q: Float64) -> tuple[Float64, Float64]:
-    """The curved point-normal triangle's edge midpoint (Vlachos et al. 2001), its departure limited."""
+    """Return midpoints and normals on the curved point-normal triangle (Vlachos et al. 2001), bulge limited."""
     along = q - p
     bulge = (
         -(np.einsum("ij,ij->i", along, n_p)[:, None] * n_p - np.einsum("ij,ij->i", along, n_q)[:, None] * n_q) / 8.0

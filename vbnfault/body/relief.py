@@ -1,12 +1,12 @@
-"""Relief below the shape model's facets: what a comet's ground adds at each scale, and where dust covers it.
+"""Compute the relief below the shape model's facets, and the dust that covers it.
 
-Heights are added along the model's normal, each a function of body-fixed position, of the facets' size there and
-of the slope against gravity:
+Heights are added along the model's normal. Each is a function of body-fixed position, of the facets' size there and
+of the slope against gravity. The relief consists of:
 
-- fractal octaves whose deviogram continues the model's own (`roughness`), creased and patchy;
-- terraces: treads and scarps of a few metres; pits and craters with rims;
-- where the slope or the ground's history leaves it bare: strata, blocks and the cracks between them;
-- dust that fills lows and level ground up to a smooth surface of its own, with faint ripples.
+- fractal octaves, creased and patchy, whose deviogram continues that of the model (`roughness`);
+- terraces with treads and scarps of a few metres; pits and craters with rims;
+- strata, blocks and the cracks between them, where the slope or a slowly varying field leaves the ground bare;
+- dust that fills low and level ground up to a smooth surface of its own, with faint ripples.
 """
 
 from __future__ import annotations
@@ -28,31 +28,31 @@ from .sites import Site
 if TYPE_CHECKING:
     from . import Body
 
-# A field fades in between facets of 1/1.6 and 1/2.8 of its wavelength.
+# A field fades in as its wavelength grows from 1.6 to 2.8 facets.
 _FADE = (1.6, 2.8)
-_SHARED_M = 20.0  # octaves at least that long lift dust and rock alike
-LONGEST_EDGES = 1.0  # the longest octave, in mean edges of the model
-_REGION_EDGES = 4.5  # the size of regions, in longest octaves
-_SHORTEST_FACETS = 1.8
+_SHARED_M = 20.0  # longer octaves raise dust and rock alike
+LONGEST_EDGES = 1.0  # wavelength of the longest octave, in mean edges of the model
+_REGION_EDGES = 4.5  # size of the regions, in longest octaves
+_SHORTEST_FACETS = 1.8  # wavelength of the shortest octave, in the smallest facets
 
-_CRATER_WIDTHS_M = (72.0, 36.0, 18.0, 9.0)  # cells; diameters are a third to two thirds of that
-_CRATER_SHARE_PER_DENSITY = 1534e-6  # of the cells, per crater of 10 m or more in a square kilometre
+_CRATER_WIDTHS_M = (72.0, 36.0, 18.0, 9.0)  # cells; diameters are a third to two thirds of their width
+_CRATER_SHARE_PER_DENSITY = 1534e-6  # fraction of the cells, per crater of 10 m or more in a square kilometre
 
-_TERRACE_M = (5.5, 2.6)  # height of a step, and of the smaller ones between them
+_TERRACE_M = (5.5, 2.6)  # height of a step, and of the smaller steps between them
 # (cell width, height per unit of block noise) of the broken ground, in metres
 _BLOCKS_M = ((17.0, 1.9), (6.0, 0.95), (2.2, 0.40), (0.85, 0.14))
-_CRACK_DEPTH = 0.30  # between blocks, per unit of their height
-_STRATA_M = ((9.0, 1.3), (3.1, 0.55), (1.1, 0.20))  # thickness and how far a hard one stands out
+_CRACK_DEPTH = 0.30  # of the cracks between blocks, per unit of the blocks' height
+_STRATA_M = ((9.0, 1.3), (3.1, 0.55), (1.1, 0.20))  # thickness of a layer, and how far a hard layer stands out
 
 _CLOD_CELLS_M = (2.1, 1.2, 0.7)
 
-_DUST_LEAVES_DEG = (27.0, 40.0)  # slopes that dust lies on, and that it has slid from
-_BARE_DEG = (30.0, 44.0)  # slopes of loose and of consolidated ground
+_DUST_LEAVES_DEG = (27.0, 40.0)  # dust lies on slopes below the first, and has slid off slopes above the second
+_BARE_DEG = (30.0, 44.0)  # slopes below the first are loose ground, slopes above the second consolidated
 _CLIFF_DEG = (38.0, 52.0)
-_GRAVITY_STEP_M = 250.0  # gravity is taken as linear over a patch, from differences over this step
-_GRAVITY_REACH_M = 1500.0
+_GRAVITY_STEP_M = 250.0  # step of the differences that give the gradient of gravity
+_GRAVITY_REACH_M = 1500.0  # gravity is linear up to this distance from the site
 
-_STEEPEST = 1.5  # tangent of the relief's slope against the model
+_STEEPEST = 1.5  # tangent of the relief's largest slope against the model
 _SLUMPS, _SLUMP_STEPS = 4, 25
 
 _TALUS_CELL_M = 4.0
@@ -62,7 +62,7 @@ _TALUS_WIDTH_M = 9.0
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Ground:
-    """Relief at each vertex of a patch.
+    """Hold the relief at each vertex of a patch.
 
     Attributes
     ----------
@@ -91,18 +91,23 @@ def add_relief(
     longest_m: float,
     craters_per_km2: float,
 ) -> Ground:
-    """Relief on a refined mesh (points relative to the site in T axes, normals, faces).
+    """Return the relief on a refined mesh.
 
     Parameters
     ----------
+    mesh
+        Points float64[n, 3] in metres relative to the site in T axes, unit normals float64[n, 3], and faces
+        int32[m, 3].
     facet_m
-        float64[n], the facets' size at each vertex: what is shorter than two of them is left out.
+        float64[n]: the facets' size at each vertex. Wavelengths shorter than about two facets are left out.
     scale
-        Multiplies the heights.
+        Factor on the heights.
+    roughness
+        Law that the fractal octaves follow.
     longest_m
-        The longest octave's wavelength: what is longer belongs to the model.
+        Wavelength of the longest octave; longer relief belongs to the model.
     craters_per_km2
-        Of 10 m diameter or more.
+        Number of craters with a diameter of at least 10 m.
     """
     points, normals, faces = mesh
     up, elevation = _vertical(body, site, points)
@@ -113,13 +118,14 @@ def add_relief(
             dust=1 - _smooth_step(*_DUST_LEAVES_DEG, slope),
             talus=np.zeros(len(points), dtype=np.float32),
         )
-    # Coarse ground sorts last, so that an octave works on a leading part of the points.
+    # Points are sorted by facet size, so that each octave is evaluated at a leading part of them only.
     order = np.argsort(facet_m, kind="stable")
     rank = np.empty_like(order)
     rank[order] = np.arange(len(order))
     noise = _Octaves(points[order] + site.position_T_m, facet_m[order], seed, roughness, longest_m)
 
-    # Regions differ: evenly rough ground, with few octaves shown far away, looks like orange peel.
+    # Roughness differs between regions. Far away, facets show few octaves, and evenly rough ground would look like
+    # orange peel.
     region = 0.45 + 0.95 * _smooth_step(-1.0, 1.2, noise.gradient(_REGION_EDGES * longest_m, 210))
     swell = region * noise.fractal(longest_m, _SHARED_M, 0)
     on_cliffs = _smooth_step(26.0, 42.0, _slope_deg(points, normals, faces, up))[order]
@@ -134,23 +140,26 @@ def add_relief(
 
 
 def _smooth_step(low: float, high: float, x: NDArray) -> Float32:
+    """Return a smooth step from 0 at `low` to 1 at `high`."""
     t = np.clip((np.asarray(x, dtype=np.float32) - np.float32(low)) / np.float32(high - low), 0, 1)
     return np.asarray(t * t * (3 - 2 * t), dtype=np.float32)
 
 
 def _smooth_max(a: NDArray, b: NDArray, width: float) -> NDArray:
+    """Return the maximum, rounded where a and b differ by less than `width`."""
     h = np.maximum(np.float32(width) - np.abs(a - b), 0) / np.float32(width)
     return np.asarray(np.maximum(a, b) + h * h * np.float32(width / 4))
 
 
-# --- where is up ------------------------------------------------------------------------------------------------
+# --- the vertical and slopes ------------------------------------------------------------------------------------
 
 
 def _vertical(body: Body, site: Site, points: Float64) -> tuple[Float64, Float64]:
-    """Unit up float64[n, 3] (T axes) and elevation float64[n] in metres of effective potential.
+    """Return the unit vertical float64[n, 3] (T axes) and the elevation float64[n] in metres.
 
-    From gravity and its gradient at the site: linear within 1.5 km, constant beyond. The potential is divided by
-    the body's mean gravity, so that elevation, and with it the strata, hardly depends on the site.
+    Both follow from gravity and its gradient at the site: gravity is linear within 1.5 km and constant beyond.
+    Elevation is the effective potential divided by the body's mean gravity. It hardly depends on the site, nor do
+    the strata that follow it.
     """
     centre = site.position_T_m
     steps = _GRAVITY_STEP_M * np.concatenate([np.eye(3), -np.eye(3)])
@@ -170,16 +179,16 @@ def _vertical(body: Body, site: Site, points: Float64) -> tuple[Float64, Float64
 
 
 def _slope_deg(points: Float64, normals: Float64, faces: Int32, up: Float64) -> Float32:
-    """Angle between the mesh's normals and up, float32[n], 0 to 180°."""
+    """Return the angle between the mesh's normals and the vertical, float32[n], 0 to 180°."""
     cosine = np.einsum("ni,ni->n", vertex_normals(points, faces), up)
     return np.degrees(np.arccos(np.clip(cosine, -1, 1))).astype(np.float32)
 
 
-# --- noise, where the facets can show it ------------------------------------------------------------------------
+# --- noise that the facets can show -----------------------------------------------------------------------------
 
 
 class _Octaves:
-    """Fields at points sorted by the facet size there; what a facet cannot show is 0."""
+    """Evaluate fields at points sorted by their facet size; a field is 0 where the facets cannot show it."""
 
     def __init__(
         self, place_m: Float64, facet_m: Float64, seed: int, roughness: Roughness, longest_m: float
@@ -193,50 +202,53 @@ class _Octaves:
         self._unit = 1.0 / windowed_deviation(roughness.hurst)
 
     def bent(self, shift_m: NDArray) -> _Octaves:
-        """The same fields at shifted places."""
+        """Return the same fields at shifted positions."""
         return _Octaves(self.place_m + shift_m, self.facet_m, self._seed, self._roughness, self._longest_m)
 
     def shown(self, wavelength_m: float) -> Float32:
+        """Return how well the facets show a wavelength, float32[n] in [0, 1]."""
         return _smooth_step(*_FADE, wavelength_m / self.facet_m)
 
     def _count(self, wavelength_m: float) -> int:
+        """Return the number of points whose facets can show a wavelength."""
         return int(np.searchsorted(self.facet_m, wavelength_m / _FADE[0]))
 
     def _full(self, part: Float32, wavelength_m: float) -> Float32:
+        """Return values of the leading points, faded in by their facet size, and 0 at the other points."""
         out = np.zeros(len(self.facet_m), dtype=np.float32)
         n = len(part)
         out[:n] = part * _smooth_step(*_FADE, wavelength_m / self.facet_m[:n])
         return out
 
     def gradient(self, wavelength_m: float, stream: int) -> Float32:
-        """Standard deviation 1."""
+        """Return gradient noise of standard deviation 1."""
         count = self._count(wavelength_m)
         part = self._points.gradient(wavelength_m, noise_key(self._seed, stream), count)
         return self._full(part, wavelength_m) * np.float32(1 / GRADIENT_STD)
 
     def amplitude(self, wavelength_m: float) -> np.float32:
-        """Of an octave, per unit of standard deviation, so that all together follow the roughness law."""
+        """Return the factor on an octave of standard deviation 1 that makes all octaves follow the law."""
         return np.float32(self._unit * float(self._roughness.deviation_at(wavelength_m)))
 
     def wavelengths(self, longest_m: float, shortest_m: float) -> list[tuple[int, float]]:
-        """Octave numbers and wavelengths in (shortest, longest], counted from the patch's longest."""
+        """Return the octaves in (shortest, longest] as (number, wavelength); the patch's longest is number 0."""
         last = int(np.ceil(np.log2(self._longest_m / shortest_m)))
         both = [(k, self._longest_m / 2**k) for k in range(last + 1)]
         return [(k, w) for k, w in both if shortest_m < w <= longest_m * 1.0001]
 
     def fractal(self, longest_m: float, shortest_m: float, stream: int) -> Float32:
-        """Metres: plain octaves of the roughness law."""
+        """Return the sum of plain octaves that follow the roughness law, metres."""
         total = np.zeros(len(self.facet_m), dtype=np.float32)
         for k, wavelength in self.wavelengths(longest_m, shortest_m):
             total += self.amplitude(wavelength) * self.gradient(wavelength, stream + k)
         return total
 
     def blocks(self, width_m: float, height_m: float, stream: int) -> Float32:
-        """Metres: blocks of that width, each at its own level, and the cracks between them."""
+        """Return the height of blocks of that width, each at its own level, with cracks between them, metres."""
         count = self._count(width_m)
         level, other, gap = self._points.blocks(width_m, noise_key(self._seed, stream), count)
         step = np.float32(height_m) * (other - level)
-        # A step narrower than two facets, or steeper than 60°, would come out as a saw.
+        # A step narrower than two facets, or steeper than 60°, would have an edge like a saw.
         ramp = np.maximum(0.06 * width_m, 1.8 * self.facet_m[:count]).astype(np.float32)
         ramp = np.maximum(ramp, 0.45 * np.abs(step))
         edge = 1 - _smooth_step(0, 1, gap / ramp)
@@ -244,15 +256,17 @@ class _Octaves:
         return self._full(height_m * level + (0.5 * step - crack) * edge, width_m)
 
     def craters(self, per_km2: float) -> Float32:
+        """Return the height of craters on cells of all widths, metres."""
         total = np.zeros(len(self.facet_m), dtype=np.float32)
         share = min(1.0, _CRATER_SHARE_PER_DENSITY * per_km2)
         for k, width in enumerate(_CRATER_WIDTHS_M):
-            shows = width / 4  # the smallest bowls are half that wide
+            shows = width / 4  # as a wavelength; the smallest bowls are a third of the cell wide
             part = self._points.craters(width, noise_key(self._seed, 400 + k), self._count(shows), share)
             total += self._full(part, shows)
         return total
 
     def clods(self, width_m: float, stream: int, share: float) -> Float32:
+        """Return the height of half-buried stones on cells of that width, metres."""
         shows = 0.7 * width_m
         part = self._points.clods(width_m, noise_key(self._seed, stream), self._count(shows), share)
         return self._full(part, shows)
@@ -260,9 +274,10 @@ class _Octaves:
 
 @lru_cache(maxsize=16)
 def windowed_deviation(hurst: float) -> float:
-    """ν(1) by `deviogram` of octaves with wavelengths w and standard deviations w^hurst.
+    """Return ν(1) that `deviogram` measures on octaves with wavelengths w and standard deviations w^hurst.
 
-    Measured over 40 tiles: the fit under each takes a part of the long octaves away, as it does on a model.
+    The measurement uses 40 tiles. The quadric fitted to each removes a part of the long octaves, as it does on a
+    model.
     """
     side, tiles = 36, 40
     x, y = np.meshgrid(np.arange(side) / 6.0, np.arange(side) / 6.0, indexing="ij")
@@ -275,17 +290,17 @@ def windowed_deviation(hurst: float) -> float:
     total = 0.0
     up = np.tile([0.0, 0.0, 1.0], (side * side, 1))
     for part in range(tiles):
-        # Made low, so that distances stay those along the plane.
+        # The heights are scaled down, so that distances stay those along the plane.
         surface = tile + np.array([0.0, 0.0, 1e-4]) * height.reshape(tiles, -1)[part][:, None]
         total += 1e8 * float(deviogram(surface, up, np.array([1.0]), windows=9)[0]) ** 2
     return float(np.sqrt(total / tiles))
 
 
-# --- what the ground is made of ---------------------------------------------------------------------------------
+# --- components of the ground -----------------------------------------------------------------------------------
 
 
 def _terraced(noise: _Octaves, swell: Float32) -> Float32:
-    """Heights gathered into treads of uneven rise, in patches: scarps that run out along their length."""
+    """Return heights gathered into treads of uneven rise, in patches, so that scarps end along their length."""
     where = _smooth_step(0.1, 1.5, noise.gradient(120.0, 200) + 0.5 * noise.gradient(31.0, 201))
     wander = swell + 1.6 * noise.gradient(43.0, 202) + 0.7 * noise.gradient(17.0, 203)
     wander += 0.16 * noise.gradient(6.0, 204) + 0.05 * noise.gradient(2.3, 205)
@@ -294,7 +309,7 @@ def _terraced(noise: _Octaves, swell: Float32) -> Float32:
         rise = np.random.Generator(np.random.Philox(900 + number)).uniform(0.0, 1.0, 256).astype(np.float32)
         u = wander / np.float32(step)
         tread = np.floor(u)
-        # Some of the steps are left out.
+        # Random factors weaken some of the steps.
         kept = where * share * rise[tread.astype(np.int64) & 255]
         out += kept * (step * (tread + _smooth_step(0.30, 0.98, u - tread)) - wander)
     return out
@@ -303,10 +318,10 @@ def _terraced(noise: _Octaves, swell: Float32) -> Float32:
 def _surface(
     noise: _Octaves, broad: Float32, slope: Float32, talus: Float32, elevation: Float64
 ) -> tuple[Float32, Float32]:
-    """Height in metres and dust, both float32[n]."""
+    """Return the height in metres and the dust cover, both float32[n]."""
     history = noise.gradient(66.0, 100) + 0.45 * noise.gradient(25.0, 101)
     cliff = _smooth_step(*_CLIFF_DEG, slope + 3 * history)
-    # Consolidated and broken (1), or not (0).
+    # 1 where the ground is consolidated and broken, 0 where it is loose.
     bare = _smooth_step(*_BARE_DEG, slope + 11 * history)
     vigour = 0.55 + 1.0 * _smooth_step(-1.2, 1.4, noise.gradient(47.0, 102)) * (0.6 + 0.4 * bare)
 
@@ -314,7 +329,7 @@ def _surface(
     rough, grit = np.zeros_like(broad), np.zeros_like(broad)
     for k, wavelength in noise.wavelengths(_SHARED_M, shortest):
         value = noise.gradient(wavelength, 300 + k)
-        # Creased into ridges: plain noise alone looks like blobs.
+        # Creases form ridges; plain noise alone looks like blobs.
         creased = (0.80 - np.abs(value)) / np.float32(0.60)
         crease = np.float32(0.8 if k % 2 else 0.35) * bare
         rough += noise.amplitude(wavelength) * (value + crease * (creased - value))
@@ -322,7 +337,7 @@ def _surface(
             grit += np.float32(0.028 * wavelength**0.65) * value
     rock = broad + vigour * rough
 
-    # Bent, or the walls between blocks are dead straight.
+    # Without this shift, the walls between blocks would be straight.
     bend = np.column_stack([1.1 * noise.gradient(7.0, 110 + axis) for axis in range(3)])
     bend += np.column_stack([0.25 * noise.gradient(1.9, 113 + axis) for axis in range(3)])
     bent = noise.bent(bend)
@@ -332,7 +347,7 @@ def _surface(
     rock += cliff * _strata(noise, elevation + np.einsum("ni,i->n", bend, np.array([0.5, 0.3, 0.4])))
     rock += talus * (0.25 * noise.gradient(2.6, 140) + 0.10 * noise.gradient(1.1, 141))
 
-    # Dust settles on level ground and hides all below its own slowly varying surface.
+    # Dust settles on level ground and hides everything below its own slowly varying surface.
     depth = 0.75 + 0.9 * noise.gradient(58.0, 130) + 0.4 * noise.gradient(19.0, 131)
     depth -= 1.1 * bare * (0.5 + 0.5 * joints) + 0.5 * talus
     depth -= 9.0 * _smooth_step(*_DUST_LEAVES_DEG, slope)
@@ -349,7 +364,7 @@ def _surface(
 
 
 def _strata(noise: _Octaves, elevation: Float64) -> Float32:
-    """Layers of uneven hardness in a cliff: how far each stands out, metres."""
+    """Return how far the layers of uneven hardness stand out of a cliff, metres."""
     total = np.zeros(len(elevation), dtype=np.float32)
     for number, (thickness, reach) in enumerate(_STRATA_M):
         hard = np.random.Generator(np.random.Philox(4096 + number)).random(4096).astype(np.float32)
@@ -365,16 +380,19 @@ def _strata(noise: _Octaves, elevation: Float64) -> Float32:
 
 
 def _slumped(points: Float64, faces: Int32, height_m: Float64) -> Float64:
-    """Heights with hardly an edge of the mesh steeper than `_STEEPEST`: what facets cannot show would come out as
-    saw teeth along every scarp. Every step takes half of what is too much off both ends."""
-    # in a closed mesh every edge runs once each way
+    """Return heights with hardly any edge of the mesh steeper than `_STEEPEST`.
+
+    Facets cannot show steeper slopes: every scarp would have saw teeth. Each step moves both ends of such an edge
+    by half of the excess.
+    """
+    # in a closed mesh, every edge occurs once in each direction; one of them is kept
     a, b = (np.concatenate([faces[:, k] for k in ends]) for ends in ((0, 1, 2), (1, 2, 0)))
     a, b = a[a < b], b[a < b]
     off = points[a] - points[b]
     most = _STEEPEST * np.sqrt(np.einsum("ni,ni->n", off, off))
     height = height_m.copy()
     for _ in range(_SLUMPS):
-        # those nearly too steep become so while others give way
+        # edges that are nearly too steep may become so while others become flatter
         near = np.abs(height[a] - height[b]) > 0.8 * most
         if not near.any():
             break
@@ -393,7 +411,7 @@ def _slumped(points: Float64, faces: Int32, height_m: Float64) -> Float64:
 
 
 def _talus(points_L: Float64, slope: Float32) -> Float32:
-    """Debris at the feet of cliffs, float32[n]: below steep ground close by, on ground that is not."""
+    """Return the debris at the feet of cliffs, float32[n]: it lies on moderate slopes below steep ground nearby."""
     cells = int(2 * _TALUS_REACH_M / _TALUS_CELL_M)
     place = np.floor((points_L[:, :2] + _TALUS_REACH_M) / _TALUS_CELL_M).astype(np.int64)
     inside = ((place >= 0) & (place < cells)).all(axis=1) & (np.abs(points_L[:, 2]) < _TALUS_REACH_M)

@@ -1,7 +1,7 @@
-"""How rough a body is at which scale, and how the ground below its model's facets has to go on.
+"""Measure how rough a body is at each scale, and derive how the ground continues below the facets of its model.
 
-The deviogram (Shepard et al. 2001, JGR 106, 32777): ν(L), the root mean square difference in height between
-points a distance L apart, heights against the local shape. Over a self-affine surface ν = ν₀ (L/L₀)^H.
+The deviogram (Shepard et al. 2001, JGR 106, 32777) is ν(L), the root mean square difference in height between
+points a distance L apart, with heights measured against the local shape. On a self-affine surface, ν = ν₀ (L/L₀)^H.
 """
 
 from __future__ import annotations
@@ -18,38 +18,40 @@ from .shape import Float64, vertex_normals
 if TYPE_CHECKING:
     from . import Body
 
-_WINDOWS = 120  # places looked at, spread over the points
-_MOST_POINTS = 300  # of a window: more add little but time
-_FEWEST_POINTS = 16  # for a quadric
+_WINDOWS = 120  # neighbourhoods, spread evenly over the points
+_MOST_POINTS = 300  # points of a window; more cost time and add little
+_FEWEST_POINTS = 16  # needed to fit a quadric
 _WINDOW_BASELINES = 3.0  # radius of a window in baselines
-_BIN = 1.15  # half the width of a baseline's bin, as a factor
-# Baselines the law is fitted over, in mean edges: below, the facets are flat; above, the body is round.
+_BIN = 1.15  # a baseline's bin reaches from L / 1.15 to 1.15 L
+# Baselines of the fit, in mean edges. At shorter ones the facets are flat, at longer ones the body is round.
 _FIT_EDGES = (1.3, 1.7, 2.2, 2.9, 3.8)
-# Natural surfaces lie within 0.3 to 1 (Shepard et al. 2001). Heights against a quadric show exponents up to 2:
-# that of a shape model near its facets comes out above 1 where the model was smoothed.
+# Natural surfaces have exponents of 0.3 to 1 (Shepard et al. 2001). Heights against a quadric can show exponents up
+# to 2: near the facets of a smoothed shape model, the measured exponent exceeds 1.
 _HURST_RANGE = (0.5, 1.0)
-_FACING = 0.5  # cos of the angle between a vertex's normal and the plane's: steeper belongs to another side
+# Least cosine between the normals of a vertex and of the window's centre; steeper vertices belong to another side.
+_FACING = 0.5
 
 
 @dataclass(frozen=True, kw_only=True)
 class Roughness:
-    """A self-affine surface: ν(L) = deviation_m · (L / baseline_m)^hurst, metres."""
+    """Describe a self-affine surface: ν(L) = deviation_m · (L / baseline_m)^hurst, metres."""
 
     deviation_m: float
     baseline_m: float
     hurst: float
 
     def deviation_at(self, baseline_m: NDArray | float) -> Float64:
-        """RMS deviation in metres at baselines in metres."""
+        """Return the RMS deviation in metres at baselines in metres."""
         return np.asarray(self.deviation_m * (np.asarray(baseline_m) / self.baseline_m) ** self.hurst)
 
 
 def deviogram(points_m: NDArray, normals: NDArray, baselines_m: NDArray, *, windows: int = _WINDOWS) -> Float64:
-    """Deviation in metres, float64[k], over a surface given by its points; nan where none lie so far apart.
+    """Return the deviation in metres, float64[k], over a surface given by its points; nan where no points qualify.
 
-    The median over neighbourhoods of their RMS deviation: typical ground, where the mean square would be that of
-    the few highest cliffs. Heights refer to the quadric fitted within three baselines: the body is round, and
-    over a self-affine surface of any exponent the fit takes the same share of ν away at each scale.
+    The result is the median, over neighbourhoods, of their RMS deviation. It describes typical ground; a mean
+    square would describe the few highest cliffs. Heights refer to the quadric fitted within three baselines,
+    because the body is round. On a self-affine surface of any exponent, this fit removes the same fraction of ν at
+    each scale.
 
     Parameters
     ----------
@@ -58,7 +60,7 @@ def deviogram(points_m: NDArray, normals: NDArray, baselines_m: NDArray, *, wind
     baselines_m
         float[k], metres along the local plane.
     windows
-        How many neighbourhoods, spread evenly over the points' order.
+        Number of neighbourhoods, spread evenly over the points' order.
     """
     points = np.asarray(points_m, dtype=np.float64)
     tree = cKDTree(points)
@@ -73,7 +75,7 @@ def deviogram(points_m: NDArray, normals: NDArray, baselines_m: NDArray, *, wind
 
 
 def _mean_square(points: Float64, normals: NDArray, tree: cKDTree, centre: int, baseline: float) -> float | None:
-    """Of height differences over the baseline around one point; None with too few points."""
+    """Return the mean square height difference over the baseline around one point, or None with too few points."""
     reach = _WINDOW_BASELINES * baseline
     near = np.sort(tree.query_ball_point(points[centre], reach))
     near = near[np.einsum("ni,i->n", normals[near], normals[centre]) > _FACING]
@@ -92,15 +94,16 @@ def _mean_square(points: Float64, normals: NDArray, tree: cKDTree, centre: int, 
 
 
 def mean_edge_m(vertices_m: NDArray, faces: NDArray) -> float:
-    """Mean edge length of a mesh, metres."""
+    """Return the mean edge length of a mesh, metres."""
     side = vertices_m[faces] - vertices_m[np.roll(faces, 1, axis=1)]
     return float(np.linalg.norm(side, axis=2).mean())
 
 
 def model_roughness(body: Body) -> Roughness:
-    """The law that continues the body's own shape model below its facets; about a second for 36,000 faces.
+    """Return the law that continues the body's own shape model below its facets.
 
-    Anchored at 1.3 mean edges, the exponent fitted over 1.3 to 3.8 and kept within 0.5 to 1.
+    The law has the measured deviation at 1.3 mean edges. Its exponent is fitted over 1.3 to 3.8 mean edges and kept
+    within 0.5 to 1. The measurement takes about a second for 36,000 faces.
     """
     edge = mean_edge_m(body.vertices_m, body.faces)
     baselines = edge * np.array(_FIT_EDGES)

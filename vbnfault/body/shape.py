@@ -1,4 +1,4 @@
-"""Reading shape models and making sure that they bound a solid."""
+"""Read shape models and make sure that they bound a solid."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ Float64 = NDArray[np.float64]
 Int32 = NDArray[np.int32]
 
 METRES_PER_KM = 1000.0
-# Dimorphos, the smallest body with a shape model, is 177 m long; Lutetia, the largest usually given in
-# kilometres to this kind of work, 121 km. No extent between the two is ambiguous.
+# Dimorphos, the smallest body with a shape model, is 177 m long. Lutetia, the largest body that is usually given in
+# kilometres for this kind of work, is 121 km long. A threshold between the two numbers is unambiguous.
 AUTO_KM_BELOW_EXTENT = 150.0
 FILE_TYPES = (".obj", ".ply", ".stl", ".glb", ".gltf", *formats.SUFFIXES)
-# These store a vertex once per face or per seam (plate tables and DSKs made from the six faces of an ICQ), so
-# welding mends nothing worth a warning.
+# These types store a vertex once per face or per seam (the latter in plate tables and DSKs made from the six faces
+# of an ICQ). Merging such vertices is normal and deserves no warning.
 _SPLIT_VERTEX_TYPES = (".stl", ".glb", ".gltf", *formats.SUFFIXES)
 _LARGEST_HOLE_EDGES = 8
-# In the file's unit: beyond any body, and such that areas and volumes stay numbers.
+# In the file's unit: larger than any body, and small enough that areas and volumes do not overflow.
 _FARTHEST = 1e12
-# Relative to the squared extent: below it a facet's normal is rounding noise in float64.
+# Relative to the squared extent. The normal of a smaller facet is rounding noise in float64.
 _DEGENERATE_AREA_FRACTION = 1e-16
 
 
@@ -41,19 +41,19 @@ def load_shape(path: str | Path, unit: Unit = "auto") -> tuple[Float64, Int32]:
     Parameters
     ----------
     path
-        OBJ, PLY, STL, GLB or GLTF file; PDS plate table (TAB, PLT, VER, TXT), Gaskell's ICQ (ICQ, TAB, TXT),
-        VRML (WRL); NAIF DSK (BDS), which needs spiceypy: `pip install 'vbnfault[spice]'`. Which of the tables it
-        is, the content says. Polygons are triangulated, several objects joined.
+        OBJ, PLY, STL, GLB or GLTF file; PDS plate table (TAB, PLT, VER, TXT), Gaskell's ICQ (ICQ, TAB, TXT), VRML
+        (WRL); NAIF DSK (BDS), which needs spiceypy: `pip install 'vbnfault[spice]'`. The content decides which kind
+        of table the file is. Polygons are triangulated, and several objects are joined.
     unit
-        Unit of the file: "m", "km", or "auto": kilometres if the format defines them (DSK) or the longest side of
-        the bounding box is below 150, else metres. No body with a shape model lies between Dimorphos (177 m) and
-        the bodies modelled in kilometres (Lutetia 121 km); for larger ones in kilometres (Vesta) or smaller ones
-        in metres give the unit, which always wins.
+        Unit of the file: "m", "km", or "auto". With "auto" it is kilometres if the format defines them (DSK) or if
+        the longest side of the bounding box is below 150, else metres. No body with a shape model lies between
+        Dimorphos (177 m) and the bodies modelled in kilometres (Lutetia 121 km). For larger bodies in kilometres
+        (Vesta) or smaller ones in metres, give the unit, which always wins.
 
     Returns
     -------
     vertices_m, faces
-        float64[n, 3] in metres and int32[m, 3], outward winding, checked and mended by `check_mesh`.
+        float64[n, 3] in metres and int32[m, 3], outward winding, checked and repaired by `check_mesh`.
 
     Raises
     ------
@@ -87,11 +87,12 @@ def load_shape(path: str | Path, unit: Unit = "auto") -> tuple[Float64, Int32]:
 
 
 def _read_with_trimesh(path: Path, data: bytes) -> tuple[Float64, NDArray[np.int64]]:
+    """Read a PLY or STL file."""
     logger = logging.getLogger("trimesh")
     level = logger.level
-    logger.setLevel(logging.CRITICAL + 1)  # it logs what it cannot read, tracebacks and all
+    logger.setLevel(logging.CRITICAL + 1)  # trimesh would log parser errors with their tracebacks
     try:
-        # numpy warns on NaN while the readers normalise; the check below reports it as an error.
+        # numpy warns about NaN while trimesh normalises vectors; `_check_arrays` reports it as an error later.
         with warnings.catch_warnings(), np.errstate(all="ignore"):
             warnings.simplefilter("ignore")
             mesh = trimesh.load(io.BytesIO(data), file_type=path.suffix[1:].lower(), process=False, force="mesh")
@@ -106,28 +107,30 @@ def _read_with_trimesh(path: Path, data: bytes) -> tuple[Float64, NDArray[np.int
 
 
 def check_mesh(vertices: NDArray, faces: NDArray, source: str) -> tuple[Float64, Int32]:
-    """Check that a mesh bounds a solid, mending what can be mended without guessing.
+    """Check that a mesh bounds a solid, and repair what can be repaired without guessing.
 
-    Merges coincident vertices, drops degenerate and loose faces, fills holes of up to eight edges and turns the
-    winding outwards, each reported in one `UserWarning`. Unreferenced vertices are dropped in silence.
+    Coincident vertices are merged, degenerate and loose faces dropped, holes of up to eight edges filled, and the
+    winding is made consistent and turned outwards. One `UserWarning` reports these repairs. Unreferenced vertices
+    are dropped silently.
 
     Parameters
     ----------
     vertices, faces
         float[n, 3] (any unit) and int[m, 3]; not modified.
     source
-        What to call the mesh in messages, usually the file's path.
+        Name of the mesh in messages, usually the file's path.
 
     Returns
     -------
     vertices, faces
-        float64[n, 3], int32[m, 3]: every edge shared by two faces in opposite directions, volume > 0.
+        float64[n, 3], int32[m, 3]: every edge is shared by two faces in opposite directions, and the volume is
+        positive.
 
     Raises
     ------
     InputError
-        Empty, no faces, NaN or infinite coordinates, indices out of range, open or non-manifold edges,
-        winding that cannot be made consistent, zero volume.
+        The mesh is empty or has no faces, coordinates are NaN, infinite or beyond 1e12, indices are out of range,
+        edges are open or non-manifold, the winding cannot be made consistent, or the volume is zero.
     """
     vertices = np.array(vertices, dtype=np.float64)
     faces = np.array(faces, dtype=np.int64)
@@ -181,13 +184,13 @@ def check_mesh(vertices: NDArray, faces: NDArray, source: str) -> tuple[Float64,
 
 
 def signed_volume(vertices: NDArray, faces: NDArray) -> float:
-    """Volume by the divergence theorem, positive for outward winding, in the cube of the vertices' unit."""
+    """Return the volume by the divergence theorem, positive for outward winding, in the vertices' unit cubed."""
     a, b, c = (vertices[faces[:, k]].astype(np.float64) for k in range(3))
     return float(np.sum(a * np.cross(b, c)) / 6.0)
 
 
 def face_normals_areas(vertices: NDArray, faces: NDArray) -> tuple[Float64, Float64]:
-    """Outward unit normals float64[m, 3] (zero where degenerate) and areas float64[m] in unit²."""
+    """Return outward unit normals float64[m, 3] (zero if degenerate) and areas float64[m] in the unit squared."""
     a, b, c = (vertices[faces[:, k]].astype(np.float64) for k in range(3))
     cross = np.cross(b - a, c - a)
     length = np.linalg.norm(cross, axis=1)
@@ -195,7 +198,7 @@ def face_normals_areas(vertices: NDArray, faces: NDArray) -> tuple[Float64, Floa
 
 
 def vertex_normals(vertices: NDArray, faces: NDArray) -> Float64:
-    """Area-weighted unit normals float64[n, 3]."""
+    """Return area-weighted unit normals float64[n, 3]."""
     a, b, c = (vertices[faces[:, k]].astype(np.float64) for k in range(3))
     cross = np.cross(b - a, c - a)
     normals = np.column_stack(
@@ -206,7 +209,8 @@ def vertex_normals(vertices: NDArray, faces: NDArray) -> Float64:
 
 
 def _check_arrays(vertices: NDArray, faces: NDArray, source: str) -> None:
-    # Faces first: the readers give no vertices either where nothing refers to them.
+    """Raise InputError unless both arrays have usable shapes, coordinates and indices."""
+    # Faces are checked first, because without faces the readers return no vertices either.
     if faces.ndim != 2 or faces.shape[-1] != 3 or len(faces) == 0:
         raise InputError(f"{source}: mesh has 0 faces.")
     if vertices.ndim != 2 or vertices.shape[-1] != 3 or len(vertices) == 0:
@@ -225,7 +229,7 @@ def _check_arrays(vertices: NDArray, faces: NDArray, source: str) -> None:
 
 
 def _weld(vertices: Float64, faces: NDArray) -> tuple[Float64, NDArray, int]:
-    """Merge vertices at the same position, keeping the order of first appearance; also how many went."""
+    """Merge vertices at the same position in order of first appearance; return also the number removed."""
     _, first, inverse = np.unique(vertices, axis=0, return_index=True, return_inverse=True)
     if len(first) == len(vertices):
         return vertices, faces, 0
@@ -236,17 +240,19 @@ def _weld(vertices: Float64, faces: NDArray) -> tuple[Float64, NDArray, int]:
 
 
 def _sound_faces(vertices: Float64, faces: NDArray) -> NDArray[np.bool_]:
+    """Return which faces have three distinct corners and an area above rounding noise."""
     distinct = (faces != np.roll(faces, 1, axis=1)).all(axis=1)
     extent = float(np.ptp(vertices, axis=0).max())
     return distinct & (face_normals_areas(vertices, faces)[1] > _DEGENERATE_AREA_FRACTION * extent**2)
 
 
 def _directed_edges(faces: NDArray) -> NDArray[np.int64]:
+    """Return the edges of all faces in their direction, int64[3 m, 2]."""
     return np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).astype(np.int64)
 
 
 def _loose_faces(faces: NDArray) -> NDArray[np.bool_]:
-    """Faces without a neighbour over any edge: filling their outline would only double them."""
+    """Return which faces share no edge with another face; filling their outline would only double them."""
     edges = np.sort(_directed_edges(faces), axis=1)
     _, inverse, counts = np.unique(
         edges[:, 0] * (int(faces.max()) + 1) + edges[:, 1], return_inverse=True, return_counts=True
@@ -255,12 +261,13 @@ def _loose_faces(faces: NDArray) -> NDArray[np.bool_]:
 
 
 def _undirected_counts(faces: NDArray) -> NDArray[np.int64]:
+    """Return the number of faces at each edge."""
     edges = np.sort(_directed_edges(faces), axis=1)
     return np.unique(edges[:, 0] * (int(faces.max()) + 1) + edges[:, 1], return_counts=True)[1]
 
 
 def _consistent(faces: NDArray) -> bool:
-    """Every edge runs once in each direction."""
+    """Return whether every edge occurs once in each direction."""
     edges = _directed_edges(faces)
     count = int(faces.max()) + 1
     forward = np.sort(edges[:, 0] * count + edges[:, 1])
@@ -269,15 +276,15 @@ def _consistent(faces: NDArray) -> bool:
 
 
 def _fill_holes(faces: NDArray) -> NDArray:
-    """Close simple boundary loops of up to eight edges with a fan; larger holes are left open."""
+    """Close simple boundary loops of up to eight edges with a fan, and leave larger holes open."""
     edges = _directed_edges(faces)
     count = int(faces.max()) + 1
     key = edges.min(axis=1) * count + edges.max(axis=1)
     _, inverse, counts = np.unique(key, return_inverse=True, return_counts=True)
     boundary = edges[counts[inverse.ravel()] == 1]
-    follow = {int(b): int(a) for a, b in boundary}  # against the faces' direction, as a filling face runs
+    follow = {int(b): int(a) for a, b in boundary}  # reversed, as a filling face needs
     if len(follow) != len(boundary):
-        return faces  # loops that touch in a vertex, or mixed winding: no simple loop to fill
+        return faces  # loops touch in a vertex, or the winding is mixed: no simple loop exists
     fans: list[tuple[int, int, int]] = []
     while follow:
         start, step = follow.popitem()

@@ -1,4 +1,4 @@
-"""Sites on the surface and their local-level frame L."""
+"""Choose sites on the surface and compute their local-level frame L."""
 
 from __future__ import annotations
 
@@ -17,21 +17,21 @@ if TYPE_CHECKING:
 
 MAX_SLOPE_DEG = 35.0
 _ATTEMPTS = 1000
-# sin of the angle to the pole below which "north" is rounding noise and +x of T stands in for the pole.
+# Sine of the angle to the pole. Below it, "north" is rounding noise, and T's +x replaces the pole.
 _POLE_SIN = 1e-6
-_STREAM = 0x51735  # keeps these draws apart from other users of the same seed
+_STREAM = 0x51735  # separates these draws from other uses of the same seed
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Site:
-    """A place on the body and its local-level frame.
+    """Describe a position on the body and its local-level frame.
 
     Attributes
     ----------
     index
         Number of the site in its set.
     position_T_m
-        float64[3], on the global model's surface, body-fixed axes.
+        float64[3], on the surface of the global model, body-fixed axes.
     T_from_L
         float64[3, 3] rotation; its columns are L's axes in T: x north, y east, z down (effective gravity).
     """
@@ -42,16 +42,16 @@ class Site:
 
 
 class Sites(Sequence[Site]):
-    """The sites of a scene, each computed when it is first asked for and then kept.
+    """Hold the sites of a scene; each site is computed when it is first used, and then kept.
 
-    A site costs some 9 ms on a shape of 20,000 facets, and a worker process visits few of them.
+    A site costs about 9 ms on a shape of 20,000 facets, and a worker process visits only a few.
 
     Parameters
     ----------
     count
         Number of sites, >= 0.
     make
-        Returns the site of an index, the same one whatever was asked for before.
+        Function that returns the site of an index, always the same one, whatever was requested before.
     """
 
     def __init__(self, count: int, make: Callable[[int], Site]) -> None:
@@ -77,15 +77,15 @@ class Sites(Sequence[Site]):
 
 
 def local_level(effective_gravity_m_s2: ArrayLike) -> Float64:
-    """T_from_L, float64[3, 3], from effective gravity float64[3] in T.
+    """Return T_from_L, float64[3, 3], from the effective gravity float64[3] in T.
 
-    z points along it; x is T's +z (the pole) projected onto the horizontal plane (T's +x within 1e-6 rad of
-    the pole's own direction); y = z × x is east.
+    The axis z points along gravity. The axis x, north, is T's +z (the pole) projected onto the horizontal plane;
+    within 1e-6 rad of the pole, T's +x is projected instead. The axis y = z × x points east.
 
     Raises
     ------
     ValueError
-        Zero gravity.
+        Gravity is zero.
     """
     gravity = np.asarray(effective_gravity_m_s2, dtype=np.float64)
     length = np.sqrt(np.sum(gravity**2))
@@ -96,14 +96,14 @@ def local_level(effective_gravity_m_s2: ArrayLike) -> Float64:
     if np.sqrt(np.sum(north**2)) < _POLE_SIN:
         north = np.array([1.0, 0.0, 0.0]) - down[0] * down
     north /= np.sqrt(np.sum(north**2))
-    # Once more: near the pole the first projection leaves a rounding error of 1e-16 / _POLE_SIN.
+    # A second projection is needed: near the pole, the first leaves a rounding error of 1e-16 / _POLE_SIN.
     north -= np.sum(north * down) * down
     north /= np.sqrt(np.sum(north**2))
     return np.column_stack([north, np.cross(down, north), down])
 
 
 def site_at(body: Body, index: int, position_T_m: ArrayLike) -> Site:
-    """The site at a given point, float64[3] metres in T."""
+    """Return the site at a given position, float64[3] metres in T."""
     position = np.array(position_T_m, dtype=np.float64)
     gravity = body.effective_gravity(position)[0]
     return Site(index=index, position_T_m=position, T_from_L=local_level(gravity))
@@ -112,8 +112,8 @@ def site_at(body: Body, index: int, position_T_m: ArrayLike) -> Site:
 def choose_sites(body: Body, count: int, seed: int, *, max_slope_deg: float = MAX_SLOPE_DEG) -> Sites:
     """Return random sites, uniform over the surface area that is no steeper than `max_slope_deg`.
 
-    A site is drawn when it is first asked for. Site k depends on (body, seed, k, max_slope_deg) only, so a longer
-    list begins with the shorter one.
+    A site is drawn when it is first used. Site k depends on (body, seed, k, max_slope_deg) only, so a longer list
+    begins with the shorter one.
 
     Parameters
     ----------
@@ -122,13 +122,13 @@ def choose_sites(body: Body, count: int, seed: int, *, max_slope_deg: float = MA
     seed
         Non-negative integer.
     max_slope_deg
-        Largest angle, 0 to 90°, between the facet's normal and up (against effective gravity); steeper ground
-        would not fill the lower half of a level camera's view.
+        Largest angle, above 0 and at most 90°, between the facet's normal and up (against effective gravity).
+        Steeper ground would not fill the lower half of a level camera's view.
 
     Raises
     ------
     InputError
-        A parameter out of range; when a site is asked for, no place found in 1000 draws.
+        A parameter is out of its range. A site raises it at its first use if 1000 draws give no position.
     """
     if count < 0:
         raise InputError(f"sites: must be 0 or more; got {count}.")
@@ -143,6 +143,7 @@ def choose_sites(body: Body, count: int, seed: int, *, max_slope_deg: float = MA
 
 
 def _draw(body: Body, index: int, seed: int, normals: Float64, cumulative: Float64, cos_bound: float) -> Site:
+    """Return the first drawn position of a site whose facet is not too steep."""
     for attempt in range(_ATTEMPTS):
         rng = np.random.Generator(np.random.Philox(np.random.SeedSequence((seed, _STREAM, index, attempt))))
         pick, u, v = rng.random(3)

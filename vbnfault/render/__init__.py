@@ -1,7 +1,7 @@
-"""Rendering with Mitsuba 3 (LLVM, spectral): the only package that imports it.
+"""Render with Mitsuba 3 (LLVM, spectral). This is the only package that imports Mitsuba.
 
-Mitsuba loads with the first name taken from here. `description` holds what a render is asked for, as plain data,
-and loads without it.
+Mitsuba is loaded when the first name is taken from this package. `description` holds the input of a render as plain
+data and loads without Mitsuba.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ def __getattr__(name: str) -> Any:
 
 
 def self_test() -> str:
-    """Render a Lambert square facing the Sun and compare its radiance with ρE/π; a sentence for `doctor`."""
+    """Render a Lambert square that faces the Sun and return a sentence that compares its radiance with ρE/π."""
     import numpy as np
 
     from ..core.photometry import Diffuse

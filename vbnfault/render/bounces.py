@@ -1,10 +1,12 @@
-"""Light that the ground throws on itself.
+"""Compute the light that the ground reflects onto itself.
 
-It is about a hundredth of the direct light, and smooth but for contacts: so it takes one sample where direct light
-takes sixteen, and neighbours help each other. The directions of the first reflection are strata of the
-cosine-weighted hemisphere, dealt out over tiles of 8 × 8 pixels (interleaved sampling: Keller & Heidrich 2001,
-EGWR, 269): all pixels at one place of their tile look the same way, so their rays run together, and a tile sees
-every way. A filter that keeps to one surface (à trous: Dammertz et al. 2010, HPG, 67) then shares what they found.
+This light is about a hundredth of the direct light, and smooth except near contacts. It therefore takes one sample
+where direct light takes sixteen, and a filter averages neighbouring pixels.
+
+The directions of the first reflection are strata of the cosine-weighted hemisphere, distributed over tiles of 8 × 8
+pixels (interleaved sampling: Keller & Heidrich 2001, EGWR, 269). All pixels at the same position in their tile have
+the same stratum, so their rays are coherent, and a tile covers all directions. A filter that does not cross the
+edges of surfaces (à trous: Dammertz et al. 2010, HPG, 67) then averages over neighbours.
 """
 
 from __future__ import annotations
@@ -27,24 +29,29 @@ from .surface import TerrainMesh
 Image = NDArray[np.float32]
 
 _TILE = 8
-_SHARE = 16
-_FIRST_BOUNCE = 2  # the first free dimension of a sample's random numbers; three a bounce
+_SHARE = 16  # samples of direct light per sample of indirect light
+_FIRST_BOUNCE = 2  # the first free dimension of a sample's random numbers; each bounce uses three
 # The filter's weights fall with the angle between normals and with the distance from the pixel's plane.
 _SIGMA_NORMAL = 0.3
 _SIGMA_PLANE_PX = 3.0
 _SPLINE = (3 / 8, 1 / 4, 1 / 16)
 _STRIDES = (1, 2, 4)
-_COLOUR_PX = 12  # standard deviation: colour varies less than brightness, so it is averaged more widely
+_COLOUR_PX = 12  # standard deviation; colour varies less than brightness, so it is averaged more widely
 
 
 def indirect(surface: TerrainMesh, scene: RenderInput, truth: Truth, *, smooth: bool = True) -> Image:
-    """Radiance after `scene.bounces` more reflections, float32[band, y, x]; `truth` of the same view guides the
-    filter, which `smooth` switches off."""
+    """Return the radiance due to light that reaches the ground in view by reflection, float32[band, y, x].
+
+    This light was reflected 1 to `scene.bounces` times before. `truth` of the same view guides the filter that
+    averages neighbouring pixels; `smooth` = False switches it off.
+    """
     found = _Indirect(surface, scene).image()
     return _smoothed(found, scene, truth) if smooth else found
 
 
 class _Indirect(Light):
+    """Trace the light between surfaces of one scene."""
+
     def __init__(self, surface: TerrainMesh, scene: RenderInput) -> None:
         super().__init__(surface, scene, banded=scene.bounces > 1 or has_bands(surface, scene))
         self.samples_per_pixel = max(1, scene.samples_per_pixel // _SHARE)
@@ -55,13 +62,13 @@ class _Indirect(Light):
             self.weights = (model.weights[0] ** 2 * sun.irradiance_W_m2_nm)[None, :]
 
     def image(self) -> Image:
-        """float32[band, y, x]."""
+        """Return the unfiltered radiance, float32[band, y, x]."""
         view, spp = self.scene.view, self.samples_per_pixel
         weights = (self.weights / spp).astype(np.float32)
         out = np.zeros((weights.shape[1], view.height_px, view.width_px), dtype=np.float32)
         key = self.scene.key ^ 0x5BD1E995
         for tiles in _Tiles.cover(view.width_px, view.height_px, len(weights)):
-            # the first rays in rows, where neighbours run together, whatever order the later ones take
+            # camera rays are traced in rows, where neighbours are coherent, whatever the order of later rays
             pixels = Pixels(view.width_px * tiles.rows, first=view.width_px * tiles.first_row)
             rows = slice(tiles.first_row, tiles.first_row + tiles.rows)
             for round_ in range(spp):
@@ -79,7 +86,7 @@ class _Indirect(Light):
         return out
 
     def terms(self, strata: TileStrata, first: tuple[Any, ...]) -> list[Any]:
-        """What each sample adds to each term; `first` is where its ray from the camera ends."""
+        """Return what each sample adds to each term; `first` holds the hits of its ray from the camera."""
         rays = self.optics.camera_rays(strata)
         hit = self.world.hit(rays, first)
         hit.valid &= strata.inside
@@ -92,11 +99,11 @@ class _Indirect(Light):
             rays = hit.shadow_rays(direction)
             on_vehicle = hit.on_vehicle
             hit = self.world.intersect(rays, hit.valid, coherent=False)
-            # the ground's own back is no ground that sends light
+            # a facet seen from behind reflects no light
             hit.valid &= dr.dot(hit.normal, rays.d) < 0
             if on_vehicle is not None:
-                # what a vehicle some metres wide sends back from tens of metres is far below 1e-3 of the light
-                # there, yet found by one ray in thousands it would be a bright speck
+                # A vehicle some metres wide adds far less than 1e-3 of the light at tens of metres. Only one ray in
+                # thousands would hit it, and would make a bright speck, so these hits are dropped.
                 hit.valid &= on_vehicle | ~hit.on_vehicle
             towards, lit = self.lit(hit, strata.disc(SUN_DIMENSION + dimension + 2), coherent=False)
             sent = _product(carried, self.reflection(hit, rays).terms(towards))
@@ -107,12 +114,15 @@ class _Indirect(Light):
 
 
 def _product(a: list[Any], b: list[Any]) -> list[Any]:
+    """Return the products of two lists, entry by entry."""
     return [x * y for x, y in zip(a, b, strict=True)]
 
 
 class _Tiles:
-    """Rows of tiles, a sample a pixel, ordered by place within the tile, then by tile: so neighbours in the
-    wavefront are the same place of neighbouring tiles."""
+    """Order one sample per pixel by position within the tile, then by tile, for some rows of tiles.
+
+    Neighbours in the wavefront then have the same position in neighbouring tiles.
+    """
 
     def __init__(self, width: int, first_row: int, rows: int) -> None:
         self.width, self.first_row, self.rows = width, first_row, rows
@@ -121,13 +131,13 @@ class _Tiles:
 
     @classmethod
     def cover(cls, width: int, height: int, values_per_pixel: int) -> Iterator[_Tiles]:
-        """Rows of tiles that cover the frame, each small enough for the wavefront."""
+        """Yield rows of tiles that cover the frame, each small enough for the wavefront."""
         rows = max(1, WAVEFRONT // (width * values_per_pixel * _TILE)) * _TILE
         for first in range(0, height, rows):
             yield cls(width, first, min(rows, height - first))
 
     def in_rows(self, values: Any) -> Any:
-        """The values of the pixels, row after row."""
+        """Return the pixels' values row after row."""
         pixel = dr.arange(mi.UInt32, self.width * self.rows)
         x, y = pixel % self.width, pixel // self.width
         place = (y % _TILE) * _TILE + x % _TILE
@@ -135,8 +145,11 @@ class _Tiles:
 
 
 class TileStrata(Strata):
-    """One sample of every pixel of tiles, and its share of the strata of directions that a tile deals out over
-    `rounds`, of which this is number `round_`."""
+    """Provide one sample of every pixel of tiles, with its strata of directions.
+
+    A tile distributes the strata of directions over its pixels and over `rounds` rounds; `round_` is the number of
+    this round.
+    """
 
     def __init__(self, tiles: _Tiles, rounds: int, round_: int, key: int) -> None:
         wavefront = dr.arange(mi.UInt32, tiles.count * _TILE * _TILE)
@@ -154,7 +167,7 @@ class TileStrata(Strata):
         self._round = [dr.opaque(mi.UInt32, k) for k in divmod(round_, self._rounds_side)]
 
     def directions(self) -> tuple[Any, Any]:
-        """A uniform point of the unit square: of the sample's own share of its tile's strata."""
+        """Return a uniform point of the unit square within the sample's own stratum."""
         u, v = self.jitter(_FIRST_BOUNCE)
         cells = _TILE * self._rounds_side
         a = self._round[0] * _TILE + _reversed(self._place % _TILE)
@@ -163,12 +176,12 @@ class TileStrata(Strata):
 
 
 def _reversed(three_bits: Any) -> Any:
-    """The order of bits turned round, so that neighbours of a tile look far apart."""
+    """Return three bits in reverse order, so that neighbouring pixels of a tile get distant strata."""
     return ((three_bits & 1) << 2) | (three_bits & 2) | (three_bits >> 2)
 
 
 def _smoothed(found: Image, scene: RenderInput, truth: Truth) -> Image:
-    """Brightness filtered along surfaces, colour over a wider window."""
+    """Return the radiance with brightness filtered along surfaces and colour averaged over a wider window."""
     brightness = found.sum(axis=0)
     if not brightness.any():
         return found
@@ -184,13 +197,13 @@ def _smoothed(found: Image, scene: RenderInput, truth: Truth) -> Image:
 
 
 def _coarse(band: Image) -> Image:
-    """The band averaged over a wide window, on every fourth pixel each way."""
+    """Return the band averaged over a wide window, on every fourth pixel in x and y."""
     small = cv2.resize(band, None, fx=1 / 4, fy=1 / 4, interpolation=cv2.INTER_AREA)
     return np.asarray(cv2.GaussianBlur(small, (0, 0), _COLOUR_PX / 4))
 
 
 class _Guide:
-    """Normals and depths that say which neighbours lie on the same surface."""
+    """Hold the normals and depths that show which neighbours lie on the same surface."""
 
     def __init__(self, scene: RenderInput, truth: Truth) -> None:
         self.optics = Optics(scene.view)
@@ -201,7 +214,7 @@ class _Guide:
         self._pixel_size = dr.opaque(mi.Float, 1 / float(scene.view.intrinsics[0]))
 
     def _at(self, x: Any, y: Any) -> tuple[Any, Any, Any]:
-        """Normal, point in camera axes, depth (0 on the sky)."""
+        """Return the normal, the position in camera axes and the depth (0 on the sky) at pixels."""
         record = dr.gather(mi.Vector4f, self._record, mi.UInt32(y * self.width + x))
         depth = record.w
         across = (mi.Float(x) + 0.5 - self.optics.centre.x) * self.optics.scale.x
@@ -209,6 +222,7 @@ class _Guide:
         return record.xyz, mi.Vector3f(across * depth, down * depth, depth), depth
 
     def filtered(self, values: Any, stride: int) -> Any:
+        """Return the values averaged over 5 × 5 pixels that are `stride` apart and lie on the same surface."""
         pixel = dr.arange(mi.Int32, self.width * self.height)
         x, y = pixel % self.width, pixel // self.width
         normal, point, depth = self._at(x, y)

@@ -1,7 +1,7 @@
-"""Reflection of the terrain: `photometry` in drjit, and as a Mitsuba plugin.
+"""Compute the terrain's reflection: the models of `photometry` in drjit, and as a Mitsuba plugin.
 
-A photometric model gives *terms* per sample and weights of each term in each band: bands are linear in the terms,
-so only the terms are summed over the samples of a pixel.
+A photometric model gives *terms* per sample, and the weight of each term in each band. Bands are linear in the
+terms, so only the terms are summed over the samples of a pixel.
 """
 
 from __future__ import annotations
@@ -17,13 +17,16 @@ from .surface import TerrainMesh, facing
 
 
 def has_bands(surface: TerrainMesh, scene: RenderInput) -> bool:
-    """Whether bands differ by more than a factor, so that each needs a term of its own."""
+    """Return whether bands differ by more than a factor, so that each needs its own term."""
     return scene.photometry.terms > 1 or scene.dust_contrast is not None or surface.vehicle is not None
 
 
 class Reflection:
-    """Reflection at `hit` with unit `normal`, seen along unit `view` (away from the surface): a term a band if
-    `banded`, with the model's weights in it, else the model's single term."""
+    """Evaluate the reflection at `hit` with unit vectors `normal` and `view` (from the surface to the viewer).
+
+    If `banded`, there is one term per band, and it includes the weights of the model. Otherwise there is the single
+    term of the model, without weights.
+    """
 
     def __init__(
         self, surface: TerrainMesh, scene: RenderInput, hit: Any, normal: Any, view: Any, *, banded: bool
@@ -34,17 +37,18 @@ class Reflection:
         self._view = _triple(self._frame.to_local(view))
 
     def terms(self, light: Any) -> list[Any]:
-        """Per sample, BRDF × cos i for unit directions towards the light; 0 where it comes from below."""
+        """Return the terms of BRDF × cos i per sample for unit directions towards the light; 0 from below."""
         return self._evaluate(self._frame.to_local(light))
 
     def scattered(self, u: Any, v: Any) -> tuple[Any, list[Any]]:
-        """A direction drawn by the cosine, from two uniform numbers, and the terms over its density there."""
+        """Return a cosine-distributed direction from two uniform numbers, and the terms divided by its density."""
         local = mi.warp.square_to_cosine_hemisphere(mi.Point2f(u, v))
         local.z = dr.maximum(local.z, 1e-5)
-        weight = dr.pi / local.z  # BRDF × cos i over cos i / π
+        weight = dr.pi / local.z  # the density is cos i / π
         return self._frame.to_world(local), [term * weight for term in self._evaluate(local)]
 
     def _evaluate(self, light: Any) -> list[Any]:
+        """Return the terms for directions towards the light in the local frame."""
         model, contrast = self._scene.photometry, self._scene.dust_contrast
         terms = model.evaluate(dr, _triple(light), self._view)
         if not self._banded:
@@ -64,17 +68,20 @@ class Reflection:
 
 
 def _triple(v: Any) -> tuple[Any, Any, Any]:
+    """Return the components of a vector."""
     return v.x, v.y, v.z
 
 
 class HapkeBSDF(mi.BSDF):  # type: ignore[misc]
-    """Mitsuba plugin `hapke`, for scenes of one's own.
+    """Provide the Mitsuba plugin `hapke` for a user's own scenes.
 
-    `mi.load_dict({"type": "hapke", "parameters": "67p_fornasier2015"})` takes a set of `photometry.HAPKE_TABLES`:
-    the reflectance is that of the tabulated wavelengths, linear between them. Or numbers, the same at all
-    wavelengths: `w`, `g`, `B0`, `h_s`, `B_C0` (default 0), `h_c` (1), `roughness_deg` (0), `K` (1), as
-    `photometry.Hapke`. Directions are drawn by the cosine, which is unbiased for any of them. One-sided: black from
-    below. Raises RuntimeError, through Mitsuba, for a set that is not known or a number that is missing.
+    `mi.load_dict({"type": "hapke", "parameters": "67p_fornasier2015"})` uses a set of `photometry.HAPKE_TABLES`.
+    The reflectance is linear between the tabulated wavelengths. Instead of a set, numbers that hold at all
+    wavelengths can be given: `w`, `g`, `B0`, `h_s`, `B_C0` (default 0), `h_c` (1), `roughness_deg` (0), `K` (1), as
+    in `photometry.Hapke`. Directions are cosine-distributed, which is unbiased for all of them. The surface is
+    one-sided: it is black from below.
+
+    Raises RuntimeError, through Mitsuba, if the set is unknown or a number is missing.
     """
 
     def __init__(self, props: Any) -> None:
@@ -104,6 +111,7 @@ class HapkeBSDF(mi.BSDF):  # type: ignore[misc]
         self.m_components = [flags]
 
     def sample(self, ctx: Any, si: Any, sample1: Any, sample2: Any, active: Any = True) -> Any:
+        """Return a cosine-distributed direction and its weight."""
         sample = mi.BSDFSample3f()
         sample.wo = mi.warp.square_to_cosine_hemisphere(sample2)
         sample.pdf = mi.warp.square_to_cosine_hemisphere_pdf(sample.wo)
@@ -115,19 +123,22 @@ class HapkeBSDF(mi.BSDF):  # type: ignore[misc]
         return sample, dr.select(usable, value / dr.maximum(sample.pdf, 1e-20), 0) & active
 
     def eval(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
+        """Return BRDF × cos i at the wavelengths of the ray."""
         values = self._model.evaluate(dr, _triple(wo), _triple(si.wi))
         value = mi.Spectrum(values[0])
-        for k in range(1, len(values)):  # piecewise linear: each node's step away from the one before
+        for k in range(1, len(values)):  # piecewise linear: each node adds its difference from the one before
             low, high = self._nodes_nm[k - 1 : k + 1]
             value += dr.clip((si.wavelengths - low) / (high - low), 0, 1) * (values[k] - values[k - 1])
         seen = (si.wi.z > 0) & (wo.z > 0) & active
         return dr.select(seen, value, 0)
 
     def pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
+        """Return the probability density of a direction."""
         seen = (si.wi.z > 0) & (wo.z > 0) & active
         return dr.select(seen, mi.warp.square_to_cosine_hemisphere_pdf(wo), 0)
 
     def eval_pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
+        """Return BRDF × cos i and the probability density."""
         return self.eval(ctx, si, wo, active), self.pdf(ctx, si, wo, active)
 
     def to_string(self) -> str:

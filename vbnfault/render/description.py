@@ -1,4 +1,4 @@
-"""One planned sample as plain data: what the renderer needs to know, and nothing of how it renders."""
+"""Describe the input of a render as plain data, independently of how it is rendered."""
 
 from __future__ import annotations
 
@@ -14,9 +14,18 @@ F64 = NDArray[np.float64]
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class View:
-    """A pinhole or thin-lens view of a patch, in the site's L axes (origin at the site, metres).
+    """Describe a pinhole or thin-lens view of a patch, in the site's L axes (origin at the site, metres).
 
-    `intrinsics` fx, fy, cx, cy in pixels; `aperture_radius_m` 0 for a pinhole; `focus_distance_m` may be inf.
+    Attributes
+    ----------
+    position_L_m, L_from_C
+        float64[3] and float64[3, 3] rotation.
+    intrinsics
+        float64[4]: fx, fy, cx, cy in pixels.
+    width_px, height_px
+        Size of the image.
+    aperture_radius_m, focus_distance_m
+        An aperture of 0 is a pinhole; the focus distance may be inf.
     """
 
     position_L_m: F64
@@ -30,9 +39,18 @@ class View:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Sunlight:
-    """The Sun as a disc: unit `direction_L`, `angular_radius_rad`, irradiance W m⁻² nm⁻¹ per band.
+    """Describe the Sun as a disc.
 
-    `limb_darkening` float64[band, 6]: see `spectra.limb_darkening`; None for a uniform disc.
+    Attributes
+    ----------
+    direction_L
+        float64[3], unit vector towards the centre of the disc.
+    angular_radius_rad
+        Angular radius of the disc.
+    irradiance_W_m2_nm
+        float64[band], W m⁻² nm⁻¹.
+    limb_darkening
+        float64[band, 6], see `spectra.limb_darkening`; None for a uniform disc.
     """
 
     direction_L: F64
@@ -42,17 +60,29 @@ class Sunlight:
 
     @property
     def radiance_W_m2_sr_nm(self) -> F64:
-        """Mean radiance of the disc, E / (π sin² α), per band."""
+        """Return the mean radiance of the disc, E / (π sin² α), per band."""
         return self.irradiance_W_m2_nm / (np.pi * np.sin(self.angular_radius_rad) ** 2)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class RenderInput:
-    """A view of a sunlit surface: `wavelength_nm` float64[band] and how the surface reflects there.
+    """Describe a view of a sunlit surface.
 
-    `dust_contrast` float64[band]: reflectance of dust-covered ground over that of bare ground, minus 1.
-    `samples_per_pixel` is a power of four; `bounces` counts the reflections between sunlit ground and the ground
-    that is seen; `key` (uint32) selects the sample's own sub-pixel jitter.
+    Attributes
+    ----------
+    wavelength_nm
+        float64[band].
+    photometry
+        How the surface reflects at these wavelengths.
+    samples_per_pixel
+        A power of four.
+    key
+        uint32 that selects the sample's own sub-pixel jitter.
+    bounces
+        Number of reflections between sunlit ground and the ground in view.
+    dust_contrast
+        float64[band]: reflectance of dust-covered ground divided by that of bare ground, minus 1. None: dust
+        reflects like bare ground.
     """
 
     view: View

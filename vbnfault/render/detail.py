@@ -1,11 +1,13 @@
-"""Relief finer than facets: slopes that turn the normal, down to the pixel and no further.
+"""Compute relief finer than the facets: slopes that turn the shading normal, down to the size of a pixel.
 
-A facet near the site is a decimetre wide, a pixel seen from ten metres a centimetre; far away, facets are metres
-wide and pixels decimetres. What lies between is a self-affine surface strewn with pebbles, that continues the
-terrain's roughness: two periodic fields of slopes, turned against each other so that their repetition does not
-show, averaged over the pixel (a pyramid) so that what is smaller than a pixel is left to the photometric model's
-own roughness. Both grow with the facets in factors of four, by turns: each while it has no weight, so that no
-border shows. It shades; it does not cast shadows.
+Near the site, a facet is a decimetre wide and a pixel seen from ten metres a centimetre. Far away, facets are
+metres wide and pixels decimetres. Between these scales lies a self-affine surface strewn with pebbles, which
+continues the terrain's roughness.
+
+The surface is the sum of two periodic fields of slopes. They are turned against each other so that their repetition
+is not visible. A pyramid of resolutions averages them over the pixel; anything smaller is left to the roughness of
+the photometric model. Both fields grow with the facets in factors of four, alternately: each changes its scale
+while its weight is zero, so that no border is visible. The relief only changes the shading; it casts no shadows.
 """
 
 from __future__ import annotations
@@ -23,26 +25,33 @@ _SIDE = 512  # texels
 _LEVELS = 8
 _TILES_M = (2.03, 1.37)
 _TURN = np.radians(37.0)
-_LONGEST_M = 0.3  # wavelength in tiles as large as this: what is longer is in the facets
+_LONGEST_M = 0.3  # longest wavelength of tiles this large; longer ones are in the facets
 _FACETS = 2.5  # the longest wavelength, in facets
 _HURST = 0.85
-# Dust lies smoother than the ground that it covers.
+# Dust is smoother than the ground that it covers.
 _ON_DUST = 0.5
 _GRAZING = 0.15
-_PEBBLES = 0.5  # of the variance of slopes
-_PEBBLE_CELLS = (4, 8, 16, 32, 64)  # texels; one pebble at most in each, up to 0.4 of it in radius
-_PEBBLE_SHARE = 0.5
+_PEBBLES = 0.5  # fraction of the variance of slopes
+_PEBBLE_CELLS = (4, 8, 16, 32, 64)  # texels; each cell holds at most one pebble, with a radius of up to 0.4 cells
+_PEBBLE_SHARE = 0.5  # fraction of the cells with a pebble
 _STEEPEST = 1.5
-_UNIT = 2.0**-11  # slopes are kept as int16
+_UNIT = 2.0**-11  # slopes are stored as int16 in this unit
 
 
 @dataclass(frozen=True, kw_only=True)
 class FineRelief:
-    """How a self-affine surface goes on below facets of `facet_m` up to `radius_m` from the origin, and beyond of
-    a size that grows as the distance to the power `growth`.
+    """Describe how a self-affine surface continues below the facets.
 
-    `slope`: RMS an octave and axis on bare ground, at wavelengths of 2.5 `facet_m`; of longer ones it changes as
-    the wavelength to the power `hurst` - 1.
+    Attributes
+    ----------
+    slope
+        RMS slope per octave and axis on bare ground, at wavelengths of 2.5 `facet_m`. At longer wavelengths it
+        changes as the wavelength to the power `hurst` - 1.
+    facet_m, radius_m, growth
+        Facets have the size `facet_m` up to `radius_m` from the origin. Beyond, their size grows as the distance to
+        the power `growth`.
+    hurst
+        Exponent of the self-affine surface.
     """
 
     slope: float
@@ -53,40 +62,43 @@ class FineRelief:
 
     @property
     def longest_m(self) -> float:
-        """The longest wavelength near the origin."""
+        """Return the longest wavelength near the origin."""
         return _FACETS * self.facet_m
 
 
 class Detail:
-    """The relief seen with pixels that subtend `pixel_rad`."""
+    """Evaluate the relief as seen with pixels that subtend `pixel_rad`."""
 
     def __init__(self, relief: FineRelief, pixel_rad: float) -> None:
         self._slope = dr.opaque(mi.Float, relief.slope)
         self._pixel = dr.opaque(mi.Float, pixel_rad)
         self._inverse_radius2 = dr.opaque(mi.Float, relief.radius_m**-2)
         self._growth = dr.opaque(mi.Float, relief.growth)
-        # the two tiles' scales differ by 2 near the site
+        # near the site, the scales of the two tiles differ by a factor of 2
         self._per_m = dr.opaque(mi.Float, _LONGEST_M * np.sqrt(2) / relief.longest_m)
         self._fall = dr.opaque(mi.Float, relief.hurst - 1)
         self._pyramid = _pyramid()
 
     def turned(self, normal: Any, point: Any, view: Any, distance_m: Any, dust: Any, dither: Any) -> Any:
-        """Unit normals turned by the slopes at points of L. `dither` in [0, 1), one number a pixel, chooses between
-        two neighbouring levels of the pyramid: from pixel to pixel they mix, and within one nothing is random."""
+        """Return unit normals turned by the slopes at points of L.
+
+        `dither` in [0, 1), one number per pixel, chooses between two neighbouring levels of the pyramid. The levels
+        therefore mix from pixel to pixel, and nothing is random within a pixel.
+        """
         footprint = distance_m * self._pixel * dr.rsqrt(dr.maximum(dr.abs(dr.dot(normal, view)), _GRAZING))
-        # the plane that the normal is nearest to: xy, yz or xz
+        # slopes refer to the coordinate plane (xy, yz or xz) that is most nearly perpendicular to the normal
         a = dr.abs(normal)
         level_ground, faces_x = (a.z >= a.x) & (a.z >= a.y), a.x > a.y
         u = dr.select(level_ground | ~faces_x, point.x, point.y)
         v = dr.select(level_ground, point.y, point.z)
-        # facets twice as large: 1 more
+        # this grows by 1 where facets become twice as large
         larger = self._growth * _log2(dr.maximum(dr.squared_norm(point) * self._inverse_radius2, 1.0)) * 0.5
         su, sv = mi.Float(0), mi.Float(0)
         for k, tile in enumerate(_TILES_M):
             turn = 0.5 * (larger + 0.5 - k)
             step = dr.round(turn)
             octave = 2 * step + k
-            # nearly a cosine: 1 in the middle of a step, 0 where the next begins
+            # this is nearly a cosine: 1 in the middle of a step, 0 where the next begins
             weight = (1 - 4 * dr.square(turn - step)) * dr.exp2(self._fall * octave)
             per_m = _power_of_two(-mi.Int32(octave)) * (self._per_m / tile)
             pair = self._slopes(k, u * per_m, v * per_m, footprint * per_m * _SIDE, dither)
@@ -103,10 +115,10 @@ class Detail:
         return dr.normalize(normal - off)
 
     def _slopes(self, k: int, u: Any, v: Any, texels: Any, dither: Any) -> tuple[Any, Any]:
-        """Slopes along the axes of tile k at places in tiles, averaged over that many texels."""
+        """Return slopes along the axes of tile k at positions in tiles, averaged over `texels` texels."""
         level = mi.Int32(dr.floor(_log2(dr.maximum(texels, 1.0)) + dither))
         shown = level < _LEVELS
-        level = dr.clip(level, 0, _LEVELS - 1)  # a ray that hits nothing may give any number
+        level = dr.clip(level, 0, _LEVELS - 1)  # a ray without a hit may give any number
         side = mi.Int32(_SIDE) >> level
         c, s = float(np.cos(k * _TURN)), float(np.sin(k * _TURN))
         tu, tv = c * u + s * v, c * v - s * u
@@ -114,7 +126,7 @@ class Detail:
         y = (tv - dr.floor(tv)) * mi.Float(side)
         column, row = mi.Int32(x), mi.Int32(y)
         x, y = x - mi.Float(column), y - mi.Float(row)
-        # the larger levels' texels come first; what rounds up to the side is the next tile's
+        # the texels of the larger levels come first; an index that rounds up to `side` belongs to the next tile
         start, last = (_SIDE * _SIDE - side * side) // 3 * 4, side - 1
         at = mi.UInt32(start + (row & last) * side + (column & last))
         corners = dr.gather(mi.Vector4i, self._pyramid, at, shown)
@@ -124,21 +136,25 @@ class Detail:
 
 
 def _log2(x: Any) -> Any:
-    """log2 of positive numbers within 0.09, exact at powers of two, rising: the bits of a float are nearly that."""
+    """Return log2 of positive numbers from the bits of the float, within 0.09.
+
+    The result rises monotonically and is exact at powers of two.
+    """
     return mi.Float(dr.reinterpret_array(mi.Int32, x)) * 2.0**-23 - 127
 
 
 def _power_of_two(exponent: Any) -> Any:
+    """Return 2 to the power of an integer."""
     return dr.reinterpret_array(mi.Float, (exponent + 127) << 23)
 
 
 @lru_cache(maxsize=1)
 def _pyramid() -> Any:
-    """Slopes of all levels, level after level: of each texel and its neighbours, two to a word."""
+    """Return the slopes of all levels, level after level: each texel with its neighbours, two slopes to a word."""
     k = np.fft.fftfreq(_SIDE) * _SIDE
     kx, ky = np.meshgrid(k, k)
     radius = np.hypot(kx, ky)
-    longest = _TILES_M[0] / _LONGEST_M  # cycles a tile
+    longest = _TILES_M[0] / _LONGEST_M  # cycles per tile
     power = np.where(radius >= longest, np.maximum(radius, 1.0) ** (-2 * (1 + _HURST)), 0.0)
     rng = np.random.Generator(np.random.Philox(np.random.SeedSequence(0xDE7A11)))
     height = np.sqrt(power) * np.fft.fft2(rng.normal(size=(_SIDE, _SIDE)))
@@ -155,7 +171,7 @@ def _pyramid() -> Any:
     words = [
         np.round(level / _UNIT).clip(-32768, 32767).astype(np.int16).view(np.int32)[..., 0] for level in levels
     ]
-    # with its neighbours to the right, below, and both: one packet
+    # each texel with its neighbours to the right, below, and both makes one packet
     corners = [np.stack([np.roll(w, (-j, -i), (0, 1)) for j in (0, 1) for i in (0, 1)], axis=-1) for w in words]
     table = mi.Int32(np.concatenate([of.reshape(-1) for of in corners]))
     dr.eval(table)
@@ -163,7 +179,7 @@ def _pyramid() -> Any:
 
 
 def _pebbles(rng: np.random.Generator) -> NDArray[np.float64]:
-    """Slopes float64[y, x, 2] of a periodic heap of pebbles, as many of each size as fit."""
+    """Return slopes float64[y, x, 2] of a periodic layer of pebbles of all sizes."""
     row, column = np.indices((_SIDE, _SIDE))
     highest = np.zeros((_SIDE, _SIDE))
     for cell in _PEBBLE_CELLS:

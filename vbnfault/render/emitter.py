@@ -1,4 +1,4 @@
-"""The Sun as a limb-darkened disc of finite angular size and true spectral irradiance."""
+"""Model the Sun as a limb-darkened disc with its true angular size and spectral irradiance."""
 
 from __future__ import annotations
 
@@ -12,8 +12,11 @@ from .sampling import opaque_vector
 
 
 class SunDisc:
-    """Directions on the disc. Works with offsets from the centre direction: the cosine of a quarter of a degree has
-    three significant bits left in float32."""
+    """Compute directions towards points of the disc.
+
+    Directions are offsets from the direction of the centre. In float32, the cosine of a quarter of a degree would
+    keep only a few significant bits of its difference from 1.
+    """
 
     def __init__(self, sun: Sunlight) -> None:
         z = sun.direction_L / np.linalg.norm(sun.direction_L)
@@ -25,20 +28,20 @@ class SunDisc:
         self._tangent = dr.opaque(mi.Float, np.tan(sun.angular_radius_rad))
 
     def towards(self, p: Any) -> Any:
-        """Unit direction towards the point of the disc at `p` on the unit disc."""
+        """Return the unit direction towards the point of the disc at `p` on the unit disc."""
         return dr.normalize(self.direction + self._tangent * (p.x * self._x + p.y * self._y))
 
 
 def mu(p: Any) -> Any:
-    """Cosine from the Sun's local vertical at a point of the unit disc."""
+    """Return the cosine of the angle to the Sun's local vertical at a point of the unit disc."""
     return dr.sqrt(dr.maximum(1 - dr.squared_norm(p), 0))
 
 
 class Limb:
-    """Limb darkening as few terms: Σ_k weights[k, b] · term_k(μ) is the radiance of band b over its disc's mean.
+    """Represent limb darkening by few terms: Σ_k weights[k, b] · term_k(μ).
 
-    The profiles of neighbouring bands are nearly multiples of one another: a singular value decomposition keeps
-    what stands out above 1e-4.
+    This sum is the radiance of band b over its mean on the disc. The profiles of neighbouring bands are nearly
+    multiples of one another, so a singular value decomposition keeps only the components above 1e-4 of the largest.
     """
 
     def __init__(self, sun: Sunlight) -> None:
@@ -52,12 +55,12 @@ class Limb:
             self.coefficients, self.weights = u[:, :kept].T @ sun.limb_darkening, u[:, :kept].T
 
     def terms(self, mu: Any) -> list[Any]:
-        """The terms at μ."""
+        """Return the terms at μ."""
         return [polynomial(c, mu) for c in self.coefficients]
 
 
 def polynomial(coefficients: np.ndarray, x: Any) -> Any:
-    """Σ c_k xᵏ by Horner's rule; the coefficients are runtime values, not constants of the kernel."""
+    """Return Σ c_k xᵏ by Horner's rule; the coefficients are runtime values, not constants of the kernel."""
     total = dr.opaque(mi.Float, float(coefficients[-1]))
     for c in coefficients[-2::-1]:
         total = dr.fma(total, x, dr.opaque(mi.Float, float(c)))

@@ -1,4 +1,4 @@
-"""All light of a scene."""
+"""Add up all light of a scene."""
 
 from __future__ import annotations
 
@@ -11,8 +11,10 @@ from .surface import TerrainMesh
 
 
 def radiance(surface: TerrainMesh, scene: RenderInput, guide: Truth | None = None) -> Radiance:
-    """Radiance per band at the camera, box-filtered over each pixel; `guide` is the view's `truth` where it is
-    known, for light between surfaces."""
+    """Return the radiance per band at the camera, box-filtered over each pixel.
+
+    `guide` is the `truth` of the view, which light between surfaces needs; it is computed if it is not given.
+    """
     found, _ = direct(surface, scene)
     if not scene.bounces:
         return found

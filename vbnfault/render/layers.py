@@ -1,4 +1,4 @@
-"""What every pixel centre sees, without noise: depth, normals, classes, angles."""
+"""Compute what each pixel centre sees, without noise: depth, normals, semantic classes and angles."""
 
 from __future__ import annotations
 
@@ -26,14 +26,20 @@ def truth(
     slopes: NDArray[np.float64] | None = None,
     projection: Projection | None = None,
 ) -> Truth:
-    """Depth, normal and semantic class of every pixel centre, from one ray each; with `angles` also those of
-    incidence, emission and phase, the dust and the spacecraft's materials.
+    """Return depth, normal and semantic class at every pixel centre, from one ray each.
 
-    Of the pixels whose centres see the sky, those that hold any of the visible Sun have its class. A Sun smaller
-    than a pixel also gives it to the one where its centre is seen, whatever the pixel's own centre sees.
+    A pixel whose centre sees the sky has the class of the Sun if any of the visible Sun lies in it. If the Sun is
+    smaller than a pixel, the pixel in which its centre is visible also has this class, whatever its own centre
+    sees.
 
-    `slopes`: tangents x/z and y/z of the rays in C, float64[y, x, 2], and `projection`, which says the same of
-    every position in those pixels; default: those of the view's pinhole.
+    Parameters
+    ----------
+    angles
+        Return also the angles of incidence, emission and phase, the dust and the spacecraft's materials.
+    slopes
+        float64[y, x, 2]: tangents x/z and y/z of the rays in C. None: those of the view's pinhole.
+    projection
+        The same map for all positions in these pixels. None: the view's pinhole.
     """
     optics = Optics(view)
     shape = (view.height_px, view.width_px) if slopes is None else slopes.shape[:2]
@@ -70,7 +76,7 @@ def truth(
 
 
 def _mark_sun(classes: NDArray[np.uint8], disc: SunInView, projection: Projection) -> None:
-    """Give the pixels that hold any of the disc their class, uint8[y, x], in place."""
+    """Set the class of the pixels that hold any of the disc, uint8[y, x], in place."""
     found, bounds = pixel_sums(disc, projection, (classes.shape[0], classes.shape[1])), bounds_px(disc, projection)
     if found is None or bounds is None:
         return
@@ -87,6 +93,6 @@ def _mark_sun(classes: NDArray[np.uint8], disc: SunInView, projection: Projectio
 
 
 def _angle_deg(a: Any, b: Any) -> Any:
-    """Angle between unit vectors, exact near 0 and 180°, where an arccosine is not."""
-    # a plain float: a numpy scalar would make a float64 numpy array of it
+    """Return the angle between unit vectors; it is exact near 0 and 180°, where an arccosine is not."""
+    # a plain float is needed: a numpy scalar would turn the result into a float64 numpy array
     return float(np.degrees(2.0)) * dr.atan2(dr.norm(a - b), dr.norm(a + b))

@@ -1,10 +1,10 @@
-"""Direct light: primary ray, one sample of the Sun's disc, photometry, every band on the same ray.
+"""Compute direct light: a camera ray, a point of the Sun's disc, and photometry in all bands on the same ray.
 
-The pixels' rays would miss a disc smaller than a pixel. Its direct image is therefore computed by `sundisc`, and
-rays from the pupil to all of the disc say which parts of it are hidden.
+The rays of the pixels would miss a disc smaller than a pixel. The Sun's direct image is therefore computed by
+`sundisc`, and rays from the pupil to all parts of the disc show which of them are hidden.
 
-All bands of a sample share its geometry, so spectral sampling adds no noise at all; the bands are the fixed
-quadrature that `spectra` defines. There is no film: the samples of a pixel are summed as a block.
+All bands of a sample share its geometry, so spectral sampling adds no noise. The bands are the fixed quadrature
+that `spectra` defines. There is no film: the samples of a pixel are summed as a block.
 """
 
 from __future__ import annotations
@@ -25,18 +25,20 @@ from .runtime import dr, mi
 from .sampling import Optics, Pixels, Strata
 from .surface import TerrainMesh
 
-# Values kept at once, samples × terms; larger images are cut into parts, so that memory stays bounded and what is
-# summed is still near the processor.
+# Number of values (samples × terms) kept at once. Larger images are divided into parts, so that memory is bounded
+# and the values are summed while they are still near the processor.
 WAVEFRONT = 1 << 23
 
-# Dimensions of a sample's random numbers: the Sun's disc; the lens takes 1, bounces the later ones.
+# Dimension of a sample's random numbers for the Sun's disc. The lens uses dimension 1, bounces use the later ones.
 SUN_DIMENSION = 0
 
-# Cells each way of the grid over the Sun's disc that rays ask for what hides it, at least and at most.
+# Least and greatest number of cells along each side of the grid over the Sun's disc; rays to each cell show whether
+# it is hidden.
 _CELLS = (128, 1024)
-# Points of the pupil that each of the fewest cells is asked from: parts of a spacecraft a metre away blur.
+# Points of the pupil per cell, if the grid has the least number of cells. Several are needed because parts of a
+# spacecraft a metre away are out of focus.
 _PUPIL_POINTS = 4
-# Powers of the inverse of the root of x⁵ = x + 1: steps of a sequence that stays even in four dimensions.
+# Steps of a sequence that is even in four dimensions: powers of 1/x, where x is the root of x⁵ = x + 1.
 _KRONECKER = 1.1673039782614187 ** -np.arange(1.0, 5.0)
 
 
@@ -46,12 +48,23 @@ def direct(
     weights: NDArray[np.float64] | None = None,
     pixels: NDArray[np.uint32] | None = None,
 ) -> tuple[Radiance, NDArray[np.float32]]:
-    """Radiance of sunlight reflected once and of the Sun's disc, and how far chance may have moved it.
+    """Return the radiance of the Sun's disc and of sunlight reflected once, and an estimate of its random error.
 
-    The second array holds for every pixel half the difference between two halves of its samples, as a signal: the
-    bands' sum with `weights` float64[band], signed; zeros without weights. Its variance is that of the pixel's own
-    error, or a little more, since half as many strata each leave more to chance. The Sun's disc is exact. `pixels`:
-    numbers of the pixels wanted, row after row; the arrays are then [band, 1, pixel] and [1, pixel].
+    Parameters
+    ----------
+    weights
+        float64[band]: weights of the bands in the signal whose error is estimated. None: the error is 0.
+    pixels
+        uint32[pixel]: row-major numbers of the wanted pixels. None: all pixels.
+
+    Returns
+    -------
+    Radiance
+        Array [band, y, x], or [band, 1, pixel] for listed pixels.
+    error
+        float32[y, x] or [1, pixel]: half the signed difference between the mean signals of two halves of the
+        pixel's samples. Its variance is that of the pixel's own error or slightly larger, because half as many
+        strata leave more to chance. The Sun's disc is exact.
     """
     view = scene.view
     wanted = Pixels(view.width_px * view.height_px) if pixels is None else Pixels(len(pixels), listed=pixels)
@@ -78,10 +91,10 @@ def direct(
 
 
 def sun_in_view(surface: TerrainMesh, view: View, sun: Sunlight) -> SunInView | None:
-    """Return the Sun's disc as the camera sees it, and which parts are hidden; None where it is not in the frame.
+    """Return the Sun's disc as the camera sees it and which parts are hidden; None if it is not in the frame.
 
-    Rays go from the pupil to points of the disc, one or more in each cell of a grid: an edge across the disc is
-    then known to a cell's width, and the area on one side of it to 1e-3 of the disc.
+    Rays go from the pupil to points of the disc, one or more in each cell of a grid. The position of an edge across
+    the disc is then known to a cell's width, and the area on one side of it to 1e-3 of the disc.
     """
     if not _may_see(view, sun):
         return None
@@ -95,17 +108,18 @@ def sun_in_view(surface: TerrainMesh, view: View, sun: Sunlight) -> SunInView | 
     bounds = bounds_px(disc, Pinhole(view.intrinsics))
     if bounds is None:
         return None
-    # two cells a pixel of a disc that the frame resolves
+    # two cells per pixel if the frame resolves the disc
     wanted = 2 * float((bounds[1] - bounds[0]).max())
     side = int(np.clip(2.0 ** np.ceil(np.log2(max(wanted, 1.0))), _CELLS[0], _CELLS[1]))
     several = _PUPIL_POINTS if view.aperture_radius_m > 0 and side == _CELLS[0] else 1
     count = side * side * several
     index = np.arange(count)
-    # a sequence in four dimensions, even in each two (Roberts 2018, after Kronecker): place in the cell, and pupil
+    # A sequence that is even in four dimensions (Roberts 2018, after Kronecker): two for the position in the cell,
+    # two for the pupil.
     u = (0.5 + index[None, :] * _KRONECKER[:, None]) % 1
     cell = index // several
     place = 2 * (np.stack([cell % side, cell // side]) + u[:2]) / side - 1
-    place /= np.maximum(np.hypot(*place), 1.0)  # of cells beyond the rim
+    place /= np.maximum(np.hypot(*place), 1.0)  # cells beyond the rim move onto it
     sine = np.sin(sun.angular_radius_rad)
     across = sine * place
     along = np.sqrt(1 - (across**2).sum(axis=0))
@@ -121,11 +135,12 @@ def sun_in_view(surface: TerrainMesh, view: View, sun: Sunlight) -> SunInView | 
 
 
 def _columns(rows: NDArray[np.float64]) -> list[Any]:
+    """Return the columns of an array as drjit floats."""
     return [mi.Float(np.ascontiguousarray(column, np.float32)) for column in rows.T]
 
 
 class Light:
-    """Rays of a view over terrain, and sunlight that reaches where they end."""
+    """Trace the rays of a view over terrain, and test whether sunlight reaches their hits."""
 
     def __init__(self, surface: TerrainMesh, scene: RenderInput, *, banded: bool) -> None:
         self.surface, self.scene, self.banded = surface, scene, banded
@@ -136,16 +151,20 @@ class Light:
             self.detail = Detail(surface.fine, 1 / float(scene.view.intrinsics[0]))
 
     def lit(self, hit: Any, point_of_sun: Any, *, coherent: bool = True) -> tuple[Any, Any]:
-        """Direction towards a point of the Sun's disc, and whether its light arrives; `coherent` where neighbours
-        run alike."""
+        """Return the direction towards a point of the Sun's disc, and whether its light arrives.
+
+        Set `coherent` where neighbouring rays are alike.
+        """
         towards = self.sun.towards(point_of_sun)
         lit = hit.valid & (dr.dot(hit.normal, towards) > 0)
         lit &= ~self.world.occluded(hit.shadow_rays(towards), lit, coherent=coherent)
         return towards, lit
 
     def reflection(self, hit: Any, rays: Any, strata: Strata | None = None) -> Reflection:
-        """How the ground at `hit` reflects towards where the rays come from; with its finest relief where `strata`
-        of the pixel's samples are given."""
+        """Return the reflection at `hit` towards the origin of the rays.
+
+        If `strata` of the pixel's samples are given, the finest relief turns the normals.
+        """
         normal = hit.normal
         if strata is not None:
             normal = hit.shading_normal(self.detail, strata.dither())
@@ -153,7 +172,10 @@ class Light:
 
 
 class _Direct(Light):
-    """Samples of pixels, and the sum of their terms; `weights` [term, band]: radiance of a unit of each term."""
+    """Compute samples of pixels and sum their terms.
+
+    `weights` [term, band] is the radiance per unit of each term.
+    """
 
     def __init__(self, surface: TerrainMesh, scene: RenderInput) -> None:
         super().__init__(surface, scene, banded=has_bands(surface, scene))
@@ -167,7 +189,7 @@ class _Direct(Light):
     def image(
         self, pixels: Pixels, signal: NDArray[np.float64] | None
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """float32[band, pixel]; and float32[pixel]: half the difference of the samples' halves, as a signal."""
+        """Return the radiance float32[band, pixel], and float32[pixel] half the difference of the sample halves."""
         spp = self.scene.samples_per_pixel
         weights = (self.weights / spp).astype(np.float32)
         out = np.zeros((weights.shape[1], pixels.count), dtype=np.float32)
@@ -182,7 +204,7 @@ class _Direct(Light):
                     (t * dr.opaque(mi.Float, float(s)) for t, s in zip(terms, shares, strict=True)), mi.Float(0)
                 )
                 terms = [*terms, seen * strata.checkered()]
-            dr.eval(*terms)  # unevaluated, every block sum would trace the rays again
+            dr.eval(*terms)  # without this, every block sum would trace the rays again
             sums = [dr.block_sum(term, spp) for term in terms]
             dr.eval(*sums)
             span = slice(done, done + part.count)
@@ -198,6 +220,7 @@ class _Direct(Light):
         return out, halves
 
     def terms(self, strata: Strata) -> list[Any]:
+        """Return what each sample adds to each term."""
         rays = self.optics.camera_rays(strata)
         hit = self.world.intersect(rays)
         point = strata.disc(SUN_DIMENSION)
@@ -211,12 +234,15 @@ class _Direct(Light):
 
 
 def _may_see(view: View, sun: Sunlight) -> bool:
-    """Whether the Sun's disc may lie in the frame; the lens's finite aperture is far smaller than the margin."""
+    """Return whether the Sun's disc may lie in the frame.
+
+    The margin is far larger than the lens's finite aperture.
+    """
     x, y, z = view.L_from_C.T @ sun.direction_L
     fx, fy, cx, cy = view.intrinsics
     if z <= 0:
         return False
-    # a tangent of the angle grows faster at the edge of a wide field
+    # the tangent of the angle grows faster at the edge of a wide field
     margin = 0.02 + np.tan(2 * sun.angular_radius_rad) * (1 + (x * x + y * y) / z**2)
     across = (-cx / fx - margin, (view.width_px - cx) / fx + margin)
     along = (-cy / fy - margin, (view.height_px - cy) / fy + margin)

@@ -1,4 +1,4 @@
-"""Triangles as a scene of their own that rays can be traced through."""
+"""Turn triangles into a Mitsuba scene through which rays can be traced."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from .runtime import mi
 
 
 def mesh_scene(name: str, vertices_m: NDArray[np.float32], faces: NDArray[np.int32]) -> Any:
-    """A Mitsuba scene of one triangle mesh: `vertices_m` float32[n, 3], `faces` int32[m, 3]."""
+    """Return a Mitsuba scene of one triangle mesh: `vertices_m` float32[n, 3], `faces` int32[m, 3]."""
     mesh = mi.Mesh(name, len(vertices_m), len(faces))
     parameters = mi.traverse(mesh)
     parameters["vertex_positions"] = mi.Float(np.ascontiguousarray(vertices_m, np.float32).ravel())

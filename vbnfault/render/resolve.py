@@ -1,4 +1,4 @@
-"""Questions the planner asks of the terrain: ground height, clearance, how much of the Sun is visible."""
+"""Answer the planner's questions about the terrain: ground height, clearance, visible fraction of the Sun."""
 
 from __future__ import annotations
 
@@ -15,15 +15,16 @@ from .vehicle import Vehicle
 
 F64 = NDArray[np.float64]
 
-_SUN_SAMPLES = 1024  # a straight edge across the disc: within 0.3 % of its area
-_FACETS = 1 << 16  # whose distance is measured at a time, for the memory's sake
+_SUN_SAMPLES = 1024  # gives the area on one side of a straight edge within 0.3 % of the disc's area
+_FACETS = 1 << 16  # facets whose distance is computed at a time, to bound memory
 _GROUND_HITS = 4
 
 
 def ground_height_m(surface: TerrainMesh, x_m: F64, y_m: F64, start_height_m: float) -> F64:
-    """Height (up, −z of L) of the ground at positions in L, float64 like `x_m`; 0 where there is none.
+    """Return the height (up, −z of L) of the ground at positions in L, float64 like `x_m`; 0 without ground.
 
-    The first surface that faces up below `start_height_m`: a start inside an overhang first leaves the body.
+    The ground is the first surface below `start_height_m` that faces up. A ray that starts inside an overhang first
+    leaves the body.
     """
     n = len(x_m)
     origin = np.column_stack([x_m, y_m, np.full(n, -start_height_m)])
@@ -47,9 +48,9 @@ def ground_height_m(surface: TerrainMesh, x_m: F64, y_m: F64, start_height_m: fl
 
 
 def is_clear(surface: TerrainMesh, position_L_m: F64, clearance_m: float) -> NDArray[np.bool_]:
-    """Return which positions float64[n, 3] are at least `clearance_m` from every facet, bool[n], by exact distance.
+    """Return which positions float64[n, 3] are at least `clearance_m` from every facet, bool[n].
 
-    Boxes about runs of neighbouring facets leave few to be measured.
+    Distances are exact. Boxes around runs of neighbouring facets leave few facets to measure.
     """
     clear = np.ones(len(position_L_m), dtype=bool)
     for k, position in enumerate(np.asarray(position_L_m, dtype=np.float64)):
@@ -65,7 +66,7 @@ def is_clear(surface: TerrainMesh, position_L_m: F64, clearance_m: float) -> NDA
 def _distance_m(corners: F64) -> F64:
     """Return the distance of the origin from triangles float64[n, corner, 3], float64[n].
 
-    It is that of the plane where the origin's foot lies within the triangle, else that of the nearest edge.
+    It is the distance to the plane if the origin projects into the triangle, else the distance to the nearest edge.
     """
     nearest = np.full(len(corners), np.inf)
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -83,7 +84,7 @@ def _distance_m(corners: F64) -> F64:
 
 
 def is_between(surface: TerrainMesh, origin_L_m: F64, points_L_m: F64) -> bool:
-    """Whether any surface lies between `origin_L_m`, float64[3], and any of the points, float64[n, 3]."""
+    """Return whether any surface lies between `origin_L_m`, float64[3], and any of the points, float64[n, 3]."""
     way = points_L_m - origin_L_m
     length = np.maximum(np.linalg.norm(way, axis=1), 1e-9)
     return bool(_any_hit(surface, origin_L_m[None], (way / length[:, None])[None], length).any())
@@ -94,7 +95,7 @@ def sun_visible_fraction(
 ) -> F64:
     """Return the fraction of the Sun's disc that is not hidden, float64[n], from 1024 points of the disc each.
 
-    The body hides it, and where the camera's axes are given, float64[n, 3, 3], so does its spacecraft.
+    The body hides the Sun. If the camera's axes are given, float64[n, 3, 3], its spacecraft hides the Sun, too.
     """
     points = sunflower(_SUN_SAMPLES)
     directions = []
@@ -114,14 +115,19 @@ def sunlit_ground(surface: TerrainMesh, position_L_m: F64, rays_L: F64, sun_L: F
 
     Parameters
     ----------
-    surface : Surface
-        The terrain; a spacecraft is not looked at.
-    position_L_m, rays_L, sun_L : float64[view, 3], float64[view, ray, 3], float64[view, 3]
-        Where each view's rays start, their unit directions, and the unit direction of its Sun.
+    surface
+        The terrain; its spacecraft is ignored.
+    position_L_m
+        float64[view, 3]: where the rays of each view start.
+    rays_L
+        float64[view, ray, 3]: their unit directions.
+    sun_L
+        float64[view, 3]: the unit direction of each view's Sun.
     """
     views, count = rays_L.shape[:2]
 
     def each(vectors: F64) -> Any:
+        """Return the components of one vector per ray."""
         rows = np.broadcast_to(vectors, (views, count, 3)).reshape(-1, 3).astype(np.float32)
         return [mi.Float(np.ascontiguousarray(column)) for column in rows.T]
 
@@ -136,8 +142,11 @@ def sunlit_ground(surface: TerrainMesh, position_L_m: F64, rays_L: F64, sun_L: F
 def _any_hit(
     surface: TerrainMesh | Vehicle, position: F64, directions: F64, reach_m: float | F64
 ) -> NDArray[np.bool_]:
-    """bool[n, k] for positions float64[n, 3] and directions float64[n or 1, k, 3], as far as `reach_m`, which may
-    be one number for each of the n · k."""
+    """Return whether rays from positions float64[n, 3] hit anything, bool[n, k].
+
+    Directions are float64[n or 1, k, 3]. `reach_m` is the largest distance: one number, or one for each of the n ·
+    k rays.
+    """
     n, k = len(position), directions.shape[1]
     origins = np.repeat(position, k, axis=0)
     d = np.broadcast_to(directions, (n, k, 3)).reshape(-1, 3)

@@ -1,4 +1,4 @@
-"""Loads drjit and mitsuba, once, with a usable LLVM and the spectral variant."""
+"""Load drjit and mitsuba once, with a usable LLVM and the spectral variant."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import mitsuba  # noqa: E402
 mitsuba.set_variant("llvm_ad_spectral")
 mitsuba.set_log_level(mitsuba.LogLevel.Error)
 
-# their stubs do not know what broadcasting and swizzling allow
+# their type stubs do not cover broadcasting and swizzling
 dr: Any = drjit
 mi: Any = mitsuba
 
@@ -22,5 +22,5 @@ __all__ = ["dr", "mi", "set_threads"]
 
 
 def set_threads(count: int) -> None:
-    """Cap the number of render threads of this process."""
+    """Limit the number of render threads of this process."""
     dr.set_thread_count(count)

@@ -1,7 +1,7 @@
-"""Primary rays: strata of each pixel, their jitter, and the thin lens.
+"""Create camera rays: strata of each pixel, their jitter, and the thin lens.
 
-Samples of a pixel are neighbours in the wavefront, so packets of rays are coherent and the sum over a pixel is
-a block sum: bit-identical from run to run, whatever the number of threads.
+The samples of a pixel are neighbours in the wavefront. Packets of rays are therefore coherent, and the sum over a
+pixel is a block sum. It is bit-identical from run to run, whatever the number of threads.
 """
 
 from __future__ import annotations
@@ -21,8 +21,11 @@ _TO_UNIT = 2.0**-32
 
 
 class Strata:
-    """Jittered strata of all pixels: `pixel`, `index` within the pixel, a point of the pixel's area, and points
-    of unit discs (the lens, the Sun) stratified over the samples of a pixel."""
+    """Provide jittered strata of all pixels.
+
+    `pixel` is the number of each sample's pixel and `index` its number within the pixel. The methods give points of
+    the pixel's area and of unit discs (the lens, the Sun), stratified over the samples of a pixel.
+    """
 
     def __init__(self, pixels: Pixels, samples_per_pixel: int, key: int) -> None:
         self.side = round(samples_per_pixel**0.5)
@@ -40,32 +43,35 @@ class Strata:
         self._wavefront = wavefront
 
     def square(self, dimension: int = 0) -> tuple[Any, Any]:
-        """A uniform point of each stratum of the unit square, x and y in [0, 1]; of the pixel, for dimension 0."""
+        """Return a uniform point of each stratum of the unit square, x and y in [0, 1].
+
+        With dimension 0, the square is the pixel.
+        """
         u, v = self.jitter(dimension)
         sx, sy = self.index & (self.side - 1), self.index >> (self.side.bit_length() - 1)
         return (mi.Float(sx) + u) / self.side, (mi.Float(sy) + v) / self.side
 
     def jitter(self, dimension: int) -> tuple[Any, Any]:
-        """Two uniform numbers in [0, 1] a sample."""
+        """Return two uniform numbers in [0, 1] per sample."""
         u, v = mi.sample_tea_32(self._wavefront, self._key ^ (0x9E3779B9 * dimension & 0xFFFFFFFF), 4)
-        # 2⁻³² · u may round to 1.0 in float32, which is still inside the closed stratum: harmless
+        # 2⁻³² · u may round to 1.0 in float32, which is harmless: it still lies in the closed stratum
         return mi.Float(u) * _TO_UNIT, mi.Float(v) * _TO_UNIT
 
     def checkered(self) -> Any:
-        """+1 and -1 by turns, as on a chessboard: two halves of the samples that each cover the pixel."""
+        """Return +1 and -1 as on a chessboard: two halves of the samples that each cover the pixel."""
         parity = (self.index ^ (self.index >> (self.side.bit_length() - 1))) & 1
         return 1 - 2 * mi.Float(parity)
 
     def dither(self) -> Any:
-        """A number in [0, 1) for each pixel, the same whatever the sample and the frame."""
+        """Return a number in [0, 1) for each pixel, the same for all samples and frames."""
         h = self.pixel * 0x9E3779B1
         h ^= h >> 15
         return mi.Float((h * 0x85EBCA77) >> 8) * 2.0**-24
 
     def disc(self, dimension: int) -> Any:
-        """A point of the unit disc; the samples of a pixel share one of 256 even sets, chosen by a hash.
+        """Return a point of the unit disc; the samples of a pixel share one of 256 even sets, chosen by a hash.
 
-        `dimension` tells uses apart: they take different sets, in different orders.
+        `dimension` separates uses: each takes different sets, in different orders.
         """
         h = (self.pixel ^ self._key) * (0x9E3779B1 + 2 * dimension)
         h ^= h >> 15
@@ -77,14 +83,14 @@ class Strata:
 
 @dataclass(frozen=True)
 class Pixels:
-    """Pixels of a frame by their number, row after row: `count` of them from `first` on, or those `listed`."""
+    """Select pixels of a frame by row-major number: `count` of them from `first` on, or those `listed`."""
 
     count: int
     first: int = 0
     listed: NDArray[np.uint32] | None = None
 
     def parts(self, most: int) -> Iterator[Pixels]:
-        """The same in parts of at most `most`."""
+        """Yield the same pixels in parts of at most `most`."""
         for start in range(0, self.count, most):
             count = min(most, self.count - start)
             if self.listed is None:
@@ -98,19 +104,21 @@ _DISC_SETS = 256
 
 @lru_cache(maxsize=8)
 def _disc_table(samples: int, dimension: int) -> Any:
-    """Stratified points of the unit disc, `_DISC_SETS` sets of `samples`, each set in an order of its own."""
+    """Return stratified points of the unit disc: `_DISC_SETS` sets of `samples`, each set in its own order."""
     table = mi.Float(disc_sets(samples, dimension).astype(np.float32).ravel())
     dr.eval(table)
     return table
 
 
 def disc_sets(samples: int, dimension: int) -> NDArray[np.float64]:
-    """Points of the unit disc, float64[set, sample, 2]: one in each ring and in each sector, as in each tile of a
-    few of both (Hammersley's points under random digit shifts).
+    """Return points of the unit disc, float64[set, sample, 2].
 
-    A ring's radius is where the cosine from the Sun's vertical has the ring's mean: limb darkening, a polynomial
-    of that cosine, then adds no noise where the whole disc is seen. Both halves of a chessboard over the samples
-    take rings and sectors evenly, by the parity of the digits' sum.
+    Each set has one point in each ring, one in each sector, and one in each tile of a few rings and sectors
+    (Hammersley's points under random digit shifts).
+
+    The point of a ring lies where the cosine to the Sun's vertical has the ring's mean. Limb darkening is a
+    polynomial of that cosine and therefore adds no noise where the whole disc is visible. The parity of the sum of
+    digits divides rings and sectors evenly between the two halves of a chessboard over the samples.
     """
     rng = np.random.Generator(np.random.Philox(np.random.SeedSequence((samples, dimension))))
     if samples == 1:
@@ -127,7 +135,7 @@ def disc_sets(samples: int, dimension: int) -> NDArray[np.float64]:
     radius = np.sqrt(1 - mean_mu[ring] ** 2)
     turn = 2 * np.pi * (sector + rng.random(sector.shape)) / samples
     points = radius[..., None] * np.stack([np.cos(turn), np.sin(turn)], axis=-1)
-    # which of them go to the white squares, and which to the black ones
+    # decide which points go to the white squares, and which to the black ones
     colour = (k ^ (k >> bits // 2)) & 1
     out = np.empty_like(points)
     swap = rng.integers(2, size=_DISC_SETS)
@@ -139,7 +147,7 @@ def disc_sets(samples: int, dimension: int) -> NDArray[np.float64]:
 
 
 class Optics:
-    """A view with its numbers as opaque variables, so that no view recompiles a kernel."""
+    """Hold the numbers of a view as opaque variables, so that a new view needs no new kernel."""
 
     def __init__(self, view: View) -> None:
         self.width, self.height = view.width_px, view.height_px
@@ -153,8 +161,10 @@ class Optics:
         self._inverse_focus = dr.opaque(mi.Float, 1.0 / view.focus_distance_m)
 
     def direction(self, x: Any, y: Any, lens: Any = None) -> tuple[Any, Any]:
-        """Origin and unit direction in L of the ray through image point (x, y) in pixels; `lens` is a point of
-        the unit disc on the aperture."""
+        """Return origin and unit direction in L of the ray through image point (x, y) in pixels.
+
+        `lens` is a point of the unit disc on the aperture; without it, the ray goes through the centre of the lens.
+        """
         cx = (x - self.centre.x) * self.scale.x
         cy = (y - self.centre.y) * self.scale.y
         ax, ay, az = self.axes
@@ -166,7 +176,7 @@ class Optics:
         return origin, dr.normalize(cx * ax + cy * ay + az)
 
     def camera_rays(self, strata: Strata) -> Any:
-        """One ray a stratum, through the thin lens."""
+        """Return one ray per stratum, through the thin lens."""
         u, v = strata.square()
         x = mi.Float(strata.pixel % self.width) + u
         y = mi.Float(strata.pixel // self.width) + v
@@ -174,19 +184,19 @@ class Optics:
         return mi.Ray3f(*self.direction(x, y, lens))
 
     def centre_rays(self) -> Any:
-        """One pinhole ray through every pixel centre."""
+        """Return one pinhole ray through every pixel centre."""
         pixel = dr.arange(mi.UInt32, self.width * self.height)
         x = mi.Float(pixel % self.width) + 0.5
         y = mi.Float(pixel // self.width) + 0.5
         return mi.Ray3f(*self.direction(x, y))
 
     def rays_of(self, slopes: NDArray[np.float64]) -> Any:
-        """One ray from the centre of the lens for each of the tangents x/z and y/z in C, float64[y, x, 2]."""
+        """Return one ray from the lens's centre for each pair of tangents x/z and y/z in C, float64[y, x, 2]."""
         across, down = (mi.Float(np.ascontiguousarray(slopes[..., k], np.float32).ravel()) for k in (0, 1))
         ax, ay, az = self.axes
         return mi.Ray3f(self.origin, dr.normalize(across * ax + down * ay + az))
 
 
 def opaque_vector(kind: Any, values: np.ndarray) -> Any:
-    """A drjit vector whose entries are runtime values, not constants of the kernel."""
+    """Return a drjit vector whose entries are runtime values, not constants of the kernel."""
     return kind(*(dr.opaque(mi.Float, float(v)) for v in values))

@@ -1,8 +1,8 @@
-"""The terrain as the renderer sees it: one triangle mesh, its normals, precise shadow origins.
+"""Trace rays through the terrain: one triangle mesh with its normals and precise origins of shadow rays.
 
-Mitsuba moves the origin of a shadow ray by 9e-5 · (1 + max|p|): 0.22 m at 2.5 km, more than a stone. Here the
-hit is taken along the ray and moved off the facet by a few units of float32 resolution at its own distance, and
-the facet's data come from tables instead of a virtual call: faster, and contact shadows survive.
+Mitsuba moves the origin of a shadow ray by 9e-5 · (1 + max|p|): 0.22 m at 2.5 km, more than a stone. Here the hit
+is a point of the ray, moved off the facet by a few units of float32 resolution at its own distance. The facet's
+data come from tables instead of a virtual call. This is faster and keeps contact shadows.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ from .mesh import mesh_scene
 from .runtime import dr, mi
 from .vehicle import Vehicle, World
 
-# Float32 resolves 2⁻²³ of a coordinate; hit distance, ray direction and vertex rounding each err by about one
-# unit, so eight of them clear the facet without visibly moving the shadow (1 mm at 1 km).
+# Float32 resolves 2⁻²³ of a coordinate. Hit distance, ray direction and vertex rounding each err by about one unit.
+# Eight units therefore clear the facet and do not visibly move the shadow (1 mm at 1 km).
 _OFFSET = 8 * 2.0**-23
-_RUN = 64  # facets in a box that tells how far they can be
-# By which the 21 bits of a number are spread out to every third bit: shift, and the bits that are kept.
+_RUN = 64  # facets in a box that bounds their distance
+# Steps that spread the 21 bits of a number to every third bit: shift, and the bits that are kept.
 _SPREAD = (
     (32, 0x1F00000000FFFF),
     (16, 0x1F0000FF0000FF),
@@ -33,15 +33,28 @@ _SPREAD = (
     (2, 0x1249249249249249),
 )
 
-# Of a normal that faces the viewer: half precision, as truth is stored, moves a cosine by up to √3 · 2⁻¹².
+# Least cosine between a normal and the direction to the viewer. Truth stores normals in half precision,
+# which moves a cosine by up to √3 · 2⁻¹².
 _LEAST_COSINE = 2.0**-11
 
 
 class TerrainMesh:
-    """A triangle mesh in L. `vertices_m` float32[n, 3], `faces` int32[m, 3], `flat` bool[m]: facets shaded with
-    their own normal, such as boulders; the others with normals interpolated from their vertices. `dust` float32[n]
-    in [0, 1]: how far each vertex is covered (default: none is). `vehicle`: the spacecraft with the camera.
-    `fine`: relief finer than the facets."""
+    """Hold a triangle mesh in L for ray tracing.
+
+    Parameters
+    ----------
+    vertices_m, faces
+        float32[n, 3] in metres, int32[m, 3].
+    flat
+        bool[m]: facets shaded with their own normal, such as boulders. The others use normals interpolated from
+        their vertices.
+    dust
+        float32[n] in [0, 1]: dust cover of each vertex. None: no dust.
+    vehicle
+        The spacecraft with the camera.
+    fine
+        Relief finer than the facets.
+    """
 
     def __init__(
         self,
@@ -53,7 +66,7 @@ class TerrainMesh:
         fine: FineRelief | None = None,
     ) -> None:
         vertices_m, faces = np.asarray(vertices_m, dtype=np.float32), np.asarray(faces, dtype=np.int32)
-        with ThreadPoolExecutor(1) as aside:  # the tree's last steps keep one core busy
+        with ThreadPoolExecutor(1) as aside:  # the last steps of building the tree keep only one core busy
             normals = aside.submit(_vertex_normals, vertices_m, faces, flat)
             self.scene = mesh_scene("terrain", vertices_m, faces)
         self._corners = _corner_records(vertices_m, faces, flat, normals.result())
@@ -67,8 +80,10 @@ class TerrainMesh:
         return self._vertices_m[self._faces[facets]].astype(np.float64)
 
     def facets_near(self, position_L_m: NDArray[np.float64], reach_m: float) -> NDArray[np.intp]:
-        """Return the indices of all facets within `reach_m` of a position, among others: those of every run of
-        facets whose box reaches there."""
+        """Return the indices of all facets within `reach_m` of a position, and of some others.
+
+        These are the facets of every run whose box is within reach.
+        """
         order, low, high = self._boxes_m
         away = np.maximum(np.maximum(low - position_L_m, position_L_m - high), 0)
         runs = np.flatnonzero(np.einsum("ri,ri->r", away, away) <= reach_m**2)
@@ -77,8 +92,10 @@ class TerrainMesh:
 
     @cached_property
     def _boxes_m(self) -> tuple[NDArray[np.intp], NDArray[np.float64], NDArray[np.float64]]:
-        """The facets in an order in which neighbours follow one another, and lower and upper corners of the boxes
-        about runs of `_RUN` of them, float64[run, 3] each."""
+        """Return an order of the facets that keeps neighbours together, and boxes around runs of `_RUN` of them.
+
+        The boxes are given by their lower and upper corners, float64[run, 3] each.
+        """
         order = np.argsort(_morton(self._vertices_m[self._faces[:, 0]]), kind="stable")
         starts = np.arange(0, len(order), _RUN)
         corners = [self._vertices_m[self._faces[order, k]] for k in range(3)]
@@ -87,29 +104,34 @@ class TerrainMesh:
         return order, low.astype(np.float64), high.astype(np.float64)
 
     def seen_from(self, view: View) -> TerrainMesh | World:
-        """What a camera sees: the terrain, and its own spacecraft if there is one."""
+        """Return what a camera sees: the terrain, and its own spacecraft if there is one."""
         return self if self.vehicle is None else World(self, self.vehicle, view)
 
     def intersect(self, rays: Any, active: Any = True, *, coherent: bool = True) -> Hit:
-        """Closest hits; `coherent` where neighbours run alike."""
+        """Return the closest hits; set `coherent` where neighbouring rays are alike."""
         return self.hit(rays, self.trace(rays, active, coherent=coherent))
 
     def trace(self, rays: Any, active: Any = True, *, coherent: bool = True) -> tuple[Any, ...]:
-        """What `hit` needs besides the rays: can be evaluated, reordered with `dr.gather`, and used later."""
+        """Return what `hit` needs besides the rays.
+
+        It can be evaluated, reordered with `dr.gather` and used later.
+        """
         return (self.scene.ray_intersect_preliminary(rays, coherent=coherent, active=active),)
 
     def hit(self, rays: Any, traced: tuple[Any, ...]) -> Hit:
-        """The closest hits that `trace` found for these rays."""
+        """Return the closest hits that `trace` computed for these rays."""
         return Hit(self, rays, *traced)
 
     def occluded(self, rays: Any, active: Any, *, coherent: bool = True) -> Any:
-        """Whether anything lies along the rays; `coherent` where neighbours run alike."""
+        """Return whether anything lies along the rays; set `coherent` where neighbouring rays are alike."""
         return self.scene.ray_test(rays, coherent, active)
 
 
 def _morton(points_m: NDArray[np.float32]) -> NDArray[np.uint64]:
-    """Return the place of points float32[n, 3] along a curve that keeps neighbours together, uint64[n]: the bits of
-    their coordinates, 21 each, interleaved (Morton 1966)."""
+    """Return the index of points float32[n, 3] along a curve that keeps neighbours together, uint64[n].
+
+    The index interleaves the bits of the coordinates, 21 each (Morton 1966).
+    """
     low = points_m.min(axis=0)
     cells = (points_m - low) * (np.float32(2**21 - 1) / max(float((points_m - low).max()), 1e-30))
     code = np.zeros(len(points_m), dtype=np.uint64)
@@ -122,8 +144,17 @@ def _morton(points_m: NDArray[np.float32]) -> NDArray[np.uint64]:
 
 
 class Hit:
-    """Closest hits of a wavefront: `valid`, `distance_m`, and the unit outward `normal` that shades, interpolated
-    over the facet unless it is flat. `material`: of the vehicle's, None for terrain alone."""
+    """Hold the closest hits of a wavefront.
+
+    Attributes
+    ----------
+    valid, distance_m
+        Whether there is a hit, and its distance.
+    normal
+        Unit outward normal for shading, interpolated over the facet unless it is flat.
+    material, on_vehicle
+        Material of the vehicle and whether the hit is on it; None for terrain alone.
+    """
 
     material: Any = None
     on_vehicle: Any = None
@@ -142,7 +173,7 @@ class Hit:
 
     @cached_property
     def dust(self) -> Any:
-        """How far the ground is covered with dust, in [0, 1], interpolated over the facet."""
+        """Return the dust cover of the ground in [0, 1], interpolated over the facet."""
         table = self._surface._dust
         if len(table) == 1:
             return mi.Float(0)
@@ -150,16 +181,19 @@ class Hit:
         return sum((corners[k] * w for k, w in enumerate(self._weights)), mi.Float(0))
 
     def shading_normal(self, detail: Detail | None, dither: Any) -> Any:
-        """The normal turned by the relief finer than facets; `dither` in [0, 1), one number a pixel."""
+        """Return the normal turned by the relief finer than facets; `dither` in [0, 1) is one number per pixel."""
         if detail is None:
             return self.normal
         point = self._rays(self.distance_m)
         return detail.turned(self.normal, point, self._rays.d, self.distance_m, self.dust, dither)
 
     def shadow_rays(self, direction: Any) -> Any:
-        """Rays from the hits. The origin is moved off the facet to the smooth surface that the corner normals
-        suggest, so that facets near the terminator do not shadow themselves (Hanika 2021, Ray Tracing Gems II,
-        chapter 4), and then by a few units of float32 resolution."""
+        """Return rays from the hits in a direction.
+
+        The origin is moved off the facet to the smooth surface that the corner normals suggest, so that facets near
+        the terminator do not shadow themselves (Hanika 2021, Ray Tracing Gems II, chapter 4). It is then moved by a
+        few units of float32 resolution.
+        """
         point = mi.Vector3f(self._rays(self.distance_m))
         lift = mi.Vector3f(0)
         for corner, weight in zip(self._corners, self._weights, strict=True):
@@ -169,11 +203,11 @@ class Hit:
 
 
 def facing(normal: Any, view: Any) -> Any:
-    """Return unit normals that face the viewer: those given, or the nearest ones that a surface in view can have.
+    """Return unit normals that face the viewer: those given, or the nearest ones that a visible surface can have.
 
-    An interpolated normal, or one turned by fine relief, may point away from who sees its facet, which no visible
-    surface element does. It is turned within the plane of the two, no further than to the tangent plane of the line
-    of sight. `view`: unit vectors from the surface to the viewer.
+    An interpolated normal, or one turned by fine relief, may point away from a viewer who sees its facet. No
+    visible surface element has such a normal. The normal is turned in the plane of normal and line of sight, no
+    further than perpendicular to the line of sight. `view` holds unit vectors from the surface to the viewer.
     """
     cosine = dr.dot(normal, view)
     turned = dr.normalize(dr.fma(view, _LEAST_COSINE - cosine, normal))
@@ -181,17 +215,17 @@ def facing(normal: Any, view: Any) -> Any:
 
 
 def _with_a_fourth(three: NDArray[np.float32]) -> NDArray[np.float32]:
-    """float32[m, 4] of float32[m, 3]: a power of two is fetched in one packet."""
+    """Return float32[m, 3] padded to float32[m, 4], because a power of two is fetched in one packet."""
     return np.pad(three.astype(np.float32), ((0, 0), (0, 1)))
 
 
 def _corner_records(
     vertices: NDArray[np.float32], faces: NDArray[np.int32], flat: NDArray[np.bool_], normals: NDArray[np.float32]
 ) -> Any:
-    """Per corner of each facet, floats [m, 3, 4]: its unit normal, and the distance of its tangent plane from the
-    origin. Four floats: drjit fetches a power of two in one packet.
+    """Return four floats per corner of each facet: its unit normal, and the distance of its tangent plane from 0.
 
-    The normal is the facet's own where it is flat, else that of the vertex.
+    The normal is the facet's own if the facet is flat, else that of the vertex. The order is
+    [facet, corner, float]. drjit fetches four floats, a power of two, in one packet.
     """
     corner = dr.arange(mi.UInt32, 3 * len(faces))
     facet = corner // 3
@@ -209,11 +243,12 @@ def _corner_records(
 def _vertex_normals(
     vertices: NDArray[np.float32], faces: NDArray[np.int32], flat: NDArray[np.bool_]
 ) -> NDArray[np.float32]:
-    """Unit means of the smooth facets around each vertex, weighted by area, float32[n, 3]; 0 where all are flat.
+    """Return area-weighted unit means of the smooth facets' normals at each vertex, float32[n, 3].
 
-    Not on the device: sums over facets there depend on the order in which threads come.
+    The normal is 0 if all facets of a vertex are flat. The sums are not computed on the device, because there they
+    depend on the order of the threads.
     """
-    # axis by axis: numpy is several times slower on arrays of triples
+    # axis by axis, because numpy is several times slower on arrays of triples
     at = [np.ascontiguousarray(faces[~flat, k]) for k in range(3)]
     axes = [np.ascontiguousarray(vertices[:, axis]) for axis in range(3)]
     one, other = ([of[at[k]] - of[at[0]] for of in axes] for k in (1, 2))

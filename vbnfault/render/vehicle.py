@@ -1,7 +1,7 @@
-"""The spacecraft around the camera, traced in its own frame.
+"""Trace the spacecraft around the camera in its own frame.
 
-The vehicle moves with the camera, so its mesh stays as it is and the rays are turned into its frame B: nothing is
-built again from sample to sample, and parts near the camera keep float32's precision.
+The vehicle moves with the camera. Its mesh therefore stays as it is, and the rays are transformed into its frame B.
+Nothing is built again from sample to sample, and parts near the camera keep the precision of float32.
 """
 
 from __future__ import annotations
@@ -21,13 +21,23 @@ from .sampling import opaque_vector
 if TYPE_CHECKING:
     from .surface import Hit, TerrainMesh
 
-# Metres off a facet where shadow rays start: far above float32's resolution at 1 km, far below a part's size.
+# Distance from the facet at which shadow rays start: far above float32's resolution at 1 km, far below a part's
+# size.
 _OFFSET_M = 5e-4
 
 
 class Vehicle:
-    """A spacecraft of diffuse facets in B: `vertices_m` float32[n, 3], `faces` int32[m, 3], `face_material`
-    int32[m], `reflectance` float64[material, band]. Facets are seen, and shine, on both sides."""
+    """Hold a spacecraft of diffuse facets in B, which are visible and reflect on both sides.
+
+    Parameters
+    ----------
+    vertices_m, faces
+        float32[n, 3] in metres, int32[m, 3].
+    face_material
+        int32[m].
+    reflectance
+        float64[material, band].
+    """
 
     def __init__(
         self,
@@ -40,13 +50,13 @@ class Vehicle:
         a, b, c = (vertices_m[faces[:, k]].astype(np.float64) for k in range(3))
         normal = np.cross(b - a, c - a)
         normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
-        # four floats a facet, fetched in one packet: its normal and its material
+        # four floats per facet, fetched in one packet: its normal and its material
         self._facets = mi.Float(np.column_stack([normal, face_material]).astype(np.float32).ravel())
         self._reflectance = [mi.Float(np.ascontiguousarray(column, np.float32)) for column in reflectance.T]
         dr.eval(self._facets, *self._reflectance)
 
     def facet(self, index: Any, active: Any) -> tuple[Any, Any]:
-        """Normal in B and material of facets."""
+        """Return the normal in B and the material of facets."""
         record = dr.gather(mi.Vector4f, self._facets, index, active)
         return mi.Vector3f(record.xyz), mi.UInt32(record.w)
 
@@ -55,12 +65,12 @@ class Vehicle:
         return self.scene.ray_test(rays, coherent, active)
 
     def albedo(self, material: Any, active: Any) -> list[Any]:
-        """Reflectance per band."""
+        """Return the reflectance per band."""
         return [dr.gather(mi.Float, band, material, active) for band in self._reflectance]
 
 
 class World:
-    """Terrain and a vehicle in its place: intersected as one."""
+    """Intersect rays with the terrain and with a vehicle at its position."""
 
     def __init__(self, surface: TerrainMesh, vehicle: Vehicle, view: View) -> None:
         self.surface, self.vehicle = surface, vehicle
@@ -68,29 +78,30 @@ class World:
         self._axes = [opaque_vector(mi.Vector3f, view.L_from_C[:, k]) for k in range(3)]  # B coincides with C
 
     def intersect(self, rays: Any, active: Any = True, *, coherent: bool = True) -> VehicleHit:
-        """Closest hits of either; `on_vehicle` tells the vehicle's from the ground's."""
+        """Return the closest hits on either; `on_vehicle` marks those on the vehicle."""
         return self.hit(rays, self.trace(rays, active, coherent=coherent))
 
     def trace(self, rays: Any, active: Any = True, *, coherent: bool = True) -> tuple[Any, ...]:
-        """As `Surface.trace`: the terrain's hits and the vehicle's."""
+        """Return the hits on the terrain and on the vehicle, in the form that `hit` needs besides the rays."""
         found = self.vehicle.scene.ray_intersect_preliminary(self._in_B(rays), coherent=coherent, active=active)
         return *self.surface.trace(rays, active, coherent=coherent), found
 
     def hit(self, rays: Any, traced: tuple[Any, ...]) -> VehicleHit:
-        """The nearer hits of the two."""
+        """Return the nearer of the two hits of each ray."""
         ground, found = self.surface.hit(rays, traced[:-1]), traced[-1]
         nearer = found.is_valid() & (~ground.valid | (found.t < ground.distance_m))
         normal, material = self.vehicle.facet(found.prim_index, nearer)
         normal = self._in_L(normal)
-        normal = dr.mulsign(normal, -dr.dot(normal, rays.d))  # towards who looks
+        normal = dr.mulsign(normal, -dr.dot(normal, rays.d))  # towards the viewer
         return VehicleHit(ground, nearer, found.t, normal, material, rays)
 
     def occluded(self, rays: Any, active: Any, *, coherent: bool = True) -> Any:
-        """Whether anything lies along the rays."""
+        """Return whether anything lies along the rays."""
         behind = self.vehicle.occluded(self._in_B(rays), active, coherent=coherent)
         return behind | self.surface.occluded(rays, active & ~behind, coherent=coherent)
 
     def _in_B(self, rays: Any) -> Any:
+        """Return rays transformed into B."""
         o = rays.o - self._origin
         turned = mi.Ray3f(
             mi.Point3f(*(dr.dot(o, axis) for axis in self._axes)),
@@ -100,12 +111,13 @@ class World:
         return turned
 
     def _in_L(self, v: Any) -> Any:
+        """Return vectors of B in L."""
         x, y, z = self._axes
         return v.x * x + v.y * y + v.z * z
 
 
 class VehicleHit:
-    """Hits of which some are on the vehicle; the rest is as the terrain's."""
+    """Hold hits of which some are on the vehicle and the others on the ground."""
 
     def __init__(self, ground: Hit, nearer: Any, distance_m: Any, normal: Any, material: Any, rays: Any) -> None:
         self._ground, self._rays = ground, rays
@@ -116,17 +128,17 @@ class VehicleHit:
 
     @cached_property
     def dust(self) -> Any:
-        """As the ground's; none on the vehicle."""
+        """Return the dust cover of the ground; 0 on the vehicle."""
         return dr.select(self.on_vehicle, 0, self._ground.dust)
 
     def shading_normal(self, detail: Detail | None, dither: Any) -> Any:
-        """As the ground's; the vehicle has no finer relief."""
+        """Return the ground's shading normal; the vehicle has no finer relief."""
         return dr.select(self.on_vehicle, self.normal, self._ground.shading_normal(detail, dither))
 
     def shadow_rays(self, direction: Any) -> Any:
-        """Rays from the hits, off the facet."""
+        """Return rays from the hits in a direction; they start off the facet."""
         rays = self._ground.shadow_rays(direction)
-        # to the side that the ray leaves on
+        # the origin lies on the side on which the ray leaves
         side = dr.mulsign(mi.Vector3f(self.normal), dr.dot(self.normal, direction))
         rays.o = dr.select(self.on_vehicle, self._rays(self.distance_m) + side * _OFFSET_M, rays.o)
         return rays
