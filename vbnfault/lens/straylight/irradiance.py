@@ -146,8 +146,9 @@ class _Drawn:
     part: NDArray[np.int64]
 
     def of(self, each: NDArray[np.int64]) -> _Drawn:
-        """Return the same for bundles that replace the original ones; `each`, rising, is the original of every
-        bundle.
+        """Return the same for bundles that replace the original ones.
+
+        `each` is the original of every new bundle, in rising order.
         """
         count = np.bincount(each)
         first = np.cumsum(count) - count
@@ -282,9 +283,7 @@ class FlareModel:
         return out
 
     def worn(self, coating_loss: float) -> FlareModel:
-        """Return the model with a fraction of the coatings' area gone: surfaces reflect the mean of coated and
-        bare.
-        """
+        """Return the model with a fraction of the coatings' area gone, as `Tracer.worn` does."""
         if not coating_loss:
             return self
         other = copy.copy(self)
@@ -347,9 +346,7 @@ class FlareModel:
         return tuple(mean_ghost(rows) for _, rows in sorted(found.items()))
 
     def _fainter(self, rays: Rays, arrivals: Arrivals) -> NDArray[np.int64]:
-        """Return the levels by which routes are drawn coarser, because their edges are too faint to show in the
-        sum.
-        """
+        """Return the levels to add where edges are too faint to show in the sum of all ghosts, by route."""
         height, width = (n / 2 * self.canvas.pitch_mm for n in self.canvas.shape)
         frame = np.hypot(height, width)
         across = np.clip(np.minimum(arrivals.most_mm, frame) - np.maximum(arrivals.least_mm, -frame), 0, None)
