@@ -107,8 +107,8 @@ class Spots:
     share
         Fraction of the light that the path transmits.
     radius
-        Largest distance from the axis at any surface of the path, over the radius of its rim; 1e6 after a missed
-        surface.
+        Largest distance from the axis at any surface of the path, over the radius of its rim; 1000 or more after a
+        missed surface or total reflection.
     margin
         Smallest value along the path of (1 - radius) over the width of the rim's soft edge; only where edges have
         widths.
@@ -309,8 +309,8 @@ class Tracer:
     def _shares(self, index: F64, bare: bool = False) -> F64:
         """Return the fractions reflected from the front, reflected from behind, and transmitted, of each surface.
 
-        float64[wavelength, row, 3, cosine]: over the cosine of the angle in the thinner of the two media, as the
-        mean of both polarisations.
+        float64[wavelength, row, 3, cosine]: over the cosine of the angle in the medium of lower index, as the mean
+        of both polarisations.
         """
         lens = self.lens
         cosine = np.maximum(np.linspace(0, 1, _COSINES), 1e-6)[None, :]
@@ -318,7 +318,7 @@ class Tracer:
         wavelength = self.wavelength_nm[:, None]
         for k, surface in enumerate(lens.surfaces):
             front, back = index[:, k, None], index[:, k + 1, None]
-            # cosines on both sides, by Snell's law from that in the thinner medium
+            # cosines on both sides, by Snell's law from that in the medium of lower index
             thin = np.minimum(front, back)
             at_front, at_back = (np.sqrt(1 - (thin / n) ** 2 * (1 - cosine**2)) for n in (front, back))
             films = () if bare else surface.coating
@@ -609,8 +609,7 @@ class Tracer:
         return x, y, z, dx, dy, dz, share, *out
 
     def _start(self, rays: Rays, across: NDArray[np.int64], centred: bool, even: bool) -> Any:
-        """Return position, direction, route and wavelength of every ray, and the numbers of the ray and its mirror
-        image.
+        """Return position, direction, route and wavelength of every ray, its number, and that of its mirror image.
 
         If `even`, only the rays on one side of the plane of axis and Sun are returned.
         """
