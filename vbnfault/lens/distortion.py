@@ -26,11 +26,11 @@ _ENOUGH_PX = 0.001
 _FOLLOWED_PX = 0.01
 _FOLLOWED = tuple(k / 16 for k in range(16, 7, -1))  # fractions of the angle of the last height
 _WEIGHTS = (1.0, 0.1, 0.01, 1e-3, 1e-4, 1e-5)  # of the outermost heights
-# Up to _BEYOND times the widest slope the denominator must stay above this and distances rise: otherwise points
-# just outside the frame would be thrown across it.
+# Up to _BEYOND times the widest slope the denominator stays above this and distances rise, so that points just
+# outside the frame are not projected into it.
 _LEAST_DENOMINATOR = 0.1
 _BEYOND = 1.1
-# Range of d ln d / d ln t. Below 0 the image folds; from 2 on the iteration t ← d0 / (d(t) / t), by which
+# Allowed d ln d / d ln t. Below 0 the image folds; from 2 on the iteration t ← d0 / (d(t) / t), by which
 # `cv2.undistortPoints` inverts the model, does not converge: its error grows by the factor 1 - d ln d / d ln t.
 _EXPONENTS = (0.1, 1.9)
 _CHECKED = 513

@@ -401,7 +401,7 @@ class RealLens:
         gx, gy = np.ceil(np.maximum(seen.max(axis=0) - half, 0)).astype(int) + _COLOUR_PX
         return int(gx), int(gy)
 
-    # --- what the tables are made of
+    # --- inputs of the tables
 
     @cached_property
     def _round(self) -> Prescription:
@@ -528,7 +528,7 @@ class RealLens:
 
         A(θ) lies in a plane across the axis; the projected solid angle of a pixel contains the cos θ. Where the
         disc is known it is imaged itself: resampling the pixels of a render would not conserve the power of a disc
-        that is hardly larger than a pixel.
+        that is hardly larger than a pixel. `pixel_pitch_um` is not used; it belongs to the interface of `ThinLens`.
         """
         if radiance.disc is None:
             return self.image(radiance)

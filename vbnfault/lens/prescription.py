@@ -181,7 +181,7 @@ class Prescription:
         return replace(self, surfaces=surfaces, scale=self.scale * factor)
 
     def with_round_stop(self) -> Prescription:
-        """Return the lens with a round stop of the same area in place of blades, for models without azimuth."""
+        """Return the lens with a round stop of the same area, for models with rotational symmetry."""
         rim = self.surfaces[self.stop]
         if not rim.blades:
             return self
@@ -403,7 +403,7 @@ def _number(
         raise InputError(f"{where}: {key}: missing")
     try:
         number = math.nan if isinstance(value, bool) or not isinstance(value, int | float) else float(value)
-    except OverflowError:  # a whole number beyond the range of floats
+    except OverflowError:  # an integer beyond the range of floats
         number = math.nan
     if not low <= number <= high:
         raise InputError(f"{where}: {key} = {shown(value)}: must be a number from {low:g} to {high:g}")

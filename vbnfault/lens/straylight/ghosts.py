@@ -1,4 +1,4 @@
-"""Trace ghosts with exact rays: which rays of each ghost pass the lens, and what reaches the sensor.
+"""Trace ghosts with exact rays: the rays of each ghost that pass the lens, and their light on the sensor.
 
 The method is that of Hullin et al. 2011. A route is the sequence of surfaces that reflect the light of one ghost.
 Two passes of few rays locate the box, in the plane of the first vertex, of all rays that pass the rims of a route.
@@ -86,9 +86,9 @@ def boxes(
 ) -> tuple[Rays, Arrivals]:
     """Return the rays' box of every route that passes light, and its arrivals, for a Sun at azimuth 0.
 
-    There is one bundle per route, at the first wavelength. Boxes are symmetric about the plane of axis and Sun, and
-    contain the ellipse that all light passes (`Rays.disc`). `width` is that of the rims' soft edges; rays that
-    arrive within `reach_mm` of the axis count as near.
+    There is one bundle per route, at the first wavelength. Boxes are symmetric about the plane of axis and Sun;
+    `Rays.disc` is the ellipse around all rays that pass. `width` is that of the rims' soft edges; rays that arrive
+    within `reach_mm` of the axis count as near.
     """
     tangent = np.tan(np.radians(sun_deg))
     direction = np.array([np.sin(np.radians(sun_deg)), 0.0, np.cos(np.radians(sun_deg))])

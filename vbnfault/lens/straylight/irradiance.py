@@ -1,8 +1,9 @@
 """Render the ghosts of the Sun as irradiance on the sensor, by exact rays or to first order, per band.
 
 A ghost is an image of the openings that its light passes. The Sun's disc and diffraction soften the edges of that
-image. The widths of the soft edges are known for each rim: the first-order shift over the radius of the disc, and
-Fresnel's width for a straight edge. Where the Sun itself is nearly in focus, its disc is sampled instead.
+image by widths that are known for each rim. The Sun's width is the shift, to first order, when the Sun moves by the
+radius of its disc. The width of diffraction is Fresnel's for a straight edge. Where the Sun itself is nearly in
+focus, its disc is sampled instead.
 """
 
 from __future__ import annotations
@@ -135,9 +136,7 @@ class _Detail:
 
 @dataclass(frozen=True, eq=False)
 class _Drawn:
-    """Hold what is drawn: the bundle, its two bands and their weights, whether it is rough, and which part of its
-    light.
-    """
+    """Hold what is drawn: bundle, two bands and their weights, whether it is rough, and part of the light."""
 
     source: NDArray[np.int64]
     band: NDArray[np.int64]
@@ -253,7 +252,7 @@ class FlareModel:
         blur_px = np.where(self._sampled, 0.3 * sun_px, blur_px)
 
         def level(px_: F64) -> NDArray[np.int64]:
-            """Return the level whose pixels are as large as a number of pixels, rounded down."""
+            """Return the coarsest level whose pixels are no larger than `px_` pixels."""
             return np.floor(np.log2(np.maximum(px_, 1.0))).astype(np.int64)
 
         edge = np.minimum(level(blur_px / 1.5) + coarser, LEVELS - 1)

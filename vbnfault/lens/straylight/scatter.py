@@ -30,23 +30,23 @@ REFERENCE_NM = 550.0  # wavelength at which roughness and the Harvey knee are qu
 # Validity of the models: beyond it a surface is not optically smooth, or dust covers it completely.
 ROUGHNESS_NM_LIMITS = (0.0, 50.0)
 CLEANLINESS_LIMITS = (0.0, 1000.0)
-ROUGHNESS_NM, KNEE, SLOPE = 1.0, 0.01, -1.5  # assumed: a good polish, and usual values of its scatter
+ROUGHNESS_NM, KNEE, SLOPE = 1.0, 0.01, -1.5  # assumed: a good polish, and usual values for its scatter
 
-# Assumed. Mineral dusts are estimated at 1.5 to 1.7 and 1e-5 to 1e-3 (Amsterdam-Granada Light Scattering Database,
-# Muñoz et al. 2012, JQSRT 113, 565).
+# Assumed. Estimates for mineral dusts are n from 1.5 to 1.7 and k from 1e-5 to 1e-3 (Amsterdam-Granada Light
+# Scattering Database, Muñoz et al. 2012, JQSRT 113, 565).
 DUST_INDEX = 1.53 + 0.0005j
 
 _CC1246_SLOPE = 0.926
 _CC1246_AREA_UM2 = 0.1e12  # 0.1 m²
-_SMALLEST_UM = 1.0  # where the standard's distribution begins
+_SMALLEST_UM = 1.0  # smallest diameter of the standard's distribution
 _MIE_LARGEST = 500.0  # size parameter above which diffraction and geometrical optics are used
-_BIN = 0.01  # of ln(size parameter)
+_BIN = 0.01  # width of bins in ln(size parameter)
 _ANGLES = 321
 _LOOKUP = 1 << 16
 _OFFSETS: F64 = np.geomspace(1e-6, 2.0, 1025)
 _STEEPEST_DEG = 89.9
 _DISC = 65  # points across a beam
-_AROUND = 360  # directions about the source in which light misses the frame
+_AROUND = 360  # azimuths about the source, for the flux outside the frame
 
 
 def _check(name: str, value: ArrayLike, low: float, high: float) -> F64:
@@ -89,7 +89,7 @@ class Harvey:
         L: float = KNEE,
         S: float = SLOPE,
     ) -> Harvey:
-        """Return the model whose TIS is (2π Δn σ/λ)², σ the rms roughness of spatial frequencies up to 1/λ.
+        """Return the model with TIS = (2π Δn σ/λ)², where σ is the rms roughness of spatial frequencies up to 1/λ.
 
         A mirror's Δn is 2.
 
@@ -118,12 +118,12 @@ class Harvey:
         return float(np.pi * self.b0 * self.L**2 * wide * exprel((self.S / 2 + 1) * wide))
 
     def at(self, wavelength_nm: float, *, known_at_nm: float = REFERENCE_NM) -> Harvey:
-        """Return the model of the same surface at another wavelength, with its index unchanged: L ∝ λ, b0 ∝ λ⁻⁴, S
-        kept.
+        """Return the model of the same surface at another wavelength: L ∝ λ, b0 ∝ λ⁻⁴, S kept.
 
-        The BSDF of a smooth surface is (2π Δn)² λ⁻⁴ PSD(β/λ), and the PSD belongs to the surface (generalised
-        Harvey-Shack theory: Krywonos, Harvey & Choi 2011, JOSA A 28, 1121). Hence TIS ∝ λ⁻² σ², with σ the
-        roughness up to frequency 1/λ: TIS ∝ λ⁻² where S is well below -2, and nearly λ^-(4+S) where it is above.
+        The change of the index is not included. The BSDF of a smooth surface is (2π Δn)² λ⁻⁴ PSD(β/λ), and the PSD
+        belongs to the surface (generalised Harvey-Shack theory: Krywonos, Harvey & Choi 2011, JOSA A 28, 1121).
+        Hence TIS ∝ λ⁻² σ², with σ the roughness up to frequency 1/λ: TIS ∝ λ⁻² where S is well below -2, and nearly
+        λ^-(4+S) where it is above.
         """
         ratio = wavelength_nm / known_at_nm
         return Harvey(b0=self.b0 / ratio**4, L=self.L * ratio, S=self.S)
@@ -151,7 +151,7 @@ def obscured_fraction(cleanliness_level: float) -> float:
     level = float(_check("cleanliness_level", cleanliness_level, *CLEANLINESS_LIMITS))
     if level <= _SMALLEST_UM:
         return 0.0
-    # ∫ π/4 D² (-dN/dD) dD with N = exp(c (U² - u²)), u = ln D: by parts, then the square completed
+    # ∫ π/4 D² (-dN/dD) dD with N = exp(c (U² - u²)), u = ln D: integrate by parts, then complete the square
     c, top = _CC1246_SLOPE / np.log(10), np.log(level)
     root = np.sqrt(c)
     inner = np.sqrt(np.pi) / (2 * root) * np.exp(1 / c + c * top**2)
@@ -225,7 +225,8 @@ def _large(x: F64, mu: F64, index: complex) -> F64:
 
 @lru_cache(maxsize=4)
 def _intensities(index: complex) -> tuple[F64, F64, F64]:
-    """Return the intensity at all sizes and forward angles: bin edges of the size parameter, angles in rad, table.
+    """Return the intensity at all sizes and forward angles: bin edges of the size parameter, angles in rad, and
+    table.
 
     The table is float64[bin, angle]. It serves all wavelengths, because the index is a constant.
     """
@@ -240,7 +241,10 @@ def _intensities(index: complex) -> tuple[F64, F64, F64]:
 
 @lru_cache(maxsize=256)
 def _dust(level: float, wavelength_nm: float, index: complex) -> tuple[F64, float]:
-    """Return intensity over irradiance of a dusty surface, float64[angle] in 1/sr, and its hemispherical integral."""
+    """Return intensity over irradiance of a dusty surface, float64[angle] in 1/sr, and its integral.
+
+    The integral is over the forward hemisphere.
+    """
     edges, angles, table = _intensities(index)
     wavelength_um = 1e-3 * wavelength_nm
     diameters = np.clip(edges * wavelength_um / np.pi, _SMALLEST_UM, max(level, _SMALLEST_UM))
@@ -272,7 +276,7 @@ def particle_bsdf(
     angles = _intensities(index)[1]
     angle = np.arcsin(np.clip(b, np.sin(angles[0]), 1))
     found = np.exp(np.interp(np.log(angle), np.log(angles), np.log(intensity)))
-    # radiance is intensity over cosine; beyond 84° the mean over that ring, which keeps the flux
+    # radiance is intensity over cosine; beyond 84° the mean of the outermost ring, which conserves the flux
     cosine = np.where(b * b < 0.99, np.sqrt(np.maximum(1 - b * b, 0)), 0.05)
     return np.where(b < 1, found / cosine, 0.0)
 
@@ -313,7 +317,10 @@ class VeilingGlare:
 
     @cached_property
     def _lookup(self) -> tuple[float, float, F32]:
-        """Return start and step of ln(offset²), and the irradiance there. The step, 4e-4, does not show in images."""
+        """Return start and step of ln(offset²), and the irradiance at these steps.
+
+        The step, 4e-4, does not show in an image.
+        """
         steps = np.linspace(2 * np.log(self.offset[0]), 2 * np.log(self.offset[-1]), _LOOKUP)
         rows = [np.interp(steps, 2 * np.log(self.offset), row) for row in self.irradiance]
         return steps[0], float(steps[1] - steps[0]), np.array(rows, dtype=np.float32)
@@ -366,7 +373,10 @@ class VeilingGlare:
 
 @dataclass(frozen=True, kw_only=True)
 class _Surfaces:
-    """Hold what a lens's surfaces scatter at a wavelength: stretch = a_ent / a_j."""
+    """Hold what a lens's surfaces scatter at a wavelength.
+
+    `stretch` is a_ent / a_j: the radius of the axial beam at the entrance over that at surface j.
+    """
 
     scale: float  # π NA² T
     stretch: F64
@@ -518,11 +528,11 @@ def point_source_transmittance(
     L: float = KNEE,
     S: float = SLOPE,
 ) -> F64:
-    """Return scattered irradiance in the middle of the sensor over a far source's at the entrance, float64[band,
-    angle].
+    """Return scattered irradiance in the middle of the sensor over a far source's at the entrance.
 
-    Angles lie inside or outside the field, 0 to 89.9°. Outside, only the surfaces count that the source's rays
-    still reach past the rims. Ghosts, mount and baffle are not included. Parameters as in `veiling_glare`.
+    The result is float64[band, angle]. Angles lie inside or outside the field, 0 to 89.9°. Outside, only the
+    surfaces count that the source's rays still reach past the rims. Ghosts, mount and baffle are not included.
+    Parameters as in `veiling_glare`.
     """
     angles = np.atleast_1d(_check("sun_deg", sun_deg, 0.0, _STEEPEST_DEG))
     share = np.stack([np.cos(np.radians(a)) * _lit(lens, float(a)) for a in angles], axis=1)
@@ -544,12 +554,11 @@ def baffle_transmission(
     entrance_radius_mm: float,
     vane_attenuation: float = 1e-6,
 ) -> F64:
-    """Return the fraction of a lens's entrance that a far source lights through a tube in front, float64 like
-    `sun_deg`.
+    """Return the fraction of a lens's entrance that a far source lights through a tube in front of the lens.
 
     It is the overlap of the entrance with the tube's mouth, shifted by length × tan(angle), and never below
     `vane_attenuation`: 1e-6 is assumed; good two-stage baffles reach 1e-9 (Haghshenas & Johari 2014, Proc. SPIE
-    9264, 92641R). Length 0 means no baffle.
+    9264, 92641R). Length 0 means no baffle. The result is float64 like `sun_deg`.
 
     Raises
     ------

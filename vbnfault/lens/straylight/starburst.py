@@ -49,18 +49,18 @@ F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
 _EDGE_POINTS = 2049  # along one blade, or round the whole rim
-_SUPERSAMPLING = 4  # of a sample, along either side
+_SUPERSAMPLING = 4  # finer samples along either side of a sample
 _GOLDEN_RAD = np.pi * (3 - np.sqrt(5))
 _FARTHEST = 2.0  # largest distance of two sines
 _SHARE_LOST = 3e-3  # error, relative to the mean of the bands, that fewer tables may cause
 _STRIP = 64  # rows of a frame at a time
 _ROW_BLUR = 0.5  # blur of fringes, in steps of the table
 _NARROW = 1 / 8  # ratio of disc to distance below which a sine equals its angle
-_WING_SUNS = 12.0  # distance from an edge's normal, in radii of the disc, from which cot² needs no average
+_WING_SUNS = 12.0  # distance from an edge's normal, in radii of the disc, beyond which cot² needs no average
 _WING_STEP, _WING_POINTS, _WING_PLACES = 0.05, 1200, 241
 _STRAIGHT_PER_MM = 1e-9
 _LEAST_CORNER_RAD = 1e-3
-_LONE_BAND_NM = 150.0  # half width of what a single band stands for, as in vbnfault.core.spectra
+_LONE_BAND_NM = 150.0  # half width of a single band, as in vbnfault.core.spectra
 _HAT_POINTS = 17  # wavelengths on either side of a band's node
 _HANKEL_POINTS = 4096
 _DISC_POINTS = 32
@@ -82,6 +82,7 @@ class StopDefects:
     scratch_angle_rad: F64 = field(default_factory=lambda: np.zeros(0))
 
     def __post_init__(self) -> None:
+        """Convert all fields to float64 arrays and check them."""
         for f in fields(self):
             values = np.asarray(getattr(self, f.name), dtype=np.float64)
             object.__setattr__(self, f.name, values)
