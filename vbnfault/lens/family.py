@@ -26,9 +26,9 @@ def relative(
 ) -> Prescription:
     """Return a random, valid lens of the same family, scaled to the focal length of the original.
 
-    Every curvature, thickness and rim except the stop's is multiplied by a log-normal random factor; so is (index -
-    1) of every medium that is given by nd. A draw whose surfaces cross, which does not focus or which lets hardly
-    any light pass is repeated.
+    Every curvature, thickness and rim except the stop's is multiplied by a log-normal random factor. The same is
+    done to (index - 1) of every medium that is given by nd. A draw whose surfaces cross, which does not focus or
+    which lets hardly any light pass is repeated.
 
     Parameters
     ----------

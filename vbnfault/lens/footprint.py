@@ -4,8 +4,8 @@ The light of a far point that passes all rims is a beam. Where the beam crosses 
 rotational symmetry one table over the field angle holds all footprints: a footprint's middle lies in the plane of
 the axis and the point, and its rim is given by its distance from that middle.
 
-Positions have the image's axes: x to the right, y down. Light of a point to the right of the axis travels towards
-+x. Everything holds for the d line.
+Positions have the image's axes: x to the right, y down. Light of a point to the right of the axis travels to +x.
+Everything holds for the d line.
 """
 
 from __future__ import annotations

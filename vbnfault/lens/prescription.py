@@ -376,9 +376,7 @@ def _coating(given: object, front: Glass, back: Glass, where: str) -> tuple[Laye
 
 
 def _facing_air(name: str, front: Glass, back: Glass) -> tuple[Layer, ...]:
-    """Return a named coating with its outer layer on the air side, in the order in which light from the front meets
-    it.
-    """
+    """Return a named coating in the order in which light from the front meets it, its outer layer next to the air."""
     films = design(name, float(max(front.index(DESIGN_NM), back.index(DESIGN_NM))))
     return films if front.nd == 1.0 else films[::-1]
 

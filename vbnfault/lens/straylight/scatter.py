@@ -225,10 +225,10 @@ def _large(x: F64, mu: F64, index: complex) -> F64:
 
 @lru_cache(maxsize=4)
 def _intensities(index: complex) -> tuple[F64, F64, F64]:
-    """Return the intensity at all sizes and forward angles: bin edges of the size parameter, angles in rad, and
-    table.
+    """Return the intensity at all sizes and forward angles.
 
-    The table is float64[bin, angle]. It serves all wavelengths, because the index is a constant.
+    The result is the bin edges of the size parameter, the angles in rad, and the table float64[bin, angle]. One
+    table serves all wavelengths, because the index is a constant.
     """
     largest = np.pi * 1e3 * 1000.0 / RANGE_NM[0]
     edges = np.exp(np.arange(0.0, np.log(largest) + _BIN, _BIN))
@@ -386,12 +386,11 @@ class _Surfaces:
     wavelength_nm: float
 
     def irradiance(self, offset: F64, share: F64) -> F64:
-        """Return irradiance over the source's, float64[sample]; share[surface, sample] is the lit fraction of each
-        beam.
+        """Return irradiance over the source's, float64[sample].
 
-        Surface j scatters the radiance E_ent T (a_ent/a_j)² BSDF, which fills the cone of the image: × π NA².
-        Lagrange's invariant n_j a_j θ = NA r makes β = NA r / a_j. With NA = a_ent / f this is (a_ent/a_j) r / f.
-        (Form of Peterson 2004, Proc. SPIE 5178, 184.)
+        `share` [surface, sample] is the lit fraction of each beam. Surface j scatters the radiance E_ent T
+        (a_ent/a_j)² BSDF, which fills the cone of the image: × π NA². Lagrange's invariant n_j a_j θ = NA r makes β
+        = NA r / a_j. With NA = a_ent / f this is (a_ent/a_j) r / f. (Form of Peterson 2004, Proc. SPIE 5178, 184.)
         """
         total = np.zeros(offset.shape)
         for stretch, harvey, dusty, lit in zip(self.stretch, self.roughness, self.dusty, share, strict=True):

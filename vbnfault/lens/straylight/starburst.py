@@ -6,8 +6,8 @@ entrance
     E / E_sun = cos θ_sun · cos⁴θ / f² · |A(k₀ (u - u_sun))|² / λ²,      A(k) = ∫ exp(-i k·x) dx
 
 over the entrance pupil (Goodman, Introduction to Fourier Optics, chapter 4). |A|² / (λ² area) is the point spread
-function per unit of u, and cos⁴θ / f² = |d²u / d²x| for an image without distortion. Near the axis, u - u_sun is (x
-- x_sun) / f.
+function per unit of u, and cos⁴θ / f² = |d²u / d²x| for an image without distortion. Near the axis, u - u_sun is
+(x - x_sun) / f.
 
 Averaging over a disc of angular radius σ multiplies the pupil's autocorrelation at the shift ξ by the disc's
 coherence 2 J₁(y) / y, y = σ k₀ ξ (van Cittert and Zernike; Born & Wolf, Principles of Optics, 10.4). Only shifts up
@@ -20,9 +20,10 @@ to some λ / σ remain, 0.1 mm at 1 au. Where this is small against the stop, th
       |A|² = 4 √(σ² - t²) / (σ² k₀³ (θ² - σ²)) · ds.
 
   A rim is described by its length per angle of the normal, convolved with this.
-- ξ², the corners. The ends of the edges at a corner are one point, so they add as amplitudes: |A|² = (cot ψ₁ - cot
-  ψ₂)² / k⁴ with the angles from their normals. Across a normal, cot² is Hadamard's finite part, which takes from
-  the spike what its wings contain. At the end of a bent edge it is Fresnel's integral, which joins light and dark.
+- ξ², the corners. The ends of the edges at a corner are one point, so they add as amplitudes:
+  |A|² = (cot ψ₁ - cot ψ₂)² / k⁴ with the angles from their normals. Across a normal, cot² is Hadamard's finite
+  part, which subtracts from the spike the light that its wings contain. At the end of a bent edge it is Fresnel's
+  integral, which joins light and dark.
 
 Corners and edges add as powers, because their fringes, λ over their distance, are finer than the disc.
 
@@ -210,8 +211,7 @@ class Starburst:
         *,
         half_width_nm: float | None = None,
     ) -> F32:
-        """Return irradiance on the sensor over the Sun's at the entrance, for a transmission of 1, float32[band, y,
-        x].
+        """Return irradiance on the sensor over the Sun's at the entrance, float32[band, y, x], without losses.
 
         Parameters
         ----------
