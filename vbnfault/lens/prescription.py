@@ -376,7 +376,10 @@ def _coating(given: object, front: Glass, back: Glass, where: str) -> tuple[Laye
 
 
 def _facing_air(name: str, front: Glass, back: Glass) -> tuple[Layer, ...]:
-    """Return a named coating in the order in which light from the front meets it, its outer layer next to the air."""
+    """Return a named coating in the order in which light from the front meets it.
+
+    Its outer layer lies on the side of the air.
+    """
     films = design(name, float(max(front.index(DESIGN_NM), back.index(DESIGN_NM))))
     return films if front.nd == 1.0 else films[::-1]
 
