@@ -1,4 +1,4 @@
-"""The optics: from scene radiance to irradiance on the sensor plane."""
+"""Map scene radiance to irradiance on the sensor plane, with an ideal lens or a real one."""
 
 from .aperture import closed_to, open_f_number, stopped_down
 from .gaussian import FirstOrder, first_order, scaled_to_field, scaled_to_focal_length

@@ -1,8 +1,8 @@
-"""The aperture of a prescription: its f-number by exact marginal rays, and a stop closed to another.
+"""Measure the f-number of a prescription with exact rays, and close its stop to another f-number.
 
-The f-number is the focal length over the diameter of the beam along the axis that passes all rims (ISO 517), by
-real rays: the irradiance on the axis is π T L / (4 N²) with it, exactly. The paraxial f-number of `first_order`
-differs by the aberration of the pupil, some percent for fast lenses.
+The f-number is the focal length divided by the diameter of the axial beam that passes all rims (ISO 517). That
+diameter is measured with exact rays, so that the irradiance on the axis is exactly π T L / (4 N²). The paraxial
+f-number of `first_order` differs from it by the aberration of the pupil, by some percent for fast lenses.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ F64 = NDArray[np.float64]
 
 LARGEST_F_NUMBER = 200.0
 
-_RAYS = 513  # of a fan, then
-_ROUNDS = 5  # fans within the interval that holds the rim: 512⁻⁵ of the first surface's radius in all
+_RAYS = 513  # in each fan
+_ROUNDS = 5  # each fan divides the interval that holds the rim by 512: 512⁻⁵ of the first surface's radius at last
 
 
 def axial_beam_diameter_mm(lens: Prescription, wavelength_nm: float = D_NM) -> float:
-    """Return the diameter of the beam along the axis that passes every rim, stop included.
+    """Return the diameter of the axial beam that passes every rim, the stop included.
 
-    A stop with blades counts as a round one of its area.
+    A stop with blades is replaced by a round one of the same area.
     """
     lens = lens.with_round_stop()
     low, high = 0.0, lens.surfaces[0].semi_diameter_mm
@@ -47,6 +47,7 @@ def axial_beam_diameter_mm(lens: Prescription, wavelength_nm: float = D_NM) -> f
 
 
 def _passes(lens: Prescription, height_mm: F64, wavelength_nm: float) -> NDArray[np.bool_]:
+    """Return which rays parallel to the axis, at these heights, pass every rim, bool[ray]."""
     nothing = np.zeros_like(height_mm)
     origins = np.column_stack(
         [height_mm, nothing, nothing - abs(float(lens.surfaces[0].sag_mm(height_mm[-1]))) - 1]
@@ -56,17 +57,18 @@ def _passes(lens: Prescription, height_mm: F64, wavelength_nm: float) -> NDArray
 
 
 def open_f_number(lens: Prescription) -> float:
-    """Return the focal length over the diameter of the real beam along the axis, the stop as prescribed."""
+    """Return the focal length divided by the diameter of the axial beam, with the stop as prescribed."""
     return first_order(lens).efl_mm / axial_beam_diameter_mm(lens)
 
 
 def stopped_down(lens: Prescription, f_number: float) -> Prescription:
-    """Return the lens with its stop closed until the real beam along the axis is EFL / f_number wide.
+    """Return the lens with its stop closed until the axial beam has the diameter EFL / `f_number`.
 
-    The lens is returned as it is where that beam is not narrower than its own.
+    A lens whose beam is already as narrow is returned unchanged.
 
-    The stop takes the height at which the marginal ray of that beam crosses it, so that any number of rays agrees.
-    Blades keep their shape, with a beam of that area.
+    The marginal ray of the wanted beam is traced, and its height at the stop becomes the stop's radius. The result
+    therefore does not depend on a number of rays. A stop with blades keeps its shape; its area is that of the round
+    stop.
     """
     as_round = lens.with_round_stop()
     wanted = first_order(as_round).efl_mm / f_number
@@ -81,10 +83,13 @@ def stopped_down(lens: Prescription, f_number: float) -> Prescription:
 
 
 def closed_to(lens: Prescription, f_number: float, key: str) -> Prescription:
-    """Return the lens stopped down to an f-number that a user asks for; `key` names it in errors.
+    """Return the lens stopped down to an f-number that a user asks for; `key` names that setting in errors.
 
-    Raises InputError for an f-number outside what the lens reaches: from its own, rounded down to two decimals as
-    users read and write it, to 200.
+    Raises
+    ------
+    InputError
+        The f-number is below that of the open lens, rounded down to two decimals as users read and write it, or
+        above 200.
     """
     least = math.floor(100 * open_f_number(lens)) / 100
     if not least <= f_number <= LARGEST_F_NUMBER:

@@ -1,7 +1,7 @@
-"""Thin-film coatings: stacks of layers, their reflectance and transmittance per wavelength, angle, polarisation.
+"""Compute reflectance and transmittance of thin-film coatings by wavelength, angle and polarisation.
 
-Airy's recursion over the interfaces, from the substrate outwards; indices n + ik with k ≥ 0 absorb (Macleod 2010,
-Thin-Film Optical Filters, chapter 2).
+Airy's recursion runs over the interfaces from the substrate outwards. A medium of index n + ik with k ≥ 0 absorbs
+(Macleod 2010, Thin-Film Optical Filters, chapter 2).
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ from ..core.errors import InputError
 F64 = NDArray[np.float64]
 
 DESIGN_NM = 550.0
-_MGF2, _HIGH = 1.38, 2.05  # magnesium fluoride; a mixed oxide
+_MGF2, _HIGH = 1.38, 2.05  # indices of magnesium fluoride and of a mixed oxide
 NAMES = ("none", "mgf2", "v", "bbar")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Layer:
-    """A film: index n + ik and thickness."""
+    """Describe one film of a coating: its index n + ik and its thickness."""
 
     n: float
     thickness_nm: float
@@ -31,11 +31,19 @@ class Layer:
 
 
 def design(name: str, glass_index: float) -> tuple[Layer, ...]:
-    """Layers of a named coating between air and glass, the air's side first.
+    """Return the layers of a named coating between air and glass, the layer next to the air first.
 
-    `none`; `mgf2`: a quarter wave of magnesium fluoride; `v`: two layers without reflection at 550 nm; `bbar`:
-    quarter, half and quarter wave, broad, its innermost layer chosen for the glass. A V coating whose glass has too
-    high an index for it is a quarter wave, which then serves as well. Raises InputError for another name.
+    - `none`: no layer;
+    - `mgf2`: a quarter wave of magnesium fluoride;
+    - `v`: two layers that do not reflect at 550 nm; where no such pair exists (index of the glass from 1.90 to
+      2.21) it is the quarter wave of `mgf2`, which then serves as well;
+    - `bbar`: a quarter, a half and a quarter wave, a broadband coating whose innermost layer is chosen for the
+      glass.
+
+    Raises
+    ------
+    InputError
+        The name is unknown.
     """
     if name not in NAMES:
         raise InputError(f"coating = {name!r}: unknown; known are {', '.join(NAMES)}, or a list of layers")
@@ -45,7 +53,7 @@ def design(name: str, glass_index: float) -> tuple[Layer, ...]:
     if name == "mgf2":
         return (outer,)
     if name == "bbar":
-        # the half wave is absent at 550 nm, where the two quarters cancel if the inner one has this index
+        # at 550 nm the half wave has no effect, and the two quarter waves cancel if the inner one has this index
         inner = _MGF2 * np.sqrt(glass_index)
         half = Layer(n=_HIGH, thickness_nm=DESIGN_NM / 2 / _HIGH)
         return (outer, half, Layer(n=float(inner), thickness_nm=float(DESIGN_NM / 4 / inner)))
@@ -65,18 +73,23 @@ def design(name: str, glass_index: float) -> tuple[Layer, ...]:
 def reflect_transmit(
     layers: Sequence[Layer], n_front: ArrayLike, n_back: ArrayLike, cos_front: ArrayLike, wavelength_nm: ArrayLike
 ) -> tuple[F64, F64, F64, F64]:
-    """Reflectance and transmittance of power, (R_s, R_p, T_s, T_p), each of the arguments' common shape.
+    """Return reflectance and transmittance of power for both polarisations.
 
     Parameters
     ----------
     layers
-        In the order that light meets them.
+        In the order in which light meets them.
     n_front, n_back
-        Indices of the media before and behind, real.
+        Real indices of the media in front of the coating and behind it.
     cos_front
         Cosine of the angle of incidence, in (0, 1].
     wavelength_nm
         In vacuum.
+
+    Returns
+    -------
+    R_s, R_p, T_s, T_p
+        float64 each, of the arguments' common shape, in [0, 1].
     """
     n0, ns, c0, wavelength = np.broadcast_arrays(
         np.asarray(n_front, complex), np.asarray(n_back, complex), np.asarray(cos_front, complex), wavelength_nm
@@ -84,7 +97,7 @@ def reflect_transmit(
     across2 = n0 * n0 * (1 - c0 * c0)
 
     def normal(index: NDArray) -> NDArray:
-        """n cos θ: the branch that decays or runs backwards into the medium."""
+        """Return n cos θ on the branch of the root whose wave decays or travels into the medium."""
         q = np.sqrt(index * index - across2 + 0j)
         return np.where((q.imag < 0) | ((q.imag == 0) & (q.real < 0)), -q, q)
 
@@ -93,7 +106,7 @@ def reflect_transmit(
     runs = [n0 * c0, *(normal(index) for index in media[1:])]
     powers = []
     for p in (False, True):
-        # admittance: n cos θ across the plane of incidence, n / cos θ in it
+        # admittance: n cos θ for s polarisation, n / cos θ for p
         y = [index * index / q if p else q for index, q in zip(media, runs, strict=True)]
         r, t = (y[-2] - y[-1]) / (y[-2] + y[-1]), 2 * y[-2] / (y[-2] + y[-1])
         for k in range(len(layers) - 1, -1, -1):
@@ -109,6 +122,6 @@ def reflect_transmit(
 def mean_reflectance(
     layers: Sequence[Layer], n_front: ArrayLike, n_back: ArrayLike, cos_front: ArrayLike, wavelength_nm: ArrayLike
 ) -> F64:
-    """Reflectance of unpolarised light: the mean of both polarisations."""
+    """Return the reflectance of unpolarised light, the mean of both polarisations."""
     rs, rp, _, _ = reflect_transmit(layers, n_front, n_back, cos_front, wavelength_nm)
     return np.asarray((rs + rp) / 2)

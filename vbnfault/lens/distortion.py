@@ -1,11 +1,11 @@
-"""OpenCV's model of radial distortion, fitted to the image heights of a lens.
+"""Fit OpenCV's model of radial distortion to the image heights of a lens.
 
 With t the tangent of the field angle, the distance from the axis in focal lengths is
 
     d(t) = t (1 + k1 t² + k2 t⁴ + k3 t⁶) / (1 + k4 t² + k5 t⁴ + k6 t⁶),
 
-the rational model of `cv2.projectPoints` (Claus and Fitzgibbon 2005, CVPR, 213) with its coefficients in the order
-k1, k2, p1, p2, k3, k4, k5, k6. Lenses here have rotational symmetry: p1 = p2 = 0.
+the rational model of `cv2.projectPoints` (Claus and Fitzgibbon 2005, CVPR, 213). OpenCV orders the coefficients k1,
+k2, p1, p2, k3, k4, k5, k6. Lenses here have rotational symmetry: p1 = p2 = 0.
 """
 
 from __future__ import annotations
@@ -19,18 +19,18 @@ F64 = NDArray[np.float64]
 
 COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 
-# A denominator of lower degree is kept where it leaves no more than this: its coefficients are better determined.
+# Residuals below this count as equal. The lowest degree then wins: its coefficients are better determined.
 _ENOUGH_PX = 0.001
-# Where no model follows the lens's own heights and goes on without folding, the outermost of them count less, until
-# the others are met to this.
+# Where no model follows all heights of the lens and continues without folding, the outermost heights get less
+# weight, until the model meets the others to this.
 _FOLLOWED_PX = 0.01
 _FOLLOWED = tuple(k / 16 for k in range(16, 7, -1))  # fractions of the angle of the last height
-_WEIGHTS = (1.0, 0.1, 0.01, 1e-3, 1e-4, 1e-5)  # of heights that count less
-# The denominator stays above this, and distances rise, up to that many times the widest slope: points just outside
-# the frame must not be thrown across it.
+_WEIGHTS = (1.0, 0.1, 0.01, 1e-3, 1e-4, 1e-5)  # of the outermost heights
+# Up to _BEYOND times the widest slope the denominator stays above this and distances rise, so that points just
+# outside the frame are not projected into it.
 _LEAST_DENOMINATOR = 0.1
 _BEYOND = 1.1
-# Range of d ln d / d ln t. Below 0 the image folds; from 2 on the iteration t ← d0 / (d(t) / t), by which
+# Allowed d ln d / d ln t. Below 0 the image folds; from 2 on the iteration t ← d0 / (d(t) / t), by which
 # `cv2.undistortPoints` inverts the model, does not converge: its error grows by the factor 1 - d ln d / d ln t.
 _EXPONENTS = (0.1, 1.9)
 _CHECKED = 513
@@ -39,13 +39,16 @@ _STEPS = 12
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class RadialModel:
-    """The model with its coefficients, float64[8] as OpenCV orders them, from the axis to the slope `end`."""
+    """Hold a distortion model that is valid from the axis to the slope `end`.
+
+    `coefficients` is float64[8] in OpenCV's order.
+    """
 
     coefficients: F64
     end: float
 
     def distance(self, slope: F64) -> F64:
-        """Return distances from the axis in focal lengths, float64 like `slope`, of tangents of field angles."""
+        """Return distances from the axis in focal lengths for tangents of field angles, float64 like `slope`."""
         above, below = self._parts
         square = slope * slope
         return np.asarray(slope * _polynomial(above, square) / _polynomial(below, square))
@@ -57,8 +60,10 @@ class RadialModel:
         return np.asarray(n / d + 2 * square * (dn * d - n * dd) / (d * d))
 
     def reaches(self, distance: float) -> bool:
-        """Return whether the model goes out to a distance from the axis in focal lengths without a pole or a fold,
-        and can be inverted by iteration on the way."""
+        """Return whether the model reaches a distance from the axis, in focal lengths, without a pole or a fold.
+
+        It must also be invertible by iteration up to there.
+        """
         slope = np.linspace(0, _BEYOND * self.end, _CHECKED)[1:]
         if not _polynomial(self._parts[1], slope * slope).min() >= _LEAST_DENOMINATOR:
             return False
@@ -73,21 +78,20 @@ class RadialModel:
 
     @property
     def _parts(self) -> tuple[F64, F64]:
-        """Coefficients of numerator and denominator."""
+        """Return the coefficients of numerator and denominator."""
         k = self.coefficients
         return k[[0, 1, 4]], k[5:]
 
 
 def fitted(slope: F64, distance: F64, focal_length_px: float, *, known: int, reach: float) -> RadialModel | None:
-    """Return the model that comes nearest to the distances of the slopes given and can be inverted; None where none
-    does.
+    """Return the invertible model that comes nearest to the given distances; None where there is none.
 
     Parameters
     ----------
     slope, distance
         float64[n], rising, above 0: tangents of field angles, and distances from the axis in focal lengths.
     known
-        How many of them, at least 8, are the lens's own; the others say how the model may go on.
+        How many of them, at least 8, the lens itself gives; the others only suggest how the model may continue.
     reach
         Distance that the model must reach, in focal lengths; at most the last of `distance`.
     """
@@ -131,11 +135,11 @@ def _derivative(coefficients: F64, square: F64) -> F64:
 
 
 def _of_degree(slope: F64, distance: F64, degree: int, weight: F64) -> F64 | None:
-    """Return coefficients by weighted least squares, the denominator of that degree in t²; None where they are not
-    determined.
+    """Return weighted least-squares coefficients with a denominator of this degree in t²; None if undetermined.
 
-    Linear in the coefficients once it is multiplied by the denominator; the weights take that back, step by step
-    (Sanathanan and Koerner 1963, IEEE Trans. Automatic Control 8, 56).
+    Multiplied by its denominator, the model is linear in the coefficients. Each iteration divides the weights by
+    the last denominator, which undoes the multiplication (Sanathanan and Koerner 1963, IEEE Trans. Automatic
+    Control 8, 56).
     """
     most = slope[-1]
     powers = (slope[:, None] / most) ** [2, 4, 6]
@@ -157,9 +161,10 @@ def _of_degree(slope: F64, distance: F64, degree: int, weight: F64) -> F64 | Non
 
 
 def _least_squares(columns: F64, right: F64) -> F64 | None:
-    """Solve by Gram and Schmidt's factorisation; None where the columns depend on one another.
+    """Solve a least-squares problem by Gram-Schmidt factorisation; None where columns depend on one another.
 
-    Plain sums in one order: a threaded library would not give the same bits on every machine, and stores keep them.
+    Sums run in one fixed order: a threaded library would not give the same bits on every machine, and stores keep
+    them.
     """
     count = columns.shape[1]
     scale = np.sqrt((columns**2).sum(axis=0))

@@ -1,4 +1,4 @@
-"""A prescription's layout as a picture: surfaces, glass, stop, and rays of three field angles."""
+"""Draw the layout of a prescription: surfaces, glass, stop, and rays of three field angles."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from .gaussian import first_order
 from .prescription import Prescription
 from .rays import real_pupil_diameter_mm, trace
 
-_FIELDS = (0.0, 0.5, 1.0)  # shares of the half field
+_FIELDS = (0.0, 0.5, 1.0)  # fractions of the half field
 _COLOURS = ("#2f6fb3", "#3c9a5f", "#c4632f")
 _RAYS = 7
 _GLASS = "#cfe3f2"
 
 
 def draw(lens: Prescription, path: Path, *, half_field_deg: float = 20.0) -> None:
-    """Write a picture of the lens in its meridional plane."""
+    """Write a drawing of the lens in its meridional plane to an image file."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -46,7 +46,7 @@ def draw(lens: Prescription, path: Path, *, half_field_deg: float = 20.0) -> Non
     for share, colour in zip(_FIELDS, _COLOURS, strict=True):
         slope = np.tan(np.radians(share * half_field_deg))
         height = np.linspace(-0.499, 0.499, _RAYS) * pupil
-        # from a plane in front of everything, aimed at the entrance pupil
+        # rays start on a plane in front of all surfaces and aim at the entrance pupil
         start = min(float(edge[0].min()) for edge in edges) - 0.12 * (vertex[-1] + figures.bfd_mm)
         origin = np.column_stack(
             [np.zeros(_RAYS), height - slope * (figures.entrance_pupil_mm - start), np.full(_RAYS, start)]

@@ -1,4 +1,4 @@
-"""Lenses around a lens: random but valid relatives of a prescription, and prescriptions as files."""
+"""Vary a prescription at random, and write prescriptions to files."""
 
 from __future__ import annotations
 
@@ -24,17 +24,25 @@ def relative(
     spread: float = 0.03,
     index_spread: float = 0.005,
 ) -> Prescription:
-    """A lens of the same family: every curvature, thickness and rim but the stop's drawn anew around its own.
+    """Return a random, valid lens of the same family, scaled to the focal length of the original.
+
+    Every curvature, thickness and rim except the stop's is multiplied by a log-normal random factor. The same is
+    done to (index - 1) of every medium that is given by nd. A draw whose surfaces cross, which does not focus or
+    which lets hardly any light pass is repeated.
 
     Parameters
     ----------
+    rng
+        Source of random numbers.
     spread
-        Standard deviation of curvatures, thicknesses and diameters, as a share of each; 0 to 0.3.
+        Standard deviation of the logarithm of the factors of curvatures, thicknesses and diameters, 0 to 0.3.
     index_spread
-        The same of (index - 1).
+        The same for (index - 1).
 
-    Scaled to the focal length of the original. What crosses, does not focus or lets no beam through is drawn again.
-    Raises InputError for a spread out of range, or where no valid lens is found.
+    Raises
+    ------
+    InputError
+        A spread is out of range, or no draw gave a valid lens.
     """
     for key, value in (("spread", spread), ("index_spread", index_spread)):
         if not 0 <= value <= 0.3:
@@ -59,7 +67,7 @@ def relative(
 
 
 def _vary(row: dict[str, Any], rng: np.random.Generator, spread: float, index_spread: float) -> None:
-    """One row's numbers, always as many draws."""
+    """Vary the numbers of one row in place; the count of random numbers is the same for every row."""
     curve, gap, rim, index = np.exp(rng.normal(size=4) * [spread, spread, spread, index_spread])
     if math.isfinite(row.get("radius_mm", math.inf)):
         row["radius_mm"] /= curve
@@ -71,7 +79,7 @@ def _vary(row: dict[str, Any], rng: np.random.Generator, spread: float, index_sp
 
 
 def to_table(lens: Prescription) -> dict[str, Any]:
-    """A prescription as the plain data that `parse_lens` reads."""
+    """Return a prescription as the plain data that `parse_lens` reads."""
     rows = [_row(surface) for surface in lens.surfaces]
     if lens.sensor_reflectance:
         rows.append({"sensor": True, "reflectance": lens.sensor_reflectance})
@@ -79,6 +87,7 @@ def to_table(lens: Prescription) -> dict[str, Any]:
 
 
 def _row(surface: Surface) -> dict[str, Any]:
+    """Return one surface as a row of that table, without keys at their defaults."""
     row: dict[str, Any] = {
         "radius_mm": surface.radius_mm,
         "thickness_mm": surface.thickness_mm,
@@ -101,6 +110,7 @@ def _row(surface: Surface) -> dict[str, Any]:
 
 
 def _medium(glass: Glass) -> dict[str, Any]:
+    """Return the keys of a row that describe a medium; none for air."""
     if glass.nd == 1.0 and math.isinf(glass.vd):
         return {}
     if glass.name in GLASSES:
@@ -111,7 +121,7 @@ def _medium(glass: Glass) -> dict[str, Any]:
 
 
 def write_lens(lens: Prescription, path: Path) -> None:
-    """Write a prescription as the TOML that `load_lens` reads."""
+    """Write a prescription as a TOML file that `load_lens` reads."""
     table = to_table(lens)
     lines = [f"{key} = {_toml(table[key])}" for key in ("name", "source")]
     for row in table["surface"]:
@@ -120,6 +130,7 @@ def write_lens(lens: Prescription, path: Path) -> None:
 
 
 def _toml(value: Any) -> str:
+    """Return a value in TOML syntax."""
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, str):

@@ -1,11 +1,11 @@
-"""Where the beams of a lens cross its surfaces and other planes, from exact rays.
+"""Compute where a lens's beams cross its surfaces and other planes, with exact rays.
 
-A far point's light that passes all rims is a beam; where it crosses a surface is its footprint there. By
-rotational symmetry one table over the field angle holds all of them: a footprint's middle lies in the plane of
-the axis and the point, and its rim is known by its distance from there.
+The light of a far point that passes all rims is a beam. Where the beam crosses a surface is its footprint there. By
+rotational symmetry one table over the field angle holds all footprints: a footprint's middle lies in the plane of
+the axis and the point, and its rim is given by its distance from that middle.
 
-Places are those of the picture: x to the right, y down, and light of a point to the right of the axis travels
-towards +x. All at the d line.
+Positions have the image's axes: x to the right, y down. Light of a point to the right of the axis travels to +x.
+Everything holds for the d line.
 """
 
 from __future__ import annotations
@@ -32,17 +32,17 @@ F32 = NDArray[np.float32]
 
 DEFAULT_LENS = "nikkor_35_f2p8"
 
-_MARGIN = 1.1  # of a frame's corner, as a tangent: how far its beams are known
+_MARGIN = 1.1  # beams are computed up to this multiple of the tangent of the frame's corner
 _ANGLES = 33
 _AZIMUTHS = 65  # of half a rim, both ends included
-_HEIGHTS = 97  # of a meridional fan
+_HEIGHTS = 97  # rays of a meridional fan
 _FANS = 2
 _HALVINGS = 10
 _NARROWINGS = 8
 _RINGS = 6  # of rays within a rim
 _DENSE = 257  # field angles of a footprint's table
-_TURNS = 65  # its directions, equal steps of their cosine
-_SHADOW = 64  # cells across a disc's shadow
+_TURNS = 65  # directions of a footprint's table, at equal steps of their cosine
+_SHADOW = 64  # cells along each side of a shadow's table
 
 
 # --- a camera's lens and frame ---------------------------------------------------------------------------------
@@ -50,7 +50,7 @@ _SHADOW = 64  # cells across a disc's shadow
 
 @dataclass(frozen=True, kw_only=True)
 class ImageFrame:
-    """A camera as far as beams know of it: its lens, and its picture about the axis."""
+    """Describe a camera for the tracing of beams: its lens, and its image centred on the axis."""
 
     lens: ThinLens | RealLens
     width_px: int
@@ -58,8 +58,10 @@ class ImageFrame:
     pixel_pitch_um: float
 
     def slopes(self, x_px: NDArray, y_px: NDArray) -> tuple[F32, F32]:
-        """Tangents of the field angles to the right and down, float32[y, x] each, at columns float64[x] and rows
-        float64[y] of the picture."""
+        """Return the tangents of the field angles, to the right and down, float32[y, x] each, of columns and rows.
+
+        `x_px` float64[x] and `y_px` float64[y] are pixel positions in the image.
+        """
         per_px = self.pixel_pitch_um * 1e-3 / self.lens.focal_length_mm
         x, y = np.broadcast_arrays(
             ((x_px - self.width_px / 2) * per_px).astype(np.float32)[None, :],
@@ -72,21 +74,26 @@ class ImageFrame:
         return x * stretch, y * stretch
 
     def real_lens(self, name: str) -> RealLens:
-        """Return the camera's own lens, if it is real and none is named; else the named one, `DEFAULT_LENS` by
-        default, scaled to the camera's focal length, its stop closed to the camera's f-number where that is larger
-        than its own."""
+        """Return the camera's own lens if it is real and `name` is empty, else the named one, fitted to the camera.
+
+        An empty name then stands for `DEFAULT_LENS`. The named lens is scaled to the camera's focal length, and its
+        stop is closed to the camera's f-number where that is larger than its own.
+        """
         own = self.lens
         if isinstance(own, RealLens) and not name:
             return own
         return _scaled(name or DEFAULT_LENS, own.focal_length_mm, own.f_number, self)
 
     def prescription(self, name: str, coating: str) -> Prescription:
-        """That lens, every surface between glass and air with the named coating, or all `as_prescribed`."""
+        """Return the prescription of that lens with a named coating on every surface between glass and air.
+
+        With `as_prescribed` the coatings stay.
+        """
         lens = self.real_lens(name).prescription
         return lens if coating == "as_prescribed" else _coated(lens, coating)
 
     def beams(self, name: str) -> Beams:
-        """The beams of that lens, to a little beyond the frame's corners."""
+        """Return the beams of that lens, from the axis to slightly beyond the frame's corners."""
         slope = np.hypot(*self.slopes(np.array([self.width_px]), np.array([self.height_px])))
         lens = self.real_lens(name)
         return beams(lens.prescription, _MARGIN * float(slope[0, 0]), lens.sensor_mm)
@@ -94,6 +101,7 @@ class ImageFrame:
 
 @resources.cached_with_contents(maxsize=8)
 def _scaled(name: str, focal_length_mm: float, f_number: float, frame: ImageFrame) -> RealLens:
+    """Return a packaged lens or a lens file fitted to a frame."""
     lens = scaled_to_focal_length(load_lens(name), focal_length_mm)
     return RealLens(
         prescription=stopped_down(lens, f_number),
@@ -105,6 +113,7 @@ def _scaled(name: str, focal_length_mm: float, f_number: float, frame: ImageFram
 
 @lru_cache(maxsize=8)
 def _coated(lens: Prescription, coating: str) -> Prescription:
+    """Return the lens with a named coating on every surface between glass and air."""
     return lens.coated(coating)
 
 
@@ -113,9 +122,18 @@ def _coated(lens: Prescription, coating: str) -> Prescription:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Beams:
-    """Beams of far points over the tangent of the field angle, `slope` float64[angle], in the plane of the first
-    vertex: a point within, `centre_mm` float64[angle] on the x axis, and distances of the rim from there,
-    `rim_mm` float64[angle, azimuth], for azimuths from 0 to π; 0 where nothing passes."""
+    """Tabulate beams of far points over the tangent of the field angle, in the plane of the first vertex.
+
+    Attributes
+    ----------
+    slope
+        float64[angle]: tangents of the field angles.
+    centre_mm
+        float64[angle]: a point inside each beam, on the x axis.
+    rim_mm
+        float64[angle, azimuth]: distance of the rim from that point, for azimuths from 0 to π; 0 where no light
+        passes.
+    """
 
     lens: Prescription
     sensor_mm: float
@@ -125,28 +143,28 @@ class Beams:
 
     @cached_property
     def bundle(self) -> Path:
-        """Rays at the centres, on rings of equal areas and on the rims: [angle × azimuth × ring]."""
+        """Return traced rays at the centres, on rings of equal areas and on the rims: [angle × azimuth × ring]."""
         distance = self.rim_mm[..., None] * np.sqrt(np.arange(_RINGS + 1) / _RINGS)
         turn = np.linspace(0, np.pi, _AZIMUTHS)[:, None]
         x = self.centre_mm[:, None, None] + distance * np.cos(turn)
         return _rays(self.lens, self.sensor_mm, self.slope[:, None, None], x, distance * np.sin(turn))[0]
 
     def on_row(self, row: int) -> Footprint:
-        """Footprints on a surface."""
+        """Return the footprints on a surface."""
         return self._footprint(self.bundle.points_mm[1 + row, :, :2])
 
     def above_sensor(self, height_mm: float) -> Footprint:
-        """Footprints in a plane before the sensor."""
+        """Return the footprints in a plane in front of the sensor."""
         slope = self.bundle.directions[:, :2] / self.bundle.directions[:, 2:]
         return self._footprint(self.bundle.points_mm[-1, :, :2] - height_mm * slope)
 
     def _footprint(self, points: F64) -> Footprint:
-        """`points` float64[angle × azimuth × ring, 2]: where the bundle crosses the surface."""
+        """Return the footprints from the points where the bundle crosses, float64[angle × azimuth × ring, 2]."""
         shape = (len(self.slope), _AZIMUTHS, _RINGS + 1)
         x, y = np.moveaxis(points.reshape(*shape, 2), 3, 0)
         lit = np.isfinite(x + y).all(axis=(1, 2)) & (self.rim_mm.min(axis=1) > 0)
         x, y, from_slope = x[lit], y[lit], self.slope[lit]
-        # the half of the rim above the axis; the other mirrors it
+        # the rim's half above the axis gives the centroid; the other half mirrors it
         a, b = x[..., -1], y[..., -1]
         twice = a[:, :-1] * b[:, 1:] - a[:, 1:] * b[:, :-1]
         middle = ((a[:, :-1] + a[:, 1:]) * twice).sum(axis=1) / (3 * twice.sum(axis=1))
@@ -173,7 +191,7 @@ class Beams:
 
 
 def _cells(x: F64, y: F64) -> tuple[F64, F64, F64]:
-    """Of a bundle's cells, float64[angle, azimuth, ring] each: signed area and middle."""
+    """Return signed area and middle of each cell of a bundle, float64[angle, azimuth, ring] each."""
     corners = [
         (slice(None), slice(a, a - 1 or None), slice(r, r - 1 or None)) for a, r in ((0, 0), (0, 1), (1, 1), (1, 0))
     ]
@@ -183,7 +201,7 @@ def _cells(x: F64, y: F64) -> tuple[F64, F64, F64]:
 
 
 def _fitted(x: F64, y: F64, area: F64, light: F64) -> F64:
-    """Light per area over its mean, c0 + c1 x + c2 x² + c3 y² by least squares, float64[angle, 4]."""
+    """Fit light per area over its mean by c0 + c1 x + c2 x² + c3 y² with least squares; float64[angle, 4]."""
     n = len(x)
     scale = np.sqrt(area.sum(axis=(1, 2)))
     u, v = (w.reshape(n, -1) / scale[:, None] for w in (x, y))
@@ -195,7 +213,7 @@ def _fitted(x: F64, y: F64, area: F64, light: F64) -> F64:
 
 
 def _rays(lens: Prescription, sensor_mm: float, slope: F64, x: F64, y: F64) -> tuple[Path, tuple[int, ...]]:
-    """Rays that cross the plane of the first vertex at (x, y) with the slope dx/dz, and the common shape."""
+    """Trace rays through (x, y) of the first vertex's plane with the slope dx/dz; return also the common shape."""
     slope, x, y = np.broadcast_arrays(slope, x, y)
     nothing = np.zeros(x.size)
     found = trace(
@@ -208,7 +226,7 @@ def _rays(lens: Prescription, sensor_mm: float, slope: F64, x: F64, y: F64) -> t
 
 
 def _beyond(lens: Prescription, sensor_mm: float, slope: F64, x: F64, y: F64) -> F64:
-    """The largest distance from the axis on the way, in semi-diameters; inf for a ray that goes nowhere."""
+    """Return each ray's largest distance from the axis in semi-diameters; inf for a ray that does not arrive."""
     found, shape = _rays(lens, sensor_mm, slope, x, y)
     lost = ~np.isfinite(found.points_mm[-1, :, 0])
     return np.where(lost, np.inf, found.relative_radius).reshape(shape)
@@ -216,13 +234,15 @@ def _beyond(lens: Prescription, sensor_mm: float, slope: F64, x: F64, y: F64) ->
 
 @lru_cache(maxsize=8)
 def beams(lens: Prescription, largest_slope: float, sensor_mm: float) -> Beams:
-    """Beams up to a field angle's tangent, or to where the lens is dark. Their rims are found by bisection and, at
-    last, linear interpolation: beams are taken as convex."""
+    """Return the beams of a lens up to a tangent of the field angle, or up to where the lens is dark.
+
+    Rims are located by bisection and a final linear interpolation, on the assumption that beams are convex.
+    """
     lens = lens.with_round_stop()
     for _ in range(_NARROWINGS):
         slope = np.tan(np.linspace(0, np.arctan(largest_slope), _ANGLES))
         centre, width = _innermost(lens, sensor_mm, slope)
-        # angles are for where there is light, and one beyond
+        # use the field angles where there is light: up to the first dark one
         last = int(np.flatnonzero(width).max(initial=0))
         if last >= _ANGLES // 2:
             break
@@ -230,7 +250,7 @@ def beams(lens: Prescription, largest_slope: float, sensor_mm: float) -> Beams:
     azimuth = np.linspace(0, np.pi, _AZIMUTHS)
     low = np.zeros((_ANGLES, _AZIMUTHS))
     high = low + (1.5 * np.maximum(width, width[0]))[:, None]
-    inside, outside = low, high + np.inf  # how far out of the way's rims a ray is at both ends
+    inside, outside = low, high + np.inf  # relative radius of the rays at both ends
     for _ in range(_HALVINGS):
         half = (low + high) / 2
         x, y = centre[:, None] + half * np.cos(azimuth), half * np.sin(azimuth)
@@ -244,8 +264,10 @@ def beams(lens: Prescription, largest_slope: float, sensor_mm: float) -> Beams:
 
 
 def _innermost(lens: Prescription, sensor_mm: float, slope: F64) -> tuple[F64, F64]:
-    """Of each beam a place well within, in a fan of rays on the x axis, and about how wide it is there; 0 where
-    nothing passes."""
+    """Return a point well inside each beam, from a fan of rays on the x axis, and its approximate width there.
+
+    The width is 0 where no light passes.
+    """
     first = lens.surfaces[0]
     reach = first.semi_diameter_mm + np.abs(first.sag_mm(first.semi_diameter_mm)) * slope
     middle, width = np.zeros_like(slope), np.zeros_like(slope)
@@ -265,10 +287,23 @@ def _innermost(lens: Prescription, sensor_mm: float, slope: F64) -> tuple[F64, F
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Footprint:
-    """Footprints over equal steps of the field angle's tangent, `slope` float64[angle]: the middle `centre_mm`
-    float64[angle] along the point's azimuth, the area, the rim's distance from the middle, float64[angle, turn],
-    at equal steps of the cosine of the direction, -1 to 1; and the light per area over its mean, a polynomial c0
-    + c1 u + c2 u² + c3 v² of the place from the middle, u outwards, `brightness` float64[angle, 4]."""
+    """Tabulate the footprints on one surface over equal steps of the tangent of the field angle.
+
+    Attributes
+    ----------
+    slope
+        float64[angle]: tangents of the field angles.
+    centre_mm
+        float64[angle]: position of the middle along the point's azimuth.
+    rim_mm
+        float64[angle, turn]: distance of the rim from the middle, at equal steps of the cosine of the direction
+        from -1 to 1.
+    area_mm2
+        float64[angle]
+    brightness
+        float64[angle, 4]: light per area over its mean, as the polynomial c0 + c1 u + c2 u² + c3 v² of the position
+        from the middle, u outwards.
+    """
 
     slope: F64
     centre_mm: F64
@@ -277,7 +312,10 @@ class Footprint:
     brightness: F64
 
     def places(self, slope_x: NDArray, slope_y: NDArray, *, light: bool = True) -> Places:
-        """Of the directions (slope_x, slope_y), float[y, x] each: their footprints, with the brightness in them."""
+        """Return the footprints of the directions (slope_x, slope_y), float[y, x] each.
+
+        `light`: whether the brightness within the footprints is included.
+        """
         slope = np.hypot(slope_x, slope_y).astype(np.float32)
         row = np.minimum(slope * np.float32(1 / self.slope[1]), np.float32(_DENSE - 1))
         per = 1 / np.maximum(slope, np.float32(1e-12))
@@ -295,17 +333,20 @@ class Footprint:
 
     @property
     def largest_mm(self) -> float:
-        """The largest distance of a rim from its middle."""
+        """Return the largest distance of a rim from its middle."""
         return float(self.rim_mm.max())
 
     @cached_property
     def rims_mm(self) -> F32:
-        """`rim_mm` in single precision."""
+        """Return `rim_mm` in single precision."""
         return self.rim_mm.astype(np.float32)
 
     def shadow(self, distance_mm: float, radius_mm: float) -> tuple[F32, float]:
-        """Share that a disc covers of the footprint whose middle lies at a distance from the axis, float32[y, x]
-        over the disc's place from that middle, which is at the table's; and table cells per mm."""
+        """Return the fraction of one footprint's light that a disc covers, and the table's cells per mm.
+
+        The footprint is the one whose middle lies at `distance_mm` from the axis. The fraction is float32[y, x]
+        over the disc's position relative to that middle, which is in the middle of the table.
+        """
         at = int(np.argmin(np.abs(np.abs(self.centre_mm) - distance_mm)))
         if self.area_mm2[at] == 0:
             return np.zeros((_SHADOW, _SHADOW), dtype=np.float32), 1.0
@@ -323,8 +364,7 @@ class Footprint:
         return np.clip(fft.fftshift(both), 0, 1).astype(np.float32), per_mm
 
     def most_covered(self, radius_mm: float) -> F32:
-        """Share of each footprint that a disc about its middle covers, float32[angle]; 0 where there is no
-        light."""
+        """Return the fraction of each footprint that a disc at its middle covers, float32[angle]; 0 if dark."""
         steps = -np.diff(np.arccos(np.linspace(-1, 1, _TURNS)))
         weight = (np.append(steps, 0) + np.append(0, steps)) / 2
         inner = np.minimum(self.rim_mm, radius_mm) ** 2 @ weight
@@ -334,7 +374,10 @@ class Footprint:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Places:
-    """Footprints of an array of directions: azimuth, middle along it, area, and the row of the rim's table."""
+    """Hold the footprints of an array of directions.
+
+    They have an azimuth (cos, sin), a middle along it, an area, and a fractional row in the table `table`.
+    """
 
     cos: F32
     sin: F32
@@ -345,23 +388,25 @@ class Places:
     table: Footprint
 
     def part(self, where: tuple[slice, slice]) -> Places:
-        """Some of them."""
+        """Return the footprints of some of the directions."""
         names = ("cos", "sin", "centre_mm", "area_mm2", "row")
         parts: dict[str, F32] = {name: np.ascontiguousarray(getattr(self, name)[where]) for name in names}
         brightness = tuple(np.ascontiguousarray(c[where]) for c in self.brightness)
         return Places(**parts, brightness=brightness, table=self.table)
 
     def _from_middle(self, x_mm: float, y_mm: float) -> tuple[F32, F32]:
-        """A place on the surface as seen from the footprints' middles, along their azimuths and across."""
+        """Return a position on the surface relative to the footprints' middles, along their azimuths and across."""
         x, y = np.float32(x_mm), np.float32(y_mm)
         return x * self.cos + y * self.sin - self.centre_mm, y * self.cos - x * self.sin
 
     def covered(self, x_mm: float, y_mm: float, radius_mm: float) -> F32:
-        """Share of each footprint's light that a disc covers, in [0, 1].
+        """Return the fraction of each footprint's light that a disc covers, in [0, 1].
 
-        The largest share that the disc can cover, times the share of that which it does where the footprint is
-        round, its rim as far from the middle as the true one is in the disc's direction: exact for round
-        footprints, and for all others where the disc lies within or hides them.
+        The footprint is taken as round, with the distance of the true rim from the middle in the disc's direction
+        as its radius. The disc's overlap with it, relative to the largest possible overlap, multiplies the largest
+        fraction that the disc can cover of the true footprint (`most_covered`). The result is exact for round
+        footprints, and for all others where the disc lies wholly inside or hides the footprint. It is then
+        corrected for the brightness at the disc.
         """
         a = np.float32(radius_mm)
         along, across = self._from_middle(x_mm, y_mm)
@@ -375,32 +420,36 @@ class Places:
         most = _looked_up(self.table.most_covered(radius_mm)[:, None], self.row)
         out *= most
         c = self.brightness
-        # of a small disc, that of its place; a large one meets the mean
+        # a small disc covers the brightness at its position, a large one the mean
         brighter = c[0] - 1 + along * (c[1] + along * c[2]) + across * across * c[3]
         out *= 1 + brighter * (1 - most)
         return np.clip(out, 0, 1, out=out)
 
     def covered_nearby(self, x_mm: float, y_mm: float, radius_mm: float) -> F32:
-        """As `covered`, for any shape of footprint, but for footprints that are alike wherever the disc touches
-        one: that of the direction in which the disc lies in the middle of it."""
+        """Return the fraction as `covered` does, for footprints of any shape that are alike around the disc.
+
+        Their common shape is that of the footprint whose middle is as far from the axis as the disc.
+        """
         table, per_mm = self.table.shadow(float(np.hypot(x_mm, y_mm)), radius_mm)
         along, across = (v * np.float32(per_mm) + np.float32(_SHADOW // 2) for v in self._from_middle(x_mm, y_mm))
         return np.asarray(cv2.remap(table, along, across, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT))
 
 
 def _looked_up(table: F32, row: F32, column: F32 | None = None) -> F32:
-    """Between a table's nodes, linear in steps of a 32nd."""
+    """Interpolate linearly between a table's nodes, in steps of 1/32 as OpenCV does."""
     across = np.zeros_like(row) if column is None else column
     return np.asarray(cv2.remap(table, across, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
 
 
 def disc_overlap(distance: ArrayLike, one: ArrayLike, other: ArrayLike) -> NDArray:
-    """Area that two discs of the radii `one` and `other` share, their middles `distance` apart; of the arguments'
-    common shape and unit squared."""
+    """Return the area that two discs have in common, whose middles are `distance` apart.
+
+    `one` and `other` are the radii. The result has the arguments' common shape and their unit squared.
+    """
     d, a, b = np.broadcast_arrays(distance, one, other)
     least = np.minimum(a, b)
     near, far = np.abs(a - b), a + b
-    # two circular segments, on either side of the chord through both rims' crossings
+    # the overlap is two circular segments on either side of the chord through the rims' crossings
     inner = np.clip(d, near + 1e-6 * least, np.maximum(far, 1e-12))
     inner = np.maximum(inner, 1e-12)
     safe_a, safe_b = np.maximum(a, 1e-12), np.maximum(b, 1e-12)

@@ -1,6 +1,6 @@
-"""First-order optics of a prescription: focal length, focus, pupils, f-numbers.
+"""Compute the first-order optics of a prescription: focal length, focus, pupils and f-number.
 
-Rays are (height, slope) in a plane through the axis; every step is a 2 × 2 matrix.
+A ray is the vector (height, slope) in a plane through the axis; each step through the lens is a 2 × 2 matrix.
 """
 
 from __future__ import annotations
@@ -20,18 +20,19 @@ F64 = NDArray[np.float64]
 
 @dataclass(frozen=True, kw_only=True)
 class FirstOrder:
-    """What a lens does near its axis, lengths in mm.
+    """Hold the first-order properties of a lens, lengths in mm.
 
     Attributes
     ----------
     efl_mm, bfd_mm
-        Focal length, and distance from the last vertex to the focus of a far object.
+        Effective focal length, and back focal distance: from the last vertex to the focus of a far object.
     entrance_pupil_mm, entrance_pupil_diameter_mm
-        Place behind the first vertex and size of the stop's image in front.
+        Position behind the first vertex, and diameter, of the stop's image seen from the front.
     exit_pupil_mm, exit_pupil_diameter_mm
-        Place behind the last vertex (negative: before it) and size of the stop's image behind.
+        Position behind the last vertex (negative: in front of it), and diameter, of the stop's image seen from
+        behind.
     f_number
-        `efl_mm` over the entrance pupil's diameter.
+        `efl_mm` divided by the diameter of the entrance pupil.
     """
 
     efl_mm: float
@@ -44,17 +45,17 @@ class FirstOrder:
 
 
 def gap(length_mm: float) -> F64:
-    """Over a distance in one medium."""
+    """Return the matrix of a distance in one medium."""
     return np.array([[1.0, length_mm], [0.0, 1.0]])
 
 
 def refraction(before: float, after: float, curvature_per_mm: float) -> F64:
-    """At a surface between two indices."""
+    """Return the matrix of a refracting surface between two indices."""
     return np.array([[1.0, 0.0], [(before - after) * curvature_per_mm / after, before / after]])
 
 
 def system(lens: Prescription, first: int, last: int, wavelength_nm: float = D_NM) -> F64:
-    """From just before row `first` to just behind row `last`, both included; the identity where first > last."""
+    """Return the matrix from just before row `first` to just behind row `last`; the identity where first > last."""
     index = lens.indices(wavelength_nm)
     steps: list[F64] = []
     for k in range(first, last + 1):
@@ -65,7 +66,13 @@ def system(lens: Prescription, first: int, last: int, wavelength_nm: float = D_N
 
 
 def first_order(lens: Prescription, wavelength_nm: float = D_NM) -> FirstOrder:
-    """The lens's first-order properties at a wavelength. Raises InputError for a lens without a focus behind it."""
+    """Return the first-order properties of a lens at a wavelength.
+
+    Raises
+    ------
+    InputError
+        The lens has no focus behind it.
+    """
     last, stop = len(lens.surfaces) - 1, lens.stop
     whole = system(lens, 0, last, wavelength_nm)
     if abs(whole[1, 0]) < 1e-12:
@@ -94,11 +101,16 @@ def first_order(lens: Prescription, wavelength_nm: float = D_NM) -> FirstOrder:
 
 
 def scaled_to_focal_length(lens: Prescription, efl_mm: float) -> Prescription:
-    """Return the lens scaled to a focal length at the d line; see `Prescription.scaled` for what keeps its size."""
+    """Return the lens scaled to a focal length at the d line.
+
+    `Prescription.scaled` lists what keeps its size.
+    """
     return lens.scaled(efl_mm / first_order(lens).efl_mm)
 
 
 def scaled_to_field(lens: Prescription, fov_deg: float, sensor_mm: float) -> Prescription:
-    """Return the lens scaled so that a sensor of that width sees the full field `fov_deg`, distortion left out; see
-    `Prescription.scaled` for what keeps its size."""
+    """Return the lens scaled so that a sensor of this width sees the full field `fov_deg`.
+
+    Distortion is not taken into account. `Prescription.scaled` lists what keeps its size.
+    """
     return scaled_to_focal_length(lens, sensor_mm / 2 / float(np.tan(np.radians(fov_deg / 2))))

@@ -1,4 +1,4 @@
-"""Optical media: index of refraction over wavelength."""
+"""Compute the refractive index of optical media by wavelength."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ RANGE_NM = (250.0, 2500.0)
 
 @dataclass(frozen=True, kw_only=True)
 class Glass:
-    """A medium by one of three formulas, λ in micrometres.
+    """Describe a medium by one of three dispersion formulas, λ in micrometres.
 
     - `cauchy`: n = A + B λ⁻², coefficients (A, B);
     - `sellmeier`: n² = 1 + Σ B_k λ² / (λ² - C_k), coefficients (B₁, B₂, B₃, C₁, C₂, C₃);
@@ -31,7 +31,7 @@ class Glass:
     coefficients: tuple[float, ...]
 
     def index(self, wavelength_nm: ArrayLike) -> F64:
-        """Index against air, float64 like `wavelength_nm`."""
+        """Return the index relative to air, float64 like `wavelength_nm`."""
         um2 = (np.asarray(wavelength_nm, dtype=np.float64) * 1e-3) ** 2
         c = self.coefficients
         if self.formula == "cauchy":
@@ -42,12 +42,12 @@ class Glass:
 
     @property
     def nd(self) -> float:
-        """Index at the d line."""
+        """Return the index at the d line."""
         return float(self.index(D_NM))
 
     @property
     def vd(self) -> float:
-        """Abbe number (nd - 1) / (nF - nC); infinite without dispersion."""
+        """Return the Abbe number (nd - 1) / (nF - nC); infinite without dispersion."""
         spread = float(self.index(F_NM) - self.index(C_NM))
         return (self.nd - 1) / spread if spread else float("inf")
 
@@ -56,7 +56,7 @@ AIR = Glass(name="air", formula="cauchy", coefficients=(1.0, 0.0))
 
 
 def from_abbe(nd: float, vd: float | None) -> Glass:
-    """A medium from its index and Abbe number at the d line (Cauchy's formula); None: no dispersion."""
+    """Return a medium by Cauchy's formula from its index and Abbe number at the d line; None: no dispersion."""
     slope = 0.0
     if vd is not None:
         slope = (nd - 1) / vd / ((F_NM * 1e-3) ** -2 - (C_NM * 1e-3) ** -2)
@@ -68,10 +68,11 @@ def from_abbe(nd: float, vd: float | None) -> Glass:
 
 
 def _sellmeier(name: str, *coefficients: float) -> Glass:
+    """Return a medium by Sellmeier's formula."""
     return Glass(name=name, formula="sellmeier", coefficients=coefficients)
 
 
-# Schott's data sheets; fused silica after Malitson 1965, JOSA 55, 1205. G: stabilised against radiation.
+# Schott's data sheets; fused silica after Malitson 1965, JOSA 55, 1205. G in a name: stabilised against radiation.
 _CATALOGUE = (
     _sellmeier("N-BK7", 1.03961212, 0.231792344, 1.01046945, 0.00600069867, 0.0200179144, 103.560653),
     _sellmeier("F2", 1.34533359, 0.209073176, 0.937357162, 0.00997743871, 0.0470450767, 111.886764),
@@ -87,14 +88,26 @@ GLASSES: Mapping[str, Glass] = MappingProxyType({glass.name: glass for glass in 
 
 
 def named(name: str) -> Glass:
-    """A glass of the catalogue. Raises InputError that lists them."""
+    """Return a glass of the catalogue.
+
+    Raises
+    ------
+    InputError
+        The name is unknown; the message lists the known ones.
+    """
     if name not in GLASSES:
         raise InputError(f"glass = {name!r}: unknown; known are {', '.join(GLASSES)}")
     return GLASSES[name]
 
 
 def from_coefficients(formula: str, coefficients: Sequence[float]) -> Glass:
-    """A medium of one's own. Raises InputError for another formula or number of coefficients."""
+    """Return a medium from a user's own coefficients.
+
+    Raises
+    ------
+    InputError
+        The formula is unknown or takes another number of coefficients.
+    """
     counts = {"cauchy": 2, "sellmeier": 6, "polynomial": 6}
     if formula not in counts:
         raise InputError(f"glass.formula = {formula!r}: must be one of {', '.join(counts)}")

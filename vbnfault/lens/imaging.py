@@ -1,21 +1,26 @@
-"""Image formation by a prescription, from exact rays: distortion, relative illumination, colour, point spread.
+"""Image a scene through a prescription with exact rays: distortion, relative illumination, colour, point spread.
 
-A render on the grid of a pinhole camera, with a guard band around the frame, becomes irradiance on the sensor:
+The input is a render on the grid of a pinhole camera, with a guard band around the frame. Per band, in this order:
 
-    radiance ─ resampled, each band where it lands ─ × transmission and solid angle ─ ∗ point spread ─▶ irradiance
+1. resample the radiance to where the lens images it (distortion, lateral colour);
+2. multiply by transmission and solid angle, which gives irradiance;
+3. spread each pixel's light by the point spread function.
 
-- Chief rays, through the middle of the real stop, give the height of the image h(θ, λ); see `mapping`.
-- The bundle that passes all rims gives the light. A field of radiance L at the angle θ sends L A cos θ dΩ through
-  the area A that the bundle takes in the plane of the first vertex, and it lands on dA = h dh dφ: with t = tan θ
+The geometry behind the steps:
 
-      E = L T A cos⁴θ · t / (h dh/dt),
+- Chief rays pass through the middle of the real stop. They give the height of the image h(θ, λ); see `mapping`.
+- The bundle that passes all rims carries the light. It covers the area A in the plane of the first vertex. A field
+  of radiance L at the angle θ sends L A cos θ dΩ through A, and this flux lands on dA = h dh dφ. With t = tan θ,
 
-  natural and mechanical vignetting and the stretch of distortion in one; no cos⁴ falls on top.
-- Its rays on the sensor, weighted with the area they came through and blurred by diffraction, are the point spread.
+      E = L T A cos⁴θ · t / (h dh/dt).
 
-Left out: the shift of a spot's centroid from its chief ray (coma), so that light lies where the labels have it;
-reflection losses off the axis; distance of the object, since rays come from infinity. A stop with blades counts as
-a round one of the same area.
+  This contains natural and mechanical vignetting and the stretch by distortion; no further cos⁴ applies.
+- The point spread is the pattern of the bundle's rays on the sensor. Each ray is weighted with the area that it
+  came through, and diffraction blurs the pattern.
+
+Not modelled: the shift of a spot's centroid from its chief ray (coma), so that light lies where the labels are;
+reflection losses off the axis; the distance of the object, since rays come from infinity. A stop with blades is
+replaced by a round one of the same area.
 """
 
 from __future__ import annotations
@@ -44,31 +49,31 @@ from .straylight.paraxial import axial_transmittance
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
-# The point spread reaches this many pixels from its centre; light beyond is shared out within.
+# The point spread reaches this many pixels from its centre; light beyond is distributed within.
 REACH_PX = 7
-# A point spread with a smaller root-mean-square radius leaves a pixel's light where it is.
+# A point spread with a smaller root-mean-square radius is not applied.
 _SHARP_PX = 0.3
 
 _ANGLES = 65  # field angles of the tables
-_BEYOND = 1.6  # of the frame's corner, as a tangent: how far the tables reach
-_HEIGHTS = 129  # of a narrower meridional fan
-_RAYS_OF_BEAM = 4  # of them that the beam along the axis takes at least
-_AZIMUTHS = 32  # of half a bundle
-_RADII = 33  # samples along which a bundle's rim is sought, then
-_FINE_RADII = 9  # within the interval found
+_BEYOND = 1.6  # the tables reach this multiple of the corner's tangent
+_HEIGHTS = 129  # rays of a narrower meridional fan
+_RAYS_OF_BEAM = 4  # the axial beam must hold at least this many of them
+_AZIMUTHS = 32  # over half a turn of a bundle
+_RADII = 33  # samples along a radius that locate a bundle's rim, and
+_FINE_RADII = 9  # samples within the interval that holds it
 _RINGS = 10  # of a bundle's rays
 _DENSE = 4097  # nodes of the tables over slope
-_STEPS = 65536  # nodes of those over squared radius
-_COLOUR_PX = 4  # by which colours may want more of a render than the d line does
+_STEPS = 65536  # nodes of the tables over squared radius
+_COLOUR_PX = 4  # extra guard band, since other colours may come from farther out than the d line
 _TILE_PX = 128
 _STRIP_PX = 64
 _FINE = 5  # cells of a pixel in which rays of a spot are counted
-_ROUNDS = 12  # in which a spot's width is brought to what it is to be
-_TRIM = 2e-3  # share of a point spread that its outermost pixels may hold without being kept
-_AIRY_SIGMA = 0.42  # of the Gaussian closest to an Airy pattern's core, in wavelengths × f-number
+_ROUNDS = 12  # iterations that correct a spot's width
+_TRIM = 2e-3  # largest fraction of a point spread in the outermost pixels that are cut off
+_AIRY_SIGMA = 0.42  # sigma of the Gaussian closest to an Airy pattern's core, in wavelengths × f-number
 _MIDWAY: F32 = np.array([[-1 / 16, 9 / 16, 9 / 16, -1 / 16]], dtype=np.float32)
 _INSIDE = (slice(REACH_PX, -REACH_PX), slice(REACH_PX, -REACH_PX))
-_DIRECT_TAPS = 121  # OpenCV filters with more by Fourier transforms, which spread the Sun's rounding errors
+_DIRECT_TAPS = 121  # with more taps OpenCV uses Fourier transforms, which spread the Sun's rounding errors
 
 
 # --- rays ------------------------------------------------------------------------------------------------------
@@ -76,8 +81,11 @@ _DIRECT_TAPS = 121  # OpenCV filters with more by Fourier transforms, which spre
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Beams:
-    """What passes all rims, per field angle, in the first vertex's plane: centres float64[angle] mm on the x axis,
-    and distances of the rim from there, float64[angle, azimuth] mm, for azimuths within half a turn."""
+    """Hold, per field angle, the bundle of rays that passes all rims, in the plane of the first vertex.
+
+    `centre_mm` float64[angle] is a point inside the bundle on the x axis. `rim_mm` float64[angle, azimuth] is the
+    distance of the bundle's rim from there, for azimuths within half a turn; the other half is its mirror image.
+    """
 
     slope: F64
     centre_mm: F64
@@ -85,19 +93,24 @@ class _Beams:
 
     @property
     def azimuth_rad(self) -> F64:
+        """Return the azimuths of `rim_mm`, float64[azimuth]."""
         return np.asarray((np.arange(_AZIMUTHS) + 0.5) * np.pi / _AZIMUTHS)
 
     @property
     def area_mm2(self) -> F64:
-        """float64[angle]; the midpoint rule, which converges fast for a whole turn of a smooth rim."""
+        """Return the area of each bundle, float64[angle].
+
+        The midpoint rule converges fast over the whole turn of a smooth rim.
+        """
         return np.asarray((self.rim_mm**2).sum(axis=1) * np.pi / _AZIMUTHS)
 
 
 def _beams(lens: Prescription, slope: F64) -> _Beams:
-    """Bundles at the d line: their rims are found between rays that pass and rays that do not."""
+    """Return the bundles at the d line; each rim is located between rays that pass and rays that do not."""
     sensor = first_order(lens).bfd_mm
 
     def beyond(x: F64, y: F64) -> F64:
+        """Return the largest relative radius of rays through (x, y), inf for rays that do not arrive."""
         found, shape = inclined_rays(lens, slope.reshape(-1, *(1,) * (x.ndim - 1)), x, y, D_NM, sensor)
         lost = ~np.isfinite(found.points_mm[-1, :, 0])
         return np.where(lost, np.inf, found.relative_radius).reshape(shape)
@@ -105,7 +118,7 @@ def _beams(lens: Prescription, slope: F64) -> _Beams:
     heights = fan_heights_mm(lens, slope)
     outside = beyond(heights, np.zeros(1))
     at = np.arange(len(slope))
-    # the beam of a stop closed far fits between two rays of the fan: narrower fans about the ray nearest to passing
+    # the beam of a nearly closed stop fits between two rays: trace narrower fans around the ray nearest to passing
     beam_mm = axial_beam_diameter_mm(lens)
     while beam_mm > 0 and (step := float((heights[:, 1] - heights[:, 0]).max())) > beam_mm / _RAYS_OF_BEAM:
         middle = heights[at, np.argmin(outside, axis=1)][:, None]
@@ -118,7 +131,7 @@ def _beams(lens: Prescription, slope: F64) -> _Beams:
     azimuth = (np.arange(_AZIMUTHS) + 0.5) * np.pi / _AZIMUTHS
 
     def rim(near: F64, far: F64, samples: int) -> tuple[F64, F64, F64]:
-        """An interval of distances that holds the rim, and the rim by linear interpolation within."""
+        """Return an interval of distances that holds the rim, and the rim by linear interpolation within it."""
         distance = near[..., None] + (far - near)[..., None] * np.linspace(0, 1, samples)
         x = centre[:, None, None] + distance * np.cos(azimuth)[:, None]
         over = beyond(x, distance * np.sin(azimuth)[:, None])
@@ -139,26 +152,30 @@ def _beams(lens: Prescription, slope: F64) -> _Beams:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Spots:
-    """Rays of bundles as they arrive, half of each (the others mirror them): places on the sensor and slopes,
-    float64[angle, ray, 2], x outwards, and the areas they came through, float64[angle, ray]."""
+    """Hold the rays of each bundle at the sensor, half of them; the other half mirrors them in the x axis.
+
+    `place_mm` and `slope`, float64[angle, ray, 2], are positions and slopes with x pointing outwards; `weight_mm2`
+    float64[angle, ray] is the area that each ray came through.
+    """
 
     place_mm: F64
     slope: F64
     weight_mm2: F64
 
     def centred(self, values: F64) -> F64:
-        """Without the weighted mean of x; the mean of y is 0 by symmetry."""
+        """Return the values without the weighted mean of x; the mean of y is 0 by symmetry."""
         total = np.maximum(self.weight_mm2.sum(axis=1), 1e-300)
         mean = (self.weight_mm2 * values[..., 0]).sum(axis=1) / total
         return np.asarray(values - np.stack([mean, np.zeros_like(mean)], axis=-1)[:, None])
 
     def mean(self, values: F64) -> F64:
-        """Weighted mean over the rays, float64[angle]."""
+        """Return the weighted mean over the rays, float64[angle]."""
         total = np.maximum(self.weight_mm2.sum(axis=1), 1e-300)
         return np.asarray((self.weight_mm2 * values).sum(axis=1) / total)
 
 
 def _spots(lens: Prescription, beams: _Beams, wavelength_nm: float, sensor_mm: float) -> _Spots:
+    """Trace rays on rings of equal area in each bundle, and return them at the sensor."""
     ring = np.sqrt((np.arange(_RINGS) + 0.5) / _RINGS)
     azimuth = beams.azimuth_rad
     distance = (beams.rim_mm[:, :, None] * ring).reshape(len(beams.slope), -1)
@@ -180,8 +197,11 @@ def _spots(lens: Prescription, beams: _Beams, wavelength_nm: float, sensor_mm: f
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Tables:
-    """Per band, over the squared distance from the axis in the picture, float32[band, step]: the slope of the field
-    over the distance in focal lengths, and irradiance over radiance in sr."""
+    """Tabulate, per band, what a pixel needs over its squared distance from the axis, float32[band, step].
+
+    `stretch` is the tangent of the field angle over the image height in focal lengths; `solid_angle_sr` is
+    irradiance over radiance.
+    """
 
     stretch: F32
     solid_angle_sr: F32
@@ -189,10 +209,17 @@ class _Tables:
 
 @dataclass(frozen=True, kw_only=True)
 class RealLens:
-    """A prescription at its scale, with a sensor behind it; the interface of `ThinLens`, and more.
+    """Image through a prescription at its final scale, with a sensor behind it.
 
-    `focus`: the sensor stands at the paraxial focus of a far object, or where the mean square of the spots' radii
-    over the frame is least ("best"), both at the d line. `focus_distance_m` is what the renderer defocuses by.
+    It has the interface of `ThinLens`, and more.
+
+    Attributes
+    ----------
+    focus
+        "paraxial": the sensor stands at the paraxial focus of a far object. "best": it stands where the mean square
+        radius of the spots over the frame is smallest. Both hold for the d line.
+    focus_distance_m
+        Object distance by which the renderer defocuses the scene.
     """
 
     prescription: Prescription
@@ -204,31 +231,37 @@ class RealLens:
 
     @property
     def name(self) -> str:
+        """Return the name of the prescription."""
         return self.prescription.name
 
     @cached_property
     def sensor_mm(self) -> float:
-        """The sensor's plane behind the last vertex."""
+        """Return the distance of the sensor plane behind the last vertex."""
         paraxial = first_order(self._round).bfd_mm
         return paraxial if self.focus == "paraxial" else paraxial + self._best_shift_mm
 
     @cached_property
     def focal_length_mm(self) -> float:
-        """Image height over the tangent of the field angle near the axis, at the d line: the EFL where the sensor
-        stands at the paraxial focus."""
+        """Return image height over the tangent of the field angle near the axis, at the d line.
+
+        It is the EFL where the sensor stands at the paraxial focus.
+        """
         efl = first_order(self._round).efl_mm
         return efl if self.focus == "paraxial" else float(self._chief_rays.rise_mm(np.zeros(1))[0])
 
     @cached_property
     def f_number(self) -> float:
-        """EFL over the diameter of the real beam along the axis (of a disc of the same area)."""
+        """Return the EFL divided by the diameter of a disc that has the area of the axial beam."""
         area = float(self._beams.area_mm2[0])
         return float(first_order(self._round).efl_mm / (2 * np.sqrt(area / np.pi)))
 
     @property
     def figures(self) -> dict[str, str | float]:
-        """What the lens is after scaling and stopping down: name, scale over the prescription's file, EFL, f-number
-        of the real beam, diameter of the stop, transmission on the axis at the d line; `summary` says so."""
+        """Return the lens's properties after scaling and stopping down, and a sentence `summary` for people.
+
+        The properties are name, scale relative to the prescription's file, EFL, f-number of the real beam, diameter
+        of the stop, and transmission on the axis at the d line.
+        """
         lens = self.prescription
         efl_mm = first_order(lens).efl_mm
         return {
@@ -244,25 +277,31 @@ class RealLens:
 
     @property
     def aperture_radius_m(self) -> float:
-        """Radius of the beam along the axis, in metres."""
+        """Return the radius of the axial beam, in metres."""
         return float(np.sqrt(self._beams.area_mm2[0] / np.pi)) * 1e-3
 
     @property
     def transmission(self) -> float:
-        """On the axis at the d line."""
+        """Return the transmittance along the axis at the d line."""
         return float(self.transmittance(np.array([D_NM]))[0])
 
     def transmittance(self, wavelength_nm: F64) -> F64:
-        """Share of the light along the axis that coatings and glass let pass, float64[band]."""
+        """Return the fraction of the axial light that coatings and glass transmit, float64[band]."""
         return axial_transmittance(self.prescription, wavelength_nm)
 
     def pupil_area_mm2(self, slope: ArrayLike) -> F64:
-        """Return the area of the beam that passes all rims, in the plane of the first vertex, for tangents of field
-        angles; float64 alike. Beyond the traced field it stays as at the field's end."""
+        """Return the area of the beam that passes all rims, in the plane of the first vertex.
+
+        `slope`: tangents of field angles; the result is float64 of the same shape. Beyond the traced field it stays
+        constant.
+        """
         return np.asarray(np.interp(np.asarray(slope, dtype=np.float64), self._beams.slope, self._beams.area_mm2))
 
     def axial_solid_angle_sr(self, wavelength_nm: F64) -> F64:
-        """Irradiance over radiance on the axis, T A / f², float64[band]: π T / (4 N²) at the paraxial focus."""
+        """Return irradiance over radiance on the axis, T A / f², float64[band].
+
+        It is π T / (4 N²) at the paraxial focus.
+        """
         return np.asarray(
             [
                 share * self._beams.area_mm2[0] / self._map(wavelength).rise_mm[0] ** 2
@@ -273,23 +312,27 @@ class RealLens:
     # --- geometry
 
     def distorted(self, slope: F64, wavelength_nm: float = D_NM) -> F64:
-        """Distances from the axis in the picture, in focal lengths, of tangents of field angles; float64 alike."""
+        """Return image heights in focal lengths for tangents of field angles, float64 like `slope`."""
         return self._map(wavelength_nm).height(slope) / self.focal_length_mm
 
     def undistorted(self, distance: F64, wavelength_nm: float = D_NM) -> F64:
-        """Tangents of the field angles seen at distances from the axis in focal lengths; float64 alike."""
+        """Return the tangents of the field angles at image heights in focal lengths, float64 like `distance`."""
         return self._map(wavelength_nm).slope_at(distance * self.focal_length_mm)
 
     @property
     def distortion(self) -> F64:
-        """OpenCV's k1, k2, p1, p2, k3, k4, k5, k6 at the d line, float64[8]; p1 = p2 = 0. They are the map between
-        field angles and the frame: `distorted` and `undistorted` follow them."""
+        """Return OpenCV's k1, k2, p1, p2, k3, k4, k5, k6 at the d line, float64[8]; p1 = p2 = 0.
+
+        They define the map between field angles and the frame, which `distorted` and `undistorted` follow.
+        """
         return self._model.coefficients
 
     @cached_property
     def distortion_residual_px(self) -> tuple[float, float]:
-        """How far `distortion` lies from the lens's chief rays: root mean square and largest, pixels over as much
-        of the lit frame as has chief rays."""
+        """Return the rms and the largest difference between `distortion` and the chief rays, in pixels.
+
+        They are taken over the part of the lit frame that has chief rays.
+        """
         slope = self.undistorted(self._distances[self._lit])
         slope = slope[slope <= self._chief_rays.end]
         apart = self._model.distance(slope) - self._chief_rays.height_mm(slope) / self.focal_length_mm
@@ -298,31 +341,31 @@ class RealLens:
 
     @cached_property
     def _distances(self) -> F64:
-        """Distances from the axis in focal lengths of places all over the frame, float64[place]."""
+        """Return image heights, in focal lengths, of positions all over the frame, float64[position]."""
         x, y = (np.linspace(0, size / 2 / self.focal_length_px, 65) for size in (self.width_px, self.height_px))
         return np.asarray(np.hypot(x[None, :], y[:, None]).ravel())
 
     @cached_property
     def _lit(self) -> NDArray[np.bool_]:
-        """Which of `_distances` light reaches."""
+        """Return which of `_distances` receive light."""
         return np.asarray(self.relative_illumination(self._distances) > 0)
 
     def projection(self, wavelength_nm: float = D_NM, margin_px: int = 0) -> ChiefRays:
-        """Return where the pixels of the frame, with a margin around it, look at one wavelength."""
+        """Return the map between pixels, of the frame and a margin around it, and directions at one wavelength."""
         return ChiefRays(lens=self, wavelength_nm=wavelength_nm, margin_px=margin_px)
 
     @cached_property
     def seen_slopes(self) -> F64:
-        """Tangents x/z and y/z of the directions that the pixels' centres see at the d line, float64[y, x, 2], by
-        chief rays."""
+        """Return tangents x/z and y/z of the directions of the pixels' centres at the d line, float64[y, x, 2]."""
         return self.projection().slopes_at(np.arange(self.width_px) + 0.5, np.arange(self.height_px) + 0.5)
 
     @property
     def focal_length_px(self) -> float:
+        """Return the focal length in pixels."""
         return self.focal_length_mm * 1e3 / self.pixel_pitch_um
 
     def relative_illumination(self, distance: F64, wavelength_nm: float = D_NM) -> F64:
-        """Irradiance of a uniform field over that on the axis, at distances from the axis in focal lengths."""
+        """Return a uniform field's irradiance relative to that on the axis, at image heights in focal lengths."""
         mapped = self._map(wavelength_nm)
         solid = self._solid_angle_sr(mapped)
         at = np.interp(mapped.slope_at(distance * self.focal_length_mm), mapped.slope, solid, right=0.0)
@@ -330,9 +373,16 @@ class RealLens:
 
     @cached_property
     def guard_px(self) -> tuple[int, int]:
-        """Pixels that a render needs on the left and right, and at top and bottom, beyond the frame, at the same
-        focal length: for light from outside that distortion and point spread bring in. Raises InputError for a lens
-        that sees much more than the render of a pinhole camera of its focal length can hold."""
+        """Return how many pixels a render needs beyond the frame: (left and right, top and bottom).
+
+        They hold the light that distortion and point spread bring in from outside the frame, at the same focal
+        length.
+
+        Raises
+        ------
+        InputError
+            The lens sees a much wider field than a pinhole render of its focal length can hold.
+        """
         mapped = self._map(D_NM)
         farthest = self._slopes[-1]
         if self._beams.area_mm2[-1] > 0 and mapped.height(farthest) < self._corner * self.focal_length_mm:
@@ -351,45 +401,49 @@ class RealLens:
         gx, gy = np.ceil(np.maximum(seen.max(axis=0) - half, 0)).astype(int) + _COLOUR_PX
         return int(gx), int(gy)
 
-    # --- what the tables are made of
+    # --- inputs of the tables
 
     @cached_property
     def _round(self) -> Prescription:
-        """The prescription with a round stop."""
+        """Return the prescription with a round stop."""
         return self.prescription.with_round_stop()
 
     @cached_property
     def _corner(self) -> float:
-        """Distance of the frame's corner, point spread included, from the axis, in EFL."""
+        """Return the image height of the frame's corner, with the reach of the point spread, in EFL."""
         half = np.hypot(self.width_px / 2 + REACH_PX, self.height_px / 2 + REACH_PX)
         return float(half * self.pixel_pitch_um * 1e-3 / first_order(self._round).efl_mm)
 
     @cached_property
     def _slopes(self) -> F64:
-        """Tangents of the tables' field angles, float64[angle]; the first is all but 0."""
+        """Return the tangents of the tables' field angles, float64[angle]; the first is nearly 0."""
         slope = np.tan(np.linspace(0, np.arctan(_BEYOND * self._corner), _ANGLES))
         slope[0] = 1e-3 * slope[1]
         return slope
 
     @cached_property
     def _beams(self) -> _Beams:
+        """Return the bundles at the field angles of the tables."""
         return _beams(self._round, self._slopes)
 
     @cached_property
     def _zones(self) -> _Beams:
-        """The bundles of point spreads: those with light, from the axis to the corner."""
+        """Return the bundles for point spreads: those with light, from the axis to the corner."""
         beams = self._beams
         lit = (beams.area_mm2 > 0) & (beams.slope <= 1.1 * self._corner)
         return _Beams(slope=beams.slope[lit], centre_mm=beams.centre_mm[lit], rim_mm=beams.rim_mm[lit])
 
     @cached_property
     def _best_shift_mm(self) -> float:
-        """From the paraxial focus to the least mean square radius of spots, each ray as much as its light."""
+        """Return the distance from the paraxial focus to the smallest mean square radius of all spots.
+
+        Each spot counts with the light that its zone of the frame receives.
+        """
         beams, lens = self._zones, self._round
         order = first_order(lens)
         spots = _spots(lens, beams, D_NM, order.bfd_mm)
         place, slope = spots.centred(spots.place_mm), spots.centred(spots.slope)
-        # pixels of the frame nearest to each zone's undistorted place
+        # count the pixels of the frame nearest to each zone's undistorted position
         x, y = (np.abs(np.arange(n) + 0.5 - n / 2) for n in (self.width_px, self.height_px))
         radius = np.hypot(x[None, ::8], y[::8, None]).ravel() * self.pixel_pitch_um * 1e-3 / order.efl_mm
         edges = (beams.slope[1:] + beams.slope[:-1]) / 2
@@ -401,10 +455,11 @@ class RealLens:
 
     @cached_property
     def _chief_rays(self) -> ChiefHeights:
-        """Those of the d line."""
+        """Return the chief rays of the d line."""
         return self._chief_rays_at(D_NM)
 
     def _chief_rays_at(self, wavelength_nm: float, within: float = np.inf) -> ChiefHeights:
+        """Return the chief rays of a wavelength, up to the slope `within` at most."""
         lens = self._round
         return chief_heights(
             lens,
@@ -417,15 +472,16 @@ class RealLens:
 
     @cached_property
     def _model(self) -> RadialModel:
-        """Distortion of the frame, point spread's reach included."""
+        """Return the distortion model of the frame, with the reach of the point spread."""
         pixels = self.focal_length_px
         return camera_model(self._chief_rays, self.focal_length_mm, self._most_px / pixels, pixels, self.name)
 
     def _map(self, wavelength_nm: float) -> FieldMap:
+        """Return the map from field angles to image heights at a wavelength."""
         return _map(self, float(wavelength_nm))
 
     def _solid_angle_sr(self, mapped: FieldMap) -> F64:
-        """Irradiance over radiance without losses, float64 like `mapped.slope`."""
+        """Return irradiance over radiance without losses, float64 like `mapped.slope`."""
         slope = mapped.slope
         area = self._beam_mm2(slope)
         stretch = np.empty_like(slope)
@@ -434,26 +490,26 @@ class RealLens:
         return np.asarray(area / (1 + slope**2) ** 2 * stretch / mapped.rise_mm)
 
     def _beam_mm2(self, slope: F64) -> F64:
-        """Area of the beam that passes all rims, float64 like `slope`, which rises."""
+        """Return the area of the beam that passes all rims, float64 like `slope`, which must rise."""
         beams = self._beams
         traced = np.clip(slope, beams.slope[0], beams.slope[-1])
         area = np.maximum(PchipInterpolator(beams.slope, beams.area_mm2)(traced), 0)
         dark = beams.area_mm2 == 0
-        if dark.any():  # the last of the light goes linearly
+        if dark.any():  # from the last lit field angle to the first dark one the area falls linearly
             first = int(np.argmax(dark))
             fades = slope > beams.slope[first - 1]
             area[fades] = np.interp(slope[fades], beams.slope, beams.area_mm2)
         return np.asarray(area)
 
-    # --- pictures
+    # --- images
 
     def on_axis(self, radiance: Radiance) -> Irradiance:
-        """Irradiance that radiance gives on the axis, of any shape: no place in the frame counts."""
+        """Return the irradiance that a radiance gives on the axis; the pixels' positions do not matter."""
         factor = self.axial_solid_angle_sr(radiance.wavelength_nm).astype(np.float32)
         return Irradiance(array=radiance.array * factor[:, None, None], wavelength_nm=radiance.wavelength_nm)
 
     def image(self, radiance: Radiance) -> Irradiance:
-        """Irradiance on the sensor, float32[band, y, x], of a render with its guard band."""
+        """Return the irradiance on the sensor, float32[band, y, x], of a render with its guard band."""
         self._check(radiance)
         bands = _key(radiance.wavelength_nm)
         tables, spreads = _tables(self, bands), _spreads(self, bands)
@@ -468,11 +524,11 @@ class RealLens:
         return Irradiance(array=array, wavelength_nm=radiance.wavelength_nm)
 
     def image_of_sun(self, radiance: Radiance, pixel_pitch_um: float) -> Irradiance:
-        """Return the irradiance of the Sun's direct image, whose power is E☉ T A(θ) cos θ: the beams hold the
-        pupil's cosine already.
+        """Return the irradiance of the Sun's direct image, whose power is E☉ T A(θ) cos θ.
 
-        The disc itself is imaged where it is known: a render's pixels, resampled, would not keep the power of a
-        disc that is hardly larger than they are.
+        A(θ) lies in a plane across the axis; the projected solid angle of a pixel contains the cos θ. Where the
+        disc is known it is imaged itself: resampling the pixels of a render would not conserve the power of a disc
+        that is hardly larger than a pixel. `pixel_pitch_um` is not used; it belongs to the interface of `ThinLens`.
         """
         if radiance.disc is None:
             return self.image(radiance)
@@ -495,8 +551,10 @@ class RealLens:
         return Irradiance(array=array, wavelength_nm=radiance.wavelength_nm)
 
     def on_frame(self, radiance: Radiance) -> Radiance:
-        """A render with its guard band on the picture's own grid: distortion and lateral colour alone, no light
-        lost and nothing blurred."""
+        """Return a render, without its guard band, on the grid of the image.
+
+        Only distortion and lateral colour act: no light is lost and nothing is blurred.
+        """
         self._check(radiance)
         bands, disc = _key(radiance.wavelength_nm), radiance.disc
         tables = _tables(self, bands)
@@ -515,6 +573,7 @@ class RealLens:
         return replace(radiance, array=array, sun=None, disc=None)
 
     def _check(self, radiance: Radiance) -> None:
+        """Raise ValueError unless the radiance has the pixels of the frame and the guard band."""
         gx, gy = self.guard_px
         wanted = self.height_px + 2 * gy, self.width_px + 2 * gx
         if radiance.array.shape[1:] != wanted:
@@ -522,22 +581,25 @@ class RealLens:
 
     @cached_property
     def _steps(self) -> NDArray[np.uint16]:
-        """For each pixel of the picture, point spread's reach included, its place in `_Tables`."""
+        """Return the step of `_Tables` for each pixel of the image and of its border for the point spread."""
         x, y = (np.arange(n + 2 * REACH_PX) + 0.5 - (n / 2 + REACH_PX) for n in (self.width_px, self.height_px))
         square = x[None, :] ** 2 + y[:, None] ** 2
         return np.asarray(np.rint(square * ((_STEPS - 1) / self._most_px**2)), dtype=np.uint16)
 
     @property
     def _most_px(self) -> float:
+        """Return the distance of the corner from the axis in pixels, with the reach of the point spread."""
         return float(np.hypot(self.width_px / 2 + REACH_PX, self.height_px / 2 + REACH_PX))
 
     def _resampled(self, band: F32, stretch: F32, solid_angle_sr: F32 | None) -> F32:
-        """Where light of the picture's pixels, point spread's reach included, comes from: strip by strip, so that
-        what lies between stays near the processor."""
+        """Resample a band of a render to the pixels of the image and of its border for the point spread.
+
+        Work goes strip by strip so that intermediate arrays stay in the processor's cache.
+        """
         gx, gy = self.guard_px
         height, width = self._steps.shape
         out = np.empty((height, width), dtype=np.float32)
-        # on the grid of half the pitch; between its pixels a linear interpolation blurs little
+        # coordinates on the grid of half the pitch, where linear interpolation blurs little
         x = 2 * np.arange(width, dtype=np.float32) + np.float32(1 - width)
         y = 2 * np.arange(height, dtype=np.float32) + np.float32(1 - height)
         for start in range(0, height, _STRIP_PX):
@@ -551,7 +613,7 @@ class RealLens:
             top = int(np.clip(row.min() // 2 - 1, 0, len(band) - 2))
             bottom = int(np.clip(row.max() // 2 + 3, top + 2, len(band)))
             row -= np.float32(2 * top)
-            if not band[top:bottom].any():  # most of a Sun's own image is dark
+            if not band[top:bottom].any():  # most strips of the Sun's image are dark
                 out[rows] = 0
                 continue
             source = finer(band[top:bottom])
@@ -564,7 +626,7 @@ class RealLens:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ChiefRays:
-    """Where pixels look behind a lens at one wavelength, by chief rays; the frame has a margin all around."""
+    """Map between pixels and directions by the chief rays of one wavelength, with a margin around the frame."""
 
     lens: RealLens
     wavelength_nm: float
@@ -572,16 +634,17 @@ class ChiefRays:
 
     @property
     def _centre_px(self) -> F64:
+        """Return the pixel position of the axis, float64[2]."""
         return np.array([self.lens.width_px, self.lens.height_px]) / 2 + self.margin_px
 
     def pixel_of(self, slopes: F64) -> F64:
-        """Return pixel positions x, y, float64[..., 2], of tangents x/z and y/z in C."""
+        """Return the pixel positions x, y, float64[..., 2], of tangents x/z and y/z in C."""
         slope = np.maximum(np.hypot(slopes[..., 0], slopes[..., 1]), 1e-12)
         stretch = self.lens.distorted(slope, self.wavelength_nm) / slope
         return np.asarray(slopes * stretch[..., None] * self.lens.focal_length_px + self._centre_px)
 
     def slopes_at(self, x_px: Floats, y_px: Floats) -> F64:
-        """Return tangents x/z and y/z in C, float64[y, x, 2], seen at the positions of a grid."""
+        """Return the tangents x/z and y/z in C, float64[y, x, 2], at the positions of a grid."""
         x, y = ((v - c) / self.lens.focal_length_px for v, c in zip((x_px, y_px), self._centre_px, strict=True))
         distance = np.maximum(np.hypot(x[None, :], y[:, None]), 1e-12)
         stretch = self.lens.undistorted(distance, self.wavelength_nm) / distance
@@ -596,18 +659,20 @@ class ChiefRays:
         return np.asarray(pixel_mm2 * slope / (mapped.height(slope) * rise * (1 + slope**2) ** 2))
 
     def beam_mm2(self, slopes: F64) -> F64:
-        """Return the area of the beam that passes all rims, float64[...]: 0 beyond the traced field."""
+        """Return the area of the beam that passes all rims, float64[...]; 0 beyond the traced field."""
         mapped = self.lens._map(self.wavelength_nm)
         slope = np.hypot(slopes[..., 0], slopes[..., 1])
         return np.asarray(np.interp(slope, mapped.slope, self.lens._beam_mm2(mapped.slope), right=0.0))
 
 
 def _key(wavelength_nm: F64) -> tuple[float, ...]:
+    """Return the wavelengths in the hashable form that caches need."""
     return tuple(float(w) for w in wavelength_nm)
 
 
 @lru_cache(maxsize=64)
 def _map(lens: RealLens, wavelength_nm: float) -> FieldMap:
+    """Return the map of one wavelength: the model at the d line, shifted by chief rays at the others."""
     main = lens._chief_rays
     if wavelength_nm != D_NM:
         return lens._map(D_NM).shifted(lens._chief_rays_at(wavelength_nm, within=main.end), main)
@@ -617,7 +682,8 @@ def _map(lens: RealLens, wavelength_nm: float) -> FieldMap:
 
 @lru_cache(maxsize=8)
 def _tables(lens: RealLens, wavelength_nm: tuple[float, ...]) -> _Tables:
-    # the first step has no distance: its pixels are those next to the axis
+    """Return the tables of all bands."""
+    # the first step lies on the axis: avoid a division by 0
     square = np.maximum(np.arange(_STEPS), 1e-3) / (_STEPS - 1)
     distance = np.sqrt(square) * lens._most_px / lens.focal_length_px
     stretch, solid = [], []
@@ -630,8 +696,11 @@ def _tables(lens: RealLens, wavelength_nm: tuple[float, ...]) -> _Tables:
 
 
 def finer(band: F32) -> F32:
-    """A picture on a grid of half the pitch, float32[2 y - 1, 2 x - 1]: its own pixels, and between them a cubic
-    (Keys 1981, IEEE ASSP 29, 1153) held within the two neighbours, so that the Sun casts no ripples."""
+    """Return a band on a grid of half the pitch, float32[2 y - 1, 2 x - 1].
+
+    The given pixels stay. Values between them are cubic (Keys 1981, IEEE ASSP 29, 1153), but limited to the range
+    of the two neighbours, so that no ripples appear around the Sun.
+    """
     height, width = band.shape
     out = np.empty((2 * height - 1, 2 * width - 1), dtype=np.float32)
     out[::2, ::2] = band
@@ -641,7 +710,7 @@ def finer(band: F32) -> F32:
 
 
 def _between(band: F32, kernel: F32) -> F32:
-    """Midpoints of neighbours along the axis of a kernel of four taps, one fewer than those."""
+    """Return the midpoints between neighbours along the axis of a four-tap kernel."""
     height, width = band.shape
     across = kernel.shape[0] == 1
     one, other = (band[:, :-1], band[:, 1:]) if across else (band[:-1], band[1:])
@@ -656,15 +725,18 @@ def _between(band: F32, kernel: F32) -> F32:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Spreads:
-    """Point spreads of tiles of the picture: `kernels[band][row][column]`, float32[n, n] with sum 1, None for a
-    single pixel; light of a tile fades into that of the next. `rows`, `columns`: start, stop, weights of each."""
+    """Hold the point spread functions of overlapping tiles of the image; neighbouring tiles blend linearly.
+
+    `kernels[band][row][column]` is float32[n, n] with sum 1, or None where light stays in its pixel. `rows` and
+    `columns` give start, stop and weights of each tile.
+    """
 
     kernels: tuple[tuple[tuple[F32 | None, ...], ...], ...]
     rows: tuple[tuple[int, int, F32], ...]
     columns: tuple[tuple[int, int, F32], ...]
 
     def applied(self, light: F32, band: int) -> F32:
-        """Light, float32[y, x], spread: every pixel's goes where its tiles' kernels send it."""
+        """Return a band's light, float32[y, x], after each pixel's light is spread by the kernels of its tiles."""
         kernels = self.kernels[band]
         if all(kernel is None for row in kernels for kernel in row):
             return light
@@ -685,7 +757,7 @@ class _Spreads:
 
 
 def spread(light: F32, kernel: F32) -> F32:
-    """The whole convolution of light with a square kernel of odd size n, float32[y + n - 1, x + n - 1]."""
+    """Return the full convolution of light with a square kernel of odd size n, float32[y + n - 1, x + n - 1]."""
     n, half = len(kernel), len(kernel) // 2
     taps = np.ascontiguousarray(kernel[::-1, ::-1])
     rows = n if n * n <= _DIRECT_TAPS else half + 1
@@ -699,7 +771,7 @@ def spread(light: F32, kernel: F32) -> F32:
 
 
 def _tiles(size: int) -> tuple[F64, tuple[tuple[int, int, F32], ...]]:
-    """Centres of tiles along an axis, and start, stop and weights of each; the weights of all add up to 1."""
+    """Return the centres of the tiles along an axis, and start, stop and weights of each; all weights sum to 1."""
     count = max(1, round(size / _TILE_PX))
     edges = np.linspace(0, size, count + 1)
     ramp = size / count / 16
@@ -719,6 +791,7 @@ def _tiles(size: int) -> tuple[F64, tuple[tuple[int, int, F32], ...]]:
 
 @lru_cache(maxsize=8)
 def _spreads(lens: RealLens, wavelength_nm: tuple[float, ...]) -> _Spreads:
+    """Return the trimmed point spread functions of all tiles and bands."""
     centre_x, columns = _tiles(lens.width_px + 2 * REACH_PX)
     centre_y, rows = _tiles(lens.height_px + 2 * REACH_PX)
     x, y = centre_x - (lens.width_px / 2 + REACH_PX), centre_y - (lens.height_px / 2 + REACH_PX)
@@ -733,14 +806,16 @@ def _spreads(lens: RealLens, wavelength_nm: tuple[float, ...]) -> _Spreads:
 
 
 def point_spreads(lens: RealLens, distance: F64, azimuth_rad: F64, wavelength_nm: float) -> F32:
-    """Point spreads at places of the picture, float32[n, y, x] of sum 1: distances from the axis in focal lengths,
-    azimuths from +x towards +y. Their centroids are their middles."""
+    """Return point spread functions at positions of the image, float32[n, y, x], each with sum 1.
+
+    `distance`: image heights in focal lengths; `azimuth_rad`: from +x towards +y. Each centroid is in the middle.
+    """
     beams = lens._zones
     spots = _spots(lens._round, beams, wavelength_nm, lens.sensor_mm)
     place = spots.centred(spots.place_mm) * 1e3 / lens.pixel_pitch_um
     mapped = lens._map(wavelength_nm)
     slope = mapped.slope_at(distance * lens.focal_length_mm)
-    # between two field angles every ray of the bundle lies between those of both
+    # interpolate each ray of the bundle between the two nearest field angles
     k = np.clip(np.searchsorted(beams.slope, slope) - 1, 0, len(beams.slope) - 2)
     share = np.clip((slope - beams.slope[k]) / (beams.slope[k + 1] - beams.slope[k]), 0, 1)[:, None]
     place = place[k] * (1 - share[..., None]) + place[k + 1] * share[..., None]
@@ -758,11 +833,12 @@ def point_spreads(lens: RealLens, distance: F64, azimuth_rad: F64, wavelength_nm
 
 
 def _rasterised(x: F64, y: F64, weight: F64, azimuth_rad: F64, sigma: F64) -> F32:
-    """Rays of spots, float64[n, ray] in pixels about the middle, turned by azimuths and blurred by Gaussians, as
-    kernels; x and y are the spots' own axes, along and across the radius.
+    """Return the kernels of spots, given as rays, float64[n, ray] in pixels along and across the radius.
 
-    A render's pixel is a mean over the pixel already. What sharing rays out between pixels adds to the mean squares
-    along both axes is therefore taken from the spot before, so that a kernel has its spot's centroid and width.
+    Each spot is turned by its azimuth and blurred by a Gaussian of `sigma` pixels. A render's pixel is already a
+    mean over its area. Distributing a ray over neighbouring pixels would add once more to the mean squares along
+    both axes; the spot is shrunk beforehand by this amount, so that a kernel has the centroid and width of its
+    spot.
     """
     cos, sin = np.cos(azimuth_rad)[:, None], np.sin(azimuth_rad)[:, None]
     squares = [np.maximum((weight * v * v).sum(axis=1), 1e-12) for v in (x, y)]
@@ -800,7 +876,7 @@ def _rasterised(x: F64, y: F64, weight: F64, azimuth_rad: F64, sigma: F64) -> F3
     along = np.einsum("nyi,nij->nyj", gather, total.reshape(n, cells, cells))
     kernels = np.einsum("nyj,nxj->nyx", along, gather)
     kernels /= np.maximum(kernels.sum(axis=(1, 2), keepdims=True), 1e-300)
-    # what is left of it, light for the middle takes back
+    # the middle pixel takes light until the remaining excess of width is gone
     square = (kernels * (pixel[None, :] ** 2 + pixel[:, None] ** 2)).sum(axis=(1, 2))
     kernels *= np.minimum(wanted / np.maximum(square, 1e-300), 1)[:, None, None]
     kernels[:, REACH_PX, REACH_PX] += 1 - kernels.sum(axis=(1, 2))
@@ -808,11 +884,12 @@ def _rasterised(x: F64, y: F64, weight: F64, azimuth_rad: F64, sigma: F64) -> F3
 
 
 def _turned(x: F64, y: F64, cos: F64, sin: F64) -> tuple[F64, F64]:
+    """Return points turned about the origin."""
     return x * cos - y * sin, x * sin + y * cos
 
 
 def _trimmed(kernel: F32) -> F32 | None:
-    """The kernel without the border that holds next to nothing, its sum still 1; None where it hardly blurs."""
+    """Return the kernel without its nearly empty border, its sum still 1; None where it hardly blurs."""
     half = len(kernel) // 2
     at = np.arange(-half, half + 1)
     square = float((kernel * (at[None, :] ** 2 + at[:, None] ** 2)).sum())

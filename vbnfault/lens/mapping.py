@@ -1,10 +1,10 @@
-"""The map from field angles to heights in the image, from chief rays, and the camera's model fitted to it.
+"""Map field angles to image heights with chief rays, and fit the camera's distortion model to the map.
 
 A chief ray passes through the middle of the stop. Chief rays end where one misses a surface or is totally
-reflected. Near that end their heights may rise without limit or turn back, which those of the light that passes
-the rims do not. So a camera's geometry at the d line is the model of `distortion`, fitted to the chief rays and
-continued smoothly past them to the frame's corners: light, truth and the stored coefficients then agree wherever a
-pixel is. Outside the frame, and for the shift of one colour against another, chief rays count as they are.
+reflected. Near that end their heights may rise without limit or turn back, unlike the heights of the light that
+passes the rims. A camera's geometry at the d line is therefore the model of `distortion`, fitted to the chief rays
+and continued smoothly beyond them to the corners of the frame. Light, truth and stored coefficients then agree at
+every pixel. Outside the frame, and for the shift of one colour against another, the chief rays themselves are used.
 """
 
 from __future__ import annotations
@@ -22,19 +22,21 @@ from .rays import Path, trace
 
 F64 = NDArray[np.float64]
 
-_STEEPNESS = 0.3  # of the heights of chief rays over the slope, in focal lengths: below it they turn back
-_ONWARD = (0.3, 1.5)  # range of that steepness past the last chief ray
-_HEIGHTS = 129  # of a meridional fan
+_STEEPNESS = 0.3  # dh/dt in focal lengths; below it chief rays are taken to turn back
+_ONWARD = (0.3, 1.5)  # limits of dh/dt beyond the last chief ray
+_HEIGHTS = 129  # rays of a meridional fan
 _SECANT_STEPS = 7
 _KNOWN, _CONTINUED = 192, 64  # field angles of the fit with and without a chief ray
-_PAST_CORNER = 1.02  # of the corner's distance from the axis: how far the model is fitted
+_PAST_CORNER = 1.02  # the model is fitted up to this multiple of the corner's distance from the axis
 
 
 def inclined_rays(
     lens: Prescription, slope: F64, x: F64, y: F64, wavelength_nm: float, sensor_mm: float
 ) -> tuple[Path, tuple[int, ...]]:
-    """Trace rays that cross the first vertex's plane at (x, y) mm with the slope dx/dz; return their paths and the
-    arguments' common shape."""
+    """Trace rays through (x, y) mm of the first vertex's plane with the slope dx/dz.
+
+    Returns their path and the common shape of the arguments.
+    """
     slope, x, y = np.broadcast_arrays(slope, x, y)
     nothing = np.zeros(x.size)
     path = trace(
@@ -48,8 +50,7 @@ def inclined_rays(
 
 
 def fan_heights_mm(lens: Prescription, slope: F64) -> F64:
-    """Return heights in the first vertex's plane, float64[angle, height] mm, of rays that between them meet all of
-    the first surface."""
+    """Return heights in the first vertex's plane, float64[angle, height] mm, that cover the whole first surface."""
     first = lens.surfaces[0]
     reach = first.semi_diameter_mm + np.abs(first.sag_mm(first.semi_diameter_mm)) * slope
     return np.asarray(reach[:, None] * np.linspace(-1, 1, _HEIGHTS))
@@ -58,8 +59,8 @@ def fan_heights_mm(lens: Prescription, slope: F64) -> F64:
 def chief_heights_mm(lens: Prescription, slope: F64, *, wavelength_nm: float, sensor_mm: float) -> F64:
     """Return where chief rays meet the sensor, float64[n] mm from the axis; nan where there is none.
 
-    `slope` float64[n]: tangents of the field angles. A chief ray passes the middle of the stop; it is sought in a
-    fan of exact rays and then by the secant method, and may itself be beyond a rim.
+    `slope` float64[n]: tangents of the field angles. A chief ray passes through the middle of the stop. It is
+    located in a fan of exact rays, then by the secant method. It may itself lie beyond a rim.
     """
     heights = fan_heights_mm(lens, slope)
     row = 1 + lens.stop
@@ -76,27 +77,30 @@ def chief_heights_mm(lens: Prescription, slope: F64, *, wavelength_nm: float, se
             next_ = np.where(off_b == off_a, b, b - off_b * (b - a) / (off_b - off_a))
         path, _ = inclined_rays(lens, slope, next_, np.zeros(1), wavelength_nm, sensor_mm)
         a, off_a, b, off_b = b, off_b, next_, path.points_mm[row, :, 0]
-    # what has not settled is no ray through the middle
+    # where the secant method did not converge, no ray passes the middle of the stop
     settled = through.any(axis=1) & (np.abs(off_b) < 1e-6 * lens.surfaces[lens.stop].semi_diameter_mm)
     return np.where(settled, path.points_mm[-1, :, 0], np.nan)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ChiefHeights:
-    """Heights in the image of the chief rays of one wavelength, up to the slope `end` of the last one, and from
-    there straight on with the derivative `onward_mm`. `ratio`: height over slope, mm."""
+    """Interpolate the image heights of the chief rays of one wavelength.
+
+    They hold up to the slope `end` of the last chief ray; beyond it the height continues linearly with the
+    derivative `onward_mm`. `ratio` is height over slope, in mm.
+    """
 
     ratio: CubicSpline
     end: float
     onward_mm: float
 
     def height_mm(self, slope: F64) -> F64:
-        """Return heights in the image, float64 like `slope`."""
+        """Return image heights, float64 like `slope`."""
         known = np.minimum(slope, self.end)
         return np.asarray(known * self.ratio(known) + (slope - known) * self.onward_mm)
 
     def rise_mm(self, slope: F64) -> F64:
-        """Return derivatives of the heights by the slope, float64 like `slope`."""
+        """Return the derivative of the height by the slope, float64 like `slope`."""
         known = np.minimum(slope, self.end)
         return np.where(slope > self.end, self.onward_mm, self.ratio(known) + known * self.ratio(known, 1))
 
@@ -110,13 +114,14 @@ def chief_heights(
     efl_mm: float,
     within: float = np.inf,
 ) -> ChiefHeights:
-    """Return the chief rays of a lens, traced at the slopes given, up to the last before which none is missing or
-    turns back, and to the slope `within` at most.
+    """Trace the chief rays of a lens at the slopes given, and return their heights as a function.
+
+    The function ends at the last slope before which no chief ray is missing or turns back, and at `within` at most.
 
     Raises
     ------
     InputError
-        There are none but next to the axis.
+        Only rays next to the axis pass the middle of the stop.
     """
     height = chief_heights_mm(lens, slope, wavelength_nm=wavelength_nm, sensor_mm=sensor_mm)
     with np.errstate(invalid="ignore"):
@@ -129,7 +134,7 @@ def chief_heights(
         raise InputError(
             f"{lens.name}: no ray through the middle of the stop comes from beyond {angle:.2g} degrees"
         )
-    # h / t is even in t
+    # h / t is even in t, so its derivative is 0 on the axis
     ratio = CubicSpline(slope[: last + 1], height[: last + 1] / slope[: last + 1], bc_type=((1, 0.0), "not-a-knot"))
     onward = np.clip(ratio(end) + end * ratio(end, 1), _ONWARD[0] * efl_mm, _ONWARD[1] * efl_mm)
     return ChiefHeights(ratio=ratio, end=end, onward_mm=float(onward))
@@ -138,15 +143,21 @@ def chief_heights(
 def camera_model(
     chief: ChiefHeights, focal_length_mm: float, corner: float, pixels: float, name: str
 ) -> RadialModel:
-    """Return the model of distortion of a frame: fitted to the chief rays, and past them to a smooth continuation.
+    """Return the distortion model of a frame, fitted to the chief rays and beyond them to a smooth continuation.
 
-    `corner`: distance of the frame's corner from the axis in focal lengths; `pixels`: focal length in pixels;
-    `name`: the lens's.
+    Parameters
+    ----------
+    corner
+        Distance of the frame's corner from the axis, in focal lengths.
+    pixels
+        Focal length in pixels.
+    name
+        Name of the lens, for the error.
 
     Raises
     ------
     InputError
-        No model found reaches the corner without folding.
+        No model reaches the corner without folding.
     """
     reach = _PAST_CORNER * corner * focal_length_mm
     missing = reach - float(chief.height_mm(np.array(chief.end)))
@@ -171,25 +182,28 @@ def camera_model(
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class FieldMap:
-    """Heights of the image over the slope of the field at one wavelength, dense; straight on beyond the table."""
+    """Tabulate image height over the tangent of the field angle at one wavelength; linear beyond the table."""
 
     slope: F64
     height_mm: F64
     rise_mm: F64  # dh/dt
 
     def height(self, slope: F64) -> F64:
-        """Return heights in the image in mm, float64 like `slope`."""
+        """Return image heights in mm, float64 like `slope`."""
         beyond = np.maximum(slope - self.slope[-1], 0)
         return np.asarray(np.interp(slope, self.slope, self.height_mm) + beyond * self.rise_mm[-1])
 
     def slope_at(self, height_mm: F64) -> F64:
-        """Return tangents of the field angles seen at heights in the image, float64 like `height_mm`."""
+        """Return the tangents of the field angles at image heights, float64 like `height_mm`."""
         beyond = np.maximum(height_mm - self.height_mm[-1], 0)
         return np.asarray(np.interp(height_mm, self.height_mm, self.slope) + beyond / self.rise_mm[-1])
 
     def shifted(self, chief: ChiefHeights, main: ChiefHeights) -> FieldMap:
-        """Return the map of another wavelength: its chief rays may lie apart from those of this map, `main`, as far
-        as both are known; past that they go on side by side."""
+        """Return the map of another wavelength, whose chief rays are `chief`; those of this map are `main`.
+
+        The difference of both sets of chief rays shifts this map. Beyond the last ray of `chief` the difference
+        stays constant.
+        """
         known = np.minimum(self.slope, chief.end)
         apart = chief.height_mm(known) - main.height_mm(known)
         steeper = np.where(self.slope > chief.end, 0, chief.rise_mm(known) - main.rise_mm(known))
@@ -197,8 +211,10 @@ class FieldMap:
 
 
 def field_map(slope: F64, chief: ChiefHeights, model: RadialModel, focal_length_mm: float) -> FieldMap:
-    """Return the map of the d line at the slopes given: the model as far as it is fitted, from there on as chief
-    rays go."""
+    """Return the map of the d line at the slopes given.
+
+    It follows the model within its fitted range, and beyond that range the chief rays.
+    """
     within = np.minimum(slope, model.end)
     height = focal_length_mm * model.distance(within) + chief.height_mm(slope) - chief.height_mm(within)
     rise = np.where(slope > model.end, chief.rise_mm(slope), focal_length_mm * model.rise(within))

@@ -1,4 +1,8 @@
-"""Lens prescriptions: rows of surfaces from a TOML file, checked, and scaled to a focal length or field."""
+"""Read lens prescriptions (tables of surfaces) from TOML files, check them and change their scale or coatings.
+
+Surfaces are counted from 0 at the front; the stop is a row like any other. Light travels towards +z, from the front
+to the sensor. A surface's vertex is its point on the axis.
+"""
 
 from __future__ import annotations
 
@@ -44,31 +48,33 @@ _RIM_POINTS = 65
 
 @dataclass(frozen=True, kw_only=True)
 class Surface:
-    """One row: a surface of revolution, and the medium behind it.
+    """Describe one row of a prescription: a surface of revolution and the medium behind it.
 
     Attributes
     ----------
     radius_mm
-        Of curvature at the vertex; positive where the centre lies behind, inf for a plane.
+        Radius of curvature at the vertex; positive where the centre lies behind the surface, inf for a plane.
     thickness_mm
-        From this vertex to the next.
+        Distance from this vertex to the next.
     medium
-        What is behind.
+        Medium behind the surface.
     semi_diameter_mm
-        A ray that meets the surface farther from the axis is lost.
+        Radius of the rim: a ray that meets the surface farther from the axis is lost.
     coating
-        Its films, those that light from the front meets first.
+        Layers of the coating, in the order in which light from the front meets them.
     stop
-        Whether it is the aperture stop, which has no other effect.
+        Whether the surface is the aperture stop. The stop only blocks rays; it does not refract.
     conic
-        0 sphere, -1 paraboloid.
+        Conic constant: 0 is a sphere, -1 a paraboloid.
     aspheric_mm
         Coefficients of r⁴, r⁶, … of the sag, in mm to the power -3, -5, …
     internal_transmittance_10mm
-        Of 10 mm of `medium`: wavelengths in nm, and the share that passes, linear between, constant beyond.
+        Internal transmittance of 10 mm of `medium`: wavelengths in nm, and transmitted fractions. It is
+        interpolated linearly and constant outside the table.
     blades, blade_rounding, rotation_deg
-        Of the stop: 0 blades make it round; else a polygon whose corners lie at `semi_diameter_mm`, the first one
-        at `rotation_deg` from +x, and whose edges bulge towards the circle by `blade_rounding`, 0 to 1.
+        Shape of the stop. 0 blades make it round. Otherwise it is a polygon whose corners lie at
+        `semi_diameter_mm`, the first corner at `rotation_deg` from +x. `blade_rounding`, 0 to 1, bulges the edges
+        towards the circle.
     """
 
     radius_mm: float
@@ -86,11 +92,11 @@ class Surface:
 
     @property
     def curvature_per_mm(self) -> float:
-        """1 / radius; 0 for a plane."""
+        """Return 1 / radius; 0 for a plane."""
         return 0.0 if math.isinf(self.radius_mm) else 1.0 / self.radius_mm
 
     def sag_mm(self, height_mm: F64 | float) -> F64:
-        """Depth of the surface behind its vertex at a distance from the axis; nan where it has none."""
+        """Return how far the surface lies behind its vertex at a distance from the axis; nan beyond its edge."""
         r2 = np.asarray(height_mm, dtype=np.float64) ** 2
         c = self.curvature_per_mm
         with np.errstate(invalid="ignore"):
@@ -100,13 +106,15 @@ class Surface:
         return np.asarray(sag)
 
     def absorption_per_mm(self, wavelength_nm: float) -> float:
-        """Absorption coefficient of the medium behind, 1 / mm."""
+        """Return the absorption coefficient of the medium behind the surface, in 1 / mm."""
         share = float(np.interp(wavelength_nm, *self.internal_transmittance_10mm))
         return -math.log(max(share, 1e-30)) / 10
 
     def rim_mm(self, angle_rad: F64 | float) -> F64:
-        """Distance of the rim from the axis in a direction from +x towards +y: `semi_diameter_mm` but for a stop
-        with blades."""
+        """Return the distance of the rim from the axis in directions measured from +x towards +y.
+
+        It is `semi_diameter_mm` in every direction, except for a stop with blades.
+        """
         angle = np.asarray(angle_rad, dtype=np.float64)
         if not self.blades:
             return np.full(angle.shape, self.semi_diameter_mm)
@@ -118,9 +126,16 @@ class Surface:
 
 @dataclass(frozen=True, kw_only=True)
 class Prescription:
-    """A lens as its rows, front to back, air in front and behind. The sensor stands at the paraxial focus at the
-    d line, not where the last row's thickness ends; it reflects `sensor_reflectance` of the light, at all angles.
-    `scale` is the factor by which it was scaled since it was read.
+    """Describe a lens by its surfaces, front to back, with air in front and behind.
+
+    The sensor stands at the paraxial focus for the d line, wherever the thickness of the last row ends.
+
+    Attributes
+    ----------
+    sensor_reflectance
+        Fraction of the light that the sensor reflects, the same at all angles.
+    scale
+        Factor by which the lens was scaled since it was read.
     """
 
     name: str
@@ -131,27 +146,27 @@ class Prescription:
 
     @property
     def stop(self) -> int:
-        """Row of the stop."""
+        """Return the row of the stop."""
         return next(k for k, s in enumerate(self.surfaces) if s.stop)
 
     @property
     def vertices_mm(self) -> F64:
-        """Where each vertex lies behind the first, float64[row]."""
+        """Return the distance of each vertex behind the first vertex, float64[row]."""
         return np.concatenate([[0.0], np.cumsum([s.thickness_mm for s in self.surfaces[:-1]])])
 
     def indices(self, wavelength_nm: float = D_NM) -> F64:
-        """Indices of all media, float64[row + 1]: in front of the first row, then behind each."""
+        """Return the indices of all media, float64[row + 1]: before the first row, then behind each row."""
         return np.array([1.0, *(float(s.medium.index(wavelength_nm)) for s in self.surfaces)])
 
     def scaled(self, factor: float) -> Prescription:
-        """Return the lens with every length of its drawing multiplied.
+        """Return the lens with every length of its drawing multiplied by a factor.
 
-        These are radii, thicknesses (of elements, gaps and plates), rims, stop and aspheric coefficients.
+        These lengths are radii, thicknesses (of elements, gaps and plates), rims, stop and aspheric coefficients.
 
-        What a maker or the environment puts on or into the glass keeps its physical size: films of coatings in nm,
-        and so their reflectance; roughness in nm; grains of dust in µm and the particles of a cleanliness level per
-        area; the glass's absorption per mm, so that the longer path through a larger lens takes more. Field angles,
-        f-numbers and the paths of ghosts in units of the focal length are unchanged.
+        What a maker or the environment adds to the glass keeps its physical size: layers of coatings in nm, and so
+        their reflectance; roughness in nm; grains of dust in µm; the number of particles per area of a cleanliness
+        level; the absorption of the glass per mm, so that a larger lens absorbs more. Field angles, f-numbers and
+        the paths of ghosts in units of the focal length do not change.
         """
         surfaces = tuple(
             replace(
@@ -166,7 +181,7 @@ class Prescription:
         return replace(self, surfaces=surfaces, scale=self.scale * factor)
 
     def with_round_stop(self) -> Prescription:
-        """Blades replaced by a round stop of the same area, for what knows no azimuth."""
+        """Return the lens with a round stop of the same area, for models with rotational symmetry."""
         rim = self.surfaces[self.stop]
         if not rim.blades:
             return self
@@ -177,7 +192,7 @@ class Prescription:
         return replace(self, surfaces=tuple(surfaces))
 
     def coated(self, name: str) -> Prescription:
-        """The lens with a named coating on every surface between glass and air. Raises InputError."""
+        """Return the lens with a named coating on every surface between glass and air. Raises InputError."""
         media = (AIR, *(s.medium for s in self.surfaces))
         surfaces = []
         for front, surface in zip(media, self.surfaces, strict=False):
@@ -188,13 +203,25 @@ class Prescription:
 
 
 def load_lens(name_or_path: str | Path) -> Prescription:
-    """A prescription by path or packaged name. Raises InputError naming file, surface and value."""
+    """Read a prescription from a path or by the name of a packaged lens.
+
+    Raises
+    ------
+    InputError
+        The file is missing or wrong; the message names file, surface and value.
+    """
     path = resources.find("scenes/lenses", name_or_path)
     return parse_lens(resources.read_toml(path, "lens"), source=str(path))
 
 
 def parse_lens(table: Mapping[str, Any], *, source: str) -> Prescription:
-    """A prescription from plain data. Raises InputError in a sentence that names `source`, surface and value."""
+    """Return the prescription that plain data (the contents of a TOML file) describe.
+
+    Raises
+    ------
+    InputError
+        The data are wrong; the message names `source`, surface and value.
+    """
     for key in table:
         if key not in _LENS_KEYS:
             raise InputError(f"{source}: {key}: unknown key; known: {', '.join(_LENS_KEYS)}")
@@ -222,13 +249,14 @@ def parse_lens(table: Mapping[str, Any], *, source: str) -> Prescription:
 
 
 def _known_keys(row: Mapping[str, Any], where: str) -> None:
+    """Raise InputError for a key that no row of a prescription has."""
     for key in row:
         if key not in _SURFACE_KEYS:
             raise InputError(f"{where}: {key}: unknown key; known: {', '.join(_SURFACE_KEYS)}")
 
 
 def _sensor(row: Mapping[str, Any], where: str) -> float:
-    """Reflectance of the sensor, whose row is the last one."""
+    """Return the sensor's reflectance from its row, which is the last one."""
     _known_keys(row, where)
     if row["sensor"] is not True:
         raise InputError(f"{where}: sensor = {shown(row['sensor'])}: must be true or false")
@@ -239,6 +267,7 @@ def _sensor(row: Mapping[str, Any], where: str) -> float:
 
 
 def _surface(row: Mapping[str, Any], front: Glass, where: str, *, last: bool) -> Surface:
+    """Return the surface that a row describes; `front` is the medium before it."""
     _known_keys(row, where)
     if row.get("sensor", False) is not False:
         raise InputError(f"{where}: sensor = {shown(row['sensor'])}: only the last surface can be the sensor")
@@ -285,6 +314,7 @@ def _surface(row: Mapping[str, Any], front: Glass, where: str, *, last: bool) ->
 
 
 def _medium(row: Mapping[str, Any], where: str) -> Glass:
+    """Return the medium behind a row, air by default, after a check of its index from 400 to 1000 nm."""
     glass = row.get("glass")
     if glass is not None and ("nd" in row or "vd" in row):
         raise InputError(f"{where}: glass: give either glass or nd and vd")
@@ -314,7 +344,7 @@ def _medium(row: Mapping[str, Any], where: str) -> Glass:
 
 
 def _internal(given: object, where: str) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """A share for all wavelengths, or a table of them."""
+    """Return wavelengths and internal transmittances from one number for all wavelengths or from a table."""
     where, key = f"{where}: internal_transmittance_10mm", "value"
     if not isinstance(given, dict):
         return (D_NM,), (_number({key: given}, key, where, None, low=0.0, high=1.0),)
@@ -331,7 +361,8 @@ def _internal(given: object, where: str) -> tuple[tuple[float, ...], tuple[float
 
 
 def _coating(given: object, front: Glass, back: Glass, where: str) -> tuple[Layer, ...]:
-    if isinstance(given, list):  # films of one's own, from the front
+    """Return the layers of a row's coating, in the order in which light from the front meets them."""
+    if isinstance(given, list):
         return tuple(_layer(film, f"{where}: coating[{k}]") for k, film in enumerate(given))
     try:
         if not isinstance(given, str):
@@ -345,12 +376,16 @@ def _coating(given: object, front: Glass, back: Glass, where: str) -> tuple[Laye
 
 
 def _facing_air(name: str, front: Glass, back: Glass) -> tuple[Layer, ...]:
-    """A named coating with its outer film on the side of the air, in the order that light from the front meets."""
+    """Return a named coating in the order in which light from the front meets it.
+
+    Its outer layer lies on the side of the air.
+    """
     films = design(name, float(max(front.index(DESIGN_NM), back.index(DESIGN_NM))))
     return films if front.nd == 1.0 else films[::-1]
 
 
 def _layer(film: object, where: str) -> Layer:
+    """Return the layer that a table of n, thickness_nm and k describes."""
     if not isinstance(film, dict) or not set(film) <= {"n", "k", "thickness_nm"}:
         raise InputError(f"{where}: must be a table of n, thickness_nm and, if it absorbs, k")
     return Layer(
@@ -363,12 +398,13 @@ def _layer(film: object, where: str) -> Layer:
 def _number(
     table: Mapping[str, Any], key: str, where: str, default: float | None, *, low: float, high: float
 ) -> float:
+    """Return a number of a table as float, or the default; raise InputError where it is missing or out of range."""
     value = table.get(key, default)
     if value is None:
         raise InputError(f"{where}: {key}: missing")
     try:
         number = math.nan if isinstance(value, bool) or not isinstance(value, int | float) else float(value)
-    except OverflowError:  # a whole number beyond the range of floats
+    except OverflowError:  # an integer beyond the range of floats
         number = math.nan
     if not low <= number <= high:
         raise InputError(f"{where}: {key} = {shown(value)}: must be a number from {low:g} to {high:g}")
@@ -376,6 +412,7 @@ def _number(
 
 
 def _check(lens: Prescription, source: str) -> None:
+    """Raise InputError unless the lens has one stop in one medium, ends in air, and no two surfaces cross."""
     stops = [k for k, s in enumerate(lens.surfaces) if s.stop]
     if len(stops) != 1:
         found = "none has" if not stops else f"surfaces {', '.join(map(str, stops))} have"

@@ -1,7 +1,7 @@
-"""Exact rays through a prescription, in double precision: forward, or along any path of reflections.
+"""Trace exact rays through a prescription in double precision, straight through or along any path of reflections.
 
-Axes of the lens: z from the first vertex backwards along the axis, x and y across. The reference that faster
-tracers are judged by, and what drawings show.
+Coordinates of the lens: z runs backwards along the axis from the first vertex, x and y lie across it. This tracer
+is the reference by which faster tracers are tested, and it makes the drawings.
 """
 
 from __future__ import annotations
@@ -23,20 +23,20 @@ _NEWTON_STEPS = 12
 
 @dataclass(frozen=True, kw_only=True)
 class Path:
-    """What n rays did on their way.
+    """Hold the trajectories of n rays.
 
     Attributes
     ----------
     points_mm
-        float64[step + 2, n, 3]: where they started, met each surface of the path, and met the sensor's plane; nan
-        after a surface that was missed or reflected all light.
+        float64[step + 2, n, 3]: where each ray started, met each surface of the path, and met the sensor plane; nan
+        after a surface that it missed or that totally reflected it.
     directions
-        float64[n, 3]: unit, as they arrive.
+        float64[n, 3]: unit vectors at the sensor plane.
     relative_radius
-        float64[n]: the largest distance from the axis on the way, in semi-diameters of the surface met; above 1 the
-        ray was lost at a rim, inf where it missed a surface.
+        float64[n]: largest distance from the axis at any surface, in semi-diameters of that surface. Above 1 the
+        ray was lost at a rim; it is inf where the ray missed a surface.
     rows
-        Which surface each step met.
+        The surface that each step met.
     """
 
     points_mm: F64
@@ -46,14 +46,17 @@ class Path:
 
     @property
     def arrives(self) -> NDArray[np.bool_]:
-        """bool[n]: not lost, and on the way to the sensor at the end."""
+        """Return which rays passed all rims and travel towards the sensor at the end, bool[n]."""
         there = np.isfinite(self.points_mm[-1, :, 0]) & (self.directions[:, 2] > 0)
         return np.asarray(there & (self.relative_radius <= 1))
 
 
 def path_of(lens: Prescription, route: Sequence[int] = ()) -> tuple[tuple[int, bool], ...]:
-    """(row, whether it reflects) in the order met, for the rows that reflect, in that order: back, forward, and so
-    on; the sensor is the row behind the last."""
+    """Return the (row, whether it reflects) of each surface met, for a route of reflections.
+
+    `route` lists the reflecting rows in the order met: the first reflects backwards, the second forwards, and so
+    on. The sensor is the row behind the last surface.
+    """
     out: list[tuple[int, bool]] = []
     at, onward = -1, True
     for row in route:
@@ -64,12 +67,12 @@ def path_of(lens: Prescription, route: Sequence[int] = ()) -> tuple[tuple[int, b
 
 
 def forward(lens: Prescription) -> tuple[tuple[int, bool], ...]:
-    """The path of the image: every row once, none as a mirror."""
+    """Return the path of the image: every row once, no reflection."""
     return path_of(lens)
 
 
 def ghost(lens: Prescription, first: int, second: int) -> tuple[tuple[int, bool], ...]:
-    """The path of a ghost: back at row `second`, forward again at row `first` < `second`."""
+    """Return the path of a ghost: backwards at row `second`, forwards again at row `first` < `second`."""
     return path_of(lens, (second, first))
 
 
@@ -82,16 +85,16 @@ def trace(
     wavelength_nm: float = D_NM,
     sensor_mm: float | None = None,
 ) -> Path:
-    """Trace rays in order along a path.
+    """Trace rays along a path that gives the order of surfaces.
 
     Parameters
     ----------
     origins_mm, directions
         float64[n, 3], in front of the lens; directions need not have length 1.
     path
-        (row, whether it reflects) in the order met; default: straight through.
+        (row, whether it reflects) of each surface in the order met; default: straight through.
     sensor_mm
-        The sensor's plane behind the last vertex; default: the paraxial focus at the d line.
+        Distance of the sensor plane behind the last vertex; default: the paraxial focus at the d line.
     """
     steps = forward(lens) if path is None else tuple(path)
     vertex, index = lens.vertices_mm, lens.indices(wavelength_nm)
@@ -124,7 +127,7 @@ def trace(
 
 
 def _meet(surface: Surface, p: F64, d: F64) -> tuple[F64, F64]:
-    """Where rays meet a surface with its vertex at the origin, and its normals there; nan where they miss it."""
+    """Return where rays meet a surface with its vertex at the origin, and the unit normals; nan for a miss."""
     c, k = surface.curvature_per_mm, 1 + surface.conic
     p = p - (p[:, 2] / d[:, 2])[:, None] * d  # to the plane of the vertex
     a = c * (d[:, 0] ** 2 + d[:, 1] ** 2 + k * d[:, 2] ** 2)
@@ -145,7 +148,7 @@ def _meet(surface: Surface, p: F64, d: F64) -> tuple[F64, F64]:
 
 
 def _slope(surface: Surface, hit: F64) -> F64:
-    """Gradient of sag - z at points of an asphere."""
+    """Return the gradient of (sag - z) at points of an asphere, which is normal to it."""
     c, k = surface.curvature_per_mm, 1 + surface.conic
     r2 = hit[:, 0] ** 2 + hit[:, 1] ** 2
     with np.errstate(invalid="ignore"):
@@ -156,14 +159,14 @@ def _slope(surface: Surface, hit: F64) -> F64:
 
 
 def real_pupil_diameter_mm(lens: Prescription, wavelength_nm: float = D_NM) -> float:
-    """Diameter of the beam along the axis that fills the stop: that of a real ray, not of the paraxial pupil."""
+    """Return the diameter of the axial beam that fills the stop, from exact rays instead of the paraxial pupil."""
     most = lens.surfaces[0].semi_diameter_mm
     height = np.linspace(0, most, 513)
     stop = lens.stop
     rays = np.column_stack([height, np.zeros_like(height), np.full_like(height, -1.0)])
     found = trace(lens, rays, np.tile([0.0, 0.0, 1.0], (len(height), 1)), wavelength_nm=wavelength_nm)
     at_stop = np.abs(found.points_mm[1 + stop, :, 0])
-    # rays far outside the beam come back to the axis, or nowhere
+    # far outside the beam, rays bend back towards the axis or miss a surface
     outwards = np.concatenate([[True], np.diff(at_stop) > 0])
     usable = len(height) if outwards.all() else int(np.argmin(outwards))
     return float(2 * np.interp(lens.surfaces[stop].semi_diameter_mm, at_stop[:usable], height[:usable]))

@@ -1,14 +1,14 @@
-"""The ideal thin lens: a rectilinear image, no distortion, no ghosts, finite depth of field.
+"""Image a scene with an ideal thin lens: rectilinear, without distortion or ghosts, with finite depth of field.
 
-The nominal camera of the paper has no cos⁴: an extended scene gets the irradiance π T L / (4 N²) at every field
-angle, and natural vignetting is a fault of its own. The Sun is a source of known flux, though, and a pupil of the
+The paper's nominal camera has no cos⁴ falloff: an extended scene gives the irradiance π T L / (4 N²) at every field
+angle, and natural vignetting is a fault of its own. The Sun, however, is a source of known flux, and a pupil of
 area A admits E☉ A cos θ of it. The Sun's direct image therefore follows the pupil,
 
     ∫ E dA = E☉ · T · A · cos θ        at every angle θ,
 
-which is cos⁴θ times what the scene's rule would give, since the image of a disc far off the axis covers 1 / cos³θ
-of its area on the axis. Ghosts, starburst and veiling glare are fractions of the same flux. All of them have met
-the pupil, so that vignetting, which adds the cos⁴ to the scene, does not dim them a second time
+which is cos⁴θ times what the scene's rule would give, because the image of a disc far off the axis covers 1 / cos³θ
+of its area on the axis. Ghosts, starburst and veiling glare are fractions of the same flux. All this light has
+already passed the pupil. Vignetting, which adds the cos⁴ to the scene, must not dim it a second time
 (`quantities.Electrons.past_rims`).
 """
 
@@ -28,7 +28,7 @@ F64 = NDArray[np.float64]
 
 @dataclass(frozen=True, kw_only=True)
 class ThinLens:
-    """A thin lens; `focus_distance_m` is the object distance in focus (inf: focused at infinity)."""
+    """Describe a thin lens; `focus_distance_m` is the object distance in focus (inf: focused at infinity)."""
 
     focal_length_mm: float
     f_number: float
@@ -37,7 +37,7 @@ class ThinLens:
 
     @property
     def figures(self) -> dict[str, str | float]:
-        """What the lens is: name, focal length, f-number, transmission; `summary` says so."""
+        """Return name, focal length, f-number, transmission, and a sentence `summary` for people."""
         return {
             "name": "thin lens",
             "efl_mm": self.focal_length_mm,
@@ -48,11 +48,11 @@ class ThinLens:
 
     @property
     def aperture_radius_m(self) -> float:
-        """Radius of the entrance pupil, f / 2N, in metres."""
+        """Return the radius of the entrance pupil, f / 2N, in metres."""
         return self.focal_length_mm * 1e-3 / (2 * self.f_number)
 
     def transmittance(self, wavelength_nm: F64) -> F64:
-        """Return the fraction of the light that the lens transmits, float64[band]: the same at every wavelength."""
+        """Return the fraction of the light that the lens transmits, float64[band], the same at every wavelength."""
         return np.full(len(wavelength_nm), float(self.transmission))
 
     def pupil_area_mm2(self, slope: ArrayLike) -> F64:
@@ -60,10 +60,10 @@ class ThinLens:
         return np.full(np.shape(slope), np.pi * (self.focal_length_mm / (2 * self.f_number)) ** 2)
 
     def image(self, radiance: Radiance) -> Irradiance:
-        """Irradiance on the sensor plane, E = π T L / (4 N²), per band.
+        """Return the irradiance on the sensor plane, E = π T L / (4 N²), per band.
 
-        No cos⁴ falls here: in the nominal camera the paper renders without, and vignetting is a fault of its
-        own (physics.md 6 warns of counting it twice).
+        It contains no cos⁴: the paper's nominal camera renders without it, and vignetting is a fault of its own
+        (physics.md, section 6, warns of counting it twice).
         """
         factor = np.float32(np.pi * self.transmission / (4 * self.f_number**2))
         return Irradiance(array=radiance.array * factor, wavelength_nm=radiance.wavelength_nm)
@@ -71,7 +71,7 @@ class ThinLens:
     def image_of_sun(self, radiance: Radiance, pixel_pitch_um: float) -> Irradiance:
         """Return the irradiance of the Sun's direct image, π T L cos⁴θ / (4 N²), per band.
 
-        Its power is E☉ T A cos θ at every field angle: what the pupil admits.
+        Its power is E☉ T A cos θ at every field angle, the flux that the pupil admits.
         """
         found = self.image(radiance)
         shape = found.array.shape[1:]
@@ -84,7 +84,7 @@ class ThinLens:
 
 @lru_cache(maxsize=2)
 def cos4_map(shape: tuple[int, int], focal_length_px: float) -> F32:
-    """cos⁴ of the off-axis angle of every pixel's centre, float32[y, x] in (0, 1], read-only."""
+    """Return cos⁴ of the off-axis angle of every pixel's centre, float32[y, x] in (0, 1], read-only."""
     height, width = shape
     x2 = ((np.arange(width) + 0.5 - width / 2) / focal_length_px) ** 2
     y2 = ((np.arange(height) + 0.5 - height / 2) / focal_length_px) ** 2
@@ -97,14 +97,14 @@ def cos4_map(shape: tuple[int, int], focal_length_px: float) -> F32:
 def beyond_frame(
     sun_slope: ArrayLike, sine: F64, angle_rad: F64, half_slope: tuple[float, float]
 ) -> NDArray[np.bool_]:
-    """Return which directions at a distance from the Sun come from in front of the lens but miss the frame.
+    """Return which directions around the Sun lie in front of the lens but outside the frame.
 
     Parameters
     ----------
     sun_slope
         float64[2], tangents of the Sun's direction along x and y.
     sine, angle_rad
-        float64[radius] and float64[angle]: polar coordinates of directions about the Sun, as direction cosines.
+        float64[radius] and float64[angle]: polar coordinates of directions about the Sun, in direction cosines.
     half_slope
         Tangents at the frame's right and lower edges.
 

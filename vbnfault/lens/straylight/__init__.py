@@ -1,1 +1,1 @@
-"""Light of the Sun that a lens sends astray: ghosts, starburst, glare, veil, and their total."""
+"""Compute the Sun's straylight on the sensor: ghosts, starburst, glare, veil, and their sum."""

@@ -1,8 +1,11 @@
-"""Rays through a lens along many paths of reflections at once: all ghosts, all wavelengths, one kernel.
+"""Trace rays along many reflection paths at once: all ghosts and all wavelengths run in one kernel.
 
-A path is a table of steps, so that rays of all ghosts run side by side through one loop (Hullin et al. 2011). Rays
-start on a grid in the plane of the first vertex. Single precision: a ray's place is kept relative to the vertex it
-has just met. Where both sides of the plane of axis and Sun are alike, one side is traced.
+Each path is a table of steps, so that the rays of all ghosts run side by side through one loop (Hullin et al.
+2011). Rays start on a grid in the plane of the first vertex. Computation is in single precision; a ray's position
+is kept relative to the vertex that it has just met. Where both sides of the plane of axis and Sun are alike, only
+one side is traced.
+
+A route is the sequence of reflecting rows. Its path is the sequence of all surfaces met, each a step.
 """
 
 from __future__ import annotations
@@ -28,15 +31,15 @@ from .paraxial import along, mirrors
 F64 = NDArray[np.float64]
 
 _COSINES = 256  # nodes of the reflectance tables
-_LOST, _FAR = -1e6, -1e4
-_BEYOND_EDGE = -1.0  # margin at which no light is left of a soft edge
-_LIMIT_SHARPNESS = 100.0  # of the edge where a limit other than a rim ends the light
-_LEAST_SLOPE = 1e-3  # of a ray against the sensor's plane, once it is lost
+_LOST, _FAR = -1e6, -1e4  # margin of lost rays, and the smallest margin of others
+_BEYOND_EDGE = -1.0  # margin at which a soft edge ends in the dark
+_LIMIT_SHARPNESS = 100.0  # of the edge where a missed surface or total reflection, not a rim, ends the light
+_LEAST_SLOPE = 1e-3  # smallest |dz| of a lost ray
 
 
 @lru_cache(maxsize=1)
 def backend() -> Any:
-    """drjit with its array types, on a usable LLVM."""
+    """Return drjit and its array types, on a usable LLVM."""
     from ...core import llvm
 
     llvm.prepare()
@@ -56,12 +59,19 @@ def backend() -> Any:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Rays:
-    """Which rays to trace: for each bundle its path, wavelength, box in the plane of the first vertex, direction.
+    """Describe the bundles to trace.
 
-    `route` and `wavelength` index those of the tracer, int[bundle]; `box_mm` float64[bundle, 4] is centre x, y and
-    half width x, y; `direction` float64[bundle, 3] unit vectors, with the Sun's azimuth at 0. `disc`
-    float64[bundle] rounds lattices to the ellipse of so many half widths, so that their outer rays go along a rim;
-    0 leaves them rectangular.
+    Attributes
+    ----------
+    route, wavelength
+        int[bundle]: indices into the routes and wavelengths of the tracer.
+    box_mm
+        float64[bundle, 4]: box in the plane of the first vertex, as centre x, y and half width x, y.
+    direction
+        float64[bundle, 3]: unit vectors, with the Sun's azimuth at 0.
+    disc
+        float64[bundle]: rounds a lattice to an ellipse of so many half widths, so that its outer rays follow a rim;
+        0 leaves it rectangular.
     """
 
     route: NDArray[np.int64]
@@ -74,7 +84,7 @@ class Rays:
         return len(self.route)
 
     def take(self, chosen: NDArray[Any]) -> Rays:
-        """Some of the bundles."""
+        """Return some of the bundles."""
         return Rays(
             route=self.route[chosen],
             wavelength=self.wavelength[chosen],
@@ -86,12 +96,22 @@ class Rays:
 
 @dataclass(frozen=True, eq=False)
 class Spots:
-    """Where rays arrive: device arrays, bundle after bundle, rows of the grid along x within one.
+    """Hold where rays arrive on the sensor: device arrays, bundle after bundle, row after row of its grid.
 
-    Of `rays` `across` int64[bundle] span each lattice; `x_mm`, `y_mm` on the sensor, `share` of the light,
-    `radius`: the largest distance from the axis over the rim's on the way, and, where edges have a width, `margin`:
-    the least of (1 - radius) over the width of the rim's soft edge; a ray that misses a surface has a radius of
-    1e6.
+    Attributes
+    ----------
+    across
+        int64[bundle]: rays along either side of each lattice.
+    x_mm, y_mm
+        Positions on the sensor.
+    share
+        Fraction of the light that the path transmits.
+    radius
+        Largest distance from the axis at any surface of the path, over the radius of its rim; 1000 or more after a
+        missed surface or total reflection.
+    margin
+        Smallest value along the path of (1 - radius) over the width of the rim's soft edge; only where edges have
+        widths.
     """
 
     rays: Rays
@@ -104,13 +124,13 @@ class Spots:
 
 
 def _paired(first: NDArray[Any], second: NDArray[Any]) -> NDArray[np.uint64]:
-    """Two arrays of numbers in single precision as one of words."""
+    """Pack two arrays of single-precision numbers into one array of 64-bit words."""
     pair = np.stack([np.asarray(first, dtype=np.float32), np.asarray(second, dtype=np.float32)], axis=-1)
     return np.ascontiguousarray(pair).view(np.uint64).ravel()
 
 
 def _unpaired(words: Any, index: Any) -> tuple[Any, Any]:
-    """What `_paired` put together."""
+    """Return the two numbers that `_paired` packed into the words at an index."""
     be = backend()
     word = be.dr.gather(be.UInt64, words, index)
     halves = be.UInt32(word), be.UInt32(word >> 32)
@@ -118,7 +138,7 @@ def _unpaired(words: Any, index: Any) -> tuple[Any, Any]:
 
 
 def routes(lens: Prescription, reflections: int = 2) -> tuple[tuple[int, ...], ...]:
-    """Sequences of reflecting rows in the order met: back, forward, and with four reflections back, forward."""
+    """Return all routes of 2 reflections (backwards, forwards), and on request those of 4 as well."""
     rows = (*mirrors(lens), *((len(lens.surfaces),) if lens.sensor_reflectance else ()))
     two = [(b, a) for a, b in combinations(rows, 2)]
     if reflections == 2:
@@ -129,19 +149,21 @@ def routes(lens: Prescription, reflections: int = 2) -> tuple[tuple[int, ...], .
 
 
 def name_of(route: Sequence[int]) -> tuple[int, ...]:
-    """What a ghost is called: of each reflection back and the one forward that follows, the row of the one forward
-    first, since it is the row nearer the front."""
+    """Return the name of a ghost: its reflecting rows in pairs, of which the first is nearer the front.
+
+    Each pair is a reflection backwards and the next one forwards, with the row of the latter first.
+    """
     return tuple(row for back, forth in zip(route[::2], route[1::2], strict=True) for row in (forth, back))
 
 
 def lattice_places(across: NDArray[np.int64], rows: NDArray[np.int64]) -> tuple[Any, Any, Any, Any]:
-    """Bundle, column, row and `across` for the first rows of every bundle's lattice, one a lane."""
+    """Return bundle, column, row and `across` for each lane: the first `rows` rows of every bundle's lattice."""
     be = backend()
     dr = be.dr
     sizes = across * rows
     each = dr.arange(be.UInt32, int(sizes.sum()))
     if (across == across[0]).all() and (rows == rows[0]).all():
-        # whole divisions by a number that the kernel knows are cheap, by others they take longer than a surface
+        # integer division by a constant of the kernel is cheap; by a variable it takes longer than a surface
         side, size = int(across[0]), int(sizes[0])
         bundle = each // size
         cell = each - bundle * size
@@ -150,13 +172,13 @@ def lattice_places(across: NDArray[np.int64], rows: NDArray[np.int64]) -> tuple[
     bundle = be.UInt32(np.repeat(np.arange(len(across), dtype=np.uint32), sizes))
     side = dr.gather(be.UInt32, be.UInt32(across.astype(np.uint32)), bundle)
     cell = each - dr.gather(be.UInt32, be.UInt32((np.cumsum(sizes) - sizes).astype(np.uint32)), bundle)
-    # exact: half a cell off a whole number is far more than rounding
+    # exact: the 0.5 keeps the quotient farther from whole numbers than rounding errors reach
     iy = be.UInt32((be.Float(cell) + 0.5) / be.Float(side))
     return bundle, cell - iy * side, iy, side
 
 
 def rounded(u: Any, v: Any, disc: Any) -> tuple[Any, Any]:
-    """Points of a square from -1 to 1 on an ellipse of `disc` half widths, smoothly; unmoved where that is 0."""
+    """Map the square from -1 to 1 smoothly to an ellipse of `disc` half widths; unchanged where that is 0."""
     dr = backend().dr
     wide = dr.select(disc > 0, disc * dr.sqrt(1 - 0.5 * v * v), 1)
     high = dr.select(disc > 0, disc * dr.sqrt(1 - 0.5 * u * u), 1)
@@ -164,9 +186,9 @@ def rounded(u: Any, v: Any, disc: Any) -> tuple[Any, Any]:
 
 
 class Tracer:
-    """A lens made ready for tracing: tables of its paths, indices and reflectances at wavelengths, made once.
+    """Trace rays through a lens, with tables of its paths, indices and reflectances that are computed once.
 
-    `reflections`: 2, or 4 for the paths of four reflections too.
+    `reflections`: 2, or 4 to include the paths of four reflections.
     """
 
     def __init__(
@@ -186,6 +208,7 @@ class Tracer:
         self._recorded: dict[Any, Any] = {}
 
     def _upload(self) -> dict[str, Any]:
+        """Compute the tables of all steps, and return those that live on the device."""
         be, lens = backend(), self.lens
         vertex = np.append(lens.vertices_mm, lens.vertices_mm[-1] + self.sensor_mm)
         sensor = len(lens.surfaces)
@@ -207,7 +230,7 @@ class Tracer:
             absorption[:, k + 1] = [surface.absorption_per_mm(w) for w in self.wavelength_nm]
         self._absorbs = bool(absorption.any())
         rows = np.array(row, dtype=np.uint32)
-        # by what the reflectance is looked up: 0 from the front, 1 from behind, 2 what passes
+        # index into the fractions of `_shares`: 0 reflected from the front, 1 from behind, 2 transmitted
         use = np.where(mirror, np.array(medium, dtype=np.int64) != rows, 2)
         self.rows = rows
         self._look_up = rows.astype(np.int64) * 3 + use
@@ -222,7 +245,7 @@ class Tracer:
         conic = [1 + s.conic for s in lens.surfaces] + [1.0]
         count = len(rows)
         ratio = index[:, medium] / index[:, other]
-        # a ray's step asks for few but wide records: fetching is what takes the time
+        # each step fetches few but wide records, since fetching takes most of the time
         curvature, per_rim = (np.array(flat)[rows], (1 / self.rims_mm)[rows])
         self._index = index
         self._look_up_word = ((rows * 3 + use) * _COSINES * 2 + np.array(mirror, dtype=np.int64)).astype(np.uint32)
@@ -256,12 +279,15 @@ class Tracer:
         return tables
 
     def _share_tables(self, share: F64) -> dict[str, Any]:
-        """What surfaces do to light, on the device."""
+        """Return the tables of reflected and transmitted fractions, on the device."""
         rise = np.diff(share, axis=-1, append=share[..., -1:])
         return {"share": backend().UInt64(_paired(share, rise))}
 
     def worn(self, coating_loss: float) -> Tracer:
-        """The same tracer with a share of the coatings' area gone: mirrors reflect the mean of coated and bare."""
+        """Return a tracer for a lens that has lost a fraction of its coatings' area.
+
+        Reflectances become the mean of coated and bare, weighted by area; transmittances stay.
+        """
         share = self._coated.copy()
         share[:, :, :2] += coating_loss * (self._bare - self._coated)[:, :, :2]
         other = copy.copy(self)
@@ -272,22 +298,27 @@ class Tracer:
 
     @cached_property
     def _coated(self) -> F64:
+        """Return the fractions of the coated surfaces."""
         return self._shares(self._index)
 
     @cached_property
     def _bare(self) -> F64:
+        """Return the fractions of the surfaces without coatings."""
         return self._shares(self._index, bare=True)
 
     def _shares(self, index: F64, bare: bool = False) -> F64:
-        """What each surface reflects from the front, from behind, and passes, float64[wavelength, row, 3, cosine]:
-        over the cosine in the thinner of its two media, mean of both polarisations."""
+        """Return the fractions reflected from the front, reflected from behind, and transmitted, of each surface.
+
+        float64[wavelength, row, 3, cosine]: over the cosine of the angle in the medium of lower index, as the mean
+        of both polarisations.
+        """
         lens = self.lens
         cosine = np.maximum(np.linspace(0, 1, _COSINES), 1e-6)[None, :]
         out = np.zeros((len(index), len(lens.surfaces) + 1, 3, _COSINES))
         wavelength = self.wavelength_nm[:, None]
         for k, surface in enumerate(lens.surfaces):
             front, back = index[:, k, None], index[:, k + 1, None]
-            # the cosine on either side; the square root is of what the denser side has left
+            # cosines on both sides, by Snell's law from that in the medium of lower index
             thin = np.minimum(front, back)
             at_front, at_back = (np.sqrt(1 - (thin / n) ** 2 * (1 - cosine**2)) for n in (front, back))
             films = () if bare else surface.coating
@@ -313,16 +344,17 @@ class Tracer:
         Parameters
         ----------
         across
-            Rays along either side of the lattice, of all bundles or int64[bundle].
+            Rays along either side of the lattice: one number for all bundles, or int64[bundle].
         width
-            float64[step]: of the soft edge of the rim at each step of each route, in radii of the rim. Without it
-            no margins are told, and rays that are lost end there.
+            float64[step]: width of the rim's soft edge at each step of each route, in radii of the rim. Without it
+            margins are not computed, and lost rays are not followed further.
         centred
-            Rays in the middles of the box's cells, else on its lattice, edges included, and rounded if it is.
+            Whether rays start in the middles of the box's cells. Otherwise they start on its lattice, edges
+            included, which is rounded where `Rays.disc` says so.
         light
-            Without it, a tracer of one path and wavelength leaves `share` at 1.
+            If False, a tracer of one path and one wavelength leaves `share` at 1.
         halved
-            Trace one side of the plane of axis and Sun where boxes lie evenly on both.
+            Whether to trace only one side of the plane of axis and Sun where boxes are symmetric about it.
         """
         be, t = backend(), self._tables
         dr = be.dr
@@ -341,7 +373,7 @@ class Tracer:
         rim = (none, dr.full(be.Float, 1e6, count)) if soft else (none,)
         ray = (start.x, start.y, none, start.dx, start.dy, start.dz, one, *(rim * sides))
         if len(self.routes) == len(self.wavelength_nm) == 1:
-            # one path, one wavelength: every number is known, and nothing need be fetched
+            # one path and one wavelength: all numbers are constants of the kernel, and nothing is fetched
             for at, sharpness in zip(self._known, per_width.tolist(), strict=True):
                 at.sharpness = sharpness
                 ray = self._meet(at, soft, *ray, light=light)
@@ -381,8 +413,10 @@ class Tracer:
         return Spots(rays, side, *whole)
 
     def _alone(self, rays: Rays, side: NDArray[np.int64], centred: bool) -> Spots:
-        """`trace` of the one bundle of the only path without its light, recorded once and replayed: for some 10⁵
-        rays, telling drjit what to do takes as long as doing it."""
+        """Trace the only bundle along the only path without its light, with a kernel recorded once and replayed.
+
+        For some 10⁵ rays, preparing a kernel in drjit takes as long as running it.
+        """
         be = backend()
         dr = be.dr
         key = int(side[0]), centred
@@ -414,7 +448,7 @@ class Tracer:
         return Spots(rays, side, *told)
 
     def _fetched(self, step: Any, edge: Any, wavelength: Any, shares: Any) -> Any:
-        """What a step of every lane's own path is made of, from the tables."""
+        """Return the data of one step of every lane's own path, fetched from the tables."""
         be, t = backend(), self._tables
         dr = be.dr
         gap, curvature = _unpaired(t["place"], step)
@@ -446,7 +480,7 @@ class Tracer:
 
     @cached_property
     def _known(self) -> list[Any]:
-        """What the steps of the only path are made of, as numbers."""
+        """Return the data of the steps of the only path, as plain numbers."""
         be, n = backend(), self._numbers
         dr = be.dr
         onward, out = 1.0, []
@@ -491,20 +525,23 @@ class Tracer:
         *rims: Any,
         light: bool = True,
     ) -> tuple[Any, ...]:
-        """On to the next surface of the path, and off it: refracted or reflected. `rims` are the square of the
-        largest radius so far and, where edges are soft, the margin; those of the mirrored ray follow if they
-        differ."""
+        """Advance rays to the next surface of their path, and refract or reflect them there.
+
+        `rims` are the square of the largest relative radius so far and, where edges are soft, the margin. Those of
+        the mirrored ray follow if they differ.
+        """
         dr = backend().dr
         c, eta, mirror = at.curvature, at.eta, at.mirror
         sense = dr.copysign(1, dz) if at.onward is None else at.onward
 
         def real(square: Any) -> Any:
-            # softly lost rays go on along the limit; others are nan from here
+            """Return the root of a square that is negative for lost rays."""
+            # with soft edges a lost ray continues along the limit; otherwise it is nan from here on
             return dr.sqrt(dr.maximum(square, 0) if soft else square)
 
         z = z + at.gap
         if self._special:
-            # to the plane of the vertex, then to the surface
+            # first to the plane of the vertex, then to the surface
             to_plane = -z / dz
             x, y = dr.fma(to_plane, dx, x), dr.fma(to_plane, dy, y)
             a = c * (dx * dx + dy * dy + at.conic * dz * dz)
@@ -520,11 +557,11 @@ class Tracer:
                 length = length + more
             norm = dr.rsqrt(nx * nx + ny * ny + nz * nz)
             along_normal = (nx * dx + ny * dy + nz * dz) * norm
-            # the normal towards where the ray comes from
+            # turn the normal towards the incoming ray
             facing = dr.select(along_normal > 0, -norm, norm)
             cosine = dr.minimum(dr.abs(along_normal), 1)
         else:
-            # a sphere: its normal has length 1, and the root is the angle's cosine
+            # on a sphere the normal has length 1 and the root is the cosine of the angle of incidence
             b = dr.fma(-c, dr.fma(x, dx, dr.fma(y, dy, z * dz)), dz)
             e = dr.fma(c, dr.fma(x, x, dr.fma(y, y, z * z)), -2 * z)
             under = dr.fma(b, b, -c * e)
@@ -534,7 +571,7 @@ class Tracer:
             facing = sense
         if light and at.absorption is not None:
             share = share * dr.exp(-at.absorption * dr.abs(length))
-        # what the angle's cosine squared leaves on the other side
+        # square of the cosine of refraction; negative for total reflection
         left = dr.fma(eta * eta, cosine * cosine, 1 - eta * eta)
         out_cosine = real(left)
         if light:
@@ -549,8 +586,8 @@ class Tracer:
             bend = turn * c
             dx, dy, dz = dr.fma(bend, x, keep * dx), dr.fma(bend, y, keep * dy), dr.fma(keep, dz, -turn)
             dz = dr.fma(bend, z, dz)
-        # lost too: a surface missed, light all reflected, a ray turned back; softly lost it goes on along the
-        # limit, so that between rays it is known where that began
+        # a ray is also lost where it misses a surface, is totally reflected or turns back; with soft edges it
+        # continues along the limit, so that the limit can be located between rays
         room = ahead = dz * onward
         if soft:
             room = dr.minimum(dr.minimum(under, dr.select(mirror, 1, left)), 4 * ahead)
@@ -559,7 +596,7 @@ class Tracer:
         out: list[Any] = []
         for k in range(sides):
             radius, *margin = rims[k * len(rims) // sides : (k + 1) * len(rims) // sides]
-            # the square of what lies beyond a rim grows by twice as much
+            # near a rim 1 - r² is twice 1 - r, hence the 0.5 below
             beyond = dr.fma(x, x, y * y) * (at.per_rim * at.per_rim)
             if self._bladed and at.stop is not False:
                 blade = self._within_blades(x, -y if k else y)
@@ -567,13 +604,15 @@ class Tracer:
             out.append(dr.maximum(radius, dr.select(room < 0, 1e6, beyond)))
             if soft:
                 here = dr.minimum((1 - beyond) * (0.5 * at.sharpness), room * _LIMIT_SHARPNESS)
-                # where a ray is lost it is off its way: what comes behind does not tell where the edge lies
+                # after a ray is lost, later surfaces do not tell where the edge lies
                 out.append(dr.select(margin[0] < _BEYOND_EDGE, margin[0], dr.minimum(margin[0], here)))
         return x, y, z, dx, dy, dz, share, *out
 
     def _start(self, rays: Rays, across: NDArray[np.int64], centred: bool, even: bool) -> Any:
-        """Place, direction, route and wavelength of every ray on the device, of one side alone if both are even,
-        with its number and that of the ray on the other side."""
+        """Return position, direction, route and wavelength of every ray, its number, and that of its mirror image.
+
+        If `even`, only the rays on one side of the plane of axis and Sun are returned.
+        """
         be = backend()
         dr = be.dr
         alone = len(rays) == 1
@@ -610,7 +649,7 @@ class Tracer:
         )
 
     def _within_blades(self, x: Any, y: Any) -> Any:
-        """Distance from the axis over that of the stop's rim in the same direction (`Surface.rim_mm`)."""
+        """Return the distance from the axis over that of the stop's rim in its direction (`Surface.rim_mm`)."""
         be, rim = backend(), self.lens.surfaces[self.lens.stop]
         dr = be.dr
         half = float(np.pi / rim.blades)
@@ -622,8 +661,10 @@ class Tracer:
     _stop_turn_rad = 0.0
 
     def turned(self, azimuth_rad: float) -> Tracer:
-        """The same tracer for a Sun at an azimuth: rays are traced with the Sun at azimuth 0, and the stop's blades
-        turned back instead."""
+        """Return the tracer for a Sun at an azimuth.
+
+        Rays are traced with the Sun at azimuth 0; the stop's blades are turned back instead.
+        """
         other = copy.copy(self)
         other._recorded = {}
         rim = self.lens.surfaces[self.lens.stop]
@@ -631,7 +672,7 @@ class Tracer:
         return other
 
     def _to_asphere(self, at: Any, x: Any, y: Any, z: Any, dx: Any, dy: Any, dz: Any) -> tuple[Any, ...]:
-        """From a conic to the asphere beside it, by Newton's method: place, normal, and how far it was."""
+        """Move rays from a conic to the asphere near it by Newton's method; return position, normal and length."""
         be = backend()
         dr = be.dr
         c, conic, terms = at.curvature, at.conic, at.aspheric

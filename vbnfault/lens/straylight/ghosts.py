@@ -1,7 +1,8 @@
-"""Ghosts by exact rays: where each lets light through and what it does on the sensor (Hullin et al. 2011).
+"""Trace ghosts with exact rays: the rays of each ghost that pass the lens, and their light on the sensor.
 
-Rays start within the box that a path's rims leave open; two coarse passes find it. Flux, place and size of a ghost
-are sums over a fine grid of rays in its box.
+The method is that of Hullin et al. 2011. A route is the sequence of surfaces that reflect the light of one ghost.
+Two passes of few rays locate the box, in the plane of the first vertex, of all rays that pass the rims of a route.
+Flux, position and size of the ghost are then sums over a fine grid of rays in its box.
 """
 
 from __future__ import annotations
@@ -23,25 +24,35 @@ from .paraxial import Ghost
 
 F64 = NDArray[np.float64]
 
-_COARSE = 25  # rays across a box while boxes are sought
-FINE = 768  # rays across a box where flux and place are told
+_COARSE = 25  # rays across a box, to locate boxes
+FINE = 768  # rays across a box, to compute flux and position
 FINE_OF_FOUR = 192
-_STEEP = 0.3  # rise of the radius over a cell
-_PEAK = 64  # rays across where the peak is sought
-_TOGETHER = 1 << 22  # rays at a time there, for the memory's sake
-_SHARP = 1e-3  # width of edges while boxes are sought, if none is given
-_LEAST_SPREAD = 0.25  # share of a ghost's picture that may be magnified less than what is told
-_UNEVEN = 2.0  # ratio of magnified areas of neighbours in the coarse lattice
+_STEEP = 0.3  # rise of the relative radius over a cell, above which neighbouring rays ended at different rims
+_PEAK = 64  # rays across a box, to locate the peak
+_TOGETHER = 1 << 22  # rays traced at a time, to limit memory
+_SHARP = 1e-3  # default width of soft edges while boxes are located
+_LEAST_SPREAD = 0.25  # fraction of a ghost's image that is magnified less than `Arrivals.magnification`
+_UNEVEN = 2.0  # ratio of the areas of neighbouring cells above which the image is uneven
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Arrivals:
-    """What the coarse rays of each route do on the sensor, in mm there.
+    """Describe where the coarse rays of each route arrive on the sensor. Near means within reach of the frame.
 
-    `least_mm`, `most_mm` float64[route, 2] bound them; `peak` is the largest share over magnification of area;
-    `move_mm` how far rays that arrive near move from the first wavelength to the last (80 % of them move less);
-    `magnification` that of lengths, exceeded over three quarters of the picture near; `folded` whether parts of the
-    picture are turned over; `uneven` the share of the picture near whose magnification changes steeply.
+    Attributes
+    ----------
+    least_mm, most_mm
+        float64[route, 2]: bounds of the ghost.
+    peak
+        Largest irradiance over that in the plane of the rays' box: transmitted fraction over magnification of area.
+    move_mm
+        Distance between the arrivals at the first and the last wavelength; 80 % of the near rays move less.
+    magnification
+        Magnification of lengths that is exceeded over three quarters of the near image.
+    folded
+        Whether the orientation of parts of the image is reversed.
+    uneven
+        Fraction of the near image where the magnification changes steeply.
     """
 
     least_mm: F64
@@ -53,12 +64,12 @@ class Arrivals:
     uneven: F64
 
     def take(self, chosen: NDArray[Any]) -> Arrivals:
-        """Of some of the routes."""
+        """Return the arrivals of some of the routes."""
         return Arrivals(**{name: values[chosen] for name, values in vars(self).items()})
 
     @classmethod
     def none(cls, count: int) -> Arrivals:
-        """Nothing arrives."""
+        """Return the arrivals of routes from which no light reaches the sensor."""
         return cls(
             least_mm=np.full((count, 2), np.inf),
             most_mm=np.full((count, 2), -np.inf),
@@ -73,10 +84,11 @@ class Arrivals:
 def boxes(
     made: Tracer, sun_deg: float, width: F64 | None = None, reach_mm: float = np.inf
 ) -> tuple[Rays, Arrivals]:
-    """The box of every route that lets light through from a Sun at azimuth 0, and where it arrives.
+    """Return the rays' box of every route that passes light, and its arrivals, for a Sun at azimuth 0.
 
-    Rays of one bundle a route, at the first wavelength; boxes lie evenly about the plane of axis and Sun, and hold
-    the ellipse that all light passes. Within `reach_mm` of the axis is near.
+    There is one bundle per route, at the first wavelength. Boxes are symmetric about the plane of axis and Sun;
+    `Rays.disc` is the ellipse around all rays that pass. `width` is that of the rims' soft edges; rays that arrive
+    within `reach_mm` of the axis count as near.
     """
     tangent = np.tan(np.radians(sun_deg))
     direction = np.array([np.sin(np.radians(sun_deg)), 0.0, np.cos(np.radians(sun_deg))])
@@ -106,7 +118,7 @@ def boxes(
 
 
 def _paraxial_boxes(made: Tracer, tangent: float, reach: float) -> F64:
-    """Where all rims let first-order rays through, with room; around the narrowest rim's disc where nowhere."""
+    """Return boxes, with room, where all rims pass first-order rays; where none pass, that of the narrowest rim."""
     a, b = made.met[:, 0, 0], made.met[:, 0, 1]
     rim = made.rims_mm[made.rows]
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -132,8 +144,11 @@ def _narrowed(
     width: F64,
     reach_mm: float,
 ) -> tuple[F64, F64, Arrivals]:
-    """Boxes of what gets through the given ones, nan where nothing does, their discs, and the arrivals: of the
-    first wavelength, and how far they lie from those of the last."""
+    """Return the boxes of the rays that pass, their ellipses, and the arrivals, each by route.
+
+    Boxes are nan where no ray passes. Arrivals are those of the first wavelength given; `move_mm` compares them
+    with the last one.
+    """
     count = len(wavelength)
     rays = Rays(
         route=np.tile(route, count),
@@ -150,7 +165,7 @@ def _narrowed(
     near = (margin > -1).all(axis=0) & (np.hypot(x[0], y[0]) < reach_mm)
     apart = np.where(near, np.hypot(x[-1] - x[0], y[-1] - y[0]), np.nan).reshape(len(route), -1)
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # a bundle of which nothing arrives near
+        warnings.simplefilter("ignore", RuntimeWarning)  # of bundles without a near ray
         move = np.nan_to_num(np.nanpercentile(apart, 80, axis=1))
     inside = margin[0] > -1
     far = np.float32(3e38)
@@ -169,7 +184,7 @@ def _narrowed(
         here_low = box[k, :2] + box[k, 2:] * lattice[[columns[0], rows[0]]]
         here_high = box[k, :2] + box[k, 2:] * lattice[[columns[-1], rows[-1]]]
         step = 2 * box[k, 2:] / (_COARSE - 1)
-        # of two boxes of one route the finer one knows better
+        # of two boxes of one route, keep the finer one
         if np.isfinite(low[r, 0]) and (spacing[r] < step).all() and (here_high - here_low < 3 * step).any():
             continue
         low[r], high[r] = np.minimum(low[r], here_low - step), np.maximum(high[r], here_high + step)
@@ -184,13 +199,13 @@ def _narrowed(
     good = np.isfinite(low[:, 0])
     out[good, 0] = (low[good, 0] + high[good, 0]) / 2
     out[good, 2] = np.maximum((high[good, 0] - low[good, 0]) / 2, 1e-6)
-    # even about the plane of axis and Sun, so that one side tells of the other
+    # symmetric about the plane of axis and Sun, so that one side can be mirrored
     out[good, 1], out[good, 3] = 0.0, np.maximum(np.maximum(high[good, 1], -low[good, 1]), 1e-6)
     disc = np.zeros(len(out))
     for r, (of, passed) in passing.items():
         ys, xs = np.nonzero(passed)
         u, v = ((of[i] + of[2 + i] * lattice[n] - out[r, i]) / out[r, 2 + i] for i, n in ((0, xs), (1, ys)))
-        # a cell beyond those that pass
+        # the ellipse includes one cell beyond those that pass
         disc[r] = np.hypot(u, v).max() + 0.5 * (spacing[r] / out[r, 2:]).sum()
     return out, np.clip(disc, 1, np.sqrt(2)), told
 
@@ -198,8 +213,11 @@ def _narrowed(
 def _spread(
     x: F64, y: F64, share: F64, inside: NDArray[np.bool_], near: NDArray[np.bool_], at_entrance: F64
 ) -> tuple[F64, F64, NDArray[np.bool_], F64]:
-    """Of lattices on the sensor, [route, y, x], that at the entrance have cells of some area: the peak, the
-    magnification, whether folded and how uneven, as `Arrivals` has them."""
+    """Return peak, magnification, whether folded, and how uneven each ghost is, as in `Arrivals`.
+
+    `x`, `y` and `share` [route, y, x] are lattices of rays on the sensor; `at_entrance` is the area of a cell at
+    the entrance.
+    """
     ax, ay = (v[:, 1:, 1:] - v[:, :-1, :-1] for v in (x, y))
     bx, by = (v[:, 1:, :-1] - v[:, :-1, 1:] for v in (x, y))
     signed = (ax * by - ay * bx) / 2
@@ -234,7 +252,7 @@ def _spread(
 
 @lru_cache(maxsize=8)
 def tracer(lens: Prescription, wavelength_nm: tuple[float, ...], reflections: int = 2) -> Tracer:
-    """A tracer, made once for a lens and its wavelengths."""
+    """Return the tracer of a lens and its wavelengths; it is cached."""
     return Tracer(lens, np.array(wavelength_nm), reflections=reflections)
 
 
@@ -248,11 +266,19 @@ def traced_ghosts(
     across: int | None = None,
     only: Collection[tuple[int, ...]] | None = None,
 ) -> tuple[Ghost, ...]:
-    """Ghosts of a far point source by exact rays, as `paraxial.paraxial_ghosts` tells them.
+    """Return the ghosts of a far point source by exact rays, in the form of `paraxial.paraxial_ghosts`.
 
-    `across` rays span each ghost's box either way (default: `FINE`, `FINE_OF_FOUR` for ghosts of four reflections,
-    of which there are many, and all faint); `only` these, by their names: the pair of rows, the smaller
-    first. The peak is the largest irradiance of a cell of a coarser grid.
+    The peak is the largest irradiance of a cell of a coarser grid.
+
+    Parameters
+    ----------
+    reflections
+        2, or 4 to include ghosts of four reflections.
+    across
+        Number of rays along either side of each ghost's box. Default: `FINE`, and `FINE_OF_FOUR` for the many faint
+        ghosts of four reflections.
+    only
+        Names of the ghosts to trace: the pair of rows, the smaller first. Default: all.
     """
     turn = np.radians(azimuth_deg)
     made = tracer(lens, (float(wavelength_nm),), reflections).turned(turn)
@@ -270,13 +296,13 @@ def traced_ghosts(
 
 
 def named(made: Tracer, rays: Rays, names: Collection[tuple[int, ...]]) -> NDArray[np.bool_]:
-    """Which bundles are of the ghosts of these names, bool[bundle]."""
+    """Return which bundles belong to the ghosts of these names, bool[bundle]."""
     wanted = set(names)
     return np.array([name_of(made.routes[r]) in wanted for r in rays.route], dtype=bool)
 
 
 def told(made: Tracer, rays: Rays, sun_deg: float, turn_rad: float, across: int) -> tuple[Ghost, ...]:
-    """What bundles of the Sun's light, one a ghost, do on the sensor's plane."""
+    """Return flux, centroid and spread on the sensor plane of each ghost's ray bundle, `across` rays wide."""
     pupil = np.pi / 4 * first_order(made.lens).entrance_pupil_diameter_mm ** 2
     out = []
     together = max(1, _TOGETHER // across**2)
@@ -287,6 +313,7 @@ def told(made: Tracer, rays: Rays, sun_deg: float, turn_rad: float, across: int)
 
 
 def _told(made: Tracer, rays: Rays, across: int, turn: float, pupil_mm2: float, cosine: float) -> list[Ghost]:
+    """Return the ghosts of bundles that are traced together."""
     be = backend()
     dr, Double = be.dr, be.Double
     spots = made.trace(rays, across, centred=True)
@@ -314,7 +341,7 @@ def _told(made: Tracer, rays: Rays, across: int, turn: float, pupil_mm2: float, 
 
 
 def _inside(radius: Any, across: int) -> Any:
-    """How much of each cell of a grid lies within the rims: all or nothing but for cells that a rim crosses."""
+    """Return the fraction of each cell of a grid that lies inside the rims; 0 or 1 unless a rim crosses it."""
     be = backend()
     dr = be.dr
     each = dr.arange(be.UInt32, dr.width(radius))
@@ -326,12 +353,15 @@ def _inside(radius: Any, across: int) -> Any:
         behind = dr.gather(be.Float, radius, dr.select(at < across - 1, each + step, each))
         rise = rise + dr.abs(behind - before) * 0.5
     part = dr.clip(0.5 + (1 - radius) / dr.maximum(rise, 1e-9), 0, 1)
-    # where the radius jumps a ray was lost elsewhere, and its slope means nothing
+    # where the radius jumps, a ray was lost at another rim, and the rise does not locate the edge
     return dr.select(rise < _STEEP, part, dr.select(radius <= 1, 1.0, 0.0))
 
 
 def _peaks(made: Tracer, rays: Rays) -> F64:
-    """The largest share over magnification of area among the cells of a lattice, float64[bundle]."""
+    """Return each ghost's largest irradiance over that at the entrance, float64[bundle].
+
+    It is taken over the cells of a lattice.
+    """
     spots = made.trace(rays, _PEAK, centred=True)
     x, y, share, radius = (
         v.numpy().reshape(len(rays), _PEAK, _PEAK) for v in (spots.x_mm, spots.y_mm, spots.share, spots.radius)
@@ -343,7 +373,7 @@ def _peaks(made: Tracer, rays: Rays) -> F64:
     cell = 4 * rays.box_mm[:, 2] * rays.box_mm[:, 3] / _PEAK**2
     with np.errstate(divide="ignore", invalid="ignore"):
         density = np.where(whole, share[:, 1:, 1:] * cell[:, None, None] / np.abs(ux * vy - uy * vx), 0)
-    # a ghost that only a few rays take has no whole cell, and no peak
+    # a ghost of only a few rays has no whole cell, and its peak is 0
     found = np.nan_to_num(density, posinf=0.0).max(axis=(1, 2))
     return np.asarray(found, dtype=np.float64)
 
@@ -351,8 +381,10 @@ def _peaks(made: Tracer, rays: Rays) -> F64:
 def surface_interactions_per_second(
     lens: Prescription, rays: int = 1_000_000, rounds: int = 5, *, light: bool = False
 ) -> float:
-    """Surfaces met per second by rays sent straight through the lens, in whole calls, median of rounds; with
-    `light` what each surface passes is told too."""
+    """Measure how many surfaces rays meet per second straight through the lens; the median of `rounds` calls.
+
+    With `light`, the tracer also computes the fraction of the light that each surface transmits.
+    """
     import time
 
     made = Tracer(lens, np.array([D_NM]), routes_=[()])

@@ -1,8 +1,9 @@
-"""Ghosts of the Sun as an irradiance picture: by exact rays or to first order, per band, on its disc.
+"""Render the ghosts of the Sun as irradiance on the sensor, by exact rays or to first order, per band.
 
-A ghost is an image of the openings on its way. The Sun's disc and diffraction soften the edges of that image by
-known widths (the first-order shift over the disc's radius, and Fresnel's of a straight edge), which each rim has of
-its own. Where the Sun itself is nearly in focus, its disc is sampled instead.
+A ghost is an image of the openings that its light passes. The Sun's disc and diffraction soften the edges of that
+image by widths that are known for each rim. The Sun's width is the shift, to first order, when the Sun moves by the
+radius of its disc. The width of diffraction is Fresnel's for a straight edge. Where the Sun itself is nearly in
+focus, its disc is sampled instead.
 """
 
 from __future__ import annotations
@@ -27,22 +28,22 @@ F64 = NDArray[np.float64]
 
 MODELS = ("traced", "paraxial")
 _ACROSS = 37  # rays across a ghost
-_UNEVEN = 0.3  # share of it that is magnified unevenly above which there are twice as many
-_ACROSS_FOCUSED = 25
-_SUBDIVISIONS = 8  # of the interval between two bands, where colours part
-_APART_PX = 2.0  # of a ghost's level: colours farther apart than this take more wavelengths
+_UNEVEN = 0.3  # uneven fraction of a ghost above which twice as many rays are traced
+_ACROSS_FOCUSED = 25  # rays across a ghost for each sample of the Sun's disc
+_SUBDIVISIONS = 8  # of the interval between two nodes, where colours separate
+_APART_PX = 2.0  # pixels of a ghost's level: colours farther apart than this need more wavelengths
 _FOCUSED = 0.35  # width of an edge in radii of its rim above which the disc is sampled
 _DISC_RINGS = 3
-_LARGE_PX = 150.0  # radius of a rim's picture
-_PLAIN = 0.03  # edges of this contrast are drawn in full; of a quarter of it a level coarser, and so on
-_RAMP, _RAMP_PX = 7.0, 24.0  # how far from an edge, in its widths and in pixels at least, details are drawn
-_SPREAD = 0.25, 256.0  # bounds of how much larger than to first order pictures of rims are taken to be
-_SPREAD_SHARP = 4.0  # and for how sharp they are
-_LEAST = 1e-10  # irradiance over the Sun's below which a ghost is left out
+_LARGE_PX = 150.0  # radius of a rim's image from which on the image is large
+_PLAIN = 0.03  # edges below this fraction of the summed irradiance are drawn one level coarser
+_RAMP, _RAMP_PX = 7.0, 24.0  # distance from an edge, in its widths and at least in pixels, that is drawn finely
+_SPREAD = 0.25, 256.0  # bounds of the size of rims' images relative to first order
+_SPREAD_SHARP = 4.0  # upper bound of the same in estimates of sharpness
+_LEAST = 1e-10  # irradiance over the Sun's below which a ghost is omitted
 
 
 class FirstOrderTracer(Tracer):
-    """Rays by matrices instead of surfaces: Lee & Eisemann's model, in the same tables."""
+    """Trace rays by matrices instead of surfaces (Lee & Eisemann's model), with the tables of `Tracer`."""
 
     def __init__(
         self, lens: Prescription, wavelength_nm: F64, *, reflections: int = 2, routes_: Any = None
@@ -58,7 +59,7 @@ class FirstOrderTracer(Tracer):
         }
 
     def _share_tables(self, share: F64) -> dict[str, Any]:
-        """As `Tracer` has them, and of every route at normal incidence."""
+        """Return the tables of `Tracer`, and the transmitted fraction of every route at normal incidence."""
         normal = share[:, :, :, -1].reshape(len(share), -1)[:, self._look_up]
         routes_ = np.multiply.reduceat(normal, self.first_step[:-1], axis=1) if len(self.routes) else normal
         return super()._share_tables(share) | {"shares": backend().Float(routes_.astype(np.float32).ravel())}
@@ -73,7 +74,7 @@ class FirstOrderTracer(Tracer):
         light: bool = True,
         halved: bool = True,
     ) -> Spots:
-        """As `Tracer.trace`, to first order; the Sun's slope is its tangent."""
+        """Trace as `Tracer.trace` does, to first order; the Sun's slope is the tangent of its angle."""
         be, t, f = backend(), self._tables, self._first_order
         dr = be.dr
         side = np.broadcast_to(np.asarray(across, dtype=np.int64), len(rays))
@@ -112,7 +113,7 @@ class FirstOrderTracer(Tracer):
             across=side,
             x_mm=dr.fma(m00, x, m01 * sx),
             y_mm=dr.fma(m00, y, m01 * sy),
-            share=dr.select(radius >= 0, dr.gather(be.Float, t["shares"], of), 0),  # one a ray
+            share=dr.select(radius >= 0, dr.gather(be.Float, t["shares"], of), 0),  # one value per ray
             radius=radius,
             margin=margin,
         )
@@ -122,7 +123,7 @@ class FirstOrderTracer(Tracer):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Detail:
-    """How finely routes are drawn: `BundleDrawing`'s columns by route, and the width of each step's rim's edge."""
+    """Hold how finely each route is drawn: columns of `BundleDrawing` by route, and edge widths by step."""
 
     level: NDArray[np.int64]
     inner_level: NDArray[np.int64]
@@ -135,7 +136,7 @@ class _Detail:
 
 @dataclass(frozen=True, eq=False)
 class _Drawn:
-    """What is drawn: bundles, two bands of each with their weights, whether it is rough, and which part of it."""
+    """Hold what is drawn: bundle, two bands and their weights, whether it is rough, and part of the light."""
 
     source: NDArray[np.int64]
     band: NDArray[np.int64]
@@ -144,7 +145,10 @@ class _Drawn:
     part: NDArray[np.int64]
 
     def of(self, each: NDArray[np.int64]) -> _Drawn:
-        """The same of bundles that stand for others: `each` for which, in order."""
+        """Return the same for bundles that replace the original ones.
+
+        `each` is the original of every new bundle, in rising order.
+        """
         count = np.bincount(each)
         first = np.cumsum(count) - count
         many = count[self.source]
@@ -155,7 +159,7 @@ class _Drawn:
 
 
 class FlareModel:
-    """Ghosts of one lens on one sensor, made once; `image` for every position of the Sun.
+    """Render the ghosts of one lens on one sensor; `image` serves every position of the Sun.
 
     Parameters
     ----------
@@ -164,18 +168,18 @@ class FlareModel:
     wavelength_nm
         float64[band]: nodes of the bands; one node is one wavelength.
     shape, pitch_mm
-        Pixels (height, width) of the sensor and their pitch.
+        (height, width) of the sensor in pixels, and their pitch.
     sun_radius_rad
-        Of the Sun's disc; 0 is a point.
+        Angular radius of the Sun's disc; 0 is a point.
     model
         'traced' or 'paraxial'.
     reflections
-        2, or 4 for ghosts of four reflections too.
+        2, or 4 to include ghosts of four reflections.
     diffraction
-        Whether edges ring as Fresnel's do.
+        Whether edges show Fresnel's fringes.
     across
-        Rays across a typical ghost either way: its light converges with them, to some 1 % with the default, ghosts
-        that are flung far apart to some 4 %.
+        Rays along either side of a typical ghost. Its light converges with their number: to some 1 % with the
+        default, and to some 4 % for ghosts that are strongly spread.
     """
 
     def __init__(
@@ -206,7 +210,7 @@ class FlareModel:
         self._soften()
 
     def _soften(self) -> None:
-        """Widths of the rims' soft edges for every step, the level and the edge's kind of every route."""
+        """Set the widths of the rims' soft edges for every step, and level and kind of edge for every route."""
         t = self._tracer
         counts = np.diff(t.first_step)
         route = np.repeat(np.arange(len(t.routes)), counts)
@@ -215,7 +219,7 @@ class FlareModel:
         a = np.where(np.abs(a) < 1e-9, 1e-9, a)
         m00 = np.where(np.abs(whole[:, 0, 0]) < 1e-9, 1e-9, whole[:, 0, 0])
         rim = t.rims_mm[t.rows]
-        # at one place of the sensor, how far the ray at this rim moves with the Sun
+        # for a fixed position on the sensor, how far its ray moves at this rim when the Sun moves by its radius
         self._sun = self.sun_radius_rad * np.abs(b - a * whole[:, 0, 1] / m00) / rim
         # phase over the rim's plane: π (Δy)² m / (λ B), Fresnel's variable is Δy √(2 m / (λ B))
         onwards = np.einsum("kij,kjl->kil", whole, np.linalg.inv(met))
@@ -223,7 +227,7 @@ class FlareModel:
         nm = float(np.median(self.nodes_nm))
         fresnel = np.sqrt(nm * 1e-6 * np.abs(in_air * a / m00) / 2) / rim
         self._fresnel = fresnel if self._diffraction else 0 * fresnel
-        self._px = rim * np.abs(m00 / a) / self.canvas.pitch_mm  # pixels a radius of the rim
+        self._px = rim * np.abs(m00 / a) / self.canvas.pitch_mm  # radius of the rim's image in pixels
         disc = np.abs(rim / a)
         bounds = zip(t.first_step[:-1], t.first_step[1:], strict=True)
         self._least = np.array([first + int(np.argmin(disc[first:last])) for first, last in bounds], dtype=np.int64)
@@ -232,12 +236,15 @@ class FlareModel:
         self._detail = self._details(np.zeros(len(t.routes), dtype=np.int64), np.ones(len(t.routes)))
 
     def _details(self, coarser: NDArray[np.int64], spread: F64) -> _Detail:
-        """Levels and edges of every route, `coarser` by so many levels than its edges ask for; the picture of its
-        rim is larger by `spread` than to first order."""
+        """Return levels and edges of every route.
+
+        `coarser` adds levels to those that the edges need. `spread` is the size of a rim's image relative to first
+        order.
+        """
         t, least = self._tracer, self._least
         route = np.repeat(np.arange(len(t.routes)), np.diff(t.first_step))
         px = self._px * spread[route]
-        # parts of a picture are less spread than most of it, and as sharp as they are
+        # parts of an image are spread less than most of it; the sharpest part decides
         sharp = np.minimum(spread, _SPREAD_SHARP)
         blur_px = np.hypot(self._sun[least], self._fresnel[least]) * self._px[least] * sharp
         # the disc's samples lie about a third of its radius apart
@@ -245,6 +252,7 @@ class FlareModel:
         blur_px = np.where(self._sampled, 0.3 * sun_px, blur_px)
 
         def level(px_: F64) -> NDArray[np.int64]:
+            """Return the coarsest level whose pixels are no larger than `px_` pixels."""
             return np.floor(np.log2(np.maximum(px_, 1.0))).astype(np.int64)
 
         edge = np.minimum(level(blur_px / 1.5) + coarser, LEVELS - 1)
@@ -254,9 +262,9 @@ class FlareModel:
         ramp = np.maximum(_RAMP, _RAMP_PX * 2.0**coarser / one_px)
         return _Detail(
             level=edge,
-            # pixels a quarter of the ramp wide for what lies within
+            # the inner part may have pixels as wide as a quarter of the ramp
             inner_level=np.clip(level(ramp * one_px / sharp / 4), edge, LEVELS - 1),
-            # a fold is as sharp as the Sun's disc, of twice the radius, lets it be; of a large ghost to two pixels
+            # the Sun's disc, of twice its radius, limits the sharpness of a fold; in a large ghost two pixels do
             rough_level=np.minimum(
                 np.minimum(np.maximum(level(1.3 * sun_px), px[least] > _LARGE_PX), edge) + coarser, LEVELS - 1
             ),
@@ -267,14 +275,14 @@ class FlareModel:
         )
 
     def _spread(self, arrivals: Arrivals, route: NDArray[np.int64]) -> F64:
-        """How much larger than to first order the pictures of the rims are, float64[route]."""
+        """Return the size of each route's image relative to first order, float64[route], within bounds."""
         out = np.ones(len(self._tracer.routes))
         first = np.abs(self._tracer.matrix[route, 0, 0])
         out[route] = np.clip(arrivals.magnification / np.maximum(first, 1e-9), *_SPREAD)
         return out
 
     def worn(self, coating_loss: float) -> FlareModel:
-        """The same model with a share of the coatings' area gone: mirrors reflect the mean of coated and bare."""
+        """Return the model with a fraction of the coatings' area gone, as `Tracer.worn` does."""
         if not coating_loss:
             return self
         other = copy.copy(self)
@@ -282,11 +290,20 @@ class FlareModel:
         return other
 
     def image(self, sun_deg: float, azimuth_deg: float = 0.0, *, only: tuple[int, int] | None = None) -> F32:
-        """Ghosts of a Sun at an angle from the axis, towards an azimuth: its direct image lies at +f tan θ there
-        (azimuth 0: +x, right; 90°: +y, down). Returns irradiance over the Sun's own at the entrance,
-        float32[band, y, x]. `only` keeps one pair of reflecting rows.
+        """Return the irradiance of all ghosts over the Sun's at the entrance, float32[band, y, x].
 
-        Raises InputError for an angle of 90° or more.
+        Parameters
+        ----------
+        sun_deg, azimuth_deg
+            Angle of the Sun from the axis, and its azimuth (0: +x, right; 90°: +y, down): the direct image lies at
+            +f tan θ in that direction.
+        only
+            Pair of reflecting rows of the only ghost to draw; default: all.
+
+        Raises
+        ------
+        InputError
+            The angle is 90° or more.
         """
         if not 0 <= sun_deg < 90:
             raise InputError(f"sun_deg = {sun_deg:g}: must be from 0 to below 90")
@@ -315,7 +332,7 @@ class FlareModel:
         return sums.irradiance()
 
     def ghosts(self, sun_deg: float, azimuth_deg: float = 0.0, *, across: int = 48) -> tuple[Ghost, ...]:
-        """The ghosts of a point Sun that reach the frame, the mean of all bands."""
+        """Return the ghosts of a point Sun that reach the frame, each the mean of all bands."""
         turn = float(np.radians(azimuth_deg))
         made = self._tracer.turned(turn)
         rays, arrivals = boxes(made, sun_deg, self._detail.width, self._reach_mm)
@@ -328,7 +345,7 @@ class FlareModel:
         return tuple(mean_ghost(rows) for _, rows in sorted(found.items()))
 
     def _fainter(self, rays: Rays, arrivals: Arrivals) -> NDArray[np.int64]:
-        """Levels by which routes may be drawn coarser: their edges are too faint against the sum of all to show."""
+        """Return the levels to add where edges are too faint to show in the sum of all ghosts, by route."""
         height, width = (n / 2 * self.canvas.pitch_mm for n in self.canvas.shape)
         frame = np.hypot(height, width)
         across = np.clip(np.minimum(arrivals.most_mm, frame) - np.maximum(arrivals.least_mm, -frame), 0, None)
@@ -339,18 +356,22 @@ class FlareModel:
         return out
 
     def _in_frame(self, arrivals: Arrivals) -> NDArray[np.bool_]:
+        """Return which ghosts may reach the frame, soft edges included, bool[bundle]."""
         beyond = np.maximum(np.maximum(arrivals.least_mm, -arrivals.most_mm), 0)
         soft = 8 * 2.0**LEVELS * self.canvas.pitch_mm
         return np.asarray(np.hypot(beyond[:, 0], beyond[:, 1]) < self._reach_mm + soft)
 
     def _coloured(self, rays: Rays, arrivals: Arrivals, detail: _Detail) -> tuple[NDArray[np.int64], Rays, _Drawn]:
-        """One bundle a wavelength, more of them where the colours of a ghost part by more than a pixel: of which
-        ghost each is, the bundles, and from which of them each part of the light is drawn: what lies within is
-        smooth, and takes the bands' nodes alone."""
+        """Return the bundles of all wavelengths, the ghost of each, and what is drawn of them.
+
+        The nodes of the bands are always traced. Further wavelengths are added where the colours of a ghost lie far
+        apart (`_APART_PX`). The inner part of the light is smooth and is drawn from the nodes alone.
+        """
         bands = len(self.nodes_nm)
         apart = arrivals.move_mm / max(bands - 1, 1) / self.canvas.pitch_mm
 
         def divided(level: NDArray[np.int64]) -> NDArray[np.int64]:
+            """Return into how many steps the interval between two nodes is divided at a level: 1, 2, 4 or 8."""
             wanted = apart / 2.0 ** level[rays.route] / _APART_PX
             return 2 ** np.clip(np.ceil(np.log2(np.maximum(wanted, 1))), 0, 3).astype(np.int64)
 
@@ -371,7 +392,7 @@ class FlareModel:
             divided_ = divisions[name]
             step = _SUBDIVISIONS // np.maximum(divided_, 1)
             source = np.flatnonzero((divided_ > 0)[which] & (wavelength % step[which] == 0))
-            # the hats of the wavelengths taken add up to one in every band
+            # the weights of the wavelengths taken sum to one in every band
             total = np.stack([hats[::n].sum(axis=0) for n in range(1, _SUBDIVISIONS + 1)])
             rows = wavelength[source]
             weight = np.take_along_axis(hats[rows] / total[step[which[source]] - 1], band[rows], axis=1)
@@ -381,7 +402,7 @@ class FlareModel:
         return which, bundles, _Drawn(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
 
     def _over_disc(self, rays: Rays, sun_deg: float) -> tuple[NDArray[np.int64], Rays, F64]:
-        """The bundles from every sample of the Sun's disc: of which each is one, and its strength."""
+        """Return bundles from samples of the Sun's disc: the original of each, the bundles, and their strength."""
         samples = disc_samples(_DISC_RINGS) * self.sun_radius_rad
         count = len(samples)
         theta = np.radians(sun_deg) + samples[:, 0]
@@ -392,6 +413,7 @@ class FlareModel:
         return each, replace(rays.take(each), direction=direction[which]), direction[which, 2] / count
 
     def _place(self, detail: _Detail, bundles: Rays, drawn: _Drawn, strength: F64) -> BundleDrawing:
+        """Return how the bundles are drawn."""
         route = bundles.route[drawn.source]
         levels = np.stack([detail.inner_level, detail.level, detail.rough_level])
         return BundleDrawing(
@@ -410,7 +432,7 @@ class FlareModel:
 
 
 def disc_samples(rings: int) -> F64:
-    """Points of a unit disc, float64[n, 2], each for the same share of its area: one, and 6 k on ring k."""
+    """Return points of the unit disc, float64[n, 2], that stand for equal areas: one, and 6 k on ring k."""
     points = [np.zeros((1, 2))]
     total = 1 + 3 * rings * (rings + 1)
     inner = 1
@@ -433,7 +455,7 @@ def flare_model(
     model: str,
     reflections: int = 2,
 ) -> FlareModel:
-    """A model, made once for what it depends on."""
+    """Return the model of a lens and a sensor; it is cached."""
     return FlareModel(
         lens,
         np.array(nodes_nm),

@@ -1,8 +1,9 @@
-"""Ghosts to first order: every path of two reflections is one matrix (Lee & Eisemann 2013, CGF 32, 1).
+"""Compute ghosts to first order: each path of two reflections is one matrix (Lee & Eisemann 2013, CGF 32, 1).
 
-A ray of a ghost leaves the first vertex's plane at height r with the slope θ of the Sun, meets every surface of its
-path at A_k r + B_k θ, and the sensor at M₀₀ r + M₀₁ θ; slopes are unfolded, so heights keep their sign. The rays
-that pass all rims are those within discs of the entrance plane, and the ghost is their overlap, magnified.
+A ghost's ray leaves the plane of the first vertex at the height r with the Sun's slope θ. It meets surface k of its
+path at the height A_k r + B_k θ, and the sensor at M₀₀ r + M₀₁ θ. Slopes are unfolded at reflections, so heights
+keep their sign. Each rim passes the rays of one disc in the entrance plane. The ghost is the image of the overlap
+of these discs, magnified by M₀₀.
 """
 
 from __future__ import annotations
@@ -22,24 +23,24 @@ from ..rays import forward, ghost
 
 F64 = NDArray[np.float64]
 
-_GRID = 129  # points across the smallest disc
+_GRID = 129  # sample points across the smallest disc
 
 
 @dataclass(frozen=True, kw_only=True)
 class Ghost:
-    """One ghost of a far point source.
+    """Describe one ghost of a far point source.
 
     Attributes
     ----------
     pair
         The reflecting rows, the one nearer the front first.
     flux_fraction
-        Flux on the unbounded sensor plane over source irradiance × cos(angle) × area of the paraxial entrance
-        pupil at the d line.
+        Flux on the unbounded sensor plane over (source irradiance × cos(angle) × area of the paraxial entrance
+        pupil at the d line).
     centroid_mm, rms_radius_mm
-        On the sensor, from the axis, and about the centroid.
+        Position of the centroid on the sensor, from the axis, and flux-weighted rms radius about it.
     peak_irradiance_fraction
-        Over the source's irradiance at the entrance.
+        Peak irradiance over the source's irradiance at the entrance.
     """
 
     pair: tuple[int, int]
@@ -50,7 +51,7 @@ class Ghost:
 
 
 def mean_ghost(rows: Sequence[tuple[float, Ghost]]) -> Ghost:
-    """One ghost at several wavelengths, each with its share of the light that enters."""
+    """Return the mean over wavelengths of one ghost, from (fraction of the entering light, ghost) for each."""
     share = np.array([weight for weight, _ in rows])
     flux = share * [ghost.flux_fraction for _, ghost in rows]
     place = np.array([ghost.centroid_mm for _, ghost in rows])
@@ -66,20 +67,37 @@ def mean_ghost(rows: Sequence[tuple[float, Ghost]]) -> Ghost:
 
 
 def mirrors(lens: Prescription) -> tuple[int, ...]:
-    """Rows that reflect: the stop does not, nor does a surface with the same medium on both sides."""
+    """Return the rows that reflect: not the stop, nor a surface with the same medium on both sides."""
     index = lens.indices()
     return tuple(k for k in range(len(lens.surfaces)) if index[k] != index[k + 1])
 
 
 def pairs(lens: Prescription) -> tuple[tuple[int, int], ...]:
-    """Return all pairs of reflecting rows, n (n - 1) / 2 of them; a sensor that reflects is one behind the last."""
+    """Return all pairs of reflecting rows, n (n - 1) / 2 of them.
+
+    A sensor that reflects is the row behind the last surface.
+    """
     rows = (*mirrors(lens), *((len(lens.surfaces),) if lens.sensor_reflectance else ()))
     return tuple(combinations(rows, 2))
 
 
 def along(lens: Prescription, path: Sequence[tuple[int, bool]], wavelength_nm: ArrayLike = D_NM) -> tuple[F64, F64]:
-    """The matrix from the first vertex's plane to the sensor, float64[..., 2, 2], and that to each surface met,
-    float64[step, ..., 2, 2]; ... is the shape of `wavelength_nm`. The sensor is the row behind the last."""
+    """Return the matrices of a path from the plane of the first vertex.
+
+    Parameters
+    ----------
+    path
+        (row, whether it reflects) of each surface met; the sensor is the row behind the last surface.
+    wavelength_nm
+        Of any shape, written ... below.
+
+    Returns
+    -------
+    matrix : float64[..., 2, 2]
+        To the sensor.
+    met : float64[step, ..., 2, 2]
+        To each surface met.
+    """
     wavelength = np.asarray(wavelength_nm, dtype=np.float64)
     index = np.stack([np.ones(wavelength.shape), *(s.medium.index(wavelength) for s in lens.surfaces)])
     sensor_mm = first_order(lens).bfd_mm
@@ -102,7 +120,7 @@ def along(lens: Prescription, path: Sequence[tuple[int, bool]], wavelength_nm: A
 
 
 def transmittance(lens: Prescription, path: Sequence[tuple[int, bool]], wavelength_nm: float = D_NM) -> float:
-    """Share of the light that takes a path, at normal incidence on every surface."""
+    """Return the fraction of the light that takes a path, for normal incidence on every surface."""
     index = lens.indices(wavelength_nm)
     share = 1.0
     for row, mirror in path:
@@ -116,10 +134,10 @@ def transmittance(lens: Prescription, path: Sequence[tuple[int, bool]], waveleng
 
 
 def axial_transmittance(lens: Prescription, wavelength_nm: ArrayLike) -> F64:
-    """Return the fraction of the light along the axis that coatings and glass transmit, float64[band].
+    """Return the fraction of the axial light that coatings and glass transmit, float64[band].
 
-    It multiplies the image of a scene and the direct image of the Sun alike. Reflected light is not in it: ghosts,
-    which are part of the reflected light, are therefore not taken from the direct image once more.
+    It multiplies the image of a scene and the direct image of the Sun alike. It excludes reflected light. Ghosts
+    are part of that light, so they are not subtracted from the direct image a second time.
     """
     nodes = np.atleast_1d(np.asarray(wavelength_nm, dtype=np.float64))
     path = forward(lens)
@@ -132,8 +150,10 @@ def axial_transmittance(lens: Prescription, wavelength_nm: ArrayLike) -> F64:
 def paraxial_ghosts(
     lens: Prescription, sun_deg: float, *, azimuth_deg: float = 0.0, wavelength_nm: float = D_NM
 ) -> tuple[Ghost, ...]:
-    """Ghosts of a far point source at an angle from the axis, towards an azimuth (0: +x); those that no ray takes
-    are left out."""
+    """Return the ghosts of a far point source at an angle from the axis, towards an azimuth (0: +x).
+
+    Ghosts that no ray takes are left out.
+    """
     turn = np.radians(azimuth_deg)
     slope = np.tan(np.radians(sun_deg)) * np.array([np.cos(turn), np.sin(turn)])
     pupil = np.pi / 4 * first_order(lens).entrance_pupil_diameter_mm ** 2

@@ -1,10 +1,12 @@
-"""Bundles of rays on the sensor, as irradiance: grid cells drawn as quadrilaterals, at the resolution they need.
+"""Draw bundles of rays on the sensor as irradiance: cells of a lattice become quadrilaterals.
 
-The cells of a bundle's lattice tile its picture; folds overlap and add. Each cell is two triangles whose
-irradiance and rim margin are interpolated between corners, so that edges stay crisp between rays; cells smaller
-than half a pixel are splatted, and where light folds cells are drawn by points on a cubic surface. Pictures with
-soft edges go to coarser levels of a pyramid. Sums are of integers: the bits do not depend on the order in which
-threads add.
+The cells of a bundle's lattice tile its image; where the image folds, cells overlap and add. Each cell is two
+triangles. Irradiance and rim margin are interpolated between their corners, so that edges stay crisp between rays.
+Two kinds of cells are drawn differently: cells smaller than half a pixel are added to the nearest pixels, and cells
+where light folds are drawn as points on a cubic surface.
+
+Images with soft edges are drawn on coarser levels of an image pyramid. Sums are of integers, so the bits do not
+depend on the order in which threads add.
 """
 
 from __future__ import annotations
@@ -26,27 +28,27 @@ F64 = NDArray[np.float64]
 
 LEVELS = 6
 PARTS = ("inner", "edge", "rough")
-# of each part: the share of light with an edge's profile is a + b × calm, that without c × calm × rise
+# (a, b, c) of each part: light with an edge's profile is a + b × calm, light without it c × calm × rise
 _SHARES = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, -1.0], [1.0, -1.0, 0.0]])
-_MARGIN = 4  # pixels around each level, for what lies half outside
+_MARGIN = 4  # pixels around each level, for cells that lie partly outside
 _UNITS = 2.0**36  # of the integer sums, per unit of irradiance
-_MOST = 1e5  # irradiance that one ghost may add to a pixel: far beyond white
-_CALM_SIGMA = 0.8  # pixels of a coarser level by which it is smoothed
-_SMALL = 0.5  # cells below this many pixels are splatted
-EDGE_LOW, EDGE_HIGH = -1.0, 5.0  # of the soft edge's profile
+_MOST = 1e5  # largest irradiance that one ghost adds to a pixel, far beyond white
+_CALM_SIGMA = 0.8  # sigma, in its pixels, by which a coarser level is smoothed
+_SMALL = 0.5  # cells below this many pixels are added to the nearest pixels
+EDGE_LOW, EDGE_HIGH = -1.0, 5.0  # range of the soft edge's profile, in its widths
 _EDGE_NODES = 2049
 _UNLIKE = 0.05  # ratio of neighbouring areas below which a fold is near
 _SMOOTH = 0.5  # change of irradiance over a pixel that still looks smooth
 _LANES = 16  # of a vector unit
-_NARROW_PX = 1.5
-_POINTS = 64  # along either side of a cell that is drawn by points
-_WANDER = 1.0  # sizes of a cell by which its points may lie beyond its corners
+_NARROW_PX = 1.5  # cells narrower than this are drawn by points
+_POINTS = 64  # most points along either side of a cell
+_WANDER = 1.0  # a cell's points may lie this many of its sizes beyond its corners
 _EDGE_KINDS = 9
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Canvas:
-    """A sensor of `shape` (height, width) pixels of `pitch_mm`, its middle on the axis, in `bands` bands."""
+    """Describe a sensor of `shape` (height, width) pixels of `pitch_mm`, centred on the axis, in `bands` bands."""
 
     shape: tuple[int, int]
     pitch_mm: float
@@ -54,25 +56,45 @@ class Canvas:
 
     @property
     def sizes(self) -> NDArray[np.int64]:
-        """Height and width of each level with its margins, int64[level, 2]."""
+        """Return height and width of each level with its margins, int64[level, 2]."""
         return np.array([[-(-n // 2**k) + 2 * _MARGIN for n in self.shape] for k in range(LEVELS)])
 
     @property
     def starts(self) -> NDArray[np.int64]:
-        """Where each level's bands begin, and the end."""
+        """Return where each level's bands begin in one flat array, and the array's length, int64[level + 1]."""
         return np.concatenate([[0], np.cumsum(self.sizes.prod(axis=1) * self.bands)])
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class BundleDrawing:
-    """Which bundles are drawn, and how.
+    """Describe which bundles are drawn, and how; every array is by drawn bundle.
 
-    `source`: which of the traced bundles. Of each its `level`; two bands with their weights, int64 and
-    float64[bundle, 2]; `strength`, irradiance for a share of 1 where nothing is magnified; the `kind` of its edges;
-    `ramp`, in widths of its edge; whether it is `rough`, folded or unevenly magnified; the
-    `magnification` of lengths that its levels are made for; and `inner_level`, that of the first of three parts of
-    the light that add up. `part`, an index of `PARTS`, says which: `inner` rises smoothly over the ramp from the
-    rims, `edge` is the rest, but near folds and where light is crowded all is `rough`.
+    The light of a ghost is the sum of three parts (`PARTS`), each drawn at a level of its own. `inner` rises
+    smoothly from the rims over the ramp. `edge` is the rest. Near folds and where light is crowded, both give way
+    to `rough`.
+
+    Attributes
+    ----------
+    source
+        Index into the traced bundles.
+    level
+        Level of the pyramid.
+    band, weight
+        int64 and float64[bundle, 2]: two bands and their weights.
+    strength
+        Irradiance for a `share` of 1 without magnification.
+    kind
+        Profile of its edges, see `edge_profiles`.
+    ramp
+        Length of the ramp, in widths of its edge.
+    rough
+        Whether the image is folded or unevenly magnified.
+    magnification
+        Magnification of lengths for which its levels were chosen.
+    inner_level
+        Level of its part `inner`.
+    part
+        Index into `PARTS`.
     """
 
     source: NDArray[np.int64]
@@ -90,16 +112,17 @@ class BundleDrawing:
 
 @lru_cache(maxsize=1)
 def edge_profiles() -> F32:
-    """Light across a soft edge, float32[kind, node]: node from `EDGE_LOW` to `EDGE_HIGH` widths into the light.
+    """Return the light across a soft edge, float32[kind, node].
 
-    The width is the root of the squares of the Sun's (its disc's radius) and of Fresnel's; kind k of 8 has their
-    ratio's arc tangent at k / 8 of 90°: 0 is the share of a uniform disc, 8 the pattern of a straight edge,
-    I = ((C + ½)² + (S + ½)²) / 2.
+    Nodes run from `EDGE_LOW` to `EDGE_HIGH` widths into the light. The width is the root of the sum of squares of
+    two widths: the Sun's (the radius of its disc) and Fresnel's. For kind k the arc tangent of their ratio,
+    Fresnel's over the Sun's, is k / 8 of 90°. Kind 0 is the visible fraction of a uniform disc; kind 8 is the
+    diffraction pattern of a straight edge, I = ((C + ½)² + (S + ½)²) / 2.
     """
     from scipy.special import fresnel
 
     s = np.linspace(EDGE_LOW, EDGE_HIGH, _EDGE_NODES)
-    # points of the disc, by chords of equal weight
+    # sample the disc by parallel chords, weighted with the area that each stands for
     ring = np.cos(np.pi * (np.arange(512) + 0.5) / 512)
     chord = np.sqrt(1 - ring**2)
     weight = chord * np.sqrt(1 - ring**2)
@@ -112,19 +135,19 @@ def edge_profiles() -> F32:
         angle = k / (_EDGE_KINDS - 1) * np.pi / 2
         v = (s[:, None] - np.cos(angle) * ring) / np.sin(angle)
         sine, cosine = fresnel(v)
-        # the last rings fade: they are those that a band's width washes out
+        # fade the outermost fringes, which the width of a band washes out
         out[k] = 1 + ((((cosine + 0.5) ** 2 + (sine + 0.5) ** 2) / 2) @ weight - 1) * fade
     out[:, 0], out[:, -1] = 0, 1  # beyond the table's ends
     return out.astype(np.float32)
 
 
 def edge_kind(sun: F64, fresnel_: F64) -> NDArray[np.int64]:
-    """The profile for a ratio of widths."""
+    """Return the kind of profile nearest to a ratio of widths."""
     return np.rint(np.arctan2(fresnel_, sun) / (np.pi / 2) * (_EDGE_KINDS - 1)).astype(np.int64)
 
 
 class Sums:
-    """Integer sums of all levels and bands."""
+    """Add up irradiance as integers, in all levels and bands."""
 
     def __init__(self, canvas: Canvas) -> None:
         self.canvas = canvas
@@ -132,7 +155,7 @@ class Sums:
         self._total = be.dr.zeros(be.UInt64, int(canvas.starts[-1]))
 
     def draw(self, spots: Spots, placement: BundleDrawing, azimuth_rad: float) -> None:
-        """Add bundles of rays on lattices, turned by the Sun's azimuth."""
+        """Add bundles of rays on lattices, turned to the Sun's azimuth."""
         UInt32 = backend().UInt32
         lattice = _Lattice(self.canvas, _Traced(spots), placement, azimuth_rad)
         number, folds = (v.numpy() for v in lattice.cells().pixels())
@@ -147,6 +170,7 @@ class Sums:
                 self._splat(lattice.cells(UInt32(order)))
 
     def _fill(self, cells: _Cells) -> None:
+        """Draw cells as pairs of triangles, and small cells by their middle."""
         be = backend()
         dr, Float, Int32, UInt32 = be.dr, be.Float, be.Int32, be.UInt32
         ends = cells.ends()
@@ -162,6 +186,7 @@ class Sums:
         profile = cells.profile()
 
         def shade(margin: Any, factor: Any, offset: Any) -> Any:
+            """Return the factor that edge and part apply to the irradiance."""
             return dr.fma(profile(margin), factor, offset)
 
         margins = [corner[3] for corner in cells.corners]
@@ -170,9 +195,11 @@ class Sums:
         add, width, small = self._adder(cells), UInt32(cells.width), cells.small
 
         def more(_x: Any, y: Any, _end: Any) -> Any:
+            """Return whether rows of the cell remain."""
             return y <= last
 
         def pixel(x: Any, y: Any, end: Any) -> Any:
+            """Add one pixel, and return the next one of the cell."""
             here = x <= end
             found = [Float(0), Float(EDGE_LOW), Float(0), Float(0)]
             for triangle in triangles:
@@ -193,7 +220,10 @@ class Sums:
         dr.eval(self._total)
 
     def _splat(self, cells: _Cells) -> None:
-        """Points of a cell, closer than pixels: where light folds its surface is not that of its corners."""
+        """Draw cells as points that are closer than pixels.
+
+        Where light folds, the corners of a cell do not describe its surface.
+        """
         be = backend()
         dr, Float, Int32, UInt32 = be.dr, be.Float, be.Int32, be.UInt32
         across, down = cells.points_along()
@@ -209,10 +239,12 @@ class Sums:
             return point < number
 
         def one(point: Any) -> Any:
+            """Add one point of the cell."""
             row = UInt32((Float(point) + 0.5) / across)
             u, v = (Float(point - row * columns) + 0.5) / across, (Float(row) + 0.5) / down
 
             def between(a: Any, b: Any, c: Any, d: Any) -> Any:
+                """Interpolate bilinearly between the corners."""
                 return dr.lerp(dr.lerp(a, b, u), dr.lerp(d, c, u), v)
 
             # Lagrange's cubic along either side
@@ -240,7 +272,7 @@ class Sums:
         dr.eval(self._total)
 
     def _adder(self, cells: _Cells) -> Any:
-        """Adds irradiance to a pixel of the level of a cell's bundle, in its bands."""
+        """Return a function that adds irradiance to a pixel, in the level and bands of the cell's bundle."""
         be = backend()
         dr, lattice, placement, total = be.dr, cells.lattice, cells.lattice.placement, self._total
         bands = [
@@ -254,18 +286,19 @@ class Sums:
 
         def add(value: Any, at: Any, shown: Any) -> None:
             for start, share in bands:
-                # negative numbers wrap around, and back when read
+                # negative numbers wrap around, and wrap back when they are read as signed
                 units = be.UInt64(be.Int64(dr.round(dr.clip(value, -_MOST, _MOST) * share)))
                 dr.scatter_add(total, units, start + at, shown & (share > 0), mode=dr.ReduceMode.Auto)
 
         return add
 
     def irradiance(self) -> F32:
-        """float32[band, y, x]: the levels laid over one another."""
+        """Return the sum of all levels, float32[band, y, x]."""
         canvas, total = self.canvas, self._total.numpy().view(np.int64)
         out = np.empty((canvas.bands, *canvas.shape), dtype=np.float32)
 
         def one(band: int) -> None:
+            """Resize and add the levels of one band, from the coarsest to the finest."""
             below: F32 | None = None
             for level in range(LEVELS - 1, -1, -1):
                 height, width = (int(v) for v in canvas.sizes[level])
@@ -273,27 +306,29 @@ class Sums:
                 part = total[first : first + height * width].reshape(height, width)
                 here = np.multiply(part, 1 / _UNITS, dtype=np.float32)
                 if below is not None:
-                    # folds end in steps, which a lattice of pixel centres samples unevenly
+                    # folds end in steps, which pixel centres sample unevenly
                     calm = cv2.GaussianBlur(below, (3, 3), _CALM_SIGMA)
                     bigger = cv2.resize(calm, None, fx=2, fy=2, interpolation=cv2.INTER_LINEAR)
-                    # a level's pixel 0 covers the pixels -M·2 + M and the next one of the finer level
+                    # pixel 0 of a level covers two pixels of the finer level, -M·2 + M and the next
                     here += bigger[_MARGIN : _MARGIN + height, _MARGIN : _MARGIN + width]
                 below = here
             assert below is not None
             rows, columns = (slice(_MARGIN, _MARGIN + n) for n in canvas.shape)
-            # the parts that add up meet on lattices of their own: where little is left of much it may be below
-            # nothing
+            # the parts are sampled on different lattices, so that their sum may be slightly negative
             np.maximum(below[rows, columns], 0, out=out[band])
 
-        # numpy and OpenCV let go of the interpreter
+        # numpy and OpenCV release the interpreter's lock
         with ThreadPoolExecutor(backend().dr.thread_count()) as pool:
             list(pool.map(one, range(canvas.bands)))
         return out
 
 
 def _shared_out(work: NDArray[np.uint32], chosen: NDArray[np.int64]) -> NDArray[np.uint32]:
-    """Some lanes in order: those with as much work side by side, for neighbours in the vector unit wait for one
-    another; groups of them such that every thread gets its share of the large ones."""
+    """Return lanes in an order that balances the work.
+
+    Lanes with equal work are neighbours, because neighbours in the vector unit wait for one another. Groups of such
+    lanes are scattered so that every thread gets some of the large ones.
+    """
     size = np.minimum(work[chosen], 65535).astype(np.uint16)
     order = chosen[np.argsort(size, kind="stable")].astype(np.uint32)
     groups = len(order) // _LANES
@@ -303,7 +338,7 @@ def _shared_out(work: NDArray[np.uint32], chosen: NDArray[np.int64]) -> NDArray[
 
 
 class _Triangle:
-    """A triangle with values at its corners, each of which is (x, y, *values)."""
+    """Interpolate values in a triangle; each corner is (x, y, *values)."""
 
     def __init__(self, *corners: tuple[Any, ...]) -> None:
         dr = backend().dr
@@ -315,22 +350,25 @@ class _Triangle:
         self._edges = tuple(_edge(p, q) for p, q in ((b, c), (c, a), (a, b)))
 
     def at(self, x: Any, y: Any) -> tuple[Any, ...]:
-        """Whether a point lies inside, and the values there."""
+        """Return whether a point lies inside, and the values there."""
         dr = backend().dr
         inside, values = None, [0.0] * (len(self._corners[0]) - 2)
         for (ox, oy, ux, uy, flip), corner in zip(self._edges, self._corners, strict=True):
             share = (ux * (y - oy) - uy * (x - ox)) * (flip * self._sign)
-            # a point on an edge belongs to the side that the edge, always read the same way, has on its left
+            # a point on an edge belongs to the triangle to the left of the edge, as `_edge` reads it
             here = (share > 0) | ((share == 0) & (flip * self._sign > 0))
             inside = here if inside is None else inside & here
-            # of a sliver's area little but rounding may be left
+            # the area of a sliver may be all rounding error
             weight = dr.clip(share * self._per_area, 0, 1)
             values = [dr.fma(weight, more, value) for value, more in zip(values, corner[2:], strict=True)]
         return inside, *values
 
 
 def _edge(p: tuple[Any, ...], q: tuple[Any, ...]) -> tuple[Any, ...]:
-    """An edge read from its lesser end, so that two triangles judge it by the same numbers; the sign for p → q."""
+    """Return an edge read from its lesser end, and the sign for p → q.
+
+    Two triangles that share the edge then judge a point by the same numbers.
+    """
     dr = backend().dr
     ordered = (p[0] < q[0]) | ((p[0] == q[0]) & (p[1] < q[1]))
     ox, oy = dr.select(ordered, p[0], q[0]), dr.select(ordered, p[1], q[1])
@@ -345,7 +383,7 @@ _OUTWARDS = ((-1, -1), (1, -1), (1, 1), (-1, 1))
 
 
 class _Traced:
-    """Lattices of rays on the sensor, whatever is drawn of them: how cells are magnified, and how they bend."""
+    """Compute how the cells of traced lattices are magnified, and how they bend."""
 
     def __init__(self, spots: Spots) -> None:
         be = backend()
@@ -353,12 +391,12 @@ class _Traced:
         rays, cells = self.across**2, (self.across - 1) ** 2
         self.first_ray, self.first_cell = np.cumsum(rays) - rays, np.cumsum(cells) - cells
         self._first_ray = be.UInt32(self.first_ray.astype(np.uint32))
-        # of the mean cell
+        # mean area of a cell at the entrance
         self.entrance_mm2 = 4 * spots.rays.box_mm[:, 2:].prod(axis=1) / (self.across - 1) ** 2
         self.magnified = self._magnified()
 
     def entrance(self, bundle: Any, ix: Any, iy: Any, side: Any) -> Any:
-        """Area of cells at the entrance over that of a rectangular lattice's."""
+        """Return the area of cells at the entrance over that in a rectangular lattice."""
         be = backend()
         dr, disc = be.dr, self.spots.rays.disc
         if disc is None:
@@ -369,7 +407,7 @@ class _Traced:
         return _area(*at) / (step * step)
 
     def _magnified(self) -> Any:
-        """Signed area of every cell on the sensor over that at the entrance, `_NO_AREA` where a ray was lost."""
+        """Return the signed magnification of area of every cell, `_NO_AREA` beside a lost ray."""
         be = backend()
         dr, spots = be.dr, self.spots
         bundle, ix, iy, side = lattice_places(self.across - 1, self.across - 1)
@@ -384,8 +422,10 @@ class _Traced:
 
     @cached_property
     def bends_mm(self) -> tuple[tuple[Any, Any], tuple[Any, Any]]:
-        """Second differences at every ray: of x along rows and columns, and of y; 0 beside a lattice's end or a ray
-        that was lost."""
+        """Return second differences at every ray, of x and of y, along rows and along columns.
+
+        They are 0 at the ends of a lattice and beside a lost ray.
+        """
         be = backend()
         dr, spots = be.dr, self.spots
         _, ix, iy, side = lattice_places(self.across, self.across)
@@ -403,7 +443,7 @@ class _Traced:
 
 
 class _Lattice:
-    """The cells of bundles that are drawn, in pixels of their level."""
+    """Hold the cells of the bundles that are drawn, in pixels of their level."""
 
     def __init__(self, canvas: Canvas, traced: _Traced, placement: BundleDrawing, azimuth_rad: float) -> None:
         self.traced, self.spots, self.placement = traced, traced.spots, placement
@@ -417,18 +457,18 @@ class _Lattice:
         self.across, self.first_ray, self.first_cell = (
             v[placement.source] for v in (traced.across, traced.first_ray, traced.first_cell)
         )
-        # light of a mean cell for a share of 1, in irradiance times pixels of the level
+        # light of a mean cell for a `share` of 1, in irradiance × pixels of the level
         self.entrance_mm2 = traced.entrance_mm2[placement.source]
         self.light = self.entrance_mm2 * placement.strength * self.per_mm**2
         self.places = lattice_places(self.across - 1, self.across - 1)
 
     def cells(self, index: Any = None) -> _Cells:
-        """All cells, or some."""
+        """Return all cells, or those at an index."""
         return _Cells(self, index)
 
 
 class _Cells:
-    """Some cells, one a lane: corners (x, y, share, margin), area, and what their bundle says of them."""
+    """Hold some cells, one in each lane: corners (x, y, share, margin), area, and values of their bundle."""
 
     def __init__(self, lattice: _Lattice, index: Any) -> None:
         be = backend()
@@ -469,22 +509,24 @@ class _Cells:
         self.middle = (xa + xb + xc + xd) * 0.25, (ya + yb + yc + yd) * 0.25
 
     def given(self, values: Any, kind: Any = None) -> Any:
-        """What each cell's bundle has."""
+        """Return each cell's value from values by bundle."""
         be = backend()
         kind = be.Float if kind is None else kind
         dtype = np.float32 if kind is be.Float else np.uint32
         return be.dr.gather(kind, kind(np.ascontiguousarray(values, dtype=dtype)), self.bundle)
 
     def pixels(self) -> tuple[Any, Any]:
-        """About how many pixels a cell covers, 0 where it has no part in what is drawn or is drawn by points; and
-        whether it is."""
+        """Return about how many pixels a cell covers, and whether it is drawn by points instead.
+
+        The number is 0 for cells without light in the part that is drawn, and for those drawn by points.
+        """
         dr, ends = backend().dr, self.ends()
         number, folds = self.rows(ends)[2], ends[3] & self.valid
         dr.eval(number, folds)
         return number, folds
 
     def points(self) -> Any:
-        """By how many points a cell is drawn, 0 where it has no part in what is drawn."""
+        """Return by how many points a cell is drawn; 0 without light in the part that is drawn."""
         be = backend()
         dr = be.dr
         across, down = self.points_along()
@@ -496,20 +538,20 @@ class _Cells:
         return be.UInt32(dr.select(lit & near, across * down, 0))
 
     def points_along(self) -> tuple[Any, Any]:
-        """Points along either side that are no farther apart than pixels."""
+        """Return the points along either side, as many as make them no farther apart than pixels."""
         dr = backend().dr
         a, b, c, d = self.corners
         (xu, xv), (yu, yv) = self.bends()
         out = []
         for sides, bends in ((((a, b), (d, c)), (xu, yu)), (((a, d), (b, c)), (xv, yv))):
             longest = _most(*(dr.abs(q[k] - p[k]) for p, q in sides for k in (0, 1)))
-            # a bow of second difference s adds s / 2 to the steps at its ends
+            # a side with the second difference s has end steps that are longer by s / 2
             bow = dr.maximum(*(_most(*(dr.abs(s) for s in bent)) for bent in bends))
             out.append(dr.clip(dr.ceil(longest + 0.5 * bow), 1, _POINTS))
         return out[0], out[1]
 
     def bends(self) -> tuple[tuple[list[Any], list[Any]], tuple[list[Any], list[Any]]]:
-        """Second differences of x and of y along rows and along columns at the corners, pixels."""
+        """Return second differences of x and of y along rows and along columns at the corners, in pixels."""
         be = backend()
         dr = be.dr
         (xu, xv), (yu, yv) = (
@@ -522,7 +564,7 @@ class _Cells:
         return x_bends, y_bends  # type: ignore[return-value]
 
     def profile(self) -> Any:
-        """Light across a soft edge of the cell's bundle, as a function of the margin."""
+        """Return a function of the margin: the light across a soft edge of the cell's bundle."""
         be = backend()
         dr = be.dr
         table = be.Float(edge_profiles().ravel())
@@ -536,13 +578,15 @@ class _Cells:
         return at
 
     def rows(self, ends: tuple[Any, ...]) -> tuple[Any, Any, Any]:
-        """First and last row of pixels whose centres may lie in a cell, and about how many pixels; no row where a
-        cell has no part in the light that is drawn, or folds."""
+        """Return the first and last row of pixels whose centres may lie in a cell, and its approximate pixel count.
+
+        The last row is -1 for cells without light in the part that is drawn, and for those that fold.
+        """
         _, factors, offsets, folds = ends
         be = backend()
         dr = be.dr
         margins = [corner[3] for corner in self.corners]
-        # beyond an edge's ringing its profile is 1, and what factor and offset add to is all there is
+        # beyond the fringes of an edge its profile is 1, so that only the sum of factor and offset counts
         plain = _least(*margins) > EDGE_HIGH
         drawn = [
             dr.select(plain, dr.abs(factor + offset), dr.maximum(dr.abs(factor), dr.abs(offset)))
@@ -559,7 +603,7 @@ class _Cells:
         return start, dr.select(lit, last, -1), be.UInt32(dr.select(lit, dr.minimum(about, 60000), 0))
 
     def columns(self, row: Any) -> tuple[Any, Any]:
-        """First and last column whose pixel centres may lie in a cell, in a row of pixels."""
+        """Return the first and last column whose pixel centres may lie in a cell, in a row of pixels."""
         dr = backend().dr
         y = row + 0.5
         low, high = 1e9, -1e9
@@ -572,11 +616,14 @@ class _Cells:
         return dr.maximum(start, 0), dr.minimum(last, self.width - 1)
 
     def ends(self) -> tuple[list[Any], list[Any], list[Any], Any]:
-        """At the four corners irradiance without edges, and how much of the part drawn is light with an edge's
-        profile (factor) and without (offset); and whether a rough cell folds, and should be drawn by points."""
+        """Return, at the four corners, what the part that is drawn needs; and whether a cell is drawn by points.
+
+        The values are the irradiance without edges, the fraction of light with an edge's profile (factor), and the
+        fraction without (offset). Rough cells that fold are drawn by points.
+        """
         dr, placement = backend().dr, self.lattice.placement
         per_ramp, even = self.given(1 / placement.ramp), self.given(~placement.rough)
-        # how unlike cells of the usual width may be, times their width, to look smooth in pixels of the first part
+        # largest difference of neighbours, times their width, that looks smooth in pixels of the part `inner`
         inner_mm = 2.0 ** (placement.inner_level - placement.level) / self.lattice.per_mm
         usual = np.maximum(placement.magnification, 1e-6)
         coarse = self.given(inner_mm * usual / np.sqrt(self.lattice.entrance_mm2) / _SMOOTH)
@@ -586,7 +633,7 @@ class _Cells:
         for corner, (sx, sy) in zip(self.corners, _OUTWARDS, strict=True):
             mean, least, most = self._around(sx, sy)
             densities.append(corner[2] * strength / dr.maximum(mean, 1e-9))
-            # calm: areas of one sign, alike over a pixel, and magnified half as much as is usual or more
+            # calm: areas have one sign, differ little over a pixel, and are magnified at least half as usual
             ratio = least / dr.maximum(most, 1e-18)
             calm = dr.minimum(2 - (1 - ratio) * coarse / dr.maximum(least, 1e-18), ratio / _UNLIKE)
             calm = dr.clip(dr.minimum(calm, 4 * dr.sqrt(mean * per_usual) - 1), even, 1)
@@ -596,14 +643,16 @@ class _Cells:
             offsets.append(with_rise * calm * rise)
             leasts.append(least)
         size = dr.maximum(self.high[0] - self.low[0], self.high[1] - self.low[1])
-        # so should narrow cells, whose edges fall anyhow between pixels
+        # narrow cells are drawn by points too: their edges fall between pixel centres
         narrow = self.area < _NARROW_PX * size
         folds = (rest > 0) & (size < _POINTS) & ((_least(*leasts) < 0) | narrow)
         return densities, factors, offsets, folds
 
     def _around(self, sx: int, sy: int) -> tuple[Any, Any, Any]:
-        """Mean size of the magnifications of area of the cells that meet in a corner, and the least and the largest
-        of them, counted positive where they have this cell's sign."""
+        """Return mean, smallest and largest magnification of area of the cells that meet in a corner.
+
+        The mean is of sizes. The smallest is positive only if all cells have this cell's sign.
+        """
         be = backend()
         dr, Int32, UInt32 = be.dr, be.Int32, be.UInt32
         own = dr.select(self.valid, self.own, 0)
@@ -624,16 +673,18 @@ class _Cells:
 
 
 def _area(*corners: tuple[Any, Any]) -> Any:
-    """Signed area of quadrilaterals."""
+    """Return the signed area of quadrilaterals."""
     (xa, ya), (xb, yb), (xc, yc), (xd, yd) = corners
     return ((xc - xa) * (yd - yb) - (yc - ya) * (xd - xb)) * 0.5
 
 
 def _least(*values: Any) -> Any:
+    """Return the smallest of four values."""
     dr = backend().dr
     return dr.minimum(dr.minimum(values[0], values[1]), dr.minimum(values[2], values[3]))
 
 
 def _most(*values: Any) -> Any:
+    """Return the largest of four values."""
     dr = backend().dr
     return dr.maximum(dr.maximum(values[0], values[1]), dr.maximum(values[2], values[3]))

@@ -1,8 +1,8 @@
-"""Veiling glare of a far bright source: light that rough and dusty lens surfaces scatter, and a baffle against it.
+"""Compute veiling glare, the light of a far bright source that rough and dusty lens surfaces scatter, and a baffle.
 
-Scatter of one surface is a BSDF over β, the distance of two directions as sines, taken in air: a surface of spatial
-frequency f turns light by β = λ f in every medium. Integrated over the disc β < 1 of sines it is the share of light
-scattered forwards, the total integrated scatter (TIS).
+Scatter of one surface is a BSDF over β, the distance of two directions as sines in air. A surface of spatial
+frequency f turns light by β = λ f in every medium. The integral of the BSDF over the disc β < 1 is the fraction of
+light that is scattered forwards, the total integrated scatter (TIS).
 """
 
 from __future__ import annotations
@@ -26,30 +26,31 @@ from .paraxial import along, axial_transmittance, mirrors
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
-REFERENCE_NM = 550.0  # what roughness and the Harvey knee are quoted at
-# What the models hold for: beyond, a surface is not smooth to light, and dust covers it whole.
+REFERENCE_NM = 550.0  # wavelength at which roughness and the Harvey knee are quoted
+# Validity of the models: beyond it a surface is not optically smooth, or dust covers it completely.
 ROUGHNESS_NM_LIMITS = (0.0, 50.0)
 CLEANLINESS_LIMITS = (0.0, 1000.0)
-ROUGHNESS_NM, KNEE, SLOPE = 1.0, 0.01, -1.5  # assumed: a good polish, and usual values of its scatter
+ROUGHNESS_NM, KNEE, SLOPE = 1.0, 0.01, -1.5  # assumed: a good polish, and usual values for its scatter
 
-# Assumed. Mineral dusts are estimated at 1.5 to 1.7 and 1e-5 to 1e-3 (Amsterdam-Granada Light Scattering Database,
-# Muñoz et al. 2012, JQSRT 113, 565).
+# Assumed. Estimates for mineral dusts are n from 1.5 to 1.7 and k from 1e-5 to 1e-3 (Amsterdam-Granada Light
+# Scattering Database, Muñoz et al. 2012, JQSRT 113, 565).
 DUST_INDEX = 1.53 + 0.0005j
 
 _CC1246_SLOPE = 0.926
 _CC1246_AREA_UM2 = 0.1e12  # 0.1 m²
-_SMALLEST_UM = 1.0  # where the standard's distribution begins
-_MIE_LARGEST = 500.0  # size parameter; beyond, diffraction and geometrical optics
-_BIN = 0.01  # of ln(size parameter)
+_SMALLEST_UM = 1.0  # smallest diameter of the standard's distribution
+_MIE_LARGEST = 500.0  # size parameter above which diffraction and geometrical optics are used
+_BIN = 0.01  # width of bins in ln(size parameter)
 _ANGLES = 321
 _LOOKUP = 1 << 16
 _OFFSETS: F64 = np.geomspace(1e-6, 2.0, 1025)
 _STEEPEST_DEG = 89.9
 _DISC = 65  # points across a beam
-_AROUND = 360  # directions about the source in which light misses the frame
+_AROUND = 360  # azimuths about the source, for the flux outside the frame
 
 
 def _check(name: str, value: ArrayLike, low: float, high: float) -> F64:
+    """Return a value as float64; raise InputError where it is out of range."""
     array = np.asarray(value, dtype=np.float64)
     wrong = ~((array >= low) & (array <= high))
     if wrong.any():
@@ -62,14 +63,14 @@ def _check(name: str, value: ArrayLike, low: float, high: float) -> F64:
 
 @dataclass(frozen=True, kw_only=True)
 class Harvey:
-    """Scatter of a polished surface: BSDF = b0 [1 + (β/L)²]^(S/2), per steradian (Harvey 1976).
+    """Model the scatter of a polished surface: BSDF = b0 [1 + (β/L)²]^(S/2), per steradian (Harvey 1976).
 
     Attributes
     ----------
     b0
-        Towards the unscattered light, 1/sr.
+        BSDF in the direction of the unscattered light, in 1/sr.
     L
-        β where the fall begins, about 1e-4 to 1e-2.
+        β where the BSDF begins to fall, about 1e-4 to 1e-2.
     S
         Slope of the fall in double logarithms, about -0.5 to -2.5.
     """
@@ -88,9 +89,14 @@ class Harvey:
         L: float = KNEE,
         S: float = SLOPE,
     ) -> Harvey:
-        """The one with TIS = (2π Δn σ/λ)², σ the rms roughness of spatial frequencies up to 1/λ.
+        """Return the model with TIS = (2π Δn σ/λ)², where σ is the rms roughness of spatial frequencies up to 1/λ.
 
-        A mirror's Δn is 2. Raises InputError outside 0 to 50 nm, L outside 1e-5 to 1 and S outside -4 to 0.
+        A mirror's Δn is 2.
+
+        Raises
+        ------
+        InputError
+            The roughness is outside 0 to 50 nm, L outside 1e-5 to 1, or S outside -4 to 0.
         """
         sigma = float(_check("roughness_nm", roughness_nm, *ROUGHNESS_NM_LIMITS))
         L, S = float(_check("L", L, 1e-5, 1.0)), float(_check("S", S, -4.0, 0.0))
@@ -98,22 +104,26 @@ class Harvey:
         return cls(b0=float(total / cls(b0=1.0, L=L, S=S).tis), L=L, S=S)
 
     def bsdf(self, beta: ArrayLike) -> F64:
-        """1/sr, float64 like `beta`; 0 from β = 1 on, where no light goes."""
+        """Return the BSDF in 1/sr, float64 like `beta`; 0 from β = 1 on, where no light goes."""
         b = np.abs(np.asarray(beta, dtype=np.float64))
         return np.where(b < 1, self.b0 * (1 + (b / self.L) ** 2) ** (self.S / 2), 0.0)
 
     @property
     def tis(self) -> float:
-        """Share of light scattered: 2π b0 L²/(S+2) [(1+L⁻²)^((S+2)/2) - 1], and π b0 L² ln(1+L⁻²) for S = -2."""
+        """Return the fraction of light scattered.
+
+        It is 2π b0 L²/(S+2) [(1+L⁻²)^((S+2)/2) - 1], and π b0 L² ln(1+L⁻²) for S = -2.
+        """
         wide = np.log1p(self.L**-2)
         return float(np.pi * self.b0 * self.L**2 * wide * exprel((self.S / 2 + 1) * wide))
 
     def at(self, wavelength_nm: float, *, known_at_nm: float = REFERENCE_NM) -> Harvey:
-        """The same surface at another wavelength, its index apart: L ∝ λ, b0 ∝ λ⁻⁴, S kept.
+        """Return the model of the same surface at another wavelength: L ∝ λ, b0 ∝ λ⁻⁴, S kept.
 
-        A smooth surface's BSDF is (2π Δn)² λ⁻⁴ PSD(β/λ), and the PSD is the surface's own (generalised
-        Harvey-Shack theory: Krywonos, Harvey & Choi 2011, JOSA A 28, 1121). Hence TIS ∝ λ⁻² σ², σ the roughness up
-        to frequency 1/λ: TIS ∝ λ⁻² where S is well below -2, and nearly λ^-(4+S) where it is above.
+        The change of the index is not included. The BSDF of a smooth surface is (2π Δn)² λ⁻⁴ PSD(β/λ), and the PSD
+        belongs to the surface (generalised Harvey-Shack theory: Krywonos, Harvey & Choi 2011, JOSA A 28, 1121).
+        Hence TIS ∝ λ⁻² σ², with σ the roughness up to frequency 1/λ: TIS ∝ λ⁻² where S is well below -2, and nearly
+        λ^-(4+S) where it is above.
         """
         ratio = wavelength_nm / known_at_nm
         return Harvey(b0=self.b0 / ratio**4, L=self.L * ratio, S=self.S)
@@ -123,7 +133,10 @@ class Harvey:
 
 
 def particle_count(level: float, diameter_um: ArrayLike) -> F64:
-    """Particles larger than a diameter on 0.1 m², float64 like `diameter_um` (IEST-STD-CC1246); 0 below level 1."""
+    """Return the number of particles larger than a diameter on 0.1 m² (IEST-STD-CC1246); 0 below level 1.
+
+    The result is float64 like `diameter_um`.
+    """
     log = np.log10(np.asarray(diameter_um, dtype=np.float64))
     if level < 1:
         return np.zeros(log.shape)
@@ -131,12 +144,14 @@ def particle_count(level: float, diameter_um: ArrayLike) -> F64:
 
 
 def obscured_fraction(cleanliness_level: float) -> float:
-    """Share of a surface that spheres of the standard's sizes cover, from 1 µm to `cleanliness_level`, in µm, of
-    which 0.1 m² has one larger."""
+    """Return the fraction of a surface that spheres of the standard's sizes cover.
+
+    The sizes run from 1 µm to `cleanliness_level` in µm; 0.1 m² has one particle larger than that.
+    """
     level = float(_check("cleanliness_level", cleanliness_level, *CLEANLINESS_LIMITS))
     if level <= _SMALLEST_UM:
         return 0.0
-    # ∫ π/4 D² (-dN/dD) dD with N = exp(c (U² - u²)), u = ln D: by parts, then the square completed
+    # ∫ π/4 D² (-dN/dD) dD with N = exp(c (U² - u²)), u = ln D: integrate by parts, then complete the square
     c, top = _CC1246_SLOPE / np.log(10), np.log(level)
     root = np.sqrt(c)
     inner = np.sqrt(np.pi) / (2 * root) * np.exp(1 / c + c * top**2)
@@ -146,11 +161,11 @@ def obscured_fraction(cleanliness_level: float) -> float:
 
 
 def scattered_intensity(size_parameter: ArrayLike, cosine: ArrayLike, *, index: complex = DUST_INDEX) -> F64:
-    """k² dσ/dΩ of spheres for unpolarised light, float64[size, angle].
+    """Return k² dσ/dΩ of spheres for unpolarised light, float64[size, angle].
 
-    By Mie's series up to a size parameter π D/λ of 500, its coefficients from miepython; beyond as the sum of
-    Fraunhofer diffraction and the rays reflected outside and refracted twice, without their interference: that is
-    within 8 % of Mie's mean over sizes to 70°, and a fifth below it at 90°.
+    Up to a size parameter π D/λ of 500 it is Mie's series, with coefficients from miepython. Beyond, it is the sum
+    of Fraunhofer diffraction, the rays reflected outside and the rays refracted twice, without their interference.
+    That sum is within 8 % of Mie's mean over sizes to 70°, and a fifth below it at 90°.
     """
     x, mu = np.atleast_1d(np.asarray(size_parameter, float)), np.atleast_1d(np.asarray(cosine, float))
     small = x <= _MIE_LARGEST
@@ -161,12 +176,12 @@ def scattered_intensity(size_parameter: ArrayLike, cosine: ArrayLike, *, index: 
 
 
 def _mie(x: F64, mu: F64, index: complex) -> F64:
-    """Bohren & Huffman 1983, chapter 4: one matrix product for all sizes and angles."""
+    """Return the intensity by Mie's series, as one matrix product (Bohren & Huffman 1983, chapter 4)."""
     if not len(x):
         return np.empty((0, len(mu)))
     import miepython
 
-    # its sign of absorption is the other one
+    # miepython has the opposite sign of absorption
     series = [miepython.coefficients(np.conj(index), float(size)) for size in x]
     orders = max(s.shape[1] for s in series)
     pi, tau = np.zeros((2, orders + 1, len(mu)))
@@ -187,13 +202,14 @@ def _mie(x: F64, mu: F64, index: complex) -> F64:
 
 
 def _large(x: F64, mu: F64, index: complex) -> F64:
+    """Return the intensity of large spheres by diffraction and geometrical optics."""
     n, size = index.real, x[:, None]
     sine = np.sqrt(np.maximum(1 - mu * mu, 0))
-    # the disc that diffracts is wider by the edge's share of extinction (Nussenzveig & Wiscombe 1980, PRL 45, 1490)
+    # the edge adds to extinction, which widens the diffracting disc (Nussenzveig & Wiscombe 1980, PRL 45, 1490)
     disc = size * np.sqrt(1 + 0.9962 * size ** (-2 / 3))
     across = disc * np.maximum(sine, 1e-12)
     diffracted = np.where(mu > 0, disc**4 * (j1(across) / across) ** 2, 0)
-    # the ray reflected outside turns by π - 2i, the one refracted twice by 2(i - r)
+    # the ray reflected outside turns by π - 2i, the ray refracted twice by 2(i - r)
     rs, rp, _, _ = reflect_transmit((), 1.0, n, np.maximum(np.sqrt((1 - mu) / 2), 1e-9), D_NM)
     reflected = (rs + rp) / 8
     half, turn = np.arccos(mu) / 2, np.maximum(np.arccos(mu), 1e-6)
@@ -209,8 +225,11 @@ def _large(x: F64, mu: F64, index: complex) -> F64:
 
 @lru_cache(maxsize=4)
 def _intensities(index: complex) -> tuple[F64, F64, F64]:
-    """Scattered intensity over all sizes and forward angles: bin edges of the size parameter, angles in rad, and
-    float64[bin, angle]. One table serves all wavelengths: the index is a constant."""
+    """Return the intensity at all sizes and forward angles.
+
+    The result is the bin edges of the size parameter, the angles in rad, and the table float64[bin, angle]. One
+    table serves all wavelengths, because the index is a constant.
+    """
     largest = np.pi * 1e3 * 1000.0 / RANGE_NM[0]
     edges = np.exp(np.arange(0.0, np.log(largest) + _BIN, _BIN))
     angles = np.geomspace(1e-5, np.pi / 2, _ANGLES)
@@ -222,7 +241,10 @@ def _intensities(index: complex) -> tuple[F64, F64, F64]:
 
 @lru_cache(maxsize=256)
 def _dust(level: float, wavelength_nm: float, index: complex) -> tuple[F64, float]:
-    """Intensity over irradiance of a dusty surface, 1/sr, float64[angle], and its integral over the hemisphere."""
+    """Return intensity over irradiance of a dusty surface, float64[angle] in 1/sr, and its integral.
+
+    The integral is over the forward hemisphere.
+    """
     edges, angles, table = _intensities(index)
     wavelength_um = 1e-3 * wavelength_nm
     diameters = np.clip(edges * wavelength_um / np.pi, _SMALLEST_UM, max(level, _SMALLEST_UM))
@@ -236,10 +258,15 @@ def _dust(level: float, wavelength_nm: float, index: complex) -> tuple[F64, floa
 def particle_bsdf(
     cleanliness_level: float, wavelength_nm: float, beta: ArrayLike, *, index: complex = DUST_INDEX
 ) -> F64:
-    """Forward scatter of particles on a surface, 1/sr, float64 like `beta`; 0 from β = 1 on.
+    """Return the forward scatter of particles on a surface, in 1/sr, float64 like `beta`; 0 from β = 1 on.
 
-    Spheres of the sizes of IEST-STD-CC1246 from 1 µm to `cleanliness_level` µm, lit along the normal, each alone.
-    Raises InputError for a level outside 0 (clean) to 1000, and a wavelength outside 250 to 2500 nm.
+    Particles are spheres with the sizes of IEST-STD-CC1246, from 1 µm to `cleanliness_level` µm. They are lit along
+    the normal, each independent of the others.
+
+    Raises
+    ------
+    InputError
+        The level is outside 0 (clean) to 1000, or the wavelength outside 250 to 2500 nm.
     """
     level = float(_check("cleanliness_level", cleanliness_level, *CLEANLINESS_LIMITS))
     intensity, _ = _dust(level, float(_check("wavelength_nm", wavelength_nm, *RANGE_NM)), index)
@@ -249,7 +276,7 @@ def particle_bsdf(
     angles = _intensities(index)[1]
     angle = np.arcsin(np.clip(b, np.sin(angles[0]), 1))
     found = np.exp(np.interp(np.log(angle), np.log(angles), np.log(intensity)))
-    # radiance is intensity over cosine; beyond 84° the mean over that ring, which keeps the flux
+    # radiance is intensity over cosine; beyond 84° the mean of the outermost ring, which conserves the flux
     cosine = np.where(b * b < 0.99, np.sqrt(np.maximum(1 - b * b, 0)), 0.05)
     return np.where(b < 1, found / cosine, 0.0)
 
@@ -257,7 +284,7 @@ def particle_bsdf(
 def particle_scatter_fraction(
     cleanliness_level: float, wavelength_nm: float, *, index: complex = DUST_INDEX
 ) -> float:
-    """Share of light that the particles of `particle_bsdf` scatter forwards."""
+    """Return the fraction of light that the particles of `particle_bsdf` scatter forwards."""
     level = float(_check("cleanliness_level", cleanliness_level, *CLEANLINESS_LIMITS))
     return _dust(level, float(_check("wavelength_nm", wavelength_nm, *RANGE_NM)), index)[1]
 
@@ -267,19 +294,20 @@ def particle_scatter_fraction(
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class VeilingGlare:
-    """Scattered light of a far source on a sensor.
+    """Hold the scattered light of a far source on a sensor.
 
     Attributes
     ----------
     offset
-        float64[sample], rising: distance between the directions of source and pixel, as sines; near the axis the
-        distance from the source's image over the focal length.
+        float64[sample], rising: distance between the directions of source and pixel, as sines. Near the axis it is
+        the distance from the source's image over the focal length.
     irradiance
-        float64[band, sample], on the sensor over the source's at the entrance, across its rays.
+        float64[band, sample]: on the sensor, over the source's irradiance across its rays at the entrance.
     efl_mm
-        Focal length, by which places on the sensor become directions.
+        Focal length, which converts positions on the sensor to directions.
     glare_total_fraction
-        float64[band], Σ TIS of all surfaces: share of the light passing that is scattered.
+        float64[band], Σ TIS of all surfaces. It is the scattered fraction of the transmitted light as long as it is
+        small; see `kept_of_single`.
     """
 
     offset: F64
@@ -289,17 +317,20 @@ class VeilingGlare:
 
     @cached_property
     def _lookup(self) -> tuple[float, float, F32]:
-        """Irradiance at equal steps of ln(offset²), of 4e-4: no step shows in an image."""
+        """Return start and step of ln(offset²), and the irradiance at these steps.
+
+        The step, 4e-4, does not show in an image.
+        """
         steps = np.linspace(2 * np.log(self.offset[0]), 2 * np.log(self.offset[-1]), _LOOKUP)
         rows = [np.interp(steps, 2 * np.log(self.offset), row) for row in self.irradiance]
         return steps[0], float(steps[1] - steps[0]), np.array(rows, dtype=np.float32)
 
     def image(self, sun_xy_mm: tuple[float, float], shape: tuple[int, int], pitch_mm: float) -> F32:
-        """Irradiance over the source's at the entrance, float32[band, y, x].
+        """Return irradiance over the source's at the entrance, float32[band, y, x].
 
-        The sensor's middle is the frame's, x to the right, y down; the source's image `sun_xy_mm` may lie outside.
-        At the source's own place the value is finite and means nothing: the direct image outshines it. No cos⁴ of
-        the pixel's field angle falls here.
+        The middle of the frame lies on the axis; x points to the right, y down. The source's image `sun_xy_mm` may
+        lie outside the frame. At its own position the value is finite but has no meaning: the direct image
+        outshines it. The cos⁴ of a pixel's field angle is not applied here.
         """
         start, step, table = self._lookup
         height, width = shape
@@ -322,12 +353,15 @@ class VeilingGlare:
 
     @property
     def kept_of_single(self) -> F64:
-        """Return what several scatterings leave of the sum of the single ones, (1 - e^-Σ) / Σ, float64[band]."""
+        """Return the sum of multiple scatterings over the sum of single ones, (1 - e^-Σ) / Σ, float64[band]."""
         return np.asarray(exprel(-self.glare_total_fraction))
 
     def beyond_mm2(self, sun_xy_mm: tuple[float, float], shape: tuple[int, int], pitch_mm: float) -> F64:
-        """Return the flux on the unbounded sensor plane outside of the frame, over the source's irradiance at the
-        entrance, float64[band] in mm²; with the cos⁴ of the field angle that `image` leaves out."""
+        """Return the flux on the sensor plane outside the frame, float64[band] in mm².
+
+        It is divided by the source's irradiance at the entrance, and includes the cos⁴ of the field angle that
+        `image` omits.
+        """
         slope = np.asarray(sun_xy_mm, dtype=np.float64) / self.efl_mm
         angle = np.linspace(0, 2 * np.pi, _AROUND, endpoint=False, dtype=np.float64)
         half_slope = (shape[1] / 2 * pitch_mm / self.efl_mm, shape[0] / 2 * pitch_mm / self.efl_mm)
@@ -339,7 +373,10 @@ class VeilingGlare:
 
 @dataclass(frozen=True, kw_only=True)
 class _Surfaces:
-    """What a lens's surfaces scatter at a wavelength: stretch = a_ent / a_j."""
+    """Hold what a lens's surfaces scatter at a wavelength.
+
+    `stretch` is a_ent / a_j: the radius of the axial beam at the entrance over that at surface j.
+    """
 
     scale: float  # π NA² T
     stretch: F64
@@ -349,11 +386,11 @@ class _Surfaces:
     wavelength_nm: float
 
     def irradiance(self, offset: F64, share: F64) -> F64:
-        """float64[sample], over the source's, for a share[surface, sample] of each beam that is lit.
+        """Return irradiance over the source's, float64[sample].
 
-        Surface j scatters the radiance E_ent T (a_ent/a_j)² BSDF, which fills the cone of the image: × π NA².
-        Lagrange's invariant n_j a_j θ = NA r makes β = NA r / a_j, which with NA = a_ent / f is (a_ent/a_j) r / f.
-        (Form of Peterson 2004, Proc. SPIE 5178, 184.)
+        `share` [surface, sample] is the lit fraction of each beam. Surface j scatters the radiance E_ent T
+        (a_ent/a_j)² BSDF, which fills the cone of the image: × π NA². Lagrange's invariant n_j a_j θ = NA r makes β
+        = NA r / a_j. With NA = a_ent / f this is (a_ent/a_j) r / f. (Form of Peterson 2004, Proc. SPIE 5178, 184.)
         """
         total = np.zeros(offset.shape)
         for stretch, harvey, dusty, lit in zip(self.stretch, self.roughness, self.dusty, share, strict=True):
@@ -365,6 +402,7 @@ class _Surfaces:
 
     @property
     def tis(self) -> float:
+        """Return the sum of the TIS of all surfaces."""
         dust = particle_scatter_fraction(self.level, self.wavelength_nm) if self.dusty.any() else 0.0
         return sum(harvey.tis for harvey in self.roughness) + dust * int(self.dusty.sum())
 
@@ -372,6 +410,7 @@ class _Surfaces:
 def _surfaces(
     lens: Prescription, wavelength_nm: float, roughness_nm: float, level: float, knee: float, slope: float
 ) -> _Surfaces:
+    """Return the scatter of a lens's surfaces at a wavelength."""
     level = float(_check("cleanliness_level", level, *CLEANLINESS_LIMITS))
     figures, path = first_order(lens, wavelength_nm), forward(lens)
     rows = list(mirrors(lens))
@@ -387,7 +426,7 @@ def _surfaces(
             ).at(wavelength_nm)
             for k in rows
         ),
-        # a cemented surface gathers no dust
+        # dust does not reach cemented surfaces
         dusty=np.array([level > 0 and 1.0 in (index[k], index[k + 1]) for k in rows]),
         level=level,
         wavelength_nm=wavelength_nm,
@@ -395,15 +434,15 @@ def _surfaces(
 
 
 def _lit(lens: Prescription, sun_deg: float) -> F64:
-    """Share of the beam at each scattering surface that a source at an angle lights past the rims so far,
-    float64[surface], to first order.
+    """Return the fraction of the beam that a source at an angle lights, float64[surface] by scattering surface.
 
-    Before the stop it is the beam that the field's middle sees there; behind the stop, what is lit is seen.
+    It is a first-order estimate of what passes the rims up to that surface. Before the stop, the beam is the one
+    that the field's middle sees there. Behind the stop, all light is seen.
     """
     _, met = along(lens, forward(lens))
     height, slope = met[:, 0, 0], met[:, 0, 1]
     radius = first_order(lens).entrance_pupil_diameter_mm / 2
-    # rims do not cut the beam on the axis: the stop does, though a paraxial one may be wider than a real one
+    # only the stop limits the axial beam; widen rims that the paraxial beam, larger than the real one, would touch
     rims = np.maximum([s.semi_diameter_mm for s in lens.surfaces], radius * np.abs(height))
     side = (np.arange(_DISC) + 0.5) / _DISC * 2 - 1
     disc = np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2)
@@ -429,7 +468,7 @@ def veiling_glare(
     L: float = KNEE,
     S: float = SLOPE,
 ) -> VeilingGlare:
-    """Light of a far point source that a lens's surfaces scatter onto the sensor.
+    """Return the light of a far point source that a lens's surfaces scatter onto the sensor.
 
     Parameters
     ----------
@@ -438,9 +477,9 @@ def veiling_glare(
     wavelength_nm
         float64[band].
     roughness_nm, L, S
-        Rms roughness and Harvey's knee and slope at 550 nm of every surface (assumed values by default).
+        Rms roughness, and Harvey's knee and slope at 550 nm, of every surface (the defaults are assumed).
     cleanliness_level
-        Particles on every surface in air, by IEST-STD-CC1246; 0: none.
+        Particles on every surface in air, as a level of IEST-STD-CC1246; 0: none.
     """
     bands = [
         _surfaces(lens, float(nm), roughness_nm, cleanliness_level, L, S)
@@ -465,8 +504,10 @@ def scattered_fraction(
     L: float = KNEE,
     S: float = SLOPE,
 ) -> F64:
-    """Return the fraction of the light passing a lens that its surfaces scatter, 1 - exp(-Σ TIS), float64[band].
-    Parameters as in `veiling_glare`."""
+    """Return the fraction of the transmitted light that a lens's surfaces scatter, 1 - exp(-Σ TIS), float64[band].
+
+    Parameters as in `veiling_glare`.
+    """
     single = np.array(
         [
             _surfaces(lens, float(nm), roughness_nm, cleanliness_level, L, S).tis
@@ -486,10 +527,11 @@ def point_source_transmittance(
     L: float = KNEE,
     S: float = SLOPE,
 ) -> F64:
-    """Scattered irradiance at the sensor's middle over a far source's at the entrance, float64[band, angle].
+    """Return scattered irradiance in the middle of the sensor over a far source's at the entrance.
 
-    For angles in the field and outside, 0 to 89.9°: outside, only the surfaces count that the source's rays
-    still reach past the rims. Ghosts, the mount and a baffle are not in it. Parameters as in `veiling_glare`.
+    The result is float64[band, angle]. Angles lie inside or outside the field, 0 to 89.9°. Outside, only the
+    surfaces count that the source's rays still reach past the rims. Ghosts, mount and baffle are not included.
+    Parameters as in `veiling_glare`.
     """
     angles = np.atleast_1d(_check("sun_deg", sun_deg, 0.0, _STEEPEST_DEG))
     share = np.stack([np.cos(np.radians(a)) * _lit(lens, float(a)) for a in angles], axis=1)
@@ -511,11 +553,16 @@ def baffle_transmission(
     entrance_radius_mm: float,
     vane_attenuation: float = 1e-6,
 ) -> F64:
-    """Share of a lens's entrance that a far source lights through a tube in front, float64 like `sun_deg`.
+    """Return the fraction of a lens's entrance that a far source lights through a tube in front of the lens.
 
-    The overlap of the entrance with the tube's mouth, moved by length × tan(angle), never below
+    It is the overlap of the entrance with the tube's mouth, shifted by length × tan(angle), and never below
     `vane_attenuation`: 1e-6 is assumed; good two-stage baffles reach 1e-9 (Haghshenas & Johari 2014, Proc. SPIE
-    9264, 92641R). Without length there is no baffle. Raises InputError for a tube narrower than the entrance.
+    9264, 92641R). Length 0 means no baffle. The result is float64 like `sun_deg`.
+
+    Raises
+    ------
+    InputError
+        The tube is narrower than the entrance.
     """
     angle = _check("sun_deg", sun_deg, 0.0, 180.0)
     length = float(_check("length_mm", length_mm, 0.0, 1e6))
@@ -526,7 +573,7 @@ def baffle_transmission(
         return np.ones(angle.shape)
     away = length * np.tan(np.radians(np.minimum(angle, 90.0)))
     d = np.clip(away, large - small + 1e-12 * small, large + small)
-    # two circular segments, on either side of the chord through both rims' crossings
+    # the overlap is two circular segments on either side of the chord through the rims' crossings
     to_small = np.arccos(np.clip((d * d + small**2 - large**2) / (2 * d * small), -1, 1))
     to_large = np.arccos(np.clip((d * d + large**2 - small**2) / (2 * d * large), -1, 1))
     area = small**2 * (to_small - np.sin(2 * to_small) / 2) + large**2 * (to_large - np.sin(2 * to_large) / 2)

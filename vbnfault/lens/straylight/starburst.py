@@ -1,31 +1,34 @@
-"""Starburst: the Sun through the stop by Fraunhofer diffraction, point by point and averaged over its disc.
+"""Compute the starburst of the Sun: Fraunhofer diffraction at the stop, averaged over the Sun's disc.
 
-A far source of wave number k₀ = 2π/λ gives at the direction cosines u the irradiance, over its own at the entrance,
+A far source of wave number k₀ = 2π/λ gives, at the direction cosines u, the irradiance relative to its own at the
+entrance
 
     E / E_sun = cos θ_sun · cos⁴θ / f² · |A(k₀ (u - u_sun))|² / λ²,      A(k) = ∫ exp(-i k·x) dx
 
 over the entrance pupil (Goodman, Introduction to Fourier Optics, chapter 4). |A|² / (λ² area) is the point spread
-function per unit of u, and cos⁴θ / f² = |d²u / d²x| for an image without distortion; near the axis u - u_sun is
+function per unit of u, and cos⁴θ / f² = |d²u / d²x| for an image without distortion. Near the axis, u - u_sun is
 (x - x_sun) / f.
 
 Averaging over a disc of angular radius σ multiplies the pupil's autocorrelation at the shift ξ by the disc's
-coherence 2 J₁(y) / y, y = σ k₀ ξ (van Cittert and Zernike; Born & Wolf, Principles of Optics, 10.4). That leaves
-shifts of some λ / σ, 0.1 mm at 1 au, and where this is small against the stop the first powers of ξ are enough:
+coherence 2 J₁(y) / y, y = σ k₀ ξ (van Cittert and Zernike; Born & Wolf, Principles of Optics, 10.4). Only shifts up
+to some λ / σ remain, 0.1 mm at 1 au. Where this is small against the stop, the first powers of ξ are enough:
 
-- ξ¹, the rim. A length ds sends 2π ds / k² along its normal, both ways: a straight edge is a line spike, a bent one
-  a fan of 2πρ / k³ at its radius of curvature ρ, a circle 4πa / k³, the mean of Airy's rings. Over the disc, with θ
-  the distance |u - u_sun| and t that across the normal,
+- ξ¹, the rim. A length ds sends 2π ds / k² along its normal, in both directions. A straight edge gives a line
+  spike, a bent one a fan of 2πρ / k³ for its radius of curvature ρ, a circle 4πa / k³, the mean of Airy's rings.
+  Averaged over the disc, with the distance θ = |u - u_sun| and its component t across the normal,
 
-      |A|² = 4 √(σ² - t²) / (σ² k₀³ (θ² - σ²)) · ds,
+      |A|² = 4 √(σ² - t²) / (σ² k₀³ (θ² - σ²)) · ds.
 
-  and a rim is its length per angle of the normal, convolved with this.
-- ξ², the corners. The edges' ends at a corner are one point, so they add as amplitudes: |A|² = (cot ψ₁ - cot ψ₂)² /
-  k⁴ with the angles from their normals. Across a normal cot² is Hadamard's finite part, which takes from the spike
-  what its wings hold, and at the end of a bent edge Fresnel's integral, which joins light and dark.
+  A rim is described by its length per angle of the normal, convolved with this.
+- ξ², the corners. The ends of the edges at a corner are one point, so they add as amplitudes:
+  |A|² = (cot ψ₁ - cot ψ₂)² / k⁴ with the angles from their normals. Across a normal, cot² is Hadamard's finite
+  part, which subtracts from the spike the light that its wings contain. At the end of a bent edge it is Fresnel's
+  integral, which joins light and dark.
 
-Corners and edges add as powers: their fringes, λ over their distance, are finer than the disc. The disc is taken as
-even, and as a circle in u although it is foreshortened by cos θ_sun on the line to the axis, so that off the axis
-some spikes come out too wide by up to 1 / cos θ_sun, and too faint, for the same flux.
+Corners and edges add as powers, because their fringes, λ over their distance, are finer than the disc.
+
+Approximations: the disc is uniform, and a circle in u although it is foreshortened by cos θ_sun on the line to the
+axis. Off the axis some spikes are therefore too wide by up to 1 / cos θ_sun, and too faint, for the same flux.
 """
 
 from __future__ import annotations
@@ -47,29 +50,32 @@ F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
 _EDGE_POINTS = 2049  # along one blade, or round the whole rim
-_SUPERSAMPLING = 4  # of a sample, along either side
+_SUPERSAMPLING = 4  # finer samples along either side of a sample
 _GOLDEN_RAD = np.pi * (3 - np.sqrt(5))
-_FARTHEST = 2.0  # two sines are no farther apart
-_SHARE_LOST = 3e-3  # of the mean of the bands
+_FARTHEST = 2.0  # largest distance of two sines
+_SHARE_LOST = 3e-3  # error, relative to the mean of the bands, that fewer tables may cause
 _STRIP = 64  # rows of a frame at a time
-_ROW_BLUR = 0.5  # of fringes, in steps of the table
-_NARROW = 1 / 8  # disc over distance from which a sine is its angle
-_WING_SUNS = 12.0  # distance from an edge's normal, in radii of the disc, from which cot² needs no average
+_ROW_BLUR = 0.5  # blur of fringes, in steps of the table
+_NARROW = 1 / 8  # ratio of disc to distance below which a sine equals its angle
+_WING_SUNS = 12.0  # distance from an edge's normal, in radii of the disc, beyond which cot² needs no average
 _WING_STEP, _WING_POINTS, _WING_PLACES = 0.05, 1200, 241
 _STRAIGHT_PER_MM = 1e-9
 _LEAST_CORNER_RAD = 1e-3
-_LONE_BAND_NM = 150.0  # half width of what a single band stands for, as in vbnfault.core.spectra
-_HAT_POINTS = 17  # of either side
+_LONE_BAND_NM = 150.0  # half width of a single band, as in vbnfault.core.spectra
+_HAT_POINTS = 17  # wavelengths on either side of a band's node
 _HANKEL_POINTS = 4096
 _DISC_POINTS = 32
 _GRAIN_POINTS = 2048
-_OUTER_STEPS = 16  # of the table's angles that are taken together outside of the frame
+_OUTER_STEPS = 16  # angles of the table that are averaged for the flux outside the frame
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class StopDefects:
-    """Opaque dust and scratches on the stop, float64 arrays in mm of its own plane: grains' diameters, and
-    scratches' lengths, widths and directions from +x towards +y. Raises InputError where they do not fit."""
+    """Describe opaque dust and scratches on the stop, float64 arrays in mm of the plane of the stop.
+
+    Grains have diameters. Scratches have lengths, widths and directions from +x towards +y. Raises InputError for
+    values that are out of range or arrays of unequal length.
+    """
 
     grain_diameter_mm: F64 = field(default_factory=lambda: np.zeros(0))
     scratch_length_mm: F64 = field(default_factory=lambda: np.zeros(0))
@@ -77,6 +83,7 @@ class StopDefects:
     scratch_angle_rad: F64 = field(default_factory=lambda: np.zeros(0))
 
     def __post_init__(self) -> None:
+        """Convert all fields to float64 arrays and check them."""
         for f in fields(self):
             values = np.asarray(getattr(self, f.name), dtype=np.float64)
             object.__setattr__(self, f.name, values)
@@ -90,7 +97,7 @@ class StopDefects:
                 raise InputError(f"{name}: {found} values: must be as many as scratch_length_mm, {count}")
 
     def scaled(self, factor: float) -> StopDefects:
-        """With every length multiplied."""
+        """Return the defects with every length multiplied by a factor."""
         return StopDefects(
             grain_diameter_mm=self.grain_diameter_mm * factor,
             scratch_length_mm=self.scratch_length_mm * factor,
@@ -112,11 +119,12 @@ def fraunhofer_psf(
     across: int = 256,
     defects: StopDefects | None = None,
 ) -> tuple[F64, float]:
-    """Point spread function of a stop, sum 1, float64[samples, samples], and its pitch on the sensor in mm.
+    """Return the point spread function of a stop for a point source, and its pitch on the sensor in mm.
 
-    x to the right, y down, the middle at [samples // 2, samples // 2]. `across` samples span the entrance pupil, so
-    the pitch is λ f `across` / (`samples` · diameter), and the frame reaches `across` / 2 times λ f / diameter from
-    the middle. Defects, in mm of the stop's plane, are spread evenly over it.
+    The function is float64[samples, samples] with sum 1: x to the right, y down, the middle at [samples // 2,
+    samples // 2]. `across` samples span the entrance pupil. The pitch is λ f `across` / (`samples` · diameter), and
+    the frame reaches `across` / 2 times λ f / diameter from the middle. Defects, in mm of the stop's plane, are
+    distributed evenly over it.
     """
     if not 8 <= across <= samples:
         raise InputError(f"across = {across}: must be from 8 to samples = {samples}")
@@ -129,7 +137,7 @@ def fraunhofer_psf(
         _block(open_, x, y, defects.scaled(1 / stop.semi_diameter_mm), pitch)
     mask = np.zeros((samples, samples))
     mask[:across, :across] = open_.reshape(across, _SUPERSAMPLING, across, _SUPERSAMPLING).mean(axis=(1, 3))
-    # the mean over a sample has dimmed the far field
+    # averaging over a sample dims the far field: divide by its transform
     turn = np.pi * np.fft.fftshift(np.fft.fftfreq(samples)) + 1e-12
     mean = np.sin(turn) / (_SUPERSAMPLING * np.sin(turn / _SUPERSAMPLING))
     power = np.abs(np.fft.fftshift(np.fft.fft2(mask)) / (mean * mean[:, None])) ** 2
@@ -137,15 +145,16 @@ def fraunhofer_psf(
 
 
 def _block(open_: F64, x: NDArray[Any], y: NDArray[Any], defects: StopDefects, pitch: float) -> None:
-    """Close what defects cover, with shares of a sample at their rims."""
+    """Close the area of a pupil that defects cover, in place; samples at their rims are closed partly."""
 
     def within(half: float, distance: F64) -> F64:
+        """Return the fraction of each sample that lies within a half width."""
         inside = np.minimum(distance + pitch / 2, half) - np.maximum(distance - pitch / 2, -half)
         return np.clip(inside / pitch, 0, 1)
 
     grains, scratches = defects.grain_diameter_mm, defects.scratch_length_mm
     count = len(grains) + len(scratches)
-    # a sunflower's seeds keep clear of each other and of the rim, the longest in the middle
+    # a sunflower's arrangement keeps defects apart and off the rim; the longest lies in the middle
     seed = np.argsort(np.argsort(-np.concatenate([grains, scratches]), kind="stable"), kind="stable")
     radius = 0.85 * np.sqrt(seed / max(count, 1))
     places = radius * np.cos(seed * _GOLDEN_RAD), radius * np.sin(seed * _GOLDEN_RAD)
@@ -165,23 +174,23 @@ def _block(open_: F64, x: NDArray[Any], y: NDArray[Any], defects: StopDefects, p
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Starburst:
-    """What diffraction at the stop of a lens spreads over the sensor, averaged over the Sun's disc.
+    """Compute the light that diffraction at a stop spreads over the sensor, averaged over the Sun's disc.
 
-    Holds from an Airy radius beyond the limb on, for a σ of 3 λ / entrance pupil or more (against the transform of
-    the sampled pupil: means 1 %, spikes 2 %). Tables for a set of wavelengths and a pitch are made at the first
-    frame that asks for them, in some tenths of a second, and kept for the next frames.
+    It is valid from an Airy radius beyond the limb outwards, and for a σ of 3 λ / entrance pupil or more. Its
+    difference from the transform of the sampled pupil is 1 % for means and 2 % for spikes. The first frame with a
+    set of wavelengths and a pitch computes tables, in some tenths of a second; the next frames reuse them.
 
     Attributes
     ----------
     efl_mm, pupil_radius_mm
-        Of the lens, the radius that of the paraxial entrance pupil's circle.
+        Focal length, and radius of the paraxial entrance pupil's circle.
     sun_radius_rad
         Angular radius of the disc.
     stop, defects
-        The stop's outline, and what lies on it in mm of the entrance pupil.
+        Outline of the stop, and its defects in mm of the entrance pupil.
     radii, angles
-        Size of the polar table: logarithmic in the sine of the distance from the Sun up to 2, and over half a turn,
-        since |A(-k)| = |A(k)|.
+        Size of the polar table. It is logarithmic in the sine of the distance from the Sun, up to 2, and covers
+        half a turn, since |A(-k)| = |A(k)|.
     """
 
     efl_mm: float
@@ -202,20 +211,22 @@ class Starburst:
         *,
         half_width_nm: float | None = None,
     ) -> F32:
-        """Irradiance on the sensor over the Sun's at the entrance, for a transmission of 1, float32[band, y, x].
+        """Return irradiance on the sensor over the Sun's at the entrance, float32[band, y, x], without losses.
 
         Parameters
         ----------
         sun_xy_mm
             Image of the Sun's centre, from the middle of the frame, x to the right and y down (the lens's own x and
-            y); it may lie outside the frame. Within the Sun's own image the value is that next to it: the direct
-            image, which is drawn elsewhere, outshines it.
+            y). It may lie outside the frame. Within the Sun's own image the result continues the value just outside
+            it; the direct image, which is drawn elsewhere, outshines it.
         wavelength_nm
-            Band nodes, float64[band], rising. A band is a hat that ends at its neighbours.
+            Nodes of the bands, float64[band], rising. The weight of a band is a triangle that ends at its
+            neighbours.
         shape, pitch_mm
             (height, width) of the frame in pixels, and their pitch.
         half_width_nm
-            Of the hats; None: up to the neighbours, and 150 nm, flat, for a single band; 0: monochromatic.
+            Half width of the triangles. None: up to the neighbours, or 150 nm of constant weight for a single band.
+            0: monochromatic.
         """
         import cv2
 
@@ -230,14 +241,14 @@ class Starburst:
         x = ((np.arange(width) - (width - 1) / 2) * pitch_mm / f).astype(np.float32)[None, :]
         out = np.empty((len(mix), height, width), dtype=np.float32)
         part = np.empty((len(tables), min(_STRIP, height), width), dtype=np.float32)
-        for top in range(0, height, _STRIP):  # what a strip needs stays in the cache
+        for top in range(0, height, _STRIP):  # the arrays of a strip stay in the cache
             strip = out[:, top : top + _STRIP]
             rows = np.arange(top, top + strip.shape[1])
             y = ((rows - (height - 1) / 2) * pitch_mm / f).astype(np.float32)[:, None]
             cosine = 1 / np.sqrt((1 + x * x) + y * y)
             du, dv = x * cosine - sun_u, y * cosine - sun_v
             apart = du * du + dv * dv
-            # next to a foreshortened Sun u can lie within the circle that the table takes for the disc
+            # beside a foreshortened Sun, u can lie inside the circle that the table assumes for the disc
             apart = np.maximum(apart, np.float32(nearest**2))
             cosine *= cosine
             gain = cosine * cosine * np.float32(sun_cos / f**2) / (apart - np.float32(sigma**2))
@@ -263,14 +274,17 @@ class Starburst:
         *,
         half_width_nm: float | None = None,
     ) -> F64:
-        """Return the flux on the unbounded sensor plane outside of the frame, over the Sun's irradiance at the
-        entrance and for a transmission of 1, float64[band] in mm². Parameters as in `image`."""
+        """Return the flux on the sensor plane outside the frame, float64[band] in mm².
+
+        It is divided by the Sun's irradiance at the entrance, and holds for a transmission of 1. Parameters as in
+        `image`.
+        """
         wavelength_nm = np.atleast_1d(np.asarray(wavelength_nm, dtype=np.float64))
         tables, mix = self._tables(wavelength_nm, pitch_mm, half_width_nm)
         sine = self._sines(pitch_mm)
         slope = np.asarray(sun_xy_mm, dtype=np.float64) / self.efl_mm
         half = self.angles // math.gcd(self.angles, _OUTER_STEPS)
-        # means over steps of the angle: spikes are narrower than these, but not so the frame
+        # average over steps of the angle: spikes are narrower than a step, but the frame is much wider
         means = tables[..., :-1].reshape(len(tables), len(sine), half, -1).mean(axis=-1, dtype=np.float64)
         angle = (np.arange(2 * half) + 0.5) * np.pi / half
         half_slope = (shape[1] / 2 * pitch_mm / self.efl_mm, shape[0] / 2 * pitch_mm / self.efl_mm)
@@ -283,13 +297,16 @@ class Starburst:
         return np.asarray(mix @ flux / np.sqrt(1 + slope @ slope))
 
     def _sines(self, pitch_mm: float) -> F64:
-        """Rows of the table: |u - u_sun|, float64[radius]."""
+        """Return |u - u_sun| of the rows of the table, float64[radius]."""
         nearest = self.sun_radius_rad + 0.9 * pitch_mm / self.efl_mm
         return np.asarray(np.geomspace(nearest, _FARTHEST, self.radii))
 
     def _tables(self, wavelength_nm: F64, pitch_mm: float, half_width_nm: float | None) -> tuple[F32, F32]:
-        """(θ² - σ²) |A|² / λ² in mm², float32[table, radius, angle + 1], the last angle that of the first, and the
-        share of each table in each band, float32[band, table]."""
+        """Return tables of (θ² - σ²) |A|² / λ² in mm², and the weight of each table in each band.
+
+        The tables are float32[table, radius, angle + 1], where the last angle repeats the first; the weights are
+        float32[band, table].
+        """
         key = (tuple(wavelength_nm), pitch_mm, half_width_nm)
         tables = self._memo.get(key)
         if tables is None:
@@ -310,10 +327,14 @@ def starburst(
     radii: int = 224,
     angles: int = 4096,
 ) -> Starburst:
-    """The starburst of a lens, with `defects` in mm of the stop's plane.
+    """Return the starburst of a lens, with `defects` in mm of the stop's plane.
 
-    `radii` × `angles` is the size of its tables; the default serves frames up to 1500 pixels wide. Raises
-    InputError.
+    `radii` × `angles` is the size of its tables; the default serves frames up to 1500 pixels wide.
+
+    Raises
+    ------
+    InputError
+        A value is out of range.
     """
     if not 0 < sun_radius_rad < 0.5:
         raise InputError(f"sun_radius_rad = {sun_radius_rad!r}: must be above 0 and below 0.5")
@@ -334,8 +355,12 @@ def starburst(
 
 @dataclass(frozen=True, kw_only=True)
 class _Edge:
-    """One blade's edge of the pupil, or the whole of a round rim: lengths and directions of normals of its pieces
-    from the edge's middle, the normal's turn from there to its end, and the curvature there."""
+    """Describe one blade's edge of the pupil, or the whole of a round rim, in pieces.
+
+    `length_mm` and `normal_rad` are lengths and directions of the normals of the pieces; the normal in the middle
+    of the edge has direction 0. `end_rad` is the direction at its end, and `end_curvature_per_mm` the curvature
+    there.
+    """
 
     count: int
     length_mm: F64
@@ -345,6 +370,7 @@ class _Edge:
 
 
 def _edge(stop: Surface, pupil_radius_mm: float) -> _Edge:
+    """Return the edge of a stop, scaled to the pupil."""
     count = max(stop.blades, 1)
     half = np.pi / count
     angle = np.linspace(-half, half, _EDGE_POINTS)
@@ -362,7 +388,7 @@ def _edge(stop: Surface, pupil_radius_mm: float) -> _Edge:
 
 
 def _hats(nodes_nm: F64, half_width_nm: float | None) -> tuple[tuple[F64, F64], ...]:
-    """Wavelengths and weights, of sum 1, that stand for each band."""
+    """Return the wavelengths that stand for each band, and their weights of sum 1."""
     if half_width_nm is None and len(nodes_nm) == 1:
         nm = np.linspace(nodes_nm[0] - _LONE_BAND_NM, nodes_nm[0] + _LONE_BAND_NM, 2 * _HAT_POINTS)
         return ((nm, np.full(len(nm), 1 / len(nm))),)
@@ -382,9 +408,9 @@ def _hats(nodes_nm: F64, half_width_nm: float | None) -> tuple[tuple[F64, F64], 
 
 
 def _polar(burst: Starburst, sine: F64, bands: Sequence[tuple[F64, F64]], pixel_rad: float) -> F32:
-    """(θ² - σ²) |A|² / λ², float32[band, radius, angle + 1]; `pixel_rad` is the rms width of a pixel."""
+    """Return (θ² - σ²) |A|² / λ², float32[band, radius, angle + 1]; `pixel_rad` is the rms width of a pixel."""
     edge = _edge(burst.stop, burst.pupil_radius_mm)
-    order = 2 * np.arange(burst.angles // 2 + 1)  # of the angle; the odd ones of both ends of a normal cancel
+    order = 2 * np.arange(burst.angles // 2 + 1)  # odd orders cancel, since light goes both ways along a normal
     excess = sine**2 - burst.sun_radius_rad**2
     chord = _chord(sine, burst.sun_radius_rad, pixel_rad, burst.angles)
     grains = _grains(burst, sine, bands, pixel_rad)
@@ -398,7 +424,7 @@ def _polar(burst: Starburst, sine: F64, bands: Sequence[tuple[F64, F64]], pixel_
     nodes, corners = mm[:1], np.zeros((1, len(sine), int(repeats.sum())), dtype=np.complex128)
     opening = np.pi / edge.count - edge.end_rad
     if burst.stop.blades and opening > _LEAST_CORNER_RAD:
-        # all that the wavelength changes in a corner is the width of Fresnel's integral
+        # in a corner the wavelength changes only the width of Fresnel's integral
         if edge.end_curvature_per_mm > _STRAIGHT_PER_MM:
             nodes = np.linspace(mm[0], mm[-1], min(len(mm), 3))
         powers = _corner(burst, sine, opening, edge.end_curvature_per_mm, nodes, pixel_rad)
@@ -421,13 +447,16 @@ def _polar(burst: Starburst, sine: F64, bands: Sequence[tuple[F64, F64]], pixel_
 
 
 def _fewest(tables: F32) -> tuple[F32, F32]:
-    """As few tables as will do, and the share of each in each band: a rim goes with λ and corners with λ², so bands
-    differ in more only where defects show fringes."""
+    """Return as few tables as represent all bands, and the weight of each table in each band.
+
+    Light of a rim grows with λ and that of corners with λ². Bands therefore differ in more than these two only
+    where defects show fringes.
+    """
     sample = tables[:, ::2, ::5].reshape(len(tables), -1).astype(np.float64)
     sample /= np.maximum(sample.mean(axis=0), 1e-30)
     _, mix = np.linalg.eigh(sample @ sample.T)
     mix = mix[:, ::-1]
-    for count in range(1, len(tables) // 2):  # with more it is no gain
+    for count in range(1, len(tables) // 2):  # more tables would save nothing
         kept = mix[:, :count]
         if np.abs(sample - kept @ (kept.T @ sample)).max() < _SHARE_LOST:
             return np.tensordot(kept.T.astype(np.float32), tables, 1), kept.astype(np.float32)
@@ -435,8 +464,10 @@ def _fewest(tables: F32) -> tuple[F32, F32]:
 
 
 def _chord(sine: F64, sun_rad: float, pixel_rad: float, angles: int) -> F64:
-    """Fourier coefficients over the angle, of even order, of (2 / π σ²) √(σ² - θ² sin²u), float64[radius, order]:
-    a spike's cross profile, blurred by a pixel and by a step of the table."""
+    """Return Fourier coefficients of a spike's cross profile over the angle, float64[radius, order].
+
+    Orders are even. The profile is (2 / π σ²) √(σ² - θ² sin²u), blurred by a pixel and by a step of the table.
+    """
     from scipy.special import j1
 
     step = np.pi / angles
@@ -452,22 +483,24 @@ def _chord(sine: F64, sun_rad: float, pixel_rad: float, angles: int) -> F64:
 
 
 def _blur(angles: int) -> F64:
-    """Coefficients of a blur by (1, 2, 1) / 4, float64[order]: what is narrower than a step must not ring."""
+    """Return the coefficients of a blur by (1, 2, 1) / 4, float64[order], so that narrow features do not ring."""
     return np.asarray(np.cos(np.arange(angles // 2 + 1) * np.pi / angles) ** 2)
 
 
 def _corner(
     burst: Starburst, sine: F64, opening: float, curvature_per_mm: float, wavelength_mm: F64, pixel_rad: float
 ) -> F64:
-    """k⁴ |A|² of one corner less what its edges' normals send, float64[wavelength, radius, angle], the angle from
-    the corner's direction; the normals of its two edges lie `opening` to either side.
+    """Return k⁴ |A|² of one corner without the light along its edges' normals, float64[wavelength, radius, angle].
 
-    cot ψ and cot² ψ, with the Fresnel integral where edges are bent, are integrals over the coherence y of the disc
-    and a pixel of radius σ' together: with q = θ sin ψ / σ', τ = θ / (2 ρ σ'² k₀) and δ = q₁ + q₂,
+    The angle counts from the direction of the corner; the normals of its two edges lie `opening` to either side.
 
-        1/q → ∫ μ(y) sin(qy + τy²) / (1 + 2τy/δ) dy,     1/q² → -∫ μ(y) [sin(qy + τy²) - sin(qy)] / (τy) dy;
+    Averaging turns cot ψ and cot² ψ, with the Fresnel integral where edges are bent, into integrals over the
+    coherence μ(y) of the disc and a pixel, which together have the radius σ'. With q = θ sin ψ / σ', τ = θ / (2 ρ
+    σ'² k₀) and δ = q₁ + q₂,
 
-    where the corner closes, δ → 0, the former cancels the latter.
+        1/q → ∫ μ(y) sin(qy + τy²) / (1 + 2τy/δ) dy,     1/q² → -∫ μ(y) [sin(qy + τy²) - sin(qy)] / (τy) dy.
+
+    Where the corner closes (δ → 0), the first cancels the second.
     """
     from scipy.special import j1
 
@@ -476,12 +509,12 @@ def _corner(
     y = (np.arange(_WING_POINTS) + 0.5) * _WING_STEP
     q = np.linspace(0, _WING_SUNS, _WING_PLACES)
     s = y * burst.sun_radius_rad / radius
-    # without the last factor, a twentieth of a radius, the limb would leave a cusp
+    # the last factor blurs by a twentieth of a radius; without it the limb would leave a cusp
     coherence = 2 * j1(s) / s * np.exp(-((y * pixel_rad / radius) ** 2 + (0.05 * y) ** 2) / 2) * _WING_STEP
     sines, cosines = np.sin(y[:, None] * q), np.cos(y[:, None] * q)
 
     def integral(of: NDArray[Any]) -> F64:
-        """Im ∫ μ(y) of(y) exp(iqy) dy at -q and q."""
+        """Return Im ∫ μ(y) of(y) exp(iqy) dy at -q and q."""
         odd, even = (coherence * of.real) @ sines, (coherence * of.imag) @ cosines
         return np.concatenate([(even - odd)[..., :0:-1], even + odd], axis=-1)
 
@@ -519,14 +552,16 @@ def _corner(
 def _add_scratches(
     tables: F32, chord: F64, burst: Starburst, sine: F64, bands: Sequence[tuple[F64, F64]], pixel_rad: float
 ) -> None:
-    """Add scratches to the tables of `_polar`. A scratch is two edges, and their fringes 4 sin²(kw / 2) =
-    2 - 2 cos(kw) are wide enough to be seen; its spike is widened by its length, whose autocorrelation is a
-    triangle."""
+    """Add scratches to the tables of `_polar`, in place.
+
+    A scratch is two edges, whose fringes 4 sin²(kw / 2) = 2 - 2 cos(kw) are wide enough to be seen. Its finite
+    length, whose autocorrelation is a triangle, widens the spike.
+    """
     defects = burst.defects
     order = 2 * np.arange(burst.angles // 2 + 1)
     blur = _ROW_BLUR * np.log(sine[1] / sine[0])
     mean_k0_per_mm = 2e6 * np.pi / np.mean([nm @ weight for nm, weight in bands])
-    # Gauss's points of the disc seen from its side, weighted by 1/k² there
+    # Gauss points of the disc projected onto a line, weighted by 1/k²
     turn = np.arange(1, _DISC_POINTS + 1) * np.pi / (_DISC_POINTS + 1)
     offset = burst.sun_radius_rad * np.cos(turn)
     share = np.sin(turn) ** 2 / (sine[:, None] + offset) ** 2
@@ -546,8 +581,11 @@ def _add_scratches(
 
 
 def _grains(burst: Starburst, sine: F64, bands: Sequence[tuple[F64, F64]], pixel_rad: float) -> F64:
-    """|A|² / λ² of all grains, float64[band, radius]: the Hankel transform of their autocorrelations, averaged over
-    the band, times the coherence of the disc."""
+    """Return |A|² / λ² of all grains, float64[band, radius].
+
+    It is the Hankel transform of the grains' autocorrelations, averaged over the band, times the coherence of the
+    disc.
+    """
     from scipy.fft import fht
     from scipy.ndimage import gaussian_filter1d
     from scipy.special import j1

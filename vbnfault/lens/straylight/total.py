@@ -1,26 +1,26 @@
-"""All light of the Sun that a lens sends astray, in one radiometric unit: ghosts, starburst, glare and veil.
+"""Add up all straylight of the Sun in one radiometric unit: ghosts, starburst, glare and veil.
 
-Energy. A lens admits the flux P = E☉ T A cos θ of the Sun, T its transmittance along the axis and A the area of the
-beam that passes. What is diffracted at the stop (starburst), scattered by surfaces (glare) and by mount, barrel and
-edges (veil) is part of P and is taken from the direct image:
+Energy. A lens admits the flux P = E☉ T A cos θ of the Sun, where T is its transmittance along the axis and A the
+area of the beam that passes. The light that the stop diffracts (starburst), that surfaces scatter (glare), and that
+mount, barrel and edges scatter (veil) is part of P. It is subtracted from the direct image:
 
     direct image = P - starburst - glare - veil,
 
-each on the whole plane of the sensor, inside and outside of the frame. Ghosts are part of the light that surfaces
-reflect, which T leaves out already. Only where the image path has lost less than the ghosts hold (a thin lens
-without losses) is the rest of them taken from the direct image too.
+each on the whole sensor plane, inside and outside the frame. Ghosts are part of the light that surfaces reflect,
+which T already excludes. Only where the image path has lost less than the ghosts contain (a thin lens without
+losses), the rest of the ghosts is subtracted from the direct image too.
 
-An extended scene follows the same rule as far as it shows: its image loses the fraction that surfaces, mount,
-barrel and edges scatter, and all of that returns as a veil. Its diffraction and its ghosts stay in the image, where
-the point spread has the one and neighbouring light outshines the others.
+An extended scene follows the same rule where its effect is visible: the image loses the fraction that surfaces,
+mount, barrel and edges scatter, and all of it returns as a veil. Diffraction and ghosts of the scene stay in its
+image: the point spread contains the diffraction, and neighbouring light outshines the ghosts.
 
-Veil. The walls behind the lens, lit by the light that passes, act as a small Lambertian source on the axis at a
+Veil. The walls behind the lens, lit by the transmitted light, act as a small Lambertian source on the axis at a
 focal length from the sensor (assumed):
 
     E(x, y) = v · Φ / (π f²) · cos⁴θ(x, y),
 
 for a flux Φ that enters; ∫ E dA = v Φ over the unbounded plane. Under a uniform sky the fraction v is then the
-veiling glare index that this veil alone gives in the middle (ISO 9358:1994): the sky's flux is π L A T and the
+veiling glare index in the middle that this veil alone gives (ISO 9358:1994): the sky's flux is π L A T and the
 irradiance of its image L A T / f². That standard's index of photographic lenses lies between about 0.5 and 5 %.
 """
 
@@ -48,8 +48,17 @@ VEIL_FRACTION = 0.01  # assumed: a lens with blackened edges and a baffled barre
 
 @dataclass(frozen=True, kw_only=True)
 class Cleanliness:
-    """What scatters: rms `roughness_nm` of every surface with Harvey's knee and slope (at 550 nm), and particles on
-    every surface in air by IEST-STD-CC1246 (`level` 0: none)."""
+    """Describe what scatters on the surfaces of a lens.
+
+    Attributes
+    ----------
+    roughness_nm
+        Rms roughness of every surface.
+    level
+        Particles on every surface in air, as a level of IEST-STD-CC1246; 0: none.
+    knee, slope
+        Harvey's knee (at 550 nm) and slope of the scatter by roughness.
+    """
 
     roughness_nm: float = 1.0
     level: float = 0.0
@@ -59,7 +68,7 @@ class Cleanliness:
 
 @dataclass(frozen=True, kw_only=True)
 class Baffle:
-    """A tube in front of the lens; none with length 0."""
+    """Describe a tube in front of the lens; length 0 means none."""
 
     length_mm: float = 0.0
     radius_mm: float = 0.0
@@ -67,17 +76,17 @@ class Baffle:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Straylight:
-    """Straylight of the Sun on a sensor, and what it takes from the direct image.
+    """Hold the Sun's straylight on a sensor, and what it takes from the direct image.
 
     Attributes
     ----------
     ghosts, starburst, glare, veil
         Irradiance on the sensor over the Sun's at the entrance, float32[band, y, x] each.
     direct_fraction
-        float64[band] in [0, 1]: what is left of the Sun's direct image.
+        float64[band] in [0, 1]: fraction that remains of the Sun's direct image.
     beyond_mm2
-        float64[band]: flux of starburst, glare and veil that meets the sensor's plane outside of the frame, over
-        the Sun's irradiance at the entrance.
+        float64[band]: flux of starburst, glare and veil on the sensor plane outside the frame, over the Sun's
+        irradiance at the entrance.
     """
 
     ghosts: F32
@@ -89,7 +98,7 @@ class Straylight:
 
     @property
     def total(self) -> F32:
-        """The sum of the four."""
+        """Return the sum of ghosts, starburst, glare and veil."""
         return np.asarray(self.ghosts + self.starburst + self.glare + self.veil)
 
 
@@ -113,31 +122,38 @@ def straylight(
     admitted_mm2: float | None = None,
     beam_fraction: float = 1.0,
 ) -> Straylight:
-    """Straylight of a Sun at an angle from the axis and an azimuth (0: +x, right; 90°: +y, down).
+    """Return the straylight of a Sun at an angle from the axis and an azimuth (0: +x, right; 90°: +y, down).
 
     Parameters
     ----------
     lens
-        At its final size; its sensor's middle lies on the axis.
+        At its final size; the sensor's middle lies on the axis.
     model
         Of the ghosts: 'traced' or 'paraxial'.
     wavelength_nm
         float64[band], nodes of the bands.
+    shape, pitch_mm
+        (height, width) of the sensor in pixels, and their pitch.
     sun_xy_mm
-        The Sun's own image; default: f tan θ along the azimuth.
+        Position of the Sun's direct image; default: f tan θ along the azimuth.
+    reflections
+        2, or 4 to include ghosts of four reflections.
     coating_loss
-        Share of the coatings' area that is gone, in [0, 1]: it raises ghosts. What the light straight through loses
-        is left to whoever darkens the image by it.
+        Fraction of the coatings' area that is gone, in [0, 1]; it raises ghosts. The loss of transmitted light is
+        not applied here, but by whoever darkens the image.
     veil_fraction
-        Fraction v of the light that mount, barrel and edges scatter onto the sensor's plane, in [0, 1].
+        Fraction v of the light that mount, barrel and edges scatter onto the sensor plane, in [0, 1].
     transmittance
         float64[band], T of the path that forms the direct image; default: that of `lens` along the axis.
     admitted_mm2
         A cos θ of the same path; default: the paraxial entrance pupil times cos θ.
     beam_fraction
-        A over its value on the axis: of the stop that the Sun lights past the rims.
+        A over its value on the axis: the fraction of the stop that the Sun lights past the rims.
 
-    Raises InputError.
+    Raises
+    ------
+    InputError
+        A value is out of range.
     """
     nodes = tuple(float(v) for v in np.atleast_1d(wavelength_nm))
     optics = first_order(lens)
@@ -153,7 +169,7 @@ def straylight(
                 sun_deg,
                 length_mm=baffle.length_mm,
                 radius_mm=baffle.radius_mm,
-                # of a tube narrower than the lens, its own opening is the entrance
+                # a tube narrower than the lens is itself the entrance
                 entrance_radius_mm=min(lens.surfaces[0].semi_diameter_mm, baffle.radius_mm),
             )
         )
@@ -164,7 +180,7 @@ def straylight(
     cos4 = cos4_map(shape, optics.efl_mm / pitch_mm)
 
     burst = _starburst(lens, sun_radius_rad)
-    # diffraction takes its fraction of what passes the stop, and at most all of it
+    # diffraction scales with the light that passes the stop, and cannot exceed it
     rays, rays_beyond = (
         burst.image(sun_xy_mm, np.array(nodes), shape, pitch_mm),
         burst.beyond_mm2(sun_xy_mm, np.array(nodes), shape, pitch_mm),
@@ -184,7 +200,7 @@ def straylight(
         L=clean.knee,
         S=clean.slope,
     )
-    # of light that is scattered several times, each surface has its part of what is left
+    # each surface scatters only the light that the others have left (`kept_of_single`)
     gain = lit * passed / own * scattering.kept_of_single
     glare = scattering.image(sun_xy_mm, shape, pitch_mm)
     glare *= gain[:, None, None].astype(np.float32) * cos4
@@ -197,7 +213,7 @@ def straylight(
 
     ghosts = made.worn(coating_loss).image(sun_deg, azimuth_deg) * np.float32(lit)
     direct = passed * admitted
-    # what the image path has lost is there for ghosts; the rest of them comes from the direct light
+    # light that the image path has lost feeds the ghosts; the direct light supplies the rest
     unpaid = np.maximum(_flux_mm2(ghosts, pitch_mm) - (1 - passed) * admitted, 0)
     beyond = rays_beyond + glare_beyond + veil_beyond
     taken = sum(_flux_mm2(layer, pitch_mm) for layer in (rays, glare, veil)) + beyond + unpaid
@@ -216,8 +232,10 @@ def straylight(
 def scene_veil_fraction(
     lens: Prescription, wavelength_nm: F64, *, cleanliness: Cleanliness, veil_fraction: float
 ) -> F64:
-    """Return the fraction of an extended scene's light that leaves its image for the veil, float64[band]: what
-    surfaces scatter, and of the rest the fraction of mount, barrel and edges."""
+    """Return the fraction of an extended scene's light that leaves its image for the veil, float64[band].
+
+    Surfaces scatter the first part of it; mount, barrel and edges scatter `veil_fraction` of the rest.
+    """
     scattered = scattered_fraction(
         lens,
         wavelength_nm,
@@ -232,17 +250,19 @@ def scene_veil_fraction(
 def veil_of(flux: F64, shape: tuple[int, int], focal_length_px: float) -> F32:
     """Return the veil of a flux that leaves the image, float32[y, x, channel] per pixel.
 
-    `flux` float64[channel], in any unit; the veil's sum over the unbounded plane is the flux, so that the part
-    outside of the frame is lost to its walls.
+    `flux` is float64[channel] in any unit. The veil's sum over the unbounded plane is the flux; the part outside
+    the frame is lost to the walls.
     """
     per_px = cos4_map(shape, focal_length_px) * np.float32(1 / (np.pi * focal_length_px**2))
     return np.asarray(per_px[..., None] * flux.astype(np.float32))
 
 
 def _flux_mm2(irradiance: F32, pitch_mm: float) -> F64:
+    """Return the flux of an irradiance, float64[band]."""
     return np.asarray(irradiance.sum(axis=(1, 2), dtype=np.float64) * pitch_mm**2)
 
 
 @lru_cache(maxsize=4)
 def _starburst(lens: Prescription, sun_radius_rad: float) -> Starburst:
+    """Return the starburst of a lens; it is cached with its tables."""
     return starburst(lens, sun_radius_rad=sun_radius_rad)
