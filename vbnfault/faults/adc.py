@@ -107,5 +107,6 @@ class ConverterFault(Fault):
 
 
 def _steepness(quadratic: float, cubic: float) -> float:
-    """Return the largest slope that both non-linearities can take from the curve, times the range in DN."""
+    """Return the largest slope, in DN over the whole range, that both non-linearities may subtract from the curve.
+    """
     return 4 * abs(quadratic) + 6 * math.sqrt(3) * abs(cubic)

@@ -305,6 +305,7 @@ class Fault:
     lens_of_thin_camera: ClassVar[str] = ""
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
+        """Register the model. Raise TypeError if its steps are out of order or its name is in use."""
         super().__init_subclass__(**kwargs)
         if "model" not in cls.__dict__:
             return  # a base class without a model name is not registered
@@ -322,6 +323,7 @@ class Fault:
         known[cls.model] = cls
 
     def __post_init__(self) -> None:
+        """Check and convert every field."""
         # this checks a fault made in Python like one from a scene file, and accepts plain numbers and pairs
         for f in dataclasses.fields(self):
             where = f"{self.fault}.{f.name}"
@@ -451,6 +453,7 @@ class LensFault(Fault):
     )
 
     def validate(self) -> None:
+        """Raise an error if the named lens cannot be loaded."""
         if self.lens:
             load_lens(self.lens)
 

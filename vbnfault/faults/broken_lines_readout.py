@@ -81,6 +81,7 @@ class ReadoutBrokenLines(Fault):
     node_chance: float = number(0.1, limits=(0, 1), doc="chance that one of several output nodes is lost; assumed")
 
     def validate(self) -> None:
+        """Raise ValueError if the weights of all kinds are 0."""
         if not any(getattr(self, f"{kind}_weight") for kind in KINDS):
             raise ValueError("the weights of all kinds of lines are 0: at least one must be above")
 

@@ -44,6 +44,7 @@ class GaussianDegradation(Fault):
     scale_with_resolution: bool = flag(True, doc="filter size refers to a 1024 px wide image and scales with it")
 
     def validate(self) -> None:
+        """Raise ValueError if the interval contains no odd size."""
         if _odd_bounds(self.filter_size_px)[0] > _odd_bounds(self.filter_size_px)[1]:
             raise ValueError(f"filter_size_px = {list(self.filter_size_px)}: no odd size within")
 

@@ -78,6 +78,7 @@ class GaussianDust(Fault):
     scale_with_resolution: bool = flag(True, doc="grain size refers to a 1024 px wide image and scales with it")
 
     def validate(self) -> None:
+        """Raise ValueError if a drawn covariance matrix might not be positive definite."""
         largest = max(abs(v) for v in self.sigma_xy)
         if largest**2 >= self.sigma_xx.lo * self.sigma_yy.lo:
             raise ValueError(
@@ -124,7 +125,8 @@ class GaussianDust(Fault):
 
 
 def _grains(factor: NDArray[np.float32]) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-    """Return the flat indices of pixels under grains and their transmission, float32[n, 1]: a tenth of the frame."""
+    """Return the flat indices of pixels under grains, a tenth of the frame, and their transmission float32[n, 1].
+    """
     at = np.flatnonzero(factor < 1)
     return at, factor.ravel()[at, None]
 

@@ -94,6 +94,7 @@ class DefocusedDust(LensFault):
     )
 
     def validate(self) -> None:
+        """Raise ValueError if the lens lacks the surface."""
         if self.lens and self.surface >= (rows := len(load_lens(self.lens).surfaces)):
             raise ValueError(f"surface = {self.surface}: {self.lens} has rows 0 to {rows - 1}")
 

@@ -51,6 +51,7 @@ class TextureOverwriting(Fault):
     strength: float = number(0.5, limits=(0, 1), doc="weight of the texture in a mixture")
 
     def validate(self) -> None:
+        """Raise ValueError if the texture cannot be read or the channels are invalid."""
         if not self.texture_file:
             raise ValueError("texture_file is missing: name a PNG or TIFF texture")
         try:

@@ -99,6 +99,7 @@ class TextureStraylight(Fault):
         return float(self.mask_level_dn)
 
     def validate(self) -> None:
+        """Raise ValueError if there are fewer textures than flares or an index is not a whole number."""
         choices = int(self.index.hi) - int(self.index.lo) + 1
         if self.count.lo > choices:
             raise ValueError(f"count = {list(self.count)}: index leaves {choices} textures, each used once")

@@ -97,6 +97,7 @@ class _LensStraylight(LensFault):
     )
 
     def validate(self) -> None:
+        """Raise ValueError if `reflections` is neither 2 nor 4, or a baffle has no radius."""
         super().validate()
         if self.reflections not in (2, 4):
             raise ValueError(f"reflections = {self.reflections}: must be 2 or 4")
