@@ -107,6 +107,5 @@ class ConverterFault(Fault):
 
 
 def _steepness(quadratic: float, cubic: float) -> float:
-    """Return the largest slope, in DN over the whole range, that both non-linearities may subtract from the curve.
-    """
+    """Return the largest slope, in DN over the whole range, that both non-linearities can take from the curve."""
     return 4 * abs(quadratic) + 6 * math.sqrt(3) * abs(cubic)

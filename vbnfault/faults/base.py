@@ -149,7 +149,7 @@ class FaultContext:
         float64[2]: pixel position of the Sun's centre. It may lie outside the frame. None if the Sun is behind the
         camera.
     sun_direction_C
-        float64[3]: unit vector towards the Sun in C.
+        float64[3]: unit vector towards the Sun in the camera frame C (x right, y down, z along the boresight).
     sun_irradiance_W_m2_nm, wavelength_nm
         float64[band]: irradiance of the Sun at the camera, and the nodes of its bands.
     sun_visible_fraction
@@ -178,7 +178,7 @@ class FaultContext:
 
     @property
     def sun_before_camera(self) -> NDArray[np.float64] | None:
-        """Return a vector towards the Sun in C with z > 0, float64[3]; not normalised.
+        """Return a vector towards the Sun in the camera frame C with z > 0, float64[3]; not normalised.
 
         If no direction is known, the vector is computed from the Sun's pixel position by a pinhole model. Return
         None if the Sun is behind the camera or unknown.

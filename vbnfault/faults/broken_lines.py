@@ -50,7 +50,7 @@ class TextureBrokenLines(Fault):
     )
 
     def validate(self) -> None:
-        """Raise ValueError if more lines of one kind are fixed than there are lines at least."""
+        """Raise ValueError if the only fixed number exceeds the smallest total number of lines."""
         fixed = {"white_count": self.white_count, "black_count": self.black_count}
         given = {name: value for name, value in fixed.items() if value is not None}
         if len(given) == 1:

@@ -125,8 +125,7 @@ class GaussianDust(Fault):
 
 
 def _grains(factor: NDArray[np.float32]) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-    """Return the flat indices of pixels under grains, a tenth of the frame, and their transmission float32[n, 1].
-    """
+    """Return the flat indices of pixels under grains and their transmission, float32[n, 1]."""
     at = np.flatnonzero(factor < 1)
     return at, factor.ravel()[at, None]
 

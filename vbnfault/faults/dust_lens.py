@@ -50,7 +50,7 @@ F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
 _DRAWN, _WINDOW = -1, -2
-_NODES = 129  # nodes along each side of the frame, for a search of shadows
+_NODES = 129  # nodes along each side of the frame at which the code searches for shadows
 _COARSEST = 8  # largest distance in px between the nodes at which shadows are computed
 _ERROR = 3e-4  # largest error of the interpolation between them, as a fraction of the light
 _OFFSETS: F64 = np.geomspace(1e-5, 2.0, 257)

@@ -29,7 +29,7 @@ F64 = NDArray[np.float64]
 
 SIZE_PX = 384
 FILL = 0.9  # radius of a flare's outline over half the side of the texture
-STEP = 16  # of 65535: coarse enough that the files stay small, far finer than one DN
+STEP = 16  # step of the stored values (65535 = 1): makes small files, and is far finer than one DN
 
 # Change of a ghost's size in R, G, B per unit of dispersion.
 _SPREAD = (1.0, 0.0, -1.0)
