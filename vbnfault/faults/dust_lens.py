@@ -4,21 +4,23 @@ A pixel loses the fraction of its beam's footprint that grains cover (`lens.foot
 
     τ = 1 - Σ (1 - t_g) · |grain ∩ footprint| / |footprint|.
 
-A grain of diameter d in front of a pupil of diameter D, at a distance z from it, gives a shadow f (D + d) / z wide.
-Its plateau is f |D - d| / z wide and (d/D)² deep. A grain at a height s above the sensor, in a cone of f-number N,
-gives a shadow d + s/N wide. Grains are discs perpendicular to the axis, with the transmission t_g. All channels
-lose the same fraction.
+A grain of diameter d in front of a pupil of diameter D, at a distance z from it, gives a shadow f (D + d) / z wide,
+with f the focal length. Its plateau is f |D - d| / z wide and (d/D)² deep. A grain at a height s above the sensor,
+in a cone of f-number N, gives a shadow d + s/N wide. Grains are discs perpendicular to the axis, with the
+transmission t_g. All channels lose the same fraction.
 
-In the Sun a grain glows. It diffracts as much light as it blocks, like a disc of its radius a:
+In the Sun a grain glows. It diffracts as much light as it blocks, like a disc of its radius a, at the angle θ from
+the Sun's direction and for k = 2π/λ:
 
     dσ/dΩ = (1 - t_g) k² a⁴ [J1(x) / x]²,   x = k a sin θ.
 
 This is averaged over radii within ±50 %, because real grains do not show the rings of a disc. The outside of a
-grain reflects like a sphere, (1 - t_g) a²/4 R((π - θ)/2). A pixel whose beam crosses the grain receives the
-irradiance
+grain reflects like a sphere, (1 - t_g) a²/4 R((π - θ)/2), with R the reflectance at an angle of incidence. A pixel
+whose beam crosses the grain receives the irradiance
 
     E = E☉ T dσ/dΩ dΩ/dA
 
+from the Sun's irradiance E☉ through the transmittance T of the lens, with dΩ/dA the solid angle per area of sensor
 (the form of Peterson 2004, Proc. SPIE 5178, 184, for a single grain). Other pixels receive nothing from the grain.
 Grains on the front are therefore bright discs near the Sun, with the outlines of their shadows.
 
