@@ -1,4 +1,4 @@
-"""Fault classes and their models; see `base` for the contract."""
+"""Define the fault classes and their models; `base` states the contract that every model follows."""
 
 from .base import (
     FAULT_AXIS,

@@ -1,9 +1,13 @@
-"""A converter that fails: stuck bits, codes that never come, and steps that are no longer even.
+"""Simulate a damaged analogue-to-digital converter: stuck bits, missing codes and uneven steps.
 
-A bit of the output stuck at 0 or 1 folds the scale (a stuck most significant bit halves it); a run of missing codes
-makes a step, its signals at the code below; integral and differential non-linearity (IEEE 1241) grow with dose.
-Differential non-linearity is the device's own pattern, larger. Sizes are shares of the converter's range, so that
-they mean the same for 8 and 14 bits; all of them are assumed.
+- A bit of the output that is stuck at 0 or 1 folds the scale. A stuck most significant bit halves it.
+- A run of missing codes makes a step in the curve: signals in the run get the code below it, or the code above it
+  if the run begins at 0.
+- Integral and differential non-linearity (IEEE 1241) grow with dose. The differential non-linearity keeps the
+  device's own pattern and becomes larger.
+
+All sizes but the differential non-linearity, which is in LSB, are fractions of the converter's range, so they mean
+the same for 8 and for 14 bits. All of them are assumed.
 """
 
 from __future__ import annotations
@@ -18,13 +22,14 @@ from ..camera import Camera
 from ..detector.readout import ReadoutSpec
 from .base import Fault, FaultContext, Interval, Params, bounds, with_sensor
 
-# Non-linearity may use this share of what keeps the curve rising: 4 |quadratic| + 6√3 |cubic| below the range.
+# The curve rises everywhere if 4 |quadratic| + 6√3 |cubic| is below the range. Non-linearity may use up to this
+# fraction of the range.
 _STEEPEST = 0.9
 
 
 @dataclass(frozen=True, kw_only=True)
 class ConverterFault(Fault):
-    """Stuck bits, missing codes and non-linearity of the converter."""
+    """Add stuck bits, missing codes and non-linearity to the converter of a mosaic's readout."""
 
     fault = "adc"
     model = "converter"
@@ -51,10 +56,14 @@ class ConverterFault(Fault):
     )
 
     def draw(self, context: FaultContext, rng: np.random.Generator) -> Params:
-        """`stuck_bits` (bit, value), the run of missing codes, and what the non-linearities gain."""
+        """Return `stuck_bits` as (bit, value) pairs, the run of missing codes, and the added non-linearities.
+
+        `missing_from` and `missing_count` are in codes, `inl_quadratic_dn` and `inl_cubic_dn` in DN of the
+        converter.
+        """
         detector: Any = context.camera.detector
         readout: ReadoutSpec = detector.sensor.readout
-        # a converter of few bits has none of the less significant ones
+        # a converter with few bits lacks the less significant ones of the range
         low, high = (min(int(p), readout.bits - 1) for p in self.stuck_place)
         places = rng.permutation(np.arange(low, high + 1))[: self.stuck_count.integer(rng)]
         values = rng.integers(0, 2, len(places))
@@ -78,7 +87,7 @@ class ConverterFault(Fault):
         }
 
     def alter(self, camera: Camera, params: Params) -> Camera:
-        """The camera with this converter."""
+        """Return the camera with this converter."""
         detector: Any = camera.detector
         readout: ReadoutSpec = detector.sensor.readout
         first = params["missing_from"]
@@ -98,4 +107,5 @@ class ConverterFault(Fault):
 
 
 def _steepness(quadratic: float, cubic: float) -> float:
+    """Return the largest slope, in DN over the whole range, that both non-linearities can take from the curve."""
     return 4 * abs(quadratic) + 6 * math.sqrt(3) * abs(cubic)

@@ -1,10 +1,13 @@
-"""Banding: interference that the signal picks up while it is read, and noise that a row shares.
+"""Simulate banding: interference that couples into the signal during the readout, and row noise.
 
-A converter of the power supply or a clock of the platform couples into the analogue chain; read in time, a sinusoid
-becomes stripes (`detector.readout`: banding over the readout time). Where a line is converted at once, as by the
-column converters of a CMOS sensor, they lie along rows; where pixel after pixel passes one node, they are slanted.
-Correlated double sampling lets frequency f pass by |2 sin(π f interval)|; the amplitude here is what is left
-in the picture, since interference may also enter behind it. Row noise is in the noise alone, of its own variates.
+A converter of the power supply or a clock of the platform couples into the analogue chain. A sinusoid in time
+becomes stripes in the image (`detector.readout`: banding over the readout time). The stripes follow the rows if a
+line is converted at once, as by the column converters of a CMOS sensor. They are slanted if the pixels pass one
+node one after the other.
+
+Correlated double sampling multiplies the amplitude at frequency f by |2 sin(π f interval)|. The drawn amplitude is
+the one left in the image, because interference may also enter after the double sampling. Row noise is part of the
+noise only, and has variates of its own.
 """
 
 from __future__ import annotations
@@ -19,13 +22,13 @@ from ..camera import Camera
 from ..detector.readout import ReadoutSpec
 from .base import Fault, FaultContext, Interval, Params, bounds, flag, number, with_sensor
 
-# Of what double sampling leaves: below it, the amplitude before it is not made any larger.
+# Least factor of double sampling that is compensated. Near its zeros the amplitude would otherwise diverge.
 _LEAST_PASSED = 1e-3
 
 
 @dataclass(frozen=True, kw_only=True)
 class InterferenceBanding(Fault):
-    """Periodic interference and row noise in the readout."""
+    """Add periodic interference and row noise to the readout of a mosaic."""
 
     fault = "banding"
     model = "interference"
@@ -62,7 +65,10 @@ class InterferenceBanding(Fault):
     )
 
     def draw(self, context: FaultContext, rng: np.random.Generator) -> Params:
-        """Amplitude and row noise in electrons as they show, frequency, phase, and the times of pixel and line."""
+        """Return amplitude and row noise in electrons, frequency, phase, and the times per pixel and per line.
+
+        The amplitude is the one left in the image, after double sampling.
+        """
         detector: Any = context.camera.detector
         sensor, readout = detector.sensor, detector.sensor.readout
         dn_e = readout.white_e / 255
@@ -84,7 +90,7 @@ class InterferenceBanding(Fault):
         }
 
     def alter(self, camera: Camera, params: Params) -> Camera:
-        """The camera whose readout picks up the interference."""
+        """Return the camera whose readout has this interference and row noise."""
         detector: Any = camera.detector
         readout: ReadoutSpec = detector.sensor.readout
         passed = replace(readout, banding_amplitude_e=1.0, banding_frequency_hz=params["frequency_hz"])

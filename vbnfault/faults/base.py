@@ -1,8 +1,11 @@
-"""The `Fault` contract and its registry. A new fault is one file beside this one, plus one test.
+"""Define the contract of a fault (`Fault`), its fields, its context and the registry of all models.
 
 A fault *class* (`dust_on_optics`) has one or more *models* (`gaussian`). A model is a frozen, keyword-only
-dataclass derived from `Fault` that names its class and model; being defined registers it. Its fields are the
-keys of the scene file: an `Interval` is drawn from, anything else is fixed.
+dataclass derived from `Fault`. It states its class and its name, and the definition of the dataclass registers it.
+Its fields are the keys of the scene file: a value is drawn from each `Interval` field, and all other fields are
+fixed.
+
+To add a fault, write one file beside this one and one test.
 """
 
 from __future__ import annotations
@@ -29,7 +32,7 @@ from ..lens.footprint import DEFAULT_LENS, ImageFrame
 Params = dict[str, Any]
 T = TypeVar("T")
 
-# The `fault` axis of the dataset begins with the six classes of the paper, in this order.
+# The `fault` axis of the dataset begins with the six classes of Gallon et al., in this order.
 FAULT_AXIS = (
     "dust_on_optics",
     "broken_pixels",
@@ -39,9 +42,9 @@ FAULT_AXIS = (
     "optics_degradation",
 )
 
-# Order of effects: it belongs to the class, so mixed models cannot change it. Optical effects act on the
-# noise-free photo-electrons, readout effects on the digital image; hence a defect is never blurred and a
-# flare never covers a broken line. Classes not named here follow, in the order of their names.
+# The order of the effects belongs to the class, so it holds for every mixture of models. Optical effects act on the
+# noise-free photo-electrons. Readout effects act later, on the mosaic or on the digital image. Hence no defect is
+# blurred, and no flare covers a broken line. Classes not named here follow in alphabetical order.
 PHYSICAL_ORDER = (
     "straylight",
     "dust_on_optics",
@@ -62,32 +65,39 @@ REFERENCE_WIDTH_PX = 1024
 
 
 class Interval(NamedTuple):
-    """Closed bounds of a uniform draw. `lo == hi` is a fixed value."""
+    """Hold the closed bounds of a uniform draw. If `lo == hi`, the value is fixed."""
 
     lo: float
     hi: float
 
     def uniform(self, rng: np.random.Generator, size: int | None = None) -> Any:
-        """Uniform float(s) in [lo, hi]."""
+        """Return one uniform float in [lo, hi], or float64[size] if `size` is given."""
         value = rng.uniform(self.lo, self.hi, size)
         return float(value) if size is None else value
 
     def power_law(self, uniform: NDArray[np.float64], exponent: float) -> NDArray[np.float64]:
-        """Values in [lo, hi], of uniform numbers in [0, 1], of which the number above v falls as v^-exponent."""
+        """Return values in [lo, hi] with density ∝ v^-(exponent + 1), one for each uniform number in [0, 1].
+
+        Far below `hi`, the number of values above v therefore falls as v^-exponent. Exponent 0 gives a density that
+        is uniform in log v. `lo` must be above 0.
+        """
         if abs(exponent) < 1e-9:
             return np.asarray(self.lo * (self.hi / self.lo) ** uniform)
         a, b = self.lo**-exponent, self.hi**-exponent
         return np.asarray((a + (b - a) * uniform) ** (-1 / exponent))
 
     def integer(self, rng: np.random.Generator) -> int:
-        """A uniform integer in lo … hi, both included."""
+        """Return one uniform integer in [lo, hi], both bounds included."""
         return int(rng.integers(int(self.lo), int(self.hi), endpoint=True))
 
 
 def bounds(
     lo: float, hi: float, *, limits: tuple[float, float], doc: str, unit: str = "", integer: bool = False
 ) -> Any:
-    """A field drawn uniformly from [lo, hi]; a scene may set other bounds, or one value, within `limits`."""
+    """Declare a field that is drawn uniformly from [lo, hi].
+
+    A scene may set other bounds, or one fixed value, within `limits`.
+    """
     return field(
         default=Interval(lo, hi),
         metadata={"kind": "bounds", "limits": limits, "doc": doc, "unit": unit, "integer": integer},
@@ -97,7 +107,7 @@ def bounds(
 def number(
     default: float | None, *, limits: tuple[float, float], doc: str, unit: str = "", integer: bool = False
 ) -> Any:
-    """A fixed number within `limits`; with default None it may be left out."""
+    """Declare a fixed number within `limits`. If its default is None, a scene may leave it out."""
     return field(
         default=default,
         metadata={"kind": "number", "limits": limits, "doc": doc, "unit": unit, "integer": integer},
@@ -105,34 +115,49 @@ def number(
 
 
 def flag(default: bool, *, doc: str) -> Any:
-    """A fixed true or false."""
+    """Declare a fixed true or false."""
     return field(default=default, metadata={"kind": "flag", "doc": doc})
 
 
 def choice(default: str, options: tuple[str, ...], *, doc: str) -> Any:
-    """One of `options`."""
+    """Declare a string that must be one of `options`."""
     return field(default=default, metadata={"kind": "choice", "options": options, "doc": doc})
 
 
 def text(default: str, *, doc: str) -> Any:
-    """A fixed string, such as a path."""
+    """Declare a fixed string, such as a path."""
     return field(default=default, metadata={"kind": "text", "doc": doc})
 
 
 def rows(columns: Mapping[str, tuple[float, float]], *, doc: str) -> Any:
-    """A list of tables with the given numeric columns and their limits; empty by default (then drawn)."""
+    """Declare a list of tables with the given numeric columns and their limits.
+
+    The list is empty by default; the model then draws these values.
+    """
     return field(default=(), metadata={"kind": "rows", "columns": dict(columns), "doc": doc})
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class FaultContext:
-    """What a fault may know of the sample it acts on.
+    """Describe the sample that a fault acts on.
 
-    `sun_xy_px` float64[2], the pixel position of the Sun's centre (it may lie outside the frame; None behind
-    the camera), `sun_direction_C` unit float64[3], `sun_irradiance_W_m2_nm` float64[band] at the camera,
-    with `wavelength_nm` its nodes, `sun_visible_fraction` in [0, 1], `sun_angular_radius_rad` of its disc. All None
-    where a user's own image is injected. `coating_loss` is the share of the coatings' area that is gone, if another
-    fault of the sample has worn them.
+    The fields of the Sun are None where they are unknown, for example for a user's own image without a pose.
+
+    Attributes
+    ----------
+    sun_xy_px
+        float64[2]: pixel position of the Sun's centre. It may lie outside the frame. None if the Sun is behind the
+        camera.
+    sun_direction_C
+        float64[3]: unit vector towards the Sun in the camera frame C (x right, y down, z along the boresight).
+    sun_irradiance_W_m2_nm, wavelength_nm
+        float64[band]: irradiance of the Sun at the camera, and the nodes of its bands.
+    sun_visible_fraction
+        Fraction of the Sun's disc that is not covered, in [0, 1].
+    sun_angular_radius_rad
+        Angular radius of the Sun's disc.
+    coating_loss
+        Fraction of the coatings' area that another fault of the sample has removed, in [0, 1].
     """
 
     camera: Camera
@@ -143,18 +168,21 @@ class FaultContext:
     sun_visible_fraction: float | None = None
     sun_angular_radius_rad: float | None = None
     coating_loss: float = 0.0
-    # not an init field: `dataclasses.replace` must not hand results for one frame to another
+    # `init=False`, because `dataclasses.replace` must not copy results of one frame to another
     _memo: dict[Any, Any] = field(default_factory=dict, init=False, repr=False)
 
     @property
     def shape(self) -> tuple[int, int]:
-        """(height, width) in pixels."""
+        """Return (height, width) in pixels."""
         return self.camera.height_px, self.camera.width_px
 
     @property
     def sun_before_camera(self) -> NDArray[np.float64] | None:
-        """Return a vector towards the Sun in C with z > 0, float64[3]; of a picture without a pose, by the Sun's
-        pixel. None where the Sun is behind the camera or unknown."""
+        """Return a vector towards the Sun in the camera frame C with z > 0, float64[3]; not normalised.
+
+        If no direction is known, the vector is computed from the Sun's pixel position by a pinhole model. Return
+        None if the Sun is behind the camera or unknown.
+        """
         direction = self.sun_direction_C
         if direction is None and self.sun_xy_px is not None:
             fx, fy, cx, cy = self.camera.intrinsics
@@ -164,12 +192,12 @@ class FaultContext:
 
     @property
     def scale(self) -> float:
-        """Factor from the pixels of a 1024 px wide image to this camera's."""
+        """Return the factor that converts pixels of a 1024 px wide image to pixels of this camera."""
         return self.camera.width_px / REFERENCE_WIDTH_PX
 
     @property
     def frame(self) -> ImageFrame:
-        """The camera as beams through its lens know it."""
+        """Return the lens and the image size of the camera, as ray tracing needs them."""
         return ImageFrame(
             lens=self.camera.lens,
             width_px=self.camera.width_px,
@@ -178,19 +206,22 @@ class FaultContext:
         )
 
     def once(self, name: str, params: Params, make: Callable[[], T]) -> T:
-        """`make()` once per (name, params object) and sample: apply and footprint share what it costs."""
+        """Return `make()`, computed once for each name and params object of this context.
+
+        `apply` and `footprint` share the result, so an expensive computation runs only once.
+        """
         key = (name, id(params))
         if key not in self._memo:
-            # params is kept too, so that its id cannot be taken over by another object
+            # the entry holds params, so that no other object can get the same id
             self._memo[key] = (params, make())
         result: T = self._memo[key][1]
         return result
 
 
 def times(array: NDArray[np.float32], factor: NDArray[Any]) -> NDArray[np.float32]:
-    """Planes float32[y, x, channel] times a factor for each channel [channel], or for each pixel [y, x]."""
+    """Return planes float32[y, x, channel] times a factor for each channel [channel] or for each pixel [y, x]."""
     if factor.ndim == 1:
-        # OpenCV wants a number for each of four
+        # OpenCV needs a scalar of four numbers
         out = cv2.multiply(array, (*factor.tolist(), 0.0, 0.0, 0.0)[:4])
     else:
         out = cv2.multiply(array, cv2.merge([factor] * array.shape[2]))
@@ -198,13 +229,13 @@ def times(array: NDArray[np.float32], factor: NDArray[Any]) -> NDArray[np.float3
 
 
 def plus(array: NDArray[np.float32], other: NDArray[np.float32]) -> NDArray[np.float32]:
-    """The sum of planes float32[y, x, channel] of one shape."""
+    """Return the sum of two arrays float32[y, x, channel] of the same shape."""
     return np.asarray(cv2.add(array, other)).reshape(array.shape)
 
 
 Q = TypeVar("Q", Electrons, Charge, Offset, RawMosaic, RGBI)
 
-# Where a fault may act. The steps between the first and the last are those of a detector with a mosaic.
+# The steps at which a fault may act, in order. All but the first and the last need a detector with a mosaic.
 STEPS = ("electrons", *MOSAIC_STEPS, "rgbi")
 QUANTITIES: dict[str, type[Quantity]] = {
     "electrons": Electrons,
@@ -219,22 +250,43 @@ QUANTITIES: dict[str, type[Quantity]] = {
 
 @dataclass(frozen=True, kw_only=True)
 class Fault:
-    """Base of all fault models; every hook is the identity by default.
+    """Define the hooks of all fault models. By default every hook leaves its input unchanged.
 
-    Class attributes of a model: `fault` (its class), `model`, `step` (what `apply` receives: `electrons`, the
-    expected photo-electrons on the sensor; of a mosaic `light`, the photo-electrons to which each pixel responds,
-    `pixels`, all electrons expected in it, `charge`, those collected, `offsets`, what is added to them, or `raw`;
-    or `rgbi`), `later_steps` (of a mosaic: others at which it acts too, in order, by `apply_at`), `needs_mosaic`
-    (also True where `alter` changes such a detector), `needs_ccd` (True: no effect on CMOS), `localised` (False
-    where the footprint is about the whole frame), `needs_sun`, `effect_mask` (True: the mask is the effect rule,
-    not the footprint), `soft_layer` (the name of the optional layer that `soft` gives, which ends as one of
-    `quantities.SOFT_KINDS`; "": none), `lens_of_thin_camera` (the packaged lens that it follows light through
-    where the camera has a thin lens and no other is named: its contents belong to the scene's identity; "": none).
+    A model sets these class attributes:
 
-    Which light has met the lens's rims is told by two more, for models of the step `electrons`. `adds_past_rims`
-    (True: the light it adds has met them; `apply` puts it into `Electrons.past_rims` where the quantity has that
-    plane, and into `array` where it has not). `at_rims` (True: it acts at the rims, so that light past them loses
-    only what `passed_to_sun` says). All other models act on all light alike (`act`).
+    fault, model
+        The names of its class and of the model.
+    step
+        The quantity that `apply` receives. `electrons`: the expected photo-electrons on the sensor. `rgbi`: the
+        digital image. For a detector with a mosaic also: `light`, the photo-electrons to which each pixel responds;
+        `pixels`, all electrons expected in it; `charge`, the electrons collected; `offsets`, the values added to
+        them; `raw`, the raw digital numbers.
+    later_steps
+        Further steps of a mosaic at which the model acts by `apply_at`, in order. `steps` holds `step` and these.
+    needs_mosaic
+        True if the model needs a detector with a mosaic, also if only `alter` changes that detector.
+    needs_ccd
+        True if the model has no effect on CMOS.
+    localised
+        False if the footprint covers about the whole frame.
+    needs_sun
+        True if the model needs the Sun's position.
+    effect_mask
+        True if the mask holds the pixels that change (see `effect_level_dn`) instead of the footprint.
+    soft_layer
+        Name of the optional layer that `soft` returns. It ends like one of `quantities.SOFT_KINDS`. "": no layer.
+    lens_of_thin_camera
+        Packaged lens that the model traces if the camera has a thin lens and the scene names no lens. Its contents
+        belong to the scene's identity. "": none.
+
+    Two more attributes, for the step `electrons`, say which light has already passed the lens's rims. A model with
+    neither acts in the same manner on all light (see `act`).
+
+    adds_past_rims
+        True if the light that the model adds has passed the rims. `apply` adds it to `Electrons.past_rims` if the
+        quantity has that plane, else to `array`.
+    at_rims
+        True if the model acts at the rims. Light past the rims is then only multiplied by `passed_to_sun`.
     """
 
     fault: ClassVar[str]
@@ -253,13 +305,14 @@ class Fault:
     lens_of_thin_camera: ClassVar[str] = ""
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
+        """Register the model. Raise TypeError if its steps are out of order or its name is in use."""
         super().__init_subclass__(**kwargs)
         if "model" not in cls.__dict__:
-            return  # an intermediate base
+            return  # a base class without a model name is not registered
         cls.steps = (cls.step, *cls.later_steps)
         if cls.steps != tuple(step for step in STEPS if step in cls.steps):
             raise TypeError(f"fault model {cls.fault}/{cls.model} acts at {cls.steps}, not in the order of {STEPS}")
-        # light and finished pictures have paths of their own, which know of one step of a fault
+        # the code for the steps electrons and rgbi handles only one step of each fault
         if cls.later_steps and not set(MOSAIC_STEPS).issuperset(cls.steps):
             raise TypeError(f"fault model {cls.fault}/{cls.model}: only steps of a mosaic may be several")
         if cls.soft_layer:
@@ -270,33 +323,34 @@ class Fault:
         known[cls.model] = cls
 
     def __post_init__(self) -> None:
-        # a fault made in Python is checked like one from a scene file, and may give plain numbers and pairs
+        """Check and convert every field."""
+        # this checks a fault made in Python like one from a scene file, and accepts plain numbers and pairs
         for f in dataclasses.fields(self):
             where = f"{self.fault}.{f.name}"
             object.__setattr__(self, f.name, _parse(getattr(self, f.name), f, where))
 
     def draw(self, context: FaultContext, rng: np.random.Generator) -> Params:
-        """Plain, JSON-able parameters, complete enough to draw the fault again."""
+        """Return the drawn parameters: plain, JSON-able data, sufficient to inject the same fault again."""
         return {}
 
     def alter(self, camera: Camera, params: Params) -> Camera:
-        """The camera with this fault, where the fault is an instrument parameter."""
+        """Return the camera with this fault, if the fault changes a parameter of the instrument."""
         return camera
 
     def inform(self, context: FaultContext, params: Params) -> FaultContext:
-        """What other faults of the sample know of it, where this one changes what they meet."""
+        """Return the context for the other faults of the sample, if this fault changes what they act on."""
         return context
 
     def apply(self, quantity: Q, params: Params, context: FaultContext) -> Q:
-        """The quantity of `step` with this fault; the input is not modified."""
+        """Return the quantity of `step` with this fault. The input is not modified."""
         return quantity
 
     def apply_at(self, step: str, quantity: Q, params: Params, context: FaultContext) -> Q:
-        """Return the quantity of one of `steps` with this fault; a model with `later_steps` overrides it."""
+        """Return the quantity of one of `steps` with this fault. A model with `later_steps` overrides this hook."""
         return self.apply(quantity, params, context)
 
     def act_at(self, step: str, params: Params, context: FaultContext) -> Callable[[Any], Any]:
-        """Return a function of the array of a step inside a detector with a mosaic: what the fault makes of it."""
+        """Return a function that applies the fault to the array of one step in a detector with a mosaic."""
         kind: Any = QUANTITIES[step]
 
         def act(array: Any) -> Any:
@@ -305,33 +359,38 @@ class Fault:
         return act
 
     def passed_to_sun(self, params: Params, context: FaultContext) -> float:
-        """Return the fraction of the light past the rims that a fault `at_rims` lets pass: of the Sun's beam, what
-        clears the openings that the fault has moved. The rims have had their part of that light before."""
+        """Return the fraction of the light past the rims that a fault with `at_rims` lets pass.
+
+        This is the fraction of the Sun's beam that clears the openings which the fault has moved. The loss at the
+        lens's own rims is already in that light, so it does not count here.
+        """
         return 1.0
 
     def footprint(self, params: Params, context: FaultContext) -> NDArray[np.bool_] | None:
-        """bool[y, x], where the fault sits; None where the class has no footprint."""
+        """Return the pixels at which the fault acts, bool[y, x]; None if the class has no footprint."""
         return None
 
     def soft(self, params: Params, context: FaultContext) -> NDArray[np.float32]:
-        """Return how strongly the fault acts, float32[y, x], in the unit of its `soft_layer`."""
+        """Return how strongly the fault acts on each pixel, float32[y, x], in the unit of its `soft_layer`."""
         raise NotImplementedError(f"{self.fault}/{self.model} has no soft layer")
 
     def defects(self, params: Params, context: FaultContext) -> NDArray[np.uint8] | None:
-        """Kinds of defects in a mosaic's pixels, uint8[y, x]: bits of `quantities.DEFECTS`; None where it makes
-        none."""
+        """Return the kinds of defects that the fault makes in the mosaic, uint8[y, x]; None if it makes none.
+
+        The values are bits of `quantities.DEFECTS`.
+        """
         return None
 
     def validate(self) -> None:
-        """Raise ValueError with one sentence where fields contradict each other."""
+        """Raise ValueError with one sentence if fields contradict each other."""
 
     @property
     def effect_level_dn(self) -> float:
-        """The change of the noise-free 8 bit image, in DN, from which a pixel counts for a mask by effect."""
+        """Return the least change of the noise-free 8 bit image, in DN, that counts for a mask by effect."""
         return 1.0
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain data that `from_dict` turns back into an equal fault."""
+        """Return plain data from which `from_dict` makes an equal fault."""
         plain: dict[str, Any] = {"model": self.model}
         for f in dataclasses.fields(self):
             value = getattr(self, f.name)
@@ -339,15 +398,16 @@ class Fault:
                 value = [value.lo, value.hi]
             elif f.metadata.get("kind") == "rows":
                 value = [dict(row) for row in value]
-            if value is not None:  # TOML has no null: a number left out stays out
+            if value is not None:  # TOML has no null, so a missing number stays out
                 plain[f.name] = value
         return plain
 
 
 def intensity_dn(electrons: NDArray[np.float32], camera: Camera) -> NDArray[np.float32]:
-    """Return the intensity of electrons float32[y, x, channel], float32[y, x]: linear, 255 is white, nothing clips.
+    """Return the intensity of electrons float32[y, x, channel], as float32[y, x] in DN of 255.
 
-    It is that of the pixels without a colour filter where the camera has such, else the luminance of R, G and B.
+    The scale is linear, 255 is white, and nothing is clipped. If the camera has pixels without a colour filter (W),
+    the intensity is their signal. Otherwise it is the luminance of R, G and B.
     """
     channels, white_e = camera.detector.channels, np.asarray(camera.detector.white_e, dtype=np.float32)
     if "W" in channels:
@@ -360,10 +420,10 @@ def intensity_dn(electrons: NDArray[np.float32], camera: Camera) -> NDArray[np.f
 
 
 def act(fault: Fault, light: Electrons, params: Params, context: FaultContext) -> Electrons:
-    """Return the light after an optical fault, with what has met the lens's rims kept apart.
+    """Return the light after an optical fault; light that has passed the lens's rims stays in its own plane.
 
-    A fault that acts on all light alike, which may clip or blur it, gives the plane past the rims what it makes of
-    all light less what it makes of the rest.
+    A fault that acts on all light may clip it, so the two planes cannot be treated one by one. The plane past the
+    rims becomes the result for all light minus the result for the light before the rims, at least 0.
     """
     if fault.adds_past_rims:
         past = np.zeros_like(light.array) if light.past_rims is None else light.past_rims
@@ -379,7 +439,10 @@ def act(fault: Fault, light: Electrons, params: Params, context: FaultContext) -
 
 @dataclass(frozen=True, kw_only=True)
 class LensFault(Fault):
-    """Base of the models that follow light through a prescription: the faults of a frame share its lens."""
+    """Add the key `lens` to the models that trace light through a prescription.
+
+    All such faults of a frame use the same lens, unless the scene names another one.
+    """
 
     lens_of_thin_camera: ClassVar[str] = DEFAULT_LENS
 
@@ -390,6 +453,7 @@ class LensFault(Fault):
     )
 
     def validate(self) -> None:
+        """Raise an error if the named lens cannot be loaded."""
         if self.lens:
             load_lens(self.lens)
 
@@ -398,8 +462,11 @@ _REGISTRY: dict[str, dict[str, type[Fault]]] = {}
 
 
 def registry() -> dict[str, dict[str, type[Fault]]]:
-    """Fault class → model → type, classes in dataset order; models in the order of their modules, this package's
-    first, whichever was imported before: the first one is a class's default."""
+    """Return fault class → model → type, with the classes in the order of the dataset.
+
+    The models of a class are sorted by module, those of this package first, whatever the order of imports. The
+    first model is the default of its class.
+    """
     _import_all()
     package = __package__ or ""
 
@@ -412,6 +479,7 @@ def registry() -> dict[str, dict[str, type[Fault]]]:
 
 @lru_cache(maxsize=1)
 def _import_all() -> None:
+    """Import every module of this package, so that all its models are registered."""
     import importlib
     import pkgutil
 
@@ -421,25 +489,30 @@ def _import_all() -> None:
 
 
 def _ordered(names: Any, order: tuple[str, ...]) -> list[str]:
+    """Return the names without duplicates: first those in `order`, then the others in alphabetical order."""
     present = set(names)
     return [n for n in order if n in present] + sorted(present - set(order))
 
 
 def dataset_order(names: Any) -> list[str]:
-    """Names in the order of the dataset's `fault` axis."""
+    """Return the names in the order of the dataset's `fault` axis."""
     return _ordered(names, FAULT_AXIS)
 
 
 def physical_order(names: Any) -> list[str]:
-    """Names in the order in which the effects act."""
+    """Return the names in the order in which the effects act."""
     return _ordered(names, PHYSICAL_ORDER)
 
 
 def from_dict(fault_class: str, table: Mapping[str, Any], *, source: str) -> Fault:
-    """Build one fault from its scene-file table `[faults.<fault_class>]`.
+    """Build one fault from its table `[faults.<fault_class>]` in the scene file.
 
-    `model` may be left out where the class has one model only (or one called `texture`/the first defined).
-    Raises `InputError` naming `source`, the key, the value and the allowed range.
+    If the table has no key `model`, the first model of the class in `registry` is used.
+
+    Raises
+    ------
+    InputError
+        Names `source`, the key, its value and the allowed range.
     """
     models = registry().get(fault_class)
     where = f"{source}: faults.{fault_class}"
@@ -466,20 +539,23 @@ def from_dict(fault_class: str, table: Mapping[str, Any], *, source: str) -> Fau
 
 
 def _hint(word: str, known: Any) -> str:
+    """Return the most similar known word as a suggestion, or the list of all known words."""
     close = difflib.get_close_matches(word, list(known), n=1)
     return f" (did you mean {close[0]}?)" if close else f"; known: {', '.join(known)}"
 
 
 def _is_number(value: Any) -> bool:
+    """Return whether the value is a finite number; booleans do not count."""
     if isinstance(value, bool) or not isinstance(value, int | float):
         return False
     try:
         return math.isfinite(value)
-    except OverflowError:  # a whole number beyond the range of floats
+    except OverflowError:  # an integer beyond the range of floats
         return False
 
 
 def _parse(value: Any, f: dataclasses.Field[Any], where: str) -> Any:
+    """Return the value of one field after its check; `where` names the key in an InputError."""
     meta = f.metadata
     kind = meta["kind"]
     if kind == "number" and value is None and f.default is None:
@@ -518,6 +594,7 @@ def _parse(value: Any, f: dataclasses.Field[Any], where: str) -> Any:
 
 
 def _parse_rows(value: Any, columns: Mapping[str, tuple[float, float]], where: str) -> tuple[Any, ...]:
+    """Return a list of tables after its check, as a tuple of dicts."""
     if not isinstance(value, list | tuple):
         raise InputError(f"{where} = {shown(value)}: must be a list of tables with keys {', '.join(columns)}")
     for i, row in enumerate(value):
@@ -530,7 +607,7 @@ def _parse_rows(value: Any, columns: Mapping[str, tuple[float, float]], where: s
 
 
 def json_schema() -> dict[str, Any]:
-    """JSON Schema of the `faults` table, from the fields of every registered model."""
+    """Return the JSON Schema of the `faults` table, made from the fields of every registered model."""
     classes: dict[str, Any] = {}
     for fault_class, models in registry().items():
         options = []
@@ -544,6 +621,7 @@ def json_schema() -> dict[str, Any]:
 
 
 def _field_schema(f: dataclasses.Field[Any]) -> dict[str, Any]:
+    """Return the JSON Schema of one field."""
     meta = f.metadata
     unit = f" [{meta['unit']}]" if meta.get("unit") else ""
     schema: dict[str, Any] = {"description": meta["doc"] + unit}
@@ -566,9 +644,9 @@ def _field_schema(f: dataclasses.Field[Any]) -> dict[str, Any]:
 
 
 def scale_by_intensity(rgbi: NDArray[np.uint8], intensity: NDArray[np.float32]) -> NDArray[np.uint8]:
-    """RGBI uint8[..., 4] with I set to `intensity` (0-255) and RGB scaled by the same ratio.
+    """Return RGBI uint8[..., 4] with I set to `intensity` (0-255) and RGB scaled by the same ratio.
 
-    Where I was 0 RGB becomes I; overflow clips per channel (design.md, conventions).
+    Where I was 0, R, G and B become the new I. Values that overflow are clipped in each channel.
     """
     before = rgbi[..., 3]
     dark = before == 0
@@ -583,7 +661,7 @@ def scale_by_intensity(rgbi: NDArray[np.uint8], intensity: NDArray[np.float32]) 
 
 
 def with_sensor(camera: Camera, **changes: Any) -> Camera:
-    """The camera with a sensor that differs, for faults that are numbers of a detector with a mosaic."""
+    """Return the camera with changed sensor fields, for faults that are parameters of a detector with a mosaic."""
     detector: Any = camera.detector
     return dataclasses.replace(
         camera, detector=dataclasses.replace(detector, sensor=dataclasses.replace(detector.sensor, **changes))

@@ -1,11 +1,12 @@
-"""Blooming: wells of a CCD that hold less, and a drain that no longer takes what they spill.
+"""Simulate blooming: a CCD whose wells hold less charge and whose drain no longer removes the excess.
 
-Charge above the full well runs along its column, half either way (`detector.charge.bloom`). Ionising dose shifts
-the voltages that the clocks set in the silicon: a well's barrier sinks, and a drain stays shut (the shares are
-assumed). Raw numbers keep their gain: a full well is no longer white, so bright areas get a flat top that runs out
-along the columns.
+Charge above the full well flows along its column, half of it to either side (`detector.charge.bloom`). Ionising
+dose shifts the voltages in the silicon that the clocks set: the barrier of a well sinks, and a drain stays closed.
+The fractions are assumed. The gain of the raw numbers does not change, so a full well no longer reaches white.
+Bright areas get a flat top that extends along the columns.
 
-It acts on collected charge before the sensor's own overflow, which then finds nothing above its full well.
+The fault acts on the collected charge, before the sensor's own overflow. The sensor then finds no charge above its
+own full well.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from .base import Fault, FaultContext, Interval, Params, bounds
 
 @dataclass(frozen=True, kw_only=True)
 class Overflow(Fault):
-    """A lower full well of all pixels, and antiblooming lost; nothing on CMOS."""
+    """Lower the full well of all pixels and the antiblooming. CMOS sensors are unchanged."""
 
     fault = "blooming"
     model = "overflow"
@@ -38,7 +39,7 @@ class Overflow(Fault):
     )
 
     def draw(self, context: FaultContext, rng: np.random.Generator) -> Params:
-        """Full well in electrons, what the drain takes, and the way of the charge; empty on CMOS."""
+        """Return full well in electrons, drained fraction and direction of the charge; {} on CMOS."""
         detector: Any = context.camera.detector
         share, drained = self.full_well_share.uniform(rng), self.antiblooming.uniform(rng)
         if detector.sensor.architecture == "cmos":
@@ -50,7 +51,7 @@ class Overflow(Fault):
         }
 
     def apply(self, quantity: Any, params: Params, context: FaultContext) -> Any:
-        """Collected electrons after the overflow."""
+        """Return the collected electrons after the overflow."""
         if not params:
             return quantity
         charge = bloom(np.ascontiguousarray(quantity.array), **params)

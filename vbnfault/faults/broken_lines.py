@@ -1,14 +1,15 @@
-"""Broken lines, the paper's model: whole rows or columns dead (0) or saturated (255) in R, G, B and I.
+"""Simulate broken lines as in the paper (Gallon et al.): rows or columns of 0 or 255 in R, G, B and I.
 
-Which way they run belongs to the sensor's architecture, which a sample's broken pixels share:
-- full-frame and frame-transfer CCD: rows or columns, never both. The lines run along the camera's readout
-  direction (left, right: rows; up, down: columns), the flag by which the paper commands the direction of
-  lines. It is the direction in which charge is shifted: a fault there takes what follows in the same line,
-  and broken lines lie parallel to the lines subtended by broken pixels.
-- interline CCD and CMOS: each line is a row or a column with equal chance.
+The sensor's architecture, the same for broken pixels of the sample, decides between rows and columns:
 
-Each line is dead or saturated with equal chance unless the scene fixes the numbers. No line occurs twice.
-Where a saturated and a dead line cross, the pixel is saturated.
+- Full-frame and frame-transfer CCD: rows or columns, never both. The lines run along the camera's readout direction
+  (left, right: rows; up, down: columns). The paper sets the direction of lines by this flag. It is the direction in
+  which charge is shifted, so a fault affects all charge that follows in the same line. Broken lines are therefore
+  parallel to the lines that broken pixels cause.
+- Interline CCD and CMOS: each line is a row or a column with equal probability.
+
+Each line is dead (0) or saturated (255) with equal probability, unless the scene fixes the numbers. No line occurs
+twice. A pixel where a saturated and a dead line cross is saturated.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ BOTH_WAYS = ("interline_ccd", "cmos")
 
 @dataclass(frozen=True, kw_only=True)
 class TextureBrokenLines(Fault):
-    """Dead and saturated lines (Gallon et al., table of broken pixels and lines)."""
+    """Set whole lines to dead or saturated (Gallon et al., table of broken pixels and lines)."""
 
     fault = "broken_lines"
     model = "texture"
@@ -49,6 +50,7 @@ class TextureBrokenLines(Fault):
     )
 
     def validate(self) -> None:
+        """Raise ValueError if the only fixed number exceeds the smallest total number of lines."""
         fixed = {"white_count": self.white_count, "black_count": self.black_count}
         given = {name: value for name, value in fixed.items() if value is not None}
         if len(given) == 1:
@@ -57,7 +59,7 @@ class TextureBrokenLines(Fault):
                 raise ValueError(f"{name} = {value}: must not exceed the least number of lines, {self.count.lo:g}")
 
     def draw(self, context: FaultContext, rng: np.random.Generator) -> Params:
-        """Lists of broken `rows` and `columns` (pixel indices) with their values, 0 or 255."""
+        """Return the indices of the broken `rows` and `columns` in pixels, with their values 0 or 255."""
         height, width = context.shape
         count = self.count.integer(rng)
         if self.white_count is not None and self.black_count is not None:
@@ -74,7 +76,7 @@ class TextureBrokenLines(Fault):
             is_row[:] = self.direction == "rows"
         elif context.camera.architecture not in BOTH_WAYS:
             is_row[:] = context.camera.readout_direction in ("left", "right")
-        # a frame of a few pixels may have fewer lines than asked for
+        # a frame of a few pixels may have fewer lines than the drawn count
         rows = rng.permutation(height)[: int(is_row.sum())]
         columns = rng.permutation(width)[: int((~is_row).sum())]
         return {
@@ -85,15 +87,15 @@ class TextureBrokenLines(Fault):
         }
 
     def apply(self, quantity: Any, params: Params, context: FaultContext) -> Any:
-        """The image with the lines set in all four channels."""
+        """Return the image with the lines set in all four channels."""
         out = quantity.array.copy()
-        for value in (0, 255):  # saturated last: it wins where lines cross
+        for value in (0, 255):  # saturated lines come last, so they win at crossings
             out[_of_value(params, "row", value)] = value
             out[:, _of_value(params, "column", value)] = value
         return quantity.with_array(out)
 
     def footprint(self, params: Params, context: FaultContext) -> NDArray[np.bool_]:
-        """bool[y, x]: the lines."""
+        """Return the pixels of the lines, bool[y, x]."""
         out = np.zeros(context.shape, dtype=bool)
         out[params["rows"]] = True
         out[:, params["columns"]] = True
@@ -101,5 +103,6 @@ class TextureBrokenLines(Fault):
 
 
 def _of_value(params: Params, kind: str, value: int) -> list[int]:
+    """Return the indices of the broken rows or columns that have the given value."""
     lines = zip(params[f"{kind}s"], params[f"{kind}_values"], strict=True)
     return [index for index, v in lines if v == value]

@@ -1,17 +1,19 @@
-"""Broken lines by what reads the mosaic: row select, column amplifiers and multiplexer, register, output nodes.
+"""Simulate broken lines by failures of the readout: row select, column amplifier, multiplexer, register, node.
 
-Which of them a sensor has follows its architecture (Waltham 2013, CCD and CMOS sensors; Gallon et al., whose
-section on broken pixels and lines it is taken from):
-- CMOS: a row by its row select, a column by its amplifier or the multiplexer, over the whole frame, each line one
-  or the other. Dead (code 0), saturated (top code), or repeating the line of the next smaller index, where an
-  address fails to advance; rows also shifted along themselves, where the multiplexer loses or gains a clock.
-- CCD: a column from its defect away from the register, since charge beyond cannot pass (dead: the bias) or takes up
-  what the defect injects (saturated). A row that the register lost (dead) or moved by clocks too few or too many
-  (shifted). Full-frame and frame-transfer CCDs have rows or columns, never both; interline CCDs either.
-- CCD: a blocked pixel of the register takes all columns behind it, seen from its node.
-- Several output nodes: one may be lost with its half or quadrant.
+The architecture decides which of these parts a sensor has (Waltham 2013, CCD and CMOS sensors; Gallon et al.,
+section on broken pixels and lines):
 
-The numbers of failures and their shares are assumed; one to five of them is the paper's.
+- CMOS, whole lines: a row fails by its row select, a column by its amplifier or by the multiplexer. A line is dead
+  (code 0), saturated (top code), or repeats the line of the next smaller index because an address fails to advance.
+  A row may also be shifted along itself if the multiplexer loses or gains a clock.
+- CCD, columns: a column fails from its defect on, away from the register. It is dead (the bias) if the charge
+  beyond the defect cannot pass, or saturated if it takes up charge that the defect injects.
+- CCD, rows: the register loses a row (dead), or moves it by too few or too many clocks (shifted). Full-frame and
+  frame-transfer CCDs have broken rows or broken columns, never both. Interline CCDs may have both.
+- CCD, register: a blocked pixel of the register removes all columns behind it, as counted from its node.
+- Several output nodes: one may fail, with its half or quadrant.
+
+The numbers of failures and their fractions are assumed, except that one to five broken lines is the paper's range.
 """
 
 from __future__ import annotations
@@ -39,9 +41,9 @@ Ints = NDArray[np.intp]
 
 ONE_WAY = ("full_frame_ccd", "frame_transfer_ccd")
 
-# What comes later wins where lines cross.
+# Kinds in the order in which they are written: where lines cross, the later kind wins.
 KINDS = ("duplicated", "shifted", "dead", "saturated")
-# (is CCD, axis): what can happen there
+# kinds that can occur, by (is CCD, axis)
 POSSIBLE = {
     (False, "row"): ("dead", "saturated", "duplicated", "shifted"),
     (False, "column"): ("dead", "saturated", "duplicated"),
@@ -52,7 +54,7 @@ POSSIBLE = {
 
 @dataclass(frozen=True, kw_only=True)
 class ReadoutBrokenLines(Fault):
-    """Lines, a part of the register or a node that the readout loses, in the raw mosaic."""
+    """Break lines, a part of the register, or an output node in the raw mosaic."""
 
     fault = "broken_lines"
     model = "readout"
@@ -79,12 +81,17 @@ class ReadoutBrokenLines(Fault):
     node_chance: float = number(0.1, limits=(0, 1), doc="chance that one of several output nodes is lost; assumed")
 
     def validate(self) -> None:
+        """Raise ValueError if the weights of all kinds are 0."""
         if not any(getattr(self, f"{kind}_weight") for kind in KINDS):
             raise ValueError("the weights of all kinds of lines are 0: at least one must be above")
 
     def draw(self, context: FaultContext, rng: np.random.Generator) -> Params:
-        """`lines`: each with axis, index, kind, shift_px, and where it begins: half of the sensor and rows from
-        its register (half -1: the whole line); `register`: node and first pixel lost, or None; lost `node`, or -1.
+        """Return the broken lines, the lost part of the register and the lost node.
+
+        - `lines`: axis, index, kind and shift_px of each, the half of the sensor that it is in (-1: the whole line
+          is broken) and `begin`, the number of rows between the register and the first broken pixel.
+        - `register`: node and first lost pixel, or None.
+        - `node`: index of the lost node, or -1.
         """
         detector: Any = context.camera.detector
         sensor, nodes = detector.sensor, detector.sensor.readout.nodes
@@ -101,13 +108,13 @@ class ReadoutBrokenLines(Fault):
             kinds = POSSIBLE[ccd, axis]
             weights = np.array([getattr(self, f"{kind}_weight") for kind in kinds], dtype=np.float64)
             weights = weights / weights.sum() if weights.sum() > 0 else np.eye(len(kinds))[0]
-            # a frame of a few pixels may have fewer lines than asked for
+            # a frame of a few pixels may have fewer lines than the drawn count
             for place in rng.permutation(max(length // group, 1))[:wanted]:
                 first = int(place) * group
                 kind = kinds[int(rng.choice(len(kinds), p=weights))]
                 shift = self.shift_px.integer(rng) * (1 if rng.random() < 0.5 else -1)
                 if kind == "duplicated" and first == 0:
-                    kind = "dead"  # there is none before
+                    kind = "dead"  # line 0 has no line before it
                 in_half, begin = -1, 0
                 if ccd and axis == "column":
                     in_half = int(rng.integers(half.max(), endpoint=True))
@@ -132,7 +139,7 @@ class ReadoutBrokenLines(Fault):
         return {"lines": lines, "register": register, "node": node}
 
     def apply(self, quantity: Any, params: Params, context: FaultContext) -> Any:
-        """Raw numbers with the lines, the part of the register and the node as they fail."""
+        """Return the raw digital numbers with the broken lines, register and node."""
         detector: Any = context.camera.detector
         readout = detector.sensor.readout
         lost_dn = readout.bias_dn if detector.sensor.architecture != "cmos" else 0
@@ -159,7 +166,7 @@ class ReadoutBrokenLines(Fault):
         return quantity.with_array(out)
 
     def footprint(self, params: Params, context: FaultContext) -> Mask:
-        """bool[y, x]: pixels of the picture that what fails can reach."""
+        """Return the pixels of the image that the failures can change, bool[y, x]."""
         detector: Any = context.camera.detector
         sensor = detector.sensor
         region = _reached(params["lines"], context)
@@ -172,11 +179,12 @@ class ReadoutBrokenLines(Fault):
 
 
 def _of(params: Params, kind: str, axis: str) -> list[dict[str, Any]]:
+    """Return the broken lines of one kind and axis."""
     return [line for line in params["lines"] if line["kind"] == kind and line["axis"] == axis]
 
 
 def _from_register(context: FaultContext) -> tuple[Ints, Ints]:
-    """The half of each row, int[y], and how many rows lie between it and the register of that half."""
+    """Return the half of each row, int[y], and the number of rows between it and its register, int[y]."""
     detector: Any = context.camera.detector
     rows = np.arange(context.shape[0])
     if detector.sensor.readout.nodes == 4:
@@ -185,7 +193,7 @@ def _from_register(context: FaultContext) -> tuple[Ints, Ints]:
 
 
 def _reached(lines: list[dict[str, Any]], context: FaultContext) -> Mask:
-    """bool[y, x]: pixels of the mosaic that lie in the broken part of a line."""
+    """Return the mosaic's pixels in the broken parts of the lines, bool[y, x]."""
     out = np.zeros(context.shape, dtype=np.bool_)
     out[[line["index"] for line in lines if line["axis"] == "row"]] = True
     half, steps = _from_register(context)
@@ -199,7 +207,7 @@ def _reached(lines: list[dict[str, Any]], context: FaultContext) -> Mask:
 
 
 def _behind(register: dict[str, int], context: FaultContext) -> Mask:
-    """bool[y, x]: pixels read through a node's register from its blocked pixel on."""
+    """Return the mosaic's pixels that are read through the blocked pixel of the register, bool[y, x]."""
     detector: Any = context.camera.detector
     nodes = detector.sensor.readout.nodes
     pixels = readout_steps(context.shape, nodes)[1]

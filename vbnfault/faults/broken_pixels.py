@@ -1,27 +1,26 @@
-"""Broken pixels, the paper's model: hot and dead pixels, their demosaicing halo, and the lines they subtend.
+"""Simulate broken pixels as in the paper (Gallon et al.): hot and dead pixels, their halo, and their lines.
 
-All acts on the digital image; I changes, R, G and B by the same ratio (where I is 0 they become I). In order,
-each step winning over the one before, so that the result does not depend on the order of the defects:
+All steps act on the digital image. They change I, and R, G and B by the same ratio (where I is 0, R, G and B become
+I). A later step overrides an earlier one, so the result does not depend on the order of the defects:
 
-1. CCD only: the pixels between a defect and the frame's edge in the readout direction gain an offset, drawn
-   per defect: I += offset. Where lines overlap, offsets add. An offset of 0 ("hot pixel without offset") is
-   no line and no part of the mask.
-2. A von Neumann neighbour of a defect is interpolated linearly between the defect and the pixel on the far
-   side of the neighbour, two pixels from the defect: (defect + far) / 2. The far pixel is taken as read out:
-   with its line's offset, or its own brightness where it is a defect, too. A neighbour of several defects
-   takes the mean of what each demands. At the frame's edge, where there is no far pixel, the neighbour's own
-   value stands in for it.
-3. A defect has exactly its brightness in I.
+1. CCD only: the pixels between a defect and the edge of the frame in the readout direction gain an offset, I +=
+   offset. Each defect has its own offset. Where lines overlap, the offsets add. A defect with offset 0 ("hot pixel
+   without offset") has no line, neither in the image nor in the mask.
+2. Demosaicing makes a halo. A von Neumann neighbour of a defect becomes (defect + far) / 2. The far pixel lies on
+   the other side of the neighbour, two pixels from the defect. Its value is the one read out: with the offset of
+   its line, or its own brightness if it is a defect too. A neighbour of several defects becomes the mean of these
+   values. At the edge of the frame, the neighbour's own value replaces the missing far pixel.
+3. The I of a defect is exactly its brightness.
 
-The table bounds a line's brightness by 65, the text by 0.4 times its defect's brightness (0.4 · 255 = 102):
-both hold here, offset = U(0, min(65, 0.4 · brightness)) in whole DN. The table asks for 10-150 defects while
-the paper's own example has 9: an explicit `count = 9` is as good as any.
+The paper's table bounds the offset of a line by 65. Its text bounds it by 0.4 times the brightness of the defect
+(0.4 · 255 = 102). Here both bounds hold: offset = U(0, min(65, 0.4 · brightness)), in whole DN. The table asks for
+10-150 defects, but the paper's own example has 9, so a scene may set `count = 9`.
 
-CCD and CMOS exclude each other: the camera's architecture decides, and its readout direction is that of all
-lines. Chapman et al. (2022, 2023) see more pairs of defects within 3×3 pixels than chance explains, and
-OSIRIS-REx saw more than three in a close neighbourhood matter to navigation: hence `cluster_fraction` and
-`dense_cluster_probability`. Salt-and-pepper defects are held to be rare (Leung et al. 2007). The defaults of
-these three shares are ours: 10 %, 10 %, 5 %.
+The camera's architecture decides whether the sensor is a CCD or CMOS. Its readout direction is that of all lines.
+Chapman et al. (2022, 2023) see more pairs of defects within 3×3 pixels than chance explains. OSIRIS-REx saw that
+more than three defects close together matter to navigation. These are the reasons for `cluster_fraction` and
+`dense_cluster_probability`. Salt-and-pepper defects are thought to be rare (Leung et al. 2007). The defaults of
+these three values are ours: 10 %, 10 %, 5 %.
 """
 
 from __future__ import annotations
@@ -34,10 +33,10 @@ from numpy.typing import NDArray
 
 from .base import Fault, FaultContext, Interval, Params, bounds, number, scale_by_intensity
 
-# Unit steps (dy, dx) of the four readout directions, which are also the von Neumann neighbours.
+# Unit steps (dy, dx) of the four readout directions. They also lead to the four von Neumann neighbours.
 STEPS = {"up": (-1, 0), "down": (1, 0), "left": (0, -1), "right": (0, 1)}
 
-# Defects in a dense cluster: more than three within 3×3 pixels.
+# Number of defects in a dense cluster: more than three within 3×3 pixels.
 DENSE_CLUSTER = 4
 
 Index = NDArray[np.int64]
@@ -45,7 +44,7 @@ Index = NDArray[np.int64]
 
 @dataclass(frozen=True, kw_only=True)
 class TextureBrokenPixels(Fault):
-    """Hot and dead pixels (Gallon et al., table of broken pixels and lines)."""
+    """Set hot and dead pixels (Gallon et al., table of broken pixels and lines)."""
 
     fault = "broken_pixels"
     model = "texture"
@@ -77,7 +76,7 @@ class TextureBrokenPixels(Fault):
     )
 
     def draw(self, context: FaultContext, rng: np.random.Generator) -> Params:
-        """Columns of defects: pixel index x, y, brightness and line offset in DN; the line's direction."""
+        """Return lists of the defects' x, y, brightness and line offset in DN, and the direction of the lines."""
         height, width = context.shape
         count = min(self.count.integer(rng), height * width // 4)
         x, y = self._positions(count, height, width, rng)
@@ -93,7 +92,8 @@ class TextureBrokenPixels(Fault):
             "brightness_dn": brightness.tolist(),
         }
         if context.camera.is_ccd:
-            # U over the whole numbers lo … hi, both included; hi below lo leaves no line
+            # U draws the whole numbers lo … hi, both included. If the fraction allows less than lo, the offset is
+            # that limit.
             hi = np.minimum(self.line_offset_dn.hi, np.floor(self.line_offset_fraction * brightness + 1e-9))
             lo = np.minimum(self.line_offset_dn.lo, hi)
             params["line_offset_dn"] = (lo + np.floor(share * (hi - lo + 1))).astype(int).tolist()
@@ -103,7 +103,7 @@ class TextureBrokenPixels(Fault):
     def _positions(
         self, count: int, height: int, width: int, rng: np.random.Generator
     ) -> tuple[list[int], list[int]]:
-        """Distinct pixels: some alone and uniform, the rest beside one that is already there."""
+        """Return x and y of distinct pixels: some alone and uniform, the others next to an earlier pixel."""
         dense = count >= DENSE_CLUSTER and rng.random() < self.dense_cluster_probability
         beside = min(round(self.cluster_fraction * count), count - 1) if count else 0
         beside = max(beside, DENSE_CLUSTER - 1) if dense else beside
@@ -112,7 +112,7 @@ class TextureBrokenPixels(Fault):
         spare = [(int(i) // width, int(i) % width) for i in flat[count - beside :]]
         taken = set(placed)
         for k in range(beside):
-            spot = spare[k]  # stays alone where no free neighbour turns up
+            spot = spare[k]  # used if no free neighbour is drawn
             for _ in range(64):
                 parent = placed[0] if dense and k < DENSE_CLUSTER - 1 else placed[int(rng.integers(len(placed)))]
                 dy, dx = rng.integers(-1, 1, 2, endpoint=True)
@@ -127,7 +127,7 @@ class TextureBrokenPixels(Fault):
         return [p[1] for p in placed], [p[0] for p in placed]
 
     def apply(self, quantity: Any, params: Params, context: FaultContext) -> Any:
-        """The image with lines, neighbours and defects; all other pixels keep their bits."""
+        """Return the image with lines, neighbours and defects. All other pixels stay bit for bit the same."""
         layout = _layout_once(params, context)
         out = np.array(quantity.array, order="C")
         if len(layout.line):
@@ -147,7 +147,7 @@ class TextureBrokenPixels(Fault):
         return quantity.with_array(out)
 
     def footprint(self, params: Params, context: FaultContext) -> NDArray[np.bool_]:
-        """bool[y, x]: defects, their neighbours, and the subtended lines with an offset."""
+        """Return the pixels of the defects, of their neighbours and of lines with an offset, bool[y, x]."""
         layout = _layout_once(params, context)
         out = np.zeros(context.shape, dtype=bool)
         flat = out.reshape(-1)
@@ -158,11 +158,17 @@ class TextureBrokenPixels(Fault):
 
 @dataclass(frozen=True)
 class _Layout:
-    """Flat pixel indices of what the defects touch.
+    """Hold the flat pixel indices that the defects change.
 
-    `line` with `line_offset` (the sum of all offsets there); `defect`; `neighbour`; and per demand of a
-    defect on a neighbour: `neighbour_of` (row of `neighbour`), `source` (row of `defect`), `far` (flat
-    index), `far_defect` (row of `defect` that sits there, or -1).
+    Attributes
+    ----------
+    line, line_offset
+        Pixels of the lines, and the sum of all offsets at each.
+    defect, neighbour
+        Pixels of the defects and of their neighbours.
+    neighbour_of, source, far, far_defect
+        One entry for each pair of a neighbour and one of its defects: position in `neighbour`, position in
+        `defect`, flat index of the far pixel, and position in `defect` of the defect at the far pixel (-1: none).
     """
 
     line: Index
@@ -175,20 +181,24 @@ class _Layout:
     far_defect: Index
 
 
-# A pixel's four bytes move as one 32 bit word: several times as fast as rows of four.
+# The four bytes of a pixel are moved as one 32 bit word, several times as fast as rows of four bytes.
 def _gather(image: NDArray[np.uint8], index: Index) -> NDArray[np.uint8]:
+    """Return the pixels at the flat indices, uint8[n, 4]."""
     return image.view(np.uint32).reshape(-1).take(index).view(np.uint8).reshape(-1, 4)
 
 
 def _scatter(image: NDArray[np.uint8], index: Index, pixels: NDArray[np.uint8]) -> None:
+    """Write the pixels at the flat indices into the image, in place."""
     image.view(np.uint32).reshape(-1)[index] = pixels.view(np.uint32).reshape(-1)
 
 
 def _layout_once(params: Params, context: FaultContext) -> _Layout:
+    """Return the layout of the defects, computed once for each sample."""
     return context.once("broken_pixels.layout", params, lambda: _layout(params, context.shape))
 
 
 def _layout(params: Params, shape: tuple[int, int]) -> _Layout:
+    """Return the layout of the defects in a frame of the given (height, width)."""
     height, width = shape
     x, y = (np.asarray(params[k], dtype=np.int64) for k in ("x", "y"))
     defect = y * width + x
@@ -204,7 +214,7 @@ def _layout(params: Params, shape: tuple[int, int]) -> _Layout:
     has_far = (far_y >= 0) & (far_y < height) & (far_x >= 0) & (far_x < width)
     near = near_y * width + near_x
     far = np.where(has_far, far_y * width + far_x, near)
-    use = inside & (which[np.where(inside, near, 0)] < 0)  # a defect is nobody's neighbour
+    use = inside & (which[np.where(inside, near, 0)] < 0)  # a defect is never a neighbour
     source = np.broadcast_to(np.arange(len(defect)), near.shape)
     neighbour, neighbour_of = np.unique(near[use], return_inverse=True)
     return _Layout(
@@ -220,7 +230,7 @@ def _layout(params: Params, shape: tuple[int, int]) -> _Layout:
 
 
 def _lines(params: Params, shape: tuple[int, int]) -> tuple[Index, NDArray[np.float32]]:
-    """Flat indices of the subtended lines (the defects' own pixels left out) and the summed offsets there."""
+    """Return the flat indices of the lines, without the defects' own pixels, and the summed offset at each."""
     total = np.zeros(shape, dtype=np.int32)
     dy, dx = STEPS[params.get("line_direction", "right")]
     along = total if dx else total.T

@@ -1,18 +1,24 @@
-"""Broken pixels by physics: the camera's own device, older and more irradiated than its file says.
+"""Simulate broken pixels by physics: the camera's own device, older and more irradiated than its file says.
 
-A device's defects come from its seed and only ever grow (`detector.individual`), so that samples of one individual
-share them; the fault draws an age, a dose and the time since, and adds what the device has by then and did not
-have before: bulk damage of displaced atoms (Srour & Lo 2000; Belloir 2016; Le Roch 2019), hot pixels with an offset
-(Chapman et al.: I = m (R T + b)), dead and stuck pixels, and random telegraph signals in the state that they are
-in. They spread over neighbours because the demosaic does. In a CCD charge is clocked past its defects: behind a hot
-pixel, away from the register, it draws a line (`detector.chain.passing_dark_e`).
+The seed of a device fixes its defects, and defects only grow in number (`detector.individual`). Samples of one
+individual therefore share them. The fault draws an age, a dose and the time since that dose. It adds the defects
+that the device has by then and did not have before:
 
-Each defect acts where the device's own of its kind does (`detector.chain`): dead pixels keep less of the light, and
-all their dark current; dark current and telegraph signals are charge, with shot noise; offsets are added after it,
-without noise; a stuck pixel shows its level, whatever it holds.
+- bulk damage of displaced atoms (Srour & Lo 2000; Belloir 2016; Le Roch 2019),
+- hot pixels with an offset (Chapman et al.: I = m (R T + b)),
+- dead and stuck pixels,
+- random telegraph signals, each in its state at the exposure.
 
-Pixels are as warm as the sensor: at short exposures and in the cold most damage does not show, as on real ones.
-The growth laws are of cameras on the ground; `growth_factor` says how much faster it goes in space (assumed).
+Defects spread to neighbouring pixels by demosaicing. In a CCD, charge is clocked past the defects. A hot pixel
+therefore draws a line on the side away from the register (`detector.chain.passing_dark_e`).
+
+Each defect acts at the same step as the device's own defects of its kind (`detector.chain`). Dead pixels keep less
+of the light, but all their dark current. Dark current and telegraph signals are charge with shot noise. Offsets are
+added after the charge, without noise. A stuck pixel shows its level, whatever charge it holds.
+
+Pixels have the sensor's temperature: at short exposures and at low temperature most damage does not show, as on
+real sensors. The growth laws are measured on cameras on the ground. `growth_factor` is the assumed ratio of the
+growth in space to the growth on the ground.
 """
 
 from __future__ import annotations
@@ -32,13 +38,13 @@ from .base import Fault, FaultContext, Interval, Params, bounds, number
 F32 = NDArray[np.float32]
 
 _MOST_LISTED = 256
-_OLDEST_YR = 100.0  # that a device's kind may be: what is older grows as many defects in that time
-_MOST_A_YEAR = 0.1  # share of pixels that die or stick in a year, at most
+_OLDEST_YR = 100.0  # limit of a device's age; a higher age becomes faster growth within that time
+_MOST_A_YEAR = 0.1  # fraction of the pixels that may die or stick in a year, at most
 
 
 @dataclass(frozen=True, kw_only=True)
 class HotPixels(Fault):
-    """Hot and dead pixels of the camera's device at a later age and dose."""
+    """Add the hot, dead, stuck and telegraph pixels that the camera's device has at a later age and dose."""
 
     fault = "broken_pixels"
     model = "hot_pixels"
@@ -72,10 +78,13 @@ class HotPixels(Fault):
     )
 
     def draw(self, context: FaultContext, rng: np.random.Generator) -> Params:
-        """Return age and dose, how many pixels they change, and the strongest: x, y, electrons at this exposure,
-        offset included, the offset alone and the share of light kept; `stuck`: x, y and level, the share of the top
-        code; `rts`: the strongest telegraph signals, with their amplitude and the share of the exposure that they
-        are high."""
+        """Return age and dose, the number of changed pixels, and lists of the strongest defects.
+
+        - `x`, `y`, `electrons` (at this exposure, offset included), `offset_e` and `response` (the fraction of
+          light kept) describe the changed pixels that gain the most electrons.
+        - `stuck`: x, y and level (fraction of the top code).
+        - `rts`: the strongest telegraph signals, with amplitude and the fraction of the exposure that each is high.
+        """
         params: Params = {
             "years": self.years.uniform(rng),
             "growth_factor": self.growth_factor.uniform(rng),
@@ -103,11 +112,14 @@ class HotPixels(Fault):
         return params
 
     def apply(self, quantity: Any, params: Params, context: FaultContext) -> Any:
-        """Return the light to which pixels respond without what dead ones lose of it."""
+        """Return the light to which the pixels respond, reduced in dead pixels."""
         return quantity.with_array(quantity.array * _damage_once(params, context).kept)
 
     def apply_at(self, step: str, quantity: Any, params: Params, context: FaultContext) -> Any:
-        """Return the quantity of a step with the defects that act there: dead, hot and telegraph, offset, stuck."""
+        """Return the quantity of one step with the defects that act there.
+
+        light: dead pixels; pixels: hot and telegraph pixels; offsets: offsets; raw: stuck pixels.
+        """
         damage = _damage_once(params, context)
         if step == "pixels":
             return quantity.with_array(quantity.array + damage.charge_e)
@@ -121,21 +133,33 @@ class HotPixels(Fault):
         return self.apply(quantity, params, context)
 
     def footprint(self, params: Params, context: FaultContext) -> NDArray[np.bool_]:
-        """bool[y, x]: pixels of the picture that a defect can reach."""
+        """Return the pixels of the image that a defect can change, bool[y, x]."""
         detector: Any = context.camera.detector
         reached: NDArray[np.bool_] = detector.footprint(_damage_once(params, context).changed)
         return reached
 
     def defects(self, params: Params, context: FaultContext) -> NDArray[np.uint8]:
-        """Kinds of the mosaic's defects that show, uint8[y, x]: bits of `quantities.DEFECTS`."""
+        """Return the kinds of the mosaic's defects that show, uint8[y, x]: bits of `quantities.DEFECTS`."""
         return _damage_once(params, context).kinds
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Damage:
-    """What defects add at this exposure, `charge_e` with shot noise and `offset_e` without, and `kept`: the share
-    of their light that pixels keep, float32[y, x]; `kinds` uint8[y, x]; stuck pixels; the telegraph signals and the
-    share of the exposure that each is high."""
+    """Hold what the defects add at this exposure.
+
+    Attributes
+    ----------
+    charge_e, offset_e
+        float32[y, x]: added electrons, with shot noise and without noise.
+    kept
+        float32[y, x]: fraction of the light that a pixel keeps.
+    kinds
+        uint8[y, x]: bits of `quantities.DEFECTS`.
+    stuck
+        The new stuck pixels.
+    rts, amplitude_e_s, high
+        The new telegraph signals, their amplitudes, and the fraction of the exposure that each is high.
+    """
 
     charge_e: F32
     offset_e: F32
@@ -148,11 +172,13 @@ class _Damage:
 
     @property
     def changed(self) -> NDArray[np.bool_]:
+        """Return the pixels that a defect changes, bool[y, x]."""
         out = (self.charge_e > 0) | (self.offset_e > 0) | (self.kept < 1)
         out[self.stuck.row, self.stuck.column] = True
         return out
 
     def listed_stuck(self) -> list[dict[str, Any]]:
+        """Return the stuck pixels with the highest levels as plain data, at most `_MOST_LISTED`."""
         stuck = self.stuck
         strongest = np.argsort(-stuck.level, kind="stable")[:_MOST_LISTED]
         return [
@@ -161,6 +187,7 @@ class _Damage:
         ]
 
     def listed(self) -> list[dict[str, Any]]:
+        """Return the strongest telegraph signals as plain data, at most `_MOST_LISTED`."""
         strongest = np.argsort(-self.amplitude_e_s, kind="stable")[:_MOST_LISTED]
         return [
             {
@@ -174,24 +201,26 @@ class _Damage:
 
 
 def _damage_once(params: Params, context: FaultContext) -> _Damage:
+    """Return the damage, computed once for each sample."""
     return context.once("broken_pixels.damage", params, lambda: _damage(params, context))
 
 
 def _damage(params: Params, context: FaultContext) -> _Damage:
+    """Return the damage that the older device has and the device of today lacks."""
     detector: Any = context.camera.detector
     device: Device = detector.device
     own = device.individual
     old = _older(own, _ageing(own.spec, params))
     exposure_s = context.camera.exposure_s
 
-    # defects are born in order: the device's own come first
+    # defects are listed in order of birth, so the device's own come first
     columns = {k: v for k, v in vars(old.rts).items() if k != "reference_K"}
     new = {name: column[len(own.rts) :] for name, column in columns.items()}
     rts = RtsPixels(**new, reference_K=old.rts.reference_K)
     signals = rts.at(device.temperature_K)
     high = upper_share(signals, exposure_s, params["telegraph_seed"]) if len(rts) else np.zeros(0)
     more = dark_rate_e_s(old, device.temperature_K) - device.dark_rate_e_s
-    np.maximum(more, 0, out=more)  # a dose that anneals takes none of the device's own away
+    np.maximum(more, 0, out=more)  # annealing must not remove dark current of the device itself
     jumps = np.zeros(device.shape, dtype=np.float32)
     np.add.at(jumps, (rts.row, rts.column), signals.amplitude_e_s * high)
     charge = np.asarray((more + jumps) * np.float32(exposure_s), dtype=np.float32)
@@ -223,15 +252,16 @@ def _damage(params: Params, context: FaultContext) -> _Damage:
 
 @lru_cache(maxsize=4)
 def _older(own: Individual, changes: tuple[tuple[str, Any], ...]) -> Individual:
+    """Return the device with the changed age and dose, computed once."""
     return aged(own, **dict(changes))
 
 
 def _ageing(own: IndividualSpec, params: Params) -> tuple[tuple[str, Any], ...]:
-    """What changes of the device with its later age and dose. Only the years that are added grow by the factor."""
+    """Return the changed specification of the device. Only the added years grow by `growth_factor`."""
     growth, factor, years = own.hot_growth, params["growth_factor"], params["years"]
     total = min(own.years + years, _OLDEST_YR)
     more = (own.years + factor * years) / total if total > 0 else 1.0
-    # of a year on the ground by what the fault adds, in shares of all the years
+    # added years on the ground, as a fraction of all years
     added = factor * years / total if total > 0 else 0.0
     if growth is not None:
         growth = replace(growth, log10_scale=growth.log10_scale + float(np.log10(more)))

@@ -1,13 +1,16 @@
-"""Cosmic rays: tracks of charged particles through the sensitive layer, as in a solar particle event.
+"""Simulate cosmic rays: tracks of charged particles through the sensitive layer, as in a solar particle event.
 
-Quiet time at L2 is 4.67 protons per cm² s (CREME96): hardly a track in a picture of milliseconds. What reaches a
-sensor in an event is what its housing lets through. In that of 14 July 2000 some 400 protons above 100 MeV came per
-cm² s sr, 5e3 over all directions, and 24 000 above 10 MeV, which a few mm of aluminium stop (recalled).
+In quiet time the flux at L2 is 4.67 protons per cm² s (CREME96), hardly a track in an exposure of milliseconds. In
+an event, a sensor receives the particles that its housing lets through. In the event of 14 July 2000, some 400
+protons above 100 MeV came per cm² s sr (5e3 per cm² s over all directions), and 24 000 above 10 MeV, which a few mm
+of aluminium stop (recalled).
 
-A minimum-ionising particle sets some 80 e/µm free in silicon, slower ones more, as Bethe's formula has it: a proton
-of 50 MeV 480. The spread of a track's charge grows in proportion: both go as 1/β², the logarithm aside.
+A minimum-ionising particle frees some 80 electrons per µm in silicon. Slower particles free more, by Bethe's
+formula: a proton of 50 MeV some 480. The spread of a track's charge grows in proportion, because both go as 1/β²
+apart from the logarithm.
 
-Charge comes after the shot noise, with which it has nothing to do, and before wells overflow and traps take it.
+The charge is added after the shot noise, because it does not depend on the light. It is added before wells overflow
+and traps capture charge.
 """
 
 from __future__ import annotations
@@ -26,13 +29,15 @@ F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
 _LEAST_READOUT_S = 0.05  # assumed
-_ASSUMED_DEPTH_UM = 3.0  # where a sensor's file has none
-_TRACKS_AT_ONCE = 256  # bounds the memory of what diffuses
+_ASSUMED_DEPTH_UM = 3.0  # for a sensor whose file has none
+_TRACKS_AT_ONCE = 256  # limits the memory of the diffusion
 
 
 @dataclass(frozen=True, kw_only=True)
 class Tracks(Fault):
-    """Straight tracks: Poisson in number, at least one; directions by the cosine law (`detector.cosmic`)."""
+    """Add straight tracks, Poisson in number but at least one, with directions by the cosine law
+    (`detector.cosmic`).
+    """
 
     fault = "cosmic_rays"
     model = "tracks"
@@ -75,7 +80,10 @@ class Tracks(Fault):
     )
 
     def draw(self, context: FaultContext, rng: np.random.Generator) -> Params:
-        """The layer, the mean number of tracks, their number; each track: `CosmicRays.params` and its energy."""
+        """Return the layer, the mean and drawn number of tracks, and the tracks.
+
+        Each track has the keys of `CosmicRays.params` and its energy in MeV.
+        """
         detector: Any = context.camera.detector
         sensor = detector.sensor
         wait_s = max(sensor.transfer.row_readout_s * context.shape[0], _LEAST_READOUT_S)
@@ -97,17 +105,18 @@ class Tracks(Fault):
         return params
 
     def apply(self, quantity: Any, params: Params, context: FaultContext) -> Any:
-        """Collected electrons with those of the tracks."""
+        """Return the collected electrons plus those of the tracks."""
         return quantity.with_array(quantity.array + _charge_once(params, context))
 
     def footprint(self, params: Params, context: FaultContext) -> NDArray[np.bool_]:
-        """bool[y, x]: pixels of the picture that the tracks' charge can reach through the demosaic."""
+        """Return the pixels of the image that the tracks' charge can change by demosaicing, bool[y, x]."""
         detector: Any = context.camera.detector
         reached: NDArray[np.bool_] = detector.footprint(_charge_once(params, context) > 0)
         return reached
 
 
 def _model(params: Params, context: FaultContext) -> CosmicRayModel:
+    """Return the model of the tracks with the drawn parameters."""
     return CosmicRayModel(
         pixel_pitch_um=context.camera.detector.pixel_pitch_um,
         thickness_um=params["thickness_um"],
@@ -117,7 +126,10 @@ def _model(params: Params, context: FaultContext) -> CosmicRayModel:
 
 
 def _poisson_above_0(mean: float, rng: np.random.Generator) -> int:
-    """A Poisson variate, given that it is not 0: its upper tail, cut at the chance of 1 or more."""
+    """Return a Poisson variate, given that it is not 0.
+
+    The variate is the inverse of the upper tail at a uniform number below the probability of 1 or more.
+    """
     chance = -np.expm1(-mean) * (1 - rng.random())
     return max(int(stats.poisson.isf(chance, mean)), 1)
 
@@ -125,22 +137,26 @@ def _poisson_above_0(mean: float, rng: np.random.Generator) -> int:
 def _tracks(
     model: CosmicRayModel, shape: tuple[int, int], count: int, energy_MeV: F64, rng: np.random.Generator
 ) -> CosmicRays:
-    """The first `count` of a draw that has so many: tracks know nothing of one another."""
+    """Return the first `count` tracks of a draw that has at least that many.
+
+    This is correct because tracks are independent of each other.
+    """
     time_s = (count + 10 * np.sqrt(count) + 10) / model.expected_count(shape, 1.0)
     while len(rays := model.draw(shape, time_s, rng)) < count:
         pass
     columns = {name: column[:count] for name, column in vars(rays).items()}
     columns["electrons"] = columns["electrons"] * (stopping_power_MeV_cm2_g(energy_MeV) / LEAST_MEV_CM2_G)
-    # rounded, so that thousands of them stay short as text; seeds stay whole
+    # rounded, because thousands of tracks must stay short as text; seeds are integers and stay exact
     return CosmicRays(**{name: np.round(column, 3) for name, column in columns.items()})
 
 
 def _charge_once(params: Params, context: FaultContext) -> F32:
+    """Return the charge of the tracks, computed once for each sample."""
     return context.once("cosmic_rays.charge", params, lambda: _charge(params, context))
 
 
 def _charge(params: Params, context: FaultContext) -> F32:
-    """Electrons that pixels gain, float32[y, x]; 0 where they are too few to show."""
+    """Return the electrons that the pixels gain, float32[y, x]; 0 where they amount to less than `least_dn`."""
     model, tracks = _model(params, context), params["tracks"]
     out = np.zeros(context.shape[0] * context.shape[1], dtype=np.float32)
     for start in range(0, len(tracks), _TRACKS_AT_ONCE):

@@ -1,10 +1,13 @@
-"""Charge transfer inefficiency: traps that radiation has made in the columns and the register of a CCD.
+"""Simulate charge transfer inefficiency: traps that radiation has made in the columns and register of a CCD.
 
-A packet fills the traps within its cloud and they let go later, into the packets behind: trails away from the
-register, and less charge where it has far to go (`detector.charge.cti`, after ArCTIC: Massey et al. 2010, MNRAS
-401, 371). Displaced atoms make traps in proportion to the dose; the densities in columns and register are drawn.
-Three species release in half a transfer, in two and in eight (assumed: slower ones stay full, faster ones give back
-to their own packet), in shares drawn uniformly over all that sum to 1.
+A packet of charge fills the traps within its cloud. The traps release the charge later, into the packets behind.
+This makes trails away from the register, and packets that are transferred far lose more charge
+(`detector.charge.cti`, after ArCTIC: Massey et al. 2010, MNRAS 401, 371). Displaced atoms make traps in proportion
+to the dose. The fault draws the densities of traps in the columns and in the register.
+
+There are three species, with release times of half a transfer, two and eight transfers. These times are assumed:
+slower traps stay full, and faster traps release into their own packet. The fractions of the species are drawn
+uniformly from all that sum to 1.
 """
 
 from __future__ import annotations
@@ -23,7 +26,10 @@ RELEASE_TRANSFERS = (0.5, 2.0, 8.0)
 
 @dataclass(frozen=True, kw_only=True)
 class RadiationTraps(Fault):
-    """Traps besides the sensor's own; nothing on CMOS, or where a sensor's file has no time of a transfer."""
+    """Add traps to those of the sensor.
+
+    CMOS sensors are unchanged, and so are sensors whose file has no transfer time.
+    """
 
     fault = "cti"
     model = "radiation"
@@ -41,7 +47,7 @@ class RadiationTraps(Fault):
     )
 
     def draw(self, context: FaultContext, rng: np.random.Generator) -> Params:
-        """Species of `parallel` and `serial` traps: density_per_px and release_time_s of each."""
+        """Return the species of `parallel` and `serial` traps, with density_per_px and release_time_s of each."""
         detector: Any = context.camera.detector
         move = detector.sensor.transfer
         params: Params = {}
@@ -58,7 +64,7 @@ class RadiationTraps(Fault):
         return params
 
     def alter(self, camera: Camera, params: Params) -> Camera:
-        """The camera with those traps."""
+        """Return the camera with the added traps."""
         if not params:
             return camera
         detector: Any = camera.detector

@@ -1,24 +1,26 @@
-"""Degraded optics by physics: a hazy film, scratches, glass browned by radiation, coatings worn off.
+"""Simulate degraded optics by physics: a hazy film, scratches, glass browned by radiation, worn coatings.
 
-    I' = T_c · [(1 - h - Σ s) · I + h · (I ∗ H) + Σ s · (I ∗ S)]     for each colour c
+    I' = T_c · [(1 - h - Σ s) · I + h · (I ∗ H) + Σ s · (I ∗ S)]     for each channel c
 
-- A film, of molecules that settled or of fine dust, turns the share h of the light away. Its BSDF is Harvey's,
-  b0 [1 + (β/L)²]^(S/2), over all angles of unit integral; on the sensor β is the sine of the angle, whose tangent
-  is the distance over the focal length.
-- A scratch of the width w turns the share s away that it takes of the beam on the front, across its own direction,
-  as a slit of its width diffracts: sinc²(π w β/λ), here its mean, a Lorentz curve of the half width λ/(2π w), which
-  falls alike. Scratches are bent, so that a streak fans out.
-- Glass darkens with dose by exp(-a0 D (λ0/λ)^p) a mm of its thickness on the axis (form of Appourchaux et al.
-  1994, Opt. Eng. 33, 1659, without saturation). The coefficients are assumed, of the size of what crown glasses
-  show (half of the light gone in 10 mm at 400 nm after 100 krad); in glasses stabilised with cerium, whose names
-  have a G and a number behind their type as in BK7G18, and in silica, they are a hundredth of that. Recovery is
+- Film: molecules or fine dust that settled on the lens scatter the fraction h of the light. The BSDF is Harvey's,
+  b0 [1 + (β/L)²]^(S/2), with unit integral over all angles. On the sensor, the distance over the focal length is
+  the tangent of the scattering angle, and β is the sine of that angle.
+- Scratch: a scratch of width w scatters the fraction s of the light, which is its area over that of the beam on the
+  front. It scatters across its own direction, as a slit of width w diffracts: sinc²(π w β/λ). The code uses a
+  Lorentz curve with half width λ/(2π w), whose tail equals that of sinc² averaged over its fringes. Scratches are
+  bent, so a streak fans out.
+- Glass darkens with dose by exp(-a0 D (λ0/λ)^p) per mm of its thickness on the axis (form of Appourchaux et al.
+  1994, Opt. Eng. 33, 1659, without saturation). The coefficients are assumed. They have the size that crown glasses
+  show (half of the light lost in 10 mm at 400 nm after 100 krad). Silica and glasses stabilised with cerium, whose
+  names have a G and a number after their type as in BK7G18, have a hundredth of these coefficients. Recovery is
   left out.
-- Where a share of the coatings is gone, a surface reflects the mean of coated and bare, and the image loses that;
-  straylight's ghosts gain.
+- Coatings: where a fraction of their area is gone, a surface reflects the mean of coated and bare glass, weighted
+  by area. The image loses this light, and the ghosts of straylight gain.
 
-T_c is the mean of what passes over the colour's response to sunlight. Light is the true light: the Sun in the
-frame, 10⁵ times white, floods it at a haze of a few per cent, as it would. What lies beyond the frame is taken to
-mirror it, without what is brighter than white; light that goes farther than a frame's width is lost.
+T_c is the transmittance averaged over wavelength, weighted by sunlight and by the response of the channel. The
+light is not clipped: the Sun in the frame, 10⁵ times white, floods it at a haze of a few per cent, as it would in
+reality. The surroundings of the frame are its mirror image, clipped to white. Light scattered by more than the
+width of a frame is lost.
 """
 
 from __future__ import annotations
@@ -44,16 +46,16 @@ F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
 _REFERENCE_NM = 400.0  # λ0 of browning
-_STREAK_NM = 550.0  # for the width of streaks
-_STABILISED = 0.01  # of the browning of ordinary glass
-_CELLS = 256  # places across a frame at which scattered light is told
-_SOFT_CELLS = 0.7  # least standard deviation of a streak's width
-_FINE = 8  # samples each way of a cell near the middle of a kernel
+_STREAK_NM = 550.0  # wavelength that sets the width of streaks
+_STABILISED = 0.01  # browning of stabilised glass over that of ordinary glass
+_CELLS = 256  # cells along the longer side of a frame, on which scattered light is computed
+_SOFT_CELLS = 0.7  # least standard deviation of a streak's width, in cells
+_FINE = 8  # samples of a cell along each axis, near the middle of a kernel
 
 
 @dataclass(frozen=True, kw_only=True)
 class Contamination(LensFault):
-    """Haze, scratches, browning and lost coatings of a lens."""
+    """Add haze, scratches, browning and coating loss to a lens."""
 
     fault = "optics_degradation"
     model = "contamination"
@@ -86,8 +88,12 @@ class Contamination(LensFault):
     coating_loss: Interval = bounds(0.0, 0.3, limits=(0, 1), doc="share of the coatings' area that is gone")
 
     def draw(self, context: FaultContext, rng: np.random.Generator) -> Params:
-        """Lens and coating; the haze; of each scratch the direction from +x towards +y, width and share of the
-        beam; dose, coefficients and loss."""
+        """Return lens, coating, haze, scratches, dose, browning coefficients and coating loss.
+
+        Each scratch has its direction in degrees (0: +x, 90: +y), its width, and the fraction `share` of the light
+        that it scatters. These fractions are scaled down if their sum is more than half of the light that the film
+        leaves.
+        """
         frame = context.frame
         beam_mm = frame.lens.focal_length_mm / frame.lens.f_number
         params: Params = {"lens": self.lens, "coating": self.coating}
@@ -107,11 +113,11 @@ class Contamination(LensFault):
         return params
 
     def inform(self, context: FaultContext, params: Params) -> FaultContext:
-        """Worn coatings raise ghosts."""
+        """Return the context with the coating loss, which makes ghosts brighter."""
         return replace(context, coating_loss=float(params["coating_loss"]))
 
     def apply(self, quantity: Any, params: Params, context: FaultContext) -> Any:
-        """Expected electrons, scattered and darkened."""
+        """Return the expected electrons, scattered and darkened."""
         passes = colours(params, context)
         lost = params["haze"] + sum(s["share"] for s in params["scratches"])
         out = times(quantity.array, passes * (1 - lost))
@@ -121,22 +127,22 @@ class Contamination(LensFault):
         return quantity.with_array(out)
 
     def footprint(self, params: Params, context: FaultContext) -> NDArray[np.bool_]:
-        """bool[y, x]: the whole image."""
+        """Return the whole image as bool[y, x]."""
         return np.ones(context.shape, dtype=bool)
 
 
-# --- what passes -----------------------------------------------------------------------------------------------
+# --- transmittance ---------------------------------------------------------------------------------------------
 
 
 def stabilised(glass: str) -> bool:
-    """Whether radiation hardly browns a glass of that name: BK7G18 and its like, and silica."""
+    """Return whether radiation hardly browns the glass of that name: silica, and glasses like BK7G18."""
     return glass == "silica" or re.search(r"\dG\d+$", glass) is not None
 
 
 def browned(
     lens: Prescription, wavelength_nm: F64, *, dose_krad: float, per_mm_krad: float, exponent: float
 ) -> F64:
-    """Share of the light along the axis that browned glass lets pass, of what it did when new, float64[band]."""
+    """Return the transmittance of browned glass along the axis, over that of new glass, float64[band]."""
     depth = 0.0
     for surface in lens.surfaces[:-1]:
         if surface.medium.nd > 1.0:
@@ -146,7 +152,7 @@ def browned(
 
 @lru_cache(maxsize=8)
 def _reflectances(lens: Prescription, wavelength_nm: tuple[float, ...]) -> tuple[F64, F64]:
-    """Of every surface at normal incidence, coated and bare, float64[row, band] each."""
+    """Return the reflectances of every surface at normal incidence, coated and bare, float64[row, band] each."""
     nodes = np.array(wavelength_nm)
     media = [np.ones_like(nodes), *(surface.medium.index(nodes) for surface in lens.surfaces)]
     coated, bare = (
@@ -162,19 +168,22 @@ def _reflectances(lens: Prescription, wavelength_nm: tuple[float, ...]) -> tuple
 
 
 def surface_reflectances(lens: Prescription, wavelength_nm: F64, coating_loss: float) -> F64:
-    """Of every surface at normal incidence, a share of the coatings' area gone, float64[row, band]."""
+    """Return the reflectance of every surface at normal incidence with worn coatings, float64[row, band].
+
+    `coating_loss` is the fraction of the coatings' area that is gone, in [0, 1].
+    """
     coated, bare = _reflectances(lens, tuple(float(w) for w in wavelength_nm))
     return np.asarray(coated + coating_loss * (bare - coated))
 
 
 def worn(lens: Prescription, wavelength_nm: F64, coating_loss: float) -> F64:
-    """Share of the light that passes worn coatings, of what passed when they were whole, float64[band]."""
+    """Return the transmittance of the surfaces with worn coatings, over that with whole coatings, float64[band]."""
     passes, passed = (1 - surface_reflectances(lens, wavelength_nm, loss) for loss in (coating_loss, 0.0))
     return np.asarray(np.prod(passes / passed, axis=0))
 
 
 def colours(params: Params, context: FaultContext) -> F64:
-    """What passes of sunlight in each of the detector's channels, float64[channel]."""
+    """Return the fraction of sunlight that passes in each of the detector's channels, float64[channel]."""
     nodes, sun = context.wavelength_nm, context.sun_irradiance_W_m2_nm
     if nodes is None or sun is None:
         nodes = spectra.band_nodes_nm(400.0, 700.0, 8)
@@ -191,12 +200,15 @@ def colours(params: Params, context: FaultContext) -> F64:
     return np.asarray(weights @ passes / np.maximum(weights.sum(axis=1), 1e-300))
 
 
-# --- what is scattered -----------------------------------------------------------------------------------------
+# --- scattered light -------------------------------------------------------------------------------------------
 
 
 def haze_kernel(distance: NDArray, knee: float, slope: float) -> F64:
-    """The film's point spread, float64 like `distance` on the sensor from the image's place, near the axis, in
-    focal lengths; its integral over the plane is 1. The distance is a tangent: β is the sine of its angle."""
+    """Return the film's point spread function near the axis, float64 of the shape of `distance`.
+
+    `distance` is the distance from the image point on the sensor, in focal lengths, which is the tangent of the
+    scattering angle; β is the sine of that angle. The integral over the plane is 1.
+    """
     square = np.asarray(distance, dtype=np.float64) ** 2 + 1
     whole = Harvey(b0=1 / Harvey(b0=1.0, L=knee, S=slope).tis, L=knee, S=slope)
     return whole.bsdf(np.sqrt(1 - 1 / square)) / square**2
@@ -205,26 +217,44 @@ def haze_kernel(distance: NDArray, knee: float, slope: float) -> F64:
 def scratch_kernel(
     along: NDArray, across: NDArray, *, width_um: float, bend_rad: float, soft: float, cell: float
 ) -> NDArray:
-    """A scratch's point spread, 1/sr, like the places along and across the streak, in focal lengths; the streak
-    lies across the scratch. `soft`: standard deviation of its width at its source; `cell`: over which length along
-    it the mean is taken. Its integral over the plane is 1."""
+    """Return the point spread function of a scratch, in 1/sr, at positions along and across its streak.
+
+    The streak is perpendicular to the scratch. The integral over the plane is 1.
+
+    Parameters
+    ----------
+    along, across
+        Positions in focal lengths, of shapes that broadcast.
+    width_um
+        Width of the scratch.
+    bend_rad
+        Standard deviation of the direction of the scratch.
+    soft
+        Standard deviation of the streak's width at its source, in focal lengths.
+    cell
+        Length along the streak over which the mean is taken, in focal lengths.
+    """
     half = _STREAK_NM * 1e-3 / (2 * np.pi * width_um)
     square = along * along
     variance = square * bend_rad**2 + soft**2
     fan = np.exp(across * across / (-2 * variance))
     fan /= np.sqrt(variance * (2 * np.pi))
-    # the difference of the arcus tangents of both ends of the cell
+    # difference of the arctangents of both ends of the cell
     fan *= np.arctan2(cell * half, square + (half**2 - cell**2 / 4))
     fan *= 1 / (np.pi * cell)
     return fan
 
 
 def _cell_px(frame: ImageFrame) -> int:
+    """Return the side of a cell in px."""
     return max(1, round(max(frame.width_px, frame.height_px) / _CELLS))
 
 
 def kernel(params: Params, frame: ImageFrame, shape: tuple[int, int]) -> F32:
-    """Shares of the light of a cell that scatter to the cells of a periodic grid, float32[y, x], its own first."""
+    """Return the fractions of a cell's light that scatter to all cells of a periodic grid, float32[y, x].
+
+    Entry [0, 0] is the cell itself.
+    """
     cell = _cell_px(frame) * frame.pixel_pitch_um * 1e-3 / frame.lens.focal_length_mm
     y, x = (fft.fftfreq(n, 1 / n).astype(np.float32) * np.float32(cell) for n in shape)
     out = (
@@ -232,7 +262,7 @@ def kernel(params: Params, frame: ImageFrame, shape: tuple[int, int]) -> F32:
         * cell**2
         * haze_kernel(np.hypot(x[None, :], y[:, None]), params["haze_knee"], params["haze_slope"])
     )
-    # near the middle a cell's mean is not its middle's value
+    # near the middle, the mean over a cell differs from the value at its centre
     reach = min(4, (min(shape) - 1) // 2)
     fine = (np.arange((2 * reach + 1) * _FINE) + 0.5) / _FINE - reach - 0.5
     near = haze_kernel(cell * np.hypot(fine[None, :], fine[:, None]), params["haze_knee"], params["haze_slope"])
@@ -254,13 +284,13 @@ def kernel(params: Params, frame: ImageFrame, shape: tuple[int, int]) -> F32:
 
 
 def _strewn(array: F32, white_e: F32, params: Params, frame: ImageFrame) -> F32:
-    """Scattered light, float32[y, x, channel]."""
+    """Return the scattered light, float32[y, x, channel]."""
     step = _cell_px(frame)
     height, width, channels = array.shape
     rows, columns = -(-height // step), -(-width // step)
     whole = cv2.copyMakeBorder(array, 0, rows * step - height, 0, columns * step - width, cv2.BORDER_REPLICATE)
     cells = cv2.resize(whole, (columns, rows), interpolation=cv2.INTER_AREA).reshape(rows, columns, channels)
-    # twice the frame: no two of its cells meet around the grid's far side
+    # the grid has twice the size of the frame, so no two cells of the frame meet across its periodic edge
     shape = (fft.next_fast_len(2 * rows, real=True), fft.next_fast_len(2 * columns, real=True))
     top, left = (shape[0] - rows) // 2, (shape[1] - columns) // 2
     around = cv2.copyMakeBorder(

@@ -1,21 +1,23 @@
-"""Dust on the optics, the paper's model: soft grains that darken the image.
+"""Simulate dust on the optics as in the paper (Gallon et al.): soft grains that darken the image.
 
-A grain is a bivariate normal density scaled so that its maximum is the drawn peak t (in units of 255):
+A grain is a bivariate normal density, scaled so that its maximum is the drawn peak t (in units of 255):
 
     t(d) = t · exp(-½ dᵀ C⁻¹ d),      I' = I (1 - t(d) / 255),
 
-d being the distance from the grain's centre on the paper's square grid and C its covariance matrix. R, G and
+where d is the distance from the grain's centre on the paper's square grid and C is the covariance matrix. R, G and
 B lose the same fraction as I, so the factor acts on the expected photo-electrons.
 
-Choices where the paper is silent or of two minds:
-- σxx and σyy (3-6) are taken as entries of the covariance matrix, as its table names them: the standard
-  deviations are 1.7-2.4 grid units. (Read as standard deviations, grains would be up to 2.5 times as wide.)
-- One grid unit is 4.5 px of a 1024 px wide image: grains are then 33-47 px wide at a tenth of their depth,
-  the soft blobs of its figure, and 44-67 px where they end.
-- "The corners of the grid are removed": the grain ends on the ellipse where it falls below 2 DN of
-  255, which removes the corners of any square grid. That step of 0.8 % lies within the sensor's noise, and
-  from a quarter of white on it is what changes the 8 bit image: the mask is the grain.
-- Where grains overlap, their transmissions multiply (two grains in one beam); the order does not matter.
+Choices where the paper says nothing or contradicts itself:
+
+- σxx and σyy (3-6) are entries of the covariance matrix, as the paper's table names them. The standard deviations
+  are then 1.7-2.4 grid units. (If they were standard deviations, grains would be up to 2.5 times as wide.)
+- One grid unit is 4.5 px of a 1024 px wide image. Grains are then 33-47 px wide at a tenth of their depth, like the
+  soft blobs in the paper's figure, and 44-67 px wide at their ends.
+- "The corners of the grid are removed": a grain ends on the ellipse where its darkening falls below 2 DN of 255,
+  which removes the corners of any square grid. That step of 0.8 % is smaller than the sensor's noise. Where the
+  image is brighter than a quarter of white, a loss of this size changes the 8 bit image. The mask is therefore the
+  grain.
+- Where grains overlap, their transmissions multiply, as for two grains in one beam. The order does not matter.
 """
 
 from __future__ import annotations
@@ -32,7 +34,7 @@ from .base import Fault, FaultContext, Interval, Params, bounds, flag, number
 
 @dataclass(frozen=True, kw_only=True)
 class GaussianDust(Fault):
-    """Gaussian dust grains (Gallon et al., table of dust parameters)."""
+    """Darken the image by Gaussian dust grains (Gallon et al., table of dust parameters)."""
 
     fault = "dust_on_optics"
     model = "gaussian"
@@ -76,6 +78,7 @@ class GaussianDust(Fault):
     scale_with_resolution: bool = flag(True, doc="grain size refers to a 1024 px wide image and scales with it")
 
     def validate(self) -> None:
+        """Raise ValueError if a drawn covariance matrix might not be positive definite."""
         largest = max(abs(v) for v in self.sigma_xy)
         if largest**2 >= self.sigma_xx.lo * self.sigma_yy.lo:
             raise ValueError(
@@ -84,7 +87,10 @@ class GaussianDust(Fault):
             )
 
     def draw(self, context: FaultContext, rng: np.random.Generator) -> Params:
-        """Columns of grains: centre in px, peak in DN, covariance in grid units²; and the size of a unit."""
+        """Return one list per property of the grains, the size of a grid unit in px, and the mask level.
+
+        Centres are in px, peaks in DN of 255, covariances in grid units².
+        """
         height, width = context.shape
         count = self.count.integer(rng)
         columns = {
@@ -102,7 +108,7 @@ class GaussianDust(Fault):
         return params
 
     def apply(self, quantity: Any, params: Params, context: FaultContext) -> Any:
-        """Expected electrons times the transmission of all grains."""
+        """Return the expected electrons times the transmission of all grains."""
         at, factor = context.once("dust.grains", params, lambda: _grains(_transmission_once(params, context)))
         out = quantity.array.copy()
         pixels = out.reshape(-1, out.shape[2])
@@ -110,33 +116,34 @@ class GaussianDust(Fault):
         return quantity.with_array(out)
 
     def footprint(self, params: Params, context: FaultContext) -> NDArray[np.bool_]:
-        """bool[y, x]: where a grain darkens by more than `mask_level_dn`."""
+        """Return the pixels that a grain darkens by more than `mask_level_dn`, bool[y, x]."""
         return _transmission_once(params, context) < 1
 
     def soft(self, params: Params, context: FaultContext) -> NDArray[np.float32]:
-        """Return the fraction of the light that the grains take, float32[y, x]."""
+        """Return the fraction of the light that the grains remove, float32[y, x]."""
         return np.float32(1) - _transmission_once(params, context)
 
 
 def _grains(factor: NDArray[np.float32]) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-    """Flat indices of the pixels under grains, and their transmission, float32[n, 1]: a tenth of the frame."""
+    """Return the flat indices of pixels under grains and their transmission, float32[n, 1]."""
     at = np.flatnonzero(factor < 1)
     return at, factor.ravel()[at, None]
 
 
 def _transmission_once(params: Params, context: FaultContext) -> NDArray[np.float32]:
+    """Return the transmission of all grains, computed once for each sample."""
     return context.once("dust.transmission", params, lambda: transmission(params, context.shape))
 
 
 def transmission(params: Params, shape: tuple[int, int]) -> NDArray[np.float32]:
-    """Transmission of all grains, float32[y, x] in [0, 1], exactly 1 outside them."""
+    """Return the transmission of all grains, float32[y, x] in [0, 1], exactly 1 outside them."""
     height, width = shape
     out = np.ones(shape, dtype=np.float32)
     unit, level = params["pixels_per_grid_unit"], params["mask_level_dn"]
     names = ("x_px", "y_px", "peak_dn", "sigma_xx", "sigma_yy", "sigma_xy")
     x, y, peak, xx, yy, xy = (np.asarray(params[n], dtype=np.float64) for n in names)
     determinant = xx * yy - xy * xy
-    # t > level within dᵀC⁻¹d < reach2: an ellipse that spans ±√(reach2 · variance) along x and y
+    # t > level where dᵀC⁻¹d < reach2: an ellipse with half widths √(reach2 · variance) along x and y
     reach2 = 2 * np.log(np.maximum(peak / level, 1))
     x0, x1 = _spans(x, unit * np.sqrt(reach2 * xx), width)
     y0, y1 = _spans(y, unit * np.sqrt(reach2 * yy), height)
@@ -157,7 +164,7 @@ def transmission(params: Params, shape: tuple[int, int]) -> NDArray[np.float32]:
 def _spans(
     centre: NDArray[np.float64], half: NDArray[np.float64], size: int
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """First and past-the-last pixel that centre ± half touches within the frame."""
+    """Return the first pixel, and the one after the last, that centre ± half covers within the frame."""
     first, last = np.floor(centre - half), np.ceil(centre + half)
     return np.maximum(first, 0).astype(np.int64), np.minimum(last, size).astype(np.int64)
 
@@ -169,7 +176,10 @@ def _profiles(
     unit: float,
     weight: NDArray[np.float64],
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """exp(-½ weight d²) and d per grain and pixel from `start` on, float32[grain, pixel], d in grid units."""
+    """Return exp(-½ weight d²) and d for each grain and each pixel from `start` on, float32[grain, pixel].
+
+    d is in grid units.
+    """
     longest = max(0, int((stop - start).max(initial=0)))
     d = (start[:, None] + np.arange(longest) + 0.5 - centre[:, None]) / unit
     return np.exp(-0.5 * weight[:, None] * d**2).astype(np.float32), d.astype(np.float32)

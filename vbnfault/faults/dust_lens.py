@@ -1,23 +1,31 @@
-"""Dust by physics: grains on a surface of the lens, or on the sensor's window, in the beams that cross them there.
+"""Simulate dust by physics: grains on a lens surface or on the sensor's window, in the beams that cross them.
 
-A pixel loses the share of its beam's footprint that grains cover (design from exact rays, `lens.footprint`):
+A pixel loses the fraction of its beam's footprint that grains cover (`lens.footprint` computes it by exact rays):
 
     τ = 1 - Σ (1 - t_g) · |grain ∩ footprint| / |footprint|.
 
-Before a pupil of the diameter D at a distance z a grain of the diameter d gives a shadow f (D + d) / z wide with a
-plateau f |D - d| / z wide and (d/D)² deep; at a height s over the sensor, in a cone of the f-number N, one that is
-d + s/N wide. Grains are discs across the axis, with the transmission t_g; colours lose alike.
+A grain of diameter d in front of a pupil of diameter D, at a distance z from it, gives a shadow f (D + d) / z wide,
+with f the focal length. Its plateau is f |D - d| / z wide and (d/D)² deep. A grain at a height s above the sensor,
+in a cone of f-number N, gives a shadow d + s/N wide. Grains are discs perpendicular to the axis, with the
+transmission t_g. All channels lose the same fraction.
 
-In the Sun a grain glows: it diffracts as much light as it takes, as a disc of its radius a does,
+In the Sun a grain glows. It diffracts as much light as it blocks, like a disc of its radius a, at the angle θ from
+the Sun's direction and for k = 2π/λ:
 
-    dσ/dΩ = (1 - t_g) k² a⁴ [J1(x) / x]²,   x = k a sin θ,
+    dσ/dΩ = (1 - t_g) k² a⁴ [J1(x) / x]²,   x = k a sin θ.
 
-averaged over radii within ±50 %, since a disc's rings are not seen of grains; and its outside reflects as a
-sphere's does, (1 - t_g) a²/4 R((π - θ)/2). A pixel whose beam crosses the grain receives E = E☉ T dσ/dΩ dΩ/dA
-(the form of Peterson 2004, Proc. SPIE 5178, 184, for a single grain), and no other: so grains on the front are
-bright discs near the Sun, outlined as their shadows are. Left out: glow of grains on the window, which is lost in
-the Sun's own image, and light that grains behind the first surface get from beside the beam that reaches the
-sensor.
+This is averaged over radii within ±50 %, because real grains do not show the rings of a disc. The outside of a
+grain reflects like a sphere, (1 - t_g) a²/4 R((π - θ)/2), with R the reflectance at an angle of incidence. A pixel
+whose beam crosses the grain receives the irradiance
+
+    E = E☉ T dσ/dΩ dΩ/dA
+
+from the Sun's irradiance E☉ through the transmittance T of the lens, with dΩ/dA the solid angle per area of sensor
+(the form of Peterson 2004, Proc. SPIE 5178, 184, for a single grain). Other pixels receive nothing from the grain.
+Grains on the front are therefore bright discs near the Sun, with the outlines of their shadows.
+
+Left out are the glow of grains on the window, which is lost in the Sun's own image, and the light that reaches
+grains behind the first surface from outside the beam of the Sun's image.
 """
 
 from __future__ import annotations
@@ -44,18 +52,18 @@ F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
 _DRAWN, _WINDOW = -1, -2
-_NODES = 129  # of the frame, each way, where a shadow is looked for
-_COARSEST = 8  # px between the places where a shadow is told
-_ERROR = 3e-4  # of the light: what interpolation between them may miss
+_NODES = 129  # nodes along each side of the frame at which the code searches for shadows
+_COARSEST = 8  # largest distance in px between the nodes at which shadows are computed
+_ERROR = 3e-4  # largest error of the interpolation between them, as a fraction of the light
 _OFFSETS: F64 = np.geomspace(1e-5, 2.0, 257)
 _LOOKUP = 1 << 14
-_RADII = 32  # over which a lobe is averaged
-_SMOOTH = 30.0  # k a sin θ from which on a lobe falls evenly
+_RADII = 32  # number of radii over which a lobe is averaged
+_SMOOTH = 30.0  # k a sin θ above which a lobe falls smoothly
 
 
 @dataclass(frozen=True, kw_only=True)
 class DefocusedDust(LensFault):
-    """Shadows of grains far out of focus, and their glow in the Sun."""
+    """Add the shadows of grains far out of focus, and their glow in the Sun."""
 
     fault = "dust_on_optics"
     model = "defocused"
@@ -88,12 +96,16 @@ class DefocusedDust(LensFault):
     )
 
     def validate(self) -> None:
+        """Raise ValueError if the lens lacks the surface."""
         if self.lens and self.surface >= (rows := len(load_lens(self.lens).surfaces)):
             raise ValueError(f"surface = {self.surface}: {self.lens} has rows 0 to {rows - 1}")
 
     def draw(self, context: FaultContext, rng: np.random.Generator) -> Params:
-        """Lens, row, height of the window, and columns of grains: `on_window`, place on the surface in mm from the
-        axis (x to the right, y down, as their shadows on the window lie), diameter in µm, transmission."""
+        """Return lens, row of the surface, height of the window, and one list per property of the grains.
+
+        `x_mm` and `y_mm` are the positions on the surface, measured from the axis (x to the right, y down, in the
+        same directions as the shadows of grains on the window). `on_window` says which grains lie on the window.
+        """
         frame = context.frame
         surfaces = frame.real_lens(self.lens).prescription.surfaces
         row = min(max(int(self.surface), 0), len(surfaces) - 1)
@@ -119,14 +131,17 @@ class DefocusedDust(LensFault):
         }
 
     def apply(self, quantity: Any, params: Params, context: FaultContext) -> Any:
-        """Expected electrons times the transmission of all grains, plus their glow."""
+        """Return the expected electrons times the transmission of all grains, plus their glow."""
         factor = _shadows_once(params, context).transmission
         out = times(quantity.array, factor)
         light = _glow_once(params, context)
         return quantity.with_array(out if light is None else plus(out, light))
 
     def footprint(self, params: Params, context: FaultContext) -> NDArray[np.bool_]:
-        """bool[y, x]: where the loss reaches `mask_loss`, or the glow that fraction of white in any channel."""
+        """Return the pixels where the loss reaches `mask_loss`, or the glow that fraction of white, bool[y, x].
+
+        The glow counts if it reaches the level in any channel.
+        """
         dark = _shadows_once(params, context).transmission <= np.float32(1 - params["mask_loss"])
         light = _glow_once(params, context)
         if light is None:
@@ -135,7 +150,7 @@ class DefocusedDust(LensFault):
         return np.asarray(dark | (light >= np.float32(params["mask_loss"]) * white).any(axis=2))
 
     def soft(self, params: Params, context: FaultContext) -> F32:
-        """Return the fraction of the light that the grains take, float32[y, x]; their glow is no part of it."""
+        """Return the fraction of the light that the grains remove, float32[y, x]. Their glow does not count."""
         return np.float32(1) - _shadows_once(params, context).transmission
 
 
@@ -144,13 +159,13 @@ class DefocusedDust(LensFault):
 
 @lru_cache(maxsize=8)
 def _footprint(frame: ImageFrame, name: str, row: int, height_mm: float) -> Footprint:
-    """On a row, or with a height in that plane above the sensor."""
+    """Return the footprints on a surface of the lens, or `height_mm` above the sensor if that is not 0."""
     found = frame.beams(name)
     return found.above_sensor(height_mm) if height_mm else found.on_row(row)
 
 
 class _Grains(NamedTuple):
-    """Grains of one surface: places and radii in mm, share of light taken."""
+    """Hold the grains of one surface: positions and radii in mm, and the fraction of light that each blocks."""
 
     x_mm: F64
     y_mm: F64
@@ -159,6 +174,7 @@ class _Grains(NamedTuple):
 
 
 def _grains(params: Params, on_window: bool) -> _Grains:
+    """Return the grains on the window, or those on the surface of the lens."""
     chosen = np.array(params["on_window"], dtype=bool) == on_window
     names = ("x_mm", "y_mm", "diameter_um", "transmission")
     x, y, diameter, passes = (np.asarray(params[n], dtype=np.float64)[chosen] for n in names)
@@ -169,19 +185,29 @@ def _grains(params: Params, on_window: bool) -> _Grains:
 
 
 class _Shadows(NamedTuple):
-    """`transmission` float32[y, x]; and sums over the grains on the row that the Sun lights of (1 - t) · share of
-    the grain in a pixel's beam · its radius, and its square, `seen` float32[2, y, x] in mm and mm²; None if it
-    lights none."""
+    """Hold what the grains do to each pixel's beam.
+
+    Attributes
+    ----------
+    transmission
+        float32[y, x].
+    seen
+        float32[2, y, x]: Σ (1 - t) · q · a in mm, and Σ (1 - t) · q · a² in mm², over the grains on the surface
+        that the Sun lights. q is the lit fraction of the grain times the fraction of it in the pixel's beam, a is
+        its radius. None if the Sun lights no grain.
+    """
 
     transmission: F32
     seen: F32 | None
 
 
 def _shadows_once(params: Params, context: FaultContext) -> _Shadows:
+    """Return the shadows, computed once for each sample."""
     return context.once("dust.shadows", params, lambda: _shadows(params, context))
 
 
 def _shadows(params: Params, context: FaultContext) -> _Shadows:
+    """Return the shadows of all grains. Transmissions of the window and of the lens's surface multiply."""
     frame = context.frame
     total: F32 | None = None
     seen: F32 | None = None
@@ -202,15 +228,19 @@ def _shadows(params: Params, context: FaultContext) -> _Shadows:
 
 
 def _step_px(grains: _Grains, footprint: Footprint, frame: ImageFrame) -> int:
-    """Distance of the places where shadows are told, a power of two, and linear between: the soft edge of a shadow
-    is as wide as the grain, or the beam if that is narrower."""
+    """Return the distance in px between the nodes at which shadows are computed, a power of two.
+
+    Between the nodes the interpolation is linear. The soft edge of a shadow is as wide as the grain, or as the beam
+    if that is narrower.
+    """
     with np.errstate(divide="ignore", invalid="ignore"):
         moves = np.abs(np.gradient(footprint.centre_mm, footprint.slope)).max()
     focal_px = frame.lens.focal_length_mm * 1e3 / frame.pixel_pitch_um
     beam_mm2 = float(np.median(footprint.area_mm2[footprint.area_mm2 > 0]))
     edge_px = 2 * np.minimum(grains.radius_mm, np.sqrt(beam_mm2 / np.pi)) * focal_px / max(float(moves), 1e-9)
     depth = grains.taken * np.minimum(np.pi * grains.radius_mm**2 / beam_mm2, 1)
-    # the edge rises over its width as a chord's area does: linear pieces miss 0.3 (step / width)^1.5 of it
+    # the edge rises over its width like the area of a circular segment: linear pieces miss 0.3 (step / width)^1.5
+    # of it
     step = float((edge_px * (_ERROR / np.maximum(0.3 * depth, 1e-12)) ** (2 / 3)).min())
     return int(2 ** np.clip(np.floor(np.log2(max(step, 1))), 0, np.log2(_COARSEST)))
 
@@ -218,14 +248,14 @@ def _step_px(grains: _Grains, footprint: Footprint, frame: ImageFrame) -> int:
 def _sums(
     grains: _Grains, footprint: Footprint, frame: ImageFrame, on_window: bool, lit: F64 | None
 ) -> tuple[F32, F32 | None]:
-    """Σ of shares taken, float32[y, x], and `seen` of `_Shadows`."""
+    """Return the summed blocked fraction of the light, float32[y, x], and `seen` of `_Shadows`."""
     height, width = frame.height_px, frame.width_px
     step = _step_px(grains, footprint, frame)
-    # with places beyond the frame on all sides, so that those within lie between some
+    # one extra node beyond each edge, so that every pixel lies between nodes
     rows, columns = -(-height // step) + 2, -(-width // step) + 2
     x_px, y_px = ((np.arange(n) - 0.5) * step for n in (columns, rows))
     sums = np.zeros((1 if lit is None else 3, rows, columns), dtype=np.float32)
-    # few places are known at once; of many, those that each grain asks for
+    # compute the footprints of a coarse grid once; on the pixel grid, compute only those near each grain
     whole = footprint.places(*frame.slopes(x_px, y_px)) if step > 1 else None
     for k, (top, bottom, left, right) in enumerate(_windows(grains, footprint, frame, x_px, y_px)):
         if top >= bottom or left >= right:
@@ -237,7 +267,8 @@ def _sums(
             else whole.part(part)
         )
         radius = float(grains.radius_mm[k])
-        # in a narrow cone near the sensor shadows are small, and footprints far from round at the frame's corners
+        # near the sensor the cone is narrow: shadows are small, and at the frame's corners footprints are far from
+        # round
         cover = places.covered_nearby if on_window else places.covered
         covered = cover(float(grains.x_mm[k]), float(grains.y_mm[k]), radius)
         covered *= np.float32(grains.taken[k])
@@ -253,11 +284,11 @@ def _sums(
 def _windows(
     grains: _Grains, footprint: Footprint, frame: ImageFrame, x_px: NDArray, y_px: NDArray
 ) -> list[tuple[int, int, int, int]]:
-    """Rows and columns, start and stop each, outside of which a grain touches no footprint."""
+    """Return for each grain the start and stop of rows and columns; outside of them it touches no footprint."""
     x, y = (np.linspace(v[0], v[-1], min(_NODES, len(v))) for v in (x_px, y_px))
     places = footprint.places(*frame.slopes(x, y), light=False)
     at_x, at_y = places.centre_mm * places.cos, places.centre_mm * places.sin
-    # from a node to any place nearer to it than to others
+    # distance from a node to the farthest position that has it as its nearest node
     apart = sum(float(np.hypot(np.diff(at_x, axis=a), np.diff(at_y, axis=a)).max(initial=0)) for a in (0, 1))
     reach = footprint.largest_mm + grains.radius_mm + 0.55 * apart
     grain_x, grain_y, square = (v.astype(np.float32)[:, None, None] for v in (grains.x_mm, grains.y_mm, reach**2))
@@ -274,7 +305,7 @@ def _windows(
 
 
 def _finer(coarse: F32, step: int, shape: tuple[int, int]) -> F32:
-    """From places `step` apart, the first of them half a step outside, to pixels."""
+    """Interpolate from nodes `step` px apart, the first of them half a step outside the frame, to pixels."""
     if step == 1:
         return np.ascontiguousarray(coarse[1:-1, 1:-1])
     rows, columns = coarse.shape
@@ -286,7 +317,7 @@ def _finer(coarse: F32, step: int, shape: tuple[int, int]) -> F32:
 
 
 class _Sun(NamedTuple):
-    """Slopes of its direction, and the direction; irradiance in the bands, W m⁻² nm⁻¹."""
+    """Hold the slopes and the unit vector of the Sun's direction, and its irradiance in the bands, W m⁻² nm⁻¹."""
 
     slope: F64
     direction: F64
@@ -296,7 +327,7 @@ class _Sun(NamedTuple):
 
 
 def _sun(context: FaultContext) -> _Sun | None:
-    """None where it is unknown or gives no light."""
+    """Return the Sun; None if it is unknown, behind the camera or covered."""
     direction, irradiance = context.sun_direction_C, context.sun_irradiance_W_m2_nm
     if direction is None or irradiance is None or context.wavelength_nm is None or direction[2] <= 1e-3:
         return None
@@ -309,7 +340,7 @@ def _sun(context: FaultContext) -> _Sun | None:
 
 
 def _in_suns_beam(params: Params, context: FaultContext, grains: _Grains, sun: _Sun) -> F64:
-    """Share of each grain on the row that lies in the beam of the Sun's image, float64[grain]."""
+    """Return the fraction of each grain's area inside the beam of the Sun's image, float64[grain]."""
     footprint = _footprint(context.frame, params["lens"], params["surface"], 0.0)
     if np.hypot(*sun.slope) > footprint.slope[-1]:
         return np.zeros(len(grains.x_mm))
@@ -322,7 +353,10 @@ def _in_suns_beam(params: Params, context: FaultContext, grains: _Grains, sun: _
 
 
 def _lit(params: Params, context: FaultContext, grains: _Grains) -> F64 | None:
-    """Share of each grain on the row that the Sun lights: all of it on the front. None where it lights none."""
+    """Return the fraction of each grain's area that the Sun lights; None if it lights no grain.
+
+    The Sun lights all of the first surface.
+    """
     sun = _sun(context)
     if sun is None:
         return None
@@ -331,9 +365,11 @@ def _lit(params: Params, context: FaultContext, grains: _Grains) -> F64 | None:
 
 
 def lobe(x: F64) -> F64:
-    """[J1(x)/x]² of a grain without a sharp radius, float64 alike: the mean over radii s a of s⁴ [J1(s x)/(s
-    x)]², s within ±50 % about its middle and scaled to a mean square of 1, so that the scattered light, ∝ a², is
-    kept."""
+    """Return [J1(x)/x]² averaged over a range of radii, float64 of the shape of `x`.
+
+    The mean is that of s⁴ [J1(s x)/(s x)]² over radii s a, with s within ±50 % of its middle. s is scaled to a mean
+    square of 1, which keeps the scattered light, ∝ a².
+    """
     u = 2 * (np.arange(_RADII) + 0.5) / _RADII - 1
     weight = 1 + np.cos(np.pi * u)
     s = 1 + 0.5 * u
@@ -344,19 +380,20 @@ def lobe(x: F64) -> F64:
 
 @lru_cache(maxsize=1)
 def _lobe_nodes() -> tuple[F64, F64]:
+    """Return the nodes and values of the table of `lobe`."""
     x = np.linspace(0, _SMOOTH, 3001)
     found = lobe(x)
     return x, found
 
 
 def lobe_tail() -> float:
-    """π x³ times `lobe`, for large x."""
+    """Return π x³ · lobe(x) for large x, where it is constant."""
     nodes, values = _lobe_nodes()
     return float(np.pi * nodes[-1] ** 3 * values[-1])
 
 
 def _lobe_table(x: F64) -> F64:
-    """`lobe` by linear interpolation, within 1e-4; beyond `_SMOOTH` its fall with x⁻³."""
+    """Return `lobe` by linear interpolation, within 1e-4; above `_SMOOTH` it falls as x⁻³."""
     nodes, values = _lobe_nodes()
     out = np.interp(x, nodes, values)
     far = x >= _SMOOTH
@@ -365,14 +402,16 @@ def _lobe_table(x: F64) -> F64:
 
 
 def _glow_once(params: Params, context: FaultContext) -> F32 | None:
+    """Return the glow, computed once for each sample."""
     return context.once("dust.glow", params, lambda: _glow(params, context))
 
 
 def _glow(params: Params, context: FaultContext) -> F32 | None:
-    """Light that grains send astray, electrons float32[y, x, channel].
+    """Return the light that grains scatter or reflect onto the sensor, electrons float32[y, x, channel].
 
-    Beyond their cores the lobes of all grains fall alike, as a / (π k sin³θ), and there a sum over the grains in a
-    pixel's beam is enough. Near the Sun each has a lobe of its own, but there the pixels' beams are the Sun's.
+    Far from the Sun the lobes of all grains fall in the same manner, as a / (π k sin³θ), so a sum over the grains
+    in a pixel's beam is sufficient. Near the Sun each grain has a lobe of its own. There the beam of a pixel is
+    close to that of the Sun's image, so the grains in the Sun's beam can be used.
     """
     seen, sun = _shadows_once(params, context).seen, _sun(context)
     if seen is None or sun is None:
@@ -393,23 +432,29 @@ def _glow(params: Params, context: FaultContext) -> F32 | None:
 
 
 def _stretch(lens: RealLens, row: int) -> float:
-    """How much smaller than at the entrance the beam is on a row, to first order."""
+    """Return the diameter of the beam at the entrance over that on the row, to first order."""
     marginal = abs(float(along(lens.prescription, forward(lens.prescription))[1][row, 0, 0]))
     return 1 / max(marginal, 1e-6)
 
 
 def _lobes(radius_mm: F64, core: F64, sun: _Sun, stretch: float) -> tuple[F64, F64, F64, F64]:
-    """Scattered intensity over `_OFFSETS`, averaged over the Sun's disc (and that of a pixel's area).
+    """Return the scattered intensity at `_OFFSETS`, averaged over the Sun's disc (widened by a pixel's area).
 
-    Of the grains in the Sun's beam, with the shares `core`, what they have beyond the common lobe, float64[band,
-    offset] in mm²; the common lobe per mm of radius, as factors of the bands and float64[offset]; and what is
-    reflected, per mm² of squared radius, float64[offset].
+    Returns
+    -------
+    own
+        float64[band, offset] in mm²: intensity of the grains in the Sun's beam, weighted by `core`, minus the
+        common lobe.
+    factor, common
+        float64[band] and float64[offset]: the common lobe per mm of radius is their product.
+    reflected
+        float64[offset]: reflected intensity per mm² of squared radius.
     """
     k = 2 * np.pi * 1e6 / sun.wavelength_nm  # per mm
     factor = lobe_tail() / (np.pi * k)
     knee = 2 / (k.mean() * np.median(radius_mm))
 
-    # `_OFFSETS` are twice the sines of half the angles
+    # an offset is twice the sine of half the angle
     sine = np.minimum(stretch * _OFFSETS * np.sqrt(np.maximum(1 - _OFFSETS**2 / 4, 0)), 1)
     common = (sine**2 + knee**2) ** -1.5 * (_OFFSETS**2 < 2)
     rs, rp, _, _ = reflect_transmit((), 1.0, DUST_INDEX.real, np.minimum(_OFFSETS / 2, 1), D_NM)
@@ -418,16 +463,19 @@ def _lobes(radius_mm: F64, core: F64, sun: _Sun, stretch: float) -> tuple[F64, F
         if share > 1e-6:
             strength = (share * k**2 * radius**4)[:, None]
             own += strength * _lobe_table(np.multiply.outer(k * radius, sine)) * (common > 0)
-    # a narrow lobe is told in the steps of `_OFFSETS`, and its mean over the disc follows from it ring by ring
+    # even a narrow lobe is sampled well at `_OFFSETS`, so its mean over the disc is a sum over rings
     over_disc = _over_disc(sun.radius_rad).T * stretch**4
     return own @ over_disc, factor, common @ over_disc, (rs + rp) / 8 @ over_disc
 
 
 def _over_disc(radius_rad: float) -> F64:
-    """The mean over a disc about a place, as weights of a function of the distance at `_OFFSETS`: float64[of the
-    mean, of the function]. Far from the disc it is the function itself."""
+    """Return weights that average a function of distance over a disc, float64[mean, function].
+
+    Both axes are distances `_OFFSETS` from the centre of the function. Far from that centre, the mean is the
+    function itself.
+    """
     r, s = _OFFSETS[:, None], _OFFSETS[None, :]
-    # of a ring about the place where the function has its middle, the arc within the disc
+    # arc within the disc of a ring about the centre of the function
     arc = np.arccos(np.clip((s * s + r * r - radius_rad**2) / (2 * s * r), -1, 1))
     weight = arc * s * np.gradient(_OFFSETS)
     weight /= np.maximum(weight.sum(axis=1, keepdims=True), 1e-300)
@@ -436,8 +484,11 @@ def _over_disc(radius_rad: float) -> F64:
 
 @lru_cache(maxsize=2)
 def _field(frame: ImageFrame) -> tuple[F32, F32 | None]:
-    """Directions of all pixels, float32[3, y, x]; and of a real lens the solid angle that it has on an area of the
-    sensor over that on the axis."""
+    """Return the directions of all pixels, float32[3, y, x], and the relative solid angle per sensor area.
+
+    The latter, float32[y, x], is the solid angle of a real lens per area of the sensor, over that on the axis; None
+    for a thin lens.
+    """
     lens = frame.lens
     x, y = frame.slopes(np.arange(frame.width_px) + 0.5, np.arange(frame.height_px) + 0.5)
     per_length = 1 / np.sqrt(1 + x * x + y * y)
@@ -454,8 +505,11 @@ def _field(frame: ImageFrame) -> tuple[F32, F32 | None]:
 def _painted(
     own_e: F64, factors_e: tuple[F64, F64], lobes: tuple[F64, F64], seen: F32, sun: _Sun, frame: ImageFrame
 ) -> F32:
-    """`own_e` float64[colour, offset], plus each of the two lobes, float64[offset], times its factor for the colour
-    and its layer of `seen`; electrons float32[y, x, channel]."""
+    """Return the glow in electrons, float32[y, x, channel].
+
+    It is the sum of `own_e`, float64[channel, offset], and of both lobes, float64[offset]. Each lobe is multiplied
+    by its factor for the channel and by its layer of `seen`.
+    """
     directions, density = _field(frame)
     square = np.zeros_like(directions[0])
     for component, at in zip(directions, sun.direction, strict=True):

@@ -1,17 +1,18 @@
-"""Pixel overwriting: a user's own texture on the image, the general tool behind the paper's faults.
+"""Overwrite pixels of the image with a user's own texture, the general operation behind the paper's faults.
 
 The texture file (PNG or TIFF, 8 or 16 bit, grey or RGB, with or without alpha) is stretched to the frame and
-blended with the chosen channels, t being the texture and v the image, both 0-255:
+blended with the chosen channels. With t the texture and v the image, both 0-255:
 
     replace   v' = t              add       v' = v + t
     multiply  v' = v · t / 255    mixture   v' = (1 - strength) v + strength · t
 
-Where the texture has an alpha channel a, the result is v + a (v' - v). A grey texture serves all channels;
-of an RGB texture I takes the luminance. Channels "I" alone follows the paper's way of changing the
-intensity: R, G and B are scaled by the same ratio. Values clip to 0-255.
+If the texture has an alpha channel a, the result is v + a (v' - v). A grey texture is used for all channels. Of an
+RGB texture, I uses the luminance. Channels "I" alone changes the intensity as in the paper: R, G and B are scaled
+by the same ratio. Values are clipped to 0-255.
 
-The mask holds the pixels on which the texture can act: alpha above 0 and, in the chosen channels, a value
-above 0 (add), below 255 (multiply) or any (replace, mixture).
+The mask holds the pixels that the texture can change: alpha is above 0, and in at least one of the chosen channels
+the texture is above 0 (add), below 255 (multiply) or anything (replace, and mixture
+with a strength above 0).
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ from ..core.errors import InputError, shown
 from ..core.quantities import CHANNELS, LUMINANCE
 from .base import Fault, FaultContext, Params, choice, number, scale_by_intensity, text
 
-# A decoded texture takes 32 bytes a pixel or more on its way: 24 megapixel, as of a photograph, take 0.8 GB.
+# A texture needs 32 bytes per pixel or more while it is decoded: 24 megapixels, as of a photograph, need 0.8 GB.
 LARGEST_TEXTURE_PIXELS = 25_000_000
 
 BLENDS = ("replace", "add", "multiply", "mixture")
@@ -38,7 +39,7 @@ BLENDS = ("replace", "add", "multiply", "mixture")
 
 @dataclass(frozen=True, kw_only=True)
 class TextureOverwriting(Fault):
-    """A texture file blended with the digital image."""
+    """Blend a texture file with the digital image."""
 
     fault = "pixel_overwriting"
     model = "texture"
@@ -50,6 +51,7 @@ class TextureOverwriting(Fault):
     strength: float = number(0.5, limits=(0, 1), doc="weight of the texture in a mixture")
 
     def validate(self) -> None:
+        """Raise ValueError if the texture cannot be read or the channels are invalid."""
         if not self.texture_file:
             raise ValueError("texture_file is missing: name a PNG or TIFF texture")
         try:
@@ -61,7 +63,7 @@ class TextureOverwriting(Fault):
             raise ValueError(f"channels = {self.channels!r}: must name some of R, G, B, I, each once")
 
     def draw(self, context: FaultContext, rng: np.random.Generator) -> Params:
-        """Nothing is random: the settings, and the SHA-256 of the texture file."""
+        """Return the settings and the SHA-256 of the texture file. Nothing is random."""
         return {
             "sha256": resources.sha256(resources.read_input(self.texture_file, "texture")),
             "channels": self.channels,
@@ -70,7 +72,7 @@ class TextureOverwriting(Fault):
         }
 
     def apply(self, quantity: Any, params: Params, context: FaultContext) -> Any:
-        """The image with the texture blended in."""
+        """Return the image with the texture blended in."""
         texture, alpha = self._fitted(params, context)
         where = np.flatnonzero(self._mask(params, context))
         out = quantity.array.copy()
@@ -88,19 +90,22 @@ class TextureOverwriting(Fault):
         return quantity.with_array(out)
 
     def footprint(self, params: Params, context: FaultContext) -> NDArray[np.bool_]:
-        """bool[y, x]: where the texture can act."""
+        """Return the pixels that the texture can change, bool[y, x]."""
         mask: NDArray[np.bool_] = self._mask(params, context).copy()
         return mask
 
     def _fitted(self, params: Params, context: FaultContext) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        # the parameters hold the texture's content, not its name: a renamed file gives the same dataset
+        """Return the texture and its alpha at the frame's size."""
+        # the parameters hold the hash of the texture, not its name, so a renamed file gives the same dataset
         return _stretch(self.texture_file, params["sha256"], context.shape)
 
     def _mask(self, params: Params, context: FaultContext) -> NDArray[np.bool_]:
+        """Return the mask, computed once for each sample."""
         return context.once("overwriting.mask", params, lambda: _mask(params, *self._fitted(params, context)))
 
 
 def _mask(params: Params, texture: NDArray[np.float32], alpha: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """Return the pixels that the texture can change, bool[y, x]."""
     mask = alpha > 0
     used = texture[..., [CHANNELS.index(c) for c in params["channels"]]]
     if params["blend"] == "add":
@@ -113,6 +118,7 @@ def _mask(params: Params, texture: NDArray[np.float32], alpha: NDArray[np.float3
 
 
 def _blend(v: NDArray[np.float32], t: NDArray[np.float32], blend: str, strength: float) -> NDArray[np.float32]:
+    """Return v' of the module's equations, without alpha."""
     if blend == "add":
         return v + t
     if blend == "multiply":
@@ -123,7 +129,7 @@ def _blend(v: NDArray[np.float32], t: NDArray[np.float32], blend: str, strength:
 
 @lru_cache(maxsize=2)
 def _stretch(path: str, sha256: str, shape: tuple[int, int]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Texture RGBI float32[y, x, 4] in 0-255 and alpha float32[y, x] in 0-1, at the frame's size."""
+    """Return texture RGBI float32[y, x, 4] in 0-255 and alpha float32[y, x] in 0-1, at the frame's size."""
     texture, alpha = load(path, sha256)
     if texture.shape[:2] != shape:
         shrinks = texture.shape[0] > shape[0] and texture.shape[1] > shape[1]
@@ -135,9 +141,12 @@ def _stretch(path: str, sha256: str, shape: tuple[int, int]) -> tuple[NDArray[np
 
 
 def load(path: str, sha256: str | None = None) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """A texture file as RGBI float32[y, x, 4] in 0-255 and alpha float32[y, x] in 0-1.
+    """Return a texture file as RGBI float32[y, x, 4] in 0-255 and alpha float32[y, x] in 0-1.
 
-    Raises InputError where it is missing, is no such image, or its content is not that of `sha256`.
+    Raises
+    ------
+    InputError
+        The file is missing, is not such an image, has too many pixels, or its content does not match `sha256`.
     """
     where = f"faults.pixel_overwriting.texture_file = {shown(path)}"
     try:
@@ -147,13 +156,13 @@ def load(path: str, sha256: str | None = None) -> tuple[NDArray[np.float32], NDA
     if sha256 and resources.sha256(data) != sha256:
         raise InputError(f"{where}: its content has changed since the parameters were drawn")
     width_px, height_px = _size_px(data)
-    if width_px * height_px > LARGEST_TEXTURE_PIXELS:  # before it is unpacked: a small file can hold a vast image
+    if width_px * height_px > LARGEST_TEXTURE_PIXELS:  # check before decoding: a small file can hold a huge image
         raise InputError(
             f"{where}: has {width_px} × {height_px} pixels; must have at most {LARGEST_TEXTURE_PIXELS} in all"
         )
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if width_px else None
-    except cv2.error:  # more than OpenCV takes
+    except cv2.error:  # larger than OpenCV accepts
         image = None
     if image is None or image.dtype not in (np.uint8, np.uint16):
         raise InputError(f"{where}: must be a PNG or TIFF image of 8 or 16 bits")
@@ -168,7 +177,7 @@ def load(path: str, sha256: str | None = None) -> tuple[NDArray[np.float32], NDA
 
 
 def _size_px(data: bytes) -> tuple[int, int]:
-    """Width and height that the header of a PNG or TIFF file states; (0, 0) where it is neither."""
+    """Return the width and height in the header of a PNG or TIFF file; (0, 0) if the file is neither."""
     if data[:8] == b"\x89PNG\r\n\x1a\n" and len(data) >= 24:
         width_px, height_px = struct.unpack(">II", data[16:24])
         return width_px, height_px
@@ -183,6 +192,6 @@ def _size_px(data: bytes) -> tuple[int, int]:
             tag, kind, _ = struct.unpack_from(f"{order}HHI", data, start + 2 + 12 * k)
             (value,) = struct.unpack_from(f"{order}{'H' if kind == 3 else 'I'}", data, start + 10 + 12 * k)
             sides[tag] = value
-    except struct.error:  # cut short
+    except struct.error:  # truncated file
         return 0, 0
     return sides.get(256, 0), sides.get(257, 0)

@@ -1,15 +1,18 @@
-"""Smear: light that falls on charge under way, where the vertical clocks or what keeps the light out have failed.
+"""Simulate smear: light that falls on charge during its transfer, because a part that should prevent it has failed.
 
-Sᵢ = t Iᵢ + τ_row Σ_{k<i} I_k + τ_clear Σ_{k>i} I_k (`detector.charge.smear`), by architecture and cause:
-- frame-transfer CCD, `clock`: charge goes to the store more slowly, under light; `clear`: the image is no longer
-  cleared at once but shifted out, so that packets come through the rows behind.
-- interline CCD, `shield`: the light shield over the registers lets more through. A packet waits a row's readout
-  time in each pixel of its register.
-- full-frame CCD, `shutter`: the shutter stays ajar, and light falls during the readout: the formula of the
-  frame transfer, with the row's readout time by the share of light as τ_row.
-- CMOS: none.
+Sᵢ = t Iᵢ + τ_row Σ_{k<i} I_k + τ_clear Σ_{k>i} I_k (`detector.charge.smear`). The possible causes depend on the
+architecture:
 
-The sums are of the light on a column, so a bright spot draws a line and the dark side of the sky fills up.
+- Frame-transfer CCD, `clock`: charge moves to the store more slowly, under light. `clear`: the image is no longer
+  cleared at once but shifted out, so packets have passed the rows behind them before the exposure.
+- Interline CCD, `shield`: the light shield over the registers lets more light through. A packet waits the readout
+  time of a row in each pixel of its register.
+- Full-frame CCD, `shutter`: the shutter stays partly open, and light falls during the readout. The formula is that
+  of the frame transfer. τ_row is the readout time of a row times the fraction of light that passes the shutter.
+- CMOS: no cause.
+
+The sums run over the light of a column, so a bright spot draws a line, and dark sky in the same column becomes
+brighter.
 """
 
 from __future__ import annotations
@@ -32,7 +35,7 @@ CAUSES = {
 
 @dataclass(frozen=True, kw_only=True)
 class FrameTransferSmear(Fault):
-    """Slower clocks, no fast clear, a leaking shield or a shutter ajar: another transfer of the same sensor."""
+    """Change the charge transfer: slow clocks, no fast clear, a leaking shield or a shutter that stays open."""
 
     fault = "smear"
     model = "frame_transfer"
@@ -62,11 +65,11 @@ class FrameTransferSmear(Fault):
     )
 
     def draw(self, context: FaultContext, rng: np.random.Generator) -> Params:
-        """The cause, and what of the sensor's transfer it changes; empty where it cannot occur."""
+        """Return the cause and the changed parameters of the transfer; {} if the cause cannot occur."""
         detector: Any = context.camera.detector
         sensor = detector.sensor
         move = sensor.transfer
-        # as many variates whatever the sensor
+        # the number of variates must not depend on the sensor
         row_s, leak, share = (v.uniform(rng) for v in (self.row_transfer_s, self.leak, self.shutter_share))
         which = rng.random()
         causes = [c for c in CAUSES[sensor.architecture] if self.cause in ("any", c)]
@@ -85,7 +88,7 @@ class FrameTransferSmear(Fault):
         return {"cause": cause} | {key: float(value) for key, value in changes[cause].items()}
 
     def alter(self, camera: Camera, params: Params) -> Camera:
-        """The camera with that transfer."""
+        """Return the camera with the changed transfer."""
         if not params:
             return camera
         detector: Any = camera.detector

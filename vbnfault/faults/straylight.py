@@ -1,24 +1,30 @@
-"""Straylight, the paper's model: flare and glare textures on the line from the Sun through the centre.
+"""Simulate straylight as in the paper (Gallon et al.): flare and glare textures on the line through Sun and centre.
 
-On that line the Sun lies at position 0 and the centre of the image at 1 (King 2001). A flare is a texture
-centred at sun + position · (centre - sun), its outline at `radius` · image width, turned so that its own axis
-follows the line, and added to the image:
+On that line the Sun is at position 0 and the centre of the image at 1 (King 2001). The centre of a flare is at
+
+    sun + position · (centre - sun).
+
+Its outline has the radius `radius` · image width, and its texture is turned so that its own axis follows the line.
+The texture is added to the image:
 
     signal += brightness · visible fraction of the Sun · texture · white
 
-per colour, texture in [0, 1] linear (1 = white), white the signal shown as 255. Nothing clips here.
+for each channel. The texture is linear in [0, 1], where 1 is white, and white is the signal shown as 255. Nothing
+is clipped here.
 
-As in the paper: flares are drawn without replacement from ten; positions and radii are sorted together, so
-that flares grow with the distance from the Sun; textures of the group *close* (1-5) take the nearer
-positions, those of the group *far* (6-10) the farther ones.
+As in the paper, flares are drawn without replacement from ten. Positions and radii are sorted together, so flares
+grow with the distance from the Sun. Textures of the group *close* (1-5) get the nearer positions, those of the
+group *far* (6-10) the farther ones.
 
-Choices where the paper is silent:
-- position, radius and brightness are drawn uniformly within the table's bounds (the text's remark on
-  positions beyond (0, 1) explains why the table ends at 2: further out they leave the frame). The radius
-  refers to the width of the image. A draw without a flare in the frame is repeated, up to 256 times.
-- One of two glares, or none, with equal chance, sits at the Sun, when the Sun is in the frame or so near
-  that the glare reaches into it. Its bounds, radius 0.2-0.45 and brightness 0.8-1.6, are ours.
-- The mask is the effect rule; the footprint is the texture from 1 DN of 255 on.
+Choices where the paper says nothing:
+
+- Position, radius and brightness are drawn uniformly within the bounds of the paper's table. (The paper's remark on
+  positions beyond (0, 1) explains why the table ends at 2: farther flares leave the frame.) The radius refers to
+  the width of the image. A draw without a flare in the frame is repeated, up to 256 times.
+- One of two glares, or none, with equal probability, is at the Sun, if the Sun is in the frame or so near that the
+  glare reaches into it. Its bounds, radius 0.2-0.45 and brightness 0.8-1.6, are ours.
+- The mask holds the pixels of the image that change. The footprint holds the pixels to which the textures add at
+  least `mask_level_dn`, 1 DN of 255 by default.
 """
 
 from __future__ import annotations
@@ -44,14 +50,14 @@ MAX_DRAWS = 256
 
 Window = tuple[slice, slice]
 
-# What of a texture's R, G, B a channel sees. Textures know nothing of the near infrared: red stands in (assumed).
+# Weights of a texture's R, G, B in each channel. Textures have no near infrared, so red replaces it (assumed).
 _COLOURS = dict(zip("RGB", np.eye(3, dtype=np.float32), strict=True))
 _COLOURS |= {"W": LUMINANCE, "NIR": _COLOURS["R"]}
 
 
 @dataclass(frozen=True, kw_only=True)
 class TextureStraylight(Fault):
-    """Flares and glare from textures (Gallon et al., table of straylight parameters)."""
+    """Add flares and glare from textures (Gallon et al., table of straylight parameters)."""
 
     fault = "straylight"
     model = "texture"
@@ -89,10 +95,11 @@ class TextureStraylight(Fault):
 
     @property
     def effect_level_dn(self) -> float:
-        """`mask_level_dn`."""
+        """Return `mask_level_dn`."""
         return float(self.mask_level_dn)
 
     def validate(self) -> None:
+        """Raise ValueError if there are fewer textures than flares or an index is not a whole number."""
         choices = int(self.index.hi) - int(self.index.lo) + 1
         if self.count.lo > choices:
             raise ValueError(f"count = {list(self.count)}: index leaves {choices} textures, each used once")
@@ -101,7 +108,11 @@ class TextureStraylight(Fault):
                 raise ValueError(f"flares[{i}].index = {row['index']}: must be a whole number from 1 to 10")
 
     def draw(self, context: FaultContext, rng: np.random.Generator) -> Params:
-        """`flares` (tables of index, position, radius, brightness), `glare` (a table or None), the centre."""
+        """Return `flares`, `glare`, the centre of the image in px and the mask level.
+
+        `flares` is a list of tables with index, position, radius and brightness. `glare` is such a table without a
+        position, or None.
+        """
         height, width = context.shape
         params: Params = {
             "flares": [],
@@ -122,6 +133,7 @@ class TextureStraylight(Fault):
         return params
 
     def _draw_flares(self, rng: np.random.Generator) -> list[dict[str, Any]]:
+        """Return the tables of drawn flares, sorted by position and radius."""
         textures = np.arange(int(self.index.lo), int(self.index.hi) + 1)
         count = min(self.count.integer(rng), len(textures))
         chosen = rng.permutation(textures)[:count]
@@ -135,6 +147,7 @@ class TextureStraylight(Fault):
         ]
 
     def _draw_glare(self, context: FaultContext, rng: np.random.Generator) -> dict[str, Any] | None:
+        """Return the table of the drawn glare, or None if there is none in the frame."""
         index = self.glare.integer(rng)
         radius = self.glare_radius.uniform(rng)
         brightness = self.glare_brightness.uniform(rng)
@@ -145,12 +158,12 @@ class TextureStraylight(Fault):
         return {"index": index, "radius": radius, "brightness": brightness}
 
     def apply(self, quantity: Any, params: Params, context: FaultContext) -> Any:
-        """Expected electrons plus flares and glare."""
+        """Return the expected electrons plus flares and glare."""
         layer = _layer_once(params, context, quantity.white_e)
         return quantity if layer is None else quantity.with_array(plus(quantity.array, layer))
 
     def footprint(self, params: Params, context: FaultContext) -> NDArray[np.bool_]:
-        """bool[y, x]: where any colour gains at least `mask_level_dn`."""
+        """Return the pixels where any channel gains at least `mask_level_dn`, bool[y, x]."""
         white = context.camera.detector.white_e
         layer = _layer_once(params, context, white)
         if layer is None:
@@ -166,13 +179,14 @@ class TextureStraylight(Fault):
 
 
 def flare_centres_px(params: Params, sun_xy_px: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Pixel x, y of the drawn flares' centres, float64[flare, 2]."""
+    """Return pixel x, y of the drawn flares' centres, float64[flare, 2]."""
     sun, centre = np.asarray(sun_xy_px, dtype=float), np.asarray(params["centre_xy_px"], dtype=float)
     position = np.array([f["position"] for f in params["flares"]], dtype=float)
     return sun + position[:, None] * (centre - sun)
 
 
 def _any_in_frame(params: Params, context: FaultContext) -> bool:
+    """Return whether a flare, taken at 0.8 of its radius, overlaps the frame."""
     assert context.sun_xy_px is not None
     centres = flare_centres_px(params, context.sun_xy_px)
     width = context.shape[1]
@@ -183,19 +197,20 @@ def _any_in_frame(params: Params, context: FaultContext) -> bool:
 
 
 def _reaches_frame(xy: NDArray[np.float64], radius_px: float, shape: tuple[int, int]) -> bool:
-    """Whether a disc overlaps the frame."""
+    """Return whether a disc overlaps the frame."""
     nearest = np.clip(xy, 0, shape[::-1])
     return bool(np.hypot(*(nearest - xy)) < radius_px)
 
 
 def _layer_once(params: Params, context: FaultContext, white_e: NDArray[np.float32]) -> NDArray[np.float32] | None:
+    """Return all flares and the glare, computed once for each sample and white level."""
     white = np.asarray(white_e, dtype=np.float32)
     name = f"straylight.layer {white.tobytes().hex()}"
     return context.once(name, params, lambda: _layer(params, context, white))
 
 
 def _layer(params: Params, context: FaultContext, white_e: NDArray[np.float32]) -> NDArray[np.float32] | None:
-    """All flares and the glare, electrons float32[y, x, channel]; None where there is nothing to add."""
+    """Return all flares and the glare, electrons float32[y, x, channel]; None if there is nothing to add."""
     visible = 1.0 if context.sun_visible_fraction is None else float(context.sun_visible_fraction)
     if context.sun_xy_px is None or visible <= 0:
         return None
@@ -232,12 +247,25 @@ def _stamp(
     weights: NDArray[np.float32],
     shape: tuple[int, int],
 ) -> tuple[Window, NDArray[np.float32]] | None:
-    """A texture resampled onto the pixels it covers, in channels that hold its colours by `weights`
-    float32[channel, 3]; None outside the frame.
+    """Return the pixels that a texture covers, as a window, and its light there, float32[y, x, channel].
 
-    `angle` in radians turns the texture's +x towards image +y. With pixel centres at +0.5 on both sides, the
-    pixel of index i shows the texel of index S/2 - 0.5 + Rᵀ(i + 0.5 - centre) / s, s pixels wide being a
-    texel.
+    Return None if the texture is outside the frame.
+
+    Parameters
+    ----------
+    centre, radius_px
+        Centre x, y and radius of the flare's outline in px.
+    angle
+        Rotation of the texture's +x axis towards image +y, in radians.
+    weights
+        float32[channel, 3]: weights of the texture's R, G, B in each channel.
+    shape
+        (height, width) of the frame.
+
+    Notes
+    -----
+    Pixel centres are at +0.5 in the image and in the texture. The pixel of index i shows the texel of index S/2 -
+    0.5 + Rᵀ(i + 0.5 - centre) / s, where S is the size of the texture and s the width of a texel in px.
     """
     half = radius_px / FILL
     x0, y0 = (max(0, int(np.floor(v - half))) for v in centre)
@@ -245,7 +273,7 @@ def _stamp(
     if x0 >= x1 or y0 >= y1:
         return None
     levels = pyramid(name)
-    # halved by averaging until a texel is about as wide as a pixel: thin rings do not alias
+    # use a level whose texels are about as wide as a pixel, so that thin rings do not alias
     texels_per_px = len(levels[0]) / (2 * half)
     level = levels[int(np.clip(round(np.log2(texels_per_px)), 0, len(levels) - 1))]
     size = len(level)
@@ -270,7 +298,15 @@ def _stamp(
 
 @cached_with_contents(maxsize=16)
 def pyramid(name: str) -> tuple[NDArray[np.float32], ...]:
-    """A packaged texture, RGB float32[y, x, 3] in [0, 1], and its halvings by 2×2 means; read-only."""
+    """Return a packaged texture, RGB float32[y, x, 3] in [0, 1], and smaller copies made by 2×2 means.
+
+    The arrays are read-only.
+
+    Raises
+    ------
+    VbnfaultError
+        The texture's file is damaged.
+    """
     path = data_dir("textures") / f"{name}.png"
     image = cv2.imdecode(np.frombuffer(read_input(path, "texture"), np.uint8), cv2.IMREAD_UNCHANGED)
     if image is None or image.dtype != np.uint16 or image.ndim != 3:

@@ -1,18 +1,21 @@
-"""Straylight by physics: ghosts, starburst and veiling glare of a lens whose prescription is known.
+"""Simulate straylight by physics: ghosts, starburst and veiling glare of a lens with a known prescription.
 
-Two models of the ghosts, everything else alike: `traced` follows exact rays along every path of two reflections
-(Hullin et al. 2011), `paraxial` draws each path's first-order image of the stop (Lee & Eisemann 2013). The light is
-added as irradiance on the sensor, from the Sun's irradiance at the camera. Starburst, glare and veil are taken from
-the light that they are part of (`lens.straylight`): from the Sun's direct image, and of the scene's image the
-fraction that is scattered, which returns as a veil over the whole frame.
+There are two models, which differ only in the ghosts. For each path of two reflections (or also of four, if
+`reflections` is 4), `traced` traces exact rays (Hullin et al. 2011), and `paraxial` draws the first-order image of
+the stop (Lee & Eisemann 2013). The light is added as irradiance on the sensor, in proportion to the Sun's
+irradiance at the camera.
 
-Rays that reach the sensor have met the pupil and all rims on their way. Both models add to the light past the rims
-(`quantities.Electrons.past_rims`), which vignetting leaves as it is. In a picture that does not tell the Sun's
-direct image from the scene, the scene's rule holds for all of it.
+The image loses the light that becomes straylight (`lens.straylight`). Starburst, glare and veil of the Sun are
+subtracted from the Sun's direct image. The image of the scene loses the fraction that is scattered, which returns
+as a veil over the whole frame.
 
-The parameters of a sample hold the ghosts in the frame, as they would be without each other: `pair` (rows of the
-prescription), `flux_fraction`, `x_px`, `y_px`, `rms_radius_px`, the brightest first. Coatings worn off by another
-fault raise them.
+Rays that reach the sensor have passed the pupil and all rims. Both models therefore add their light to the light
+past the rims (`quantities.Electrons.past_rims`), which the lens's own rims do not vignette again. If the image does
+not separate the Sun's direct image from the scene, the rule for the scene applies to all light.
+
+The parameters of a sample list the ghosts in the frame, the brightest first, at most 24. Each is described as if it
+were the only ghost: `pair` (the reflecting rows of the prescription), `flux_fraction`, `peak_irradiance_fraction`,
+`x_px`, `y_px`, `rms_radius_px`. Ghosts become brighter if another fault has worn the coatings.
 """
 
 from __future__ import annotations
@@ -37,8 +40,17 @@ _LEAST_SUN_RAD = 1e-5
 
 
 class _Light(NamedTuple):
-    """Straylight of the Sun, electrons float32[y, x, channel]; the fraction left of its direct image, and the
-    fraction that the scene's image loses to the veil, float64[channel] each."""
+    """Hold the straylight of the Sun and what it costs the image.
+
+    Attributes
+    ----------
+    added
+        float32[y, x, channel]: straylight in electrons.
+    direct_left
+        float64[channel]: remaining fraction of the Sun's direct image.
+    scene_lost
+        float64[channel]: fraction of the scene's image that becomes veil.
+    """
 
     added: F32
     direct_left: F64
@@ -47,6 +59,8 @@ class _Light(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class _LensStraylight(LensFault):
+    """Add ghosts, starburst and veiling glare of the Sun, and the veil of the scene; base of both models."""
+
     fault = "straylight"
     step = "electrons"
     needs_sun = True
@@ -83,6 +97,7 @@ class _LensStraylight(LensFault):
     )
 
     def validate(self) -> None:
+        """Raise ValueError if `reflections` is neither 2 nor 4, or a baffle has no radius."""
         super().validate()
         if self.reflections not in (2, 4):
             raise ValueError(f"reflections = {self.reflections}: must be 2 or 4")
@@ -90,7 +105,7 @@ class _LensStraylight(LensFault):
             raise ValueError("baffle_length_mm: needs baffle_radius_mm")
 
     def draw(self, context: FaultContext, rng: np.random.Generator) -> Params:
-        """Lens, coating, roughness, cleanliness, and the ghosts in the frame."""
+        """Return lens, coating, roughness, cleanliness, veil, baffle, mask level and the ghosts in the frame."""
         params: Params = {
             "lens": self.lens,
             "coating": self.coating,
@@ -105,7 +120,7 @@ class _LensStraylight(LensFault):
         return params
 
     def apply(self, quantity: Any, params: Params, context: FaultContext) -> Any:
-        """Expected electrons plus what the lens sends astray, less what that is taken from."""
+        """Return the expected electrons plus straylight, minus the light that straylight is taken from."""
         found = self._light_once(params, context)
         if found is None:
             return quantity
@@ -119,7 +134,7 @@ class _LensStraylight(LensFault):
         return replace(quantity, array=scene, past_rims=past)
 
     def footprint(self, params: Params, context: FaultContext) -> NDArray[np.bool_]:
-        """bool[y, x]: where any colour gains at least `mask_level_dn` of the Sun's light."""
+        """Return the pixels where any channel gains at least `mask_level_dn` of the Sun's light, bool[y, x]."""
         found = self._light_once(params, context)
         if found is None:
             return np.zeros(context.shape, dtype=bool)
@@ -127,20 +142,21 @@ class _LensStraylight(LensFault):
         return np.asarray((found.added >= white * np.float32(params["mask_level_dn"] / 255)).any(axis=2))
 
     def soft(self, params: Params, context: FaultContext) -> F32:
-        """Return the intensity of what the lens sends astray of the Sun's light, float32[y, x] in DN of 255."""
+        """Return the intensity of the Sun's straylight, float32[y, x] in DN of 255."""
         found = self._light_once(params, context)
         return np.zeros(context.shape, np.float32) if found is None else intensity_dn(found.added, context.camera)
 
     @property
     def effect_level_dn(self) -> float:
-        """`mask_level_dn`."""
+        """Return `mask_level_dn`."""
         return float(self.mask_level_dn)
 
     def _light_once(self, params: Params, context: FaultContext) -> _Light | None:
+        """Return the straylight, computed once for each sample."""
         return context.once("straylight.lens", params, lambda: self._light(params, context))
 
     def _light(self, params: Params, context: FaultContext) -> _Light | None:
-        """The Sun's straylight; None without a Sun in front of the camera."""
+        """Return the straylight of the Sun; None if there is no Sun in front of the camera."""
         sun = _sun(context)
         if sun is None:
             return None
@@ -177,7 +193,7 @@ class _LensStraylight(LensFault):
         visible = 1.0 if context.sun_visible_fraction is None else float(context.sun_visible_fraction)
         light = found.total * (irradiance * visible).astype(np.float32)[:, None, None]
         on_sensor = Irradiance(array=light, wavelength_nm=nodes)
-        # both the scene and the Sun's image have the Sun's spectrum, as the lens passes it
+        # the scene and the Sun's image both have the spectrum of sunlight that the lens transmits
         weights = camera.detector.electron_rate_weights(nodes) * irradiance * passed
         weights /= np.maximum(weights.sum(axis=1, keepdims=True), 1e-300)
         lost = scene_veil_fraction(lens, nodes, cleanliness=cleanliness, veil_fraction=params["veil_fraction"])
@@ -188,6 +204,7 @@ class _LensStraylight(LensFault):
         )
 
     def _ghosts(self, params: Params, context: FaultContext) -> list[dict[str, Any]]:
+        """Return the brightest ghosts in the frame as plain data."""
         from ..lens.straylight.irradiance import flare_model
 
         sun = _sun(context)
@@ -222,20 +239,20 @@ class _LensStraylight(LensFault):
 
 @dataclass(frozen=True, kw_only=True)
 class TracedStraylight(_LensStraylight):
-    """Ghosts by exact rays, starburst and veiling glare."""
+    """Add ghosts computed by exact rays, starburst and veiling glare."""
 
     model = "traced"
 
 
 @dataclass(frozen=True, kw_only=True)
 class ParaxialStraylight(_LensStraylight):
-    """Ghosts to first order, starburst and veiling glare."""
+    """Add ghosts computed to first order, starburst and veiling glare."""
 
     model = "paraxial"
 
 
 def _sun(context: FaultContext) -> tuple[float, float] | None:
-    """The Sun's angle from the axis and azimuth in the picture, degrees; None where it gives no light."""
+    """Return the Sun's angle from the axis and its azimuth in the image, in degrees; None if it gives no light."""
     if context.sun_xy_px is None or context.sun_visible_fraction == 0:
         return None
     direction = context.sun_before_camera
@@ -246,7 +263,10 @@ def _sun(context: FaultContext) -> tuple[float, float] | None:
 
 
 def _sunlight(context: FaultContext) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Band nodes and the Sun's irradiance in them."""
+    """Return the band nodes and the Sun's irradiance in them.
+
+    If they are unknown, use eight bands from 400 to 700 nm and the Sun at 1 AU.
+    """
     if context.wavelength_nm is not None and context.sun_irradiance_W_m2_nm is not None:
         return context.wavelength_nm, context.sun_irradiance_W_m2_nm
     nodes = spectra.band_nodes_nm(400.0, 700.0, 8)
@@ -254,5 +274,6 @@ def _sunlight(context: FaultContext) -> tuple[NDArray[np.float64], NDArray[np.fl
 
 
 def _sun_radius_rad(context: FaultContext) -> float:
+    """Return the angular radius of the Sun; if it is unknown, that at 1 AU."""
     found = context.sun_angular_radius_rad
     return spectra.sun_angular_radius_rad(1.0) if found is None else max(float(found), _LEAST_SUN_RAD)

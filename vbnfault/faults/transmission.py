@@ -1,11 +1,12 @@
-"""Transmission: packets and lines of the raw mosaic that are lost or damaged on the way to who makes the picture.
+"""Simulate transmission errors: packets and lines of the raw mosaic are lost or damaged before they arrive.
 
-Pixels leave in packets of `packet_px`, in the order in which the sensor's nodes read them. A lost packet arrives as
-zeros, or the receiver repeats the last one that came; bursts take several. In a damaged packet that passes, bits
-flip without memory (binary symmetric channel) at a high rate: links are coded, and what fails to decode is
-full of errors (CCSDS 130.1-G). A line may be lost on the camera's own interface. The picture is made from what
-arrives, so the demosaic spreads it. Sizes and numbers are assumed; space packets carry at most 65 536 bytes of data
-(CCSDS 133.0-B).
+The pixels leave in packets of `packet_px`, in the order in which the sensor's nodes read them. A lost packet
+arrives as zeros, or the receiver repeats the last packet that arrived. A burst removes several packets. In a
+damaged packet, bits flip independently (binary symmetric channel) and at a high rate: links are coded, and a packet
+that cannot be decoded is full of errors (CCSDS 130.1-G). A line may be lost on the camera's own interface.
+
+The image is made from the data that arrive, so demosaicing spreads the errors. Sizes and numbers are assumed. Space
+packets carry at most 65 536 bytes of data (CCSDS 133.0-B).
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True, kw_only=True)
 class PacketTransmission(Fault):
-    """Lost and damaged packets and lost lines of the raw mosaic."""
+    """Lose and damage packets of the raw mosaic, and lose lines of it."""
 
     fault = "transmission"
     model = "packets"
@@ -52,7 +53,10 @@ class PacketTransmission(Fault):
     )
 
     def draw(self, context: FaultContext, rng: np.random.Generator) -> Params:
-        """Indices of lost and damaged packets, never the same, and of lost rows; the seed of the flips."""
+        """Return the indices of lost packets, damaged packets and lost rows, and the seed of the bit flips.
+
+        No packet is both lost and damaged.
+        """
         detector: Any = context.camera.detector
         packet_px = self.packet_px.integer(rng)
         packets = packet_count(context.shape, packet_px)
@@ -78,20 +82,20 @@ class PacketTransmission(Fault):
         }
 
     def apply(self, quantity: Any, params: Params, context: FaultContext) -> Any:
-        """The raw numbers as they arrive."""
+        """Return the raw digital numbers that arrive."""
         return quantity.with_array(_arrived(quantity.array, params)[0])
 
     def footprint(self, params: Params, context: FaultContext) -> Mask:
-        """bool[y, x]: pixels of the picture that lost pixels and flipped ones can reach."""
+        """Return the pixels of the image that lost or flipped pixels can change, bool[y, x]."""
         detector: Any = context.camera.detector
-        # which bits flip does not depend on the signal
+        # the flipped bits do not depend on the signal
         _, region = _arrived(np.zeros(context.shape, dtype=np.uint16), params)
         reached: Mask = detector.footprint(region)
         return reached
 
 
 def _arrived(raw: Raw, params: Params) -> tuple[Raw, Mask]:
-    """What arrives of a mosaic, and bool[y, x], the pixels that were lost or had bits flipped."""
+    """Return the mosaic that arrives, and its pixels that were lost or had bits flipped, bool[y, x]."""
     packet_px, fill = params["packet_px"], cast(Fill, params["fill"])
     order = None if params["nodes"] == 1 else _order(raw.shape, params["nodes"])
     damaged = corrupted_packets(
@@ -110,6 +114,7 @@ def _arrived(raw: Raw, params: Params) -> tuple[Raw, Mask]:
 
 @lru_cache(maxsize=2)
 def _order(shape: tuple[int, int], nodes: int) -> NDArray[np.intp]:
+    """Return the order of transmission, computed once; read-only."""
     order = transmission_order(shape, nodes)
     order.flags.writeable = False
     return order

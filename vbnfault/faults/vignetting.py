@@ -1,10 +1,10 @@
-"""Vignetting, the paper's model: the cos⁴ law with a random on-axis illuminance E0.
+"""Simulate vignetting as in the paper (Gallon et al.): the cos⁴ law with a random on-axis illuminance E0.
 
     factor(θ) = E0 / 255 · cos⁴θ,     tan θ = r / f,
 
-r being the distance of a pixel's centre from the frame's middle and f the focal length in pixels. E0 below
-255 darkens the whole image, as the paper's texture does. It acts on the expected photo-electrons, on R, G
-and B alike. The thin lens applies no cos⁴ of its own, so nothing is counted twice.
+where r is the distance of a pixel's centre from the middle of the frame and f is the focal length in pixels. If E0
+is below 255, the whole image becomes darker, like the paper's texture. The factor acts on the expected
+photo-electrons of all channels alike. The thin lens applies no cos⁴ of its own, so nothing is counted twice.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from .base import Fault, FaultContext, Interval, Params, bounds, number
 
 @dataclass(frozen=True, kw_only=True)
 class Cos4Vignetting(Fault):
-    """Natural vignetting by the cos⁴ law (Gallon et al., table of vignetting parameters)."""
+    """Darken the image by the cos⁴ law (Gallon et al., table of vignetting parameters)."""
 
     fault = "vignetting"
     model = "cos4"
@@ -38,20 +38,20 @@ class Cos4Vignetting(Fault):
     mask_loss: float = number(0.1, limits=(0, 1), doc="the mask holds the pixels that lose at least this fraction")
 
     def draw(self, context: FaultContext, rng: np.random.Generator) -> Params:
-        """E0, and the loss from which the mask starts."""
+        """Return E0, and the least loss of the pixels in the mask."""
         return {
             "on_axis_illuminance_dn": self.on_axis_illuminance_dn.uniform(rng),
             "mask_loss": float(self.mask_loss),
         }
 
     def apply(self, quantity: Any, params: Params, context: FaultContext) -> Any:
-        """Expected electrons times the factor of each pixel."""
+        """Return the expected electrons times the factor of each pixel."""
         cos4 = _cos4_planes(context.shape, context.camera.focal_length_px, quantity.array.shape[2])
         e0 = params["on_axis_illuminance_dn"] / 255
         return quantity.with_array(cv2.multiply(quantity.array, cos4, scale=e0).reshape(cos4.shape))
 
     def footprint(self, params: Params, context: FaultContext) -> NDArray[np.bool_]:
-        """bool[y, x]: where the loss reaches `mask_loss`."""
+        """Return the pixels where the loss reaches `mask_loss`, bool[y, x]."""
         return self.soft(params, context) <= np.float32(1 - params["mask_loss"])
 
     def soft(self, params: Params, context: FaultContext) -> NDArray[np.float32]:
@@ -62,7 +62,8 @@ class Cos4Vignetting(Fault):
 
 @lru_cache(maxsize=2)
 def _cos4_planes(shape: tuple[int, int], focal_length_px: float, channels: int) -> NDArray[np.float32]:
-    # equal planes, kept for all samples of a camera: one fast product in place of a broadcast
+    """Return cos⁴θ as float32[y, x, channel] with equal planes, read-only."""
+    # kept for all samples of a camera: one fast product replaces a broadcast
     out = np.repeat(cos4_map(shape, focal_length_px)[..., None], channels, axis=2)
     out.flags.writeable = False
     return out

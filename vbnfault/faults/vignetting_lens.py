@@ -1,20 +1,22 @@
-"""Vignetting by a prescription: what the lens itself takes, and what a slipped ring or a hood in the way takes
-more.
+"""Simulate vignetting by a prescription: the loss in the lens itself, and at a slipped ring or a moved hood.
 
-The share of the light that a faulty lens passes is that of its beam's rays, from exact tracing, that clear both
+A faulty lens passes the light of those rays of a beam, traced exactly, that clear both
 
-- a ring as wide as the stop that has slipped sideways in the stop's plane: what is left is the overlap of the two,
-- a round opening in front of the lens, a hood that was bent or moved,
+- a ring as wide as the stop that has slipped sideways in the plane of the stop: the overlap of the two remains
+  open,
+- a round opening in front of the lens, a hood that was bent or moved.
 
-each ray for the area that it comes through in the plane of the first vertex. It is never above 1.
+Each ray is weighted by its area in the plane of the first vertex. The fraction that passes is at most 1.
 
-Where the camera has a prescription the image is already formed by it, and only this share is applied. A thin lens
-has no vignetting: there the relative illumination E(θ) / E(0) of the named lens comes with it, natural and
-mechanical vignetting and distortion in one (`lens.imaging`); no cos⁴ falls on top. Both are those of the d line.
+If the camera has a prescription, its image contains the lens's own vignetting, and only this fraction is applied. A
+thin lens has no vignetting. In that case the relative illumination E(θ) / E(0) of the named lens is applied too,
+which contains natural and mechanical vignetting and distortion (`lens.imaging`). No further cos⁴ is applied. Both
+factors are computed at the d line.
 
-The Sun's direct image and its straylight have met the lens's rims already, but neither the slipped ring nor the
-moved hood: they lose what the Sun's beam loses there, and no more. That one fraction stands for all ghosts, by
-whichever part of the front they enter, and for the veil of the scene, some hundredths of the scene's light.
+The Sun's direct image and its straylight have passed the lens's own rims, but neither the slipped ring nor the
+moved hood. They therefore lose only the fraction that the Sun's beam loses at these two. The same fraction is used
+for all ghosts, although they enter through different parts of the front, and for the veil of the scene, which is
+some hundredths of the scene's light.
 """
 
 from __future__ import annotations
@@ -34,15 +36,15 @@ from .base import FaultContext, Interval, LensFault, Params, bounds, number, tim
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
-_COARSEST_PX = 16  # between the places where the share of a beam is told
-_EVERY = 2  # of a beam's lines of rays is followed
-_ROUNDING = 1e-4  # within which a beam's rim is known
-_TOGETHER = 2048  # places at a time, for the memory's sake
+_COARSEST_PX = 16  # largest distance between the positions at which the fraction of a beam is computed
+_EVERY = 2  # every second line of rays of a beam is used
+_ROUNDING = 1e-4  # relative accuracy of a beam's rim
+_TOGETHER = 2048  # positions at a time; limits the memory
 
 
 @dataclass(frozen=True, kw_only=True)
 class LensVignetting(LensFault):
-    """Light lost at a slipped ring and a moved hood, and with a thin lens in the lens itself."""
+    """Remove light at a slipped ring and a moved hood, and with a thin lens also in the named lens itself."""
 
     fault = "vignetting"
     model = "lens"
@@ -76,7 +78,10 @@ class LensVignetting(LensFault):
     mask_loss: float = number(0.1, limits=(0, 1), doc="the mask holds the pixels that lose at least this fraction")
 
     def draw(self, context: FaultContext, rng: np.random.Generator) -> Params:
-        """Lens; slip of the ring; the hood's distance, radius and place, in mm, x to the right and y down."""
+        """Return lens, decentre of the ring, distance, radius and offset of the hood, and the mask loss.
+
+        Lengths are in mm. Decentre and offset have x to the right and y down.
+        """
         frame = context.frame
         beams = frame.beams(self.lens)
         distance = frame.lens.focal_length_mm if self.hood_distance_mm is None else float(self.hood_distance_mm)
@@ -94,18 +99,20 @@ class LensVignetting(LensFault):
         }
 
     def apply(self, quantity: Any, params: Params, context: FaultContext) -> Any:
-        """Expected electrons times the factor of each pixel."""
+        """Return the expected electrons times the factor of each pixel."""
         factor = _factor_once(params, context)
         return quantity.with_array(times(quantity.array, factor))
 
     def passed_to_sun(self, params: Params, context: FaultContext) -> float:
-        """Return the fraction of the Sun's beam that clears ring and hood: direct image and straylight enter with
-        that beam."""
+        """Return the fraction of the Sun's beam that clears ring and hood.
+
+        Direct image and straylight of the Sun enter with that beam.
+        """
         sun = context.sun_before_camera
         return 1.0 if sun is None else share_left(params, context.frame, np.asarray(sun[:2] / sun[2]))
 
     def footprint(self, params: Params, context: FaultContext) -> NDArray[np.bool_]:
-        """bool[y, x]: where the loss reaches `mask_loss`."""
+        """Return the pixels where the loss reaches `mask_loss`, bool[y, x]."""
         return np.asarray(_factor_once(params, context) <= np.float32(1 - params["mask_loss"]))
 
     def soft(self, params: Params, context: FaultContext) -> F32:
@@ -114,18 +121,22 @@ class LensVignetting(LensFault):
 
 
 def _factor_once(params: Params, context: FaultContext) -> F32:
+    """Return the factor on the light, computed once for each sample."""
     return context.once("vignetting.factor", params, lambda: factor(params, context.frame))
 
 
 def factor(params: Params, frame: ImageFrame) -> F32:
-    """What is left of the light, float32[y, x] in [0, 1]."""
+    """Return the factor on the light, float32[y, x] in [0, 1]."""
     left = _share_left(params, frame)
     return left if isinstance(frame.lens, RealLens) else left * _illumination(frame, params["lens"])
 
 
 def share_left(params: Params, frame: ImageFrame, slope: F64) -> float:
-    """Return the fraction of one direction's beam that clears ring and hood; `slope` float64[2], its tangents to
-    the right and down, which may lie outside of the frame."""
+    """Return the fraction of one direction's beam that clears ring and hood.
+
+    `slope` float64[2] holds the direction's tangents to the right and down. The direction may lie outside the
+    frame.
+    """
     beams = frame.beams(params["lens"])
     stop_mm = beams.lens.surfaces[beams.lens.stop].semi_diameter_mm
     x, y = np.asarray(slope, dtype=np.float64)[:, None]
@@ -134,7 +145,7 @@ def share_left(params: Params, frame: ImageFrame, slope: F64) -> float:
 
 @lru_cache(maxsize=2)
 def _illumination(frame: ImageFrame, name: str) -> F32:
-    """E(θ) / E(0) of a lens at the field angles of a thin lens's pixels, float32[y, x]."""
+    """Return E(θ) / E(0) of a lens at the field angles of a thin lens's pixels, float32[y, x]."""
     lens = frame.real_lens(name)
     slope = np.hypot(*frame.slopes(np.arange(frame.width_px) + 0.5, np.arange(frame.height_px) + 0.5))
     nodes = np.linspace(0, float(slope.max()) * 1.001, 2049)
@@ -148,7 +159,10 @@ def _illumination(frame: ImageFrame, name: str) -> F32:
 
 
 def _clear_radius_mm(beams: Beams, distance_mm: float) -> float:
-    """Of an opening about the axis, a distance before the first vertex, that takes no light of the frame's."""
+    """Return the radius of an opening about the axis that clears all beams of the frame.
+
+    `distance_mm` is the distance of the opening from the first vertex.
+    """
     rim = beams.bundle.points_mm[0, :, :2].reshape(len(beams.slope), -1, 2)
     lit = beams.rim_mm.min(axis=1) > 0
     return float(np.hypot(rim[lit, :, 0] - distance_mm * beams.slope[lit, None], rim[lit, :, 1]).max())
@@ -156,25 +170,33 @@ def _clear_radius_mm(beams: Beams, distance_mm: float) -> float:
 
 @lru_cache(maxsize=4)
 def _lines(beams: Beams) -> tuple[F64, F64]:
-    """Of the straight lines of rays from the middle of a beam to its rim, in the plane of the first vertex and in
-    that of the stop: where they begin, float64[2, angle], on the x axis, and from there to the rim, float64[2, 2,
-    angle, turn], x and y; turns all around."""
+    """Return straight lines of rays from the middle of each beam to its rim.
+
+    They are computed in two planes, that of the first vertex and that of the stop.
+
+    Returns
+    -------
+    begin
+        float64[plane, angle]: start of the lines on the x axis.
+    to_rim
+        float64[plane, 2, angle, turn]: x and y from the start to the rim, for turns all around.
+    """
     shape = (len(beams.slope), beams.rim_mm.shape[1], -1, 2)
     planes = np.stack([beams.bundle.points_mm[k, :, :2].reshape(shape) for k in (0, 1 + beams.lens.stop)])
     planes = np.nan_to_num(planes)
     begin = planes[:, :, 0, 0, 0]
     to_rim = np.moveaxis(planes[:, :, ::_EVERY, -1] - planes[:, :, ::_EVERY, 0], -1, 1)
-    # the half below the axis mirrors that above
+    # the half below the axis mirrors the half above it
     below = to_rim[:, :, :, -2:0:-1] * np.array([1, -1])[None, :, None, None]
     return begin, np.concatenate([to_rim, below], axis=3)
 
 
 def _share_left(params: Params, frame: ImageFrame) -> F32:
-    """Of the beams' light, what clears the slipped ring and the hood, float32[y, x] in [0, 1]."""
+    """Return the fraction of each beam's light that clears ring and hood, float32[y, x] in [0, 1]."""
     beams = frame.beams(params["lens"])
     stop_mm = beams.lens.surfaces[beams.lens.stop].semi_diameter_mm
     focal_px = frame.lens.focal_length_mm * 1e3 / frame.pixel_pitch_um
-    # the edge of a far hood is as wide as the beam's image through it
+    # the edge of a far hood is as wide as the beam projected through it
     soft_px = focal_px * beams.rim_mm[0].mean() / max(params["hood_distance_mm"], 1e-3)
     finest = 2 ** int(np.clip(np.log2(frame.width_px * frame.height_px) / 2 - 7, 0, 6))
     step = int(np.clip(2 ** np.floor(np.log2(max(soft_px / 6, 1))), finest, max(_COARSEST_PX, finest)))
@@ -192,11 +214,14 @@ def _share_left(params: Params, frame: ImageFrame) -> F32:
 
 
 def _left_of(params: Params, beams: Beams, stop_mm: float, slope_x: F64, slope_y: F64) -> F64:
-    """Share left of the beams of directions, float64[n] each. Along a line of rays the light within a distance from
-    the beam's middle goes with its square."""
+    """Return the fraction left of the beams of the directions, float64[n].
+
+    Along a line of rays, the light within a distance of the beam's middle is proportional to the square of that
+    distance.
+    """
     begin, to_rim = _lines(beams)
     slope = np.hypot(slope_x, slope_y)
-    # where the lens is dark, as where it has the last of its light
+    # beyond the last direction that passes the lens, use that direction
     known = np.minimum(slope, beams.slope[np.flatnonzero(beams.rim_mm.min(axis=1) > 0).max()])
     low = np.clip(np.searchsorted(beams.slope, known, side="right") - 1, 0, len(beams.slope) - 2)
     part = (known - beams.slope[low]) / (beams.slope[low + 1] - beams.slope[low])
@@ -210,7 +235,7 @@ def _left_of(params: Params, beams: Beams, stop_mm: float, slope_x: F64, slope_y
         (begin[1], to_rim[1], params["decentre_mm"], stop_mm),
     )
     for start, onwards, (x, y), radius in openings:
-        # the opening's middle as the beam has its axes, outwards and across
+        # middle of the opening in the axes of the beam, outwards and across
         along, across = x * cos + y * sin, y * cos - x * sin
         enters, leaves = _crossings(start - along, -across, onwards, radius)
         first, last = np.maximum(first, enters), np.minimum(last, leaves)
@@ -220,12 +245,16 @@ def _left_of(params: Params, beams: Beams, stop_mm: float, slope_x: F64, slope_y
 
 
 def _crossings(x: F64, y: F64, onwards: F64, radius: float) -> tuple[F64, F64]:
-    """Between which shares of their way lines from (x, y), seen from the middle of a disc, lie within it."""
+    """Return the parameters at which lines enter and leave a disc; 0 is the start of a line, 1 its end.
+
+    The lines start at (x, y), measured from the middle of the disc, and run along `onwards`. A line that misses the
+    disc gets 2 and -1.
+    """
     a = np.maximum(onwards[0] ** 2 + onwards[1] ** 2, 1e-300)
     b = (x[:, None] * onwards[0] + y[:, None] * onwards[1]) / a
     c = (x**2 + y**2 - radius**2)[:, None] / a
     under = b * b - c
     root = np.sqrt(np.maximum(under, 0))
-    # a rim that is the opening's own is not to be cut by rounding
+    # if the rim is that of the opening itself, rounding must not cut it
     leaves = np.where(under > 0, -b + root, -1.0)
     return np.where(under > 0, -b - root, 2.0), np.where(leaves > 1 - _ROUNDING, 1.0, leaves)
