@@ -302,8 +302,8 @@ class Device:
         black, highest = self.black_dn(exposure_s), 0.0
         if self.row_black_dn is not None:
             mosaic, highest = mosaic - self.row_black_dn, float(self.row_black_dn.max())
-        # white is the range above the highest black level. A saturated pixel then stays white, even if its full well
-        # lies below the top code
+        # white is the range above the highest black level. A saturated pixel then stays white, even if its full
+        # well lies below the top code
         white = sensor.readout.bias_dn + sensor.readout.system_gain_dn_per_e * sensor.readout.white_e
         full = 255.0 / max(white - black - highest, 1.0)
         scale = {
