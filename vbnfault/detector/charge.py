@@ -83,7 +83,6 @@ def smear(
     every = (passed[-1] + rate[-1]) * np.float32(early)
 
     def step(rows: slice) -> None:
-        """DELETE"""
         cv2.addWeighted(rate[rows], exposure_s - early, passed[rows], late - early, 0.0, dst=passed[rows])
         if early:
             passed[rows] += every

@@ -3,8 +3,8 @@
 A seed fixes the properties of the device; age and radiation add defects.
 
 Every property has its own random stream, keyed by (seed, name). Every defect has a fixed position in an endless
-list in order of birth; the age or dose says how much of the list exists. So more hot pixels do not change the gain map, and
-an older device keeps all its earlier defects.
+list in order of birth; the age or dose says how much of the list exists. So more hot pixels do not change the gain
+map, and an older device keeps all its earlier defects.
 """
 
 from __future__ import annotations
@@ -289,6 +289,7 @@ class Individual:
 
     @property
     def shape(self) -> tuple[int, int]:
+        """Return (height, width) in pixels."""
         height, width = self.gain.shape
         return height, width
 

@@ -52,18 +52,22 @@ class MosaicDetector:
 
     @property
     def name(self) -> str:
+        """Return the name of the sensor."""
         return self.sensor.name
 
     @property
     def pixel_pitch_um(self) -> float:
+        """Return the pixel pitch in µm."""
         return self.sensor.pixel_pitch_um
 
     @property
     def full_well_e(self) -> float:
+        """Return the full well in electrons."""
         return self.sensor.readout.full_well_e
 
     @property
     def read_noise_e_rms(self) -> float:
+        """Return the temporal noise of a dark pixel, as `ReadoutSpec.noise_e_rms`."""
         return self.sensor.readout.noise_e_rms
 
     @property

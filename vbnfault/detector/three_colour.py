@@ -107,6 +107,7 @@ class Detector:
 
     @property
     def adc_max_dn(self) -> int:
+        """Return the highest code of the converter."""
         return 2**self.adc_bits - 1
 
     @property
