@@ -348,7 +348,7 @@ def _pieces(start: F64, step: F64, end: F64) -> tuple[I64, F64, F64]:
     for at, rate in zip(start, step, strict=True):
         here, there = np.floor(at).astype(np.int64), np.floor(at + rate * end).astype(np.int64)
         group = np.repeat(tracks, np.abs(there - here))
-        # borders in increasing direction begin behind the pixel, in decreasing direction at the pixel's own border
+        # a track towards larger coordinates meets the pixel's upper border first, else its lower border
         rank = _rank(group)
         border = here[group] + np.where(rate[group] > 0, 1 + rank, -rank)
         groups.append(group)

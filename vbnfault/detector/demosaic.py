@@ -1,8 +1,8 @@
 """Convert a mosaic to full R, G and B planes, and correct the defects that on-board software corrects first.
 
-All methods are linear in the unit of the mosaic and never clip. A Bayer mosaic is mirrored about its outermost
-pixels (… c b a b c …). This keeps the order of the filters, so a flat field stays flat at the border. Normalised
-convolution needs no mirror: it uses only the pixels inside the mosaic.
+All methods return values in the unit of the mosaic and never clip. A Bayer mosaic is mirrored about its
+outermost pixels (… c b a b c …). This keeps the order of the filters, so a flat field stays flat at the border.
+Normalised convolution needs no mirror: it uses only the pixels inside the mosaic.
 """
 
 from __future__ import annotations

@@ -42,7 +42,7 @@ class Transfer:
     row_transfer_s
         Time in s to shift the charge by one row into the store or the register.
     row_clear_s
-        Time in s to shift it by one row when the sensor is cleared before the exposure; 0 clears all rows at once.
+        Time in s to shift charge by one row while the sensor is cleared before the exposure; 0 clears all at once.
     pixel_transfer_s
         Time in s to shift the charge by one pixel in the serial register.
     row_readout_s

@@ -2,8 +2,8 @@
 
 The mask of a class is its *footprint*. Classes that label by *effect* (straylight) are the exception. Their mask is
 the pixels of the noise-free image that change by at least `Fault.effect_level_dn` DN (1 by default) when the fault
-is switched off. So where a broken line or saturation overwrites a flare, the mask of the flare is empty. In a
-CCD, charge may leave the footprint of a fault; then the mask is the union of footprint and effect.
+is switched off. So where a broken line or saturation overwrites a flare, the mask of the flare is empty. In a CCD,
+charge may leave the footprint of a fault; then the mask is the union of footprint and effect.
 """
 
 from __future__ import annotations
