@@ -293,6 +293,7 @@ def _in_blocks(step: Callable[[F32, Pattern], Sequence[F32]], raw: F32, pattern:
 
 
 def _bilinear(raw: F32, pattern: Pattern) -> list[F32]:
+    """Return R, G, B of a Bayer mosaic by bilinear interpolation."""
     red, green, blue = (plane_of(raw, pattern, colour) for colour in "RGB")
     return [
         cv2.sepFilter2D(red, -1, _TENT, _TENT),
@@ -302,6 +303,7 @@ def _bilinear(raw: F32, pattern: Pattern) -> list[F32]:
 
 
 def _normalised(raw: F32, pattern: Pattern, channel: str) -> F32:
+    """Return one channel at every pixel by normalised convolution, float32[y, x]; measured values are kept."""
     plane = plane_of(raw, pattern, channel)
     index = pattern.index(channel)
     reach, scale = _normaliser(pattern, raw.shape, index)

@@ -343,9 +343,10 @@ def aged(individual: Individual, **changes: Any) -> Individual:
     """Return the same device at a later state.
 
     `changes` may set a later age (`years`), a higher dose (`dose_TeV_g`), another time since the irradiation
-    (`anneal_s`) or another growth. Defects keep their positions; annealing lowers the rates of radiation damage.
-    The result equals `make_individual` with such a spec, bit for bit. The exception is `hot_clustered_share`, which
-    applies to new hot pixels only. Raises InputError for other keys, an earlier age or a lower dose.
+    (`anneal_s`) or another growth of defects. Defects keep their positions; annealing lowers the rates of radiation
+    damage. The result equals `make_individual` with such a spec, bit for bit. The exception is
+    `hot_clustered_share`, which applies to new hot pixels only. Raises InputError for other keys, an earlier age or
+    a lower dose.
     """
     spec = individual.spec
     for key in changes:
