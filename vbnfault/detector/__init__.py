@@ -1,4 +1,4 @@
-"""Detectors: from irradiance to digital numbers and pictures."""
+"""Model detectors: convert irradiance to electrons, raw digital numbers (DN) and 8 bit images."""
 
 from .mosaic_detector import MosaicDetector
 from .sensor import Sensor, load_sensor

@@ -1,11 +1,13 @@
-"""One device of a sensor at work: from photo-electrons expected in its mosaic to raw numbers and to a picture.
+"""Simulate one device with a colour mosaic: from expected photo-electrons to raw DN and to the RGBI image.
 
-    expected photo-electrons → response of each pixel (PRNU, dead pixels) → smear, parasitic light → dark current,
-    that of charge under way, telegraph signals → shot noise → particles → blooming → traps → full well → offsets,
-    nodes, noise, converter (`readout`) → raw → defect correction, black level, demosaic, white balance → RGBI
+    expected photo-electrons → response of each pixel (PRNU, dead pixels) → smear, parasitic light
+    → dark current (also during charge transfer), telegraph signals → shot noise → particles → blooming → traps
+    → full well → offsets, nodes, noise, converter (`readout`) → raw DN
+    → defect correction, black level, demosaicing, white balance → RGBI
 
-Smear is light that falls on charge under way, so it comes before the shot noise. Offsets (DSNU, "partially stuck"
-pixels) are no charge: they have no shot noise, and no well limits them. A stuck pixel shows its level as it is.
+Smear is light that falls on charge during its transfer, so it comes before the shot noise. Offsets (DSNU,
+"partially stuck" pixels) are not charge: they have no shot noise, and the full well does not limit them. A stuck
+pixel always shows its own level.
 """
 
 from __future__ import annotations
@@ -33,9 +35,12 @@ from .three_colour import _normal_field, poisson_quantile
 F32 = NDArray[np.float32]
 Raw = NDArray[np.uint16]
 
-# What may act on a picture under way, and where: on the photo-electrons to which each pixel responds, before smear
-# and dark current; on all electrons expected in each pixel, before shot noise; on those collected; on the offsets
-# that are added to them; on the raw numbers.
+# Steps at which a fault may act on the signal:
+#   light    photo-electrons after each pixel's response, before smear and dark current
+#   pixels   all electrons expected in each pixel, before shot noise
+#   charge   collected electrons, before blooming
+#   offsets  electrons that the readout adds to each pixel
+#   raw      raw DN
 STEPS = ("light", "pixels", "charge", "offsets", "raw")
 Acts = Mapping[str, Sequence[Callable[[Any], Any]]]
 _NOTHING: Acts = {}
@@ -45,8 +50,11 @@ _LEAST_BLACK_DN = 0.05
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class MosaicNoise:
-    """Variates of one exposure: `shot` float32[y, x], standard normal, those of the readout, and a generator's seed
-    for the few pixels whose dark current jumps."""
+    """Hold the variates of one exposure.
+
+    `shot` float32[y, x] is standard normal, `readout` holds the variates of the readout. `telegraph_seed` seeds the
+    generator of the few pixels with telegraph signals.
+    """
 
     shot: F32
     readout: ReadoutNoise
@@ -56,7 +64,7 @@ class MosaicNoise:
     def draw(
         cls, shape: tuple[int, int], shot: np.random.Generator, read: np.random.Generator, row: np.random.Generator
     ) -> MosaicNoise:
-        """For a (height, width) sensor: as many variates whatever the signal."""
+        """Draw the variates for a (height, width) sensor. Their number does not depend on the signal."""
         return cls(
             shot=_normal_field(shape, shot),
             readout=ReadoutNoise.draw(shape, read, row),
@@ -65,18 +73,22 @@ class MosaicNoise:
 
 
 class Device:
-    """One individual of a sensor at a temperature: what its pictures share is made once.
+    """Simulate one device of a sensor at one temperature.
+
+    Everything that does not change from exposure to exposure is computed once.
 
     Parameters
     ----------
+    sensor
+        Type of the sensor.
     seed
-        Of the individual, at least 0: the same seed is the same device for life.
+        Seed of the device, at least 0. The same seed always gives the same device.
     shape
-        (height, width) of the part that is looked at; default: the whole sensor.
+        (height, width) in pixels of the part in use; default: the whole sensor.
     temperature_K
-        Default: the sensor's own.
+        Temperature of the sensor in K; default: `sensor.temperature_K`.
     direction
-        Towards which a CCD's rows are read: "up" or "down".
+        Direction in which charge moves and rows are read: "up" (row 0 first) or "down".
     """
 
     def __init__(
@@ -102,11 +114,14 @@ class Device:
         self.transfer_dark_e = transfer_dark_e(sensor, self.dark_rate_e_s, direction)
         self._telegraph = self.individual.rts.at(self.temperature_K)
 
-    # --- light to numbers -----------------------------------------------------------------------------------------
+    # --- light to raw DN ------------------------------------------------------------------------------------------
 
     def expected_e(self, photo_e: F32, exposure_s: float, acts: Acts = _NOTHING) -> F32:
-        """Return the electrons expected in each pixel, float32[y, x], telegraph signals aside, of photo-electrons
-        expected there if all pixels responded alike; `acts` as in `raw`."""
+        """Return the electrons expected in each pixel, float32[y, x], without telegraph signals.
+
+        `photo_e` float32[y, x] are the photo-electrons expected if all pixels had the same response. `acts` is as
+        in `raw`.
+        """
         light: F32 = np.asarray(cv2.multiply(photo_e, self.response))
         for act in acts.get("light", ()):
             light = act(light)
@@ -115,7 +130,7 @@ class Device:
         return out if self.transfer_dark_e is None else cv2.add(out, self.transfer_dark_e)
 
     def _smeared(self, light: F32, exposure_s: float) -> F32:
-        """Electrons with those of the light that falls on charge under way, or waiting."""
+        """Return the electrons, with the light added that falls on charge while it moves or waits."""
         sensor, move = self.sensor, self.sensor.transfer
         steps = {
             "frame_transfer_ccd": (
@@ -130,7 +145,7 @@ class Device:
                 move.row_transfer_s * move.leak,
                 partial(smear_interline, row_transfer_s=move.row_transfer_s, leak=move.leak),
             ),
-            # the store of a global shutter; a rolling one reads at once
+            # only a global shutter stores charge; a rolling shutter reads each row at once
             "cmos": (move.row_readout_s * move.leak * (sensor.shutter == "global"), None),
         }
         weight, step = steps[sensor.architecture]
@@ -146,7 +161,7 @@ class Device:
     def collected_e(
         self, photo_e: F32, exposure_s: float, noise: MosaicNoise | None = None, acts: Acts = _NOTHING
     ) -> F32:
-        """Charge at the output, float32[y, x] in e, before offsets and the readout."""
+        """Return the charge at the output, float32[y, x] in e, before the offsets and the readout."""
         sensor, move = self.sensor, self.sensor.transfer
         charge = self.expected_e(photo_e, exposure_s, acts)
         if len(self.individual.rts):
@@ -176,7 +191,10 @@ class Device:
         return charge
 
     def raw(self, photo_e: F32, exposure_s: float, noise: MosaicNoise | None = None, acts: Acts = _NOTHING) -> Raw:
-        """Raw DN, uint16[y, x]; noise-free without `noise`. `acts` are what faults do at the `STEPS`."""
+        """Return raw DN, uint16[y, x].
+
+        Without `noise` the result is noise-free. `acts` are the changes that faults make, by the names of `STEPS`.
+        """
         charge = self.collected_e(photo_e, exposure_s, noise, acts)
         chain = self.readout_individual
         for act in acts.get("offsets", ()):
@@ -188,8 +206,9 @@ class Device:
         return raw
 
     def _captured(self, charge: F32, *, direction: str) -> F32:
+        """Return the charge after the deep traps of the device."""
         traps = self.individual.traps
-        # of a half, the rows that are read this way
+        # where the sensor is read in two halves, select the traps of this half
         first = len(self.response) - len(charge) if direction == "down" else 0
         here = (traps.row >= first) & (traps.row < first + len(charge))
         return capture(
@@ -197,10 +216,11 @@ class Device:
         )
 
     def _along_columns(self, step: Callable[..., F32], image: F32) -> F32:
+        """Apply a step along the columns, as the function `along_columns` does."""
         return along_columns(self.sensor, self.direction, step, image)
 
     def _along_registers(self, step: Callable[..., F32], image: F32) -> F32:
-        """As `along_columns`, along rows: to the left, or each half to its own side with two nodes or four."""
+        """Apply a step along the rows: all to the left or, with two or four nodes, each half to its own side."""
         if self.sensor.readout.nodes == 1:
             return step(image, direction="left")
         middle = (image.shape[1] + 1) // 2
@@ -209,27 +229,33 @@ class Device:
         )
 
     def _add_telegraph(self, charge: F32, exposure_s: float, seed: int | None) -> None:
+        """Add the electrons of the telegraph signals to the charge, in place; without a seed, the expected ones."""
         pixels = self.individual.rts
         share = self._telegraph.duty if seed is None else upper_share(self._telegraph, exposure_s, seed)
         high_e_s = self._telegraph.amplitude_e_s * share
         np.add.at(charge, (pixels.row, pixels.column), high_e_s * exposure_s)
-        if self.transfer_dark_e is not None:  # charge under way waits in these pixels, too
+        if self.transfer_dark_e is not None:  # charge that passes these pixels collects this signal, too
             rate = np.zeros_like(charge)
             np.add.at(rate, (pixels.row, pixels.column), high_e_s)
             charge += passing_dark_e(self.sensor, rate, self.direction)
 
-    # --- numbers to a picture -------------------------------------------------------------------------------------
+    # --- raw DN to image ------------------------------------------------------------------------------------------
 
     def black_dn(self, exposure_s: float) -> float:
-        """Level of no light: bias and mean dark signal, as a camera's covered pixels tell it; that of charge under
-        way aside, which is for each row another."""
+        """Return the black level in DN: the bias and the mean dark signal of the exposure.
+
+        A real camera measures this level in its covered pixels. The dark signal of the charge transfer is not
+        included, because it differs from row to row (`row_black_dn`).
+        """
         readout = self.sensor.readout
         return readout.bias_dn + readout.system_gain_dn_per_e * float(self.dark_rate_e_s.mean()) * exposure_s
 
     @cached_property
     def row_black_dn(self) -> F32 | None:
-        """What each row's level of no light is higher for the dark current of its charge under way, float32[y, 1];
-        None where that is too little to matter."""
+        """Return how far the dark signal of the charge transfer raises each row's black level, float32[y, 1], DN.
+
+        None if this is at most `_LEAST_BLACK_DN` in every row.
+        """
         if self.transfer_dark_e is None:
             return None
         rows = np.median(self.transfer_dark_e, axis=1, keepdims=True) * self.sensor.readout.system_gain_dn_per_e
@@ -237,12 +263,11 @@ class Device:
 
     @cached_property
     def bad(self) -> NDArray[np.bool_]:
-        """Pixels that a map of defects would name: hot, dead and stuck ones, bool[y, x]."""
+        """Return the hot, dead and stuck pixels, bool[y, x], as a camera's defect map would list them."""
         return (self._kinds & (HOT | DEAD | STUCK)) > 0
 
     def defects(self, exposure_s: float, noise: MosaicNoise) -> NDArray[np.uint8]:
-        """What is wrong with each pixel of the mosaic in one exposure, uint8[y, x]: bits of
-        `quantities.DEFECTS`."""
+        """Return the defects of each mosaic pixel in one exposure, uint8[y, x], as bits of `quantities.DEFECTS`."""
         out = self._kinds.copy()
         pixels = self.individual.rts
         high = upper_share(self._telegraph, exposure_s, noise.telegraph_seed) > 0.5
@@ -251,6 +276,7 @@ class Device:
 
     @cached_property
     def _kinds(self) -> NDArray[np.uint8]:
+        """Return the permanent defects of each mosaic pixel, uint8[y, x], as bits."""
         out = np.zeros(self.shape, dtype=np.uint8)
         one = self.individual
         for value, some in (
@@ -264,8 +290,11 @@ class Device:
         return out
 
     def rgbi(self, raw: Raw, exposure_s: float) -> RGBI:
-        """The 8 bit picture of a raw mosaic: bad pixels corrected first if the sensor does so, I from W where there
-        is one."""
+        """Return the 8 bit image of a raw mosaic.
+
+        Bad pixels are corrected first if the sensor does so. I comes from the W pixels if there are any, else it is
+        the luminance of R, G and B.
+        """
         sensor = self.sensor
         mosaic: NDArray[Any] = raw
         if sensor.correct_defects:
@@ -273,8 +302,8 @@ class Device:
         black, highest = self.black_dn(exposure_s), 0.0
         if self.row_black_dn is not None:
             mosaic, highest = mosaic - self.row_black_dn, float(self.row_black_dn.max())
-        # what is left above the highest black level is white: a saturated pixel stays so, also where its full well
-        # falls short of the top code
+        # white is the range above the highest black level. A saturated pixel then stays white, even if its full
+        # well lies below the top code
         white = sensor.readout.bias_dn + sensor.readout.system_gain_dn_per_e * sensor.readout.white_e
         full = 255.0 / max(white - black - highest, 1.0)
         scale = {
@@ -297,23 +326,25 @@ class Device:
 
     @property
     def white_balance(self) -> NDArray[np.float32]:
-        """Gain of each channel, float32[channel], as `efficiency.white_balance`."""
+        """Return the gain of each channel, float32[channel], as `efficiency.white_balance` does."""
         return white_balance(self.sensor.efficiency)
 
 
 @lru_cache(maxsize=4)
 def individual(spec: IndividualSpec, shape: tuple[int, int], pixel_pitch_um: float, seed: int) -> Individual:
-    """An individual, made once."""
+    """Return an individual from the cache, or make it."""
     return make_individual(spec, shape, pixel_pitch_um=pixel_pitch_um, seed=seed)
 
 
 def transfer_dark_e(sensor: Sensor, dark_rate_e_s: F32, direction: str) -> F32 | None:
-    """Electrons that packets of a CCD gather from dark current on their way, float32[y, x]; None on CMOS.
+    """Return the electrons from dark current that charge packets collect during transfer, float32[y, x].
 
-    A full-frame CCD clocks a packet through all pixels between its own and the register, a row's readout time in
-    each, so that a hot pixel draws a line behind it. In the store of a frame-transfer CCD and the registers of an
-    interline one packets wait as long, in pixels as the median one of the image (assumed); on its quick way to the
-    store a packet of the former passes the image's.
+    A full-frame CCD moves each packet through all pixels between its own pixel and the register. It stays in each
+    for the readout time of a row, so a hot pixel leaves a line. Packets in the store of a frame-transfer CCD and in
+    the registers of an interline CCD wait equally long; their dark current is assumed to be the median of the
+    image. In a frame-transfer CCD a packet also passes the image pixels on its quick transfer to the store.
+
+    Returns None for a CMOS sensor, and for a CCD without transfer times.
     """
     move = sensor.transfer
     if sensor.architecture == "cmos" or not (move.row_readout_s or move.row_transfer_s):
@@ -326,7 +357,7 @@ def transfer_dark_e(sensor: Sensor, dark_rate_e_s: F32, direction: str) -> F32 |
 
 
 def passing_dark_e(sensor: Sensor, dark_rate_e_s: F32, direction: str) -> F32:
-    """The part of `transfer_dark_e` that comes from the image's own pixels, float32[y, x]: linear in their rate."""
+    """Return the part of `transfer_dark_e` from the image's own pixels, float32[y, x]: linear in their rate."""
     period_s = {
         "full_frame_ccd": sensor.transfer.row_readout_s,
         "frame_transfer_ccd": sensor.transfer.row_transfer_s,
@@ -338,8 +369,10 @@ def passing_dark_e(sensor: Sensor, dark_rate_e_s: F32, direction: str) -> F32:
 
 
 def along_columns(sensor: Sensor, direction: str, step: Callable[..., F32], image: F32) -> F32:
-    """`step(part, direction=…)` for what is read towards one register: all rows, or each half of them where four
-    nodes sit in the corners."""
+    """Apply `step(part, direction=…)` along the columns of an image.
+
+    A part holds all rows that are read towards one register: the whole image or, with four nodes, each half of it.
+    """
     if sensor.readout.nodes < 4:
         return step(image, direction=direction)
     middle = (len(image) + 1) // 2
@@ -347,18 +380,24 @@ def along_columns(sensor: Sensor, direction: str, step: Callable[..., F32], imag
 
 
 def show_stuck(raw: Raw, stuck: StuckPixels, top_dn: int) -> None:
-    """Set stuck pixels of a raw mosaic, uint16[y, x], to their levels, in place; of two in one pixel the later."""
+    """Set the stuck pixels of a raw mosaic, uint16[y, x], to their levels, in place.
+
+    If two of them share a pixel, the later one counts.
+    """
     raw[stuck.row, stuck.column] = np.rint(stuck.level * top_dn)
 
 
 def upper_share(signals: Telegraph, exposure_s: float, seed: int) -> NDArray[np.float64]:
-    """The share of an exposure that telegraph signals spend in their upper level, float64[n], by a seed."""
+    """Return the fraction of an exposure that each telegraph signal spends in its upper level, float64[n]."""
     rng = np.random.default_rng(seed)
     return signals.expose(signals.start(rng), exposure_s, rng)[0]
 
 
 def channel_sites(sensor: Sensor) -> dict[str, tuple[slice, slice]]:
-    """Of each channel, a regular grid of its pixels: the first place of it in a tile."""
+    """Return, for each channel, (row, column) slices that select a regular grid of its pixels.
+
+    The grid starts at the channel's first pixel in the tile and has one pixel per tile.
+    """
     tile = np.array(sensor.pattern.tile)
     out = {}
     for k, name in enumerate(sensor.pattern.channels):
@@ -368,5 +407,5 @@ def channel_sites(sensor: Sensor) -> dict[str, tuple[slice, slice]]:
 
 
 def by_channel(sensor: Sensor, shape: tuple[int, int], values: Sequence[float]) -> F32:
-    """A mosaic with a value for each channel, float32[y, x]."""
+    """Return a mosaic float32[y, x] that holds one value per channel."""
     return np.asarray(values, dtype=np.float32)[channel_of(sensor.pattern, shape)]

@@ -1,11 +1,12 @@
-"""Charge on its way: what a sensor does to collected electrons before they are measured.
+"""Simulate how charge moves through a sensor before it is measured.
 
-Every function takes one plane of electrons (a mosaic), float32[y, x], row 0 at the top, and returns a new one.
-Physical order: light falls during the frame transfer (`smear`) or on waiting charge (`parasitic_light`); wells
-overflow (`bloom`); packets lose charge to traps on their way (`capture`, `cti`; first parallel, then serial).
+Every function takes one plane of electrons (a mosaic), float32[y, x], with row 0 at the top, and returns a new
+one. The physical order is: light falls on charge during the frame transfer (`smear`) or while it waits
+(`parasitic_light`); wells overflow (`bloom`); packets lose charge to traps (`capture`, then `cti`, first parallel,
+then serial).
 
-A direction ("up", "down", "left", "right") is the way in which charge moves: "up" has its register above row 0,
-so that row 0 is read first. Effects along one line never depend on other lines.
+A direction ("up", "down", "left", "right") says where the charge moves. "up" has its register above row 0, so row
+0 is read first. Effects along one line never depend on other lines.
 """
 
 from __future__ import annotations
@@ -43,14 +44,31 @@ def smear(
     shutter_transmission: float = 1.0,
     direction: str = "up",
 ) -> F32:
-    """Electrons of a frame-transfer exposure, float32[y, x], from the rate in e/s, float32[y, x].
+    """Return the electrons of a frame-transfer exposure, float32[y, x].
 
-    S_i = t_exp I_i + τ_row Σ_{k<i} I_k + τ_clear Σ_{k>i} I_k, for charge that moves up: on its way to the store
-    the packet of row i passes every row nearer to it; before the exposure it came through the rows behind. A
-    fast clear, or an electronic shutter that dumps the image before the exposure, has `row_clear_s` 0.
-    `shutter_transmission` 0 … 1 is the light a shutter lets through meanwhile: 1 without one, 0 when closed.
-    The times in s, at least 0. The light is taken as constant over exposure and transfer.
-    Raises InputError outside the ranges.
+    For charge that moves up,
+
+        S_i = t_exp I_i + τ_row Σ_{k<i} I_k + τ_clear Σ_{k>i} I_k .
+
+    On the transfer to the store, the packet of row i passes every row nearer to it. Before the exposure, it came
+    through the rows behind. The light is assumed constant during exposure and transfer.
+
+    Parameters
+    ----------
+    rate_e_s
+        Electrons per second, float32[y, x].
+    exposure_s, row_transfer_s, row_clear_s
+        t_exp, τ_row and τ_clear in s, at least 0. `row_clear_s` is 0 for a fast clear, or for an electronic shutter
+        that dumps the image before the exposure.
+    shutter_transmission
+        Fraction of the light that passes the shutter during the transfer: 1 without a shutter, 0 when closed.
+    direction
+        Direction of the charge.
+
+    Raises
+    ------
+    InputError
+        A value is out of range.
     """
     _at_least_0(exposure_s=exposure_s, row_transfer_s=row_transfer_s, row_clear_s=row_clear_s)
     _share(shutter_transmission=shutter_transmission)
@@ -81,11 +99,13 @@ def smear_interline(
     leak: float,
     direction: str = "up",
 ) -> F32:
-    """Electrons of an interline exposure, float32[y, x]: S_i = t_exp I_i + leak τ_row Σ_k I_k.
+    """Return the electrons of an interline exposure, float32[y, x]: S_i = t_exp I_i + leak τ_row Σ_k I_k.
 
-    `leak` in [0, 1] is the share of a pixel's light that reaches the covered register beside it. The register
-    runs all the time, so a packet is followed from an empty register's far end to the near one: it gathers the
-    whole column, which draws a line above and below a bright spot. Other arguments and errors as in `smear`.
+    The covered register runs all the time. A packet therefore starts at the far end of the register and collects
+    light along the whole column. This draws a line above and below a bright spot.
+
+    `leak` in [0, 1] is the fraction of a pixel's light that reaches the covered register beside it. Other arguments
+    and errors are as in `smear`.
     """
     _at_least_0(exposure_s=exposure_s, row_transfer_s=row_transfer_s)
     _share(leak=leak)
@@ -101,13 +121,28 @@ def smear_interline(
 
 
 def bloom(signal_e: F32, *, full_well_e: float, antiblooming: float = 0.0, direction: str = "up") -> F32:
-    """Charge above the full well runs along its column, half either way, until other wells have taken it.
+    """Return the electrons after wells above the full well have overflowed along their columns.
 
-    float32[y, x] in e, at least 0; afterwards nothing exceeds the full well. `antiblooming` in [0, 1] is the
-    share of the excess that a drain takes where it arises. What reaches an end of the column is lost there;
-    everything else is kept: sums agree to float32's rounding. Where currents meet from both sides, either is let
-    in first and the mean of both outcomes is taken, so that the result has no preferred side. Columns without
-    excess come back bit for bit. Raises InputError unless full_well_e > 0 and antiblooming is in [0, 1].
+    Half of the excess moves in each direction until other wells have taken it. Excess that reaches an end of the
+    column is lost. Everything else is conserved to float32 rounding, and no pixel exceeds the full well afterwards.
+    Where currents from both sides meet, the result is the mean of two cases: each current enters first in one of
+    them. So the result prefers no side. Columns without excess are returned bit for bit.
+
+    Parameters
+    ----------
+    signal_e
+        Electrons, float32[y, x], at least 0.
+    full_well_e
+        Full well in e, above 0.
+    antiblooming
+        Fraction of the excess that a drain removes in the pixel itself, 0 to 1.
+    direction
+        Direction of the charge, which selects columns or rows.
+
+    Raises
+    ------
+    InputError
+        A value is out of range.
     """
     _above_0(full_well_e=full_well_e)
     _share(antiblooming=antiblooming)
@@ -117,7 +152,8 @@ def bloom(signal_e: F32, *, full_well_e: float, antiblooming: float = 0.0, direc
     image = _facing(signal_e.copy() if direction == "up" else signal_e, direction)
     columns = np.flatnonzero(image.max(axis=0) > full_well_e)
     count = len(columns)
-    # both orders side by side: the current to the last row comes first in the left part, last in the right one
+    # compute both orders side by side: in the left part the current towards the last row enters first, in the
+    # right part it enters last
     excess = np.empty((len(image), 2 * count))
     np.subtract(np.take(image, columns, axis=1), full_well_e, out=excess[:, :count], dtype=np.float64)
     excess[:, count:] = excess[::-1, :count]
@@ -133,11 +169,12 @@ def bloom(signal_e: F32, *, full_well_e: float, antiblooming: float = 0.0, direc
 
 
 def _run_over(excess: F64, *, first: bool) -> None:
-    """A current runs from row 0 to the last: what is above 0 joins it, what is below takes from it, in place.
+    """Let a current of excess charge run from row 0 to the last row, in place.
 
-    With one current after the other to come, what joins stays marked for the second; afterwards only the free
-    room is left, as numbers up to 0. The current behind a row is max(0, before + excess): Lindley's recursion,
-    as of a queue. Row by row: no large array is made, and a row stays in the cache.
+    Positive values join the current, negative values (free room) take charge from it. The current behind a row is
+    max(0, before + excess): Lindley's recursion for a queue. After the `first` of two currents, positive values
+    stay for the second one; otherwise only the remaining room is left, as numbers up to 0. The loop works row by
+    row, so that it makes no large array and a row stays in the cache.
     """
     current = np.zeros(excess.shape[1])
     room = np.empty_like(current)
@@ -158,7 +195,15 @@ def _run_over(excess: F64, *, first: bool) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class TrapSpecies:
-    """Traps of one kind: number per pixel, at least 0, and mean time until release, in s, above 0."""
+    """Describe traps of one kind.
+
+    Attributes
+    ----------
+    density_per_px
+        Number of traps per pixel, at least 0.
+    release_time_s
+        Mean time until a trap releases its electron in s, above 0.
+    """
 
     density_per_px: float
     release_time_s: float
@@ -170,10 +215,19 @@ class TrapSpecies:
 
 @dataclass(frozen=True, kw_only=True)
 class ChargeCloud:
-    """How a packet fills the volume of its well: ((n − notch) / (full well − notch))^fill_power, in [0, 1].
+    """Describe how a packet fills the volume of its well.
 
-    `full_well_e` above `notch_e` ≥ 0, the charge in a supplementary buried channel that meets no trap;
-    `fill_power` in (0, 1]: 1 makes the loss proportional to the charge. (Massey et al. 2010, MNRAS 401, 371.)
+    The filled fraction is ((n − notch) / (full well − notch))^fill_power, in [0, 1] (Massey et al. 2010, MNRAS 401,
+    371).
+
+    Attributes
+    ----------
+    full_well_e
+        Full well in e, above `notch_e`.
+    notch_e
+        Charge in a supplementary buried channel that meets no trap, at least 0 e.
+    fill_power
+        Exponent in (0, 1]; 1 makes the loss proportional to the charge.
     """
 
     full_well_e: float
@@ -188,7 +242,7 @@ class ChargeCloud:
             raise InputError(f"fill_power = {self.fill_power:g}: must be above 0, at most 1")
 
     def volume(self, signal_e: F32) -> F32:
-        """Share of the well filled, float32 in [0, 1], shape kept."""
+        """Return the filled fraction of the well, float32 in [0, 1], in the shape of `signal_e`."""
         share = np.ascontiguousarray(signal_e) - np.float32(self.notch_e)
         share *= np.float32(1 / (self.full_well_e - self.notch_e))
         # OpenCV clips and takes powers several times faster than numpy
@@ -210,26 +264,51 @@ def cti(
     passes: int = 1,
     trail_left_out: float = 0.01,
 ) -> F32:
-    """Image after readout through a register with traps, float32[y, x] in e; parallel ("up", "down") or serial
-    ("left", "right"): for both, call it twice.
+    """Return the image after readout through a register with traps, float32[y, x] in e.
 
-    The model is volume-driven (ArCTIC: Massey et al. 2010, MNRAS 401, 371; 2014, MNRAS 439, 887): a packet fills
-    at once every trap within its cloud; a trap lets go of its electron with probability 1 − exp(−t/τ) per
-    transfer of `transfer_s`, into the packet that sits there then. Row i passes the traps of pixels 0 … i, its own
-    included, and `transfers_before` pixels ahead of them (a store, a prescan); all are empty when readout starts.
+    The register is parallel ("up", "down") or serial ("left", "right"). Call the function twice for both.
 
-    Express approximation. A packet's cloud is taken as it is at the start of a pass, not shrinking from pixel to
-    pixel. Then all transfers have a closed sum: with V_j(i) the largest cloud among the packets i−j … i and
-    f(j) = Σ ρ exp(−j t/τ), the traps hold after packet i Σ_j V_j [f(j) + (f(j) − f(j+1)) (i − j)] electrons, and
-    packet i leaves with its charge and the change of that sum. `passes` cuts the transfers into that many equal
-    parts, each with the clouds that the former left: the error is of second order in the loss, and falls as
-    1/passes, until float32 rounds more (beyond some 16). A packet never gives more than it has.
+    The model is volume-driven (ArCTIC: Massey et al. 2010, MNRAS 401, 371; 2014, MNRAS 439, 887). A packet fills
+    every trap within its cloud at once. A trap releases its electron with probability 1 − exp(−t/τ) per transfer of
+    `transfer_s`, into the packet that is there at that time. Row i passes the traps of pixels 0 … i, including its
+    own pixel, and of `transfers_before` pixels ahead of them (a store, a prescan). All traps are empty when readout
+    starts.
 
-    Trails end where `trail_left_out` of the trapped charge is left: f is lowered by a constant to reach 0 there
-    and scaled to keep f(0), so that nothing is lost; the cost rises with the longest release time. Sums are kept
-    but for charge still trapped when the last row has left.
+    The computation is an express approximation: a packet's cloud keeps its size during a pass, instead of shrinking
+    from pixel to pixel. Then the sum over all transfers has a closed form. With V_j(i) the largest cloud among the
+    packets i−j … i and f(j) = Σ ρ exp(−j t/τ), the traps hold Σ_j V_j [f(j) + (f(j) − f(j+1)) (i − j)] electrons
+    after packet i. Packet i leaves with its charge plus the change of that sum. A packet never gives more than it
+    has.
 
-    Raises InputError unless transfer_s > 0, transfers_before ≥ 0, passes ≥ 1, 0 < trail_left_out < 1.
+    A trail ends where `trail_left_out` of the trapped charge is left: f is lowered by a constant to reach 0 there
+    and scaled to keep f(0), so that nothing is lost. The cost rises with the longest release time. The total charge
+    is conserved, except for charge that is still trapped when the last row has left.
+
+    Parameters
+    ----------
+    signal_e
+        Electrons, float32[y, x].
+    species
+        Kinds of traps.
+    cloud
+        Charge cloud of a packet.
+    transfer_s
+        Time per transfer in s, above 0.
+    direction
+        Direction of the charge.
+    transfers_before
+        Pixels with traps ahead of row 0, at least 0.
+    passes
+        Number of equal parts into which the transfers are divided, at least 1. Each part uses the clouds that the
+        part before left. The error is of second order in the loss and falls as 1/passes, until float32 rounding
+        dominates (beyond about 16 passes).
+    trail_left_out
+        Fraction of the trapped charge at which a trail ends, between 0 and 1.
+
+    Raises
+    ------
+    InputError
+        A value is out of range.
     """
     _above_0(transfer_s=transfer_s)
     if transfers_before < 0:
@@ -244,7 +323,7 @@ def cti(
         return signal_e.copy()
     trapped = _trapped(species, transfer_s, len(image), trail_left_out) / passes
     density = sum(s.density_per_px for s in species)
-    met = density * (np.arange(len(image)) + 1.0 + transfers_before)  # all the traps a packet passes
+    met = density * (np.arange(len(image)) + 1.0 + transfers_before)  # number of traps that a packet passes
     per_cloud = (passes / met).astype(np.float32)[:, None]
     for _ in range(passes):
         _clock(image, cloud, per_cloud, trapped, transfers_before)
@@ -252,7 +331,7 @@ def cti(
 
 
 def _trapped(species: Iterable[TrapSpecies], transfer_s: float, height: int, left_out: float) -> F64:
-    """f of `cti`, float64[j]: electrons that the traps of a pixel within a cloud hold j transfers after it."""
+    """Return f of `cti`, float64[j]: electrons that a pixel's traps in a cloud hold j transfers after the cloud."""
     f = np.zeros(height + 1)
     for s in species:
         f += s.density_per_px * np.exp(-np.arange(height + 1) * (transfer_s / s.release_time_s))
@@ -263,9 +342,9 @@ def _trapped(species: Iterable[TrapSpecies], transfer_s: float, height: int, lef
 
 
 def _clock(image: F32, cloud: ChargeCloud, per_cloud: F32, trapped: F64, before: int) -> None:
-    """One pass of `cti` towards row 0, in place, block by block of rows.
+    """Run one pass of `cti` towards row 0, in place, in blocks of rows.
 
-    `per_cloud` float32[y, 1] bounds a cloud to what its packet can give.
+    `per_cloud` float32[y, 1] limits a cloud to the charge that its packet has.
     """
     height = len(image)
     volume = np.empty(image.shape, dtype=np.float32)
@@ -281,13 +360,13 @@ def _clock(image: F32, cloud: ChargeCloud, per_cloud: F32, trapped: F64, before:
         largest = volume[rows].copy()
         total = held[rows]
         total[:] = 0
-        slope = np.zeros_like(largest)  # a lag's weight is linear in the row: two numbers, counted from `start`
+        slope = np.zeros_like(largest)  # the weight of a lag is linear in the row: value and slope from `start` on
         for j in range(min(len(released), stop)):
-            skip = max(j - start, 0)  # rows that have no packet j rows ahead
+            skip = max(j - start, 0)  # the first rows have no packet j rows ahead
             part = largest[skip:]
             if j:
                 np.maximum(part, volume[start + skip - j : stop - j], out=part)
-            if j >= start:  # in the pixels ahead, the first packet finds empty traps
+            if j >= start:  # in the `before` pixels, the first packet meets empty traps
                 total[skip] += part[0] * np.float32(before * f[j + 1])
             cv2.scaleAdd(part, f[j] + released[j] * (start - j + before), total[skip:], dst=total[skip:])
             cv2.scaleAdd(part, released[j], slope[skip:], dst=slope[skip:])
@@ -301,7 +380,7 @@ def _clock(image: F32, cloud: ChargeCloud, per_cloud: F32, trapped: F64, before:
             part[1:] += held[: rows.stop - 1]
         else:
             part += held[rows.start - 1 : rows.stop - 1]
-        cv2.max(part, 0.0, dst=part)  # rounding alone
+        cv2.max(part, 0.0, dst=part)  # removes rounding errors only
 
     for step in (fill, hold, leave):
         _by_rows(step, height)
@@ -315,12 +394,27 @@ def capture(
     *,
     direction: str = "up",
 ) -> F32:
-    """Image after readout past deep single traps, float32[y, x] in e: each takes the first `depth_e` electrons that
-    come by and keeps them beyond the picture.
+    """Return the image after readout past single deep traps, float32[y, x] in e.
 
-    A trap, empty when readout starts, sits in a pixel (row, column, int[n]); it is passed first by the packet of
-    its own pixel, then by those behind. A packet meets the traps farthest from the register first. `direction` is
-    "up" or "down". Raises InputError for other directions.
+    Each trap takes the first `depth_e` electrons that pass it and never releases them during the readout. Traps are
+    empty when readout starts. The packet of a trap's own pixel passes it first, then the packets behind. A packet
+    meets the traps farthest from the register first.
+
+    Parameters
+    ----------
+    signal_e
+        Electrons, float32[y, x].
+    row, column
+        Pixel of each trap, int[n].
+    depth_e
+        Electrons that each trap holds, float[n].
+    direction
+        "up" or "down".
+
+    Raises
+    ------
+    InputError
+        `direction` is neither "up" nor "down".
     """
     if direction not in ("up", "down"):
         raise InputError(f"direction = {direction!r}: must be up or down: traps sit in columns")
@@ -329,7 +423,7 @@ def capture(
     at = row if direction == "up" else len(image) - 1 - row
     order = np.lexsort((-at, column))
     at, column, depth = at[order], column[order], np.asarray(depth_e, dtype=np.float64)[order]
-    # of every column the farthest trap, then the next: a few rounds
+    # each round handles one trap in every column, starting with the farthest; a few rounds are enough
     first = np.flatnonzero(np.append(True, np.diff(column) != 0)) if len(column) else column
     rank = np.arange(len(column)) - np.repeat(first, np.diff(np.append(first, len(column))))
     rows = np.arange(len(image))[:, None]
@@ -345,10 +439,10 @@ def capture(
 
 
 def row_wait_s(height_px: int, *, row_period_s: float, direction: str = "up") -> F64:
-    """Time from the end of a global exposure until each row is read, float64[y] in s: i · row_period_s.
+    """Return the time from the end of a global exposure until each row is read, float64[y] in s: i · row_period_s.
 
-    "up" reads row 0 first, "down" the last row. Raises InputError for other directions, height_px < 1 or a
-    negative period.
+    "up" reads row 0 first, "down" the last row. Raises InputError for other directions, height_px < 1 or a negative
+    period.
     """
     _at_least_0(row_period_s=row_period_s)
     if height_px < 1:
@@ -367,10 +461,11 @@ def parasitic_light(
     row_period_s: float,
     direction: str = "up",
 ) -> F32:
-    """Global shutter: the stored charge gains sensitivity × rate × waiting time of its row, float32[y, x] in e.
+    """Return the electrons of a global shutter, float32[y, x], including light that falls on the waiting charge.
 
-    `sensitivity` in [0, 1] is the parasitic light sensitivity of the storage node over the photodiode's (1/50 000
-    for a CMV4000, recalled from its data sheet). Errors as in `row_wait_s`.
+    The stored charge gains sensitivity × rate × waiting time of its row. `sensitivity` in [0, 1] is the parasitic
+    light sensitivity: that of the storage node over that of the photodiode (1/50 000 for a CMV4000, recalled from
+    its data sheet). Raises InputError for it and as `row_wait_s` does.
     """
     _share(sensitivity=sensitivity)
     wait = row_wait_s(len(signal_e), row_period_s=row_period_s, direction=direction)
@@ -381,7 +476,10 @@ def parasitic_light(
 
 
 def _facing(image: F32, direction: str, *, back: bool = False) -> F32:
-    """The image turned so that charge moves to row 0, or turned `back`; contiguous, a copy unless "up"."""
+    """Turn the image so that charge moves to row 0, or turn it `back`.
+
+    The result is contiguous, and a copy unless `direction` is "up".
+    """
     _known(direction)
     sideways = direction in ("left", "right")
     if direction == "up":
@@ -394,7 +492,7 @@ def _facing(image: F32, direction: str, *, back: bool = False) -> F32:
 
 
 def _by_rows(step: Callable[[slice], None], height: int) -> None:
-    """`step` for blocks of rows in two threads: blocks fit the cache, numpy releases the interpreter lock."""
+    """Call `step` for blocks of rows in two threads: blocks fit the cache, numpy releases the interpreter lock."""
     starts = range(0, height, _ROWS_PER_BLOCK)
     list(_pool().map(step, (slice(i, min(i + _ROWS_PER_BLOCK, height)) for i in starts)))
 
@@ -404,7 +502,7 @@ def _pool() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(2)
 
 
-if hasattr(os, "register_at_fork"):  # threads do not live on in a forked process, such as a data loader's
+if hasattr(os, "register_at_fork"):  # threads do not survive in a forked process, such as a data loader's
     os.register_at_fork(after_in_child=_pool.cache_clear)
 
 

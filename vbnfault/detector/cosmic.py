@@ -1,11 +1,12 @@
-"""Cosmic rays: straight tracks of ionisation through a sensor's sensitive layer.
+"""Simulate cosmic rays: straight tracks of ionisation through the sensitive layer of a sensor.
 
-Coordinates: x_px, y_px as in images (origin at the top left corner, pixel centres at +0.5) and the depth in µm
-behind the face that collects charge. A track starts at a point and runs along theta, from the inward normal, and
-phi, from +x towards +y. A particle from behind draws the same line, so all tracks start at the collecting face.
+x_px and y_px are image coordinates (origin at the top left corner, pixel centres at +0.5). The depth in µm is
+measured from the face that collects charge. A track starts at a point in a direction (theta, phi). theta is
+measured from the inward normal, phi from +x towards +y. A particle from behind leaves the same track, so all tracks
+start at the collecting face.
 
-What is drawn once is kept as plain numbers; the charge in each pixel follows from them alone: the fluctuations
-along a track come from a hash of its stored seed.
+The drawn tracks are kept as plain numbers. The charge in each pixel follows from these numbers alone: fluctuations
+along a track come from a hash of the track's stored seed.
 """
 
 from __future__ import annotations
@@ -25,42 +26,49 @@ F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
 
-# Protons, all directions, per cm² of a sphere's cross-section: CREME96 at the Sun-Earth point L2, behind nothing
-# and behind 11 mm of aluminium.
+# Omnidirectional proton flux per cm² of a sphere's cross-section: CREME96 at the Sun-Earth point L2, without
+# shielding and behind 11 mm of aluminium.
 FLUX_UNSHIELDED_CM2_S = 4.67
 FLUX_BEHIND_11_MM_AL_CM2_S = 4.32
 
 PAIR_ENERGY_EV = 3.65  # mean energy per electron-hole pair in silicon at 300 K
 
-# Landau's width parameter per length: ξ = ½ K (Z/A) ρ / β², K = 0.307075 MeV cm² mol⁻¹ (Particle Data Group,
-# "Passage of particles through matter"), silicon Z/A = 14/28.0855 mol/g, ρ = 2.329 g/cm³, β = 1.
+# Width parameter of Landau's distribution per length: ξ = ½ K (Z/A) ρ / β² with K = 0.307075 MeV cm² mol⁻¹
+# (Particle Data Group, "Passage of particles through matter"), Z/A = 14/28.0855 mol/g and ρ = 2.329 g/cm³
+# (silicon), β = 1.
 XI_EV_PER_UM = 0.5 * 0.307075e6 * (14 / 28.0855) * 2.329 * 1e-4
 XI_E_PER_UM = XI_EV_PER_UM / PAIR_ENERGY_EV  # 4.88
 
 PROTON_MEV, ELECTRON_MEV = 938.27209, 0.51099895  # rest energies, CODATA 2018
 
-# Silicon, of the Particle Data Group's table of the density effect (Sternheimer, Berger & Seltzer 1984).
+# Values of silicon from the Particle Data Group's table of the density effect (Sternheimer, Berger & Seltzer 1984).
 _EXCITATION_EV = 173.0
 _STERNHEIMER = {"x0": 0.2015, "x1": 2.8716, "c": 4.4355, "a": 0.14921, "k": 3.2546}
 
-MOYAL_MEAN = float(np.euler_gamma) + math.log(2)  # of the standard Moyal distribution
+MOYAL_MEAN = float(np.euler_gamma) + math.log(2)  # mean of the standard Moyal distribution
 
-# Secondary electrons: energies considered, assumed. Slower ones stop within a µm; faster ones are rare.
+# Energies of the secondary electrons that are simulated (assumed). Slower electrons stop within about 1 µm, faster
+# electrons are rare.
 SECONDARY_MIN_KEV, SECONDARY_MAX_KEV = 10.0, 100.0
 
-_SIGMAS = 4.0  # of diffusion that are followed
-_STEPS_PER_PIXEL = 4  # when charge diffuses: a track is cut at least so fine …
-_STEPS_PER_DEPTH = 8  # … and so fine in depth, where the spread changes
+_SIGMAS = 4.0  # diffused charge is cut at this many standard deviations
+# With diffusion, a track is divided into at least this many steps per pixel, and per thickness of the layer because
+# the spread changes with depth.
+_STEPS_PER_PIXEL = 4
+_STEPS_PER_DEPTH = 8
 
 
 def stopping_power_MeV_cm2_g(energy_MeV: ArrayLike) -> F64:
-    """Mean energy that a proton of a kinetic energy from 1 MeV to 100 GeV leaves in silicon, per g/cm²: Bethe's
-    formula with the density effect (Particle Data Group, "Passage of particles through matter")."""
+    """Return the mean energy that a proton of 1 MeV to 100 GeV leaves in silicon per g/cm², float64.
+
+    This is Bethe's formula with the density effect (Particle Data Group, "Passage of particles through matter").
+    `energy_MeV` is the kinetic energy.
+    """
     gamma = 1 + np.asarray(energy_MeV, dtype=np.float64) / PROTON_MEV
     square = 1 - gamma**-2  # β²
     p2 = square * gamma**2
     ratio = ELECTRON_MEV / PROTON_MEV
-    most_MeV = 2 * ELECTRON_MEV * p2 / (1 + 2 * gamma * ratio + ratio**2)  # to one electron
+    most_MeV = 2 * ELECTRON_MEV * p2 / (1 + 2 * gamma * ratio + ratio**2)  # largest transfer to one electron
     s, x = _STERNHEIMER, np.log10(p2) / 2
     density = np.where(x < s["x0"], 0.0, 2 * math.log(10) * x - s["c"])
     density += np.where((x >= s["x0"]) & (x < s["x1"]), s["a"] * np.maximum(s["x1"] - x, 0) ** s["k"], 0.0)
@@ -68,15 +76,25 @@ def stopping_power_MeV_cm2_g(energy_MeV: ArrayLike) -> F64:
     return np.asarray(0.307075 * (14 / 28.0855) / square * bracket)
 
 
-LEAST_MEV_CM2_G = 1.664  # of any energy: minimum ionisation, some 2.5 GeV (Particle Data Group)
+LEAST_MEV_CM2_G = 1.664  # minimum ionisation, at about 2.5 GeV (Particle Data Group)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class CosmicRays:
-    """Tracks of one exposure, each field [n], float64 but for `seed`.
+    """Hold the tracks of one exposure. Every field is float64[n], except `seed`.
 
-    Start (x_px, y_px, depth_um), direction (theta_deg 0 … 180, phi_deg 0 … 360), length_um within the layer,
-    electrons set free along it, and the seed (uint32) of their fluctuations along the track.
+    Attributes
+    ----------
+    x_px, y_px, depth_um
+        Start of the track.
+    theta_deg, phi_deg
+        Direction, 0 to 180 and 0 to 360 degrees.
+    length_um
+        Length within the layer.
+    electrons
+        Electrons set free along this length.
+    seed
+        Seed of the fluctuations along the track, uint32[n].
     """
 
     x_px: F64
@@ -93,13 +111,13 @@ class CosmicRays:
 
     @property
     def params(self) -> list[dict[str, float]]:
-        """One dict of plain numbers per track, for JSON; `from_params` restores every bit."""
+        """Return one dict of plain numbers per track, for JSON. `from_params` restores every bit."""
         columns = {name: value.tolist() for name, value in vars(self).items()}
         return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
 
     @classmethod
     def from_params(cls, params: Sequence[Mapping[str, Any]]) -> CosmicRays:
-        """Tracks from the list that `params` gave. Raises InputError where a key is missing."""
+        """Return the tracks from a list that `params` gave. Raises InputError if a key is missing."""
         names = [f.name for f in fields(cls)]
         for number, row in enumerate(params):
             missing = [name for name in names if name not in row]
@@ -114,19 +132,35 @@ class CosmicRays:
 
 @dataclass(frozen=True, kw_only=True)
 class CosmicRayModel:
-    """Rate, geometry and ionisation.
+    """Describe the rate, geometry and ionisation of cosmic rays.
 
-    `flux_per_cm2_s` is omnidirectional, per cross-section of a sphere: a plane sees half of it, both sides
-    together. `pixel_pitch_um` and `thickness_um` of the sensitive layer, above 0. `electrons_per_um` is the mean
-    of a track; a track's total fluctuates by Moyal's distribution (Moyal 1955, Phil. Mag. 46, 263), the usual
-    closed form for Landau's with a lighter tail, of width `width_e_per_um` × length, and so does every pixel's
-    part before the parts are scaled to the total. Below some 50 µm of silicon real distributions are wider.
-    `diffusion_um` is the Gaussian σ of charge from the far face when it is collected; from depth z it is
-    √(z/thickness) of that, drift in a constant field. 0 turns it off. `secondaries` adds knock-on electrons of
-    10 to 100 keV, straight and square to their track (assumed), 1/T² in energy, with the range of Everhart & Hoff
-    1971 (J. Appl. Phys. 42, 5837); they come on top of the mean, at most 14 % of it.
+    Attributes
+    ----------
+    pixel_pitch_um
+        Pixel pitch, above 0.
+    thickness_um
+        Thickness of the sensitive layer, above 0. The default is assumed.
+    flux_per_cm2_s
+        Omnidirectional flux per cross-section of a sphere. A plane receives half of it, both sides together.
+    electrons_per_um
+        Mean number of electrons per µm of track, above 0.
+    width_e_per_um
+        Width of the fluctuation, per µm. A track's total follows Moyal's distribution (Moyal 1955, Phil. Mag. 46,
+        263) of this width times the length. This is the usual closed form for Landau's distribution, with a lighter
+        tail. Every pixel's part fluctuates likewise before the parts are scaled to the total. Below about 50 µm of
+        silicon real distributions are wider.
+    diffusion_um
+        Gaussian σ of charge from the far face when it is collected. Charge from depth z has √(z/thickness) of this
+        (drift in a constant field). 0 switches diffusion off.
+    secondaries
+        Whether to add knock-on electrons of 10 to 100 keV, straight and perpendicular to their track (assumed),
+        with 1/T² in energy and the range of Everhart & Hoff 1971 (J. Appl. Phys. 42, 5837). They add to the mean,
+        by at most 14 %.
 
-    The thickness default is assumed. Raises InputError outside the ranges.
+    Raises
+    ------
+    InputError
+        A value is out of range.
     """
 
     pixel_pitch_um: float
@@ -142,7 +176,7 @@ class CosmicRayModel:
             above = key in ("pixel_pitch_um", "thickness_um", "electrons_per_um")
             if not (0 < value < math.inf if above else 0 <= value < math.inf):
                 raise InputError(f"{key} = {value:g}: must be finite and {'above' if above else 'at least'} 0")
-        # the least that Moyal's distribution gives, in practice, must be charge
+        # the smallest value that Moyal's distribution gives in practice must still be a positive charge
         if self.width_e_per_um > 0.15 * self.electrons_per_um:
             raise InputError(
                 f"width_e_per_um = {self.width_e_per_um:g}: must be at most 0.15 electrons_per_um = "
@@ -150,18 +184,19 @@ class CosmicRayModel:
             )
 
     def expected_count(self, shape: tuple[int, int], exposure_s: float) -> float:
-        """Mean number of tracks on a (height, width) sensor: flux/2 × area × time."""
+        """Return the mean number of tracks on a (height, width) sensor: flux/2 × area × time."""
         if not 0 <= exposure_s < math.inf:
             raise InputError(f"exposure_s = {exposure_s:g}: must be finite and at least 0")
         area_cm2 = shape[0] * shape[1] * (self.pixel_pitch_um * 1e-4) ** 2
         return 0.5 * self.flux_per_cm2_s * area_cm2 * exposure_s
 
     def draw(self, shape: tuple[int, int], exposure_s: float, rng: np.random.Generator) -> CosmicRays:
-        """Tracks of one exposure (and, if wanted, readout) of `exposure_s` on a (height, width) sensor.
+        """Draw the tracks of one exposure of `exposure_s` on a (height, width) sensor.
 
-        Their number is Poisson. Through a plane pass directions of density ∝ cosθ sinθ, uniform in azimuth and
-        place. Lengths are thickness/cosθ, or up to the sensor's edge. Tracks that enter through the narrow sides
-        are left out. Raises InputError unless exposure_s is finite and at least 0.
+        `exposure_s` may include the readout. The number of tracks is Poisson distributed. The directions through a
+        plane have the density ∝ cosθ sinθ. Azimuth and position are uniform. A track is thickness/cosθ long, or
+        ends at the sensor's edge. Tracks that enter through the narrow sides are left out. Raises InputError unless
+        `exposure_s` is finite and at least 0.
         """
         count = int(rng.poisson(self.expected_count(shape, exposure_s)))
         x, y, sin2, turn = rng.random((count, 4)).T
@@ -183,10 +218,17 @@ class CosmicRayModel:
         return self._with_secondaries(rays, shape, rng) if self.secondaries else rays
 
     def deposit(self, rays: CosmicRays, shape: tuple[int, int]) -> tuple[I64, F32]:
-        """Charge per pixel: flat indices y · width + x, int64[m], rising, and electrons, float32[m].
+        """Return the charge per pixel of the tracks on a (height, width) sensor.
 
-        A track is cut where it crosses pixel borders, so each pixel has its exact chord. Depends on nothing
-        but the arguments. What falls outside the sensor is left out.
+        A track is cut where it crosses pixel borders, so each pixel gets its exact chord. Charge outside the sensor
+        is left out. The result depends only on the arguments.
+
+        Returns
+        -------
+        index
+            Flat pixel indices y · width + x, int64[m], in increasing order.
+        electrons
+            Electrons in these pixels, float32[m].
         """
         height, width = shape
         theta, phi = np.radians(rays.theta_deg), np.radians(rays.phi_deg)
@@ -203,7 +245,7 @@ class CosmicRayModel:
         electrons = weight * (rays.electrons * end / np.where(total > 0, total, 1))[track]
         if not self.diffusion_um:
             x, y = start[:, track] + step[:, track] * (a + b) / 2
-            # rounding may put a middle on the far border
+            # rounding may put the middle of a piece on the far border
             column = np.clip(np.floor(x).astype(np.int64), 0, width - 1)
             row = np.clip(np.floor(y).astype(np.int64), 0, height - 1)
             return _gather(row * width + column, electrons)
@@ -223,7 +265,7 @@ class CosmicRayModel:
         return _spread(x, y, sigma, (electrons / parts)[piece], shape)
 
     def image(self, rays: CosmicRays, shape: tuple[int, int]) -> F32:
-        """The electrons of `deposit` as an image, float32[y, x]."""
+        """Return the electrons of `deposit` as an image, float32[y, x]."""
         out = np.zeros(shape, dtype=np.float32)
         index, electrons = self.deposit(rays, shape)
         out.ravel()[index] = electrons
@@ -232,7 +274,7 @@ class CosmicRayModel:
     def _inside(
         self, shape: tuple[int, int], x: F64, y: F64, depth: F64, theta: F64, phi: F64, length_um: F64
     ) -> F64:
-        """How far, in µm, a track runs before it leaves the layer or the sensor, or ends."""
+        """Return the distance in µm that a track runs until it leaves the layer or the sensor, or ends."""
         sine = np.sin(theta) / self.pixel_pitch_um
         end = length_um
         for at, rate, far in (
@@ -246,12 +288,13 @@ class CosmicRayModel:
         return end
 
     def _local_e_per_um(self, seed: NDArray[np.uint32], number: I64) -> F64:
-        """Ionisation of a track's n-th piece, not yet scaled to the track's total."""
+        """Return the ionisation of the n-th piece of a track in e/µm, before it is scaled to the track's total."""
         u = _hash_uniform((seed.astype(np.uint64) << np.uint64(32)) + number.astype(np.uint64))
         moyal = -2 * np.log(-ndtri(u / 2))  # −ln z², z a standard normal variate
         return self.electrons_per_um + self.width_e_per_um * (moyal - MOYAL_MEAN)
 
     def _with_secondaries(self, rays: CosmicRays, shape: tuple[int, int], rng: np.random.Generator) -> CosmicRays:
+        """Return the tracks together with their knock-on electrons."""
         low, high = SECONDARY_MIN_KEV, SECONDARY_MAX_KEV
         # ∫ ξ/T² dT per length, ξ in keV/µm
         number = rng.poisson(rays.length_um * XI_EV_PER_UM * 1e-3 * (1 / low - 1 / high))
@@ -263,7 +306,7 @@ class CosmicRayModel:
         theta, phi = np.radians(rays.theta_deg[parent]), np.radians(rays.phi_deg[parent])
         length = along * rays.length_um[parent]
         across = length * np.sin(theta) / self.pixel_pitch_um
-        # square to (sinθ cosφ, sinθ sinφ, cosθ): (cosθ cosφ, cosθ sinφ, −sinθ) and (−sinφ, cosφ, 0)
+        # (cosθ cosφ, cosθ sinφ, −sinθ) and (−sinφ, cosφ, 0) are perpendicular to (sinθ cosφ, sinθ sinφ, cosθ)
         turn = 2 * np.pi * turn
         dx = np.cos(turn) * np.cos(theta) * np.cos(phi) - np.sin(turn) * np.sin(phi)
         dy = np.cos(turn) * np.cos(theta) * np.sin(phi) + np.sin(turn) * np.cos(phi)
@@ -287,7 +330,7 @@ class CosmicRayModel:
 
 
 def _rank(group: I64) -> I64:
-    """Number of each entry within its group; equal groups stand together."""
+    """Return the number of each entry within its group. Entries of a group are adjacent."""
     at = np.arange(len(group))
     first = np.ones(len(group), dtype=bool)
     first[1:] = group[1:] != group[:-1]
@@ -295,14 +338,17 @@ def _rank(group: I64) -> I64:
 
 
 def _pieces(start: F64, step: F64, end: F64) -> tuple[I64, F64, F64]:
-    """Pieces of tracks within one pixel each: the track and both ends, as fractions of its length; `start` and
-    `step` float64[2, n] in pixels, `end` float64[n] the fraction of each track to cut."""
+    """Cut tracks into pieces that lie within one pixel each.
+
+    Returns the track of each piece and both its ends, as fractions of the track's length. `start` and `step` are
+    float64[2, n] in pixels; `end` float64[n] is the fraction of each track to cut.
+    """
     tracks = np.arange(len(end))
     groups, cuts = [tracks, tracks], [np.zeros(len(end)), end]
     for at, rate in zip(start, step, strict=True):
         here, there = np.floor(at).astype(np.int64), np.floor(at + rate * end).astype(np.int64)
         group = np.repeat(tracks, np.abs(there - here))
-        # borders are crossed one by one: upwards from the one after, downwards from the one at hand
+        # a track towards larger coordinates meets the pixel's upper border first, else its lower border
         rank = _rank(group)
         border = here[group] + np.where(rate[group] > 0, 1 + rank, -rank)
         groups.append(group)
@@ -315,8 +361,10 @@ def _pieces(start: F64, step: F64, end: F64) -> tuple[I64, F64, F64]:
 
 
 def _hash_uniform(key: NDArray[np.uint64]) -> F64:
-    """Uniform numbers in (0, 1), 24 bit, from keys: the output function of SplitMix64 (Steele, Lea & Flood 2014,
-    doi 10.1145/2660193.2660195)."""
+    """Return uniform 24 bit numbers in (0, 1) from keys.
+
+    This is the output function of SplitMix64 (Steele, Lea & Flood 2014, doi 10.1145/2660193.2660195).
+    """
     z = (key + np.uint64(1)) * np.uint64(0x9E3779B97F4A7C15)
     z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
@@ -325,14 +373,16 @@ def _hash_uniform(key: NDArray[np.uint64]) -> F64:
 
 
 def _gather(index: I64, electrons: F64) -> tuple[I64, F32]:
-    """Sums of the electrons of equal indices, these rising."""
+    """Return the unique indices in increasing order, and the sum of the electrons of each."""
     unique, place = np.unique(index, return_inverse=True)
     return unique, np.bincount(place, electrons, minlength=len(unique)).astype(np.float32)
 
 
 def _spread(x: F64, y: F64, sigma_px: F64, electrons: F64, shape: tuple[int, int]) -> tuple[I64, F32]:
-    """Points of charge as Gaussians integrated over pixels; beyond `_SIGMAS` they are cut and scaled to keep
-    their charge."""
+    """Spread points of charge as Gaussians integrated over pixels.
+
+    The Gaussians are cut at `_SIGMAS` and scaled to keep the charge. Returns as `_gather` does.
+    """
     reach = math.ceil(_SIGMAS * float(sigma_px.max(initial=0.0)))
     offset = np.arange(-reach, reach + 2)
     parts = []

@@ -1,8 +1,8 @@
-"""From a mosaic to full planes of R, G, B, and the defects that on-board software corrects first.
+"""Convert a mosaic to full R, G and B planes, and correct the defects that on-board software corrects first.
 
-All methods keep linear signals in their unit and never clip. Beyond its borders a Bayer mosaic is mirrored about
-its outermost pixels (… c b a b c …), which keeps the order of the filters, so a flat field stays flat there.
-What is interpolated by normalised convolution takes the pixels there are.
+All methods return values in the unit of the mosaic and never clip. A Bayer mosaic is mirrored about its
+outermost pixels (… c b a b c …). This keeps the order of the filters, so a flat field stays flat at the border.
+Normalised convolution needs no mirror: it uses only the pixels inside the mosaic.
 """
 
 from __future__ import annotations
@@ -26,21 +26,21 @@ Method = Literal["bilinear", "malvar", "menon"]
 
 _MIRROR = cv2.BORDER_REFLECT_101
 
-# Rows of a mosaic and pixels of border around it: even, so that blocks begin with the same filters.
+# Both are even, so that every block begins with the same filters.
 _ROWS_PER_BLOCK = 64
 _HALO_PX = {"bilinear": 2, "malvar": 2, "menon": 8}
 
-# Bilinear: what a pixel gives to its neighbours of its own plane (Losson, Macaire & Yang 2010, Advances in
-# Imaging and Electron Physics 162, doi 10.1016/S1076-5670(10)62005-8). The first is [½ 1 ½]ᵀ [½ 1 ½].
+# Bilinear: weights with which a pixel contributes to the neighbours in its own plane (Losson, Macaire & Yang 2010,
+# Advances in Imaging and Electron Physics 162, doi 10.1016/S1076-5670(10)62005-8). The first is [½ 1 ½]ᵀ [½ 1 ½].
 BILINEAR_RED_BLUE = np.array([[1, 2, 1], [2, 4, 2], [1, 2, 1]], dtype=np.float32) / 4
 BILINEAR_GREEN = np.array([[0, 1, 0], [1, 4, 1], [0, 1, 0]], dtype=np.float32) / 4
 _TENT = np.array([0.5, 1, 0.5], dtype=np.float32)
 
-# Malvar, He & Cutler 2004, ICASSP, doi 10.1109/ICASSP.2004.1326587, figure 2: all symmetric, in eighths.
+# Malvar, He & Cutler 2004, ICASSP, doi 10.1109/ICASSP.2004.1326587, figure 2. All kernels are symmetric.
 MALVAR_GREEN = np.array(
     [[0, 0, -1, 0, 0], [0, 0, 2, 0, 0], [-1, 2, 4, 2, -1], [0, 0, 2, 0, 0], [0, 0, -1, 0, 0]], dtype=np.float32
 ) / np.float32(8)
-# a colour at green pixels of the rows that hold it; in the columns that hold it: the transpose
+# red (or blue) at the green pixels of the rows that hold it; the transpose serves the columns that hold it
 MALVAR_ALONG_ROW = np.array(
     [[0, 0, 0.5, 0, 0], [0, -1, 0, -1, 0], [-1, 4, 5, 4, -1], [0, -1, 0, -1, 0], [0, 0, 0.5, 0, 0]],
     dtype=np.float32,
@@ -51,27 +51,39 @@ MALVAR_ACROSS = np.array(
     dtype=np.float32,
 ) / np.float32(8)
 
-# Bad pixels mended together: bounds the memory of their neighbours.
+# Number of bad pixels that are corrected together, which limits the memory for their neighbours.
 _PIXELS_AT_ONCE = 4096
 
 _SUM = np.ones((1, 3), dtype=np.float32)
 
-# Menon 2007: colour differences two pixels apart, summed around a pixel to tell how rough a direction is.
+# Menon 2007: weights that sum colour differences two pixels apart around a pixel, as the roughness of a direction.
 _ROUGHNESS = np.array(
     [[1, 0, 1, 0, 0], [0, 1, 0, 0, 0], [3, 0, 3, 0, 0], [0, 1, 0, 0, 0], [1, 0, 1, 0, 0]], dtype=np.float32
 )
 
 
 def demosaic(raw: NDArray[Any], pattern: Pattern, method: Method = "bilinear") -> F32:
-    """Full-resolution R, G, B, float32[y, x, 3], of a mosaic [y, x] (any real dtype), in the mosaic's unit.
+    """Return full-resolution R, G, B, float32[y, x, 3], in the unit of the mosaic.
 
-    `malvar` (Malvar, He & Cutler 2004) and `menon` (DDFAPD: Menon, Andriani & Calvagno 2007, IEEE Trans. Image
-    Process. 16, 132, doi 10.1109/TIP.2006.884928, with its refining step) are made for Bayer patterns;
-    `bilinear` serves all. A monochrome mosaic gives R = G = B. W and NIR pixels are left out of R, G, B: see
-    `interpolate`. Measured values stay as they are.
+    A monochrome mosaic gives R = G = B. W and NIR pixels do not contribute to R, G, B: see `interpolate`. Measured
+    values are not changed. Sums of 16 bit integers are exact in float32, so rounding does not affect Menon's choice
+    of direction for raw DN.
 
-    Sums of 16 bit integers are exact in float32, so Menon's choice of direction is free of rounding for raw DN.
-    InputError for an unknown method, one that does not fit the pattern, or a mosaic below 6 × 6 pixels.
+    Parameters
+    ----------
+    raw
+        Mosaic [y, x] of any real dtype, at least 6 × 6 pixels.
+    pattern
+        Its colour filter array.
+    method
+        `malvar` (Malvar, He & Cutler 2004) and `menon` (DDFAPD: Menon, Andriani & Calvagno 2007, IEEE Trans. Image
+        Process. 16, 132, doi 10.1109/TIP.2006.884928, with its refining step) need a Bayer pattern. `bilinear`
+        works with all patterns.
+
+    Raises
+    ------
+    InputError
+        The method is unknown or does not fit the pattern, or the mosaic is too small.
     """
     if method not in get_args(Method):
         raise InputError(f"demosaic method is '{method}', but must be one of {', '.join(get_args(Method))}")
@@ -92,12 +104,12 @@ def demosaic(raw: NDArray[Any], pattern: Pattern, method: Method = "bilinear") -
 def without_undershoot(
     rgb: F32, raw: NDArray[Any], pattern: Pattern, method: Method, black: float, noise: float
 ) -> F32:
-    """Return demosaiced planes in which no hard edge makes its dark side darker than it was measured.
+    """Return the demosaiced planes, corrected where a hard edge makes its dark side darker than it was measured.
 
-    The kernels of Malvar and Menon have negative weights, which sharpen; beside an edge of 10,000:1 they turn the
-    dark side negative by a quarter of the bright one. A value there is raised to the least of its own colour's
-    measured values within one pixel, but only where those around span more than noise can (16 standard deviations)
-    and more than 8:1 above black: elsewhere a bound from below alone would be a bias of noise.
+    The kernels of Malvar and Menon have negative weights, which sharpen. Beside an edge of 10,000:1 they turn the
+    dark side negative by a quarter of the bright side. A value there is raised to the smallest measured value of
+    its own colour within one pixel. This happens only where the surrounding values span more than noise can (16
+    standard deviations) and more than 8:1 above black. Elsewhere a lower bound alone would bias the noise.
 
     Parameters
     ----------
@@ -105,6 +117,8 @@ def without_undershoot(
         float32[y, x, 3], from `demosaic` of `raw` with `method`; changed in place.
     raw
         The mosaic [y, x], in the same unit.
+    pattern, method
+        As in `demosaic`.
     black
         Black level of `raw`.
     noise
@@ -113,7 +127,7 @@ def without_undershoot(
     Returns
     -------
     F32
-        `rgb`. Only values that `demosaic` computed from the same pixels decide, so `footprint` holds for it too.
+        `rgb`. The correction depends on the same pixels as `demosaic`, so `footprint` is valid for it too.
     """
     if method == "bilinear" or not pattern.is_bayer:
         return rgb
@@ -133,16 +147,19 @@ def without_undershoot(
 
 
 def interpolate(raw: NDArray[Any], pattern: Pattern, channel: str) -> F32:
-    """One channel of a mosaic [y, x] at every pixel, float32[y, x], bilinearly: W of an RGBW mosaic is its
-    intensity. InputError where the pattern lacks the channel."""
+    """Return one channel of a mosaic [y, x] at every pixel by bilinear interpolation, float32[y, x].
+
+    The W channel of an RGBW mosaic is its intensity. Raises InputError if the pattern lacks the channel.
+    """
     return _normalised(_checked(raw), pattern, channel)
 
 
 def footprint(mask: Mask, pattern: Pattern, method: Method = "bilinear") -> Mask:
-    """bool[y, x]: pixels whose R, G, B (or W, NIR) may depend on the mosaic's pixels of `mask` bool[y, x].
+    """Return the pixels whose R, G, B (or W, NIR) may depend on the mosaic pixels in `mask`, bool[y, x].
 
-    Exact for the linear methods: the support of their kernels. Menon's method decides by the signal, so there it
-    is the union over all decisions, up to 8 pixels away, of which one picture shows a part.
+    `mask` is bool[y, x]. For linear methods the result is exact: the support of their kernels. Menon's method
+    chooses its direction from the signal. For it the result is the union over all choices, up to 8 pixels away; a
+    single image shows a part of this.
     """
     ones = _checked(mask)
     if method == "menon" and pattern.is_bayer:
@@ -160,12 +177,33 @@ def footprint(mask: Mask, pattern: Pattern, method: Method = "bilinear") -> Mask
 def correct_defects(
     raw: NDArray[Any], bad: Mask, pattern: Pattern, how: Literal["median", "mean"] = "median"
 ) -> NDArray[Any]:
-    """On-board defect correction: each pixel of `bad` bool[y, x] takes the median or mean of its good neighbours
-    of the same channel; a new array of the shape and dtype of `raw` [y, x].
+    """Return a mosaic whose bad pixels are replaced by their good neighbours, as on-board software does.
 
-    Neighbours lie within one tile (Bayer: 5 × 5 pixels, so 8 for red or blue, 12 for green; RGBW: 9 × 9;
-    monochrome: 3 × 3). Where none is good, four times as far is looked, and where none is good there either the
-    pixel is left. Integers round half to even.
+    Each bad pixel takes the median or mean of its good neighbours of the same channel. Neighbours lie within one
+    tile (Bayer: 5 × 5 pixels, so 8 neighbours for red or blue and 12 for green; RGBW: 9 × 9; monochrome: 3 × 3). If
+    none is good, the search goes four times as far. If none is good there either, the pixel is not changed.
+    Integers round half to even.
+
+    Parameters
+    ----------
+    raw
+        Mosaic [y, x].
+    bad
+        Bad pixels, bool[y, x].
+    pattern
+        Colour filter array.
+    how
+        "median" or "mean".
+
+    Returns
+    -------
+    NDArray
+        A new array with the shape and dtype of `raw`.
+
+    Raises
+    ------
+    InputError
+        `how` is unknown, or the shapes differ.
     """
     if how not in ("median", "mean"):
         raise InputError(f"correction is by '{how}', but must be by median or mean")
@@ -188,7 +226,7 @@ def correct_defects(
 
 
 def mended_from(changed: Mask, bad: Mask, pattern: Pattern) -> Mask:
-    """bool[y, x]: pixels of `bad` bool[y, x] that `correct_defects` mends with values of `changed` bool[y, x]."""
+    """Return the pixels of `bad` that `correct_defects` replaces with values from `changed`; all are bool[y, x]."""
     channels = channel_of(pattern, (bad.shape[0], bad.shape[1]))
     near, far = max(pattern.shape), 4 * max(pattern.shape)
     alone = ~_in_reach(~bad, channels, near)
@@ -197,7 +235,7 @@ def mended_from(changed: Mask, bad: Mask, pattern: Pattern) -> Mask:
 
 
 def _in_reach(good: Mask, channels: NDArray[np.uint8], reach: int) -> Mask:
-    """bool[y, x]: whether a good pixel of a pixel's own channel lies within `reach` rows and columns."""
+    """Return whether a good pixel of a pixel's own channel lies within `reach` rows and columns, bool[y, x]."""
     out = np.zeros(good.shape, dtype=np.bool_)
     square = np.ones((2 * reach + 1, 2 * reach + 1), dtype=np.uint8)
     for channel in range(int(channels.max()) + 1):
@@ -209,7 +247,7 @@ def _in_reach(good: Mask, channels: NDArray[np.uint8], reach: int) -> Mask:
 def _from_neighbours(
     raw: NDArray[Any], bad: Mask, channels: NDArray[np.uint8], at: NDArray[np.intp], reach: int, how: str
 ) -> tuple[NDArray[np.float64], Mask]:
-    """Median or mean of the good neighbours of each pixel `at` [n, 2], and whether there are any."""
+    """Return the median or mean of the good neighbours of each pixel `at` [n, 2], and whether there are any."""
     offset = np.arange(-reach, reach + 1)
     dy, dx = (d.ravel() for d in np.meshgrid(offset, offset, indexing="ij"))
     y, x = at[:, :1] + dy, at[:, 1:] + dx
@@ -221,19 +259,23 @@ def _from_neighbours(
     if how == "mean":
         return np.where(good, raw[y, x], 0.0).sum(axis=1) / some, count > 0
     values = np.where(good, raw[y, x], np.inf)
-    values.sort(axis=1)  # what is not good is infinite and goes last
+    values.sort(axis=1)  # values that are not good are infinite and go last
     row = np.arange(len(at))
     return (values[row, (some - 1) // 2] + values[row, some // 2]) / 2, count > 0
 
 
 def _checked(raw: NDArray[Any]) -> F32:
+    """Return the mosaic as contiguous float32. Raises InputError for a wrong shape."""
     if raw.ndim != 2 or min(raw.shape) < 6:
         raise InputError(f"the mosaic has shape {raw.shape}, but must be [y, x] of at least 6 × 6 pixels")
     return np.ascontiguousarray(raw, dtype=np.float32)
 
 
 def _in_blocks(step: Callable[[F32, Pattern], Sequence[F32]], raw: F32, pattern: Pattern, method: Method) -> F32:
-    """R, G, B, float32[y, x, 3], of blocks of rows with a mirrored halo, in two threads: blocks fit the cache."""
+    """Return R, G, B, float32[y, x, 3], computed in blocks of rows with a mirrored halo, in two threads.
+
+    Blocks fit the cache.
+    """
     halo = _HALO_PX[method]
     padded = cv2.copyMakeBorder(raw, halo, halo, halo, halo, _MIRROR)
     out = np.empty((*raw.shape, 3), dtype=np.float32)
@@ -251,6 +293,7 @@ def _in_blocks(step: Callable[[F32, Pattern], Sequence[F32]], raw: F32, pattern:
 
 
 def _bilinear(raw: F32, pattern: Pattern) -> list[F32]:
+    """Return R, G, B of a Bayer mosaic by bilinear interpolation."""
     red, green, blue = (plane_of(raw, pattern, colour) for colour in "RGB")
     return [
         cv2.sepFilter2D(red, -1, _TENT, _TENT),
@@ -260,6 +303,7 @@ def _bilinear(raw: F32, pattern: Pattern) -> list[F32]:
 
 
 def _normalised(raw: F32, pattern: Pattern, channel: str) -> F32:
+    """Return one channel at every pixel by normalised convolution, float32[y, x]; measured values are kept."""
     plane = plane_of(raw, pattern, channel)
     index = pattern.index(channel)
     reach, scale = _normaliser(pattern, raw.shape, index)
@@ -271,7 +315,7 @@ def _normalised(raw: F32, pattern: Pattern, channel: str) -> F32:
     rows, columns = pattern.shape
     for y in range(rows):
         for x in range(columns):
-            if pattern.tile[y][x] == index:  # what is measured stays
+            if pattern.tile[y][x] == index:  # measured values are kept exactly
                 out[y::rows, x::columns] = raw[y::rows, x::columns]
     return out
 
@@ -280,10 +324,13 @@ def _tent(reach: int) -> F32:
     return (1 - np.abs(np.arange(1 - reach, reach)) / reach).astype(np.float32)
 
 
-@lru_cache(maxsize=8)  # a picture each
+@lru_cache(maxsize=8)  # each entry is as large as an image
 def _normaliser(pattern: Pattern, shape: tuple[int, ...], index: int) -> tuple[int, F32]:
-    """Half-width of the narrowest tent that reaches every pixel from those of a channel (0: it is everywhere),
-    and the reciprocal of the weights it finds (Knutsson & Westin 1993, normalised convolution)."""
+    """Return the half-width of the tent and the reciprocal of its weights for normalised convolution.
+
+    The tent is the narrowest that reaches every pixel from the pixels of the channel; half-width 0 means that the
+    channel is everywhere. Source: Knutsson & Westin 1993.
+    """
     mask = (channel_of(pattern, (shape[0], shape[1])) == index).astype(np.float32)
     if mask.all():
         return 0, mask
@@ -307,7 +354,7 @@ def _normaliser(pattern: Pattern, shape: tuple[int, ...], index: int) -> tuple[i
 
 
 def _sites(pattern: Pattern) -> tuple[tuple[int, int], tuple[int, int]]:
-    """Row and column of the tile's red pixel and of its blue one."""
+    """Return row and column of the tile's red pixel and of its blue one."""
     flat = [pattern.channels[i] for row in pattern.tile for i in row]
     red, blue = flat.index("R"), flat.index("B")
     return (red // 2, red % 2), (blue // 2, blue % 2)
@@ -329,14 +376,15 @@ def _most(raw: F32, kernel: F32) -> F32:
 
 
 def _malvar(raw: F32, pattern: Pattern, *, filtered: Callable[[F32, F32], F32] = _signed) -> list[F32]:
-    """R, G, B at every pixel, each by `filtered` with the kernel that Malvar's method has there."""
+    """Return R, G, B at every pixel, each from `filtered` with the kernel that Malvar's method uses there."""
     (ry, rx), (by, bx) = _sites(pattern)
     red_rows, red_columns = slice(ry, None, 2), slice(rx, None, 2)
     blue_rows, blue_columns = slice(by, None, 2), slice(bx, None, 2)
     green = filtered(raw, MALVAR_GREEN)
     for rows, columns in ((red_rows, blue_columns), (blue_rows, red_columns)):
         green[rows, columns] = raw[rows, columns]
-    # each starts as what the green pixels of one kind of row need; the other three kinds are put in
+    # each plane starts with the values for the green pixels of one kind of row; then the three other kinds of
+    # pixels are written into it
     along_row = filtered(raw, MALVAR_ALONG_ROW)
     along_column = filtered(raw, np.ascontiguousarray(MALVAR_ALONG_ROW.T))
     across = filtered(raw, MALVAR_ACROSS)
@@ -361,13 +409,16 @@ def _row(*weights: float) -> F32:
 _BESIDE = _row(0.5, 0, 0.5)
 _THIRDS = _row(1 / 3, 1 / 3, 1 / 3)
 _TWO_APART = _row(0, 0, 1, 0, -1)
-# raw minus green as interpolated from green neighbours and the curvature of the pixel's own colour (eq. 1)
+# raw minus green, which is interpolated from green neighbours and the curvature of the pixel's own colour (eq. 1)
 _COLOUR_DIFFERENCE = _row(0.25, -0.5, 0.5, -0.5, 0.25)
 
 
 def _menon(raw: F32, pattern: Pattern) -> list[F32]:
-    """R, G, B, by way of colour differences: K, red minus green at red pixels and blue minus green at blue ones,
-    and L, red minus blue. The direction along which K varies less is the one to interpolate along."""
+    """Return R, G, B by Menon's method, which interpolates colour differences.
+
+    K is red minus green at red pixels and blue minus green at blue pixels; L is red minus blue. The method
+    interpolates along the direction in which K varies less.
+    """
     (ry, rx), (by, bx) = _sites(pattern)
     red, blue = (slice(ry, None, 2), slice(rx, None, 2)), (slice(by, None, 2), slice(bx, None, 2))
     # green pixels of the red rows and of the blue rows
@@ -401,7 +452,7 @@ def _menon(raw: F32, pattern: Pattern) -> list[F32]:
         return along_row(k, _BESIDE), along_column(k, _BESIDE)
 
     def red_minus_blue(row: F32, column: F32) -> F32:
-        # at green pixels of a red row the red ones lie along it, the blue ones across
+        # at a green pixel of a red row, red pixels are neighbours along the row and blue ones along the column
         out = np.zeros_like(raw)
         np.subtract(row[green_r], column[green_r], out=out[green_r])
         np.subtract(column[green_b], row[green_b], out=out[green_b])
@@ -412,7 +463,7 @@ def _menon(raw: F32, pattern: Pattern) -> list[F32]:
     between = red_minus_blue(row, column)
     l_first = chosen(*beside(between))  # at red and blue pixels
 
-    # refining: green from the mean of three colour differences along the chosen direction
+    # refining step: green from the mean of three colour differences along the chosen direction
     for full in (row, column):
         full[red], full[blue] = k[red], k[blue]
     k = clear_green(chosen(along_row(row, _THIRDS), along_column(column, _THIRDS)))
@@ -434,10 +485,10 @@ def _menon(raw: F32, pattern: Pattern) -> list[F32]:
 
 @lru_cache(maxsize=1)
 def _menon_support() -> NDArray[np.uint8]:
-    """Which pixels around one may feel it, uint8[17, 17].
+    """Return which pixels around a changed pixel may change, uint8[17, 17].
 
-    Green feels the decision's 9 × 5 and 5 × 9 pixels; the refined colour differences, green along an axis by up
-    to 2; red and blue, those within 2 steps.
+    Green depends on the decision, which uses 9 × 5 and 5 × 9 pixels. The refined colour differences depend on green
+    along an axis by up to 2 pixels. Red and blue depend on those within 2 steps.
     """
     point = np.zeros((17, 17), dtype=np.uint8)
     point[8, 8] = 1

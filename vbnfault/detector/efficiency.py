@@ -1,4 +1,4 @@
-"""Quantum efficiency of a sensor's channels: electrons per photon behind each of its filters."""
+"""Compute the quantum efficiency (QE) of a sensor's channels: electrons per photon behind each colour filter."""
 
 from __future__ import annotations
 
@@ -15,13 +15,29 @@ from ..core.errors import InputError
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
-# A long pass before the pixels of the near infrared, where a sensor's file gives no curve: assumed.
+# Edge of the long-pass filter over NIR pixels (assumed), for sensors whose file gives no NIR curve.
+# The transmission rises linearly between these wavelengths.
 _NIR_EDGE_NM = (700.0, 750.0)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Curve:
-    """QE of one channel, in 0 to 1, at rising wavelengths; linear between them, none beyond."""
+    """Hold the QE of one channel as a sampled curve.
+
+    Attributes
+    ----------
+    channel
+        Name of the channel, such as "R".
+    wavelength_nm
+        Wavelengths in nm, in increasing order.
+    value
+        QE at these wavelengths, in [0, 1]. It is linear between them and 0 outside their range.
+
+    Raises
+    ------
+    InputError
+        The lists differ in length or have fewer than 2 values, or a value is out of range or order.
+    """
 
     channel: str
     wavelength_nm: tuple[float, ...]
@@ -41,11 +57,11 @@ class Curve:
 
 @dataclass(frozen=True, kw_only=True)
 class QuantumEfficiency:
-    """QE of `channels`.
+    """Hold the QE of all channels of a sensor.
 
-    A channel without a curve of its own has, of R, G and B, the relative curve `response` names
-    (`spectra.RESPONSES`) times `peak`; of W, which has no filter, `peak` at all wavelengths; of NIR the same behind
-    a long pass (both assumed).
+    A channel without a curve of its own gets a default. R, G and B take the relative curve named by `response`
+    (`spectra.RESPONSES`) times `peak`. W has no filter and takes `peak` at all wavelengths (assumed). NIR takes
+    `peak` behind a long-pass filter (assumed).
     """
 
     channels: tuple[str, ...] = ("R", "G", "B")
@@ -54,7 +70,7 @@ class QuantumEfficiency:
     curves: tuple[Curve, ...] = ()
 
     def at(self, wavelength_nm: F64) -> F64:
-        """QE at wavelengths, float64[channel, n]."""
+        """Return the QE at the given wavelengths, float64[channel, n], in [0, 1]."""
         own = {curve.channel: curve for curve in self.curves}
         known: dict[str, F64] = {}
         if (set(self.channels) - set(own)) & set("RGB"):
@@ -67,14 +83,17 @@ class QuantumEfficiency:
         return np.stack([known[name] for name in self.channels])
 
     def electron_weights(self, nodes_nm: F64) -> F64:
-        """`spectra.electron_weights` of the channels, float64[channel, band]."""
+        """Return `spectra.electron_weights` of the channels, float64[channel, band], in electrons nm / J."""
         return spectra.electron_weights(self.at, nodes_nm)
 
 
 @lru_cache(maxsize=16)
 def white_balance(efficiency: QuantumEfficiency) -> F32:
-    """Gain of each channel, float32[channel], at least 1, that makes a grey surface in sunlight as bright in all
-    that are seen; 1 for NIR, which is not."""
+    """Return the gain of each channel that makes a grey surface in sunlight appear grey, float32[channel].
+
+    The smallest gain of a visible channel is 1. NIR is not visible and has the gain 1. Raises InputError if a
+    visible channel receives no sunlight between 400 and 700 nm.
+    """
     nodes = spectra.band_nodes_nm(400.0, 700.0, 31)
     grey = efficiency.electron_weights(nodes) @ spectra.solar_band_irradiance_W_m2_nm(nodes, 1.0)
     out = np.ones(len(grey))

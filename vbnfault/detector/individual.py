@@ -1,8 +1,10 @@
-"""One sensor as an individual: what a seed fixes for life, and what age and radiation add to it.
+"""Generate one device of a sensor type.
 
-Every property has its own random stream, keyed by (seed, name), and every defect its place in an endless list in
-order of birth, of which age shows the beginning. So more hot pixels leave the gain map alone, and an older sensor
-keeps each defect of its youth.
+A seed fixes the properties of the device; age and radiation add defects.
+
+Every property has its own random stream, keyed by (seed, name). Every defect has a fixed position in an endless
+list in order of birth; the age or dose says how much of the list exists. So more hot pixels do not change the gain
+map, and an older device keeps all its earlier defects.
 """
 
 from __future__ import annotations
@@ -33,60 +35,64 @@ F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 I32 = NDArray[np.int32]
 
-_LOW_FREQUENCY_CELLS = 6  # across the sensor, of the slowly varying gain
-_BIRTHS = 1 << 15  # drawn at a time; part of what a seed means
-_MOST_DEFECTS = 2e8  # of one kind: seconds of drawing
+_LOW_FREQUENCY_CELLS = 6  # nodes across the sensor of the slowly varying gain
+_BIRTHS = 1 << 15  # births drawn at once; another number changes the result of a seed
+_MOST_DEFECTS = 2e8  # limit for defects of one kind: drawing them takes seconds
 
-# assumed but for the range of energies of silicon's traps: switching in a defect is slower to freeze than it
-# generates
+# Assumed, within the range of energies of silicon's traps: the switching rate of a defect depends more steeply on
+# temperature than its dark current.
 _RTS_TIME_EV = 0.9
 _RTS_REFERENCE_K = 294.15
 
 
 @dataclass(frozen=True, kw_only=True)
 class IndividualSpec:
-    """What individuals of one sensor type, age and dose have in common. Numbers marked * are assumed.
+    """Describe what devices of one sensor type, age and dose have in common. Numbers marked * are assumed.
 
-    Rates hold at `reference_K`; signals are in electrons (e); shares are of all pixels. InputError outside the
-    ranges given.
+    Rates refer to `reference_K`, signals are in electrons (e), fractions are of all pixels. Raises InputError
+    outside the given ranges.
 
     Attributes
     ----------
     prnu, prnu_row, prnu_column, prnu_low
-        Standard deviation of the gain about 1, 0 to 0.5: of pixels*, rows, columns, slow variation.
+        Standard deviation of the gain about 1, 0 to 0.5: per pixel*, per row, per column, slow variation.
     dsnu_e, dsnu_row_e, dsnu_column_e
-        Standard deviation of the offset, 0 to 1e5 e: of pixels*, rows, columns.
+        Standard deviation of the offset, 0 to 1e5 e: per pixel*, per row, per column.
     dark_current_e_s, dark_nonuniformity
         Mean dark current of undamaged pixels, 0 to 1e8 e/s, and its spread* over the mean, 0 to 1.
     dark_activation_eV
-        Energy with which it rises, 0.1 to 2 eV, as a data sheet's doubling temperature ΔT has it: k T² ln 2/ΔT;
-        None is silicon's band gap (`dark.silicon_factor`).
+        Activation energy of the dark current, 0.1 to 2 eV. It follows from a data sheet's doubling temperature ΔT
+        as k T² ln 2/ΔT. None uses silicon's band gap (`dark.silicon_factor`).
     reference_K
         Temperature of these rates, 80 to 400 K.
     dose_TeV_g, depletion_depth_um, anneal_s
-        As in `RadiationDamage`; the depleted volume of a pixel is the depth*, 0 to 100 µm, times its area.
+        As in `RadiationDamage`. The depleted volume of a pixel is the depth*, 0 to 100 µm, times its area.
     years, hot_growth, iso
-        Age, 0 to 100 years, and the growth of hot pixels; None leaves them out. They are displacement damage
-        too: with a dose from the same years, damage counts twice.
+        Age, 0 to 100 years, growth law of hot pixels (None: no hot pixels), and ISO setting. Hot pixels are
+        displacement damage too: with a dose from the same years, damage counts twice.
     hot_rate_e_s
-        Least and largest rate* of a hot pixel, above 0 to 1e8 e/s. Between them the share above a rate R falls as
-        R^-iso_power: then the number above a threshold that falls as 1/ISO grows as the law of growth has it.
+        Smallest and largest rate* of a hot pixel, above 0 to 1e8 e/s. Between them the fraction above a rate R
+        falls as R^-iso_power. The threshold at which a camera sees a hot pixel falls as 1/ISO; with this power the
+        number above it grows with ISO as in the growth law.
     hot_offset_share, hot_offset_e
-        Share of hot pixels with an offset (over 0.4: Chapman et al. 2013), and its mean*, 0 to 1e6 e
-        (exponential).
+        Fraction of hot pixels with an offset (over 0.4: Chapman et al. 2013), and mean* of the exponentially
+        distributed offset, 0 to 1e6 e.
     hot_clustered_share
-        Share of hot pixels born beside an earlier one, 0 to 1.
+        Fraction of hot pixels that are born next to an earlier one, 0 to 1.
     dead_share, dead_share_yr, stuck_share, stuck_share_yr
-        Dead* and stuck pixels at delivery and their growth, 0 to 0.1 (per year).
+        Fraction of dead* and stuck pixels at delivery, and its growth per year; 0 to 0.1.
     rts_share, rts_per_interaction
-        Pixels with telegraph signals at delivery, and more per interaction of radiation*; 0 to 1.
+        Fraction of pixels with telegraph signals at delivery, and additional ones per radiation interaction*; 0 to
+        1.
     rts_amplitude_nA_cm2
-        Mean amplitude at 294 K (exponential), 0 to 100. In proton-irradiated CCDs at 21 °C many have up to 0.1
-        nA/cm² and one in 1000 up to 0.4 (Hopkins & Hopkinson 1993, doi 10.1109/23.273552): 0.4/ln 1000.
+        Mean of the exponentially distributed amplitude at 294 K, 0 to 100. In proton-irradiated CCDs at 21 °C many
+        pixels have up to 0.1 nA/cm² and one in 1000 up to 0.4 (Hopkins & Hopkinson 1993, doi 10.1109/23.273552),
+        hence 0.4/ln 1000.
     rts_time_s
         Shortest and longest mean time* in a level at `reference_K` (log-uniform), 1e-3 to 1e9 s.
     trap_share, trap_share_TeV_g, trap_depth_e
-        CCD traps at delivery, and more per TeV/g, 0 to 0.1; their mean depth*, 0 to 1e6 e (exponential).
+        Fraction of pixels with CCD traps at delivery and its growth per TeV/g, 0 to 0.1; mean* of their
+        exponentially distributed depth, 0 to 1e6 e.
     """
 
     prnu: float = 0.01
@@ -134,13 +140,13 @@ class IndividualSpec:
                 raise InputError(f"{field.name} = {value}: must be two numbers, the smaller first")
 
     def dark_factor(self, temperature_K: float) -> float:
-        """Dark current of undamaged pixels over that at the reference temperature."""
+        """Return the dark current of undamaged pixels over that at the reference temperature."""
         if self.dark_activation_eV is None:
             return silicon_factor(temperature_K, self.reference_K)
         return arrhenius_factor(temperature_K, self.reference_K, self.dark_activation_eV)
 
     def radiation(self, pixel_pitch_um: float) -> RadiationDamage:
-        """The damage of this dose to a pixel."""
+        """Return the radiation damage that this dose causes in a pixel."""
         volume = self.depletion_depth_um * pixel_pitch_um**2
         return RadiationDamage(dose_TeV_g=self.dose_TeV_g, depletion_volume_um3=volume, anneal_s=self.anneal_s)
 
@@ -169,6 +175,7 @@ _RANGES: dict[str, tuple[float, float]] = {
 
 
 def _freeze(holder: Any) -> None:
+    """Make all arrays of a dataclass read-only."""
     for field in fields(holder):
         value = getattr(holder, field.name)
         if isinstance(value, np.ndarray):
@@ -177,7 +184,7 @@ def _freeze(holder: Any) -> None:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Defects:
-    """Pixels, int32[n] each, in order of birth. Two defects can share a pixel."""
+    """Hold the pixels of some defects, int32[n] each, in order of birth. Two defects can share a pixel."""
 
     row: I32
     column: I32
@@ -191,8 +198,11 @@ class Defects:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class HotPixelTable(Defects):
-    """Hot pixels: `rate_e_s` at the reference temperature and `offset_e` in electrons, float64[n]; `born_yr`,
-    the sensor's age at their birth."""
+    """Hold hot pixels.
+
+    `rate_e_s` float64[n] refers to the reference temperature, `offset_e` float64[n] is in electrons. `born_yr`
+    float64[n] is the age of the sensor at their birth.
+    """
 
     rate_e_s: F64
     offset_e: F64
@@ -201,21 +211,21 @@ class HotPixelTable(Defects):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class DeadPixels(Defects):
-    """Dead pixels: `response`, float64[n] in 0 to below 1, multiplies their gain."""
+    """Hold dead pixels. `response`, float64[n] from 0 to below 1, multiplies their gain."""
 
     response: F64
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class StuckPixels(Defects):
-    """Stuck pixels: `level`, float64[n] in 0 to 1, the share of full scale that they always show."""
+    """Hold stuck pixels. They always show `level`, a fraction of full scale, float64[n] from 0 to 1."""
 
     level: F64
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class RtsPixels(Defects):
-    """Pixels with telegraph signals: amplitude and mean times in the levels, float64[n], at `reference_K`."""
+    """Hold pixels with telegraph signals: amplitude and mean time in each level at `reference_K`, float64[n]."""
 
     amplitude_e_s: F64
     high_s: F64
@@ -223,10 +233,10 @@ class RtsPixels(Defects):
     reference_K: float
 
     def at(self, temperature_K: float) -> Telegraph:
-        """The signals at a temperature of 80 to 400 K: both the amplitudes and the jumps are faster in the heat.
+        """Return the signals at a temperature of 80 to 400 K. Heat raises both amplitudes and switching rates.
 
-        Activation energies: 0.63 eV of the amplitudes, as other bulk damage; 0.9 eV of the times (both assumed).
-        Raises InputError outside the range.
+        The activation energy of the amplitudes is 0.63 eV, as for other bulk damage; that of the times is 0.9 eV
+        (both assumed). Raises InputError outside the range.
         """
         slower = 1 / arrhenius_factor(temperature_K, self.reference_K, _RTS_TIME_EV)
         return Telegraph(
@@ -238,25 +248,27 @@ class RtsPixels(Defects):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Traps(Defects):
-    """CCD traps: `depth_e`, float64[n], electrons that one holds."""
+    """Hold CCD traps. Each holds up to `depth_e` electrons, float64[n]."""
 
     depth_e: F64
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Individual:
-    """One sensor for life. Maps are float32[y, x], read-only; rates hold at `spec.reference_K`.
+    """Hold all fixed properties of one device.
+
+    Maps are float32[y, x] and read-only. Rates refer to `spec.reference_K`.
 
     Attributes
     ----------
     gain
-        Response over the mean one, at least 0, dead pixels aside.
+        Response over the mean response, at least 0, without dead pixels.
     dsnu_e
-        Fixed offset, electrons, either sign, hot pixels aside.
+        Fixed offset in electrons of either sign, without hot pixels.
     dark_e_s
-        Dark current of undamaged silicon.
+        Dark current of undamaged silicon in e/s.
     damage_e_s
-        Dark current of bulk damage: radiation and hot pixels.
+        Dark current of bulk damage (radiation and hot pixels) in e/s.
     """
 
     spec: IndividualSpec
@@ -277,6 +289,7 @@ class Individual:
 
     @property
     def shape(self) -> tuple[int, int]:
+        """Return (height, width) in pixels."""
         height, width = self.gain.shape
         return height, width
 
@@ -284,17 +297,17 @@ class Individual:
 def make_individual(
     spec: IndividualSpec, shape: tuple[int, int], *, pixel_pitch_um: float, seed: int
 ) -> Individual:
-    """The sensor of (height, width) pixels that a seed of at least 0 stands for, at the spec's age and dose.
+    """Generate the (height, width) device of a seed, at the age and dose of the spec.
 
-    Raises InputError for a sensor without pixels, a pitch outside 0.1 to 100 µm, a negative seed, and a spec that
-    makes more than 2e8 defects of a kind.
+    Raises InputError for a sensor without pixels, a pitch outside 0.1 to 100 µm, a negative seed, or a spec that
+    makes more than 2e8 defects of one kind.
     """
     if min(shape) < 1:
         raise InputError(f"shape = {shape}: must be at least 1 pixel high and wide")
     if seed < 0:
         raise InputError(f"seed = {seed}: must be at least 0")
     checked("pixel_pitch_um", pixel_pitch_um, 0.1, 100.0)
-    # one generator for each pattern, whether its part is switched on or not
+    # every pattern has its own generator, so switching one off does not change the others
     gain = _pattern(seed, "prnu", shape, spec.prnu, spec.prnu_row, spec.prnu_column)
     if spec.prnu_low > 0:
         gain += _slow(seed, shape) * np.float32(spec.prnu_low)
@@ -327,12 +340,13 @@ _AGEING = (
 
 
 def aged(individual: Individual, **changes: Any) -> Individual:
-    """The same sensor at a later age (`years`), dose (`dose_TeV_g`) or time since the irradiation (`anneal_s`), or
-    with another growth since.
+    """Return the same device at a later state.
 
-    Defects stay where they are; annealing lowers the rates of the radiation's. Equal, bit for bit, to
-    `make_individual` with such a spec, unless `hot_clustered_share` changes, which holds for new hot pixels only.
-    Raises InputError for other keys, an earlier age or a lower dose.
+    `changes` may set a later age (`years`), a higher dose (`dose_TeV_g`), another time since the irradiation
+    (`anneal_s`) or another growth of defects. Defects keep their positions; annealing lowers the rates of radiation
+    damage. The result equals `make_individual` with such a spec, bit for bit. The exception is
+    `hot_clustered_share`, which applies to new hot pixels only. Raises InputError for other keys, an earlier age or
+    a lower dose.
     """
     spec = individual.spec
     for key in changes:
@@ -353,8 +367,10 @@ def _defects(
     seed: int,
     earlier: tuple[int, float] = (0, 0.0),
 ) -> dict[str, Any]:
-    """What of an individual depends on its age and dose; `earlier`: how many hot pixels were placed before, and the
-    share of them that was clustered."""
+    """Return the properties of an individual that depend on its age and dose.
+
+    `earlier` holds the number of hot pixels placed before, and the clustered fraction used for them.
+    """
     hot = _hot(spec, shape, pixel_pitch_um, seed, earlier)
     return {
         "damage_e_s": _damage(spec, shape, pixel_pitch_um, seed, hot),
@@ -367,7 +383,7 @@ def _defects(
 
 
 def dark_rate_e_s(individual: Individual, temperature_K: float) -> F32:
-    """Dark current of each pixel, e/s, float32[y, x], at 80 to 400 K, telegraph signals aside.
+    """Return the dark current of each pixel at 80 to 400 K, float32[y, x] in e/s, without telegraph signals.
 
     Raises InputError outside the range.
     """
@@ -377,14 +393,14 @@ def dark_rate_e_s(individual: Individual, temperature_K: float) -> F32:
 
 
 def offset_e(individual: Individual) -> F32:
-    """Offset of each pixel, electrons, float32[y, x]: its DSNU and, of hot pixels, b."""
+    """Return the offset of each pixel, float32[y, x] in electrons: its DSNU plus the offset b of hot pixels."""
     out = individual.dsnu_e.copy()
     np.add.at(out, (individual.hot.row, individual.hot.column), individual.hot.offset_e)
     return out
 
 
 def response(individual: Individual) -> F32:
-    """Response of each pixel over the mean one, float32[y, x], at least 0: its gain and whether it is dead."""
+    """Return the response of each pixel over the mean response, float32[y, x], at least 0, with dead pixels."""
     out = individual.gain.copy()
     np.multiply.at(out, (individual.dead.row, individual.dead.column), individual.dead.response)
     return out
@@ -394,13 +410,14 @@ def response(individual: Individual) -> F32:
 
 
 def _stream(seed: int, name: str) -> np.random.Generator:
+    """Return the random generator for (seed, name)."""
     return np.random.Generator(np.random.SFC64(np.random.SeedSequence([seed, *name.encode()])))
 
 
 def _pattern(
     seed: int, name: str, shape: tuple[int, int], pixel: float, row: float = 0.0, column: float = 0.0
 ) -> F32:
-    """Normal variates of mean 0: white, and constant along rows and columns."""
+    """Draw normal variates of mean 0 per pixel, plus others that are constant along a row or a column."""
     if pixel > 0:
         out = _stream(seed, name).standard_normal(shape, dtype=np.float32)
         out *= np.float32(pixel)
@@ -414,7 +431,7 @@ def _pattern(
 
 
 def _slow(seed: int, shape: tuple[int, int]) -> F32:
-    """A smooth field of mean 0 and standard deviation 1: the same nodes at any resolution."""
+    """Draw a smooth field of mean 0 and standard deviation 1 from the same nodes at any resolution."""
     nodes = _stream(seed, "prnu low").standard_normal(
         (_LOW_FREQUENCY_CELLS, _LOW_FREQUENCY_CELLS), dtype=np.float32
     )
@@ -424,7 +441,10 @@ def _slow(seed: int, shape: tuple[int, int]) -> F32:
 
 
 def _birth_blocks(rng: np.random.Generator, expected: float) -> Iterator[F64]:
-    """Births of a Poisson process of rate 1 in [0, expected], in order: a larger `expected` appends to the same."""
+    """Draw the births of a Poisson process of rate 1 in [0, expected], in order.
+
+    A larger `expected` only appends births.
+    """
     now = 0.0
     while now < expected:
         births = now + np.cumsum(rng.standard_exponential(_BIRTHS))
@@ -433,16 +453,18 @@ def _birth_blocks(rng: np.random.Generator, expected: float) -> Iterator[F64]:
 
 
 def _births(seed: int, name: str, expected: float) -> F64:
+    """Return all births of `_birth_blocks`. Raises InputError if too many are expected."""
     checked(f"expected number of {name} pixels", expected, 0.0, _MOST_DEFECTS)
     return np.concatenate([np.zeros(0), *_birth_blocks(_stream(seed, f"{name} birth"), expected)])
 
 
 def _uniform(seed: int, name: str, count: int) -> F64:
-    """The first of an endless list: more of them begin with the same."""
+    """Draw the first `count` numbers of an endless list; a larger count keeps the first numbers."""
     return _stream(seed, name).random(count)
 
 
 def _places(seed: int, name: str, count: int, shape: tuple[int, int]) -> tuple[I32, I32]:
+    """Draw the row and column of each defect."""
     row = _uniform(seed, f"{name} row", count) * shape[0]
     column = _uniform(seed, f"{name} column", count) * shape[1]
     return row.astype(np.int32), column.astype(np.int32)
@@ -451,6 +473,7 @@ def _places(seed: int, name: str, count: int, shape: tuple[int, int]) -> tuple[I
 def _damage(
     spec: IndividualSpec, shape: tuple[int, int], pixel_pitch_um: float, seed: int, hot: HotPixelTable
 ) -> F32:
+    """Return the dark current of bulk damage in each pixel, float32[y, x] in e/s at the reference temperature."""
     radiation = spec.radiation(pixel_pitch_um)
     pixels = shape[0] * shape[1]
     expected = checked("expected number of interactions", radiation.interactions * pixels, 0.0, _MOST_DEFECTS)
@@ -459,7 +482,7 @@ def _damage(
     for born in _birth_blocks(births, expected):
         place = (places.random(len(born)) * pixels).astype(np.intp)
         np.add.at(steps, place, sizes.standard_exponential(len(born)).astype(np.float32))
-    # scaled from 300 K by the one activation energy
+    # one activation energy serves all damage, so one factor scales it from 300 K
     damage = steps.reshape(shape)
     damage *= np.float32(radiation.step_e_s(spec.reference_K))
     np.add.at(damage, (hot.row, hot.column), hot.rate_e_s.astype(np.float32))
@@ -469,13 +492,14 @@ def _damage(
 def _hot(
     spec: IndividualSpec, shape: tuple[int, int], pixel_pitch_um: float, seed: int, earlier: tuple[int, float]
 ) -> HotPixelTable:
+    """Draw the hot pixels born up to the age of the spec."""
     growth = spec.hot_growth
     per_yr = 0.0 if growth is None else growth.expected(1.0, shape, pixel_pitch_um, spec.iso)
     born = _births(seed, "hot", per_yr * spec.years)
     count = len(born)
     share = np.where(np.arange(count) < earlier[0], earlier[1], spec.hot_clustered_share)
     row, column = _clustered(*_places(seed, "hot", count, shape), share, shape, seed)
-    # inverse of a power law cut off at both ends
+    # inverse distribution function of a power law between two limits
     least, most = spec.hot_rate_e_s
     power = 1.0 if growth is None else growth.iso_power
     rate = least * (1 - _uniform(seed, "hot rate", count) * (1 - (least / most) ** power)) ** (-1 / power)
@@ -491,11 +515,11 @@ def _hot(
 
 
 def _clustered(row: I32, column: I32, share: F64, shape: tuple[int, int], seed: int) -> tuple[I32, I32]:
-    """Places moved, by their chance, beside one of those before them that were not moved."""
+    """Move each defect, with probability `share`, next to an earlier, unmoved defect."""
     count = len(row)
     moved = _uniform(seed, "hot clustered", count) < share
     alone = np.flatnonzero(~moved)
-    before = np.cumsum(~moved)  # of a moved one: how many stand before it
+    before = np.cumsum(~moved)  # for a moved defect: the number of unmoved ones before it
     moved &= before > 0
     which = np.flatnonzero(moved)
     parent = alone[(_uniform(seed, "hot parent", count)[which] * before[which]).astype(np.intp)]
@@ -504,13 +528,14 @@ def _clustered(row: I32, column: I32, share: F64, shape: tuple[int, int], seed: 
     out = []
     for place, step, size in zip((row, column), neighbours.T, shape, strict=True):
         to = place[parent] + step
-        to = np.where((to < 0) | (to >= size), place[parent] - step, to)  # at an edge, the other side
+        to = np.where((to < 0) | (to >= size), place[parent] - step, to)  # at an edge, use the other side
         place[which] = np.clip(to, 0, size - 1)
         out.append(place)
     return out[0], out[1]
 
 
 def _expected(spec: IndividualSpec, shape: tuple[int, int], share: float, share_yr: float) -> float:
+    """Return the expected number of defects at the age of the spec."""
     return (share + share_yr * spec.years) * shape[0] * shape[1]
 
 

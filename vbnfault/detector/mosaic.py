@@ -1,7 +1,7 @@
-"""Colour filter arrays: which filter sits over which pixel.
+"""Describe colour filter arrays: which filter lies over which pixel.
 
-A pattern is a small tile of channel indices, repeated from pixel (0, 0), the top left. "W" is a pixel without a
-colour filter; a monochrome sensor has nothing else.
+A pattern is a small tile of channel indices. The tile repeats from pixel (0, 0) at the top left. "W" is a pixel
+without a colour filter; a monochrome sensor has only W pixels.
 """
 
 from __future__ import annotations
@@ -21,7 +21,11 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True, kw_only=True)
 class Pattern:
-    """A colour filter array: `tile[y][x]` is an index into `channels`, repeated over the sensor."""
+    """Describe a colour filter array.
+
+    `tile[y][x]` is an index into `channels` and repeats over the sensor. Raises InputError if the tile is not
+    rectangular or does not hold every index.
+    """
 
     name: str
     channels: tuple[str, ...]
@@ -40,17 +44,17 @@ class Pattern:
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Rows and columns of the tile."""
+        """Return the number of rows and columns of the tile."""
         return len(self.tile), len(self.tile[0])
 
     @property
     def is_bayer(self) -> bool:
-        """Two green pixels on one diagonal, red and blue on the other."""
+        """Return whether two green pixels lie on one diagonal of a 2 × 2 tile, red and blue on the other."""
         name = "".join(self.channels[i] for row in self.tile for i in row)
         return self.shape == (2, 2) and name in BAYER
 
     def index(self, channel: str) -> int:
-        """Index of a channel by its name; InputError where the pattern has none of that name."""
+        """Return the index of a channel by its name. Raises InputError if the pattern has no such channel."""
         if channel not in self.channels:
             raise InputError(f"channel is '{channel}', but pattern '{self.name}' has {self.channels}")
         return self.channels.index(channel)
@@ -76,27 +80,31 @@ PATTERNS: dict[str, Pattern] = {
 
 
 def pattern(name: str) -> Pattern:
-    """The colour filter array of that name in `PATTERNS`, upper or lower case; else InputError."""
+    """Return the colour filter array with this name in `PATTERNS`; case does not matter.
+
+    Raises InputError for an unknown name.
+    """
     if name.lower() not in PATTERNS:
         raise InputError(f"pattern is '{name}', but must be one of {', '.join(PATTERNS)}")
     return PATTERNS[name.lower()]
 
 
 def channel_of(pattern: Pattern, shape: tuple[int, int]) -> NDArray[np.uint8]:
-    """Index of each pixel's channel, uint8[y, x], on a sensor of (height, width)."""
+    """Return the channel index of each pixel of a (height, width) sensor, uint8[y, x]."""
     rows, columns = (np.arange(n) % size for n, size in zip(shape, pattern.shape, strict=True))
     return np.asarray(pattern.tile, dtype=np.uint8)[rows[:, None], columns]
 
 
 def channel_mask(pattern: Pattern, shape: tuple[int, int], channel: str) -> Mask:
-    """bool[y, x]: the pixels of one channel."""
+    """Return the pixels that belong to one channel, bool[y, x]."""
     return channel_of(pattern, shape) == pattern.index(channel)
 
 
 def sample(planes: F32, pattern: Pattern) -> F32:
-    """What the mosaic sees, float32[y, x], of full-resolution planes float32[y, x, channel] in any unit.
+    """Return the mosaic float32[y, x] that takes each pixel from the plane of its own channel.
 
-    The planes are in the order of `pattern.channels`; InputError where their number differs.
+    `planes` float32[y, x, channel] has full resolution, any unit, and the order of `pattern.channels`. Raises
+    InputError if the number of planes differs.
     """
     if planes.ndim != 3 or planes.shape[2] != len(pattern.channels):
         raise InputError(
@@ -107,7 +115,7 @@ def sample(planes: F32, pattern: Pattern) -> F32:
     rows, columns = pattern.shape
 
     def fill(start: int) -> None:
-        block = slice(start, start + 64)  # a multiple of every tile
+        block = slice(start, start + 64)  # 64 is a multiple of the height of every packaged tile
         for y in range(rows):
             for x in range(columns):
                 out[block][y::rows, x::columns] = planes[block][y::rows, x::columns, pattern.tile[y][x]]
@@ -118,7 +126,7 @@ def sample(planes: F32, pattern: Pattern) -> F32:
 
 
 def plane_of(raw: NDArray[Any], pattern: Pattern, channel: str) -> F32:
-    """One channel of a mosaic [y, x] as float32[y, x], 0 at the other channels' pixels."""
+    """Return one channel of a mosaic [y, x] as float32[y, x], with 0 at the pixels of other channels."""
     out = np.zeros(raw.shape, dtype=np.float32)
     index = pattern.index(channel)
     rows, columns = pattern.shape
@@ -130,8 +138,8 @@ def plane_of(raw: NDArray[Any], pattern: Pattern, channel: str) -> F32:
 
 
 def separate(raw: NDArray[Any], pattern: Pattern) -> F32:
-    """A mosaic [y, x] as sparse planes float32[y, x, channel]: 0 where a pixel has another filter.
+    """Return a mosaic [y, x] as sparse planes float32[y, x, channel], with 0 at the pixels of other channels.
 
-    `sample` takes them back to the mosaic.
+    `sample` is the inverse.
     """
     return np.stack([plane_of(raw, pattern, channel) for channel in pattern.channels], axis=-1)

@@ -1,4 +1,7 @@
-"""A device of a sensor as a camera's detector: with a mosaic, where `Detector` has all colours in every pixel."""
+"""Provide the camera's detector for a sensor with a colour mosaic.
+
+`three_colour.Detector` is the simpler alternative, in which every pixel senses all colours.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +27,11 @@ F32 = NDArray[np.float32]
 
 @dataclass(frozen=True, kw_only=True)
 class MosaicDetector:
-    """One individual of a sensor, of `width_px` × `height_px` pixels of it, read towards `direction`."""
+    """Represent one device of a sensor type as the detector of a camera.
+
+    The detector uses `width_px` × `height_px` pixels of the sensor. Charge moves and rows are read in `direction`
+    ("up" or "down"). `seed` selects the device. Raises InputError if the sensor has fewer pixels.
+    """
 
     sensor: Sensor
     seed: int = 0
@@ -32,7 +39,7 @@ class MosaicDetector:
     height_px: int = 1024
     direction: str = "up"
 
-    # a pixel of the picture depends on others of the mosaic
+    # demosaicing makes a pixel of the image depend on other pixels
     local: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
@@ -45,72 +52,79 @@ class MosaicDetector:
 
     @property
     def name(self) -> str:
+        """Return the name of the sensor."""
         return self.sensor.name
 
     @property
     def pixel_pitch_um(self) -> float:
+        """Return the pixel pitch in µm."""
         return self.sensor.pixel_pitch_um
 
     @property
     def full_well_e(self) -> float:
+        """Return the full well in electrons."""
         return self.sensor.readout.full_well_e
 
     @property
     def read_noise_e_rms(self) -> float:
+        """Return the temporal noise of a dark pixel, as `ReadoutSpec.noise_e_rms`."""
         return self.sensor.readout.noise_e_rms
 
     @property
     def dark_current_e_s(self) -> float:
-        """Of undamaged pixels at the sensor's temperature."""
+        """Return the mean dark current of undamaged pixels in e/s at the sensor's temperature."""
         spec = self.sensor.individual
         return spec.dark_current_e_s * spec.dark_factor(self.sensor.temperature_K)
 
     @property
     def channels(self) -> tuple[str, ...]:
-        """Channels of its pattern: planes of the light on it, before the mosaic."""
+        """Return the channels of the pattern: the planes of the light on the sensor, before the mosaic."""
         return self.sensor.pattern.channels
 
     @property
     def white_balance(self) -> F32:
-        """Gain of each channel, float32[channel], at least 1, that makes a grey surface in sunlight grey."""
+        """Return each channel's gain that shows a grey surface in sunlight as grey, float32[channel], ≥ 1."""
         return white_balance(self.sensor.efficiency)
 
     @property
     def white_e(self) -> F32:
-        """Signal of each channel, float32[channel] in electrons, that the 8 bit image shows as 255."""
+        """Return the signal of each channel in electrons that the 8 bit image shows as 255, float32[channel]."""
         return np.asarray(self.sensor.readout.white_e / self.white_balance, dtype=np.float32)
 
     def electron_rate_weights(self, wavelength_nm: NDArray[np.float64]) -> F32:
-        """float32[channel, band]: electrons per second and pixel for 1 W m⁻² nm⁻¹ in a band, behind each filter."""
+        """Return electrons per second and pixel for 1 W m⁻² nm⁻¹ in each band, float32[channel, band]."""
         return electron_rate_weights(self.sensor.efficiency, self.pixel_pitch_um, wavelength_nm)
 
     def electrons_expected(self, irradiance: Irradiance, exposure_s: float) -> Electrons:
-        """Expected photo-electrons per pixel behind each filter, noise-free, not clipped."""
+        """Return the expected photo-electrons per pixel behind each filter, noise-free and not clipped."""
         weights = self.electron_rate_weights(irradiance.wavelength_nm) * np.float32(exposure_s)
         return Electrons(array=electrons_of(irradiance, weights), white_e=self.white_e)
 
     def draw_noise(self, shape: tuple[int, int], rng: Callable[[str], np.random.Generator]) -> MosaicNoise:
-        """Variates of one exposure, by the generators of their names."""
+        """Draw the variates of one exposure. `rng` returns the random generator for a name."""
         return MosaicNoise.draw(shape, rng("shot"), rng("read"), rng("row"))
 
     def raw(
         self, expected: Electrons, exposure_s: float, noise: Any, acts: Acts | None = None
     ) -> NDArray[np.uint16]:
-        """Raw mosaic, uint16[y, x]; noise-free without `noise`, which is what `draw_noise` gives. `acts` are what
-        faults do on the way (`chain.STEPS`)."""
+        """Return the raw mosaic, uint16[y, x].
+
+        `noise` comes from `draw_noise`; None gives a noise-free mosaic. `acts` are the changes that faults make at
+        the steps of `chain.STEPS`.
+        """
         return self.device.raw(sample(expected.array, self.sensor.pattern), exposure_s, noise, acts or {})
 
     def develop(self, expected: Electrons, exposure_s: float, noise: Any, acts: Acts | None = None) -> RGBI:
-        """The 8 bit picture of expected photo-electrons."""
+        """Return the 8 bit image of the expected photo-electrons. Arguments are as in `raw`."""
         return self.device.rgbi(self.raw(expected, exposure_s, noise, acts), exposure_s)
 
     @property
     def step_e(self) -> float:
-        """Electrons of one DN of 255 in a channel whose white balance is 1."""
+        """Return the electrons per DN of the 8 bit image, in a channel whose white balance is 1."""
         return self.sensor.readout.white_e / 255
 
     def footprint(self, changed: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """bool[y, x]: pixels of the picture that pixels of the mosaic, bool[y, x], can reach."""
+        """Return the pixels of the image that the given mosaic pixels, bool[y, x], can influence, bool[y, x]."""
         sensor = self.sensor
         if sensor.correct_defects:
             changed = changed | mended_from(changed, self.device.bad, sensor.pattern)
@@ -118,7 +132,7 @@ class MosaicDetector:
 
     @property
     def optics_key(self) -> Any:
-        """What the electrons expected behind the filters depend on."""
+        """Return a key of everything on which the expected electrons behind the filters depend."""
         return (
             self.sensor.efficiency,
             self.sensor.readout.white_e,
@@ -129,10 +143,11 @@ class MosaicDetector:
 
     @property
     def device(self) -> Device:
-        """The device at work."""
+        """Return the simulated device, which is cached."""
         return _device(self.sensor, self.seed, (self.height_px, self.width_px), self.direction)
 
 
 @lru_cache(maxsize=4)
 def _device(sensor: Sensor, seed: int, shape: tuple[int, int], direction: str) -> Device:
+    """Return a device from the cache, or make it."""
     return Device(sensor, seed, shape=shape, direction=direction)

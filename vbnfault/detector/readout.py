@@ -1,10 +1,10 @@
-"""From collected electrons to raw digital numbers, and what goes wrong on the way.
+"""Convert collected electrons to raw digital numbers (DN), and simulate the faults of readout and downlink.
 
     full well → row and column pattern, row noise, banding → read noise → gain and offset of the node
     → non-linearity → converter → stuck bits
 
-Every pixel is read once, by one of 1, 2 or 4 output nodes. All functions are pure: noise, patterns and the places
-of faults are passed in. Raw pictures are uint16[y, x].
+One of 1, 2 or 4 output nodes reads each pixel once. All functions are pure: noise, patterns and the positions of
+faults are arguments. Raw images are uint16[y, x].
 """
 
 from __future__ import annotations
@@ -28,38 +28,39 @@ Mask = NDArray[np.bool_]
 Axis = Literal["row", "column"]
 Fill = Literal["zero", "previous"]
 
-# The cubic u(1-u)(1-2u) has its extremes, ±√3/18, at u = (3 ∓ √3)/6: this makes them ±1.
+# The cubic u(1-u)(1-2u) has extremes of ±√3/18 at u = (3 ∓ √3)/6. This factor scales them to ±1.
 _CUBIC_SCALE = 6 * math.sqrt(3)
 
 
 @dataclass(frozen=True, kw_only=True)
 class ReadoutSpec:
-    """The signal chain of a sensor. Electrons are those at the pixel, digital numbers (DN) at the converter.
+    """Describe the signal chain of a sensor. Electrons are counted at the pixel, DN at the converter.
 
-    bits                     of the converter, 1 to 16
-    full_well_e              > 0; clips before all that follows
-    bias_dn                  level of no light, 0 to the top code
+    bits                     bits of the converter, 1 to 16
+    full_well_e              full well, > 0; it clips the electrons before all later effects
+    bias_dn                  level without light, 0 to the top code
     gain_dn_per_e            system gain K of EMVA 1288; None: the full well reaches the top code
-    read_noise_e_rms         temporal, at the output, correlated double sampling (CDS) included
-    reset_noise_e_rms        kTC noise of the sense node; removed whole by CDS
-    cds, cds_interval_s      whether the reset level is subtracted, and how long before the signal it is sampled.
-                             Interference at frequency f passes by |2 sin(π f interval)|
+    read_noise_e_rms         temporal noise at the output, including correlated double sampling (CDS)
+    reset_noise_e_rms        kTC noise of the sense node; CDS removes all of it
+    cds, cds_interval_s      whether the reset level is subtracted, and the time between sampling it and the signal.
+                             Interference at frequency f passes with the factor |2 sin(π f interval)|
     nodes                    1, 2 (left, right) or 4 (quadrants: top left, top right, bottom left, bottom right)
-    node_gains               relative gain of each node, > 0; empty: all 1. A full well below 1 misses the top code
-    node_offsets_dn          added to the bias of each node; empty: all 0
-    row_pattern_e_rms, column_pattern_e_rms    fixed pattern, from sensor to sensor
-    row_noise_e_rms          one value per row and exposure
-    banding_amplitude_e, banding_frequency_hz, banding_phase_rad    sinusoidal interference over the readout time
-    pixel_time_s             between two pixels of a line at one node; 0 where a line is converted at once
-    line_time_s              between two lines; None: the pixels of a node's line take all of it
-    inl_quadratic_dn         integral non-linearity: an arc of this height at half range
-    inl_cubic_dn             … and an S, extreme at (3 ∓ √3)/6 of the range, of this sign in its lower half
-    dnl_lsb_rms              differential non-linearity: spread of the code widths, from sensor to sensor
-    missing_codes            never given; their range goes to the next code below (above, where there is none)
+    node_gains               relative gain of each node, > 0; empty: all 1. Below 1 a full well misses the top code
+    node_offsets_dn          offset that each node adds to the bias; empty: all 0
+    row_pattern_e_rms, column_pattern_e_rms    fixed pattern, which differs between sensors
+    row_noise_e_rms          noise with one value per row and exposure
+    banding_amplitude_e, banding_frequency_hz, banding_phase_rad    sinusoidal interference during the readout
+    pixel_time_s             time between two pixels of a line at one node; 0 if a line is converted at once
+    line_time_s              time between two lines; None: as long as the pixels of a node's line take
+    inl_quadratic_dn         integral non-linearity: height of an arc at half range
+    inl_cubic_dn             integral non-linearity: an S with extremes of this height at (3 ∓ √3)/6 of the range
+                             and with this sign in the lower half
+    dnl_lsb_rms              differential non-linearity: spread of the code widths; they differ between sensors
+    missing_codes            codes that never occur; their range goes to the next code below, or else above
     stuck_bits               (bit, value) pairs: bit 0 is the least significant, value 0 or 1
 
-    The defaults of the noise, node, pattern, interference and converter terms are those of an ideal chain; the
-    100 ns of a pixel and the 1 µs of CDS are assumed.
+    By default the chain is ideal, apart from its read noise. The 100 ns of a pixel and the 1 µs of CDS are assumed.
+    Raises InputError if a value is out of range.
     """
 
     bits: int = 12
@@ -122,7 +123,7 @@ class ReadoutSpec:
                 raise InputError(f"{name} is {getattr(self, name)}, but must hold {self.nodes} values or none")
         for gain in self.node_gains:
             _positive("node_gains", gain)
-        # a falling curve would give one code for two signals
+        # a falling curve would map two signals to one code
         steepest = 4 * abs(self.inl_quadratic_dn) + _CUBIC_SCALE * abs(self.inl_cubic_dn)
         if steepest and not steepest < self.top_dn - self.bias_dn:
             raise InputError(
@@ -137,29 +138,29 @@ class ReadoutSpec:
 
     @property
     def top_dn(self) -> int:
-        """The highest code."""
+        """Return the highest code."""
         return 2**self.bits - 1
 
     @property
     def system_gain_dn_per_e(self) -> float:
-        """K of EMVA 1288, before the mismatch of the nodes."""
+        """Return K of EMVA 1288, before the mismatch of the nodes."""
         if self.gain_dn_per_e is not None:
             return self.gain_dn_per_e
         return (self.top_dn - self.bias_dn) / self.full_well_e
 
     @property
     def white_e(self) -> float:
-        """The largest signal that is told: a full well, or less where the top code comes first."""
+        """Return the largest signal that can be measured in e: the full well, unless the top code comes first."""
         return min(self.full_well_e, max(self.top_dn - self.bias_dn, 1) / self.system_gain_dn_per_e)
 
     @property
     def noise_e_rms(self) -> float:
-        """Temporal noise of a dark pixel, row noise and quantisation aside: read noise, and kTC without CDS."""
+        """Return a dark pixel's temporal noise: read noise, and kTC without CDS; no row noise or quantisation."""
         return math.hypot(self.read_noise_e_rms, 0.0 if self.cds else self.reset_noise_e_rms)
 
     @property
     def banding_seen_e(self) -> float:
-        """Amplitude of the interference in the picture: what the difference of two samples leaves of it."""
+        """Return the amplitude of the interference in the image, which is the part that CDS does not remove."""
         if not self.cds:
             return self.banding_amplitude_e
         return self.banding_amplitude_e * abs(
@@ -168,7 +169,7 @@ class ReadoutSpec:
 
     @cached_property
     def codes(self) -> Raw:
-        """What comes out for each code, uint16[2^bits]: missing codes, then stuck bits."""
+        """Return the output for each code, uint16[2^bits], after missing codes and then stuck bits."""
         codes = np.arange(self.top_dn + 1)
         if self.missing_codes:
             there = np.setdiff1d(codes, self.missing_codes)
@@ -189,29 +190,29 @@ def _positive(name: str, value: float) -> None:
         raise InputError(f"{name} is {value}, but must be above 0")
 
 
-# ----------------------------------------------------------------------------------------- what is passed in
+# ------------------------------------------------------------------------------- noise and fixed pattern
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ReadoutNoise:
-    """Variates of one exposure, standard normal: `read` float32[y, x] and `row` float32[y]."""
+    """Hold the variates of one exposure, standard normal: `read` float32[y, x] and `row` float32[y]."""
 
     read: F32
     row: F32
 
     @classmethod
     def draw(cls, shape: tuple[int, int], read: np.random.Generator, row: np.random.Generator) -> ReadoutNoise:
-        """For a (height, width) sensor: as many variates whatever the signal and the spec."""
+        """Draw the variates for a (height, width) sensor. Their number does not depend on signal or spec."""
         return cls(read=_normal_field(shape, read), row=row.standard_normal(shape[0], dtype=np.float32))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ReadoutIndividual:
-    """What makes one sensor's chain differ from another's of its kind; None where it does not.
+    """Hold the differences of one sensor's chain from others of its type; None means no difference.
 
-    `row_e` float32[y], `column_e` float32[x] and `pixel_e` float32[y, x]: fixed pattern, in electrons, which no
-    well limits. `transitions_dn` float32[2^bits - 1], rising: the converter gives code k from transition k - 1 to
-    transition k.
+    `row_e` float32[y], `column_e` float32[x] and `pixel_e` float32[y, x] are fixed patterns in electrons, which the
+    full well does not limit. `transitions_dn` float32[2^bits - 1] increases: the converter gives code k from
+    transition k - 1 to transition k.
     """
 
     row_e: F32 | None = None
@@ -221,7 +222,7 @@ class ReadoutIndividual:
 
     @classmethod
     def draw(cls, shape: tuple[int, int], spec: ReadoutSpec, rng: np.random.Generator) -> ReadoutIndividual:
-        """Normal patterns of the spec's spreads: one variate a row, a column and a code, whatever the spreads."""
+        """Draw normal patterns of the spec's spreads. It always draws one variate per row, column and code."""
         row, column = (rng.standard_normal(n, dtype=np.float32) for n in shape)
         widths = rng.standard_normal(spec.top_dn + 1, dtype=np.float32)
         return cls(
@@ -232,11 +233,11 @@ class ReadoutIndividual:
 
 
 def transitions_dn(dnl_lsb: NDArray[np.floating]) -> F32:
-    """Transition levels, float32[2^bits - 1], of a converter whose codes are 1 + dnl_lsb[2^bits] wide.
+    """Return the transition levels, float32[2^bits - 1], of a converter whose codes are 1 + dnl_lsb[2^bits] wide.
 
-    A width below 0 counts as 0: that code is missing. Widths are scaled so that the first transition stays at
-    half a code and the last at half a code below the top, as an end-point fit has it; the widths of the outermost
-    codes, which have one transition only, do not matter.
+    A width below 0 counts as 0: that code is missing. The widths are scaled, as in an end-point fit, so that the
+    first transition stays at half a code and the last at half a code below the top. The outermost codes have one
+    transition only, so their widths do not matter.
     """
     widths = np.maximum(1.0 + np.asarray(dnl_lsb, dtype=np.float64)[1:-1], 0.0)
     if widths.size and widths.sum() > 0:
@@ -244,20 +245,21 @@ def transitions_dn(dnl_lsb: NDArray[np.floating]) -> F32:
     return np.concatenate([[0.5], 0.5 + np.cumsum(widths)]).astype(np.float32)
 
 
-# ------------------------------------------------------------------------------------------ where and when
+# ---------------------------------------------------------------------------- position and time of readout
 
 
 def node_of(shape: tuple[int, int], nodes: int) -> NDArray[np.uint8]:
-    """Which output node reads each pixel, uint8[y, x]: 0; 0 left, 1 right; or the quadrants in reading order.
+    """Return the output node that reads each pixel, uint8[y, x].
 
-    The middle row or column of an odd number belongs to the top or left.
+    One node is 0. Two nodes are 0 left and 1 right. Four nodes number the quadrants in reading order. The middle
+    row or column of an odd number belongs to the top or left.
     """
     down, right = _halves(shape, nodes)
     return (2 * down[:, None] + right).astype(np.uint8)
 
 
 def _halves(shape: tuple[int, int], nodes: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """0 or 1 for each row and each column: the half it is in, where the sensor is read in halves."""
+    """Return, for each row and each column, the half (0 or 1) in which it lies, if the sensor is read in halves."""
     if nodes not in (1, 2, 4):
         raise InputError(f"nodes is {nodes}, but must be 1, 2 or 4")
     down, right = ((np.arange(n) >= (n + 1) // 2).astype(np.intp) for n in shape)
@@ -265,7 +267,7 @@ def _halves(shape: tuple[int, int], nodes: int) -> tuple[NDArray[np.intp], NDArr
 
 
 def readout_steps(shape: tuple[int, int], nodes: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """How many lines, int[y], and pixels, int[x], are read before each at its node.
+    """Return how many lines, int[y], and pixels, int[x], the node of each reads before it.
 
     Nodes sit in the sensor's corners, the first at the top left (assumed), and are read at the same time.
     """
@@ -275,7 +277,7 @@ def readout_steps(shape: tuple[int, int], nodes: int) -> tuple[NDArray[np.intp],
 
 
 def readout_time_s(shape: tuple[int, int], spec: ReadoutSpec) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """When each line is reached, float64[y], and how much later each of its pixels, float64[x], in seconds."""
+    """Return the time at which each line is reached, float64[y], and the delay of its pixels, float64[x], in s."""
     lines, pixels = readout_steps(shape, spec.nodes)
     line_time_s = spec.line_time_s
     if line_time_s is None:
@@ -284,8 +286,10 @@ def readout_time_s(shape: tuple[int, int], spec: ReadoutSpec) -> tuple[NDArray[n
 
 
 def transmission_order(shape: tuple[int, int], nodes: int) -> NDArray[np.intp]:
-    """Flat indices of the pixels, int[y·x], in the order they leave the sensor: at each step one pixel of every
-    node, in the nodes' order. With one node this is row by row."""
+    """Return the flat indices of the pixels, int[y·x], in the order in which they leave the sensor.
+
+    Each step sends one pixel of every node, in the order of the nodes. With one node this is row by row.
+    """
     if nodes == 1:
         return np.arange(shape[0] * shape[1])
     lines, pixels = readout_steps(shape, nodes)
@@ -302,8 +306,11 @@ def read_out(
     noise: ReadoutNoise | None = None,
     individual: ReadoutIndividual | None = None,
 ) -> Raw:
-    """Raw DN, uint16[y, x], of collected electrons float32[y, x]; noise-free without `noise`, without fixed
-    pattern or differential non-linearity without `individual`. The whole chain at once, in blocks of rows."""
+    """Return raw DN, uint16[y, x], of collected electrons float32[y, x]; the chain runs in blocks of rows.
+
+    Without `noise` the result is noise-free. Without `individual` it has no fixed pattern and no differential
+    non-linearity.
+    """
     transitions = None if individual is None else individual.transitions_dn
     chain = _Chain(electrons.shape, spec, noise, individual)
     code_of = _Converter(spec, transitions)
@@ -320,13 +327,13 @@ def analogue_dn(
     noise: ReadoutNoise | None = None,
     individual: ReadoutIndividual | None = None,
 ) -> F32:
-    """What reaches the converter, float32[y, x], in DN, neither rounded nor clipped to its range."""
+    """Return the level at the converter, float32[y, x] in DN, neither rounded nor clipped to its range."""
     chain = _Chain(electrons.shape, spec, noise, individual)
     return _blockwise(chain.amplify, _picture(electrons), *chain.of_rows)
 
 
 def convert(analogue: F32, spec: ReadoutSpec, transitions_dn: F32 | None = None) -> Raw:
-    """The converter: code, uint16[y, x], of a level float32[y, x] in DN; half codes round to even.
+    """Return the code, uint16[y, x], of a level float32[y, x] in DN; half codes round to even.
 
     With `transitions_dn` (see `ReadoutIndividual`) a code begins at its transition.
     """
@@ -334,12 +341,12 @@ def convert(analogue: F32, spec: ReadoutSpec, transitions_dn: F32 | None = None)
 
 
 def clip_full_well(electrons: F32, full_well_e: float) -> F32:
-    """Electrons that a pixel holds, float32 of any shape, at most its full well."""
+    """Return the electrons, clipped to the full well; float32 of any shape."""
     return np.minimum(electrons, np.float32(full_well_e))
 
 
 def banding_e(shape: tuple[int, int], spec: ReadoutSpec) -> F32:
-    """The interference in electrons, float32[y, x]: A sin(2π f t + φ) at the time t of each pixel."""
+    """Return the interference in electrons, float32[y, x]: A sin(2π f t + φ) at the time t of each pixel."""
     return _product(*_waves(shape, spec))
 
 
@@ -350,7 +357,8 @@ def _picture(array: F32) -> F32:
 
 
 def _waves(shape: tuple[int, int], spec: ReadoutSpec) -> tuple[F32, F32]:
-    # sin(a + b) of a line's and a pixel's phase: two products [y] × [x], without a sine per pixel
+    """Return the interference as two factors, float32[y, 2] and float32[2, x]."""
+    # sin(a + b) of the line's and the pixel's phase is a sum of two products [y] × [x]: no sine per pixel is needed
     line_s, pixel_s = readout_time_s(shape, spec)
     turn = 2 * math.pi * spec.banding_frequency_hz
     line, pixel = turn * line_s + spec.banding_phase_rad, turn * pixel_s
@@ -359,14 +367,14 @@ def _waves(shape: tuple[int, int], spec: ReadoutSpec) -> tuple[F32, F32]:
 
 
 def _product(wave: F32, across: F32) -> F32:
-    # not BLAS, whose sums may depend on the size of the block
+    # BLAS is avoided: its sums may depend on the size of the block
     out = wave[:, :1] * across[0]
     out += wave[:, 1:] * across[1]
     return out
 
 
 class _Chain:
-    """The analogue chain of one exposure, made ready for blocks of rows."""
+    """Prepare the analogue chain of one exposure for blocks of rows."""
 
     def __init__(
         self,
@@ -399,7 +407,7 @@ class _Chain:
         down, right = _halves((height, width), spec.nodes)
         gains = np.array(spec.node_gains or (1.0,) * spec.nodes) * spec.system_gain_dn_per_e
         offsets = np.array(spec.node_offsets_dn or (0.0,) * spec.nodes) + spec.bias_dn
-        # of the upper and the lower half: float32[2, x]
+        # gains and offsets of the upper and the lower half, float32[2, x]
         table = np.array([[0, 1], [2, 3]]) if spec.nodes == 4 else np.array([[0, 1]] * 2)
         by_column = np.minimum(table[:, right], spec.nodes - 1)
         self.gains, self.offsets = (v[by_column].astype(np.float32) for v in (gains, offsets))
@@ -415,6 +423,7 @@ class _Chain:
         read: F32 | None,
         pixel_e: F32 | None,
     ) -> F32:
+        """Return the level at the converter, in DN, of a block of rows."""
         out = clip_full_well(electrons, self.full_well_e)
         if pixel_e is not None:
             out += pixel_e
@@ -437,12 +446,12 @@ class _Chain:
         return self._bend(out)
 
     def _bend(self, dn: F32) -> F32:
-        """Integral non-linearity: no deviation at the bias and at the top code."""
+        """Apply the integral non-linearity, which has no deviation at the bias and at the top code."""
         spec = self.spec
         if not (spec.inl_quadratic_dn or spec.inl_cubic_dn):
             return dn
         u = (dn - np.float32(spec.bias_dn)) * np.float32(1 / (spec.top_dn - spec.bias_dn))
-        # beyond the range, where the polynomials run away, the curve goes on straight
+        # outside the range the polynomials diverge, so the curve continues as a straight line
         np.clip(u, 0, 1, out=u)
         arc = u * (1 - u)
         s = 4 * spec.inl_quadratic_dn + _CUBIC_SCALE * spec.inl_cubic_dn
@@ -456,7 +465,7 @@ def _fits(name: str, array: F32 | None, shape: tuple[int, ...]) -> None:
 
 
 class _Converter:
-    """Levels to codes, with tables made once."""
+    """Convert levels to codes with tables that are made once."""
 
     def __init__(self, spec: ReadoutSpec, transitions: F32 | None) -> None:
         self.top = spec.top_dn
@@ -464,7 +473,8 @@ class _Converter:
         self.transitions = transitions
         if transitions is not None:
             _fits("transitions_dn", transitions, (self.top,))
-            # levels whose whole part is k have at least low[k] transitions at or below them, and at most `more`
+            # levels with integer part k have at least low[k] transitions at or below them, and at most `more`
+            # further ones
             low = np.searchsorted(transitions, np.arange(self.top + 2), side="right")
             self.low = low.astype(np.int32)
             self.more = int(np.diff(low).max(initial=0))
@@ -501,8 +511,10 @@ def _stuck(raw: Raw, stuck_bits: Sequence[tuple[int, int]]) -> Raw:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Damaged:
-    """A raw picture after a fault: `raw` uint16[y, x]; `region` bool[y, x], where the fault acted; `changed`
-    bool[y, x], the pixels of other value than before, which are a part of it."""
+    """Hold a raw image uint16[y, x] after a fault.
+
+    `region` bool[y, x] is where the fault acted; `changed` bool[y, x] are its pixels whose value changed.
+    """
 
     raw: Raw
     region: Mask
@@ -527,14 +539,14 @@ def _indices(name: str, values: Sequence[int] | NDArray[np.integer], count: int)
 
 
 def _along(array: NDArray, axis: Axis) -> NDArray:
-    """The array with lines of `axis` as its first index."""
+    """Return the array with the lines of `axis` as its first index."""
     if axis not in ("row", "column"):
         raise InputError(f"axis is '{axis}', but must be row or column")
     return array if axis == "row" else array.T
 
 
 def _last_before(lost: NDArray[np.intp]) -> NDArray[np.intp]:
-    """The nearest index below each of the rising `lost` that is none of them; -1 where there is none."""
+    """Return, for each of the increasing indices `lost`, the nearest lower index that is not lost, or -1."""
     run_begins = np.append(True, np.diff(lost) > 1)
     return (lost[run_begins] - 1)[np.cumsum(run_begins) - 1] if len(lost) else lost
 
@@ -542,7 +554,7 @@ def _last_before(lost: NDArray[np.intp]) -> NDArray[np.intp]:
 def _with_lines(
     raw: Raw, lines: Sequence[int] | NDArray[np.integer], axis: Axis, name: str
 ) -> tuple[Raw, Mask, NDArray[np.intp]]:
-    """A copy, an empty region, and the checked line numbers."""
+    """Return a copy of the image, the region of the lines, and their checked numbers."""
     at = _indices(name, lines, len(_along(_checked(raw), axis)))
     region = np.zeros(raw.shape, dtype=np.bool_)
     _along(region, axis)[at] = True
@@ -552,7 +564,7 @@ def _with_lines(
 def dead_lines(
     raw: Raw, lines: Sequence[int] | NDArray[np.integer], axis: Axis = "column", level_dn: int = 0
 ) -> Damaged:
-    """Rows or columns that give one level, such as 0 or the bias."""
+    """Set rows or columns to one level, such as 0 or the bias."""
     _within("level_dn", level_dn, 0, 65535)
     out, region, at = _with_lines(raw, lines, axis, "lines")
     _along(out, axis)[at] = level_dn
@@ -562,14 +574,16 @@ def dead_lines(
 def saturated_lines(
     raw: Raw, lines: Sequence[int] | NDArray[np.integer], axis: Axis = "column", bits: int = 12
 ) -> Damaged:
-    """Rows or columns at the top code."""
+    """Set rows or columns to the top code."""
     _within("bits", bits, 1, 16)
     return dead_lines(raw, lines, axis, 2**bits - 1)
 
 
 def duplicated_lines(raw: Raw, lines: Sequence[int] | NDArray[np.integer], axis: Axis = "row") -> Damaged:
-    """Rows or columns that repeat the one before: an address that fails to advance. A run of them repeats the
-    last line before the run; at the border, where there is none, lines stay."""
+    """Make rows or columns repeat the line before, as if an address failed to advance.
+
+    A run of them repeats the last line before the run. Lines at the border without a line before them stay.
+    """
     out, region, at = _with_lines(raw, lines, axis, "lines")
     source = _last_before(at)
     at, source = at[source >= 0], source[source >= 0]
@@ -584,8 +598,10 @@ def shifted_lines(
     shift_px: int = 1,
     fill_dn: int | None = 0,
 ) -> Damaged:
-    """Rows or columns moved along themselves by `shift_px` towards larger indices (negative: smaller), as after
-    a lost or added clock. Vacated pixels take `fill_dn`; None wraps the line round."""
+    """Shift rows or columns along themselves, as after a lost or added clock.
+
+    A positive `shift_px` is towards larger indices. Vacated pixels take `fill_dn`; with None the line wraps round.
+    """
     if fill_dn is not None:
         _within("fill_dn", fill_dn, 0, 65535)
     out, region, at = _with_lines(raw, lines, axis, "lines")
@@ -599,7 +615,7 @@ def shifted_lines(
 
 
 def lost_node(raw: Raw, nodes: int, node: int, level_dn: int = 0) -> Damaged:
-    """The whole share of one output node (see `node_of`) at one level."""
+    """Set all pixels of one output node (see `node_of`) to one level."""
     _within("level_dn", level_dn, 0, 65535)
     _indices("node", [node], nodes)
     region = node_of(_checked(raw).shape, nodes) == node  # type: ignore[arg-type]
@@ -609,8 +625,7 @@ def lost_node(raw: Raw, nodes: int, node: int, level_dn: int = 0) -> Damaged:
 def stick_bits(
     raw: Raw, stuck_bits: Sequence[tuple[int, int]], bits: int = 12, where: Mask | None = None
 ) -> Damaged:
-    """(bit, value) pairs held at 0 or 1, in the whole picture or in the pixels of `where` bool[y, x], such as
-    those of one node."""
+    """Hold the bits of (bit, value) pairs at 0 or 1, in the whole image or in the pixels `where` bool[y, x]."""
     _within("bits", bits, 1, 16)
     _check_bits(stuck_bits, bits)
     region = np.ones(_checked(raw).shape, dtype=np.bool_) if where is None else np.array(where, dtype=np.bool_)
@@ -621,7 +636,7 @@ def stick_bits(
 
 
 def packet_count(shape: tuple[int, int], packet_px: int) -> int:
-    """How many packets of `packet_px` pixels carry a picture; the last may be short."""
+    """Return how many packets of `packet_px` pixels carry an image; the last one may be short."""
     if packet_px < 1:
         raise InputError(f"packet_px is {packet_px}, but must be at least 1")
     return -(-shape[0] * shape[1] // packet_px)
@@ -630,8 +645,10 @@ def packet_count(shape: tuple[int, int], packet_px: int) -> int:
 def _stream(
     raw: Raw, packets: Sequence[int] | NDArray[np.integer], packet_px: int, order: NDArray[np.intp] | None
 ) -> tuple[Raw, NDArray[np.intp], NDArray[np.intp]]:
-    """The pixels in the order they are sent, the checked packets, and their places in the stream
-    int[packet, packet_px], those beyond the end of a short last packet included."""
+    """Return the pixels in the order sent, the checked packets, and the positions of their pixels in that order.
+
+    The positions, int[packet, packet_px], include those beyond the end of a short last packet.
+    """
     at = _indices("packets", packets, packet_count(_checked(raw).shape, packet_px))  # type: ignore[arg-type]
     if order is not None and order.shape != (raw.size,):
         raise InputError(f"order has shape {order.shape}, but must have ({raw.size},)")
@@ -640,6 +657,7 @@ def _stream(
 
 
 def _received(raw: Raw, stream: Raw, hit: NDArray[np.intp], order: NDArray[np.intp] | None) -> Damaged:
+    """Return the image that the receiver makes from a stream that was damaged at the positions `hit`."""
     region, out = np.zeros(raw.size, dtype=np.bool_), stream
     if order is None:
         region[hit] = True
@@ -657,8 +675,11 @@ def lost_packets(
     fill: Fill = "zero",
     order: NDArray[np.intp] | None = None,
 ) -> Damaged:
-    """Packets that never arrive: runs of `packet_px` pixels in the order sent (row by row, or flat indices
-    `order` as of `transmission_order`). Filled by 0 or by the last packet that did arrive (0 where none did)."""
+    """Fill packets that never arrive with 0 or with the last packet that did arrive (0 if none did).
+
+    A packet is a run of `packet_px` pixels in the order sent: row by row, or by the flat indices `order`
+    (`transmission_order`).
+    """
     stream, at, places = _stream(raw, packets, packet_px, order)
     there = places < raw.size
     value = np.zeros(places.shape, dtype=np.uint16)
@@ -679,8 +700,10 @@ def corrupted_packets(
     bits: int = 12,
     order: NDArray[np.intp] | None = None,
 ) -> Damaged:
-    """Packets whose bits flip, each of the `bits` of a pixel with probability `bit_error_rate`, without
-    memory. One uniform variate a bit, whatever the signal and the rate."""
+    """Flip each of the `bits` of a pixel in some packets, independently, with probability `bit_error_rate`.
+
+    The number of uniform variates (one per bit) does not depend on the signal or the rate.
+    """
     _within("bit_error_rate", bit_error_rate, 0, 1)
     _within("bits", bits, 1, 16)
     stream, _, places = _stream(raw, packets, packet_px, order)
@@ -695,7 +718,7 @@ def corrupted_packets(
 def lost_lines(
     raw: Raw, lines: Sequence[int] | NDArray[np.integer], axis: Axis = "row", fill: Fill = "zero"
 ) -> Damaged:
-    """Rows or columns that never arrive, filled by 0 or by the last that did (0 where none did)."""
+    """Fill rows or columns that never arrive with 0 or with the last line that did arrive (0 if none did)."""
     out, region, at = _with_lines(raw, lines, axis, "lines")
     _along(out, axis)[at] = 0
     if _checked_fill(fill) == "previous":

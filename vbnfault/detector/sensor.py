@@ -1,6 +1,6 @@
-"""A sensor as a file describes it: every number with its source, or marked as assumed.
+"""Read and check the description of a sensor from a TOML file.
 
-[sources] names, for each numeric key of the file, where the number comes from; `assumed` where from nowhere.
+The table `[sources]` of the file must name the origin of every number in the file, or say "assumed".
 """
 
 from __future__ import annotations
@@ -28,18 +28,37 @@ from .readout import ReadoutSpec
 ARCHITECTURES = ("full_frame_ccd", "frame_transfer_ccd", "interline_ccd", "cmos")
 DEMOSAICS = ("bilinear", "malvar", "menon")
 SHUTTERS = ("global", "rolling", "mechanical")
-# Of a file: what no default could stand for.
+# Keys that every file must have, because no default would be meaningful.
 _REQUIRED = ("architecture", "pixel_pitch_um", "readout.bits", "readout.full_well_e")
 _KINDS = ((bool, "true or false"), (int, "a whole number"), (float, "a number"), (str, "a text"))
 
 
 @dataclass(frozen=True, kw_only=True)
 class Transfer:
-    """Charge on its way: times in s of a row's transfer to the store or register, of a row's clearing before the
-    exposure (0: at once), and of a pixel's in the register; the share of light that leaks into a covered register
-    (interline) or store (global shutter, a second), and that a shutter lets through while a full frame is read; the
-    share of the excess that an antiblooming drain takes; traps in columns and in the register, with the cloud that
-    meets them."""
+    """Describe how the sensor moves charge, and what happens to the charge meanwhile.
+
+    Attributes
+    ----------
+    row_transfer_s
+        Time in s to shift the charge by one row into the store or the register.
+    row_clear_s
+        Time in s to shift charge by one row while the sensor is cleared before the exposure; 0 clears all at once.
+    pixel_transfer_s
+        Time in s to shift the charge by one pixel in the serial register.
+    row_readout_s
+        Time in s from the readout of one row to the next.
+    leak
+        Sensitivity to light of the covered register (interline) or of the store (global shutter), over that of the
+        photodiode. 0 to 1.
+    shutter_transmission
+        Fraction of the light that a closed shutter lets through while a full frame is read. 0 to 1.
+    antiblooming
+        Fraction of the excess charge that an antiblooming drain removes. 0 to 1.
+    parallel_traps, serial_traps
+        Traps in the columns and in the serial register.
+    cloud
+        Charge cloud that meets the traps; None takes the default `ChargeCloud` with the sensor's full well.
+    """
 
     row_transfer_s: float = 0.0
     row_clear_s: float = 0.0
@@ -61,11 +80,12 @@ class Transfer:
 
 @dataclass(frozen=True, kw_only=True)
 class Sensor:
-    """A type of sensor; `individual` says how devices of it differ, `readout` what happens from charge to numbers.
+    """Describe a type of sensor.
 
-    Lengths in µm, temperatures in K, signals in electrons (e). `quantum_efficiency` gives the QE of channels; those
-    without have the relative colour curves that `response` names (`spectra.RESPONSES`), scaled by
-    `quantum_efficiency_peak`.
+    Lengths are in µm, temperatures in K and signals in electrons (e). `individual` says how devices of this type
+    differ. `readout` describes the chain from charge to DN. `quantum_efficiency` gives the QE of single channels.
+    Other channels use the relative colour curves named by `response` (`spectra.RESPONSES`), scaled by
+    `quantum_efficiency_peak`. Raises InputError if a value is out of range or two values contradict each other.
     """
 
     name: str
@@ -118,7 +138,7 @@ class Sensor:
 
     @property
     def efficiency(self) -> QuantumEfficiency:
-        """Electrons per photon behind each filter."""
+        """Return the QE (electrons per photon) behind each filter."""
         return QuantumEfficiency(
             channels=self.pattern.channels,
             response=self.response,
@@ -128,12 +148,15 @@ class Sensor:
 
     @property
     def method(self) -> Method:
-        """How its mosaics are interpolated: other patterns than Bayer's bilinearly."""
+        """Return the demosaicing method. Patterns other than Bayer always use "bilinear"."""
         return cast(Method, self.demosaic) if self.pattern.is_bayer else "bilinear"
 
 
 def load_sensor(name_or_path: str | Path) -> Sensor:
-    """A sensor by path or packaged name. Raises InputError naming file, key, value and allowed range."""
+    """Read a sensor from a path or by the name of a packaged one.
+
+    Raises InputError that names the file, the key, the value and the allowed range.
+    """
     path = resources.find("scenes/detectors", name_or_path)
     table = resources.read_toml(path, "detector")
     for key in _REQUIRED:
@@ -147,8 +170,11 @@ def load_sensor(name_or_path: str | Path) -> Sensor:
 
 
 def parse_sensor(table: Mapping[str, Any], *, source: str) -> Sensor:
-    """A sensor from plain data; hot pixels of CCDs grow by their own law unless the data have another. Raises
-    InputError in a sentence that names `source`, key and value."""
+    """Build a sensor from plain data, such as a parsed TOML file.
+
+    For a CCD without `individual.hot_growth` the growth law of CCDs (`CCD_GROWTH`) is used. Raises InputError
+    that names `source`, the key and the value.
+    """
     plain = dict(table)
     sources = plain.pop("sources", {})
     if not isinstance(sources, dict) or not all(isinstance(v, str) for v in sources.values()):
@@ -160,7 +186,7 @@ def parse_sensor(table: Mapping[str, Any], *, source: str) -> Sensor:
             plain["pattern"] = pattern_of(plain["pattern"])
         except InputError as error:
             raise InputError(f"{source}: {error}") from None
-    # a misspelt key before its source
+    # built before the sources are checked, so that a misspelt key is reported as such
     sensor: Sensor = _build(Sensor, plain, source)
     for key in numbers:
         if not sources.get(key, "").strip():
@@ -176,7 +202,10 @@ def parse_sensor(table: Mapping[str, Any], *, source: str) -> Sensor:
 
 
 def _numbers(table: Mapping[str, Any], before: str = "") -> list[str]:
-    """Keys of all numbers, those in tables as `table.key`; of lists of tables, and of numbers, the list's key."""
+    """Return the keys of all numbers, `table.key` in tables.
+
+    A list gives its own key, unless it holds texts only.
+    """
     out = []
     for key, value in table.items():
         name = f"{before}{key}"
@@ -190,7 +219,7 @@ def _numbers(table: Mapping[str, Any], before: str = "") -> list[str]:
 
 
 def _build(cls: Any, table: Mapping[str, Any], where: str) -> Any:
-    """A dataclass from a table, and those within it."""
+    """Build a dataclass, and the dataclasses nested in it, from a table."""
     kinds = get_type_hints(cls)
     known = [f.name for f in dataclasses.fields(cls) if f.name != "sources"]
     found = {}
@@ -209,14 +238,14 @@ def _build(cls: Any, table: Mapping[str, Any], where: str) -> Any:
 
 
 def _value(kind: Any, value: Any, where: str) -> Any:
-    """A value of a field's type: a number, a text, a table or a list of them, all the way down."""
+    """Convert a value to the type of its field: a number, a text, a table or a list, recursively."""
     kinds = get_args(kind)
     if get_origin(kind) is tuple:
         if isinstance(value, list):
             each = kinds[:1] * len(value) if kinds[-1] is Ellipsis else kinds
             if len(each) == len(value):
                 return tuple(_value(k, v, f"{where} {n}") for n, (k, v) in enumerate(zip(each, value, strict=True)))
-    elif kinds:  # or None, which a file leaves out
+    elif kinds:  # an optional type: a file cannot give None, so only the first type counts
         return _value(kinds[0], value, where)
     elif dataclasses.is_dataclass(kind):
         if isinstance(value, dict):
@@ -224,7 +253,7 @@ def _value(kind: Any, value: Any, where: str) -> Any:
         if isinstance(value, cast(type, kind)):
             return value
     elif kind is float and type(value) in (int, float):
-        # of whole numbers too: one of 400 digits is no float
+        # an integer can be too large for a float, too
         if abs(value) <= sys.float_info.max:
             return float(value)
         raise InputError(f"{where} = {shown(value)}: must be finite")

@@ -1,10 +1,10 @@
-"""A simple, honest detector in named steps.
+"""Simulate a simple detector in named steps.
 
     irradiance → photo-electrons expected → electrons → raw DN → RGBI
 
-Every pixel senses the three colours (no mosaic), as the image model of Gallon et al. does. Noise is drawn
-from a fixed number of variates per pixel that do not depend on the signal, so that two exposures of twins
-differ only where their signals differ.
+Every pixel senses three colours (no mosaic), as in the image model of Gallon et al. Noise comes from a fixed number
+of variates per pixel that do not depend on the signal. Two exposures of twins therefore differ only where their
+signals differ.
 """
 
 from __future__ import annotations
@@ -28,15 +28,16 @@ from .efficiency import QuantumEfficiency, white_balance
 
 F32 = NDArray[np.float32]
 
-# Below this mean the Poisson quantile is summed exactly; above, its asymptotic expansion (Giles 2016, ACM TOMS
-# 42, 6, doi 10.1145/2699466, Q_N2) is off by one count in at most 0.2 % of the draws up to 1e4 electrons, and in
-# 0.4 % at 1e5, where float32 rounds; the mean errs by at most 0.001 and 0.005 electrons (tests/test_detector.py).
+# Below this mean the Poisson quantile is summed exactly. Above it an asymptotic expansion is used (Giles 2016, ACM
+# TOMS 42, 6, doi 10.1145/2699466, Q_N2). It is wrong by one count in at most 0.2 % of the draws up to 1e4
+# electrons, and in 0.4 % at 1e5, where float32 rounds. The mean is wrong by at most 0.001 and 0.005 electrons
+# (tests/test_detector.py).
 EXACT_POISSON_BELOW_E = 4.0
 
-# Above this mean three terms of that expansion are enough.
+# Above this mean the first three terms of that expansion are enough.
 _ALL_TERMS_BELOW_E = 1000.0
 
-# Above this mean counting steps takes longer than the general quantile.
+# Above this mean, counting steps takes longer than the general quantile.
 _MANY_STEPS_E = 30.0
 
 _ROWS_PER_BLOCK = 32
@@ -44,21 +45,24 @@ _ROWS_PER_BLOCK = 32
 
 @dataclass(frozen=True, kw_only=True)
 class Noise:
-    """Variates of one exposure, float32[y, x, 3] standard normal each: shot noise and read noise."""
+    """Hold the variates of one exposure for shot and read noise, float32[y, x, 3] each, standard normal."""
 
     shot: F32
     read: F32
 
     @classmethod
     def draw(cls, shape: tuple[int, int], shot: np.random.Generator, read: np.random.Generator) -> Noise:
-        """Two fields of normal variates for a (height, width) sensor, drawn in two threads."""
+        """Draw two fields of normal variates for a (height, width) sensor, in two threads."""
         fields = _pool().map(lambda rng: _normal_field((*shape, 3), rng), (shot, read))
         return cls(shot=next(fields), read=next(fields))
 
 
 def _normal_field(shape: tuple[int, ...], rng: np.random.Generator) -> F32:
-    """Standard normal variates by the inverse distribution of 16 bit uniform numbers, each bin at its median;
-    the two outermost bins, 4.2 standard deviations out, are drawn again within: the tails stay whole."""
+    """Draw standard normal variates by the inverse distribution function of 16 bit uniform numbers.
+
+    Each number stands for the median of its bin. The two outermost bins, 4.2 standard deviations from the mean, are
+    drawn again within the bin, so the tails are complete.
+    """
     size = math.prod(shape)
     code = np.frombuffer(rng.bytes(2 * size), dtype=np.uint16)
     out = np.take(_normal_table(), code, mode="clip")
@@ -75,10 +79,10 @@ def _normal_table() -> F32:
 
 @dataclass(frozen=True, kw_only=True)
 class Detector:
-    """A three-colour sensor. Lengths in µm, signals in electrons (e), digital numbers in DN.
+    """Describe a sensor whose pixels sense R, G and B. Lengths are in µm, signals in electrons (e) or DN.
 
-    `response` names relative colour curves of `spectra.RESPONSES`; `quantum_efficiency_peak` in (0, 1] scales
-    them. The full well clips before bias and read noise are added; the converter spans bias … full well.
+    `response` names the relative colour curves in `spectra.RESPONSES`; `quantum_efficiency_peak` in (0, 1] scales
+    them. The full well clips before bias and read noise are added. The converter spans bias … full well.
     """
 
     name: str = "generic"
@@ -93,70 +97,74 @@ class Detector:
     response: str = "nikon_5100"
     quantum_efficiency_peak: float = 0.5
 
-    # a pixel of the picture depends on no other
+    # each pixel of the image is independent of the others
     local: ClassVar[bool] = True
     channels: ClassVar[tuple[str, ...]] = ("R", "G", "B")
 
     def draw_noise(self, shape: tuple[int, int], rng: Callable[[str], np.random.Generator]) -> Noise:
-        """Variates of one exposure, by the generators of their names."""
+        """Draw the variates of one exposure. `rng` returns the random generator for a name."""
         return Noise.draw(shape, rng("shot"), rng("read"))
 
     @property
     def adc_max_dn(self) -> int:
+        """Return the highest code of the converter."""
         return 2**self.adc_bits - 1
 
     @property
     def gain_dn_per_e(self) -> float:
-        """System gain K: the full well reaches the top code."""
+        """Return the system gain K in DN/e, with which the full well reaches the top code."""
         return (self.adc_max_dn - self.bias_dn) / self.full_well_e
 
     @property
     def efficiency(self) -> QuantumEfficiency:
-        """Electrons per photon in R, G, B."""
+        """Return the QE (electrons per photon) in R, G, B."""
         return QuantumEfficiency(response=self.response, peak=self.quantum_efficiency_peak)
 
     @property
     def white_balance(self) -> F32:
-        """Gain of R, G, B, float32[3], at least 1, that makes a grey surface in sunlight grey."""
+        """Return the gain of R, G, B that shows a grey surface in sunlight as grey, float32[3], at least 1."""
         return white_balance(self.efficiency)
 
     @property
     def white_e(self) -> F32:
-        """Signal of R, G, B, in electrons, that the 8 bit image shows as 255."""
+        """Return the signal of R, G, B in electrons that the 8 bit image shows as 255, float32[3]."""
         return np.asarray(self.full_well_e / self.white_balance, dtype=np.float32)
 
     def electron_rate_weights(self, wavelength_nm: NDArray[np.float64]) -> F32:
-        """float32[3, band]: electrons per second and pixel for 1 W m⁻² nm⁻¹ in a band."""
+        """Return electrons per second and pixel for 1 W m⁻² nm⁻¹ in each band, float32[3, band]."""
         return electron_rate_weights(self.efficiency, self.pixel_pitch_um, wavelength_nm)
 
     def electrons_expected(self, irradiance: Irradiance, exposure_s: float) -> Electrons:
-        """Expected photo-electrons per pixel and colour, noise-free, not clipped."""
+        """Return the expected photo-electrons per pixel and colour, noise-free and not clipped."""
         weights = self.electron_rate_weights(irradiance.wavelength_nm) * np.float32(exposure_s)
         return Electrons(array=electrons_of(irradiance, weights), white_e=self.white_e)
 
     def electrons(self, expected: Electrons, exposure_s: float, noise: Noise | None) -> Electrons:
-        """Collected electrons: dark current added, shot noise, clipped at the full well."""
+        """Return the collected electrons: add dark current, draw shot noise, clip at the full well."""
         shot = None if noise is None else noise.shot
         return expected.with_array(_blockwise(self._collector(exposure_s), expected.array, shot))
 
     def raw_dn(self, electrons: Electrons, noise: Noise | None) -> RawDN:
-        """Digital numbers: gain, bias, read noise, quantisation, clipped to the converter's range."""
+        """Return digital numbers: apply the gain, add read noise and bias, round, clip to the converter's range."""
         read = None if noise is None else noise.read
         return RawDN(array=_blockwise(self._convert, electrons.array, read).astype(np.uint16))
 
     def rgbi(self, raw: RawDN, exposure_s: float) -> RGBI:
-        """8 bit R, G, B, I: black level (bias and mean dark) subtracted, white balance; I is the luminance."""
+        """Return 8 bit R, G, B, I: subtract bias and mean dark signal, balance white, add the luminance as I."""
         show = self._shower(exposure_s)
         return RGBI(array=_blockwise(lambda dn: show(dn.astype(np.float32)), raw.array))
 
     @property
     def optics_key(self) -> Any:
-        """What the electrons expected depend on."""
+        """Return a key of everything on which the expected electrons depend."""
         return self
 
     def develop(self, expected: Electrons, exposure_s: float, noise: Any, acts: Any = None) -> RGBI:
-        """The 8 bit image of expected photo-electrons: all later steps at once, block by block, so that what
-        lies between never leaves the cache. Noise-free without `noise`, which is what `draw_noise` gives."""
+        """Return the 8 bit image of the expected photo-electrons.
+
+        All later steps run block by block, so that intermediate results stay in the cache. `noise` comes from
+        `draw_noise`; None gives a noise-free image.
+        """
         collect, show = self._collector(exposure_s), self._shower(exposure_s)
 
         def step(signal: F32, shot: F32 | None, read: F32 | None) -> NDArray[np.uint8]:
@@ -166,6 +174,7 @@ class Detector:
         return RGBI(array=_blockwise(step, expected.array, shot, read))
 
     def _collector(self, exposure_s: float) -> Callable[[F32, F32 | None], F32]:
+        """Return the function that computes the collected electrons of a block."""
         dark = np.float32(self.dark_current_e_s * exposure_s)
         full_well = np.float32(self.full_well_e)
 
@@ -176,6 +185,7 @@ class Detector:
         return collect
 
     def _convert(self, electrons: F32, read: F32 | None) -> F32:
+        """Return the digital numbers of electrons, as float32."""
         gain = np.float32(self.gain_dn_per_e)
         dn = electrons * gain
         if read is not None:
@@ -185,8 +195,9 @@ class Detector:
         return np.clip(dn, 0, self.adc_max_dn, out=dn)
 
     def _shower(self, exposure_s: float) -> Callable[[F32], NDArray[np.uint8]]:
+        """Return the function that computes the 8 bit image of a block."""
         black = np.float32(self.bias_dn + self.dark_current_e_s * exposure_s * self.gain_dn_per_e)
-        # what is left above the black level is white: a saturated pixel stays so after a long exposure
+        # white is the range above the black level, so a saturated pixel stays white after a long exposure
         scale = (255.0 / max(self.adc_max_dn - float(black), 1.0) * self.white_balance).astype(np.float32)
         luminance = LUMINANCE.reshape(1, 3).astype(np.float64)
 
@@ -204,15 +215,15 @@ class Detector:
 def electron_rate_weights(
     efficiency: QuantumEfficiency, pixel_pitch_um: float, wavelength_nm: NDArray[np.float64]
 ) -> F32:
-    """float32[channel, band]: electrons per second and pixel for 1 W m⁻² nm⁻¹ in a band."""
+    """Return electrons per second and pixel for 1 W m⁻² nm⁻¹ in each band, float32[channel, band]."""
     area_m2 = (pixel_pitch_um * 1e-6) ** 2
     return np.asarray(efficiency.electron_weights(wavelength_nm) * area_m2, dtype=np.float32)
 
 
 def electrons_of(irradiance: Irradiance, weights: F32) -> F32:
-    """Electrons per pixel and channel, float32[y, x, channel], by weights float32[channel, band]."""
+    """Return the electrons per pixel and channel, float32[y, x, channel], with weights float32[channel, band]."""
 
-    # a matrix product over the bands, in the cache: BLAS is slow at 3 × 8
+    # a matrix product over the bands that stays in the cache: BLAS is slow for 3 × 8
     def step(energy: F32) -> F32:
         energy = np.moveaxis(energy, 1, 0)
         colours = []
@@ -227,10 +238,10 @@ def electrons_of(irradiance: Irradiance, weights: F32) -> F32:
 
 
 def poisson_quantile(mean: F32, normal: F32) -> F32:
-    """The Poisson count, float32, at the quantile Φ(normal): one variate per value, whatever the mean.
+    """Return the Poisson count at the quantile Φ(normal), float32: one variate per value for any mean.
 
-    Exact (by summing the distribution) where the mean is below `EXACT_POISSON_BELOW_E`, else by the expansion
-    named there.
+    The result is exact (the distribution is summed) where the mean is below `EXACT_POISSON_BELOW_E`. Elsewhere it
+    uses the expansion named there.
     """
     normal = z = np.ascontiguousarray(normal)  # out takes its layout: ravel must be a view
     root = np.sqrt(mean)
@@ -257,7 +268,7 @@ def poisson_quantile(mean: F32, normal: F32) -> F32:
 
 
 def _poisson_on_dark(signal: F32, dark: np.float32, normal: F32) -> F32:
-    """`poisson_quantile(signal + dark, normal)`, quick where there is no signal: one mean for all of the sky."""
+    """Return `poisson_quantile(signal + dark, normal)`, quickly where there is no signal: the sky has one mean."""
     lit = signal > 0
     count = np.count_nonzero(lit)
     if count == signal.size:
@@ -269,6 +280,7 @@ def _poisson_on_dark(signal: F32, dark: np.float32, normal: F32) -> F32:
 
 
 def _poisson_exact(mean: F32, normal: F32) -> F32:
+    """Return the Poisson count at the quantile Φ(normal) by summing the distribution."""
     u = ndtr(normal.astype(np.float64))
     m = mean.astype(np.float64)
     term = np.exp(-m)
@@ -281,7 +293,7 @@ def _poisson_exact(mean: F32, normal: F32) -> F32:
         count += 1
         term = term * m / count
         total += term
-        # past 1 - 1e-15 the sum no longer moves in float64: stop there
+        # past 1 - 1e-15 the sum no longer changes in float64: stop there
         more = (u > total) & (total < 1 - 1e-15)
         out[left[~more]] = count
         left, m, u, term, total = left[more], m[more], u[more], term[more], total[more]
@@ -289,7 +301,7 @@ def _poisson_exact(mean: F32, normal: F32) -> F32:
 
 
 def _counts_of_one_mean(mean: float, normal: F32) -> F32:
-    """`poisson_quantile` of a single mean: how many of the distribution's steps lie below each variate."""
+    """Return `poisson_quantile` for a single mean by counting the distribution's steps below each variate."""
     if mean > _MANY_STEPS_E:
         return poisson_quantile(np.full(normal.shape, mean, dtype=np.float32), normal)
     count = np.zeros(normal.shape, dtype=np.uint8)
@@ -300,7 +312,8 @@ def _counts_of_one_mean(mean: float, normal: F32) -> F32:
 
 @lru_cache(maxsize=256)
 def _normal_steps(mean: float) -> tuple[np.float32, ...]:
-    # ±6 holds every float32 normal variate that a generator gives in practice (1 in 5e8 lies beyond)
+    """Return the normal variates at which the Poisson count of this mean increases by one."""
+    # ±6 includes every float32 normal variate that a generator gives in practice (1 in 5e8 lies outside)
     last = int(poisson.ppf(ndtr(6.0), mean)) if mean > 0 else 0
     return tuple(np.float32(z) for z in ndtri(poisson.cdf(np.arange(last), mean)))
 
@@ -310,12 +323,12 @@ def _pool() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(2)
 
 
-if hasattr(os, "register_at_fork"):  # threads do not live on in a forked process, such as a data loader's
+if hasattr(os, "register_at_fork"):  # threads do not survive in a forked process, such as a data loader's
     os.register_at_fork(after_in_child=_pool.cache_clear)
 
 
 def _blockwise(step: Callable[..., NDArray[Any]], array: NDArray[Any], *more: NDArray[Any] | None) -> NDArray[Any]:
-    """`step` over blocks of rows in two threads: blocks fit the cache, numpy releases the interpreter lock."""
+    """Apply `step` to blocks of rows in two threads: blocks fit the cache, numpy releases the interpreter lock."""
 
     def one(start: int) -> NDArray[Any]:
         rows = slice(start, start + _ROWS_PER_BLOCK)

@@ -1,4 +1,4 @@
-"""What happens to one sample, in order: resolve, render, meter, photograph, label."""
+"""Make one sample in five stages: resolve the view, render, meter the exposure, take the images, label."""
 
 from .session import STAGES, VIEW_STAGES, Session, configure_faults, develop_frame
 

@@ -1,7 +1,6 @@
-"""Light on the sensor before any fault: the render of a sample, and how long it is exposed.
+"""Compute the light on the sensor before any fault: render a sample and set its exposure.
 
-The two belong together: how many samples a pixel is given depends on the sensor's noise at the exposure that the
-picture is metered for.
+Both belong together: the number of samples per pixel depends on the sensor's noise at the metered exposure.
 """
 
 from __future__ import annotations
@@ -25,12 +24,12 @@ from .spec import Frame
 
 F64 = NDArray[np.float64]
 
-# The metered exposure stays within these factors of what a facet lit at 45 degrees would be given, so that a
-# sliver of grazing light does not turn the frame into noise.
+# The metered exposure stays within these factors of the exposure for a facet lit at 45 degrees. So a small area of
+# grazing light does not make the whole frame noisy.
 _METERING_RANGE = (0.25, 8.0)
-# Of the full well: what counts as lit where noise of sampling is judged.
+# Fraction of the full well above which a pixel counts as lit when sampling noise is measured.
 _LIT = 0.01
-# Share of the lit pixels that may keep more noise of sampling than the scene allows.
+# Fraction of the lit pixels that may keep more sampling noise than the scene allows.
 _FEW = 0.01
 _ANGLE_LAYERS = {"incidence_deg", "emission_deg", "phase_deg", "albedo"}
 
@@ -39,7 +38,7 @@ _ANGLE_LAYERS = {"incidence_deg", "emission_deg", "phase_deg", "albedo"}
 
 
 def describe(frame: Frame) -> RenderInput:
-    """The sample as the renderer takes it."""
+    """Return the sample as the renderer's input."""
     spec, camera = frame.spec, frame.camera
     scene = spec.scene
     guard_x, guard_y = camera.guard_px
@@ -66,11 +65,11 @@ def describe(frame: Frame) -> RenderInput:
 
 
 def render_frame(frame: Frame) -> None:
-    """Radiance of every band, and truth.
+    """Render the radiance of every band, and the truth layers.
 
-    The renderer knows pinhole cameras only. Behind a prescription `rendered` is what it gives, guard band included;
-    `radiance` is the same on the picture's own grid, distorted, before any of it is lost or blurred. Truth follows
-    the chief rays of the pixels' centres.
+    The renderer has pinhole cameras only. With a lens prescription, `frame.rendered` is its output with a guard
+    band. `frame.radiance` is the same light on the grid of the image: distorted, but without losses or blur. Truth
+    follows the chief rays of the pixel centres.
     """
     from .. import render
 
@@ -97,7 +96,7 @@ def render_frame(frame: Frame) -> None:
             slopes=camera.seen_slopes,
             projection=camera.projection,
         )
-        # on the render's own grid where that is asked for: light between surfaces, and stars
+        # light between surfaces and stars need truth on the render's own grid
         needed = scene.bounces or spec.scene.sky.stars != "off"
         guide = render.truth(surface, scene.view, scene.sun) if needed else None
         frame.open_sky = None if guide is None else guide.semantic == SKY
@@ -110,7 +109,7 @@ def render_frame(frame: Frame) -> None:
 
 
 def _keep(frame: Frame, radiance: Radiance) -> None:
-    """Radiance as rendered, on whose grid the lens acts, and as the picture has it."""
+    """Store the rendered radiance on the lens's grid, and the same radiance on the image's grid."""
     lens = frame.camera.lens
     if isinstance(lens, RealLens):
         frame.rendered, radiance = radiance, lens.on_frame(radiance)
@@ -118,11 +117,12 @@ def _keep(frame: Frame, radiance: Radiance) -> None:
 
 
 def _render_to_the_noise(frame: Frame, scene: RenderInput, guide: Truth | None, fraction: float) -> None:
-    """Render with more samples where chance would show: up to `fraction` of the sensor's own noise.
+    """Render with more samples where sampling noise would show: above `fraction` of the sensor's own noise.
 
-    The error of a pixel is judged by two halves of its samples, over 3×3 pixels; those that err too much are
-    rendered again with four times as many, and so on, until at most 1 % of the lit pixels are left or the scene's
-    limit is reached. All of it follows from scene and sample, so the bits do not depend on how a build runs.
+    The error of a pixel comes from two halves of its samples, averaged over 3×3 pixels. Pixels with a large error
+    are rendered again with four times as many samples. This is repeated until at most 1 % of the lit pixels are
+    left, or the scene's limit is reached. All of it follows from scene and sample, so the result does not depend on
+    how a build runs.
     """
     from .. import render
 
@@ -139,13 +139,14 @@ def _render_to_the_noise(frame: Frame, scene: RenderInput, guide: Truth | None, 
     signal_e = np.einsum("b,byx->yx", lens_and_sensor * exposure, whole.array)
     detector = frame.camera.detector
     sensor_e2 = signal_e + detector.dark_current_e_s * exposure + detector.read_noise_e_rms**2
-    # neither what is hardly lit nor what saturates shows this noise; the latter is lit all the same
+    # dark pixels and saturated pixels do not show this noise; saturated pixels still count as lit
     lit = signal_e > _LIT * detector.full_well_e
     shows = lit & (signal_e - 4 * error_e < detector.full_well_e)
     worth = cv2.dilate(shows.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
     spent = np.full(error_e.shape, scene.samples_per_pixel, dtype=np.int32)
     while True:
-        # of nine pixels, each as if it had this one's samples: along an edge variance falls as their number^-3/2
+        # scale the variance of the nine pixels to the number of samples of the central one: along an edge the
+        # variance falls as this number^-3/2
         each = np.where(worth, error_e**2 / sensor_e2, 0) * spent**1.5
         share = np.sqrt(np.maximum(cv2.blur(each, (3, 3)), 0) / spent**1.5)
         noisy = (share > fraction) & worth & (4 * spent <= settings.max_samples_per_pixel)
@@ -154,7 +155,7 @@ def _render_to_the_noise(frame: Frame, scene: RenderInput, guide: Truth | None, 
             break
         for samples in np.unique(spent[noisy]):
             chosen = np.flatnonzero(noisy & (spent == samples)).astype(np.uint32)
-            # samples of their own: the first ones chose the pixel, and a lucky choice would be a bias
+            # draw new samples: the first ones selected the pixel, so keeping them would be a bias
             key = (scene.key + 4 * int(samples)) & 0xFFFFFFFF
             again = replace(scene, samples_per_pixel=4 * int(samples), key=key)
             more, halves = render.direct(surface, again, lens_and_sensor, chosen)
@@ -169,7 +170,7 @@ def _render_to_the_noise(frame: Frame, scene: RenderInput, guide: Truth | None, 
 
 
 def green_per_second(frame: Frame) -> F64:
-    """Electrons per second of the green pixels for a unit of radiance in each band, float64[band]."""
+    """Return electrons per second of the green pixels for unit radiance in each band, float64[band]."""
     nodes = assemble.wavelengths_nm(frame.spec.scene)
     unit = Radiance(array=np.eye(len(nodes), dtype=np.float32)[:, :, None], wavelength_nm=nodes)
     return np.asarray(_rate_on_axis(frame.camera, unit).array[:, 0, 1], dtype=np.float64)
@@ -179,7 +180,10 @@ def green_per_second(frame: Frame) -> F64:
 
 
 def meter(frame: Frame) -> None:
-    """Exposure: fixed, or metered once on the noise-free, fault-free frame; all twins share it."""
+    """Set the exposure: fixed, or metered once on the noise-free, fault-free frame. All twins share it.
+
+    This stage also adds the stars and makes the context of the faults.
+    """
     _expose(frame)
     frame.camera = replace(frame.camera, exposure_s=_exposure_s(frame, frame.rate))
     _add_stars(frame)
@@ -196,12 +200,13 @@ def meter(frame: Frame) -> None:
 
 
 def _exposure_s(frame: Frame, rate: Electrons) -> float:
+    """Return the fixed or the metered exposure in s."""
     fixed = frame.spec.scene.camera.exposure_s
     return _metered_exposure_s(frame, rate) if fixed == "auto" else float(fixed)
 
 
 def _add_stars(frame: Frame) -> None:
-    """Stars after metering: no exposure is made for them."""
+    """Add the stars. This comes after metering, so that stars do not affect the exposure."""
     scene, truth = frame.spec.scene, frame.truth
     if scene.sky.stars == "off":
         return
@@ -219,13 +224,13 @@ def _add_stars(frame: Frame) -> None:
 
 
 def reference_exposure_s(scene: Scene, camera: Camera) -> float:
-    """Return the exposure that puts ground whose normal is 45 degrees from the Sun at the metering level."""
+    """Return the exposure in s that puts ground whose normal is 45 degrees from the Sun at the metering level."""
     half = np.sqrt(0.5)
     lit = (
         photometry.radiance_factor(assemble.photometric_model(scene), [0, half, half], [half, 0, half])[:, 0]
         / np.pi
     )
-    sunlight = assemble.sunlight(scene, np.array([0.0, 0.0, -1.0]))  # of any direction
+    sunlight = assemble.sunlight(scene, np.array([0.0, 0.0, -1.0]))  # the direction does not matter
     facet = (lit * sunlight.irradiance_W_m2_nm).astype(np.float32).reshape(-1, 1, 1)
     wavelength = assemble.wavelengths_nm(scene)
     per_second = _rate_on_axis(camera, Radiance(array=facet, wavelength_nm=wavelength))
@@ -234,9 +239,10 @@ def reference_exposure_s(scene: Scene, camera: Camera) -> float:
 
 
 def _metered_exposure_s(frame: Frame, rate: Electrons) -> float:
+    """Return the exposure in s that puts a percentile of the sunlit ground at the metering level, within limits."""
     settings = frame.spec.scene.camera
     reference = reference_exposure_s(frame.spec.scene, frame.camera)
-    # every other pixel each way is sample enough for a percentile
+    # every second row and column is enough for a percentile
     body = frame.truth.semantic[::2, ::2] == BODY
     shown = _brightness(rate.array[::2, ::2], rate.white_e)[body]
     shown = shown[shown > 0.02 / reference]  # sunlit: above a fiftieth of the reference facet
@@ -249,23 +255,23 @@ def _metered_exposure_s(frame: Frame, rate: Electrons) -> float:
 
 
 def _brightness(electrons: NDArray[np.float32], white_e: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Greatest of a pixel's channels as a fraction of white, float32[y, x]."""
+    """Return the greatest of a pixel's channels as a fraction of white, float32[y, x]."""
     return np.asarray(reduce(np.maximum, np.moveaxis(electrons / white_e, -1, 0)))
 
 
 def _expose(frame: Frame) -> None:
-    """Expected electrons after one second of the imaged radiance: all of them, and with the Sun's apart."""
+    """Store the electrons expected after one second of the imaged radiance, merged and with the Sun's apart."""
     found = _rate(frame, frame.imaged)
     frame.rate, frame.rate_apart = found.merged, None if found.past_rims is None else found
 
 
 def _rate(frame: Frame, radiance: Radiance) -> Electrons:
-    """Expected electrons after one second."""
+    """Return the electrons expected after one second."""
     return frame.camera.expose(radiance, 1.0)
 
 
 def _rate_on_axis(camera: Camera, radiance: Radiance) -> Electrons:
-    """Expected electrons after one second of radiance of any shape, as if all of it were seen along the axis."""
+    """Return the electrons expected after one second of radiance of any shape, as if all of it were on the axis."""
     lens = camera.lens
     irradiance = lens.on_axis(radiance) if isinstance(lens, RealLens) else lens.image(radiance)
     return camera.detector.electrons_expected(irradiance, 1.0)

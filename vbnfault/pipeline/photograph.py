@@ -1,6 +1,6 @@
-"""The pictures of a sample: its faults are drawn, and the camera takes image, clean twin and `without_<fault>`.
+"""Draw the faults of a sample and take its images: `image`, the clean twin, and `without_<fault>`.
 
-All share radiance, exposure and noise, so they differ by the faults alone.
+All images share radiance, exposure and noise, so they differ by the faults alone.
 """
 
 from __future__ import annotations
@@ -20,22 +20,22 @@ from . import labels
 from .spec import Frame, stored_layers
 
 _DRAW_TRIES = 8
-# A step's own change of this many DN survives every later optical step of the paper's tables (cos⁴ at 255 → 105
-# keeps 41 %), so the fault needs no full comparison to be called present.
+# If a step changes a pixel by this many DN, the change survives every later optical step within the paper's tables
+# (cos⁴ at 255 → 105 keeps 41 %). Such a fault counts as visible without a full comparison.
 _CLEARLY_VISIBLE_DN = 6.0
 
 
 def photograph(frame: Frame) -> None:
-    """Draw the commanded faults and take the pictures: `clean`, `image` and the twins the scene asks for.
+    """Draw the commanded faults and take the images: `clean`, `image` and the twins that the scene asks for.
 
-    A drawn fault that does not show is drawn again a few times, then left out, so that `frame.drawn` holds what
-    is in the pixels and labels never claim more.
+    A drawn fault without a visible effect is drawn again a few times, then left out. So `frame.drawn` lists the
+    faults that are in the image, and labels never claim more.
     """
     spec = frame.spec
     commanded = list(spec.commanded)
     if not frame.pose.resolved or frame.pose.sun_visible_fraction == 0:
         commanded = [name for name in commanded if not spec.faults[name].needs_sun]
-    # noise and the clean picture need one core, the faults' optics another
+    # noise and the clean image use one core, the optics of the faults another
     undisturbed = _signal(frame, {}, [])
     with ThreadPoolExecutor(1) as aside:
         exposed = aside.submit(_expose_clean, frame, undisturbed)
@@ -48,7 +48,7 @@ def photograph(frame: Frame) -> None:
     frame.pictures[frame.camera, (), (), False] = frame.images["clean"]
     attempt = 0
     while invisible := _invisible(frame, noise):
-        # the rejected are kept, or a new draw could take over the identity of an old one
+        # rejected draws are kept: cache keys use their id, which a new draw could otherwise reuse
         frame.rejected += [frame.drawn.pop(name) for name in invisible]
         attempt += 1
         if attempt < _DRAW_TRIES:
@@ -68,15 +68,16 @@ def photograph(frame: Frame) -> None:
 
 
 def _expose_clean(frame: Frame, signal: Electrons) -> tuple[Any, RGBI]:
+    """Return the variates of the exposure, and the clean image."""
     spec, camera = frame.spec, frame.camera
     noise = camera.detector.draw_noise(frame.context.shape, lambda name: spec.rng("detector", name))
     return noise, camera.detector.develop(signal.merged, camera.exposure_s, noise)
 
 
 def _draw(frame: Frame, commanded: Sequence[str], attempt: int) -> None:
-    """Draw the commanded faults that are not drawn yet, those first of which others should know.
+    """Draw the commanded faults that are not drawn yet, beginning with those that inform others.
 
-    Another view of the sample goes on with other draws: what cannot show in one need not be tried in the next.
+    Every view of the sample uses new draws: a draw that is invisible in one view is not tried again in the next.
     """
     faults = frame.spec.faults
     attempt += (frame.views - 1) * _DRAW_TRIES
@@ -87,15 +88,17 @@ def _draw(frame: Frame, commanded: Sequence[str], attempt: int) -> None:
 
 
 def _but(drawn: Mapping[str, Params], left_out: str) -> dict[str, Params]:
+    """Return the drawn faults without one of them."""
     return {name: params for name, params in drawn.items() if name != left_out}
 
 
 def _in_order(frame: Frame, drawn: Mapping[str, Params], step: str) -> list[str]:
+    """Return the drawn faults that act at a step, in physical order."""
     return [name for name in physical_order(drawn) if step in frame.spec.faults[name].steps]
 
 
 def _altered(frame: Frame, drawn: Mapping[str, Params]) -> Camera:
-    """The camera as the drawn faults alter it."""
+    """Return the camera as the drawn faults alter it."""
     camera = frame.camera
     for name in physical_order(drawn):
         camera = frame.spec.faults[name].alter(camera, drawn[name])
@@ -103,7 +106,7 @@ def _altered(frame: Frame, drawn: Mapping[str, Params]) -> Camera:
 
 
 def _context(frame: Frame, drawn: Mapping[str, Params]) -> tuple[Any, FaultContext]:
-    """What the drawn faults know of one another, under a key."""
+    """Return a key of the faults that inform others, and the context that they have changed."""
     faults = frame.spec.faults
     informing = [name for name in drawn if type(faults[name]).inform is not Fault.inform]
     key = _key(drawn, informing)
@@ -116,15 +119,16 @@ def _context(frame: Frame, drawn: Mapping[str, Params]) -> tuple[Any, FaultConte
 
 
 def _key(drawn: Mapping[str, Params], names: Sequence[str]) -> tuple[tuple[str, int], ...]:
+    """Return a key of some drawn faults, from the identity of their parameters."""
     return tuple((name, id(drawn[name])) for name in names)
 
 
 def _signal(frame: Frame, drawn: Mapping[str, Params], names: Sequence[str]) -> Electrons:
-    """Expected electrons with the optical faults `names`, of those drawn; twins share what they have in common."""
+    """Return the expected electrons with the optical faults `names` of those drawn. Twins share common results."""
     camera = _altered(frame, drawn)
     same = camera.optics == frame.camera.optics
     if not same:
-        cached: dict[Any, Electrons] = {}  # another instrument: not to be mixed with the others
+        cached: dict[Any, Electrons] = {}  # another instrument, whose results must not enter the shared cache
     else:
         cached = frame.signals
     state, context = _context(frame, drawn)
@@ -144,7 +148,7 @@ def _signal(frame: Frame, drawn: Mapping[str, Params], names: Sequence[str]) -> 
 
 
 def develop(frame: Frame, drawn: Mapping[str, Params], noise: Any) -> RGBI:
-    """The finished picture with the faults `drawn`; noise-free without `noise`."""
+    """Return the finished image with the faults `drawn`; noise-free if `noise` is None."""
     readout = _key(drawn, _in_order(frame, drawn, "rgbi"))
     picture = _before_readout(frame, drawn, noise)
     if not readout:
@@ -156,7 +160,7 @@ def develop(frame: Frame, drawn: Mapping[str, Params], noise: Any) -> RGBI:
 
 
 def _before_readout(frame: Frame, drawn: Mapping[str, Params], noise: Any) -> RGBI:
-    """The picture with the faults `drawn` but for those of the readout."""
+    """Return the image with the faults `drawn`, except those that act on the finished image."""
     optical = _in_order(frame, drawn, "electrons")
     inside = [name for step in MOSAIC_STEPS for name in _in_order(frame, drawn, step)]
     camera = _altered(frame, drawn)
@@ -168,7 +172,7 @@ def _before_readout(frame: Frame, drawn: Mapping[str, Params], noise: Any) -> RG
 
 
 def _raw(frame: Frame, noise: Any) -> NDArray[np.uint16]:
-    """The raw mosaic of the picture, before the faults of the finished picture."""
+    """Return the raw mosaic of the image, uint16[y, x], before the faults that act on the finished image."""
     camera = _altered(frame, frame.drawn)
     assert isinstance(camera.detector, MosaicDetector)
     signal = _signal(frame, frame.drawn, _in_order(frame, frame.drawn, "electrons")).merged
@@ -176,7 +180,7 @@ def _raw(frame: Frame, noise: Any) -> NDArray[np.uint16]:
 
 
 def _defects(frame: Frame, noise: Any) -> NDArray[np.uint8]:
-    """What is wrong with the mosaic's pixels: of the device itself, and by the drawn faults."""
+    """Return the defects of the mosaic's pixels, uint8[y, x]: those of the device and those of the drawn faults."""
     detector, context = frame.camera.detector, _context(frame, frame.drawn)[1]
     assert isinstance(detector, MosaicDetector)
     out = detector.device.defects(frame.camera.exposure_s, noise)
@@ -188,7 +192,7 @@ def _defects(frame: Frame, noise: Any) -> NDArray[np.uint8]:
 
 
 def _acts(frame: Frame, drawn: Mapping[str, Params]) -> dict[str, list[Callable[[Any], Any]]]:
-    """What the drawn faults do inside a detector with a mosaic, by its steps."""
+    """Return the changes that the drawn faults make inside a mosaic detector, by its steps."""
     context = _context(frame, drawn)[1]
 
     return {
@@ -198,18 +202,18 @@ def _acts(frame: Frame, drawn: Mapping[str, Params]) -> dict[str, list[Callable[
 
 
 def _read_out(frame: Frame, picture: RGBI, drawn: Mapping[str, Params]) -> RGBI:
-    """The picture with the drawn readout faults."""
+    """Return the image with the drawn faults that act on the finished image."""
     for name in _in_order(frame, drawn, "rgbi"):
         picture = frame.spec.faults[name].apply(picture, drawn[name], frame.context)
     return picture
 
 
-# --- what shows --------------------------------------------------------------------------------------------
+# --- visible effects ---------------------------------------------------------------------------------------
 
 
 def _invisible(frame: Frame, noise: Any) -> list[str]:
-    """Drawn faults without any effect on the noise-free picture."""
-    if "mask_effect" in frame.spec.scene.dataset.layers:  # all effects are stored, so no cheaper look is needed
+    """Return the drawn faults without any effect on the noise-free image."""
+    if "mask_effect" in frame.spec.scene.dataset.layers:  # all effects are stored, so no cheaper test is needed
         frame.effects = {name: effect_of(frame, name) for name in frame.drawn}
         return [name for name in frame.drawn if not mask_effect_of(frame, name).any()]
     doubtful = sorted(_doubtful(frame, noise))
@@ -217,7 +221,10 @@ def _invisible(frame: Frame, noise: Any) -> list[str]:
 
 
 def _shows_on_some_rows(frame: Frame, name: str) -> bool:
-    """Whether every eighth row of the noise-free picture is enough to see an optical fault."""
+    """Return whether an optical fault is already visible in every eighth row of the noise-free image.
+
+    False does not mean that the fault is invisible.
+    """
     faults, drawn = frame.spec.faults, frame.drawn
     optical, readout = (_in_order(frame, drawn, step) for step in ("electrons", "rgbi"))
     if name not in optical or _altered(frame, drawn) != frame.camera or not frame.camera.detector.local:
@@ -238,7 +245,7 @@ def _shows_on_some_rows(frame: Frame, name: str) -> bool:
 
 
 def mask_effect_of(frame: Frame, name: str) -> NDArray[np.bool_]:
-    """bool[y, x]: where the change is as large as the fault's mask by effect asks for."""
+    """Return where the change is as large as the fault's effect mask requires, bool[y, x]."""
     least_dn = frame.spec.faults[name].effect_level_dn
     if least_dn > 1:
         return effect_of(frame, name, least_dn)
@@ -246,13 +253,12 @@ def mask_effect_of(frame: Frame, name: str) -> NDArray[np.bool_]:
 
 
 def effect_of(frame: Frame, name: str, least_dn: float = 1.0) -> NDArray[np.bool_]:
-    """bool[y, x]: where the noise-free picture changes, by `least_dn` or more, when one of the drawn faults is
-    switched off."""
+    """Return where the noise-free image changes by `least_dn` or more without one drawn fault, bool[y, x]."""
     drawn, others = frame.drawn, _but(frame.drawn, name)
     optical = _in_order(frame, drawn, "electrons")
     if name not in optical or _altered(frame, drawn) != frame.camera or not frame.camera.detector.local:
         return labels.effect(develop(frame, drawn, None).array, develop(frame, others, None).array, least_dn)
-    # only pixels whose signal changes can change: the others need not be developed
+    # only pixels whose signal differs can change, so only these are developed
     whole, part = (_signal(frame, d, [n for n in optical if n in d]).merged for d in (drawn, others))
     differ = whole.array != part.array
     changed = np.flatnonzero(np.logical_or.reduce([differ[..., k] for k in range(differ.shape[2])]))
@@ -260,7 +266,7 @@ def effect_of(frame: Frame, name: str, least_dn: float = 1.0) -> NDArray[np.bool
         return np.zeros(frame.context.shape, dtype=bool)
     with_it = develop(frame, drawn, None).array
     array = _before_readout(frame, drawn, None).array.copy()
-    # as rows of a picture, of which the last is filled up
+    # arrange these pixels as the rows of an image, and fill up the last row
     width = frame.context.shape[1]
     filled = np.resize(changed, (-(-len(changed) // width), width))
     pixels = part.array.reshape(-1, part.array.shape[2])[filled]
@@ -270,7 +276,7 @@ def effect_of(frame: Frame, name: str, least_dn: float = 1.0) -> NDArray[np.bool
 
 
 def soft_layer(frame: Frame, name: str) -> NDArray[Any]:
-    """Return how strongly a fault acts on each pixel, [y, x] of the data type of its soft layer."""
+    """Return how strongly a fault acts on each pixel, [y, x], in the data type of its soft layer."""
     fault = frame.spec.faults[name]
     kind = soft_kind(fault.soft_layer)
     if name not in frame.drawn:
@@ -280,7 +286,7 @@ def soft_layer(frame: Frame, name: str) -> NDArray[Any]:
 
 
 def _doubtful(frame: Frame, noise: Any) -> set[str]:
-    """Drawn faults that a cheap look does not show to be plainly visible."""
+    """Return the drawn faults that a cheap test does not show to be clearly visible."""
     faults, drawn = frame.spec.faults, frame.drawn
     if _altered(frame, drawn) != frame.camera:
         return set(drawn)
@@ -288,7 +294,7 @@ def _doubtful(frame: Frame, noise: Any) -> set[str]:
         name for name in drawn if faults[name].effect_mask or not set(MOSAIC_STEPS).isdisjoint(faults[name].steps)
     }
     optical, readout = (_in_order(frame, drawn, step) for step in ("electrons", "rgbi"))
-    # pixels enough to see what is plainly visible; the rest of the doubt is settled by `effect_of`
+    # these pixels are enough to see a clearly visible fault; `effect_of` decides about the others
     some = (slice(frame.context.shape[0] // 32, None, 16), slice(None, None, 4))
     for k, name in enumerate(optical):
         a, b = (
@@ -306,7 +312,7 @@ def _doubtful(frame: Frame, noise: Any) -> set[str]:
         touched.append((name, where[(np.abs(b - a) >= _CLEARLY_VISIBLE_DN).any(axis=1)]))
         picture = after
     overwritten = np.zeros(frame.context.shape[0] * frame.context.shape[1], dtype=bool)
-    for name, where in reversed(touched):  # what a later fault overwrites does not count
+    for name, where in reversed(touched):  # changes that a later fault overwrites do not count
         if overwritten[where].all():
             out.add(name)
         overwritten[where] = True

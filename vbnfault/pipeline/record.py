@@ -1,4 +1,4 @@
-"""What is kept of a frame: its masks, and layers and scalars by the names of the dataset's arrays."""
+"""Collect masks, layers and scalars of a frame by the names of the dataset's arrays."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ F64 = NDArray[np.float64]
 
 
 def label(frame: Frame) -> None:
-    """Masks of every class, by footprint or by effect."""
+    """Compute the masks of every class, by footprint or by effect."""
     spec = frame.spec
     wanted = stored_layers(spec.scene, spec.faults)
     for name in frame.drawn:
@@ -34,7 +34,7 @@ def label(frame: Frame) -> None:
 
 
 def to_sample(frame: Frame) -> Sample:
-    """The layers and scalars of the dataset, by the names of its arrays."""
+    """Return the layers and scalars of the dataset, by the names of its arrays."""
     spec, pose, i = frame.spec, frame.pose, frame.spec.index
     site = spec.terrain.site
     names = list(spec.faults)
@@ -119,7 +119,7 @@ def to_sample(frame: Frame) -> Sample:
 
 
 def _points_T_m(frame: Frame) -> F64:
-    """Surface points that truth belongs to, of the pixel centres, in T, float64[y, x, 3] metres, NaN on the sky."""
+    """Return the surface points seen at the pixel centres in T, float64[y, x, 3] in m; NaN on the sky."""
     depth = np.where(np.isfinite(frame.truth.depth_m), frame.truth.depth_m.astype(np.float64), np.nan)
     slopes = frame.camera.seen_slopes
     seen_C = np.stack([slopes[..., 0] * depth, slopes[..., 1] * depth, depth], axis=-1)
@@ -130,12 +130,12 @@ def _points_T_m(frame: Frame) -> F64:
 
 
 def proposal(scene: Scene, table: plan.Plan, index: int, variables: Mapping[str, float]) -> dict[str, Any]:
-    """Return what the plan says of a sample and of the view that was kept, whose `variables` are given."""
+    """Return the plan's values for a sample and for the view that was kept, whose `variables` are given."""
     camera = scene.camera
     return {
         **variables,
         "injected": list(table.commanded(index)),
-        # a detector has its own
+        # a named detector has its own architecture
         **({} if camera.detector else {"architecture": camera.architectures[int(table.architecture[index])]}),
         "readout_direction": camera.readout_directions[int(table.readout_direction[index])],
     }

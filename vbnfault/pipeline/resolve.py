@@ -1,4 +1,4 @@
-"""Where a sample's camera and Sun are: the plan's views, tried against the terrain until one can be used."""
+"""Resolve a sample's camera pose and Sun: try the views of the plan against the terrain until one is usable."""
 
 from __future__ import annotations
 
@@ -19,19 +19,30 @@ from .spec import Frame, Pose, SampleSpec
 F64 = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-# Views are tried so many at a time: batches of one size share one kernel.
+# Number of views tried at once. Batches of one size share one compiled kernel.
 _BATCH = 8
-# Rays each way over the frame that look for sunlit ground: 576, so 5 % of the frame is told to 0.9 %.
+# Rays per direction that sample the frame for sunlit ground: 576 in total, so a fraction of 5 % has an error of
+# 0.9 %.
 _LIT_GRID = 24
 
 
 def resolve(frame: Frame) -> None:
-    """Take the first of the sample's views, in the plan's order, that meets every condition.
+    """Set the pose to the first of the sample's views, in the plan's order, that meets every condition.
 
-    Nothing lies within the clearance, camera and spacecraft are above the ground, a Sun-averted camera does not
-    look at the Sun, a sample whose faults need the Sun sees the whole of it, and enough of the frame is sunlit
-    ground (`geometry`). A spacecraft that SPICE places stays where it is. Raises VbnfaultError that names the
-    sample and what could not be met.
+    The conditions (`geometry`) are:
+
+    - no surface lies within the clearance
+    - camera and spacecraft are above the ground
+    - a Sun-averted camera does not look at the Sun
+    - if `sun_visibility` is "required", a sample whose faults need the Sun sees the whole Sun
+    - enough of the frame is sunlit ground
+
+    A spacecraft that SPICE places keeps its pose.
+
+    Raises
+    ------
+    VbnfaultError
+        No view meets the conditions; the message names the sample and the unmet conditions.
     """
     if frame.spec.scene.spice.spacecraft:
         frame.pose = _on_the_trajectory(frame.spec)
@@ -57,7 +68,7 @@ def resolve(frame: Frame) -> None:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Views:
-    """A batch of views: the plan's `variables`, and what follows from them, float64[view, ...]."""
+    """Hold a batch of views: the plan's `variables` and the values that follow from them, float64[view, ...]."""
 
     variables: list[dict[str, float]]
     ground_m: F64
@@ -101,7 +112,7 @@ class _Views:
         )
 
     def sun_angle_deg(self) -> F64:
-        """Return the angle between boresight and Sun."""
+        """Return the angle between the boresight and the Sun, float64[view]."""
         cosine = [axes[:, 2] @ sun.direction_L for axes, sun in zip(self.L_from_C, self.suns, strict=True)]
         return np.asarray(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
 
@@ -121,7 +132,10 @@ class _Views:
 
 
 def _first_usable(spec: SampleSpec, views: _Views, count: int, unmet: dict[str, int]) -> int | None:
-    """The first of `count` views that meets every condition; else None, and `unmet` counts what failed."""
+    """Return the index of the first of `count` views that meets every condition.
+
+    If there is none, return None and count the failures of each condition in `unmet`.
+    """
     from .. import render
 
     scene, surface, vehicle = spec.scene, spec.terrain.surface, spec.terrain.vehicle
@@ -135,7 +149,7 @@ def _first_usable(spec: SampleSpec, views: _Views, count: int, unmet: dict[str, 
         least = plan.least_sun_angle_deg(scene)
         met[f"the Sun at least {least:.1f} deg from the boresight"] = views.sun_angle_deg() >= least
     if geometry.sun_visibility == "required" and any(spec.faults[name].needs_sun for name in spec.commanded):
-        # behind the camera it makes no straylight: known before anything is rendered
+        # a Sun behind the camera makes no straylight, so such a view is rejected before it is rendered
         seen = (views.sun_visible == 1.0) & (views.sun_angle_deg() < 90)
         met["the whole Sun visible before the camera, as straylight needs it"] = seen
     good = np.logical_and.reduce(list(met.values()))
@@ -159,7 +173,7 @@ def _first_usable(spec: SampleSpec, views: _Views, count: int, unmet: dict[str, 
 
 
 def _lit_fraction(spec: SampleSpec, views: _Views) -> F64:
-    """Return the fraction of each view's frame that shows sunlit ground, by a grid of rays of a pinhole camera."""
+    """Return the fraction of each view's frame that shows sunlit ground, from a grid of pinhole camera rays."""
     from .. import render
 
     camera, vehicle = spec.scene.camera, spec.terrain.vehicle
@@ -173,7 +187,7 @@ def _lit_fraction(spec: SampleSpec, views: _Views) -> F64:
 
 
 def _grid_rays_C(fov_deg: float, height_over_width: float) -> F64:
-    """Unit directions through the centres of a grid of cells over the frame, float64[ray, 3]."""
+    """Return unit directions through the centres of a grid of cells over the frame, float64[ray, 3]."""
     at = (np.arange(_LIT_GRID) + 0.5) / _LIT_GRID * 2 - 1
     slope = np.tan(np.radians(fov_deg) / 2)
     x, y = np.meshgrid(slope * at, slope * height_over_width * at)
@@ -183,16 +197,16 @@ def _grid_rays_C(fov_deg: float, height_over_width: float) -> F64:
 
 @lru_cache(maxsize=4)
 def _hidden_by(vehicle: SpacecraftMesh, fov_deg: float, height_over_width: float) -> Mask:
-    """Which rays of the grid meet the spacecraft, bool[ray]: the same in every view."""
+    """Return which rays of the grid meet the spacecraft, bool[ray]. They are the same in every view."""
     return vehicle.blocked(_grid_rays_C(fov_deg, height_over_width))
 
 
 def _on_the_trajectory(spec: SampleSpec) -> Pose:
-    """Camera and Sun where SPICE has them at the sample's epoch, which is its scene's.
+    """Return the pose that SPICE gives at the epoch of the sample.
 
-    Such a pose is what was flown, so none is drawn in its place. A camera within the clearance of the ground means
-    that kernels and shape do not belong together: VbnfaultError. Where the Sun is hidden or behind the camera of a
-    sample whose faults need it, those are not injected, and the pose is marked as not resolved.
+    This pose was flown, so no other view is tried. A camera within the clearance of the ground shows that kernels
+    and shape do not belong together; this raises VbnfaultError. If a fault needs the Sun, but the Sun is hidden or
+    behind the camera, the pose is marked as not resolved and the fault is not injected.
     """
     from .. import render
 

@@ -1,9 +1,9 @@
-"""From one planned sample to one labelled sample, in physical order.
+"""Run the stages that turn one planned sample into one labelled sample, in physical order.
 
     resolve ▶ render ▶ meter ▶ photograph ▶ label
 
-One expensive render serves every twin. Where a commanded fault cannot show, the first four are done again with
-another view. A `Session` runs the stages for any sample of a scene.
+All twins share one expensive render. If a commanded fault cannot be visible in a view, the first four stages run
+again with another view. A `Session` runs the stages for any sample of a scene.
 """
 
 from __future__ import annotations
@@ -36,24 +36,24 @@ from .spec import Frame, SampleSpec, Terrain
 if TYPE_CHECKING:
     from ..render import TerrainMesh
 
-# Slope an octave of the finest relief: steeper would be a wall of needles.
+# Limit of the slope of an octave of the finest relief: steeper relief would look like needles.
 _STEEPEST_DETAIL = 0.12
 
-# The stages, in physical order: of a view, and then of the one that is kept.
+# The stages in physical order: first those of each view, then the stage of the view that is kept.
 VIEW_STAGES = (resolve, render_frame, meter, photograph)
 STAGES = (*VIEW_STAGES, label)
 
 
 def simulate(spec: SampleSpec) -> Sample:
-    """One finished sample, every stage in order."""
+    """Return one finished sample after every stage."""
     return to_sample(develop_frame(spec))
 
 
 def develop_frame(spec: SampleSpec) -> Frame:
-    """All stages, everything between radiance and labels kept.
+    """Run all stages of one sample and return its frame, with everything between radiance and labels.
 
-    A view in which a commanded fault cannot show is left for the sample's next one, up to `plan.max_views` views.
-    Raises VbnfaultError that names the sample and the faults where none of them will do.
+    If a commanded fault cannot be visible in a view, the sample's next view is used, up to `plan.max_views` views.
+    Raises VbnfaultError that names the sample and the faults if no view shows them.
     """
     frame = Frame(spec=spec)
     while True:
@@ -73,11 +73,11 @@ def develop_frame(spec: SampleSpec) -> Frame:
 
 
 def _asking_for_another_view(frame: Frame) -> list[str]:
-    """The commanded faults that are not in the image, although another view of the sample might show them."""
+    """Return the commanded faults that are not in the image, but that another view of the sample might show."""
     spec, scene = frame.spec, frame.spec.scene
     if scene.plan.on_invisible == "drop" or scene.spice.spacecraft:
         return []
-    # a Sun that stays where it was drawn may be hidden
+    # with "as_drawn" the Sun may be hidden, so faults that need it may be absent
     as_drawn = scene.geometry.sun_visibility == "as_drawn"
     return [
         name
@@ -90,9 +90,9 @@ def _asking_for_another_view(frame: Frame) -> list[str]:
 
 
 def configure_faults(scene: Scene, source: str = "scene") -> dict[str, Fault]:
-    """The scene's faults in dataset order. Raises InputError."""
+    """Return the scene's faults in dataset order. Raises InputError if faults or layers do not fit the scene."""
     for name in scene.faults:
-        from_dict(name, scene.faults[name], source=source)  # unknown classes first: they cannot be ordered
+        from_dict(name, scene.faults[name], source=source)  # refuse unknown classes first: they have no order
     faults = {n: from_dict(n, scene.faults[n], source=source) for n in dataset_order(scene.faults)}
     if scene.camera.lens and "vignetting" in faults and faults["vignetting"].model == "cos4":
         raise InputError(
@@ -130,10 +130,23 @@ def configure_faults(scene: Scene, source: str = "scene") -> dict[str, Fault]:
 
 
 class Session:
-    """A scene with its plan, and the terrain of the site at work: `simulate` for any sample, in any order.
+    """Hold a scene, its plan, and the terrain of the current site, and simulate its samples in any order.
 
-    `blocks`: sizes of the planned blocks (default: one of `dataset.samples`); `threads`: render threads of this
-    process. Raises InputError for a scene that cannot be used.
+    Parameters
+    ----------
+    scene
+        The scene.
+    blocks
+        Sizes of the planned blocks; default: one block of `dataset.samples`.
+    threads
+        Render threads of this process.
+    source
+        Name of the scene in messages.
+
+    Raises
+    ------
+    InputError
+        The scene cannot be used.
     """
 
     def __init__(
@@ -149,45 +162,45 @@ class Session:
         self.plan = plan.make_plan(scene, list(self.faults), blocks)
         self._threads = threads
         self._terrain: Terrain | None = None
-        self._compiled = False  # kernels are made for the first sample
+        self._compiled = False  # the first sample compiles the kernels
 
     @cached_property
     def base_camera(self) -> Camera:
-        """The camera before a sample's exposure, architecture and readout direction."""
+        """Return the camera with the first architecture and readout direction of the scene, without an exposure."""
         return assemble.base_camera(self.scene)
 
     @cached_property
     def body(self) -> Body:
-        """The body, loaded when first asked for."""
+        """Return the body, which is loaded at the first use."""
         activity.begin("shape of the body")
         return assemble.make_body(self.scene)
 
     def warn_of_assumptions(self) -> None:
-        """Warn, in one sentence, of what a body that is not 67P takes from it for want of a value."""
+        """Warn, in one sentence, if a body other than 67P uses values of 67P."""
         sentence = assemble.assumed_of_67p(self.scene, self.body)
         if sentence:
             warnings.warn(sentence, stacklevel=2)
 
     @cached_property
     def vehicle(self) -> SpacecraftMesh | None:
-        """The spacecraft that carries the camera, if the scene has one."""
+        """Return the spacecraft that carries the camera, or None if the scene has none."""
         return assemble.spacecraft(self.scene)
 
     @cached_property
     def sites(self) -> Sites:
-        """Return the sites of the scene, each drawn when it is first asked for."""
+        """Return the sites of the scene. Each is drawn at its first use."""
         if self.scene.spice.spacecraft:
             return assemble.way_sites(self.scene, self.body)
         return choose_sites(self.body, self.scene.dataset.sites, self.scene.dataset.seed)
 
     def terrain(self, site: int) -> Terrain:
-        """The terrain of a site; the one used last is kept."""
+        """Return the terrain of a site. Only the last one is kept."""
         if self._terrain is None or self._terrain.site.index != site:
             from .. import render
 
             if self._threads is not None:
                 render.set_threads(self._threads)
-            self._terrain = None  # let go of the old one first: two do not fit a small machine
+            self._terrain = None  # release the old one first: a small machine has no memory for two
             activity.begin(f"terrain of site {site}")
             patch = self.patch(self.sites[site])
             surface = self.surface(patch)
@@ -195,7 +208,7 @@ class Session:
         return self._terrain
 
     def surface(self, patch: Patch) -> TerrainMesh:
-        """The renderer's copy of a patch, with relief finer than its facets and the scene's spacecraft."""
+        """Return the renderer's copy of a patch, with relief finer than its facets and the scene's spacecraft."""
         from .. import render
 
         vehicle = None if self.vehicle is None else assemble.render_vehicle(self.scene, self.vehicle)
@@ -206,8 +219,8 @@ class Session:
             growth=GROWTH_POWER,
             hurst=self.body.roughness.hurst,
         )
-        # slopes of an octave of wavelength λ are 0.44 times the deviation over λ/4 a length of λ/4, for a
-        # self-affine surface of Hurst exponent 0.85: the ratio of the integrals of its spectrum
+        # for a self-affine surface of Hurst exponent 0.85 the slope of an octave of wavelength λ is 0.44 times the
+        # deviation over λ/4, divided by λ/4: the ratio of the integrals of its spectrum
         length = fine.longest_m / 4
         slope = 0.44 * float(self.body.roughness.deviation_at(length)) / length
         slope = min(slope, _STEEPEST_DETAIL) * self.scene.patch.relief
@@ -221,7 +234,7 @@ class Session:
         )
 
     def patch(self, site: Site) -> Patch:
-        """The ground of a site, from the cache where it was built before."""
+        """Return the ground of a site, from the cache if it was built before."""
         table = self.scene.patch
         return cached_patch(
             self.body,
@@ -239,7 +252,10 @@ class Session:
         )
 
     def spec(self, index: int) -> SampleSpec:
-        """What `simulate` needs for one sample. On a spacecraft's way every sample has a date of its own."""
+        """Return everything that `simulate` needs for one sample.
+
+        On a spacecraft's trajectory every sample has its own date.
+        """
         scene, site = self.scene, int(self.plan.site[index])
         if scene.spice.spacecraft:
             share = float(config.keyed_uniform(scene.dataset.seed, np.array([index]), "plan", "epoch")[0])
@@ -248,7 +264,7 @@ class Session:
         return SampleSpec(index=index, scene=scene, plan=self.plan, faults=self.faults, terrain=self.terrain(site))
 
     def simulate(self, index: int) -> Sample:
-        """One finished sample."""
+        """Return one finished sample."""
         spec = self.spec(index)
         if not self._compiled:
             activity.begin("compiling of kernels, with the first sample")
@@ -257,5 +273,5 @@ class Session:
         return sample
 
     def frame(self, index: int) -> Frame:
-        """One sample with all that lies between radiance and labels."""
+        """Return one sample with everything between radiance and labels."""
         return develop_frame(self.spec(index))

@@ -1,4 +1,4 @@
-"""What a sample is while it is made: its terrain, pose and specification, and the frame that the stages fill."""
+"""Define the data of a sample: terrain, pose, specification, and the frame that the stages fill."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ F64 = NDArray[np.float64]
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Terrain:
-    """A site with its patch and the renderer's copy of it, and the spacecraft above it, if there is one."""
+    """Hold a site, the renderer's copy of its patch, and the spacecraft above it if there is one."""
 
     body: Body
     site: Site
@@ -36,11 +36,11 @@ class Terrain:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Pose:
-    """The outcome of `resolve`: where the camera and the Sun are.
+    """Hold the outcome of `resolve`: the position and attitude of the camera, and the Sun.
 
-    `tries` counts the views drawn, of which this is the last; `variables` are the plan's for it, by the names of
-    `plan.VARIABLES`. `resolved`: every condition is met; False only where SPICE places a camera whose sample has a
-    fault that needs the Sun, and the Sun is hidden.
+    `tries` counts the views drawn; this is the last of them. `variables` are the values of the plan, by the names
+    of `plan.VARIABLES`. `resolved` says whether every condition is met. It is False only if SPICE places the
+    camera, a fault of the sample needs the Sun, and the camera does not see the whole Sun ahead.
     """
 
     position_L_m: F64
@@ -56,7 +56,7 @@ class Pose:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SampleSpec:
-    """One sample of a plan, with all that `simulate` needs."""
+    """Hold one sample of a plan, with everything that `simulate` needs."""
 
     index: int
     scene: Scene
@@ -66,6 +66,7 @@ class SampleSpec:
 
     @property
     def seed(self) -> int:
+        """Return the seed of the dataset."""
         return self.scene.dataset.seed
 
     @property
@@ -74,16 +75,16 @@ class SampleSpec:
         return self.plan.commanded(self.index)
 
     def rng(self, stage: str, name: str) -> np.random.Generator:
-        """The generator of this sample for (stage, name)."""
+        """Return the random generator of this sample for (stage, name)."""
         return config.rng(self.seed, self.index, stage, name)
 
 
 @dataclass(kw_only=True, eq=False)
 class Frame:
-    """What the stages add to, one after the other.
+    """Hold the results of the stages, each of which adds to the frame.
 
-    `views` counts the views of the sample that were photographed, this one included; `first_try` is the number of
-    views that were drawn before it.
+    `views` counts the views of the sample that went through the stages, including this one. `first_try` is the
+    number of views that were drawn before it.
     """
 
     spec: SampleSpec
@@ -93,13 +94,13 @@ class Frame:
     camera: Camera = field(init=False)
     sunlight: Sunlight = field(init=False)
     radiance: Radiance = field(init=False)
-    # what was rendered and where it shows open sky, guard band included, where the picture has another grid
+    # rendered radiance and its open sky, including the guard band, if the render has another grid than the image
     rendered: Radiance | None = None
     open_sky: NDArray[np.bool_] | None = None
     truth: Truth = field(init=False)
     context: FaultContext = field(init=False)
     rate: Electrons = field(init=False)
-    # the same with the Sun's direct image past the rims; None where all light is the scene's
+    # `rate` with the Sun's direct image apart, as light past the rims; None if the Sun is not in view
     rate_apart: Electrons | None = None
     drawn: dict[str, Params] = field(default_factory=dict)
     rejected: list[Params] = field(default_factory=list)
@@ -116,19 +117,21 @@ class Frame:
 
     @property
     def imaged(self) -> Radiance:
-        """What the lens takes: radiance on the grid of the render."""
+        """Return the radiance that enters the lens, on the grid of the render."""
         return self.radiance if self.rendered is None else self.rendered
 
 
 def stored_layers(scene: Scene, faults: Mapping[str, Fault]) -> tuple[str, ...]:
-    """The optional layers of the scene; the default asks for a twin without straylight, which a scene that has
-    no straylight does without."""
+    """Return the optional layers that the dataset stores.
+
+    The default layers include a twin without straylight, which is left out if the scene has no straylight.
+    """
     idle = "without_straylight" if plan.STRAYLIGHT not in faults else None
     return tuple(layer for layer in scene.dataset.layers if layer != idle)
 
 
 def mask_any_faults(scene: Scene, faults: Mapping[str, Fault]) -> tuple[str, ...]:
-    """Return the classes united in mask_any, in dataset order: those configured, else the localised ones."""
+    """Return the classes united in mask_any, in dataset order: the configured ones, else the localised ones."""
     chosen = scene.dataset.mask_any
     if chosen is not None:
         return tuple(name for name in faults if name in chosen)

@@ -1,1 +1,1 @@
-"""What is out there: Sun and orbit, stars, spacecraft, the body under them."""
+"""Describe the surroundings of the camera: Sun and orbit, stars, spacecraft, and the body."""

@@ -1,4 +1,4 @@
-"""What a scene file stands for: its Sun and ephemeris, ground, body, camera, spacecraft and stars, as objects."""
+"""Build the objects that a scene file describes: Sun, ephemeris, ground, body, camera, spacecraft and stars."""
 
 from __future__ import annotations
 
@@ -29,10 +29,11 @@ if TYPE_CHECKING:
 
 F64 = NDArray[np.float64]
 
-# Stars whose brightest pixel collects less than this share of the read noise are left out by `stars = "auto"`.
+# `stars = "auto"` leaves out stars whose brightest pixel collects less than this fraction of the read noise.
 _STAR_OVER_READ_NOISE = 0.1
 
-# Narrower, a star's light would depend on its place among the pixels that a lens resamples: 1 % at this deviation.
+# Largest standard deviation of a star that a prescription resamples and blurs. The light of a narrower star would
+# depend more on its position within a pixel; at this deviation the variation is 1 %.
 _STAR_SIGMA_PX = 0.6
 
 
@@ -43,6 +44,7 @@ _STAR_SIGMA_PX = 0.6
 def _ephemeris(
     sun: SunTable, body: BodyTable, orbit: OrbitTable | None, kernels: SpiceTable
 ) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """Return the Sun's position in J and T_from_J as plain numbers, which the cache can hold."""
     date = sun.julian_date
     own = frames.Rotation(
         pole_ra_deg=body.pole_ra_deg,
@@ -61,27 +63,30 @@ def _ephemeris(
 
 
 def ephemeris(scene: Scene) -> tuple[F64, F64]:
-    """The Sun seen from the target in J, float64[3] in au, and the target's own T_from_J, float64[3, 3].
+    """Return the Sun's position relative to the target in J, float64[3] in au, and T_from_J, float64[3, 3].
 
-    From SPICE kernels where the scene names some, else from the two-body `[orbit]` (67P's by default) and the pole
-    and period of `[body]`. Raises InputError for kernels that do not serve.
+    If the scene names SPICE kernels, the Sun's position comes from them, else from the two-body `[orbit]` (default:
+    that of 67P). T_from_J is the target's own attitude. It comes from the kernels if the scene names a frame in
+    them, else from the pole and period in `[body]`. Raises InputError for kernels that lack the data.
     """
     sun_J_au, own = _ephemeris(scene.sun, scene.body, scene.orbit, scene.spice)
     return np.array(sun_J_au), np.array(own).reshape(3, 3)
 
 
 def _orbit(table: OrbitTable | None) -> frames.Orbit:
+    """Return the orbit of a scene's table, by default that of 67P."""
     return frames.ORBIT_67P if table is None else frames.Orbit(**table.model_dump())
 
 
 def epoch_jd(scene: Scene, site: int, share: float) -> float:
-    """TDB Julian date at that share, 0 to 1, of the time that a site has on the spacecraft's way."""
+    """Return the TDB Julian date at the fraction `share` in [0, 1] of a site's time on the trajectory."""
     start, end = scene.sun.julian_date, scene.spice.until_julian_date
     return start if end is None else start + (end - start) * (site + share) / scene.dataset.sites
 
 
 @resources.cached_with_contents(maxsize=256)
 def _spacecraft_pose(table: SpiceTable, julian_date: float) -> spice.SpacecraftState:
+    """Return `spacecraft_pose` from the cache, or compute it."""
     axes = None if table.camera_axes is None else np.array(table.camera_axes).reshape(3, 3)
     with spice.kernels(*table.kernels):
         et_s = spice.et_s_from_julian_date(julian_date)
@@ -89,13 +94,16 @@ def _spacecraft_pose(table: SpiceTable, julian_date: float) -> spice.SpacecraftS
 
 
 def spacecraft_pose(scene: Scene, julian_date: float) -> spice.SpacecraftState:
-    """Where SPICE has the scene's spacecraft and its camera. Raises InputError for kernels that do not serve."""
+    """Return the pose of the spacecraft's camera from SPICE. Raises InputError if kernels lack the data."""
     return _spacecraft_pose(scene.spice, julian_date)
 
 
 def way_sites(scene: Scene, body: Body) -> Sites:
-    """Return the sites of a scene on a spacecraft's trajectory: the ground in the middle of the image, half-way
-    through each site's time; where the camera looks past the body, the ground nearest to the line of sight."""
+    """Return the sites of a scene on a spacecraft's trajectory.
+
+    A site is the ground at the centre of the image, half-way through the time of the site. If the camera looks past
+    the body, it is the ground nearest to the line of sight.
+    """
 
     def site(index: int) -> Site:
         pose = spacecraft_pose(scene, epoch_jd(scene, index, 0.5))
@@ -105,7 +113,7 @@ def way_sites(scene: Scene, body: Body) -> Sites:
 
 
 def looked_at(body: Body, origin_T_m: F64, direction_T: F64) -> F64:
-    """Where a ray first meets the body's shape model, float64[3] metres in T; else the vertex nearest to it."""
+    """Return where a ray first meets the body's shape model, float64[3] in m in T, or else the nearest vertex."""
     a, b, c = (body.vertices_m[body.faces[:, k]] - origin_T_m for k in range(3))
     normal = np.cross(b - a, c - a)
     turn = np.stack([np.cross(p, q) @ direction_T for p, q in ((a, b), (b, c), (c, a))])
@@ -121,14 +129,14 @@ def looked_at(body: Body, origin_T_m: F64, direction_T: F64) -> F64:
 
 
 def sun_distance_au(scene: Scene) -> float:
-    """The body's distance from the Sun: as given, or by the ephemeris at the Julian date."""
+    """Return the body's distance from the Sun: as given, or from the ephemeris at the Julian date."""
     if scene.sun.distance_au is not None:
         return scene.sun.distance_au
     return float(np.linalg.norm(ephemeris(scene)[0]))
 
 
 def sunlight(scene: Scene, direction_L: F64) -> Sunlight:
-    """The Sun at the scene's distance in a direction of L."""
+    """Return the sunlight of the scene from a direction in L."""
     distance = sun_distance_au(scene)
     return Sunlight(
         direction_L=direction_L,
@@ -139,14 +147,14 @@ def sunlight(scene: Scene, direction_L: F64) -> Sunlight:
 
 
 def target_attitude(scene: Scene, sun_T: F64) -> F64:
-    """T_from_J of the target under the commanded Sun: the attitude nearest to the body's own at the date."""
+    """Return T_from_J of the target under the commanded Sun: the attitude nearest to the body's own at the date."""
     sun_J_au, own = ephemeris(scene)
     return frames.T_from_J_commanded(own, frames.unit(sun_J_au), sun_T)
 
 
 def attitude_references(scene: Scene) -> tuple[str, str]:
-    """Return what attitudes count from in the Sun-facing and the Sun-averted stratum, "sun" or "nadir"."""
-    if scene.spice.spacecraft:  # the attitude is that of the kernels, expressed from the Sun
+    """Return the reference of attitudes, "sun" or "nadir", in the Sun-facing and the Sun-averted stratum."""
+    if scene.spice.spacecraft:  # the kernels give the attitude, and it is stored relative to the Sun
         return "sun", "sun"
     facing, averted = scene.geometry.sun_facing, scene.geometry.sun_averted
     assert facing is not None
@@ -158,13 +166,13 @@ def attitude_references(scene: Scene) -> tuple[str, str]:
 
 
 def wavelengths_nm(scene: Scene) -> F64:
-    """Band nodes of the scene."""
+    """Return the band nodes of the scene in nm, float64[band]."""
     r = scene.render
     return spectra.band_nodes_nm(r.band_min_nm, r.band_max_nm, r.bands)
 
 
 def photometric_model(scene: Scene) -> Photometry:
-    """How the scene's ground reflects, at its band nodes."""
+    """Return the model of how the scene's ground reflects, at its band nodes."""
     table, wavelength = scene.body.photometry, wavelengths_nm(scene)
     if table.model == "hapke":
         rows = table.parameters if table.hapke is None else table.rows()
@@ -177,7 +185,7 @@ def photometric_model(scene: Scene) -> Photometry:
 
 
 def dust_contrast(scene: Scene) -> F64 | None:
-    """Reflectance of dust-covered over bare ground, minus 1, float64[band]; None where they are alike."""
+    """Return the reflectance of dust-covered over bare ground minus 1, float64[band]; None if they are equal."""
     table, wavelength = scene.body.photometry, wavelengths_nm(scene)
     slope = table.dust_slope_per_100nm * (wavelength - photometry.REFERENCE_NM) / 100
     contrast = (1 + table.dust_contrast) * (1 + slope) - 1
@@ -194,11 +202,13 @@ def normal_albedo(
 
     Parameters
     ----------
+    scene
+        The scene.
     dust
-        How far the ground is covered, in [0, 1]; NaN where there is nothing.
+        Dust cover of the ground, in [0, 1]; NaN where there is no surface.
     material
-        The spacecraft's material in each place, -1 where that is none: a Lambert surface, whose I/F is its
-        reflectance. Default: none anywhere.
+        Index of the spacecraft's material in each pixel, -1 where there is none. It is a Lambert surface, so its
+        I/F is its reflectance. Default: no spacecraft.
     vehicle
         The spacecraft with these materials.
     """
@@ -214,7 +224,7 @@ def normal_albedo(
 
 
 def make_body(scene: Scene) -> Body:
-    """The scene's body. Raises InputError."""
+    """Return the scene's body. Raises InputError."""
     table = scene.body
     physical = {
         "density_kg_m3": table.density_kg_m3,
@@ -226,14 +236,18 @@ def make_body(scene: Scene) -> Body:
     return load_body(table.shape, unit=table.unit, name=table.name, **physical)
 
 
-# 67P: volume, and length of its longest extent (Preusker et al. 2015, A&A 583, A33); a shape that differs by more
-# than these shares is another body's.
+# Volume and longest extent of 67P (Preusker et al. 2015, A&A 583, A33). A shape that differs by more than these
+# fractions belongs to another body.
 _67P_VOLUME_M3, _67P_LENGTH_M = 18.7e9, 5.0e3
 _VOLUME_SHARE, _LENGTH_SHARE = 0.25, 0.2
 
 
 def assumed_of_67p(scene: Scene, body: Body) -> str:
-    """Return one sentence on the values of 67P that a body of another size has, left in place or set, or ""."""
+    """Return one sentence that lists values of 67P in use for another body, or "" if there are none.
+
+    A value counts whether the scene sets it or leaves its default. The size of the shape model decides whether the
+    body is 67P.
+    """
     length_m = float(np.ptp(body.vertices_m, axis=0).max())
     if (
         abs(body.volume_m3 / _67P_VOLUME_M3 - 1) <= _VOLUME_SHARE
@@ -244,14 +258,14 @@ def assumed_of_67p(scene: Scene, body: Body) -> str:
     keys = ["name", "density_kg_m3", "rotation_period_h"]
     keys += [] if scene.spice.frame else ["pole_ra_deg", "pole_dec_deg", "prime_meridian_deg"]
     keys += [] if table.photometry.model == "hapke" else ["reflectance"]
-    # not by what was left unset: a packaged scene of 67P whose shape is replaced says its values itself
+    # compare values, not whether they were set: a packaged scene of 67P sets them, and its shape may be replaced
     values = [
         (key, getattr(table, key)) for key in keys if getattr(table, key) == BodyTable.model_fields[key].default
     ]
     assumed = [f"body.{key} = {v:.6g}" if isinstance(v, float) else f"body.{key} = {v!r}" for key, v in values]
     if table.photometry.model == "hapke" and table.photometry.hapke is None:
         assumed.append(f"body.photometry.parameters = {table.photometry.parameters!r}")
-    # with a distance of its own the orbit only turns the stars
+    # if the scene gives a distance, the orbit only rotates the stars
     if scene.orbit is None and not scene.spice.kernels and scene.sun.distance_au is None:
         assumed.append("[orbit]")
     if not assumed:
@@ -263,7 +277,7 @@ def assumed_of_67p(scene: Scene, body: Body) -> str:
 
 
 def ellipsoid(semi_axes_m: tuple[float, float, float]) -> tuple[F64, NDArray[np.int32]]:
-    """A triaxial ellipsoid as a closed mesh of 82,000 triangles: vertices float64[n, 3] in m, faces int32."""
+    """Return a triaxial ellipsoid as a closed mesh of 82,000 triangles: vertices float64[n, 3], m; faces int32."""
     import trimesh
 
     sphere = trimesh.creation.icosphere(subdivisions=6)
@@ -274,7 +288,7 @@ def ellipsoid(semi_axes_m: tuple[float, float, float]) -> tuple[F64, NDArray[np.
 
 
 def base_camera(scene: Scene, *, architecture: int = 0, readout_direction: int = 0, individual: int = 0) -> Camera:
-    """The scene's camera without exposure; the integers index its lists of options."""
+    """Return the scene's camera before an exposure is set. The integers are indices into its lists of options."""
     c = scene.camera
     direction = c.readout_directions[readout_direction]
     if c.detector:
@@ -292,6 +306,7 @@ def base_camera(scene: Scene, *, architecture: int = 0, readout_direction: int =
 
 
 def _three_colours(c: CameraTable) -> Detector:
+    """Return the three-colour detector of a camera table."""
     return Detector(
         width_px=c.width_px,
         height_px=c.height_px,
@@ -308,7 +323,7 @@ def _three_colours(c: CameraTable) -> Detector:
 
 @resources.cached_with_contents(maxsize=4)
 def mosaic_sensor(c: CameraTable) -> Sensor:
-    """The sensor that a camera names, at the camera's temperature. Raises InputError."""
+    """Return the sensor that a camera names, at the camera's temperature. Raises InputError."""
     try:
         sensor = load_sensor(c.detector)
     except InputError as error:
@@ -319,7 +334,8 @@ def mosaic_sensor(c: CameraTable) -> Sensor:
 
 
 def _detector_of(scene: Scene, sensor: Sensor, individual: int, direction: str) -> MosaicDetector:
-    # CCDs are read towards an end of their columns
+    """Return the detector of one device. Raises InputError if a channel receives no light of the scene's bands."""
+    # a mosaic detector is read along its columns only
     towards = direction if direction in ("up", "down") else "up"
     seed = int(config.rng(scene.dataset.seed, individual, "detector", "device").integers(2**31))
     try:
@@ -343,10 +359,12 @@ def _detector_of(scene: Scene, sensor: Sensor, individual: int, direction: str) 
 
 
 def _focus_distance_m(c: CameraTable) -> float:
+    """Return the focus distance in m, infinite by default."""
     return float("inf") if c.focus_distance_m is None else c.focus_distance_m
 
 
 def _thin_lens(c: CameraTable, pixel_pitch_um: float) -> ThinLens:
+    """Return the thin lens of a camera table."""
     return ThinLens(
         focal_length_mm=cameras.focal_length_mm(c.fov_deg, c.width_px, pixel_pitch_um),
         f_number=config.THIN_LENS["f_number"] if c.f_number is None else c.f_number,
@@ -357,9 +375,9 @@ def _thin_lens(c: CameraTable, pixel_pitch_um: float) -> ThinLens:
 
 @resources.cached_with_contents(maxsize=4)
 def real_lens(c: CameraTable, pixel_pitch_um: float) -> RealLens:
-    """Return the prescription that a camera names, scaled to its field of view and closed to its f-number.
+    """Return the prescription that a camera names, scaled to its field of view and stopped down to its f-number.
 
-    Raises InputError for a file that is no lens, and for an f-number that it does not reach.
+    Raises InputError for a file that is not a lens, and for an f-number that the lens does not reach.
     """
     try:
         prescription = load_lens(c.lens)
@@ -385,7 +403,7 @@ def real_lens(c: CameraTable, pixel_pitch_um: float) -> RealLens:
 
 
 def spacecraft(scene: Scene) -> SpacecraftMesh | None:
-    """The vehicle that carries the camera, in B; None where the scene has none. Raises InputError."""
+    """Return the spacecraft that carries the camera, in B, or None if the scene has none. Raises InputError."""
     table = scene.spacecraft
     if table.model == "none":
         return None
@@ -412,10 +430,12 @@ def spacecraft(scene: Scene) -> SpacecraftMesh | None:
 
 
 def _plain(material: object) -> Any:
+    """Return a material as plain data."""
     return material.model_dump() if hasattr(material, "model_dump") else material
 
 
 def _pose(name: str, table: PoseTable, vehicle: Spacecraft | None) -> HingePose:
+    """Return the turn of a joint. Raises InputError if hinge or axis is missing."""
     hinge = None if vehicle is None else vehicle.hinges[name]
     at = table.hinge_m or (hinge.hinge_B_m if hinge else None)
     axis = table.axis or (hinge.axis_B if hinge else None)
@@ -425,7 +445,7 @@ def _pose(name: str, table: PoseTable, vehicle: Spacecraft | None) -> HingePose:
 
 
 def render_vehicle(scene: Scene, mesh: SpacecraftMesh) -> Vehicle:
-    """The renderer's copy of the spacecraft."""
+    """Return the renderer's copy of the spacecraft."""
     from .. import render
 
     return render.Vehicle(
@@ -444,11 +464,23 @@ def with_stars(
     open_sky: NDArray[np.bool_],
     view: View | None = None,
 ) -> Radiance:
-    """The radiance with the stars that the scene asks for and the exposure can show.
+    """Return the radiance with the stars that the scene asks for and the exposure can show.
 
-    `camera` has its exposure; `open_sky` bool[y, x]: pixels that see neither a body nor the Sun; `view`: the grid
-    of the radiance where it is not the camera's frame. A prescription blurs the stars itself: they then come to it
-    as small as a grid can hold them in place.
+    Parameters
+    ----------
+    scene
+        The scene.
+    radiance
+        Radiance without stars.
+    camera
+        The camera with its exposure.
+    J_from_C
+        Camera axes in J, float64[3, 3].
+    open_sky
+        Pixels that see neither a body nor the Sun, bool[y, x].
+    view
+        Grid of the radiance, if it is not the camera's frame. A prescription blurs the stars itself, so they are
+        drawn with at most `_STAR_SIGMA_PX` for it.
     """
     table = scene.sky
     if table.stars == "off" or not open_sky.any():

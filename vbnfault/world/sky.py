@@ -1,9 +1,14 @@
-"""The stars: a catalogue to magnitude 7 and the radiance that it adds to a frame.
+"""Provide a star catalogue to magnitude 7, and compute the radiance that the stars add to an image.
 
-Positions and proper motions refer to ICRF axes (frame J). Ignored are stellar aberration, up to 24″ for a camera
-that moves with 67P at perihelion (34 km/s: a pixel of 1024 across 7°), parallax (3″ at most, α Centauri from
-3.6 au), and variability. Planets, the Moon and nebulae are absent.
-A double star that Hipparcos lists as one entry is one point with the light of both.
+Positions and proper motions refer to ICRF axes (frame J). These effects are neglected:
+
+- stellar aberration, up to 24″ for a camera that moves with 67P at perihelion (34 km/s; 24″ is one pixel of 1024
+  across 7°)
+- parallax, at most 3″ (α Centauri from 3.6 au)
+- variability
+
+Planets, the Moon and nebulae are absent. A double star that Hipparcos lists as one entry is one point with the
+light of both.
 """
 
 from __future__ import annotations
@@ -27,12 +32,12 @@ I64 = NDArray[np.int64]
 BOLTZMANN_J_K = 1.380649e-23  # SI, exact
 DAYS_PER_YEAR = 365.25
 
-# Spectral irradiance of V = 0, mean over the V passband, outside the atmosphere: Bessell, Castelli & Plez 1998
-# (A&A 333, 231), table A2, 363.1e-11 erg cm⁻² s⁻¹ Å⁻¹.
+# Spectral irradiance of a star of V = 0 outside the atmosphere, mean over the V passband: Bessell, Castelli & Plez
+# 1998 (A&A 333, 231), table A2, 363.1e-11 erg cm⁻² s⁻¹ Å⁻¹.
 ZERO_POINT_V_W_M2_NM = 3.631e-11
 
-# Bessell 1990 (PASP 102, 1181), table 2: V passband, 470 to 700 nm in steps of 10 nm, peak 1. Read as response
-# to energy; read per photon instead, the light of no star would change by more than 2.5 %.
+# V passband of Bessell 1990 (PASP 102, 1181), table 2: 470 to 700 nm in steps of 10 nm, peak 1. It is used as the
+# response to energy. Used as the response per photon, it would change the light of a star by at most 2.5 %.
 PASSBAND_V_NM = np.arange(470.0, 701.0, 10.0)
 PASSBAND_V = np.array(
     [
@@ -41,20 +46,20 @@ PASSBAND_V = np.array(
     ]
 )
 
-# Outside, Ballesteros' formula turns steep (its pole lies at -0.67) or has no star to stand on.
+# Outside this range Ballesteros' formula becomes steep (its pole is at -0.67) or is not supported by any star.
 COLOUR_RANGE_BV = (-0.4, 4.0)
 
-# The point spread is cut where 6e-7 of a star's light is left on either axis.
+# The point spread is cut at this many σ, where 6e-7 of a star's light is left on either axis.
 REACH_SIGMA = 5.0
 SIGMA_MAX_PX = 16.0
 
-# The sky's brightest star, Sirius, has V = -1.44: fainter limits than this show something.
+# Sirius, the brightest star, has V = -1.44. A limiting magnitude below this value shows no star.
 BRIGHTEST_V = -1.5
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class StarCatalogue:
-    """Stars from the brightest to the faintest; every field float64[n], ICRF, epoch J2000.0.
+    """Hold stars, ordered from the brightest to the faintest. Every field is float64[n], ICRF, epoch J2000.0.
 
     `proper_motion_ra_mas_year` is μα cos δ. `magnitude_V` and `colour_BV` are Johnson magnitudes.
     """
@@ -70,15 +75,15 @@ class StarCatalogue:
         return len(self.magnitude_V)
 
     def select(self, keep: NDArray[np.bool_] | slice) -> StarCatalogue:
-        """The stars that a mask bool[n] or a slice keeps."""
+        """Return the stars that a mask bool[n] or a slice selects."""
         return replace(self, **{name: getattr(self, name)[keep] for name in self.__dataclass_fields__})
 
     def brighter_than(self, magnitude_V: float) -> StarCatalogue:
-        """The stars with V below `magnitude_V`."""
+        """Return the stars with V below `magnitude_V`."""
         return self.select(slice(int(np.searchsorted(self.magnitude_V, magnitude_V))))
 
     def direction_J(self, julian_date: float = J2000_JD) -> F64:
-        """Unit vectors in J, float64[n, 3], moved along great circles from J2000.0 to a TDB Julian date."""
+        """Return unit vectors in J, float64[n, 3], moved along great circles from J2000.0 to a TDB Julian date."""
         ra, dec = np.radians(self.right_ascension_deg), np.radians(self.declination_deg)
         zero = np.zeros_like(ra)
         radial = np.stack([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)], axis=1)
@@ -96,9 +101,9 @@ class StarCatalogue:
 
 @resources.cached_with_contents(maxsize=1)
 def load_catalogue() -> StarCatalogue:
-    """The packaged catalogue: every star of Hipparcos (ESA 1997) with V ≤ 7.0, 15 thousand of them.
+    """Return the packaged catalogue: every star of Hipparcos (ESA 1997) with V ≤ 7.0, about 15 thousand.
 
-    Steps of the table: 1 mas, 1 mas/year, 0.01 mag in V, 0.001 mag in B−V. Raises InputError where the
+    The steps of the table are 1 mas, 1 mas/year, 0.01 mag in V and 0.001 mag in B−V. Raises InputError if the
     installation lacks the file.
     """
     data = resources.read_input(resources.data_dir("catalogues") / "stars.npz", "star catalogue")
@@ -119,10 +124,11 @@ TYPICAL_COLOUR_BV = 0.543  # median of the stars with V ≤ 7
 
 
 def pack_hipparcos(lines: Iterable[str], faintest_V: float = 7.0) -> dict[str, NDArray[np.generic]]:
-    """Columns of the packaged table from lines of `hip_main.dat` (CDS I/239), brightest first.
+    """Return the columns of the packaged table from lines of `hip_main.dat` (CDS I/239), brightest first.
 
-    Positions go from J1991.25 to J2000.0. Where Hipparcos has no astrometric solution (7 stars of V ≤ 7) the
-    sexagesimal position stands, without proper motion; without B−V (13 stars) the median of the others.
+    Positions are moved from J1991.25 to J2000.0. If Hipparcos has no astrometric solution (7 stars of V ≤ 7), the
+    sexagesimal position is used, without proper motion. If B−V is missing (13 stars), the median of the others is
+    used.
     """
     rows = [line.split("|") for line in lines]
     rows = [row for row in rows if row[5].strip() and float(row[5]) <= faintest_V]
@@ -153,27 +159,27 @@ def pack_hipparcos(lines: Iterable[str], faintest_V: float = 7.0) -> dict[str, N
 
 
 def colour_temperature_K(colour_BV: F64 | float) -> F64:
-    """Temperature of the black body of a colour B−V, kelvin, float64: Ballesteros 2012 (EPL 97, 34008), eq. 14.
+    """Return the temperature of the black body with a colour B−V, float64 in K.
 
-    The colour is held within `COLOUR_RANGE_BV`.
+    The formula is eq. 14 of Ballesteros 2012 (EPL 97, 34008). The colour is clipped to `COLOUR_RANGE_BV`.
     """
     colour = 0.92 * np.clip(np.asarray(colour_BV, dtype=np.float64), *COLOUR_RANGE_BV)
     return np.asarray(4600.0 * (1 / (colour + 1.7) + 1 / (colour + 0.62)))
 
 
 def _planck(wavelength_nm: F64, temperature_K: F64) -> F64:
-    """Shape of the black body's spectrum per nm, float64[n, wavelength]; the scale is left out."""
+    """Return the shape of the black body's spectrum per nm, float64[n, wavelength], without a scale."""
     hc_k = spectra.PLANCK_J_S * spectra.LIGHT_SPEED_M_S / BOLTZMANN_J_K
     exponent = hc_k / (wavelength_nm[None] * 1e-9 * temperature_K[:, None])
     return np.asarray((550.0 / wavelength_nm[None]) ** 5 / np.expm1(exponent))
 
 
 def star_spectrum_W_m2_nm(magnitude_V: F64 | float, colour_BV: F64 | float, wavelength_nm: F64) -> F64:
-    """Spectral irradiance at the aperture, across the star's direction, W m⁻² nm⁻¹, float64[n, wavelength].
+    """Return the spectral irradiance at the aperture, W m⁻² nm⁻¹, float64[n, wavelength].
 
-    A black body of the colour temperature, its mean over the V passband set to the star's magnitude. Right in
-    B and V by construction; lines and the Balmer jump are missing, which costs white stars up to 20 % at
-    400 nm.
+    The receiving area is perpendicular to the star's direction. The spectrum is a black body of the colour
+    temperature, whose mean over the V passband has the star's magnitude. It is correct in B and V by construction.
+    Lines and the Balmer jump are missing, which causes errors up to 20 % for white stars at 400 nm.
     """
     temperature = np.atleast_1d(colour_temperature_K(colour_BV))
     level = ZERO_POINT_V_W_M2_NM * 10 ** (-0.4 * np.atleast_1d(np.asarray(magnitude_V, dtype=np.float64)))
@@ -182,22 +188,23 @@ def star_spectrum_W_m2_nm(magnitude_V: F64 | float, colour_BV: F64 | float, wave
 
 
 def star_irradiance_W_m2_nm(magnitude_V: F64 | float, colour_BV: F64 | float, wavelength_nm: F64) -> F64:
-    """The spectrum of `star_spectrum_W_m2_nm` at band nodes, hat-weighted as the solar one: float64[n, band].
+    """Return `star_spectrum_W_m2_nm` at band nodes, hat-weighted like the solar spectrum, float64[n, band].
 
     `wavelength_nm` float64[band] are the nodes of `spectra.band_nodes_nm`.
     """
     fine = spectra._fine_nm(wavelength_nm)
     hats = spectra._hats(wavelength_nm, fine)
     spectrum = star_spectrum_W_m2_nm(magnitude_V, colour_BV, fine)
-    rule = np.gradient(fine) * np.where((fine == fine[0]) | (fine == fine[-1]), 0.5, 1.0)  # trapezoidal
+    rule = np.gradient(fine) * np.where((fine == fine[0]) | (fine == fine[-1]), 0.5, 1.0)  # trapezoidal rule
     return np.asarray(spectrum @ (hats * rule).T / (hats @ rule))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class StarRadiance:
-    """What the stars add: `radiance` float32[band, n], W m⁻² sr⁻¹ nm⁻¹, at pixels `rows`, `columns` int64[n].
+    """Hold the radiance that the stars add, in the pixels that have any.
 
-    No pixel comes twice; they are in the frame's order, row by row.
+    `radiance` float32[band, n] is in W m⁻² sr⁻¹ nm⁻¹. `rows` and `columns` int64[n] are the pixels, each once, row
+    by row.
     """
 
     rows: I64
@@ -205,7 +212,7 @@ class StarRadiance:
     radiance: NDArray[np.float32]
 
     def added_to(self, radiance: Radiance, where: NDArray[np.bool_] | None = None) -> Radiance:
-        """`radiance` with the stars added, at the pixels of bool[y, x] `where` alone if that is given."""
+        """Return `radiance` with the stars added; if `where` bool[y, x] is given, only in its pixels."""
         keep = slice(None) if where is None else where[self.rows, self.columns]
         array = radiance.array.copy()
         array[:, self.rows[keep], self.columns[keep]] += self.radiance[:, keep]
@@ -225,37 +232,46 @@ def star_radiance(
     sky: NDArray[np.bool_] | None = None,
     lens_falloff: bool = False,
 ) -> StarRadiance:
-    """Radiance that the stars add to each pixel, averaged over the pixel and summed over the stars.
+    """Return the radiance that the stars add to each pixel, averaged over the pixel and summed over the stars.
 
-    A star of irradiance E at the angle θ from the boresight sends T E A cos θ through an aperture of area
-    A = π (f/2N)², while a pixel of radiance L receives π T L / (4N²) times its own area from `lens.ThinLens`,
-    which has no falloff. Equal flux makes the radiances of a star add up to
+    A star of irradiance E at the angle θ from the boresight sends the flux T E A cos θ through an aperture of area
+    A = π (f/2N)². A pixel of radiance L receives π T L / (4N²) times its own area from `lens.ThinLens`, which has
+    no falloff. Equal flux requires that the radiances of a star sum to
 
         Σ L = E fx fy cos θ          (`lens_falloff` False: the lens adds no factor)
-        Σ L = E fx fy / cos³ θ       (True: a lens or a later stage multiplies by cos⁴ θ)
+        Σ L = E fx fy / cos³ θ       (`lens_falloff` True: a lens or a later stage multiplies by cos⁴ θ)
 
-    the second being E over the pixel's solid angle. The electrons are the star's either way.
+    The second sum is E over the solid angle of the pixel. The star gives the same electrons in both cases.
 
     Parameters
     ----------
-    J_from_C, intrinsics
-        Camera axes in J, float64[3, 3]; fx, fy, cx, cy in pixels, float64[4], pixel centres at +0.5.
+    catalogue
+        The stars.
+    J_from_C
+        Camera axes in J, float64[3, 3].
+    intrinsics
+        fx, fy, cx, cy in pixels, float64[4], pixel centres at +0.5.
+    width_px, height_px
+        Size of the frame.
     wavelength_nm
         Band nodes, float64[band].
     sigma_px
-        Standard deviation of the Gaussian point spread, pixels, in [0, 16]. It is integrated over the pixels, cut
-        at 5 σ. With 0 a star lights the one pixel it falls on. The frame must not be blurred by it again.
+        Standard deviation of the Gaussian point spread in pixels, in [0, 16]. The Gaussian is integrated over the
+        pixels and cut at 5 σ. With 0, a star lights the one pixel that contains it. Nothing else may blur the frame
+        by it again.
     julian_date
-        TDB, for proper motion.
+        TDB Julian date, for proper motion.
     sky
-        bool[y, x], pixels whose centre sees no body. A star whose place in the frame is not sky is hidden, and
-        the light of the others spreads over sky and body alike. Without it no star is hidden: then add the
-        result where there is sky.
+        Pixels whose centre sees no body, bool[y, x]. A star is hidden if its position in the frame is not sky. The
+        light of other stars spreads over sky and body alike. Default: no star is hidden, so add the result only
+        where there is sky.
+    lens_falloff
+        Whether a lens or a later stage multiplies by cos⁴ θ.
 
     Raises
     ------
     ValueError
-        `sigma_px` out of range, or `sky` not of the frame's shape.
+        `sigma_px` is out of range, or `sky` does not have the shape of the frame.
     """
     if not 0 <= sigma_px <= SIGMA_MAX_PX:
         raise ValueError(f"sigma_px = {sigma_px:g}: must be in [0, {SIGMA_MAX_PX:g}]")
@@ -283,7 +299,7 @@ def star_radiance(
     offset = np.arange(-window, window + 1)
     pixel = np.floor(place).astype(np.int64)[:, :, None] + offset  # [star, axis, window]
     edges = np.concatenate([pixel, pixel[:, :, -1:] + 1], axis=2) - place[:, :, None]
-    # a point is a very narrow Gaussian: of a star right on an edge either side gets half
+    # a point is a very narrow Gaussian: a star exactly on an edge gives half of its light to either side
     share = np.diff(ndtr(edges / max(sigma_px, 1e-9)), axis=2)
     share = np.where((pixel >= 0) & (pixel < size[:, None]), share, 0.0)
 
@@ -311,11 +327,30 @@ def limiting_magnitude(
     threshold_e: float,
     colour_BV: float = 0.6,
 ) -> float:
-    """V of the star on the axis, centred on a pixel, whose brightest pixel and colour collect `threshold_e`.
+    """Return V of a star whose brightest pixel collects `threshold_e` in its brightest colour.
 
-    `electron_rate_weights` float[colour, band] are those of `Detector`, electrons per second for 1 W m⁻² nm⁻¹ on
-    a pixel; `irradiance_per_radiance` is the lens's π T / (4N²), sr. Below `BRIGHTEST_V` the exposure hides every
-    star. -inf where no light is collected. Raises ValueError for a threshold that is not above 0.
+    The star is on the axis, centred on a pixel. If the result is below `BRIGHTEST_V`, the exposure shows no star.
+    It is -inf if no light is collected.
+
+    Parameters
+    ----------
+    electron_rate_weights
+        Electrons per second for 1 W m⁻² nm⁻¹ on a pixel, float[colour, band], as of `Detector`.
+    wavelength_nm
+        Band nodes, float64[band].
+    irradiance_per_radiance
+        π T / (4N²) of the lens, in sr.
+    focal_length_px, exposure_s, sigma_px
+        As in the camera and in `star_radiance`.
+    threshold_e
+        Electrons, above 0.
+    colour_BV
+        Colour of the star.
+
+    Raises
+    ------
+    ValueError
+        `threshold_e` is not above 0.
     """
     if not threshold_e > 0:
         raise ValueError(f"threshold_e = {threshold_e:g}: must be above 0")

@@ -1,8 +1,8 @@
-"""The spacecraft around the camera: parts with a material each, some of which can be posed.
+"""Describe the spacecraft around the camera: parts with one material each, some of which can be posed.
 
-Everything is in B, metres: the camera's entrance pupil is the origin, x image right, y image down, z along the
-boresight. A part's name is its path, `solar_array_left/panel`; a key of a user's table (a pose, a material) is
-such a path, a leading piece of it, or any single name along it, and holds for all parts below.
+All coordinates are in B, in metres. The origin is the camera's entrance pupil; x is image right, y image down and z
+along the boresight. A part's name is its path, such as `solar_array_left/panel`. A key of a user's table (a pose, a
+material) is such a path, the beginning of one, or any single name in it. It applies to all parts below.
 """
 
 from __future__ import annotations
@@ -28,18 +28,18 @@ Unit = Literal["m", "cm", "mm"]
 
 METRES_PER: dict[str, float] = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 FILE_TYPES = (".obj", ".glb", ".gltf")
-# No vehicle near a comet is larger (Rosetta: 32 m from tip to tip); a file in millimetres read as metres is.
+# No spacecraft near a comet is larger (Rosetta: 32 m from tip to tip), but a file in millimetres read as metres is.
 LARGEST_EXTENT_M = 200.0
-# In the file's unit: a vehicle of 200 m in millimetres, far from its origin.
+# Largest coordinate in the file's unit: a spacecraft of 200 m in millimetres, far from its origin, is below it.
 _FARTHEST = 1e9
-# Relative to the squared extent: below it a face's normal is rounding noise in float64.
+# Smallest area relative to the squared extent. Below it the normal of a face is rounding noise in float64.
 _DEGENERATE_AREA_FRACTION = 1e-16
 
 _NM = (350.0, 400.0, 450.0, 500.0, 550.0, 600.0, 650.0, 700.0, 800.0, 900.0)
 
-# Hemispherical reflectance, used as that of a Lambert surface. The level of each follows from the solar
-# absorptance α, 1 − α within 0.03, of Fortescue, Swinerd & Stark 2011, Spacecraft Systems Engineering, 4th ed.,
-# table 11.3; the course over wavelength is assumed.
+# Hemispherical reflectance, used for a Lambert surface. The level of each is 1 − α within 0.03, with the solar
+# absorptance α of Fortescue, Swinerd & Stark 2011, Spacecraft Systems Engineering, 4th ed., table 11.3. The
+# dependence on wavelength is assumed.
 _FORTESCUE = "1 - α of Fortescue, Swinerd & Stark 2011, table 11.3 (α = {}, {}); spectral course assumed"
 NAMED_REFLECTANCES: dict[str, tuple[tuple[float, ...], tuple[float, ...], str]] = {
     "white_paint": (
@@ -70,8 +70,11 @@ NAMED_REFLECTANCES: dict[str, tuple[tuple[float, ...], tuple[float, ...], str]] 
 
 @dataclass(frozen=True, kw_only=True)
 class Material:
-    """A Lambert surface. `reflectance` in [0, 1] at `wavelength_nm` (increasing), linear between its nodes and
-    constant beyond them; `source` says where the numbers are from."""
+    """Describe a Lambert surface.
+
+    `reflectance` in [0, 1] is given at `wavelength_nm` (increasing); it is linear between these nodes and constant
+    outside. `source` names the origin of the numbers.
+    """
 
     name: str
     wavelength_nm: tuple[float, ...]
@@ -79,13 +82,16 @@ class Material:
     source: str = ""
 
     def at(self, wavelength_nm: F64) -> F64:
-        """Reflectance at `wavelength_nm`, float64[band]."""
+        """Return the reflectance at `wavelength_nm`, float64[band]."""
         return np.interp(wavelength_nm, self.wavelength_nm, self.reflectance)
 
 
 def make_material(setting: str | float | Mapping[str, Any], name: str = "default") -> Material:
-    """A material from a scene file's value: a name of `NAMED_REFLECTANCES`, a grey number in [0, 1], or a table
-    with `wavelength_nm` and `value`. Raises InputError, which calls the setting by `name`."""
+    """Return the material for a value of a scene file.
+
+    `setting` is a name of `NAMED_REFLECTANCES`, a grey number in [0, 1], or a table with `wavelength_nm` and
+    `value`. `name` identifies the setting in messages. Raises InputError.
+    """
     where = f"spacecraft material {name!r}"
     if isinstance(setting, str):
         if setting not in NAMED_REFLECTANCES:
@@ -116,8 +122,11 @@ def make_material(setting: str | float | Mapping[str, Any], name: str = "default
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Part:
-    """Faces of one material. `vertices_B_m` float64[n, 3], `faces` int64[m, 3], outward winding where the file
-    has it; the mesh need not be closed."""
+    """Hold the faces of one material.
+
+    `vertices_B_m` is float64[n, 3], `faces` int64[m, 3]. The winding is outward if it is so in the file. The mesh
+    need not be closed.
+    """
 
     name: str
     vertices_B_m: F64
@@ -127,10 +136,11 @@ class Part:
 
 @dataclass(frozen=True, kw_only=True)
 class HingePose:
-    """A turn of a part by `angle_deg` about the axis through `hinge_B_m`, right-handed; `axis_B` of any length.
+    """Describe a right-handed turn of a part by `angle_deg` about an axis through `hinge_B_m`.
 
-    Hinge and axis are those of the vehicle at rest, before any pose: where a parent turns, its children's hinges
-    turn with it.
+    `axis_B` may have any length above 0. Hinge and axis refer to the vehicle at rest, before any pose. If a parent
+    turns, its children's hinges turn with it. Raises InputError for numbers that are not finite or an axis
+    of length 0.
     """
 
     hinge_B_m: tuple[float, float, float]
@@ -145,7 +155,7 @@ class HingePose:
             raise InputError("pose: axis = [0, 0, 0]: must have a length")
 
     def moved(self, points_B_m: F64) -> F64:
-        """The points, float64[n, 3], turned."""
+        """Return the points, float64[n, 3], after the turn."""
         hinge, axis = np.array(self.hinge_B_m, dtype=float), np.array(self.axis_B, dtype=float)
         turn = Rotation.from_rotvec(np.radians(self.angle_deg) * axis / np.linalg.norm(axis))
         return np.asarray(turn.apply(points_B_m - hinge) + hinge)
@@ -153,8 +163,11 @@ class HingePose:
 
 @dataclass(frozen=True, kw_only=True)
 class ModelPlacement:
-    """Where a file's axes V lie in B: p_B = Rx(roll) · Ry(pitch) · Rz(yaw) · p_V + translation, the order of
-    angles of `frames.L_from_C`. GLB files are by convention y up, z forward, x left: yaw_deg = 180 makes that B."""
+    """Describe the position of a file's axes V in B: p_B = Rx(roll) · Ry(pitch) · Rz(yaw) · p_V + translation.
+
+    The order of the angles is that of `frames.L_from_C`. By convention GLB files have y up, z forward and x left;
+    yaw_deg = 180 turns these axes into those of B.
+    """
 
     roll_deg: float = 0.0
     pitch_deg: float = 0.0
@@ -163,16 +176,16 @@ class ModelPlacement:
 
     @property
     def B_from_V(self) -> F64:
-        """Rotation matrix, float64[3, 3]."""
+        """Return the rotation matrix, float64[3, 3]."""
         roll, pitch, yaw = np.radians([self.roll_deg, self.pitch_deg, self.yaw_deg])
         return np.asarray(rx(roll) @ ry(pitch) @ rz(yaw))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SpacecraftMesh:
-    """All parts as one mesh, what the renderer takes.
+    """Hold all parts as one mesh for the renderer.
 
-    `vertices_B_m` float32[n, 3], `faces` int32[m, 3], `face_material` int32[m], an index into `materials`.
+    `vertices_B_m` is float32[n, 3], `faces` int32[m, 3]. `face_material` int32[m] is an index into `materials`.
     """
 
     vertices_B_m: NDArray[np.float32]
@@ -181,35 +194,41 @@ class SpacecraftMesh:
     materials: tuple[Material, ...]
 
     def reflectance(self, wavelength_nm: F64) -> F64:
-        """Lambert reflectance, float64[material, band]."""
+        """Return the Lambert reflectance, float64[material, band]."""
         return np.stack([material.at(wavelength_nm) for material in self.materials])
 
     @cached_property
     def outline_B_m(self) -> F64:
-        """Vertices that tell how far the vehicle reaches, float64[256, 3]: every n-th, or some more than once."""
+        """Return 256 vertices that show how far the vehicle reaches, float64[256, 3].
+
+        They are evenly spaced in the list of vertices; a small mesh repeats some.
+        """
         n = len(self.vertices_B_m)
         return self.vertices_B_m[np.linspace(0, n - 1, 256).astype(int)].astype(np.float64)
 
     def blocked(self, directions_B: F64) -> NDArray[np.bool_]:
-        """Which of the rays from the pupil's centre along `directions_B`, float64[n, 3], meet the vehicle."""
+        """Return which rays from the pupil's centre along `directions_B`, float64[n, 3], meet the vehicle."""
         corner = self.vertices_B_m.astype(np.float64)[self.faces]
         a, b, c = corner[:, 0], corner[:, 1], corner[:, 2]
         normal = np.cross(b - a, c - a)
         height = np.einsum("ij,ij->i", a, normal)
         sides = np.stack([np.cross(a, b), np.cross(b, c), np.cross(c, a)])
         hit = np.zeros(len(directions_B), dtype=bool)
-        step = max(1, 4_000_000 // max(1, len(self.faces)))  # rays at a time: 100 MB
+        step = max(1, 4_000_000 // max(1, len(self.faces)))  # number of rays at once, which limits memory to 100 MB
         for start in range(0, len(directions_B), step):
             some = directions_B[start : start + step]
-            # inside the cone that a triangle spans from the origin, on the side it lies on
+            # the ray must lie inside the cone of a triangle from the origin, and on the triangle's side
             turn = some @ sides.transpose(0, 2, 1)
             within = (turn >= 0).all(axis=0) | (turn <= 0).all(axis=0)
             hit[start : start + step] = (within & ((some @ normal.T) * height > 0)).any(axis=1)
         return hit
 
     def blocked_fraction(self, fov_deg: float, side: int = 64) -> float:
-        """Share of a square image of the full field `fov_deg`, boresight in its middle, that the vehicle covers,
-        from `side`² rays."""
+        """Return the fraction of a square image that the vehicle covers, from `side`² rays.
+
+        `fov_deg` is the full field of view of the image.
+        The boresight is in the centre of the image.
+        """
         at = (np.arange(side) + 0.5) / side * 2 - 1
         slope = np.tan(np.radians(fov_deg) / 2) * at
         x, y = np.meshgrid(slope, slope)
@@ -218,21 +237,21 @@ class SpacecraftMesh:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Spacecraft:
-    """A vehicle: its parts, at rest or posed, and the `hinges` that its maker knows of, by name, at angle 0."""
+    """Hold a vehicle: its parts, at rest or posed, and by name the `hinges` that its maker defines, at angle 0."""
 
     parts: tuple[Part, ...]
     hinges: Mapping[str, HingePose] = field(default_factory=dict)
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Every name a table may use: the paths of parts, their leading pieces, and single names in them."""
+        """Return all names that a table may use: paths of parts, their leading pieces, and single names in them."""
         keys = dict.fromkeys(key for part in self.parts for key in _keys(part.name))
         return tuple(keys)
 
     def posed(self, poses: Mapping[str, HingePose]) -> Spacecraft:
-        """The vehicle with the named parts turned, sub-parts with them. Of nested poses the inner acts first.
+        """Return the vehicle with the named parts turned, together with their sub-parts.
 
-        Raises InputError for a name that no part has.
+        Of nested poses the inner one acts first. Raises InputError for a name that no part has.
         """
         _refuse_unknown(poses, self.names, "pose")
 
@@ -248,7 +267,7 @@ class Spacecraft:
         return replace(self, parts=tuple(turned(part) for part in self.parts))
 
     def merged(self) -> SpacecraftMesh:
-        """All parts as one mesh; equal materials are joined, in the order in which they come first."""
+        """Return all parts as one mesh. Equal materials are merged, in the order of their first use."""
         materials = tuple(dict.fromkeys(part.material for part in self.parts))
         first = np.cumsum([0, *(len(part.vertices_B_m) for part in self.parts)])
         return SpacecraftMesh(
@@ -262,7 +281,7 @@ class Spacecraft:
 
 
 def _keys(name: str) -> list[str]:
-    """Names that a part of this path goes by, the innermost first: of `a/b` these are `a/b`, `b`, `a`."""
+    """Return the names of a part with this path, the innermost first: `a/b` has `a/b`, `b`, `a`."""
     pieces = name.split("/")
     keys: list[str] = []
     for depth in range(len(pieces), 0, -1):
@@ -271,6 +290,7 @@ def _keys(name: str) -> list[str]:
 
 
 def _refuse_unknown(table: Iterable[str], known: Iterable[str], what: str) -> None:
+    """Raise InputError for the first key of a table that is not a known name."""
     names = sorted(set(known))
     for key in table:
         if key not in names:
@@ -289,30 +309,32 @@ def load_spacecraft(
     poses: Mapping[str, HingePose] | None = None,
     default_material: str | float | Mapping[str, Any] = 0.3,
 ) -> Spacecraft:
-    """Read a vehicle, place it in B, give its parts their materials and turn them.
+    """Read a vehicle from a file, place it in B, assign its materials and turn its parts.
 
     Parameters
     ----------
     path
-        OBJ, GLB or GLTF. Parts are an OBJ's objects (`o`) and the groups within (`g`), named `object/group`, or
-        the nodes of a GLB, named by their path; each is split by material (`usemtl`). Polygons are triangulated.
-        Textures, colours and .mtl files are not read.
+        OBJ, GLB or GLTF file. In an OBJ file, parts are the objects (`o`) and the groups in them (`g`), named
+        `object/group`. In a GLB file, parts are the nodes, named by their path. Each part is split by material
+        (`usemtl`). Polygons are triangulated. Textures, colours and .mtl files are not read.
     unit
-        Unit of the file: "m", "cm" or "mm". GLB is in metres by its standard.
+        Unit of the file: "m", "cm" or "mm". The GLB standard uses metres.
     placement
-        The file's axes and origin in B; by default they are B's.
+        Axes and origin of the file in B; by default they are those of B.
     materials
-        By part or by the file's material, `make_material`'s settings. The first that is named holds: the part's
-        path, its name, its parents' from the nearest on, the file's material. Next comes a material of the file
-        that is itself named in `NAMED_REFLECTANCES`, then `default_material`.
+        Settings for `make_material` by part or by the file's material. The first match applies: the part's path,
+        its name, its parents' names from the nearest on, the file's material. Next follows a material of the file
+        whose name is in `NAMED_REFLECTANCES`, then `default_material`.
     poses
-        By part, in B after the placement: see `Spacecraft.posed`.
+        Poses by part, in B after the placement: see `Spacecraft.posed`.
+    default_material
+        Setting for all other parts.
 
     Raises
     ------
     InputError
-        The file is missing, unreadable, of another type, empty or larger than 200 m; has a NaN; or a table names
-        no part of it. Faces without area are dropped in silence.
+        The file is missing, unreadable, of another type, empty or larger than 200 m, or has a NaN; or a table names
+        no part of it. Faces without area are dropped without a message.
     """
     path = Path(path)
     if unit not in METRES_PER:
@@ -355,6 +377,7 @@ def load_spacecraft(
 
 
 def _read(path: Path) -> list[MeshPart]:
+    """Read the parts of a file. Raises InputError for missing faces or coordinates out of range."""
     data = resources.read_input(path, "spacecraft", types=FILE_TYPES)
     if path.suffix.lower() == ".obj":
         pieces = meshes.read_obj(data, str(path), name=path.stem)
@@ -374,7 +397,7 @@ def _read(path: Path) -> list[MeshPart]:
 
 
 def _without_degenerate_faces(piece: MeshPart) -> MeshPart:
-    """Without faces of no area, and without the vertices that no face names."""
+    """Return the part without faces of zero area, and without vertices that no face uses."""
     a, b, c = (piece.vertices[piece.faces[:, k]] for k in range(3))
     area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
     corners = piece.vertices[np.unique(piece.faces)]
@@ -385,7 +408,8 @@ def _without_degenerate_faces(piece: MeshPart) -> MeshPart:
 
 # ------------------------------------------------------------------------------------ the default vehicle
 
-# The bus, metres: its front panel lies 6 cm behind the pupil, which looks out of a short barrel.
+# Size and position of the bus in metres. Its front panel lies 6 cm behind the pupil, which looks out of a short
+# barrel.
 BUS_SIZE_M = (1.2, 1.0, 1.2)
 BUS_CENTRE_M = (0.0, 0.0, -0.66)
 BARREL_RADIUS_M = 0.05
@@ -401,6 +425,7 @@ _CORNERS = {
 
 @lru_cache(maxsize=1)
 def _default_at_rest() -> Spacecraft:
+    """Build the default vehicle with all joints at angle 0."""
     hinges: dict[str, HingePose] = {}
     parts: list[Part] = []
 
@@ -430,7 +455,7 @@ def _default_at_rest() -> Spacecraft:
     add("bus/body", box(BUS_CENTRE_M, BUS_SIZE_M), "gold_mli")
     add("bus/radiator", box((0.0, -0.25, -0.055), (0.9, 0.35, 0.02)), "white_paint")
     add("bus/camera_barrel", rod((0, 0, -0.08), (0, 0, -0.01), BARREL_RADIUS_M, 32), "black_paint")
-    # a bell that opens downwards, its wall 1 cm thick
+    # the bell opens downwards and has a wall of 1 cm
     bell = [(0.0, 0.0), (0.06, 0.0), (0.21, 0.3), (0.2, 0.3), (0.05, 0.01), (0.0, 0.01)]
     add("bus/engine", revolved(bell, (0.0, 0.48, -0.66), (0, 1, 0)), "black_paint")
 
@@ -442,7 +467,7 @@ def _default_at_rest() -> Spacecraft:
             rod((sign * 0.58, 0, ARRAY_HINGE_Z_M), (sign * 0.96, 0, ARRAY_HINGE_Z_M), 0.025),
             "aluminium",
         )
-        # cells face up, -y, in the rest position; a sheet on the panel
+        # at rest the cells face up (-y); they are a thin sheet on the panel
         add(f"{wing}/panel", box((sign * 1.95, 0, ARRAY_HINGE_Z_M), (2.0, 0.02, 0.9)), "black_paint")
         add(f"{wing}/cells", box((sign * 1.95, -0.011, ARRAY_HINGE_Z_M), (1.96, 0.006, 0.86)), "solar_cell")
 
@@ -474,24 +499,27 @@ def _default_at_rest() -> Spacecraft:
 def default_spacecraft(
     *, solar_array_deg: float = 0.0, leg_fold_deg: float = 0.0, antenna_deg: float = 0.0
 ) -> Spacecraft:
-    """A lander whose camera looks out of its front panel, in B; every part is a closed mesh.
+    """Return a lander in B whose camera looks out of its front panel. Every part is a closed mesh.
 
-    A box of 1.2 × 1.0 × 1.2 m in gold foil behind the pupil (z from -1.26 to -0.06 m), two solar arrays of
-    2.0 × 0.9 m to the sides, an antenna dish of 0.9 m on top (-y), an engine and four legs below (+y). The two
-    front footpads, 1.5 m ahead, are all that the camera sees: in the lower corners of a field of 65°, 1.7 % of a
-    square image; nothing within 35° of the boresight. Folding the legs takes them through the field's sides.
+    A box of 1.2 × 1.0 × 1.2 m in gold foil lies behind the pupil (z from -1.26 to -0.06 m). Two solar arrays of
+    2.0 × 0.9 m extend to the sides. An antenna dish of 0.9 m is on top (-y), an engine and four legs are below
+    (+y). The camera sees only the two front footpads, 1.5 m ahead. They are in the lower corners of a field of 65°
+    and cover 1.7 % of a square image; nothing is within 35° of the boresight. Folding the legs moves them through
+    the sides of the field.
 
     Parameters
     ----------
     solar_array_deg
-        Turn of both arrays about +x: at 0 the cells face up (-y), at -90 ahead (+z), at 90 back (-z).
+        Turn of both arrays about +x. The cells face up (-y) at 0, ahead (+z) at -90 and back (-z) at 90.
     leg_fold_deg
-        Turn of the legs about +x from the deployed position, front legs forwards and up, hind legs backwards and
+        Turn of the legs about +x from the deployed position: front legs forwards and up, hind legs backwards and
         up.
     antenna_deg
         Turn of the dish about +x.
 
-    The poses of single parts: `default_spacecraft().posed({name: replace(hinges[name], angle_deg=…)})`.
+    Notes
+    -----
+    Single parts are posed with `default_spacecraft().posed({name: replace(hinges[name], angle_deg=…)})`.
     """
     vehicle = _default_at_rest()
     angle = {"antenna": antenna_deg}
