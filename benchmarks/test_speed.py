@@ -1,11 +1,11 @@
-"""How fast a labelled sample is made, against the tracing bound and against Blender Cycles.
+"""Measure how fast a labelled sample is made, compared with the tracing bound and with Blender Cycles.
 
     python -m pytest benchmarks --benchmark-only -n 0
-    python -m pytest benchmarks --benchmark-only -n 0 --picture pair.png     (look whether both show the same)
+    python -m pytest benchmarks --benchmark-only -n 0 --picture pair.png     (to compare both images by eye)
 
-1024×1024 pixels, 16 samples per pixel, direct light, 1.2 million triangles that fill the frame, one run.
-Every round times bound, render, truth, the stages after it and the store in turn, so that whatever else the
-machine does falls on all alike. The table comes at the end. Cycles is optional: see `blender_cycles.py`.
+The image has 1024×1024 pixels with 16 samples per pixel; 1.2 million triangles fill the frame. Every round times
+the bound, the render, the truth, the later stages and the store one after the other, so that other load on the
+machine affects all of them equally. The table is printed at the end. Cycles is optional: see `blender_cycles.py`.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from vbnfault.pipeline.spec import Frame
 
 @pytest.fixture(scope="session")
 def workload(request: pytest.FixtureRequest) -> Workload:
-    """The sample, its terrain built once."""
+    """Return the benchmark's sample; its terrain is built once."""
     return Workload.load(request.config.getoption("--size"), facet_m=request.config.getoption("--facet-m"))
 
 
