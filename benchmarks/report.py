@@ -20,6 +20,7 @@ class Target:
 
     @property
     def met(self) -> bool:
+        """Whether the ratio keeps its limit."""
         return self.ratio >= self.limit if self.least else self.ratio <= self.limit
 
 

@@ -33,12 +33,14 @@ def workload(request: pytest.FixtureRequest) -> Workload:
 
 @pytest.fixture
 def rounds(request: pytest.FixtureRequest) -> int:
+    """Return the number of timed rounds."""
     return request.config.getoption("--rounds")
 
 
 def test_labelled_sample(
     benchmark: Any, workload: Workload, results: dict[str, float], rounds: int, tmp_path: Path
 ) -> None:
+    """Time one labelled sample, stage by stage, and the tracing bound."""
     folder, taken = workload.empty_store(tmp_path / "store.zarr"), []
 
     def one_round() -> Frame:
@@ -66,6 +68,7 @@ def test_cycles(
     bounces: int,
     request: pytest.FixtureRequest,
 ) -> None:
+    """Time Blender's render of the same scene, and check that both images agree."""
     try:
         python = interpreter()
     except Unavailable as why:
@@ -100,6 +103,7 @@ def test_cycles(
 
 @pytest.fixture(scope="session", autouse=True)
 def _enforce(results: dict[str, float], request: pytest.FixtureRequest) -> Iterator[None]:
+    """Fail at the end of the session if a target is missed and `--enforce` is given."""
     yield
     if results and request.config.getoption("--enforce"):
         missed = [t.what for t in targets(results) if not t.met]
@@ -107,6 +111,7 @@ def _enforce(results: dict[str, float], request: pytest.FixtureRequest) -> Itera
 
 
 def _write_pair(path: Path, ours: np.ndarray, theirs: np.ndarray) -> None:
+    """Write both images side by side as a PNG, each scaled to its 99th percentile."""
     shown = [np.clip(255 * (p / np.percentile(p, 99)) ** (1 / 2.2), 0, 255) for p in (ours, theirs)]
     path.parent.mkdir(parents=True, exist_ok=True)
     assert cv2.imwrite(str(path), np.hstack(shown).astype(np.uint8))

@@ -373,6 +373,7 @@ def _flatten(value: Any, key: str = "") -> Iterator[tuple[str, Any]]:
 
 
 def _list(values: Sequence[int]) -> str:
+    """Return block sizes as text: `8 + 4`."""
     return " + ".join(str(v) for v in values)
 
 

@@ -135,5 +135,6 @@ def _span(low: float, high: float) -> str:
 
 
 def _bounds(pair: tuple[float, float] | None) -> str:
+    """Return bounds as text; a resolved scene has no None."""
     assert pair is not None
     return _range(*pair)

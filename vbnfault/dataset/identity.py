@@ -305,6 +305,7 @@ class _Session:
     contents: resources.Contents
 
     def simulate(self, index: int) -> Sample:
+        """Return a sample. Raises InputChanged if an input file has changed."""
         with self.contents.in_use():
             return self.session.simulate(index)
 

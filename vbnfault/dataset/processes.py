@@ -211,7 +211,7 @@ class Pool:
             self._run.tick(sample, what, payload)
 
     def _mourn(self, worker: _Process) -> None:
-        """Replace a worker that died; raise VbnfaultError if two died before they began a sample."""
+        """Replace a worker that died; raise VbnfaultError at the second death between samples."""
         self._workers.remove(worker)
         worker.stop()
         worker.join()

@@ -65,6 +65,7 @@ class Progress:
         return f"{unit}, {duration_text((self._total - self._done) / rate)} left"
 
     def _line(self) -> str:
+        """Return the progress as one line."""
         return f"{self._done}/{self._total} samples, {self._pace()}"
 
     def advance(self, built: bool) -> None:

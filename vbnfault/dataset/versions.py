@@ -44,10 +44,12 @@ def made_now(
 
 
 def _entries(attributes: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Return the tables of `versions_of_samples`; none if the attribute is missing."""
     return list(attributes.get(VERSIONS_OF_SAMPLES, ()))
 
 
 def _samples(entry: Mapping[str, Any]) -> set[int]:
+    """Return the samples in the ranges of a table."""
     return {i for first, last in entry["samples"] for i in range(first, last + 1)}
 
 

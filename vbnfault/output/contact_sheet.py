@@ -230,10 +230,12 @@ def _write(image: U8, text: str, at: tuple[int, int], colour: tuple[int, int, in
 
 
 def _text_width(text: str, scale: float) -> int:
+    """Return the width of text in pixels."""
     return int(cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, scale, 1)[0][0])
 
 
 def _write_png(path: Path, rgb: U8) -> None:
+    """Write an RGB image; a path that cannot be used raises InputError, any other failure VbnfaultError."""
     if path.suffix.lower() != ".png":
         raise InputError(f"{path}: the sheet is a PNG, so its name must end in .png")
     encoded = cv2.imencode(".png", np.ascontiguousarray(rgb[..., ::-1]))[1]

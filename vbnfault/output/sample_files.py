@@ -119,6 +119,7 @@ def _plain(sample: Sample) -> dict[str, Any]:
 
 
 def _write_png(path: Path, array: NDArray[np.uint8]) -> Path:
+    """Write an image, uint8[y, x] or [y, x, 3] B, G, R, and return its path."""
     ok, data = cv2.imencode(".png", np.ascontiguousarray(array))
     if not ok:
         raise VbnfaultError(f"{path}: PNG encoding failed")
@@ -127,6 +128,7 @@ def _write_png(path: Path, array: NDArray[np.uint8]) -> Path:
 
 
 def _write_exr(frame: Frame, sample: Sample, path: Path) -> Path:
+    """Write radiance, truth and soft layers to one EXR file and return its path."""
     import OpenEXR
 
     truth = frame.truth

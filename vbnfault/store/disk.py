@@ -21,8 +21,8 @@ from typing import TypeVar
 from ..core.errors import VbnfaultError
 
 PARTIAL = ".partial"
-# parallel flushes. Measured on ext4 for the 42 files and 90 folders of a shard: 45-600 ms one after the other,
-# 15-35 ms with eight in parallel
+# Number of parallel flushes. Measured on ext4, the 42 files and 90 folders of a shard take 45-600 ms one after the
+# other, and 15-35 ms eight at a time.
 _FLUSHES = 8
 T = TypeVar("T")
 _UNSUPPORTED = (errno.EINVAL, errno.ENOTSUP)  # errors of file systems that cannot flush a folder
@@ -34,7 +34,7 @@ class Misplaced(OSError):
 
 @contextlib.contextmanager
 def explained(path: Path, doing: str) -> Iterator[None]:
-    """Turn an OSError into a VbnfaultError with one sentence for the user."""
+    """Turn an OSError in a `with` block into a VbnfaultError with one sentence for the user."""
     try:
         yield
     except OSError as error:

@@ -425,6 +425,7 @@ def _lock_folder(folder: Path, *, wait: bool) -> int | None:
 
 
 def _unlock_folder(lock: int | None) -> None:
+    """Release the lock that `_lock_folder` returned, if any."""
     if lock is not None:
         os.close(lock)
 

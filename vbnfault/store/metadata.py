@@ -90,6 +90,7 @@ _ABSENT = "absent"
 
 
 def _differ(a: Any, b: Any) -> bool:
+    """Return whether two JSON values differ; 1, 1.0 and true are different."""
     return canonical(a) != canonical(b)
 
 

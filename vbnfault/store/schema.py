@@ -18,7 +18,7 @@ from ..core.quantities import CHANNELS, DEFECTS, soft_kind
 from ..scene.plan import SPLITS, STRATA
 
 # Version 2 added the group `spare`, the checksum of the root, eight coefficients of `distortion`, and further
-# arrays. A store of another version is refused, because its arrays could not be told from damaged ones.
+# arrays. A store of another version is refused, because its arrays could not be distinguished from damaged ones.
 FORMAT_VERSION = 2
 SEMANTIC = ("sky", "body", "sun", "spacecraft")
 
