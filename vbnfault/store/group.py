@@ -487,7 +487,8 @@ def is_store(path: str | os.PathLike[str]) -> bool:
 def open_store(path: str | os.PathLike[str] | Store, mode: str = "r") -> Store:
     """Open a store for reading (`r`) or writing (`r+`).
 
-    If its root is damaged, the copy in `spare` is used; mode `r` then warns. An open `Store` is returned as it is.
+    If its root is damaged, the copy in `spare` is used. Mode `r` warns if either of them is damaged. An open
+    `Store` is returned as it is.
     Raises InputError if the path holds no store, or a store of another format version.
     """
     if isinstance(path, Store):

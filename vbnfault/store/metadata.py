@@ -119,8 +119,8 @@ def _root_differences(
 ) -> Iterator[str]:
     """Yield a sentence for each error in the root's document, attributes excepted.
 
-    The consolidated metadata matter because readers look there first. They are compared for `sound` arrays only:
-    any other array is reported already.
+    The consolidated metadata matter because readers look there first. They must list no unknown array. They are
+    compared for `sound` arrays only: any other array is reported already.
     """
     root = read_document(store.path / DOCUMENT)
     if root is None:
@@ -167,9 +167,9 @@ def append_samples(
 def recover(path: str | os.PathLike[str]) -> Store:
     """Repair a store's metadata and open it for writing. No other process may write to it meanwhile.
 
-    Removes the `*.partial` files of killed processes. Rewrites root, `spare`, the metadata of arrays and the
-    coordinates if they differ from what the root attributes require. A missing array gets its metadata again, but
-    no data.
+    This removes the `*.partial` files of killed processes. It rewrites root, `spare`, the metadata of arrays and
+    the coordinates if they differ from what the root attributes require. A missing array gets its metadata again,
+    but no data.
     """
     store = open_store(path, "r+")
     with disk.explained(store.path, "recovering the store"):
