@@ -1,16 +1,16 @@
-"""Blender Cycles on the same picture: same mesh, pose, Sun and sample count, direct light alone.
+"""Render the same image with Blender Cycles: same mesh, pose, Sun and sample count, direct light or one bounce.
 
-Blender is optional and runs in a process of its own: its wheel (`pip install bpy`, Blender 5.0, Python 3.11)
-asks for numpy < 2, vbnfault for numpy >= 2.1, so the two cannot share an environment. Make another one,
+Blender is optional and runs in its own process. Its wheel (`pip install bpy`, Blender 5.0, Python 3.11) requires
+numpy < 2, and vbnfault requires numpy >= 2.1, so the two cannot share an environment. Make another environment,
 
     python3.11 -m venv blender && blender/bin/pip install bpy==5.0.1 --extra-index-url https://download.blender.org/pypi/
 
-and name its interpreter in VBNFAULT_BPY_PYTHON. The wheel links to these Debian packages, part of
-most desktop installations: libx11-6 libxfixes3 libxi6 libxrender1 libxkbcommon0 libsm6 libice6 libgl1.
+and set VBNFAULT_BPY_PYTHON to its interpreter. The wheel needs these Debian packages, which most desktop
+installations include: libx11-6 libxfixes3 libxi6 libxrender1 libxkbcommon0 libsm6 libice6 libgl1.
 
-(This file cannot be called cycles.py, since Blender has a module of that name.)
-It is both sides: imported it starts and drives that process, run by Blender's interpreter it renders.
-Only numpy and the standard library are imported on top, since that interpreter has no vbnfault.
+This file holds both sides: imported, it starts and controls the Blender process; run by Blender's interpreter, it
+renders. That interpreter has no vbnfault, so the imports at the top are numpy and the standard library only. The
+file cannot be called cycles.py, because Blender has a module of that name.
 """
 
 from __future__ import annotations
@@ -27,15 +27,15 @@ from typing import Any
 import numpy as np
 
 VARIABLE = "VBNFAULT_BPY_PYTHON"
-_ANSWER = "vbnfault:"  # Blender prints whatever it likes; our lines begin with this
+_ANSWER = "vbnfault:"  # start of our lines among those that Blender prints
 
 
 class Unavailable(Exception):
-    """No interpreter with Blender; the message says what to do."""
+    """There is no interpreter with Blender; the message says what to do."""
 
 
 def interpreter() -> str:
-    """The interpreter that can `import bpy`. Raises Unavailable."""
+    """Return the path of an interpreter that can `import bpy`. Raises Unavailable."""
     chosen = os.environ.get(VARIABLE, sys.executable)
     try:
         tried = subprocess.run([chosen, "-c", "import bpy"], capture_output=True, text=True, check=False)
@@ -53,8 +53,18 @@ def interpreter() -> str:
 class Cycles:
     """A Blender process that holds one scene; a context manager.
 
-    `vertices_m` float32[n, 3] and `faces` int32[m, 3] in L, `flat` bool[m]; position, attitude and Sun
-    as in `vbnfault.render.description`.
+    Parameters
+    ----------
+    python
+        Result of `interpreter`.
+    vertices_m, faces
+        Mesh in L, float32[n, 3] and int32[m, 3].
+    flat
+        Faces without smooth shading, bool[m].
+    position_L_m, L_from_C, sun_direction_L, sun_angular_radius_rad
+        As in `vbnfault.render.description`.
+    bounces
+        Number of diffuse bounces; 0 is direct light only.
     """
 
     def __init__(
@@ -114,20 +124,22 @@ class Cycles:
         self._folder.cleanup()
 
     def render(self) -> float:
-        """Seconds of one render call; only the first one builds the BVH."""
+        """Render once and return the duration in s; only the first call builds the BVH."""
         return float(self._ask("render"))
 
     def picture(self) -> np.ndarray:
-        """The last render, linear grey float32[y, x], top row first."""
+        """Return the last render, linear grey, float32[y, x], top row first."""
         return np.load(self._ask("picture"))
 
     def _ask(self, command: str) -> str:
+        """Send a command to Blender and return its answer."""
         assert self._process.stdin is not None
         self._process.stdin.write(command + "\n")
         self._process.stdin.flush()
         return self._listen()
 
     def _listen(self) -> str:
+        """Return Blender's next answer; raise RuntimeError if it has ended."""
         assert self._process.stdout is not None
         for line in self._process.stdout:
             if line.startswith(_ANSWER):
@@ -140,6 +152,7 @@ class Cycles:
 
 
 def _set_up(folder: Path) -> Any:
+    """Make the Blender scene from the files in `folder` and return it."""
     import bpy
     from mathutils import Matrix, Vector
 
@@ -174,7 +187,7 @@ def _set_up(folder: Path) -> Any:
     camera = bpy.data.objects.new("camera", lens)
     L_from_C = np.array(numbers["L_from_C"])
     pose = np.eye(4)
-    pose[:3, :3] = L_from_C * [1, -1, -1]  # Blender's camera: y up, looking along -z
+    pose[:3, :3] = L_from_C * [1, -1, -1]  # Blender's camera has y up and looks along -z
     pose[:3, 3] = numbers["position"]
     camera.matrix_world = Matrix(pose.tolist())
     scene.collection.objects.link(camera)
@@ -204,12 +217,13 @@ def _set_up(folder: Path) -> Any:
     cycles.glossy_bounces = cycles.transmission_bounces = 0
     cycles.volume_bounces = cycles.transparent_max_bounces = 0
     cycles.pixel_filter_type = "BOX"
-    cycles.use_light_tree = False  # one lamp
+    cycles.use_light_tree = False  # useless with one lamp
     cycles.caustics_reflective = cycles.caustics_refractive = False
     return scene
 
 
 def _serve(folder: Path) -> None:
+    """Answer the commands on standard input until it closes."""
     import time
 
     import bpy
@@ -234,7 +248,7 @@ def _serve(folder: Path) -> None:
             image.pixels.foreach_get(pixels)
             bpy.data.images.remove(image)
             out = folder / "cycles.npy"
-            np.save(out, pixels.reshape(size, size, 4)[::-1, :, 0])  # Blender's rows go up
+            np.save(out, pixels.reshape(size, size, 4)[::-1, :, 0])  # Blender's first row is the lowest
             answer(out)
 
 

@@ -1,4 +1,4 @@
-"""Options of the benchmarks, and the table at the end of the run."""
+"""Define the options of the benchmarks, and print the table at the end of a run."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def pytest_configure(config: pytest.Config) -> None:
 
 @pytest.fixture(scope="session")
 def results(request: pytest.FixtureRequest) -> dict[str, float]:
-    """Median seconds by name, for the table."""
+    """Return the median durations in s by name; the tests fill them in for the table."""
     return request.config.stash[RESULTS]
 
 

@@ -1,6 +1,8 @@
-"""The detector's chain with every effect on, as the benchmarks time it.
+"""Time the detector's chain with every effect on; `test_speed` uses the same chain.
 
-python benchmarks/detector_chain.py      (milliseconds of each sensor and demosaic, 1024×1024, medians of five)
+    python benchmarks/detector_chain.py
+
+Prints milliseconds for each kind of sensor and demosaic method, at 1024×1024 pixels, as medians of five images.
 """
 
 from __future__ import annotations
@@ -24,7 +26,7 @@ from vbnfault.lens import ThinLens
 KINDS = ("full_frame_ccd", "frame_transfer_ccd", "interline_ccd", "cmos")
 DEMOSAICS = ("malvar", "menon")
 EXPOSURE_S = 0.02
-# What happens inside the mosaic, every class; those of a transfer act through the sensor below.
+# Every fault class inside the mosaic; effects of the charge transfer come from the sensor below.
 FAULTS = (
     "broken_pixels/hot_pixels",
     "cosmic_rays",
@@ -37,7 +39,7 @@ FAULTS = (
 
 
 def busy_sensor(architecture: str, demosaic: str) -> Sensor:
-    """A sensor that leaves no effect out."""
+    """Return a packaged sensor with every effect of its architecture switched on."""
     sensor = load_sensor("generic_cmos" if architecture == "cmos" else "generic_ccd")
     individual = replace(
         sensor.individual,
@@ -96,7 +98,7 @@ def busy_sensor(architecture: str, demosaic: str) -> Sensor:
 
 @dataclass(frozen=True, eq=False)
 class Chain:
-    """Pictures of one scene with one sensor: noise, every effect, demosaic."""
+    """One scene and one sensor: `expose` takes images with noise, every effect and the demosaic."""
 
     context: FaultContext
     light: Electrons
@@ -104,7 +106,7 @@ class Chain:
 
     @classmethod
     def of(cls, architecture: str, demosaic: str, light: np.ndarray) -> Chain:
-        """Under `light`, float32[y, x, colour], shares of white."""
+        """Return the chain for `light`, float32[y, x, colour], in fractions of white."""
         sensor = busy_sensor(architecture, demosaic)
         height, width = light.shape[:2]
         detector = MosaicDetector(sensor=sensor, seed=1, width_px=width, height_px=height)
@@ -126,8 +128,8 @@ class Chain:
         return cls(context, Electrons(array=(light * white).astype(np.float32), white_e=white), faults)
 
     def expose(self, number: int = 0) -> np.ndarray:
-        """One picture, uint8[y, x, channel]: noise drawn, tracks and defects laid out, everything applied."""
-        context = replace(self.context)  # nothing kept from the picture before
+        """Take one image, uint8[y, x, channel]; draw its noise, tracks and defects anew."""
+        context = replace(self.context)  # a copy, so that nothing is cached from the image before
         acts = {
             step: [fault.act_at(step, p, context) for fault, p in self.faults.values() if step in fault.steps]
             for step in MOSAIC_STEPS
@@ -138,7 +140,7 @@ class Chain:
 
 
 def speckled(size_px: int) -> np.ndarray:
-    """A contrasty scene, some of it beyond the full well, float32[y, x, 3] in shares of white."""
+    """Return a scene of high contrast, partly beyond the full well, float32[y, x, 3] in fractions of white."""
     grains = np.random.default_rng(0).gamma(0.5, 1.0, (size_px, size_px, 3)).astype(np.float32)
     smooth = cv2.GaussianBlur(grains, (0, 0), 3)
     smooth *= 0.4 / smooth.mean()
@@ -148,6 +150,7 @@ def speckled(size_px: int) -> np.ndarray:
 
 
 def main() -> None:
+    """Print the durations."""
     light = speckled(1024)
     for architecture in KINDS:
         for demosaic in DEMOSAICS:

@@ -1,11 +1,11 @@
-"""Every fault inside a detector, alone, on a scene and in the dark, at full size with its mask: to be looked at.
+"""Show every fault class of the detector alone, on a scene and in the dark, at full size with its mask.
 
     python benchmarks/detector_gallery.py --out gallery
     python benchmarks/detector_gallery.py --out gallery --scene physical67p --sample 401
     python benchmarks/detector_gallery.py --out gallery --set camera.detector=generic_ccd --dark-s 5
 
-Of each class: CLASS_scene.png and CLASS_dark.png; on the right the difference from the clean picture, eight times
-as strong about grey, with the mask in green.
+Writes CLASS_scene.png and CLASS_dark.png for each class. The left half is the image. The right half is its
+difference from the clean image, eight times as strong and around grey, with the mask in green.
 """
 
 from __future__ import annotations
@@ -31,6 +31,7 @@ CLASSES = [name for name, models in registry().items() for m in models.values() 
 
 
 def main() -> None:
+    """Write the images and print the drawn parameters."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--scene", default="navcam67p")
@@ -67,6 +68,7 @@ def main() -> None:
 
 
 def _value(text: str) -> object:
+    """Return a setting's value: parsed as JSON if possible, otherwise the text."""
     try:
         return json.loads(text)
     except json.JSONDecodeError:
@@ -74,7 +76,7 @@ def _value(text: str) -> object:
 
 
 def _dark(frame: Frame, exposure_s: float) -> Frame:
-    """The same camera with its cap on."""
+    """Return the frame that the same camera would take without any light."""
     out = Frame(spec=frame.spec)
     out.pose, out.sunlight, out.radiance, out.truth = frame.pose, frame.sunlight, frame.radiance, frame.truth
     out.camera = replace(frame.camera, exposure_s=exposure_s)
@@ -88,6 +90,7 @@ def _dark(frame: Frame, exposure_s: float) -> Frame:
 
 
 def _seen(image: np.ndarray, clean: np.ndarray, mask: np.ndarray) -> np.ndarray:
+    """Return the amplified difference of two images around grey, with the mask in green."""
     change = 8 * (image[..., 2::-1].astype(np.int16) - clean[..., 2::-1]) + 96
     out = np.clip(change, 0, 255).astype(np.uint8)
     out[mask] = (0.75 * out[mask] + 0.25 * np.array([0, 255, 0])).astype(np.uint8)

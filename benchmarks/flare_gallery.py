@@ -1,10 +1,11 @@
-"""Flares of every packaged lens over Sun angles, one sheet a lens:
+"""Draw the flares of every packaged lens at several Sun angles, one sheet a lens.
 
     python benchmarks/flare_gallery.py OUT_FOLDER [--lens NAME ...] [--coating mgf2] [--model traced|paraxial|both]
 
-One row a model, one column an angle; with both models a third row shows where they part: traced over paraxial
-light, red where there is more of it, blue where less, a factor of ten at full colour. Also writes `energy.csv`: the
-flux of all ghosts over the light that enters the pupil, by lens, coating and angle.
+A sheet has one row for each model and one column for each angle. With both models, a third row shows the ratio of
+traced to paraxial irradiance: red if it is above 1, blue if it is below 1, with full colour at a factor of ten. The
+tool also writes `energy.csv`: the flux of all ghosts divided by the flux through the entrance pupil, by lens,
+coating, model and angle.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ FOV_DEG = 60.0
 
 
 def part(traced: np.ndarray, paraxial: np.ndarray) -> np.ndarray:
-    """Ratio of two irradiance pictures as colours, uint8[y, x, 3] R, G, B."""
+    """Return the ratio of two irradiance images as colours, uint8[y, x, 3] R, G, B."""
     floor = 1e-3 * np.percentile(traced, 90)
     ratio = np.clip(np.log10((traced + floor) / (paraxial + floor)), -1, 1)
     out = np.full((*ratio.shape, 3), 255.0)
@@ -37,6 +38,7 @@ def part(traced: np.ndarray, paraxial: np.ndarray) -> np.ndarray:
 
 
 def sheet(name: str, coating: str, models: tuple[str, ...], pixels: int) -> tuple[np.ndarray, list[list[object]]]:
+    """Return the sheet of one lens, uint8[y, x, 3] R, G, B, and its rows of `energy.csv`."""
     lens = load_lens(name).coated(coating)
     columns, energy = [], []
     white = None
@@ -54,7 +56,7 @@ def sheet(name: str, coating: str, models: tuple[str, ...], pixels: int) -> tupl
                 model=model,
             )
             found = flare_images.layers(view)
-            if white is None:  # one exposure for the sheet
+            if white is None:  # the whole sheet has one exposure
                 ghosts = flare_images.colours(view, found["ghosts"] + found["veil"]).max(axis=2)
                 white = float(np.percentile(ghosts, 99)) * 2
             cells.append(flare_images.picture(view, found, white))
@@ -69,6 +71,7 @@ def sheet(name: str, coating: str, models: tuple[str, ...], pixels: int) -> tupl
 
 
 def main() -> None:
+    """Write the sheets and `energy.csv`."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("out", type=Path)
     parser.add_argument("--lens", nargs="*")

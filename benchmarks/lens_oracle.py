@@ -1,6 +1,8 @@
-"""Surfaces met per second by rays sent straight through a lens: optiland's trace, and the project's own.
+"""Compare the speed of ray tracing through a lens, in ray-surface intersections per second, with optiland's.
 
-python benchmarks/lens_oracle.py [--lens NAME]
+    python benchmarks/lens_oracle.py [--lens NAME]
+
+The rays pass the lens without reflection.
 """
 
 from __future__ import annotations
@@ -28,14 +30,17 @@ ROUNDS = 3
 
 
 def optilands(lens: Prescription, count: int) -> tuple[float, float]:
-    """Surfaces of the lens met per second, medians of rounds after one that compiles: by `Optic.trace`, as its
-    users call it, and by its surfaces alone, from rays that are there already and without a record of the way."""
+    """Return optiland's ray-surface intersections per second, twice: medians of the rounds after a warm-up.
+
+    The first figure is that of `Optic.trace`, as users call it. The second is that of its surfaces only, for rays
+    that exist already and without recording their paths.
+    """
     optic = oracle.system(lens)
     for surface in optic.surfaces.surfaces[1:-1]:
-        surface.interaction_model.coating = None  # its intersections and refractions alone
+        surface.interaction_model.coating = None  # to time intersections and refractions only
         surface.aperture = RadialAperture(surface.aperture.r_max)
     across = int(np.ceil(np.sqrt(count)))
-    over_disc = int(np.ceil(np.sqrt(count * 4 / np.pi)))  # its uniform grid keeps to the pupil's disc
+    over_disc = int(np.ceil(np.sqrt(count * 4 / np.pi)))  # optiland's uniform grid leaves out the pupil's corners
     half = first_order(lens).entrance_pupil_diameter_mm / 2 / np.sqrt(2)
     x, y = (v.ravel() for v in np.meshgrid(*[np.linspace(-half, half, across)] * 2))
     one, none = np.ones_like(x), np.zeros_like(x)
@@ -52,18 +57,19 @@ def optilands(lens: Prescription, count: int) -> tuple[float, float]:
 
 
 def rate(lens: Prescription, trace: Callable[[], int]) -> float:
-    """Surfaces met per second by a call that tells how many rays it traced."""
+    """Return the ray-surface intersections per second of a call that returns the number of traced rays."""
     seconds, rays = [], 0
     for _ in range(ROUNDS + 1):
         start = time.perf_counter()
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # numba's, of its own workings
+            warnings.simplefilter("ignore")  # numba's warnings about itself
             rays = trace()
         seconds.append(time.perf_counter() - start)
     return rays * len(lens.surfaces) / statistics.median(seconds[1:])
 
 
 def main() -> None:
+    """Print the speeds."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--lens", default="nikkor_28_f2p8")
     lens = load_lens(parser.parse_args().lens)

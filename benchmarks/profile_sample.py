@@ -1,7 +1,10 @@
-"""Where the time of one sample goes:  python benchmarks/profile_sample.py [SCENE] [--sample I] [--rounds N]
+"""Measure how long each stage of one sample takes.
 
-Prints the stages with their median in ms, after one warm-up; with --functions N also the N functions of our
-own that take longest in the stages after the render (threads are counted where they are waited for).
+    python benchmarks/profile_sample.py [SCENE] [--sample I] [--rounds N]
+
+Prints the median duration of each stage in ms, after one warm-up. With --functions N it also prints the N functions
+of vbnfault that take longest in the stages after the render. The time of a thread counts for the function that
+waits for it.
 """
 
 from __future__ import annotations
@@ -21,7 +24,7 @@ from vbnfault.scene import config
 
 
 def stages(spec: SampleSpec, profile: cProfile.Profile | None = None) -> dict[str, float]:
-    """Seconds per stage of one sample, the render's among them; `profile` sees the stages after it."""
+    """Return the duration in s of each stage of one sample; `profile` records the stages after the render."""
     frame, seconds = Frame(spec=spec), {}
     for stage in pipeline.STAGES:
         after = profile is not None and stage not in (resolve, render_frame)
@@ -35,7 +38,7 @@ def stages(spec: SampleSpec, profile: cProfile.Profile | None = None) -> dict[st
 
 
 def main() -> None:
-    """Command line."""
+    """Print the stages, and the functions if asked for."""
     parser = argparse.ArgumentParser(description="Time per stage of one sample.")
     parser.add_argument("scene", nargs="?", default="quickstart", help="a scene file or a packaged scene")
     parser.add_argument("--sample", type=int, default=0)

@@ -1,4 +1,4 @@
-"""The table of medians, and the ratios that the project aims at."""
+"""Print the table of median durations, and compare ratios of them with the project's targets."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ SAMPLE = ("resolve", "render", "truth", *AFTER)
 
 @dataclass(frozen=True, kw_only=True)
 class Target:
-    """A ratio with the value it must reach (`least`) or keep below."""
+    """A ratio and its limit: a minimum if `least`, otherwise a maximum."""
 
     what: str
     ratio: float
@@ -20,16 +20,17 @@ class Target:
 
     @property
     def met(self) -> bool:
+        """Whether the ratio keeps its limit."""
         return self.ratio >= self.limit if self.least else self.ratio <= self.limit
 
 
 def sample_seconds(seconds: Mapping[str, float]) -> float:
-    """The whole labelled sample."""
+    """Return the duration of a whole labelled sample, in s."""
     return sum(seconds[name] for name in SAMPLE)
 
 
 def targets(seconds: Mapping[str, float]) -> list[Target]:
-    """The ratios of one run; that to Cycles only where it was measured."""
+    """Return the ratios of one run with their limits; those to Cycles only if it was measured."""
     after = sum(seconds[name] for name in AFTER)
     found = [
         Target(
@@ -80,7 +81,7 @@ def targets(seconds: Mapping[str, float]) -> list[Target]:
 
 
 def table(seconds: Mapping[str, float]) -> str:
-    """Medians in ms, then the ratios."""
+    """Return the medians in ms and the ratios, as a text table."""
     names = {
         "bound": "bound: closest hit + shadow ray, one kernel",
         "resolve": "resolve",

@@ -4,10 +4,10 @@
     python benchmarks/scene_counts.py --samples 32 --keep stores navcam67p physical67p
     python benchmarks/scene_counts.py --set camera.width_px=2048 --set camera.height_px=2048 physical67p
 
-Every scene is built with its own geometry, faults, lens and sensor, over coarse ground, and then verified. A scene
-with a detector keeps its own number of pixels, since a small corner of a sensor may hold no defect that shows; of
-the others the width is `--pixels`, and the height follows. The exit status is 1 where a count of the table differs
-from the plan, or where `verify` finds a problem.
+Every scene is built with its own geometry, faults, lens and sensor, over coarse terrain, and then verified. A scene
+with a detector keeps its number of pixels, because a small part of a sensor may have no visible defect. For all
+other scenes, `--pixels` is the width, and the height keeps the aspect ratio. The exit status is 1 if a count
+differs from the plan, or if `verify` reports a problem.
 """
 
 from __future__ import annotations
@@ -32,11 +32,16 @@ HEAD = ("scene", "pixels", "samples", "planned", "realised", "redrawn", "views",
 
 @dataclass(frozen=True, kw_only=True)
 class Counts:
-    """What one scene was to hold and what it holds: samples by fault class, and its samples that took another view.
+    """Planned and realised samples of one scene by fault class, and how often a view was replaced.
 
-    `redrawn` is the number of samples whose first view was not kept because a fault could not show in it, `views`
-    the most views that were rendered for one sample, `problem` the first of what `verify` found, or why there is
-    no store.
+    Attributes
+    ----------
+    redrawn
+        Number of samples whose first rendered view was not kept because a fault could not show in it.
+    views
+        Largest number of views that were rendered for one sample.
+    problem
+        The first problem that `verify` reports, or why there is no store.
     """
 
     scene: str
@@ -50,11 +55,11 @@ class Counts:
 
     @property
     def is_exact(self) -> bool:
-        """Whether every class is in as many samples as planned, in a sound store."""
+        """Whether every class is in as many samples as planned, in a store without problems."""
         return not self.problem and self.planned == self.realised
 
     def cells(self) -> tuple[str, ...]:
-        """Return the row of the table, by HEAD."""
+        """Return the row of the table; HEAD names its columns."""
         short = contact_sheet.abbreviations(list(self.planned))
         planned, realised = (
             " ".join(f"{short[name]} {n}" for name, n in counts.items()) for counts in (self.planned, self.realised)
@@ -64,7 +69,7 @@ class Counts:
 
 
 def settings(scene: str, *, pixels: int, triangles: int) -> dict[str, object]:
-    """Return the keys that make a scene small: its frame, unless it has a detector, and its ground."""
+    """Return the settings that make a scene small: fewer pixels, unless it has a detector, and coarse terrain."""
     whole = config.load_scene(scene)
     out: dict[str, object] = {"patch.max_triangles": min(triangles, whole.patch.max_triangles)}
     if not whole.camera.detector:
@@ -100,7 +105,7 @@ def counts(scene: str, path: Path, *, samples: int, given: Sequence[str]) -> Cou
 
 
 def main() -> int:
-    """Print a row a scene, and return the exit status."""
+    """Print one row for each scene and return the exit status."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--samples", type=int, default=16, help="of each scene, at most [16]")
     parser.add_argument("--pixels", type=int, default=128, help="width of the frame without a detector [128]")

@@ -1,11 +1,12 @@
-"""Print digests of small builds of every packaged scene, to tell which scenes a change has altered.
+"""Print digests of small builds of every packaged scene, to show which scenes a change has altered.
 
     python benchmarks/scene_digests.py --out digests.json
     python benchmarks/scene_digests.py --out after.json --before digests.json
 
-Every scene is built at its own geometry, faults and lens, with a small image and few samples. Two digests are
-printed: `pixels` covers image, clean twin and masks; `store` covers all arrays and attributes, the versions of the
-libraries included. Run both sides on one machine with one set of libraries, since bits are promised only there.
+Every scene is built with its own geometry, faults and lens, with a small image and few samples. Two digests are
+printed: `pixels` covers image, clean twin and masks; `store` covers all arrays and attributes, including the
+versions of the libraries. Run both versions on one machine with the same libraries: only then are the bits
+reproducible.
 """
 
 from __future__ import annotations
@@ -53,7 +54,7 @@ def digests(scene: str, *, samples: int, pixels: int, folder: Path) -> dict[str,
 
 
 def main() -> None:
-    """Print the table, and write it as JSON."""
+    """Print the table and write it as JSON."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, required=True, help="JSON to write")
     parser.add_argument("--before", type=Path, help="JSON of an earlier run, to compare with")

@@ -1,11 +1,11 @@
-"""Draw the figures beside the scene files again, to be looked at.
+"""Draw the figures that accompany the scene files.
 
     python benchmarks/scene_pictures.py --out scenes
     python benchmarks/scene_pictures.py --out scenes landing flares
 
-Contact sheets show samples of a dataset with their masks. They are built with 512 pixels across, over terrain as
-coarse as quickstart's, and shrunk. The figures of `flares`, `navcam67p`, `paper_example` and `physical67p` show
-single samples at the scene's own size, shrunk.
+Contact sheets show samples of a dataset with their masks. Their samples are 512 pixels wide, over terrain as coarse
+as quickstart's; the sheets are then shrunk. The figures of `flares`, `navcam67p`, `paper_example` and `physical67p`
+show single samples, rendered at the scene's own size and then shrunk.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ SHEETS = {"earth_observation": 12, "interplanetary": 12, "landing": 12, "quickst
 SHEET_PX = 512
 SHEET_TRIANGLES = 800_000
 SHEET_WIDTH_PX = 1080
-# Samples with many classes, and several of one site: its terrain is built once.
+# Samples with many fault classes; several share a site, whose terrain is then built once.
 FLARES, NAVCAM, PHYSICAL = (1, 2, 3), (5, 6, 12, 15), (7, 4)
 
 
@@ -62,24 +62,24 @@ def grid(rows: list[list[U8]], tile_px: int) -> U8:
 
 
 def flares() -> U8:
-    """Three samples by the three models of straylight, a row a model."""
+    """Draw three samples with each of the three models of straylight, one row a model."""
     models: list[dict[str, Any]] = [
         {},  # traced
         {"faults.straylight.model": "paraxial"},
-        {"faults.straylight": {"model": "texture"}},  # which has no coating
+        {"faults.straylight": {"model": "texture"}},  # replaces the table: this model has no key `coating`
     ]
     rows = [frames("flares", FLARES, model) for model in models]
     return grid([[rgb(frame, "image") for frame in row] for row in rows], 360)
 
 
 def navcam67p() -> U8:
-    """Four samples of a dataset of 16."""
+    """Draw four samples of a dataset of 16."""
     images = [rgb(frame, "image") for frame in frames("navcam67p", NAVCAM, {"dataset.samples": 16})]
     return grid([images[:2], images[2:]], 540)
 
 
 def paper_example() -> U8:
-    """The image, without straylight, with its flares marked; masks of straylight, dust, pixels, lines and all."""
+    """Draw the image, its twin without straylight, the image with its flares marked, four masks and their union."""
     (frame,) = frames("paper_example", (0,))
     local = ("straylight", "dust_on_optics", "broken_pixels", "broken_lines")
     masks = [mask(frame, name) for name in local]
@@ -88,7 +88,7 @@ def paper_example() -> U8:
 
 
 def physical67p() -> U8:
-    """Two samples, each with its faults and without."""
+    """Draw two samples, each with and without its faults."""
     taken = frames("physical67p", PHYSICAL)
     return grid([[rgb(frame, "image"), rgb(frame, "clean")] for frame in taken], 540)
 
@@ -115,7 +115,7 @@ def sheet(scene: str) -> U8:
 
 
 def main() -> None:
-    """Write the figures that are asked for."""
+    """Write the requested figures."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, required=True, help="folder for SCENE.png")
     known = sorted([*SHEETS, *SINGLE])

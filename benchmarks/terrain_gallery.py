@@ -1,4 +1,4 @@
-"""Pictures of the terrain: sites × views × Sun, for looking at, and sheets of them.
+"""Render images of the terrain for visual inspection: several sites, views and Suns, and one sheet a site.
 
 python benchmarks/terrain_gallery.py --out FOLDER [--scene SCENE] [--shape FILE] [--sites 0 1 2] [--size PX]
 """
@@ -30,15 +30,26 @@ VIEWS = {
     "h060_nadir": (60.0, 90.0),
     "h100_horizon": (100.0, 22.0),
 }
-SUN_TO_VIEW_DEG = 100.0  # the Sun from the side: relief shows
-SUN_TRIES_DEG = (35.0, -35.0, 0.0, 70.0, -70.0, 105.0, -105.0, 180.0)  # from downhill, until the site is lit
+SUN_TO_VIEW_DEG = 100.0  # light from the side makes the relief visible
+# Sun azimuths tried from the downhill direction, until the site is lit
+SUN_TRIES_DEG = (35.0, -35.0, 0.0, 70.0, -70.0, 105.0, -105.0, 180.0)
 GAMMA = 2.2
 
 
 def pose_at(
     surface: render.TerrainMesh, height_m: float, below_deg: float, azimuth_deg: float, sun: tuple[float, float]
 ) -> Pose:
-    """A level camera that height above the ground, moved off the site against its heading."""
+    """Return the pose of a camera without roll, `height_m` above the ground, behind the site as the camera looks.
+
+    Parameters
+    ----------
+    below_deg
+        Angle of the boresight below the horizon.
+    azimuth_deg
+        Azimuth of the boresight, from north towards east.
+    sun
+        Azimuth and elevation of the Sun in degrees.
+    """
     heading = frames.direction_L(azimuth_deg, 0.0)
     foot = -0.35 * height_m * heading
     ground = float(render.ground_height_m(surface, foot[:1], foot[1:2], 400.0)[0])
@@ -59,7 +70,7 @@ def pose_at(
 
 
 def sunlit_azimuth(surface: render.TerrainMesh) -> float:
-    """From where a low Sun reaches most of the ground around the site."""
+    """Return the Sun azimuth in degrees at which a low Sun lights most of the ground around the site."""
     x, y = (axis.ravel() for axis in np.meshgrid(np.linspace(-40, 40, 7), np.linspace(-40, 40, 7)))
     height = render.ground_height_m(surface, x, y, 400.0) + 0.5
     fit = np.linalg.lstsq(np.column_stack([x, y, np.ones_like(x)]), height, rcond=None)[0]
@@ -79,7 +90,7 @@ def sunlit_azimuth(surface: render.TerrainMesh) -> float:
 
 
 def picture(session: Session, site: int, pose: Pose) -> NDArray:
-    """uint8[y, x, 3], as the scene's camera takes it without faults or noise, gamma 2.2 for the eye."""
+    """Return the image of the scene's camera without faults and noise, with gamma 2.2, uint8[y, x, 3] B, G, R."""
     frame = Frame(spec=session.spec(int(np.flatnonzero(session.plan.site == site)[0])))
     frame.pose = pose
     expose.render_frame(frame)
@@ -90,6 +101,7 @@ def picture(session: Session, site: int, pose: Pose) -> NDArray:
 
 
 def main() -> None:
+    """Write the images and sheets."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--scene", default="physical67p")

@@ -1,4 +1,4 @@
-"""Deviogram of the shape model and of the terrain below its facets: does one continue the other?
+"""Plot the deviograms of the shape model and of the synthetic terrain, to see whether one continues the other.
 
 python benchmarks/terrain_spectrum.py --out FILE.png [--shape FILE] [--sites N]
 """
@@ -19,7 +19,10 @@ TERRAIN_M = np.geomspace(0.4, 40.0, 11)
 
 
 def terrain_deviogram(patch: Patch, baselines_m: NDArray) -> NDArray:
-    """ν at each baseline from the ground near the site where its facets are a third of that or finer."""
+    """Return the RMS deviation ν in m at each baseline.
+
+    Only ground near the site is used, where facets are at most a third of the baseline.
+    """
     faces = patch.faces[~patch.face_is_boulder]
     points = patch.vertices_L_m[: faces.max() + 1].astype(np.float64)
     normals = vertex_normals(points, faces)
@@ -33,6 +36,7 @@ def terrain_deviogram(patch: Patch, baselines_m: NDArray) -> NDArray:
 
 
 def main() -> None:
+    """Print the values and draw the figure."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--shape", default=EMBEDDED)

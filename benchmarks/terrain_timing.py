@@ -1,4 +1,4 @@
-"""How long a patch takes to build, to read from the cache and to hand to the renderer, and how much memory.
+"""Measure how long a patch of terrain takes to build, to read from the cache and to load, and its memory.
 
 python benchmarks/terrain_timing.py [--shape FILE] [--sites N]
 """
@@ -21,7 +21,7 @@ from vbnfault.body.cache import FOLDER_VARIABLE, cached_patch
 
 
 def peak_gib() -> float:
-    """Largest resident set of this process so far."""
+    """Return the largest resident set of this process so far, in GiB."""
     if sys.platform == "win32":
         return float(psutil.Process().memory_info().peak_wset) / 2**30
     import resource
@@ -31,6 +31,7 @@ def peak_gib() -> float:
 
 
 def main() -> None:
+    """Print durations and memory for each site."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--shape", default=EMBEDDED)
     parser.add_argument("--sites", type=int, default=3)

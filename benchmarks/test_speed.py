@@ -1,11 +1,11 @@
-"""How fast a labelled sample is made, against the tracing bound and against Blender Cycles.
+"""Measure how fast a labelled sample is made, compared with the tracing bound and with Blender Cycles.
 
     python -m pytest benchmarks --benchmark-only -n 0
-    python -m pytest benchmarks --benchmark-only -n 0 --picture pair.png     (look whether both show the same)
+    python -m pytest benchmarks --benchmark-only -n 0 --picture pair.png     (to compare both images by eye)
 
-1024×1024 pixels, 16 samples per pixel, direct light, 1.2 million triangles that fill the frame, one run.
-Every round times bound, render, truth, the stages after it and the store in turn, so that whatever else the
-machine does falls on all alike. The table comes at the end. Cycles is optional: see `blender_cycles.py`.
+The image has 1024×1024 pixels with 16 samples per pixel; 1.2 million triangles fill the frame. Every round times
+the bound, the render, the truth, the later stages and the store one after the other, so that other load on the
+machine affects all of them equally. The table is printed at the end. Cycles is optional: see `blender_cycles.py`.
 """
 
 from __future__ import annotations
@@ -27,18 +27,20 @@ from vbnfault.pipeline.spec import Frame
 
 @pytest.fixture(scope="session")
 def workload(request: pytest.FixtureRequest) -> Workload:
-    """The sample, its terrain built once."""
+    """Return the benchmark's sample; its terrain is built once."""
     return Workload.load(request.config.getoption("--size"), facet_m=request.config.getoption("--facet-m"))
 
 
 @pytest.fixture
 def rounds(request: pytest.FixtureRequest) -> int:
+    """Return the number of timed rounds."""
     return request.config.getoption("--rounds")
 
 
 def test_labelled_sample(
     benchmark: Any, workload: Workload, results: dict[str, float], rounds: int, tmp_path: Path
 ) -> None:
+    """Time one labelled sample, stage by stage, and the tracing bound."""
     folder, taken = workload.empty_store(tmp_path / "store.zarr"), []
 
     def one_round() -> Frame:
@@ -66,6 +68,7 @@ def test_cycles(
     bounces: int,
     request: pytest.FixtureRequest,
 ) -> None:
+    """Time Blender's render of the same scene, and check that both images agree."""
     try:
         python = interpreter()
     except Unavailable as why:
@@ -100,6 +103,7 @@ def test_cycles(
 
 @pytest.fixture(scope="session", autouse=True)
 def _enforce(results: dict[str, float], request: pytest.FixtureRequest) -> Iterator[None]:
+    """Fail at the end of the session if a target is missed and `--enforce` is given."""
     yield
     if results and request.config.getoption("--enforce"):
         missed = [t.what for t in targets(results) if not t.met]
@@ -107,6 +111,7 @@ def _enforce(results: dict[str, float], request: pytest.FixtureRequest) -> Itera
 
 
 def _write_pair(path: Path, ours: np.ndarray, theirs: np.ndarray) -> None:
+    """Write both images side by side as a PNG, each scaled to its 99th percentile."""
     shown = [np.clip(255 * (p / np.percentile(p, 99)) ** (1 / 2.2), 0, 255) for p in (ours, theirs)]
     path.parent.mkdir(parents=True, exist_ok=True)
     assert cv2.imwrite(str(path), np.hstack(shown).astype(np.uint8))

@@ -1,17 +1,19 @@
-"""Veiling glare index of every packaged lens, part by part (ISO 9358:1994, a black spot in a uniform field):
+"""Print the veiling glare index of every packaged lens and its parts (ISO 9358:1994, black spot, uniform field).
 
     python benchmarks/veil_table.py [--lens NAME ...] [--coating NAME] [--veil-fraction V] [--cleanliness-level C]
 
-The field is a sky of radiance L over the whole half space, the spot a black disc of 2° half angle on the axis. The
-index is the irradiance in the middle of the spot's image over that of the sky's image beside it, L A T / f². Of a
-source at the angle θ it needs the irradiance that its straylight has in the middle:
+The field is a sky of radiance L over the whole half space. The spot is a black disc of 2° half angle on the axis.
+The index is the irradiance at the centre of the spot's image divided by the irradiance of the sky's image beside
+it, L A T / f². Each part integrates, over sources at the angle θ, the irradiance of their straylight at that
+centre:
 
 - veil: v A T cos θ / (π f²), which integrates to v;
-- scatter: `lens.scatter.point_source_transmittance`, with roughness and particles;
-- ghosts: radiance is kept along a path but for its losses, so that a ghost gives L T_g Ω, with Ω the solid angle
-  that its beam fills as seen from the sensor's middle: to first order r = ±r_max and slope r / M01 there.
+- scatter: `lens.straylight.scatter.point_source_transmittance`, with roughness and particles;
+- ghosts: apart from losses, radiance is constant along a path. So a ghost contributes L T_g Ω, where Ω is the solid
+  angle of its beam as seen from the centre of the sensor. To first order the beam ends at r = ±r_max, where its
+  slope is r / M01.
 
-Coatings are those of `--coating`: the patents name none, and bare glass would add 2 to 11 % of ghosts.
+`--coating` sets the coatings: the patents state none, and uncoated glass would add 2 to 11 % of ghosts.
 """
 
 from __future__ import annotations
@@ -40,7 +42,7 @@ def index_of(
     cleanliness_level: float = 100.0,
     wavelength_nm: float = D_NM,
 ) -> dict[str, float]:
-    """Return the parts of the veiling glare index: `veil`, `scatter` and `ghosts`, as fractions of the field."""
+    """Return the parts of the veiling glare index, `veil`, `scatter` and `ghosts`, as fractions of the field."""
     order = first_order(lens)
     passed = float(axial_transmittance(lens, wavelength_nm)[0])
     field = passed * np.pi / 4 * order.entrance_pupil_diameter_mm**2 / order.efl_mm**2
@@ -54,7 +56,7 @@ def index_of(
         roughness_nm=roughness_nm,
         cleanliness_level=cleanliness_level,
     )[0]
-    # the veil comes from within the spot too: the spot is left out of the integral, as it is black
+    # the integrals begin at the rim of the spot, which is black
     return {
         "veil": float(np.trapezoid(source * rings, theta) / field),
         "scatter": float(np.trapezoid(scattered * rings, theta) / field),
@@ -63,14 +65,14 @@ def index_of(
 
 
 def _ghosts_sr(lens: Prescription, wavelength_nm: float) -> float:
-    """Return Σ T_g Ω of all ghosts of two reflections at the sensor's middle."""
+    """Return Σ T_g Ω in sr over all ghosts of two reflections, at the centre of the sensor."""
     total = 0.0
     for pair in pairs(lens):
         path = ghost(lens, *pair)
         whole, met = along(lens, path, wavelength_nm)
-        # rays that arrive in the middle: θ = -r M00 / M01
+        # rays that arrive at the centre: θ = -r M00 / M01
         height = np.abs(met[:, 0, 0] - met[:, 0, 1] * whole[0, 0] / whole[0, 1])
-        # the last row may be the sensor, a mirror without a rim
+        # the last row may be the sensor, which reflects and has no rim
         rims = np.array([lens.surfaces[r].semi_diameter_mm if r < len(lens.surfaces) else np.inf for r, _ in path])
         most = float((rims / np.maximum(height, 1e-12)).min())
         total += transmittance(lens, path, wavelength_nm) * np.pi * (most / whole[0, 1]) ** 2
@@ -78,6 +80,7 @@ def _ghosts_sr(lens: Prescription, wavelength_nm: float) -> float:
 
 
 def main() -> None:
+    """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--lens", nargs="*")
     parser.add_argument("--coating", default="mgf2")

@@ -1,22 +1,21 @@
-"""Plot the views of a store beside the bounds of its scene's table: the first ones, and those drawn again.
+"""Plot the distribution of a store's first and kept views, and compare it with the bounds of the scene.
 
     vbnfault build paper67p --out paper.zarr --samples 2000 --set camera.width_px=128 --set camera.height_px=128 \
         --set patch.max_triangles=200000
     python benchmarks/view_distribution.py paper.zarr --out views.png
 
-A view is drawn again where the geometry of the scene does not allow it (the camera below the ground, the Sun hidden
-from a sample with straylight), and where a commanded fault cannot show in it. The kept views follow the table's
-distribution, given that they can be used. Three comparisons by the Kolmogorov-Smirnov test, for each stratum and
-each variable, say what that does:
+A view is drawn again if the geometry of the scene excludes it (the camera is below the ground, or the Sun is hidden
+in a sample with straylight), or if a commanded fault cannot show in it. The reference distribution is that of the
+first views of a plan with 200,000 samples and another seed: uniform within the bounds, without the attitudes of
+Sun-averted samples that look at the Sun. The kept views should follow it, on the condition that they can be used.
 
-- `first`: the first views of all samples with the table. They must agree.
-- `kept`: the views of the store with the table. They differ by what the conditions exclude; `shift` is the
-  difference of the means over the width of the table's bounds.
-- `again`: the views kept at a later try with those kept at the first, of samples that carry a fault. They must
-  agree, or drawing again prefers some of the views that can be used.
+Three comparisons with the Kolmogorov-Smirnov test show this, for each stratum and each variable:
 
-The table's distribution is that of the first views of a plan with 200,000 samples and another seed: uniform within
-the bounds, less the attitudes of Sun-averted samples that look at the Sun.
+- `first`: the first views of all samples with the reference. They must agree.
+- `kept`: the views of the store with the reference. They differ because the conditions exclude some views; `shift`
+  is the difference of the means divided by the width of the bounds.
+- `again`: the views kept at a later try with those kept at the first try, for samples with a fault. They must
+  agree; otherwise drawing again prefers some of the usable views.
 """
 
 from __future__ import annotations
@@ -44,8 +43,16 @@ F64 = NDArray[np.float64]
 class Views:
     """The views of one stratum: values of each variable, float64[sample], and its bounds.
 
-    `table` are draws of the table; `first` and `kept` the first and the kept views of the samples; `again` says
-    which samples kept a later view, and `faulty` which are commanded to carry a fault, bool[sample].
+    Attributes
+    ----------
+    table
+        Values of the reference plan.
+    first, kept
+        First and kept views of the samples.
+    again
+        Samples that kept a later view, bool[sample].
+    faulty
+        Samples for which a fault is commanded, bool[sample].
     """
 
     stratum: str
@@ -70,7 +77,7 @@ class Views:
 
 
 def views_of(path: Path) -> list[Views]:
-    """Return the views of a store's finished samples, by stratum. Strata without samples are left out."""
+    """Return the views of a store's finished samples by stratum; strata without samples are left out."""
     opened = store.open_store(path)
     scene = dataset.stored_scene(opened.attributes)
     made = plan.make_plan(scene, opened.spec.faults, opened.attributes["blocks"])
@@ -100,7 +107,7 @@ def views_of(path: Path) -> list[Views]:
 
 
 def lines(views: Views) -> list[str]:
-    """Return the results of a stratum as lines."""
+    """Return the test results of a stratum as lines of text."""
     out = [
         f"{views.stratum}: {len(views.again)} samples, {int(views.again.sum())} kept a later view",
         f"  {'':<18}{'bounds':>18}  {'first: D':>9}{'p':>8}  {'kept: D':>9}{'p':>9}{'shift':>8}  "
@@ -119,7 +126,7 @@ def lines(views: Views) -> list[str]:
 
 
 def plot(strata: list[Views], title: str, path: Path) -> None:
-    """Write histograms of every variable, a row a stratum, as a PNG."""
+    """Write histograms of every variable as a PNG, one row a stratum."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -155,7 +162,7 @@ def plot(strata: list[Views], title: str, path: Path) -> None:
 
 
 def main() -> None:
-    """Print the tests, and write the plot."""
+    """Print the test results and write the plot."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("store", type=Path, help="store whose views are looked at")
     parser.add_argument("--out", type=Path, required=True, help="PNG to write")

@@ -1,4 +1,4 @@
-"""What the benchmarks time: one labelled sample of a frame filled with terrain, cut into its stages."""
+"""Define the work that the benchmarks time: the stages of one labelled sample, its frame filled with terrain."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ from vbnfault.render.sampling import Optics, Pixels, Strata
 from vbnfault.scene import config, plan
 from vbnfault.world import assemble
 
-SCENE = "paper_example"  # its six faults; the view is our own
+SCENE = "paper_example"  # for its six faults; the view is defined below
 SHARD_SAMPLES = 8
 
-# An oblique look at talus, no sky in the frame, the Sun ahead and above it: long shadows, flares in view.
+# An oblique view of talus without sky. The Sun is ahead, above the frame: long shadows and visible flares.
 CAMERA_HEIGHT_M = 80.0
 CAMERA_AZIMUTH_DEG = 240.0
 CAMERA_BELOW_HORIZON_DEG = 52.0
@@ -45,7 +45,7 @@ FLARE_SUN_DEG = 16.0
 
 
 def clock(function: Callable[[], Any]) -> tuple[float, Any]:
-    """Seconds that a call takes, what it queued on the render threads included, and what it returned."""
+    """Return the duration of a call in s, including the work it queued on the render threads, and its result."""
     dr.sync_thread()
     start = time.perf_counter()
     result = function()
@@ -55,7 +55,7 @@ def clock(function: Callable[[], Any]) -> tuple[float, Any]:
 
 @dataclass(frozen=True, eq=False)
 class Workload:
-    """A terrain, a pose above it, and a sample of the scene that is put there."""
+    """A terrain, a pose above it, and a sample of the scene with this pose."""
 
     session: pipeline.Session
     patch: Patch
@@ -64,14 +64,14 @@ class Workload:
 
     @classmethod
     def load(cls, size_px: int, *, facet_m: float | None = None) -> Workload:
-        """The scene at `size_px`; `facet_m` coarsens the terrain (for a quick look)."""
+        """Return the workload for an image of `size_px` × `size_px`; `facet_m` gives coarser terrain."""
         overrides: dict[str, Any] = {
             "camera.width_px": size_px,
             "camera.height_px": size_px,
             "dataset.layers": ["clean"],
             "dataset.samples": SHARD_SAMPLES,
             "dataset.shard_samples": SHARD_SAMPLES,
-            "faults.optics_degradation.scale_with_resolution": False,  # else too fine to show at small sizes
+            "faults.optics_degradation.scale_with_resolution": False,  # otherwise too fine to show in small images
         }
         if facet_m is not None:
             overrides |= {"patch.facet_m": facet_m, "patch.min_boulder_m": 4 * facet_m}
@@ -84,10 +84,11 @@ class Workload:
 
     @cached_property
     def scene(self) -> RenderInput:
-        """What the renderer is given."""
+        """The input of the renderer."""
         return self._placed()[1]
 
     def _placed(self) -> tuple[Frame, RenderInput]:
+        """Return a frame with the pose, and the renderer's input for it."""
         frame = Frame(spec=self.spec)
         frame.pose = self.pose
         frame.camera = self.session.base_camera
@@ -95,29 +96,31 @@ class Workload:
         return frame, describe(frame)
 
     def bound(self) -> None:
-        """As fast as tracing gets: the render's own rays in its order, a closest hit and a shadow ray each.
+        """Trace the same rays as the render in the same order, one closest hit and one shadow ray each.
 
-        One kernel, which writes a byte a sample: no bands, no shading, no sum over pixels.
+        This is the lower bound of the render's duration: one kernel that writes one byte a sample, without bands,
+        shading and sums over pixels.
         """
         view, traced = self.scene.view, self.spec.terrain.surface.scene
         optics, sun = Optics(view), SunDisc(self.scene.sun)
         strata = Strata(Pixels(view.width_px * view.height_px), self.scene.samples_per_pixel, self.scene.key)
         rays = optics.camera_rays(strata)
         found = traced.ray_intersect_preliminary(rays, coherent=True)
-        # towards the Sun's centre, from just in front of the hit: no normal, no point of the disc is fetched
+        # towards the Sun's centre from just before the hit, which needs neither a normal nor a point on the disc
         shadow = mi.Ray3f(rays(found.t * (1 - 1e-4)), sun.direction)
         lit = found.is_valid() & ~traced.ray_test(shadow, True, found.is_valid())
         dr.eval(lit)
 
     def grey(self) -> np.ndarray:
-        """The render as linear grey float32[y, x]: the middle band."""
+        """Return the middle band of the render as linear grey, float32[y, x]."""
         array = render.radiance(self.spec.terrain.surface, self.scene).array
         return array[len(array) // 2]
 
     def labelled_sample(self, folder: store.Store) -> tuple[dict[str, float], Frame]:
-        """Seconds per stage of a sample from proposal to disk, and its frame.
+        """Return the duration in s of each stage of a sample from proposal to disk, and its frame.
 
-        `store` is the time per sample of encoding and writing a shard of 8.
+        `store` is the time per sample of encoding and writing a shard of 8. The other renders, the flare and the
+        detector chains are timed in between, but are not part of the sample.
         """
         seconds: dict[str, float] = {}
         surface = self.spec.terrain.surface
@@ -127,7 +130,7 @@ class Workload:
         seconds["truth"], frame.truth = clock(lambda: render.truth(surface, scene.view, scene.sun))
         for stage in (meter, photograph, label):
             seconds[stage.__name__], _ = clock(lambda stage=stage: stage(frame))
-        # the same view as the physical scenes have it; not part of the sample
+        # the same view with the photometry of the physical scenes
         physical = replace(scene, photometry=photometry.hapke_at(scene.wavelength_nm))
         seconds["hapke"], _ = clock(lambda: render.radiance(surface, physical))
         lit = replace(physical, bounces=1)
@@ -142,7 +145,7 @@ class Workload:
 
     @cached_property
     def flares(self) -> FlareModel:
-        """All ghosts of an 11-surface lens on the camera's own sensor, eight wavelengths."""
+        """The model of all ghosts of an 11-surface lens at eight wavelengths, on the camera's sensor."""
         camera = self.session.base_camera
         lens = scaled_to_focal_length(load_lens(FLARE_LENS), camera.lens.focal_length_mm)
         return FlareModel(
@@ -154,12 +157,12 @@ class Workload:
         )
 
     def flare(self) -> np.ndarray:
-        """A full flare frame: irradiance of all ghosts, float32[band, y, x]."""
+        """Return a full flare frame, the irradiance of all ghosts, float32[band, y, x]."""
         return self.flares.image(FLARE_SUN_DEG, 30.0)
 
     @cached_property
     def chains(self) -> dict[str, Chain]:
-        """Sensors with every effect of the chain."""
+        """A CCD's and a CMOS sensor's chain with every effect on."""
         light = speckled(self.session.base_camera.width_px)
         return {
             "chain_ccd": Chain.of("frame_transfer_ccd", "malvar", light),
@@ -167,7 +170,7 @@ class Workload:
         }
 
     def empty_store(self, path: Path) -> store.Store:
-        """A store for one shard of samples."""
+        """Create a store for one shard of samples at `path` and return it."""
         return store.create(path, dataset.store_spec(self.session, [SHARD_SAMPLES]), SHARD_SAMPLES)
 
 
@@ -177,9 +180,10 @@ def write_shard(folder: store.Store, sample: Sample) -> None:
 
 
 def _pose(surface: render.TerrainMesh) -> Pose:
+    """Return the benchmark's pose above the site, with the Sun at its direction."""
     ground = float(render.ground_height_m(surface, np.zeros(1), np.zeros(1), 300.0)[0])
     z = frames.direction_L(CAMERA_AZIMUTH_DEG, -CAMERA_BELOW_HORIZON_DEG)
-    x = np.cross([0.0, 0.0, 1.0], z)  # level: y of the image points down
+    x = np.cross([0.0, 0.0, 1.0], z)  # no roll: y of the image points down
     x /= np.linalg.norm(x)
     return Pose(
         position_L_m=np.array([0.0, 0.0, -(ground + CAMERA_HEIGHT_M)]),
@@ -195,5 +199,5 @@ def _pose(surface: render.TerrainMesh) -> Pose:
 
 
 def medians(rounds: list[Mapping[str, float]]) -> dict[str, float]:
-    """Median over the rounds of every entry."""
+    """Return the median of every entry over the rounds."""
     return {name: float(np.median([r[name] for r in rounds])) for name in rounds[0]}

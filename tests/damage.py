@@ -1,14 +1,14 @@
-"""Flip single bits of stores and of cached terrain, at random: each flip is found and mended, or is harmless.
+"""Flip random bits of stores and cached terrain; each flip must be detected and repaired, or be harmless.
 
     python tests/damage.py --count 2000 [--seed 0]
-    python tests/damage.py --operations [--count 500] [--seed 0]    operations of the disk fail, instead
+    python tests/damage.py --operations [--count 500] [--seed 0]    make file operations fail instead
 
-With `--operations` each operation of the disk of each command fails once with each of three errors, in an order
-drawn by the seed; `--count` ends after so many of them.
+A flip is detected if `verify` reports a problem, or, in a cached patch, if the patch is built again. A flip is
+harmless if a reader still gets the same data. After a detected flip the build command must restore the store
+exactly. The exit code is 1 if a flip was missed or not repaired.
 
-A flip is found where `verify` reports a problem (of a cached patch: where the patch is built again), harmless where
-nothing that a reader sees has changed. Whatever is found, the build command mends: then all is as it was. The exit
-code is 1 where a flip was neither.
+With `--operations`, each file operation of each command fails once with each of three errors. The seed gives the
+order; `--count` limits the number of failing operations.
 """
 
 from __future__ import annotations
@@ -52,18 +52,18 @@ COARSE = {"seed": 3, "facet_m": 20.0, "radius_m": 60.0, "min_boulder_m": 8.0, "m
 
 
 def spec() -> st.StoreSpec:
-    """A small spec, two samples a shard."""
+    """Return the spec of a small store with two samples a shard."""
     return make_spec(16, layers=("depth_m",), shard_samples=2)
 
 
 def sample(index: int) -> Sample:
-    """A sample of the small spec; all are of one site."""
+    """Return a sample of that store; all samples belong to one site."""
     return fake_sample(spec(), index, site=0)
 
 
 @dataclass(frozen=True)
 class Session:
-    """Makes the samples of the store, without rendering."""
+    """A session that makes the samples of the store without rendering."""
 
     def __call__(self) -> Session:
         return self
@@ -73,12 +73,12 @@ class Session:
 
 
 def build(path: Path) -> None:
-    """Build the store, or mend it."""
+    """Build the store, or repair it."""
     bd.build(Session(), spec(), path, site=np.zeros(SAMPLES, dtype=int), progress=False)
 
 
 def mend(path: Path, samples: int = SAMPLES) -> None:
-    """Do what the build command does, without lock, progress and processes."""
+    """Repair or extend a store as the build command does, but without lock, progress and processes."""
     store = st.recover(path)
     if store.samples < samples:
         store = st.append_samples(store, samples - store.samples, {"blocks": [SAMPLES, samples - SAMPLES]})
@@ -86,7 +86,7 @@ def mend(path: Path, samples: int = SAMPLES) -> None:
 
 
 def seen(path: Path) -> dict[str, Any]:
-    """Return all that a reader sees of a store: metadata, coordinates, and the decoded samples as their digest."""
+    """Return all data that a reader gets from a store: metadata, coordinates, and the digest of the samples."""
     documents = {str(p.relative_to(path)): json.loads(p.read_bytes()) for p in sorted(path.rglob("zarr.json"))}
     spec = st.open_store(path).spec
     names = spec.coordinates(SAMPLES)
@@ -100,7 +100,7 @@ def seen(path: Path) -> dict[str, Any]:
 
 @contextlib.contextmanager
 def flipped(file: Path, place: int, bit: int) -> Iterator[None]:
-    """Flip a bit of a file; whoever leaves its content alone finds it as it was afterwards."""
+    """Flip one bit of a file during a `with` block; undo it at the end unless the file was rewritten."""
     good = file.read_bytes()
     wrong = bytearray(good)
     wrong[place] ^= 1 << bit
@@ -111,10 +111,10 @@ def flipped(file: Path, place: int, bit: int) -> Iterator[None]:
 
 
 def flip_in_store(path: Path, before: dict[str, Any], rng: np.random.Generator) -> str:
-    """Flip a bit of a random file of the store and say what came of it."""
+    """Flip one bit of a random file of the store and return the outcome as text."""
     files = sorted(p for p in path.rglob("*") if p.is_file() and p.stat().st_size)
     size = np.array([p.stat().st_size for p in files], dtype=float)
-    # every file as likely, or every byte: small files are many, large ones few
+    # in half of the cases all bytes are equally likely, otherwise all files: most files are small
     chance = size / size.sum() if rng.random() < 0.5 else np.full(len(files), 1 / len(files))
     file = files[int(rng.choice(len(files), p=chance))]
     place, bit = int(rng.integers(file.stat().st_size)), int(rng.integers(8))
@@ -130,7 +130,7 @@ def flip_in_store(path: Path, before: dict[str, Any], rng: np.random.Generator) 
 
 
 def flip_in_cache(folder: Path, read: Callable[[], tuple[bool, bool]], rng: np.random.Generator) -> str:
-    """Flip a bit of the cached patch and say what came of it."""
+    """Flip one bit of the cached patch and return the outcome as text."""
     (file,) = folder.glob("patch-*.patch")
     place, bit = int(rng.integers(file.stat().st_size)), int(rng.integers(8))
     with flipped(file, place, bit):
@@ -145,7 +145,10 @@ def flip_in_cache(folder: Path, read: Callable[[], tuple[bool, bool]], rng: np.r
 
 
 def terrain(folder: Path) -> Callable[[], tuple[bool, bool]]:
-    """Fill a cache with one patch; return what reads it: is it the same, and was it built again?"""
+    """Fill a cache with one patch.
+
+    Return a function that reads the patch and returns whether it is unchanged and whether it was built again.
+    """
     ball = trimesh.creation.icosphere(subdivisions=3, radius=900.0)
     body = Body(name="ball", vertices_m=np.array(ball.vertices), faces=np.array(ball.faces))
     site = choose_sites(body, 1, seed=0)[0]
@@ -168,7 +171,7 @@ def terrain(folder: Path) -> Callable[[], tuple[bool, bool]]:
 
 @dataclass
 class Progress:
-    """Counts cases and failures, and prints them with their rate, every 50 cases."""
+    """Count cases and failures; print them with their rate every 50 cases."""
 
     total: int
     ended: int = 0
@@ -176,7 +179,7 @@ class Progress:
     began: float = dataclasses.field(default_factory=time.monotonic)
 
     def advance(self, failure: str) -> None:
-        """Count one case; `failure` says what went wrong, if anything."""
+        """Count one case; `failure` describes what went wrong, and is empty if nothing did."""
         self.ended += 1
         self.failures += bool(failure)
         if failure:
@@ -190,23 +193,24 @@ class Progress:
 
 
 def is_failure(outcome: str) -> bool:
-    """Whether a flip was neither harmless nor found and mended."""
+    """Return whether a flip was missed or not repaired."""
     return outcome.startswith(("MISSED", "NOT MENDED"))
 
 
 def damage(
     count: int, seed: int, folder: Path, ended: Callable[[str], None] = lambda failure: None
 ) -> Counter[str]:
-    """Flip `count` bits, nine in ten of them in a store, the others in a cached patch; return what came of them.
+    """Flip `count` bits, nine of ten in a store, the others in a cached patch; return how often each outcome
+    occurs.
 
-    `ended` is called after each flip with what went wrong, "" where nothing did.
+    `ended` is called after each flip with a description of the failure, or "".
     """
     rng = np.random.default_rng(seed)
     path, caches = folder / "s.zarr", folder / "cache"
     caches.mkdir()
     outcomes: Counter[str] = Counter()
     with warnings.catch_warnings(), contextlib.redirect_stderr(io.StringIO()):
-        warnings.simplefilter("ignore", UserWarning)  # that the root was read from its spare
+        warnings.simplefilter("ignore", UserWarning)  # the warning that the root was read from `spare`
         build(path)
         before = seen(path)
         read = terrain(caches)
@@ -217,11 +221,14 @@ def damage(
     return outcomes
 
 
-# --- a disk that fails at its n-th operation --------------------------------------------------------------
+# --- a disk whose n-th operation fails --------------------------------------------------------------------
 
 
 class FailingSystem(types.ModuleType):
-    """Stands for `os` in the store: the operation number `fails_at` raises, or writes less than asked for."""
+    """Replaces the module `os` in `store.disk`: operation number `fails_at` raises OSError with `code`.
+
+    With `short`, no operation has to fail, but each `write` writes only half of its data.
+    """
 
     OPERATIONS = (
         "open",
@@ -264,35 +271,38 @@ class FailingSystem(types.ModuleType):
             self.failed = name
             if name == "close":
                 real(*arguments)
-            if name == "write":  # part of it is on the disk
+            if name == "write":  # a failing write may have written a part
                 real(arguments[0], arguments[1][: len(arguments[1]) // 2])
             raise OSError(self.code, os.strerror(self.code))
 
         return operation
 
     def noted(self, name: str, arguments: tuple[Any, ...], result: Any) -> None:
-        """Is told of each operation that succeeded."""
+        """Handle an operation that succeeded; for subclasses."""
 
 
 def create(path: Path) -> None:
+    """Create the store."""
     st.create(path, spec(), SAMPLES)
 
 
 def write(path: Path) -> None:
-    """One sample of a shard whose other sample is finished: that one is kept."""
+    """Write one sample of a shard whose other sample is finished and must be kept."""
     st.write_samples(path, [sample(2)])
 
 
 def append(path: Path) -> None:
+    """Append one sample."""
     st.append_samples(path, 1, {"blocks": [SAMPLES, 1]})
 
 
 def recover(path: Path) -> None:
+    """Recover the store."""
     st.recover(path)
 
 
 def damaged(path: Path) -> None:
-    """Something for `recover` to mend."""
+    """Damage a store so that `recover` has something to repair."""
     (path / "zarr.json").write_bytes(b"{")
     (path / "x" / "c" / "0").unlink()
     (path / "image" / "zarr.json").unlink()
@@ -304,7 +314,7 @@ COMMANDS = (create, write, append, recover)
 
 @functools.cache
 def _finished() -> tempfile.TemporaryDirectory[str]:
-    """Return a folder with a finished store, made once."""
+    """Return a folder with a finished store, which is made only once."""
     folder = tempfile.TemporaryDirectory(prefix="vbnfault-damage-")
     create(Path(folder.name, "s.zarr"))
     mend(Path(folder.name, "s.zarr"))
@@ -312,7 +322,7 @@ def _finished() -> tempfile.TemporaryDirectory[str]:
 
 
 def _prepare(command: Callable[[Path], None], folder: Path) -> Path:
-    """Make what a command works on: nothing for `create`, else a finished store."""
+    """Make the input of a command: a path without a store for `create`, otherwise a finished store."""
     folder.mkdir()
     path = folder / "s.zarr"
     if command is not create:
@@ -323,6 +333,7 @@ def _prepare(command: Callable[[Path], None], folder: Path) -> Path:
 
 
 def _with(system: FailingSystem, command: Callable[[Path], None], path: Path) -> None:
+    """Run a command while `system` replaces `os` in `store.disk`."""
     disk.os = system  # type: ignore[assignment]
     try:
         command(path)
@@ -331,14 +342,17 @@ def _with(system: FailingSystem, command: Callable[[Path], None], path: Path) ->
 
 
 def operations(command: Callable[[Path], None], folder: Path) -> int:
-    """Return how many operations of the disk a command takes."""
+    """Return how many file operations a command does."""
     path, system = _prepare(command, folder), FailingSystem()
     _with(system, command, path)
     return system.count
 
 
 def fails_at(number: int, code: int, command: Callable[[Path], None], folder: Path) -> str:
-    """Let one operation of a command fail, then run what mends; return what is wrong after that, if anything."""
+    """Make one operation of a command fail, then repair the store.
+
+    Return what is wrong after that; empty if nothing is.
+    """
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)
         path, system = _prepare(command, folder), FailingSystem(number, code)
@@ -363,14 +377,14 @@ def fails_at(number: int, code: int, command: Callable[[Path], None], folder: Pa
 
 
 def failing_operations(count: int | None, seed: int) -> Progress:
-    """Let operations of each command fail, with each kind of error; return the counts.
+    """Make operations of each command fail, with each of three errors; return the counts.
 
     Parameters
     ----------
     count
-        How many of all (command, operation, error) are drawn, each at most once; all of them where it is None.
+        How many cases (command, operation, error) are drawn, without repetition; all if None.
     seed
-        Gives the order.
+        Seed of the order.
     """
     cases: list[tuple[Callable[[Path], None], int, int]] = []
     with tempfile.TemporaryDirectory(prefix="vbnfault-damage-") as above:
@@ -392,7 +406,7 @@ def failing_operations(count: int | None, seed: int) -> Progress:
 
 
 def main() -> int:
-    """Flip bits, or let operations fail; the exit code says whether something was lost or missed."""
+    """Flip bits, or make operations fail; the exit code is 1 if there was a failure."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--count", type=int, help="flips [default: 2000], or operations that fail [default: all]")
     parser.add_argument("--seed", type=int, default=0)

@@ -1,12 +1,13 @@
-"""Malformed input of every kind, by the thousand: `python -m tests.fuzz --count 5000 --seed 7`.
+"""Run the program on many malformed inputs: `python -m tests.fuzz --count 5000 --seed 7`.
 
-Each case is a sound input, damaged: a scene, lens or sensor file, a mesh of any format, a spacecraft, a texture, a
-SPICE kernel or DSK, options and environment variables, a store. The program runs on it as from the command line and
-may succeed or refuse it: exit code 0, 1 or 2 and at most a short sentence. A traceback, a signal, more than 20 s of
-computing time or 2 GB of memory is a failure, printed with the command that repeats it (`--only N`).
+Each case damages a valid input: a scene, lens or sensor file, a mesh of any format, a spacecraft, a texture, a
+SPICE kernel or DSK, options and environment variables, or a store. The program then runs as from the command line.
+It may succeed or refuse the input: exit code 0, 1 or 2, with a short message if it is not 0. A case fails if it
+ends with a traceback or a signal, or uses more than 20 s of processor time or 2 GiB of memory. A failure is printed
+with the command that repeats it (`--only N`).
 
-Cases run in a few processes, started again where one dies, so that a case costs little more than the reading
-itself. A case depends on the seed and its number alone; by default the seed is a hash of the package's sources.
+A few processes run all cases, so that the imports are paid once; a process that dies is replaced. A case depends
+only on the seed and its number. The default seed is a hash of the package's sources.
 """
 
 from __future__ import annotations
@@ -40,7 +41,8 @@ from typing import Any
 ROOT = Path(__file__).resolve().parents[1]
 CPU_S = 20
 MEMORY_BYTES = 2 << 30
-# Without computing: a case that waits for ever, for a pipe, say. Far longer than any wait of a loaded machine.
+# Limit for a case that waits without using the processor, for example for a pipe. It is far longer than any wait
+# on a busy machine.
 BLOCKED_S = 600
 LONGEST_MESSAGE = 3000
 
@@ -81,7 +83,7 @@ NUMBERS += [1e150, -1e150, 1e308, 5e-324, math.nan, math.inf, -math.inf, 0.5, -0
 
 
 def deep(levels: int) -> Any:
-    """Return lists within lists."""
+    """Return nested lists."""
     node: Any = []
     for _ in range(levels):
         node = [node]
@@ -89,7 +91,7 @@ def deep(levels: int) -> Any:
 
 
 def hostile(rng: random.Random) -> Any:
-    """Return a value that a key may not expect."""
+    """Return a random value that a key may not expect."""
     kind = rng.random()
     if kind < 0.5:
         return rng.choice(NUMBERS)
@@ -100,7 +102,7 @@ def hostile(rng: random.Random) -> Any:
 
 
 def places(node: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
-    """Return the paths of everything within plain data."""
+    """Return the paths (tuples of keys and indices) of all values in plain data."""
     items = node.items() if isinstance(node, dict) else enumerate(node) if isinstance(node, list) else ()
     found = []
     for key, value in items:
@@ -109,7 +111,7 @@ def places(node: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
 
 
 def changed(table: Any, rng: random.Random) -> Any:
-    """Return plain data with one to three changes: a key left out, of another kind, misspelt, twice, huge."""
+    """Return plain data with one to three changes: a value deleted, renamed, repeated, scaled or replaced."""
     table = copy.deepcopy(table)
     for _ in range(rng.choice((1, 1, 2, 3))):
         where = places(table)
@@ -137,7 +139,7 @@ def changed(table: Any, rng: random.Random) -> Any:
 
 
 def flipped(data: bytes, rng: random.Random, other: bytes = b"") -> bytes:
-    """Return bytes with damage: flips, cuts, splices, zeros, repeats, long words."""
+    """Return damaged bytes: changed, cut, spliced with `other`, zeroed, repeated, or with odd words inserted."""
     out = bytearray(data)
     for _ in range(rng.choice((1, 1, 2, 4, 16))):
         at = rng.randrange(len(out) + 1)
@@ -164,7 +166,7 @@ def flipped(data: bytes, rng: random.Random, other: bytes = b"") -> bytes:
 
 
 def toml_value(value: Any) -> str:
-    """Return a value as TOML, or as what looks like it."""
+    """Return a value as TOML text; for some values it is only similar to TOML."""
     if isinstance(value, dict):
         return "{ " + ", ".join(f"{json.dumps(str(k))} = {toml_value(v)}" for k, v in value.items()) + " }"
     if isinstance(value, list):
@@ -177,23 +179,23 @@ def toml_value(value: Any) -> str:
 
 
 def toml(table: dict[str, Any]) -> bytes:
-    """Return plain data as a TOML file."""
+    """Return plain data as the bytes of a TOML file."""
     lines = [f"{json.dumps(str(key))} = {toml_value(value)}" for key, value in table.items()]
     return ("\n".join(lines) + "\n").encode("utf-8", "surrogatepass")
 
 
 def any_toml(table: dict[str, Any], rng: random.Random) -> bytes:
-    """Return a damaged TOML file: mostly damaged values, else damaged text."""
+    """Return a damaged TOML file: in three of four cases with damaged values, otherwise with damaged text."""
     if rng.random() < 0.75:
         return toml(changed(table, rng))
     return flipped(toml(table), rng, toml(table))
 
 
-# --- sound inputs ---------------------------------------------------------------------------------------------
+# --- valid inputs ---------------------------------------------------------------------------------------------
 
 
 class Seeds:
-    """Sound inputs, made once in `folder`."""
+    """Valid inputs, made once in `folder`; the cases damage them."""
 
     def __init__(self, folder: Path) -> None:
         sys.path.insert(0, str(ROOT / "tests"))
@@ -213,7 +215,7 @@ class Seeds:
         self.textures = _textures()
 
     def build(self) -> None:
-        """Build the store that store cases damage, of two small samples."""
+        """Build the store that `case_store` damages; it has two small samples."""
         path = self.folder / "seed.toml"
         path.write_bytes(toml({**self.scene, "dataset": {**self.scene["dataset"], "samples": 2, "sites": 1}}))
         done = run(["build", str(path), "--out", str(self.store)])
@@ -222,6 +224,7 @@ class Seeds:
 
 
 def _meshes(folder: Path) -> dict[str, bytes]:
+    """Return a small valid mesh in every format, by file name."""
     import numpy as np
     import trimesh
     from test_formats import both_counts, letters, lumpy, vrml1, vrml2
@@ -279,6 +282,7 @@ def _meshes(folder: Path) -> dict[str, bytes]:
 
 
 def _kernels(folder: Path) -> dict[str, bytes]:
+    """Return small valid SPICE kernels by file name; the meta-kernel refers to a file in `folder`."""
     text = (
         "KPL/PCK\n\\begindata\nBODY399_RADII = ( 6378.1 6378.1 6356.8 )\nBODY399_PM = ( 190.147 360.9 0. )\n"
         "BODY399_POLE_RA = ( 0. -0.641 0. )\nBODY399_POLE_DEC = ( 90. -0.557 0. )\n\\begintext\n"
@@ -307,6 +311,7 @@ def _kernels(folder: Path) -> dict[str, bytes]:
 
 
 def _textures() -> dict[str, bytes]:
+    """Return small valid images by file name."""
     import cv2
     import numpy as np
 
@@ -320,16 +325,17 @@ def _textures() -> dict[str, bytes]:
 
 # --- cases ----------------------------------------------------------------------------------------------------
 
-Case = tuple[list[str], dict[str, str]]  # arguments, and variables of the environment
+Case = tuple[list[str], dict[str, str]]  # arguments, and environment variables
 
 
 def dry(scene: Path, *settings: str) -> list[str]:
+    """Return the arguments of a dry run of a scene, with `--set` for each setting."""
     out = str(scene.parent / "out.zarr")
     return ["build", str(scene), "--out", out, "--dry-run", *(x for s in settings for x in ("--set", s))]
 
 
 def case_scene(seeds: Seeds, rng: random.Random, here: Path) -> Case:
-    """A scene file; of a packaged one the small parts."""
+    """Damage a scene file: the small one or a packaged one."""
     table = rng.choice([seeds.scene, seeds.scene, *seeds.scenes])
     path = here / "scene.toml"
     path.write_bytes(any_toml(table, rng))
@@ -337,13 +343,14 @@ def case_scene(seeds: Seeds, rng: random.Random, here: Path) -> Case:
 
 
 def _whole_scene(seeds: Seeds, here: Path, **tables: Any) -> Path:
+    """Write the small valid scene with some tables replaced; return its path."""
     path = here / "scene.toml"
     path.write_bytes(toml({**seeds.scene, **tables}))
     return path
 
 
 def case_fault(seeds: Seeds, rng: random.Random, here: Path) -> Case:
-    """One key of a fault out of its range, or of another kind."""
+    """Give one or two keys of a fault model unexpected values."""
     from vbnfault import faults
 
     models = [(name, model, kind) for name, of in faults.registry().items() for model, kind in of.items()]
@@ -354,6 +361,7 @@ def case_fault(seeds: Seeds, rng: random.Random, here: Path) -> Case:
 
 
 def case_lens(seeds: Seeds, rng: random.Random, here: Path) -> Case:
+    """Damage a lens file; run `lens` on it, or a scene that uses it."""
     path = here / "lens.toml"
     path.write_bytes(any_toml(rng.choice(seeds.lenses), rng))
     if rng.random() < 0.5:
@@ -363,6 +371,7 @@ def case_lens(seeds: Seeds, rng: random.Random, here: Path) -> Case:
 
 
 def case_sensor(seeds: Seeds, rng: random.Random, here: Path) -> Case:
+    """Damage a sensor file that a scene uses."""
     path = here / "sensor.toml"
     path.write_bytes(any_toml(rng.choice(seeds.sensors), rng))
     camera = {**seeds.scene["camera"], "detector": str(path)}
@@ -370,6 +379,7 @@ def case_sensor(seeds: Seeds, rng: random.Random, here: Path) -> Case:
 
 
 def _damaged_mesh(name: str, data: bytes, rng: random.Random, seeds: Seeds) -> bytes:
+    """Return a damaged mesh file: in most cases with damaged values, otherwise with damaged bytes."""
     if rng.random() < 0.6:
         if name.endswith(".gltf"):
             return json.dumps(changed(json.loads(data), rng)).encode()
@@ -398,7 +408,8 @@ def _damaged_mesh(name: str, data: bytes, rng: random.Random, seeds: Seeds) -> b
 
 
 def case_mesh(seeds: Seeds, rng: random.Random, here: Path) -> Case:
-    # a DSK costs a process: few of them
+    """Damage the shape of the body."""
+    # a DSK is read in a process of its own, which takes time: choose it less often
     name = rng.choice([n for n in seeds.meshes if n != "a.bds" or rng.random() < 0.3])
     path = here / name
     path.write_bytes(_damaged_mesh(name, seeds.meshes[name], rng, seeds))
@@ -407,6 +418,7 @@ def case_mesh(seeds: Seeds, rng: random.Random, here: Path) -> Case:
 
 
 def case_spacecraft(seeds: Seeds, rng: random.Random, here: Path) -> Case:
+    """Damage the model of the spacecraft, and at times its table in the scene."""
     name = rng.choice(("a.obj", "b.obj", "a.glb", "a.gltf"))
     path = here / name
     path.write_bytes(_damaged_mesh(name, seeds.meshes[name], rng, seeds))
@@ -419,6 +431,7 @@ def case_spacecraft(seeds: Seeds, rng: random.Random, here: Path) -> Case:
 
 
 def case_texture(seeds: Seeds, rng: random.Random, here: Path) -> Case:
+    """Damage the texture of a fault."""
     name = rng.choice(list(seeds.textures))
     path = here / name
     path.write_bytes(flipped(seeds.textures[name], rng, seeds.textures["a.png"]))
@@ -427,6 +440,7 @@ def case_texture(seeds: Seeds, rng: random.Random, here: Path) -> Case:
 
 
 def case_kernel(seeds: Seeds, rng: random.Random, here: Path) -> Case:
+    """Damage one of the SPICE kernels, and at times their table in the scene."""
     paths = []
     broken = rng.choice(list(seeds.kernels))
     for name, data in seeds.kernels.items():
@@ -440,7 +454,7 @@ def case_kernel(seeds: Seeds, rng: random.Random, here: Path) -> Case:
 
 
 def case_special(seeds: Seeds, rng: random.Random, here: Path) -> Case:
-    """What is no regular file, in the place of each file."""
+    """Replace an input file by a pipe, device, folder, circular link or sparse file, or give a bad name."""
     key, suffix = rng.choice(
         [
             ("body.shape", ".obj"),
@@ -476,7 +490,7 @@ def case_special(seeds: Seeds, rng: random.Random, here: Path) -> Case:
 
 
 def case_options(seeds: Seeds, rng: random.Random, here: Path) -> Case:
-    """Options and environment variables of every command; what would compute for long stays small."""
+    """Give unexpected options and environment variables to several commands; the work itself stays small."""
     scene = str(_whole_scene(seeds, here))
     out = str(here / "out")
     sound: dict[str, list[str]] = {
@@ -549,7 +563,7 @@ def case_options(seeds: Seeds, rng: random.Random, here: Path) -> Case:
 
 
 def case_store(seeds: Seeds, rng: random.Random, here: Path) -> Case:
-    """A store with one or two files damaged."""
+    """Damage one or two files of a store."""
     store = here / "store.zarr"
     shutil.copytree(seeds.store, store)
     files = sorted(p for p in store.rglob("*") if p.is_file())
@@ -576,7 +590,7 @@ def case_store(seeds: Seeds, rng: random.Random, here: Path) -> Case:
     return [command, str(store), *(["--out", str(here / "sheet.png")] if command == "preview" else [])], {}
 
 
-CASES: dict[str, tuple[Callable[[Seeds, random.Random, Path], Case], int]] = {  # and how many of a hundred
+CASES: dict[str, tuple[Callable[[Seeds, random.Random, Path], Case], int]] = {  # function, percentage of cases
     "scene": (case_scene, 17),
     "fault": (case_fault, 12),
     "lens": (case_lens, 12),
@@ -595,7 +609,10 @@ CASES: dict[str, tuple[Callable[[Seeds, random.Random, Path], Case], int]] = {  
 
 
 def run(arguments: list[str]) -> tuple[int, str, str]:
-    """Run the program in this process: exit code (-1 for a traceback), and what it wrote to both outputs."""
+    """Run the program in this process.
+
+    Return its exit code (-1 for a traceback), its standard error and its standard output.
+    """
     from vbnfault import cli
 
     output, errors = io.StringIO(), io.StringIO()
@@ -618,7 +635,7 @@ def run(arguments: list[str]) -> tuple[int, str, str]:
 
 
 def attempt(seeds: Seeds, seed: str, number: int, keep: Path | None = None) -> dict[str, Any]:
-    """Run case `number`, and return what came of it."""
+    """Run case `number` and return its result; its files are kept in the folder `keep`, if given."""
     rng = random.Random(f"{seed}/{number}")
     kind = rng.choices(list(CASES), [weight for _, weight in CASES.values()])[0]
     here = Path(tempfile.mkdtemp(dir=seeds.folder)) if keep is None else keep
@@ -627,7 +644,7 @@ def attempt(seeds: Seeds, seed: str, number: int, keep: Path | None = None) -> d
     before = dict(os.environ)
     os.environ.update(variables)
     folder = os.getcwd()
-    os.chdir(here)  # commands write where they are run
+    os.chdir(here)  # commands may write to the working folder
     try:
         code, errors, _ = run(arguments)
     finally:
@@ -662,12 +679,12 @@ def attempt(seeds: Seeds, seed: str, number: int, keep: Path | None = None) -> d
 
 
 def worker(folder: Path, seed: str) -> None:
-    """Run the cases whose numbers arrive on standard input; answer each with a line of JSON."""
+    """Run the cases whose numbers arrive on standard input; answer each with one line of JSON."""
     answers = os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)
     seeds = Seeds(Path(tempfile.mkdtemp(dir=folder)))
     seeds.store = folder / "seed.zarr"
-    run(dry(_whole_scene(seeds, seeds.folder)))  # what is imported counts for no case
+    run(dry(_whole_scene(seeds, seeds.folder)))  # imports everything before the time of a case is measured
     for limit, value in ((resource.RLIMIT_CORE, 0), (resource.RLIMIT_AS, _address_space() + 2 * MEMORY_BYTES)):
         resource.setrlimit(limit, (value, resource.getrlimit(limit)[1]))
     for line in sys.stdin:
@@ -678,6 +695,7 @@ def worker(folder: Path, seed: str) -> None:
 
 
 def _address_space() -> int:
+    """Return the size of this process's address space, in bytes; 0 if the system does not report it."""
     for line in Path("/proc/self/status").read_text().splitlines():
         if line.startswith("VmSize:"):
             return int(line.split()[1]) * 1024
@@ -688,7 +706,7 @@ def _address_space() -> int:
 
 
 class Process:
-    """A worker, and the case it is at."""
+    """A worker process and the number of its current case."""
 
     def __init__(self, folder: Path, seed: str) -> None:
         self.number: int | None = None
@@ -711,6 +729,7 @@ class Process:
         )
 
     def give(self, number: int | None) -> None:
+        """Send it a case; None ends the process."""
         assert self.process.stdin is not None
         self.number, self.since = number, time.monotonic()
         if number is None:
@@ -721,7 +740,7 @@ class Process:
                 self.process.stdin.flush()
 
     def blocked(self) -> bool:
-        """Whether the case has neither ended nor computed for long."""
+        """Return whether the case has used no processor time for `BLOCKED_S`."""
         import psutil
 
         with contextlib.suppress(psutil.Error):
@@ -733,7 +752,7 @@ class Process:
 
 
 def fuzz(count: int, seed: str, processes: int, progress: bool = True) -> list[dict[str, Any]]:
-    """Run cases 0 to `count` - 1, and return the failures."""
+    """Run cases 0 to `count` - 1; print and return the failures."""
     failures: list[dict[str, Any]] = []
     outcomes: Counter[tuple[str, Any]] = Counter()
     slowest, began = 0.0, time.monotonic()
@@ -777,7 +796,7 @@ def fuzz(count: int, seed: str, processes: int, progress: bool = True) -> list[d
                     print(f"{ended} of {count} cases, {rate:.0f} a minute, {len(failures)} failures", flush=True)
             for one in workers:
                 if one.number is not None and one.blocked():
-                    one.process.kill()  # its end is read as one of a case that died
+                    one.process.kill()  # the loop above then reports that the process died
         for one in workers:
             one.process.wait()
             assert one.process.stdout is not None
@@ -794,6 +813,7 @@ def fuzz(count: int, seed: str, processes: int, progress: bool = True) -> list[d
 
 
 def report(result: dict[str, Any], seed: str) -> None:
+    """Print a failure and the command that repeats it."""
     print(f"FAILED case {result['number']} ({result['kind']}): {result['problem']}")
     for key in ("arguments", "variables", "text"):
         if result.get(key):
@@ -802,7 +822,7 @@ def report(result: dict[str, Any], seed: str) -> None:
 
 
 def source_hash() -> str:
-    """Return a hash of the package's sources: other cases for each commit, the same for all runs of one."""
+    """Return a hash of the package's sources, so that each commit has its own cases."""
     digest = hashlib.sha256()
     for path in sorted((ROOT / "vbnfault").rglob("*.py")):
         digest.update(path.read_bytes())
@@ -810,6 +830,7 @@ def source_hash() -> str:
 
 
 def main() -> None:
+    """Run all cases or one; the exit code is 1 if a case of a full run failed."""
     parser = argparse.ArgumentParser(prog="python -m tests.fuzz", description=__doc__.split("\n")[0])
     parser.add_argument("--count", type=int, default=500)
     parser.add_argument("--seed", default=None, help="default: a hash of the sources")

@@ -2,11 +2,14 @@
 
     python -m tests.kills --count 500 --rendering off
 
-Each round kills one build up to three times (SIGKILL, half of them leaving half a file, or SIGTERM), at operations
-drawn by `--seed`, with one worker and, in one round of eight, with two. The store is then completed in peace: its
-digest has to be that of a build that nothing disturbed, `verify` finds nothing, no temporary file is left, and no
-finished sample is lost by a kill. Every build runs in a process forked from this one, which imports what a build
-needs, without rendering, and opens no store.
+Each round ends one build early, up to three times, at operations drawn with `--seed`. The signal is SIGKILL, or in
+one of four cases SIGTERM; half of the SIGKILLs leave a half-written file. The build has one worker, in every eighth
+round two. A last build then completes the store without disturbance. A round passes if the digest equals that of a
+build that was never disturbed, `verify` reports no problem, no temporary file is left, and no kill lost a finished
+sample.
+
+Every build runs in a process forked from this one. This process imports what a build needs, except the renderer,
+and opens no store.
 """
 
 from __future__ import annotations
@@ -29,20 +32,20 @@ import numpy as np
 import victim
 from conftest import small_scene
 
-# The child processes of a build import this file anew, as `__mp_main__`.
+# The worker processes of a build import this file again, as `__mp_main__`.
 if __name__ == "__mp_main__":
     victim.follow_the_environment("worker")
 
 
 def import_all() -> None:
-    """Import what builds and reports need, all but the renderer, whose threads no forked process would have."""
+    """Import what builds and reports need, except the renderer: a forked process would lack its threads."""
     import test_build  # noqa: F401
 
     from vbnfault import dataset, store  # noqa: F401
 
 
 def synthetic(out: Path, workers: int) -> None:
-    """Build 18 made-up samples."""
+    """Build 18 synthetic samples."""
     import test_build
 
     test_build.run(out, workers=workers)
@@ -58,14 +61,14 @@ def rendered(out: Path, workers: int) -> None:
 
 
 def finished(out: Path) -> int:
-    """Return how many samples of a store are finished; 0 where there is none."""
+    """Return how many samples of a store are finished; 0 if there is no store."""
     from vbnfault import store
 
     return store.open_store(out).finished() if store.is_store(out) else 0
 
 
 def report(out: Path) -> dict[str, Any]:
-    """Return what there is of a store."""
+    """Return the number of finished samples, the digest (empty if there are problems) and the problems."""
     from vbnfault import store
 
     problems = store.verify(out)
@@ -73,7 +76,7 @@ def report(out: Path) -> dict[str, Any]:
 
 
 def forked(action: Callable[[], Any]) -> tuple[int, Any]:
-    """Run an action in a forked process: its exit code, negative for a signal, and what it returned."""
+    """Run an action in a forked process; return its exit code, negative for a signal, and its result."""
     reader, writer = os.pipe()
     pid = os.fork()
     if pid == 0:
@@ -92,7 +95,7 @@ def forked(action: Callable[[], Any]) -> tuple[int, Any]:
 
 
 def main() -> int:
-    """Run the rounds; the exit code says whether one failed."""
+    """Run the rounds; the exit code is 1 if one failed."""
     options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     options.add_argument("--count", type=int, default=500, help="kills in all")
     options.add_argument("--rendering", choices=("on", "off"), default="off")

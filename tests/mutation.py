@@ -1,21 +1,21 @@
-"""Measure how many mutations of the code the tests notice. A tool for people, not a part of the test suite.
+"""Measure which fraction of mutations of the code the tests detect. This tool is not part of the test suite.
 
     pip install 'cosmic-ray>=8.7'
     python tests/mutation.py --count 40 --seed 1 --out survivors.json plan labels
     python tests/mutation.py --only survivors.json --out still.json
 
-For each group of modules below, `count` mutations are drawn at random, one at a time is applied to a copy of the
+For each group of modules, `--count` mutations are drawn at random. Each one is applied alone to a copy of the
 project, and the group's tests run until the first failure. A mutation is *killed* if a test fails or if the tests
-take ten times as long as without it, and *survives* otherwise. The score is the fraction killed, printed with its
-95 % interval (Wilson).
+take more than 60 s plus ten times their normal duration; otherwise it *survives*. The score is the fraction killed,
+printed with its 95 % interval (Wilson).
 
-Before the first mutation the group's tests run once with a tracer, which notes the lines that each test executes
-and its duration (`--traces` keeps them in a file for the next run). Of a mutation only the tests that execute its
-statement run, the shortest first. What runs in the set-up of a test counts for all tests of its file, and what runs
-while modules are imported for all tests. Tests marked `slow` are left out.
+Before the first mutation the tests run once with a tracer, which records each test's duration and the lines that it
+executes (`--traces` keeps both in a file for the next run). For a mutation, only the tests that execute its
+statement run, the shortest first. Lines that run in the set-up of a test count for all tests of its file. Lines
+that run while modules are imported count for all tests. Tests marked `slow` are left out.
 
-Mutations that cannot change what the program does are left out where that can be told from their position alone:
-type annotations, decorators, conditions on `TYPE_CHECKING`, the text of errors, and what is no Python at all.
+Mutations whose position shows that they cannot change what the program computes are left out: those of type
+annotations, decorators and the text of errors, and those that are not valid Python.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from typing import Any
 
 ROOT = Path(__file__).resolve().parents[1]
 
-# group → (modules, tests that are meant to notice their mutations)
+# group → (modules, tests that should detect their mutations)
 GROUPS: dict[str, tuple[list[str], list[str]]] = {
     "plan": (["vbnfault/scene/plan.py"], ["tests/test_plan.py", "tests/test_views.py"]),
     "splits": (["vbnfault/scene/plan.py"], ["tests/test_plan.py", "tests/test_views.py"]),
@@ -58,22 +58,25 @@ GROUPS: dict[str, tuple[list[str], list[str]]] = {
     "store": (["vbnfault/store/*.py"], ["tests/test_store*.py"]),
     "faults": (["vbnfault/faults/*.py"], ["tests/test_fault_{stem}*.py", "tests/test_faults_contract.py"]),
 }
-# functions of a module that make up a group of their own
+# functions of a module that form their own group
 PARTS: dict[str, set[str]] = {
     "splits": {"shortcomings", "site_split", "individual_split", "_in_turn", "_individuals", "_dealt", "_exchange"}
     | {"_shard_sites", "_site_order"},
 }
 _ALWAYS = ["-q", "-n", "0", "-p", "no:cacheprovider", "-m", "not slow"]
-# of mutations that would rarely tell anything: annotations hold `|`, and decorators make dataclasses
+# operators whose mutations rarely show anything: most `|` are in annotations, most decorators make dataclasses
 _LEFT_OUT = ("BitOr", "RemoveDecorator", "VariableInserter", "VariableReplacer")
-_IMPORT = "import"  # as tests/lines_by_test.py names what runs outside of tests
+_IMPORT = "import"  # name in tests/lines_by_test.py for lines that run outside of tests
 
 
 # ------------------------------------------------------------------------------------ which test executes a line
 
 
 def traced(root: Path, file: str, python: str, kept: Path | None) -> dict[str, Any]:
-    """Return lines and durations of each test of a file, from an earlier run where nothing has changed."""
+    """Return the lines and the duration of each test of a file.
+
+    They come from the file `kept` if the sources, `conftest.py` and the test file are unchanged since.
+    """
     sources = [*sorted(root.glob("vbnfault/**/*.py")), root / "tests/conftest.py", root / file]
     digest = hashlib.sha256(b"".join(p.read_bytes() for p in sources) + file.encode()).hexdigest()
     known = json.loads(kept.read_text(encoding="utf-8")) if kept and kept.is_file() else {}
@@ -91,7 +94,7 @@ def traced(root: Path, file: str, python: str, kept: Path | None) -> dict[str, A
 
 
 def executing(mutation: dict[str, Any], traces: list[dict[str, Any]]) -> dict[str, float]:
-    """Return the tests that execute a mutation's statement and their durations, the shortest first."""
+    """Return the tests that execute a mutation's statement with their durations in s, the shortest first."""
     first, last = mutation["statement"]
     keys = [f"{mutation['path']}:{k}" for k in range(first, last + 1)]
     runs: dict[str, float] = {}
@@ -105,12 +108,16 @@ def executing(mutation: dict[str, Any], traces: list[dict[str, Any]]) -> dict[st
 
 
 def _decorated(node: ast.AST) -> Iterator[int]:
+    """Yield the lines of a definition's decorators."""
     for decorator in getattr(node, "decorator_list", ()):
         yield from range(decorator.lineno, decorator.end_lineno + 1)
 
 
 def statements(path: Path) -> dict[int, tuple[int, int, str, bool]]:
-    """Return for each line of a module first and last line of its statement, its function, if it is left out."""
+    """Return for each line of a module: first and last line of its statement, its function, whether it is left out.
+
+    Decorators and `raise` statements are left out.
+    """
     found: dict[int, tuple[int, int, str, bool]] = {}
 
     def visit(node: ast.AST, function: str) -> None:
@@ -133,7 +140,7 @@ def statements(path: Path) -> dict[int, tuple[int, int, str, bool]]:
 
 
 def positions(path: Path) -> list[dict[str, Any]]:
-    """List every mutation of a module: operator, occurrence and position in the text."""
+    """Return every mutation of a module: operator, occurrence, position, statement and function."""
     import cosmic_ray.plugins
     from cosmic_ray.ast import ast_nodes, get_ast_from_path
 
@@ -153,7 +160,7 @@ def positions(path: Path) -> list[dict[str, Any]]:
 
 
 def drawn(group: str, count: int, seed: int) -> list[dict[str, Any]]:
-    """Draw mutations of a group: one at each of `count` random positions."""
+    """Draw mutations of a group: one at each of up to `count` random positions."""
     files = sorted(p for pattern in GROUPS[group][0] for p in ROOT.glob(pattern))
     apart = set().union(*(PARTS[g] for g in PARTS if g != group and GROUPS[g][0] == GROUPS[group][0]))
     by_place: dict[Any, list[dict[str, Any]]] = {}
@@ -174,6 +181,7 @@ def drawn(group: str, count: int, seed: int) -> list[dict[str, Any]]:
 
 
 def _compiles(mutation: dict[str, Any]) -> bool:
+    """Return whether the mutated module is valid Python."""
     import cosmic_ray.plugins
     from cosmic_ray.mutating import mutate_code
 
@@ -181,7 +189,7 @@ def _compiles(mutation: dict[str, Any]) -> bool:
     changed = mutate_code(text, cosmic_ray.plugins.get_operator(mutation["operator"])(), mutation["occurrence"])
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # `is` with a number
+            warnings.simplefilter("ignore")  # compile warns about `is` with a number
             compile(changed or "", mutation["path"], "exec")
     except SyntaxError:
         return False
@@ -189,7 +197,7 @@ def _compiles(mutation: dict[str, Any]) -> bool:
 
 
 def tests_of(mutation: dict[str, Any], root: Path) -> list[str]:
-    """Return the test files that are meant to notice a mutation."""
+    """Return the test files that should detect a mutation."""
     stem = Path(mutation["path"]).stem
     patterns = [p.format(stem=stem) for p in GROUPS[mutation["group"]][1]]
     return [str(p.relative_to(root)) for pattern in patterns for p in sorted(root.glob(pattern))]
@@ -201,7 +209,10 @@ def tests_of(mutation: dict[str, Any], root: Path) -> list[str]:
 def run_tests(
     root: Path, tests: list[str], python: str, limit_s: float | None, more: dict[str, str] | None = None
 ) -> tuple[bool, str]:
-    """Run tests in a copy of the project; return whether they failed, and the first failing test."""
+    """Run tests in a copy of the project; return whether they failed, and the first failing test.
+
+    `limit_s`: duration after which the tests count as failed. `more`: further environment variables.
+    """
     paths = os.pathsep.join((str(root), str(root / "tests")))
     environment = {**os.environ, "PYTHONPATH": paths, "PYTHONDONTWRITEBYTECODE": "1", **(more or {})}
     command = [python, "-m", "pytest", *_ALWAYS, "-x", *tests]
@@ -216,7 +227,7 @@ def run_tests(
 
 
 def judge(mutation: dict[str, Any], root: Path, python: str, traces: list[dict[str, Any]]) -> dict[str, Any]:
-    """Apply a mutation to the copy at `root`, run its tests, take it back."""
+    """Apply a mutation to the copy at `root`, run its tests, undo the mutation; return the verdict."""
     import cosmic_ray.plugins
     from cosmic_ray.mutating import use_mutation
 
@@ -241,7 +252,7 @@ def interval(killed: int, count: int) -> tuple[float, float]:
 
 
 def main() -> None:
-    """Run the tool."""
+    """Draw the mutations, judge them, and print the scores."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("groups", nargs="*", help=f"of {', '.join(GROUPS)} [default: all]")
     parser.add_argument("--count", type=int, default=40, help="mutations of each group")
@@ -262,7 +273,7 @@ def main() -> None:
         for k in range(given.workers):
             copies.append(Path(folder) / f"copy{k}")
             shutil.copytree(ROOT, copies[-1], ignore=shutil.ignore_patterns(".git", "*.zarr", ".*_cache"))
-        if (ROOT.parent / "shared").is_dir():  # the real shape, where tests look for it
+        if (ROOT.parent / "shared").is_dir():  # some tests read the real shape of the comet there
             (Path(folder) / "shared").symlink_to(ROOT.parent / "shared")
         traces: dict[str, dict[str, Any]] = {}
         for file in sorted({file for m in chosen for file in tests_of(m, copies[0])}):

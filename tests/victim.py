@@ -1,15 +1,17 @@
-"""A program that sends itself signals at its n-th file operation, import or process start: tests count no seconds.
+"""Run the program so that it sends itself signals at its n-th file operation, import or process start.
 
     VICTIM_PLAN='{"main": [{"events": ["write"], "count": 7, "signal": "SIGKILL"}]}' python tests/victim.py cli …
 
-`cli` runs the command line, `build` a build of made-up samples (`test_build.main`). The plan is a list of steps for
-the program itself (`main`) and one for each of its worker processes (`worker`). A step waits until `count` events
-of one of its kinds, with `text` in what they concern, have begun, sends its signal and gives way to the next step:
+So a test interrupts the program at an exact point and does not depend on time. `cli` runs the command line; `build`
+builds synthetic samples (`test_build.main`). The plan has one list of steps for the program itself (`main`) and one
+for each of its worker processes (`worker`). A step counts the events of its kinds that concern a name containing
+`text`. When event number `count` begins, the step sends its signal, and the next step follows.
 
-events      `write` (a file is opened to be written, renamed, removed, made durable; a folder is made), `open` (any
-            file), `import` (a module), `start` (a worker process has been started), `kill` (a signal is sent)
+events      `write` (a file is opened for writing, renamed, removed or flushed, or a folder is made or removed),
+            `open` (of any file), `import` (of a module), `start` (a worker process has been started), `kill` (a
+            signal is sent)
 to          `self`, `parent`, or `group`: every process of the command, as a terminal does on Ctrl-C
-torn        a write leaves half a file of nonsense first
+torn        if the event opens a file for writing, nonsense is written to that file before the signal
 """
 
 from __future__ import annotations
@@ -29,14 +31,14 @@ _WRITES = {"os.rename", "os.mkdir", "os.remove", "os.rmdir", "os.truncate", "os.
 
 
 def step(*events: str, count: int = 1, number: str = "SIGKILL", **more: Any) -> dict[str, Any]:
-    """A step of a plan."""
+    """Return a step of a plan; `number` is the name of the signal."""
     return {"events": events, "count": count, "signal": number, **more}
 
 
 def start(
     arguments: Sequence[object], *, main: Sequence[dict] = (), worker: Sequence[dict] = (), **more: Any
 ) -> subprocess.Popen[str]:
-    """Start the program with a plan, in a session of its own; its outputs are pipes."""
+    """Start the program with a plan, in its own session (process group); its outputs are pipes."""
     path = os.pathsep.join([str(HERE.parent), str(HERE)])
     plan = json.dumps({"main": main, "worker": worker})
     return subprocess.Popen(
@@ -51,10 +53,10 @@ def start(
 
 
 def run(arguments: Sequence[object], **more: Any) -> subprocess.CompletedProcess[str]:
-    """Run the program to its end, and to that of every process that it started: they hold its outputs."""
+    """Run the program until it and every process that it started have ended: they share its outputs."""
     process = start(arguments, **more)
     try:
-        out, err = process.communicate(timeout=600)  # no measure: it guards against a test that hangs
+        out, err = process.communicate(timeout=600)  # only against a test that hangs
     except subprocess.TimeoutExpired:
         os.killpg(process.pid, signal.SIGKILL)
         out, err = process.communicate()
@@ -63,7 +65,7 @@ def run(arguments: Sequence[object], **more: Any) -> subprocess.CompletedProcess
 
 
 def follow(steps: Sequence[dict[str, Any]], count: Callable[[str, str], None] | None = None) -> None:
-    """Follow a plan in this process, from now on; `count` is called with every event."""
+    """Follow a plan in this process from now on; `count` is called with the kind and text of every event."""
     left = [dict(one) for one in steps]
     inside = [False]
     parent = os.getppid()
@@ -114,22 +116,24 @@ def follow(steps: Sequence[dict[str, Any]], count: Callable[[str, str], None] | 
 
 
 def _send(number: int, to: str, parent: int) -> None:
+    """Send a signal to this process, its parent or its group."""
     if to == "group":
         os.killpg(os.getpgid(0), number)
     elif to == "self":
         os.kill(os.getpid(), number)
-    elif os.getppid() == parent:  # an orphan has another parent, which is none of a build's processes
+    elif os.getppid() == parent:  # an orphan has another parent, which is not a process of the build
         os.kill(parent, number)
 
 
 def follow_the_environment(role: str) -> None:
-    """Follow what VICTIM_PLAN says for this process."""
+    """Follow the steps in VICTIM_PLAN for this process; `role`: `main` or `worker`."""
     steps = json.loads(os.environ.get("VICTIM_PLAN", "{}")).get(role)
     if steps:
         follow(steps)
 
 
 def main() -> None:
+    """Run `build` or `cli` with the other arguments."""
     kind, *arguments = sys.argv[1:]
     if kind == "build":
         import test_build
@@ -141,7 +145,7 @@ def main() -> None:
     cli.main()
 
 
-if __name__ == "__mp_main__":  # a worker imports the main program anew
+if __name__ == "__mp_main__":  # a worker process imports the main program again
     follow_the_environment("worker")
 if __name__ == "__main__":
     follow_the_environment("main")

@@ -1,4 +1,4 @@
-"""How a dataset is built, resumed, mended and checked against its scene."""
+"""Build, resume, repair and extend a dataset, and derive what its store must hold from its scene."""
 
 from .identity import SessionFactory, build_scene, describe_scene, is_exact, planned, scene_identity, store_spec
 

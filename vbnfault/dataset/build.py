@@ -1,9 +1,9 @@
-"""Building a dataset: which samples are missing, who makes them, what happens when something goes wrong.
+"""Build a dataset: find the missing samples, have workers make them, and handle failures and interruption.
 
-A task is a shard. Tasks are handed out by site, so that a worker loads a site's
-terrain once. A task first checks what its shard already holds, then makes the rest: resuming, repairing and
-appending are the same thing. What a build makes depends on no order: workers, interruption and repair leave
-no trace in the arrays.
+A task completes one shard. Tasks are assigned by site, so that a worker loads the terrain of a site once. A task
+first checks the samples that its shard already holds, then makes the others. So a build resumes, repairs and
+extends a store with the same code. The arrays do not depend on the order of work, on the number of workers, or on
+interruptions and repairs.
 """
 
 from __future__ import annotations
@@ -44,15 +44,31 @@ __all__ = [
     "planned_blocks",
 ]
 
-RECYCLE_SHARDS = 32  # a worker process is replaced after so many: long LLVM runs grow and at last fail
+RECYCLE_SHARDS = 32  # shards after which a worker process is replaced: long LLVM runs grow and finally fail
 
 
 @dataclass(frozen=True, kw_only=True)
 class Summary:
-    """What a build would do, or did. `finished` samples were there before; `built` ones were made now.
-    `description`: what the scene will photograph, a line each.
+    """What a build would do, or did.
 
-    `estimated_seconds`: of the whole work, None where unknown. `counts` and `digest`: of the store at the end.
+    Attributes
+    ----------
+    finished, built
+        Numbers of samples that existed before, and that were made now.
+    estimated_bytes, free_bytes
+        Approximate size of the whole store, and free space on its disk.
+    fault_counts
+        Number of samples planned for each fault class.
+    optics
+        One line on the lens.
+    seconds
+        Duration of the build.
+    estimated_seconds
+        Estimated duration of building the whole dataset; None if unknown.
+    counts, digest
+        Of the store after the build; None before it. `digest` is also None if a sample is missing.
+    description
+        Lines that describe what the scene will photograph.
     """
 
     path: Path
@@ -72,7 +88,7 @@ class Summary:
     description: tuple[str, ...] = ()
 
     def outlook(self) -> list[str]:
-        """What there is to do, in words."""
+        """Return lines that say what there is to do."""
         head = f"{self.path}: {self.samples} samples at {self.sites} sites in {self.shards} shards"
         size = f"about {size_text(self.estimated_bytes)}, {size_text(self.free_bytes)} free"
         lines = [f"{head}, {size}; {self.finished} of them were finished before"]
@@ -86,7 +102,7 @@ class Summary:
         return lines
 
     def lines(self) -> list[str]:
-        """The summary in words: of what was done, or else of what there is to do."""
+        """Return lines that say what was done, or, before a build, what there is to do."""
         if self.counts is None:
             return [*self.outlook(), *self.description]
         lines = [f"{self.path}: {self.samples} samples, {self.finished} of them finished before"]
@@ -103,11 +119,11 @@ class Summary:
 def planned_blocks(
     out: str | os.PathLike[str], samples: int, *, append: int = 0, overwrite: bool = False
 ) -> tuple[int, ...]:
-    """Sizes of the planned blocks: those of an existing store, one more where `append` asks for it.
+    """Return the sizes of the planned blocks: those of an existing store, and one of size `append` if it is not 0.
 
-    Where the last block was appended, has the size `append` and is unfinished, it is resumed instead of
-    adding another: so a command that was interrupted can be repeated as it is. Raises InputError where there
-    is nothing to append to, or where the store was made with another number of samples.
+    If the last block was appended, has the size `append` and is unfinished, it is resumed and none is added. So an
+    interrupted command can be repeated unchanged. Raises InputError if there is no store to append to, if `append`
+    is negative, or if the first block of the store does not have `samples` samples.
     """
     exists = store_module.is_store(out) and not overwrite
     if not exists:
@@ -150,18 +166,51 @@ def build(
 ) -> Summary:
     """Build, resume, repair or extend the store at `out`; see the module.
 
-    `session_factory`: picklable where `workers` > 1 or a scheduler is used. `site` int[sample], over all
-    blocks. `blocks`: from `planned_blocks`; one block by default. `workers` processes on this machine (1: in
-    this process), each with `threads` threads (an equal share of the cores by default; VBNFAULT_THREADS and
-    OMP_NUM_THREADS in its environment), or the Dask cluster at `scheduler`, whose workers must see `out`.
-    `planned_faults` bool[sample, fault] are counted beside those injected; `estimated_seconds` is announced.
-    `expected` and `exact`: as of `store.examine`; finished samples that are not as planned are built again.
-    `accept_versions`: a store made with other versions of the libraries is completed all the same, and its root
-    attribute `versions_of_samples` says with which ones.
+    Parameters
+    ----------
+    session_factory
+        Makes the object that simulates samples. It must be picklable if `workers` > 1 or a scheduler is used.
+    spec
+        The store to build.
+    site
+        Site of each sample, int[sample], over all blocks.
+    blocks
+        Result of `planned_blocks`; one block by default.
+    workers
+        Number of processes on this machine; 1 uses this process.
+    scheduler
+        Address of a Dask cluster that does the work instead; its workers must have access to `out`.
+    threads
+        Threads of each worker process, set through VBNFAULT_THREADS and OMP_NUM_THREADS in its environment; by
+        default the cores are divided equally.
+    overwrite
+        Replace an existing store.
+    dry_run
+        Only return the summary.
+    progress
+        Whether to show progress.
+    fault_counts, estimated_seconds
+        Shown to the user, see `Summary`.
+    planned_faults
+        Commanded faults, bool[sample, fault], counted beside the injected ones.
+    expected, exact
+        As in `store.examine`; finished samples that differ from the plan are rebuilt.
+    accept_versions
+        Also complete a store that was made with other library versions. Its root attribute `versions_of_samples`
+        then lists the versions of each sample.
+    recycle_shards
+        Number of shards after which a worker process is replaced.
 
-    Raises InputError where `out` holds another scene or nothing answers at `scheduler`, BuildFailed where
-    samples failed (all others are built), Interrupted after Ctrl-C or SIGTERM, VbnfaultError where the disk
-    or the cluster fails.
+    Raises
+    ------
+    InputError
+        If `out` holds another scene, or no scheduler answers.
+    BuildFailed
+        If samples failed; all others are built.
+    Interrupted
+        After Ctrl-C, SIGTERM or SIGHUP.
+    VbnfaultError
+        If the files cannot be written, the disk is too small, or the cluster fails.
     """
     sites = np.asarray(site, dtype=np.int64)
     blocks = tuple(blocks or (len(sites),))
@@ -200,7 +249,7 @@ def build(
     with interruptible():
         try:
             with locked(path):
-                summary = outlook()  # another build may have ended just now
+                summary = outlook()  # again: another build may have ended before the lock was free
                 if overwrite or not store_module.is_store(path):
                     store_module.create(path, spec, len(sites), overwrite=overwrite)
                 store = store_module.recover(path)
@@ -232,13 +281,14 @@ def build(
             "built": run.built,
             "seconds": time.monotonic() - began,
             "counts": store_module.count_faults(store, planned_faults),
-            # every sample was read or made just now, so nothing has to be read again
+            # every sample was read or made in this run, so its digest is known already
             "digest": run.digests.of(store) if run.digests.complete else None,
         }
     return Summary(**{**vars(summary), **results})
 
 
 def _with_attributes(spec: StoreSpec, blocks: tuple[int, ...]) -> StoreSpec:
+    """Return the spec with the planned blocks as a root attribute."""
     values = {**spec.plain(), "attributes": {**spec.attributes, "blocks": list(blocks)}}
     return StoreSpec(**values)
 
@@ -246,7 +296,10 @@ def _with_attributes(spec: StoreSpec, blocks: tuple[int, ...]) -> StoreSpec:
 def _with_versions_noted(
     store: Store, spec: StoreSpec, expected: store_module.Planned | None, *, exact: bool
 ) -> Store:
-    """Note in a store which samples are about to be made with other versions; before they are, whatever happens."""
+    """Record in a store which samples this build will make with other versions; return the store opened again.
+
+    This happens before any of them is made, so that the record is right after an interruption, too.
+    """
     now = spec.attributes.get("versions", {})
     if versions.known(store.attributes) == [now]:
         return store
@@ -262,7 +315,7 @@ def _with_versions_noted(
 
 
 def _same_scene(store: Store, spec: StoreSpec, blocks: tuple[int, ...], *, accept_versions: bool = False) -> None:
-    """Raise InputError that says what differs between a store and what is to be built into it."""
+    """Raise InputError with the differences if a store does not belong to the scene that is to be built into it."""
     ignored = {
         "blocks",
         versions.VERSIONS_OF_SAMPLES,
@@ -289,7 +342,7 @@ def _same_scene(store: Store, spec: StoreSpec, blocks: tuple[int, ...], *, accep
             )
         differing = []
     if differing:
-        # a scene's keys say more than the hash that follows from them
+        # keys of the scene first: they tell a user more than the hashes that follow from them
         differing.sort(key=lambda k: (not k.startswith("scene."), "hash" in k, k))
 
         def show(values: Mapping[str, Any], key: str) -> str:
@@ -311,7 +364,7 @@ def _same_scene(store: Store, spec: StoreSpec, blocks: tuple[int, ...], *, accep
 
 
 def _flatten(value: Any, key: str = "") -> Iterator[tuple[str, Any]]:
-    """Nested tables → dotted key, value."""
+    """Yield each value of nested tables with its dotted key."""
     if isinstance(value, dict) and value:
         for name, inner in value.items():
             yield from _flatten(inner, f"{key}.{name}" if key else str(name))
@@ -320,21 +373,26 @@ def _flatten(value: Any, key: str = "") -> Iterator[tuple[str, Any]]:
 
 
 def _list(values: Sequence[int]) -> str:
+    """Return block sizes as text: `8 + 4`."""
     return " + ".join(str(v) for v in values)
 
 
 def _free_bytes(path: Path) -> int:
+    """Return the free space at a path, in bytes; sys.maxsize if the system does not report it."""
     for folder in (path, *path.absolute().parents):
         try:
             usage = shutil.disk_usage(folder)
-        except (OSError, ValueError):  # not there yet, not to be looked into, or a name that none can have
+        except (OSError, ValueError):  # it does not exist yet, is not accessible, or is no valid name
             continue
-        return usage.free if usage.total else sys.maxsize  # some mounts do not say
+        return usage.free if usage.total else sys.maxsize  # some mounts report a size of 0
     return sys.maxsize
 
 
 def _check_room(summary: Summary, spec: StoreSpec) -> None:
-    """Refuse what cannot fit, warn of what may not: images compress to half or twice the estimate."""
+    """Raise VbnfaultError if the samples cannot fit on the disk; warn if they may not fit.
+
+    Images compress to between half and twice the estimate.
+    """
     needed = spec.estimated_sample_bytes * (summary.samples - summary.finished)
     free, text = summary.free_bytes, f"{summary.path}: about {size_text(needed)} are needed"
     if needed / 2 > free:

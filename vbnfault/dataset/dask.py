@@ -1,4 +1,4 @@
-"""Workers of a Dask cluster. The only importer of dask."""
+"""Run the tasks of a build on a Dask cluster. Only this module imports dask."""
 
 from __future__ import annotations
 
@@ -15,7 +15,8 @@ from .. import store as store_module
 from ..core.errors import InputError, VbnfaultError
 from .tasks import Fatal, Lazy, Run, SessionFactory, Task, describe, work
 
-# For what listens nowhere, or is no scheduler: a scheduler of a cluster at work may answer after many seconds.
+# Time limits for addresses where nothing listens, or no scheduler. They are long because the scheduler of a busy
+# cluster may need many seconds to answer.
 _SECONDS_TO_CONNECT = 30.0
 _SECONDS_TO_ANSWER = 60.0
 
@@ -27,9 +28,9 @@ _cluster_session: dict[bytes, Lazy] = {}
 
 
 def _work_on_cluster(pickled: bytes, path: Path, task: Task, topic: str) -> list[tuple[int, str, Any]]:
-    """A task on a Dask worker. Its threads share one session and take turns.
+    """Do a task on a Dask worker and return its events; the worker's threads share one session, one at a time.
 
-    Stages are told at once, under `topic` of the cluster's log; the other events are returned.
+    Stages are reported at once, under `topic` in the cluster's event log; all other events are returned at the end.
     """
     import distributed
 
@@ -57,14 +58,16 @@ def _work_on_cluster(pickled: bytes, path: Path, task: Task, topic: str) -> list
 
 
 def check_scheduler(address: str) -> None:
-    """Refuse an address that is none, or where no Dask scheduler answers: Dask's client would leave a traceback,
-    and would wait for ever for an answer."""
+    """Raise InputError if an address is invalid, or if no Dask scheduler answers there.
+
+    Dask's own client would end with a traceback, or wait for an answer without a time limit.
+    """
     try:
         from distributed import comm
     except ImportError as error:
         raise InputError(f"--scheduler {address}: Dask is not installed; pip install 'vbnfault[dask]'") from error
     try:
-        if comm.parse_address(address)[0] in ("inproc", "ucx"):  # no TCP
+        if comm.parse_address(address)[0] in ("inproc", "ucx"):  # these do not use TCP
             return
         host, port = comm.get_address_host_port(address)
     except ValueError as error:
@@ -73,7 +76,7 @@ def check_scheduler(address: str) -> None:
         socket.create_connection((host, port), timeout=_SECONDS_TO_CONNECT).close()
     except (OSError, OverflowError, UnicodeError) as error:
         raise InputError(f"--scheduler {address}: nothing answers there: {error}") from error
-    with ThreadPoolExecutor(1) as pool:  # a loop of its own: the caller's thread may be running one
+    with ThreadPoolExecutor(1) as pool:  # another thread: an event loop may be running in the caller's
         kind = pool.submit(asyncio.run, _kind_of_dask_node(address)).result()
     if not kind:
         raise InputError(f"--scheduler {address}: what listens there does not answer as a Dask scheduler does")
@@ -82,7 +85,7 @@ def check_scheduler(address: str) -> None:
 
 
 async def _kind_of_dask_node(address: str) -> str:
-    """`Scheduler`, `Worker` or `Nanny`, as what listens there says; empty where it does not speak Dask."""
+    """Ask the Dask node at an address what it is: `Scheduler`, `Worker` or `Nanny`; empty if it is no Dask node."""
     from distributed import Security, comm
 
     async def ask() -> Any:
@@ -96,11 +99,15 @@ async def _kind_of_dask_node(address: str) -> str:
     try:
         answer = await asyncio.wait_for(ask(), _SECONDS_TO_ANSWER)
         return str(answer["type"])
-    except Exception:  # other protocols are read as Dask's: absurd sizes, undecodable messages, silence
+    except Exception:  # another protocol, read as Dask's, gives absurd sizes, undecodable messages or silence
         return ""
 
 
 def run_on_dask(factory: SessionFactory, run: Run, scheduler: str) -> None:
+    """Do all tasks of a run on the Dask cluster at an address.
+
+    A task that its workers do not survive is reported as the failure of all its samples.
+    """
     import distributed
 
     try:
@@ -115,7 +122,7 @@ def run_on_dask(factory: SessionFactory, run: Run, scheduler: str) -> None:
         shard = run.next_shard()
         while shard is not None:
             task = run.task(shard)
-            priority = -len(futures)  # in the order of the sites
+            priority = -len(futures)  # keeps the order of `next_shard`, which groups by site
             futures[client.submit(_work_on_cluster, pickled, path, task, topic, pure=False, priority=priority)] = (
                 shard
             )
@@ -125,7 +132,7 @@ def run_on_dask(factory: SessionFactory, run: Run, scheduler: str) -> None:
                 shard = futures.pop(future)
                 try:
                     events = future.result()
-                except Exception as error:  # its workers died, or the cluster gave it up
+                except Exception as error:  # its workers died, or the cluster gave up
                     text = describe(error)
                     events = [(i, "failed", text) for i in run.store.shard(shard)]
                 for sample, what, payload in events:

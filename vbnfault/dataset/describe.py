@@ -1,4 +1,4 @@
-"""What a scene will photograph, in words and before any render: `vbnfault describe` and `build --dry-run`."""
+"""Describe in words what a scene will photograph, without rendering: `vbnfault describe`, `build --dry-run`."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from .progress import duration_text, size_text
 
 
 def describe(session: Session, *, sample_bytes: int, seconds: float) -> list[str]:
-    """Return the lines that say what the samples of a session are; warnings come last.
+    """Return lines that describe the samples of a session; warnings come last.
 
     Parameters
     ----------
     session : Session
         The scene with its plan; neither terrain nor renderer is needed.
     sample_bytes : int
-        About what a sample takes on disk.
+        Approximate size of a sample on disk.
     seconds : float
-        About how long the build takes on this machine.
+        Approximate duration of the build on this machine.
     """
     lines = [f"{session.scene.title}: {session.scene.description}".rstrip(": ")]
     lines += _samples(session)
@@ -34,6 +34,7 @@ def describe(session: Session, *, sample_bytes: int, seconds: float) -> list[str
 
 
 def _samples(session: Session) -> list[str]:
+    """Describe the numbers of samples: by site, device, stratum, fault class and split."""
     scene, table = session.scene, session.plan
     per_site = np.bincount(table.site)
     per_site = per_site[per_site > 0]
@@ -59,6 +60,7 @@ def _samples(session: Session) -> list[str]:
 
 
 def _geometry(session: Session) -> list[str]:
+    """Describe camera positions, attitudes and the Sun, or the trajectory of a SPICE spacecraft."""
     scene, table = session.scene, session.plan
     geometry, camera = scene.geometry, scene.camera
     sun = f"Sun: {assemble.sun_distance_au(scene):.4g} au away"
@@ -72,7 +74,7 @@ def _geometry(session: Session) -> list[str]:
     low, high = geometry.height_m
     above = "the ground below the camera" if geometry.height_reference == "local_ground" else "the site"
     across = 2 * np.tan(np.radians(camera.fov_deg) / 2)
-    # no camera is closer than the clearance
+    # poses with a surface within the clearance are refused, so no camera is lower than that
     nearest = max(low, min(geometry.clearance_m, high))
     lines = [
         f"heights: {low:g} to {high:g} m above {above}, x {_bounds(geometry.x_m)} m, y {_bounds(geometry.y_m)} m",
@@ -102,6 +104,7 @@ def _geometry(session: Session) -> list[str]:
 
 
 def _camera(session: Session) -> list[str]:
+    """Describe camera, lens, detector and exposure."""
     scene, camera = session.scene, session.base_camera
     settings = scene.camera
     if settings.exposure_s == "auto":
@@ -122,13 +125,16 @@ def _camera(session: Session) -> list[str]:
 
 
 def _range(low: float, high: float) -> str:
+    """Return `low to high`, or one number if both are equal."""
     return f"{low:g}" if low == high else f"{low:g} to {high:g}"
 
 
 def _span(low: float, high: float) -> str:
+    """Return a range with three significant digits."""
     return _range(float(f"{low:.3g}"), float(f"{high:.3g}"))
 
 
 def _bounds(pair: tuple[float, float] | None) -> str:
+    """Return bounds as text; a resolved scene has no None."""
     assert pair is not None
     return _range(*pair)

@@ -1,4 +1,4 @@
-"""How a build ends early."""
+"""Define the errors that end a build early."""
 
 from __future__ import annotations
 
@@ -8,7 +8,10 @@ from ..core.errors import VbnfaultError
 
 
 class Interrupted(VbnfaultError):
-    """Stopped by the user or the system; the same command resumes. `exit_code`: 128 + the signal's number."""
+    """The user or the system stopped the build; the same command resumes it.
+
+    `exit_code`: 128 + the signal's number.
+    """
 
     def __init__(self, sentence: str, exit_code: int = 130) -> None:
         super().__init__(sentence)
@@ -16,7 +19,10 @@ class Interrupted(VbnfaultError):
 
 
 class BuildFailed(VbnfaultError):
-    """Some samples could not be made. `failures`: sample → traceback, or what happened to its worker."""
+    """Some samples could not be made.
+
+    `failures`: by sample, one line and the traceback, or a sentence on how its worker ended.
+    """
 
     def __init__(self, sentence: str, failures: Mapping[int, str] | None = None) -> None:
         super().__init__(sentence)

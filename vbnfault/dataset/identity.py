@@ -1,4 +1,7 @@
-"""What the store of a scene holds: its schema, its root attributes, and what `verify` may expect of a sample."""
+"""Derive from a scene the spec and root attributes of its store, and from a store the planned scalars of a sample.
+
+Also estimate the duration of a build, and build or describe a scene in one call.
+"""
 
 from __future__ import annotations
 
@@ -30,13 +33,13 @@ from ..store import StoreSpec
 from ..world import assemble
 from . import build, describe
 
-# Libraries whose version may change a pixel.
+# Libraries whose version may change a pixel value.
 _LIBRARIES = ("mitsuba", "drjit", "numpy", "scipy", "trimesh", "scikit-image", "colour-science", "zarr")
 _OPENCV = ("opencv-python-headless", "opencv-python")
 
 
 def versions() -> dict[str, str]:
-    """Versions of vbnfault and of every library that affects pixels, and the machine type."""
+    """Return the versions of vbnfault and of every library that affects pixel values, and the machine type."""
     found = {"vbnfault": __version__}
     for name in (*_LIBRARIES, *_OPENCV):
         try:
@@ -50,14 +53,17 @@ def versions() -> dict[str, str]:
 
 
 def scene_identity(session: pipeline.Session) -> dict[str, Any]:
-    """The resolved scene with the contents, not the paths, of what it names; sizes of blocks left out."""
+    """Return the resolved scene with a digest of the contents of each file instead of its path.
+
+    The number of samples is left out: appending samples does not change the scene.
+    """
     scene = session.scene.resolved()
     scene["body"]["shape_sha256"] = session.body.content_hash
     if session.scene.body.shape not in ("embedded", "ellipsoid"):
         scene["body"]["shape"] = _digest(session.scene.body.shape, "shape")
     if session.scene.camera.detector:
         for key in config.OF_THE_DETECTOR:
-            del scene["camera"][key]  # the detector has its own
+            del scene["camera"][key]  # the detector's own value is used instead
     scene["faults"] = {name: fault.to_dict() for name, fault in session.faults.items()}
     for name, table in scene["faults"].items():
         if table.get("texture_file"):
@@ -70,17 +76,17 @@ def scene_identity(session: pipeline.Session) -> dict[str, Any]:
         textures = sorted(resources.data_dir("textures").glob("*.png"))
         data = b"".join(resources.read_input(path, "texture") for path in textures)
         scene["textures_sha256"] = resources.sha256(data)
-    del scene["dataset"]["samples"]  # a block more makes no other scene
+    del scene["dataset"]["samples"]
     return scene
 
 
 def _digest(path: str | Path, what: str) -> str:
-    """`sha256:` and the digest of a file's contents, which stand for its name: renamed, it is the same."""
+    """Return `sha256:` and the digest of a file's contents; a renamed file keeps it."""
     return f"sha256:{resources.sha256(resources.read_input(path, what))}"
 
 
 def _contents_of_files(identity: dict[str, Any], scene: Scene) -> None:
-    """Put the sha256 of what lens, spacecraft, kernels and stars are read from in the place of paths."""
+    """Replace the paths of lens, detector, spacecraft, kernels and stars by digests of their contents."""
     if scene.camera.lens:
         identity["camera"]["lens"] = _digest(resources.find("scenes/lenses", scene.camera.lens), "lens")
     if scene.camera.detector:
@@ -88,11 +94,11 @@ def _contents_of_files(identity: dict[str, Any], scene: Scene) -> None:
             resources.find("scenes/detectors", scene.camera.detector), "detector"
         )
     if scene.spacecraft.model not in ("none", "default"):
-        with resources.noting() as digests:  # a glTF names files beside it
+        with resources.noting() as digests:  # a glTF file refers to further files
             assemble.spacecraft(scene)
         identity["spacecraft"]["model"] = f"sha256:{'+'.join(digests)}"
     if scene.spice.kernels:
-        # a meta-kernel only names others: what follows from them all says more than its own text
+        # a meta-kernel only lists other kernels, so the ephemeris that they give is hashed, not its text
         sun_J_au, T_from_J = assemble.ephemeris(scene)
         follows = [*sun_J_au.tolist(), *T_from_J.ravel().tolist()]
         if scene.spice.spacecraft:
@@ -106,9 +112,12 @@ def _contents_of_files(identity: dict[str, Any], scene: Scene) -> None:
 
 
 def store_spec(session: pipeline.Session, blocks: Sequence[int]) -> StoreSpec:
-    """The store of a scene, planned in `blocks`. Raises InputError for layers this world cannot give."""
+    """Return the spec of the store of a scene, planned in `blocks`.
+
+    Raises InputError for layers that the scene's world does not provide.
+    """
     scene = session.scene
-    dataset, camera = scene.dataset, session.base_camera  # first of all: a lens that cannot be had is told here
+    dataset, camera = scene.dataset, session.base_camera  # first: a lens that cannot be used is reported here
     layers = tuple(name for name in stored_layers(scene, session.faults) if name != "clean")
     individuals = scene.camera.individuals
     kinds = tuple(labels.kind(fault, is_ccd=camera.is_ccd) for fault in session.faults.values())
@@ -157,6 +166,7 @@ def store_spec(session: pipeline.Session, blocks: Sequence[int]) -> StoreSpec:
 
 
 def _mask_rule(kind: str, fault: Fault) -> str:
+    """Return the rule of a fault class's mask as a sentence."""
     if kind == "effect":
         return store.EFFECT_RULE
     rule = labels.footprint_rule(fault)
@@ -166,13 +176,14 @@ def _mask_rule(kind: str, fault: Fault) -> str:
 
 
 def _intensity(detector: Detector | MosaicDetector) -> str:
+    """Return where the intensity channel comes from, as text."""
     if "W" in detector.channels:
         return "pixels without a colour filter"
     return "luminance of RGB, Rec. 709 weights"
 
 
 def _detector(detector: Detector | MosaicDetector) -> dict[str, Any]:
-    """What a user of the raw mosaic, or of noise, must know of the sensor."""
+    """Return the sensor's data that a user of the raw mosaic, or of its noise, needs."""
     plain: dict[str, Any] = {
         "name": detector.name,
         "pixel_pitch_um": detector.pixel_pitch_um,
@@ -201,16 +212,16 @@ def _detector(detector: Detector | MosaicDetector) -> dict[str, Any]:
         "temperature_K": sensor.temperature_K,
         "row_readout_s": sensor.transfer.row_readout_s,
         "demosaic": sensor.method,
-        # the whole file, with the sources of its numbers
+        # the whole description of the sensor, with the sources of its values
         "sensor": json.loads(json.dumps(dataclasses.asdict(sensor))),
     }
 
 
 def is_exact(attributes: Mapping[str, Any]) -> bool:
-    """Return whether the plan of a stored scene is met exactly: every commanded fault is injected.
+    """Return whether every commanded fault of a stored scene must be injected.
 
-    It is not where another view may not be taken: as `plan.on_invisible` says, where SPICE places the camera, and
-    where the Sun stays as drawn.
+    This needs a new view where a fault cannot show. So the result is False if `plan.on_invisible` is not
+    `redraw_view`, if SPICE places the camera, or if `geometry.sun_visibility` is `as_drawn`.
     """
     scene = attributes["scene"]
     redraws = scene.get("plan", {}).get("on_invisible") == "redraw_view"
@@ -219,14 +230,14 @@ def is_exact(attributes: Mapping[str, Any]) -> bool:
 
 
 def stored_scene(attributes: Mapping[str, Any]) -> Scene:
-    """Return the scene that a store was planned from, without the contents of the files that it names."""
+    """Return the scene from which a store was planned, without digests of file contents."""
     stored = {key: value for key, value in attributes["scene"].items() if key != "textures_sha256"}
     stored["body"] = {key: value for key, value in stored["body"].items() if key != "shape_sha256"}
-    # what is added to the tables of a scene's identity is no key of a scene
+    # a scene's identity adds keys that are not valid in a scene
     for name, added in (("sky", "catalogue"),):
         stored[name] = {key: value for key, value in stored.get(name, {}).items() if key != added}
     if stored["camera"].get("lens"):
-        # earlier versions stored those of a thin lens here, which did nothing; no plan depends on them
+        # earlier versions stored these keys of a thin lens here, without effect; no plan depends on them
         unused = ("f_number", "transmission")
         stored["camera"] = {key: value for key, value in stored["camera"].items() if key not in unused}
     stored["dataset"] = {**stored["dataset"], "samples": attributes["blocks"][0]}
@@ -234,14 +245,24 @@ def stored_scene(attributes: Mapping[str, Any]) -> Scene:
 
 
 def planned(attributes: Mapping[str, Any], faults: Sequence[str]) -> Callable[[int, int], dict[str, Any]]:
-    """What the plan of a stored scene says of a sample that kept the view of so many `tries`: the scalars that
-    rendering cannot change, and the commanded faults as `injected`."""
+    """Return a function that gives the planned scalars of a sample, for `store.examine`.
+
+    The function takes a sample and its stored `tries`, which select the view. It returns the scalars that rendering
+    cannot change, and the commanded faults, bool[fault], as `injected`.
+
+    Parameters
+    ----------
+    attributes
+        Root attributes of the store.
+    faults
+        The fault axis of the store.
+    """
     scene = stored_scene(attributes)
     table = plan.make_plan(scene, faults, attributes["blocks"])
 
     def expected(index: int, tries: int) -> dict[str, Any]:
         drawn = table.view(scene, index, tries - 1)
-        # where SPICE places camera and Sun, they are not the plan's
+        # if SPICE places camera and Sun, the plan does not set these angles
         names = ("sun_azimuth_deg", "sun_elevation_deg", "roll_deg", "pitch_deg", "yaw_deg")
         angles = () if scene.spice.spacecraft else names
         return {
@@ -259,7 +280,11 @@ def planned(attributes: Mapping[str, Any], faults: Sequence[str]) -> Callable[[i
 
 @dataclasses.dataclass(frozen=True)
 class SessionFactory:
-    """Makes the session of a scene in a worker; picklable. `threads`: render threads of that worker."""
+    """A picklable function that makes the session of a scene in a worker.
+
+    `threads`: render threads of the worker; VBNFAULT_THREADS by default. `contents`: the input files as they were
+    when the build was planned.
+    """
 
     scene: Scene
     blocks: tuple[int, ...]
@@ -274,23 +299,24 @@ class SessionFactory:
 
 @dataclasses.dataclass(frozen=True)
 class _Session:
-    """Run a session whose input files must hold what they held when the build was planned."""
+    """A session that fails if an input file changed after the build was planned."""
 
     session: pipeline.Session
     contents: resources.Contents
 
     def simulate(self, index: int) -> Sample:
+        """Return a sample. Raises InputChanged if an input file has changed."""
         with self.contents.in_use():
             return self.session.simulate(index)
 
 
 def estimated_seconds(session: pipeline.Session) -> float:
-    """Return about how long the whole dataset takes on this machine, in seconds.
+    """Return the approximate duration of building the whole dataset on this machine, in seconds.
 
-    The model follows the README's table. A sample takes 0.3 s of processor time, and each of its megapixels 1.2 s
-    for truth, pictures, labels and the store and 0.25 s for each ray of a pixel and each bounce. A new patch of
-    terrain takes 16 s for 1.6 million triangles. Adaptive sampling counts as four times the least rays. All cores
-    work.
+    The model follows the README's table and assumes that all cores work. In processor time, a sample takes 0.3 s.
+    Each megapixel adds 1.2 s for truth, images, labels and the store, and 0.25 s for each ray of a pixel, times
+    1 + bounces. The terrain of a site takes 16 s for 1.6 million triangles. Adaptive sampling counts as four times
+    the minimum number of rays, but not more than the maximum.
     """
     scene = session.scene
     render, camera = scene.render, scene.camera
@@ -318,9 +344,16 @@ def build_scene(
     accept_versions: bool = False,
     samples_given: bool = True,
 ) -> build.Summary:
-    """Build, resume, mend or extend the store of a scene at `out`; see `build.build` for what is raised.
+    """Build, resume, repair or extend the store of a scene at `out`; `build.build` documents parameters and errors.
 
-    `source` names the scene in errors. With `append` and no samples given, the store's own first block counts.
+    Parameters
+    ----------
+    source
+        Name of the scene in messages.
+    append
+        Number of samples to add to an existing store.
+    samples_given
+        Whether the caller set the number of samples. If not, `append` takes it from the store's first block.
     """
     samples = scene.dataset.samples
     if append and not samples_given and store.is_store(out):
@@ -363,7 +396,10 @@ def build_scene(
 
 
 def describe_scene(scene: Scene, *, source: str) -> list[str]:
-    """Return what a scene will photograph, as lines; nothing is rendered. `source` names it in errors."""
+    """Return lines that describe what a scene will photograph; nothing is rendered.
+
+    `source`: name of the scene in messages.
+    """
     session = pipeline.Session(scene, source=source)
     spec = store_spec(session, (scene.dataset.samples,))
     return describe.describe(session, sample_bytes=spec.estimated_sample_bytes, seconds=estimated_seconds(session))

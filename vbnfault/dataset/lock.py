@@ -1,4 +1,4 @@
-"""One build of a store at a time, also where the store's folder is replaced meanwhile."""
+"""Lock a store so that only one build writes to it at a time, even if its folder is replaced meanwhile."""
 
 from __future__ import annotations
 
@@ -28,13 +28,15 @@ _SECONDS_BETWEEN_BEATS = 10.0
 
 @contextlib.contextmanager
 def locked(path: Path) -> Iterator[None]:
-    """Hold the lock of the store at `path` for the length of a block.
+    """Hold the lock of the store at `path` during a `with` block.
 
-    The lock is a file beside the store, `.NAME.lock`: it outlives a store that is replaced, and is there before the
-    store is. The operating system releases it with the process. Where the file system knows no locks, a file
-    `.NAME.owner` names host, process and start of its owner instead: that of a process which has ended on this host
-    is taken over; that of another host never is, and the sentence names the file and the owner's last heart-beat.
-    Two names, so that one kind of lock never removes the other's file.
+    The lock is a locked file beside the store, `.NAME.lock`. So it exists before the store does, and it stays when
+    the store is replaced. The operating system releases the lock when the process ends.
+
+    If the file system has no locks, a file `.NAME.owner` holds the host, the process number and the start time of
+    its owner instead. If its owner ran on this host and has ended, the file is removed and the lock taken. The file
+    of an owner on another host is never removed; the error then states the file and the owner's last heart-beat.
+    The two kinds of lock have different names, so that one never removes the file of the other.
 
     Raises
     ------
@@ -57,7 +59,7 @@ def locked(path: Path) -> Iterator[None]:
 
 
 def _lock_file(path: Path, file: Path, stack: contextlib.ExitStack) -> bool:
-    """Lock a file until the stack ends, which removes it. False where the file system has no locks."""
+    """Lock a file until the stack ends, which removes the file. Return False if the file system has no locks."""
     assert fcntl is not None
     while True:
         try:
@@ -65,7 +67,7 @@ def _lock_file(path: Path, file: Path, stack: contextlib.ExitStack) -> bool:
         except OSError as error:
             if not os.path.isdir(path):
                 raise InputError(f"{path}: no store can be created here: {error.strerror}") from None
-            # a store in a folder that its owner may not write to is never replaced: its own folder serves
+            # its parent folder is not writable, so the store cannot be replaced: lock the store's own folder
             handle = os.open(path, os.O_RDONLY)
         with contextlib.ExitStack() as undo:
             undo.callback(os.close, handle)
@@ -87,11 +89,11 @@ def _lock_file(path: Path, file: Path, stack: contextlib.ExitStack) -> bool:
                         undo.callback(file.unlink, missing_ok=True)  # before it is closed
                     stack.push(undo.pop_all())
                     return True
-            # its owner removed it between our opening and locking it
+            # the file was removed by its owner between our opening and our locking it: try again
 
 
 def _own(path: Path, file: Path, stack: contextlib.ExitStack) -> None:
-    """Own a file until the stack ends, which removes it."""
+    """Make an owner's file and keep its heart-beat going until the stack ends, which removes the file."""
     mine = _this_process() | {"token": uuid.uuid4().hex}
     while True:
         try:
@@ -123,13 +125,14 @@ def _own(path: Path, file: Path, stack: contextlib.ExitStack) -> None:
 
 
 def _this_process() -> dict[str, Any]:
+    """Return host, process number and start time of this process."""
     import psutil
 
     return {"host": platform.node(), "pid": os.getpid(), "started": psutil.Process().create_time()}
 
 
 def _read_owner(file: Path) -> dict[str, Any]:
-    """Host, process and start of an owner; empty where the file does not say."""
+    """Return the content of an owner's file; empty if it cannot be read."""
     try:
         owner = json.loads(file.read_text())
     except (OSError, ValueError):
@@ -138,7 +141,10 @@ def _read_owner(file: Path) -> dict[str, Any]:
 
 
 def _has_ended(owner: dict[str, Any]) -> bool:
-    """Whether a lock's owner was a process of this host that has ended; its number may be another's by now."""
+    """Return whether a lock's owner was a process of this host that has ended.
+
+    The start time is compared, too: another process may have got the number of the owner.
+    """
     import psutil
 
     if owner.get("host") != platform.node() or not isinstance(owner.get("pid"), int):
@@ -154,7 +160,10 @@ def _has_ended(owner: dict[str, Any]) -> bool:
 
 
 def _remove_owner(file: Path, owner: dict[str, Any]) -> None:
-    """Remove an owner's file, but not one that another has made in its place meanwhile."""
+    """Remove an owner's file, unless another process has replaced it meanwhile.
+
+    The file is renamed first and then compared, because comparing and removing are not one atomic step.
+    """
     aside = file.with_name(f"{file.name}.{uuid.uuid4().hex}")
     try:
         os.rename(file, aside)
@@ -167,6 +176,7 @@ def _remove_owner(file: Path, owner: dict[str, Any]) -> None:
 
 
 def _held(path: Path, owner: dict[str, Any], file: Path | None = None) -> VbnfaultError:
+    """Return the error for a lock that another build holds."""
     by = f" (process {owner['pid']} on {owner['host']})" if {"pid", "host"} <= owner.keys() else ""
     sentence = f"{path}: another build is writing to it{by}; wait until it ends"
     if file is not None:

@@ -1,4 +1,7 @@
-"""Worker processes on this machine, replaced before they grow too large and when they die."""
+"""Run the tasks of a build in worker processes on this machine.
+
+A worker process is replaced after a number of shards, before it grows too large, and when it dies.
+"""
 
 from __future__ import annotations
 
@@ -20,11 +23,11 @@ from ..core.errors import VbnfaultError
 from ..core.resources import import_path
 from .tasks import Fatal, Lazy, Run, SessionFactory, Task, work
 
-_SECONDS_TO_STOP = 60.0  # for the samples in hand to be written; a second Ctrl-C waits no longer
+_SECONDS_TO_STOP = 60.0  # for a worker to write its finished samples; a second Ctrl-C ends the wait
 
 
 def _worker(factory: SessionFactory, path: Path, pipe: connection.Connection) -> None:
-    """A worker process: tasks come in by the pipe, ticks go out. It does not outlive its parent."""
+    """Run a worker process: receive tasks from the pipe, send ticks back. It ends when its parent ends."""
     with contextlib.suppress(EOFError, OSError, interrupts.Stopped), streams.steady():
         interrupts.obey_parent()
         threading.Thread(target=_die_with_parent, daemon=True).start()
@@ -35,13 +38,14 @@ def _worker(factory: SessionFactory, path: Path, pipe: connection.Connection) ->
                 work(session.simulate, store, task, lambda *event: pipe.send(event))
             except Fatal as fatal:
                 pipe.send((-1, "fatal", fatal.error))
-            except VbnfaultError as error:  # the disk refused
+            except VbnfaultError as error:  # files cannot be written
                 pipe.send((-1, "fatal", error))
             else:
                 pipe.send((-1, "finished", ""))
 
 
 def _die_with_parent() -> None:
+    """Wait until the parent process ends, then end this one."""
     parent = multiprocessing.parent_process()
     if parent is not None:
         parent.join()
@@ -49,7 +53,7 @@ def _die_with_parent() -> None:
 
 
 class _Process:
-    """A worker process as its parent sees it."""
+    """The parent's handle of a worker process."""
 
     def __init__(self, factory: SessionFactory, path: Path, threads: int) -> None:
         context = multiprocessing.get_context("spawn")
@@ -57,43 +61,44 @@ class _Process:
         self.process = context.Process(target=_worker, args=(factory, path, theirs), daemon=True)
         try:
             with _environment(threads), _without_working_folder():
-                resource_tracker.ensure_running()  # else the start would do it, and let signals through
+                # otherwise `start` would start the tracker, and would no longer hold signals back
+                resource_tracker.ensure_running()
                 with interrupts.held():
                     self.process.start()
         except BaseException:
             if self.process.pid is not None:
-                self.process.kill()  # nobody else knows of it
+                self.process.kill()  # the pool does not know this process yet
             raise
         theirs.close()
-        self.heard = False  # has it said anything yet
+        self.heard = False  # whether it has sent anything yet
         self.shards = 0
         self.shard = -1
-        self.sample: int | None = None  # in work
+        self.sample: int | None = None  # the sample it works on
 
     def give(self, task: Task) -> None:
-        """Hand it a task."""
+        """Send it a task."""
         self.shard, self.sample = task.shard, None
         self.shards += 1
-        with contextlib.suppress(OSError):  # it died: the next wait notices
+        with contextlib.suppress(OSError):  # it died; the next `connection.wait` reports that
             self.pipe.send(task)
 
     def stop(self, *, at_once: bool = False) -> None:
-        """Let it end: after its task, or at once, with time to write what it has."""
+        """Ask it to end: after its task, or at once but with time to write its finished samples."""
         if at_once and not self.heard:
-            self.process.kill()  # it has nothing to write
+            self.process.kill()  # it has made nothing yet
         elif at_once:
             self.process.terminate()
         self.pipe.close()
 
     def join(self) -> None:
-        """Wait for its end, but not for ever."""
+        """Wait until it ends; kill it after `_SECONDS_TO_STOP`."""
         self.process.join(_SECONDS_TO_STOP)
         if self.process.is_alive():
             self.process.kill()
             self.process.join()
 
     def obituary(self) -> str:
-        """How it ended."""
+        """Return how it ended, as a clause."""
         code = self.process.exitcode or 0
         if code == -signal.SIGKILL:
             return "was killed (signal 9, as the system does when memory runs out)"
@@ -102,9 +107,9 @@ class _Process:
 
 @contextlib.contextmanager
 def _environment(threads: int) -> Iterator[None]:
-    """Cap the threads of processes started within, and keep Python from importing out of their working folder.
+    """Limit the threads of processes started in a `with` block, and stop imports from their working folder.
 
-    Libraries and Python read these variables when they load.
+    The libraries and Python read these environment variables when they load.
     """
     names = ("VBNFAULT_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
     values = dict.fromkeys(names, str(threads)) | {"PYTHONSAFEPATH": "1"}
@@ -120,9 +125,9 @@ def _environment(threads: int) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _without_working_folder() -> Iterator[None]:
-    """Keep the working folder out of the import path of processes started within.
+    """Keep the working folder out of the import path of processes started in a `with` block.
 
-    PYTHONSAFEPATH does the same for what they import before they have it.
+    PYTHONSAFEPATH does the same for imports before they receive this path.
     """
     before = sys.path.copy()
     sys.path[:] = import_path()
@@ -135,8 +140,8 @@ def _without_working_folder() -> Iterator[None]:
 class Pool:
     """Worker processes that are replaced after `recycle` shards, or when they die.
 
-    A sample during which a process died is tried once more, in a new one, then given up; the others of its
-    shard are written one by one, so that a crash costs that sample alone.
+    If a process dies during a sample, the shard is done again in a new process, which writes each sample as soon as
+    it is made. So a second crash loses only that sample, which is then recorded as failed and skipped.
     """
 
     def __init__(self, factory: SessionFactory, run: Run, threads: int, recycle: int) -> None:
@@ -145,10 +150,11 @@ class Pool:
         self._workers: list[_Process] = []
         self._again: deque[int] = deque()
         self._deaths: Counter[int | None] = Counter()
-        self._given_up: dict[int, frozenset[int]] = {}  # shard → samples; its keys are worked carefully
+        # by shard, the samples to skip; the tasks of these shards are done with `careful`
+        self._given_up: dict[int, frozenset[int]] = {}
 
     def work(self, workers: int) -> None:
-        """Do all tasks."""
+        """Do all tasks of the run with this number of processes."""
         try:
             for _ in range(min(workers, self._run.store.shards)):
                 self._next(None, None)
@@ -164,11 +170,15 @@ class Pool:
                     worker.join()
 
     def _kill(self) -> None:
+        """Kill all processes."""
         for worker in self._workers:
             worker.process.kill()
 
     def _next(self, worker: _Process | None, last: int | None) -> None:
-        """Hand the next task to a worker, or to a new one; without a task it retires."""
+        """Give the next task to a worker, or to a new one if it is None or due for replacement.
+
+        If no task is left, the worker ends. `last`: the shard that it completed.
+        """
         busy = [w.shard for w in self._workers if w is not worker]
         shard = self._again.popleft() if self._again else self._run.next_shard(last, busy)
         if worker is not None and (shard is None or worker.shards >= self._recycle):
@@ -185,6 +195,7 @@ class Pool:
         worker.give(self._run.task(shard, self._given_up.get(shard, frozenset()), careful=careful))
 
     def _hear(self, worker: _Process) -> None:
+        """Handle one message from a worker, or its death."""
         try:
             sample, what, payload = worker.pipe.recv()
             worker.heard = True
@@ -200,6 +211,7 @@ class Pool:
             self._run.tick(sample, what, payload)
 
     def _mourn(self, worker: _Process) -> None:
+        """Replace a worker that died; raise VbnfaultError at the second death between samples."""
         self._workers.remove(worker)
         worker.stop()
         worker.join()

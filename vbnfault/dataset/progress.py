@@ -1,4 +1,4 @@
-"""How far a build is: a bar, or plain lines."""
+"""Show the progress of a build: a bar on a terminal, plain lines elsewhere."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ _SECONDS_BETWEEN_LINES = 5.0
 
 
 def size_text(count: float) -> str:
+    """Return a number of bytes as text with a decimal unit: `1.23 GB`."""
     for unit in ("B", "kB", "MB", "GB"):
         if count < 1000:
             return f"{count:.3g} {unit}"
@@ -18,12 +19,13 @@ def size_text(count: float) -> str:
 
 
 def duration_text(seconds: float) -> str:
+    """Return a duration as text in seconds, minutes or hours."""
     minutes, hours = seconds / 60, seconds / 3600
     return f"{seconds:.0f} s" if seconds < 100 else f"{minutes:.0f} min" if minutes < 100 else f"{hours:.1f} h"
 
 
 class Progress:
-    """Samples done, rate and time left, and the stage at work: a bar on a terminal, plain lines elsewhere."""
+    """Show samples done, rate, time left and the current stage, on standard error."""
 
     def __init__(self, total: int, *, shown: bool) -> None:
         self._total, self._shown = total, shown
@@ -54,6 +56,7 @@ class Progress:
             print(self._line(), file=sys.stderr, flush=True)
 
     def _pace(self) -> str:
+        """Return rate and time left as text; `checking` until a sample has been built."""
         seconds = time.monotonic() - self._began
         if not self._built or seconds <= 0:
             return "checking"
@@ -62,10 +65,11 @@ class Progress:
         return f"{unit}, {duration_text((self._total - self._done) / rate)} left"
 
     def _line(self) -> str:
+        """Return the progress as one line."""
         return f"{self._done}/{self._total} samples, {self._pace()}"
 
     def advance(self, built: bool) -> None:
-        """One sample further."""
+        """Count one more sample as done; `built`: it was made now, not kept."""
         self._done += 1
         self._built += built
         if self._bar is not None:
@@ -75,14 +79,14 @@ class Progress:
             print(self._line(), file=sys.stderr, flush=True)
 
     def stage(self, text: str) -> None:
-        """A stage that may take seconds begins: beside the bar's rate until the next sample is done, or a line."""
+        """Show a stage that may take seconds: beside the bar until the next sample is done, or as a line."""
         if self._bar is not None:
             self._bar.update(self._task, description=f"{self._pace()}; {text}")
         else:
             self.say(text)
 
     def say(self, text: str) -> None:
-        """A line beside the bar."""
+        """Print a line; a bar stays intact."""
         if self._bar is not None:
             self._bar.console.print(text, highlight=False, markup=False)
         elif self._shown:

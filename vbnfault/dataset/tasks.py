@@ -1,5 +1,7 @@
-"""A task is a shard: what it lacks is made and written. Tasks are handed out by site, so that a worker loads a
-site's terrain once.
+"""Define the tasks of a build, the order in which workers get them, and how a task is done.
+
+A task completes one shard: it makes and writes the missing samples. Tasks are assigned by site, so that a worker
+loads the terrain of a site once.
 """
 
 from __future__ import annotations
@@ -25,29 +27,40 @@ from ..store import Encoded, Planned, SampleDigests, Store
 from .errors import BuildFailed
 from .progress import Progress
 
-_HOPELESS = 32  # so many failed samples and not one success: the rest would fail as well
+_HOPELESS = 32  # after so many failures without one success, the build stops: the others would fail, too
 
 
 class SampleMaker(Protocol):
-    """What makes samples; it keeps between samples what is costly to make, such as the terrain of a site."""
+    """An object that makes samples. It may keep costly data between samples, such as the terrain of a site."""
 
     def simulate(self, index: int) -> Sample:
-        """The sample of this index, the same whatever was simulated before."""
+        """Return a sample, which must not depend on the samples simulated before."""
         ...
 
 
 SessionFactory = Callable[[], SampleMaker]
 
 
-# sample; what: "begun", "stage", "kept", "built" or "failed"; text: of a stage its name, of a sample that is kept
-# or built its digest (hex), of one that failed a line and then the traceback
+# Arguments: the sample; an event: "begun", "stage", "kept", "built" or "failed"; a text. The text is the stage's
+# name, the digest (hex) of a kept or built sample, or one line and the traceback of a failure.
 Tick = Callable[[int, str, str], None]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Task:
-    """Complete one shard. `sites`: of its samples. `unplanned`: finished, but not as planned, so to be built again.
-    `skip`: not to be tried. `careful`: write every sample at once, because the process may die at the next one."""
+    """The task to complete one shard.
+
+    Attributes
+    ----------
+    sites
+        Site of each sample of the shard.
+    unplanned
+        Finished samples that differ from the plan and must be rebuilt.
+    skip
+        Samples that must not be tried.
+    careful
+        Write every sample as soon as it is made, because the process may die at the next one.
+    """
 
     shard: int
     sites: tuple[int, ...]
@@ -59,8 +72,8 @@ class Task:
 def work(simulate: Callable[[int], Sample], store: Store, task: Task, tick: Tick) -> None:
     """Do a task; a sample that fails is reported and left out.
 
-    What was made is written also where an interrupt ends the task early, but not where `tick` finds that
-    nobody listens any more: another build may have begun.
+    If an interrupt ends the task early, the finished samples are still written. If `tick` raises OSError, they are
+    not: the build that started this worker has ended, and another build may have begun.
     """
     checked = store_module.examine_shard(store, task.shard, labels=True)
     wanted = checked.wanted | task.unplanned
@@ -107,7 +120,7 @@ def work(simulate: Callable[[int], Sample], store: Store, task: Task, tick: Tick
 
 
 def describe(error: Exception) -> str:
-    """One line, then the traceback."""
+    """Return one line on an error, then its traceback."""
     frame = traceback.extract_tb(error.__traceback__)[-1]
     if isinstance(error, VbnfaultError):
         line = str(error)
@@ -117,7 +130,7 @@ def describe(error: Exception) -> str:
 
 
 class Run:
-    """The tasks of a build, handed out by site, and what came of them."""
+    """The tasks of a build, assigned by site, and their results."""
 
     def __init__(
         self,
@@ -138,16 +151,16 @@ class Run:
         for shard in range(store.shards):
             self._by_site.setdefault(self.lead(shard), deque()).append(shard)
         self._begun = frozenset(store.begun())
-        # sites with the most shards left first; brought up to date when an entry is taken out
+        # heap of sites, those with the most shards left first; an entry is updated when it is taken out
         self._longest = [(-len(queue), site) for site, queue in self._by_site.items()]
         heapq.heapify(self._longest)
 
     def lead(self, shard: int) -> int:
-        """The site a shard is handed out with: that of its first sample."""
+        """Return the site by which a shard is assigned: that of its first sample."""
         return int(self.sites[self.store.shard(shard).start])
 
     def task(self, shard: int, skip: frozenset[int] = frozenset(), *, careful: bool = False) -> Task:
-        """The task that completes a shard."""
+        """Return the task that completes a shard; for `skip` and `careful` see `Task`."""
         samples = self.store.shard(shard)
         sites = tuple(int(s) for s in self.sites[samples.start : samples.stop])
         unplanned: set[int] = set()
@@ -156,8 +169,11 @@ class Run:
         return Task(shard=shard, sites=sites, unplanned=frozenset(unplanned), skip=skip, careful=careful)
 
     def next_shard(self, last: int | None = None, busy: Sequence[int] = ()) -> int | None:
-        """What a worker does after the shard `last`: a shard of the same site if one is left, else of the
-        site where the fewest of the `busy` shards are, then of the one with the most left."""
+        """Return the shard that a worker does after the shard `last`; None if none is left.
+
+        It is a shard of the same site, if one is left. Otherwise it comes from the site that has the fewest of the
+        `busy` shards, and among equal sites from the one with the most shards left.
+        """
         if last is None or not self._by_site[self.lead(last)]:
             site = self._next_site(Counter(self.lead(shard) for shard in busy))
         else:
@@ -165,7 +181,7 @@ class Run:
         return None if site is None else self._by_site[site].popleft()
 
     def _next_site(self, taken: Counter[int]) -> int | None:
-        """Return the site with shards left where the fewest are `taken`, of those the one with the most left."""
+        """Return, among sites with shards left, the one with the fewest `taken`, then with the most left."""
         passed: list[tuple[int, int]] = []
         while self._longest:
             length, site = heapq.heappop(self._longest)
@@ -181,7 +197,7 @@ class Run:
         return min(passed, key=lambda entry: (taken[entry[1]], *entry))[1] if passed else None
 
     def tick(self, sample: int, what: str, text: str) -> None:
-        """Note what became of a sample. Raises BuildFailed where nothing succeeds."""
+        """Record an event of a sample, see `Tick`. Raises BuildFailed after too many failures without a success."""
         if what == "begun":
             return
         if what == "stage":
@@ -202,7 +218,7 @@ class Run:
             self.raise_failures(" before any succeeded, so the build was stopped")
 
     def raise_failures(self, why: str = "") -> None:
-        """Raise BuildFailed that names the failed samples, if any."""
+        """Raise BuildFailed with the failed samples, if there are any."""
         if not self.failures:
             return
         failed = sorted(self.failures)
@@ -217,13 +233,14 @@ class Run:
 
 
 class Lazy:
-    """A session made when the first sample needs it: a shard that is whole needs none."""
+    """A session that is made when the first sample needs it: a complete shard needs none."""
 
     def __init__(self, factory: SessionFactory) -> None:
         self._factory = factory
         self._session: SampleMaker | None = None
 
     def simulate(self, index: int) -> Sample:
+        """Return a sample. Raises Fatal if no session can be made, or if an input file has changed."""
         if self._session is None:
             try:
                 self._session = self._factory()
@@ -234,12 +251,12 @@ class Lazy:
                 raise Fatal(VbnfaultError(describe(error).splitlines()[0])) from error
         try:
             return self._session.simulate(index)
-        except InputChanged as error:  # no other sample would be any better
+        except InputChanged as error:  # every other sample would fail, too
             raise Fatal(error) from error
 
 
 class Fatal(BaseException):
-    """Carries what ends the whole build, past the handling of a single sample's failure."""
+    """Carries an error that ends the whole build. As a BaseException it passes the handler of a failed sample."""
 
     def __init__(self, error: VbnfaultError) -> None:
         super().__init__(error)
@@ -247,6 +264,7 @@ class Fatal(BaseException):
 
 
 def run_here(factory: SessionFactory, run: Run) -> None:
+    """Do all tasks of a run in this process."""
     session = Lazy(factory)
     shard = run.next_shard()
     while shard is not None:

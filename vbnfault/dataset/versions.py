@@ -1,22 +1,22 @@
-"""Which versions of the libraries made which samples of a store."""
+"""Record which versions of the libraries made which samples of a store."""
 
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping
 from typing import Any
 
-# Root attribute: a list of tables, each `versions` and the `samples` that they made, as [first, last] ranges. All
-# other samples were made with the versions of the root attribute `versions`.
+# Root attribute: a list of tables, each with `versions` and the `samples` made with them, as ranges [first, last].
+# All other samples were made with the versions in the root attribute `versions`.
 VERSIONS_OF_SAMPLES = "versions_of_samples"
 
 
 def known(attributes: Mapping[str, Any]) -> list[dict[str, str]]:
-    """Return all versions that made samples of a store, or were accepted to."""
+    """Return all sets of versions that made samples of a store, or were accepted for that."""
     return [attributes.get("versions", {}), *(entry["versions"] for entry in _entries(attributes))]
 
 
 def differences(stored: Mapping[str, Any], now: Mapping[str, Any]) -> str:
-    """Return in words which versions differ between two sets of root attributes."""
+    """Return as text which versions differ between two sets of root attributes."""
     old, new = stored.get("versions", {}), now.get("versions", {})
     names = [name for name in {**new, **old} if old.get(name) != new.get(name)]
     return ", ".join(f"{name} {old.get(name, 'absent')} (now {new.get(name, 'absent')})" for name in names)
@@ -25,8 +25,15 @@ def differences(stored: Mapping[str, Any], now: Mapping[str, Any]) -> str:
 def made_now(
     attributes: Mapping[str, Any], now: Mapping[str, str], samples: Collection[int]
 ) -> list[dict[str, Any]]:
-    """Return the attribute `versions_of_samples` of a store whose `samples` are about to be made with versions
-    `now`."""
+    """Return the new attribute `versions_of_samples` of a store.
+
+    Parameters
+    ----------
+    attributes
+        Root attributes of the store.
+    now
+        Versions with which `samples` are about to be made.
+    """
     entries = [(entry["versions"], _samples(entry) - set(samples)) for entry in _entries(attributes)]
     if now != attributes.get("versions", {}):
         made = next((made for versions, made in entries if versions == now), None)
@@ -37,14 +44,17 @@ def made_now(
 
 
 def _entries(attributes: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Return the tables of `versions_of_samples`; none if the attribute is missing."""
     return list(attributes.get(VERSIONS_OF_SAMPLES, ()))
 
 
 def _samples(entry: Mapping[str, Any]) -> set[int]:
+    """Return the samples in the ranges of a table."""
     return {i for first, last in entry["samples"] for i in range(first, last + 1)}
 
 
 def _ranges(samples: Iterable[int]) -> list[list[int]]:
+    """Return samples as ascending ranges [first, last]."""
     ranges: list[list[int]] = []
     for i in sorted(samples):
         if ranges and i == ranges[-1][1] + 1:

@@ -1,1 +1,1 @@
-"""How people look at a dataset, a sample or a flare, and take it elsewhere."""
+"""Show a dataset, a sample or the straylight of a lens, and write them as files for other programs."""

@@ -1,4 +1,4 @@
-"""Pictures of a dataset: the contact sheet of `vbnfault preview`."""
+"""Draw the contact sheet of a dataset: `vbnfault preview`."""
 
 from __future__ import annotations
 
@@ -16,7 +16,8 @@ from ..store import STRATA, Store, open_store
 
 U8 = NDArray[np.uint8]
 
-# R, G, B: distinct on dark images and for colour-blind eyes (after Okabe and Ito), in dataset order.
+# R, G, B of each fault class in dataset order: distinct on dark images and for colour-blind readers (after Okabe
+# and Ito).
 COLOURS = (
     (240, 228, 66),
     (86, 200, 255),
@@ -37,7 +38,7 @@ _BACKGROUND, _PANEL, _TEXT, _FAINT = (18, 20, 24), (30, 33, 39), (225, 228, 232)
 _TILE_PX = 320  # longer side of a tile
 _GAP_PX, _CAPTION_PX, _LINE_PX = 14, 46, 24
 _FILL = 0.30  # opacity of a mask
-_WHOLE_FRAME = 0.98  # a mask that covers so much is a frame around the tile, not a veil over it
+_WHOLE_FRAME = 0.98  # a mask that covers more than this fraction is drawn as a border, not as a tint
 
 
 def preview(
@@ -49,9 +50,29 @@ def preview(
 ) -> int:
     """Write a contact sheet of up to `max_samples` finished samples, spread evenly over the store.
 
-    Each tile shows the image with the mask of every injected fault in its colour; the caption gives sample,
-    stratum, site and faults. Returns the number of tiles. Raises InputError where there is no store, no
-    finished sample or no such folder to write to.
+    Each tile shows the image, tinted by the mask of every injected fault in the fault's colour. The caption gives
+    sample, stratum, site and faults.
+
+    Parameters
+    ----------
+    store
+        A store or its path.
+    out_png
+        File to write; its name must end in .png.
+    masks
+        Whether to draw the masks.
+
+    Returns
+    -------
+    int
+        Number of tiles.
+
+    Raises
+    ------
+    InputError
+        If there is no store or no finished sample, or the file name or its folder cannot be used.
+    VbnfaultError
+        If the file cannot be written for another reason.
     """
     store = open_store(store)
     if max_samples < 1:
@@ -71,7 +92,10 @@ def preview(
 
 
 def abbreviations(faults: Sequence[str]) -> dict[str, str]:
-    """Initials of the words of each fault's name (`dust_on_optics` → DO), lengthened where two are equal."""
+    """Return an abbreviation of each fault's name: the initials of its words (`dust_on_optics`: DO).
+
+    If two faults have the same initials, one gets more letters.
+    """
     short: dict[str, str] = {}
     for fault in faults:
         words = [w for w in fault.split("_") if w not in ("on", "of", "the")]
@@ -86,10 +110,19 @@ def abbreviations(faults: Sequence[str]) -> dict[str, str]:
 
 
 def overlay(rgb: U8, mask: NDArray[np.bool_], injected: Sequence[bool]) -> U8:
-    """RGB uint8[y, x, 3] with the masks bool[fault, y, x] of injected faults: a veil and an outline each.
+    """Return an RGB image with the masks of the injected faults drawn on it, each as a tint and an outline.
 
-    A mask that covers nearly everything is drawn as a border, one beside the other, so that the image and
-    the local masks stay visible.
+    A mask that covers nearly the whole image is drawn as a border instead, so that the image and the other masks
+    stay visible. Several borders are nested.
+
+    Parameters
+    ----------
+    rgb
+        Image, uint8[y, x, 3]; not changed.
+    mask
+        Masks, bool[fault, y, x].
+    injected
+        Which faults are injected, bool[fault].
     """
     out = rgb.copy()
     height, width = rgb.shape[:2]
@@ -110,6 +143,7 @@ def overlay(rgb: U8, mask: NDArray[np.bool_], injected: Sequence[bool]) -> U8:
 
 
 def _tile(store: Store, index: int, short: Mapping[str, str], masks: bool) -> U8:
+    """Draw one sample with its caption."""
     spec = store.spec
 
     def one(name: str) -> Any:
@@ -117,7 +151,7 @@ def _tile(store: Store, index: int, short: Mapping[str, str], masks: bool) -> U8
 
     scale = _TILE_PX / max(spec.height, spec.width)
     size = (max(1, round(spec.width * scale)), max(1, round(spec.height * scale)))
-    # masks are enlarged by nearest neighbour and shrunk by "any of it": a lone broken pixel stays visible
+    # a shrunk mask is True where any of its pixels is, so that a single broken pixel stays visible
     rgb = _resized(one("image")[..., :3], size)
     injected = one("injected").astype(bool)
     if masks:
@@ -142,19 +176,21 @@ def _tile(store: Store, index: int, short: Mapping[str, str], masks: bool) -> U8
 
 
 def _resized(image: U8, size: tuple[int, int]) -> U8:
+    """Return an image at a size (width, height): shrunk by averaging, enlarged without interpolation."""
     shrinks = size[0] <= image.shape[1]
     how = cv2.INTER_AREA if shrinks else cv2.INTER_NEAREST
     return np.asarray(cv2.resize(np.ascontiguousarray(image), size, interpolation=how), dtype=np.uint8)
 
 
 def _resized_mask(mask: NDArray[np.bool_], size: tuple[int, int]) -> NDArray[np.bool_]:
-    """True where any pixel of the mask falls into the new one."""
+    """Return a mask at a size (width, height); a new pixel is True if any mask pixel inside it is."""
     if size[0] > mask.shape[1]:
         return cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST).astype(bool)
     return cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 1e-6
 
 
 def _grid(tiles: Sequence[U8], columns: int) -> U8:
+    """Return the tiles in rows of `columns`, with gaps between them."""
     height, width = tiles[0].shape[:2]
     rows = -(-len(tiles) // columns)
     shape = (rows * (height + _GAP_PX) + _GAP_PX, columns * (width + _GAP_PX) + _GAP_PX, 3)
@@ -167,7 +203,7 @@ def _grid(tiles: Sequence[U8], columns: int) -> U8:
 
 
 def _header(name: str, faults: Sequence[str], short: Mapping[str, str], width: int) -> U8:
-    """Name of the store, and the legend in as many lines as it takes."""
+    """Draw the name of the store and the legend, which takes as many lines as it needs."""
     entries = [(k, f"{short[f]}  {f.replace('_', ' ')}") for k, f in enumerate(faults)]
     places, x, line = [], _GAP_PX, 0
     for _, text in entries:
@@ -188,15 +224,18 @@ def _header(name: str, faults: Sequence[str], short: Mapping[str, str], width: i
 
 
 def _write(image: U8, text: str, at: tuple[int, int], colour: tuple[int, int, int], scale: float) -> None:
-    plain = text.encode("ascii", "replace").decode()  # the font has no more
+    """Draw text into an image; `at`: the lower left corner (x, y)."""
+    plain = text.encode("ascii", "replace").decode()  # OpenCV's font has ASCII characters only
     cv2.putText(image, plain, at, cv2.FONT_HERSHEY_SIMPLEX, scale, colour, 1, cv2.LINE_AA)
 
 
 def _text_width(text: str, scale: float) -> int:
+    """Return the width of text in pixels."""
     return int(cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, scale, 1)[0][0])
 
 
 def _write_png(path: Path, rgb: U8) -> None:
+    """Write an RGB image; a path that cannot be used raises InputError, any other failure VbnfaultError."""
     if path.suffix.lower() != ".png":
         raise InputError(f"{path}: the sheet is a PNG, so its name must end in .png")
     encoded = cv2.imencode(".png", np.ascontiguousarray(rgb[..., ::-1]))[1]

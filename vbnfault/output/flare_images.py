@@ -1,4 +1,4 @@
-"""Straylight of a lens by itself: a picture on black, and a table of every ghost."""
+"""Compute the straylight of a lens alone, as an image on black and as a table of every ghost: `vbnfault flare`."""
 
 from __future__ import annotations
 
@@ -34,10 +34,24 @@ _SHOWN_PERCENTILE = 99.7
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class FlareRequest:
-    """A lens and where the Sun is; the picture's middle lies on the axis.
+    """A lens, the direction of the Sun, and an image whose centre lies on the optical axis.
 
-    Angles in degrees, azimuth 0 to the right, 90 down; `fov_deg` across the picture's width; `wavelength_nm`
-    float64[band].
+    Attributes
+    ----------
+    sun_deg, azimuth_deg
+        Angle of the Sun from the axis; its direction in the image: 0 to the right, 90 down.
+    fov_deg
+        Field of view across the width of the image.
+    pixels
+        Width and height of the image.
+    wavelength_nm
+        Wavelengths of the bands, float64[band].
+    model
+        `traced`, `paraxial` or `texture`.
+    reflections
+        Reflections of a traced ghost: 2, or 4 to add ghosts of four reflections.
+    roughness_nm, cleanliness_level, veil_fraction
+        Scatter of the surfaces, see `lens.straylight`.
     """
 
     lens: Prescription
@@ -55,12 +69,12 @@ class FlareRequest:
 
     @property
     def pitch_mm(self) -> float:
-        """Of the picture's pixels."""
+        """Pixel pitch of the image on the sensor plane, in mm."""
         return 2 * first_order(self.lens).efl_mm * float(np.tan(np.radians(self.fov_deg / 2))) / self.pixels
 
     @property
     def sun_xy_mm(self) -> tuple[float, float]:
-        """The Sun's own image, f tan θ from the axis."""
+        """Position of the Sun's direct image on the sensor plane, f tan θ from the axis, in mm."""
         radius, turn = (
             first_order(self.lens).efl_mm * np.tan(np.radians(self.sun_deg)),
             np.radians(self.azimuth_deg),
@@ -69,7 +83,10 @@ class FlareRequest:
 
 
 def wavelengths_nm(one: float | None = None) -> F64:
-    """A single wavelength, or the nodes of the cameras' default bands. Raises InputError."""
+    """Return the wavelength `one`, or the nodes of the cameras' default bands; float64[band].
+
+    Raises InputError for a wavelength outside 250 to 2500 nm.
+    """
     if one is None:
         return spectra.band_nodes_nm(400.0, 700.0, _BANDS)
     if not 250 <= one <= 2500:
@@ -78,11 +95,15 @@ def wavelengths_nm(one: float | None = None) -> F64:
 
 
 def layers(view: FlareRequest) -> dict[str, F32]:
-    """Irradiance over the Sun's at the entrance, float32[band, y, x] each: `sun`, `ghosts`, `starburst`, `glare`,
-    `veil`; of model texture `sun` and `texture`, in units of white.
+    """Return the irradiance of each kind of straylight, divided by the Sun's irradiance at the lens's entrance.
 
-    `sun` is the direct image: what the lens transmits of the light that enters the pupil, less what starburst,
-    glare and veil take from it (`lens.straylight`). The textures take nothing.
+    Returns
+    -------
+    dict
+        float32[band, y, x] each: `sun`, `ghosts`, `starburst`, `glare`, `veil`. `sun` is the direct image of the
+        Sun: the light that the lens transmits, minus the light that starburst, glare and veil scatter
+        (`lens.straylight`). For the model `texture`: `sun`, with nothing subtracted, and `texture`,
+        float32[3, y, x] in units of white.
     """
     sun = _direct_image(view)
     if view.model == "texture":
@@ -111,8 +132,10 @@ def layers(view: FlareRequest) -> dict[str, F32]:
 
 
 def ghosts(view: FlareRequest, progress: Callable[[int], None] | None = None) -> tuple[Ghost, ...]:
-    """Every ghost of a point Sun; over several bands, means weighted by the Sun's spectrum. `progress` is told of
-    each wavelength that is done, by a 1."""
+    """Return every ghost of a point-like Sun; over several bands, means weighted by the Sun's spectrum.
+
+    `progress` is called with 1 after each wavelength.
+    """
     weight = spectra.solar_band_irradiance_W_m2_nm(view.wavelength_nm, 1.0)
     weight = weight / weight.sum()
     found: dict[tuple[int, ...], list[tuple[float, Ghost]]] = {}
@@ -125,6 +148,7 @@ def ghosts(view: FlareRequest, progress: Callable[[int], None] | None = None) ->
 
 
 def _ghosts_at(view: FlareRequest, wavelength_nm: float, *, alone: bool) -> tuple[Ghost, ...]:
+    """Return every ghost at one wavelength; `alone`: the only one, traced with the default number of rays."""
     from ..lens.straylight.ghosts import traced_ghosts
 
     if view.model == "paraxial":
@@ -140,17 +164,17 @@ def _ghosts_at(view: FlareRequest, wavelength_nm: float, *, alone: bool) -> tupl
 
 
 def _direct_image(view: FlareRequest) -> F32:
-    """Return the Sun's own image, a uniform disc at least a pixel wide, float32[band, y, x].
+    """Return the Sun's direct image as a uniform disc of at least one pixel's area, float32[band, y, x].
 
-    Its power over the Sun's irradiance is T(λ) A cos θ: the transmittance of the image path, and the area of the
-    paraxial entrance pupil, by which the ghosts' fluxes are counted too.
+    Its power divided by the Sun's irradiance is T(λ) A cos θ. T is the transmittance of the image path, A the area
+    of the paraxial entrance pupil. The fluxes of the ghosts refer to the same A cos θ.
     """
     optics = first_order(view.lens)
     radius_px = max(
         optics.efl_mm * spectra.sun_angular_radius_rad(view.sun_distance_au) / view.pitch_mm, np.sqrt(1 / np.pi)
     )
     x, y = (v / view.pitch_mm + view.pixels / 2 for v in view.sun_xy_mm)
-    # the whole disc first, so that its sum is known wherever the frame cuts it
+    # the whole disc is drawn first, so that its sum is right if the image border cuts it
     reach = int(np.ceil(radius_px)) + 1
     columns, rows = (int(np.floor(v)) + np.arange(-reach, reach + 1) for v in (x, y))
     cover = np.clip(radius_px - np.hypot(columns[None, :] + 0.5 - x, rows[:, None] + 0.5 - y) + 0.5, 0, 1)
@@ -165,7 +189,7 @@ def _direct_image(view: FlareRequest) -> F32:
 
 
 def _textures(view: FlareRequest) -> F32:
-    """One draw of the texture model with the Sun in the same place, R, G, B in units of white, float32[3, y, x]."""
+    """Draw the texture model once, with the Sun at the same position; R, G, B in units of white."""
     focal_px = first_order(view.lens).efl_mm / view.pitch_mm
     detector = Detector(width_px=view.pixels, height_px=view.pixels)
     lens = ThinLens(focal_length_mm=focal_px * detector.pixel_pitch_um * 1e-3, f_number=4.0)
@@ -181,8 +205,10 @@ def _textures(view: FlareRequest) -> F32:
 
 
 def colours(view: FlareRequest, irradiance: F32) -> F32:
-    """Linear R, G, B as the default detector sees sunlight of that irradiance, float32[y, x, 3]; a single
-    wavelength is shown grey."""
+    """Return linear R, G, B of an irradiance float32[band, y, x] for the default detector, float32[y, x, 3].
+
+    The scale is such that an irradiance of 1 in every band gives 1. A single wavelength gives grey.
+    """
     if len(view.wavelength_nm) == 1:
         return np.repeat(irradiance[0][..., None], 3, axis=2)
     detector = Detector()
@@ -193,8 +219,11 @@ def colours(view: FlareRequest, irradiance: F32) -> F32:
 
 
 def picture(view: FlareRequest, found: dict[str, F32], white: float | None = None) -> NDArray[np.uint8]:
-    """The layers as a picture, uint8[y, x, 3] R, G, B, sRGB; `white`: irradiance shown as white, else that of a
-    bright ghost."""
+    """Return the sum of the layers as an sRGB image, uint8[y, x, 3].
+
+    `white`: the irradiance shown as white. By default it is a high percentile of ghosts, glare and veil; for the
+    model `texture` it is 1.
+    """
     if "texture" in found:
         linear = np.moveaxis(found["texture"], 0, -1) + 1e3 * (colours(view, found["sun"]) > 0)
         white = 1.0 if white is None else white
@@ -209,7 +238,7 @@ def picture(view: FlareRequest, found: dict[str, F32], white: float | None = Non
 
 
 def write_picture(view: FlareRequest, found: dict[str, F32], path: Path) -> None:
-    """Write the layers: `.png`, or `.exr` with R, G, B and `<layer>.<wavelength>nm` of every band."""
+    """Write the layers as `.png`, or as `.exr` with linear R, G, B and `<layer>.<wavelength>nm` of every band."""
     if path.suffix.lower() == ".png":
         ok, data = cv2.imencode(".png", picture(view, found)[..., ::-1])
         assert ok
@@ -231,7 +260,7 @@ def write_picture(view: FlareRequest, found: dict[str, F32], path: Path) -> None
 
 
 def table(view: FlareRequest, found: tuple[Ghost, ...]) -> dict[str, Any]:
-    """The ghosts as plain data."""
+    """Return the ghosts, the lens and the Sun's direction as plain data."""
     optics = first_order(view.lens)
     return {
         "lens": view.lens.name,

@@ -1,4 +1,4 @@
-"""One sample as files a person can open: EXR for radiance and truth, PNG for pictures and masks, JSON."""
+"""Write one sample as files that other programs open: EXR for radiance and truth, PNG for images, and JSON."""
 
 from __future__ import annotations
 
@@ -22,14 +22,17 @@ _MARKED_GHOSTS = 10
 
 
 def write_frame(frame: Frame, folder: Path) -> list[Path]:
-    """Write one simulated frame to `folder` (made if missing); returns the files.
+    """Write one simulated frame to `folder` (made if missing) and return the paths of the files.
 
-    `sample.exr`: `radiance.<wavelength>nm` (W m⁻² sr⁻¹ nm⁻¹), `depth.Z` (m), `normal.X/Y/Z` (C frame),
-    `semantic`, and the soft layers of the scene; `image.png`, `clean.png`, `without_<fault>.png` as RGB, each with
-    its intensity channel beside it;
-    `mask_<fault>.png`, `mask_any.png`; `annotated_<fault>.png`, the image with a class pointed out;
-    `parameters.json` with every scalar of the dataset.
-    Raises VbnfaultError where a file cannot be written.
+    - `sample.exr`: `radiance.<wavelength>nm` (W m⁻² sr⁻¹ nm⁻¹), `depth.Z` (m), `normal.X/Y/Z` (C frame),
+      `semantic`, and the soft layers of the scene.
+    - `image.png`, `clean.png`, `without_<fault>.png`: RGB. The intensity channel of each is in
+      `<name>_intensity.png`.
+    - `mask_<fault>.png`, `mask_effect_<fault>.png`, `mask_any.png`.
+    - `annotated_<fault>.png`: the image with one class marked, see `annotated`.
+    - `parameters.json`: every scalar of the dataset.
+
+    Raises VbnfaultError if a file cannot be written.
     """
     sample = to_sample(frame)
     try:
@@ -54,8 +57,11 @@ def write_frame(frame: Frame, folder: Path) -> list[Path]:
 
 
 def annotated(frame: Frame, fault: str) -> NDArray[np.uint8]:
-    """The image with one class pointed out, uint8[y, x, 3] R, G, B: the outline of its mask and, for straylight,
-    the line from the Sun through the centre with every flare's or bright ghost's centre and radius on it."""
+    """Return the image with one fault class marked by the outline of its mask, uint8[y, x, 3] R, G, B.
+
+    For straylight, also draw the line from the Sun through the image centre, and the centre and radius of every
+    flare or bright ghost.
+    """
     names = list(frame.spec.faults)
     colour = contact_sheet.COLOURS[names.index(fault) % len(contact_sheet.COLOURS)]
     picture = np.ascontiguousarray(frame.images["image"].array[..., :3])
@@ -66,7 +72,7 @@ def annotated(frame: Frame, fault: str) -> NDArray[np.uint8]:
         centre = np.array([frame.camera.width_px / 2, frame.camera.height_px / 2])
 
         def at(point: NDArray[np.float64]) -> tuple[int, int]:
-            # a pixel's centre lies at +0.5 here and at 0 in OpenCV, whose points have 1/16 px with shift = 4
+            # pixel centres lie at +0.5 here and at 0 in OpenCV, which counts in 1/16 px with shift = 4
             return round(float(point[0] - 0.5) * 16), round(float(point[1] - 0.5) * 16)
 
         far = sun + 2.2 * (centre - sun)
@@ -83,8 +89,10 @@ def annotated(frame: Frame, fault: str) -> NDArray[np.uint8]:
 def _marks(
     params: Mapping[str, Any], sun: NDArray[np.float64] | None, width: int, height: int
 ) -> list[tuple[str, NDArray[np.float64], float]]:
-    """Name, place and radius in pixels of what straylight has drawn: textures, or a lens's brightest ghosts, whose
-    radius is that of a disc with their spread."""
+    """Return name, position and radius in pixels of straylight's textures or of a lens's brightest ghosts.
+
+    The radius of a ghost is that of a uniform disc with the same rms radius.
+    """
     if sun is None:
         return []
     centre = np.array([width / 2, height / 2])
@@ -100,6 +108,8 @@ def _marks(
 
 
 def _plain(sample: Sample) -> dict[str, Any]:
+    """Return the scalars of a sample as plain data; arrays become flat lists with None for NaN."""
+
     def plain(value: Any) -> Any:
         if isinstance(value, np.ndarray):
             return [None if isinstance(v, float) and np.isnan(v) else v for v in value.ravel().tolist()]
@@ -109,6 +119,7 @@ def _plain(sample: Sample) -> dict[str, Any]:
 
 
 def _write_png(path: Path, array: NDArray[np.uint8]) -> Path:
+    """Write an image, uint8[y, x] or [y, x, 3] B, G, R, and return its path."""
     ok, data = cv2.imencode(".png", np.ascontiguousarray(array))
     if not ok:
         raise VbnfaultError(f"{path}: PNG encoding failed")
@@ -117,6 +128,7 @@ def _write_png(path: Path, array: NDArray[np.uint8]) -> Path:
 
 
 def _write_exr(frame: Frame, sample: Sample, path: Path) -> Path:
+    """Write radiance, truth and soft layers to one EXR file and return its path."""
     import OpenEXR
 
     truth = frame.truth
@@ -131,6 +143,6 @@ def _write_exr(frame: Frame, sample: Sample, path: Path) -> Path:
     soft = [fault.soft_layer for fault in frame.spec.faults.values()]
     channels |= {name: sample.layers[name] for name in soft if name in sample.layers}
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
-    # OpenEXR takes writeable arrays only
+    # OpenEXR accepts writeable arrays only
     OpenEXR.File(header, {name: array.copy() for name, array in channels.items()}).write(str(path))
     return path

@@ -1,19 +1,20 @@
-"""The dataset: one Zarr v3 group. Its schema, and how it is created, written, opened, verified.
+"""Create, write, open and verify a dataset, which is one Zarr v3 group (the store).
 
-The only importer of zarr. How a store survives what happens to it:
+Only this package imports zarr. A sample has layers (arrays with one value or vector for each pixel) and scalars
+(everything else). These rules protect a store against kills, power loss and bad disks:
 
-- Chunk files are encoded here, not by zarr, which would drop a chunk of zeros (an absent one reads as zeros
-  too) and recompress the neighbours of a sample that is built again. Reads go through zarr, as a user's do.
-- Every file is written beside its place, flushed to the device, and renamed into it, so it is either the old or
-  the new one, also after a loss of power (`disk`). `create` makes the whole group that way. A kill leaves
-  `*.partial` files, which `recover` removes.
-- Metadata follow from the root attributes alone (`layout`), so whatever differs is found and mended. The root
-  attributes hold a checksum, and the group `spare` holds a copy, written before the root.
-- A per-pixel layer is sharded: a chunk is one sample, a file holds `shard_samples` of them. One task owns a
-  shard. Whoever rewrites it copies the compressed chunks of the samples it does not rebuild, untouched.
-- `crc32c` holds a checksum of every layer and of all scalars of a sample, over decoded bytes; a chunk carries
-  Zstd's own checksum besides. `done` is written last. So a lost power supply or a bad disk is found, and
-  exactly the samples concerned are rebuilt.
+- This package encodes the chunk files itself. zarr would drop a chunk of zeros, and a missing chunk reads as zeros
+  too; zarr would also compress the neighbours of a rebuilt sample again. Reads go through zarr, as a user's do.
+- A file is written under a temporary name in the same folder, flushed to the device, and renamed. So each file is
+  either the old or the new one, also after a loss of power (`disk`). `create` makes the whole group this way. A
+  killed process leaves `*.partial` files, which `recover` removes.
+- The metadata follow from the root attributes alone (`layout`), so every difference can be detected and repaired.
+  The root attributes hold a checksum. The group `spare` holds a copy of them and is written before the root.
+- A layer is sharded: a chunk holds one sample, and a file holds the chunks of `shard_samples` samples. One task
+  owns a shard. Rewriting a shard copies the compressed chunks of the samples that are not rebuilt.
+- `crc32c` holds a checksum of every layer and one of all scalars of a sample, over the decoded bytes. A chunk also
+  carries Zstd's own checksum. `done` is written last. So damage is detected, and only the damaged samples are
+  rebuilt.
 """
 
 from .check import (

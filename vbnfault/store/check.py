@@ -1,4 +1,7 @@
-"""Is a store whole, labelled and as planned? Every problem is a sentence; `digest` says whether two are equal."""
+"""Check that a store is complete, correctly labelled and as planned; compute the digest that identifies it.
+
+Every problem is reported as one sentence. Two stores with the same digest hold the same data.
+"""
 
 from __future__ import annotations
 
@@ -23,20 +26,28 @@ from .schema import SCALARS, VOLATILE_ATTRIBUTES, StoreSpec
 
 
 class Problem(NamedTuple):
-    """What is wrong with some samples, in one sentence. `unfinished`: they were not made yet, no more."""
+    """What is wrong with some samples, in one sentence. `unfinished`: they are only not built yet, not damaged."""
 
     samples: tuple[int, ...]
     sentence: str
     unfinished: bool = False
 
 
-Planned = Callable[[int, int], Mapping[str, Any]]  # sample, its tries → scalars as planned
-_MOST_RANGES = 16  # of samples, in a sentence
+Planned = Callable[[int, int], Mapping[str, Any]]  # (sample, its `tries`) → planned scalars by name
+_MOST_RANGES = 16  # sample ranges that one sentence lists
 
 
 class ShardCheck(NamedTuple):
-    """What was read of a shard: its problems; of sound samples the scalars, the digest of each (`sample_digest`),
-    and what contradicts in their labels, where that was asked for."""
+    """The result of reading one shard.
+
+    Attributes
+    ----------
+    problems
+        What is unfinished, missing or damaged.
+    scalars, digests, contradictions
+        By sample, for undamaged finished samples only: the scalars, the digest (`sample_digest`), and one sentence
+        for each contradiction between labels and pixels (no sentence unless labels were checked).
+    """
 
     problems: list[Problem]
     scalars: dict[int, dict[str, Any]]
@@ -45,20 +56,20 @@ class ShardCheck(NamedTuple):
 
     @property
     def wanted(self) -> set[int]:
-        """The samples that have to be built, or built again."""
+        """The samples that must be built or rebuilt."""
         wrong = {i for i, sentences in self.contradictions.items() if sentences}
         return wrong.union(*(problem.samples for problem in self.problems))
 
 
 def check_shard(store: Store, number: int) -> list[Problem]:
-    """What is unfinished, missing or damaged in one shard; every finished layer is decoded and compared."""
+    """Return what is unfinished, missing or damaged in one shard; decode and compare every finished layer."""
     return examine_shard(store, number).problems
 
 
 def examine_shard(store: Store, number: int, *, labels: bool = False) -> ShardCheck:
-    """Read one shard once: decode every finished layer, compare it with its checksum, take its digest.
+    """Read one shard once: decode every finished layer, compare it with its checksum, compute its digest.
 
-    With `labels` the samples' labels are compared with their pixels as well.
+    `labels`: also compare the labels of the samples with their pixels.
     """
     samples = store.shard(number)
     columns: dict[str, NDArray[Any]] = {}
@@ -122,7 +133,7 @@ def examine_shard(store: Store, number: int, *, labels: bool = False) -> ShardCh
 
 
 def _chunks(store: Store, number: int, finished: list[int]) -> tuple[dict[str, dict[int, bytes]], list[Problem]]:
-    """Layer → sample → compressed chunk of a shard, and which files cannot be read."""
+    """Return the compressed chunks of a shard by layer and sample, and one problem for each unreadable file."""
     chunks: dict[str, dict[int, bytes]] = {}
     problems = []
     for name in store.spec.pixel_layers:
@@ -142,7 +153,7 @@ def _chunks(store: Store, number: int, finished: list[int]) -> tuple[dict[str, d
 def _layers(
     store: Store, number: int, i: int, chunks: Mapping[str, Mapping[int, bytes]], crcs: NDArray[np.uint32]
 ) -> tuple[list[tuple[int, Problem]], dict[str, bytes]]:
-    """The decoded layers of a sample, and what is wrong with them, with the place of the layer among its like."""
+    """Return the problems of one sample, each with the index of its layer, and the decoded bytes of its layers."""
     problems, layers = [], {}
     for k, name in enumerate(store.spec.pixel_layers):
         if store.spec.empty(name):
@@ -165,7 +176,7 @@ def _layers(
 
 
 def _spans(indices: Iterable[int]) -> str:
-    """`3-7, 9` for 3, 4, 5, 6, 7, 9."""
+    """Return sorted indices as ranges: `3-7, 9` for 3, 4, 5, 6, 7, 9."""
     runs: list[list[int]] = []
     for i in sorted(indices):
         if runs and i == runs[-1][1] + 1:
@@ -176,7 +187,7 @@ def _spans(indices: Iterable[int]) -> str:
 
 
 def _not_built(samples: list[int]) -> Iterator[str]:
-    """Yield one sentence for all samples that are not built yet, with their first ranges."""
+    """Yield one sentence that lists the first ranges of the samples that are not built yet; none if all are."""
     if samples:
         ranges = _spans(samples).split(", ")
         more = f" and {len(ranges) - _MOST_RANGES} ranges more" if len(ranges) > _MOST_RANGES else ""
@@ -189,7 +200,7 @@ def _not_built(samples: list[int]) -> Iterator[str]:
 
 
 def problem_samples(store: str | os.PathLike[str] | Store) -> list[int]:
-    """Samples that have to be built, or built again: unfinished, missing or damaged ones."""
+    """Return the samples that must be built or rebuilt: unfinished, missing or damaged ones, in ascending order."""
     store = open_store(store)
     begun = store.begun()
     wanted = {i for n in begun for p in check_shard(store, n) for i in p.samples}
@@ -197,8 +208,10 @@ def problem_samples(store: str | os.PathLike[str] | Store) -> list[int]:
 
 
 def unplanned_samples(store: Store, number: int, expected: Planned, *, exact: bool = False) -> set[int]:
-    """Return the finished samples of a shard whose stored scalars are not as `expected`; none where the scalars
-    cannot be read, which `check_shard` finds. For the parameters see `examine`."""
+    """Return the finished samples of a shard whose stored scalars differ from the plan.
+
+    The set is empty if the scalars cannot be read: `check_shard` reports that. `examine` explains the parameters.
+    """
     finished = [i for i, done in store.done(number).items() if done]
     try:
         columns = {name: store.column(name, number) for name in SCALARS} if finished else {}
@@ -216,8 +229,17 @@ def unplanned_samples(store: Store, number: int, expected: Planned, *, exact: bo
 
 
 class Report(NamedTuple):
-    """What `examine` found: problems, one sentence each; the digest, None where a sample is missing or damaged;
-    and how often each fault class is planned and in the pixels."""
+    """The result of `examine`.
+
+    Attributes
+    ----------
+    problems
+        One sentence each.
+    digest
+        sha256 (hex); None if a sample is missing or damaged.
+    counts
+        How often each fault class is planned, and how often it is in the pixels.
+    """
 
     problems: list[str]
     digest: str | None
@@ -231,7 +253,7 @@ def verify(
     exact: bool = False,
     progress: Callable[[int], None] | None = None,
 ) -> list[str]:
-    """Return the problems that `examine` finds."""
+    """Return the problems that `examine` detects, one sentence each."""
     return examine(path, expected=expected, exact=exact, progress=progress).problems
 
 
@@ -244,24 +266,26 @@ def examine(
 ) -> Report:
     """Read a store once and return every problem, its digest and its counts of faults.
 
-    Checks that every array is there with its layout, attributes and coordinates, and as the consolidated
-    metadata say; where an array of samples is not, samples are not looked at. Checks that each sample is whole
-    (`check_shard`) and labelled: masks, `injected`, `parameters` and pictures agree, a site lies in one split.
+    First check that every array exists and that its layout, attributes and coordinates match the schema and the
+    consolidated metadata. If the layout of an array of samples is wrong, no sample is read. Then check that each
+    sample is complete (`check_shard`) and labelled: masks, `injected`, `parameters` and images must agree, and all
+    samples of a site must be in one split.
 
     Parameters
     ----------
     expected
-        Gives the scalars of a sample as planned for the view of its `tries`, compared exactly, except for
-        `injected`: there it gives the commanded faults.
+        Called with a sample and its stored `tries`; returns the scalars planned for that view. They are compared
+        exactly, except `injected`, for which it returns the commanded faults.
     exact
-        Whether a commanded fault that is not injected is a problem; no other may be injected in either case.
+        Whether a commanded fault that is not injected is a problem. An injected fault that was not commanded is
+        always one.
     progress
-        Is called with the number of samples just checked.
+        Called with the number of samples just checked.
 
     Raises
     ------
     InputError
-        Where there is no store.
+        If there is no store at `path`.
     """
     store = open_store(path)
     counts = FaultCounts(store.spec.faults)
@@ -295,8 +319,10 @@ def examine(
 
 
 def count_faults(store: Store, planned: NDArray[np.bool_] | None = None) -> FaultCounts:
-    """Return how often each fault is injected in the finished samples, beside how often it is planned,
-    bool[sample, fault]; only the arrays `done`, `split` and `injected` are read."""
+    """Return how often each fault is injected in the finished samples, and how often it is planned there.
+
+    `planned`: commanded faults, bool[sample, fault]. Only the arrays `done`, `split` and `injected` are read.
+    """
     counts = FaultCounts(store.spec.faults)
     for number in range(store.shards):
         finished = [i for i, done in store.done(number).items() if done]
@@ -313,7 +339,7 @@ def count_faults(store: Store, planned: NDArray[np.bool_] | None = None) -> Faul
 def _check_labels(
     spec: StoreSpec, i: int, scalars: Mapping[str, Any], layers: Mapping[str, bytes], crcs: NDArray[np.uint32]
 ) -> Iterator[str]:
-    """What a sample's labels say that its pixels, or its other labels, do not."""
+    """Yield one sentence for each contradiction between a sample's labels and its pixels or other labels."""
     injected = scalars["injected"]
     parameters = json.loads(str(scalars["parameters"]) or "{}")
     for fault, is_in in zip(spec.faults, injected.tolist(), strict=True):
@@ -326,7 +352,7 @@ def _check_labels(
     yield from _check_masks(i, spec.faults, "mask", mask, injected, spec.localised_faults or ())
     effect: Any = ()
     if "mask_effect" in layers:
-        # an injected fault is one that changes the noise-free picture somewhere
+        # by definition, an injected fault changes the noise-free image somewhere
         effect = _array(spec, "mask_effect", layers)
         yield from _check_masks(i, spec.faults, "mask_effect", effect, injected, spec.faults)
     if not np.array_equal(_array(spec, "mask_any", layers), mask_union(spec, mask)):
@@ -340,7 +366,7 @@ def _check_labels(
             yield f"sample {i}: mask of {fault} is not its effect, as mask_effect has it"
         if kind == "strong effect" and (one & ~other).any():
             yield f"sample {i}: mask of {fault} holds pixels outside of its effect, as mask_effect has it"
-    # equal checksums stand for equal pictures: both have just been compared with their pixels
+    # equal checksums mean equal images: both have just been compared with their pixels
     crc = dict(zip(spec.pixel_layers, crcs.tolist(), strict=False))
     if not injected.any() and crc["image"] != crc["clean"]:
         yield f"sample {i}: image differs from clean, although no fault is injected"
@@ -358,7 +384,8 @@ def _check_masks(
     injected: Iterable[bool],
     seen: Iterable[str],
 ) -> Iterator[str]:
-    """Which masks claim a fault that is not injected, or do not show one that is and must be `seen`."""
+    """Yield one sentence for each mask that marks a fault that is not injected, or that is empty although its fault
+    is injected and is one of `seen`."""
     seen = set(seen)
     for fault, mask, is_in in zip(faults, masks, injected, strict=True):
         marks = bool(mask.any())
@@ -369,6 +396,7 @@ def _check_masks(
 
 
 def _array(spec: StoreSpec, name: str, layers: Mapping[str, bytes]) -> NDArray[Any]:
+    """Return the decoded bytes of a layer as an array of its dtype and shape."""
     row = spec.pixel_layers[name]
     return np.frombuffer(layers[name], dtype=row.dtype).reshape(spec.shape(row))
 
@@ -376,6 +404,10 @@ def _array(spec: StoreSpec, name: str, layers: Mapping[str, bytes]) -> NDArray[A
 def _check_split(
     store: Store, i: int, scalars: Mapping[str, Any], split_of: dict[int, tuple[int, str]]
 ) -> Iterator[str]:
+    """Yield a sentence if a sample's split differs from that of the first sample of its site.
+
+    `split_of`: site → (its first sample, the split of that sample); this function adds new sites.
+    """
     site, split = int(scalars["site"]), str(scalars["split"])
     first, before = split_of.setdefault(site, (i, split))
     if split != before:
@@ -387,9 +419,10 @@ def _check_split(
 def _check_plan(
     spec: StoreSpec, i: int, scalars: Mapping[str, Any], expected: Mapping[str, Any], exact: bool
 ) -> Iterator[str]:
+    """Yield one sentence for each stored scalar of a sample that differs from the `expected` (planned) one."""
     for name, planned in expected.items():
         stored = scalars[name]
-        if name == "injected":  # a commanded fault may have no effect, but no other may be there
+        if name == "injected":  # a commanded fault may have no effect, but no other fault may be injected
             for fault, is_in, commanded in zip(spec.faults, stored, planned, strict=True):
                 if is_in and not commanded:
                     yield f"sample {i}: {fault} is injected, but the plan does not command it"
@@ -407,7 +440,7 @@ def _check_plan(
 
 
 def _parsed(text: str) -> Any:
-    """JSON as data: the order of keys does not count; other text as it is."""
+    """Return JSON text as data, so that the order of keys does not count; return other text as it is."""
     try:
         return json.loads(text)
     except ValueError:
@@ -415,23 +448,26 @@ def _parsed(text: str) -> Any:
 
 
 class SampleDigests:
-    """The digests of a store's samples, collected in any order, and the digest of the store that follows."""
+    """Collect the digests of a store's samples in any order; compute the digest of the store from them."""
 
     def __init__(self, samples: int) -> None:
         self._digests = np.zeros((samples, DIGEST_BYTES), dtype=np.uint8)
 
     def add(self, digests: Mapping[int, bytes]) -> None:
-        """Note the digests of some samples."""
+        """Add the digests of some samples."""
         for i, one in digests.items():
             self._digests[i] = np.frombuffer(one, dtype=np.uint8)
 
     @property
     def complete(self) -> bool:
-        """Whether every sample has its digest."""
+        """Whether every sample has a digest."""
         return bool(self._digests.any(axis=1).all())
 
     def of(self, store: Store) -> str:
-        """sha256 (hex) of the root attributes, the schema and the samples; one without a digest is unfinished."""
+        """Return the sha256 (hex) of the root attributes, the schema and the samples' digests.
+
+        A sample without a digest counts as unfinished: zeros stand for it.
+        """
         attributes = {k: v for k, v in store.attributes.items() if k not in VOLATILE_ATTRIBUTES}
         plain = {k: v for k, v in store.spec.plain().items() if k != "shard_samples"}
         rows = [[name, row.dims, row.dtype] for name, row in sorted(store.spec.arrays.items())]
@@ -441,10 +477,10 @@ class SampleDigests:
 
 
 def digest(path: str | os.PathLike[str] | Store, *, progress: Callable[[int], None] | None = None) -> str:
-    """Return the sha256 (hex) of what a store holds: root attributes, schema, and decoded arrays of its samples.
+    """Return the sha256 (hex) of the data in a store: root attributes, schema, and decoded arrays of its samples.
 
-    Time of creation, sharding and compression are no part of it. A store is read shard by shard, once;
-    `progress` is called with the number of samples just read. Raises VbnfaultError for damaged chunks.
+    The digest does not depend on the creation time, the sharding or the compression. The store is read once, shard
+    by shard; `progress` is called with the number of samples just read. Raises VbnfaultError for damaged chunks.
     """
     store = open_store(path)
     digests = SampleDigests(store.samples)

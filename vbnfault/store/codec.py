@@ -1,4 +1,4 @@
-"""A sample as bytes: compressed chunks, checksums, and the shard files that hold the chunks."""
+"""Encode a sample as bytes: compress its chunks, compute checksums, and assemble the shard files."""
 
 from __future__ import annotations
 
@@ -22,32 +22,32 @@ from .schema import SCALARS, StoreSpec
 
 # Level 1: 16 ms for a noisy 1024 px RGBI image; level 3 takes three times as long and saves a sixth.
 ZSTD_LEVEL = 1
-_ABSENT = 2**64 - 1  # how a shard's index says that it has no such chunk
+_ABSENT = 2**64 - 1  # marks a missing chunk in a shard's index (Zarr v3 specification)
 
 
 def threads() -> int:
-    """How many threads compress or check the layers of a sample."""
+    """Return how many threads compress or check the layers of a sample, 1 to 4."""
     given = resources.environment_whole("VBNFAULT_THREADS", resources.MOST_THREADS)
     return max(1, min(4, given or os.cpu_count() or 1))
 
 
 def crc32c(array: NDArray[Any]) -> int:
-    """CRC-32C of the bytes of an array."""
+    """Return the CRC-32C of the bytes of an array."""
     frozen = np.ascontiguousarray(array).view()
-    frozen.flags.writeable = False  # the C function takes read-only buffers alone
+    frozen.flags.writeable = False  # the C function accepts read-only buffers only
     return int(google_crc32c.value(frozen))
 
 
 def compress(data: Any) -> bytes:
-    """One Zstd frame with a checksum of its own, as a chunk of the store is."""
+    """Return data as one Zstd frame with its own checksum: a chunk of the store."""
     return bytes(Zstd(level=ZSTD_LEVEL, checksum=True).encode(data))
 
 
 def decompress(data: bytes) -> bytes:
-    """What `compress` was given. Raises ValueError where the frame or its checksum is broken."""
+    """Return the data that `compress` was given. Raises ValueError if the frame or its checksum is wrong."""
     try:
         return bytes(Zstd().decode(data))
-    except (RuntimeError, MemoryError) as error:  # a damaged header may ask for any size
+    except (RuntimeError, MemoryError) as error:  # a damaged header may request any size
         raise ValueError(str(error)) from error
 
 
@@ -55,7 +55,7 @@ def decompress(data: bytes) -> bytes:
 
 
 def join_shard(chunks: Mapping[int, bytes], count: int) -> bytes:
-    """A shard file of `count` chunks; those missing from `chunks` are marked absent."""
+    """Return a shard file of `count` chunks; its index marks those missing from `chunks` as absent."""
     index = np.full((count, 2), _ABSENT, dtype="<u8")
     position = 0
     for i in sorted(chunks):
@@ -67,7 +67,7 @@ def join_shard(chunks: Mapping[int, bytes], count: int) -> bytes:
 
 
 def split_shard(data: bytes, count: int) -> dict[int, bytes]:
-    """Chunk number → compressed bytes. Raises ValueError where the file is no whole shard."""
+    """Return the compressed chunks of a shard file by number. Raises ValueError if its index is damaged."""
     size = 16 * count
     table, crc = data[-size - 4 : -4], data[-4:]
     if len(table) != size or struct.pack("<I", google_crc32c.value(table)) != crc:
@@ -84,8 +84,11 @@ def split_shard(data: bytes, count: int) -> dict[int, bytes]:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Encoded:
-    """A sample with its layers compressed: what a task keeps until its shard is complete. `digest`: of
-    `sample_digest`."""
+    """A sample with its layers compressed; a task keeps it until its shard is complete.
+
+    `chunks`: compressed bytes by layer. `crc32c`: uint32[layer], the last one over all scalars. `digest`: the
+    result of `sample_digest`.
+    """
 
     index: int
     chunks: Mapping[str, bytes]
@@ -97,8 +100,8 @@ class Encoded:
 def encode(spec: StoreSpec, sample: Sample) -> Encoded:
     """Check a sample against the schema, compress its layers, compute its checksums.
 
-    `mask_any` is made here where the sample has none. Raises ValueError that names the sample and the array
-    where one is missing, unknown, or of another shape or dtype.
+    `mask_any` is computed here if the sample lacks it. Raises ValueError, with the sample and the array, if an
+    array is missing, unknown, or of the wrong shape or dtype.
     """
     layers = dict(sample.layers)
     if "mask" in layers and "mask_any" not in layers:
@@ -130,12 +133,13 @@ def encode(spec: StoreSpec, sample: Sample) -> Encoded:
 
 
 def mask_union(spec: StoreSpec, mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """bool[y, x] from bool[fault, y, x]: what `mask_any` must be."""
+    """Return the union bool[y, x] of the masks bool[fault, y, x] of the classes in `spec.mask_any_faults`."""
     chosen = np.array([f in spec.mask_any_faults for f in spec.faults], dtype=bool)
     return np.logical_or.reduce(mask[chosen], axis=0)
 
 
 def _same_names(index: int, kind: str, got: Iterable[str], expected: Iterable[str]) -> None:
+    """Raise ValueError if a sample's names are not exactly the expected ones."""
     for name in set(expected) - set(got):
         raise ValueError(f"sample {index}: the {kind} {name} is missing")
     for name in set(got) - set(expected):
@@ -143,6 +147,7 @@ def _same_names(index: int, kind: str, got: Iterable[str], expected: Iterable[st
 
 
 def _scalar(spec: StoreSpec, index: int, name: str, value: Any) -> Any:
+    """Return a scalar in the dtype of the schema; raise ValueError if its shape or value does not fit."""
     row = SCALARS[name]
     if row.is_text:
         return value if isinstance(value, str) else json.dumps(value, sort_keys=True)
@@ -157,7 +162,7 @@ def _scalar(spec: StoreSpec, index: int, name: str, value: Any) -> Any:
 
 
 def crc_of_scalars(scalars: Mapping[str, Any]) -> int:
-    """One checksum over all scalars of a sample, in the order of the schema."""
+    """Return one CRC-32C over all scalars of a sample, in the order of the schema."""
     return int(google_crc32c.value(_packed(scalars)))
 
 
@@ -165,7 +170,10 @@ DIGEST_BYTES = hashlib.sha256().digest_size
 
 
 def sample_digest(layers: Mapping[str, bytes], scalars: Mapping[str, Any]) -> bytes:
-    """sha256 of a sample, of the sha256 of the decoded bytes of each layer by name, and of its scalars."""
+    """Return the sha256 of a sample: over its layers in the order of their names, then over its scalars.
+
+    `layers`: by name, the sha256 of the decoded bytes of each layer.
+    """
     total = hashlib.sha256()
     for name, layer in sorted(layers.items()):
         total.update(name.encode() + b"\0" + layer)
@@ -174,6 +182,7 @@ def sample_digest(layers: Mapping[str, bytes], scalars: Mapping[str, Any]) -> by
 
 
 def _packed(scalars: Mapping[str, Any]) -> bytes:
+    """Return all scalars of a sample as bytes, each after its length, in the order of the schema."""
     parts = []
     for name, row in SCALARS.items():
         data = scalars[name].encode() if row.is_text else np.asarray(scalars[name]).astype(row.dtype).tobytes()

@@ -1,4 +1,4 @@
-"""How often each fault class is planned and how often it is in the pixels, by split."""
+"""Count how often each fault class is planned, and how often it is in the pixels, by split."""
 
 from __future__ import annotations
 
@@ -9,7 +9,10 @@ from .schema import SPLITS
 
 
 class FaultCounts:
-    """Samples that a fault class is planned for and injected in, by split. `add` takes them one by one."""
+    """How many samples each fault class is planned for, and how many it is injected in, by split.
+
+    `add` counts the samples one by one.
+    """
 
     def __init__(self, faults: Sequence[str]) -> None:
         self.faults = tuple(faults)
@@ -19,7 +22,11 @@ class FaultCounts:
         self._has_plan = True
 
     def add(self, split: str, planned: Iterable[bool] | None, injected: Iterable[bool]) -> None:
-        """Count a sample: its split, the faults commanded (None where no plan is known) and those injected."""
+        """Count one sample.
+
+        `planned`, `injected`: bool[fault], the commanded and the injected faults; `planned` is None if no plan is
+        known.
+        """
         self.samples[split] += 1
         self._has_plan &= planned is not None
         for which, flags in ((self._planned, planned), (self._realised, injected)):
@@ -27,28 +34,28 @@ class FaultCounts:
                 which[split, fault] += bool(is_in)
 
     def planned(self, fault: str, split: str | None = None) -> int:
-        """Samples that a fault is planned for, in a split or in all."""
+        """Return the number of samples for which a fault is planned, in one split or in all."""
         return sum(n for (s, f), n in self._planned.items() if f == fault and split in (None, s))
 
     def realised(self, fault: str, split: str | None = None) -> int:
-        """Samples that a fault is injected in, in a split or in all."""
+        """Return the number of samples in which a fault is injected, in one split or in all."""
         return sum(n for (s, f), n in self._realised.items() if f == fault and split in (None, s))
 
     @property
     def missing(self) -> dict[str, int]:
-        """Fault → how many fewer samples hold it than are planned, of those faults where that is not 0."""
+        """Planned minus realised samples by fault class; only classes where the difference is not 0."""
         if not self._has_plan:
             return {}
         differences = {f: self.planned(f) - self.realised(f) for f in self.faults}
         return {fault: n for fault, n in differences.items() if n}
 
     def missing_text(self) -> str:
-        """Return `missing` in words."""
+        """Return `missing` as a sentence."""
         few = ", ".join(f"{name} {count}" for name, count in self.missing.items())
         return f"planned, but without effect and not injected: {few}"
 
     def lines(self) -> list[str]:
-        """The table in words, a line a fault class: realised and planned samples, in all and by split."""
+        """Return a text table: for each fault class the planned and realised samples, in all and by split."""
         if not self.faults or not self.samples:
             return []
         known = [s for s in SPLITS if s in self.samples]

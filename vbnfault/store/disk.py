@@ -1,8 +1,9 @@
-"""Whole files, durably: every operation of a store on the file system goes through here.
+"""Read, write, rename and remove the files of a store; writes are durable and of whole files only.
 
-A batch of files is written beside the final names (`*.partial`), flushed to the device with fsync, renamed, and
-the folders are flushed: after a loss of power each file is either the old or the new one, and what is written after
-a batch is never on the device before it (Pillai et al. 2014, "All file systems are not created equal", OSDI).
+A batch of files is written under temporary names in the same folders (`*.partial`), flushed to the device with
+fsync, and renamed; then the folders are flushed. After a loss of power each file is either the old or the new one.
+A later batch never reaches the device before an earlier one (Pillai et al. 2014, "All file systems are not created
+equal", OSDI).
 """
 
 from __future__ import annotations
@@ -20,19 +21,20 @@ from typing import TypeVar
 from ..core.errors import VbnfaultError
 
 PARTIAL = ".partial"
-# at once: of the 42 files and 90 folders of a shard, on ext4, one after the other take 45-600 ms, eight 15-35 ms
+# Number of parallel flushes. Measured on ext4, the 42 files and 90 folders of a shard take 45-600 ms one after the
+# other, and 15-35 ms eight at a time.
 _FLUSHES = 8
 T = TypeVar("T")
-_UNSUPPORTED = (errno.EINVAL, errno.ENOTSUP)  # what file systems answer that cannot flush a folder
+_UNSUPPORTED = (errno.EINVAL, errno.ENOTSUP)  # errors of file systems that cannot flush a folder
 
 
 class Misplaced(OSError):
-    """Something else has the name of a file: a folder, a link, a pipe."""
+    """Raised if the name of a file belongs to something else: a folder, a link, a pipe."""
 
 
 @contextlib.contextmanager
 def explained(path: Path, doing: str) -> Iterator[None]:
-    """Turn what the operating system refuses into one sentence; what was finished stays as it is."""
+    """Turn an OSError in a `with` block into a VbnfaultError with one sentence for the user."""
     try:
         yield
     except OSError as error:
@@ -48,11 +50,11 @@ def read(path: Path) -> bytes:
     Raises
     ------
     Misplaced
-        Something else has its name.
+        The path is a folder, a link or a pipe.
     OSError
-        The system refuses.
+        The file cannot be read.
     """
-    # O_NONBLOCK: opening a pipe would wait for a writer
+    # without O_NONBLOCK, opening a pipe would wait for a writer
     flags = os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
     try:
         file = os.open(path, flags)
@@ -73,7 +75,7 @@ def read(path: Path) -> bytes:
 
 
 def names(folder: Path) -> list[str]:
-    """Return the names in a folder, none where there is no such folder."""
+    """Return the names in a folder; an empty list if there is no such folder."""
     try:
         return os.listdir(folder)
     except (FileNotFoundError, NotADirectoryError):
@@ -81,21 +83,23 @@ def names(folder: Path) -> list[str]:
 
 
 def write(root: Path, files: Iterable[tuple[str, bytes]]) -> None:
-    """Replace files durably, as one batch; each is the old or the whole new one at any moment.
+    """Replace files durably, as one batch; each is the old or the complete new one at any moment.
 
-    Whatever else has the name of a file or of its folder below `root` makes way: a folder, a link, a pipe.
+    If something else (a folder, a link, a pipe) has the name of a file or of its folder below `root`, it is
+    removed.
 
     Parameters
     ----------
     root
         An existing folder.
     files
-        Name relative to `root`, with `/`, and content. Taken one at a time: only one content is held.
+        Name relative to `root`, separated by `/`, and content. They are taken one at a time, so that only one
+        content is in memory.
 
     Raises
     ------
     OSError
-        The system refuses. Each file is then the old or the new one; unfinished ones are removed.
+        A file cannot be written. Each file is then the old or the new one; temporary files are removed.
     """
     written: list[tuple[Path, Path]] = []
     opened: list[int] = []
@@ -130,13 +134,14 @@ def write(root: Path, files: Iterable[tuple[str, bytes]]) -> None:
 
 
 def _at_once(flush: Callable[[T], None], items: Iterable[T]) -> None:
-    """Flush many files or folders in parallel: file systems with a journal commit it once for those that wait."""
+    """Flush files or folders in parallel: a journaling file system commits once for all that wait."""
     with ThreadPoolExecutor(_FLUSHES) as pool:
         for _ in pool.map(flush, items):
             pass
 
 
 def _write_all(file: int, content: bytes) -> None:
+    """Write all bytes to an open file: one call of os.write may write only a part."""
     rest = memoryview(content)
     while rest:
         count = os.write(file, rest)
@@ -146,12 +151,12 @@ def _write_all(file: int, content: bytes) -> None:
 
 
 def _make_folders(root: Path, folder: Path, changed: dict[Path, None]) -> None:
-    """Make a folder and those above it, up to `root`; note whose entries changed."""
+    """Make a folder and its missing parents below `root`; add the folders whose entries changed to `changed`."""
     if folder == root or folder in changed:
         return
     try:
-        is_folder = stat.S_ISDIR(os.stat(folder).st_mode)  # of a link: where it leads
-    except OSError:  # there is none, or a file among those above
+        is_folder = stat.S_ISDIR(os.stat(folder).st_mode)  # follows a link
+    except OSError:  # it does not exist, or one of its parents is a file
         is_folder = False
     if is_folder:
         return
@@ -161,7 +166,7 @@ def _make_folders(root: Path, folder: Path, changed: dict[Path, None]) -> None:
             os.unlink(folder)
         os.mkdir(folder)
     except OSError:
-        if not folder.is_dir():  # else another worker has just made it
+        if not folder.is_dir():  # otherwise another worker has just made it
             raise
     changed[folder.parent] = changed[folder] = None
 
@@ -177,6 +182,7 @@ def _make_way(target: Path) -> None:
 
 
 def _flush(file: int) -> None:
+    """Flush an open file or folder to the device; ignore file systems that cannot."""
     try:
         os.fsync(file)
     except OSError as error:
@@ -185,8 +191,8 @@ def _flush(file: int) -> None:
 
 
 def flush_folder(folder: Path) -> None:
-    """Make what was made, renamed or removed in a folder durable."""
-    if os.name == "nt":  # folders cannot be opened there
+    """Flush the entries of a folder to the device: files made, renamed or removed in it."""
+    if os.name == "nt":  # Windows cannot open folders
         return
     file = os.open(folder, os.O_RDONLY)
     try:
@@ -202,7 +208,7 @@ def rename(source: Path, target: Path) -> None:
 
 
 def remove_tree(folder: Path) -> None:
-    """Remove a folder with all it holds, links in it but not what they lead to."""
+    """Remove a folder and its contents; links in it are removed, their targets are not."""
     with os.scandir(folder) as entries:
         inside = [(entry.path, entry.is_dir(follow_symlinks=False)) for entry in entries]
     for path, is_folder in inside:
@@ -214,7 +220,7 @@ def remove_tree(folder: Path) -> None:
 
 
 def remove_partials(folder: Path) -> None:
-    """Remove the unfinished files that a killed process left in a folder and below it."""
+    """Remove the temporary files that a killed process left in a folder or below it."""
     with os.scandir(folder) as entries:
         inside = [(entry.path, entry.name, entry.is_dir(follow_symlinks=False)) for entry in entries]
     for path, name, is_folder in inside:

@@ -1,4 +1,7 @@
-"""The Zarr group on disk: create, open, read, and write its shards. Whole files only, `done` last."""
+"""Create, open and read the Zarr group on disk, and write its shards.
+
+Only whole files are written, and `done` is written last.
+"""
 
 from __future__ import annotations
 
@@ -37,13 +40,18 @@ from .layout import (
 )
 from .schema import FORMAT_VERSION, SCALARS, StoreSpec, spec_from_plain
 
-# what a damaged file gives, unlike one that the system does not let us read just now
+# errors that mean a damaged or missing file; any other OSError may be temporary
 _DAMAGE = (ValueError, FileNotFoundError, NotADirectoryError, disk.Misplaced)
-_READS = 3  # that do not match their checksums while nothing is rewritten: then a sample counts as damaged
+# a sample counts as damaged after so many reads that do not match the checksums although nothing was rewritten
+_READS = 3
 
 
 class Store:
-    """An open store. `open_store` makes one; reads go through zarr, as a user's do."""
+    """An open store, as `open_store` returns it.
+
+    `array`, `read` and `read_sample` read through zarr, as a user does. `column` and `chunk` read the files
+    directly.
+    """
 
     def __init__(self, path: Path, attributes: dict[str, Any], mode: str) -> None:
         self.path = path
@@ -60,36 +68,36 @@ class Store:
         return -(-self.samples // self.spec.shard_samples)
 
     def shard(self, number: int) -> range:
-        """The samples of a shard."""
+        """Return the samples of a shard."""
         size = self.spec.shard_samples
         return range(number * size, min((number + 1) * size, self.samples))
 
     def array(self, name: str) -> zarr.Array[Any]:
-        """The zarr array. Raises VbnfaultError where it is missing or its metadata cannot be read."""
+        """Return the zarr array. Raises VbnfaultError if it is missing or its metadata cannot be read."""
         if name not in self._arrays:
             try:
                 self._arrays[name] = zarr.open_array(self.path / name, mode=self._mode, zarr_format=3)
-            except Exception as error:  # zarr raises many kinds for metadata that it cannot parse
+            except Exception as error:  # zarr raises many types for metadata that it cannot parse
                 raise VbnfaultError(
                     f"{self.path}: {self.why_closed(name)}; the build command re-creates it"
                 ) from error
         return self._arrays[name]
 
     def update_attributes(self, values: Mapping[str, Any]) -> None:
-        """Change root attributes on disk, the spare first; who opens the store again sees them."""
+        """Change root attributes on disk, in `spare` first. A store must be opened again to show them."""
         self.root_attributes = sealed({**self.root_attributes, **json.loads(json.dumps(values))})
         arrays = array_documents(self.spec.members(self.samples))
         disk.write(self.path, [(f"{SPARE}/{DOCUMENT}", to_bytes(group_document(self.root_attributes)))])
         disk.write(self.path, [(DOCUMENT, to_bytes(group_document(self.root_attributes, arrays)))])
 
     def why_closed(self, name: str) -> str:
-        """What is wrong with an array that `array` cannot open."""
+        """Return why `array` cannot open an array, as a clause."""
         if not (self.path / name / "zarr.json").is_file():
             return f"array {name} is missing"
         return f"array {name} cannot be opened, {name}/zarr.json is damaged"
 
     def read(self, name: str, start: int = 0, stop: int | None = None) -> NDArray[Any]:
-        """Samples `start` … `stop` of an array. Raises VbnfaultError where they cannot be decoded."""
+        """Return samples `start` to `stop` - 1 of an array. Raises VbnfaultError if they cannot be decoded."""
         stop = self.samples if stop is None else stop
         try:
             values = self.array(name)[start:stop]
@@ -103,10 +111,10 @@ class Store:
         return np.asarray(values)
 
     def read_sample(self, index: int) -> Sample:
-        """Return one sample as it was written, compared with its checksums; while it is rewritten, the old or the
-        new one.
+        """Return one sample, compared with its checksums.
 
-        Raises InputError where it does not exist or is not finished, VbnfaultError where it is damaged.
+        If the sample is being rewritten, the result is the old or the new version, never a mixture. Raises
+        InputError if the sample does not exist or is not finished, VbnfaultError if it is damaged.
         """
         if not 0 <= index < self.samples:
             raise InputError(f"{self.path}: sample {index} does not exist; the range is 0 to {self.samples - 1}")
@@ -124,14 +132,14 @@ class Store:
             if [*found, crc_of_scalars(scalars)] == crcs:
                 layers = {name: one[name] for name in self.spec.pixel_layers}
                 return Sample(index=index, layers=layers, scalars=scalars)
-            # whoever rewrites the sample replaces the file of `done` first
+            # a process that rewrites the sample replaces the file of `done` first
             mismatches += _stamp(file) == stamp
         raise VbnfaultError(
             f"{self.path}: sample {index} does not match its stored crc32c; the build command repairs it"
         )
 
     def column(self, name: str, number: int) -> NDArray[Any]:
-        """A scalar for all samples of a shard. Raises OSError or ValueError where its chunk is damaged."""
+        """Return a scalar for all samples of a shard. Raises OSError or ValueError if its chunk is damaged."""
         row, size = self.spec.arrays[name], self.spec.shard_samples
         if self.spec.empty(name):
             return np.zeros((len(self.shard(number)), *self.spec.shape(row)), dtype=row.dtype)
@@ -139,6 +147,7 @@ class Store:
         return values.reshape(size, *self.spec.shape(row))[: len(self.shard(number))]
 
     def _column_bytes(self, name: str, number: int, values: Mapping[int, Any]) -> bytes:
+        """Return the chunk file of a scalar of a shard; samples without a value get the fill value."""
         row, first = self.spec.arrays[name], self.shard(number).start
         dtype = object if row.is_text else row.dtype
         column = np.full((self.spec.shard_samples, *self.spec.shape(row)), row.fill, dtype=dtype)
@@ -147,7 +156,7 @@ class Store:
         return encode_values(column)
 
     def done(self, number: int) -> dict[int, bool]:
-        """Sample → is it finished; none of the shard is where that cannot be read."""
+        """Return by sample whether it is finished; False for all of the shard if that cannot be read."""
         samples = self.shard(number)
         try:
             return dict(zip(samples, self.column("done", number).astype(bool).tolist(), strict=True))
@@ -155,15 +164,15 @@ class Store:
             return dict.fromkeys(samples, False)
 
     def begun(self) -> list[int]:
-        """Return the shards of which there are files, in order; of the others no sample is built yet."""
+        """Return the shards that have files, in ascending order; no sample of any other shard is built yet."""
         listed = {*disk.names(self.path / "done" / "c"), *disk.names(self.path / "image" / "c")}
         numbers = {int(name) for name in listed if name.isascii() and name.isdecimal()}
         return sorted(n for n in numbers if n < self.shards)
 
     def finished(self) -> int:
-        """Return how many samples say that they are finished."""
+        """Return how many samples are marked as finished in `done`."""
         total, whole = 0, self.samples // self.spec.shard_samples
-        counts: dict[bytes, int] = {}  # most files are alike, so each kind is decoded once
+        counts: dict[bytes, int] = {}  # most files have the same content, so each content is decoded once
         for number in self.begun():
             try:
                 data = disk.read(self.file("done", number))
@@ -175,16 +184,18 @@ class Store:
         return total
 
     def file_name(self, name: str, number: int) -> str:
-        """Return the name below the store of the file of a shard: of a layer its chunks, of a scalar its one
-        chunk."""
+        """Return the name, relative to the store, of the file that holds an array's values for one shard."""
         return "/".join([name, "c", str(number), *("0" for _ in self.spec.arrays[name].dims[1:])])
 
     def file(self, name: str, number: int) -> Path:
-        """Return the path of the file of a shard."""
+        """Return the path of the file that holds an array's values for one shard."""
         return self.path / self.file_name(name, number)
 
     def chunk(self, name: str, number: int) -> dict[int, bytes]:
-        """Sample → compressed bytes of a layer's shard. Raises ValueError or OSError where it is damaged."""
+        """Return the compressed chunks of a layer's shard by sample.
+
+        Raises ValueError or OSError if the file is damaged or missing.
+        """
         if self.spec.empty(name):
             return dict.fromkeys(self.shard(number), b"")
         size = self.spec.shard_samples
@@ -192,19 +203,19 @@ class Store:
         return {number * size + i: chunk for i, chunk in chunks.items()}
 
     def write_shard(self, number: int, given: Mapping[int, Encoded], damaged: Collection[int] = ()) -> set[int]:
-        """Write a shard: the `given` samples, and those that were finished before, unchanged.
+        """Write a shard: the `given` samples, and unchanged those that were finished before.
 
-        `damaged` samples are not kept. `done` comes last.
+        `damaged` samples are not kept. `done` is written last.
 
         Returns
         -------
         set of int
-            Samples that said they were finished, but could not be kept because their files are damaged.
+            Samples that were marked as finished, but could not be kept because their files are damaged.
 
         Raises
         ------
         VbnfaultError
-            The disk refuses.
+            The files cannot be written.
         """
         samples = self.shard(number)
         others = {i for i in samples if i not in given and i not in damaged}
@@ -219,8 +230,12 @@ class Store:
         return wished - kept
 
     def _finished(self, number: int, *, strict: bool) -> set[int]:
-        """Return the samples of a shard that say they are finished; all where that cannot be read, or, if `strict`,
-        raise OSError: to take them for unfinished could lose them."""
+        """Return the samples of a shard that are marked as finished in `done`.
+
+        If that file is missing, there are none. If it is damaged: none if `strict`, otherwise all. If the system
+        does not let us read it just now: OSError if `strict`, because finished samples could get lost; otherwise
+        all.
+        """
         samples = self.shard(number)
         try:
             column = self.column("done", number).astype(bool)
@@ -235,13 +250,14 @@ class Store:
         return {i for i, done in zip(samples, column.tolist(), strict=True) if done}
 
     def _write_done(self, number: int, finished: set[int]) -> None:
+        """Mark exactly the `finished` samples of a shard as finished."""
         data = self._column_bytes("done", number, {i: i in finished for i in self.shard(number)})
         disk.write(self.path, [(self.file_name("done", number), data)])
 
     def _kept(
         self, number: int, wished: set[int]
     ) -> tuple[set[int], dict[str, dict[int, bytes]], dict[str, NDArray[Any]]]:
-        """Return which of the `wished` samples can be kept, their chunks by layer, and the columns of scalars."""
+        """Return which of the `wished` samples can be kept, their chunks by layer, and the shard's scalars."""
         chunks: dict[str, dict[int, bytes]] = {}
         columns: dict[str, NDArray[Any]] = {}
         try:
@@ -262,7 +278,7 @@ class Store:
         chunks: Mapping[str, Mapping[int, bytes]],
         columns: Mapping[str, NDArray[Any]],
     ) -> Iterator[tuple[str, bytes]]:
-        """Yield every file of a shard but `done`."""
+        """Yield the name and content of every file of a shard except `done`."""
         first = self.shard(number).start
         for name in self.spec.pixel_layers:
             if not self.spec.empty(name):
@@ -277,7 +293,7 @@ class Store:
 
 
 def _stamp(file: Path) -> tuple[int, int] | None:
-    """Return what changes when a file is replaced, None where there is none."""
+    """Return inode and modification time, which change if a file is replaced; None if there is no file."""
     try:
         status = os.stat(file)
     except OSError:
@@ -289,10 +305,10 @@ def _stamp(file: Path) -> tuple[int, int] | None:
 
 
 def create(path: str | os.PathLike[str], spec: StoreSpec, samples: int, *, overwrite: bool = False) -> Store:
-    """Create an empty store of `samples` samples and open it for writing.
+    """Create a store of `samples` unfinished samples and open it for writing.
 
-    It appears under its name only once it is whole. With `overwrite` an existing store is replaced; a folder
-    that holds anything else never is. Raises InputError where the path cannot be used.
+    The store appears under its name only after all its files are written. `overwrite` replaces an existing store;
+    a folder that holds anything else is never replaced. Raises InputError if the path cannot be used.
     """
     target = Path(path)
     if samples < 1:
@@ -317,7 +333,7 @@ def create(path: str | os.PathLike[str], spec: StoreSpec, samples: int, *, overw
 
 
 def _group_files(spec: StoreSpec, samples: int) -> Iterator[tuple[str, bytes]]:
-    """Yield every file of an empty store, the root last."""
+    """Yield the name and content of every file of an empty store, the root last."""
     members, attributes = spec.members(samples), root_attributes(spec, samples)
     arrays = array_documents(members)
     for name, member in members.items():
@@ -329,7 +345,7 @@ def _group_files(spec: StoreSpec, samples: int) -> Iterator[tuple[str, bytes]]:
 
 
 def _replace(hidden: Path, target: Path, *, old: bool) -> None:
-    """Give a new store its name, durably; an `old` one makes way, and comes back where that fails."""
+    """Rename a new store to its final name, durably. An `old` store is removed, or restored if renaming fails."""
     if not old:
         if target.is_dir():
             target.rmdir()
@@ -349,22 +365,23 @@ def _replace(hidden: Path, target: Path, *, old: bool) -> None:
 
 # --- folders in which a store is created before it has its name --------------------------------------------
 #
-# Whoever works in one holds a lock on it, which ends with the process: one that can be locked is abandoned. Where
-# the file system has no locks, nobody can tell, and they are left alone.
+# A process that works in such a folder holds a lock on it, which ends with the process: a folder that can be locked
+# is abandoned. If the file system has no locks, an abandoned folder cannot be recognised, and none is removed.
 
 
 def _hidden_name(target: Path) -> Path:
+    """Return a new, unique temporary name beside `target`."""
     return target.with_name(f".{target.name}.{uuid.uuid4().hex}{disk.PARTIAL}")
 
 
 @contextlib.contextmanager
 def _hidden_folder(target: Path) -> Iterator[Path]:
-    """Give a new, locked folder beside `target`; what is still there at the end is removed."""
+    """Make a new, locked folder beside `target`; remove it at the end unless it was renamed."""
     while True:
         folder = _hidden_name(target)
         os.mkdir(folder)
         lock = _lock_folder(folder, wait=True)
-        if folder.is_dir():  # else another process took it for abandoned before it was locked
+        if folder.is_dir():  # otherwise another process removed it as abandoned before it was locked
             break
         _unlock_folder(lock)
     try:
@@ -376,7 +393,7 @@ def _hidden_folder(target: Path) -> Iterator[Path]:
 
 
 def _remove_abandoned(target: Path) -> None:
-    """Remove the folders of killed processes that were creating a store of this name."""
+    """Remove the temporary folders of killed processes that were creating a store of this name."""
     own = re.compile(rf"\.{re.escape(target.name)}\.[0-9a-f]{{32}}{re.escape(disk.PARTIAL)}")
     for name in disk.names(target.parent):
         folder = target.with_name(name)
@@ -389,7 +406,10 @@ def _remove_abandoned(target: Path) -> None:
 
 
 def _lock_folder(folder: Path, *, wait: bool) -> int | None:
-    """Return what `_unlock_folder` takes; None where another process holds it, or where there are no locks."""
+    """Lock a folder and return a handle for `_unlock_folder`.
+
+    None if another process holds the lock (and not `wait`), or if the file system has no locks.
+    """
     try:
         import fcntl
 
@@ -405,6 +425,7 @@ def _lock_folder(folder: Path, *, wait: bool) -> int | None:
 
 
 def _unlock_folder(lock: int | None) -> None:
+    """Release the lock that `_lock_folder` returned, if any."""
     if lock is not None:
         os.close(lock)
 
@@ -413,14 +434,14 @@ def _unlock_folder(lock: int | None) -> None:
 
 
 class Root(NamedTuple):
-    """The root attributes of a store, and what is wrong with the files that hold them."""
+    """The root attributes of a store, and one sentence for each problem of the files that hold them."""
 
     attributes: dict[str, Any]
     problems: tuple[str, ...]
 
 
 def read_document(path: Path) -> dict[str, Any] | None:
-    """Return the JSON object in a file, None where there is none that can be read."""
+    """Return the JSON object in a file; None if it is missing, unreadable or not a JSON object."""
     try:
         document = json.loads(disk.read(path))
     except (OSError, ValueError, RecursionError):
@@ -429,21 +450,21 @@ def read_document(path: Path) -> dict[str, Any] | None:
 
 
 def _attributes_in(path: Path) -> dict[str, Any] | None:
-    """Return the root attributes that a group's document holds, sealed or not; None where it holds none."""
+    """Return the root attributes in a group's document, with or without a valid checksum; None if it has none."""
     attributes = (read_document(path) or {}).get("attributes")
     return attributes if isinstance(attributes, dict) and attributes.get("format") == "vbnfault" else None
 
 
 def read_root(path: Path) -> Root | None:
-    """Return the root attributes of the store at `path`; None where there is none that can be believed.
+    """Return the root attributes of the store at `path`; None if no copy of them is valid.
 
-    The spare is believed where it is whole: it is written before the root, and so is the later one.
+    If the copy in `spare` is valid, it is used: it is written before the root, so it is never older.
     """
     files = {DOCUMENT: path / DOCUMENT, f"{SPARE}/{DOCUMENT}": path / SPARE / DOCUMENT}
     attributes = {name: _attributes_in(file) for name, file in files.items()}
     whole = {name: value for name, value in attributes.items() if value is not None and is_sealed(value)}
     if not whole:
-        # made before there were checksums
+        # a store made before checksums existed
         root = attributes[DOCUMENT]
         if root is None or CHECKSUM in root or (path / SPARE).exists():
             return None
@@ -459,14 +480,16 @@ def read_root(path: Path) -> Root | None:
 
 
 def is_store(path: str | os.PathLike[str]) -> bool:
-    """Is there a vbnfault store at this path?"""
+    """Return whether there is a vbnfault store at this path."""
     return read_root(Path(path)) is not None
 
 
 def open_store(path: str | os.PathLike[str] | Store, mode: str = "r") -> Store:
-    """Open a store, `r` or `r+`; where its root is damaged, by the spare, with a warning.
+    """Open a store for reading (`r`) or writing (`r+`).
 
-    Raises InputError where the path holds none, or one of another format.
+    If its root is damaged, the copy in `spare` is used. Mode `r` warns if either of them is damaged. An open
+    `Store` is returned as it is.
+    Raises InputError if the path holds no store, or a store of another format version.
     """
     if isinstance(path, Store):
         return path
@@ -489,7 +512,7 @@ _NO_STORE = "is no vbnfault store: its root attributes are not those of one"
 
 
 def _check_format(path: Path, version: Any) -> None:
-    """Raise InputError where a store is of another format."""
+    """Raise InputError if a store has another format version."""
     if type(version) is not int or version < 1:
         raise InputError(f"{path}: {_NO_STORE}")
     if version > FORMAT_VERSION:
@@ -504,6 +527,7 @@ def _check_format(path: Path, version: Any) -> None:
 
 
 def _why_no_store(path: Path) -> str:
+    """Return why the path cannot be opened as a store, as a clause."""
     if not path.exists():
         return "no such store"
     if (path / SPARE / DOCUMENT).exists():
@@ -515,10 +539,10 @@ def _why_no_store(path: Path) -> str:
 
 
 def write_samples(store: str | os.PathLike[str] | Store, samples: Iterable[Sample | Encoded]) -> None:
-    """Write samples into their shards, whole files only; the other samples of those shards keep their bits.
+    """Write samples into their shards; the other samples of those shards stay bit-identical.
 
-    Only one process may write to a shard at a time. Raises ValueError for a sample that does not fit the
-    schema or the store, VbnfaultError where the disk refuses.
+    Only one process may write to a shard at a time. Raises ValueError for a sample that does not fit the schema or
+    the store, VbnfaultError if the files cannot be written.
     """
     store = open_store(store, "r+")
     by_shard: dict[int, dict[int, Encoded]] = {}

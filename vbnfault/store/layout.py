@@ -1,10 +1,12 @@
-"""The metadata of a store as JSON documents, and the values of its coordinates as chunk files.
+"""Make the metadata of a store as JSON documents, and the values of its coordinates as chunk files.
 
-Made from the schema alone, so that every key of every `zarr.json` can be compared with what it must be, and mended.
-The documents follow the Zarr v3 specification and are what zarr 3.1 writes. Nothing here touches a file.
+Everything follows from the schema alone, so every key of every `zarr.json` can be checked and repaired. The
+documents follow the Zarr v3 specification and equal those that zarr 3.1 writes. This module reads and writes no
+file.
 
-The root attributes hold `attributes_sha256`, a checksum over themselves. Readers that damage must not stop find the
-same attributes in the group `spare`, which the consolidated metadata leave out: it holds no data.
+The root attributes hold `attributes_sha256`, a checksum over all other attributes. The group `spare` holds a copy
+of them, for reading a store whose root is damaged. The consolidated metadata do not list `spare`, because it holds
+no data.
 """
 
 from __future__ import annotations
@@ -24,7 +26,7 @@ from .schema import FORMAT_VERSION, Member, StoreSpec
 DOCUMENT = "zarr.json"
 SPARE = "spare"
 CHECKSUM = "attributes_sha256"
-# root attributes that are the store's own, not the user's
+# root attributes that the store needs for itself; all others are the user's
 OWN_ATTRIBUTES = ("store", "samples", "coordinates", CHECKSUM)
 
 _ZSTD = {"name": "zstd", "configuration": {"level": ZSTD_LEVEL, "checksum": True}}
@@ -32,17 +34,17 @@ _LITTLE_ENDIAN = {"name": "bytes", "configuration": {"endian": "little"}}
 
 
 def canonical(value: Any) -> str:
-    """Return JSON that is the same for equal values, however they were written: 1, 1.0 and true differ."""
+    """Return JSON text without spaces and with sorted keys, to compare values: 1, 1.0 and true differ."""
     return json.dumps(value, sort_keys=True, separators=(",", ":"))
 
 
 def to_bytes(document: Mapping[str, Any]) -> bytes:
-    """Return the content of the file of a document."""
+    """Return a document as the bytes of its file."""
     return json.dumps(document, indent=2).encode()
 
 
 def sealed(attributes: Mapping[str, Any]) -> dict[str, Any]:
-    """Return root attributes with the checksum over them."""
+    """Return root attributes together with the checksum over them."""
     plain = {key: value for key, value in attributes.items() if key != CHECKSUM}
     return {**plain, CHECKSUM: hashlib.sha256(canonical(plain).encode()).hexdigest()}
 
@@ -53,7 +55,7 @@ def is_sealed(attributes: Mapping[str, Any]) -> bool:
 
 
 def root_attributes(spec: StoreSpec, samples: int) -> dict[str, Any]:
-    """Return the attributes of the root of a new store."""
+    """Return the root attributes of a store of `samples` samples, with their checksum."""
     return sealed(
         {
             **json.loads(json.dumps(spec.attributes)),
@@ -61,17 +63,18 @@ def root_attributes(spec: StoreSpec, samples: int) -> dict[str, Any]:
             "format_version": FORMAT_VERSION,
             "store": json.loads(json.dumps(spec.plain())),
             "samples": samples,
-            "coordinates": "wavelength_nm",  # makes xarray show it as a coordinate of `band`
+            "coordinates": "wavelength_nm",  # xarray then shows it as a coordinate of `band`
         }
     )
 
 
 def array_documents(members: Mapping[str, Member]) -> dict[str, dict[str, Any]]:
-    """Return array name → the content of its `zarr.json`."""
+    """Return the content of each array's `zarr.json`, by array name."""
     return {name: _array_document(member) for name, member in members.items()}
 
 
 def _array_document(member: Member) -> dict[str, Any]:
+    """Return the content of one array's `zarr.json`."""
     is_text = member.dtype == "str"
     wide = not is_text and np.dtype(member.dtype).itemsize > 1
     values = (
@@ -99,10 +102,11 @@ def _array_document(member: Member) -> dict[str, Any]:
         "node_type": "array",
         "storage_transformers": [],
     }
-    return json.loads(json.dumps(document))  # no part shared with another document
+    return json.loads(json.dumps(document))  # a deep copy: documents must not share parts
 
 
 def _fill_value(member: Member) -> Any:
+    """Return an array's fill value as Zarr writes it in JSON."""
     if member.dtype == "str":
         return str(member.fill)
     plain = np.dtype(member.dtype).type(member.fill).item()
@@ -112,8 +116,10 @@ def _fill_value(member: Member) -> Any:
 def group_document(
     attributes: Mapping[str, Any], arrays: Mapping[str, Mapping[str, Any]] | None = None
 ) -> dict[str, Any]:
-    """Return the content of a group's `zarr.json`; of the root with the documents of all `arrays`, where zarr and
-    xarray look first."""
+    """Return the content of a group's `zarr.json`.
+
+    `arrays`, given for the root only, become the consolidated metadata, which zarr and xarray read first.
+    """
     document: dict[str, Any] = {"attributes": dict(attributes), "zarr_format": 3}
     if arrays is not None:
         metadata = {name: arrays[name] for name in sorted(arrays)}
@@ -122,7 +128,7 @@ def group_document(
 
 
 def coordinate_chunks(member: Member) -> Iterator[tuple[str, NDArray[Any]]]:
-    """Yield the name below its array's folder, and the values, of each chunk of a coordinate."""
+    """Yield the file name, relative to the array's folder, and the values of each chunk of a coordinate."""
     if member.values is None or not len(member.values):
         return
     (size,) = member.chunks
@@ -135,16 +141,16 @@ def coordinate_chunks(member: Member) -> Iterator[tuple[str, NDArray[Any]]]:
 
 
 def encode_values(values: NDArray[Any]) -> bytes:
-    """Return the chunk file of numbers, or of texts (dtype object)."""
+    """Return numbers or texts (dtype object) as the bytes of a chunk file."""
     return compress(VLenUTF8().encode(values) if values.dtype == object else values)
 
 
 def decode_values(data: bytes, dtype: str) -> NDArray[Any]:
-    """Return the values, flat, of a chunk file. Raises ValueError where it is damaged."""
+    """Return the values of a chunk file as a flat array. Raises ValueError if the file is damaged."""
     plain = decompress(data)
     if dtype != "str":
         return np.frombuffer(plain, dtype=dtype)
     try:
         return np.asarray(VLenUTF8().decode(plain))
-    except Exception as error:  # the codec raises many kinds for lengths that cannot be
+    except Exception as error:  # the codec raises many types for impossible lengths
         raise ValueError(str(error)) from error

@@ -1,4 +1,4 @@
-"""The metadata of a group, and the values of its coordinates: compared with the schema, mended, grown."""
+"""Compare a store's metadata and coordinates with the schema, repair them, and append samples to the store."""
 
 from __future__ import annotations
 
@@ -30,8 +30,15 @@ from .schema import Member
 
 
 def metadata_problems(store: Store) -> tuple[list[str], bool]:
-    """Return what of the root, the arrays' metadata and the coordinates is not as the schema says, one sentence
-    each; and whether samples cannot be looked at before that is mended."""
+    """Compare the root, the metadata of every array and the coordinates with the schema.
+
+    Returns
+    -------
+    problems : list of str
+        One sentence for each difference.
+    hopeless : bool
+        Whether no sample can be read before the store is repaired.
+    """
     root = read_root(store.path)
     problems = list(root.problems) if root is not None else [f"{DOCUMENT} and {SPARE}/{DOCUMENT} are damaged"]
     hopeless = False
@@ -53,7 +60,7 @@ def metadata_problems(store: Store) -> tuple[list[str], bool]:
             )
         else:
             problems += [f"array {name}: {what}" for what in found]
-        # of other attributes the data files know nothing
+        # a wrong attribute does not change how the data files are read
         hopeless |= not is_coordinate and any(not what.startswith("its attribute") for what in found)
         if not found:
             sound[name] = documents[name]
@@ -62,13 +69,13 @@ def metadata_problems(store: Store) -> tuple[list[str], bool]:
 
 
 def _samples_of(document: Mapping[str, Any]) -> int | None:
-    """Return the number of samples of an array's document, None where it does not say."""
+    """Return the number of samples in an array's document; None if the document has no valid shape."""
     shape = document.get("shape")
     return shape[0] if isinstance(shape, list) and shape and type(shape[0]) is int else None
 
 
 def _differences(stored: Mapping[str, Any], wanted: Mapping[str, Any]) -> Iterator[str]:
-    """Yield which keys, and which attributes, of an array's document are not as they must be."""
+    """Yield a clause for each key and each attribute of an array's document that is wrong."""
     for key in {**wanted, **stored}:
         a, b = stored.get(key, _ABSENT), wanted.get(key, _ABSENT)
         if isinstance(a, dict) and isinstance(b, dict) and key == "attributes":
@@ -83,11 +90,12 @@ _ABSENT = "absent"
 
 
 def _differ(a: Any, b: Any) -> bool:
+    """Return whether two JSON values differ; 1, 1.0 and true are different."""
     return canonical(a) != canonical(b)
 
 
 def _misvalued(folder: Path, member: Member) -> Iterator[str]:
-    """Yield what of a coordinate's values is not as it must be."""
+    """Yield a clause for each chunk of a coordinate that cannot be decoded or holds wrong values."""
     for chunk, wanted in coordinate_chunks(member):
         stored = _values_in(folder / chunk, member.dtype)
         if stored is None or stored.shape != wanted.shape:
@@ -99,6 +107,7 @@ def _misvalued(folder: Path, member: Member) -> Iterator[str]:
 
 
 def _values_in(file: Path, dtype: str) -> NDArray[Any] | None:
+    """Return the values in a chunk file; None if it is missing or cannot be decoded."""
     try:
         return decode_values(disk.read(file), dtype)
     except (OSError, ValueError):
@@ -108,8 +117,11 @@ def _values_in(file: Path, dtype: str) -> NDArray[Any] | None:
 def _root_differences(
     store: Store, sound: Mapping[str, Any], documents: Mapping[str, Mapping[str, Any]]
 ) -> Iterator[str]:
-    """Yield what the root's document says, beside attributes, that it must not say: readers look into its
-    consolidated metadata first. Arrays that are not `sound` have a sentence of their own."""
+    """Yield a sentence for each error in the root's document, attributes excepted.
+
+    The consolidated metadata matter because readers look there first. They must list no unknown array. They are
+    compared for `sound` arrays only: any other array is reported already.
+    """
     root = read_document(store.path / DOCUMENT)
     if root is None:
         return
@@ -130,7 +142,7 @@ def _root_differences(
 
 
 def short(value: Any) -> str:
-    """A value in a sentence: at most 80 characters."""
+    """Return a value as text of at most 80 characters, for use in a sentence."""
     text = str(value.tolist() if isinstance(value, np.ndarray | np.generic) else value)
     return text if len(text) <= 80 else text[:77] + "..."
 
@@ -138,10 +150,10 @@ def short(value: Any) -> str:
 def append_samples(
     store: str | os.PathLike[str] | Store, count: int, attributes: Mapping[str, Any] | None = None
 ) -> Store:
-    """Grow a store by `count` unfinished samples, with further root attributes, and open it again.
+    """Extend a store by `count` unfinished samples, set further root attributes, and open the store again.
 
-    Earlier samples keep their bits. The arrays grow first: a kill before the spare is written leaves the store as
-    it was, one after that leaves it grown, once it is recovered.
+    Earlier samples stay bit-identical. The arrays are extended first, then `spare`, then the root. After a kill,
+    `recover` completes the change if `spare` was written, and otherwise restores the store as it was.
     """
     store = open_store(store, "r+")
     if count < 1:
@@ -153,10 +165,11 @@ def append_samples(
 
 
 def recover(path: str | os.PathLike[str]) -> Store:
-    """Open a store for writing after whatever happened to it; only while nothing else writes to it.
+    """Repair a store's metadata and open it for writing. No other process may write to it meanwhile.
 
-    Removes the `*.partial` files of a killed process, and brings root, spare, the metadata of every array and all
-    coordinates to what the attributes say. Arrays that are missing are made again, unwritten.
+    This removes the `*.partial` files of killed processes. It rewrites root, `spare`, the metadata of arrays and
+    the coordinates if they differ from what the root attributes require. A missing array gets its metadata again,
+    but no data.
     """
     store = open_store(path, "r+")
     with disk.explained(store.path, "recovering the store"):
@@ -166,7 +179,7 @@ def recover(path: str | os.PathLike[str]) -> Store:
 
 
 def _bring_to(store: Store, attributes: Mapping[str, Any]) -> None:
-    """Write what differs of the metadata and the coordinates: arrays, then spare, then root."""
+    """Rewrite the metadata and coordinates that differ from `attributes`: arrays, then `spare`, then the root."""
     attributes = sealed(attributes)
     members = store.spec.members(int(attributes["samples"]))
     documents = array_documents(members)
@@ -181,7 +194,7 @@ def _bring_to(store: Store, attributes: Mapping[str, Any]) -> None:
 def _outdated_arrays(
     path: Path, members: Mapping[str, Member], documents: Mapping[str, Mapping[str, Any]]
 ) -> Iterator[tuple[str, bytes]]:
-    """Yield the files of arrays and coordinates that are not as they must be."""
+    """Yield the name and right content of each array document and coordinate chunk that is wrong."""
     for name, member in members.items():
         for chunk, wanted in coordinate_chunks(member):
             stored = _values_in(path / name / chunk, member.dtype)
@@ -191,7 +204,7 @@ def _outdated_arrays(
 
 
 def _outdated(path: Path, documents: Mapping[str, Mapping[str, Any]]) -> Iterator[tuple[str, bytes]]:
-    """Yield the files of documents that are not as they must be."""
+    """Yield the name and right content of each document that is missing or wrong."""
     for name, wanted in documents.items():
         stored = read_document(path / name)
         if stored is None or _differ(stored, wanted):

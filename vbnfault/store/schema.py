@@ -1,4 +1,7 @@
-"""The schema: every array of a store, with its dims, dtype, unit and layout. Plain data; touches no file."""
+"""Define the schema: every array of a store with its dimensions, dtype, unit and layout.
+
+This module holds plain data; it reads and writes no file.
+"""
 
 from __future__ import annotations
 
@@ -14,56 +17,58 @@ from ..core.errors import InputError
 from ..core.quantities import CHANNELS, DEFECTS, soft_kind
 from ..scene.plan import SPLITS, STRATA
 
-# 2: the spare and the checksum of the root, eight coefficients of `distortion`, further arrays. A store of another
-# format is refused: nothing here could tell its arrays from damaged ones.
+# Version 2 added the group `spare`, the checksum of the root, eight coefficients of `distortion`, and further
+# arrays. A store of another version is refused, because its arrays could not be distinguished from damaged ones.
 FORMAT_VERSION = 2
 SEMANTIC = ("sky", "body", "sun", "spacecraft")
 
-# Root attributes that say when or how a store was written, not what it holds: no part of the digest.
+# Root attributes that say when or how a store was written. The digest leaves them out.
 VOLATILE_ATTRIBUTES = ("created", "modified", "command")
 
 MAX_SHARD_SAMPLES = 16
 MAX_SHARD_BYTES = 2**30
-MAX_HELD_BYTES = 2**31  # all layers of a shard, uncompressed: what a task may have to hold
+MAX_HELD_BYTES = 2**31  # all layers of a shard, uncompressed: a task may have to hold them in memory
 
 _SCALARS = "scalars"  # the entry of the `layer` axis that stands for all scalars of a sample
 
 
 @dataclass(frozen=True)
 class Array:
-    """One row of the schema. `ratio`: a typical compressed size over the uncompressed one."""
+    """One row of the schema. `ratio`: typical compressed size divided by the uncompressed size."""
 
     dimensions: str
     dtype: str
     units: str
     long_name: str
-    names: tuple[str, ...] = ()  # CF flag meanings …
-    bits: bool = False  # … of values, or of bits
+    names: tuple[str, ...] = ()  # CF flag meanings, of the values 0, 1, … or of the bits 0, 1, …
+    bits: bool = False  # whether `names` are of bits
     ratio: float = 1.0
 
     @property
     def dims(self) -> tuple[str, ...]:
+        """Names of the dimensions, in order."""
         return tuple(self.dimensions.split())
 
     @property
     def is_text(self) -> bool:
+        """Whether the values are strings."""
         return self.dtype == "str"
 
     @property
     def fill(self) -> Any:
-        """What an unwritten sample reads as."""
+        """The value that an unwritten sample has."""
         return "" if self.is_text else float("nan") if self.dtype == "float64" else 0
 
 
 _IMAGE = "sample y x channel"
 
-# The schema. Per-pixel layers: one chunk a sample, sharded.
+# Layers (per-pixel arrays): a chunk holds one sample, and chunks are sharded.
 LAYERS: dict[str, Array] = {
     "image": Array(_IMAGE, "uint8", "DN", "image with faults", ratio=0.45),
     "mask": Array("sample fault y x", "bool", "1", "where each fault is, by its kind", ratio=0.005),
     "mask_any": Array("sample y x", "bool", "1", "union of mask over the faults named here", ratio=0.005),
     "clean": Array(_IMAGE, "uint8", "DN", "same camera, exposure and noise, no fault", ratio=0.45),
-    # optional from here on; `without_<fault>` follows the pattern of the straylight one
+    # the layers from here on are optional; `StoreSpec.pixel_layers` makes the rows of `without_<fault>`
     "mask_effect": Array("sample fault y x", "bool", "1", "where each fault changes the image", ratio=0.02),
     "raw": Array("sample y x", "uint16", "DN", "raw mosaic of the analogue-to-digital converter", ratio=0.6),
     "defects": Array(
@@ -85,7 +90,7 @@ LAYERS: dict[str, Array] = {
     ),
     "radiance": Array("sample band y x", "float16", "W m-2 sr-1 nm-1", "radiance at the camera", ratio=0.7),
 }
-# What `mask_effect` is, and the mask of a class that is labelled by effect.
+# The rule for `mask_effect`, and for the mask of a class that is labelled by effect.
 EFFECT_DN = 1
 EFFECT_RULE = (
     f"a channel of the noise-free 8 bit image changes by {EFFECT_DN} DN or more when the fault is switched off "
@@ -94,7 +99,7 @@ EFFECT_RULE = (
 MASK_ANY_RULE = "union of the masks of the classes in the attribute faults, which dataset.mask_any chose"
 REQUIRED_LAYERS = ("image", "mask", "mask_any", "clean")
 
-# Scalars and small vectors: a chunk is a shard, so that a task writes whole chunks.
+# Scalars and small vectors: one chunk holds a whole shard, so that a task writes whole chunks.
 SCALARS: dict[str, Array] = {
     "injected": Array("sample fault", "bool", "1", "faults that are in the pixels"),
     "camera_position_T_m": Array("sample xyz", "float64", "m", "camera position in T"),
@@ -150,9 +155,10 @@ _LABELS = {  # coordinates of the short axes
 
 
 class Member(NamedTuple):
-    """One array of the group as it must be: `create`, `verify` and `recover` go by it.
+    """The required layout of one array of the group; `create`, `verify` and `recover` use it.
 
-    `values`: of a coordinate; None for what tasks write. `chunks`, `shards`: of zarr, 1 at least in every axis.
+    `values`: the values of a coordinate; None for an array that tasks write. `chunks`, `shards`: shapes of zarr's
+    chunks and shards, at least 1 in every axis.
     """
 
     shape: tuple[int, ...]
@@ -166,7 +172,7 @@ class Member(NamedTuple):
 
 
 def _coordinate(dim: str, values: NDArray[Any] | tuple[str, ...], **attributes: str) -> Member:
-    """A row of `StoreSpec.members` for a coordinate of one axis."""
+    """Return the entry of `StoreSpec.members` for the coordinate of one axis."""
     dtype, fill = (values.dtype.name, 0) if isinstance(values, np.ndarray) else ("str", "")
     chunks = (65536 if dim == "sample" else max(1, len(values)),)
     return Member((len(values),), chunks, None, dtype, fill, (dim,), attributes, values)
@@ -174,18 +180,44 @@ def _coordinate(dim: str, values: NDArray[Any] | tuple[str, ...], **attributes: 
 
 @dataclass(frozen=True, kw_only=True)
 class StoreSpec:
-    """What a store holds, as plain data.
+    """Which arrays a store holds, and their sizes, names and attributes, as plain data.
 
-    `faults`: the fault axis in dataset order. `mask_any_faults`: the union that `mask_any` is.
-    `localised_faults`: those whose mask is not empty where they are injected (default: `mask_any_faults`).
-    `mask_kinds`, `mask_rules`: what the mask of each of `faults` is, and by which rule. `soft_layers`: the soft
-    layer of each of `faults`, "" where it has none. `layers`: the optional layers, of `LAYERS`, `soft_layers` or
-    `without_<fault>`. `shard_samples` 0 chooses the most, up to
-    16, that keeps the largest array of a shard within 1 GiB and all of them within 2 GiB; a larger one is
-    lowered to its largest divisor that does. `attributes`: JSON-able root attributes. Raises InputError for
-    names that do not exist. `distortion_residual_px`: root mean square and largest deviation of the
-    coefficients of distortion from the lens's chief rays, over the lit frame. `attitude_references`: the
-    direction that roll, pitch and yaw count from in each of `STRATA`, "sun" or "nadir".
+    Parameters
+    ----------
+    height, width
+        Image size in pixels.
+    faults
+        The fault axis, in dataset order.
+    mask_any_faults
+        The classes whose masks `mask_any` unites.
+    wavelength_nm
+        Nodes of the bands of `radiance`.
+    layers
+        Optional layers: names in `LAYERS` or `soft_layers`, or `without_<fault>`.
+    localised_faults
+        The classes whose mask is never empty if they are injected; `mask_any_faults` by default.
+    mask_kinds, mask_rules
+        For each of `faults`, the kind of its mask, and the rule as a sentence.
+    soft_layers
+        For each of `faults`, the name of its soft layer, or "".
+    site_names, lens_names, detector_names
+        Names that the integer arrays `site`, `lens` and `detector_individual` index.
+    distortion_residual_px
+        Root mean square and maximum deviation of the stored distortion coefficients from the lens's chief rays,
+        over the lit frame.
+    attitude_references
+        For each of `STRATA`, the direction from which roll, pitch and yaw are measured: "sun" or "nadir".
+    shard_samples
+        Samples a shard. 0 chooses the largest number up to 16 for which the largest array of a shard stays within
+        1 GiB and all layers within 2 GiB. A number that is too large is lowered to its largest divisor within these
+        limits.
+    attributes
+        JSON-able root attributes.
+
+    Raises
+    ------
+    InputError
+        For a layer or fault that does not exist.
     """
 
     height: int
@@ -221,13 +253,13 @@ class StoreSpec:
         sizes = [self.layer_bytes(name) for name in self.pixel_layers]
         most = max(1, min(MAX_SHARD_SAMPLES, MAX_SHARD_BYTES // max(sizes), MAX_HELD_BYTES // sum(sizes)))
         wished = self.shard_samples if self.shard_samples > 0 else most
-        # a divisor: what the plan groups by site in shards of the wished size is then in no shard with another
+        # the plan assigns sites to groups of the wished size; a divisor keeps each shard within one group
         size = next(n for n in range(min(wished, most), 0, -1) if wished % n == 0)
         object.__setattr__(self, "shard_samples", size)
 
     @cached_property
     def pixel_layers(self) -> dict[str, Array]:
-        """Name → schema row of every per-pixel layer, in the order of the `layer` axis."""
+        """The schema row of every layer by name, in the order of the `layer` axis."""
         rows = {name: LAYERS[name] for name in REQUIRED_LAYERS}
         for name in self.layers:
             if name == "radiance":
@@ -244,18 +276,18 @@ class StoreSpec:
 
     @cached_property
     def arrays(self) -> dict[str, Array]:
-        """Name → schema row of every array that tasks write."""
+        """The schema row by name of every array that tasks write."""
         crc32c = Array("sample layer", "uint32", "1", "CRC-32C of the decoded bytes")
         done = Array("sample", "uint8", "1", "1 where a sample is whole; written last")
         return {**self.pixel_layers, **SCALARS, "crc32c": crc32c, "done": done}
 
     @property
     def checked(self) -> tuple[str, ...]:
-        """The `layer` axis of `crc32c`."""
+        """The labels of the `layer` axis of `crc32c`: every layer, then all scalars together."""
         return (*self.pixel_layers, _SCALARS)
 
     def shape(self, row: Array) -> tuple[int, ...]:
-        """Shape of one sample of an array: its dims without `sample`."""
+        """Return the shape of one sample of an array: its dimensions without `sample`."""
         sizes = {
             "y": self.height,
             "x": self.width,
@@ -267,11 +299,14 @@ class StoreSpec:
         return tuple(sizes[d] for d in row.dims if d != "sample")
 
     def empty(self, name: str) -> bool:
-        """Has an array an axis of no length, as `mask` without fault classes? It has no data files then."""
+        """Return whether an axis of an array has length 0, as in `mask` without fault classes.
+
+        Such an array has no data files.
+        """
         return 0 in self.shape(self.arrays[name])
 
     def members(self, samples: int) -> dict[str, Member]:
-        """Name → what it must be, for every array of a group of `samples` samples, coordinates last."""
+        """Return the required layout by name of every array of a store of `samples` samples, coordinates last."""
         extra: dict[str, dict[str, Any]] = {
             "mask": {"kinds": list(self.mask_kinds), "rules": list(self.mask_rules)} if self.mask_kinds else {},
             "mask_effect": {"threshold_dn": EFFECT_DN, "rule": EFFECT_RULE},
@@ -313,7 +348,7 @@ class StoreSpec:
         return {**members, **self.coordinates(samples)}
 
     def coordinates(self, samples: int) -> dict[str, Member]:
-        """Name → what it must be, for every coordinate of a group of `samples` samples."""
+        """Return the required layout by name of every coordinate of a store of `samples` samples."""
         y, x = np.arange(self.height) + 0.5, np.arange(self.width) + 0.5
         nodes = np.array(self.wavelength_nm, dtype=np.float64)
         bands = {"wavelength_nm": _coordinate("band", nodes, units="nm", long_name="wavelength of the band")}
@@ -328,24 +363,24 @@ class StoreSpec:
         }
 
     def layer_bytes(self, name: str) -> int:
-        """Uncompressed bytes of one sample of a per-pixel layer."""
+        """Return the uncompressed size of one sample of a layer, in bytes."""
         row = self.pixel_layers[name]
         return int(np.prod(self.shape(row), dtype=np.int64)) * np.dtype(row.dtype).itemsize
 
     @property
     def estimated_sample_bytes(self) -> int:
-        """About what a sample takes on disk."""
+        """Approximate size of a sample on disk, in bytes."""
         pixels = sum(self.layer_bytes(name) * row.ratio for name, row in self.pixel_layers.items())
         return int(pixels) + 4096
 
     def plain(self) -> dict[str, Any]:
-        """JSON-able fields without the root attributes; `spec_from_plain` reads them back."""
-        # not asdict: it would copy the whole scene to leave it out
+        """Return the fields as plain data, without the root attributes; `spec_from_plain` reads them back."""
+        # asdict would copy the whole scene first
         return {f.name: getattr(self, f.name) for f in fields(self) if f.name != "attributes"}
 
 
 def spec_from_plain(plain: Mapping[str, Any], attributes: Mapping[str, Any]) -> StoreSpec:
-    """What `StoreSpec.plain` gave, with the root attributes of a store."""
+    """Return the StoreSpec that the result of `StoreSpec.plain` and a store's root attributes describe."""
     known = {f.name for f in fields(StoreSpec)}
     values: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in plain.items() if k in known}
     return StoreSpec(**values, attributes=attributes)
