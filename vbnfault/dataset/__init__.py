@@ -1,5 +1,6 @@
 """How a dataset is built, resumed, mended and checked against its scene."""
 
+from .checking import verify
 from .identity import SessionFactory, build_scene, describe_scene, is_exact, planned, scene_identity, store_spec
 
 __all__ = [
@@ -10,4 +11,5 @@ __all__ = [
     "planned",
     "scene_identity",
     "store_spec",
+    "verify",
 ]

@@ -305,10 +305,10 @@ def estimated_seconds(session: pipeline.Session) -> float:
 
 
 def build_scene(
-    scene: Scene,
-    out: Path,
+    scene: Scene | str | Path,
+    out: str | Path,
     *,
-    source: str,
+    source: str | None = None,
     workers: int = 1,
     threads: int | None = None,
     scheduler: str | None = None,
@@ -320,8 +320,12 @@ def build_scene(
 ) -> build.Summary:
     """Build, resume, mend or extend the store of a scene at `out`; see `build.build` for what is raised.
 
-    `source` names the scene in errors. With `append` and no samples given, the store's own first block counts.
+    `scene` is a scene, the path of a scene file, or the name of a packaged scene; `source` names it in errors. With
+    `append` and no samples given, the store's own first block counts.
     """
+    if not isinstance(scene, Scene):
+        source, scene = source or str(scene), config.load_scene(scene)
+    source, out = source or "scene", Path(out)
     samples = scene.dataset.samples
     if append and not samples_given and store.is_store(out):
         samples = int(store.open_store(out).attributes["blocks"][0])
