@@ -83,12 +83,12 @@ def test_errors_name_what_is_wrong(tmp_path: Path) -> None:
         vbnfault.simulate(small(), 3)
     with pytest.raises(InputError, match="nowhere"):
         vbnfault.load_scene("nowhere")
-    with pytest.raises(InputError, match="no vbnfault store|no such|not exist"):
+    with pytest.raises(InputError, match=r"none\.zarr: "):
         vbnfault.open_dataset(tmp_path / "none.zarr")
 
 
 def test_lens_sensor_and_flare_are_at_hand() -> None:
-    lens = vbnfault.load_lens("tessar_50_f2p8") if "tessar_50_f2p8" in _lenses() else vbnfault.load_lens(_lenses()[0])
+    lens = vbnfault.load_lens("tessar_50_f2p8")
     flare = vbnfault.trace_flare(lens, 20.0, wavelength_nm=550.0, pixels=32, fov_deg=40.0)
     assert set(flare.layers) == {"sun", "ghosts", "starburst", "glare", "veil"}
     assert flare.layers["ghosts"].shape == (1, 32, 32)
@@ -97,7 +97,7 @@ def test_lens_sensor_and_flare_are_at_hand() -> None:
     assert all(ghost.flux_fraction >= 0 for ghost in flare.ghosts)
     texture = vbnfault.trace_flare(lens, 20.0, model="texture", pixels=32)
     assert texture.ghosts == ()
-    sensor = vbnfault.load_sensor(_sensors()[0])
+    sensor = vbnfault.load_sensor("rosetta_navcam")
     assert sensor.height_px > 0
 
 
@@ -114,13 +114,13 @@ def test_lens_sensor_and_flare_are_at_hand() -> None:
 )
 def test_a_flare_refuses_what_the_physics_does_not_take(setting: dict[str, Any], sentence: str) -> None:
     with pytest.raises(InputError, match=sentence):
-        vbnfault.trace_flare(_lenses()[0], **setting)
+        vbnfault.trace_flare("tessar_50_f2p8", **setting)
 
 
 def test_the_field_helpers_make_a_fault() -> None:
     import dataclasses
 
-    from vbnfault.faults import base
+    from vbnfault.faults import base, from_dict
 
     known = {name: dict(models) for name, models in base._REGISTRY.items()}
     try:
@@ -129,24 +129,16 @@ def test_the_field_helpers_make_a_fault() -> None:
         class Tint(vbnfault.Fault):
             """A fault of a user."""
 
-            fault_class = "tint"
+            fault = "tint"
             model = "plain"
-            strength: vbnfault.Interval = vbnfault.bounds(0.1, 0.9, doc="fraction of light lost")
+            step = "electrons"
+            strength: vbnfault.Interval = vbnfault.bounds(0.1, 0.9, limits=(0, 1), doc="fraction of light lost")  # noqa: RUF009
 
         assert Tint().strength == (0.1, 0.9)
+        assert from_dict("tint", {"strength": 0.5}, source="a scene").strength == (0.5, 0.5)  # type: ignore[attr-defined]
+        with pytest.raises(InputError, match=r"a scene: faults.tint.strength = 2"):
+            from_dict("tint", {"strength": 2.0}, source="a scene")
     finally:
         base._REGISTRY.clear()
         base._REGISTRY.update(known)
     assert config.Scene is vbnfault.Scene
-
-
-def _lenses() -> list[str]:
-    from vbnfault.core import resources
-
-    return sorted(resources.packaged("scenes/lenses"))
-
-
-def _sensors() -> list[str]:
-    from vbnfault.core import resources
-
-    return sorted(resources.packaged("scenes/detectors"))
