@@ -1,3 +1,102 @@
-"""vbnfault: labelled, fault-injected camera images for vision-based navigation near small bodies."""
+"""Labelled, fault-injected camera images for vision-based navigation near comets and other small bodies.
 
-__version__ = "0.1.0"
+    import vbnfault
+
+    scene = vbnfault.load_scene("quickstart")
+    sample = vbnfault.simulate(scene, 3)
+    vbnfault.build(scene, "quickstart.zarr", workers=2)
+    data = vbnfault.open_dataset("quickstart.zarr")
+
+Importing the package loads nothing heavy: each name loads its module when it is first used.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+__version__ = "0.2.0"
+
+if TYPE_CHECKING:
+    from .core.errors import InputError, VbnfaultError
+    from .dataset import build_scene as build
+    from .dataset import verify
+    from .detector.sensor import Sensor, load_sensor
+    from .faults import Fault, FaultContext, Interval, bounds, choice, flag, number, rows, text
+    from .lens import Prescription, load_lens
+    from .output.flare_images import Flare, trace_flare
+    from .pipeline import Session, simulate
+    from .scene.config import Scene, load_scene
+    from .store import open_dataset
+
+# public name → the module that defines it, and its name there
+_HOME = {
+    "Fault": ("faults", "Fault"),
+    "FaultContext": ("faults", "FaultContext"),
+    "Flare": ("output.flare_images", "Flare"),
+    "InputError": ("core.errors", "InputError"),
+    "Interval": ("faults", "Interval"),
+    "Prescription": ("lens", "Prescription"),
+    "Scene": ("scene.config", "Scene"),
+    "Sensor": ("detector.sensor", "Sensor"),
+    "Session": ("pipeline", "Session"),
+    "VbnfaultError": ("core.errors", "VbnfaultError"),
+    "bounds": ("faults", "bounds"),
+    "build": ("dataset", "build_scene"),
+    "choice": ("faults", "choice"),
+    "flag": ("faults", "flag"),
+    "load_lens": ("lens", "load_lens"),
+    "load_scene": ("scene.config", "load_scene"),
+    "load_sensor": ("detector.sensor", "load_sensor"),
+    "number": ("faults", "number"),
+    "open_dataset": ("store", "open_dataset"),
+    "rows": ("faults", "rows"),
+    "simulate": ("pipeline", "simulate"),
+    "text": ("faults", "text"),
+    "trace_flare": ("output.flare_images", "trace_flare"),
+    "verify": ("dataset", "verify"),
+}
+
+__all__ = [
+    "Fault",
+    "FaultContext",
+    "Flare",
+    "InputError",
+    "Interval",
+    "Prescription",
+    "Scene",
+    "Sensor",
+    "Session",
+    "VbnfaultError",
+    "__version__",
+    "bounds",
+    "build",
+    "choice",
+    "flag",
+    "load_lens",
+    "load_scene",
+    "load_sensor",
+    "number",
+    "open_dataset",
+    "rows",
+    "simulate",
+    "text",
+    "trace_flare",
+    "verify",
+]
+
+
+def __getattr__(name: str) -> Any:
+    """Return a public name from the module that defines it."""
+    if name not in _HOME:
+        raise AttributeError(f"module 'vbnfault' has no attribute {name!r}")
+    import importlib
+
+    module, defined = _HOME[name]
+    value = getattr(importlib.import_module(f".{module}", __name__), defined)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    """Return the public names."""
+    return __all__

@@ -212,14 +212,8 @@ def verify(store: StoreArgument) -> None:
     from .. import store as stores
 
     opened = stores.open_store(store)
-    attributes = opened.spec.attributes
     with typer.progressbar(length=opened.samples, label="samples", file=sys.stderr) as bar:
-        report = stores.examine(
-            opened,
-            expected=dataset.planned(attributes, opened.spec.faults),
-            exact=dataset.is_exact(attributes),
-            progress=bar.update,
-        )
+        report = dataset.verify(opened, progress=bar.update)
     for problem in report.problems:
         typer.echo(f"{store}: {problem}", err=True)
     for line in report.counts.lines():

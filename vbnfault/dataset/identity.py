@@ -331,10 +331,10 @@ def estimated_seconds(session: pipeline.Session) -> float:
 
 
 def build_scene(
-    scene: Scene,
-    out: Path,
+    scene: Scene | str | Path,
+    out: str | Path,
     *,
-    source: str,
+    source: str | None = None,
     workers: int = 1,
     threads: int | None = None,
     scheduler: str | None = None,
@@ -348,13 +348,18 @@ def build_scene(
 
     Parameters
     ----------
+    scene
+        A scene, the path of a scene file, or the name of a packaged scene.
     source
-        Name of the scene in messages.
+        Name of the scene in messages; by default what `scene` is called.
     append
         Number of samples to add to an existing store.
     samples_given
         Whether the caller set the number of samples. If not, `append` takes it from the store's first block.
     """
+    if not isinstance(scene, Scene):
+        source, scene = source or str(scene), config.load_scene(scene)
+    source, out = source or "scene", Path(out)
     samples = scene.dataset.samples
     if append and not samples_given and store.is_store(out):
         samples = int(store.open_store(out).attributes["blocks"][0])

@@ -11,11 +11,17 @@ from .base import (
     Interval,
     Params,
     act,
+    bounds,
+    choice,
     dataset_order,
+    flag,
     from_dict,
     json_schema,
+    number,
     physical_order,
     registry,
+    rows,
+    text,
 )
 
 __all__ = [
@@ -29,9 +35,15 @@ __all__ = [
     "Interval",
     "Params",
     "act",
+    "bounds",
+    "choice",
     "dataset_order",
+    "flag",
     "from_dict",
     "json_schema",
+    "number",
     "physical_order",
     "registry",
+    "rows",
+    "text",
 ]

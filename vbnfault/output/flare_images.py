@@ -18,7 +18,7 @@ from ..core.errors import InputError
 from ..core.quantities import Electrons
 from ..detector import Detector
 from ..faults import FaultContext, registry
-from ..lens import Prescription, ThinLens, first_order
+from ..lens import Prescription, ThinLens, first_order, load_lens
 from ..lens.straylight.paraxial import Ghost, axial_transmittance, mean_ghost, paraxial_ghosts
 from ..lens.straylight.total import VEIL_FRACTION, Cleanliness, straylight
 from ..scene import config
@@ -27,6 +27,17 @@ F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
 MODELS = ("traced", "paraxial", "texture")
+# field of a request, least and greatest value
+_RANGES = (
+    ("sun_deg", 0, 90),
+    ("azimuth_deg", -360, 360),
+    ("fov_deg", 0.1, 140),
+    ("pixels", 16, 4096),
+    ("sun_distance_au", 0.01, 1000),
+    ("roughness_nm", 0, 50),
+    ("cleanliness_level", 0, 1000),
+    ("veil_fraction", 0, 0.5),
+)
 _BANDS = 8
 _ACROSS_SPECTRUM = 192
 _SHOWN_PERCENTILE = 99.7
@@ -66,6 +77,18 @@ class FlareRequest:
     roughness_nm: float = 1.0
     cleanliness_level: float = 0.0
     veil_fraction: float = VEIL_FRACTION
+
+    def __post_init__(self) -> None:
+        for name, lowest, highest in _RANGES:
+            value = getattr(self, name)
+            if not lowest <= value <= highest:
+                raise InputError(f"{name} = {value}: must be from {lowest:g} to {highest:g}")
+        if self.sun_deg == 90:
+            raise InputError("sun_deg = 90: must be from 0 to below 90")
+        if self.model not in MODELS:
+            raise InputError(f"model = {self.model!r}: must be one of {', '.join(MODELS)}")
+        if self.reflections not in (2, 4):
+            raise InputError(f"reflections = {self.reflections}: must be 2 or 4")
 
     @property
     def pitch_mm(self) -> float:
@@ -145,6 +168,52 @@ def ghosts(view: FlareRequest, progress: Callable[[int], None] | None = None) ->
         if progress is not None:
             progress(1)
     return tuple(mean_ghost(rows) for _, rows in sorted(found.items()))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Flare:
+    """What the Sun does in a lens.
+
+    `layers`: irradiance on the sensor over the Sun's at the entrance, float32[band, y, x] each, as `layers` returns
+    them. `ghosts`: flux, centroid and size of every ghost; empty for the model `texture`.
+    """
+
+    request: FlareRequest
+    layers: dict[str, F32]
+    ghosts: tuple[Ghost, ...]
+
+
+def trace_flare(
+    lens: Prescription | str | Path, sun_deg: float, *, wavelength_nm: float | None = None, **settings: Any
+) -> Flare:
+    """Return the ghosts, starburst, glare and veil of the Sun in a lens.
+
+    Parameters
+    ----------
+    lens
+        A prescription, the path of a lens file, or the name of a packaged lens.
+    sun_deg
+        Angle of the Sun from the axis, degrees, from 0 to below 90.
+    wavelength_nm
+        A single wavelength from 250 to 2500; by default the nodes of eight bands from 400 to 700 nm.
+    **settings
+        Further fields of `FlareRequest`: `azimuth_deg`, `fov_deg`, `pixels`, `sun_distance_au`, `model`,
+        `reflections`, `roughness_nm`, `cleanliness_level`, `veil_fraction`.
+
+    Raises
+    ------
+    InputError
+        If the lens cannot be read or a value is out of its range.
+    """
+    prescription = lens if isinstance(lens, Prescription) else load_lens(lens)
+    request = FlareRequest(
+        lens=prescription, sun_deg=sun_deg, wavelength_nm=wavelengths_nm(wavelength_nm), **settings
+    )
+    return Flare(
+        request=request,
+        layers=layers(request),
+        ghosts=() if request.model == "texture" else ghosts(request),
+    )
 
 
 def _ghosts_at(view: FlareRequest, wavelength_nm: float, *, alone: bool) -> tuple[Ghost, ...]:

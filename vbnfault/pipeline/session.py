@@ -12,6 +12,7 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import cached_property
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -44,9 +45,33 @@ VIEW_STAGES = (resolve, render_frame, meter, photograph)
 STAGES = (*VIEW_STAGES, label)
 
 
-def simulate(spec: SampleSpec) -> Sample:
-    """Return one finished sample after every stage."""
-    return to_sample(develop_frame(spec))
+def simulate(scene: Scene | str | Path, sample: int = 0, *, threads: int | None = None) -> Sample:
+    """Return one sample of a scene as the store would hold it.
+
+    Each call makes the terrain and compiles the kernels anew; a `Session` keeps them for further samples.
+
+    Parameters
+    ----------
+    scene
+        A scene, the path of a scene file, or the name of a packaged scene.
+    sample
+        Index of the sample, from 0 to below `dataset.samples`.
+    threads
+        Render threads; by default every core.
+
+    Raises
+    ------
+    InputError
+        If the scene cannot be used, or plans no such sample.
+    """
+    if not isinstance(scene, Scene):
+        source, scene = str(scene), config.load_scene(scene)
+    else:
+        source = "scene"
+    session = Session(scene, threads=threads, source=source)
+    if not 0 <= sample < len(session.plan):
+        raise InputError(f"{source}: sample {sample}: must be from 0 to {len(session.plan) - 1}")
+    return session.simulate(sample)
 
 
 def develop_frame(spec: SampleSpec) -> Frame:
@@ -268,7 +293,7 @@ class Session:
         spec = self.spec(index)
         if not self._compiled:
             activity.begin("compiling of kernels, with the first sample")
-        sample = simulate(spec)
+        sample = to_sample(develop_frame(spec))
         self._compiled = True
         return sample
 

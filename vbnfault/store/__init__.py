@@ -34,6 +34,7 @@ from .check import (
 from .codec import Encoded, encode, mask_union
 from .counts import FaultCounts
 from .group import Store, create, is_store, open_store, write_samples
+from .labelled import open_dataset
 from .metadata import append_samples, recover
 from .schema import (
     EFFECT_RULE,
@@ -80,6 +81,7 @@ __all__ = [
     "examine_shard",
     "is_store",
     "mask_union",
+    "open_dataset",
     "open_store",
     "problem_samples",
     "recover",

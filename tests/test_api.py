@@ -1,0 +1,144 @@
+"""What `import vbnfault` offers to Python."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import vbnfault
+from vbnfault.core.errors import InputError
+from vbnfault.scene import config
+
+
+def small(scene: str = "quickstart") -> vbnfault.Scene:
+    """Return a packaged scene with few pixels, samples and triangles."""
+    values: dict[str, Any] = {
+        "camera.width_px": 48,
+        "camera.height_px": 40,
+        "dataset.samples": 3,
+        "dataset.sites": 1,
+        "patch.max_triangles": 60_000,
+        "plan.on_invisible": "drop",
+    }
+    return vbnfault.load_scene(scene, values)
+
+
+def test_every_public_name_resolves_and_is_listed() -> None:
+    assert set(vbnfault._HOME) | {"__version__"} == set(vbnfault.__all__) == set(dir(vbnfault))
+    for name in vbnfault.__all__:
+        assert getattr(vbnfault, name) is not None
+    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
+        vbnfault.nothing  # noqa: B018
+
+
+def test_the_import_loads_nothing_but_itself() -> None:
+    script = (
+        "import sys; before = set(sys.modules); import vbnfault; "
+        "print(sorted(m for m in set(sys.modules) - before if m.split('.')[0] not in sys.stdlib_module_names))"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "['vbnfault']"
+
+
+def test_the_package_says_that_it_is_typed_and_which_version_it_is() -> None:
+    assert (Path(vbnfault.__file__).parent / "py.typed").is_file()
+    assert vbnfault.__version__.count(".") == 2
+    done = subprocess.run(
+        [sys.executable, "-m", "vbnfault", "--version"], capture_output=True, text=True, check=True
+    )
+    assert done.stdout.split() == ["vbnfault", vbnfault.__version__]
+    assert importlib.metadata.requires("vbnfault") is not None
+
+
+def test_a_dataset_is_built_checked_and_opened(tmp_path: Path) -> None:
+    scene = small()
+    summary = vbnfault.build(scene, str(tmp_path / "s.zarr"))
+    assert summary.built == 3
+    report = vbnfault.verify(tmp_path / "s.zarr")
+    assert report.problems == []
+    assert report.digest == summary.digest
+    with vbnfault.open_dataset(tmp_path / "s.zarr") as data:
+        assert data["image"].dims == ("sample", "y", "x", "channel")
+        assert data["image"].shape == (3, 40, 48, 4)
+        alone = vbnfault.simulate(scene, 1)
+        assert np.array_equal(alone.layers["image"], data["image"][1])
+        assert np.array_equal(alone.layers["mask"], data["mask"][1])
+
+
+def test_a_session_keeps_what_is_costly_and_gives_any_sample() -> None:
+    session = vbnfault.Session(small())
+    last, first = session.simulate(2), session.simulate(0)
+    assert (last.index, first.index) == (2, 0)
+    assert session.terrain(int(session.plan.site[0])) is session.terrain(int(session.plan.site[2]))
+
+
+def test_errors_name_what_is_wrong(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="sample 3: must be from 0 to 2"):
+        vbnfault.simulate(small(), 3)
+    with pytest.raises(InputError, match="nowhere"):
+        vbnfault.load_scene("nowhere")
+    with pytest.raises(InputError, match=r"none\.zarr: "):
+        vbnfault.open_dataset(tmp_path / "none.zarr")
+
+
+def test_lens_sensor_and_flare_are_at_hand() -> None:
+    lens = vbnfault.load_lens("tessar_50_f2p8")
+    flare = vbnfault.trace_flare(lens, 20.0, wavelength_nm=550.0, pixels=32, fov_deg=40.0)
+    assert set(flare.layers) == {"sun", "ghosts", "starburst", "glare", "veil"}
+    assert flare.layers["ghosts"].shape == (1, 32, 32)
+    n = len(lens.surfaces)
+    assert len(flare.ghosts) <= n * (n - 1) // 2
+    assert all(ghost.flux_fraction >= 0 for ghost in flare.ghosts)
+    texture = vbnfault.trace_flare(lens, 20.0, model="texture", pixels=32)
+    assert texture.ghosts == ()
+    sensor = vbnfault.load_sensor("rosetta_navcam")
+    assert sensor.height_px > 0
+
+
+@pytest.mark.parametrize(
+    ("setting", "sentence"),
+    [
+        ({"sun_deg": 90.0}, "sun_deg = 90"),
+        ({"sun_deg": float("nan")}, "sun_deg = nan: must be from 0 to 90"),
+        ({"sun_deg": 10.0, "pixels": 5}, "pixels = 5: must be from 16 to 4096"),
+        ({"sun_deg": 10.0, "model": "painted"}, "model = 'painted': must be one of"),
+        ({"sun_deg": 10.0, "reflections": 3}, "reflections = 3: must be 2 or 4"),
+        ({"sun_deg": 10.0, "wavelength_nm": 20.0}, "20: must be from 250 to 2500"),
+    ],
+)
+def test_a_flare_refuses_what_the_physics_does_not_take(setting: dict[str, Any], sentence: str) -> None:
+    with pytest.raises(InputError, match=sentence):
+        vbnfault.trace_flare("tessar_50_f2p8", **setting)
+
+
+def test_the_field_helpers_make_a_fault() -> None:
+    import dataclasses
+
+    from vbnfault.faults import base, from_dict
+
+    known = {name: dict(models) for name, models in base._REGISTRY.items()}
+    try:
+
+        @dataclasses.dataclass(frozen=True, kw_only=True)
+        class Tint(vbnfault.Fault):
+            """A fault of a user."""
+
+            fault = "tint"
+            model = "plain"
+            step = "electrons"
+            strength: vbnfault.Interval = vbnfault.bounds(0.1, 0.9, limits=(0, 1), doc="fraction of light lost")  # noqa: RUF009
+
+        assert Tint().strength == (0.1, 0.9)
+        assert from_dict("tint", {"strength": 0.5}, source="a scene").strength == (0.5, 0.5)  # type: ignore[attr-defined]
+        with pytest.raises(InputError, match=r"a scene: faults.tint.strength = 2"):
+            from_dict("tint", {"strength": 2.0}, source="a scene")
+    finally:
+        base._REGISTRY.clear()
+        base._REGISTRY.update(known)
+    assert config.Scene is vbnfault.Scene

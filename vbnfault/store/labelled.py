@@ -1,0 +1,27 @@
+"""A store as labelled arrays, for analysis and training."""
+
+from __future__ import annotations
+
+import os
+from typing import TYPE_CHECKING
+
+from .group import open_store
+
+if TYPE_CHECKING:
+    import xarray
+
+
+def open_dataset(path: str | os.PathLike[str]) -> xarray.Dataset:
+    """Return a store as an `xarray.Dataset` with named dimensions, units and coordinates.
+
+    Arrays are read when they are used, a sample of a layer at a time. README and the reference list them.
+
+    Raises
+    ------
+    InputError
+        If there is no store at `path`, or one of another format.
+    """
+    import xarray
+
+    store = open_store(path)
+    return xarray.open_zarr(store.path, chunks=None)
