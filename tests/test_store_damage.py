@@ -55,6 +55,18 @@ def rewrite(file: Path, change: Callable[[dict], None]) -> None:
     file.write_text(json.dumps(document))
 
 
+@pytest.mark.parametrize("key", ["node_type", "zarr_format", "attributes of another name"])
+def test_the_spare_is_checked_outside_its_attributes_too(store: Path, template: tuple[Path, str], key: str) -> None:
+    """The checksum covers the attributes only; a flipped bit in `node_type` was found by random damage."""
+    rewrite(store / "spare/zarr.json", lambda document: document.update({key: "gro5p"}))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        assert any(problem.startswith("spare/zarr.json is damaged") for problem in st.verify(store))
+        st.recover(store)
+    assert st.verify(store) == []
+    assert st.digest(store) == template[1]
+
+
 @pytest.mark.parametrize("name", ["zarr.json", "spare/zarr.json"])
 @pytest.mark.parametrize("how", ["another value", "another key", "cut", "gone", "folder", "no utf-8", "list"])
 def test_either_root_may_be_lost(store: Path, template: tuple[Path, str], name: str, how: str) -> None:

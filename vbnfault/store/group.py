@@ -29,6 +29,7 @@ from .layout import (
     OWN_ATTRIBUTES,
     SPARE,
     array_documents,
+    canonical,
     coordinate_chunks,
     decode_values,
     encode_values,
@@ -463,6 +464,10 @@ def read_root(path: Path) -> Root | None:
     files = {DOCUMENT: path / DOCUMENT, f"{SPARE}/{DOCUMENT}": path / SPARE / DOCUMENT}
     attributes = {name: _attributes_in(file) for name, file in files.items()}
     whole = {name: value for name, value in attributes.items() if value is not None and is_sealed(value)}
+    spare = f"{SPARE}/{DOCUMENT}"
+    # the checksum is that of the attributes; `metadata_problems` compares the rest of the root's document
+    if spare in whole and canonical(read_document(files[spare])) != canonical(group_document(whole[spare])):
+        del whole[spare]
     if not whole:
         # a store made before checksums existed
         root = attributes[DOCUMENT]
