@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -360,3 +362,13 @@ def test_what_lies_between() -> None:
     origin = np.array([0.0, 0.0, -2.0])
     assert not render.is_between(ground, origin, above)
     assert render.is_between(ground, origin, np.concatenate([above, below]))
+
+
+def test_the_plugin_is_registered_by_one_import() -> None:
+    """A user's own Mitsuba scene needs `import vbnfault.render.bsdf` only, as the README says."""
+    script = (
+        "import vbnfault.render.bsdf; import mitsuba as mi; "
+        "print(mi.load_dict({'type': 'hapke', 'parameters': '67p_fornasier2015'}))"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
+    assert done.stdout.startswith("Hapke["), done.stderr
