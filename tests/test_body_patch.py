@@ -10,9 +10,10 @@ import trimesh
 from scipy import stats
 
 from vbnfault.body import Body, Patch, Site, build_patch, choose_sites, load_body
-from vbnfault.body.boulders import SizeLaw, scatter, smallest_at
+from vbnfault.body.boulders import PER_KM2, SizeLaw, scatter, smallest_at
 from vbnfault.body.shape import check_mesh, signed_volume
 from vbnfault.core.errors import InputError
+from vbnfault.scene.config import PatchTable
 
 REAL_SHAPE = Path(__file__).parents[2] / "shared/data/shapes/67p_18k.obj"
 QUICK = {"facet_m": 4.0, "radius_m": 150.0, "min_boulder_m": 0.8, "max_triangles": 1_200_000}
@@ -187,6 +188,12 @@ def test_boulders_of_a_patch_follow_the_law(body: Body, site: Site, index: float
     assert stats.kstest(quantiles, "uniform").pvalue > 1e-3
     distance = np.linalg.norm(stony.boulder_position_L_m, axis=1)
     assert (smallest > 0.95 * smallest_at(distance, 0.8) - 0.1).all()
+
+
+def test_the_density_of_boulders_is_the_published_one() -> None:
+    """3546 boulders on 36.4 km² (Pajola et al. 2015), to the Poisson error of that count; scenes start from it."""
+    assert abs(PER_KM2 - 3546 / 36.4) <= np.sqrt(3546) / 36.4
+    assert PatchTable.model_fields["boulders_per_km2"].default == PER_KM2
 
 
 def test_density_of_boulders_is_what_was_asked_for(body: Body, site: Site) -> None:

@@ -52,6 +52,7 @@ class Session:
     dies_once: str = ""  # a file that is made at the first death
     log: str = ""
     stage: str = ""  # told before every sample
+    dies_writing: str = ""  # a folder of files; a process dies, once each, as it writes the shards 0 and 1
 
     def __call__(self) -> Session:
         return self
@@ -62,6 +63,8 @@ class Session:
                 log.write(f"{os.getpid()} {index}\n")
         if self.stage:
             activity.begin(f"{self.stage} {index}")
+        if self.dies_writing:
+            die_once_as_two_shards_are_written(Path(self.dies_writing))
         if index in self.raises:
             raise KeyError(f"no terrain for {index}")
         if index in self.dies and not (self.dies_once and Path(self.dies_once).exists()):
@@ -69,6 +72,34 @@ class Session:
                 Path(self.dies_once).touch()
             os.kill(os.getpid(), signal.SIGKILL)
         return fake_sample(make_spec(), index, site=int(site_of(index + 1)[-1]))
+
+
+def die_once_as_two_shards_are_written(folder: Path) -> None:
+    """Have this process die before it first writes shard 0 or 1, when all samples of the shard are made."""
+
+    def write(store: st.Store, shard: int, *given: Any, **more: Any) -> Any:
+        if shard < 2 and not (folder / str(shard)).exists():
+            (folder / str(shard)).touch()
+            os.kill(os.getpid(), signal.SIGKILL)
+        return _write_shard(store, shard, *given, **more)
+
+    st.Store.write_shard = write  # type: ignore[method-assign]
+
+
+_write_shard = st.Store.write_shard
+
+
+def end_unless(process: int) -> None:
+    if os.getpid() != process:
+        os.kill(os.getpid(), signal.SIGKILL)
+
+
+@dataclass(frozen=True)
+class Deadly:
+    """A factory that kills every other process that receives it."""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return end_unless, (os.getpid(),)
 
 
 @dataclass(frozen=True)
@@ -290,6 +321,25 @@ def test_a_worker_that_dies_once_is_replaced(reference: tuple[Path, str], tmp_pa
     assert run(tmp_path / "s.zarr", session, workers=2).built == SAMPLES
     assert (tmp_path / "died").exists()
     assert st.digest(tmp_path / "s.zarr") == reference[1]
+
+
+def test_workers_that_die_between_samples_are_replaced(
+    reference: tuple[Path, str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    died = tmp_path / "died"
+    died.mkdir()
+    assert run(tmp_path / "s.zarr", Session(dies_writing=str(died)), workers=2, progress=True).built == SAMPLES
+    assert len(list(died.iterdir())) == 2
+    assert st.digest(tmp_path / "s.zarr") == reference[1]
+    said = capsys.readouterr().err
+    assert "None" not in said
+    for shard in range(2):
+        assert re.search(rf"shard {shard}: .*killed \(signal 9.*while no sample was in work; trying again", said)
+
+
+def test_workers_that_cannot_begin_end_the_build(tmp_path: Path) -> None:
+    with pytest.raises(VbnfaultError, match=r"shard \d: .*killed.* twice while no sample was in work; finished"):
+        run(tmp_path / "s.zarr", Deadly(), workers=2)
 
 
 @pytest.mark.parametrize("workers", [1, 2])

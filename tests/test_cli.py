@@ -10,6 +10,7 @@ import socket
 import subprocess
 import sys
 import tomllib
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,10 +19,13 @@ import pytest
 import victim
 from conftest import small_scene
 
-from vbnfault import cli, store
+from vbnfault import cli, pipeline, store
+from vbnfault.core.quantities import Sample
 from vbnfault.dataset import dask
 from vbnfault.lens import load_lens
-from vbnfault.output import flare_images
+from vbnfault.output import flare_images, sample_files
+from vbnfault.pipeline.record import to_sample
+from vbnfault.pipeline.spec import Frame
 
 ENVIRONMENT = {**os.environ, "PYTHONWARNINGS": "error::UserWarning"}
 
@@ -160,6 +164,11 @@ def test_a_rendered_sample_equals_the_stored_one(
     import cv2
     import OpenEXR
 
+    def without_a_number(frame: Frame) -> Sample:
+        sample = to_sample(frame)
+        return replace(sample, scalars={**sample.scalars, "noise_fraction_p99": float("nan")})
+
+    monkeypatch.setattr(sample_files, "to_sample", without_a_number)
     layers = 'dataset.layers=["clean", "dust_opacity"]'
     assert run(monkeypatch, "render", scene, "--sample", 5, "--out", tmp_path, "--set", layers) == 0
     stored = store.open_store(built).read_sample(5)
@@ -173,7 +182,9 @@ def test_a_rendered_sample_equals_the_stored_one(
     for k, name in enumerate(names):
         mask = cv2.imread(str(tmp_path / f"mask_{name}.png"), cv2.IMREAD_UNCHANGED) > 0
         assert np.array_equal(mask, stored.layers["mask"][k])
-    scalars = json.loads((tmp_path / "parameters.json").read_text())
+    # NaN and Infinity, which Python also reads, are not JSON
+    scalars = json.loads((tmp_path / "parameters.json").read_text(), parse_constant=pytest.fail)
+    assert scalars["noise_fraction_p99"] is None
     assert scalars["exposure_s"] == stored.scalars["exposure_s"]
     with OpenEXR.File(str(tmp_path / "sample.exr"), separate_channels=True) as exr:
         channels = exr.channels()
@@ -369,6 +380,16 @@ def test_a_path_that_cannot_be_written_is_one_sentence(
     assert code in (1, 2)
     assert str(blocked) in said
     assert "Traceback" not in said
+    with monkeypatch.context() as patch:  # told before the work
+        patch.setattr(pipeline.Session, "frame", lambda *_: pytest.fail("rendered"))
+        code = run(monkeypatch, "render", scene, "--out", blocked / "x")
+    assert_one_sentence(code, capsys.readouterr().err, f"{blocked / 'x'}: cannot be written: Not a directory")
+    (tmp_path / "sample.exr").mkdir()
+    code = run(monkeypatch, "render", scene, "--out", tmp_path)
+    assert_one_sentence(code, capsys.readouterr().err, "sample.exr: cannot be written: Is a directory")
+    options = ("--sun-deg", 12, "--model", "texture", "--pixels", 16, "--out", tmp_path / "sample.exr")
+    assert run(monkeypatch, "flare", "tessar_50_f2p8", *options) == 2
+    assert "sample.exr: cannot be written: Is a directory" in capsys.readouterr().err
 
 
 def test_a_port_where_no_scheduler_answers_is_one_sentence(

@@ -64,10 +64,14 @@ def test_near_infrared_replaces_the_second_green() -> None:
     assert nir.channels == ("R", "G", "B", "NIR")
 
 
-@pytest.mark.parametrize("name", PATTERNS)
-@pytest.mark.parametrize("shape", [(6, 8), (67, 131), (64, 64)])
-def test_sample_takes_each_pixels_own_filter(name: str, shape: tuple[int, int]) -> None:
-    p = pattern(name)
+# tiles of a user: their heights divide no power of two, or are larger than the blocks that are copied at a time
+SIX = Pattern(name="six", channels=("R", "W"), tile=((0, 1, 1, 1, 1, 1), *(((1,) * 6,) * 5)))
+TALL = Pattern(name="tall", channels=("R", "W"), tile=((0,),) * 3 + ((1,),) * 67)
+
+
+@pytest.mark.parametrize("p", [*PATTERNS.values(), SIX, TALL], ids=lambda p: p.name)
+@pytest.mark.parametrize("shape", [(6, 8), (67, 131), (64, 64), (200, 9)])
+def test_sample_takes_each_pixels_own_filter(p: Pattern, shape: tuple[int, int]) -> None:
     planes = np.random.default_rng(3).random((*shape, len(p.channels)), dtype=np.float32)
     before = planes.copy()
     raw = sample(planes, p)

@@ -149,6 +149,16 @@ def test_draw_follows_the_table() -> None:
     assert len(make("broken_pixels", count=9).draw(context, rng())["x"]) == 9
 
 
+def test_a_crowded_frame_still_has_as_many_pixels_as_drawn() -> None:
+    """Where all neighbours of a defect are taken, and its own pixel too, it goes elsewhere."""
+    context = make_context(12)
+    fault = make("broken_pixels", count=36, cluster_fraction=1, dense_cluster_probability=0)
+    for seed in range(60):
+        params = fault.draw(context, rng(seed))
+        assert len(set(zip(params["x"], params["y"], strict=True))) == len(params["brightness_dn"]) == 36
+        assert (fault.apply(flat_rgbi(context, 50), params, context).array != 50).any()
+
+
 def test_cmos_has_no_lines() -> None:
     params = make("broken_pixels").draw(make_context(64, architecture="cmos"), rng())
     assert params["sensor"] == "cmos"

@@ -14,7 +14,7 @@ from vbnfault.core.errors import InputError
 from vbnfault.core.quantities import RTS, RTS_HIGH, STUCK, Charge, Offset, RawMosaic
 from vbnfault.detector.chain import MosaicNoise
 from vbnfault.detector.individual import offset_e
-from vbnfault.faults import FaultContext
+from vbnfault.faults import FaultContext, broken_pixels_hot
 from vbnfault.pipeline import Session
 from vbnfault.scene import config
 
@@ -43,6 +43,16 @@ def added(where: FaultContext, params: dict[str, Any]) -> Any:
 
 def drawn(where: FaultContext, **keys: Any) -> dict[str, Any]:
     return make("broken_pixels", model="hot_pixels", **(KEYS | keys)).draw(where, rng(1))
+
+
+def test_the_damage_of_a_sample_is_computed_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    calls, compute = [], broken_pixels_hot._damage
+    monkeypatch.setattr(broken_pixels_hot, "_damage", lambda *given: calls.append(1) or compute(*given))
+    where, fault = context(), make("broken_pixels", model="hot_pixels")
+    params = fault.draw(where, rng(1))
+    added(where, params)
+    fault.footprint(params, where)
+    assert len(calls) == 1
 
 
 def test_defects_grow_with_exposure_from_their_offset() -> None:

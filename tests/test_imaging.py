@@ -528,11 +528,15 @@ def test_the_lens_of_a_thin_camera_is_told_by_its_contents(tmp_path: Path, monke
         assert (identity(faults, **camera) != was) == other, (faults, camera)
 
 
-def test_stars_go_through_the_lens() -> None:
-    """A catalogue's stars on the sensor: where the camera has them, with the light that the beam lets pass."""
+@pytest.mark.parametrize("sigma_px", [0.0, 2.5])
+def test_stars_go_through_the_lens(sigma_px: float) -> None:
+    """A catalogue's stars on the sensor: where the camera has them, with the light that the beam lets pass.
+
+    The prescription spreads them, whatever point spread the scene states for a thin lens.
+    """
     table = small_scene(
         camera={"width_px": 256, "height_px": 256, "pixel_pitch_um": 22.0, "lens": "nikkor_28_f2p8"},
-        sky={"stars": "on", "limiting_magnitude": 2.5, "sigma_px": 0.9},
+        sky={"stars": "on", "limiting_magnitude": 2.5, "sigma_px": sigma_px},
         render={"bands": 3, "band_min_nm": 550.0, "band_max_nm": 620.0},
     )
     stars = config.parse_scene(table, source="test")

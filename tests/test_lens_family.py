@@ -23,13 +23,35 @@ def test_a_lens_survives_being_written(name: str, tmp_path: Path) -> None:
     surfaces[0] = replace(
         surfaces[0], conic=-0.1, aspheric_mm=(1e-7,), internal_transmittance_10mm=((400.0, 700.0), (0.9, 0.99))
     )
-    lens = replace(lens, surfaces=tuple(surfaces), sensor_reflectance=0.2, name='a "lens" \\ of old')
+    lens = replace(
+        lens, surfaces=tuple(surfaces), sensor_reflectance=0.2, name='a "lens" \\ of old\n[surface]\t\x00\x7f 🌀 α'
+    )
     write_lens(lens, tmp_path / "lens.toml")
     again = load_lens(tmp_path / "lens.toml")
     assert (again.name, again.source, again.sensor_reflectance) == (lens.name, lens.source, 0.2)
     for a, b in zip(lens.surfaces, again.surfaces, strict=True):
         assert replace(a, medium=b.medium) == b
         np.testing.assert_allclose(a.medium.index([400.0, 550.0, 900.0]), b.medium.index([400.0, 550.0, 900.0]))
+
+
+def test_a_scaled_lens_is_written_with_its_own_lengths(tmp_path: Path) -> None:
+    """The file holds the lens as scaled; what is read from a file is not scaled yet."""
+    lens = load_lens("tessar_50_f2p8")
+    lens = replace(lens, surfaces=(replace(lens.surfaces[0], aspheric_mm=(1e-7, 1e-10)), *lens.surfaces[1:]))
+    lens = lens.scaled(0.37)
+    write_lens(lens, tmp_path / "lens.toml")
+    again = load_lens(tmp_path / "lens.toml")
+    assert (lens.scale, again.scale) == (0.37, 1.0)
+    # media compare by index in the test above: nd and vd give their coefficients but for rounding
+    for a, b in zip(lens.surfaces, again.surfaces, strict=True):
+        assert replace(a, medium=b.medium) == b
+    assert first_order(again).efl_mm == pytest.approx(first_order(lens).efl_mm, rel=1e-9)
+
+
+def test_a_name_without_utf_8_can_be_written(tmp_path: Path) -> None:
+    lens = replace(load_lens("tessar_50_f2p8"), name="lens \udcff")  # as a path of undecodable bytes has it
+    write_lens(lens, tmp_path / "lens.toml")
+    assert load_lens(tmp_path / "lens.toml").name == "lens ?"
 
 
 def test_relatives_are_valid_alike_and_repeatable() -> None:

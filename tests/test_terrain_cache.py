@@ -157,13 +157,17 @@ def test_a_cache_that_cannot_be_read_is_built_again(
     assert "is damaged (Permission denied)" in capsys.readouterr().err
 
 
-def test_unwritable_folder_costs_nothing_but_time(
-    body: Body, site: Site, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_unwritable_folder_costs_nothing_but_time_and_is_told_once(
+    body: Body, site: Site, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     blocked = tmp_path / "file"
     blocked.write_text("in the way")
     monkeypatch.setenv(cache.FOLDER_VARIABLE, str(blocked / "below"))
-    patch = cached_patch(body, site, **COARSE)  # -W error: no warning either
+    patch = cached_patch(body, site, **COARSE)
+    told = f"warning: {blocked / 'below'}: terrain cannot be kept there (Not a directory), so every run builds it"
+    assert capsys.readouterr().err.startswith(told)
+    cached_patch(body, site, **COARSE)
+    assert capsys.readouterr().err == ""
 
     def full(*args: object, **kwargs: object) -> bytes:
         raise OSError(28, "No space left on device")
@@ -172,6 +176,7 @@ def test_unwritable_folder_costs_nothing_but_time(
     monkeypatch.setattr(cache, "_parts", full)
     assert same(cached_patch(body, site, **COARSE), patch)
     assert list((tmp_path / "full").iterdir()) == []
+    assert "full: terrain cannot be kept there (No space left on device)" in capsys.readouterr().err
 
 
 def test_used_longest_ago_goes_first(body: Body, site: Site, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:

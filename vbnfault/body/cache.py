@@ -3,7 +3,7 @@
 A file's name is a hash of everything that determines its content: the body, the site, all parameters, the sources
 of the terrain code, and the versions of the libraries that compute it. The file holds the same hash and ends with a
 checksum of all its bytes. A damaged file is reported to the user and the patch is built again. If the folder cannot
-be written, only time is lost.
+be written, the user is told once, and only time is lost.
 """
 
 from __future__ import annotations
@@ -205,13 +205,22 @@ def _write(path: Path, key: str, patch: Patch, limit_bytes: int) -> None:
         os.replace(unfinished, path)
         unfinished = None
         _evict(path.parent, limit_bytes)
-    # The folder is read-only or full, or another worker uses the file. The patch is built all the same.
-    except OSError:
-        pass
+    except OSError as error:  # the folder is read-only or full, or another worker uses the file
+        _warn_unwritable(path.parent, error.strerror or str(error))
     finally:
         if unfinished is not None:
             with contextlib.suppress(OSError):
                 unfinished.unlink()
+
+
+@lru_cache
+def _warn_unwritable(folder: Path, why: str) -> None:
+    """Tell the user, once in a process, that patches cannot be kept in a folder."""
+    print(
+        f"warning: {folder}: terrain cannot be kept there ({why}), so every run builds it again; "
+        f"{FOLDER_VARIABLE} names another folder",
+        file=sys.stderr,
+    )
 
 
 def _evict(folder: Path, limit_bytes: int) -> None:

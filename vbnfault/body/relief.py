@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from .fields import GRADIENT_STD, Points
+from .gravity import GRAVITATIONAL_CONSTANT
 from .noise import Float32, noise_key
 from .roughness import Roughness, deviogram
 from .shape import Float64, Int32, vertex_normals
@@ -174,7 +175,7 @@ def _vertical(body: Body, site: Site, points: Float64) -> tuple[Float64, Float64
     at_site += 0.5 * body.omega_rad_s**2 * float(centre[0] ** 2 + centre[1] ** 2)
     potential = at_site + np.einsum("ni,ni->n", near, gravity[0] + 0.5 * bend)
     radius = (3 * body.volume_m3 / (4 * np.pi)) ** (1 / 3)
-    mean_gravity = 4 / 3 * np.pi * 6.6743e-11 * body.density_kg_m3 * radius
+    mean_gravity = 4 / 3 * np.pi * GRAVITATIONAL_CONSTANT * body.density_kg_m3 * radius
     return up, -potential / mean_gravity
 
 

@@ -277,6 +277,8 @@ def render(
 
     session = pipeline.Session(source, blocks=blocks, source=scene)
     session.warn_of_assumptions()
+    with _written(out):  # before the work
+        out.mkdir(parents=True, exist_ok=True)
     for path in sample_files.write_frame(session.frame(sample), out):
         typer.echo(str(path))
 

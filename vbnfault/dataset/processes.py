@@ -70,7 +70,7 @@ class _Process:
                 self.process.kill()  # the pool does not know this process yet
             raise
         theirs.close()
-        self.heard = False  # whether it has sent anything yet
+        self.has_reported = False  # whether it has sent anything yet
         self.shards = 0
         self.shard = -1
         self.sample: int | None = None  # the sample it works on
@@ -84,7 +84,7 @@ class _Process:
 
     def stop(self, *, at_once: bool = False) -> None:
         """Ask it to end: after its task, or at once but with time to write its finished samples."""
-        if at_once and not self.heard:
+        if at_once and not self.has_reported:
             self.process.kill()  # it has made nothing yet
         elif at_once:
             self.process.terminate()
@@ -97,7 +97,7 @@ class _Process:
             self.process.kill()
             self.process.join()
 
-    def obituary(self) -> str:
+    def exit_reason(self) -> str:
         """Return how it ended, as a clause."""
         code = self.process.exitcode or 0
         if code == -signal.SIGKILL:
@@ -141,7 +141,9 @@ class Pool:
     """Worker processes that are replaced after `recycle` shards, or when they die.
 
     If a process dies during a sample, the shard is done again in a new process, which writes each sample as soon as
-    it is made. So a second crash loses only that sample, which is then recorded as failed and skipped.
+    it is made. So a second crash loses only that sample, which is then recorded as failed and skipped. If a process
+    dies while it works on no sample, its shard is done again, too. The build ends if this happens twice to a shard
+    that made no sample in between.
     """
 
     def __init__(self, factory: SessionFactory, run: Run, threads: int, recycle: int) -> None:
@@ -149,7 +151,9 @@ class Pool:
         self._run, self._recycle = run, recycle
         self._workers: list[_Process] = []
         self._again: deque[int] = deque()
-        self._deaths: Counter[int | None] = Counter()
+        self._deaths_by_sample: Counter[int] = Counter()
+        # deaths while no sample was in work, since the shard's last sample was made
+        self._deaths_by_shard: Counter[int] = Counter()
         # by shard, the samples to skip; the tasks of these shards are done with `careful`
         self._given_up: dict[int, frozenset[int]] = {}
 
@@ -161,7 +165,7 @@ class Pool:
             while self._workers:
                 by_pipe: dict[Any, _Process] = {worker.pipe: worker for worker in self._workers}
                 for pipe in connection.wait(list(by_pipe)):
-                    self._hear(by_pipe[pipe])
+                    self._receive(by_pipe[pipe])
         finally:
             with interrupts.finishing(self._kill):
                 for worker in self._workers:
@@ -194,13 +198,13 @@ class Pool:
         careful = shard in self._given_up
         worker.give(self._run.task(shard, self._given_up.get(shard, frozenset()), careful=careful))
 
-    def _hear(self, worker: _Process) -> None:
+    def _receive(self, worker: _Process) -> None:
         """Handle one message from a worker, or its death."""
         try:
             sample, what, payload = worker.pipe.recv()
-            worker.heard = True
+            worker.has_reported = True
         except (EOFError, OSError):
-            self._mourn(worker)
+            self._replace_dead(worker)
             return
         if what == "fatal":
             raise payload
@@ -208,25 +212,34 @@ class Pool:
             self._next(worker, worker.shard)
         else:
             worker.sample = sample if what in ("begun", "stage") else None
+            if what == "built":
+                del self._deaths_by_shard[worker.shard]
             self._run.tick(sample, what, payload)
 
-    def _mourn(self, worker: _Process) -> None:
-        """Replace a worker that died; raise VbnfaultError at the second death between samples."""
+    def _replace_dead(self, worker: _Process) -> None:
+        """Replace a worker that died, and do its shard again.
+
+        Raises VbnfaultError at the second death at one shard without a sample in work and none made in between.
+        """
         self._workers.remove(worker)
         worker.stop()
         worker.join()
-        sample, shard, how = worker.sample, worker.shard, f"its worker process {worker.obituary()}"
-        self._deaths[sample] += 1
+        sample, shard, how = worker.sample, worker.shard, f"its worker process {worker.exit_reason()}"
         given_up = self._given_up.setdefault(shard, frozenset())
-        if self._deaths[sample] == 1:
-            self._run.progress.say(f"sample {sample}: {how}; trying again in a new one")
-        elif sample is None:
-            raise VbnfaultError(
-                f"{self._run.store.path}: a worker process ended before it made anything ({how}); "
-                f"finished samples stay, and the same command resumes"
-            )
+        if sample is None:
+            self._deaths_by_shard[shard] += 1
+            if self._deaths_by_shard[shard] > 1:
+                raise VbnfaultError(
+                    f"{self._run.store.path}: shard {shard}: {how}, twice while no sample was in work; "
+                    f"finished samples stay, and the same command resumes"
+                )
+            self._run.progress.say(f"shard {shard}: {how} while no sample was in work; trying again in a new one")
         else:
-            self._run.tick(sample, "failed", f"{how}, twice")
-            self._given_up[shard] = given_up | {sample}
+            self._deaths_by_sample[sample] += 1
+            if self._deaths_by_sample[sample] == 1:
+                self._run.progress.say(f"sample {sample}: {how}; trying again in a new one")
+            else:
+                self._run.tick(sample, "failed", f"{how}, twice")
+                self._given_up[shard] = given_up | {sample}
         self._again.append(shard)
         self._next(None, None)

@@ -18,6 +18,8 @@ from .three_colour import _pool
 F32 = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
+_BLOCK_ROWS = 64  # rows that one thread copies at a time, about
+
 
 @dataclass(frozen=True, kw_only=True)
 class Pattern:
@@ -113,15 +115,16 @@ def sample(planes: F32, pattern: Pattern) -> F32:
         )
     out = np.empty(planes.shape[:2], dtype=np.float32)
     rows, columns = pattern.shape
+    height = rows * max(1, _BLOCK_ROWS // rows)  # whole tiles, so that each block begins with the tile's first row
 
     def fill(start: int) -> None:
-        block = slice(start, start + 64)  # 64 is a multiple of the height of every packaged tile
+        block = slice(start, start + height)
         for y in range(rows):
             for x in range(columns):
                 out[block][y::rows, x::columns] = planes[block][y::rows, x::columns, pattern.tile[y][x]]
 
     # numpy releases the interpreter lock while it copies
-    list(_pool().map(fill, range(0, len(out), 64 if 64 % rows == 0 else len(out))))
+    list(_pool().map(fill, range(0, len(out), height)))
     return out
 
 

@@ -103,7 +103,7 @@ class TextureBrokenPixels(Fault):
     def _positions(
         self, count: int, height: int, width: int, rng: np.random.Generator
     ) -> tuple[list[int], list[int]]:
-        """Return x and y of distinct pixels: some alone and uniform, the others next to an earlier pixel."""
+        """Return x and y of `count` distinct pixels: some alone and uniform, the others next to an earlier one."""
         dense = count >= DENSE_CLUSTER and rng.random() < self.dense_cluster_probability
         beside = min(round(self.cluster_fraction * count), count - 1) if count else 0
         beside = max(beside, DENSE_CLUSTER - 1) if dense else beside
@@ -120,8 +120,8 @@ class TextureBrokenPixels(Fault):
                 if 0 <= near[0] < height and 0 <= near[1] < width and near not in taken:
                     spot = near
                     break
-            if spot in taken:
-                continue
+            while spot in taken:  # an earlier one took it; at most a quarter of the frame is taken
+                spot = (int(rng.integers(height)), int(rng.integers(width)))
             placed.append(spot)
             taken.add(spot)
         return [p[1] for p in placed], [p[0] for p in placed]

@@ -96,7 +96,7 @@ class HotPixels(Fault):
             "least_dn": float(self.least_dn),
             "telegraph_seed": int(rng.integers(2**63)),
         }
-        damage = _damage(params, context)
+        damage = _damage_once(params, context)
         offset, kept = damage.offset_e.ravel(), damage.kept.ravel()
         extra = damage.charge_e.ravel() + offset
         changed = np.flatnonzero(damage.changed.ravel())

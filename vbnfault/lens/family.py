@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from pathlib import Path
 from typing import Any
@@ -79,7 +80,11 @@ def _vary(row: dict[str, Any], rng: np.random.Generator, spread: float, index_sp
 
 
 def to_table(lens: Prescription) -> dict[str, Any]:
-    """Return a prescription as the plain data that `parse_lens` reads."""
+    """Return a prescription as the plain data that `parse_lens` reads.
+
+    The lengths are those of the lens as it is now scaled. `Prescription.scale` counts from the file that was read,
+    so it is 1 in the lens that `parse_lens` returns.
+    """
     rows = [_row(surface) for surface in lens.surfaces]
     if lens.sensor_reflectance:
         rows.append({"sensor": True, "reflectance": lens.sensor_reflectance})
@@ -121,7 +126,7 @@ def _medium(glass: Glass) -> dict[str, Any]:
 
 
 def write_lens(lens: Prescription, path: Path) -> None:
-    """Write a prescription as a TOML file that `load_lens` reads."""
+    """Write a prescription, as it is now scaled, as a TOML file that `load_lens` reads; see `to_table`."""
     table = to_table(lens)
     lines = [f"{key} = {_toml(table[key])}" for key in ("name", "source")]
     for row in table["surface"]:
@@ -134,7 +139,9 @@ def _toml(value: Any) -> str:
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, str):
-        return '"' + value.replace("\\", "\\\\").replace('"', '\\"') + '"'
+        # JSON's escapes are those of TOML, which also refuses DEL; a lone surrogate, of a path, has no UTF-8
+        text = json.dumps(value.encode("utf-8", "replace").decode(), ensure_ascii=False)
+        return text.replace("\x7f", "\\u007f")
     if isinstance(value, dict):
         return "{" + ", ".join(f"{k} = {_toml(v)}" for k, v in value.items()) + "}"
     if isinstance(value, list):

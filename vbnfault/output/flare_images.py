@@ -22,6 +22,7 @@ from ..lens import Prescription, ThinLens, first_order, load_lens
 from ..lens.straylight.paraxial import Ghost, axial_transmittance, mean_ghost, paraxial_ghosts
 from ..lens.straylight.total import VEIL_FRACTION, Cleanliness, straylight
 from ..scene import config
+from .exr import write_exr
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -313,19 +314,16 @@ def write_picture(view: FlareRequest, found: dict[str, F32], path: Path) -> None
         assert ok
         path.write_bytes(data.tobytes())
         return
-    import OpenEXR
-
     channels: dict[str, Any] = {}
     for name, layer in found.items():
         labels = "RGB" if name == "texture" else [f"{nm:.1f}nm" for nm in view.wavelength_nm]
-        channels |= {f"{name}.{label}": band.copy() for label, band in zip(labels, layer, strict=True)}
+        channels |= {f"{name}.{label}": band for label, band in zip(labels, layer, strict=True)}
     if "texture" in found:
         rgb = np.moveaxis(found["texture"], 0, -1)
     else:
         rgb = colours(view, sum(found.values(), np.zeros_like(found["sun"])))
     channels |= {c: np.ascontiguousarray(rgb[..., k]) for k, c in enumerate("RGB")}
-    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
-    OpenEXR.File(header, channels).write(str(path))
+    write_exr(path, channels)
 
 
 def table(view: FlareRequest, found: tuple[Ghost, ...]) -> dict[str, Any]:

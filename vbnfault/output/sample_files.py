@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -11,12 +12,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.errors import VbnfaultError
+from ..core.errors import InputError, VbnfaultError
 from ..core.quantities import Sample
 from ..pipeline import labels
 from ..pipeline.record import to_sample
 from ..pipeline.spec import Frame
 from . import contact_sheet
+from .exr import write_exr
 
 _MARKED_GHOSTS = 10
 
@@ -30,9 +32,9 @@ def write_frame(frame: Frame, folder: Path) -> list[Path]:
       `<name>_intensity.png`.
     - `mask_<fault>.png`, `mask_effect_<fault>.png`, `mask_any.png`.
     - `annotated_<fault>.png`: the image with one class marked, see `annotated`.
-    - `parameters.json`: every scalar of the dataset.
+    - `parameters.json`: every scalar of the dataset, null where it is not a finite number.
 
-    Raises VbnfaultError if a file cannot be written.
+    Raises InputError if a file cannot be written.
     """
     sample = to_sample(frame)
     try:
@@ -50,10 +52,10 @@ def write_frame(frame: Frame, folder: Path) -> list[Path]:
         for name in frame.drawn:
             files.append(_write_png(folder / f"annotated_{name}.png", annotated(frame, name)[..., ::-1]))
         path = folder / "parameters.json"
-        path.write_text(json.dumps(_plain(sample), indent=2) + "\n")
+        path.write_text(json.dumps(_plain(sample), indent=2, allow_nan=False) + "\n", encoding="utf-8")
         return [*files, path]
     except OSError as error:
-        raise VbnfaultError(f"{error.filename or folder}: cannot be written: {error.strerror}") from None
+        raise InputError(f"{error.filename or folder}: cannot be written: {error.strerror}") from None
 
 
 def annotated(frame: Frame, fault: str) -> NDArray[np.uint8]:
@@ -108,12 +110,17 @@ def _marks(
 
 
 def _plain(sample: Sample) -> dict[str, Any]:
-    """Return the scalars of a sample as plain data; arrays become flat lists with None for NaN."""
+    """Return the scalars of a sample as plain data.
+
+    Arrays become flat lists. NaN and infinity, which JSON lacks, become None.
+    """
 
     def plain(value: Any) -> Any:
         if isinstance(value, np.ndarray):
-            return [None if isinstance(v, float) and np.isnan(v) else v for v in value.ravel().tolist()]
-        return value
+            return [plain(v) for v in value.ravel().tolist()]
+        if isinstance(value, np.generic):
+            return plain(value.item())
+        return None if isinstance(value, float) and not math.isfinite(value) else value
 
     return {"sample": sample.index, **{name: plain(value) for name, value in sample.scalars.items()}}
 
@@ -129,8 +136,6 @@ def _write_png(path: Path, array: NDArray[np.uint8]) -> Path:
 
 def _write_exr(frame: Frame, sample: Sample, path: Path) -> Path:
     """Write radiance, truth and soft layers to one EXR file and return its path."""
-    import OpenEXR
-
     truth = frame.truth
     channels: dict[str, NDArray[Any]] = {
         f"radiance.{wavelength:.1f}nm": np.ascontiguousarray(band)
@@ -142,7 +147,5 @@ def _write_exr(frame: Frame, sample: Sample, path: Path) -> Path:
     channels["semantic"] = truth.semantic.astype(np.uint32)
     soft = [fault.soft_layer for fault in frame.spec.faults.values()]
     channels |= {name: sample.layers[name] for name in soft if name in sample.layers}
-    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
-    # OpenEXR accepts writeable arrays only
-    OpenEXR.File(header, {name: array.copy() for name, array in channels.items()}).write(str(path))
+    write_exr(path, channels)
     return path

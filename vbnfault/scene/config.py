@@ -291,7 +291,7 @@ class SkyTable(Table):
 
     stars: Literal["off", "auto", "on"] = Field("off", description="auto: those that the exposure can show")
     limiting_magnitude: float = Field(7.0, ge=-2, le=7)
-    sigma_px: float = Field(0.6, ge=0, le=16, description="Gaussian point spread of the lens")
+    sigma_px: float = Field(0.6, ge=0, le=16, description="Gaussian point spread of a thin lens")
 
 
 class PoseTable(Table):

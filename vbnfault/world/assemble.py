@@ -32,8 +32,10 @@ F64 = NDArray[np.float64]
 # `stars = "auto"` leaves out stars whose brightest pixel collects less than this fraction of the read noise.
 _STAR_OVER_READ_NOISE = 0.1
 
-# Largest standard deviation of a star that a prescription resamples and blurs. The light of a narrower star would
-# depend more on its position within a pixel; at this deviation the variation is 1 %.
+# Standard deviation of a star that a prescription resamples and blurs. Resampling changes the light of a narrower
+# star with its position within a pixel. Measured with 65° across a frame: with 0.6 px the light varies by 1.3 % rms
+# half-way to the corner and by 2.6 % at two thirds of the way; with 0 px it varies by 2.8 % and 5.1 %, and at two
+# thirds its mean is 15 % higher. A wider star would add to the point spread of the prescription.
 _STAR_SIGMA_PX = 0.6
 
 
@@ -479,15 +481,16 @@ def with_stars(
     open_sky
         Pixels that see neither a body nor the Sun, bool[y, x].
     view
-        Grid of the radiance, if it is not the camera's frame. A prescription blurs the stars itself, so they are
-        drawn with at most `_STAR_SIGMA_PX` for it.
+        Grid of the radiance, if it is not the camera's frame.
+
+    A prescription blurs the stars itself. For it they are drawn with `_STAR_SIGMA_PX`, whatever `sky.sigma_px` is.
     """
     table = scene.sky
     if table.stars == "off" or not open_sky.any():
         return radiance
     lens = camera.lens
     real = isinstance(lens, RealLens)
-    sigma_px = min(table.sigma_px, _STAR_SIGMA_PX) if real else table.sigma_px
+    sigma_px = _STAR_SIGMA_PX if real else table.sigma_px
     faintest = table.limiting_magnitude
     if table.stars == "auto":
         faintest = min(
