@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from types import ModuleType
+from typing import Any
 
 import cv2
 import numpy as np
@@ -12,12 +13,12 @@ import pytest
 from vbnfault.core.errors import InputError
 from vbnfault.detector import demosaic as module
 from vbnfault.detector.demosaic import (
+    bounded_at_edges,
     correct_defects,
     demosaic,
     footprint,
     interpolate,
     mended_from,
-    without_undershoot,
 )
 from vbnfault.detector.mosaic import BAYER, PATTERNS, Pattern, channel_mask, channel_of, pattern, sample, separate
 
@@ -249,20 +250,98 @@ def test_interpolated_bayer_channels_are_the_bilinear_ones_inside(name: str) -> 
         np.testing.assert_allclose(plane[2:-2, 2:-2], rgb[2:-2, 2:-2, index], rtol=2e-6)
 
 
+def edges(shape: tuple[int, int] = (40, 44)) -> list[np.ndarray]:
+    """Bright sides, bool[y, x]: straight, diagonal and slanted edges, corners, a strut of 3 px, a line, a point, a
+    hole; the straight ones at both phases of a tile."""
+    y, x = np.indices(shape)
+    straight = [x > 20, x > 21, y > 17, y > 18, x < 21, y < 17]
+    slanted = [x + y > 40, x + y > 41, x > y + 2, x < y + 2, y + 2 * x > 60]
+    thin = [np.abs(x - 20) <= 1, np.abs(y - 21) <= 1, np.abs(x - y) <= 1, x == 20, (x == 20) & (y == 20)]
+    return [*straight, *slanted, *thin, (x > 15) & (y > 17), (x > 15) | (y > 17), (x - 20) ** 2 + (y - 20) ** 2 > 2]
+
+
+def bounded(raw: np.ndarray, p: Pattern, method: str, **known: Any) -> np.ndarray:
+    return bounded_at_edges(demosaic(raw, p, method), raw, p, method, **known)  # type: ignore[arg-type]
+
+
 @pytest.mark.parametrize(("name", "method"), FITTING)
 def test_the_dark_side_of_a_hard_edge_stays_as_dark_as_it_is(name: str, method: str) -> None:
-    # 10,000:1, as a sunlit foot before shaded ground: straight, slanted, a corner, a thin bright line
-    p, (y, x) = pattern(name), np.mgrid[:40, :44]
-    black, dark, lowest = 64.0, 1.0, np.inf
-    for bright in (x > 20, y + 2 * x > 60, (x > 15) & (y > 17), x == 20, (x == 20) & (y == 20)):
+    # 10,000:1, as a sunlit foot before shaded ground
+    p, black, dark, lowest = pattern(name), 64.0, 1.0, np.inf
+    for bright in edges():
         raw = (black + np.where(bright, 1e4 * dark, dark)).astype(np.float32)
         published = demosaic(raw, p, method)
-        kept = without_undershoot(published.copy(), raw, p, method, black, 0.5)
+        kept = bounded(raw, p, method, black=black, noise=0.5)
         assert kept.min() >= black + dark * (1 - 1e-3)
-        # nothing else is touched
-        assert np.array_equal(kept[published >= black + dark], published[published >= black + dark])
+        # what is bright keeps its interpolated values, but for those below all of their own colour
+        high = bright[..., None] & (published >= black + dark)
+        assert np.array_equal(kept[high], published[high])
+        if p.is_bayer:  # no colour is measured farther than one pixel away: a false bright rim is none either
+            away = ~cv2.dilate(bright.view(np.uint8), np.ones((3, 3), np.uint8)).view(bool)
+            assert kept[away].max(initial=0) <= black + dark * (1 + 1e-3)
         lowest = min(lowest, float(published.min()))
     assert (lowest < black - 100 * dark) == (method != "bilinear")  # so there is something to mend
+
+
+@pytest.mark.parametrize("ratio", [3.0, 6.0, 7.9])
+@pytest.mark.parametrize("method", METHODS)
+def test_edges_below_the_hard_ratio_give_no_negative_light(method: str, ratio: float) -> None:
+    for name in BAYER:
+        for bright in edges():
+            raw = np.where(bright, ratio * 1000, 1000).astype(np.float32)
+            assert bounded(raw, pattern(name), method, black=0.0, noise=4.0).min() >= 0
+
+
+# Bright colours that reach full scale. The white balance of the class makes green the first.
+CLIPPED = ("G", "RG", "GB", "RB", "RGB")
+
+
+@pytest.mark.parametrize("clipped", CLIPPED)
+@pytest.mark.parametrize("method", METHODS)
+def test_the_dark_side_of_a_clipped_edge_has_no_rim(method: str, clipped: str) -> None:
+    # colours that end at the same full scale do not rise by the same amount, as the kernels assume
+    black, top, balance = 70.0, 4095.0, np.array([1.43, 1.0, 1.35])
+    shown = 255 / (top - black) * balance
+    bright_dn = np.where([c in clipped for c in "RGB"], 2 * top, 0.98 * (top - black) / balance)
+    inside, lowest = np.s_[3:-3, 3:-3], 0.0  # beyond its borders the mirrored mosaic has other edges
+    for name in BAYER:
+        p = pattern(name)
+        for bright in edges():
+            for dark in (0.0, 1.0, 30.0, 100.0, 155.0, 225.0, 245.0):  # of 255; the brighter side is above
+                planes = black + np.where(bright[..., None], bright_dn, dark / shown)
+                raw = np.minimum(sample(planes.astype(np.float32), p), np.float32(top))
+                if bright.sum() == 1 and raw.max() < top:
+                    continue  # the point is a pixel of a colour that is not clipped
+                published, kept = (
+                    (((rgb - black) * shown - dark)[inside])[~bright[inside]]
+                    for rgb in (
+                        demosaic(raw, p, method),  # type: ignore[arg-type]
+                        bounded(raw, p, method, black=black, noise=3.9, clipped=raw >= top),
+                    )
+                )
+                assert kept.min(initial=0) > -1e-2  # rounding of float32 at 4095, not the 1 DN that is asked for
+                lowest = min(lowest, float(published.min(initial=0)))
+    assert (lowest < -20) == (method != "bilinear")  # so there is something to mend
+
+
+@pytest.mark.parametrize("method", ["malvar", "menon"])
+def test_bounds_beside_clipped_pixels_bring_noise_nearer_to_its_mean(method: str) -> None:
+    # one saturated pixel in 24 rows and columns: its surroundings are bounded from both sides
+    p, rng = pattern("rggb"), np.random.default_rng(8)
+    raw = rng.normal(1000, 30, (480, 480)).astype(np.float32)
+    clipped = np.zeros(raw.shape, bool)
+    clipped[12::24, 12::24] = True
+    raw[clipped] = 4095
+    near = cv2.dilate(clipped.view(np.uint8), np.ones((3, 3), np.uint8)).view(bool)
+    beside = footprint(clipped, p, method) & ~near  # type: ignore[arg-type]  # no colour is clipped within one pixel
+    published = demosaic(raw, p, method)[beside]  # type: ignore[arg-type]
+    kept = bounded(raw, p, method, black=0.0, noise=30.0, clipped=clipped)[beside]
+    shift, before = abs(kept.mean() - 1000), abs(published.mean() - 1000)
+    # the least of two to four measured values lies 0.56 to 1.03 standard deviations below their mean
+    assert shift < 0.56 * 30
+    # 4 standard errors; values share measured neighbours, at most 25 each
+    assert shift < max(before, 4 * 30 / np.sqrt(kept.size / 25))
+    assert np.abs(kept - 1000).max() <= np.abs(raw[~clipped] - 1000).max()
 
 
 @pytest.mark.parametrize(("name", "method"), FITTING)
@@ -271,8 +350,42 @@ def test_noise_without_edges_is_demosaiced_as_published(name: str, method: str) 
     p, rng = pattern(name), np.random.default_rng(5)
     for level in (0.0, 30.0, 3000.0):
         raw = (64 + level + rng.normal(0, np.hypot(3.0, np.sqrt(level)), (120, 120))).astype(np.float32)
-        published = demosaic(raw, p, method)
-        assert np.array_equal(without_undershoot(published.copy(), raw, p, method, 64.0, 3.0), published)
+        published = demosaic(raw, p, method)  # type: ignore[arg-type]
+        for clipped in (None, np.zeros(raw.shape, bool)):
+            kept = bounded_at_edges(published.copy(), raw, p, method, black=64.0, noise=3.0, clipped=clipped)  # type: ignore[arg-type]
+            assert np.array_equal(kept, published)
+
+
+@pytest.mark.parametrize("method", ["malvar", "menon"])
+def test_frames_without_hard_edges_are_only_looked_at(method: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    p, rng = pattern("grbg"), np.random.default_rng(6)
+    y, x = np.indices((200, 150))
+    smooth = (364 + 3000 * np.exp(-((x - 70) ** 2 + (y - 90) ** 2) / 1800)).astype(np.float32)
+    flat = rng.normal(64, 3, smooth.shape).astype(np.float32)
+    worked: list[int] = []
+    kernels = module._support
+    monkeypatch.setattr(module, "_support", lambda method: (worked.append(1), kernels(method))[1])
+    for raw in (smooth, flat):
+        bounded(raw, p, method, black=64.0, noise=3.0, clipped=np.zeros(raw.shape, bool))
+    assert not worked
+    flat[150, 20] = 5000
+    bounded(flat, p, method, black=64.0, noise=3.0)
+    assert worked
+
+
+@pytest.mark.parametrize("method", ["malvar", "menon"])
+def test_the_first_look_misses_no_edge(method: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    p, rng = pattern("bggr"), np.random.default_rng(7)
+    for shape in ((67, 40), (128, 21), (131, 64), (6, 9)):
+        for spread in (0.2, 0.5, 1.0, 2.0):
+            raw = np.exp(rng.normal(5, spread, shape)).astype(np.float32)
+            # an edge in the last row of a block, or one row past it
+            raw[min(64, shape[0] - 1), 5] = raw[min(63, shape[0] - 1), 8] = 3e4
+            known = {"black": 2.0, "noise": 3.0, "clipped": raw > 2e4}
+            some = bounded(raw, p, method, **known)
+            with monkeypatch.context() as everywhere:
+                everywhere.setattr(module, "_blocks_with_edges", lambda rgb, *_: np.arange(0, len(rgb), 64))
+                np.testing.assert_array_equal(some, bounded(raw, p, method, **known))
 
 
 # ------------------------------------------------------------------------------------------------- footprints
@@ -281,23 +394,47 @@ def test_noise_without_edges_is_demosaiced_as_published(name: str, method: str) 
 def changed(raw: np.ndarray, mask: np.ndarray, p: Pattern, method: str, value: float) -> np.ndarray:
     other = np.where(mask, value, raw)
     # as a detector shows them, bounded at hard edges
-    one, two = (without_undershoot(demosaic(a, p, method), a, p, method, 0.0, 1.0) for a in (raw, other))  # type: ignore[arg-type]
+    one, two = (bounded(a, p, method, black=0.0, noise=1.0, clipped=a >= 65_000) for a in (raw, other))
     out = (one != two).any(axis=2)
     for channel in set(p.channels) - set("RGB"):
         out |= interpolate(raw, p, channel) != interpolate(other, p, channel)
     return out
 
 
-@pytest.mark.parametrize(("name", "method"), [f for f in FITTING if f[1] != "menon"])
-def test_footprint_of_linear_methods_is_what_changes(name: str, method: str) -> None:
+def defects_apart(shape: tuple[int, int]) -> np.ndarray:
+    """Corners and borders; every filter; far apart, so that no two changes cancel."""
+    mask = np.zeros(shape, bool)
+    mask[::12, ::11] = mask[-1, -1] = mask[31, 30] = True
+    return mask
+
+
+@pytest.mark.parametrize(("name", "method"), [f for f in FITTING if f[1] == "bilinear"])
+def test_footprint_of_the_linear_method_is_what_changes(name: str, method: str) -> None:
     p = pattern(name)
     raw = random_raw((70, 60)).astype(np.float32)
-    mask = np.zeros(raw.shape, bool)
-    mask[::12, ::11] = True  # corners and borders; every filter; far apart, so that no two changes cancel
-    mask[-1, -1] = True
-    mask[31, 30] = True
+    mask = defects_apart(raw.shape)
     np.testing.assert_array_equal(footprint(mask, p, method), changed(raw, mask, p, method, 3e5))
     assert not footprint(np.zeros_like(mask), p, method).any()
+
+
+@pytest.mark.parametrize("name", BAYER)
+def test_footprint_of_malvar_is_its_kernels_and_what_shows_a_clipped_edge(name: str) -> None:
+    p = pattern(name)
+    raw = random_raw((70, 60)).astype(np.float32)
+    mask = defects_apart(raw.shape)
+    where = footprint(mask, p, "malvar")
+    seen = np.zeros_like(mask)
+    for scene in (raw, raw / 1000, cv2.GaussianBlur(raw, (5, 5), 0)):
+        for value in (0.0, 300.0, 3e5):
+            seen |= changed(scene, mask, p, "malvar", value)
+            seen |= (demosaic(scene, p, "malvar") != demosaic(np.where(mask, value, scene), p, "malvar")).any(
+                axis=2
+            )
+    assert not (seen & ~where).any()
+    # 21 pixels inside, of which the kernels weight at least 9
+    assert where[29:34, 28:33].sum() == 21
+    assert seen.sum() > 0.5 * where.sum()
+    assert not footprint(np.zeros_like(mask), p, "malvar").any()
 
 
 @pytest.mark.parametrize("name", BAYER)

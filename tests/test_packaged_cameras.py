@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from conftest import small_scene
@@ -12,8 +14,9 @@ from conftest import small_scene
 from vbnfault import dataset, pipeline, store
 from vbnfault.core import llvm, photometry, resources, spectra
 from vbnfault.core.errors import VbnfaultError
-from vbnfault.core.quantities import Irradiance
+from vbnfault.core.quantities import Electrons, Irradiance
 from vbnfault.detector import MosaicDetector
+from vbnfault.detector.mosaic import sample
 from vbnfault.detector.readout import ReadoutNoise, analogue_dn, read_out
 from vbnfault.detector.sensor import load_sensor
 from vbnfault.lens import ThinLens, load_lens
@@ -103,6 +106,29 @@ def test_noise_hides_the_steps_of_the_converter(name: str) -> None:
         electrons = np.full(shape, (20 + part) / spec.system_gain_dn_per_e, np.float32)
         level = analogue_dn(electrons, spec).mean(dtype=np.float64) + sigma * noise.read.mean(dtype=np.float64)
         assert read_out(electrons, spec, noise).mean(dtype=np.float64) == pytest.approx(level, abs=allowed)
+
+
+@pytest.mark.parametrize("name", [n for n in DETECTORS if load_sensor(n).pattern.is_bayer])
+@pytest.mark.parametrize("method", ["malvar", "menon"])
+def test_nothing_is_darker_beside_a_saturated_strut_than_it_is_measured(name: str, method: str) -> None:
+    """A strut of 3 px, ten times white, before ground at 40 % of white."""
+    y, x = np.indices((48, 64))
+    strut = (np.abs(x - 12) <= 1) | (np.abs(x - y - 16) <= 1) | (np.abs(y - 40) <= 1)
+    sensor = load_sensor(name)
+    light = np.where(strut, 10.0, 0.4).astype(np.float32)[..., None]
+    pictures = {}
+    for how in (method, "bilinear"):
+        detector = MosaicDetector(sensor=replace(sensor, demosaic=how), seed=3, width_px=64, height_px=48)
+        expected = Electrons(array=light * detector.white_e, white_e=detector.white_e)
+        pictures[how] = detector.develop(expected, 1e-3, None).array[..., :3]
+    # bilinear interpolation keeps what is measured, so its least value within one pixel is at most the least that
+    # is measured there
+    least = cv2.erode(pictures["bilinear"], np.ones((3, 3), np.uint8))
+    saturated = detector.device.raw(sample(expected.array, sensor.pattern), 1e-3) >= detector.device.saturated_dn
+    assert saturated[strut].all()
+    assert saturated.mean() < 0.9  # a CCD without antiblooming fills the columns
+    beside = detector.footprint(saturated) & ~saturated
+    assert (pictures[method][beside] >= least[beside]).all()
 
 
 # --- Rosetta's navigation camera ---------------------------------------------------------------------------------

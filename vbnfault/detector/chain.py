@@ -12,6 +12,7 @@ pixel always shows its own level.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache, partial
@@ -24,7 +25,7 @@ from numpy.typing import NDArray
 from ..core.quantities import DEAD, HOT, LUMINANCE, RGBI, RTS, RTS_HIGH, STUCK, TRAP
 from .charge import ChargeCloud, bloom, capture, cti, parasitic_light, smear, smear_interline
 from .dark import Telegraph
-from .demosaic import correct_defects, demosaic, interpolate, without_undershoot
+from .demosaic import bounded_at_edges, correct_defects, demosaic, interpolate
 from .efficiency import white_balance
 from .individual import Individual, IndividualSpec, StuckPixels, dark_rate_e_s, make_individual, offset_e, response
 from .mosaic import channel_of
@@ -262,6 +263,20 @@ class Device:
         return rows.astype(np.float32) if rows.max() > _LEAST_BLACK_DN else None
 
     @cached_property
+    def saturated_dn(self) -> Raw:
+        """Raw number from which each pixel counts as saturated, uint16[y, x] in DN.
+
+        It is what a full well gives there through the pixel's own node, offsets and converter, less what temporal
+        noise can take away (interference whole, the rest four standard deviations).
+        """
+        readout = self.sensor.readout
+        full = np.full(self.shape, readout.full_well_e, dtype=np.float32)
+        temporal_e = math.hypot(readout.noise_e_rms, readout.row_noise_e_rms)
+        margin_dn = (4 * temporal_e + 2 * readout.banding_seen_e) * readout.system_gain_dn_per_e
+        level = read_out(full, readout, None, self.readout_individual) - np.float32(margin_dn)
+        return np.ceil(np.maximum(level, 0)).astype(np.uint16)
+
+    @cached_property
     def bad(self) -> NDArray[np.bool_]:
         """Return the hot, dead and stuck pixels, bool[y, x], as a camera's defect map would list them."""
         return (self._kinds & (HOT | DEAD | STUCK)) > 0
@@ -299,6 +314,7 @@ class Device:
         mosaic: NDArray[Any] = raw
         if sensor.correct_defects:
             mosaic = correct_defects(raw, self.bad, sensor.pattern)
+        saturated = mosaic >= self.saturated_dn
         black, highest = self.black_dn(exposure_s), 0.0
         if self.row_black_dn is not None:
             mosaic, highest = mosaic - self.row_black_dn, float(self.row_black_dn.max())
@@ -312,7 +328,9 @@ class Device:
         shown = [scale.get(colour, scale.get("W", full)) for colour in "RGB"]
         linear = demosaic(mosaic, sensor.pattern, sensor.method)
         noise_dn = sensor.readout.read_noise_e_rms * sensor.readout.system_gain_dn_per_e
-        linear = without_undershoot(linear, mosaic, sensor.pattern, sensor.method, black, noise_dn)
+        linear = bounded_at_edges(
+            linear, mosaic, sensor.pattern, sensor.method, black=black, noise=noise_dn, clipped=saturated
+        )
         rgb = cv2.multiply(cv2.subtract(linear, (black, black, black, 0.0)), (*shown, 0.0), dtype=cv2.CV_8U)
         out = np.empty((*raw.shape, 4), dtype=np.uint8)
         if "W" in sensor.pattern.channels:

@@ -8,7 +8,7 @@ Normalised convolution needs no mirror: it uses only the pixels inside the mosai
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from functools import lru_cache, partial
+from functools import lru_cache
 from typing import Any, Literal, get_args
 
 import cv2
@@ -29,6 +29,11 @@ _MIRROR = cv2.BORDER_REFLECT_101
 # Both are even, so that every block begins with the same filters.
 _ROWS_PER_BLOCK = 64
 _HALO_PX = {"bilinear": 2, "malvar": 2, "menon": 8}
+# Rows whose extremes the first look for edges takes together: at least the halo, a divisor of the block.
+_ROWS_PER_LOOK = {"malvar": 4, "menon": 8}
+
+# A hard edge spans more standard deviations of the noise than this and more than this to one.
+_HARD_NOISE, _HARD_RATIO = 16.0, 8.0
 
 # Bilinear: weights with which a pixel contributes to the neighbours in its own plane (Losson, Macaire & Yang 2010,
 # Advances in Imaging and Electron Physics 162, doi 10.1016/S1076-5670(10)62005-8). The first is [½ 1 ½]ᵀ [½ 1 ½].
@@ -101,15 +106,27 @@ def demosaic(raw: NDArray[Any], pattern: Pattern, method: Method = "bilinear") -
     return cv2.merge([_normalised(signal, pattern, colour) for colour in "RGB"])
 
 
-def without_undershoot(
-    rgb: F32, raw: NDArray[Any], pattern: Pattern, method: Method, black: float, noise: float
+def bounded_at_edges(
+    rgb: F32,
+    raw: NDArray[Any],
+    pattern: Pattern,
+    method: Method,
+    *,
+    black: float,
+    noise: float,
+    clipped: Mask | None = None,
 ) -> F32:
-    """Return the demosaiced planes, corrected where a hard edge makes its dark side darker than it was measured.
+    """Return demosaiced planes in which no hard or clipped edge leaves a rim on its dark side.
 
-    The kernels of Malvar and Menon have negative weights, which sharpen. Beside an edge of 10,000:1 they turn the
-    dark side negative by a quarter of the bright side. A value there is raised to the smallest measured value of
-    its own colour within one pixel. This happens only where the surrounding values span more than noise can (16
-    standard deviations) and more than 8:1 above black. Elsewhere a lower bound alone would bias the noise.
+    The kernels of Malvar and Menon have negative weights and take all colours to rise by the same amount. Beside an
+    edge of 10,000:1 they turn the dark side negative by a quarter of the bright one. Where pixels are clipped,
+    colours do not rise alike, and the rim reaches 190 DN of 255. There a value stays within its own colour's
+    measured values within one pixel: never below the least, and on the dark side of the edge never above the
+    greatest.
+
+    An edge is hard where the pixels of the method's `footprint` span more than noise can (16 standard deviations)
+    and more than 8:1 above black, or 2:1 where the value is below black. A clipped pixel may have any brightness,
+    so an edge beside it is always hard. Elsewhere values stay as published: a bound there would change the noise.
 
     Parameters
     ----------
@@ -123,27 +140,84 @@ def without_undershoot(
         Black level of `raw`.
     noise
         Standard deviation of the noise in the dark, in the unit of `raw`.
+    clipped
+        bool[y, x], pixels of `raw` that are saturated; None: no pixel.
 
     Returns
     -------
     F32
-        `rgb`. The correction depends on the same pixels as `demosaic`, so `footprint` is valid for it too.
+        `rgb`. The correction depends on pixels within the method's `footprint` only.
     """
     if method == "bilinear" or not pattern.is_bayer:
         return rgb
     signal = _checked(raw)
-    if method == "malvar":
-        most = _in_blocks(partial(_malvar, filtered=_most), signal, pattern, method)
-    else:
-        most = np.repeat(cv2.dilate(signal, _menon_support())[..., None], 3, axis=2)
-    channels = channel_of(pattern, (signal.shape[0], signal.shape[1]))
-    for k, colour in enumerate("RGB"):
-        own = np.where(channels == pattern.index(colour), signal, np.float32(np.inf))
-        least = cv2.erode(own, np.ones((3, 3), np.uint8))
-        span = most[..., k] - least
-        edge = (span > 16 * noise) & (span > 7 * (least - black)) & (rgb[..., k] < least)
-        np.copyto(rgb[..., k], least, where=edge)
+    bright = signal
+    if clipped is not None and clipped.any():
+        bright = np.where(clipped, np.float32(np.inf), signal)
+    halo = _HALO_PX[method]
+    starts = _blocks_with_edges(rgb, signal, bright, method, black, noise)
+    if not len(starts):
+        return rgb
+    measured = cv2.copyMakeBorder(signal, halo, halo, halo, halo, _MIRROR)
+    brightest = measured if bright is signal else cv2.copyMakeBorder(bright, halo, halo, halo, halo, _MIRROR)
+
+    def bound(start: int) -> None:
+        block = rgb[start : start + _ROWS_PER_BLOCK]
+        rows = slice(start, start + len(block) + 2 * halo)
+        inner = np.s_[halo:-halo, halo:-halo]
+        top = cv2.dilate(brightest[rows], _support(method))[inner]
+        lowest = cv2.erode(measured[rows], np.ones((3, 3), np.uint8))[inner]
+        # the few pixels where an edge may be hard for one of the colours
+        y, x = np.nonzero((top - lowest > _HARD_NOISE * noise) & (top - lowest > lowest - black))
+        least = _malvar(measured[rows], pattern, filtered=_least_beside)
+        greatest = _malvar(measured[rows], pattern, filtered=_greatest_beside)
+        top, own = top[y, x], brightest[rows][inner][y, x] - black
+        for k in range(3):
+            value, low, high = block[y, x, k], least[k][inner][y, x], greatest[k][inner][y, x]
+            span, dark = top - low, low - black
+            ratio = (span > (_HARD_RATIO - 1) * dark) | ((value < black) & (span > dark))
+            hard = (span > _HARD_NOISE * noise) & ratio
+            dark_side = hard & (_HARD_RATIO * own < top - black)
+            value = np.where(hard & (value < low), low, value)
+            block[y, x, k] = np.where(dark_side & (value > high), high, value)
+
+    list(_pool().map(bound, starts))
     return rgb
+
+
+def _blocks_with_edges(
+    rgb: F32, signal: F32, bright: F32, method: Method, black: float, noise: float
+) -> NDArray[np.intp]:
+    """Return the first rows, int[n], of the blocks of rows that may hold a hard edge.
+
+    This is a cheap first look, at the extremes of groups of rows: it finds every pixel that `bounded_at_edges`
+    changes, since the extremes of the groups are at least as far apart as those of the pixels that decide.
+    """
+    group, reach = _ROWS_PER_LOOK[method], _HALO_PX[method]
+    # a group and the two beside it hold all rows within reach
+    top = cv2.dilate(_by_groups(np.max, bright, group), np.ones((3, 2 * reach + 1), np.uint8))
+    low = cv2.erode(_by_groups(np.min, signal, group), np.ones((3, 3), np.uint8))
+    span, dark = top - low, low - black
+    clear = span > _HARD_NOISE * noise
+    blocks = np.arange(0, len(span), _ROWS_PER_BLOCK // group)
+    hard, negative = (
+        np.logical_or.reduceat((clear & (span > ratio * dark)).any(axis=1), blocks)
+        for ratio in (_HARD_RATIO - 1, 1)
+    )
+    starts = range(0, len(signal), _ROWS_PER_BLOCK)
+    wanted = [
+        hard[i] or (negative[i] and rgb[start : start + _ROWS_PER_BLOCK].min() < black)
+        for i, start in enumerate(starts)
+    ]
+    return np.flatnonzero(wanted) * _ROWS_PER_BLOCK
+
+
+def _by_groups(extreme: Callable[..., F32], array: F32, rows: int) -> F32:
+    """Return the extreme of each `rows` rows of an array [y, x], the last of which may be fewer."""
+    whole = len(array) - len(array) % rows
+    out = extreme(array[:whole].reshape(-1, rows, array.shape[1]), axis=1)
+    # not `reduceat`, which takes twenty times as long
+    return out if whole == len(array) else np.concatenate([out, extreme(array[whole:], axis=0, keepdims=True)])
 
 
 def interpolate(raw: NDArray[Any], pattern: Pattern, channel: str) -> F32:
@@ -157,16 +231,13 @@ def interpolate(raw: NDArray[Any], pattern: Pattern, channel: str) -> F32:
 def footprint(mask: Mask, pattern: Pattern, method: Method = "bilinear") -> Mask:
     """Return the pixels whose R, G, B (or W, NIR) may depend on the mosaic pixels in `mask`, bool[y, x].
 
-    `mask` is bool[y, x]. For linear methods the result is exact: the support of their kernels. Menon's method
-    chooses its direction from the signal. For it the result is the union over all choices, up to 8 pixels away; a
-    single image shows a part of this.
+    `mask` is bool[y, x]. For bilinear interpolation, which is linear, the result is exact: the support of its
+    kernels. The methods of Malvar and Menon, with `bounded_at_edges`, choose by the signal. For them the result is
+    the union over all choices, up to 2 and 8 pixels away; a single image shows a part of this.
     """
     ones = _checked(mask)
-    if method == "menon" and pattern.is_bayer:
-        return cv2.dilate(np.ascontiguousarray(mask, dtype=np.uint8), _menon_support()).view(np.bool_)
-    if method == "malvar" and pattern.is_bayer:
-        touched = _in_blocks(partial(_malvar, filtered=_unsigned), ones, pattern, method)
-        return cv2.transform(touched, _SUM).reshape(mask.shape) > 0
+    if method != "bilinear" and pattern.is_bayer:
+        return cv2.dilate(np.ascontiguousarray(mask, dtype=np.uint8), _support(method)).view(np.bool_)
     touched = demosaic(ones, pattern, method)
     out = cv2.transform(touched, _SUM).reshape(mask.shape) > 0
     for channel in set(pattern.channels) - set("RGB"):
@@ -365,14 +436,23 @@ def _signed(raw: F32, kernel: F32) -> F32:
     return cv2.filter2D(raw, -1, kernel)
 
 
-def _unsigned(raw: F32, kernel: F32) -> F32:
-    """Return the sum with absolute weights: positive wherever the result depends on a marked pixel."""
-    return cv2.filter2D(raw, -1, np.abs(kernel))
+def _beside(kernel: F32) -> NDArray[np.uint8]:
+    """Return which pixels within one of the centre hold the colour that a kernel of Malvar's gives, uint8[3, 3]."""
+    near = (kernel[1:4, 1:4] > 0).astype(
+        np.uint8
+    )  # the pixel's own colour counts there by its differences, below 0
+    near[1, 1] = 0
+    return near
 
 
-def _most(raw: F32, kernel: F32) -> F32:
-    """Return the greatest value among the pixels that have a weight in the kernel."""
-    return cv2.dilate(raw, (kernel != 0).astype(np.uint8))
+def _least_beside(raw: F32, kernel: F32) -> F32:
+    """Return the least value of the kernel's colour that is measured within one pixel."""
+    return cv2.erode(raw, _beside(kernel))
+
+
+def _greatest_beside(raw: F32, kernel: F32) -> F32:
+    """Return the greatest value of the kernel's colour that is measured within one pixel."""
+    return cv2.dilate(raw, _beside(kernel))
 
 
 def _malvar(raw: F32, pattern: Pattern, *, filtered: Callable[[F32, F32], F32] = _signed) -> list[F32]:
@@ -483,21 +563,27 @@ def _menon(raw: F32, pattern: Pattern) -> list[F32]:
     return [out_red, green, out_blue]
 
 
-@lru_cache(maxsize=1)
-def _menon_support() -> NDArray[np.uint8]:
-    """Return which pixels around a changed pixel may change, uint8[17, 17].
+@lru_cache(maxsize=2)
+def _support(method: Method) -> NDArray[np.uint8]:
+    """Return which pixels around one may change its colours, uint8[y, x].
 
-    Green depends on the decision, which uses 9 × 5 and 5 × 9 pixels. The refined colour differences depend on green
-    along an axis by up to 2 pixels. Red and blue depend on those within 2 steps.
+    Malvar: 5 × 5 pixels without their corners. The kernels use fewer of them; the others show that a colour is
+    clipped on the bright side of an edge where the kernel itself meets only a colour that is not. Menon: green
+    depends on the decision, which uses 9 × 5 and 5 × 9 pixels. The refined colour differences depend on green along
+    an axis by up to 2 pixels. Red and blue depend on those within 2 steps.
     """
-    point = np.zeros((17, 17), dtype=np.uint8)
-    point[8, 8] = 1
-    cross = np.array([[0, 1, 0], [1, 1, 1], [0, 1, 0]], dtype=np.uint8)
-    axes = np.zeros((5, 5), dtype=np.uint8)
-    axes[2, :] = axes[:, 2] = 1
-    decision = np.zeros((9, 9), dtype=np.uint8)
-    decision[2:7, :] = decision[:, 2:7] = 1
-    for element in (cross, cross, axes, decision):
-        point = cv2.dilate(point, element, borderValue=0)
-    point.flags.writeable = False
-    return point
+    if method == "malvar":
+        support = np.ones((5, 5), dtype=np.uint8)
+        support[::4, ::4] = 0
+    else:
+        support = np.zeros((17, 17), dtype=np.uint8)
+        support[8, 8] = 1
+        cross = np.array([[0, 1, 0], [1, 1, 1], [0, 1, 0]], dtype=np.uint8)
+        axes = np.zeros((5, 5), dtype=np.uint8)
+        axes[2, :] = axes[:, 2] = 1
+        decision = np.zeros((9, 9), dtype=np.uint8)
+        decision[2:7, :] = decision[:, 2:7] = 1
+        for element in (cross, cross, axes, decision):
+            support = cv2.dilate(support, element, borderValue=0)
+    support.flags.writeable = False
+    return support
