@@ -245,7 +245,7 @@ def test_what_overflows_from_a_track_is_in_its_mask() -> None:
     camera = {"width_px": 96, "height_px": 80, "detector": "generic_ccd", "exposure_s": 0.02}
     scene = {**small_scene(camera=camera, plan={"faulty_fraction": 1.0}), "faults": faults}
     s = Session(config.parse_scene(scene, source="test"))
-    frame = s.frame(0)
+    frame = s.frame(1)
     footprint = s.faults["cosmic_rays"].footprint(frame.drawn["cosmic_rays"], frame.context)
     assert footprint is not None
     change = np.abs(frame.images["image"].array.astype(int) - frame.images["clean"].array).max(axis=2)
