@@ -68,6 +68,14 @@ def test_what_fails_follows_the_architecture(architecture: str) -> None:
     assert 1 <= registers <= 17 if ccd else registers == 0
 
 
+def test_only_the_first_line_cannot_repeat_the_one_before_it() -> None:
+    where = context()
+    drawn = [entry for seed in range(40) for entry in fault().draw(where, rng(seed))["lines"]]
+    repeated = [entry for entry in drawn if entry["kind"] == "duplicated"]
+    assert len(repeated) > 10
+    assert all(entry["index"] > 0 for entry in repeated)
+
+
 def test_lines_in_closed_form_on_cmos() -> None:
     where = context()
     raw = raw_of(where)
@@ -94,6 +102,7 @@ def test_charge_beyond_a_defect_of_a_ccd_never_arrives(direction: str, broken: s
 def test_nodes_and_register() -> None:
     where = context("frame_transfer_ccd", nodes=4)
     quadrants = node_of(where.shape, 4)
+    assert np.array_equal(after(where, node=0) == 0, quadrants == 0)
     out = after(where, node=2)
     assert np.array_equal(out == 0, quadrants == 2)
     # the right nodes read from the right edge: 10 pixels of 32 pass, 22 lie behind

@@ -47,6 +47,19 @@ def light(model: str, where: FaultContext, **keys: Any) -> tuple[Any, dict[str, 
     return fault.apply(black, params, where).array.astype(np.float64), params
 
 
+def test_what_is_left_of_the_direct_light_is_a_mean_over_each_channels_bands() -> None:
+    """Each channel's weights add up to 1, so nearly all is left where the surfaces are smooth and nothing veils."""
+    where = context()
+    fault = registry()["straylight"]["paraxial"](cleanliness_level=0, roughness_nm=0, veil_fraction=0)
+    found = fault._light(fault.draw(where, np.random.default_rng(3)), where)
+    assert found is not None
+    assert found.direct_left.shape == (3,)
+    # starburst takes 11 to 13 % here; weights of four bands in three channels that did not add up to 1 in each
+    # channel would give a third more
+    assert (found.direct_left > 0.8).all()
+    assert (found.direct_left <= 1).all()
+
+
 @pytest.mark.parametrize("model", MODELS)
 def test_ghosts_lie_on_the_line_from_the_sun_through_the_centre(model: str) -> None:
     where = context()
