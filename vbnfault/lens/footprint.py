@@ -22,9 +22,11 @@ from scipy.interpolate import PchipInterpolator
 from ..core import resources
 from .aperture import stopped_down
 from .gaussian import scaled_to_focal_length
+from .glass import D_NM
 from .imaging import RealLens
+from .mapping import inclined_rays
 from .prescription import Prescription, load_lens
-from .rays import Path, trace
+from .rays import Path
 from .thin import ThinLens
 
 F64 = NDArray[np.float64]
@@ -147,7 +149,9 @@ class Beams:
         distance = self.rim_mm[..., None] * np.sqrt(np.arange(_RINGS + 1) / _RINGS)
         turn = np.linspace(0, np.pi, _AZIMUTHS)[:, None]
         x = self.centre_mm[:, None, None] + distance * np.cos(turn)
-        return _rays(self.lens, self.sensor_mm, self.slope[:, None, None], x, distance * np.sin(turn))[0]
+        return inclined_rays(
+            self.lens, self.slope[:, None, None], x, distance * np.sin(turn), D_NM, self.sensor_mm
+        )[0]
 
     def on_row(self, row: int) -> Footprint:
         """Return the footprints on a surface."""
@@ -212,22 +216,9 @@ def _fitted(x: F64, y: F64, area: F64, light: F64) -> F64:
     return np.asarray(found / scale[:, None] ** np.array([0, 1, 2, 2]))
 
 
-def _rays(lens: Prescription, sensor_mm: float, slope: F64, x: F64, y: F64) -> tuple[Path, tuple[int, ...]]:
-    """Trace rays through (x, y) of the first vertex's plane with the slope dx/dz; return also the common shape."""
-    slope, x, y = np.broadcast_arrays(slope, x, y)
-    nothing = np.zeros(x.size)
-    found = trace(
-        lens,
-        np.column_stack([x.ravel(), y.ravel(), nothing]),
-        np.column_stack([slope.ravel(), nothing, nothing + 1]),
-        sensor_mm=sensor_mm,
-    )
-    return found, x.shape
-
-
 def _beyond(lens: Prescription, sensor_mm: float, slope: F64, x: F64, y: F64) -> F64:
     """Return each ray's largest distance from the axis in semi-diameters; inf for a ray that does not arrive."""
-    found, shape = _rays(lens, sensor_mm, slope, x, y)
+    found, shape = inclined_rays(lens, slope, x, y, D_NM, sensor_mm)
     lost = ~np.isfinite(found.points_mm[-1, :, 0])
     return np.where(lost, np.inf, found.relative_radius).reshape(shape)
 

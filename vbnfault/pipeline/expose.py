@@ -129,7 +129,7 @@ def _render_to_the_noise(frame: Frame, scene: RenderInput, guide: Truth | None, 
     surface, settings = frame.spec.terrain.surface, frame.spec.scene.render
     lens_and_sensor = green_per_second(frame)
     found, halves = render.direct(surface, scene, lens_and_sensor)
-    array, sun = found.array.copy(), None if found.sun is None else found.sun.copy()
+    array = found.array.copy()
     once_more = (
         np.zeros_like(array) if guide is None or not scene.bounces else render.indirect(surface, scene, guide)
     )
@@ -160,11 +160,10 @@ def _render_to_the_noise(frame: Frame, scene: RenderInput, guide: Truth | None, 
             again = replace(scene, samples_per_pixel=4 * int(samples), key=key)
             more, halves = render.direct(surface, again, lens_and_sensor, chosen)
             array.reshape(len(array), -1)[:, chosen] = more.array[:, 0]
-            if sun is not None:
-                sun.reshape(len(sun), -1)[:, chosen] = 0 if more.sun is None else more.sun[:, 0]
             error_e.ravel()[chosen] = np.abs(halves[0]) * exposure
         spent[noisy] *= 4
-    _keep(frame, replace(found, array=array + once_more, sun=sun))
+    # the Sun's own part depends on no rays, so the first one holds
+    _keep(frame, replace(found, array=array + once_more))
     frame.samples_per_pixel = float(spent.mean())
     frame.noise_fraction_p99 = float(np.percentile(share[lit], 99)) if lit.any() else 0.0
 
