@@ -13,7 +13,7 @@ from vbnfault.body import Body, Patch, Site, build_patch, choose_sites, load_bod
 from vbnfault.body.boulders import PER_KM2, SizeLaw, scatter, smallest_at
 from vbnfault.body.shape import check_mesh, signed_volume
 from vbnfault.core.errors import InputError
-from vbnfault.scene.config import PatchTable
+from vbnfault.scene.target import PatchTable
 
 REAL_SHAPE = Path(__file__).parents[2] / "shared/data/shapes/67p_18k.obj"
 QUICK = {"facet_m": 4.0, "radius_m": 150.0, "min_boulder_m": 0.8, "max_triangles": 1_200_000}

@@ -16,8 +16,9 @@ from scipy import stats
 from vbnfault import faults
 from vbnfault.core import resources
 from vbnfault.core.errors import InputError
-from vbnfault.scene import config
+from vbnfault.scene import config, keyed_random
 from vbnfault.scene.config import Scene, load_scene, parse_scene
+from vbnfault.scene.hashing import content_hash
 
 PACKAGED = sorted(resources.packaged("scenes"))
 
@@ -460,29 +461,29 @@ def test_json_schema_describes_the_scene_file() -> None:
 def test_content_hash_tells_everything_apart() -> None:
     base = {"a": 1, "b": [1, 2]}
     different = [
-        config.content_hash(),
-        config.content_hash(base),
-        config.content_hash({**base, "a": 2}),
-        config.content_hash({**base, "b": [2, 1]}),
-        config.content_hash({**base, "c": None}),
-        config.content_hash(base, b""),
-        config.content_hash(b"", base),
-        config.content_hash(b"ab", b"c"),
-        config.content_hash(b"a", b"bc"),  # the border between parts counts
-        config.content_hash(b"abc"),
-        config.content_hash(1),
-        config.content_hash("1"),
-        config.content_hash(1.0),
+        content_hash(),
+        content_hash(base),
+        content_hash({**base, "a": 2}),
+        content_hash({**base, "b": [2, 1]}),
+        content_hash({**base, "c": None}),
+        content_hash(base, b""),
+        content_hash(b"", base),
+        content_hash(b"ab", b"c"),
+        content_hash(b"a", b"bc"),  # the border between parts counts
+        content_hash(b"abc"),
+        content_hash(1),
+        content_hash("1"),
+        content_hash(1.0),
     ]
     assert len(set(different)) == len(different)
     assert all(len(h) == 64 and int(h, 16) >= 0 for h in different)
     # the order of a table's keys does not count
-    assert config.content_hash(base) == config.content_hash({"b": [1, 2], "a": 1})
+    assert content_hash(base) == content_hash({"b": [1, 2], "a": 1})
 
 
 def test_hash_of_a_scene_follows_every_number_of_it() -> None:
     plain = load_scene("quickstart").resolved()
-    reference = config.content_hash(plain)
+    reference = content_hash(plain)
     for table, key, schema in schema_numbers():
         value = plain[table][key]
         if isinstance(value, int | float):
@@ -490,13 +491,13 @@ def test_hash_of_a_scene_follows_every_number_of_it() -> None:
                 **plain,
                 table: {**plain[table], key: value + (1 if schema["type"] == "integer" else 1e-9)},
             }
-            assert config.content_hash(changed) != reference, (table, key)
+            assert content_hash(changed) != reference, (table, key)
 
 
 def test_rng_is_keyed_by_all_four_and_by_nothing_else() -> None:
-    first = config.rng(1, 2, "stage", "name").random(4)
-    config.rng(9, 9, "other", "draws").random(1000)  # what else is drawn, and when, does not matter
-    np.testing.assert_array_equal(config.rng(1, 2, "stage", "name").random(4), first)
+    first = keyed_random.rng(1, 2, "stage", "name").random(4)
+    keyed_random.rng(9, 9, "other", "draws").random(1000)  # what else is drawn, and when, does not matter
+    np.testing.assert_array_equal(keyed_random.rng(1, 2, "stage", "name").random(4), first)
     keys = [(0, 2, "stage", "name"), (1, 3, "stage", "name"), (1, 2, "stag", "name"), (1, 2, "stage", "nam")]
     # the borders between the keys count too
     keys += [
@@ -505,14 +506,14 @@ def test_rng_is_keyed_by_all_four_and_by_nothing_else() -> None:
         (1, 2, "stagen", "ame"),
         (2, 1, "stage", "name"),
     ]
-    drawn = {tuple(config.rng(*key).random(4)) for key in keys} | {tuple(first)}
+    drawn = {tuple(keyed_random.rng(*key).random(4)) for key in keys} | {tuple(first)}
     assert len(drawn) == len(keys) + 1
 
 
 def test_rng_streams_of_neighbours_are_uniform_and_uncorrelated() -> None:
     # first number of 6000 streams that differ in the sample only, against those of the next name
     n = 6000
-    a, b = (np.array([config.rng(3, i, "fault", name).random() for i in range(n)]) for name in ("x", "y"))
+    a, b = (np.array([keyed_random.rng(3, i, "fault", name).random() for i in range(n)]) for name in ("x", "y"))
     assert stats.kstest(a, "uniform").pvalue > 1e-4
     # a correlation of independent numbers has the spread 1/√n: 4.5 of it is 7e-6 two-sided
     for pair in ((a, b), (a[:-1], a[1:])):
@@ -527,7 +528,7 @@ def test_keyed_uniform_is_uniform() -> None:
     for seed in (0, 1, 2**63 - 1):
         for name in ("roll_deg/0", "roll_deg/1", "height_m/0"):
             for start in (0, 10_000_000):
-                u = config.keyed_uniform(seed, SAMPLES + start, "plan", name)
+                u = keyed_random.keyed_uniform(seed, SAMPLES + start, "plan", name)
                 assert u.dtype == np.float64
                 assert u.min() >= 0
                 assert u.max() < 1
@@ -542,7 +543,7 @@ def test_keyed_uniform_is_uniform() -> None:
 
 def test_keyed_uniform_uses_its_low_bits() -> None:
     # 53 bits: each is set in half of the numbers, 4.5 standard deviations of √(n/4)
-    bits = (config.keyed_uniform(5, SAMPLES, "plan", "x") * 2.0**53).astype(np.uint64)
+    bits = (keyed_random.keyed_uniform(5, SAMPLES, "plan", "x") * 2.0**53).astype(np.uint64)
     for b in range(53):
         ones = int(((bits >> np.uint64(b)) & np.uint64(1)).sum())
         assert abs(ones - len(SAMPLES) / 2) < 4.5 * np.sqrt(len(SAMPLES) / 4)
@@ -550,7 +551,7 @@ def test_keyed_uniform_uses_its_low_bits() -> None:
 
 def test_keyed_uniform_is_independent_across_names_seeds_and_stages() -> None:
     columns = [
-        config.keyed_uniform(seed, SAMPLES, stage, name)
+        keyed_random.keyed_uniform(seed, SAMPLES, stage, name)
         for seed in (1, 2)
         for stage in ("plan", "resolve")
         for name in ("roll_deg/0", "pitch_deg/0", "roll_deg/1")
@@ -562,10 +563,10 @@ def test_keyed_uniform_is_independent_across_names_seeds_and_stages() -> None:
 
 
 def test_keyed_uniform_does_not_depend_on_what_else_is_asked() -> None:
-    u = config.keyed_uniform(7, SAMPLES[:100], "plan", "x")
+    u = keyed_random.keyed_uniform(7, SAMPLES[:100], "plan", "x")
     pick = np.array([3, 99, 0])
-    np.testing.assert_array_equal(config.keyed_uniform(7, pick, "plan", "x"), u[pick])
-    assert not np.array_equal(config.keyed_uniform(8, SAMPLES[:100], "plan", "x"), u)
+    np.testing.assert_array_equal(keyed_random.keyed_uniform(7, pick, "plan", "x"), u[pick])
+    assert not np.array_equal(keyed_random.keyed_uniform(8, SAMPLES[:100], "plan", "x"), u)
 
 
 def test_keyed_uniform_is_the_published_finaliser() -> None:
@@ -580,4 +581,4 @@ def test_keyed_uniform_is_the_published_finaliser() -> None:
             x = ((x ^ (x >> 30)) * 0xBF58476D1CE4E5B9) & u64
             x = ((x ^ (x >> 27)) * 0x94D049BB133111EB) & u64
             x ^= x >> 31
-        assert config.keyed_uniform(7, np.array([sample]), "plan", "x")[0] == (x >> 11) / 2**53
+        assert keyed_random.keyed_uniform(7, np.array([sample]), "plan", "x")[0] == (x >> 11) / 2**53

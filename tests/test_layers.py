@@ -18,10 +18,10 @@ from vbnfault.core.errors import InputError
 from vbnfault.core.quantities import SOFT_KINDS, soft_kind
 from vbnfault.faults import Fault, from_dict, registry
 from vbnfault.pipeline import Session
-from vbnfault.scene import config
+from vbnfault.scene import config, sampling
 
 # The names of layers that the scene file takes; the patterns of names are filled in below.
-PATTERN = next(m.pattern for m in typing.get_args(config.Layer)[1].metadata if hasattr(m, "pattern"))
+PATTERN = next(m.pattern for m in typing.get_args(sampling.Layer)[1].metadata if hasattr(m, "pattern"))
 NAMED = [name for name in re.sub(r"^\^\(|\)\$$", "", PATTERN).split("|") if re.fullmatch(r"[A-Za-z_]+", name)]
 PAPER = {name: {} for name in ("dust_on_optics", "broken_pixels", "broken_lines", "straylight", "vignetting")}
 PHYSICAL = {
@@ -175,6 +175,6 @@ def test_mask_any_unites_the_classes_that_a_scene_chooses() -> None:
 
 
 def test_mask_effect_is_stored_by_default_and_soft_layers_need_their_fault() -> None:
-    assert "mask_effect" in config.DatasetTable().layers
+    assert "mask_effect" in sampling.DatasetTable().layers
     with pytest.raises(InputError, match="'dust_opacity': no fault of the scene has this layer; theirs: none"):
         Session(config.parse_scene({"title": "t", "dataset": {"layers": ["dust_opacity"]}}, source="test"))

@@ -15,7 +15,7 @@ from scipy import stats
 from vbnfault.core import frames
 from vbnfault.core.errors import InputError
 from vbnfault.faults import FAULT_AXIS
-from vbnfault.scene import config, plan
+from vbnfault.scene import config, keyed_random, plan
 from vbnfault.scene.config import Scene, parse_scene
 
 N = 2000
@@ -549,13 +549,13 @@ def test_planning_looks_at_every_sample_a_bounded_number_of_times(
     """Generators and keyed draws are counted, not seconds: neither grows with the number of samples."""
     calls = {"rng": 0, "keyed_uniform": 0}
     for name in calls:
-        original = getattr(config, name)
+        original = getattr(keyed_random, name)
 
         def counted(*args: Any, _name: str = name, _original: Any = original) -> Any:
             calls[_name] += 1
             return _original(*args)
 
-        monkeypatch.setattr(config, name, counted)
+        monkeypatch.setattr(keyed_random, name, counted)
     seen = []
     for samples in (2_000, 200_000):
         calls.update(dict.fromkeys(calls, 0))
@@ -587,5 +587,5 @@ def test_bounds_of_one_value_are_met_exactly() -> None:
 
 
 def test_every_number_is_keyed_by_its_sample() -> None:
-    u = config.keyed_uniform(20, np.arange(N), "plan", "height_m/0")
+    u = keyed_random.keyed_uniform(20, np.arange(N), "plan", "height_m/0")
     np.testing.assert_allclose(make().variables["height_m"], 100 * u, rtol=1e-15)

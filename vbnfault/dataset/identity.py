@@ -29,6 +29,8 @@ from ..pipeline.record import proposal
 from ..pipeline.spec import mask_any_faults, stored_layers
 from ..scene import config, plan
 from ..scene.config import Scene
+from ..scene.hashing import content_hash
+from ..scene.instrument import OF_THE_DETECTOR
 from ..store import StoreSpec
 from ..world import assemble
 from . import build, describe
@@ -62,7 +64,7 @@ def scene_identity(session: pipeline.Session) -> dict[str, Any]:
     if session.scene.body.shape not in ("embedded", "ellipsoid"):
         scene["body"]["shape"] = _digest(session.scene.body.shape, "shape")
     if session.scene.camera.detector:
-        for key in config.OF_THE_DETECTOR:
+        for key in OF_THE_DETECTOR:
             del scene["camera"][key]  # the detector's own value is used instead
     scene["faults"] = {name: fault.to_dict() for name, fault in session.faults.items()}
     for name, table in scene["faults"].items():
@@ -105,7 +107,7 @@ def _contents_of_files(identity: dict[str, Any], scene: Scene) -> None:
             for k in range(scene.dataset.sites):
                 pose = assemble.spacecraft_pose(scene, assemble.epoch_jd(scene, k, 0.5))
                 follows += [*pose.camera_position_T_m.tolist(), *pose.T_from_C.ravel().tolist()]
-        numbers = config.content_hash(follows)
+        numbers = content_hash(follows)
         identity["spice"]["kernels"] = [f"ephemeris:{numbers}"]
     if scene.sky.stars != "off":
         identity["sky"]["catalogue"] = _digest(resources.data_dir("catalogues") / "stars.npz", "star catalogue")
@@ -128,7 +130,7 @@ def store_spec(session: pipeline.Session, blocks: Sequence[int]) -> StoreSpec:
         "title": scene.title,
         "description": scene.description,
         "scene": identity,
-        "scene_hash": config.content_hash(identity, made_with),
+        "scene_hash": content_hash(identity, made_with),
         "seed": dataset.seed,
         "blocks": list(blocks),
         "versions": made_with,

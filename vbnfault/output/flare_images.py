@@ -21,7 +21,7 @@ from ..faults import FaultContext, registry
 from ..lens import Prescription, ThinLens, first_order, load_lens
 from ..lens.straylight.paraxial import Ghost, axial_transmittance, mean_ghost, paraxial_ghosts
 from ..lens.straylight.total import VEIL_FRACTION, Cleanliness, straylight
-from ..scene import config
+from ..scene import keyed_random
 from .exr import write_exr
 
 F32 = NDArray[np.float32]
@@ -268,7 +268,7 @@ def _textures(view: FlareRequest) -> F32:
         camera=Camera(lens=lens, detector=detector), sun_xy_px=np.array([x, y]), sun_visible_fraction=1.0
     )
     fault = registry()["straylight"]["texture"]()
-    params = fault.draw(context, config.rng(0, 0, "flare", "texture"))
+    params = fault.draw(context, keyed_random.rng(0, 0, "flare", "texture"))
     black = np.zeros((view.pixels, view.pixels, 3), dtype=np.float32)
     drawn = fault.apply(Electrons(array=black, white_e=detector.white_e), params, context)
     return np.ascontiguousarray(np.moveaxis(drawn.array / detector.white_e, -1, 0))

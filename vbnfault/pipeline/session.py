@@ -26,6 +26,7 @@ from ..core.quantities import SOFT_KINDS, Sample
 from ..faults import Fault, dataset_order, from_dict
 from ..scene import config, plan
 from ..scene.config import Scene
+from ..scene.keyed_random import keyed_uniform
 from ..world import assemble
 from ..world.spacecraft import SpacecraftMesh
 from .expose import meter, render_frame
@@ -283,7 +284,7 @@ class Session:
         """
         scene, site = self.scene, int(self.plan.site[index])
         if scene.spice.spacecraft:
-            share = float(config.keyed_uniform(scene.dataset.seed, np.array([index]), "plan", "epoch")[0])
+            share = float(keyed_uniform(scene.dataset.seed, np.array([index]), "plan", "epoch")[0])
             sun = scene.sun.model_copy(update={"julian_date": assemble.epoch_jd(scene, site, share)})
             scene = scene.model_copy(update={"sun": sun})
         return SampleSpec(index=index, scene=scene, plan=self.plan, faults=self.faults, terrain=self.terrain(site))

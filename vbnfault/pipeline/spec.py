@@ -14,7 +14,7 @@ from ..camera import Camera
 from ..core.quantities import RGBI, Electrons, Radiance, Truth
 from ..faults import Fault, FaultContext, Params
 from ..render.description import Sunlight
-from ..scene import config, plan
+from ..scene import keyed_random, plan
 from ..scene.config import Scene
 from ..world.spacecraft import SpacecraftMesh
 
@@ -76,7 +76,7 @@ class SampleSpec:
 
     def rng(self, stage: str, name: str) -> np.random.Generator:
         """Return the random generator of this sample for (stage, name)."""
-        return config.rng(self.seed, self.index, stage, name)
+        return keyed_random.rng(self.seed, self.index, stage, name)
 
 
 @dataclass(kw_only=True, eq=False)

@@ -23,8 +23,9 @@ from numpy.typing import NDArray
 
 from ..core import frames
 from ..core.errors import InputError
-from . import config
-from .config import Scene, StratumTable
+from . import keyed_random
+from .config import Scene
+from .sampling import StratumTable
 
 STRATA = ("sun-facing", "sun-averted")
 SPLITS = ("train", "val", "test")
@@ -198,9 +199,9 @@ def _views(
         lo, hi = low[stratum], high[stratum]
         if name in _SUN and scene.plan.pair_strata:
             lo, hi = np.where(paired, low.max(), lo), np.where(paired, high.min(), hi)
-            u = config.keyed_uniform(scene.dataset.seed, light, "plan", f"{name}/0")
+            u = keyed_random.keyed_uniform(scene.dataset.seed, light, "plan", f"{name}/0")
         else:
-            u = config.keyed_uniform(scene.dataset.seed, samples, "plan", f"{name}/{attempt}")
+            u = keyed_random.keyed_uniform(scene.dataset.seed, samples, "plan", f"{name}/{attempt}")
         drawn[name] = lo + u * (hi - lo)
     _keep_sun_out_of_view(scene, samples, stratum, drawn, attempt)
     return drawn
@@ -231,7 +232,7 @@ def _keep_sun_out_of_view(
         if not len(again):
             return
         for j, name in enumerate(names):
-            u = config.keyed_uniform(scene.dataset.seed, samples[again], "plan", f"{name}/{attempt}.{k}")
+            u = keyed_random.keyed_uniform(scene.dataset.seed, samples[again], "plan", f"{name}/{attempt}.{k}")
             variables[name][again] = lo[j] + u * (hi[j] - lo[j])
     raise InputError(
         f"geometry.sun_averted: its roll_deg and pitch_deg keep the Sun within {least:.1f} deg of the boresight; "
@@ -290,7 +291,7 @@ def _block(
 ) -> tuple[NDArray[np.bool_], NDArray[np.uint8]]:
     """Return the fault matrix bool[n, fault] and the strata uint8[n] of a block whose first sample is `start`."""
     n = len(shard)
-    rng = config.rng(scene.dataset.seed, start, "plan", f"fault_matrix/{block}")
+    rng = keyed_random.rng(scene.dataset.seed, start, "plan", f"fault_matrix/{block}")
     make = fault_matrix_per_class if scene.plan.mode == "per_class" else fault_matrix_per_sample
     lo, hi = scene.plan.classes_per_sample
     injected = make(n, faults, scene.plan.faulty_fraction, rng, (lo, hi))
@@ -428,7 +429,7 @@ def _shard_sites(scene: Scene, shards: int) -> NDArray[np.int32]:
     """
     sites = scene.dataset.sites
     rounds = -(-shards // sites)
-    key = config.keyed_uniform(scene.dataset.seed, np.arange(rounds * sites, dtype=np.int64), "plan", "sites")
+    key = keyed_random.keyed_uniform(scene.dataset.seed, np.arange(rounds * sites, dtype=np.int64), "plan", "sites")
     order = np.argsort(key.reshape(rounds, sites), axis=1, kind="stable")
     order[0] = _site_order(scene)
     return order.ravel()[:shards].astype(np.int32)
@@ -436,7 +437,7 @@ def _shard_sites(scene: Scene, shards: int) -> NDArray[np.int32]:
 
 def _site_order(scene: Scene) -> NDArray[np.int64]:
     """Return the sites in the random order in which splits are assigned to them, int64[sites]."""
-    return config.rng(scene.dataset.seed, 0, "plan", "split").permutation(scene.dataset.sites)
+    return keyed_random.rng(scene.dataset.seed, 0, "plan", "split").permutation(scene.dataset.sites)
 
 
 def site_split(scene: Scene) -> NDArray[np.uint8]:
@@ -461,7 +462,7 @@ def individual_split(scene: Scene) -> NDArray[np.uint8] | None:
     if count < len(used):
         return None
     out = np.empty(count, dtype=np.uint8)
-    order = config.rng(scene.dataset.seed, 0, "plan", "individual split").permutation(count)
+    order = keyed_random.rng(scene.dataset.seed, 0, "plan", "individual split").permutation(count)
     out[order] = _in_turn(scene, count, used)
     return out
 
@@ -490,7 +491,7 @@ def _in_turn(scene: Scene, count: int, used: NDArray[Any]) -> NDArray[np.uint8]:
 def _individuals(scene: Scene, samples: NDArray[np.int64], split: NDArray[np.uint8]) -> NDArray[np.int32]:
     """Return the device that takes each sample, from the devices of its split, int32[n]."""
     of_split = individual_split(scene)
-    u = config.keyed_uniform(scene.dataset.seed, samples, "plan", "individual")
+    u = keyed_random.keyed_uniform(scene.dataset.seed, samples, "plan", "individual")
     if of_split is None:
         return (u * scene.camera.individuals).astype(np.int32)
     out = np.zeros(len(samples), dtype=np.int32)
@@ -503,4 +504,4 @@ def _individuals(scene: Scene, samples: NDArray[np.int64], split: NDArray[np.uin
 
 def _pick(seed: int, samples: NDArray[np.int64], name: str, options: int) -> NDArray[np.uint8]:
     """Return a uniform choice of one of `options` for each sample, uint8[n] from 0."""
-    return (config.keyed_uniform(seed, samples, "plan", name) * options).astype(np.uint8)
+    return (keyed_random.keyed_uniform(seed, samples, "plan", name) * options).astype(np.uint8)

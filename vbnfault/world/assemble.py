@@ -19,8 +19,11 @@ from ..core.quantities import Radiance
 from ..detector import Detector, MosaicDetector, Sensor, load_sensor
 from ..lens import RealLens, ThinLens, closed_to, coating, load_lens, scaled_to_focal_length
 from ..render.description import Sunlight, View
-from ..scene import config
-from ..scene.config import BodyTable, CameraTable, OrbitTable, PoseTable, Scene, SpiceTable, SunTable
+from ..scene.config import Scene
+from ..scene.instrument import THIN_LENS, CameraTable
+from ..scene.keyed_random import rng
+from ..scene.surroundings import OrbitTable, PoseTable, SpiceTable, SunTable
+from ..scene.target import BodyTable
 from . import sky
 from .spacecraft import HingePose, ModelPlacement, Spacecraft, SpacecraftMesh, default_spacecraft, load_spacecraft
 
@@ -339,7 +342,7 @@ def _detector_of(scene: Scene, sensor: Sensor, individual: int, direction: str) 
     """Return the detector of one device. Raises InputError if a channel receives no light of the scene's bands."""
     # a mosaic detector is read along its columns only
     towards = direction if direction in ("up", "down") else "up"
-    seed = int(config.rng(scene.dataset.seed, individual, "detector", "device").integers(2**31))
+    seed = int(rng(scene.dataset.seed, individual, "detector", "device").integers(2**31))
     try:
         made = MosaicDetector(
             sensor=sensor,
@@ -369,8 +372,8 @@ def _thin_lens(c: CameraTable, pixel_pitch_um: float) -> ThinLens:
     """Return the thin lens of a camera table."""
     return ThinLens(
         focal_length_mm=cameras.focal_length_mm(c.fov_deg, c.width_px, pixel_pitch_um),
-        f_number=config.THIN_LENS["f_number"] if c.f_number is None else c.f_number,
-        transmission=config.THIN_LENS["transmission"] if c.transmission is None else c.transmission,
+        f_number=THIN_LENS["f_number"] if c.f_number is None else c.f_number,
+        transmission=THIN_LENS["transmission"] if c.transmission is None else c.transmission,
         focus_distance_m=_focus_distance_m(c),
     )
 

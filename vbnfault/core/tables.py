@@ -1,0 +1,287 @@
+"""Check plain data, such as the contents of a TOML file, with pydantic, and say in one sentence what is wrong.
+
+Every file that a user writes has a model: `Table` for data that only describe, `table_class` for dataclasses that
+physics uses too. Both are frozen, refuse unknown keys and take ranges from `pydantic.Field`. From the same fields
+follow the checks, the error messages and the JSON Schema.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import json
+import re
+from collections.abc import Mapping, Sequence
+from functools import lru_cache, wraps
+from typing import Annotated, Any, TypeVar, dataclass_transform
+
+import pydantic.dataclasses
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
+
+from . import resources
+from .errors import InputError, shown
+
+T = TypeVar("T")
+
+_CONFIG = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, validate_default=True)
+_SCHEMA = "https://json-schema.org/draft/2020-12/schema"
+# The most unknown keys that one message names.
+_MOST_NAMED = 5
+# Names that pydantic puts into an error's location for the alternatives of a union.
+_ALTERNATIVE = re.compile(r"(str|float|int|bool)$|(constrained|literal|function|tuple|list|dict|lax|json)\b")
+# Types of pydantic's errors for a value that is no table, and for an unknown key.
+_NO_TABLE = ("model_type", "dataclass_type", "dict_type", "model_attributes_type")
+_UNKNOWN = ("extra_forbidden", "unexpected_keyword_argument")
+
+
+class Table(BaseModel):
+    """Check a table of a file: it is frozen and strict, and refuses unknown keys."""
+
+    model_config = _CONFIG
+
+
+@dataclass_transform(frozen_default=True, kw_only_default=True, field_specifiers=(dataclasses.field, Field))
+def table_class(cls: type[T]) -> type[T]:
+    """Make a class a frozen, keyword-only dataclass whose fields are checked whenever an object is made.
+
+    An object made in Python is checked as one from a file, but numbers of numpy and lists in place of tuples are
+    accepted. A check in `__post_init__` raises ValueError with a sentence "key = value: must be …". Whoever makes
+    an object with wrong values gets an InputError.
+    """
+    made: Any = pydantic.dataclasses.dataclass(frozen=True, kw_only=True, config=_CONFIG)(cls)
+    checked = made.__init__
+
+    @wraps(checked)
+    def __init__(self: Any, **values: Any) -> None:
+        try:
+            checked(self, **values)
+        except ValidationError as error:
+            raise InputError(sentence(error, made)) from None
+
+    made.__init__ = __init__
+    result: type[T] = made
+    return result
+
+
+def ordered(pair: tuple[float, float]) -> tuple[float, float]:
+    """Return a pair of bounds. Raises ValueError where they are reversed."""
+    if pair[0] > pair[1]:
+        raise ValueError("bounds reversed, the lower one comes first")
+    return pair
+
+
+def pair_within(lo: float, hi: float) -> Any:
+    """Return the type of a pair of bounds within `lo` and `hi`, the lower one first."""
+    value = Annotated[float, Field(ge=lo, le=hi)]
+    return Annotated[tuple[value, value], AfterValidator(ordered)]
+
+
+def parse(kind: type[T], plain: Mapping[str, Any], *, source: str, overrides: Sequence[str] = ()) -> T:
+    """Return plain data, such as the contents of a TOML file, as a checked object.
+
+    Parameters
+    ----------
+    kind
+        Model of the data: a `Table`, or a class made by `table_class`.
+    plain
+        The data. Types are not converted, but a whole number is accepted as a float.
+    source
+        File that the data come from; an error message begins with it.
+    overrides
+        Dotted keys whose values replaced those of the file; an error message marks them.
+
+    Raises
+    ------
+    InputError
+        The data are wrong. One sentence names the source, the key, the value and what is allowed.
+    """
+    resources.check_plain(plain, source)
+    model: Any = kind
+    try:
+        # JSON mode is strict about types, but accepts arrays as tuples. No key takes a TOML date: a list fails.
+        text = json.dumps(plain, default=lambda date: [str(date)])
+        checked: T = _adapter(model).validate_json(text, strict=True)
+        return checked
+    except ValidationError as error:
+        wrong = ".".join(map(str, error.errors()[0]["loc"]))
+        replaced = any(wrong.startswith(key) or key.startswith(f"{wrong}.") for key in overrides)
+        mark = " (set in place of the file)" if replaced else ""
+        raise InputError(f"{source}: {sentence(error, kind)}{mark}") from None
+
+
+def json_schema(kind: Any) -> dict[str, Any]:
+    """Return the JSON Schema (draft 2020-12) of the files that a model describes."""
+    return {"$schema": _SCHEMA, **_schema(kind)}
+
+
+@lru_cache(maxsize=256)
+def _adapter(kind: Any) -> TypeAdapter[Any]:
+    """Return pydantic's checks of a type."""
+    return TypeAdapter(kind)
+
+
+@lru_cache(maxsize=256)
+def _schema(kind: Any) -> dict[str, Any]:
+    """Return the JSON Schema of a type. It is shared: do not modify it."""
+    return _adapter(kind).json_schema()
+
+
+# --- error messages ---------------------------------------------------------------------------------------------
+
+
+def sentence(error: ValidationError, kind: Any) -> str:
+    """Return what is wrong as one sentence that names the key, the value and what is allowed.
+
+    All unknown keys and all missing keys are named at once, since one is often a misspelling of the other. Of
+    wrong values only the first is named.
+    """
+    schema = _schema(kind)
+    details = error.errors(include_url=False)
+    unknown = [_unknown(detail["loc"], schema) for detail in details if detail["type"] in _UNKNOWN]
+    if len(unknown) > _MOST_NAMED:
+        unknown[_MOST_NAMED:] = [f"and {len(unknown) - _MOST_NAMED} more unknown keys"]
+    missing = [
+        _dotted(_locate(detail["loc"], schema)[0])
+        for detail in details
+        if detail["type"] == "missing" and isinstance(detail["loc"][-1], str)
+    ]
+    if missing:
+        unknown.append(f"{', '.join(missing)}: {'is' if len(missing) == 1 else 'are'} missing")
+    return "; ".join(unknown) or _wrong(details[0], schema)
+
+
+def did_you_mean(word: str, known: Sequence[str]) -> str:
+    """Return the known word that is nearest to an unknown one as a suggestion, or the list of all known words."""
+    close = difflib.get_close_matches(word, known, n=1)
+    return f" (did you mean {close[0]}?)" if close else f"; known: {', '.join(known)}"
+
+
+def _unknown(loc: Sequence[int | str], schema: Mapping[str, Any]) -> str:
+    """Return the clause for an unknown key, with the nearest known one."""
+    keys, table = _locate(loc[:-1], schema)
+    known = [key for choice in _choices(table, schema) for key in choice.get("properties", {})]
+    return f"{_dotted([*keys, loc[-1]])}: unknown key{did_you_mean(str(loc[-1]), known)}"
+
+
+def _wrong(detail: Any, schema: Mapping[str, Any]) -> str:
+    """Return the clause for a wrong value."""
+    value, message = detail.get("input"), str(detail.get("ctx", {}).get("error", detail["msg"]))
+    keys, node = _locate(detail["loc"], schema)
+    if detail["type"] == "missing":  # a list that is too short
+        keys, node = _locate(detail["loc"][:-1], schema)
+    elif detail["type"] == "value_error":
+        return f"{_dotted(keys)}{_shown(value)}: {message}" if keys else message
+    elif detail["type"] in _NO_TABLE and "type" not in node:
+        message = "a table"
+    return f"{_dotted(keys)}{_shown(value)}: must be {_allowed(_merged(node, schema), message)}"
+
+
+def _dotted(keys: Sequence[int | str]) -> str:
+    """Return keys as one dotted key for an error message."""
+    return ".".join(map(resources.shown_path, map(str, keys)))
+
+
+def _shown(value: Any) -> str:
+    """Return " = value" for an error message, empty for a table."""
+    described = isinstance(value, dict | BaseModel) or dataclasses.is_dataclass(value)
+    return "" if described or hasattr(value, "kwargs") else f" = {shown(value)}"
+
+
+def _allowed(schema: Mapping[str, Any], message: str) -> str:
+    """Return in words which values a key takes, from its JSON Schema, or else from pydantic's message."""
+    items = schema.get("prefixItems")
+    if items:
+        each = _allowed(items[0], "a value").removeprefix("a ")
+        count = {2: "two", 3: "three"}.get(len(items), str(len(items)))
+        return f"a list of {count} values, each a {each}"
+    if schema.get("type") == "array" and schema.get("minItems") and "at least" in message:
+        return f"a list of at least {schema['minItems']}"
+    if schema.get("pattern", "").startswith("^("):
+        options = schema["pattern"].removeprefix("^(").removesuffix(")$").replace("[a-z0-9_]+", "<fault>")
+        return f"one of {', '.join(options.split('|'))}"
+    word = f"{schema['const']!r} or " if "const" in schema else ""
+    interval = _interval(schema)
+    if interval:
+        return f"{word}{'a whole number' if schema.get('type') == 'integer' else 'a number'} {interval}"
+    if word:
+        return f"{word}a number"
+    plain = message.replace("Input should be ", "")
+    words = {
+        "a valid string": "a string",
+        "an object": "a table",
+        "a valid boolean": "true or false",
+        "a valid array": "a list",
+        "a valid integer": "a whole number",
+        "a valid number": "a number",
+    }
+    return words.get(plain, plain)
+
+
+def _interval(schema: Mapping[str, Any]) -> str:
+    """Return the limits of a number in words; empty where it has none."""
+    lo, hi = schema.get("minimum"), schema.get("maximum")
+    above, below = schema.get("exclusiveMinimum"), schema.get("exclusiveMaximum")
+    parts = [f"from {lo:g}"] if lo is not None else [f"above {above:g}"] if above is not None else []
+    if hi is not None:
+        parts.append(f"to {hi:g}" if lo is not None else f"and at most {hi:g}" if parts else f"up to {hi:g}")
+    elif below is not None:
+        parts.append(f"and below {below:g}" if parts else f"below {below:g}")
+    elif lo is not None:
+        return f"of at least {lo:g}"
+    return " ".join(parts)
+
+
+# --- the schema at the location of an error ---------------------------------------------------------------------
+
+
+def _resolved(node: Mapping[str, Any], root: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Return a node of a JSON Schema without references."""
+    while "$ref" in node or "allOf" in node:
+        node = root["$defs"][node["$ref"].rsplit("/", 1)[-1]] if "$ref" in node else node["allOf"][0]
+    return node
+
+
+def _choices(node: Mapping[str, Any], root: Mapping[str, Any]) -> list[Mapping[str, Any]]:
+    """Return the alternatives of a node without null; the node itself where it is no union."""
+    node = _resolved(node, root)
+    parts = node.get("anyOf", node.get("oneOf"))
+    if parts is None:
+        return [node]
+    return [choice for part in parts for choice in _choices(part, root) if choice.get("type") != "null"]
+
+
+def _merged(node: Mapping[str, Any], root: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Return one schema for a union: the limits of its number and its constant, if it has them."""
+    choices = _choices(node, root)
+    if len(choices) == 1:
+        return choices[0]
+    numeric = next((choice for choice in choices if choice.get("type") in ("number", "integer")), {})
+    constant = next(({"const": choice["const"]} for choice in choices if "const" in choice), {})
+    return {**numeric, **constant}
+
+
+def _locate(loc: Sequence[int | str], root: Mapping[str, Any]) -> tuple[list[int | str], Mapping[str, Any]]:
+    """Return the keys of an error's location without pydantic's names of alternatives, and the schema there."""
+    keys: list[int | str] = []
+    node = _resolved(root, root)
+    for part in loc:
+        choices = _choices(node, root)
+        tables = [choice for choice in choices if part in choice.get("properties", {})]
+        lists = [choice for choice in choices if isinstance(part, int) and choice.get("type") == "array"]
+        if tables:
+            node = tables[0]["properties"][part]
+        elif lists and "prefixItems" in lists[0]:
+            node = lists[0]["prefixItems"][part]
+        elif lists:
+            node = lists[0].get("items", {})
+        elif len(choices) > 1 and any(choice.get("title") == part for choice in choices):
+            node = next(choice for choice in choices if choice.get("title") == part)
+            continue
+        elif isinstance(part, str) and _ALTERNATIVE.match(part):
+            continue
+        else:  # a table with keys of the user's choice, or an unknown key
+            other = choices[0].get("additionalProperties") if choices else None
+            node = other if isinstance(other, Mapping) else {}
+        keys.append(part)
+        node = _resolved(node, root)
+    return keys, node

@@ -1,0 +1,159 @@
+"""Define the tables of a scene file that describe the camera and the rendering: `[camera]` and `[render]`."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field, model_validator
+
+from ..core import spectra
+from ..core.tables import Table
+
+Architecture = Literal["full_frame_ccd", "frame_transfer_ccd", "interline_ccd", "cmos"]
+Direction = Literal["up", "down", "left", "right"]
+
+# Values of a camera without a prescription, where the scene gives none.
+THIN_LENS = {"f_number": 4.0, "transmission": 0.9}
+# Keys that a named detector sets itself.
+OF_THE_DETECTOR = (
+    "pixel_pitch_um",
+    "full_well_e",
+    "read_noise_e_rms",
+    "dark_current_e_s",
+    "adc_bits",
+    "bias_dn",
+    "response",
+    "quantum_efficiency_peak",
+    "architectures",
+)
+
+
+class CameraTable(Table):
+    """Describe the camera and its exposure."""
+
+    fov_deg: float = Field(65.0, ge=0.01, le=140, description="full field of view across the width")
+    width_px: int = Field(1024, ge=16, le=16384)
+    height_px: int = Field(1024, ge=16, le=16384)
+    lens: str = Field(
+        "",
+        description="a packaged lens or a prescription's TOML, scaled to the field of view; default: a thin lens",
+    )
+    lens_coating: str = Field(
+        "", description="put on all its surfaces between glass and air: none, mgf2, v or bbar; default: its own"
+    )
+    focus: Literal["paraxial", "best"] = Field(
+        "paraxial", description="where its sensor stands: best has the smallest spots over the frame"
+    )
+    f_number: float | None = Field(
+        None,
+        ge=0.5,
+        le=200,
+        description="default: 4 of a thin lens, a prescription's own; a larger one than that closes its stop",
+    )
+    transmission: float | None = Field(
+        None,
+        gt=0,
+        le=1,
+        description="of a thin lens, default 0.9; a prescription's follows from glass and coatings",
+    )
+    focus_distance_m: float | None = Field(None, gt=0, le=1e12, description="default: infinity")
+    detector: str = Field(
+        "",
+        description="a packaged detector or a sensor's TOML, with a mosaic; its numbers are those of the keys from "
+        "pixel_pitch_um to quantum_efficiency_peak; default: three colours in every pixel, from these keys",
+    )
+    individuals: int = Field(
+        1,
+        ge=1,
+        le=10_000,
+        description="devices of the detector that the samples are taken with; each is in one split only, if there "
+        "are as many as splits",
+    )
+    detector_temperature_K: float | None = Field(None, ge=100, le=400, description="default: the detector's own")
+    pixel_pitch_um: float = Field(5.5, ge=0.5, le=100)
+    full_well_e: float = Field(13_500.0, ge=10, le=1e8)
+    read_noise_e_rms: float = Field(13.0, ge=0, le=1e5)
+    dark_current_e_s: float = Field(
+        15.0,
+        ge=0,
+        le=1e9,
+        description="default: a CMV4000's 125 e/s at 25 °C brought to 0 °C, halving every 8 K",
+    )
+    adc_bits: int = Field(12, ge=8, le=16)
+    bias_dn: int = Field(64, ge=0, le=1000)
+    response: str = "nikon_5100"
+    quantum_efficiency_peak: float = Field(0.5, gt=0, le=1)
+    exposure_s: float | Literal["auto"] = Field("auto", description="seconds, or metered on each clean frame")
+    exposure_min_s: float = Field(1e-5, gt=0, le=1e4)
+    exposure_max_s: float = Field(5.0, gt=0, le=1e4)
+    metering_level: float = Field(
+        0.75, gt=0, le=1, description="fraction of white given to metering_percentile of the sunlit pixels"
+    )
+    metering_percentile: float = Field(99.0, gt=0, le=100)
+    architectures: tuple[Architecture, ...] = Field(
+        ("full_frame_ccd", "frame_transfer_ccd", "interline_ccd", "cmos"), min_length=1
+    )
+    readout_directions: tuple[Direction, ...] = Field(("up", "down", "left", "right"), min_length=1)
+
+    @model_validator(mode="after")
+    def _of_the_lens(self) -> CameraTable:
+        if self.lens and self.transmission is not None:
+            raise ValueError(
+                f"transmission = {self.transmission:g}: the lens has its own, of glass and coatings; leave one out"
+            )
+        if not self.lens:  # with a prescription, None stays and means the prescription's own f-number
+            for key, value in THIN_LENS.items():
+                if getattr(self, key) is None:
+                    object.__setattr__(self, key, value)
+        return self
+
+    @model_validator(mode="after")
+    def _known(self) -> CameraTable:
+        if self.response not in spectra.RESPONSES:
+            raise ValueError(f"response = {self.response!r}: must be one of {', '.join(spectra.RESPONSES)}")
+        if isinstance(self.exposure_s, float | int) and not 0 < self.exposure_s <= 1e4:
+            raise ValueError(f"exposure_s = {self.exposure_s!r}: must be 'auto' or above 0 and at most 1e4 s")
+        for key in ("lens_coating", "focus"):
+            value = getattr(self, key)
+            if not self.lens and value not in ("", "paraxial"):
+                raise ValueError(f"{key} = {value!r}: needs lens")
+        for key in OF_THE_DETECTOR if self.detector else ("individuals", "detector_temperature_K"):
+            if getattr(self, key) != CameraTable.model_fields[key].default:
+                why = "the detector has its own; leave one out" if self.detector else "needs detector"
+                raise ValueError(f"{key} = {getattr(self, key)!r}: {why}")
+        if self.exposure_min_s > self.exposure_max_s:
+            raise ValueError(
+                f"exposure_min_s = {self.exposure_min_s:g}, "
+                f"exposure_max_s = {self.exposure_max_s:g}: bounds reversed"
+            )
+        return self
+
+
+class RenderTable(Table):
+    """Set the spectral bands and the sampling."""
+
+    band_min_nm: float = Field(400.0, ge=280, le=3900)
+    band_max_nm: float = Field(700.0, ge=290, le=4000)
+    bands: int = Field(8, ge=1, le=64)
+    samples_per_pixel: int = Field(16, ge=1, le=4096, description="a power of four: strata of each pixel")
+    noise_fraction: float | None = Field(
+        None,
+        gt=0.01,
+        le=10,
+        description="most noise of sampling, over the sensor's own, in 99 % of lit pixels: more samples where it "
+        "takes them; default: no more anywhere",
+    )
+    max_samples_per_pixel: int = Field(256, ge=1, le=4096, description="a power of four; for noise_fraction")
+    bounces: int = Field(0, ge=0, le=4, description="reflections between sunlit ground and the ground that is seen")
+
+    @model_validator(mode="after")
+    def _valid(self) -> RenderTable:
+        if self.band_min_nm >= self.band_max_nm:
+            raise ValueError(
+                f"band_min_nm = {self.band_min_nm:g}, band_max_nm = {self.band_max_nm:g}: bounds reversed"
+            )
+        for key in ("samples_per_pixel", "max_samples_per_pixel"):
+            n = getattr(self, key)
+            if n & (n - 1) or (n.bit_length() - 1) % 2:
+                raise ValueError(f"{key} = {n}: must be 1, 4, 16, 64, 256, 1024 or 4096")
+        return self

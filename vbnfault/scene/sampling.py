@@ -1,0 +1,129 @@
+"""Define the tables of a scene file that say how samples are drawn and what a store holds."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import AfterValidator, Field, model_validator
+
+from ..core.quantities import SOFT_KINDS
+from ..core.tables import Table, ordered, pair_within
+
+_LAYERS = (
+    "clean|depth_m|normal|semantic|raw|defects|radiance|mask_effect|"
+    "point_T_m|incidence_deg|emission_deg|phase_deg|albedo|without_[a-z0-9_]+|"
+    + "|".join(f"[a-z0-9_]+_{kind}" for kind in SOFT_KINDS)
+)
+Layer = Annotated[str, Field(pattern=f"^({_LAYERS})$")]
+
+
+class SplitTable(Table):
+    """Set the fraction of the sites in each split."""
+
+    train: float = Field(0.7, ge=0, le=1)
+    val: float = Field(0.15, ge=0, le=1)
+    test: float = Field(0.15, ge=0, le=1)
+
+    @model_validator(mode="after")
+    def _sum(self) -> SplitTable:
+        if abs(self.train + self.val + self.test - 1) > 1e-6:
+            raise ValueError(f"train = {self.train:g}, val = {self.val:g}, test = {self.test:g}: must add up to 1")
+        return self
+
+
+class DatasetTable(Table):
+    """Set the size of the dataset and what it stores."""
+
+    samples: int = Field(16, ge=1, le=10_000_000)
+    seed: int = Field(1, ge=0, le=2**63 - 1)
+    sites: int = Field(32, ge=1, le=100_000, description="sites on the body; samples are grouped by site")
+    shard_samples: int = Field(
+        8, ge=1, le=16, description="samples a shard, all of one site: what a kill can lose at most"
+    )
+    layers: tuple[Layer, ...] = (
+        "clean",
+        "without_straylight",
+        "mask_effect",
+        "depth_m",
+        "normal",
+        "semantic",
+    )
+    mask_any: tuple[str, ...] | None = Field(
+        None,
+        description="classes of the scene whose masks mask_any unites; []: none; default: the localised ones",
+    )
+    split: SplitTable = SplitTable()
+    licence: str = "CC-BY-4.0"
+    citation: str = ""
+
+
+class StratumTable(Table):
+    """Set the bounds of one stratum of the sampling (Gallon et al., Table of bounds). Angles are in degrees.
+
+    Roll and pitch tilt the boresight away from the reference direction; yaw turns the camera about the boresight.
+    At the site, the Sun's elevation counts from the horizon upwards and its azimuth from north towards east.
+    """
+
+    sun_azimuth_deg: pair_within(-360, 720) | None = None  # type: ignore[valid-type]
+    sun_elevation_deg: pair_within(-90, 90) | None = None  # type: ignore[valid-type]
+    roll_deg: pair_within(-360, 720) | None = None  # type: ignore[valid-type]
+    pitch_deg: pair_within(-360, 720) | None = None  # type: ignore[valid-type]
+    yaw_deg: pair_within(-360, 720) | None = None  # type: ignore[valid-type]
+    reference: Literal["sun", "nadir"] = Field("sun", description="where the boresight points at zero angles")
+    min_lit_fraction: Annotated[float, Field(ge=0, le=1)] | None = Field(
+        None, description="default: that of [geometry]"
+    )
+
+
+class GeometryTable(Table):
+    """Set where the camera is and looks. Unset bounds follow the paper's table for the camera's field of view."""
+
+    x_m: pair_within(-1e9, 1e9) = (-150.0, 150.0)  # type: ignore[valid-type]
+    y_m: pair_within(-1e9, 1e9) = (-150.0, 150.0)  # type: ignore[valid-type]
+    height_m: pair_within(0, 1e12) = (0.0, 100.0)  # type: ignore[valid-type]
+    height_reference: Literal["local_ground", "site"] = Field(
+        "local_ground", description="height_m counts from the ground below the camera, or from the site's level"
+    )
+    clearance_m: float = Field(0.5, ge=0, le=1e9, description="least distance to any surface, else drawn again")
+    sun_visibility: Literal["required", "as_drawn"] = Field(
+        "required",
+        description="of the Sun in samples with straylight: required whole and before the camera, else the view is "
+        "drawn again; or left as drawn, and straylight is not injected where the Sun is hidden",
+    )
+    min_lit_fraction: float = Field(
+        0.0,
+        ge=0,
+        le=1,
+        description="least fraction of the frame that shows sunlit ground, by a grid of rays, else drawn again; "
+        "not for cameras that SPICE places",
+    )
+    max_tries: int = Field(
+        256, ge=1, le=100_000, description="views drawn until one meets all conditions; the sample fails after them"
+    )
+    sun_facing: StratumTable | None = None
+    sun_averted: StratumTable | None = None
+
+
+class PlanTable(Table):
+    """Set the fault matrix and the choice of views."""
+
+    mode: Literal["per_class", "per_sample"] = "per_sample"
+    faulty_fraction: float = Field(0.5, ge=0, le=1, description="the paper's percentage p")
+    classes_per_sample: Annotated[
+        tuple[Annotated[int, Field(ge=1, le=64)], Annotated[int, Field(ge=1, le=64)]],
+        AfterValidator(ordered),
+    ] = (1, 6)
+    sun_facing_nominal_fraction: float = Field(
+        0.0, ge=0, le=1, description="share of all samples that face the Sun without straylight"
+    )
+    on_invisible: Literal["redraw_view", "drop"] = Field(
+        "redraw_view",
+        description="where a commanded fault cannot show in a view: another view is drawn and rendered, or the "
+        "fault is recorded as not injected; where SPICE places the camera there is no other view",
+    )
+    max_views: int = Field(16, ge=1, le=1000, description="views rendered for a sample; it fails after them")
+    pair_strata: bool = Field(
+        False,
+        description="Sun-facing and Sun-averted samples share a target attitude in pairs, as in the paper; needs "
+        "geometry.sun_visibility = 'as_drawn', since the Sun of a pair is not drawn again",
+    )

@@ -1,0 +1,131 @@
+"""Define the tables of a scene file that describe the body and its ground: `[body]` and `[patch]`."""
+
+from __future__ import annotations
+
+import itertools
+from typing import Annotated, Literal
+
+from pydantic import Field, model_validator
+
+from ..core import photometry, spectra
+from ..core.tables import Table
+
+# The most rows of a spectrum or of Hapke's parameters.
+_MOST_ROWS = 10_000
+Wavelength = Annotated[float, Field(gt=0, le=1e5)]
+SemiAxis = Annotated[float, Field(gt=0, le=1e9)]
+
+
+class SpectrumTable(Table):
+    """Give values at wavelengths. They are interpolated linearly and are constant beyond the ends."""
+
+    wavelength_nm: tuple[Wavelength, ...] = Field(min_length=1, max_length=_MOST_ROWS)
+    value: tuple[Annotated[float, Field(ge=0, le=1)], ...] = Field(min_length=1, max_length=_MOST_ROWS)
+
+    @model_validator(mode="after")
+    def _paired(self) -> SpectrumTable:
+        if len(self.wavelength_nm) != len(self.value):
+            raise ValueError(f"{len(self.wavelength_nm)} wavelengths for {len(self.value)} values: must be as many")
+        if any(a >= b for a, b in itertools.pairwise(self.wavelength_nm)):
+            raise ValueError(f"wavelength_nm = {list(self.wavelength_nm)}: must increase")
+        return self
+
+
+class HapkeRow(Table):
+    """Give Hapke's parameters at one wavelength (Hapke 2002, 2012)."""
+
+    wavelength_nm: float = Field(gt=0, le=1e5)
+    single_scattering_albedo: float = Field(ge=0, le=1, description="w")
+    asymmetry: float = Field(gt=-1, lt=1, description="g of Henyey-Greenstein; negative scatters back")
+    shadow_hiding_amplitude: float = Field(0.0, ge=0, le=100, description="B0")
+    shadow_hiding_width: float = Field(1.0, gt=0, le=100, description="h_s, dimensionless: not an angle")
+    coherent_amplitude: float = Field(0.0, ge=0, le=100, description="B_C0")
+    coherent_width: float = Field(1.0, gt=0, le=100, description="h_c")
+    roughness_deg: float = Field(0.0, ge=0, le=60, description="mean slope below a pixel")
+    porosity_factor: float = Field(1.0, ge=1, le=10, description="K")
+
+
+class PhotometryTable(Table):
+    """Set how the ground reflects. All models except Hapke's scale `body.reflectance`."""
+
+    model: Literal["lambert", "lommel_seeliger", "mcewen", "hapke"] = "lambert"
+    phase_slope_mag_deg: float = Field(
+        0.0, ge=0, le=1, description="fading with phase angle, not for 'hapke'; 67P: 0.047"
+    )
+    parameters: str = Field("67p_fornasier2015", description="a named set of Hapke's parameters")
+    hapke: tuple[HapkeRow, ...] | None = Field(
+        None,
+        min_length=1,
+        max_length=_MOST_ROWS,
+        description="Hapke's parameters at wavelengths of one's own, in place of a named set",
+    )
+    dust_contrast: float = Field(
+        0.0, ge=-0.9, le=4, description="how much brighter dust-covered ground is at 649 nm: 0.2 for 20 %"
+    )
+    dust_slope_per_100nm: float = Field(
+        0.0, ge=-0.2, le=0.2, description="spectral slope of dust-covered over bare ground"
+    )
+
+    @model_validator(mode="after")
+    def _known(self) -> PhotometryTable:
+        if self.parameters not in photometry.HAPKE_TABLES:
+            known = ", ".join(photometry.HAPKE_TABLES)
+            raise ValueError(f"parameters = {self.parameters!r}: must be one of {known}")
+        return self
+
+    def rows(self) -> tuple[tuple[float, ...], ...]:
+        """Return `hapke` as rows for `photometry.hapke_at`."""
+        return tuple(
+            (row.wavelength_nm, *(getattr(row, name) for name in photometry.COLUMNS)) for row in self.hapke or ()
+        )
+
+
+class BodyTable(Table):
+    """Describe the target body in its body-fixed frame T."""
+
+    name: str = "67P/Churyumov-Gerasimenko"
+    shape: str = Field(
+        "embedded",
+        description="'embedded', 'ellipsoid', or a shape file: OBJ, PLY, STL, GLB, PDS TAB, ICQ, WRL, BDS",
+    )
+    unit: Literal["auto", "m", "km"] = "auto"
+    semi_axes_m: tuple[SemiAxis, SemiAxis, SemiAxis] = Field(
+        (1000.0, 1000.0, 1000.0), description="of an 'ellipsoid'"
+    )
+    density_kg_m3: float = Field(537.8, gt=0, le=30_000)
+    rotation_period_h: float = Field(
+        24 * 360 / 696.543884683, gt=0.01, le=1e5, description="67P before perihelion 2015: 12.4041 h"
+    )
+    pole_ra_deg: float = Field(69.54, ge=0, le=360)
+    pole_dec_deg: float = Field(64.11, ge=-90, le=90)
+    prime_meridian_deg: float = Field(114.69, ge=-360, le=360, description="W at J2000.0")
+    reflectance: str | Annotated[float, Field(ge=0, le=1)] | SpectrumTable = Field(
+        "67p", description="a named reflectance, a grey value, or a table of values at wavelengths"
+    )
+    photometry: PhotometryTable = PhotometryTable()
+
+    @model_validator(mode="after")
+    def _known(self) -> BodyTable:
+        if isinstance(self.reflectance, str) and self.reflectance not in spectra.REFLECTANCES:
+            known = ", ".join(spectra.REFLECTANCES)
+            raise ValueError(f"reflectance = {self.reflectance!r}: must be a grey value 0 to 1 or one of {known}")
+        return self
+
+
+class PatchTable(Table):
+    """Set how far and how finely the terrain around a site is refined."""
+
+    facet_m: float = Field(0.12, ge=0.05, le=1e6, description="edge length aimed at within radius_m of the site")
+    radius_m: float = Field(40.0, ge=1, le=1e8, description="beyond, facets grow with the distance")
+    max_triangles: int = Field(
+        1_600_000, ge=10_000, le=20_000_000, description="facets are coarsened to keep to it"
+    )
+    relief: float = Field(1.0, ge=0, le=10, description="amplitude of relief below the model's facets; 0: none")
+    hurst: float | None = Field(
+        None, ge=0.3, le=1.2, description="exponent of the relief's roughness; default: as the model's own"
+    )
+    craters_per_km2: float = Field(60.0, ge=0, le=600, description="of 10 m or more")
+    boulders: bool = True
+    min_boulder_m: float = Field(0.25, ge=0.05, le=1000, description="diameter of the smallest near the site")
+    boulder_index: float = Field(3.6, ge=0.5, le=6, description="of the cumulative size law; Pajola et al. 2015")
+    boulders_per_km2: float = Field(98.0, ge=0, le=1e5, description="of 7 m or more; Pajola et al. 2015")
