@@ -16,7 +16,7 @@ CONTRIBUTING = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
 CHANGELOG = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
 
 # Files that the commands in the text write or that a reader of it adds.
-_WRITTEN = {"after.json", "digests.json", "survivors.json"}
+_WRITTEN = {"after.json", "digests.json", "docs/_build", "survivors.json"}
 
 
 def code_spans(text: str) -> list[str]:

@@ -1,0 +1,217 @@
+"""The documentation is complete, and every code block of it and of the README runs, on small images.
+
+The blocks of a page run in order, in one folder, in this process. What is added to a command makes it smaller,
+never different: image size, terrain and number of samples.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import re
+import shutil
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import vbnfault
+from vbnfault.body import load_body
+from vbnfault.faults import registry
+
+ROOT = Path(__file__).parents[1]
+DOCS = ROOT / "docs"
+sys.path.insert(0, str(DOCS / "_ext"))
+
+import blocks  # noqa: E402
+import reference  # noqa: E402
+
+PAGES = [ROOT / "README.md", *sorted(DOCS.rglob("*.md"))]
+TERRAIN = {"patch.facet_m": 12.0, "patch.radius_m": 60.0, "patch.min_boulder_m": 6.0}
+LONGEST_PX = 64
+MOST_SAMPLES = 4
+SMALLER = {
+    "detector": ["--pixels", "64", "--points", "12", "--stack", "4"],
+    "flare": ["--pixels", "64"],
+}
+# a documented count → one with which the command takes seconds
+FEWER = {"--samples": MOST_SAMPLES, "--append": 2, "--sample": MOST_SAMPLES - 1}
+
+load_scene = vbnfault.load_scene
+
+
+def page_name(page: Path) -> str:
+    return str(page.relative_to(ROOT))
+
+
+def page_blocks(page: Path) -> list[blocks.Block]:
+    return blocks.blocks(page.read_text(encoding="utf-8"), page_name(page))
+
+
+def small_values(scene: vbnfault.Scene) -> dict[str, Any]:
+    """Return overrides that make a scene small: its image keeps its aspect, its ground is coarse."""
+    width, height = scene.camera.width_px, scene.camera.height_px
+    scale = min(1.0, LONGEST_PX / max(width, height))
+    size = {"camera.width_px": max(16, round(width * scale)), "camera.height_px": max(16, round(height * scale))}
+    return {**TERRAIN, **size, "dataset.samples": min(MOST_SAMPLES, scene.dataset.samples)}
+
+
+def smaller(words: list[str]) -> list[str]:
+    """Return a command on small images, with few samples."""
+    out = list(words)
+    for k, (option, value) in enumerate(itertools.pairwise(words)):
+        if option in FEWER:
+            out[k + 1] = str(min(FEWER[option], int(value)))
+    if words[1] in ("build", "render", "describe"):
+        small = small_values(load_scene(words[2]))
+        if "--samples" in words or words[1] == "describe":
+            del small["dataset.samples"]
+        out += [word for key, value in small.items() for word in ("--set", f"{key}={value}")]
+    return out + SMALLER.get(words[1], [])
+
+
+def small_scene(name: str | Path, overrides: dict[str, Any] | None = None) -> vbnfault.Scene:
+    """Load a scene as the page says, and then on small images."""
+    given = dict(overrides or {})
+    return load_scene(name, given | small_values(load_scene(name, given)))
+
+
+@pytest.fixture(scope="module")
+def built(tmp_path_factory: pytest.TempPathFactory) -> dict[tuple[str, ...], Path]:
+    """Return an empty memory of the stores that pages have built: command without its path → store."""
+    return {}
+
+
+@pytest.fixture
+def command(
+    built: dict[tuple[str, ...], Path], capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> Callable[[list[str]], int]:
+    """Return what runs a command small; it copies a store that an earlier page has built of a packaged scene."""
+
+    def run(words: list[str]) -> int:
+        arguments = smaller(words)
+        out = Path(words[words.index("--out") + 1]) if "--out" in words else None
+        key = tuple(word for word in arguments if out is None or word != str(out))
+        fresh = words[1] == "build" and out is not None and not out.exists() and "/" not in words[2]
+        fresh = fresh and not words[2].endswith(".toml") and "--set" not in words
+        if fresh and out is not None and key in built:
+            shutil.copytree(built[key], out)
+            return 0
+        code = blocks.run_command(arguments)
+        for option, value in itertools.pairwise(arguments):
+            if not code and option in ("--out", "--json", "--toml") and "--dry-run" not in words:
+                assert Path(value).exists(), f"{' '.join(arguments)} wrote no {value}"
+        if fresh and out is not None and not code and "--dry-run" not in words:
+            built[key] = out.resolve()
+        return code
+
+    return run
+
+
+@pytest.mark.parametrize("page", PAGES, ids=page_name)
+def test_every_block_runs_in_order(
+    page: Path,
+    command: Callable[[list[str]], int],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    found = page_blocks(page)
+    if not found:
+        return
+    monkeypatch.setenv("MPLBACKEND", "Agg")
+    monkeypatch.setattr(vbnfault, "load_scene", small_scene)
+    if "67p.obj" in page.read_text(encoding="utf-8"):
+        # a user's own shape: the real comet's name, the embedded body's form
+        body = load_body("embedded")
+        rows = [f"v {x:.3f} {y:.3f} {z:.3f}" for x, y, z in body.vertices_m]
+        rows += [f"f {a} {b} {c}" for a, b, c in body.faces + 1]
+        (tmp_path / "67p.obj").write_text("\n".join(rows) + "\n", encoding="utf-8")
+    blocks.run_page(found, tmp_path, command=command, said=lambda: capsys.readouterr().err)
+
+
+def test_every_fence_is_a_block_that_is_known() -> None:
+    for page in PAGES:
+        text = page.read_text(encoding="utf-8")
+        fences = re.findall(r"^```(\w*)", text, flags=re.MULTILINE)
+        opened = [language for language in fences if language]
+        assert set(opened) <= set(blocks.LANGUAGES), page_name(page)
+        assert len(opened) == len(page_blocks(page)), page_name(page)
+
+
+def test_a_block_that_does_not_run_says_why() -> None:
+    idle = [block for page in PAGES for block in page_blocks(page) if block.not_run]
+    assert all(len(block.not_run.split()) >= 3 for block in idle)
+    # most blocks run: the marks are for downloads and clusters
+    assert len(idle) < 0.2 * sum(len(page_blocks(page)) for page in PAGES)
+
+
+def test_a_block_with_a_wrong_option_is_refused(tmp_path: Path) -> None:
+    page = "<!-- not run: a test of the check -->\n```sh\nvbnfault build quickstart --oout x.zarr\n```\n"
+    (block,) = blocks.blocks(page, "page.md")
+    with pytest.raises(Exception, match=r"oout"):
+        blocks.check(block)
+    with pytest.raises(ValueError, match="no command bulid"):
+        blocks.parse(["bulid", "quickstart"])
+
+
+def generated(page: str) -> str:
+    """Return a reference page as Sphinx reads it."""
+    text = reference.fill((DOCS / "reference" / f"{page}.md").read_text(encoding="utf-8"))
+    assert "<!-- generated" not in text
+    return text
+
+
+def test_the_reference_has_every_command_and_option(capsys: pytest.CaptureFixture[str]) -> None:
+    text = generated("commands")
+    walked = list(reference.walk_commands())
+    assert len(walked) > 10
+    assert blocks.run_command(["vbnfault", "--help"]) == 0
+    helped = capsys.readouterr().out
+    for words, shown in walked:
+        assert words[0] in helped
+        section = text.partition(f"## vbnfault {' '.join(words)}\n")[2].partition("\n## ")[0]
+        for parameter in shown.params:
+            if parameter.param_type_name == "option" and parameter.name != "help":
+                assert f"`{parameter.opts[0]}`" in section, f"{words}: {parameter.opts}"
+
+
+def test_the_reference_has_every_key_of_a_scene() -> None:
+    text = generated("scene")
+    scene = load_scene("quickstart").resolved()
+    tables = {name: table for name, table in scene.items() if isinstance(table, dict) and name != "faults"}
+    keys = [(name, key) for name, table in tables.items() for key in table]
+    assert len(keys) > 80
+    for name, key in keys:
+        section = text.partition(f"## `[{name}]`\n")[2].partition("\n## ")[0]
+        own_table = re.search(rf"^## `\[+{name}\.{key}[].]", text, flags=re.MULTILINE)
+        assert f"| `{key}` |" in section or own_table, f"{name}.{key}"
+
+
+def test_the_reference_has_every_fault_and_key() -> None:
+    text = generated("faults")
+    for fault_class, models in registry().items():
+        for model, cls in models.items():
+            section = text.partition(f"### {fault_class} / {model}")[2].partition("\n##")[0]
+            assert section, (fault_class, model)
+            for field in dataclasses.fields(cls):
+                assert f"| `{field.name}` |" in section, (fault_class, model, field.name)
+
+
+def test_the_reference_has_every_array_of_a_store(
+    command: Callable[[list[str]], int], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    text = generated("store")
+    monkeypatch.chdir(tmp_path)
+    assert command(["vbnfault", "build", "quickstart", "--out", "quickstart.zarr"]) == 0
+    with vbnfault.open_dataset("quickstart.zarr") as data:
+        arrays = [re.sub(r"^without_.*", "without_<fault>", str(name)) for name in data.data_vars]
+    assert len(arrays) > 40
+    assert not [name for name in arrays if f"| `{name}` |" not in text]
+
+
+def test_the_reference_has_every_public_name() -> None:
+    text = generated("api")
+    assert not [n for n in vbnfault.__all__ if not n.startswith("__") and f":: vbnfault.{n}\n" not in text]
