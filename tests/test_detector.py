@@ -12,7 +12,7 @@ from scipy import stats
 
 from vbnfault.core import spectra
 from vbnfault.core.quantities import Electrons, Irradiance, RawDN
-from vbnfault.detector import Detector, Noise, poisson_quantile
+from vbnfault.detector import Noise, ThreeColourDetector, poisson_quantile
 from vbnfault.detector import three_colour as module
 
 SHORT_S = 1e-3
@@ -20,7 +20,7 @@ NODES = spectra.band_nodes_nm(400, 700, 8)
 MEANS = [0.1, 0.7, 1.0, 3.0, 3.99, 4.0, 4.5, 6.0, 8.0, 12.0, 30.0, 100.0, 999.0, 1000.0, 1e4, 1e5]
 
 
-def flat(detector: Detector, value: float, shape: tuple[int, int] = (64, 64)) -> Electrons:
+def flat(detector: ThreeColourDetector, value: float, shape: tuple[int, int] = (64, 64)) -> Electrons:
     return Electrons(array=np.full((*shape, 3), value, np.float32), white_e=detector.white_e)
 
 
@@ -146,7 +146,7 @@ def test_poisson_does_not_depend_on_neighbours_or_layout() -> None:
 @pytest.mark.parametrize("dark_e", [0.0, 0.015, 3.0, 20.0, 75.0, 2000.0])
 def test_dark_frame_is_the_poisson_of_its_dark_current(dark_e: float) -> None:
     # pixels without light go a quicker way: the same draws, but for the error stated
-    detector = Detector(dark_current_e_s=dark_e / SHORT_S)
+    detector = ThreeColourDetector(dark_current_e_s=dark_e / SHORT_S)
     noise = draw(5, (128, 128))
     electrons = detector.electrons(flat(detector, 0.0, (128, 128)), SHORT_S, noise).array
     exact = stats.poisson.ppf(stats.norm.cdf(noise.shot.astype(np.float64)), np.float32(dark_e)) if dark_e else 0.0
@@ -158,7 +158,7 @@ def test_dark_frame_is_the_poisson_of_its_dark_current(dark_e: float) -> None:
 
 
 def test_electrons_expected_is_the_weighted_sum_of_the_bands() -> None:
-    detector = Detector()
+    detector = ThreeColourDetector()
     light = np.random.default_rng(1).random((8, 37, 53), dtype=np.float32)
     got = detector.electrons_expected(Irradiance(array=light, wavelength_nm=NODES), 0.02)
     weights = spectra.band_weights("nikon_5100", 0.5, NODES) * (5.5e-6) ** 2 * 0.02
@@ -170,7 +170,7 @@ def test_electrons_expected_is_the_weighted_sum_of_the_bands() -> None:
 
 
 def test_a_grey_surface_in_sunlight_is_grey() -> None:
-    detector = Detector(width_px=4, height_px=4)
+    detector = ThreeColourDetector(width_px=4, height_px=4)
     assert detector.white_balance.min() == 1
     for level in (0.02, 0.2, 0.7):
         sun = spectra.solar_band_irradiance_W_m2_nm(NODES, 2.0)
@@ -189,7 +189,7 @@ def test_a_grey_surface_in_sunlight_is_grey() -> None:
 
 
 def test_white_is_where_255_begins() -> None:
-    detector = Detector(dark_current_e_s=0)
+    detector = ThreeColourDetector(dark_current_e_s=0)
     for share, value in ((1.0, 255), (0.5, 127.5)):
         white = Electrons(
             array=np.broadcast_to(share * detector.white_e, (4, 4, 3)).astype(np.float32),
@@ -207,7 +207,7 @@ def test_white_is_where_255_begins() -> None:
 
 @pytest.mark.parametrize("bits", [8, 10, 12, 14, 16])
 def test_no_light_gives_the_bias_and_black(bits: int) -> None:
-    detector = Detector(dark_current_e_s=0, adc_bits=bits, bias_dn=17)
+    detector = ThreeColourDetector(dark_current_e_s=0, adc_bits=bits, bias_dn=17)
     dark = flat(detector, 0.0)
     raw = detector.raw_dn(detector.electrons(dark, SHORT_S, None), None)
     np.testing.assert_array_equal(raw.array, 17)
@@ -219,7 +219,7 @@ def test_no_light_gives_the_bias_and_black(bits: int) -> None:
 
 @pytest.mark.parametrize("dark_current_e_s", [0.0, 125.0, 30_000.0])
 def test_dark_current_is_subtracted_as_black_level(dark_current_e_s: float) -> None:
-    detector = Detector(dark_current_e_s=dark_current_e_s)
+    detector = ThreeColourDetector(dark_current_e_s=dark_current_e_s)
     image = detector.develop(flat(detector, 0.0), 0.1, None)
     # half a code of rounding is 0.03 of a step at most: it rounds to 0
     np.testing.assert_array_equal(image.array, 0)
@@ -227,7 +227,7 @@ def test_dark_current_is_subtracted_as_black_level(dark_current_e_s: float) -> N
 
 @pytest.mark.parametrize("bits", [8, 10, 12, 14, 16])
 def test_saturation_gives_the_top_code_and_255(bits: int) -> None:
-    detector = Detector(adc_bits=bits, dark_current_e_s=0)
+    detector = ThreeColourDetector(adc_bits=bits, dark_current_e_s=0)
     for light in (detector.full_well_e, 2 * detector.full_well_e, 1e9):
         electrons = detector.electrons(flat(detector, light), SHORT_S, None)
         np.testing.assert_array_equal(electrons.array, np.float32(detector.full_well_e))
@@ -238,14 +238,14 @@ def test_saturation_gives_the_top_code_and_255(bits: int) -> None:
 
 
 def test_saturation_is_white_after_a_long_exposure_too() -> None:
-    detector = Detector(dark_current_e_s=125)
+    detector = ThreeColourDetector(dark_current_e_s=125)
     np.testing.assert_array_equal(detector.develop(flat(detector, 1e6), 5.0, None).array, 255)
 
 
 def test_full_well_clips_before_bias_and_read_noise() -> None:
     # read noise is added to a clipped well and then cut at the top code: what is left below it is the mean of
     # min(0, N(0, σ)) = -σ/√(2π), and half of the pixels. Clipping afterwards would leave no noise at all
-    detector = Detector(read_noise_e_rms=50.0)
+    detector = ThreeColourDetector(read_noise_e_rms=50.0)
     shape = (200, 200)
     raw = detector.raw_dn(
         detector.electrons(flat(detector, 1e6, shape), SHORT_S, draw(8, shape)), draw(8, shape)
@@ -260,14 +260,16 @@ def test_full_well_clips_before_bias_and_read_noise() -> None:
 
 
 def test_the_bias_keeps_the_noise_of_a_dark_frame_whole() -> None:
-    detector = Detector(dark_current_e_s=0)
+    detector = ThreeColourDetector(dark_current_e_s=0)
     shape = (200, 200)
     raw = detector.raw_dn(flat(detector, 0.0, shape), draw(9, shape)).array.astype(np.float64)
     sigma = 13 * detector.gain_dn_per_e
     assert raw.mean() == pytest.approx(64, abs=4 * sigma / np.sqrt(raw.size))
     assert raw.var() == pytest.approx(sigma**2 + 1 / 12, rel=4 * np.sqrt(2 / raw.size))
     # a bias too low would cut it: with none, half of the pixels stick at 0
-    cut = Detector(dark_current_e_s=0, bias_dn=0).raw_dn(flat(detector, 0.0, shape), draw(9, shape)).array
+    cut = (
+        ThreeColourDetector(dark_current_e_s=0, bias_dn=0).raw_dn(flat(detector, 0.0, shape), draw(9, shape)).array
+    )
     assert (cut == 0).mean() == pytest.approx(stats.norm.cdf(0.5 / sigma), abs=4 * np.sqrt(0.25 / cut.size))
 
 
@@ -276,13 +278,13 @@ def test_the_bias_keeps_the_noise_of_a_dark_frame_whole() -> None:
 
 @pytest.mark.parametrize(("bits", "bias", "full_well"), [(12, 64, 13_500.0), (8, 0, 1000.0), (16, 500, 100_000.0)])
 def test_gain_takes_the_full_well_to_the_top_code(bits: int, bias: int, full_well: float) -> None:
-    detector = Detector(adc_bits=bits, bias_dn=bias, full_well_e=full_well)
+    detector = ThreeColourDetector(adc_bits=bits, bias_dn=bias, full_well_e=full_well)
     assert detector.adc_max_dn == 2**bits - 1
     assert detector.gain_dn_per_e * full_well + bias == pytest.approx(2**bits - 1)
 
 
 def test_noise_free_response_is_linear() -> None:
-    detector = Detector(dark_current_e_s=0)
+    detector = ThreeColourDetector(dark_current_e_s=0)
     signal = np.linspace(0, 13_500, 64 * 64 * 3, dtype=np.float32).reshape(64, 64, 3)
     given = Electrons(array=signal.copy(), white_e=detector.white_e)
     raw = detector.raw_dn(detector.electrons(given, SHORT_S, None), None).array
@@ -297,7 +299,7 @@ def test_noise_free_response_is_linear() -> None:
 @pytest.mark.parametrize("signal_e", [0.0, 5.0, 50.0, 500.0, 3000.0, 9000.0])
 def test_photon_transfer(signal_e: float) -> None:
     # EMVA 1288: σ² = K² (signal + dark + read²) + 1/12
-    detector = Detector(dark_current_e_s=20.0 / SHORT_S)
+    detector = ThreeColourDetector(dark_current_e_s=20.0 / SHORT_S)
     shape = (256, 256)
     noise = draw(int(signal_e) + 10, shape)
     raw = detector.raw_dn(detector.electrons(flat(detector, signal_e, shape), SHORT_S, noise), noise).array
@@ -310,7 +312,7 @@ def test_photon_transfer(signal_e: float) -> None:
 
 
 def test_intensity_is_the_luminance() -> None:
-    detector = Detector()
+    detector = ThreeColourDetector()
     raw = np.random.default_rng(4).integers(0, 4096, (50, 60, 3), dtype=np.uint16)
     image = detector.rgbi(RawDN(array=raw), SHORT_S).array
     luminance = image[..., :3].astype(np.float64) @ [0.2126, 0.7152, 0.0722]  # Rec. 709
@@ -319,7 +321,7 @@ def test_intensity_is_the_luminance() -> None:
 
 
 def test_colours_stay_in_their_channels() -> None:
-    detector = Detector(dark_current_e_s=0)
+    detector = ThreeColourDetector(dark_current_e_s=0)
     for c in range(3):
         only = np.zeros((8, 8, 3), np.float32)
         only[..., c] = detector.white_e[c] / 2
@@ -331,7 +333,7 @@ def test_colours_stay_in_their_channels() -> None:
 # ------------------------------------------------------------------------------------------- twins and blocks
 
 
-def gradient(detector: Detector, shape: tuple[int, int]) -> np.ndarray:
+def gradient(detector: ThreeColourDetector, shape: tuple[int, int]) -> np.ndarray:
     signal = np.linspace(0, 1.2 * detector.full_well_e, shape[0] * shape[1] * 3, dtype=np.float32)
     signal[: len(signal) // 4] = 0  # sky
     return signal.reshape(*shape, 3)
@@ -339,7 +341,7 @@ def gradient(detector: Detector, shape: tuple[int, int]) -> np.ndarray:
 
 @pytest.mark.parametrize("brighter", [1.0, 30.0, 1e5])
 def test_brightening_a_patch_changes_no_other_pixel(brighter: float) -> None:
-    detector = Detector()
+    detector = ThreeColourDetector()
     shape = (101, 70)
     noise, signal = draw(6, shape), gradient(detector, shape)
     patch = np.zeros(shape, dtype=bool)
@@ -354,7 +356,7 @@ def test_brightening_a_patch_changes_no_other_pixel(brighter: float) -> None:
 
 
 def test_expected_electrons_of_a_pixel_do_not_depend_on_the_others() -> None:
-    detector = Detector()
+    detector = ThreeColourDetector()
     light = np.random.default_rng(1).random((8, 90, 77), dtype=np.float32)
     whole = detector.electrons_expected(Irradiance(array=light.copy(), wavelength_nm=NODES), 0.02).array
     crop = detector.electrons_expected(
@@ -365,7 +367,7 @@ def test_expected_electrons_of_a_pixel_do_not_depend_on_the_others() -> None:
 
 @pytest.mark.parametrize("rows", [1, 7, 1000])
 def test_results_do_not_depend_on_the_blocks(rows: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    detector = Detector()
+    detector = ThreeColourDetector()
     shape = (101, 70)
     noise = draw(6, shape)
     light = np.random.default_rng(1).random((8, *shape), dtype=np.float32) * np.float32(1e-3)
@@ -387,7 +389,7 @@ def test_results_do_not_depend_on_the_blocks(rows: int, monkeypatch: pytest.Monk
 
 @pytest.mark.parametrize("noisy", [True, False])
 def test_develop_is_all_the_steps(noisy: bool) -> None:
-    detector = Detector()
+    detector = ThreeColourDetector()
     shape = (101, 70)
     noise = draw(6, shape) if noisy else None
     expected = Electrons(array=gradient(detector, shape), white_e=detector.white_e)
@@ -396,7 +398,7 @@ def test_develop_is_all_the_steps(noisy: bool) -> None:
 
 
 def test_steps_return_new_read_only_quantities() -> None:
-    detector = Detector()
+    detector = ThreeColourDetector()
     noise = draw(2)
     expected = flat(detector, 100.0)
     shot, read = noise.shot.copy(), noise.read.copy()
@@ -439,7 +441,7 @@ raise SystemExit(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
 def test_the_paper_worlds_detector_is_what_it_was() -> None:
     """Block means of a picture of fixed light and noise, as first published: sensors with a mosaic must not change
     the one without. A block has 256 pixels, of which five may round otherwise on another processor."""
-    d = Detector(width_px=64, height_px=64)
+    d = ThreeColourDetector(width_px=64, height_px=64)
     ramp = np.linspace(0, 1.2, 64, dtype=np.float32)
     light = np.stack([np.tile(ramp, (64, 1)), np.tile(ramp[:, None], (1, 64)), np.full((64, 64), 0.05)], axis=-1)
     expected = Electrons(array=(light * d.white_e).astype(np.float32), white_e=d.white_e)

@@ -16,7 +16,7 @@ from vbnfault import dataset
 from vbnfault.core import spectra
 from vbnfault.core.errors import InputError
 from vbnfault.core.quantities import Irradiance
-from vbnfault.detector import Detector, MosaicDetector, load_sensor
+from vbnfault.detector import MosaicDetector, ThreeColourDetector, load_sensor
 from vbnfault.detector.efficiency import Curve, QuantumEfficiency, white_balance
 from vbnfault.detector.mosaic import pattern
 from vbnfault.detector.sensor import parse_sensor
@@ -93,7 +93,7 @@ def test_grey_ground_in_sunlight_is_grey(name: str) -> None:
 
 
 def test_white_balance_is_that_of_three_colours_and_leaves_the_infrared_out() -> None:
-    three = Detector(response="nikon_5100", quantum_efficiency_peak=0.5)
+    three = ThreeColourDetector(response="nikon_5100", quantum_efficiency_peak=0.5)
     found = white_balance(QuantumEfficiency(channels=("R", "G", "B", "NIR")))
     np.testing.assert_array_equal(found, [*three.white_balance, 1])
     with pytest.raises(InputError, match="no sunlight"):

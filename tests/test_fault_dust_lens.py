@@ -17,7 +17,7 @@ from test_faults_kit import flat_electrons, make, make_context, rng
 from vbnfault.camera import Camera
 from vbnfault.core import spectra
 from vbnfault.core.errors import InputError
-from vbnfault.detector import Detector
+from vbnfault.detector import ThreeColourDetector
 from vbnfault.faults import FaultContext, dust_lens
 from vbnfault.lens import RealLens, ThinLens, first_order, load_lens, scaled_to_field, stopped_down
 from vbnfault.lens.footprint import ImageFrame, beams, disc_overlap
@@ -48,14 +48,14 @@ def window_lens(tmp_path: Path, *, distance: float, pupil: float) -> str:
 
 
 def thin_context(size: int = 200, *, f_number: float = 1.0, **more: Any) -> FaultContext:
-    detector = Detector(width_px=size, height_px=size, pixel_pitch_um=PITCH_UM)
+    detector = ThreeColourDetector(width_px=size, height_px=size, pixel_pitch_um=PITCH_UM)
     lens = ThinLens(focal_length_mm=FOCAL_MM, f_number=f_number)
     return FaultContext(camera=Camera(lens=lens, detector=detector), **more)
 
 
 @cache
 def real_context(name: str, size: int = 256) -> FaultContext:
-    detector = Detector(width_px=size, height_px=size, pixel_pitch_um=22.0)
+    detector = ThreeColourDetector(width_px=size, height_px=size, pixel_pitch_um=22.0)
     lens = scaled_to_field(load_lens(name), 65.0, size * detector.pixel_pitch_um * 1e-3)
     real = RealLens(prescription=lens, width_px=size, height_px=size, pixel_pitch_um=detector.pixel_pitch_um)
     return FaultContext(camera=Camera(lens=real, detector=detector))
@@ -171,7 +171,7 @@ def test_places_have_the_pictures_axes(tmp_path: Path) -> None:
 @pytest.mark.parametrize(("height", "grain"), [(1.0, 0.03), (0.4, 0.1)])
 def test_a_grain_on_the_window_lies_in_the_cone(height: float, grain: float) -> None:
     size, pitch_mm, f_number = 128, 2e-3, 16.0
-    detector = Detector(width_px=size, height_px=size, pixel_pitch_um=1e3 * pitch_mm)
+    detector = ThreeColourDetector(width_px=size, height_px=size, pixel_pitch_um=1e3 * pitch_mm)
     prescription = stopped_down(load_lens("tessar_50_f2p8").scaled(0.2), f_number)
     real = RealLens(prescription=prescription, width_px=size, height_px=size, pixel_pitch_um=1e3 * pitch_mm)
     context = FaultContext(camera=Camera(lens=real, detector=detector))

@@ -15,7 +15,7 @@ from test_faults_kit import flat_electrons, make, make_context, rng
 
 from vbnfault.camera import Camera
 from vbnfault.core.errors import InputError
-from vbnfault.detector import Detector
+from vbnfault.detector import ThreeColourDetector
 from vbnfault.faults import FaultContext
 from vbnfault.lens import RealLens, ThinLens, first_order, load_lens, scaled_to_field
 from vbnfault.lens.rays import real_pupil_diameter_mm, trace
@@ -42,13 +42,13 @@ def thin_lens(tmp_path: Path, *, pupil: float, rim: float, thickness: float) -> 
 
 def context(fov_deg: float = 60.0) -> FaultContext:
     pitch_um = 2e3 * FOCAL_MM * np.tan(np.radians(fov_deg / 2)) / SIZE
-    detector = Detector(width_px=SIZE, height_px=SIZE, pixel_pitch_um=float(pitch_um))
+    detector = ThreeColourDetector(width_px=SIZE, height_px=SIZE, pixel_pitch_um=float(pitch_um))
     return FaultContext(camera=Camera(lens=ThinLens(focal_length_mm=FOCAL_MM, f_number=1.0), detector=detector))
 
 
 @cache
 def real_context(name: str) -> FaultContext:
-    detector = Detector(width_px=SIZE, height_px=SIZE, pixel_pitch_um=20.0)
+    detector = ThreeColourDetector(width_px=SIZE, height_px=SIZE, pixel_pitch_um=20.0)
     lens = scaled_to_field(load_lens(name), 65.0, SIZE * 20e-3)
     real = RealLens(prescription=lens, width_px=SIZE, height_px=SIZE, pixel_pitch_um=20.0)
     return FaultContext(camera=Camera(lens=real, detector=detector))

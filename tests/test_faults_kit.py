@@ -9,7 +9,7 @@ import numpy as np
 
 from vbnfault.camera import Camera, focal_length_mm
 from vbnfault.core.quantities import RGBI, Charge, Electrons, Offset, Quantity, RawMosaic
-from vbnfault.detector import Detector, MosaicDetector, load_sensor
+from vbnfault.detector import MosaicDetector, ThreeColourDetector, load_sensor
 from vbnfault.faults import Fault, FaultContext, from_dict
 from vbnfault.lens import ThinLens
 
@@ -25,7 +25,7 @@ def make_context(
     **camera: Any,
 ) -> FaultContext:
     """A context with a thin lens of `fov_deg` across the width; height as width unless given."""
-    detector = Detector(width_px=width, height_px=height or width)
+    detector = ThreeColourDetector(width_px=width, height_px=height or width)
     focal = focal_length_mm(fov_deg, width, detector.pixel_pitch_um)
     return FaultContext(
         camera=Camera(lens=ThinLens(focal_length_mm=focal, f_number=4.0), detector=detector, **camera),

@@ -24,7 +24,7 @@ from vbnfault.camera import Camera
 from vbnfault.core import resources
 from vbnfault.core.errors import InputError
 from vbnfault.core.quantities import BODY, SUN, Radiance
-from vbnfault.detector import Detector
+from vbnfault.detector import ThreeColourDetector
 from vbnfault.lens import RealLens, ThinLens, first_order, imaging, load_lens, parse_lens, scaled_to_field
 from vbnfault.lens.coating import design, mean_reflectance
 from vbnfault.lens.footprint import DEFAULT_LENS
@@ -59,7 +59,9 @@ def real(name: str, **changes: Any) -> RealLens:
 
 def camera(lens: RealLens | ThinLens, width_px: int = SIDE_PX, height_px: int = SIDE_PX) -> Camera:
     pitch = lens.pixel_pitch_um if isinstance(lens, RealLens) else PITCH_UM
-    return Camera(lens=lens, detector=Detector(width_px=width_px, height_px=height_px, pixel_pitch_um=pitch))
+    return Camera(
+        lens=lens, detector=ThreeColourDetector(width_px=width_px, height_px=height_px, pixel_pitch_um=pitch)
+    )
 
 
 def rays(lens: RealLens, slope: Any, x: Any, y: Any, wavelength_nm: float) -> Any:
@@ -160,13 +162,13 @@ def test_opencv_reproduces_the_map(name: str) -> None:
     slope = offset * (lens.undistorted(distance) / distance)[:, None]
     directions = np.column_stack([slope, np.ones(len(slope))])[keep]
     matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
-    seen, _ = cv2.projectPoints(directions, np.zeros(3), np.zeros(3), matrix, c.distortion)
+    seen, _ = cv2.projectPoints(directions, np.zeros(3), np.zeros(3), matrix, c.lens.distortion)
     exact = np.array([c.project(direction) for direction in directions])
     np.testing.assert_allclose(exact, pixels[keep], atol=1e-4)
     off = np.hypot(*(seen[:, 0] - exact).T)
     # a table of 4097 slopes with linear heights between: (1.5 / 4096)² / 8 of some 800 px is 1e-5
     assert off.max() <= 1e-4
-    rms, most = c.distortion_residual_px
+    rms, most = c.lens.distortion_residual_px
     assert 0 < rms < 0.1
     assert rms < most
 
@@ -543,7 +545,7 @@ def test_stars_go_through_the_lens(sigma_px: float) -> None:
     c, nodes, date = assemble.base_camera(stars), assemble.wavelengths_nm(stars), stars.sun.julian_date
     lens = c.lens
     assert isinstance(lens, RealLens)
-    gx, gy = c.guard_px
+    gx, gy = c.lens.guard_px
     view = View(
         position_L_m=np.zeros(3),
         L_from_C=np.eye(3),
@@ -582,9 +584,9 @@ def test_stars_go_through_the_lens(sigma_px: float) -> None:
 def test_a_thin_lens_has_neither_distortion_nor_guard_band() -> None:
     thin = assemble.base_camera(scene())
     assert isinstance(thin.lens, ThinLens)
-    assert thin.guard_px == (0, 0)
-    assert thin.lens_name == "thin lens"
-    assert not thin.distortion.any()
+    assert thin.lens.guard_px == (0, 0)
+    assert thin.lens.name == "thin lens"
+    assert not thin.lens.distortion.any()
 
 
 def test_samples_of_a_scene_with_a_lens() -> None:
@@ -604,7 +606,7 @@ def test_samples_of_a_scene_with_a_lens() -> None:
     spec = dataset.store_spec(session, [16])
     assert spec.lens_names == ("AF Nikkor 28 mm f/2.8D",)
     members = spec.members(16)
-    assert members["distortion"].attributes["residual_px_max"] == c.distortion_residual_px[1] > 0
+    assert members["distortion"].attributes["residual_px_max"] == c.lens.distortion_residual_px[1] > 0
     # Sun and ground in one frame
     frames_ = (session.frame(int(i)) for i in np.flatnonzero(session.plan.stratum == plan.SUN_FACING))
     frame = next(
@@ -617,11 +619,11 @@ def test_samples_of_a_scene_with_a_lens() -> None:
     lens = frame.camera.lens
     assert isinstance(lens, RealLens)
     assert frame.rendered is not None
-    assert frame.rendered.array.shape[1:] == (112 + 2 * c.guard_px[1], 128 + 2 * c.guard_px[0])
+    assert frame.rendered.array.shape[1:] == (112 + 2 * c.lens.guard_px[1], 128 + 2 * c.lens.guard_px[0])
     sample = to_sample(frame)
     for name, layer in sample.layers.items():
         assert (112, 128) in (layer.shape[:2], layer.shape[1:3], layer.shape[-2:]), name
-    np.testing.assert_array_equal(sample.scalars["distortion"], c.distortion)
+    np.testing.assert_array_equal(sample.scalars["distortion"], c.lens.distortion)
     assert sample.scalars["intrinsics"].tolist() == c.intrinsics.tolist()
 
     # the Sun is in this frame: label and light where the camera has it

@@ -10,7 +10,7 @@ import pytest
 from vbnfault import render
 from vbnfault.core import frames, spectra
 from vbnfault.core.photometry import Diffuse
-from vbnfault.detector import Detector
+from vbnfault.detector import ThreeColourDetector
 from vbnfault.lens import ThinLens
 from vbnfault.render.description import RenderInput, Sunlight, View
 from vbnfault.render.runtime import dr
@@ -111,7 +111,7 @@ def test_spectral_sampling_adds_no_noise_and_no_bias() -> None:
     """Flat Lambert plane at 16 samples per pixel: spread < 0.3 of the sensor's noise, bias < 0.5 %."""
     light = sun(frames.direction_L(0, 60), 2.0)
     image = render.radiance(join(plane()), scene(view(10 * UP, -UP), light, reflectance="67p"))
-    detector = Detector(width_px=64, height_px=64)
+    detector = ThreeColourDetector(width_px=64, height_px=64)
     lens = ThinLens(focal_length_mm=4.4, f_number=4.0)
     one = detector.electrons_expected(lens.image(image), 1.0)
     exposure = 0.5 * float((one.white_e / one.array.mean(axis=(0, 1))).min())  # half white

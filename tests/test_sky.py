@@ -12,7 +12,7 @@ from scipy import constants
 from vbnfault.core import resources, spectra
 from vbnfault.core.frames import J2000_JD, minimal_rotation, rx, ry
 from vbnfault.core.quantities import Radiance
-from vbnfault.detector import Detector
+from vbnfault.detector import ThreeColourDetector
 from vbnfault.lens import ThinLens
 from vbnfault.world import sky
 
@@ -173,7 +173,9 @@ def test_hotter_stars_are_bluer() -> None:
 @pytest.mark.parametrize("off_axis_px", [0.0, 40.0])
 def test_electrons_of_a_star_of_magnitude_zero(off_axis_px: float) -> None:
     lens = ThinLens(focal_length_mm=FOCAL_PX * 5.5e-3, f_number=2.8, transmission=0.9)
-    detector = Detector(width_px=WIDTH, height_px=HEIGHT, pixel_pitch_um=5.5, quantum_efficiency_peak=0.5)
+    detector = ThreeColourDetector(
+        width_px=WIDTH, height_px=HEIGHT, pixel_pitch_um=5.5, quantum_efficiency_peak=0.5
+    )
     stars = sky.star_radiance(at((WIDTH / 2 + off_axis_px, HEIGHT / 2)), J_from_C=AXES, sigma_px=0.8, **FRAME)
     black = Radiance(array=np.zeros((8, HEIGHT, WIDTH), dtype=np.float32), wavelength_nm=NODES_NM)
     exposed = detector.electrons_expected(lens.image(stars.added_to(black)), 2.0).array
@@ -318,7 +320,7 @@ def test_adding_leaves_the_rest_bit_for_bit() -> None:
 
 def test_the_faintest_star_that_an_exposure_shows() -> None:
     lens = ThinLens(focal_length_mm=8.0, f_number=2.8, transmission=0.9)
-    detector = Detector(width_px=WIDTH, height_px=HEIGHT)
+    detector = ThreeColourDetector(width_px=WIDTH, height_px=HEIGHT)
     focal_px = 8e3 / detector.pixel_pitch_um
     limit: dict[str, Any] = {
         "electron_rate_weights": detector.electron_rate_weights(NODES_NM),

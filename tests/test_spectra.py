@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from vbnfault.core import spectra
 from vbnfault.core.quantities import LUMINANCE, Irradiance
-from vbnfault.detector import Detector
+from vbnfault.detector import ThreeColourDetector
 
 NODES = spectra.band_nodes_nm(400, 700, 8)
 TABLE_NM = np.array(list(DATA_ASTMG173_ETR))
@@ -153,7 +153,7 @@ def test_67p_in_eight_bands_is_within_half_a_percent_of_the_converged_integral()
     expected = direct_electrons(spectra.reflectance("67p", fine), fine)
     got = band_electrons(spectra.reflectance("67p", NODES))
     np.testing.assert_allclose(got, expected, rtol=5e-3)
-    balance = Detector().white_balance
+    balance = ThreeColourDetector().white_balance
     assert LUMINANCE @ (balance * got) == pytest.approx(LUMINANCE @ (balance * expected), rel=5e-3)
     # and the bands do better than the same nodes with monochromatic weights, which miss the lines of the Sun
     naive = []
@@ -196,7 +196,7 @@ def test_photons_of_nearly_monochromatic_light() -> None:
     photons = 2.0 * 1e-3 * (10e-6) ** 2 / (6.62607015e-34 * 299792458 / 552.5e-9)
     assert photons == pytest.approx(2e-13 / 3.5954e-19, rel=1e-4)
     nodes = np.array([551.5, 552.5, 553.5])
-    detector = Detector(width_px=2, height_px=2, pixel_pitch_um=10)
+    detector = ThreeColourDetector(width_px=2, height_px=2, pixel_pitch_um=10)
     light = Irradiance(array=np.ones((3, 2, 2), np.float32), wavelength_nm=nodes)
     got = detector.electrons_expected(light, 1e-3)
     # QE changes by up to 4 % a nm (in R), and the Sun's lines weight the halves by 3 %: their product
@@ -207,11 +207,11 @@ def test_electrons_scale_with_energy_exposure_area_and_efficiency() -> None:
     base = spectra.band_weights("nikon_5100", 0.5, NODES)
     np.testing.assert_allclose(spectra.band_weights("nikon_5100", 0.25, NODES), base / 2, rtol=1e-15)
     light = Irradiance(array=np.full((8, 2, 2), 0.01, np.float32), wavelength_nm=NODES)
-    reference = Detector(pixel_pitch_um=5).electrons_expected(light, 1e-3).array
+    reference = ThreeColourDetector(pixel_pitch_um=5).electrons_expected(light, 1e-3).array
     # float32: 8 products summed, each to 6e-8
     np.testing.assert_allclose(
-        Detector(pixel_pitch_um=10).electrons_expected(light, 1e-3).array, 4 * reference, rtol=1e-6
+        ThreeColourDetector(pixel_pitch_um=10).electrons_expected(light, 1e-3).array, 4 * reference, rtol=1e-6
     )
     np.testing.assert_allclose(
-        Detector(pixel_pitch_um=5).electrons_expected(light, 3e-3).array, 3 * reference, rtol=1e-6
+        ThreeColourDetector(pixel_pitch_um=5).electrons_expected(light, 3e-3).array, 3 * reference, rtol=1e-6
     )

@@ -15,7 +15,7 @@ from vbnfault.camera import Camera
 from vbnfault.core import llvm, resources, spectra
 from vbnfault.core.errors import VbnfaultError
 from vbnfault.core.quantities import Electrons, Radiance
-from vbnfault.detector import Detector
+from vbnfault.detector import ThreeColourDetector
 from vbnfault.faults import FaultContext, act, from_dict, registry
 from vbnfault.lens import Prescription, RealLens, ThinLens, first_order, load_lens, parse_lens, scaled_to_field
 from vbnfault.lens.coating import mean_reflectance
@@ -103,7 +103,7 @@ def disc(camera: Camera, sun_deg: float, radius_rad: float) -> tuple[Radiance, f
 
 @pytest.mark.parametrize("sun_deg", [0.0, 20.0, 38.0])
 def test_a_thin_lens_images_what_its_pupil_admits_of_the_sun(sun_deg: float) -> None:
-    detector = Detector(width_px=SIZE, height_px=SIZE, pixel_pitch_um=20.0)
+    detector = ThreeColourDetector(width_px=SIZE, height_px=SIZE, pixel_pitch_um=20.0)
     lens = ThinLens(focal_length_mm=1.4, f_number=2.0, transmission=0.8)
     camera = Camera(lens=lens, detector=detector)
     radiance, solid = disc(camera, sun_deg, 0.04)
@@ -177,7 +177,7 @@ def thin_context(sun_deg: float, size: int = SIZE, fov_deg: float = 40.0) -> Fau
 
 def real_context(sun_deg: float) -> FaultContext:
     lens = scaled_to_field(load_lens("nikkor_28_f2p8").coated("bbar"), 60.0, SIZE * 20e-3)
-    detector = Detector(width_px=SIZE, height_px=SIZE, pixel_pitch_um=20.0)
+    detector = ThreeColourDetector(width_px=SIZE, height_px=SIZE, pixel_pitch_um=20.0)
     real = RealLens(prescription=lens, width_px=SIZE, height_px=SIZE, pixel_pitch_um=20.0)
     where = thin_context(sun_deg)
     camera = Camera(lens=real, detector=detector, exposure_s=1e-3)

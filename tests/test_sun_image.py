@@ -14,7 +14,7 @@ from vbnfault.camera import Camera
 from vbnfault.core import frames, spectra
 from vbnfault.core.quantities import SUN, Radiance, SunInView
 from vbnfault.core.sundisc import Pinhole, add_mean, pixel_sums
-from vbnfault.detector import Detector
+from vbnfault.detector import ThreeColourDetector
 from vbnfault.lens import RealLens, ThinLens, load_lens
 from vbnfault.render.description import Sunlight, View
 
@@ -154,13 +154,13 @@ def test_a_small_sun_owns_its_pixel(surface: render.TerrainMesh) -> None:
 
 
 def thin(pixels: int) -> Camera:
-    detector = Detector(width_px=pixels, height_px=pixels, pixel_pitch_um=12800 / pixels)
+    detector = ThreeColourDetector(width_px=pixels, height_px=pixels, pixel_pitch_um=12800 / pixels)
     return Camera(lens=ThinLens(focal_length_mm=12.0, f_number=4.0, transmission=0.9), detector=detector)
 
 
 def real(pixels: int) -> Camera:
     found = load_lens("distagon_25_f2p8")
-    detector = Detector(width_px=pixels, height_px=pixels, pixel_pitch_um=18000 / pixels)
+    detector = ThreeColourDetector(width_px=pixels, height_px=pixels, pixel_pitch_um=18000 / pixels)
     lens = RealLens(prescription=found, width_px=pixels, height_px=pixels, pixel_pitch_um=18000 / pixels)
     return Camera(lens=lens, detector=detector)
 
@@ -172,7 +172,7 @@ def test_a_lens_images_the_power_that_it_admits(camera: Callable[[int], Camera],
     c = camera(pixels)
     nodes = np.array([486.1, 587.6, 656.3])
     sin_a = np.sin(0.00465)
-    guard = c.guard_px
+    guard = c.lens.guard_px
     for sx, sy in ((0.003, 0.001), (0.11, -0.17), (-0.2, 0.13)):
         direction = np.array([sx, sy, 1.0]) / np.sqrt(1 + sx * sx + sy * sy)
         disc = SunInView(

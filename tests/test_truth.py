@@ -17,7 +17,7 @@ from test_render import UP, sun, view
 from vbnfault import dataset, render, store
 from vbnfault.camera import Camera
 from vbnfault.core import frames
-from vbnfault.detector import Detector
+from vbnfault.detector import ThreeColourDetector
 from vbnfault.lens import RealLens, load_lens, scaled_to_field
 from vbnfault.lens.aperture import stopped_down
 from vbnfault.lens.distortion import fitted
@@ -130,7 +130,7 @@ def behind(lens: Prescription, fov_deg: float, width_px: int = 1024, height_px: 
         height_px=height_px,
         pixel_pitch_um=5.5,
     )
-    detector = Detector(width_px=width_px, height_px=height_px, pixel_pitch_um=5.5)
+    detector = ThreeColourDetector(width_px=width_px, height_px=height_px, pixel_pitch_um=5.5)
     return Camera(lens=real, detector=detector)
 
 
@@ -150,15 +150,15 @@ def assert_opencv_agrees(camera: Camera) -> None:
     fx, fy, cx, cy = camera.intrinsics
     matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
     in_C = np.column_stack([slopes, np.ones(len(slopes))])
-    seen, _ = cv2.projectPoints(in_C, np.zeros(3), np.zeros(3), matrix, camera.distortion)
+    seen, _ = cv2.projectPoints(in_C, np.zeros(3), np.zeros(3), matrix, camera.lens.distortion)
     off = np.hypot(*(seen[:, 0] - centres).T)
     # a table of 4097 slopes in between which heights are linear: h'' (T / 4096)² / 8 focal lengths, T up to 7
     assert off.max() < 0.002
     # an error of the iteration shrinks by a factor of 0.9 or better a step
     ends = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 300, 1e-12)
-    undone = cv2.undistortPoints(centres[:, None], matrix, camera.distortion, criteria=ends)[:, 0]
+    undone = cv2.undistortPoints(centres[:, None], matrix, camera.lens.distortion, criteria=ends)[:, 0]
     again, _ = cv2.projectPoints(
-        np.column_stack([undone, np.ones(len(undone))]), np.zeros(3), np.zeros(3), matrix, camera.distortion
+        np.column_stack([undone, np.ones(len(undone))]), np.zeros(3), np.zeros(3), matrix, camera.lens.distortion
     )
     assert np.hypot(*(again[:, 0] - centres).T).max() < 0.002
     np.testing.assert_allclose(undone, slopes, rtol=1e-4, atol=1e-6)

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..core.quantities import Electrons, Irradiance, Radiance
-from ..core.sundisc import Pinhole, Projection
+from ..core.sundisc import Projection
 from ..detector import Detector, MosaicDetector
-from ..lens import RealLens, ThinLens
+from ..lens import Lens
 
 ARCHITECTURES = ("full_frame_ccd", "frame_transfer_ccd", "interline_ccd", "cmos")
 READOUT_DIRECTIONS = ("up", "down", "left", "right")
@@ -25,8 +26,8 @@ class Camera:
     sample, and broken pixels and broken lines share them. `exposure_s` is above 0.
     """
 
-    lens: ThinLens | RealLens
-    detector: Detector | MosaicDetector
+    lens: Lens
+    detector: Detector
     architecture: str = "full_frame_ccd"
     readout_direction: str = "right"
     exposure_s: float = 1e-3
@@ -85,42 +86,41 @@ class Camera:
         if z <= 1e-9:
             return None
         fx, fy, cx, cy = self.intrinsics
-        if isinstance(self.lens, RealLens):
-            slope = np.hypot(x, y) / z
-            stretch = float(self.lens.distorted(slope) / slope) if slope > 1e-9 else 1.0
-            return np.array([cx + fx * x / z * stretch, cy + fy * y / z * stretch])
-        return np.array([cx + fx * x / z, cy + fy * y / z])
+        slope = np.hypot(x, y) / z
+        stretch = float(self.lens.distorted(slope) / slope) if slope > 1e-9 else 1.0
+        return np.array([cx + fx * x / z * stretch, cy + fy * y / z * stretch])
 
     @property
     def projection(self) -> Projection:
         """Return the map of directions to pixels: by chief rays at the d line, or of a rectilinear camera."""
-        return self.lens.projection() if isinstance(self.lens, RealLens) else Pinhole(self.intrinsics)
+        return self.lens.projection(self.intrinsics)
 
     @property
     def seen_slopes(self) -> NDArray[np.float64]:
         """Return the tangents x/z and y/z in C of the directions that the pixel centres see, float64[y, x, 2]."""
-        if isinstance(self.lens, RealLens):
-            return self.lens.seen_slopes
-        return self.projection.slopes_at(np.arange(self.width_px) + 0.5, np.arange(self.height_px) + 0.5)
+        return _seen_slopes(self.lens, tuple(self.intrinsics.tolist()), self.width_px, self.height_px)
 
     @property
-    def lens_name(self) -> str:
-        return self.lens.name if isinstance(self.lens, RealLens) else "thin lens"
+    def mosaic(self) -> MosaicDetector:
+        """Return the detector, for what only one with a colour mosaic can do.
 
-    @property
-    def distortion(self) -> NDArray[np.float64]:
-        """Return OpenCV's k1, k2, p1, p2, k3, k4, k5, k6, float64[8]; zeros for a thin lens."""
-        return np.array(self.lens.distortion) if isinstance(self.lens, RealLens) else np.zeros(8)
+        Raises
+        ------
+        TypeError
+            The detector has no colour mosaic.
+        """
+        if self.detector.mosaic is None:
+            raise TypeError(f"detector {self.detector.name!r} has no colour mosaic")
+        return self.detector.mosaic
 
-    @property
-    def distortion_residual_px(self) -> tuple[float, float]:
-        """Return the RMS and largest distance of `distortion` from the lens's chief rays over the lit frame."""
-        return self.lens.distortion_residual_px if isinstance(self.lens, RealLens) else (0.0, 0.0)
 
-    @property
-    def guard_px(self) -> tuple[int, int]:
-        """Return how many pixels beyond each side of the frame, in x and in y, the lens needs from a render."""
-        return self.lens.guard_px if isinstance(self.lens, RealLens) else (0, 0)
+@lru_cache(maxsize=2)
+def _seen_slopes(lens: Lens, intrinsics: tuple[float, ...], width_px: int, height_px: int) -> NDArray[np.float64]:
+    """Return `Camera.seen_slopes`, read-only. All samples of a camera share them."""
+    projection = lens.projection(np.array(intrinsics))
+    out = projection.slopes_at(np.arange(width_px) + 0.5, np.arange(height_px) + 0.5)
+    out.flags.writeable = False
+    return out
 
 
 def focal_length_mm(fov_deg: float, width_px: int, pixel_pitch_um: float) -> float:

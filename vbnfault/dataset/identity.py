@@ -8,7 +8,6 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import importlib.metadata
-import json
 import os
 import platform
 import sys
@@ -22,7 +21,7 @@ from .. import __version__, pipeline, store
 from ..core import llvm, resources
 from ..core.errors import VbnfaultError
 from ..core.quantities import Sample
-from ..detector import Detector, MosaicDetector
+from ..detector import Detector
 from ..faults import Fault
 from ..pipeline import labels
 from ..pipeline.record import proposal
@@ -138,7 +137,7 @@ def store_spec(session: pipeline.Session, blocks: Sequence[int]) -> StoreSpec:
         "citation": dataset.citation,
         "intensity_channel": _intensity(camera.detector),
         "optics": camera.lens.figures,
-        "detector": _detector(camera.detector),
+        "detector": camera.detector.description,
         "fault_models": {name: fault.model for name, fault in session.faults.items()},
     }
     return StoreSpec(
@@ -155,8 +154,8 @@ def store_spec(session: pipeline.Session, blocks: Sequence[int]) -> StoreSpec:
         wavelength_nm=tuple(float(w) for w in assemble.wavelengths_nm(scene)),
         layers=layers,
         site_names=tuple(f"site_{k:05d}" for k in range(dataset.sites)),
-        lens_names=(camera.lens_name,),
-        distortion_residual_px=camera.distortion_residual_px,
+        lens_names=(camera.lens.name,),
+        distortion_residual_px=camera.lens.distortion_residual_px,
         attitude_references=assemble.attitude_references(scene),
         detector_names=tuple(f"{camera.detector.name} {k}" for k in range(individuals))
         if individuals > 1
@@ -177,46 +176,11 @@ def _mask_rule(kind: str, fault: Fault) -> str:
     return f"{rule}; or {store.EFFECT_RULE}" if "effect" in kind else rule
 
 
-def _intensity(detector: Detector | MosaicDetector) -> str:
+def _intensity(detector: Detector) -> str:
     """Return where the intensity channel comes from, as text."""
     if "W" in detector.channels:
         return "pixels without a colour filter"
     return "luminance of RGB, Rec. 709 weights"
-
-
-def _detector(detector: Detector | MosaicDetector) -> dict[str, Any]:
-    """Return the sensor's data that a user of the raw mosaic, or of its noise, needs."""
-    plain: dict[str, Any] = {
-        "name": detector.name,
-        "pixel_pitch_um": detector.pixel_pitch_um,
-        "full_well_e": detector.full_well_e,
-        "read_noise_e_rms": detector.read_noise_e_rms,
-    }
-    if isinstance(detector, Detector):
-        return plain | {
-            "bits": detector.adc_bits,
-            "bias_dn": detector.bias_dn,
-            "gain_dn_per_e": detector.gain_dn_per_e,
-        }
-    sensor = detector.sensor
-    readout, tile = sensor.readout, sensor.pattern.tile
-    return plain | {
-        "architecture": sensor.architecture,
-        "shutter": sensor.shutter,
-        "mosaic": [[sensor.pattern.channels[k] for k in row] for row in tile],
-        "bits": readout.bits,
-        "bias_dn": readout.bias_dn,
-        "gain_dn_per_e": readout.system_gain_dn_per_e,
-        "nodes": readout.nodes,
-        "node_gains": list(readout.node_gains),
-        "node_offsets_dn": list(readout.node_offsets_dn),
-        "white_balance": dict(zip(detector.channels, detector.white_balance.tolist(), strict=True)),
-        "temperature_K": sensor.temperature_K,
-        "row_readout_s": sensor.transfer.row_readout_s,
-        "demosaic": sensor.method,
-        # the whole description of the sensor, with the sources of its values
-        "sensor": json.loads(json.dumps(dataclasses.asdict(sensor))),
-    }
 
 
 def is_exact(attributes: Mapping[str, Any]) -> bool:

@@ -1,8 +1,9 @@
 """Model detectors: convert irradiance to electrons, raw digital numbers (DN) and 8 bit images."""
 
+from .interface import Detector
 from .mosaic_detector import MosaicDetector
 from .sensor import Sensor, load_sensor
-from .three_colour import EXACT_POISSON_BELOW_E, Detector, Noise, poisson_quantile
+from .three_colour import EXACT_POISSON_BELOW_E, Noise, ThreeColourDetector, poisson_quantile
 
 __all__ = [
     "EXACT_POISSON_BELOW_E",
@@ -10,6 +11,7 @@ __all__ = [
     "MosaicDetector",
     "Noise",
     "Sensor",
+    "ThreeColourDetector",
     "load_sensor",
     "poisson_quantile",
 ]

@@ -1,12 +1,13 @@
 """Provide the camera's detector for a sensor with a colour mosaic.
 
-`three_colour.Detector` is the simpler alternative, in which every pixel senses all colours.
+`three_colour.ThreeColourDetector` is the simpler alternative, in which every pixel senses all colours.
 """
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import lru_cache
 from typing import Any, ClassVar
 
@@ -140,6 +141,38 @@ class MosaicDetector:
             self.width_px,
             self.height_px,
         )
+
+    @property
+    def mosaic(self) -> MosaicDetector:
+        """Return the detector itself, which has a colour mosaic."""
+        return self
+
+    @property
+    def description(self) -> dict[str, Any]:
+        """Return what a user of the raw mosaic or of the noise needs to know, as plain JSON data."""
+        sensor = self.sensor
+        readout, tile = sensor.readout, sensor.pattern.tile
+        return {
+            "name": self.name,
+            "pixel_pitch_um": self.pixel_pitch_um,
+            "full_well_e": self.full_well_e,
+            "read_noise_e_rms": self.read_noise_e_rms,
+            "architecture": sensor.architecture,
+            "shutter": sensor.shutter,
+            "mosaic": [[sensor.pattern.channels[k] for k in row] for row in tile],
+            "bits": readout.bits,
+            "bias_dn": readout.bias_dn,
+            "gain_dn_per_e": readout.system_gain_dn_per_e,
+            "nodes": readout.nodes,
+            "node_gains": list(readout.node_gains),
+            "node_offsets_dn": list(readout.node_offsets_dn),
+            "white_balance": dict(zip(self.channels, self.white_balance.tolist(), strict=True)),
+            "temperature_K": sensor.temperature_K,
+            "row_readout_s": sensor.transfer.row_readout_s,
+            "demosaic": sensor.method,
+            # the whole description of the sensor, with the sources of its values
+            "sensor": json.loads(json.dumps(asdict(sensor))),
+        }
 
     @property
     def device(self) -> Device:

@@ -78,7 +78,7 @@ def _normal_table() -> F32:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Detector:
+class ThreeColourDetector:
     """Describe a sensor whose pixels sense R, G and B. Lengths are in µm, signals in electrons (e) or DN.
 
     `response` names the relative colour curves in `spectra.RESPONSES`; `quantum_efficiency_peak` in (0, 1] scales
@@ -158,6 +158,23 @@ class Detector:
     def optics_key(self) -> Any:
         """Return a key of everything on which the expected electrons depend."""
         return self
+
+    @property
+    def mosaic(self) -> None:
+        """Return None: every pixel senses all colours."""
+
+    @property
+    def description(self) -> dict[str, Any]:
+        """Return what a user of the noise needs to know, as plain JSON data."""
+        return {
+            "name": self.name,
+            "pixel_pitch_um": self.pixel_pitch_um,
+            "full_well_e": self.full_well_e,
+            "read_noise_e_rms": self.read_noise_e_rms,
+            "bits": self.adc_bits,
+            "bias_dn": self.bias_dn,
+            "gain_dn_per_e": self.gain_dn_per_e,
+        }
 
     def develop(self, expected: Electrons, exposure_s: float, noise: Any, acts: Any = None) -> RGBI:
         """Return the 8 bit image of the expected photo-electrons.

@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
@@ -61,7 +60,7 @@ class ConverterFault(Fault):
         `missing_from` and `missing_count` are in codes, `inl_quadratic_dn` and `inl_cubic_dn` in DN of the
         converter.
         """
-        detector: Any = context.camera.detector
+        detector = context.camera.mosaic
         readout: ReadoutSpec = detector.sensor.readout
         # a converter with few bits lacks the less significant ones of the range
         low, high = (min(int(p), readout.bits - 1) for p in self.stuck_place)
@@ -88,7 +87,7 @@ class ConverterFault(Fault):
 
     def alter(self, camera: Camera, params: Params) -> Camera:
         """Return the camera with this converter."""
-        detector: Any = camera.detector
+        detector = camera.mosaic
         readout: ReadoutSpec = detector.sensor.readout
         first = params["missing_from"]
         missing = range(first, first + params["missing_count"])

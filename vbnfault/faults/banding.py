@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
@@ -69,7 +68,7 @@ class InterferenceBanding(Fault):
 
         The amplitude is the one left in the image, after double sampling.
         """
-        detector: Any = context.camera.detector
+        detector = context.camera.mosaic
         sensor, readout = detector.sensor, detector.sensor.readout
         dn_e = readout.white_e / 255
         amplitude_e = self.amplitude_dn.uniform(rng) * dn_e
@@ -91,7 +90,7 @@ class InterferenceBanding(Fault):
 
     def alter(self, camera: Camera, params: Params) -> Camera:
         """Return the camera whose readout has this interference and row noise."""
-        detector: Any = camera.detector
+        detector = camera.mosaic
         readout: ReadoutSpec = detector.sensor.readout
         passed = replace(readout, banding_amplitude_e=1.0, banding_frequency_hz=params["frequency_hz"])
         return with_sensor(

@@ -662,7 +662,7 @@ def scale_by_intensity(rgbi: NDArray[np.uint8], intensity: NDArray[np.float32]) 
 
 def with_sensor(camera: Camera, **changes: Any) -> Camera:
     """Return the camera with changed sensor fields, for faults that are parameters of a detector with a mosaic."""
-    detector: Any = camera.detector
+    detector = camera.mosaic
     return dataclasses.replace(
         camera, detector=dataclasses.replace(detector, sensor=dataclasses.replace(detector.sensor, **changes))
     )

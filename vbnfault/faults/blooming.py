@@ -40,7 +40,7 @@ class Overflow(Fault):
 
     def draw(self, context: FaultContext, rng: np.random.Generator) -> Params:
         """Return full well in electrons, drained fraction and direction of the charge; {} on CMOS."""
-        detector: Any = context.camera.detector
+        detector = context.camera.mosaic
         share, drained = self.full_well_share.uniform(rng), self.antiblooming.uniform(rng)
         if detector.sensor.architecture == "cmos":
             return {}

@@ -93,7 +93,7 @@ class ReadoutBrokenLines(Fault):
         - `register`: node and first lost pixel, or None.
         - `node`: index of the lost node, or -1.
         """
-        detector: Any = context.camera.detector
+        detector = context.camera.mosaic
         sensor, nodes = detector.sensor, detector.sensor.readout.nodes
         ccd = sensor.architecture != "cmos"
         count, group = self.count.integer(rng), self.group.integer(rng)
@@ -140,7 +140,7 @@ class ReadoutBrokenLines(Fault):
 
     def apply(self, quantity: Any, params: Params, context: FaultContext) -> Any:
         """Return the raw digital numbers with the broken lines, register and node."""
-        detector: Any = context.camera.detector
+        detector = context.camera.mosaic
         readout = detector.sensor.readout
         lost_dn = readout.bias_dn if detector.sensor.architecture != "cmos" else 0
         out = quantity.array.copy()
@@ -167,7 +167,7 @@ class ReadoutBrokenLines(Fault):
 
     def footprint(self, params: Params, context: FaultContext) -> Mask:
         """Return the pixels of the image that the failures can change, bool[y, x]."""
-        detector: Any = context.camera.detector
+        detector = context.camera.mosaic
         sensor = detector.sensor
         region = _reached(params["lines"], context)
         if params["register"]:
@@ -185,7 +185,7 @@ def _of(params: Params, kind: str, axis: str) -> list[dict[str, Any]]:
 
 def _from_register(context: FaultContext) -> tuple[Ints, Ints]:
     """Return the half of each row, int[y], and the number of rows between it and its register, int[y]."""
-    detector: Any = context.camera.detector
+    detector = context.camera.mosaic
     rows = np.arange(context.shape[0])
     if detector.sensor.readout.nodes == 4:
         return (node_of(context.shape, 4)[:, 0] // 2).astype(np.intp), readout_steps(context.shape, 4)[0]
@@ -208,7 +208,7 @@ def _reached(lines: list[dict[str, Any]], context: FaultContext) -> Mask:
 
 def _behind(register: dict[str, int], context: FaultContext) -> Mask:
     """Return the mosaic's pixels that are read through the blocked pixel of the register, bool[y, x]."""
-    detector: Any = context.camera.detector
+    detector = context.camera.mosaic
     nodes = detector.sensor.readout.nodes
     pixels = readout_steps(context.shape, nodes)[1]
     return (node_of(context.shape, nodes) == register["node"]) & (pixels >= register["begin"])

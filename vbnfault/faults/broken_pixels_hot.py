@@ -126,7 +126,7 @@ class HotPixels(Fault):
         if step == "offsets":
             return quantity.with_array(quantity.array + damage.offset_e)
         if step == "raw":
-            detector: Any = context.camera.detector
+            detector = context.camera.mosaic
             raw = quantity.array.copy()
             show_stuck(raw, damage.stuck, detector.sensor.readout.top_dn)
             return quantity.with_array(raw)
@@ -134,7 +134,7 @@ class HotPixels(Fault):
 
     def footprint(self, params: Params, context: FaultContext) -> NDArray[np.bool_]:
         """Return the pixels of the image that a defect can change, bool[y, x]."""
-        detector: Any = context.camera.detector
+        detector = context.camera.mosaic
         reached: NDArray[np.bool_] = detector.footprint(_damage_once(params, context).changed)
         return reached
 
@@ -207,7 +207,7 @@ def _damage_once(params: Params, context: FaultContext) -> _Damage:
 
 def _damage(params: Params, context: FaultContext) -> _Damage:
     """Return the damage that the older device has and the device of today lacks."""
-    detector: Any = context.camera.detector
+    detector = context.camera.mosaic
     device: Device = detector.device
     own = device.individual
     old = _older(own, _ageing(own.spec, params))

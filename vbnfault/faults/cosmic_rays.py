@@ -84,7 +84,7 @@ class Tracks(Fault):
 
         Each track has the keys of `CosmicRays.params` and its energy in MeV.
         """
-        detector: Any = context.camera.detector
+        detector = context.camera.mosaic
         sensor = detector.sensor
         wait_s = max(sensor.transfer.row_readout_s * context.shape[0], _LEAST_READOUT_S)
         depth_um = sensor.individual.depletion_depth_um or _ASSUMED_DEPTH_UM
@@ -110,7 +110,7 @@ class Tracks(Fault):
 
     def footprint(self, params: Params, context: FaultContext) -> NDArray[np.bool_]:
         """Return the pixels of the image that the tracks' charge can change by demosaicing, bool[y, x]."""
-        detector: Any = context.camera.detector
+        detector = context.camera.mosaic
         reached: NDArray[np.bool_] = detector.footprint(_charge_once(params, context) > 0)
         return reached
 
@@ -163,6 +163,6 @@ def _charge(params: Params, context: FaultContext) -> F32:
         some = CosmicRays.from_params(tracks[start : start + _TRACKS_AT_ONCE])
         index, electrons = model.deposit(some, context.shape)
         out[index] += electrons
-    detector: Any = context.camera.detector
+    detector = context.camera.mosaic
     out[out < detector.step_e * params["least_dn"]] = 0
     return out.reshape(context.shape)

@@ -13,7 +13,6 @@ uniformly from all that sum to 1.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
@@ -48,7 +47,7 @@ class RadiationTraps(Fault):
 
     def draw(self, context: FaultContext, rng: np.random.Generator) -> Params:
         """Return the species of `parallel` and `serial` traps, with density_per_px and release_time_s of each."""
-        detector: Any = context.camera.detector
+        detector = context.camera.mosaic
         move = detector.sensor.transfer
         params: Params = {}
         for name, density, transfer_s in (
@@ -67,7 +66,7 @@ class RadiationTraps(Fault):
         """Return the camera with the added traps."""
         if not params:
             return camera
-        detector: Any = camera.detector
+        detector = camera.mosaic
         move = detector.sensor.transfer
         more = {
             f"{name}_traps": getattr(move, f"{name}_traps") + tuple(TrapSpecies(**row) for row in species)

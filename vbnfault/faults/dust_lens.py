@@ -493,7 +493,7 @@ def _field(frame: ImageFrame) -> tuple[F32, F32 | None]:
     x, y = frame.slopes(np.arange(frame.width_px) + 0.5, np.arange(frame.height_px) + 0.5)
     per_length = 1 / np.sqrt(1 + x * x + y * y)
     density = None
-    if isinstance(lens, RealLens):
+    if lens.falls_off:
         slope = np.hypot(x, y)
         nodes = np.linspace(1e-4, float(slope.max()) + 1e-3, 1025)
         height = lens.distorted(nodes)

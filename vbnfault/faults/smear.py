@@ -18,7 +18,6 @@ brighter.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
@@ -66,7 +65,7 @@ class FrameTransferSmear(Fault):
 
     def draw(self, context: FaultContext, rng: np.random.Generator) -> Params:
         """Return the cause and the changed parameters of the transfer; {} if the cause cannot occur."""
-        detector: Any = context.camera.detector
+        detector = context.camera.mosaic
         sensor = detector.sensor
         move = sensor.transfer
         # the number of variates must not depend on the sensor
@@ -91,6 +90,6 @@ class FrameTransferSmear(Fault):
         """Return the camera with the changed transfer."""
         if not params:
             return camera
-        detector: Any = camera.detector
+        detector = camera.mosaic
         changes = {key: value for key, value in params.items() if key != "cause"}
         return with_sensor(camera, transfer=replace(detector.sensor.transfer, **changes))

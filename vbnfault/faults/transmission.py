@@ -57,7 +57,7 @@ class PacketTransmission(Fault):
 
         No packet is both lost and damaged.
         """
-        detector: Any = context.camera.detector
+        detector = context.camera.mosaic
         packet_px = self.packet_px.integer(rng)
         packets = packet_count(context.shape, packet_px)
         bursts = self.lost_count.integer(rng)
@@ -87,7 +87,7 @@ class PacketTransmission(Fault):
 
     def footprint(self, params: Params, context: FaultContext) -> Mask:
         """Return the pixels of the image that lost or flipped pixels can change, bool[y, x]."""
-        detector: Any = context.camera.detector
+        detector = context.camera.mosaic
         # the flipped bits do not depend on the signal
         _, region = _arrived(np.zeros(context.shape, dtype=np.uint16), params)
         reached: Mask = detector.footprint(region)

@@ -29,7 +29,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..lens import RealLens
 from ..lens.footprint import Beams, ImageFrame
 from .base import FaultContext, Interval, LensFault, Params, bounds, number, times
 
@@ -128,7 +127,7 @@ def _factor_once(params: Params, context: FaultContext) -> F32:
 def factor(params: Params, frame: ImageFrame) -> F32:
     """Return the factor on the light, float32[y, x] in [0, 1]."""
     left = _share_left(params, frame)
-    return left if isinstance(frame.lens, RealLens) else left * _illumination(frame, params["lens"])
+    return left if frame.lens.falls_off else left * _illumination(frame, params["lens"])
 
 
 def share_left(params: Params, frame: ImageFrame, slope: F64) -> float:

@@ -24,10 +24,10 @@ from .aperture import stopped_down
 from .gaussian import scaled_to_focal_length
 from .glass import D_NM
 from .imaging import RealLens
+from .interface import Lens
 from .mapping import inclined_rays
 from .prescription import Prescription, load_lens
 from .rays import Path
-from .thin import ThinLens
 
 F64 = NDArray[np.float64]
 F32 = NDArray[np.float32]
@@ -54,7 +54,7 @@ _SHADOW = 64  # cells along each side of a shadow's table
 class ImageFrame:
     """Describe a camera for the tracing of beams: its lens, and its image centred on the axis."""
 
-    lens: ThinLens | RealLens
+    lens: Lens
     width_px: int
     height_px: int
     pixel_pitch_um: float
@@ -69,11 +69,7 @@ class ImageFrame:
             ((x_px - self.width_px / 2) * per_px).astype(np.float32)[None, :],
             ((y_px - self.height_px / 2) * per_px).astype(np.float32)[:, None],
         )
-        if not isinstance(self.lens, RealLens):
-            return x, y
-        distance = np.maximum(np.hypot(x, y), np.float32(1e-6))
-        stretch = (self.lens.undistorted(distance) / distance).astype(np.float32)
-        return x * stretch, y * stretch
+        return self.lens.field_slopes(x, y)
 
     def real_lens(self, name: str) -> RealLens:
         """Return the camera's own lens if it is real and `name` is empty, else the named one, fitted to the camera.
@@ -82,8 +78,8 @@ class ImageFrame:
         stop is closed to the camera's f-number where that is larger than its own.
         """
         own = self.lens
-        if isinstance(own, RealLens) and not name:
-            return own
+        if own.real is not None and not name:
+            return own.real
         return _scaled(name or DEFAULT_LENS, own.focal_length_mm, own.f_number, self)
 
     def prescription(self, name: str, coating: str) -> Prescription:

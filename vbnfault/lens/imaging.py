@@ -28,6 +28,7 @@ from __future__ import annotations
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
+from typing import ClassVar
 
 import cv2
 import numpy as np
@@ -211,7 +212,7 @@ class _Tables:
 class RealLens:
     """Image through a prescription at its final scale, with a sensor behind it.
 
-    It has the interface of `ThinLens`, and more.
+    It has the interface `Lens`.
 
     Attributes
     ----------
@@ -228,6 +229,15 @@ class RealLens:
     pixel_pitch_um: float
     focus: str = "paraxial"
     focus_distance_m: float = float("inf")
+
+    resamples: ClassVar[bool] = True
+    blurs: ClassVar[bool] = True
+    falls_off: ClassVar[bool] = True
+
+    @property
+    def real(self) -> RealLens:
+        """Return the lens itself, which has surfaces."""
+        return self
 
     @property
     def name(self) -> str:
@@ -325,7 +335,7 @@ class RealLens:
 
         They define the map between field angles and the frame, which `distorted` and `undistorted` follow.
         """
-        return self._model.coefficients
+        return np.array(self._model.coefficients)
 
     @cached_property
     def distortion_residual_px(self) -> tuple[float, float]:
@@ -350,14 +360,25 @@ class RealLens:
         """Return which of `_distances` receive light."""
         return np.asarray(self.relative_illumination(self._distances) > 0)
 
-    def projection(self, wavelength_nm: float = D_NM, margin_px: int = 0) -> ChiefRays:
+    def field_slopes(self, x: NDArray, y: NDArray) -> tuple[NDArray, NDArray]:
+        """Return the tangents of the field angles, along x and y, of the d line's chief rays.
+
+        `x` and `y` are float32 image heights in focal lengths, of one shape, which the results have too.
+        """
+        distance = np.maximum(np.hypot(x, y), np.float32(1e-6))
+        stretch = (self.undistorted(distance) / distance).astype(np.float32)
+        return x * stretch, y * stretch
+
+    def projection(self, intrinsics: F64 | None = None) -> ChiefRays:
+        """Return the map between directions and pixels by chief rays at the d line.
+
+        `intrinsics` belong to the interface; the lens knows its own pixels.
+        """
+        return self.chief_rays()
+
+    def chief_rays(self, wavelength_nm: float = D_NM, margin_px: int = 0) -> ChiefRays:
         """Return the map between pixels, of the frame and a margin around it, and directions at one wavelength."""
         return ChiefRays(lens=self, wavelength_nm=wavelength_nm, margin_px=margin_px)
-
-    @cached_property
-    def seen_slopes(self) -> F64:
-        """Return tangents x/z and y/z of the directions of the pixels' centres at the d line, float64[y, x, 2]."""
-        return self.projection().slopes_at(np.arange(self.width_px) + 0.5, np.arange(self.height_px) + 0.5)
 
     @property
     def focal_length_px(self) -> float:
@@ -528,7 +549,7 @@ class RealLens:
 
         A(θ) lies in a plane across the axis; the projected solid angle of a pixel contains the cos θ. Where the
         disc is known it is imaged itself: resampling the pixels of a render would not conserve the power of a disc
-        that is hardly larger than a pixel. `pixel_pitch_um` is not used; it belongs to the interface of `ThinLens`.
+        that is hardly larger than a pixel. `pixel_pitch_um` belongs to the interface: the lens knows its pixels.
         """
         if radiance.disc is None:
             return self.image(radiance)
@@ -540,7 +561,7 @@ class RealLens:
         pixel_mm2 = (self.pixel_pitch_um * 1e-3) ** 2
 
         def one(band: int) -> None:
-            rays = self.projection(bands[band], REACH_PX)
+            rays = self.chief_rays(bands[band], REACH_PX)
             found = pixel_sums(disc, rays, shape, disc.profiles([band]), rays.beam_mm2)
             if found is not None:
                 light = found.on(shape)[0] * (disc.radiance_W_m2_sr_nm[band] * passes[band] / pixel_mm2)
@@ -565,7 +586,7 @@ class RealLens:
         def one(band: int) -> F32:
             out = self._resampled(source[band], tables.stretch[band], None)[_INSIDE]
             if disc is not None:
-                add_mean(out[None], disc, self.projection(bands[band]), [band])
+                add_mean(out[None], disc, self.chief_rays(bands[band]), [band])
             return out
 
         with ThreadPoolExecutor(2) as pool:

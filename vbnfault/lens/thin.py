@@ -16,11 +16,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..core.quantities import Irradiance, Radiance
+from ..core.sundisc import Pinhole
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -28,22 +30,36 @@ F64 = NDArray[np.float64]
 
 @dataclass(frozen=True, kw_only=True)
 class ThinLens:
-    """Describe a thin lens; `focus_distance_m` is the object distance in focus (inf: focused at infinity)."""
+    """Describe a thin lens; `focus_distance_m` is the object distance in focus (inf: focused at infinity).
+
+    It has the interface `Lens`.
+    """
 
     focal_length_mm: float
     f_number: float
     transmission: float = 1.0
     focus_distance_m: float = float("inf")
 
+    name: ClassVar[str] = "thin lens"
+    resamples: ClassVar[bool] = False
+    blurs: ClassVar[bool] = False
+    falls_off: ClassVar[bool] = False
+    guard_px: ClassVar[tuple[int, int]] = (0, 0)
+    distortion_residual_px: ClassVar[tuple[float, float]] = (0.0, 0.0)
+
+    @property
+    def real(self) -> None:
+        """Return None: the lens has no surfaces."""
+
     @property
     def figures(self) -> dict[str, str | float]:
         """Return name, focal length, f-number, transmission, and a sentence `summary` for people."""
         return {
-            "name": "thin lens",
+            "name": self.name,
             "efl_mm": self.focal_length_mm,
             "f_number": self.f_number,
             "transmission": self.transmission,
-            "summary": f"thin lens of {self.focal_length_mm:.4g} mm, f/{self.f_number:.3g}",
+            "summary": f"{self.name} of {self.focal_length_mm:.4g} mm, f/{self.f_number:.3g}",
         }
 
     @property
@@ -58,6 +74,31 @@ class ThinLens:
     def pupil_area_mm2(self, slope: ArrayLike) -> F64:
         """Return the area of the beam that passes the pupil, π (f / 2N)², for any tangent of the field angle."""
         return np.full(np.shape(slope), np.pi * (self.focal_length_mm / (2 * self.f_number)) ** 2)
+
+    @property
+    def distortion(self) -> F64:
+        """Return OpenCV's eight coefficients, all 0."""
+        return np.zeros(8)
+
+    def distorted(self, slope: F64) -> F64:
+        """Return the tangents of the field angles: they are the image heights in focal lengths."""
+        return slope
+
+    def field_slopes(self, x: NDArray, y: NDArray) -> tuple[NDArray, NDArray]:
+        """Return image heights in focal lengths: they are the tangents of the field angles."""
+        return x, y
+
+    def projection(self, intrinsics: F64) -> Pinhole:
+        """Return the rectilinear map between directions and pixels; `intrinsics` are fx, fy, cx, cy."""
+        return Pinhole(intrinsics)
+
+    def on_axis(self, radiance: Radiance) -> Irradiance:
+        """Return the irradiance of `image`, which does not depend on the position in the image."""
+        return self.image(radiance)
+
+    def on_frame(self, radiance: Radiance) -> Radiance:
+        """Return the radiance itself: the image has the grid of the render."""
+        return radiance
 
     def image(self, radiance: Radiance) -> Irradiance:
         """Return the irradiance on the sensor plane, E = π T L / (4 N²), per band.

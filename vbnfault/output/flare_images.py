@@ -16,7 +16,7 @@ from ..camera import Camera
 from ..core import spectra
 from ..core.errors import InputError
 from ..core.quantities import Electrons
-from ..detector import Detector
+from ..detector import ThreeColourDetector
 from ..faults import FaultContext, registry
 from ..lens import Prescription, ThinLens, first_order, load_lens
 from ..lens.straylight.paraxial import Ghost, axial_transmittance, mean_ghost, paraxial_ghosts
@@ -261,7 +261,7 @@ def _direct_image(view: FlareRequest) -> F32:
 def _textures(view: FlareRequest) -> F32:
     """Draw the texture model once, with the Sun at the same position; R, G, B in units of white."""
     focal_px = first_order(view.lens).efl_mm / view.pitch_mm
-    detector = Detector(width_px=view.pixels, height_px=view.pixels)
+    detector = ThreeColourDetector(width_px=view.pixels, height_px=view.pixels)
     lens = ThinLens(focal_length_mm=focal_px * detector.pixel_pitch_um * 1e-3, f_number=4.0)
     x, y = (v / view.pitch_mm + view.pixels / 2 for v in view.sun_xy_mm)
     context = FaultContext(
@@ -281,7 +281,7 @@ def colours(view: FlareRequest, irradiance: F32) -> F32:
     """
     if len(view.wavelength_nm) == 1:
         return np.repeat(irradiance[0][..., None], 3, axis=2)
-    detector = Detector()
+    detector = ThreeColourDetector()
     sun = spectra.solar_band_irradiance_W_m2_nm(view.wavelength_nm, 1.0)
     weight = detector.electron_rate_weights(view.wavelength_nm) * sun
     weight = weight / weight.sum(axis=1, keepdims=True)

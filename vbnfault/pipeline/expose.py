@@ -16,7 +16,6 @@ from ..camera import Camera
 from ..core import photometry
 from ..core.quantities import BODY, SKY, Electrons, Radiance, Truth
 from ..faults import FaultContext
-from ..lens import RealLens
 from ..render.description import RenderInput, View
 from ..scene.config import Scene
 from ..world import assemble
@@ -41,7 +40,7 @@ def describe(frame: Frame) -> RenderInput:
     """Return the sample as the renderer's input."""
     spec, camera = frame.spec, frame.camera
     scene = spec.scene
-    guard_x, guard_y = camera.guard_px
+    guard_x, guard_y = camera.lens.guard_px
     view = View(
         position_L_m=frame.pose.position_L_m,
         L_from_C=frame.pose.L_from_C,
@@ -86,7 +85,7 @@ def render_frame(frame: Frame) -> None:
     surface = spec.terrain.surface
     angles = bool(_ANGLE_LAYERS & set(spec.scene.dataset.layers))
     guide: Truth | None
-    if isinstance(frame.camera.lens, RealLens):
+    if frame.camera.lens.resamples:
         camera = frame.camera
         frame.truth = render.truth(
             surface,
@@ -111,7 +110,7 @@ def render_frame(frame: Frame) -> None:
 def _keep(frame: Frame, radiance: Radiance) -> None:
     """Store the rendered radiance on the lens's grid, and the same radiance on the image's grid."""
     lens = frame.camera.lens
-    if isinstance(lens, RealLens):
+    if lens.resamples:
         frame.rendered, radiance = radiance, lens.on_frame(radiance)
     frame.radiance = radiance
 
@@ -271,6 +270,4 @@ def _rate(frame: Frame, radiance: Radiance) -> Electrons:
 
 def _rate_on_axis(camera: Camera, radiance: Radiance) -> Electrons:
     """Return the electrons expected after one second of radiance of any shape, as if all of it were on the axis."""
-    lens = camera.lens
-    irradiance = lens.on_axis(radiance) if isinstance(lens, RealLens) else lens.image(radiance)
-    return camera.detector.electrons_expected(irradiance, 1.0)
+    return camera.detector.electrons_expected(camera.lens.on_axis(radiance), 1.0)

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from ..camera import Camera
 from ..core.quantities import RGBI, Electrons, soft_kind
-from ..detector import MosaicDetector
 from ..faults import MOSAIC_STEPS, Fault, FaultContext, Params, act, physical_order
 from . import labels
 from .spec import Frame, stored_layers
@@ -174,16 +173,14 @@ def _before_readout(frame: Frame, drawn: Mapping[str, Params], noise: Any) -> RG
 def _raw(frame: Frame, noise: Any) -> NDArray[np.uint16]:
     """Return the raw mosaic of the image, uint16[y, x], before the faults that act on the finished image."""
     camera = _altered(frame, frame.drawn)
-    assert isinstance(camera.detector, MosaicDetector)
     signal = _signal(frame, frame.drawn, _in_order(frame, frame.drawn, "electrons")).merged
-    return camera.detector.raw(signal, camera.exposure_s, noise, _acts(frame, frame.drawn))
+    return camera.mosaic.raw(signal, camera.exposure_s, noise, _acts(frame, frame.drawn))
 
 
 def _defects(frame: Frame, noise: Any) -> NDArray[np.uint8]:
     """Return the defects of the mosaic's pixels, uint8[y, x]: those of the device and those of the drawn faults."""
-    detector, context = frame.camera.detector, _context(frame, frame.drawn)[1]
-    assert isinstance(detector, MosaicDetector)
-    out = detector.device.defects(frame.camera.exposure_s, noise)
+    context = _context(frame, frame.drawn)[1]
+    out = frame.camera.mosaic.device.defects(frame.camera.exposure_s, noise)
     for name, params in frame.drawn.items():
         more = frame.spec.faults[name].defects(params, context)
         if more is not None:

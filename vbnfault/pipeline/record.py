@@ -91,7 +91,7 @@ def to_sample(frame: Frame) -> Sample:
         "sun_distance_au": assemble.sun_distance_au(spec.scene),
         "julian_date": spec.scene.sun.julian_date,
         "intrinsics": frame.camera.intrinsics,
-        "distortion": frame.camera.distortion,
+        "distortion": frame.camera.lens.distortion,
         "sun_azimuth_deg": pose.sun_azimuth_deg,
         "sun_elevation_deg": pose.sun_elevation_deg,
         "roll_deg": angles[0],

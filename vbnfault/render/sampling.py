@@ -160,17 +160,17 @@ class Optics:
         self._radius = dr.opaque(mi.Float, view.aperture_radius_m)
         self._inverse_focus = dr.opaque(mi.Float, 1.0 / view.focus_distance_m)
 
-    def direction(self, x: Any, y: Any, lens: Any = None) -> tuple[Any, Any]:
+    def direction(self, x: Any, y: Any, on_aperture: Any = None) -> tuple[Any, Any]:
         """Return origin and unit direction in L of the ray through image point (x, y) in pixels.
 
-        `lens` is a point of the unit disc on the aperture; without it, the ray goes through the centre of the lens.
+        `on_aperture` is a point of the unit disc on the aperture; without it, the ray meets the lens's centre.
         """
         cx = (x - self.centre.x) * self.scale.x
         cy = (y - self.centre.y) * self.scale.y
         ax, ay, az = self.axes
         origin = self.origin
-        if lens is not None:
-            lx, ly = lens.x * self._radius, lens.y * self._radius
+        if on_aperture is not None:
+            lx, ly = on_aperture.x * self._radius, on_aperture.y * self._radius
             origin = origin + lx * ax + ly * ay
             cx, cy = cx - lx * self._inverse_focus, cy - ly * self._inverse_focus
         return origin, dr.normalize(cx * ax + cy * ay + az)
@@ -180,8 +180,8 @@ class Optics:
         u, v = strata.square()
         x = mi.Float(strata.pixel % self.width) + u
         y = mi.Float(strata.pixel // self.width) + v
-        lens = strata.disc(1) if self.aperture > 0 else None
-        return mi.Ray3f(*self.direction(x, y, lens))
+        on_aperture = strata.disc(1) if self.aperture > 0 else None
+        return mi.Ray3f(*self.direction(x, y, on_aperture))
 
     def centre_rays(self) -> Any:
         """Return one pinhole ray through every pixel centre."""

@@ -16,7 +16,7 @@ from ..core import frames, photometry, resources, spectra, spice
 from ..core.errors import InputError
 from ..core.photometry import Photometry
 from ..core.quantities import Radiance
-from ..detector import Detector, MosaicDetector, Sensor, load_sensor
+from ..detector import Detector, MosaicDetector, Sensor, ThreeColourDetector, load_sensor
 from ..lens import RealLens, ThinLens, closed_to, coating, load_lens, scaled_to_focal_length
 from ..render.description import Sunlight, View
 from ..scene.config import Scene
@@ -298,7 +298,7 @@ def base_camera(scene: Scene, *, architecture: int = 0, readout_direction: int =
     direction = c.readout_directions[readout_direction]
     if c.detector:
         sensor = mosaic_sensor(c)
-        detector: Detector | MosaicDetector = _detector_of(scene, sensor, individual, direction)
+        detector: Detector = _detector_of(scene, sensor, individual, direction)
         pitch_um, which = sensor.pixel_pitch_um, sensor.architecture
     else:
         detector, pitch_um, which = _three_colours(c), c.pixel_pitch_um, c.architectures[architecture]
@@ -310,9 +310,9 @@ def base_camera(scene: Scene, *, architecture: int = 0, readout_direction: int =
     )
 
 
-def _three_colours(c: CameraTable) -> Detector:
+def _three_colours(c: CameraTable) -> ThreeColourDetector:
     """Return the three-colour detector of a camera table."""
-    return Detector(
+    return ThreeColourDetector(
         width_px=c.width_px,
         height_px=c.height_px,
         pixel_pitch_um=c.pixel_pitch_um,
@@ -486,14 +486,14 @@ def with_stars(
     view
         Grid of the radiance, if it is not the camera's frame.
 
-    A prescription blurs the stars itself. For it they are drawn with `_STAR_SIGMA_PX`, whatever `sky.sigma_px` is.
+    A lens with a point spread blurs the stars itself. For it they are drawn with `_STAR_SIGMA_PX`, whatever
+    `sky.sigma_px` is.
     """
     table = scene.sky
     if table.stars == "off" or not open_sky.any():
         return radiance
     lens = camera.lens
-    real = isinstance(lens, RealLens)
-    sigma_px = _STAR_SIGMA_PX if real else table.sigma_px
+    sigma_px = _STAR_SIGMA_PX if lens.blurs else table.sigma_px
     faintest = table.limiting_magnitude
     if table.stars == "auto":
         faintest = min(
@@ -520,6 +520,6 @@ def with_stars(
         sigma_px=sigma_px,
         julian_date=scene.sun.julian_date,
         sky=open_sky,
-        lens_falloff=real,
+        lens_falloff=lens.falls_off,
     )
     return stars.added_to(radiance)
