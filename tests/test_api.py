@@ -120,10 +120,10 @@ def test_a_flare_refuses_what_the_physics_does_not_take(setting: dict[str, Any],
 def test_the_field_helpers_make_a_fault() -> None:
     import dataclasses
 
-    from vbnfault.faults import base, from_dict
+    from vbnfault.faults import from_dict
+    from vbnfault.faults.models import undoing_registrations
 
-    known = {name: dict(models) for name, models in base._REGISTRY.items()}
-    try:
+    with undoing_registrations(always=True):
 
         @dataclasses.dataclass(frozen=True, kw_only=True)
         class Tint(vbnfault.Fault):
@@ -131,6 +131,8 @@ def test_the_field_helpers_make_a_fault() -> None:
 
             fault = "tint"
             model = "plain"
+            default = True
+            after = "dust_on_optics"
             step = "electrons"
             strength: vbnfault.Interval = vbnfault.bounds(0.1, 0.9, limits=(0, 1), doc="fraction of light lost")  # noqa: RUF009
 
@@ -138,7 +140,4 @@ def test_the_field_helpers_make_a_fault() -> None:
         assert from_dict("tint", {"strength": 0.5}, source="a scene").strength == (0.5, 0.5)  # type: ignore[attr-defined]
         with pytest.raises(InputError, match=r"a scene: faults.tint.strength = 2"):
             from_dict("tint", {"strength": 2.0}, source="a scene")
-    finally:
-        base._REGISTRY.clear()
-        base._REGISTRY.update(known)
     assert config.Scene is vbnfault.Scene

@@ -10,6 +10,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from conftest import ALL_FAULTS
 from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 from test_faults_kit import make_context, noisy, with_mosaic
@@ -17,7 +18,6 @@ from test_faults_kit import make_context, noisy, with_mosaic
 from vbnfault.camera import ARCHITECTURES, READOUT_DIRECTIONS
 from vbnfault.core.errors import InputError
 from vbnfault.faults import (
-    FAULT_AXIS,
     MOSAIC_STEPS,
     STEPS,
     Fault,
@@ -28,7 +28,8 @@ from vbnfault.faults import (
     physical_order,
     registry,
 )
-from vbnfault.faults.base import scale_by_intensity
+from vbnfault.faults.models import undoing_registrations
+from vbnfault.faults.planes import scale_by_intensity
 
 MODELS = [(fault, model) for fault, models in registry().items() for model in models]
 WITH_BOUNDS = [
@@ -212,7 +213,7 @@ def test_wrong_types_and_unknown_keys_are_refused(
     base = required.get(name, {}) | {"model": model}
     with pytest.raises(InputError, match=rf"faults\.{name}\.colour_of_the_moon: unknown key"):
         from_dict(name, base | {"colour_of_the_moon": 1}, source="test.toml")
-    wrong = {"number": "a lot", "flag": 1, "choice": "sideways", "text": 3, "rows": [{"nothing": 1}]}
+    wrong = {"number": "a lot", "flag": 1, "choice": "sideways", "text": 3, "path": 3, "rows": [{"nothing": 1}]}
     for f in dataclasses.fields(registry()[name][model]):
         if f.metadata["kind"] in wrong:
             with pytest.raises(InputError, match=rf"faults\.{name}\.{f.name}"):
@@ -250,13 +251,13 @@ def test_several_steps_come_in_order_and_inside_the_mosaic(first: str, later: tu
 
 def test_orders() -> None:
     names = list(registry())
-    assert tuple(names[: len(FAULT_AXIS)]) == FAULT_AXIS
-    assert names.index("pixel_overwriting") >= len(FAULT_AXIS)
+    assert tuple(names[: len(ALL_FAULTS)]) == ALL_FAULTS
+    assert names.index("pixel_overwriting") >= len(ALL_FAULTS)
     assert dataset_order(reversed(names)) == names
     order = physical_order(names)
     # light first meets the optics, then the pixels, then the readout (design document, "Order"); within the
     # detector: charge collected, moved, read, converted, assembled and sent
-    assert [name for name in order if name != "pixel_overwriting"] == [
+    assert order == [
         "straylight",
         "dust_on_optics",
         "optics_degradation",
@@ -270,12 +271,74 @@ def test_orders() -> None:
         "adc",
         "broken_lines",
         "transmission",
+        "pixel_overwriting",
     ]
     # optical effects come before those of detector and readout, whatever the models
     optical = [{m.step for m in registry()[n].values()} for n in order]
     assert all(len(s) == 1 for s in optical if "electrons" in s)
     flat = ["electrons" in s for s in optical]
     assert flat == sorted(flat, reverse=True)
+
+
+def declare(name: str, **attributes: Any) -> type[Fault]:
+    """Define a model of a test's own class."""
+    declared = {"fault": name, "model": "one", "step": "rgbi", "default": True, "__module__": f"of_a_test.{name}"}
+    return dataclasses.dataclass(frozen=True, kw_only=True)(
+        type(f"Of{name.title()}", (Fault,), declared | {"after": "vignetting"} | attributes)
+    )
+
+
+def test_a_class_acts_directly_behind_the_class_that_it_names() -> None:
+    before = physical_order(registry())
+    with undoing_registrations(always=True):
+        declare("b_of_a_test", after="straylight")
+        declare("a_of_a_test", after="straylight")
+        declare("on_a_of_a_test", after="a_of_a_test")
+        declare("first_of_all", after="")
+        order = physical_order(registry())
+        assert order[:5] == ["first_of_all", "straylight", "a_of_a_test", "on_a_of_a_test", "b_of_a_test"]
+        assert order[5:] == before[1:]
+        assert list(registry())[: len(ALL_FAULTS)] == list(ALL_FAULTS)
+    assert physical_order(registry()) == before
+
+
+@pytest.mark.parametrize(
+    ("classes", "sentence"),
+    [
+        ({"x": {"after": "vigneting"}}, r"fault class x: after = 'vigneting': .* \(did you mean vignetting\?\)"),
+        ({"x": {"after": "y"}, "y": {"after": "x"}}, r"fault classes x, y: .* in a circle"),
+        ({"x": {"after": "x"}}, r"fault classes x: .* in a circle"),
+        ({"x": {"default": False}}, r"fault class x: none of its models \(one\) states default = True"),
+        ({"x": {"after": None}}, r"fault model x/one: the default model must state the class after"),
+        ({"vignetting": {}}, r"fault model vignetting/one: default = True, but vignetting/cos4 is the default"),
+        ({"dust_on_optics": {"model": "gaussian", "default": False}}, r"gaussian is defined twice: .* of_a_test"),
+        ({"x": {"axis": 0}}, r"fault model x/one: axis = 0: only the six classes"),
+        ({"X": {}}, r"fault model X/one: its names must consist of lower-case"),
+        ({"x": {"wide": dataclasses.field(default=3), "__annotations__": {"wide": int}}}, r"x/one: wide must be"),
+    ],
+)
+def test_contradictory_declarations_are_refused(classes: dict[str, dict[str, Any]], sentence: str) -> None:
+    known = registry()
+
+    @undoing_registrations()
+    def declare_all() -> None:
+        for name, attributes in classes.items():
+            declare(name, **attributes)
+        registry()
+
+    with pytest.raises(TypeError, match=sentence):
+        declare_all()
+    assert registry() == known
+
+
+def test_a_model_has_to_be_a_frozen_dataclass() -> None:
+    @undoing_registrations()
+    def declare_it() -> None:
+        type("Bare", (Fault,), {"fault": "x", "model": "one", "step": "rgbi", "default": True, "after": "adc"})
+        registry()
+
+    with pytest.raises(TypeError, match=r"x/one: .* @dataclass\(frozen=True, kw_only=True\)"):
+        declare_it()
 
 
 def test_json_schema_names_every_key() -> None:

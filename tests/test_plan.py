@@ -7,14 +7,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import calls_of
+from conftest import ALL_FAULTS, calls_of
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
 from vbnfault.core import frames
 from vbnfault.core.errors import InputError
-from vbnfault.faults import FAULT_AXIS
 from vbnfault.scene import config, keyed_random, plan
 from vbnfault.scene.config import Scene, parse_scene
 
@@ -33,7 +32,7 @@ def scene(**tables: dict[str, Any]) -> Scene:
 
 
 def make(**tables: dict[str, Any]) -> plan.Plan:
-    return plan.make_plan(scene(**tables), FAULT_AXIS)
+    return plan.make_plan(scene(**tables), ALL_FAULTS)
 
 
 @pytest.fixture(scope="module")
@@ -142,7 +141,7 @@ def test_variables_are_independent_of_each_other_and_of_the_faults(paper: plan.P
     near = paper.stratum == NEAR
     for mask in (near, ~near):
         columns = [paper.variables[name][mask] for name in plan.VARIABLES]
-        columns += [paper.injected[mask, k].astype(float) for k, f in enumerate(FAULT_AXIS) if f != plan.STRAYLIGHT]
+        columns += [paper.injected[mask, k].astype(float) for k, f in enumerate(ALL_FAULTS) if f != plan.STRAYLIGHT]
         columns += [paper.architecture[mask], paper.readout_direction[mask]]
         rho = stats.spearmanr(np.column_stack(columns)).statistic
         v = len(plan.VARIABLES)
@@ -184,7 +183,7 @@ def test_the_sun_stays_out_of_an_upright_frame() -> None:
 # ----------------------------------------------------------------------------------------------- fault matrix
 
 fractions = st.floats(0, 1) | st.sampled_from([0.0, 0.25, 1 / 3, 0.5, 0.75, 1.0])
-subsets = st.lists(st.sampled_from(FAULT_AXIS), max_size=6, unique=True).map(tuple)
+subsets = st.lists(st.sampled_from(ALL_FAULTS), max_size=6, unique=True).map(tuple)
 
 
 @st.composite
@@ -226,7 +225,7 @@ def test_per_sample_gives_exactly_the_faulty_samples(
 
 @pytest.mark.parametrize(("sizes", "classes"), [((1, 6), 6), ((2, 4), 6), ((1, 6), 3), ((3, 3), 5)])
 def test_per_sample_subset_sizes_are_uniform(sizes: tuple[int, int], classes: int) -> None:
-    faults = FAULT_AXIS[:classes]
+    faults = ALL_FAULTS[:classes]
     matrix = plan.fault_matrix_per_sample(6000, faults, 1.0, np.random.default_rng(5), sizes)
     lo, hi = (min(s, classes) for s in sizes)
     counts = np.bincount(matrix.sum(axis=1), minlength=hi + 1)[lo:]
@@ -239,7 +238,7 @@ def test_per_sample_rows_are_shuffled() -> None:
     # without straylight neither the faulty rows nor their sizes depend on the place: rank correlations of
     # spread 1/√n
     n = 4000
-    matrix = plan.fault_matrix_per_sample(n, FAULT_AXIS[:3], 0.5, np.random.default_rng(5))
+    matrix = plan.fault_matrix_per_sample(n, ALL_FAULTS[:3], 0.5, np.random.default_rng(5))
     rank = np.arange(n)
     for column in (matrix.any(axis=1), *matrix.T):
         assert abs(stats.spearmanr(rank, column).statistic) < 4.5 / np.sqrt(n)
@@ -296,7 +295,7 @@ def test_too_many_sun_facing_samples_are_refused() -> None:
 
 
 def test_a_scene_without_straylight_never_faces_the_sun() -> None:
-    faults = tuple(f for f in FAULT_AXIS if f != "straylight")
+    faults = tuple(f for f in ALL_FAULTS if f != "straylight")
     p = plan.make_plan(scene(), faults)
     np.testing.assert_array_equal(p.stratum, FAR)
     assert not p.injects("straylight").any()
@@ -330,7 +329,7 @@ def assert_same_rows(a: plan.Plan, b: plan.Plan, rows: slice, *, faults: bool = 
 @settings(max_examples=25)
 def test_appending_a_block_leaves_earlier_rows_alone(first: int, more: int, seed: int, mode: str) -> None:
     s = scene(dataset={"samples": first, "seed": seed}, plan={"mode": mode})
-    short, long = (plan.make_plan(s, FAULT_AXIS, blocks) for blocks in ([first], [first, more]))
+    short, long = (plan.make_plan(s, ALL_FAULTS, blocks) for blocks in ([first], [first, more]))
     assert len(long) == first + more
     assert_same_rows(short, long, slice(0, first))
     # the block appended has the matrix of its own size
@@ -342,7 +341,7 @@ def test_appending_a_block_leaves_earlier_rows_alone(first: int, more: int, seed
 
 
 def test_an_appended_block_has_its_own_matrix() -> None:
-    p = plan.make_plan(scene(), FAULT_AXIS, [N, N])
+    p = plan.make_plan(scene(), ALL_FAULTS, [N, N])
     assert not np.array_equal(p.injected[:N], p.injected[N:])
 
 
@@ -482,16 +481,16 @@ def test_packaged_scenes_ask_for_lit_ground_in_four_of_five_views(name: str) -> 
 @settings(max_examples=40)
 def test_no_split_is_empty_and_classes_are_dealt_evenly(samples: int, sites: int, shard: int, mode: str) -> None:
     s = scene(dataset={"samples": samples, "sites": sites, "shard_samples": shard}, plan={"mode": mode})
-    p = plan.make_plan(s, FAULT_AXIS)
+    p = plan.make_plan(s, ALL_FAULTS)
     present = set(p.split.tolist())
     assert len(present) == min(3, sites, -(-samples // shard))
     missing = plan.shortcomings(s, p)
     assert all(name in " ".join(missing) for code, name in enumerate(plan.SPLITS) if code not in present)
     for code in present:
         here = p.split == code
-        lacks = [f for k, f in enumerate(FAULT_AXIS) if not p.injected[here, k].any()]
+        lacks = [f for k, f in enumerate(ALL_FAULTS) if not p.injected[here, k].any()]
         assert lacks == [
-            f for f in FAULT_AXIS if any(f"{plan.SPLITS[code]} has no" in m and f in m for m in missing)
+            f for f in ALL_FAULTS if any(f"{plan.SPLITS[code]} has no" in m and f in m for m in missing)
         ]
         # rows of a split are at least 5; a class has a quarter of all rows or more
         assert not lacks or here.sum() < 5 or p.injected.sum(axis=0).min() < 6
@@ -533,10 +532,10 @@ def test_rows_are_exchanged_where_a_split_wins_a_class_and_loses_none(theirs: li
 
 def test_splits_that_cannot_hold_every_class_are_told() -> None:
     few = scene(dataset={"samples": 16, "sites": 2, "shard_samples": 8})
-    (sentence,) = plan.shortcomings(few, plan.make_plan(few, FAULT_AXIS))
+    (sentence,) = plan.shortcomings(few, plan.make_plan(few, ALL_FAULTS))
     assert sentence.startswith("split test has no samples: 2 sites are in use (dataset.sites = 2")
     rare = scene(dataset={"samples": 30, "sites": 3, "shard_samples": 1}, plan={"faulty_fraction": 0.04})
-    p = plan.make_plan(rare, FAULT_AXIS[:2])
+    p = plan.make_plan(rare, ALL_FAULTS[:2])
     assert p.injected.any(axis=1).sum() == 1
     lacking = [m for m in plan.shortcomings(rare, p) if "has no sample with" in m]
     assert len(lacking) == 2  # one row cannot be in three splits
@@ -559,7 +558,7 @@ def test_planning_looks_at_every_sample_a_bounded_number_of_times(
     seen = []
     for samples in (2_000, 200_000):
         calls.update(dict.fromkeys(calls, 0))
-        plan.make_plan(scene(dataset={"samples": samples, "sites": sites, "shard_samples": 1}), FAULT_AXIS)
+        plan.make_plan(scene(dataset={"samples": samples, "sites": sites, "shard_samples": 1}), ALL_FAULTS)
         seen.append(calls["rng"])
         # eight variables, four choices, and at most a dozen redraws of two angles: 8 % of the draws each time
         assert calls["keyed_uniform"] < 40
@@ -568,13 +567,13 @@ def test_planning_looks_at_every_sample_a_bounded_number_of_times(
 
 @pytest.mark.parametrize("mode", ["per_class", "per_sample"])
 def test_100_000_samples_are_planned_without_a_loop_over_samples(mode: str) -> None:
-    plan.make_plan(scene(dataset={"samples": 1000}), FAULT_AXIS)  # what is made once
+    plan.make_plan(scene(dataset={"samples": 1000}), ALL_FAULTS)  # what is made once
     calls = []
     for samples in (1000, 100_000):
         s = scene(dataset={"samples": samples}, plan={"mode": mode})
-        calls.append(calls_of(lambda s=s: plan.make_plan(s, FAULT_AXIS)))
+        calls.append(calls_of(lambda s=s: plan.make_plan(s, ALL_FAULTS)))
     assert calls[1] < 2 * calls[0] < 4000  # 825 and 742; rare samples need redraws, which few scenes have
-    p = plan.make_plan(s, FAULT_AXIS)
+    p = plan.make_plan(s, ALL_FAULTS)
     assert len(p) == 100_000
     far = p.stratum == FAR
     assert sun_angle_deg(p)[far].min() >= 32.5 * np.sqrt(2)

@@ -1,33 +1,12 @@
-"""Define the fault classes and their models; `base` states the contract that every model follows."""
+"""Define the fault classes and their models; `contract` states what every model follows."""
 
-from .base import (
-    FAULT_AXIS,
-    MOSAIC_STEPS,
-    PHYSICAL_ORDER,
-    QUANTITIES,
-    STEPS,
-    Fault,
-    FaultContext,
-    Interval,
-    Params,
-    act,
-    bounds,
-    choice,
-    dataset_order,
-    flag,
-    from_dict,
-    json_schema,
-    number,
-    physical_order,
-    registry,
-    rows,
-    text,
-)
+from .context import FaultContext, Params
+from .contract import MOSAIC_STEPS, QUANTITIES, STEPS, Fault, act
+from .fields import Interval, bounds, choice, flag, number, path, rows, text
+from .models import dataset_order, from_dict, json_schema, physical_order, registry
 
 __all__ = [
-    "FAULT_AXIS",
     "MOSAIC_STEPS",
-    "PHYSICAL_ORDER",
     "QUANTITIES",
     "STEPS",
     "Fault",
@@ -42,6 +21,7 @@ __all__ = [
     "from_dict",
     "json_schema",
     "number",
+    "path",
     "physical_order",
     "registry",
     "rows",

@@ -19,7 +19,9 @@ import numpy as np
 
 from ..camera import Camera
 from ..detector.readout import ReadoutSpec
-from .base import Fault, FaultContext, Interval, Params, bounds, with_sensor
+from .context import FaultContext, Params
+from .contract import Fault, with_sensor
+from .fields import Interval, bounds
 
 # The curve rises everywhere if 4 |quadratic| + 6√3 |cubic| is below the range. Non-linearity may use up to this
 # fraction of the range.
@@ -32,6 +34,8 @@ class ConverterFault(Fault):
 
     fault = "adc"
     model = "converter"
+    default = True
+    after = "banding"
     step = "raw"
     needs_mosaic = True
     localised = False

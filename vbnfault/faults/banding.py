@@ -19,7 +19,9 @@ import numpy as np
 
 from ..camera import Camera
 from ..detector.readout import ReadoutSpec
-from .base import Fault, FaultContext, Interval, Params, bounds, flag, number, with_sensor
+from .context import FaultContext, Params
+from .contract import Fault, with_sensor
+from .fields import Interval, bounds, flag, number
 
 # Least factor of double sampling that is compensated. Near its zeros the amplitude would otherwise diverge.
 _LEAST_PASSED = 1e-3
@@ -31,6 +33,8 @@ class InterferenceBanding(Fault):
 
     fault = "banding"
     model = "interference"
+    default = True
+    after = "cti"
     step = "raw"
     needs_mosaic = True
     localised = False

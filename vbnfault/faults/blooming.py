@@ -17,7 +17,9 @@ from typing import Any
 import numpy as np
 
 from ..detector.charge import bloom
-from .base import Fault, FaultContext, Interval, Params, bounds
+from .context import FaultContext, Params
+from .contract import Fault
+from .fields import Interval, bounds
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -26,6 +28,8 @@ class Overflow(Fault):
 
     fault = "blooming"
     model = "overflow"
+    default = True
+    after = "cosmic_rays"
     step = "charge"
     needs_mosaic = True
     needs_ccd = True

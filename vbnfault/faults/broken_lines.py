@@ -20,7 +20,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .base import Fault, FaultContext, Interval, Params, bounds, choice, number
+from .context import FaultContext, Params
+from .contract import Fault
+from .fields import Interval, bounds, choice, number
 
 BOTH_WAYS = ("interline_ccd", "cmos")
 
@@ -31,6 +33,9 @@ class TextureBrokenLines(Fault):
 
     fault = "broken_lines"
     model = "texture"
+    default = True
+    after = "adc"
+    axis = 2
     step = "rgbi"
 
     count: Interval = bounds(1, 5, limits=(0, 10_000), integer=True, doc="number of broken lines")

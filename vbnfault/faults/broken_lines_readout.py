@@ -34,7 +34,9 @@ from ..detector.readout import (
     saturated_lines,
     shifted_lines,
 )
-from .base import Fault, FaultContext, Interval, Params, bounds, number
+from .context import FaultContext, Params
+from .contract import Fault
+from .fields import Interval, bounds, number
 
 Mask = NDArray[np.bool_]
 Ints = NDArray[np.intp]

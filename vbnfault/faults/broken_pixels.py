@@ -31,7 +31,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .base import Fault, FaultContext, Interval, Params, bounds, number, scale_by_intensity
+from .context import FaultContext, Params
+from .contract import Fault
+from .fields import Interval, bounds, number
+from .planes import scale_by_intensity
 
 # Unit steps (dy, dx) of the four readout directions. They also lead to the four von Neumann neighbours.
 STEPS = {"up": (-1, 0), "down": (1, 0), "left": (0, -1), "right": (0, 1)}
@@ -48,6 +51,9 @@ class TextureBrokenPixels(Fault):
 
     fault = "broken_pixels"
     model = "texture"
+    default = True
+    after = "vignetting"
+    axis = 1
     step = "rgbi"
 
     count: Interval = bounds(10, 150, limits=(0, 10_000), integer=True, doc="number of broken pixels")

@@ -33,7 +33,9 @@ from numpy.typing import NDArray
 from ..core.quantities import DEAD, HOT, RTS, RTS_HIGH, STUCK
 from ..detector.chain import Device, passing_dark_e, show_stuck, upper_share
 from ..detector.individual import Individual, IndividualSpec, RtsPixels, StuckPixels, aged, dark_rate_e_s, offset_e
-from .base import Fault, FaultContext, Interval, Params, bounds, number
+from .context import FaultContext, Params
+from .contract import Fault
+from .fields import Interval, bounds, number
 
 F32 = NDArray[np.float32]
 

@@ -23,7 +23,9 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from ..detector.cosmic import LEAST_MEV_CM2_G, CosmicRayModel, CosmicRays, stopping_power_MeV_cm2_g
-from .base import Fault, FaultContext, Interval, Params, bounds, number
+from .context import FaultContext, Params
+from .contract import Fault
+from .fields import Interval, bounds, number
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -41,6 +43,8 @@ class Tracks(Fault):
 
     fault = "cosmic_rays"
     model = "tracks"
+    default = True
+    after = "smear"
     step = "charge"
     needs_mosaic = True
 

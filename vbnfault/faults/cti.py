@@ -18,7 +18,9 @@ import numpy as np
 
 from ..camera import Camera
 from ..detector.charge import TrapSpecies
-from .base import Fault, FaultContext, Interval, Params, bounds, with_sensor
+from .context import FaultContext, Params
+from .contract import Fault, with_sensor
+from .fields import Interval, bounds
 
 RELEASE_TRANSFERS = (0.5, 2.0, 8.0)
 
@@ -32,6 +34,8 @@ class RadiationTraps(Fault):
 
     fault = "cti"
     model = "radiation"
+    default = True
+    after = "blooming"
     step = "charge"
     needs_mosaic = True
     needs_ccd = True

@@ -24,7 +24,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from .base import Fault, FaultContext, Interval, Params, bounds, flag
+from .context import FaultContext, Params
+from .contract import Fault
+from .fields import Interval, bounds, flag
 
 _LEAST_SIGMA_PX = 0.4
 
@@ -35,6 +37,9 @@ class GaussianDegradation(Fault):
 
     fault = "optics_degradation"
     model = "gaussian"
+    default = True
+    after = "dust_on_optics"
+    axis = 5
     step = "electrons"
     localised = False
 

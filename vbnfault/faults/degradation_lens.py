@@ -40,7 +40,10 @@ from ..lens import Prescription
 from ..lens.coating import mean_reflectance
 from ..lens.footprint import ImageFrame
 from ..lens.straylight.scatter import Harvey
-from .base import FaultContext, Interval, LensFault, Params, bounds, choice, number, times
+from .context import FaultContext, Params
+from .contract import LensFault
+from .fields import Interval, bounds, choice, number
+from .planes import times
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]

@@ -29,7 +29,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from .base import Fault, FaultContext, Interval, Params, bounds, flag, number
+from .context import FaultContext, Params
+from .contract import Fault
+from .fields import Interval, bounds, flag, number
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,6 +40,9 @@ class GaussianDust(Fault):
 
     fault = "dust_on_optics"
     model = "gaussian"
+    default = True
+    after = "straylight"
+    axis = 0
     step = "electrons"
     soft_layer = "dust_opacity"
 

@@ -46,7 +46,10 @@ from ..lens.glass import D_NM
 from ..lens.rays import forward
 from ..lens.straylight.paraxial import along
 from ..lens.straylight.scatter import DUST_INDEX
-from .base import FaultContext, Interval, LensFault, Params, bounds, number, plus, times
+from .context import FaultContext, Params
+from .contract import LensFault
+from .fields import Interval, bounds, number
+from .planes import plus, times
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]

@@ -29,7 +29,10 @@ from numpy.typing import NDArray
 from ..core import resources
 from ..core.errors import InputError, shown
 from ..core.quantities import CHANNELS, LUMINANCE
-from .base import Fault, FaultContext, Params, choice, number, scale_by_intensity, text
+from .context import FaultContext, Params
+from .contract import Fault
+from .fields import choice, number, path, text
+from .planes import scale_by_intensity
 
 # A texture needs 32 bytes per pixel or more while it is decoded: 24 megapixels, as of a photograph, need 0.8 GB.
 LARGEST_TEXTURE_PIXELS = 25_000_000
@@ -43,9 +46,11 @@ class TextureOverwriting(Fault):
 
     fault = "pixel_overwriting"
     model = "texture"
+    default = True
+    after = "transmission"
     step = "rgbi"
 
-    texture_file: str = text("", doc="path of a PNG or TIFF texture; required")
+    texture_file: str = path(content="texture", doc="path of a PNG or TIFF texture; required")
     channels: str = text("RGBI", doc='the channels to overwrite, such as "RGBI", "I" or "R"')
     blend: str = choice("replace", BLENDS, doc="how the texture joins the image")
     strength: float = number(0.5, limits=(0, 1), doc="weight of the texture in a mixture")

@@ -22,7 +22,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..camera import Camera
-from .base import Fault, FaultContext, Interval, Params, bounds, choice, with_sensor
+from .context import FaultContext, Params
+from .contract import Fault, with_sensor
+from .fields import Interval, bounds, choice
 
 CAUSES = {
     "frame_transfer_ccd": ("clock", "clear"),
@@ -38,6 +40,8 @@ class FrameTransferSmear(Fault):
 
     fault = "smear"
     model = "frame_transfer"
+    default = True
+    after = "broken_pixels"
     step = "pixels"
     needs_mosaic = True
     needs_ccd = True

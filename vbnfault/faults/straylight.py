@@ -40,8 +40,11 @@ from numpy.typing import NDArray
 from ..core.errors import VbnfaultError
 from ..core.quantities import LUMINANCE
 from ..core.resources import cached_with_contents, data_dir, read_input
-from .base import Fault, FaultContext, Interval, Params, bounds, intensity_dn, number, plus, rows
+from .context import FaultContext, Params
+from .contract import Fault
+from .fields import Interval, bounds, number, rows
 from .flare_textures import FILL
+from .planes import intensity_dn, plus
 
 CLOSE = (1, 2, 3, 4, 5)
 FAR = (6, 7, 8, 9, 10)
@@ -61,6 +64,9 @@ class TextureStraylight(Fault):
 
     fault = "straylight"
     model = "texture"
+    default = True
+    after = ""
+    axis = 3
     step = "electrons"
     needs_sun = True
     effect_mask = True

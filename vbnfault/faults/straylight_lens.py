@@ -30,7 +30,10 @@ from ..core import spectra
 from ..core.quantities import Irradiance
 from ..lens.straylight.scatter import CLEANLINESS_LIMITS, ROUGHNESS_NM_LIMITS
 from ..lens.straylight.total import Baffle, Cleanliness, scene_veil_fraction, straylight, veil_of
-from .base import FaultContext, Interval, LensFault, Params, bounds, choice, intensity_dn, number, plus, times
+from .context import FaultContext, Params
+from .contract import LensFault
+from .fields import Interval, bounds, choice, number
+from .planes import intensity_dn, plus, times
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]

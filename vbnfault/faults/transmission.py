@@ -19,7 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..detector.readout import Fill, corrupted_packets, lost_lines, lost_packets, packet_count, transmission_order
-from .base import Fault, FaultContext, Interval, Params, bounds, choice
+from .context import FaultContext, Params
+from .contract import Fault
+from .fields import Interval, bounds, choice
 
 Raw = NDArray[np.uint16]
 Mask = NDArray[np.bool_]
@@ -31,6 +33,8 @@ class PacketTransmission(Fault):
 
     fault = "transmission"
     model = "packets"
+    default = True
+    after = "broken_lines"
     step = "raw"
     needs_mosaic = True
 

@@ -18,7 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..lens.thin import cos4_map
-from .base import Fault, FaultContext, Interval, Params, bounds, number
+from .context import FaultContext, Params
+from .contract import Fault
+from .fields import Interval, bounds, number
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,6 +29,9 @@ class Cos4Vignetting(Fault):
 
     fault = "vignetting"
     model = "cos4"
+    default = True
+    after = "optics_degradation"
+    axis = 4
     step = "electrons"
     localised = False
     soft_layer = "vignetting_factor"

@@ -30,7 +30,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..lens.footprint import Beams, ImageFrame
-from .base import FaultContext, Interval, LensFault, Params, bounds, number, times
+from .context import FaultContext, Params
+from .contract import LensFault
+from .fields import Interval, bounds, number
+from .planes import times
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]

@@ -1,0 +1,99 @@
+"""Define what a fault knows of the sample that it acts on."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..camera import Camera
+from ..lens.footprint import ImageFrame
+
+Params = dict[str, Any]
+T = TypeVar("T")
+
+REFERENCE_WIDTH_PX = 1024
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FaultContext:
+    """Describe the sample that a fault acts on.
+
+    The fields of the Sun are None where they are unknown, for example for a user's own image without a pose.
+
+    Attributes
+    ----------
+    sun_xy_px
+        float64[2]: pixel position of the Sun's centre. It may lie outside the frame. None if the Sun is behind the
+        camera.
+    sun_direction_C
+        float64[3]: unit vector towards the Sun in the camera frame C (x right, y down, z along the boresight).
+    sun_irradiance_W_m2_nm, wavelength_nm
+        float64[band]: irradiance of the Sun at the camera, and the nodes of its bands.
+    sun_visible_fraction
+        Fraction of the Sun's disc that is not covered, in [0, 1].
+    sun_angular_radius_rad
+        Angular radius of the Sun's disc.
+    coating_loss
+        Fraction of the coatings' area that another fault of the sample has removed, in [0, 1].
+    """
+
+    camera: Camera
+    sun_xy_px: NDArray[np.float64] | None = None
+    sun_direction_C: NDArray[np.float64] | None = None
+    sun_irradiance_W_m2_nm: NDArray[np.float64] | None = None
+    wavelength_nm: NDArray[np.float64] | None = None
+    sun_visible_fraction: float | None = None
+    sun_angular_radius_rad: float | None = None
+    coating_loss: float = 0.0
+    # `init=False`, because `dataclasses.replace` must not copy results of one frame to another
+    _memo: dict[Any, Any] = field(default_factory=dict, init=False, repr=False)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Return (height, width) in pixels."""
+        return self.camera.height_px, self.camera.width_px
+
+    @property
+    def sun_before_camera(self) -> NDArray[np.float64] | None:
+        """Return a vector towards the Sun in the camera frame C with z > 0, float64[3]; not normalised.
+
+        If no direction is known, the vector is computed from the Sun's pixel position by a pinhole model. Return
+        None if the Sun is behind the camera or unknown.
+        """
+        direction = self.sun_direction_C
+        if direction is None and self.sun_xy_px is not None:
+            fx, fy, cx, cy = self.camera.intrinsics
+            x, y = self.sun_xy_px
+            direction = np.array([(x - cx) / fx, (y - cy) / fy, 1.0])
+        return direction if direction is not None and direction[2] > 0 else None
+
+    @property
+    def scale(self) -> float:
+        """Return the factor that converts pixels of a 1024 px wide image to pixels of this camera."""
+        return self.camera.width_px / REFERENCE_WIDTH_PX
+
+    @property
+    def frame(self) -> ImageFrame:
+        """Return the lens and the image size of the camera, as ray tracing needs them."""
+        return ImageFrame(
+            lens=self.camera.lens,
+            width_px=self.camera.width_px,
+            height_px=self.camera.height_px,
+            pixel_pitch_um=self.camera.detector.pixel_pitch_um,
+        )
+
+    def once(self, name: str, params: Params, make: Callable[[], T]) -> T:
+        """Return `make()`, computed once for each name and params object of this context.
+
+        `apply` and `footprint` share the result, so an expensive computation runs only once.
+        """
+        key = (name, id(params))
+        if key not in self._memo:
+            # the entry holds params, so that no other object can get the same id
+            self._memo[key] = (params, make())
+        result: T = self._memo[key][1]
+        return result

@@ -1,0 +1,254 @@
+"""Define the contract that every fault model follows.
+
+A fault *class* (`dust_on_optics`) has one or more *models* (`gaussian`). A model is a frozen, keyword-only
+dataclass derived from `Fault`. It states its class and its name, and the definition of the dataclass registers it.
+Its fields are the keys of the scene file: a value is drawn from each `Interval` field, and all other fields are
+fixed.
+
+To add a fault, write one file beside this one and one test, or a plug-in outside the package (`plugins`).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..camera import Camera
+from ..core.quantities import RGBI, Charge, Electrons, Offset, Quantity, RawMosaic, soft_kind
+from ..detector.chain import STEPS as MOSAIC_STEPS
+from ..lens import load_lens
+from ..lens.footprint import DEFAULT_LENS
+from .context import FaultContext, Params
+from .fields import Interval, parse_field, path
+from .models import register
+
+Q = TypeVar("Q", Electrons, Charge, Offset, RawMosaic, RGBI)
+
+# The steps at which a fault may act, in order. All but the first and the last need a detector with a mosaic.
+STEPS = ("electrons", *MOSAIC_STEPS, "rgbi")
+QUANTITIES: dict[str, type[Quantity]] = {
+    "electrons": Electrons,
+    "light": Charge,
+    "pixels": Charge,
+    "charge": Charge,
+    "offsets": Offset,
+    "raw": RawMosaic,
+    "rgbi": RGBI,
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Fault:
+    """Define the hooks of all fault models. By default every hook leaves its input unchanged.
+
+    A model sets these class attributes:
+
+    fault, model
+        The names of its class and of the model: lower-case letters, digits and underscores.
+    default
+        True for the one model of the class that a scene uses if it names none. A subclass does not inherit it.
+    after
+        Stated by the default model: the class behind which this class acts, "" if it acts first. A class of a
+        plug-in acts directly behind the class that it names.
+    axis
+        Stated by the default models of the six classes of Gallon et al.: the position on the dataset's `fault`
+        axis. All other classes follow in alphabetical order.
+    step
+        The quantity that `apply` receives. `electrons`: the expected photo-electrons on the sensor. `rgbi`: the
+        digital image. For a detector with a mosaic also: `light`, the photo-electrons to which each pixel responds;
+        `pixels`, all electrons expected in it; `charge`, the electrons collected; `offsets`, the values added to
+        them; `raw`, the raw digital numbers.
+    later_steps
+        Further steps of a mosaic at which the model acts by `apply_at`, in order. `steps` holds `step` and these.
+    needs_mosaic
+        True if the model needs a detector with a mosaic, also if only `alter` changes that detector.
+    needs_ccd
+        True if the model has no effect on CMOS.
+    localised
+        False if the footprint covers about the whole frame.
+    needs_sun
+        True if the model needs the Sun's position.
+    effect_mask
+        True if the mask holds the pixels that change (see `effect_level_dn`) instead of the footprint.
+    soft_layer
+        Name of the optional layer that `soft` returns. It ends like one of `quantities.SOFT_KINDS`. "": no layer.
+    lens_of_thin_camera
+        Packaged lens that the model traces if the camera has a thin lens and the scene names no lens. Its contents
+        belong to the scene's identity. "": none.
+
+    Two more attributes, for the step `electrons`, say which light has already passed the lens's rims. A model with
+    neither acts in the same manner on all light (see `act`).
+
+    adds_past_rims
+        True if the light that the model adds has passed the rims. `apply` adds it to `Electrons.past_rims` if the
+        quantity has that plane, else to `array`.
+    at_rims
+        True if the model acts at the rims. Light past the rims is then only multiplied by `passed_to_sun`.
+    """
+
+    fault: ClassVar[str]
+    model: ClassVar[str]
+    default: ClassVar[bool] = False
+    after: ClassVar[str | None] = None
+    axis: ClassVar[int | None] = None
+    step: ClassVar[str]
+    later_steps: ClassVar[tuple[str, ...]] = ()
+    steps: ClassVar[tuple[str, ...]]
+    localised: ClassVar[bool] = True
+    needs_sun: ClassVar[bool] = False
+    needs_mosaic: ClassVar[bool] = False
+    needs_ccd: ClassVar[bool] = False
+    effect_mask: ClassVar[bool] = False
+    soft_layer: ClassVar[str] = ""
+    adds_past_rims: ClassVar[bool] = False
+    at_rims: ClassVar[bool] = False
+    lens_of_thin_camera: ClassVar[str] = ""
+
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        """Register the model. Raise TypeError if its steps are out of order or its name is in use."""
+        super().__init_subclass__(**kwargs)
+        if "model" not in cls.__dict__:
+            return  # a base class without a model name is not registered
+        cls.default = cls.__dict__.get("default", False)
+        cls.steps = (cls.step, *cls.later_steps)
+        if cls.steps != tuple(step for step in STEPS if step in cls.steps):
+            raise TypeError(f"fault model {cls.fault}/{cls.model} acts at {cls.steps}, not in the order of {STEPS}")
+        # the code for the steps electrons and rgbi handles only one step of each fault
+        if cls.later_steps and not set(MOSAIC_STEPS).issuperset(cls.steps):
+            raise TypeError(f"fault model {cls.fault}/{cls.model}: only steps of a mosaic may be several")
+        if cls.soft_layer:
+            soft_kind(cls.soft_layer)
+        register(cls)
+
+    def __post_init__(self) -> None:
+        """Check and convert every field."""
+        # this checks a fault made in Python like one from a scene file, and accepts plain numbers and pairs
+        for f in dataclasses.fields(self):
+            where = f"{self.fault}.{f.name}"
+            object.__setattr__(self, f.name, parse_field(getattr(self, f.name), f, where))
+
+    def draw(self, context: FaultContext, rng: np.random.Generator) -> Params:
+        """Return the drawn parameters: plain, JSON-able data, sufficient to inject the same fault again."""
+        return {}
+
+    def alter(self, camera: Camera, params: Params) -> Camera:
+        """Return the camera with this fault, if the fault changes a parameter of the instrument."""
+        return camera
+
+    def inform(self, context: FaultContext, params: Params) -> FaultContext:
+        """Return the context for the other faults of the sample, if this fault changes what they act on."""
+        return context
+
+    def apply(self, quantity: Q, params: Params, context: FaultContext) -> Q:
+        """Return the quantity of `step` with this fault. The input is not modified."""
+        return quantity
+
+    def apply_at(self, step: str, quantity: Q, params: Params, context: FaultContext) -> Q:
+        """Return the quantity of one of `steps` with this fault. A model with `later_steps` overrides this hook."""
+        return self.apply(quantity, params, context)
+
+    def act_at(self, step: str, params: Params, context: FaultContext) -> Callable[[Any], Any]:
+        """Return a function that applies the fault to the array of one step in a detector with a mosaic."""
+        kind: Any = QUANTITIES[step]
+
+        def act(array: Any) -> Any:
+            return self.apply_at(step, kind(array=array), params, context).array
+
+        return act
+
+    def passed_to_sun(self, params: Params, context: FaultContext) -> float:
+        """Return the fraction of the light past the rims that a fault with `at_rims` lets pass.
+
+        This is the fraction of the Sun's beam that clears the openings which the fault has moved. The loss at the
+        lens's own rims is already in that light, so it does not count here.
+        """
+        return 1.0
+
+    def footprint(self, params: Params, context: FaultContext) -> NDArray[np.bool_] | None:
+        """Return the pixels at which the fault acts, bool[y, x]; None if the class has no footprint."""
+        return None
+
+    def soft(self, params: Params, context: FaultContext) -> NDArray[np.float32]:
+        """Return how strongly the fault acts on each pixel, float32[y, x], in the unit of its `soft_layer`."""
+        raise NotImplementedError(f"{self.fault}/{self.model} has no soft layer")
+
+    def defects(self, params: Params, context: FaultContext) -> NDArray[np.uint8] | None:
+        """Return the kinds of defects that the fault makes in the mosaic, uint8[y, x]; None if it makes none.
+
+        The values are bits of `quantities.DEFECTS`.
+        """
+        return None
+
+    def validate(self) -> None:
+        """Raise ValueError with one sentence if fields contradict each other."""
+
+    @property
+    def effect_level_dn(self) -> float:
+        """Return the least change of the noise-free 8 bit image, in DN, that counts for a mask by effect."""
+        return 1.0
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain data from which `from_dict` makes an equal fault."""
+        plain: dict[str, Any] = {"model": self.model}
+        for f in dataclasses.fields(self):
+            value = getattr(self, f.name)
+            if isinstance(value, Interval):
+                value = [value.lo, value.hi]
+            elif f.metadata.get("kind") == "rows":
+                value = [dict(row) for row in value]
+            if value is not None:  # TOML has no null, so a missing number stays out
+                plain[f.name] = value
+        return plain
+
+
+def act(fault: Fault, light: Electrons, params: Params, context: FaultContext) -> Electrons:
+    """Return the light after an optical fault; light that has passed the lens's rims stays in its own plane.
+
+    A fault that acts on all light may clip it, so the two planes cannot be treated one by one. The plane past the
+    rims becomes the result for all light minus the result for the light before the rims, at least 0.
+    """
+    if fault.adds_past_rims:
+        past = np.zeros_like(light.array) if light.past_rims is None else light.past_rims
+        return fault.apply(replace(light, past_rims=past), params, context)
+    if light.past_rims is None:
+        return fault.apply(light, params, context)
+    rest = fault.apply(replace(light, past_rims=None), params, context)
+    if fault.at_rims:
+        return replace(rest, past_rims=light.past_rims * np.float32(fault.passed_to_sun(params, context)))
+    whole = fault.apply(light.merged, params, context)
+    return replace(rest, past_rims=np.maximum(whole.array - rest.array, 0))
+
+
+@dataclass(frozen=True, kw_only=True)
+class LensFault(Fault):
+    """Add the key `lens` to the models that trace light through a prescription.
+
+    All such faults of a frame use the same lens, unless the scene names another one.
+    """
+
+    lens_of_thin_camera: ClassVar[str] = DEFAULT_LENS
+
+    lens: str = path(
+        content="lens",
+        packaged="scenes/lenses",
+        doc="path of a prescription or name of a packaged lens, scaled to the camera's focal length and closed to "
+        f"its f-number; default: the camera's own, or {DEFAULT_LENS} where that is a thin lens",
+    )
+
+    def validate(self) -> None:
+        """Raise an error if the named lens cannot be loaded."""
+        if self.lens:
+            load_lens(self.lens)
+
+
+def with_sensor(camera: Camera, **changes: Any) -> Camera:
+    """Return the camera with changed sensor fields, for faults that are parameters of a detector with a mosaic."""
+    detector = camera.mosaic
+    return dataclasses.replace(
+        camera, detector=dataclasses.replace(detector, sensor=dataclasses.replace(detector.sensor, **changes))
+    )

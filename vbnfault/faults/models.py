@@ -1,0 +1,222 @@
+"""Keep all fault models, in the order of the dataset, and read the faults of a scene file.
+
+The definition of a model registers it. The orders of the classes follow from what their default models declare.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import importlib
+import pkgutil
+import re
+from collections.abc import Iterable, Iterator, Mapping
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any
+
+from ..core.errors import InputError, shown
+from .fields import field_schema, parse_field, suggestion
+
+if TYPE_CHECKING:
+    from .contract import Fault
+
+_PACKAGE = __package__ or ""
+_NAME = re.compile("[a-z][a-z0-9_]*")
+
+# fault class → model → type, in the order of their definition
+_models: dict[str, dict[str, type[Fault]]] = {}
+
+
+def register(cls: type[Fault]) -> None:
+    """Add a model to the registry. Raise TypeError if its names cannot be used or its declarations contradict."""
+    where = f"fault model {cls.fault}/{cls.model}"
+    if not _NAME.fullmatch(cls.fault) or not _NAME.fullmatch(cls.model):
+        raise TypeError(f"{where}: its names must consist of lower-case letters, digits and underscores")
+    models = _models.get(cls.fault, {})
+    known = models.get(cls.model)
+    if known is not None and (known.__module__, known.__qualname__) != (cls.__module__, cls.__qualname__):
+        raise TypeError(f"{where} is defined twice: in {known.__module__} and in {cls.__module__}")
+    if cls.default:
+        other = next((m for m in models.values() if m.default and m.model != cls.model), None)
+        if other is not None:
+            raise TypeError(f"{where}: default = True, but {other.fault}/{other.model} is the default of the class")
+        if cls.after is None:
+            raise TypeError(
+                f"{where}: the default model must state the class after which its class acts: after = ..."
+            )
+        if cls.axis is not None and not is_packaged(cls):
+            raise TypeError(f"{where}: axis = {cls.axis}: only the six classes of the paper have a position")
+    _models.setdefault(cls.fault, {})[cls.model] = cls
+    _forget_orders()
+
+
+def _forget_orders() -> None:
+    """Forget what was computed from the models that were registered so far."""
+    _sorted_registry.cache_clear()
+    _physical_order.cache_clear()
+
+
+@contextlib.contextmanager
+def undoing_registrations(*, always: bool = False) -> Iterator[None]:
+    """Forget the models that a block registers if the block raises an exception, or `always`."""
+    before = {name: dict(models) for name, models in _models.items()}
+    undo = True
+    try:
+        yield
+        undo = always
+    finally:
+        if undo:
+            _models.clear()
+            _models.update(before)
+            _forget_orders()
+
+
+def is_packaged(cls: type[Fault]) -> bool:
+    """Return whether a model belongs to vbnfault itself."""
+    return cls.__module__.startswith(f"{_PACKAGE}.")
+
+
+def registry() -> dict[str, dict[str, type[Fault]]]:
+    """Return fault class → model → type, with the classes in the order of the dataset.
+
+    The first model of each class is its default. The others are sorted by module, those of this package first,
+    whatever the order of imports. Raise TypeError if what the classes declare does not fit together.
+    """
+    _import_all()
+    return _sorted_registry()
+
+
+@lru_cache(maxsize=1)
+def _import_all() -> None:
+    """Import every module of this package, so that all its models are registered."""
+    for info in pkgutil.iter_modules(importlib.import_module(_PACKAGE).__path__):
+        importlib.import_module(f"{_PACKAGE}.{info.name}")
+
+
+@lru_cache(maxsize=1)
+def _sorted_registry() -> dict[str, dict[str, type[Fault]]]:
+    """Return the registry as it is now; see `registry`."""
+
+    def position(cls: type[Fault]) -> tuple[bool, bool, str]:
+        return not cls.default, not is_packaged(cls), cls.__module__
+
+    for models in _models.values():
+        for cls in models.values():
+            _check_fields(cls)
+    _physical_order()
+    return {
+        name: {cls.model: cls for cls in sorted(_models[name].values(), key=position)}
+        for name in dataset_order(_models)
+    }
+
+
+def _check_fields(cls: type[Fault]) -> None:
+    """Raise TypeError if a model is no frozen, keyword-only dataclass of fields made by the helpers."""
+    where = f"fault model {cls.fault}/{cls.model}"
+    options = cls.__dict__.get("__dataclass_params__")
+    if options is None or not (options.frozen and getattr(options, "kw_only", True)):
+        raise TypeError(f"{where}: its class must be decorated with @dataclass(frozen=True, kw_only=True)")
+    for f in dataclasses.fields(cls):
+        if "kind" not in f.metadata:
+            raise TypeError(f"{where}: {f.name} must be declared with one of the field helpers, such as bounds()")
+
+
+def _defaults() -> dict[str, type[Fault]]:
+    """Return the default model of every class. Raise TypeError if a class has none."""
+    defaults = {cls.fault: cls for models in _models.values() for cls in models.values() if cls.default}
+    for name, models in _models.items():
+        if name not in defaults:
+            raise TypeError(f"fault class {name}: none of its models ({', '.join(models)}) states default = True")
+    return defaults
+
+
+@lru_cache(maxsize=1)
+def _physical_order() -> tuple[str, ...]:
+    """Return all classes in the order in which their effects act.
+
+    The `after` of the classes form a tree with one root. The classes of this package are one long branch of it; a
+    class of a plug-in comes directly behind the class that it names.
+    """
+    defaults = _defaults()
+    followers: dict[str, list[str]] = {"": [], **{name: [] for name in defaults}}
+    for name, cls in sorted(defaults.items(), key=lambda item: (is_packaged(item[1]), item[0])):
+        if cls.after not in followers:
+            hint = suggestion(str(cls.after), defaults)
+            raise TypeError(f"fault class {name}: after = {cls.after!r}: no such fault class{hint}")
+        followers[cls.after].append(name)
+    order: list[str] = []
+    pending = followers[""][::-1]
+    while pending:
+        order.append(pending.pop())
+        pending += followers[order[-1]][::-1]
+    circle = sorted(set(defaults) - set(order))
+    if circle:
+        raise TypeError(f"fault classes {', '.join(circle)}: what they state by `after` runs in a circle")
+    return tuple(order)
+
+
+def dataset_order(names: Iterable[str]) -> list[str]:
+    """Return the names in the order of the dataset's `fault` axis."""
+    _import_all()
+    axis = {cls.fault: cls.axis for cls in _defaults().values()}
+
+    def position(name: str) -> tuple[float, str]:
+        index = axis.get(name)
+        return float("inf") if index is None else index, name
+
+    return sorted(set(names), key=position)
+
+
+def physical_order(names: Iterable[str]) -> list[str]:
+    """Return the names in the order in which the effects act."""
+    _import_all()
+    position = {name: k for k, name in enumerate(_physical_order())}
+    return sorted(set(names), key=lambda name: (position.get(name, len(position)), name))
+
+
+def from_dict(fault_class: str, table: Mapping[str, Any], *, source: str) -> Fault:
+    """Build one fault from its table `[faults.<fault_class>]` in the scene file.
+
+    If the table has no key `model`, the default model of the class is used.
+
+    Raises
+    ------
+    InputError
+        Names `source`, the key, its value and the allowed range.
+    """
+    models = registry().get(fault_class)
+    where = f"{source}: faults.{fault_class}"
+    if models is None:
+        raise InputError(f"{where}: no such fault class{suggestion(fault_class, registry())}")
+    name = table.get("model", next(iter(models)))
+    if not isinstance(name, str) or name not in models:
+        raise InputError(f"{where}.model = {shown(name)}: must be one of {', '.join(models)}")
+    cls = models[name]
+    fields = {f.name: f for f in dataclasses.fields(cls)}
+    values: dict[str, Any] = {}
+    for key, value in table.items():
+        if key == "model":
+            continue
+        if key not in fields:
+            raise InputError(f"{where}.{key}: unknown key{suggestion(key, fields)}")
+        values[key] = parse_field(value, fields[key], f"{where}.{key}")
+    fault = cls(**values)
+    try:
+        fault.validate()
+    except ValueError as error:
+        raise InputError(f"{where}: {error}") from None
+    return fault
+
+
+def json_schema() -> dict[str, Any]:
+    """Return the JSON Schema of the `faults` table, made from the fields of every registered model."""
+    classes: dict[str, Any] = {}
+    for fault_class, models in registry().items():
+        options = []
+        for name, cls in models.items():
+            properties: dict[str, Any] = {"model": {"const": name}}
+            for f in dataclasses.fields(cls):
+                properties[f.name] = field_schema(f)
+            options.append({"type": "object", "properties": properties, "additionalProperties": False})
+        classes[fault_class] = options[0] if len(options) == 1 else {"anyOf": options}
+    return {"type": "object", "properties": classes, "additionalProperties": False}

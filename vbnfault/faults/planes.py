@@ -1,0 +1,60 @@
+"""Compute with the planes of an image, for the hooks of fault models."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ..camera import Camera
+from ..core.quantities import LUMINANCE
+
+
+def times(array: NDArray[np.float32], factor: NDArray[Any]) -> NDArray[np.float32]:
+    """Return planes float32[y, x, channel] times a factor for each channel [channel] or for each pixel [y, x]."""
+    if factor.ndim == 1:
+        # OpenCV needs a scalar of four numbers
+        out = cv2.multiply(array, (*factor.tolist(), 0.0, 0.0, 0.0)[:4])
+    else:
+        out = cv2.multiply(array, cv2.merge([factor] * array.shape[2]))
+    return np.asarray(out).reshape(array.shape)
+
+
+def plus(array: NDArray[np.float32], other: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return the sum of two arrays float32[y, x, channel] of the same shape."""
+    return np.asarray(cv2.add(array, other)).reshape(array.shape)
+
+
+def intensity_dn(electrons: NDArray[np.float32], camera: Camera) -> NDArray[np.float32]:
+    """Return the intensity of electrons float32[y, x, channel], as float32[y, x] in DN of 255.
+
+    The scale is linear, 255 is white, and nothing is clipped. If the camera has pixels without a colour filter (W),
+    the intensity is their signal. Otherwise it is the luminance of R, G and B.
+    """
+    channels, white_e = camera.detector.channels, np.asarray(camera.detector.white_e, dtype=np.float32)
+    if "W" in channels:
+        weights = np.array([channel == "W" for channel in channels], dtype=np.float32)
+    else:
+        luminance = dict(zip("RGB", LUMINANCE, strict=True))
+        weights = np.array([luminance.get(channel, 0) for channel in channels], dtype=np.float32)
+        weights /= weights.sum()
+    return np.asarray(electrons @ (weights * 255 / white_e), dtype=np.float32)
+
+
+def scale_by_intensity(rgbi: NDArray[np.uint8], intensity: NDArray[np.float32]) -> NDArray[np.uint8]:
+    """Return RGBI uint8[..., 4] with I set to `intensity` (0-255) and RGB scaled by the same ratio.
+
+    Where I was 0, R, G and B become the new I. Values that overflow are clipped in each channel.
+    """
+    before = rgbi[..., 3]
+    dark = before == 0
+    ratio = intensity / np.maximum(before, np.float32(1))
+    out = np.empty_like(rgbi)
+    for channel in range(4):
+        value = intensity.copy() if channel == 3 else rgbi[..., channel] * ratio
+        np.copyto(value, intensity, where=dark)
+        np.rint(value, out=value)
+        out[..., channel] = np.clip(value, 0, 255, out=value)
+    return out
