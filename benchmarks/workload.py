@@ -14,7 +14,7 @@ from detector_chain import Chain, speckled
 
 from vbnfault import dataset, pipeline, render, store
 from vbnfault.body import Patch
-from vbnfault.core import frames, photometry, spectra
+from vbnfault.core import frames, spectra
 from vbnfault.core.quantities import Sample
 from vbnfault.lens import load_lens, scaled_to_focal_length
 from vbnfault.lens.straylight.irradiance import FlareModel
@@ -23,6 +23,7 @@ from vbnfault.pipeline.photograph import photograph
 from vbnfault.pipeline.record import label, to_sample
 from vbnfault.pipeline.resolve import resolve
 from vbnfault.pipeline.spec import Frame, Pose, SampleSpec, Terrain
+from vbnfault.reflectance.hapke import hapke_at
 from vbnfault.render.description import RenderInput
 from vbnfault.render.emitter import SunDisc
 from vbnfault.render.runtime import dr, mi
@@ -131,7 +132,7 @@ class Workload:
         for stage in (meter, photograph, label):
             seconds[stage.__name__], _ = clock(lambda stage=stage: stage(frame))
         # the same view with the photometry of the physical scenes
-        physical = replace(scene, photometry=photometry.hapke_at(scene.wavelength_nm))
+        physical = replace(scene, reflectance=hapke_at(scene.wavelength_nm))
         seconds["hapke"], _ = clock(lambda: render.radiance(surface, physical))
         lit = replace(physical, bounces=1)
         seconds["bounce"], _ = clock(lambda: render.radiance(surface, lit, frame.truth))

@@ -9,26 +9,30 @@ import sys
 
 import numpy as np
 import pytest
-from test_photometry import SETS, by_angles, directions
+from test_reflectance import SETS, by_angles, directions
 from test_render import NODES, UP, join, plane, sun, view
 
 from vbnfault import render
-from vbnfault.core import frames, photometry, spectra
-from vbnfault.core.photometry import HAPKE_TABLES, Diffuse, Photometry, hapke_at
+from vbnfault.core import frames, spectra
+from vbnfault.reflectance import BandReflectance, DiscReflectance, radiance_factor, registry
+from vbnfault.reflectance.disc import Lambert
+from vbnfault.reflectance.hapke import HAPKE_TABLES, hapke_at
 from vbnfault.render.description import RenderInput, Sunlight, View
 from vbnfault.render.runtime import dr, mi
 from vbnfault.render.sampling import disc_sets
 
 
-def scene(a_view: View, light: Sunlight, ground: Photometry | float, spp: int = 16, **more: object) -> RenderInput:
-    """A scene with the photometry given, or Lambert's of a grey value."""
+def scene(
+    a_view: View, light: Sunlight, ground: BandReflectance | float, spp: int = 16, **more: object
+) -> RenderInput:
+    """A scene with the reflectance given, or Lambert's of a grey value."""
     if isinstance(ground, float):
-        ground = Diffuse(reflectance=np.full(len(NODES), ground))
+        ground = Lambert().at(NODES, np.full(len(NODES), ground))
     return RenderInput(
         view=a_view,
         sun=light,
         wavelength_nm=NODES,
-        photometry=ground,
+        reflectance=ground,
         samples_per_pixel=spp,
         key=5,
         **more,  # type: ignore[arg-type]
@@ -89,7 +93,7 @@ def test_every_band_has_its_own_phase_function() -> None:
 
 
 def _columns() -> tuple[str, ...]:
-    from vbnfault.core.photometry import COLUMNS
+    from vbnfault.reflectance.hapke import COLUMNS
 
     return COLUMNS
 
@@ -264,7 +268,7 @@ def test_dust_colours_its_ground() -> None:
     surface = render.TerrainMesh(vertices, faces, np.ones(2, bool), dust=np.ones(4, np.float32))
     a_view, light = view(10 * UP, -UP, width=16), sun(frames.direction_L(0, 50))
     contrast = np.linspace(0.1, 0.3, len(NODES))
-    for ground in (Diffuse(reflectance=np.full(len(NODES), 0.06)), hapke_at(NODES)):
+    for ground in (Lambert().at(NODES, np.full(len(NODES), 0.06)), hapke_at(NODES)):
         bare, dusty = (
             render.radiance(surface, scene(a_view, light, ground, dust_contrast=c)).array.mean(axis=(1, 2))
             for c in (None, contrast)
@@ -273,27 +277,25 @@ def test_dust_colours_its_ground() -> None:
 
 
 @pytest.mark.parametrize(
-    ("disc", "phase_slope_mag_deg"),
-    [("hapke", 0.0), *itertools.product(("lambert", "lommel_seeliger", "mcewen"), (0.0, 0.047))],
+    ("name", "more"),
+    [(name, {}) for name in registry()]
+    + [(name, {"phase_slope_mag_deg": 0.047}) for name, c in registry().items() if issubclass(c, DiscReflectance)],
 )
-def test_a_plane_has_the_radiance_of_its_model(disc: str, phase_slope_mag_deg: float) -> None:
+def test_a_plane_has_the_radiance_of_its_model(name: str, more: dict[str, float]) -> None:
     """Every model, with dust and without, with bounces and without: radiance_factor · E / π at every pixel."""
     vertices, faces = plane()
     dust = np.full(4, 0.5, np.float32)
     surface = render.TerrainMesh(vertices, faces, np.ones(2, bool), dust=dust)
     a_view = view(np.array([0.0, 0.0, -10.0]), np.array([0.5, 0.2, 1.0]), width=8, fov_deg=2.0)
     light = dataclasses.replace(sun(frames.direction_L(40, 35)), angular_radius_rad=1e-5)
-    ground: Photometry = hapke_at(NODES)
-    if disc != "hapke":
-        grey = np.full(len(NODES), 0.06)
-        ground = Diffuse(reflectance=grey, disc=disc, phase_slope_mag_deg=phase_slope_mag_deg)
+    ground = registry()[name](**more).at(NODES, np.full(len(NODES), 0.06))
     fx, fy, cx, cy = a_view.intrinsics
     x, y = np.meshgrid((np.arange(8) + 0.5 - cx) / fx, (np.arange(8) + 0.5 - cy) / fy)
     seen = np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3) @ a_view.L_from_C.T
     seen /= np.linalg.norm(seen, axis=1)[:, None]
     # the surface's z axis is L's up
     turn = np.diag([1.0, -1.0, -1.0])
-    factor = photometry.radiance_factor(ground, light.direction_L @ turn, -seen @ turn)
+    factor = radiance_factor(ground, light.direction_L @ turn, -seen @ turn)
     bare = factor * (light.irradiance_W_m2_nm / np.pi)[:, None]
     for contrast, bounces in itertools.product((None, np.full(len(NODES), 0.16)), (0, 1, 2)):
         a_scene = scene(a_view, light, ground, spp=4, dust_contrast=contrast, bounces=bounces)

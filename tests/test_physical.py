@@ -14,11 +14,11 @@ from test_render import NODES, UP, join, plane, sun, view
 from vbnfault import render
 from vbnfault.core import frames
 from vbnfault.core.errors import InputError
-from vbnfault.core.photometry import hapke_at
 from vbnfault.core.quantities import BODY, SKY, SPACECRAFT
 from vbnfault.pipeline import STAGES, Session, expose
 from vbnfault.pipeline.record import to_sample
 from vbnfault.pipeline.spec import Frame
+from vbnfault.reflectance.hapke import hapke_at
 from vbnfault.render.detail import _LEVELS, _SIDE, _UNIT, _pyramid
 from vbnfault.scene import config
 from vbnfault.world import assemble, sky

@@ -9,9 +9,9 @@ import pytest
 
 from vbnfault import render
 from vbnfault.core import frames, spectra
-from vbnfault.core.photometry import Diffuse
 from vbnfault.detector import ThreeColourDetector
 from vbnfault.lens import ThinLens
+from vbnfault.reflectance.disc import Lambert
 from vbnfault.render.description import RenderInput, Sunlight, View
 from vbnfault.render.runtime import dr
 
@@ -71,7 +71,7 @@ def scene(
         view=a_view,
         sun=light,
         wavelength_nm=NODES,
-        photometry=Diffuse(reflectance=spectra.reflectance(reflectance, NODES)),
+        reflectance=Lambert().at(NODES, spectra.reflectance(reflectance, NODES)),
         samples_per_pixel=spp,
         key=key,
     )

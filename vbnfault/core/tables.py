@@ -126,6 +126,11 @@ def _schema(kind: Any) -> dict[str, Any]:
     return _adapter(kind).json_schema()
 
 
+def forget_schemas() -> None:
+    """Forget all schemas: a class that registers itself may extend any of them."""
+    _schema.cache_clear()
+
+
 # --- error messages ---------------------------------------------------------------------------------------------
 
 

@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..camera import Camera
-from ..core import photometry
 from ..core.quantities import BODY, SKY, Electrons, Radiance, Truth
 from ..faults import FaultContext
+from ..reflectance import radiance_factor
 from ..render.description import RenderInput, View
 from ..scene.config import Scene
 from ..world import assemble
@@ -55,7 +55,7 @@ def describe(frame: Frame) -> RenderInput:
         view=view,
         sun=frame.sunlight,
         wavelength_nm=wavelength,
-        photometry=assemble.photometric_model(scene),
+        reflectance=assemble.ground_reflectance(scene),
         dust_contrast=assemble.dust_contrast(scene),
         bounces=scene.render.bounces,
         samples_per_pixel=scene.render.samples_per_pixel,
@@ -224,10 +224,7 @@ def _add_stars(frame: Frame) -> None:
 def reference_exposure_s(scene: Scene, camera: Camera) -> float:
     """Return the exposure in s that puts ground whose normal is 45 degrees from the Sun at the metering level."""
     half = np.sqrt(0.5)
-    lit = (
-        photometry.radiance_factor(assemble.photometric_model(scene), [0, half, half], [half, 0, half])[:, 0]
-        / np.pi
-    )
+    lit = radiance_factor(assemble.ground_reflectance(scene), [0, half, half], [half, 0, half])[:, 0] / np.pi
     sunlight = assemble.sunlight(scene, np.array([0.0, 0.0, -1.0]))  # the direction does not matter
     facet = (lit * sunlight.irradiance_W_m2_nm).astype(np.float32).reshape(-1, 1, 1)
     wavelength = assemble.wavelengths_nm(scene)

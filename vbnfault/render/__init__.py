@@ -48,7 +48,7 @@ def self_test() -> str:
     """Render a Lambert square that faces the Sun and return a sentence that compares its radiance with ρE/π."""
     import numpy as np
 
-    from ..core.photometry import Diffuse
+    from ..reflectance.disc import Lambert
     from .description import RenderInput, Sunlight, View
     from .integrate import radiance
     from .surface import TerrainMesh
@@ -68,7 +68,7 @@ def self_test() -> str:
         view=view,
         sun=sun,
         wavelength_nm=np.array([550.0]),
-        photometry=Diffuse(reflectance=np.array([0.06])),
+        reflectance=Lambert().at(np.array([550.0]), np.array([0.06])),
         samples_per_pixel=4,
         key=0,
     )

@@ -55,7 +55,7 @@ class _Indirect(Light):
     def __init__(self, surface: TerrainMesh, scene: RenderInput) -> None:
         super().__init__(surface, scene, banded=scene.bounces > 1 or has_bands(surface, scene))
         self.samples_per_pixel = max(1, scene.samples_per_pixel // _SHARE)
-        sun, model = scene.sun, scene.photometry
+        sun, model = scene.sun, scene.reflectance
         if self.banded:
             self.weights = np.diag(sun.irradiance_W_m2_nm)
         else:

@@ -1,6 +1,6 @@
-"""Compute the terrain's reflection: the models of `photometry` in drjit, and as a Mitsuba plugin.
+"""Compute the terrain's reflection: the models of `reflectance` in drjit, and as a Mitsuba plugin.
 
-A photometric model gives *terms* per sample, and the weight of each term in each band. Bands are linear in the
+A reflectance gives *terms* per sample, and the weight of each term in each band. Bands are linear in the
 terms, so only the terms are summed over the samples of a pixel.
 """
 
@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from ..core.photometry import HAPKE_TABLES, Hapke, hapke_at
+from ..reflectance.hapke import HAPKE_TABLES, Hapke, hapke_at
 from .description import RenderInput
 from .runtime import dr, mi
 from .surface import TerrainMesh, facing
@@ -18,7 +18,7 @@ from .surface import TerrainMesh, facing
 
 def has_bands(surface: TerrainMesh, scene: RenderInput) -> bool:
     """Return whether bands differ by more than a factor, so that each needs its own term."""
-    return scene.photometry.terms > 1 or scene.dust_contrast is not None or surface.vehicle is not None
+    return scene.reflectance.terms > 1 or scene.dust_contrast is not None or surface.vehicle is not None
 
 
 class Reflection:
@@ -49,7 +49,7 @@ class Reflection:
 
     def _evaluate(self, light: Any) -> list[Any]:
         """Return the terms for directions towards the light in the local frame."""
-        model, contrast = self._scene.photometry, self._scene.dust_contrast
+        model, contrast = self._scene.reflectance, self._scene.dust_contrast
         terms = model.evaluate(dr, _triple(light), self._view)
         if not self._banded:
             return terms
@@ -75,11 +75,11 @@ def _triple(v: Any) -> tuple[Any, Any, Any]:
 class HapkeBSDF(mi.BSDF):  # type: ignore[misc]
     """Provide the Mitsuba plugin `hapke` for a user's own scenes.
 
-    `mi.load_dict({"type": "hapke", "parameters": "67p_fornasier2015"})` uses a set of `photometry.HAPKE_TABLES`.
-    The reflectance is linear between the tabulated wavelengths. Instead of a set, numbers that hold at all
-    wavelengths can be given: `w`, `g`, `B0`, `h_s`, `B_C0` (default 0), `h_c` (1), `roughness_deg` (0), `K` (1), as
-    in `photometry.Hapke`. Directions are cosine-distributed, which is unbiased for all of them. The surface is
-    one-sided: it is black from below.
+    `mi.load_dict({"type": "hapke", "parameters": "67p_fornasier2015"})` uses a set of
+    `reflectance.hapke.HAPKE_TABLES`. The reflectance is linear between the tabulated wavelengths. Instead of a set,
+    numbers that hold at all wavelengths can be given: `w`, `g`, `B0`, `h_s`, `B_C0` (default 0), `h_c` (1),
+    `roughness_deg` (0), `K` (1), as in `reflectance.hapke.Hapke`. Directions are cosine-distributed, which is
+    unbiased for all of them. The surface is one-sided: it is black from below.
 
     Raises RuntimeError, through Mitsuba, if the set is unknown or a number is missing.
     """
@@ -87,7 +87,7 @@ class HapkeBSDF(mi.BSDF):  # type: ignore[misc]
     def __init__(self, props: Any) -> None:
         mi.BSDF.__init__(self, props)
 
-        def one(key: str, default: float | None = None) -> np.ndarray:
+        def parameter(key: str, default: float | None = None) -> np.ndarray:
             return np.array([float(props[key] if default is None else props.get(key, default))])
 
         if "parameters" in props:
@@ -97,14 +97,14 @@ class HapkeBSDF(mi.BSDF):  # type: ignore[misc]
         else:
             self._nodes_nm = np.zeros(1)
             self._model = Hapke(
-                single_scattering_albedo=one("w"),
-                asymmetry=one("g"),
-                shadow_hiding_amplitude=one("B0"),
-                shadow_hiding_width=one("h_s"),
-                coherent_amplitude=one("B_C0", 0.0),
-                coherent_width=one("h_c", 1.0),
-                roughness_deg=one("roughness_deg", 0.0),
-                porosity_factor=one("K", 1.0),
+                single_scattering_albedo=parameter("w"),
+                asymmetry=parameter("g"),
+                shadow_hiding_amplitude=parameter("B0"),
+                shadow_hiding_width=parameter("h_s"),
+                coherent_amplitude=parameter("B_C0", 0.0),
+                coherent_width=parameter("h_c", 1.0),
+                roughness_deg=parameter("roughness_deg", 0.0),
+                porosity_factor=parameter("K", 1.0),
             )
         flags = mi.BSDFFlags.GlossyReflection | mi.BSDFFlags.FrontSide
         self.m_flags = flags

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.photometry import Photometry
+from ..reflectance import BandReflectance
 
 F64 = NDArray[np.float64]
 
@@ -72,7 +72,7 @@ class RenderInput:
     ----------
     wavelength_nm
         float64[band].
-    photometry
+    reflectance
         How the surface reflects at these wavelengths.
     samples_per_pixel
         A power of four.
@@ -88,7 +88,7 @@ class RenderInput:
     view: View
     sun: Sunlight
     wavelength_nm: F64
-    photometry: Photometry
+    reflectance: BandReflectance
     samples_per_pixel: int
     key: int
     bounces: int = 0

@@ -6,7 +6,7 @@ continues the terrain's roughness.
 
 The surface is the sum of two periodic fields of slopes. They are turned against each other so that their repetition
 is not visible. A pyramid of resolutions averages them over the pixel; anything smaller is left to the roughness of
-the photometric model. Both fields grow with the facets in factors of four, alternately: each changes its scale
+the ground reflectance. Both fields grow with the facets in factors of four, alternately: each changes its scale
 while its weight is zero, so that no border is visible. The relief only changes the shading; it casts no shadows.
 """
 

@@ -1,4 +1,4 @@
-"""Compute direct light: a camera ray, a point of the Sun's disc, and photometry in all bands on the same ray.
+"""Compute direct light: a camera ray, a point of the Sun's disc, and reflectance in all bands on the same ray.
 
 The rays of the pixels would miss a disc smaller than a pixel. The Sun's direct image is therefore computed by
 `sundisc`, and rays from the pupil to all parts of the disc show which of them are hidden.
@@ -179,7 +179,7 @@ class _Direct(Light):
 
     def __init__(self, surface: TerrainMesh, scene: RenderInput) -> None:
         super().__init__(surface, scene, banded=has_bands(surface, scene))
-        sun, model = scene.sun, scene.photometry
+        sun, model = scene.sun, scene.reflectance
         self.limb = Limb(sun)
         if self.banded:
             self.weights = np.diag(sun.irradiance_W_m2_nm)

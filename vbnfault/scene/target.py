@@ -7,8 +7,10 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from ..core import photometry, spectra
+from ..core import spectra
 from ..core.tables import Table
+from ..reflectance import AnyReflectance
+from ..reflectance.disc import Lambert
 
 # The most rows of a spectrum or of Hapke's parameters.
 _MOST_ROWS = 10_000
@@ -29,55 +31,6 @@ class SpectrumTable(Table):
         if any(a >= b for a, b in itertools.pairwise(self.wavelength_nm)):
             raise ValueError(f"wavelength_nm = {list(self.wavelength_nm)}: must increase")
         return self
-
-
-class HapkeRow(Table):
-    """Give Hapke's parameters at one wavelength (Hapke 2002, 2012)."""
-
-    wavelength_nm: float = Field(gt=0, le=1e5)
-    single_scattering_albedo: float = Field(ge=0, le=1, description="w")
-    asymmetry: float = Field(gt=-1, lt=1, description="g of Henyey-Greenstein; negative scatters back")
-    shadow_hiding_amplitude: float = Field(0.0, ge=0, le=100, description="B0")
-    shadow_hiding_width: float = Field(1.0, gt=0, le=100, description="h_s, dimensionless: not an angle")
-    coherent_amplitude: float = Field(0.0, ge=0, le=100, description="B_C0")
-    coherent_width: float = Field(1.0, gt=0, le=100, description="h_c")
-    roughness_deg: float = Field(0.0, ge=0, le=60, description="mean slope below a pixel")
-    porosity_factor: float = Field(1.0, ge=1, le=10, description="K")
-
-
-class PhotometryTable(Table):
-    """Set how the ground reflects. All models except Hapke's scale `body.reflectance`."""
-
-    model: Literal["lambert", "lommel_seeliger", "mcewen", "hapke"] = "lambert"
-    phase_slope_mag_deg: float = Field(
-        0.0, ge=0, le=1, description="fading with phase angle, not for 'hapke'; 67P: 0.047"
-    )
-    parameters: str = Field("67p_fornasier2015", description="a named set of Hapke's parameters")
-    hapke: tuple[HapkeRow, ...] | None = Field(
-        None,
-        min_length=1,
-        max_length=_MOST_ROWS,
-        description="Hapke's parameters at wavelengths of one's own, in place of a named set",
-    )
-    dust_contrast: float = Field(
-        0.0, ge=-0.9, le=4, description="how much brighter dust-covered ground is at 649 nm: 0.2 for 20 %"
-    )
-    dust_slope_per_100nm: float = Field(
-        0.0, ge=-0.2, le=0.2, description="spectral slope of dust-covered over bare ground"
-    )
-
-    @model_validator(mode="after")
-    def _known(self) -> PhotometryTable:
-        if self.parameters not in photometry.HAPKE_TABLES:
-            known = ", ".join(photometry.HAPKE_TABLES)
-            raise ValueError(f"parameters = {self.parameters!r}: must be one of {known}")
-        return self
-
-    def rows(self) -> tuple[tuple[float, ...], ...]:
-        """Return `hapke` as rows for `photometry.hapke_at`."""
-        return tuple(
-            (row.wavelength_nm, *(getattr(row, name) for name in photometry.COLUMNS)) for row in self.hapke or ()
-        )
 
 
 class BodyTable(Table):
@@ -102,7 +55,7 @@ class BodyTable(Table):
     reflectance: str | Annotated[float, Field(ge=0, le=1)] | SpectrumTable = Field(
         "67p", description="a named reflectance, a grey value, or a table of values at wavelengths"
     )
-    photometry: PhotometryTable = PhotometryTable()
+    photometry: AnyReflectance = Lambert()
 
     @model_validator(mode="after")
     def _known(self) -> BodyTable:

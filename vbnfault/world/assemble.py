@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 from .. import camera as cameras
 from ..body import Body, Site, Sites, load_body, site_at
 from ..camera import Camera
-from ..core import frames, photometry, resources, spectra, spice
+from ..core import frames, resources, spectra, spice
 from ..core.errors import InputError
-from ..core.photometry import Photometry
 from ..core.quantities import Radiance
 from ..detector import Detector, MosaicDetector, Sensor, ThreeColourDetector, load_sensor
 from ..lens import RealLens, ThinLens, closed_to, coating, load_lens, scaled_to_focal_length
+from ..reflectance import REFERENCE_NM, BandReflectance, radiance_factor
 from ..render.description import Sunlight, View
 from ..scene.config import Scene
 from ..scene.instrument import THIN_LENS, CameraTable
@@ -176,23 +176,16 @@ def wavelengths_nm(scene: Scene) -> F64:
     return spectra.band_nodes_nm(r.band_min_nm, r.band_max_nm, r.bands)
 
 
-def photometric_model(scene: Scene) -> Photometry:
-    """Return the model of how the scene's ground reflects, at its band nodes."""
-    table, wavelength = scene.body.photometry, wavelengths_nm(scene)
-    if table.model == "hapke":
-        rows = table.parameters if table.hapke is None else table.rows()
-        return photometry.hapke_at(wavelength, rows)
-    return photometry.Diffuse(
-        reflectance=spectra.reflectance(_plain(scene.body.reflectance), wavelength),
-        disc=table.model,
-        phase_slope_mag_deg=table.phase_slope_mag_deg,
-    )
+def ground_reflectance(scene: Scene) -> BandReflectance:
+    """Return how the scene's ground reflects, at its band nodes."""
+    wavelength = wavelengths_nm(scene)
+    return scene.body.photometry.at(wavelength, spectra.reflectance(_plain(scene.body.reflectance), wavelength))
 
 
 def dust_contrast(scene: Scene) -> F64 | None:
     """Return the reflectance of dust-covered over bare ground minus 1, float64[band]; None if they are equal."""
     table, wavelength = scene.body.photometry, wavelengths_nm(scene)
-    slope = table.dust_slope_per_100nm * (wavelength - photometry.REFERENCE_NM) / 100
+    slope = table.dust_slope_per_100nm * (wavelength - REFERENCE_NM) / 100
     contrast = (1 + table.dust_contrast) * (1 + slope) - 1
     return contrast if np.any(contrast) else None
 
@@ -218,9 +211,9 @@ def normal_albedo(
         The spacecraft with these materials.
     """
     nodes = wavelengths_nm(scene)
-    band = int(np.argmin(np.abs(nodes - photometry.REFERENCE_NM)))
+    band = int(np.argmin(np.abs(nodes - REFERENCE_NM)))
     contrast = dust_contrast(scene)
-    bare = photometry.radiance_factor(photometric_model(scene), [0, 0, 1], [0, 0, 1])[band, 0]
+    bare = radiance_factor(ground_reflectance(scene), [0, 0, 1], [0, 0, 1])[band, 0]
     ground = np.asarray(bare * (1 + (0 if contrast is None else contrast[band]) * dust), dtype=np.float32)
     if material is None or vehicle is None:
         return ground
@@ -262,14 +255,15 @@ def assumed_of_67p(scene: Scene, body: Body) -> str:
     table = scene.body
     keys = ["name", "density_kg_m3", "rotation_period_h"]
     keys += [] if scene.spice.frame else ["pole_ra_deg", "pole_dec_deg", "prime_meridian_deg"]
-    keys += [] if table.photometry.model == "hapke" else ["reflectance"]
+    keys += ["reflectance"] if table.photometry.scales_reflectance else []
     # compare values, not whether they were set: a packaged scene of 67P sets them, and its shape may be replaced
     values = [
         (key, getattr(table, key)) for key in keys if getattr(table, key) == BodyTable.model_fields[key].default
     ]
     assumed = [f"body.{key} = {v:.6g}" if isinstance(v, float) else f"body.{key} = {v!r}" for key, v in values]
-    if table.photometry.model == "hapke" and table.photometry.hapke is None:
-        assumed.append(f"body.photometry.parameters = {table.photometry.parameters!r}")
+    assumed += [
+        f"body.photometry.{key} = {getattr(table.photometry, key)!r}" for key in table.photometry.keys_of_67p
+    ]
     # if the scene gives a distance, the orbit only rotates the stars
     if scene.orbit is None and not scene.spice.kernels and scene.sun.distance_au is None:
         assumed.append("[orbit]")

@@ -1,84 +1,22 @@
-"""Define how the ground reflects: photometric models and their parameters per wavelength.
-
-Every model gives the bidirectional reflectance r in sr⁻¹, so that I/F = πr. r is the radiance over the irradiance
-of the beam on a plane normal to the beam (r = BRDF · cos i). Each formula is written once, over an array namespace:
-`evaluate` takes numpy arrays (float64) and drjit arrays (float32, in the renderer).
-
-Directions are unit vectors in the local frame of the surface, with z along its normal. `light` points towards the
-Sun and `view` towards the camera; each is a triple of arrays. No angle is computed by arccos: in float32 this gives
-the opposition surge an error of 0.4 % at small phase angles. Hapke's model of 2012 needs only tan(α/2).
-"""
+"""Define Hapke's reflectance with the parameter sets of 67P, and its evaluation in the bands of a scene."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
 from functools import cached_property
-from types import SimpleNamespace
 from typing import Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from pydantic import Field, model_validator
+
+from ..core.tables import Table
+from .contract import LEAST_COSINE, BandReflectance, Reflectance, Triple, tan_half_phase
 
 F64 = NDArray[np.float64]
-Triple = tuple[Any, Any, Any]
 
-NUMPY = SimpleNamespace(
-    exp=np.exp, log=np.log, sqrt=np.sqrt, atan=np.arctan, maximum=np.maximum, minimum=np.minimum, select=np.where
-)
-
-# Below this cosine a direction counts as grazing. An interpolated normal may put the camera slightly below the
-# horizon of a facet that the camera does see.
-_LEAST_COSINE = 1e-4
 _TINY = 1e-30
-# Plain Python numbers: a numpy scalar times a drjit array would be a numpy array.
-_DECAY_PER_MAG = float(0.4 * np.log(10))
-_DEG_PER_HALF = float(np.degrees(2.0))  # degrees of an angle per radian of its half
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Diffuse:
-    """Model reflectance, disc function and phase function as a product: r = (A/π) D(i, e, α) 10^(-0.4 β α).
-
-    `reflectance` float64[band] in [0, 1] is the normal reflectance A at zero phase. `disc` names the disc function
-    D, which is 1 at i = e = α = 0:
-
-    - `lambert`: cos i
-    - `lommel_seeliger`: 2 cos i / (cos i + cos e)
-    - `mcewen`: 2 L cos i / (cos i + cos e) + (1 - L) cos i, the lunar-Lambert function of McEwen (1991, Icarus
-      92, 298), with L(α) = 1 - 0.019 α + 2.42e-4 α² - 1.46e-6 α³, α in degrees, at least 0 (McEwen 1996, LPSC 27).
-
-    `phase_slope_mag_deg` is β in magnitudes per degree; 67P has 0.047 at phase angles of 1.3-54° (Fornasier et al.
-    2015).
-    """
-
-    reflectance: F64
-    disc: Literal["lambert", "lommel_seeliger", "mcewen"] = "lambert"
-    phase_slope_mag_deg: float = 0.0
-
-    # all wavelengths have the same shape: a single term with a weight per band
-    terms: ClassVar[int] = 1
-
-    @property
-    def weights(self) -> F64:
-        """Return the reflectance r of each band per unit of the term, float64[1, band]."""
-        return self.reflectance[None, :] / np.pi
-
-    def evaluate(self, m: Any, light: Triple, view: Triple) -> list[Any]:
-        """Return the single term π r / A; it is 0 where the light comes from below the surface."""
-        mu0, mu = light[2], m.maximum(view[2], _LEAST_COSINE)
-        lit = m.maximum(mu0, 0)
-        if self.disc == "lambert":
-            value = lit
-        else:
-            seeliger = 2 * lit / m.maximum(lit + mu, _LEAST_COSINE)
-            value = seeliger
-            if self.disc == "mcewen":
-                a = _phase_deg(m, light, view)
-                share = m.maximum(1 + a * (-0.019 + a * (2.42e-4 - a * 1.46e-6)), 0)
-                value = share * seeliger + (1 - share) * lit
-        if self.phase_slope_mag_deg:
-            value = value * m.exp(-_DECAY_PER_MAG * self.phase_slope_mag_deg * _phase_deg(m, light, view))
-        return [value]
+_MOST_ROWS = 10_000
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -119,8 +57,8 @@ class Hapke:
         """Return r per band; it is 0 where the light comes from below the surface."""
         lit = light[2] > 0
         light = (light[0], light[1], m.maximum(light[2], _TINY))
-        view = (view[0], view[1], m.maximum(view[2], _LEAST_COSINE))
-        half = _tan_half_phase(m, light, view)
+        view = (view[0], view[1], m.maximum(view[2], LEAST_COSINE))
+        half = tan_half_phase(m, light, view)
         cos_phase = light[0] * view[0] + light[1] * view[1] + light[2] * view[2]
         shared: dict[tuple[float, float], tuple[Any, ...]] = {}
         out = []
@@ -147,30 +85,7 @@ class Hapke:
         return out
 
 
-Photometry = Diffuse | Hapke
-
-
-def radiance_factor(model: Photometry, light: ArrayLike, view: ArrayLike) -> F64:
-    """Return I/F = πr, float64[band, n], for unit directions float64[n, 3] in the surface's frame (z: normal)."""
-    triples = [tuple(np.atleast_2d(np.asarray(d, dtype=np.float64)).T) for d in (light, view)]
-    with np.errstate(under="ignore"):
-        terms = np.stack(np.broadcast_arrays(*model.evaluate(NUMPY, *triples)))
-    return np.pi * np.einsum("tb,tn->bn", model.weights, terms)
-
-
 # --- parts of the models ------------------------------------------------------------------------------------
-
-
-def _tan_half_phase(m: Any, light: Triple, view: Triple) -> Any:
-    """Return tan(α/2) = |l - v| / |l + v| of the phase angle α."""
-    apart = sum((a - b) * (a - b) for a, b in zip(light, view, strict=True))
-    together = sum((a + b) * (a + b) for a, b in zip(light, view, strict=True))
-    return m.sqrt(apart / m.maximum(together, 1e-12))
-
-
-def _phase_deg(m: Any, light: Triple, view: Triple) -> Any:
-    """Return the phase angle in degrees."""
-    return _DEG_PER_HALF * m.atan(_tan_half_phase(m, light, view))
 
 
 def _henyey_greenstein(m: Any, g: float, cos_phase: Any) -> Any:
@@ -189,8 +104,8 @@ def _chandrasekhar(w: float, x: Any, log: Any) -> Any:
 def _coherent(m: Any, z: Any) -> Any:
     """Return the coherent-backscatter surge [1 + (1 - e^-z) / z] / [2 (1 + z)²] (Hapke 2002, eq. 32)."""
     # a series for small z, where 1 - e^-z loses its digits
-    share = m.select(z < 1e-2, 1 - z * (0.5 - z * (1 / 6)), (1 - m.exp(-z)) / m.maximum(z, 1e-2))
-    return (1 + share) / (2 * (1 + z) * (1 + z))
+    mean = m.select(z < 1e-2, 1 - z * (0.5 - z * (1 / 6)), (1 - m.exp(-z)) / m.maximum(z, 1e-2))
+    return (1 + mean) / (2 * (1 + z) * (1 + z))
 
 
 def _rough(m: Any, light: Triple, view: Triple, theta: float) -> tuple[Any, Any, Any]:
@@ -208,7 +123,7 @@ def _rough(m: Any, light: Triple, view: Triple, theta: float) -> tuple[Any, Any,
     sin2 = 0.25 * ((lx - vx) * (lx - vx) + (ly - vy) * (ly - vy))
     cos2 = 0.25 * ((lx + vx) * (lx + vx) + (ly + vy) * (ly + vy))
     tan_half = m.sqrt(sin2 / m.maximum(cos2, 1e-15))
-    psi_share = m.atan(tan_half) * (2 / np.pi)
+    psi_fraction = m.atan(tan_half) * (2 / np.pi)
     cos_psi = cos2 - sin2
     f = m.exp(-2 * tan_half)
 
@@ -222,7 +137,7 @@ def _rough(m: Any, light: Triple, view: Triple, theta: float) -> tuple[Any, Any,
     high = mu0 >= mu  # i <= e
     e1_far, e1_near = m.select(high, e1_e, e1_i), m.select(high, e1_i, e1_e)
     e2_far, e2_near = m.select(high, e2_e, e2_i), m.select(high, e2_i, e2_e)
-    scale = tan / (2 - e1_far - psi_share * e1_near)
+    scale = tan / (2 - e1_far - psi_fraction * e1_near)
     near = (cos_psi * e2_far + sin2 * e2_near) * scale  # for the direction nearer to the normal
     far = (e2_far - sin2 * e2_near) * scale
     mu0_e = chi * (mu0 + sin_i * m.select(high, near, far))
@@ -233,9 +148,6 @@ def _rough(m: Any, light: Triple, view: Triple, theta: float) -> tuple[Any, Any,
 
 
 # --- parameters ---------------------------------------------------------------------------------------------
-
-# Contrasts between terrains refer to this wavelength, the reference of Fornasier et al. 2015.
-REFERENCE_NM = 649.0
 
 COLUMNS = tuple(f.name for f in fields(Hapke))
 # w, g, B0, h_s, B_C0, h_c, roughness, K at each wavelength
@@ -269,14 +181,14 @@ def hapke_at(wavelength_nm: ArrayLike, table: str | tuple[tuple[float, ...], ...
     KeyError
         No table has this name.
     """
-    wanted = np.asarray(wavelength_nm, dtype=np.float64)
+    nodes_nm = np.asarray(wavelength_nm, dtype=np.float64)
     rows = np.array(HAPKE_TABLES[table] if isinstance(table, str) else table, dtype=np.float64)
     rows = rows[np.argsort(rows[:, 0])]
-    columns = {name: np.interp(wanted, rows[:, 0], rows[:, k]) for k, name in enumerate(COLUMNS, start=1)}
+    columns = {name: np.interp(nodes_nm, rows[:, 0], rows[:, k]) for k, name in enumerate(COLUMNS, start=1)}
     if isinstance(table, str) and len(rows) == 1:
         spectrum = np.array(HAPKE_TABLES["67p_fornasier2015"])
-        at, reference = (np.interp(x, spectrum[:, 0], spectrum[:, 1]) for x in (wanted, rows[0, 0]))
-        columns["single_scattering_albedo"] = columns["single_scattering_albedo"] * at / reference
+        here, there = (np.interp(x, spectrum[:, 0], spectrum[:, 1]) for x in (nodes_nm, rows[0, 0]))
+        columns["single_scattering_albedo"] = columns["single_scattering_albedo"] * here / there
     return Hapke(**columns)
 
 
@@ -297,3 +209,54 @@ def geometric_albedo(model: Hapke) -> F64:
     r0 = (1 - gamma) / (1 + gamma)
     p0 = (1 - g * g) / (1 + g) ** 3
     return np.asarray(r0 / 2 + r0**2 / 6 + w / 8 * ((1 + model.shadow_hiding_amplitude) * p0 - 1))
+
+
+# --- the table of the scene file ------------------------------------------------------------------------------
+
+
+class HapkeRow(Table):
+    """Give Hapke's parameters at one wavelength (Hapke 2002, 2012)."""
+
+    wavelength_nm: float = Field(gt=0, le=1e5)
+    single_scattering_albedo: float = Field(ge=0, le=1, description="w")
+    asymmetry: float = Field(gt=-1, lt=1, description="g of Henyey-Greenstein; negative scatters back")
+    shadow_hiding_amplitude: float = Field(0.0, ge=0, le=100, description="B0")
+    shadow_hiding_width: float = Field(1.0, gt=0, le=100, description="h_s, dimensionless: not an angle")
+    coherent_amplitude: float = Field(0.0, ge=0, le=100, description="B_C0")
+    coherent_width: float = Field(1.0, gt=0, le=100, description="h_c")
+    roughness_deg: float = Field(0.0, ge=0, le=60, description="mean slope below a pixel")
+    porosity_factor: float = Field(1.0, ge=1, le=10, description="K")
+
+
+class HapkeReflectance(Reflectance):
+    """Reflect after Hapke, by a named set of parameters or by the rows of a table."""
+
+    model: Literal["hapke"] = "hapke"
+    parameters: str = Field("67p_fornasier2015", description="a named set of Hapke's parameters")
+    hapke: tuple[HapkeRow, ...] | None = Field(
+        None,
+        min_length=1,
+        max_length=_MOST_ROWS,
+        description="Hapke's parameters at wavelengths of one's own, in place of a named set",
+    )
+
+    scales_reflectance: ClassVar[bool] = False
+
+    @model_validator(mode="after")
+    def _known(self) -> HapkeReflectance:
+        if self.parameters not in HAPKE_TABLES:
+            known = ", ".join(HAPKE_TABLES)
+            raise ValueError(f"parameters = {self.parameters!r}: must be one of {known}")
+        return self
+
+    def at(self, wavelength_nm: F64, reflectance: F64) -> BandReflectance:
+        """Return Hapke's model with the parameters of the bands; `reflectance` has no effect."""
+        if self.hapke is None:
+            return hapke_at(wavelength_nm, self.parameters)
+        rows = tuple((row.wavelength_nm, *(getattr(row, name) for name in COLUMNS)) for row in self.hapke)
+        return hapke_at(wavelength_nm, rows)
+
+    @property
+    def keys_of_67p(self) -> tuple[str, ...]:
+        """Return the key of the named set, which is always one of 67P."""
+        return () if self.hapke else ("parameters",)

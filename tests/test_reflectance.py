@@ -1,15 +1,24 @@
-"""Photometry against an evaluation of its own: Hapke by angles in float64, closed forms, published albedos."""
+"""Ground reflectance: Hapke by angles in float64, closed forms, published albedos, and a model from outside."""
 
 from __future__ import annotations
 
 import itertools
+import json
 import math
+from typing import Any, Literal
 
 import numpy as np
 import pytest
+from conftest import small_scene
+from pydantic import Field
 
-from vbnfault.core import photometry
-from vbnfault.core.photometry import COLUMNS, HAPKE_TABLES, Diffuse, Hapke, hapke_at, radiance_factor
+from vbnfault import render
+from vbnfault.core.errors import InputError
+from vbnfault.reflectance import DiscReflectance, radiance_factor, registry
+from vbnfault.reflectance.hapke import COLUMNS, HAPKE_TABLES, Hapke, geometric_albedo, hapke_at, porosity_factor
+from vbnfault.render.description import RenderInput, Sunlight, View
+from vbnfault.scene import config
+from vbnfault.world import assemble
 
 # w, g, B0, h_s, B_C0, h_c, roughness (deg), K
 SETS = {
@@ -177,7 +186,7 @@ def test_energy_is_conserved_by_isotropic_scatterers(incidence_deg: float) -> No
 def test_published_geometric_albedos() -> None:
     # Fornasier et al. 2015, table 3; its parameters have two digits: 1/2 in the last of w = 0.028 is 2 %
     published = {480: 0.0554, 535: 0.0589, 649: 0.0677, 700: 0.0720, 743: 0.0766, 882: 0.0780}
-    got = photometry.geometric_albedo(hapke_at(np.array([*published], dtype=float)))
+    got = geometric_albedo(hapke_at(np.array([*published], dtype=float)))
     np.testing.assert_allclose(got, [*published.values()], rtol=0.03)
     assert got[2] == pytest.approx(0.0677, rel=0.01)
 
@@ -196,7 +205,7 @@ def test_parameters_by_wavelength() -> None:
 
 def test_porosity_factor() -> None:
     # Hapke 2012 for 67P: K = 1.20 at a porosity of 87 % (Fornasier et al. 2015, table 4)
-    assert photometry.porosity_factor(1 - 0.87) == pytest.approx(1.20, abs=0.01)
+    assert porosity_factor(1 - 0.87) == pytest.approx(1.20, abs=0.01)
 
 
 def test_disc_functions() -> None:
@@ -204,7 +213,7 @@ def test_disc_functions() -> None:
 
     def of(disc: str, slope: float = 0.0) -> np.ndarray:
         return radiance_factor(
-            Diffuse(reflectance=np.array([0.06]), disc=disc, phase_slope_mag_deg=slope),  # type: ignore[arg-type]
+            registry()[disc](phase_slope_mag_deg=slope).at(np.array([550.0]), np.array([0.06])),
             light,
             view,
         )[0]
@@ -216,3 +225,93 @@ def test_disc_functions() -> None:
     assert of("mcewen")[1] / 0.06 == pytest.approx(share * 2 / 3 + (1 - share) / 2, rel=1e-12)
     # 0.047 mag per degree: 60° are 2.82 magnitudes
     np.testing.assert_allclose(of("lambert", 0.047)[:2] / of("lambert")[:2], [1, 10 ** (-0.4 * 2.82)], rtol=1e-9)
+
+
+# --- the registry -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", registry())
+def test_every_model_is_the_same_in_numpy_and_in_the_renderer(name: str) -> None:
+    from vbnfault.render.runtime import dr, mi
+
+    ground = registry()[name]().at(np.array([450.0, 650.0]), np.array([0.05, 0.06]))
+    light, view = directions(GRID)
+    triples = (
+        tuple(mi.Float(np.ascontiguousarray(column)) for column in d.astype(np.float32).T) for d in (light, view)
+    )
+    terms = np.stack(np.broadcast_arrays(*(term.numpy() for term in ground.evaluate(dr, *triples))))
+    got = np.pi * np.einsum("tb,tn->bn", ground.weights, terms)
+    assert len(terms) == ground.terms
+    # float32: see test_hapke_in_the_renderers_float32
+    np.testing.assert_allclose(got, radiance_factor(ground, light, view), rtol=2e-4)
+    assert not radiance_factor(ground, [[0.6, 0, -0.8]], [[0, 0, 1]]).any(), "light from below the surface"
+
+
+@pytest.mark.parametrize("name", registry())
+def test_every_model_survives_the_scene_file(name: str) -> None:
+    model = registry()[name](dust_contrast=0.16)
+    scene = config.parse_scene({"title": "t", "body": {"photometry": model.model_dump()}}, source="t.toml")
+    assert scene.body.photometry == model
+    assert config.parse_scene(scene.resolved(), source="t.toml").body.photometry == model
+
+
+class Minnaert(DiscReflectance):
+    """Reflect after Minnaert (1941): D = cos(i)^k cos(e)^(k - 1)."""
+
+    model: Literal["minnaert"] = "minnaert"
+    exponent: float = Field(0.7, ge=0.5, le=1, description="k; 1: as Lambert")
+
+    def disc(self, m: Any, cos_i: Any, cos_e: Any, phase_deg: Any) -> Any:
+        bright = m.exp(self.exponent * m.log(m.maximum(cos_i, 1e-9)) + (self.exponent - 1) * m.log(cos_e))
+        return m.select(cos_i > 0, bright, 0)
+
+
+def test_a_model_defined_here_alone_is_a_key_of_the_scene_file() -> None:
+    def parsed(**table: Any) -> config.Scene:
+        return config.parse_scene({"title": "t", "body": {"photometry": table}}, source="t.toml")
+
+    scene = parsed(model="minnaert", exponent=0.6)
+    assert scene.body.photometry == Minnaert(exponent=0.6)
+    assert scene.resolved()["body"]["photometry"]["exponent"] == 0.6  # the identity of a store is made of this
+    for wrong, sentence in (
+        ({"model": "minnaert", "exponent": 3}, "body.photometry.exponent = 3: must be a number from 0.5 to 1"),
+        ({"model": "lambert", "exponent": 0.6}, "exponent = 0.6: is a key of minnaert, not of model = 'lambert'"),
+        ({"model": "minnaert", "exponant": 0.6}, r"exponant: unknown key \(did you mean exponent\?\)"),
+        ({"model": "minnart"}, "model = 'minnart': must be one of hapke, lambert, lommel_seeliger, mcewen, minn"),
+    ):
+        with pytest.raises(InputError, match=sentence):
+            parsed(**wrong)
+    assert "exponent" in json.dumps(config.json_schema({}))
+    # every store of an earlier version lists the keys of all models of that time
+    assert parsed(model="minnaert", phase_slope_mag_deg=0.0, parameters="67p_fornasier2015", hapke=None)
+
+
+def test_a_model_defined_here_alone_is_rendered() -> None:
+    """A plane in oblique light, seen from straight above: cos(i)^k of the normal reflectance."""
+    table = {"photometry": {"model": "minnaert", "exponent": 0.6}}
+    scene = config.parse_scene(small_scene(body=table, render={"bands": 1}), source="t.toml")
+    ground = assemble.ground_reflectance(scene)
+    light = np.array([math.sin(math.radians(60)), 0.0, -0.5])
+    vertices = np.array([[-9, -9, 0], [9, -9, 0], [9, 9, 0], [-9, 9, 0]], dtype=np.float32)
+    plane = render.TerrainMesh(vertices, np.array([[0, 2, 1], [0, 3, 2]], np.int32), np.ones(2, dtype=bool))
+    seen = View(
+        position_L_m=np.array([0.0, 0.0, -9000.0]),
+        L_from_C=np.eye(3),
+        intrinsics=np.array([16000.0, 16000.0, 4.0, 4.0]),
+        width_px=8,
+        height_px=8,
+    )
+    sun = Sunlight(direction_L=light, angular_radius_rad=1e-5, irradiance_W_m2_nm=np.ones(1))
+    got = render.radiance(
+        plane,
+        RenderInput(
+            view=seen,
+            sun=sun,
+            wavelength_nm=assemble.wavelengths_nm(scene),
+            reflectance=ground,
+            samples_per_pixel=4,
+            key=0,
+        ),
+    ).array
+    normal = ground.weights[0, 0]
+    np.testing.assert_allclose(got, normal * 0.5**0.6, rtol=1e-4)

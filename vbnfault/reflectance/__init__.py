@@ -1,0 +1,23 @@
+"""Define how the ground reflects: one class a model, which registers itself (`contract`)."""
+
+from .contract import (
+    NUMPY,
+    REFERENCE_NM,
+    AnyReflectance,
+    BandReflectance,
+    DiscReflectance,
+    Reflectance,
+    radiance_factor,
+    registry,
+)
+
+__all__ = [
+    "NUMPY",
+    "REFERENCE_NM",
+    "AnyReflectance",
+    "BandReflectance",
+    "DiscReflectance",
+    "Reflectance",
+    "radiance_factor",
+    "registry",
+]
