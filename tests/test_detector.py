@@ -12,8 +12,7 @@ from scipy import stats
 
 from vbnfault.core import spectra
 from vbnfault.core.quantities import Electrons, Irradiance, RawDN
-from vbnfault.detector import Noise, ThreeColourDetector, poisson_quantile
-from vbnfault.detector import three_colour as module
+from vbnfault.detector import EXACT_POISSON_BELOW_E, Noise, ThreeColourDetector, blocks, poisson_quantile
 
 SHORT_S = 1e-3
 NODES = spectra.band_nodes_nm(400, 700, 8)
@@ -85,7 +84,7 @@ def test_poisson_quantile_keeps_its_stated_errors(mean: float) -> None:
     mean = float(np.float32(mean))
     exact = exact_count(QUANTILES, mean)
     off = got - exact
-    if mean < module.EXACT_POISSON_BELOW_E:
+    if mean < EXACT_POISSON_BELOW_E:
         # one slice may fall on either side of a step for the rounding of its last bit
         assert np.count_nonzero(off) <= 2
         return
@@ -381,7 +380,7 @@ def test_results_do_not_depend_on_the_blocks(rows: int, monkeypatch: pytest.Monk
         return [q.array for q in (expected, electrons, raw, image, detector.develop(expected, 1.0, noise))]
 
     reference = steps()
-    monkeypatch.setattr(module, "_ROWS_PER_BLOCK", rows)
+    monkeypatch.setattr(blocks, "ROWS_PER_BLOCK", rows)
     for a, b in zip(reference, steps(), strict=True):
         np.testing.assert_array_equal(a, b)
     assert 0 < reference[3].mean() < 255

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from vbnfault.core.errors import InputError
-from vbnfault.detector import charge
+from vbnfault.detector import blocks
 from vbnfault.detector.charge import (
     DIRECTIONS,
     ChargeCloud,
@@ -23,7 +23,7 @@ from vbnfault.detector.charge import (
 )
 
 # more rows than a block, and no multiple of one
-SHAPE = (2 * charge._ROWS_PER_BLOCK + 7, 11)
+SHAPE = (2 * blocks.ROWS_PER_BLOCK_OF_A_PLANE + 7, 11)
 
 # moves an image so that charge that moved up moves in the named direction
 TURN: dict[str, Callable[[np.ndarray], np.ndarray]] = {
@@ -274,7 +274,7 @@ def test_cti_against_arctic(passes: int, tolerance: float) -> None:
 
 
 def test_cti_against_a_register_clocked_trap_by_trap() -> None:
-    image = scene(1, (charge._ROWS_PER_BLOCK + 9, 3))
+    image = scene(1, (blocks.ROWS_PER_BLOCK_OF_A_PLANE + 9, 3))
     got = cti(image, TRAPS, cloud=CLOUD, transfer_s=1.0, transfers_before=3, passes=2, trail_left_out=1e-6)
     truth = np.transpose([clocked_traps(c, TRAPS, CLOUD, 1.0, before=3) for c in image.T])
     effect = np.abs(truth - image).max()

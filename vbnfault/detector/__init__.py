@@ -2,8 +2,9 @@
 
 from .interface import Detector
 from .mosaic_detector import MosaicDetector
+from .noise import EXACT_POISSON_BELOW_E, poisson_quantile
 from .sensor import Sensor, load_sensor
-from .three_colour import EXACT_POISSON_BELOW_E, Noise, ThreeColourDetector, poisson_quantile
+from .three_colour import Noise, ThreeColourDetector
 
 __all__ = [
     "EXACT_POISSON_BELOW_E",

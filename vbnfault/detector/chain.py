@@ -29,9 +29,9 @@ from .demosaic import bounded_at_edges, correct_defects, demosaic, interpolate
 from .efficiency import white_balance
 from .individual import Individual, IndividualSpec, StuckPixels, dark_rate_e_s, make_individual, offset_e, response
 from .mosaic import channel_of
+from .noise import normal_field, poisson_quantile
 from .readout import ReadoutIndividual, ReadoutNoise, read_out
 from .sensor import Sensor
-from .three_colour import _normal_field, poisson_quantile
 
 F32 = NDArray[np.float32]
 Raw = NDArray[np.uint16]
@@ -67,7 +67,7 @@ class MosaicNoise:
     ) -> MosaicNoise:
         """Draw the variates for a (height, width) sensor. Their number does not depend on the signal."""
         return cls(
-            shot=_normal_field(shape, shot),
+            shot=normal_field(shape, shot),
             readout=ReadoutNoise.draw(shape, read, row),
             telegraph_seed=int(row.integers(2**63)),
         )

@@ -12,24 +12,20 @@ A direction ("up", "down", "left", "right") says where the charge moves. "up" ha
 from __future__ import annotations
 
 import math
-import os
-from collections.abc import Callable, Iterable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from ..core.errors import InputError
+from .blocks import by_rows
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
 DIRECTIONS = ("up", "down", "left", "right")
-
-_ROWS_PER_BLOCK = 64
 
 
 # ------------------------------------------------------------------------------------------------------ smear
@@ -87,7 +83,7 @@ def smear(
         if early:
             passed[rows] += every
 
-    _by_rows(step, len(rate))
+    by_rows(step, len(rate))
     return _facing(passed, direction, back=True)
 
 
@@ -383,7 +379,7 @@ def _clock(image: F32, cloud: ChargeCloud, per_cloud: F32, trapped: F64, before:
         cv2.max(part, 0.0, dst=part)  # removes rounding errors only
 
     for step in (fill, hold, leave):
-        _by_rows(step, height)
+        by_rows(step, height)
 
 
 def capture(
@@ -489,21 +485,6 @@ def _facing(image: F32, direction: str, *, back: bool = False) -> F32:
     if direction in ("down", "right"):
         image = cv2.flip(image, 0)
     return cv2.transpose(image) if sideways and back else image
-
-
-def _by_rows(step: Callable[[slice], None], height: int) -> None:
-    """Call `step` for blocks of rows in two threads: blocks fit the cache, numpy releases the interpreter lock."""
-    starts = range(0, height, _ROWS_PER_BLOCK)
-    list(_pool().map(step, (slice(i, min(i + _ROWS_PER_BLOCK, height)) for i in starts)))
-
-
-@lru_cache(maxsize=1)
-def _pool() -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(2)
-
-
-if hasattr(os, "register_at_fork"):  # threads do not survive in a forked process, such as a data loader's
-    os.register_at_fork(after_in_child=_pool.cache_clear)
 
 
 def _known(direction: str) -> None:

@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.errors import InputError
+from .blocks import pool
 from .mosaic import Pattern, channel_of, plane_of
-from .three_colour import _pool
 
 F32 = NDArray[np.float32]
 Mask = NDArray[np.bool_]
@@ -181,7 +181,7 @@ def bounded_at_edges(
             value = np.where(hard & (value < low), low, value)
             block[y, x, k] = np.where(dark_side & (value > high), high, value)
 
-    list(_pool().map(bound, starts))
+    list(pool().map(bound, starts))
     return rgb
 
 
@@ -356,7 +356,7 @@ def _in_blocks(step: Callable[[F32, Pattern], Sequence[F32]], raw: F32, pattern:
         planes = step(padded[start : start + len(block) + 2 * halo], pattern)
         cv2.merge([plane[halo:-halo, halo:-halo] for plane in planes], block)
 
-    list(_pool().map(one, range(0, len(raw), _ROWS_PER_BLOCK)))
+    list(pool().map(one, range(0, len(raw), _ROWS_PER_BLOCK)))
     return out
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.errors import InputError
-from .three_colour import _pool
+from .blocks import pool
 
 F32 = NDArray[np.float32]
 Mask = NDArray[np.bool_]
@@ -124,7 +124,7 @@ def sample(planes: F32, pattern: Pattern) -> F32:
                 out[block][y::rows, x::columns] = planes[block][y::rows, x::columns, pattern.tile[y][x]]
 
     # numpy releases the interpreter lock while it copies
-    list(_pool().map(fill, range(0, len(out), height)))
+    list(pool().map(fill, range(0, len(out), height)))
     return out
 
 

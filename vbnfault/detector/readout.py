@@ -19,7 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.errors import InputError
-from .three_colour import _blockwise, _normal_field
+from .blocks import blockwise
+from .noise import normal_field
 
 F32 = NDArray[np.float32]
 Raw = NDArray[np.uint16]
@@ -203,7 +204,7 @@ class ReadoutNoise:
     @classmethod
     def draw(cls, shape: tuple[int, int], read: np.random.Generator, row: np.random.Generator) -> ReadoutNoise:
         """Draw the variates for a (height, width) sensor. Their number does not depend on signal or spec."""
-        return cls(read=_normal_field(shape, read), row=row.standard_normal(shape[0], dtype=np.float32))
+        return cls(read=normal_field(shape, read), row=row.standard_normal(shape[0], dtype=np.float32))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -314,7 +315,7 @@ def read_out(
     transitions = None if individual is None else individual.transitions_dn
     chain = _Chain(electrons.shape, spec, noise, individual)
     code_of = _Converter(spec, transitions)
-    return _blockwise(
+    return blockwise(
         lambda *block: code_of(chain.amplify(*block)),
         _picture(electrons),
         *chain.of_rows,
@@ -329,7 +330,7 @@ def analogue_dn(
 ) -> F32:
     """Return the level at the converter, float32[y, x] in DN, neither rounded nor clipped to its range."""
     chain = _Chain(electrons.shape, spec, noise, individual)
-    return _blockwise(chain.amplify, _picture(electrons), *chain.of_rows)
+    return blockwise(chain.amplify, _picture(electrons), *chain.of_rows)
 
 
 def convert(analogue: F32, spec: ReadoutSpec, transitions_dn: F32 | None = None) -> Raw:
@@ -337,7 +338,7 @@ def convert(analogue: F32, spec: ReadoutSpec, transitions_dn: F32 | None = None)
 
     With `transitions_dn` (see `ReadoutIndividual`) a code begins at its transition.
     """
-    return _blockwise(_Converter(spec, transitions_dn), _picture(analogue))
+    return blockwise(_Converter(spec, transitions_dn), _picture(analogue))
 
 
 def clip_full_well(electrons: F32, full_well_e: float) -> F32:

@@ -9,38 +9,20 @@ signals differ.
 
 from __future__ import annotations
 
-import math
-import os
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Any, ClassVar
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import ndtr, ndtri
-from scipy.stats import poisson
 
 from ..core.quantities import LUMINANCE, RGBI, Electrons, Irradiance, RawDN
+from .blocks import blockwise, pool
 from .efficiency import QuantumEfficiency, white_balance
+from .noise import normal_field, poisson_on_dark
 
 F32 = NDArray[np.float32]
-
-# Below this mean the Poisson quantile is summed exactly. Above it an asymptotic expansion is used (Giles 2016, ACM
-# TOMS 42, 6, doi 10.1145/2699466, Q_N2). It is wrong by one count in at most 0.2 % of the draws up to 1e4
-# electrons, and in 0.4 % at 1e5, where float32 rounds. The mean is wrong by at most 0.001 and 0.005 electrons
-# (tests/test_detector.py).
-EXACT_POISSON_BELOW_E = 4.0
-
-# Above this mean the first three terms of that expansion are enough.
-_ALL_TERMS_BELOW_E = 1000.0
-
-# Above this mean, counting steps takes longer than the general quantile.
-_MANY_STEPS_E = 30.0
-
-_ROWS_PER_BLOCK = 32
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,28 +35,8 @@ class Noise:
     @classmethod
     def draw(cls, shape: tuple[int, int], shot: np.random.Generator, read: np.random.Generator) -> Noise:
         """Draw two fields of normal variates for a (height, width) sensor, in two threads."""
-        fields = _pool().map(lambda rng: _normal_field((*shape, 3), rng), (shot, read))
+        fields = pool().map(lambda rng: normal_field((*shape, 3), rng), (shot, read))
         return cls(shot=next(fields), read=next(fields))
-
-
-def _normal_field(shape: tuple[int, ...], rng: np.random.Generator) -> F32:
-    """Draw standard normal variates by the inverse distribution function of 16 bit uniform numbers.
-
-    Each number stands for the median of its bin. The two outermost bins, 4.2 standard deviations from the mean, are
-    drawn again within the bin, so the tails are complete.
-    """
-    size = math.prod(shape)
-    code = np.frombuffer(rng.bytes(2 * size), dtype=np.uint16)
-    out = np.take(_normal_table(), code, mode="clip")
-    tail = np.flatnonzero(code + np.uint16(1) <= 1)  # the first and the last code
-    sign = np.where(code[tail] == 0, 1.0, -1.0)
-    out[tail] = sign * ndtri((1.0 - rng.random(len(tail))) / 65536)
-    return out.reshape(shape)
-
-
-@lru_cache(maxsize=1)
-def _normal_table() -> F32:
-    return ndtri((np.arange(65536) + 0.5) / 65536).astype(np.float32)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -142,17 +104,17 @@ class ThreeColourDetector:
     def electrons(self, expected: Electrons, exposure_s: float, noise: Noise | None) -> Electrons:
         """Return the collected electrons: add dark current, draw shot noise, clip at the full well."""
         shot = None if noise is None else noise.shot
-        return expected.with_array(_blockwise(self._collector(exposure_s), expected.array, shot))
+        return expected.with_array(blockwise(self._collector(exposure_s), expected.array, shot))
 
     def raw_dn(self, electrons: Electrons, noise: Noise | None) -> RawDN:
         """Return digital numbers: apply the gain, add read noise and bias, round, clip to the converter's range."""
         read = None if noise is None else noise.read
-        return RawDN(array=_blockwise(self._convert, electrons.array, read).astype(np.uint16))
+        return RawDN(array=blockwise(self._convert, electrons.array, read).astype(np.uint16))
 
     def rgbi(self, raw: RawDN, exposure_s: float) -> RGBI:
         """Return 8 bit R, G, B, I: subtract bias and mean dark signal, balance white, add the luminance as I."""
         show = self._shower(exposure_s)
-        return RGBI(array=_blockwise(lambda dn: show(dn.astype(np.float32)), raw.array))
+        return RGBI(array=blockwise(lambda dn: show(dn.astype(np.float32)), raw.array))
 
     @property
     def optics_key(self) -> Any:
@@ -188,7 +150,7 @@ class ThreeColourDetector:
             return show(self._convert(collect(signal, shot), read))
 
         shot, read = (None, None) if noise is None else (noise.shot, noise.read)
-        return RGBI(array=_blockwise(step, expected.array, shot, read))
+        return RGBI(array=blockwise(step, expected.array, shot, read))
 
     def _collector(self, exposure_s: float) -> Callable[[F32, F32 | None], F32]:
         """Return the function that computes the collected electrons of a block."""
@@ -196,7 +158,7 @@ class ThreeColourDetector:
         full_well = np.float32(self.full_well_e)
 
         def collect(signal: F32, shot: F32 | None) -> F32:
-            mean = signal + dark if shot is None else _poisson_on_dark(signal, dark, shot)
+            mean = signal + dark if shot is None else poisson_on_dark(signal, dark, shot)
             return np.minimum(mean, full_well, out=mean)
 
         return collect
@@ -251,104 +213,4 @@ def electrons_of(irradiance: Irradiance, weights: F32) -> F32:
             colours.append(total)
         return cv2.merge(colours).reshape(*colours[0].shape, len(colours))
 
-    return np.asarray(_blockwise(step, np.moveaxis(irradiance.array, 0, 1)))
-
-
-def poisson_quantile(mean: F32, normal: F32) -> F32:
-    """Return the Poisson count at the quantile Φ(normal), float32: one variate per value for any mean.
-
-    The result is exact (the distribution is summed) where the mean is below `EXACT_POISSON_BELOW_E`. Elsewhere it
-    uses the expansion named there.
-    """
-    normal = z = np.ascontiguousarray(normal)  # out takes its layout: ravel must be a view
-    root = np.sqrt(mean)
-    out = z * z
-    out *= np.float32(1 / 6)
-    out += np.float32(1 / 3)
-    out += root * z
-    out += mean
-    # the later terms move a count by less than 0.01 where the mean is above this
-    few = np.flatnonzero(mean < _ALL_TERMS_BELOW_E)
-    if len(few):
-        m, z = mean.ravel()[few], normal.ravel()[few]
-        safe = np.maximum(m, np.float32(1))
-        zz = z * z
-        terms = (np.float32(-8 / 405) + zz * (np.float32(7 / 810) + np.float32(1 / 270) * zz)) / safe
-        terms -= z * (np.float32(1 / 36) + np.float32(1 / 72) * zz) / np.sqrt(safe)
-        out.ravel()[few] += terms
-    np.floor(out, out=out)
-    np.maximum(out, 0, out=out)
-    if len(few):
-        low = m < EXACT_POISSON_BELOW_E
-        out.ravel()[few[low]] = _poisson_exact(m[low], z[low])
-    return out
-
-
-def _poisson_on_dark(signal: F32, dark: np.float32, normal: F32) -> F32:
-    """Return `poisson_quantile(signal + dark, normal)`, quickly where there is no signal: the sky has one mean."""
-    lit = signal > 0
-    count = np.count_nonzero(lit)
-    if count == signal.size:
-        return poisson_quantile(signal + dark, normal)
-    out = _counts_of_one_mean(float(dark), normal)
-    if count:
-        out[lit] = poisson_quantile(signal[lit] + dark, normal[lit])
-    return out
-
-
-def _poisson_exact(mean: F32, normal: F32) -> F32:
-    """Return the Poisson count at the quantile Φ(normal) by summing the distribution."""
-    u = ndtr(normal.astype(np.float64))
-    m = mean.astype(np.float64)
-    term = np.exp(-m)
-    total = term.copy()
-    out = np.zeros(len(m), dtype=np.float32)
-    left = np.flatnonzero(u > total)
-    u, m, term, total = u[left], m[left], term[left], total[left]
-    count = 0
-    while len(left):
-        count += 1
-        term = term * m / count
-        total += term
-        # past 1 - 1e-15 the sum no longer changes in float64: stop there
-        more = (u > total) & (total < 1 - 1e-15)
-        out[left[~more]] = count
-        left, m, u, term, total = left[more], m[more], u[more], term[more], total[more]
-    return out
-
-
-def _counts_of_one_mean(mean: float, normal: F32) -> F32:
-    """Return `poisson_quantile` for a single mean by counting the distribution's steps below each variate."""
-    if mean > _MANY_STEPS_E:
-        return poisson_quantile(np.full(normal.shape, mean, dtype=np.float32), normal)
-    count = np.zeros(normal.shape, dtype=np.uint8)
-    for step in _normal_steps(mean):
-        count += normal > step
-    return count.astype(np.float32)
-
-
-@lru_cache(maxsize=256)
-def _normal_steps(mean: float) -> tuple[np.float32, ...]:
-    """Return the normal variates at which the Poisson count of this mean increases by one."""
-    # ±6 includes every float32 normal variate that a generator gives in practice (1 in 5e8 lies outside)
-    last = int(poisson.ppf(ndtr(6.0), mean)) if mean > 0 else 0
-    return tuple(np.float32(z) for z in ndtri(poisson.cdf(np.arange(last), mean)))
-
-
-@lru_cache(maxsize=1)
-def _pool() -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(2)
-
-
-if hasattr(os, "register_at_fork"):  # threads do not survive in a forked process, such as a data loader's
-    os.register_at_fork(after_in_child=_pool.cache_clear)
-
-
-def _blockwise(step: Callable[..., NDArray[Any]], array: NDArray[Any], *more: NDArray[Any] | None) -> NDArray[Any]:
-    """Apply `step` to blocks of rows in two threads: blocks fit the cache, numpy releases the interpreter lock."""
-
-    def one(start: int) -> NDArray[Any]:
-        rows = slice(start, start + _ROWS_PER_BLOCK)
-        return step(array[rows], *(None if extra is None else extra[rows] for extra in more))
-
-    return np.concatenate(list(_pool().map(one, range(0, len(array), _ROWS_PER_BLOCK))))
+    return np.asarray(blockwise(step, np.moveaxis(irradiance.array, 0, 1)))
