@@ -74,7 +74,8 @@ class Session:
 
 def build(path: Path) -> None:
     """Build the store, or repair it."""
-    bd.build(Session(), spec(), path, site=np.zeros(SAMPLES, dtype=int), progress=False)
+    plan = bd.BuildPlan(spec=spec(), site=np.zeros(SAMPLES, dtype=int))
+    bd.build(Session(), plan, path, bd.BuildOptions(progress=False))
 
 
 def mend(path: Path, samples: int = SAMPLES) -> None:

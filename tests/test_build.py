@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import errno
 import gc
 import json
@@ -111,8 +112,11 @@ class Broken:
 
 
 def run(out: Path, session: object = None, samples: int = SAMPLES, **options: object) -> bd.Summary:
-    values: dict = {"site": site_of(samples), "progress": False, **options}
-    return bd.build(session or Session(), values.pop("spec", make_spec()), out, **values)  # type: ignore[arg-type]
+    """Build made-up samples; `options` are fields of `BuildPlan` and of `BuildOptions`."""
+    of_plan = {f.name for f in dataclasses.fields(bd.BuildPlan)} & options.keys()
+    planned: dict = {"spec": make_spec(), "site": site_of(samples)} | {name: options.pop(name) for name in of_plan}
+    how: dict = {"progress": False, **options}
+    return bd.build(session or Session(), bd.BuildPlan(**planned), out, bd.BuildOptions(**how))  # type: ignore[arg-type]
 
 
 @pytest.fixture(scope="module")
@@ -436,10 +440,12 @@ def test_a_store_of_other_versions_is_completed_on_request_and_says_by_whom(
 
 
 def test_dry_run_touches_nothing(tmp_path: Path) -> None:
-    summary = run(tmp_path / "s.zarr", dry_run=True, fault_counts={"straylight": 9})
+    planned = np.arange(SAMPLES)[:, None] % 2 < [1, 2, 0, 1]  # a column a fault class
+    summary = run(tmp_path / "s.zarr", dry_run=True, planned_faults=planned)
     assert not (tmp_path / "s.zarr").exists()
     assert summary.lines()[0].startswith(f"{tmp_path / 's.zarr'}: 18 samples at 3 sites in 5 shards, about ")
-    assert summary.lines()[1] == "planned faults: straylight 9"
+    counts = ", ".join(f"{name} {n}" for name, n in zip(make_spec().faults, (9, 18, 0, 9), strict=True))
+    assert summary.lines()[1] == f"planned faults: {counts}"
     summary = run(tmp_path / "s.zarr", dry_run=True, estimated_seconds=7200.0)
     assert summary.lines()[1].startswith("estimated time: 2.0 h, ")
 
@@ -503,8 +509,21 @@ def test_paths_that_cannot_be_used_are_bad_input(tmp_path: Path) -> None:
     for out in (tmp_path / "file", tmp_path / "file" / "s.zarr", Path("/proc/none/s.zarr"), long, long / "s.zarr"):
         with pytest.raises(InputError, match=str(out)):
             run(out)
-    with pytest.raises(InputError, match="--workers 0"):
-        run(tmp_path / "s.zarr", workers=0)
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        ({"workers": 0}, "--workers 0: must be at least 1"),
+        ({"workers": 5000}, "--workers 5000: must be at most 1024"),
+        ({"threads": 0}, "--threads 0: must be at least 1"),
+        ({"recycle_shards": 0}, "recycle_shards = 0: must be at least 1"),
+        ({"workers": 2, "scheduler": "tcp://a:1"}, "--workers 2 and --scheduler tcp://a:1 exclude each other"),
+    ],
+)
+def test_options_are_checked_by_the_library(options: dict, sentence: str) -> None:
+    with pytest.raises(InputError, match=sentence):
+        bd.BuildOptions(**options)
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no such locks there")

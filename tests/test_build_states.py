@@ -48,9 +48,8 @@ def spec_of(scene: int) -> store.StoreSpec:
 
 def make(out: Path, scene: int, samples: int, *, overwrite: bool = False) -> build.Summary:
     blocks = (FIRST, *([BLOCK] * ((samples - FIRST) // BLOCK)))
-    return build.build(
-        Session(), spec_of(scene), out, site=site_of(samples), blocks=blocks, progress=False, overwrite=overwrite
-    )
+    plan = build.BuildPlan(spec=spec_of(scene), site=site_of(samples), blocks=blocks)
+    return build.build(Session(), plan, out, build.BuildOptions(progress=False, overwrite=overwrite))
 
 
 def reference(scene: int, samples: int) -> str:

@@ -129,12 +129,12 @@ def test_a_mesh_replaced_during_a_build_ends_it_with_nothing_wrong_written(
 
     def replaced(*args: Any, **kwargs: Any) -> build.Summary:
         write_mesh(files["shape"], 700.0)
-        return planned(*args, **{**kwargs, "progress": False})
+        return planned(*args, **kwargs)
 
     monkeypatch.setattr(build, "build", replaced)
     out = tmp_path / "s.zarr"
     with pytest.raises(InputChanged, match=r"body.obj: shape file has changed since the build began") as e:
-        dataset.build_scene(scene_of(files), out, source="test", workers=workers)
+        dataset.build_scene(scene_of(files), out, source="test", workers=workers, progress=False)
     assert e.value.exit_code == 1
     assert store.open_store(out).finished() == 0
     with pytest.raises(InputError, match=r"holds another dataset: scene.body.shape"):

@@ -18,8 +18,8 @@ __version__ = "0.2.0"
 
 if TYPE_CHECKING:
     from .core.errors import InputError, VbnfaultError
+    from .dataset import BuildOptions, verify
     from .dataset import build_scene as build
-    from .dataset import verify
     from .detector.sensor import Sensor, load_sensor
     from .faults import Fault, FaultContext, Interval, bounds, choice, flag, number, rows, text
     from .lens import Prescription, load_lens
@@ -30,6 +30,7 @@ if TYPE_CHECKING:
 
 # public name → the module that defines it, and its name there
 _HOME = {
+    "BuildOptions": ("dataset", "BuildOptions"),
     "Fault": ("faults", "Fault"),
     "FaultContext": ("faults", "FaultContext"),
     "Flare": ("output.flare_images", "Flare"),
@@ -57,6 +58,7 @@ _HOME = {
 }
 
 __all__ = [
+    "BuildOptions",
     "Fault",
     "FaultContext",
     "Flare",

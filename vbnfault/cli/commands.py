@@ -166,24 +166,17 @@ def build(
 ) -> None:
     """Build a dataset, or resume one: a store of the same scene is completed and mended where it is damaged."""
     from .. import dataset
-    from ..core import llvm
 
-    source = _scene(scene, settings, dataset__samples=samples, dataset__seed=seed)
-    if not dry_run:
-        llvm.find()
-    summary = dataset.build_scene(
-        source,
-        out,
-        source=scene,
+    options = dataset.BuildOptions(
         workers=workers,
         threads=threads,
         scheduler=scheduler,
-        append=append,
         overwrite=overwrite,
-        dry_run=dry_run,
         accept_versions=accept_versions,
-        samples_given=samples is not None,
+        dry_run=dry_run,
     )
+    source = _scene(scene, settings, dataset__seed=seed)
+    summary = dataset.build_scene(source, out, options, samples=samples, append=append, source=scene)
     for line in summary.lines():
         typer.echo(line)
 

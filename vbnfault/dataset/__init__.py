@@ -1,9 +1,12 @@
 """Build, resume, repair and extend a dataset, and derive what its store must hold from its scene."""
 
+from .build import BuildOptions
 from .checking import verify
-from .identity import SessionFactory, build_scene, describe_scene, is_exact, planned, scene_identity, store_spec
+from .from_scene import SessionFactory, build_scene, describe_scene
+from .identity import is_exact, planned, scene_identity, store_spec
 
 __all__ = [
+    "BuildOptions",
     "SessionFactory",
     "build_scene",
     "describe_scene",

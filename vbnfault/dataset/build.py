@@ -8,34 +8,34 @@ interruptions and repairs.
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
 import sys
 import time
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from .. import store as store_module
-from ..core.errors import InputError, VbnfaultError
+from ..core.errors import InputError, VbnfaultError, shown
 from ..core.interrupts import Stopped, exit_code, finishing, interruptible
-from ..store import FaultCounts, Store, StoreSpec
-from . import versions
+from ..store import FaultCounts, Planned, Store, StoreSpec
 from .dask import check_scheduler, run_on_dask
 from .errors import BuildFailed, Interrupted
 from .lock import locked
 from .processes import Pool
 from .progress import Progress, duration_text, size_text
+from .resume import check_same_scene, planned_blocks, with_versions_noted
 from .tasks import Run, SampleMaker, SessionFactory, run_here
 
 __all__ = [
-    "RECYCLE_SHARDS",
     "BuildFailed",
+    "BuildOptions",
+    "BuildPlan",
     "Interrupted",
     "SampleMaker",
     "SessionFactory",
@@ -44,7 +44,115 @@ __all__ = [
     "planned_blocks",
 ]
 
-RECYCLE_SHARDS = 32  # shards after which a worker process is replaced: long LLVM runs grow and finally fail
+_MOST_PROCESSES = 1024  # of workers and of threads: more than any machine has
+
+
+@dataclass(frozen=True, kw_only=True)
+class BuildOptions:
+    """How a build does its work. No option changes a stored value.
+
+    Parameters
+    ----------
+    workers : int
+        Number of processes on this machine, 1 to 1024. With 1, this process does the work.
+    threads : int, optional
+        Render threads of each worker process, 1 to 1024; by default the processor's cores are divided equally.
+    scheduler : str, optional
+        Address of a Dask scheduler, whose workers do the work instead. They must have access to the store.
+    overwrite : bool
+        Replace an existing store.
+    accept_versions : bool
+        Also complete a store that was made with other library versions. Its root attribute `versions_of_samples`
+        then lists the versions of each sample.
+    dry_run : bool
+        Plan and describe the build, but make nothing.
+    progress : bool
+        Show the progress on standard error.
+    recycle_shards : int
+        Number of shards after which a worker process is replaced: long runs of LLVM grow and finally fail.
+
+    Raises
+    ------
+    InputError
+        If a value is outside its range, or if two options exclude each other.
+    """
+
+    workers: int = 1
+    threads: int | None = None
+    scheduler: str | None = None
+    overwrite: bool = False
+    accept_versions: bool = False
+    dry_run: bool = False
+    progress: bool = True
+    recycle_shards: int = 32
+
+    def __post_init__(self) -> None:
+        _check_whole("workers", self.workers)
+        if self.threads is not None:
+            _check_whole("threads", self.threads)
+        if self.recycle_shards < 1:
+            raise InputError(f"recycle_shards = {self.recycle_shards}: must be at least 1")
+        if self.scheduler is not None and self.workers > 1:
+            raise InputError(
+                f"--workers {self.workers} and --scheduler {self.scheduler} exclude each other: the cluster has its"
+                " own workers; give one of them"
+            )
+
+
+def _check_whole(option: str, value: int) -> None:
+    """Raise InputError unless an option's value is a whole number from 1 to `_MOST_PROCESSES`."""
+    if type(value) is not int or value < 1:
+        raise InputError(f"--{option} {shown(value)}: must be at least 1, and a whole number")
+    if value > _MOST_PROCESSES:
+        raise InputError(f"--{option} {shown(value)}: must be at most {_MOST_PROCESSES}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class BuildPlan:
+    """What a build makes: a store, its samples, and what is known about them before the first one is rendered.
+
+    Parameters
+    ----------
+    spec : StoreSpec
+        The store.
+    site : int[sample]
+        Site of each sample, over all blocks.
+    blocks : tuple of int
+        Numbers of samples that were, or are now, added together, as `planned_blocks` returns them; one block by
+        default. They become a root attribute of the store.
+    planned_faults : bool[sample, fault], optional
+        The commanded faults, counted beside the injected ones.
+    expected : callable, optional
+        Planned scalars of a sample, as in `store.examine`; finished samples that differ from them are rebuilt.
+    exact : bool
+        Whether every commanded fault must be injected, as in `store.examine`.
+    estimated_seconds : float, optional
+        Estimated duration of building the whole dataset.
+    """
+
+    spec: StoreSpec
+    site: NDArray[np.integer[Any]]
+    blocks: tuple[int, ...] = ()
+    planned_faults: NDArray[np.bool_] | None = None
+    expected: Planned | None = None
+    exact: bool = False
+    estimated_seconds: float | None = None
+
+    def __post_init__(self) -> None:
+        site = np.asarray(self.site, dtype=np.int64)
+        blocks = tuple(self.blocks) or (len(site),)
+        if sum(blocks) != len(site):
+            raise ValueError(f"site has {len(site)} samples, the blocks {sum(blocks)}")
+        values = {**self.spec.plain(), "attributes": {**self.spec.attributes, "blocks": list(blocks)}}
+        object.__setattr__(self, "site", site)
+        object.__setattr__(self, "blocks", blocks)
+        object.__setattr__(self, "spec", StoreSpec(**values))
+
+    def fault_counts(self) -> dict[str, int]:
+        """Return the number of samples that are planned for each fault class; empty if that is not known."""
+        if self.planned_faults is None:
+            return {}
+        return dict(zip(self.spec.faults, self.planned_faults.sum(axis=0).tolist(), strict=True))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -116,90 +224,24 @@ class Summary:
         return lines
 
 
-def planned_blocks(
-    out: str | os.PathLike[str], samples: int, *, append: int = 0, overwrite: bool = False
-) -> tuple[int, ...]:
-    """Return the sizes of the planned blocks: those of an existing store, and one of size `append` if it is not 0.
-
-    If the last block was appended, has the size `append` and is unfinished, it is resumed and none is added. So an
-    interrupted command can be repeated unchanged. Raises InputError if there is no store to append to, if `append`
-    is negative, or if the first block of the store does not have `samples` samples.
-    """
-    exists = store_module.is_store(out) and not overwrite
-    if not exists:
-        if append:
-            raise InputError(f"--append {append}: there is no store at {out} yet; build it first")
-        return (samples,)
-    store = store_module.open_store(out)
-    blocks = tuple(int(b) for b in store.attributes.get("blocks", [store.samples]))
-    if blocks[0] != samples:
-        raise InputError(
-            f"{out}: samples = {samples}, but the store was made with {blocks[0]}; use --append to add some, "
-            f"--overwrite to start anew, or another --out"
-        )
-    if append < 0:
-        raise InputError(f"--append {append}: must be at least 1")
-    resumes = len(blocks) > 1 and blocks[-1] == append and store.finished() < store.samples
-    return (*blocks, append) if append and not resumes else blocks
-
-
 def build(
     session_factory: SessionFactory,
-    spec: StoreSpec,
+    plan: BuildPlan,
     out: str | os.PathLike[str],
-    *,
-    site: ArrayLike,
-    blocks: Sequence[int] | None = None,
-    workers: int = 1,
-    scheduler: str | None = None,
-    threads: int | None = None,
-    overwrite: bool = False,
-    dry_run: bool = False,
-    progress: bool = True,
-    fault_counts: Mapping[str, int] | None = None,
-    planned_faults: NDArray[np.bool_] | None = None,
-    estimated_seconds: float | None = None,
-    expected: store_module.Planned | None = None,
-    exact: bool = False,
-    accept_versions: bool = False,
-    recycle_shards: int = RECYCLE_SHARDS,
+    options: BuildOptions | None = None,
 ) -> Summary:
-    """Build, resume, repair or extend the store at `out`; see the module.
+    """Build, resume, repair or extend the store at `out`; the module's docstring describes how.
 
     Parameters
     ----------
     session_factory
-        Makes the object that simulates samples. It must be picklable if `workers` > 1 or a scheduler is used.
-    spec
-        The store to build.
-    site
-        Site of each sample, int[sample], over all blocks.
-    blocks
-        Result of `planned_blocks`; one block by default.
-    workers
-        Number of processes on this machine; 1 uses this process.
-    scheduler
-        Address of a Dask cluster that does the work instead; its workers must have access to `out`.
-    threads
-        Threads of each worker process, set through VBNFAULT_THREADS and OMP_NUM_THREADS in its environment; by
-        default the cores are divided equally.
-    overwrite
-        Replace an existing store.
-    dry_run
-        Only return the summary.
-    progress
-        Whether to show progress.
-    fault_counts, estimated_seconds
-        Shown to the user, see `Summary`.
-    planned_faults
-        Commanded faults, bool[sample, fault], counted beside the injected ones.
-    expected, exact
-        As in `store.examine`; finished samples that differ from the plan are rebuilt.
-    accept_versions
-        Also complete a store that was made with other library versions. Its root attribute `versions_of_samples`
-        then lists the versions of each sample.
-    recycle_shards
-        Number of shards after which a worker process is replaced.
+        Makes the object that simulates samples. It must be picklable if worker processes or a cluster are used.
+    plan
+        What is built.
+    out
+        Path of the store.
+    options
+        How it is built.
 
     Raises
     ------
@@ -212,169 +254,87 @@ def build(
     VbnfaultError
         If the files cannot be written, the disk is too small, or the cluster fails.
     """
-    sites = np.asarray(site, dtype=np.int64)
-    blocks = tuple(blocks or (len(sites),))
-    if sum(blocks) != len(sites):
-        raise ValueError(f"site has {len(sites)} samples, the blocks {sum(blocks)}")
-    if workers < 1:
-        raise InputError(f"--workers {workers}: must be at least 1")
-    path = Path(out)
-    spec = _with_attributes(spec, blocks)
-
-    def outlook() -> Summary:
-        existing = store_module.is_store(path) and not overwrite
-        if existing:
-            _same_scene(store_module.open_store(path), spec, blocks, accept_versions=accept_versions)
-        return Summary(
-            path=path,
-            samples=len(sites),
-            shards=-(-len(sites) // spec.shard_samples),
-            sites=len(np.unique(sites)),
-            finished=store_module.open_store(path).finished() if existing else 0,
-            estimated_bytes=spec.estimated_sample_bytes * len(sites),
-            free_bytes=_free_bytes(path),
-            fault_counts=dict(fault_counts or {}),
-            estimated_seconds=estimated_seconds,
-            optics=spec.attributes.get("optics", {}).get("summary", ""),
-        )
-
-    summary = outlook()
-    if dry_run:
+    options, path = options or BuildOptions(), Path(out)
+    summary = _outlook(plan, path, options)
+    if options.dry_run:
         return summary
-    _check_room(summary, spec)
-    if scheduler is not None:
-        check_scheduler(scheduler)
+    _check_room(summary, plan.spec)
+    if options.scheduler is not None:
+        check_scheduler(options.scheduler)
 
     began = time.monotonic()
     with interruptible():
         try:
             with locked(path):
-                summary = outlook()  # again: another build may have ended before the lock was free
-                if overwrite or not store_module.is_store(path):
-                    store_module.create(path, spec, len(sites), overwrite=overwrite)
-                store = store_module.recover(path)
-                if store.samples < len(sites):
-                    added = len(sites) - store.samples
-                    store = store_module.append_samples(store, added, {"blocks": list(blocks)})
-                store = _with_versions_noted(store, spec, expected, exact=exact)
-                run = Run(store, sites, Progress(len(sites), shown=progress), expected, exact=exact)
+                summary = _outlook(plan, path, options)  # another build may have ended before the lock was free
+                store = _prepared_store(plan, path, options)
+                progress = Progress(len(plan.site), shown=options.progress)
+                run = Run(store, plan.site, progress, plan.expected, exact=plan.exact)
                 with run.progress:
                     for line in summary.outlook():
                         run.progress.say(line)
-                    if scheduler is not None:
-                        run_on_dask(session_factory, run, scheduler)
-                    elif workers == 1:
-                        run_here(session_factory, run)
-                    else:
-                        share = max(1, (os.cpu_count() or 1) // workers)
-                        Pool(session_factory, run, threads or share, recycle_shards).work(workers)
+                    _do_tasks(session_factory, run, options)
         except (Stopped, KeyboardInterrupt) as stop:
             with finishing():
                 done = store_module.open_store(path).finished() if store_module.is_store(path) else 0
             raise Interrupted(
-                f"{path}: interrupted; {done} of {len(sites)} samples are finished, and the same command resumes",
+                f"{path}: interrupted; {done} of {len(plan.site)} samples are finished, and the same command "
+                "resumes",
                 exit_code(stop),
             ) from stop
         run.raise_failures()
         store = store_module.open_store(path)
-        results = {
-            "built": run.built,
-            "seconds": time.monotonic() - began,
-            "counts": store_module.count_faults(store, planned_faults),
+        return replace(
+            summary,
+            built=run.built,
+            seconds=time.monotonic() - began,
+            counts=store_module.count_faults(store, plan.planned_faults),
             # every sample was read or made in this run, so its digest is known already
-            "digest": run.digests.of(store) if run.digests.complete else None,
-        }
-    return Summary(**{**vars(summary), **results})
-
-
-def _with_attributes(spec: StoreSpec, blocks: tuple[int, ...]) -> StoreSpec:
-    """Return the spec with the planned blocks as a root attribute."""
-    values = {**spec.plain(), "attributes": {**spec.attributes, "blocks": list(blocks)}}
-    return StoreSpec(**values)
-
-
-def _with_versions_noted(
-    store: Store, spec: StoreSpec, expected: store_module.Planned | None, *, exact: bool
-) -> Store:
-    """Record in a store which samples this build will make with other versions; return the store opened again.
-
-    This happens before any of them is made, so that the record is right after an interruption, too.
-    """
-    now = spec.attributes.get("versions", {})
-    if versions.known(store.attributes) == [now]:
-        return store
-    wanted = set(store_module.problem_samples(store))
-    if expected is not None:
-        shards = range(store.shards)
-        wanted |= {i for n in shards for i in store_module.unplanned_samples(store, n, expected, exact=exact)}
-    made = versions.made_now(store.attributes, now, wanted)
-    if made == store.attributes.get(versions.VERSIONS_OF_SAMPLES, []):
-        return store
-    store.update_attributes({versions.VERSIONS_OF_SAMPLES: made})
-    return store_module.open_store(store.path, "r+")
-
-
-def _same_scene(store: Store, spec: StoreSpec, blocks: tuple[int, ...], *, accept_versions: bool = False) -> None:
-    """Raise InputError with the differences if a store does not belong to the scene that is to be built into it."""
-    ignored = {
-        "blocks",
-        versions.VERSIONS_OF_SAMPLES,
-        "shard_samples",
-        "format",
-        "format_version",
-        *store_module.VOLATILE_ATTRIBUTES,
-    }
-
-    def flat(a_spec: StoreSpec) -> dict[str, Any]:
-        everything = json.loads(json.dumps({**a_spec.attributes, **a_spec.plain()}))
-        return dict(_flatten({k: v for k, v in everything.items() if k not in ignored}))
-
-    old, new = flat(store.spec), flat(spec)
-    absent = object()
-    differing = [k for k in {**new, **old} if old.get(k, absent) != new.get(k, absent)]
-    if differing and all(k.startswith("versions.") or k == "scene_hash" for k in differing):
-        if not accept_versions and spec.attributes.get("versions") not in versions.known(store.attributes):
-            which = versions.differences(store.attributes, spec.attributes)
-            raise InputError(
-                f"{store.path}: was made with other versions: {which}; "
-                "--accept-versions completes it with those of now and notes which samples they made, or choose "
-                "another --out"
-            )
-        differing = []
-    if differing:
-        # keys of the scene first: they tell a user more than the hashes that follow from them
-        differing.sort(key=lambda k: (not k.startswith("scene."), "hash" in k, k))
-
-        def show(values: Mapping[str, Any], key: str) -> str:
-            text = repr(values[key]) if key in values else "absent"
-            return text if len(text) <= 60 else text[:57] + "..."
-
-        first = [f"{k} is {show(old, k)} in the store and {show(new, k)} now" for k in differing[:4]]
-        more = f", and {len(differing) - 4} more" if len(differing) > 4 else ""
-        raise InputError(
-            f"{store.path}: holds another dataset: {'; '.join(first)}{more}; "
-            f"choose another --out, or --overwrite to replace it"
-        )
-    stored = tuple(store.attributes.get("blocks", [store.samples]))
-    if blocks[: len(stored)] != stored:
-        raise InputError(
-            f"{store.path}: holds blocks of {_list(stored)} samples, not {_list(blocks)}; "
-            f"choose another --out, or --overwrite to replace it"
+            digest=run.digests.of(store) if run.digests.complete else None,
         )
 
 
-def _flatten(value: Any, key: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield each value of nested tables with its dotted key."""
-    if isinstance(value, dict) and value:
-        for name, inner in value.items():
-            yield from _flatten(inner, f"{key}.{name}" if key else str(name))
+def _outlook(plan: BuildPlan, path: Path, options: BuildOptions) -> Summary:
+    """Return what a build would do. Raises InputError if the store at `path` holds another scene."""
+    finished = 0
+    if store_module.is_store(path) and not options.overwrite:
+        store = store_module.open_store(path)
+        check_same_scene(store, plan.spec, plan.blocks, accept_versions=options.accept_versions)
+        finished = store.finished()
+    return Summary(
+        path=path,
+        samples=len(plan.site),
+        shards=-(-len(plan.site) // plan.spec.shard_samples),
+        sites=len(np.unique(plan.site)),
+        finished=finished,
+        estimated_bytes=plan.spec.estimated_sample_bytes * len(plan.site),
+        free_bytes=_free_bytes(path),
+        fault_counts=plan.fault_counts(),
+        estimated_seconds=plan.estimated_seconds,
+        optics=plan.spec.attributes.get("optics", {}).get("summary", ""),
+    )
+
+
+def _prepared_store(plan: BuildPlan, path: Path, options: BuildOptions) -> Store:
+    """Create, repair or extend the store, and return it open for writing. The caller holds its lock."""
+    samples = len(plan.site)
+    if options.overwrite or not store_module.is_store(path):
+        store_module.create(path, plan.spec, samples, overwrite=options.overwrite)
+    store = store_module.recover(path)
+    if store.samples < samples:
+        store = store_module.append_samples(store, samples - store.samples, {"blocks": list(plan.blocks)})
+    return with_versions_noted(store, plan.spec, plan.expected, exact=plan.exact)
+
+
+def _do_tasks(session_factory: SessionFactory, run: Run, options: BuildOptions) -> None:
+    """Do all tasks of a run: on a cluster, in this process, or in worker processes."""
+    if options.scheduler is not None:
+        run_on_dask(session_factory, run, options.scheduler)
+    elif options.workers == 1:
+        run_here(session_factory, run)
     else:
-        yield key, value
-
-
-def _list(values: Sequence[int]) -> str:
-    """Return block sizes as text: `8 + 4`."""
-    return " + ".join(str(v) for v in values)
+        threads = options.threads or max(1, (os.cpu_count() or 1) // options.workers)
+        Pool(session_factory, run, threads, options.recycle_shards).work(options.workers)
 
 
 def _free_bytes(path: Path) -> int:

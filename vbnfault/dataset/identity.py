@@ -1,26 +1,17 @@
-"""Derive from a scene the spec and root attributes of its store, and from a store the planned scalars of a sample.
-
-Also estimate the duration of a build, and build or describe a scene in one call.
-"""
+"""Derive from a scene the spec and root attributes of its store, and from these the planned scalars of a sample."""
 
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import importlib.metadata
-import os
 import platform
-import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from .. import __version__, pipeline, store
 from ..core import llvm, resources
 from ..core.errors import VbnfaultError
-from ..core.quantities import Sample
 from ..detector import Detector
 from ..faults import Fault
 from ..pipeline import labels
@@ -32,7 +23,6 @@ from ..scene.hashing import content_hash
 from ..scene.instrument import OF_THE_DETECTOR
 from ..store import StoreSpec
 from ..world import assemble
-from . import build, describe
 
 # Libraries whose version may change a pixel value.
 _LIBRARIES = ("mitsuba", "drjit", "numpy", "scipy", "trimesh", "scikit-image", "colour-science", "zarr")
@@ -242,135 +232,3 @@ def planned(attributes: Mapping[str, Any], faults: Sequence[str]) -> Callable[[i
         }
 
     return expected
-
-
-@dataclasses.dataclass(frozen=True)
-class SessionFactory:
-    """A picklable function that makes the session of a scene in a worker.
-
-    `threads`: render threads of the worker; VBNFAULT_THREADS by default. `contents`: the input files as they were
-    when the build was planned.
-    """
-
-    scene: Scene
-    blocks: tuple[int, ...]
-    threads: int | None = None
-    contents: resources.Contents = dataclasses.field(default_factory=resources.Contents)
-
-    def __call__(self) -> build.SampleMaker:
-        threads = self.threads or resources.environment_whole("VBNFAULT_THREADS", resources.MOST_THREADS) or None
-        with self.contents.in_use():
-            return _Session(pipeline.Session(self.scene, blocks=self.blocks, threads=threads), self.contents)
-
-
-@dataclasses.dataclass(frozen=True)
-class _Session:
-    """A session that fails if an input file changed after the build was planned."""
-
-    session: pipeline.Session
-    contents: resources.Contents
-
-    def simulate(self, index: int) -> Sample:
-        """Return a sample. Raises InputChanged if an input file has changed."""
-        with self.contents.in_use():
-            return self.session.simulate(index)
-
-
-def estimated_seconds(session: pipeline.Session) -> float:
-    """Return the approximate duration of building the whole dataset on this machine, in seconds.
-
-    The model follows the README's table and assumes that all cores work. In processor time, a sample takes 0.3 s.
-    Each megapixel adds 1.2 s for truth, images, labels and the store, and 0.25 s for each ray of a pixel, times
-    1 + bounces. The terrain of a site takes 16 s for 1.6 million triangles. Adaptive sampling counts as four times
-    the minimum number of rays, but not more than the maximum.
-    """
-    scene = session.scene
-    render, camera = scene.render, scene.camera
-    rays = render.samples_per_pixel
-    if render.noise_fraction is not None:
-        rays = min(4 * rays, max(rays, render.max_samples_per_pixel))
-    megapixels = camera.width_px * camera.height_px / 1e6
-    sample_s = 0.3 + megapixels * (1.2 + 0.25 * rays * (1 + render.bounces))
-    patch_s = 16 * scene.patch.max_triangles / 1.6e6
-    sites = len(np.unique(session.plan.site))
-    return (len(session.plan) * sample_s + sites * patch_s) / (os.cpu_count() or 1)
-
-
-def build_scene(
-    scene: Scene | str | Path,
-    out: str | Path,
-    *,
-    source: str | None = None,
-    workers: int = 1,
-    threads: int | None = None,
-    scheduler: str | None = None,
-    append: int | None = None,
-    overwrite: bool = False,
-    dry_run: bool = False,
-    accept_versions: bool = False,
-    samples_given: bool = True,
-) -> build.Summary:
-    """Build, resume, repair or extend the store of a scene at `out`; `build.build` documents parameters and errors.
-
-    Parameters
-    ----------
-    scene
-        A scene, the path of a scene file, or the name of a packaged scene.
-    source
-        Name of the scene in messages; by default what `scene` is called.
-    append
-        Number of samples to add to an existing store.
-    samples_given
-        Whether the caller set the number of samples. If not, `append` takes it from the store's first block.
-    """
-    if not isinstance(scene, Scene):
-        source, scene = source or str(scene), config.load_scene(scene)
-    source, out = source or "scene", Path(out)
-    samples = scene.dataset.samples
-    if append and not samples_given and store.is_store(out):
-        samples = int(store.open_store(out).attributes["blocks"][0])
-    blocks = build.planned_blocks(out, samples, append=append or 0, overwrite=overwrite)
-    contents = resources.Contents()
-    with contents.in_use():
-        session = pipeline.Session(scene, blocks=blocks, source=source)
-        session.warn_of_assumptions()
-        counts = {name: int(session.plan.injects(name).sum()) for name in session.faults}
-        spec = store_spec(session, blocks)
-        description: list[str] = []
-        if dry_run:
-            description = describe.describe(
-                session, sample_bytes=spec.estimated_sample_bytes, seconds=estimated_seconds(session)
-            )
-    contents.complete()
-    if not dry_run:
-        for sentence in plan.shortcomings(scene, session.plan):
-            print(f"warning: {sentence}", file=sys.stderr)
-    summary = build.build(
-        SessionFactory(scene, blocks, threads, contents),
-        spec,
-        out,
-        site=session.plan.site,
-        blocks=blocks,
-        workers=workers,
-        scheduler=scheduler,
-        threads=threads,
-        overwrite=overwrite,
-        dry_run=dry_run,
-        accept_versions=accept_versions,
-        fault_counts=counts,
-        planned_faults=session.plan.injected,
-        estimated_seconds=estimated_seconds(session),
-        expected=planned(spec.attributes, spec.faults),
-        exact=is_exact(spec.attributes),
-    )
-    return dataclasses.replace(summary, description=tuple(description))
-
-
-def describe_scene(scene: Scene, *, source: str) -> list[str]:
-    """Return lines that describe what a scene will photograph; nothing is rendered.
-
-    `source`: name of the scene in messages.
-    """
-    session = pipeline.Session(scene, source=source)
-    spec = store_spec(session, (scene.dataset.samples,))
-    return describe.describe(session, sample_bytes=spec.estimated_sample_bytes, seconds=estimated_seconds(session))

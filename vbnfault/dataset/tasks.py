@@ -13,7 +13,7 @@ from collections import Counter, deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -135,7 +135,7 @@ class Run:
     def __init__(
         self,
         store: Store,
-        sites: NDArray[np.int64],
+        sites: NDArray[np.integer[Any]],
         progress: Progress,
         expected: Planned | None = None,
         *,

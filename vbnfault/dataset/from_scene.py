@@ -1,0 +1,176 @@
+"""Plan, build and describe the dataset of a scene."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .. import pipeline, store
+from ..core import llvm, resources
+from ..core.errors import InputError, shown
+from ..core.quantities import Sample
+from ..scene import config, plan
+from ..scene.config import Scene
+from . import build, describe
+from .identity import is_exact, planned, store_spec
+
+_MOST_SAMPLES = 10_000_000
+
+
+@dataclasses.dataclass(frozen=True)
+class SessionFactory:
+    """A picklable function that makes the session of a scene in a worker.
+
+    `threads`: render threads of the worker; VBNFAULT_THREADS by default. `contents`: the input files as they were
+    when the build was planned.
+    """
+
+    scene: Scene
+    blocks: tuple[int, ...]
+    threads: int | None = None
+    contents: resources.Contents = dataclasses.field(default_factory=resources.Contents)
+
+    def __call__(self) -> build.SampleMaker:
+        threads = self.threads or resources.environment_whole("VBNFAULT_THREADS", resources.MOST_THREADS) or None
+        with self.contents.in_use():
+            return _Session(pipeline.Session(self.scene, blocks=self.blocks, threads=threads), self.contents)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Session:
+    """A session that fails if an input file changed after the build was planned."""
+
+    session: pipeline.Session
+    contents: resources.Contents
+
+    def simulate(self, index: int) -> Sample:
+        """Return a sample. Raises InputChanged if an input file has changed."""
+        with self.contents.in_use():
+            return self.session.simulate(index)
+
+
+def estimated_seconds(session: pipeline.Session) -> float:
+    """Return the approximate duration of building the whole dataset on this machine, in seconds.
+
+    The model follows the README's table and assumes that all cores work. In processor time, a sample takes 0.3 s.
+    Each megapixel adds 1.2 s for truth, images, labels and the store, and 0.25 s for each ray of a pixel, times
+    1 + bounces. The terrain of a site takes 16 s for 1.6 million triangles. Adaptive sampling counts as four times
+    the minimum number of rays, but not more than the maximum.
+    """
+    scene = session.scene
+    render, camera = scene.render, scene.camera
+    rays = render.samples_per_pixel
+    if render.noise_fraction is not None:
+        rays = min(4 * rays, max(rays, render.max_samples_per_pixel))
+    megapixels = camera.width_px * camera.height_px / 1e6
+    sample_s = 0.3 + megapixels * (1.2 + 0.25 * rays * (1 + render.bounces))
+    patch_s = 16 * scene.patch.max_triangles / 1.6e6
+    sites = len(np.unique(session.plan.site))
+    return (len(session.plan) * sample_s + sites * patch_s) / (os.cpu_count() or 1)
+
+
+def build_scene(
+    scene: Scene | str | Path,
+    out: str | Path,
+    options: build.BuildOptions | None = None,
+    *,
+    samples: int | None = None,
+    append: int | None = None,
+    source: str | None = None,
+    **keywords: Any,
+) -> build.Summary:
+    """Build, resume, repair or extend the store of a scene.
+
+    Parameters
+    ----------
+    scene : Scene, str or Path
+        A scene, the path of a scene file, or the name of a packaged scene.
+    out : str or Path
+        Path of the store.
+    options : BuildOptions, optional
+        How the build does its work: number of processes, cluster, progress.
+    samples : int, optional
+        Number of samples, 1 to 10 000 000, in place of the scene's. An append to an existing store takes it from
+        the first block of the store.
+    append : int, optional
+        Number of samples to add to an existing store.
+    source : str, optional
+        Name of the scene in messages; by default the path or name that `scene` is.
+    **keywords
+        Fields of `BuildOptions`, such as `workers=2`; they replace those of `options`.
+
+    Returns
+    -------
+    Summary
+        What was done, or, with `dry_run`, what would be.
+
+    Raises
+    ------
+    InputError
+        If a value is outside its range, if the scene and the store at `out` do not belong together, or if no
+        scheduler answers.
+    BuildFailed
+        If samples failed; all others are built.
+    Interrupted
+        After Ctrl-C, SIGTERM or SIGHUP; the same call resumes.
+    VbnfaultError
+        If the files cannot be written, the disk is too small, or the cluster fails.
+    """
+    options = dataclasses.replace(options or build.BuildOptions(), **keywords)
+    if not isinstance(scene, Scene):
+        source, scene = source or str(scene), config.load_scene(scene)
+    source, out = source or "scene", Path(out)
+    if not options.dry_run:
+        llvm.find()  # raises VbnfaultError: without LLVM every sample would fail
+    if append and samples is None and not options.overwrite and store.is_store(out):
+        samples = int(store.open_store(out).attributes["blocks"][0])
+    if samples is not None:
+        scene = _with_samples(scene, samples)
+    blocks = build.planned_blocks(out, scene.dataset.samples, append=append or 0, overwrite=options.overwrite)
+    contents = resources.Contents()
+    with contents.in_use():
+        session = pipeline.Session(scene, blocks=blocks, source=source)
+        session.warn_of_assumptions()
+        spec = store_spec(session, blocks)
+        seconds = estimated_seconds(session)
+        description: list[str] = []
+        if options.dry_run:
+            description = describe.describe(session, sample_bytes=spec.estimated_sample_bytes, seconds=seconds)
+    contents.complete()
+    if not options.dry_run:
+        for sentence in plan.shortcomings(scene, session.plan):
+            print(f"warning: {sentence}", file=sys.stderr)
+    build_plan = build.BuildPlan(
+        spec=spec,
+        site=session.plan.site,
+        blocks=blocks,
+        planned_faults=session.plan.injected,
+        expected=planned(spec.attributes, spec.faults),
+        exact=is_exact(spec.attributes),
+        estimated_seconds=seconds,
+    )
+    factory = SessionFactory(scene, blocks, options.threads, contents)
+    summary = build.build(factory, build_plan, out, options)
+    return dataclasses.replace(summary, description=tuple(description))
+
+
+def _with_samples(scene: Scene, samples: int) -> Scene:
+    """Return the scene with another number of samples. Raises InputError if it is outside its range."""
+    if type(samples) is not int or not 1 <= samples <= _MOST_SAMPLES:
+        raise InputError(f"--samples {shown(samples)}: must be from 1 to {_MOST_SAMPLES}")
+    return scene.model_copy(update={"dataset": scene.dataset.model_copy(update={"samples": samples})})
+
+
+def describe_scene(scene: Scene, *, source: str) -> list[str]:
+    """Return lines that describe what a scene will photograph; nothing is rendered.
+
+    `source`: name of the scene in messages.
+    """
+    session = pipeline.Session(scene, source=source)
+    spec = store_spec(session, (scene.dataset.samples,))
+    return describe.describe(session, sample_bytes=spec.estimated_sample_bytes, seconds=estimated_seconds(session))
