@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from sensor_file import completed
 from typer.testing import CliRunner
 
 from vbnfault.camera.characterise import Settings, VirtualCamera, characterise
@@ -312,7 +313,7 @@ def test_lists_of_a_file_become_parts_of_a_device() -> None:
         "readout": {"stuck_bits": [[2, 0], [0, 1]]},
         "sources": {"pattern.tile": "x", "readout.stuck_bits": "x"},
     }
-    made = parse_sensor(table, source="d.toml")
+    made = parse_sensor(completed(table), source="d.toml")
     assert made.pattern.is_bayer
     device = MosaicDetector(sensor=made, width_px=32, height_px=32).device
     raw = device.raw(np.full((32, 32), 3000.0, np.float32), 0.01, noise(1, (32, 32)))
@@ -336,25 +337,31 @@ def test_a_saturated_pixel_is_white_whatever_the_gain(gain: float | None) -> Non
     ("table", "words"),
     [
         ({"readout": {"bits": 12}}, ["d.toml: sources", "readout.bits"]),
-        ({"sources": {"readout.bits": "x"}}, ["d.toml: sources: readout.bits", "no such number"]),
+        ({"sources": {"readout.nodes": "x"}}, ["d.toml: sources: readout.nodes", "no such number"]),
         ({"architecture": "cathode_ray"}, ["d.toml: architecture = 'cathode_ray'", "cmos"]),
         ({"colour": "red"}, ["d.toml: colour: unknown key", "pattern"]),
         ({"pattern": "plaid"}, ["d.toml", "plaid", "rggb"]),
-        ({"readout": {"bits": 20}, "sources": {"readout.bits": "x"}}, ["d.toml: readout", "bits", "20", "16"]),
-        ({"readout": {"bits": "12"}}, ["d.toml: readout: bits = '12'", "whole number"]),
-        ({"individual": {"prnuu": 0.1}}, ["d.toml: individual: prnuu: unknown key", "did you mean prnu?"]),
+        (
+            {"readout": {"bits": 20}, "sources": {"readout.bits": "x"}},
+            ["d.toml: readout.bits = 20", "1 to 16"],
+        ),
+        ({"readout": {"bits": "12"}}, ["d.toml: readout.bits = '12'", "whole number"]),
+        ({"individual": {"prnuu": 0.1}}, ["d.toml: individual.prnuu: unknown key", "did you mean prnu?"]),
         ({"readout": {"bits": 12}, "sources": {"readout.bits": " "}}, ["d.toml: sources", "readout.bits"]),
         ({"pixel_pitch_um": 0.0, "sources": {"pixel_pitch_um": "x"}}, ["d.toml: pixel_pitch_um = 0", "0.5 to 100"]),
         ({"individual": []}, ["d.toml: individual = []", "must be"]),
         ({"pattern": []}, ["d.toml: pattern = []", "must be"]),
         ({"correct_defects": ["yes"]}, ["d.toml: correct_defects = ['yes']", "must be"]),
-        (_one("individual", "years", [1.0, 2.0]), ["d.toml: individual: years = [1.0, 2.0]", "must be"]),
-        (_one("individual", "rts_time_s", 3.0), ["d.toml: individual: rts_time_s = 3.0", "must be"]),
-        (_one("readout", "stuck_bits", [["x"]]), ["d.toml: readout: stuck_bits 0", "must be"]),
-        (_one("readout", "node_offsets_dn", [float("nan")]), ["d.toml: readout: node_offsets_dn 0", "finite"]),
-        (_one("transfer", "leak", 3.5), ["d.toml: transfer: leak = 3.5", "from 0 to 1"]),
-        (_one("transfer", "row_transfer_s", -1.0), ["d.toml: transfer: row_transfer_s = -1", "at least 0"]),
-        (_one("transfer", "parallel_traps", [3]), ["d.toml: transfer: parallel_traps 0 = 3", "must be"]),
+        (_one("individual", "years", [1.0, 2.0]), ["d.toml: individual.years = [1.0, 2.0]", "must be"]),
+        (_one("individual", "rts_time_s", 3.0), ["d.toml: individual.rts_time_s = 3.0", "must be"]),
+        (_one("readout", "stuck_bits", [["x"]]), ["d.toml: readout.stuck_bits[0]", "must be"]),
+        (
+            _one("readout", "node_offsets_dn", [float("nan")]),
+            ["readout.node_offsets_dn[0] = nan", "finite"],
+        ),
+        (_one("transfer", "leak", 3.5), ["d.toml: transfer.leak = 3.5", "from 0 to 1"]),
+        (_one("transfer", "row_transfer_s", -1.0), ["d.toml: transfer.row_transfer_s = -1", "at least 0"]),
+        (_one("transfer", "parallel_traps", [3]), ["d.toml: transfer.parallel_traps[0] = 3", "must be"]),
         (
             {"architecture": "full_frame_ccd"}
             | _one("transfer", "serial_traps", [{"density_per_px": 1.0, "release_time_s": 1.0}]),
@@ -362,13 +369,13 @@ def test_a_saturated_pixel_is_white_whatever_the_gain(gain: float | None) -> Non
         ),
         (
             {"pattern": {"name": "p", "channels": ["R", "X"], "tile": [[0, 1]]}, "sources": {"pattern.tile": "x"}},
-            ["d.toml: pattern", "'X'", "NIR"],
+            ["d.toml: pattern.channels: 'X'", "NIR"],
         ),
     ],
 )
 def test_bad_files_are_refused_in_a_sentence(table: dict[str, Any], words: list[str]) -> None:
     with pytest.raises(InputError) as caught:
-        parse_sensor(table, source="d.toml")
+        parse_sensor(completed(table), source="d.toml")
     for word in words:
         assert word in str(caught.value)
 

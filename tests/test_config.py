@@ -118,7 +118,7 @@ TITLE = 'title = "t"\n'
         # shapes and sums
         (TITLE + "[geometry]\nx_m = [3]", ["geometry.x_m = [3]"]),
         (TITLE + "[geometry]\nx_m = 3", ["geometry.x_m = 3:", "two"]),
-        (TITLE + "[body]\nsemi_axes_m = [0, 1, 1]", ["body.semi_axes_m.0 = 0:", "1e+09"]),
+        (TITLE + "[body]\nsemi_axes_m = [0, 1, 1]", ["body.semi_axes_m[0] = 0:", "1e+09"]),
         (TITLE + '[camera]\nexposure_s = "fast"', ["exposure_s = 'fast'", "'auto'"]),
         (TITLE + "[dataset]\nsplit = {train = 0.5}", ["train", "0.5"]),
         (

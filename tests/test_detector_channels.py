@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from conftest import small_scene
+from sensor_file import completed
 from test_faults_kit import make, make_context, noisy_electrons, rng, with_mosaic
 
 from vbnfault import dataset
@@ -44,7 +45,7 @@ def test_a_curve_of_a_file_takes_the_place_of_the_default() -> None:
 def test_sensor_files_may_give_curves() -> None:
     rows = [{"channel": "W", "wavelength_nm": [400, 500, 700], "value": [0.91, 0.93, 0.86]}]
     table: dict[str, Any] = {"pattern": "mono", "quantum_efficiency": rows}
-    sensor = parse_sensor({**table, "sources": {"quantum_efficiency": "assumed"}}, source="x.toml")
+    sensor = parse_sensor(completed({**table, "sources": {"quantum_efficiency": "assumed"}}), source="x.toml")
     np.testing.assert_allclose(sensor.efficiency.at(np.array([450.0])), [[0.92]])
     hash(sensor)  # devices are kept by their sensor
 
@@ -52,11 +53,14 @@ def test_sensor_files_may_give_curves() -> None:
 @pytest.mark.parametrize(
     ("row", "message"),
     [
-        ({"channel": "W", "wavelength_nm": [400, 500], "value": [0.9]}, "2 wavelengths for 1 values"),
+        (
+            {"channel": "W", "wavelength_nm": [400, 500], "value": [0.9]},
+            "quantum_efficiency[0].value = [0.9]: must be a list of at least 2",
+        ),
         ({"channel": "W", "wavelength_nm": [500, 400], "value": [0.9, 0.9]}, "must increase"),
         (
             {"channel": "W", "wavelength_nm": [400, 500], "value": [0.9, 1.2]},
-            "value holds 1.2: must be from 0 to 1",
+            "quantum_efficiency[0].value[1] = 1.2: must be a number from 0 to 1",
         ),
         ({"channel": "R", "wavelength_nm": [400, 500], "value": [0.9, 0.9]}, "channel = 'R': must be one of W"),
     ],
@@ -64,7 +68,7 @@ def test_sensor_files_may_give_curves() -> None:
 def test_bad_curves_are_refused_in_a_sentence(row: dict[str, Any], message: str) -> None:
     table = {"pattern": "mono", "quantum_efficiency": [row], "sources": {"quantum_efficiency": "assumed"}}
     with pytest.raises(InputError, match=r"x\.toml") as caught:
-        parse_sensor(table, source="x.toml")
+        parse_sensor(completed(table), source="x.toml")
     assert message in str(caught.value)
 
 

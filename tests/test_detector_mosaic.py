@@ -92,8 +92,11 @@ LONG = Pattern(name="long", channels=("R", "W"), tile=((0,),) * 8 + ((1,),))
 
 def test_bad_patterns_are_told_in_a_sentence() -> None:
     for bad, sentence in (
-        (lambda: pattern("RGBG"), "pattern is 'RGBG', but must be one of rggb"),
-        (lambda: Pattern(name="a", channels=("R",), tile=((0, 0), (0,))), "rows must be of one length"),
+        (lambda: pattern("RGBG"), "pattern = 'RGBG': must be one of rggb"),
+        (
+            lambda: Pattern(name="a", channels=("R",), tile=((0, 0), (0,))),
+            r"tile = \[\[0, 0\], \[0\]\]: must have rows of one length",
+        ),
         (lambda: Pattern(name="a", channels=("R", "G"), tile=((0, 0),)), "every index 0 to 1"),
         (lambda: sample(np.zeros((8, 8, 2), np.float32), pattern("rggb")), r"shape \(8, 8, 2\)"),
         (lambda: interpolate(np.zeros((8, 8)), pattern("rggb"), "W"), "channel is 'W'"),

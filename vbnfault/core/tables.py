@@ -11,7 +11,7 @@ import dataclasses
 import difflib
 import json
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import lru_cache, wraps
 from typing import Annotated, Any, TypeVar, dataclass_transform
 
@@ -23,44 +23,58 @@ from .errors import InputError, shown
 
 T = TypeVar("T")
 
-_CONFIG = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, validate_default=True)
+_CONFIG = ConfigDict(extra="forbid", allow_inf_nan=False, validate_default=True)
 _SCHEMA = "https://json-schema.org/draft/2020-12/schema"
 # The most unknown keys that one message names.
 _MOST_NAMED = 5
 # Names that pydantic puts into an error's location for the alternatives of a union.
 _ALTERNATIVE = re.compile(r"(str|float|int|bool)$|(constrained|literal|function|tuple|list|dict|lax|json)\b")
+# A message of a model's own check that begins with the key and the value.
+_BEGINS_WITH_KEY = re.compile(r"\w+ = ")
 # Types of pydantic's errors for a value that is no table, and for an unknown key.
 _NO_TABLE = ("model_type", "dataclass_type", "dict_type", "model_attributes_type")
 _UNKNOWN = ("extra_forbidden", "unexpected_keyword_argument")
+
+Fraction = Annotated[float, Field(ge=0, le=1)]
 
 
 class Table(BaseModel):
     """Check a table of a file: it is frozen and strict, and refuses unknown keys."""
 
-    model_config = _CONFIG
+    model_config = ConfigDict(frozen=True, **_CONFIG)
 
 
 @dataclass_transform(frozen_default=True, kw_only_default=True, field_specifiers=(dataclasses.field, Field))
-def table_class(cls: type[T]) -> type[T]:
-    """Make a class a frozen, keyword-only dataclass whose fields are checked whenever an object is made.
+def table_class(*, required: Sequence[str] = ()) -> Callable[[type[T]], type[T]]:
+    """Return a decorator that makes a class a frozen, keyword-only dataclass whose fields are always checked.
 
     An object made in Python is checked as one from a file, but numbers of numpy and lists in place of tuples are
-    accepted. A check in `__post_init__` raises ValueError with a sentence "key = value: must be …". Whoever makes
-    an object with wrong values gets an InputError.
+    accepted; wrong values raise InputError. A check in `__post_init__` raises ValueError with a sentence
+    "key = value: must be …".
+
+    Parameters
+    ----------
+    required
+        Fields that every file must set, although they have a default in Python.
     """
-    made: Any = pydantic.dataclasses.dataclass(frozen=True, kw_only=True, config=_CONFIG)(cls)
-    checked = made.__init__
+    config = ConfigDict(json_schema_extra={"required": list(required)}, **_CONFIG) if required else _CONFIG
 
-    @wraps(checked)
-    def __init__(self: Any, **values: Any) -> None:
-        try:
-            checked(self, **values)
-        except ValidationError as error:
-            raise InputError(sentence(error, made)) from None
+    def decorate(cls: type[T]) -> type[T]:
+        made: Any = pydantic.dataclasses.dataclass(frozen=True, kw_only=True, config=config)(cls)
+        checked = made.__init__
 
-    made.__init__ = __init__
-    result: type[T] = made
-    return result
+        @wraps(checked)
+        def __init__(self: Any, **values: Any) -> None:
+            try:
+                checked(self, **values)
+            except ValidationError as error:
+                raise InputError(sentence(error.errors(include_url=False), _schema(made))) from None
+
+        made.__init__ = __init__
+        result: type[T] = made
+        return result
+
+    return decorate
 
 
 def ordered(pair: tuple[float, float]) -> tuple[float, float]:
@@ -97,16 +111,35 @@ def parse(kind: type[T], plain: Mapping[str, Any], *, source: str, overrides: Se
     """
     resources.check_plain(plain, source)
     model: Any = kind
+    errors: list[Any] = [{"type": "missing", "loc": loc} for loc in _missing(plain, _schema(model), _schema(model))]
     try:
         # JSON mode is strict about types, but accepts arrays as tuples. No key takes a TOML date: a list fails.
         text = json.dumps(plain, default=lambda date: [str(date)])
         checked: T = _adapter(model).validate_json(text, strict=True)
-        return checked
+        if not errors:
+            return checked
     except ValidationError as error:
-        wrong = ".".join(map(str, error.errors()[0]["loc"]))
-        replaced = any(wrong.startswith(key) or key.startswith(f"{wrong}.") for key in overrides)
-        mark = " (set in place of the file)" if replaced else ""
-        raise InputError(f"{source}: {sentence(error, kind)}{mark}") from None
+        located = [one["loc"] for one in errors]
+        errors += [detail for detail in error.errors(include_url=False) if detail["loc"] not in located]
+    wrong = ".".join(map(str, errors[0]["loc"]))
+    replaced = any(wrong.startswith(key) or key.startswith(f"{wrong}.") for key in overrides)
+    mark = " (set in place of the file)" if replaced else ""
+    raise InputError(f"{source}: {sentence(errors, _schema(model))}{mark}")
+
+
+def _missing(plain: Any, node: Mapping[str, Any], root: Mapping[str, Any]) -> list[tuple[str, ...]]:
+    """Return the locations of all required keys that plain data lack, also within tables that are missing."""
+    found: list[tuple[str, ...]] = []
+    node = _resolved(node, root)
+    for key, child in node.get("properties", {}).items():
+        below = _resolved(child, root)
+        if key in plain or (key in node.get("required", ()) and "required" in below):
+            value = plain.get(key, {})
+            nested = _missing(value, below, root) if isinstance(value, Mapping) else []
+            found += [(key, *loc) for loc in nested]
+        elif key in node.get("required", ()):
+            found.append((key,))
+    return found
 
 
 def json_schema(kind: Any) -> dict[str, Any]:
@@ -134,14 +167,12 @@ def forget_schemas() -> None:
 # --- error messages ---------------------------------------------------------------------------------------------
 
 
-def sentence(error: ValidationError, kind: Any) -> str:
-    """Return what is wrong as one sentence that names the key, the value and what is allowed.
+def sentence(details: Sequence[Any], schema: Mapping[str, Any]) -> str:
+    """Return pydantic's errors as one sentence that names the key, the value and what is allowed.
 
     All unknown keys and all missing keys are named at once, since one is often a misspelling of the other. Of
-    wrong values only the first is named.
+    wrong values only the first is named. `schema` is the JSON Schema of the data.
     """
-    schema = _schema(kind)
-    details = error.errors(include_url=False)
     unknown = [_unknown(detail["loc"], schema) for detail in details if detail["type"] in _UNKNOWN]
     if len(unknown) > _MOST_NAMED:
         unknown[_MOST_NAMED:] = [f"and {len(unknown) - _MOST_NAMED} more unknown keys"]
@@ -175,6 +206,8 @@ def _wrong(detail: Any, schema: Mapping[str, Any]) -> str:
     if detail["type"] == "missing":  # a list that is too short
         keys, node = _locate(detail["loc"][:-1], schema)
     elif detail["type"] == "value_error":
+        if keys and _shown(value) == "" and _BEGINS_WITH_KEY.match(message):
+            return f"{_dotted(keys)}.{message}"
         return f"{_dotted(keys)}{_shown(value)}: {message}" if keys else message
     elif detail["type"] in _NO_TABLE and "type" not in node:
         message = "a table"
@@ -182,8 +215,9 @@ def _wrong(detail: Any, schema: Mapping[str, Any]) -> str:
 
 
 def _dotted(keys: Sequence[int | str]) -> str:
-    """Return keys as one dotted key for an error message."""
-    return ".".join(map(resources.shown_path, map(str, keys)))
+    """Return keys as one dotted key for an error message; the index of a list is in brackets."""
+    parts = [f"[{key}]" if isinstance(key, int) else f".{resources.shown_path(key)}" for key in keys]
+    return "".join(parts).removeprefix(".")
 
 
 def _shown(value: Any) -> str:
@@ -207,7 +241,9 @@ def _allowed(schema: Mapping[str, Any], message: str) -> str:
     word = f"{schema['const']!r} or " if "const" in schema else ""
     interval = _interval(schema)
     if interval:
-        return f"{word}{'a whole number' if schema.get('type') == 'integer' else 'a number'} {interval}"
+        kind = "a whole number" if schema.get("type") == "integer" else "a number"
+        one_sided = "aximum" not in "".join(schema)
+        return f"{word}{'a finite number' if one_sided and kind == 'a number' else kind} {interval}"
     if word:
         return f"{word}a number"
     plain = message.replace("Input should be ", "")

@@ -13,13 +13,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
 from ..core.errors import InputError
+from ..core.tables import table_class
 from .blocks import by_rows
 
 F32 = NDArray[np.float32]
@@ -189,53 +190,34 @@ def _run_over(excess: F64, *, first: bool) -> None:
 # ------------------------------------------------------------------------------------------------------ CTI
 
 
-@dataclass(frozen=True, kw_only=True)
+@table_class()
 class TrapSpecies:
-    """Describe traps of one kind.
+    """Describe traps of one kind."""
 
-    Attributes
-    ----------
-    density_per_px
-        Number of traps per pixel, at least 0.
-    release_time_s
-        Mean time until a trap releases its electron in s, above 0.
-    """
-
-    density_per_px: float
-    release_time_s: float
-
-    def __post_init__(self) -> None:
-        _at_least_0(density_per_px=self.density_per_px)
-        _above_0(release_time_s=self.release_time_s)
+    density_per_px: float = Field(ge=0, description="number of traps per pixel")
+    release_time_s: float = Field(gt=0, description="mean time until a trap releases its electron")
 
 
-@dataclass(frozen=True, kw_only=True)
+@table_class()
 class ChargeCloud:
     """Describe how a packet fills the volume of its well.
 
     The filled fraction is ((n − notch) / (full well − notch))^fill_power, in [0, 1] (Massey et al. 2010, MNRAS 401,
     371).
-
-    Attributes
-    ----------
-    full_well_e
-        Full well in e, above `notch_e`.
-    notch_e
-        Charge in a supplementary buried channel that meets no trap, at least 0 e.
-    fill_power
-        Exponent in (0, 1]; 1 makes the loss proportional to the charge.
     """
 
-    full_well_e: float
-    notch_e: float = 0.0
-    fill_power: float = 0.5
+    full_well_e: float = Field(gt=0, description="full well, above notch_e")
+    notch_e: float = Field(
+        default=0.0, ge=0, description="charge in a supplementary buried channel, which meets no trap"
+    )
+    fill_power: float = Field(
+        default=0.5, gt=0, le=1, description="exponent; 1 makes the loss proportional to the charge"
+    )
 
     def __post_init__(self) -> None:
-        _at_least_0(notch_e=self.notch_e)
+        """Raise ValueError unless the full well is above the notch."""
         if not self.full_well_e > self.notch_e:
-            raise InputError(f"full_well_e = {self.full_well_e:g}: must be above notch_e = {self.notch_e:g}")
-        if not 0 < self.fill_power <= 1:
-            raise InputError(f"fill_power = {self.fill_power:g}: must be above 0, at most 1")
+            raise ValueError(f"full_well_e = {self.full_well_e:g}: must be above notch_e = {self.notch_e:g}")
 
     def volume(self, signal_e: F32) -> F32:
         """Return the filled fraction of the well, float32 in [0, 1], in the shape of `signal_e`."""

@@ -17,11 +17,13 @@ from functools import lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from pydantic import Field
 from scipy.optimize import brentq
 from scipy.special import gammaincc
 from scipy.stats import poisson
 
 from ..core.errors import InputError
+from ..core.tables import table_class
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -256,24 +258,17 @@ def _quantile_table(interactions: float) -> tuple[F64, F64]:
 # --- hot pixels -------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, kw_only=True)
+@table_class()
 class HotPixelGrowth:
     """Describe how the number of hot pixels grows: D = 10^log10_scale S^size_power ISO^iso_power per year and mm².
 
     S is the pixel pitch in µm. The fits of Chapman, Leung, Koren and Koren (Chapman et al. 2013, Leung et al. 2009)
     describe consumer cameras on the ground, so they are not rates in space.
-
-    `log10_scale` is -20 to 20, `size_power` -10 to 10 and `iso_power` 0.01 to 5; InputError otherwise.
     """
 
-    log10_scale: float
-    size_power: float
-    iso_power: float
-
-    def __post_init__(self) -> None:
-        checked("log10_scale", self.log10_scale, -20.0, 20.0)
-        checked("size_power", self.size_power, -10.0, 10.0)
-        checked("iso_power", self.iso_power, 0.01, 5.0)
+    log10_scale: float = Field(ge=-20, le=20, description="log10 of the rate at 1 µm and ISO 1")
+    size_power: float = Field(ge=-10, le=10, description="power of the pixel pitch")
+    iso_power: float = Field(ge=0.01, le=5, description="power of the ISO setting")
 
     def per_yr_mm2(self, pixel_pitch_um: float, iso: float) -> float:
         """Return the number of new defects per year and mm².

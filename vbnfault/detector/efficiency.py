@@ -5,12 +5,15 @@ from __future__ import annotations
 import itertools
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
 from ..core import spectra
 from ..core.errors import InputError
+from ..core.tables import Fraction, table_class
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -20,39 +23,24 @@ F64 = NDArray[np.float64]
 _NIR_EDGE_NM = (700.0, 750.0)
 
 
-@dataclass(frozen=True, kw_only=True)
+@table_class()
 class Curve:
-    """Hold the QE of one channel as a sampled curve.
+    """Hold the QE of one channel as a sampled curve: linear between the wavelengths and 0 outside their range."""
 
-    Attributes
-    ----------
-    channel
-        Name of the channel, such as "R".
-    wavelength_nm
-        Wavelengths in nm, in increasing order.
-    value
-        QE at these wavelengths, in [0, 1]. It is linear between them and 0 outside their range.
-
-    Raises
-    ------
-    InputError
-        The lists differ in length or have fewer than 2 values, or a value is out of range or order.
-    """
-
-    channel: str
-    wavelength_nm: tuple[float, ...]
-    value: tuple[float, ...]
+    channel: str = Field(description='name of the channel, such as "R"')
+    wavelength_nm: tuple[Annotated[float, Field(gt=0, le=1e5)], ...] = Field(
+        min_length=2, description="wavelengths, in increasing order"
+    )
+    value: tuple[Fraction, ...] = Field(min_length=2, description="QE at these wavelengths")
 
     def __post_init__(self) -> None:
-        if len(self.wavelength_nm) != len(self.value) or len(self.value) < 2:
-            raise InputError(
+        """Raise ValueError unless there are as many wavelengths as values, and the wavelengths increase."""
+        if len(self.wavelength_nm) != len(self.value):
+            raise ValueError(
                 f"{len(self.wavelength_nm)} wavelengths for {len(self.value)} values: must be as many, at least 2"
             )
         if any(a >= b for a, b in itertools.pairwise(self.wavelength_nm)):
-            raise InputError(f"wavelength_nm = {list(self.wavelength_nm)}: must increase")
-        for value in self.value:
-            if not 0 <= value <= 1:
-                raise InputError(f"value holds {value:g}: must be from 0 to 1")
+            raise ValueError(f"wavelength_nm = {list(self.wavelength_nm)}: must increase")
 
 
 @dataclass(frozen=True, kw_only=True)

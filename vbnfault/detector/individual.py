@@ -17,8 +17,10 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
 from ..core.errors import InputError
+from ..core.tables import Fraction, pair_within, table_class
 from .dark import (
     APS_GROWTH,
     WEEK_S,
@@ -45,99 +47,85 @@ _RTS_TIME_EV = 0.9
 _RTS_REFERENCE_K = 294.15
 
 
-@dataclass(frozen=True, kw_only=True)
+@table_class()
 class IndividualSpec:
-    """Describe what devices of one sensor type, age and dose have in common. Numbers marked * are assumed.
+    """Describe what devices of one sensor type, age and dose have in common.
 
-    Rates refer to `reference_K`, signals are in electrons (e), fractions are of all pixels. Raises InputError
-    outside the given ranges.
-
-    Attributes
-    ----------
-    prnu, prnu_row, prnu_column, prnu_low
-        Standard deviation of the gain about 1, 0 to 0.5: per pixel*, per row, per column, slow variation.
-    dsnu_e, dsnu_row_e, dsnu_column_e
-        Standard deviation of the offset, 0 to 1e5 e: per pixel*, per row, per column.
-    dark_current_e_s, dark_nonuniformity
-        Mean dark current of undamaged pixels, 0 to 1e8 e/s, and its spread* over the mean, 0 to 1.
-    dark_activation_eV
-        Activation energy of the dark current, 0.1 to 2 eV. It follows from a data sheet's doubling temperature ΔT
-        as k T² ln 2/ΔT. None uses silicon's band gap (`dark.silicon_factor`).
-    reference_K
-        Temperature of these rates, 80 to 400 K.
-    dose_TeV_g, depletion_depth_um, anneal_s
-        As in `RadiationDamage`. The depleted volume of a pixel is the depth*, 0 to 100 µm, times its area.
-    years, hot_growth, iso
-        Age, 0 to 100 years, growth law of hot pixels (None: no hot pixels), and ISO setting. Hot pixels are
-        displacement damage too: with a dose from the same years, damage counts twice.
-    hot_rate_e_s
-        Smallest and largest rate* of a hot pixel, above 0 to 1e8 e/s. Between them the fraction above a rate R
-        falls as R^-iso_power. The threshold at which a camera sees a hot pixel falls as 1/ISO; with this power the
-        number above it grows with ISO as in the growth law.
-    hot_offset_share, hot_offset_e
-        Fraction of hot pixels with an offset (over 0.4: Chapman et al. 2013), and mean* of the exponentially
-        distributed offset, 0 to 1e6 e.
-    hot_clustered_share
-        Fraction of hot pixels that are born next to an earlier one, 0 to 1.
-    dead_share, dead_share_yr, stuck_share, stuck_share_yr
-        Fraction of dead* and stuck pixels at delivery, and its growth per year; 0 to 0.1.
-    rts_share, rts_per_interaction
-        Fraction of pixels with telegraph signals at delivery, and additional ones per radiation interaction*; 0 to
-        1.
-    rts_amplitude_nA_cm2
-        Mean of the exponentially distributed amplitude at 294 K, 0 to 100. In proton-irradiated CCDs at 21 °C many
-        pixels have up to 0.1 nA/cm² and one in 1000 up to 0.4 (Hopkins & Hopkinson 1993, doi 10.1109/23.273552),
-        hence 0.4/ln 1000.
-    rts_time_s
-        Shortest and longest mean time* in a level at `reference_K` (log-uniform), 1e-3 to 1e9 s.
-    trap_share, trap_share_TeV_g, trap_depth_e
-        Fraction of pixels with CCD traps at delivery and its growth per TeV/g, 0 to 0.1; mean* of their
-        exponentially distributed depth, 0 to 1e6 e.
+    Rates refer to `reference_K`, signals are in electrons (e), fractions are of all pixels. Numbers marked * are
+    assumed. Hot pixels are displacement damage too: with a dose from the same years, damage counts twice.
     """
 
-    prnu: float = 0.01
-    prnu_row: float = 0.0
-    prnu_column: float = 0.0
-    prnu_low: float = 0.0
-    dsnu_e: float = 2.0
-    dsnu_row_e: float = 0.0
-    dsnu_column_e: float = 0.0
-    dark_current_e_s: float = 15.0
-    dark_nonuniformity: float = 0.1
-    dark_activation_eV: float | None = None
-    reference_K: float = 298.15
-    dose_TeV_g: float = 0.0
-    depletion_depth_um: float = 3.0
-    anneal_s: float = WEEK_S
-    years: float = 0.0
-    hot_growth: HotPixelGrowth | None = APS_GROWTH
-    iso: float = 400.0
-    hot_rate_e_s: tuple[float, float] = (100.0, 1e5)
-    hot_offset_share: float = 0.45
-    hot_offset_e: float = 500.0
-    hot_clustered_share: float = 0.0
-    dead_share: float = 1e-6
-    dead_share_yr: float = 0.0
-    stuck_share: float = 0.0
-    stuck_share_yr: float = 0.0
-    rts_share: float = 0.0
-    rts_per_interaction: float = 0.05
-    rts_amplitude_nA_cm2: float = 0.4 / math.log(1000)
-    rts_time_s: tuple[float, float] = (1.0, 1e4)
-    trap_share: float = 0.0
-    trap_share_TeV_g: float = 0.0
-    trap_depth_e: float = 200.0
-
-    def __post_init__(self) -> None:
-        for field in fields(self):
-            value = getattr(self, field.name)
-            if field.name == "hot_growth" or value is None:
-                continue
-            low, high = _RANGES[field.name]
-            for number in value if isinstance(value, tuple) else (value,):
-                checked(field.name, number, low, high)
-            if isinstance(value, tuple) and (len(value) != 2 or value[0] > value[1]):
-                raise InputError(f"{field.name} = {value}: must be two numbers, the smaller first")
+    prnu: float = Field(
+        default=0.01, ge=0, le=0.5, description="standard deviation of the gain about 1, per pixel*"
+    )
+    prnu_row: float = Field(default=0.0, ge=0, le=0.5, description="of the gain of rows")
+    prnu_column: float = Field(default=0.0, ge=0, le=0.5, description="of the gain of columns")
+    prnu_low: float = Field(default=0.0, ge=0, le=0.5, description="of the slow variation of the gain")
+    dsnu_e: float = Field(default=2.0, ge=0, le=1e5, description="standard deviation of the offset, per pixel*")
+    dsnu_row_e: float = Field(default=0.0, ge=0, le=1e5, description="of the offset of rows")
+    dsnu_column_e: float = Field(default=0.0, ge=0, le=1e5, description="of the offset of columns")
+    dark_current_e_s: float = Field(
+        default=15.0, ge=0, le=1e8, description="mean dark current of undamaged pixels, e/s"
+    )
+    dark_nonuniformity: float = Field(default=0.1, ge=0, le=1, description="its spread* over the mean")
+    dark_activation_eV: float | None = Field(
+        default=None,
+        ge=0.1,
+        le=2,
+        description="activation energy of the dark current, k T² ln 2/ΔT of a data sheet's doubling temperature "
+        "ΔT; default: silicon's band gap",
+    )
+    reference_K: float = Field(default=298.15, ge=80, le=400, description="temperature of these rates")
+    dose_TeV_g: float = Field(default=0.0, ge=0, le=1e6, description="displacement damage dose")
+    depletion_depth_um: float = Field(
+        default=3.0, ge=0, le=100, description="depth* of a pixel's depleted volume; times its area"
+    )
+    anneal_s: float = Field(default=WEEK_S, ge=0, le=1e12, description="time since the irradiation")
+    years: float = Field(default=0.0, ge=0, le=100, description="age")
+    hot_growth: HotPixelGrowth | None = Field(
+        default=APS_GROWTH, description="growth law of hot pixels; default: that of the architecture"
+    )
+    iso: float = Field(default=400.0, ge=1, le=1e7, description="ISO setting")
+    # The threshold at which a camera sees a hot pixel falls as 1/ISO; with this power the number above it grows
+    # with ISO as in the growth law.
+    hot_rate_e_s: pair_within(1e-9, 1e8) = Field(  # type: ignore[valid-type]
+        default=(100.0, 1e5),
+        description="smallest and largest rate* of a hot pixel; the fraction above a rate R falls as R^-iso_power",
+    )
+    hot_offset_share: Fraction = Field(
+        default=0.45, description="fraction of hot pixels with an offset; over 0.4: Chapman et al. 2013"
+    )
+    hot_offset_e: float = Field(
+        default=500.0, ge=0, le=1e6, description="mean* of the exponentially distributed offset"
+    )
+    hot_clustered_share: Fraction = Field(
+        default=0.0, description="fraction of hot pixels that are born next to an earlier one"
+    )
+    dead_share: float = Field(default=1e-6, ge=0, le=0.1, description="fraction* of dead pixels at delivery")
+    dead_share_yr: float = Field(default=0.0, ge=0, le=0.1, description="its growth per year")
+    stuck_share: float = Field(default=0.0, ge=0, le=0.1, description="fraction of stuck pixels at delivery")
+    stuck_share_yr: float = Field(default=0.0, ge=0, le=0.1, description="its growth per year")
+    rts_share: Fraction = Field(default=0.0, description="fraction of pixels with telegraph signals at delivery")
+    rts_per_interaction: Fraction = Field(default=0.05, description="more of them per radiation interaction*")
+    # In proton-irradiated CCDs at 21 °C many pixels have up to 0.1 nA/cm² and one in 1000 up to 0.4 (Hopkins &
+    # Hopkinson 1993, doi 10.1109/23.273552).
+    rts_amplitude_nA_cm2: float = Field(
+        default=0.4 / math.log(1000),
+        ge=0,
+        le=100,
+        description="mean of the exponentially distributed amplitude at 294 K",
+    )
+    rts_time_s: pair_within(1e-3, 1e9) = Field(  # type: ignore[valid-type]
+        default=(1.0, 1e4),
+        description="shortest and longest mean time* in a level at reference_K; log-uniform",
+    )
+    trap_share: float = Field(
+        default=0.0, ge=0, le=0.1, description="fraction of pixels with CCD traps at delivery"
+    )
+    trap_share_TeV_g: float = Field(default=0.0, ge=0, le=0.1, description="its growth per TeV/g")
+    trap_depth_e: float = Field(
+        default=200.0, ge=0, le=1e6, description="mean* of their exponentially distributed depth"
+    )
 
     def dark_factor(self, temperature_K: float) -> float:
         """Return the dark current of undamaged pixels over that at the reference temperature."""
@@ -149,29 +137,6 @@ class IndividualSpec:
         """Return the radiation damage that this dose causes in a pixel."""
         volume = self.depletion_depth_um * pixel_pitch_um**2
         return RadiationDamage(dose_TeV_g=self.dose_TeV_g, depletion_volume_um3=volume, anneal_s=self.anneal_s)
-
-
-_RANGES: dict[str, tuple[float, float]] = {
-    **dict.fromkeys(("prnu", "prnu_row", "prnu_column", "prnu_low"), (0.0, 0.5)),
-    **dict.fromkeys(("dsnu_e", "dsnu_row_e", "dsnu_column_e"), (0.0, 1e5)),
-    "dark_current_e_s": (0.0, 1e8),
-    "dark_nonuniformity": (0.0, 1.0),
-    "dark_activation_eV": (0.1, 2.0),
-    "reference_K": (80.0, 400.0),
-    "dose_TeV_g": (0.0, 1e6),
-    "depletion_depth_um": (0.0, 100.0),
-    "anneal_s": (0.0, 1e12),
-    "years": (0.0, 100.0),
-    "iso": (1.0, 1e7),
-    "hot_rate_e_s": (1e-9, 1e8),
-    "hot_offset_e": (0.0, 1e6),
-    **dict.fromkeys(("hot_offset_share", "hot_clustered_share", "rts_share", "rts_per_interaction"), (0.0, 1.0)),
-    **dict.fromkeys(("dead_share", "dead_share_yr", "stuck_share", "stuck_share_yr"), (0.0, 0.1)),
-    "rts_amplitude_nA_cm2": (0.0, 100.0),
-    "rts_time_s": (1e-3, 1e9),
-    **dict.fromkeys(("trap_share", "trap_share_TeV_g"), (0.0, 0.1)),
-    "trap_depth_e": (0.0, 1e6),
-}
 
 
 def _freeze(holder: Any) -> None:
@@ -353,8 +318,8 @@ def aged(individual: Individual, **changes: Any) -> Individual:
         if key not in _AGEING:
             raise InputError(f"{key}: does not age; must be one of {', '.join(_AGEING)}")
     new = replace(spec, **changes)
-    checked("years", new.years, spec.years, _RANGES["years"][1])
-    checked("dose_TeV_g", new.dose_TeV_g, spec.dose_TeV_g, _RANGES["dose_TeV_g"][1])
+    checked("years", new.years, spec.years, math.inf)
+    checked("dose_TeV_g", new.dose_TeV_g, spec.dose_TeV_g, math.inf)
     earlier = len(individual.hot), spec.hot_clustered_share
     changed = _defects(new, individual.shape, individual.pixel_pitch_um, individual.seed, earlier)
     return replace(individual, spec=new, **changed)

@@ -6,13 +6,14 @@ without a colour filter; a monochrome sensor has only W pixels.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
-from ..core.errors import InputError
+from ..core.errors import InputError, shown
+from ..core.tables import table_class
 from .blocks import pool
 
 F32 = NDArray[np.float32]
@@ -21,27 +22,27 @@ Mask = NDArray[np.bool_]
 _BLOCK_ROWS = 64  # rows that one thread copies at a time, about
 
 
-@dataclass(frozen=True, kw_only=True)
+@table_class()
 class Pattern:
-    """Describe a colour filter array.
+    """Describe a colour filter array: a tile of channels that repeats over the sensor."""
 
-    `tile[y][x]` is an index into `channels` and repeats over the sensor. Raises InputError if the tile is not
-    rectangular or does not hold every index.
-    """
-
-    name: str
-    channels: tuple[str, ...]
-    tile: tuple[tuple[int, ...], ...]
+    name: str = Field(description="name of the pattern")
+    channels: tuple[str, ...] = Field(
+        min_length=1, description="names of its channels: W alone, or R, G and B among them"
+    )
+    tile: tuple[tuple[Annotated[int, Field(ge=0)], ...], ...] = Field(
+        min_length=1, description="rows of the tile; each pixel holds the index of its channel in channels"
+    )
 
     def __post_init__(self) -> None:
+        """Raise ValueError unless the tile is rectangular and holds the index of every channel."""
+        tile = [list(row) for row in self.tile]
         if len({len(row) for row in self.tile}) != 1 or not self.tile[0]:
-            raise InputError(
-                f"the tile of pattern '{self.name}' is {self.tile}, but its rows must be of one length"
-            )
+            raise ValueError(f"tile = {tile}: must have rows of one length")
         if {i for row in self.tile for i in row} != set(range(len(self.channels))):
-            raise InputError(
-                f"the tile of pattern '{self.name}' is {self.tile}, but must hold every index "
-                f"0 to {len(self.channels) - 1} of its channels {self.channels}"
+            raise ValueError(
+                f"tile = {tile}: must hold every index 0 to {len(self.channels) - 1} of the channels "
+                f"{', '.join(self.channels)}"
             )
 
     @property
@@ -87,7 +88,7 @@ def pattern(name: str) -> Pattern:
     Raises InputError for an unknown name.
     """
     if name.lower() not in PATTERNS:
-        raise InputError(f"pattern is '{name}', but must be one of {', '.join(PATTERNS)}")
+        raise InputError(f"pattern = {shown(name)}: must be one of {', '.join(PATTERNS)}")
     return PATTERNS[name.lower()]
 
 

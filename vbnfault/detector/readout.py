@@ -13,12 +13,14 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
 from ..core.errors import InputError
+from ..core.tables import table_class
 from .blocks import blockwise
 from .noise import normal_field
 
@@ -33,109 +35,103 @@ Fill = Literal["zero", "previous"]
 _CUBIC_SCALE = 6 * math.sqrt(3)
 
 
-@dataclass(frozen=True, kw_only=True)
+@table_class(required=("bits", "full_well_e"))
 class ReadoutSpec:
     """Describe the signal chain of a sensor. Electrons are counted at the pixel, DN at the converter.
 
-    bits                     bits of the converter, 1 to 16
-    full_well_e              full well, > 0; it clips the electrons before all later effects
-    bias_dn                  level without light, 0 to the top code
-    gain_dn_per_e            system gain K of EMVA 1288; None: the full well reaches the top code
-    read_noise_e_rms         temporal noise at the output, including correlated double sampling (CDS)
-    reset_noise_e_rms        kTC noise of the sense node; CDS removes all of it
-    cds, cds_interval_s      whether the reset level is subtracted, and the time between sampling it and the signal.
-                             Interference at frequency f passes with the factor |2 sin(π f interval)|
-    nodes                    1, 2 (left, right) or 4 (quadrants: top left, top right, bottom left, bottom right)
-    node_gains               relative gain of each node, > 0; empty: all 1. Below 1 a full well misses the top code
-    node_offsets_dn          offset that each node adds to the bias; empty: all 0
-    row_pattern_e_rms, column_pattern_e_rms    fixed pattern, which differs between sensors
-    row_noise_e_rms          noise with one value per row and exposure
-    banding_amplitude_e, banding_frequency_hz, banding_phase_rad    sinusoidal interference during the readout
-    pixel_time_s             time between two pixels of a line at one node; 0 if a line is converted at once
-    line_time_s              time between two lines; None: as long as the pixels of a node's line take
-    inl_quadratic_dn         integral non-linearity: height of an arc at half range
-    inl_cubic_dn             integral non-linearity: an S with extremes of this height at (3 ∓ √3)/6 of the range
-                             and with this sign in the lower half
-    dnl_lsb_rms              differential non-linearity: spread of the code widths; they differ between sensors
-    missing_codes            codes that never occur; their range goes to the next code below, or else above
-    stuck_bits               (bit, value) pairs: bit 0 is the least significant, value 0 or 1
-
-    By default the chain is ideal, apart from its read noise. The 100 ns of a pixel and the 1 µs of CDS are assumed.
-    Raises InputError if a value is out of range.
+    By default the chain is ideal, apart from its read noise. The 100 ns of a pixel and the 1 µs of correlated
+    double sampling (CDS) are assumed.
     """
 
-    bits: int = 12
-    full_well_e: float = 13_500.0
-    bias_dn: int = 64
-    gain_dn_per_e: float | None = None
-    read_noise_e_rms: float = 13.0
-    reset_noise_e_rms: float = 0.0
-    cds: bool = True
-    cds_interval_s: float = 1e-6
-    nodes: int = 1
-    node_gains: tuple[float, ...] = ()
-    node_offsets_dn: tuple[float, ...] = ()
-    row_pattern_e_rms: float = 0.0
-    column_pattern_e_rms: float = 0.0
-    row_noise_e_rms: float = 0.0
-    banding_amplitude_e: float = 0.0
-    banding_frequency_hz: float = 0.0
-    banding_phase_rad: float = 0.0
-    pixel_time_s: float = 1e-7
-    line_time_s: float | None = None
-    inl_quadratic_dn: float = 0.0
-    inl_cubic_dn: float = 0.0
-    dnl_lsb_rms: float = 0.0
-    missing_codes: tuple[int, ...] = ()
-    stuck_bits: tuple[tuple[int, int], ...] = ()
+    bits: int = Field(default=12, ge=1, le=16, description="bits of the converter")
+    full_well_e: float = Field(
+        default=13_500.0, gt=0, description="full well; it clips the electrons before all later effects"
+    )
+    bias_dn: int = Field(default=64, ge=0, le=65535, description="level without light, up to the top code")
+    gain_dn_per_e: float | None = Field(
+        default=None, gt=0, description="system gain K of EMVA 1288; default: the full well reaches the top code"
+    )
+    read_noise_e_rms: float = Field(default=13.0, ge=0, description="temporal noise at the output, CDS included")
+    reset_noise_e_rms: float = Field(
+        default=0.0, ge=0, description="kTC noise of the sense node; CDS removes all of it"
+    )
+    cds: bool = Field(default=True, description="whether the reset level is subtracted")
+    cds_interval_s: float = Field(
+        default=1e-6,
+        ge=0,
+        description="time between sampling the reset level and the signal; interference of frequency f passes with "
+        "the factor |2 sin(π f interval)|",
+    )
+    nodes: Literal[1, 2, 4] = Field(
+        default=1,
+        description="output nodes: 2 are left and right, 4 the quadrants top left, top right, bottom left, "
+        "bottom right",
+    )
+    node_gains: tuple[Annotated[float, Field(gt=0)], ...] = Field(
+        default=(), description="relative gain of each node, default 1; below 1 a full well misses the top code"
+    )
+    node_offsets_dn: tuple[float, ...] = Field(
+        default=(), description="offset that each node adds to the bias, default 0"
+    )
+    row_pattern_e_rms: float = Field(default=0.0, ge=0, description="fixed pattern of rows; devices differ")
+    column_pattern_e_rms: float = Field(default=0.0, ge=0, description="fixed pattern of columns; devices differ")
+    row_noise_e_rms: float = Field(default=0.0, ge=0, description="noise with one value per row and exposure")
+    banding_amplitude_e: float = Field(
+        default=0.0, ge=0, description="amplitude of sinusoidal interference during the readout"
+    )
+    banding_frequency_hz: float = Field(default=0.0, ge=0, description="its frequency")
+    banding_phase_rad: float = Field(default=0.0, description="its phase at the first pixel")
+    pixel_time_s: float = Field(
+        default=1e-7, ge=0, description="time between two pixels of a line; 0 where a line is converted at once"
+    )
+    line_time_s: float | None = Field(
+        default=None, ge=0, description="time between two lines; default: that of the pixels of a node's line"
+    )
+    inl_quadratic_dn: float = Field(
+        default=0.0, description="integral non-linearity: height of an arc at half range"
+    )
+    inl_cubic_dn: float = Field(
+        default=0.0,
+        description="integral non-linearity: an S with extremes of this height at (3 ∓ √3)/6 of the range, with "
+        "this sign in the lower half",
+    )
+    dnl_lsb_rms: float = Field(
+        default=0.0, ge=0, description="differential non-linearity: spread of the code widths; devices differ"
+    )
+    missing_codes: tuple[Annotated[int, Field(ge=0, le=65535)], ...] = Field(
+        default=(), description="codes that never occur; their range goes to the next code below, or else above"
+    )
+    stuck_bits: tuple[tuple[Annotated[int, Field(ge=0, le=15)], Literal[0, 1]], ...] = Field(
+        default=(), description="pairs of a bit, 0 the least significant, and its value"
+    )
 
     def __post_init__(self) -> None:
-        _within("bits", self.bits, 1, 16)
-        _within("bias_dn", self.bias_dn, 0, self.top_dn)
-        for name in (
-            "read_noise_e_rms",
-            "reset_noise_e_rms",
-            "cds_interval_s",
-            "row_pattern_e_rms",
-            "column_pattern_e_rms",
-            "row_noise_e_rms",
-            "banding_amplitude_e",
-            "banding_frequency_hz",
-            "pixel_time_s",
-            "dnl_lsb_rms",
-        ):
-            _within(name, getattr(self, name), 0, math.inf)
-        for number in (self.banding_phase_rad, *self.node_offsets_dn):
-            if not math.isfinite(number):
-                raise InputError(f"banding_phase_rad or node_offsets_dn holds {number}, but must be finite")
-        _positive("full_well_e", self.full_well_e)
-        if self.gain_dn_per_e is not None:
-            _positive("gain_dn_per_e", self.gain_dn_per_e)
-        elif self.bias_dn == self.top_dn:
-            raise InputError(
-                f"bias_dn is {self.bias_dn}, the top code, but must lie below it where gain_dn_per_e is not given"
+        """Raise ValueError where values contradict each other."""
+        for name, codes in (("bias_dn", (self.bias_dn,)), ("missing_codes", self.missing_codes)):
+            if codes and max(codes) > self.top_dn:
+                raise ValueError(f"{name} = {max(codes)}: must be from 0 to {self.top_dn}, the top code")
+        if self.gain_dn_per_e is None and self.bias_dn == self.top_dn:
+            raise ValueError(
+                f"bias_dn = {self.bias_dn}: must be below the top code where gain_dn_per_e is not given"
             )
-        if self.line_time_s is not None:
-            _within("line_time_s", self.line_time_s, 0, math.inf)
-        if self.nodes not in (1, 2, 4):
-            raise InputError(f"nodes is {self.nodes}, but must be 1, 2 or 4")
         for name in ("node_gains", "node_offsets_dn"):
-            if len(getattr(self, name)) not in (0, self.nodes):
-                raise InputError(f"{name} is {getattr(self, name)}, but must hold {self.nodes} values or none")
-        for gain in self.node_gains:
-            _positive("node_gains", gain)
+            values = getattr(self, name)
+            if len(values) not in (0, self.nodes):
+                raise ValueError(
+                    f"{name} = {list(values)}: must hold a value for each of {self.nodes} nodes, or none"
+                )
         # a falling curve would map two signals to one code
         steepest = 4 * abs(self.inl_quadratic_dn) + _CUBIC_SCALE * abs(self.inl_cubic_dn)
         if steepest and not steepest < self.top_dn - self.bias_dn:
-            raise InputError(
-                f"inl_quadratic_dn is {self.inl_quadratic_dn} and inl_cubic_dn is {self.inl_cubic_dn}, but "
-                f"4·|quadratic| + 10.4·|cubic| must stay below the {self.top_dn - self.bias_dn} DN of the range"
+            raise ValueError(
+                f"inl_quadratic_dn = {self.inl_quadratic_dn:g}, inl_cubic_dn = {self.inl_cubic_dn:g}: "
+                f"4·|quadratic| + 10.4·|cubic| must be below the {self.top_dn - self.bias_dn} DN of the range"
             )
-        for code in self.missing_codes:
-            _within("missing_codes", code, 0, self.top_dn)
         if len(set(self.missing_codes)) > self.top_dn:
-            raise InputError(f"missing_codes are all {self.top_dn + 1} codes, but one must be left")
-        _check_bits(self.stuck_bits, self.bits)
+            raise ValueError(f"missing_codes: must leave one of the {self.top_dn + 1} codes")
+        for bit, _ in self.stuck_bits:
+            if bit >= self.bits:
+                raise ValueError(f"stuck_bits: bit = {bit}: must be from 0 to {self.bits - 1}")
 
     @property
     def top_dn(self) -> int:
@@ -184,11 +180,6 @@ def _within(name: str, value: float, low: float, high: float) -> None:
     if not low <= value <= high or math.isinf(value):
         allowed = f"at least {low}" if math.isinf(high) else f"in {low} to {high}"
         raise InputError(f"{name} is {value}, but must be {allowed}")
-
-
-def _positive(name: str, value: float) -> None:
-    if not 0 < value < math.inf:
-        raise InputError(f"{name} is {value}, but must be above 0")
 
 
 # ------------------------------------------------------------------------------- noise and fixed pattern

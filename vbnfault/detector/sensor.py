@@ -6,135 +6,154 @@ The table `[sources]` of the file must name the origin of every number in the fi
 from __future__ import annotations
 
 import dataclasses
-import difflib
-import math
-import sys
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import field
 from pathlib import Path
-from typing import Any, cast, get_args, get_origin, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
 
-from ..core import resources, spectra
+from pydantic import AfterValidator, Field
+
+from ..core import resources, spectra, tables
 from ..core.errors import InputError, shown
+from ..core.tables import Fraction, table_class
 from .charge import ChargeCloud, TrapSpecies
 from .dark import CCD_GROWTH
 from .demosaic import Method
 from .efficiency import Curve, QuantumEfficiency
 from .individual import IndividualSpec
-from .mosaic import Pattern
+from .mosaic import PATTERNS, Pattern
 from .mosaic import pattern as pattern_of
 from .readout import ReadoutSpec
 
-ARCHITECTURES = ("full_frame_ccd", "frame_transfer_ccd", "interline_ccd", "cmos")
-DEMOSAICS = ("bilinear", "malvar", "menon")
-SHUTTERS = ("global", "rolling", "mechanical")
-# Keys that every file must have, because no default would be meaningful.
-_REQUIRED = ("architecture", "pixel_pitch_um", "readout.bits", "readout.full_well_e")
-_KINDS = ((bool, "true or false"), (int, "a whole number"), (float, "a number"), (str, "a text"))
+Architecture = Literal["full_frame_ccd", "frame_transfer_ccd", "interline_ccd", "cmos"]
+ARCHITECTURES: tuple[str, ...] = get_args(Architecture)
+# How to describe a sensor without colour filters; part of the errors of who looks for a response of that kind.
+MONOCHROME = (
+    'a monochrome sensor has pattern = "mono", and its efficiency is quantum_efficiency_peak or a '
+    "[[quantum_efficiency]] of channel W"
+)
 
 
-@dataclass(frozen=True, kw_only=True)
+def _named_pattern(value: Pattern | str) -> Pattern:
+    """Return the colour filter array that a file names or describes. Raises ValueError for an unknown name."""
+    if isinstance(value, Pattern):
+        return value
+    try:
+        return pattern_of(value)
+    except InputError as error:
+        raise ValueError(f"{str(error).partition(': ')[2]}, or a table of name, channels and tile") from None
+
+
+if TYPE_CHECKING:
+    _PatternOrName = Pattern
+else:
+    _PATTERN_NAMES = {"enum": sorted({spelling for name in PATTERNS for spelling in (name, name.upper())})}
+    _PatternOrName = Annotated[
+        Pattern | Annotated[str, Field(json_schema_extra=_PATTERN_NAMES)], AfterValidator(_named_pattern)
+    ]
+
+
+@table_class()
 class Transfer:
-    """Describe how the sensor moves charge, and what happens to the charge meanwhile.
+    """Describe how the sensor moves charge, and what happens to the charge meanwhile."""
 
-    Attributes
-    ----------
-    row_transfer_s
-        Time in s to shift the charge by one row into the store or the register.
-    row_clear_s
-        Time in s to shift charge by one row while the sensor is cleared before the exposure; 0 clears all at once.
-    pixel_transfer_s
-        Time in s to shift the charge by one pixel in the serial register.
-    row_readout_s
-        Time in s from the readout of one row to the next.
-    leak
-        Sensitivity to light of the covered register (interline) or of the store (global shutter), over that of the
-        photodiode. 0 to 1.
-    shutter_transmission
-        Fraction of the light that a closed shutter lets through while a full frame is read. 0 to 1.
-    antiblooming
-        Fraction of the excess charge that an antiblooming drain removes. 0 to 1.
-    parallel_traps, serial_traps
-        Traps in the columns and in the serial register.
-    cloud
-        Charge cloud that meets the traps; None takes the default `ChargeCloud` with the sensor's full well.
-    """
-
-    row_transfer_s: float = 0.0
-    row_clear_s: float = 0.0
-    pixel_transfer_s: float = 0.0
-    row_readout_s: float = 0.0
-    leak: float = 0.0
-    shutter_transmission: float = 0.0
-    antiblooming: float = 0.0
-    parallel_traps: tuple[TrapSpecies, ...] = ()
-    serial_traps: tuple[TrapSpecies, ...] = ()
-    cloud: ChargeCloud | None = None
-
-    def __post_init__(self) -> None:
-        for key in ("row_transfer_s", "row_clear_s", "pixel_transfer_s", "row_readout_s"):
-            _in_range(key, getattr(self, key), 0.0, math.inf)
-        for key in ("leak", "shutter_transmission", "antiblooming"):
-            _in_range(key, getattr(self, key), 0.0, 1.0)
+    row_transfer_s: float = Field(
+        default=0.0, ge=0, description="time to shift the charge by one row into the store or the register"
+    )
+    row_clear_s: float = Field(
+        default=0.0,
+        ge=0,
+        description="time to shift charge by one row while the sensor is cleared before the exposure; 0 clears all "
+        "rows at once",
+    )
+    pixel_transfer_s: float = Field(
+        default=0.0, ge=0, description="time to shift the charge by one pixel in the serial register"
+    )
+    row_readout_s: float = Field(default=0.0, ge=0, description="time from the readout of one row to the next")
+    leak: Fraction = Field(
+        default=0.0,
+        description="sensitivity to light of the covered register (interline) or of the store (global shutter), "
+        "over that of the photodiode",
+    )
+    shutter_transmission: Fraction = Field(
+        default=0.0, description="fraction of the light that a closed shutter lets through while a frame is read"
+    )
+    antiblooming: Fraction = Field(
+        default=0.0, description="fraction of the excess charge that an antiblooming drain removes"
+    )
+    parallel_traps: tuple[TrapSpecies, ...] = Field(default=(), description="traps in the columns")
+    serial_traps: tuple[TrapSpecies, ...] = Field(default=(), description="traps in the serial register")
+    cloud: ChargeCloud | None = Field(
+        default=None, description="charge cloud that meets the traps; default: one with the sensor's full well"
+    )
 
 
-@dataclass(frozen=True, kw_only=True)
+@table_class(required=("architecture", "pixel_pitch_um", "readout"))
 class Sensor:
     """Describe a type of sensor.
 
-    Lengths are in µm, temperatures in K and signals in electrons (e). `individual` says how devices of this type
-    differ. `readout` describes the chain from charge to DN. `quantum_efficiency` gives the QE of single channels.
-    Other channels use the relative colour curves named by `response` (`spectra.RESPONSES`), scaled by
-    `quantum_efficiency_peak`. Raises InputError if a value is out of range or two values contradict each other.
+    Lengths are in µm, temperatures in K and signals in electrons (e). Values that contradict each other raise
+    InputError.
     """
 
-    name: str
-    source: str = ""
-    architecture: str = "cmos"
-    shutter: str = "global"
-    width_px: int = 1024
-    height_px: int = 1024
-    pixel_pitch_um: float = 5.5
-    pattern: Pattern = field(default_factory=lambda: pattern_of("rggb"))
-    response: str = "nikon_5100"
-    quantum_efficiency_peak: float = 0.5
-    quantum_efficiency: tuple[Curve, ...] = ()
-    temperature_K: float = 293.0
-    demosaic: str = "malvar"
-    correct_defects: bool = False
-    individual: IndividualSpec = field(default_factory=IndividualSpec)
-    readout: ReadoutSpec = field(default_factory=ReadoutSpec)
-    transfer: Transfer = field(default_factory=Transfer)
+    name: str = Field(default="", description="name of the sensor; default: that of the file")
+    source: str = Field(default="", description="what the file describes, and after which document")
+    architecture: Architecture = Field(default="cmos", description="how the charge is moved and read")
+    shutter: Literal["global", "rolling", "mechanical"] = Field(
+        default="global", description="what ends the exposure; rolling: CMOS only"
+    )
+    width_px: int = Field(default=1024, ge=16, le=16384, description="width of the whole sensor")
+    height_px: int = Field(default=1024, ge=16, le=16384, description="height of the whole sensor")
+    pixel_pitch_um: float = Field(default=5.5, ge=0.5, le=100, description="distance of neighbouring pixels")
+    pattern: _PatternOrName = Field(
+        default_factory=lambda: pattern_of("rggb"), description="colour filter array: a name, or a table"
+    )
+    response: str = Field(
+        default="nikon_5100", description="relative colour curves of channels without a quantum_efficiency"
+    )
+    quantum_efficiency_peak: float = Field(
+        default=0.5, ge=1e-3, le=1, description="largest efficiency of these curves, and that of the channel W"
+    )
+    quantum_efficiency: tuple[Curve, ...] = Field(default=(), description="efficiency of single channels")
+    temperature_K: float = Field(default=293.0, ge=100, le=400, description="operating temperature")
+    demosaic: Method = Field(default="malvar", description="method for a Bayer pattern; others use bilinear")
+    correct_defects: bool = Field(
+        default=False, description="whether known defects are replaced before demosaicing"
+    )
+    individual: IndividualSpec = Field(
+        default_factory=IndividualSpec, description="how devices of this type differ"
+    )
+    readout: ReadoutSpec = Field(default_factory=ReadoutSpec, description="the chain from charge to DN")
+    transfer: Transfer = Field(default_factory=Transfer, description="how charge is moved")
     sources: Mapping[str, str] = field(default_factory=dict, hash=False)
 
     def __post_init__(self) -> None:
-        _one_of("architecture", self.architecture, ARCHITECTURES)
-        _one_of("shutter", self.shutter, SHUTTERS)
+        """Raise ValueError where values contradict each other."""
         if self.shutter == "rolling" and self.architecture != "cmos":
-            raise InputError("shutter = 'rolling': must be global or mechanical, as the architecture is a CCD")
-        _one_of("response", self.response, (*spectra.RESPONSES, spectra.FLAT))
-        _one_of("demosaic", self.demosaic, DEMOSAICS)
-        for key, low, high in (
-            ("width_px", 16, 16384),
-            ("height_px", 16, 16384),
-            ("pixel_pitch_um", 0.5, 100.0),
-            ("quantum_efficiency_peak", 1e-3, 1.0),
-            ("temperature_K", 100.0, 400.0),
-        ):
-            _in_range(key, getattr(self, key), low, high)
-        for curve in self.quantum_efficiency:
-            _one_of("quantum_efficiency: channel", curve.channel, self.pattern.channels)
-        own = {curve.channel for curve in self.quantum_efficiency}
-        for channel in set(self.pattern.channels) - own:
-            _one_of("pattern: without a quantum_efficiency of its own, channel", channel, (*"RGBW", "NIR"))
-        if self.pattern.channels != ("W",) and not set("RGB") <= set(self.pattern.channels):
-            raise InputError(
-                f"pattern: channels = {self.pattern.channels}: must be W alone, or R, G and B among them"
+            raise ValueError("shutter = 'rolling': must be global or mechanical, as the architecture is a CCD")
+        responses = (*spectra.RESPONSES, spectra.FLAT)
+        if self.response not in responses:
+            raise ValueError(
+                f"response = {shown(self.response)}: must be one of {', '.join(responses)}; {MONOCHROME}"
             )
+        self._check_channels()
         if self.architecture != "cmos":
             for traps, clock in (("parallel_traps", "row_readout_s"), ("serial_traps", "pixel_transfer_s")):
                 if getattr(self.transfer, traps) and not getattr(self.transfer, clock) > 0:
-                    raise InputError(f"transfer.{clock} = 0: must be above 0 where there are {traps}")
+                    raise ValueError(f"transfer.{clock} = 0: must be above 0 where there are {traps}")
+
+    def _check_channels(self) -> None:
+        """Raise ValueError unless every channel has an efficiency and the channels can make an image."""
+        channels = self.pattern.channels
+        own = {curve.channel for curve in self.quantum_efficiency}
+        for name in sorted(own - set(channels)):
+            raise ValueError(f"quantum_efficiency: channel = {name!r}: must be one of {', '.join(channels)}")
+        for name in sorted(set(channels) - own - {*"RGBW", "NIR"}):
+            raise ValueError(
+                f"pattern.channels: {name!r} has no quantum_efficiency: must be one of R, G, B, W, NIR without it"
+            )
+        if channels != ("W",) and not set("RGB") <= set(channels):
+            raise ValueError(f"pattern.channels = {list(channels)}: must be W alone, or R, G and B among them")
 
     @property
     def efficiency(self) -> QuantumEfficiency:
@@ -149,7 +168,7 @@ class Sensor:
     @property
     def method(self) -> Method:
         """Return the demosaicing method. Patterns other than Bayer always use "bilinear"."""
-        return cast(Method, self.demosaic) if self.pattern.is_bayer else "bilinear"
+        return self.demosaic if self.pattern.is_bayer else "bilinear"
 
 
 def load_sensor(name_or_path: str | Path) -> Sensor:
@@ -158,118 +177,47 @@ def load_sensor(name_or_path: str | Path) -> Sensor:
     Raises InputError that names the file, the key, the value and the allowed range.
     """
     path = resources.find("scenes/detectors", name_or_path)
-    table = resources.read_toml(path, "detector")
-    for key in _REQUIRED:
-        *parents, leaf = key.split(".")
-        node: Any = table
-        for parent in parents:
-            node = node.get(parent, {})
-        if isinstance(node, dict) and leaf not in node:
-            raise InputError(f"{path}: {key}: is missing")
-    return parse_sensor(table, source=str(path))
+    return parse_sensor(resources.read_toml(path, "detector"), source=str(path))
 
 
 def parse_sensor(table: Mapping[str, Any], *, source: str) -> Sensor:
-    """Build a sensor from plain data, such as a parsed TOML file.
+    """Return the sensor that plain data, such as the contents of a TOML file, describe.
 
     For a CCD without `individual.hot_growth` the growth law of CCDs (`CCD_GROWTH`) is used. Raises InputError
     that names `source`, the key and the value.
     """
-    plain = dict(table)
-    sources = plain.pop("sources", {})
-    if not isinstance(sources, dict) or not all(isinstance(v, str) for v in sources.values()):
-        raise InputError(f"{source}: sources: must be a table of texts")
-    numbers = _numbers(plain)
-    plain.setdefault("name", Path(source).stem)
-    if isinstance(plain.get("pattern"), str):
-        try:
-            plain["pattern"] = pattern_of(plain["pattern"])
-        except InputError as error:
-            raise InputError(f"{source}: {error}") from None
-    # built before the sources are checked, so that a misspelt key is reported as such
-    sensor: Sensor = _build(Sensor, plain, source)
-    for key in numbers:
-        if not sources.get(key, "").strip():
-            raise InputError(f'{source}: sources: {key} has none; name one, or say "assumed"')
-    for key in sources:
-        if key not in numbers:
-            raise InputError(f"{source}: sources: {key}: the file gives no such number")
-    own = plain.get("individual")
-    if sensor.architecture != "cmos" and not (isinstance(own, Mapping) and "hot_growth" in own):
+    sensor = tables.parse(Sensor, {"name": Path(source).stem, "sources": {}, **table}, source=source)
+    _check_sources(
+        _numbers({key: value for key, value in table.items() if key != "sources"}), sensor.sources, source
+    )
+    if sensor.architecture != "cmos" and "hot_growth" not in table.get("individual", {}):
         grows = dataclasses.replace(sensor.individual, hot_growth=CCD_GROWTH)
         sensor = dataclasses.replace(sensor, individual=grows)
-    return dataclasses.replace(sensor, sources=dict(sources))
+    return sensor
+
+
+def _check_sources(numbers: list[str], sources: Mapping[str, str], source: str) -> None:
+    """Raise InputError that names all numbers without a source, or all sources without a number."""
+    without = [key for key in numbers if not sources.get(key, "").strip()]
+    if without:
+        raise InputError(
+            f"{source}: sources: {', '.join(without)} {'has' if len(without) == 1 else 'have'} none; say where "
+            'each number comes from, or "assumed"'
+        )
+    spare = [key for key in sources if key not in numbers]
+    if spare:
+        raise InputError(f"{source}: sources: {', '.join(spare)}: the file gives no such number")
 
 
 def _numbers(table: Mapping[str, Any], before: str = "") -> list[str]:
-    """Return the keys of all numbers, `table.key` in tables.
-
-    A list gives its own key, unless it holds texts only.
-    """
-    out = []
+    """Return the dotted keys of all numbers. A list gives its own key, unless it holds texts only."""
+    keys = []
     for key, value in table.items():
         name = f"{before}{key}"
         if isinstance(value, dict):
-            out += _numbers(value, f"{name}.")
+            keys += _numbers(value, f"{name}.")
         elif (isinstance(value, int | float) and not isinstance(value, bool)) or (
             isinstance(value, list) and not all(isinstance(v, str) for v in value)
         ):
-            out.append(name)
-    return out
-
-
-def _build(cls: Any, table: Mapping[str, Any], where: str) -> Any:
-    """Build a dataclass, and the dataclasses nested in it, from a table."""
-    kinds = get_type_hints(cls)
-    known = [f.name for f in dataclasses.fields(cls) if f.name != "sources"]
-    found = {}
-    for key, value in table.items():
-        if key not in known:
-            near = difflib.get_close_matches(key, known, n=1)
-            told = f" (did you mean {near[0]}?)" if near else f"; known: {', '.join(known)}"
-            raise InputError(f"{where}: {key}: unknown key{told}")
-        found[key] = _value(kinds[key], value, f"{where}: {key}")
-    try:
-        return cls(**found)
-    except InputError as error:
-        raise InputError(f"{where}: {error}") from None
-    except TypeError as error:
-        raise InputError(f"{where}: {error}") from None
-
-
-def _value(kind: Any, value: Any, where: str) -> Any:
-    """Convert a value to the type of its field: a number, a text, a table or a list, recursively."""
-    kinds = get_args(kind)
-    if get_origin(kind) is tuple:
-        if isinstance(value, list):
-            each = kinds[:1] * len(value) if kinds[-1] is Ellipsis else kinds
-            if len(each) == len(value):
-                return tuple(_value(k, v, f"{where} {n}") for n, (k, v) in enumerate(zip(each, value, strict=True)))
-    elif kinds:  # an optional type: a file cannot give None, so only the first type counts
-        return _value(kinds[0], value, where)
-    elif dataclasses.is_dataclass(kind):
-        if isinstance(value, dict):
-            return _build(kind, value, where)
-        if isinstance(value, cast(type, kind)):
-            return value
-    elif kind is float and type(value) in (int, float):
-        # an integer can be too large for a float, too
-        if abs(value) <= sys.float_info.max:
-            return float(value)
-        raise InputError(f"{where} = {shown(value)}: must be finite")
-    elif type(value) is kind:  # not isinstance: true and false are whole numbers to Python
-        return value
-    other = "a table" if dataclasses.is_dataclass(kind) else "a list of the right length"
-    wanted = next((word for plain, word in _KINDS if kind is plain), other)
-    raise InputError(f"{where} = {shown(value)}: must be {wanted}")
-
-
-def _in_range(key: str, value: float, low: float, high: float) -> None:
-    if not low <= value <= high or math.isinf(value):
-        allowed = f"finite and at least {low:g}" if math.isinf(high) else f"from {low:g} to {high:g}"
-        raise InputError(f"{key} = {value:g}: must be {allowed}")
-
-
-def _one_of(key: str, value: str, allowed: tuple[str, ...]) -> None:
-    if value not in allowed:
-        raise InputError(f"{key} = {shown(value)}: must be one of {', '.join(allowed)}")
+            keys.append(name)
+    return keys
