@@ -45,7 +45,7 @@ def sheet(name: str, coating: str, models: tuple[str, ...], pixels: int) -> tupl
     for angle in ANGLES_DEG:
         cells, light = [], []
         for model in models:
-            view = flare_images.FlareRequest(
+            request = flare_images.FlareRequest(
                 lens=lens,
                 sun_deg=angle,
                 azimuth_deg=AZIMUTH_DEG,
@@ -55,15 +55,16 @@ def sheet(name: str, coating: str, models: tuple[str, ...], pixels: int) -> tupl
                 sun_distance_au=3.0,
                 model=model,
             )
-            found = flare_images.layers(view)
+            layers = flare_images.layers(request)
             if white is None:  # the whole sheet has one exposure
-                ghosts = flare_images.colours(view, found["ghosts"] + found["veil"]).max(axis=2)
+                ghosts = flare_images.colours(request, layers["ghosts"] + layers["veil"]).max(axis=2)
                 white = float(np.percentile(ghosts, 99)) * 2
-            cells.append(flare_images.picture(view, found, white))
-            light.append(flare_images.colours(view, found["ghosts"])[..., 1])
-            one = replace(view, wavelength_nm=flare_images.wavelengths_nm(550.0))
-            told = flare_images.ghosts(one)
-            energy.append([name, coating, model, angle, len(told), sum(g.flux_fraction for g in told)])
+            exposed = replace(request, white=white)
+            cells.append(flare_images.picture(flare_images.Flare(request=exposed, layers=layers)))
+            light.append(flare_images.colours(request, layers["ghosts"])[..., 1])
+            at_550_nm = replace(request, wavelength_nm=flare_images.wavelengths_nm(550.0))
+            all_ghosts = flare_images.ghosts(at_550_nm)
+            energy.append([name, coating, model, angle, len(all_ghosts), sum(g.flux_fraction for g in all_ghosts)])
         if len(models) == 2:
             cells.append(part(light[0], light[1]))
         columns.append(np.concatenate(cells))

@@ -21,7 +21,7 @@ import pytest
 from vbnfault import cli
 from vbnfault.body import load_shape
 from vbnfault.body.shape import signed_volume
-from vbnfault.cli import commands
+from vbnfault.cli.options import finite
 from vbnfault.core import resources, spice
 from vbnfault.core.errors import InputError, VbnfaultError, shown
 from vbnfault.detector.sensor import load_sensor
@@ -424,7 +424,7 @@ def test_every_number_of_the_command_line_has_both_limits() -> None:
         assert option.min is not None, (name, parameter)
         assert option.max is not None, (name, parameter)
         # click finds nan within any limits
-        assert int in kinds or option.callback is commands._finite, (name, parameter)
+        assert int in kinds or option.callback is finite, (name, parameter)
 
 
 @pytest.mark.parametrize("value", ["nan", "inf", "-inf", "1e400", "361"])

@@ -17,7 +17,7 @@ from vbnfault.core import resources
 from vbnfault.core.quantities import Sample
 from vbnfault.dataset.errors import Interrupted
 
-SENTENCE = "vbnfault: interrupted; what was written stays; repeat the command to go on\n"
+SENTENCE = "vbnfault: interrupted; the files written so far stay, and the same command continues the work\n"
 NUMBERS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 

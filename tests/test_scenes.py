@@ -11,7 +11,7 @@ import pytest
 import xarray
 
 from vbnfault import dataset, pipeline, store
-from vbnfault.cli import commands
+from vbnfault.cli.options import SceneOptions
 from vbnfault.core import resources
 from vbnfault.scene import config
 
@@ -53,4 +53,4 @@ def test_the_commands_in_a_scenes_comments_are_accepted(name: str) -> None:
     for words in shown:
         assert words[2] == name
         settings = [value for option, value in itertools.pairwise(words) if option == "--set"]
-        pipeline.configure_faults(commands._scene(name, settings), name)
+        pipeline.configure_faults(SceneOptions(settings=settings).load(name), name)

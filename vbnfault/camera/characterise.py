@@ -8,10 +8,8 @@ with a device of a simulated sensor.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, fields
-from pathlib import Path
+from dataclasses import asdict, dataclass
 from typing import Any, Protocol
 
 import numpy as np
@@ -346,101 +344,3 @@ class VirtualCamera:
         light = by_channel(self.device.sensor, shape, [photons * eta for eta in self.efficiency.values()])
         shot, read, row = (np.random.default_rng([self.seed, number, k]) for k in range(3))
         return self.device.raw(light, exposure_s, MosaicNoise.draw(shape, shot, read, row))
-
-
-# --- output as figure and text -----------------------------------------------------------------------------------
-
-
-def draw(found: Mapping[str, Characterisation], title: str, path: Path) -> None:
-    """Write a PNG figure of photon transfer, response, dark signal, spectra and histograms."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-    from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
-
-    figure = Figure(figsize=(15, 9), layout="constrained")
-    FigureCanvasAgg(figure)
-    figure.suptitle(f"{title}: EMVA 1288")
-    axes = figure.subplots(2, 3)
-    for name, one in found.items():
-        colour = _COLOURS.get(name[0], "0.3")
-        t, r = one.transfer, one.result
-        signal, noise = t.mean_dn - t.dark_mean_dn, np.maximum(t.variance_dn2 - t.dark_variance_dn2, 1e-3)
-        axes[0, 0].loglog(signal, noise, ".", color=colour, label=f"{name}: K = {r.gain_dn_per_e:.4g} DN/e")
-        axes[0, 0].loglog(signal, r.gain_dn_per_e * signal, "-", lw=0.8, color=colour)
-        axes[0, 1].plot(
-            t.photons, signal, ".-", lw=0.6, color=colour, label=f"{name}: η = {r.quantum_efficiency:.3f}"
-        )
-        axes[0, 2].plot(
-            one.dark_exposure_s,
-            one.dark_mean_dn,
-            ".-",
-            color=colour,
-            label=f"{name}: {r.dark_current_mean_e_s:.3g} e/s",
-        )
-        for k, kind in enumerate(("rows", "columns")):
-            axes[1, 0].semilogy(
-                one.spectrum.frequency[kind],
-                one.spectrum.dark_dn[kind],
-                ("-", ":")[k],
-                lw=0.7,
-                color=colour,
-                label=f"{name}, along {kind}",
-            )
-        for ax, values, unit in (
-            (axes[1, 1], one.dsnu_map_dn / r.gain_dn_per_e, f"DSNU {r.dsnu_e:.3g} e"),
-            (axes[1, 2], 100 * one.prnu_map, f"PRNU {r.prnu_percent:.3g} %"),
-        ):
-            count, edge = np.histogram(values, bins=_bins(values))
-            ax.semilogy(
-                (edge[1:] + edge[:-1]) / 2, np.maximum(count, 0.5), color=colour, lw=0.8, label=f"{name}: {unit}"
-            )
-    labels = (
-        ("photon transfer", "signal, DN", "temporal variance, DN²"),
-        ("response", "photons a pixel", "signal, DN"),
-        ("dark signal", "exposure, s", "mean, DN"),
-        ("spectra of dark pictures", "cycles a pixel", "DN rms"),
-        ("dark signal of pixels", "from the mean, e", "pixels"),
-        ("response of pixels", "from the mean, %", "pixels"),
-    )
-    top = max(float(one.transfer.variance_dn2.max()) for one in found.values())
-    axes[0, 0].set_ylim(top * 1e-4, top * 2)
-    axes[0, 0].xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-    axes[0, 0].xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:.0f}"))
-    axes[0, 0].xaxis.set_minor_formatter(NullFormatter())
-    axes[0, 1].xaxis.set_major_locator(MaxNLocator(6))
-    axes[0, 2].ticklabel_format(useOffset=False)
-    for formatter in (axes[1, 0].yaxis.set_major_formatter, axes[1, 0].yaxis.set_minor_formatter):
-        formatter(FuncFormatter(lambda value, _: f"{value:.3g}"))
-    for ax, (head, x, y) in zip(axes.ravel(), labels, strict=True):
-        ax.set(title=head, xlabel=x, ylabel=y)
-        ax.grid(alpha=0.3)
-        ax.legend(fontsize=7)
-    figure.savefig(path, dpi=100)
-
-
-def _bins(values: F64) -> F64:
-    """Return the edges of at most about 200 bins for a histogram.
-
-    Averages of integers are multiples of a step. Each bin is a whole number of these steps wide.
-    """
-    levels = np.unique(values)
-    extent = float(levels[-1] - levels[0])
-    if extent == 0:
-        return np.asarray([levels[0] - 0.5, levels[0] + 0.5])
-    apart = np.diff(levels)
-    step = float(apart[apart > 1e-5 * extent].min())
-    width = step * math.ceil(extent / step / 200)
-    return np.asarray(levels[0] - step / 2 + width * np.arange(math.ceil((extent + step) / width) + 1))
-
-
-_COLOURS = {"R": "tab:red", "G": "tab:green", "B": "tab:blue", "N": "tab:brown", "W": "0.4", "M": "0.2"}
-
-
-def table(found: Mapping[str, Characterisation]) -> list[str]:
-    """Return lines of text with a row per parameter and a column per channel."""
-    names = list(found)
-    lines = [f"{'':<30}" + "".join(f"{name:>12}" for name in names)]
-    for field in fields(Result):
-        values = (getattr(found[name].result, field.name) for name in names)
-        lines.append(f"{field.name:<30}" + "".join(f"{value:>12.5g}" for value in values))
-    return lines

@@ -1,5 +1,10 @@
-"""The command line."""
+"""Define the command line: parse the arguments, call the library, and print the result.
 
-from .commands import app, main
+The commands stand in one file per group. They hold no physics and no checks beyond the types and limits of their
+options, and they import the library only when they run, so that `vbnfault --help` stays fast.
+"""
 
-__all__ = ["app", "main"]
+from . import datasets, instruments, support  # each registers its commands
+from .app import app, main
+
+__all__ = ["app", "datasets", "instruments", "main", "support"]

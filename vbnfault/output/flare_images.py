@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -23,13 +22,14 @@ from ..lens.straylight.paraxial import Ghost, axial_transmittance, mean_ghost, p
 from ..lens.straylight.total import VEIL_FRACTION, Cleanliness, straylight
 from ..scene import keyed_random
 from .exr import write_exr
+from .json_files import write_json
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
 MODELS = ("traced", "paraxial", "texture")
-# field of a request, least and greatest value
-_RANGES = (
+# Field of a request, least and greatest value.
+RANGES = (
     ("sun_deg", 0, 90),
     ("azimuth_deg", -360, 360),
     ("fov_deg", 0.1, 140),
@@ -38,6 +38,7 @@ _RANGES = (
     ("roughness_nm", 0, 50),
     ("cleanliness_level", 0, 1000),
     ("veil_fraction", 0, 0.5),
+    ("white", 1e-12, 1e6),
 )
 _BANDS = 8
 _ACROSS_SPECTRUM = 192
@@ -53,7 +54,7 @@ class FlareRequest:
     sun_deg, azimuth_deg
         Angle of the Sun from the axis; its direction in the image: 0 to the right, 90 down.
     fov_deg
-        Field of view across the width of the image.
+        Field of request across the width of the image.
     pixels
         Width and height of the image.
     wavelength_nm
@@ -64,6 +65,9 @@ class FlareRequest:
         Reflections of a traced ghost: 2, or 4 to add ghosts of four reflections.
     roughness_nm, cleanliness_level, veil_fraction
         Scatter of the surfaces, see `lens.straylight`.
+    white
+        Irradiance on the sensor that `picture` shows as white, as a fraction of the Sun's irradiance at the lens's
+        entrance; for the model `texture`, as a fraction of the camera's white. None: see `Flare.white`.
     """
 
     lens: Prescription
@@ -78,11 +82,12 @@ class FlareRequest:
     roughness_nm: float = 1.0
     cleanliness_level: float = 0.0
     veil_fraction: float = VEIL_FRACTION
+    white: float | None = None
 
     def __post_init__(self) -> None:
-        for name, lowest, highest in _RANGES:
+        for name, lowest, highest in RANGES:
             value = getattr(self, name)
-            if not lowest <= value <= highest:
+            if value is not None and not lowest <= value <= highest:
                 raise InputError(f"{name} = {value}: must be from {lowest:g} to {highest:g}")
         if self.sun_deg == 90:
             raise InputError("sun_deg = 90: must be from 0 to below 90")
@@ -90,6 +95,11 @@ class FlareRequest:
             raise InputError(f"model = {self.model!r}: must be one of {', '.join(MODELS)}")
         if self.reflections not in (2, 4):
             raise InputError(f"reflections = {self.reflections}: must be 2 or 4")
+
+    @property
+    def steps(self) -> int:
+        """Return how many steps of progress `compute` reports."""
+        return 1 + (0 if self.model == "texture" else len(self.wavelength_nm))
 
     @property
     def pitch_mm(self) -> float:
@@ -106,19 +116,19 @@ class FlareRequest:
         return float(radius * np.cos(turn)), float(radius * np.sin(turn))
 
 
-def wavelengths_nm(one: float | None = None) -> F64:
-    """Return the wavelength `one`, or the nodes of the cameras' default bands; float64[band].
+def wavelengths_nm(single_nm: float | None = None) -> F64:
+    """Return a single wavelength, or the nodes of the cameras' default bands; float64[band].
 
     Raises InputError for a wavelength outside 250 to 2500 nm.
     """
-    if one is None:
+    if single_nm is None:
         return spectra.band_nodes_nm(400.0, 700.0, _BANDS)
-    if not 250 <= one <= 2500:
-        raise InputError(f"--wavelength-nm {one:g}: must be from 250 to 2500")
-    return np.array([float(one)])
+    if not 250 <= single_nm <= 2500:
+        raise InputError(f"wavelength_nm = {single_nm:g}: must be from 250 to 2500")
+    return np.array([float(single_nm)])
 
 
-def layers(view: FlareRequest) -> dict[str, F32]:
+def layers(request: FlareRequest) -> dict[str, F32]:
     """Return the irradiance of each kind of straylight, divided by the Sun's irradiance at the lens's entrance.
 
     Returns
@@ -129,59 +139,87 @@ def layers(view: FlareRequest) -> dict[str, F32]:
         (`lens.straylight`). For the model `texture`: `sun`, with nothing subtracted, and `texture`,
         float32[3, y, x] in units of white.
     """
-    sun = _direct_image(view)
-    if view.model == "texture":
-        return {"sun": sun, "texture": _textures(view)}
-    found = straylight(
-        view.lens,
-        model=view.model,
-        wavelength_nm=view.wavelength_nm,
-        shape=(view.pixels, view.pixels),
-        pitch_mm=view.pitch_mm,
-        sun_deg=view.sun_deg,
-        azimuth_deg=view.azimuth_deg,
-        sun_radius_rad=spectra.sun_angular_radius_rad(view.sun_distance_au),
-        cleanliness=Cleanliness(roughness_nm=view.roughness_nm, level=view.cleanliness_level),
-        reflections=view.reflections,
-        veil_fraction=view.veil_fraction,
+    sun = _direct_image(request)
+    if request.model == "texture":
+        return {"sun": sun, "texture": _textures(request)}
+    light = straylight(
+        request.lens,
+        model=request.model,
+        wavelength_nm=request.wavelength_nm,
+        shape=(request.pixels, request.pixels),
+        pitch_mm=request.pitch_mm,
+        sun_deg=request.sun_deg,
+        azimuth_deg=request.azimuth_deg,
+        sun_radius_rad=spectra.sun_angular_radius_rad(request.sun_distance_au),
+        cleanliness=Cleanliness(roughness_nm=request.roughness_nm, level=request.cleanliness_level),
+        reflections=request.reflections,
+        veil_fraction=request.veil_fraction,
     )
-    sun *= found.direct_fraction[:, None, None].astype(np.float32)
+    sun *= light.direct_fraction[:, None, None].astype(np.float32)
     return {
         "sun": sun,
-        "ghosts": found.ghosts,
-        "starburst": found.starburst,
-        "glare": found.glare,
-        "veil": found.veil,
+        "ghosts": light.ghosts,
+        "starburst": light.starburst,
+        "glare": light.glare,
+        "veil": light.veil,
     }
 
 
-def ghosts(view: FlareRequest, progress: Callable[[int], None] | None = None) -> tuple[Ghost, ...]:
+def ghosts(request: FlareRequest, progress: Callable[[int], None] | None = None) -> tuple[Ghost, ...]:
     """Return every ghost of a point-like Sun; over several bands, means weighted by the Sun's spectrum.
 
     `progress` is called with 1 after each wavelength.
     """
-    weight = spectra.solar_band_irradiance_W_m2_nm(view.wavelength_nm, 1.0)
+    weight = spectra.solar_band_irradiance_W_m2_nm(request.wavelength_nm, 1.0)
     weight = weight / weight.sum()
-    found: dict[tuple[int, ...], list[tuple[float, Ghost]]] = {}
-    for nm, share in zip(view.wavelength_nm, weight, strict=True):
-        for ghost in _ghosts_at(view, float(nm), alone=len(weight) == 1):
-            found.setdefault(ghost.pair, []).append((float(share), ghost))
+    by_pair: dict[tuple[int, ...], list[tuple[float, Ghost]]] = {}
+    for wavelength_nm, fraction in zip(request.wavelength_nm, weight, strict=True):
+        for ghost in _ghosts_of_wavelength(request, float(wavelength_nm), alone=len(weight) == 1):
+            by_pair.setdefault(ghost.pair, []).append((float(fraction), ghost))
         if progress is not None:
             progress(1)
-    return tuple(mean_ghost(rows) for _, rows in sorted(found.items()))
+    return tuple(mean_ghost(weighted) for _, weighted in sorted(by_pair.items()))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Flare:
-    """What the Sun does in a lens.
+    """Hold what the Sun does in a lens.
 
-    `layers`: irradiance on the sensor over the Sun's at the entrance, float32[band, y, x] each, as `layers` returns
-    them. `ghosts`: flux, centroid and size of every ghost; empty for the model `texture`.
+    Attributes
+    ----------
+    layers
+        Irradiance on the sensor over the Sun's at the entrance, float32[band, y, x] each; see `layers`.
+    ghosts
+        Flux, centroid and size of every ghost; empty for the model `texture`.
     """
 
     request: FlareRequest
     layers: dict[str, F32]
-    ghosts: tuple[Ghost, ...]
+    ghosts: tuple[Ghost, ...] = ()
+
+    @property
+    def white(self) -> float:
+        """Return the irradiance that `picture` shows as white, over the Sun's at the entrance.
+
+        It is `request.white`, or else a high percentile of ghosts, glare and veil. The model `texture` counts in
+        units of the camera's white, and has 1.
+        """
+        if self.request.white is not None:
+            return self.request.white
+        if "texture" in self.layers:
+            return 1.0
+        scattered = self.layers["ghosts"] + self.layers["glare"] + self.layers["veil"]
+        brightness = colours(self.request, scattered).max(axis=2)
+        return max(float(np.percentile(brightness, _SHOWN_PERCENTILE)), 1e-12)
+
+
+def compute(request: FlareRequest, progress: Callable[[int], None] | None = None) -> Flare:
+    """Return layers and ghosts of a request; `progress` is called with 1 after each of `request.steps` steps."""
+    all_ghosts = () if request.model == "texture" else ghosts(request, progress)
+    flare = Flare(request=request, layers=layers(request), ghosts=all_ghosts)
+    if progress is not None:
+        progress(1)
+    return flare
 
 
 def trace_flare(
@@ -199,7 +237,7 @@ def trace_flare(
         A single wavelength from 250 to 2500; by default the nodes of eight bands from 400 to 700 nm.
     **settings
         Further fields of `FlareRequest`: `azimuth_deg`, `fov_deg`, `pixels`, `sun_distance_au`, `model`,
-        `reflections`, `roughness_nm`, `cleanliness_level`, `veil_fraction`.
+        `reflections`, `roughness_nm`, `cleanliness_level`, `veil_fraction`, `white`.
 
     Raises
     ------
@@ -210,139 +248,133 @@ def trace_flare(
     request = FlareRequest(
         lens=prescription, sun_deg=sun_deg, wavelength_nm=wavelengths_nm(wavelength_nm), **settings
     )
-    return Flare(
-        request=request,
-        layers=layers(request),
-        ghosts=() if request.model == "texture" else ghosts(request),
-    )
+    return compute(request)
 
 
-def _ghosts_at(view: FlareRequest, wavelength_nm: float, *, alone: bool) -> tuple[Ghost, ...]:
+def _ghosts_of_wavelength(request: FlareRequest, wavelength_nm: float, *, alone: bool) -> tuple[Ghost, ...]:
     """Return every ghost at one wavelength; `alone`: the only one, traced with the default number of rays."""
     from ..lens.straylight.ghosts import traced_ghosts
 
-    if view.model == "paraxial":
-        return paraxial_ghosts(view.lens, view.sun_deg, azimuth_deg=view.azimuth_deg, wavelength_nm=wavelength_nm)
+    if request.model == "paraxial":
+        return paraxial_ghosts(
+            request.lens, request.sun_deg, azimuth_deg=request.azimuth_deg, wavelength_nm=wavelength_nm
+        )
     return traced_ghosts(
-        view.lens,
-        view.sun_deg,
-        azimuth_deg=view.azimuth_deg,
+        request.lens,
+        request.sun_deg,
+        azimuth_deg=request.azimuth_deg,
         wavelength_nm=wavelength_nm,
-        reflections=view.reflections,
+        reflections=request.reflections,
         across=None if alone else _ACROSS_SPECTRUM,
     )
 
 
-def _direct_image(view: FlareRequest) -> F32:
+def _direct_image(request: FlareRequest) -> F32:
     """Return the Sun's direct image as a uniform disc of at least one pixel's area, float32[band, y, x].
 
     Its power divided by the Sun's irradiance is T(λ) A cos θ. T is the transmittance of the image path, A the area
     of the paraxial entrance pupil. The fluxes of the ghosts refer to the same A cos θ.
     """
-    optics = first_order(view.lens)
+    optics = first_order(request.lens)
     radius_px = max(
-        optics.efl_mm * spectra.sun_angular_radius_rad(view.sun_distance_au) / view.pitch_mm, np.sqrt(1 / np.pi)
+        optics.efl_mm * spectra.sun_angular_radius_rad(request.sun_distance_au) / request.pitch_mm,
+        np.sqrt(1 / np.pi),
     )
-    x, y = (v / view.pitch_mm + view.pixels / 2 for v in view.sun_xy_mm)
+    x, y = (v / request.pitch_mm + request.pixels / 2 for v in request.sun_xy_mm)
     # the whole disc is drawn first, so that its sum is right if the image border cuts it
     reach = int(np.ceil(radius_px)) + 1
     columns, rows = (int(np.floor(v)) + np.arange(-reach, reach + 1) for v in (x, y))
     cover = np.clip(radius_px - np.hypot(columns[None, :] + 0.5 - x, rows[:, None] + 0.5 - y) + 0.5, 0, 1)
-    cover /= cover.sum() * view.pitch_mm**2
-    inside = [(v >= 0) & (v < view.pixels) for v in (rows, columns)]
-    out = np.zeros((len(view.wavelength_nm), view.pixels, view.pixels), dtype=np.float32)
-    power = axial_transmittance(view.lens, view.wavelength_nm) * np.cos(np.radians(view.sun_deg))
+    cover /= cover.sum() * request.pitch_mm**2
+    inside = [(v >= 0) & (v < request.pixels) for v in (rows, columns)]
+    out = np.zeros((len(request.wavelength_nm), request.pixels, request.pixels), dtype=np.float32)
+    power = axial_transmittance(request.lens, request.wavelength_nm) * np.cos(np.radians(request.sun_deg))
     power *= np.pi / 4 * optics.entrance_pupil_diameter_mm**2
     within = cover[np.ix_(*inside)]
     out[:, rows[inside[0]][:, None], columns[inside[1]]] = power[:, None, None] * within
     return out
 
 
-def _textures(view: FlareRequest) -> F32:
+def _textures(request: FlareRequest) -> F32:
     """Draw the texture model once, with the Sun at the same position; R, G, B in units of white."""
-    focal_px = first_order(view.lens).efl_mm / view.pitch_mm
-    detector = ThreeColourDetector(width_px=view.pixels, height_px=view.pixels)
+    focal_px = first_order(request.lens).efl_mm / request.pitch_mm
+    detector = ThreeColourDetector(width_px=request.pixels, height_px=request.pixels)
     lens = ThinLens(focal_length_mm=focal_px * detector.pixel_pitch_um * 1e-3, f_number=4.0)
-    x, y = (v / view.pitch_mm + view.pixels / 2 for v in view.sun_xy_mm)
+    x, y = (v / request.pitch_mm + request.pixels / 2 for v in request.sun_xy_mm)
     context = FaultContext(
         camera=Camera(lens=lens, detector=detector), sun_xy_px=np.array([x, y]), sun_visible_fraction=1.0
     )
     fault = registry()["straylight"]["texture"]()
     params = fault.draw(context, keyed_random.rng(0, 0, "flare", "texture"))
-    black = np.zeros((view.pixels, view.pixels, 3), dtype=np.float32)
+    black = np.zeros((request.pixels, request.pixels, 3), dtype=np.float32)
     drawn = fault.apply(Electrons(array=black, white_e=detector.white_e), params, context)
     return np.ascontiguousarray(np.moveaxis(drawn.array / detector.white_e, -1, 0))
 
 
-def colours(view: FlareRequest, irradiance: F32) -> F32:
+def colours(request: FlareRequest, irradiance: F32) -> F32:
     """Return linear R, G, B of an irradiance float32[band, y, x] for the default detector, float32[y, x, 3].
 
     The scale is such that an irradiance of 1 in every band gives 1. A single wavelength gives grey.
     """
-    if len(view.wavelength_nm) == 1:
+    if len(request.wavelength_nm) == 1:
         return np.repeat(irradiance[0][..., None], 3, axis=2)
     detector = ThreeColourDetector()
-    sun = spectra.solar_band_irradiance_W_m2_nm(view.wavelength_nm, 1.0)
-    weight = detector.electron_rate_weights(view.wavelength_nm) * sun
+    sun = spectra.solar_band_irradiance_W_m2_nm(request.wavelength_nm, 1.0)
+    weight = detector.electron_rate_weights(request.wavelength_nm) * sun
     weight = weight / weight.sum(axis=1, keepdims=True)
     return np.asarray(np.einsum("cb,byx->yxc", weight, irradiance), dtype=np.float32)
 
 
-def picture(view: FlareRequest, found: dict[str, F32], white: float | None = None) -> NDArray[np.uint8]:
-    """Return the sum of the layers as an sRGB image, uint8[y, x, 3].
-
-    `white`: the irradiance shown as white. By default it is a high percentile of ghosts, glare and veil; for the
-    model `texture` it is 1.
-    """
-    if "texture" in found:
-        linear = np.moveaxis(found["texture"], 0, -1) + 1e3 * (colours(view, found["sun"]) > 0)
-        white = 1.0 if white is None else white
-    else:
-        linear = colours(view, sum(found.values(), np.zeros_like(found["sun"])))
-        if white is None:
-            ghosts_ = colours(view, found["ghosts"] + found["glare"] + found["veil"]).max(axis=2)
-            white = max(float(np.percentile(ghosts_, _SHOWN_PERCENTILE)), 1e-30)
-    level = np.clip(linear / np.float32(white), 0, 1)
-    shown = np.where(level <= 0.0031308, 12.92 * level, 1.055 * level ** (1 / 2.4) - 0.055)
-    return np.asarray(np.rint(255 * shown), dtype=np.uint8)
+def picture(flare: Flare) -> NDArray[np.uint8]:
+    """Return the sum of the layers as an sRGB image, uint8[y, x, 3], with `flare.white` as white."""
+    linear = np.clip(_sum_of_layers(flare) / np.float32(flare.white), 0, 1)
+    if "texture" in flare.layers:
+        linear[colours(flare.request, flare.layers["sun"]) > 0] = 1
+    encoded = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+    return np.asarray(np.rint(255 * encoded), dtype=np.uint8)
 
 
-def write_picture(view: FlareRequest, found: dict[str, F32], path: Path) -> None:
+def _sum_of_layers(flare: Flare) -> F32:
+    """Return the sum of the layers as linear R, G, B, float32[y, x, 3]; the texture alone for its model."""
+    if "texture" in flare.layers:
+        return np.moveaxis(flare.layers["texture"], 0, -1)
+    return colours(flare.request, sum(flare.layers.values(), np.zeros_like(flare.layers["sun"])))
+
+
+def write_picture(flare: Flare, path: Path) -> None:
     """Write the layers as `.png`, or as `.exr` with linear R, G, B and `<layer>.<wavelength>nm` of every band."""
     if path.suffix.lower() == ".png":
-        ok, data = cv2.imencode(".png", picture(view, found)[..., ::-1])
+        ok, data = cv2.imencode(".png", picture(flare)[..., ::-1])
         assert ok
         path.write_bytes(data.tobytes())
         return
     channels: dict[str, Any] = {}
-    for name, layer in found.items():
-        labels = "RGB" if name == "texture" else [f"{nm:.1f}nm" for nm in view.wavelength_nm]
+    for name, layer in flare.layers.items():
+        labels = "RGB" if name == "texture" else [f"{nm:.1f}nm" for nm in flare.request.wavelength_nm]
         channels |= {f"{name}.{label}": band for label, band in zip(labels, layer, strict=True)}
-    if "texture" in found:
-        rgb = np.moveaxis(found["texture"], 0, -1)
-    else:
-        rgb = colours(view, sum(found.values(), np.zeros_like(found["sun"])))
+    rgb = _sum_of_layers(flare)
     channels |= {c: np.ascontiguousarray(rgb[..., k]) for k, c in enumerate("RGB")}
     write_exr(path, channels)
 
 
-def table(view: FlareRequest, found: tuple[Ghost, ...]) -> dict[str, Any]:
+def table(flare: Flare) -> dict[str, Any]:
     """Return the ghosts, the lens and the Sun's direction as plain data."""
-    optics = first_order(view.lens)
+    request = flare.request
+    optics = first_order(request.lens)
     return {
-        "lens": view.lens.name,
-        "model": view.model,
-        "sun_deg": view.sun_deg,
-        "azimuth_deg": view.azimuth_deg,
-        "wavelength_nm": [float(nm) for nm in view.wavelength_nm],
+        "lens": request.lens.name,
+        "model": request.model,
+        "sun_deg": request.sun_deg,
+        "azimuth_deg": request.azimuth_deg,
+        "wavelength_nm": [float(nm) for nm in request.wavelength_nm],
         "efl_mm": optics.efl_mm,
         "entrance_pupil_diameter_mm": optics.entrance_pupil_diameter_mm,
-        "sun_xy_mm": list(view.sun_xy_mm),
-        "total_flux_fraction": float(sum(ghost.flux_fraction for ghost in found)),
-        "ghosts": [asdict(ghost) for ghost in found],
+        "sun_xy_mm": list(request.sun_xy_mm),
+        "total_flux_fraction": float(sum(ghost.flux_fraction for ghost in flare.ghosts)),
+        "ghosts": [asdict(ghost) for ghost in flare.ghosts],
     }
 
 
-def write_table(view: FlareRequest, found: tuple[Ghost, ...], path: Path) -> None:
-    """Write `table` as JSON."""
-    path.write_text(json.dumps(table(view, found), indent=2) + "\n", encoding="utf-8")
+def write_table(flare: Flare, path: Path) -> None:
+    """Write `table` as JSON, null where a value is undefined, such as the centroid of a ghost without light."""
+    write_json(path, table(flare))

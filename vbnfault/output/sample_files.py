@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -19,6 +17,7 @@ from ..pipeline.record import to_sample
 from ..pipeline.spec import Frame
 from . import contact_sheet
 from .exr import write_exr
+from .json_files import write_json
 
 _MARKED_GHOSTS = 10
 
@@ -52,7 +51,7 @@ def write_frame(frame: Frame, folder: Path) -> list[Path]:
         for name in frame.drawn:
             files.append(_write_png(folder / f"annotated_{name}.png", annotated(frame, name)[..., ::-1]))
         path = folder / "parameters.json"
-        path.write_text(json.dumps(_plain(sample), indent=2, allow_nan=False) + "\n", encoding="utf-8")
+        write_json(path, _scalars(sample))
         return [*files, path]
     except OSError as error:
         raise InputError(f"{error.filename or folder}: cannot be written: {error.strerror}") from None
@@ -109,20 +108,10 @@ def _marks(
     return marks
 
 
-def _plain(sample: Sample) -> dict[str, Any]:
-    """Return the scalars of a sample as plain data.
-
-    Arrays become flat lists. NaN and infinity, which JSON lacks, become None.
-    """
-
-    def plain(value: Any) -> Any:
-        if isinstance(value, np.ndarray):
-            return [plain(v) for v in value.ravel().tolist()]
-        if isinstance(value, np.generic):
-            return plain(value.item())
-        return None if isinstance(value, float) and not math.isfinite(value) else value
-
-    return {"sample": sample.index, **{name: plain(value) for name, value in sample.scalars.items()}}
+def _scalars(sample: Sample) -> dict[str, Any]:
+    """Return the index and the scalars of a sample; arrays become flat lists."""
+    flat = {n: v.ravel().tolist() if isinstance(v, np.ndarray) else v for n, v in sample.scalars.items()}
+    return {"sample": sample.index, **flat}
 
 
 def _write_png(path: Path, array: NDArray[np.uint8]) -> Path:

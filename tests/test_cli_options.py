@@ -1,0 +1,80 @@
+"""The options of all commands: their help is complete, and each is tried by some test."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import pytest
+import typer.main
+from typer.testing import CliRunner
+
+from vbnfault import cli
+from vbnfault.output.flare_images import RANGES
+
+COMMANDS: dict[str, Any] = typer.main.get_command(cli.app).commands  # type: ignore[attr-defined]
+
+
+def options() -> Iterator[tuple[str, Any]]:
+    """Yield (command, option) of every option but `--help`."""
+    for name, command in COMMANDS.items():
+        for option in command.params:
+            if option.param_type_name == "option" and "--help" not in option.opts:
+                yield name, option
+
+
+@cache
+def help_of(command: str) -> str:
+    """The help of a command as one line of words, without the frame around its tables."""
+    shown = CliRunner().invoke(cli.app, [command, "--help"], env={"COLUMNS": "300", "TERMINAL_WIDTH": "300"})
+    assert shown.exit_code == 0
+    return re.sub(r"[│\s]+", " ", shown.output)
+
+
+def test_help_shows_the_text_and_the_default_of_every_option() -> None:
+    seen = 0
+    for command, option in options():
+        text = help_of(command)
+        assert option.help, (command, option.name)
+        assert option.help[-1] == ".", (command, option.name)
+        assert option.help in text, (command, option.name)  # a [word] would be taken for markup
+        if isinstance(option.show_default, str):
+            seen += 1
+            assert f"{option.help} [default: ({option.show_default})]" in text, (command, option.name)
+        elif option.default is not None and option.default is not False and not option.required:
+            seen += 1
+            word = "masks" if option.default is True else option.default
+            assert f"{option.help} [default: {word}]" in text, (command, option.name)
+    assert seen > 30
+
+
+def test_a_number_without_a_default_says_what_holds_instead() -> None:
+    counts = {"append"}  # nothing is appended without it
+    for command, option in options():
+        if option.default is None and not option.required and hasattr(option.type, "min"):
+            assert isinstance(option.show_default, str) or option.name in counts, (command, option.name)
+
+
+def test_the_flares_options_have_the_limits_of_the_library() -> None:
+    limits = {
+        option.name: (option.type.min, option.type.max)
+        for name, option in options()
+        if name == "flare" and hasattr(option.type, "min")
+    }
+    for name, low, high in RANGES:
+        assert limits.pop(name) == (low, high), name
+    assert set(limits) == {"wavelength_nm", "focal_length_mm", "reflections"}
+
+
+def test_every_option_is_named_in_a_test() -> None:
+    texts = "".join(path.read_text(encoding="utf-8") for path in Path(__file__).parent.glob("*.py"))
+    missing = []
+    for command, option in options():
+        for name in option.opts:
+            if not re.search(rf"{re.escape(name)}(?![\w-])", texts):
+                missing.append(f"{command} {name}")
+    assert not missing

@@ -1,0 +1,161 @@
+"""Define the commands that plan, build, check and show datasets."""
+
+from __future__ import annotations
+
+import dataclasses
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from ..core.errors import InputError
+from .app import app
+from .options import MOST_PROCESSES, MOST_SAMPLES, SceneArgument, SceneOptions, StoreArgument, grouped, writing
+
+_PANEL = "Datasets"
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class WorkOptions:
+    """Hold the options that say how a build does its work; fields of `dataset.BuildOptions`."""
+
+    workers: Annotated[int, typer.Option(min=1, max=MOST_PROCESSES, help="Number of processes.")] = 1
+    threads: Annotated[
+        int | None,
+        typer.Option(
+            min=1,
+            max=MOST_PROCESSES,
+            help="Number of render threads of each process.",
+            show_default="all cores, divided equally",
+        ),
+    ] = None
+    scheduler: Annotated[
+        str | None, typer.Option(help="Address of a Dask scheduler whose workers build, such as tcp://host:8786.")
+    ] = None
+    overwrite: Annotated[bool, typer.Option(help="Delete an existing store first.")] = False
+    dry_run: Annotated[bool, typer.Option(help="Plan and describe the dataset, but render nothing.")] = False
+    accept_versions: Annotated[
+        bool,
+        typer.Option(
+            help="Complete a store that was begun with other library versions, and record in it which samples "
+            "have which versions."
+        ),
+    ] = False
+
+
+@app.command(rich_help_panel=_PANEL)
+@grouped
+def build(
+    scene: SceneArgument,
+    out: Annotated[Path, typer.Option(help="Path of the Zarr store to make or to resume.")],
+    options: SceneOptions,
+    work: WorkOptions,
+    append: Annotated[
+        int | None,
+        typer.Option(min=1, max=MOST_SAMPLES, help="Number of samples to add to a finished store as a new block."),
+    ] = None,
+) -> None:
+    """Build a dataset, resume an interrupted build, or repair the damaged samples of a store."""
+    from .. import dataset
+
+    how = dataset.BuildOptions(**vars(work))
+    source = dataclasses.replace(options, samples=None).load(scene)
+    summary = dataset.build_scene(source, out, how, samples=options.samples, append=append, source=scene)
+    for line in summary.lines():
+        typer.echo(line)
+
+
+@app.command(rich_help_panel=_PANEL)
+@grouped
+def describe(scene: SceneArgument, options: SceneOptions) -> None:
+    """Describe what a scene will photograph: samples by class and split, geometry, camera, size and time."""
+    from .. import dataset
+
+    source = options.load(scene)
+    for line in dataset.describe_scene(source, source=scene):
+        typer.echo(line)
+
+
+@app.command(rich_help_panel=_PANEL)
+@grouped
+def render(
+    scene: SceneArgument,
+    out: Annotated[Path, typer.Option(help="Folder for the files.")],
+    options: SceneOptions,
+    sample: Annotated[
+        int, typer.Option(min=0, max=100 * MOST_SAMPLES, help="Index of the sample, counted from 0.")
+    ] = 0,
+    append: Annotated[
+        list[int] | None,
+        typer.Option(
+            min=1,
+            max=MOST_SAMPLES,
+            help="Number of samples of a block that was appended to the store; repeat it for each block, in order.",
+        ),
+    ] = None,
+) -> None:
+    """Render one sample of a scene as EXR, PNG and JSON, equal to the stored sample bit for bit."""
+    from ..core import llvm
+
+    source = options.load(scene)
+    blocks = (source.dataset.samples, *(append or ()))
+    if sample >= sum(blocks):
+        raise InputError(f"--sample {sample}: {scene} plans samples 0 to {sum(blocks) - 1}; --samples plans more")
+    llvm.find()
+    from .. import pipeline
+    from ..output import sample_files
+
+    session = pipeline.Session(source, blocks=blocks, source=scene)
+    session.warn_of_assumptions()
+    with writing(out):  # before the work
+        out.mkdir(parents=True, exist_ok=True)
+    for path in sample_files.write_frame(session.frame(sample), out):
+        typer.echo(str(path))
+
+
+@app.command(rich_help_panel=_PANEL)
+def verify(store: StoreArgument) -> None:
+    """Check a store: exit code 0 only if every sample is whole, labelled and as planned."""
+    from .. import dataset
+    from .. import store as stores
+
+    opened = stores.open_store(store)
+    with typer.progressbar(length=opened.samples, label="samples", file=sys.stderr) as bar:
+        report = dataset.verify(opened, progress=bar.update)
+    for problem in report.problems:
+        typer.echo(f"{store}: {problem}", err=True)
+    for line in report.counts.lines():
+        typer.echo(line)
+    if report.problems:
+        many = f"{len(report.problems)} problems" if len(report.problems) > 1 else "1 problem"
+        typer.echo(f"vbnfault: {store}: {many}; run the build command again to repair the store", err=True)
+        raise typer.Exit(1)
+    if report.counts.missing:
+        typer.echo(report.counts.missing_text())
+    typer.echo(f"{store}: {opened.samples} samples, whole, labelled and as planned")
+    typer.echo(f"digest {report.digest}")
+
+
+@app.command(rich_help_panel=_PANEL)
+def digest(store: StoreArgument) -> None:
+    """Print the digest of a store's decoded arrays, which is equal for equal datasets, however they were built."""
+    from .. import store as stores
+
+    opened = stores.open_store(store)
+    with typer.progressbar(length=opened.samples, label="samples", file=sys.stderr) as bar:
+        typer.echo(stores.digest(opened, progress=bar.update))
+
+
+@app.command(rich_help_panel=_PANEL)
+def preview(
+    store: StoreArgument,
+    out: Annotated[Path, typer.Option(help="PNG file to write.")],
+    samples: Annotated[int, typer.Option(min=1, max=400, help="Largest number of samples to show.")] = 16,
+    masks: Annotated[bool, typer.Option(help="Draw the masks of the faults over the images.")] = True,
+) -> None:
+    """Draw a contact sheet of a store, with the masks over the images."""
+    from ..output import contact_sheet
+
+    contact_sheet.preview(store, out, max_samples=samples, masks=masks)
+    typer.echo(str(out))

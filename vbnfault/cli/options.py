@@ -1,0 +1,146 @@
+"""Define the arguments and options that several commands share, and groups of options as dataclasses."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import functools
+import inspect
+import math
+import tomllib
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
+
+import typer
+
+from ..core.errors import InputError, shown
+
+if TYPE_CHECKING:
+    from ..scene.config import Scene
+
+MOST_SAMPLES = 10_000_000
+MOST_PROCESSES = 1024
+MOST_SEED = 2**63 - 1
+
+SceneArgument = Annotated[str, typer.Argument(help="Path of a scene file, or name of a packaged scene.")]
+StoreArgument = Annotated[Path, typer.Argument(help="Path of a Zarr store.")]
+LensArgument = Annotated[str, typer.Argument(help="Path of a prescription, or name of a packaged lens.")]
+
+
+def finite(value: float | None) -> float | None:
+    """Return an option's number. Refuses `nan`, which click accepts within any minimum and maximum."""
+    if value is not None and not math.isfinite(value):
+        raise typer.BadParameter(f"{value} is not a finite number")
+    return value
+
+
+def number(low: float, high: float, text: str, *names: str, unset: str | None = None) -> Any:
+    """Return an option that takes a finite number from `low` to `high`.
+
+    `unset` says in the help what holds without the option, where its default is None.
+    """
+    return typer.Option(*names, callback=finite, min=low, max=high, help=text, show_default=unset or True)
+
+
+FocalLengthOption = Annotated[
+    float | None, number(0.01, 1e5, "Focal length in mm to which the lens is scaled.", unset="as prescribed")
+]
+
+
+def grouped(command: Callable[..., None]) -> Callable[..., None]:
+    """Return a command whose parameters of a dataclass type are replaced by the fields of the dataclass.
+
+    Each field becomes an option of the command, with the field's annotation and default. The command gets the
+    dataclass.
+    """
+    hints = get_type_hints(command, include_extras=True)
+    groups: dict[str, Any] = {}
+    parameters: list[inspect.Parameter] = []
+
+    def add(name: str, default: Any, annotation: Any) -> None:
+        parameters.append(
+            inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
+        )
+
+    for name, parameter in inspect.signature(command).parameters.items():
+        if not dataclasses.is_dataclass(hints[name]):
+            add(name, parameter.default, hints[name])
+            continue
+        groups[name] = hints[name]
+        annotations = get_type_hints(hints[name], include_extras=True)
+        for field in dataclasses.fields(hints[name]):
+            missing = field.default is dataclasses.MISSING
+            add(field.name, inspect.Parameter.empty if missing else field.default, annotations[field.name])
+
+    @functools.wraps(command)
+    def flat(**values: Any) -> None:
+        for name, group in groups.items():
+            values[name] = group(**{field.name: values.pop(field.name) for field in dataclasses.fields(group)})
+        command(**values)
+
+    del flat.__wrapped__  # type: ignore[attr-defined]  # typer must read the parameters below
+    flat.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+    flat.__annotations__ = {p.name: p.annotation for p in parameters} | {"return": None}
+    return flat
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class SceneOptions:
+    """Hold the options that replace values of a scene file."""
+
+    samples: Annotated[
+        int | None,
+        typer.Option(min=1, max=MOST_SAMPLES, help="Number of samples to plan.", show_default="the scene's"),
+    ] = None
+    seed: Annotated[
+        int | None,
+        typer.Option(min=0, max=MOST_SEED, help="Seed of all random numbers.", show_default="the scene's"),
+    ] = None
+    settings: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--set",
+            metavar="KEY=VALUE",
+            help="Replace a value of the scene, such as body.shape=comet.obj; may be repeated.",
+        ),
+    ] = None
+
+    def load(self, scene: str) -> Scene:
+        """Return the scene with these values."""
+        from ..scene import config
+
+        named = {"dataset.samples": self.samples, "dataset.seed": self.seed}
+        values = overrides(self.settings) | {key: value for key, value in named.items() if value is not None}
+        return config.load_scene(scene, values)
+
+
+def overrides(settings: list[str] | None) -> dict[str, Any]:
+    """Return the values of `--set KEY=VALUE` by key. A value that is not TOML is a text. Raises InputError."""
+    values: dict[str, Any] = {}
+    for setting in settings or ():
+        key, equals, text = setting.partition("=")
+        if not equals or not key.strip():
+            raise InputError(f"--set {shown(setting)}: must be KEY=VALUE, such as body.shape=comet.obj")
+        try:
+            values[key.strip()] = tomllib.loads(f"value = {text}")["value"]
+        except tomllib.TOMLDecodeError:
+            values[key.strip()] = text.strip()  # a bare word or path
+        except (ValueError, RecursionError):  # a number of thousands of digits; lists within lists
+            raise InputError(f"--set {shown(setting)}: the value is out of range or nested too deep") from None
+    return values
+
+
+@contextlib.contextmanager
+def writing(path: Path) -> Iterator[None]:
+    """Turn an OSError of a block that writes `path` into an InputError that names it."""
+    try:
+        yield
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written: {error.strerror}") from None
+
+
+def check_image_path(path: Path, *endings: str) -> None:
+    """Refuse a path before the work unless it has one of the endings and its folder exists. Raises InputError."""
+    if path.suffix.lower() not in endings or not path.absolute().parent.is_dir():
+        raise InputError(f"--out {path}: must be a {' or '.join(endings)} in a folder that exists")

@@ -1,0 +1,72 @@
+"""Adapt a prescription to a camera: vary it, scale it, coat it, and close its stop."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ..core.errors import InputError
+from .aperture import closed_to
+from .family import relative
+from .gaussian import scaled_to_field, scaled_to_focal_length
+from .prescription import Prescription, load_lens
+
+
+@dataclass(frozen=True, kw_only=True)
+class LensRequest:
+    """Name a lens and what is to be changed in it; None changes nothing.
+
+    The changes are made in the order of the attributes. Raises InputError if two of them contradict each other.
+
+    Attributes
+    ----------
+    lens
+        Path of a prescription, or name of a packaged lens.
+    vary_seed, spread
+        Replace the lens by a random relative of this seed; see `family.relative` for `spread`.
+    focal_length_mm
+        Scale the lens to this focal length.
+    fov_deg, sensor_width_mm
+        Scale the lens so that this width of the sensor spans this field of view. Both or none.
+    coating
+        Put this coating on every surface between glass and air: none, mgf2, v or bbar.
+    f_number
+        Close the stop to this f-number.
+    """
+
+    lens: str | Path
+    vary_seed: int | None = None
+    spread: float = 0.03
+    focal_length_mm: float | None = None
+    fov_deg: float | None = None
+    sensor_width_mm: float | None = None
+    coating: str | None = None
+    f_number: float | None = None
+
+    def __post_init__(self) -> None:
+        for key, other in (("fov_deg", "sensor_width_mm"), ("sensor_width_mm", "fov_deg")):
+            value = getattr(self, key)
+            if value is not None and getattr(self, other) is None:
+                raise InputError(f"{key} = {value:g}: needs {other} beside it")
+        if self.focal_length_mm is not None and self.fov_deg is not None:
+            raise InputError(
+                f"focal_length_mm = {self.focal_length_mm:g}: contradicts fov_deg = {self.fov_deg:g}; leave one out"
+            )
+
+
+def adapted_lens(request: LensRequest) -> Prescription:
+    """Read the lens of a request and return it with the changes. Raises InputError."""
+    lens = load_lens(request.lens)
+    if request.vary_seed is not None:
+        lens = relative(lens, np.random.default_rng(request.vary_seed), spread=request.spread)
+    if request.focal_length_mm is not None:
+        lens = scaled_to_focal_length(lens, request.focal_length_mm)
+    if request.fov_deg is not None and request.sensor_width_mm is not None:
+        lens = scaled_to_field(lens, request.fov_deg, request.sensor_width_mm)
+    if request.coating is not None:
+        lens = lens.coated(request.coating)
+    if request.f_number is not None:
+        lens = closed_to(lens, request.f_number, "f_number")
+    return lens

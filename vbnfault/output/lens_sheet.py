@@ -1,0 +1,131 @@
+"""Show a prescription: its first-order properties as a table, and its layout as a figure (`vbnfault lens`)."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import isotonic_regression
+
+from ..lens import Prescription, first_order, open_f_number
+from ..lens.rays import real_pupil_diameter_mm, trace
+from .json_files import write_json
+
+F64 = NDArray[np.float64]
+
+_FIELDS = (0.0, 0.5, 1.0)  # fractions of the half field
+_COLOURS = ("#2f6fb3", "#3c9a5f", "#c4632f")
+_RAYS = 7
+_GLASS = "#cfe3f2"
+_FAINT = "#777777"
+# Share of the figure's width between two row numbers. Two digits of the font take a little less.
+_NUMBER_GAP = 0.019
+
+
+def figures(lens: Prescription) -> dict[str, float]:
+    """Return the first-order properties of a lens, the f-number of its real beam, and its scale."""
+    return asdict(first_order(lens)) | {"real_f_number": open_f_number(lens), "scale": lens.scale}
+
+
+def write_table(lens: Prescription, path: Path) -> None:
+    """Write name, source and `figures` as JSON; null for a value that is infinite, such as a pupil's position."""
+    write_json(path, {"name": lens.name, "source": lens.source, **figures(lens)})
+
+
+def draw(lens: Prescription, path: Path, *, half_field_deg: float = 20.0) -> None:
+    """Write a drawing of the lens in its meridional plane to an image file.
+
+    Each surface carries its row number, counted from 0 at the front with the stop included, as in the pairs of
+    `vbnfault flare`. Rays come from the axis, half of `half_field_deg` and the whole of it.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    optics = first_order(lens)
+    figure = Figure(figsize=(10, 5.4), dpi=120)
+    FigureCanvasAgg(figure)
+    axes = figure.add_subplot()
+    _draw_rays(axes, lens, half_field_deg)
+    outline = _draw_surfaces(axes, lens)
+    sensor = lens.vertices_mm[-1] + optics.bfd_mm
+    half = optics.efl_mm * np.tan(np.radians(half_field_deg))
+    axes.plot([sensor, sensor], [-half, half], color="black", lw=2)
+    axes.set_aspect("equal")
+    _draw_row_numbers(axes, outline)
+    axes.set(
+        xlabel="z / mm",
+        ylabel="y / mm",
+        title=f"{lens.name}, f = {optics.efl_mm:.2f} mm, f/{open_f_number(lens):.2f}",
+    )
+    axes.legend(
+        loc="lower center", bbox_to_anchor=(0.5, -0.32), ncols=len(_FIELDS), frameon=False, title="field angle"
+    )
+    figure.savefig(path, bbox_inches="tight")
+
+
+def _edges(lens: Prescription) -> list[tuple[F64, F64]]:
+    """Return the profile of each surface: z and y in mm, from its lower to its upper rim."""
+    profiles = []
+    for z, surface in zip(lens.vertices_mm, lens.surfaces, strict=True):
+        height = np.linspace(-1, 1, 121) * surface.semi_diameter_mm
+        profiles.append((z + surface.sag_mm(height), height))
+    return profiles
+
+
+def _draw_surfaces(axes: Any, lens: Prescription) -> list[tuple[float, float]]:
+    """Draw glass and stop; return the (z, y) of each row's upper end in mm, to which its number belongs."""
+    profiles, ends = _edges(lens), []
+    for k, surface in enumerate(lens.surfaces):
+        z, height = profiles[k]
+        if surface.stop:
+            rim = surface.semi_diameter_mm
+            for side in (-1, 1):
+                axes.plot([lens.vertices_mm[k]] * 2, [side * rim, side * 1.5 * rim], color="black", lw=2.5)
+            ends.append((float(lens.vertices_mm[k]), 1.5 * rim))
+            continue
+        ends.append((float(z[-1]), float(height[-1])))
+        axes.plot(z, height, color="black", lw=0.9)
+        if surface.medium.nd > 1 and k + 1 < len(profiles):
+            back_z, back_height = profiles[k + 1]
+            axes.fill(np.append(z, back_z[::-1]), np.append(height, back_height[::-1]), color=_GLASS, lw=0)
+            for end in (0, -1):
+                axes.plot([z[end], back_z[end]], [height[end], back_height[end]], color="black", lw=0.9)
+    return ends
+
+
+def _draw_rays(axes: Any, lens: Prescription, half_field_deg: float) -> None:
+    """Draw the rays of each field that reach the sensor."""
+    optics, pupil = first_order(lens), real_pupil_diameter_mm(lens)
+    front = min(float(z.min()) for z, _ in _edges(lens))
+    # rays start on a plane in front of all surfaces and aim at the entrance pupil
+    start = front - 0.12 * (lens.vertices_mm[-1] + optics.bfd_mm)
+    for fraction, colour in zip(_FIELDS, _COLOURS, strict=True):
+        slope = np.tan(np.radians(fraction * half_field_deg))
+        height = np.linspace(-0.499, 0.499, _RAYS) * pupil
+        origin = np.column_stack(
+            [np.zeros(_RAYS), height - slope * (optics.entrance_pupil_mm - start), np.full(_RAYS, start)]
+        )
+        traced = trace(lens, origin, np.tile([0.0, slope, 1.0], (_RAYS, 1)))
+        axes.plot([], [], color=colour, label=f"{fraction * half_field_deg:g}°")
+        for ray in np.moveaxis(traced.points_mm[:, traced.arrives], 1, 0):
+            axes.plot(ray[:, 2], ray[:, 1], color=colour, lw=0.6)
+
+
+def _draw_row_numbers(axes: Any, ends: list[tuple[float, float]]) -> None:
+    """Write the row numbers in one line above the drawing, each joined to the upper end of its surface.
+
+    The numbers keep a distance from each other; within that, each is as near to its surface as possible.
+    """
+    z, y = np.array(ends).T
+    low, high = axes.get_ylim()
+    left, right = axes.get_xlim()
+    line = max(high, y.max()) + 0.04 * (high - low)
+    steps = _NUMBER_GAP * (right - left) * np.arange(len(z))
+    spread = isotonic_regression(z - steps).x + steps
+    for row, (at_z, at_y, number_z) in enumerate(zip(z, y, spread, strict=True)):
+        axes.plot([number_z, at_z], [line, at_y], color=_FAINT, lw=0.4)
+        axes.text(number_z, line, str(row), fontsize=7, ha="center", va="bottom", color="black")
+    axes.set_ylim(low, line + 0.06 * (high - low))

@@ -1,0 +1,224 @@
+"""Measure a simulated sensor as EMVA 1288 defines, and write the results as JSON, figure and text."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..camera.characterise import Characterisation, Result, Settings, VirtualCamera, characterise, pictures
+from ..core.errors import InputError
+from ..detector.chain import Device
+from ..detector.sensor import load_sensor
+from .json_files import write_json
+
+F64 = NDArray[np.float64]
+
+_COLOURS = {"R": "tab:red", "G": "tab:green", "B": "tab:blue", "N": "tab:brown", "W": "0.4", "M": "0.2"}
+_LEAST_PIXELS = 16
+_MOST_BINS = 200
+# title, x axis and y axis of each panel
+_PANELS = (
+    ("photon transfer", "signal / DN", "temporal variance / DN²"),
+    ("response", "photons per pixel", "signal / DN"),
+    ("dark signal", "exposure / s", "mean / DN"),
+    ("spectra of the mean dark image", "spatial frequency / cycles per pixel", "amplitude / DN rms"),
+    ("dark signal of each pixel (DSNU)", "difference from the mean / e", "number of pixels"),
+    ("response of each pixel (PRNU)", "difference from the mean / %", "number of pixels"),
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SensorRequest:
+    """Name a sensor and say how to measure it. Raises InputError if a value is out of range.
+
+    Attributes
+    ----------
+    sensor
+        Path of a sensor file, or name of a packaged sensor.
+    individual
+        Seed of the device: devices of one sensor differ in their defects and fixed patterns.
+    pixels
+        Width and height of the measured part of the sensor, at most the whole sensor.
+    wavelength_nm
+        Wavelength of the light; None takes the wavelength at which each channel is most sensitive.
+    temperature_K
+        Temperature of the sensor; None takes that of its file.
+    points, stack
+        See `camera.characterise.Settings`.
+    """
+
+    sensor: str | Path
+    individual: int = 1
+    pixels: int = 512
+    wavelength_nm: float | None = None
+    temperature_K: float | None = None
+    points: int = 40
+    stack: int = 24
+
+    def __post_init__(self) -> None:
+        if self.pixels < _LEAST_PIXELS:
+            raise InputError(f"pixels = {self.pixels}: must be at least {_LEAST_PIXELS}")
+
+    @property
+    def settings(self) -> Settings:
+        """Return the extent of the measurement."""
+        return Settings(points=self.points, stack=self.stack)
+
+    @property
+    def images(self) -> int:
+        """Return how many images `measure` takes."""
+        return pictures(self.settings)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SensorReport:
+    """Hold the results of a measurement, one for each channel."""
+
+    request: SensorRequest
+    sensor: str
+    temperature_K: float
+    channels: Mapping[str, Characterisation]
+
+    @property
+    def title(self) -> str:
+        """Return a line that names the sensor and the conditions."""
+        title = f"{self.sensor}, individual {self.request.individual}, {self.temperature_K:g} K"
+        return title if self.request.wavelength_nm is None else f"{title}, {self.request.wavelength_nm:g} nm"
+
+    def write(self, folder: Path) -> list[Path]:
+        """Write `emva1288.json` and `emva1288.png` to a folder and return their paths.
+
+        The JSON has null where a value is undefined, such as a logarithm of 0.
+        """
+        paths = [folder / "emva1288.json", folder / "emva1288.png"]
+        table = {
+            "detector": self.sensor,
+            "individual": self.request.individual,
+            "temperature_K": self.temperature_K,
+            "wavelength_nm": self.request.wavelength_nm,
+            "channels": [channel.to_dict() for channel in self.channels.values()],
+        }
+        write_json(paths[0], table, indent=1)
+        draw(self.channels, self.title, paths[1])
+        return paths
+
+    def lines(self) -> list[str]:
+        """Return lines of text with a row per parameter and a column per channel."""
+        lines = [f"{'':<30}" + "".join(f"{name:>12}" for name in self.channels)]
+        for field in fields(Result):
+            values = (getattr(channel.result, field.name) for channel in self.channels.values())
+            lines.append(f"{field.name:<30}" + "".join(f"{value:>12.5g}" for value in values))
+        return lines
+
+
+def measure(request: SensorRequest, progress: Callable[[int], None] | None = None) -> SensorReport:
+    """Characterise a sensor; `progress` is called with 1 after each image. Raises InputError."""
+    sensor = load_sensor(request.sensor)
+    shape = min(request.pixels, sensor.height_px), min(request.pixels, sensor.width_px)
+    device = Device(sensor, request.individual, shape=shape, temperature_K=request.temperature_K)
+    camera = VirtualCamera(device, wavelength_nm=request.wavelength_nm)
+    channels = characterise(
+        camera,
+        sites=camera.sites,
+        photons_at_saturation=camera.photons_at_saturation,
+        settings=request.settings,
+        progress=progress,
+    )
+    return SensorReport(request=request, sensor=sensor.name, temperature_K=device.temperature_K, channels=channels)
+
+
+def draw(channels: Mapping[str, Characterisation], title: str, path: Path) -> None:
+    """Write a PNG figure of photon transfer, response, dark signal, spectra and histograms."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(15, 9), layout="constrained")
+    FigureCanvasAgg(figure)
+    figure.suptitle(f"{title}: EMVA 1288")
+    axes = figure.subplots(2, 3)
+    for name, channel in channels.items():
+        colour = _COLOURS.get(name[0], "0.3")
+        _draw_signals(axes[0], name, channel, colour)
+        _draw_spatial(axes[1], name, channel, colour)
+    top = max(float(channel.transfer.variance_dn2.max()) for channel in channels.values())
+    axes[0, 0].set_ylim(top * 1e-4, top * 2)
+    _set_ticks(axes)
+    for panel, (head, x, y) in zip(axes.ravel(), _PANELS, strict=True):
+        panel.set(title=head, xlabel=x, ylabel=y)
+        panel.grid(alpha=0.3)
+        panel.legend(fontsize=7)
+    figure.savefig(path, dpi=100)
+
+
+def _draw_signals(panels: Any, name: str, channel: Characterisation, colour: str) -> None:
+    """Draw photon transfer, response and dark signal of one channel."""
+    transfer, result = channel.transfer, channel.result
+    signal = transfer.mean_dn - transfer.dark_mean_dn
+    noise = np.maximum(transfer.variance_dn2 - transfer.dark_variance_dn2, 1e-3)
+    panels[0].loglog(signal, noise, ".", color=colour, label=f"{name}: K = {result.gain_dn_per_e:.4g} DN/e")
+    panels[0].loglog(signal, result.gain_dn_per_e * signal, "-", lw=0.8, color=colour)
+    panels[1].plot(
+        transfer.photons, signal, ".-", lw=0.6, color=colour, label=f"{name}: η = {result.quantum_efficiency:.3f}"
+    )
+    panels[2].plot(
+        channel.dark_exposure_s,
+        channel.dark_mean_dn,
+        ".-",
+        color=colour,
+        label=f"{name}: {result.dark_current_mean_e_s:.3g} e/s",
+    )
+
+
+def _draw_spatial(panels: Any, name: str, channel: Characterisation, colour: str) -> None:
+    """Draw the spectra and the histograms of DSNU and PRNU of one channel."""
+    result, spectrum = channel.result, channel.spectrum
+    for kind, style in (("rows", "-"), ("columns", ":")):
+        panels[0].semilogy(
+            spectrum.frequency[kind],
+            spectrum.dark_dn[kind],
+            style,
+            lw=0.7,
+            color=colour,
+            label=f"{name}, along {kind}",
+        )
+    for panel, values, label in (
+        (panels[1], channel.dsnu_map_dn / result.gain_dn_per_e, f"DSNU {result.dsnu_e:.3g} e"),
+        (panels[2], 100 * channel.prnu_map, f"PRNU {result.prnu_percent:.3g} %"),
+    ):
+        count, edge = np.histogram(values, bins=_bins(values))
+        middle = (edge[1:] + edge[:-1]) / 2
+        panel.semilogy(middle, np.maximum(count, 0.5), color=colour, lw=0.8, label=f"{name}: {label}")
+
+
+def _set_ticks(axes: Any) -> None:
+    """Write the ticks as plain numbers, as few as fit."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
+
+    axes[0, 0].xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axes[0, 0].xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:.0f}"))
+    axes[0, 0].xaxis.set_minor_formatter(NullFormatter())
+    axes[0, 1].xaxis.set_major_locator(MaxNLocator(6))
+    axes[0, 2].ticklabel_format(useOffset=False)
+    for formatter in (axes[1, 0].yaxis.set_major_formatter, axes[1, 0].yaxis.set_minor_formatter):
+        formatter(FuncFormatter(lambda value, _: f"{value:.3g}"))
+
+
+def _bins(values: F64) -> F64:
+    """Return the edges of at most about 200 bins for a histogram.
+
+    Averages of integers are multiples of a step. Each bin is a whole number of these steps wide.
+    """
+    levels = np.unique(values)
+    extent = float(levels[-1] - levels[0])
+    if extent == 0:
+        return np.asarray([levels[0] - 0.5, levels[0] + 0.5])
+    apart = np.diff(levels)
+    step = float(apart[apart > 1e-5 * extent].min())
+    width = step * math.ceil(extent / step / _MOST_BINS)
+    return np.asarray(levels[0] - step / 2 + width * np.arange(math.ceil((extent + step) / width) + 1))
