@@ -219,7 +219,7 @@ def test_a_build_tells_how_a_lens_was_scaled(tmp_path: Path) -> None:
     assert runner.invoke(app, ["lens", "nikkor_35_f2p8", *by_field]).exit_code == 0
     assert json.loads(made.read_text())["scale"] == pytest.approx(focal / 35.9993, rel=1e-5)
     refused = runner.invoke(app, ["lens", "nikkor_35_f2p8", "--f-number", "1.2"])
-    assert "--f-number = 1.2: must be from 2.79" in str(refused.exception)
+    assert "f_number = 1.2: must be from 2.79" in str(refused.exception)
 
 
 # --- what scaling keeps -----------------------------------------------------------------------------------------

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +14,9 @@ from ..lens import Prescription, first_order, open_f_number
 from ..lens.rays import real_pupil_diameter_mm, trace
 from .json_files import write_json
 
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
 F64 = NDArray[np.float64]
 
 _FIELDS = (0.0, 0.5, 1.0)  # fractions of the half field
@@ -21,8 +24,8 @@ _COLOURS = ("#2f6fb3", "#3c9a5f", "#c4632f")
 _RAYS = 7
 _GLASS = "#cfe3f2"
 _FAINT = "#777777"
-# Share of the figure's width between two row numbers. Two digits of the font take a little less.
-_NUMBER_GAP = 0.019
+_FONT_PT = 7
+_NUMBER_GAP_PT = 11  # between the centres of two row numbers; two digits are 9 pt wide
 
 
 def figures(lens: Prescription) -> dict[str, float]:
@@ -36,16 +39,22 @@ def write_table(lens: Prescription, path: Path) -> None:
 
 
 def draw(lens: Prescription, path: Path, *, half_field_deg: float = 20.0) -> None:
-    """Write a drawing of the lens in its meridional plane to an image file.
+    """Write `layout` to an image file."""
+    layout(lens, half_field_deg=half_field_deg).savefig(path, bbox_inches="tight")
+
+
+def layout(lens: Prescription, *, half_field_deg: float = 20.0) -> Figure:
+    """Return a drawing of the lens in its meridional plane.
 
     Each surface carries its row number, counted from 0 at the front with the stop included, as in the pairs of
-    `vbnfault flare`. Rays come from the axis, half of `half_field_deg` and the whole of it.
+    `vbnfault flare`. Rays come from the axis, half of `half_field_deg`, and the whole of it. The angle of each
+    bundle stands beside the sensor.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     optics = first_order(lens)
-    figure = Figure(figsize=(10, 5.4), dpi=120)
+    figure = Figure(figsize=(10, 5.6), dpi=120)
     FigureCanvasAgg(figure)
     axes = figure.add_subplot()
     _draw_rays(axes, lens, half_field_deg)
@@ -60,10 +69,7 @@ def draw(lens: Prescription, path: Path, *, half_field_deg: float = 20.0) -> Non
         ylabel="y / mm",
         title=f"{lens.name}, f = {optics.efl_mm:.2f} mm, f/{open_f_number(lens):.2f}",
     )
-    axes.legend(
-        loc="lower center", bbox_to_anchor=(0.5, -0.32), ncols=len(_FIELDS), frameon=False, title="field angle"
-    )
-    figure.savefig(path, bbox_inches="tight")
+    return figure
 
 
 def _edges(lens: Prescription) -> list[tuple[F64, F64]]:
@@ -109,7 +115,15 @@ def _draw_rays(axes: Any, lens: Prescription, half_field_deg: float) -> None:
             [np.zeros(_RAYS), height - slope * (optics.entrance_pupil_mm - start), np.full(_RAYS, start)]
         )
         traced = trace(lens, origin, np.tile([0.0, slope, 1.0], (_RAYS, 1)))
-        axes.plot([], [], color=colour, label=f"{fraction * half_field_deg:g}°")
+        axes.annotate(
+            f"{fraction * half_field_deg:g}°",
+            (lens.vertices_mm[-1] + optics.bfd_mm, optics.efl_mm * slope),
+            xytext=(4, 0),
+            textcoords="offset points",
+            fontsize=_FONT_PT + 1,
+            va="center",
+            color=colour,
+        )
         for ray in np.moveaxis(traced.points_mm[:, traced.arrives], 1, 0):
             axes.plot(ray[:, 2], ray[:, 1], color=colour, lw=0.6)
 
@@ -122,10 +136,12 @@ def _draw_row_numbers(axes: Any, ends: list[tuple[float, float]]) -> None:
     z, y = np.array(ends).T
     low, high = axes.get_ylim()
     left, right = axes.get_xlim()
-    line = max(high, y.max()) + 0.04 * (high - low)
-    steps = _NUMBER_GAP * (right - left) * np.arange(len(z))
+    line = high + 0.04 * (high - low)
+    axes.set_ylim(low, line + 0.06 * (high - low))
+    axes.apply_aspect()
+    width_pt = axes.get_window_extent().width * 72 / axes.figure.dpi
+    steps = _NUMBER_GAP_PT / width_pt * (right - left) * np.arange(len(z))
     spread = isotonic_regression(z - steps).x + steps
     for row, (at_z, at_y, number_z) in enumerate(zip(z, y, spread, strict=True)):
         axes.plot([number_z, at_z], [line, at_y], color=_FAINT, lw=0.4)
-        axes.text(number_z, line, str(row), fontsize=7, ha="center", va="bottom", color="black")
-    axes.set_ylim(low, line + 0.06 * (high - low))
+        axes.text(number_z, line, str(row), fontsize=_FONT_PT, ha="center", va="bottom", color="black")
