@@ -394,11 +394,11 @@ def test_files_must_say_what_no_default_can(key: str, tmp_path: Path) -> None:
 
 def test_the_command_writes_report_and_plots(tmp_path: Path) -> None:
     out = tmp_path / "report"
-    run = CliRunner().invoke(
-        app, ["detector", "generic_cmos", "--out", str(out), "--pixels", "64", "--points", "12", "--stack", "4"]
-    )
+    size = ["--pixels", "64", "--points", "12", "--stack", "4"]
+    run = CliRunner().invoke(app, ["detector", "generic_cmos", "--out", str(out), "--temperature-k", "280", *size])
     assert run.exit_code == 0, run.output
     report = json.loads((out / "emva1288.json").read_text())
+    assert report["temperature_K"] == 280
     assert [one["channel"] for one in report["channels"]] == ["R", "G", "B"]
     assert report["channels"][0]["gain_dn_per_e"] == pytest.approx(0.2986, rel=0.1)
     assert (out / "emva1288.png").read_bytes()[:4] == b"\x89PNG"

@@ -452,6 +452,13 @@ def test_a_flare_is_a_table_and_a_picture(
     assert f"{len(table['ghosts'])} ghosts hold" in said.out
     assert len(table["wavelength_nm"]) == 8
     assert picture.stat().st_size > 1000
+    level = re.search(r"white level (\S+); --white \1 gives", said.out)
+    assert level
+    bright = picture.read_bytes()
+    dimmed = ("--white", 10 * float(level[1]), "--veil-fraction", 0)
+    assert run(monkeypatch, "flare", "tessar_50_f2p8", *options, *dimmed) == 0
+    assert "white level" not in capsys.readouterr().out
+    assert picture.read_bytes() != bright
 
 
 def test_a_flares_progress_is_told_by_wavelengths() -> None:

@@ -24,7 +24,7 @@ COMMANDS = {
     "describe": "quickstart --samples 8",
     "verify": "{}/s.zarr",
     "digest": "{}/s.zarr",
-    "preview": "{}/s.zarr --out {}/p.png --samples 1",
+    "preview": "{}/s.zarr --out {}/p.png --samples 1 --masks",
     "lens": "tessar_50_f2p8 --out {}/l.png",
     "flare": "tessar_50_f2p8 --sun-deg 9 --model paraxial --pixels 16 --wavelength-nm 550 --out {}/f.png",
     "detector": "cmv4000 --out {}/d --pixels 64 --points 8 --stack 2",
