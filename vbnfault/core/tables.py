@@ -31,8 +31,8 @@ _MOST_NAMED = 5
 _ALTERNATIVE = re.compile(r"(str|float|int|bool)$|(constrained|literal|function|tuple|list|dict|lax|json)\b")
 # A message of a model's own check that begins with the key and the value.
 _BEGINS_WITH_KEY = re.compile(r"\w+ = ")
-# Types of pydantic's errors for a value that is no table, and for an unknown key.
-_NO_TABLE = ("model_type", "dataclass_type", "dict_type", "model_attributes_type")
+_COUNTS = {2: "two", 3: "three"}
+# Types of pydantic's errors for an unknown key.
 _UNKNOWN = ("extra_forbidden", "unexpected_keyword_argument")
 
 Fraction = Annotated[float, Field(ge=0, le=1)]
@@ -127,6 +127,24 @@ def parse(kind: type[T], plain: Mapping[str, Any], *, source: str, overrides: Se
     raise InputError(f"{source}: {sentence(errors, _schema(model))}{mark}")
 
 
+def check(checks: TypeAdapter[Any], value: Any, where: str, *, whole_value: bool = False) -> Any:
+    """Return a value after its check. Raises InputError; its message begins with `where`, the key of the value.
+
+    With `whole_value`, the message shows the whole value, also where one of its parts is wrong.
+    """
+    try:
+        return checks.validate_python(value)
+    except ValidationError as error:
+        schema = checks.json_schema()
+        details = error.errors(include_url=False)
+        if not whole_value:
+            source, separator, key = where.rpartition(": ")
+            raise InputError(f"{source}{separator}{sentence(details, schema, key)}") from None
+        reason = next((str(d["ctx"]["error"]) for d in details if d["type"] == "value_error"), "")
+        wanted = reason or f"must be {_allowed(schema, schema, details[0]['msg'])}"
+        raise InputError(f"{where}{_shown(value)}: {wanted}") from None
+
+
 def _missing(plain: Any, node: Mapping[str, Any], root: Mapping[str, Any]) -> list[tuple[str, ...]]:
     """Return the locations of all required keys that plain data lack, also within tables that are missing."""
     found: list[tuple[str, ...]] = []
@@ -167,23 +185,44 @@ def forget_schemas() -> None:
 # --- error messages ---------------------------------------------------------------------------------------------
 
 
-def sentence(details: Sequence[Any], schema: Mapping[str, Any]) -> str:
+def sentence(details: Sequence[Any], schema: Mapping[str, Any], where: str = "") -> str:
     """Return pydantic's errors as one sentence that names the key, the value and what is allowed.
 
     All unknown keys and all missing keys are named at once, since one is often a misspelling of the other. Of
-    wrong values only the first is named. `schema` is the JSON Schema of the data.
+    wrong values only one is named: the first of those that lie deepest in the data.
+
+    Parameters
+    ----------
+    details
+        What `ValidationError.errors` returns.
+    schema
+        JSON Schema of the data.
+    where
+        Key of the data, if they are the value of one.
     """
-    unknown = [_unknown(detail["loc"], schema) for detail in details if detail["type"] in _UNKNOWN]
-    if len(unknown) > _MOST_NAMED:
-        unknown[_MOST_NAMED:] = [f"and {len(unknown) - _MOST_NAMED} more unknown keys"]
-    missing = [
-        _dotted(_locate(detail["loc"], schema)[0])
+    located = [
+        (detail, *_locate(detail["loc"][:-1] if detail["type"] in _UNKNOWN else detail["loc"], schema))
         for detail in details
+    ]
+    clauses = []
+    for detail, keys, node in located:
+        if detail["type"] in _UNKNOWN:
+            known = [key for choice in _choices(node, schema) for key in choice.get("properties", {})]
+            hint = did_you_mean(str(detail["loc"][-1]), known)
+            clauses.append(f"{_dotted([*keys, detail['loc'][-1]], where)}: unknown key{hint}")
+    if len(clauses) > _MOST_NAMED:
+        clauses[_MOST_NAMED:] = [f"and {len(clauses) - _MOST_NAMED} more unknown keys"]
+    missing = [
+        _dotted(keys, where)
+        for detail, keys, _ in located
         if detail["type"] == "missing" and isinstance(detail["loc"][-1], str)
     ]
     if missing:
-        unknown.append(f"{', '.join(missing)}: {'is' if len(missing) == 1 else 'are'} missing")
-    return "; ".join(unknown) or _wrong(details[0], schema)
+        clauses.append(f"{', '.join(missing)}: {'is' if len(missing) == 1 else 'are'} missing")
+    if clauses:
+        return "; ".join(clauses)
+    deepest = max(located, key=lambda entry: (entry[0]["type"] == "value_error", len(entry[1])))
+    return _wrong(*deepest, schema, where)
 
 
 def did_you_mean(word: str, known: Sequence[str]) -> str:
@@ -192,32 +231,25 @@ def did_you_mean(word: str, known: Sequence[str]) -> str:
     return f" (did you mean {close[0]}?)" if close else f"; known: {', '.join(known)}"
 
 
-def _unknown(loc: Sequence[int | str], schema: Mapping[str, Any]) -> str:
-    """Return the clause for an unknown key, with the nearest known one."""
-    keys, table = _locate(loc[:-1], schema)
-    known = [key for choice in _choices(table, schema) for key in choice.get("properties", {})]
-    return f"{_dotted([*keys, loc[-1]])}: unknown key{did_you_mean(str(loc[-1]), known)}"
-
-
-def _wrong(detail: Any, schema: Mapping[str, Any]) -> str:
+def _wrong(
+    detail: Any, keys: list[int | str], node: Mapping[str, Any], schema: Mapping[str, Any], where: str
+) -> str:
     """Return the clause for a wrong value."""
     value, message = detail.get("input"), str(detail.get("ctx", {}).get("error", detail["msg"]))
-    keys, node = _locate(detail["loc"], schema)
     if detail["type"] == "missing":  # a list that is too short
         keys, node = _locate(detail["loc"][:-1], schema)
-    elif detail["type"] == "value_error":
-        if keys and _shown(value) == "" and _BEGINS_WITH_KEY.match(message):
-            return f"{_dotted(keys)}.{message}"
-        return f"{_dotted(keys)}{_shown(value)}: {message}" if keys else message
-    elif detail["type"] in _NO_TABLE and "type" not in node:
-        message = "a table"
-    return f"{_dotted(keys)}{_shown(value)}: must be {_allowed(_merged(node, schema), message)}"
+    key = _dotted(keys, where)
+    if detail["type"] != "value_error":
+        return f"{key}{_shown(value)}: must be {_allowed(node, schema, message)}"
+    if not _shown(value) and (not key or _BEGINS_WITH_KEY.match(message)):
+        return f"{key}.{message}".removeprefix(".")
+    return f"{key}{_shown(value)}: {message}"
 
 
-def _dotted(keys: Sequence[int | str]) -> str:
-    """Return keys as one dotted key for an error message; the index of a list is in brackets."""
+def _dotted(keys: Sequence[int | str], where: str = "") -> str:
+    """Return keys behind `where` as one dotted key for an error message; the index of a list is in brackets."""
     parts = [f"[{key}]" if isinstance(key, int) else f".{resources.shown_path(key)}" for key in keys]
-    return "".join(parts).removeprefix(".")
+    return f"{where}{''.join(parts)}".removeprefix(".")
 
 
 def _shown(value: Any) -> str:
@@ -226,36 +258,38 @@ def _shown(value: Any) -> str:
     return "" if described or hasattr(value, "kwargs") else f" = {shown(value)}"
 
 
-def _allowed(schema: Mapping[str, Any], message: str) -> str:
+def _allowed(node: Mapping[str, Any], root: Mapping[str, Any], message: str) -> str:
     """Return in words which values a key takes, from its JSON Schema, or else from pydantic's message."""
-    items = schema.get("prefixItems")
-    if items:
-        each = _allowed(items[0], "a value").removeprefix("a ")
-        count = {2: "two", 3: "three"}.get(len(items), str(len(items)))
-        return f"a list of {count} values, each a {each}"
-    if schema.get("type") == "array" and schema.get("minItems") and "at least" in message:
-        return f"a list of at least {schema['minItems']}"
+    choices = _choices(node, root)
+    if len(choices) == 1:
+        return _kind(choices[0], root) or message.replace("Input should be ", "")
+    words = dict.fromkeys(_kind(choice, root) for choice in choices)
+    return ", or ".join(word for word in words if word) or message
+
+
+def _kind(schema: Mapping[str, Any], root: Mapping[str, Any]) -> str:
+    """Return in words which values a JSON Schema without alternatives allows; empty where it does not say."""
+    names = schema.get("enum", [schema["const"]] if "const" in schema else [])
+    if names:
+        shown_names = [repr(name) for name in names]
+        return " or ".join(filter(None, [", ".join(shown_names[:-1]), shown_names[-1]]))
     if schema.get("pattern", "").startswith("^("):
         options = schema["pattern"].removeprefix("^(").removesuffix(")$").replace("[a-z0-9_]+", "<fault>")
         return f"one of {', '.join(options.split('|'))}"
-    word = f"{schema['const']!r} or " if "const" in schema else ""
-    interval = _interval(schema)
-    if interval:
-        kind = "a whole number" if schema.get("type") == "integer" else "a number"
-        one_sided = "aximum" not in "".join(schema)
-        return f"{word}{'a finite number' if one_sided and kind == 'a number' else kind} {interval}"
-    if word:
-        return f"{word}a number"
-    plain = message.replace("Input should be ", "")
-    words = {
-        "a valid string": "a string",
-        "an object": "a table",
-        "a valid boolean": "true or false",
-        "a valid array": "a list",
-        "a valid integer": "a whole number",
-        "a valid number": "a number",
-    }
-    return words.get(plain, plain)
+    if schema.get("type") in ("number", "integer"):
+        whole, interval = schema["type"] == "integer", _interval(schema)
+        finite = not whole and "aximum" not in "".join(schema)
+        noun = "a whole number" if whole else "a finite number" if finite else "a number"
+        return f"{noun} {interval}".strip()
+    items = schema.get("prefixItems")
+    if items:
+        each = _allowed(items[0], root, "a value").removeprefix("a ")
+        return f"a list of {_COUNTS.get(len(items), str(len(items)))} values, each a {each}"
+    if schema.get("type") == "array":
+        count = f" of at least {schema['minItems']}" if schema.get("minItems") else ""
+        tables = "properties" in _resolved(schema.get("items", {}), root)
+        return f"a list{count}" + (" of tables" if tables and not count else "")
+    return {"string": "a string", "object": "a table", "boolean": "true or false"}.get(schema.get("type", ""), "")
 
 
 def _interval(schema: Mapping[str, Any]) -> str:
@@ -289,16 +323,6 @@ def _choices(node: Mapping[str, Any], root: Mapping[str, Any]) -> list[Mapping[s
     if parts is None:
         return [node]
     return [choice for part in parts for choice in _choices(part, root) if choice.get("type") != "null"]
-
-
-def _merged(node: Mapping[str, Any], root: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Return one schema for a union: the limits of its number and its constant, if it has them."""
-    choices = _choices(node, root)
-    if len(choices) == 1:
-        return choices[0]
-    numeric = next((choice for choice in choices if choice.get("type") in ("number", "integer")), {})
-    constant = next(({"const": choice["const"]} for choice in choices if "const" in choice), {})
-    return {**numeric, **constant}
 
 
 def _locate(loc: Sequence[int | str], root: Mapping[str, Any]) -> tuple[list[int | str], Mapping[str, Any]]:

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import dataclasses
-import difflib
 import math
 from collections.abc import Mapping
 from dataclasses import field
-from typing import Any, NamedTuple
+from functools import lru_cache
+from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import AfterValidator, BeforeValidator, Field, StrictBool, StrictStr, TypeAdapter, create_model
 
-from ..core.errors import InputError, shown
+from ..core import tables
 
 
 class Interval(NamedTuple):
@@ -105,92 +106,66 @@ def rows(columns: Mapping[str, tuple[float, float]], *, doc: str) -> Any:
     return field(default=(), metadata={"kind": "rows", "columns": dict(columns), "doc": doc})
 
 
-def suggestion(word: str, known: Any) -> str:
-    """Return the most similar known word as a suggestion, or the list of all known words."""
-    close = difflib.get_close_matches(word, list(known), n=1)
-    return f" (did you mean {close[0]}?)" if close else f"; known: {', '.join(known)}"
-
-
-def _is_number(value: Any) -> bool:
-    """Return whether the value is a finite number; booleans do not count."""
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        return False
-    try:
-        return math.isfinite(value)
-    except OverflowError:  # an integer beyond the range of floats
-        return False
-
-
 def parse_field(value: Any, f: dataclasses.Field[Any], where: str) -> Any:
     """Return the value of one field after its check; `where` names the key in an InputError."""
-    meta = f.metadata
-    kind = meta["kind"]
+    kind = f.metadata["kind"]
     if kind == "number" and value is None and f.default is None:
         return None
-    if kind == "flag":
-        if not isinstance(value, bool):
-            raise InputError(f"{where} = {shown(value)}: must be true or false")
-        return value
-    if kind == "choice":
-        if not isinstance(value, str) or value not in meta["options"]:
-            raise InputError(f"{where} = {shown(value)}: must be one of {', '.join(meta['options'])}")
-        return value
-    if kind in ("text", "path"):
-        if not isinstance(value, str):
-            raise InputError(f"{where} = {shown(value)}: must be a string")
-        return value
+    tables.check(_checks(f), value, where, whole_value=kind == "bounds")
+    # the numbers stay as they were given, 1 a whole number
     if kind == "rows":
-        return _parse_rows(value, meta["columns"], where)
-    lo, hi = meta["limits"]
-    whole = " whole" if meta["integer"] else ""
-    if kind == "number":
-        fits = _is_number(value) and lo <= value <= hi and (not whole or float(value).is_integer())
-        if not fits:
-            raise InputError(f"{where} = {shown(value)}: must be a{whole} number from {lo:g} to {hi:g}")
-        return value
-    pair = value if isinstance(value, list | tuple) else [value, value]
-    ok = len(pair) == 2 and all(_is_number(v) and (not whole or float(v).is_integer()) for v in pair)
-    if not ok or not (lo <= pair[0] and pair[1] <= hi):
-        raise InputError(
-            f"{where} = {shown(value)}: must be one{whole} number, or [lower, upper]{whole} bounds, "
-            f"from {lo:g} to {hi:g}"
-        )
-    if pair[0] > pair[1]:
-        raise InputError(f"{where} = {shown(value)}: bounds reversed, the lower one comes first")
-    return Interval(*pair)
-
-
-def _parse_rows(value: Any, columns: Mapping[str, tuple[float, float]], where: str) -> tuple[Any, ...]:
-    """Return a list of tables after its check, as a tuple of dicts."""
-    if not isinstance(value, list | tuple):
-        raise InputError(f"{where} = {shown(value)}: must be a list of tables with keys {', '.join(columns)}")
-    for i, row in enumerate(value):
-        if not isinstance(row, Mapping) or set(row) != set(columns):
-            raise InputError(f"{where}[{i}] = {shown(row)}: must be a table with the keys {', '.join(columns)}")
-        for key, (lo, hi) in columns.items():
-            if not _is_number(row[key]) or not lo <= row[key] <= hi:
-                raise InputError(f"{where}[{i}].{key} = {shown(row[key])}: must be a number from {lo:g} to {hi:g}")
-    return tuple(dict(row) for row in value)
+        return tuple(dict(row) for row in value)
+    if kind == "bounds":
+        return Interval(*value) if isinstance(value, list | tuple) else Interval(value, value)
+    return value
 
 
 def field_schema(f: dataclasses.Field[Any]) -> dict[str, Any]:
     """Return the JSON Schema of one field."""
-    meta = f.metadata
-    unit = f" [{meta['unit']}]" if meta.get("unit") else ""
-    schema: dict[str, Any] = {"description": meta["doc"] + unit}
-    kind = meta["kind"]
-    if kind in ("bounds", "number"):
-        lo, hi = meta["limits"]
-        value = {"type": "integer" if meta.get("integer") else "number"}
-        value |= {k: v for k, v in (("minimum", lo), ("maximum", hi)) if np.isfinite(v)}
-        if kind == "number":
-            return schema | value | ({} if f.default is None else {"default": f.default})
-        pair = {"type": "array", "items": value, "minItems": 2, "maxItems": 2}
-        return schema | {"anyOf": [value, pair], "default": list(f.default)}  # type: ignore
-    if kind == "rows":
-        columns = {k: {"type": "number", "minimum": v[0], "maximum": v[1]} for k, v in meta["columns"].items()}
-        item = {"type": "object", "properties": columns, "required": list(columns)}
-        return schema | {"type": "array", "items": item | {"additionalProperties": False}, "default": []}
-    if kind == "choice":
-        return schema | {"enum": list(meta["options"]), "default": f.default}
-    return schema | {"type": "boolean" if kind == "flag" else "string", "default": f.default}
+    unit = f" [{f.metadata['unit']}]" if f.metadata.get("unit") else ""
+    schema = {"description": f.metadata["doc"] + unit, **_checks(f).json_schema()}
+    row = schema.pop("$defs", {}).get("Row")
+    if row:
+        schema["items"] = row  # without a reference, which would not reach beyond this field
+    if f.default is None:
+        return schema
+    return schema | {"default": list(f.default) if isinstance(f.default, tuple) else f.default}
+
+
+@lru_cache(maxsize=1024)
+def _checks(f: dataclasses.Field[Any]) -> TypeAdapter[Any]:
+    """Return pydantic's checks of the value of a field."""
+    return TypeAdapter(_type_of(f.metadata))
+
+
+def _type_of(meta: Mapping[str, Any]) -> Any:
+    """Return the type of a field as pydantic checks it."""
+    one_of: Any = Literal
+    pair_of: Any = tuple
+    list_of: Any = list
+    match meta["kind"]:
+        case "flag":
+            return StrictBool
+        case "choice":
+            return one_of[meta["options"]]
+        case "text" | "path":
+            return StrictStr
+        case "rows":
+            columns: dict[str, Any] = {name: (_number(*limits), ...) for name, limits in meta["columns"].items()}
+            return list_of[create_model("Row", __base__=tables.Table, **columns)]
+        case "number":
+            return _number(*meta["limits"], integer=meta["integer"])
+    value = _number(*meta["limits"], integer=meta["integer"])
+    return value | Annotated[pair_of[value, value], AfterValidator(tables.ordered)]
+
+
+def _number(lo: float, hi: float, *, integer: bool = False) -> Any:
+    """Return the type of a finite number within limits. A whole number may be written as 3.0."""
+    least, most = (limit if math.isfinite(limit) else None for limit in (lo, hi))
+    if not integer:
+        return Annotated[float, Field(strict=True, allow_inf_nan=False, ge=least, le=most)]
+
+    def whole(value: Any) -> Any:
+        return int(value) if isinstance(value, float) and value.is_integer() else value
+
+    return Annotated[int, Field(strict=True, ge=least, le=most), BeforeValidator(whole)]

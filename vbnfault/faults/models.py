@@ -15,7 +15,8 @@ from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 from ..core.errors import InputError, shown
-from .fields import field_schema, parse_field, suggestion
+from ..core.tables import did_you_mean
+from .fields import field_schema, parse_field
 
 if TYPE_CHECKING:
     from .contract import Fault
@@ -141,7 +142,7 @@ def _physical_order() -> tuple[str, ...]:
     followers: dict[str, list[str]] = {"": [], **{name: [] for name in defaults}}
     for name, cls in sorted(defaults.items(), key=lambda item: (is_packaged(item[1]), item[0])):
         if cls.after not in followers:
-            hint = suggestion(str(cls.after), defaults)
+            hint = did_you_mean(str(cls.after), list(defaults))
             raise TypeError(f"fault class {name}: after = {cls.after!r}: no such fault class{hint}")
         followers[cls.after].append(name)
     order: list[str] = []
@@ -187,7 +188,7 @@ def from_dict(fault_class: str, table: Mapping[str, Any], *, source: str) -> Fau
     models = registry().get(fault_class)
     where = f"{source}: faults.{fault_class}"
     if models is None:
-        raise InputError(f"{where}: no such fault class{suggestion(fault_class, registry())}")
+        raise InputError(f"{where}: no such fault class{did_you_mean(fault_class, list(registry()))}")
     name = table.get("model", next(iter(models)))
     if not isinstance(name, str) or name not in models:
         raise InputError(f"{where}.model = {shown(name)}: must be one of {', '.join(models)}")
@@ -198,7 +199,7 @@ def from_dict(fault_class: str, table: Mapping[str, Any], *, source: str) -> Fau
         if key == "model":
             continue
         if key not in fields:
-            raise InputError(f"{where}.{key}: unknown key{suggestion(key, fields)}")
+            raise InputError(f"{where}.{key}: unknown key{did_you_mean(key, list(fields))}")
         values[key] = parse_field(value, fields[key], f"{where}.{key}")
     fault = cls(**values)
     try:
@@ -217,6 +218,7 @@ def json_schema() -> dict[str, Any]:
             properties: dict[str, Any] = {"model": {"const": name}}
             for f in dataclasses.fields(cls):
                 properties[f.name] = field_schema(f)
-            options.append({"type": "object", "properties": properties, "additionalProperties": False})
+            option = {"type": "object", "properties": properties, "additionalProperties": False}
+            options.append(option if cls.default else option | {"required": ["model"]})
         classes[fault_class] = options[0] if len(options) == 1 else {"anyOf": options}
     return {"type": "object", "properties": classes, "additionalProperties": False}

@@ -110,7 +110,10 @@ class CameraTable(Table):
     @model_validator(mode="after")
     def _known(self) -> CameraTable:
         if self.response not in spectra.RESPONSES:
-            raise ValueError(f"response = {self.response!r}: must be one of {', '.join(spectra.RESPONSES)}")
+            raise ValueError(
+                f"response = {self.response!r}: must be one of {', '.join(spectra.RESPONSES)}; for a monochrome "
+                'camera let detector name a sensor file with pattern = "mono"'
+            )
         if isinstance(self.exposure_s, float | int) and not 0 < self.exposure_s <= 1e4:
             raise ValueError(f"exposure_s = {self.exposure_s!r}: must be 'auto' or above 0 and at most 1e4 s")
         for key in ("lens_coating", "focus"):
