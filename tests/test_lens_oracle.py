@@ -4,23 +4,26 @@ from __future__ import annotations
 
 import os
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from test_lens import BACK, GLASS, STOP
+from test_zemax import TRIPLET
 
 from vbnfault.core import llvm
 from vbnfault.core.errors import VbnfaultError
 from vbnfault.lens import Prescription, first_order, load_lens, parse_lens
 from vbnfault.lens.coating import mean_reflectance
-from vbnfault.lens.glass import D_NM, F_NM, from_abbe
+from vbnfault.lens.glass import C_NM, D_NM, F_NM, from_abbe
 from vbnfault.lens.rays import ghost, trace
 from vbnfault.lens.straylight.paraxial import paraxial_ghosts, transmittance
 
 pytest.importorskip("optiland", reason="optiland (of the extra 'test') is not installed")
 
 import sequential_oracle as oracle
+from optiland.fileio import load_zemax_file
 
 # Of every lens the five ghosts with the most light from 8° off the axis, of those that rays take from 0° and 16°
 # too. Left out is the Tessar's pair 5, 7, whose rays leave at all angles up to 90°: on an unbounded plane their
@@ -85,6 +88,33 @@ def test_first_order_figures(name: str) -> None:
         assert theirs["EPD"] == pytest.approx(ours.entrance_pupil_diameter_mm, rel=1e-4)
         assert theirs["XPL"] + sensor == pytest.approx(ours.exit_pupil_mm, abs=close)
         assert abs(theirs["XPD"]) == pytest.approx(ours.exit_pupil_diameter_mm, rel=1e-4)
+
+
+def test_a_zemax_file_is_read_as_by_optiland(tmp_path: Path) -> None:
+    path = tmp_path / "lens.zmx"
+    path.write_text(TRIPLET, encoding="utf-8")
+    lens, theirs = load_lens(path), load_zemax_file(str(path))
+    rows = [1 + k for k in range(1, len(lens.surfaces) + 1)]  # without object and dummy
+    surfaces = [theirs.surfaces[k] for k in rows]
+    assert [s.is_stop for s in surfaces] == [s.stop for s in lens.surfaces]
+    np.testing.assert_allclose([s.radius_mm for s in lens.surfaces], [float(s.geometry.radius) for s in surfaces])
+    np.testing.assert_allclose(
+        [s.conic for s in lens.surfaces], [float(getattr(s.geometry, "k", 0)) for s in surfaces]
+    )
+    z = np.array([float(s.geometry.cs.z) for s in surfaces])
+    np.testing.assert_allclose(lens.vertices_mm, z - z[0], atol=1e-12)
+    asphere = [float(c) for c in surfaces[0].geometry.coefficients]
+    assert [0.0, *lens.surfaces[0].aspheric_mm] == asphere[:3]
+    assert not any(asphere[3:])
+    for wavelength in (F_NM, D_NM, C_NM):
+        index = [float(np.ravel(s.material_post.n(wavelength / 1e3))[0]) for s in surfaces]
+        # the model glass has another formula there (Buchdahl), which differs from Cauchy's by less than 2e-4
+        np.testing.assert_allclose(lens.indices(wavelength)[1:], index, atol=2e-4)
+    # the file has no wavelengths: compare focal lengths at the d line
+    theirs.wavelengths.add(value=D_NM / 1e3, is_primary=True)
+    assert first_order(lens).efl_mm == pytest.approx(float(np.ravel(theirs.paraxial.f2())[0]), rel=1e-6)
+    assert [2 * s.semi_diameter_mm for s in lens.surfaces] == [16, 15, 10, 10, 8, 12, 12]  # CLAP before DIAM
+    assert lens.name == "a triplet"
 
 
 @pytest.mark.parametrize("name", PAIRS)

@@ -29,6 +29,7 @@ MIB = 1 << 20
 LIMIT_BYTES: dict[str, int] = {
     "scene": 4 * MIB,
     "lens": 4 * MIB,
+    "glass catalogue": 16 * MIB,
     "detector": 4 * MIB,
     "shape": 1024 * MIB,
     "spacecraft": 512 * MIB,

@@ -14,6 +14,7 @@ from ..core import llvm, resources
 from ..core.errors import VbnfaultError
 from ..detector import Detector
 from ..faults import Fault
+from ..lens import load_lens
 from ..pipeline import labels
 from ..pipeline.record import proposal
 from ..pipeline.spec import mask_any_faults, stored_layers
@@ -61,7 +62,7 @@ def scene_identity(session: pipeline.Session) -> dict[str, Any]:
             table["texture_file"] = _digest(table["texture_file"], "texture")
         lens = table.get("lens") or ("" if session.scene.camera.lens else session.faults[name].lens_of_thin_camera)
         if lens:
-            table["lens"] = _digest(resources.find("scenes/lenses", lens), "lens")
+            table["lens"] = _lens_digest(lens)
     _contents_of_files(scene, session.scene)
     if "straylight" in session.faults:
         textures = sorted(resources.data_dir("textures").glob("*.png"))
@@ -76,10 +77,17 @@ def _digest(path: str | Path, what: str) -> str:
     return f"sha256:{resources.sha256(resources.read_input(path, what))}"
 
 
+def _lens_digest(name: str) -> str:
+    """Return `sha256:` and the digests, joined by +, of a lens file and of the glass catalogues that it uses."""
+    with resources.noting() as digests:
+        load_lens(name)
+    return f"sha256:{'+'.join(digests)}"
+
+
 def _contents_of_files(identity: dict[str, Any], scene: Scene) -> None:
     """Replace the paths of lens, detector, spacecraft, kernels and stars by digests of their contents."""
     if scene.camera.lens:
-        identity["camera"]["lens"] = _digest(resources.find("scenes/lenses", scene.camera.lens), "lens")
+        identity["camera"]["lens"] = _lens_digest(scene.camera.lens)
     if scene.camera.detector:
         identity["camera"]["detector"] = _digest(
             resources.find("scenes/detectors", scene.camera.detector), "detector"

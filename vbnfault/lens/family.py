@@ -11,7 +11,7 @@ import numpy as np
 
 from ..core.errors import InputError
 from .gaussian import first_order, scaled_to_focal_length
-from .glass import GLASSES, Glass
+from .glass import CLEAR, GLASSES, Glass
 from .prescription import Prescription, Surface, parse_lens
 from .rays import real_pupil_diameter_mm
 
@@ -109,7 +109,9 @@ def _row(surface: Surface) -> dict[str, Any]:
         if getattr(surface, key) != default:
             row[key] = getattr(surface, key)
     nodes, values = surface.internal_transmittance_10mm
-    if set(values) != {1.0}:
+    registered = GLASSES.get(surface.medium.name) == surface.medium
+    of_glass = surface.medium.internal_transmittance_10mm if registered else CLEAR
+    if surface.internal_transmittance_10mm != of_glass:
         row["internal_transmittance_10mm"] = {"wavelength_nm": list(nodes), "value": list(values)}
     return row
 
@@ -118,7 +120,7 @@ def _medium(glass: Glass) -> dict[str, Any]:
     """Return the keys of a row that describe a medium; none for air."""
     if glass.nd == 1.0 and math.isinf(glass.vd):
         return {}
-    if glass.name in GLASSES:
+    if GLASSES.get(glass.name) == glass:
         return {"glass": glass.name}
     if glass.formula == "cauchy":
         return {"nd": glass.nd} | ({} if math.isinf(glass.vd) else {"vd": glass.vd})

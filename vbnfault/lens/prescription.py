@@ -7,7 +7,7 @@ to the sensor. A surface's vertex is its point on the axis.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 from ..core import resources
 from ..core.errors import InputError, shown
 from .coating import DESIGN_NM, Layer, design
-from .glass import AIR, D_NM, Glass, from_abbe, from_coefficients, named
+from .glass import AIR, CLEAR, D_NM, GLASSES, Glass, Transmittance, from_abbe, from_coefficients
+from .zemax import LENS_SUFFIX, GlassCatalogue, read_catalogue, read_lens
 
 F64 = NDArray[np.float64]
 
@@ -41,7 +42,7 @@ _SURFACE_KEYS = (
     "reflectance",
 )
 _STOP_KEYS = ("blades", "blade_rounding", "rotation_deg")
-_LENS_KEYS = ("name", "source", "surface")
+_LENS_KEYS = ("name", "source", "glass_catalogues", "surface")
 _INDEX_RANGE = (1.0, 5.0)
 _RIM_POINTS = 65
 
@@ -85,7 +86,7 @@ class Surface:
     stop: bool = False
     conic: float = 0.0
     aspheric_mm: tuple[float, ...] = ()
-    internal_transmittance_10mm: tuple[tuple[float, ...], tuple[float, ...]] = ((D_NM,), (1.0,))
+    internal_transmittance_10mm: Transmittance = CLEAR
     blades: int = 0
     blade_rounding: float = 0.0
     rotation_deg: float = 0.0
@@ -203,7 +204,7 @@ class Prescription:
 
 
 def load_lens(name_or_path: str | Path) -> Prescription:
-    """Read a prescription from a path or by the name of a packaged lens.
+    """Read a prescription from a TOML or Zemax file (.zmx), or by the name of a packaged lens.
 
     Raises
     ------
@@ -211,17 +212,35 @@ def load_lens(name_or_path: str | Path) -> Prescription:
         The file is missing or wrong; the message names file, surface and value.
     """
     path = resources.find("scenes/lenses", name_or_path)
+    if path.suffix.lower() == LENS_SUFFIX:
+        table, catalogues = read_lens(path)
+        return _prescription(table, str(path), catalogues)
     return parse_lens(resources.read_toml(path, "lens"), source=str(path))
 
 
 def parse_lens(table: Mapping[str, Any], *, source: str) -> Prescription:
     """Return the prescription that plain data (the contents of a TOML file) describe.
 
+    `source` is the path of the file, beside which its glass catalogues are searched, or another name for messages.
+
     Raises
     ------
     InputError
         The data are wrong; the message names `source`, surface and value.
     """
+    names = table.get("glass_catalogues", [])
+    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+        raise InputError(f"{source}: glass_catalogues = {shown(names)}: must be a list of paths of .agf files")
+    folder = Path(source).parent
+    try:
+        catalogues = tuple(read_catalogue(folder / name) for name in names)
+    except InputError as error:
+        raise InputError(f"{source}: glass_catalogues: {error}") from None
+    return _prescription(table, source, catalogues)
+
+
+def _prescription(table: Mapping[str, Any], source: str, catalogues: Sequence[GlassCatalogue]) -> Prescription:
+    """Return the prescription of plain data, whose glasses are those of the catalogues and the registered ones."""
     for key in table:
         if key not in _LENS_KEYS:
             raise InputError(f"{source}: {key}: unknown key; known: {', '.join(_LENS_KEYS)}")
@@ -237,7 +256,7 @@ def parse_lens(table: Mapping[str, Any], *, source: str) -> Prescription:
     surfaces: tuple[Surface, ...] = ()
     for k, row in enumerate(rows):
         front = surfaces[-1].medium if surfaces else AIR
-        surfaces += (_surface(row, front, f"{source}: surface {k}", last=k == len(rows) - 1),)
+        surfaces += (_surface(row, front, f"{source}: surface {k}", catalogues, last=k == len(rows) - 1),)
     lens = Prescription(
         name=str(table.get("name", Path(source).stem)),
         source=str(table.get("source", "")),
@@ -266,7 +285,9 @@ def _sensor(row: Mapping[str, Any], where: str) -> float:
     return _number(row, "reflectance", where, None, low=0.0, high=1.0)
 
 
-def _surface(row: Mapping[str, Any], front: Glass, where: str, *, last: bool) -> Surface:
+def _surface(
+    row: Mapping[str, Any], front: Glass, where: str, catalogues: Sequence[GlassCatalogue], *, last: bool
+) -> Surface:
     """Return the surface that a row describes; `front` is the medium before it."""
     _known_keys(row, where)
     if row.get("sensor", False) is not False:
@@ -288,7 +309,7 @@ def _surface(row: Mapping[str, Any], front: Glass, where: str, *, last: bool) ->
     coefficients = row.get("aspheric_mm", [])
     if not isinstance(coefficients, list):
         raise InputError(f"{where}: aspheric_mm = {shown(coefficients)}: must be a list of numbers")
-    medium = _medium(row, where)
+    medium = _medium(row, where, catalogues)
     surface = Surface(
         radius_mm=radius,
         thickness_mm=_number(row, "thickness_mm", where, 0.0 if last else None, low=0.0, high=1e6),
@@ -300,7 +321,11 @@ def _surface(row: Mapping[str, Any], front: Glass, where: str, *, last: bool) ->
         aspheric_mm=tuple(
             _number({"aspheric_mm": c}, "aspheric_mm", where, None, low=-1e12, high=1e12) for c in coefficients
         ),
-        internal_transmittance_10mm=_internal(row.get("internal_transmittance_10mm", 1.0), where),
+        internal_transmittance_10mm=(
+            _internal(row["internal_transmittance_10mm"], where)
+            if "internal_transmittance_10mm" in row
+            else medium.internal_transmittance_10mm
+        ),
         blades=int(blades),
         blade_rounding=_number(row, "blade_rounding", where, 0.0, low=0.0, high=1.0),
         rotation_deg=_number(row, "rotation_deg", where, 0.0, low=-360.0, high=360.0),
@@ -313,14 +338,14 @@ def _surface(row: Mapping[str, Any], front: Glass, where: str, *, last: bool) ->
     return surface
 
 
-def _medium(row: Mapping[str, Any], where: str) -> Glass:
+def _medium(row: Mapping[str, Any], where: str, catalogues: Sequence[GlassCatalogue]) -> Glass:
     """Return the medium behind a row, air by default, after a check of its index from 400 to 1000 nm."""
     glass = row.get("glass")
     if glass is not None and ("nd" in row or "vd" in row):
         raise InputError(f"{where}: glass: give either glass or nd and vd")
     try:
         if isinstance(glass, str):
-            medium = named(glass)
+            medium = _named(glass, catalogues)
         elif isinstance(glass, dict):
             medium = from_coefficients(str(glass.get("formula")), list(glass.get("coefficients", [])))
         elif glass is not None:
@@ -343,7 +368,21 @@ def _medium(row: Mapping[str, Any], where: str) -> Glass:
     return medium
 
 
-def _internal(given: object, where: str) -> tuple[tuple[float, ...], tuple[float, ...]]:
+def _named(name: str, catalogues: Sequence[GlassCatalogue]) -> Glass:
+    """Return a glass of the catalogues, the first that has it, or a registered one. Raises InputError."""
+    for catalogue in catalogues:
+        if (glass := catalogue.glass(name)) is not None:
+            return glass
+    if name in GLASSES:
+        return GLASSES[name]
+    read = "".join(f" {catalogue.path}," for catalogue in catalogues)
+    raise InputError(
+        f"glass = {name!r}: unknown; known are{read and f' those of{read} and'} {', '.join(GLASSES)}; "
+        "glass_catalogues names files that have more"
+    )
+
+
+def _internal(given: object, where: str) -> Transmittance:
     """Return wavelengths and internal transmittances from one number for all wavelengths or from a table."""
     where, key = f"{where}: internal_transmittance_10mm", "value"
     if not isinstance(given, dict):
@@ -421,7 +460,7 @@ def _check(lens: Prescription, source: str) -> None:
         raise InputError(f"{source}: surface {len(lens.surfaces) - 1}: nd: behind the last surface there is air")
     media = (AIR, *(s.medium for s in lens.surfaces))
     stop = stops[0]
-    if media[stop].coefficients != media[stop + 1].coefficients:
+    if not media[stop].same_index(media[stop + 1]):
         raise InputError(f"{source}: surface {stop}: nd: the stop has the same medium on both sides")
     for k, (front, back) in enumerate(zip(lens.surfaces[:-1], lens.surfaces[1:], strict=True)):
         height = np.linspace(0, min(front.semi_diameter_mm, back.semi_diameter_mm), _RIM_POINTS)

@@ -1,0 +1,359 @@
+"""Zemax lens files and glass catalogues: units, stops, glasses, and what is refused (see also test_lens_oracle)."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from vbnfault.core.errors import InputError
+from vbnfault.dataset.identity import _lens_digest
+from vbnfault.lens import Prescription, first_order, load_lens
+from vbnfault.lens.family import write_lens
+from vbnfault.lens.glass import (
+    DISPERSIONS,
+    GLASSES,
+    Glass,
+    dispersion,
+    from_coefficients,
+    register,
+)
+from vbnfault.lens.zemax import _FORMULAS, read_catalogue
+from vbnfault.scene import config
+from vbnfault.world import assemble
+
+HEAD = "VERS 190513 0 123457 L123457\nMODE SEQ\nNAME a triplet\nUNIT MM X W X CM MR CPMM\nENPD 10\nGCAT SCHOTT\n"
+OBJECT = 'SURF 0\n  TYPE STANDARD\n  CURV 0.0 0 0 0 0 ""\n  DISZ INFINITY\n  DIAM 0 0 0 0 1 ""\n'
+# a Cooke triplet: glasses by name and by index, a dummy surface, an asphere, the stop in the air
+TRIPLET = (
+    HEAD
+    + OBJECT
+    + """SURF 1
+  COMM a dummy surface
+  TYPE STANDARD
+  CURV 0.0 0 0 0 0 ""
+  DISZ 5
+  DIAM 9 0 0 0 1 ""
+SURF 2
+  TYPE EVENASPH
+  CURV 4.5421E-02 0 0 0 0 ""
+  COAT AR
+  PARM 1 0
+  PARM 2 1.5E-06
+  PARM 3 -2.0E-09
+  DISZ 3.26
+  GLAS N-BK7 0 0 1.5168 64.17 0 0 0 0 0 0
+  DIAM 8 1 0 0 1 ""
+  MEMA 8.2 0 0 0 1 ""
+SURF 3
+  TYPE STANDARD
+  CURV -2.294E-03 0 0 0 0 ""
+  CONI -0.7
+  DISZ 6.007
+  DIAM 8 1 0 0 1 ""
+  CLAP 0 7.5 0
+SURF 4
+  TYPE STANDARD
+  CURV -4.502E-02 0 0 0 0 ""
+  DISZ 1.0
+  GLAS ___BLANK 1 0 1.62 36.37 0 0 0 0 0 0
+  DIAM 5 1 0 0 1 ""
+SURF 5
+  TYPE STANDARD
+  CURV 4.928E-02 0 0 0 0 ""
+  DISZ 2.0
+  DIAM 5 1 0 0 1 ""
+SURF 6
+  STOP
+  TYPE STANDARD
+  CURV 0.0 0 0 0 0 ""
+  DISZ 2.75
+  DIAM 4 0 0 0 1 ""
+SURF 7
+  TYPE STANDARD
+  CURV 1.255E-02 0 0 0 0 ""
+  DISZ 2.95
+  GLAS SF6 0 0 1.5 40 0 0 0 0 0 0
+  DIAM 6 1 0 0 1 ""
+SURF 8
+  TYPE STANDARD
+  CURV -5.4361E-02 0 0 0 0 ""
+  DISZ 42.2
+  DIAM 6 1 0 0 1 ""
+SURF 9
+  TYPE STANDARD
+  CURV 0.0 0 0 0 0 ""
+  DISZ 0
+  DIAM 18 0 0 0 1 ""
+"""
+)
+# Glasses of makers' catalogues, one for each formula that these use below 600 nm, with the index that they print.
+CATALOGUE = """CC excerpts of catalogues
+NM N-BK7 2 517642.251 1.5168 64.17 0 1
+CD 1.039612120E+00 6.000698670E-03 2.317923440E-01 2.001791440E-02 1.010469450E+00 1.035606530E+02
+IT 4.00000E-01 9.92000E-01 2.50000E+01
+IT 3.80000E-01 -9.99000E+02 1.00000E+01
+IT 3.50000E-01 9.30000E-01 2.50000E+01
+NM QUARTZ 1 1 1.544296 70.132045 0 0 0
+CD 2.356764950E+00 -1.139969240E-02 1.087416560E-02 3.320669140E-05 1.086093460E-05 -3.101239840E-07
+NM KCL 3 0 1.490213 43.338570 0 0 0
+CD 1.474596440E+00 5.054600850E-03 -2.574806930E-05 -1.782830090E-04 -4.495950450E-08 -2.075729940E-11
+NM BASF5 5 0 1.603233 42.504788 0 0 0
+CD 1.574103270E+00 1.397861490E-02 8.300451100E-04 0 0
+NM CALCITE 6 1 1.658643 48.541403 0 0 0
+CD 8.559E-01 3.45744E-03 8.391E-01 1.9881E-02 9.0E-04 3.8809E-02 6.845E-01 4.907002500E+01
+NM ALN 9 1 2.154291 50.733102 0 0 0
+CD 3.139900000E+00 1.378600000E+00 2.941000000E-02 3.861000000E+00 2.259009000E+02
+NM P-LAF010S 12 1 1.742999 49.277592 0 2 0
+CD 2.971455510E+00 -1.230843360E-02 2.294064430E-02 5.557501220E-04
+-1.482403630E-05 1.438426280E-06 -1.144491200E-04 0.000000000E+00
+NM J-LASFH17 13 1 2.000690 25.455728 0 0 1
+CD 3.810716760E+00 -1.637379360E-02 0.000000000E+00 5.836728750E-02
+4.127261080E-03 -5.522291260E-04 1.413028160E-04 -1.455178620E-05
+7.444268000E-07 0.000000000E+00
+"""
+
+
+def written(folder: Path, text: str = TRIPLET, name: str = "lens.zmx") -> Path:
+    """The path of a file with this text."""
+    path = folder / name
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+# --- lens files -----------------------------------------------------------------------------------------------
+
+
+def test_the_unit_scales_every_length(tmp_path: Path) -> None:
+    lens = load_lens(written(tmp_path))
+    inches = load_lens(written(tmp_path, TRIPLET.replace("UNIT MM", "UNIT IN"), "inches.zmx"))
+    wanted = lens.scaled(25.4)
+    for mine, other in zip(inches.surfaces, wanted.surfaces, strict=True):
+        assert mine.aspheric_mm == pytest.approx(other.aspheric_mm)
+        for key in ("radius_mm", "thickness_mm", "semi_diameter_mm", "conic"):
+            assert getattr(mine, key) == pytest.approx(getattr(other, key))
+
+
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16", "latin-1"])
+def test_encodings(tmp_path: Path, encoding: str) -> None:
+    path = tmp_path / "lens.ZMX"
+    path.write_bytes(TRIPLET.replace("a triplet", "für Zemax").encode(encoding))
+    lens = load_lens(path)
+    assert lens.name == "für Zemax"
+    assert lens.surfaces == load_lens(written(tmp_path)).surfaces
+
+
+def test_a_stop_on_a_refracting_surface_is_a_row_of_its_shape(tmp_path: Path) -> None:
+    """The same light passes as through a stop in the air just in front of the surface's vertex."""
+    stop = 'SURF 6\n  STOP\n  TYPE STANDARD\n  CURV 0.0 0 0 0 0 ""\n  DISZ 2.75\n  DIAM 4 0 0 0 1 ""\n'
+    assert stop in TRIPLET
+    text = TRIPLET.replace(stop, "").replace("  DISZ 2.0\n", "  DISZ 4.75\n")
+    text = text.replace("SURF 7\n", "SURF 7\n  STOP\n").replace("SURF 9", "SURF 8")
+    lens = load_lens(written(tmp_path, text))
+    k = lens.stop
+    assert lens.surfaces[k].thickness_mm == 0
+    assert lens.surfaces[k].radius_mm == lens.surfaces[k + 1].radius_mm == pytest.approx(1 / 1.255e-2)
+    assert lens.surfaces[k].semi_diameter_mm == lens.surfaces[k + 1].semi_diameter_mm == 6
+    before = load_lens(written(tmp_path))
+    assert first_order(lens).efl_mm == pytest.approx(first_order(before).efl_mm)
+    np.testing.assert_allclose(lens.vertices_mm[k:], before.vertices_mm[[5, 5, 6]], atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("MODE SEQ", "MODE NSC", "MODE NSC: must be SEQ"),
+        ("UNIT MM", "UNIT FT", "UNIT FT: must be one of MM, CM, IN"),
+        ("TYPE EVENASPH", "TYPE ODDASPHE", "SURF 2: TYPE ODDASPHE: must be STANDARD or EVENASPH"),
+        ("PARM 1 0", "PARM 1 0.1", "SURF 2: PARM 1 0.1: the term of r² must be 0"),
+        ("CURV 4.5421E-02 0", "CURV often 0", "SURF 2: CURV: value 1 is 'often'; must be a number"),
+        ("CLAP 0 7.5", "CLAP 1 7.5", "SURF 3: CLAP 1: the inner radius of the aperture must be 0"),
+        ("CLAP 0 7.5", "SQAP 7 7.5", "SURF 3: SQAP: a rectangular aperture cannot be read"),
+        ("GLAS SF6 0 0 1.5 40", "GLAS MIRROR 0 0 1.5 40", "SURF 7: GLAS MIRROR: lenses with mirrors"),
+        (
+            "GLAS SF6 0 0 1.5 40",
+            "GLAS SF66 0 0 1.5 40",
+            "SURF 7: GLAS SF66: unknown; known are the glasses of",
+        ),
+        ("DISZ 2.75", "DISZ -2.75", "SURF 6: DISZ -2.75: the distance to the next surface comes to -2.75 mm"),
+        ("DIAM 4 0", "DIAM 0 0", "SURF 6: DIAM 0: the semi-diameter must be above 0"),
+        ("STOP", "HIDE", "stop: exactly one surface must have stop = true; none has"),
+        (TRIPLET[TRIPLET.index("SURF 1") :], "", "not a lens: between the first SURF"),
+        ("  DISZ 0\n  DIAM 18", "  CURV 0.1\n  DIAM 18", "SURF 9: CURV 0.1: the image must be plane"),
+    ],
+)
+def test_what_cannot_be_read_is_named(tmp_path: Path, old: str, new: str, said: str) -> None:
+    assert old in TRIPLET
+    path = written(tmp_path, TRIPLET.replace(old, new))
+    with pytest.raises(InputError) as error:
+        load_lens(path)
+    assert str(error.value).startswith(str(path))
+    assert said in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_glasses_are_those_beside_the_lens_file(tmp_path: Path) -> None:
+    """From the catalogue that GCAT names, then from the packaged ones; the record's index serves last."""
+    written(tmp_path, CATALOGUE.replace("NM QUARTZ", "NM SF6"), "Schott.AGF")
+    written(tmp_path, "this is not read", "other.agf")
+    lens = load_lens(written(tmp_path))
+    assert lens.surfaces[5].medium.nd == pytest.approx(1.544296, abs=1e-6)
+    assert lens.surfaces[0].medium.nd == pytest.approx(1.5168, abs=5e-6)
+    nodes, fractions = lens.surfaces[0].internal_transmittance_10mm
+    assert nodes == (350.0, 400.0)
+    assert fractions == pytest.approx((0.93**0.4, 0.992**0.4))
+    by_index = load_lens(written(tmp_path, TRIPLET.replace("GLAS SF6 0 0 1.5 40", "GLAS XYZ 0 0 1.7 30"), "b.zmx"))
+    assert by_index.surfaces[5].medium.nd == pytest.approx(1.7)
+    assert by_index.surfaces[5].medium.vd == pytest.approx(30)
+
+
+def test_a_lens_written_as_toml_is_the_same(tmp_path: Path) -> None:
+    written(tmp_path, CATALOGUE, "lens.agf")
+    lens = load_lens(written(tmp_path))
+    write_lens(lens, tmp_path / "lens.toml")
+    again = load_lens(tmp_path / "lens.toml")
+    for mine, other in zip(again.surfaces, lens.surfaces, strict=True):
+        np.testing.assert_allclose(mine.medium.index([450.0, 900.0]), other.medium.index([450.0, 900.0]))
+        assert mine.internal_transmittance_10mm == other.internal_transmittance_10mm
+        assert mine.radius_mm == other.radius_mm
+
+
+def test_a_scene_takes_a_zemax_lens_and_knows_its_catalogues(tmp_path: Path) -> None:
+    path = written(tmp_path)
+    catalogue = written(tmp_path, CATALOGUE, "schott.agf")
+    scene = config.load_scene("quickstart", {"camera.lens": str(path), "faults.vignetting.model": "lens"})
+    assert assemble.base_camera(scene).lens.name == "a triplet"
+    before = _lens_digest(scene.camera.lens)
+    assert before.count("+") == 1
+    catalogue.write_text(CATALOGUE.replace("9.92000E-01", "9.91000E-01"), encoding="utf-8")
+    after = _lens_digest(scene.camera.lens)
+    assert after.split("+")[0] == before.split("+")[0]
+    assert after != before
+
+
+# --- glasses --------------------------------------------------------------------------------------------------
+
+
+def test_catalogues_give_the_index_that_they_print(tmp_path: Path) -> None:
+    catalogue = read_catalogue(written(tmp_path, CATALOGUE, "x.agf"))
+    for name, records in catalogue.records.items():
+        glass = catalogue.glass(name.lower())
+        assert glass is not None
+        assert glass.nd == pytest.approx(float(records[0][4]), abs=5e-6)  # printed with five or six decimals
+    assert catalogue.glass("unknown") is None
+
+
+def test_every_formula_of_catalogues_is_registered() -> None:
+    for name, count, _ in _FORMULAS.values():
+        assert count in DISPERSIONS[name].counts
+
+
+@pytest.mark.parametrize(
+    ("formula", "coefficients", "square"),
+    [
+        ("sellmeier_2", (1.2, 0.9, 0.1, 0.01, 0.12), lambda s: 2.2 + 0.9 * s / (s - 0.01) + 0.01 / (s - 0.0144)),
+        ("handbook_1", (2.2, 0.01, 0.02, 0.003), lambda s: 2.2 + 0.01 / (s - 0.02) - 0.003 * s),
+        ("handbook_2", (1.3, 0.9, 0.02, 0.003), lambda s: 1.3 + 0.9 * s / (s - 0.02) - 0.003 * s),
+        (
+            "polynomial",
+            (2.3, -0.01, 0.01, 2e-4, 3e-5, 4e-6, 5e-7, 6e-8),
+            lambda s: (
+                2.3 - 0.01 * s + 0.01 / s + 2e-4 / s**2 + 3e-5 / s**3 + 4e-6 / s**4 + 5e-7 / s**5 + 6e-8 / s**6
+            ),
+        ),
+        (
+            "sellmeier",
+            (0.1, 0.2, 0.3, 0.4, 0.5, 0.01, 0.02, 0.03, 0.04, 50.0),
+            lambda s: (
+                1
+                + 0.1 * s / (s - 0.01)
+                + 0.2 * s / (s - 0.02)
+                + 0.3 * s / (s - 0.03)
+                + 0.4 * s / (s - 0.04)
+                + 0.5 * s / (s - 50)
+            ),
+        ),
+    ],
+)
+def test_formulas_that_no_packaged_glass_uses(formula: str, coefficients: tuple[float, ...], square) -> None:
+    um = np.array([0.45, 0.7, 1.0])
+    index = from_coefficients(formula, coefficients).index(1e3 * um)
+    np.testing.assert_allclose(index, np.sqrt(square(um**2)), rtol=1e-12)
+
+
+def test_a_lens_in_toml_names_catalogues(tmp_path: Path) -> None:
+    written(tmp_path, CATALOGUE, "mine.agf")
+    text = """glass_catalogues = ["mine.agf"]
+[[surface]]
+stop = true
+thickness_mm = 1.0
+diameter_mm = 5.0
+[[surface]]
+radius_mm = 50.0
+thickness_mm = 3.0
+diameter_mm = 10.0
+glass = "BASF5"
+[[surface]]
+radius_mm = -50.0
+diameter_mm = 10.0
+"""
+    lens = load_lens(written(tmp_path, text, "lens.toml"))
+    assert lens.surfaces[1].medium.nd == pytest.approx(1.603233, abs=1e-6)
+    for changed, said in (
+        (text.replace("BASF5", "BASF55"), "glass = 'BASF55': unknown; known are those of"),
+        (text.replace("mine.agf", "none.agf"), "none.agf: glass catalogue file not found"),
+        (text.replace('["mine.agf"]', "3"), "glass_catalogues = 3: must be a list of paths"),
+        (text.replace("mine.agf", "lens.toml"), "unsupported glass catalogue type '.toml'; allowed are .agf"),
+    ):
+        with pytest.raises(InputError, match=r"lens\.toml") as error:
+            load_lens(written(tmp_path, changed, "lens.toml"))
+        assert said in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("NM KCL 3", "NM KCL 14", "KCL: dispersion formula 14: must be from 1 to 13"),
+        ("NM KCL 3", "NM KCL x", "KCL: NM: value 2 is 'x'; must be a number"),
+        ("CD 1.474596440E+00", "CD 1.47q", "KCL: CD: value 1 is '1.47q'; must be a number"),
+        (
+            "CD 1.474596440E+00",
+            "XX 1.474596440E+00",
+            "KCL: CD: the coefficients",
+        ),
+    ],
+)
+def test_a_wrong_glass_is_named_when_it_is_used(tmp_path: Path, old: str, new: str, said: str) -> None:
+    assert old in CATALOGUE
+    catalogue = read_catalogue(written(tmp_path, CATALOGUE.replace(old, new), "x.agf"))
+    assert catalogue.glass("QUARTZ") is not None
+    with pytest.raises(InputError) as error:
+        catalogue.glass("KCL")
+    assert said in str(error.value)
+
+
+def test_a_glass_and_a_formula_register_in_one_place(monkeypatch: pytest.MonkeyPatch) -> None:
+    from vbnfault.lens import glass, parse_lens
+
+    monkeypatch.setattr(glass, "_DISPERSIONS", dict(DISPERSIONS))
+    monkeypatch.setattr(glass, "_GLASSES", dict(GLASSES))
+    monkeypatch.setattr(glass, "DISPERSIONS", glass._DISPERSIONS)
+    monkeypatch.setattr("vbnfault.lens.prescription.GLASSES", glass._GLASSES)
+
+    @dispersion("flat", 1)
+    def _flat(um2: np.ndarray, c: tuple[float, ...]) -> np.ndarray:
+        return np.full(np.shape(um2), c[0])
+
+    register(Glass(name="jelly", formula="flat", coefficients=(1.4,)))
+    stop = {"stop": True, "thickness_mm": 1.0, "diameter_mm": 5.0}
+    rows = [stop, {"radius_mm": 50.0, "thickness_mm": 3.0, "diameter_mm": 9.0, "glass": "jelly"}]
+    rows.append({"radius_mm": -50.0, "diameter_mm": 9.0})
+    lens: Prescription = parse_lens({"surface": rows}, source="test")
+    assert lens.surfaces[1].medium.nd == 1.4
+    assert math.isinf(lens.surfaces[1].medium.vd)
+    with pytest.raises(ValueError, match="another one of this name"):
+        register(Glass(name="jelly", formula="flat", coefficients=(1.5,)))
+    with pytest.raises(ValueError, match="one of this name already"):
+        dispersion("flat", 1)
