@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import pkgutil
+from collections.abc import Collection, Mapping
 from typing import Generic, TypeVar
 
 from . import tables
@@ -51,7 +52,37 @@ class Registry(Generic[T]):
                 importlib.import_module(f"{self.package}.{info.name}")
             self._complete = True
 
-        def place(item: tuple[str, type[T]]) -> tuple[bool, str]:
-            return not item[1].__module__.startswith(f"{self.package}."), item[0]
+        return dict(sorted(self._classes.items(), key=lambda item: (not self.is_packaged(item[1]), item[0])))
 
-        return dict(sorted(self._classes.items(), key=place))
+    def is_packaged(self, cls: type[T]) -> bool:
+        """Return whether a class belongs to vbnfault itself."""
+        return cls.__module__.startswith(f"{self.package}.")
+
+
+def chained(after: Mapping[str, str], packaged: Collection[str], kind: str) -> tuple[str, ...]:
+    """Return names in the order that follows from what each comes after.
+
+    The names form a tree with one root, which comes after "". Those in `packaged` are one long branch of it; any
+    other comes directly behind the name that it comes after, in alphabetical order.
+
+    Raises
+    ------
+    TypeError
+        A name comes after one that does not exist, or names come after each other in a circle. `kind` says in the
+        message what the names are.
+    """
+    followers: dict[str, list[str]] = {"": [], **{name: [] for name in after}}
+    for name in sorted(after, key=lambda name: (name in packaged, name)):
+        if after[name] not in followers:
+            hint = tables.did_you_mean(after[name], list(after))
+            raise TypeError(f"{kind} {name}: after = {after[name]!r}: there is none of this name{hint}")
+        followers[after[name]].append(name)
+    order: list[str] = []
+    pending = followers[""][::-1]
+    while pending:
+        order.append(pending.pop())
+        pending += followers[order[-1]][::-1]
+    circle = sorted(set(after) - set(order))
+    if circle:
+        raise TypeError(f"{kind}: what {', '.join(circle)} state by `after` runs in a circle")
+    return tuple(order)

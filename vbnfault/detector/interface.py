@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.quantities import RGBI, Electrons, Irradiance
-from .chain import Acts
+from .effects import Acts
 
 if TYPE_CHECKING:
     from .mosaic_detector import MosaicDetector
@@ -96,5 +96,5 @@ class Detector(Protocol):
         """Return the 8 bit image of the expected photo-electrons.
 
         `noise` comes from `draw_noise`; None gives a noise-free image. `acts` are the changes that faults make at
-        the steps of `chain.STEPS`, for a detector with a colour mosaic.
+        the steps of `effects.STEPS`, for a detector with a colour mosaic.
         """

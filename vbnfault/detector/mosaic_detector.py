@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 
 from ..core.errors import InputError
 from ..core.quantities import RGBI, Electrons, Irradiance
-from .chain import Acts, Device, MosaicNoise
+from .chain import Device, MosaicNoise
 from .demosaic import footprint, mended_from
+from .effects import Acts, Effect
 from .efficiency import white_balance
 from .mosaic import sample
 from .sensor import Sensor
@@ -111,7 +112,7 @@ class MosaicDetector:
         """Return the raw mosaic, uint16[y, x].
 
         `noise` comes from `draw_noise`; None gives a noise-free mosaic. `acts` are the changes that faults make at
-        the steps of `chain.STEPS`.
+        the steps of `effects.STEPS`.
         """
         return self.device.raw(sample(expected.array, self.sensor.pattern), exposure_s, noise, acts or {})
 
@@ -171,7 +172,7 @@ class MosaicDetector:
             "row_readout_s": sensor.transfer.row_readout_s,
             "demosaic": sensor.method,
             # the whole description of the sensor, with the sources of its values
-            "sensor": json.loads(json.dumps(asdict(sensor))),
+            "sensor": json.loads(json.dumps(asdict(sensor), default=_plain)),
         }
 
     @property
@@ -184,3 +185,8 @@ class MosaicDetector:
 def _device(sensor: Sensor, seed: int, shape: tuple[int, int], direction: str) -> Device:
     """Return a device from the cache, or make it."""
     return Device(sensor, seed, shape=shape, direction=direction)
+
+
+def _plain(effect: Effect) -> dict[str, Any]:
+    """Return an effect of a sensor as plain data."""
+    return {"name": effect.name, **effect.model_dump(mode="json")}

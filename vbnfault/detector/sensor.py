@@ -19,6 +19,7 @@ from ..core.tables import Fraction, table_class
 from .charge import ChargeCloud, TrapSpecies
 from .dark import CCD_GROWTH
 from .demosaic import Method
+from .effects import Effects
 from .efficiency import Curve, QuantumEfficiency
 from .individual import IndividualSpec
 from .mosaic import PATTERNS, Pattern
@@ -125,6 +126,7 @@ class Sensor:
     )
     readout: ReadoutSpec = Field(default_factory=ReadoutSpec, description="the chain from charge to DN")
     transfer: Transfer = Field(default_factory=Transfer, description="how charge is moved")
+    effects: Effects = Field(default=(), description="effects of plug-ins, by their names")
     sources: Mapping[str, str] = field(default_factory=dict, hash=False)
 
     def __post_init__(self) -> None:

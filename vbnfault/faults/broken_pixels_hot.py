@@ -10,11 +10,11 @@ that the device has by then and did not have before:
 - random telegraph signals, each in its state at the exposure.
 
 Defects spread to neighbouring pixels by demosaicing. In a CCD, charge is clocked past the defects. A hot pixel
-therefore draws a line on the side away from the register (`detector.chain.passing_dark_e`).
+therefore draws a line on the side away from the register (`detector.transfer.passing_dark_e`).
 
-Each defect acts at the same step as the device's own defects of its kind (`detector.chain`). Dead pixels keep less
-of the light, but all their dark current. Dark current and telegraph signals are charge with shot noise. Offsets are
-added after the charge, without noise. A stuck pixel shows its level, whatever charge it holds.
+Each defect acts at the same step as the device's own defects of its kind (`detector.effects`). Dead pixels keep
+less of the light, but all their dark current. Dark current and telegraph signals are charge with shot noise.
+Offsets are added after the charge, without noise. A stuck pixel shows its level, whatever charge it holds.
 
 Pixels have the sensor's temperature: at short exposures and at low temperature most damage does not show, as on
 real sensors. The growth laws are measured on cameras on the ground. `growth_factor` is the assumed ratio of the
@@ -31,8 +31,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.quantities import DEAD, HOT, RTS, RTS_HIGH, STUCK
-from ..detector.chain import Device, passing_dark_e, show_stuck, upper_share
+from ..detector.chain import Device
+from ..detector.effects.electrons import upper_fraction
+from ..detector.effects.output import show_stuck
 from ..detector.individual import Individual, IndividualSpec, RtsPixels, StuckPixels, aged, dark_rate_e_s, offset_e
+from ..detector.transfer import passing_dark_e
 from .context import FaultContext, Params
 from .contract import Fault
 from .fields import Interval, bounds, number
@@ -220,7 +223,7 @@ def _damage(params: Params, context: FaultContext) -> _Damage:
     new = {name: column[len(own.rts) :] for name, column in columns.items()}
     rts = RtsPixels(**new, reference_K=old.rts.reference_K)
     signals = rts.at(device.temperature_K)
-    high = upper_share(signals, exposure_s, params["telegraph_seed"]) if len(rts) else np.zeros(0)
+    high = upper_fraction(signals, exposure_s, params["telegraph_seed"]) if len(rts) else np.zeros(0)
     more = dark_rate_e_s(old, device.temperature_K) - device.dark_rate_e_s
     np.maximum(more, 0, out=more)  # annealing must not remove dark current of the device itself
     jumps = np.zeros(device.shape, dtype=np.float32)

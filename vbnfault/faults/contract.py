@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from ..camera import Camera
 from ..core.quantities import RGBI, Charge, Electrons, Offset, Quantity, RawMosaic, soft_kind
-from ..detector.chain import STEPS as MOSAIC_STEPS
+from ..detector.effects import STEPS as MOSAIC_STEPS
 from ..lens import load_lens
 from ..lens.footprint import DEFAULT_LENS
 from .context import FaultContext, Params

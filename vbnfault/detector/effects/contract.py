@@ -1,0 +1,240 @@
+"""Define the contract of a detector effect (`Effect`), the exposure that it sees, and the order of the chain.
+
+An effect is a frozen class. Its class attribute `name` gives its name, and the definition of the class registers
+it. `after` names the effect or the step behind which it acts. Its fields are the keys of the table `[effects.NAME]`
+of a sensor file, and an effect outside vbnfault acts where the sensor has this table:
+
+    class Persistence(Effect):
+        \"\"\"Add a fraction of the light of a bright exposure before this one.\"\"\"
+
+        name = "persistence"
+        after = "dark_current"
+
+        before_e: float = Field(ge=0, le=1e6, description="electrons per pixel of the exposure before")
+        fraction: float = Field(0.001, ge=0, le=0.1, description="part of them that is left")
+
+        def apply(self, signal, exposure):
+            return signal + np.float32(self.fraction * self.before_e)
+
+The chain has these effects and steps, in this order. `signal` is float32[y, x] in electrons, from "analogue" on
+float32[y, x] in DN, from "converter" on uint16[y, x] in DN.
+
+    response, light, smear, dark_current, telegraph, pixels, shot_noise, charge, blooming, deep_traps,
+    parallel_cti, serial_cti, analogue, converter, stuck_pixels, raw
+
+"light", "pixels", "charge" and "raw" are the steps at which faults act; "offsets" belongs to "analogue".
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import GetCoreSchemaHandler, GetJsonSchemaHandler, ValidationError
+from pydantic.json_schema import JsonSchemaValue
+from pydantic_core import CoreSchema, PydanticCustomError, core_schema
+
+from ...core.registry import Registry, chained
+from ...core.tables import Table, did_you_mean
+
+if TYPE_CHECKING:
+    from ..chain import Device, MosaicNoise
+    from ..sensor import Sensor
+
+F32 = NDArray[np.float32]
+
+# Steps at which a fault may act on the signal:
+#   light    photo-electrons after each pixel's response, before smear and dark current
+#   pixels   all electrons expected in each pixel, before shot noise
+#   charge   collected electrons, before blooming
+#   offsets  electrons that the readout adds to each pixel
+#   raw      raw DN
+STEPS = ("light", "pixels", "charge", "offsets", "raw")
+# The changes that faults make to the array of a step, by the names of `STEPS`.
+Acts = Mapping[str, Sequence[Callable[[Any], Any]]]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Exposure:
+    """Describe one exposure of a device, as an effect sees it.
+
+    Attributes
+    ----------
+    device
+        The device, with its sensor and the maps of its pixels.
+    exposure_s
+        Exposure time in s.
+    noise
+        Variates of the exposure; None: the expected signal without noise.
+    acts
+        Changes that faults make at each step.
+    """
+
+    device: Device
+    exposure_s: float
+    noise: MosaicNoise | None
+    acts: Acts
+
+    @property
+    def sensor(self) -> Sensor:
+        """Return the type of the sensor."""
+        return self.device.sensor
+
+    def rng(self, name: str) -> np.random.Generator | None:
+        """Return the random generator of this exposure for a name, such as that of an effect.
+
+        None where the exposure is without noise; the effect then returns the expected signal. Draw a number of
+        variates that does not depend on the signal, so that twins differ only where their signals differ.
+        """
+        if self.noise is None:
+            return None
+        return np.random.default_rng(np.random.SeedSequence([self.noise.seed, *name.encode()]))
+
+    def acted(self, step: str, array: Any) -> Any:
+        """Return an array with the changes that faults make at a step."""
+        for act in self.acts.get(step, ()):
+            array = act(array)
+        return array
+
+
+class Effect(Table):
+    """Change the signal at one place of a detector's chain.
+
+    A subclass sets the class attributes, declares its fields with `pydantic.Field` (default, bounds, description;
+    the unit is in the name) and writes `apply`.
+
+    Attributes
+    ----------
+    name
+        Name of the effect, and of its table in a sensor file.
+    after
+        Name of the effect or the step directly behind which it acts.
+    """
+
+    name: ClassVar[str]
+    after: ClassVar[str]
+
+    @classmethod
+    def __pydantic_init_subclass__(cls, **kwargs: Any) -> None:
+        """Register the effect, unless it is a base class without a name."""
+        if "name" in cls.__dict__:
+            _REGISTRY.add(cls.name, cls)
+
+    @abstractmethod
+    def apply(self, signal: Any, exposure: Exposure) -> Any:
+        """Return the signal [y, x] with this effect; the input may be changed in place only if it is returned."""
+
+
+class FaultStep(Effect):
+    """Let faults act on the signal at one of `STEPS`; a subclass gives its name and place."""
+
+    def apply(self, signal: Any, exposure: Exposure) -> Any:
+        """Return the signal with the faults of this step."""
+        return exposure.acted(self.name, signal)
+
+
+_REGISTRY: Registry[Effect] = Registry("detector effect", __package__ or "")
+
+
+def registry() -> dict[str, type[Effect]]:
+    """Return the name and the class of every detector effect."""
+    return _REGISTRY.classes()
+
+
+def is_packaged(cls: type[Effect]) -> bool:
+    """Return whether an effect belongs to vbnfault, so that it acts in every sensor."""
+    return _REGISTRY.is_packaged(cls)
+
+
+def order() -> tuple[str, ...]:
+    """Return the names of all effects in the order in which they act.
+
+    An effect from outside acts directly behind the one that it names, before the next one of vbnfault. Raise
+    TypeError if an effect names none that exists, or effects name each other in a circle.
+    """
+    classes = registry()
+    return chained(
+        {name: cls.after for name, cls in classes.items()},
+        [name for name, cls in classes.items() if is_packaged(cls)],
+        "detector effect",
+    )
+
+
+def chain_of(effects: Sequence[Effect]) -> tuple[Effect, ...]:
+    """Return the whole chain of a sensor with the given effects of its own, in order."""
+    own = {effect.name: effect for effect in effects}
+    classes = registry()
+    return tuple(
+        own[name] if name in own else classes[name]()
+        for name in order()
+        if name in own or is_packaged(classes[name])
+    )
+
+
+# --- the tables of the sensor file ------------------------------------------------------------------------------
+
+
+def parse(tables: Any) -> tuple[Effect, ...]:
+    """Return the effects of the tables `[effects.NAME]` of a sensor, in the order of the chain.
+
+    Raises ValueError, or pydantic's ValidationError that names the key.
+    """
+    if isinstance(tables, tuple) and all(isinstance(effect, Effect) for effect in tables):
+        own = {effect.name: effect for effect in tables}
+    elif isinstance(tables, Mapping):
+        own = {name: _parse_effect(name, table) for name, table in tables.items()}
+    else:
+        raise ValueError("must be a table")
+    return tuple(own[name] for name in order() if name in own)
+
+
+def _parse_effect(name: str, table: Any) -> Effect:
+    """Return the effect of one table."""
+    known = {key: cls for key, cls in registry().items() if not is_packaged(cls)}
+    cls = known.get(name)
+    if cls is None:
+        hint = did_you_mean(name, list(known)) if known else "; none is known"
+        reason = f"no such effect{hint}; name the plug-in that defines it in the scene's plugins"
+        error = PydanticCustomError("value_error", "{reason}", {"reason": reason})
+        raise ValidationError.from_exception_data("effects", [{"type": error, "loc": (name,), "input": {}}])
+    try:
+        return cls.model_validate(table, strict=not isinstance(table, Effect))
+    except ValidationError as error:
+        details: list[Any] = [
+            {**detail, "loc": (name, *detail["loc"]), "type": _reason(detail)}
+            for detail in error.errors(include_url=False)
+        ]
+        raise ValidationError.from_exception_data("effects", details) from None
+
+
+def _reason(detail: Any) -> Any:
+    """Return the type of an error of pydantic from which the same error can be made again."""
+    if detail["type"] == "value_error":
+        return PydanticCustomError("value_error", "{reason}", {"reason": str(detail["ctx"]["error"])})
+    return detail["type"]
+
+
+class _FromRegistry:
+    """Give pydantic the validation and the JSON Schema of a field that holds effects by their names."""
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        return core_schema.no_info_plain_validator_function(
+            parse,
+            serialization=core_schema.plain_serializer_function_ser_schema(
+                lambda effects: {effect.name: effect.model_dump() for effect in effects}
+            ),
+        )
+
+    def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
+        properties = {
+            name: handler(cls.__pydantic_core_schema__) for name, cls in registry().items() if not is_packaged(cls)
+        }
+        return {"type": "object", "properties": properties, "additionalProperties": False}
+
+
+# The type of a field of a model that holds the effects of a sensor by their names.
+Effects = Annotated[tuple[Effect, ...], _FromRegistry()]
