@@ -1,0 +1,179 @@
+"""The chain of a detector: its order, and effects that are defined outside the package."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import pickle
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from pydantic import Field
+
+from vbnfault.core import tables
+from vbnfault.core.errors import InputError
+from vbnfault.core.quantities import Electrons
+from vbnfault.core.registry import chained
+from vbnfault.detector import MosaicDetector, Sensor
+from vbnfault.detector.chain import Device, MosaicNoise
+from vbnfault.detector.effects import STEPS, Effect, Exposure, contract, order, registry
+from vbnfault.detector.sensor import load_sensor, parse_sensor
+
+SHAPE = (48, 40)
+RNG = np.random.default_rng(5)
+LIGHT = RNG.uniform(0, 20_000, SHAPE).astype(np.float32)
+
+
+class Persistence(Effect):
+    """Add what is left of the exposure before, with noise of its own."""
+
+    name = "persistence"
+    after = "dark_current"
+
+    before_e: float = Field(ge=0, le=1e6, description="electrons per pixel of the exposure before")
+    fraction: float = Field(0.001, ge=0, le=0.1, description="part of them that is left")
+    spread: float = Field(0.0, ge=0, le=1, description="spread of that part from exposure to exposure")
+
+    def apply(self, signal: Any, exposure: Exposure) -> Any:
+        rng = exposure.rng(self.name)
+        factor = 1.0 if rng is None else 1 + self.spread * rng.standard_normal()
+        return signal + np.float32(self.before_e * self.fraction * factor)
+
+
+class Nothing(Effect):
+    """Change nothing between the analogue chain and the converter, which else run in one pass."""
+
+    name = "nothing"
+    after = "analogue"
+
+    def apply(self, signal: Any, exposure: Exposure) -> Any:
+        assert signal.dtype == np.float32
+        return signal
+
+
+class LostBit(Effect):
+    """Clear the least significant bit of the raw numbers."""
+
+    name = "lost_bit"
+    after = "stuck_pixels"
+
+    def apply(self, signal: Any, exposure: Exposure) -> Any:
+        return signal & np.uint16(0xFFFE)
+
+
+@pytest.fixture(autouse=True, scope="module")
+def only_here() -> Iterator[None]:
+    """Forget the effects of this file, so that other tests see those of the package."""
+    yield
+    for name in ("persistence", "nothing", "lost_bit"):
+        contract._REGISTRY._classes.pop(name)
+    tables.forget_schemas()
+
+
+def noise(seed: int, shape: tuple[int, int] = SHAPE) -> MosaicNoise:
+    return MosaicNoise.draw(shape, *(np.random.default_rng([seed, k]) for k in range(3)))
+
+
+def sensor_with(*effects: Effect, name: str = "generic_ccd") -> Sensor:
+    return dataclasses.replace(load_sensor(name), effects=effects)
+
+
+def test_the_order_is_the_documented_one() -> None:
+    listed = re.search(r"    (response, .*?raw)\n", contract.__doc__ or "", flags=re.DOTALL)
+    assert listed is not None
+    packaged = [name for name in order() if contract.is_packaged(registry()[name])]
+    assert packaged == re.findall(r"\w+", listed.group(1))
+    assert [name for name in packaged if name in STEPS] == [step for step in STEPS if step != "offsets"]
+
+
+def test_an_effect_from_outside_acts_behind_the_one_that_it_names() -> None:
+    names = list(order())
+    assert names.index("persistence") == names.index("dark_current") + 1
+    chain = [effect.name for effect in Device(sensor_with(Persistence(before_e=1.0)), 1, shape=SHAPE).chain]
+    assert chain == [name for name in names if name not in ("nothing", "lost_bit")]
+    with pytest.raises(TypeError, match=r"detector effect b: after = 'c': there is none of this name"):
+        chained({"a": "", "b": "c"}, ["a"], "detector effect")
+    with pytest.raises(TypeError, match=r"what b, c state by `after` runs in a circle"):
+        chained({"a": "", "b": "c", "c": "b"}, ["a"], "detector effect")
+
+
+@pytest.mark.parametrize("name", ["generic_ccd", "generic_cmos"])
+def test_effects_without_strength_change_no_bit(name: str) -> None:
+    """The first also has noise of its own, which must not move that of the others."""
+    plain = Device(sensor_with(name=name), 3, shape=SHAPE).raw(LIGHT, 0.1, noise(1))
+    off = sensor_with(Persistence(before_e=0.0, spread=0.5), Nothing(), name=name)
+    np.testing.assert_array_equal(Device(off, 3, shape=SHAPE).raw(LIGHT, 0.1, noise(1)), plain)
+
+
+def test_an_effect_from_outside_adds_its_electrons() -> None:
+    acting = Device(sensor_with(Persistence(before_e=1e5, fraction=0.01)), 3, shape=SHAPE)
+    plain = Device(sensor_with(), 3, shape=SHAPE)
+    gained = acting.expected_e(LIGHT, 0.1) - plain.expected_e(LIGHT, 0.1)
+    np.testing.assert_allclose(gained, 1000.0, rtol=1e-5)  # float32 of up to 2e4 electrons
+    raw = Device(sensor_with(LostBit()), 3, shape=SHAPE).raw(LIGHT, 0.1, noise(1))
+    np.testing.assert_array_equal(raw, plain.raw(LIGHT, 0.1, noise(1)) & 0xFFFE)
+
+
+def test_the_noise_of_an_effect_is_keyed_by_its_exposure() -> None:
+    device = Device(sensor_with(Persistence(before_e=1e5, fraction=0.01, spread=0.3)), 3, shape=SHAPE)
+    dark = np.zeros(SHAPE, np.float32)
+    first, again, other = (float(device.collected_e(dark, 0.1, noise(k)).mean()) for k in (1, 1, 2))
+    assert first == again
+    assert first != pytest.approx(
+        other, rel=0.01
+    )  # 30 % of 1000 e apart, of which shot noise moves the mean by 1 e
+
+
+def sensor_file(folder: Path, **table: Any) -> Path:
+    path = folder / "mine.toml"
+    numbers = "".join(f"{key} = {value}\n" for key, value in table.items())
+    sources = "".join(f'"effects.persistence.{key}" = "assumed"\n' for key in table)
+    path.write_text(
+        'architecture = "cmos"\npixel_pitch_um = 5.5\n[readout]\nbits = 12\nfull_well_e = 13500.0\n'
+        f"[effects.persistence]\n{numbers}[sources]\npixel_pitch_um = 'a'\n'readout.bits' = 'a'\n"
+        f"'readout.full_well_e' = 'a'\n{sources}"
+    )
+    return path
+
+
+def test_a_sensor_file_sets_an_effect_from_outside(tmp_path: Path) -> None:
+    sensor = load_sensor(sensor_file(tmp_path, before_e=1e5))
+    assert sensor.effects == (Persistence(before_e=1e5),)
+    assert "persistence" in json.dumps(tables.json_schema(Sensor))
+    detector = MosaicDetector(sensor=sensor, width_px=SHAPE[1], height_px=SHAPE[0])
+    assert detector.description["sensor"]["effects"] == [
+        {"name": "persistence", "before_e": 1e5, "fraction": 0.001, "spread": 0.0}
+    ]
+    planes = np.zeros((*SHAPE, 3), np.float32)
+    light = Electrons(array=planes, white_e=detector.white_e)
+    plain = dataclasses.replace(detector, sensor=dataclasses.replace(sensor, effects=()))
+    assert detector != plain  # caches of devices tell them apart
+    gained = detector.raw(light, 0.0, None).mean() - plain.raw(light, 0.0, None).mean()
+    assert gained == pytest.approx(100 * sensor.readout.system_gain_dn_per_e, abs=0.5)  # rounding to whole DN
+    assert pickle.loads(pickle.dumps(detector)) == detector
+
+
+@pytest.mark.parametrize(
+    ("table", "sentence"),
+    [
+        ({"before_e": -3.0}, r"effects.persistence.before_e = -3.0: must be a number from 0 to 1e\+06"),
+        ({}, r"effects.persistence.before_e: is missing"),
+        (
+            {"before_e": 1.0, "fractoin": 0.1},
+            r"effects.persistence.fractoin: unknown key \(did you mean fraction\?",
+        ),
+    ],
+)
+def test_a_wrong_value_is_named(tmp_path: Path, table: dict[str, float], sentence: str) -> None:
+    with pytest.raises(InputError, match=sentence):
+        load_sensor(sensor_file(tmp_path, **table))
+
+
+def test_an_unknown_effect_is_named() -> None:
+    table = {"architecture": "cmos", "pixel_pitch_um": 5.5, "readout": {"bits": 12, "full_well_e": 1e4}}
+    with pytest.raises(InputError, match=r"t.toml: effects.persistance: no such effect \(did you mean persistence"):
+        parse_sensor({**table, "effects": {"persistance": {}}}, source="t.toml")
