@@ -16,9 +16,9 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-import cv2
 import numpy as np
 
+from vbnfault.core.images import write_png
 from vbnfault.faults import registry
 from vbnfault.pipeline import Session, labels
 from vbnfault.pipeline.photograph import develop, effect_of
@@ -60,9 +60,8 @@ def main() -> None:
             image = develop(frame, frame.drawn, noise).array
             effects = {name: effect_of(frame, name)}
             mask = labels.mask_layers({name: fault}, frame.drawn, frame.context, effects)[0]
-            cv2.imwrite(
-                str(given.out / f"{name}_{kind}.png"), np.hstack([image[..., 2::-1], _seen(image, clean, mask)])
-            )
+            pair = np.hstack([image[..., :3], _seen(image, clean, mask)])
+            write_png(given.out / f"{name}_{kind}.png", pair)
             short = {k: v for k, v in params.items() if not isinstance(v, list | dict)}
             print(f"{kind} {name}: mask {mask.mean():.4f}", json.dumps(short), flush=True)
 
@@ -91,7 +90,7 @@ def _dark(frame: Frame, exposure_s: float) -> Frame:
 
 def _seen(image: np.ndarray, clean: np.ndarray, mask: np.ndarray) -> np.ndarray:
     """Return the amplified difference of two images around grey, with the mask in green."""
-    change = 8 * (image[..., 2::-1].astype(np.int16) - clean[..., 2::-1]) + 96
+    change = 8 * (image[..., :3].astype(np.int16) - clean[..., :3]) + 96
     out = np.clip(change, 0, 255).astype(np.uint8)
     out[mask] = (0.75 * out[mask] + 0.25 * np.array([0, 255, 0])).astype(np.uint8)
     return out

@@ -15,10 +15,10 @@ import csv
 from dataclasses import replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from vbnfault.core import resources
+from vbnfault.core.images import write_png
 from vbnfault.lens import load_lens
 from vbnfault.output import flare_images
 
@@ -86,7 +86,7 @@ def main() -> None:
     for name in args.lens or resources.packaged("scenes/lenses"):
         picture, energy = sheet(name, args.coating, models, args.pixels)
         path = args.out / f"{name}_{args.coating}.png"
-        cv2.imwrite(str(path), picture[..., ::-1])
+        write_png(path, picture)
         print(path)
         rows += energy
         for row in energy:

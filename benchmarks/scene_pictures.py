@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vbnfault import dataset
+from vbnfault.core.images import decoded_image, write_png
 from vbnfault.output import contact_sheet
 from vbnfault.output.sample_files import annotated
 from vbnfault.pipeline import Session
@@ -109,7 +110,7 @@ def sheet(scene: str) -> U8:
         path = Path(folder) / f"{scene}.zarr"
         dataset.build_scene(config.load_scene(scene, small), path, source=scene)
         contact_sheet.preview(path, path.with_suffix(".png"))
-        whole = cv2.imread(str(path.with_suffix(".png")))[..., ::-1]
+        whole = decoded_image(path.with_suffix(".png").read_bytes())
     size = (SHEET_WIDTH_PX, round(SHEET_WIDTH_PX * whole.shape[0] / whole.shape[1]))
     return np.asarray(cv2.resize(whole, size, interpolation=cv2.INTER_AREA))
 
@@ -124,7 +125,7 @@ def main() -> None:
     for scene in given.scenes or known:
         path = given.out / f"{scene}.png"
         figure = sheet(scene) if scene in SHEETS else SINGLE[scene]()
-        cv2.imwrite(str(path), figure[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 9])
+        write_png(path, figure, smallest=True)
         print(f"{path}: {path.stat().st_size / 1e3:.0f} kB", flush=True)
 
 

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from vbnfault import render
 from vbnfault.body import EMBEDDED
 from vbnfault.core import frames
+from vbnfault.core.images import write_png
 from vbnfault.pipeline import Session, expose
 from vbnfault.pipeline.spec import Frame, Pose
 from vbnfault.render.description import Sunlight
@@ -90,13 +91,13 @@ def sunlit_azimuth(surface: render.TerrainMesh) -> float:
 
 
 def picture(session: Session, site: int, pose: Pose) -> NDArray:
-    """Return the image of the scene's camera without faults and noise, with gamma 2.2, uint8[y, x, 3] B, G, R."""
+    """Return the image of the scene's camera without faults and noise, with gamma 2.2, uint8[y, x, 3]."""
     frame = Frame(spec=session.spec(int(np.flatnonzero(session.plan.site == site)[0])))
     frame.pose = pose
     expose.render_frame(frame)
     expose.meter(frame)
     exposed = frame.rate.with_array(frame.rate.array * np.float32(frame.camera.exposure_s))
-    image = frame.camera.detector.develop(exposed, frame.camera.exposure_s, None).array[..., 2::-1]
+    image = frame.camera.detector.develop(exposed, frame.camera.exposure_s, None).array[..., :3]
     return np.round(255 * (image / 255.0) ** (1 / GAMMA)).astype(np.uint8)
 
 
@@ -136,10 +137,10 @@ def main() -> None:
             for name in arguments.views:
                 pose = pose_at(surface, *VIEWS[name], azimuth, (sun_azimuth, SUNS_DEG[sun]))
                 row.append(picture(session, site, pose))
-                cv2.imwrite(str(arguments.out / f"site{site:02d}_{name}_{sun}.png"), row[-1])
+                write_png(arguments.out / f"site{site:02d}_{name}_{sun}.png", row[-1])
             rows.append(np.hstack(row))
         sheet = cv2.resize(np.vstack(rows), None, fx=0.4, fy=0.4, interpolation=cv2.INTER_AREA)
-        cv2.imwrite(str(arguments.out / f"site{site:02d}_sheet.png"), sheet)
+        write_png(arguments.out / f"site{site:02d}_sheet.png", sheet)
         print(
             f"site {site}: terrain in {built - start:.1f} s, {len(arguments.suns) * len(arguments.views)} pictures"
         )

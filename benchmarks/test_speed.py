@@ -15,13 +15,13 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
 from blender_cycles import Cycles, Unavailable, interpreter
 from report import SAMPLE, targets
 from workload import Workload, clock, medians
 
+from vbnfault.core.images import write_png
 from vbnfault.pipeline.spec import Frame
 
 
@@ -114,4 +114,4 @@ def _write_pair(path: Path, ours: np.ndarray, theirs: np.ndarray) -> None:
     """Write both images side by side as a PNG, each scaled to its 99th percentile."""
     shown = [np.clip(255 * (p / np.percentile(p, 99)) ** (1 / 2.2), 0, 255) for p in (ours, theirs)]
     path.parent.mkdir(parents=True, exist_ok=True)
-    assert cv2.imwrite(str(path), np.hstack(shown).astype(np.uint8))
+    write_png(path, np.hstack(shown).astype(np.uint8))

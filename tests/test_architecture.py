@@ -53,6 +53,7 @@ ONLY = {  # distribution → the packages or modules that import it
     "distributed": {"dataset.dask"},
     "typer": {"cli"},
     "spiceypy": {"core.spice"},
+    "OpenEXR": {"core.images"},
 }
 
 

@@ -28,6 +28,7 @@ from numpy.typing import NDArray
 
 from ..core import resources
 from ..core.errors import InputError, shown
+from ..core.images import decoded_image
 from ..core.quantities import CHANNELS, LUMINANCE
 from .context import FaultContext, Params
 from .contract import Fault
@@ -165,10 +166,7 @@ def load(path: str, sha256: str | None = None) -> tuple[NDArray[np.float32], NDA
         raise InputError(
             f"{where}: has {width_px} × {height_px} pixels; must have at most {LARGEST_TEXTURE_PIXELS} in all"
         )
-    try:
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if width_px else None
-    except cv2.error:  # larger than OpenCV accepts
-        image = None
+    image = decoded_image(data) if width_px else None
     if image is None or image.dtype not in (np.uint8, np.uint16):
         raise InputError(f"{where}: must be a PNG or TIFF image of 8 or 16 bits")
     full = 255 if image.dtype == np.uint8 else 65535
@@ -176,7 +174,7 @@ def load(path: str, sha256: str | None = None) -> tuple[NDArray[np.float32], NDA
     alpha = np.ones(plain.shape[:2], np.float32)
     if plain.shape[2] in (2, 4):
         alpha = np.ascontiguousarray(plain[..., -1])
-    rgb = plain[..., 2::-1] if plain.shape[2] >= 3 else np.repeat(plain[..., :1], 3, axis=2)
+    rgb = plain[..., :3] if plain.shape[2] >= 3 else np.repeat(plain[..., :1], 3, axis=2)
     intensity = rgb @ LUMINANCE if plain.shape[2] >= 3 else plain[..., 0]
     return np.concatenate([rgb, intensity[..., None]], axis=2) * np.float32(255), alpha
 

@@ -38,6 +38,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.errors import VbnfaultError
+from ..core.images import decoded_image
 from ..core.quantities import LUMINANCE
 from ..core.resources import cached_with_contents, data_dir, read_input
 from .context import FaultContext, Params
@@ -314,10 +315,10 @@ def pyramid(name: str) -> tuple[NDArray[np.float32], ...]:
         The texture's file is damaged.
     """
     path = data_dir("textures") / f"{name}.png"
-    image = cv2.imdecode(np.frombuffer(read_input(path, "texture"), np.uint8), cv2.IMREAD_UNCHANGED)
+    image = decoded_image(read_input(path, "texture"))
     if image is None or image.dtype != np.uint16 or image.ndim != 3:
         raise VbnfaultError(f"{path}: missing or damaged; install vbnfault again")
-    levels = [np.ascontiguousarray(image[..., ::-1], dtype=np.float32) / np.float32(65535)]
+    levels = [np.ascontiguousarray(image, dtype=np.float32) / np.float32(65535)]
     while levels[-1].shape[0] % 2 == 0 and levels[-1].shape[0] > 6:
         half = levels[-1].shape[0] // 2
         levels.append(levels[-1].reshape(half, 2, half, 2, 3).mean(axis=(1, 3), dtype=np.float32))

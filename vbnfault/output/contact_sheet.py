@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.errors import InputError, VbnfaultError
+from ..core.images import write_png
 from ..store import STRATA, Store, open_store
 
 U8 = NDArray[np.uint8]
@@ -238,9 +239,8 @@ def _write_png(path: Path, rgb: U8) -> None:
     """Write an RGB image; a path that cannot be used raises InputError, any other failure VbnfaultError."""
     if path.suffix.lower() != ".png":
         raise InputError(f"{path}: the sheet is a PNG, so its name must end in .png")
-    encoded = cv2.imencode(".png", np.ascontiguousarray(rgb[..., ::-1]))[1]
     try:
-        path.write_bytes(encoded.tobytes())
+        write_png(path, rgb)
     except (FileNotFoundError, NotADirectoryError, PermissionError) as error:
         raise InputError(f"{path}: cannot be written: {error.strerror}") from error
     except OSError as error:

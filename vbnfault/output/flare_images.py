@@ -7,13 +7,13 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from ..camera import Camera
 from ..core import spectra
 from ..core.errors import InputError
+from ..core.images import srgb8, write_exr, write_png
 from ..core.quantities import Electrons
 from ..detector import ThreeColourDetector
 from ..faults import FaultContext, registry
@@ -21,7 +21,6 @@ from ..lens import Prescription, ThinLens, first_order, load_lens
 from ..lens.straylight.paraxial import Ghost, axial_transmittance, mean_ghost, paraxial_ghosts
 from ..lens.straylight.total import VEIL_FRACTION, Cleanliness, straylight
 from ..scene import keyed_random
-from .exr import write_exr
 from .json_files import write_json
 
 F32 = NDArray[np.float32]
@@ -330,8 +329,7 @@ def picture(flare: Flare) -> NDArray[np.uint8]:
     linear = np.clip(_sum_of_layers(flare) / np.float32(flare.white), 0, 1)
     if "texture" in flare.layers:
         linear[colours(flare.request, flare.layers["sun"]) > 0] = 1
-    encoded = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
-    return np.asarray(np.rint(255 * encoded), dtype=np.uint8)
+    return srgb8(linear)
 
 
 def _sum_of_layers(flare: Flare) -> F32:
@@ -344,9 +342,7 @@ def _sum_of_layers(flare: Flare) -> F32:
 def write_picture(flare: Flare, path: Path) -> None:
     """Write the layers as `.png`, or as `.exr` with linear R, G, B and `<layer>.<wavelength>nm` of every band."""
     if path.suffix.lower() == ".png":
-        ok, data = cv2.imencode(".png", picture(flare)[..., ::-1])
-        assert ok
-        path.write_bytes(data.tobytes())
+        write_png(path, picture(flare))
         return
     channels: dict[str, Any] = {}
     for name, layer in flare.layers.items():

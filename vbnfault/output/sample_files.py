@@ -10,13 +10,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.errors import InputError, VbnfaultError
+from ..core.errors import InputError
+from ..core.images import write_exr, write_png
 from ..core.quantities import Sample
 from ..pipeline import labels
 from ..pipeline.record import to_sample
 from ..pipeline.spec import Frame
 from . import contact_sheet
-from .exr import write_exr
 from .json_files import write_json
 
 _MARKED_GHOSTS = 10
@@ -41,15 +41,15 @@ def write_frame(frame: Frame, folder: Path) -> list[Path]:
         files = [_write_exr(frame, sample, folder / "sample.exr")]
         for name, layer in sample.layers.items():
             if layer.ndim == 3 and layer.shape[-1] == 4:
-                files.append(_write_png(folder / f"{name}.png", layer[..., 2::-1]))
-                files.append(_write_png(folder / f"{name}_intensity.png", layer[..., 3]))
+                files.append(write_png(folder / f"{name}.png", layer[..., :3]))
+                files.append(write_png(folder / f"{name}_intensity.png", layer[..., 3]))
         for layer_name, prefix in (("mask", "mask_"), ("mask_effect", "mask_effect_")):
             for fault, mask in zip(frame.spec.faults, sample.layers.get(layer_name, ()), strict=False):
-                files.append(_write_png(folder / f"{prefix}{fault}.png", mask.astype(np.uint8) * 255))
+                files.append(write_png(folder / f"{prefix}{fault}.png", mask.astype(np.uint8) * 255))
         union = sample.layers["mask_any"].astype(np.uint8) * 255
-        files.append(_write_png(folder / "mask_any.png", union))
+        files.append(write_png(folder / "mask_any.png", union))
         for name in frame.drawn:
-            files.append(_write_png(folder / f"annotated_{name}.png", annotated(frame, name)[..., ::-1]))
+            files.append(write_png(folder / f"annotated_{name}.png", annotated(frame, name)))
         path = folder / "parameters.json"
         write_json(path, _scalars(sample))
         return [*files, path]
@@ -114,15 +114,6 @@ def _scalars(sample: Sample) -> dict[str, Any]:
     return {"sample": sample.index, **flat}
 
 
-def _write_png(path: Path, array: NDArray[np.uint8]) -> Path:
-    """Write an image, uint8[y, x] or [y, x, 3] B, G, R, and return its path."""
-    ok, data = cv2.imencode(".png", np.ascontiguousarray(array))
-    if not ok:
-        raise VbnfaultError(f"{path}: PNG encoding failed")
-    path.write_bytes(data.tobytes())
-    return path
-
-
 def _write_exr(frame: Frame, sample: Sample, path: Path) -> Path:
     """Write radiance, truth and soft layers to one EXR file and return its path."""
     truth = frame.truth
@@ -136,5 +127,4 @@ def _write_exr(frame: Frame, sample: Sample, path: Path) -> Path:
     channels["semantic"] = truth.semantic.astype(np.uint32)
     soft = [fault.soft_layer for fault in frame.spec.faults.values()]
     channels |= {name: sample.layers[name] for name in soft if name in sample.layers}
-    write_exr(path, channels)
-    return path
+    return write_exr(path, channels)

@@ -1,0 +1,82 @@
+"""Read and write image files (PNG, TIFF, OpenEXR), and encode linear light as sRGB.
+
+Arrays have their channels in the order R, G, B, alpha.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from .errors import VbnfaultError
+
+# Channels of OpenCV's order B, G, R, alpha in the order R, G, B, alpha, and back.
+_SWAPPED = {3: [2, 1, 0], 4: [2, 1, 0, 3]}
+
+
+def decoded_image(data: bytes) -> NDArray[Any] | None:
+    """Return the pixels of a PNG or TIFF file as stored, [y, x] or [y, x, channel]; None for any other data."""
+    try:
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if data else None
+    except cv2.error:  # more pixels than OpenCV accepts
+        return None
+    return None if image is None else _swapped(np.asarray(image))
+
+
+def write_png(path: Path, image: NDArray[Any], *, smallest: bool = False) -> Path:
+    """Write an image as PNG and return its path.
+
+    Parameters
+    ----------
+    image
+        uint8 or uint16, [y, x] or [y, x, channel] with the channels R, G, B and, if any, alpha.
+    smallest
+        Whether to compress as far as possible, which takes longer.
+
+    Raises
+    ------
+    OSError
+        The file cannot be written.
+    """
+    options = [cv2.IMWRITE_PNG_COMPRESSION, 9] if smallest else []
+    done, data = cv2.imencode(".png", np.ascontiguousarray(_swapped(image)), options)
+    if not done:
+        raise VbnfaultError(f"{path}: the image cannot be encoded as PNG")
+    path.write_bytes(data.tobytes())
+    return path
+
+
+def write_exr(path: Path, channels: Mapping[str, NDArray[Any]]) -> Path:
+    """Write named channels, float16, float32 or uint32 [y, x] of one size, to an OpenEXR file; return its path.
+
+    Raises OSError if the file cannot be opened, and VbnfaultError if writing fails later, as on a full disk.
+    """
+    import OpenEXR
+
+    path.write_bytes(b"")  # raises OSError with the system's reason; OpenEXR raises RuntimeError
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    try:
+        # OpenEXR accepts writeable arrays only
+        OpenEXR.File(header, {name: array.copy() for name, array in channels.items()}).write(str(path))
+    except RuntimeError as error:
+        raise VbnfaultError(f"{path}: cannot be written: {error}") from None
+    return path
+
+
+def srgb8(linear: ArrayLike) -> NDArray[np.uint8]:
+    """Return linear light, clipped to [0, 1], as 8-bit sRGB (IEC 61966-2-1), uint8 in the shape of `linear`."""
+    from colour.models import eotf_inverse_sRGB  # takes a second to import
+
+    encoded = eotf_inverse_sRGB(np.clip(linear, 0, 1))
+    return np.asarray(np.rint(255 * encoded), dtype=np.uint8)
+
+
+def _swapped(image: NDArray[Any]) -> NDArray[Any]:
+    """Return the image with R and B exchanged, if it has colours."""
+    order = _SWAPPED.get(image.shape[2]) if image.ndim == 3 else None
+    return image if order is None else image[..., order]
