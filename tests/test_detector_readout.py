@@ -11,28 +11,28 @@ import pytest
 from scipy import stats
 
 from vbnfault.core.errors import InputError
-from vbnfault.detector.readout import (
-    ReadoutIndividual,
-    ReadoutNoise,
-    ReadoutSpec,
-    analogue_dn,
-    banding_e,
-    convert,
+from vbnfault.detector.converter import convert, transitions_dn
+from vbnfault.detector.nodes import node_of, transmission_order
+from vbnfault.detector.raw_damage import (
     corrupted_packets,
     dead_lines,
     duplicated_lines,
     lost_lines,
     lost_node,
     lost_packets,
-    node_of,
     packet_count,
-    read_out,
-    readout_time_s,
     saturated_lines,
     shifted_lines,
     stick_bits,
-    transitions_dn,
-    transmission_order,
+)
+from vbnfault.detector.readout import (
+    ReadoutIndividual,
+    ReadoutNoise,
+    ReadoutSpec,
+    analogue_dn,
+    banding_e,
+    read_out,
+    readout_time_s,
 )
 
 IDEAL = ReadoutSpec(read_noise_e_rms=0)

@@ -24,16 +24,8 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from ..detector.readout import (
-    Axis,
-    dead_lines,
-    duplicated_lines,
-    lost_node,
-    node_of,
-    readout_steps,
-    saturated_lines,
-    shifted_lines,
-)
+from ..detector.nodes import node_of, readout_steps
+from ..detector.raw_damage import Axis, dead_lines, duplicated_lines, lost_node, saturated_lines, shifted_lines
 from .context import FaultContext, Params
 from .contract import Fault
 from .fields import Interval, bounds, number

@@ -18,7 +18,8 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from ..detector.readout import Fill, corrupted_packets, lost_lines, lost_packets, packet_count, transmission_order
+from ..detector.nodes import transmission_order
+from ..detector.raw_damage import Fill, corrupted_packets, lost_lines, lost_packets, packet_count
 from .context import FaultContext, Params
 from .contract import Fault
 from .fields import Interval, bounds, choice

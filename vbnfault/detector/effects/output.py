@@ -7,8 +7,9 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from ..converter import convert
 from ..individual import StuckPixels
-from ..readout import ReadoutIndividual, analogue_dn, convert, read_out
+from ..readout import ReadoutIndividual, analogue_dn, read_out
 from .contract import F32, Effect, Exposure, FaultStep
 
 Raw = NDArray[np.uint16]
