@@ -1,8 +1,10 @@
 """Run the code blocks of a Markdown page, in order, in one folder.
 
     python docs/_ext/blocks.py docs/tutorial.md --figures docs/figures
+    python docs/_ext/blocks.py docs/howto/own_body.md --only bennu --figures docs/figures
 
-runs a page as it is printed and keeps the figures that the page shows. The tests run every page with small images.
+runs a page as it is printed, or its blocks with a word in them, and keeps the figures that the page shows. The
+tests run every page with small images.
 
 What a fenced block is follows from its language and its first line:
 
@@ -25,7 +27,6 @@ import itertools
 import os
 import re
 import shlex
-import shutil
 import sys
 import tempfile
 import tomllib
@@ -39,10 +40,11 @@ _FENCE = re.compile(
     flags=re.DOTALL | re.MULTILINE,
 )
 _FILE = re.compile(r"# ([\w./-]+\.(?:toml|py|csv|txt))\n")
+WIDEST_PX = 900
 LANGUAGES = ("sh", "python", "toml", "text", "json")
 
 # pip and the tests are what continuous integration itself runs
-DEVELOPERS = ("pip", "pytest", "python -m pytest")
+DEVELOPERS = ("pip", "pytest", "python -m pytest", "sphinx-build")
 
 
 @dataclass(frozen=True)
@@ -199,17 +201,25 @@ def figures(text: str) -> list[str]:
 
 
 def main() -> None:
-    """Run one page at full size and keep its figures."""
+    """Run one page at full size and keep its figures, at most `WIDEST_PX` wide."""
+    import cv2
+
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("page", type=Path)
+    parser.add_argument("--only", default="", help="run only the blocks that contain this word")
     parser.add_argument("--figures", type=Path, required=True, help="folder for the figures of the page")
     given = parser.parse_args()
     text = given.page.read_text(encoding="utf-8")
+    chosen = [block for block in blocks(text, str(given.page)) if given.only in block.text]
     os.environ["MPLBACKEND"] = "Agg"
     with tempfile.TemporaryDirectory() as folder:
-        run_page(blocks(text, str(given.page)), Path(folder))
-        for name in figures(text):
-            shutil.copy(Path(folder) / name, given.figures / name)
+        run_page(chosen, Path(folder))
+        made = [name for name in figures(text) if (Path(folder) / name).exists()]
+        for name in made:
+            image = cv2.imread(str(Path(folder) / name))
+            scale = min(1.0, WIDEST_PX / image.shape[1])
+            shrunk = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+            cv2.imwrite(str(given.figures / name), shrunk, [cv2.IMWRITE_PNG_COMPRESSION, 9])
             print(given.figures / name)
 
 

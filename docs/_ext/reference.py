@@ -11,6 +11,7 @@ import inspect
 import json
 import math
 import re
+import tomllib
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
@@ -76,7 +77,7 @@ def _sentence(text: str) -> str:
     text = text.strip()
     if not text:
         return ""
-    first = re.match(r"[a-z][a-z'-]+(?= |,|;|:|$)", text)
+    first = re.match(r"(?:a |an )?[a-z][a-z'-]+(?= |,|;|:|$)", text)
     if first and "_" not in first[0]:
         text = text[0].upper() + text[1:]
     return text + ("" if text[-1] in ".!?:" else ".")
@@ -241,7 +242,8 @@ def _options(node: Mapping[str, Any], schema: Mapping[str, Any]) -> list[Mapping
 def _inner_table(path: str, node: Mapping[str, Any], schema: Mapping[str, Any]) -> list[tuple[str, str, Any]]:
     """Return header, dotted path and schema of the table that a key holds, in a list; none for a plain value."""
     if "properties" in node:
-        return [(f"[{path}]", path, node)]
+        model = node["properties"].get("model", {}).get("const")
+        return [(f"[{path}] model = {json.dumps(model)}" if model else f"[{path}]", path, node)]
     for nested, header, inner in (
         ("items", f"[[{path}]]", path),
         ("additionalProperties", f"[{path}.NAME]", f"{path}.NAME"),
@@ -333,17 +335,18 @@ def faults() -> str:
     """Return every fault class with its models and their keys."""
     from vbnfault import faults as registered
 
-    parts = []
-    for fault_class, models in registered.registry().items():
+    classes = registered.registry()
+    parts = [_fault_overview(classes)]
+    for fault_class, models in classes.items():
         parts.append(f"## {fault_class}\n")
-        for k, (model, cls) in enumerate(models.items()):
+        for model, cls in models.items():
             needs = "a CCD with a mosaic" if cls.needs_ccd else "a detector with a mosaic"
             facts = [f"It acts on: `{'`, `'.join(cls.steps)}`."]
             facts += [f"It needs {needs} (`camera.detector`)."] if cls.needs_mosaic else []
             facts += ["It needs the Sun's position."] if cls.needs_sun else []
             facts += ["Its mask holds the pixels that change."] if cls.effect_mask else []
             facts += [f"Its optional layer is `{cls.soft_layer}`."] if cls.soft_layer else []
-            title = f"### {fault_class} / {model}{' (default)' if k == 0 and len(models) > 1 else ''}"
+            title = f"### {fault_class} / {model}{' (default)' if cls.default and len(models) > 1 else ''}"
             parts.append(f"{title}\n\n{_first_paragraph(cls)}\n\n{' '.join(facts)}\n")
             rows = [_fault_key(f) for f in dataclasses.fields(cls)]
             parts.append(_table(("key", "default", "unit", "allowed", "meaning"), rows))
@@ -375,6 +378,17 @@ def _fault_key(field: dataclasses.Field[Any]) -> tuple[str, ...]:
     else:
         allowed = "path" if kind == "path" else "text"
     return f"`{field.name}`", _code(default), meta.get("unit", ""), allowed, _sentence(meta.get("doc", ""))
+
+
+def _fault_overview(classes: Mapping[str, Mapping[str, Any]]) -> str:
+    """Return a table of every model and what it does."""
+    rows = []
+    for fault_class, models in classes.items():
+        for model, cls in models.items():
+            name = f"`{fault_class}`" if model == next(iter(models)) else ""
+            needs = "CCD" if cls.needs_ccd else "mosaic" if cls.needs_mosaic else ""
+            rows.append((name, f"`{model}`", f"`{cls.step}`", needs, _first_paragraph(cls)))
+    return _table(("class", "model", "acts on", "needs", "what it does"), rows)
 
 
 # --- the store ----------------------------------------------------------------------------------------------------
@@ -459,8 +473,29 @@ def api() -> str:
     return "\n".join(parts)
 
 
+# --- packaged files -----------------------------------------------------------------------------------------------
+
+
+def catalogue() -> str:
+    """Return the packaged scenes, lenses and detectors with their descriptions and figures."""
+    from vbnfault.core import resources
+
+    parts = []
+    for title, folder in (("Scenes", "scenes"), ("Lenses", "scenes/lenses"), ("Detectors", "scenes/detectors")):
+        files = sorted(resources.data_dir(folder).glob("*.toml"))
+        rows = []
+        for file in files:
+            table = tomllib.loads(file.read_text(encoding="utf-8"))
+            rows.append(
+                (f"`{file.stem}`", table.get("description", table.get("name", "")), table.get("source", ""))
+            )
+        parts.append(f"## {title}\n\n" + _table(("name", "what it is", "source"), rows))
+    return "\n".join(parts)
+
+
 PAGES: dict[str, Callable[[], str]] = {
     "api": api,
+    "catalogue": catalogue,
     "commands": commands,
     "faults": faults,
     "scene": scene,
