@@ -9,7 +9,6 @@ from __future__ import annotations
 import dataclasses
 import inspect
 import json
-import math
 import re
 import tomllib
 from collections.abc import Callable, Iterator, Mapping
@@ -84,15 +83,12 @@ def _sentence(text: str) -> str:
 
 
 def _number(value: float) -> str:
-    """Return a limit as a short text: powers of ten and of two as such, other numbers in full."""
-    if isinstance(value, int | float) and float(value).is_integer() and abs(value) >= 1e15:
-        power = round(math.log2(abs(value) + 1))
-        return f"2^{power} − 1" if int(value) == 2**power - 1 else f"{value:g}"
-    return (
-        f"{value:.0f}"
-        if float(value).is_integer() and abs(value) < 1e5
-        else f"{value:g}".replace("e+0", "e").replace("e+", "e")
-    )
+    """Return a limit as a short text."""
+    if isinstance(value, int) and value == 2**63 - 1:
+        return "2^63 − 1"
+    if float(value).is_integer() and abs(value) < 1e9:
+        return f"{value:,.0f}" if abs(value) >= 1e4 else f"{value:.0f}"
+    return f"{value:g}".replace("e+0", "e").replace("e+", "e")
 
 
 def _code(value: Any) -> str:
