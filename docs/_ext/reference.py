@@ -61,7 +61,8 @@ def unit_of(key: str) -> str:
 
 def _cell(text: Any) -> str:
     """Return text that stays within one cell of a Markdown table."""
-    return " ".join(str(text).split()).replace("|", "\\|")
+    parts = re.split(r"(`[^`]*`)", " ".join(str(text).split()))
+    return "".join(part if part.startswith("`") else part.replace("*", "\\*") for part in parts).replace("|", "\\|")
 
 
 def _table(head: tuple[str, ...], rows: list[tuple[str, ...]]) -> str:
@@ -259,7 +260,8 @@ def _allowed(node: Mapping[str, Any], schema: Mapping[str, Any]) -> str:
     if "const" in node:
         return _code(node["const"])
     if "enum" in node:
-        return ", ".join(_code(value) for value in node["enum"])
+        lower = [value for value in node["enum"] if not isinstance(value, str) or value == value.lower()]
+        return ", ".join(_code(value) for value in lower or node["enum"])
     kind = node.get("type")
     if kind in ("number", "integer"):
         return _range(node)
@@ -304,7 +306,7 @@ def toml_reference(described: list[TomlTable], root: str) -> str:
             (f"`{key.name}`", key.default, unit_of(key.name), key.allowed, _sentence(key.meaning))
             for key in table.keys
         ]
-        meaning = table.meaning if table.header else ""
+        meaning = _sentence(table.meaning) if table.header else ""
         parts.append(
             f"## {title}\n\n{meaning}\n\n" + _table(("key", "default", "unit", "allowed", "meaning"), rows)
         )
@@ -324,6 +326,14 @@ def scene() -> str:
     return toml_reference(scene_tables(), "Top level")
 
 
+def sensor() -> str:
+    """Return the keys of a sensor file."""
+    from vbnfault.core.tables import json_schema
+    from vbnfault.detector import Sensor
+
+    return toml_reference(tables(json_schema(Sensor)), "Top level")
+
+
 # --- faults -------------------------------------------------------------------------------------------------------
 
 
@@ -332,6 +342,10 @@ def faults() -> str:
     from vbnfault import faults as registered
 
     classes = registered.registry()
+    keys = {
+        name: {node["properties"]["model"]["const"]: node for node in models.get("anyOf", [models])}
+        for name, models in registered.json_schema()["properties"].items()
+    }
     parts = [_fault_overview(classes)]
     for fault_class, models in classes.items():
         parts.append(f"## {fault_class}\n")
@@ -344,8 +358,8 @@ def faults() -> str:
             facts += [f"Its optional layer is `{cls.soft_layer}`."] if cls.soft_layer else []
             title = f"### {fault_class} / {model}{' (default)' if cls.default and len(models) > 1 else ''}"
             parts.append(f"{title}\n\n{_first_paragraph(cls)}\n\n{' '.join(facts)}\n")
-            rows = [_fault_key(f) for f in dataclasses.fields(cls)]
-            parts.append(_table(("key", "default", "unit", "allowed", "meaning"), rows))
+            rows = _fault_keys(keys[fault_class][model])
+            parts.append(_table(("key", "default", "unit", "allowed", "meaning"), rows) if rows else "")
     return "\n".join(parts)
 
 
@@ -354,26 +368,19 @@ def _first_paragraph(cls: type) -> str:
     return " ".join(inspect.cleandoc(cls.__doc__ or "").split("\n\n")[0].split())
 
 
-def _fault_key(field: dataclasses.Field[Any]) -> tuple[str, ...]:
-    """Return one row of the table of a model's keys."""
-    meta = field.metadata
-    kind = meta.get("kind", "")
-    default: Any = list(field.default) if isinstance(field.default, tuple) else field.default
-    allowed = ""
-    if "limits" in meta:
-        low, high = meta["limits"]
-        allowed = f"{'whole number ' if meta.get('integer') else ''}{_number(low)} to {_number(high)}"
-        if kind == "bounds":
-            allowed = f"[lower, upper] or one value, {allowed}"
-    elif kind == "choice":
-        allowed = ", ".join(f"`{json.dumps(option)}`" for option in meta["options"])
-    elif kind == "flag":
-        allowed = "`true`, `false`"
-    elif kind == "rows":
-        allowed = "list of tables with " + ", ".join(f"`{name}`" for name in meta["columns"])
-    else:
-        allowed = "path" if kind == "path" else "text"
-    return f"`{field.name}`", _code(default), meta.get("unit", ""), allowed, _sentence(meta.get("doc", ""))
+def _fault_keys(schema: Mapping[str, Any]) -> list[tuple[str, ...]]:
+    """Return the rows of the table of a model's keys, from the JSON Schema of its table."""
+    rows = []
+    for key, node in schema["properties"].items():
+        if key == "model":
+            continue
+        options = _options(node, schema)
+        allowed = " or ".join(dict.fromkeys(_allowed(option, schema) for option in options))
+        if len(options) == 2 and options[1].get("type") == "array" and options[0].get("type") != "string":
+            allowed = f"one value or [lower, upper], {_allowed(options[0], schema)}"
+        meaning, _, unit = node.get("description", "").partition(" [")
+        rows.append((f"`{key}`", _code(node.get("default")), unit.rstrip("]"), allowed, _sentence(meaning)))
+    return rows
 
 
 def _fault_overview(classes: Mapping[str, Mapping[str, Any]]) -> str:
@@ -495,6 +502,7 @@ PAGES: dict[str, Callable[[], str]] = {
     "commands": commands,
     "faults": faults,
     "scene": scene,
+    "sensor": sensor,
     "store": store,
 }
 
