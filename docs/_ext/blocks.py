@@ -40,7 +40,7 @@ _FENCE = re.compile(
     flags=re.DOTALL | re.MULTILINE,
 )
 _FILE = re.compile(r"# ([\w./-]+\.(?:toml|py|csv|txt))\n")
-WIDEST_PX = 900
+WIDEST_PX = 720
 LANGUAGES = ("sh", "python", "toml", "text", "json")
 
 # pip and the tests are what continuous integration itself runs
