@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import builtins
+import errno
 import gc
+import io
 import os
 import signal
 import sys
 import tempfile
+import threading
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -16,10 +20,12 @@ from hypothesis import HealthCheck, settings
 
 # A shell that starts the tests in the background makes them, and every process they start, deaf to Ctrl-C;
 # with a handler here, processes that are started begin with the default again.
-signal.signal(signal.SIGINT, signal.default_int_handler)
-# So does `nohup` for the hang-up of a terminal: handled here, it is ignored by the tests alone.
-if hasattr(signal, "SIGHUP") and signal.getsignal(signal.SIGHUP) is signal.SIG_IGN:
-    signal.signal(signal.SIGHUP, lambda *_: None)
+# A worker of a Dask cluster imports this file in a thread that sets no handlers.
+if threading.current_thread() is threading.main_thread():
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    # So does `nohup` for the hang-up of a terminal: handled here, it is ignored by the tests alone.
+    if hasattr(signal, "SIGHUP") and signal.getsignal(signal.SIGHUP) is signal.SIG_IGN:
+        signal.signal(signal.SIGHUP, lambda *_: None)
 
 # A loaded machine is slow at everything: no example fails for the seconds that it or its drawing took. What cannot
 # be drawn for other reasons (too much is filtered out) still fails, and a failure prints what repeats it.
@@ -73,6 +79,25 @@ def calls_of(action: Callable[[], Any]) -> int:
         sys.setprofile(before)
         gc.enable()
     return calls
+
+
+def deny(monkeypatch: pytest.MonkeyPatch, *paths: Path) -> None:
+    """Have the system refuse to open, list or look below `paths`; for a user other than root, `chmod` would do."""
+
+    def refusing(real: Callable[..., Any], *, below: bool = False) -> Callable[..., Any]:
+        def call(path: Any = ".", *args: Any, **kwargs: Any) -> Any:
+            if isinstance(path, str | bytes | os.PathLike):
+                absolute = Path(os.path.abspath(os.fsdecode(path)))
+                if any(p in absolute.parents or (p == absolute and not below) for p in paths):
+                    raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(path))
+            return real(path, *args, **kwargs)
+
+        return call
+
+    for module, name in ((os, "open"), (os, "listdir"), (os, "scandir"), (io, "open"), (builtins, "open")):
+        monkeypatch.setattr(module, name, refusing(getattr(module, name)))
+    for name in ("stat", "lstat"):  # what lies in a folder cannot be looked at, the folder itself can
+        monkeypatch.setattr(os, name, refusing(getattr(os, name), below=True))
 
 
 def small_scene(**tables: dict[str, Any]) -> dict[str, Any]:

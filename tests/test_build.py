@@ -2,22 +2,19 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import errno
-import gc
 import json
 import os
 import pickle
 import platform
 import re
+import resource
 import shutil
 import signal
-import socket
 import subprocess
 import sys
-import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -25,6 +22,7 @@ from typing import Any
 import numpy as np
 import pytest
 import victim
+from conftest import deny
 from test_store import fake_sample, flip, make_spec
 
 from vbnfault import store as st
@@ -32,7 +30,7 @@ from vbnfault.core import activity
 from vbnfault.core.errors import InputError, VbnfaultError
 from vbnfault.core.quantities import Sample
 from vbnfault.dataset import build as bd
-from vbnfault.dataset import dask, lock, progress, tasks
+from vbnfault.dataset import lock, progress, tasks
 from vbnfault.store import codec
 
 SAMPLES = 18
@@ -637,43 +635,6 @@ def test_progress_without_a_terminal_is_plain_lines(
     assert all(map(form.fullmatch, lines)), lines
 
 
-@pytest.mark.filterwarnings("default")
-def test_a_dask_cluster_makes_the_same_bits(
-    reference: tuple[Path, str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    distributed = pytest.importorskip("distributed")
-    out = tmp_path / "s.zarr"
-    with distributed.LocalCluster(
-        n_workers=2, threads_per_worker=2, processes=False, dashboard_address=None
-    ) as cluster:
-        with pytest.raises(bd.BuildFailed, match=r"sample 5 failed.*KeyError"):
-            run(out, Session(raises=frozenset({5})), scheduler=cluster.scheduler_address)
-        summary = run(out, Session(stage="terrain of"), scheduler=cluster.scheduler_address, progress=True)
-        assert (summary.built, summary.digest) == (1, reference[1])
-        with pytest.raises(VbnfaultError, match="no such mesh"):
-            run(tmp_path / "t.zarr", Broken(), scheduler=cluster.scheduler_address)
-    assert capsys.readouterr().err.splitlines().count("terrain of 5") == 1
-    assert st.digest(out) == reference[1]
-
-
-@pytest.mark.filterwarnings("default")
-def test_a_scheduler_is_told_from_a_worker() -> None:
-    distributed = pytest.importorskip("distributed")
-    with distributed.LocalCluster(
-        n_workers=1, processes=False, protocol="tcp://", dashboard_address=None
-    ) as cluster:
-        dask.check_scheduler(cluster.scheduler_address)
-        (worker,) = cluster.scheduler_info["workers"]
-        with pytest.raises(InputError, match="a Dask worker listens there, no scheduler"):
-            dask.check_scheduler(worker)
-
-
-def test_without_dask_the_sentence_says_how_to_get_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "distributed", None)
-    with pytest.raises(InputError, match=r"pip install 'vbnfault\[dask\]'"):
-        run(tmp_path / "s.zarr", scheduler="tcp://127.0.0.1:1")
-
-
 @pytest.mark.parametrize("what", ["mask", "image/zarr.json", "sample", "done", "fault/c"])
 def test_arrays_that_are_missing_are_made_again(reference: tuple[Path, str], tmp_path: Path, what: str) -> None:
     out = shutil.copytree(reference[0], tmp_path / "s.zarr")
@@ -685,54 +646,61 @@ def test_arrays_that_are_missing_are_made_again(reference: tuple[Path, str], tmp
     assert st.digest(out) == reference[1]
 
 
-@pytest.mark.parametrize("address", ["nonsense", "foo://x:1", "tcp://127.0.0.1:1", "tcp://127.0.0.1:99999999"])
-def test_a_scheduler_that_cannot_be_reached_is_one_sentence(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], address: str
+@pytest.mark.parametrize("what", ["", "zarr.json", "image", "image/c", "image/c/1", "done/c", "roll_deg/c/0"])
+def test_a_store_that_may_not_be_read_is_not_taken_for_damaged(
+    reference: tuple[Path, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, what: str
 ) -> None:
-    pytest.importorskip("distributed")
-    with pytest.raises(InputError, match=f"^--scheduler {address}: "):
-        run(tmp_path / "s.zarr", scheduler=address)
-    assert not (tmp_path / "s.zarr").exists()
-    assert capsys.readouterr().err == ""
+    out, log = shutil.copytree(reference[0], tmp_path / "s.zarr"), tmp_path / "log"
+    times = {p: p.stat().st_mtime_ns for p in out.rglob("*")}
+    uses = (st.verify, st.digest, lambda path: run(path, Session(log=str(log))))
+    with monkeypatch.context() as patch:
+        deny(patch, out / what)
+        for use in uses:
+            with pytest.raises(VbnfaultError, match=rf"^{out}.*: Permission denied"):
+                use(out)
+    assert not log.exists()
+    assert {p: p.stat().st_mtime_ns for p in out.rglob("*")} == times
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["s.zarr"]
 
 
-@contextlib.contextmanager
-def listening(reply: bytes | None) -> Iterator[str]:
-    """Address of a socket that sends `reply` to everyone and hangs up; that stays silent where it is None."""
-    kept: list[socket.socket] = []
+@dataclass(frozen=True)
+class FullDisk(Session):
+    """From sample 9 on, no file of this process can grow beyond 100 bytes."""
 
-    def serve() -> None:
-        with contextlib.suppress(OSError):  # closed at the end
-            while True:
-                kept.append(server.accept()[0])
-                if reply is not None:
-                    kept[-1].sendall(reply)
-                    kept.pop().close()
-
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        thread = threading.Thread(target=serve, daemon=True)
-        thread.start()
-        yield f"tcp://127.0.0.1:{server.getsockname()[1]}"
-        server.shutdown(socket.SHUT_RDWR)
-        thread.join()
-    for link in kept:
-        link.close()
+    def simulate(self, index: int) -> Sample:
+        if index == 9:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (100, resource.getrlimit(resource.RLIMIT_FSIZE)[1]))
+        return Session.simulate(self, index)
 
 
-@pytest.mark.parametrize(
-    "reply", [b"", b"HTTP/1.1 400 Bad\r\n\r\n", bytes(64), None], ids=["closes", "http", "zeros", "silent"]
-)
-def test_what_is_no_dask_scheduler_is_one_sentence(
-    tmp_path: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, reply: bytes | None
+@pytest.mark.parametrize("workers", [1, 2])
+def test_a_full_disk_ends_the_build_and_the_same_command_resumes(
+    reference: tuple[Path, str], tmp_path: Path, workers: int
 ) -> None:
-    pytest.importorskip("distributed")
-    monkeypatch.setattr(dask, "_SECONDS_TO_ANSWER", 2.0)
-    with listening(reply) as address, pytest.raises(InputError) as e:
-        run(tmp_path / "s.zarr", scheduler=address)
-    assert str(e.value) == f"--scheduler {address}: what listens there does not answer as a Dask scheduler does"
-    assert not (tmp_path / "s.zarr").exists()
-    gc.collect()
-    assert capfd.readouterr().err == ""
+    out, before = tmp_path / "s.zarr", resource.getrlimit(resource.RLIMIT_FSIZE)
+    try:
+        with pytest.raises(
+            VbnfaultError, match=r"File too large while writing samples 8-11; finished .* stay"
+        ) as e:
+            run(out, FullDisk(), workers=workers)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert e.value.exit_code == 1
+    assert not list(out.rglob("*.partial"))
+    finished = st.open_store(out).finished()
+    assert run(out).built == SAMPLES - finished
+    assert st.digest(out) == reference[1]
+
+
+def test_a_store_without_room_for_its_first_file_leaves_nothing(tmp_path: Path) -> None:
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100, before[1]))
+    try:
+        with pytest.raises(VbnfaultError, match=r"no store can be created here: File too large"):
+            run(tmp_path / "s.zarr")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert list(tmp_path.iterdir()) == []
 
 
 def main(out: str, workers: str, samples: str) -> int:

@@ -17,6 +17,7 @@ from typing import Any, get_args, get_type_hints
 
 import numpy as np
 import pytest
+from conftest import deny
 
 from vbnfault import cli
 from vbnfault.body import load_shape
@@ -84,6 +85,20 @@ def test_only_regular_files_of_a_size_are_read(kind: str, tmp_path: Path) -> Non
     loop = tmp_path / f"loop{suffix}"
     loop.symlink_to(loop)
     refused(read, loop)
+
+
+@pytest.mark.parametrize("what", ["file", "folder"])
+@pytest.mark.parametrize("kind", [*READERS, "kernel"])
+def test_files_that_may_not_be_read_say_so(
+    kind: str, what: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    read, suffix = READERS.get(kind, (lambda path: spice.kernels(path).__enter__(), ".tls"))
+    path = tmp_path / f"mine{suffix}"
+    path.write_text(TITLE)
+    deny(monkeypatch, path if what == "file" else tmp_path)
+    sentence = refused(read, path)
+    assert str(path) in sentence
+    assert "Permission denied" in sentence
 
 
 def test_a_pipe_that_takes_the_place_of_a_file_does_not_block(

@@ -50,13 +50,13 @@ def refuse(*args: object, **kwargs: object) -> Patch:
 
 def test_read_is_what_was_built(body: Body, site: Site, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     told: list[str] = []
-    with activity.told_to(told.append):
+    with activity.reported_to(told.append):
         built = cached_patch(body, site, **COARSE)
     assert told == ["terrain of site 0 (new patch)"]
     assert same(built, build_patch(body, site, **COARSE))
     assert [path.suffix for path in folder.iterdir()] == [".patch"]
     monkeypatch.setattr(cache, "build_patch", _same_signature(refuse))
-    with activity.told_to(told.append):
+    with activity.reported_to(told.append):
         read = cached_patch(body, site, **COARSE)
     assert len(told) == 1
     assert same(read, built)

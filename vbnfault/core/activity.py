@@ -1,6 +1,6 @@
 """Report which stage a process works on between two samples, such as the terrain of a site.
 
-Code that may take seconds names its stage with `begin`; a caller receives these names through `told_to`.
+Code that may take seconds names its stage with `begin`; a caller receives these names through `reported_to`.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ def begin(stage: str) -> None:
 
 
 @contextlib.contextmanager
-def told_to(listener: Callable[[str], None]) -> Iterator[None]:
+def reported_to(listener: Callable[[str], None]) -> Iterator[None]:
     """Call `listener` with the name of every stage that begins within a block."""
     token = _listener.set(listener)
     try:

@@ -126,7 +126,7 @@ def _opened_now(path: Path, what: str, types: Sequence[str], limit_bytes: int) -
     """Return the open file as `_opened` does, but without comparing it with an earlier reading."""
     status = file_status(path)
     if status is None:
-        raise InputError(f"{shown_path(path)}: {what} file not found.")
+        raise InputError(f"{shown_path(path)}: {what} file {_why_absent(path)}.")
     if not stat.S_ISREG(status.st_mode):  # before opening: opening a device may already act on it
         raise InputError(f"{path}: {what} is not a file{_kind(status)}.")
     if types and path.suffix.lower() not in types:
@@ -312,6 +312,17 @@ def file_status(path: str | Path) -> os.stat_result | None:
         return None
 
 
+def _why_absent(path: Path) -> str:
+    """Return as a clause why a path has no status: nothing exists there, or this user may not look."""
+    try:
+        os.stat(path)
+    except PermissionError as error:
+        return f"cannot be read: {error.strerror}"
+    except (OSError, ValueError):
+        pass
+    return "not found"
+
+
 def check_path(path: str, where: str) -> None:
     """Check that a path is possible. Raises InputError; its message begins with `where`, the key of the path."""
     try:
@@ -439,6 +450,8 @@ def find(kind: str, name_or_path: str | Path) -> Path:
     if path.suffix or status:
         if status and stat.S_ISREG(status.st_mode):
             return path
+        if status is None and (why := _why_absent(path)) != "not found":
+            raise InputError(f"{shown_path(path)}: {why}")
         raise InputError(f"{shown_path(path)}: no such file{',' + _kind(status) if status else ''}")
     known = packaged(kind)
     if str(name_or_path) in known:

@@ -46,15 +46,15 @@ def _samples(session: Session) -> list[str]:
         per_device = np.bincount(table.individual, minlength=scene.camera.individuals)
         each = _range(per_device.min(), per_device.max())
         lines[0] += f"; {len(per_device)} devices of the detector, {each} samples each"
-    rows: dict[str, NDArray[np.bool_]] = {"samples": np.ones(len(table), dtype=bool)}
-    rows |= {name: np.asarray(table.stratum == k) for k, name in enumerate(plan.STRATA)}
-    rows["no fault"] = np.asarray(~table.injected.any(axis=1))
-    rows |= {name: table.injects(name) for name in table.faults}
+    chosen: dict[str, NDArray[np.bool_]] = {"samples": np.ones(len(table), dtype=bool)}
+    chosen |= {name: np.asarray(table.stratum == k) for k, name in enumerate(plan.STRATA)}
+    chosen["no fault"] = np.asarray(~table.injected.any(axis=1))
+    chosen |= {name: table.injects(name) for name in table.faults}
     splits = {name: table.split == k for k, name in enumerate(plan.SPLITS)}
-    wide = max(map(len, rows))
+    wide = max(map(len, chosen))
     lines.append(f"  {'planned':<{wide}}{'all':>9}" + "".join(f"{name:>9}" for name in splits))
-    for name, row in rows.items():
-        counts = [int(row.sum()), *(int((row & split).sum()) for split in splits.values())]
+    for name, samples in chosen.items():
+        counts = [int(samples.sum()), *(int((samples & split).sum()) for split in splits.values())]
         lines.append(f"  {name:<{wide}}" + "".join(f"{count:>9}" for count in counts))
     return lines
 

@@ -32,16 +32,16 @@ _OPENCV = ("opencv-python-headless", "opencv-python")
 
 def versions() -> dict[str, str]:
     """Return the versions of vbnfault and of every library that affects pixel values, and the machine type."""
-    found = {"vbnfault": __version__}
+    numbers = {"vbnfault": __version__}
     for name in (*_LIBRARIES, *_OPENCV):
         try:
-            found[name] = importlib.metadata.version(name)
+            numbers[name] = importlib.metadata.version(name)
         except importlib.metadata.PackageNotFoundError:
             continue
     with contextlib.suppress(VbnfaultError):  # planning and verifying need no LLVM
         version = llvm.find().version or ()
-        found["llvm"] = ".".join(map(str, version))
-    return found | {"machine": platform.machine()}
+        numbers["llvm"] = ".".join(map(str, version))
+    return numbers | {"machine": platform.machine()}
 
 
 def scene_identity(session: pipeline.Session) -> dict[str, Any]:

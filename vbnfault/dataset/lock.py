@@ -81,8 +81,8 @@ def _lock_file(path: Path, file: Path, stack: contextlib.ExitStack) -> bool:
                 return False
             status = os.fstat(handle)
             with contextlib.suppress(FileNotFoundError):
-                there = os.stat(path if stat.S_ISDIR(status.st_mode) else file)
-                if (there.st_dev, there.st_ino) == (status.st_dev, status.st_ino):
+                named = os.stat(path if stat.S_ISDIR(status.st_mode) else file)
+                if (named.st_dev, named.st_ino) == (status.st_dev, status.st_ino):
                     if not stat.S_ISDIR(status.st_mode):
                         os.ftruncate(handle, 0)
                         os.write(handle, json.dumps(_this_process()).encode())
@@ -94,15 +94,15 @@ def _lock_file(path: Path, file: Path, stack: contextlib.ExitStack) -> bool:
 
 def _own(path: Path, file: Path, stack: contextlib.ExitStack) -> None:
     """Make an owner's file and keep its heart-beat going until the stack ends, which removes the file."""
-    mine = _this_process() | {"token": uuid.uuid4().hex}
+    owner = _this_process() | {"token": uuid.uuid4().hex}
     while True:
         try:
             handle = os.open(file, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666)
         except FileExistsError:
-            owner = _read_owner(file)
-            if not _has_ended(owner):
-                raise _held(path, owner, file) from None
-            _remove_owner(file, owner)
+            other = _read_owner(file)
+            if not _has_ended(other):
+                raise _held(path, other, file) from None
+            _remove_owner(file, other)
             continue
         except OSError as error:
             raise InputError(
@@ -110,7 +110,7 @@ def _own(path: Path, file: Path, stack: contextlib.ExitStack) -> None:
                 f"({error.strerror}); choose an --out on another file system"
             ) from None
         with os.fdopen(handle, "w") as text:
-            json.dump(mine, text)
+            json.dump(owner, text)
         break
     ended = threading.Event()
 
@@ -120,7 +120,7 @@ def _own(path: Path, file: Path, stack: contextlib.ExitStack) -> None:
                 os.utime(file)
 
     threading.Thread(target=beat, daemon=True).start()
-    stack.callback(_remove_owner, file, mine)
+    stack.callback(_remove_owner, file, owner)
     stack.callback(ended.set)
 
 

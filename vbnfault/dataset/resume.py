@@ -73,9 +73,9 @@ def check_same_scene(
     differing = [key for key in {**wanted, **stored} if stored.get(key, absent) != wanted.get(key, absent)]
     if differing and all(key.startswith("versions.") or key == "scene_hash" for key in differing):
         if not accept_versions and spec.attributes.get("versions") not in versions.known(store.attributes):
-            which = versions.differences(store.attributes, spec.attributes)
+            changed = versions.differences(store.attributes, spec.attributes)
             raise InputError(
-                f"{store.path}: was made with other versions: {which}; "
+                f"{store.path}: was made with other versions: {changed}; "
                 "--accept-versions completes it with those of now and notes which samples they made, or choose "
                 "another --out"
             )

@@ -94,7 +94,7 @@ def work(simulate: Callable[[int], Sample], store: Store, task: Task, tick: Tick
             check()
             tick(i, "begun", "")
             try:
-                with activity.told_to(functools.partial(tick, i, "stage")):
+                with activity.reported_to(functools.partial(tick, i, "stage")):
                     encoded = store_module.encode(store.spec, simulate(i))
             except Exception as error:
                 check()
@@ -224,9 +224,9 @@ class Run:
         failed = sorted(self.failures)
         first = self.failures[failed[0]].splitlines()[0]
         names = ", ".join(map(str, failed[:8])) + (", ..." if len(failed) > 8 else "")
-        many = f"sample {names}" if len(failed) == 1 else f"{len(failed)} samples ({names})"
+        listed = f"sample {names}" if len(failed) == 1 else f"{len(failed)} samples ({names})"
         raise BuildFailed(
-            f"{self.store.path}: {many} failed{why}, the first with: {first}; "
+            f"{self.store.path}: {listed} failed{why}, the first with: {first}; "
             f"all others are kept, and the same command tries the failed ones again",
             self.failures,
         )

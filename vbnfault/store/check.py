@@ -72,64 +72,87 @@ def examine_shard(store: Store, number: int, *, labels: bool = False) -> ShardCh
     `labels`: also compare the labels of the samples with their pixels.
     """
     samples = store.shard(number)
-    columns: dict[str, NDArray[Any]] = {}
-    unreadable = {}
-    for name in ("done", "crc32c", *SCALARS):
-        where = store.file(name, number).relative_to(store.path)
-        try:
-            columns[name] = store.column(name, number)
-        except FileNotFoundError:
-            unreadable[name] = f"the chunk file {where} is missing"
-        except ValueError:
-            unreadable[name] = f"cannot be decoded, {where} is damaged"
-        except OSError as error:
-            unreadable[name] = f"cannot be read, {where} is damaged: {error.strerror}"
-        if name == "done" and unreadable and store.file("image", number).exists():
-            problem = Problem(tuple(samples), f"done of samples {_spans(samples)}: {unreadable[name]}")
-            return ShardCheck([problem], {}, {}, {})
-        if name == "done" and unreadable:
-            break
+    columns, unreadable = _columns(store, number)
+    if "done" not in columns and store.file("image", number).exists():
+        problem = Problem(tuple(samples), f"done of samples {_spans(samples)}: {unreadable['done']}")
+        return ShardCheck([problem], {}, {}, {})
     finished = [i for i in samples if "done" in columns and columns["done"][i - samples.start]]
     missing = tuple(i for i in samples if i not in finished)
     problems = [Problem(missing, f"samples {_spans(missing)}: not finished", True)] if missing else []
     if not finished:
         return ShardCheck(problems, {}, {}, {})
-    many = f"of samples {_spans(finished)}"
-    problems += [Problem(tuple(finished), f"{name} {many}: {why}") for name, why in unreadable.items()]
+    problems += [
+        Problem(tuple(finished), f"{name} of samples {_spans(finished)}: {why}") for name, why in unreadable.items()
+    ]
     if "crc32c" not in columns:
         return ShardCheck(problems, {}, {}, {})
+    crcs = {i: columns["crc32c"][i - samples.start] for i in finished}
     scalars: dict[int, dict[str, Any]] = {}
     if not unreadable:
         scalars = {i: {name: columns[name][i - samples.start] for name in SCALARS} for i in finished}
-        for i in finished:
-            if crc_of_scalars(scalars[i]) != columns["crc32c"][i - samples.start, -1]:
-                problems.append(Problem((i,), f"sample {i}: its scalars do not match their crc32c"))
-
+        problems += [
+            Problem((i,), f"sample {i}: its scalars do not match their crc32c")
+            for i in finished
+            if crc_of_scalars(scalars[i]) != crcs[i][-1]
+        ]
     chunks, lost = _chunks(store, number, finished)
-    crcs = {i: columns["crc32c"][i - samples.start] for i in finished}
-    broken = {i for problem in problems + lost for i in problem.samples}
+    problems += lost
+    damaged = {i for problem in problems for i in problem.samples}
 
-    def look(i: int) -> tuple[list[tuple[int, Problem]], bytes, list[str]]:
-        found, layers = _layers(store, number, i, chunks, crcs[i])
-        if found or i in broken:
-            return found, b"", []
-        says = list(_check_labels(store.spec, i, scalars[i], layers, crcs[i])) if labels else []
+    def examine_sample(i: int) -> _SampleCheck:
+        problems_of_layers, layers = _layers(store, number, i, chunks, crcs[i])
+        if problems_of_layers or i in damaged:
+            return _SampleCheck(problems_of_layers, None, [])
+        sentences = list(_check_labels(store.spec, i, scalars[i], layers, crcs[i])) if labels else []
         hashes = {name: hashlib.sha256(data).digest() for name, data in layers.items()}
-        return [], sample_digest(hashes, scalars[i]), says
+        return _SampleCheck([], sample_digest(hashes, scalars[i]), sentences)
 
     with ThreadPoolExecutor(threads()) as pool:
-        looked = dict(zip(finished, pool.map(look, finished), strict=True))
-    problems += lost
-    # by array, then by sample
-    of_layers = [(k, problem) for found, _, _ in looked.values() for k, problem in found]
-    problems += [problem for _, problem in sorted(of_layers, key=lambda entry: (entry[0], entry[1].samples))]
-    sound = [i for i, (_, leaf, _) in looked.items() if leaf]
-    return ShardCheck(
-        problems=problems,
-        scalars={i: scalars[i] for i in sound},
-        digests={i: looked[i][1] for i in sound},
-        contradictions={i: looked[i][2] for i in sound},
+        checks = dict(zip(finished, pool.map(examine_sample, finished), strict=True))
+    by_layer = sorted(
+        (entry for check in checks.values() for entry in check.problems),
+        key=lambda entry: (entry[0], entry[1].samples),
     )
+    sound = {i: check for i, check in checks.items() if check.digest is not None}
+    return ShardCheck(
+        problems=[*problems, *(problem for _, problem in by_layer)],
+        scalars={i: scalars[i] for i in sound},
+        digests={i: check.digest for i, check in sound.items() if check.digest is not None},
+        contradictions={i: check.contradictions for i, check in sound.items()},
+    )
+
+
+class _SampleCheck(NamedTuple):
+    """The result of examining one sample: problems with the index of their layer, and digest and contradictions.
+
+    `digest` is None if the sample is damaged.
+    """
+
+    problems: list[tuple[int, Problem]]
+    digest: bytes | None
+    contradictions: list[str]
+
+
+def _columns(store: Store, number: int) -> tuple[dict[str, NDArray[Any]], dict[str, str]]:
+    """Return the scalars of a shard by name, and for each that cannot be read the reason as a clause.
+
+    If `done` cannot be read, nothing else is.
+    """
+    columns: dict[str, NDArray[Any]] = {}
+    unreadable: dict[str, str] = {}
+    for name in ("done", "crc32c", *SCALARS):
+        file = store.file(name, number).relative_to(store.path)
+        try:
+            columns[name] = store.column(name, number)
+        except FileNotFoundError:
+            unreadable[name] = f"the chunk file {file} is missing"
+        except ValueError:
+            unreadable[name] = f"cannot be decoded, {file} is damaged"
+        except OSError as error:
+            unreadable[name] = f"{file} cannot be read: {error.strerror}"
+        if "done" not in columns:
+            break
+    return columns, unreadable
 
 
 def _chunks(store: Store, number: int, finished: list[int]) -> tuple[dict[str, dict[int, bytes]], list[Problem]]:
@@ -139,14 +162,18 @@ def _chunks(store: Store, number: int, finished: list[int]) -> tuple[dict[str, d
     for name in store.spec.pixel_layers:
         if store.spec.empty(name):
             continue
-        where, many = store.file(name, number).relative_to(store.path), f"{name} of samples {_spans(finished)}"
+        file = store.file(name, number).relative_to(store.path)
         try:
             chunks[name] = store.chunk(name, number)
         except FileNotFoundError:
-            problems.append(Problem(tuple(finished), f"{many}: the shard file {where} is missing"))
-        except (OSError, ValueError) as error:
-            why = error.strerror if isinstance(error, OSError) else error
-            problems.append(Problem(tuple(finished), f"{many}: the shard file {where} is damaged: {why}"))
+            why = "is missing"
+        except ValueError as error:
+            why = f"is damaged: {error}"
+        except OSError as error:
+            why = f"cannot be read: {error.strerror}"
+        if name not in chunks:
+            sentence = f"{name} of samples {_spans(finished)}: the shard file {file} {why}"
+            problems.append(Problem(tuple(finished), sentence))
     return chunks, problems
 
 
@@ -160,18 +187,18 @@ def _layers(
             layers[name] = b""
         if name not in chunks:
             continue
-        where, wrong = store.file(name, number).relative_to(store.path), ""
+        file, why = store.file(name, number).relative_to(store.path), ""
         if i not in chunks[name]:
-            wrong = f"has no chunk in {where}"
+            why = f"has no chunk in {file}"
         else:
             try:
                 layers[name] = decompress(chunks[name][i])
                 if google_crc32c.value(layers[name]) != crcs[k]:
-                    wrong = f"in {where} does not match its stored crc32c"
+                    why = f"in {file} does not match its stored crc32c"
             except ValueError:
-                wrong = f"cannot be decoded, its chunk in {where} is damaged"
-        if wrong:
-            problems.append((k, Problem((i,), f"sample {i}: {name} {wrong}")))
+                why = f"cannot be decoded, its chunk in {file} is damaged"
+        if why:
+            problems.append((k, Problem((i,), f"sample {i}: {name} {why}")))
     return problems, layers
 
 
@@ -191,12 +218,8 @@ def _not_built(samples: list[int]) -> Iterator[str]:
     if samples:
         ranges = _spans(samples).split(", ")
         more = f" and {len(ranges) - _MOST_RANGES} ranges more" if len(ranges) > _MOST_RANGES else ""
-        many = (
-            f"samples {', '.join(ranges[:_MOST_RANGES])}{more} are"
-            if len(samples) > 1
-            else f"sample {ranges[0]} is"
-        )
-        yield f"{many} not built yet"
+        listed = ", ".join(ranges[:_MOST_RANGES]) + more
+        yield f"samples {listed} are not built yet" if len(samples) > 1 else f"sample {listed} is not built yet"
 
 
 def problem_samples(store: str | os.PathLike[str] | Store) -> list[int]:
@@ -300,13 +323,13 @@ def examine(
         if number not in begun:
             not_built += store.shard(number)
             continue
-        found = examine_shard(store, number, labels=True)
-        problems += [p.sentence for p in found.problems if not p.unfinished]
-        not_built += [i for p in found.problems if p.unfinished for i in p.samples]
-        digests.add(found.digests)
-        for i, scalars in found.scalars.items():
+        check = examine_shard(store, number, labels=True)
+        problems += [p.sentence for p in check.problems if not p.unfinished]
+        not_built += [i for p in check.problems if p.unfinished for i in p.samples]
+        digests.add(check.digests)
+        for i, scalars in check.scalars.items():
             planned = expected(i, int(scalars["tries"])) if expected else {}
-            problems += found.contradictions[i]
+            problems += check.contradictions[i]
             problems += _check_split(store, i, scalars, split_of)
             problems += _check_plan(store.spec, i, scalars, planned, exact)
             counts.add(str(scalars["split"]), planned.get("injected"), scalars["injected"])
@@ -346,8 +369,8 @@ def _check_labels(
         drawn = parameters.get(fault)
         listed = drawn is not None and not (isinstance(drawn, dict) and drawn.get("injected") is False)
         if listed != is_in:
-            says = "has no parameters, although" if is_in else "has parameters, although not"
-            yield f"sample {i}: {fault} {says} marked in injected"
+            clause = "has no parameters, although" if is_in else "has parameters, although not"
+            yield f"sample {i}: {fault} {clause} marked in injected"
     mask = _array(spec, "mask", layers)
     yield from _check_masks(i, spec.faults, "mask", mask, injected, spec.localised_faults or ())
     effect: Any = ()
@@ -361,10 +384,10 @@ def _check_labels(
     for fault, name, is_in in zip(spec.faults, spec.soft_layers, injected, strict=False):
         if name in layers and not is_in and (_array(spec, name, layers) != soft_kind(name).neutral).any():
             yield f"sample {i}: {name} is not {soft_kind(name).neutral:g}, although {fault} is not injected"
-    for fault, kind, one, other in zip(spec.faults, spec.mask_kinds, mask, effect, strict=False):
-        if kind == "effect" and not np.array_equal(one, other):
+    for fault, kind, its_mask, its_effect in zip(spec.faults, spec.mask_kinds, mask, effect, strict=False):
+        if kind == "effect" and not np.array_equal(its_mask, its_effect):
             yield f"sample {i}: mask of {fault} is not its effect, as mask_effect has it"
-        if kind == "strong effect" and (one & ~other).any():
+        if kind == "strong effect" and (its_mask & ~its_effect).any():
             yield f"sample {i}: mask of {fault} holds pixels outside of its effect, as mask_effect has it"
     # equal checksums mean equal images: both have just been compared with their pixels
     crc = dict(zip(spec.pixel_layers, crcs.tolist(), strict=False))
@@ -455,8 +478,8 @@ class SampleDigests:
 
     def add(self, digests: Mapping[int, bytes]) -> None:
         """Add the digests of some samples."""
-        for i, one in digests.items():
-            self._digests[i] = np.frombuffer(one, dtype=np.uint8)
+        for i, digest_of_sample in digests.items():
+            self._digests[i] = np.frombuffer(digest_of_sample, dtype=np.uint8)
 
     @property
     def complete(self) -> bool:
@@ -470,8 +493,8 @@ class SampleDigests:
         """
         attributes = {k: v for k, v in store.attributes.items() if k not in VOLATILE_ATTRIBUTES}
         plain = {k: v for k, v in store.spec.plain().items() if k != "shard_samples"}
-        rows = [[name, row.dims, row.dtype] for name, row in sorted(store.spec.arrays.items())]
-        total = hashlib.sha256(json.dumps([attributes, plain, store.samples, rows], sort_keys=True).encode())
+        arrays = [[name, array.dims, array.dtype] for name, array in sorted(store.spec.arrays.items())]
+        total = hashlib.sha256(json.dumps([attributes, plain, store.samples, arrays], sort_keys=True).encode())
         total.update(self._digests.data)
         return total.hexdigest()
 
@@ -485,11 +508,11 @@ def digest(path: str | os.PathLike[str] | Store, *, progress: Callable[[int], No
     store = open_store(path)
     digests = SampleDigests(store.samples)
     for number in store.begun():
-        found = examine_shard(store, number)
-        for problem in found.problems:
+        check = examine_shard(store, number)
+        for problem in check.problems:
             if not problem.unfinished:
                 raise VbnfaultError(f"{store.path}: {problem.sentence}; the build command mends it")
-        digests.add(found.digests)
+        digests.add(check.digests)
         if progress:
             progress(len(store.shard(number)))
     return digests.of(store)

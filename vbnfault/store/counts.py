@@ -29,9 +29,9 @@ class FaultCounts:
         """
         self.samples[split] += 1
         self._has_plan &= planned is not None
-        for which, flags in ((self._planned, planned), (self._realised, injected)):
+        for counts, flags in ((self._planned, planned), (self._realised, injected)):
             for fault, is_in in zip(self.faults, flags if flags is not None else (), strict=False):
-                which[split, fault] += bool(is_in)
+                counts[split, fault] += bool(is_in)
 
     def planned(self, fault: str, split: str | None = None) -> int:
         """Return the number of samples for which a fault is planned, in one split or in all."""

@@ -39,7 +39,7 @@ from .layout import (
     sealed,
     to_bytes,
 )
-from .schema import FORMAT_VERSION, SCALARS, StoreSpec, spec_from_plain
+from .schema import FORMAT_VERSION, FORMATS, SCALARS, StoreSpec, spec_from_plain
 
 # errors that mean a damaged or missing file; any other OSError may be temporary
 _DAMAGE = (ValueError, FileNotFoundError, NotADirectoryError, disk.Misplaced)
@@ -78,6 +78,8 @@ class Store:
         if name not in self._arrays:
             try:
                 self._arrays[name] = zarr.open_array(self.path / name, mode=self._mode, zarr_format=3)
+            except PermissionError as error:
+                raise disk.denied(error, self.path / name) from error
             except Exception as error:  # zarr raises many types for metadata that it cannot parse
                 raise VbnfaultError(
                     f"{self.path}: {self.why_closed(name)}; the build command re-creates it"
@@ -104,6 +106,8 @@ class Store:
             values = self.array(name)[start:stop]
         except VbnfaultError:
             raise
+        except PermissionError as error:
+            raise disk.denied(error, self.path / name) from error
         except Exception as error:
             raise VbnfaultError(
                 f"{self.path}: {name} of samples {start}-{stop - 1} cannot be read ({error}); "
@@ -127,11 +131,13 @@ class Store:
             if not self.read("done", index, index + 1)[0]:
                 raise InputError(f"{self.path}: sample {index} is not finished yet; the build command resumes")
             crcs = self.read("crc32c", index, index + 1)[0].tolist()
-            one = {name: self.read(name, index, index + 1)[0] for name in names}
-            found = [crc32c(one[name]) if one[name].size else 0 for name in self.spec.pixel_layers]
-            scalars = {name: str(one[name]) if row.is_text else one[name] for name, row in SCALARS.items()}
-            if [*found, crc_of_scalars(scalars)] == crcs:
-                layers = {name: one[name] for name in self.spec.pixel_layers}
+            values = {name: self.read(name, index, index + 1)[0] for name in names}
+            layers = {name: values[name] for name in self.spec.pixel_layers}
+            scalars = {
+                name: str(values[name]) if array.is_text else values[name] for name, array in SCALARS.items()
+            }
+            crcs_of_layers = [crc32c(layer) if layer.size else 0 for layer in layers.values()]
+            if [*crcs_of_layers, crc_of_scalars(scalars)] == crcs:
                 return Sample(index=index, layers=layers, scalars=scalars)
             # a process that rewrites the sample replaces the file of `done` first
             mismatches += _stamp(file) == stamp
@@ -517,7 +523,7 @@ _NO_STORE = "is no vbnfault store: its root attributes are not those of one"
 
 
 def _check_format(path: Path, version: Any) -> None:
-    """Raise InputError if a store has another format version."""
+    """Raise InputError if a store has another format version; its sentence says what to do with the store."""
     if type(version) is not int or version < 1:
         raise InputError(f"{path}: {_NO_STORE}")
     if version > FORMAT_VERSION:
@@ -526,8 +532,9 @@ def _check_format(path: Path, version: Any) -> None:
         )
     if version < FORMAT_VERSION:
         raise InputError(
-            f"{path}: format_version = {version}: an earlier vbnfault made it, and this one reads "
-            f"{FORMAT_VERSION}; open it with xarray, or build it again with another --out or --overwrite"
+            f"{path}: format_version = {version}, of vbnfault {FORMATS[version]}: an earlier vbnfault made it, and "
+            f"this one reads {FORMAT_VERSION}; open it with xarray, complete it with vbnfault {FORMATS[version]}, "
+            "or build it again with another --out or --overwrite"
         )
 
 

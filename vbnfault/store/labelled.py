@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from typing import TYPE_CHECKING
 
+from . import disk
 from .group import open_store
 
 if TYPE_CHECKING:
@@ -19,9 +20,12 @@ def open_dataset(path: str | os.PathLike[str]) -> xarray.Dataset:
     Raises
     ------
     InputError
-        If there is no store at `path`, or one of another format.
+        If there is no store at `path`, one of another format, or one that this user may not read.
     """
     import xarray
 
     store = open_store(path)
-    return xarray.open_zarr(store.path, chunks=None)
+    try:
+        return xarray.open_zarr(store.path, chunks=None)
+    except PermissionError as error:
+        raise disk.denied(error, store.path) from error

@@ -52,19 +52,19 @@ def metadata_problems(store: Store) -> tuple[list[str], bool]:
             problems.append(store.why_closed(name))
             hopeless |= not is_coordinate
             continue
-        found = list(_differences(stored, documents[name]))
+        differences = list(_differences(stored, documents[name]))
         if not is_coordinate and _samples_of(stored) not in (None, store.samples):
             problems.append(
                 f"{name} holds {_samples_of(stored)} samples, not {store.samples}: appending was interrupted, "
                 f"the build command resumes it"
             )
         else:
-            problems += [f"array {name}: {what}" for what in found]
+            problems += [f"array {name}: {clause}" for clause in differences]
         # a wrong attribute does not change how the data files are read
-        hopeless |= not is_coordinate and any(not what.startswith("its attribute") for what in found)
-        if not found:
+        hopeless |= not is_coordinate and any(not clause.startswith("its attribute") for clause in differences)
+        if not differences:
             sound[name] = documents[name]
-            problems += [f"array {name}: {what}" for what in _misvalued(store.path / name, member)]
+            problems += [f"array {name}: {clause}" for clause in _misvalued(store.path / name, member)]
     return problems + list(_root_differences(store, sound, documents)), hopeless
 
 

@@ -17,9 +17,18 @@ from ..core.errors import InputError
 from ..core.quantities import CHANNELS, DEFECTS, soft_kind
 from ..scene.plan import SPLITS, STRATA
 
-# Version 2 added the group `spare`, the checksum of the root, eight coefficients of `distortion`, and further
-# arrays. A store of another version is refused, because its arrays could not be distinguished from damaged ones.
-FORMAT_VERSION = 2
+# Format version → the first version of vbnfault that wrote it. A store of another format is refused in a sentence
+# and left as it is: its arrays could not be distinguished from damaged ones, and the samples that are missing would
+# come from other code. xarray reads the stores of every format. The way from one format to the next is:
+#
+# 1 → 2: build again. `spare` and the checksum of the root are new, `distortion` has eight coefficients instead of
+#        five, `split` is a string instead of a number, and `resolved` and `views` are new. The samples of format 1
+#        do not say what these two hold, and were made by other code, so no program can convert a store.
+#
+# A format whose arrays all follow from those of the one before needs no new build: then `recover`, which brings the
+# metadata to the schema under the lock of a build, is the place to convert, before `_check_format` refuses.
+FORMATS = {1: "0.1", 2: "0.2"}
+FORMAT_VERSION = max(FORMATS)
 SEMANTIC = ("sky", "body", "sun", "spacecraft")
 
 # Root attributes that say when or how a store was written. The digest leaves them out.
@@ -260,19 +269,19 @@ class StoreSpec:
     @cached_property
     def pixel_layers(self) -> dict[str, Array]:
         """The schema row of every layer by name, in the order of the `layer` axis."""
-        rows = {name: LAYERS[name] for name in REQUIRED_LAYERS}
+        layers = {name: LAYERS[name] for name in REQUIRED_LAYERS}
         for name in self.layers:
             if name == "radiance":
-                rows[name] = replace(LAYERS[name], dtype=self.radiance_dtype)
+                layers[name] = replace(LAYERS[name], dtype=self.radiance_dtype)
             elif name in LAYERS:
-                rows[name] = LAYERS[name]
+                layers[name] = LAYERS[name]
             elif name in self.soft_layers:
                 kind, fault = soft_kind(name), self.faults[self.soft_layers.index(name)]
-                rows[name] = Array("sample y x", kind.dtype, kind.units, f"{fault}: {kind.meaning}", ratio=0.4)
+                layers[name] = Array("sample y x", kind.dtype, kind.units, f"{fault}: {kind.meaning}", ratio=0.4)
             else:
                 without = name.removeprefix("without_")
-                rows[name] = Array(_IMAGE, "uint8", "DN", f"the image without {without}", ratio=0.45)
-        return rows
+                layers[name] = Array(_IMAGE, "uint8", "DN", f"the image without {without}", ratio=0.45)
+        return layers
 
     @cached_property
     def arrays(self) -> dict[str, Array]:

@@ -1,0 +1,304 @@
+"""Builds on a Dask cluster: the same bits, and a sentence for whatever happens to client, scheduler and workers."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import gc
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+from test_build import SAMPLES, Broken, Deadly, Session, run, site_of
+from test_store import fake_sample, make_spec
+
+from vbnfault import store as st
+from vbnfault.core.errors import InputError, VbnfaultError
+from vbnfault.core.quantities import Sample
+from vbnfault.dataset import build as bd
+from vbnfault.dataset import dask
+
+distributed = pytest.importorskip("distributed")
+pytestmark = pytest.mark.filterwarnings("default")  # what Dask warns of is not ours
+HERE = Path(__file__).resolve().parent
+AT = 6  # the third sample of the second shard, in the order of the work
+
+
+@dataclass(frozen=True)
+class Disturbing:
+    """Makes made-up samples; something happens when a worker makes sample `AT`.
+
+    `client`: the process of the build. `folder`: holds a file once the event has happened.
+    """
+
+    event: str
+    folder: str
+    client: int = 0
+
+    def __call__(self) -> Disturbing:
+        return self
+
+    def simulate(self, index: int) -> Sample:
+        happened = Path(self.folder) / "happened"
+        if index == AT and not (happened.exists() and self.event != "worker dies"):
+            happened.touch()
+            getattr(self, "_" + self.event.replace(" ", "_"))()
+        return fake_sample(make_spec(), index, site=int(site_of(index + 1)[-1]))
+
+    def _worker_dies(self) -> None:
+        os.kill(os.getpid(), signal.SIGKILL)
+
+    _worker_dies_once = _worker_dies
+
+    def _user_interrupts(self) -> None:
+        os.kill(self.client, signal.SIGINT)
+        while not dask._stopped_builds:
+            time.sleep(0.01)
+
+    def _client_dies(self) -> None:
+        os.kill(self.client, signal.SIGKILL)
+        self._until_unwanted()
+
+    def _scheduler_closes(self) -> None:
+        worker = distributed.get_worker()
+        instances = distributed.Scheduler._instances
+        (scheduler,) = [s for s in instances if s.address == worker.scheduler.address]
+        asyncio.run_coroutine_threadsafe(scheduler.close(), worker.loop.asyncio_loop)
+        self._until_unwanted()
+
+    def _workers_leave(self) -> None:
+        worker = distributed.get_worker()
+        worker.loop.add_callback(worker.close, nanny=False)
+        self._until_unwanted()
+
+    def _until_unwanted(self) -> None:
+        worker = distributed.get_worker()
+        while dask._is_wanted(worker, worker.get_current_task()):
+            time.sleep(0.01)
+
+
+@pytest.fixture(scope="module")
+def reference(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """Return the digest of an undisturbed build in one process."""
+    digest = run(tmp_path_factory.mktemp("dask") / "reference.zarr").digest
+    assert digest is not None
+    return digest
+
+
+@pytest.fixture(scope="module")
+def processes() -> Iterator[Any]:
+    """Yield a cluster of two worker processes, which are started again when they die."""
+    import dask.config
+
+    with (
+        dask.config.set({"distributed.scheduler.allowed-failures": 0}),
+        distributed.LocalCluster(
+            n_workers=2, threads_per_worker=1, processes=True, memory_limit=0, dashboard_address=None
+        ) as cluster,
+    ):
+        yield cluster
+
+
+@contextlib.contextmanager
+def threads(workers: int = 2) -> Iterator[Any]:
+    """Yield a cluster whose workers are threads of this process."""
+    with distributed.LocalCluster(
+        n_workers=workers, threads_per_worker=2, processes=False, protocol="tcp://", dashboard_address=None
+    ) as cluster:
+        yield cluster
+
+
+def finished(out: Path) -> set[int]:
+    """Return the finished samples of a store."""
+    store = st.open_store(out)
+    return {i for shard in range(store.shards) for i, done in store.done(shard).items() if done}
+
+
+def resumed(out: Path) -> str | None:
+    """Complete a store in this process, check that nothing is left behind, and return its digest."""
+    summary = run(out)
+    assert st.verify(out) == []
+    assert [p.name for p in out.parent.iterdir() if p.name != "happened"] == ["s.zarr"]
+    assert not list(out.rglob("*.partial"))
+    return summary.digest
+
+
+def test_a_worker_that_dies_once_is_replaced(processes: Any, reference: str, tmp_path: Path) -> None:
+    processes.scheduler.allowed_failures = 1
+    try:
+        summary = run(
+            tmp_path / "s.zarr",
+            Disturbing("worker dies once", str(tmp_path)),
+            scheduler=processes.scheduler_address,
+        )
+    finally:
+        processes.scheduler.allowed_failures = 0
+    assert (tmp_path / "happened").exists()
+    assert (summary.built, summary.digest) == (SAMPLES, reference)
+
+
+def test_a_sample_that_kills_its_workers_fails_alone(processes: Any, reference: str, tmp_path: Path) -> None:
+    out = tmp_path / "s.zarr"
+    sentence = rf"sample {AT} failed, the first with: a worker of the cluster died while it was in work"
+    with pytest.raises(bd.BuildFailed, match=sentence):
+        run(out, Disturbing("worker dies", str(tmp_path)), scheduler=processes.scheduler_address)
+    assert finished(out) == set(range(SAMPLES)) - {AT}
+    assert resumed(out) == reference
+
+
+def test_tasks_that_kill_every_worker_end_the_build(processes: Any, tmp_path: Path) -> None:
+    with pytest.raises(VbnfaultError, match=r"shard \d: a worker .*died while no sample .* second time"):
+        run(tmp_path / "s.zarr", Deadly(), scheduler=processes.scheduler_address)
+    assert finished(tmp_path / "s.zarr") == set()
+
+
+def test_ctrl_c_waits_until_the_workers_have_written(processes: Any, reference: str, tmp_path: Path) -> None:
+    out = tmp_path / "s.zarr"
+    with pytest.raises(bd.Interrupted, match=r"interrupted; (\d+) of 18 samples are finished") as stopped:
+        run(
+            out,
+            Disturbing("user interrupts", str(tmp_path), os.getpid()),
+            scheduler=processes.scheduler_address,
+        )
+    assert stopped.value.exit_code == 130
+    done = finished(out)
+    assert f" {len(done)} of 18" in str(stopped.value)
+    assert done & {4, 5, 6, 7} == {4, 5, 6}  # what the worker had made of its shard, and nothing more
+    assert resumed(out) == reference
+
+
+def test_workers_write_nothing_after_the_client_was_killed(processes: Any, reference: str, tmp_path: Path) -> None:
+    """Another build of the same store may have begun by then."""
+    out = tmp_path / "s.zarr"
+    code = "import sys, test_build_dask; test_build_dask.main(*sys.argv[1:])"
+    client = subprocess.run(
+        [sys.executable, "-c", code, str(out), processes.scheduler_address],
+        env={**os.environ, "PYTHONPATH": os.pathsep.join([str(HERE.parent), str(HERE)])},
+        capture_output=True,
+        text=True,
+    )
+    assert client.returncode == -signal.SIGKILL, client.stderr
+    with distributed.Client(processes.scheduler_address, set_as_default=False) as other:
+        other.run(until_idle)
+    assert finished(out).isdisjoint({4, 5, 6, 7})
+    (tmp_path / ".s.zarr.lock").unlink()
+    assert resumed(out) == reference
+
+
+def until_idle() -> None:
+    """Wait until no task runs on a worker."""
+    with dask._session_lock:
+        pass
+
+
+def main(out: str, scheduler: str) -> None:
+    """Build on a cluster; a worker kills this process."""
+    run(Path(out), Disturbing("client dies", str(Path(out).parent), os.getpid()), scheduler=scheduler)
+
+
+@pytest.mark.parametrize(
+    ("event", "sentence"),
+    [
+        ("scheduler closes", "the connection to the scheduler was lost; finished samples stay"),
+        ("workers leave", "all workers of the cluster have gone; finished samples stay"),
+    ],
+)
+def test_a_cluster_that_ends_is_one_sentence(
+    event: str, sentence: str, reference: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(dask, "_SECONDS_BETWEEN_CHECKS", 0.01)
+    monkeypatch.setattr(dask, "_SECONDS_WITHOUT_WORKERS", 0.0)
+    out = tmp_path / "s.zarr"
+    with threads(1) as cluster, pytest.raises(VbnfaultError, match=f"^--scheduler tcp://.*: {sentence}"):
+        run(out, Disturbing(event, str(tmp_path)), scheduler=cluster.scheduler_address)
+    assert resumed(out) == reference
+
+
+def test_a_dask_cluster_makes_the_same_bits(
+    reference: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "s.zarr"
+    with distributed.LocalCluster(
+        n_workers=2, threads_per_worker=2, processes=False, dashboard_address=None
+    ) as cluster:
+        with pytest.raises(bd.BuildFailed, match=r"sample 5 failed.*KeyError"):
+            run(out, Session(raises=frozenset({5})), scheduler=cluster.scheduler_address)
+        summary = run(out, Session(stage="terrain of"), scheduler=cluster.scheduler_address, progress=True)
+        assert (summary.built, summary.digest) == (1, reference)
+        with pytest.raises(VbnfaultError, match="no such mesh"):
+            run(tmp_path / "t.zarr", Broken(), scheduler=cluster.scheduler_address)
+    assert capsys.readouterr().err.splitlines().count("terrain of 5") == 1
+    assert st.digest(out) == reference
+
+
+def test_a_scheduler_is_told_from_a_worker() -> None:
+    with distributed.LocalCluster(
+        n_workers=1, processes=False, protocol="tcp://", dashboard_address=None
+    ) as cluster:
+        dask.check_scheduler(cluster.scheduler_address)
+        (worker,) = cluster.scheduler_info["workers"]
+        with pytest.raises(InputError, match="a Dask worker listens there, no scheduler"):
+            dask.check_scheduler(worker)
+
+
+def test_without_dask_the_sentence_says_how_to_get_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    with pytest.raises(InputError, match=r"pip install 'vbnfault\[dask\]'"):
+        run(tmp_path / "s.zarr", scheduler="tcp://127.0.0.1:1")
+
+
+@pytest.mark.parametrize("address", ["nonsense", "foo://x:1", "tcp://127.0.0.1:1", "tcp://127.0.0.1:99999999"])
+def test_a_scheduler_that_cannot_be_reached_is_one_sentence(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], address: str
+) -> None:
+    with pytest.raises(InputError, match=f"^--scheduler {address}: "):
+        run(tmp_path / "s.zarr", scheduler=address)
+    assert not (tmp_path / "s.zarr").exists()
+    assert capsys.readouterr().err == ""
+
+
+@contextlib.contextmanager
+def listening(reply: bytes | None) -> Iterator[str]:
+    """Address of a socket that sends `reply` to everyone and hangs up; that stays silent where it is None."""
+    kept: list[socket.socket] = []
+
+    def serve() -> None:
+        with contextlib.suppress(OSError):  # closed at the end
+            while True:
+                kept.append(server.accept()[0])
+                if reply is not None:
+                    kept[-1].sendall(reply)
+                    kept.pop().close()
+
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        thread = threading.Thread(target=serve, daemon=True)
+        thread.start()
+        yield f"tcp://127.0.0.1:{server.getsockname()[1]}"
+        server.shutdown(socket.SHUT_RDWR)
+        thread.join()
+    for link in kept:
+        link.close()
+
+
+@pytest.mark.parametrize(
+    "reply", [b"", b"HTTP/1.1 400 Bad\r\n\r\n", bytes(64), None], ids=["closes", "http", "zeros", "silent"]
+)
+def test_what_is_no_dask_scheduler_is_one_sentence(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, reply: bytes | None
+) -> None:
+    monkeypatch.setattr(dask, "_SECONDS_TO_ANSWER", 2.0)
+    with listening(reply) as address, pytest.raises(InputError) as e:
+        run(tmp_path / "s.zarr", scheduler=address)
+    assert str(e.value) == f"--scheduler {address}: what listens there does not answer as a Dask scheduler does"
+    assert not (tmp_path / "s.zarr").exists()
+    gc.collect()
+    assert capfd.readouterr().err == ""
