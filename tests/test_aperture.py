@@ -29,9 +29,9 @@ from vbnfault.lens import (
     scaled_to_focal_length,
     stopped_down,
 )
-from vbnfault.lens.family import to_table
 from vbnfault.lens.glass import D_NM
 from vbnfault.lens.imaging import point_spreads
+from vbnfault.lens.prescription_file import to_table
 from vbnfault.lens.rays import trace
 from vbnfault.lens.straylight.paraxial import paraxial_ghosts
 from vbnfault.lens.straylight.scatter import veiling_glare

@@ -86,7 +86,7 @@ TITLE = 'title = "t"\n'
         (TITLE + "[geometry]\nheight_m = [-3, 1]", ["geometry.height_m", "= -3:", "from 0"]),
         (TITLE + "[sun]\ndistance_au = 0", ["sun.distance_au = 0:", "above 0.01", "1000"]),
         (TITLE + "[body]\nreflectance = 2", ["body.reflectance = 2:", "0 to 1"]),
-        (TITLE + "[camera]\nexposure_s = 2e4", ["exposure_s = 20000.0:", "'auto'", "1e4"]),
+        (TITLE + "[camera]\nexposure_s = 2e4", ["exposure_s = 20000.0:", "'auto'", "at most 10000"]),
         (TITLE + "[camera]\nexposure_s = 0", ["exposure_s = 0", "'auto'", "above 0"]),
         (TITLE + "[render]\nsamples_per_pixel = 8", ["samples_per_pixel = 8:", "1, 4, 16, 64"]),
         # names

@@ -11,7 +11,8 @@ from test_lens import PUBLISHED
 
 from vbnfault.core.errors import InputError
 from vbnfault.lens import first_order, load_lens
-from vbnfault.lens.family import relative, to_table, write_lens
+from vbnfault.lens.family import relative
+from vbnfault.lens.prescription_file import to_table, write_lens
 
 
 @pytest.mark.parametrize("name", PUBLISHED)

@@ -11,7 +11,6 @@ import pytest
 from vbnfault.core.errors import InputError
 from vbnfault.dataset.identity import _lens_digest
 from vbnfault.lens import Prescription, first_order, load_lens
-from vbnfault.lens.family import write_lens
 from vbnfault.lens.glass import (
     DISPERSIONS,
     GLASSES,
@@ -20,6 +19,7 @@ from vbnfault.lens.glass import (
     from_coefficients,
     register,
 )
+from vbnfault.lens.prescription_file import write_lens
 from vbnfault.lens.zemax import _FORMULAS, read_catalogue
 from vbnfault.scene import config
 from vbnfault.world import assemble
@@ -304,7 +304,7 @@ diameter_mm = 10.0
     for changed, said in (
         (text.replace("BASF5", "BASF55"), "glass = 'BASF55': unknown; known are those of"),
         (text.replace("mine.agf", "none.agf"), "none.agf: glass catalogue file not found"),
-        (text.replace('["mine.agf"]', "3"), "glass_catalogues = 3: must be a list of paths"),
+        (text.replace('["mine.agf"]', "3"), "glass_catalogues = 3: must be a list of strings"),
         (text.replace("mine.agf", "lens.toml"), "unsupported glass catalogue type '.toml'; allowed are .agf"),
     ):
         with pytest.raises(InputError, match=r"lens\.toml") as error:
@@ -340,7 +340,7 @@ def test_a_glass_and_a_formula_register_in_one_place(monkeypatch: pytest.MonkeyP
     monkeypatch.setattr(glass, "_DISPERSIONS", dict(DISPERSIONS))
     monkeypatch.setattr(glass, "_GLASSES", dict(GLASSES))
     monkeypatch.setattr(glass, "DISPERSIONS", glass._DISPERSIONS)
-    monkeypatch.setattr("vbnfault.lens.prescription.GLASSES", glass._GLASSES)
+    monkeypatch.setattr("vbnfault.lens.prescription_file.GLASSES", glass._GLASSES)
 
     @dispersion("flat", 1)
     def _flat(um2: np.ndarray, c: tuple[float, ...]) -> np.ndarray:

@@ -78,7 +78,7 @@ def lens(
 ) -> None:
     """Print a lens's focal length, pupils and f-number, and draw it with the numbers of its rows."""
     from ..lens.adapt import LensRequest, adapted_lens
-    from ..lens.family import write_lens
+    from ..lens.prescription_file import write_lens
     from ..output import lens_sheet
 
     prescription = adapted_lens(LensRequest(lens=lens, **vars(options)))

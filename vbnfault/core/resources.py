@@ -19,6 +19,8 @@ from functools import lru_cache, wraps
 from pathlib import Path
 from typing import Any, BinaryIO, TypeVar
 
+import tomli_w
+
 from .errors import InputChanged, InputError, shown
 
 _PACKAGE = Path(__file__).resolve().parents[1]
@@ -383,6 +385,11 @@ def parse_toml(text: str, source: str) -> dict[str, Any]:
         ) from None
     check_plain(table, source)
     return table
+
+
+def toml_text(table: Mapping[str, Any]) -> str:
+    """Return plain data as a TOML text. A lone surrogate, as in a path, becomes a question mark: UTF-8 has none."""
+    return tomli_w.dumps(table).encode("utf-8", "replace").decode()
 
 
 def check_plain(table: Mapping[str, Any], source: str) -> None:

@@ -262,24 +262,25 @@ def _allowed(node: Mapping[str, Any], root: Mapping[str, Any], message: str) -> 
     """Return in words which values a key takes, from its JSON Schema, or else from pydantic's message."""
     choices = _choices(node, root)
     if len(choices) == 1:
-        return _kind(choices[0], root) or message.replace("Input should be ", "")
-    words = dict.fromkeys(_kind(choice, root) for choice in choices)
-    return ", or ".join(word for word in words if word) or message
+        words = _kind(choices[0], root) or message.replace("Input should be ", "")
+        return "a finite number" if words == "a number" and "finite" in message else words
+    kinds = dict.fromkeys(_kind(choice, root) for choice in choices)
+    return ", or ".join(kind for kind in kinds if kind) or message
 
 
 def _kind(schema: Mapping[str, Any], root: Mapping[str, Any]) -> str:
     """Return in words which values a JSON Schema without alternatives allows; empty where it does not say."""
     names = schema.get("enum", [schema["const"]] if "const" in schema else [])
     if names:
-        shown_names = [repr(name) for name in names]
+        shown_names = [str(name).lower() if isinstance(name, bool) else repr(name) for name in names]
         return " or ".join(filter(None, [", ".join(shown_names[:-1]), shown_names[-1]]))
     if schema.get("pattern", "").startswith("^("):
         options = schema["pattern"].removeprefix("^(").removesuffix(")$").replace("[a-z0-9_]+", "<fault>")
         return f"one of {', '.join(options.split('|'))}"
     if schema.get("type") in ("number", "integer"):
         whole, interval = schema["type"] == "integer", _interval(schema)
-        finite = not whole and "aximum" not in "".join(schema)
-        noun = "a whole number" if whole else "a finite number" if finite else "a number"
+        one_sided = bool(interval) and "aximum" not in "".join(schema)
+        noun = "a whole number" if whole else "a finite number" if one_sided else "a number"
         return f"{noun} {interval}".strip()
     items = schema.get("prefixItems")
     if items:
@@ -287,8 +288,9 @@ def _kind(schema: Mapping[str, Any], root: Mapping[str, Any]) -> str:
         return f"a list of {_COUNTS.get(len(items), str(len(items)))} values, each a {each}"
     if schema.get("type") == "array":
         count = f" of at least {schema['minItems']}" if schema.get("minItems") else ""
-        tables = "properties" in _resolved(schema.get("items", {}), root)
-        return f"a list{count}" + (" of tables" if tables and not count else "")
+        kind = _kind(_choices(schema.get("items", {}), root)[0], root)
+        plural = {"a table": " of tables", "a string": " of strings"}.get(kind, "")
+        return f"a list{count or plural}"
     return {"string": "a string", "object": "a table", "boolean": "true or false"}.get(schema.get("type", ""), "")
 
 

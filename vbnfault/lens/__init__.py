@@ -4,7 +4,8 @@ from .aperture import closed_to, open_f_number, stopped_down
 from .gaussian import FirstOrder, first_order, scaled_to_field, scaled_to_focal_length
 from .imaging import RealLens
 from .interface import Lens
-from .prescription import Prescription, Surface, load_lens, parse_lens
+from .prescription import Prescription, Surface
+from .prescription_file import load_lens, parse_lens
 from .thin import ThinLens
 
 __all__ = [

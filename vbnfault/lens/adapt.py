@@ -11,7 +11,8 @@ from ..core.errors import InputError
 from .aperture import closed_to
 from .family import relative
 from .gaussian import scaled_to_field, scaled_to_focal_length
-from .prescription import Prescription, load_lens
+from .prescription import Prescription
+from .prescription_file import load_lens
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,18 +1,16 @@
-"""Vary a prescription at random, and write prescriptions to files."""
+"""Vary a prescription at random."""
 
 from __future__ import annotations
 
-import json
 import math
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ..core.errors import InputError
 from .gaussian import first_order, scaled_to_focal_length
-from .glass import CLEAR, GLASSES, Glass
-from .prescription import Prescription, Surface, parse_lens
+from .prescription import Prescription
+from .prescription_file import parse_lens, to_table
 from .rays import real_pupil_diameter_mm
 
 _TRIES = 200
@@ -77,75 +75,3 @@ def _vary(row: dict[str, Any], rng: np.random.Generator, spread: float, index_sp
         row["diameter_mm"] *= rim
     if "nd" in row:
         row["nd"] = 1 + (row["nd"] - 1) * index
-
-
-def to_table(lens: Prescription) -> dict[str, Any]:
-    """Return a prescription as the plain data that `parse_lens` reads.
-
-    The lengths are those of the lens as it is now scaled. `Prescription.scale` counts from the file that was read,
-    so it is 1 in the lens that `parse_lens` returns.
-    """
-    rows = [_row(surface) for surface in lens.surfaces]
-    if lens.sensor_reflectance:
-        rows.append({"sensor": True, "reflectance": lens.sensor_reflectance})
-    return {"name": lens.name, "source": lens.source, "surface": rows}
-
-
-def _row(surface: Surface) -> dict[str, Any]:
-    """Return one surface as a row of that table, without keys at their defaults."""
-    row: dict[str, Any] = {
-        "radius_mm": surface.radius_mm,
-        "thickness_mm": surface.thickness_mm,
-        "diameter_mm": 2 * surface.semi_diameter_mm,
-        **_medium(surface.medium),
-    }
-    if surface.stop:
-        row["stop"] = True
-    if surface.coating:
-        row["coating"] = [{"n": f.n, "k": f.k, "thickness_nm": f.thickness_nm} for f in surface.coating]
-    if surface.aspheric_mm:
-        row["aspheric_mm"] = list(surface.aspheric_mm)
-    for key, default in (("conic", 0.0), ("blades", 0), ("blade_rounding", 0.0), ("rotation_deg", 0.0)):
-        if getattr(surface, key) != default:
-            row[key] = getattr(surface, key)
-    nodes, values = surface.internal_transmittance_10mm
-    registered = GLASSES.get(surface.medium.name) == surface.medium
-    of_glass = surface.medium.internal_transmittance_10mm if registered else CLEAR
-    if surface.internal_transmittance_10mm != of_glass:
-        row["internal_transmittance_10mm"] = {"wavelength_nm": list(nodes), "value": list(values)}
-    return row
-
-
-def _medium(glass: Glass) -> dict[str, Any]:
-    """Return the keys of a row that describe a medium; none for air."""
-    if glass.nd == 1.0 and math.isinf(glass.vd):
-        return {}
-    if GLASSES.get(glass.name) == glass:
-        return {"glass": glass.name}
-    if glass.formula == "cauchy":
-        return {"nd": glass.nd} | ({} if math.isinf(glass.vd) else {"vd": glass.vd})
-    return {"glass": {"formula": glass.formula, "coefficients": list(glass.coefficients)}}
-
-
-def write_lens(lens: Prescription, path: Path) -> None:
-    """Write a prescription, as it is now scaled, as a TOML file that `load_lens` reads; see `to_table`."""
-    table = to_table(lens)
-    lines = [f"{key} = {_toml(table[key])}" for key in ("name", "source")]
-    for row in table["surface"]:
-        lines += ["", "[[surface]]", *(f"{key} = {_toml(value)}" for key, value in row.items())]
-    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
-
-
-def _toml(value: Any) -> str:
-    """Return a value in TOML syntax."""
-    if isinstance(value, bool):
-        return str(value).lower()
-    if isinstance(value, str):
-        # JSON's escapes are those of TOML, which also refuses DEL; a lone surrogate, of a path, has no UTF-8
-        text = json.dumps(value.encode("utf-8", "replace").decode(), ensure_ascii=False)
-        return text.replace("\x7f", "\\u007f")
-    if isinstance(value, dict):
-        return "{" + ", ".join(f"{k} = {_toml(v)}" for k, v in value.items()) + "}"
-    if isinstance(value, list):
-        return "[" + ", ".join(map(_toml, value)) + "]"
-    return repr(float(value)) if isinstance(value, float) else str(value)

@@ -26,7 +26,8 @@ from .glass import D_NM
 from .imaging import RealLens
 from .interface import Lens
 from .mapping import inclined_rays
-from .prescription import Prescription, load_lens
+from .prescription import Prescription
+from .prescription_file import load_lens
 from .rays import Path
 
 F64 = NDArray[np.float64]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
@@ -83,7 +83,9 @@ class CameraTable(Table):
     bias_dn: int = Field(64, ge=0, le=1000)
     response: str = "nikon_5100"
     quantum_efficiency_peak: float = Field(0.5, gt=0, le=1)
-    exposure_s: float | Literal["auto"] = Field("auto", description="seconds, or metered on each clean frame")
+    exposure_s: Annotated[float, Field(gt=0, le=1e4)] | Literal["auto"] = Field(
+        "auto", description="seconds, or metered on each clean frame"
+    )
     exposure_min_s: float = Field(1e-5, gt=0, le=1e4)
     exposure_max_s: float = Field(5.0, gt=0, le=1e4)
     metering_level: float = Field(
@@ -114,8 +116,6 @@ class CameraTable(Table):
                 f"response = {self.response!r}: must be one of {', '.join(spectra.RESPONSES)}; for a monochrome "
                 'camera let detector name a sensor file with pattern = "mono"'
             )
-        if isinstance(self.exposure_s, float | int) and not 0 < self.exposure_s <= 1e4:
-            raise ValueError(f"exposure_s = {self.exposure_s!r}: must be 'auto' or above 0 and at most 1e4 s")
         for key in ("lens_coating", "focus"):
             value = getattr(self, key)
             if not self.lens and value not in ("", "paraxial"):
