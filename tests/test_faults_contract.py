@@ -11,17 +11,13 @@ import cv2
 import numpy as np
 import pytest
 from conftest import ALL_FAULTS
-from hypothesis import HealthCheck, assume, given, settings
-from hypothesis import strategies as st
 from test_faults_kit import make_context, noisy, with_mosaic
 
-from vbnfault.camera import ARCHITECTURES, READOUT_DIRECTIONS
 from vbnfault.core.errors import InputError
 from vbnfault.faults import (
     MOSAIC_STEPS,
     STEPS,
     Fault,
-    FaultContext,
     dataset_order,
     from_dict,
     json_schema,
@@ -30,6 +26,7 @@ from vbnfault.faults import (
 )
 from vbnfault.faults.models import undoing_registrations
 from vbnfault.faults.planes import scale_by_intensity
+from vbnfault.testing import check_fault
 
 MODELS = [(fault, model) for fault, models in registry().items() for model in models]
 WITH_BOUNDS = [
@@ -38,13 +35,6 @@ WITH_BOUNDS = [
     for f in dataclasses.fields(registry()[fault][model])
     if f.metadata["kind"] == "bounds"
 ]
-
-SHAPES = [(96, 64), (200, 200), (60, 130)]  # width, height
-LIGHT = settings(
-    max_examples=12,
-    deadline=None,
-    suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
-)
 
 
 @pytest.fixture(scope="module")
@@ -57,126 +47,13 @@ def required(tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict[str, An
     return {"pixel_overwriting": {"texture_file": str(path)}}
 
 
-@st.composite
-def tables(draw: st.DrawFn, fault: str, model: str) -> dict[str, Any]:
-    """A scene-file table with values within the declared bounds, from the fields' metadata alone."""
-    table: dict[str, Any] = {"model": model}
-    for f in dataclasses.fields(registry()[fault][model]):
-        if not draw(st.booleans()):
-            continue
-        kind = f.metadata["kind"]
-        if kind == "bounds":
-            lo, hi = f.default  # type: ignore[misc]
-            one = st.integers(int(lo), int(hi)) if f.metadata["integer"] else st.floats(lo, hi)
-            pair = sorted((draw(one), draw(one)))
-            table[f.name] = pair if draw(st.booleans()) else pair[0]
-        elif kind == "flag":
-            table[f.name] = draw(st.booleans())
-        elif kind == "choice":
-            table[f.name] = draw(st.sampled_from(f.metadata["options"]))
-    return table
-
-
-@st.composite
-def contexts(draw: st.DrawFn) -> FaultContext:
-    width, height = draw(st.sampled_from(SHAPES))
-    suns = [None, (width / 2, height / 2), (0.3 * width, 0.2 * height), (-0.4 * width, 1.7 * height)]
-    return make_context(
-        width,
-        height,
-        sun=draw(st.sampled_from(suns)),
-        visible=draw(st.sampled_from([0.0, 0.5, 1.0])),
-        architecture=draw(st.sampled_from(ARCHITECTURES)),
-        readout_direction=draw(st.sampled_from(READOUT_DIRECTIONS)),
-    )
-
-
-def fresh(context: FaultContext) -> FaultContext:
-    """The same context with an empty memo."""
-    return dataclasses.replace(context)
-
-
-def build(fault: str, table: dict[str, Any], required: dict[str, dict[str, Any]]) -> Fault:
-    try:
-        return from_dict(fault, required.get(fault, {}) | table, source="test.toml")
-    except InputError:  # drawn fields that contradict each other
-        assume(False)
-        raise
-
-
 SLOW = [("straylight", "traced"), ("straylight", "paraxial")]  # a lens is made ready for every camera
 
 
-@pytest.mark.parametrize(("name", "model"), SLOW)
-@settings(LIGHT, max_examples=4)
-@given(data=st.data())
-def test_contract_of_slow_models(
-    name: str, model: str, required: dict[str, dict[str, Any]], data: st.DataObject
-) -> None:
-    keeps_the_contract(name, model, required, data)
-
-
-@pytest.mark.parametrize(("name", "model"), [m for m in MODELS if m not in SLOW])
-@LIGHT
-@given(data=st.data())
-def test_contract(name: str, model: str, required: dict[str, dict[str, Any]], data: st.DataObject) -> None:
-    keeps_the_contract(name, model, required, data)
-
-
-def keeps_the_contract(name: str, model: str, required: dict[str, dict[str, Any]], data: st.DataObject) -> None:
-    fault = build(name, data.draw(tables(name, model)), required)
-    context = data.draw(contexts())
-    if fault.needs_mosaic:
-        context = with_mosaic(context)
-    key = data.draw(st.integers(0, 2**32 - 1))
-    for step in fault.steps:
-        keeps_the_contract_at(step, fault, context, key)
-
-
-def keeps_the_contract_at(step: str, fault: Fault, context: FaultContext, key: int) -> None:
-    params = fault.draw(context, np.random.default_rng(key))
-    quantity: Any = noisy(step, context)
-    before = quantity.array.tobytes()
-    result = fault.apply_at(step, quantity, params, context)
-    mask = fault.footprint(params, context)
-
-    assert quantity.array.tobytes() == before, "input modified"
-    assert type(result) is type(quantity)
-    assert result.unit == quantity.unit
-    assert result.array.shape == quantity.array.shape
-    assert result.array.dtype == quantity.array.dtype
-    if step in ("electrons", "light", "pixels", "charge", "offsets"):
-        assert np.isfinite(result.array).all()
-        assert (result.array >= 0).all() or step == "offsets"
-
-    # the same key gives the same parameters and the same image, from an empty memo
-    again = fault.draw(fresh(context), np.random.default_rng(key))
-    assert again == params
-    assert fault.apply_at(step, quantity, again, fresh(context)).array.tobytes() == result.array.tobytes()
-
-    # what the store keeps is enough to draw the fault again, by the bits
-    stored = json.loads(json.dumps(params, allow_nan=False))
-    assert stored == params
-    assert fault.apply_at(step, quantity, stored, fresh(context)).array.tobytes() == result.array.tobytes()
-
-    if mask is not None:
-        assert mask.shape == context.shape
-        assert mask.dtype == np.bool_
-        other = fault.footprint(params, fresh(context))
-        assert other is not None
-        assert np.array_equal(other, mask)
-        if fault.localised and not fault.effect_mask:
-            assert result.array[~mask].tobytes() == quantity.array[~mask].tobytes()
-
-
 @pytest.mark.parametrize(("name", "model"), MODELS)
-@LIGHT
-@given(data=st.data())
-def test_round_trips(name: str, model: str, required: dict[str, dict[str, Any]], data: st.DataObject) -> None:
-    fault = build(name, data.draw(tables(name, model)), required)
-    table = fault.to_dict()
-    assert from_dict(name, json.loads(json.dumps(table)), source="test.toml") == fault
-    assert pickle.loads(pickle.dumps(fault)) == fault
+def test_contract(name: str, model: str, required: dict[str, dict[str, Any]]) -> None:
+    examples = 4 if (name, model) in SLOW else 12
+    check_fault(registry()[name][model], required=required.get(name), examples=examples)
 
 
 @pytest.mark.parametrize(("name", "model"), MODELS)

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from .dataset import BuildOptions, verify
     from .dataset import build_scene as build
     from .detector.sensor import Sensor, load_sensor
-    from .faults import Fault, FaultContext, Interval, bounds, choice, flag, number, rows, text
+    from .faults import Fault, FaultContext, Interval, bounds, choice, flag, number, path, rows, text
     from .lens import Prescription, load_lens
     from .output.flare_images import Flare, trace_flare
     from .pipeline import Session, simulate
@@ -50,6 +50,7 @@ _HOME = {
     "load_sensor": ("detector.sensor", "load_sensor"),
     "number": ("faults", "number"),
     "open_dataset": ("store", "open_dataset"),
+    "path": ("faults", "path"),
     "rows": ("faults", "rows"),
     "simulate": ("pipeline", "simulate"),
     "text": ("faults", "text"),
@@ -79,6 +80,7 @@ __all__ = [
     "load_sensor",
     "number",
     "open_dataset",
+    "path",
     "rows",
     "simulate",
     "text",

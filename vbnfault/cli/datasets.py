@@ -125,6 +125,8 @@ def verify(store: StoreArgument) -> None:
         report = dataset.verify(opened, progress=bar.update)
     for problem in report.problems:
         typer.echo(f"{store}: {problem}", err=True)
+    for sentence in dataset.missing_plugins(opened.attributes):
+        typer.echo(f"note: {sentence}", err=True)
     for line in report.counts.lines():
         typer.echo(line)
     if report.problems:

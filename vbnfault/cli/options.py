@@ -25,6 +25,15 @@ MOST_SEED = 2**63 - 1
 
 SceneArgument = Annotated[str, typer.Argument(help="Path of a scene file, or name of a packaged scene.")]
 StoreArgument = Annotated[Path, typer.Argument(help="Path of a Zarr store.")]
+PluginOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--plugin",
+        metavar="MODULE",
+        help="Plug-in with further faults: the name of a module, or the path of a file; may be repeated.",
+        show_default=False,
+    ),
+]
 LensArgument = Annotated[str, typer.Argument(help="Path of a prescription, or name of a packaged lens.")]
 
 
@@ -129,6 +138,14 @@ def overrides(settings: list[str] | None) -> dict[str, Any]:
         except (ValueError, RecursionError):  # a number of thousands of digits; lists within lists
             raise InputError(f"--set {shown(setting)}: the value is out of range or nested too deep") from None
     return values
+
+
+def load_plugins(names: list[str] | None) -> None:
+    """Load the plug-ins of `--plugin`; their paths start from the working folder. Raises InputError."""
+    from .. import faults
+    from ..core import resources
+
+    faults.load_plugins([resources.absolute(n, "--plugin") if n.endswith(".py") else n for n in names or ()])
 
 
 @contextlib.contextmanager

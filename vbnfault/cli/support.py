@@ -12,6 +12,7 @@ import typer
 from .. import __version__
 from ..core.errors import InputError
 from .app import app
+from .options import PluginOption, load_plugins
 
 _PANEL = "Getting started"
 _LIBRARIES = ("mitsuba", "drjit", "numpy", "zarr", "trimesh", "OpenEXR", "colour-science", "dask")
@@ -20,11 +21,13 @@ _LIBRARIES = ("mitsuba", "drjit", "numpy", "zarr", "trimesh", "OpenEXR", "colour
 @app.command("list", rich_help_panel=_PANEL)
 def list_(
     kind: Annotated[str, typer.Argument(help="One of scenes, lenses, detectors and faults.", metavar="KIND")],
+    plugins: PluginOption = None,
 ) -> None:
     """List the packaged scenes, lenses or detectors, or the fault models with their keys."""
     from ..core import resources
 
     if kind == "faults":
+        load_plugins(plugins)
         _list_faults()
         return
     folders = {"scenes": "scenes", "lenses": "scenes/lenses", "detectors": "scenes/detectors"}
@@ -56,11 +59,12 @@ def _list_faults() -> None:
 
 
 @app.command(rich_help_panel=_PANEL)
-def schema() -> None:
+def schema(plugins: PluginOption = None) -> None:
     """Print the JSON Schema of the scene file."""
     from .. import faults
     from ..scene import config
 
+    load_plugins(plugins)
     typer.echo(json.dumps(config.json_schema(faults.json_schema()), indent=2))
 
 

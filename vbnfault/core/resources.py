@@ -36,6 +36,8 @@ LIMIT_BYTES: dict[str, int] = {
     "shape": 1024 * MIB,
     "spacecraft": 512 * MIB,
     "texture": 256 * MIB,
+    "data": 1024 * MIB,
+    "plug-in": 64 * MIB,
     "SPICE kernel": 8192 * MIB,
     "star catalogue": 64 * MIB,
     "SPICE text kernel": 256 * MIB,
@@ -424,12 +426,18 @@ def import_path() -> list[str]:
     """Return the import path for a process that this one starts: this one's path without the working folder.
 
     Under `python -m` and at the prompt, Python puts the working folder first, so that it would run a file
-    `random.py` among a user's data. The working folder stays in the path where PYTHONPATH names it; where it holds
-    vbnfault itself, it moves to the end.
+    `random.py` among a user's data. The working folder stays in the path where PYTHONPATH names it, or where it
+    follows the standard library, as an editable installation from this folder has it. Where it holds vbnfault
+    itself, it moves to the end.
     """
     here, package = os.path.realpath(os.getcwd()), os.path.realpath(_PACKAGE.parent)
     wanted = {os.path.realpath(p) for p in os.environ.get("PYTHONPATH", "").split(os.pathsep) if p}
-    path = [p for p in sys.path if isinstance(p, str) and (os.path.realpath(p or here) != here or here in wanted)]
+    library, after_library, path = os.path.realpath(os.path.dirname(os.__file__)), False, []
+    for entry in (p for p in sys.path if isinstance(p, str)):
+        where = os.path.realpath(entry or here)
+        after_library |= where == library
+        if where != here or here in wanted or after_library:
+            path.append(entry)
     return [*path, package] if here == package and here not in wanted else path
 
 

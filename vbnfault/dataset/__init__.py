@@ -1,7 +1,7 @@
 """Build, resume, repair and extend a dataset, and derive what its store must hold from its scene."""
 
 from .build import BuildOptions
-from .checking import verify
+from .checking import missing_plugins, verify
 from .from_scene import SessionFactory, build_scene, describe_scene
 from .identity import is_exact, planned, scene_identity, store_spec
 
@@ -11,6 +11,7 @@ __all__ = [
     "build_scene",
     "describe_scene",
     "is_exact",
+    "missing_plugins",
     "planned",
     "scene_identity",
     "store_spec",

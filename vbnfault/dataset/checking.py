@@ -2,11 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
 
 from .. import store
+from ..faults import loaded_plugin
 from .identity import is_exact, planned
+
+
+def missing_plugins(attributes: Mapping[str, Any]) -> list[str]:
+    """Return a sentence for each plug-in of a store that is not installed, or not with the same source."""
+    sentences = []
+    for name, stored in attributes["scene"].get("plugins", {}).items():
+        plugin = loaded_plugin(name)
+        if plugin is None or plugin.sha256 != stored["sha256"]:
+            state = "not installed" if plugin is None else "installed in another version"
+            sentences.append(
+                f"{', '.join(stored['models'])} came from the plug-in {name} (sha256 {stored['sha256'][:12]}), "
+                f"which is {state} here; the samples were checked without it"
+            )
+    return sentences
 
 
 def verify(path: str | Path | store.Store, progress: Callable[[int], None] | None = None) -> store.Report:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import importlib.metadata
 import platform
 from collections.abc import Callable, Mapping, Sequence
@@ -11,9 +12,9 @@ from typing import Any
 
 from .. import __version__, pipeline, store
 from ..core import llvm, resources
-from ..core.errors import VbnfaultError
+from ..core.errors import InputError, VbnfaultError
 from ..detector import Detector
-from ..faults import Fault
+from ..faults import Fault, belongs_here, plugins_of
 from ..lens import load_lens
 from ..pipeline import labels
 from ..pipeline.record import proposal
@@ -58,18 +59,38 @@ def scene_identity(session: pipeline.Session) -> dict[str, Any]:
             del scene["camera"][key]  # the detector's own value is used instead
     scene["faults"] = {name: fault.to_dict() for name, fault in session.faults.items()}
     for name, table in scene["faults"].items():
-        if table.get("texture_file"):
-            table["texture_file"] = _digest(table["texture_file"], "texture")
-        lens = table.get("lens") or ("" if session.scene.camera.lens else session.faults[name].lens_of_thin_camera)
-        if lens:
-            table["lens"] = _lens_digest(lens)
+        _contents_of_fault(table, session.faults[name], session.scene)
     _contents_of_files(scene, session.scene)
-    if "straylight" in session.faults:
-        textures = sorted(resources.data_dir("textures").glob("*.png"))
-        data = b"".join(resources.read_input(path, "texture") for path in textures)
-        scene["textures_sha256"] = resources.sha256(data)
+    for folder in {fault.packaged_images for fault in session.faults.values()} - {""}:
+        images = sorted(resources.data_dir(folder).glob("*.png"))
+        data = b"".join(resources.read_input(path, "texture") for path in images)
+        scene[f"{folder}_sha256"] = resources.sha256(data)
+    del scene["plugins"]
+    plugins = plugins_of(session.faults, session.scene.plugins)
+    if plugins:
+        scene["plugins"] = {
+            plugin.name: {
+                "sha256": plugin.sha256,
+                "models": plugin.model_names,
+                "needs_sun": sorted({cls.fault for cls in plugin.models if cls.needs_sun}),
+            }
+            for plugin in plugins
+        }
     del scene["dataset"]["samples"]
     return scene
+
+
+def _contents_of_fault(table: dict[str, Any], fault: Fault, scene: Scene) -> None:
+    """Replace the paths in the table of a fault by digests of their contents."""
+    for f in dataclasses.fields(fault):
+        if f.metadata["kind"] == "path" and table[f.name]:
+            content, packaged, path = f.metadata["content"], f.metadata["packaged"], table[f.name]
+            if content == "lens":
+                table[f.name] = _lens_digest(path)
+            else:
+                table[f.name] = _digest(resources.find(packaged, path) if packaged else path, content)
+    if fault.lens_of_thin_camera and not scene.camera.lens and not table["lens"]:
+        table["lens"] = _lens_digest(fault.lens_of_thin_camera)
 
 
 def _digest(path: str | Path, what: str) -> str:
@@ -119,6 +140,7 @@ def store_spec(session: pipeline.Session, blocks: Sequence[int]) -> StoreSpec:
     dataset, camera = scene.dataset, session.base_camera  # first: a lens that cannot be used is reported here
     layers = tuple(name for name in stored_layers(scene, session.faults) if name != "clean")
     individuals = scene.camera.individuals
+    _check_origins(session.faults)
     kinds = tuple(labels.kind(fault, is_ccd=camera.is_ccd) for fault in session.faults.values())
     identity, made_with = scene_identity(session), versions()
     if scene.spice.kernels:
@@ -164,6 +186,17 @@ def store_spec(session: pipeline.Session, blocks: Sequence[int]) -> StoreSpec:
     )
 
 
+def _check_origins(faults: Mapping[str, Fault]) -> None:
+    """Raise InputError for a fault that other processes cannot load, such as one defined in a notebook."""
+    for name, fault in faults.items():
+        if not belongs_here(fault):
+            cls = type(fault)
+            raise InputError(
+                f"faults.{name}.model = {fault.model!r}: its class {cls.__qualname__} is defined in "
+                f"{cls.__module__}, which worker processes cannot load; put it in a file and name that in plugins"
+            )
+
+
 def _mask_rule(kind: str, fault: Fault) -> str:
     """Return the rule of a fault class's mask as a sentence."""
     if kind == "effect":
@@ -195,7 +228,8 @@ def is_exact(attributes: Mapping[str, Any]) -> bool:
 
 def stored_scene(attributes: Mapping[str, Any]) -> Scene:
     """Return the scene from which a store was planned, without digests of file contents."""
-    stored = {key: value for key, value in attributes["scene"].items() if key != "textures_sha256"}
+    scene = attributes["scene"]
+    stored = {key: value for key, value in scene.items() if key != "plugins" and not key.endswith("_sha256")}
     stored["body"] = {key: value for key, value in stored["body"].items() if key != "shape_sha256"}
     # a scene's identity adds keys that are not valid in a scene
     for name, added in (("sky", "catalogue"),):

@@ -3,26 +3,34 @@
 from .context import FaultContext, Params
 from .contract import MOSAIC_STEPS, QUANTITIES, STEPS, Fault, act
 from .fields import Interval, bounds, choice, flag, number, path, rows, text
-from .models import dataset_order, from_dict, json_schema, physical_order, registry
+from .models import DeclarationError, dataset_order, from_dict, json_schema, path_fields, physical_order, registry
+from .plugins import Plugin, belongs_here, load_plugins, loaded_plugin, plugins_of
 
 __all__ = [
     "MOSAIC_STEPS",
     "QUANTITIES",
     "STEPS",
+    "DeclarationError",
     "Fault",
     "FaultContext",
     "Interval",
     "Params",
+    "Plugin",
     "act",
+    "belongs_here",
     "bounds",
     "choice",
     "dataset_order",
     "flag",
     "from_dict",
     "json_schema",
+    "load_plugins",
+    "loaded_plugin",
     "number",
     "path",
+    "path_fields",
     "physical_order",
+    "plugins_of",
     "registry",
     "rows",
     "text",

@@ -25,7 +25,7 @@ from ..lens import load_lens
 from ..lens.footprint import DEFAULT_LENS
 from .context import FaultContext, Params
 from .fields import Interval, parse_field, path
-from .models import register
+from .models import DeclarationError, register
 
 Q = TypeVar("Q", Electrons, Charge, Offset, RawMosaic, RGBI)
 
@@ -81,6 +81,9 @@ class Fault:
         Packaged lens that the model traces if the camera has a thin lens and the scene names no lens. Its contents
         belong to the scene's identity. "": none.
 
+    packaged_images
+        Folder of packaged images that the model may read. Their contents belong to the scene's identity. "": none.
+
     Two more attributes, for the step `electrons`, say which light has already passed the lens's rims. A model with
     neither acts in the same manner on all light (see `act`).
 
@@ -108,19 +111,24 @@ class Fault:
     adds_past_rims: ClassVar[bool] = False
     at_rims: ClassVar[bool] = False
     lens_of_thin_camera: ClassVar[str] = ""
+    packaged_images: ClassVar[str] = ""
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
-        """Register the model. Raise TypeError if its steps are out of order or its name is in use."""
+        """Register the model. Raise DeclarationError if its steps are out of order or its name is in use."""
         super().__init_subclass__(**kwargs)
         if "model" not in cls.__dict__:
             return  # a base class without a model name is not registered
         cls.default = cls.__dict__.get("default", False)
+        where = f"fault model {getattr(cls, 'fault', '?')}/{cls.model}"
+        missing = [name for name in ("fault", "step") if not isinstance(getattr(cls, name, None), str)]
+        if missing:
+            raise DeclarationError([], f"{where}: states no {' and no '.join(missing)}")
         cls.steps = (cls.step, *cls.later_steps)
         if cls.steps != tuple(step for step in STEPS if step in cls.steps):
-            raise TypeError(f"fault model {cls.fault}/{cls.model} acts at {cls.steps}, not in the order of {STEPS}")
+            raise DeclarationError([cls.fault], f"{where} acts at {cls.steps}, not in the order of {STEPS}")
         # the code for the steps electrons and rgbi handles only one step of each fault
         if cls.later_steps and not set(MOSAIC_STEPS).issuperset(cls.steps):
-            raise TypeError(f"fault model {cls.fault}/{cls.model}: only steps of a mosaic may be several")
+            raise DeclarationError([cls.fault], f"{where}: only steps of a mosaic may be several")
         if cls.soft_layer:
             soft_kind(cls.soft_layer)
         register(cls)

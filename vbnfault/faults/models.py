@@ -10,11 +10,12 @@ import dataclasses
 import importlib
 import pkgutil
 import re
-from collections.abc import Iterable, Iterator, Mapping
+import sys
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
-from ..core.errors import InputError, shown
+from ..core.errors import InputError, VbnfaultError, shown
 from ..core.tables import did_you_mean
 from .fields import field_schema, parse_field
 
@@ -28,26 +29,69 @@ _NAME = re.compile("[a-z][a-z0-9_]*")
 _models: dict[str, dict[str, type[Fault]]] = {}
 
 
+# Modules of plug-ins that no scene names at present: other plug-ins may define the same models.
+_replaceable: set[str] = set()
+
+
+class DeclarationError(TypeError):
+    """The class attributes or fields of fault models are wrong, or contradict those of others.
+
+    `classes` holds the names of the fault classes concerned.
+    """
+
+    def __init__(self, classes: Iterable[str], message: str) -> None:
+        super().__init__(message)
+        self.classes = tuple(classes)
+
+
 def register(cls: type[Fault]) -> None:
-    """Add a model to the registry. Raise TypeError if its names cannot be used or its declarations contradict."""
+    """Add a model to the registry. Raise DeclarationError if its names or declarations contradict the others'."""
     where = f"fault model {cls.fault}/{cls.model}"
+    models = {m.model: m for m in _models.get(cls.fault, {}).values() if m.__module__ not in _replaceable}
     if not _NAME.fullmatch(cls.fault) or not _NAME.fullmatch(cls.model):
-        raise TypeError(f"{where}: its names must consist of lower-case letters, digits and underscores")
-    models = _models.get(cls.fault, {})
+        text = f"{where}: its names must consist of lower-case letters, digits and underscores"
+        raise DeclarationError([cls.fault], text)
     known = models.get(cls.model)
     if known is not None and (known.__module__, known.__qualname__) != (cls.__module__, cls.__qualname__):
-        raise TypeError(f"{where} is defined twice: in {known.__module__} and in {cls.__module__}")
+        text = f"{where} is defined twice: in {_source(known)} and in {_source(cls)}"
+        raise DeclarationError([cls.fault], text)
     if cls.default:
         other = next((m for m in models.values() if m.default and m.model != cls.model), None)
         if other is not None:
-            raise TypeError(f"{where}: default = True, but {other.fault}/{other.model} is the default of the class")
+            text = f"{where}: default = True, but {other.fault}/{other.model} is the default of the class"
+            raise DeclarationError([cls.fault], text)
         if cls.after is None:
-            raise TypeError(
-                f"{where}: the default model must state the class after which its class acts: after = ..."
-            )
+            text = f"{where}: the default model must state the class after which its class acts: after = ..."
+            raise DeclarationError([cls.fault], text)
         if cls.axis is not None and not is_packaged(cls):
-            raise TypeError(f"{where}: axis = {cls.axis}: only the six classes of the paper have a position")
-    _models.setdefault(cls.fault, {})[cls.model] = cls
+            text = f"{where}: axis = {cls.axis}: only the six classes of the paper have a position"
+            raise DeclarationError([cls.fault], text)
+    _models[cls.fault] = {**models, cls.model: cls}
+    _forget_orders()
+
+
+def _source(cls: type[Fault]) -> str:
+    """Return the file that defines a model, or its module."""
+    return str(getattr(sys.modules.get(cls.__module__), "__file__", None) or cls.__module__)
+
+
+def models_of(condition: Callable[[type[Fault]], bool]) -> tuple[type[Fault], ...]:
+    """Return the registered models that meet a condition."""
+    return tuple(cls for models in _models.values() for cls in models.values() if condition(cls))
+
+
+def allow_replacement(modules: Iterable[str]) -> None:
+    """Let other definitions replace the models of these modules, and of no others."""
+    _replaceable.clear()
+    _replaceable.update(modules)
+
+
+def forget(module: str) -> None:
+    """Remove the models of a module from the registry."""
+    for name, models in list(_models.items()):
+        _models[name] = {m.model: m for m in models.values() if m.__module__ != module}
+        if not _models[name]:
+            del _models[name]
     _forget_orders()
 
 
@@ -60,6 +104,7 @@ def _forget_orders() -> None:
 @contextlib.contextmanager
 def undoing_registrations(*, always: bool = False) -> Iterator[None]:
     """Forget the models that a block registers if the block raises an exception, or `always`."""
+    _import_all()
     before = {name: dict(models) for name, models in _models.items()}
     undo = True
     try:
@@ -81,17 +126,32 @@ def registry() -> dict[str, dict[str, type[Fault]]]:
     """Return fault class → model → type, with the classes in the order of the dataset.
 
     The first model of each class is its default. The others are sorted by module, those of this package first,
-    whatever the order of imports. Raise TypeError if what the classes declare does not fit together.
+    whatever the order of imports. Models of installed plug-ins are among them.
+
+    Raises
+    ------
+    DeclarationError
+        If what the classes declare does not fit together.
+    InputError
+        If an installed plug-in is broken.
     """
     _import_all()
     return _sorted_registry()
 
 
+def check_declarations() -> None:
+    """Raise DeclarationError if what the registered classes declare does not fit together."""
+    _sorted_registry()
+
+
 @lru_cache(maxsize=1)
 def _import_all() -> None:
-    """Import every module of this package, so that all its models are registered."""
+    """Import every module of this package and every installed plug-in, so that all models are registered."""
     for info in pkgutil.iter_modules(importlib.import_module(_PACKAGE).__path__):
         importlib.import_module(f"{_PACKAGE}.{info.name}")
+    from .plugins import load_installed
+
+    load_installed()
 
 
 @lru_cache(maxsize=1)
@@ -106,28 +166,33 @@ def _sorted_registry() -> dict[str, dict[str, type[Fault]]]:
             _check_fields(cls)
     _physical_order()
     return {
-        name: {cls.model: cls for cls in sorted(_models[name].values(), key=position)}
-        for name in dataset_order(_models)
+        name: {cls.model: cls for cls in sorted(_models[name].values(), key=position)} for name in _on_axis(_models)
     }
 
 
 def _check_fields(cls: type[Fault]) -> None:
-    """Raise TypeError if a model is no frozen, keyword-only dataclass of fields made by the helpers."""
+    """Raise DeclarationError if a model is no frozen, keyword-only dataclass of fields made by the helpers."""
     where = f"fault model {cls.fault}/{cls.model}"
     options = cls.__dict__.get("__dataclass_params__")
     if options is None or not (options.frozen and getattr(options, "kw_only", True)):
-        raise TypeError(f"{where}: its class must be decorated with @dataclass(frozen=True, kw_only=True)")
+        raise DeclarationError(
+            [cls.fault], f"{where}: its class must be decorated with @dataclass(frozen=True, kw_only=True)"
+        )
     for f in dataclasses.fields(cls):
         if "kind" not in f.metadata:
-            raise TypeError(f"{where}: {f.name} must be declared with one of the field helpers, such as bounds()")
+            raise DeclarationError(
+                [cls.fault], f"{where}: {f.name} must be declared with one of the field helpers, such as bounds()"
+            )
 
 
 def _defaults() -> dict[str, type[Fault]]:
-    """Return the default model of every class. Raise TypeError if a class has none."""
+    """Return the default model of every class. Raise DeclarationError if a class has none."""
     defaults = {cls.fault: cls for models in _models.values() for cls in models.values() if cls.default}
     for name, models in _models.items():
         if name not in defaults:
-            raise TypeError(f"fault class {name}: none of its models ({', '.join(models)}) states default = True")
+            raise DeclarationError(
+                [name], f"fault class {name}: none of its models ({', '.join(models)}) states default = True"
+            )
     return defaults
 
 
@@ -143,7 +208,7 @@ def _physical_order() -> tuple[str, ...]:
     for name, cls in sorted(defaults.items(), key=lambda item: (is_packaged(item[1]), item[0])):
         if cls.after not in followers:
             hint = did_you_mean(str(cls.after), list(defaults))
-            raise TypeError(f"fault class {name}: after = {cls.after!r}: no such fault class{hint}")
+            raise DeclarationError([name], f"fault class {name}: after = {cls.after!r}: no such fault class{hint}")
         followers[cls.after].append(name)
     order: list[str] = []
     pending = followers[""][::-1]
@@ -152,13 +217,20 @@ def _physical_order() -> tuple[str, ...]:
         pending += followers[order[-1]][::-1]
     circle = sorted(set(defaults) - set(order))
     if circle:
-        raise TypeError(f"fault classes {', '.join(circle)}: what they state by `after` runs in a circle")
+        raise DeclarationError(
+            circle, f"fault classes {', '.join(circle)}: what they state by `after` runs in a circle"
+        )
     return tuple(order)
 
 
 def dataset_order(names: Iterable[str]) -> list[str]:
     """Return the names in the order of the dataset's `fault` axis."""
     _import_all()
+    return _on_axis(names)
+
+
+def _on_axis(names: Iterable[str]) -> list[str]:
+    """Return the names as `dataset_order` does, from the models that are registered so far."""
     axis = {cls.fault: cls.axis for cls in _defaults().values()}
 
     def position(name: str) -> tuple[float, str]:
@@ -168,11 +240,14 @@ def dataset_order(names: Iterable[str]) -> list[str]:
     return sorted(set(names), key=position)
 
 
-def physical_order(names: Iterable[str]) -> list[str]:
-    """Return the names in the order in which the effects act."""
+def physical_order(names: Collection[str]) -> list[str]:
+    """Return the names in the order in which the effects act. Raises VbnfaultError for an unknown class."""
     _import_all()
     position = {name: k for k, name in enumerate(_physical_order())}
-    return sorted(set(names), key=lambda name: (position.get(name, len(position)), name))
+    for name in names:
+        if name not in position:
+            raise VbnfaultError(f"fault class {name}: its plug-in is not loaded any more; load the scene again")
+    return sorted(set(names), key=position.__getitem__)
 
 
 def from_dict(fault_class: str, table: Mapping[str, Any], *, source: str) -> Fault:
@@ -207,6 +282,16 @@ def from_dict(fault_class: str, table: Mapping[str, Any], *, source: str) -> Fau
     except ValueError as error:
         raise InputError(f"{where}: {error}") from None
     return fault
+
+
+def path_fields(fault_class: str) -> dict[str, str]:
+    """Return the keys of a fault class that hold paths, each with its folder of packaged files or ""."""
+    return {
+        f.name: f.metadata["packaged"]
+        for cls in registry().get(fault_class, {}).values()
+        for f in dataclasses.fields(cls)
+        if f.metadata["kind"] == "path"
+    }
 
 
 def json_schema() -> dict[str, Any]:

@@ -70,6 +70,7 @@ class TextureStraylight(Fault):
     axis = 3
     step = "electrons"
     needs_sun = True
+    packaged_images = "textures"
     effect_mask = True
     soft_layer = "straylight_added"
 

@@ -67,6 +67,7 @@ class _LensStraylight(LensFault):
     fault = "straylight"
     step = "electrons"
     needs_sun = True
+    packaged_images = "textures"
     effect_mask = True
     soft_layer = "straylight_added"
     adds_past_rims = True

@@ -23,7 +23,7 @@ from ..camera import Camera
 from ..core import activity
 from ..core.errors import InputError, VbnfaultError
 from ..core.quantities import SOFT_KINDS, Sample
-from ..faults import Fault, dataset_order, from_dict
+from ..faults import Fault, dataset_order, from_dict, load_plugins, plugins_of
 from ..scene import config, plan
 from ..scene.config import Scene
 from ..scene.keyed_random import keyed_uniform
@@ -117,9 +117,17 @@ def _asking_for_another_view(frame: Frame) -> list[str]:
 
 def configure_faults(scene: Scene, source: str = "scene") -> dict[str, Fault]:
     """Return the scene's faults in dataset order. Raises InputError if faults or layers do not fit the scene."""
+    try:
+        load_plugins(scene.plugins)  # a worker has not read the scene file
+    except InputError as error:
+        raise InputError(f"{source}: {error}") from None
     for name in scene.faults:
         from_dict(name, scene.faults[name], source=source)  # refuse unknown classes first: they have no order
     faults = {n: from_dict(n, scene.faults[n], source=source) for n in dataset_order(scene.faults)}
+    try:
+        plugins_of(faults, scene.plugins)
+    except InputError as error:
+        raise InputError(f"{source}: {error}") from None
     if scene.camera.lens and "vignetting" in faults and faults["vignetting"].model == "cos4":
         raise InputError(
             f"{source}: faults.vignetting.model = 'cos4': with camera.lens = {scene.camera.lens!r} pictures fall "

@@ -8,9 +8,9 @@ every fault model has its own keys.
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 from pydantic import Field, model_validator
 
@@ -34,6 +34,12 @@ class Scene(Table):
 
     title: str
     description: str = ""
+    plugins: tuple[Annotated[str, Field(min_length=1)], ...] = Field(
+        (),
+        max_length=64,
+        description="plug-ins that define further faults: names of modules, and paths of files that end with .py, "
+        "from the scene file's folder",
+    )
     dataset: DatasetTable = DatasetTable()
     body: BodyTable = BodyTable()
     patch: PatchTable = PatchTable()
@@ -99,20 +105,13 @@ def load_scene(name_or_path: str | Path, overrides: Mapping[str, Any] | None = N
     for key, value in (overrides or {}).items():
         *parents, leaf = key.split(".")
         node = table
-        if isinstance(value, str) and (
-            key.endswith(".texture_file")
-            or (key.endswith((".lens", ".detector")) and Path(value).suffix)
-            or (key == "body.shape" and value not in _SHAPES)
-            or (key == "spacecraft.model" and value not in _VEHICLES)
-        ):
-            value = resources.absolute(value, key)  # a path on the command line starts from the working folder
         for parent in parents:
             node = node.setdefault(parent, {})
             if not isinstance(node, dict):
                 raise InputError(f"{path}: {key} = {shown(value)}: {parent} is a value, not a table")
         node[leaf] = value
     try:
-        _anchor_paths(table, path.parent)
+        _anchor_paths(table, path.parent, overrides or ())
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
     return parse_scene(table, source=str(path), overrides=tuple(overrides or ()))
@@ -126,13 +125,18 @@ def parse_scene(table: Mapping[str, Any], *, source: str, overrides: Sequence[st
     return tables.parse(Scene, table, source=source, overrides=overrides)
 
 
-def _anchor_paths(table: dict[str, Any], folder: Path) -> None:
-    """Make relative paths absolute, from the scene file's folder, else from the working folder."""
+def _anchor_paths(table: dict[str, Any], folder: Path, overrides: Collection[str]) -> None:
+    """Make relative paths absolute, from the scene file's folder, else from the working folder.
+
+    The paths under the dotted keys `overrides` start from the working folder. Loads the scene's plug-ins, whose
+    faults may have keys that hold paths.
+    """
 
     def anchored(path: str, where: str) -> str:
         resources.check_path(path, where)
         beside = folder / path
-        return resources.absolute(path if resources.file_status(beside) is None else beside, where)
+        from_here = where in overrides or resources.file_status(beside) is None
+        return resources.absolute(path if from_here else beside, where)
 
     def anchor(node: Any, where: str, built_in: tuple[str, ...] = ()) -> None:
         key = where.rsplit(".", 1)[-1]
@@ -153,10 +157,17 @@ def _anchor_paths(table: dict[str, Any], folder: Path) -> None:
         kernels["kernels"] = [
             anchored(k, "spice.kernels") if isinstance(k, str) and k else k for k in kernels["kernels"]
         ]
-    faults = table.get("faults")
+    plugins, faults = table.get("plugins"), table.get("faults")
+    if not plugins and not faults:
+        return
+    from ..faults import load_plugins, path_fields  # here, because a scene without faults needs no optics
+
+    if isinstance(plugins, list) and all(isinstance(name, str) for name in plugins):
+        plugins[:] = [anchored(name, "plugins") if name.endswith(".py") else name for name in plugins]
+        load_plugins(plugins)
     for name, fault in faults.items() if isinstance(faults, dict) else ():
-        anchor(fault, f"faults.{name}.texture_file")
-        anchor_file(fault, f"faults.{name}.lens")
+        for key, packaged in path_fields(name).items():
+            (anchor_file if packaged else anchor)(fault, f"faults.{name}.{key}")
 
 
 def json_schema(faults: Mapping[str, Any]) -> dict[str, Any]:

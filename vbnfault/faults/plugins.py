@@ -1,0 +1,329 @@
+"""Load fault models from outside the package.
+
+A plug-in is a Python module that defines models of `Fault`. It is found in one of two ways:
+
+- An installed distribution names it in the entry-point group `vbnfault.faults`. It is then known to every scene.
+- The scene file names it: `plugins = ["my_module", "folder/my_fault.py"]`, as a module that can be imported or as
+  a file beside the scene file.
+
+Every process that works on a scene loads its plug-ins by itself. The digest of a plug-in's source belongs to the
+identity of a store: of a file, its contents; of a module, all source files and extensions of its top-level package.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import importlib.machinery
+import importlib.metadata
+import os
+import re
+import sys
+import traceback
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from types import ModuleType
+from typing import TYPE_CHECKING
+
+from ..core import resources
+from ..core.errors import InputError, VbnfaultError, shown
+from ..core.interrupts import check
+from . import models
+
+if TYPE_CHECKING:
+    from .contract import Fault
+
+ENTRY_POINTS = "vbnfault.faults"
+_FILE_MODULE = "vbnfault_plugin_"
+_MODULE = re.compile(r"[^\W\d]\w*(\.[^\W\d]\w*)*")
+_SUFFIXES = (*importlib.machinery.SOURCE_SUFFIXES, *importlib.machinery.EXTENSION_SUFFIXES)
+
+
+@dataclass(frozen=True)
+class Plugin:
+    """A plug-in that this process has loaded.
+
+    Attributes
+    ----------
+    name
+        The name of its file, or of its module, as stores and messages name it.
+    module
+        The name of its module in this process.
+    sha256
+        The digest of its source when it was loaded.
+    models
+        The models that it defines.
+    """
+
+    name: str
+    module: str
+    sha256: str
+    models: tuple[type[Fault], ...]
+
+    @property
+    def is_file(self) -> bool:
+        """Return whether the plug-in is a file that a scene names."""
+        return self.module.startswith(_FILE_MODULE)
+
+    def defines(self, cls: type[Fault]) -> bool:
+        """Return whether a model belongs to this plug-in."""
+        return _defines(self.module, cls)
+
+    @property
+    def model_names(self) -> list[str]:
+        """Return the names of its models as "class/model", sorted."""
+        return sorted(f"{cls.fault}/{cls.model}" for cls in self.models)
+
+
+# Every plug-in that this process has loaded, by its absolute path or its module name.
+_loaded: dict[str, Plugin] = {}
+
+
+def load_plugins(names: Sequence[str]) -> None:
+    """Load the plug-ins that a scene names, each once. A file that has changed is loaded again.
+
+    Parameters
+    ----------
+    names
+        Names of modules, and paths that end with ".py".
+
+    Raises
+    ------
+    InputError
+        If a plug-in is missing or broken, or clashes with another fault. Nothing of it stays loaded.
+    """
+    models.registry()  # first the faults that every scene has
+    paths = {name for name in names if _is_path(name)}
+    with _undoing(), models.undoing_registrations():
+        models.allow_replacement(p.module for key, p in _loaded.items() if p.is_file and key not in paths)
+        for name in names:
+            with _errors_named(f"plugins = {shown(name)}"):
+                _loaded[name] = _load_file(name) if name in paths else _load_module(name)
+        _check_together({f"plugins = {shown(name)}": _loaded[name] for name in names})
+
+
+def plugins_of(faults: Mapping[str, Fault], named: Sequence[str]) -> tuple[Plugin, ...]:
+    """Return the plug-ins that a scene depends on: those that it names, and those that define one of its faults.
+
+    Their sources are read again and compared with what this process has loaded.
+
+    Parameters
+    ----------
+    faults
+        The faults of the scene.
+    named
+        The scene's key `plugins`.
+
+    Raises
+    ------
+    InputError
+        If a fault comes from a plug-in file that the scene does not name, or if a module has changed since it was
+        loaded.
+    """
+    wanted = {name: _loaded[name] for name in named}
+    for name, fault in faults.items():
+        for key, plugin in _loaded.items():
+            if plugin.defines(type(fault)) and key not in wanted:
+                if key not in _installed():
+                    raise InputError(
+                        f"faults.{name}.model = {fault.model!r}: comes from the plug-in {plugin.name}, which the "
+                        "scene does not name; add it to plugins"
+                    )
+                wanted[key] = plugin
+    for key, plugin in wanted.items():
+        if not plugin.is_file and _digest_of_module(plugin.module) != plugin.sha256:
+            raise InputError(
+                f"the plug-in {plugin.name} has changed since this process loaded it; start Python again, or the "
+                "workers of the cluster"
+            )
+        if plugin.is_file:
+            resources.read_input(key, "plug-in")  # notices a change during a build
+    return tuple(sorted(wanted.values(), key=lambda plugin: plugin.name))
+
+
+def loaded_plugin(name: str) -> Plugin | None:
+    """Return the plug-in of this name that this process has loaded, or None."""
+    models.registry()
+    return next((plugin for plugin in _loaded.values() if plugin.name == name), None)
+
+
+def forget_all() -> None:
+    """Forget every plug-in of this process, for tests."""
+    for plugin in _loaded.values():
+        models.forget(plugin.module)
+    _loaded.clear()
+
+
+def belongs_here(fault: Fault) -> bool:
+    """Return whether another process can load a model: it belongs to vbnfault or to a plug-in."""
+    cls = type(fault)
+    return models.is_packaged(cls) or any(plugin.defines(cls) for plugin in _loaded.values())
+
+
+def load_installed() -> None:
+    """Load the plug-ins of all installed distributions. Raises InputError that names the broken one."""
+    where = {module: f"installed plug-in {entry.name} ({entry.value})" for module, entry in _installed().items()}
+    with _undoing():
+        for module, entry in _installed().items():
+            with _errors_named(where[module]):
+                _loaded[module] = _load_module(module)
+                if entry.attr and not hasattr(sys.modules[module], entry.attr):
+                    raise InputError(f"its module has no {entry.attr}")
+        _check_together({where[module]: _loaded[module] for module in where})
+
+
+@lru_cache(maxsize=1)
+def _installed() -> dict[str, importlib.metadata.EntryPoint]:
+    """Return the entry points of installed plug-ins by their modules."""
+    entries = importlib.metadata.entry_points(group=ENTRY_POINTS)
+    return {entry.module: entry for entry in sorted(entries, key=lambda e: (e.module, e.name))}
+
+
+# --- files and modules --------------------------------------------------------------------------------------
+
+
+def _is_path(name: str) -> bool:
+    """Return whether an entry of `plugins` is a path and not the name of a module."""
+    return name.endswith(".py") or "/" in name or os.sep in name
+
+
+def _load_file(path: str) -> Plugin:
+    """Return the plug-in of a file, executed again if its contents have changed."""
+    data = resources.read_input(path, "plug-in", types=(".py",))
+    digest, known = resources.sha256(data), _loaded.get(path)
+    if known is not None and known.sha256 == digest:
+        return _registered(known)
+    if known is not None:
+        models.forget(known.module)
+    stem = re.sub(r"\W", "_", Path(path).stem)
+    name = f"{_FILE_MODULE}{stem}_{resources.sha256(path.encode() + data)[:16]}"
+    module = ModuleType(name)
+    module.__file__ = path
+    sys.modules[name] = module  # a dataclass looks its module up
+    try:
+        exec(compile(data, path, "exec", dont_inherit=True), module.__dict__)
+    except BaseException:
+        del sys.modules[name]
+        raise
+    return Plugin(Path(path).name, name, digest, models.models_of(lambda cls: _defines(name, cls)))
+
+
+def _load_module(name: str) -> Plugin:
+    """Return the plug-in of a module that can be imported, without a search in the working folder."""
+    if not _MODULE.fullmatch(name):
+        raise InputError("must be the name of a module, or the path of a file that ends with .py")
+    if name in _loaded:
+        return _registered(_loaded[name])
+    before, path = set(sys.modules), sys.path.copy()
+    sys.path[:] = resources.import_path()  # as in a worker process
+    try:
+        importlib.import_module(name)
+    except ModuleNotFoundError as error:
+        if error.name is not None and f"{name}.".startswith(f"{error.name}."):
+            raise InputError(
+                "no such module; install it or put its folder into PYTHONPATH, or give the path of its file, which "
+                "ends with .py"
+            ) from None
+        raise
+    except BaseException:
+        for new in set(sys.modules) - before:
+            if new.split(".")[0] == name.split(".")[0]:
+                del sys.modules[new]
+        raise
+    finally:
+        sys.path[:] = path
+    return Plugin(name, name, _digest_of_module(name), models.models_of(lambda cls: _defines(name, cls)))
+
+
+def _registered(plugin: Plugin) -> Plugin:
+    """Return a plug-in that was loaded before, with its models registered: another scene may have replaced them."""
+    for cls in plugin.models:
+        models.register(cls)
+    return plugin
+
+
+def _defines(module: str, cls: type[Fault]) -> bool:
+    """Return whether a model is defined in a plug-in's module, or elsewhere in its top-level package."""
+    if module.startswith(_FILE_MODULE):
+        return cls.__module__ == module
+    return cls.__module__.split(".")[0] == module.split(".")[0]
+
+
+def _digest_of_module(name: str) -> str:
+    """Return the SHA-256 (hex) of the sources of a module's top-level package."""
+    top = sys.modules[name.split(".")[0]]
+    if not hasattr(top, "__path__"):
+        if top.__file__ is None:
+            raise InputError("has no source file")
+        return resources.sha256(resources.read_input(top.__file__, "plug-in"))
+    digests = []
+    for folder in top.__path__:
+        files = [path for path in Path(folder).rglob("*") if path.name.endswith(_SUFFIXES) and path.is_file()]
+        for path in sorted(files, key=lambda path: path.relative_to(folder).as_posix()):
+            if path.stat().st_size:  # an empty __init__.py is usual
+                digest = resources.sha256(resources.read_input(path, "plug-in"))
+                digests.append(f"{path.relative_to(folder).as_posix()} {digest}")
+    return resources.sha256("\n".join(digests).encode())
+
+
+# --- errors -------------------------------------------------------------------------------------------------
+
+
+@contextlib.contextmanager
+def _undoing() -> Iterator[None]:
+    """Forget the plug-ins that a block loads if it raises an exception."""
+    before = dict(_loaded)
+    try:
+        yield
+    except BaseException:
+        for key, plugin in _loaded.items():
+            if before.get(key) is not plugin:
+                top = plugin.module.split(".")[0]
+                for name in [name for name in sys.modules if name.split(".")[0] == top]:
+                    del sys.modules[name]
+        _loaded.clear()
+        _loaded.update(before)
+        raise
+
+
+def _check_together(plugins: Mapping[str, Plugin]) -> None:
+    """Raise InputError if the names or the orders of plug-ins contradict; the keys name them in the message."""
+    by_name: dict[str, str] = {}
+    for where, plugin in plugins.items():
+        if by_name.setdefault(plugin.name, plugin.module) != plugin.module:
+            raise InputError(f"{where}: another plug-in of the scene has the name {plugin.name}, too; rename one")
+    try:
+        models.check_declarations()
+    except models.DeclarationError as error:
+        guilty = [w for w, p in plugins.items() if any(cls.fault in error.classes for cls in p.models)]
+        raise InputError(f"{', '.join(guilty) or 'plug-ins'}: {error}") from None
+
+
+@contextlib.contextmanager
+def _errors_named(where: str) -> Iterator[None]:
+    """Turn every error of a plug-in's code into an InputError of one sentence that begins with `where`."""
+    try:
+        yield
+    except InputError as error:
+        raise InputError(f"{where}: {error}") from None
+    except (Exception, SystemExit) as error:
+        check()
+        if isinstance(error, VbnfaultError):  # such as a file that changed during a build
+            raise
+        text = (str(error).splitlines() or [""])[0]
+        if not isinstance(error, models.DeclarationError):
+            text = f"cannot be loaded: {type(error).__name__}{text and ': '}{text}"
+        raise InputError(f"{where}: {text}{_line(error)}") from None
+
+
+def _line(error: BaseException) -> str:
+    """Return the line of a plug-in's code that raised an error, as a clause; empty if it is unknown."""
+    if isinstance(error, SyntaxError):
+        return ""  # its message has the line
+    ours = os.path.dirname(os.path.dirname(__file__))
+    for frame in reversed(traceback.extract_tb(error.__traceback__)):
+        if not frame.filename.startswith((ours, "<frozen")) and "importlib" not in frame.filename:
+            return f" ({os.path.basename(frame.filename)}, line {frame.lineno})"
+    return ""
