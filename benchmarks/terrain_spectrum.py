@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from vbnfault.body import EMBEDDED, Patch, build_patch, choose_sites, load_body
+from vbnfault.body import EMBEDDED, Patch, PatchSpec, build_patch, choose_sites, load_body
 from vbnfault.body.roughness import deviogram, mean_edge_m, model_roughness
 from vbnfault.body.shape import vertex_normals
 
@@ -49,7 +49,7 @@ def main() -> None:
     model = deviogram(body.vertices_m, vertex_normals(body.vertices_m, body.faces), coarse)
     fine = np.array(
         [
-            terrain_deviogram(build_patch(body, site, seed=arguments.seed), TERRAIN_M)
+            terrain_deviogram(build_patch(body, site, PatchSpec(seed=arguments.seed)), TERRAIN_M)
             for site in choose_sites(body, arguments.sites, arguments.seed)
         ]
     )

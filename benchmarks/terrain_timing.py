@@ -16,7 +16,7 @@ import numpy as np
 import psutil
 
 from vbnfault import render
-from vbnfault.body import EMBEDDED, choose_sites, load_body
+from vbnfault.body import EMBEDDED, PatchSpec, choose_sites, load_body
 from vbnfault.body.cache import FOLDER_VARIABLE, cached_patch
 
 
@@ -41,9 +41,9 @@ def main() -> None:
         os.environ[FOLDER_VARIABLE] = folder
         for site in choose_sites(body, arguments.sites, 7):
             times = [time.perf_counter()]
-            cached_patch(body, site, seed=7)
+            cached_patch(body, site, PatchSpec(seed=7))
             times.append(time.perf_counter())
-            patch = cached_patch(body, site, seed=7)
+            patch = cached_patch(body, site, PatchSpec(seed=7))
             times.append(time.perf_counter())
             surface = render.TerrainMesh(patch.vertices_L_m, patch.faces, patch.face_is_flat, patch.dust)
             render.ground_height_m(surface, np.zeros(1), np.zeros(1), 400.0)

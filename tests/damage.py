@@ -42,6 +42,7 @@ from test_store import fake_sample, make_spec
 from vbnfault import store as st
 from vbnfault.body import Body, cache, choose_sites
 from vbnfault.body.patch import build_patch
+from vbnfault.body.spec import PatchSpec
 from vbnfault.core.errors import VbnfaultError
 from vbnfault.core.quantities import Sample
 from vbnfault.dataset import build as bd
@@ -153,8 +154,8 @@ def terrain(folder: Path) -> Callable[[], tuple[bool, bool]]:
     ball = trimesh.creation.icosphere(subdivisions=3, radius=900.0)
     body = Body(name="ball", vertices_m=np.array(ball.vertices), faces=np.array(ball.faces))
     site = choose_sites(body, 1, seed=0)[0]
-    patch = build_patch(body, site, **COARSE)
-    key = cache.patch_key(body, site, **COARSE)
+    patch = build_patch(body, site, PatchSpec(**COARSE))
+    key = cache.patch_key(body, site, PatchSpec(**COARSE))
     file = folder / f"patch-{key}.patch"
     cache._write(file, key, patch, 2**30)
 

@@ -9,7 +9,7 @@ import pytest
 import trimesh
 from scipy import stats
 
-from vbnfault.body import Body, Patch, Site, build_patch, choose_sites, load_body
+from vbnfault.body import Body, Patch, PatchSpec, Site, build_patch, choose_sites, load_body
 from vbnfault.body.boulders import PER_KM2, SizeLaw, scatter, smallest_at
 from vbnfault.body.shape import check_mesh, signed_volume
 from vbnfault.core.errors import InputError
@@ -31,12 +31,12 @@ def site(body: Body) -> Site:
 
 @pytest.fixture(scope="module")
 def patch(body: Body, site: Site) -> Patch:
-    return build_patch(body, site, seed=7, **QUICK)
+    return build_patch(body, site, PatchSpec(seed=7, **QUICK))
 
 
 @pytest.fixture(scope="module")
 def full(body: Body, site: Site) -> Patch:
-    return build_patch(body, site, seed=7)
+    return build_patch(body, site, PatchSpec(seed=7))
 
 
 def ground(patch: Patch) -> trimesh.Trimesh:
@@ -83,7 +83,7 @@ def test_ground_and_boulders_are_closed(patch: Patch, body: Body) -> None:
 
 def test_smooth_patch_stays_near_the_model(body: Body, site: Site) -> None:
     plain = {**QUICK, "min_boulder_m": 100.0}
-    smooth = build_patch(body, site, seed=7, relief=0.0, **plain)
+    smooth = build_patch(body, site, PatchSpec(seed=7, relief=0.0, **plain))
     assert not smooth.face_is_boulder.any()
     model = (body.vertices_m - site.position_T_m) @ site.T_from_L
     # The model's own points come first and do not move: float32 of kilometres keeps 0.25 mm.
@@ -111,7 +111,9 @@ def test_refining_a_coarse_ball_rounds_it() -> None:
     ball = trimesh.creation.icosphere(subdivisions=2, radius=1000.0)
     body = Body(name="ball", vertices_m=np.array(ball.vertices), faces=np.array(ball.faces))
     site = choose_sites(body, 1, seed=0)[0]
-    fine = build_patch(body, site, seed=0, facet_m=10.0, radius_m=3000.0, relief=0.0, min_boulder_m=100.0)
+    fine = build_patch(
+        body, site, PatchSpec(seed=0, facet_m=10.0, radius_m=3000.0, relief=0.0, min_boulder_m=100.0)
+    )
     centre = -site.position_T_m @ site.T_from_L
     radius = np.linalg.norm(fine.vertices_L_m - centre, axis=1)
     # Edges of 0.31 rad: the midpoint rule errs by 0.24 m, of fourth order; area-weighted normals are up to
@@ -128,18 +130,18 @@ def test_origin_and_down(patch: Patch, body: Body) -> None:
 
 
 def test_same_key_same_patch_other_seed_other_relief(body: Body, site: Site, patch: Patch) -> None:
-    again = build_patch(body, site, seed=7, **QUICK)
+    again = build_patch(body, site, PatchSpec(seed=7, **QUICK))
     np.testing.assert_array_equal(again.vertices_L_m, patch.vertices_L_m)
     np.testing.assert_array_equal(again.faces, patch.faces)
-    other = build_patch(body, site, seed=8, **QUICK)
+    other = build_patch(body, site, PatchSpec(seed=8, **QUICK))
     same = min(len(again.vertices_L_m), len(other.vertices_L_m))
     assert np.abs(again.vertices_L_m[:same] - other.vertices_L_m[:same]).max() > 0.5
 
 
 def test_relief_is_a_few_percent_of_its_wavelength(body: Body, site: Site) -> None:
     plain = {**QUICK, "min_boulder_m": 100.0}
-    smooth = build_patch(body, site, seed=7, relief=0.0, **plain)
-    rough = build_patch(body, site, seed=7, **plain)
+    smooth = build_patch(body, site, PatchSpec(seed=7, relief=0.0, **plain))
+    rough = build_patch(body, site, PatchSpec(seed=7, **plain))
     np.testing.assert_array_equal(smooth.faces, rough.faces)
     near = np.linalg.norm(smooth.vertices_L_m, axis=1) < 150.0
     moved = np.linalg.norm(rough.vertices_L_m - smooth.vertices_L_m, axis=1)
@@ -179,7 +181,7 @@ def _quantiles(diameter: np.ndarray, smallest: np.ndarray, index: float) -> np.n
 
 @pytest.mark.parametrize("index", [2.5, 3.6])
 def test_boulders_of_a_patch_follow_the_law(body: Body, site: Site, index: float) -> None:
-    stony = build_patch(body, site, seed=7, **QUICK, boulder_index=index)
+    stony = build_patch(body, site, PatchSpec(seed=7, **QUICK, boulder_index=index))
     diameter, smallest = stony.boulder_diameter_m, stony.boulder_smallest_m
     assert len(diameter) > 500
     quantiles = _quantiles(diameter, smallest, index)
@@ -201,11 +203,11 @@ def test_density_of_boulders_is_what_was_asked_for(body: Body, site: Site) -> No
     counts = {}
     for density in (0.0, 24.5, 98.0):
         sparse = build_patch(
-            body, site, seed=7, facet_m=12.0, radius_m=400.0, min_boulder_m=1.5, boulders_per_km2=density
+            body, site, PatchSpec(seed=7, facet_m=12.0, radius_m=400.0, min_boulder_m=1.5, boulders_per_km2=density)
         )
         counts[density] = len(sparse.boulder_diameter_m)
     assert counts[0.0] == 0
-    assert not build_patch(body, site, seed=7, facet_m=12.0, min_boulder_m=1e6).face_is_boulder.any()
+    assert not build_patch(body, site, PatchSpec(seed=7, facet_m=12.0, min_boulder_m=1e6)).face_is_boulder.any()
     # Four times the density, Poisson; paving takes the smallest in the densest places.
     assert 2.5 < counts[98.0] / counts[24.5] < 4.6
 
@@ -223,16 +225,16 @@ def test_bounds(body: Body, site: Site) -> None:
         ({"hurst": 2.0}, "hurst"),
     ):
         with pytest.raises(InputError, match=key):
-            build_patch(body, site, seed=0, **arguments)  # type: ignore[arg-type]
+            build_patch(body, site, PatchSpec(seed=0, **arguments))
     with pytest.raises(InputError, match="seed"):
-        build_patch(body, site, seed=-1)
+        build_patch(body, site, PatchSpec(seed=-1))
 
 
 def test_real_shape_patch_is_closed() -> None:
     if not REAL_SHAPE.exists():
         pytest.skip(f"the real shape model is not at {REAL_SHAPE}")
     real = load_body(REAL_SHAPE)
-    patch = build_patch(real, choose_sites(real, 1, seed=3)[0], seed=3, **QUICK)
+    patch = build_patch(real, choose_sites(real, 1, seed=3)[0], PatchSpec(seed=3, **QUICK))
     assert ground(patch).is_watertight
     assert signed_volume(patch.vertices_L_m, patch.faces[~patch.face_is_boulder]) == pytest.approx(
         real.volume_m3, rel=2e-3

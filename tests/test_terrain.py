@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from vbnfault.body import Body, Patch, Site, build_patch, choose_sites, load_body, relief, site_at
+from vbnfault.body import Body, Patch, PatchSpec, Site, build_patch, choose_sites, load_body, relief, site_at
 from vbnfault.body.fields import GRADIENT_STD, Points
 from vbnfault.body.patch import _roughness
 from vbnfault.body.roughness import Roughness, deviogram, mean_edge_m, model_roughness
@@ -31,7 +31,7 @@ def sites(body: Body) -> tuple[Site, ...]:
 
 @pytest.fixture(scope="module")
 def patches(body: Body, sites: tuple[Site, ...]) -> list[Patch]:
-    return [build_patch(body, site, **FINE) for site in sites]
+    return [build_patch(body, site, PatchSpec(**FINE)) for site in sites]
 
 
 def ground_of(patch: Patch) -> tuple[np.ndarray, np.ndarray]:
@@ -159,8 +159,8 @@ def test_neighbouring_sites_see_the_same_ground(body: Body, sites: tuple[Site, .
     first = sites[0]
     second = site_at(body, 1, first.position_T_m + 25.0 * first.T_from_L[:, 0])
     even = {"seed": 7, "facet_m": 4.0, "radius_m": 250.0, "min_boulder_m": 1e6}
-    a, b = (build_patch(body, site, **even) for site in (first, second))
-    flat = [build_patch(body, site, **even, relief=0.0) for site in (first, second)]
+    a, b = (build_patch(body, site, PatchSpec(**even)) for site in (first, second))
+    flat = [build_patch(body, site, PatchSpec(**even, relief=0.0)) for site in (first, second)]
 
     def in_T(patch: Patch) -> np.ndarray:
         return patch.vertices_L_m.astype(np.float64) @ patch.site.T_from_L.T + patch.site.position_T_m
@@ -189,7 +189,7 @@ def test_patch_is_the_same_for_any_number_of_threads(body: Body, sites: tuple[Si
     try:
         for count in (1, 4):
             dr.set_thread_count(count)
-            built.append(build_patch(body, sites[1], **coarse))
+            built.append(build_patch(body, sites[1], PatchSpec(**coarse)))
     finally:
         dr.set_thread_count(threads)
     for name in ("vertices_L_m", "faces", "dust", "boulder_diameter_m", "boulder_position_L_m"):

@@ -22,10 +22,12 @@ from .patch import Patch, build_patch
 from .roughness import Roughness, model_roughness
 from .shape import Float64, Int32, Unit, check_mesh, load_shape, signed_volume
 from .sites import Site, Sites, choose_sites, local_level, site_at
+from .spec import PatchSpec
 
 __all__ = [
     "Body",
     "Patch",
+    "PatchSpec",
     "PolyhedronGravity",
     "Site",
     "Sites",

@@ -13,11 +13,8 @@ from .fields import GRADIENT_STD, Points
 from .noise import noise_key
 from .refine import split
 from .shape import Float64, Int32, face_normals_areas
+from .spec import INDEX, PER_KM2, PatchSpec
 
-# Boulders of 7 m or more. Pajola et al. (2015, A&A 583, A37) counted 3546 on 36.4 km²: 97.4 ± 1.6 per km², with the
-# Poisson error of the count.
-PER_KM2 = 98.0
-INDEX = 3.6
 REFERENCE_M = 7.0
 LARGEST_M = 45.0
 # Up to this distance the smallest drawn diameter is constant. Beyond, it grows with the distance, so that its
@@ -72,58 +69,50 @@ def smallest_at(distance_m: Float64, min_boulder_m: float) -> Float64:
     return min_boulder_m * np.maximum(np.asarray(distance_m) / NEAR_M, 1.0)
 
 
-def add_boulders(
-    points: Float64,
-    faces: Int32,
-    facet_m: Float64,
-    dust: NDArray[np.float32],
-    talus: NDArray[np.float32],
-    place_T_m: Float64,
-    *,
-    rng: np.random.Generator,
-    seed: int,
-    min_boulder_m: float,
-    per_km2: float,
-    index: float,
-    budget: int,
-) -> Boulders:
+@dataclass(frozen=True, kw_only=True, eq=False)
+class GroundMesh:
+    """Hold the ground on which boulders lie.
+
+    Attributes
+    ----------
+    points, faces
+        float64[n, 3] in L, metres, and int32[m, 3].
+    facet_m
+        float64[n]: edge length at each point.
+    dust, talus
+        float32[n] in [0, 1] at each point.
+    place_T_m
+        float64[n, 3]: body-fixed position of each point, before the relief was added.
+    """
+
+    points: Float64
+    faces: Int32
+    facet_m: Float64
+    dust: NDArray[np.float32]
+    talus: NDArray[np.float32]
+    place_T_m: Float64
+
+
+def add_boulders(ground: GroundMesh, spec: PatchSpec, *, rng: np.random.Generator, budget: int) -> Boulders:
     """Scatter boulders over the ground with at most `budget` triangles.
 
     If the boulders exceed the budget, their meshes first become coarser. If they still exceed it, the boulders that
     are smallest in proportion to the smallest drawn diameter (nearly: smallest in angle) are left out.
 
-    Parameters
-    ----------
-    points, faces
-        float64[n, 3] in L, metres, and int32[m, 3]: the ground.
-    facet_m, dust, talus, place_T_m
-        Edge length, dust and talus in [0, 1], and body-fixed position at each of the points.
-    rng, seed
-        `rng` draws the boulders; `seed` selects the noise fields by which they cluster.
-    min_boulder_m, per_km2, index
-        The size law, as in `patch.build_patch`.
+    `rng` draws the boulders; `spec.seed` selects the noise fields by which they cluster.
     """
+    points, faces = ground.points, ground.faces
     normals, _ = face_normals_areas(points, faces)
     centre = points[faces].mean(axis=1)
     distance = np.sqrt(np.einsum("ni,ni->n", centre, centre))
-    smallest = smallest_at(distance, min_boulder_m)
-    wanted = smallest < LARGEST_M
+    smallest = smallest_at(distance, spec.min_boulder_m)
+    bearing = smallest < LARGEST_M
     favour = np.zeros(len(faces))
-    favour[wanted] = _favour(
-        normals[wanted], dust[faces[wanted]], talus[faces[wanted]], seed, place_T_m, faces[wanted]
-    )
-    law = SizeLaw(per_m2=1e-6 * per_km2, index=index)
-    diameter, face, at, least = scatter(points, faces, favour, smallest, law, rng)
+    favour[bearing] = _favour(ground, normals[bearing], faces[bearing], spec.seed)
+    law = SizeLaw(per_m2=1e-6 * spec.boulders_per_km2, index=spec.boulder_index)
+    diameter, face, position, least = scatter(points, faces, favour, smallest, law, rng)
 
-    detail = facet_m[faces[face, 0]]
-    edge = _EDGE_FACETS * detail * np.maximum(diameter / 0.5, 1.0) ** _EDGE_POWER
-    edge *= np.clip(distance[face] / _CLOSE_M, _CLOSEST, 1.0)
-    # Coarser rocks are better than fewer rocks. `finest` limits a single rock to 6 % of the budget.
-    finest = min(_LEVELS, max(1, int(np.log2(max(0.06 * budget / 20, 1.0)) / 2)))
-    for coarser in _COARSER:
-        level = np.clip(np.ceil(np.log2(0.53 * diameter / (coarser * edge))), 0, finest).astype(np.int64)
-        if np.sum(20 * 4**level) <= budget:
-            break
+    level = _levels(diameter, ground.facet_m[faces[face, 0]], distance[face], budget)
     # The cut is at the same multiple of the smallest diameter everywhere, so the size law holds above it.
     order = np.argsort(-diameter / least, kind="stable")
     fits = np.cumsum(20 * 4 ** level[order]) <= budget
@@ -139,7 +128,7 @@ def add_boulders(
         group = kept[level[kept] == k]
         if len(group):
             rocks, sphere_faces, centres = _rocks(
-                k, diameter[group], at[group], normals[face[group]], points, tree, rng
+                k, diameter[group], position[group], normals[face[group]], points, tree, rng
             )
             offsets = start + np.arange(len(group))[:, None, None] * rocks.shape[1]
             vertices.append(rocks.reshape(-1, 3))
@@ -157,19 +146,33 @@ def add_boulders(
     )
 
 
-def _favour(
-    normals: Float64, dust: NDArray, talus: NDArray, seed: int, place_T_m: Float64, faces: Int32
-) -> Float64:
-    """Return the relative density of boulders on each face, float64[m]."""
-    place = Points(place_T_m[faces].mean(axis=1))
+def _levels(diameter_m: Float64, facet_m: Float64, distance_m: Float64, budget: int) -> NDArray[np.int64]:
+    """Return the level of detail of each boulder, int64[k], coarser ones if the budget asks for it.
+
+    Coarser rocks are better than fewer rocks. A single rock takes at most 6 % of the budget.
+    """
+    edge = _EDGE_FACETS * facet_m * np.maximum(diameter_m / 0.5, 1.0) ** _EDGE_POWER
+    edge *= np.clip(distance_m / _CLOSE_M, _CLOSEST, 1.0)
+    finest = min(_LEVELS, max(1, int(np.log2(max(0.06 * budget / 20, 1.0)) / 2)))
+    for coarser in _COARSER:
+        level = np.clip(np.ceil(np.log2(0.53 * diameter_m / (coarser * edge))), 0, finest).astype(np.int64)
+        if np.sum(20 * 4**level) <= budget:
+            break
+    return level
+
+
+def _favour(ground: GroundMesh, normals: Float64, faces: Int32, seed: int) -> Float64:
+    """Return the relative density of boulders on some faces, float64[m], from their normals and vertices."""
+    dust, talus = ground.dust[faces], ground.talus[faces]
+    place = Points(ground.place_T_m[faces].mean(axis=1))
     count = len(faces)
     broad = place.gradient(110.0, noise_key(seed, 9001), count) / GRADIENT_STD
     close = place.gradient(23.0, noise_key(seed, 9002), count) / GRADIENT_STD
     cluster = np.exp(1.0 * broad.astype(np.float64) + 0.6 * close)
-    ground = 0.15 + 0.6 * (1 - dust.mean(axis=1)) + 7.0 * talus.mean(axis=1)
+    cover = 0.15 + 0.6 * (1 - dust.mean(axis=1)) + 7.0 * talus.mean(axis=1)
     # Boulders do not stay on steep ground.
     lie = np.clip((-normals[:, 2] - 0.70) / (0.84 - 0.70), 0, 1)
-    return np.asarray(cluster * ground * lie, dtype=np.float64)
+    return np.asarray(cluster * cover * lie, dtype=np.float64)
 
 
 # --- numbers and sizes ------------------------------------------------------------------------------------------

@@ -9,9 +9,9 @@ be written, the user is told once, and only time is lost.
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import hashlib
 import importlib.metadata
-import inspect
 import json
 import os
 import platform
@@ -24,7 +24,7 @@ import time
 from collections.abc import Iterator
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -32,6 +32,7 @@ from ..core import activity
 from ..core.errors import InputError
 from .patch import Patch, build_patch
 from .sites import Site
+from .spec import PatchSpec
 
 if TYPE_CHECKING:
     from . import Body
@@ -79,7 +80,7 @@ def cache_limit_bytes() -> int:
     return int(gib * 2**30)
 
 
-def cached_patch(body: Body, site: Site, **parameters: Any) -> Patch:
+def cached_patch(body: Body, site: Site, spec: PatchSpec) -> Patch:
     """Return what `build_patch` returns for the same arguments, from disk if it was built before.
 
     The patch is the same bit for bit in both cases. Raises what `build_patch` raises, and InputError if
@@ -87,12 +88,12 @@ def cached_patch(body: Body, site: Site, **parameters: Any) -> Patch:
     """
     limit = cache_limit_bytes()
     if limit == 0:
-        return _new_patch(body, site, parameters)
-    key = patch_key(body, site, **parameters)
+        return _new_patch(body, site, spec)
+    key = patch_key(body, site, spec)
     try:
         path = cache_folder() / f"patch-{key}{_SUFFIX}"
     except (RuntimeError, OSError):  # no home folder
-        return _new_patch(body, site, parameters)
+        return _new_patch(body, site, spec)
     try:
         patch = _read(path, key, site)
     except (FileNotFoundError, NotADirectoryError):
@@ -102,31 +103,24 @@ def cached_patch(body: Body, site: Site, **parameters: Any) -> Patch:
         print(f"note: {path}: the terrain kept there is damaged ({why}); it is built again", file=sys.stderr)
         patch = None
     if patch is None:
-        patch = _new_patch(body, site, parameters)
+        patch = _new_patch(body, site, spec)
         _write(path, key, patch, limit)
     return patch
 
 
-def _new_patch(body: Body, site: Site, parameters: dict[str, Any]) -> Patch:
+def _new_patch(body: Body, site: Site, spec: PatchSpec) -> Patch:
     """Build a patch and report the activity."""
     activity.begin(f"terrain of site {site.index} (new patch)")
-    return build_patch(body, site, **parameters)
+    return build_patch(body, site, spec)
 
 
-def patch_key(body: Body, site: Site, **parameters: Any) -> str:
-    """Return the sha256 (hex) of all that determines a patch; omitted parameters count with their defaults."""
-    bound = inspect.signature(build_patch).bind(body, site, **parameters)
-    bound.apply_defaults()
+def patch_key(body: Body, site: Site, spec: PatchSpec) -> str:
+    """Return the sha256 (hex) of all that determines a patch."""
     content = {
         "code": _code_hash(),
         "body": [body.content_hash, body.density_kg_m3, body.rotation_period_s],
         "site": [site.index, site.position_T_m.tolist(), site.T_from_L.tolist()],
-        # Equal numbers give equal keys: 1 and 1.0 build the same patch.
-        "parameters": {
-            key: value if value is None else int(value) if key == "seed" else float(value)
-            for key, value in bound.arguments.items()
-            if key not in ("body", "site")
-        },
+        "spec": dataclasses.asdict(spec),
     }
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 

@@ -25,6 +25,7 @@ from .noise import Float32, noise_key
 from .roughness import Roughness, deviogram
 from .shape import Float64, Int32, vertex_normals
 from .sites import Site
+from .spec import PatchSpec
 
 if TYPE_CHECKING:
     from . import Body
@@ -85,12 +86,10 @@ def add_relief(
     site: Site,
     mesh: tuple[Float64, Float64, Int32],
     facet_m: Float64,
+    spec: PatchSpec,
     *,
-    seed: int,
-    scale: float,
     roughness: Roughness,
     longest_m: float,
-    craters_per_km2: float,
 ) -> Ground:
     """Return the relief on a refined mesh.
 
@@ -101,17 +100,16 @@ def add_relief(
         int32[m, 3].
     facet_m
         float64[n]: the facets' size at each vertex. Wavelengths shorter than about two facets are left out.
-    scale
-        Factor on the heights.
+    spec
+        Seed, factor on the heights and number of craters.
     roughness
         Law that the fractal octaves follow.
     longest_m
         Wavelength of the longest octave; longer relief belongs to the model.
-    craters_per_km2
-        Number of craters with a diameter of at least 10 m.
     """
     points, normals, faces = mesh
     up, elevation = _vertical(body, site, points)
+    scale = spec.relief
     if scale == 0:
         slope = _slope_deg(points, normals, faces, up)
         return Ground(
@@ -123,14 +121,14 @@ def add_relief(
     order = np.argsort(facet_m, kind="stable")
     rank = np.empty_like(order)
     rank[order] = np.arange(len(order))
-    noise = _Octaves(points[order] + site.position_T_m, facet_m[order], seed, roughness, longest_m)
+    noise = _Octaves(points[order] + site.position_T_m, facet_m[order], spec.seed, roughness, longest_m)
 
     # Roughness differs between regions. Far away, facets show few octaves, and evenly rough ground would look like
     # orange peel.
     region = 0.45 + 0.95 * _smooth_step(-1.0, 1.2, noise.gradient(_REGION_EDGES * longest_m, 210))
     swell = region * noise.fractal(longest_m, _SHARED_M, 0)
     on_cliffs = _smooth_step(26.0, 42.0, _slope_deg(points, normals, faces, up))[order]
-    broad = _terraced(noise, swell) + (1 - on_cliffs) * noise.craters(craters_per_km2)
+    broad = _terraced(noise, swell) + (1 - on_cliffs) * noise.craters(spec.craters_per_km2)
     shown = noise.shown(longest_m)
     raised = points + (scale * (broad * shown)[rank].astype(np.float64))[:, None] * normals
     slope = _slope_deg(raised, normals, faces, up)

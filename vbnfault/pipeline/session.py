@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..body import Body, Patch, Site, Sites, cached_patch, choose_sites
+from ..body import Body, Patch, PatchSpec, Site, Sites, cached_patch, choose_sites
 from ..body.refine import GROWTH_POWER
 from ..camera import Camera
 from ..core import activity
@@ -270,9 +270,7 @@ class Session:
     def patch(self, site: Site) -> Patch:
         """Return the ground of a site, from the cache if it was built before."""
         table = self.scene.patch
-        return cached_patch(
-            self.body,
-            site,
+        spec = PatchSpec(
             seed=self.scene.dataset.seed,
             facet_m=table.facet_m,
             radius_m=table.radius_m,
@@ -284,6 +282,7 @@ class Session:
             boulders_per_km2=table.boulders_per_km2,
             max_triangles=max(table.max_triangles, 2 * len(self.body.faces)),
         )
+        return cached_patch(self.body, site, spec)
 
     def spec(self, index: int) -> SampleSpec:
         """Return everything that `simulate` needs for one sample.
