@@ -149,7 +149,7 @@ def run_page(
     `command` runs one command of the program, `said` returns its last output for a message.
     """
     names: dict[str, Any] = {"__name__": "__main__"}
-    with contextlib.chdir(folder), _importable(folder):
+    with contextlib.chdir(folder), contextlib.ExitStack() as python:
         for block in page:
             check(block)
             if block.not_run or (block.needs and importlib.util.find_spec(block.needs) is None):
@@ -160,14 +160,17 @@ def run_page(
             elif block.language == "toml":
                 _accept(block)
             elif block.language == "python":
+                python.enter_context(_own_modules(folder))
                 exec(compile(block.text, block.where, "exec"), names)
             elif block.language == "sh":
+                python.close()  # a command is a process of its own: it knows no module of the page
                 for words in commands(block.text):
                     if " ".join(words).startswith(DEVELOPERS):
                         continue
                     if words[0] != "vbnfault":
                         raise ValueError(f"{block.where}: {words[0]}: only commands of vbnfault run")
-                    code = command(words)
+                    with _own_modules(folder):
+                        code = command(words)
                     if code:
                         raise RuntimeError(f"{block.where}: {shlex.join(words)}: exit code {code}: {said()}")
 
@@ -181,14 +184,27 @@ def _accept(block: Block) -> None:
 
 
 @contextlib.contextmanager
-def _importable(folder: Path) -> Iterator[None]:
-    """Let Python import the modules that a page writes, as in the working folder; forget them afterwards."""
+def _own_modules(folder: Path) -> Iterator[None]:
+    """Let Python import the modules that a page writes; forget them, and the classes that they registered."""
+    from vbnfault.core import tables
+    from vbnfault.detector.effects import contract as effects
+    from vbnfault.faults import models, plugins
+    from vbnfault.reflectance import contract as reflectances
+
+    registries = (effects._REGISTRY, reflectances._REGISTRY)
+    known = [dict(registry.classes()) for registry in registries]
+    models.registry()
     before = set(sys.modules)
     sys.path.insert(0, str(folder))
     try:
-        yield
+        with models.undoing_registrations(always=True):
+            yield
     finally:
         sys.path.remove(str(folder))
+        plugins.forget_all()
+        for registry, classes in zip(registries, known, strict=True):
+            registry._classes = classes
+        tables.forget_schemas()
         for name in set(sys.modules) - before:
             origin = getattr(sys.modules[name], "__file__", None) or ""
             if origin.startswith(str(folder)):

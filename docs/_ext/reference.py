@@ -144,26 +144,27 @@ def commands() -> str:
         parts.append(
             f"## vbnfault {' '.join(words)}\n\n{inspect.cleandoc(command.help or '')}\n\n```text\n{usage}\n```\n"
         )
-        rows = [(f"`{p.name.upper()}`", "", "", _sentence(p.help or "")) for p in arguments]
+        rows = [(f"`{p.name.upper()}`", _sentence(p.help or ""), "", "") for p in arguments]
         for p in options:
-            shown = " / ".join(f"`{name}`" for name in (*p.opts, *p.secondary_opts))
-            default = (
-                ""
-                if p.required or p.default is None or p.default is False or callable(p.default)
-                else _code(_plain(p.default))
-            )
-            if getattr(p, "is_flag", False) and p.default is True:
-                default = f"`{p.opts[0]}`"
-            help_text = re.sub(r"\s*\[default: ([^\]]+)\]", r"; default: \1", p.help or "")
-            rows.append((shown, "required" if p.required else default, _limits(p), _sentence(help_text)))
+            shown = p.opts if p.default is False else (*p.opts, *p.secondary_opts)
+            names_shown = " / ".join(f"`{name}`" for name in shown)
+            rows.append((names_shown, _sentence(p.help or ""), _option_default(p), _limits(p)))
         if rows:
-            parts.append(_table(("argument or option", "default", "range", "meaning"), rows))
+            parts.append(_table(("argument or option", "meaning", "default", "range"), rows))
     return "\n".join(parts)
 
 
-def _plain(value: Any) -> Any:
-    """Return a default as plain data."""
-    return value if isinstance(value, int | float | str | bool | list) else str(value)
+def _option_default(option: Any) -> str:
+    """Return what an option is if it is not given; "" for a flag that is off."""
+    if option.required:
+        return "required"
+    if isinstance(getattr(option, "show_default", None), str):
+        return str(option.show_default)
+    if option.default is None or option.default is False or callable(option.default):
+        return ""
+    if option.default is True:
+        return f"`{option.opts[0]}`"
+    return _code(option.default if isinstance(option.default, int | float | str | list) else str(option.default))
 
 
 # --- tables of TOML files, from their JSON Schema -----------------------------------------------------------------
@@ -308,7 +309,7 @@ def toml_reference(described: list[TomlTable], root: str) -> str:
         ]
         meaning = _sentence(table.meaning) if table.header else ""
         parts.append(
-            f"## {title}\n\n{meaning}\n\n" + _table(("key", "default", "unit", "allowed", "meaning"), rows)
+            f"## {title}\n\n{meaning}\n\n" + _table(("key", "meaning", "default", "unit", "allowed"), rows)
         )
     return "\n".join(parts)
 
@@ -359,7 +360,7 @@ def faults() -> str:
             title = f"### {fault_class} / {model}{' (default)' if cls.default and len(models) > 1 else ''}"
             parts.append(f"{title}\n\n{_first_paragraph(cls)}\n\n{' '.join(facts)}\n")
             rows = _fault_keys(keys[fault_class][model])
-            parts.append(_table(("key", "default", "unit", "allowed", "meaning"), rows) if rows else "")
+            parts.append(_table(("key", "meaning", "default", "unit", "allowed"), rows) if rows else "")
     return "\n".join(parts)
 
 
@@ -379,7 +380,7 @@ def _fault_keys(schema: Mapping[str, Any]) -> list[tuple[str, ...]]:
         if len(options) == 2 and options[1].get("type") == "array" and options[0].get("type") != "string":
             allowed = f"one value or [lower, upper], {_allowed(options[0], schema)}"
         meaning, _, unit = node.get("description", "").partition(" [")
-        rows.append((f"`{key}`", _code(node.get("default")), unit.rstrip("]"), allowed, _sentence(meaning)))
+        rows.append((f"`{key}`", _sentence(meaning), _code(node.get("default")), unit.rstrip("]"), allowed))
     return rows
 
 
@@ -388,10 +389,9 @@ def _fault_overview(classes: Mapping[str, Mapping[str, Any]]) -> str:
     rows = []
     for fault_class, models in classes.items():
         for model, cls in models.items():
-            name = f"`{fault_class}`" if model == next(iter(models)) else ""
             needs = "CCD" if cls.needs_ccd else "mosaic" if cls.needs_mosaic else ""
-            rows.append((name, f"`{model}`", f"`{cls.step}`", needs, _first_paragraph(cls)))
-    return _table(("class", "model", "acts on", "needs", "what it does"), rows)
+            rows.append((f"`{fault_class}` / `{model}`", _first_paragraph(cls), f"`{cls.step}`", needs))
+    return _table(("class / model", "what it does", "acts on", "needs"), rows)
 
 
 # --- the store ----------------------------------------------------------------------------------------------------
@@ -434,8 +434,8 @@ def store() -> str:
                 kind = "Bits" if row.bits else "Values"
                 meaning += f" {kind}: " + ", ".join(f"{k} {flag}" for k, flag in enumerate(row.names)) + "."
             unit = "" if row.units == "1" else row.units
-            lines.append((f"`{name}`", ", ".join(row.dims), row.dtype, unit, meaning))
-        return _table(("array", "dimensions", "type", "unit", "meaning"), lines)
+            lines.append((f"`{name}`", meaning, ", ".join(row.dims), row.dtype, unit))
+        return _table(("array", "meaning", "dimensions", "type", "unit"), lines)
 
     return "\n".join(
         [
