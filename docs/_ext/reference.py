@@ -78,7 +78,7 @@ def _sentence(text: str) -> str:
     if not text:
         return ""
     first = re.match(r"(?:a |an )?[a-z][a-z'-]+(?= |,|;|:|$)", text)
-    if first and "_" not in first[0]:
+    if first and first[0] != "none":
         text = text[0].upper() + text[1:]
     return text + ("" if text[-1] in ".!?:" else ".")
 
@@ -242,14 +242,19 @@ def _inner_table(path: str, node: Mapping[str, Any], schema: Mapping[str, Any]) 
     if "properties" in node:
         model = node["properties"].get("model", {}).get("const")
         return [(f"[{path}] model = {json.dumps(model)}" if model else f"[{path}]", path, node)]
+    out = []
     for nested, header, inner in (
         ("items", f"[[{path}]]", path),
         ("additionalProperties", f"[{path}.NAME]", f"{path}.NAME"),
     ):
         child = node.get(nested)
-        if isinstance(child, Mapping) and "properties" in _resolve(child, schema):
-            return [(header, inner, _resolve(child, schema))]
-    return []
+        tables_there = (
+            [o for o in _options(child, schema) if "properties" in o] if isinstance(child, Mapping) else []
+        )
+        for k, table in enumerate(tables_there):
+            kind = f" {table.get('title', k + 1)}" if len(tables_there) > 1 else ""
+            out.append((f"{header}{kind}", inner, table))
+    return out
 
 
 def _allowed(node: Mapping[str, Any], schema: Mapping[str, Any]) -> str:
@@ -304,7 +309,7 @@ def toml_reference(described: list[TomlTable], root: str) -> str:
             continue
         title = f"`{table.header}`" if table.header else root
         rows = [
-            (f"`{key.name}`", key.default, unit_of(key.name), key.allowed, _sentence(key.meaning))
+            (f"`{key.name}`", _sentence(key.meaning), key.default, unit_of(key.name), key.allowed)
             for key in table.keys
         ]
         meaning = _sentence(table.meaning) if table.header else ""
@@ -325,6 +330,14 @@ def scene_tables() -> list[TomlTable]:
 def scene() -> str:
     """Return the keys of the scene file."""
     return toml_reference(scene_tables(), "Top level")
+
+
+def lens() -> str:
+    """Return the keys of a lens file."""
+    from vbnfault.core.tables import json_schema
+    from vbnfault.lens.prescription_file import PrescriptionFile
+
+    return toml_reference(tables(json_schema(PrescriptionFile)), "Top level")
 
 
 def sensor() -> str:
@@ -501,6 +514,7 @@ PAGES: dict[str, Callable[[], str]] = {
     "catalogue": catalogue,
     "commands": commands,
     "faults": faults,
+    "lens": lens,
     "scene": scene,
     "sensor": sensor,
     "store": store,
