@@ -59,13 +59,15 @@ def _list_faults() -> None:
 
 
 @app.command(rich_help_panel=_PANEL)
-def schema(plugins: PluginOption = None) -> None:
-    """Print the JSON Schema of the scene file."""
-    from .. import faults
-    from ..scene import config
+def schema(
+    kind: Annotated[str, typer.Argument(help="kind of file: scene, lens or sensor")] = "scene",
+    plugins: PluginOption = None,
+) -> None:
+    """Print the JSON Schema of a kind of TOML file, for editors that check and complete it."""
+    from ..output.schemas import file_schema
 
     load_plugins(plugins)
-    typer.echo(json.dumps(config.json_schema(faults.json_schema()), indent=2))
+    typer.echo(json.dumps(file_schema(kind), indent=2))
 
 
 @app.command(rich_help_panel=_PANEL)
