@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -363,3 +364,82 @@ def test_the_command_line_loads_plug_ins(tmp_path: Path) -> None:
     refused = run(tmp_path, "describe", str(scene_file(tmp_path, "my_glint.py")))
     assert refused.returncode == 2
     assert refused.stderr.count("\n") == 1
+
+
+# --- other kinds of classes ---------------------------------------------------------------------------------
+
+GROUND = '''
+from typing import Literal
+
+import numpy as np
+from pydantic import Field
+
+from vbnfault.detector.effects import Effect
+from vbnfault.reflectance import DiscReflectance
+
+
+class Glazed(DiscReflectance):
+    """Reflect as a power of the cosine of incidence."""
+
+    model: Literal["glazed"] = "glazed"
+    power: int = Field(2, ge=1, le=4, description="power of the cosine")
+
+    def disc(self, m, cos_i, cos_e, phase_deg):
+        return cos_i * cos_i
+
+
+class Pedestal(Effect):
+    """Add electrons to every pixel."""
+
+    name = "pedestal"
+    after = "dark_current"
+
+    level_e: float = Field(ge=0, le=1e5, description="added electrons")
+
+    def apply(self, signal, exposure):
+        return signal + np.float32(self.level_e)
+'''
+SENSOR = """
+architecture = "cmos"
+pixel_pitch_um = 5.5
+[readout]
+bits = 12
+full_well_e = 13500.0
+[effects.pedestal]
+level_e = 2000.0
+[sources]
+pixel_pitch_um = "assumed"
+"readout.bits" = "assumed"
+"readout.full_well_e" = "assumed"
+"effects.pedestal.level_e" = "assumed"
+"""
+
+
+def test_a_ground_and_a_detector_effect_come_from_a_plugin(tmp_path: Path) -> None:
+    """The names in the scene's and the sensor's file are enough, also in another process, and edits are seen."""
+    path = plugin(tmp_path, GROUND, "my_ground.py")
+    (tmp_path / "mine.toml").write_text(SENSOR, encoding="utf-8")
+    tables = '[body.photometry]\nmodel = "glazed"\npower = 3\n[camera]\ndetector = "mine.toml"\n'
+    file = scene_file(tmp_path, "my_ground.py", faults=tables)
+    scene = config.load_scene(file)
+    assert scene.body.photometry.model_dump()["power"] == 3
+    camera = pipeline.Session(scene).base_camera
+    assert [effect.model_dump() for effect in camera.mosaic.sensor.effects] == [{"level_e": 2000.0}]
+    (tmp_path / "scene.pickle").write_bytes(pickle.dumps(scene))
+    code = (
+        f"import pickle; scene = pickle.load(open({str(tmp_path / 'scene.pickle')!r}, 'rb'))\n"
+        "from vbnfault.world import assemble\n"
+        "print(scene.body.photometry.power, assemble.ground_reflectance(scene).terms)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert (done.stdout.strip(), done.stderr) == ("3 1", "")
+    path.write_text(GROUND.replace("le=4", "le=2"), encoding="utf-8")
+    with pytest.raises(InputError, match=r"body.photometry.power = 3: must be a whole number from 1 to 2"):
+        config.load_scene(file)
+
+
+def test_a_plugin_that_defines_a_known_reflectance_is_refused(tmp_path: Path) -> None:
+    plugin(tmp_path, GROUND.replace("glazed", "lambert"), "my_ground.py")
+    with pytest.raises(InputError, match=r"my_ground.py': .*ground reflectance 'lambert' is defined twice"):
+        config.load_scene(scene_file(tmp_path, "my_ground.py", faults=""))
+    assert config.load_scene(scene_file(tmp_path, faults="")).body.photometry.model == "lambert"

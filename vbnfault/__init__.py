@@ -20,22 +20,27 @@ if TYPE_CHECKING:
     from .core.errors import InputError, VbnfaultError
     from .dataset import BuildOptions, verify
     from .dataset import build_scene as build
+    from .detector.effects import Effect
     from .detector.sensor import Sensor, load_sensor
     from .faults import Fault, FaultContext, Interval, bounds, choice, flag, number, path, rows, text
     from .lens import Prescription, load_lens
     from .output.flare_images import Flare, trace_flare
     from .pipeline import Session, simulate
+    from .reflectance import DiscReflectance, Reflectance
     from .scene.config import Scene, load_scene
     from .store import open_dataset
 
 # public name → the module that defines it, and its name there
 _HOME = {
+    "DiscReflectance": ("reflectance", "DiscReflectance"),
+    "Effect": ("detector.effects", "Effect"),
     "BuildOptions": ("dataset", "BuildOptions"),
     "Fault": ("faults", "Fault"),
     "FaultContext": ("faults", "FaultContext"),
     "Flare": ("output.flare_images", "Flare"),
     "InputError": ("core.errors", "InputError"),
     "Interval": ("faults", "Interval"),
+    "Reflectance": ("reflectance", "Reflectance"),
     "Prescription": ("lens", "Prescription"),
     "Scene": ("scene.config", "Scene"),
     "Sensor": ("detector.sensor", "Sensor"),
@@ -60,12 +65,15 @@ _HOME = {
 
 __all__ = [
     "BuildOptions",
+    "DiscReflectance",
+    "Effect",
     "Fault",
     "FaultContext",
     "Flare",
     "InputError",
     "Interval",
     "Prescription",
+    "Reflectance",
     "Scene",
     "Sensor",
     "Session",

@@ -5,11 +5,15 @@ from __future__ import annotations
 import importlib
 import pkgutil
 from collections.abc import Collection, Mapping
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 from . import tables
 
 T = TypeVar("T")
+
+# The names of modules that are the files of plug-ins begin with this.
+FILE_MODULE = "vbnfault_plugin_"
+_registries: list[Registry[Any]] = []
 
 
 class Registry(Generic[T]):
@@ -29,20 +33,25 @@ class Registry(Generic[T]):
     def __init__(self, kind: str, package: str) -> None:
         self.kind, self.package = kind, package
         self._classes: dict[str, type[T]] = {}
+        self._by_module: dict[str, dict[str, type[T]]] = {}
         self._complete = False
+        _registries.append(self)
 
     def add(self, name: str, cls: type[T]) -> None:
         """Register a class. Raise TypeError if another class has the name.
 
-        A module that is imported again, as after an edit in a notebook, may define its class again.
+        A module that is imported again, as after an edit in a notebook, may define its class again. The class of a
+        plug-in's file gives way to any other: the file may have been edited, or belong to another scene.
         """
         known = self._classes.get(name)
-        if known is not None and (known.__module__, known.__qualname__) != (cls.__module__, cls.__qualname__):
+        same = known is None or (known.__module__, known.__qualname__) == (cls.__module__, cls.__qualname__)
+        if known is not None and not same and not known.__module__.startswith(FILE_MODULE):
             raise TypeError(
                 f"{self.kind} {name!r} is defined twice: {known.__module__}.{known.__qualname__} and "
                 f"{cls.__module__}.{cls.__qualname__}"
             )
         self._classes[name] = cls
+        self._by_module.setdefault(cls.__module__, {})[name] = cls
         tables.forget_schemas()  # those of tables that take any class of this kind
 
     def classes(self) -> dict[str, type[T]]:
@@ -54,9 +63,33 @@ class Registry(Generic[T]):
 
         return dict(sorted(self._classes.items(), key=lambda item: (not self.is_packaged(item[1]), item[0])))
 
+    def restore(self, module: str) -> None:
+        """Register the classes of a module again, which another scene may have replaced."""
+        self._classes |= self._by_module.get(module, {})
+        tables.forget_schemas()
+
+    def forget(self, module: str) -> None:
+        """Remove the classes of a module."""
+        for name, cls in self._by_module.pop(module, {}).items():
+            if self._classes.get(name) is cls:
+                del self._classes[name]
+        tables.forget_schemas()
+
     def is_packaged(self, cls: type[T]) -> bool:
         """Return whether a class belongs to vbnfault itself."""
         return cls.__module__.startswith(f"{self.package}.")
+
+
+def restore(module: str) -> None:
+    """Register the classes of a plug-in's module again, of every kind."""
+    for registry in _registries:
+        registry.restore(module)
+
+
+def forget(module: str) -> None:
+    """Remove the classes of a plug-in's module, of every kind."""
+    for registry in _registries:
+        registry.forget(module)
 
 
 def chained(after: Mapping[str, str], packaged: Collection[str], kind: str) -> tuple[str, ...]:

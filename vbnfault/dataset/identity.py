@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from .. import __version__, pipeline, store
+from .. import __version__, pipeline, reflectance, store
 from ..core import llvm, resources
 from ..core.errors import InputError, VbnfaultError
 from ..detector import Detector
@@ -231,6 +231,8 @@ def stored_scene(attributes: Mapping[str, Any]) -> Scene:
     scene = attributes["scene"]
     stored = {key: value for key, value in scene.items() if key != "plugins" and not key.endswith("_sha256")}
     stored["body"] = {key: value for key, value in stored["body"].items() if key != "shape_sha256"}
+    if stored["body"].get("photometry", {}).get("model") not in reflectance.registry():
+        stored["body"].pop("photometry", None)  # it came from a plug-in, and no plan depends on it
     # a scene's identity adds keys that are not valid in a scene
     for name, added in (("sky", "catalogue"),):
         stored[name] = {key: value for key, value in stored.get(name, {}).items() if key != added}

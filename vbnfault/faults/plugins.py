@@ -1,6 +1,6 @@
-"""Load fault models from outside the package.
+"""Load fault models, ground reflectances and detector effects from outside the package.
 
-A plug-in is a Python module that defines models of `Fault`. It is found in one of two ways:
+A plug-in is a Python module that defines classes of these kinds. It is found in one of two ways:
 
 - An installed distribution names it in the entry-point group `vbnfault.faults`. It is then known to every scene.
 - The scene file names it: `plugins = ["my_module", "folder/my_fault.py"]`, as a module that can be imported or as
@@ -27,7 +27,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING
 
-from ..core import resources
+from ..core import registry, resources
 from ..core.errors import InputError, VbnfaultError, shown
 from ..core.interrupts import check
 from . import models
@@ -36,7 +36,6 @@ if TYPE_CHECKING:
     from .contract import Fault
 
 ENTRY_POINTS = "vbnfault.faults"
-_FILE_MODULE = "vbnfault_plugin_"
 _MODULE = re.compile(r"[^\W\d]\w*(\.[^\W\d]\w*)*")
 _SUFFIXES = (*importlib.machinery.SOURCE_SUFFIXES, *importlib.machinery.EXTENSION_SUFFIXES)
 
@@ -65,7 +64,7 @@ class Plugin:
     @property
     def is_file(self) -> bool:
         """Return whether the plug-in is a file that a scene names."""
-        return self.module.startswith(_FILE_MODULE)
+        return self.module.startswith(registry.FILE_MODULE)
 
     def defines(self, cls: type[Fault]) -> bool:
         """Return whether a model belongs to this plug-in."""
@@ -153,6 +152,7 @@ def forget_all() -> None:
     """Forget every plug-in of this process, for tests."""
     for plugin in _loaded.values():
         models.forget(plugin.module)
+        registry.forget(plugin.module)
     _loaded.clear()
 
 
@@ -197,8 +197,9 @@ def _load_file(path: str) -> Plugin:
         return _registered(known)
     if known is not None:
         models.forget(known.module)
+        registry.forget(known.module)
     stem = re.sub(r"\W", "_", Path(path).stem)
-    name = f"{_FILE_MODULE}{stem}_{resources.sha256(path.encode() + data)[:16]}"
+    name = f"{registry.FILE_MODULE}{stem}_{resources.sha256(path.encode() + data)[:16]}"
     module = ModuleType(name)
     module.__file__ = path
     sys.modules[name] = module  # a dataclass looks its module up
@@ -206,6 +207,7 @@ def _load_file(path: str) -> Plugin:
         exec(compile(data, path, "exec", dont_inherit=True), module.__dict__)
     except BaseException:
         del sys.modules[name]
+        registry.forget(name)
         raise
     return Plugin(Path(path).name, name, digest, models.models_of(lambda cls: _defines(name, cls)))
 
@@ -241,12 +243,13 @@ def _registered(plugin: Plugin) -> Plugin:
     """Return a plug-in that was loaded before, with its models registered: another scene may have replaced them."""
     for cls in plugin.models:
         models.register(cls)
+    registry.restore(plugin.module)
     return plugin
 
 
 def _defines(module: str, cls: type[Fault]) -> bool:
     """Return whether a model is defined in a plug-in's module, or elsewhere in its top-level package."""
-    if module.startswith(_FILE_MODULE):
+    if module.startswith(registry.FILE_MODULE):
         return cls.__module__ == module
     return cls.__module__.split(".")[0] == module.split(".")[0]
 
@@ -283,6 +286,7 @@ def _undoing() -> Iterator[None]:
                 top = plugin.module.split(".")[0]
                 for name in [name for name in sys.modules if name.split(".")[0] == top]:
                     del sys.modules[name]
+                    registry.forget(name)
         _loaded.clear()
         _loaded.update(before)
         raise

@@ -7,6 +7,7 @@ from .contract import (
     BandReflectance,
     DiscReflectance,
     Reflectance,
+    is_packaged,
     radiance_factor,
     registry,
 )
@@ -18,6 +19,7 @@ __all__ = [
     "BandReflectance",
     "DiscReflectance",
     "Reflectance",
+    "is_packaged",
     "radiance_factor",
     "registry",
 ]

@@ -11,7 +11,8 @@ scene file, its JSON Schema and its identity, and the renderer.
         exponent: float = Field(0.7, ge=0.5, le=1, description="k; 1: as Lambert")
 
         def disc(self, m, cos_i, cos_e, phase_deg):
-            return m.exp(self.exponent * m.log(m.maximum(cos_i, 1e-9)) + (self.exponent - 1) * m.log(cos_e))
+            log_i = m.log(m.maximum(cos_i, 1e-9))
+            return m.select(cos_i > 0, m.exp(self.exponent * log_i + (self.exponent - 1) * m.log(cos_e)), 0)
 
 Every model gives the bidirectional reflectance r in sr⁻¹, so that I/F = πr. r is the radiance over the irradiance
 of the beam on a plane normal to the beam (r = BRDF · cos i). Each formula is written once, over an array namespace
@@ -128,6 +129,11 @@ class Reflectance(Table):
 def registry() -> dict[str, type[Reflectance]]:
     """Return the name and the class of every ground reflectance."""
     return _REGISTRY.classes()
+
+
+def is_packaged(cls: type[Reflectance]) -> bool:
+    """Return whether a reflectance belongs to vbnfault, so that every process knows it."""
+    return _REGISTRY.is_packaged(cls)
 
 
 class DiscReflectance(Reflectance):

@@ -17,6 +17,7 @@ from pydantic import Field, model_validator
 from ..core import resources, tables
 from ..core.errors import InputError, shown
 from ..core.tables import Table
+from ..reflectance import is_packaged
 from .instrument import CameraTable, RenderTable
 from .sampling import DatasetTable, GeometryTable, PlanTable, StratumTable
 from .surroundings import OrbitTable, SkyTable, SpacecraftTable, SpiceTable, SunTable
@@ -37,8 +38,8 @@ class Scene(Table):
     plugins: tuple[Annotated[str, Field(min_length=1)], ...] = Field(
         (),
         max_length=64,
-        description="plug-ins that define further faults: names of modules, and paths of files that end with .py, "
-        "from the scene file's folder",
+        description="plug-ins that define further faults, ground reflectances and detector effects: names of "
+        "modules, and paths of files that end with .py, from the scene file's folder",
     )
     dataset: DatasetTable = DatasetTable()
     body: BodyTable = BodyTable()
@@ -91,6 +92,20 @@ class Scene(Table):
         """Return the whole scene as plain JSON-able data."""
         plain: dict[str, Any] = json.loads(self.model_dump_json())
         return plain
+
+    def __reduce_ex__(self, protocol: Any) -> Any:
+        """Pickle a scene whose reflectance comes from a plug-in as plain data, which need no class of it."""
+        if is_packaged(type(self.body.photometry)):
+            return super().__reduce_ex__(protocol)
+        return _restored, (self.resolved(),)
+
+
+def _restored(plain: dict[str, Any]) -> Scene:
+    """Return the scene of plain data in another process, which has to load the scene's plug-ins first."""
+    from ..faults import load_plugins
+
+    load_plugins(plain["plugins"])
+    return parse_scene(plain, source=plain["title"])
 
 
 def load_scene(name_or_path: str | Path, overrides: Mapping[str, Any] | None = None) -> Scene:
