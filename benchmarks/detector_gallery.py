@@ -13,16 +13,15 @@ from __future__ import annotations
 import argparse
 import json
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from vbnfault.core.images import write_png
 from vbnfault.faults import registry
-from vbnfault.pipeline import Session, labels
-from vbnfault.pipeline.photograph import develop, effect_of
-from vbnfault.pipeline.spec import Frame
+from vbnfault.pipeline import Session, masks
+from vbnfault.pipeline.development import Development
+from vbnfault.pipeline.spec import Draw, Exposure, Frame, SceneLight
 from vbnfault.scene.config import load_scene
 from vbnfault.world.assemble import mosaic_sensor
 
@@ -49,17 +48,15 @@ def main() -> None:
     frame = session.frame(given.sample)
     given.out.mkdir(parents=True, exist_ok=True)
     for kind in ("scene", "dark"):
-        if kind == "dark":
-            frame = _dark(frame, given.dark_s)
-        noise = frame.camera.detector.draw_noise(frame.context.shape, partial(frame.spec.rng, "detector"))
-        clean = develop(frame, {}, noise).array
+        development = frame.injection.development if kind == "scene" else _dark(frame, given.dark_s)
+        clean = development.image({}).array
         for name in possible:
             fault = frame.spec.faults[name]
-            params = fault.draw(frame.context, frame.spec.rng("fault", f"{name}/0"))
-            frame.drawn = {name: params}
-            image = develop(frame, frame.drawn, noise).array
-            effects = {name: effect_of(frame, name)}
-            mask = labels.mask_layers({name: fault}, frame.drawn, frame.context, effects)[0]
+            params = fault.draw(development.context, frame.spec.rng("fault", f"{name}/0"))
+            draws = {name: Draw(fault=fault, attempt=0, params=params)}
+            image = development.image(draws).array
+            effects = {name: development.effect(draws, name)}
+            mask = masks.mask_layers({name: fault}, {name: params}, development.context, effects)[0]
             pair = np.hstack([image[..., :3], _seen(image, clean, mask)])
             write_png(given.out / f"{name}_{kind}.png", pair)
             short = {k: v for k, v in params.items() if not isinstance(v, list | dict)}
@@ -74,18 +71,17 @@ def _value(text: str) -> object:
         return text
 
 
-def _dark(frame: Frame, exposure_s: float) -> Frame:
-    """Return the frame that the same camera would take without any light."""
-    out = Frame(spec=frame.spec)
-    out.pose, out.sunlight, out.radiance, out.truth = frame.pose, frame.sunlight, frame.radiance, frame.truth
-    out.camera = replace(frame.camera, exposure_s=exposure_s)
-    out.context = replace(frame.context, camera=out.camera)
-    out.rate = frame.rate.with_array(np.zeros_like(frame.rate.array))
-    out.rendered, out.open_sky = frame.rendered, frame.open_sky
-    out.radiance = frame.radiance.with_array(np.zeros_like(frame.radiance.array))
-    if out.rendered is not None:
-        out.rendered = out.rendered.with_array(np.zeros_like(out.rendered.array))
-    return out
+def _dark(frame: Frame, exposure_s: float) -> Development:
+    """Return the images that the same camera would take without any light."""
+    camera = replace(frame.camera, exposure_s=exposure_s)
+    rate, light = frame.exposure.rate.merged, frame.exposure.light
+    black = light.rendered.with_array(np.zeros_like(light.rendered.array))
+    exposure = Exposure(
+        camera=camera,
+        light=SceneLight(lens=light.lens, rendered=black),
+        rate=rate.with_array(np.zeros_like(rate.array)),
+    )
+    return Development(exposure=exposure, context=replace(frame.context, camera=camera), rng=frame.spec.rng)
 
 
 def _seen(image: np.ndarray, clean: np.ndarray, mask: np.ndarray) -> np.ndarray:

@@ -12,27 +12,38 @@ from __future__ import annotations
 import argparse
 import cProfile
 import pstats
+from collections import defaultdict
+from collections.abc import Callable
+from typing import ParamSpec, TypeVar
 
 from workload import clock, medians
 
 from vbnfault import pipeline
-from vbnfault.pipeline.expose import render_frame
 from vbnfault.pipeline.record import to_sample
+from vbnfault.pipeline.rendering import render_view
 from vbnfault.pipeline.resolve import resolve
-from vbnfault.pipeline.spec import Frame, SampleSpec
+from vbnfault.pipeline.spec import SampleSpec
 from vbnfault.scene import config
+
+P = ParamSpec("P")
+T = TypeVar("T")
 
 
 def stages(spec: SampleSpec, profile: cProfile.Profile | None = None) -> dict[str, float]:
     """Return the duration in s of each stage of one sample; `profile` records the stages after the render."""
-    frame, seconds = Frame(spec=spec), {}
-    for stage in pipeline.STAGES:
-        after = profile is not None and stage not in (resolve, render_frame)
+    seconds: dict[str, float] = defaultdict(float)  # a stage runs once for every view of the sample
+
+    def timed(stage: Callable[P, T], /, *inputs: P.args, **options: P.kwargs) -> T:
+        after = profile is not None and stage not in (resolve, render_view)
         if after:
             profile.enable()
-        seconds[stage.__name__], _ = clock(lambda stage=stage: stage(frame))
+        duration, output = clock(lambda: stage(*inputs, **options))
         if after:
             profile.disable()
+        seconds[stage.__name__] += duration
+        return output
+
+    frame = pipeline.simulate_frame(spec, timed)
     seconds["to_sample"], _ = clock(lambda: to_sample(frame))
     return seconds
 

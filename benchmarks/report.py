@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-AFTER = ("meter", "photograph", "label", "to_sample", "store")
+AFTER = ("meter", "inject_faults", "take_images", "label", "to_sample", "store")
 SAMPLE = ("resolve", "render", "truth", *AFTER)
 
 
@@ -88,7 +88,8 @@ def table(seconds: Mapping[str, float]) -> str:
         "render": "render: eight bands",
         "truth": "truth: depth, normals, classes",
         "meter": "meter",
-        "photograph": "photograph: image with six faults, clean twin",
+        "inject_faults": "inject_faults: draws of six faults, clean twin",
+        "take_images": "take_images: image with six faults",
         "label": "label: masks",
         "to_sample": "to_sample",
         "store": "store: encode and write, per sample of a shard",

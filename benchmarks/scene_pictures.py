@@ -46,13 +46,14 @@ def frames(scene: str, samples: tuple[int, ...], overrides: dict[str, Any] | Non
 
 def rgb(frame: Frame, name: str) -> U8:
     """Return one of a sample's images as uint8[y, x, 3] R, G, B."""
-    return np.asarray(frame.images[name].array[..., :3])
+    images = frame.images
+    return np.asarray({"image": images.image, "clean": images.clean}[name].array[..., :3])
 
 
 def mask(frame: Frame, *classes: str) -> U8:
     """Return the union of the masks of some classes in white, uint8[y, x, 3]."""
     chosen = [name in classes for name in frame.spec.faults]
-    return np.repeat(frame.mask[chosen].any(axis=0)[..., None].astype(np.uint8) * 255, 3, axis=2)
+    return np.repeat(frame.labels.masks[chosen].any(axis=0)[..., None].astype(np.uint8) * 255, 3, axis=2)
 
 
 def grid(rows: list[list[U8]], tile_px: int) -> U8:

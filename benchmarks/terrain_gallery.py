@@ -17,8 +17,10 @@ from vbnfault import render
 from vbnfault.body import EMBEDDED
 from vbnfault.core import frames
 from vbnfault.core.images import write_png
-from vbnfault.pipeline import Session, expose
-from vbnfault.pipeline.spec import Frame, Pose
+from vbnfault.pipeline import Session
+from vbnfault.pipeline.exposure import meter
+from vbnfault.pipeline.rendering import render_view
+from vbnfault.pipeline.spec import Pose
 from vbnfault.render.description import Sunlight
 from vbnfault.scene import config, plan
 
@@ -92,12 +94,11 @@ def sunlit_azimuth(surface: render.TerrainMesh) -> float:
 
 def picture(session: Session, site: int, pose: Pose) -> NDArray:
     """Return the image of the scene's camera without faults and noise, with gamma 2.2, uint8[y, x, 3]."""
-    frame = Frame(spec=session.spec(int(np.flatnonzero(session.plan.site == site)[0])))
-    frame.pose = pose
-    expose.render_frame(frame)
-    expose.meter(frame)
-    exposed = frame.rate.with_array(frame.rate.array * np.float32(frame.camera.exposure_s))
-    image = frame.camera.detector.develop(exposed, frame.camera.exposure_s, None).array[..., :3]
+    spec = session.spec(int(np.flatnonzero(session.plan.site == site)[0]))
+    exposure = meter(spec, render_view(spec, pose))
+    rate, camera = exposure.rate.merged, exposure.camera
+    exposed = rate.with_array(rate.array * np.float32(camera.exposure_s))
+    image = camera.detector.develop(exposed, camera.exposure_s, None).array[..., :3]
     return np.round(255 * (image / 255.0) ** (1 / GAMMA)).astype(np.uint8)
 
 

@@ -53,7 +53,7 @@ def test_labelled_sample(
     results |= medians(taken[1:] or taken)
     benchmark.extra_info |= results
     assert set(SAMPLE) <= set(results)
-    assert (frame.truth.semantic == 1).all(), "the terrain must fill the frame"
+    assert (frame.rendering.truth.semantic == 1).all(), "the terrain must fill the frame"
     missing = set(workload.spec.faults) - set(frame.drawn)
     assert not missing, f"every fault must show: {missing}"
     assert folder.finished() == folder.samples

@@ -18,18 +18,20 @@ from vbnfault.core import frames, spectra
 from vbnfault.core.quantities import Sample
 from vbnfault.lens import load_lens, scaled_to_focal_length
 from vbnfault.lens.straylight.irradiance import FlareModel
-from vbnfault.pipeline.expose import describe, meter
-from vbnfault.pipeline.photograph import photograph
-from vbnfault.pipeline.record import label, to_sample
+from vbnfault.pipeline.exposure import meter
+from vbnfault.pipeline.images import take_images
+from vbnfault.pipeline.injection import inject_faults
+from vbnfault.pipeline.labels import label
+from vbnfault.pipeline.record import to_sample
+from vbnfault.pipeline.rendering import describe
 from vbnfault.pipeline.resolve import resolve
-from vbnfault.pipeline.spec import Frame, Pose, SampleSpec, Terrain
+from vbnfault.pipeline.spec import Frame, Pose, Rendering, SampleSpec, SceneLight, Terrain
 from vbnfault.reflectance.hapke import hapke_at
 from vbnfault.render.description import RenderInput
 from vbnfault.render.emitter import SunDisc
 from vbnfault.render.runtime import dr, mi
 from vbnfault.render.sampling import Optics, Pixels, Strata
 from vbnfault.scene import config, plan
-from vbnfault.world import assemble
 
 SCENE = "paper_example"  # for its six faults; the view is defined below
 SHARD_SAMPLES = 8
@@ -86,15 +88,7 @@ class Workload:
     @cached_property
     def scene(self) -> RenderInput:
         """The input of the renderer."""
-        return self._placed()[1]
-
-    def _placed(self) -> tuple[Frame, RenderInput]:
-        """Return a frame with the pose, and the renderer's input for it."""
-        frame = Frame(spec=self.spec)
-        frame.pose = self.pose
-        frame.camera = self.session.base_camera
-        frame.sunlight = assemble.sunlight(self.spec.scene, self.pose.sun_L)
-        return frame, describe(frame)
+        return describe(self.spec, self.pose)
 
     def bound(self) -> None:
         """Trace the same rays as the render in the same order, one closest hit and one shadow ray each.
@@ -125,17 +119,37 @@ class Workload:
         """
         seconds: dict[str, float] = {}
         surface = self.spec.terrain.surface
-        seconds["resolve"], _ = clock(lambda: resolve(Frame(spec=self.spec)))
-        frame, scene = self._placed()
-        seconds["render"], frame.radiance = clock(lambda: render.radiance(surface, scene))
-        seconds["truth"], frame.truth = clock(lambda: render.truth(surface, scene.view, scene.sun))
-        for stage in (meter, photograph, label):
-            seconds[stage.__name__], _ = clock(lambda stage=stage: stage(frame))
+        spec, pose, scene = self.spec, self.pose, self.scene
+        seconds["resolve"], _ = clock(lambda: resolve(spec))
+        seconds["render"], radiance = clock(lambda: render.radiance(surface, scene))
+        seconds["truth"], truth = clock(lambda: render.truth(surface, scene.view, scene.sun))
+        light = SceneLight(lens=spec.camera.lens, rendered=radiance)
+        rendering = Rendering(
+            scene=scene,
+            light=light,
+            truth=truth,
+            open_sky=None,
+            samples_per_pixel=float(scene.samples_per_pixel),
+        )
+        seconds["meter"], exposure = clock(lambda: meter(spec, rendering))
+        seconds["inject_faults"], injection = clock(lambda: inject_faults(spec, pose, rendering, exposure))
+        seconds["take_images"], images = clock(lambda: take_images(spec, injection))
+        seconds["label"], labels = clock(lambda: label(spec, injection))
+        frame = Frame(
+            spec=spec,
+            views=1,
+            pose=pose,
+            rendering=rendering,
+            exposure=exposure,
+            injection=injection,
+            images=images,
+            labels=labels,
+        )
         # the same view with the photometry of the physical scenes
         physical = replace(scene, reflectance=hapke_at(scene.wavelength_nm))
         seconds["hapke"], _ = clock(lambda: render.radiance(surface, physical))
         lit = replace(physical, bounces=1)
-        seconds["bounce"], _ = clock(lambda: render.radiance(surface, lit, frame.truth))
+        seconds["bounce"], _ = clock(lambda: render.radiance(surface, lit, truth))
         seconds["flare"], _ = clock(self.flare)
         for name, chain in self.chains.items():
             seconds[name], _ = clock(chain.expose)

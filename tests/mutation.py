@@ -47,12 +47,15 @@ GROUPS: dict[str, tuple[list[str], list[str]]] = {
         ["tests/test_resolve.py", "tests/test_views.py", "tests/test_pipeline.py", "tests/test_spice.py"],
     ),
     "labels": (
-        ["vbnfault/pipeline/labels.py", "vbnfault/pipeline/record.py"],
+        ["vbnfault/pipeline/masks.py", "vbnfault/pipeline/labels.py", "vbnfault/pipeline/record.py"],
         ["tests/test_labels.py", "tests/test_pipeline.py", "tests/test_truth.py"],
     ),
-    "pictures": (["vbnfault/pipeline/photograph.py"], ["tests/test_pipeline.py", "tests/test_labels.py"]),
+    "images": (
+        ["vbnfault/pipeline/injection.py", "vbnfault/pipeline/development.py", "vbnfault/pipeline/images.py"],
+        ["tests/test_pipeline.py", "tests/test_labels.py"],
+    ),
     "exposure": (
-        ["vbnfault/pipeline/expose.py"],
+        ["vbnfault/pipeline/rendering.py", "vbnfault/pipeline/exposure.py", "vbnfault/pipeline/stars.py"],
         ["tests/test_exposure.py", "tests/test_pipeline.py", "tests/test_physical.py"],
     ),
     "store": (["vbnfault/store/*.py"], ["tests/test_store*.py"]),

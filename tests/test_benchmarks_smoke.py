@@ -50,7 +50,8 @@ def test_benchmarks_print_every_stage_and_ratio(tmp_path: Path) -> None:
     for line in (
         "bound:",
         "render:",
-        "photograph:",
+        "inject_faults:",
+        "take_images:",
         "store:",
         "labelled sample",
         "at least 0.7",

@@ -196,9 +196,11 @@ def test_near_infrared_pixels_need_light_that_they_see(tmp_path: Any) -> None:
         _ = Session(parse_scene(scene(detector), source="x")).base_camera
     table = scene(detector, band_max_nm=1000.0, bands=12)
     frame = Session(parse_scene(table, source="x")).frame(0)
-    assert frame.raw is not None
-    lit = frame.truth.semantic[1::2, ::2] == 1
-    assert np.median(frame.raw[1::2, ::2][lit]) > np.median(frame.raw[::2, ::2][lit])  # NIR over the red beside it
+    assert frame.images.raw is not None
+    lit = frame.rendering.truth.semantic[1::2, ::2] == 1
+    assert np.median(frame.images.raw[1::2, ::2][lit]) > np.median(
+        frame.images.raw[::2, ::2][lit]
+    )  # NIR over the red beside it
 
 
 def test_stores_say_what_a_user_of_raw_pictures_must_know(tmp_path: Any) -> None:

@@ -13,7 +13,7 @@ from conftest import small_scene
 from vbnfault.camera import Camera
 from vbnfault.core import spectra
 from vbnfault.core.quantities import BODY, SKY, Electrons, Radiance
-from vbnfault.pipeline import expose
+from vbnfault.pipeline import exposure
 from vbnfault.scene import config
 from vbnfault.scene.config import Scene
 from vbnfault.world import assemble
@@ -42,7 +42,7 @@ def test_the_reference_exposure_puts_a_facet_at_45_degrees_at_the_metering_level
 ) -> None:
     scene = parsed(camera={"metering_level": level}, body={"photometry": {"phase_slope_mag_deg": slope_mag_deg}})
     camera = assemble.base_camera(scene)
-    found = camera.expose(facet(scene), expose.reference_exposure_s(scene, camera))
+    found = camera.expose(facet(scene), exposure.reference_exposure_s(scene, camera))
     # a facet that light meets and leaves at 45 degrees in planes at right angles has a phase of 60 degrees
     dimmed = 10 ** (-0.4 * slope_mag_deg * 60)
     # the four pixels about the axis: natural vignetting takes 1 - cos⁴ of half a pixel's diagonal, 2e-3
@@ -55,10 +55,8 @@ def metered(scene: Scene, brightness: np.ndarray, semantic: np.ndarray) -> tuple
     camera: Camera = assemble.base_camera(scene)
     white = np.ones(4, dtype=np.float32)
     rate = Electrons(array=np.tile(brightness[..., None].astype(np.float32), (1, 1, 4)), white_e=white)
-    frame: Any = SimpleNamespace(
-        spec=SimpleNamespace(scene=scene), camera=camera, truth=SimpleNamespace(semantic=semantic)
-    )
-    return expose._metered_exposure_s(frame, rate), expose.reference_exposure_s(scene, camera)
+    truth: Any = SimpleNamespace(semantic=semantic)
+    return exposure.metered_exposure_s(scene, camera, truth, rate), exposure.reference_exposure_s(scene, camera)
 
 
 def test_metering_puts_the_percentile_of_the_lit_body_at_its_level_within_its_range() -> None:
@@ -106,7 +104,7 @@ def test_electrons_of_a_second_are_the_rate() -> None:
     scene = parsed()
     camera = assemble.base_camera(scene)
     light = facet(scene)
-    rate = expose._rate(SimpleNamespace(camera=camera), light)  # type: ignore[arg-type]
+    rate = camera.expose(light, 1.0)
     # by the lens's irradiance and the detector's exposure of a quarter of a second, apart from Camera.expose
     quarter = camera.detector.electrons_expected(camera.lens.image(light), 0.25)
     np.testing.assert_allclose(quarter.array, 0.25 * rate.array, rtol=1e-6)

@@ -18,7 +18,7 @@ from vbnfault.core.errors import InputError
 from vbnfault.core.quantities import Electrons
 from vbnfault.detector import MosaicDetector
 from vbnfault.faults import Fault, FaultContext, act, from_dict, registry
-from vbnfault.pipeline import labels
+from vbnfault.pipeline import masks
 
 SIZE = 64
 KEYS = [
@@ -123,7 +123,7 @@ def outcome(table: dict[str, Any], name: str, key: str) -> list[NDArray[Any]]:
         found.append(np.frombuffer(repr(camera.detector).encode(), dtype=np.uint8))
     if fault.effect_mask and isinstance(before, Electrons):
         one, other = (where.camera.detector.develop(q, 1e-3, None).array for q in (after, before))
-        found.append(labels.effect(one, other, fault.effect_level_dn))
+        found.append(masks.effect(one, other, fault.effect_level_dn))
     else:
         mask = fault.footprint(params, where)
         found.append(np.zeros(0) if mask is None else mask)

@@ -614,12 +614,12 @@ def test_samples_of_a_scene_with_a_lens() -> None:
         for f in frames_
         if (f.context.sun_xy_px > 5).all()
         and (f.context.sun_xy_px < (123, 107)).all()
-        and 0.2 < (f.truth.semantic == BODY).mean() < 0.9
+        and 0.2 < (f.rendering.truth.semantic == BODY).mean() < 0.9
     )
     lens = frame.camera.lens
     assert isinstance(lens, RealLens)
-    assert frame.rendered is not None
-    assert frame.rendered.array.shape[1:] == (112 + 2 * c.lens.guard_px[1], 128 + 2 * c.lens.guard_px[0])
+    light, guard_px = frame.exposure.light, c.lens.guard_px
+    assert light.rendered.array.shape[1:] == (112 + 2 * guard_px[1], 128 + 2 * guard_px[0])
     sample = to_sample(frame)
     for name, layer in sample.layers.items():
         assert (112, 128) in (layer.shape[:2], layer.shape[1:3], layer.shape[-2:]), name
@@ -632,7 +632,7 @@ def test_samples_of_a_scene_with_a_lens() -> None:
     assert (sun < (123, 107)).all()
     rows, columns = np.nonzero(sample.layers["semantic"] == SUN)
     np.testing.assert_allclose([columns.mean() + 0.5, rows.mean() + 0.5], sun, atol=0.8)
-    bright = np.argmax(frame.rate.merged.array[..., 1])
+    bright = np.argmax(frame.exposure.rate.merged.array[..., 1])
     assert np.hypot(bright % 128 + 0.5 - sun[0], bright // 128 + 0.5 - sun[1]) < 1
 
     # surface points through the stored pose, the intrinsics and OpenCV's model
@@ -650,17 +650,17 @@ def test_samples_of_a_scene_with_a_lens() -> None:
     assert off.max() < 1e-3
 
     # light ends where the body does: dark sky holds none
-    lit = frame.rate.array[..., 1] > 0
+    lit = frame.exposure.rate.merged.array[..., 1] > 0
     away = cv2.dilate((sample.layers["semantic"] > 0).astype(np.uint8), np.ones((5, 5), np.uint8)) == 0
     assert not (lit & away).any()
     assert (lit & body).sum() > 0.3 * body.sum()
     # and the stored radiance, with the light the lens takes, is the picture up to its blur
-    solid = lens.axial_solid_angle_sr(frame.radiance.wavelength_nm)
+    solid = lens.axial_solid_angle_sr(frame.exposure.light.on_image.wavelength_nm)
     x, y = np.arange(128) + 0.5 - 64, np.arange(112) + 0.5 - 56
     distance = np.hypot(x[None], y[:, None]) / lens.focal_length_px
     band = 4
-    expected = frame.radiance.array[band] * solid[band] * lens.relative_illumination(distance)
-    image = lens.image(frame.rendered).array[band]
+    expected = frame.exposure.light.on_image.array[band] * solid[band] * lens.relative_illumination(distance)
+    image = lens.image(frame.exposure.light.rendered).array[band]
     inner = cv2.erode((body & lit).astype(np.uint8), np.ones((9, 9), np.uint8)) > 0
     assert inner.sum() > 500
     assert image[inner].sum() == pytest.approx(expected[inner].sum(), rel=5e-3)

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from vbnfault.pipeline import labels, record
+from vbnfault.pipeline import masks, record
 
 images = arrays(np.uint8, (3, 5, 4), elements=st.sampled_from([0, 1, 128, 254, 255]))
 SHAPE = (4, 6)
@@ -28,18 +28,18 @@ def test_effect_marks_a_difference_of_one_in_any_channel() -> None:
         without[y, x, channel] = 8 if channel % 2 else 6
     expected = np.zeros(SHAPE, bool)
     expected[[0, 1, 3, 2], [0, 5, 2, 4]] = True
-    np.testing.assert_array_equal(labels.effect(image, without), expected)
-    assert not labels.effect(image, image).any()
+    np.testing.assert_array_equal(masks.effect(image, without), expected)
+    assert not masks.effect(image, image).any()
 
 
 @given(images, images)
 def test_effect_is_any_channel_differing_and_symmetric(a: np.ndarray, b: np.ndarray) -> None:
-    got = labels.effect(a, b)
+    got = masks.effect(a, b)
     assert got.dtype == bool
     assert got.shape == (3, 5)
     for y, x in np.ndindex(3, 5):
         assert got[y, x] == any(a[y, x, c] != b[y, x, c] for c in range(4))
-    np.testing.assert_array_equal(got, labels.effect(b, a))
+    np.testing.assert_array_equal(got, masks.effect(b, a))
 
 
 def test_effect_takes_read_only_and_strided_images() -> None:
@@ -48,9 +48,9 @@ def test_effect_takes_read_only_and_strided_images() -> None:
     a.flags.writeable = False
     expected = (a != b).any(axis=-1)
     assert 0 < expected.sum() < 80
-    np.testing.assert_array_equal(labels.effect(a, b), expected)
-    np.testing.assert_array_equal(labels.effect(a[::2, ::-1], b[::2, ::-1]), expected[::2, ::-1])
-    np.testing.assert_array_equal(labels.effect(a, np.asfortranarray(b)), expected)
+    np.testing.assert_array_equal(masks.effect(a, b), expected)
+    np.testing.assert_array_equal(masks.effect(a[::2, ::-1], b[::2, ::-1]), expected[::2, ::-1])
+    np.testing.assert_array_equal(masks.effect(a, np.asfortranarray(b)), expected)
 
 
 # ------------------------------------------------------------------------------------ mask layers
@@ -90,7 +90,7 @@ def test_mask_layers_in_the_order_of_the_faults() -> None:
         "pixels": {"row": 1},
         "ghost": {},
     }  # dust is not injected, the order is another
-    got = labels.mask_layers(FAULTS, drawn, CONTEXT, {"straylight": seen})
+    got = masks.mask_layers(FAULTS, drawn, CONTEXT, {"straylight": seen})
     assert got.shape == (4, *SHAPE)
     assert got.dtype == bool
     assert not got[0].any()
@@ -102,12 +102,12 @@ def test_mask_layers_in_the_order_of_the_faults() -> None:
 
 
 def test_mask_layers_of_nothing_drawn_are_empty() -> None:
-    assert not labels.mask_layers(FAULTS, {}, CONTEXT, {"straylight": np.ones(SHAPE, bool)}).any()
+    assert not masks.mask_layers(FAULTS, {}, CONTEXT, {"straylight": np.ones(SHAPE, bool)}).any()
 
 
 def test_a_class_labelled_by_effect_needs_its_effect() -> None:
     with pytest.raises(KeyError, match="straylight"):
-        labels.mask_layers(FAULTS, {"straylight": {}}, CONTEXT, {})
+        masks.mask_layers(FAULTS, {"straylight": {}}, CONTEXT, {})
 
 
 # ------------------------------------------------------------------------------------ union
@@ -117,12 +117,12 @@ def test_a_class_labelled_by_effect_needs_its_effect() -> None:
     arrays(bool, (4, 3, 5)),
     st.sets(st.sampled_from(["dust", "pixels", "straylight", "ghost", "not in the scene"])),
 )
-def test_union_is_any_of_its_members(masks: np.ndarray, members: set[str]) -> None:
-    got = labels.union(masks, FAULTS, members)
+def test_union_is_any_of_its_members(layers: np.ndarray, members: set[str]) -> None:
+    got = masks.union(layers, FAULTS, members)
     expected = np.zeros((3, 5), bool)
     for k, name in enumerate(FAULTS):
         if name in members:
-            expected = expected | masks[k]
+            expected = expected | layers[k]
     assert got.dtype == bool
     np.testing.assert_array_equal(got, expected)
 
@@ -135,12 +135,12 @@ def test_outline_of_a_square_is_its_border() -> None:
     mask[2:7, 1:6] = True
     expected = mask.copy()
     expected[3:6, 2:5] = False
-    np.testing.assert_array_equal(labels.outline(mask), expected)
+    np.testing.assert_array_equal(masks.outline(mask), expected)
 
 
 @given(arrays(bool, (6, 7)))
 def test_outline_is_the_part_of_the_mask_with_a_neighbour_outside(mask: np.ndarray) -> None:
-    got = labels.outline(mask)
+    got = masks.outline(mask)
     # beyond the frame counts as inside: a mask cut by the edge of the image has no line there
     padded = np.pad(mask, 1, constant_values=True)
     for y, x in np.ndindex(6, 7):
@@ -153,7 +153,7 @@ def test_in_a_ccd_charge_that_runs_out_of_a_footprint_is_labelled_too() -> None:
     for ccd in (True, False):
         context: Any = SimpleNamespace(shape=SHAPE, camera=SimpleNamespace(is_ccd=ccd))
         effects = {"rays": seen} if ccd else {}
-        (mask,) = labels.mask_layers(fault, {"rays": {"row": 1}}, context, effects)  # type: ignore[arg-type]
+        (mask,) = masks.mask_layers(fault, {"rays": {"row": 1}}, context, effects)  # type: ignore[arg-type]
         assert mask[1].all()
         assert mask[:, 2].all() == ccd
 
@@ -164,7 +164,7 @@ def test_in_a_ccd_charge_that_runs_out_of_a_footprint_is_labelled_too() -> None:
 @given(images, images, st.sampled_from([1.5, 2.0, 126.0, 127.0, 254.0, 255.0]))
 def test_strong_effect_is_any_channel_differing_by_its_level(a: np.ndarray, b: np.ndarray, least_dn: float) -> None:
     expected = (np.abs(a.astype(int) - b) >= least_dn).any(axis=2)
-    np.testing.assert_array_equal(labels.effect(a, b, least_dn), expected)
+    np.testing.assert_array_equal(masks.effect(a, b, least_dn), expected)
 
 
 @pytest.mark.parametrize(
@@ -183,9 +183,9 @@ def test_kind_of_a_mask(
 ) -> None:
     fault: Any = SimpleNamespace(effect_mask=effect_mask, effect_level_dn=level_dn, steps=steps)
     for is_ccd, kind in ((True, of_a_ccd), (False, of_cmos)):
-        assert labels.kind(fault, is_ccd=is_ccd) == kind
+        assert masks.kind(fault, is_ccd=is_ccd) == kind
         where: Any = SimpleNamespace(camera=SimpleNamespace(is_ccd=is_ccd))
-        assert labels.spreads(fault, where) == (kind == "footprint and effect")
+        assert masks.spreads(fault, where) == (kind == "footprint and effect")
 
 
 @dataclass(frozen=True)
@@ -198,9 +198,9 @@ class Thresholds:
 
 
 def test_footprint_rule_names_every_threshold_its_value_and_unit() -> None:
-    rule = labels.footprint_rule(Thresholds())  # type: ignore[arg-type]
+    rule = masks.footprint_rule(Thresholds())  # type: ignore[arg-type]
     assert rule == "loss of light: mask_loss = 0.25; least change: mask_level = 3 dn"
-    assert "mask" not in labels.footprint_rule(Labelled())  # type: ignore[arg-type]
+    assert "mask" not in masks.footprint_rule(Labelled())  # type: ignore[arg-type]
 
 
 # ------------------------------------------------------------------------------------ points of truth
@@ -214,7 +214,7 @@ def test_points_of_truth_lie_at_their_depth_along_their_rays() -> None:
     # C's x, y, z are L's y, z, x; L's are T's -x, -y, z
     L_from_C = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
     frame: Any = SimpleNamespace(
-        truth=SimpleNamespace(depth_m=depth),
+        rendering=SimpleNamespace(truth=SimpleNamespace(depth_m=depth)),
         camera=SimpleNamespace(seen_slopes=np.stack([u, v], axis=-1)),
         spec=SimpleNamespace(
             terrain=SimpleNamespace(
@@ -227,4 +227,4 @@ def test_points_of_truth_lie_at_their_depth_along_their_rays() -> None:
     )
     want = np.stack([100 - (7 + 5 + 0 * u), 200 - (8 + 5 * u), 300 + (9 + 5 * v)], axis=-1)
     want[0, 1] = np.nan
-    np.testing.assert_allclose(record._points_T_m(frame), want, rtol=1e-14)
+    np.testing.assert_allclose(record.points_T_m(frame), want, rtol=1e-14)

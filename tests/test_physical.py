@@ -15,9 +15,13 @@ from vbnfault import render
 from vbnfault.core import frames
 from vbnfault.core.errors import InputError
 from vbnfault.core.quantities import BODY, SKY, SPACECRAFT
-from vbnfault.pipeline import STAGES, Session, expose
+from vbnfault.pipeline import Session
+from vbnfault.pipeline.exposure import meter
 from vbnfault.pipeline.record import to_sample
+from vbnfault.pipeline.rendering import describe, green_per_second, render_view
+from vbnfault.pipeline.resolve import resolve
 from vbnfault.pipeline.spec import Frame
+from vbnfault.pipeline.stars import add_stars
 from vbnfault.reflectance.hapke import hapke_at
 from vbnfault.render.detail import _LEVELS, _SIDE, _UNIT, _pyramid
 from vbnfault.scene import config
@@ -112,10 +116,12 @@ def test_spacecraft_is_in_its_own_pictures(samples: tuple[Session, list[Frame]])
     blocked = s.vehicle.blocked(rays / np.linalg.norm(rays, axis=1)[:, None]).reshape(height, width)
     assert blocked.any()
     for frame in all_frames:
-        np.testing.assert_array_equal(frame.truth.semantic == 3, blocked & (frame.truth.semantic == 3))
+        np.testing.assert_array_equal(
+            frame.rendering.truth.semantic == 3, blocked & (frame.rendering.truth.semantic == 3)
+        )
         # ground may lie before a footpad, nothing else may hide one
-        hidden = blocked & (frame.truth.semantic != 3)
-        assert (frame.truth.semantic[hidden] == BODY).all()
+        hidden = blocked & (frame.rendering.truth.semantic != 3)
+        assert (frame.rendering.truth.semantic[hidden] == BODY).all()
 
 
 def test_albedo_on_the_spacecraft_is_that_of_its_material(samples: tuple[Session, list[Frame]]) -> None:
@@ -123,7 +129,7 @@ def test_albedo_on_the_spacecraft_is_that_of_its_material(samples: tuple[Session
     s, all_frames = samples
     mesh = s.vehicle
     assert mesh is not None
-    sample = next(to_sample(f) for f in all_frames if (f.truth.semantic == SPACECRAFT).any())
+    sample = next(to_sample(f) for f in all_frames if (f.rendering.truth.semantic == SPACECRAFT).any())
     rows, columns = np.nonzero(sample.layers["semantic"] == SPACECRAFT)
     fx, fy, cx, cy = sample.scalars["intrinsics"]
     rays = np.column_stack([(columns + 0.5 - cx) / fx, (rows + 0.5 - cy) / fy, np.ones(len(rows))])
@@ -185,9 +191,9 @@ def test_stars_fall_where_the_catalogue_says() -> None:
             if not (4 <= column < 252 and 4 <= row < 252):
                 continue
             window = np.s_[row - 3 : row + 4, column - 3 : column + 4]
-            if (frame.truth.semantic[window] != SKY).any():
+            if (frame.rendering.truth.semantic[window] != SKY).any():
                 continue
-            light = frame.radiance.array[4][window].astype(float)
+            light = frame.exposure.light.on_image.array[4][window].astype(float)
             y, x = np.mgrid[-3:4, -3:4] + 0.5
             centroid = np.array([(light * x).sum(), (light * y).sum()]) / light.sum() + [column, row]
             np.testing.assert_allclose(centroid, xy, atol=0.05)  # other stars of V < 3 may shine into the window
@@ -206,17 +212,17 @@ def test_noise_of_sampling_stays_below_the_sensors() -> None:
     s = Session(config.parse_scene(table, source="test"))
     judged = 0
     for i in range(10):
-        frame = Frame(spec=s.spec(i))
-        for stage in STAGES[:3]:
-            stage(frame)
-        described = dataclasses.replace(expose.describe(frame), samples_per_pixel=4096, key=99)
-        converged, _ = render.direct(frame.spec.terrain.surface, described)
-        to_e = frame.camera.exposure_s * expose.green_per_second(frame)
-        signal, error = (np.einsum("b,byx->yx", to_e, a) for a in (converged.array, frame.radiance.array))
-        detector = frame.camera.detector
-        sensor = np.sqrt(
-            signal + detector.read_noise_e_rms**2 + detector.dark_current_e_s * frame.camera.exposure_s
-        )
+        spec = s.spec(i)
+        pose = resolve(spec)
+        rendering = render_view(spec, pose)
+        exposure = add_stars(spec, pose, rendering, meter(spec, rendering))
+        camera, light = exposure.camera, exposure.light.on_image
+        described = dataclasses.replace(describe(spec, pose), samples_per_pixel=4096, key=99)
+        converged, _ = render.direct(spec.terrain.surface, described)
+        to_e = camera.exposure_s * green_per_second(spec)
+        signal, error = (np.einsum("b,byx->yx", to_e, a) for a in (converged.array, light.array))
+        detector = camera.detector
+        sensor = np.sqrt(signal + detector.read_noise_e_rms**2 + detector.dark_current_e_s * camera.exposure_s)
         lit = (signal > 0.01 * detector.full_well_e) & (signal < 0.9 * detector.full_well_e)
         if lit.sum() < 200:
             continue
@@ -227,7 +233,7 @@ def test_noise_of_sampling_stays_below_the_sensors() -> None:
         # the fraction is a standard deviation: two thirds of the errors lie within it, so ask that those of the
         # 99 % whose deviation is allowed to reach it exceed three of it in no more than another 1 %
         assert np.mean(share > 3 * 0.3) < 0.02
-        assert frame.samples_per_pixel > 16
+        assert rendering.samples_per_pixel > 16
     assert judged >= 3
 
 

@@ -12,9 +12,12 @@ from conftest import ALL_FAULTS, small_scene
 
 from vbnfault import pipeline
 from vbnfault.core import frames
-from vbnfault.pipeline import Session, labels
-from vbnfault.pipeline.photograph import develop, effect_of
+from vbnfault.pipeline import Session, masks
+from vbnfault.pipeline.development import without
+from vbnfault.pipeline.exposure import meter
 from vbnfault.pipeline.record import to_sample
+from vbnfault.pipeline.rendering import render_view
+from vbnfault.pipeline.resolve import resolve
 from vbnfault.pipeline.spec import Frame
 from vbnfault.scene import config, plan
 
@@ -45,15 +48,15 @@ def test_masks_of_defects_lie_exactly_on_their_pixels(frames_: list[Frame]) -> N
     for frame in frames_:
         for k, name in enumerate(frame.spec.faults):
             if name not in frame.drawn:
-                assert not frame.mask[k].any()
+                assert not frame.labels.masks[k].any()
                 continue
             seen.add(name)
-            effect = effect_of(frame, name)
+            effect = frame.injection.development.effect(frame.injection.draws, name)
             assert effect.any(), f"{name} is claimed and not in the pixels"
             if name == "straylight":
-                assert np.array_equal(frame.mask[k], effect)
+                assert np.array_equal(frame.labels.masks[k], effect)
             elif name in ("broken_pixels", "broken_lines"):
-                assert not (effect & ~frame.mask[k]).any()
+                assert not (effect & ~frame.labels.masks[k]).any()
     assert seen == set(ALL_FAULTS)
 
 
@@ -63,7 +66,7 @@ def test_broken_lines_are_whole_lines_of_their_value(frames_: list[Frame]) -> No
     for frame in frames_:
         if "broken_lines" not in frame.drawn:
             continue
-        mask, image = frame.mask[k], frame.images["image"].array
+        mask, image = frame.labels.masks[k], frame.images.image.array
         rows, columns = mask.all(axis=1), mask.all(axis=0)
         rebuilt = rows[:, None] | columns[None, :]
         assert np.array_equal(mask, rebuilt)
@@ -86,7 +89,8 @@ def test_flares_lie_on_the_line_from_the_sun_through_the_centre(frames_: list[Fr
         x, y, z = pose.L_from_C.T @ pose.sun_L
         sun, centre = np.array([fx * x / z + cx, fy * y / z + cy]), np.array([48.0, 40.0])
         along = (centre - sun) / np.linalg.norm(centre - sun)
-        dark = frame.rate.with_array(np.zeros_like(frame.rate.array))
+        rate = frame.exposure.rate.merged
+        dark = rate.with_array(np.zeros_like(rate.array))
         for flare in params["flares"]:
             alone = {**params, "flares": [flare], "glare": None}
             light = fault.apply(dark, alone, frame.context).array[..., 1].astype(float)
@@ -117,9 +121,10 @@ def test_optical_faults_act_in_the_stated_order(frames_: list[Frame]) -> None:
     both = 0
     for frame in frames_:
         drawn, faults, camera = frame.drawn, frame.spec.faults, frame.camera
-        light = frame.rate.with_array(frame.rate.array * np.float32(camera.exposure_s))
+        rate = frame.exposure.rate
+        light = rate.merged.with_array(rate.merged.array * np.float32(camera.exposure_s))
         # the Sun's direct image has met the lens's rims already, and is not vignetted again
-        apart = (frame.rate_apart or frame.rate).array * np.float32(camera.exposure_s)
+        apart = rate.array * np.float32(camera.exposure_s)
         rest = light.with_array(apart)
         for name in order:
             if name in drawn:
@@ -131,7 +136,9 @@ def test_optical_faults_act_in_the_stated_order(frames_: list[Frame]) -> None:
         for name in ("broken_pixels", "broken_lines"):
             if name in drawn:
                 picture = faults[name].apply(picture, drawn[name], frame.context)
-        assert np.array_equal(develop(frame, drawn, None).array, picture.array)
+        assert np.array_equal(
+            frame.injection.development.image(frame.injection.draws, noisy=False).array, picture.array
+        )
         both += "straylight" in drawn and "optics_degradation" in drawn
     assert both >= 1  # else the order of these two would not be seen
 
@@ -140,7 +147,7 @@ def test_sun_is_whole_and_a_flare_is_in_the_frame_where_straylight_is(frames_: l
     for frame in frames_:
         if "straylight" in frame.drawn:
             assert frame.pose.sun_visible_fraction == 1.0
-            assert frame.mask[ALL_FAULTS.index("straylight")].any()
+            assert frame.labels.masks[ALL_FAULTS.index("straylight")].any()
             assert frame.spec.plan.stratum[frame.spec.index] == plan.SUN_FACING
         else:
             angle = np.degrees(np.arccos(frame.pose.L_from_C[:, 2] @ frame.pose.sun_L))
@@ -159,12 +166,12 @@ def test_the_image_without_a_class_equals_the_one_of_a_scene_that_lacks_it(frame
         planned = replace(
             lacking.plan, injected=full.injected[:, columns], stratum=full.stratum, variables=full.variables
         )
-        frame = pipeline.develop_frame(
+        frame = pipeline.simulate_frame(
             replace(frames_[i].spec, scene=lacking.scene, plan=planned, faults=lacking.faults)
         )
-        assert np.array_equal(frame.images["clean"].array, frames_[i].images["clean"].array)
-        want = frames_[i].images[f"without_{dropped}"].array
-        assert np.array_equal(frame.images["image"].array, want)
+        assert np.array_equal(frame.images.clean.array, frames_[i].images.clean.array)
+        want = frames_[i].images.without[dropped].array
+        assert np.array_equal(frame.images.image.array, want)
 
 
 def test_worn_coatings_raise_the_ghosts_of_the_same_picture_alone() -> None:
@@ -190,11 +197,11 @@ def test_worn_coatings_raise_the_ghosts_of_the_same_picture_alone() -> None:
         stratum=s.plan.stratum,
         variables=s.plan.variables,
     )
-    lacking = pipeline.develop_frame(replace(frame.spec, scene=alone.scene, plan=planned, faults=alone.faults))
-    assert np.array_equal(frame.images["without_optics_degradation"].array, lacking.images["image"].array)
+    lacking = pipeline.simulate_frame(replace(frame.spec, scene=alone.scene, plan=planned, faults=alone.faults))
+    assert np.array_equal(frame.images.without["optics_degradation"].array, lacking.images.image.array)
     worn, whole = (sum(g["flux_fraction"] for g in f.drawn["straylight"]["ghosts"]) for f in (frame, lacking))
     assert worn > 1.5 * whole
-    assert frame.images["image"].array.mean() > frame.images["without_optics_degradation"].array.mean()
+    assert frame.images.image.array.mean() > frame.images.without["optics_degradation"].array.mean()
 
 
 def test_a_mosaic_detector_takes_raw_pictures_with_its_own_device() -> None:
@@ -228,13 +235,13 @@ def test_a_mosaic_detector_takes_raw_pictures_with_its_own_device() -> None:
             assert not (kinds[~own] & 7).any()
         assert devices.setdefault(int(sample.scalars["detector_individual"]), detector.seed) == detector.seed
         if "broken_pixels" in frame.drawn:
-            changed = (frame.images["image"].array != frame.images["without_broken_pixels"].array).any(axis=2)
-            mask = frame.mask[list(s.faults).index("broken_pixels")]
-            lines = frame.mask[list(s.faults).index("broken_lines")]
+            changed = (frame.images.image.array != frame.images.without["broken_pixels"].array).any(axis=2)
+            mask = frame.labels.masks[list(s.faults).index("broken_pixels")]
+            lines = frame.labels.masks[list(s.faults).index("broken_lines")]
             assert not (changed & ~mask & ~lines).any()
             assert (changed & mask).any()
         again = s.frame(i)
-        assert np.array_equal(again.images["image"].array, frame.images["image"].array)
+        assert np.array_equal(again.images.image.array, frame.images.image.array)
     assert len(set(devices.values())) == len(devices) > 1
     assert stuck > 10
 
@@ -248,11 +255,11 @@ def test_what_overflows_from_a_track_is_in_its_mask() -> None:
     frame = s.frame(1)
     footprint = s.faults["cosmic_rays"].footprint(frame.drawn["cosmic_rays"], frame.context)
     assert footprint is not None
-    change = np.abs(frame.images["image"].array.astype(int) - frame.images["clean"].array).max(axis=2)
+    change = np.abs(frame.images.image.array.astype(int) - frame.images.clean.array).max(axis=2)
     assert change[~footprint].max() > 5
     # noise rounds to another number here and there, where a trail is too weak to show without it
-    assert change[~frame.mask[0]].max(initial=0) <= 1
-    assert not (footprint & ~frame.mask[0]).any()
+    assert change[~frame.labels.masks[0]].max(initial=0) <= 1
+    assert not (footprint & ~frame.labels.masks[0]).any()
 
 
 def test_clean_twin_differs_only_where_faults_are(frames_: list[Frame]) -> None:
@@ -261,8 +268,8 @@ def test_clean_twin_differs_only_where_faults_are(frames_: list[Frame]) -> None:
     for frame in frames_:
         if not set(frame.drawn) <= {ALL_FAULTS[k] for k in local}:
             continue
-        changed = labels.effect(frame.images["image"].array, frame.images["clean"].array)
-        assert not (changed & ~frame.mask[local].any(axis=0)).any()
+        changed = masks.effect(frame.images.image.array, frame.images.clean.array)
+        assert not (changed & ~frame.labels.masks[local].any(axis=0)).any()
         checked += 1
     assert checked >= 1
 
@@ -298,12 +305,12 @@ def test_surface_points_reproject_to_their_pixels(frames_: list[Frame]) -> None:
 
     checked = 0
     for frame in frames_:
-        body = frame.truth.semantic == 1
+        body = frame.rendering.truth.semantic == 1
         if body.mean() < 0.2:
             continue
         y, x = np.nonzero(body)
         pick = slice(None, None, max(1, len(y) // 200))
-        depth = frame.truth.depth_m[y[pick], x[pick]].astype(float)
+        depth = frame.rendering.truth.depth_m[y[pick], x[pick]].astype(float)
         fx, fy, cx, cy = frame.camera.intrinsics
         in_C = np.stack([(x[pick] + 0.5 - cx) / fx, (y[pick] + 0.5 - cy) / fy, np.ones_like(depth)], -1)
         point = frame.pose.position_L_m + (in_C * depth[:, None]) @ frame.pose.L_from_C.T
@@ -330,12 +337,12 @@ def test_cameras_are_above_ground_and_clear() -> None:
     vertices = low.patch(low.sites[0]).vertices_L_m
     tree = cKDTree(vertices)
     for i in range(16):
-        frame = Frame(spec=low.spec(i))
-        pipeline.STAGES[0](frame)
-        assert frame.pose.resolved
-        p = frame.pose.position_L_m
+        spec = low.spec(i)
+        pose = resolve(spec)
+        assert pose.resolved
+        p = pose.position_L_m
         assert tree.query(p)[0] >= 30.0  # no vertex is nearer than the surface
-        ground = render.ground_height_m(frame.spec.terrain.surface, p[:1], p[1:2], 500.0)[0]
+        ground = render.ground_height_m(spec.terrain.surface, p[:1], p[1:2], 500.0)[0]
         assert -1e-3 <= -p[2] - ground <= 40 + 1e-3
 
 
@@ -343,18 +350,16 @@ def test_metered_exposure_puts_the_percentile_at_its_level() -> None:
     s = session(camera={"metering_level": 0.5, "metering_percentile": 90.0})
     checked = 0
     for i in range(16):
-        frame = Frame(spec=s.spec(i))
-        for stage in pipeline.STAGES[:3]:
-            stage(frame)
-        signal = frame.camera.detector.electrons_expected(
-            frame.camera.lens.image(frame.radiance), frame.camera.exposure_s
-        )
-        share = (signal.array / signal.white_e).max(axis=-1)[frame.truth.semantic == 1]
+        spec = s.spec(i)
+        rendering = render_view(spec, resolve(spec))
+        camera = meter(spec, rendering).camera
+        signal = camera.detector.electrons_expected(camera.lens.image(rendering.light.on_image), camera.exposure_s)
+        share = (signal.array / signal.white_e).max(axis=-1)[rendering.truth.semantic == 1]
         bright = share[share > 0.05]
         if len(bright) < 0.1 * share.size or len(bright) < 500:
             continue
         # metered on a quarter of the pixels, with a slightly different bound of what counts as lit
-        if frame.camera.exposure_s not in (1e-5, 5.0):
+        if camera.exposure_s not in (1e-5, 5.0):
             checked += abs(np.percentile(bright, 90) - 0.5) < 0.05
     assert checked >= 3
 
@@ -364,7 +369,7 @@ def test_a_fixed_exposure_is_kept_and_scales_the_signal() -> None:
     for i in range(8, 12):
         short, long = (session(camera={"exposure_s": t}).frame(i) for t in (0.002, 0.004))
         assert (short.camera.exposure_s, long.camera.exposure_s) == (0.002, 0.004)
-        one, two = (develop(frame, {}, None).array.astype(int) for frame in (short, long))
+        one, two = (frame.injection.development.image({}, noisy=False).array.astype(int) for frame in (short, long))
         shown = (two < 255) & (one > 0)
         # both are rounded to whole numbers, 2 · 0.5 + 0.5, after the converter rounded them to finer ones
         assert not shown.any() or np.abs(two - 2 * one)[shown].max() <= 2
@@ -422,8 +427,8 @@ def test_the_paper_example_has_the_papers_parameters() -> None:
 def test_the_effect_by_rows_equals_the_effect_of_whole_pictures(frames_: list[Frame]) -> None:
     # the pipeline develops only the rows whose signal changes
     for frame in frames_:
-        whole = develop(frame, frame.drawn, None).array
-        for name in frame.drawn:
-            others = {n: params for n, params in frame.drawn.items() if n != name}
-            other = develop(frame, others, None).array
-            assert np.array_equal(effect_of(frame, name), (whole != other).any(axis=-1))
+        development, draws = frame.injection.development, frame.injection.draws
+        whole = development.image(draws, noisy=False).array
+        for name in draws:
+            other = development.image(without(draws, name), noisy=False).array
+            assert np.array_equal(development.effect(draws, name), (whole != other).any(axis=-1))

@@ -10,7 +10,7 @@ from scipy import stats
 from vbnfault import render
 from vbnfault.core import frames
 from vbnfault.pipeline import Session, resolve
-from vbnfault.pipeline.spec import Frame, SampleSpec
+from vbnfault.pipeline.spec import Pose, SampleSpec
 from vbnfault.scene import config, plan
 from vbnfault.world import assemble
 
@@ -18,23 +18,21 @@ N = 2000
 
 
 @pytest.fixture(scope="module")
-def resolved() -> tuple[Session, list[Frame]]:
+def resolved() -> tuple[Session, list[Pose]]:
     table = small_scene(dataset={"samples": N, "sites": 1, "shard_samples": 16}, plan={"faulty_fraction": 0.5})
     session = Session(config.parse_scene(table, source="test"))
     terrain = session.terrain(0)
     out = []
     for i in range(N):
         spec = SampleSpec(index=i, scene=session.scene, plan=session.plan, faults=session.faults, terrain=terrain)
-        frame = Frame(spec=spec)
-        resolve.resolve(frame)
-        out.append(frame)
+        out.append(resolve.resolve(spec))
     return session, out
 
 
-def test_every_sample_is_within_its_bounds_and_clear(resolved: tuple[Session, list[Frame]]) -> None:
-    session, all_frames = resolved
+def test_every_sample_is_within_its_bounds_and_clear(resolved: tuple[Session, list[Pose]]) -> None:
+    session, poses = resolved
     surface = session.terrain(0).surface
-    position = np.stack([f.pose.position_L_m for f in all_frames])
+    position = np.stack([p.position_L_m for p in poses])
     ground = render.ground_height_m(surface, position[:, 0], position[:, 1], 424.3)
     height = -position[:, 2] - ground
     # float32 ground heights of some 100 m: 1e-5 m
@@ -42,49 +40,49 @@ def test_every_sample_is_within_its_bounds_and_clear(resolved: tuple[Session, li
     assert height.max() <= 100 + 1e-3
     assert np.abs(position[:, :2]).max() <= 150
     assert render.is_clear(surface, position, session.scene.geometry.clearance_m).all()
-    elevation = np.array([f.pose.sun_elevation_deg for f in all_frames])
+    elevation = np.array([p.sun_elevation_deg for p in poses])
     facing = session.plan.stratum == plan.SUN_FACING
     assert np.abs(elevation[facing]).max() <= 30
     assert elevation[~facing].min() >= -30
     assert elevation[~facing].max() <= 90
-    assert all(f.pose.resolved for f in all_frames)
+    assert all(p.resolved for p in poses)
 
 
 def test_straylight_samples_see_the_whole_sun_and_averted_ones_do_not_look_at_it(
-    resolved: tuple[Session, list[Frame]],
+    resolved: tuple[Session, list[Pose]],
 ) -> None:
-    session, all_frames = resolved
+    session, poses = resolved
     straylight = session.plan.injects("straylight")
     assert straylight.sum() > 500
-    for frame, has in zip(all_frames, straylight, strict=True):
-        angle = np.degrees(np.arccos(frame.pose.L_from_C[:, 2] @ frame.pose.sun_L))
+    for pose, has in zip(poses, straylight, strict=True):
+        angle = np.degrees(np.arccos(pose.L_from_C[:, 2] @ pose.sun_L))
         if has:
-            assert frame.pose.sun_visible_fraction == 1.0
+            assert pose.sun_visible_fraction == 1.0
             # both angles within ±FoV/2: at most acos(cos² 32.5°) = 44.7° off
             assert angle <= np.degrees(np.arccos(np.cos(np.radians(32.5)) ** 2)) + 1e-6
         else:
             assert angle >= np.sqrt(2) * 32.5 - 1e-6
 
 
-def test_the_pose_is_the_plans_view_of_its_try(resolved: tuple[Session, list[Frame]]) -> None:
-    session, all_frames = resolved
+def test_the_pose_is_the_plans_view_of_its_try(resolved: tuple[Session, list[Pose]]) -> None:
+    session, poses = resolved
     redrawn = 0
-    for i, frame in enumerate(all_frames):
-        v = session.plan.view(session.scene, i, frame.pose.tries - 1)
-        assert frame.pose.variables == v
-        x, y, _ = frame.pose.position_L_m
+    for i, pose in enumerate(poses):
+        v = session.plan.view(session.scene, i, pose.tries - 1)
+        assert pose.variables == v
+        x, y, _ = pose.position_L_m
         assert (x, y) == (v["x_m"], v["y_m"])
-        want = frames.L_from_C(frame.pose.sun_L, v["roll_deg"], v["pitch_deg"], v["yaw_deg"])
-        np.testing.assert_allclose(frame.pose.L_from_C, want, atol=1e-12)
-        assert frame.pose.sun_azimuth_deg == v["sun_azimuth_deg"]
-        assert frame.pose.sun_elevation_deg == v["sun_elevation_deg"]
-        redrawn += frame.pose.tries > 1
+        want = frames.L_from_C(pose.sun_L, v["roll_deg"], v["pitch_deg"], v["yaw_deg"])
+        np.testing.assert_allclose(pose.L_from_C, want, atol=1e-12)
+        assert pose.sun_azimuth_deg == v["sun_azimuth_deg"]
+        assert pose.sun_elevation_deg == v["sun_elevation_deg"]
+        redrawn += pose.tries > 1
     assert redrawn > 200  # the Sun is below the horizon in many a proposal
 
 
-def test_redrawn_samples_follow_the_conditional_distribution(resolved: tuple[Session, list[Frame]]) -> None:
+def test_redrawn_samples_follow_the_conditional_distribution(resolved: tuple[Session, list[Pose]]) -> None:
     """Against rejection sampling of our own: uniform views, kept where the Sun is whole and nothing is near."""
-    session, all_frames = resolved
+    session, poses = resolved
     surface = session.terrain(0).surface
     chosen = np.flatnonzero(session.plan.injects("straylight"))
     rng = np.random.default_rng(2024)
@@ -101,16 +99,16 @@ def test_redrawn_samples_follow_the_conditional_distribution(resolved: tuple[Ses
     assert good.sum() > 300
     want = {"x_m": x, "y_m": y, "height_m": height, "sun_azimuth_deg": azimuth, "sun_elevation_deg": elevation}
     for name, values in want.items():
-        got = [all_frames[i].pose.variables[name] for i in chosen]
+        got = [poses[i].pose.variables[name] for i in chosen]
         # five tests at a joint level of 1e-3; the seed is fixed, so this cannot flicker
         assert stats.ks_2samp(got, values[good]).pvalue > 2e-4, name
-    got_elevation = np.array([all_frames[i].pose.sun_elevation_deg for i in chosen])
-    got_height = np.array([-all_frames[i].pose.position_L_m[2] for i in chosen])
+    got_elevation = np.array([poses[i].pose.sun_elevation_deg for i in chosen])
+    got_height = np.array([-poses[i].pose.position_L_m[2] for i in chosen])
     got_ground = render.ground_height_m(
-        surface, *(np.array([all_frames[i].pose.variables[n] for i in chosen]) for n in ("x_m", "y_m")), 424.3
+        surface, *(np.array([poses[i].pose.variables[n] for i in chosen]) for n in ("x_m", "y_m")), 424.3
     )
     # float32 ground heights of some 100 m
-    planned = [all_frames[i].pose.variables["height_m"] for i in chosen]
+    planned = [poses[i].pose.variables["height_m"] for i in chosen]
     np.testing.assert_allclose(got_height - got_ground, planned, atol=1e-3)
     # and it is no longer the uniform law: low Suns are hidden
     assert stats.kstest(got_elevation, stats.uniform(-30, 60).cdf).pvalue < 1e-6

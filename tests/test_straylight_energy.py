@@ -334,10 +334,11 @@ def test_the_sun_in_a_build_is_vignetted_once() -> None:
     from conftest import small_scene
 
     from vbnfault.pipeline import Session
-    from vbnfault.pipeline.expose import meter, render_frame
-    from vbnfault.pipeline.photograph import _draw, _signal
+    from vbnfault.pipeline.development import Development
+    from vbnfault.pipeline.exposure import meter
+    from vbnfault.pipeline.injection import draw_faults, fault_context
+    from vbnfault.pipeline.rendering import render_view
     from vbnfault.pipeline.resolve import resolve
-    from vbnfault.pipeline.spec import Frame
     from vbnfault.scene import config
 
     table = small_scene(
@@ -349,24 +350,28 @@ def test_the_sun_in_a_build_is_vignetted_once() -> None:
     table["faults"] = {"straylight": {"model": "paraxial"}, "vignetting": {"on_axis_illuminance_dn": 255}}
     session = Session(config.parse_scene(table, source="test"))
     for index in range(16):
-        frame = Frame(spec=session.spec(index))
-        for stage in (resolve, render_frame, meter):
-            stage(frame)
-        sun = frame.context.sun_xy_px
+        spec = session.spec(index)
+        pose = resolve(spec)
+        rendering = render_view(spec, pose)
+        exposure = meter(spec, rendering)
+        context = fault_context(pose, rendering, exposure)
+        sun = context.sun_xy_px
         inside = sun is not None and bool(((sun > 10) & (sun < 54)).all())
-        if frame.rate_apart is not None and frame.pose.sun_visible_fraction == 1 and inside:
+        if exposure.rate.past_rims is not None and pose.sun_visible_fraction == 1 and inside:
             break
     else:
         pytest.fail("no sample has all of the Sun in its frame")
-    assert frame.context.sun_direction_C is not None
-    cosine = float(frame.context.sun_direction_C[2])
-    lens, detector = frame.camera.lens, frame.camera.detector
+    assert context.sun_direction_C is not None
+    cosine = float(context.sun_direction_C[2])
+    lens, detector = context.camera.lens, context.camera.detector
     area = float(lens.pupil_area_mm2(0.0)) / (detector.pixel_pitch_um * 1e-3) ** 2
-    nodes = frame.radiance.wavelength_nm
-    weights = detector.electron_rate_weights(nodes) * frame.sunlight.irradiance_W_m2_nm * lens.transmittance(nodes)
-    admitted = weights.sum(axis=1) * area * cosine * frame.camera.exposure_s
-    _draw(frame, ["vignetting"], attempt=0)
-    plain, dimmed = _signal(frame, frame.drawn, []), _signal(frame, frame.drawn, ["vignetting"])
+    nodes, irradiance = context.wavelength_nm, context.sun_irradiance_W_m2_nm
+    assert nodes is not None
+    weights = detector.electron_rate_weights(nodes) * irradiance * lens.transmittance(nodes)
+    admitted = weights.sum(axis=1) * area * cosine * context.camera.exposure_s
+    development = Development(exposure=exposure, context=context, rng=spec.rng)
+    draws = draw_faults(spec, development, ["vignetting"], {}, attempt=0)
+    plain, dimmed = (development.signal(draws, names) for names in ([], ["vignetting"]))
     assert plain.past_rims is not None
     assert dimmed.past_rims is not None
     # the disc's image is exact in total; float32 sums
@@ -381,7 +386,6 @@ def test_the_mask_level_is_that_of_the_mask() -> None:
 
     from vbnfault.dataset import store_spec
     from vbnfault.pipeline import Session
-    from vbnfault.pipeline.photograph import develop
     from vbnfault.scene import config
 
     table = small_scene(
@@ -396,11 +400,12 @@ def test_the_mask_level_is_that_of_the_mask() -> None:
         frame = session.frame(index)
         if "straylight" not in frame.drawn:
             continue
-        with_it, without = (develop(frame, drawn, None).array.astype(int) for drawn in (frame.drawn, {}))
+        development, draws = frame.injection.development, frame.injection.draws
+        with_it, without = (development.image(d, noisy=False).array.astype(int) for d in (draws, {}))
         change = np.abs(with_it - without).max(axis=2)
-        np.testing.assert_array_equal(frame.mask[0], change >= 40)
-        np.testing.assert_array_equal(frame.effects["straylight"], change >= 1)
-        seen += (frame.mask[0] != frame.effects["straylight"]).any()
+        np.testing.assert_array_equal(frame.labels.masks[0], change >= 40)
+        np.testing.assert_array_equal(frame.labels.effects["straylight"], change >= 1)
+        seen += (frame.labels.masks[0] != frame.labels.effects["straylight"]).any()
     assert seen
     spec = store_spec(session, [16])
     assert spec.mask_kinds == ("strong effect",)

@@ -14,6 +14,7 @@ from vbnfault.core import frames
 from vbnfault.core.errors import InputError, VbnfaultError
 from vbnfault.pipeline import Session, resolve
 from vbnfault.pipeline.record import to_sample
+from vbnfault.pipeline.rendering import render_view
 from vbnfault.pipeline.spec import Frame, Pose, SampleSpec, Terrain
 from vbnfault.scene import config, plan
 
@@ -38,9 +39,7 @@ def spec(s: Session, terrain: Terrain, index: int) -> SampleSpec:
 
 
 def resolved(s: Session, terrain: Terrain, index: int, first_try: int = 0) -> Pose:
-    frame = Frame(spec=spec(s, terrain, index), first_try=first_try)
-    resolve.resolve(frame)
-    return frame.pose
+    return resolve.resolve(spec(s, terrain, index), first_try)
 
 
 # ------------------------------------------------------------------------------------------------- conditions
@@ -126,7 +125,7 @@ def test_a_suns_place_is_kept_as_drawn_where_the_scene_says_so(terrain: Terrain)
         if found.sun_visible_fraction == 0:
             hidden.append(index)
     assert len(hidden) >= 4
-    frame = pipeline.develop_frame(spec(s, terrain, hidden[0]))
+    frame = pipeline.simulate_frame(spec(s, terrain, hidden[0]))
     assert frame.views == 1
     sample = to_sample(frame)
     assert not sample.scalars["injected"].any()
@@ -141,16 +140,16 @@ def test_the_fraction_of_sunlit_ground_agrees_with_the_renderers_angles(terrain:
     """Against the render: pixels that a noise-free frame shows brighter than ground in shadow, which is black."""
     s = session({"vignetting": {}}, geometry={"min_lit_fraction": 0.05}, plan={"faulty_fraction": 0.0})
     for index in range(4):
-        frame = Frame(spec=spec(s, terrain, index))
-        for stage in pipeline.VIEW_STAGES[:2]:
-            stage(frame)
-        lit = (frame.radiance.array.sum(axis=0) > 0) & (frame.truth.semantic == 1)
-        views = resolve._Views.of(frame.spec, frame.pose.tries - 1)
-        told = resolve._lit_fraction(frame.spec, views)[0]
-        assert told >= 0.05
+        sample_spec = spec(s, terrain, index)
+        pose = resolve.resolve(sample_spec)
+        rendering = render_view(sample_spec, pose)
+        lit = (rendering.light.on_image.array.sum(axis=0) > 0) & (rendering.truth.semantic == 1)
+        views = resolve._Views.of(sample_spec, pose.tries - 1)
+        estimate = resolve._lit_fraction(sample_spec, views)[0]
+        assert estimate >= 0.05
         # 576 rays against 7680 pixels of four samples each: a border of shadow through the frame crosses at most
         # 2 · 24 of the grid's cells, each told wrong by half of it
-        assert told == pytest.approx(lit.mean(), abs=24 / 576 + 0.02)
+        assert estimate == pytest.approx(lit.mean(), abs=24 / 576 + 0.02)
 
 
 def test_views_without_lit_ground_are_drawn_again_and_the_strata_may_differ(terrain: Terrain) -> None:
@@ -164,9 +163,9 @@ def test_views_without_lit_ground_are_drawn_again_and_the_strata_may_differ(terr
         more, few = (resolved(s, terrain, index).tries for s in (asked, free))
         tries[stratum].append(more - few)
         if stratum == plan.SUN_AVERTED:
-            frame = Frame(spec=spec(asked, terrain, index))
-            resolve.resolve(frame)
-            assert resolve._lit_fraction(frame.spec, resolve._Views.of(frame.spec, frame.pose.tries - 1))[0] >= 0.3
+            sample_spec = spec(asked, terrain, index)
+            views = resolve._Views.of(sample_spec, resolve.resolve(sample_spec).tries - 1)
+            assert resolve._lit_fraction(sample_spec, views)[0] >= 0.3
     assert not any(tries[plan.SUN_FACING])
     assert sum(tries[plan.SUN_AVERTED]) > 5
 
@@ -193,7 +192,7 @@ ASIDE = {
 @pytest.fixture(scope="module")
 def redrawn(terrain: Terrain) -> tuple[Session, list[Frame]]:
     s = session(DEAD_LINE, plan=EVERY, geometry=ASIDE)
-    return s, [pipeline.develop_frame(spec(s, terrain, i)) for i in range(8)]
+    return s, [pipeline.simulate_frame(spec(s, terrain, i)) for i in range(8)]
 
 
 def test_a_commanded_fault_that_cannot_show_gets_another_view(
@@ -216,14 +215,14 @@ def test_a_commanded_fault_that_cannot_show_gets_another_view(
         np.testing.assert_allclose(frame.pose.L_from_C, frames.L_from_C(down, *angles), atol=1e-12)
         # a view that is kept at once has the bits of a scene that never asks for another
         if frame.views == 1:
-            other = to_sample(pipeline.develop_frame(spec(dropping, terrain, index)))
+            other = to_sample(pipeline.simulate_frame(spec(dropping, terrain, index)))
             assert np.array_equal(other.layers["image"], sample.layers["image"])
     first = next(i for i, n in enumerate(views) if n > 1)
-    dropped = to_sample(pipeline.develop_frame(spec(dropping, terrain, first)))
+    dropped = to_sample(pipeline.simulate_frame(spec(dropping, terrain, first)))
     assert not dropped.scalars["injected"].any()
     assert dropped.scalars["views"] == 1
-    again = to_sample(pipeline.develop_frame(spec(s, terrain, first)))
-    assert np.array_equal(again.layers["image"], all_frames[first].images["image"].array)
+    again = to_sample(pipeline.simulate_frame(spec(s, terrain, first)))
+    assert np.array_equal(again.layers["image"], all_frames[first].images.image.array)
 
 
 def test_the_plans_comparison_knows_the_view_that_was_kept(redrawn: tuple[Session, list[Frame]]) -> None:
@@ -241,7 +240,7 @@ def test_a_fault_that_shows_in_no_view_is_an_error_that_names_it(terrain: Terrai
     night = {"sun_averted": {"reference": "nadir", "roll_deg": [180, 180], "sun_elevation_deg": [-80, -60]}}
     s = session(DEAD_LINE, plan={**EVERY, "max_views": 2}, geometry={"height_m": [5e4, 6e4], **night})
     with pytest.raises(VbnfaultError) as caught:
-        pipeline.develop_frame(spec(s, terrain, 1))
+        pipeline.simulate_frame(spec(s, terrain, 1))
     for part in ("sample 1: broken_lines", "plan.max_views = 2", "plan.on_invisible = 'drop'"):
         assert part in str(caught.value)
 
@@ -294,7 +293,7 @@ def test_a_flown_pose_is_kept_with_its_sun_hidden_and_refused_within_the_ground(
     scene = s.scene.model_copy(update={"spice": spice_table})
     site = terrain.site
 
-    def at(height_m: float, sun_L: list[float], boresight: np.ndarray) -> Frame:
+    def at(height_m: float, sun_L: list[float], boresight: np.ndarray) -> Pose:
         position = site.position_T_m + site.T_from_L @ np.array([0.0, 0.0, -height_m])
         placed = spice.SpacecraftState(
             camera_position_T_m=position, T_from_C=site.T_from_L @ frames.L_from_C0(boresight)
@@ -302,16 +301,14 @@ def test_a_flown_pose_is_kept_with_its_sun_hidden_and_refused_within_the_ground(
         sun_T = site.T_from_L @ frames.unit(np.array(sun_L))
         monkeypatch.setattr(assemble, "spacecraft_pose", lambda *_: placed)
         monkeypatch.setattr(assemble, "ephemeris", lambda *_: (3.0 * sun_T, np.eye(3)))
-        frame = Frame(spec=SampleSpec(index=0, scene=scene, plan=flown, faults=s.faults, terrain=terrain))
-        resolve.resolve(frame)
-        return frame
+        return resolve.resolve(SampleSpec(index=0, scene=scene, plan=flown, faults=s.faults, terrain=terrain))
 
     up, down = np.array([0.0, 0.0, -1.0]), np.array([0.0, 0.0, 1.0])
-    seen = at(500.0, [0, 0.1, -1], up).pose
+    seen = at(500.0, [0, 0.1, -1], up)
     assert seen.resolved
     assert seen.tries == 1  # nothing is drawn in its place
-    assert not at(500.0, [0, 0.1, -1], down).pose.resolved  # behind the camera
-    assert not at(500.0, [0, 0.1, 1], down).pose.resolved  # behind the body
+    assert not at(500.0, [0, 0.1, -1], down).resolved  # behind the camera
+    assert not at(500.0, [0, 0.1, 1], down).resolved  # behind the body
     with pytest.raises(VbnfaultError, match=r"sample 0: .* is within geometry.clearance_m = 0.5 m of the ground"):
         at(float(render.ground_height_m(terrain.surface, np.zeros(1), np.zeros(1), 300.0)[0]) + 0.1, [0, 0, -1], up)
 

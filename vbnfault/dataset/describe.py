@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..pipeline import Session
-from ..pipeline.expose import reference_exposure_s
+from ..pipeline.exposure import reference_exposure_s
 from ..scene import plan
 from ..world import assemble
 from .progress import duration_text, size_text

@@ -16,7 +16,7 @@ from ..core.errors import InputError, VbnfaultError
 from ..detector import Detector
 from ..faults import Fault, belongs_here, plugins_of
 from ..lens import load_lens
-from ..pipeline import labels
+from ..pipeline import masks
 from ..pipeline.record import proposal
 from ..pipeline.spec import mask_any_faults, stored_layers
 from ..scene import config, plan
@@ -141,7 +141,7 @@ def store_spec(session: pipeline.Session, blocks: Sequence[int]) -> StoreSpec:
     layers = tuple(name for name in stored_layers(scene, session.faults) if name != "clean")
     individuals = scene.camera.individuals
     _check_origins(session.faults)
-    kinds = tuple(labels.kind(fault, is_ccd=camera.is_ccd) for fault in session.faults.values())
+    kinds = tuple(masks.kind(fault, is_ccd=camera.is_ccd) for fault in session.faults.values())
     identity, made_with = scene_identity(session), versions()
     if scene.spice.kernels:
         made_with["spiceypy"] = importlib.metadata.version("spiceypy")
@@ -201,7 +201,7 @@ def _mask_rule(kind: str, fault: Fault) -> str:
     """Return the rule of a fault class's mask as a sentence."""
     if kind == "effect":
         return store.EFFECT_RULE
-    rule = labels.footprint_rule(fault)
+    rule = masks.footprint_rule(fault)
     if kind == "strong effect":
         return rule
     return f"{rule}; or {store.EFFECT_RULE}" if "effect" in kind else rule

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, TypeVar
@@ -38,7 +39,8 @@ class FaultContext:
     sun_angular_radius_rad
         Angular radius of the Sun's disc.
     coating_loss
-        Fraction of the coatings' area that another fault of the sample has removed, in [0, 1].
+        Fraction of the coatings' area that another fault of the sample has removed, in [0, 1]. Only a model with
+        `Fault.informed` gets it; for the others it is 0.
     """
 
     camera: Camera
@@ -87,13 +89,12 @@ class FaultContext:
         )
 
     def once(self, name: str, params: Params, make: Callable[[], T]) -> T:
-        """Return `make()`, computed once for each name and params object of this context.
+        """Return `make()`, computed once for each name and content of `params` in this context.
 
         `apply` and `footprint` share the result, so an expensive computation runs only once.
         """
-        key = (name, id(params))
+        key = (name, pickle.dumps(params))
         if key not in self._memo:
-            # the entry holds params, so that no other object can get the same id
-            self._memo[key] = (params, make())
-        result: T = self._memo[key][1]
+            self._memo[key] = make()
+        result: T = self._memo[key]
         return result

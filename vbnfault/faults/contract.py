@@ -73,6 +73,12 @@ class Fault:
         False if the footprint covers about the whole frame.
     needs_sun
         True if the model needs the Sun's position.
+    informed
+        True if the model reads a field of the context that another fault of the sample changes by `inform`. The
+        other models get the context without such changes.
+    thin_lens_only
+        Why the model does not act behind a prescription (`camera.lens`), as the second half of a sentence. "": it
+        does.
     effect_mask
         True if the mask holds the pixels that change (see `effect_level_dn`) instead of the footprint.
     soft_layer
@@ -104,6 +110,8 @@ class Fault:
     steps: ClassVar[tuple[str, ...]]
     localised: ClassVar[bool] = True
     needs_sun: ClassVar[bool] = False
+    informed: ClassVar[bool] = False
+    thin_lens_only: ClassVar[str] = ""
     needs_mosaic: ClassVar[bool] = False
     needs_ccd: ClassVar[bool] = False
     effect_mask: ClassVar[bool] = False
@@ -149,7 +157,7 @@ class Fault:
         return camera
 
     def inform(self, context: FaultContext, params: Params) -> FaultContext:
-        """Return the context for the other faults of the sample, if this fault changes what they act on."""
+        """Return the context for the models with `informed`, if this fault changes what they act on."""
         return context
 
     def apply(self, quantity: Q, params: Params, context: FaultContext) -> Q:

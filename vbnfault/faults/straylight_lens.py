@@ -68,6 +68,7 @@ class _LensStraylight(LensFault):
     step = "electrons"
     needs_sun = True
     packaged_images = "textures"
+    informed = True  # of the coating loss
     effect_mask = True
     soft_layer = "straylight_added"
     adds_past_rims = True

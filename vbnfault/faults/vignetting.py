@@ -36,6 +36,7 @@ class Cos4Vignetting(Fault):
     localised = False
     soft_layer = "vignetting_factor"
     at_rims = True
+    thin_lens_only = "images fall off as its rays do, and cos⁴ would count that twice; use model 'lens'"
 
     on_axis_illuminance_dn: Interval = bounds(
         105, 255, limits=(0, 255), unit="DN of 255", doc="E0: 255 leaves the centre as it is"

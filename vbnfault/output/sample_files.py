@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from ..core.errors import InputError
 from ..core.images import write_exr, write_png
 from ..core.quantities import Sample
-from ..pipeline import labels
+from ..pipeline import masks
 from ..pipeline.record import to_sample
 from ..pipeline.spec import Frame
 from . import contact_sheet
@@ -65,8 +65,8 @@ def annotated(frame: Frame, fault: str) -> NDArray[np.uint8]:
     """
     names = list(frame.spec.faults)
     colour = contact_sheet.COLOURS[names.index(fault) % len(contact_sheet.COLOURS)]
-    picture = np.ascontiguousarray(frame.images["image"].array[..., :3])
-    picture[labels.outline(frame.mask[names.index(fault)])] = colour
+    picture = np.ascontiguousarray(frame.images.image.array[..., :3])
+    picture[masks.outline(frame.labels.masks[names.index(fault)])] = colour
     params, sun = frame.drawn[fault], frame.context.sun_xy_px
     marks = _marks(params, sun, frame.camera.width_px, frame.camera.height_px)
     if marks and sun is not None:
@@ -116,10 +116,10 @@ def _scalars(sample: Sample) -> dict[str, Any]:
 
 def _write_exr(frame: Frame, sample: Sample, path: Path) -> Path:
     """Write radiance, truth and soft layers to one EXR file and return its path."""
-    truth = frame.truth
+    truth, radiance = frame.rendering.truth, frame.exposure.light.on_image
     channels: dict[str, NDArray[Any]] = {
         f"radiance.{wavelength:.1f}nm": np.ascontiguousarray(band)
-        for wavelength, band in zip(frame.radiance.wavelength_nm, frame.radiance.array, strict=True)
+        for wavelength, band in zip(radiance.wavelength_nm, radiance.array, strict=True)
     }
     channels["depth.Z"] = truth.depth_m
     normal = truth.normal.astype(np.float32)

@@ -1,5 +1,6 @@
-"""Make one sample in five stages: resolve the view, render, meter the exposure, take the images, label."""
+"""Make one sample in seven stages, from the view to the labels; `stages` lists them."""
 
-from .session import STAGES, VIEW_STAGES, Session, configure_faults, develop_frame, simulate
+from .session import Session, configure_faults, simulate
+from .stages import simulate_frame
 
-__all__ = ["STAGES", "VIEW_STAGES", "Session", "configure_faults", "develop_frame", "simulate"]
+__all__ = ["Session", "configure_faults", "simulate", "simulate_frame"]

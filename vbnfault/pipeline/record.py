@@ -1,4 +1,4 @@
-"""Collect masks, layers and scalars of a frame by the names of the dataset's arrays."""
+"""Collect layers and scalars of a frame under the names of the dataset's arrays."""
 
 from __future__ import annotations
 
@@ -13,114 +13,118 @@ from ..core.quantities import Sample
 from ..scene import plan
 from ..scene.config import Scene
 from ..world import assemble
-from . import labels
-from .photograph import effect_of, mask_effect_of, soft_layer
+from . import masks
 from .spec import Frame, mask_any_faults, stored_layers
 
 F64 = NDArray[np.float64]
 
-
-def label(frame: Frame) -> None:
-    """Compute the masks of every class, by footprint or by effect."""
-    spec = frame.spec
-    wanted = stored_layers(spec.scene, spec.faults)
-    for name in frame.drawn:
-        fault = spec.faults[name]
-        needed = "mask_effect" in wanted or fault.effect_mask or labels.spreads(fault, frame.context)
-        if needed and name not in frame.effects:
-            frame.effects[name] = effect_of(frame, name)
-    shown = frame.effects | {name: mask_effect_of(frame, name) for name in frame.effects}
-    frame.mask = labels.mask_layers(spec.faults, frame.drawn, frame.context, shown)
+_TRUTH_LAYERS = ("depth_m", "normal", "semantic", "incidence_deg", "emission_deg", "phase_deg")
 
 
 def to_sample(frame: Frame) -> Sample:
     """Return the layers and scalars of the dataset, by the names of its arrays."""
-    spec, pose, i = frame.spec, frame.pose, frame.spec.index
-    site = spec.terrain.site
+    scalars = {**_geometry(frame), **_instrument(frame), **_provenance(frame)}
+    return Sample(index=frame.spec.index, layers=_layers(frame), scalars=scalars)
+
+
+def _layers(frame: Frame) -> dict[str, NDArray[Any]]:
+    """Return the layers that every dataset has, and the optional ones that the scene stores."""
+    spec, images, labels = frame.spec, frame.images, frame.labels
     names = list(spec.faults)
-    available: dict[str, Any] = {
-        "depth_m": frame.truth.depth_m,
-        "normal": frame.truth.normal,
-        "semantic": frame.truth.semantic,
-        "incidence_deg": frame.truth.incidence_deg,
-        "emission_deg": frame.truth.emission_deg,
-        "phase_deg": frame.truth.phase_deg,
-    }
-    soft = {fault.soft_layer: name for name, fault in spec.faults.items() if fault.soft_layer}
     layers: dict[str, Any] = {
-        "image": frame.images["image"].array,
-        "clean": frame.images["clean"].array,
-        "mask": frame.mask,
-        "mask_any": labels.union(frame.mask, names, mask_any_faults(spec.scene, spec.faults)),
+        "image": images.image.array,
+        "clean": images.clean.array,
+        "mask": labels.masks,
+        "mask_any": masks.union(labels.masks, names, mask_any_faults(spec.scene, spec.faults)),
     }
     for name in stored_layers(spec.scene, spec.faults):
         if name.startswith("without_"):
-            layers[name] = frame.images[name].array
+            layers[name] = images.without[name.removeprefix("without_")].array
         elif name == "mask_effect":
             empty = np.zeros(frame.context.shape, dtype=bool)
-            layers[name] = np.stack([frame.effects.get(f, empty) for f in names])
-        elif name in soft:
-            layers[name] = soft_layer(frame, soft[name])
+            layers[name] = np.stack([labels.effects.get(fault, empty) for fault in names])
+        elif name in labels.strengths:
+            layers[name] = labels.strengths[name]
         elif name in ("raw", "defects"):
-            layers[name] = getattr(frame, name)
+            layers[name] = getattr(images, name)
         elif name == "radiance":
-            layers[name] = frame.radiance.array
-        elif name == "albedo" and frame.truth.dust is not None:
-            dust, material = frame.truth.dust, frame.truth.material
+            layers[name] = frame.exposure.light.on_image.array
+        elif name == "albedo" and frame.rendering.truth.dust is not None:
+            dust, material = frame.rendering.truth.dust, frame.rendering.truth.material
             layers[name] = assemble.normal_albedo(spec.scene, dust, material, spec.terrain.vehicle)
         elif name == "point_T_m":
-            layers[name] = _points_T_m(frame)
-        elif name in available:
-            layers[name] = available[name]
+            layers[name] = points_T_m(frame)
+        elif name in _TRUTH_LAYERS:
+            layers[name] = getattr(frame.rendering.truth, name)
+    return layers
+
+
+def _geometry(frame: Frame) -> dict[str, Any]:
+    """Return the position and attitude of camera, site and Sun."""
+    spec, pose = frame.spec, frame.pose
+    site = spec.terrain.site
     T_from_L = site.T_from_L
-    T_from_C = T_from_L @ pose.L_from_C
     sun_T = T_from_L @ pose.sun_L
     sun_xy = frame.context.sun_xy_px
-    angles = tuple(pose.variables[name] for name in ("roll_deg", "pitch_deg", "yaw_deg"))
+    roll, pitch, yaw = (pose.variables[name] for name in ("roll_deg", "pitch_deg", "yaw_deg"))
     if spec.scene.spice.spacecraft:
-        angles = frames.roll_pitch_yaw_deg(pose.sun_L, pose.L_from_C)
-    scalars: dict[str, Any] = {
-        "injected": np.array([name in frame.drawn for name in names]),
+        roll, pitch, yaw = frames.roll_pitch_yaw_deg(pose.sun_L, pose.L_from_C)
+    return {
         "camera_position_T_m": site.position_T_m + T_from_L @ pose.position_L_m,
         "position_L_m": pose.position_L_m,
-        "camera_from_T": frames.quaternion(T_from_C.T),
+        "camera_from_T": frames.quaternion((T_from_L @ pose.L_from_C).T),
         "T_from_L": T_from_L,
         "T_from_J": assemble.target_attitude(spec.scene, sun_T),
         "site_T_m": site.position_T_m,
         "sun_direction_T": sun_T,
         "sun_distance_au": assemble.sun_distance_au(spec.scene),
         "julian_date": spec.scene.sun.julian_date,
-        "intrinsics": frame.camera.intrinsics,
-        "distortion": frame.camera.lens.distortion,
         "sun_azimuth_deg": pose.sun_azimuth_deg,
         "sun_elevation_deg": pose.sun_elevation_deg,
-        "roll_deg": angles[0],
-        "pitch_deg": angles[1],
-        "yaw_deg": angles[2],
+        "roll_deg": roll,
+        "pitch_deg": pitch,
+        "yaw_deg": yaw,
         "sun_xy_px": np.full(2, np.nan) if sun_xy is None else sun_xy,
         "sun_visible_fraction": pose.sun_visible_fraction,
+    }
+
+
+def _instrument(frame: Frame) -> dict[str, Any]:
+    """Return the parameters of camera, exposure and render."""
+    return {
+        "intrinsics": frame.camera.intrinsics,
+        "distortion": frame.camera.lens.distortion,
+        "lens": 0,
+        "detector_individual": int(frame.spec.plan.individual[frame.spec.index]),
         "exposure_s": frame.camera.exposure_s,
-        "samples_per_pixel": frame.samples_per_pixel,
-        "noise_fraction_p99": frame.noise_fraction_p99,
+        "samples_per_pixel": frame.rendering.samples_per_pixel,
+        "noise_fraction_p99": frame.rendering.noise_fraction_p99,
+    }
+
+
+def _provenance(frame: Frame) -> dict[str, Any]:
+    """Return what the plan says about the sample, and what became of it."""
+    spec, pose, i = frame.spec, frame.pose, frame.spec.index
+    return {
+        "injected": np.array([name in frame.drawn for name in spec.faults]),
         "tries": pose.tries,
         "views": frame.views,
         "resolved": pose.resolved,
         "stratum": int(spec.plan.stratum[i]),
         "site": int(spec.plan.site[i]),
-        "lens": 0,
-        "detector_individual": int(spec.plan.individual[i]),
         "split": plan.SPLITS[spec.plan.split[i]],
         "parameters": {
             name: {"model": spec.faults[name].model, **params} for name, params in sorted(frame.drawn.items())
         },
         "proposal": proposal(spec.scene, spec.plan, i, pose.variables),
     }
-    return Sample(index=i, layers=layers, scalars=scalars)
 
 
-def _points_T_m(frame: Frame) -> F64:
+def points_T_m(frame: Frame) -> F64:
     """Return the surface points seen at the pixel centres in T, float64[y, x, 3] in m; NaN on the sky."""
-    depth = np.where(np.isfinite(frame.truth.depth_m), frame.truth.depth_m.astype(np.float64), np.nan)
+    depth = np.where(
+        np.isfinite(frame.rendering.truth.depth_m), frame.rendering.truth.depth_m.astype(np.float64), np.nan
+    )
     slopes = frame.camera.seen_slopes
     seen_C = np.stack([slopes[..., 0] * depth, slopes[..., 1] * depth, depth], axis=-1)
     site, pose = frame.spec.terrain.site, frame.pose

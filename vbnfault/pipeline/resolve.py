@@ -14,7 +14,7 @@ from ..render.description import Sunlight
 from ..scene import plan
 from ..world import assemble
 from ..world.spacecraft import SpacecraftMesh
-from .spec import Frame, Pose, SampleSpec
+from .spec import Pose, SampleSpec
 
 F64 = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -26,8 +26,10 @@ _BATCH = 8
 _LIT_GRID = 24
 
 
-def resolve(frame: Frame) -> None:
-    """Set the pose to the first of the sample's views, in the plan's order, that meets every condition.
+def resolve(spec: SampleSpec, first_try: int = 0) -> Pose:
+    """Return the first of the sample's views, in the plan's order, that meets every condition.
+
+    The views before `first_try` are skipped.
 
     The conditions (`geometry`) are:
 
@@ -44,19 +46,16 @@ def resolve(frame: Frame) -> None:
     VbnfaultError
         No view meets the conditions; the message names the sample and the unmet conditions.
     """
-    if frame.spec.scene.spice.spacecraft:
-        frame.pose = _on_the_trajectory(frame.spec)
-        return
-    most = frame.spec.scene.geometry.max_tries
+    if spec.scene.spice.spacecraft:
+        return _on_the_trajectory(spec)
+    most = spec.scene.geometry.max_tries
     unmet: dict[str, int] = {}
-    for start in range(frame.first_try, frame.first_try + most, _BATCH):
-        views = _Views.of(frame.spec, start)
-        count = min(_BATCH, frame.first_try + most - start)
-        chosen = _first_usable(frame.spec, views, count, unmet)
+    for start in range(first_try, first_try + most, _BATCH):
+        views = _Views.of(spec, start)
+        count = min(_BATCH, first_try + most - start)
+        chosen = _first_usable(spec, views, count, unmet)
         if chosen is not None:
-            frame.pose = views.pose(chosen, start)
-            return
-    spec = frame.spec
+            return views.pose(chosen, start)
     conditions = "; ".join(f"{text} ({n} of {most} tries did not)" for text, n in unmet.items())
     stratum = plan.STRATA[spec.plan.stratum[spec.index]]
     raise VbnfaultError(
@@ -148,10 +147,11 @@ def _first_usable(spec: SampleSpec, views: _Views, count: int, unmet: dict[str, 
     if stratum == plan.SUN_AVERTED:
         least = plan.least_sun_angle_deg(scene)
         met[f"the Sun at least {least:.1f} deg from the boresight"] = views.sun_angle_deg() >= least
-    if geometry.sun_visibility == "required" and any(spec.faults[name].needs_sun for name in spec.commanded):
-        # a Sun behind the camera makes no straylight, so such a view is rejected before it is rendered
+    needing_sun = [name for name in spec.commanded if spec.faults[name].needs_sun]
+    if geometry.sun_visibility == "required" and needing_sun:
+        # with the Sun behind the camera these faults cannot show, so such a view is rejected before it is rendered
         seen = (views.sun_visible == 1.0) & (views.sun_angle_deg() < 90)
-        met["the whole Sun visible before the camera, as straylight needs it"] = seen
+        met[f"the whole Sun visible before the camera, for {', '.join(needing_sun)}"] = seen
     good = np.logical_and.reduce(list(met.values()))
     lit_fraction = plan.strata(scene)[stratum].min_lit_fraction
     if lit_fraction and good[:count].any():

@@ -1,10 +1,4 @@
-"""Run the stages that turn one planned sample into one labelled sample, in physical order.
-
-    resolve ▶ render ▶ meter ▶ photograph ▶ label
-
-All twins share one expensive render. If a commanded fault cannot be visible in a view, the first four stages run
-again with another view. A `Session` runs the stages for any sample of a scene.
-"""
+"""Simulate the samples of one scene: check its faults, and keep plan, body and terrain for all samples."""
 
 from __future__ import annotations
 
@@ -21,7 +15,7 @@ from ..body import Body, Patch, PatchSpec, Site, Sites, cached_patch, choose_sit
 from ..body.refine import GROWTH_POWER
 from ..camera import Camera
 from ..core import activity
-from ..core.errors import InputError, VbnfaultError
+from ..core.errors import InputError
 from ..core.quantities import SOFT_KINDS, Sample
 from ..faults import Fault, dataset_order, from_dict, load_plugins, plugins_of
 from ..scene import config, plan
@@ -29,21 +23,15 @@ from ..scene.config import Scene
 from ..scene.keyed_random import keyed_uniform
 from ..world import assemble
 from ..world.spacecraft import SpacecraftMesh
-from .expose import meter, render_frame
-from .photograph import photograph
-from .record import label, to_sample
-from .resolve import resolve
-from .spec import Frame, SampleSpec, Terrain
+from .record import to_sample
+from .spec import DEFAULT_TWINS, Frame, SampleSpec, Terrain
+from .stages import simulate_frame
 
 if TYPE_CHECKING:
     from ..render import TerrainMesh
 
 # Limit of the slope of an octave of the finest relief: steeper relief would look like needles.
 _STEEPEST_DETAIL = 0.12
-
-# The stages in physical order: first those of each view, then the stage of the view that is kept.
-VIEW_STAGES = (resolve, render_frame, meter, photograph)
-STAGES = (*VIEW_STAGES, label)
 
 
 def simulate(scene: Scene | str | Path, sample: int = 0, *, threads: int | None = None) -> Sample:
@@ -75,43 +63,6 @@ def simulate(scene: Scene | str | Path, sample: int = 0, *, threads: int | None 
     return session.simulate(sample)
 
 
-def develop_frame(spec: SampleSpec) -> Frame:
-    """Run all stages of one sample and return its frame, with everything between radiance and labels.
-
-    If a commanded fault cannot be visible in a view, the sample's next view is used, up to `plan.max_views` views.
-    Raises VbnfaultError that names the sample and the faults if no view shows them.
-    """
-    frame = Frame(spec=spec)
-    while True:
-        for stage in VIEW_STAGES:
-            stage(frame)
-        unseen = _asking_for_another_view(frame)
-        if not unseen:
-            label(frame)
-            return frame
-        if frame.views == spec.scene.plan.max_views:
-            raise VbnfaultError(
-                f"sample {spec.index}: {', '.join(unseen)} cannot be seen in the last of plan.max_views = "
-                f"{frame.views} views that were rendered; change the bounds of the fault or of [geometry], raise "
-                f"max_views, or set plan.on_invisible = 'drop'"
-            )
-        frame = Frame(spec=spec, views=frame.views + 1, first_try=frame.pose.tries)
-
-
-def _asking_for_another_view(frame: Frame) -> list[str]:
-    """Return the commanded faults that are not in the image, but that another view of the sample might show."""
-    spec, scene = frame.spec, frame.spec.scene
-    if scene.plan.on_invisible == "drop" or scene.spice.spacecraft:
-        return []
-    # with "as_drawn" the Sun may be hidden, so faults that need it may be absent
-    as_drawn = scene.geometry.sun_visibility == "as_drawn"
-    return [
-        name
-        for name in spec.commanded
-        if name not in frame.drawn and not (as_drawn and spec.faults[name].needs_sun)
-    ]
-
-
 # --- a session: many samples of one scene ------------------------------------------------------------------
 
 
@@ -128,12 +79,12 @@ def configure_faults(scene: Scene, source: str = "scene") -> dict[str, Fault]:
         plugins_of(faults, scene.plugins)
     except InputError as error:
         raise InputError(f"{source}: {error}") from None
-    if scene.camera.lens and "vignetting" in faults and faults["vignetting"].model == "cos4":
-        raise InputError(
-            f"{source}: faults.vignetting.model = 'cos4': with camera.lens = {scene.camera.lens!r} pictures fall "
-            "off as its rays do, and cos⁴ would count that twice; use model 'lens'"
-        )
     for name, fault in faults.items():
+        if fault.thin_lens_only and scene.camera.lens:
+            raise InputError(
+                f"{source}: faults.{name}.model = {fault.model!r}: with camera.lens = {scene.camera.lens!r} "
+                f"{fault.thin_lens_only}"
+            )
         if fault.needs_mosaic and not scene.camera.detector:
             raise InputError(
                 f"{source}: faults.{name}.model = {fault.model!r}: acts inside a detector with a mosaic; name a "
@@ -146,7 +97,7 @@ def configure_faults(scene: Scene, source: str = "scene") -> dict[str, Fault]:
             )
     soft = [fault.soft_layer for fault in faults.values() if fault.soft_layer]
     for layer in scene.dataset.layers:
-        if layer.startswith("without_") and layer != "without_straylight" and layer[8:] not in faults:
+        if layer.startswith("without_") and layer not in DEFAULT_TWINS and layer[8:] not in faults:
             raise InputError(f"{source}: dataset.layers: {layer!r}: the scene has no such fault")
         if layer.endswith(tuple(f"_{kind}" for kind in SOFT_KINDS)) and layer not in soft:
             known = ", ".join(soft) or "none"
@@ -301,10 +252,10 @@ class Session:
         spec = self.spec(index)
         if not self._compiled:
             activity.begin("compiling of kernels, with the first sample")
-        sample = to_sample(develop_frame(spec))
+        sample = to_sample(simulate_frame(spec))
         self._compiled = True
         return sample
 
     def frame(self, index: int) -> Frame:
-        """Return one sample with everything between radiance and labels."""
-        return develop_frame(self.spec(index))
+        """Return one sample with the outcome of every stage, from its pose to its labels."""
+        return simulate_frame(self.spec(index))

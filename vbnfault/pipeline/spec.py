@@ -1,9 +1,10 @@
-"""Define the data of a sample: terrain, pose, specification, and the frame that the stages fill."""
+"""Define the data of a sample: its specification, and the frozen output of every stage."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -13,15 +14,19 @@ from ..body import Body, Site
 from ..camera import Camera
 from ..core.quantities import RGBI, Electrons, Radiance, Truth
 from ..faults import Fault, FaultContext, Params
-from ..render.description import Sunlight
+from ..lens import Lens
+from ..render.description import RenderInput
 from ..scene import keyed_random, plan
-from ..scene.config import Scene
+from ..scene.config import DatasetTable, Scene
+from ..world import assemble
 from ..world.spacecraft import SpacecraftMesh
 
 if TYPE_CHECKING:
     from ..render import TerrainMesh
+    from .development import Development
 
 F64 = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -78,56 +83,183 @@ class SampleSpec:
         """Return the random generator of this sample for (stage, name)."""
         return keyed_random.rng(self.seed, self.index, stage, name)
 
+    @cached_property
+    def camera(self) -> Camera:
+        """Return the camera of the sample before an exposure is set."""
+        return assemble.base_camera(
+            self.scene,
+            architecture=int(self.plan.architecture[self.index]),
+            readout_direction=int(self.plan.readout_direction[self.index]),
+            individual=int(self.plan.individual[self.index]),
+        )
 
-@dataclass(kw_only=True, eq=False)
-class Frame:
-    """Hold the results of the stages, each of which adds to the frame.
 
-    `views` counts the views of the sample that went through the stages, including this one. `first_try` is the
-    number of views that were drawn before it.
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SceneLight:
+    """Hold the radiance that reaches the lens.
+
+    `rendered` is on the grid of the render. With a lens prescription this grid is that of a pinhole camera with a
+    guard band.
     """
 
-    spec: SampleSpec
-    views: int = 1
-    first_try: int = 0
-    pose: Pose = field(init=False)
-    camera: Camera = field(init=False)
-    sunlight: Sunlight = field(init=False)
-    radiance: Radiance = field(init=False)
-    # rendered radiance and its open sky, including the guard band, if the render has another grid than the image
-    rendered: Radiance | None = None
-    open_sky: NDArray[np.bool_] | None = None
-    truth: Truth = field(init=False)
-    context: FaultContext = field(init=False)
-    rate: Electrons = field(init=False)
-    # `rate` with the Sun's direct image apart, as light past the rims; None if the Sun is not in view
-    rate_apart: Electrons | None = None
-    drawn: dict[str, Params] = field(default_factory=dict)
-    rejected: list[Params] = field(default_factory=list)
-    images: dict[str, RGBI] = field(default_factory=dict)
-    raw: NDArray[np.uint16] | None = None
-    defects: NDArray[np.uint8] | None = None
-    contexts: dict[Any, FaultContext] = field(default_factory=dict)
-    signals: dict[Any, Electrons] = field(default_factory=dict)
-    pictures: dict[Any, RGBI] = field(default_factory=dict)
-    samples_per_pixel: float = float("nan")
+    lens: Lens
+    rendered: Radiance
+
+    @cached_property
+    def on_image(self) -> Radiance:
+        """Return the same radiance on the grid of the image: distorted, but without losses or blur."""
+        return self.lens.on_frame(self.rendered)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Rendering:
+    """Hold the outcome of `render_view`.
+
+    Attributes
+    ----------
+    scene
+        Input of the renderer: the view and its sunlight.
+    light
+        Radiance without stars.
+    truth
+        Truth at the chief rays of the image's pixel centres.
+    open_sky
+        bool[y, x] on the grid of the render: pixels that see neither the body nor the Sun. None if the scene has no
+        stars.
+    samples_per_pixel
+        Mean number of samples of a pixel.
+    noise_fraction_p99
+        99th percentile over the lit pixels of the sampling noise as a fraction of the sensor's noise. NaN if
+        `render.noise_fraction` is not set.
+    """
+
+    scene: RenderInput
+    light: SceneLight
+    truth: Truth
+    open_sky: Mask | None
+    samples_per_pixel: float
     noise_fraction_p99: float = float("nan")
-    mask: NDArray[np.bool_] = field(init=False)
-    effects: dict[str, NDArray[np.bool_]] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Exposure:
+    """Hold the outcome of `meter`, to which `add_stars` adds the stars.
+
+    `camera` has its exposure. `rate` are the electrons expected after one second of `light`; `Electrons.past_rims`
+    holds those of the Sun's disc.
+    """
+
+    camera: Camera
+    light: SceneLight
+    rate: Electrons
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Draw:
+    """Hold one draw of a fault.
+
+    `attempt` counts the draws of this fault for the sample over all its views. So the fault's class and `attempt`
+    together identify the draw.
+    """
+
+    fault: Fault
+    attempt: int
+    params: Params
 
     @property
-    def imaged(self) -> Radiance:
-        """Return the radiance that enters the lens, on the grid of the render."""
-        return self.radiance if self.rendered is None else self.rendered
+    def key(self) -> tuple[str, int]:
+        """Return the fault class and the attempt, which identify the draw within its sample."""
+        return self.fault.fault, self.attempt
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Injection:
+    """Hold the outcome of `inject_faults`: the draws of the faults that are in the image, by class.
+
+    `development` computes images of the exposure with any of these faults.
+    """
+
+    draws: Mapping[str, Draw]
+    development: Development
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Images:
+    """Hold the outcome of `take_images`.
+
+    `without` holds the twins that lack one fault, by the fault's class. `raw` uint16[y, x] is the mosaic, `defects`
+    uint8[y, x] are the bits of `quantities.DEFECTS`; both are None if the scene does not store them.
+    """
+
+    image: RGBI
+    clean: RGBI
+    without: Mapping[str, RGBI]
+    raw: NDArray[np.uint16] | None = None
+    defects: NDArray[np.uint8] | None = None
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Labels:
+    """Hold the outcome of `label`.
+
+    Attributes
+    ----------
+    masks
+        bool[fault, y, x]: the mask of each class of the scene, in dataset order.
+    effects
+        bool[y, x]: the pixels of the noise-free image that change by 1 DN or more without a fault, by class, for
+        the injected faults whose effect is stored or needed by their mask.
+    strengths
+        [y, x]: how strongly a fault acts on each pixel, by the names of the stored soft layers.
+    """
+
+    masks: Mask
+    effects: Mapping[str, Mask]
+    strengths: Mapping[str, NDArray[Any]]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Frame:
+    """Hold the outcome of every stage of one sample. `views` counts the views that were rendered for it."""
+
+    spec: SampleSpec
+    views: int
+    pose: Pose
+    rendering: Rendering
+    exposure: Exposure
+    injection: Injection
+    images: Images
+    labels: Labels
+
+    @property
+    def camera(self) -> Camera:
+        """Return the camera with its exposure and without faults."""
+        return self.exposure.camera
+
+    @property
+    def context(self) -> FaultContext:
+        """Return the sample as its faults see it."""
+        return self.injection.development.context
+
+    @property
+    def drawn(self) -> dict[str, Params]:
+        """Return the parameters of the faults that are in the image, by class."""
+        return {name: draw.params for name, draw in self.injection.draws.items()}
+
+
+# The twins among the default layers: a scene may list them without having their faults.
+DEFAULT_TWINS = frozenset(
+    layer for layer in DatasetTable.model_fields["layers"].default if layer.startswith("without_")
+)
 
 
 def stored_layers(scene: Scene, faults: Mapping[str, Fault]) -> tuple[str, ...]:
     """Return the optional layers that the dataset stores.
 
-    The default layers include a twin without straylight, which is left out if the scene has no straylight.
+    The default layers include the twin without one class, which is left out if the scene lacks this class.
     """
-    idle = "without_straylight" if plan.STRAYLIGHT not in faults else None
-    return tuple(layer for layer in scene.dataset.layers if layer != idle)
+    present = {f"without_{name}" for name in faults}
+    return tuple(layer for layer in scene.dataset.layers if layer not in DEFAULT_TWINS - present)
 
 
 def mask_any_faults(scene: Scene, faults: Mapping[str, Fault]) -> tuple[str, ...]:

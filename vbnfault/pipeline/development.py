@@ -1,0 +1,250 @@
+"""Compute the images of one exposure with any set of its drawn faults.
+
+All images share radiance, exposure and noise, so they differ by the faults alone. Results that several images share
+are computed once. They are kept by the draws that they depend on, each identified by its fault class and attempt.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..camera import Camera
+from ..core.quantities import RGBI, Electrons
+from ..faults import MOSAIC_STEPS, Fault, FaultContext, act, physical_order
+from . import masks
+from .spec import Draw, Exposure
+
+Draws = Mapping[str, Draw]
+Keys = tuple[tuple[str, int], ...]
+Mask = NDArray[np.bool_]
+
+
+def acting_at(draws: Draws, step: str) -> list[str]:
+    """Return the drawn faults that act at a step, in physical order."""
+    return [name for name in physical_order(draws) if step in draws[name].fault.steps]
+
+
+def without(draws: Draws, left_out: str) -> dict[str, Draw]:
+    """Return the draws without those of one fault."""
+    return {name: draw for name, draw in draws.items() if name != left_out}
+
+
+def _keys(draws: Draws, names: Iterable[str]) -> Keys:
+    """Return the keys of some draws."""
+    return tuple(draws[name].key for name in names)
+
+
+class Development:
+    """Develop images of one exposure, each with its own set of drawn faults.
+
+    Parameters
+    ----------
+    exposure
+        Camera and light.
+    context
+        The sample as its faults see it, before a fault informs others.
+    rng
+        Function that returns the random generator of the sample for (stage, name).
+
+    All methods take the draws by fault class. Two draws with equal keys must be the same draw.
+    """
+
+    def __init__(
+        self, *, exposure: Exposure, context: FaultContext, rng: Callable[[str, str], np.random.Generator]
+    ) -> None:
+        self.exposure = exposure
+        self.context = context
+        self._rng = rng
+        self._cameras: dict[Keys, Camera] = {(): exposure.camera}
+        self._contexts: dict[Keys, FaultContext] = {(): context}
+        self._signals: dict[Any, Electrons] = {}
+        self._images: dict[Any, RGBI] = {}
+        self._effects: dict[Any, Mask] = {}
+
+    @cached_property
+    def noise(self) -> Any:
+        """Return the variates of the exposure, which all its images share."""
+        return self.exposure.camera.detector.draw_noise(
+            self.context.shape, lambda name: self._rng("detector", name)
+        )
+
+    # --- camera and context ----------------------------------------------------------------------------------
+
+    def camera_with(self, draws: Draws) -> Camera:
+        """Return the camera as the drawn faults alter it."""
+        altering = _altering(draws)
+        key = _keys(draws, altering)
+        if key not in self._cameras:
+            camera = self.exposure.camera
+            for name in altering:
+                camera = draws[name].fault.alter(camera, draws[name].params)
+            self._cameras[key] = camera
+        return self._cameras[key]
+
+    def leaves_camera(self, draws: Draws) -> bool:
+        """Return whether the drawn faults leave the camera unaltered."""
+        return self.camera_with(draws) == self.exposure.camera
+
+    def context_of(self, fault: Fault, draws: Draws) -> FaultContext:
+        """Return the context in which a fault acts beside the drawn ones."""
+        informing = _informing(fault, draws)
+        key = _keys(draws, informing)
+        if key not in self._contexts:
+            context = self.context
+            for name in informing:
+                context = draws[name].fault.inform(context, draws[name].params)
+            self._contexts[key] = context
+        return self._contexts[key]
+
+    # --- light -----------------------------------------------------------------------------------------------
+
+    def signal(self, draws: Draws, names: Sequence[str]) -> Electrons:
+        """Return the expected electrons with the optical faults `names`, in physical order, of those drawn."""
+        key = (self._instrument(draws), _acting_keys(draws, names))
+        if key not in self._signals:
+            if names:
+                *before, last = names
+                draw = draws[last]
+                context = self.context_of(draw.fault, draws)
+                self._signals[key] = act(draw.fault, self.signal(draws, before), draw.params, context)
+            else:
+                self._signals[key] = self._undisturbed(draws)
+        return self._signals[key]
+
+    def _instrument(self, draws: Draws) -> Keys:
+        """Return the keys of the faults that alter the camera, if its expected electrons differ for them."""
+        if self.camera_with(draws).optics == self.exposure.camera.optics:
+            return ()
+        return _keys(draws, _altering(draws))
+
+    def _undisturbed(self, draws: Draws) -> Electrons:
+        """Return the expected electrons of the camera as the drawn faults alter it, without their own light."""
+        camera = self.camera_with(draws)
+        if self._instrument(draws):
+            return camera.expose(self.exposure.light.rendered, camera.exposure_s)
+        return self.exposure.rate.scaled(camera.exposure_s)
+
+    # --- images ----------------------------------------------------------------------------------------------
+
+    def image(self, draws: Draws, *, noisy: bool = True) -> RGBI:
+        """Return the finished image with the drawn faults, with or without the noise of the exposure."""
+        readout = acting_at(draws, "rgbi")
+        key = (*self._image_key(draws, noisy), _keys(draws, readout))
+        if key not in self._images:
+            before = self._before_readout(draws, noisy)
+            self._images[key] = self._read_out(before, draws) if readout else before
+        return self._images[key]
+
+    def _image_key(self, draws: Draws, noisy: bool) -> tuple[Any, ...]:
+        """Return a key of everything on which the image before readout faults depends."""
+        inside = [name for step in ("electrons", *MOSAIC_STEPS) for name in acting_at(draws, step)]
+        return _keys(draws, _altering(draws)), _acting_keys(draws, inside), noisy
+
+    def _before_readout(self, draws: Draws, noisy: bool) -> RGBI:
+        """Return the image with the drawn faults, except those that act on the finished image."""
+        key = (*self._image_key(draws, noisy), ())
+        if key not in self._images:
+            camera = self.camera_with(draws)
+            signal = self.signal(draws, acting_at(draws, "electrons")).merged
+            noise = self.noise if noisy else None
+            self._images[key] = camera.detector.develop(signal, camera.exposure_s, noise, self._acts(draws))
+        return self._images[key]
+
+    def _read_out(self, image: RGBI, draws: Draws) -> RGBI:
+        """Return the image with the drawn faults that act on the finished image."""
+        for name in acting_at(draws, "rgbi"):
+            draw = draws[name]
+            image = draw.fault.apply(image, draw.params, self.context_of(draw.fault, draws))
+        return image
+
+    def _acts(self, draws: Draws) -> dict[str, list[Callable[[Any], Any]]]:
+        """Return the changes that the drawn faults make inside a detector with a mosaic, by its steps."""
+        return {
+            step: [
+                draws[name].fault.act_at(step, draws[name].params, self.context_of(draws[name].fault, draws))
+                for name in acting_at(draws, step)
+            ]
+            for step in MOSAIC_STEPS
+        }
+
+    def raw(self, draws: Draws) -> NDArray[np.uint16]:
+        """Return the raw mosaic of the image, uint16[y, x], before the faults that act on the finished image."""
+        camera = self.camera_with(draws)
+        signal = self.signal(draws, acting_at(draws, "electrons")).merged
+        return camera.mosaic.raw(signal, camera.exposure_s, self.noise, self._acts(draws))
+
+    def defects(self, draws: Draws) -> NDArray[np.uint8]:
+        """Return the defects of the mosaic's pixels, uint8[y, x]: those of the device and those of the faults."""
+        camera = self.exposure.camera
+        defects = camera.mosaic.device.defects(camera.exposure_s, self.noise)
+        for draw in draws.values():
+            more = draw.fault.defects(draw.params, self.context_of(draw.fault, draws))
+            if more is not None:
+                defects |= more
+        return defects
+
+    # --- effects ---------------------------------------------------------------------------------------------
+
+    def effect(self, draws: Draws, name: str, least_dn: float = 1.0) -> Mask:
+        """Return where the noise-free image changes by `least_dn` or more without one drawn fault, bool[y, x].
+
+        The 8-bit image is digital, so every change is at least 1 DN.
+        """
+        key = (frozenset(_keys(draws, draws)), name, max(1.0, least_dn))
+        if key not in self._effects:
+            self._effects[key] = self._effect(draws, name, least_dn)
+        return self._effects[key]
+
+    def _effect(self, draws: Draws, name: str, least_dn: float) -> Mask:
+        """Return `effect`, computed anew."""
+        others = without(draws, name)
+        if not self.is_local(draws, name):
+            with_it, lacking = (self.image(d, noisy=False).array for d in (draws, others))
+            return masks.effect(with_it, lacking, least_dn)
+        # only pixels whose signal differs can change, so only these are developed
+        optical = acting_at(draws, "electrons")
+        whole, part = (self.signal(d, [n for n in optical if n in d]).merged for d in (draws, others))
+        differ = whole.array != part.array
+        changed = np.flatnonzero(np.logical_or.reduce([differ[..., k] for k in range(differ.shape[2])]))
+        if not len(changed):
+            return np.zeros(self.context.shape, dtype=bool)
+        with_it = self.image(draws, noisy=False).array
+        array = self._before_readout(draws, False).array.copy()
+        # arrange these pixels as the rows of an image, and fill up the last row
+        width = self.context.shape[1]
+        filled = np.resize(changed, (-(-len(changed) // width), width))
+        pixels = part.array.reshape(-1, part.array.shape[2])[filled]
+        camera = self.exposure.camera
+        developed = camera.detector.develop(part.with_array(pixels), camera.exposure_s, None).array
+        array.reshape(-1, 4)[changed] = developed.reshape(-1, 4)[: len(changed)]
+        return masks.effect(with_it, self._read_out(RGBI(array=array), others).array, least_dn)
+
+    def is_local(self, draws: Draws, name: str) -> bool:
+        """Return whether a drawn fault changes only those pixels whose expected electrons it changes."""
+        detector = self.exposure.camera.detector
+        return "electrons" in draws[name].fault.steps and self.leaves_camera(draws) and detector.local
+
+
+def _altering(draws: Draws) -> list[str]:
+    """Return the drawn faults that may alter the camera, in physical order."""
+    return [name for name in physical_order(draws) if type(draws[name].fault).alter is not Fault.alter]
+
+
+def informs(fault: Fault) -> bool:
+    """Return whether a fault may inform other faults of its sample."""
+    return type(fault).inform is not Fault.inform
+
+
+def _informing(fault: Fault, draws: Draws) -> list[str]:
+    """Return the drawn faults that inform a fault, in physical order."""
+    return [name for name in physical_order(draws) if informs(draws[name].fault)] if fault.informed else []
+
+
+def _acting_keys(draws: Draws, names: Iterable[str]) -> tuple[tuple[tuple[str, int], Keys], ...]:
+    """Return the keys of some draws, each with the keys of the draws that inform its fault."""
+    return tuple((draws[name].key, _keys(draws, _informing(draws[name].fault, draws))) for name in names)

@@ -1,0 +1,71 @@
+"""Set the exposure of a sample: fixed, or metered on its sunlit ground."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import reduce
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..camera import Camera
+from ..core.quantities import BODY, Electrons, Radiance, Truth
+from ..reflectance import radiance_factor
+from ..scene.config import Scene
+from ..world import assemble
+from .spec import Exposure, Rendering, SampleSpec
+
+# The metered exposure stays within these factors of the exposure for a facet lit at 45 degrees. So a small area of
+# grazing light does not make the whole frame noisy.
+_METERING_RANGE = (0.25, 8.0)
+
+
+def meter(spec: SampleSpec, rendering: Rendering) -> Exposure:
+    """Set the exposure: fixed, or metered once on the noise-free, fault-free frame. All twins share it."""
+    rate = spec.camera.expose(rendering.light.rendered, 1.0)
+    seconds = exposure_s(spec.scene, spec.camera, rendering.truth, rate.merged)
+    return Exposure(camera=replace(spec.camera, exposure_s=seconds), light=rendering.light, rate=rate)
+
+
+def exposure_s(scene: Scene, camera: Camera, truth: Truth, rate: Electrons) -> float:
+    """Return the fixed or the metered exposure in s; `rate` are the electrons expected after one second."""
+    fixed = scene.camera.exposure_s
+    return metered_exposure_s(scene, camera, truth, rate) if fixed == "auto" else float(fixed)
+
+
+def reference_exposure_s(scene: Scene, camera: Camera) -> float:
+    """Return the exposure in s that puts ground whose normal is 45 degrees from the Sun at the metering level."""
+    half = np.sqrt(0.5)
+    reflected = radiance_factor(assemble.ground_reflectance(scene), [0, half, half], [half, 0, half])[:, 0] / np.pi
+    sunlight = assemble.sunlight(scene, np.array([0.0, 0.0, -1.0]))  # the direction does not matter
+    facet = (reflected * sunlight.irradiance_W_m2_nm).astype(np.float32).reshape(-1, 1, 1)
+    wavelength = assemble.wavelengths_nm(scene)
+    per_second = rate_on_axis(camera, Radiance(array=facet, wavelength_nm=wavelength))
+    facet_brightness = float(_brightness(per_second.array, per_second.white_e).max())
+    return float(scene.camera.metering_level / max(facet_brightness, 1e-30))
+
+
+def metered_exposure_s(scene: Scene, camera: Camera, truth: Truth, rate: Electrons) -> float:
+    """Return the exposure in s that puts a percentile of the sunlit ground at the metering level, within limits."""
+    settings = scene.camera
+    reference = reference_exposure_s(scene, camera)
+    # every second row and column is enough for a percentile
+    body = truth.semantic[::2, ::2] == BODY
+    brightness = _brightness(rate.array[::2, ::2], rate.white_e)[body]
+    brightness = brightness[brightness > 0.02 / reference]  # sunlit: above a fiftieth of the reference facet
+    exposure = reference
+    if len(brightness) >= 64:
+        metered = settings.metering_level / float(np.percentile(brightness, settings.metering_percentile))
+        low, high = _METERING_RANGE
+        exposure = float(np.clip(metered, low * reference, high * reference))
+    return float(np.clip(exposure, settings.exposure_min_s, settings.exposure_max_s))
+
+
+def rate_on_axis(camera: Camera, radiance: Radiance) -> Electrons:
+    """Return the electrons expected after one second of radiance of any shape, as if all of it were on the axis."""
+    return camera.detector.electrons_expected(camera.lens.on_axis(radiance), 1.0)
+
+
+def _brightness(electrons: NDArray[np.float32], white_e: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return the greatest of a pixel's channels as a fraction of white, float32[y, x]."""
+    return np.asarray(reduce(np.maximum, np.moveaxis(electrons / white_e, -1, 0)))

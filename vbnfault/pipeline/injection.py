@@ -1,0 +1,162 @@
+"""Draw the commanded faults of a sample so that each is visible in its image."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+
+from ..faults import MOSAIC_STEPS, FaultContext
+from . import masks
+from .development import Development, Draws, acting_at, informs
+from .spec import Draw, Exposure, Injection, Pose, Rendering, SampleSpec
+
+_DRAW_TRIES = 8
+# If a step changes a pixel by this many DN, the change survives every later optical step within the paper's tables
+# (cos⁴ at 255 → 105 keeps 41 %). Such a fault counts as visible without a full comparison.
+_CLEARLY_VISIBLE_DN = 6.0
+
+
+def inject_faults(
+    spec: SampleSpec, pose: Pose, rendering: Rendering, exposure: Exposure, views: int = 1
+) -> Injection:
+    """Draw the commanded faults, `views` being the number of views of the sample that were rendered so far.
+
+    A fault without a visible effect is drawn again a few times, then left out. So the result holds the faults that
+    are in the image, and labels never claim more.
+    """
+    commanded = list(spec.commanded)
+    if not pose.resolved or pose.sun_visible_fraction == 0:
+        commanded = [name for name in commanded if not spec.faults[name].needs_sun]
+    development = Development(exposure=exposure, context=fault_context(pose, rendering, exposure), rng=spec.rng)
+    # every view uses new draws: a draw that is invisible in one view is not tried again in the next
+    attempt = (views - 1) * _DRAW_TRIES
+    last = attempt + _DRAW_TRIES - 1
+    # noise and the clean image use one core, the optics of the faults another
+    development.signal({}, [])
+    with ThreadPoolExecutor(1) as aside:
+        clean = aside.submit(development.image, {})
+        draws = draw_faults(spec, development, commanded, {}, attempt)
+        _prepare_signals(development, draws)
+        clean.result()
+    while invisible := _invisible(development, draws, stored="mask_effect" in spec.scene.dataset.layers):
+        draws = {name: draw for name, draw in draws.items() if name not in invisible}
+        attempt += 1
+        if attempt <= last:
+            draws = draw_faults(spec, development, commanded, draws, attempt)
+    return Injection(draws=draws, development=development)
+
+
+def fault_context(pose: Pose, rendering: Rendering, exposure: Exposure) -> FaultContext:
+    """Return the sample as its faults see it."""
+    direction_C = pose.L_from_C.T @ pose.sun_L
+    sunlight = rendering.scene.sun
+    return FaultContext(
+        camera=exposure.camera,
+        sun_xy_px=exposure.camera.project(direction_C),
+        sun_direction_C=direction_C,
+        sun_irradiance_W_m2_nm=sunlight.irradiance_W_m2_nm,
+        wavelength_nm=exposure.light.rendered.wavelength_nm,
+        sun_angular_radius_rad=sunlight.angular_radius_rad,
+        sun_visible_fraction=pose.sun_visible_fraction,
+    )
+
+
+def draw_faults(
+    spec: SampleSpec, development: Development, commanded: Sequence[str], draws: Draws, attempt: int
+) -> dict[str, Draw]:
+    """Return the draws, together with one of each commanded fault that they lack; first of those that inform."""
+    complete = dict(draws)
+    for name in sorted(commanded, key=lambda n: not informs(spec.faults[n])):
+        if name not in complete:
+            fault = spec.faults[name]
+            context = development.context_of(fault, complete)
+            params = fault.draw(context, spec.rng("fault", f"{name}/{attempt}"))
+            complete[name] = Draw(fault=fault, attempt=attempt, params=params)
+    return complete
+
+
+def _prepare_signals(development: Development, draws: Draws) -> None:
+    """Compute the signals that image and labels need in any case."""
+    optical = acting_at(draws, "electrons")
+    development.signal(draws, optical)
+    for name in optical:
+        if draws[name].fault.effect_mask:
+            development.signal(draws, [n for n in optical if n != name])
+
+
+# --- visibility --------------------------------------------------------------------------------------------
+
+
+def _invisible(development: Development, draws: Draws, *, stored: bool) -> list[str]:
+    """Return the drawn faults without any effect on the noise-free image.
+
+    `stored` says that the scene stores all effects, so no cheaper test is needed.
+    """
+
+    def is_invisible(name: str) -> bool:
+        return not development.effect(draws, name, draws[name].fault.effect_level_dn).any()
+
+    if stored:
+        return [name for name in draws if is_invisible(name)]
+    doubtful = sorted(_doubtful(development, draws))
+    return [n for n in doubtful if not _shows_on_some_rows(development, draws, n) and is_invisible(n)]
+
+
+def _shows_on_some_rows(development: Development, draws: Draws, name: str) -> bool:
+    """Return whether an optical fault is already visible in every eighth row of the noise-free image.
+
+    False does not mean that the fault is invisible.
+    """
+    if not development.is_local(draws, name):
+        return False
+    context, camera = development.context, development.exposure.camera
+    optical = acting_at(draws, "electrons")
+    rows = slice(context.shape[0] // 32, None, 8)
+    images = []
+    for names in (optical, [n for n in optical if n != name]):
+        signal = development.signal(draws, names).merged
+        some = signal.with_array(np.ascontiguousarray(signal.array[rows]))
+        images.append(camera.detector.develop(some, camera.exposure_s, None).array)
+    visible = masks.effect(images[0], images[1], draws[name].fault.effect_level_dn)
+    for other in acting_at(draws, "rgbi"):
+        overwritten = draws[other].fault.footprint(draws[other].params, context)
+        if overwritten is not None:
+            visible &= ~overwritten[rows]
+    return bool(visible.any())
+
+
+def _doubtful(development: Development, draws: Draws) -> set[str]:
+    """Return the drawn faults that a cheap test does not show to be clearly visible."""
+    if not development.leaves_camera(draws):
+        return set(draws)
+    doubtful = {
+        name
+        for name, draw in draws.items()
+        if draw.fault.effect_mask or not set(MOSAIC_STEPS).isdisjoint(draw.fault.steps)
+    }
+    optical, context = acting_at(draws, "electrons"), development.context
+    # these pixels are enough to see a clearly visible fault; the whole effect decides about the others
+    some = (slice(context.shape[0] // 32, None, 16), slice(None, None, 4))
+    for k, name in enumerate(optical):
+        before, after = (
+            np.minimum(q.array[some], q.white_e) * (255 / q.white_e)
+            for q in (development.signal(draws, optical[: k + n]).merged for n in (0, 1))
+        )
+        if np.abs(after - before).max(initial=0) < _CLEARLY_VISIBLE_DN:
+            doubtful.add(name)
+    image = development.image({name: draws[name] for name in optical})
+    clearly_changed = []
+    for name in acting_at(draws, "rgbi"):
+        changed_image = draws[name].fault.apply(image, draws[name].params, context)
+        pixels = np.flatnonzero(masks.effect(changed_image.array, image.array))
+        was, now = (q.array.reshape(-1, 4)[pixels].astype(np.int16) for q in (image, changed_image))
+        clearly_changed.append((name, pixels[(np.abs(now - was) >= _CLEARLY_VISIBLE_DN).any(axis=1)]))
+        image = changed_image
+    overwritten = np.zeros(context.shape[0] * context.shape[1], dtype=bool)
+    for name, pixels in reversed(clearly_changed):  # changes that a later fault overwrites do not count
+        if overwritten[pixels].all():
+            doubtful.add(name)
+        overwritten[pixels] = True
+    return doubtful

@@ -1,0 +1,100 @@
+"""Compute the masks of faults: the pixels on which a fault acts, or the pixels that it changes.
+
+The mask of a class is its *footprint*. Classes that label by *effect* (straylight) are the exception. Their mask is
+the pixels of the noise-free image that change by at least `Fault.effect_level_dn` DN (1 by default) when the fault
+is switched off. So where a broken line or saturation overwrites a flare, the mask of the flare is empty. In a CCD,
+charge may leave the footprint of a fault; then the mask is the union of footprint and effect.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable, Mapping
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ..faults import Fault, FaultContext, Params
+
+Mask = NDArray[np.bool_]
+
+# Steps of a mosaic detector after which charge may still leave the pixels on which a fault acts.
+_MOVES = {"light", "pixels", "charge"}
+
+
+def effect(image: NDArray[np.uint8], without: NDArray[np.uint8], least_dn: float = 1.0) -> Mask:
+    """Return where two noise-free 8 bit images differ by `least_dn` or more in any channel, bool[y, x]."""
+    if least_dn > 1:
+        return np.asarray((cv2.absdiff(image, without) >= least_dn).any(axis=2))
+    # compare the four 8 bit channels as one 32 bit word
+    a, b = (np.ascontiguousarray(x).view(np.uint32)[..., 0] for x in (image, without))
+    return a != b
+
+
+def kind(fault: Fault, *, is_ccd: bool) -> str:
+    """Return what the mask of a fault is: "footprint", "effect", "footprint and effect" or "strong effect".
+
+    A strong effect is one whose threshold is above 1 DN.
+    """
+    if fault.effect_mask:
+        return "effect" if fault.effect_level_dn <= 1 else "strong effect"
+    return "footprint and effect" if is_ccd and _moves(fault) else "footprint"
+
+
+def _moves(fault: Fault) -> bool:
+    """Return whether a fault acts at a step after which charge may still move."""
+    return not _MOVES.isdisjoint(fault.steps)
+
+
+def footprint_rule(fault: Fault) -> str:
+    """Return a text that says which pixels the mask of a fault holds, with its thresholds (fields mask_*)."""
+    thresholds = [f for f in dataclasses.fields(fault) if f.name.startswith("mask_")]
+    rules = []
+    for f in thresholds:
+        unit = f.metadata.get("unit", "")
+        rules.append(f"{f.metadata['doc']}: {f.name} = {getattr(fault, f.name):g}{unit and ' ' + unit}")
+    return "; ".join(rules) or "the pixels that the fault acts on"
+
+
+def mask_layers(
+    faults: Mapping[str, Fault],
+    drawn: Mapping[str, Params],
+    context: FaultContext,
+    effects: Mapping[str, Mask],
+) -> Mask:
+    """Return the masks of all classes, bool[fault, y, x], in the order of `faults`.
+
+    Classes that are not in `drawn` have empty masks. `effects` holds the effect masks, bool[y, x], of the classes
+    that need them.
+    """
+    out = np.zeros((len(faults), *context.shape), dtype=bool)
+    for k, (name, fault) in enumerate(faults.items()):
+        if name not in drawn:
+            continue
+        mask = effects[name] if fault.effect_mask else fault.footprint(drawn[name], context)
+        if mask is not None and spreads(fault, context):
+            mask = mask | effects[name]
+        if mask is not None:
+            out[k] = mask
+    return out
+
+
+def spreads(fault: Fault, context: FaultContext) -> bool:
+    """Return whether a fault's charge may leave its footprint.
+
+    In a CCD, charge overflows along columns and traps make trails.
+    """
+    return _moves(fault) and kind(fault, is_ccd=context.camera.is_ccd) == "footprint and effect"
+
+
+def union(masks: Mask, faults: Iterable[str], members: Iterable[str]) -> Mask:
+    """Return where any of the classes `members` has its mask, bool[y, x]."""
+    chosen = set(members)
+    return np.asarray(masks[[name in chosen for name in faults]].any(axis=0))
+
+
+def outline(mask: Mask) -> Mask:
+    """Return the inner border of a mask, bool[y, x]."""
+    solid = mask.astype(np.uint8)
+    return mask & (cv2.erode(solid, np.ones((3, 3), np.uint8)) == 0)

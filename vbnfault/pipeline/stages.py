@@ -1,0 +1,112 @@
+"""Run the stages that turn one planned sample into one labelled frame, in physical order.
+
+    resolve ▶ render_view ▶ meter ▶ add_stars ▶ inject_faults ▶ take_images ▶ label
+
+Each stage is a function from frozen inputs to a frozen output. All twins share one expensive render. If a commanded
+fault cannot be visible in a view, the stages up to `inject_faults` run again with the next view of the sample.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import ParamSpec, Protocol, TypeVar
+
+from ..core.errors import VbnfaultError
+from .exposure import meter
+from .images import take_images
+from .injection import inject_faults
+from .labels import label
+from .rendering import render_view
+from .resolve import resolve
+from .spec import Exposure, Frame, Injection, Pose, Rendering, SampleSpec
+from .stars import add_stars
+
+P = ParamSpec("P")
+T = TypeVar("T")
+
+
+class StageRunner(Protocol):
+    """Call a stage with its inputs and return its output, for example to measure how long it takes."""
+
+    def __call__(self, stage: Callable[P, T], /, *inputs: P.args, **options: P.kwargs) -> T: ...
+
+
+def run_stage(stage: Callable[P, T], /, *inputs: P.args, **options: P.kwargs) -> T:
+    """Call a stage with its inputs and return its output."""
+    return stage(*inputs, **options)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _RenderedView:
+    """Hold the outcomes of the stages that run for every view of a sample."""
+
+    pose: Pose
+    rendering: Rendering
+    exposure: Exposure
+    injection: Injection
+
+
+def simulate_frame(spec: SampleSpec, run: StageRunner = run_stage) -> Frame:
+    """Run all stages of one sample and return its frame.
+
+    If a commanded fault cannot be visible in a view, the sample's next view is used, up to `plan.max_views` views.
+
+    Parameters
+    ----------
+    spec
+        The sample.
+    run
+        Function that calls each stage.
+
+    Raises
+    ------
+    VbnfaultError
+        Names the sample and the faults that no view shows.
+    """
+    views = 1
+    view = _take_view(spec, run, views=1, first_try=0)
+    while unseen := _asking_for_another_view(spec, view.injection):
+        if views == spec.scene.plan.max_views:
+            raise VbnfaultError(
+                f"sample {spec.index}: {', '.join(unseen)} cannot be seen in the last of plan.max_views = {views} "
+                f"views that were rendered; change the bounds of the fault or of [geometry], raise max_views, or "
+                f"set plan.on_invisible = 'drop'"
+            )
+        views, first_try = views + 1, view.pose.tries
+        del view  # release its memory before the next render
+        view = _take_view(spec, run, views=views, first_try=first_try)
+    return Frame(
+        spec=spec,
+        views=views,
+        pose=view.pose,
+        rendering=view.rendering,
+        exposure=view.exposure,
+        injection=view.injection,
+        images=run(take_images, spec, view.injection),
+        labels=run(label, spec, view.injection),
+    )
+
+
+def _take_view(spec: SampleSpec, run: StageRunner, *, views: int, first_try: int) -> _RenderedView:
+    """Run the stages of one view; `first_try` views of the plan were drawn before it."""
+    pose = run(resolve, spec, first_try)
+    rendering = run(render_view, spec, pose)
+    metered = run(meter, spec, rendering)
+    exposure = run(add_stars, spec, pose, rendering, metered)
+    injection = run(inject_faults, spec, pose, rendering, exposure, views)
+    return _RenderedView(pose=pose, rendering=rendering, exposure=exposure, injection=injection)
+
+
+def _asking_for_another_view(spec: SampleSpec, injection: Injection) -> list[str]:
+    """Return the commanded faults that are not in the image, but that another view of the sample might show."""
+    scene = spec.scene
+    if scene.plan.on_invisible == "drop" or scene.spice.spacecraft:
+        return []
+    # with "as_drawn" the Sun may be hidden, so faults that need it may be absent
+    as_drawn = scene.geometry.sun_visibility == "as_drawn"
+    return [
+        name
+        for name in spec.commanded
+        if name not in injection.draws and not (as_drawn and spec.faults[name].needs_sun)
+    ]
