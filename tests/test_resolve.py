@@ -99,16 +99,16 @@ def test_redrawn_samples_follow_the_conditional_distribution(resolved: tuple[Ses
     assert good.sum() > 300
     want = {"x_m": x, "y_m": y, "height_m": height, "sun_azimuth_deg": azimuth, "sun_elevation_deg": elevation}
     for name, values in want.items():
-        got = [poses[i].pose.variables[name] for i in chosen]
+        got = [poses[i].variables[name] for i in chosen]
         # five tests at a joint level of 1e-3; the seed is fixed, so this cannot flicker
         assert stats.ks_2samp(got, values[good]).pvalue > 2e-4, name
-    got_elevation = np.array([poses[i].pose.sun_elevation_deg for i in chosen])
-    got_height = np.array([-poses[i].pose.position_L_m[2] for i in chosen])
+    got_elevation = np.array([poses[i].sun_elevation_deg for i in chosen])
+    got_height = np.array([-poses[i].position_L_m[2] for i in chosen])
     got_ground = render.ground_height_m(
-        surface, *(np.array([poses[i].pose.variables[n] for i in chosen]) for n in ("x_m", "y_m")), 424.3
+        surface, *(np.array([poses[i].variables[n] for i in chosen]) for n in ("x_m", "y_m")), 424.3
     )
     # float32 ground heights of some 100 m
-    planned = [poses[i].pose.variables["height_m"] for i in chosen]
+    planned = [poses[i].variables["height_m"] for i in chosen]
     np.testing.assert_allclose(got_height - got_ground, planned, atol=1e-3)
     # and it is no longer the uniform law: low Suns are hidden
     assert stats.kstest(got_elevation, stats.uniform(-30, 60).cdf).pvalue < 1e-6
