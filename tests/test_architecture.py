@@ -136,7 +136,7 @@ def test_the_walk_reads_every_form_of_import() -> None:
     found = {(i.module, i.target, i.at_load) for i in imports()}
     assert ("scene.plan", "vbnfault.scene.config", True) in found  # from . import config
     assert ("scene.plan", "vbnfault.core.errors", True) in found  # from ..core.errors import InputError
-    assert ("pipeline.stars", "vbnfault.world", True) in found  # from ..world import assemble
+    assert ("pipeline.spec", "vbnfault.render.description", True) in found  # from ..render.description import …
     assert ("faults.contract", "vbnfault.camera", True) in found  # from ..camera import Camera
     assert ("body.patch", "vbnfault.body.noise", True) in found  # from vbnfault.body.noise import …
     assert ("pipeline.resolve", "vbnfault.render", False) in found  # within a function

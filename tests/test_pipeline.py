@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections import Counter
 from dataclasses import replace
 from typing import Any
 
@@ -202,6 +203,76 @@ def test_worn_coatings_raise_the_ghosts_of_the_same_picture_alone() -> None:
     worn, whole = (sum(g["flux_fraction"] for g in f.drawn["straylight"]["ghosts"]) for f in (frame, lacking))
     assert worn > 1.5 * whole
     assert frame.images.image.array.mean() > frame.images.without["optics_degradation"].array.mean()
+
+
+def test_light_is_traced_once_for_each_state_of_the_coatings(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Straylight depends on the coatings' loss; the shadows of dust do not, so they are computed once."""
+    from vbnfault.faults import dust_lens, straylight_lens
+
+    calls: Counter[str] = Counter()
+
+    def counted(module: Any, name: str) -> None:
+        original = getattr(module, name)
+
+        def count(*inputs: Any, **options: Any) -> Any:
+            calls[name] += 1
+            return original(*inputs, **options)
+
+        monkeypatch.setattr(module, name, count)
+
+    counted(straylight_lens, "straylight")
+    counted(dust_lens, "_shadows")
+    faults = {
+        "straylight": {"model": "paraxial"},
+        "dust_on_optics": {"model": "defocused"},
+        "optics_degradation": {"model": "contamination"},
+    }
+    layers = ["clean", "mask_effect", "straylight_added", "dust_opacity", *(f"without_{name}" for name in faults)]
+    scene = small_scene(
+        camera={"width_px": 48, "height_px": 48},
+        dataset={"layers": layers},
+        plan={"faulty_fraction": 1.0, "mode": "per_class"},
+    )
+    s = Session(config.parse_scene({**scene, "faults": faults}, source="test"))
+    whole = []
+    for i in range(3):
+        calls.clear()
+        draws = s.frame(i).injection.draws
+        if {draw.key for draw in draws.values()} == {(name, 0) for name in faults}:
+            whole.append(dict(calls))
+    # with the worn coatings, and with whole ones where the degradation is left out
+    assert whole
+    assert all(count == {"straylight": 2, "_shadows": 1} for count in whole), whole
+
+
+def test_a_redrawn_fault_leaves_the_draws_and_results_of_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A degradation that changes nothing is drawn until it is given up; dust is drawn and computed once."""
+    from vbnfault.faults import degradation_lens, dust_lens
+
+    calls: Counter[str] = Counter()
+    classes = {"dust": dust_lens.DefocusedDust, "degradation": degradation_lens.Contamination}
+    for label, cls in classes.items():
+
+        def draw(self: Any, *inputs: Any, label: str = label, original: Any = cls.draw) -> Any:
+            calls[label] += 1
+            return original(self, *inputs)
+
+        monkeypatch.setattr(cls, "draw", draw)
+    shadows = dust_lens._shadows
+    monkeypatch.setattr(dust_lens, "_shadows", lambda *inputs: calls.update(["shadows"]) or shadows(*inputs))
+    nothing = {"haze": 0.0, "scratches": 0, "dose_krad": 0.0, "coating_loss": 0.0}
+    faults = {
+        "dust_on_optics": {"model": "defocused"},
+        "optics_degradation": {"model": "contamination", **nothing},
+    }
+    plan_ = {"faulty_fraction": 1.0, "mode": "per_class", "on_invisible": "drop"}
+    camera = {"width_px": 48, "height_px": 48}
+    for layers in (["clean"], ["clean", "mask_effect"]):
+        calls.clear()
+        scene = {**small_scene(camera=camera, plan=plan_, dataset={"layers": layers}), "faults": faults}
+        frame = Session(config.parse_scene(scene, source="test")).frame(0)
+        assert [draw.key for draw in frame.injection.draws.values()] == [("dust_on_optics", 0)]
+        assert calls == {"dust": 1, "degradation": 8, "shadows": 1}
 
 
 def test_a_mosaic_detector_takes_raw_pictures_with_its_own_device() -> None:

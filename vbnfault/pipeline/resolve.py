@@ -27,11 +27,9 @@ _LIT_GRID = 24
 
 
 def resolve(spec: SampleSpec, first_try: int = 0) -> Pose:
-    """Return the first of the sample's views, in the plan's order, that meets every condition.
+    """Return the pose of the first of the sample's views, in the plan's order, that meets every condition.
 
-    The views before `first_try` are skipped.
-
-    The conditions (`geometry`) are:
+    The search begins at the view with index `first_try`. The conditions (`geometry`) are:
 
     - no surface lies within the clearance
     - camera and spacecraft are above the ground
@@ -48,20 +46,20 @@ def resolve(spec: SampleSpec, first_try: int = 0) -> Pose:
     """
     if spec.scene.spice.spacecraft:
         return _on_the_trajectory(spec)
-    most = spec.scene.geometry.max_tries
+    max_tries = spec.scene.geometry.max_tries
     unmet: dict[str, int] = {}
-    for start in range(first_try, first_try + most, _BATCH):
+    for start in range(first_try, first_try + max_tries, _BATCH):
         views = _Views.of(spec, start)
-        count = min(_BATCH, first_try + most - start)
+        count = min(_BATCH, first_try + max_tries - start)
         chosen = _first_usable(spec, views, count, unmet)
         if chosen is not None:
             return views.pose(chosen, start)
-    conditions = "; ".join(f"{text} ({n} of {most} tries did not)" for text, n in unmet.items())
+    conditions = "; ".join(f"{text} ({n} of {max_tries} tries did not)" for text, n in unmet.items())
     stratum = plan.STRATA[spec.plan.stratum[spec.index]]
     raise VbnfaultError(
         f"sample {spec.index} ({stratum}, site {spec.plan.site[spec.index]}): no view met every condition in "
-        f"geometry.max_tries = {most} tries: {conditions}; widen the bounds of [geometry], relax the condition, or "
-        f"raise max_tries"
+        f"geometry.max_tries = {max_tries} tries: {conditions}; widen the bounds of [geometry], relax the "
+        f"condition, or raise max_tries"
     )
 
 
@@ -165,8 +163,8 @@ def _first_usable(spec: SampleSpec, views: _Views, count: int, unmet: dict[str, 
         if not render.is_between(surface, views.position_L_m[k], parts):
             return int(k)
         met.setdefault("the spacecraft above the ground", np.ones(len(good), dtype=bool))[k] = False
-    for text, each in met.items():
-        failed = int(np.count_nonzero(~each[:count]))
+    for text, is_met in met.items():
+        failed = int(np.count_nonzero(~is_met[:count]))
         if failed:
             unmet[text] = unmet.get(text, 0) + failed
     return None
@@ -188,9 +186,9 @@ def _lit_fraction(spec: SampleSpec, views: _Views) -> F64:
 
 def _grid_rays_C(fov_deg: float, height_over_width: float) -> F64:
     """Return unit directions through the centres of a grid of cells over the frame, float64[ray, 3]."""
-    at = (np.arange(_LIT_GRID) + 0.5) / _LIT_GRID * 2 - 1
+    centres = (np.arange(_LIT_GRID) + 0.5) / _LIT_GRID * 2 - 1
     slope = np.tan(np.radians(fov_deg) / 2)
-    x, y = np.meshgrid(slope * at, slope * height_over_width * at)
+    x, y = np.meshgrid(slope * centres, slope * height_over_width * centres)
     rays = np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3)
     return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))
 
@@ -211,11 +209,11 @@ def _on_the_trajectory(spec: SampleSpec) -> Pose:
     from .. import render
 
     scene, site, surface = spec.scene, spec.terrain.site, spec.terrain.surface
-    placed = assemble.spacecraft_pose(scene, scene.sun.julian_date)
+    spacecraft = assemble.spacecraft_pose(scene, scene.sun.julian_date)
     sun_J_au, T_from_J = assemble.ephemeris(scene)
     L_from_T = site.T_from_L.T
-    position = L_from_T @ (placed.camera_position_T_m - site.position_T_m)
-    axes, sun_L = L_from_T @ placed.T_from_C, L_from_T @ T_from_J @ frames.unit(sun_J_au)
+    position = L_from_T @ (spacecraft.camera_position_T_m - site.position_T_m)
+    axes, sun_L = L_from_T @ spacecraft.T_from_C, L_from_T @ T_from_J @ frames.unit(sun_J_au)
     light = assemble.sunlight(scene, sun_L)
     visible = float(render.sun_visible_fraction(surface, position[None], [light], axes[None])[0])
     azimuth, elevation = frames.azimuth_elevation_deg(sun_L)

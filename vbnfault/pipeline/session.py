@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -67,7 +67,20 @@ def simulate(scene: Scene | str | Path, sample: int = 0, *, threads: int | None 
 
 
 def configure_faults(scene: Scene, source: str = "scene") -> dict[str, Fault]:
-    """Return the scene's faults in dataset order. Raises InputError if faults or layers do not fit the scene."""
+    """Return the scene's faults in dataset order.
+
+    Parameters
+    ----------
+    scene
+        The scene.
+    source
+        Name of the scene in messages.
+
+    Raises
+    ------
+    InputError
+        A fault is unknown or does not fit the camera, or the dataset stores a layer that no fault of the scene has.
+    """
     try:
         load_plugins(scene.plugins)  # a worker has not read the scene file
     except InputError as error:
@@ -95,9 +108,19 @@ def configure_faults(scene: Scene, source: str = "scene") -> dict[str, Fault]:
                 f"{source}: faults.{name}: acts on charge that a CCD moves, and camera.detector = "
                 f"{scene.camera.detector!r} is a CMOS sensor; leave the fault out, or name a CCD"
             )
+    _check_layers(scene, faults, source)
+    return faults
+
+
+def _check_layers(scene: Scene, faults: Mapping[str, Fault], source: str) -> None:
+    """Raise InputError if the dataset stores what the scene's camera and faults do not have."""
     soft = [fault.soft_layer for fault in faults.values() if fault.soft_layer]
     for layer in scene.dataset.layers:
-        if layer.startswith("without_") and layer not in DEFAULT_TWINS and layer[8:] not in faults:
+        if (
+            layer.startswith("without_")
+            and layer not in DEFAULT_TWINS
+            and layer.removeprefix("without_") not in faults
+        ):
             raise InputError(f"{source}: dataset.layers: {layer!r}: the scene has no such fault")
         if layer.endswith(tuple(f"_{kind}" for kind in SOFT_KINDS)) and layer not in soft:
             known = ", ".join(soft) or "none"
@@ -111,7 +134,6 @@ def configure_faults(scene: Scene, source: str = "scene") -> dict[str, Fault]:
         if name not in faults:
             known = ", ".join(faults) or "none"
             raise InputError(f"{source}: dataset.mask_any: {name!r}: the scene has no such fault; it has: {known}")
-    return faults
 
 
 class Session:
@@ -242,8 +264,8 @@ class Session:
         """
         scene, site = self.scene, int(self.plan.site[index])
         if scene.spice.spacecraft:
-            share = float(keyed_uniform(scene.dataset.seed, np.array([index]), "plan", "epoch")[0])
-            sun = scene.sun.model_copy(update={"julian_date": assemble.epoch_jd(scene, site, share)})
+            fraction = float(keyed_uniform(scene.dataset.seed, np.array([index]), "plan", "epoch")[0])
+            sun = scene.sun.model_copy(update={"julian_date": assemble.epoch_jd(scene, site, fraction)})
             scene = scene.model_copy(update={"sun": sun})
         return SampleSpec(index=index, scene=scene, plan=self.plan, faults=self.faults, terrain=self.terrain(site))
 

@@ -20,6 +20,10 @@ _PLAIN = (dict, list, str, int, float, bool, type(None))
 _MAX_DRAWS = 100
 
 
+class _NotInformed:
+    """Stand for what other faults say to a model that does not state `informed = True`: any use of it fails."""
+
+
 def check_fault(
     model: type[Fault], *, required: Mapping[str, Any] | None = None, examples: int = 12, seed: int = 0
 ) -> None:
@@ -55,6 +59,9 @@ def check_fault(
         context = draw_context(rng, architectures=CCDS if model.needs_ccd else ARCHITECTURES)
         if model.needs_mosaic:
             context = with_mosaic(context)
+        if not model.informed:
+            not_informed: Any = _NotInformed()
+            context = replace(context, coating_loss=not_informed)
         try:
             _check_round_trips(fault)
             _check_instrument(fault, context, k)
