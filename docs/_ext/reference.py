@@ -12,12 +12,16 @@ import json
 import re
 import tomllib
 from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
 from typing import Any
+
+_SCENES = Path(__file__).parents[2] / "scenes"
 
 # The unit that the end of a key's name states; the longest one that fits counts.
 _UNITS = {
     "_W_m2_nm": "W m⁻² nm⁻¹",
     "_arcsec": "arcsec",
+    "_aspheric_mm": "mm⁻³, mm⁻⁵, …",
     "_au": "au",
     "_days": "d",
     "_deg": "°",
@@ -493,19 +497,22 @@ def api() -> str:
 
 
 def catalogue() -> str:
-    """Return the packaged scenes, lenses and detectors with their descriptions and figures."""
+    """Return the packaged scenes, lenses and detectors with their descriptions, and the figures of the scenes."""
     from vbnfault.core import resources
 
     parts = []
     for title, folder in (("Scenes", "scenes"), ("Lenses", "scenes/lenses"), ("Detectors", "scenes/detectors")):
-        files = sorted(resources.data_dir(folder).glob("*.toml"))
-        rows = []
-        for file in files:
+        rows, figures = [], []
+        for file in sorted(resources.data_dir(folder).glob("*.toml")):
             table = tomllib.loads(file.read_text(encoding="utf-8"))
             rows.append(
                 (f"`{file.stem}`", table.get("description", table.get("name", "")), table.get("source", ""))
             )
+            if (_SCENES / f"{file.stem}.png").exists():
+                text = f"Samples of the scene {file.stem}"
+                figures.append(f"### {file.stem}\n\n![{text}](../../scenes/{file.stem}.png)\n")
         parts.append(f"## {title}\n\n" + _table(("name", "what it is", "source"), rows))
+        parts += figures
     return "\n".join(parts)
 
 
