@@ -21,7 +21,7 @@ from vbnfault.core.images import write_png
 from vbnfault.faults import registry
 from vbnfault.pipeline import Session, masks
 from vbnfault.pipeline.development import Development
-from vbnfault.pipeline.spec import Draw, Exposure, Frame, SceneLight
+from vbnfault.pipeline.spec import Draw, Frame, SceneExposure, SceneLight
 from vbnfault.scene.config import load_scene
 from vbnfault.world.assemble import mosaic_sensor
 
@@ -76,7 +76,7 @@ def _dark(frame: Frame, exposure_s: float) -> Development:
     camera = replace(frame.camera, exposure_s=exposure_s)
     rate, light = frame.exposure.rate.merged, frame.exposure.light
     black = light.rendered.with_array(np.zeros_like(light.rendered.array))
-    exposure = Exposure(
+    exposure = SceneExposure(
         camera=camera,
         light=SceneLight(lens=light.lens, rendered=black),
         rate=rate.with_array(np.zeros_like(rate.array)),

@@ -17,7 +17,7 @@ from ..camera import Camera
 from ..core.quantities import RGBI, Electrons
 from ..faults import MOSAIC_STEPS, Fault, FaultContext, act, physical_order
 from . import masks
-from .spec import Draw, Exposure
+from .spec import Draw, SceneExposure
 
 Draws = Mapping[str, Draw]
 Keys = tuple[tuple[str, int], ...]
@@ -55,7 +55,7 @@ class Development:
     """
 
     def __init__(
-        self, *, exposure: Exposure, context: FaultContext, rng: Callable[[str, str], np.random.Generator]
+        self, *, exposure: SceneExposure, context: FaultContext, rng: Callable[[str, str], np.random.Generator]
     ) -> None:
         self.exposure = exposure
         self.context = context

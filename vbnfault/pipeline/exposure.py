@@ -13,18 +13,18 @@ from ..core.quantities import BODY, Electrons, Radiance, Truth
 from ..reflectance import radiance_factor
 from ..scene.config import Scene
 from ..world import assemble
-from .spec import Exposure, Rendering, SampleSpec
+from .spec import Rendering, SampleSpec, SceneExposure
 
 # The metered exposure stays within these factors of the exposure for a facet lit at 45 degrees. So a small area of
 # grazing light does not make the whole frame noisy.
 _METERING_RANGE = (0.25, 8.0)
 
 
-def meter(spec: SampleSpec, rendering: Rendering) -> Exposure:
+def meter(spec: SampleSpec, rendering: Rendering) -> SceneExposure:
     """Set the exposure: fixed, or metered once on the noise-free, fault-free frame. All twins share it."""
     rate = spec.camera.expose(rendering.light.rendered, 1.0)
     seconds = exposure_s(spec.scene, spec.camera, rendering.truth, rate.merged)
-    return Exposure(camera=replace(spec.camera, exposure_s=seconds), light=rendering.light, rate=rate)
+    return SceneExposure(camera=replace(spec.camera, exposure_s=seconds), light=rendering.light, rate=rate)
 
 
 def exposure_s(scene: Scene, camera: Camera, truth: Truth, rate: Electrons) -> float:

@@ -10,7 +10,7 @@ import numpy as np
 from ..faults import MOSAIC_STEPS, FaultContext
 from . import masks
 from .development import Development, Draws, acting_at, informs
-from .spec import Draw, Exposure, Injection, Pose, Rendering, SampleSpec
+from .spec import Draw, Injection, Pose, Rendering, SampleSpec, SceneExposure
 
 _DRAW_TRIES = 8
 # If a step changes a pixel by this many DN, the change survives every later optical step within the paper's tables
@@ -19,7 +19,7 @@ _CLEARLY_VISIBLE_DN = 6.0
 
 
 def inject_faults(
-    spec: SampleSpec, pose: Pose, rendering: Rendering, exposure: Exposure, views: int = 1
+    spec: SampleSpec, pose: Pose, rendering: Rendering, exposure: SceneExposure, views: int = 1
 ) -> Injection:
     """Draw the commanded faults, `views` being the number of views of the sample that were rendered so far.
 
@@ -48,7 +48,7 @@ def inject_faults(
     return Injection(draws=draws, development=development)
 
 
-def fault_context(pose: Pose, rendering: Rendering, exposure: Exposure) -> FaultContext:
+def fault_context(pose: Pose, rendering: Rendering, exposure: SceneExposure) -> FaultContext:
     """Return the sample as its faults see it."""
     direction_C = pose.L_from_C.T @ pose.sun_L
     sunlight = rendering.scene.sun

@@ -142,7 +142,7 @@ class Rendering:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Exposure:
+class SceneExposure:
     """Hold the outcome of `meter`, to which `add_stars` adds the stars.
 
     `camera` has its exposure. `rate` are the electrons expected after one second of `light`; `Electrons.past_rims`
@@ -226,7 +226,7 @@ class Frame:
     views: int
     pose: Pose
     rendering: Rendering
-    exposure: Exposure
+    exposure: SceneExposure
     injection: Injection
     images: Images
     labels: Labels

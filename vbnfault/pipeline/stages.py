@@ -19,7 +19,7 @@ from .injection import inject_faults
 from .labels import label
 from .rendering import render_view
 from .resolve import resolve
-from .spec import Exposure, Frame, Injection, Pose, Rendering, SampleSpec
+from .spec import Frame, Injection, Pose, Rendering, SampleSpec, SceneExposure
 from .stars import add_stars
 
 P = ParamSpec("P")
@@ -43,7 +43,7 @@ class _RenderedView:
 
     pose: Pose
     rendering: Rendering
-    exposure: Exposure
+    exposure: SceneExposure
     injection: Injection
 
 

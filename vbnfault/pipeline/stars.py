@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import replace
 
 from ..world import assemble
-from .spec import Exposure, Pose, Rendering, SampleSpec, SceneLight
+from .spec import Pose, Rendering, SampleSpec, SceneExposure, SceneLight
 
 
-def add_stars(spec: SampleSpec, pose: Pose, rendering: Rendering, exposure: Exposure) -> Exposure:
+def add_stars(spec: SampleSpec, pose: Pose, rendering: Rendering, exposure: SceneExposure) -> SceneExposure:
     """Add the stars that the exposure can show. They are added after metering, so they do not affect it."""
     if rendering.open_sky is None:
         return exposure
