@@ -29,8 +29,8 @@ _SCHEMA = "https://json-schema.org/draft/2020-12/schema"
 _MOST_NAMED = 5
 # Names that pydantic puts into an error's location for the alternatives of a union.
 _ALTERNATIVE = re.compile(r"(str|float|int|bool)$|(constrained|literal|function|tuple|list|dict|lax|json)\b")
-# A message of a model's own check that begins with the key and the value.
-_BEGINS_WITH_KEY = re.compile(r"\w+ = ")
+# A message of a model's own check that begins with the key.
+_BEGINS_WITH_KEY = re.compile(r"[\w.]+( = |: )")
 _COUNTS = {2: "two", 3: "three"}
 # Types of pydantic's errors for an unknown key.
 _UNKNOWN = ("extra_forbidden", "unexpected_keyword_argument")
@@ -147,17 +147,17 @@ def check(checks: TypeAdapter[Any], value: Any, where: str, *, whole_value: bool
 
 def _missing(plain: Any, node: Mapping[str, Any], root: Mapping[str, Any]) -> list[tuple[str, ...]]:
     """Return the locations of all required keys that plain data lack, also within tables that are missing."""
-    found: list[tuple[str, ...]] = []
+    locations: list[tuple[str, ...]] = []
     node = _resolved(node, root)
     for key, child in node.get("properties", {}).items():
         below = _resolved(child, root)
         if key in plain or (key in node.get("required", ()) and "required" in below):
             value = plain.get(key, {})
             nested = _missing(value, below, root) if isinstance(value, Mapping) else []
-            found += [(key, *loc) for loc in nested]
+            locations += [(key, *loc) for loc in nested]
         elif key in node.get("required", ()):
-            found.append((key,))
-    return found
+            locations.append((key,))
+    return locations
 
 
 def json_schema(kind: Any) -> dict[str, Any]:

@@ -92,7 +92,7 @@ class SurfaceRow(Table):
     @model_validator(mode="after")
     def _consistent(self) -> SurfaceRow:
         if self.radius_mm is None and not self.stop:
-            raise ValueError("radius_mm is missing")
+            raise ValueError("radius_mm: is missing")
         if self.radius_mm is not None and (self.radius_mm == 0 or math.isnan(self.radius_mm)):
             raise ValueError(f"radius_mm = {self.radius_mm:g}: must be a number other than 0; a plane has inf")
         for key in _OF_THE_STOP if not self.stop else ():
@@ -101,7 +101,7 @@ class SurfaceRow(Table):
         if self.blades in (1, 2):
             raise ValueError(f"blades = {self.blades}: must be 0, for a round stop, or from 3 to 64")
         if self.glass is not None and (self.nd is not None or self.vd is not None):
-            raise ValueError("give either glass or nd and vd")
+            raise ValueError("glass: give either glass or nd and vd")
         if self.vd is not None and self.nd is None:
             raise ValueError(f"vd = {self.vd:g}: needs nd")
         return self

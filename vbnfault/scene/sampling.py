@@ -114,7 +114,7 @@ class PlanTable(Table):
         AfterValidator(ordered),
     ] = (1, 6)
     sun_facing_nominal_fraction: float = Field(
-        0.0, ge=0, le=1, description="share of all samples that face the Sun without straylight"
+        0.0, ge=0, le=1, description="fraction of all samples that face the Sun without straylight"
     )
     on_invisible: Literal["redraw_view", "drop"] = Field(
         "redraw_view",
