@@ -186,28 +186,22 @@ def _accept(block: Block) -> None:
 @contextlib.contextmanager
 def _own_modules(folder: Path) -> Iterator[None]:
     """Let Python import the modules that a page writes; forget them, and the classes that they registered."""
-    from vbnfault.core import tables
-    from vbnfault.detector.effects import contract as effects
+    from vbnfault.core import registry
     from vbnfault.faults import models, plugins
-    from vbnfault.reflectance import contract as reflectances
 
-    registries = (effects._REGISTRY, reflectances._REGISTRY)
-    known = [dict(registry.classes()) for registry in registries]
     models.registry()
     before = set(sys.modules)
     sys.path.insert(0, str(folder))
     try:
-        with models.undoing_registrations(always=True):
-            yield
+        yield
     finally:
         sys.path.remove(str(folder))
         plugins.forget_all()
-        for registry, classes in zip(registries, known, strict=True):
-            registry._classes = classes
-        tables.forget_schemas()
         for name in set(sys.modules) - before:
             origin = getattr(sys.modules[name], "__file__", None) or ""
             if origin.startswith(str(folder)):
+                models.forget(name)
+                registry.forget(name)
                 del sys.modules[name]
 
 

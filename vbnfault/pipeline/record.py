@@ -41,8 +41,10 @@ def _layers(frame: Frame) -> dict[str, NDArray[Any]]:
         if name.startswith("without_"):
             layers[name] = images.without[name.removeprefix("without_")].array
         elif name == "mask_effect":
-            empty = np.zeros(frame.context.shape, dtype=bool)
-            layers[name] = np.stack([labels.effects.get(fault, empty) for fault in names])
+            layers[name] = np.zeros_like(labels.masks)  # of a scene without faults, too
+            for k, fault in enumerate(names):
+                if fault in labels.effects:
+                    layers[name][k] = labels.effects[fault]
         elif name in labels.strengths:
             layers[name] = labels.strengths[name]
         elif name in ("raw", "defects"):
