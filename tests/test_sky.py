@@ -27,6 +27,13 @@ FRAME: dict[str, Any] = {
 AXES = np.eye(3)
 
 
+def star_radiance(
+    catalogue: sky.StarCatalogue, *, J_from_C: Any, intrinsics: Any, width_px: int, height_px: int, **more: Any
+) -> sky.StarRadiance:
+    frame = sky.SkyFrame(J_from_C=J_from_C, intrinsics=intrinsics, width_px=width_px, height_px=height_px)
+    return sky.star_radiance(catalogue, frame, **more)
+
+
 def hms(hours: float, minutes: float, seconds: float) -> float:
     return 15 * (hours + minutes / 60 + seconds / 3600)
 
@@ -176,7 +183,7 @@ def test_electrons_of_a_star_of_magnitude_zero(off_axis_px: float) -> None:
     detector = ThreeColourDetector(
         width_px=WIDTH, height_px=HEIGHT, pixel_pitch_um=5.5, quantum_efficiency_peak=0.5
     )
-    stars = sky.star_radiance(at((WIDTH / 2 + off_axis_px, HEIGHT / 2)), J_from_C=AXES, sigma_px=0.8, **FRAME)
+    stars = star_radiance(at((WIDTH / 2 + off_axis_px, HEIGHT / 2)), J_from_C=AXES, sigma_px=0.8, **FRAME)
     black = Radiance(array=np.zeros((8, HEIGHT, WIDTH), dtype=np.float32), wavelength_nm=NODES_NM)
     exposed = detector.electrons_expected(lens.image(stars.added_to(black)), 2.0).array
     collected = exposed.sum(axis=(0, 1), dtype=np.float64)
@@ -201,8 +208,8 @@ def test_electrons_of_a_star_of_magnitude_zero(off_axis_px: float) -> None:
 
 def test_falloff_of_the_lens_takes_the_same_electrons() -> None:
     star = at((WIDTH - 10.5, 8.5))
-    plain = sky.star_radiance(star, J_from_C=AXES, sigma_px=0.5, **FRAME)
-    divided = sky.star_radiance(star, J_from_C=AXES, sigma_px=0.5, lens_falloff=True, **FRAME)
+    plain = star_radiance(star, J_from_C=AXES, sigma_px=0.5, **FRAME)
+    divided = star_radiance(star, J_from_C=AXES, sigma_px=0.5, lens_falloff=True, **FRAME)
     cosine = star.direction_J()[0, 2]
     np.testing.assert_allclose(divided.radiance * cosine**4, plain.radiance, rtol=1e-6)
     # the solid angle of a small pixel: cos³ θ / f²
@@ -217,33 +224,33 @@ def test_falloff_of_the_lens_takes_the_same_electrons() -> None:
 @pytest.mark.parametrize("sigma_px", [0.0, 0.3, 1.0, 3.0])
 def test_energy_is_kept(sigma_px: float) -> None:
     stars = at((40.3, 30.9), (52.0, 33.0), (60.7, 21.2))
-    total = image(sky.star_radiance(stars, J_from_C=AXES, sigma_px=sigma_px, **FRAME)).sum(axis=(1, 2))
+    total = image(star_radiance(stars, J_from_C=AXES, sigma_px=sigma_px, **FRAME)).sum(axis=(1, 2))
     expected = sky.star_irradiance_W_m2_nm(0.0, 0.0, NODES_NM)[0] * FOCAL_PX**2 * stars.direction_J()[:, 2].sum()
     np.testing.assert_allclose(total, expected, rtol=3e-6)  # 1.2e-6 is cut; float32 rounds by 6e-8 a pixel
 
 
 def test_a_point_without_spread_lights_one_pixel() -> None:
-    stars = sky.star_radiance(at((70.9, 10.1)), J_from_C=AXES, sigma_px=0.0, **FRAME)
+    stars = star_radiance(at((70.9, 10.1)), J_from_C=AXES, sigma_px=0.0, **FRAME)
     assert (stars.rows.tolist(), stars.columns.tolist()) == ([10], [70])
     assert stars.radiance.shape == (8, 1)
 
 
 def test_the_edge_of_the_frame_takes_its_part() -> None:
-    whole = image(sky.star_radiance(at((30.0, 30.0)), J_from_C=AXES, sigma_px=1.0, **FRAME))
-    half = image(sky.star_radiance(at((0.0, 30.0)), J_from_C=AXES, sigma_px=1.0, **FRAME))
-    beyond = image(sky.star_radiance(at((-1.0, 30.0)), J_from_C=AXES, sigma_px=1.0, **FRAME))
+    whole = image(star_radiance(at((30.0, 30.0)), J_from_C=AXES, sigma_px=1.0, **FRAME))
+    half = image(star_radiance(at((0.0, 30.0)), J_from_C=AXES, sigma_px=1.0, **FRAME))
+    beyond = image(star_radiance(at((-1.0, 30.0)), J_from_C=AXES, sigma_px=1.0, **FRAME))
     cosine = [at((x, 30.0)).direction_J()[0, 2] for x in (30.0, 0.0, -1.0)]
     assert half.sum() / cosine[1] == pytest.approx(0.5 * whole.sum() / cosine[0], rel=1e-5)
     # one sigma beyond the edge 15.866 % of a Gaussian reach in
     assert beyond.sum() / cosine[2] == pytest.approx(0.158655 * whole.sum() / cosine[0], rel=1e-4)
-    assert len(sky.star_radiance(at((-6.1, 30.0)), J_from_C=AXES, sigma_px=1.0, **FRAME).rows) == 0
+    assert len(star_radiance(at((-6.1, 30.0)), J_from_C=AXES, sigma_px=1.0, **FRAME).rows) == 0
 
 
 @pytest.mark.parametrize("sigma_px", [0.5, 1.0, 2.0])
 @pytest.mark.parametrize("place", [(40.5, 30.5), (41.07, 29.81), (44.0, 33.0)])
 def test_centroid(sigma_px: float, place: tuple[float, float]) -> None:
     # a Gaussian integrated over pixels errs by exp(-2 pi² sigma²) / pi: 0.0023 px at 0.5, nothing at 1
-    light = image(sky.star_radiance(at(place), J_from_C=AXES, sigma_px=sigma_px, **FRAME)).sum(axis=0)
+    light = image(star_radiance(at(place), J_from_C=AXES, sigma_px=sigma_px, **FRAME)).sum(axis=0)
     y, x = np.indices(light.shape) + 0.5
     assert (light * x).sum() / light.sum() == pytest.approx(place[0], abs=0.01)
     assert (light * y).sum() / light.sum() == pytest.approx(place[1], abs=0.01)
@@ -255,11 +262,11 @@ def test_axes_of_the_camera() -> None:
     vega = direction(hms(18, 36, 56.33635), 38.783689)
     catalogue = sky.load_catalogue().brighter_than(0.04)
     J_from_C = minimal_rotation(np.array([0.0, 0.0, 1.0]), vega)
-    ahead = image(sky.star_radiance(catalogue, J_from_C=J_from_C, sigma_px=1.0, **FRAME)).sum(axis=0)
+    ahead = image(star_radiance(catalogue, J_from_C=J_from_C, sigma_px=1.0, **FRAME)).sum(axis=0)
     assert np.unravel_index(ahead.argmax(), ahead.shape) in {(31, 47), (31, 48), (32, 47), (32, 48)}
     # turned to the right (+x), the star moves left; turned down (+y), it moves up
     for turn, (row, column) in ((ry(0.1), (HEIGHT / 2, WIDTH / 2 - 12.04)), (rx(-0.1), (HEIGHT / 2 - 12.04, 48))):
-        moved = image(sky.star_radiance(catalogue, J_from_C=J_from_C @ turn, sigma_px=1.0, **FRAME)).sum(axis=0)
+        moved = image(star_radiance(catalogue, J_from_C=J_from_C @ turn, sigma_px=1.0, **FRAME)).sum(axis=0)
         y, x = np.indices(moved.shape) + 0.5
         assert (moved * x).sum() / moved.sum() == pytest.approx(column, abs=0.05)
         assert (moved * y).sum() / moved.sum() == pytest.approx(row, abs=0.05)
@@ -267,10 +274,10 @@ def test_axes_of_the_camera() -> None:
 
 def test_no_star_behind_the_camera() -> None:
     star = at((20.0, 20.0))
-    assert len(sky.star_radiance(star, J_from_C=AXES, sigma_px=1.0, **FRAME).rows) > 0
-    behind = sky.star_radiance(star, J_from_C=np.diag([-1.0, -1.0, -1.0]), sigma_px=1.0, **FRAME)
+    assert len(star_radiance(star, J_from_C=AXES, sigma_px=1.0, **FRAME).rows) > 0
+    behind = star_radiance(star, J_from_C=np.diag([-1.0, -1.0, -1.0]), sigma_px=1.0, **FRAME)
     assert behind.radiance.shape == (8, 0)
-    none = sky.star_radiance(star.brighter_than(-9.0), J_from_C=AXES, sigma_px=1.0, **FRAME)
+    none = star_radiance(star.brighter_than(-9.0), J_from_C=AXES, sigma_px=1.0, **FRAME)
     assert none.radiance.shape == (8, 0)
     assert none.radiance.dtype == np.float32
 
@@ -281,7 +288,7 @@ def test_stars_in_view_share_the_whole_sky() -> None:
     cube: dict[str, Any] = {**FRAME, "width_px": 64, "intrinsics": np.array([32.0, 32.0, 32.0, 32.0])}
     total = np.zeros(8)
     for view in views:  # six faces of a cube; lens_falloff gives the light per solid angle, cos³ per pixel
-        stars = sky.star_radiance(catalogue, J_from_C=view, sigma_px=0.0, lens_falloff=True, **cube)
+        stars = star_radiance(catalogue, J_from_C=view, sigma_px=0.0, lens_falloff=True, **cube)
         slope = np.stack([stars.columns + 0.5 - 32, stars.rows + 0.5 - 32]) / 32
         total += (stars.radiance * (1 + (slope**2).sum(axis=0)) ** -1.5 / 32**2).sum(axis=1)
     light = sky.star_irradiance_W_m2_nm(catalogue.magnitude_V, catalogue.colour_BV, NODES_NM).sum(axis=0)
@@ -290,8 +297,8 @@ def test_stars_in_view_share_the_whole_sky() -> None:
 
 def test_light_of_near_stars_adds_up() -> None:
     one, other = at((40.2, 30.5)), at((41.1, 30.7))
-    both = image(sky.star_radiance(at((40.2, 30.5), (41.1, 30.7)), J_from_C=AXES, sigma_px=1.0, **FRAME))
-    apart = [image(sky.star_radiance(star, J_from_C=AXES, sigma_px=1.0, **FRAME)) for star in (one, other)]
+    both = image(star_radiance(at((40.2, 30.5), (41.1, 30.7)), J_from_C=AXES, sigma_px=1.0, **FRAME))
+    apart = [image(star_radiance(star, J_from_C=AXES, sigma_px=1.0, **FRAME)) for star in (one, other)]
     np.testing.assert_allclose(both, apart[0] + apart[1], rtol=1e-5, atol=1e-14)
 
 
@@ -299,8 +306,8 @@ def test_bodies_hide_stars() -> None:
     stars = at((20.5, 20.5), (22.5, 20.5), (-0.5, 20.5))
     visible = np.ones((HEIGHT, WIDTH), dtype=bool)
     visible[20, 20] = visible[20, 0] = False
-    seen = sky.star_radiance(stars, J_from_C=AXES, sigma_px=1.0, sky=visible, **FRAME)
-    alone = sky.star_radiance(at((22.5, 20.5), (-0.5, 20.5)), J_from_C=AXES, sigma_px=1.0, **FRAME)
+    seen = star_radiance(stars, J_from_C=AXES, sigma_px=1.0, sky=visible, **FRAME)
+    alone = star_radiance(at((22.5, 20.5), (-0.5, 20.5)), J_from_C=AXES, sigma_px=1.0, **FRAME)
     np.testing.assert_array_equal(image(seen), image(alone))
     assert image(seen)[0, 20, 20] > 0  # the neighbour's light spreads over the body
 
@@ -308,7 +315,7 @@ def test_bodies_hide_stars() -> None:
 def test_adding_leaves_the_rest_bit_for_bit() -> None:
     rng = np.random.default_rng(1)
     before = Radiance(array=rng.random((8, HEIGHT, WIDTH), dtype=np.float32), wavelength_nm=NODES_NM)
-    stars = sky.star_radiance(at((20.5, 20.5)), J_from_C=AXES, sigma_px=1.0, **FRAME)
+    stars = star_radiance(at((20.5, 20.5)), J_from_C=AXES, sigma_px=1.0, **FRAME)
     where = np.zeros((HEIGHT, WIDTH), dtype=bool)
     where[18:21] = True
     after = stars.added_to(before, where)
@@ -341,7 +348,7 @@ def test_the_faintest_star_that_an_exposure_shows() -> None:
     turned = minimal_rotation(
         np.array([0.5 / focal_px, 0.5 / focal_px, 1.0]) / np.hypot(1, 0.5**0.5 / focal_px), star.direction_J()[0]
     )
-    added = sky.star_radiance(star, J_from_C=turned, sigma_px=0.7, **frame)
+    added = star_radiance(star, J_from_C=turned, sigma_px=0.7, **frame)
     black = Radiance(array=np.zeros((8, HEIGHT, WIDTH), dtype=np.float32), wavelength_nm=NODES_NM)
     electrons = detector.electrons_expected(lens.image(added.added_to(black)), 1.0).array
     assert electrons.max() == pytest.approx(13.0, rel=1e-4)
@@ -357,7 +364,7 @@ def test_the_faintest_star_that_an_exposure_shows() -> None:
 )
 def test_refusals(change: dict[str, Any], says: str) -> None:
     with pytest.raises(ValueError, match=says):
-        sky.star_radiance(at((1.0, 1.0)), **{"J_from_C": AXES, "sigma_px": 1.0, **FRAME, **change})
+        star_radiance(at((1.0, 1.0)), **{"J_from_C": AXES, "sigma_px": 1.0, **FRAME, **change})
 
 
 def test_a_threshold_of_nothing_is_refused() -> None:

@@ -44,7 +44,7 @@ def band_nodes_nm(minimum_nm: float, maximum_nm: float, bands: int) -> F64:
     return np.linspace(minimum_nm, maximum_nm, bands)
 
 
-def _fine_nm(nodes_nm: F64) -> F64:
+def fine_nodes_nm(nodes_nm: F64) -> F64:
     """Return the wavelengths of the grid for integrals over the bands, float64[n], about 1 nm apart."""
     if len(nodes_nm) == 1:  # one band covers 300 nm around its node
         lo, hi = nodes_nm[0] - 150.0, nodes_nm[0] + 150.0
@@ -53,7 +53,7 @@ def _fine_nm(nodes_nm: F64) -> F64:
     return np.linspace(lo, hi, max(2, round(hi - lo)) + 1)
 
 
-def _hats(nodes_nm: F64, fine_nm: F64) -> F64:
+def hat_weights(nodes_nm: F64, fine_nm: F64) -> F64:
     """Return the hat functions of the nodes, float64[band, n]; a single band has a constant 1."""
     if len(nodes_nm) == 1:
         return np.ones((1, len(fine_nm)))
@@ -81,8 +81,8 @@ def solar_irradiance_W_m2_nm(wavelength_nm: F64, distance_au: float = 1.0) -> F6
 def _band_irradiance(nodes: tuple[float, ...]) -> F64:
     """Return S_b of the module docstring at 1 au, W m⁻² nm⁻¹, float64[band]."""
     nodes_nm = np.array(nodes)
-    fine = _fine_nm(nodes_nm)
-    hats = _hats(nodes_nm, fine)
+    fine = fine_nodes_nm(nodes_nm)
+    hats = hat_weights(nodes_nm, fine)
     sun = solar_irradiance_W_m2_nm(fine)
     return np.asarray(np.trapezoid(hats * sun, fine, axis=1) / np.trapezoid(hats, fine, axis=1))
 
@@ -189,8 +189,8 @@ def electron_weights(efficiency: Callable[[F64], F64], nodes_nm: F64) -> F64:
     The weights are ∫ QE(λ) S(λ) h_b(λ) λ/(hc) dλ / S_b with the symbols of the module docstring. `efficiency`
     returns QE, float64[channel, n], at wavelengths in nm.
     """
-    fine = _fine_nm(nodes_nm)
-    hats = _hats(nodes_nm, fine)
+    fine = fine_nodes_nm(nodes_nm)
+    hats = hat_weights(nodes_nm, fine)
     sun = solar_irradiance_W_m2_nm(fine)
     per_photon = fine * 1e-9 / (PLANCK_J_S * LIGHT_SPEED_M_S)
     mean = np.trapezoid(hats * sun, fine, axis=1) / np.trapezoid(hats, fine, axis=1)

@@ -504,12 +504,12 @@ def with_stars(
         )
     if faintest < sky.BRIGHTEST_V:
         return radiance
+    grid = camera if view is None else view
     stars = sky.star_radiance(
         sky.load_catalogue().brighter_than(faintest),
-        J_from_C=J_from_C,
-        intrinsics=camera.intrinsics if view is None else view.intrinsics,
-        width_px=camera.width_px if view is None else view.width_px,
-        height_px=camera.height_px if view is None else view.height_px,
+        sky.SkyFrame(
+            J_from_C=J_from_C, intrinsics=grid.intrinsics, width_px=grid.width_px, height_px=grid.height_px
+        ),
         wavelength_nm=radiance.wavelength_nm,
         sigma_px=sigma_px,
         julian_date=scene.sun.julian_date,

@@ -19,7 +19,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
+from scipy.sparse import coo_array, csr_array
 from scipy.special import ndtr
 
 from ..core import resources, spectra
@@ -192,8 +192,8 @@ def star_irradiance_W_m2_nm(magnitude_V: F64 | float, colour_BV: F64 | float, wa
 
     `wavelength_nm` float64[band] are the nodes of `spectra.band_nodes_nm`.
     """
-    fine = spectra._fine_nm(wavelength_nm)
-    hats = spectra._hats(wavelength_nm, fine)
+    fine = spectra.fine_nodes_nm(wavelength_nm)
+    hats = spectra.hat_weights(wavelength_nm, fine)
     spectrum = star_spectrum_W_m2_nm(magnitude_V, colour_BV, fine)
     rule = np.gradient(fine) * np.where((fine == fine[0]) | (fine == fine[-1]), 0.5, 1.0)  # trapezoidal rule
     return np.asarray(spectrum @ (hats * rule).T / (hats @ rule))
@@ -219,13 +219,41 @@ class StarRadiance:
         return radiance.with_array(array)
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SkyFrame:
+    """Describe the frame in which stars are drawn.
+
+    Attributes
+    ----------
+    J_from_C
+        Camera axes in J, float64[3, 3].
+    intrinsics
+        fx, fy, cx, cy in pixels, float64[4], pixel centres at +0.5.
+    width_px, height_px
+        Size of the frame.
+    """
+
+    J_from_C: F64
+    intrinsics: F64
+    width_px: int
+    height_px: int
+
+    def positions_px(self, direction_J: F64) -> tuple[F64, F64, I64]:
+        """Return the image positions float64[k, 2] and the cosines to the boresight of the directions ahead.
+
+        The cosines are float64[n] of all n directions; int64[k] are the indices of the directions ahead.
+        """
+        direction = direction_J @ np.asarray(self.J_from_C, dtype=np.float64)
+        ahead = np.flatnonzero(direction[:, 2] > 1e-6)
+        slope = direction[ahead, :2] / direction[ahead, 2:]
+        fx, fy, cx, cy = (float(v) for v in self.intrinsics)
+        return slope * (fx, fy) + (cx, cy), direction[:, 2], ahead
+
+
 def star_radiance(
     catalogue: StarCatalogue,
+    frame: SkyFrame,
     *,
-    J_from_C: F64,
-    intrinsics: F64,
-    width_px: int,
-    height_px: int,
     wavelength_nm: F64,
     sigma_px: float,
     julian_date: float = J2000_JD,
@@ -247,12 +275,8 @@ def star_radiance(
     ----------
     catalogue
         The stars.
-    J_from_C
-        Camera axes in J, float64[3, 3].
-    intrinsics
-        fx, fy, cx, cy in pixels, float64[4], pixel centres at +0.5.
-    width_px, height_px
-        Size of the frame.
+    frame
+        Attitude and geometry of the frame.
     wavelength_nm
         Band nodes, float64[band].
     sigma_px
@@ -275,45 +299,61 @@ def star_radiance(
     """
     if not 0 <= sigma_px <= SIGMA_MAX_PX:
         raise ValueError(f"sigma_px = {sigma_px:g}: must be in [0, {SIGMA_MAX_PX:g}]")
-    if sky is not None and sky.shape != (height_px, width_px):
-        raise ValueError(f"sky has shape {sky.shape}, the frame {(height_px, width_px)}")
-    direction = catalogue.direction_J(julian_date) @ np.asarray(J_from_C, dtype=np.float64)
-    ahead = np.flatnonzero(direction[:, 2] > 1e-6)
-    slope = direction[ahead, :2] / direction[ahead, 2:]
-    fx, fy, cx, cy = (float(v) for v in intrinsics)
-    place = slope * (fx, fy) + (cx, cy)
-    size = np.array([width_px, height_px])
+    if sky is not None and sky.shape != (frame.height_px, frame.width_px):
+        raise ValueError(f"sky has shape {sky.shape}, the frame {(frame.height_px, frame.width_px)}")
+    position, cosines, ahead = frame.positions_px(catalogue.direction_J(julian_date))
+    size = np.array([frame.width_px, frame.height_px])
     reach = REACH_SIGMA * sigma_px
-    inside = np.asarray(((place >= -reach) & (place < size + reach)).all(axis=1))
+    inside = np.asarray(((position >= -reach) & (position < size + reach)).all(axis=1))
     if sky is not None:
-        column, row = np.clip(np.floor(place[inside]).astype(np.int64), 0, size - 1).T
-        outside = ((place[inside] < 0) | (place[inside] >= size)).any(axis=1)
+        column, row = np.clip(np.floor(position[inside]).astype(np.int64), 0, size - 1).T
+        outside = ((position[inside] < 0) | (position[inside] >= size)).any(axis=1)
         inside[inside] = outside | sky[row, column]
-    place, stars = place[inside], ahead[inside]
+    position, stars = position[inside], ahead[inside]
 
-    cosine = direction[stars, 2]
+    cosine = cosines[stars]
+    fx, fy = (float(v) for v in frame.intrinsics[:2])
     irradiance = star_irradiance_W_m2_nm(catalogue.magnitude_V[stars], catalogue.colour_BV[stars], wavelength_nm)
     total = irradiance * (fx * fy * (cosine**-3 if lens_falloff else cosine))[:, None]
-
-    window = max(1, int(np.ceil(reach)))
-    offset = np.arange(-window, window + 1)
-    pixel = np.floor(place).astype(np.int64)[:, :, None] + offset  # [star, axis, window]
-    edges = np.concatenate([pixel, pixel[:, :, -1:] + 1], axis=2) - place[:, :, None]
-    # a point is a very narrow Gaussian: a star exactly on an edge gives half of its light to either side
-    share = np.diff(ndtr(edges / max(sigma_px, 1e-9)), axis=2)
-    share = np.where((pixel >= 0) & (pixel < size[:, None]), share, 0.0)
-
-    weight = (share[:, 1, :, None] * share[:, 0, None, :]).ravel()
-    index = (pixel[:, 1, :, None] * width_px + pixel[:, 0, None, :]).ravel()
-    star = np.repeat(np.arange(len(stars)), len(offset) ** 2)
-    lit = weight > 0
-    lit_pixels, target = np.unique(index[lit], return_inverse=True)
-    spread = coo_array((weight[lit], (target, star[lit])), shape=(len(lit_pixels), len(stars))).tocsr()
+    pixels, spread = _spread_over_pixels(position, size, sigma_px)
     return StarRadiance(
-        rows=lit_pixels // width_px,
-        columns=lit_pixels % width_px,
+        rows=pixels // frame.width_px,
+        columns=pixels % frame.width_px,
         radiance=np.ascontiguousarray((spread @ total).T, dtype=np.float32),
     )
+
+
+def _spread_over_pixels(position: F64, size: I64, sigma_px: float) -> tuple[I64, csr_array]:
+    """Return the pixels that stars light, and the fraction of each star's light in each of them.
+
+    Parameters
+    ----------
+    position
+        Image positions (x, y) of the stars in pixels, float64[star, 2].
+    size
+        Width and height of the frame, int64[2].
+    sigma_px
+        Standard deviation of the point spread.
+
+    Returns
+    -------
+    pixels, fraction
+        int64[n] flat indices, in order, and a sparse matrix float64[n, star].
+    """
+    window = max(1, int(np.ceil(REACH_SIGMA * sigma_px)))
+    offset = np.arange(-window, window + 1)
+    pixel = np.floor(position).astype(np.int64)[:, :, None] + offset  # [star, axis, window]
+    edges = np.concatenate([pixel, pixel[:, :, -1:] + 1], axis=2) - position[:, :, None]
+    # a point is a very narrow Gaussian: a star exactly on an edge gives half of its light to either side
+    fraction = np.diff(ndtr(edges / max(sigma_px, 1e-9)), axis=2)
+    fraction = np.where((pixel >= 0) & (pixel < size[:, None]), fraction, 0.0)
+
+    weight = (fraction[:, 1, :, None] * fraction[:, 0, None, :]).ravel()
+    index = (pixel[:, 1, :, None] * size[0] + pixel[:, 0, None, :]).ravel()
+    star = np.repeat(np.arange(len(position)), len(offset) ** 2)
+    lit = weight > 0
+    pixels, target = np.unique(index[lit], return_inverse=True)
+    return pixels, coo_array((weight[lit], (target, star[lit])), shape=(len(pixels), len(position))).tocsr()
 
 
 def limiting_magnitude(
@@ -355,8 +395,8 @@ def limiting_magnitude(
     if not threshold_e > 0:
         raise ValueError(f"threshold_e = {threshold_e:g}: must be above 0")
     half = 0.5 / max(sigma_px, 1e-9)
-    share = float(ndtr(half) - ndtr(-half)) ** 2
+    fraction = float(ndtr(half) - ndtr(-half)) ** 2  # of the light, in the brightest pixel
     irradiance = star_irradiance_W_m2_nm(0.0, colour_BV, wavelength_nm)[0] * focal_length_px**2
     rate = float((np.asarray(electron_rate_weights, dtype=np.float64) @ irradiance).max())
-    collected = rate * irradiance_per_radiance * exposure_s * share
+    collected = rate * irradiance_per_radiance * exposure_s * fraction
     return float(2.5 * np.log10(collected / threshold_e)) if collected > 0 else float("-inf")
