@@ -285,7 +285,7 @@ def _unit(v: Float64) -> Float64:
 def _rocks(
     level: int,
     diameter: Float64,
-    at: Float64,
+    position: Float64,
     normal: Float64,
     ground: Float64,
     tree: cKDTree,
@@ -315,7 +315,7 @@ def _rocks(
         * np.column_stack([np.ones(count), rng.uniform(0.65, 0.95, count), rng.uniform(0.45, 0.80, count)])
     )
     rock = radius[:, :, None] * sphere * semi[:, None, :]
-    normal = _ground_normal(at, normal, 0.5 * diameter, ground, tree)
+    normal = _ground_normal(position, normal, 0.5 * diameter, ground, tree)
     # The third axis, usually the shortest, lies near the ground's normal, so that rocks rest on their broad side.
     # The heading is random.
     up = _unit(normal + 0.25 * rng.normal(size=(count, 3)))
@@ -324,9 +324,9 @@ def _rocks(
 
     along = np.einsum("nvi,ni->nv", rock, normal)
     low, high = along.min(axis=1), along.max(axis=1)
-    lowest = _lowest_ground(at, normal, 0.5 * diameter, ground, tree)
+    lowest = _lowest_ground(position, normal, 0.5 * diameter, ground, tree)
     lift = lowest - low - rng.uniform(*_BURIED, count) * (high - low)
-    centre = at + lift[:, None] * normal
+    centre = position + lift[:, None] * normal
     for _ in range(3):  # lower the rock until its lowest corners are in the ground beside them
         corners = rock + centre[:, None, :]
         lowest_few = np.argsort(-corners[..., 2], axis=1, kind="stable")[:, :_LOWEST_CORNERS]
@@ -337,11 +337,12 @@ def _rocks(
     return rock + centre[:, None, :], faces, centre
 
 
-def _ground_normal(at: Float64, normal: Float64, radius: Float64, ground: Float64, tree: cKDTree) -> Float64:
+def _ground_normal(position: Float64, normal: Float64, radius: Float64, ground: Float64, tree: cKDTree) -> Float64:
     """Return the ground's unit normal at the scale of a rock, float64[n, 3], from a ring of points."""
     across, other = _tangents(normal)
     ring = [
-        ground[tree.query(at + radius[:, None] * (np.cos(turn) * across + np.sin(turn) * other))[1]] - at
+        ground[tree.query(position + radius[:, None] * (np.cos(turn) * across + np.sin(turn) * other))[1]]
+        - position
         for turn in np.linspace(0, 2 * np.pi, _RING, endpoint=False)
     ]
     total = np.zeros_like(normal)
@@ -371,14 +372,14 @@ def _weathered(sphere: Float64, level: int, count: int, rng: np.random.Generator
     return 1.0 + out.reshape(count, -1)
 
 
-def _lowest_ground(at: Float64, normal: Float64, radius: Float64, ground: Float64, tree: cKDTree) -> Float64:
+def _lowest_ground(position: Float64, normal: Float64, radius: Float64, ground: Float64, tree: cKDTree) -> Float64:
     """Return the height along the normal of the lowest ground within a rock's reach, float64[n] m, at most 0."""
     across, other = _tangents(normal)
-    lowest = np.zeros(len(at))
+    lowest = np.zeros(len(position))
     for reach in (0.5, 1.0):
         for turn in np.linspace(0, 2 * np.pi, _RING, endpoint=False):
-            ring = at + reach * radius[:, None] * (np.cos(turn) * across + np.sin(turn) * other)
-            near = ground[tree.query(ring)[1]] - at
+            ring = position + reach * radius[:, None] * (np.cos(turn) * across + np.sin(turn) * other)
+            near = ground[tree.query(ring)[1]] - position
             height = np.einsum("ni,ni->n", near, normal)
             aside = np.sqrt(np.maximum(np.einsum("ni,ni->n", near, near) - height**2, 0.0))
             lowest = np.minimum(lowest, np.where(aside < 1.3 * radius, height, 0.0))

@@ -101,9 +101,9 @@ def read_plate_table(data: bytes, source: str) -> Mesh:
     table = _numbers(data, source)
     first = table[0]
     if not (first == np.floor(first) and 4 <= first < 2**31):
-        at = _token_line(data, 0)
+        number = _token_line(data, 0)
         raise InputError(
-            f"{source}: line {at}: expected the number of vertices, an integer of at least 4, found {first:g}."
+            f"{source}: line {number}: expected the number of vertices, an integer of at least 4, found {first:g}."
         )
     layout = _layout(table)
     if layout is None:
@@ -121,10 +121,10 @@ def read_plate_table(data: bytes, source: str) -> Mesh:
     x, y, z = mesh[0].T
     # A Cartesian model centred on the body has vertices on both sides of the equator, so z is not always positive.
     if z.min() > 0 and np.abs(x).max() <= 90 and np.ptp(x) > 150 and y.min() >= -180 and np.ptp(y) > 300:
-        at = _token_line(data, vertex_at)
+        number = _token_line(data, vertex_at)
         raise InputError(
-            f"{source}: line {at}: expected Cartesian coordinates, found what looks like latitude, longitude and "
-            "radius."
+            f"{source}: line {number}: expected Cartesian coordinates, found what looks like latitude, longitude "
+            "and radius."
         )
     return mesh
 
@@ -332,10 +332,10 @@ def _numbers(data: bytes, source: str, lines: Lines = lambda line: line) -> Floa
         return values
     wrong = _NOT_A_NUMBER.search(data.translate(_FORTRAN))  # both texts are equally long, so offsets agree
     if wrong is None:
-        at = 1 if values is None else _token_line(data, int(np.argmin(np.isfinite(values))))
-        raise InputError(f"{source}: line {lines(at)}: expected a number, found one that is too large.")
-    at, what = _line(data, wrong.start()), _shown(data[wrong.start() : wrong.end()])
-    raise InputError(f"{source}: line {lines(at)}: expected a number, found {what}.")
+        line = 1 if values is None else _token_line(data, int(np.argmin(np.isfinite(values))))
+        raise InputError(f"{source}: line {lines(line)}: expected a number, found one that is too large.")
+    line, shown = _line(data, wrong.start()), _shown(data[wrong.start() : wrong.end()])
+    raise InputError(f"{source}: line {lines(line)}: expected a number, found {shown}.")
 
 
 def _from_one(vertices: Float64, faces: Float64, source: str, line: Lines) -> Mesh:
@@ -416,42 +416,42 @@ def _layout(table: Float64) -> tuple[int, int, int, int, int] | None:
 def _table_error(data: bytes, table: Float64, source: str) -> InputError:
     """Return the error for a table without a layout, with the first line that contradicts the counts."""
 
-    def error(line: int, expected: str, found: str) -> InputError:
-        return InputError(f"{source}: line {line}: expected {expected}, found {found}.")
+    def error(line: int, expected: str, given: str) -> InputError:
+        return InputError(f"{source}: line {line}: expected {expected}, found {given}.")
 
     rows: Iterator[tuple[int, list[bytes]]] = (
         (number, row.split()) for number, row in enumerate(_clean(data).split(b"\n"), 1) if row.strip()
     )
-    at, header = next(rows)
+    line, header = next(rows)
     vertices_n = int(table[0])
     if len(header) > 2:
-        return error(at, "the number of vertices and of facets", f"{len(header)} numbers")
+        return error(line, "the number of vertices and of facets", f"{len(header)} numbers")
     faces_n = int(table[1]) if len(header) == 2 else 0
-    for what, length in (("vertex", vertices_n), ("facet", None)):
-        if what == "facet" and len(header) == 1:
-            at, row = next(rows, (at, []))
+    for kind, length in (("vertex", vertices_n), ("facet", None)):
+        if kind == "facet" and len(header) == 1:
+            line, row = next(rows, (line, []))
             if len(row) != 1 or not row[0].isdigit():
                 return error(
-                    at, f"the number of facets after {vertices_n} vertices", b" ".join(row).decode() or "the end"
+                    line, f"the number of facets after {vertices_n} vertices", b" ".join(row).decode() or "the end"
                 )
             faces_n = int(row[0])
         total = faces_n if length is None else length
         width = 0
         for k in range(1, total + 1):
-            at, row = next(rows, (at, []))
+            line, row = next(rows, (line, []))
             if not row:
                 return error(
-                    at, f"{total} {'vertices' if what == 'vertex' else 'facets'}", f"the end after {k - 1}"
+                    line, f"{total} {'vertices' if kind == 'vertex' else 'facets'}", f"the end after {k - 1}"
                 )
             width = width or len(row)
             if len(row) != width or width not in (3, 4):
-                wanted = f"{width} numbers" if width in (3, 4) else "3 or 4 numbers"
-                return error(at, f"{wanted} for {what} {k} of {total}", str(len(row)))
+                width_allowed = f"{width} numbers" if width in (3, 4) else "3 or 4 numbers"
+                return error(line, f"{width_allowed} for {kind} {k} of {total}", str(len(row)))
             if width == 4 and float(row[0]) not in (k, k - 1, 3):
-                return error(at, f"number {k} in front of a {what}", row[0].decode())
-    at, row = next(rows, (at, []))
+                return error(line, f"number {k} in front of a {kind}", row[0].decode())
+    line, row = next(rows, (line, []))
     if row:
-        return error(at, f"the end after {vertices_n} vertices and {faces_n} facets", f"{len(row)} more numbers")
+        return error(line, f"the end after {vertices_n} vertices and {faces_n} facets", f"{len(row)} more numbers")
     return error(
         1, "the number of vertices and of facets, then the two tables", f"{len(table)} numbers in no such order"
     )
@@ -462,8 +462,8 @@ def _table_error(data: bytes, table: Float64, source: str) -> InputError:
 
 def _not_a_statement(data: bytes, offset: int, source: str) -> InputError:
     """Return the error for a line that is neither a vertex nor a facet."""
-    found = _shown(data[offset : offset + 80])
-    return InputError(f"{source}: line {_line(data, offset)}: expected 'v x y z' or 'f a b c', found {found}.")
+    given = _shown(data[offset : offset + 80])
+    return InputError(f"{source}: line {_line(data, offset)}: expected 'v x y z' or 'f a b c', found {given}.")
 
 
 def _letter_line(data: bytes, letter: bytes, row: int) -> int:
@@ -606,18 +606,18 @@ def _check_identity(node: _Node, text: bytes, source: str) -> None:
             )
 
 
-def _list_numbers(text: bytes, found: Match, source: str) -> Float64:
+def _list_numbers(text: bytes, block: Match, source: str) -> Float64:
     """Return the numbers in a bracketed list."""
-    start = _line(text, found.start())
-    return _numbers(found[0][1:-1], source, lambda line: start + line - 1)
+    start = _line(text, block.start())
+    return _numbers(block[0][1:-1], source, lambda line: start + line - 1)
 
 
-def _fans(values: Float64, points: int, text: bytes, found: Match, source: str) -> Int64:
+def _fans(values: Float64, points: int, text: bytes, block: Match, source: str) -> Int64:
     """Split polygons, each ended by -1 in `values` float64[n], into fans of triangles int64[m, 3]."""
 
-    def error(at: int, what: str) -> InputError:
-        line = _line(text, found.start()) + _token_line(found[0][1:-1], at) - 1
-        return InputError(f"{source}: line {line}: expected {what}, found {values[at]:g}.")
+    def error(index: int, expected: str) -> InputError:
+        line = _line(text, block.start()) + _token_line(block[0][1:-1], index) - 1
+        return InputError(f"{source}: line {line}: expected {expected}, found {values[index]:g}.")
 
     wrong = (values != np.floor(values)) | (values < -1) | (values >= points)
     if wrong.any():

@@ -40,8 +40,8 @@ class EdgeLimit:
         A long edge can pass the site between two far ends. The point is kept within the middle half of the edge.
         """
         edge = b - a
-        at = np.einsum("...i,...i->...", -a, edge) / np.maximum(np.einsum("...i,...i->...", edge, edge), 1e-30)
-        return self(a + np.clip(at, 0.25, 0.75)[..., None] * edge)
+        nearest = np.einsum("...i,...i->...", -a, edge) / np.maximum(np.einsum("...i,...i->...", edge, edge), 1e-30)
+        return self(a + np.clip(nearest, 0.25, 0.75)[..., None] * edge)
 
     def _at(self, distance: Float64) -> Float64:
         """Return the limit at a distance from the site."""

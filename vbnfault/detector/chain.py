@@ -206,15 +206,15 @@ class Device:
     def _kinds(self) -> NDArray[np.uint8]:
         """Return the permanent defects of each mosaic pixel, uint8[y, x], as bits."""
         out = np.zeros(self.shape, dtype=np.uint8)
-        one = self.individual
-        for value, some in (
-            (HOT, one.hot),
-            (DEAD, one.dead),
-            (STUCK, one.stuck),
-            (RTS, one.rts),
-            (TRAP, one.traps),
+        device = self.individual
+        for value, defects in (
+            (HOT, device.hot),
+            (DEAD, device.dead),
+            (STUCK, device.stuck),
+            (RTS, device.rts),
+            (TRAP, device.traps),
         ):
-            out[some.row, some.column] |= value
+            out[defects.row, defects.column] |= value
         return out
 
     def rgbi(self, raw: Raw, exposure_s: float) -> RGBI:

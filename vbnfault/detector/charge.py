@@ -398,9 +398,9 @@ def capture(
         raise InputError(f"direction = {direction!r}: must be up or down: traps sit in columns")
     out = signal_e.copy()
     image = out if direction == "up" else out[::-1]
-    at = row if direction == "up" else len(image) - 1 - row
-    order = np.lexsort((-at, column))
-    at, column, depth = at[order], column[order], np.asarray(depth_e, dtype=np.float64)[order]
+    distance = row if direction == "up" else len(image) - 1 - row
+    order = np.lexsort((-distance, column))
+    distance, column, depth = distance[order], column[order], np.asarray(depth_e, dtype=np.float64)[order]
     # each round handles one trap in every column, starting with the farthest; a few rounds are enough
     first = np.flatnonzero(np.append(True, np.diff(column) != 0)) if len(column) else column
     rank = np.arange(len(column)) - np.repeat(first, np.diff(np.append(first, len(column))))
@@ -408,7 +408,7 @@ def capture(
     for turn in range(int(rank.max(initial=-1)) + 1):
         now = rank == turn
         packets = image[:, column[now]].astype(np.float64)
-        taken = np.minimum(np.cumsum(np.where(rows >= at[now], packets, 0), axis=0), depth[now])
+        taken = np.minimum(np.cumsum(np.where(rows >= distance[now], packets, 0), axis=0), depth[now])
         image[:, column[now]] = packets - np.diff(taken, axis=0, prepend=0.0)
     return out
 

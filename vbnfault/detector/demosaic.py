@@ -205,11 +205,11 @@ def _blocks_with_edges(
         for ratio in (_HARD_RATIO - 1, 1)
     )
     starts = range(0, len(signal), _ROWS_PER_BLOCK)
-    wanted = [
+    with_edges = [
         hard[i] or (negative[i] and rgb[start : start + _ROWS_PER_BLOCK].min() < black)
         for i, start in enumerate(starts)
     ]
-    return np.flatnonzero(wanted) * _ROWS_PER_BLOCK
+    return np.flatnonzero(with_edges) * _ROWS_PER_BLOCK
 
 
 def _by_groups(extreme: Callable[..., F32], array: F32, rows: int) -> F32:
@@ -283,16 +283,20 @@ def correct_defects(
     out = raw.copy()
     whole = np.issubdtype(raw.dtype, np.integer)
     channels = channel_of(pattern, (raw.shape[0], raw.shape[1]))
-    at = np.argwhere(bad)
+    pixels = np.argwhere(bad)
     for reach in (max(pattern.shape), 4 * max(pattern.shape)):
-        near = _in_reach(~bad, channels, reach)[at[:, 0], at[:, 1]] if len(at) > _PIXELS_AT_ONCE else slice(None)
+        near = (
+            _in_reach(~bad, channels, reach)[pixels[:, 0], pixels[:, 1]]
+            if len(pixels) > _PIXELS_AT_ONCE
+            else slice(None)
+        )
         later = []
-        for some in np.array_split(at[near], len(at[near]) // _PIXELS_AT_ONCE + 1):
-            value, found = _from_neighbours(raw, bad, channels, some, reach, how)
-            y, x = some[found].T
-            out[y, x] = np.rint(value[found]) if whole else value[found]
-            later.append(some[~found])
-        at = np.concatenate([at[~near] if isinstance(near, np.ndarray) else at[:0], *later])
+        for group in np.array_split(pixels[near], len(pixels[near]) // _PIXELS_AT_ONCE + 1):
+            value, has_neighbours = _from_neighbours(raw, bad, channels, group, reach, how)
+            y, x = group[has_neighbours].T
+            out[y, x] = np.rint(value[has_neighbours]) if whole else value[has_neighbours]
+            later.append(group[~has_neighbours])
+        pixels = np.concatenate([pixels[~near] if isinstance(near, np.ndarray) else pixels[:0], *later])
     return out
 
 
@@ -316,23 +320,23 @@ def _in_reach(good: Mask, channels: NDArray[np.uint8], reach: int) -> Mask:
 
 
 def _from_neighbours(
-    raw: NDArray[Any], bad: Mask, channels: NDArray[np.uint8], at: NDArray[np.intp], reach: int, how: str
+    raw: NDArray[Any], bad: Mask, channels: NDArray[np.uint8], pixels: NDArray[np.intp], reach: int, how: str
 ) -> tuple[NDArray[np.float64], Mask]:
     """Return the median or mean of the good neighbours of each pixel `at` [n, 2], and whether there are any."""
     offset = np.arange(-reach, reach + 1)
     dy, dx = (d.ravel() for d in np.meshgrid(offset, offset, indexing="ij"))
-    y, x = at[:, :1] + dy, at[:, 1:] + dx
+    y, x = pixels[:, :1] + dy, pixels[:, 1:] + dx
     inside = (y >= 0) & (y < raw.shape[0]) & (x >= 0) & (x < raw.shape[1])
     y, x = np.where(inside, y, 0), np.where(inside, x, 0)
-    good = inside & ~bad[y, x] & (channels[y, x] == channels[at[:, 0], at[:, 1]][:, None])
+    good = inside & ~bad[y, x] & (channels[y, x] == channels[pixels[:, 0], pixels[:, 1]][:, None])
     count = good.sum(axis=1)
-    some = np.maximum(count, 1)
+    divisor = np.maximum(count, 1)
     if how == "mean":
-        return np.where(good, raw[y, x], 0.0).sum(axis=1) / some, count > 0
+        return np.where(good, raw[y, x], 0.0).sum(axis=1) / divisor, count > 0
     values = np.where(good, raw[y, x], np.inf)
     values.sort(axis=1)  # values that are not good are infinite and go last
-    row = np.arange(len(at))
-    return (values[row, (some - 1) // 2] + values[row, some // 2]) / 2, count > 0
+    row = np.arange(len(pixels))
+    return (values[row, (divisor - 1) // 2] + values[row, divisor // 2]) / 2, count > 0
 
 
 def _checked(raw: NDArray[Any]) -> F32:
@@ -557,9 +561,9 @@ def _menon(raw: F32, pattern: Pattern) -> list[F32]:
     out_red[red], out_blue[blue] = raw[red], raw[blue]
     np.add(raw[blue], l_all[blue], out=out_red[blue])
     np.subtract(raw[red], l_all[red], out=out_blue[red])
-    for at, of_red, of_blue in ((green_r, row, column), (green_b, column, row)):
-        np.add(raw[at], of_red[at], out=out_red[at])
-        np.add(raw[at], of_blue[at], out=out_blue[at])
+    for sites, of_red, of_blue in ((green_r, row, column), (green_b, column, row)):
+        np.add(raw[sites], of_red[sites], out=out_red[sites])
+        np.add(raw[sites], of_blue[sites], out=out_blue[sites])
     return [out_red, green, out_blue]
 
 

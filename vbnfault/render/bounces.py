@@ -180,17 +180,17 @@ def _reversed(three_bits: Any) -> Any:
     return ((three_bits & 1) << 2) | (three_bits & 2) | (three_bits >> 2)
 
 
-def _smoothed(found: Image, scene: RenderInput, truth: Truth) -> Image:
+def _smoothed(image: Image, scene: RenderInput, truth: Truth) -> Image:
     """Return the radiance with brightness filtered along surfaces and colour averaged over a wider window."""
-    brightness = found.sum(axis=0)
+    brightness = image.sum(axis=0)
     if not brightness.any():
-        return found
+        return image
     guide = _Guide(scene, truth)
     smooth = mi.Float(brightness.ravel())
     for stride in _STRIDES:
         smooth = guide.filtered(smooth, stride)
         dr.eval(smooth)
-    bands = np.stack([_coarse(band) for band in found])
+    bands = np.stack([_coarse(band) for band in image])
     colour = bands / np.maximum(bands.sum(axis=0), 1e-6 * brightness.max())
     shape, bright = brightness.shape[::-1], smooth.numpy().reshape(brightness.shape)
     return np.stack([cv2.resize(c, shape, interpolation=cv2.INTER_LINEAR) * bright for c in colour])

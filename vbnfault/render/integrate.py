@@ -15,8 +15,8 @@ def radiance(surface: TerrainMesh, scene: RenderInput, guide: Truth | None = Non
 
     `guide` is the `truth` of the view, which light between surfaces needs; it is computed if it is not given.
     """
-    found, _ = direct(surface, scene)
+    image, _ = direct(surface, scene)
     if not scene.bounces:
-        return found
+        return image
     guide = truth(surface, scene.view, scene.sun) if guide is None else guide
-    return found.with_array(found.array + indirect(surface, scene, guide))
+    return image.with_array(image.array + indirect(surface, scene, guide))

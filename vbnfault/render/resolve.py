@@ -36,11 +36,11 @@ def ground_height_m(surface: TerrainMesh, x_m: F64, y_m: F64, start_height_m: fl
         hit = surface.intersect(mi.Ray3f(points, down))
         normal, distance, valid = hit.normal, hit.distance_m, hit.valid
         dr.eval(normal, distance, valid)
-        found, up = valid.numpy().astype(bool), normal.z.numpy() < 0
-        depth = origin[:, 2] + np.where(found, distance.numpy(), 0.0)
-        hit_ground = open_ & found & up
+        met, up = valid.numpy().astype(bool), normal.z.numpy() < 0
+        depth = origin[:, 2] + np.where(met, distance.numpy(), 0.0)
+        hit_ground = open_ & met & up
         height[hit_ground] = -depth[hit_ground]
-        open_ &= found & ~up
+        open_ &= met & ~up
         if not open_.any():
             break
         origin[:, 2] = np.where(open_, depth + 1e-3, origin[:, 2])
@@ -85,9 +85,9 @@ def _distance_m(corners: F64) -> F64:
 
 def is_between(surface: TerrainMesh, origin_L_m: F64, points_L_m: F64) -> bool:
     """Return whether any surface lies between `origin_L_m`, float64[3], and any of the points, float64[n, 3]."""
-    way = points_L_m - origin_L_m
-    length = np.maximum(np.linalg.norm(way, axis=1), 1e-9)
-    return bool(_any_hit(surface, origin_L_m[None], (way / length[:, None])[None], length).any())
+    ray = points_L_m - origin_L_m
+    length = np.maximum(np.linalg.norm(ray, axis=1), 1e-9)
+    return bool(_any_hit(surface, origin_L_m[None], (ray / length[:, None])[None], length).any())
 
 
 def sun_visible_fraction(

@@ -88,12 +88,12 @@ class World:
 
     def hit(self, rays: Any, traced: tuple[Any, ...]) -> VehicleHit:
         """Return the nearer of the two hits of each ray."""
-        ground, found = self.surface.hit(rays, traced[:-1]), traced[-1]
-        nearer = found.is_valid() & (~ground.valid | (found.t < ground.distance_m))
-        normal, material = self.vehicle.facet(found.prim_index, nearer)
+        ground, on_vehicle = self.surface.hit(rays, traced[:-1]), traced[-1]
+        nearer = on_vehicle.is_valid() & (~ground.valid | (on_vehicle.t < ground.distance_m))
+        normal, material = self.vehicle.facet(on_vehicle.prim_index, nearer)
         normal = self._in_L(normal)
         normal = dr.mulsign(normal, -dr.dot(normal, rays.d))  # towards the viewer
-        return VehicleHit(ground, nearer, found.t, normal, material, rays)
+        return VehicleHit(ground, nearer, on_vehicle.t, normal, material, rays)
 
     def occluded(self, rays: Any, active: Any, *, coherent: bool = True) -> Any:
         """Return whether anything lies along the rays."""

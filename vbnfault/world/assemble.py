@@ -436,11 +436,11 @@ def _plain(material: object) -> Any:
 def _pose(name: str, table: PoseTable, vehicle: Spacecraft | None) -> HingePose:
     """Return the turn of a joint. Raises InputError if hinge or axis is missing."""
     hinge = None if vehicle is None else vehicle.hinges[name]
-    at = table.hinge_m or (hinge.hinge_B_m if hinge else None)
+    hinge_m = table.hinge_m or (hinge.hinge_B_m if hinge else None)
     axis = table.axis or (hinge.axis_B if hinge else None)
-    if at is None or axis is None:
+    if hinge_m is None or axis is None:
         raise InputError(f"spacecraft.pose.{name}: hinge_m and axis are missing")
-    return HingePose(hinge_B_m=at, axis_B=axis, angle_deg=table.angle_deg)
+    return HingePose(hinge_B_m=hinge_m, axis_B=axis, angle_deg=table.angle_deg)
 
 
 def render_vehicle(scene: Scene, mesh: SpacecraftMesh) -> Vehicle:

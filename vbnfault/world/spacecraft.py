@@ -216,11 +216,11 @@ class SpacecraftMesh:
         hit = np.zeros(len(directions_B), dtype=bool)
         step = max(1, 4_000_000 // max(1, len(self.faces)))  # number of rays at once, which limits memory to 100 MB
         for start in range(0, len(directions_B), step):
-            some = directions_B[start : start + step]
+            part = directions_B[start : start + step]
             # the ray must lie inside the cone of a triangle from the origin, and on the triangle's side
-            turn = some @ sides.transpose(0, 2, 1)
+            turn = part @ sides.transpose(0, 2, 1)
             within = (turn >= 0).all(axis=0) | (turn <= 0).all(axis=0)
-            hit[start : start + step] = (within & ((some @ normal.T) * height > 0)).any(axis=1)
+            hit[start : start + step] = (within & ((part @ normal.T) * height > 0)).any(axis=1)
         return hit
 
     def blocked_fraction(self, fov_deg: float, side: int = 64) -> float:
@@ -229,8 +229,8 @@ class SpacecraftMesh:
         `fov_deg` is the full field of view of the image.
         The boresight is in the centre of the image.
         """
-        at = (np.arange(side) + 0.5) / side * 2 - 1
-        slope = np.tan(np.radians(fov_deg) / 2) * at
+        across = (np.arange(side) + 0.5) / side * 2 - 1
+        slope = np.tan(np.radians(fov_deg) / 2) * across
         x, y = np.meshgrid(slope, slope)
         return float(self.blocked(np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3)).mean())
 
@@ -289,12 +289,12 @@ def _keys(name: str) -> list[str]:
     return list(dict.fromkeys(keys))
 
 
-def _refuse_unknown(table: Iterable[str], known: Iterable[str], what: str) -> None:
+def _refuse_unknown(table: Iterable[str], known: Iterable[str], kind: str) -> None:
     """Raise InputError for the first key of a table that is not a known name."""
     names = sorted(set(known))
     for key in table:
         if key not in names:
-            raise InputError(f"spacecraft {what} {key!r}: no such name; the vehicle has {', '.join(names)}")
+            raise InputError(f"spacecraft {kind} {key!r}: no such name; the vehicle has {', '.join(names)}")
 
 
 # ------------------------------------------------------------------------------------ files
