@@ -27,8 +27,8 @@ from vbnfault.lens import Prescription, first_order, load_lens
 from vbnfault.lens.glass import D_NM
 from vbnfault.lens.rays import ghost
 from vbnfault.lens.straylight.paraxial import along, axial_transmittance, pairs, transmittance
-from vbnfault.lens.straylight.scatter import ROUGHNESS_NM, point_source_transmittance
-from vbnfault.lens.straylight.total import VEIL_FRACTION
+from vbnfault.lens.straylight.scatter import ROUGHNESS_NM, Cleanliness, point_source_transmittance
+from vbnfault.lens.straylight.settings import VEIL_FRACTION
 
 SPOT_DEG = 2.0
 ANGLES_DEG = np.concatenate([np.geomspace(SPOT_DEG, 10, 24)[:-1], np.linspace(10, 89.9, 64)])
@@ -53,8 +53,7 @@ def index_of(
         lens,
         ANGLES_DEG,
         wavelength_nm=wavelength_nm,
-        roughness_nm=roughness_nm,
-        cleanliness_level=cleanliness_level,
+        cleanliness=Cleanliness(roughness_nm=roughness_nm, level=cleanliness_level),
     )[0]
     # the integrals begin at the rim of the spot, which is black
     return {

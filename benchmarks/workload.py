@@ -18,6 +18,7 @@ from vbnfault.core import frames, spectra
 from vbnfault.core.quantities import Sample
 from vbnfault.lens import load_lens, scaled_to_focal_length
 from vbnfault.lens.straylight.irradiance import FlareModel
+from vbnfault.lens.straylight.settings import SensorGrid
 from vbnfault.pipeline.exposure import meter
 from vbnfault.pipeline.images import take_images
 from vbnfault.pipeline.injection import inject_faults
@@ -166,8 +167,7 @@ class Workload:
         return FlareModel(
             lens,
             spectra.band_nodes_nm(400.0, 700.0, 8),
-            shape=(camera.height_px, camera.width_px),
-            pitch_mm=camera.detector.pixel_pitch_um * 1e-3,
+            SensorGrid(shape=(camera.height_px, camera.width_px), pitch_mm=camera.detector.pixel_pitch_um * 1e-3),
             sun_radius_rad=self.scene.sun.angular_radius_rad,
         )
 

@@ -34,7 +34,7 @@ from vbnfault.lens.imaging import point_spreads
 from vbnfault.lens.prescription_file import to_table
 from vbnfault.lens.rays import trace
 from vbnfault.lens.straylight.paraxial import paraxial_ghosts
-from vbnfault.lens.straylight.scatter import veiling_glare
+from vbnfault.lens.straylight.scatter import Cleanliness, veiling_glare
 from vbnfault.lens.straylight.starburst import starburst
 from vbnfault.scene import config
 from vbnfault.world import assemble
@@ -255,7 +255,9 @@ def test_scaling_keeps_films_roughness_and_grains_and_lengthens_paths_in_glass()
     assert taken(lens) / taken(clear[0]) == pytest.approx(0.9 ** (glass_mm / 10), rel=1e-9)
     # in clear glass, roughness of 2 nm and particles of a level scatter the same share, over the same angles
     glare = [
-        veiling_glare(v, sun_deg=10.0, wavelength_nm=np.array([D_NM]), roughness_nm=2.0, cleanliness_level=300.0)
+        veiling_glare(
+            v, sun_deg=10.0, wavelength_nm=np.array([D_NM]), cleanliness=Cleanliness(roughness_nm=2.0, level=300.0)
+        )
         for v in clear
     ]
     shape, pitch = (32, 32), 1.0

@@ -10,6 +10,7 @@ import pytest
 from vbnfault.core import llvm
 from vbnfault.core.errors import VbnfaultError
 from vbnfault.lens import RealLens, first_order, load_lens, scaled_to_field
+from vbnfault.lens.straylight.settings import SensorGrid, SunSource
 from vbnfault.lens.straylight.total import straylight
 
 LENSES = ("nikkor_28_f2p8", "nikkor_35_f2p8")
@@ -58,13 +59,9 @@ def test_the_sensor_raises_ghosts_near_the_axis(name: str) -> None:
     for reflectance in (0.0, 0.05, 0.1):
         found = straylight(
             replace(lens, sensor_reflectance=reflectance),
-            model="traced",
             wavelength_nm=np.array([450.0, 650.0]),
-            shape=(32, 32),
-            pitch_mm=SENSOR_MM / 32,
-            sun_deg=3.0,
-            azimuth_deg=0.0,
-            sun_radius_rad=4.65e-3,
+            sensor=SensorGrid(shape=(32, 32), pitch_mm=SENSOR_MM / 32),
+            sun=SunSource(angle_deg=3.0, radius_rad=4.65e-3),
         )
         light.append(float(found.ghosts[:, near].sum()))
     # of two reflections one is the sensor's: linear in its reflectance; brighter ghosts are drawn with more rays,

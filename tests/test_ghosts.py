@@ -22,10 +22,12 @@ try:
 except VbnfaultError as error:
     pytest.skip(f"no usable LLVM: {error}", allow_module_level=True)
 
-from vbnfault.lens.straylight.bundles import Rays, Tracer, backend, name_of, routes
+from vbnfault.lens.straylight.bundles import Rays, Tracer, name_of, routes
 from vbnfault.lens.straylight.ghosts import boxes, traced_ghosts
 from vbnfault.lens.straylight.irradiance import FlareModel, disc_samples
 from vbnfault.lens.straylight.raster import _EDGE_NODES, EDGE_HIGH, EDGE_LOW, edge_profiles
+from vbnfault.lens.straylight.settings import GhostSettings, SensorGrid
+from vbnfault.lens.straylight.steps import backend
 
 LENSES = (
     "nikkor_35_f2p8",
@@ -111,7 +113,7 @@ def test_aspheres_conics_and_glass_that_absorbs() -> None:
         rays = bundle(route, (0.0, 0.0, 4.0, 4.0), [0.1, 0.0, 1.0])
         single, double, _, found = both_ways(lens, made, rays, 15)
         assert np.abs(single - double)[found.arrives].max() < 1e-4
-    straight = made.trace(bundle(0, (0.0, 0.0, 1e-3, 1e-3), [0.0, 0.0, 1.0]), 3).share.numpy()
+    straight = made.trace(bundle(0, (0.0, 0.0, 1e-3, 1e-3), [0.0, 0.0, 1.0]), 3).fraction.numpy()
     n = 1.5
     assert straight == pytest.approx((1 - ((n - 1) / (n + 1)) ** 2) ** 2 * 0.5**0.4, rel=1e-4)
 
@@ -159,7 +161,7 @@ def test_one_side_tells_of_the_other() -> None:
         assert kept[0].shape == ((across**2).sum(),)
         assert (kept[0] == kept[1]).mean() > 0.99
         both = kept[0] & kept[1]
-        for name in ("x_mm", "y_mm", "share", "radius", "margin"):
+        for name in ("x_mm", "y_mm", "fraction", "radius", "margin"):
             one, other = (getattr(spots, name).numpy()[both] for spots in (half, whole))
             # single precision, from mirrored starts; margins are a hundred times radii
             np.testing.assert_allclose(one, other, rtol=5e-5, atol=2e-3 if name == "margin" else 5e-5)
@@ -265,8 +267,10 @@ def test_blades_bound_the_beam() -> None:
 
 
 def model(lens: Prescription, **more: Any) -> FlareModel:
-    settings: dict[str, Any] = {"shape": (160, 200), "pitch_mm": 0.2, "sun_radius_rad": 2e-3} | more
-    return FlareModel(lens, settings.pop("wavelength_nm", np.array([D_NM])), **settings)
+    given: dict[str, Any] = {"shape": (160, 200), "pitch_mm": 0.2, "sun_radius_rad": 2e-3} | more
+    sensor = SensorGrid(shape=given.pop("shape"), pitch_mm=given.pop("pitch_mm"))
+    wavelength, radius = given.pop("wavelength_nm", np.array([D_NM])), given.pop("sun_radius_rad")
+    return FlareModel(lens, wavelength, sensor, sun_radius_rad=radius, settings=GhostSettings(**given))
 
 
 @pytest.mark.parametrize(("kind", "worst"), [("traced", 0.05), ("paraxial", 0.01)])

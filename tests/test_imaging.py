@@ -25,7 +25,17 @@ from vbnfault.core import resources
 from vbnfault.core.errors import InputError
 from vbnfault.core.quantities import BODY, SUN, Radiance
 from vbnfault.detector import ThreeColourDetector
-from vbnfault.lens import RealLens, ThinLens, first_order, imaging, load_lens, parse_lens, scaled_to_field
+from vbnfault.lens import (
+    RealLens,
+    ThinLens,
+    first_order,
+    imaging,
+    load_lens,
+    parse_lens,
+    point_spread,
+    resampling,
+    scaled_to_field,
+)
 from vbnfault.lens.coating import design, mean_reflectance
 from vbnfault.lens.footprint import DEFAULT_LENS
 from vbnfault.lens.glass import C_NM, D_NM, F_NM
@@ -308,11 +318,11 @@ def test_point_spreads_have_the_moments_of_their_rays(name: str, angle_deg: floa
     slope = math.tan(math.radians(angle_deg))
     at, _ = bundle(lens, slope, D_NM, side=201)
     at = at - at.mean(axis=0)
-    assert np.hypot(*at.T).max() < imaging.REACH_PX  # no light is cut off
+    assert np.hypot(*at.T).max() < point_spread.REACH_PX  # no light is cut off
     distance = lens.distorted(np.array([slope] * 4))
     turns = np.radians([0.0, 90.0, 180.0, 30.0])
     kernels = imaging.point_spreads(lens, distance, turns, D_NM)
-    place = np.arange(-imaging.REACH_PX, imaging.REACH_PX + 1)
+    place = np.arange(-point_spread.REACH_PX, point_spread.REACH_PX + 1)
     x, y = np.meshgrid(place, place)
     # diffraction: a Gaussian of 0.42 λ N each way, N by the irradiance there
     light = float(lens.relative_illumination(distance)[0])
@@ -382,9 +392,9 @@ def test_what_a_point_spread_leaves_out_moves_no_light() -> None:
         lens = real(name)
         slope = math.tan(math.radians(angle_deg))
         at, _ = bundle(lens, slope, D_NM)
-        assert (np.hypot(*(at - at.mean(axis=0)).T) > imaging.REACH_PX).mean() > 0.01
+        assert (np.hypot(*(at - at.mean(axis=0)).T) > point_spread.REACH_PX).mean() > 0.01
         turns = np.radians([0.0, 70.0])
-        place = np.arange(-imaging.REACH_PX, imaging.REACH_PX + 1)
+        place = np.arange(-point_spread.REACH_PX, point_spread.REACH_PX + 1)
         for kernel in imaging.point_spreads(lens, lens.distorted(np.full(2, slope)), turns, D_NM):
             assert kernel.sum() == pytest.approx(1, abs=1e-6)
             assert abs((kernel.sum(axis=0) * place).sum()) < 2e-3
@@ -415,19 +425,19 @@ def test_the_whole_convolution() -> None:
     light = rng.random((23, 37), dtype=np.float32)
     for n in (3, 11, 13, 15):  # with more than 121 taps it goes in two parts
         kernel = rng.random((n, n), dtype=np.float32)
-        np.testing.assert_allclose(imaging.spread(light, kernel), convolve2d(light, kernel), rtol=1e-5)
+        np.testing.assert_allclose(point_spread.spread(light, kernel), convolve2d(light, kernel), rtol=1e-5)
 
 
 def test_a_finer_grid_keeps_its_pixels_and_does_not_ripple() -> None:
     rng = np.random.default_rng(6)
     band = rng.random((9, 12), dtype=np.float32)
     band[4, 5] = 1e6
-    fine = imaging.finer(band)
+    fine = resampling.finer(band)
     assert np.array_equal(fine[::2, ::2], band)
     assert fine.min() >= band.min()
     assert fine.max() <= band.max()
     x, y = np.meshgrid(np.arange(12.0), np.arange(9.0))
-    bent = imaging.finer((x**2 + 3 * y + 1).astype(np.float32))
+    bent = resampling.finer((x**2 + 3 * y + 1).astype(np.float32))
     x, y = np.meshgrid(np.arange(0, 11.1, 0.5), np.arange(0, 8.1, 0.5))
     np.testing.assert_allclose(bent[2:-2, 2:-2], (x**2 + 3 * y + 1)[2:-2, 2:-2], rtol=1e-6)  # quadratics are exact
 

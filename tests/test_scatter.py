@@ -23,6 +23,7 @@ from vbnfault.lens.straylight import scatter
 from vbnfault.lens.straylight.paraxial import mirrors, transmittance
 from vbnfault.lens.straylight.scatter import (
     DUST_INDEX,
+    Cleanliness,
     Harvey,
     baffle_transmission,
     obscured_fraction,
@@ -235,7 +236,7 @@ def test_light_scattered_at_a_surface_lands_where_it_is_said_to(name: str) -> No
     lens = load_lens(name)
     figures, index = first_order(lens), lens.indices()
     last = len(lens.surfaces) - 1
-    stretch = scatter._surfaces(lens, 587.5618, 1.0, 0.0, 0.01, -1.5).stretch
+    stretch = scatter._surfaces(lens, 587.5618, scatter.POLISHED).stretch
     for row, found in zip(mirrors(lens), stretch, strict=True):
         rest = system(lens, row + 1, last)
         if row < last:
@@ -254,7 +255,10 @@ def test_all_scattered_flux_arrives(name: str) -> None:
     """∫ E dA over the sensor's plane = T Σ TIS × what enters, for any BSDF that ends at β = 1."""
     lens, wavelength = load_lens(name), [450.0, 800.0]
     glare = veiling_glare(
-        lens, sun_deg=0.0, wavelength_nm=wavelength, roughness_nm=2.0, cleanliness_level=200.0, L=3e-3, S=-2.2
+        lens,
+        sun_deg=0.0,
+        wavelength_nm=wavelength,
+        cleanliness=Cleanliness(roughness_nm=2.0, level=200.0, knee=3e-3, slope=-2.2),
     )
     r = glare.efl_mm * glare.offset
     for row, total, nm in zip(glare.irradiance, glare.glare_total_fraction, wavelength, strict=True):
@@ -273,7 +277,7 @@ def test_all_scattered_flux_arrives(name: str) -> None:
 def test_flux_of_an_image() -> None:
     """S = -4 in closed form: x²/(1+x²) of the light lies within x = r / (L f a_j/a_ent)."""
     lens, L = singlet(), 2e-3
-    glare = veiling_glare(lens, sun_deg=0.0, wavelength_nm=587.5618, L=L, S=-4.0)
+    glare = veiling_glare(lens, sun_deg=0.0, wavelength_nm=587.5618, cleanliness=Cleanliness(knee=L, slope=-4.0))
     pitch, size = 0.02, 301
     image = glare.image((0.0, 0.0), (size, size), pitch)[0].astype(np.float64)
     y, x = np.indices(image.shape) - (size - 1) / 2
@@ -297,7 +301,7 @@ def test_an_image_is_the_formula_at_every_pixel() -> None:
     sun = np.array([9.0, -4.0])
     f = first_order(lens).efl_mm
     angle = np.degrees(np.arctan(np.hypot(*sun) / f))
-    glare = veiling_glare(lens, sun_deg=angle, wavelength_nm=[500.0, 700.0], cleanliness_level=300.0)
+    glare = veiling_glare(lens, sun_deg=angle, wavelength_nm=[500.0, 700.0], cleanliness=Cleanliness(level=300.0))
     image = glare.image((9.0, -4.0), (40, 60), 0.3)
     assert image.shape == (2, 40, 60)
     assert image.dtype == np.float32
@@ -349,17 +353,21 @@ def test_transmittance_of_a_point_source() -> None:
     lens = load_lens("nikkor_35_f2p8")
     angles = np.array([0.5, 3.0, 15.0, 30.0, 45.0, 60.0, 80.0])
     wavelength = [500.0, 700.0]
-    found = point_source_transmittance(lens, angles, wavelength_nm=wavelength, cleanliness_level=100.0)
+    found = point_source_transmittance(lens, angles, wavelength_nm=wavelength, cleanliness=Cleanliness(level=100.0))
     assert found.shape == (2, 7)
     assert (np.diff(found, axis=1) < 0).all()
     for column in (1, 4):
-        glare = veiling_glare(lens, sun_deg=angles[column], wavelength_nm=wavelength, cleanliness_level=100.0)
+        glare = veiling_glare(
+            lens, sun_deg=angles[column], wavelength_nm=wavelength, cleanliness=Cleanliness(level=100.0)
+        )
         far = glare.efl_mm * np.tan(np.radians(angles[column]))
         middle = glare.image((far, 0.0), (1, 1), 0.01)[:, 0, 0]
         np.testing.assert_allclose(found[:, column], middle, rtol=1e-3)  # a step of the table
-    dirty = point_source_transmittance(lens, angles, wavelength_nm=wavelength, cleanliness_level=500.0)
+    dirty = point_source_transmittance(lens, angles, wavelength_nm=wavelength, cleanliness=Cleanliness(level=500.0))
     assert (dirty > 10 * found).all()
-    smooth = point_source_transmittance(lens, angles, wavelength_nm=wavelength, roughness_nm=0.0)
+    smooth = point_source_transmittance(
+        lens, angles, wavelength_nm=wavelength, cleanliness=Cleanliness(roughness_nm=0.0)
+    )
     assert (smooth == 0).all()
 
 
@@ -426,10 +434,10 @@ def test_a_baffle_only_shades() -> None:
     [
         ({"sun_deg": 90.0}, "sun_deg = 90: must be from 0 to 89.9"),
         ({"wavelength_nm": [500.0, np.nan]}, "wavelength_nm = nan: must be from 250 to 2500"),
-        ({"roughness_nm": -1.0}, "roughness_nm = -1: must be from 0 to 50"),
-        ({"cleanliness_level": -3.0}, "cleanliness_level = -3: must be from 0 to 1000"),
-        ({"L": 0.0}, "L = 0: must be from 1e-05 to 1"),
-        ({"S": 1.0}, "S = 1: must be from -4 to 0"),
+        ({"cleanliness": Cleanliness(roughness_nm=-1.0)}, "roughness_nm = -1: must be from 0 to 50"),
+        ({"cleanliness": Cleanliness(level=-3.0)}, "cleanliness_level = -3: must be from 0 to 1000"),
+        ({"cleanliness": Cleanliness(knee=0.0)}, "L = 0: must be from 1e-05 to 1"),
+        ({"cleanliness": Cleanliness(slope=1.0)}, "S = 1: must be from -4 to 0"),
     ],
 )
 def test_bad_values_are_told(more: dict[str, Any], words: str) -> None:

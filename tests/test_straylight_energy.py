@@ -19,7 +19,9 @@ from vbnfault.detector import ThreeColourDetector
 from vbnfault.faults import FaultContext, act, from_dict, registry
 from vbnfault.lens import Prescription, RealLens, ThinLens, first_order, load_lens, parse_lens, scaled_to_field
 from vbnfault.lens.coating import mean_reflectance
-from vbnfault.lens.straylight.total import Cleanliness, straylight
+from vbnfault.lens.straylight.scatter import Cleanliness
+from vbnfault.lens.straylight.settings import DirectPath, GhostSettings, SensorGrid, StraylightSettings, SunSource
+from vbnfault.lens.straylight.total import straylight
 from vbnfault.output import flare_images
 
 try:
@@ -138,15 +140,12 @@ def test_starburst_glare_and_veil_come_from_the_direct_light(sun_deg: float) -> 
     for size in (SIZE, 9 * SIZE):
         found = straylight(
             lens,
-            model="paraxial",
             wavelength_nm=NODES,
-            shape=(size, size),
-            pitch_mm=pitch,
-            sun_deg=sun_deg,
-            azimuth_deg=20.0,
-            sun_radius_rad=spectra.sun_angular_radius_rad(1.0),
-            cleanliness=Cleanliness(level=300.0),
-            veil_fraction=0.02,
+            sensor=SensorGrid(shape=(size, size), pitch_mm=pitch),
+            sun=SunSource(angle_deg=sun_deg, azimuth_deg=20.0, radius_rad=spectra.sun_angular_radius_rad(1.0)),
+            settings=StraylightSettings(
+                ghosts=GhostSettings(model="paraxial"), cleanliness=Cleanliness(level=300.0), veil_fraction=0.02
+            ),
         )
         strayed = sum(flux(layer, pitch) for layer in (found.starburst, found.glare, found.veil))
         books.append((strayed, found.beyond_mm2, found.direct_fraction))
@@ -232,19 +231,19 @@ def test_a_frame_with_all_straylight_holds_what_enters(camera: str, sun_deg: flo
     assert where.sun_xy_px is not None
     found = straylight(
         lens,
-        model="traced",
         wavelength_nm=NODES,
-        shape=where.shape,
-        pitch_mm=pitch_mm,
-        sun_deg=sun_deg,
-        azimuth_deg=0.0,
-        sun_radius_rad=spectra.sun_angular_radius_rad(1.0),
-        sun_xy_mm=(float((where.sun_xy_px[0] - SIZE / 2) * pitch_mm), 0.0),
-        cleanliness=Cleanliness(level=200.0, roughness_nm=1.0),
-        veil_fraction=0.02,
-        transmittance=where.camera.lens.transmittance(NODES),
-        admitted_mm2=float(area[0] * np.cos(np.radians(sun_deg))),
-        beam_fraction=float(area[0] / area[1]),
+        sensor=SensorGrid(shape=where.shape, pitch_mm=pitch_mm),
+        sun=SunSource(
+            angle_deg=sun_deg,
+            radius_rad=spectra.sun_angular_radius_rad(1.0),
+            image_xy_mm=(float((where.sun_xy_px[0] - SIZE / 2) * pitch_mm), 0.0),
+        ),
+        settings=StraylightSettings(cleanliness=Cleanliness(level=200.0, roughness_nm=1.0), veil_fraction=0.02),
+        path=DirectPath(
+            transmittance=where.camera.lens.transmittance(NODES),
+            admitted_mm2=float(area[0] * np.cos(np.radians(sun_deg))),
+            beam_fraction=float(area[0] / area[1]),
+        ),
     )
     assert where.sun_irradiance_W_m2_nm is not None
     to_e = where.camera.detector.electron_rate_weights(NODES) * where.sun_irradiance_W_m2_nm

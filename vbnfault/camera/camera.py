@@ -48,9 +48,9 @@ class Camera:
         # the rounding errors of the Sun's radiance may be as large as the radiance of the scene
         scene = replace(radiance, array=np.maximum(radiance.array - radiance.sun, 0), sun=None, disc=None)
         sun = replace(radiance, array=radiance.sun, sun=None)
-        found = electrons(self.lens.image(scene))
+        of_scene = electrons(self.lens.image(scene))
         direct = electrons(self.lens.image_of_sun(sun, self.detector.pixel_pitch_um))
-        return replace(found, past_rims=direct.array)
+        return replace(of_scene, past_rims=direct.array)
 
     @property
     def width_px(self) -> int:

@@ -22,7 +22,7 @@ F64 = NDArray[np.float64]
 Site = tuple[slice, slice]
 
 _QUANTISATION_DN2 = 1 / 12  # variance of rounding, EMVA 1288 eq. 11
-_LINEAR_SHARE = 0.7  # fraction of saturation up to which gain and response are fitted (section 6.6)
+_LINEAR_RANGE = 0.7  # fraction of saturation up to which gain and response are fitted (section 6.6)
 _LINEARITY_RANGE = 0.05, 0.95  # fractions of saturation that bound the test of linearity (section 6.7)
 
 
@@ -187,10 +187,10 @@ def _pair(take: Take, photons: float, exposure_s: float, sites: Mapping[str, Sit
 
     The spatial variation cancels in the difference of the two images.
     """
-    one, other = take(photons, exposure_s), take(photons, exposure_s)
+    first, second = take(photons, exposure_s), take(photons, exposure_s)
     out = {}
     for name, site in sites.items():
-        a, b = one[site], other[site]
+        a, b = first[site], second[site]
         step = a.mean() - b.mean()
         out[name] = (float((a.mean() + b.mean()) / 2), float(np.mean((a - b) ** 2) / 2 - step**2 / 2))
     return out
@@ -230,11 +230,9 @@ def _channel(
         raise InputError(
             f"channel {name}: it saturates within the first three exposures, so that no line can be fitted"
         )
-    linear = mean - dark_mean <= _LINEAR_SHARE * (mean[last] - dark_mean)
+    linear = mean - dark_mean <= _LINEAR_RANGE * (mean[last] - dark_mean)
     linear &= np.arange(len(mean)) <= last
-    signal, noise = (mean - dark_mean)[linear], (variance - dark_variance)[linear]
-    gain = float(signal @ noise / (signal @ signal))
-    response = float(photons[linear] @ signal / (photons[linear] @ photons[linear]))
+    gain, response = _slopes(photons[linear], (mean - dark_mean)[linear], (variance - dark_variance)[linear])
     efficiency = response / gain
     dark_noise_dn = float(np.sqrt(max(dark_variance, 0.24)))  # below this, rounding hides the noise (eq. 56)
     dark_noise_e = float(np.sqrt(max(dark_variance - _QUANTISATION_DN2, 0.0)) / gain)
@@ -245,13 +243,11 @@ def _channel(
     dark_means, dark_variances = (np.array([darks[0][name][k], *(p[k] for p in later)]) for k in (0, 1))
     slope_mean, slope_variance = (np.polyfit(exposure, v, 1)[0] for v in (dark_means, dark_variances))
     (flat, flat_var), (dark, dark_var) = ((v[site] for v in stacks[kind]) for kind in ("flat", "dark"))
-    spatial = [
+    flat_spatial, dark_spatial = (
         max(float(v.var(ddof=1) - in_time.mean() / use.stack), 0.0)
         for v, in_time in ((flat, flat_var), (dark, dark_var))
-    ]
-    gain_of_light = flat.mean() - dark.mean()
-    prnu = np.sqrt(max(spatial[0] - spatial[1], 0.0)) / gain_of_light
-    spectra = {kind: _spectra(stacks[kind][0][site]) for kind in ("flat", "dark")}
+    )
+    of_light = flat.mean() - dark.mean()
     return Characterisation(
         channel=name,
         result=Result(
@@ -267,8 +263,8 @@ def _channel(
             linearity_error_percent=_linearity(photons, mean - dark_mean, last),
             dark_current_mean_e_s=float(slope_mean / gain),
             dark_current_variance_e_s=float(slope_variance / gain**2),
-            dsnu_e=float(np.sqrt(spatial[1]) / gain),
-            prnu_percent=float(100 * prnu),
+            dsnu_e=float(np.sqrt(dark_spatial) / gain),
+            prnu_percent=float(100 * (np.sqrt(max(flat_spatial - dark_spatial, 0.0)) / of_light)),
             black_level_dn=float(dark_mean),
         ),
         transfer=PhotonTransfer(
@@ -281,31 +277,38 @@ def _channel(
         dark_mean_dn=dark_means,
         dark_variance_dn2=dark_variances,
         dark_exposure_s=exposure,
-        spectrum=Spectrum(
-            frequency={
-                k: np.asarray(np.fft.rfftfreq(flat.shape[axis]), dtype=np.float64)
-                for k, axis in (("rows", 1), ("columns", 0))
-            },
-            flat_dn=spectra["flat"],
-            dark_dn=spectra["dark"],
-        ),
+        spectrum=_spectrum(flat, dark),
         dsnu_map_dn=dark - dark.mean(),
-        prnu_map=(flat - dark) / gain_of_light - 1,
+        prnu_map=(flat - dark) / of_light - 1,
     )
+
+
+def _slopes(photons: F64, signal: F64, noise: F64) -> tuple[float, float]:
+    """Return the slopes through the origin of the variance over the signal and of the signal over the photons."""
+    return float(signal @ noise / (signal @ signal)), float(photons @ signal / (photons @ photons))
 
 
 def _linearity(photons: F64, signal: F64, last: int) -> float:
     """Return the mean relative deviation from the line with the best relative fit, in % (section 6.7)."""
-    low, high = (share * signal[last] for share in _LINEARITY_RANGE)
+    low, high = (fraction * signal[last] for fraction in _LINEARITY_RANGE)
     chosen = (signal >= low) & (signal <= high) & (np.arange(len(signal)) <= last)
     p, y = photons[chosen], signal[chosen]
     slope, offset = np.polyfit(p, y, 1, w=1 / y)
     return float(100 * np.mean(np.abs(y - (offset + slope * p)) / (offset + slope * p)))
 
 
-def _spectra(picture: F64) -> dict[str, F64]:
+def _spectrum(flat: F64, dark: F64) -> Spectrum:
+    """Return the spectra of the mean images under light and in the dark."""
+    frequency = {
+        k: np.asarray(np.fft.rfftfreq(flat.shape[axis]), dtype=np.float64)
+        for k, axis in (("rows", 1), ("columns", 0))
+    }
+    return Spectrum(frequency=frequency, flat_dn=_spectra(flat), dark_dn=_spectra(dark))
+
+
+def _spectra(image: F64) -> dict[str, F64]:
     """Return the root of the mean power spectrum over the rows, and over the columns (section 8.6)."""
-    flat = picture - picture.mean()
+    flat = image - image.mean()
     out = {}
     for name, along in (("rows", flat), ("columns", flat.T)):
         power = np.abs(np.fft.rfft(along, axis=1)) ** 2 / along.shape[1]

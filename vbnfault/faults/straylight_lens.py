@@ -28,8 +28,9 @@ from numpy.typing import NDArray
 
 from ..core import spectra
 from ..core.quantities import Irradiance
-from ..lens.straylight.scatter import CLEANLINESS_LIMITS, ROUGHNESS_NM_LIMITS
-from ..lens.straylight.total import Baffle, Cleanliness, scene_veil_fraction, straylight, veil_of
+from ..lens.straylight.scatter import CLEANLINESS_LIMITS, ROUGHNESS_NM_LIMITS, Cleanliness
+from ..lens.straylight.settings import Baffle, DirectPath, GhostSettings, SensorGrid, StraylightSettings, SunSource
+from ..lens.straylight.total import scene_veil_fraction, straylight, veil_of
 from .context import FaultContext, Params
 from .contract import LensFault
 from .fields import Interval, bounds, choice, number
@@ -178,22 +179,26 @@ class _LensStraylight(LensFault):
         cleanliness = Cleanliness(roughness_nm=params["roughness_nm"], level=params["cleanliness_level"])
         found = straylight(
             lens,
-            model=self.model,
             wavelength_nm=nodes,
-            shape=context.shape,
-            pitch_mm=pitch_mm,
-            sun_deg=theta,
-            azimuth_deg=azimuth,
-            sun_radius_rad=_sun_radius_rad(context),
-            sun_xy_mm=(float(x), float(y)),
-            cleanliness=cleanliness,
-            baffle=Baffle(length_mm=params["baffle_mm"][0], radius_mm=params["baffle_mm"][1]),
-            reflections=params["reflections"],
-            coating_loss=context.coating_loss,
-            veil_fraction=params["veil_fraction"],
-            transmittance=passed,
-            admitted_mm2=float(area_mm2 * np.cos(np.radians(theta))),
-            beam_fraction=float(area_mm2 / axial_mm2),
+            sensor=SensorGrid(shape=context.shape, pitch_mm=pitch_mm),
+            sun=SunSource(
+                angle_deg=theta,
+                azimuth_deg=azimuth,
+                radius_rad=_sun_radius_rad(context),
+                image_xy_mm=(float(x), float(y)),
+            ),
+            settings=StraylightSettings(
+                ghosts=GhostSettings(model=self.model, reflections=params["reflections"]),
+                cleanliness=cleanliness,
+                baffle=Baffle(length_mm=params["baffle_mm"][0], radius_mm=params["baffle_mm"][1]),
+                coating_loss=context.coating_loss,
+                veil_fraction=params["veil_fraction"],
+            ),
+            path=DirectPath(
+                transmittance=passed,
+                admitted_mm2=float(area_mm2 * np.cos(np.radians(theta))),
+                beam_fraction=float(area_mm2 / axial_mm2),
+            ),
         )
         visible = 1.0 if context.sun_visible_fraction is None else float(context.sun_visible_fraction)
         light = found.total * (irradiance * visible).astype(np.float32)[:, None, None]
@@ -220,11 +225,9 @@ class _LensStraylight(LensFault):
         made = flare_model(
             context.frame.prescription(params["lens"], params["coating"]),
             tuple(float(v) for v in _sunlight(context)[0]),
-            context.shape,
-            pitch_mm,
+            SensorGrid(shape=context.shape, pitch_mm=pitch_mm),
             _sun_radius_rad(context),
-            self.model,
-            params["reflections"],
+            GhostSettings(model=self.model, reflections=params["reflections"]),
         )
         ghosts = sorted(made.worn(context.coating_loss).ghosts(*sun), key=lambda g: -g.peak_irradiance_fraction)[
             :_MOST_GHOSTS

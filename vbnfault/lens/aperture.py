@@ -74,10 +74,10 @@ def stopped_down(lens: Prescription, f_number: float) -> Prescription:
     wanted = first_order(as_round).efl_mm / f_number
     if wanted >= axial_beam_diameter_mm(as_round):
         return lens
-    found = trace(as_round, [[wanted / 2, 0.0, -1.0]], [[0.0, 0.0, 1.0]])
+    marginal = trace(as_round, [[wanted / 2, 0.0, -1.0]], [[0.0, 0.0, 1.0]])
     surfaces, stop = list(lens.surfaces), lens.stop
     corner = surfaces[stop].semi_diameter_mm / as_round.surfaces[stop].semi_diameter_mm
-    closed_mm = float(abs(found.points_mm[1 + stop, 0, 0]))
+    closed_mm = float(abs(marginal.points_mm[1 + stop, 0, 0]))
     surfaces[stop] = replace(surfaces[stop], semi_diameter_mm=corner * closed_mm)
     return replace(lens, surfaces=tuple(surfaces))
 

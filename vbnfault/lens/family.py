@@ -56,9 +56,9 @@ def relative(
                 continue
             _vary(row, rng, spread, index_spread)
         try:
-            found = scaled_to_focal_length(parse_lens(table, source=lens.name), efl_mm)
-            if real_pupil_diameter_mm(found) > 0.5 * real_pupil_diameter_mm(lens):
-                return found
+            varied = scaled_to_focal_length(parse_lens(table, source=lens.name), efl_mm)
+            if real_pupil_diameter_mm(varied) > 0.5 * real_pupil_diameter_mm(lens):
+                return varied
             why = "hardly any light passes"
         except InputError as error:
             why = str(error)

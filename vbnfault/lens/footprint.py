@@ -183,12 +183,14 @@ class Beams:
         known = np.minimum(slope, from_slope[-1])
         dark = slope > known + slope[1]
 
-        def at(values: F64) -> F64:
+        def at_slopes(values: F64) -> F64:
             return np.asarray(PchipInterpolator(from_slope, values)(known))
 
-        rim, area = at(rim), at(np.trapezoid(radius**2, turn, axis=1))
+        rim, area = at_slopes(rim), at_slopes(np.trapezoid(radius**2, turn, axis=1))
         rim[dark], area[dark] = 0, 0
-        return Footprint(slope=slope, centre_mm=at(middle), rim_mm=rim, area_mm2=area, brightness=at(brightness))
+        return Footprint(
+            slope=slope, centre_mm=at_slopes(middle), rim_mm=rim, area_mm2=area, brightness=at_slopes(brightness)
+        )
 
 
 def _cells(x: F64, y: F64) -> tuple[F64, F64, F64]:
@@ -209,15 +211,15 @@ def _fitted(x: F64, y: F64, area: F64, light: F64) -> F64:
     area, light = (w.reshape(n, -1) / w.sum(axis=(1, 2))[:, None] for w in (area, light))
     terms = np.stack([np.ones_like(u), u, u * u, v * v], axis=1)
     matrix = np.einsum("nik,njk,nk->nij", terms, terms, area)
-    found = np.linalg.solve(matrix, np.einsum("nik,nk->ni", terms, light)[..., None])[..., 0]
-    return np.asarray(found / scale[:, None] ** np.array([0, 1, 2, 2]))
+    coefficients = np.linalg.solve(matrix, np.einsum("nik,nk->ni", terms, light)[..., None])[..., 0]
+    return np.asarray(coefficients / scale[:, None] ** np.array([0, 1, 2, 2]))
 
 
 def _beyond(lens: Prescription, sensor_mm: float, slope: F64, x: F64, y: F64) -> F64:
     """Return each ray's largest distance from the axis in semi-diameters; inf for a ray that does not arrive."""
-    found, shape = inclined_rays(lens, slope, x, y, D_NM, sensor_mm)
-    lost = ~np.isfinite(found.points_mm[-1, :, 0])
-    return np.where(lost, np.inf, found.relative_radius).reshape(shape)
+    path, shape = inclined_rays(lens, slope, x, y, D_NM, sensor_mm)
+    lost = ~np.isfinite(path.points_mm[-1, :, 0])
+    return np.where(lost, np.inf, path.relative_radius).reshape(shape)
 
 
 @lru_cache(maxsize=8)
@@ -242,12 +244,12 @@ def beams(lens: Prescription, largest_slope: float, sensor_mm: float) -> Beams:
     for _ in range(_HALVINGS):
         half = (low + high) / 2
         x, y = centre[:, None] + half * np.cos(azimuth), half * np.sin(azimuth)
-        there = _beyond(lens, sensor_mm, slope[:, None], x, y)
-        passes = there <= 1
-        low, inside = np.where(passes, half, low), np.where(passes, there, inside)
-        high, outside = np.where(passes, high, half), np.where(passes, outside, there)
-    share = np.where(np.isfinite(outside), (1 - inside) / np.maximum(outside - inside, 1e-12), 0)
-    rim = np.where(width[:, None] > 0, low + (high - low) * np.clip(share, 0, 1), 0)
+        beyond = _beyond(lens, sensor_mm, slope[:, None], x, y)
+        passes = beyond <= 1
+        low, inside = np.where(passes, half, low), np.where(passes, beyond, inside)
+        high, outside = np.where(passes, high, half), np.where(passes, outside, beyond)
+    fraction = np.where(np.isfinite(outside), (1 - inside) / np.maximum(outside - inside, 1e-12), 0)
+    rim = np.where(width[:, None] > 0, low + (high - low) * np.clip(fraction, 0, 1), 0)
     return Beams(lens=lens, sensor_mm=sensor_mm, slope=slope, centre_mm=centre, rim_mm=rim)
 
 
@@ -335,17 +337,17 @@ class Footprint:
         The footprint is the one whose middle lies at `distance_mm` from the axis. The fraction is float32[y, x]
         over the disc's position relative to that middle, which is in the middle of the table.
         """
-        at = int(np.argmin(np.abs(np.abs(self.centre_mm) - distance_mm)))
-        if self.area_mm2[at] == 0:
+        nearest = int(np.argmin(np.abs(np.abs(self.centre_mm) - distance_mm)))
+        if self.area_mm2[nearest] == 0:
             return np.zeros((_SHADOW, _SHADOW), dtype=np.float32), 1.0
-        rim = self.rim_mm[at]
+        rim = self.rim_mm[nearest]
         per_mm = (_SHADOW / 2 - 2) / (float(rim.max()) + radius_mm)
         x = np.arange(_SHADOW) - _SHADOW // 2
         distance = np.hypot(x[None, :], x[:, None])
         cosine = x[None, :] / np.maximum(distance, 1e-9)
         rims = np.interp(cosine, np.linspace(-1, 1, _TURNS), rim) * per_mm
         light, disc = (np.clip(edge - distance + 0.5, 0, 1) for edge in (rims, radius_mm * per_mm))
-        c, u, v = self.brightness[at], x[None, :] / per_mm, x[:, None] / per_mm
+        c, u, v = self.brightness[nearest], x[None, :] / per_mm, x[:, None] / per_mm
         light = light * np.maximum(c[0] + u * (c[1] + u * c[2]) + v * v * c[3], 0)
         light, disc = light / light.sum(), disc * (np.pi * (radius_mm * per_mm) ** 2 / disc.sum())
         both = fft.irfft2(fft.rfft2(light) * fft.rfft2(disc), s=(_SHADOW, _SHADOW))
@@ -429,12 +431,12 @@ def _looked_up(table: F32, row: F32, column: F32 | None = None) -> F32:
     return np.asarray(cv2.remap(table, across, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
 
 
-def disc_overlap(distance: ArrayLike, one: ArrayLike, other: ArrayLike) -> NDArray:
+def disc_overlap(distance: ArrayLike, radius: ArrayLike, other_radius: ArrayLike) -> NDArray:
     """Return the area that two discs have in common, whose middles are `distance` apart.
 
-    `one` and `other` are the radii. The result has the arguments' common shape and their unit squared.
+    The result has the arguments' common shape and their unit squared.
     """
-    d, a, b = np.broadcast_arrays(distance, one, other)
+    d, a, b = np.broadcast_arrays(distance, radius, other_radius)
     least = np.minimum(a, b)
     near, far = np.abs(a - b), a + b
     # the overlap is two circular segments on either side of the chord through the rims' crossings

@@ -30,182 +30,34 @@ from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from typing import ClassVar
 
-import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import PchipInterpolator
-from scipy.special import ndtr
 
 from ..core.errors import InputError
 from ..core.quantities import Irradiance, Radiance
 from ..core.sundisc import Floats, add_mean, pixel_sums
-from .aperture import axial_beam_diameter_mm
 from .distortion import RadialModel
 from .gaussian import first_order
 from .glass import D_NM
-from .mapping import ChiefHeights, FieldMap, camera_model, chief_heights, fan_heights_mm, field_map, inclined_rays
+from .mapping import ChiefHeights, FieldMap, camera_model, chief_heights, field_map
+from .point_spread import REACH_PX, PointSpreads, Tiles, kernels_of_spots
 from .prescription import Prescription
+from .resampling import RadialTables, Resampling, table_distances
+from .spots import FieldBundles, field_bundles, spot_diagrams
 from .straylight.paraxial import axial_transmittance
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
-# The point spread reaches this many pixels from its centre; light beyond is distributed within.
-REACH_PX = 7
-# A point spread with a smaller root-mean-square radius is not applied.
-_SHARP_PX = 0.3
-
 _ANGLES = 65  # field angles of the tables
 _BEYOND = 1.6  # the tables reach this multiple of the corner's tangent
-_HEIGHTS = 129  # rays of a narrower meridional fan
-_RAYS_OF_BEAM = 4  # the axial beam must hold at least this many of them
-_AZIMUTHS = 32  # over half a turn of a bundle
-_RADII = 33  # samples along a radius that locate a bundle's rim, and
-_FINE_RADII = 9  # samples within the interval that holds it
-_RINGS = 10  # of a bundle's rays
 _DENSE = 4097  # nodes of the tables over slope
-_STEPS = 65536  # nodes of the tables over squared radius
 _COLOUR_PX = 4  # extra guard band, since other colours may come from farther out than the d line
-_TILE_PX = 128
-_STRIP_PX = 64
-_FINE = 5  # cells of a pixel in which rays of a spot are counted
-_ROUNDS = 12  # iterations that correct a spot's width
-_TRIM = 2e-3  # largest fraction of a point spread in the outermost pixels that are cut off
-_AIRY_SIGMA = 0.42  # sigma of the Gaussian closest to an Airy pattern's core, in wavelengths × f-number
-_MIDWAY: F32 = np.array([[-1 / 16, 9 / 16, 9 / 16, -1 / 16]], dtype=np.float32)
 _INSIDE = (slice(REACH_PX, -REACH_PX), slice(REACH_PX, -REACH_PX))
-_DIRECT_TAPS = 121  # with more taps OpenCV uses Fourier transforms, which spread the Sun's rounding errors
-
-
-# --- rays ------------------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Beams:
-    """Hold, per field angle, the bundle of rays that passes all rims, in the plane of the first vertex.
-
-    `centre_mm` float64[angle] is a point inside the bundle on the x axis. `rim_mm` float64[angle, azimuth] is the
-    distance of the bundle's rim from there, for azimuths within half a turn; the other half is its mirror image.
-    """
-
-    slope: F64
-    centre_mm: F64
-    rim_mm: F64
-
-    @property
-    def azimuth_rad(self) -> F64:
-        """Return the azimuths of `rim_mm`, float64[azimuth]."""
-        return np.asarray((np.arange(_AZIMUTHS) + 0.5) * np.pi / _AZIMUTHS)
-
-    @property
-    def area_mm2(self) -> F64:
-        """Return the area of each bundle, float64[angle].
-
-        The midpoint rule converges fast over the whole turn of a smooth rim.
-        """
-        return np.asarray((self.rim_mm**2).sum(axis=1) * np.pi / _AZIMUTHS)
-
-
-def _beams(lens: Prescription, slope: F64) -> _Beams:
-    """Return the bundles at the d line; each rim is located between rays that pass and rays that do not."""
-    sensor = first_order(lens).bfd_mm
-
-    def beyond(x: F64, y: F64) -> F64:
-        """Return the largest relative radius of rays through (x, y), inf for rays that do not arrive."""
-        found, shape = inclined_rays(lens, slope.reshape(-1, *(1,) * (x.ndim - 1)), x, y, D_NM, sensor)
-        lost = ~np.isfinite(found.points_mm[-1, :, 0])
-        return np.where(lost, np.inf, found.relative_radius).reshape(shape)
-
-    heights = fan_heights_mm(lens, slope)
-    outside = beyond(heights, np.zeros(1))
-    at = np.arange(len(slope))
-    # the beam of a nearly closed stop fits between two rays: trace narrower fans around the ray nearest to passing
-    beam_mm = axial_beam_diameter_mm(lens)
-    while beam_mm > 0 and (step := float((heights[:, 1] - heights[:, 0]).max())) > beam_mm / _RAYS_OF_BEAM:
-        middle = heights[at, np.argmin(outside, axis=1)][:, None]
-        heights = middle + 2 * max(step, beam_mm) * np.linspace(-1, 1, _HEIGHTS)
-        outside = beyond(heights, np.zeros(1))
-    centre = heights[at, np.argmin(outside, axis=1)]
-    passing = outside <= 1
-    width = passing.sum(axis=1) * (heights[:, 1] - heights[:, 0])
-    reach = 1.5 * np.maximum(width, width[0])
-    azimuth = (np.arange(_AZIMUTHS) + 0.5) * np.pi / _AZIMUTHS
-
-    def rim(near: F64, far: F64, samples: int) -> tuple[F64, F64, F64]:
-        """Return an interval of distances that holds the rim, and the rim by linear interpolation within it."""
-        distance = near[..., None] + (far - near)[..., None] * np.linspace(0, 1, samples)
-        x = centre[:, None, None] + distance * np.cos(azimuth)[:, None]
-        over = beyond(x, distance * np.sin(azimuth)[:, None])
-        k = np.maximum(np.argmax(over > 1, axis=2), 1)[..., None]
-        (low, high), (a, b) = (
-            (np.take_along_axis(v, k - 1, 2)[..., 0], np.take_along_axis(v, k, 2)[..., 0]) for v in (distance, over)
-        )
-        with np.errstate(invalid="ignore"):
-            share = np.where(np.isfinite(b), (1 - a) / np.maximum(b - a, 1e-12), 0.0)
-        return low, high, low + np.clip(share, 0, 1) * (high - low)
-
-    nothing = np.zeros((len(slope), _AZIMUTHS))
-    low, high, _ = rim(nothing, nothing + reach[:, None], _RADII)
-    _, _, found = rim(low, high, _FINE_RADII)
-    found[~passing.any(axis=1)] = 0
-    return _Beams(slope=slope, centre_mm=centre, rim_mm=found)
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Spots:
-    """Hold the rays of each bundle at the sensor, half of them; the other half mirrors them in the x axis.
-
-    `place_mm` and `slope`, float64[angle, ray, 2], are positions and slopes with x pointing outwards; `weight_mm2`
-    float64[angle, ray] is the area that each ray came through.
-    """
-
-    place_mm: F64
-    slope: F64
-    weight_mm2: F64
-
-    def centred(self, values: F64) -> F64:
-        """Return the values without the weighted mean of x; the mean of y is 0 by symmetry."""
-        total = np.maximum(self.weight_mm2.sum(axis=1), 1e-300)
-        mean = (self.weight_mm2 * values[..., 0]).sum(axis=1) / total
-        return np.asarray(values - np.stack([mean, np.zeros_like(mean)], axis=-1)[:, None])
-
-    def mean(self, values: F64) -> F64:
-        """Return the weighted mean over the rays, float64[angle]."""
-        total = np.maximum(self.weight_mm2.sum(axis=1), 1e-300)
-        return np.asarray((self.weight_mm2 * values).sum(axis=1) / total)
-
-
-def _spots(lens: Prescription, beams: _Beams, wavelength_nm: float, sensor_mm: float) -> _Spots:
-    """Trace rays on rings of equal area in each bundle, and return them at the sensor."""
-    ring = np.sqrt((np.arange(_RINGS) + 0.5) / _RINGS)
-    azimuth = beams.azimuth_rad
-    distance = (beams.rim_mm[:, :, None] * ring).reshape(len(beams.slope), -1)
-    turn = np.repeat(azimuth, _RINGS)
-    x, y = beams.centre_mm[:, None] + distance * np.cos(turn), distance * np.sin(turn)
-    found, shape = inclined_rays(lens, beams.slope[:, None], x, y, wavelength_nm, sensor_mm)
-    weight = np.repeat(beams.rim_mm**2, _RINGS, axis=1)
-    lost = ~np.isfinite(found.points_mm[-1, :, 0]).reshape(shape)
-    slope = found.directions[:, :2] / found.directions[:, 2:]
-    return _Spots(
-        place_mm=np.nan_to_num(found.points_mm[-1, :, :2]).reshape(*shape, 2),
-        slope=np.nan_to_num(slope).reshape(*shape, 2),
-        weight_mm2=np.where(lost, 0, weight),
-    )
 
 
 # --- the lens --------------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Tables:
-    """Tabulate, per band, what a pixel needs over its squared distance from the axis, float32[band, step].
-
-    `stretch` is the tangent of the field angle over the image height in focal lengths; `solid_angle_sr` is
-    irradiance over radiance.
-    """
-
-    stretch: F32
-    solid_angle_sr: F32
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -314,8 +166,10 @@ class RealLens:
         """
         return np.asarray(
             [
-                share * self._beams.area_mm2[0] / self._map(wavelength).rise_mm[0] ** 2
-                for share, wavelength in zip(self.transmittance(wavelength_nm), wavelength_nm.tolist(), strict=True)
+                passed * self._beams.area_mm2[0] / self._map(wavelength).rise_mm[0] ** 2
+                for passed, wavelength in zip(
+                    self.transmittance(wavelength_nm), wavelength_nm.tolist(), strict=True
+                )
             ]
         )
 
@@ -389,8 +243,8 @@ class RealLens:
         """Return a uniform field's irradiance relative to that on the axis, at image heights in focal lengths."""
         mapped = self._map(wavelength_nm)
         solid = self._solid_angle_sr(mapped)
-        at = np.interp(mapped.slope_at(distance * self.focal_length_mm), mapped.slope, solid, right=0.0)
-        return np.asarray(at / solid[0])
+        seen = np.interp(mapped.slope_at(distance * self.focal_length_mm), mapped.slope, solid, right=0.0)
+        return np.asarray(seen / solid[0])
 
     @cached_property
     def guard_px(self) -> tuple[int, int]:
@@ -413,8 +267,8 @@ class RealLens:
                 "the corners, which the render has not; it must be smaller"
             )
         half = np.array([self.width_px, self.height_px]) / 2
-        share, whole = np.linspace(0, 1, 129), np.ones(129)
-        border = np.concatenate([np.column_stack([share, whole]), np.column_stack([whole, share])])
+        part, whole = np.linspace(0, 1, 129), np.ones(129)
+        border = np.concatenate([np.column_stack([part, whole]), np.column_stack([whole, part])])
         border *= half + REACH_PX
         distance = np.hypot(*border.T) / self.focal_length_px
         lit = self.relative_illumination(distance) > 0
@@ -443,16 +297,16 @@ class RealLens:
         return slope
 
     @cached_property
-    def _beams(self) -> _Beams:
+    def _beams(self) -> FieldBundles:
         """Return the bundles at the field angles of the tables."""
-        return _beams(self._round, self._slopes)
+        return field_bundles(self._round, self._slopes)
 
     @cached_property
-    def _zones(self) -> _Beams:
+    def _zones(self) -> FieldBundles:
         """Return the bundles for point spreads: those with light, from the axis to the corner."""
         beams = self._beams
         lit = (beams.area_mm2 > 0) & (beams.slope <= 1.1 * self._corner)
-        return _Beams(slope=beams.slope[lit], centre_mm=beams.centre_mm[lit], rim_mm=beams.rim_mm[lit])
+        return FieldBundles(slope=beams.slope[lit], centre_mm=beams.centre_mm[lit], rim_mm=beams.rim_mm[lit])
 
     @cached_property
     def _best_shift_mm(self) -> float:
@@ -462,8 +316,8 @@ class RealLens:
         """
         beams, lens = self._zones, self._round
         order = first_order(lens)
-        spots = _spots(lens, beams, D_NM, order.bfd_mm)
-        place, slope = spots.centred(spots.place_mm), spots.centred(spots.slope)
+        spots = spot_diagrams(lens, beams, D_NM, order.bfd_mm)
+        position, slope = spots.centred(spots.position_mm), spots.centred(spots.slope)
         # count the pixels of the frame nearest to each zone's undistorted position
         x, y = (np.abs(np.arange(n) + 0.5 - n / 2) for n in (self.width_px, self.height_px))
         radius = np.hypot(x[None, ::8], y[::8, None]).ravel() * self.pixel_pitch_um * 1e-3 / order.efl_mm
@@ -471,7 +325,7 @@ class RealLens:
         lit = radius[radius <= beams.slope[-1]]
         pixels = np.bincount(np.searchsorted(edges, lit), minlength=len(beams.slope))
         light = pixels * beams.area_mm2 / (1 + beams.slope**2) ** 2
-        together, alone = (spots.mean((v * slope).sum(axis=-1)) for v in (place, slope))
+        together, alone = (spots.mean((v * slope).sum(axis=-1)) for v in (position, slope))
         return float(-(light @ together) / (light @ alone))
 
     @cached_property
@@ -536,12 +390,14 @@ class RealLens:
         tables, spreads = _tables(self, bands), _spreads(self, bands)
         array = np.empty((len(radiance.array), self.height_px, self.width_px), dtype=np.float32)
 
-        def one(band: int) -> None:
-            light = self._resampled(radiance.array[band], tables.stretch[band], tables.solid_angle_sr[band])
+        def image_band(band: int) -> None:
+            light = self._resampling.resampled(
+                radiance.array[band], tables.stretch[band], tables.solid_angle_sr[band]
+            )
             array[band] = spreads.applied(light, band)[_INSIDE]
 
         with ThreadPoolExecutor(2) as pool:
-            list(pool.map(one, range(len(array))))
+            list(pool.map(image_band, range(len(array))))
         return Irradiance(array=array, wavelength_nm=radiance.wavelength_nm)
 
     def image_of_sun(self, radiance: Radiance, pixel_pitch_um: float) -> Irradiance:
@@ -560,15 +416,15 @@ class RealLens:
         shape = self.height_px + 2 * REACH_PX, self.width_px + 2 * REACH_PX
         pixel_mm2 = (self.pixel_pitch_um * 1e-3) ** 2
 
-        def one(band: int) -> None:
+        def image_band(band: int) -> None:
             rays = self.chief_rays(bands[band], REACH_PX)
-            found = pixel_sums(disc, rays, shape, disc.profiles([band]), rays.beam_mm2)
-            if found is not None:
-                light = found.on(shape)[0] * (disc.radiance_W_m2_sr_nm[band] * passes[band] / pixel_mm2)
+            sums = pixel_sums(disc, rays, shape, disc.profiles([band]), rays.beam_mm2)
+            if sums is not None:
+                light = sums.on(shape)[0] * (disc.radiance_W_m2_sr_nm[band] * passes[band] / pixel_mm2)
                 array[band] = spreads.applied(light.astype(np.float32), band)[_INSIDE]
 
         with ThreadPoolExecutor(2) as pool:
-            list(pool.map(one, range(len(array))))
+            list(pool.map(image_band, range(len(array))))
         return Irradiance(array=array, wavelength_nm=radiance.wavelength_nm)
 
     def on_frame(self, radiance: Radiance) -> Radiance:
@@ -583,14 +439,14 @@ class RealLens:
         if disc is not None and radiance.sun is not None:
             source = np.maximum(source - radiance.sun, 0)
 
-        def one(band: int) -> F32:
-            out = self._resampled(source[band], tables.stretch[band], None)[_INSIDE]
+        def frame_band(band: int) -> F32:
+            out = self._resampling.resampled(source[band], tables.stretch[band], None)[_INSIDE]
             if disc is not None:
                 add_mean(out[None], disc, self.chief_rays(bands[band]), [band])
             return out
 
         with ThreadPoolExecutor(2) as pool:
-            array = np.stack(list(pool.map(one, range(len(radiance.array)))))
+            array = np.stack(list(pool.map(frame_band, range(len(radiance.array)))))
         return replace(radiance, array=array, sun=None, disc=None)
 
     def _check(self, radiance: Radiance) -> None:
@@ -600,49 +456,20 @@ class RealLens:
         if radiance.array.shape[1:] != wanted:
             raise ValueError(f"radiance of {radiance.array.shape[1:]} pixels: with its guard band it has {wanted}")
 
-    @cached_property
-    def _steps(self) -> NDArray[np.uint16]:
-        """Return the step of `_Tables` for each pixel of the image and of its border for the point spread."""
-        x, y = (np.arange(n + 2 * REACH_PX) + 0.5 - (n / 2 + REACH_PX) for n in (self.width_px, self.height_px))
-        square = x[None, :] ** 2 + y[:, None] ** 2
-        return np.asarray(np.rint(square * ((_STEPS - 1) / self._most_px**2)), dtype=np.uint16)
-
     @property
     def _most_px(self) -> float:
         """Return the distance of the corner from the axis in pixels, with the reach of the point spread."""
         return float(np.hypot(self.width_px / 2 + REACH_PX, self.height_px / 2 + REACH_PX))
 
-    def _resampled(self, band: F32, stretch: F32, solid_angle_sr: F32 | None) -> F32:
-        """Resample a band of a render to the pixels of the image and of its border for the point spread.
-
-        Work goes strip by strip so that intermediate arrays stay in the processor's cache.
-        """
+    @cached_property
+    def _resampling(self) -> Resampling:
+        """Return the map from the grid of a render to that of the image and of its border for the point spread."""
         gx, gy = self.guard_px
-        height, width = self._steps.shape
-        out = np.empty((height, width), dtype=np.float32)
-        # coordinates on the grid of half the pitch, where linear interpolation blurs little
-        x = 2 * np.arange(width, dtype=np.float32) + np.float32(1 - width)
-        y = 2 * np.arange(height, dtype=np.float32) + np.float32(1 - height)
-        for start in range(0, height, _STRIP_PX):
-            rows = slice(start, start + _STRIP_PX)
-            steps = self._steps[rows]
-            row = np.take(stretch, steps, mode="clip")
-            column = row * x
-            column += np.float32(self.width_px + 2 * gx - 1)
-            row *= y[rows, None]
-            row += np.float32(self.height_px + 2 * gy - 1)
-            top = int(np.clip(row.min() // 2 - 1, 0, len(band) - 2))
-            bottom = int(np.clip(row.max() // 2 + 3, top + 2, len(band)))
-            row -= np.float32(2 * top)
-            if not band[top:bottom].any():  # most strips of the Sun's image are dark
-                out[rows] = 0
-                continue
-            source = finer(band[top:bottom])
-            light = cv2.remap(source, column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-            if solid_angle_sr is not None:
-                light *= np.take(solid_angle_sr, steps, mode="clip")
-            out[rows] = light
-        return out
+        return Resampling.of(
+            (self.height_px + 2 * REACH_PX, self.width_px + 2 * REACH_PX),
+            render_shape=(self.height_px + 2 * gy, self.width_px + 2 * gx),
+            reach_px=self._most_px,
+        )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -702,128 +529,27 @@ def _map(lens: RealLens, wavelength_nm: float) -> FieldMap:
 
 
 @lru_cache(maxsize=8)
-def _tables(lens: RealLens, wavelength_nm: tuple[float, ...]) -> _Tables:
+def _tables(lens: RealLens, wavelength_nm: tuple[float, ...]) -> RadialTables:
     """Return the tables of all bands."""
-    # the first step lies on the axis: avoid a division by 0
-    square = np.maximum(np.arange(_STEPS), 1e-3) / (_STEPS - 1)
-    distance = np.sqrt(square) * lens._most_px / lens.focal_length_px
+    distance = table_distances(lens._most_px) / lens.focal_length_px
     stretch, solid = [], []
-    for wavelength, share in zip(wavelength_nm, lens.transmittance(np.array(wavelength_nm)), strict=True):
+    for wavelength, passed in zip(wavelength_nm, lens.transmittance(np.array(wavelength_nm)), strict=True):
         mapped = lens._map(wavelength)
         slope = mapped.slope_at(distance * lens.focal_length_mm)
         stretch.append(slope / distance)
-        solid.append(share * np.interp(slope, mapped.slope, lens._solid_angle_sr(mapped), right=0.0))
-    return _Tables(stretch=np.array(stretch, np.float32), solid_angle_sr=np.array(solid, np.float32))
-
-
-def finer(band: F32) -> F32:
-    """Return a band on a grid of half the pitch, float32[2 y - 1, 2 x - 1].
-
-    The given pixels stay. Values between them are cubic (Keys 1981, IEEE ASSP 29, 1153), but limited to the range
-    of the two neighbours, so that no ripples appear around the Sun.
-    """
-    height, width = band.shape
-    out = np.empty((2 * height - 1, 2 * width - 1), dtype=np.float32)
-    out[::2, ::2] = band
-    out[::2, 1::2] = _between(band, _MIDWAY)
-    out[1::2] = _between(np.ascontiguousarray(out[::2]), _MIDWAY.T)
-    return out
-
-
-def _between(band: F32, kernel: F32) -> F32:
-    """Return the midpoints between neighbours along the axis of a four-tap kernel."""
-    height, width = band.shape
-    across = kernel.shape[0] == 1
-    one, other = (band[:, :-1], band[:, 1:]) if across else (band[:-1], band[1:])
-    middle = cv2.filter2D(
-        band, cv2.CV_32F, kernel, anchor=(1, 0) if across else (0, 1), borderType=cv2.BORDER_REPLICATE
-    )[: height - (not across), : width - across]
-    return np.asarray(cv2.min(cv2.max(middle, cv2.min(one, other)), cv2.max(one, other)))
-
-
-# --- point spread ----------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Spreads:
-    """Hold the point spread functions of overlapping tiles of the image; neighbouring tiles blend linearly.
-
-    `kernels[band][row][column]` is float32[n, n] with sum 1, or None where light stays in its pixel. `rows` and
-    `columns` give start, stop and weights of each tile.
-    """
-
-    kernels: tuple[tuple[tuple[F32 | None, ...], ...], ...]
-    rows: tuple[tuple[int, int, F32], ...]
-    columns: tuple[tuple[int, int, F32], ...]
-
-    def applied(self, light: F32, band: int) -> F32:
-        """Return a band's light, float32[y, x], after each pixel's light is spread by the kernels of its tiles."""
-        kernels = self.kernels[band]
-        if all(kernel is None for row in kernels for kernel in row):
-            return light
-        r = REACH_PX
-        out = np.zeros((light.shape[0] + 2 * r, light.shape[1] + 2 * r), dtype=np.float32)
-        for (top, bottom, down), of_row in zip(self.rows, kernels, strict=True):
-            for (left, right, across), kernel in zip(self.columns, of_row, strict=True):
-                part = light[top:bottom, left:right]
-                if not part.any():
-                    continue
-                part = part * (down[:, None] * across)
-                reach = 0
-                if kernel is not None:
-                    part, reach = spread(part, kernel), len(kernel) // 2
-                window = out[top + r - reach : bottom + r + reach, left + r - reach : right + r + reach]
-                cv2.add(window, part, window)
-        return out[r:-r, r:-r]
-
-
-def spread(light: F32, kernel: F32) -> F32:
-    """Return the full convolution of light with a square kernel of odd size n, float32[y + n - 1, x + n - 1]."""
-    n, half = len(kernel), len(kernel) // 2
-    taps = np.ascontiguousarray(kernel[::-1, ::-1])
-    rows = n if n * n <= _DIRECT_TAPS else half + 1
-    wide = cv2.copyMakeBorder(light, half, half + n - rows, half, half, cv2.BORDER_CONSTANT, value=0)
-    out = cv2.filter2D(wide, cv2.CV_32F, taps[:rows], anchor=(half, half), borderType=cv2.BORDER_CONSTANT)
-    if rows < n:  # the rows of taps below the middle
-        below = cv2.filter2D(wide, cv2.CV_32F, taps[rows:], anchor=(half, 0), borderType=cv2.BORDER_CONSTANT)
-        out[:-1] += below[1:]
-        out = out[: half - n + 1 or None]
-    return np.asarray(out)
-
-
-def _tiles(size: int) -> tuple[F64, tuple[tuple[int, int, F32], ...]]:
-    """Return the centres of the tiles along an axis, and start, stop and weights of each; all weights sum to 1."""
-    count = max(1, round(size / _TILE_PX))
-    edges = np.linspace(0, size, count + 1)
-    ramp = size / count / 16
-    found = []
-    for k in range(count):
-        low, high = (edges[k] - ramp if k else 0), (edges[k + 1] + ramp if k < count - 1 else size)
-        start, stop = max(int(np.floor(low)), 0), min(int(np.ceil(high)), size)
-        at = np.arange(start, stop) + 0.5
-        weight = np.ones(len(at))
-        if k:
-            weight *= np.clip((at - low) / (2 * ramp), 0, 1)
-        if k < count - 1:
-            weight *= np.clip((high - at) / (2 * ramp), 0, 1)
-        found.append((start, stop, weight.astype(np.float32)))
-    return (edges[:-1] + edges[1:]) / 2, tuple(found)
+        solid.append(passed * np.interp(slope, mapped.slope, lens._solid_angle_sr(mapped), right=0.0))
+    return RadialTables(stretch=np.array(stretch, np.float32), solid_angle_sr=np.array(solid, np.float32))
 
 
 @lru_cache(maxsize=8)
-def _spreads(lens: RealLens, wavelength_nm: tuple[float, ...]) -> _Spreads:
+def _spreads(lens: RealLens, wavelength_nm: tuple[float, ...]) -> PointSpreads:
     """Return the trimmed point spread functions of all tiles and bands."""
-    centre_x, columns = _tiles(lens.width_px + 2 * REACH_PX)
-    centre_y, rows = _tiles(lens.height_px + 2 * REACH_PX)
-    x, y = centre_x - (lens.width_px / 2 + REACH_PX), centre_y - (lens.height_px / 2 + REACH_PX)
+    tiles = Tiles.of(lens.width_px + 2 * REACH_PX, lens.height_px + 2 * REACH_PX)
+    x = tiles.centre_x_px - (lens.width_px / 2 + REACH_PX)
+    y = tiles.centre_y_px - (lens.height_px / 2 + REACH_PX)
     distance = np.hypot(x[None, :], y[:, None]).ravel() / lens.focal_length_px
     azimuth = np.arctan2(y[:, None], x[None, :]).ravel()
-    kernels = []
-    for wavelength in wavelength_nm:
-        stack = point_spreads(lens, distance, azimuth, wavelength)
-        trimmed = [_trimmed(kernel) for kernel in stack]
-        kernels.append(tuple(tuple(trimmed[k * len(x) : (k + 1) * len(x)]) for k in range(len(y))))
-    return _Spreads(kernels=tuple(kernels), rows=rows, columns=columns)
+    return tiles.spreads([point_spreads(lens, distance, azimuth, wavelength) for wavelength in wavelength_nm])
 
 
 def point_spreads(lens: RealLens, distance: F64, azimuth_rad: F64, wavelength_nm: float) -> F32:
@@ -831,93 +557,15 @@ def point_spreads(lens: RealLens, distance: F64, azimuth_rad: F64, wavelength_nm
 
     `distance`: image heights in focal lengths; `azimuth_rad`: from +x towards +y. Each centroid is in the middle.
     """
-    beams = lens._zones
-    spots = _spots(lens._round, beams, wavelength_nm, lens.sensor_mm)
-    place = spots.centred(spots.place_mm) * 1e3 / lens.pixel_pitch_um
     mapped = lens._map(wavelength_nm)
     slope = mapped.slope_at(distance * lens.focal_length_mm)
-    # interpolate each ray of the bundle between the two nearest field angles
-    k = np.clip(np.searchsorted(beams.slope, slope) - 1, 0, len(beams.slope) - 2)
-    share = np.clip((slope - beams.slope[k]) / (beams.slope[k + 1] - beams.slope[k]), 0, 1)[:, None]
-    place = place[k] * (1 - share[..., None]) + place[k + 1] * share[..., None]
-    weight = spots.weight_mm2[k] * (1 - share) + spots.weight_mm2[k + 1] * share
-    x, y = place[..., 0], place[..., 1]
-    for _ in range(3):
-        near = x * x + y * y <= REACH_PX**2
-        weight = np.where(near | ~np.any(near & (weight > 0), axis=1, keepdims=True), weight, 0)
-        x = x - ((weight * x).sum(axis=1) / weight.sum(axis=1))[:, None]
-    x, y, weight = np.hstack([x, x]), np.hstack([y, -y]), np.hstack([weight, weight])
     solid = np.interp(slope, mapped.slope, lens._solid_angle_sr(mapped))
-    f_number = np.sqrt(np.pi / np.maximum(solid, 1e-3 * solid.max())) / 2
-    sigma = _AIRY_SIGMA * wavelength_nm * 1e-3 * f_number / lens.pixel_pitch_um
-    return _rasterised(x, y, weight / weight.sum(axis=1)[:, None], azimuth_rad, sigma)
-
-
-def _rasterised(x: F64, y: F64, weight: F64, azimuth_rad: F64, sigma: F64) -> F32:
-    """Return the kernels of spots, given as rays, float64[n, ray] in pixels along and across the radius.
-
-    Each spot is turned by its azimuth and blurred by a Gaussian of `sigma` pixels. A render's pixel is already a
-    mean over its area. Distributing a ray over neighbouring pixels would add once more to the mean squares along
-    both axes; the spot is shrunk beforehand by this amount, so that a kernel has the centroid and width of its
-    spot.
-    """
-    cos, sin = np.cos(azimuth_rad)[:, None], np.sin(azimuth_rad)[:, None]
-    squares = [np.maximum((weight * v * v).sum(axis=1), 1e-12) for v in (x, y)]
-    scale = [np.ones(len(x)), np.ones(len(x))]
-    for _ in range(_ROUNDS):
-        turned = _turned(x * scale[0][:, None], y * scale[1][:, None], cos, sin)
-        parts = [np.abs(v) % 1 for v in turned]
-        added = [(weight * part * (1 - part)).sum(axis=1) for part in parts]
-        share = cos[:, 0] ** 2
-        more = share * added[0] + (1 - share) * added[1], share * added[1] + (1 - share) * added[0]
-        scale = [
-            (old + np.sqrt(np.maximum(1 - extra / square, 0))) / 2
-            for old, extra, square in zip(scale, more, squares, strict=True)
-        ]
-    wanted = squares[0] + squares[1] + 2 * sigma**2
-    x, y = _turned(x * scale[0][:, None], y * scale[1][:, None], cos, sin)
-    n, side = len(x), 2 * REACH_PX + 1
-    cells = side * _FINE
-    total = np.zeros(n * cells * cells)
-    u, v = ((p + side / 2) * _FINE - 0.5 for p in (x, y))
-    column, row = np.floor(u).astype(np.int64), np.floor(v).astype(np.int64)
-    for dy in (0, 1):
-        for dx in (0, 1):
-            share = weight * np.abs(1 - dx - (u - column)) * np.abs(1 - dy - (v - row))
-            at = (np.arange(n)[:, None] * cells + np.clip(row + dy, 0, cells - 1)) * cells
-            at += np.clip(column + dx, 0, cells - 1)
-            total += np.bincount(at.ravel(), share.ravel(), minlength=len(total))
-    edge = np.arange(cells + 1) / _FINE - side / 2
-    middle = (edge[1:] + edge[:-1]) / 2
-    pixel = np.arange(side) - REACH_PX
-    linear = np.maximum(1 - np.abs(middle[None, :] - pixel[:, None]), 0)
-    s = np.maximum(sigma, 1e-3)[:, None, None]
-    gauss = np.diff(ndtr((edge[None, :, None] - middle[None, None, :]) / s), axis=1)
-    gather = np.einsum("ki,nij->nkj", linear, gauss)
-    along = np.einsum("nyi,nij->nyj", gather, total.reshape(n, cells, cells))
-    kernels = np.einsum("nyj,nxj->nyx", along, gather)
-    kernels /= np.maximum(kernels.sum(axis=(1, 2), keepdims=True), 1e-300)
-    # the middle pixel takes light until the remaining excess of width is gone
-    square = (kernels * (pixel[None, :] ** 2 + pixel[:, None] ** 2)).sum(axis=(1, 2))
-    kernels *= np.minimum(wanted / np.maximum(square, 1e-300), 1)[:, None, None]
-    kernels[:, REACH_PX, REACH_PX] += 1 - kernels.sum(axis=(1, 2))
-    return np.asarray(kernels, dtype=np.float32)
-
-
-def _turned(x: F64, y: F64, cos: F64, sin: F64) -> tuple[F64, F64]:
-    """Return points turned about the origin."""
-    return x * cos - y * sin, x * sin + y * cos
-
-
-def _trimmed(kernel: F32) -> F32 | None:
-    """Return the kernel without its nearly empty border, its sum still 1; None where it hardly blurs."""
-    half = len(kernel) // 2
-    at = np.arange(-half, half + 1)
-    square = float((kernel * (at[None, :] ** 2 + at[:, None] ** 2)).sum())
-    if np.sqrt(square) < _SHARP_PX:
-        return None
-    for reach in range(1, half + 1):
-        inner = kernel[half - reach : half + reach + 1, half - reach : half + reach + 1]
-        if inner.sum() >= 1 - _TRIM:
-            break
-    return np.ascontiguousarray(inner / inner.sum(dtype=np.float64), dtype=np.float32)
+    return kernels_of_spots(
+        spot_diagrams(lens._round, lens._zones, wavelength_nm, lens.sensor_mm),
+        lens._zones.slope,
+        slope,
+        azimuth_rad,
+        f_number=np.sqrt(np.pi / np.maximum(solid, 1e-3 * solid.max())) / 2,
+        wavelength_nm=wavelength_nm,
+        pixel_pitch_um=lens.pixel_pitch_um,
+    )

@@ -70,8 +70,8 @@ def chief_heights_mm(lens: Prescription, slope: F64, *, wavelength_nm: float, se
     with np.errstate(invalid="ignore"):
         through = off[:, :-1] * off[:, 1:] <= 0
     k = np.argmin(np.where(through, outside[:, :-1], np.inf), axis=1)
-    at = np.arange(len(slope))
-    a, b, off_a, off_b = heights[at, k], heights[at, k + 1], off[at, k], off[at, k + 1]
+    each = np.arange(len(slope))
+    a, b, off_a, off_b = heights[each, k], heights[each, k + 1], off[each, k], off[each, k + 1]
     for _ in range(_SECANT_STEPS):
         with np.errstate(invalid="ignore", divide="ignore"):
             next_ = np.where(off_b == off_a, b, b - off_b * (b - a) / (off_b - off_a))

@@ -81,8 +81,8 @@ class Surface:
 
     def absorption_per_mm(self, wavelength_nm: float) -> float:
         """Return the absorption coefficient of the medium behind the surface, in 1 / mm."""
-        share = float(np.interp(wavelength_nm, *self.internal_transmittance_10mm))
-        return -math.log(max(share, 1e-30)) / 10
+        fraction = float(np.interp(wavelength_nm, *self.internal_transmittance_10mm))
+        return -math.log(max(fraction, 1e-30)) / 10
 
     def rim_mm(self, angle_rad: F64 | float) -> F64:
         """Return the distance of the rim from the axis in directions measured from +x towards +y.

@@ -164,8 +164,8 @@ def real_pupil_diameter_mm(lens: Prescription, wavelength_nm: float = D_NM) -> f
     height = np.linspace(0, most, 513)
     stop = lens.stop
     rays = np.column_stack([height, np.zeros_like(height), np.full_like(height, -1.0)])
-    found = trace(lens, rays, np.tile([0.0, 0.0, 1.0], (len(height), 1)), wavelength_nm=wavelength_nm)
-    at_stop = np.abs(found.points_mm[1 + stop, :, 0])
+    path = trace(lens, rays, np.tile([0.0, 0.0, 1.0], (len(height), 1)), wavelength_nm=wavelength_nm)
+    at_stop = np.abs(path.points_mm[1 + stop, :, 0])
     # far outside the beam, rays bend back towards the axis or miss a surface
     outwards = np.concatenate([[True], np.diff(at_stop) > 0])
     usable = len(height) if outwards.all() else int(np.argmin(outwards))

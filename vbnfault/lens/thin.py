@@ -114,10 +114,10 @@ class ThinLens:
 
         Its power is E☉ T A cos θ at every field angle, the flux that the pupil admits.
         """
-        found = self.image(radiance)
-        shape = found.array.shape[1:]
+        as_scene = self.image(radiance)
+        shape = as_scene.array.shape[1:]
         cos4 = cos4_map((int(shape[0]), int(shape[1])), self.focal_length_mm * 1e3 / pixel_pitch_um)
-        return Irradiance(array=found.array * cos4, wavelength_nm=radiance.wavelength_nm)
+        return Irradiance(array=as_scene.array * cos4, wavelength_nm=radiance.wavelength_nm)
 
 
 # --- a rectilinear frame -----------------------------------------------------------------------------------------

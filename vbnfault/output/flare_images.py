@@ -19,7 +19,9 @@ from ..detector import ThreeColourDetector
 from ..faults import FaultContext, registry
 from ..lens import Prescription, ThinLens, first_order, load_lens
 from ..lens.straylight.paraxial import Ghost, axial_transmittance, mean_ghost, paraxial_ghosts
-from ..lens.straylight.total import VEIL_FRACTION, Cleanliness, straylight
+from ..lens.straylight.scatter import Cleanliness
+from ..lens.straylight.settings import VEIL_FRACTION, GhostSettings, SensorGrid, StraylightSettings, SunSource
+from ..lens.straylight.total import straylight
 from ..scene import keyed_random
 from .json_files import write_json
 
@@ -106,13 +108,18 @@ class FlareRequest:
         return 2 * first_order(self.lens).efl_mm * float(np.tan(np.radians(self.fov_deg / 2))) / self.pixels
 
     @property
+    def sun(self) -> SunSource:
+        """The Sun as the lens sees it."""
+        return SunSource(
+            angle_deg=self.sun_deg,
+            azimuth_deg=self.azimuth_deg,
+            radius_rad=spectra.sun_angular_radius_rad(self.sun_distance_au),
+        )
+
+    @property
     def sun_xy_mm(self) -> tuple[float, float]:
         """Position of the Sun's direct image on the sensor plane, f tan θ from the axis, in mm."""
-        radius, turn = (
-            first_order(self.lens).efl_mm * np.tan(np.radians(self.sun_deg)),
-            np.radians(self.azimuth_deg),
-        )
-        return float(radius * np.cos(turn)), float(radius * np.sin(turn))
+        return self.sun.xy_mm(first_order(self.lens).efl_mm)
 
 
 def wavelengths_nm(single_nm: float | None = None) -> F64:
@@ -143,16 +150,14 @@ def layers(request: FlareRequest) -> dict[str, F32]:
         return {"sun": sun, "texture": _textures(request)}
     light = straylight(
         request.lens,
-        model=request.model,
         wavelength_nm=request.wavelength_nm,
-        shape=(request.pixels, request.pixels),
-        pitch_mm=request.pitch_mm,
-        sun_deg=request.sun_deg,
-        azimuth_deg=request.azimuth_deg,
-        sun_radius_rad=spectra.sun_angular_radius_rad(request.sun_distance_au),
-        cleanliness=Cleanliness(roughness_nm=request.roughness_nm, level=request.cleanliness_level),
-        reflections=request.reflections,
-        veil_fraction=request.veil_fraction,
+        sensor=SensorGrid(shape=(request.pixels, request.pixels), pitch_mm=request.pitch_mm),
+        sun=request.sun,
+        settings=StraylightSettings(
+            ghosts=GhostSettings(model=request.model, reflections=request.reflections),
+            cleanliness=Cleanliness(roughness_nm=request.roughness_nm, level=request.cleanliness_level),
+            veil_fraction=request.veil_fraction,
+        ),
     )
     sun *= light.direct_fraction[:, None, None].astype(np.float32)
     return {

@@ -11,12 +11,13 @@ A route is the sequence of reflecting rows. Its path is the sequence of all surf
 from __future__ import annotations
 
 import copy
+import gc
 from collections.abc import Sequence
-from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import combinations
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, TypedDict, Unpack
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,34 +28,11 @@ from ..gaussian import first_order
 from ..prescription import Prescription
 from ..rays import path_of
 from .paraxial import along, mirrors
+from .steps import Step, StopBlades, arrived, backend, meet
 
 F64 = NDArray[np.float64]
 
 _COSINES = 256  # nodes of the reflectance tables
-_LOST, _FAR = -1e6, -1e4  # margin of lost rays, and the smallest margin of others
-_BEYOND_EDGE = -1.0  # margin at which a soft edge ends in the dark
-_LIMIT_SHARPNESS = 100.0  # of the edge where a missed surface or total reflection, not a rim, ends the light
-_LEAST_SLOPE = 1e-3  # smallest |dz| of a lost ray
-
-
-@lru_cache(maxsize=1)
-def backend() -> Any:
-    """Return drjit and its array types, on a usable LLVM."""
-    from ...core import llvm
-
-    llvm.prepare()
-    import drjit
-    import drjit.llvm as types
-
-    return SimpleNamespace(
-        dr=drjit,
-        Float=types.Float,
-        UInt32=types.UInt,
-        Int32=types.Int,
-        UInt64=types.UInt64,
-        Int64=types.Int64,
-        Double=types.Float64,
-    )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -104,7 +82,7 @@ class Spots:
         int64[bundle]: rays along either side of each lattice.
     x_mm, y_mm
         Positions on the sensor.
-    share
+    fraction
         Fraction of the light that the path transmits.
     radius
         Largest distance from the axis at any surface of the path, over the radius of its rim; 1000 or more after a
@@ -118,9 +96,28 @@ class Spots:
     across: NDArray[np.int64]
     x_mm: Any
     y_mm: Any
-    share: Any
+    fraction: Any
     radius: Any
     margin: Any = None
+
+
+class TraceOptions(TypedDict, total=False):
+    """Name the options of `Tracer.trace`.
+
+    Attributes
+    ----------
+    centred
+        Whether rays start in the middles of the box's cells. Otherwise they start on its lattice, edges included,
+        which is rounded where `Rays.disc` says so.
+    light
+        If False, a tracer of one path and one wavelength leaves `fraction` at 1.
+    halved
+        Whether to trace only one side of the plane of axis and Sun where boxes are symmetric about it.
+    """
+
+    centred: bool
+    light: bool
+    halved: bool
 
 
 def _paired(first: NDArray[Any], second: NDArray[Any]) -> NDArray[np.uint64]:
@@ -185,6 +182,64 @@ def rounded(u: Any, v: Any, disc: Any) -> tuple[Any, Any]:
     return u * wide, v * high
 
 
+@dataclass(frozen=True, eq=False)
+class _PathSteps:
+    """Hold the steps of all paths, path after path.
+
+    Attributes
+    ----------
+    row
+        uint32[step]: surface; the number of surfaces stands for the sensor.
+    mirror
+        bool[step]: whether the surface reflects.
+    medium, other
+        int64[step]: media before and behind the surface, counted from 0 in front of the lens.
+    gap_mm
+        float64[step]: distance of the last vertex behind this one.
+    last_gap_mm
+        float64[path]: distance of the last vertex of a path behind the sensor.
+    """
+
+    row: NDArray[np.uint32]
+    mirror: NDArray[np.bool_]
+    medium: NDArray[np.int64]
+    other: NDArray[np.int64]
+    gap_mm: F64
+    last_gap_mm: F64
+
+    @classmethod
+    def of(cls, paths: Sequence[Sequence[tuple[int, bool]]], vertex_mm: F64) -> _PathSteps:
+        """Return the steps of paths; the last vertex is that of the sensor."""
+        row, mirror, medium, other, gap, last = [], [], [], [], [], []
+        for path in paths:
+            onward, before = True, 0
+            for k, reflects in path:
+                row.append(k)
+                mirror.append(reflects)
+                medium.append(k if onward else k + 1)
+                other.append(k + 1 if onward else k)
+                gap.append(vertex_mm[before] - vertex_mm[k])
+                before, onward = k, onward ^ reflects
+            last.append(vertex_mm[before] - vertex_mm[-1])
+        return cls(
+            row=np.array(row, dtype=np.uint32),
+            mirror=np.array(mirror, dtype=bool),
+            medium=np.array(medium, dtype=np.int64),
+            other=np.array(other, dtype=np.int64),
+            gap_mm=np.array(gap, dtype=np.float64),
+            last_gap_mm=np.array(last, dtype=np.float64),
+        )
+
+
+def _aspheric_terms(lens: Prescription) -> F64:
+    """Return the aspheric coefficients, float64[term, row], of all surfaces and of the plane sensor."""
+    most = max((len(s.aspheric_mm) for s in lens.surfaces), default=0)
+    out = np.zeros((most, len(lens.surfaces) + 1))
+    for k, surface in enumerate(lens.surfaces):
+        out[: len(surface.aspheric_mm), k] = surface.aspheric_mm
+    return out
+
+
 class Tracer:
     """Trace rays through a lens, with tables of its paths, indices and reflectances that are computed once.
 
@@ -210,63 +265,46 @@ class Tracer:
     def _upload(self) -> dict[str, Any]:
         """Compute the tables of all steps, and return those that live on the device."""
         be, lens = backend(), self.lens
-        vertex = np.append(lens.vertices_mm, lens.vertices_mm[-1] + self.sensor_mm)
-        sensor = len(lens.surfaces)
-        row, mirror, medium, other, gap = [], [], [], [], []
-        last = []
-        for path in self._paths:
-            onward, before = True, 0
-            for k, reflects in path:
-                row.append(k)
-                mirror.append(reflects)
-                medium.append(k if onward else k + 1)
-                other.append(k + 1 if onward else k)
-                gap.append(vertex[before] - vertex[k])
-                before, onward = k, onward ^ reflects
-            last.append(vertex[before] - vertex[sensor])
+        steps = _PathSteps.of(self._paths, np.append(lens.vertices_mm, lens.vertices_mm[-1] + self.sensor_mm))
         index = np.stack([np.append(lens.indices(w), 1.0) for w in self.wavelength_nm])
         absorption = np.zeros_like(index)
         for k, surface in enumerate(lens.surfaces):
             absorption[:, k + 1] = [surface.absorption_per_mm(w) for w in self.wavelength_nm]
         self._absorbs = bool(absorption.any())
-        rows = np.array(row, dtype=np.uint32)
-        # index into the fractions of `_shares`: 0 reflected from the front, 1 from behind, 2 transmitted
-        use = np.where(mirror, np.array(medium, dtype=np.int64) != rows, 2)
+        rows, medium = steps.row, steps.medium
+        # index into the fractions of `_fractions`: 0 reflected from the front, 1 from behind, 2 transmitted
+        use = np.where(steps.mirror, medium != rows, 2)
         self.rows = rows
         self._look_up = rows.astype(np.int64) * 3 + use
         middle = lens.indices(float(np.median(self.wavelength_nm)))
         self.medium_index = np.append(middle, 1.0)[medium]
         self.rims_mm = np.array([s.semi_diameter_mm for s in lens.surfaces] + [np.inf])
-        most = max((len(s.aspheric_mm) for s in lens.surfaces), default=0)
-        aspheric = np.zeros((most, sensor + 1))
-        for k, s in enumerate(lens.surfaces):
-            aspheric[: len(s.aspheric_mm), k] = s.aspheric_mm
+        aspheric = _aspheric_terms(lens)
         flat = [s.curvature_per_mm for s in lens.surfaces] + [0.0]
         conic = [1 + s.conic for s in lens.surfaces] + [1.0]
-        count = len(rows)
-        ratio = index[:, medium] / index[:, other]
+        ratio = index[:, medium] / index[:, steps.other]
         # each step fetches few but wide records, since fetching takes most of the time
         curvature, per_rim = (np.array(flat)[rows], (1 / self.rims_mm)[rows])
         self._index = index
-        self._look_up_word = ((rows * 3 + use) * _COSINES * 2 + np.array(mirror, dtype=np.int64)).astype(np.uint32)
+        self._look_up_word = ((rows * 3 + use) * _COSINES * 2 + steps.mirror.astype(np.int64)).astype(np.uint32)
         tables = {
             "row": be.UInt32(rows),
             "stop": be.UInt32((rows == lens.stop).astype(np.uint32)),
-            "place": be.UInt64(_paired(np.array(gap), curvature)),
-            "bend": be.UInt64(_paired(ratio, np.broadcast_to(per_rim, (len(index), count)))),
+            "place": be.UInt64(_paired(steps.gap_mm, curvature)),
+            "bend": be.UInt64(_paired(ratio, np.broadcast_to(per_rim, (len(index), len(rows))))),
             "end": be.UInt32(self.first_step[1:].astype(np.uint32)),
             "start": be.UInt32(self.first_step[:-1].astype(np.uint32)),
-            "last": be.Float(np.array(last, dtype=np.float32)),
+            "last": be.Float(steps.last_gap_mm.astype(np.float32)),
             "conic": be.Float(np.array(conic, dtype=np.float32)),
             "per_rim": be.Float(per_rim.astype(np.float32)),
             "absorption": be.Float(absorption[:, medium].astype(np.float32).ravel()),
             "aspheric": [be.Float(c.astype(np.float32)) for c in aspheric],
         }
-        self._last_gap_mm = float(last[0]) if last else 0.0
-        self._special = bool(most) or any(c != 1 for c in conic)
+        self._last_gap_mm = float(steps.last_gap_mm[0]) if len(steps.last_gap_mm) else 0.0
+        self._special = bool(len(aspheric)) or any(c != 1 for c in conic)
         self._bladed = bool(lens.surfaces[lens.stop].blades)
         self._numbers = {
-            "gap": np.array(gap),
+            "gap": steps.gap_mm,
             "curvature": curvature,
             "eta": ratio,
             "per_rim": per_rim,
@@ -274,24 +312,24 @@ class Tracer:
             "aspheric": aspheric,
             "absorption": absorption[:, medium],
         }
-        tables |= self._share_tables(self._shares(index))
+        tables |= self._fraction_tables(self._fractions(index))
         be.dr.eval(tables)
         return tables
 
-    def _share_tables(self, share: F64) -> dict[str, Any]:
+    def _fraction_tables(self, fraction: F64) -> dict[str, Any]:
         """Return the tables of reflected and transmitted fractions, on the device."""
-        rise = np.diff(share, axis=-1, append=share[..., -1:])
-        return {"share": backend().UInt64(_paired(share, rise))}
+        rise = np.diff(fraction, axis=-1, append=fraction[..., -1:])
+        return {"fraction": backend().UInt64(_paired(fraction, rise))}
 
     def worn(self, coating_loss: float) -> Tracer:
         """Return a tracer for a lens that has lost a fraction of its coatings' area.
 
         Reflectances become the mean of coated and bare, weighted by area; transmittances stay.
         """
-        share = self._coated.copy()
-        share[:, :, :2] += coating_loss * (self._bare - self._coated)[:, :, :2]
+        fraction = self._coated.copy()
+        fraction[:, :, :2] += coating_loss * (self._bare - self._coated)[:, :, :2]
         other = copy.copy(self)
-        other._tables = self._tables | other._share_tables(share)
+        other._tables = self._tables | other._fraction_tables(fraction)
         other.__dict__.pop("_known", None)
         other._recorded = {}
         return other
@@ -299,14 +337,14 @@ class Tracer:
     @cached_property
     def _coated(self) -> F64:
         """Return the fractions of the coated surfaces."""
-        return self._shares(self._index)
+        return self._fractions(self._index)
 
     @cached_property
     def _bare(self) -> F64:
         """Return the fractions of the surfaces without coatings."""
-        return self._shares(self._index, bare=True)
+        return self._fractions(self._index, bare=True)
 
-    def _shares(self, index: F64, bare: bool = False) -> F64:
+    def _fractions(self, index: F64, bare: bool = False) -> F64:
         """Return the fractions reflected from the front, reflected from behind, and transmitted, of each surface.
 
         float64[wavelength, row, 3, cosine]: over the cosine of the angle in the medium of lower index, as the mean
@@ -334,10 +372,7 @@ class Tracer:
         rays: Rays,
         across: int | NDArray[np.int64],
         width: F64 | None = None,
-        *,
-        centred: bool = False,
-        light: bool = True,
-        halved: bool = True,
+        **options: Unpack[TraceOptions],
     ) -> Spots:
         """Trace a lattice of rays of every bundle.
 
@@ -348,69 +383,65 @@ class Tracer:
         width
             float64[step]: width of the rim's soft edge at each step of each route, in radii of the rim. Without it
             margins are not computed, and lost rays are not followed further.
-        centred
-            Whether rays start in the middles of the box's cells. Otherwise they start on its lattice, edges
-            included, which is rounded where `Rays.disc` says so.
-        light
-            If False, a tracer of one path and one wavelength leaves `share` at 1.
-        halved
-            Whether to trace only one side of the plane of axis and Sun where boxes are symmetric about it.
+        options
+            See `TraceOptions`; by default not centred, with light, and halved.
         """
-        be, t = backend(), self._tables
-        dr = be.dr
-        even = halved and not rays.direction[:, 1].any() and not rays.box_mm[:, 1].any()
         side = np.broadcast_to(np.asarray(across, dtype=np.int64), len(rays))
+        centred, light = options.get("centred", False), options.get("light", True)
+        even = options.get("halved", True) and not rays.direction[:, 1].any() and not rays.box_mm[:, 1].any()
         single = len(self.routes) == len(self.wavelength_nm) == len(rays) == 1
         plain = width is None and not light and not even and not self._bladed
         if single and plain and (centred or rays.disc is None):
             return self._alone(rays, side, centred)
+        be = backend()
+        dr = be.dr
         start = self._start(rays, side, centred, even)
-        count, route = dr.width(start.x), start.route
-        soft = width is not None
+        count, soft = dr.width(start.x), width is not None
         per_width = (np.zeros(len(self.rows)) if width is None else 1 / width).astype(np.float32)
         sides = 2 if even and self._bladed else 1
-        none, one = dr.zeros(be.Float, count), dr.full(be.Float, 1, count)
+        none, unit = dr.zeros(be.Float, count), dr.full(be.Float, 1, count)
         rim = (none, dr.full(be.Float, 1e6, count)) if soft else (none,)
-        ray = (start.x, start.y, none, start.dx, start.dy, start.dz, one, *(rim * sides))
+        ray = (start.x, start.y, none, start.dx, start.dy, start.dz, unit, *(rim * sides))
         if len(self.routes) == len(self.wavelength_nm) == 1:
             # one path and one wavelength: all numbers are constants of the kernel, and nothing is fetched
             for at, sharpness in zip(self._known, per_width.tolist(), strict=True):
-                at.sharpness = sharpness
-                ray = self._meet(at, soft, *ray, light=light)
+                step = replace(at, sharpness=sharpness)
+                ray = meet(step, ray, soft=soft, special=self._special, blades=self._blades, light=light)
             last: Any = self._last_gap_mm
         else:
-            edge = be.UInt64(_paired(per_width, self._look_up_word.view(np.float32)))
-            wavelength = start.wavelength * dr.opaque(be.UInt32, len(self.rows))
-            shares = start.wavelength * dr.opaque(be.UInt32, 3 * _COSINES * (len(self.lens.surfaces) + 1))
-            end = dr.gather(be.UInt32, t["end"], route)
-
-            def on(step: Any, *_: Any) -> Any:
-                return step < end
-
-            def body(step: Any, *ray: Any) -> Any:
-                return step + 1, *self._meet(self._fetched(step, edge, wavelength, shares), soft, *ray)
-
-            first = dr.gather(be.UInt32, t["start"], route)
-            _, *ray = dr.while_loop((first, *ray), on, body, mode="symbolic")
-            last = dr.gather(be.Float, t["last"], route)
-        x, y, z, dx, dy, dz, share, *rims = ray
-        away = -(z + last) / dz
-        x, y = dr.fma(away, dx, x), dr.fma(away, dy, y)
-        found = dr.isfinite(x + y + rims[0]) & (dr.abs(x) + dr.abs(y) < 1e9)
-        x, y, share = (dr.select(found, v, 0) for v in (x, y, share))
-        radius = [dr.select(found, dr.sqrt(r), -_LOST) for r in (rims[::2] if soft else rims)]
-        margin = [dr.select(found, dr.maximum(m, _FAR), _LOST) for m in (rims[1::2] if soft else ())]
-        told = [(x, x), (y, -y), (share, share), (radius[0], radius[-1])]
-        told += [(margin[0], margin[-1])] if soft else []
-        dr.eval(told)
+            ray, last = self._followed(ray, start, per_width, soft)
+        both = arrived(ray, last, soft)
+        dr.eval(both)
         if not even:
-            return Spots(rays, side, *(one for one, _ in told))
-        whole = [dr.empty(be.Float, int((side**2).sum())) for _ in told]
-        for out, (here, there) in zip(whole, told, strict=True):
-            dr.scatter(out, here, start.ray)
-            dr.scatter(out, there, start.mirrored)
+            return Spots(rays, side, *(own for own, _ in both))
+        whole = [dr.empty(be.Float, int((side**2).sum())) for _ in both]
+        for out, (own, mirrored) in zip(whole, both, strict=True):
+            dr.scatter(out, own, start.ray)
+            dr.scatter(out, mirrored, start.mirrored)
         dr.eval(whole)
         return Spots(rays, side, *whole)
+
+    def _followed(
+        self, ray: tuple[Any, ...], start: Any, per_width: NDArray[np.float32], soft: bool
+    ) -> tuple[tuple[Any, ...], Any]:
+        """Return the rays at the last surface of their paths, and the distance of its vertex behind the sensor."""
+        be, t = backend(), self._tables
+        dr = be.dr
+        edge = be.UInt64(_paired(per_width, self._look_up_word.view(np.float32)))
+        wavelength = start.wavelength * dr.opaque(be.UInt32, len(self.rows))
+        fractions = start.wavelength * dr.opaque(be.UInt32, 3 * _COSINES * (len(self.lens.surfaces) + 1))
+        end = dr.gather(be.UInt32, t["end"], start.route)
+
+        def on(step: Any, *_: Any) -> Any:
+            return step < end
+
+        def body(step: Any, *ray: Any) -> Any:
+            at = self._fetched(step, edge, wavelength, fractions)
+            return step + 1, *meet(at, ray, soft=soft, special=self._special, blades=self._blades)
+
+        first = dr.gather(be.UInt32, t["start"], start.route)
+        _, *after = dr.while_loop((first, *ray), on, body, mode="symbolic")
+        return tuple(after), dr.gather(be.Float, t["last"], start.route)
 
     def _alone(self, rays: Rays, side: NDArray[np.int64], centred: bool) -> Spots:
         """Trace the only bundle along the only path without its light, with a kernel recorded once and replayed.
@@ -426,28 +457,28 @@ class Tracer:
                 _, ix, iy, _ = lattice_places(side, side)
                 offset, spacing = (0.5, 2 / int(side[0])) if centred else (0.0, 2 / (int(side[0]) - 1))
                 count = dr.width(ix)
-                none, one = dr.zeros(be.Float, count), dr.full(be.Float, 1, count)
+                none, unit = dr.zeros(be.Float, count), dr.full(be.Float, 1, count)
                 x = dr.fma(half_x, (be.Float(ix) + offset) * spacing - 1, x)
                 y = dr.fma(half_y, (be.Float(iy) + offset) * spacing - 1, y)
-                ray: tuple[Any, ...] = (x, y, none, dx + none, dy + none, dz + none, one, none)
+                ray: tuple[Any, ...] = (x, y, none, dx + none, dy + none, dz + none, unit, none)
                 for at in self._known:
-                    ray = self._meet(at, False, *ray, light=False)
-                x, y, z, dx, dy, dz, share, rim = ray
-                away = -(z + self._last_gap_mm) / dz
-                x, y = dr.fma(away, dx, x), dr.fma(away, dy, y)
-                found = dr.isfinite(x + y + rim) & (dr.abs(x) + dr.abs(y) < 1e9)
-                return (
-                    *(dr.select(found, v, 0) for v in (x, y, share)),
-                    dr.select(found, dr.sqrt(rim), -_LOST),
-                )
+                    ray = meet(at, ray, soft=False, special=self._special, blades=self._blades, light=False)
+                return tuple(own for own, _ in arrived(ray, self._last_gap_mm, False))
 
             self._recorded[key] = dr.freeze(run)
         given = [dr.opaque(be.Float, float(v)) for v in (*rays.box_mm[0], *rays.direction[0])]
-        told = self._recorded[key](*given)
-        dr.eval(told)
-        return Spots(rays, side, *told)
+        # drjit cannot record that arrays are freed, as Python's collector may do with those of other tracers
+        collects = gc.isenabled()
+        gc.disable()
+        try:
+            spots = self._recorded[key](*given)
+        finally:
+            if collects:
+                gc.enable()
+        dr.eval(spots)
+        return Spots(rays, side, *spots)
 
-    def _fetched(self, step: Any, edge: Any, wavelength: Any, shares: Any) -> Any:
+    def _fetched(self, step: Any, edge: Any, wavelength: Any, fractions: Any) -> Step:
         """Return the data of one step of every lane's own path, fetched from the tables."""
         be, t = backend(), self._tables
         dr = be.dr
@@ -460,10 +491,10 @@ class Tracer:
         def passed(cosine: Any) -> Any:
             at = cosine * (_COSINES - 1)
             node = dr.minimum(be.UInt32(at), _COSINES - 2)
-            low, rise = _unpaired(t["share"], (word >> 1) + shares + node)
+            low, rise = _unpaired(t["fraction"], (word >> 1) + fractions + node)
             return dr.fma(at - be.Float(node), rise, low)
 
-        return SimpleNamespace(
+        return Step(
             gap=gap,
             curvature=curvature,
             eta=eta,
@@ -479,7 +510,7 @@ class Tracer:
         )
 
     @cached_property
-    def _known(self) -> list[Any]:
+    def _known(self) -> list[Step]:
         """Return the data of the steps of the only path, as plain numbers."""
         be, n = backend(), self._numbers
         dr = be.dr
@@ -490,15 +521,16 @@ class Tracer:
             def passed(cosine: Any, word: int = word) -> Any:
                 at = cosine * (_COSINES - 1)
                 node = dr.minimum(be.UInt32(at), _COSINES - 2)
-                low, rise = _unpaired(self._tables["share"], (word >> 1) + node)
+                low, rise = _unpaired(self._tables["fraction"], (word >> 1) + node)
                 return dr.fma(at - be.Float(node), rise, low)
 
             out.append(
-                SimpleNamespace(
+                Step(
                     gap=float(n["gap"][step]),
                     curvature=float(n["curvature"][step]),
                     eta=float(n["eta"][0, step]),
                     per_rim=float(n["per_rim"][step]),
+                    sharpness=1.0,
                     mirror=bool(word & 1),
                     onward=onward,
                     stop=row == self.lens.stop,
@@ -510,103 +542,6 @@ class Tracer:
             )
             onward = -onward if word & 1 else onward
         return out
-
-    def _meet(
-        self,
-        at: Any,
-        soft: bool,
-        x: Any,
-        y: Any,
-        z: Any,
-        dx: Any,
-        dy: Any,
-        dz: Any,
-        share: Any,
-        *rims: Any,
-        light: bool = True,
-    ) -> tuple[Any, ...]:
-        """Advance rays to the next surface of their path, and refract or reflect them there.
-
-        `rims` are the square of the largest relative radius so far and, where edges are soft, the margin. Those of
-        the mirrored ray follow if they differ.
-        """
-        dr = backend().dr
-        c, eta, mirror = at.curvature, at.eta, at.mirror
-        sense = dr.copysign(1, dz) if at.onward is None else at.onward
-
-        def real(square: Any) -> Any:
-            """Return the root of a square that is negative for lost rays."""
-            # with soft edges a lost ray continues along the limit; otherwise it is nan from here on
-            return dr.sqrt(dr.maximum(square, 0) if soft else square)
-
-        z = z + at.gap
-        if self._special:
-            # first to the plane of the vertex, then to the surface
-            to_plane = -z / dz
-            x, y = dr.fma(to_plane, dx, x), dr.fma(to_plane, dy, y)
-            a = c * (dx * dx + dy * dy + at.conic * dz * dz)
-            b = c * (x * dx + y * dy) - dz
-            e = c * (x * x + y * y)
-            under = b * b - a * e
-            t_hit = e / (sense * real(under) - b)
-            x, y, z = dr.fma(t_hit, dx, x), dr.fma(t_hit, dy, y), t_hit * dz
-            length = t_hit + to_plane
-            nx, ny, nz = c * x, c * y, c * at.conic * z - 1
-            if at.aspheric:
-                x, y, z, nx, ny, nz, more = self._to_asphere(at, x, y, z, dx, dy, dz)
-                length = length + more
-            norm = dr.rsqrt(nx * nx + ny * ny + nz * nz)
-            along_normal = (nx * dx + ny * dy + nz * dz) * norm
-            # turn the normal towards the incoming ray
-            facing = dr.select(along_normal > 0, -norm, norm)
-            cosine = dr.minimum(dr.abs(along_normal), 1)
-        else:
-            # on a sphere the normal has length 1 and the root is the cosine of the angle of incidence
-            b = dr.fma(-c, dr.fma(x, dx, dr.fma(y, dy, z * dz)), dz)
-            e = dr.fma(c, dr.fma(x, x, dr.fma(y, y, z * z)), -2 * z)
-            under = dr.fma(b, b, -c * e)
-            cosine = real(under)
-            length = e / dr.fma(sense, cosine, b)
-            x, y, z = dr.fma(length, dx, x), dr.fma(length, dy, y), dr.fma(length, dz, z)
-            facing = sense
-        if light and at.absorption is not None:
-            share = share * dr.exp(-at.absorption * dr.abs(length))
-        # square of the cosine of refraction; negative for total reflection
-        left = dr.fma(eta * eta, cosine * cosine, 1 - eta * eta)
-        out_cosine = real(left)
-        if light:
-            passed = at.passed(dr.clip(dr.select(eta > 1, out_cosine, cosine), 0, 1))
-            share = share * dr.select((left < 0) & mirror, 1, passed)
-        turn = facing * dr.select(mirror, 2 * cosine, dr.fma(eta, cosine, -out_cosine))
-        keep = dr.select(mirror, 1, eta)
-        onward = dr.select(mirror, -sense, sense)
-        if self._special:
-            dx, dy, dz = dr.fma(turn, nx, keep * dx), dr.fma(turn, ny, keep * dy), dr.fma(turn, nz, keep * dz)
-        else:
-            bend = turn * c
-            dx, dy, dz = dr.fma(bend, x, keep * dx), dr.fma(bend, y, keep * dy), dr.fma(keep, dz, -turn)
-            dz = dr.fma(bend, z, dz)
-        # a ray is also lost where it misses a surface, is totally reflected or turns back; with soft edges it
-        # continues along the limit, so that the limit can be located between rays
-        room = ahead = dz * onward
-        if soft:
-            room = dr.minimum(dr.minimum(under, dr.select(mirror, 1, left)), 4 * ahead)
-            dz = onward * dr.maximum(ahead, _LEAST_SLOPE)
-        sides = 2 if len(rims) > 1 + soft else 1
-        out: list[Any] = []
-        for k in range(sides):
-            radius, *margin = rims[k * len(rims) // sides : (k + 1) * len(rims) // sides]
-            # near a rim 1 - r² is twice 1 - r, hence the 0.5 below
-            beyond = dr.fma(x, x, y * y) * (at.per_rim * at.per_rim)
-            if self._bladed and at.stop is not False:
-                blade = self._within_blades(x, -y if k else y)
-                beyond = dr.select(at.stop, blade * blade, beyond)
-            out.append(dr.maximum(radius, dr.select(room < 0, 1e6, beyond)))
-            if soft:
-                here = dr.minimum((1 - beyond) * (0.5 * at.sharpness), room * _LIMIT_SHARPNESS)
-                # after a ray is lost, later surfaces do not tell where the edge lies
-                out.append(dr.select(margin[0] < _BEYOND_EDGE, margin[0], dr.minimum(margin[0], here)))
-        return x, y, z, dx, dy, dz, share, *out
 
     def _start(self, rays: Rays, across: NDArray[np.int64], centred: bool, even: bool) -> Any:
         """Return position, direction, route and wavelength of every ray, its number, and that of its mirror image.
@@ -648,17 +583,13 @@ class Tracer:
             mirrored=first + (side - 1 - iy) * side + ix,
         )
 
-    def _within_blades(self, x: Any, y: Any) -> Any:
-        """Return the distance from the axis over that of the stop's rim in its direction (`Surface.rim_mm`)."""
-        be, rim = backend(), self.lens.surfaces[self.lens.stop]
-        dr = be.dr
-        half = float(np.pi / rim.blades)
-        angle = (dr.atan2(y, x) - dr.opaque(be.Float, self._stop_turn_rad)) * (0.5 / half)
-        beside = (angle - dr.floor(angle)) * (2 * half) - half
-        edge = float(np.cos(half)) / dr.cos(beside)
-        return dr.sqrt(x * x + y * y) / (rim.semi_diameter_mm * (edge + (1 - edge) * rim.blade_rounding))
-
     _stop_turn_rad = 0.0
+
+    @property
+    def _blades(self) -> StopBlades | None:
+        """Return the shape of the stop, turned as the Sun's azimuth asks; None where it is round."""
+        rim = self.lens.surfaces[self.lens.stop]
+        return StopBlades(rim, self._stop_turn_rad) if rim.blades else None
 
     def turned(self, azimuth_rad: float) -> Tracer:
         """Return the tracer for a Sun at an azimuth.
@@ -670,25 +601,3 @@ class Tracer:
         rim = self.lens.surfaces[self.lens.stop]
         other._stop_turn_rad = float(np.radians(rim.rotation_deg) - azimuth_rad)
         return other
-
-    def _to_asphere(self, at: Any, x: Any, y: Any, z: Any, dx: Any, dy: Any, dz: Any) -> tuple[Any, ...]:
-        """Move rays from a conic to the asphere near it by Newton's method; return position, normal and length."""
-        be = backend()
-        dr = be.dr
-        c, conic, terms = at.curvature, at.conic, at.aspheric
-        way = 0 * x
-        for k in range(5):
-            r2 = x * x + y * y
-            root = dr.sqrt(dr.maximum(1 - conic * c * c * r2, 1e-6))
-            sag, slope, power = c * r2 / (1 + root), c / root, r2
-            for n, term in enumerate(terms):
-                slope = slope + (2 * n + 4) * term * power
-                sag = sag + term * power * r2
-                power = power * r2
-            nx, ny = slope * x, slope * y
-            if k == 4:
-                return x, y, z, nx, ny, 0 * x - 1, way
-            step = (z - sag) / (nx * dx + ny * dy - dz)
-            x, y, z = dr.fma(step, dx, x), dr.fma(step, dy, y), dr.fma(step, dz, z)
-            way = way + step
-        raise AssertionError("unreachable")

@@ -19,8 +19,9 @@ from numpy.typing import NDArray
 from ..gaussian import first_order
 from ..glass import D_NM
 from ..prescription import Prescription
-from .bundles import Rays, Tracer, backend, name_of
+from .bundles import Rays, Tracer, name_of
 from .paraxial import Ghost
+from .steps import backend
 
 F64 = NDArray[np.float64]
 
@@ -157,9 +158,9 @@ def _narrowed(
         direction=np.tile(direction, (count * len(route), 1)),
     )
     spots = made.trace(rays, _COARSE, width)
-    margin, x, y, share = (
+    margin, x, y, fraction = (
         v.numpy().reshape(count, len(route), _COARSE, _COARSE)
-        for v in (spots.margin, spots.x_mm, spots.y_mm, spots.share)
+        for v in (spots.margin, spots.x_mm, spots.y_mm, spots.fraction)
     )
     passes = (margin > -1).any(axis=0)
     near = (margin > -1).all(axis=0) & (np.hypot(x[0], y[0]) < reach_mm)
@@ -172,50 +173,88 @@ def _narrowed(
     least = np.stack([np.where(inside, v[0], far).min(axis=(1, 2)) for v in (x, y)], axis=-1)
     most = np.stack([np.where(inside, v[0], -far).max(axis=(1, 2)) for v in (x, y)], axis=-1)
     at_entrance = 4 * box[:, 2] * box[:, 3] / (_COARSE - 1) ** 2
-    peak, magnification, folded, uneven = _spread(x[0], y[0], share[0], inside, near, at_entrance)
-    lattice = np.linspace(-1, 1, _COARSE)
-    out, told = np.full((len(made.routes), 4), np.nan), Arrivals.none(len(made.routes))
-    low, high = np.full((len(out), 2), np.inf), np.full((len(out), 2), -np.inf)
-    spacing = np.zeros((len(out), 2))
-    passing: dict[int, tuple[F64, NDArray[np.bool_]]] = {}
-    for k in np.flatnonzero(passes.any(axis=(1, 2))):
+    peak, magnification, folded, uneven = _spread(x[0], y[0], fraction[0], inside, near, at_entrance)
+    lattice = _CoarseRays(box=box, passes=passes, inside=inside)
+    arrivals = Arrivals.none(len(made.routes))
+    low, high, spacing, kept = lattice.bounds(route, len(made.routes))
+    for k in kept:
         r = route[k]
-        columns, rows = np.flatnonzero(passes[k].any(axis=0)), np.flatnonzero(passes[k].any(axis=1))
-        here_low = box[k, :2] + box[k, 2:] * lattice[[columns[0], rows[0]]]
-        here_high = box[k, :2] + box[k, 2:] * lattice[[columns[-1], rows[-1]]]
-        step = 2 * box[k, 2:] / (_COARSE - 1)
-        # of two boxes of one route, keep the finer one
-        if np.isfinite(low[r, 0]) and (spacing[r] < step).all() and (here_high - here_low < 3 * step).any():
-            continue
-        low[r], high[r] = np.minimum(low[r], here_low - step), np.maximum(high[r], here_high + step)
-        spacing[r], passing[r] = step, (box[k], passes[k])
         if inside[k].any():
-            told.least_mm[r] = np.minimum(told.least_mm[r], least[k])
-            told.most_mm[r] = np.maximum(told.most_mm[r], most[k])
-            told.peak[r] = max(told.peak[r], peak[k], 1e-30)
-        told.move_mm[r] = max(told.move_mm[r], move[k])
-        told.folded[r] |= folded[k]
-        told.magnification[r], told.uneven[r] = magnification[k], uneven[k]
-    good = np.isfinite(low[:, 0])
-    out[good, 0] = (low[good, 0] + high[good, 0]) / 2
-    out[good, 2] = np.maximum((high[good, 0] - low[good, 0]) / 2, 1e-6)
-    # symmetric about the plane of axis and Sun, so that one side can be mirrored
-    out[good, 1], out[good, 3] = 0.0, np.maximum(np.maximum(high[good, 1], -low[good, 1]), 1e-6)
-    disc = np.zeros(len(out))
-    for r, (of, passed) in passing.items():
-        ys, xs = np.nonzero(passed)
-        u, v = ((of[i] + of[2 + i] * lattice[n] - out[r, i]) / out[r, 2 + i] for i, n in ((0, xs), (1, ys)))
-        # the ellipse includes one cell beyond those that pass
-        disc[r] = np.hypot(u, v).max() + 0.5 * (spacing[r] / out[r, 2:]).sum()
-    return out, np.clip(disc, 1, np.sqrt(2)), told
+            arrivals.least_mm[r] = np.minimum(arrivals.least_mm[r], least[k])
+            arrivals.most_mm[r] = np.maximum(arrivals.most_mm[r], most[k])
+            arrivals.peak[r] = max(arrivals.peak[r], peak[k], 1e-30)
+        arrivals.move_mm[r] = max(arrivals.move_mm[r], move[k])
+        arrivals.folded[r] |= folded[k]
+        arrivals.magnification[r], arrivals.uneven[r] = magnification[k], uneven[k]
+    route_boxes, disc = lattice.boxes(low, high, spacing, {int(route[k]): k for k in kept})
+    return route_boxes, disc, arrivals
+
+
+@dataclass(frozen=True, eq=False)
+class _CoarseRays:
+    """Hold coarse lattices of rays, and compute from them the boxes of the rays that pass, by route.
+
+    Attributes
+    ----------
+    box
+        float64[bundle, 4]: boxes of the lattices.
+    passes, inside
+        bool[bundle, y, x]: rays that pass at any of the wavelengths, and at the first one.
+    """
+
+    box: F64
+    passes: NDArray[np.bool_]
+    inside: NDArray[np.bool_]
+
+    def bounds(self, route: NDArray[np.int64], count: int) -> tuple[F64, F64, F64, list[int]]:
+        """Return lower and upper bounds of the rays that pass and the lattice's spacing, float64[route, 2] each.
+
+        The last value lists the bundles that are kept.
+        """
+        nodes = np.linspace(-1, 1, _COARSE)
+        low, high = np.full((count, 2), np.inf), np.full((count, 2), -np.inf)
+        spacing, kept = np.zeros((count, 2)), []
+        for k in np.flatnonzero(self.passes.any(axis=(1, 2))):
+            r, box = route[k], self.box[k]
+            columns, rows = np.flatnonzero(self.passes[k].any(axis=0)), np.flatnonzero(self.passes[k].any(axis=1))
+            here_low = box[:2] + box[2:] * nodes[[columns[0], rows[0]]]
+            here_high = box[:2] + box[2:] * nodes[[columns[-1], rows[-1]]]
+            step = 2 * box[2:] / (_COARSE - 1)
+            # of two boxes of one route, keep the finer one
+            if np.isfinite(low[r, 0]) and (spacing[r] < step).all() and (here_high - here_low < 3 * step).any():
+                continue
+            low[r], high[r] = np.minimum(low[r], here_low - step), np.maximum(high[r], here_high + step)
+            spacing[r] = step
+            kept.append(int(k))
+        return low, high, spacing, kept
+
+    def boxes(self, low: F64, high: F64, spacing: F64, kept: dict[int, int]) -> tuple[F64, F64]:
+        """Return boxes, float64[route, 4], nan where no ray passes, and ellipses, float64[route], by route.
+
+        `kept` maps a route to the last bundle of it that was kept.
+        """
+        nodes = np.linspace(-1, 1, _COARSE)
+        out, good = np.full((len(low), 4), np.nan), np.isfinite(low[:, 0])
+        out[good, 0] = (low[good, 0] + high[good, 0]) / 2
+        out[good, 2] = np.maximum((high[good, 0] - low[good, 0]) / 2, 1e-6)
+        # symmetric about the plane of axis and Sun, so that one side can be mirrored
+        out[good, 1], out[good, 3] = 0.0, np.maximum(np.maximum(high[good, 1], -low[good, 1]), 1e-6)
+        disc = np.zeros(len(out))
+        for r, k in kept.items():
+            ys, xs = np.nonzero(self.passes[k])
+            box = self.box[k]
+            u, v = ((box[i] + box[2 + i] * nodes[n] - out[r, i]) / out[r, 2 + i] for i, n in ((0, xs), (1, ys)))
+            # the ellipse includes one cell beyond those that pass
+            disc[r] = np.hypot(u, v).max() + 0.5 * (spacing[r] / out[r, 2:]).sum()
+        return out, np.clip(disc, 1, np.sqrt(2))
 
 
 def _spread(
-    x: F64, y: F64, share: F64, inside: NDArray[np.bool_], near: NDArray[np.bool_], at_entrance: F64
+    x: F64, y: F64, fraction: F64, inside: NDArray[np.bool_], near: NDArray[np.bool_], at_entrance: F64
 ) -> tuple[F64, F64, NDArray[np.bool_], F64]:
     """Return peak, magnification, whether folded, and how uneven each ghost is, as in `Arrivals`.
 
-    `x`, `y` and `share` [route, y, x] are lattices of rays on the sensor; `at_entrance` is the area of a cell at
+    `x`, `y` and `fraction` [route, y, x] are lattices of rays on the sensor; `at_entrance` is the area of a cell at
     the entrance.
     """
     ax, ay = (v[:, 1:, 1:] - v[:, :-1, :-1] for v in (x, y))
@@ -223,7 +262,7 @@ def _spread(
     signed = (ax * by - ay * bx) / 2
     area = np.abs(signed)
     whole = inside[:, 1:, 1:] & inside[:, :-1, :-1] & inside[:, 1:, :-1] & inside[:, :-1, 1:]
-    density = share[:, 1:, 1:] * at_entrance[:, None, None] / np.maximum(area, 1e-9)
+    density = fraction[:, 1:, 1:] * at_entrance[:, None, None] / np.maximum(area, 1e-9)
     peak = np.where(whole, density, 0).max(axis=(1, 2))
     seen = (whole & near[:, 1:, 1:]).reshape(len(x), -1)
     lit = np.where(seen, area.reshape(len(x), -1), 0)
@@ -231,20 +270,20 @@ def _spread(
     sorted_ = np.take_along_axis(lit, order, axis=1)
     below = np.cumsum(sorted_, axis=1)
     total = np.maximum(below[:, -1], 1e-30)
-    at = (below >= _LEAST_SPREAD * total[:, None]).argmax(axis=1)
-    magnification = np.sqrt(sorted_[np.arange(len(x)), at] / at_entrance)
+    first = (below >= _LEAST_SPREAD * total[:, None]).argmax(axis=1)
+    magnification = np.sqrt(sorted_[np.arange(len(x)), first] / at_entrance)
     folded = np.where(whole, signed, 0).min(axis=(1, 2)) * np.where(whole, signed, 0).max(axis=(1, 2)) < 0
     steep = np.zeros(area.shape, dtype=bool)
     for axis in (1, 2):
-        one, other = (np.take(area, np.arange(n, area.shape[axis] - 1 + n), axis=axis) for n in (0, 1))
-        jump = np.maximum(one, other) > _UNEVEN * np.minimum(one, other)
+        before, behind = (np.take(area, np.arange(n, area.shape[axis] - 1 + n), axis=axis) for n in (0, 1))
+        jump = np.maximum(before, behind) > _UNEVEN * np.minimum(before, behind)
         both = np.take(whole, np.arange(area.shape[axis] - 1), axis=axis) & np.take(
             whole, np.arange(1, area.shape[axis]), axis=axis
         )
         jump &= both
         pad = [(0, 0), (0, 0), (0, 0)]
-        for before in (0, 1):
-            pad[axis] = (before, 1 - before)
+        for shift in (0, 1):
+            pad[axis] = (shift, 1 - shift)
             steep |= np.pad(jump, pad)
     uneven = np.where(steep.reshape(len(x), -1), lit, 0).sum(axis=1) / total
     return peak, magnification, folded, uneven
@@ -288,10 +327,10 @@ def traced_ghosts(
     if not len(rays):
         return ()
     if across is not None:
-        return told(made, rays, sun_deg, turn, across)
+        return traced(made, rays, sun_deg, turn, across)
     four = np.array([len(made.routes[r]) > 2 for r in rays.route])
-    found = [(rays.take(~four), FINE), (rays.take(four), FINE_OF_FOUR)]
-    ghosts = [ghost for some, count in found for ghost in told(made, some, sun_deg, turn, count)]
+    parts = [(rays.take(~four), FINE), (rays.take(four), FINE_OF_FOUR)]
+    ghosts = [ghost for part, count in parts for ghost in traced(made, part, sun_deg, turn, count)]
     return tuple(sorted(ghosts, key=lambda g: g.pair))
 
 
@@ -301,23 +340,25 @@ def named(made: Tracer, rays: Rays, names: Collection[tuple[int, ...]]) -> NDArr
     return np.array([name_of(made.routes[r]) in wanted for r in rays.route], dtype=bool)
 
 
-def told(made: Tracer, rays: Rays, sun_deg: float, turn_rad: float, across: int) -> tuple[Ghost, ...]:
+def traced(made: Tracer, rays: Rays, sun_deg: float, turn_rad: float, across: int) -> tuple[Ghost, ...]:
     """Return flux, centroid and spread on the sensor plane of each ghost's ray bundle, `across` rays wide."""
     pupil = np.pi / 4 * first_order(made.lens).entrance_pupil_diameter_mm ** 2
     out = []
     together = max(1, _TOGETHER // across**2)
     for first in range(0, len(rays), together):
         part = rays.take(np.arange(first, min(first + together, len(rays))))
-        out += _told(made, part, across, turn_rad, pupil, float(np.cos(np.radians(sun_deg))))
+        out += _traced_together(made, part, across, turn_rad, pupil, float(np.cos(np.radians(sun_deg))))
     return tuple(sorted(out, key=lambda g: g.pair))
 
 
-def _told(made: Tracer, rays: Rays, across: int, turn: float, pupil_mm2: float, cosine: float) -> list[Ghost]:
+def _traced_together(
+    made: Tracer, rays: Rays, across: int, turn: float, pupil_mm2: float, cosine: float
+) -> list[Ghost]:
     """Return the ghosts of bundles that are traced together."""
     be = backend()
     dr, Double = be.dr, be.Double
     spots = made.trace(rays, across, centred=True)
-    weight = Double(spots.share * _inside(spots.radius, across))
+    weight = Double(spots.fraction * _inside(spots.radius, across))
     x, y = Double(spots.x_mm), Double(spots.y_mm)
     parts = (weight, weight * x, weight * y, weight * (x * x + y * y))
     dr.eval(*parts)
@@ -327,12 +368,12 @@ def _told(made: Tracer, rays: Rays, across: int, turn: float, pupil_mm2: float, 
     out = []
     for k in np.flatnonzero(total > 0):
         cx, cy = mx[k] / total[k], my[k] / total[k]
-        place = (cx * np.cos(turn) - cy * np.sin(turn), cx * np.sin(turn) + cy * np.cos(turn))
+        centroid = (cx * np.cos(turn) - cy * np.sin(turn), cx * np.sin(turn) + cy * np.cos(turn))
         out.append(
             Ghost(
                 pair=name_of(made.routes[rays.route[k]]),  # type: ignore[arg-type]
                 flux_fraction=float(total[k] * cell[k] / pupil_mm2),
-                centroid_mm=(float(place[0]), float(place[1])),
+                centroid_mm=(float(centroid[0]), float(centroid[1])),
                 rms_radius_mm=float(np.sqrt(max(square[k] / total[k] - cx * cx - cy * cy, 0.0))),
                 peak_irradiance_fraction=float(peak[k]),
             )
@@ -348,9 +389,9 @@ def _inside(radius: Any, across: int) -> Any:
     row = each // across
     ix, iy = each - row * across, row % across
     rise: Any = 0.0
-    for at, step in ((ix, 1), (iy, across)):
-        before = dr.gather(be.Float, radius, dr.select(at > 0, each - step, each))
-        behind = dr.gather(be.Float, radius, dr.select(at < across - 1, each + step, each))
+    for node, step in ((ix, 1), (iy, across)):
+        before = dr.gather(be.Float, radius, dr.select(node > 0, each - step, each))
+        behind = dr.gather(be.Float, radius, dr.select(node < across - 1, each + step, each))
         rise = rise + dr.abs(behind - before) * 0.5
     part = dr.clip(0.5 + (1 - radius) / dr.maximum(rise, 1e-9), 0, 1)
     # where the radius jumps, a ray was lost at another rim, and the rise does not locate the edge
@@ -363,8 +404,8 @@ def _peaks(made: Tracer, rays: Rays) -> F64:
     It is taken over the cells of a lattice.
     """
     spots = made.trace(rays, _PEAK, centred=True)
-    x, y, share, radius = (
-        v.numpy().reshape(len(rays), _PEAK, _PEAK) for v in (spots.x_mm, spots.y_mm, spots.share, spots.radius)
+    x, y, fraction, radius = (
+        v.numpy().reshape(len(rays), _PEAK, _PEAK) for v in (spots.x_mm, spots.y_mm, spots.fraction, spots.radius)
     )
     ux, uy = (np.diff(v, axis=2)[:, 1:] for v in (x, y))
     vx, vy = (np.diff(v, axis=1)[:, :, 1:] for v in (x, y))
@@ -372,10 +413,9 @@ def _peaks(made: Tracer, rays: Rays) -> F64:
     whole = passes[:, 1:, 1:] & passes[:, 1:, :-1] & passes[:, :-1, 1:]
     cell = 4 * rays.box_mm[:, 2] * rays.box_mm[:, 3] / _PEAK**2
     with np.errstate(divide="ignore", invalid="ignore"):
-        density = np.where(whole, share[:, 1:, 1:] * cell[:, None, None] / np.abs(ux * vy - uy * vx), 0)
+        density = np.where(whole, fraction[:, 1:, 1:] * cell[:, None, None] / np.abs(ux * vy - uy * vx), 0)
     # a ghost of only a few rays has no whole cell, and its peak is 0
-    found = np.nan_to_num(density, posinf=0.0).max(axis=(1, 2))
-    return np.asarray(found, dtype=np.float64)
+    return np.asarray(np.nan_to_num(density, posinf=0.0).max(axis=(1, 2)), dtype=np.float64)
 
 
 def surface_interactions_per_second(

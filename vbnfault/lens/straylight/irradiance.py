@@ -11,23 +11,24 @@ from __future__ import annotations
 import copy
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ...core.errors import InputError
 from ..prescription import Prescription
-from .bundles import Rays, Spots, Tracer, backend
-from .ghosts import Arrivals, boxes, named, told
+from .bundles import Rays, Spots, TraceOptions, Tracer
+from .ghosts import Arrivals, boxes, named, traced
 from .paraxial import Ghost, along, mean_ghost
 from .raster import LEVELS, PARTS, BundleDrawing, Canvas, Sums, edge_kind
+from .settings import TRACED, GhostSettings, SensorGrid
+from .steps import backend
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
 MODELS = ("traced", "paraxial")
-_ACROSS = 37  # rays across a ghost
 _UNEVEN = 0.3  # uneven fraction of a ghost above which twice as many rays are traced
 _ACROSS_FOCUSED = 25  # rays across a ghost for each sample of the Sun's disc
 _SUBDIVISIONS = 8  # of the interval between two nodes, where colours separate
@@ -42,7 +43,7 @@ _SPREAD_SHARP = 4.0  # upper bound of the same in estimates of sharpness
 _LEAST = 1e-10  # irradiance over the Sun's below which a ghost is omitted
 
 
-class FirstOrderTracer(Tracer):
+class ParaxialTracer(Tracer):
     """Trace rays by matrices instead of surfaces (Lee & Eisemann's model), with the tables of `Tracer`."""
 
     def __init__(
@@ -53,34 +54,33 @@ class FirstOrderTracer(Tracer):
         found = [along(lens, path, self.wavelength_nm) for path in self._paths]
         whole = np.stack([m for m, _ in found])  # route, wavelength
         met = np.concatenate([m for _, m in found])  # step, wavelength
-        self._first_order = {
+        self._paraxial = {
             "whole": be.Float(whole[:, :, 0, :].transpose(1, 0, 2).astype(np.float32).ravel()),
             "met": be.Float(met[:, :, 0, :].transpose(1, 0, 2).astype(np.float32).ravel()),
         }
 
-    def _share_tables(self, share: F64) -> dict[str, Any]:
+    def _fraction_tables(self, fraction: F64) -> dict[str, Any]:
         """Return the tables of `Tracer`, and the transmitted fraction of every route at normal incidence."""
-        normal = share[:, :, :, -1].reshape(len(share), -1)[:, self._look_up]
+        normal = fraction[:, :, :, -1].reshape(len(fraction), -1)[:, self._look_up]
         routes_ = np.multiply.reduceat(normal, self.first_step[:-1], axis=1) if len(self.routes) else normal
-        return super()._share_tables(share) | {"shares": backend().Float(routes_.astype(np.float32).ravel())}
+        return super()._fraction_tables(fraction) | {
+            "fractions": backend().Float(routes_.astype(np.float32).ravel())
+        }
 
     def trace(
         self,
         rays: Rays,
         across: int | NDArray[np.int64],
         width: F64 | None = None,
-        *,
-        centred: bool = False,
-        light: bool = True,
-        halved: bool = True,
+        **options: Unpack[TraceOptions],
     ) -> Spots:
         """Trace as `Tracer.trace` does, to first order; the Sun's slope is the tangent of its angle."""
-        be, t, f = backend(), self._tables, self._first_order
+        be, t, f = backend(), self._tables, self._paraxial
         dr = be.dr
         side = np.broadcast_to(np.asarray(across, dtype=np.int64), len(rays))
-        start = self._start(rays, side, centred, False)
+        start = self._start(rays, side, options.get("centred", False), False)
         per_width = be.Float((np.zeros(len(self.rows)) if width is None else 1 / width).astype(np.float32))
-        rim = self.lens.surfaces[self.lens.stop]
+        blades = self._blades
         x, y = start.x, start.y
         sx, sy = start.dx / start.dz, start.dy / start.dz
         of = start.wavelength * dr.opaque(be.UInt32, len(self.routes)) + start.route
@@ -95,8 +95,8 @@ class FirstOrderTracer(Tracer):
             a, b = (dr.gather(be.Float, f["met"], 2 * (steps + step) + k) for k in (0, 1))
             hx, hy = dr.fma(a, x, b * sx), dr.fma(a, y, b * sy)
             beyond = dr.sqrt(hx * hx + hy * hy) * dr.gather(be.Float, t["per_rim"], step)
-            if rim.blades:
-                blade = self._within_blades(hx, hy)
+            if blades is not None:
+                blade = blades.relative_radius(hx, hy)
                 beyond = dr.select(dr.gather(be.UInt32, t["stop"], step) == 1, blade, beyond)
             margin = dr.minimum(margin, (1 - beyond) * dr.gather(be.Float, per_width, step))
             return step + 1, dr.maximum(radius, beyond), margin
@@ -113,11 +113,11 @@ class FirstOrderTracer(Tracer):
             across=side,
             x_mm=dr.fma(m00, x, m01 * sx),
             y_mm=dr.fma(m00, y, m01 * sy),
-            share=dr.select(radius >= 0, dr.gather(be.Float, t["shares"], of), 0),  # one value per ray
+            fraction=dr.select(radius >= 0, dr.gather(be.Float, t["fractions"], of), 0),  # one value per ray
             radius=radius,
             margin=margin,
         )
-        dr.eval(spots.x_mm, spots.y_mm, spots.share, spots.radius, spots.margin)
+        dr.eval(spots.x_mm, spots.y_mm, spots.fraction, spots.radius, spots.margin)
         return spots
 
 
@@ -167,45 +167,35 @@ class FlareModel:
         At its final size.
     wavelength_nm
         float64[band]: nodes of the bands; one node is one wavelength.
-    shape, pitch_mm
-        (height, width) of the sensor in pixels, and their pitch.
+    sensor
+        Pixels whose middle lies on the axis.
     sun_radius_rad
         Angular radius of the Sun's disc; 0 is a point.
-    model
-        'traced' or 'paraxial'.
-    reflections
-        2, or 4 to include ghosts of four reflections.
-    diffraction
-        Whether edges show Fresnel's fringes.
-    across
-        Rays along either side of a typical ghost. Its light converges with their number: to some 1 % with the
-        default, and to some 4 % for ghosts that are strongly spread.
+    settings
+        How ghosts are computed.
     """
 
     def __init__(
         self,
         lens: Prescription,
         wavelength_nm: F64,
+        sensor: SensorGrid,
         *,
-        shape: tuple[int, int],
-        pitch_mm: float,
         sun_radius_rad: float,
-        model: str = "traced",
-        reflections: int = 2,
-        diffraction: bool = True,
-        across: int = _ACROSS,
+        settings: GhostSettings = TRACED,
     ) -> None:
+        model, shape, pitch_mm = settings.model, sensor.shape, sensor.pitch_mm
         if model not in MODELS:
             raise InputError(f"model = {model!r}: must be one of {', '.join(MODELS)}")
         self.lens = lens
         self.nodes_nm = np.atleast_1d(np.asarray(wavelength_nm, dtype=np.float64))
         self.canvas = Canvas(shape=shape, pitch_mm=pitch_mm, bands=len(self.nodes_nm))
         self.sun_radius_rad = sun_radius_rad
-        kind = Tracer if model == "traced" else FirstOrderTracer
+        kind = Tracer if model == "traced" else ParaxialTracer
         at = np.arange((len(self.nodes_nm) - 1) * _SUBDIVISIONS + 1) / _SUBDIVISIONS
         self._fine = np.interp(at, np.arange(len(self.nodes_nm)), self.nodes_nm)
-        self._tracer = kind(lens, self._fine, reflections=reflections)
-        self._diffraction, self._across = diffraction, across
+        self._tracer = kind(lens, self._fine, reflections=settings.reflections)
+        self._diffraction, self._across = settings.diffraction, settings.across
         self._reach_mm = float(np.hypot(*shape) / 2 * pitch_mm)
         self._soften()
 
@@ -337,12 +327,12 @@ class FlareModel:
         made = self._tracer.turned(turn)
         rays, arrivals = boxes(made, sun_deg, self._detail.width, self._reach_mm)
         rays = rays.take(self._in_frame(arrivals) & (arrivals.peak > _LEAST))
-        found: dict[tuple[int, ...], list[tuple[float, Ghost]]] = {}
+        by_name: dict[tuple[int, ...], list[tuple[float, Ghost]]] = {}
         for node in range(0, len(self._fine), _SUBDIVISIONS):
-            at = replace(rays, wavelength=np.full(len(rays), node))
-            for ghost in told(made, at, sun_deg, turn, across):
-                found.setdefault(ghost.pair, []).append((1 / len(self.nodes_nm), ghost))
-        return tuple(mean_ghost(rows) for _, rows in sorted(found.items()))
+            of_node = replace(rays, wavelength=np.full(len(rays), node))
+            for ghost in traced(made, of_node, sun_deg, turn, across):
+                by_name.setdefault(ghost.pair, []).append((1 / len(self.nodes_nm), ghost))
+        return tuple(mean_ghost(ghosts) for _, ghosts in sorted(by_name.items()))
 
     def _fainter(self, rays: Rays, arrivals: Arrivals) -> NDArray[np.int64]:
         """Return the levels to add where edges are too faint to show in the sum of all ghosts, by route."""
@@ -449,22 +439,12 @@ def disc_samples(rings: int) -> F64:
 def flare_model(
     lens: Prescription,
     nodes_nm: tuple[float, ...],
-    shape: tuple[int, int],
-    pitch_mm: float,
+    sensor: SensorGrid,
     sun_radius_rad: float,
-    model: str,
-    reflections: int = 2,
+    settings: GhostSettings = TRACED,
 ) -> FlareModel:
     """Return the model of a lens and a sensor; it is cached."""
-    return FlareModel(
-        lens,
-        np.array(nodes_nm),
-        shape=shape,
-        pitch_mm=pitch_mm,
-        sun_radius_rad=sun_radius_rad,
-        model=model,
-        reflections=reflections,
-    )
+    return FlareModel(lens, np.array(nodes_nm), sensor, sun_radius_rad=sun_radius_rad, settings=settings)
 
 
 __all__ = ["MODELS", "FlareModel", "disc_samples", "flare_model"]

@@ -52,8 +52,8 @@ class Ghost:
 
 def mean_ghost(rows: Sequence[tuple[float, Ghost]]) -> Ghost:
     """Return the mean over wavelengths of one ghost, from (fraction of the entering light, ghost) for each."""
-    share = np.array([weight for weight, _ in rows])
-    flux = share * [ghost.flux_fraction for _, ghost in rows]
+    fraction = np.array([weight for weight, _ in rows])
+    flux = fraction * [ghost.flux_fraction for _, ghost in rows]
     place = np.array([ghost.centroid_mm for _, ghost in rows])
     centre = flux @ place / flux.sum()
     square = [g.rms_radius_mm**2 + float(((p - centre) ** 2).sum()) for (_, g), p in zip(rows, place, strict=True)]
@@ -62,7 +62,7 @@ def mean_ghost(rows: Sequence[tuple[float, Ghost]]) -> Ghost:
         flux_fraction=float(flux.sum()),
         centroid_mm=(float(centre[0]), float(centre[1])),
         rms_radius_mm=float(np.sqrt(flux @ square / flux.sum())),
-        peak_irradiance_fraction=float(share @ [ghost.peak_irradiance_fraction for _, ghost in rows]),
+        peak_irradiance_fraction=float(fraction @ [ghost.peak_irradiance_fraction for _, ghost in rows]),
     )
 
 
@@ -122,15 +122,15 @@ def along(lens: Prescription, path: Sequence[tuple[int, bool]], wavelength_nm: A
 def transmittance(lens: Prescription, path: Sequence[tuple[int, bool]], wavelength_nm: float = D_NM) -> float:
     """Return the fraction of the light that takes a path, for normal incidence on every surface."""
     index = lens.indices(wavelength_nm)
-    share = 1.0
+    fraction = 1.0
     for row, mirror in path:
         if row == len(lens.surfaces):
-            share *= lens.sensor_reflectance
+            fraction *= lens.sensor_reflectance
             continue
         films = lens.surfaces[row].coating
         reflected = float(mean_reflectance(films, index[row], index[row + 1], 1.0, wavelength_nm))
-        share *= reflected if mirror else 1 - reflected
-    return share
+        fraction *= reflected if mirror else 1 - reflected
+    return fraction
 
 
 def axial_transmittance(lens: Prescription, wavelength_nm: ArrayLike) -> F64:
@@ -177,14 +177,14 @@ def paraxial_ghosts(
             continue
         on_sensor = matrix[0, 0] * passing + matrix[0, 1] * slope
         centroid = on_sensor.mean(axis=0)
-        share = transmittance(lens, path, wavelength_nm)
+        fraction = transmittance(lens, path, wavelength_nm)
         found.append(
             Ghost(
                 pair=pair,
-                flux_fraction=share * len(passing) * (2 * radius[least] / _GRID) ** 2 / pupil,
+                flux_fraction=fraction * len(passing) * (2 * radius[least] / _GRID) ** 2 / pupil,
                 centroid_mm=(float(centroid[0]), float(centroid[1])),
                 rms_radius_mm=float(np.sqrt(np.mean(np.sum((on_sensor - centroid) ** 2, axis=1)))),
-                peak_irradiance_fraction=float(share * np.cos(np.radians(sun_deg)) / matrix[0, 0] ** 2),
+                peak_irradiance_fraction=float(fraction * np.cos(np.radians(sun_deg)) / matrix[0, 0] ** 2),
             )
         )
     return tuple(found)

@@ -21,7 +21,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from .bundles import Spots, backend, lattice_places, rounded
+from .bundles import Spots, lattice_places, rounded
+from .steps import backend
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -82,7 +83,7 @@ class BundleDrawing:
     band, weight
         int64 and float64[bundle, 2]: two bands and their weights.
     strength
-        Irradiance for a `share` of 1 without magnification.
+        Irradiance for a `fraction` of 1 without magnification.
     kind
         Profile of its edges, see `edge_profiles`.
     ramp
@@ -238,7 +239,7 @@ class Sums:
         def on(point: Any) -> Any:
             return point < number
 
-        def one(point: Any) -> Any:
+        def add_point(point: Any) -> Any:
             """Add one point of the cell."""
             row = UInt32((Float(point) + 0.5) / across)
             u, v = (Float(point - row * columns) + 0.5) / across, (Float(row) + 0.5) / down
@@ -250,25 +251,25 @@ class Sums:
             # Lagrange's cubic along either side
             along = [u * (1 - u) * (-1 / 6) * k for k in (2 - u, 1 + u)]
             aside = [v * (1 - v) * (-1 / 6) * k for k in (2 - v, 1 + v)]
-            place = []
+            position = []
             for corners, (bent_u, bent_v) in zip(((xa, xb, xc, xd), (ya, yb, yc, yd)), bends, strict=True):
                 a, b, c, d = bent_u
                 bow = dr.fma(along[0], dr.lerp(a, d, v), along[1] * dr.lerp(b, c, v))
                 a, b, c, d = bent_v
                 bow = bow + dr.fma(aside[0], dr.lerp(a, b, u), aside[1] * dr.lerp(d, c, u))
-                place.append(between(*corners) + bow - 0.5)
+                position.append(between(*corners) + bow - 0.5)
             value = light * between(sa, sb, sc, sd) * between(fa, fb, fc, fd) * profile(between(ma, mb, mc, md))
-            x, y = (dr.clip(p, -10, 1e5) for p in place)
+            x, y = (dr.clip(p, -10, 1e5) for p in position)
             left, top = dr.floor(x), dr.floor(y)
-            right_share, low_share = x - left, y - top
+            right_part, low_part = x - left, y - top
             for dx, dy in _CORNERS:
-                share = (right_share if dx else 1 - right_share) * (low_share if dy else 1 - low_share)
+                fraction = (right_part if dx else 1 - right_part) * (low_part if dy else 1 - low_part)
                 px, py = left + dx, top + dy
                 inside = (px >= 0) & (py >= 0) & (px < cells.width) & (py < cells.height) & (value != 0)
-                add(value * share, UInt32(Int32(py)) * width + UInt32(Int32(px)), inside)
+                add(value * fraction, UInt32(Int32(py)) * width + UInt32(Int32(px)), inside)
             return (point + 1,)
 
-        dr.while_loop((dr.zeros(UInt32, dr.width(number)),), on, one, mode="symbolic")
+        dr.while_loop((dr.zeros(UInt32, dr.width(number)),), on, add_point, mode="symbolic")
         dr.eval(self._total)
 
     def _adder(self, cells: _Cells) -> Any:
@@ -285,10 +286,10 @@ class Sums:
         ]
 
         def add(value: Any, at: Any, shown: Any) -> None:
-            for start, share in bands:
+            for start, weight in bands:
                 # negative numbers wrap around, and wrap back when they are read as signed
-                units = be.UInt64(be.Int64(dr.round(dr.clip(value, -_MOST, _MOST) * share)))
-                dr.scatter_add(total, units, start + at, shown & (share > 0), mode=dr.ReduceMode.Auto)
+                units = be.UInt64(be.Int64(dr.round(dr.clip(value, -_MOST, _MOST) * weight)))
+                dr.scatter_add(total, units, start + at, shown & (weight > 0), mode=dr.ReduceMode.Auto)
 
         return add
 
@@ -297,7 +298,7 @@ class Sums:
         canvas, total = self.canvas, self._total.numpy().view(np.int64)
         out = np.empty((canvas.bands, *canvas.shape), dtype=np.float32)
 
-        def one(band: int) -> None:
+        def resize_band(band: int) -> None:
             """Resize and add the levels of one band, from the coarsest to the finest."""
             below: F32 | None = None
             for level in range(LEVELS - 1, -1, -1):
@@ -319,7 +320,7 @@ class Sums:
 
         # numpy and OpenCV release the interpreter's lock
         with ThreadPoolExecutor(backend().dr.thread_count()) as pool:
-            list(pool.map(one, range(canvas.bands)))
+            list(pool.map(resize_band, range(canvas.bands)))
         return out
 
 
@@ -354,12 +355,12 @@ class _Triangle:
         dr = backend().dr
         inside, values = None, [0.0] * (len(self._corners[0]) - 2)
         for (ox, oy, ux, uy, flip), corner in zip(self._edges, self._corners, strict=True):
-            share = (ux * (y - oy) - uy * (x - ox)) * (flip * self._sign)
+            fraction = (ux * (y - oy) - uy * (x - ox)) * (flip * self._sign)
             # a point on an edge belongs to the triangle to the left of the edge, as `_edge` reads it
-            here = (share > 0) | ((share == 0) & (flip * self._sign > 0))
+            here = (fraction > 0) | ((fraction == 0) & (flip * self._sign > 0))
             inside = here if inside is None else inside & here
             # the area of a sliver may be all rounding error
-            weight = dr.clip(share * self._per_area, 0, 1)
+            weight = dr.clip(fraction * self._per_area, 0, 1)
             values = [dr.fma(weight, more, value) for value, more in zip(values, corner[2:], strict=True)]
         return inside, *values
 
@@ -367,7 +368,7 @@ class _Triangle:
 def _edge(p: tuple[Any, ...], q: tuple[Any, ...]) -> tuple[Any, ...]:
     """Return an edge read from its lesser end, and the sign for p → q.
 
-    Two triangles that share the edge then judge a point by the same numbers.
+    Two triangles that fraction the edge then judge a point by the same numbers.
     """
     dr = backend().dr
     ordered = (p[0] < q[0]) | ((p[0] == q[0]) & (p[1] < q[1]))
@@ -457,7 +458,7 @@ class _Lattice:
         self.across, self.first_ray, self.first_cell = (
             v[placement.source] for v in (traced.across, traced.first_ray, traced.first_cell)
         )
-        # light of a mean cell for a `share` of 1, in irradiance × pixels of the level
+        # light of a mean cell for a `fraction` of 1, in irradiance × pixels of the level
         self.entrance_mm2 = traced.entrance_mm2[placement.source]
         self.light = self.entrance_mm2 * placement.strength * self.per_mm**2
         self.places = lattice_places(self.across - 1, self.across - 1)
@@ -468,7 +469,7 @@ class _Lattice:
 
 
 class _Cells:
-    """Hold some cells, one in each lane: corners (x, y, share, margin), area, and values of their bundle."""
+    """Hold some cells, one in each lane: corners (x, y, fraction, margin), area, and values of their bundle."""
 
     def __init__(self, lattice: _Lattice, index: Any) -> None:
         be = backend()
@@ -490,16 +491,16 @@ class _Cells:
         self.light = self.given(lattice.light) * lattice.traced.entrance(source, self.ix, self.iy, self.side)
         self.height, self.width = (self.given(lattice.sides[:, k]) for k in (0, 1))
         spots = lattice.spots
-        x, y, share, margin = (
+        x, y, fraction, margin = (
             [dr.gather(Float, v, at) for at in self.rays]
-            for v in (spots.x_mm, spots.y_mm, spots.share, spots.margin)
+            for v in (spots.x_mm, spots.y_mm, spots.fraction, spots.margin)
         )
         self.valid = _least(*margin) > _WHOLE
         x, y = (
             [dr.fma(a * cos - b * sin, scale, middle_x) for a, b in zip(x, y, strict=True)],
             [dr.fma(a * sin + b * cos, scale, middle_y) for a, b in zip(x, y, strict=True)],
         )
-        self.corners = list(zip(x, y, share, margin, strict=True))
+        self.corners = list(zip(x, y, fraction, margin, strict=True))
         (xa, xb, xc, xd), (ya, yb, yc, yd) = x, y
         self.area = dr.abs(_area(*zip(x, y, strict=True)))
         self.own = dr.gather(Float, lattice.traced.magnified, self.first_cell + self.iy * self.side + self.ix)

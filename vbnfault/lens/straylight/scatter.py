@@ -16,6 +16,7 @@ from scipy.special import erf, exprel, j1
 
 from ...core.errors import InputError
 from ..coating import reflect_transmit
+from ..footprint import disc_overlap
 from ..gaussian import first_order
 from ..glass import D_NM, RANGE_NM
 from ..prescription import Prescription
@@ -47,6 +48,29 @@ _OFFSETS: F64 = np.geomspace(1e-6, 2.0, 1025)
 _STEEPEST_DEG = 89.9
 _DISC = 65  # points across a beam
 _AROUND = 360  # azimuths about the source, for the flux outside the frame
+
+
+@dataclass(frozen=True, kw_only=True)
+class Cleanliness:
+    """Describe what scatters on the surfaces of a lens.
+
+    Attributes
+    ----------
+    roughness_nm
+        Rms roughness of every surface.
+    level
+        Particles on every surface in air, as a level of IEST-STD-CC1246; 0: none.
+    knee, slope
+        Harvey's knee (at 550 nm) and slope of the scatter by roughness.
+    """
+
+    roughness_nm: float = ROUGHNESS_NM
+    level: float = 0.0
+    knee: float = KNEE
+    slope: float = SLOPE
+
+
+POLISHED = Cleanliness()
 
 
 def _check(name: str, value: ArrayLike, low: float, high: float) -> F64:
@@ -251,8 +275,8 @@ def _dust(level: float, wavelength_nm: float, index: complex) -> tuple[F64, floa
     bins = -np.diff(particle_count(level, diameters)) / _CC1246_AREA_UM2
     intensity = bins @ table / (2 * np.pi / wavelength_um) ** 2
     intensity.setflags(write=False)
-    share = np.trapezoid(2 * np.pi * np.sin(angles) * angles * intensity, x=np.log(angles))
-    return intensity, float(share)
+    scattered = np.trapezoid(2 * np.pi * np.sin(angles) * angles * intensity, x=np.log(angles))
+    return intensity, float(scattered)
 
 
 def particle_bsdf(
@@ -385,19 +409,19 @@ class _Surfaces:
     level: float
     wavelength_nm: float
 
-    def irradiance(self, offset: F64, share: F64) -> F64:
+    def irradiance(self, offset: F64, lit: F64) -> F64:
         """Return irradiance over the source's, float64[sample].
 
-        `share` [surface, sample] is the lit fraction of each beam. Surface j scatters the radiance E_ent T
+        `lit` [surface, sample] is the lit fraction of each beam. Surface j scatters the radiance E_ent T
         (a_ent/a_j)² BSDF, which fills the cone of the image: × π NA². Lagrange's invariant n_j a_j θ = NA r makes β
         = NA r / a_j. With NA = a_ent / f this is (a_ent/a_j) r / f. (Form of Peterson 2004, Proc. SPIE 5178, 184.)
         """
         total = np.zeros(offset.shape)
-        for stretch, harvey, dusty, lit in zip(self.stretch, self.roughness, self.dusty, share, strict=True):
+        for stretch, harvey, dusty, part in zip(self.stretch, self.roughness, self.dusty, lit, strict=True):
             bsdf = harvey.bsdf(stretch * offset)
             if dusty:
                 bsdf = bsdf + particle_bsdf(self.level, self.wavelength_nm, stretch * offset)
-            total += lit * stretch**2 * bsdf
+            total += part * stretch**2 * bsdf
         return self.scale * total
 
     @property
@@ -407,11 +431,9 @@ class _Surfaces:
         return sum(harvey.tis for harvey in self.roughness) + dust * int(self.dusty.sum())
 
 
-def _surfaces(
-    lens: Prescription, wavelength_nm: float, roughness_nm: float, level: float, knee: float, slope: float
-) -> _Surfaces:
+def _surfaces(lens: Prescription, wavelength_nm: float, cleanliness: Cleanliness) -> _Surfaces:
     """Return the scatter of a lens's surfaces at a wavelength."""
-    level = float(_check("cleanliness_level", level, *CLEANLINESS_LIMITS))
+    level = float(_check("cleanliness_level", cleanliness.level, *CLEANLINESS_LIMITS))
     figures, path = first_order(lens, wavelength_nm), forward(lens)
     rows = list(mirrors(lens))
     index = lens.indices(wavelength_nm)
@@ -422,7 +444,10 @@ def _surfaces(
         stretch=1 / np.maximum(marginal, 1e-6),
         roughness=tuple(
             Harvey.of_roughness(
-                roughness_nm=roughness_nm, index_step=float(index[k + 1] - index[k]), L=knee, S=slope
+                roughness_nm=cleanliness.roughness_nm,
+                index_step=float(index[k + 1] - index[k]),
+                L=cleanliness.knee,
+                S=cleanliness.slope,
             ).at(wavelength_nm)
             for k in rows
         ),
@@ -448,25 +473,26 @@ def _lit(lens: Prescription, sun_deg: float) -> F64:
     disc = np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2)
     disc = disc[np.einsum("nc,nc->n", disc, disc) <= 1]
     lean = np.array([np.tan(np.radians(sun_deg)), 0.0])
-    shares = []
+    fractions = []
     for row in mirrors(lens):
         k = min(row, lens.stop)
         entrance = radius * disc - slope[k] / height[k] * lean
         reached = height[: row + 1, None, None] * entrance + slope[: row + 1, None, None] * lean
         inside = np.einsum("knc,knc->kn", reached, reached) <= rims[: row + 1, None] ** 2 * (1 + 1e-9)
-        shares.append(inside.all(axis=0).mean())
-    return np.array(shares)
+        fractions.append(inside.all(axis=0).mean())
+    return np.array(fractions)
+
+
+def _surfaces_of_bands(lens: Prescription, wavelength_nm: ArrayLike, cleanliness: Cleanliness) -> list[_Surfaces]:
+    """Return the scatter of a lens's surfaces at each wavelength."""
+    return [
+        _surfaces(lens, float(nm), cleanliness)
+        for nm in np.atleast_1d(_check("wavelength_nm", wavelength_nm, *RANGE_NM))
+    ]
 
 
 def veiling_glare(
-    lens: Prescription,
-    *,
-    sun_deg: float,
-    wavelength_nm: ArrayLike,
-    roughness_nm: float = ROUGHNESS_NM,
-    cleanliness_level: float = 0.0,
-    L: float = KNEE,
-    S: float = SLOPE,
+    lens: Prescription, *, sun_deg: float, wavelength_nm: ArrayLike, cleanliness: Cleanliness = POLISHED
 ) -> VeilingGlare:
     """Return the light of a far point source that a lens's surfaces scatter onto the sensor.
 
@@ -476,56 +502,31 @@ def veiling_glare(
         Angle of the source from the axis, 0 to 89.9.
     wavelength_nm
         float64[band].
-    roughness_nm, L, S
-        Rms roughness, and Harvey's knee and slope at 550 nm, of every surface (the defaults are assumed).
-    cleanliness_level
-        Particles on every surface in air, as a level of IEST-STD-CC1246; 0: none.
+    cleanliness
+        What scatters on the surfaces.
     """
-    bands = [
-        _surfaces(lens, float(nm), roughness_nm, cleanliness_level, L, S)
-        for nm in np.atleast_1d(_check("wavelength_nm", wavelength_nm, *RANGE_NM))
-    ]
+    bands = _surfaces_of_bands(lens, wavelength_nm, cleanliness)
     angle = float(_check("sun_deg", sun_deg, 0.0, _STEEPEST_DEG))
-    share = np.cos(np.radians(angle)) * _lit(lens, angle)[:, None]
+    lit = np.cos(np.radians(angle)) * _lit(lens, angle)[:, None]
     return VeilingGlare(
         offset=_OFFSETS,
-        irradiance=np.stack([band.irradiance(_OFFSETS, share) for band in bands]),
+        irradiance=np.stack([band.irradiance(_OFFSETS, lit) for band in bands]),
         efl_mm=first_order(lens).efl_mm,
         glare_total_fraction=np.array([band.tis for band in bands]),
     )
 
 
-def scattered_fraction(
-    lens: Prescription,
-    wavelength_nm: ArrayLike,
-    *,
-    roughness_nm: float = ROUGHNESS_NM,
-    cleanliness_level: float = 0.0,
-    L: float = KNEE,
-    S: float = SLOPE,
-) -> F64:
+def scattered_fraction(lens: Prescription, wavelength_nm: ArrayLike, *, cleanliness: Cleanliness = POLISHED) -> F64:
     """Return the fraction of the transmitted light that a lens's surfaces scatter, 1 - exp(-Σ TIS), float64[band].
 
     Parameters as in `veiling_glare`.
     """
-    single = np.array(
-        [
-            _surfaces(lens, float(nm), roughness_nm, cleanliness_level, L, S).tis
-            for nm in np.atleast_1d(_check("wavelength_nm", wavelength_nm, *RANGE_NM))
-        ]
-    )
+    single = np.array([band.tis for band in _surfaces_of_bands(lens, wavelength_nm, cleanliness)])
     return np.asarray(-np.expm1(-single))
 
 
 def point_source_transmittance(
-    lens: Prescription,
-    sun_deg: ArrayLike,
-    *,
-    wavelength_nm: ArrayLike,
-    roughness_nm: float = ROUGHNESS_NM,
-    cleanliness_level: float = 0.0,
-    L: float = KNEE,
-    S: float = SLOPE,
+    lens: Prescription, sun_deg: ArrayLike, *, wavelength_nm: ArrayLike, cleanliness: Cleanliness = POLISHED
 ) -> F64:
     """Return scattered irradiance in the middle of the sensor over a far source's at the entrance.
 
@@ -534,12 +535,9 @@ def point_source_transmittance(
     Parameters as in `veiling_glare`.
     """
     angles = np.atleast_1d(_check("sun_deg", sun_deg, 0.0, _STEEPEST_DEG))
-    share = np.stack([np.cos(np.radians(a)) * _lit(lens, float(a)) for a in angles], axis=1)
-    bands = [
-        _surfaces(lens, float(nm), roughness_nm, cleanliness_level, L, S)
-        for nm in np.atleast_1d(_check("wavelength_nm", wavelength_nm, *RANGE_NM))
-    ]
-    return np.stack([band.irradiance(np.sin(np.radians(angles)), share) for band in bands])
+    lit = np.stack([np.cos(np.radians(a)) * _lit(lens, float(a)) for a in angles], axis=1)
+    bands = _surfaces_of_bands(lens, wavelength_nm, cleanliness)
+    return np.stack([band.irradiance(np.sin(np.radians(angles)), lit) for band in bands])
 
 
 # --- a baffle ---------------------------------------------------------------------------------------------------
@@ -571,10 +569,5 @@ def baffle_transmission(
     least = float(_check("vane_attenuation", vane_attenuation, 0.0, 1.0))
     if length == 0 or np.isinf(large):
         return np.ones(angle.shape)
-    away = length * np.tan(np.radians(np.minimum(angle, 90.0)))
-    d = np.clip(away, large - small + 1e-12 * small, large + small)
-    # the overlap is two circular segments on either side of the chord through the rims' crossings
-    to_small = np.arccos(np.clip((d * d + small**2 - large**2) / (2 * d * small), -1, 1))
-    to_large = np.arccos(np.clip((d * d + large**2 - small**2) / (2 * d * large), -1, 1))
-    area = small**2 * (to_small - np.sin(2 * to_small) / 2) + large**2 * (to_large - np.sin(2 * to_large) / 2)
+    area = disc_overlap(length * np.tan(np.radians(np.minimum(angle, 90.0))), small, large)
     return np.clip(area / (np.pi * small**2), least, 1.0)

@@ -38,6 +38,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -228,8 +229,6 @@ class Starburst:
             Half width of the triangles. None: up to the neighbours, or 150 nm of constant weight for a single band.
             0: monochromatic.
         """
-        import cv2
-
         wavelength_nm = np.atleast_1d(np.asarray(wavelength_nm, dtype=np.float64))
         tables, mix = self._tables(wavelength_nm, pitch_mm, half_width_nm)
         height, width = shape
@@ -259,10 +258,7 @@ class Starburst:
                 cv2.remap(table, angle, row, cv2.INTER_LINEAR, dst=layer, borderMode=cv2.BORDER_REPLICATE)
                 layer *= gain
             if len(tables) < len(mix):
-                for band, (first, *rest) in zip(strip, mix, strict=True):
-                    np.multiply(layers[0], first, out=band)
-                    for layer, share in zip(layers[1:], rest, strict=True):
-                        cv2.scaleAdd(layer, float(share), band, dst=band)
+                _mixed(layers, mix, strip)
         return out
 
     def beyond_mm2(
@@ -317,6 +313,14 @@ class Starburst:
             self._memo.clear()
             self._memo[key] = tables
         return tables
+
+
+def _mixed(layers: F32, mix: F32, out: F32) -> None:
+    """Write the sums of layers, float32[table, y, x], by the weights of a mix, float32[band, table], to `out`."""
+    for band, (first, *rest) in zip(out, mix, strict=True):
+        np.multiply(layers[0], first, out=band)
+        for layer, weight in zip(layers[1:], rest, strict=True):
+            cv2.scaleAdd(layer, float(weight), band, dst=band)
 
 
 def starburst(
@@ -400,9 +404,9 @@ def _hats(nodes_nm: F64, half_width_nm: float | None) -> tuple[tuple[F64, F64], 
             low, high = nodes_nm[max(k - 1, 0)], nodes_nm[min(k + 1, len(nodes_nm) - 1)]
         else:
             low, high = node - half_width_nm, node + half_width_nm
-        share = (np.arange(_HAT_POINTS) + 0.5) / _HAT_POINTS
-        nm = np.concatenate([low + (node - low) * share, high + (node - high) * share])
-        weight = np.concatenate([(node - low) * share, (high - node) * share])
+        part = (np.arange(_HAT_POINTS) + 0.5) / _HAT_POINTS
+        nm = np.concatenate([low + (node - low) * part, high + (node - high) * part])
+        weight = np.concatenate([(node - low) * part, (high - node) * part])
         bands.append((nm, weight / weight.sum()))
     return tuple(bands)
 

@@ -37,41 +37,12 @@ from ..prescription import Prescription
 from ..thin import cos4_map
 from .irradiance import flare_model
 from .paraxial import axial_transmittance
-from .scatter import KNEE, SLOPE, baffle_transmission, scattered_fraction, veiling_glare
+from .scatter import Cleanliness, baffle_transmission, scattered_fraction, veiling_glare
+from .settings import DEFAULT, Baffle, DirectPath, SensorGrid, StraylightSettings, SunSource
 from .starburst import Starburst, starburst
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
-
-VEIL_FRACTION = 0.01  # assumed: a lens with blackened edges and a baffled barrel (ISO 9358 indices of 0.5 to 5 %)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Cleanliness:
-    """Describe what scatters on the surfaces of a lens.
-
-    Attributes
-    ----------
-    roughness_nm
-        Rms roughness of every surface.
-    level
-        Particles on every surface in air, as a level of IEST-STD-CC1246; 0: none.
-    knee, slope
-        Harvey's knee (at 550 nm) and slope of the scatter by roughness.
-    """
-
-    roughness_nm: float = 1.0
-    level: float = 0.0
-    knee: float = KNEE
-    slope: float = SLOPE
-
-
-@dataclass(frozen=True, kw_only=True)
-class Baffle:
-    """Describe a tube in front of the lens; length 0 means none."""
-
-    length_mm: float = 0.0
-    radius_mm: float = 0.0
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -105,128 +76,147 @@ class Straylight:
 def straylight(
     lens: Prescription,
     *,
-    model: str,
     wavelength_nm: F64,
-    shape: tuple[int, int],
-    pitch_mm: float,
-    sun_deg: float,
-    azimuth_deg: float,
-    sun_radius_rad: float,
-    sun_xy_mm: tuple[float, float] | None = None,
-    cleanliness: Cleanliness | None = None,
-    baffle: Baffle | None = None,
-    reflections: int = 2,
-    coating_loss: float = 0.0,
-    veil_fraction: float = VEIL_FRACTION,
-    transmittance: F64 | None = None,
-    admitted_mm2: float | None = None,
-    beam_fraction: float = 1.0,
+    sensor: SensorGrid,
+    sun: SunSource,
+    settings: StraylightSettings = DEFAULT,
+    path: DirectPath | None = None,
 ) -> Straylight:
-    """Return the straylight of a Sun at an angle from the axis and an azimuth (0: +x, right; 90°: +y, down).
+    """Return the Sun's straylight on a sensor.
 
     Parameters
     ----------
     lens
-        At its final size; the sensor's middle lies on the axis.
-    model
-        Of the ghosts: 'traced' or 'paraxial'.
+        At its final size.
     wavelength_nm
         float64[band], nodes of the bands.
-    shape, pitch_mm
-        (height, width) of the sensor in pixels, and their pitch.
-    sun_xy_mm
-        Position of the Sun's direct image; default: f tan θ along the azimuth.
-    reflections
-        2, or 4 to include ghosts of four reflections.
-    coating_loss
-        Fraction of the coatings' area that is gone, in [0, 1]; it raises ghosts. The loss of transmitted light is
-        not applied here, but by whoever darkens the image.
-    veil_fraction
-        Fraction v of the light that mount, barrel and edges scatter onto the sensor plane, in [0, 1].
-    transmittance
-        float64[band], T of the path that forms the direct image; default: that of `lens` along the axis.
-    admitted_mm2
-        A cos θ of the same path; default: the paraxial entrance pupil times cos θ.
-    beam_fraction
-        A over its value on the axis: the fraction of the stop that the Sun lights past the rims.
+    path
+        The path that forms the direct image; default: the lens along its axis, with its paraxial entrance pupil.
 
     Raises
     ------
     InputError
         A value is out of range.
     """
-    nodes = tuple(float(v) for v in np.atleast_1d(wavelength_nm))
-    optics = first_order(lens)
-    made = flare_model(lens, nodes, shape, pitch_mm, sun_radius_rad, model, reflections)
-    turn = np.radians(azimuth_deg)
-    if sun_xy_mm is None:
-        radius = optics.efl_mm * np.tan(np.radians(sun_deg))
-        sun_xy_mm = (float(radius * np.cos(turn)), float(radius * np.sin(turn)))
-    lit = 1.0
-    if baffle is not None and baffle.length_mm > 0:
-        lit = float(
-            baffle_transmission(
-                sun_deg,
-                length_mm=baffle.length_mm,
-                radius_mm=baffle.radius_mm,
-                # a tube narrower than the lens is itself the entrance
-                entrance_radius_mm=min(lens.surfaces[0].semi_diameter_mm, baffle.radius_mm),
-            )
-        )
+    nodes = np.atleast_1d(np.asarray(wavelength_nm, dtype=np.float64))
+    pupil_mm2 = np.pi / 4 * first_order(lens).entrance_pupil_diameter_mm ** 2 * np.cos(np.radians(sun.angle_deg))
     own = axial_transmittance(lens, nodes)
-    passed = own if transmittance is None else np.broadcast_to(transmittance, own.shape)
-    pupil_mm2 = float(np.pi / 4 * optics.entrance_pupil_diameter_mm**2 * np.cos(np.radians(sun_deg)))
-    admitted = pupil_mm2 if admitted_mm2 is None else float(admitted_mm2)
-    cos4 = cos4_map(shape, optics.efl_mm / pitch_mm)
-
-    burst = _starburst(lens, sun_radius_rad)
-    # diffraction scales with the light that passes the stop, and cannot exceed it
-    rays, rays_beyond = (
-        burst.image(sun_xy_mm, np.array(nodes), shape, pitch_mm),
-        burst.beyond_mm2(sun_xy_mm, np.array(nodes), shape, pitch_mm),
+    path = DirectPath(transmittance=own, admitted_mm2=float(pupil_mm2)) if path is None else path
+    light = _SunlightInLens(
+        lens=lens,
+        nodes_nm=nodes,
+        sensor=sensor,
+        sun=sun,
+        own=own,
+        passed=np.broadcast_to(path.transmittance, own.shape),
+        beam_fraction=path.beam_fraction,
+        lit=_lit_fraction(lens, settings.baffle, sun.angle_deg),
+        pupil_mm2=float(pupil_mm2),
     )
-    diffracted = (_flux_mm2(rays, pitch_mm) + rays_beyond) / pupil_mm2
-    gain = lit * passed * beam_fraction / np.maximum(diffracted, 1)
-    rays *= gain[:, None, None].astype(np.float32)
-    rays_beyond = rays_beyond * gain
-
-    clean = Cleanliness() if cleanliness is None else cleanliness
-    scattering = veiling_glare(
-        lens,
-        sun_deg=sun_deg,
-        wavelength_nm=np.array(nodes),
-        roughness_nm=clean.roughness_nm,
-        cleanliness_level=clean.level,
-        L=clean.knee,
-        S=clean.slope,
-    )
-    # each surface scatters only the light that the others have left (`kept_of_single`)
-    gain = lit * passed / own * scattering.kept_of_single
-    glare = scattering.image(sun_xy_mm, shape, pitch_mm)
-    glare *= gain[:, None, None].astype(np.float32) * cos4
-    glare_beyond = scattering.beyond_mm2(sun_xy_mm, shape, pitch_mm) * gain
-
-    entering = lit * passed * pupil_mm2 * veil_fraction
-    shape_per_mm2 = cos4 * np.float32(1 / (np.pi * optics.efl_mm**2))
-    veil = np.asarray(entering[:, None, None].astype(np.float32) * shape_per_mm2)
-    veil_beyond = entering * (1 - float(shape_per_mm2.sum(dtype=np.float64)) * pitch_mm**2)
-
-    ghosts = made.worn(coating_loss).image(sun_deg, azimuth_deg) * np.float32(lit)
-    direct = passed * admitted
+    burst, burst_beyond = light.starburst()
+    glare, glare_beyond = light.glare(settings.cleanliness)
+    veil, veil_beyond = light.veil(settings.veil_fraction)
+    model = flare_model(lens, tuple(nodes.tolist()), sensor, sun.radius_rad, settings.ghosts)
+    ghosts = model.worn(settings.coating_loss).image(sun.angle_deg, sun.azimuth_deg) * np.float32(light.lit)
+    direct = light.passed * path.admitted_mm2
     # light that the image path has lost feeds the ghosts; the direct light supplies the rest
-    unpaid = np.maximum(_flux_mm2(ghosts, pitch_mm) - (1 - passed) * admitted, 0)
-    beyond = rays_beyond + glare_beyond + veil_beyond
-    taken = sum(_flux_mm2(layer, pitch_mm) for layer in (rays, glare, veil)) + beyond + unpaid
+    unpaid = np.maximum(_flux_mm2(ghosts, sensor.pitch_mm) - (1 - light.passed) * path.admitted_mm2, 0)
+    beyond = burst_beyond + glare_beyond + veil_beyond
+    taken = sum(_flux_mm2(layer, sensor.pitch_mm) for layer in (burst, glare, veil)) + beyond + unpaid
     with np.errstate(divide="ignore", invalid="ignore"):
         left = np.where(direct > 0, 1 - taken / direct, 1.0)
     return Straylight(
         ghosts=ghosts,
-        starburst=rays,
+        starburst=burst,
         glare=glare,
         veil=veil,
         direct_fraction=np.clip(left, 0, 1),
         beyond_mm2=beyond,
     )
+
+
+def _lit_fraction(lens: Prescription, baffle: Baffle, sun_deg: float) -> float:
+    """Return the fraction of the lens's entrance that the Sun lights through a baffle."""
+    if baffle.length_mm <= 0:
+        return 1.0
+    return float(
+        baffle_transmission(
+            sun_deg,
+            length_mm=baffle.length_mm,
+            radius_mm=baffle.radius_mm,
+            # a tube narrower than the lens is itself the entrance
+            entrance_radius_mm=min(lens.surfaces[0].semi_diameter_mm, baffle.radius_mm),
+        )
+    )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _SunlightInLens:
+    """Hold the Sun's light in a lens, and compute what of it is diffracted and scattered.
+
+    Each method returns the irradiance on the sensor, float32[band, y, x], and the flux beyond the frame,
+    float64[band] in mm², both over the Sun's irradiance at the entrance.
+
+    Attributes
+    ----------
+    own, passed
+        float64[band]: transmittance of the lens along its axis, and of the path of the direct image.
+    lit
+        Fraction of the entrance that the Sun lights.
+    pupil_mm2
+        Area of the paraxial entrance pupil across the Sun's direction.
+    """
+
+    lens: Prescription
+    nodes_nm: F64
+    sensor: SensorGrid
+    sun: SunSource
+    own: F64
+    passed: F64
+    beam_fraction: float
+    lit: float
+    pupil_mm2: float
+
+    @property
+    def _efl_mm(self) -> float:
+        """Return the focal length."""
+        return first_order(self.lens).efl_mm
+
+    @property
+    def _cos4(self) -> F32:
+        """Return cos⁴ of the field angle of every pixel."""
+        return cos4_map(self.sensor.shape, self._efl_mm / self.sensor.pitch_mm)
+
+    def starburst(self) -> tuple[F32, F64]:
+        """Return what the stop diffracts."""
+        burst, where = _starburst(self.lens, self.sun.radius_rad), self.sun.xy_mm(self._efl_mm)
+        shape, pitch_mm = self.sensor.shape, self.sensor.pitch_mm
+        image = burst.image(where, self.nodes_nm, shape, pitch_mm)
+        beyond = burst.beyond_mm2(where, self.nodes_nm, shape, pitch_mm)
+        # diffraction scales with the light that passes the stop, and cannot exceed it
+        diffracted = (_flux_mm2(image, pitch_mm) + beyond) / self.pupil_mm2
+        gain = self.lit * self.passed * self.beam_fraction / np.maximum(diffracted, 1)
+        image *= gain[:, None, None].astype(np.float32)
+        return image, beyond * gain
+
+    def glare(self, cleanliness: Cleanliness) -> tuple[F32, F64]:
+        """Return what the surfaces scatter."""
+        scattering = veiling_glare(
+            self.lens, sun_deg=self.sun.angle_deg, wavelength_nm=self.nodes_nm, cleanliness=cleanliness
+        )
+        where = self.sun.xy_mm(self._efl_mm)
+        # each surface scatters only the light that the others have left (`kept_of_single`)
+        gain = self.lit * self.passed / self.own * scattering.kept_of_single
+        image = scattering.image(where, self.sensor.shape, self.sensor.pitch_mm)
+        image *= gain[:, None, None].astype(np.float32) * self._cos4
+        return image, scattering.beyond_mm2(where, self.sensor.shape, self.sensor.pitch_mm) * gain
+
+    def veil(self, veil_fraction: float) -> tuple[F32, F64]:
+        """Return what mount, barrel and edges scatter."""
+        entering = self.lit * self.passed * self.pupil_mm2 * veil_fraction
+        per_mm2 = self._cos4 * np.float32(1 / (np.pi * self._efl_mm**2))
+        image = np.asarray(entering[:, None, None].astype(np.float32) * per_mm2)
+        return image, entering * (1 - float(per_mm2.sum(dtype=np.float64)) * self.sensor.pitch_mm**2)
 
 
 def scene_veil_fraction(
@@ -236,14 +226,7 @@ def scene_veil_fraction(
 
     Surfaces scatter the first part of it; mount, barrel and edges scatter `veil_fraction` of the rest.
     """
-    scattered = scattered_fraction(
-        lens,
-        wavelength_nm,
-        roughness_nm=cleanliness.roughness_nm,
-        cleanliness_level=cleanliness.level,
-        L=cleanliness.knee,
-        S=cleanliness.slope,
-    )
+    scattered = scattered_fraction(lens, wavelength_nm, cleanliness=cleanliness)
     return np.asarray(1 - (1 - scattered) * (1 - veil_fraction))
 
 

@@ -1,0 +1,279 @@
+"""Advance rays from surface to surface on the device: where they meet it, how they go on, and how near its rim.
+
+All values are drjit arrays with one lane for each ray, in single precision. Positions are relative to the vertex
+that a ray has just met.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+
+from ..prescription import Surface
+
+_LOST, _FAR = -1e6, -1e4  # margin of lost rays, and the smallest margin of others
+_BEYOND_EDGE = -1.0  # margin at which a soft edge ends in the dark
+_LIMIT_SHARPNESS = 100.0  # of the edge where a missed surface or total reflection, not a rim, ends the light
+_LEAST_SLOPE = 1e-3  # smallest |dz| of a lost ray
+
+
+@lru_cache(maxsize=1)
+def backend() -> Any:
+    """Return drjit and its array types, on a usable LLVM."""
+    from ...core import llvm
+
+    llvm.prepare()
+    import drjit
+    import drjit.llvm as types
+
+    return SimpleNamespace(
+        dr=drjit,
+        Float=types.Float,
+        UInt32=types.UInt,
+        Int32=types.Int,
+        UInt64=types.UInt64,
+        Int64=types.Int64,
+        Double=types.Float64,
+    )
+
+
+@dataclass(eq=False)
+class Step:
+    """Hold the data of one step: the next surface of a path, as plain numbers or fetched for every lane.
+
+    Attributes
+    ----------
+    gap
+        Distance of the last vertex behind this one.
+    curvature, conic, aspheric
+        Shape of the surface; `conic` is 1 + the conic constant.
+    eta
+        Index before the surface over the index behind it.
+    per_rim, sharpness
+        One over the radius of the rim, and over the width of its soft edge in radii.
+    mirror, stop
+        Whether the ray is reflected, and whether the surface is the stop.
+    onward
+        Sign of dz before the surface, where it is known.
+    absorption
+        Absorption coefficient per mm before the surface; None where no medium absorbs.
+    passed
+        Function of the cosine of incidence that returns the reflected or transmitted fraction.
+    """
+
+    gap: Any
+    curvature: Any
+    eta: Any
+    per_rim: Any
+    sharpness: Any
+    mirror: Any
+    onward: Any
+    stop: Any
+    conic: Any
+    aspheric: list[Any]
+    absorption: Any
+    passed: Callable[[Any], Any]
+
+
+@dataclass(eq=False)
+class _Hit:
+    """Hold where rays meet a surface: position, unit normal (None on a sphere), and `length` of the way to it.
+
+    `cosine` is that of the angle of incidence, `facing` turns the normal towards the incoming ray, and `under` is
+    negative for rays that miss the surface.
+    """
+
+    x: Any
+    y: Any
+    z: Any
+    length: Any
+    cosine: Any
+    facing: Any
+    under: Any
+    normal: tuple[Any, Any, Any] | None = None
+
+
+@dataclass(frozen=True)
+class StopBlades:
+    """Describe the shape of a stop with blades; `turn_rad` is the direction of its first corner from +x."""
+
+    rim: Surface
+    turn_rad: float
+
+    def relative_radius(self, x: Any, y: Any) -> Any:
+        """Return the distance from the axis over that of the stop's rim in its direction (`Surface.rim_mm`)."""
+        be, rim = backend(), self.rim
+        dr = be.dr
+        half = float(np.pi / rim.blades)
+        angle = (dr.atan2(y, x) - dr.opaque(be.Float, self.turn_rad)) * (0.5 / half)
+        beside = (angle - dr.floor(angle)) * (2 * half) - half
+        edge = float(np.cos(half)) / dr.cos(beside)
+        return dr.sqrt(x * x + y * y) / (rim.semi_diameter_mm * (edge + (1 - edge) * rim.blade_rounding))
+
+
+def meet(
+    at: Step, ray: Sequence[Any], *, soft: bool, special: bool, blades: StopBlades | None, light: bool = True
+) -> tuple[Any, ...]:
+    """Advance rays to the next surface of their path, and refract or reflect them there.
+
+    A ray is position, direction, fraction and rims. The rims are the square of the largest relative radius so far
+    and, where edges are soft, the margin. Those of the mirrored ray follow if they differ.
+
+    Parameters
+    ----------
+    soft
+        Whether rims have soft edges.
+    special
+        Whether any surface is a conic or an asphere.
+    blades
+        Shape of the stop; None where it is round.
+    light
+        Whether the transmitted fraction is computed.
+    """
+    dr = backend().dr
+    *_, dx, dy, dz, fraction = ray[:7]
+    c, eta, mirror = at.curvature, at.eta, at.mirror
+    sense = dr.copysign(1, dz) if at.onward is None else at.onward
+
+    def real(square: Any) -> Any:
+        """Return the root of a square that is negative for lost rays."""
+        # with soft edges a lost ray continues along the limit; otherwise it is nan from here on
+        return dr.sqrt(dr.maximum(square, 0) if soft else square)
+
+    hit = (_on_conic if special else _on_sphere)(at, ray, sense, real)
+    if light and at.absorption is not None:
+        fraction = fraction * dr.exp(-at.absorption * dr.abs(hit.length))
+    # square of the cosine of refraction; negative for total reflection
+    left = dr.fma(eta * eta, hit.cosine * hit.cosine, 1 - eta * eta)
+    out_cosine = real(left)
+    if light:
+        passed = at.passed(dr.clip(dr.select(eta > 1, out_cosine, hit.cosine), 0, 1))
+        fraction = fraction * dr.select((left < 0) & mirror, 1, passed)
+    turn = hit.facing * dr.select(mirror, 2 * hit.cosine, dr.fma(eta, hit.cosine, -out_cosine))
+    keep = dr.select(mirror, 1, eta)
+    onward = dr.select(mirror, -sense, sense)
+    if hit.normal is not None:
+        nx, ny, nz = hit.normal
+        dx, dy, dz = dr.fma(turn, nx, keep * dx), dr.fma(turn, ny, keep * dy), dr.fma(turn, nz, keep * dz)
+    else:
+        bend = turn * c
+        dx, dy, dz = dr.fma(bend, hit.x, keep * dx), dr.fma(bend, hit.y, keep * dy), dr.fma(keep, dz, -turn)
+        dz = dr.fma(bend, hit.z, dz)
+    # a ray is also lost where it misses a surface, is totally reflected or turns back; with soft edges it
+    # continues along the limit, so that the limit can be located between rays
+    room = ahead = dz * onward
+    if soft:
+        room = dr.minimum(dr.minimum(hit.under, dr.select(mirror, 1, left)), 4 * ahead)
+        dz = onward * dr.maximum(ahead, _LEAST_SLOPE)
+    return hit.x, hit.y, hit.z, dx, dy, dz, fraction, *_rims_after(at, soft, hit, room, ray[7:], blades)
+
+
+def _on_sphere(at: Step, ray: Sequence[Any], sense: Any, real: Callable[[Any], Any]) -> _Hit:
+    """Return where rays meet a sphere, on which the normal has length 1 and the root is the cosine of incidence."""
+    dr = backend().dr
+    x, y, z, dx, dy, dz = ray[:6]
+    c = at.curvature
+    z = z + at.gap
+    b = dr.fma(-c, dr.fma(x, dx, dr.fma(y, dy, z * dz)), dz)
+    e = dr.fma(c, dr.fma(x, x, dr.fma(y, y, z * z)), -2 * z)
+    under = dr.fma(b, b, -c * e)
+    cosine = real(under)
+    length = e / dr.fma(sense, cosine, b)
+    x, y, z = dr.fma(length, dx, x), dr.fma(length, dy, y), dr.fma(length, dz, z)
+    return _Hit(x, y, z, length, cosine, sense, under)
+
+
+def _on_conic(at: Step, ray: Sequence[Any], sense: Any, real: Callable[[Any], Any]) -> _Hit:
+    """Return where rays meet a conic or an asphere: first the plane of the vertex, then the surface."""
+    dr = backend().dr
+    x, y, z, dx, dy, dz = ray[:6]
+    c = at.curvature
+    z = z + at.gap
+    to_plane = -z / dz
+    x, y = dr.fma(to_plane, dx, x), dr.fma(to_plane, dy, y)
+    a = c * (dx * dx + dy * dy + at.conic * dz * dz)
+    b = c * (x * dx + y * dy) - dz
+    e = c * (x * x + y * y)
+    under = b * b - a * e
+    t_hit = e / (sense * real(under) - b)
+    x, y, z = dr.fma(t_hit, dx, x), dr.fma(t_hit, dy, y), t_hit * dz
+    length = t_hit + to_plane
+    nx, ny, nz = c * x, c * y, c * at.conic * z - 1
+    if at.aspheric:
+        x, y, z, nx, ny, nz, more = _to_asphere(at, x, y, z, dx, dy, dz)
+        length = length + more
+    norm = dr.rsqrt(nx * nx + ny * ny + nz * nz)
+    along_normal = (nx * dx + ny * dy + nz * dz) * norm
+    # turn the normal towards the incoming ray
+    facing = dr.select(along_normal > 0, -norm, norm)
+    cosine = dr.minimum(dr.abs(along_normal), 1)
+    return _Hit(x, y, z, length, cosine, facing, under, (nx, ny, nz))
+
+
+def _to_asphere(at: Step, x: Any, y: Any, z: Any, dx: Any, dy: Any, dz: Any) -> tuple[Any, ...]:
+    """Move rays from a conic to the asphere near it by Newton's method; return position, normal and length."""
+    be = backend()
+    dr = be.dr
+    c, conic, terms = at.curvature, at.conic, at.aspheric
+    length = 0 * x
+    for k in range(5):
+        r2 = x * x + y * y
+        root = dr.sqrt(dr.maximum(1 - conic * c * c * r2, 1e-6))
+        sag, slope, power = c * r2 / (1 + root), c / root, r2
+        for n, term in enumerate(terms):
+            slope = slope + (2 * n + 4) * term * power
+            sag = sag + term * power * r2
+            power = power * r2
+        nx, ny = slope * x, slope * y
+        if k == 4:
+            return x, y, z, nx, ny, 0 * x - 1, length
+        step = (z - sag) / (nx * dx + ny * dy - dz)
+        x, y, z = dr.fma(step, dx, x), dr.fma(step, dy, y), dr.fma(step, dz, z)
+        length = length + step
+    raise AssertionError("unreachable")
+
+
+def _rims_after(
+    at: Step, soft: bool, hit: _Hit, room: Any, rims: Sequence[Any], blades: StopBlades | None
+) -> list[Any]:
+    """Return the rims of the rays after a surface; `room` is negative for rays that are lost there."""
+    dr = backend().dr
+    x, y = hit.x, hit.y
+    sides = 2 if len(rims) > 1 + soft else 1
+    out: list[Any] = []
+    for k in range(sides):
+        radius, *margin = rims[k * len(rims) // sides : (k + 1) * len(rims) // sides]
+        # near a rim 1 - r² is twice 1 - r, hence the 0.5 below
+        beyond = dr.fma(x, x, y * y) * (at.per_rim * at.per_rim)
+        if blades is not None and at.stop is not False:
+            blade = blades.relative_radius(x, -y if k else y)
+            beyond = dr.select(at.stop, blade * blade, beyond)
+        out.append(dr.maximum(radius, dr.select(room < 0, 1e6, beyond)))
+        if soft:
+            here = dr.minimum((1 - beyond) * (0.5 * at.sharpness), room * _LIMIT_SHARPNESS)
+            # after a ray is lost, later surfaces do not tell where the edge lies
+            out.append(dr.select(margin[0] < _BEYOND_EDGE, margin[0], dr.minimum(margin[0], here)))
+    return out
+
+
+def arrived(ray: Sequence[Any], last: Any, soft: bool) -> list[tuple[Any, Any]]:
+    """Return x, y, fraction, radius and, with soft edges, margin on the sensor, as `bundles.Spots` has them.
+
+    Each is a pair: of the rays, and of their mirror images. `last` is the distance of the last vertex behind the
+    sensor.
+    """
+    dr = backend().dr
+    x, y, z, dx, dy, dz, fraction, *rims = ray
+    away = -(z + last) / dz
+    x, y = dr.fma(away, dx, x), dr.fma(away, dy, y)
+    arrives = dr.isfinite(x + y + rims[0]) & (dr.abs(x) + dr.abs(y) < 1e9)
+    x, y, fraction = (dr.select(arrives, v, 0) for v in (x, y, fraction))
+    radius = [dr.select(arrives, dr.sqrt(r), -_LOST) for r in (rims[::2] if soft else rims)]
+    margin = [dr.select(arrives, dr.maximum(m, _FAR), _LOST) for m in (rims[1::2] if soft else ())]
+    out = [(x, x), (y, -y), (fraction, fraction), (radius[0], radius[-1])]
+    return [*out, (margin[0], margin[-1])] if soft else out
