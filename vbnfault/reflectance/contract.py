@@ -244,7 +244,7 @@ def _refused(key: str, value: Any, sentence: str) -> ValidationError:
     return ValidationError.from_exception_data("table", [{"type": reason, "loc": (key,), "input": value}])
 
 
-class _FromRegistry:
+class _ReflectanceTable:
     """Give pydantic the validation and the JSON Schema of a field that holds any registered reflectance."""
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
@@ -257,4 +257,4 @@ class _FromRegistry:
 
 
 # The type of a field of a pydantic model that holds any registered reflectance.
-AnyReflectance = Annotated[Reflectance, _FromRegistry()]
+AnyReflectance = Annotated[Reflectance, _ReflectanceTable()]

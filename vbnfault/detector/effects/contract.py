@@ -218,7 +218,7 @@ def _reason(detail: Any) -> Any:
     return detail["type"]
 
 
-class _FromRegistry:
+class _EffectTables:
     """Give pydantic the validation and the JSON Schema of a field that holds effects by their names."""
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
@@ -237,4 +237,4 @@ class _FromRegistry:
 
 
 # The type of a field of a model that holds the effects of a sensor by their names.
-Effects = Annotated[tuple[Effect, ...], _FromRegistry()]
+Effects = Annotated[tuple[Effect, ...], _EffectTables()]

@@ -27,7 +27,7 @@ class Analogue(Effect):
         return analogue_dn(signal, exposure.sensor.readout, noise, _with_offsets(exposure))
 
 
-class Converter(Effect):
+class Conversion(Effect):
     """Convert the level to a code: rounding, clipping, uneven and missing codes, stuck bits."""
 
     name = "converter"
@@ -58,7 +58,7 @@ class RawStep(FaultStep):
 
 
 def analogue_and_converter(signal: F32, exposure: Exposure) -> Raw:
-    """Return what `Analogue` and `Converter` give one after the other, in one pass over blocks of rows."""
+    """Return what `Analogue` and `Conversion` give one after the other, in one pass over blocks of rows."""
     noise = None if exposure.noise is None else exposure.noise.readout
     return read_out(signal, exposure.sensor.readout, noise, _with_offsets(exposure))
 
