@@ -74,14 +74,14 @@ def candidates() -> Iterator[Candidate]:
 
 def find() -> Candidate:
     """Return the first usable library. Raises VbnfaultError, which lists the unusable ones and their problems."""
-    looked_at = []
+    candidates_seen = []
     for candidate in candidates():
         if candidate.usable:
             return candidate
-        looked_at.append(f"{candidate.path} ({candidate.problem})")
-    found = "; ".join(looked_at) if looked_at else "none found"
+        candidates_seen.append(f"{candidate.path} ({candidate.problem})")
+    seen = "; ".join(candidates_seen) if candidates_seen else "none found"
     raise VbnfaultError(
-        f"no usable LLVM: rendering needs libLLVM {OLDEST_USABLE} or newer, {found}; install one with "
+        f"no usable LLVM: rendering needs libLLVM {OLDEST_USABLE} or newer, {seen}; install one with "
         f"'pip install {_WHEEL}' (Linux x86-64) or your system's package, or set {VARIABLE} to its path"
     )
 
@@ -89,9 +89,9 @@ def find() -> Candidate:
 @functools.lru_cache(maxsize=1)
 def prepare() -> Candidate:
     """Point drjit to a usable library. Call this before drjit or mitsuba is imported. Raises VbnfaultError."""
-    found = find()
-    os.environ[VARIABLE] = str(found.path)
-    return found
+    library = find()
+    os.environ[VARIABLE] = str(library.path)
+    return library
 
 
 def _paths() -> Iterator[tuple[str, Path]]:
@@ -160,13 +160,13 @@ def _is_cut_short(path: Path) -> bool:
         order: Literal["little", "big"] = "little" if header[5] == 1 else "big"
         table, entry, count = (int.from_bytes(header[a:b], order) for a, b in ((32, 40), (54, 56), (56, 58)))
         file.seek(table)
-        rows = file.read(entry * count)
+        entries = file.read(entry * count)
     size = path.stat().st_size
-    if len(rows) < entry * count:
+    if len(entries) < entry * count:
         return True
     ends = (
         int.from_bytes(row[8:16], order) + int.from_bytes(row[32:40], order)
-        for row in (rows[k * entry : (k + 1) * entry] for k in range(count))
+        for row in (entries[k * entry : (k + 1) * entry] for k in range(count))
     )
     return any(end > size for end in ends)
 

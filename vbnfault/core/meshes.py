@@ -95,19 +95,19 @@ def read_obj(data: bytes, source: str, *, name: str = "") -> list[MeshPart]:
         offset = next(match.start() for k, match in enumerate(pattern.finditer(text)) if k == row)
         return data.count(b"\n", 0, offset) + 1
 
-    def error(pattern: re.Pattern[bytes], row: int, expected: str, found: object) -> InputError:
-        return InputError(f"{source}: line {line(pattern, row)}: expected {expected}, found {found}.")
+    def error(pattern: re.Pattern[bytes], row: int, expected: str, given: object) -> InputError:
+        return InputError(f"{source}: line {line(pattern, row)}: expected {expected}, found {given}.")
 
-    rows = _VERTEX.findall(text)
-    values, ends = _values(rows)
+    vertex_lines = _VERTEX.findall(text)
+    values, ends = _values(vertex_lines)
     width = np.diff(ends, prepend=-1) - 1
-    sound = len(ends) == len(rows) and bool(np.isin(width, _VERTEX_WIDTHS).all())
+    sound = len(ends) == len(vertex_lines) and bool(np.isin(width, _VERTEX_WIDTHS).all())
     first = ends - width
-    vertices = values[first[:, None] + np.arange(3)] if sound and len(rows) else np.empty((0, 3))
-    if rows and not (sound and np.isfinite(vertices).all()):
-        for k, row in enumerate(rows):
-            one, end = _values([row])
-            if len(end) != 1 or end[0] not in _VERTEX_WIDTHS or not np.isfinite(one[:3]).all():
+    vertices = values[first[:, None] + np.arange(3)] if sound and len(vertex_lines) else np.empty((0, 3))
+    if vertex_lines and not (sound and np.isfinite(vertices).all()):
+        for k, row in enumerate(vertex_lines):
+            numbers, end = _values([row])
+            if len(end) != 1 or end[0] not in _VERTEX_WIDTHS or not np.isfinite(numbers[:3]).all():
                 what = row.decode("utf-8", "replace").strip()
                 raise error(_VERTEX, k, "'v x y z', finite numbers", shown(what))
 
@@ -115,22 +115,24 @@ def read_obj(data: bytes, source: str, *, name: str = "") -> list[MeshPart]:
     faces: dict[tuple[str, str], list[int]] = {}  # index of each face in the file
     count = 0
     for key, piece in _stretches(text, name):
-        found = _FACE.findall(piece)
-        if found:
-            stretches.setdefault(key, []).extend(found)
-            faces.setdefault(key, []).extend(range(count, count + len(found)))
-            count += len(found)
+        face_lines = _FACE.findall(piece)
+        if face_lines:
+            stretches.setdefault(key, []).extend(face_lines)
+            faces.setdefault(key, []).extend(range(count, count + len(face_lines)))
+            count += len(face_lines)
     if len(stretches) > MAX_PARTS:
         raise InputError(f"{source}: has {len(stretches)} objects and groups; at most {MAX_PARTS} are read.")
     before: I64 | None = None
     parts = []
     triangles_n = 0
-    for key, found in stretches.items():
+    for key, face_lines in stretches.items():
         number = np.array(faces[key])
-        corners, corner_ends = _values([_TEXTURE_AND_NORMAL.sub(b"", row) if b"/" in row else row for row in found])
+        corners, corner_ends = _values(
+            [_TEXTURE_AND_NORMAL.sub(b"", row) if b"/" in row else row for row in face_lines]
+        )
         lengths = np.diff(corner_ends, prepend=-1) - 1
-        if len(corner_ends) != len(found) or (lengths < 3).any() or (corners % 1 > 0).any():
-            for k, row in enumerate(found):
+        if len(corner_ends) != len(face_lines) or (lengths < 3).any() or (corners % 1 > 0).any():
+            for k, row in enumerate(face_lines):
                 tokens = row.split()
                 if len(tokens) < 3 or not all(map(_CORNER.fullmatch, tokens)):
                     what = shown(row.decode("utf-8", "replace").strip())
@@ -142,11 +144,11 @@ def read_obj(data: bytes, source: str, *, name: str = "") -> list[MeshPart]:
                 above = np.array([match.start() for match in _VERTEX.finditer(text)])
                 before = np.searchsorted(above, [match.start() for match in _FACE.finditer(text)])
             index = np.where(index < 0, before[face] + index + 1, index)
-        outside = ~((index >= 1) & (index <= len(rows)))
+        outside = ~((index >= 1) & (index <= len(vertex_lines)))
         if outside.any():
             k = int(np.argmax(outside))
             what = f"{np.delete(corners, corner_ends)[k]:g}"
-            raise error(_FACE, int(face[k]), f"vertex numbers from 1 to {len(rows)}", what)
+            raise error(_FACE, int(face[k]), f"vertex numbers from 1 to {len(vertex_lines)}", what)
         triangles = _fans(index.astype(np.int64) - 1, lengths)
         triangles_n += len(triangles)
         if triangles_n > MAX_FACES:
@@ -162,32 +164,32 @@ def read_obj(data: bytes, source: str, *, name: str = "") -> list[MeshPart]:
 
 def _stretches(text: bytes, name: str) -> Iterator[tuple[tuple[str, str], bytes]]:
     """Yield (name, material) and the text of each stretch of an OBJ between two naming statements."""
-    now = {b"o": "", b"g": "", b"usemtl": ""}
+    current = {b"o": "", b"g": "", b"usemtl": ""}
     start = 0
 
     def key() -> tuple[str, str]:
-        return "/".join(piece for piece in (now[b"o"], now[b"g"]) if piece) or name, now[b"usemtl"]
+        return "/".join(piece for piece in (current[b"o"], current[b"g"]) if piece) or name, current[b"usemtl"]
 
     for match in _DIRECTIVE.finditer(text):
         yield key(), text[start : match.start()]
         start = match.end()
-        now[match[1]] = match[2].decode("utf-8", "replace").strip()
+        current[match[1]] = match[2].decode("utf-8", "replace").strip()
         if match[1] == b"o":
-            now[b"g"] = ""
+            current[b"g"] = ""
     yield key(), text[start:]
 
 
-def _values(rows: list[bytes]) -> tuple[F64, I64]:
+def _values(lines: list[bytes]) -> tuple[F64, I64]:
     """Return all numbers of text rows, float64[n], with a NaN after each row, and the indices of these NaNs.
 
     Both are empty where the text holds anything but numbers. A "nan" in the text shows as an additional index.
     """
-    if not rows:
+    if not lines:
         return np.empty(0), np.empty(0, dtype=np.int64)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error")  # some versions of numpy warn here, others raise
-            values = np.fromstring(b" nan\n".join([*rows, b""]), dtype=np.float64, sep=" ")  # type: ignore[call-overload]
+            values = np.fromstring(b" nan\n".join([*lines, b""]), dtype=np.float64, sep=" ")  # type: ignore[call-overload]
     except (ValueError, DeprecationWarning):
         return np.empty(0), np.empty(0, dtype=np.int64)
     return values, np.flatnonzero(np.isnan(values))
@@ -296,14 +298,14 @@ class _Gltf:
 
     def item(self, kind: str, index: Any, where: str) -> Mapping[str, Any]:
         """Return table `index` of the list `kind`; `where` is the key that refers to it."""
-        rows = self.table.get(kind, [])
-        if not isinstance(rows, list):
-            raise self.error(kind, rows, "a list")
-        if type(index) is not int or not 0 <= index < len(rows):
-            raise self.error(where, index, f"a number of {kind}, from 0 to {len(rows) - 1}")
-        if not isinstance(rows[index], dict):
-            raise self.error(f"{kind}[{index}]", rows[index], "a table")
-        return rows[index]
+        items = self.table.get(kind, [])
+        if not isinstance(items, list):
+            raise self.error(kind, items, "a list")
+        if type(index) is not int or not 0 <= index < len(items):
+            raise self.error(where, index, f"a number of {kind}, from 0 to {len(items) - 1}")
+        if not isinstance(items[index], dict):
+            raise self.error(f"{kind}[{index}]", items[index], "a table")
+        return items[index]
 
     def whole(self, table: Mapping[str, Any], key: str, where: str, high: int, default: int | None = None) -> int:
         """Return the whole number of a key, from 0 to `high`."""
@@ -324,8 +326,8 @@ class _Gltf:
         """Yield path, mesh index and V_from_node float64[4, 4] of each node with a mesh; V has the scene's axes."""
         nodes = self.table.get("nodes", [])
         if not isinstance(nodes, list) or len(nodes) > MAX_NODES:
-            found = f"{len(nodes)} nodes" if isinstance(nodes, list) else nodes
-            raise self.error("nodes", found, f"a list of at most {MAX_NODES}")
+            given = f"{len(nodes)} nodes" if isinstance(nodes, list) else nodes
+            raise self.error("nodes", given, f"a list of at most {MAX_NODES}")
         if self.table.get("scenes"):
             roots = self.item("scenes", self.table.get("scene", 0), "scene").get("nodes", [])
         else:
@@ -383,7 +385,7 @@ class _Gltf:
         table = self.item("meshes", mesh, "mesh")
         if mesh in self.meshes:
             return self.meshes[mesh]
-        found = []
+        parts = []
         for k, primitive in enumerate(_list(table.get("primitives"))):
             where = f"meshes[{mesh}].primitives[{k}]"
             if not isinstance(primitive, dict):
@@ -403,42 +405,42 @@ class _Gltf:
             if "material" in primitive:
                 material = str(self.item("materials", primitive["material"], f"{where}.material").get("name") or "")
             faces = _triangles(index, mode)
-            found.append((np.asarray(vertices, dtype=np.float64), faces, material[:_LONGEST_NAME]))
-        self.meshes[mesh] = found
-        return found
+            parts.append((np.asarray(vertices, dtype=np.float64), faces, material[:_LONGEST_NAME]))
+        self.meshes[mesh] = parts
+        return parts
 
     def accessor(self, index: Any, kind: str, where: str) -> NDArray[Any]:
         """Return the numbers of an accessor, [count, 1] for SCALAR or [count, 3] for VEC3."""
         table = self.item("accessors", index, where)
-        at = f"accessors[{index}]"
+        key = f"accessors[{index}]"
         width = {"SCALAR": 1, "VEC3": 3}[kind]
         component = table.get("componentType")
         if table.get("type") != kind:
-            raise self.error(f"{at}.type", table.get("type"), kind)
+            raise self.error(f"{key}.type", table.get("type"), kind)
         if type(component) is not int or component not in _COMPONENTS:
-            raise self.error(f"{at}.componentType", component, f"one of {', '.join(map(str, _COMPONENTS))}")
+            raise self.error(f"{key}.componentType", component, f"one of {', '.join(map(str, _COMPONENTS))}")
         dtype = np.dtype(_COMPONENTS[component])
-        count = self.whole(table, "count", at, 3 * MAX_FACES)
+        count = self.whole(table, "count", key, 3 * MAX_FACES)
         if "bufferView" in table:
-            values = self.view(table, at, dtype, count, width)
+            values = self.view(table, key, dtype, count, width)
         elif "sparse" in table:
             values = np.zeros((count, width), dtype=dtype)
         else:
-            raise self.error(f"{at}.bufferView", None, "given")
+            raise self.error(f"{key}.bufferView", None, "given")
         sparse = table.get("sparse")
         if isinstance(sparse, dict):
             values = values.copy()
-            n = self.whole(sparse, "count", f"{at}.sparse", count)
-            places, changes = sparse.get("indices"), sparse.get("values")
-            if not (isinstance(places, dict) and isinstance(changes, dict)):
-                raise self.error(f"{at}.sparse", sparse, "a table with indices and values")
-            kind_of_place = places.get("componentType")
-            if kind_of_place not in (5121, 5123, 5125):
-                raise self.error(f"{at}.sparse.indices.componentType", kind_of_place, "5121, 5123 or 5125")
-            rows = self.view(places, f"{at}.sparse.indices", np.dtype(_COMPONENTS[kind_of_place]), n, 1)[:, 0]
-            if n and rows.max() >= count:
-                raise self.error(f"{at}.sparse.indices", int(rows.max()), f"from 0 to {count - 1}")
-            values[rows.astype(np.int64)] = self.view(changes, f"{at}.sparse.values", dtype, n, width)
+            n = self.whole(sparse, "count", f"{key}.sparse", count)
+            indices, replacements = sparse.get("indices"), sparse.get("values")
+            if not (isinstance(indices, dict) and isinstance(replacements, dict)):
+                raise self.error(f"{key}.sparse", sparse, "a table with indices and values")
+            index_type = indices.get("componentType")
+            if index_type not in (5121, 5123, 5125):
+                raise self.error(f"{key}.sparse.indices.componentType", index_type, "5121, 5123 or 5125")
+            changed = self.view(indices, f"{key}.sparse.indices", np.dtype(_COMPONENTS[index_type]), n, 1)[:, 0]
+            if n and changed.max() >= count:
+                raise self.error(f"{key}.sparse.indices", int(changed.max()), f"from 0 to {count - 1}")
+            values[changed.astype(np.int64)] = self.view(replacements, f"{key}.sparse.values", dtype, n, width)
         if table.get("normalized") is True and dtype.kind != "f":
             return np.maximum(values / float(np.iinfo(dtype).max), -1.0)
         return values
@@ -447,16 +449,16 @@ class _Gltf:
         """Return the numbers [count, width] of the buffer view that a table names."""
         number = table.get("bufferView")
         view = self.item("bufferViews", number, f"{where}.bufferView")
-        at = f"bufferViews[{number}]"
-        buffer = self.buffer(view.get("buffer"), f"{at}.buffer")
-        start = self.whole(view, "byteOffset", at, len(buffer), 0)
-        length = self.whole(view, "byteLength", at, len(buffer) - start)
+        key = f"bufferViews[{number}]"
+        buffer = self.buffer(view.get("buffer"), f"{key}.buffer")
+        start = self.whole(view, "byteOffset", key, len(buffer), 0)
+        length = self.whole(view, "byteLength", key, len(buffer) - start)
         offset = self.whole(table, "byteOffset", where, length, 0)
         element = dtype.itemsize * width
-        stride = self.whole(view, "byteStride", at, 252, element) or element
+        stride = self.whole(view, "byteStride", key, 252, element) or element
         end = offset + stride * (count - 1) + element if count else offset
         if end > length:
-            raise self.error(f"{where}.count", count, f"at most what the {length} bytes of {at} hold")
+            raise self.error(f"{where}.count", count, f"at most what the {length} bytes of {key} hold")
         return np.ndarray((count, width), dtype, buffer, offset=start + offset, strides=(stride, dtype.itemsize))
 
     def buffer(self, index: Any, where: str) -> bytes:
@@ -465,21 +467,21 @@ class _Gltf:
         if index in self.buffers:
             return self.buffers[index]
         uri = table.get("uri")
-        at = f"buffers[{index}].uri"
+        key = f"buffers[{index}].uri"
         if uri is None:
             data = self.binary
         elif not isinstance(uri, str):
-            raise self.error(at, uri, "a text")
+            raise self.error(key, uri, "a text")
         elif uri.startswith("data:"):
             try:
                 data = base64.b64decode(uri.partition(",")[2], validate=True)
             except (binascii.Error, ValueError):
-                raise self.error(at, uri, "base64 after its comma") from None
+                raise self.error(key, uri, "base64 after its comma") from None
         else:
             name = Path(unquote(uri))
             if self.folder is None or name.is_absolute() or ".." in name.parts:
-                raise self.error(at, uri, "a file in the folder of the .gltf")
-            resources.check_path(str(name), f"{self.source}: {at}")
+                raise self.error(key, uri, "a file in the folder of the .gltf")
+            resources.check_path(str(name), f"{self.source}: {key}")
             data = resources.read_input(self.folder / name, "spacecraft")
         self.buffers[index] = data
         return data

@@ -200,16 +200,16 @@ class Contents:
         `status` is given for a large file: its digest is then computed only where the status has changed.
         """
         key = _key(path)
-        now = None if status is None else (status.st_dev, status.st_ino, status.st_size, status.st_mtime_ns)
-        if now is not None and self._status.get(key) == now:
+        status_now = None if status is None else (status.st_dev, status.st_ino, status.st_size, status.st_mtime_ns)
+        if status_now is not None and self._status.get(key) == status_now:
             return
-        found = digest()
+        digest_now = digest()
         if key not in self._sha256 and self._complete and not key.startswith(_OWN):
             raise _changed(f"{path}: {what} file was not there, or not used, when the build began", path, what)
-        if self._sha256.setdefault(key, found) != found:
+        if self._sha256.setdefault(key, digest_now) != digest_now:
             raise _changed(f"{path}: {what} file has changed since the build began", path, what)
-        if now is not None:
-            self._status[key] = now
+        if status_now is not None:
+            self._status[key] = status_now
 
 
 _in_use: ContextVar[Contents | None] = ContextVar("contents", default=None)
@@ -408,8 +408,10 @@ def check_plain(table: Mapping[str, Any], source: str) -> None:
                 if isinstance(value, Mapping | list | tuple):
                     below.append((f"{where}{_shown_key(key)}.", value))
                 elif isinstance(value, int) and not -(2**63) <= value < 2**64:
-                    at = f"{where}{_shown_key(key)}"
-                    raise InputError(f"{source}: {at} = {shown(value)}: must be a whole number of at most 64 bits")
+                    path = f"{where}{_shown_key(key)}"
+                    raise InputError(
+                        f"{source}: {path} = {shown(value)}: must be a whole number of at most 64 bits"
+                    )
         level = below
         if not level:
             return

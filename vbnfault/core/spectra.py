@@ -130,9 +130,9 @@ def limb_darkening(wavelength_nm: F64) -> F64:
     """
     nodes, a = _LIMB_NM_AND_A[:, 0], _LIMB_NM_AND_A[:, 1:]
     a = a / a.sum(axis=1, keepdims=True)  # the sums of the table are 1 to five digits only
-    at = np.column_stack([np.interp(wavelength_nm, nodes, column) for column in a.T])
-    mean = at @ (2 / (np.arange(6) + 2))  # μᵏ has the mean 2 / (k + 2) over the disc
-    return np.asarray(at / mean[:, None])
+    coefficients = np.column_stack([np.interp(wavelength_nm, nodes, column) for column in a.T])
+    mean = coefficients @ (2 / (np.arange(6) + 2))  # μᵏ has the mean 2 / (k + 2) over the disc
+    return np.asarray(coefficients / mean[:, None])
 
 
 def reflectance(spec: str | float | Mapping[str, tuple[float, ...]], wavelength_nm: F64) -> F64:

@@ -464,8 +464,8 @@ def _dsk(spiceypy: Any, path: str) -> tuple[F64, NDArray[np.int64]]:
     room = os.path.getsize(path)
     handle = spiceypy.dasopr(path)
     with spiceypy.no_found_check():
-        segment, found = spiceypy.dlabfs(handle)
-        while found:
+        segment, exists = spiceypy.dlabfs(handle)
+        while exists:
             segments += 1
             if segments > _DSK_MOST_SEGMENTS:
                 raise InputError(f"has more than {_DSK_MOST_SEGMENTS} segments")
@@ -482,7 +482,7 @@ def _dsk(spiceypy: Any, path: str) -> tuple[F64, NDArray[np.int64]]:
                 faces.append(plates - 1 + base)
                 base += vertices_n
                 surfaces.add((about.center, about.surfce))
-            segment, found = spiceypy.dlafns(handle, segment)
+            segment, exists = spiceypy.dlafns(handle, segment)
     if not faces:
         raise InputError("expected a DSK segment of type 2 (triangular plates), found none")
     if len(surfaces) > 1:

@@ -107,8 +107,8 @@ def bounds_px(disc: SunInView, projection: Projection) -> F64 | None:
     rim = np.column_stack([s * np.cos(turn), s * np.sin(turn), np.full(_RIM, c)]) @ axes(disc.direction_C)
     if (rim[:, 2] < _LEAST_Z).any():
         return None
-    at = projection.pixel_of(rim[:, :2] / rim[:, 2:])
-    low, high = at.min(axis=0), at.max(axis=0)
+    rim_px = projection.pixel_of(rim[:, :2] / rim[:, 2:])
+    low, high = rim_px.min(axis=0), rim_px.max(axis=0)
     more = 0.01 * (high - low)
     return np.stack([low - more, high + more])
 
@@ -158,8 +158,8 @@ def pixel_sums(
     if (high <= low).any():
         return None
     for shift in shifts:
-        found = _sums(disc, projection, bounds, shift, (low, high), profiles, gain)
-        total = found if total is None else total + found
+        sums = _sums(disc, projection, bounds, shift, (low, high), profiles, gain)
+        total = sums if total is None else total + sums
     assert total is not None
     if not total.any():
         return None
@@ -174,14 +174,14 @@ def add_mean(
     The mean radiance of a pixel is its power over the projected solid angle of a pixel at its centre.
     """
     shape = (int(radiance.shape[1]), int(radiance.shape[2]))
-    found = pixel_sums(disc, projection, shape, disc.profiles(bands))
-    if found is None:
+    sums = pixel_sums(disc, projection, shape, disc.profiles(bands))
+    if sums is None:
         return None
-    y, x = (np.arange(s.start, s.stop) + 0.5 for s in (found.rows, found.columns))
+    y, x = (np.arange(s.start, s.stop) + 0.5 for s in (sums.rows, sums.columns))
     solid = projection.solid_angle_sr(projection.slopes_at(x, y))
-    light = found.values * (disc.radiance_W_m2_sr_nm[list(bands)][:, None, None] / solid)
-    radiance[:, found.rows, found.columns] += light.astype(np.float32)
-    return found.rows, found.columns
+    light = sums.values * (disc.radiance_W_m2_sr_nm[list(bands)][:, None, None] / solid)
+    radiance[:, sums.rows, sums.columns] += light.astype(np.float32)
+    return sums.rows, sums.columns
 
 
 def sunflower(count: int) -> F64:
@@ -230,8 +230,10 @@ def _sums(
     def on_disc(slopes: F64) -> F64:
         """Return positions on the unit disc, float64[y, x, 2]: the disc seen along its own direction."""
         length = np.sqrt(1 + (slopes**2).sum(axis=-1))
-        places = [(slopes[..., 0] * a[0] + slopes[..., 1] * a[1] + a[2]) / (sine * length) for a in (across, down)]
-        return np.stack(places, axis=-1)
+        coordinates = [
+            (slopes[..., 0] * a[0] + slopes[..., 1] * a[1] + a[2]) / (sine * length) for a in (across, down)
+        ]
+        return np.stack(coordinates, axis=-1)
 
     middle, quarter = bounds.mean(axis=0), (bounds[1] - bounds[0]) / 4
     near = on_disc(
@@ -241,35 +243,35 @@ def _sums(
     per_x = (near[:, 1] - near[:, 0]).mean(axis=0) / (2 * quarter[0])
     per_y = (near[1] - near[0]).mean(axis=0) / (2 * quarter[1])
     out = np.zeros((len(profiles), bottom - top, right - left))
-    whole = np.zeros(len(profiles))
+    total = np.zeros(len(profiles))
     starts = np.flatnonzero(np.diff(column, prepend=-2))
     of_frame = column[starts] >= 0
     strips = max(1, _MOST_CELLS // len(x))
     for first in range(0, len(y), strips):
-        rows = slice(first, first + strips)
-        slopes = projection.slopes_at(x, y[rows])
-        place = on_disc(slopes)
-        r = np.maximum(np.hypot(place[..., 0], place[..., 1]), 1e-12)
-        a = np.abs(place @ per_x) / r * dx
-        b = np.abs(place @ per_y) / r * dy[rows, None]
+        strip = slice(first, first + strips)
+        slopes = projection.slopes_at(x, y[strip])
+        position = on_disc(slopes)
+        r = np.maximum(np.hypot(position[..., 0], position[..., 1]), 1e-12)
+        a = np.abs(position @ per_x) / r * dx
+        b = np.abs(position @ per_y) / r * dy[strip, None]
         covered = _covered(1 - r, a, b)
         # mean distance from the rim of the cell's part inside the disc
         depth = np.where(covered < 1, covered * (a + b) / 2, 1 - r)
         mu = np.sqrt(np.clip(1 - (1 - depth) ** 2, 0, 1))
-        weight = covered * projection.solid_angle_sr(slopes) * dx * dy[rows, None]
-        shown = weight * _visible(disc.visible, place)
+        weight = covered * projection.solid_angle_sr(slopes) * dx * dy[strip, None]
+        shown = weight * _visible(disc.visible, position)
         if gain is not None:
             shown = shown * gain(slopes)
-        inside = row[rows] >= 0
+        inside = row[strip] >= 0
         for k, coefficients in enumerate(profiles):
             profile = np.polynomial.polynomial.polyval(mu, coefficients)
-            whole[k] += (weight * profile).sum()
+            total[k] += (weight * profile).sum()
             of_columns = np.add.reduceat((shown * profile)[inside], starts, axis=1)[:, of_frame]
             for_rows = np.zeros((bottom - top, int(of_frame.sum())))
-            np.add.at(for_rows, row[rows][inside], of_columns)
+            np.add.at(for_rows, row[strip][inside], of_columns)
             out[k][:, column[starts][of_frame]] += for_rows
     mean = profiles @ (2 / (np.arange(profiles.shape[1]) + 2))  # of each profile over the disc
-    return np.asarray(out * (np.pi * sine**2 * z[2] * mean / whole)[:, None, None])
+    return np.asarray(out * (np.pi * sine**2 * z[2] * mean / total)[:, None, None])
 
 
 def _covered(depth: F64, a: F64, b: F64) -> F64:
@@ -289,7 +291,7 @@ def _covered(depth: F64, a: F64, b: F64) -> F64:
     return np.where(depth >= s, 1.0, np.clip(area / (2 * a * b), 0, 1))
 
 
-def _visible(table: NDArray[np.float32], place: F64) -> F64 | float:
+def _visible(table: NDArray[np.float32], position: F64) -> F64 | float:
     """Return the visible fraction at positions on the unit disc, float64[...], linear between the cells' centres.
 
     The nearest cell's value would shift a straight edge along the grid by up to half a cell.
@@ -297,12 +299,12 @@ def _visible(table: NDArray[np.float32], place: F64) -> F64 | float:
     if table.min() == table.max():
         return float(table[0, 0])
     n = len(table)
-    values = np.zeros(place.shape[:-1])
-    at = [np.clip((place[..., k] + 1) * (n / 2) - 0.5, 0, n - 1) for k in (0, 1)]
-    first = [np.minimum(v.astype(int), n - 2) for v in at]
-    part = [v - k for v, k in zip(at, first, strict=True)]
+    values = np.zeros(position.shape[:-1])
+    cells = [np.clip((position[..., k] + 1) * (n / 2) - 0.5, 0, n - 1) for k in (0, 1)]
+    first = [np.minimum(v.astype(int), n - 2) for v in cells]
+    fraction = [v - k for v, k in zip(cells, first, strict=True)]
     for down in (0, 1):
         for right in (0, 1):
-            weight = np.abs(1 - right - part[0]) * np.abs(1 - down - part[1])
+            weight = np.abs(1 - right - fraction[0]) * np.abs(1 - down - fraction[1])
             values += weight * table[first[1] + down, first[0] + right]
     return values
