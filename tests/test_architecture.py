@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import re
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -227,6 +228,40 @@ def test_faults_import_no_other_fault() -> None:
         if i.module in files | CONTRACT and i.target.removeprefix("vbnfault.") in files - {i.module}
     ]
     assert not wrong
+
+
+# The only places outside faults/ that know a fault: the default layers, whose names are a contract with all readers
+# of a store, and the figures of flares, which are about straylight alone.
+KNOW_A_FAULT = {"scene.sampling": {"without_straylight"}, "output.flare_images": {"straylight"}}
+
+
+def docstrings(tree: ast.Module) -> set[int]:
+    """Identities of the constants that are docstrings."""
+    bodies = [getattr(node, "body", None) for node in ast.walk(tree)]
+    first = [body[0] for body in bodies if isinstance(body, list) and body]
+    return {id(node.value) for node in first if isinstance(node, ast.Expr)}
+
+
+def test_no_fault_has_a_name_outside_faults() -> None:
+    """What sets a fault apart is said by the attributes of its class, so that a plug-in can say it, too."""
+    from vbnfault.faults import registry
+
+    classes = set(registry())
+    pattern = re.compile(rf"\bfaults\.({'|'.join(classes)})\b")
+    # a class of one word, such as smear, has the name of its physics, which detector and lens name, too
+    names = {name for name in classes if "_" in name} | {"straylight", "vignetting", "cos4", "texture_file"}
+    names |= {f"without_{name}" for name in classes}
+    wrong = [
+        f"vbnfault/{module.replace('.', '/')}.py:{node.lineno} names {node.value!r}"
+        for module, tree in sources().items()
+        if module.split(".")[0] != "faults"
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in docstrings(tree)
+        if (node.value in names or pattern.search(node.value)) and node.value not in KNOW_A_FAULT.get(module, ())
+    ]
+    assert not wrong
+    imported = [i for i in imports() if i.unit != "faults" and i.target.removeprefix("vbnfault.") in fault_files()]
+    assert not imported
 
 
 def test_modules_of_the_store_import_only_those_before_them() -> None:

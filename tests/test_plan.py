@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -18,6 +18,7 @@ from vbnfault.scene import config, keyed_random, plan
 from vbnfault.scene.config import Scene, parse_scene
 
 N = 2000
+STRAYLIGHT = "straylight"  # the class whose samples face the Sun
 FAR = plan.SUN_AVERTED
 NEAR = plan.SUN_FACING
 
@@ -31,8 +32,13 @@ def scene(**tables: dict[str, Any]) -> Scene:
     return parse_scene({"title": "t", "dataset": dataset, **tables}, source="here")
 
 
+def planned(s: Scene, faults: Sequence[str], blocks: Sequence[int] | None = None) -> plan.Plan:
+    """The plan of a scene, in which straylight needs the Sun."""
+    return plan.make_plan(s, faults, blocks, need_sun=(STRAYLIGHT,))
+
+
 def make(**tables: dict[str, Any]) -> plan.Plan:
-    return plan.make_plan(scene(**tables), ALL_FAULTS)
+    return planned(scene(**tables), ALL_FAULTS)
 
 
 @pytest.fixture(scope="module")
@@ -141,7 +147,7 @@ def test_variables_are_independent_of_each_other_and_of_the_faults(paper: plan.P
     near = paper.stratum == NEAR
     for mask in (near, ~near):
         columns = [paper.variables[name][mask] for name in plan.VARIABLES]
-        columns += [paper.injected[mask, k].astype(float) for k, f in enumerate(ALL_FAULTS) if f != plan.STRAYLIGHT]
+        columns += [paper.injected[mask, k].astype(float) for k, f in enumerate(ALL_FAULTS) if f != STRAYLIGHT]
         columns += [paper.architecture[mask], paper.readout_direction[mask]]
         rho = stats.spearmanr(np.column_stack(columns)).statistic
         v = len(plan.VARIABLES)
@@ -194,12 +200,12 @@ def size_bounds(draw: st.DrawFn) -> tuple[int, int]:
 
 @given(st.integers(1, 300), subsets, fractions, st.integers(0, 2**32))
 def test_per_class_gives_every_class_its_exact_share(n: int, faults: tuple[str, ...], p: float, seed: int) -> None:
-    matrix = plan.fault_matrix_per_class(n, faults, p, np.random.default_rng(seed))
+    matrix = plan.fault_matrix_per_class(n, faults, p, np.random.default_rng(seed), need_sun=(STRAYLIGHT,))
     assert matrix.shape == (n, len(faults))
     assert matrix.dtype == bool
     for k, fault in enumerate(faults):
         assert matrix[:, k].sum() == round(p * n)
-        if fault == plan.STRAYLIGHT:  # Gallon et al., equation of the straylight injection
+        if fault == STRAYLIGHT:  # Gallon et al., equation of the straylight injection
             np.testing.assert_array_equal(matrix[:, k], np.arange(n) < round(p * n))
 
 
@@ -207,7 +213,7 @@ def test_per_class_gives_every_class_its_exact_share(n: int, faults: tuple[str, 
 def test_per_sample_gives_exactly_the_faulty_samples(
     n: int, faults: tuple[str, ...], p: float, seed: int, sizes: tuple[int, int]
 ) -> None:
-    matrix = plan.fault_matrix_per_sample(n, faults, p, np.random.default_rng(seed), sizes)
+    matrix = plan.fault_matrix_per_sample(n, faults, p, np.random.default_rng(seed), sizes, (STRAYLIGHT,))
     assert matrix.shape == (n, len(faults))
     assert matrix.dtype == bool
     in_row = matrix.sum(axis=1)
@@ -218,9 +224,22 @@ def test_per_sample_gives_exactly_the_faulty_samples(
     if faults:  # dealt from decks of one card a class
         per_class = matrix.sum(axis=0)
         assert per_class.max() - per_class.min() <= 1
-    if plan.STRAYLIGHT in faults:
-        column = matrix[:, faults.index(plan.STRAYLIGHT)]
+    if STRAYLIGHT in faults:
+        column = matrix[:, faults.index(STRAYLIGHT)]
         np.testing.assert_array_equal(column, np.arange(n) < column.sum())
+
+
+@pytest.mark.parametrize("make_matrix", [plan.fault_matrix_per_class, plan.fault_matrix_per_sample])
+def test_samples_of_every_fault_that_needs_the_sun_come_first(make_matrix: Any) -> None:
+    """A class of a plug-in may need the Sun, too: its draws do not depend on those of straylight."""
+    n, two = 4000, (STRAYLIGHT, "vignetting")
+    matrix = make_matrix(n, ALL_FAULTS, 0.5, np.random.default_rng(3), (1, 6), two)
+    columns = matrix[:, [ALL_FAULTS.index(name) for name in two]]
+    facing = columns.any(axis=1)
+    np.testing.assert_array_equal(facing, np.arange(n) < facing.sum())
+    if make_matrix is plan.fault_matrix_per_class:
+        assert columns.sum(axis=0).tolist() == [n // 2] * 2
+        assert abs(columns.all(axis=1).sum() - n / 4) < 4 * np.sqrt(n / 16)  # hypergeometric: below binomial
 
 
 @pytest.mark.parametrize(("sizes", "classes"), [((1, 6), 6), ((2, 4), 6), ((1, 6), 3), ((3, 3), 5)])
@@ -296,7 +315,7 @@ def test_too_many_sun_facing_samples_are_refused() -> None:
 
 def test_a_scene_without_straylight_never_faces_the_sun() -> None:
     faults = tuple(f for f in ALL_FAULTS if f != "straylight")
-    p = plan.make_plan(scene(), faults)
+    p = planned(scene(), faults)
     np.testing.assert_array_equal(p.stratum, FAR)
     assert not p.injects("straylight").any()
     assert p.injects("vignetting").any()
@@ -329,7 +348,7 @@ def assert_same_rows(a: plan.Plan, b: plan.Plan, rows: slice, *, faults: bool = 
 @settings(max_examples=25)
 def test_appending_a_block_leaves_earlier_rows_alone(first: int, more: int, seed: int, mode: str) -> None:
     s = scene(dataset={"samples": first, "seed": seed}, plan={"mode": mode})
-    short, long = (plan.make_plan(s, ALL_FAULTS, blocks) for blocks in ([first], [first, more]))
+    short, long = (planned(s, ALL_FAULTS, blocks) for blocks in ([first], [first, more]))
     assert len(long) == first + more
     assert_same_rows(short, long, slice(0, first))
     # the block appended has the matrix of its own size
@@ -341,7 +360,7 @@ def test_appending_a_block_leaves_earlier_rows_alone(first: int, more: int, seed
 
 
 def test_an_appended_block_has_its_own_matrix() -> None:
-    p = plan.make_plan(scene(), ALL_FAULTS, [N, N])
+    p = planned(scene(), ALL_FAULTS, [N, N])
     assert not np.array_equal(p.injected[:N], p.injected[N:])
 
 
@@ -455,7 +474,7 @@ def test_devices_are_shared_out_as_sites_are() -> None:
 )
 def test_packaged_scenes_have_every_class_in_every_split(name: str) -> None:
     s = config.load_scene(name)
-    p = plan.make_plan(s, list(s.faults))
+    p = planned(s, list(s.faults))
     assert plan.shortcomings(s, p) == []
     for code in range(len(plan.SPLITS)):
         here = p.split == code
@@ -472,7 +491,7 @@ def test_packaged_scenes_have_every_class_in_every_split(name: str) -> None:
 )
 def test_packaged_scenes_ask_for_lit_ground_in_four_of_five_views(name: str) -> None:
     s = config.load_scene(name)
-    p = plan.make_plan(s, list(s.faults))
+    p = planned(s, list(s.faults))
     asked = np.array([table.min_lit_fraction for table in plan.strata(s)])[p.stratum]
     assert (asked >= 0.01).mean() >= 0.8
 
@@ -481,7 +500,7 @@ def test_packaged_scenes_ask_for_lit_ground_in_four_of_five_views(name: str) -> 
 @settings(max_examples=40)
 def test_no_split_is_empty_and_classes_are_dealt_evenly(samples: int, sites: int, shard: int, mode: str) -> None:
     s = scene(dataset={"samples": samples, "sites": sites, "shard_samples": shard}, plan={"mode": mode})
-    p = plan.make_plan(s, ALL_FAULTS)
+    p = planned(s, ALL_FAULTS)
     present = set(p.split.tolist())
     assert len(present) == min(3, sites, -(-samples // shard))
     missing = plan.shortcomings(s, p)
@@ -532,10 +551,10 @@ def test_rows_are_exchanged_where_a_split_wins_a_class_and_loses_none(theirs: li
 
 def test_splits_that_cannot_hold_every_class_are_told() -> None:
     few = scene(dataset={"samples": 16, "sites": 2, "shard_samples": 8})
-    (sentence,) = plan.shortcomings(few, plan.make_plan(few, ALL_FAULTS))
+    (sentence,) = plan.shortcomings(few, planned(few, ALL_FAULTS))
     assert sentence.startswith("split test has no samples: 2 sites are in use (dataset.sites = 2")
     rare = scene(dataset={"samples": 30, "sites": 3, "shard_samples": 1}, plan={"faulty_fraction": 0.04})
-    p = plan.make_plan(rare, ALL_FAULTS[:2])
+    p = planned(rare, ALL_FAULTS[:2])
     assert p.injected.any(axis=1).sum() == 1
     lacking = [m for m in plan.shortcomings(rare, p) if "has no sample with" in m]
     assert len(lacking) == 2  # one row cannot be in three splits
@@ -558,7 +577,7 @@ def test_planning_looks_at_every_sample_a_bounded_number_of_times(
     seen = []
     for samples in (2_000, 200_000):
         calls.update(dict.fromkeys(calls, 0))
-        plan.make_plan(scene(dataset={"samples": samples, "sites": sites, "shard_samples": 1}), ALL_FAULTS)
+        planned(scene(dataset={"samples": samples, "sites": sites, "shard_samples": 1}), ALL_FAULTS)
         seen.append(calls["rng"])
         # eight variables, four choices, and at most a dozen redraws of two angles: 8 % of the draws each time
         assert calls["keyed_uniform"] < 40
@@ -567,13 +586,13 @@ def test_planning_looks_at_every_sample_a_bounded_number_of_times(
 
 @pytest.mark.parametrize("mode", ["per_class", "per_sample"])
 def test_100_000_samples_are_planned_without_a_loop_over_samples(mode: str) -> None:
-    plan.make_plan(scene(dataset={"samples": 1000}), ALL_FAULTS)  # what is made once
+    planned(scene(dataset={"samples": 1000}), ALL_FAULTS)  # what is made once
     calls = []
     for samples in (1000, 100_000):
         s = scene(dataset={"samples": samples}, plan={"mode": mode})
-        calls.append(calls_of(lambda s=s: plan.make_plan(s, ALL_FAULTS)))
+        calls.append(calls_of(lambda s=s: planned(s, ALL_FAULTS)))
     assert calls[1] < 2 * calls[0] < 4000  # 825 and 742; rare samples need redraws, which few scenes have
-    p = plan.make_plan(s, ALL_FAULTS)
+    p = planned(s, ALL_FAULTS)
     assert len(p) == 100_000
     far = p.stratum == FAR
     assert sun_angle_deg(p)[far].min() >= 32.5 * np.sqrt(2)

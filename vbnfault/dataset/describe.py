@@ -92,13 +92,13 @@ def _geometry(session: Session) -> list[str]:
             f"{_bounds(stratum.sun_azimuth_deg)} deg; camera from {towards} by roll {_bounds(stratum.roll_deg)}, "
             f"pitch {_bounds(stratum.pitch_deg)}, yaw {_bounds(stratum.yaw_deg)} deg; {lit}"
         )
-    hidden = "is drawn again" if geometry.sun_visibility == "required" else "is kept, without straylight"
+    hidden = "is drawn again" if geometry.sun_visibility == "required" else "is kept, without this fault"
     unseen = f"gets another view, of {scene.plan.max_views} at most"
     if scene.plan.on_invisible == "drop":
         unseen = "is recorded as not injected"
     lines.append(
-        f"views: nothing within {geometry.clearance_m:g} m; a straylight view whose Sun is hidden {hidden}; a "
-        f"fault that cannot show {unseen}"
+        f"views: nothing within {geometry.clearance_m:g} m; a view whose fault needs the Sun, which is hidden, "
+        f"{hidden}; a fault that cannot show {unseen}"
     )
     return lines
 

@@ -14,7 +14,7 @@ from .. import __version__, pipeline, reflectance, store
 from ..core import llvm, resources
 from ..core.errors import InputError, VbnfaultError
 from ..detector import Detector
-from ..faults import Fault, belongs_here, plugins_of
+from ..faults import Fault, belongs_here, is_packaged, plugins_of, registry
 from ..lens import load_lens
 from ..pipeline import masks
 from ..pipeline.record import proposal
@@ -244,6 +244,17 @@ def stored_scene(attributes: Mapping[str, Any]) -> Scene:
     return config.parse_scene(stored, source="the store's own scene")
 
 
+def _need_sun(attributes: Mapping[str, Any]) -> list[str]:
+    """Return the fault classes of a store whose samples face the Sun; those of plug-ins as the store names them."""
+    plugins = attributes["scene"].get("plugins", {})
+    classes = {name for plugin in plugins.values() for name in plugin["needs_sun"]}
+    for name, model in attributes["fault_models"].items():
+        cls = registry().get(name, {}).get(model)
+        if cls is not None and is_packaged(cls) and cls.needs_sun:
+            classes.add(name)
+    return sorted(classes)
+
+
 def planned(attributes: Mapping[str, Any], faults: Sequence[str]) -> Callable[[int, int], dict[str, Any]]:
     """Return a function that gives the planned scalars of a sample, for `store.examine`.
 
@@ -258,7 +269,7 @@ def planned(attributes: Mapping[str, Any], faults: Sequence[str]) -> Callable[[i
         The fault axis of the store.
     """
     scene = stored_scene(attributes)
-    table = plan.make_plan(scene, faults, attributes["blocks"])
+    table = plan.make_plan(scene, faults, attributes["blocks"], need_sun=_need_sun(attributes))
 
     def expected(index: int, tries: int) -> dict[str, Any]:
         drawn = table.view(scene, index, tries - 1)

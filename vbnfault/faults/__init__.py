@@ -3,7 +3,16 @@
 from .context import FaultContext, Params
 from .contract import MOSAIC_STEPS, QUANTITIES, STEPS, Fault, act
 from .fields import Interval, bounds, choice, flag, number, path, rows, text
-from .models import DeclarationError, dataset_order, from_dict, json_schema, path_fields, physical_order, registry
+from .models import (
+    DeclarationError,
+    dataset_order,
+    from_dict,
+    is_packaged,
+    json_schema,
+    path_fields,
+    physical_order,
+    registry,
+)
 from .plugins import Plugin, belongs_here, load_plugins, loaded_plugin, plugins_of
 
 __all__ = [
@@ -23,6 +32,7 @@ __all__ = [
     "dataset_order",
     "flag",
     "from_dict",
+    "is_packaged",
     "json_schema",
     "load_plugins",
     "loaded_plugin",

@@ -166,7 +166,8 @@ class Session:
     ) -> None:
         self.scene = scene
         self.faults = configure_faults(scene, source)
-        self.plan = plan.make_plan(scene, list(self.faults), blocks)
+        need_sun = [name for name, fault in self.faults.items() if fault.needs_sun]
+        self.plan = plan.make_plan(scene, list(self.faults), blocks, need_sun=need_sun)
         self._threads = threads
         self._terrain: Terrain | None = None
         self._compiled = False  # the first sample compiles the kernels

@@ -1,10 +1,11 @@
 """Draw the plan: a plain table, made before any rendering, of what each sample sees and which faults it carries.
 
-The sampling is stratified after Gallon et al.: samples with straylight face the Sun, the others look away from it
-(`sun_facing_nominal_fraction` adds Sun-facing samples without straylight). The rows of the fault matrix are
-distributed over the shards, so that every site and every split holds every class where the counts allow. Every
-number is keyed by its sample, so a longer block keeps the numbers of a shorter one. The exceptions are the fault
-matrix, which is balanced over the whole block, and the strata and bounds that follow from it.
+The sampling is stratified after Gallon et al.: samples with a fault that needs the Sun (straylight) face it, the
+others look away from it (`sun_facing_nominal_fraction` adds Sun-facing samples without such a fault). The rows of
+the fault matrix are distributed over the shards, so that every site and every split holds every class where the
+counts allow. Every number is keyed by its sample, so a longer block keeps the numbers of a shorter one. The
+exceptions are the fault matrix, which is balanced over the whole block, and the strata and bounds that follow from
+it.
 
 A sample's view (position, Sun, attitude) is a function of (sample, try). Where a view cannot be used, the whole
 view is drawn again within the same bounds. The views that are kept therefore follow the table's distribution, under
@@ -14,7 +15,7 @@ the condition that they can be used.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -30,7 +31,6 @@ from .sampling import StratumTable
 STRATA = ("sun-facing", "sun-averted")
 SPLITS = ("train", "val", "test")
 SUN_FACING, SUN_AVERTED = 0, 1
-STRAYLIGHT = "straylight"
 
 _SUN = ("sun_azimuth_deg", "sun_elevation_deg")
 _POSITION = ("x_m", "y_m", "height_m")
@@ -87,18 +87,20 @@ class Plan:
         """
         if attempt == 0:
             return {name: float(values[index]) for name, values in self.variables.items()}
-        one = slice(index, index + 1)
+        row = slice(index, index + 1)
         drawn = _views(
-            scene, np.array([index]), self.stratum[one], self.light[one], self.paired[one], attempt=attempt
+            scene, np.array([index]), self.stratum[row], self.light[row], self.paired[row], attempt=attempt
         )
         return {name: float(values[0]) for name, values in drawn.items()}
 
 
-def make_plan(scene: Scene, faults: Sequence[str], blocks: Sequence[int] | None = None) -> Plan:
+def make_plan(
+    scene: Scene, faults: Sequence[str], blocks: Sequence[int] | None = None, *, need_sun: Collection[str] = ()
+) -> Plan:
     """Draw the plan of all blocks, each with its own fault matrix; default: one block of `dataset.samples`.
 
-    Raises InputError where `sun_facing_nominal_fraction` and the samples with straylight exceed all samples, and
-    where the bounds of a stratum cannot be met.
+    `need_sun` names the faults whose samples face the Sun. Raises InputError where `sun_facing_nominal_fraction`
+    and the samples with these faults exceed all samples, and where the bounds of a stratum cannot be met.
     """
     sizes = [scene.dataset.samples] if blocks is None else list(blocks)
     seed = scene.dataset.seed
@@ -110,7 +112,7 @@ def make_plan(scene: Scene, faults: Sequence[str], blocks: Sequence[int] | None 
     parts = []
     for b, (start, end) in enumerate(itertools.pairwise(starts.tolist())):
         rows = slice(start, end)
-        parts.append(_block(scene, tuple(faults), b, start, shard[rows], split[rows]))
+        parts.append(_block(scene, (tuple(faults), frozenset(need_sun)), (b, start), shard[rows], split[rows]))
     injected = np.concatenate([p[0] for p in parts])
     stratum = np.concatenate([p[1] for p in parts])
     light, paired = _pairs(scene, samples, stratum, shard)
@@ -263,16 +265,16 @@ def _pairs(
                 f"plan.pair_strata = true: geometry.sun_facing.{name} = {_pair(low, high, SUN_FACING)} and "
                 f"geometry.sun_averted.{name} = {_pair(low, high, SUN_AVERTED)} must overlap"
             )
-    by_place = np.lexsort((samples, stratum, shard))
-    group = shard[by_place] * 2 + stratum[by_place]
+    by_group = np.lexsort((samples, stratum, shard))
+    group = shard[by_group] * 2 + stratum[by_group]
     first = np.searchsorted(group, group, side="left")
     rank = np.arange(len(samples)) - first
     # match the Sun-facing and the Sun-averted samples by (shard, rank)
     width = scene.dataset.shard_samples
-    key = shard[by_place] * width + rank
-    facing = stratum[by_place] == SUN_FACING
-    _, one, other = np.intersect1d(key[facing], key[~facing], assume_unique=True, return_indices=True)
-    leads, follows = by_place[facing][one], by_place[~facing][other]
+    key = shard[by_group] * width + rank
+    facing = stratum[by_group] == SUN_FACING
+    _, in_facing, in_averted = np.intersect1d(key[facing], key[~facing], assume_unique=True, return_indices=True)
+    leads, follows = by_group[facing][in_facing], by_group[~facing][in_averted]
     light[follows] = samples[leads]
     paired[leads] = paired[follows] = True
     return light, paired
@@ -283,51 +285,73 @@ def _pairs(
 
 def _block(
     scene: Scene,
-    faults: tuple[str, ...],
-    block: int,
-    start: int,
+    classes: tuple[tuple[str, ...], frozenset[str]],
+    block: tuple[int, int],
     shard: NDArray[np.int64],
     split: NDArray[np.uint8],
 ) -> tuple[NDArray[np.bool_], NDArray[np.uint8]]:
-    """Return the fault matrix bool[n, fault] and the strata uint8[n] of a block whose first sample is `start`."""
+    """Return the fault matrix bool[n, fault] and the strata uint8[n] of a block.
+
+    `classes` are the faults, and those of them that need the Sun. `block` is the number of the block and its first
+    sample.
+    """
     n = len(shard)
-    rng = keyed_random.rng(scene.dataset.seed, start, "plan", f"fault_matrix/{block}")
+    faults, need_sun = classes
+    number, start = block
+    rng = keyed_random.rng(scene.dataset.seed, start, "plan", f"fault_matrix/{number}")
     make = fault_matrix_per_class if scene.plan.mode == "per_class" else fault_matrix_per_sample
     lo, hi = scene.plan.classes_per_sample
-    injected = make(n, faults, scene.plan.faulty_fraction, rng, (lo, hi))
-    straylight = int(injected[:, faults.index(STRAYLIGHT)].sum()) if STRAYLIGHT in faults else 0
+    injected = make(n, faults, scene.plan.faulty_fraction, rng, (lo, hi), need_sun)
+    towards_sun = int(_with_any(injected, faults, need_sun).sum())
     nominal = round(scene.plan.sun_facing_nominal_fraction * n)
-    if straylight + nominal > n:
+    if towards_sun + nominal > n:
+        names = " or ".join(name for name in faults if name in need_sun)
         raise InputError(
-            f"plan.sun_facing_nominal_fraction = {scene.plan.sun_facing_nominal_fraction:g}: with {straylight} of "
-            f"{n} samples in straylight it must be at most {(n - straylight) / n:g}"
+            f"plan.sun_facing_nominal_fraction = {scene.plan.sun_facing_nominal_fraction:g}: with {names} in "
+            f"{towards_sun} of {n} samples it must be at most {(n - towards_sun) / n:g}"
         )
     stratum = np.full(n, SUN_AVERTED, dtype=np.uint8)
-    stratum[: straylight + nominal] = SUN_FACING
+    stratum[: towards_sun + nominal] = SUN_FACING
     order = _dealt(injected, stratum, shard, split, rng)
     return injected[order], stratum[order]
 
 
+def _with_any(matrix: NDArray[np.bool_], faults: Sequence[str], wanted: Collection[str]) -> NDArray[np.bool_]:
+    """Return which rows of a fault matrix bool[n, fault] hold one of the classes `wanted`, bool[n]."""
+    return np.asarray(matrix[:, [name in wanted for name in faults]].any(axis=1))
+
+
 def fault_matrix_per_class(
-    n: int, faults: tuple[str, ...], p: float, rng: np.random.Generator, sizes: tuple[int, int] = (1, 6)
+    n: int,
+    faults: tuple[str, ...],
+    p: float,
+    rng: np.random.Generator,
+    sizes: tuple[int, int] = (1, 6),
+    need_sun: Collection[str] = (),
 ) -> NDArray[np.bool_]:
-    """Return bool[n, fault] with every class in exactly round(p·n) rows; straylight is in the first rows."""
+    """Return bool[n, fault] with every class in exactly round(p·n) rows; rows with `need_sun` come first."""
     count = round(p * n)
     matrix = np.zeros((n, len(faults)), dtype=bool)
+    first = next((name for name in faults if name in need_sun), None)
     for f, name in enumerate(faults):
-        rows = np.arange(count) if name == STRAYLIGHT else rng.permutation(n)[:count]
+        rows = np.arange(count) if name == first else rng.permutation(n)[:count]
         matrix[rows, f] = True
-    return matrix
+    return matrix[np.argsort(~_with_any(matrix, faults, need_sun), kind="stable")]
 
 
 def fault_matrix_per_sample(
-    n: int, faults: tuple[str, ...], p: float, rng: np.random.Generator, sizes: tuple[int, int] = (1, 6)
+    n: int,
+    faults: tuple[str, ...],
+    p: float,
+    rng: np.random.Generator,
+    sizes: tuple[int, int] = (1, 6),
+    need_sun: Collection[str] = (),
 ) -> NDArray[np.bool_]:
     """Return bool[n, fault] with exactly round(p·n) faulty rows, each with a non-empty subset of the classes.
 
     Subset sizes are uniform in `sizes` (at most the number of classes). All subsets of one size have the same
-    probability, until some are changed so that the counts of any two classes differ by at most one. Rows with
-    straylight come first.
+    probability, until some are changed so that the counts of any two classes differ by at most one. Rows with a
+    class of `need_sun` come first.
     """
     classes = len(faults)
     matrix = np.zeros((n, classes), dtype=bool)
@@ -340,11 +364,11 @@ def fault_matrix_per_sample(
     rank = np.argsort(np.argsort(rng.random((faulty, classes), dtype=np.float32), axis=1), axis=1)
     rows = rank < size[:, None]
     _level(rows, rng)
-    first = rows[:, faults.index(STRAYLIGHT)] if STRAYLIGHT in faults else np.zeros(faulty, dtype=bool)
-    with_straylight = int(first.sum())
-    matrix[:with_straylight] = rows[first]
-    places = with_straylight + rng.permutation(n - with_straylight)[: faulty - with_straylight]
-    matrix[places] = rows[~first]
+    first = _with_any(rows, faults, need_sun)
+    towards_sun = int(first.sum())
+    matrix[:towards_sun] = rows[first]
+    others = towards_sun + rng.permutation(n - towards_sun)[: faulty - towards_sun]
+    matrix[others] = rows[~first]
     return matrix
 
 
@@ -352,8 +376,8 @@ def _level(rows: NDArray[np.bool_], rng: np.random.Generator) -> None:
     """Exchange classes in random rows until the counts of any two classes differ by at most one; in place."""
     classes = rows.shape[1]
     count = rows.sum(axis=0)
-    share, extra = divmod(int(count.sum()), classes)
-    wanted = np.full(classes, share)
+    each, extra = divmod(int(count.sum()), classes)
+    wanted = np.full(classes, each)
     wanted[rng.permutation(classes)[:extra]] += 1
     while (count != wanted).any():
         most, least = int(np.argmax(count - wanted)), int(np.argmin(count - wanted))

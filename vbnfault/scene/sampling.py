@@ -31,6 +31,10 @@ class SplitTable(Table):
         return self
 
 
+# The layers of a scene that names none. The twin is left out where the scene lacks its fault.
+DEFAULT_LAYERS = ("clean", "without_straylight", "mask_effect", "depth_m", "normal", "semantic")
+
+
 class DatasetTable(Table):
     """Set the size of the dataset and what it stores."""
 
@@ -40,14 +44,7 @@ class DatasetTable(Table):
     shard_samples: int = Field(
         8, ge=1, le=16, description="samples a shard, all of one site: what a kill can lose at most"
     )
-    layers: tuple[Layer, ...] = (
-        "clean",
-        "without_straylight",
-        "mask_effect",
-        "depth_m",
-        "normal",
-        "semantic",
-    )
+    layers: tuple[Layer, ...] = DEFAULT_LAYERS
     mask_any: tuple[str, ...] | None = Field(
         None,
         description="classes of the scene whose masks mask_any unites; []: none; default: the localised ones",
@@ -114,7 +111,7 @@ class PlanTable(Table):
         AfterValidator(ordered),
     ] = (1, 6)
     sun_facing_nominal_fraction: float = Field(
-        0.0, ge=0, le=1, description="fraction of all samples that face the Sun without straylight"
+        0.0, ge=0, le=1, description="fraction of all samples that face the Sun without a fault that needs it"
     )
     on_invisible: Literal["redraw_view", "drop"] = Field(
         "redraw_view",
