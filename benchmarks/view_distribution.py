@@ -29,7 +29,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from vbnfault import dataset, store
+from vbnfault import store
+from vbnfault.dataset.identity import classes_that_need_sun, stored_scene
 from vbnfault.scene import plan
 
 VARIABLES = ("height_m", "roll_deg", "pitch_deg", "yaw_deg", "sun_elevation_deg", "sun_azimuth_deg")
@@ -79,11 +80,12 @@ class Views:
 def views_of(path: Path) -> list[Views]:
     """Return the views of a store's finished samples by stratum; strata without samples are left out."""
     opened = store.open_store(path)
-    scene = dataset.stored_scene(opened.attributes)
-    made = plan.make_plan(scene, opened.spec.faults, opened.attributes["blocks"])
+    scene = stored_scene(opened.attributes)
+    need_sun = classes_that_need_sun(opened.attributes)
+    made = plan.make_plan(scene, opened.spec.faults, opened.attributes["blocks"], need_sun=need_sun)
     large = {"samples": TABLE_SAMPLES, "seed": scene.dataset.seed + 1}
     many = scene.model_copy(update={"dataset": scene.dataset.model_copy(update=large)})
-    table = plan.make_plan(many, opened.spec.faults)
+    table = plan.make_plan(many, opened.spec.faults, need_sun=need_sun)
     whole = np.flatnonzero(np.asarray(opened.read("done")))
     tries = np.asarray(opened.read("tries"))[whole]
     kept = [made.view(scene, int(i), int(k) - 1) for i, k in zip(whole, tries, strict=True)]

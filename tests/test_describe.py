@@ -21,7 +21,7 @@ def described(*settings: str, scene: str = "quickstart") -> list[str]:
 
 def test_describe_counts_what_is_planned_by_class_stratum_and_split() -> None:
     scene = config.load_scene("quickstart")
-    table = plan.make_plan(scene, list(scene.faults))
+    table = plan.make_plan(scene, list(scene.faults), need_sun=("straylight",))
     lines = described()
     rows = {line.split()[0]: [int(n) for n in re.findall(r"\d+", line)] for line in lines if line.startswith("  ")}
     for fault in scene.faults:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import re
+import runpy
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,9 +13,11 @@ from test_faults_kit import flat_electrons, make, make_context, rng
 
 from vbnfault.core.errors import InputError
 from vbnfault.core.resources import data_dir
-from vbnfault.faults.flare_textures import STEP, TEXTURES
-from vbnfault.faults.flare_textures import make as make_texture
 from vbnfault.faults.straylight import CLOSE, FAR, flare_centres_px, pyramid
+
+# The script that draws the packaged textures; it is no part of the package.
+SCRIPT = runpy.run_path(str(Path(__file__).parents[1] / "benchmarks" / "flare_textures.py"))
+STEP, TEXTURES, make_texture = SCRIPT["STEP"], SCRIPT["TEXTURES"], SCRIPT["make"]
 
 # The paper's table of the parameters of its full example.
 PAPER_EXAMPLE = [

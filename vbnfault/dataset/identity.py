@@ -244,7 +244,7 @@ def stored_scene(attributes: Mapping[str, Any]) -> Scene:
     return config.parse_scene(stored, source="the store's own scene")
 
 
-def _need_sun(attributes: Mapping[str, Any]) -> list[str]:
+def classes_that_need_sun(attributes: Mapping[str, Any]) -> list[str]:
     """Return the fault classes of a store whose samples face the Sun; those of plug-ins as the store names them."""
     plugins = attributes["scene"].get("plugins", {})
     classes = {name for plugin in plugins.values() for name in plugin["needs_sun"]}
@@ -269,7 +269,7 @@ def planned(attributes: Mapping[str, Any], faults: Sequence[str]) -> Callable[[i
         The fault axis of the store.
     """
     scene = stored_scene(attributes)
-    table = plan.make_plan(scene, faults, attributes["blocks"], need_sun=_need_sun(attributes))
+    table = plan.make_plan(scene, faults, attributes["blocks"], need_sun=classes_that_need_sun(attributes))
 
     def expected(index: int, tries: int) -> dict[str, Any]:
         drawn = table.view(scene, index, tries - 1)

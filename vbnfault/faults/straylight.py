@@ -44,9 +44,10 @@ from ..core.resources import cached_with_contents, data_dir, read_input
 from .context import FaultContext, Params
 from .contract import Fault
 from .fields import Interval, bounds, number, rows
-from .flare_textures import FILL
 from .planes import intensity_dn, plus
 
+# Radius of a flare's outline over half the side of its texture, as `benchmarks/flare_textures.py` draws it.
+FILL = 0.9
 CLOSE = (1, 2, 3, 4, 5)
 FAR = (6, 7, 8, 9, 10)
 GLARES = (1, 2)

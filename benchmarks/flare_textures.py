@@ -1,4 +1,4 @@
-"""Write the flare and glare textures of straylight/texture:  python -m vbnfault.faults.flare_textures OUTDIR
+"""Write the flare and glare textures of straylight/texture:  python benchmarks/flare_textures.py OUTDIR
 
 The paper (Gallon et al.) shows ten flares and two glares but publishes none of them. These textures are our own,
 computed from closed-form profiles. Flares 1-5 are dense orbs and discs close to the Sun. Flares 6-10 are rings,
@@ -25,10 +25,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from vbnfault.faults.straylight import FILL
+
 F64 = NDArray[np.float64]
 
 SIZE_PX = 384
-FILL = 0.9  # radius of a flare's outline over half the side of the texture
 STEP = 16  # step of the stored values (65535 = 1): makes small files, and is far finer than one DN
 
 # Change of a ghost's size in R, G, B per unit of dispersion.
@@ -224,7 +225,7 @@ _SOURCES = """\
 # Textures
 
 Flares and glares of `straylight/texture`. All are our own work, computed from closed-form profiles by
-`python -m vbnfault.faults.flare_textures textures` (no photograph, no third party's texture), under the
+`python benchmarks/flare_textures.py textures` (no photograph, no third party's texture), under the
 project's licence.
 
 Unit: share of white at brightness 1, linear in light, 65535 = 1; 16 bit RGB, {size} × {size} px. A flare's
@@ -242,7 +243,7 @@ def main() -> None:
     import sys
 
     if len(sys.argv) != 2:
-        raise SystemExit("usage: python -m vbnfault.faults.flare_textures OUTDIR")
+        raise SystemExit("usage: python benchmarks/flare_textures.py OUTDIR")
     write_all(Path(sys.argv[1]))
 
 
