@@ -12,34 +12,35 @@ import numpy as np
 import pytest
 
 from vbnfault import Fault, FaultContext, Interval, bounds
-from vbnfault.faults.models import undoing_registrations
+from vbnfault.faults.models import register, undoing_registrations
 from vbnfault.testing import check_fault
 
+with undoing_registrations(always=True):  # other tests must not meet this fault
 
-@dataclass(frozen=True, kw_only=True)
-class Stripe(Fault):
-    """Darken some rows."""
+    @dataclass(frozen=True, kw_only=True)
+    class Stripe(Fault):
+        """Darken some rows."""
 
-    fault = "stripe"
-    model = "rows"
-    default = True
-    after = "straylight"
-    step = "electrons"
+        fault = "stripe"
+        model = "rows"
+        default = True
+        after = "straylight"
+        step = "electrons"
 
-    first: Interval = bounds(0, 20, limits=(0, 1000), integer=True, doc="first row")  # noqa: RUF009
+        first: Interval = bounds(0, 20, limits=(0, 1000), integer=True, doc="first row")  # noqa: RUF009
 
-    def draw(self, context: FaultContext, rng: np.random.Generator) -> dict[str, Any]:
-        return {"first": self.first.integer(rng)}
+        def draw(self, context: FaultContext, rng: np.random.Generator) -> dict[str, Any]:
+            return {"first": self.first.integer(rng)}
 
-    def apply(self, quantity: Any, params: dict[str, Any], context: FaultContext) -> Any:
-        array = quantity.array.copy()
-        array[params["first"] :][:4] *= 0.5
-        return quantity.with_array(array)
+        def apply(self, quantity: Any, params: dict[str, Any], context: FaultContext) -> Any:
+            array = quantity.array.copy()
+            array[params["first"] :][:4] *= 0.5
+            return quantity.with_array(array)
 
-    def footprint(self, params: dict[str, Any], context: FaultContext) -> Any:
-        mask = np.zeros(context.shape, dtype=bool)
-        mask[params["first"] :][:4] = True
-        return mask
+        def footprint(self, params: dict[str, Any], context: FaultContext) -> Any:
+            mask = np.zeros(context.shape, dtype=bool)
+            mask[params["first"] :][:4] = True
+            return mask
 
 
 GOOD = {name: getattr(Stripe, name) for name in ("draw", "apply", "footprint")}
@@ -86,8 +87,9 @@ BROKEN: dict[str, tuple[dict[str, Any], str]] = {
 
 
 @pytest.fixture(autouse=True)
-def registrations_undone() -> Iterator[None]:
+def registered_for_a_test() -> Iterator[None]:
     with undoing_registrations(always=True):
+        register(Stripe)
         yield
 
 

@@ -301,7 +301,10 @@ BROKEN = {
     ),
     "default": (GLINT.replace('"glint"', '"vignetting"'), r"default = True, but vignetting/cos4 is the default"),
     "order": (GLINT.replace('"straylight"', '"strailight"'), r"after = 'strailight': .* \(did you mean straylight"),
-    "circle": (GLINT.replace('"straylight"', '"glint"'), r"fault classes glint: .* in a circle"),
+    "circle": (
+        GLINT.replace('"straylight"', '"glint"'),
+        r"fault class: what glint state by `after` runs in a circle",
+    ),
     "step": (GLINT.replace('"electrons"', '"light", "raw"'), r"my_glint.py, line"),
     "no step": (GLINT.replace('    step = "electrons"\n', ""), r"fault model glint/square: states no step"),
     "no dataclass": (GLINT.replace("@dataclass(frozen=True, kw_only=True)\n", ""), r"must be decorated with @data"),

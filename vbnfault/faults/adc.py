@@ -68,8 +68,8 @@ class ConverterFault(Fault):
         readout: ReadoutSpec = detector.sensor.readout
         # a converter with few bits lacks the less significant ones of the range
         low, high = (min(int(p), readout.bits - 1) for p in self.stuck_place)
-        places = rng.permutation(np.arange(low, high + 1))[: self.stuck_count.integer(rng)]
-        values = rng.integers(0, 2, len(places))
+        bits = rng.permutation(np.arange(low, high + 1))[: self.stuck_count.integer(rng)]
+        values = rng.integers(0, 2, len(bits))
         codes = readout.top_dn + 1
         missing = min(round(self.missing_share.uniform(rng) * codes), codes // 2)
         range_dn = readout.top_dn - readout.bias_dn
@@ -80,7 +80,7 @@ class ConverterFault(Fault):
         heights *= min(1.0, room / max(_steepness(*heights), 1e-9))
         return {
             "stuck_bits": [
-                [readout.bits - 1 - int(place), int(value)] for place, value in zip(places, values, strict=True)
+                [readout.bits - 1 - int(bit), int(value)] for bit, value in zip(bits, values, strict=True)
             ],
             "missing_from": int(rng.integers(0, codes - missing, endpoint=True)),
             "missing_count": int(missing),

@@ -45,11 +45,11 @@ class Overflow(Fault):
     def draw(self, context: FaultContext, rng: np.random.Generator) -> Params:
         """Return full well in electrons, drained fraction and direction of the charge; {} on CMOS."""
         detector = context.camera.mosaic
-        share, drained = self.full_well_share.uniform(rng), self.antiblooming.uniform(rng)
+        fraction, drained = self.full_well_share.uniform(rng), self.antiblooming.uniform(rng)
         if detector.sensor.architecture == "cmos":
             return {}
         return {
-            "full_well_e": float(share * detector.full_well_e),
+            "full_well_e": float(fraction * detector.full_well_e),
             "antiblooming": float(min(drained, detector.sensor.transfer.antiblooming)),
             "direction": str(detector.direction),
         }

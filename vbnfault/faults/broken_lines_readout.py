@@ -103,8 +103,8 @@ class ReadoutBrokenLines(Fault):
             weights = np.array([getattr(self, f"{kind}_weight") for kind in kinds], dtype=np.float64)
             weights = weights / weights.sum() if weights.sum() > 0 else np.eye(len(kinds))[0]
             # a frame of a few pixels may have fewer lines than the drawn count
-            for place in rng.permutation(max(length // group, 1))[:wanted]:
-                first = int(place) * group
+            for block in rng.permutation(max(length // group, 1))[:wanted]:
+                first = int(block) * group
                 kind = kinds[int(rng.choice(len(kinds), p=weights))]
                 shift = self.shift_px.integer(rng) * (1 if rng.random() < 0.5 else -1)
                 if kind == "duplicated" and first == 0:

@@ -58,11 +58,11 @@ class RadiationTraps(Fault):
             ("parallel", self.parallel_per_px, move.row_readout_s),
             ("serial", self.serial_per_px, move.pixel_transfer_s),
         ):
-            total, shares = density.uniform(rng), rng.dirichlet(np.ones(len(RELEASE_TRANSFERS)))
+            total, fractions = density.uniform(rng), rng.dirichlet(np.ones(len(RELEASE_TRANSFERS)))
             if detector.sensor.architecture != "cmos" and transfer_s > 0 and total > 0:
                 params[name] = [
-                    {"density_per_px": float(total * share), "release_time_s": float(transfers * transfer_s)}
-                    for share, transfers in zip(shares, RELEASE_TRANSFERS, strict=True)
+                    {"density_per_px": float(total * fraction), "release_time_s": float(transfers * transfer_s)}
+                    for fraction, transfers in zip(fractions, RELEASE_TRANSFERS, strict=True)
                 ]
         return params
 

@@ -105,9 +105,9 @@ class Contamination(LensFault):
         scratches = []
         for _ in range(self.scratches.integer(rng)):
             width, length = self.scratch_width_um.uniform(rng), self.scratch_length.uniform(rng)
-            share = width * 1e-3 * length * beam_mm / (np.pi / 4 * beam_mm**2)
+            fraction = width * 1e-3 * length * beam_mm / (np.pi / 4 * beam_mm**2)
             angle = rng.uniform(0, 180)
-            scratches.append({"angle_deg": float(angle), "width_um": width, "share": float(share)})
+            scratches.append({"angle_deg": float(angle), "width_um": width, "share": float(fraction)})
         most = (1 - params["haze"]) / 2
         too_much = max(1.0, sum(s["share"] for s in scratches) / most)
         params["scratches"] = [s | {"share": s["share"] / too_much} for s in scratches]

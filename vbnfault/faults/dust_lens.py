@@ -163,8 +163,8 @@ class DefocusedDust(LensFault):
 @lru_cache(maxsize=8)
 def _footprint(frame: ImageFrame, name: str, row: int, height_mm: float) -> Footprint:
     """Return the footprints on a surface of the lens, or `height_mm` above the sensor if that is not 0."""
-    found = frame.beams(name)
-    return found.above_sensor(height_mm) if height_mm else found.on_row(row)
+    beams = frame.beams(name)
+    return beams.above_sensor(height_mm) if height_mm else beams.on_row(row)
 
 
 class _Grains(NamedTuple):
@@ -385,8 +385,7 @@ def lobe(x: F64) -> F64:
 def _lobe_nodes() -> tuple[F64, F64]:
     """Return the nodes and values of the table of `lobe`."""
     x = np.linspace(0, _SMOOTH, 3001)
-    found = lobe(x)
-    return x, found
+    return x, lobe(x)
 
 
 def lobe_tail() -> float:
@@ -532,8 +531,8 @@ def _painted(
 
     diffracted, reflected = (looked_up(lobe) * layer for lobe, layer in zip(lobes, seen, strict=True))
     colours = []
-    for own, one, other in zip(own_e, *factors_e, strict=True):
-        light = cv2.addWeighted(diffracted, float(one), reflected, float(other), 0)
+    for own, by_diffraction, by_reflection in zip(own_e, *factors_e, strict=True):
+        light = cv2.addWeighted(diffracted, float(by_diffraction), reflected, float(by_reflection), 0)
         if own.any():
             light += looked_up(own)
         if density is not None:

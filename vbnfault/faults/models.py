@@ -16,6 +16,7 @@ from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 from ..core.errors import InputError, VbnfaultError, shown
+from ..core.registry import chained
 from ..core.tables import did_you_mean
 from .fields import field_schema, parse_field
 
@@ -204,23 +205,12 @@ def _physical_order() -> tuple[str, ...]:
     class of a plug-in comes directly behind the class that it names.
     """
     defaults = _defaults()
-    followers: dict[str, list[str]] = {"": [], **{name: [] for name in defaults}}
-    for name, cls in sorted(defaults.items(), key=lambda item: (is_packaged(item[1]), item[0])):
-        if cls.after not in followers:
-            hint = did_you_mean(str(cls.after), list(defaults))
-            raise DeclarationError([name], f"fault class {name}: after = {cls.after!r}: no such fault class{hint}")
-        followers[cls.after].append(name)
-    order: list[str] = []
-    pending = followers[""][::-1]
-    while pending:
-        order.append(pending.pop())
-        pending += followers[order[-1]][::-1]
-    circle = sorted(set(defaults) - set(order))
-    if circle:
-        raise DeclarationError(
-            circle, f"fault classes {', '.join(circle)}: what they state by `after` runs in a circle"
-        )
-    return tuple(order)
+    packaged = {name for name, cls in defaults.items() if is_packaged(cls)}
+    try:
+        return chained({name: str(cls.after) for name, cls in defaults.items()}, packaged, "fault class")
+    except TypeError as error:
+        named = [name for name in defaults if name not in packaged and re.search(rf"\b{name}\b", str(error))]
+        raise DeclarationError(named, str(error)) from None
 
 
 def dataset_order(names: Iterable[str]) -> list[str]:

@@ -73,7 +73,7 @@ class FrameTransferSmear(Fault):
         sensor = detector.sensor
         move = sensor.transfer
         # the number of variates must not depend on the sensor
-        row_s, leak, share = (v.uniform(rng) for v in (self.row_transfer_s, self.leak, self.shutter_share))
+        row_s, leak, passed = (v.uniform(rng) for v in (self.row_transfer_s, self.leak, self.shutter_share))
         which = rng.random()
         causes = [c for c in CAUSES[sensor.architecture] if self.cause in ("any", c)]
         if not causes:
@@ -86,7 +86,7 @@ class FrameTransferSmear(Fault):
                 "leak": max(leak, move.leak),
                 "row_transfer_s": max(move.row_transfer_s, move.row_readout_s),
             },
-            "shutter": {"shutter_transmission": max(share, move.shutter_transmission)},
+            "shutter": {"shutter_transmission": max(passed, move.shutter_transmission)},
         }
         return {"cause": cause} | {key: float(value) for key, value in changes[cause].items()}
 

@@ -127,30 +127,30 @@ class _LensStraylight(LensFault):
 
     def apply(self, quantity: Any, params: Params, context: FaultContext) -> Any:
         """Return the expected electrons plus straylight, minus the light that straylight is taken from."""
-        found = self._light_once(params, context)
-        if found is None:
+        light = self._light_once(params, context)
+        if light is None:
             return quantity
-        flux = quantity.array.sum(axis=(0, 1), dtype=np.float64) * found.scene_lost
-        scene = times(quantity.array, 1 - found.scene_lost)
+        flux = quantity.array.sum(axis=(0, 1), dtype=np.float64) * light.scene_lost
+        scene = times(quantity.array, 1 - light.scene_lost)
         veil = veil_of(flux, context.shape, context.camera.focal_length_px)
-        added = plus(found.added, veil)
+        added = plus(light.added, veil)
         if quantity.past_rims is None:
             return quantity.with_array(plus(scene, added))
-        past = plus(times(quantity.past_rims, found.direct_left), added)
+        past = plus(times(quantity.past_rims, light.direct_left), added)
         return replace(quantity, array=scene, past_rims=past)
 
     def footprint(self, params: Params, context: FaultContext) -> NDArray[np.bool_]:
         """Return the pixels where any channel gains at least `mask_level_dn` of the Sun's light, bool[y, x]."""
-        found = self._light_once(params, context)
-        if found is None:
+        light = self._light_once(params, context)
+        if light is None:
             return np.zeros(context.shape, dtype=bool)
         white = context.camera.detector.white_e
-        return np.asarray((found.added >= white * np.float32(params["mask_level_dn"] / 255)).any(axis=2))
+        return np.asarray((light.added >= white * np.float32(params["mask_level_dn"] / 255)).any(axis=2))
 
     def soft(self, params: Params, context: FaultContext) -> F32:
         """Return the intensity of the Sun's straylight, float32[y, x] in DN of 255."""
-        found = self._light_once(params, context)
-        return np.zeros(context.shape, np.float32) if found is None else intensity_dn(found.added, context.camera)
+        light = self._light_once(params, context)
+        return np.zeros(context.shape, np.float32) if light is None else intensity_dn(light.added, context.camera)
 
     @property
     def effect_level_dn(self) -> float:
@@ -177,7 +177,7 @@ class _LensStraylight(LensFault):
         passed = camera.lens.transmittance(nodes)
         area_mm2, axial_mm2 = camera.lens.pupil_area_mm2([np.tan(np.radians(theta)), 0.0])
         cleanliness = Cleanliness(roughness_nm=params["roughness_nm"], level=params["cleanliness_level"])
-        found = straylight(
+        sunlight = straylight(
             lens,
             wavelength_nm=nodes,
             sensor=SensorGrid(shape=context.shape, pitch_mm=pitch_mm),
@@ -201,7 +201,7 @@ class _LensStraylight(LensFault):
             ),
         )
         visible = 1.0 if context.sun_visible_fraction is None else float(context.sun_visible_fraction)
-        light = found.total * (irradiance * visible).astype(np.float32)[:, None, None]
+        light = sunlight.total * (irradiance * visible).astype(np.float32)[:, None, None]
         on_sensor = Irradiance(array=light, wavelength_nm=nodes)
         # the scene and the Sun's image both have the spectrum of sunlight that the lens transmits
         weights = camera.detector.electron_rate_weights(nodes) * irradiance * passed
@@ -209,7 +209,7 @@ class _LensStraylight(LensFault):
         lost = scene_veil_fraction(lens, nodes, cleanliness=cleanliness, veil_fraction=params["veil_fraction"])
         return _Light(
             added=camera.detector.electrons_expected(on_sensor, camera.exposure_s).array,
-            direct_left=weights @ found.direct_fraction,
+            direct_left=weights @ sunlight.direct_fraction,
             scene_lost=weights @ lost,
         )
 
@@ -283,5 +283,5 @@ def _sunlight(context: FaultContext) -> tuple[NDArray[np.float64], NDArray[np.fl
 
 def _sun_radius_rad(context: FaultContext) -> float:
     """Return the angular radius of the Sun; if it is unknown, that at 1 AU."""
-    found = context.sun_angular_radius_rad
-    return spectra.sun_angular_radius_rad(1.0) if found is None else max(float(found), _LEAST_SUN_RAD)
+    radius_rad = context.sun_angular_radius_rad
+    return spectra.sun_angular_radius_rad(1.0) if radius_rad is None else max(float(radius_rad), _LEAST_SUN_RAD)

@@ -147,11 +147,11 @@ def _check_instrument(fault: Fault, context: FaultContext, key: int) -> None:
     """Check the hooks that say what changes in the camera, and how strongly the fault acts."""
     params = fault.draw(context, np.random.default_rng(key))
     before = repr(context.camera)
-    camera, told = fault.alter(context.camera, params), fault.inform(context, params)
+    camera, informed = fault.alter(context.camera, params), fault.inform(context, params)
     assert repr(context.camera) == before, "alter modified the camera"
     assert repr(camera) == repr(fault.alter(context.camera, params)), "alter gives another camera each time"
     assert (camera.height_px, camera.width_px) == context.shape, "alter changed the size of the image"
-    assert isinstance(told, FaultContext), "inform returned no FaultContext"
+    assert isinstance(informed, FaultContext), "inform returned no FaultContext"
     if fault.soft_layer:
         layer = fault.soft(params, context)
         assert (layer.shape, layer.dtype) == (context.shape, np.float32), "soft must return float32[y, x]"
