@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -59,8 +60,24 @@ def _list_faults() -> None:
 
 
 @app.command(rich_help_panel=_PANEL)
+def new(
+    kind: Annotated[str, typer.Argument(help="One of scene, lens, sensor and fault.", metavar="KIND")],
+    name: Annotated[
+        str,
+        typer.Argument(help="Name of the new thing and, with .toml or .py behind it, of its file.", metavar="NAME"),
+    ],
+    out: Annotated[Path, typer.Option(help="Folder for the file.")] = Path("."),
+    overwrite: Annotated[bool, typer.Option(help="Replace a file of this name.")] = False,
+) -> None:
+    """Write a commented scene, lens, sensor or fault model that works as it is, to start your own from."""
+    from ..output.template_files import write_template
+
+    typer.echo(str(write_template(kind, name, out, overwrite=overwrite)))
+
+
+@app.command(rich_help_panel=_PANEL)
 def schema(
-    kind: Annotated[str, typer.Argument(help="kind of file: scene, lens or sensor")] = "scene",
+    kind: Annotated[str, typer.Argument(help="One of scene, lens and sensor.", metavar="KIND")] = "scene",
     plugins: PluginOption = None,
 ) -> None:
     """Print the JSON Schema of a kind of TOML file, for editors that check and complete it."""
