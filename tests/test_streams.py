@@ -30,6 +30,7 @@ COMMANDS = {
     "detector": "cmv4000 --out {}/d --pixels 64 --points 8 --stack 2",
     "list": "faults",
     "schema": "",
+    "new": "lens own --out {} --overwrite",
 }
 # they end with the test render, or a sample's files, and print through the same calls
 _WITH_MITSUBA = {"render", "doctor"}

@@ -22,6 +22,8 @@ F64 = NDArray[np.float64]
 _COLOURS = {"R": "tab:red", "G": "tab:green", "B": "tab:blue", "N": "tab:brown", "W": "0.4", "M": "0.2"}
 _LEAST_PIXELS = 16
 _MOST_BINS = 200
+# Variances below this fraction of the largest are not drawn: saturated pixels, whose noise is clipped.
+_LEAST_NOISE = 1e-4
 # title, x axis and y axis of each panel
 _PANELS = (
     ("photon transfer", "signal / DN", "temporal variance / DN²"),
@@ -146,13 +148,14 @@ def draw(channels: Mapping[str, Characterisation], title: str, path: Path) -> No
         colour = _COLOURS.get(name[0], "0.3")
         _draw_signals(axes[0], name, channel, colour)
         _draw_spatial(axes[1], name, channel, colour)
-    top = max(float(channel.transfer.variance_dn2.max()) for channel in channels.values())
-    axes[0, 0].set_ylim(top * 1e-4, top * 2)
     _set_ticks(axes)
     for panel, (head, x, y) in zip(axes.ravel(), _PANELS, strict=True):
         panel.set(title=head, xlabel=x, ylabel=y)
         panel.grid(alpha=0.3)
         panel.legend(fontsize=7)
+    low, high = axes[1, 0].get_ylim()
+    axes[1, 0].set_ylim(low, high * (high / low) ** 0.2)  # room for the legend, as the spectra fill the panel
+    axes[1, 0].legend(fontsize=7, loc="upper center", ncols=len(channels))
     figure.savefig(path, dpi=100)
 
 
@@ -160,7 +163,8 @@ def _draw_signals(panels: Any, name: str, channel: Characterisation, colour: str
     """Draw photon transfer, response and dark signal of one channel."""
     transfer, result = channel.transfer, channel.result
     signal = transfer.mean_dn - transfer.dark_mean_dn
-    noise = np.maximum(transfer.variance_dn2 - transfer.dark_variance_dn2, 1e-3)
+    noise = transfer.variance_dn2 - transfer.dark_variance_dn2
+    noise = np.where(noise > _LEAST_NOISE * noise.max(), noise, np.nan)  # none of a saturated pixel
     panels[0].loglog(signal, noise, ".", color=colour, label=f"{name}: K = {result.gain_dn_per_e:.4g} DN/e")
     panels[0].loglog(signal, result.gain_dn_per_e * signal, "-", lw=0.8, color=colour)
     panels[1].plot(

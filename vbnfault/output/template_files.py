@@ -8,7 +8,7 @@ from pathlib import Path
 from ..core.errors import InputError, shown
 
 _FOLDER = Path(__file__).parent / "templates"
-# Kind of file → name of its template, ending of the file, and the name that the template has in place of the user's.
+# Kind of file → its template, the ending of the file, and the name that stands in the template for the user's.
 _KINDS = {
     "scene": ("scene.toml", ".toml", "my_scene"),
     "lens": ("lens.toml", ".toml", "my_lens"),
