@@ -2,19 +2,27 @@
 
 from __future__ import annotations
 
+import json
 import tomllib
+from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
 from typer.testing import CliRunner
 
 from vbnfault import cli, dataset, store
 from vbnfault.core.errors import InputError
+from vbnfault.core.quantities import Electrons
 from vbnfault.detector import load_sensor
+from vbnfault.faults import plugins
+from vbnfault.faults.models import undoing_registrations
 from vbnfault.lens import first_order, load_lens
 from vbnfault.output import template_files
 from vbnfault.output.template_files import write_template
+from vbnfault.pipeline import configure_faults
 from vbnfault.scene.config import load_scene
+from vbnfault.testing import check_fault, make_context
 
 
 def test_the_command_writes_each_kind(tmp_path: Path) -> None:
@@ -70,10 +78,48 @@ def test_the_lens_and_the_sensor_are_read(tmp_path: Path) -> None:
     assert (sensor.name, sensor.readout.bits) == ("chip", 12)
 
 
+@pytest.fixture
+def undone() -> Iterator[None]:
+    """What a plug-in has registered is gone after the test."""
+    with undoing_registrations(always=True):
+        yield
+        plugins.forget_all()
+
+
+@pytest.mark.usefixtures("undone")
+def test_the_fault_keeps_the_contract_and_acts_in_a_scene(tmp_path: Path) -> None:
+    write_template("fault", "rain_drop", tmp_path)
+    path = write_template("scene", "first", tmp_path)
+    text = path.read_text(encoding="utf-8")
+    path.write_text(f'plugins = ["rain_drop.py"]\n{text}\n[faults.rain_drop]\nradius_px = 200\n', encoding="utf-8")
+    scene = load_scene(path)
+    fault = configure_faults(scene)["rain_drop"]
+    assert type(fault).__name__ == "RainDrop"
+    check_fault(type(fault), examples=3)
+    context = make_context(128)
+    params = fault.draw(context, np.random.default_rng(0))
+    assert params["radius_px"] == 200 / 8
+    flat = Electrons(array=np.full((128, 128, 3), 1000.0, np.float32), white_e=13500.0)
+    dark = fault.apply(flat, params, context).array < 999
+    assert np.array_equal(dark.all(axis=2), fault.footprint(params, context))
+    assert dark.any()
+
+
+def test_the_schema_of_each_kind_accepts_its_template(tmp_path: Path) -> None:
+    for kind in ("lens", "sensor"):
+        done = CliRunner().invoke(cli.app, ["schema", kind])
+        keys = json.loads(done.output)["properties"]
+        assert set(tomllib.loads(write_template(kind, "own", tmp_path / kind).read_text(encoding="utf-8"))) <= set(
+            keys
+        )
+    refused = CliRunner().invoke(cli.app, ["schema", "camera"])
+    assert "schema camera: must be one of scene, lens, sensor" in str(refused.exception)
+
+
 def test_a_sensor_without_sources_is_told_all_that_are_missing(tmp_path: Path) -> None:
     path = write_template("sensor", "chip", tmp_path)
     text = path.read_text(encoding="utf-8")
-    path.write_text(text[: text.index("[sources]")], encoding="utf-8")
+    path.write_text(text[: text.index("\n[sources]")], encoding="utf-8")
     with pytest.raises(InputError) as caught:
         load_sensor(path)
     for key in ("width_px", "pixel_pitch_um", "individual.prnu", "readout.bits", "transfer.row_readout_s"):
