@@ -166,6 +166,14 @@ def test_a_block_with_a_wrong_option_is_refused(tmp_path: Path) -> None:
         blocks.parse(["bulid", "quickstart"])
 
 
+def test_inline_commands_name_real_commands() -> None:
+    known = {words[0] for words, _ in reference.walk_commands()}
+    texts = [page.read_text(encoding="utf-8") for page in PAGES]
+    named = {word for text in texts for word in re.findall(r"`vbnfault ([a-z]+)", text)}
+    assert len(named) > 5
+    assert named <= known
+
+
 def generated(page: str) -> str:
     """Return a reference page as Sphinx reads it."""
     text = reference.fill((DOCS / "reference" / f"{page}.md").read_text(encoding="utf-8"))
