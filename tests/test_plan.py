@@ -552,7 +552,9 @@ def test_rows_are_exchanged_where_a_split_wins_a_class_and_loses_none(theirs: li
 def test_splits_that_cannot_hold_every_class_are_told() -> None:
     few = scene(dataset={"samples": 16, "sites": 2, "shard_samples": 8})
     (sentence,) = plan.shortcomings(few, planned(few, ALL_FAULTS))
-    assert sentence.startswith("split test has no samples: 2 sites are in use (dataset.sites = 2")
+    assert sentence.startswith(
+        "split test has no samples: a site belongs to one split, and 2 sites are in use (dataset.sites = 2, "
+    )
     rare = scene(dataset={"samples": 30, "sites": 3, "shard_samples": 1}, plan={"faulty_fraction": 0.04})
     p = planned(rare, ALL_FAULTS[:2])
     assert p.injected.any(axis=1).sum() == 1

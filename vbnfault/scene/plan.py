@@ -139,10 +139,12 @@ def shortcomings(scene: Scene, table: Plan) -> list[str]:
         here = table.split == code
         if not here.any():
             if fractions[name] > 0:
+                used = len(np.unique(table.site))
                 out.append(
-                    f"split {name} has no samples: {len(np.unique(table.site))} sites are in use "
-                    f"(dataset.sites = {scene.dataset.sites}, one for each {scene.dataset.shard_samples} samples), "
-                    "and a site belongs to one split"
+                    f"split {name} has no samples: a site belongs to one split, and {used} "
+                    f"{'site is' if used == 1 else 'sites are'} in use (dataset.sites = {scene.dataset.sites}, and "
+                    f"dataset.shard_samples = {scene.dataset.shard_samples} samples at each); make more samples "
+                    "or lower dataset.shard_samples"
                 )
             continue
         lacking = table.injected.any(axis=0) & ~table.injected[here].any(axis=0)
