@@ -5,8 +5,8 @@ The formulas are those of Werner & Scheeres 1996, Celest. Mech. Dyn. Astron. 65,
     U = ½ Gρ (Σ_e L_e r_e·E_e·r_e - Σ_f ω_f r_f·F_f·r_f)
     ∇U = -Gρ (Σ_e L_e E_e·r_e - Σ_f ω_f F_f·r_f)
 
-The sums run over edges e and faces f; r points from the field point to any point of the edge or
-face. E and F are dyads of normals, L_e is the logarithmic term of an edge, and ω_f is the solid angle of a face.
+The sums run over edges e and faces f. The vector r_e or r_f points from the field point to any point of the edge or
+face. E and F are dyads of normals. L_e is the logarithmic term of an edge. ω_f is the solid angle of a face.
 """
 
 from __future__ import annotations
@@ -22,18 +22,22 @@ GRAVITATIONAL_CONSTANT = 6.67430e-11  # m³ kg⁻¹ s⁻², CODATA 2018
 
 
 class GravityField(NamedTuple):
-    """Hold the potential (positive, U = GM/r far away) and the acceleration (its gradient) at k points."""
+    """Hold the gravity at k points: the potential and its gradient, which is the acceleration.
+
+    The potential is positive; far from the body it is U = GM/r.
+    """
 
     potential_m2_s2: Float64
     acceleration_m_s2: Float64
 
 
 class PolyhedronGravity:
-    """Compute the field of a polyhedron; the dyads of its edges and faces are prepared once.
+    """Compute the gravity of a polyhedron; the constructor computes the dyads of edges and faces once.
 
-    The field is valid inside, outside and on the surface. At an edge itself, where its factor vanishes, the
-    logarithm is limited. The value at a point does not depend, to the bit, on the other points of the call: all
-    sums run over the mesh alone and avoid BLAS, whose order of summation changes with threads and shapes.
+    The field is valid inside the body, outside the body and on its surface. At a point on an edge, the logarithm of
+    this edge is infinite but its factor is 0, so the code limits the logarithm. The result at a point is the same
+    to the bit whatever other points are in the call. For this, all sums run over the mesh alone and avoid BLAS,
+    whose order of summation changes with the number of threads and the shapes of the arrays.
 
     Parameters
     ----------
@@ -47,8 +51,8 @@ class PolyhedronGravity:
 
     def __init__(self, vertices_m: NDArray, faces: NDArray, density_kg_m3: float) -> None:
         self.density_kg_m3 = float(density_kg_m3)
-        # Coordinates refer to the centre of the bounding box. The terms below nearly cancel, and smaller terms lose
-        # fewer digits.
+        # Coordinates start at the centre of the bounding box. The terms of the sums nearly cancel, and with small
+        # coordinates they lose fewer digits.
         self._centre_m: Float64 = 0.5 * (vertices_m.max(axis=0) + vertices_m.min(axis=0)).astype(np.float64)
         self._vertices_m: Float64 = np.asarray(vertices_m, dtype=np.float64) - self._centre_m
         self._faces = np.asarray(faces, dtype=np.int64)
@@ -62,8 +66,8 @@ class PolyhedronGravity:
         owner = np.tile(np.arange(len(self._faces)), 3)
         along = self._vertices_m[directed[:, 1]] - self._vertices_m[directed[:, 0]]
         length = np.linalg.norm(along, axis=1)
-        # These unit vectors lie in the face's plane, perpendicular to the edge, and point out of the face
-        # (counter-clockwise winding).
+        # Unit vectors in the plane of the face, perpendicular to the edge. They point out of the face, because the
+        # winding is counter-clockwise.
         outward = np.cross(along / length[:, None], normals[owner])
         half_dyad = np.einsum("ei,ej->eij", normals[owner], outward)
         key = directed.min(axis=1) * len(self._vertices_m) + directed.max(axis=1)
@@ -76,7 +80,7 @@ class PolyhedronGravity:
         self._edge_start_m: Float64 = self._vertices_m[self._edges[:, 0]]
 
     def evaluate(self, points_m: ArrayLike) -> GravityField:
-        """Return the potential and the acceleration of the attraction alone.
+        """Return the potential and the acceleration of gravity, without the centrifugal term.
 
         Parameters
         ----------
@@ -91,20 +95,20 @@ class PolyhedronGravity:
         points = np.atleast_2d(np.asarray(points_m, dtype=np.float64)) - self._centre_m
         potential = np.empty(len(points))
         acceleration = np.empty((len(points), 3))
-        # One point at a time is fast enough: tens of thousands of edges fill the vector units. Memory stays that of
-        # one mesh.
+        # A loop over points is fast enough, because tens of thousands of edges fill the vector units. The loop
+        # needs memory for only one array over the mesh.
         for k, point in enumerate(points):
             potential[k], acceleration[k] = self._at(point)
         return GravityField(potential, acceleration)
 
     def _at(self, point: Float64) -> tuple[float, Float64]:
-        """Return the potential and the acceleration at one point, given relative to the centre of the box."""
+        """Return potential and acceleration at a point, whose coordinates start at the centre of the box."""
         to_vertex = self._vertices_m - point
         distance = np.sqrt(np.einsum("vi,vi->v", to_vertex, to_vertex))
 
         to_edge = self._edge_start_m - point
         ends = distance[self._edges[:, 0]] + distance[self._edges[:, 1]]
-        # ln((a+b+e)/(a+b−e)) loses digits far away. The equal 2 artanh(e/(a+b)) does not.
+        # Far away, ln((a+b+e)/(a+b−e)) loses digits, but 2 artanh(e/(a+b)), which is equal, does not.
         ratio = np.minimum(self._edge_length_m / np.maximum(ends, 1e-300), 1.0 - 1e-16)
         log_term = 2.0 * np.arctanh(ratio)
         edge_vector = np.einsum("eij,ej->ei", self._edge_dyad, to_edge) * log_term[:, None]
@@ -128,7 +132,7 @@ class PolyhedronGravity:
         return float(potential), acceleration
 
     def effective(self, points_m: ArrayLike, omega_rad_s: float) -> Float64:
-        """Return attraction plus the centrifugal term of a rotation about +z, float64[k, 3] in m/s²."""
+        """Return gravity plus the centrifugal term of a rotation about +z, float64[k, 3] in m/s²."""
         points = np.atleast_2d(np.asarray(points_m, dtype=np.float64))
         acceleration = self.evaluate(points).acceleration_m_s2
         acceleration[:, :2] += omega_rad_s**2 * points[:, :2]
@@ -148,5 +152,5 @@ def polyhedron_potential(vertices_m: NDArray, faces: NDArray, density_kg_m3: flo
 def effective_gravity(
     vertices_m: NDArray, faces: NDArray, density_kg_m3: float, points_m: ArrayLike, *, omega_rad_s: float
 ) -> Float64:
-    """Return attraction plus centrifugal term, float64[k, 3] in m/s², of a polyhedron that rotates about +z."""
+    """Return gravity plus centrifugal term, float64[k, 3] in m/s², of a polyhedron that rotates about +z."""
     return PolyhedronGravity(vertices_m, faces, density_kg_m3).effective(points_m, omega_rad_s)

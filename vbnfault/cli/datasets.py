@@ -18,7 +18,7 @@ _PANEL = "Datasets"
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class WorkOptions:
-    """Hold the options that say how a build does its work; fields of `dataset.BuildOptions`."""
+    """Hold the options that control how a build runs; the names are those of `dataset.BuildOptions`."""
 
     workers: Annotated[int, typer.Option(min=1, max=MOST_PROCESSES, help="Number of processes.")] = 1
     threads: Annotated[

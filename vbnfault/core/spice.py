@@ -5,9 +5,10 @@ This is the only module that imports spiceypy, an optional extra (`pip install '
 TargetFromSource. Positions are geometric, without light time or aberration, like those of the built-in two-body
 ephemeris.
 
-SPICE runs in a separate process, which starts with the first kernel. A damaged kernel can crash CSPICE in native
-code; it then ends only that process. If the calling program uses spiceypy too, its kernels are not visible here and
-do not change. The process keeps all kernels in one pool, so they are loaded only within a `with` block:
+SPICE runs in a separate process, which starts when the first question is sent to SPICE. A damaged kernel can crash
+CSPICE in native code; such a crash ends only the separate process. If the calling program also uses spiceypy, this
+module neither sees nor changes the program's kernels. The separate process keeps all kernels in one pool. Kernels
+are therefore loaded only within a `with` block:
 
     with kernels("mission.tm"):
         et_s = et_s_from_utc("2014-08-06T00:00:00")
@@ -47,10 +48,10 @@ METRES_PER_KM = 1000.0
 SECONDS_PER_DAY = 86400.0
 J_FRAME = "J2000"  # SPICE's name for the ICRF axes
 
-# CSPICE is not thread-safe, and threads would share their kernels.
+# CSPICE is not thread-safe, and all threads would share one pool of kernels.
 _pool = threading.RLock()
 
-# SPICE short message → its meaning here; other errors keep SPICE's words.
+# Explanations of SPICE's short messages. For all other errors, the message quotes SPICE's text.
 _MEANINGS = {
     "SPICE(SPKINSUFFDATA)": "the kernels hold no position at that epoch",
     "SPICE(NOLOADEDFILES)": "no kernel with positions is loaded",
@@ -82,15 +83,16 @@ class SpacecraftState:
 
 @contextmanager
 def kernels(*paths: str | Path) -> Iterator[None]:
-    """Load kernels for a block, in the order given; later kernels take precedence.
+    """Load kernels for the duration of a `with` block, in the given order; later kernels take precedence.
 
-    Kernels of an outer block stay loaded after this block. Other threads that use this module wait until it ends.
+    The kernels of an outer block stay loaded when this block ends. Other threads that use this module wait until
+    this block ends.
 
     Parameters
     ----------
     paths
-        Kernels of any type, also meta-kernels. SPICE resolves the relative paths in a meta-kernel from the working
-        folder, unless the meta-kernel's PATH_VALUES say otherwise.
+        Kernels of any type, including meta-kernels. SPICE takes relative paths in a meta-kernel as relative to the
+        working folder, unless PATH_VALUES in the meta-kernel name another folder.
 
     Raises
     ------
@@ -111,43 +113,45 @@ def kernels(*paths: str | Path) -> Iterator[None]:
                 for path in paths:
                     _ask(str(path), "load", str(path), os.getcwd())
             except InputError:
-                if before == 0:  # SPICE keeps records of a refused file: start afresh
+                if before == 0:  # SPICE keeps records of a refused file, so end its process
                     _end()
                 raise
             yield
         finally:
-            if reader is _reader is not None:  # otherwise it has ended, and its pool is gone
+            if reader is _reader is not None:  # a process that has ended has no pool to unload from
                 _ask("SPICE kernels", "unload", before)
 
 
 def loaded() -> int:
-    """Return the number of kernels that are loaded now."""
+    """Return the number of kernels that are currently loaded."""
     return int(_ask("SPICE kernels", "loaded"))
 
 
 def read_dsk(path: str | Path) -> tuple[F64, NDArray[np.int64]]:
-    """Return the plates of a NAIF DSK: all type 2 segments, which must belong to one body and surface.
+    """Return the triangular plates of a NAIF DSK: those of all its segments of type 2.
+
+    These segments must belong to the same body and surface.
 
     Parameters
     ----------
     path
-        Path of the file, already checked by `resources.read_input`.
+        Path of the file, which `resources.read_input` has already checked.
 
     Returns
     -------
     vertices_km, faces
-        float64[n, 3] in the body-fixed frame that the segments name, and int64[m, 3] counted from 0.
+        float64[n, 3] in the body-fixed frame that the segments name, and int64[m, 3], vertex numbers from 0.
 
     Raises
     ------
     InputError
-        spiceypy is not installed, the file is no DSK or is damaged, or it holds no segment of type 2 or segments of
-        several surfaces.
+        spiceypy is not installed, the file is not a DSK, the file is damaged, no segment is of type 2, or the
+        segments belong to several surfaces.
     """
     _check_installed(str(path))
     size = resources.file_status(path)
     more_s = 0.0 if size is None else size.st_size / _DSK_BYTES_PER_S
-    reader = _Reader()  # a separate process, since SPICE keeps records of a refused file
+    reader = _Reader()  # a process for this file only, since SPICE keeps records of a refused file
     try:
         vertices_km, faces = _answer(reader, str(path), "dsk", os.path.abspath(path), cpu_s=_CPU_S + more_s)
     finally:
@@ -161,12 +165,12 @@ def et_s_from_julian_date(julian_date: float) -> float:
 
 
 def julian_date_from_et_s(et_s: float) -> float:
-    """Return the TDB Julian date of an ephemeris time. This inverts `et_s_from_julian_date`."""
+    """Return the TDB Julian date of an ephemeris time, which is in seconds TDB past J2000.0."""
     return J2000_JD + et_s / SECONDS_PER_DAY
 
 
 def et_s_from_utc(utc: str) -> float:
-    """Return the ephemeris time, seconds TDB past J2000.0, of a UTC text such as "2014-08-06T12:00:00".
+    """Return the ephemeris time, in seconds TDB past J2000.0, of a UTC text such as "2014-08-06T12:00:00".
 
     Raises
     ------
@@ -179,7 +183,7 @@ def et_s_from_utc(utc: str) -> float:
 def sun_position_J_au(target: str, et_s: float) -> F64:
     """Return the geometric position of the Sun from the target's centre, float64[3] au, frame J.
 
-    `frames.Orbit.position_J_au` has the opposite direction: it is the target's position from the Sun.
+    `frames.Orbit.position_J_au` has the opposite direction: from the Sun to the target.
 
     Parameters
     ----------
@@ -199,12 +203,15 @@ def sun_position_J_au(target: str, et_s: float) -> F64:
 
 
 def J_from_T(frame: str, et_s: float) -> F64:
-    """Return the attitude of a body-fixed frame, float64[3, 3], from T to ICRF axes; its transpose is T_from_J.
+    """Return the rotation matrix from a body-fixed frame T to the ICRF axes, float64[3, 3].
+
+    The transpose of this matrix is T_from_J.
 
     Parameters
     ----------
     frame
-        SPICE name of the body-fixed frame, such as "IAU_EROS" or "67P/C-G_CK"; its axes must be those of the shape.
+        SPICE name of the body-fixed frame, such as "IAU_EROS" or "67P/C-G_CK". The axes of this frame must be those
+        of the shape model.
     et_s
         Ephemeris time, seconds TDB past J2000.0.
 
@@ -230,13 +237,13 @@ def pose_T(
     et_s
         Ephemeris time, seconds TDB past J2000.0.
     K_from_C
-        Rotation float64[3, 3] from C (x image right, y image down, z boresight) to K, as the instrument's frame
-        kernel describes it; default: K is C.
+        Rotation float64[3, 3] from C (x image right, y image down, z boresight) to K. The frame kernel of the
+        instrument describes this rotation. By default K is C.
 
     Raises
     ------
     InputError
-        A body or frame is unknown, the kernels hold no position or attitude at the epoch, or K_from_C is no
+        A body or frame is unknown, the kernels hold no position or attitude at the epoch, or K_from_C is not a
         rotation.
     """
     mounting = np.eye(3) if K_from_C is None else np.asarray(K_from_C, dtype=np.float64)
@@ -255,7 +262,7 @@ def pose_T(
 
 
 def _epoch(et_s: float) -> str:
-    """Return an ephemeris time as a Julian date for an error message."""
+    """Return the text of an ephemeris time, as a Julian date, for an error message."""
     return f"JD {julian_date_from_et_s(et_s):.6f} TDB"
 
 
@@ -269,13 +276,16 @@ _DEEPEST_META_KERNEL = 8
 
 
 def _check_installed(purpose: str) -> None:
-    """Raise InputError, whose message begins with `purpose`, where spiceypy is not installed."""
+    """Raise InputError if spiceypy is not installed; the message begins with `purpose`."""
     if importlib.util.find_spec("spiceypy") is None:
         raise InputError(f"{purpose}: needs spiceypy: pip install 'vbnfault[spice]'.")
 
 
 def _check_kernel(path: Path, depth: int = 0) -> None:
-    """Check that a kernel, and those that a meta-kernel names, are regular files: a pipe would block SPICE."""
+    """Check that a kernel is a regular file, because a pipe would block SPICE.
+
+    If the kernel is a meta-kernel, the kernels that it names are checked too.
+    """
     resources.check_path(str(path), "SPICE kernel")
     if resources.head_of_input(path, "SPICE kernel", 8).startswith(_BINARY):
         resources.check_input(path, "SPICE kernel")
@@ -295,7 +305,7 @@ def _check_kernel(path: Path, depth: int = 0) -> None:
         for symbol in sorted(symbols, key=len, reverse=True):
             named = named.replace(f"${symbol}", symbols[symbol])
         status = resources.file_status(named)
-        if status is not None:  # for a missing file, SPICE's message is better
+        if status is not None:  # if the file is missing, SPICE's message is better
             if depth == _DEEPEST_META_KERNEL:
                 raise InputError(f"{path}: names meta-kernels more than {_DEEPEST_META_KERNEL} deep.")
             _check_kernel(Path(named), depth + 1)
@@ -304,16 +314,16 @@ def _check_kernel(path: Path, depth: int = 0) -> None:
 
 # --- the process that SPICE runs in ---------------------------------------------------------------------------
 
-# CPU time for one question: many times what an undamaged kernel needs.
+# CPU time limit for one question. An undamaged kernel needs only a small part of this time.
 _CPU_S = 15.0
 _DSK_BYTES_PER_S = 5e6
 _ADDRESS_SPACE_BYTES = 6 << 30
 _DSK_MOST_SEGMENTS = 10_000
-_PLATE_BYTES, _VERTEX_BYTES = 12, 24  # the least that a DSK of type 2 needs
+_PLATE_BYTES, _VERTEX_BYTES = 12, 24  # smallest numbers of bytes that a DSK of type 2 stores
 
 
 class _Reader:
-    """Run a process that answers questions to SPICE, one after the other."""
+    """Run a separate process for SPICE, which answers one question after the other."""
 
     def __init__(self) -> None:
         self.owner = os.getpid()
@@ -327,11 +337,11 @@ class _Reader:
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
-            start_new_session=True,  # only this process acts on Ctrl-C; the other ends with its input
+            start_new_session=True,  # Ctrl-C does not reach the SPICE process; it ends with its input
         )
 
     def ask(self, question: tuple[Any, ...]) -> Any:
-        """Return the answer to a question. Raises EOFError or OSError where the process ends before it answers."""
+        """Return the answer to a question. Raises EOFError or OSError if the process ends before it answers."""
         assert self.process.stdin is not None
         assert self.process.stdout is not None
         pickle.dump(question, self.process.stdin)
@@ -339,7 +349,7 @@ class _Reader:
         return pickle.load(self.process.stdout)
 
     def close(self) -> int:
-        """End the process. Return its exit code, which is negative after a signal."""
+        """End the process and return its exit code. The code is negative if a signal ended the process."""
         assert self.process.stdin is not None
         assert self.process.stdout is not None
         with suppress(OSError):
@@ -354,7 +364,7 @@ _reader: _Reader | None = None
 
 @atexit.register
 def _end() -> None:
-    """End the shared process, if this process started it."""
+    """End the shared SPICE process if the current process started it."""
     global _reader
     if _reader is not None and _reader.owner == os.getpid():
         _reader.close()
@@ -362,11 +372,14 @@ def _end() -> None:
 
 
 def _ask(purpose: str, name: str, *arguments: Any, cpu_s: float = _CPU_S) -> Any:
-    """Return SPICE's answer to a question of `_QUESTIONS`. Raises InputError; its message begins with `purpose`."""
+    """Return the answer of the shared SPICE process to a question of `_QUESTIONS`.
+
+    Raises InputError, with a message that begins with `purpose`, if SPICE refuses the question or the process ends.
+    """
     global _reader
     _check_installed(purpose)
     with _pool:
-        if _reader is None or _reader.owner != os.getpid():  # after a fork the pipes are the parent's
+        if _reader is None or _reader.owner != os.getpid():  # after a fork, the pipes belong to the parent process
             _reader = _Reader()
         try:
             return _answer(_reader, purpose, name, *arguments, cpu_s=cpu_s)
@@ -376,12 +389,12 @@ def _ask(purpose: str, name: str, *arguments: Any, cpu_s: float = _CPU_S) -> Any
 
 
 def _answer(reader: _Reader, purpose: str, name: str, *arguments: Any, cpu_s: float) -> Any:
-    """Return the answer of a process to one question. Raises InputError where it refuses, or has ended."""
+    """Return the answer of a process to a question. Raises InputError if the process refuses it or has ended."""
     try:
         kind, answer = reader.ask((name, arguments, cpu_s))
     except (EOFError, OSError, pickle.UnpicklingError):
         raise InputError(f"{purpose}: SPICE {_cause(reader.close())}: a kernel is damaged.") from None
-    except BaseException:  # after an interrupt, the next question would get this answer
+    except BaseException:  # without this, the next question after an interrupt would get this answer
         reader.process.kill()
         reader.close()
         raise
@@ -391,7 +404,7 @@ def _answer(reader: _Reader, purpose: str, name: str, *arguments: Any, cpu_s: fl
 
 
 def _cause(code: int) -> str:
-    """Return, for an error message, why the process ended with an exit code."""
+    """Return the reason for an exit code of the SPICE process, as text for an error message."""
     if -code == getattr(signal, "SIGXCPU", 0):
         return "does not come to an end"
     name = signal.Signals(-code).name if code < 0 else f"exit code {code}"
@@ -399,13 +412,13 @@ def _cause(code: int) -> str:
 
 
 def serve() -> None:
-    """Answer questions from standard input until it ends. This is the whole program of the process for SPICE."""
+    """Answer questions from standard input until the input ends. The SPICE process runs only this function."""
     answers = os.fdopen(os.dup(1), "wb")
-    os.dup2(2, 1)  # text that CSPICE prints must not mix with the answers
+    os.dup2(2, 1)  # CSPICE prints to file descriptor 1, and its text must not mix with the answers
     questions = sys.stdin.buffer
     try:
         import resource
-    except ImportError:  # Windows has no such limits
+    except ImportError:  # Windows does not have this module
         resource = None  # type: ignore[assignment]
     if resource is not None:
         for limit, value in ((resource.RLIMIT_CORE, 0), (resource.RLIMIT_AS, _ADDRESS_SPACE_BYTES)):
@@ -433,29 +446,30 @@ def serve() -> None:
             answer = "refused", _meaning(error)
         except MemoryError:
             answer = "refused", "takes more memory than a kernel may"
-        except Exception as error:  # spiceypy raises it for texts and numbers too large for C
+        except Exception as error:  # spiceypy raises such errors if a text or number is too large for C
             answer = "refused", f"SPICE refuses it ({type(error).__name__})"
         pickle.dump(answer, answers)
         answers.flush()
 
 
 def _load(spiceypy: Any, path: str, folder: str) -> None:
-    """Load a kernel; a meta-kernel's relative paths start from `folder`."""
+    """Load a kernel; relative paths in a meta-kernel are relative to `folder`."""
     os.chdir(folder)
     spiceypy.furnsh(path)
 
 
 def _unload(spiceypy: Any, before: int) -> None:
-    """Unload all but the first `before` kernels, also those that a failed meta-kernel had loaded."""
+    """Unload all kernels except the first `before`, including kernels from a meta-kernel that failed to load."""
     for index in range(spiceypy.ktotal("ALL") - 1, before - 1, -1):
         with suppress(spiceypy.utils.exceptions.SpiceyError):
             spiceypy.unload(spiceypy.kdata(index, "ALL")[0])
 
 
 def _dsk(spiceypy: Any, path: str) -> tuple[F64, NDArray[np.int64]]:
-    """Return the vertices in km and the faces of a DSK (`read_dsk`).
+    """Return the vertices in km and the faces of a DSK, for `read_dsk`.
 
-    A damaged file may state any number of plates, so the numbers are checked against the size of the file.
+    A damaged file may state any number of vertices and plates. Therefore the code compares these numbers with the
+    size of the file before it allocates memory.
     """
     vertices: list[F64] = []
     faces: list[NDArray[np.int64]] = []
@@ -505,10 +519,10 @@ _QUESTIONS: dict[str, Callable[..., Any]] = {
 
 
 def _meaning(error: Any) -> str:
-    """Return one clause, without a full stop, for an error of spiceypy."""
+    """Return the explanation of a spiceypy error, as one clause without a full stop."""
     short = str(getattr(error, "short", ""))
     if short in _MEANINGS:
         return _MEANINGS[short]
-    # SPICE explains over several sentences; the first says what went wrong.
+    # SPICE's explanation has several sentences, and the first sentence describes the error.
     words = " ".join(str(getattr(error, "long", "") or error).split())
     return f"SPICE says: {words.split('. ')[0].rstrip('.')}"

@@ -1,4 +1,7 @@
-"""Build, resume, repair and extend a dataset, and derive what its store must hold from its scene."""
+"""Build, resume, repair, extend and check a dataset.
+
+`store_spec`, `scene_identity` and `planned` compute from a scene what the store of its dataset must hold.
+"""
 
 from .build import BuildOptions
 from .checking import missing_plugins, verify

@@ -1,4 +1,7 @@
-"""Describe in words what a scene will photograph, without rendering: `vbnfault describe`, `build --dry-run`."""
+"""Describe in words what a scene will photograph, without rendering.
+
+The commands `vbnfault describe` and `vbnfault build --dry-run` print this description.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +23,7 @@ def describe(session: Session, *, sample_bytes: int, seconds: float) -> list[str
     Parameters
     ----------
     session : Session
-        The scene with its plan; neither terrain nor renderer is needed.
+        Session of the scene, with its plan. The function uses neither the terrain nor the renderer.
     sample_bytes : int
         Approximate size of a sample on disk.
     seconds : float
@@ -36,7 +39,7 @@ def describe(session: Session, *, sample_bytes: int, seconds: float) -> list[str
 
 
 def _samples(session: Session) -> list[str]:
-    """Describe the numbers of samples: by site, device, stratum, fault class and split."""
+    """Return lines with the numbers of samples for each site, device, stratum, fault class and split."""
     scene, table = session.scene, session.plan
     per_site = np.bincount(table.site)
     per_site = per_site[per_site > 0]
@@ -62,7 +65,7 @@ def _samples(session: Session) -> list[str]:
 
 
 def _geometry(session: Session) -> list[str]:
-    """Describe camera positions, attitudes and the Sun, or the trajectory of a SPICE spacecraft."""
+    """Return lines about the camera's positions and attitudes (or its SPICE trajectory) and about the Sun."""
     scene, table = session.scene, session.plan
     geometry, camera = scene.geometry, scene.camera
     sun = f"Sun: {assemble.sun_distance_au(scene):.4g} au away"
@@ -76,7 +79,7 @@ def _geometry(session: Session) -> list[str]:
     low, high = geometry.height_m
     above = "the ground below the camera" if geometry.height_reference == "local_ground" else "the site"
     across = 2 * np.tan(np.radians(camera.fov_deg) / 2)
-    # poses with a surface within the clearance are refused, so no camera is lower than that
+    # a pose is refused if a surface is closer than the clearance, so no camera is lower than the clearance
     nearest = max(low, min(geometry.clearance_m, high))
     lines = [
         f"heights: {low:g} to {high:g} m above {above}, x {_bounds(geometry.x_m)} m, y {_bounds(geometry.y_m)} m",
@@ -125,7 +128,7 @@ def _down(session: Session) -> str:
 
 
 def _camera(session: Session) -> list[str]:
-    """Describe camera, lens, detector and exposure."""
+    """Return lines about the camera, the lens, the detector and the exposure."""
     scene, camera = session.scene, session.base_camera
     settings = scene.camera
     if settings.exposure_s == "auto":
@@ -146,16 +149,16 @@ def _camera(session: Session) -> list[str]:
 
 
 def _range(low: float, high: float) -> str:
-    """Return `low to high`, or one number if both are equal."""
+    """Return `low to high` as text, or a single number if both bounds are equal."""
     return f"{low:g}" if low == high else f"{low:g} to {high:g}"
 
 
 def _span(low: float, high: float) -> str:
-    """Return a range with three significant digits."""
+    """Return a range as text, with three significant digits."""
     return _range(float(f"{low:.3g}"), float(f"{high:.3g}"))
 
 
 def _bounds(pair: tuple[float, float] | None) -> str:
-    """Return bounds as text; a resolved scene has no None."""
+    """Return bounds as text. The bounds are never None, because the scene is resolved."""
     assert pair is not None
     return _range(*pair)

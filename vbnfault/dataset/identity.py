@@ -1,4 +1,9 @@
-"""Derive from a scene the spec and root attributes of its store, and from these the planned scalars of a sample."""
+"""Compute what a store must hold according to its scene.
+
+`store_spec` returns the spec of the store, which includes the root attributes. `scene_identity` returns the part of
+the root attributes that identifies the scene. `planned` computes the scalars of each sample that the plan sets; it
+reads the root attributes of an existing store.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +31,7 @@ from ..scene.instrument import OF_THE_DETECTOR
 from ..store import StoreSpec
 from ..world import assemble
 
-# Libraries whose version may change a pixel value.
+# A new version of one of these libraries may change pixel values.
 _LIBRARIES = ("mitsuba", "drjit", "numpy", "scipy", "trimesh", "scikit-image", "colour-science", "zarr")
 _OPENCV = ("opencv-python-headless", "opencv-python")
 
@@ -39,16 +44,16 @@ def versions() -> dict[str, str]:
             numbers[name] = importlib.metadata.version(name)
         except importlib.metadata.PackageNotFoundError:
             continue
-    with contextlib.suppress(VbnfaultError):  # planning and verifying need no LLVM
+    with contextlib.suppress(VbnfaultError):  # plans and checks work without LLVM, so a missing LLVM is no error
         version = llvm.find().version or ()
         numbers["llvm"] = ".".join(map(str, version))
     return numbers | {"machine": platform.machine()}
 
 
 def scene_identity(session: pipeline.Session) -> dict[str, Any]:
-    """Return the resolved scene with a digest of the contents of each file instead of its path.
+    """Return the resolved scene, in which a digest of each file's contents replaces the path of the file.
 
-    The number of samples is left out: appending samples does not change the scene.
+    The result omits the number of samples, because the identity must not change when samples are appended.
     """
     scene = session.scene.resolved()
     scene["body"]["shape_sha256"] = session.body.content_hash
@@ -56,7 +61,7 @@ def scene_identity(session: pipeline.Session) -> dict[str, Any]:
         scene["body"]["shape"] = _digest(session.scene.body.shape, "shape")
     if session.scene.camera.detector:
         for key in OF_THE_DETECTOR:
-            del scene["camera"][key]  # the detector's own value is used instead
+            del scene["camera"][key]  # the value in the detector's file overrides this key
     scene["faults"] = {name: fault.to_dict() for name, fault in session.faults.items()}
     for name, table in scene["faults"].items():
         _contents_of_fault(table, session.faults[name], session.scene)
@@ -81,7 +86,7 @@ def scene_identity(session: pipeline.Session) -> dict[str, Any]:
 
 
 def _contents_of_fault(table: dict[str, Any], fault: Fault, scene: Scene) -> None:
-    """Replace the paths in the table of a fault by digests of their contents."""
+    """Replace each path in the table of a fault by a digest of the file's contents."""
     for f in dataclasses.fields(fault):
         if f.metadata["kind"] == "path" and table[f.name]:
             content, packaged, path = f.metadata["content"], f.metadata["packaged"], table[f.name]
@@ -94,19 +99,22 @@ def _contents_of_fault(table: dict[str, Any], fault: Fault, scene: Scene) -> Non
 
 
 def _digest(path: str | Path, what: str) -> str:
-    """Return `sha256:` and the digest of a file's contents; a renamed file keeps it."""
+    """Return `sha256:` followed by the digest of a file's contents; the digest does not depend on its name."""
     return f"sha256:{resources.sha256(resources.read_input(path, what))}"
 
 
 def _lens_digest(name: str) -> str:
-    """Return `sha256:` and the digests, joined by +, of a lens file and of the glass catalogues that it uses."""
+    """Return `sha256:` and the digests of a lens file and of the glass catalogues it refers to, joined by +."""
     with resources.noting() as digests:
         load_lens(name)
     return f"sha256:{'+'.join(digests)}"
 
 
 def _contents_of_files(identity: dict[str, Any], scene: Scene) -> None:
-    """Replace the paths of lens, detector, spacecraft, kernels and stars by digests of their contents."""
+    """Replace the paths in a scene by digests: lens, detector, spacecraft model and SPICE kernels.
+
+    If the scene has stars, the digest of the star catalogue is added.
+    """
     if scene.camera.lens:
         identity["camera"]["lens"] = _lens_digest(scene.camera.lens)
     if scene.camera.detector:
@@ -114,11 +122,11 @@ def _contents_of_files(identity: dict[str, Any], scene: Scene) -> None:
             resources.find("scenes/detectors", scene.camera.detector), "detector"
         )
     if scene.spacecraft.model not in ("none", "default"):
-        with resources.noting() as digests:  # a glTF file refers to further files
+        with resources.noting() as digests:  # a glTF file may refer to other files, whose digests are needed too
             assemble.spacecraft(scene)
         identity["spacecraft"]["model"] = f"sha256:{'+'.join(digests)}"
     if scene.spice.kernels:
-        # a meta-kernel only lists other kernels, so the ephemeris that they give is hashed, not its text
+        # the text of a meta-kernel only lists other kernels, so the digest is that of the resulting ephemeris
         sun_J_au, T_from_J = assemble.ephemeris(scene)
         follows = [*sun_J_au.tolist(), *T_from_J.ravel().tolist()]
         if scene.spice.spacecraft:
@@ -132,12 +140,22 @@ def _contents_of_files(identity: dict[str, Any], scene: Scene) -> None:
 
 
 def store_spec(session: pipeline.Session, blocks: Sequence[int]) -> StoreSpec:
-    """Return the spec of the store of a scene, planned in `blocks`.
+    """Return the spec of the store of a scene whose samples are planned in `blocks`.
 
-    Raises InputError for layers that the scene's world does not provide.
+    Parameters
+    ----------
+    session
+        Session of the scene.
+    blocks
+        Number of samples in each block: the first block, then the appended blocks in order.
+
+    Raises
+    ------
+    InputError
+        The scene asks for a layer that its world does not provide, or worker processes cannot load a fault.
     """
     scene = session.scene
-    dataset, camera = scene.dataset, session.base_camera  # first: a lens that cannot be used is reported here
+    dataset, camera = scene.dataset, session.base_camera  # base_camera first: it reports an unusable lens
     layers = tuple(name for name in stored_layers(scene, session.faults) if name != "clean")
     individuals = scene.camera.individuals
     _check_origins(session.faults)
@@ -187,7 +205,7 @@ def store_spec(session: pipeline.Session, blocks: Sequence[int]) -> StoreSpec:
 
 
 def _check_origins(faults: Mapping[str, Fault]) -> None:
-    """Raise InputError for a fault that other processes cannot load, such as one defined in a notebook."""
+    """Raise InputError if worker processes cannot load a fault, for example a fault defined in a notebook."""
     for name, fault in faults.items():
         if not belongs_here(fault):
             cls = type(fault)
@@ -198,7 +216,7 @@ def _check_origins(faults: Mapping[str, Fault]) -> None:
 
 
 def _mask_rule(kind: str, fault: Fault) -> str:
-    """Return the rule of a fault class's mask as a sentence."""
+    """Return the rule by which the mask of a fault class is made, as text."""
     if kind == "effect":
         return store.EFFECT_RULE
     rule = masks.footprint_rule(fault)
@@ -208,17 +226,18 @@ def _mask_rule(kind: str, fault: Fault) -> str:
 
 
 def _intensity(detector: Detector) -> str:
-    """Return where the intensity channel comes from, as text."""
+    """Return a text that names the source of the intensity channel."""
     if "W" in detector.channels:
         return "pixels without a colour filter"
     return "luminance of RGB, Rec. 709 weights"
 
 
 def is_exact(attributes: Mapping[str, Any]) -> bool:
-    """Return whether every commanded fault of a stored scene must be injected.
+    """Return whether a stored scene must inject every commanded fault.
 
-    This needs a new view where a fault cannot show. So the result is False if `plan.on_invisible` is not
-    `redraw_view`, if SPICE places the camera, or if `geometry.sun_visibility` is `as_drawn`.
+    A fault that is invisible in a view can be injected only if the view is drawn again. The result is therefore
+    False if `plan.on_invisible` is not `redraw_view`, if SPICE places the camera, or if `geometry.sun_visibility`
+    is `as_drawn`.
     """
     scene = attributes["scene"]
     redraws = scene.get("plan", {}).get("on_invisible") == "redraw_view"
@@ -227,17 +246,17 @@ def is_exact(attributes: Mapping[str, Any]) -> bool:
 
 
 def stored_scene(attributes: Mapping[str, Any]) -> Scene:
-    """Return the scene from which a store was planned, without digests of file contents."""
+    """Return the scene of a store from its root attributes, without the digests that `scene_identity` added."""
     scene = attributes["scene"]
     stored = {key: value for key, value in scene.items() if key != "plugins" and not key.endswith("_sha256")}
     stored["body"] = {key: value for key, value in stored["body"].items() if key != "shape_sha256"}
     if stored["body"].get("photometry", {}).get("model") not in reflectance.registry():
-        stored["body"].pop("photometry", None)  # it came from a plug-in, and no plan depends on it
-    # a scene's identity adds keys that are not valid in a scene
+        stored["body"].pop("photometry", None)  # the model is a plug-in's; no plan depends on the photometry
+    # `scene_identity` adds keys that are not valid in a scene
     for name, added in (("sky", "catalogue"),):
         stored[name] = {key: value for key, value in stored.get(name, {}).items() if key != added}
     if stored["camera"].get("lens"):
-        # earlier versions stored these keys of a thin lens here, without effect; no plan depends on them
+        # earlier versions also stored these two keys of a thin lens here; the keys had no effect on any plan
         unused = ("f_number", "transmission")
         stored["camera"] = {key: value for key, value in stored["camera"].items() if key not in unused}
     stored["dataset"] = {**stored["dataset"], "samples": attributes["blocks"][0]}
@@ -245,7 +264,10 @@ def stored_scene(attributes: Mapping[str, Any]) -> Scene:
 
 
 def classes_that_need_sun(attributes: Mapping[str, Any]) -> list[str]:
-    """Return the fault classes of a store whose samples face the Sun; those of plug-ins as the store names them."""
+    """Return the sorted names of a store's fault classes whose samples must face the Sun.
+
+    The store lists such classes of plug-ins by name. For packaged classes, the registry decides.
+    """
     plugins = attributes["scene"].get("plugins", {})
     classes = {name for plugin in plugins.values() for name in plugin["needs_sun"]}
     for name, model in attributes["fault_models"].items():
@@ -256,10 +278,10 @@ def classes_that_need_sun(attributes: Mapping[str, Any]) -> list[str]:
 
 
 def planned(attributes: Mapping[str, Any], faults: Sequence[str]) -> Callable[[int, int], dict[str, Any]]:
-    """Return a function that gives the planned scalars of a sample, for `store.examine`.
+    """Return a function that computes the planned scalars of a sample; `store.examine` calls this function.
 
-    The function takes a sample and its stored `tries`, which select the view. It returns the scalars that rendering
-    cannot change, and the commanded faults, bool[fault], as `injected`.
+    The function takes the index of a sample and the stored number of tries, which selects the view. The function
+    returns the scalars that rendering cannot change. Its key `injected` holds the commanded faults, bool[fault].
 
     Parameters
     ----------
@@ -273,7 +295,7 @@ def planned(attributes: Mapping[str, Any], faults: Sequence[str]) -> Callable[[i
 
     def expected(index: int, tries: int) -> dict[str, Any]:
         drawn = table.view(scene, index, tries - 1)
-        # if SPICE places camera and Sun, the plan does not set these angles
+        # if SPICE sets the positions of camera and Sun, the plan does not set these angles
         names = ("sun_azimuth_deg", "sun_elevation_deg", "roll_deg", "pitch_deg", "yaw_deg")
         angles = () if scene.spice.spacecraft else names
         return {

@@ -1,1 +1,18 @@
-"""Compute the Sun's straylight on the sensor: ghosts, starburst, glare, veil, and their sum."""
+"""Compute the Sun's straylight on the sensor: ghosts, starburst, glare, veil, and their sum.
+
+Modules:
+
+- `settings` describes the Sun, the sensor, the state of the lens, and the path of the direct image.
+- `bundles` traces bundles of rays along reflection paths, and `steps` advances the rays by one surface. These two
+  modules clip rays at rims.
+- `ghosts` computes the box of the rays that pass the lens, for each ghost, and the table of ghosts (flux, position
+  and size) from exact rays.
+- `paraxial` computes the same table to first order, and the transmittance along the axis.
+- `raster` draws bundles of rays on the sensor.
+- `irradiance` renders the image of all ghosts with these modules.
+- `starburst` computes the light that the stop diffracts.
+- `scatter` computes the glare, which surfaces and dust scatter, and the transmission of a baffle.
+- `total` adds the veil, and returns the sum of all straylight and the remaining fraction of the direct image.
+
+To change where ghosts are clipped, see `steps.meet`, which lists all code that does so.
+"""

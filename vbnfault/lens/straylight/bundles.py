@@ -1,11 +1,15 @@
 """Trace rays along many reflection paths at once: all ghosts and all wavelengths run in one kernel.
 
 Each path is a table of steps, so that the rays of all ghosts run side by side through one loop (Hullin et al.
-2011). Rays start on a grid in the plane of the first vertex. Computation is in single precision; a ray's position
-is kept relative to the vertex that it has just met. Where both sides of the plane of axis and Sun are alike, only
-one side is traced.
+2011). Rays start on a grid in the plane of the first vertex. The computation is in single precision; the position
+of a ray is relative to the vertex of the surface that the ray has just met. If the boxes of the bundles are
+symmetric about the plane of axis and Sun, the code traces only one side of this plane.
 
-A route is the sequence of reflecting rows. Its path is the sequence of all surfaces met, each a step.
+A route is the sequence of reflecting surfaces, which are numbered by their row in the prescription. The path of a
+route is the sequence of all surfaces that a ray meets; each of them is one step.
+
+A ray is lost (clipped) outside the rim of any surface. `Tracer.rims_mm` holds the radii of round rims;
+`steps.meet`, which clips, lists the other code that applies rims.
 """
 
 from __future__ import annotations
@@ -48,8 +52,8 @@ class Rays:
     direction
         float64[bundle, 3]: unit vectors, with the Sun's azimuth at 0.
     disc
-        float64[bundle]: rounds a lattice to an ellipse of so many half widths, so that its outer rays follow a rim;
-        0 leaves it rectangular.
+        float64[bundle]: semi-axis, in half widths of the box, of the ellipse to which a lattice is rounded. The
+        outer rays of this lattice then follow a rim. With 0, the lattice stays rectangular.
     """
 
     route: NDArray[np.int64]
@@ -74,22 +78,25 @@ class Rays:
 
 @dataclass(frozen=True, eq=False)
 class Spots:
-    """Hold where rays arrive on the sensor: device arrays, bundle after bundle, row after row of its grid.
+    """Hold the arrival of every ray on the sensor.
+
+    The values are device arrays, in the order of the bundles; the rays of a bundle are in the order of the rows of
+    its lattice. A ray is lost (clipped) if `radius` is above 1 or, with soft edges, if `margin` is below -1.
 
     Attributes
     ----------
     across
-        int64[bundle]: rays along either side of each lattice.
+        int64[bundle]: rays along each side of each lattice.
     x_mm, y_mm
         Positions on the sensor.
     fraction
         Fraction of the light that the path transmits.
     radius
-        Largest distance from the axis at any surface of the path, over the radius of its rim; 1000 or more after a
-        missed surface or total reflection.
+        Largest relative radius along the path: distance from the axis over the radius of the rim in this direction.
+        The value is 1000 or more if the ray has missed a surface or is totally reflected.
     margin
-        Smallest value along the path of (1 - radius) over the width of the rim's soft edge; only where edges have
-        widths.
+        Smallest value along the path of (1 - relative radius) over the width of the rim's soft edge. The margin
+        is negative outside a rim. It is computed only if soft edges have widths.
     """
 
     rays: Rays
@@ -241,9 +248,14 @@ def _aspheric_terms(lens: Prescription) -> F64:
 
 
 class Tracer:
-    """Trace rays through a lens, with tables of its paths, indices and reflectances that are computed once.
+    """Trace rays through a lens; the constructor computes tables of paths, indices and reflectances once.
 
-    `reflections`: 2, or 4 to include the paths of four reflections.
+    `reflections` is 2, or 4 to include the paths of four reflections.
+
+    A ray is lost (clipped) outside `rims_mm`, float64[row]: the semi-diameter of each round rim, and infinity for
+    the sensor. `steps.meet` clips at these rims. `irradiance.ParaxialTracer` clips at the same rims to first order.
+    A stop with blades does not use `rims_mm` but `steps.StopBlades`. `paraxial.paraxial_ghosts` has separate rims.
+    From `rims_mm`, `ghosts` also computes first boxes and `irradiance` the widths of soft edges.
     """
 
     def __init__(
@@ -381,8 +393,8 @@ class Tracer:
         across
             Rays along either side of the lattice: one number for all bundles, or int64[bundle].
         width
-            float64[step]: width of the rim's soft edge at each step of each route, in radii of the rim. Without it
-            margins are not computed, and lost rays are not followed further.
+            float64[step]: width of the rim's soft edge at each step of each route, in radii of the rim. Without
+            widths, margins are not computed, and rays that miss a surface or are totally reflected become nan.
         options
             See `TraceOptions`; by default not centred, with light, and halved.
         """
@@ -587,7 +599,7 @@ class Tracer:
 
     @property
     def _blades(self) -> StopBlades | None:
-        """Return the shape of the stop, turned as the Sun's azimuth asks; None where it is round."""
+        """Return the blades of the stop, turned for the Sun's azimuth; None if the stop is round."""
         rim = self.lens.surfaces[self.lens.stop]
         return StopBlades(rim, self._stop_turn_rad) if rim.blades else None
 

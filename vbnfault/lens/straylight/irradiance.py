@@ -44,7 +44,11 @@ _LEAST = 1e-10  # irradiance over the Sun's below which a ghost is omitted
 
 
 class ParaxialTracer(Tracer):
-    """Trace rays by matrices instead of surfaces (Lee & Eisemann's model), with the tables of `Tracer`."""
+    """Trace rays by matrices instead of surfaces (Lee & Eisemann's model), with the tables of `Tracer`.
+
+    A ray is lost (clipped) outside the rims of `Tracer.rims_mm`, or outside the blades of the stop (`StopBlades`).
+    `steps.meet` does the same for exact rays and lists all code that applies rims.
+    """
 
     def __init__(
         self, lens: Prescription, wavelength_nm: F64, *, reflections: int = 2, routes_: Any = None
@@ -74,7 +78,10 @@ class ParaxialTracer(Tracer):
         width: F64 | None = None,
         **options: Unpack[TraceOptions],
     ) -> Spots:
-        """Trace as `Tracer.trace` does, to first order; the Sun's slope is the tangent of its angle."""
+        """Trace as `Tracer.trace` does, to first order; the slope of a ray is the tangent of its angle.
+
+        Here `beyond` and `radius` are relative radii, not squares as in `steps.meet`.
+        """
         be, t, f = backend(), self._tables, self._paraxial
         dr = be.dr
         side = np.broadcast_to(np.asarray(across, dtype=np.int64), len(rays))

@@ -2,8 +2,8 @@
 
 A ghost's ray leaves the plane of the first vertex at the height r with the Sun's slope θ. It meets surface k of its
 path at the height A_k r + B_k θ, and the sensor at M₀₀ r + M₀₁ θ. Slopes are unfolded at reflections, so heights
-keep their sign. Each rim passes the rays of one disc in the entrance plane. The ghost is the image of the overlap
-of these discs, magnified by M₀₀.
+keep their sign. Each rim passes the rays of one disc in the entrance plane; a ray is lost (clipped) outside this
+disc. The ghost is the image of the overlap of these discs, magnified by M₀₀.
 """
 
 from __future__ import annotations
@@ -152,7 +152,9 @@ def paraxial_ghosts(
 ) -> tuple[Ghost, ...]:
     """Return the ghosts of a far point source at an angle from the axis, towards an azimuth (0: +x).
 
-    Ghosts that no ray takes are left out.
+    A ray is lost (clipped) outside the round rim of any surface, whose radius is `semi_diameter_mm`; blades of the
+    stop are ignored. These rims are separate from those of the tracers, which `steps.meet` lists. Ghosts without
+    rays are left out.
     """
     turn = np.radians(azimuth_deg)
     slope = np.tan(np.radians(sun_deg)) * np.array([np.cos(turn), np.sin(turn)])

@@ -1,34 +1,38 @@
 """Compute the starburst of the Sun: Fraunhofer diffraction at the stop, averaged over the Sun's disc.
 
-A far source of wave number k₀ = 2π/λ gives, at the direction cosines u, the irradiance relative to its own at the
-entrance
+A far point source at the direction cosines u_sun has the irradiance E_sun at the entrance and the wave number
+k₀ = 2π/λ. At the direction cosines u, its light has the irradiance E on the sensor:
 
-    E / E_sun = cos θ_sun · cos⁴θ / f² · |A(k₀ (u - u_sun))|² / λ²,      A(k) = ∫ exp(-i k·x) dx
+    E / E_sun = cos θ_sun · cos⁴θ / f² · |A(k₀ (u - u_sun))|² / λ²,      A(k) = ∫ exp(-i k·x) dx.
 
-over the entrance pupil (Goodman, Introduction to Fourier Optics, chapter 4). |A|² / (λ² area) is the point spread
-function per unit of u, and cos⁴θ / f² = |d²u / d²x| for an image without distortion. Near the axis, u - u_sun is
-(x - x_sun) / f.
+The integral covers the entrance pupil (Goodman, Introduction to Fourier Optics, chapter 4). |A|² / (λ² area) is the
+point spread function per unit of u. The factor cos⁴θ / f² = |d²u / d²x| holds for an image without distortion. Near
+the axis, u - u_sun is (x - x_sun) / f.
 
-Averaging over a disc of angular radius σ multiplies the pupil's autocorrelation at the shift ξ by the disc's
-coherence 2 J₁(y) / y, y = σ k₀ ξ (van Cittert and Zernike; Born & Wolf, Principles of Optics, 10.4). Only shifts up
-to some λ / σ remain, 0.1 mm at 1 au. Where this is small against the stop, the first powers of ξ are enough:
+The average over a disc of angular radius σ multiplies the pupil's autocorrelation at the shift ξ by the disc's
+coherence 2 J₁(y) / y, y = σ k₀ ξ (van Cittert and Zernike; Born & Wolf, Principles of Optics, 10.4). The coherence
+leaves only shifts up to some λ / σ, which is 0.1 mm at 1 au. If this shift is small compared with the stop, the
+autocorrelation is needed only to the second power of ξ:
 
-- ξ¹, the rim. A length ds sends 2π ds / k² along its normal, in both directions. A straight edge gives a line
-  spike, a bent one a fan of 2πρ / k³ for its radius of curvature ρ, a circle 4πa / k³, the mean of Airy's rings.
-  Averaged over the disc, with the distance θ = |u - u_sun| and its component t across the normal,
+- ξ¹ describes the rim. A piece of the rim of length ds sends 2π ds / k² along its normal, in both directions. A
+  straight edge gives a line spike. A bent edge gives a fan, 2πρ / k³ for the radius of curvature ρ. A circle of
+  radius a gives 4πa / k³, which is the mean of Airy's rings. The average over the disc is
 
-      |A|² = 4 √(σ² - t²) / (σ² k₀³ (θ² - σ²)) · ds.
+      |A|² = 4 √(σ² - t²) / (σ² k₀³ (θ² - σ²)) · ds
 
-  A rim is described by its length per angle of the normal, convolved with this.
-- ξ², the corners. The ends of the edges at a corner are one point, so they add as amplitudes:
-  |A|² = (cot ψ₁ - cot ψ₂)² / k⁴ with the angles from their normals. Across a normal, cot² is Hadamard's finite
-  part, which subtracts from the spike the light that its wings contain. At the end of a bent edge it is Fresnel's
-  integral, which joins light and dark.
+  at the distance θ = |u - u_sun|, whose component across the normal is t. The code describes a rim by its length
+  per angle of the normal, and convolves this function with the average above.
+- ξ² describes the corners. The two edges at a corner end at the same point, so their amplitudes add:
+  |A|² = (cot ψ₁ - cot ψ₂)² / k⁴, where ψ₁ and ψ₂ are the angles from the normals of the two edges. The integral of
+  cot² across a normal is Hadamard's finite part. It subtracts from the spike the light that the wings of the spike
+  contain. At the end of a bent edge, Fresnel's integral replaces the cotangent and joins light and dark.
 
-Corners and edges add as powers, because their fringes, λ over their distance, are finer than the disc.
+The light of different corners and edges adds as power, because the interference fringes between them are finer than
+the disc: the period of the fringes is λ over the distance between the corners or edges.
 
-Approximations: the disc is uniform, and a circle in u although it is foreshortened by cos θ_sun on the line to the
-axis. Off the axis some spikes are therefore too wide by up to 1 / cos θ_sun, and too faint, for the same flux.
+Approximations: The disc is uniform. The disc is also a circle in u, although projection shortens the real disc by
+cos θ_sun along the line to the axis. Off the axis, some spikes are therefore too wide by up to 1 / cos θ_sun. These
+spikes are also too faint, so their flux is right.
 """
 
 from __future__ import annotations
@@ -50,32 +54,33 @@ from ..thin import beyond_frame
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
-_EDGE_POINTS = 2049  # along one blade, or round the whole rim
-_SUPERSAMPLING = 4  # finer samples along either side of a sample
+_EDGE_POINTS = 2049  # points along the edge of one blade, or around a round rim
+_SUPERSAMPLING = 4  # finer samples along each side of a sample
 _GOLDEN_RAD = np.pi * (3 - np.sqrt(5))
-_FARTHEST = 2.0  # largest distance of two sines
-_SHARE_LOST = 3e-3  # error, relative to the mean of the bands, that fewer tables may cause
-_STRIP = 64  # rows of a frame at a time
-_ROW_BLUR = 0.5  # blur of fringes, in steps of the table
-_NARROW = 1 / 8  # ratio of disc to distance below which a sine equals its angle
-_WING_SUNS = 12.0  # distance from an edge's normal, in radii of the disc, beyond which cot² needs no average
+_FARTHEST = 2.0  # largest distance between two directions, in direction cosines
+_SHARE_LOST = 3e-3  # largest error of a mix of fewer tables, relative to the mean of the bands
+_STRIP = 64  # rows of the frame that are computed at a time
+_ROW_BLUR = 0.5  # blur of fringes along the radius, in rows of the table
+_NARROW = 1 / 8  # ratio of the disc's radius to the distance below which sin φ = φ across a spike
+_WING_SUNS = 12.0  # distance from an edge's normal, in radii of the disc, beyond which cot² is not averaged
 _WING_STEP, _WING_POINTS, _WING_PLACES = 0.05, 1200, 241
 _STRAIGHT_PER_MM = 1e-9
 _LEAST_CORNER_RAD = 1e-3
 _LONE_BAND_NM = 150.0  # half width of a single band, as in vbnfault.core.spectra
-_HAT_POINTS = 17  # wavelengths on either side of a band's node
+_HAT_POINTS = 17  # wavelengths on each side of a band's node
 _HANKEL_POINTS = 4096
 _DISC_POINTS = 32
 _GRAIN_POINTS = 2048
-_OUTER_STEPS = 16  # angles of the table that are averaged for the flux outside the frame
+_OUTER_STEPS = 16  # angles of the table that are averaged into one for the flux outside the frame
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class StopDefects:
-    """Describe opaque dust and scratches on the stop, float64 arrays in mm of the plane of the stop.
+    """Describe opaque grains of dust and opaque scratches on the stop.
 
-    Grains have diameters. Scratches have lengths, widths and directions from +x towards +y. Raises InputError for
-    values that are out of range or arrays of unequal length.
+    The fields are float64 arrays with one value for each grain or each scratch. Lengths are in mm in the plane of
+    the stop. The angle of a scratch counts from +x towards +y. Raises InputError if a value is out of range or if
+    the arrays of the scratches differ in length.
     """
 
     grain_diameter_mm: F64 = field(default_factory=lambda: np.zeros(0))
@@ -120,12 +125,13 @@ def fraunhofer_psf(
     across: int = 256,
     defects: StopDefects | None = None,
 ) -> tuple[F64, float]:
-    """Return the point spread function of a stop for a point source, and its pitch on the sensor in mm.
+    """Return the point spread function of a stop for a point source, and the pitch of its samples on the sensor.
 
-    The function is float64[samples, samples] with sum 1: x to the right, y down, the middle at [samples // 2,
-    samples // 2]. `across` samples span the entrance pupil. The pitch is λ f `across` / (`samples` · diameter), and
-    the frame reaches `across` / 2 times λ f / diameter from the middle. Defects, in mm of the stop's plane, are
-    distributed evenly over it.
+    The function is float64[samples, samples] with sum 1. Its x axis points to the right, its y axis points down,
+    and its middle is the sample [samples // 2, samples // 2]. `across` samples span the entrance pupil. The pitch
+    in mm is λ f `across` / (`samples` · diameter). The frame reaches `across` / 2 times λ f / diameter from the
+    middle. The lengths of the defects are in mm in the plane of the stop; the code distributes the defects evenly
+    over the stop.
     """
     if not 8 <= across <= samples:
         raise InputError(f"across = {across}: must be from 8 to samples = {samples}")
@@ -138,7 +144,7 @@ def fraunhofer_psf(
         _block(open_, x, y, defects.scaled(1 / stop.semi_diameter_mm), pitch)
     mask = np.zeros((samples, samples))
     mask[:across, :across] = open_.reshape(across, _SUPERSAMPLING, across, _SUPERSAMPLING).mean(axis=(1, 3))
-    # averaging over a sample dims the far field: divide by its transform
+    # the mean over each sample dims the far field, so divide by the transform of that mean
     turn = np.pi * np.fft.fftshift(np.fft.fftfreq(samples)) + 1e-12
     mean = np.sin(turn) / (_SUPERSAMPLING * np.sin(turn / _SUPERSAMPLING))
     power = np.abs(np.fft.fftshift(np.fft.fft2(mask)) / (mean * mean[:, None])) ** 2
@@ -146,7 +152,7 @@ def fraunhofer_psf(
 
 
 def _block(open_: F64, x: NDArray[Any], y: NDArray[Any], defects: StopDefects, pitch: float) -> None:
-    """Close the area of a pupil that defects cover, in place; samples at their rims are closed partly."""
+    """Close the area of a pupil that defects cover, in place; partly covered samples are partly closed."""
 
     def within(half: float, distance: F64) -> F64:
         """Return the fraction of each sample that lies within a half width."""
@@ -155,7 +161,7 @@ def _block(open_: F64, x: NDArray[Any], y: NDArray[Any], defects: StopDefects, p
 
     grains, scratches = defects.grain_diameter_mm, defects.scratch_length_mm
     count = len(grains) + len(scratches)
-    # a sunflower's arrangement keeps defects apart and off the rim; the longest lies in the middle
+    # a sunflower's arrangement keeps the defects apart and off the rim; the longest defect is in the middle
     seed = np.argsort(np.argsort(-np.concatenate([grains, scratches]), kind="stable"), kind="stable")
     radius = 0.85 * np.sqrt(seed / max(count, 1))
     places = radius * np.cos(seed * _GOLDEN_RAD), radius * np.sin(seed * _GOLDEN_RAD)
@@ -177,21 +183,22 @@ def _block(open_: F64, x: NDArray[Any], y: NDArray[Any], defects: StopDefects, p
 class Starburst:
     """Compute the light that diffraction at a stop spreads over the sensor, averaged over the Sun's disc.
 
-    It is valid from an Airy radius beyond the limb outwards, and for a σ of 3 λ / entrance pupil or more. Its
-    difference from the transform of the sampled pupil is 1 % for means and 2 % for spikes. The first frame with a
-    set of wavelengths and a pitch computes tables, in some tenths of a second; the next frames reuse them.
+    The result is valid at distances of an Airy radius or more from the limb, if σ is at least 3 λ / diameter of the
+    entrance pupil. It differs from the transform of the sampled pupil by 1 % in means and by 2 % in spikes. The
+    first image for given wavelengths and a given pitch computes tables, which takes some tenths of a second. Later
+    images with the same wavelengths and pitch use the same tables.
 
     Attributes
     ----------
     efl_mm, pupil_radius_mm
-        Focal length, and radius of the paraxial entrance pupil's circle.
+        Focal length, and radius of the paraxial entrance pupil.
     sun_radius_rad
         Angular radius of the disc.
     stop, defects
-        Outline of the stop, and its defects in mm of the entrance pupil.
+        Surface of the stop, which has the outline, and the stop's defects in mm in the entrance pupil.
     radii, angles
-        Size of the polar table. It is logarithmic in the sine of the distance from the Sun, up to 2, and covers
-        half a turn, since |A(-k)| = |A(k)|.
+        Numbers of rows and columns of the polar table. The rows are logarithmic in the distance |u - u_sun|, up to
+        2. The columns cover half a turn, because |A(-k)| = |A(k)|.
     """
 
     efl_mm: float
@@ -212,22 +219,24 @@ class Starburst:
         *,
         half_width_nm: float | None = None,
     ) -> F32:
-        """Return irradiance on the sensor over the Sun's at the entrance, float32[band, y, x], without losses.
+        """Return the irradiance on the sensor over the Sun's irradiance at the entrance, float32[band, y, x].
+
+        The result holds for a lens with a transmission of 1.
 
         Parameters
         ----------
         sun_xy_mm
-            Image of the Sun's centre, from the middle of the frame, x to the right and y down (the lens's own x and
-            y). It may lie outside the frame. Within the Sun's own image the result continues the value just outside
-            it; the direct image, which is drawn elsewhere, outshines it.
+            Position of the image of the Sun's centre, from the middle of the frame. As in the lens, x points to the
+            right and y points down. The position may lie outside the frame. Inside the image of the Sun's disc, the
+            result has the value from just outside the disc; the direct image, which other code draws, is brighter.
         wavelength_nm
             Nodes of the bands, float64[band], rising. The weight of a band is a triangle that ends at its
             neighbours.
         shape, pitch_mm
-            (height, width) of the frame in pixels, and their pitch.
+            (height, width) of the frame in pixels, and the pitch of the pixels.
         half_width_nm
-            Half width of the triangles. None: up to the neighbours, or 150 nm of constant weight for a single band.
-            0: monochromatic.
+            Half width of the triangles. With None, each triangle ends at the neighbouring nodes, and a single band
+            has constant weight over 150 nm on each side. With 0, each band is monochromatic.
         """
         wavelength_nm = np.atleast_1d(np.asarray(wavelength_nm, dtype=np.float64))
         tables, mix = self._tables(wavelength_nm, pitch_mm, half_width_nm)
@@ -247,7 +256,7 @@ class Starburst:
             cosine = 1 / np.sqrt((1 + x * x) + y * y)
             du, dv = x * cosine - sun_u, y * cosine - sun_v
             apart = du * du + dv * dv
-            # beside a foreshortened Sun, u can lie inside the circle that the table assumes for the disc
+            # the real disc is foreshortened, so a u beside it can lie inside the circle that the table assumes
             apart = np.maximum(apart, np.float32(nearest**2))
             cosine *= cosine
             gain = cosine * cosine * np.float32(sun_cos / f**2) / (apart - np.float32(sigma**2))
@@ -272,15 +281,15 @@ class Starburst:
     ) -> F64:
         """Return the flux on the sensor plane outside the frame, float64[band] in mm².
 
-        It is divided by the Sun's irradiance at the entrance, and holds for a transmission of 1. Parameters as in
-        `image`.
+        The flux is divided by the Sun's irradiance at the entrance and holds for a lens with a transmission of 1.
+        The parameters are those of `image`.
         """
         wavelength_nm = np.atleast_1d(np.asarray(wavelength_nm, dtype=np.float64))
         tables, mix = self._tables(wavelength_nm, pitch_mm, half_width_nm)
         sine = self._sines(pitch_mm)
         slope = np.asarray(sun_xy_mm, dtype=np.float64) / self.efl_mm
         half = self.angles // math.gcd(self.angles, _OUTER_STEPS)
-        # average over steps of the angle: spikes are narrower than a step, but the frame is much wider
+        # average over steps of several angles: a spike is narrower than a step, but the frame is much wider
         means = tables[..., :-1].reshape(len(tables), len(sine), half, -1).mean(axis=-1, dtype=np.float64)
         angle = (np.arange(2 * half) + 0.5) * np.pi / half
         half_slope = (shape[1] / 2 * pitch_mm / self.efl_mm, shape[0] / 2 * pitch_mm / self.efl_mm)
@@ -288,12 +297,12 @@ class Starburst:
         missing_half = (missing[:, :half].astype(np.float64) + missing[:, half:]) * (np.pi / half)
         per_radius = np.einsum("tra,ra->tr", means, missing_half) / (sine**2 - self.sun_radius_rad**2)
         flux = np.trapezoid(per_radius * sine**2, x=np.log(sine), axis=1)
-        # within the nearest radius the image is constant
+        # inside the nearest radius of the table, the image is constant
         flux += per_radius[:, 0] * sine[0] ** 2 / 2
         return np.asarray(mix @ flux / np.sqrt(1 + slope @ slope))
 
     def _sines(self, pitch_mm: float) -> F64:
-        """Return |u - u_sun| of the rows of the table, float64[radius]."""
+        """Return the distance |u - u_sun| of each row of the table, float64[radius]."""
         nearest = self.sun_radius_rad + 0.9 * pitch_mm / self.efl_mm
         return np.asarray(np.geomspace(nearest, _FARTHEST, self.radii))
 
@@ -316,7 +325,7 @@ class Starburst:
 
 
 def _mixed(layers: F32, mix: F32, out: F32) -> None:
-    """Write the sums of layers, float32[table, y, x], by the weights of a mix, float32[band, table], to `out`."""
+    """Write to `out` each band's sum of layers, float32[table, y, x], weighted by `mix`, float32[band, table]."""
     for band, (first, *rest) in zip(out, mix, strict=True):
         np.multiply(layers[0], first, out=band)
         for layer, weight in zip(layers[1:], rest, strict=True):
@@ -331,9 +340,10 @@ def starburst(
     radii: int = 224,
     angles: int = 4096,
 ) -> Starburst:
-    """Return the starburst of a lens, with `defects` in mm of the stop's plane.
+    """Return the starburst of a lens; the lengths of `defects` are in mm in the plane of the stop.
 
-    `radii` × `angles` is the size of its tables; the default serves frames up to 1500 pixels wide.
+    The tables of the starburst have `radii` × `angles` values. The defaults are fine enough for frames up to 1500
+    pixels wide.
 
     Raises
     ------
@@ -359,11 +369,11 @@ def starburst(
 
 @dataclass(frozen=True, kw_only=True)
 class _Edge:
-    """Describe one blade's edge of the pupil, or the whole of a round rim, in pieces.
+    """Describe one blade's edge in the entrance pupil, or the whole of a round rim, in short pieces.
 
-    `length_mm` and `normal_rad` are lengths and directions of the normals of the pieces; the normal in the middle
-    of the edge has direction 0. `end_rad` is the direction at its end, and `end_curvature_per_mm` the curvature
-    there.
+    `count` is the number of such edges. `length_mm` is the length of each piece, and `normal_rad` is the direction
+    of the normal of each piece. The normal in the middle of the edge has the direction 0. `end_rad` is the
+    direction of the normal at the end of the edge, and `end_curvature_per_mm` is the curvature at this end.
     """
 
     count: int
@@ -374,7 +384,7 @@ class _Edge:
 
 
 def _edge(stop: Surface, pupil_radius_mm: float) -> _Edge:
-    """Return the edge of a stop, scaled to the pupil."""
+    """Return the edge of a stop, scaled to the entrance pupil."""
     count = max(stop.blades, 1)
     half = np.pi / count
     angle = np.linspace(-half, half, _EDGE_POINTS)
@@ -392,7 +402,7 @@ def _edge(stop: Surface, pupil_radius_mm: float) -> _Edge:
 
 
 def _hats(nodes_nm: F64, half_width_nm: float | None) -> tuple[tuple[F64, F64], ...]:
-    """Return the wavelengths that stand for each band, and their weights of sum 1."""
+    """Return the wavelengths that represent each band, and the weights of these wavelengths, whose sum is 1."""
     if half_width_nm is None and len(nodes_nm) == 1:
         nm = np.linspace(nodes_nm[0] - _LONE_BAND_NM, nodes_nm[0] + _LONE_BAND_NM, 2 * _HAT_POINTS)
         return ((nm, np.full(len(nm), 1 / len(nm))),)
@@ -414,7 +424,7 @@ def _hats(nodes_nm: F64, half_width_nm: float | None) -> tuple[tuple[F64, F64], 
 def _polar(burst: Starburst, sine: F64, bands: Sequence[tuple[F64, F64]], pixel_rad: float) -> F32:
     """Return (θ² - σ²) |A|² / λ², float32[band, radius, angle + 1]; `pixel_rad` is the rms width of a pixel."""
     edge = _edge(burst.stop, burst.pupil_radius_mm)
-    order = 2 * np.arange(burst.angles // 2 + 1)  # odd orders cancel, since light goes both ways along a normal
+    order = 2 * np.arange(burst.angles // 2 + 1)  # odd orders cancel: light takes both directions of a normal
     excess = sine**2 - burst.sun_radius_rad**2
     chord = _chord(sine, burst.sun_radius_rad, pixel_rad, burst.angles)
     grains = _grains(burst, sine, bands, pixel_rad)
@@ -428,7 +438,7 @@ def _polar(burst: Starburst, sine: F64, bands: Sequence[tuple[F64, F64]], pixel_
     nodes, corners = mm[:1], np.zeros((1, len(sine), int(repeats.sum())), dtype=np.complex128)
     opening = np.pi / edge.count - edge.end_rad
     if burst.stop.blades and opening > _LEAST_CORNER_RAD:
-        # in a corner the wavelength changes only the width of Fresnel's integral
+        # apart from k⁴, the wavelength changes only the width of Fresnel's integral, so three nodes are enough
         if edge.end_curvature_per_mm > _STRAIGHT_PER_MM:
             nodes = np.linspace(mm[0], mm[-1], min(len(mm), 3))
         powers = _corner(burst, sine, opening, edge.end_curvature_per_mm, nodes, pixel_rad)
@@ -451,16 +461,16 @@ def _polar(burst: Starburst, sine: F64, bands: Sequence[tuple[F64, F64]], pixel_
 
 
 def _fewest(tables: F32) -> tuple[F32, F32]:
-    """Return as few tables as represent all bands, and the weight of each table in each band.
+    """Return the smallest number of tables that represents all bands, and the weight of each table in each band.
 
-    Light of a rim grows with λ and that of corners with λ². Bands therefore differ in more than these two only
-    where defects show fringes.
+    The light of a rim grows with λ, and the light of corners grows with λ². Two tables are therefore nearly enough,
+    unless defects show fringes.
     """
     sample = tables[:, ::2, ::5].reshape(len(tables), -1).astype(np.float64)
     sample /= np.maximum(sample.mean(axis=0), 1e-30)
     _, mix = np.linalg.eigh(sample @ sample.T)
     mix = mix[:, ::-1]
-    for count in range(1, len(tables) // 2):  # more tables would save nothing
+    for count in range(1, len(tables) // 2):  # a mix of more tables would save nothing
         kept = mix[:, :count]
         if np.abs(sample - kept @ (kept.T @ sample)).max() < _SHARE_LOST:
             return np.tensordot(kept.T.astype(np.float32), tables, 1), kept.astype(np.float32)
@@ -468,9 +478,10 @@ def _fewest(tables: F32) -> tuple[F32, F32]:
 
 
 def _chord(sine: F64, sun_rad: float, pixel_rad: float, angles: int) -> F64:
-    """Return Fourier coefficients of a spike's cross profile over the angle, float64[radius, order].
+    """Return the Fourier coefficients, over the angle, of the profile across a spike, float64[radius, order].
 
-    Orders are even. The profile is (2 / π σ²) √(σ² - θ² sin²u), blurred by a pixel and by a step of the table.
+    Only even orders are returned. At the angle φ from the spike, the profile is (2 / π σ²) √(σ² - θ² sin²φ). It is
+    blurred by a pixel and by a step of the table.
     """
     from scipy.special import j1
 
@@ -487,7 +498,7 @@ def _chord(sine: F64, sun_rad: float, pixel_rad: float, angles: int) -> F64:
 
 
 def _blur(angles: int) -> F64:
-    """Return the coefficients of a blur by (1, 2, 1) / 4, float64[order], so that narrow features do not ring."""
+    """Return the Fourier coefficients of the blur (1, 2, 1) / 4, float64[order]; it prevents ringing."""
     return np.asarray(np.cos(np.arange(angles // 2 + 1) * np.pi / angles) ** 2)
 
 
@@ -496,15 +507,16 @@ def _corner(
 ) -> F64:
     """Return k⁴ |A|² of one corner without the light along its edges' normals, float64[wavelength, radius, angle].
 
-    The angle counts from the direction of the corner; the normals of its two edges lie `opening` to either side.
+    The angle counts from the direction of the corner. The normals of the two edges have the angles -`opening` and
+    +`opening`.
 
-    Averaging turns cot ψ and cot² ψ, with the Fresnel integral where edges are bent, into integrals over the
-    coherence μ(y) of the disc and a pixel, which together have the radius σ'. With q = θ sin ψ / σ', τ = θ / (2 ρ
-    σ'² k₀) and δ = q₁ + q₂,
+    The average over the disc and a pixel turns 1 / sin ψ and its square into integrals over the coherence μ(y).
+    Disc and pixel together have the radius σ'. Bent edges add the terms of Fresnel's integral, with τ. With
+    q = θ sin ψ / σ' for each edge, τ = θ / (2 ρ σ'² k₀) and δ = q₁ + q₂, the averages are
 
         1/q → ∫ μ(y) sin(qy + τy²) / (1 + 2τy/δ) dy,     1/q² → -∫ μ(y) [sin(qy + τy²) - sin(qy)] / (τy) dy.
 
-    Where the corner closes (δ → 0), the first cancels the second.
+    If both edges have the same normal (δ → 0), there is no corner, and the first integral cancels the second.
     """
     from scipy.special import j1
 
@@ -513,12 +525,12 @@ def _corner(
     y = (np.arange(_WING_POINTS) + 0.5) * _WING_STEP
     q = np.linspace(0, _WING_SUNS, _WING_PLACES)
     s = y * burst.sun_radius_rad / radius
-    # the last factor blurs by a twentieth of a radius; without it the limb would leave a cusp
+    # the term 0.05 y blurs by a twentieth of the radius; without this blur the limb would leave a cusp
     coherence = 2 * j1(s) / s * np.exp(-((y * pixel_rad / radius) ** 2 + (0.05 * y) ** 2) / 2) * _WING_STEP
     sines, cosines = np.sin(y[:, None] * q), np.cos(y[:, None] * q)
 
     def integral(of: NDArray[Any]) -> F64:
-        """Return Im ∫ μ(y) of(y) exp(iqy) dy at -q and q."""
+        """Return Im ∫ μ(y) of(y) exp(iqy) dy for the function `of`, at all values of -q and q."""
         odd, even = (coherence * of.real) @ sines, (coherence * of.imag) @ cosines
         return np.concatenate([(even - odd)[..., :0:-1], even + odd], axis=-1)
 
@@ -532,7 +544,7 @@ def _corner(
     places = (len(wavelength_mm), len(sine), 2 * len(q) - 1)
     kernels = [np.ascontiguousarray(np.broadcast_to(kernel, places)) for kernel in (single, square)]
 
-    angle = np.arange(burst.angles // 2 + 1) * np.pi / burst.angles  # the other half is its mirror image
+    angle = np.arange(burst.angles // 2 + 1) * np.pi / burst.angles  # the other half mirrors this half
     total = np.full((len(wavelength_mm), len(sine), len(angle)), 2.0)
     for psi in (opening - angle, opening + angle):
         psi = np.mod(psi + np.pi / 2, np.pi) - np.pi / 2
@@ -556,16 +568,17 @@ def _corner(
 def _add_scratches(
     tables: F32, chord: F64, burst: Starburst, sine: F64, bands: Sequence[tuple[F64, F64]], pixel_rad: float
 ) -> None:
-    """Add scratches to the tables of `_polar`, in place.
+    """Add the light of scratches to the tables of `_polar`, in place.
 
-    A scratch is two edges, whose fringes 4 sin²(kw / 2) = 2 - 2 cos(kw) are wide enough to be seen. Its finite
-    length, whose autocorrelation is a triangle, widens the spike.
+    A scratch of width w has two long edges. The interference fringes of these edges, 4 sin²(kw / 2) =
+    2 - 2 cos(kw), are wide enough to be visible. The autocorrelation over the finite length of a scratch is a
+    triangle, and therefore the spike is wider.
     """
     defects = burst.defects
     order = 2 * np.arange(burst.angles // 2 + 1)
     blur = _ROW_BLUR * np.log(sine[1] / sine[0])
     mean_k0_per_mm = 2e6 * np.pi / np.mean([nm @ weight for nm, weight in bands])
-    # Gauss points of the disc projected onto a line, weighted by 1/k²
+    # Gauss points of the disc, which is projected onto a line; the weights include 1/k²
     turn = np.arange(1, _DISC_POINTS + 1) * np.pi / (_DISC_POINTS + 1)
     offset = burst.sun_radius_rad * np.cos(turn)
     share = np.sin(turn) ** 2 / (sine[:, None] + offset) ** 2
@@ -587,8 +600,8 @@ def _add_scratches(
 def _grains(burst: Starburst, sine: F64, bands: Sequence[tuple[F64, F64]], pixel_rad: float) -> F64:
     """Return |A|² / λ² of all grains, float64[band, radius].
 
-    It is the Hankel transform of the grains' autocorrelations, averaged over the band, times the coherence of the
-    disc.
+    The code adds the autocorrelations of all grains, averages the sum over the band, multiplies it by the coherence
+    of the disc, and takes the Hankel transform.
     """
     from scipy.fft import fht
     from scipy.ndimage import gaussian_filter1d

@@ -1,7 +1,9 @@
-"""Advance rays from surface to surface on the device: where they meet it, how they go on, and how near its rim.
+"""Advance rays from surface to surface on the device.
 
-All values are drjit arrays with one lane for each ray, in single precision. Positions are relative to the vertex
-that a ray has just met.
+`meet` computes where a ray meets the next surface, refracts or reflects the ray, and clips it at the surface's rim.
+
+All values are drjit arrays with one lane for each ray, in single precision. Positions are relative to the vertex of
+the surface that a ray has just met.
 """
 
 from __future__ import annotations
@@ -16,9 +18,9 @@ import numpy as np
 
 from ..prescription import Surface
 
-_LOST, _FAR = -1e6, -1e4  # margin of lost rays, and the smallest margin of others
+_LOST, _FAR = -1e6, -1e4  # margin of rays that do not reach the sensor, and the smallest margin of other rays
 _BEYOND_EDGE = -1.0  # margin at which a soft edge ends in the dark
-_LIMIT_SHARPNESS = 100.0  # of the edge where a missed surface or total reflection, not a rim, ends the light
+_LIMIT_SHARPNESS = 100.0  # of an edge that a missed surface or total reflection makes, not a rim
 _LEAST_SLOPE = 1e-3  # smallest |dz| of a lost ray
 
 
@@ -44,24 +46,26 @@ def backend() -> Any:
 
 @dataclass(eq=False)
 class Step:
-    """Hold the data of one step: the next surface of a path, as plain numbers or fetched for every lane.
+    """Hold the data of one step, which is the next surface of a path.
+
+    The values are plain numbers, or device arrays with one value for each lane.
 
     Attributes
     ----------
     gap
-        Distance of the last vertex behind this one.
+        Distance of the vertex of the last surface behind the vertex of this surface.
     curvature, conic, aspheric
         Shape of the surface; `conic` is 1 + the conic constant.
     eta
         Index before the surface over the index behind it.
     per_rim, sharpness
-        One over the radius of the rim, and over the width of its soft edge in radii.
+        One over the radius of the rim, and one over the width of the rim's soft edge in radii of the rim.
     mirror, stop
         Whether the ray is reflected, and whether the surface is the stop.
     onward
-        Sign of dz before the surface, where it is known.
+        Sign of dz before the surface; None if the sign differs between lanes.
     absorption
-        Absorption coefficient per mm before the surface; None where no medium absorbs.
+        Absorption coefficient per mm before the surface; None if no medium absorbs.
     passed
         Function of the cosine of incidence that returns the reflected or transmitted fraction.
     """
@@ -82,10 +86,11 @@ class Step:
 
 @dataclass(eq=False)
 class _Hit:
-    """Hold where rays meet a surface: position, unit normal (None on a sphere), and `length` of the way to it.
+    """Hold the position at which rays meet a surface, the normal there, and the `length` of the path to it.
 
-    `cosine` is that of the angle of incidence, `facing` turns the normal towards the incoming ray, and `under` is
-    negative for rays that miss the surface.
+    `normal` is None on a sphere. `cosine` is the cosine of the angle of incidence. `facing` is the factor that
+    scales the normal to length 1 and turns it towards the incoming ray. `under` is negative for rays that miss the
+    surface.
     """
 
     x: Any
@@ -100,13 +105,17 @@ class _Hit:
 
 @dataclass(frozen=True)
 class StopBlades:
-    """Describe the shape of a stop with blades; `turn_rad` is the direction of its first corner from +x."""
+    """Describe the shape of a stop with blades; `turn_rad` is the direction of its first corner from +x.
+
+    A ray is lost (clipped) outside this rim. The stop's `semi_diameter_mm` is the distance of the corners from the
+    axis. For round rims see `bundles.Tracer`; `meet` lists all code that applies rims.
+    """
 
     rim: Surface
     turn_rad: float
 
     def relative_radius(self, x: Any, y: Any) -> Any:
-        """Return the distance from the axis over that of the stop's rim in its direction (`Surface.rim_mm`)."""
+        """Return the distance from the axis over that of the rim (`Surface.rim_mm`) in the same direction."""
         be, rim = backend(), self.rim
         dr = be.dr
         half = float(np.pi / rim.blades)
@@ -119,10 +128,19 @@ class StopBlades:
 def meet(
     at: Step, ray: Sequence[Any], *, soft: bool, special: bool, blades: StopBlades | None, light: bool = True
 ) -> tuple[Any, ...]:
-    """Advance rays to the next surface of their path, and refract or reflect them there.
+    """Advance rays to the next surface of their path, refract or reflect them there, and clip them at its rim.
 
-    A ray is position, direction, fraction and rims. The rims are the square of the largest relative radius so far
-    and, where edges are soft, the margin. Those of the mirrored ray follow if they differ.
+    A ray is lost (clipped) outside the rim of this surface. The code still follows a lost ray and only records the
+    rim values; `ghosts` and `raster` then leave out the light of lost rays, see `bundles.Spots`. Code that applies
+    rims to ghosts:
+
+    - `meet` (for exact rays) and `irradiance.ParaxialTracer.trace` (to first order). Round rims have the radii
+      `bundles.Tracer.rims_mm`. For a stop with blades, `StopBlades.relative_radius` gives the rim.
+    - `paraxial.paraxial_ghosts`, which reads the radii from the prescription and treats the stop as round.
+
+    A ray is a tuple of position, direction, fraction and rim values. The rim values are `radius`, the square of the
+    largest relative radius so far, and, if edges are soft, `margin`. If a stop with blades makes the rim values of
+    the mirrored ray different, these follow.
 
     Parameters
     ----------
@@ -131,7 +149,7 @@ def meet(
     special
         Whether any surface is a conic or an asphere.
     blades
-        Shape of the stop; None where it is round.
+        Shape of the stop; None if the stop is round.
     light
         Whether the transmitted fraction is computed.
     """
@@ -142,7 +160,7 @@ def meet(
 
     def real(square: Any) -> Any:
         """Return the root of a square that is negative for lost rays."""
-        # with soft edges a lost ray continues along the limit; otherwise it is nan from here on
+        # with soft edges a lost ray continues along the limit; with sharp edges the ray is nan from here on
         return dr.sqrt(dr.maximum(square, 0) if soft else square)
 
     hit = (_on_conic if special else _on_sphere)(at, ray, sense, real)
@@ -164,7 +182,7 @@ def meet(
         bend = turn * c
         dx, dy, dz = dr.fma(bend, hit.x, keep * dx), dr.fma(bend, hit.y, keep * dy), dr.fma(keep, dz, -turn)
         dz = dr.fma(bend, hit.z, dz)
-    # a ray is also lost where it misses a surface, is totally reflected or turns back; with soft edges it
+    # a ray is also lost if it misses a surface, is totally reflected or turns back; with soft edges the ray then
     # continues along the limit, so that the limit can be located between rays
     room = ahead = dz * onward
     if soft:
@@ -174,7 +192,10 @@ def meet(
 
 
 def _on_sphere(at: Step, ray: Sequence[Any], sense: Any, real: Callable[[Any], Any]) -> _Hit:
-    """Return where rays meet a sphere, on which the normal has length 1 and the root is the cosine of incidence."""
+    """Return where rays meet a sphere.
+
+    On a sphere, the normal has length 1, and the root of the quadratic equation is the cosine of incidence.
+    """
     dr = backend().dr
     x, y, z, dx, dy, dz = ray[:6]
     c = at.curvature
@@ -189,7 +210,7 @@ def _on_sphere(at: Step, ray: Sequence[Any], sense: Any, real: Callable[[Any], A
 
 
 def _on_conic(at: Step, ray: Sequence[Any], sense: Any, real: Callable[[Any], Any]) -> _Hit:
-    """Return where rays meet a conic or an asphere: first the plane of the vertex, then the surface."""
+    """Return where rays meet a conic or an asphere; the rays advance to the vertex plane first."""
     dr = backend().dr
     x, y, z, dx, dy, dz = ray[:6]
     c = at.curvature
@@ -241,14 +262,18 @@ def _to_asphere(at: Step, x: Any, y: Any, z: Any, dx: Any, dy: Any, dz: Any) -> 
 def _rims_after(
     at: Step, soft: bool, hit: _Hit, room: Any, rims: Sequence[Any], blades: StopBlades | None
 ) -> list[Any]:
-    """Return the rims of the rays after a surface; `room` is negative for rays that are lost there."""
+    """Return the rim values of the rays after a surface.
+
+    `room` is negative for rays that miss the surface, are totally reflected there, or turn back. `radius` and
+    `beyond` are squares of relative radii, before and at this surface; a ray with `beyond` above 1 is clipped.
+    """
     dr = backend().dr
     x, y = hit.x, hit.y
     sides = 2 if len(rims) > 1 + soft else 1
     out: list[Any] = []
     for k in range(sides):
         radius, *margin = rims[k * len(rims) // sides : (k + 1) * len(rims) // sides]
-        # near a rim 1 - r² is twice 1 - r, hence the 0.5 below
+        # near a rim 1 - r² is twice 1 - r; the factor 0.5 below corrects for this
         beyond = dr.fma(x, x, y * y) * (at.per_rim * at.per_rim)
         if blades is not None and at.stop is not False:
             blade = blades.relative_radius(x, -y if k else y)
@@ -256,16 +281,16 @@ def _rims_after(
         out.append(dr.maximum(radius, dr.select(room < 0, 1e6, beyond)))
         if soft:
             here = dr.minimum((1 - beyond) * (0.5 * at.sharpness), room * _LIMIT_SHARPNESS)
-            # after a ray is lost, later surfaces do not tell where the edge lies
+            # the margins of a lost ray at later surfaces do not locate the edge
             out.append(dr.select(margin[0] < _BEYOND_EDGE, margin[0], dr.minimum(margin[0], here)))
     return out
 
 
 def arrived(ray: Sequence[Any], last: Any, soft: bool) -> list[tuple[Any, Any]]:
-    """Return x, y, fraction, radius and, with soft edges, margin on the sensor, as `bundles.Spots` has them.
+    """Return x, y, fraction, radius and, with soft edges, margin on the sensor, as `bundles.Spots` describes them.
 
-    Each is a pair: of the rays, and of their mirror images. `last` is the distance of the last vertex behind the
-    sensor.
+    Each value is a pair: the first for the rays, the second for their mirror images. The radius is not squared
+    here. `last` is the distance of the vertex of the last surface behind the sensor.
     """
     dr = backend().dr
     x, y, z, dx, dy, dz, fraction, *rims = ray
