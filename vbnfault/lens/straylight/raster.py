@@ -1,9 +1,9 @@
-"""Draw bundles of rays on the sensor as irradiance: cells of a lattice become quadrilaterals.
+"""Draw bundles of rays on the sensor as irradiance: each cell of a lattice becomes a quadrilateral.
 
-The cells of a bundle's lattice tile its image; where the image folds, cells overlap and add. Each cell is two
-triangles. Irradiance and rim margin are interpolated between their corners, so that edges stay crisp between rays.
-Two kinds of cells are drawn differently: cells smaller than half a pixel are added to the nearest pixels, and cells
-where light folds are drawn as points on a cubic surface.
+The cells of a bundle's lattice tile the image of the bundle. If the image folds, cells overlap and their light
+adds. Each cell is two triangles. Irradiance and rim margin are interpolated between their corners, so that edges
+stay crisp between rays. Two kinds of cells are drawn differently: cells smaller than half a pixel are added to the
+nearest pixels, and cells where light folds are drawn as points on a cubic surface.
 
 Images with soft edges are drawn on coarser levels of an image pyramid. Sums are of integers, so the bits do not
 depend on the order in which threads add.
@@ -32,18 +32,18 @@ PARTS = ("inner", "edge", "rough")
 # (a, b, c) of each part: light with an edge's profile is a + b × calm, light without it c × calm × rise
 _SHARES = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, -1.0], [1.0, -1.0, 0.0]])
 _MARGIN = 4  # pixels around each level, for cells that lie partly outside
-_UNITS = 2.0**36  # of the integer sums, per unit of irradiance
+_UNITS = 2.0**36  # units of the integer sums per unit of irradiance
 _MOST = 1e5  # largest irradiance that one ghost adds to a pixel, far beyond white
-_CALM_SIGMA = 0.8  # sigma, in its pixels, by which a coarser level is smoothed
+_CALM_SIGMA = 0.8  # sigma by which a coarser level is smoothed, in pixels of this level
 _SMALL = 0.5  # cells below this many pixels are added to the nearest pixels
-EDGE_LOW, EDGE_HIGH = -1.0, 5.0  # range of the soft edge's profile, in its widths
+EDGE_LOW, EDGE_HIGH = -1.0, 5.0  # range of the profile of a soft edge, in widths of the edge
 _EDGE_NODES = 2049
 _UNLIKE = 0.05  # ratio of neighbouring areas below which a fold is near
 _SMOOTH = 0.5  # change of irradiance over a pixel that still looks smooth
-_LANES = 16  # of a vector unit
+_LANES = 16  # lanes of a vector unit
 _NARROW_PX = 1.5  # cells narrower than this are drawn by points
-_POINTS = 64  # most points along either side of a cell
-_WANDER = 1.0  # a cell's points may lie this many of its sizes beyond its corners
+_POINTS = 64  # largest number of points along each side of a cell
+_WANDER = 1.0  # largest distance of a cell's points beyond its corners, in sizes of the cell
 _EDGE_KINDS = 9
 
 
@@ -62,17 +62,17 @@ class Canvas:
 
     @property
     def starts(self) -> NDArray[np.int64]:
-        """Return where each level's bands begin in one flat array, and the array's length, int64[level + 1]."""
+        """Return the index in a flat array at which each level begins, and the array's length, int64[level + 1]."""
         return np.concatenate([[0], np.cumsum(self.sizes.prod(axis=1) * self.bands)])
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class BundleDrawing:
-    """Describe which bundles are drawn, and how; every array is by drawn bundle.
+    """Describe the bundles to draw; every array has one value or row for each drawn bundle.
 
-    The light of a ghost is the sum of three parts (`PARTS`), each drawn at a level of its own. `inner` rises
-    smoothly from the rims over the ramp. `edge` is the rest. Near folds and where light is crowded, both give way
-    to `rough`.
+    The light of a ghost is the sum of three parts (`PARTS`), and each part has a separate level. `inner`
+    rises smoothly from the rims over the ramp. `edge` is the remaining light. Near folds and steep changes of
+    magnification, `rough` replaces both.
 
     Attributes
     ----------
@@ -85,15 +85,15 @@ class BundleDrawing:
     strength
         Irradiance for a `fraction` of 1 without magnification.
     kind
-        Profile of its edges, see `edge_profiles`.
+        Kind of the edges' profile, see `edge_profiles`.
     ramp
-        Length of the ramp, in widths of its edge.
+        Length of the ramp, in widths of the edge.
     rough
         Whether the image is folded or unevenly magnified.
     magnification
-        Magnification of lengths for which its levels were chosen.
+        Magnification of lengths that was used to choose the levels.
     inner_level
-        Level of its part `inner`.
+        Level of the part `inner` of the same ghost.
     part
         Index into `PARTS`.
     """
@@ -113,17 +113,17 @@ class BundleDrawing:
 
 @lru_cache(maxsize=1)
 def edge_profiles() -> F32:
-    """Return the light across a soft edge, float32[kind, node].
+    """Return the relative irradiance across a soft edge, float32[kind, node].
 
     Nodes run from `EDGE_LOW` to `EDGE_HIGH` widths into the light. The width is the root of the sum of squares of
-    two widths: the Sun's (the radius of its disc) and Fresnel's. For kind k the arc tangent of their ratio,
-    Fresnel's over the Sun's, is k / 8 of 90°. Kind 0 is the visible fraction of a uniform disc; kind 8 is the
+    two widths: the Sun's (the radius of its disc) and Fresnel's. For kind k, the arc tangent of Fresnel's width
+    over the Sun's width is k / 8 of 90°. Kind 0 is the visible fraction of a uniform disc; kind 8 is the
     diffraction pattern of a straight edge, I = ((C + ½)² + (S + ½)²) / 2.
     """
     from scipy.special import fresnel
 
     s = np.linspace(EDGE_LOW, EDGE_HIGH, _EDGE_NODES)
-    # sample the disc by parallel chords, weighted with the area that each stands for
+    # sample the disc by parallel chords; the weight of a chord is the area that it represents
     ring = np.cos(np.pi * (np.arange(512) + 0.5) / 512)
     chord = np.sqrt(1 - ring**2)
     weight = chord * np.sqrt(1 - ring**2)
@@ -136,9 +136,9 @@ def edge_profiles() -> F32:
         angle = k / (_EDGE_KINDS - 1) * np.pi / 2
         v = (s[:, None] - np.cos(angle) * ring) / np.sin(angle)
         sine, cosine = fresnel(v)
-        # fade the outermost fringes, which the width of a band washes out
+        # fade the outermost fringes, because the width of a band makes them invisible
         out[k] = 1 + ((((cosine + 0.5) ** 2 + (sine + 0.5) ** 2) / 2) @ weight - 1) * fade
-    out[:, 0], out[:, -1] = 0, 1  # beyond the table's ends
+    out[:, 0], out[:, -1] = 0, 1  # values beyond the ends of the table
     return out.astype(np.float32)
 
 
@@ -171,7 +171,7 @@ class Sums:
                 self._splat(lattice.cells(UInt32(order)))
 
     def _fill(self, cells: _Cells) -> None:
-        """Draw cells as pairs of triangles, and small cells by their middle."""
+        """Draw cells as pairs of triangles; add small cells to the pixels nearest to their middle."""
         be = backend()
         dr, Float, Int32, UInt32 = be.dr, be.Float, be.Int32, be.UInt32
         ends = cells.ends()
@@ -221,9 +221,9 @@ class Sums:
         dr.eval(self._total)
 
     def _splat(self, cells: _Cells) -> None:
-        """Draw cells as points that are closer than pixels.
+        """Draw cells as points that are closer together than pixels.
 
-        Where light folds, the corners of a cell do not describe its surface.
+        This is for cells in which light folds, because their corners do not describe their surface.
         """
         be = backend()
         dr, Float, Int32, UInt32 = be.dr, be.Float, be.Int32, be.UInt32
@@ -248,7 +248,7 @@ class Sums:
                 """Interpolate bilinearly between the corners."""
                 return dr.lerp(dr.lerp(a, b, u), dr.lerp(d, c, u), v)
 
-            # Lagrange's cubic along either side
+            # Lagrange's cubic along each side
             along = [u * (1 - u) * (-1 / 6) * k for k in (2 - u, 1 + u)]
             aside = [v * (1 - v) * (-1 / 6) * k for k in (2 - v, 1 + v)]
             position = []
@@ -366,9 +366,9 @@ class _Triangle:
 
 
 def _edge(p: tuple[Any, ...], q: tuple[Any, ...]) -> tuple[Any, ...]:
-    """Return an edge read from its lesser end, and the sign for p → q.
+    """Return an edge that starts at its smaller end, and the sign that applies to the direction p → q.
 
-    Two triangles that fraction the edge then judge a point by the same numbers.
+    Two triangles with this edge in common then test a point with the same numbers.
     """
     dr = backend().dr
     ordered = (p[0] < q[0]) | ((p[0] == q[0]) & (p[1] < q[1]))
@@ -379,7 +379,7 @@ def _edge(p: tuple[Any, ...], q: tuple[Any, ...]) -> tuple[Any, ...]:
 
 _CORNERS = ((0, 0), (1, 0), (1, 1), (0, 1))
 _NO_AREA = 3e38
-_WHOLE = -1e5  # margins below are those of lost rays
+_WHOLE = -1e5  # only rays that do not reach the sensor have a margin below this
 _OUTWARDS = ((-1, -1), (1, -1), (1, 1), (-1, 1))
 
 
@@ -397,7 +397,7 @@ class _Traced:
         self.magnified = self._magnified()
 
     def entrance(self, bundle: Any, ix: Any, iy: Any, side: Any) -> Any:
-        """Return the area of cells at the entrance over that in a rectangular lattice."""
+        """Return the area of cells at the entrance over the area of a cell in a rectangular lattice."""
         be = backend()
         dr, disc = be.dr, self.spots.rays.disc
         if disc is None:
@@ -539,7 +539,7 @@ class _Cells:
         return be.UInt32(dr.select(lit & near, across * down, 0))
 
     def points_along(self) -> tuple[Any, Any]:
-        """Return the points along either side, as many as make them no farther apart than pixels."""
+        """Return the numbers of points along both sides, at which points are no farther apart than pixels."""
         dr = backend().dr
         a, b, c, d = self.corners
         (xu, xv), (yu, yv) = self.bends()
@@ -634,7 +634,8 @@ class _Cells:
         for corner, (sx, sy) in zip(self.corners, _OUTWARDS, strict=True):
             mean, least, most = self._around(sx, sy)
             densities.append(corner[2] * strength / dr.maximum(mean, 1e-9))
-            # calm: areas have one sign, differ little over a pixel, and are magnified at least half as usual
+            # calm: areas have the same sign, differ little over a pixel, and have at least half the usual
+            # magnification
             ratio = least / dr.maximum(most, 1e-18)
             calm = dr.minimum(2 - (1 - ratio) * coarse / dr.maximum(least, 1e-18), ratio / _UNLIKE)
             calm = dr.clip(dr.minimum(calm, 4 * dr.sqrt(mean * per_usual) - 1), even, 1)
@@ -652,7 +653,7 @@ class _Cells:
     def _around(self, sx: int, sy: int) -> tuple[Any, Any, Any]:
         """Return mean, smallest and largest magnification of area of the cells that meet in a corner.
 
-        The mean is of sizes. The smallest is positive only if all cells have this cell's sign.
+        The mean is that of absolute values. The smallest is positive only if all cells have the sign of this cell.
         """
         be = backend()
         dr, Int32, UInt32 = be.dr, be.Int32, be.UInt32

@@ -1,8 +1,9 @@
-"""Compute veiling glare, the light of a far bright source that rough and dusty lens surfaces scatter, and a baffle.
+"""Compute veiling glare, and the fraction of the lens that a source lights through a baffle.
 
-Scatter of one surface is a BSDF over β, the distance of two directions as sines in air. A surface of spatial
-frequency f turns light by β = λ f in every medium. The integral of the BSDF over the disc β < 1 is the fraction of
-light that is scattered forwards, the total integrated scatter (TIS).
+Veiling glare is the light of a far bright source that rough and dusty lens surfaces scatter. The scatter of one
+surface is a BSDF over β, the distance between two directions in direction cosines in air. A surface roughness of
+spatial frequency f turns light by β = λ f in every medium. The integral of the BSDF over the disc β < 1 is the
+fraction of the light that the surface scatters forwards: the total integrated scatter (TIS).
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
 REFERENCE_NM = 550.0  # wavelength at which roughness and the Harvey knee are quoted
-# Validity of the models: beyond it a surface is not optically smooth, or dust covers it completely.
+# Outside these limits the models are not valid: a surface is not optically smooth, or dust covers all of it.
 ROUGHNESS_NM_LIMITS = (0.0, 50.0)
 CLEANLINESS_LIMITS = (0.0, 1000.0)
 ROUGHNESS_NM, KNEE, SLOPE = 1.0, 0.01, -1.5  # assumed: a good polish, and usual values for its scatter
@@ -59,9 +60,9 @@ class Cleanliness:
     roughness_nm
         Rms roughness of every surface.
     level
-        Particles on every surface in air, as a level of IEST-STD-CC1246; 0: none.
+        Level of IEST-STD-CC1246 of the particles on every surface next to air; 0 means no particles.
     knee, slope
-        Harvey's knee (at 550 nm) and slope of the scatter by roughness.
+        Knee (at 550 nm) and slope of the scatter by roughness, as in `Harvey`.
     """
 
     roughness_nm: float = ROUGHNESS_NM
@@ -74,7 +75,7 @@ POLISHED = Cleanliness()
 
 
 def _check(name: str, value: ArrayLike, low: float, high: float) -> F64:
-    """Return a value as float64; raise InputError where it is out of range."""
+    """Return a value as float64. Raises InputError if any part of the value is out of range."""
     array = np.asarray(value, dtype=np.float64)
     wrong = ~((array >= low) & (array <= high))
     if wrong.any():
@@ -94,9 +95,9 @@ class Harvey:
     b0
         BSDF in the direction of the unscattered light, in 1/sr.
     L
-        β where the BSDF begins to fall, about 1e-4 to 1e-2.
+        Value of β at which the BSDF begins to fall, about 1e-4 to 1e-2.
     S
-        Slope of the fall in double logarithms, about -0.5 to -2.5.
+        Slope of log BSDF over log β beyond L, about -0.5 to -2.5.
     """
 
     b0: float
@@ -115,7 +116,7 @@ class Harvey:
     ) -> Harvey:
         """Return the model with TIS = (2π Δn σ/λ)², where σ is the rms roughness of spatial frequencies up to 1/λ.
 
-        A mirror's Δn is 2.
+        `index_step` is Δn; for a mirror Δn is 2.
 
         Raises
         ------
@@ -128,7 +129,7 @@ class Harvey:
         return cls(b0=float(total / cls(b0=1.0, L=L, S=S).tis), L=L, S=S)
 
     def bsdf(self, beta: ArrayLike) -> F64:
-        """Return the BSDF in 1/sr, float64 like `beta`; 0 from β = 1 on, where no light goes."""
+        """Return the BSDF in 1/sr, float64 like `beta`; for β of 1 or more, the BSDF is 0."""
         b = np.abs(np.asarray(beta, dtype=np.float64))
         return np.where(b < 1, self.b0 * (1 + (b / self.L) ** 2) ** (self.S / 2), 0.0)
 
@@ -136,18 +137,18 @@ class Harvey:
     def tis(self) -> float:
         """Return the fraction of light scattered.
 
-        It is 2π b0 L²/(S+2) [(1+L⁻²)^((S+2)/2) - 1], and π b0 L² ln(1+L⁻²) for S = -2.
+        The fraction is 2π b0 L²/(S+2) [(1+L⁻²)^((S+2)/2) - 1]. For S = -2 the fraction is π b0 L² ln(1+L⁻²).
         """
         wide = np.log1p(self.L**-2)
         return float(np.pi * self.b0 * self.L**2 * wide * exprel((self.S / 2 + 1) * wide))
 
     def at(self, wavelength_nm: float, *, known_at_nm: float = REFERENCE_NM) -> Harvey:
-        """Return the model of the same surface at another wavelength: L ∝ λ, b0 ∝ λ⁻⁴, S kept.
+        """Return the model of the same surface at another wavelength: L ∝ λ, b0 ∝ λ⁻⁴, and S does not change.
 
-        The change of the index is not included. The BSDF of a smooth surface is (2π Δn)² λ⁻⁴ PSD(β/λ), and the PSD
-        belongs to the surface (generalised Harvey-Shack theory: Krywonos, Harvey & Choi 2011, JOSA A 28, 1121).
-        Hence TIS ∝ λ⁻² σ², with σ the roughness up to frequency 1/λ: TIS ∝ λ⁻² where S is well below -2, and nearly
-        λ^-(4+S) where it is above.
+        The change of the refractive index is not included. The BSDF of a smooth surface is (2π Δn)² λ⁻⁴ PSD(β/λ),
+        and the PSD does not depend on λ (generalised Harvey-Shack theory: Krywonos, Harvey & Choi 2011, JOSA A 28,
+        1121). Hence TIS ∝ λ⁻² σ², where σ is the roughness up to the frequency 1/λ. If S is well below -2, TIS is
+        proportional to λ⁻²; if S is above -2, TIS is nearly proportional to λ^-(4+S).
         """
         ratio = wavelength_nm / known_at_nm
         return Harvey(b0=self.b0 / ratio**4, L=self.L * ratio, S=self.S)
@@ -170,7 +171,7 @@ def particle_count(level: float, diameter_um: ArrayLike) -> F64:
 def obscured_fraction(cleanliness_level: float) -> float:
     """Return the fraction of a surface that spheres of the standard's sizes cover.
 
-    The sizes run from 1 µm to `cleanliness_level` in µm; 0.1 m² has one particle larger than that.
+    The sizes run from 1 µm to `cleanliness_level` in µm; 0.1 m² has one particle larger than this level.
     """
     level = float(_check("cleanliness_level", cleanliness_level, *CLEANLINESS_LIMITS))
     if level <= _SMALLEST_UM:
@@ -187,9 +188,10 @@ def obscured_fraction(cleanliness_level: float) -> float:
 def scattered_intensity(size_parameter: ArrayLike, cosine: ArrayLike, *, index: complex = DUST_INDEX) -> F64:
     """Return k² dσ/dΩ of spheres for unpolarised light, float64[size, angle].
 
-    Up to a size parameter π D/λ of 500 it is Mie's series, with coefficients from miepython. Beyond, it is the sum
-    of Fraunhofer diffraction, the rays reflected outside and the rays refracted twice, without their interference.
-    That sum is within 8 % of Mie's mean over sizes to 70°, and a fifth below it at 90°.
+    Up to a size parameter π D/λ of 500, the result is Mie's series, with coefficients from miepython. For larger
+    spheres, the result is the sum of Fraunhofer diffraction, the rays reflected outside and the rays refracted
+    twice, without interference. Up to 70°, this sum is within 8 % of the mean of Mie's series over sizes; at 90°
+    the sum is a fifth below this mean.
     """
     x, mu = np.atleast_1d(np.asarray(size_parameter, float)), np.atleast_1d(np.asarray(cosine, float))
     small = x <= _MIE_LARGEST
@@ -265,9 +267,9 @@ def _intensities(index: complex) -> tuple[F64, F64, F64]:
 
 @lru_cache(maxsize=256)
 def _dust(level: float, wavelength_nm: float, index: complex) -> tuple[F64, float]:
-    """Return intensity over irradiance of a dusty surface, float64[angle] in 1/sr, and its integral.
+    """Return the intensity of a dusty surface over its irradiance, float64[angle] in 1/sr, and an integral.
 
-    The integral is over the forward hemisphere.
+    The integral is that of the intensity over the forward hemisphere.
     """
     edges, angles, table = _intensities(index)
     wavelength_um = 1e-3 * wavelength_nm
@@ -282,10 +284,10 @@ def _dust(level: float, wavelength_nm: float, index: complex) -> tuple[F64, floa
 def particle_bsdf(
     cleanliness_level: float, wavelength_nm: float, beta: ArrayLike, *, index: complex = DUST_INDEX
 ) -> F64:
-    """Return the forward scatter of particles on a surface, in 1/sr, float64 like `beta`; 0 from β = 1 on.
+    """Return the forward scatter of particles on a surface, in 1/sr, float64 like `beta`; 0 for β of 1 or more.
 
-    Particles are spheres with the sizes of IEST-STD-CC1246, from 1 µm to `cleanliness_level` µm. They are lit along
-    the normal, each independent of the others.
+    Particles are spheres with the sizes of IEST-STD-CC1246, from 1 µm to `cleanliness_level` µm. The light
+    falls on them along the normal, and each particle scatters independently of the others.
 
     Raises
     ------
@@ -300,7 +302,7 @@ def particle_bsdf(
     angles = _intensities(index)[1]
     angle = np.arcsin(np.clip(b, np.sin(angles[0]), 1))
     found = np.exp(np.interp(np.log(angle), np.log(angles), np.log(intensity)))
-    # radiance is intensity over cosine; beyond 84° the mean of the outermost ring, which conserves the flux
+    # radiance is intensity over cosine; beyond 84° a mean cosine of the outermost ring conserves the flux
     cosine = np.where(b * b < 0.99, np.sqrt(np.maximum(1 - b * b, 0)), 0.05)
     return np.where(b < 1, found / cosine, 0.0)
 
@@ -323,15 +325,16 @@ class VeilingGlare:
     Attributes
     ----------
     offset
-        float64[sample], rising: distance between the directions of source and pixel, as sines. Near the axis it is
-        the distance from the source's image over the focal length.
+        float64[sample], rising: distance between the directions of source and pixel, in direction cosines. Near the
+        axis, this is the distance on the sensor from the source's image, over the focal length.
     irradiance
-        float64[band, sample]: on the sensor, over the source's irradiance across its rays at the entrance.
+        float64[band, sample]: irradiance on the sensor over the source's irradiance at the entrance. The latter is
+        measured perpendicular to the rays.
     efl_mm
         Focal length, which converts positions on the sensor to directions.
     glare_total_fraction
-        float64[band], Σ TIS of all surfaces. It is the scattered fraction of the transmitted light as long as it is
-        small; see `kept_of_single`.
+        float64[band], Σ TIS of all surfaces. If this sum is small, it is the scattered fraction of the transmitted
+        light; for larger sums see `kept_of_single`.
     """
 
     offset: F64
@@ -343,18 +346,18 @@ class VeilingGlare:
     def _lookup(self) -> tuple[float, float, F32]:
         """Return start and step of ln(offset²), and the irradiance at these steps.
 
-        The step, 4e-4, does not show in an image.
+        The step of 4e-4 is too small to be visible in an image.
         """
         steps = np.linspace(2 * np.log(self.offset[0]), 2 * np.log(self.offset[-1]), _LOOKUP)
         rows = [np.interp(steps, 2 * np.log(self.offset), row) for row in self.irradiance]
         return steps[0], float(steps[1] - steps[0]), np.array(rows, dtype=np.float32)
 
     def image(self, sun_xy_mm: tuple[float, float], shape: tuple[int, int], pitch_mm: float) -> F32:
-        """Return irradiance over the source's at the entrance, float32[band, y, x].
+        """Return the irradiance of the glare over the source's at the entrance, float32[band, y, x].
 
-        The middle of the frame lies on the axis; x points to the right, y down. The source's image `sun_xy_mm` may
-        lie outside the frame. At its own position the value is finite but has no meaning: the direct image
-        outshines it. The cos⁴ of a pixel's field angle is not applied here.
+        The middle of the frame lies on the axis; x points to the right, y down. `sun_xy_mm` is the position of the
+        source's image, which may lie outside the frame. At this position the glare is finite but has no meaning,
+        because the direct image is much brighter. The result does not include the cos⁴ of a pixel's field angle.
         """
         start, step, table = self._lookup
         height, width = shape
@@ -377,14 +380,18 @@ class VeilingGlare:
 
     @property
     def kept_of_single(self) -> F64:
-        """Return the sum of multiple scatterings over the sum of single ones, (1 - e^-Σ) / Σ, float64[band]."""
+        """Return the factor (1 - e^-Σ) / Σ, float64[band].
+
+        The factor converts the sum of single scatterings, Σ, to the light that all scatterings remove from the
+        beam.
+        """
         return np.asarray(exprel(-self.glare_total_fraction))
 
     def beyond_mm2(self, sun_xy_mm: tuple[float, float], shape: tuple[int, int], pitch_mm: float) -> F64:
         """Return the flux on the sensor plane outside the frame, float64[band] in mm².
 
-        It is divided by the source's irradiance at the entrance, and includes the cos⁴ of the field angle that
-        `image` omits.
+        The flux is divided by the source's irradiance at the entrance. The flux includes the cos⁴ of the field
+        angle, which `image` omits.
         """
         slope = np.asarray(sun_xy_mm, dtype=np.float64) / self.efl_mm
         angle = np.linspace(0, 2 * np.pi, _AROUND, endpoint=False, dtype=np.float64)
@@ -397,9 +404,9 @@ class VeilingGlare:
 
 @dataclass(frozen=True, kw_only=True)
 class _Surfaces:
-    """Hold what a lens's surfaces scatter at a wavelength.
+    """Hold the scatter of a lens's surfaces at one wavelength.
 
-    `stretch` is a_ent / a_j: the radius of the axial beam at the entrance over that at surface j.
+    `stretch` is a_ent / a_j: the radius of the axial beam at the entrance over its radius at surface j.
     """
 
     scale: float  # π NA² T
@@ -410,11 +417,12 @@ class _Surfaces:
     wavelength_nm: float
 
     def irradiance(self, offset: F64, lit: F64) -> F64:
-        """Return irradiance over the source's, float64[sample].
+        """Return the irradiance on the sensor over the source's at the entrance, float64[sample].
 
         `lit` [surface, sample] is the lit fraction of each beam. Surface j scatters the radiance E_ent T
-        (a_ent/a_j)² BSDF, which fills the cone of the image: × π NA². Lagrange's invariant n_j a_j θ = NA r makes β
-        = NA r / a_j. With NA = a_ent / f this is (a_ent/a_j) r / f. (Form of Peterson 2004, Proc. SPIE 5178, 184.)
+        (a_ent/a_j)² BSDF. This radiance fills the cone of the image, hence the factor π NA². From Lagrange's
+        invariant n_j a_j θ = NA r follows β = NA r / a_j, and with NA = a_ent / f, β = (a_ent/a_j) r / f. (Form of
+        Peterson 2004, Proc. SPIE 5178, 184.)
         """
         total = np.zeros(offset.shape)
         for stretch, harvey, dusty, part in zip(self.stretch, self.roughness, self.dusty, lit, strict=True):
@@ -451,7 +459,7 @@ def _surfaces(lens: Prescription, wavelength_nm: float, cleanliness: Cleanliness
             ).at(wavelength_nm)
             for k in rows
         ),
-        # dust does not reach cemented surfaces
+        # cemented surfaces have no dust
         dusty=np.array([level > 0 and 1.0 in (index[k], index[k + 1]) for k in rows]),
         level=level,
         wavelength_nm=wavelength_nm,
@@ -461,13 +469,15 @@ def _surfaces(lens: Prescription, wavelength_nm: float, cleanliness: Cleanliness
 def _lit(lens: Prescription, sun_deg: float) -> F64:
     """Return the fraction of the beam that a source at an angle lights, float64[surface] by scattering surface.
 
-    It is a first-order estimate of what passes the rims up to that surface. Before the stop, the beam is the one
-    that the field's middle sees there. Behind the stop, all light is seen.
+    The fraction is a first-order estimate of the light that passes all rims up to the surface. At a surface before
+    the stop, the beam is the part of the surface that the middle of the sensor receives light from. Behind the
+    stop, the sensor receives light from the whole beam.
     """
     _, met = along(lens, forward(lens))
     height, slope = met[:, 0, 0], met[:, 0, 1]
     radius = first_order(lens).entrance_pupil_diameter_mm / 2
-    # only the stop limits the axial beam; widen rims that the paraxial beam, larger than the real one, would touch
+    # only the stop limits the axial beam; the paraxial beam is larger than the real beam, so widen rims it would
+    # touch
     rims = np.maximum([s.semi_diameter_mm for s in lens.surfaces], radius * np.abs(height))
     side = (np.arange(_DISC) + 0.5) / _DISC * 2 - 1
     disc = np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2)
@@ -530,9 +540,9 @@ def point_source_transmittance(
 ) -> F64:
     """Return scattered irradiance in the middle of the sensor over a far source's at the entrance.
 
-    The result is float64[band, angle]. Angles lie inside or outside the field, 0 to 89.9°. Outside, only the
-    surfaces count that the source's rays still reach past the rims. Ghosts, mount and baffle are not included.
-    Parameters as in `veiling_glare`.
+    The result is float64[band, angle]. Angles lie inside or outside the field, 0 to 89.9°. Outside the
+    field, only surfaces that the source's rays still reach contribute. Ghosts, mount and baffle are not included.
+    The parameters are those of `veiling_glare`.
     """
     angles = np.atleast_1d(_check("sun_deg", sun_deg, 0.0, _STEEPEST_DEG))
     lit = np.stack([np.cos(np.radians(a)) * _lit(lens, float(a)) for a in angles], axis=1)
@@ -553,9 +563,10 @@ def baffle_transmission(
 ) -> F64:
     """Return the fraction of a lens's entrance that a far source lights through a tube in front of the lens.
 
-    It is the overlap of the entrance with the tube's mouth, shifted by length × tan(angle), and never below
-    `vane_attenuation`: 1e-6 is assumed; good two-stage baffles reach 1e-9 (Haghshenas & Johari 2014, Proc. SPIE
-    9264, 92641R). Length 0 means no baffle. The result is float64 like `sun_deg`.
+    The fraction is the overlap of the entrance with the tube's mouth, which is shifted by length × tan(angle). The
+    fraction is never below `vane_attenuation`. The default, 1e-6, is assumed; good two-stage baffles reach 1e-9
+    (Haghshenas & Johari 2014, Proc. SPIE 9264, 92641R). A length of 0 means no baffle. The result is float64 like
+    `sun_deg`.
 
     Raises
     ------
