@@ -1,4 +1,4 @@
-"""Trace rays along many reflection paths at once: all ghosts and all wavelengths run in one kernel.
+"""Trace rays along many reflection paths at once, for all ghosts and all wavelengths in one kernel.
 
 Each path is a table of steps, so that the rays of all ghosts run side by side through one loop (Hullin et al.
 2011). Rays start on a grid in the plane of the first vertex. The computation is in single precision; the position
@@ -114,12 +114,12 @@ class TraceOptions(TypedDict, total=False):
     Attributes
     ----------
     centred
-        Whether rays start in the middles of the box's cells. Otherwise they start on its lattice, edges included,
-        which is rounded where `Rays.disc` says so.
+        Whether rays start in the middles of the cells of the box. Otherwise rays start on the lattice of the box,
+        which includes the edges of the box and is rounded if `Rays.disc` is not 0.
     light
-        If False, a tracer of one path and one wavelength leaves `fraction` at 1.
+        If False, a tracer with only one path and one wavelength does not compute `fraction`, which is then 1.
     halved
-        Whether to trace only one side of the plane of axis and Sun where boxes are symmetric about it.
+        Whether to trace only one side of the plane of axis and Sun if all boxes are symmetric about this plane.
     """
 
     centred: bool
@@ -142,7 +142,7 @@ def _unpaired(words: Any, index: Any) -> tuple[Any, Any]:
 
 
 def routes(lens: Prescription, reflections: int = 2) -> tuple[tuple[int, ...], ...]:
-    """Return all routes of 2 reflections (backwards, forwards), and on request those of 4 as well."""
+    """Return all routes of 2 reflections (backwards, then forwards), and for `reflections` = 4 also those of 4."""
     rows = (*mirrors(lens), *((len(lens.surfaces),) if lens.sensor_reflectance else ()))
     two = [(b, a) for a, b in combinations(rows, 2)]
     if reflections == 2:
@@ -153,21 +153,21 @@ def routes(lens: Prescription, reflections: int = 2) -> tuple[tuple[int, ...], .
 
 
 def name_of(route: Sequence[int]) -> tuple[int, ...]:
-    """Return the name of a ghost: its reflecting rows in pairs, of which the first is nearer the front.
+    """Return the name of a ghost: its reflecting rows in pairs; the first row of a pair is nearer the front.
 
-    Each pair is a reflection backwards and the next one forwards, with the row of the latter first.
+    Each pair is one reflection backwards and the next reflection forwards. The row that reflects forwards is first.
     """
     return tuple(row for back, forth in zip(route[::2], route[1::2], strict=True) for row in (forth, back))
 
 
 def lattice_places(across: NDArray[np.int64], rows: NDArray[np.int64]) -> tuple[Any, Any, Any, Any]:
-    """Return bundle, column, row and `across` for each lane: the first `rows` rows of every bundle's lattice."""
+    """Return bundle, column, row and `across` of each lane; the lanes are the first `rows` rows of all lattices."""
     be = backend()
     dr = be.dr
     sizes = across * rows
     each = dr.arange(be.UInt32, int(sizes.sum()))
     if (across == across[0]).all() and (rows == rows[0]).all():
-        # integer division by a constant of the kernel is cheap; by a variable it takes longer than a surface
+        # division of integers by a constant is cheap; division by a variable takes longer than a surface
         side, size = int(across[0]), int(sizes[0])
         bundle = each // size
         cell = each - bundle * size
@@ -182,7 +182,7 @@ def lattice_places(across: NDArray[np.int64], rows: NDArray[np.int64]) -> tuple[
 
 
 def rounded(u: Any, v: Any, disc: Any) -> tuple[Any, Any]:
-    """Map the square from -1 to 1 smoothly to an ellipse of `disc` half widths; unchanged where that is 0."""
+    """Map the square from -1 to 1 smoothly to an ellipse of `disc` half widths; if `disc` is 0, change nothing."""
     dr = backend().dr
     wide = dr.select(disc > 0, disc * dr.sqrt(1 - 0.5 * v * v), 1)
     high = dr.select(disc > 0, disc * dr.sqrt(1 - 0.5 * u * u), 1)
@@ -196,13 +196,13 @@ class _PathSteps:
     Attributes
     ----------
     row
-        uint32[step]: surface; the number of surfaces stands for the sensor.
+        uint32[step]: row of the surface; the row behind the last surface is the sensor.
     mirror
         bool[step]: whether the surface reflects.
     medium, other
         int64[step]: media before and behind the surface, counted from 0 in front of the lens.
     gap_mm
-        float64[step]: distance of the last vertex behind this one.
+        float64[step]: distance of the last step's vertex behind the vertex of this step.
     last_gap_mm
         float64[path]: distance of the last vertex of a path behind the sensor.
     """
@@ -216,7 +216,7 @@ class _PathSteps:
 
     @classmethod
     def of(cls, paths: Sequence[Sequence[tuple[int, bool]]], vertex_mm: F64) -> _PathSteps:
-        """Return the steps of paths; the last vertex is that of the sensor."""
+        """Return the steps of paths; the last of `vertex_mm` is the vertex of the sensor."""
         row, mirror, medium, other, gap, last = [], [], [], [], [], []
         for path in paths:
             onward, before = True, 0
@@ -275,7 +275,7 @@ class Tracer:
         self._recorded: dict[Any, Any] = {}
 
     def _upload(self) -> dict[str, Any]:
-        """Compute the tables of all steps, and return those that live on the device."""
+        """Compute the tables of all steps, and return the tables that are stored on the device."""
         be, lens = backend(), self.lens
         steps = _PathSteps.of(self._paths, np.append(lens.vertices_mm, lens.vertices_mm[-1] + self.sensor_mm))
         index = np.stack([np.append(lens.indices(w), 1.0) for w in self.wavelength_nm])
@@ -295,7 +295,7 @@ class Tracer:
         flat = [s.curvature_per_mm for s in lens.surfaces] + [0.0]
         conic = [1 + s.conic for s in lens.surfaces] + [1.0]
         ratio = index[:, medium] / index[:, steps.other]
-        # each step fetches few but wide records, since fetching takes most of the time
+        # each step fetches few but wide records, because fetches take most of the time
         curvature, per_rim = (np.array(flat)[rows], (1 / self.rims_mm)[rows])
         self._index = index
         self._look_up_word = ((rows * 3 + use) * _COSINES * 2 + steps.mirror.astype(np.int64)).astype(np.uint32)
@@ -336,7 +336,8 @@ class Tracer:
     def worn(self, coating_loss: float) -> Tracer:
         """Return a tracer for a lens that has lost a fraction of its coatings' area.
 
-        Reflectances become the mean of coated and bare, weighted by area; transmittances stay.
+        The reflectance of a surface becomes the mean of coated and bare glass, weighted by area. Transmittances do
+        not change.
         """
         fraction = self._coated.copy()
         fraction[:, :, :2] += coating_loss * (self._bare - self._coated)[:, :, :2]
@@ -359,8 +360,8 @@ class Tracer:
     def _fractions(self, index: F64, bare: bool = False) -> F64:
         """Return the fractions reflected from the front, reflected from behind, and transmitted, of each surface.
 
-        float64[wavelength, row, 3, cosine]: over the cosine of the angle in the medium of lower index, as the mean
-        of both polarisations.
+        The result is float64[wavelength, row, 3, cosine], the mean of both polarisations. The cosine is that of the
+        angle in the medium of lower index.
         """
         lens = self.lens
         cosine = np.maximum(np.linspace(0, 1, _COSINES), 1e-6)[None, :]
@@ -368,7 +369,7 @@ class Tracer:
         wavelength = self.wavelength_nm[:, None]
         for k, surface in enumerate(lens.surfaces):
             front, back = index[:, k, None], index[:, k + 1, None]
-            # cosines on both sides, by Snell's law from that in the medium of lower index
+            # cosines on both sides, from the cosine in the medium of lower index by Snell's law
             thin = np.minimum(front, back)
             at_front, at_back = (np.sqrt(1 - (thin / n) ** 2 * (1 - cosine**2)) for n in (front, back))
             films = () if bare else surface.coating
@@ -391,7 +392,7 @@ class Tracer:
         Parameters
         ----------
         across
-            Rays along either side of the lattice: one number for all bundles, or int64[bundle].
+            Rays along each side of the lattice: one number for all bundles, or int64[bundle].
         width
             float64[step]: width of the rim's soft edge at each step of each route, in radii of the rim. Without
             widths, margins are not computed, and rays that miss a surface or are totally reflected become nan.
@@ -436,7 +437,7 @@ class Tracer:
     def _followed(
         self, ray: tuple[Any, ...], start: Any, per_width: NDArray[np.float32], soft: bool
     ) -> tuple[tuple[Any, ...], Any]:
-        """Return the rays at the last surface of their paths, and the distance of its vertex behind the sensor."""
+        """Return the rays at the last surface of their paths, and the distance of this vertex behind the sensor."""
         be, t = backend(), self._tables
         dr = be.dr
         edge = be.UInt64(_paired(per_width, self._look_up_word.view(np.float32)))
@@ -456,9 +457,10 @@ class Tracer:
         return tuple(after), dr.gather(be.Float, t["last"], start.route)
 
     def _alone(self, rays: Rays, side: NDArray[np.int64], centred: bool) -> Spots:
-        """Trace the only bundle along the only path without its light, with a kernel recorded once and replayed.
+        """Trace the only bundle along the only path, without its light.
 
-        For some 10⁵ rays, preparing a kernel in drjit takes as long as running it.
+        The kernel is recorded once and then replayed, because drjit needs as long to prepare a kernel as to run it
+        for some 10⁵ rays.
         """
         be = backend()
         dr = be.dr
@@ -479,7 +481,7 @@ class Tracer:
 
             self._recorded[key] = dr.freeze(run)
         given = [dr.opaque(be.Float, float(v)) for v in (*rays.box_mm[0], *rays.direction[0])]
-        # drjit cannot record that arrays are freed, as Python's collector may do with those of other tracers
+        # drjit cannot record while arrays are freed, and Python's collector may free arrays of other tracers
         collects = gc.isenabled()
         gc.disable()
         try:
@@ -491,7 +493,7 @@ class Tracer:
         return Spots(rays, side, *spots)
 
     def _fetched(self, step: Any, edge: Any, wavelength: Any, fractions: Any) -> Step:
-        """Return the data of one step of every lane's own path, fetched from the tables."""
+        """Return the data of one step of each lane's path, fetched from the tables."""
         be, t = backend(), self._tables
         dr = be.dr
         gap, curvature = _unpaired(t["place"], step)
@@ -556,7 +558,9 @@ class Tracer:
         return out
 
     def _start(self, rays: Rays, across: NDArray[np.int64], centred: bool, even: bool) -> Any:
-        """Return position, direction, route and wavelength of every ray, its number, and that of its mirror image.
+        """Return the start, route, wavelength and number of every ray, and the number of its mirror image.
+
+        The start is a position in the plane of the first vertex and a direction.
 
         If `even`, only the rays on one side of the plane of axis and Sun are returned.
         """
@@ -606,7 +610,7 @@ class Tracer:
     def turned(self, azimuth_rad: float) -> Tracer:
         """Return the tracer for a Sun at an azimuth.
 
-        Rays are traced with the Sun at azimuth 0; the stop's blades are turned back instead.
+        The tracer always traces rays with the Sun at azimuth 0, and turns the blades of the stop back instead.
         """
         other = copy.copy(self)
         other._recorded = {}

@@ -517,7 +517,7 @@ class _Cells:
         return be.dr.gather(kind, kind(np.ascontiguousarray(values, dtype=dtype)), self.bundle)
 
     def pixels(self) -> tuple[Any, Any]:
-        """Return about how many pixels a cell covers, and whether it is drawn by points instead.
+        """Return approximately how many pixels a cell covers, and whether the cell is drawn by points instead.
 
         The number is 0 for cells without light in the part that is drawn, and for those drawn by points.
         """
@@ -617,10 +617,10 @@ class _Cells:
         return dr.maximum(start, 0), dr.minimum(last, self.width - 1)
 
     def ends(self) -> tuple[list[Any], list[Any], list[Any], Any]:
-        """Return, at the four corners, what the part that is drawn needs; and whether a cell is drawn by points.
+        """Return the values of the drawn part at the four corners, and whether a cell is drawn by points.
 
         The values are the irradiance without edges, the fraction of light with an edge's profile (factor), and the
-        fraction without (offset). Rough cells that fold are drawn by points.
+        fraction without (offset). Rough cells that fold or are narrow are drawn by points.
         """
         dr, placement = backend().dr, self.lattice.placement
         per_ramp, even = self.given(1 / placement.ramp), self.given(~placement.rough)
@@ -645,7 +645,7 @@ class _Cells:
             offsets.append(with_rise * calm * rise)
             leasts.append(least)
         size = dr.maximum(self.high[0] - self.low[0], self.high[1] - self.low[1])
-        # narrow cells are drawn by points too: their edges fall between pixel centres
+        # narrow cells are drawn by points too, because they can lie between pixel centres
         narrow = self.area < _NARROW_PX * size
         folds = (rest > 0) & (size < _POINTS) & ((_least(*leasts) < 0) | narrow)
         return densities, factors, offsets, folds
