@@ -15,7 +15,7 @@ import pytest
 from pydantic import Field
 
 from vbnfault.core import tables
-from vbnfault.core.errors import InputError
+from vbnfault.core.errors import InputError, VbnfaultError
 from vbnfault.core.quantities import Electrons
 from vbnfault.core.registry import chained
 from vbnfault.detector import MosaicDetector, Sensor
@@ -31,7 +31,7 @@ LIGHT = RNG.uniform(0, 20_000, SHAPE).astype(np.float32)
 class Persistence(Effect):
     """Add what is left of the exposure before, with noise of its own."""
 
-    name = "persistence"
+    name = "afterimage"
     after = "dark_current"
 
     before_e: float = Field(ge=0, le=1e6, description="electrons per pixel of the exposure before")
@@ -69,7 +69,7 @@ class LostBit(Effect):
 def only_here() -> Iterator[None]:
     """Forget the effects of this file, so that other tests see those of the package."""
     yield
-    for name in ("persistence", "nothing", "lost_bit"):
+    for name in ("afterimage", "nothing", "lost_bit"):
         contract._REGISTRY._classes.pop(name)
     tables.forget_schemas()
 
@@ -92,13 +92,28 @@ def test_the_order_is_the_documented_one() -> None:
 
 def test_an_effect_from_outside_acts_behind_the_one_that_it_names() -> None:
     names = list(order())
-    assert names.index("persistence") == names.index("dark_current") + 1
+    assert names.index("afterimage") == names.index("dark_current") + 1
     chain = [effect.name for effect in Device(sensor_with(Persistence(before_e=1.0)), 1, shape=SHAPE).chain]
     assert chain == [name for name in names if name not in ("nothing", "lost_bit")]
     with pytest.raises(TypeError, match=r"detector effect b: after = 'c': there is none of this name"):
         chained({"a": "", "b": "c"}, ["a"], "detector effect")
     with pytest.raises(TypeError, match=r"what b, c state by `after` runs in a circle"):
         chained({"a": "", "b": "c", "c": "b"}, ["a"], "detector effect")
+
+
+@pytest.mark.parametrize(
+    ("result", "got"),
+    [(LIGHT[1:], r"float32\[47, 40\]"), (LIGHT.astype(np.float64), r"float64\[48, 40\]"), (None, "NoneType")],
+)
+def test_an_effect_that_changes_shape_or_dtype_is_named(
+    monkeypatch: pytest.MonkeyPatch, result: Any, got: str
+) -> None:
+    monkeypatch.setattr(Persistence, "apply", lambda *_: result)
+    device = Device(sensor_with(Persistence(before_e=1.0)), 1, shape=SHAPE)
+    with pytest.raises(
+        VbnfaultError, match=rf"effect afterimage: apply returned {got}, but must .* float32\[48, 40\]"
+    ):
+        device.expected_e(LIGHT, 0.1)
 
 
 @pytest.mark.parametrize("name", ["generic_ccd", "generic_cmos"])
@@ -131,10 +146,10 @@ def test_the_noise_of_an_effect_is_keyed_by_its_exposure() -> None:
 def sensor_file(folder: Path, **table: Any) -> Path:
     path = folder / "mine.toml"
     numbers = "".join(f"{key} = {value}\n" for key, value in table.items())
-    sources = "".join(f'"effects.persistence.{key}" = "assumed"\n' for key in table)
+    sources = "".join(f'"effects.afterimage.{key}" = "assumed"\n' for key in table)
     path.write_text(
         'architecture = "cmos"\npixel_pitch_um = 5.5\n[readout]\nbits = 12\nfull_well_e = 13500.0\n'
-        f"[effects.persistence]\n{numbers}[sources]\npixel_pitch_um = 'a'\n'readout.bits' = 'a'\n"
+        f"[effects.afterimage]\n{numbers}[sources]\npixel_pitch_um = 'a'\n'readout.bits' = 'a'\n"
         f"'readout.full_well_e' = 'a'\n{sources}"
     )
     return path
@@ -143,10 +158,10 @@ def sensor_file(folder: Path, **table: Any) -> Path:
 def test_a_sensor_file_sets_an_effect_from_outside(tmp_path: Path) -> None:
     sensor = load_sensor(sensor_file(tmp_path, before_e=1e5))
     assert sensor.effects == (Persistence(before_e=1e5),)
-    assert "persistence" in json.dumps(tables.json_schema(Sensor))
+    assert "afterimage" in json.dumps(tables.json_schema(Sensor))
     detector = MosaicDetector(sensor=sensor, width_px=SHAPE[1], height_px=SHAPE[0])
     assert detector.description["sensor"]["effects"] == [
-        {"name": "persistence", "before_e": 1e5, "fraction": 0.001, "spread": 0.0}
+        {"name": "afterimage", "before_e": 1e5, "fraction": 0.001, "spread": 0.0}
     ]
     planes = np.zeros((*SHAPE, 3), np.float32)
     light = Electrons(array=planes, white_e=detector.white_e)
@@ -160,11 +175,11 @@ def test_a_sensor_file_sets_an_effect_from_outside(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("table", "sentence"),
     [
-        ({"before_e": -3.0}, r"effects.persistence.before_e = -3.0: must be a number from 0 to 1e\+06"),
-        ({}, r"effects.persistence.before_e: is missing"),
+        ({"before_e": -3.0}, r"effects.afterimage.before_e = -3.0: must be a number from 0 to 1e\+06"),
+        ({}, r"effects.afterimage.before_e: is missing"),
         (
             {"before_e": 1.0, "fractoin": 0.1},
-            r"effects.persistence.fractoin: unknown key \(did you mean fraction\?",
+            r"effects.afterimage.fractoin: unknown key \(did you mean fraction\?",
         ),
     ],
 )
@@ -175,5 +190,5 @@ def test_a_wrong_value_is_named(tmp_path: Path, table: dict[str, float], sentenc
 
 def test_an_unknown_effect_is_named() -> None:
     table = {"architecture": "cmos", "pixel_pitch_um": 5.5, "readout": {"bits": 12, "full_well_e": 1e4}}
-    with pytest.raises(InputError, match=r"t.toml: effects.persistance: no such effect \(did you mean persistence"):
+    with pytest.raises(InputError, match=r"t.toml: effects.afterimege: no such effect \(did you mean afterimage"):
         parse_sensor({**table, "effects": {"persistance": {}}}, source="t.toml")

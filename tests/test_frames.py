@@ -369,7 +369,7 @@ def test_a_parabola_has_no_mean_motion() -> None:
     table |= {"argument_deg": 0.0, "perihelion_jd": 2457000.0}
     scene = config.parse_scene(small_scene(orbit=table), source="test")
     assert np.isfinite(assemble.ephemeris(scene)[0]).all()
-    with pytest.raises(InputError, match=r"orbit: mean_motion_deg_day = 0.1: a parabola .* has none"):
+    with pytest.raises(InputError, match=r"orbit.mean_motion_deg_day = 0.1: a parabola .* has none"):
         config.parse_scene(small_scene(orbit={**table, "mean_motion_deg_day": 0.1}), source="test")
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+import re
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -228,7 +229,7 @@ def test_a_plug_in_through_the_store_and_back(tmp_path: Path, capsys: pytest.Cap
     # another process, which knows nothing of the plug-in, verifies the store and names it
     done = run(tmp_path, "verify", str(out))
     assert done.returncode == 0, done.stderr
-    assert f"glint/square came from the plug-in my_glint.py (sha256 {kept['sha256'][:12]})" in done.stderr
+    assert f"the scene uses the plug-in my_glint.py (sha256 {kept['sha256'][:12]}, glint/square)" in done.stderr
 
     # the plug-in is part of what the store holds
     plugin(tmp_path, GLINT.replace("4:12", "5:13"))
@@ -439,6 +440,27 @@ def test_a_ground_and_a_detector_effect_come_from_a_plugin(tmp_path: Path) -> No
     path.write_text(GROUND.replace("le=4", "le=2"), encoding="utf-8")
     with pytest.raises(InputError, match=r"body.photometry.power = 3: must be a whole number from 1 to 2"):
         config.load_scene(file)
+
+
+def test_a_detector_effect_behind_an_unknown_one_is_refused(tmp_path: Path) -> None:
+    text = re.sub(r"(after.*= )\"\w+\"", r'\1"dark_curent"', GROUND)
+    assert text != GROUND
+    plugin(tmp_path, text, "my_ground.py")
+    with pytest.raises(InputError, match=r"my_ground.py': .*after = 'dark_curent'.*did you mean dark_current"):
+        config.load_scene(scene_file(tmp_path, "my_ground.py", faults=""))
+    config.load_scene(scene_file(tmp_path, faults=""))
+
+
+def test_a_sensor_with_an_effect_of_a_plugin_is_characterised(tmp_path: Path) -> None:
+    plugin(tmp_path, GROUND, "my_ground.py")
+    (tmp_path / "mine.toml").write_text(SENSOR, encoding="utf-8")
+    small = ("--pixels", "64", "--points", "8", "--stack", "2", "--out", "mine")
+    refused = run(tmp_path, "detector", "mine.toml", *small)
+    assert refused.returncode == 2
+    assert "--plugin" in refused.stderr
+    done = run(tmp_path, "detector", "mine.toml", "--plugin", "my_ground.py", *small)
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "mine" / "emva1288.json").is_file()
 
 
 def test_a_plugin_that_defines_a_known_reflectance_is_refused(tmp_path: Path) -> None:

@@ -258,7 +258,7 @@ def test_every_model_survives_the_scene_file(name: str) -> None:
 class Minnaert(DiscReflectance):
     """Reflect after Minnaert (1941): D = cos(i)^k cos(e)^(k - 1)."""
 
-    model: Literal["minnaert"] = "minnaert"
+    model: Literal["powered"] = "powered"
     exponent: float = Field(0.7, ge=0.5, le=1, description="k; 1: as Lambert")
 
     def disc(self, m: Any, cos_i: Any, cos_e: Any, phase_deg: Any) -> Any:
@@ -270,25 +270,25 @@ def test_a_model_defined_here_alone_is_a_key_of_the_scene_file() -> None:
     def parsed(**table: Any) -> config.Scene:
         return config.parse_scene({"title": "t", "body": {"photometry": table}}, source="t.toml")
 
-    scene = parsed(model="minnaert", exponent=0.6)
+    scene = parsed(model="powered", exponent=0.6)
     assert scene.body.photometry == Minnaert(exponent=0.6)
     assert scene.resolved()["body"]["photometry"]["exponent"] == 0.6  # the identity of a store is made of this
     for wrong, sentence in (
-        ({"model": "minnaert", "exponent": 3}, "body.photometry.exponent = 3: must be a number from 0.5 to 1"),
-        ({"model": "lambert", "exponent": 0.6}, "exponent = 0.6: is a key of minnaert, not of model = 'lambert'"),
-        ({"model": "minnaert", "exponant": 0.6}, r"exponant: unknown key \(did you mean exponent\?\)"),
+        ({"model": "powered", "exponent": 3}, "body.photometry.exponent = 3: must be a number from 0.5 to 1"),
+        ({"model": "lambert", "exponent": 0.6}, "exponent = 0.6: is a key of powered, not of model = 'lambert'"),
+        ({"model": "powered", "exponant": 0.6}, r"exponant: unknown key \(did you mean exponent\?\)"),
         ({"model": "minnart"}, "model = 'minnart': must be one of hapke, lambert, lommel_seeliger, mcewen, minn"),
     ):
         with pytest.raises(InputError, match=sentence):
             parsed(**wrong)
     assert "exponent" in json.dumps(config.json_schema({}))
     # every store of an earlier version lists the keys of all models of that time
-    assert parsed(model="minnaert", phase_slope_mag_deg=0.0, parameters="67p_fornasier2015", hapke=None)
+    assert parsed(model="powered", phase_slope_mag_deg=0.0, parameters="67p_fornasier2015", hapke=None)
 
 
 def test_a_model_defined_here_alone_is_rendered() -> None:
     """A plane in oblique light, seen from straight above: cos(i)^k of the normal reflectance."""
-    table = {"photometry": {"model": "minnaert", "exponent": 0.6}}
+    table = {"photometry": {"model": "powered", "exponent": 0.6}}
     scene = config.parse_scene(small_scene(body=table, render={"bands": 1}), source="t.toml")
     ground = assemble.ground_reflectance(scene)
     light = np.array([math.sin(math.radians(60)), 0.0, -0.5])

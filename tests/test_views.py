@@ -227,7 +227,8 @@ def test_a_commanded_fault_that_cannot_show_gets_another_view(
 
 def test_the_plans_comparison_knows_the_view_that_was_kept(redrawn: tuple[Session, list[Frame]]) -> None:
     s, all_frames = redrawn
-    attributes = {"scene": s.scene.resolved(), "blocks": [len(s.plan)]}
+    models = {name: fault.model for name, fault in s.faults.items()}
+    attributes = {"scene": {**s.scene.resolved(), "plugins": {}}, "blocks": [len(s.plan)], "fault_models": models}
     expected = dataset.planned(attributes, list(s.faults))
     index = next(i for i, frame in enumerate(all_frames) if frame.views > 1)
     scalars = to_sample(all_frames[index]).scalars

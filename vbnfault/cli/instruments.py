@@ -10,7 +10,17 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from .app import app
-from .options import MOST_SEED, FocalLengthOption, LensArgument, check_image_path, grouped, number, writing
+from .options import (
+    MOST_SEED,
+    FocalLengthOption,
+    LensArgument,
+    PluginOption,
+    check_image_path,
+    grouped,
+    load_plugins,
+    number,
+    writing,
+)
 
 if TYPE_CHECKING:
     from ..lens.straylight.paraxial import Ghost
@@ -229,9 +239,12 @@ def detector(
     stack: Annotated[
         int, typer.Option(min=2, max=2000, help="Number of images that are averaged for DSNU, PRNU and spectra.")
     ] = 24,
+    plugins: PluginOption = None,
 ) -> None:
     """Characterise a virtual sensor as EMVA 1288 defines, with plots."""
     from ..output import sensor_report
+
+    load_plugins(plugins)
 
     request = sensor_report.SensorRequest(
         sensor=detector,

@@ -17,10 +17,11 @@ def missing_plugins(attributes: Mapping[str, Any]) -> list[str]:
     for name, stored in attributes["scene"].get("plugins", {}).items():
         plugin = loaded_plugin(name)
         if plugin is None or plugin.sha256 != stored["sha256"]:
-            state = "not installed" if plugin is None else "installed in another version"
+            state = "not loaded" if plugin is None else "loaded in another version"
             sentences.append(
-                f"{', '.join(stored['models'])} came from the plug-in {name} (sha256 {stored['sha256'][:12]}), "
-                f"which is {state} here; the samples were checked without it"
+                f"the scene uses the plug-in {name} (sha256 {stored['sha256'][:12]}"
+                + "".join(f", {model}" for model in stored["models"])
+                + f"), which is {state} here; the check does not need it"
             )
     return sentences
 

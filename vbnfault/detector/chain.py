@@ -20,9 +20,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core.errors import VbnfaultError
 from ..core.quantities import DEAD, HOT, LUMINANCE, RGBI, RTS, RTS_HIGH, STUCK, TRAP
 from .demosaic import bounded_at_edges, correct_defects, demosaic, interpolate
-from .effects import Acts, Exposure, chain_of
+from .effects import Acts, Effect, Exposure, chain_of, is_packaged
 from .effects.electrons import upper_fraction
 from .effects.output import analogue_and_converter
 from .efficiency import white_balance
@@ -150,7 +151,7 @@ class Device:
                 next(effects)
                 signal = analogue_and_converter(signal, exposure)
             else:
-                signal = effect.apply(signal, exposure)
+                signal = _checked(effect, signal, effect.apply(signal, exposure))
         return signal
 
     # --- raw DN to image ------------------------------------------------------------------------------------------
@@ -259,6 +260,21 @@ class Device:
     def white_balance(self) -> NDArray[np.float32]:
         """Return the gain of each channel, float32[channel], as `efficiency.white_balance` does."""
         return white_balance(self.sensor.efficiency)
+
+
+def _checked(effect: Effect, given: Any, result: Any) -> Any:
+    """Return the result of an effect. Raise VbnfaultError if one from outside changed the shape or the dtype."""
+    if not is_packaged(type(effect)) and (np.shape(result), getattr(result, "dtype", None)) != (
+        given.shape,
+        given.dtype,
+    ):
+        size = ", ".join(map(str, np.shape(result)))
+        got = f"{result.dtype}[{size}]" if isinstance(result, np.ndarray) else type(result).__name__
+        raise VbnfaultError(
+            f"detector effect {effect.name}: apply returned {got}, but must return "
+            f"{given.dtype}[{', '.join(map(str, given.shape))}]"
+        )
+    return result
 
 
 @lru_cache(maxsize=4)

@@ -30,6 +30,7 @@ from typing import TYPE_CHECKING
 from ..core import registry, resources
 from ..core.errors import InputError, VbnfaultError, shown
 from ..core.interrupts import check
+from ..detector import effects
 from . import models
 
 if TYPE_CHECKING:
@@ -303,6 +304,10 @@ def _check_together(plugins: Mapping[str, Plugin]) -> None:
     except models.DeclarationError as error:
         guilty = [w for w, p in plugins.items() if any(cls.fault in error.classes for cls in p.models)]
         raise InputError(f"{', '.join(guilty) or 'plug-ins'}: {error}") from None
+    try:
+        effects.order()
+    except TypeError as error:
+        raise InputError(f"{', '.join(plugins) or 'plug-ins'}: {error}") from None
 
 
 @contextlib.contextmanager

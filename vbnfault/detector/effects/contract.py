@@ -198,7 +198,9 @@ def _parse_effect(name: str, table: Any) -> Effect:
     cls = known.get(name)
     if cls is None:
         hint = did_you_mean(name, list(known)) if known else "; none is known"
-        reason = f"no such effect{hint}; name the plug-in that defines it in the scene's plugins"
+        reason = (
+            f"no such effect{hint}; name the plug-in that defines it in the scene's key plugins, or by --plugin"
+        )
         error = PydanticCustomError("value_error", "{reason}", {"reason": reason})
         raise ValidationError.from_exception_data("effects", [{"type": error, "loc": (name,), "input": {}}])
     try:
