@@ -191,4 +191,4 @@ def test_a_wrong_value_is_named(tmp_path: Path, table: dict[str, float], sentenc
 def test_an_unknown_effect_is_named() -> None:
     table = {"architecture": "cmos", "pixel_pitch_um": 5.5, "readout": {"bits": 12, "full_well_e": 1e4}}
     with pytest.raises(InputError, match=r"t.toml: effects.afterimege: no such effect \(did you mean afterimage"):
-        parse_sensor({**table, "effects": {"persistance": {}}}, source="t.toml")
+        parse_sensor({**table, "effects": {"afterimege": {}}}, source="t.toml")

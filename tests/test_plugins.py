@@ -452,15 +452,15 @@ def test_a_detector_effect_behind_an_unknown_one_is_refused(tmp_path: Path) -> N
 
 
 def test_a_sensor_with_an_effect_of_a_plugin_is_characterised(tmp_path: Path) -> None:
-    plugin(tmp_path, GROUND, "my_ground.py")
-    (tmp_path / "mine.toml").write_text(SENSOR, encoding="utf-8")
-    small = ("--pixels", "64", "--points", "8", "--stack", "2", "--out", "mine")
-    refused = run(tmp_path, "detector", "mine.toml", *small)
+    path, sensor, out = plugin(tmp_path, GROUND, "my_ground.py"), tmp_path / "mine.toml", tmp_path / "mine"
+    sensor.write_text(SENSOR, encoding="utf-8")
+    small = ("--pixels", "64", "--points", "8", "--stack", "2", "--out", str(out))
+    refused = run(tmp_path, "detector", str(sensor), *small)
     assert refused.returncode == 2
     assert "--plugin" in refused.stderr
-    done = run(tmp_path, "detector", "mine.toml", "--plugin", "my_ground.py", *small)
+    done = run(tmp_path, "detector", str(sensor), "--plugin", str(path), *small)
     assert done.returncode == 0, done.stderr
-    assert (tmp_path / "mine" / "emva1288.json").is_file()
+    assert (out / "emva1288.json").is_file()
 
 
 def test_a_plugin_that_defines_a_known_reflectance_is_refused(tmp_path: Path) -> None:

@@ -30,8 +30,8 @@ PluginOption = Annotated[
     typer.Option(
         "--plugin",
         metavar="MODULE",
-        help="Plug-in with further faults, detector effects or reflectances: the name of a module, or the path of a "
-        "file; may be repeated.",
+        help="Plug-in with further faults, detector effects or reflectances: the name of a module, or the path of "
+        "a file; may be repeated.",
         show_default=False,
     ),
 ]
