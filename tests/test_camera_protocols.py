@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from test_faults_kit import make_context, with_mosaic
 
-from tests.test_faults_kit import make_context, with_mosaic
 from vbnfault.camera import Camera
 from vbnfault.core.quantities import Radiance
 from vbnfault.detector import Detector, MosaicDetector, ThreeColourDetector
