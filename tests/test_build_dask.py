@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from dask import config as dask_config
 from test_build import SAMPLES, Broken, Deadly, Session, run, site_of
 from test_store import fake_sample, make_spec
 
@@ -218,7 +219,12 @@ def test_a_cluster_that_ends_is_one_sentence(
     monkeypatch.setattr(dask, "_SECONDS_BETWEEN_CHECKS", 0.01)
     monkeypatch.setattr(dask, "_SECONDS_WITHOUT_WORKERS", 0.0)
     out = tmp_path / "s.zarr"
-    with threads(1) as cluster, pytest.raises(VbnfaultError, match=f"^--scheduler tcp://.*: {sentence}"):
+    # else the client looks for a scheduler that is gone for half a minute
+    with (
+        dask_config.set({"distributed.comm.timeouts.connect": "10s"}),
+        threads(1) as cluster,
+        pytest.raises(VbnfaultError, match=f"^--scheduler tcp://.*: {sentence}"),
+    ):
         run(out, Disturbing(event, str(tmp_path)), scheduler=cluster.scheduler_address)
     assert resumed(out) == reference
 
