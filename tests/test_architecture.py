@@ -26,7 +26,8 @@ PIPELINE = WORLD | {"world", "faults"}
 DATASET = PIPELINE | {"pipeline", "store"}
 OUTPUT = DATASET | {"dataset"}
 MAY_IMPORT: dict[str, set[str]] = {
-    "__init__": OUTPUT | {"output"},  # for type checkers; at run time a name loads its module when it is used
+    "__init__": OUTPUT
+    | {"study", "output"},  # for type checkers; at run time a name loads its module when it is used
     "core": set(),
     "reflectance": {"core"},
     "body": {"core"},
@@ -41,8 +42,9 @@ MAY_IMPORT: dict[str, set[str]] = {
     "pipeline": PIPELINE,
     "store": {"core", "scene"},
     "dataset": DATASET,
+    "study": OUTPUT,
     "output": OUTPUT,
-    "cli": OUTPUT | {"output"},
+    "cli": OUTPUT | {"output", "study"},
     "__main__": {"cli"},
 }
 
@@ -54,6 +56,8 @@ ONLY = {  # distribution → the packages or modules that import it
     "dask": {"dataset.dask"},
     "distributed": {"dataset.dask"},
     "typer": {"cli"},
+    "pyarrow": {"study"},
+    "SALib": {"study"},
     "spiceypy": {"core.spice"},
     "OpenEXR": {"core.images"},
 }

@@ -30,6 +30,7 @@ MIB = 1 << 20
 # ten times the size of the largest files in use.
 LIMIT_BYTES: dict[str, int] = {
     "scene": 4 * MIB,
+    "study": 4 * MIB,
     "lens": 4 * MIB,
     "glass catalogue": 16 * MIB,
     "detector": 4 * MIB,

@@ -127,6 +127,18 @@ def parse(kind: type[T], plain: Mapping[str, Any], *, source: str, overrides: Se
     raise InputError(f"{source}: {sentence(errors, _schema(model))}{mark}")
 
 
+def replace(table: dict[str, Any], values: Mapping[str, Any], *, source: str) -> None:
+    """Replace values of plain data, given by dotted key. Raises InputError where a key leads through a value."""
+    for key, value in values.items():
+        *parents, leaf = key.split(".")
+        node = table
+        for parent in parents:
+            node = node.setdefault(parent, {})
+            if not isinstance(node, dict):
+                raise InputError(f"{source}: {key} = {shown(value)}: {parent} is a value, not a table")
+        node[leaf] = value
+
+
 def check(checks: TypeAdapter[Any], value: Any, where: str, *, whole_value: bool = False) -> Any:
     """Return a value after its check. Raises InputError; its message begins with `where`, the key of the value.
 
@@ -239,6 +251,13 @@ def _wrong(
     if detail["type"] == "missing":  # a list that is too short
         keys, node = _locate(detail["loc"][:-1], schema)
     key = _dotted(keys, where)
+    if detail["type"] in ("union_tag_invalid", "union_tag_not_found"):  # a table whose tag selects its keys
+        tag, tags = (
+            detail["ctx"]["discriminator"].strip("'"),
+            ", ".join(map(repr, node["discriminator"]["mapping"])),
+        )
+        given = f" = {shown(detail['ctx']['tag'])}:" if "tag" in detail["ctx"] else ": is missing,"
+        return f"{key}.{tag}{given} must be one of {tags}"
     if detail["type"] != "value_error":
         return f"{key}{_shown(value)}: must be {_allowed(node, schema, message)}"
     if not _shown(value) and (not key or _BEGINS_WITH_KEY.match(message)):
@@ -332,6 +351,10 @@ def _locate(loc: Sequence[int | str], root: Mapping[str, Any]) -> tuple[list[int
     keys: list[int | str] = []
     node = _resolved(root, root)
     for part in loc:
+        tagged = node.get("discriminator", {}).get("mapping", {})
+        if part in tagged:  # pydantic names the alternative that the table's tag selects
+            node = _resolved({"$ref": tagged[part]}, root)
+            continue
         choices = _choices(node, root)
         tables = [choice for choice in choices if part in choice.get("properties", {})]
         lists = [choice for choice in choices if isinstance(part, int) and choice.get("type") == "array"]

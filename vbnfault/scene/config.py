@@ -15,7 +15,7 @@ from typing import Annotated, Any
 from pydantic import Field, model_validator
 
 from ..core import resources, tables
-from ..core.errors import InputError, shown
+from ..core.errors import InputError
 from ..core.tables import Table
 from ..reflectance import is_packaged
 from .instrument import CameraTable, RenderTable
@@ -117,14 +117,7 @@ def load_scene(name_or_path: str | Path, overrides: Mapping[str, Any] | None = N
     """
     path = resources.find("scenes", name_or_path)
     table = resources.read_toml(path)
-    for key, value in (overrides or {}).items():
-        *parents, leaf = key.split(".")
-        node = table
-        for parent in parents:
-            node = node.setdefault(parent, {})
-            if not isinstance(node, dict):
-                raise InputError(f"{path}: {key} = {shown(value)}: {parent} is a value, not a table")
-        node[leaf] = value
+    tables.replace(table, overrides or {}, source=str(path))
     try:
         _anchor_paths(table, path.parent, overrides or ())
     except InputError as error:

@@ -1,0 +1,149 @@
+"""Define the distributions of a study's factors: between the unit interval and a factor's values.
+
+Every design is made in the unit hypercube, so that one design serves all distributions.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Annotated, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pydantic import Field, model_validator
+
+from ..core.tables import Table
+
+_Text = Annotated[str, Field(min_length=1)]
+
+
+class _Factor(Table):
+    """Hold what the factors of all distributions have in common."""
+
+    key: str = Field(min_length=1, description="parameter that varies, such as lens.surface.3.radius")
+    unit: str = Field("", description="unit of the values, such as nm, K or fraction")
+    description: str = Field("", description="meaning of the factor, for figures and tables")
+
+
+class _Bounded(_Factor):
+    """Hold a factor with a lower and an upper bound."""
+
+    low: float = Field(description="lower bound")
+    high: float = Field(description="upper bound")
+
+    @model_validator(mode="after")
+    def _ordered(self) -> _Bounded:
+        if not self.low < self.high:
+            raise ValueError(
+                f"low = {self.low:g}, high = {self.high:g}: bounds reversed or equal, low must be below high"
+            )
+        return self
+
+
+class Uniform(_Bounded):
+    """Distribute a factor evenly between two bounds."""
+
+    distribution: Literal["uniform"] = "uniform"
+
+    def values(self, points: ArrayLike) -> NDArray[np.float64]:
+        """Return the values at points of the unit interval."""
+        u = np.asarray(points, dtype=np.float64)
+        return self.low * (1 - u) + self.high * u
+
+    def points(self, values: ArrayLike) -> NDArray[np.float64]:
+        """Return the points of the unit interval at which the values are taken."""
+        return (np.asarray(values, dtype=np.float64) - self.low) / (self.high - self.low)
+
+    def nominal(self) -> float:
+        """Return the point of the unit interval at which a one-at-a-time design holds the factor: the middle."""
+        return 0.5
+
+
+class LogUniform(_Bounded):
+    """Distribute the logarithm of a factor evenly between two bounds above 0."""
+
+    distribution: Literal["log_uniform"] = "log_uniform"
+    low: float = Field(gt=0, description="lower bound, above 0")
+
+    def values(self, points: ArrayLike) -> NDArray[np.float64]:
+        """Return the values at points of the unit interval."""
+        u = np.asarray(points, dtype=np.float64)
+        logarithm = np.log(self.low) * (1 - u) + np.log(self.high) * u
+        return np.clip(np.exp(logarithm), self.low, self.high)  # the exponential may round past a bound
+
+    def points(self, values: ArrayLike) -> NDArray[np.float64]:
+        """Return the points of the unit interval at which the values are taken."""
+        ratio = np.log(np.asarray(values, dtype=np.float64) / self.low)
+        return ratio / np.log(self.high / self.low)
+
+    def nominal(self) -> float:
+        """Return the point of the unit interval at which a one-at-a-time design holds the factor: the middle."""
+        return 0.5
+
+
+class TruncatedNormal(_Bounded):
+    """Distribute a factor as a normal distribution, cut off at two bounds."""
+
+    distribution: Literal["truncated_normal"] = "truncated_normal"
+    mean: float = Field(description="mean of the normal distribution before it is cut off")
+    deviation: float = Field(gt=0, description="standard deviation of the normal distribution before it is cut off")
+
+    @model_validator(mode="after")
+    def _within_reach(self) -> TruncatedNormal:
+        if not self.low <= self.mean <= self.high:
+            raise ValueError(f"mean = {self.mean:g}: must be from low = {self.low:g} to high = {self.high:g}")
+        return self
+
+    def values(self, points: ArrayLike) -> NDArray[np.float64]:
+        """Return the values at points of the unit interval."""
+        from scipy import stats
+
+        scaled = stats.truncnorm.ppf(points, *self._limits(), loc=self.mean, scale=self.deviation)
+        return np.clip(np.asarray(scaled, dtype=np.float64), self.low, self.high)
+
+    def points(self, values: ArrayLike) -> NDArray[np.float64]:
+        """Return the points of the unit interval at which the values are taken."""
+        from scipy import stats
+
+        fractions = stats.truncnorm.cdf(values, *self._limits(), loc=self.mean, scale=self.deviation)
+        return np.asarray(fractions, dtype=np.float64)
+
+    def nominal(self) -> float:
+        """Return the point of the unit interval at which a one-at-a-time design holds the factor: the mean."""
+        return float(self.points(self.mean))
+
+    def _limits(self) -> tuple[float, float]:
+        """Return the bounds in standard deviations from the mean."""
+        return (self.low - self.mean) / self.deviation, (self.high - self.mean) / self.deviation
+
+
+class Categorical(_Factor):
+    """Choose a factor's value from a list, each with the same probability. The first one is the nominal value."""
+
+    distribution: Literal["categorical"] = "categorical"
+    choices: tuple[float | _Text, ...] = Field(min_length=2, alias="values", description="the values, at least two")
+
+    @model_validator(mode="after")
+    def _differ(self) -> Categorical:
+        twice = [choice for i, choice in enumerate(self.choices) if choice in self.choices[:i]]
+        if twice:
+            raise ValueError(f"values = {list(self.choices)!r}: {twice[0]!r} is given twice")
+        return self
+
+    def values(self, points: ArrayLike) -> NDArray[np.object_]:
+        """Return the values at points of the unit interval, of which each value has an equal part."""
+        index = np.floor(np.asarray(points, dtype=np.float64) * len(self.choices)).astype(int)
+        chosen = np.array(self.choices, dtype=object)
+        return np.asarray(chosen[np.clip(index, 0, len(self.choices) - 1)])
+
+    def points(self, values: ArrayLike | Sequence[str]) -> NDArray[np.float64]:
+        """Return the middle of the part of the unit interval in which each value is taken."""
+        index = [self.choices.index(value) for value in np.ravel(np.asarray(values, dtype=object)).tolist()]
+        return ((np.array(index, dtype=np.float64) + 0.5) / len(self.choices)).reshape(np.shape(values))
+
+    def nominal(self) -> float:
+        """Return the point of the unit interval at which a one-at-a-time design holds the factor."""
+        return 0.5 / len(self.choices)
+
+
+Factor = Annotated[Uniform | LogUniform | TruncatedNormal | Categorical, Field(discriminator="distribution")]
