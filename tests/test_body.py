@@ -237,6 +237,15 @@ def test_body_defaults_hash_and_bounds() -> None:
         load_body(rotation_period_s=float("nan"))
 
 
+def test_centre_of_mass_of_a_moved_wedge() -> None:
+    # a tetrahedron's centre of mass is the mean of its corners; 1e6 m away, coordinates keep 1e-10 m
+    moved = np.array([1e6, -2e6, 3e5])
+    corners = np.array([[0.0, 0, 0], [400, 0, 0], [0, 200, 0], [0, 0, 100]]) + moved
+    faces = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]], dtype=np.int32)
+    body = Body(name="wedge", vertices_m=corners, faces=faces)
+    np.testing.assert_allclose(body.centre_of_mass_T_m, corners.mean(axis=0), rtol=0, atol=1e-8)
+
+
 def test_real_shape_loads_as_it_is() -> None:
     if not REAL_SHAPE.exists():
         pytest.skip(f"the real shape model is not at {REAL_SHAPE}")

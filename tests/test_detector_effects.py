@@ -55,6 +55,19 @@ class Nothing(Effect):
         return signal
 
 
+class SenseNode(Effect):
+    """Add charge at the sense node, behind the full well."""
+
+    name = "sense_node"
+    after = "full_well"
+
+    added_e: float = Field(500.0, ge=0, le=1e4, description="charge that is added")
+
+    def apply(self, signal: Any, exposure: Exposure) -> Any:
+        assert signal.max() <= exposure.sensor.readout.full_well_e
+        return signal + np.float32(self.added_e)
+
+
 class LostBit(Effect):
     """Clear the least significant bit of the raw numbers."""
 
@@ -69,7 +82,7 @@ class LostBit(Effect):
 def only_here() -> Iterator[None]:
     """Forget the effects of this file, so that other tests see those of the package."""
     yield
-    for name in ("afterimage", "nothing", "lost_bit"):
+    for name in ("afterimage", "nothing", "sense_node", "lost_bit"):
         contract._REGISTRY._classes.pop(name)
     tables.forget_schemas()
 
@@ -94,7 +107,7 @@ def test_an_effect_from_outside_acts_behind_the_one_that_it_names() -> None:
     names = list(order())
     assert names.index("afterimage") == names.index("dark_current") + 1
     chain = [effect.name for effect in Device(sensor_with(Persistence(before_e=1.0)), 1, shape=SHAPE).chain]
-    assert chain == [name for name in names if name not in ("nothing", "lost_bit")]
+    assert chain == [name for name in names if name not in ("nothing", "sense_node", "lost_bit")]
     with pytest.raises(TypeError, match=r"detector effect b: after = 'c': there is none of this name"):
         chained({"a": "", "b": "c"}, ["a"], "detector effect")
     with pytest.raises(TypeError, match=r"what b, c state by `after` runs in a circle"):
@@ -120,7 +133,7 @@ def test_an_effect_that_changes_shape_or_dtype_is_named(
 def test_effects_without_strength_change_no_bit(name: str) -> None:
     """The first also has noise of its own, which must not move that of the others."""
     plain = Device(sensor_with(name=name), 3, shape=SHAPE).raw(LIGHT, 0.1, noise(1))
-    off = sensor_with(Persistence(before_e=0.0, spread=0.5), Nothing(), name=name)
+    off = sensor_with(Persistence(before_e=0.0, spread=0.5), SenseNode(added_e=0.0), Nothing(), name=name)
     np.testing.assert_array_equal(Device(off, 3, shape=SHAPE).raw(LIGHT, 0.1, noise(1)), plain)
 
 
@@ -131,6 +144,21 @@ def test_an_effect_from_outside_adds_its_electrons() -> None:
     np.testing.assert_allclose(gained, 1000.0, rtol=1e-5)  # float32 of up to 2e4 electrons
     raw = Device(sensor_with(LostBit()), 3, shape=SHAPE).raw(LIGHT, 0.1, noise(1))
     np.testing.assert_array_equal(raw, plain.raw(LIGHT, 0.1, noise(1)) & 0xFFFE)
+
+
+@pytest.mark.parametrize("name", ["generic_ccd", "generic_cmos"])
+def test_an_effect_behind_the_full_well_gets_what_the_wells_hold_and_is_not_clipped(name: str) -> None:
+    sensor = sensor_with(name=name)
+    readout = dataclasses.replace(sensor.readout, full_well_e=5000.0, gain_dn_per_e=0.1)
+    full = np.full(SHAPE, 5e5, np.float32)
+    plain, acting = (
+        Device(dataclasses.replace(sensor, readout=readout, effects=effects), 3, shape=SHAPE).raw(full, 0.1)
+        for effects in ((), (SenseNode(added_e=500.0),))
+    )
+    working = plain < 0.9 * readout.top_dn  # neither stuck nor at the top code
+    gained_dn = acting[working].astype(float) - plain[working]
+    assert working.mean() > 0.9
+    assert gained_dn.mean() == pytest.approx(50, abs=0.5)  # rounding to whole DN
 
 
 def test_the_noise_of_an_effect_is_keyed_by_its_exposure() -> None:

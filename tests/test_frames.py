@@ -127,6 +127,16 @@ def test_c0_with_a_vertical_reference_continues_one_slightly_north(vertical: flo
     np.testing.assert_allclose(exact[:, 1], [-vertical, 0, 0])  # nadir: south; zenith: north
 
 
+def test_c0_with_north_up_is_smooth_about_the_nadir() -> None:
+    nadir = np.array([0.0, 0, 1])
+    straight = frames.L_from_C0(nadir, north_up=True)
+    np.testing.assert_array_equal(straight, frames.L_from_C0(nadir))
+    for tilt in ([1e-6, 0, 0], [-1e-6, 0, 0], [0, 1e-6, 0], [0, -1e-6, 0]):
+        np.testing.assert_allclose(frames.L_from_C0(nadir + tilt, north_up=True), straight, atol=2e-6)
+    north = frames.L_from_C0(np.array([1.0, 0, 0]), north_up=True)  # south has no projection: y is down
+    np.testing.assert_array_equal(north[:, 1], nadir)
+
+
 @given(unit_vectors(), angles, angles, angles)
 def test_l_from_c_is_the_product_of_the_conventions(sun: np.ndarray, roll: float, pitch: float, yaw: float) -> None:
     assume(np.hypot(sun[0], sun[1]) > 1e-3)

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from conftest import small_scene
+from scipy.spatial.transform import Rotation
 
+import vbnfault
 from vbnfault import dataset, pipeline, render
+from vbnfault.body import load_body
 from vbnfault.core import frames
 from vbnfault.core.errors import InputError, VbnfaultError
 from vbnfault.pipeline import Session, resolve
@@ -244,6 +248,60 @@ def test_a_fault_that_shows_in_no_view_is_an_error_that_names_it(terrain: Terrai
         pipeline.simulate_frame(spec(s, terrain, 1))
     for part in ("sample 1: broken_lines", "plan.max_views = 2", "plan.on_invisible = 'drop'"):
         assert part in str(caught.value)
+
+
+# ------------------------------------------------------------------------------------- the centre of the body
+
+FROM_AFAR = {
+    "height_m": [20e3, 30e3],
+    "height_reference": "site",
+    "x_m": [-3e3, 3e3],
+    "y_m": [-3e3, 3e3],
+    "sun_averted": {"reference": "centre", "roll_deg": [0, 0], "pitch_deg": [0, 0], "sun_elevation_deg": [20, 60]},
+}
+
+
+def test_the_boresight_points_at_the_centre_of_mass_through_the_store_and_back(tmp_path: Path) -> None:
+    """The packaged nucleus is bilobed, and its centre of mass lies 145 m from the origin of T."""
+    table = small_scene(
+        dataset={"samples": 2, "sites": 1, "layers": ["clean"]},
+        camera={"fov_deg": 20.0, "width_px": 32, "height_px": 32},
+        geometry=FROM_AFAR,
+    )
+    table["faults"] = {"broken_pixels": {}}
+    scene = config.parse_scene(table, source="test")
+    out = tmp_path / "centre.zarr"
+    dataset.build_scene(scene, out, source="test", threads=2)
+    data = vbnfault.open_dataset(out)
+    attributes = data["roll_deg"].attrs
+    assert attributes["reference"] == {"sun-facing": "sun", "sun-averted": "centre"}
+    centre_T_m = np.array(attributes["centre_of_mass_T_m"])
+    np.testing.assert_allclose(centre_T_m, load_body().centre_of_mass_T_m)
+    assert np.linalg.norm(centre_T_m) > 100
+    for i in range(2):
+        sample = data.isel(sample=i)
+        w, x, y, z = sample["camera_from_T"].values
+        C_from_T = Rotation.from_quat([x, y, z, w]).as_matrix()
+        centre_C_m = C_from_T @ (centre_T_m - sample["camera_position_T_m"].values)
+        # rounding of 30 km in float64 and of the quaternion: some 1e-16 rad each
+        assert np.hypot(*centre_C_m[:2]) / centre_C_m[2] < 1e-14
+        down_L = sample["T_from_L"].values.T @ C_from_T.T[:, 2]
+        assert np.degrees(np.arccos(down_L[2])) > 1  # the plumb line points elsewhere
+        towards = sample["T_from_L"].values.T @ frames.unit(centre_T_m - sample["camera_position_T_m"].values)
+        want = frames.L_from_C(towards, 0, 0, float(sample["yaw_deg"]), north_up=True)
+        np.testing.assert_allclose(sample["T_from_L"].values.T @ C_from_T.T, want, atol=1e-9)
+
+
+def test_roll_and_pitch_tilt_the_boresight_away_from_the_centre(terrain: Terrain) -> None:
+    averted = {**FROM_AFAR["sun_averted"], "roll_deg": [3, 3], "pitch_deg": [-4, -4]}
+    s = session({"broken_pixels": {}}, geometry={**FROM_AFAR, "sun_averted": averted})
+    pose = resolved(s, terrain, 0)
+    site = terrain.site
+    towards = frames.unit(
+        site.T_from_L.T @ (terrain.body.centre_of_mass_T_m - site.position_T_m) - pose.position_L_m
+    )
+    angle = np.degrees(np.arccos(pose.L_from_C[:, 2] @ towards))
+    assert angle == pytest.approx(float(frames.boresight_angle_deg(3, -4)), abs=1e-6)
 
 
 # ------------------------------------------------------------------------------------------- the paper's pairs

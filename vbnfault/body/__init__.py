@@ -20,7 +20,7 @@ from .gravity import PolyhedronGravity
 from .nucleus import embedded_nucleus
 from .patch import Patch, build_patch
 from .roughness import Roughness, model_roughness
-from .shape import Float64, Int32, Unit, check_mesh, load_shape, signed_volume
+from .shape import Float64, Int32, Unit, centre_of_mass, check_mesh, load_shape, signed_volume
 from .sites import Site, Sites, choose_sites, local_level, site_at
 from .spec import PatchSpec
 
@@ -88,6 +88,11 @@ class Body:
     def volume_m3(self) -> float:
         """Return the volume that the mesh encloses."""
         return signed_volume(self.vertices_m, self.faces)
+
+    @cached_property
+    def centre_of_mass_T_m(self) -> Float64:
+        """Return the centre of mass of the homogeneous body in T, float64[3] in m."""
+        return centre_of_mass(self.vertices_m, self.faces)
 
     @cached_property
     def gravity(self) -> PolyhedronGravity:

@@ -189,6 +189,18 @@ def signed_volume(vertices: NDArray, faces: NDArray) -> float:
     return float(np.sum(a * np.cross(b, c)) / 6.0)
 
 
+def centre_of_mass(vertices: NDArray, faces: NDArray) -> Float64:
+    """Return the centre of mass of a closed, homogeneous mesh, float64[3] in the vertices' unit.
+
+    It is the mean of the centroids of the tetrahedra from one point to each face, weighted with their signed
+    volumes. The point is the centre of the bounding box, near which the terms lose few digits.
+    """
+    middle = 0.5 * (vertices.max(axis=0) + vertices.min(axis=0)).astype(np.float64)
+    a, b, c = (vertices[faces[:, k]].astype(np.float64) - middle for k in range(3))
+    volume = np.sum(a * np.cross(b, c), axis=1)
+    return np.asarray(middle + np.sum(volume[:, None] * (a + b + c), axis=0) / (4 * volume.sum()))
+
+
 def face_normals_areas(vertices: NDArray, faces: NDArray) -> tuple[Float64, Float64]:
     """Return outward unit normals float64[m, 3] (zero if degenerate) and areas float64[m] in the unit squared."""
     a, b, c = (vertices[faces[:, k]].astype(np.float64) for k in range(3))

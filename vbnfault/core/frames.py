@@ -5,7 +5,8 @@
 - L: local-level frame at a site; x north, y east, z down along effective gravity.
 - B: spacecraft body frame.
 - C: camera frame; x image right, y image down, z boresight. It coincides with B.
-- C0: z points at the reference direction (the Sun), y along the projection of L's down axis.
+- C0: z points at the reference direction: the Sun, the nadir or the body's centre. Under the Sun, y is along the
+  projection of L's down axis; under the nadir and the centre, along that of south.
 
     L_from_C = L_from_C0 · Rx(ψ) · Ry(θ) · Rz(φ)        roll ψ, pitch θ, yaw φ
 
@@ -67,25 +68,30 @@ def azimuth_elevation_deg(direction: F64) -> tuple[float, float]:
     return float(np.degrees(np.arctan2(y, x)) % 360), float(np.degrees(np.arctan2(-z, np.hypot(x, y))))
 
 
-def L_from_C0(reference_L: F64) -> F64:
+def L_from_C0(reference_L: F64, *, north_up: bool = False) -> F64:
     """Return the axes of C0 in L as columns: z at the reference, y along the projection of L's down (0, 0, 1).
 
     Where the reference is vertical, the projection vanishes. Then y points south for the nadir and north for the
     zenith, which is the limit of a reference tilted slightly north.
+
+    With `north_up`, y is along the projection of south, (-1, 0, 0). So y changes smoothly where the reference is
+    near the nadir. Where the projection vanishes, y is along that of down.
     """
     z = unit(reference_L)
-    for down in (np.array([0.0, 0.0, 1.0]), np.array([-z[2], 0.0, 0.0])):
-        y = down - (down @ z) * z
+    down = np.array([0.0, 0.0, 1.0])
+    candidates = (np.array([-1.0, 0.0, 0.0]), down) if north_up else (down, np.array([-z[2], 0.0, 0.0]))
+    for axis in candidates:
+        y = axis - (axis @ z) * z
         if np.linalg.norm(y) > 1e-9:
             break
     y = unit(y)
     return np.column_stack([np.cross(y, z), y, z])
 
 
-def L_from_C(reference_L: F64, roll_deg: float, pitch_deg: float, yaw_deg: float) -> F64:
+def L_from_C(reference_L: F64, roll_deg: float, pitch_deg: float, yaw_deg: float, *, north_up: bool = False) -> F64:
     """Return the camera axes in L from the reference direction and the three Euler angles (module docstring)."""
     roll, pitch, yaw = np.radians([roll_deg, pitch_deg, yaw_deg])
-    return L_from_C0(reference_L) @ rx(roll) @ ry(pitch) @ rz(yaw)
+    return L_from_C0(reference_L, north_up=north_up) @ rx(roll) @ ry(pitch) @ rz(yaw)
 
 
 def roll_pitch_yaw_deg(reference_L: F64, L_from_C_: F64) -> tuple[float, float, float]:

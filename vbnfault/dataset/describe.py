@@ -8,6 +8,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core import frames
 from ..pipeline import Session
 from ..pipeline.exposure import reference_exposure_s
 from ..scene import plan
@@ -92,7 +93,7 @@ def _geometry(session: Session) -> list[str]:
     for k, stratum in enumerate(plan.strata(scene)):
         if not (table.stratum == k).any():
             continue
-        towards = "the Sun" if stratum.reference == "sun" else "straight down"
+        towards = _REFERENCES[stratum.reference]
         lit = f"at least {stratum.min_lit_fraction:.0%} sunlit ground" if stratum.min_lit_fraction else "any ground"
         lines.append(
             f"  {plan.STRATA[k]}: Sun elevation {_bounds(stratum.sun_elevation_deg)}, azimuth "
@@ -110,8 +111,12 @@ def _geometry(session: Session) -> list[str]:
     return lines
 
 
+# The references of attitude (`geometry.sun_facing.reference`) in words.
+_REFERENCES = {"sun": "the Sun", "nadir": "straight down", "centre": "the body's centre of mass"}
+
+
 def _down(session: Session) -> str:
-    """Describe how far straight down is from the direction to the centre of the body-fixed frame, at a few sites.
+    """Describe how far straight down is from the direction to the body's centre of mass, at a few sites.
 
     Down follows gravity and the centrifugal force. On a fast rotator or an irregular body, it does not point at the
     centre.
@@ -119,11 +124,12 @@ def _down(session: Session) -> str:
     used = np.unique(session.plan.site)
     some = used[np.linspace(0, len(used) - 1, min(_SITES_DESCRIBED, len(used))).astype(int)]
     sites = [session.sites[int(index)] for index in some]
-    cosine = [-site.T_from_L[:, 2] @ site.position_T_m / np.linalg.norm(site.position_T_m) for site in sites]
+    centre_T_m = session.body.centre_of_mass_T_m
+    cosine = [site.T_from_L[:, 2] @ frames.unit(centre_T_m - site.position_T_m) for site in sites]
     angle = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
     return (
         f"straight down (gravity and rotation) is {_range(round(angle.min()), round(angle.max()))} deg from the "
-        f"direction to the body's centre, at {len(sites)} of the sites"
+        f"direction to the body's centre of mass, at {len(sites)} of the sites"
     )
 
 

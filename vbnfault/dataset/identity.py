@@ -161,6 +161,7 @@ def store_spec(session: pipeline.Session, blocks: Sequence[int]) -> StoreSpec:
     _check_origins(session.faults)
     kinds = tuple(masks.kind(fault, is_ccd=camera.is_ccd) for fault in session.faults.values())
     identity, made_with = scene_identity(session), versions()
+    references = assemble.attitude_references(scene)
     if scene.spice.kernels:
         made_with["spiceypy"] = importlib.metadata.version("spiceypy")
     attributes: dict[str, Any] = {
@@ -194,7 +195,8 @@ def store_spec(session: pipeline.Session, blocks: Sequence[int]) -> StoreSpec:
         site_names=tuple(f"site_{k:05d}" for k in range(dataset.sites)),
         lens_names=(camera.lens.name,),
         distortion_residual_px=camera.lens.distortion_residual_px,
-        attitude_references=assemble.attitude_references(scene),
+        attitude_references=references,
+        centre_of_mass_T_m=tuple(session.body.centre_of_mass_T_m.tolist()) if "centre" in references else None,
         detector_names=tuple(f"{camera.detector.name} {k}" for k in range(individuals))
         if individuals > 1
         else (camera.detector.name,),

@@ -25,7 +25,7 @@ from ..core.quantities import DEAD, HOT, LUMINANCE, RGBI, RTS, RTS_HIGH, STUCK, 
 from .demosaic import bounded_at_edges, correct_defects, demosaic, interpolate
 from .effects import Acts, Effect, Exposure, chain_of, is_packaged
 from .effects.electrons import upper_fraction
-from .effects.output import analogue_and_converter
+from .effects.output import full_well_to_codes
 from .efficiency import white_balance
 from .individual import Individual, IndividualSpec, dark_rate_e_s, make_individual, offset_e, response
 from .mosaic import channel_of
@@ -109,8 +109,8 @@ class Device:
         self.telegraph = self.individual.rts.at(self.temperature_K)
         self.chain = chain_of(sensor.effects)
         names = [effect.name for effect in self.chain]
-        # with no effect between them, both run on one block of rows after the other, which is quicker
-        self._converts_at_once = names.index("converter") == names.index("analogue") + 1
+        # with no effect between them, the three run on one block of rows after the other, which is quicker
+        self._reads_out_at_once = names.index("converter") == names.index("full_well") + 2
 
     # --- light to raw DN ------------------------------------------------------------------------------------------
 
@@ -126,8 +126,8 @@ class Device:
     def collected_e(
         self, photo_e: F32, exposure_s: float, noise: MosaicNoise | None = None, acts: Acts = _NOTHING
     ) -> F32:
-        """Return the charge at the output, float32[y, x] in e, before the offsets and the readout."""
-        electrons: F32 = self._run(photo_e, exposure_s, noise, acts, before="analogue")
+        """Return the charge at the output, float32[y, x] in e, before the full well and the readout."""
+        electrons: F32 = self._run(photo_e, exposure_s, noise, acts, before="full_well")
         return electrons
 
     def raw(self, photo_e: F32, exposure_s: float, noise: MosaicNoise | None = None, acts: Acts = _NOTHING) -> Raw:
@@ -147,9 +147,9 @@ class Device:
         for effect in effects:
             if effect.name == before:
                 break
-            if effect.name == "analogue" and self._converts_at_once:
-                next(effects)
-                signal = analogue_and_converter(signal, exposure)
+            if effect.name == "full_well" and self._reads_out_at_once:
+                next(effects), next(effects)  # analogue and converter
+                signal = full_well_to_codes(signal, exposure)
             else:
                 signal = _checked(effect, signal, effect.apply(signal, exposure))
         return signal

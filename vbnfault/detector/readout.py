@@ -241,7 +241,7 @@ def read_out(
     chain = _Chain(electrons.shape, spec, noise, individual)
     code_of = Converter(spec, transitions)
     return blockwise(
-        lambda *block: code_of(chain.amplify(*block)),
+        lambda block, *of_rows: code_of(chain.amplify(clip_full_well(block, spec.full_well_e), *of_rows)),
         plane(electrons),
         *chain.of_rows,
     )
@@ -253,9 +253,14 @@ def analogue_dn(
     noise: ReadoutNoise | None = None,
     individual: ReadoutIndividual | None = None,
 ) -> F32:
-    """Return the level at the converter, float32[y, x] in DN, neither rounded nor clipped to its range."""
+    """Return the level at the converter, float32[y, x] in DN, neither rounded nor clipped to its range.
+
+    `electrons` are those that the full well has left (`clip_full_well`); other arguments are as in `read_out`.
+    """
     chain = _Chain(electrons.shape, spec, noise, individual)
-    return blockwise(chain.amplify, plane(electrons), *chain.of_rows)
+    return blockwise(
+        lambda block, *of_rows: chain.amplify(block.copy(), *of_rows), plane(electrons), *chain.of_rows
+    )
 
 
 def clip_full_well(electrons: F32, full_well_e: float) -> F32:
@@ -299,7 +304,6 @@ class _Chain:
             raise InputError(f"the image has shape {shape}, but must be [y, x]")
         height, width = shape
         self.spec = spec
-        self.full_well_e = spec.full_well_e
         rows = np.zeros(height, dtype=np.float32)
         self.column_e: F32 | None = None
         if individual is not None:
@@ -335,8 +339,8 @@ class _Chain:
         read: F32 | None,
         pixel_e: F32 | None,
     ) -> F32:
-        """Return the level at the converter, in DN, of a block of rows."""
-        out = clip_full_well(electrons, self.full_well_e)
+        """Return the level at the converter, in DN, of a block of rows, whose array `electrons` is overwritten."""
+        out = electrons
         if pixel_e is not None:
             out += pixel_e
         if self.column_e is not None:

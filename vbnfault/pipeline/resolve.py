@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 
@@ -14,7 +15,7 @@ from ..render.description import Sunlight
 from ..scene import plan
 from ..world import assemble
 from ..world.spacecraft import SpacecraftMesh
-from .spec import Pose, SampleSpec
+from .spec import Pose, SampleSpec, Terrain
 
 F64 = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -90,13 +91,13 @@ class _Views:
         directions = [frames.direction_L(d["sun_azimuth_deg"], d["sun_elevation_deg"]) for d in drawn]
         light = assemble.sunlight(scene, directions[0])
         suns = [replace(light, direction_L=direction) for direction in directions]
-        to_the_sun = plan.strata(scene)[spec.plan.stratum[spec.index]].reference == "sun"
-        down = np.array([0.0, 0.0, 1.0])
-        axes = [
-            frames.L_from_C(sun if to_the_sun else down, d["roll_deg"], d["pitch_deg"], d["yaw_deg"])
-            for sun, d in zip(directions, drawn, strict=True)
-        ]
         position = np.column_stack([x, y, -height])
+        reference = plan.strata(scene)[spec.plan.stratum[spec.index]].reference
+        references_L = _references_L(reference, spec.terrain, position, directions)
+        axes = [
+            frames.L_from_C(towards, d["roll_deg"], d["pitch_deg"], d["yaw_deg"], north_up=reference == "centre")
+            for towards, d in zip(references_L, drawn, strict=True)
+        ]
         visible = render.sun_visible_fraction(spec.terrain.surface, position, suns, np.stack(axes))
         return _Views(
             variables=drawn,
@@ -126,6 +127,19 @@ class _Views:
             variables=self.variables[k],
             resolved=True,
         )
+
+
+def _references_L(
+    reference: str, terrain: Terrain, position_L_m: F64, sun_directions_L: Sequence[F64]
+) -> list[F64]:
+    """Return the direction in L from which the attitude of each view counts; `reference` names it in the scene."""
+    if reference == "sun":
+        return list(sun_directions_L)
+    if reference == "nadir":
+        return [np.array([0.0, 0.0, 1.0])] * len(position_L_m)
+    site = terrain.site
+    centre_L_m = site.T_from_L.T @ (terrain.body.centre_of_mass_T_m - site.position_T_m)
+    return [frames.unit(centre_L_m - camera_L_m) for camera_L_m in position_L_m]
 
 
 def _first_usable(spec: SampleSpec, views: _Views, count: int, unmet: dict[str, int]) -> int | None:

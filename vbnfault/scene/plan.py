@@ -222,7 +222,7 @@ def _keep_sun_out_of_view(
 
     The paper's bounds leave 8 % of the Sun-averted draws looking at the Sun, where roll and pitch are both near
     half a turn. Where the angles count from the Sun, only roll and pitch decide this. Where they count from the
-    nadir, the function does nothing. Raises InputError where the bounds keep the Sun in view.
+    nadir or the centre, the function does nothing. Raises InputError where the bounds keep the Sun in view.
     """
     if strata(scene)[SUN_AVERTED].reference != "sun":
         return

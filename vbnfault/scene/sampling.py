@@ -66,7 +66,11 @@ class StratumTable(Table):
     roll_deg: pair_within(-360, 720) | None = None  # type: ignore[valid-type]
     pitch_deg: pair_within(-360, 720) | None = None  # type: ignore[valid-type]
     yaw_deg: pair_within(-360, 720) | None = None  # type: ignore[valid-type]
-    reference: Literal["sun", "nadir"] = Field("sun", description="where the boresight points at zero angles")
+    reference: Literal["sun", "nadir", "centre"] = Field(
+        "sun",
+        description="where the boresight points at zero roll and pitch: the Sun, straight down as a plumb line at "
+        "the site, or the body's centre of mass",
+    )
     min_lit_fraction: Annotated[float, Field(ge=0, le=1)] | None = Field(
         None, description="default: that of [geometry]"
     )

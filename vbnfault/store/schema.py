@@ -215,7 +215,9 @@ class StoreSpec:
         Root mean square and maximum deviation of the stored distortion coefficients from the lens's chief rays,
         over the lit frame.
     attitude_references
-        For each of `STRATA`, the direction from which roll, pitch and yaw are measured: "sun" or "nadir".
+        For each of `STRATA`, the direction from which roll, pitch and yaw are measured: "sun", "nadir" or "centre".
+    centre_of_mass_T_m
+        The body's centre of mass in T, which the reference "centre" names; stored only with this reference.
     shard_samples
         Samples a shard. 0 chooses the largest number up to 16 for which the largest array of a shard stays within
         1 GiB and all layers within 2 GiB. A number that is too large is lowered to its largest divisor within these
@@ -243,6 +245,7 @@ class StoreSpec:
     lens_names: tuple[str, ...] = ()
     distortion_residual_px: tuple[float, float] = (0.0, 0.0)
     attitude_references: tuple[str, ...] = ("sun", "sun")
+    centre_of_mass_T_m: tuple[float, float, float] | None = None
     detector_names: tuple[str, ...] = ()
     radiance_dtype: str = "float16"
     shard_samples: int = 0
@@ -316,6 +319,9 @@ class StoreSpec:
 
     def members(self, samples: int) -> dict[str, Member]:
         """Return the required layout by name of every array of a store of `samples` samples, coordinates last."""
+        attitude: dict[str, Any] = {"reference": dict(zip(STRATA, self.attitude_references, strict=True))}
+        if "centre" in self.attitude_references:
+            attitude["centre_of_mass_T_m"] = self.centre_of_mass_T_m and list(self.centre_of_mass_T_m)
         extra: dict[str, dict[str, Any]] = {
             "mask": {"kinds": list(self.mask_kinds), "rules": list(self.mask_rules)} if self.mask_kinds else {},
             "mask_effect": {"threshold_dn": EFFECT_DN, "rule": EFFECT_RULE},
@@ -326,10 +332,7 @@ class StoreSpec:
                 "residual_px_rms": self.distortion_residual_px[0],
                 "residual_px_max": self.distortion_residual_px[1],
             },
-            **{
-                name: {"reference": dict(zip(STRATA, self.attitude_references, strict=True))}
-                for name in ("roll_deg", "pitch_deg", "yaw_deg")
-            },
+            **dict.fromkeys(("roll_deg", "pitch_deg", "yaw_deg"), attitude),
             "detector_individual": {"names": list(self.detector_names)},
             "split": {"names": list(SPLITS)},
             "radiance": {"coordinates": "wavelength_nm"},

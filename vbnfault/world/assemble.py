@@ -158,7 +158,7 @@ def target_attitude(scene: Scene, sun_T: F64) -> F64:
 
 
 def attitude_references(scene: Scene) -> tuple[str, str]:
-    """Return the reference of attitudes, "sun" or "nadir", in the Sun-facing and the Sun-averted stratum."""
+    """Return the references of attitudes ("sun", "nadir" or "centre"): Sun-facing stratum, Sun-averted stratum."""
     if scene.spice.spacecraft:  # the kernels give the attitude, and it is stored relative to the Sun
         return "sun", "sun"
     facing, averted = scene.geometry.sun_facing, scene.geometry.sun_averted

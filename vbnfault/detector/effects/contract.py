@@ -16,11 +16,12 @@ of a sensor file, and an effect outside vbnfault acts where the sensor has this 
         def apply(self, signal, exposure):
             return signal + np.float32(self.fraction * self.before_e)
 
-The chain has these effects and steps, in this order. `signal` is float32[y, x] in electrons, from "analogue" on
-float32[y, x] in DN, from "converter" on uint16[y, x] in DN.
+The chain has these effects and steps, in this order. `signal` is float32[y, x] in electrons, behind "analogue"
+float32[y, x] in DN, behind "converter" uint16[y, x] in DN. An effect with `after = "full_well"` acts on the charge
+that the wells hold, and what it adds is not clipped.
 
     response, light, smear, dark_current, telegraph, pixels, shot_noise, charge, blooming, deep_traps,
-    parallel_cti, serial_cti, analogue, converter, stuck_pixels, raw
+    parallel_cti, serial_cti, full_well, analogue, converter, stuck_pixels, raw
 
 "light", "pixels", "charge" and "raw" are the steps at which faults act; "offsets" belongs to "analogue".
 """

@@ -1,4 +1,4 @@
-"""Define what happens at the output: the analogue chain, the converter and pixels that are stuck."""
+"""Define what happens at the output: full well, analogue chain, converter and pixels that are stuck."""
 
 from __future__ import annotations
 
@@ -9,17 +9,28 @@ from numpy.typing import NDArray
 
 from ..converter import convert
 from ..individual import StuckPixels
-from ..readout import ReadoutIndividual, analogue_dn, read_out
+from ..readout import ReadoutIndividual, analogue_dn, clip_full_well, read_out
 from .contract import F32, Effect, Exposure, FaultStep
 
 Raw = NDArray[np.uint16]
 
 
+class FullWell(Effect):
+    """Limit the charge of each pixel to the full well."""
+
+    name = "full_well"
+    after = "serial_cti"
+
+    def apply(self, signal: F32, exposure: Exposure) -> F32:
+        """Return the electrons, at most the full well."""
+        return clip_full_well(signal, exposure.sensor.readout.full_well_e)
+
+
 class Analogue(Effect):
-    """Bring charge to the level at the converter: full well, offsets, patterns, noise, gain and non-linearity."""
+    """Bring charge to the level at the converter: offsets, patterns, bias, noise, gain and non-linearity."""
 
     name = "analogue"
-    after = "serial_cti"
+    after = "full_well"
 
     def apply(self, signal: F32, exposure: Exposure) -> F32:
         """Return the level in DN, neither rounded nor clipped to the converter's range."""
@@ -57,8 +68,8 @@ class RawStep(FaultStep):
     after = "stuck_pixels"
 
 
-def analogue_and_converter(signal: F32, exposure: Exposure) -> Raw:
-    """Return what `Analogue` and `Conversion` give one after the other, in one pass over blocks of rows."""
+def full_well_to_codes(signal: F32, exposure: Exposure) -> Raw:
+    """Return what `FullWell`, `Analogue` and `Conversion` give one after the other, in one pass over blocks."""
     noise = None if exposure.noise is None else exposure.noise.readout
     return read_out(signal, exposure.sensor.readout, noise, _with_offsets(exposure))
 
