@@ -1,0 +1,114 @@
+"""`vbnfault.testing.check_effect` names what is wrong with a detector effect, and accepts all packaged ones."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+from pydantic import Field
+
+from vbnfault import Effect
+from vbnfault.core import tables
+from vbnfault.detector.effects import contract, registry
+from vbnfault.testing import check_effect
+
+PACKAGED = [cls for cls in registry().values() if contract.is_packaged(cls)]
+
+
+@pytest.fixture(autouse=True)
+def undone() -> Iterator[None]:
+    """The effects that a test defines are gone after it."""
+    before = dict(contract._REGISTRY._classes)
+    yield
+    contract._REGISTRY._classes = before
+    tables.forget_schemas()
+
+
+@pytest.mark.parametrize("effect", PACKAGED, ids=lambda cls: cls.name)
+def test_packaged_effects_keep_the_contract(effect: type[Effect]) -> None:
+    check_effect(effect)
+
+
+FRACTION = Field(0.1, ge=0, le=1, description="fraction")
+
+
+def good(self: Any, signal: Any, exposure: Any) -> Any:
+    rng = exposure.rng(self.name)
+    factor = 1.0 if rng is None else rng.uniform()
+    return signal + np.float32(100 * self.fraction * factor)
+
+
+def in_place(self: Any, signal: Any, exposure: Any) -> Any:
+    signal += 1
+    return signal.copy()
+
+
+def by_the_signal(self: Any, signal: Any, exposure: Any) -> Any:
+    rng = exposure.rng(self.name)
+    return signal if rng is None else signal + rng.poisson(signal).astype(np.float32)
+
+
+counter = itertools.count(1)
+
+BROKEN: dict[str, tuple[dict[str, Any], str]] = {
+    "in place": ({"apply": in_place}, "apply modified its input and returned another array"),
+    "dtype": ({"apply": lambda _, s, e: s.astype(np.float64)}, "apply changed the dtype from float32 to float64"),
+    "shape": ({"apply": lambda _, s, e: s[1:]}, r"apply changed the shape from \(24, 40\) to \(23, 40\)"),
+    "none": ({"apply": lambda _, s, e: None}, "apply returned NoneType, but must return an array"),
+    "negative": ({"apply": lambda _, s, e: s - 1}, "apply returned negative electrons"),
+    "infinite": ({"apply": lambda _, s, e: s + np.float32(np.inf)}, "apply returned a value that is not finite"),
+    "code": (
+        {"apply": lambda _, s, e: s | np.uint16(0x8000), "after": "converter"},
+        r"apply returned a code above the highest, \d+",
+    ),
+    "draw": ({"apply": lambda _, s, e: s + np.float32(next(counter))}, "another result for the same exposure"),
+    "variates": ({"apply": by_the_signal}, "draws a number of variates that depends on the signal"),
+    "after": ({"after": "dark_curent"}, r"after = 'dark_curent': there is none of this name \(did you mean"),
+    "description": ({"fraction": Field(0.1, ge=0, le=1)}, "fraction has no description"),
+    "limit": ({"fraction": Field(0.1, ge=0, description="a")}, "fraction has no upper limit"),
+    "raises": ({"apply": lambda _, s, e: s / e.nothing}, "raised AttributeError: .*nothing"),
+    "document": ({"__doc__": None}, "has no docstring"),
+}
+
+
+def define(kind: str, body: dict[str, Any]) -> type[Effect]:
+    """Return an effect that keeps the contract but for what `body` replaces."""
+    kept = {"name": f"broken_{kind}", "after": "dark_current", "apply": good, "fraction": FRACTION}
+    kept |= {"__doc__": "Add.", "__module__": __name__, "__qualname__": "Broken"}
+    made = type("Broken", (Effect,), kept | body | {"__annotations__": {"fraction": float}})
+    globals()["Broken"] = made  # pickle looks it up there
+    return made
+
+
+def test_an_effect_that_keeps_the_contract_passes() -> None:
+    check_effect(define("good", {}))
+
+
+@pytest.mark.parametrize("kind", BROKEN)
+def test_what_breaks_the_contract_is_named(kind: str) -> None:
+    body, sentence = BROKEN[kind]
+    effect = define(kind.replace(" ", "_"), body)
+    with pytest.raises(AssertionError, match=sentence) as caught:
+        check_effect(effect)
+    assert str(caught.value).startswith(f"detector effect {effect.name}: ")
+
+
+def test_keys_without_limits_to_draw_between_are_given() -> None:
+    class Named(Effect):
+        """Change nothing."""
+
+        name = "named"
+        after = "dark_current"
+        label: str = Field(description="text without a default")
+
+        def apply(self, signal: Any, exposure: Any) -> Any:
+            return signal
+
+    with pytest.raises(AssertionError, match=r"draws of its keys were refused, .* label: .*; name the keys"):
+        check_effect(Named)
+    Named.__qualname__ = "Named"
+    globals()["Named"] = Named
+    check_effect(Named, required={"label": "a"}, examples=2)
