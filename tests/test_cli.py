@@ -430,6 +430,16 @@ def test_list_schema_doctor_and_dry_run(
     assert run(monkeypatch, "list", "lenses") == 0
     assert run(monkeypatch, "list", "detectors") == 0
     capsys.readouterr()
+    for kind, line in (
+        ("effects", "\nfull_well     Limit the charge of each pixel to the full well.\nanalogue "),
+        ("reflectances", "\n    phase_slope_mag_deg = 0.0    fading with phase angle"),
+        ("glasses", "N-BK7   nd 1.51680  Abbe number 64.17  formula sellmeier\n"),
+    ):
+        assert run(monkeypatch, "list", kind) == 0
+        assert line in capsys.readouterr().out
+    assert run(monkeypatch, "list", "cameras") == 2
+    assert "must be one of scenes, lenses, detectors, faults, effects, reflect" in capsys.readouterr().err
+    capsys.readouterr()
     assert run(monkeypatch, "schema") == 0
     schema = json.loads(capsys.readouterr().out)
     assert "straylight" in schema["properties"]["faults"]["properties"]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tomllib
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,15 +14,18 @@ from typer.testing import CliRunner
 from vbnfault import cli, dataset, store
 from vbnfault.core.errors import InputError
 from vbnfault.core.quantities import Electrons
-from vbnfault.detector import load_sensor
+from vbnfault.detector import MosaicDetector, load_sensor
+from vbnfault.detector.chain import Device
 from vbnfault.faults import plugins
 from vbnfault.faults.models import undoing_registrations
 from vbnfault.lens import first_order, load_lens
 from vbnfault.output import template_files
 from vbnfault.output.template_files import write_template
 from vbnfault.pipeline import configure_faults
+from vbnfault.reflectance import radiance_factor
 from vbnfault.scene.config import load_scene
-from vbnfault.testing import check_fault, make_context
+from vbnfault.testing import check_effect, check_fault, make_context
+from vbnfault.world.assemble import base_camera
 
 
 def test_the_command_writes_each_kind(tmp_path: Path) -> None:
@@ -104,6 +108,45 @@ def test_the_fault_keeps_the_contract_and_acts_in_a_scene(tmp_path: Path) -> Non
     assert dark.any()
 
 
+@pytest.mark.usefixtures("undone")
+def test_the_effect_keeps_the_contract_and_acts_in_a_detector(tmp_path: Path) -> None:
+    plugin = write_template("effect", "amplifier_glow", tmp_path)
+    path = write_template("sensor", "chip", tmp_path)
+    table = "[effects.amplifier_glow]\nglow_e_s = 200.0\nreach_px = 10.0\n\n[sources]"
+    text = path.read_text(encoding="utf-8").replace("\n[sources]", f"\n{table}", 1)
+    names = ("glow_e_s", "reach_px")
+    path.write_text(text + "".join(f'"effects.amplifier_glow.{n}" = "assumed"\n' for n in names), encoding="utf-8")
+    plugins.load_plugins([str(plugin)])
+    sensor = load_sensor(path)
+    (effect,) = sensor.effects
+    assert type(effect).__name__ == "AmplifierGlow"
+    check_effect(type(effect), examples=3)
+    scene = write_template("scene", "first", tmp_path)
+    text = scene.read_text(encoding="utf-8").replace('\n# detector = "generic_cmos"', '\ndetector = "chip.toml"')
+    scene.write_text(f'plugins = ["amplifier_glow.py"]\n{text}', encoding="utf-8")
+    detector = base_camera(load_scene(scene, {"camera.width_px": 64, "camera.height_px": 48})).detector
+    assert isinstance(detector, MosaicDetector)
+    dark = np.zeros((48, 64), np.float32)
+    without = Device(replace(sensor, effects=()), detector.seed, shape=dark.shape)
+    gained_e = detector.device.expected_e(dark, 2.0) - without.expected_e(dark, 2.0)
+    # 200 e/s for 2 s, at half a pixel's diagonal from the corner
+    assert gained_e[0, 0] == pytest.approx(400 * np.exp(-np.sqrt(0.5) / 10), rel=1e-4)
+    assert gained_e[-1, -1] < 1
+
+
+@pytest.mark.usefixtures("undone")
+def test_the_reflectance_is_lamberts_law_at_an_exponent_of_one(tmp_path: Path) -> None:
+    write_template("reflectance", "own_law", tmp_path)
+    path = write_template("scene", "first", tmp_path)
+    text = path.read_text(encoding="utf-8").replace('\nmodel = "hapke"', '\nmodel = "own_law"\nexponent = 1.0', 1)
+    path.write_text(f'plugins = ["own_law.py"]\n{text}', encoding="utf-8")
+    model = load_scene(path).body.photometry
+    assert type(model).__name__ == "OwnLaw"
+    bands = model.at(np.array([550.0]), np.array([0.05]))
+    light = [[0.6, 0, 0.8], [0.8, 0, -0.6]]
+    np.testing.assert_allclose(radiance_factor(bands, light, [[0, 0, 1]]), [[0.04, 0]], atol=1e-12)
+
+
 def test_a_sensor_without_sources_is_told_all_that_are_missing(tmp_path: Path) -> None:
     path = write_template("sensor", "chip", tmp_path)
     text = path.read_text(encoding="utf-8")
@@ -129,10 +172,11 @@ def test_a_file_is_not_replaced_unless_asked(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("kind", "name", "sentence"),
     [
-        ("camera", "a", "new 'camera': must be one of scene, lens, sensor, fault"),
+        ("camera", "a", "new 'camera': must be one of scene, lens, sensor, fault, effect, reflectance"),
         ("lens", "../a", r"new lens '\.\./a': must be letters, digits, hyphens and underscores"),
         ("lens", "", "new lens '': must be letters"),
         ("fault", "My-fault", "new fault 'My-fault': must be lower-case letters, digits and underscores"),
+        ("effect", "lambda", "new effect 'lambda': must be .* and no keyword of Python"),
     ],
 )
 def test_bad_names_are_refused(kind: str, name: str, sentence: str, tmp_path: Path) -> None:

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from .core.errors import InputError, VbnfaultError
     from .dataset import BuildOptions, verify
     from .dataset import build_scene as build
-    from .detector.effects import Effect
+    from .detector.effects import Effect, Exposure
     from .detector.sensor import Sensor, load_sensor
     from .faults import Fault, FaultContext, Interval, bounds, choice, flag, number, path, rows, text
     from .lens import Prescription, load_lens
@@ -34,6 +34,7 @@ if TYPE_CHECKING:
 _HOME = {
     "DiscReflectance": ("reflectance", "DiscReflectance"),
     "Effect": ("detector.effects", "Effect"),
+    "Exposure": ("detector.effects", "Exposure"),
     "BuildOptions": ("dataset", "BuildOptions"),
     "Fault": ("faults", "Fault"),
     "FaultContext": ("faults", "FaultContext"),
@@ -67,6 +68,7 @@ __all__ = [
     "BuildOptions",
     "DiscReflectance",
     "Effect",
+    "Exposure",
     "Fault",
     "FaultContext",
     "Flare",

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import contextlib
+import inspect
 import json
 import os
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -21,19 +23,30 @@ _LIBRARIES = ("mitsuba", "drjit", "numpy", "zarr", "trimesh", "OpenEXR", "colour
 
 @app.command("list", rich_help_panel=_PANEL)
 def list_(
-    kind: Annotated[str, typer.Argument(help="One of scenes, lenses, detectors and faults.", metavar="KIND")],
+    kind: Annotated[
+        str,
+        typer.Argument(
+            help="One of scenes, lenses, detectors, faults, effects, reflectances and glasses.", metavar="KIND"
+        ),
+    ],
     plugins: PluginOption = None,
 ) -> None:
-    """List the packaged scenes, lenses or detectors, or the fault models with their keys."""
+    """List packaged scenes, lenses or detectors, glasses, or faults, effects and reflectances with their keys."""
     from ..core import resources
 
-    if kind == "faults":
-        load_plugins(plugins)
-        _list_faults()
-        return
+    registered = {
+        "faults": _list_faults,
+        "effects": _list_effects,
+        "reflectances": _list_reflectances,
+        "glasses": _list_glasses,
+    }
     folders = {"scenes": "scenes", "lenses": "scenes/lenses", "detectors": "scenes/detectors"}
+    if kind in registered:
+        load_plugins(plugins)
+        registered[kind]()
+        return
     if kind not in folders:
-        raise InputError(f"list {kind}: must be one of {', '.join(folders)}, faults")
+        raise InputError(f"list {kind}: must be one of {', '.join((*folders, *registered))}")
     paths = resources.packaged(folders[kind])
     if not paths:
         typer.echo(f"no packaged {kind}")
@@ -54,14 +67,62 @@ def _list_faults() -> None:
             cls = faults.registry()[name][model]
             needs = " (needs camera.detector, a CCD)" if cls.needs_ccd else " (needs camera.detector)"
             typer.echo(f"{name} / {model}{needs if cls.needs_mosaic else ''}")
-            for key, value in keys.items():
-                default = json.dumps(value.get("default"))
-                typer.echo(f"    {key} = {default}    {value['description']}")
+            _list_keys(keys)
+
+
+def _list_effects() -> None:
+    """Print the effects of a detector in the order of the chain, those of plug-ins with their keys."""
+    from ..detector import effects
+
+    classes = effects.registry()
+    width = max(map(len, classes))
+    for name in effects.order():
+        cls = classes[name]
+        typer.echo(f"{name:<{width}}  {_summary(cls)}{_origin(effects.is_packaged(cls))}")
+        _list_keys(cls.model_json_schema().get("properties", {}))
+
+
+def _list_reflectances() -> None:
+    """Print every ground reflectance, and under it each key with its default and its meaning."""
+    from .. import reflectance
+
+    for name, cls in reflectance.registry().items():
+        typer.echo(f"{name}: {_summary(cls)}{_origin(reflectance.is_packaged(cls))}")
+        keys = cls.model_json_schema()["properties"]
+        _list_keys({key: value for key, value in keys.items() if key != "model"})
+
+
+def _list_glasses() -> None:
+    """Print every glass that a lens file may name, with its index and Abbe number at the d line."""
+    from ..lens.glass import GLASSES
+
+    width = max(map(len, GLASSES))
+    for name, glass in GLASSES.items():
+        typer.echo(f"{name:<{width}}  nd {glass.nd:.5f}  Abbe number {glass.vd:.2f}  formula {glass.formula}")
+
+
+def _list_keys(properties: Mapping[str, Any]) -> None:
+    """Print the keys of a table, from the properties of its JSON Schema, with default and meaning."""
+    for key, value in properties.items():
+        value_text = f" = {json.dumps(value['default'])}" if "default" in value else " must be given"
+        typer.echo(f"    {key}{value_text}    {value.get('description', '')}".rstrip())
+
+
+def _summary(cls: type) -> str:
+    """Return the first paragraph of a class's docstring in one line."""
+    return " ".join((inspect.getdoc(cls) or "").split("\n\n")[0].split())
+
+
+def _origin(is_packaged: bool) -> str:
+    """Return the mark of a class that a plug-in defines, as the end of its line."""
+    return "" if is_packaged else " (of a plug-in)"
 
 
 @app.command(rich_help_panel=_PANEL)
 def new(
-    kind: Annotated[str, typer.Argument(help="One of scene, lens, sensor and fault.", metavar="KIND")],
+    kind: Annotated[
+        str, typer.Argument(help="One of scene, lens, sensor, fault, effect and reflectance.", metavar="KIND")
+    ],
     name: Annotated[
         str,
         typer.Argument(help="Name of the new thing and, with .toml or .py behind it, of its file.", metavar="NAME"),
@@ -69,7 +130,7 @@ def new(
     out: Annotated[Path, typer.Option(help="Folder for the file.")] = Path("."),
     overwrite: Annotated[bool, typer.Option(help="Replace a file of this name.")] = False,
 ) -> None:
-    """Write a commented scene, lens, sensor or fault model that works as it is, to start your own from."""
+    """Write a commented file that works as it is, to start your own from."""
     from ..output.template_files import write_template
 
     typer.echo(str(write_template(kind, name, out, overwrite=overwrite)))

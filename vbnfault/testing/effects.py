@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from pydantic import ValidationError
 
-from ..detector import Sensor, load_sensor
+from ..detector import load_sensor
 from ..detector.chain import Device, MosaicNoise
 from ..detector.effects import Effect, Exposure, is_packaged, order, registry
 
@@ -198,9 +198,10 @@ def _draw_number(node: Mapping[str, Any], rng: np.random.Generator) -> float:
 def _draw_exposure(effect: Effect, example: int, rng: np.random.Generator) -> _Recorded:
     """Return a random exposure of a small device that has the effect; every fourth one is without noise."""
     name, architecture = _SENSORS[example % len(_SENSORS)]
-    sensor: Sensor = replace(load_sensor(name), architecture=architecture)
+    changes: dict[str, Any] = {"architecture": architecture}
     if not is_packaged(type(effect)):
-        sensor = replace(sensor, effects=(effect,))
+        changes["effects"] = (effect,)
+    sensor = replace(load_sensor(name), **changes)
     device = Device(sensor, example, shape=_SHAPE, direction=("up", "down")[rng.integers(2)])
     noise = MosaicNoise.draw(_SHAPE, *rng.spawn(3)) if rng.random() < 0.75 else None
     exposure_s = (0.0, 1e-4, 0.1, 100.0)[rng.integers(4)]
