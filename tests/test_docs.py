@@ -19,7 +19,10 @@ import pytest
 
 import vbnfault
 from vbnfault.body import load_body
+from vbnfault.core.tables import json_schema
+from vbnfault.detector import Sensor
 from vbnfault.faults import registry
+from vbnfault.lens.prescription_file import PrescriptionFile
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
@@ -219,6 +222,35 @@ def test_the_reference_has_every_key_of_packaged_files(page: str, folder: str) -
     }
     assert len(keys) >= 12
     assert not [key for key in sorted(keys) if f"| `{key}` |" not in text]
+
+
+# Numbers without a unit: counts, fractions, ratios, exponents, and coefficients of formulas.
+_DIMENSIONLESS = """
+    adc_bits antiblooming asymmetry axis bands bits blade_rounding blades boulder_index bounces camera_axes
+    classes_per_sample coefficients coherent_amplitude coherent_width conic dark_nonuniformity dead_share
+    default_material dust_contrast eccentricity f_number faulty_fraction fill_power hot_clustered_share
+    hot_offset_share hurst individuals internal_transmittance_10mm iso iso_power k leak log10_scale
+    max_samples_per_pixel max_triangles max_tries max_views metering_level min_lit_fraction missing_codes n nd
+    node_gains noise_fraction porosity_factor prnu prnu_column prnu_low prnu_row quantum_efficiency_peak
+    reflectance relief rts_per_interaction rts_share samples samples_per_pixel seed shadow_hiding_amplitude
+    shadow_hiding_width shard_samples shutter_transmission single_scattering_albedo sites size_power
+    stuck_bits stuck_share sun_facing_nominal_fraction test tile train transmission trap_share val value vd
+"""
+
+
+def test_every_number_of_the_reference_has_its_meaning_and_its_unit() -> None:
+    described = [
+        *reference.scene_tables(),
+        *reference.tables(json_schema(PrescriptionFile)),
+        *reference.tables(json_schema(Sensor)),
+    ]
+    keys = {key.name: key for table in described for key in table.keys}
+    assert len(keys) > 150
+    assert not sorted(name for name, key in keys.items() if not key.meaning and name != "model")
+    numbers = {name for name, key in keys.items() if re.search(r"number| to \d|above|at least", key.allowed)}
+    assert len(numbers) > 100
+    without = {name for name in numbers if not reference.unit_of(name)}
+    assert without == set(_DIMENSIONLESS.split())  # a new one needs a unit at the end of its name, or a line here
 
 
 def test_the_reference_has_every_fault_and_key() -> None:

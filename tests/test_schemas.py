@@ -6,6 +6,7 @@ import copy
 import dataclasses
 import json
 import tomllib
+from collections.abc import Iterator
 from typing import Any
 
 import pytest
@@ -113,6 +114,42 @@ def test_every_key_of_every_fault_is_in_the_schema() -> None:
                 described = option["properties"][field.name]
                 assert described["description"]
                 assert set(described) & {"type", "anyOf", "enum", "const"}, (fault, model, field.name)
+
+
+def keys_of(schema: dict[str, Any]) -> Iterator[tuple[str, str, dict[str, Any]]]:
+    """Yield the owner, the name and the schema of every key of every table of a JSON Schema."""
+
+    def walk(owner: str, node: Any) -> Iterator[tuple[str, str, dict[str, Any]]]:
+        if isinstance(node, list):
+            for part in node:
+                yield from walk(owner, part)
+        elif isinstance(node, dict):
+            for key, described in node.get("properties", {}).items():
+                yield node.get("title", owner), key, described
+            for key, part in node.items():
+                yield from walk(f"{owner}.{key}", part)
+
+    return walk("", schema)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_key_has_a_description(kind: str) -> None:
+    schema = file_schema(kind)
+    described = list(keys_of(schema))
+    assert len(described) > 25
+
+    def meaning(node: dict[str, Any]) -> str:
+        if "$ref" in node:  # a table, whose docstring describes it
+            node = {**schema["$defs"][node["$ref"].rsplit("/", 1)[-1]], **node}
+        return node.get("description", "") or " ".join(meaning(part) for part in node.get("anyOf", ()))
+
+    bare = [
+        f"{owner}.{key}"
+        for owner, key, node in described
+        # a key with a single value says all by itself; the rows of a fault's key have the names of its other keys
+        if "const" not in node and owner != "Row" and not meaning(node).strip()
+    ]
+    assert not bare
 
 
 def test_all_sources_and_all_keys_that_are_missing_are_named_at_once() -> None:

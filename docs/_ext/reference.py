@@ -41,11 +41,14 @@ _UNITS = {
     "_krad": "krad",
     "_lsb_rms": "LSB",
     "_m": "m",
+    "_magnitude": "mag",
     "_mm": "mm",
+    "_nA_cm2": "nA/cm²",
     "_nm": "nm",
     "_per_100nm": "1/(100 nm)",
     "_per_km2": "1/km²",
     "_per_mm": "1/mm",
+    "_percentile": "%",
     "_px": "px",
     "_rad": "rad",
     "_s": "s",
@@ -54,6 +57,7 @@ _UNITS = {
     "_K": "K",
     "_mag_deg": "mag/°",
     "_years": "a",
+    "_share_yr": "1/a",
 }
 
 

@@ -127,7 +127,9 @@ class Sensor:
     readout: ReadoutSpec = Field(default_factory=ReadoutSpec, description="the chain from charge to DN")
     transfer: Transfer = Field(default_factory=Transfer, description="how charge is moved")
     effects: Effects = Field(default_factory=tuple, description="effects of plug-ins, by their names")
-    sources: Mapping[str, str] = field(default_factory=dict, hash=False)
+    sources: Annotated[
+        Mapping[str, str], Field(description="where each number comes from, by its key, or 'assumed'")
+    ] = field(default_factory=dict, hash=False)
 
     def __post_init__(self) -> None:
         """Raise ValueError where values contradict each other."""

@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import importlib
+import inspect
 import pkgutil
 import re
 import sys
@@ -293,7 +294,17 @@ def json_schema() -> dict[str, Any]:
             properties: dict[str, Any] = {"model": {"const": name}}
             for f in dataclasses.fields(cls):
                 properties[f.name] = field_schema(f)
-            option = {"type": "object", "properties": properties, "additionalProperties": False}
+            option = {
+                "type": "object",
+                "description": " ".join(inspect.cleandoc(cls.__doc__ or "").split("\n\n")[0].split()),
+                "properties": properties,
+                "additionalProperties": False,
+            }
             options.append(option if cls.default else option | {"required": ["model"]})
         classes[fault_class] = options[0] if len(options) == 1 else {"anyOf": options}
-    return {"type": "object", "properties": classes, "additionalProperties": False}
+    return {
+        "type": "object",
+        "description": "the faults of the dataset, one table a class",
+        "properties": classes,
+        "additionalProperties": False,
+    }

@@ -31,14 +31,18 @@ class GlassTable(Table):
     """Give a medium by a dispersion formula and its coefficients."""
 
     formula: str = Field(description="name of a dispersion formula, λ in µm: cauchy, sellmeier, polynomial, …")
-    coefficients: tuple[Annotated[float, Field(ge=-1e12, le=1e12)], ...] = Field(min_length=1, max_length=16)
+    coefficients: tuple[Annotated[float, Field(ge=-1e12, le=1e12)], ...] = Field(
+        min_length=1, max_length=16, description="of the formula, in its order"
+    )
 
 
 class TransmittanceTable(Table):
     """Give the internal transmittance of 10 mm at wavelengths; linear between them, constant outside."""
 
-    wavelength_nm: tuple[Annotated[float, Field(ge=0, le=1e5)], ...] = Field(min_length=1)
-    value: tuple[Fraction, ...] = Field(min_length=1)
+    wavelength_nm: tuple[Annotated[float, Field(ge=0, le=1e5)], ...] = Field(
+        min_length=1, description="increasing wavelengths"
+    )
+    value: tuple[Fraction, ...] = Field(min_length=1, description="internal transmittance at each wavelength")
 
     @model_validator(mode="after")
     def _paired(self) -> TransmittanceTable:
@@ -54,7 +58,7 @@ class CoatingLayer(Table):
 
     n: float = Field(ge=0.01, le=10, description="refractive index")
     k: float = Field(0.0, ge=0, le=20, description="extinction coefficient")
-    thickness_nm: float = Field(ge=0, le=1e5)
+    thickness_nm: float = Field(ge=0, le=1e5, description="thickness of the layer")
 
 
 class SurfaceRow(Table):
@@ -110,7 +114,7 @@ class SurfaceRow(Table):
 class SensorRow(Table):
     """Describe the sensor, in the last row. It is a plane at the focus."""
 
-    sensor: Literal[True]
+    sensor: Literal[True] = Field(description="true: the row describes the sensor")
     reflectance: Fraction = Field(description="fraction of the light that it reflects, the same at all angles")
 
 

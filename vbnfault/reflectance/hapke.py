@@ -217,7 +217,7 @@ def geometric_albedo(model: Hapke) -> F64:
 class HapkeRow(Table):
     """Give Hapke's parameters at one wavelength (Hapke 2002, 2012)."""
 
-    wavelength_nm: float = Field(gt=0, le=1e5)
+    wavelength_nm: float = Field(gt=0, le=1e5, description="at which these parameters hold")
     single_scattering_albedo: float = Field(ge=0, le=1, description="w")
     asymmetry: float = Field(gt=-1, lt=1, description="g of Henyey-Greenstein; negative scatters back")
     shadow_hiding_amplitude: float = Field(0.0, ge=0, le=100, description="B0")

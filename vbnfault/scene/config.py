@@ -33,8 +33,8 @@ _MOST_RADIANCES = 2**28
 class Scene(Table):
     """Hold a whole scene file with all defaults filled in."""
 
-    title: str
-    description: str = ""
+    title: str = Field(description="name of the scene")
+    description: str = Field("", description="what the scene is for, in a sentence")
     plugins: tuple[Annotated[str, Field(min_length=1)], ...] = Field(
         (),
         max_length=64,

@@ -32,8 +32,8 @@ class CameraTable(Table):
     """Describe the camera and its exposure."""
 
     fov_deg: float = Field(65.0, ge=0.01, le=140, description="full field of view across the width")
-    width_px: int = Field(1024, ge=16, le=16384)
-    height_px: int = Field(1024, ge=16, le=16384)
+    width_px: int = Field(1024, ge=16, le=16384, description="width of the image")
+    height_px: int = Field(1024, ge=16, le=16384, description="height of the image")
     lens: str = Field(
         "",
         description="a packaged lens or a prescription's TOML, scaled to the field of view; default: a thin lens",
@@ -70,32 +70,42 @@ class CameraTable(Table):
         "are as many as splits",
     )
     detector_temperature_K: float | None = Field(None, ge=100, le=400, description="default: the detector's own")
-    pixel_pitch_um: float = Field(5.5, ge=0.5, le=100)
-    full_well_e: float = Field(13_500.0, ge=10, le=1e8)
-    read_noise_e_rms: float = Field(13.0, ge=0, le=1e5)
+    pixel_pitch_um: float = Field(5.5, ge=0.5, le=100, description="distance of neighbouring pixels")
+    full_well_e: float = Field(13_500.0, ge=10, le=1e8, description="most electrons that a pixel holds")
+    read_noise_e_rms: float = Field(13.0, ge=0, le=1e5, description="noise of one readout of a pixel")
     dark_current_e_s: float = Field(
         15.0,
         ge=0,
         le=1e9,
         description="default: a CMV4000's 125 e/s at 25 °C brought to 0 °C, halving every 8 K",
     )
-    adc_bits: int = Field(12, ge=8, le=16)
-    bias_dn: int = Field(64, ge=0, le=1000)
-    response: str = "nikon_5100"
-    quantum_efficiency_peak: float = Field(0.5, gt=0, le=1)
+    adc_bits: int = Field(12, ge=8, le=16, description="bits of the converter")
+    bias_dn: int = Field(64, ge=0, le=1000, description="digital number without light")
+    response: str = Field("nikon_5100", description="relative spectral response of the three colours")
+    quantum_efficiency_peak: float = Field(
+        0.5, gt=0, le=1, description="electrons per photon at the best wavelength"
+    )
     exposure_s: Annotated[float, Field(gt=0, le=1e4)] | Literal["auto"] = Field(
         "auto", description="seconds, or metered on each clean frame"
     )
-    exposure_min_s: float = Field(1e-5, gt=0, le=1e4)
-    exposure_max_s: float = Field(5.0, gt=0, le=1e4)
+    exposure_min_s: float = Field(1e-5, gt=0, le=1e4, description="shortest exposure that 'auto' takes")
+    exposure_max_s: float = Field(5.0, gt=0, le=1e4, description="longest exposure that 'auto' takes")
     metering_level: float = Field(
         0.75, gt=0, le=1, description="fraction of white given to metering_percentile of the sunlit pixels"
     )
-    metering_percentile: float = Field(99.0, gt=0, le=100)
-    architectures: tuple[Architecture, ...] = Field(
-        ("full_frame_ccd", "frame_transfer_ccd", "interline_ccd", "cmos"), min_length=1
+    metering_percentile: float = Field(
+        99.0, gt=0, le=100, description="percentile of the sunlit pixels that is brought to metering_level"
     )
-    readout_directions: tuple[Direction, ...] = Field(("up", "down", "left", "right"), min_length=1)
+    architectures: tuple[Architecture, ...] = Field(
+        ("full_frame_ccd", "frame_transfer_ccd", "interline_ccd", "cmos"),
+        min_length=1,
+        description="architectures between which each sample draws",
+    )
+    readout_directions: tuple[Direction, ...] = Field(
+        ("up", "down", "left", "right"),
+        min_length=1,
+        description="directions of the readout between which each sample draws",
+    )
 
     @model_validator(mode="after")
     def _of_the_lens(self) -> CameraTable:
@@ -135,9 +145,9 @@ class CameraTable(Table):
 class RenderTable(Table):
     """Set the spectral bands and the sampling."""
 
-    band_min_nm: float = Field(400.0, ge=280, le=3900)
-    band_max_nm: float = Field(700.0, ge=290, le=4000)
-    bands: int = Field(8, ge=1, le=64)
+    band_min_nm: float = Field(400.0, ge=280, le=3900, description="lower end of the spectral range")
+    band_max_nm: float = Field(700.0, ge=290, le=4000, description="upper end of the spectral range")
+    bands: int = Field(8, ge=1, le=64, description="number of spectral bands")
     samples_per_pixel: int = Field(16, ge=1, le=4096, description="a power of four: strata of each pixel")
     noise_fraction: float | None = Field(
         None,

@@ -20,9 +20,9 @@ Layer = Annotated[str, Field(pattern=f"^({_LAYERS})$")]
 class SplitTable(Table):
     """Set the fraction of the sites in each split."""
 
-    train: float = Field(0.7, ge=0, le=1)
-    val: float = Field(0.15, ge=0, le=1)
-    test: float = Field(0.15, ge=0, le=1)
+    train: float = Field(0.7, ge=0, le=1, description="fraction of the sites for training")
+    val: float = Field(0.15, ge=0, le=1, description="fraction of the sites for validation")
+    test: float = Field(0.15, ge=0, le=1, description="fraction of the sites for the test")
 
     @model_validator(mode="after")
     def _sum(self) -> SplitTable:
@@ -38,20 +38,22 @@ DEFAULT_LAYERS = ("clean", "without_straylight", "mask_effect", "depth_m", "norm
 class DatasetTable(Table):
     """Set the size of the dataset and what it stores."""
 
-    samples: int = Field(16, ge=1, le=10_000_000)
-    seed: int = Field(1, ge=0, le=2**63 - 1)
+    samples: int = Field(16, ge=1, le=10_000_000, description="number of samples")
+    seed: int = Field(
+        1, ge=0, le=2**63 - 1, description="of all random draws: the same seed gives the same dataset"
+    )
     sites: int = Field(32, ge=1, le=100_000, description="sites on the body; samples are grouped by site")
     shard_samples: int = Field(
         8, ge=1, le=16, description="samples a shard, all of one site: what a kill can lose at most"
     )
-    layers: tuple[Layer, ...] = DEFAULT_LAYERS
+    layers: tuple[Layer, ...] = Field(DEFAULT_LAYERS, description="optional layers that are stored")
     mask_any: tuple[str, ...] | None = Field(
         None,
         description="classes of the scene whose masks mask_any unites; []: none; default: the localised ones",
     )
     split: SplitTable = SplitTable()
-    licence: str = "CC-BY-4.0"
-    citation: str = ""
+    licence: str = Field("CC-BY-4.0", description="licence of the dataset, as text")
+    citation: str = Field("", description="how to cite the dataset, as text")
 
 
 class StratumTable(Table):
@@ -61,11 +63,23 @@ class StratumTable(Table):
     At the site, the Sun's elevation counts from the horizon upwards and its azimuth from north towards east.
     """
 
-    sun_azimuth_deg: pair_within(-360, 720) | None = None  # type: ignore[valid-type]
-    sun_elevation_deg: pair_within(-90, 90) | None = None  # type: ignore[valid-type]
-    roll_deg: pair_within(-360, 720) | None = None  # type: ignore[valid-type]
-    pitch_deg: pair_within(-360, 720) | None = None  # type: ignore[valid-type]
-    yaw_deg: pair_within(-360, 720) | None = None  # type: ignore[valid-type]
+    sun_azimuth_deg: pair_within(-360, 720) | None = Field(  # type: ignore[valid-type]
+        None, description="of the Sun at the site, from north towards east; default: any"
+    )
+    sun_elevation_deg: pair_within(-90, 90) | None = Field(  # type: ignore[valid-type]
+        None, description="of the Sun above the site's horizon; default: the paper's bounds"
+    )
+    roll_deg: pair_within(-360, 720) | None = Field(  # type: ignore[valid-type]
+        None,
+        description="tilt of the boresight from the reference about the image's x; default: the paper's bounds",
+    )
+    pitch_deg: pair_within(-360, 720) | None = Field(  # type: ignore[valid-type]
+        None,
+        description="tilt of the boresight from the reference about the image's y; default: the paper's bounds",
+    )
+    yaw_deg: pair_within(-360, 720) | None = Field(  # type: ignore[valid-type]
+        None, description="turn of the camera about the boresight; default: any"
+    )
     reference: Literal["sun", "nadir", "centre"] = Field(
         "sun",
         description="where the boresight points at zero roll and pitch: the Sun, straight down as a plumb line at "
@@ -79,9 +93,15 @@ class StratumTable(Table):
 class GeometryTable(Table):
     """Set where the camera is and looks. Unset bounds follow the paper's table for the camera's field of view."""
 
-    x_m: pair_within(-1e9, 1e9) = (-150.0, 150.0)  # type: ignore[valid-type]
-    y_m: pair_within(-1e9, 1e9) = (-150.0, 150.0)  # type: ignore[valid-type]
-    height_m: pair_within(0, 1e12) = (0.0, 100.0)  # type: ignore[valid-type]
+    x_m: pair_within(-1e9, 1e9) = Field(  # type: ignore[valid-type]
+        (-150.0, 150.0), description="the camera's position north of the site"
+    )
+    y_m: pair_within(-1e9, 1e9) = Field(  # type: ignore[valid-type]
+        (-150.0, 150.0), description="the camera's position east of the site"
+    )
+    height_m: pair_within(0, 1e12) = Field(  # type: ignore[valid-type]
+        (0.0, 100.0), description="the camera's height, see height_reference"
+    )
     height_reference: Literal["local_ground", "site"] = Field(
         "local_ground", description="height_m counts from the ground below the camera, or from the site's level"
     )
@@ -101,19 +121,22 @@ class GeometryTable(Table):
     max_tries: int = Field(
         256, ge=1, le=100_000, description="views drawn until one meets all conditions; the sample fails after them"
     )
-    sun_facing: StratumTable | None = None
-    sun_averted: StratumTable | None = None
+    sun_facing: StratumTable | None = Field(None, description="bounds of the samples that face the Sun")
+    sun_averted: StratumTable | None = Field(None, description="bounds of the samples that do not face the Sun")
 
 
 class PlanTable(Table):
     """Set the fault matrix and the choice of views."""
 
-    mode: Literal["per_class", "per_sample"] = "per_sample"
+    mode: Literal["per_class", "per_sample"] = Field(
+        "per_sample",
+        description="per_class: each class is in faulty_fraction of the samples; per_sample: so many have faults",
+    )
     faulty_fraction: float = Field(0.5, ge=0, le=1, description="the paper's percentage p")
     classes_per_sample: Annotated[
         tuple[Annotated[int, Field(ge=1, le=64)], Annotated[int, Field(ge=1, le=64)]],
         AfterValidator(ordered),
-    ] = (1, 6)
+    ] = Field((1, 6), description="least and most classes of a faulty sample, with mode = 'per_sample'")
     sun_facing_nominal_fraction: float = Field(
         0.0, ge=0, le=1, description="fraction of all samples that face the Sun without a fault that needs it"
     )

@@ -19,7 +19,9 @@ class SunTable(Table):
     """Set the date of the ephemeris, the Sun's distance (default: from the ephemeris) and its limb darkening."""
 
     julian_date: float = Field(2456974.0, ge=1_000_000, le=5_000_000, description="TDB; sets the body's attitude")
-    distance_au: float | None = Field(None, gt=0.01, le=1000)
+    distance_au: float | None = Field(
+        None, gt=0.01, le=1000, description="of the body from the Sun; default: from the ephemeris"
+    )
     limb_darkening: bool = Field(True, description="after Neckel & Labs 1994; else a uniform disc")
 
 
@@ -27,9 +29,9 @@ class OrbitTable(Table):
     """Describe the body's two-body orbit about the Sun (ecliptic, equinox J2000); default: 67P's orbit of 2015."""
 
     eccentricity: float = Field(ge=0, le=100, description="1: a parabola, above: a hyperbola")
-    perihelion_au: float = Field(gt=0.01, le=1000)
-    inclination_deg: float = Field(ge=0, le=180)
-    node_deg: float = Field(ge=-360, le=360)
+    perihelion_au: float = Field(gt=0.01, le=1000, description="perihelion distance")
+    inclination_deg: float = Field(ge=0, le=180, description="of the orbit to the ecliptic")
+    node_deg: float = Field(ge=-360, le=360, description="longitude of the ascending node")
     argument_deg: float = Field(ge=-360, le=360, description="of perihelion")
     perihelion_jd: float = Field(ge=1_000_000, le=5_000_000, description="TDB")
     mean_motion_deg_day: float | None = Field(
@@ -85,16 +87,22 @@ class SkyTable(Table):
     """Set which stars the sky shows. An exposure for a sunlit comet hides stars, so the default is none."""
 
     stars: Literal["off", "auto", "on"] = Field("off", description="auto: those that the exposure can show")
-    limiting_magnitude: float = Field(7.0, ge=-2, le=7)
+    limiting_magnitude: float = Field(
+        7.0, ge=-2, le=7, description="V magnitude of the faintest star that is drawn"
+    )
     sigma_px: float = Field(0.6, ge=0, le=16, description="Gaussian point spread of a thin lens")
 
 
 class PoseTable(Table):
     """Turn a part about its hinge, in the camera's axes B."""
 
-    hinge_m: tuple[Offset, Offset, Offset] | None = None
-    axis: tuple[Offset, Offset, Offset] | None = None
-    angle_deg: float = Field(0.0, ge=-360, le=360)
+    hinge_m: tuple[Offset, Offset, Offset] | None = Field(
+        None, description="a point of the hinge's axis; the default vehicle has its own"
+    )
+    axis: tuple[Offset, Offset, Offset] | None = Field(
+        None, description="direction of the hinge's axis, of any length; the default vehicle has its own"
+    )
+    angle_deg: float = Field(0.0, ge=-360, le=360, description="turn about the axis, by the right-hand rule")
 
 
 Paint = str | Annotated[float, Field(ge=0, le=1)] | SpectrumTable
@@ -104,11 +112,13 @@ class SpacecraftTable(Table):
     """Describe the spacecraft that carries the camera, in the camera's axes B (x right, y down, z boresight)."""
 
     model: str = Field("none", description="'none', 'default' (a lander), or an OBJ or GLB file")
-    unit: Literal["m", "cm", "mm"] = "m"
-    roll_deg: float = Field(0.0, ge=-360, le=360)
-    pitch_deg: float = Field(0.0, ge=-360, le=360)
-    yaw_deg: float = Field(0.0, ge=-360, le=360)
-    translation_m: tuple[Offset, Offset, Offset] = (0.0, 0.0, 0.0)
+    unit: Literal["m", "cm", "mm"] = Field("m", description="of the model's file")
+    roll_deg: float = Field(0.0, ge=-360, le=360, description="turn of the model about x, after pitch and yaw")
+    pitch_deg: float = Field(0.0, ge=-360, le=360, description="turn of the model about y, after yaw")
+    yaw_deg: float = Field(0.0, ge=-360, le=360, description="turn of the model about z, first")
+    translation_m: tuple[Offset, Offset, Offset] = Field(
+        (0.0, 0.0, 0.0), description="shift of the turned model: where its origin lies from the camera"
+    )
     default_material: Paint = Field(0.3, description="a named material, a grey value, or a table")
     materials: dict[str, Paint] = Field(default_factory=dict, description="by part or material of the file")
     pose: dict[str, PoseTable] = Field(default_factory=dict, description="by part")

@@ -21,8 +21,12 @@ SemiAxis = Annotated[float, Field(gt=0, le=1e9)]
 class SpectrumTable(Table):
     """Give values at wavelengths. They are interpolated linearly and are constant beyond the ends."""
 
-    wavelength_nm: tuple[Wavelength, ...] = Field(min_length=1, max_length=_MOST_ROWS)
-    value: tuple[Annotated[float, Field(ge=0, le=1)], ...] = Field(min_length=1, max_length=_MOST_ROWS)
+    wavelength_nm: tuple[Wavelength, ...] = Field(
+        min_length=1, max_length=_MOST_ROWS, description="increasing wavelengths"
+    )
+    value: tuple[Annotated[float, Field(ge=0, le=1)], ...] = Field(
+        min_length=1, max_length=_MOST_ROWS, description="value at each wavelength"
+    )
 
     @model_validator(mode="after")
     def _paired(self) -> SpectrumTable:
@@ -36,26 +40,26 @@ class SpectrumTable(Table):
 class BodyTable(Table):
     """Describe the target body in its body-fixed frame T."""
 
-    name: str = "67P/Churyumov-Gerasimenko"
+    name: str = Field("67P/Churyumov-Gerasimenko", description="name of the body, for messages and attributes")
     shape: str = Field(
         "embedded",
         description="'embedded', 'ellipsoid', or a shape file: OBJ, PLY, STL, GLB, PDS TAB, ICQ, WRL, BDS",
     )
-    unit: Literal["auto", "m", "km"] = "auto"
+    unit: Literal["auto", "m", "km"] = Field("auto", description="of the shape file; auto: from its size")
     semi_axes_m: tuple[SemiAxis, SemiAxis, SemiAxis] = Field(
         (1000.0, 1000.0, 1000.0), description="of an 'ellipsoid'"
     )
-    density_kg_m3: float = Field(537.8, gt=0, le=30_000)
+    density_kg_m3: float = Field(537.8, gt=0, le=30_000, description="of the homogeneous body, for its gravity")
     rotation_period_h: float = Field(
         24 * 360 / 696.543884683, gt=0.01, le=1e5, description="67P before perihelion 2015: 12.4041 h"
     )
-    pole_ra_deg: float = Field(69.54, ge=0, le=360)
-    pole_dec_deg: float = Field(64.11, ge=-90, le=90)
+    pole_ra_deg: float = Field(69.54, ge=0, le=360, description="right ascension of the north pole, ICRF")
+    pole_dec_deg: float = Field(64.11, ge=-90, le=90, description="declination of the north pole, ICRF")
     prime_meridian_deg: float = Field(114.69, ge=-360, le=360, description="W at J2000.0")
     reflectance: str | Annotated[float, Field(ge=0, le=1)] | SpectrumTable = Field(
         "67p", description="a named reflectance, a grey value, or a table of values at wavelengths"
     )
-    photometry: AnyReflectance = Lambert()
+    photometry: AnyReflectance = Field(Lambert(), description="how the ground reflects")
 
     @model_validator(mode="after")
     def _known(self) -> BodyTable:
@@ -78,7 +82,7 @@ class PatchTable(Table):
         None, ge=0.3, le=1.2, description="exponent of the relief's roughness; default: as the model's own"
     )
     craters_per_km2: float = Field(60.0, ge=0, le=600, description="of 10 m or more")
-    boulders: bool = True
+    boulders: bool = Field(True, description="whether boulders lie on the ground")
     min_boulder_m: float = Field(0.25, ge=0.05, le=1000, description="diameter of the smallest near the site")
     boulder_index: float = Field(3.6, ge=0.5, le=6, description="of the cumulative size law; Pajola et al. 2015")
     boulders_per_km2: float = Field(98.0, ge=0, le=1e5, description="of 7 m or more; Pajola et al. 2015")
