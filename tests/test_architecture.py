@@ -27,7 +27,7 @@ DATASET = PIPELINE | {"pipeline", "store"}
 OUTPUT = DATASET | {"dataset"}
 MAY_IMPORT: dict[str, set[str]] = {
     "__init__": OUTPUT
-    | {"study", "output"},  # for type checkers; at run time a name loads its module when it is used
+    | {"navigation", "study", "output"},  # for type checkers; at run time a name loads its module when it is used
     "core": set(),
     "reflectance": {"core"},
     "body": {"core"},
@@ -35,6 +35,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "lens": {"core"},
     "detector": {"core"},
     "camera": PHYSICS - {"camera"},
+    "navigation": {"core"},
     "faults": PHYSICS,
     "testing": PHYSICS | {"faults"},
     "scene": {"core", "reflectance", "faults"},
@@ -42,7 +43,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "pipeline": PIPELINE,
     "store": {"core", "scene"},
     "dataset": DATASET,
-    "study": OUTPUT,
+    "study": OUTPUT | {"navigation"},
     "output": OUTPUT,
     "cli": OUTPUT | {"output", "study"},
     "__main__": {"cli"},

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.2.0"
 
 if TYPE_CHECKING:
+    from . import navigation
     from .core.errors import InputError, VbnfaultError
     from .dataset import BuildOptions, verify
     from .dataset import build_scene as build
@@ -30,7 +31,7 @@ if TYPE_CHECKING:
     from .scene.config import Scene, load_scene
     from .store import open_dataset
 
-# public name → the module that defines it, and its name there
+# public name → the module that defines it, and its name there; "": the module itself
 _HOME = {
     "DiscReflectance": ("reflectance", "DiscReflectance"),
     "Effect": ("detector.effects", "Effect"),
@@ -54,6 +55,7 @@ _HOME = {
     "load_lens": ("lens", "load_lens"),
     "load_scene": ("scene.config", "load_scene"),
     "load_sensor": ("detector.sensor", "load_sensor"),
+    "navigation": ("navigation", ""),
     "number": ("faults", "number"),
     "open_dataset": ("store", "open_dataset"),
     "path": ("faults", "path"),
@@ -88,6 +90,7 @@ __all__ = [
     "load_lens",
     "load_scene",
     "load_sensor",
+    "navigation",
     "number",
     "open_dataset",
     "path",
@@ -106,7 +109,8 @@ def __getattr__(name: str) -> Any:
     import importlib
 
     module, defined = _HOME[name]
-    value = getattr(importlib.import_module(f".{module}", __name__), defined)
+    loaded = importlib.import_module(f".{module}", __name__)
+    value = getattr(loaded, defined) if defined else loaded
     globals()[name] = value
     return value
 

@@ -478,12 +478,14 @@ def api() -> str:
     """Return directives that document every public name of `import vbnfault`."""
     import vbnfault
 
-    groups: dict[str, list[str]] = {"Functions": [], "Classes": [], "Errors": []}
+    groups: dict[str, list[str]] = {"Functions": [], "Classes": [], "Errors": [], "Modules": []}
     for name in vbnfault.__all__:
         value = getattr(vbnfault, name)
         if name.startswith("__"):
             continue
-        if inspect.isclass(value):
+        if inspect.ismodule(value):
+            groups["Modules"].append(name)
+        elif inspect.isclass(value):
             groups["Errors" if issubclass(value, Exception) else "Classes"].append(name)
         else:
             groups["Functions"].append(name)
@@ -491,10 +493,27 @@ def api() -> str:
     for title, names in groups.items():
         parts.append(f"## {title}\n")
         for name in names:
+            if title == "Modules":
+                parts.append(_module(f"vbnfault.{name}"))
+                continue
             kind = "function" if title == "Functions" else "class" if title == "Classes" else "exception"
             members = "" if kind == "function" else "   :members:\n   :exclude-members: model_config\n"
             parts.append(f"```{{eval-rst}}\n.. auto{kind}:: vbnfault.{name}\n{members}```\n")
     return "\n".join(parts)
+
+
+def _module(name: str) -> str:
+    """Return directives that document a module and every name that it exports, functions first."""
+    import importlib
+
+    module = importlib.import_module(name)
+    lines = [f".. automodule:: {name}", "   :no-members:", ""]
+    for kind, belongs in (("function", inspect.isfunction), ("class", inspect.isclass)):
+        for export in module.__all__:
+            if belongs(getattr(module, export)):
+                members = ["   :members:"] if kind == "class" else []
+                lines += [f".. auto{kind}:: {name}.{export}", *members, ""]
+    return "```{eval-rst}\n" + "\n".join(lines) + "```\n"
 
 
 # --- packaged files -----------------------------------------------------------------------------------------------

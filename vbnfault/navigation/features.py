@@ -1,0 +1,321 @@
+"""Detect features, compare those of two images of one view, and match those of two views."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from ..core.errors import InputError
+from .geometry import View, reprojected
+from .images import F64, U8, eight_bit, intensity, same_shape, white_level
+
+# Corners of a frame, and the least distance between two of them in px, as trackers of space flight use.
+CORNERS = 500
+_CORNER_DISTANCE_PX = 8.0
+_CORNER_QUALITY = 0.01
+_CORNER_BLOCK_PX = 5
+# ORB: as many as in ORB-SLAM2 (Mur-Artal and Tardós 2017) for a frame of this size, and its lower FAST threshold.
+ORB_FEATURES = 1000
+_ORB_FAST_DN = 7
+_ORB_BORDER_PX = 16  # the descriptor's patch has a radius of 15 px
+_ORB_LEVELS = 8
+_ORB_SCALE = 1.2
+_LEAST_SIZE_PX = 2 * _ORB_BORDER_PX + 1
+
+# A feature is found again within this distance (Mikolajczyk and Schmid 2005; Schmid et al. 2000, 1.5 px).
+REPEATED_WITHIN_PX = 1.5
+# A match is right within this distance of the true reprojection.
+RIGHT_WITHIN_PX = 3.0
+# Lowe's (2004) ratio of the nearest to the second nearest descriptor.
+_RATIO = 0.8
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Repeatability:
+    """Hold how many features of the clean twin are detected again.
+
+    `fraction` in [0, 1] is NaN where the clean twin has no feature, and `reason` says so. `clean`, `image` and
+    `repeated` count the features of both images, and the pairs of them.
+    """
+
+    fraction: float
+    clean: int
+    image: int
+    repeated: int
+    reason: str = ""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Matches:
+    """Hold matched pixels of two images, float64[n, 2] each, row by row."""
+
+    first_xy: F64
+    second_xy: F64
+
+    def __len__(self) -> int:
+        return len(self.first_xy)
+
+
+def corners(image: NDArray[Any], *, white: float | None = None, count: int = CORNERS) -> F64:
+    """Return the strongest corners of an image after Shi and Tomasi, float64[n, 2] px, n at most `count`.
+
+    The score is the smaller eigenvalue of Σ ∇I ∇Iᵀ over 5 × 5 px; corners are at least 8 px apart and have at least
+    a hundredth of the best score.
+
+    Parameters
+    ----------
+    image
+        The image (`intensity`).
+    white
+        Signal that counts as 255; default: 255 for uint8, else the largest of the image.
+    count
+        The most corners.
+
+    Raises
+    ------
+    InputError
+        The array is no image.
+
+    References
+    ----------
+    Shi and Tomasi (1994), Good Features to Track, CVPR, 593.
+    """
+    grey = eight_bit(image, white_level(image) if white is None else white)
+    return _corners(grey, count)
+
+
+def _corners(grey: U8, count: int) -> F64:
+    """Return `corners` of an 8-bit image."""
+    found = cv2.goodFeaturesToTrack(
+        grey, count, _CORNER_QUALITY, _CORNER_DISTANCE_PX, blockSize=_CORNER_BLOCK_PX, useHarrisDetector=False
+    )
+    return np.empty((0, 2)) if found is None else found.reshape(-1, 2).astype(np.float64) + 0.5
+
+
+def corner_repeatability(
+    clean: NDArray[Any], image: NDArray[Any], *, tolerance_px: float = REPEATED_WITHIN_PX
+) -> Repeatability:
+    """Return the fraction of the clean twin's corners that the image has, too.
+
+    r = (pairs of corners within the tolerance) / (corners of the clean twin). Both images show one view, so that
+    the homography of Schmid et al. is the identity. A pair are two corners that are each other's nearest. Schmid et
+    al. and Mikolajczyk and Schmid divide by the smaller of both counts, which gives 1 where one corner alone
+    survives; here the count is that of the clean twin, so the fraction is what a navigator keeps.
+
+    Parameters
+    ----------
+    clean, image
+        Images of the same size (`intensity`).
+    tolerance_px
+        Largest distance of a pair in px.
+
+    Raises
+    ------
+    InputError
+        An array is no image, or the sizes differ.
+
+    References
+    ----------
+    Schmid, Mohr and Bauckhage (2000), Evaluation of Interest Point Detectors, IJCV 37, 151.
+    Mikolajczyk and Schmid (2005), A Performance Evaluation of Local Descriptors, IEEE TPAMI 27, 1615.
+    """
+    before, after = _pair(clean, image)
+    return _repeatability(_corners(before, CORNERS), _corners(after, CORNERS), tolerance_px)
+
+
+def orb_repeatability(
+    clean: NDArray[Any], image: NDArray[Any], *, tolerance_px: float = REPEATED_WITHIN_PX
+) -> Repeatability:
+    """Return the fraction of the clean twin's ORB features that the image has, too.
+
+    As `corner_repeatability`, for oriented FAST corners in a pyramid of eight levels. The tolerance holds on the
+    level of a feature, and a pair lies on equal or neighbouring levels.
+
+    Parameters
+    ----------
+    clean, image
+        Images of the same size (`intensity`).
+    tolerance_px
+        Largest distance of a pair on the finest level, in px.
+
+    Raises
+    ------
+    InputError
+        An array is no image, or the sizes differ.
+
+    References
+    ----------
+    Rublee et al. (2011), ORB: an Efficient Alternative to SIFT or SURF, ICCV, 2564.
+    Mikolajczyk and Schmid (2005), A Performance Evaluation of Local Descriptors, IEEE TPAMI 27, 1615.
+    """
+    positions = []
+    for grey in _pair(clean, image):
+        xy, level, _ = _orb(grey)
+        # two levels apart are two tolerances apart, so that no such pair counts
+        in_scale = np.column_stack([xy / _ORB_SCALE ** level[:, None], 0.7 * tolerance_px * level])
+        positions.append(in_scale)
+    return _repeatability(positions[0], positions[1], tolerance_px)
+
+
+def _pair(clean: NDArray[Any], image: NDArray[Any]) -> tuple[U8, U8]:
+    """Return two images of one size with 8 bits, on the scale of the clean one."""
+    same_shape(intensity(clean, "clean"), intensity(image, "image"), "clean", "image")
+    white = white_level(clean)
+    return eight_bit(clean, white, "clean"), eight_bit(image, white)
+
+
+def _repeatability(clean: F64, image: F64, tolerance: float) -> Repeatability:
+    """Return the repeatability of positions, float64[n, k] each."""
+    if not len(clean):
+        return Repeatability(
+            fraction=float("nan"), clean=0, image=len(image), repeated=0, reason="the clean twin has no feature"
+        )
+    repeated = 0
+    if len(image):
+        to_image, nearest_image = cKDTree(image).query(clean, distance_upper_bound=np.nextafter(tolerance, np.inf))
+        _, nearest_clean = cKDTree(clean).query(image)
+        near = np.isfinite(to_image)
+        back = nearest_clean[np.where(near, nearest_image, 0)]
+        repeated = int(np.count_nonzero(near & (back == np.arange(len(clean)))))
+    return Repeatability(fraction=repeated / len(clean), clean=len(clean), image=len(image), repeated=repeated)
+
+
+# --- matches -------------------------------------------------------------------------------------------------
+
+
+def match(first: NDArray[Any], second: NDArray[Any], *, white: float | None = None) -> Matches:
+    """Return matched ORB features of two images, which may show different views.
+
+    A match are two descriptors that are each other's nearest by Hamming distance, the distance being at most 0.8
+    times that of the second nearest.
+
+    Parameters
+    ----------
+    first, second
+        Images (`intensity`).
+    white
+        Signal that counts as 255; default: 255 for uint8, else the largest of the first image.
+
+    Raises
+    ------
+    InputError
+        An array is no image.
+
+    References
+    ----------
+    Rublee et al. (2011), ORB: an Efficient Alternative to SIFT or SURF, ICCV, 2564.
+    Lowe (2004), Distinctive Image Features from Scale-Invariant Keypoints, IJCV 60, 91.
+    """
+    level = white_level(first) if white is None else white
+    (xy_a, _, a), (xy_b, _, b) = (
+        _orb(eight_bit(image, level, name)) for image, name in ((first, "first"), (second, "second"))
+    )
+    nothing = Matches(first_xy=np.empty((0, 2)), second_xy=np.empty((0, 2)))
+    if len(a) < 2 or len(b) < 2:
+        return nothing
+    distance, nearest = cv2.batchDistance(a, b, cv2.CV_32S, normType=cv2.NORM_HAMMING, K=2)
+    _, back = cv2.batchDistance(b, a, cv2.CV_32S, normType=cv2.NORM_HAMMING, K=1)
+    mutual = back[nearest[:, 0], 0] == np.arange(len(a))
+    chosen = mutual & (distance[:, 0] <= _RATIO * distance[:, 1])
+    if not chosen.any():
+        return nothing
+    return Matches(first_xy=xy_a[chosen], second_xy=xy_b[nearest[chosen, 0]])
+
+
+def _orb(grey: U8) -> tuple[F64, NDArray[np.int64], U8]:
+    """Return positions float64[n, 2], pyramid levels int64[n] and descriptors uint8[n, 32] of ORB features."""
+    nothing = np.empty((0, 2)), np.empty(0, dtype=np.int64), np.empty((0, 32), dtype=np.uint8)
+    if min(grey.shape) < _LEAST_SIZE_PX:
+        return nothing
+    detector = cv2.ORB_create(
+        nfeatures=ORB_FEATURES,
+        scaleFactor=_ORB_SCALE,
+        nlevels=_ORB_LEVELS,
+        edgeThreshold=_ORB_BORDER_PX,
+        fastThreshold=_ORB_FAST_DN,
+    )
+    points, descriptors = detector.detectAndCompute(grey, None)
+    if descriptors is None:
+        return nothing
+    xy = cv2.KeyPoint.convert(points).astype(np.float64) + 0.5
+    return xy, np.array([point.octave for point in points], dtype=np.int64), np.asarray(descriptors)
+
+
+def right_matches(
+    matches: Matches, first: View, second: View, *, tolerance_px: float = RIGHT_WITHIN_PX
+) -> NDArray[np.bool_]:
+    """Return which matches are right, bool[n]: within the tolerance of the true reprojection.
+
+    A match whose pixel of the first view sees the sky is wrong, since nothing there moves with the body.
+
+    Parameters
+    ----------
+    matches
+        Matched pixels of two views.
+    first, second
+        The views; `depth_m` of the first is needed.
+    tolerance_px
+        Largest distance in the second view, in px.
+
+    Raises
+    ------
+    InputError
+        The tolerance is not above 0, or the first view has no depth.
+    """
+    if not tolerance_px > 0:
+        raise InputError(f"tolerance_px = {tolerance_px:g}: must be above 0")
+    off = matches.second_xy - reprojected(matches.first_xy, first, second)
+    with np.errstate(invalid="ignore"):
+        return np.asarray(np.hypot(off[:, 0], off[:, 1]) <= tolerance_px)
+
+
+def match_precision(matches: Matches, first: View, second: View, *, tolerance_px: float = RIGHT_WITHIN_PX) -> float:
+    """Return the fraction of the matches that are right, in [0, 1]; NaN where there is no match.
+
+    precision = (matches within the tolerance of the true reprojection) / (all matches), by depth, pose and the
+    stored distortion model. The parameters are those of `right_matches`.
+
+    Raises
+    ------
+    InputError
+        The tolerance is not above 0, or the first view has no depth.
+
+    References
+    ----------
+    Mikolajczyk and Schmid (2005), A Performance Evaluation of Local Descriptors, IEEE TPAMI 27, 1615, where 1 −
+    precision is the abscissa.
+    """
+    if not len(matches):
+        return float("nan")
+    return float(right_matches(matches, first, second, tolerance_px=tolerance_px).mean())
+
+
+def matches_lost(
+    clean: Matches, faulted: Matches, first: View, second: View, *, tolerance_px: float = RIGHT_WITHIN_PX
+) -> float:
+    """Return the fraction of the clean twins' right matches that the faulted images lack, in [0, 1].
+
+    lost = 1 − (right matches of the clean twins near whose first pixel the faulted images have a right match, too)
+    / (right matches of the clean twins), near being within the tolerance. NaN where the clean twins have no right
+    match. The other parameters are those of `right_matches`.
+
+    Raises
+    ------
+    InputError
+        The tolerance is not above 0, or the first view has no depth.
+    """
+    kept = [
+        matches.first_xy[right_matches(matches, first, second, tolerance_px=tolerance_px)]
+        for matches in (clean, faulted)
+    ]
+    if not len(kept[0]):
+        return float("nan")
+    if not len(kept[1]):
+        return 1.0
+    distance, _ = cKDTree(kept[1]).query(kept[0])
+    return float(np.mean(distance > tolerance_px))

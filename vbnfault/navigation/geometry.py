@@ -1,0 +1,208 @@
+"""Relate pixels of two views by depth, pose and the camera model that a dataset stores.
+
+Pixel coordinates are (x, y) from the image's top left corner; pixel centres lie at +0.5. The camera model is
+OpenCV's: intrinsics fx, fy, cx, cy and the coefficients k1, k2, p1, p2, k3, k4, k5, k6 of the rational distortion.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core.errors import InputError
+
+F64 = NDArray[np.float64]
+
+_NEWTON_STEPS = 12
+_DIFFERENCE = 1e-6  # step of the numeric derivative, in focal lengths
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class View:
+    """Describe how a camera saw one image: its model, its true pose, and the depth that it saw.
+
+    The names are those of the arrays of a dataset.
+
+    Attributes
+    ----------
+    intrinsics
+        float64[4]: fx, fy, cx, cy in px.
+    camera_from_T
+        Attitude: the unit quaternion w, x, y, z, float64[4], or the rotation matrix, float64[3, 3], that takes
+        vectors of the target's frame T to the camera's frame C (x right, y down, z along the boresight).
+    camera_position_T_m
+        float64[3]: position of the camera in T, in m. Any frame that is fixed in the ground serves as T.
+    distortion
+        OpenCV's k1, k2, p1, p2, k3, k4, k5, k6, float64[8], or the first 4 or 5 of them.
+    depth_m
+        float[y, x]: true depth along the boresight at the pixel centres in m, inf on the sky; None where it is not
+        needed.
+
+    Raises
+    ------
+    InputError
+        A field has another shape.
+    """
+
+    intrinsics: F64
+    camera_from_T: F64
+    camera_position_T_m: F64
+    distortion: F64 = field(default_factory=lambda: np.zeros(8))
+    depth_m: NDArray[Any] | None = None
+
+    def __post_init__(self) -> None:
+        for name, shapes in _SHAPES.items():
+            value = np.asarray(getattr(self, name), dtype=np.float64)
+            if value.shape not in shapes or not np.isfinite(value).all():
+                allowed = " or ".join(str(shape) for shape in shapes)
+                raise InputError(f"view.{name}: shape {value.shape}: must be finite numbers of shape {allowed}")
+            object.__setattr__(self, name, value)
+        if self.depth_m is not None and np.ndim(self.depth_m) != 2:
+            raise InputError(f"view.depth_m: shape {np.shape(self.depth_m)}: must be [y, x]")
+        attitude = self.camera_from_T
+        matrix = attitude if attitude.shape == (3, 3) else _matrix(attitude)
+        if np.abs(matrix @ matrix.T - np.eye(3)).max() > 1e-6:
+            raise InputError("view.camera_from_T: is no rotation; give a rotation matrix or a unit quaternion")
+        object.__setattr__(self, "camera_from_T", matrix)
+
+    @property
+    def matrix(self) -> F64:
+        """Return OpenCV's camera matrix, float64[3, 3]."""
+        fx, fy, cx, cy = self.intrinsics
+        return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+
+    def slopes(self, xy: F64) -> F64:
+        """Return the tangents x/z and y/z in C that the pixels `xy` float64[n, 2] see, float64[n, 2]."""
+        fx, fy, cx, cy = self.intrinsics
+        target = (np.asarray(xy, dtype=np.float64) - (cx, cy)) / (fx, fy)
+        k = self.distortion
+        if not k.any():
+            return target
+        slopes = target.copy()
+        step_x, step_y = _DIFFERENCE * np.eye(2)
+        for _ in range(_NEWTON_STEPS):
+            value = _distorted(slopes, k)
+            along_x = (_distorted(slopes + step_x, k) - value) / _DIFFERENCE
+            along_y = (_distorted(slopes + step_y, k) - value) / _DIFFERENCE
+            off = value - target
+            determinant = along_x[:, 0] * along_y[:, 1] - along_y[:, 0] * along_x[:, 1]
+            slopes[:, 0] -= (off[:, 0] * along_y[:, 1] - off[:, 1] * along_y[:, 0]) / determinant
+            slopes[:, 1] -= (off[:, 1] * along_x[:, 0] - off[:, 0] * along_x[:, 1]) / determinant
+        return slopes
+
+    def points_T_m(self, xy: F64) -> F64:
+        """Return the points of the ground that pixels see, float64[n, 3] in T; NaN where they see the sky.
+
+        A pixel of the sky next to the ground counts as the nearest ground of its eight neighbours, since features
+        at the limb may lie just outside.
+
+        Raises
+        ------
+        InputError
+            The view has no depth.
+        """
+        depth = self.depth_at(xy)
+        slopes = self.slopes(xy)
+        seen_C = np.column_stack([slopes * depth[:, None], depth])
+        return np.asarray(seen_C @ self.camera_from_T + self.camera_position_T_m)
+
+    def depth_at(self, xy: F64) -> F64:
+        """Return the depth of pixels, float64[n] in m; NaN on the sky and outside the frame."""
+        if self.depth_m is None:
+            raise InputError("view.depth_m: is None, and true positions need the depth at the pixel centres")
+        depth = np.asarray(self.depth_m)
+        height, width = depth.shape
+        column, row = np.floor(np.asarray(xy, dtype=np.float64)).astype(np.int64).T
+        inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+        column, row = np.clip(column, 0, width - 1), np.clip(row, 0, height - 1)
+        own = depth[row, column].astype(np.float64)
+        around = np.full(len(own), np.inf)
+        for dy in (-1, 0, 1):
+            for dx in (-1, 0, 1):
+                near = depth[np.clip(row + dy, 0, height - 1), np.clip(column + dx, 0, width - 1)]
+                around = np.fmin(around, near)
+        own = np.where(np.isfinite(own), own, around)
+        return np.where(inside & np.isfinite(own), own, np.nan)
+
+    def project(self, points_T_m: F64) -> F64:
+        """Return the pixels of points float64[n, 3] in T, float64[n, 2]; NaN where they lie behind the camera."""
+        in_C = (np.asarray(points_T_m, dtype=np.float64) - self.camera_position_T_m) @ self.camera_from_T.T
+        z = np.where(in_C[:, 2] > 0, in_C[:, 2], np.nan)
+        fx, fy, cx, cy = self.intrinsics
+        return np.asarray(_distorted(in_C[:, :2] / z[:, None], self.distortion) * (fx, fy) + (cx, cy))
+
+
+_SHAPES: dict[str, tuple[tuple[int, ...], ...]] = {
+    "intrinsics": ((4,),),
+    "camera_from_T": ((4,), (3, 3)),
+    "camera_position_T_m": ((3,),),
+    "distortion": ((8,), (5,), (4,)),
+}
+
+
+def reprojected(xy: F64, from_view: View, to_view: View) -> F64:
+    """Return where the ground that pixels of one view see lies in another view.
+
+    Parameters
+    ----------
+    xy
+        float64[n, 2]: pixels of `from_view`, whose `depth_m` is needed.
+
+    Returns
+    -------
+    float64[n, 2]
+        Pixels of `to_view`, whether or not something hides the ground there; NaN where `from_view` sees the sky and
+        where the ground lies behind `to_view`.
+
+    Raises
+    ------
+    InputError
+        `from_view` has no depth.
+    """
+    return to_view.project(from_view.points_T_m(xy))
+
+
+def relative_motion(first: View, second: View) -> tuple[F64, F64]:
+    """Return the true motion between two views: second_from_first float64[3, 3], and its translation in m.
+
+    The translation is float64[3]. A point x of the first camera's frame lies at R x + t in the second camera's
+    frame.
+    """
+    rotation = second.camera_from_T @ first.camera_from_T.T
+    return rotation, second.camera_from_T @ (first.camera_position_T_m - second.camera_position_T_m)
+
+
+def rotation_angle_deg(rotation: F64) -> float:
+    """Return the angle of a rotation matrix in degrees, accurate to rounding also near 0."""
+    return float(np.degrees(np.linalg.norm(cv2.Rodrigues(np.ascontiguousarray(rotation))[0])))
+
+
+def _matrix(quaternion: F64) -> F64:
+    """Return the rotation matrix of a quaternion w, x, y, z."""
+    w, x, y, z = quaternion
+    return np.array(
+        [
+            [w * w + x * x - y * y - z * z, 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), w * w - x * x + y * y - z * z, 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), w * w - x * x - y * y + z * z],
+        ]
+    )
+
+
+def _distorted(slopes: F64, coefficients: F64) -> F64:
+    """Return image positions in focal lengths, float64[n, 2], by the model of `cv2.projectPoints`."""
+    k = np.zeros(8)
+    k[: len(coefficients)] = coefficients
+    x, y = slopes[:, 0], slopes[:, 1]
+    r2 = x * x + y * y
+    radial = (1 + r2 * (k[0] + r2 * (k[1] + r2 * k[4]))) / (1 + r2 * (k[5] + r2 * (k[6] + r2 * k[7])))
+    return np.column_stack(
+        [
+            x * radial + 2 * k[2] * x * y + k[3] * (r2 + 2 * x * x),
+            y * radial + k[2] * (r2 + 2 * y * y) + 2 * k[3] * x * y,
+        ]
+    )
