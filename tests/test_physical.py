@@ -23,6 +23,7 @@ from vbnfault.pipeline.resolve import resolve
 from vbnfault.pipeline.spec import Frame
 from vbnfault.pipeline.stars import add_stars
 from vbnfault.reflectance.hapke import hapke_at
+from vbnfault.render import light, sampling
 from vbnfault.render.detail import _LEVELS, _SIDE, _UNIT, _pyramid
 from vbnfault.scene import config
 from vbnfault.world import assemble, sky
@@ -245,6 +246,36 @@ def test_listed_pixels_are_the_frames_own() -> None:
     some, some_halves = render.direct(surface, a_scene, np.ones(len(NODES)), chosen)
     np.testing.assert_array_equal(some.array[:, 0], whole.array.reshape(len(NODES), -1)[:, chosen])
     np.testing.assert_array_equal(some_halves[0], halves.ravel()[chosen])
+
+
+def test_later_passes_use_the_suns_part_of_the_first(monkeypatch: pytest.MonkeyPatch) -> None:
+    towards = frames.direction_L(30, 20)
+    surface = join(plane())
+    a_scene = scene(view(10 * UP, towards), sun(towards, 0.02), hapke_at(NODES))
+    first, _ = render.direct(surface, a_scene)
+    assert first.sun is not None
+    chosen = np.flatnonzero(first.sun[0] > 0).astype(np.uint32)
+    assert len(chosen)
+    monkeypatch.setattr(light, "sun_in_view", lambda *_: pytest.fail("the disc was traced again"))
+    again, _ = render.direct(surface, a_scene, None, chosen, first)
+    np.testing.assert_array_equal(again.array[:, 0], first.array.reshape(len(NODES), -1)[:, chosen])
+
+
+def test_tables_of_an_adaptive_render_are_made_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    made = []
+    make = sampling.disc_sets
+    monkeypatch.setattr(sampling, "disc_sets", lambda *key: made.append(key) or make(*key))
+
+    def one_render() -> None:
+        for samples in (4, 16, 64, 256):
+            strata = sampling.Strata(sampling.Pixels(4), samples, 0)
+            for dimension in range(3):  # the Sun's disc, the aperture, one bounce
+                strata.disc(dimension)
+
+    one_render()
+    made.clear()
+    one_render()
+    assert not made
 
 
 def test_finest_relief_has_its_slopes_and_fades_into_the_pixel() -> None:

@@ -145,7 +145,7 @@ def sample_to_noise(
             # draw new samples: the first ones selected the pixel, so keeping them would be a bias
             key = (scene.key + 4 * int(count)) & 0xFFFFFFFF
             again = replace(scene, samples_per_pixel=4 * int(count), key=key)
-            more, halves = render.direct(surface, again, electron_rate, chosen)
+            more, halves = render.direct(surface, again, electron_rate, chosen, first)
             array.reshape(len(array), -1)[:, chosen] = more.array[:, 0]
             error_e.ravel()[chosen] = np.abs(halves[0]) * exposure
         samples[noisy] *= 4

@@ -47,6 +47,7 @@ def direct(
     scene: RenderInput,
     weights: NDArray[np.float64] | None = None,
     pixels: NDArray[np.uint32] | None = None,
+    first: Radiance | None = None,
 ) -> tuple[Radiance, NDArray[np.float32]]:
     """Return the radiance of the Sun's disc and of sunlight reflected once, and an estimate of its random error.
 
@@ -56,6 +57,9 @@ def direct(
         float64[band]: weights of the bands in the signal whose error is estimated. None: the error is 0.
     pixels
         uint32[pixel]: row-major numbers of the wanted pixels. None: all pixels.
+    first
+        Earlier output for all pixels of the same view and Sun. Its part of the Sun, which depends on no samples, is
+        used again. None: that part is computed.
 
     Returns
     -------
@@ -70,9 +74,10 @@ def direct(
     wanted = Pixels(view.width_px * view.height_px) if pixels is None else Pixels(len(pixels), listed=pixels)
     out, halves = _Direct(surface, scene).image(wanted, weights)
     bands, frame = len(scene.wavelength_nm), (view.height_px, view.width_px)
-    disc = sun_in_view(surface, view, scene.sun)
     sun: NDArray[np.float32] | None = None
-    if disc is not None:
+    if first is not None:
+        disc, sun = first.disc, first.sun
+    elif (disc := sun_in_view(surface, view, scene.sun)) is not None:
         sun = np.zeros((bands, *frame), dtype=np.float32)
         if add_mean(sun, disc, Pinhole(view.intrinsics), range(bands)) is None:
             sun = None

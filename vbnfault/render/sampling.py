@@ -102,7 +102,9 @@ class Pixels:
 _DISC_SETS = 256
 
 
-@lru_cache(maxsize=8)
+# An adaptive render with an aperture and bounces needs three tables for each of five to seven sample counts. A
+# table has 2 KiB per sample.
+@lru_cache(maxsize=32)
 def _disc_table(samples: int, dimension: int) -> Any:
     """Return stratified points of the unit disc: `_DISC_SETS` sets of `samples`, each set in its own order."""
     table = mi.Float(disc_sets(samples, dimension).astype(np.float32).ravel())

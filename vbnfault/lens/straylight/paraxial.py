@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from itertools import combinations
 
 import numpy as np
@@ -140,11 +141,17 @@ def axial_transmittance(lens: Prescription, wavelength_nm: ArrayLike) -> F64:
     are part of that light, so they are not subtracted from the direct image a second time.
     """
     nodes = np.atleast_1d(np.asarray(wavelength_nm, dtype=np.float64))
+    return np.array(_axial_transmittance(lens, tuple(nodes.tolist())))
+
+
+@lru_cache(maxsize=64)
+def _axial_transmittance(lens: Prescription, wavelength_nm: tuple[float, ...]) -> tuple[float, ...]:
+    """Return `axial_transmittance`, which every exposure and every direct image of the Sun needs."""
     path = forward(lens)
-    reflected = np.array([transmittance(lens, path, float(nm)) for nm in nodes])
+    passed = np.array([transmittance(lens, path, nm) for nm in wavelength_nm])
     glass = lens.surfaces[:-1]
-    depth = np.array([sum(s.thickness_mm * s.absorption_per_mm(float(nm)) for s in glass) for nm in nodes])
-    return np.asarray(reflected * np.exp(-depth))
+    depth = np.array([sum(s.thickness_mm * s.absorption_per_mm(nm) for s in glass) for nm in wavelength_nm])
+    return tuple((passed * np.exp(-depth)).tolist())
 
 
 def paraxial_ghosts(
