@@ -465,6 +465,84 @@ def test_a_sensor_with_an_effect_of_a_plugin_is_characterised(tmp_path: Path) ->
 
 def test_a_plugin_that_defines_a_known_reflectance_is_refused(tmp_path: Path) -> None:
     plugin(tmp_path, GROUND.replace("glazed", "lambert"), "my_ground.py")
-    with pytest.raises(InputError, match=r"my_ground.py': .*ground reflectance 'lambert' is defined twice"):
+    with pytest.raises(
+        InputError,
+        match=r"my_ground.py': .*ground reflectance lambert is defined twice: in .*disc.*py and in .*my_ground.py",
+    ):
         config.load_scene(scene_file(tmp_path, "my_ground.py", faults=""))
     assert config.load_scene(scene_file(tmp_path, faults="")).body.photometry.model == "lambert"
+
+
+# --- one name, one definition ---------------------------------------------------------------------------------
+
+GLASS = """
+from vbnfault.lens.glass import Glass, register
+
+register(Glass(name="jelly", formula="cauchy", coefficients=(1.4, 0.0)))
+"""
+KINDS = {
+    "fault": (GLINT, "fault model glint/square"),
+    "ground": (GROUND.split("class Pedestal")[0], "ground reflectance glazed"),
+    "effect": (GROUND.replace('"glazed"', '"frosted"'), "detector effect pedestal"),
+    "glass": (GLASS, "glass jelly"),
+}
+
+
+def defined(kind: str) -> Any:
+    """Return what the kind's plug-in has registered."""
+    from vbnfault import reflectance
+    from vbnfault.detector import effects
+    from vbnfault.lens.glass import GLASSES
+
+    if kind == "fault":
+        return faults.registry()["glint"]["square"]
+    if kind == "ground":
+        return reflectance.registry()["glazed"]
+    return effects.registry()["pedestal"] if kind == "effect" else GLASSES["jelly"]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_two_files_that_define_one_name_are_refused_together_only(tmp_path: Path, kind: str) -> None:
+    text, name = KINDS[kind]
+    if kind == "effect":
+        plugin(tmp_path, GROUND, "my_a.py")
+    else:
+        plugin(tmp_path, text, "my_a.py")
+    changed = text.replace("1.4", "1.5")  # two glasses of one name and one index do not contradict
+    plugin(tmp_path, changed, "my_b.py")
+    sentence = rf"plugins = '.*my_b.py': {name} is defined twice: in .*my_a.py and in .*my_b.py"
+    both = scene_file(tmp_path, "my_a.py", "my_b.py", faults="")
+    with pytest.raises(InputError, match=sentence) as caught:
+        config.load_scene(both)
+    assert "\n" not in str(caught.value)
+
+    def load(*names: str) -> Any:
+        config.load_scene(scene_file(tmp_path, *names, faults=""))
+        return defined(kind)
+
+    first, second = load("my_a.py"), load("my_b.py")  # each alone, and the scene in use decides
+    assert first != second
+    assert load("my_a.py") == first
+    with pytest.raises(InputError, match=sentence):  # also where both have been loaded before
+        load("my_a.py", "my_b.py")
+    assert load("my_b.py") == second
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_an_edited_file_is_loaded_again_and_a_broken_edit_leaves_nothing(tmp_path: Path, kind: str) -> None:
+    text, _ = KINDS[kind]
+    plugin(tmp_path, text, "my_a.py")
+    file = scene_file(tmp_path, "my_a.py", faults="")
+    config.load_scene(file)
+    first = defined(kind)
+    plugin(tmp_path, text.replace("1.4", "1.5") + "# edited\n", "my_a.py")
+    config.load_scene(file)
+    second = defined(kind)
+    assert second != first
+    plugin(tmp_path, text.replace("1.4", "1.6") + "1 / 0\n", "my_a.py")
+    with pytest.raises(InputError, match="division by zero"):
+        config.load_scene(file)
+    assert defined(kind) == second
+    plugin(tmp_path, text.replace("1.4", "1.5") + "# edited\n", "my_a.py")
+    config.load_scene(file)
+    assert defined(kind) == second

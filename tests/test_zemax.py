@@ -334,26 +334,26 @@ def test_a_wrong_glass_is_named_when_it_is_used(tmp_path: Path, old: str, new: s
     assert said in str(error.value)
 
 
-def test_a_glass_and_a_formula_register_in_one_place(monkeypatch: pytest.MonkeyPatch) -> None:
-    from vbnfault.lens import glass, parse_lens
+def test_a_glass_and_a_formula_register_in_one_place() -> None:
+    from vbnfault.core.registry import undoing_registrations
+    from vbnfault.lens import parse_lens
 
-    monkeypatch.setattr(glass, "_DISPERSIONS", dict(DISPERSIONS))
-    monkeypatch.setattr(glass, "_GLASSES", dict(GLASSES))
-    monkeypatch.setattr(glass, "DISPERSIONS", glass._DISPERSIONS)
-    monkeypatch.setattr("vbnfault.lens.prescription_file.GLASSES", glass._GLASSES)
+    with undoing_registrations(always=True):
 
-    @dispersion("flat", 1)
-    def _flat(um2: np.ndarray, c: tuple[float, ...]) -> np.ndarray:
-        return np.full(np.shape(um2), c[0])
+        @dispersion("flat", 1)
+        def _flat(um2: np.ndarray, c: tuple[float, ...]) -> np.ndarray:
+            return np.full(np.shape(um2), c[0])
 
-    register(Glass(name="jelly", formula="flat", coefficients=(1.4,)))
-    stop = {"stop": True, "thickness_mm": 1.0, "diameter_mm": 5.0}
-    rows = [stop, {"radius_mm": 50.0, "thickness_mm": 3.0, "diameter_mm": 9.0, "glass": "jelly"}]
-    rows.append({"radius_mm": -50.0, "diameter_mm": 9.0})
-    lens: Prescription = parse_lens({"surface": rows}, source="test")
-    assert lens.surfaces[1].medium.nd == 1.4
-    assert math.isinf(lens.surfaces[1].medium.vd)
-    with pytest.raises(ValueError, match="another one of this name"):
-        register(Glass(name="jelly", formula="flat", coefficients=(1.5,)))
-    with pytest.raises(ValueError, match="one of this name already"):
-        dispersion("flat", 1)
+        register(Glass(name="jelly", formula="flat", coefficients=(1.4,)))
+        stop = {"stop": True, "thickness_mm": 1.0, "diameter_mm": 5.0}
+        rows = [stop, {"radius_mm": 50.0, "thickness_mm": 3.0, "diameter_mm": 9.0, "glass": "jelly"}]
+        rows.append({"radius_mm": -50.0, "diameter_mm": 9.0})
+        lens: Prescription = parse_lens({"surface": rows}, source="test")
+        assert lens.surfaces[1].medium.nd == 1.4
+        assert math.isinf(lens.surfaces[1].medium.vd)
+        with pytest.raises(TypeError, match=r"glass jelly is defined twice: in .*test_zemax.py"):
+            register(Glass(name="jelly", formula="flat", coefficients=(1.5,)))
+        with pytest.raises(TypeError, match=r"dispersion formula flat is defined twice: in .*test_zemax.py"):
+            dispersion("flat", 1)(lambda um2, c: um2)
+    assert "jelly" not in GLASSES
+    assert "flat" not in DISPERSIONS

@@ -200,7 +200,6 @@ def _own_modules(folder: Path) -> Iterator[None]:
         for name in set(sys.modules) - before:
             origin = getattr(sys.modules[name], "__file__", None) or ""
             if origin.startswith(str(folder)):
-                models.forget(name)
                 registry.forget(name)
                 del sys.modules[name]
 

@@ -1,95 +1,210 @@
-"""Keep the classes of one kind that register themselves by being defined, such as ground reflectances."""
+"""Keep what registers itself by being defined: fault models, ground reflectances, detector effects, glasses.
+
+One rule holds for every kind: a name has one definition. A module may define its classes again, as after an edit in
+a notebook. Another module may not, unless the first one is a plug-in's file that the scene in use does not name
+(`allow_replacement`).
+"""
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import pkgutil
-from collections.abc import Collection, Mapping
-from typing import Any, Generic, TypeVar
+import sys
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from typing import Any, NamedTuple, TypeVar
 
 from . import tables
 
 T = TypeVar("T")
 
-# The names of modules that are the files of plug-ins begin with this.
-FILE_MODULE = "vbnfault_plugin_"
 _registries: list[Registry[Any]] = []
+# Modules whose definitions may be replaced by those of others.
+_replaceable: set[str] = set()
 
 
-class Registry(Generic[T]):
-    """Map names to classes of one kind.
+class DeclarationError(TypeError):
+    """Report that registered classes are declared wrongly, or contradict each other.
 
-    The classes of vbnfault are the modules of one package, which are imported at the first question. Any other
-    class registers when its own module is imported.
+    `names` holds the names of the classes concerned.
+    """
+
+    def __init__(self, names: Iterable[str], message: str) -> None:
+        super().__init__(message)
+        self.names = tuple(names)
+
+
+class _Definition(NamedTuple):
+    """Hold a registered entry, the module that defines it, and its name in that module ("": it has none)."""
+
+    entry: Any
+    module: str
+    qualname: str
+
+
+class Registry(Mapping[str, T]):
+    """Map names to what was registered of one kind, such as classes; vbnfault's own first, each sorted by name.
+
+    The modules of a package of vbnfault are imported at the first question. Anything else registers when its own
+    module is imported.
 
     Parameters
     ----------
     kind
-        What the classes are, for messages.
+        What the entries are, for messages.
     package
-        Dotted name of the package whose modules define the classes of vbnfault.
+        Dotted name of the package whose modules define the entries of vbnfault.
+    own_modules
+        False if that package is imported elsewhere.
+    changed
+        Called after every change, to forget what was computed from the entries.
     """
 
-    def __init__(self, kind: str, package: str) -> None:
+    def __init__(
+        self, kind: str, package: str, *, own_modules: bool = True, changed: Callable[[], None] = lambda: None
+    ) -> None:
         self.kind, self.package = kind, package
-        self._classes: dict[str, type[T]] = {}
-        self._by_module: dict[str, dict[str, type[T]]] = {}
-        self._complete = False
+        self._changed = changed
+        self._definitions: dict[str, _Definition] = {}
+        self._by_module: dict[str, dict[str, _Definition]] = {}
+        self._complete = not own_modules
         _registries.append(self)
 
-    def add(self, name: str, cls: type[T]) -> None:
-        """Register a class. Raise TypeError if another class has the name.
+    def add(self, name: str, entry: T, *, module: str, qualname: str = "") -> None:
+        """Register an entry that `module` defines, in which it has the name `qualname` if it has one.
 
-        A module that is imported again, as after an edit in a notebook, may define its class again. The class of a
-        plug-in's file gives way to any other: the file may have been edited, or belong to another scene.
+        Raises
+        ------
+        DeclarationError
+            Another definition has the name, and its module is not replaceable.
         """
-        known = self._classes.get(name)
-        same = known is None or (known.__module__, known.__qualname__) == (cls.__module__, cls.__qualname__)
-        if known is not None and not same and not known.__module__.startswith(FILE_MODULE):
-            raise TypeError(
-                f"{self.kind} {name!r} is defined twice: {known.__module__}.{known.__qualname__} and "
-                f"{cls.__module__}.{cls.__qualname__}"
-            )
-        self._classes[name] = cls
-        self._by_module.setdefault(cls.__module__, {})[name] = cls
-        tables.forget_schemas()  # those of tables that take any class of this kind
+        self._put(name, _Definition(entry, module, qualname))
+        self._forget_results()
 
-    def classes(self) -> dict[str, type[T]]:
-        """Return name → class, sorted by name, those of vbnfault first."""
+    def _put(self, name: str, new: _Definition) -> None:
+        """Register a definition; see `add`."""
+        known = self._definitions.get(name)
+        if known is not None and known.module not in _replaceable:
+            if known.entry == new.entry:
+                return
+            if not new.qualname or known[1:] != new[1:]:
+                files = dict.fromkeys([_source(known.module), _source(new.module)])
+                raise DeclarationError([name], f"{self.kind} {name} is defined twice: in {' and in '.join(files)}")
+        self._definitions[name] = new
+        self._by_module.setdefault(new.module, {})[name] = new
+
+    def _forget_results(self) -> None:
+        """Forget what was computed from the entries, such as the schemas of tables that take any of them."""
+        tables.forget_schemas()
+        self._changed()
+
+    def __getitem__(self, name: str) -> T:
+        self.complete()
+        entry: T = self._definitions[name].entry
+        return entry
+
+    def __iter__(self) -> Iterator[str]:
+        self.complete()
+        return iter(sorted(self._definitions, key=lambda name: (not self._is_ours(name), name)))
+
+    def __len__(self) -> int:
+        self.complete()
+        return len(self._definitions)
+
+    def complete(self) -> None:
+        """Import the modules of the package, once, so that all of them are registered."""
         if not self._complete:
             for info in pkgutil.iter_modules(importlib.import_module(self.package).__path__):
                 importlib.import_module(f"{self.package}.{info.name}")
             self._complete = True
 
-        return dict(sorted(self._classes.items(), key=lambda item: (not self.is_packaged(item[1]), item[0])))
+    def registered(self) -> dict[str, T]:
+        """Return the entries so far, in the order of their definition, without importing anything."""
+        return {name: definition.entry for name, definition in self._definitions.items()}
+
+    def is_replaceable(self, name: str) -> bool:
+        """Return whether other modules may define a registered name again."""
+        return self._definitions[name].module in _replaceable
+
+    def remove(self, names: Iterable[str]) -> None:
+        """Remove entries until `restore` registers their module again."""
+        for name in list(names):
+            del self._definitions[name]
+        self._forget_results()
 
     def restore(self, module: str) -> None:
-        """Register the classes of a module again, which another scene may have replaced."""
-        self._classes |= self._by_module.get(module, {})
-        tables.forget_schemas()
+        """Register the entries of a module again, which another scene may have replaced."""
+        for name, definition in self._by_module.get(module, {}).items():
+            self._put(name, definition)
+        self._forget_results()
 
     def forget(self, module: str) -> None:
-        """Remove the classes of a module."""
-        for name, cls in self._by_module.pop(module, {}).items():
-            if self._classes.get(name) is cls:
-                del self._classes[name]
-        tables.forget_schemas()
+        """Remove the entries of a module for good."""
+        for name, definition in self._by_module.pop(module, {}).items():
+            if self._definitions.get(name) is definition:
+                del self._definitions[name]
+        self._forget_results()
 
-    def is_packaged(self, cls: type[T]) -> bool:
+    def snapshot(self) -> Callable[[], None]:
+        """Return a function that undoes all later registrations, except those of vbnfault."""
+        definitions = dict(self._definitions)
+        by_module = {module: dict(names) for module, names in self._by_module.items()}
+
+        def undo() -> None:
+            self._definitions = {n: d for n, d in self._definitions.items() if self._is_ours(n)} | definitions
+            self._by_module = by_module
+            self._forget_results()
+
+        return undo
+
+    def is_packaged(self, cls: type) -> bool:
         """Return whether a class belongs to vbnfault itself."""
         return cls.__module__.startswith(f"{self.package}.")
 
+    def _is_ours(self, name: str) -> bool:
+        """Return whether the entry of a name belongs to vbnfault itself."""
+        return f"{self._definitions[name].module}.".startswith(f"{self.package}.")
+
+
+def _source(module: str) -> str:
+    """Return the file of a module, or its name."""
+    return str(getattr(sys.modules.get(module), "__file__", None) or module)
+
+
+def allow_replacement(modules: Iterable[str]) -> None:
+    """Let other modules replace the definitions of these modules, and of no others."""
+    wanted = set(modules)
+    _replaceable.clear()
+    _replaceable.update(wanted)
+
 
 def restore(module: str) -> None:
-    """Register the classes of a plug-in's module again, of every kind."""
+    """Register what a plug-in's module defines again, of every kind."""
     for registry in _registries:
         registry.restore(module)
 
 
 def forget(module: str) -> None:
-    """Remove the classes of a plug-in's module, of every kind."""
+    """Remove what a plug-in's module defines, of every kind."""
     for registry in _registries:
         registry.forget(module)
+
+
+@contextlib.contextmanager
+def undoing_registrations(*, always: bool = False) -> Iterator[None]:
+    """Forget what a block registers, of every kind, if the block raises an exception, or `always`."""
+    known = list(_registries)
+    undos = [registry.snapshot() for registry in known]
+    replaceable = set(_replaceable)
+    undo = True
+    try:
+        yield
+        undo = always
+    finally:
+        if undo:
+            allow_replacement(replaceable)
+            for put_back in undos:
+                put_back()
 
 
 def chained(after: Mapping[str, str], packaged: Collection[str], kind: str) -> tuple[str, ...]:
@@ -100,7 +215,7 @@ def chained(after: Mapping[str, str], packaged: Collection[str], kind: str) -> t
 
     Raises
     ------
-    TypeError
+    DeclarationError
         A name comes after one that does not exist, or names come after each other in a circle. `kind` says in the
         message what the names are.
     """
@@ -108,7 +223,8 @@ def chained(after: Mapping[str, str], packaged: Collection[str], kind: str) -> t
     for name in sorted(after, key=lambda name: (name in packaged, name)):
         if after[name] not in followers:
             hint = tables.did_you_mean(after[name], list(after))
-            raise TypeError(f"{kind} {name}: after = {after[name]!r}: there is none of this name{hint}")
+            text = f"{kind} {name}: after = {after[name]!r}: there is none of this name{hint}"
+            raise DeclarationError([name], text)
         followers[after[name]].append(name)
     order: list[str] = []
     pending = followers[""][::-1]
@@ -117,5 +233,5 @@ def chained(after: Mapping[str, str], packaged: Collection[str], kind: str) -> t
         pending += followers[order[-1]][::-1]
     circle = sorted(set(after) - set(order))
     if circle:
-        raise TypeError(f"{kind}: what {', '.join(circle)} state by `after` runs in a circle")
+        raise DeclarationError(circle, f"{kind}: what {', '.join(circle)} state by `after` runs in a circle")
     return tuple(order)

@@ -4,7 +4,6 @@ from .context import FaultContext, Params
 from .contract import MOSAIC_STEPS, QUANTITIES, STEPS, Fault, act
 from .fields import Interval, bounds, choice, flag, number, path, rows, text
 from .models import (
-    DeclarationError,
     dataset_order,
     from_dict,
     is_packaged,
@@ -19,7 +18,6 @@ __all__ = [
     "MOSAIC_STEPS",
     "QUANTITIES",
     "STEPS",
-    "DeclarationError",
     "Fault",
     "FaultContext",
     "Interval",

@@ -20,12 +20,13 @@ from numpy.typing import NDArray
 
 from ..camera import Camera
 from ..core.quantities import RGBI, Charge, Electrons, Offset, Quantity, RawMosaic, soft_kind
+from ..core.registry import DeclarationError
 from ..detector.effects import STEPS as MOSAIC_STEPS
 from ..lens import load_lens
 from ..lens.footprint import DEFAULT_LENS
 from .context import FaultContext, Params
 from .fields import Interval, parse_field, path
-from .models import DeclarationError, register
+from .models import register
 
 Q = TypeVar("Q", Electrons, Charge, Offset, RawMosaic, RGBI)
 

@@ -7,17 +7,15 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import importlib
 import inspect
-import pkgutil
 import re
-import sys
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 from ..core.errors import InputError, VbnfaultError, shown
-from ..core.registry import chained
+from ..core.registry import DeclarationError, Registry, chained
+from ..core.registry import undoing_registrations as undoing_all
 from ..core.tables import did_you_mean
 from .fields import field_schema, parse_field
 
@@ -27,75 +25,6 @@ if TYPE_CHECKING:
 _PACKAGE = __package__ or ""
 _NAME = re.compile("[a-z][a-z0-9_]*")
 
-# fault class → model → type, in the order of their definition
-_models: dict[str, dict[str, type[Fault]]] = {}
-
-
-# Modules of plug-ins that no scene names at present: other plug-ins may define the same models.
-_replaceable: set[str] = set()
-
-
-class DeclarationError(TypeError):
-    """The class attributes or fields of fault models are wrong, or contradict those of others.
-
-    `classes` holds the names of the fault classes concerned.
-    """
-
-    def __init__(self, classes: Iterable[str], message: str) -> None:
-        super().__init__(message)
-        self.classes = tuple(classes)
-
-
-def register(cls: type[Fault]) -> None:
-    """Add a model to the registry. Raise DeclarationError if its names or declarations contradict the others'."""
-    where = f"fault model {cls.fault}/{cls.model}"
-    models = {m.model: m for m in _models.get(cls.fault, {}).values() if m.__module__ not in _replaceable}
-    if not _NAME.fullmatch(cls.fault) or not _NAME.fullmatch(cls.model):
-        text = f"{where}: its names must consist of lower-case letters, digits and underscores"
-        raise DeclarationError([cls.fault], text)
-    known = models.get(cls.model)
-    if known is not None and (known.__module__, known.__qualname__) != (cls.__module__, cls.__qualname__):
-        text = f"{where} is defined twice: in {_source(known)} and in {_source(cls)}"
-        raise DeclarationError([cls.fault], text)
-    if cls.default:
-        other = next((m for m in models.values() if m.default and m.model != cls.model), None)
-        if other is not None:
-            text = f"{where}: default = True, but {other.fault}/{other.model} is the default of the class"
-            raise DeclarationError([cls.fault], text)
-        if cls.after is None:
-            text = f"{where}: the default model must state the class after which its class acts: after = ..."
-            raise DeclarationError([cls.fault], text)
-        if cls.axis is not None and not is_packaged(cls):
-            text = f"{where}: axis = {cls.axis}: only the six classes of the paper have a position"
-            raise DeclarationError([cls.fault], text)
-    _models[cls.fault] = {**models, cls.model: cls}
-    _forget_orders()
-
-
-def _source(cls: type[Fault]) -> str:
-    """Return the file that defines a model, or its module."""
-    return str(getattr(sys.modules.get(cls.__module__), "__file__", None) or cls.__module__)
-
-
-def models_of(condition: Callable[[type[Fault]], bool]) -> tuple[type[Fault], ...]:
-    """Return the registered models that meet a condition."""
-    return tuple(cls for models in _models.values() for cls in models.values() if condition(cls))
-
-
-def allow_replacement(modules: Iterable[str]) -> None:
-    """Let other definitions replace the models of these modules, and of no others."""
-    _replaceable.clear()
-    _replaceable.update(modules)
-
-
-def forget(module: str) -> None:
-    """Remove the models of a module from the registry."""
-    for name, models in list(_models.items()):
-        _models[name] = {m.model: m for m in models.values() if m.__module__ != module}
-        if not _models[name]:
-            del _models[name]
-    _forget_orders()
-
 
 def _forget_orders() -> None:
     """Forget what was computed from the models that were registered so far."""
@@ -103,25 +32,57 @@ def _forget_orders() -> None:
     _physical_order.cache_clear()
 
 
-@contextlib.contextmanager
-def undoing_registrations(*, always: bool = False) -> Iterator[None]:
-    """Forget the models that a block registers if the block raises an exception, or `always`."""
+# "class/model" → type
+_REGISTRY: Registry[type[Fault]] = Registry("fault model", _PACKAGE, changed=_forget_orders)
+
+
+def _models() -> dict[str, dict[str, type[Fault]]]:
+    """Return fault class → model → type of the models that are registered so far."""
+    classes: dict[str, dict[str, type[Fault]]] = {}
+    for cls in _REGISTRY.registered().values():
+        classes.setdefault(cls.fault, {})[cls.model] = cls
+    return classes
+
+
+def register(cls: type[Fault]) -> None:
+    """Add a model to the registry. Raise DeclarationError if its names or declarations contradict the others'."""
+    where = f"fault model {cls.fault}/{cls.model}"
+    if not _NAME.fullmatch(cls.fault) or not _NAME.fullmatch(cls.model):
+        text = f"{where}: its names must consist of lower-case letters, digits and underscores"
+        raise DeclarationError([cls.fault], text)
+    others = {name: other for name, other in _REGISTRY.registered().items() if other.fault == cls.fault}
+    replaceable = {name for name in others if _REGISTRY.is_replaceable(name)}
+    if cls.default:
+        rivals = [m for name, m in others.items() if m.default and m.model != cls.model and name not in replaceable]
+        if rivals:
+            text = f"{where}: default = True, but {rivals[0].fault}/{rivals[0].model} is the default of the class"
+            raise DeclarationError([cls.fault], text)
+        if cls.after is None:
+            text = f"{where}: the default model must state the class after which its class acts: after = ..."
+            raise DeclarationError([cls.fault], text)
+        if cls.axis is not None and not is_packaged(cls):
+            text = f"{where}: axis = {cls.axis}: only the six classes of the paper have a position"
+            raise DeclarationError([cls.fault], text)
+    name = f"{cls.fault}/{cls.model}"
+    _REGISTRY.add(name, cls, module=cls.__module__, qualname=cls.__qualname__)
+    # a plug-in of another scene may have defined the whole class, with a default model of its own
+    _REGISTRY.remove(replaceable - {name})
+
+
+def models_of(condition: Callable[[type[Fault]], bool]) -> tuple[type[Fault], ...]:
+    """Return the registered models that meet a condition."""
+    return tuple(cls for cls in _REGISTRY.registered().values() if condition(cls))
+
+
+def undoing_registrations(*, always: bool = False) -> contextlib.AbstractContextManager[None]:
+    """Return a context that forgets what its block registers if the block raises an exception, or `always`."""
     _import_all()
-    before = {name: dict(models) for name, models in _models.items()}
-    undo = True
-    try:
-        yield
-        undo = always
-    finally:
-        if undo:
-            _models.clear()
-            _models.update(before)
-            _forget_orders()
+    return undoing_all(always=always)
 
 
 def is_packaged(cls: type[Fault]) -> bool:
     """Return whether a model belongs to vbnfault itself."""
-    return cls.__module__.startswith(f"{_PACKAGE}.")
+    return _REGISTRY.is_packaged(cls)
 
 
 def registry() -> dict[str, dict[str, type[Fault]]]:
@@ -149,8 +110,7 @@ def check_declarations() -> None:
 @lru_cache(maxsize=1)
 def _import_all() -> None:
     """Import every module of this package and every installed plug-in, so that all models are registered."""
-    for info in pkgutil.iter_modules(importlib.import_module(_PACKAGE).__path__):
-        importlib.import_module(f"{_PACKAGE}.{info.name}")
+    _REGISTRY.complete()
     from .plugins import load_installed
 
     load_installed()
@@ -163,12 +123,12 @@ def _sorted_registry() -> dict[str, dict[str, type[Fault]]]:
     def position(cls: type[Fault]) -> tuple[bool, bool, str]:
         return not cls.default, not is_packaged(cls), cls.__module__
 
-    for models in _models.values():
-        for cls in models.values():
-            _check_fields(cls)
+    for cls in _REGISTRY.registered().values():
+        _check_fields(cls)
     _physical_order()
+    known = _models()
     return {
-        name: {cls.model: cls for cls in sorted(_models[name].values(), key=position)} for name in _on_axis(_models)
+        name: {cls.model: cls for cls in sorted(known[name].values(), key=position)} for name in _on_axis(known)
     }
 
 
@@ -189,8 +149,9 @@ def _check_fields(cls: type[Fault]) -> None:
 
 def _defaults() -> dict[str, type[Fault]]:
     """Return the default model of every class. Raise DeclarationError if a class has none."""
-    defaults = {cls.fault: cls for models in _models.values() for cls in models.values() if cls.default}
-    for name, models in _models.items():
+    known = _models()
+    defaults = {cls.fault: cls for models in known.values() for cls in models.values() if cls.default}
+    for name, models in known.items():
         if name not in defaults:
             raise DeclarationError(
                 [name], f"fault class {name}: none of its models ({', '.join(models)}) states default = True"
@@ -207,11 +168,7 @@ def _physical_order() -> tuple[str, ...]:
     """
     defaults = _defaults()
     packaged = {name for name, cls in defaults.items() if is_packaged(cls)}
-    try:
-        return chained({name: str(cls.after) for name, cls in defaults.items()}, packaged, "fault class")
-    except TypeError as error:
-        named = [name for name in defaults if name not in packaged and re.search(rf"\b{name}\b", str(error))]
-        raise DeclarationError(named, str(error)) from None
+    return chained({name: str(cls.after) for name, cls in defaults.items()}, packaged, "fault class")
 
 
 def dataset_order(names: Iterable[str]) -> list[str]:

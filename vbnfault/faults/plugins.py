@@ -1,4 +1,4 @@
-"""Load fault models, ground reflectances and detector effects from outside the package.
+"""Load fault models, ground reflectances, detector effects and glasses from outside the package.
 
 A plug-in is a Python module that defines classes of these kinds. It is found in one of two ways:
 
@@ -37,6 +37,8 @@ if TYPE_CHECKING:
     from .contract import Fault
 
 ENTRY_POINTS = "vbnfault.faults"
+# The names of modules that are the files of plug-ins begin with this.
+_FILE_MODULE = "vbnfault_plugin_"
 _MODULE = re.compile(r"[^\W\d]\w*(\.[^\W\d]\w*)*")
 _SUFFIXES = (*importlib.machinery.SOURCE_SUFFIXES, *importlib.machinery.EXTENSION_SUFFIXES)
 
@@ -65,7 +67,7 @@ class Plugin:
     @property
     def is_file(self) -> bool:
         """Return whether the plug-in is a file that a scene names."""
-        return self.module.startswith(registry.FILE_MODULE)
+        return self.module.startswith(_FILE_MODULE)
 
     def defines(self, cls: type[Fault]) -> bool:
         """Return whether a model belongs to this plug-in."""
@@ -96,8 +98,8 @@ def load_plugins(names: Sequence[str]) -> None:
     """
     models.registry()  # first the faults that every scene has
     paths = {name for name in names if _is_path(name)}
-    with _undoing(), models.undoing_registrations():
-        models.allow_replacement(p.module for key, p in _loaded.items() if p.is_file and key not in paths)
+    with _undoing():
+        registry.allow_replacement(p.module for key, p in _loaded.items() if p.is_file and key not in paths)
         for name in names:
             with _errors_named(f"plugins = {shown(name)}"):
                 _loaded[name] = _load_file(name) if name in paths else _load_module(name)
@@ -152,7 +154,6 @@ def loaded_plugin(name: str) -> Plugin | None:
 def forget_all() -> None:
     """Forget every plug-in of this process, for tests."""
     for plugin in _loaded.values():
-        models.forget(plugin.module)
         registry.forget(plugin.module)
     _loaded.clear()
 
@@ -197,10 +198,9 @@ def _load_file(path: str) -> Plugin:
     if known is not None and known.sha256 == digest:
         return _registered(known)
     if known is not None:
-        models.forget(known.module)
         registry.forget(known.module)
     stem = re.sub(r"\W", "_", Path(path).stem)
-    name = f"{registry.FILE_MODULE}{stem}_{resources.sha256(path.encode() + data)[:16]}"
+    name = f"{_FILE_MODULE}{stem}_{resources.sha256(path.encode() + data)[:16]}"
     module = ModuleType(name)
     module.__file__ = path
     sys.modules[name] = module  # a dataclass looks its module up
@@ -208,7 +208,6 @@ def _load_file(path: str) -> Plugin:
         exec(compile(data, path, "exec", dont_inherit=True), module.__dict__)
     except BaseException:
         del sys.modules[name]
-        registry.forget(name)
         raise
     return Plugin(Path(path).name, name, digest, models.models_of(lambda cls: _defines(name, cls)))
 
@@ -241,7 +240,7 @@ def _load_module(name: str) -> Plugin:
 
 
 def _registered(plugin: Plugin) -> Plugin:
-    """Return a plug-in that was loaded before, with its models registered: another scene may have replaced them."""
+    """Return a plug-in that was loaded before, with all that it defines: another scene may have replaced that."""
     for cls in plugin.models:
         models.register(cls)
     registry.restore(plugin.module)
@@ -250,7 +249,7 @@ def _registered(plugin: Plugin) -> Plugin:
 
 def _defines(module: str, cls: type[Fault]) -> bool:
     """Return whether a model is defined in a plug-in's module, or elsewhere in its top-level package."""
-    if module.startswith(registry.FILE_MODULE):
+    if module.startswith(_FILE_MODULE):
         return cls.__module__ == module
     return cls.__module__.split(".")[0] == module.split(".")[0]
 
@@ -277,17 +276,17 @@ def _digest_of_module(name: str) -> str:
 
 @contextlib.contextmanager
 def _undoing() -> Iterator[None]:
-    """Forget the plug-ins that a block loads if it raises an exception."""
+    """Forget the plug-ins that a block loads, and all that they define, if it raises an exception."""
     before = dict(_loaded)
     try:
-        yield
+        with registry.undoing_registrations():
+            yield
     except BaseException:
         for key, plugin in _loaded.items():
             if before.get(key) is not plugin:
                 top = plugin.module.split(".")[0]
                 for name in [name for name in sys.modules if name.split(".")[0] == top]:
                     del sys.modules[name]
-                    registry.forget(name)
         _loaded.clear()
         _loaded.update(before)
         raise
@@ -301,12 +300,12 @@ def _check_together(plugins: Mapping[str, Plugin]) -> None:
             raise InputError(f"{where}: another plug-in of the scene has the name {plugin.name}, too; rename one")
     try:
         models.check_declarations()
-    except models.DeclarationError as error:
-        guilty = [w for w, p in plugins.items() if any(cls.fault in error.classes for cls in p.models)]
+    except registry.DeclarationError as error:
+        guilty = [w for w, p in plugins.items() if any(cls.fault in error.names for cls in p.models)]
         raise InputError(f"{', '.join(guilty) or 'plug-ins'}: {error}") from None
     try:
         effects.order()
-    except TypeError as error:
+    except registry.DeclarationError as error:
         raise InputError(f"{', '.join(plugins) or 'plug-ins'}: {error}") from None
 
 
@@ -322,7 +321,7 @@ def _errors_named(where: str) -> Iterator[None]:
         if isinstance(error, VbnfaultError):  # such as a file that changed during a build
             raise
         text = (str(error).splitlines() or [""])[0]
-        if not isinstance(error, models.DeclarationError):
+        if not isinstance(error, registry.DeclarationError):
             text = f"cannot be loaded: {type(error).__name__}{text and ': '}{text}"
         raise InputError(f"{where}: {text}{_line(error)}") from None
 

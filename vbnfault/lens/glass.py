@@ -7,14 +7,15 @@ give coefficients of any registered formula, or name glass catalogues in Zemax's
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+import sys
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..core.errors import InputError
+from ..core.registry import Registry
 
 F64 = NDArray[np.float64]
 # Wavelengths in nm, rising, and the internal transmittance of 10 mm at each.
@@ -37,8 +38,7 @@ class Dispersion:
     index: Formula
 
 
-_DISPERSIONS: dict[str, Dispersion] = {}
-DISPERSIONS: Mapping[str, Dispersion] = MappingProxyType(_DISPERSIONS)
+DISPERSIONS: Registry[Dispersion] = Registry("dispersion formula", __name__, own_modules=False)
 
 
 def dispersion(name: str, *counts: int) -> Callable[[Formula], Formula]:
@@ -48,14 +48,12 @@ def dispersion(name: str, *counts: int) -> Callable[[Formula], Formula]:
 
     Raises
     ------
-    ValueError
+    DeclarationError
         Another formula has the name.
     """
-    if name in _DISPERSIONS:
-        raise ValueError(f"dispersion formula {name!r}: there is one of this name already")
 
     def registered(index: Formula) -> Formula:
-        _DISPERSIONS[name] = Dispersion(counts, index)
+        DISPERSIONS.add(name, Dispersion(counts, index), module=index.__module__, qualname=index.__qualname__)
         return index
 
     return registered
@@ -176,8 +174,7 @@ class Glass:
 
 AIR = Glass(name="air", formula="cauchy", coefficients=(1.0, 0.0))
 
-_GLASSES: dict[str, Glass] = {}
-GLASSES: Mapping[str, Glass] = MappingProxyType(_GLASSES)
+GLASSES: Registry[Glass] = Registry("glass", __name__, own_modules=False)
 
 
 def register(glass: Glass) -> Glass:
@@ -185,14 +182,14 @@ def register(glass: Glass) -> Glass:
 
     Raises
     ------
-    ValueError
+    DeclarationError
         Another glass has the name.
     InputError
         The formula is unknown or takes another number of coefficients.
     """
-    if _GLASSES.setdefault(glass.name, glass) != glass:
-        raise ValueError(f"glass {glass.name!r}: there is another one of this name")
     from_coefficients(glass.formula, glass.coefficients)
+    # a glass is a value, which does not know its module as a class does
+    GLASSES.add(glass.name, glass, module=sys._getframe(1).f_globals["__name__"])
     return glass
 
 

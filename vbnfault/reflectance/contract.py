@@ -56,7 +56,7 @@ LEAST_COSINE = 1e-4
 # Contrasts between terrains refer to this wavelength, the reference of Fornasier et al. 2015.
 REFERENCE_NM = 649.0
 
-_REGISTRY: Registry[Reflectance] = Registry("ground reflectance", __package__ or "")
+_REGISTRY: Registry[type[Reflectance]] = Registry("ground reflectance", __package__ or "")
 
 _DECAY_PER_MAG = float(0.4 * np.log(10))
 _DEG_PER_HALF = float(np.degrees(2.0))  # degrees of an angle per radian of its half
@@ -111,7 +111,7 @@ class Reflectance(Table):
         """Register the model, unless it is a base class without a name."""
         name = cls.model_fields["model"].default
         if name is not PydanticUndefined:
-            _REGISTRY.add(name, cls)
+            _REGISTRY.add(name, cls, module=cls.__module__, qualname=cls.__qualname__)
 
     @abstractmethod
     def at(self, wavelength_nm: F64, reflectance: F64) -> BandReflectance:
@@ -128,7 +128,7 @@ class Reflectance(Table):
 
 def registry() -> dict[str, type[Reflectance]]:
     """Return the name and the class of every ground reflectance."""
-    return _REGISTRY.classes()
+    return dict(_REGISTRY)
 
 
 def is_packaged(cls: type[Reflectance]) -> bool:

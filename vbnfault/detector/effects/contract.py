@@ -123,7 +123,7 @@ class Effect(Table):
     def __pydantic_init_subclass__(cls, **kwargs: Any) -> None:
         """Register the effect, unless it is a base class without a name."""
         if "name" in cls.__dict__:
-            _REGISTRY.add(cls.name, cls)
+            _REGISTRY.add(cls.name, cls, module=cls.__module__, qualname=cls.__qualname__)
 
     @abstractmethod
     def apply(self, signal: Any, exposure: Exposure) -> Any:
@@ -138,12 +138,12 @@ class FaultStep(Effect):
         return exposure.acted(self.name, signal)
 
 
-_REGISTRY: Registry[Effect] = Registry("detector effect", __package__ or "")
+_REGISTRY: Registry[type[Effect]] = Registry("detector effect", __package__ or "")
 
 
 def registry() -> dict[str, type[Effect]]:
     """Return the name and the class of every detector effect."""
-    return _REGISTRY.classes()
+    return dict(_REGISTRY)
 
 
 def is_packaged(cls: type[Effect]) -> bool:
@@ -155,7 +155,7 @@ def order() -> tuple[str, ...]:
     """Return the names of all effects in the order in which they act.
 
     An effect from outside acts directly behind the one that it names, before the next one of vbnfault. Raise
-    TypeError if an effect names none that exists, or effects name each other in a circle.
+    DeclarationError if an effect names none that exists, or effects name each other in a circle.
     """
     classes = registry()
     return chained(
