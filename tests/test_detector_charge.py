@@ -7,10 +7,10 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
+from vbnfault.core.architecture import READOUT_DIRECTIONS
 from vbnfault.core.errors import InputError
 from vbnfault.detector import blocks
 from vbnfault.detector.charge import (
-    DIRECTIONS,
     ChargeCloud,
     TrapSpecies,
     bloom,
@@ -52,7 +52,7 @@ EFFECTS: dict[str, Callable[..., np.ndarray]] = {
 }
 
 
-@pytest.mark.parametrize("direction", DIRECTIONS)
+@pytest.mark.parametrize("direction", READOUT_DIRECTIONS)
 @pytest.mark.parametrize("effect", EFFECTS)
 def test_effects_turn_with_their_direction(effect: str, direction: str) -> None:
     image = scene()

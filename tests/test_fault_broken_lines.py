@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from test_faults_kit import flat_rgbi, make, make_context, rng
 
-from vbnfault.camera import ARCHITECTURES
+from vbnfault.core.architecture import ARCHITECTURES
 from vbnfault.core.errors import InputError
 from vbnfault.faults.broken_lines import TextureBrokenLines
 

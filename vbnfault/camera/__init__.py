@@ -1,5 +1,5 @@
 """Define the camera: lens, detector, sensor architecture, readout direction and exposure, frozen together."""
 
-from .camera import ARCHITECTURES, READOUT_DIRECTIONS, Camera, focal_length_mm
+from .camera import Camera, focal_length_mm
 
-__all__ = ["ARCHITECTURES", "READOUT_DIRECTIONS", "Camera", "focal_length_mm"]
+__all__ = ["Camera", "focal_length_mm"]

@@ -14,15 +14,12 @@ from ..core.sundisc import Projection
 from ..detector import Detector, MosaicDetector
 from ..lens import Lens
 
-ARCHITECTURES = ("full_frame_ccd", "frame_transfer_ccd", "interline_ccd", "cmos")
-READOUT_DIRECTIONS = ("up", "down", "left", "right")
-
 
 @dataclass(frozen=True, kw_only=True)
 class Camera:
     """Hold a camera in the state in which it takes one image.
 
-    `architecture` (one of ARCHITECTURES) and `readout_direction` (one of READOUT_DIRECTIONS) are drawn once per
+    `architecture` and `readout_direction` (`core.architecture` names their values) are drawn once per
     sample, and broken pixels and broken lines share them. `exposure_s` is above 0.
     """
 

@@ -19,14 +19,13 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from ..core.architecture import READOUT_DIRECTIONS
 from ..core.errors import InputError
 from ..core.tables import table_class
 from .blocks import by_rows
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
-
-DIRECTIONS = ("up", "down", "left", "right")
 
 
 # ------------------------------------------------------------------------------------------------------ smear
@@ -470,8 +469,8 @@ def _facing(image: F32, direction: str, *, back: bool = False) -> F32:
 
 
 def _known(direction: str) -> None:
-    if direction not in DIRECTIONS:
-        raise InputError(f"direction = {direction!r}: must be one of {', '.join(DIRECTIONS)}")
+    if direction not in READOUT_DIRECTIONS:
+        raise InputError(f"direction = {direction!r}: must be one of {', '.join(READOUT_DIRECTIONS)}")
 
 
 def _at_least_0(**values: float) -> None:

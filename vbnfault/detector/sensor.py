@@ -9,11 +9,12 @@ import dataclasses
 from collections.abc import Mapping
 from dataclasses import field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field
 
 from ..core import resources, spectra, tables
+from ..core.architecture import Architecture
 from ..core.errors import InputError, shown
 from ..core.tables import Fraction, table_class
 from .charge import ChargeCloud, TrapSpecies
@@ -26,8 +27,6 @@ from .mosaic import PATTERNS, Pattern
 from .mosaic import pattern as pattern_of
 from .readout import ReadoutSpec
 
-Architecture = Literal["full_frame_ccd", "frame_transfer_ccd", "interline_ccd", "cmos"]
-ARCHITECTURES: tuple[str, ...] = get_args(Architecture)
 # How to describe a sensor without colour filters; part of the errors of who looks for a response of that kind.
 MONOCHROME = (
     'a monochrome sensor has pattern = "mono", and its efficiency is quantum_efficiency_peak or a '

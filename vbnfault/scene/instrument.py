@@ -7,10 +7,8 @@ from typing import Annotated, Literal
 from pydantic import Field, model_validator
 
 from ..core import spectra
+from ..core.architecture import ARCHITECTURES, READOUT_DIRECTIONS, Architecture, ReadoutDirection
 from ..core.tables import Table
-
-Architecture = Literal["full_frame_ccd", "frame_transfer_ccd", "interline_ccd", "cmos"]
-Direction = Literal["up", "down", "left", "right"]
 
 # Values of a camera without a prescription, where the scene gives none.
 THIN_LENS = {"f_number": 4.0, "transmission": 0.9}
@@ -97,12 +95,12 @@ class CameraTable(Table):
         99.0, gt=0, le=100, description="percentile of the sunlit pixels that is brought to metering_level"
     )
     architectures: tuple[Architecture, ...] = Field(
-        ("full_frame_ccd", "frame_transfer_ccd", "interline_ccd", "cmos"),
+        ARCHITECTURES,
         min_length=1,
         description="architectures between which each sample draws",
     )
-    readout_directions: tuple[Direction, ...] = Field(
-        ("up", "down", "left", "right"),
+    readout_directions: tuple[ReadoutDirection, ...] = Field(
+        READOUT_DIRECTIONS,
         min_length=1,
         description="directions of the readout between which each sample draws",
     )

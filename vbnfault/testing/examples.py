@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..camera import ARCHITECTURES, READOUT_DIRECTIONS, Camera, focal_length_mm
+from ..camera import Camera, focal_length_mm
+from ..core.architecture import ARCHITECTURES, READOUT_DIRECTIONS
 from ..core.quantities import RGBI, Charge, Electrons, Offset, Quantity, RawMosaic
 from ..detector import MosaicDetector as _Mosaic
 from ..detector import ThreeColourDetector, load_sensor

@@ -11,10 +11,11 @@ from typing import Any
 
 import numpy as np
 
+from ..core.architecture import ARCHITECTURES
 from ..core.errors import InputError
 from ..core.quantities import Electrons
 from ..faults import MOSAIC_STEPS, STEPS, Fault, FaultContext, Params, act, from_dict, physical_order, registry
-from .examples import ARCHITECTURES, CCDS, draw_context, random_quantity, with_mosaic
+from .examples import CCDS, draw_context, random_quantity, with_mosaic
 
 _PLAIN = (dict, list, str, int, float, bool, type(None))
 _MAX_DRAWS = 100
