@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -174,30 +175,22 @@ def _starburst_glare() -> F64:
     return np.stack(planes, axis=-1) * np.array([1.0, 0.97, 0.93])
 
 
+# name → (description, gains of R, G and B, dispersion, shape)
+FLARES: dict[str, tuple[str, tuple[float, float, float], float, Callable[[F64, F64], F64]]] = {
+    "flare_01": ("close: warm orb, bright core", (0.30, 0.27, 0.21), 0.02, _orb),
+    "flare_02": ("close: dense green disc", (0.07, 0.15, 0.12), 0.02, _disc),
+    "flare_03": ("close: amber disc, bright limb", (0.18, 0.135, 0.08), 0.025, _limb_disc),
+    "flare_04": ("close: magenta orb, leaning outwards", (0.18, 0.10, 0.17), 0.02, _leaning_orb),
+    "flare_05": ("close: blue disc with a denser core", (0.07, 0.14, 0.21), 0.03, _cored_disc),
+    "flare_06": ("far: thin ring, colours parted", (0.17, 0.17, 0.18), 0.022, _ring),
+    "flare_07": ("far: iris of six blades, bright edge", (0.06, 0.13, 0.10), 0.02, _hexagon),
+    "flare_08": ("far: iris of seven blades, graded", (0.13, 0.08, 0.15), 0.025, _heptagon),
+    "flare_09": ("far: double halo, colours parted", (0.14, 0.135, 0.13), 0.03, _halo),
+    "flare_10": ("far: clipped pupil with a caustic", (0.16, 0.15, 0.20), 0.03, _crescent),
+}
 # name → (description, function that makes it)
 TEXTURES: dict[str, tuple[str, Callable[[], F64]]] = {
-    "flare_01": ("close: warm orb, bright core", lambda: _coloured((0.30, 0.27, 0.21), 0.02, _orb)),
-    "flare_02": ("close: dense green disc", lambda: _coloured((0.07, 0.15, 0.12), 0.02, _disc)),
-    "flare_03": ("close: amber disc, bright limb", lambda: _coloured((0.18, 0.135, 0.08), 0.025, _limb_disc)),
-    "flare_04": (
-        "close: magenta orb, leaning outwards",
-        lambda: _coloured((0.18, 0.10, 0.17), 0.02, _leaning_orb),
-    ),
-    "flare_05": (
-        "close: blue disc with a denser core",
-        lambda: _coloured((0.07, 0.14, 0.21), 0.03, _cored_disc),
-    ),
-    "flare_06": ("far: thin ring, colours parted", lambda: _coloured((0.17, 0.17, 0.18), 0.022, _ring)),
-    "flare_07": (
-        "far: iris of six blades, bright edge",
-        lambda: _coloured((0.06, 0.13, 0.10), 0.02, _hexagon),
-    ),
-    "flare_08": (
-        "far: iris of seven blades, graded",
-        lambda: _coloured((0.13, 0.08, 0.15), 0.025, _heptagon),
-    ),
-    "flare_09": ("far: double halo, colours parted", lambda: _coloured((0.14, 0.135, 0.13), 0.03, _halo)),
-    "flare_10": ("far: clipped pupil with a caustic", lambda: _coloured((0.16, 0.15, 0.20), 0.03, _crescent)),
+    **{name: (how, partial(_coloured, *of)) for name, (how, *of) in FLARES.items()},
     "glare_1": ("glare: core and soft skirt", _soft_glare),
     "glare_2": ("glare: core and starburst of 14 rays", _starburst_glare),
 }

@@ -51,7 +51,7 @@ MAY_IMPORT: dict[str, set[str]] = {
 
 ONLY = {  # distribution → the packages or modules that import it
     "mitsuba": {"render"},
-    "drjit": {"body", "render", "lens"},
+    "drjit": {"core.llvm", "render"},
     "zarr": {"store"},
     "numcodecs": {"store"},
     "dask": {"dataset.dask"},

@@ -9,13 +9,11 @@ number of threads nor the neighbouring points change a bit.
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import lru_cache
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 
-from ..core import llvm
+from ..core.llvm import backend
 from .noise import Float32, seed_word
 from .shape import Float64
 
@@ -27,22 +25,6 @@ _OFFSET_CELLS = 0.37
 
 # Standard deviation of `Points.gradient`, measured over a million points.
 GRADIENT_STD = 0.191
-
-
-@lru_cache(maxsize=1)
-def _device() -> Any:
-    """Import drjit and return it with the array types used here."""
-    llvm.prepare()
-    import drjit
-    import drjit.llvm as backend
-
-    return SimpleNamespace(
-        dr=drjit,
-        Float=backend.Float,
-        Float64=backend.Float64,
-        UInt32=backend.UInt32,
-        Int32=backend.Int32,
-    )
 
 
 def octave_rotation(number: int) -> Float64:
@@ -58,14 +40,14 @@ class Points:
 
     Parameters
     ----------
-    place_m
+    position_m
         float64[n, 3], metres.
     """
 
-    def __init__(self, place_m: Float64) -> None:
-        d = _device()
-        self.count = len(place_m)
-        self._axes = [d.Float64(np.ascontiguousarray(place_m[:, k])) for k in range(3)]
+    def __init__(self, position_m: Float64) -> None:
+        d = backend()
+        self.count = len(position_m)
+        self._axes = [d.Float64(np.ascontiguousarray(position_m[:, k])) for k in range(3)]
 
     def gradient(self, wavelength_m: float, key: int, count: int) -> Float32:
         """Return gradient noise of one cycle per 1-2 wavelengths, float32[count], mean 0, within ±1.3."""
@@ -81,28 +63,28 @@ class Points:
         level, other, gap = self._run(_blocks, width_m, key, count)
         return level, other, np.float32(width_m) * gap
 
-    def craters(self, width_m: float, key: int, count: int, share: float) -> Float32:
+    def craters(self, width_m: float, key: int, count: int, fraction: float) -> Float32:
         """Return the height of bowls with rims, float32[count] in metres, negative inside.
 
-        A cell of this width holds at most one crater, and the fraction `share` of the cells holds one. Diameters
+        A cell of this width holds at most one crater, and the given fraction of the cells holds one. Diameters
         are a third to two thirds of the width, with a cumulative index of 2. The same index holds over several
-        widths if each is half of the one before and all have the same `share` of cells.
+        widths if each is half of the one before and all have the same fraction of cells.
         """
-        (value,) = self._run(_craters, width_m, key, count, share)
+        (value,) = self._run(_craters, width_m, key, count, fraction)
         return np.float32(width_m) * value
 
-    def clods(self, width_m: float, key: int, count: int, share: float) -> Float32:
+    def clods(self, width_m: float, key: int, count: int, fraction: float) -> Float32:
         """Return the height above the ground of half-buried stones, float32[count] in metres.
 
-        A cell of this width holds at most one stone, and the fraction `share` of the cells holds one. Diameters are
+        A cell of this width holds at most one stone, and the given fraction of the cells holds one. Diameters are
         0.3 to 0.65 of the width.
         """
-        (value,) = self._run(_clods, width_m, key, count, share)
+        (value,) = self._run(_clods, width_m, key, count, fraction)
         return np.float32(width_m) * value
 
     def _run(self, kernel: Callable, unit_m: float, key: int, count: int, *more: float) -> tuple[Float32, ...]:
         """Evaluate a kernel at the first `count` positions, in units of `unit_m`, on the axes of its octave."""
-        d = _device()
+        d = backend()
         if count == 0:
             return tuple(np.zeros(0, dtype=np.float32) for _ in range(3))[: 3 if kernel is _blocks else 1]
         # With opaque values, one compiled kernel serves all octaves.

@@ -11,7 +11,16 @@ import typer
 
 from ..core.errors import InputError
 from .app import app
-from .options import MOST_PROCESSES, MOST_SAMPLES, SceneArgument, SceneOptions, StoreArgument, grouped, writing
+from .options import (
+    MOST_PROCESSES,
+    MOST_SAMPLES,
+    SceneArgument,
+    SceneOptions,
+    StoreArgument,
+    grouped,
+    whole,
+    writing,
+)
 
 _PANEL = "Datasets"
 
@@ -20,15 +29,10 @@ _PANEL = "Datasets"
 class WorkOptions:
     """Hold the options that control how a build runs; the names are those of `dataset.BuildOptions`."""
 
-    workers: Annotated[int, typer.Option(min=1, max=MOST_PROCESSES, help="Number of processes.")] = 1
+    workers: Annotated[int, whole(1, MOST_PROCESSES, "Number of processes.")] = 1
     threads: Annotated[
         int | None,
-        typer.Option(
-            min=1,
-            max=MOST_PROCESSES,
-            help="Number of render threads of each process.",
-            show_default="all cores, divided equally",
-        ),
+        whole(1, MOST_PROCESSES, "Number of render threads of each process.", unset="all cores, divided equally"),
     ] = None
     scheduler: Annotated[
         str | None, typer.Option(help="Address of a Dask scheduler whose workers build, such as tcp://host:8786.")
@@ -53,7 +57,7 @@ def build(
     work: WorkOptions,
     append: Annotated[
         int | None,
-        typer.Option(min=1, max=MOST_SAMPLES, help="Number of samples to add to a finished store as a new block."),
+        whole(1, MOST_SAMPLES, "Number of samples to add to a finished store as a new block."),
     ] = None,
 ) -> None:
     """Build a dataset, resume an interrupted build, or repair the damaged samples of a store."""
@@ -83,15 +87,13 @@ def render(
     scene: SceneArgument,
     out: Annotated[Path, typer.Option(help="Folder for the files.")],
     options: SceneOptions,
-    sample: Annotated[
-        int, typer.Option(min=0, max=100 * MOST_SAMPLES, help="Index of the sample, counted from 0.")
-    ] = 0,
+    sample: Annotated[int, whole(0, 100 * MOST_SAMPLES, "Index of the sample, counted from 0.")] = 0,
     append: Annotated[
         list[int] | None,
-        typer.Option(
-            min=1,
-            max=MOST_SAMPLES,
-            help="Number of samples of a block that was appended to the store; repeat it for each block, in order.",
+        whole(
+            1,
+            MOST_SAMPLES,
+            "Number of samples of a block that was appended to the store; repeat it for each block, in order.",
         ),
     ] = None,
 ) -> None:
@@ -153,7 +155,7 @@ def digest(store: StoreArgument) -> None:
 def preview(
     store: StoreArgument,
     out: Annotated[Path, typer.Option(help="PNG file to write.")],
-    samples: Annotated[int, typer.Option(min=1, max=400, help="Largest number of samples to show.")] = 16,
+    samples: Annotated[int, whole(1, 400, "Largest number of samples to show.")] = 16,
     masks: Annotated[bool, typer.Option(help="Draw the masks of the faults over the images.")] = True,
 ) -> None:
     """Draw a contact sheet of a store, with the masks over the images."""

@@ -19,6 +19,7 @@ from .options import (
     grouped,
     load_plugins,
     number,
+    whole,
     writing,
 )
 
@@ -35,12 +36,7 @@ class LensOptions:
 
     vary_seed: Annotated[
         int | None,
-        typer.Option(
-            min=0,
-            max=MOST_SEED,
-            help="Seed of a random relative that replaces the lens.",
-            show_default="the lens as it is",
-        ),
+        whole(0, MOST_SEED, "Seed of a random relative that replaces the lens.", unset="the lens as it is"),
     ] = None
     spread: Annotated[
         float,
@@ -120,12 +116,12 @@ class FlareOptions:
     ] = 0.0
     model: Annotated[str, typer.Option(help="Model of the ghosts: traced, paraxial or texture.")] = "traced"
     fov_deg: Annotated[float, number(0.1, 140, "Field of view across the width of the image in degrees.")] = 65.0
-    pixels: Annotated[int, typer.Option(min=16, max=4096, help="Width and height of the image in pixels.")] = 1024
+    pixels: Annotated[int, whole(16, 4096, "Width and height of the image in pixels.")] = 1024
     sun_distance_au: Annotated[
         float, number(0.01, 1000, "Distance of the Sun in au; it sets the size of the Sun's disc.")
     ] = 1.0
     reflections: Annotated[
-        int, typer.Option(min=2, max=4, help="Reflections of a ghost: 2, or 4 to add ghosts of four reflections.")
+        int, whole(2, 4, "Reflections of a ghost: 2, or 4 to add ghosts of four reflections.")
     ] = 2
     roughness_nm: Annotated[float, number(0, 50, "Roughness of each surface in nm rms.")] = 1.0
     cleanliness_level: Annotated[
@@ -219,13 +215,11 @@ def detector(
     out: Annotated[Path, typer.Option(help="Folder for emva1288.json and emva1288.png.")],
     seed: Annotated[
         int,
-        typer.Option(min=0, max=MOST_SEED, help="Seed of the device that is measured: each has its own defects."),
+        whole(0, MOST_SEED, "Seed of the device that is measured: each has its own defects."),
     ] = 1,
     pixels: Annotated[
         int,
-        typer.Option(
-            min=64, max=4096, help="Width and height in pixels of the part that is measured, at most the sensor."
-        ),
+        whole(64, 4096, "Width and height in pixels of the part that is measured, at most the sensor."),
     ] = 512,
     wavelength_nm: Annotated[
         float | None, number(300, 1100, "Wavelength of the light in nm.", unset="the best one of each channel")
@@ -233,19 +227,14 @@ def detector(
     temperature_k: Annotated[
         float | None, number(100, 400, "Temperature of the sensor in kelvin.", unset="that of its file")
     ] = None,
-    points: Annotated[
-        int, typer.Option(min=8, max=2000, help="Number of light levels of the photon transfer.")
-    ] = 40,
-    stack: Annotated[
-        int, typer.Option(min=2, max=2000, help="Number of images that are averaged for DSNU, PRNU and spectra.")
-    ] = 24,
+    points: Annotated[int, whole(8, 2000, "Number of light levels of the photon transfer.")] = 40,
+    stack: Annotated[int, whole(2, 2000, "Number of images that are averaged for DSNU, PRNU and spectra.")] = 24,
     plugins: PluginOption = None,
 ) -> None:
     """Characterise a virtual sensor as EMVA 1288 defines, with plots."""
     from ..output import sensor_report
 
     load_plugins(plugins)
-
     request = sensor_report.SensorRequest(
         sensor=detector,
         individual=seed,

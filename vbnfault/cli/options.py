@@ -53,6 +53,11 @@ def number(low: float, high: float, text: str, *names: str, unset: str | None = 
     return typer.Option(*names, callback=finite, min=low, max=high, help=text, show_default=unset or True)
 
 
+def whole(low: int, high: int, text: str, *, unset: str | None = None) -> Any:
+    """Return an option that takes a whole number from `low` to `high`; for `unset` see `number`."""
+    return typer.Option(min=low, max=high, help=text, show_default=unset or True)
+
+
 FocalLengthOption = Annotated[
     float | None, number(0.01, 1e5, "Focal length in mm to which the lens is scaled.", unset="as prescribed")
 ]
@@ -101,11 +106,11 @@ class SceneOptions:
 
     samples: Annotated[
         int | None,
-        typer.Option(min=1, max=MOST_SAMPLES, help="Number of samples to plan.", show_default="the scene's"),
+        whole(1, MOST_SAMPLES, "Number of samples to plan.", unset="the scene's"),
     ] = None
     seed: Annotated[
         int | None,
-        typer.Option(min=0, max=MOST_SEED, help="Seed of all random numbers.", show_default="the scene's"),
+        whole(0, MOST_SEED, "Seed of all random numbers.", unset="the scene's"),
     ] = None
     settings: Annotated[
         list[str] | None,

@@ -19,7 +19,8 @@ import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from types import SimpleNamespace
+from typing import Any, Literal
 
 from .errors import VbnfaultError
 
@@ -92,6 +93,17 @@ def prepare() -> Candidate:
     library = find()
     os.environ[VARIABLE] = str(library.path)
     return library
+
+
+@functools.lru_cache(maxsize=1)
+def backend() -> Any:
+    """Return drjit as `dr` and its array types for the LLVM backend, on a usable library. Raises VbnfaultError."""
+    prepare()
+    import drjit
+    import drjit.llvm as types
+
+    names = ("Float", "Float64", "UInt32", "Int32", "UInt64", "Int64")
+    return SimpleNamespace(dr=drjit, **{name: getattr(types, name) for name in names})
 
 
 def _paths() -> Iterator[tuple[str, Path]]:

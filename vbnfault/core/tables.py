@@ -119,7 +119,7 @@ def parse(kind: type[T], plain: Mapping[str, Any], *, source: str, overrides: Se
         if not errors:
             return checked
     except ValidationError as error:
-        located = [one["loc"] for one in errors]
+        located = [known["loc"] for known in errors]
         errors += [detail for detail in error.errors(include_url=False) if detail["loc"] not in located]
     wrong = ".".join(map(str, errors[0]["loc"]))
     replaced = any(wrong.startswith(key) or key.startswith(f"{wrong}.") for key in overrides)

@@ -442,9 +442,8 @@ def _signed(raw: F32, kernel: F32) -> F32:
 
 def _beside(kernel: F32) -> NDArray[np.uint8]:
     """Return which pixels within one of the centre hold the colour that a kernel of Malvar's gives, uint8[3, 3]."""
-    near = (kernel[1:4, 1:4] > 0).astype(
-        np.uint8
-    )  # the pixel's own colour counts there by its differences, below 0
+    # the weights of the pixel's own colour are negative there: it counts by its differences
+    near = (kernel[1:4, 1:4] > 0).astype(np.uint8)
     near[1, 1] = 0
     return near
 

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 
-from ..charge import ChargeCloud, bloom, capture, cti
+from ..charge import ChargeCloud, TrapSpecies, bloom, capture, cti
 from ..transfer import along_columns, along_registers
 from .contract import F32, Effect, Exposure
 
@@ -59,11 +60,9 @@ class ParallelCti(Effect):
 
     def apply(self, signal: F32, exposure: Exposure) -> F32:
         """Return the electrons at the ends of the columns."""
-        sensor, move = exposure.sensor, exposure.sensor.transfer
-        if sensor.architecture == "cmos" or not move.parallel_traps:
-            return signal
-        step = partial(cti, species=move.parallel_traps, cloud=_cloud(exposure), transfer_s=move.row_readout_s)
-        return along_columns(sensor, exposure.device.direction, step, signal)
+        move = exposure.sensor.transfer
+        delay = _delay(exposure, move.parallel_traps, move.row_readout_s)
+        return along_columns(exposure.sensor, exposure.device.direction, delay, signal) if delay else signal
 
 
 class SerialCti(Effect):
@@ -74,15 +73,17 @@ class SerialCti(Effect):
 
     def apply(self, signal: F32, exposure: Exposure) -> F32:
         """Return the electrons at the output nodes."""
-        sensor, move = exposure.sensor, exposure.sensor.transfer
-        if sensor.architecture == "cmos" or not move.serial_traps:
-            return signal
-        step = partial(cti, species=move.serial_traps, cloud=_cloud(exposure), transfer_s=move.pixel_transfer_s)
-        return along_registers(sensor, step, signal)
+        move = exposure.sensor.transfer
+        delay = _delay(exposure, move.serial_traps, move.pixel_transfer_s)
+        return along_registers(exposure.sensor, delay, signal) if delay else signal
 
 
-def _cloud(exposure: Exposure) -> ChargeCloud:
-    """Return the charge cloud that meets the traps."""
+def _delay(exposure: Exposure, species: tuple[TrapSpecies, ...], transfer_s: float) -> Callable[..., F32] | None:
+    """Return the function that lets traps delay charge on its way through a register; None without traps."""
     sensor = exposure.sensor
+    if sensor.architecture == "cmos" or not species:
+        return None
     cloud = sensor.transfer.cloud
-    return ChargeCloud(full_well_e=sensor.readout.full_well_e) if cloud is None else cloud
+    if cloud is None:
+        cloud = ChargeCloud(full_well_e=sensor.readout.full_well_e)
+    return partial(cti, species=species, cloud=cloud, transfer_s=transfer_s)

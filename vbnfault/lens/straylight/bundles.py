@@ -27,12 +27,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...core.errors import InputError
+from ...core.llvm import backend
 from ..coating import reflect_transmit
 from ..gaussian import first_order
 from ..prescription import Prescription
 from ..rays import path_of
 from .paraxial import along, mirrors
-from .steps import Step, StopBlades, arrived, backend, meet
+from .steps import Step, StopBlades, arrived, meet
 
 F64 = NDArray[np.float64]
 

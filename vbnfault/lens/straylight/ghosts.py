@@ -16,12 +16,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ...core.llvm import backend
 from ..gaussian import first_order
 from ..glass import D_NM
 from ..prescription import Prescription
 from .bundles import Rays, Tracer, name_of
 from .paraxial import Ghost
-from .steps import backend
 
 F64 = NDArray[np.float64]
 
@@ -356,10 +356,10 @@ def _traced_together(
 ) -> list[Ghost]:
     """Return the ghosts of bundles that are traced together."""
     be = backend()
-    dr, Double = be.dr, be.Double
+    dr, Float64 = be.dr, be.Float64
     spots = made.trace(rays, across, centred=True)
-    weight = Double(spots.fraction * _inside(spots.radius, across))
-    x, y = Double(spots.x_mm), Double(spots.y_mm)
+    weight = Float64(spots.fraction * _inside(spots.radius, across))
+    x, y = Float64(spots.x_mm), Float64(spots.y_mm)
     parts = (weight, weight * x, weight * y, weight * (x * x + y * y))
     dr.eval(*parts)
     total, mx, my, square = (dr.block_sum(v, across * across).numpy() for v in parts)

@@ -17,13 +17,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...core.errors import InputError
+from ...core.llvm import backend
 from ..prescription import Prescription
 from .bundles import Rays, Spots, TraceOptions, Tracer
 from .ghosts import Arrivals, boxes, named, traced
 from .paraxial import Ghost, along, mean_ghost
 from .raster import LEVELS, PARTS, BundleDrawing, Canvas, Sums, edge_kind
 from .settings import TRACED, GhostSettings, SensorGrid
-from .steps import backend
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]

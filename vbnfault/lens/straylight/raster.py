@@ -21,8 +21,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ...core.llvm import backend
 from .bundles import Spots, lattice_places, rounded
-from .steps import backend
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]

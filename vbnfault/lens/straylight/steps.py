@@ -10,38 +10,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 
+from ...core.llvm import backend
 from ..prescription import Surface
 
 _LOST, _FAR = -1e6, -1e4  # margin of rays that do not reach the sensor, and the smallest margin of other rays
 _BEYOND_EDGE = -1.0  # margin at which a soft edge ends in the dark
 _LIMIT_SHARPNESS = 100.0  # of an edge that a missed surface or total reflection makes, not a rim
 _LEAST_SLOPE = 1e-3  # smallest |dz| of a lost ray
-
-
-@lru_cache(maxsize=1)
-def backend() -> Any:
-    """Return drjit and its array types, on a usable LLVM."""
-    from ...core import llvm
-
-    llvm.prepare()
-    import drjit
-    import drjit.llvm as types
-
-    return SimpleNamespace(
-        dr=drjit,
-        Float=types.Float,
-        UInt32=types.UInt,
-        Int32=types.Int,
-        UInt64=types.UInt64,
-        Int64=types.Int64,
-        Double=types.Float64,
-    )
 
 
 @dataclass(eq=False)
