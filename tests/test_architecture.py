@@ -318,6 +318,59 @@ def test_a_cycle_would_be_found() -> None:
         assert_no_cycle({"a": {"b"}, "b": {"c"}, "c": {"a"}})
 
 
+# --------------------------------------------------------------------------------- docstrings
+
+# A docstring begins with a verb in the imperative, not with one of these or a word in -s, -ed or -ing.
+NO_VERB = {"A", "An", "The", "This", "What", "Which", "How", "Whether", "Some", "One", "Number", "Position"}
+
+
+def definitions(body: list[ast.stmt], name: str, public: bool = True) -> Iterator[tuple[str, ast.AST, bool]]:
+    """Yield each function, method and class with its dotted name, and whether it is public."""
+    for node in body:
+        if isinstance(node, ast.If | ast.Try):
+            yield from definitions(node.body, name, public)
+        elif isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
+            own = f"{name}.{node.name}"
+            yield own, node, public and not node.name.startswith("_")
+            if isinstance(node, ast.ClassDef):
+                yield from definitions(node.body, own, public and not node.name.startswith("_"))
+
+
+def fault_of_docstring(text: str | None) -> str:
+    """Return what is wrong with a docstring, or an empty text."""
+    if text is None:
+        return "is missing"
+    first = text.split("\n\n")[0]
+    if not re.search(r"\.(\s|$)", first):
+        return "has no full stop behind its first sentence"
+    word = text.split()[0].strip(",.:")
+    # "Pass" and "Bring" are verbs
+    if word in NO_VERB or not word[0].isupper() or re.search(r"([^s]s|ed|[A-Za-z]{3}ing)$", word):
+        return f"begins with {word!r} instead of a verb in the imperative"
+    return ""
+
+
+def test_every_docstring_begins_with_an_imperative_sentence() -> None:
+    wrong = []
+    for module, tree in sources().items():
+        units = [(module, tree, True), *definitions(tree.body, module)]
+        for name, node, public in units:
+            assert isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef)
+            text = ast.get_docstring(node)
+            if public or text is not None:
+                fault = fault_of_docstring(text)
+                wrong += [f"{name}: its docstring {fault}"] * bool(fault)
+    assert not wrong, "\n".join(wrong)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [None, "Return a number", "The number.", "Numbers of rows.", "Raised where a file is gone.", "number of rows."],
+)
+def test_a_poor_docstring_would_be_found(text: str | None) -> None:
+    assert fault_of_docstring(text)
+
+
 # ------------------------------------------------------------------------------------ Mitsuba
 
 

@@ -1,4 +1,4 @@
-"""Labelled, fault-injected camera images for vision-based navigation near comets and other small bodies.
+"""Make labelled, fault-injected camera images for vision-based navigation near comets and other small bodies.
 
     import vbnfault
 

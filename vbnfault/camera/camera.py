@@ -51,14 +51,17 @@ class Camera:
 
     @property
     def width_px(self) -> int:
+        """Return the number of columns of the image."""
         return self.detector.width_px
 
     @property
     def height_px(self) -> int:
+        """Return the number of rows of the image."""
         return self.detector.height_px
 
     @property
     def is_ccd(self) -> bool:
+        """Return whether the sensor is a CCD of any architecture."""
         return self.architecture != "cmos"
 
     @property

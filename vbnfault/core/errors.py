@@ -12,7 +12,7 @@ _LONGEST_VALUE = 120
 
 
 class VbnfaultError(Exception):
-    """A run failed for the reason that the message states. The command line exits with code 1."""
+    """Report that a run failed, for the reason in the message. The command line exits with code 1."""
 
     exit_code = 1
 
@@ -22,13 +22,13 @@ class VbnfaultError(Exception):
 
 
 class InputError(VbnfaultError):
-    """The input is bad: the message names the file, the key, the value and the allowed range. Exit code 2."""
+    """Report bad input; the message names file, key, value and allowed range. Exit code 2."""
 
     exit_code = 2
 
 
 class InputChanged(VbnfaultError):
-    """A file has changed since the run that reads it began."""
+    """Report that a file has changed since the run that reads it began."""
 
 
 def shown(value: object) -> str:

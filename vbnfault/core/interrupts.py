@@ -24,7 +24,7 @@ _raised: list[int] = []
 
 
 class Stopped(BaseException):
-    """A signal asked the program to end; `number` is the signal's number.
+    """Report that a signal asked the program to end; `number` is the signal's number.
 
     This is not a KeyboardInterrupt, because typer ends the program without a message on that one.
     """

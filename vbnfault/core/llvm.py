@@ -59,6 +59,7 @@ class Candidate:
 
     @property
     def usable(self) -> bool:
+        """Return whether Mitsuba can use the library."""
         return not self.problem
 
 

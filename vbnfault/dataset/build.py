@@ -49,7 +49,7 @@ _MOST_PROCESSES = 1024  # of workers and of threads: more than any machine has
 
 @dataclass(frozen=True, kw_only=True)
 class BuildOptions:
-    """How a build does its work. No option changes a stored value.
+    """Hold the options of how a build does its work. No option changes a stored value.
 
     Parameters
     ----------
@@ -109,7 +109,7 @@ def _check_whole(option: str, value: int) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class BuildPlan:
-    """What a build makes: a store, its samples, and what is known about them before the first one is rendered.
+    """Describe what a build makes: a store, its samples, and what is known before the first one is rendered.
 
     Parameters
     ----------
@@ -157,7 +157,7 @@ class BuildPlan:
 
 @dataclass(frozen=True, kw_only=True)
 class Summary:
-    """What a build would do, or did.
+    """Describe what a build would do, or did.
 
     Attributes
     ----------

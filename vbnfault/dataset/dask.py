@@ -171,7 +171,7 @@ def run_on_dask(factory: SessionFactory, run: Run, scheduler: str) -> None:
 
 
 class _ClusterRun:
-    """The tasks of a run on a cluster: hand them out, collect their events, and do again what workers died of."""
+    """Hand out the tasks of a run on a cluster, collect their events, and repeat tasks whose worker died."""
 
     def __init__(self, client: Any, factory: SessionFactory, run: Run, scheduler: str) -> None:
         self._client, self._run, self._scheduler = client, run, scheduler

@@ -8,7 +8,7 @@ from ..core.errors import VbnfaultError
 
 
 class Interrupted(VbnfaultError):
-    """The user or the system stopped the build; the same command resumes it.
+    """Report that the user or the system stopped the build; the same command resumes it.
 
     `exit_code`: 128 + the signal's number.
     """
@@ -19,7 +19,7 @@ class Interrupted(VbnfaultError):
 
 
 class BuildFailed(VbnfaultError):
-    """Some samples could not be made.
+    """Report that some samples could not be made.
 
     `failures`: by sample, one line and the traceback, or a sentence on how its worker ended.
     """

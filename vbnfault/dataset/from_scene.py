@@ -24,7 +24,7 @@ _MOST_SAMPLES = 10_000_000
 
 @dataclasses.dataclass(frozen=True)
 class SessionFactory:
-    """A picklable function that makes the session of a scene in a worker.
+    """Make the session of a scene in a worker; the object is a function that can be pickled.
 
     `threads`: render threads of the worker; VBNFAULT_THREADS by default. `contents`: the input files as they were
     when the build was planned.
@@ -43,7 +43,7 @@ class SessionFactory:
 
 @dataclasses.dataclass(frozen=True)
 class _Session:
-    """A session that fails if an input file changed after the build was planned."""
+    """Make samples as a session does, but fail if an input file changed after the build was planned."""
 
     session: pipeline.Session
     contents: resources.Contents

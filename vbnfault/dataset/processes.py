@@ -72,7 +72,7 @@ def _die_with_parent() -> None:
 
 
 class _Process:
-    """The parent's handle of a worker process."""
+    """Represent a worker process in its parent."""
 
     def __init__(self, factory: SessionFactory, path: Path, threads: int) -> None:
         context = multiprocessing.get_context("spawn")
@@ -157,7 +157,7 @@ def _without_working_folder() -> Iterator[None]:
 
 
 class Pool:
-    """Worker processes that are replaced after `recycle` shards, or when they die.
+    """Run worker processes, which are replaced after `recycle` shards, or when they die.
 
     If a process dies during a sample, the shard is done again in a new process, which writes each sample as soon as
     it is made. So a second crash loses only that sample, which is then recorded as failed and skipped. If a process

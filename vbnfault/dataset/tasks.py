@@ -31,7 +31,7 @@ _HOPELESS = 32  # after so many failures without one success, the build stops: t
 
 
 class SampleMaker(Protocol):
-    """An object that makes samples. It may keep costly data between samples, such as the terrain of a site."""
+    """Make samples. An object may keep costly data between samples, such as the terrain of a site."""
 
     def simulate(self, index: int) -> Sample:
         """Return a sample, which must not depend on the samples simulated before."""
@@ -48,7 +48,7 @@ Tick = Callable[[int, str, str], None]
 
 @dataclass(frozen=True, kw_only=True)
 class Task:
-    """The task to complete one shard.
+    """Describe the task to complete one shard.
 
     Attributes
     ----------
@@ -130,7 +130,7 @@ def describe(error: Exception) -> str:
 
 
 class Run:
-    """The tasks of a build, assigned by site, and their results."""
+    """Assign the tasks of a build by site, and collect their results."""
 
     def __init__(
         self,
@@ -233,7 +233,7 @@ class Run:
 
 
 class Lazy:
-    """A session that is made when the first sample needs it: a complete shard needs none."""
+    """Make a session when the first sample needs it: a complete shard needs none."""
 
     def __init__(self, factory: SessionFactory) -> None:
         self._factory = factory
@@ -256,7 +256,7 @@ class Lazy:
 
 
 class Fatal(BaseException):
-    """Carries an error that ends the whole build. As a BaseException it passes the handler of a failed sample."""
+    """Carry an error that ends the whole build. As a BaseException it passes the handler of a failed sample."""
 
     def __init__(self, error: VbnfaultError) -> None:
         super().__init__(error)

@@ -178,7 +178,7 @@ class Device:
 
     @cached_property
     def saturated_dn(self) -> Raw:
-        """Raw number from which each pixel counts as saturated, uint16[y, x] in DN.
+        """Return the raw number from which each pixel counts as saturated, uint16[y, x] in DN.
 
         It is what a full well gives there through the pixel's own node, offsets and converter, less what temporal
         noise can take away (interference whole, the rest four standard deviations).

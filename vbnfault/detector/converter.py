@@ -68,12 +68,14 @@ class Converter:
 
 
 def with_stuck_bits(raw: Raw, stuck_bits: Sequence[tuple[int, int]]) -> Raw:
+    """Return raw numbers in which some bits, given as (bit, value), always have the same value."""
     high = sum(1 << bit for bit, value in dict(stuck_bits).items() if value)
     low = sum(1 << bit for bit, value in dict(stuck_bits).items() if not value)
     return (raw | np.uint16(high)) & np.uint16(0xFFFF ^ low)
 
 
 def check_shape(name: str, array: F32 | None, shape: tuple[int, ...]) -> None:
+    """Raise InputError, which names the array, unless it is None or has the shape."""
     if array is not None and array.shape != shape:
         raise InputError(f"{name} has shape {array.shape}, but must have {shape}")
 

@@ -1,4 +1,4 @@
-"""Apply steps along the ways of charge through a sensor, and compute the dark current that it collects there."""
+"""Apply steps along the paths of charge through a sensor, and compute the dark current that it collects there."""
 
 from __future__ import annotations
 

@@ -45,7 +45,7 @@ _SUFFIXES = (*importlib.machinery.SOURCE_SUFFIXES, *importlib.machinery.EXTENSIO
 
 @dataclass(frozen=True)
 class Plugin:
-    """A plug-in that this process has loaded.
+    """Describe a plug-in that this process has loaded.
 
     Attributes
     ----------

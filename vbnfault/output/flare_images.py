@@ -48,7 +48,7 @@ _SHOWN_PERCENTILE = 99.7
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class FlareRequest:
-    """A lens, the direction of the Sun, and an image whose centre lies on the optical axis.
+    """Hold a lens, the direction of the Sun, and the size of an image whose centre lies on the optical axis.
 
     Attributes
     ----------
@@ -104,12 +104,12 @@ class FlareRequest:
 
     @property
     def pitch_mm(self) -> float:
-        """Pixel pitch of the image on the sensor plane, in mm."""
+        """Return the pixel pitch of the image on the sensor plane, in mm."""
         return 2 * first_order(self.lens).efl_mm * float(np.tan(np.radians(self.fov_deg / 2))) / self.pixels
 
     @property
     def sun(self) -> SunSource:
-        """The Sun as the lens sees it."""
+        """Return the Sun as the lens sees it."""
         return SunSource(
             angle_deg=self.sun_deg,
             azimuth_deg=self.azimuth_deg,
@@ -118,7 +118,7 @@ class FlareRequest:
 
     @property
     def sun_xy_mm(self) -> tuple[float, float]:
-        """Position of the Sun's direct image on the sensor plane, f tan θ from the axis, in mm."""
+        """Return the position of the Sun's direct image on the sensor plane, f tan θ from the axis, in mm."""
         return self.sun.xy_mm(first_order(self.lens).efl_mm)
 
 

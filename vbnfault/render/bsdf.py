@@ -142,6 +142,7 @@ class HapkeBSDF(mi.BSDF):  # type: ignore[misc]
         return self.eval(ctx, si, wo, active), self.pdf(ctx, si, wo, active)
 
     def to_string(self) -> str:
+        """Return a text for Mitsuba's messages."""
         return f"Hapke[{self._model}]"
 
 

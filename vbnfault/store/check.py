@@ -26,7 +26,10 @@ from .schema import SCALARS, VOLATILE_ATTRIBUTES, StoreSpec
 
 
 class Problem(NamedTuple):
-    """What is wrong with some samples, in one sentence. `unfinished`: they are only not built yet, not damaged."""
+    """Say in one sentence what is wrong with some samples.
+
+    `unfinished` is True if they are not damaged, but only not built yet.
+    """
 
     samples: tuple[int, ...]
     sentence: str
@@ -38,7 +41,7 @@ _MOST_RANGES = 16  # sample ranges that one sentence lists
 
 
 class ShardCheck(NamedTuple):
-    """The result of reading one shard.
+    """Hold the result of reading one shard.
 
     Attributes
     ----------
@@ -56,7 +59,7 @@ class ShardCheck(NamedTuple):
 
     @property
     def wanted(self) -> set[int]:
-        """The samples that must be built or rebuilt."""
+        """Return the samples that must be built or rebuilt."""
         wrong = {i for i, sentences in self.contradictions.items() if sentences}
         return wrong.union(*(problem.samples for problem in self.problems))
 
@@ -123,7 +126,7 @@ def examine_shard(store: Store, number: int, *, labels: bool = False) -> ShardCh
 
 
 class _SampleCheck(NamedTuple):
-    """The result of examining one sample: problems with the index of their layer, and digest and contradictions.
+    """Hold the result of examining one sample: problems by layer, the digest, and contradictions.
 
     `digest` is None if the sample is damaged.
     """
@@ -252,7 +255,7 @@ def unplanned_samples(store: Store, number: int, expected: Planned, *, exact: bo
 
 
 class Report(NamedTuple):
-    """The result of `examine`.
+    """Hold the result of `examine`.
 
     Attributes
     ----------
@@ -483,7 +486,7 @@ class SampleDigests:
 
     @property
     def complete(self) -> bool:
-        """Whether every sample has a digest."""
+        """Return whether every sample has a digest."""
         return bool(self._digests.any(axis=1).all())
 
     def of(self, store: Store) -> str:

@@ -84,7 +84,7 @@ def split_shard(data: bytes, count: int) -> dict[int, bytes]:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Encoded:
-    """A sample with its layers compressed; a task keeps it until its shard is complete.
+    """Hold a sample with its layers compressed; a task keeps it until its shard is complete.
 
     `chunks`: compressed bytes by layer. `crc32c`: uint32[layer], the last one over all scalars. `digest`: the
     result of `sample_digest`.

@@ -9,7 +9,7 @@ from .schema import SPLITS
 
 
 class FaultCounts:
-    """How many samples each fault class is planned for, and how many it is injected in, by split.
+    """Count the samples for which each fault class is planned, and those in which it is injected, by split.
 
     `add` counts the samples one by one.
     """
@@ -43,7 +43,7 @@ class FaultCounts:
 
     @property
     def missing(self) -> dict[str, int]:
-        """Planned minus realised samples by fault class; only classes where the difference is not 0."""
+        """Return planned minus realised samples by fault class, only where the difference is not 0."""
         if not self._has_plan:
             return {}
         differences = {f: self.planned(f) - self.realised(f) for f in self.faults}

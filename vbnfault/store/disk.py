@@ -29,7 +29,7 @@ _UNSUPPORTED = (errno.EINVAL, errno.ENOTSUP)  # errors of file systems that cann
 
 
 class Misplaced(OSError):
-    """Raised if the name of a file belongs to something else: a folder, a link, a pipe."""
+    """Report that the name of a file belongs to something else: a folder, a link, a pipe."""
 
 
 @contextlib.contextmanager

@@ -48,7 +48,7 @@ _READS = 3
 
 
 class Store:
-    """An open store, as `open_store` returns it.
+    """Hold an open store, as `open_store` returns it.
 
     `array`, `read` and `read_sample` read through zarr, as a user does. `column` and `chunk` read the files
     directly.
@@ -65,7 +65,7 @@ class Store:
 
     @property
     def shards(self) -> int:
-        """Number of shards along the sample axis."""
+        """Return the number of shards along the sample axis."""
         return -(-self.samples // self.spec.shard_samples)
 
     def shard(self, number: int) -> range:
@@ -441,7 +441,7 @@ def _unlock_folder(lock: int | None) -> None:
 
 
 class Root(NamedTuple):
-    """The root attributes of a store, and one sentence for each problem of the files that hold them."""
+    """Hold the root attributes of a store, and one sentence for each problem of the files that hold them."""
 
     attributes: dict[str, Any]
     problems: tuple[str, ...]

@@ -1,4 +1,4 @@
-"""A store as labelled arrays, for analysis and training."""
+"""Open a store as labelled arrays, for analysis and training."""
 
 from __future__ import annotations
 

@@ -43,7 +43,7 @@ _SCALARS = "scalars"  # the entry of the `layer` axis that stands for all scalar
 
 @dataclass(frozen=True)
 class Array:
-    """One row of the schema. `ratio`: typical compressed size divided by the uncompressed size."""
+    """Describe one array of the schema. `ratio` is its typical compressed size over the uncompressed size."""
 
     dimensions: str
     dtype: str
@@ -55,17 +55,17 @@ class Array:
 
     @property
     def dims(self) -> tuple[str, ...]:
-        """Names of the dimensions, in order."""
+        """Return the names of the dimensions, in order."""
         return tuple(self.dimensions.split())
 
     @property
     def is_text(self) -> bool:
-        """Whether the values are strings."""
+        """Return whether the values are strings."""
         return self.dtype == "str"
 
     @property
     def fill(self) -> Any:
-        """The value that an unwritten sample has."""
+        """Return the value that an unwritten sample has."""
         return "" if self.is_text else float("nan") if self.dtype == "float64" else 0
 
 
@@ -164,7 +164,7 @@ _LABELS = {  # coordinates of the short axes
 
 
 class Member(NamedTuple):
-    """The required layout of one array of the group; `create`, `verify` and `recover` use it.
+    """Describe the required layout of one array of the group; `create`, `verify` and `recover` use it.
 
     `values`: the values of a coordinate; None for an array that tasks write. `chunks`, `shards`: shapes of zarr's
     chunks and shards, at least 1 in every axis.
@@ -189,7 +189,7 @@ def _coordinate(dim: str, values: NDArray[Any] | tuple[str, ...], **attributes: 
 
 @dataclass(frozen=True, kw_only=True)
 class StoreSpec:
-    """Which arrays a store holds, and their sizes, names and attributes, as plain data.
+    """Describe the arrays of a store, with their sizes, names and attributes, as plain data.
 
     Parameters
     ----------
@@ -271,7 +271,7 @@ class StoreSpec:
 
     @cached_property
     def pixel_layers(self) -> dict[str, Array]:
-        """The schema row of every layer by name, in the order of the `layer` axis."""
+        """Return the schema row of every layer by name, in the order of the `layer` axis."""
         layers = {name: LAYERS[name] for name in REQUIRED_LAYERS}
         for name in self.layers:
             if name == "radiance":
@@ -288,14 +288,14 @@ class StoreSpec:
 
     @cached_property
     def arrays(self) -> dict[str, Array]:
-        """The schema row by name of every array that tasks write."""
+        """Return the schema row by name of every array that tasks write."""
         crc32c = Array("sample layer", "uint32", "1", "CRC-32C of the decoded bytes")
         done = Array("sample", "uint8", "1", "1 where a sample is whole; written last")
         return {**self.pixel_layers, **SCALARS, "crc32c": crc32c, "done": done}
 
     @property
     def checked(self) -> tuple[str, ...]:
-        """The labels of the `layer` axis of `crc32c`: every layer, then all scalars together."""
+        """Return the labels of the `layer` axis of `crc32c`: every layer, then all scalars together."""
         return (*self.pixel_layers, _SCALARS)
 
     def shape(self, row: Array) -> tuple[int, ...]:
