@@ -14,7 +14,7 @@ import trimesh
 from conftest import small_scene
 
 from vbnfault import dataset, pipeline, store
-from vbnfault.core import resources, spice
+from vbnfault.core import file_contents, resources, spice
 from vbnfault.core.errors import InputChanged, InputError
 from vbnfault.dataset import build
 from vbnfault.scene import config
@@ -80,7 +80,7 @@ LOADED = {
 
 @pytest.mark.parametrize("kind", LOADED)
 def test_a_worker_refuses_a_file_that_is_not_the_planned_one(files: dict[str, Path], kind: str) -> None:
-    contents, scene = resources.Contents(), scene_of(files)
+    contents, scene = file_contents.Contents(), scene_of(files)
     with contents.in_use():
         dataset.store_spec(pipeline.Session(scene), (4,))
     contents.complete()
@@ -103,7 +103,7 @@ def test_kernels_are_those_of_the_plan_also_where_a_meta_kernel_names_them(tmp_p
     kernel, meta = tmp_path / "one.tpc", tmp_path / "meta.tm"
     kernel.write_text(KERNEL.format(1))
     meta.write_text(f"KPL/MK\n\\begindata\nKERNELS_TO_LOAD = ( '{kernel}' )\n\\begintext\n")
-    contents = resources.Contents()
+    contents = file_contents.Contents()
     with contents.in_use(), spice.kernels(meta):
         pass
     contents.complete()
@@ -143,7 +143,7 @@ def test_a_mesh_replaced_during_a_build_ends_it_with_nothing_wrong_written(
 
 def test_a_second_plan_in_one_process_reads_anew(files: dict[str, Path]) -> None:
     def lens_of(scene: config.Scene) -> Any:
-        with resources.Contents().in_use():
+        with file_contents.Contents().in_use():
             return pipeline.Session(scene).base_camera.lens.prescription
 
     scene = scene_of(files)

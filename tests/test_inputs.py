@@ -23,7 +23,7 @@ from vbnfault import cli
 from vbnfault.body import load_shape
 from vbnfault.body.shape import signed_volume
 from vbnfault.cli.options import finite
-from vbnfault.core import resources, spice
+from vbnfault.core import path_checks, resources, spice, user_files
 from vbnfault.core.errors import InputError, VbnfaultError, shown
 from vbnfault.detector.sensor import load_sensor
 from vbnfault.faults import from_dict, registry
@@ -107,18 +107,18 @@ def test_a_pipe_that_takes_the_place_of_a_file_does_not_block(
     path = tmp_path / "scene.toml"
     os.mkfifo(path)
     regular = os.stat(__file__)
-    monkeypatch.setattr(resources, "file_status", lambda _: regular)  # as it was a moment ago
+    monkeypatch.setattr(path_checks, "file_status", lambda _: regular)  # as it was a moment ago
     with pytest.raises(InputError, match="is not a file but a pipe"):
-        resources.read_input(path, "scene")
+        user_files.read_input(path, "scene")
 
 
 def test_a_file_that_grows_while_it_is_read_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "scene.toml"
     path.write_text(TITLE * 100)
     status = os.stat_result((*os.stat(path)[:6], 5, *os.stat(path)[7:10]))  # 5 bytes, as it says
-    monkeypatch.setattr(resources.os, "fstat", lambda _: status)
+    monkeypatch.setattr(user_files.os, "fstat", lambda _: status)
     with pytest.raises(InputError, match="at most"):
-        resources.read_input(path, "scene", limit_bytes=64)
+        user_files.read_input(path, "scene", limit_bytes=64)
 
 
 @pytest.mark.parametrize(
@@ -362,7 +362,7 @@ def test_a_vast_kernel_without_a_mark_is_not_read(tmp_path: Path, monkeypatch: p
     path = tmp_path / "vast.tls"
     path.touch()
     os.truncate(path, 1 << 32)  # a text, as its head says, of holes
-    monkeypatch.setattr(resources, "_sha256_of", lambda _: pytest.fail("4 GiB are read"))
+    monkeypatch.setattr(user_files, "_sha256_of", lambda _: pytest.fail("4 GiB are read"))
     with pytest.raises(InputError, match=r"SPICE text kernel file has 4\.1e[+]03 MiB or more"), spice.kernels(path):
         pass
 

@@ -243,10 +243,10 @@ def test_a_plug_in_through_the_store_and_back(tmp_path: Path, capsys: pytest.Cap
 def test_a_plug_in_edited_during_a_build_stops_it(tmp_path: Path) -> None:
     plugin(tmp_path)
     scene = small(scene_file(tmp_path, "my_glint.py"), plan=EVERY)
-    from vbnfault.core import resources
+    from vbnfault.core import file_contents
     from vbnfault.core.errors import InputChanged
 
-    contents = resources.Contents()
+    contents = file_contents.Contents()
     with contents.in_use():
         pipeline.Session(scene)
     contents.complete()

@@ -12,7 +12,7 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from ..core import meshes, resources
+from ..core import meshes, user_files
 from ..core.errors import InputError
 from . import formats
 
@@ -63,7 +63,7 @@ def load_shape(path: str | Path, unit: Unit = "auto") -> tuple[Float64, Int32]:
     path = Path(path)
     if unit not in ("auto", "m", "km"):
         raise InputError(f"{path}: unit must be one of auto, m, km; got {unit!r}.")
-    data = resources.read_input(path, "shape", types=FILE_TYPES)
+    data = user_files.read_input(path, "shape", types=FILE_TYPES)
     suffix = path.suffix.lower()
     native: Unit | None = None
     if suffix in formats.SUFFIXES:

@@ -149,9 +149,9 @@ def overrides(settings: list[str] | None) -> dict[str, Any]:
 def load_plugins(names: list[str] | None) -> None:
     """Load the plug-ins of `--plugin`; their paths start from the working folder. Raises InputError."""
     from .. import faults
-    from ..core import resources
+    from ..core import path_checks
 
-    faults.load_plugins([resources.absolute(n, "--plugin") if n.endswith(".py") else n for n in names or ()])
+    faults.load_plugins([path_checks.absolute(n, "--plugin") if n.endswith(".py") else n for n in names or ()])
 
 
 @contextlib.contextmanager

@@ -32,7 +32,7 @@ def list_(
     plugins: PluginOption = None,
 ) -> None:
     """List packaged scenes, lenses or detectors, glasses, or faults, effects and reflectances with their keys."""
-    from ..core import resources
+    from ..core import resources, toml_files
 
     registered = {
         "faults": _list_faults,
@@ -52,7 +52,7 @@ def list_(
         typer.echo(f"no packaged {kind}")
     width = max((len(name) for name in paths), default=0)
     for name, path in paths.items():
-        table = resources.read_toml(path)
+        table = toml_files.read_toml(path)
         typer.echo(f"{name:<{width}}  {table.get('description') or table.get('name', '')}")
 
 

@@ -21,7 +21,7 @@ from urllib.parse import unquote
 import numpy as np
 from numpy.typing import NDArray
 
-from . import resources
+from . import path_checks, user_files
 from .errors import InputError, shown
 
 F64 = NDArray[np.float64]
@@ -481,8 +481,8 @@ class _Gltf:
             name = Path(unquote(uri))
             if self.folder is None or name.is_absolute() or ".." in name.parts:
                 raise self.error(key, uri, "a file in the folder of the .gltf")
-            resources.check_path(str(name), f"{self.source}: {key}")
-            data = resources.read_input(self.folder / name, "spacecraft")
+            path_checks.check_path(str(name), f"{self.source}: {key}")
+            data = user_files.read_input(self.folder / name, "spacecraft")
         self.buffers[index] = data
         return data
 

@@ -37,7 +37,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from . import resources
+from . import environment, path_checks, user_files
 from .errors import InputError
 from .frames import J2000_JD
 
@@ -135,7 +135,7 @@ def read_dsk(path: str | Path) -> tuple[F64, NDArray[np.int64]]:
     Parameters
     ----------
     path
-        Path of the file, which `resources.read_input` has already checked.
+        Path of the file, which `user_files.read_input` has already checked.
 
     Returns
     -------
@@ -149,7 +149,7 @@ def read_dsk(path: str | Path) -> tuple[F64, NDArray[np.int64]]:
         segments belong to several surfaces.
     """
     _check_installed(str(path))
-    size = resources.file_status(path)
+    size = path_checks.file_status(path)
     more_s = 0.0 if size is None else size.st_size / _DSK_BYTES_PER_S
     reader = _Reader()  # a process for this file only, since SPICE keeps records of a refused file
     try:
@@ -286,11 +286,11 @@ def _check_kernel(path: Path, depth: int = 0) -> None:
 
     If the kernel is a meta-kernel, the kernels that it names are checked too.
     """
-    resources.check_path(str(path), "SPICE kernel")
-    if resources.head_of_input(path, "SPICE kernel", 8).startswith(_BINARY):
-        resources.check_input(path, "SPICE kernel")
+    path_checks.check_path(str(path), "SPICE kernel")
+    if user_files.head_of_input(path, "SPICE kernel", 8).startswith(_BINARY):
+        user_files.check_input(path, "SPICE kernel")
         return
-    text = resources.read_input(path, "SPICE text kernel")
+    text = user_files.read_input(path, "SPICE text kernel")
     values: dict[bytes, list[str]] = {}
     for data in _DATA.findall(text):
         for name, value in _ASSIGNED.findall(data):
@@ -304,7 +304,7 @@ def _check_kernel(path: Path, depth: int = 0) -> None:
             continue
         for symbol in sorted(symbols, key=len, reverse=True):
             named = named.replace(f"${symbol}", symbols[symbol])
-        status = resources.file_status(named)
+        status = path_checks.file_status(named)
         if status is not None:  # if the file is missing, SPICE's message is better
             if depth == _DEEPEST_META_KERNEL:
                 raise InputError(f"{path}: names meta-kernels more than {_DEEPEST_META_KERNEL} deep.")
@@ -327,7 +327,7 @@ class _Reader:
 
     def __init__(self) -> None:
         self.owner = os.getpid()
-        paths = resources.import_path()
+        paths = environment.import_path()
         self.process = subprocess.Popen(
             [
                 sys.executable,

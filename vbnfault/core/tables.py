@@ -18,7 +18,7 @@ from typing import Annotated, Any, TypeVar, dataclass_transform
 import pydantic.dataclasses
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
-from . import resources
+from . import path_checks, toml_files
 from .errors import InputError, shown
 
 T = TypeVar("T")
@@ -109,7 +109,7 @@ def parse(kind: type[T], plain: Mapping[str, Any], *, source: str, overrides: Se
     InputError
         The data are wrong. One sentence names the source, the key, the value and what is allowed.
     """
-    resources.check_plain(plain, source)
+    toml_files.check_plain(plain, source)
     model: Any = kind
     errors: list[Any] = [{"type": "missing", "loc": loc} for loc in _missing(plain, _schema(model), _schema(model))]
     try:
@@ -267,7 +267,7 @@ def _wrong(
 
 def _dotted(keys: Sequence[int | str], where: str = "") -> str:
     """Return keys behind `where` as one dotted key for an error message; the index of a list is in brackets."""
-    parts = [f"[{key}]" if isinstance(key, int) else f".{resources.shown_path(key)}" for key in keys]
+    parts = [f"[{key}]" if isinstance(key, int) else f".{path_checks.shown_path(key)}" for key in keys]
     return f"{where}{''.join(parts)}".removeprefix(".")
 
 

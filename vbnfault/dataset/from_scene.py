@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from .. import pipeline, store
-from ..core import llvm, resources
+from ..core import environment, file_contents, llvm
 from ..core.errors import InputError, shown
 from ..core.quantities import Sample
 from ..scene import config, plan
@@ -33,10 +33,10 @@ class SessionFactory:
     scene: Scene
     blocks: tuple[int, ...]
     threads: int | None = None
-    contents: resources.Contents = dataclasses.field(default_factory=resources.Contents)
+    contents: file_contents.Contents = dataclasses.field(default_factory=file_contents.Contents)
 
     def __call__(self) -> build.SampleMaker:
-        threads = self.threads or resources.environment_whole("VBNFAULT_THREADS", resources.MOST_THREADS) or None
+        threads = self.threads or environment.whole_number("VBNFAULT_THREADS", environment.MOST_THREADS) or None
         with self.contents.in_use():
             return _Session(pipeline.Session(self.scene, blocks=self.blocks, threads=threads), self.contents)
 
@@ -46,7 +46,7 @@ class _Session:
     """Make samples as a session does, but fail if an input file changed after the build was planned."""
 
     session: pipeline.Session
-    contents: resources.Contents
+    contents: file_contents.Contents
 
     def simulate(self, index: int) -> Sample:
         """Return a sample. Raises InputChanged if an input file has changed."""
@@ -132,7 +132,7 @@ def build_scene(
     if samples is not None:
         scene = _with_samples(scene, samples)
     blocks = build.planned_blocks(out, scene.dataset.samples, append=append or 0, overwrite=options.overwrite)
-    contents = resources.Contents()
+    contents = file_contents.Contents()
     with contents.in_use():
         session = pipeline.Session(scene, blocks=blocks, source=source)
         session.warn_of_assumptions()

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from .. import __version__, pipeline, reflectance, store
-from ..core import llvm, resources
+from ..core import file_contents, llvm, resources, user_files
 from ..core.errors import InputError, VbnfaultError
 from ..detector import Detector
 from ..faults import Fault, belongs_here, is_packaged, plugins_of, registry
@@ -68,8 +68,8 @@ def scene_identity(session: pipeline.Session) -> dict[str, Any]:
     _contents_of_files(scene, session.scene)
     for folder in {fault.packaged_images for fault in session.faults.values()} - {""}:
         images = sorted(resources.data_dir(folder).glob("*.png"))
-        data = b"".join(resources.read_input(path, "texture") for path in images)
-        scene[f"{folder}_sha256"] = resources.sha256(data)
+        data = b"".join(user_files.read_input(path, "texture") for path in images)
+        scene[f"{folder}_sha256"] = user_files.sha256(data)
     del scene["plugins"]
     plugins = plugins_of(session.faults, session.scene.plugins)
     if plugins:
@@ -100,12 +100,12 @@ def _contents_of_fault(table: dict[str, Any], fault: Fault, scene: Scene) -> Non
 
 def _digest(path: str | Path, what: str) -> str:
     """Return `sha256:` followed by the digest of a file's contents; the digest does not depend on its name."""
-    return f"sha256:{resources.sha256(resources.read_input(path, what))}"
+    return f"sha256:{user_files.sha256(user_files.read_input(path, what))}"
 
 
 def _lens_digest(name: str) -> str:
     """Return `sha256:` and the digests of a lens file and of the glass catalogues it refers to, joined by +."""
-    with resources.noting() as digests:
+    with file_contents.noting() as digests:
         load_lens(name)
     return f"sha256:{'+'.join(digests)}"
 
@@ -122,7 +122,9 @@ def _contents_of_files(identity: dict[str, Any], scene: Scene) -> None:
             resources.find("scenes/detectors", scene.camera.detector), "detector"
         )
     if scene.spacecraft.model not in ("none", "default"):
-        with resources.noting() as digests:  # a glTF file may refer to other files, whose digests are needed too
+        with (
+            file_contents.noting() as digests
+        ):  # a glTF file may refer to other files, whose digests are needed too
             assemble.spacecraft(scene)
         identity["spacecraft"]["model"] = f"sha256:{'+'.join(digests)}"
     if scene.spice.kernels:

@@ -38,8 +38,8 @@ from typing import Any
 
 from .. import store as store_module
 from ..core import interrupts, streams
+from ..core.environment import import_path
 from ..core.errors import VbnfaultError
-from ..core.resources import import_path
 from .tasks import Fatal, Lazy, Run, SessionFactory, Task, work
 
 _SECONDS_TO_STOP = 60.0  # for a worker to write its finished samples; a second Ctrl-C ends the wait

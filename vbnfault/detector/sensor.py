@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field
 
-from ..core import resources, spectra, tables
+from ..core import resources, spectra, tables, toml_files
 from ..core.architecture import Architecture
 from ..core.errors import InputError, shown
 from ..core.tables import Fraction, table_class
@@ -180,7 +180,7 @@ def load_sensor(name_or_path: str | Path) -> Sensor:
     Raises InputError that names the file, the key, the value and the allowed range.
     """
     path = resources.find("scenes/detectors", name_or_path)
-    return parse_sensor(resources.read_toml(path, "detector"), source=str(path))
+    return parse_sensor(toml_files.read_toml(path, "detector"), source=str(path))
 
 
 def parse_sensor(table: Mapping[str, Any], *, source: str) -> Sensor:

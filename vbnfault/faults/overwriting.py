@@ -26,7 +26,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core import resources
+from ..core import user_files
 from ..core.errors import InputError, shown
 from ..core.images import decoded_image
 from ..core.quantities import CHANNELS, LUMINANCE
@@ -71,7 +71,7 @@ class TextureOverwriting(Fault):
     def draw(self, context: FaultContext, rng: np.random.Generator) -> Params:
         """Return the settings and the SHA-256 of the texture file. Nothing is random."""
         return {
-            "sha256": resources.sha256(resources.read_input(self.texture_file, "texture")),
+            "sha256": user_files.sha256(user_files.read_input(self.texture_file, "texture")),
             "channels": self.channels,
             "blend": self.blend,
             "strength": float(self.strength),
@@ -156,10 +156,10 @@ def load(path: str, sha256: str | None = None) -> tuple[NDArray[np.float32], NDA
     """
     where = f"faults.pixel_overwriting.texture_file = {shown(path)}"
     try:
-        data = resources.read_input(path, "texture")
+        data = user_files.read_input(path, "texture")
     except InputError as error:
         raise InputError(f"{where}: {str(error).removeprefix(f'{path}: ')}") from None
-    if sha256 and resources.sha256(data) != sha256:
+    if sha256 and user_files.sha256(data) != sha256:
         raise InputError(f"{where}: its content has changed since the parameters were drawn")
     width_px, height_px = _size_px(data)
     if width_px * height_px > LARGEST_TEXTURE_PIXELS:  # check before decoding: a small file can hold a huge image

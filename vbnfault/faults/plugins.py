@@ -27,7 +27,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING
 
-from ..core import registry, resources
+from ..core import environment, registry, user_files
 from ..core.errors import InputError, VbnfaultError, shown
 from ..core.interrupts import check
 from ..detector import effects
@@ -141,7 +141,7 @@ def plugins_of(faults: Mapping[str, Fault], named: Sequence[str]) -> tuple[Plugi
                 "workers of the cluster"
             )
         if plugin.is_file:
-            resources.read_input(key, "plug-in")  # notices a change during a build
+            user_files.read_input(key, "plug-in")  # notices a change during a build
     return tuple(sorted(wanted.values(), key=lambda plugin: plugin.name))
 
 
@@ -193,14 +193,14 @@ def _is_path(name: str) -> bool:
 
 def _load_file(path: str) -> Plugin:
     """Return the plug-in of a file, executed again if its contents have changed."""
-    data = resources.read_input(path, "plug-in", types=(".py",))
-    digest, known = resources.sha256(data), _loaded.get(path)
+    data = user_files.read_input(path, "plug-in", types=(".py",))
+    digest, known = user_files.sha256(data), _loaded.get(path)
     if known is not None and known.sha256 == digest:
         return _registered(known)
     if known is not None:
         registry.forget(known.module)
     stem = re.sub(r"\W", "_", Path(path).stem)
-    name = f"{_FILE_MODULE}{stem}_{resources.sha256(path.encode() + data)[:16]}"
+    name = f"{_FILE_MODULE}{stem}_{user_files.sha256(path.encode() + data)[:16]}"
     module = ModuleType(name)
     module.__file__ = path
     sys.modules[name] = module  # a dataclass looks its module up
@@ -219,7 +219,7 @@ def _load_module(name: str) -> Plugin:
     if name in _loaded:
         return _registered(_loaded[name])
     before, path = set(sys.modules), sys.path.copy()
-    sys.path[:] = resources.import_path()  # as in a worker process
+    sys.path[:] = environment.import_path()  # as in a worker process
     try:
         importlib.import_module(name)
     except ModuleNotFoundError as error:
@@ -260,15 +260,15 @@ def _digest_of_module(name: str) -> str:
     if not hasattr(top, "__path__"):
         if top.__file__ is None:
             raise InputError("has no source file")
-        return resources.sha256(resources.read_input(top.__file__, "plug-in"))
+        return user_files.sha256(user_files.read_input(top.__file__, "plug-in"))
     digests = []
     for folder in top.__path__:
         files = [path for path in Path(folder).rglob("*") if path.name.endswith(_SUFFIXES) and path.is_file()]
         for path in sorted(files, key=lambda path: path.relative_to(folder).as_posix()):
             if path.stat().st_size:  # an empty __init__.py is usual
-                digest = resources.sha256(resources.read_input(path, "plug-in"))
+                digest = user_files.sha256(user_files.read_input(path, "plug-in"))
                 digests.append(f"{path.relative_to(folder).as_posix()} {digest}")
-    return resources.sha256("\n".join(digests).encode())
+    return user_files.sha256("\n".join(digests).encode())
 
 
 # --- errors -------------------------------------------------------------------------------------------------

@@ -38,9 +38,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.errors import VbnfaultError
+from ..core.file_contents import cached_with_contents
 from ..core.images import decoded_image
 from ..core.quantities import LUMINANCE
-from ..core.resources import cached_with_contents, data_dir, read_input
+from ..core.resources import data_dir
+from ..core.user_files import read_input
 from .context import FaultContext, Params
 from .contract import Fault
 from .fields import Interval, bounds, number, rows

@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import fft
 from scipy.interpolate import PchipInterpolator
 
-from ..core import resources
+from ..core import file_contents
 from .aperture import stopped_down
 from .gaussian import scaled_to_focal_length
 from .glass import D_NM
@@ -98,7 +98,7 @@ class ImageFrame:
         return beams(lens.prescription, _MARGIN * float(slope[0, 0]), lens.sensor_mm)
 
 
-@resources.cached_with_contents(maxsize=8)
+@file_contents.cached_with_contents(maxsize=8)
 def _scaled(name: str, focal_length_mm: float, f_number: float, frame: ImageFrame) -> RealLens:
     """Return a packaged lens or a lens file fitted to a frame."""
     lens = scaled_to_focal_length(load_lens(name), focal_length_mm)

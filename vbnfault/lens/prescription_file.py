@@ -14,7 +14,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Discriminator, Field, Tag, model_validator
 
-from ..core import resources, tables
+from ..core import resources, tables, toml_files
 from ..core.errors import InputError
 from ..core.tables import Fraction, Table
 from .coating import Layer
@@ -179,7 +179,7 @@ def load_lens(name_or_path: str | Path) -> Prescription:
     if path.suffix.lower() == LENS_SUFFIX:
         table, catalogues = read_lens(path)
         return _prescription(tables.parse(PrescriptionFile, table, source=str(path)), str(path), catalogues)
-    return parse_lens(resources.read_toml(path, "lens"), source=str(path))
+    return parse_lens(toml_files.read_toml(path, "lens"), source=str(path))
 
 
 def parse_lens(table: Mapping[str, Any], *, source: str) -> Prescription:
@@ -370,4 +370,4 @@ def _keys_of(glass: Glass) -> dict[str, Any]:
 
 def write_lens(lens: Prescription, path: Path) -> None:
     """Write a prescription, as it is now scaled, as a TOML file that `load_lens` reads; see `to_table`."""
-    path.write_text(resources.toml_text(to_table(lens)), encoding="utf-8")
+    path.write_text(toml_files.toml_text(to_table(lens)), encoding="utf-8")

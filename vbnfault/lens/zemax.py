@@ -46,7 +46,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from ..core import resources
+from ..core import user_files
 from ..core.errors import InputError, shown
 from .glass import CLEAR, GLASSES, Glass, Transmittance
 
@@ -86,7 +86,7 @@ _FORMULAS = {
 
 def _lines(path: Path, what: str, suffix: str) -> list[list[str]]:
     """Return the words of each line of a file in UTF-16, UTF-8 or Latin-1. Raises InputError."""
-    data = resources.read_input(path, what, types=(suffix,))
+    data = user_files.read_input(path, what, types=(suffix,))
     if data.startswith((b"\xff\xfe", b"\xfe\xff")):
         text = data.decode("utf-16", errors="replace")
     else:

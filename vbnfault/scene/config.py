@@ -14,7 +14,7 @@ from typing import Annotated, Any
 
 from pydantic import Field, model_validator
 
-from ..core import resources, tables
+from ..core import path_checks, resources, tables, toml_files
 from ..core.errors import InputError
 from ..core.tables import Table
 from ..reflectance import is_packaged
@@ -116,7 +116,7 @@ def load_scene(name_or_path: str | Path, overrides: Mapping[str, Any] | None = N
     `overrides` starts from the working folder.
     """
     path = resources.find("scenes", name_or_path)
-    table = resources.read_toml(path)
+    table = toml_files.read_toml(path)
     tables.replace(table, overrides or {}, source=str(path))
     try:
         _anchor_paths(table, path.parent, overrides or ())
@@ -141,10 +141,10 @@ def _anchor_paths(table: dict[str, Any], folder: Path, overrides: Collection[str
     """
 
     def anchored(path: str, where: str) -> str:
-        resources.check_path(path, where)
+        path_checks.check_path(path, where)
         beside = folder / path
-        from_here = where in overrides or resources.file_status(beside) is None
-        return resources.absolute(path if from_here else beside, where)
+        from_here = where in overrides or path_checks.file_status(beside) is None
+        return path_checks.absolute(path if from_here else beside, where)
 
     def anchor(node: Any, where: str, built_in: tuple[str, ...] = ()) -> None:
         key = where.rsplit(".", 1)[-1]

@@ -16,7 +16,7 @@ import numpy as np
 from numcodecs import Zstd
 from numpy.typing import NDArray
 
-from ..core import resources
+from ..core import environment
 from ..core.quantities import Sample
 from .schema import SCALARS, StoreSpec
 
@@ -27,7 +27,7 @@ _ABSENT = 2**64 - 1  # marks a missing chunk in a shard's index (Zarr v3 specifi
 
 def threads() -> int:
     """Return how many threads compress or check the layers of a sample, 1 to 4."""
-    given = resources.environment_whole("VBNFAULT_THREADS", resources.MOST_THREADS)
+    given = environment.whole_number("VBNFAULT_THREADS", environment.MOST_THREADS)
     return max(1, min(4, given or os.cpu_count() or 1))
 
 

@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal, Protocol
 
 from pydantic import ConfigDict, Field, model_validator
 
-from ..core import resources, tables
+from ..core import path_checks, resources, tables, toml_files
 from ..core.errors import shown
 from ..core.tables import Table
 from .distributions import Factor
@@ -257,7 +257,7 @@ def load_study(name_or_path: str | Path, overrides: Mapping[str, Any] | None = N
     that lies beside it starts from its folder, every other one from the working folder.
     """
     path = resources.find("scenes/studies", name_or_path)
-    table = resources.read_toml(path, "study")
+    table = toml_files.read_toml(path, "study")
     scene = table.get("scene")
     if isinstance(scene, dict):
         _anchor(scene, path.parent)
@@ -275,5 +275,5 @@ def _anchor(table: dict[str, Any], folder: Path) -> None:
     for key, value in table.items():
         if isinstance(value, dict):
             _anchor(value, folder)
-        elif isinstance(value, str) and Path(value).suffix and resources.file_status(folder / value):
-            table[key] = resources.absolute(folder / value, f"scene.{key}")
+        elif isinstance(value, str) and Path(value).suffix and path_checks.file_status(folder / value):
+            table[key] = path_checks.absolute(folder / value, f"scene.{key}")

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from .. import camera as cameras
 from ..body import Body, Site, Sites, load_body, site_at
 from ..camera import Camera
-from ..core import frames, resources, spectra, spice
+from ..core import file_contents, frames, spectra, spice
 from ..core.errors import InputError
 from ..core.quantities import Radiance
 from ..detector import Detector, MosaicDetector, Sensor, ThreeColourDetector, load_sensor
@@ -45,7 +45,7 @@ _STAR_SIGMA_PX = 0.6
 # --- Sun and ephemeris --------------------------------------------------------------------------------------
 
 
-@resources.cached_with_contents(maxsize=8)
+@file_contents.cached_with_contents(maxsize=8)
 def _ephemeris(
     sun: SunTable, body: BodyTable, orbit: OrbitTable | None, kernels: SpiceTable
 ) -> tuple[tuple[float, ...], tuple[float, ...]]:
@@ -89,7 +89,7 @@ def epoch_jd(scene: Scene, site: int, share: float) -> float:
     return start if end is None else start + (end - start) * (site + share) / scene.dataset.sites
 
 
-@resources.cached_with_contents(maxsize=256)
+@file_contents.cached_with_contents(maxsize=256)
 def _spacecraft_pose(table: SpiceTable, julian_date: float) -> spice.SpacecraftState:
     """Return `spacecraft_pose` from the cache, or compute it."""
     axes = None if table.camera_axes is None else np.array(table.camera_axes).reshape(3, 3)
@@ -320,7 +320,7 @@ def _three_colours(c: CameraTable) -> ThreeColourDetector:
     )
 
 
-@resources.cached_with_contents(maxsize=4)
+@file_contents.cached_with_contents(maxsize=4)
 def mosaic_sensor(c: CameraTable) -> Sensor:
     """Return the sensor that a camera names, at the camera's temperature. Raises InputError."""
     try:
@@ -372,7 +372,7 @@ def _thin_lens(c: CameraTable, pixel_pitch_um: float) -> ThinLens:
     )
 
 
-@resources.cached_with_contents(maxsize=4)
+@file_contents.cached_with_contents(maxsize=4)
 def real_lens(c: CameraTable, pixel_pitch_um: float) -> RealLens:
     """Return the prescription that a camera names, scaled to its field of view and stopped down to its f-number.
 

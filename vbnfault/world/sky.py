@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array, csr_array
 from scipy.special import ndtr
 
-from ..core import resources, spectra
+from ..core import file_contents, resources, spectra, user_files
 from ..core.frames import J2000_JD
 from ..core.quantities import Radiance
 
@@ -99,14 +99,14 @@ class StarCatalogue:
         return np.asarray(moved / np.linalg.norm(moved, axis=1, keepdims=True))
 
 
-@resources.cached_with_contents(maxsize=1)
+@file_contents.cached_with_contents(maxsize=1)
 def load_catalogue() -> StarCatalogue:
     """Return the packaged catalogue: every star of Hipparcos (ESA 1997) with V ≤ 7.0, about 15 thousand.
 
     The steps of the table are 1 mas, 1 mas/year, 0.01 mag in V and 0.001 mag in B−V. Raises InputError if the
     installation lacks the file.
     """
-    data = resources.read_input(resources.data_dir("catalogues") / "stars.npz", "star catalogue")
+    data = user_files.read_input(resources.data_dir("catalogues") / "stars.npz", "star catalogue")
     with np.load(io.BytesIO(data)) as table:
         columns = {name: table[name].astype(np.float64) for name in table.files}
     return StarCatalogue(

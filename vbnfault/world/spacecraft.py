@@ -18,7 +18,7 @@ import trimesh
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from ..core import meshes, resources
+from ..core import meshes, user_files
 from ..core.errors import InputError
 from ..core.frames import rx, ry, rz
 from ..core.meshes import MeshPart
@@ -378,7 +378,7 @@ def load_spacecraft(
 
 def _read(path: Path) -> list[MeshPart]:
     """Read the parts of a file. Raises InputError for missing faces or coordinates out of range."""
-    data = resources.read_input(path, "spacecraft", types=FILE_TYPES)
+    data = user_files.read_input(path, "spacecraft", types=FILE_TYPES)
     if path.suffix.lower() == ".obj":
         pieces = meshes.read_obj(data, str(path), name=path.stem)
     else:
