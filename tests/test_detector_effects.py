@@ -17,7 +17,7 @@ from pydantic import Field
 from vbnfault.core import tables
 from vbnfault.core.errors import InputError, VbnfaultError
 from vbnfault.core.quantities import Electrons
-from vbnfault.core.registry import chained
+from vbnfault.core.registry import chained, forget
 from vbnfault.detector import MosaicDetector, Sensor
 from vbnfault.detector.chain import Device, MosaicNoise
 from vbnfault.detector.effects import STEPS, Effect, Exposure, contract, order, registry
@@ -82,9 +82,7 @@ class LostBit(Effect):
 def only_here() -> Iterator[None]:
     """Forget the effects of this file, so that other tests see those of the package."""
     yield
-    for name in ("afterimage", "nothing", "sense_node", "lost_bit"):
-        contract._REGISTRY._classes.pop(name)
-    tables.forget_schemas()
+    forget(__name__)
 
 
 def noise(seed: int, shape: tuple[int, int] = SHAPE) -> MosaicNoise:

@@ -195,14 +195,14 @@ class SizeLaw:
         truncated = 1.0 - (smallest_m / LARGEST_M) ** self.index
         return np.asarray(smallest_m * (1.0 - u * truncated) ** (-1.0 / self.index))
 
-    def paved_m(self, share: Float64) -> Float64:
+    def paved_m(self, density: Float64) -> Float64:
         """Return the diameter above which boulders cover the fraction `_MOST_COVER` of the ground.
 
-        `share` is the density of boulders on this ground, relative to the law's.
+        `density` is the density of boulders on this ground, relative to the law's.
         """
         index = max(self.index, 2.05)
         unit = np.pi / 4 * index / (index - 2) * self.per_m2 * REFERENCE_M**index
-        return np.asarray((np.maximum(share, 0.0) * unit / _MOST_COVER) ** (1.0 / (index - 2)))
+        return np.asarray((np.maximum(density, 0.0) * unit / _MOST_COVER) ** (1.0 / (index - 2)))
 
 
 def scatter(
@@ -233,12 +233,12 @@ def scatter(
     """
     area = face_normals_areas(points, faces)[1]
     # Normalising by area keeps the mean density at its published value, whatever the clusters and empty slopes.
-    share = favour / max(float(np.sum(favour * area) / np.sum(area)), 1e-12)
-    least = np.maximum(smallest_m, law.paved_m(share))
-    expected = share * area * law.above(least)
+    density = favour / max(float(np.sum(favour * area) / np.sum(area)), 1e-12)
+    least = np.maximum(smallest_m, law.paved_m(density))
+    expected = density * area * law.above(least)
     if expected.sum() > _MOST_DRAWN:
         least = least * (expected.sum() / _MOST_DRAWN) ** (1.0 / law.index)
-        expected = share * area * law.above(least)
+        expected = density * area * law.above(least)
     cumulative = np.cumsum(expected)
     total = int(rng.poisson(float(cumulative[-1])))
     face = np.searchsorted(cumulative, rng.random(total) * cumulative[-1], side="right")

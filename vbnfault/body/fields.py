@@ -183,7 +183,7 @@ def _blocks(d: Any, q: list[Any], word: Any) -> tuple[Any, ...]:
     return level, other, gap
 
 
-def _craters(d: Any, q: list[Any], word: Any, share: Any) -> tuple[Any, ...]:
+def _craters(d: Any, q: list[Any], word: Any, fraction: Any) -> tuple[Any, ...]:
     """Return the sum of the craters' heights at positions in cells."""
     words, f = _split(d, [x - 0.5 for x in q])
     total = d.Float(0)
@@ -195,7 +195,7 @@ def _craters(d: Any, q: list[Any], word: Any, share: Any) -> tuple[Any, ...]:
         # The radius inverts N(>= D) ~ D^-2. The outer slope of the rim ends at 1.5 radii, within the eight cells.
         radius = (1.0 / 6) / d.dr.sqrt(1 - 0.75 * _unit(d, g, 0))
         x = distance / radius
-        present = (_unit(d, g, 10) < share) & (x < 1.5)
+        present = (_unit(d, g, 10) < fraction) & (x < 1.5)
         freshness = 0.35 + 0.65 * _unit(d, g, 20)
         bowl = d.dr.minimum(x * x, 1) - 1  # -1 in the middle
         bowl = d.dr.maximum(bowl, -(0.45 + 0.5 * freshness))  # dust on the floor
@@ -206,7 +206,7 @@ def _craters(d: Any, q: list[Any], word: Any, share: Any) -> tuple[Any, ...]:
     return (total,)
 
 
-def _clods(d: Any, q: list[Any], word: Any, share: Any) -> tuple[Any, ...]:
+def _clods(d: Any, q: list[Any], word: Any, fraction: Any) -> tuple[Any, ...]:
     """Return the height of the highest stone at positions in cells."""
     words, f = _split(d, [x - 0.5 for x in q])
     highest = d.Float(0)
@@ -219,5 +219,5 @@ def _clods(d: Any, q: list[Any], word: Any, share: Any) -> tuple[Any, ...]:
         # 1 - (distance / radius)^4 has a flatter top and steeper sides than a sphere.
         x = square / (radius * radius)
         dome = radius * (0.35 + 0.5 * _unit(d, g, 10)) * (1 - x * x)
-        highest = d.dr.maximum(highest, d.dr.select(_unit(d, g, 20) < share, dome, 0))
+        highest = d.dr.maximum(highest, d.dr.select(_unit(d, g, 20) < fraction, dome, 0))
     return (highest,)

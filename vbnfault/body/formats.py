@@ -489,10 +489,10 @@ def _rows(rows: list[bytes], form: str, source: str, line: Lines) -> Float64:
         return np.ascontiguousarray(values)
     _numbers(b"\n".join(rows), source, lambda at: line(at - 1))
     for row, text in enumerate(rows):
-        found = len(_clean(text).split())
-        if found < 3 or found != width:
+        numbers = len(_clean(text).split())
+        if numbers < 3 or numbers != width:
             raise InputError(
-                f"{source}: line {line(row)}: expected {form!r} with {max(width, 3)} numbers, found {found}."
+                f"{source}: line {line(row)}: expected {form!r} with {max(width, 3)} numbers, found {numbers}."
             )
     raise InputError(f"{source}: line {line(0)}: expected {form!r}, found {_shown(rows[0])}.")
 

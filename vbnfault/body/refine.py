@@ -102,8 +102,8 @@ def split(
     how_many = marked.sum(axis=1)
     out = [faces[how_many == 0]]
 
-    one = how_many == 1
-    f, m = _turn(faces[one], middle[one], np.argmax(marked[one], axis=1))
+    marked_once = how_many == 1
+    f, m = _turn(faces[marked_once], middle[marked_once], np.argmax(marked[marked_once], axis=1))
     out += [np.column_stack([f[:, 0], f[:, 1], m[:, 0]]), np.column_stack([f[:, 0], m[:, 0], f[:, 2]])]
 
     two = how_many == 2

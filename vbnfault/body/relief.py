@@ -257,17 +257,17 @@ class _Octaves:
     def craters(self, per_km2: float) -> Float32:
         """Return the height of craters on cells of all widths, metres."""
         total = np.zeros(len(self.facet_m), dtype=np.float32)
-        share = min(1.0, _CRATER_SHARE_PER_DENSITY * per_km2)
+        fraction = min(1.0, _CRATER_SHARE_PER_DENSITY * per_km2)
         for k, width in enumerate(_CRATER_WIDTHS_M):
             shows = width / 4  # as a wavelength; the smallest bowls are a third of the cell wide
-            part = self._points.craters(width, noise_key(self._seed, 400 + k), self._count(shows), share)
+            part = self._points.craters(width, noise_key(self._seed, 400 + k), self._count(shows), fraction)
             total += self._full(part, shows)
         return total
 
-    def clods(self, width_m: float, stream: int, share: float) -> Float32:
+    def clods(self, width_m: float, stream: int, fraction: float) -> Float32:
         """Return the height of half-buried stones on cells of that width, metres."""
         shows = 0.7 * width_m
-        part = self._points.clods(width_m, noise_key(self._seed, stream), self._count(shows), share)
+        part = self._points.clods(width_m, noise_key(self._seed, stream), self._count(shows), fraction)
         return self._full(part, shows)
 
 
@@ -281,11 +281,11 @@ def windowed_deviation(hurst: float) -> float:
     side, tiles = 36, 40
     x, y = np.meshgrid(np.arange(side) / 6.0, np.arange(side) / 6.0, indexing="ij")
     tile = np.column_stack([x.ravel(), y.ravel(), np.zeros(side * side)])
-    place = (tile[None] + 400.0 * np.arange(tiles)[:, None, None] * np.array([1.0, 0.7, 0.3])).reshape(-1, 3)
-    field, height = Points(place), np.zeros(len(place))
+    position = (tile[None] + 400.0 * np.arange(tiles)[:, None, None] * np.array([1.0, 0.7, 0.3])).reshape(-1, 3)
+    field, height = Points(position), np.zeros(len(position))
     for k in range(-4, 6):
         key = noise_key(1, 40 + k)
-        height += 2.0 ** (k * hurst) / GRADIENT_STD * field.gradient(2.0**k, key, len(place))
+        height += 2.0 ** (k * hurst) / GRADIENT_STD * field.gradient(2.0**k, key, len(position))
     total = 0.0
     up = np.tile([0.0, 0.0, 1.0], (side * side, 1))
     for part in range(tiles):
@@ -304,12 +304,12 @@ def _terraced(noise: _Octaves, swell: Float32) -> Float32:
     wander = swell + 1.6 * noise.gradient(43.0, 202) + 0.7 * noise.gradient(17.0, 203)
     wander += 0.16 * noise.gradient(6.0, 204) + 0.05 * noise.gradient(2.3, 205)
     out = swell.copy()
-    for number, (step, share) in enumerate(zip(_TERRACE_M, (0.7, 0.5), strict=True)):
+    for number, (step, height_fraction) in enumerate(zip(_TERRACE_M, (0.7, 0.5), strict=True)):
         rise = np.random.Generator(np.random.Philox(900 + number)).uniform(0.0, 1.0, 256).astype(np.float32)
         u = wander / np.float32(step)
         tread = np.floor(u)
         # Random factors weaken some of the steps.
-        kept = where * share * rise[tread.astype(np.int64) & 255]
+        kept = where * height_fraction * rise[tread.astype(np.int64) & 255]
         out += kept * (step * (tread + _smooth_step(0.30, 0.98, u - tread)) - wander)
     return out
 
@@ -396,8 +396,8 @@ def _slumped(points: Float64, faces: Int32, height_m: Float64) -> Float64:
         if not near.any():
             break
         i, j, limit = a[near], b[near], most[near]
-        ends, at = np.unique(np.concatenate([i, j]), return_inverse=True)
-        i, j, moved = at[: len(i)], at[len(i) :], height[ends]
+        ends, number = np.unique(np.concatenate([i, j]), return_inverse=True)
+        i, j, moved = number[: len(i)], number[len(i) :], height[ends]
         for _ in range(_SLUMP_STEPS):
             step = moved[i] - moved[j]
             excess = step - np.clip(step, -limit, limit)
@@ -412,9 +412,9 @@ def _slumped(points: Float64, faces: Int32, height_m: Float64) -> Float64:
 def _talus(points_L: Float64, slope: Float32) -> Float32:
     """Return the debris at the feet of cliffs, float32[n]: it lies on moderate slopes below steep ground nearby."""
     cells = int(2 * _TALUS_REACH_M / _TALUS_CELL_M)
-    place = np.floor((points_L[:, :2] + _TALUS_REACH_M) / _TALUS_CELL_M).astype(np.int64)
-    inside = ((place >= 0) & (place < cells)).all(axis=1) & (np.abs(points_L[:, 2]) < _TALUS_REACH_M)
-    cell = place[inside, 0] * cells + place[inside, 1]
+    cell_xy = np.floor((points_L[:, :2] + _TALUS_REACH_M) / _TALUS_CELL_M).astype(np.int64)
+    inside = ((cell_xy >= 0) & (cell_xy < cells)).all(axis=1) & (np.abs(points_L[:, 2]) < _TALUS_REACH_M)
+    cell = cell_xy[inside, 0] * cells + cell_xy[inside, 1]
     weight = _smooth_step(*_CLIFF_DEG, slope[inside]).astype(np.float64)
     height = -points_L[inside, 2]
 

@@ -67,7 +67,7 @@ def smear(
         A value is out of range.
     """
     _at_least_0(exposure_s=exposure_s, row_transfer_s=row_transfer_s, row_clear_s=row_clear_s)
-    _share(shutter_transmission=shutter_transmission)
+    _fraction(shutter_transmission=shutter_transmission)
     late, early = row_transfer_s * shutter_transmission, row_clear_s * shutter_transmission
     rate = _facing(rate_e_s, direction)
     if not (late or early):
@@ -104,7 +104,7 @@ def smear_interline(
     and errors are as in `smear`.
     """
     _at_least_0(exposure_s=exposure_s, row_transfer_s=row_transfer_s)
-    _share(leak=leak)
+    _fraction(leak=leak)
 
     rate = _facing(rate_e_s, direction)
     gathered = rate.sum(axis=0, dtype=np.float64) * (leak * row_transfer_s)
@@ -141,7 +141,7 @@ def bloom(signal_e: F32, *, full_well_e: float, antiblooming: float = 0.0, direc
         A value is out of range.
     """
     _above_0(full_well_e=full_well_e)
-    _share(antiblooming=antiblooming)
+    _fraction(antiblooming=antiblooming)
     _known(direction)
     if signal_e.size == 0 or signal_e.max() <= full_well_e:
         return signal_e.copy()
@@ -220,14 +220,14 @@ class ChargeCloud:
 
     def volume(self, signal_e: F32) -> F32:
         """Return the filled fraction of the well, float32 in [0, 1], in the shape of `signal_e`."""
-        share = np.ascontiguousarray(signal_e) - np.float32(self.notch_e)
-        share *= np.float32(1 / (self.full_well_e - self.notch_e))
+        fill = np.ascontiguousarray(signal_e) - np.float32(self.notch_e)
+        fill *= np.float32(1 / (self.full_well_e - self.notch_e))
         # OpenCV clips and takes powers several times faster than numpy
-        cv2.max(share, 0.0, dst=share)
-        cv2.min(share, 1.0, dst=share)
+        cv2.max(fill, 0.0, dst=fill)
+        cv2.min(fill, 1.0, dst=fill)
         if self.fill_power == 0.5:
-            return np.sqrt(share, out=share)
-        return share if self.fill_power == 1 else cv2.pow(share, self.fill_power, dst=share)
+            return np.sqrt(fill, out=fill)
+        return fill if self.fill_power == 1 else cv2.pow(fill, self.fill_power, dst=fill)
 
 
 def cti(
@@ -444,7 +444,7 @@ def parasitic_light(
     light sensitivity: that of the storage node over that of the photodiode (1/50 000 for a CMV4000, recalled from
     its data sheet). Raises InputError for it and as `row_wait_s` does.
     """
-    _share(sensitivity=sensitivity)
+    _fraction(sensitivity=sensitivity)
     wait = row_wait_s(len(signal_e), row_period_s=row_period_s, direction=direction)
     return signal_e + rate_e_s * (sensitivity * wait).astype(np.float32)[:, None]
 
@@ -485,7 +485,7 @@ def _above_0(**values: float) -> None:
             raise InputError(f"{key} = {value:g}: must be finite and above 0")
 
 
-def _share(**values: float) -> None:
+def _fraction(**values: float) -> None:
     for key, value in values.items():
         if not 0 <= value <= 1:
             raise InputError(f"{key} = {value:g}: must be from 0 to 1")

@@ -277,13 +277,13 @@ class CosmicRayModel:
         """Return the distance in µm that a track runs until it leaves the layer or the sensor, or ends."""
         sine = np.sin(theta) / self.pixel_pitch_um
         end = length_um
-        for at, rate, far in (
+        for position, rate, far in (
             (x, sine * np.cos(phi), shape[1]),
             (y, sine * np.sin(phi), shape[0]),
             (depth, np.cos(theta), self.thickness_um),
         ):
-            wall = np.where(rate > 0, far - at, -at)
-            room = np.divide(wall, rate, out=np.full(len(at), np.inf), where=rate != 0)
+            wall = np.where(rate > 0, far - position, -position)
+            room = np.divide(wall, rate, out=np.full(len(position), np.inf), where=rate != 0)
             end = np.minimum(end, np.maximum(room, 0))
         return end
 
@@ -331,10 +331,10 @@ class CosmicRayModel:
 
 def _rank(group: I64) -> I64:
     """Return the number of each entry within its group. Entries of a group are adjacent."""
-    at = np.arange(len(group))
+    index = np.arange(len(group))
     first = np.ones(len(group), dtype=bool)
     first[1:] = group[1:] != group[:-1]
-    return at - np.maximum.accumulate(np.where(first, at, 0))
+    return index - np.maximum.accumulate(np.where(first, index, 0))
 
 
 def _pieces(start: F64, step: F64, end: F64) -> tuple[I64, F64, F64]:
@@ -345,14 +345,14 @@ def _pieces(start: F64, step: F64, end: F64) -> tuple[I64, F64, F64]:
     """
     tracks = np.arange(len(end))
     groups, cuts = [tracks, tracks], [np.zeros(len(end)), end]
-    for at, rate in zip(start, step, strict=True):
-        here, there = np.floor(at).astype(np.int64), np.floor(at + rate * end).astype(np.int64)
+    for position, rate in zip(start, step, strict=True):
+        here, there = np.floor(position).astype(np.int64), np.floor(position + rate * end).astype(np.int64)
         group = np.repeat(tracks, np.abs(there - here))
         # a track towards larger coordinates meets the pixel's upper border first, else its lower border
         rank = _rank(group)
         border = here[group] + np.where(rate[group] > 0, 1 + rank, -rank)
         groups.append(group)
-        cuts.append(np.clip((border - at[group]) / rate[group], 0, end[group]))
+        cuts.append(np.clip((border - position[group]) / rate[group], 0, end[group]))
     track, cut = np.concatenate(groups), np.concatenate(cuts)
     order = np.lexsort((cut, track))
     track, cut = track[order], cut[order]
@@ -374,8 +374,8 @@ def _hash_uniform(key: NDArray[np.uint64]) -> F64:
 
 def _gather(index: I64, electrons: F64) -> tuple[I64, F32]:
     """Return the unique indices in increasing order, and the sum of the electrons of each."""
-    unique, place = np.unique(index, return_inverse=True)
-    return unique, np.bincount(place, electrons, minlength=len(unique)).astype(np.float32)
+    unique, number = np.unique(index, return_inverse=True)
+    return unique, np.bincount(number, electrons, minlength=len(unique)).astype(np.float32)
 
 
 def _spread(x: F64, y: F64, sigma_px: F64, electrons: F64, shape: tuple[int, int]) -> tuple[I64, F32]:
@@ -386,11 +386,11 @@ def _spread(x: F64, y: F64, sigma_px: F64, electrons: F64, shape: tuple[int, int
     reach = math.ceil(_SIGMAS * float(sigma_px.max(initial=0.0)))
     offset = np.arange(-reach, reach + 2)
     parts = []
-    for at in (x, y):
-        border = np.floor(at)[:, None] + offset - at[:, None]
-        share = np.diff(ndtr(border / np.maximum(sigma_px, 1e-6)[:, None]), axis=1)
-        parts.append(share / share.sum(axis=1, keepdims=True))
-    pixels = [np.floor(at).astype(np.int64)[:, None] + offset[:-1] for at in (x, y)]
+    for position in (x, y):
+        border = np.floor(position)[:, None] + offset - position[:, None]
+        fraction = np.diff(ndtr(border / np.maximum(sigma_px, 1e-6)[:, None]), axis=1)
+        parts.append(fraction / fraction.sum(axis=1, keepdims=True))
+    pixels = [np.floor(position).astype(np.int64)[:, None] + offset[:-1] for position in (x, y)]
     charge = electrons[:, None, None] * parts[1][:, :, None] * parts[0][:, None, :]
     column, row = pixels[0][:, None, :], pixels[1][:, :, None]
     inside = (column >= 0) & (column < shape[1]) & (row >= 0) & (row < shape[0])

@@ -377,11 +377,11 @@ class Telegraph:
             passed = np.count_nonzero(switch < exposure_s, axis=1)
             end[left[done]] = state[left[done]] ^ (passed[done] % 2 == 1)
             left, now = left[~done], switch[~done, -1]
-        share = np.minimum(high_total / exposure_s, 1.0)
+        fraction = np.minimum(high_total / exposure_s, 1.0)
         if quick.any():
             # variance of the mean over the exposure, for a correlation exp(-t/τ)
             duty, memory = self.duty[quick], self.correlation_s[quick] / exposure_s
             spread = np.sqrt(2 * memory * duty * (1 - duty))
-            share[quick] = np.clip(duty + spread * rng.standard_normal(len(duty)), 0, 1)
+            fraction[quick] = np.clip(duty + spread * rng.standard_normal(len(duty)), 0, 1)
             end[quick] = rng.random(len(duty)) < duty
-        return share, end
+        return fraction, end

@@ -355,12 +355,12 @@ def _in_blocks(step: Callable[[F32, Pattern], Sequence[F32]], raw: F32, pattern:
     padded = cv2.copyMakeBorder(raw, halo, halo, halo, halo, _MIRROR)
     out = np.empty((*raw.shape, 3), dtype=np.float32)
 
-    def one(start: int) -> None:
+    def fill_block(start: int) -> None:
         block = out[start : start + _ROWS_PER_BLOCK]
         planes = step(padded[start : start + len(block) + 2 * halo], pattern)
         cv2.merge([plane[halo:-halo, halo:-halo] for plane in planes], block)
 
-    list(pool().map(one, range(0, len(raw), _ROWS_PER_BLOCK)))
+    list(pool().map(fill_block, range(0, len(raw), _ROWS_PER_BLOCK)))
     return out
 
 

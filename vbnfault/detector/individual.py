@@ -462,8 +462,8 @@ def _hot(
     per_yr = 0.0 if growth is None else growth.expected(1.0, shape, pixel_pitch_um, spec.iso)
     born = _births(seed, "hot", per_yr * spec.years)
     count = len(born)
-    share = np.where(np.arange(count) < earlier[0], earlier[1], spec.hot_clustered_share)
-    row, column = _clustered(*_places(seed, "hot", count, shape), share, shape, seed)
+    fraction = np.where(np.arange(count) < earlier[0], earlier[1], spec.hot_clustered_share)
+    row, column = _clustered(*_places(seed, "hot", count, shape), fraction, shape, seed)
     # inverse distribution function of a power law between two limits
     least, most = spec.hot_rate_e_s
     power = 1.0 if growth is None else growth.iso_power
@@ -479,10 +479,10 @@ def _hot(
     )
 
 
-def _clustered(row: I32, column: I32, share: F64, shape: tuple[int, int], seed: int) -> tuple[I32, I32]:
-    """Move each defect, with probability `share`, next to an earlier, unmoved defect."""
+def _clustered(row: I32, column: I32, fraction: F64, shape: tuple[int, int], seed: int) -> tuple[I32, I32]:
+    """Move each defect, with probability `fraction`, next to an earlier, unmoved defect."""
     count = len(row)
-    moved = _uniform(seed, "hot clustered", count) < share
+    moved = _uniform(seed, "hot clustered", count) < fraction
     alone = np.flatnonzero(~moved)
     before = np.cumsum(~moved)  # for a moved defect: the number of unmoved ones before it
     moved &= before > 0
@@ -499,9 +499,9 @@ def _clustered(row: I32, column: I32, share: F64, shape: tuple[int, int], seed: 
     return out[0], out[1]
 
 
-def _expected(spec: IndividualSpec, shape: tuple[int, int], share: float, share_yr: float) -> float:
+def _expected(spec: IndividualSpec, shape: tuple[int, int], fraction: float, fraction_yr: float) -> float:
     """Return the expected number of defects at the age of the spec."""
-    return (share + share_yr * spec.years) * shape[0] * shape[1]
+    return (fraction + fraction_yr * spec.years) * shape[0] * shape[1]
 
 
 def _dead(spec: IndividualSpec, shape: tuple[int, int], seed: int) -> DeadPixels:

@@ -48,7 +48,7 @@ class ConverterFault(Fault):
         1, 5, limits=(0, 15), integer=True, doc="which bits: 0 is the most significant, the next 1, …; assumed"
     )
     missing_share: Interval = bounds(
-        0.0, 0.05, limits=(0, 0.5), doc="share of the codes that are missing, in one run; assumed"
+        0.0, 0.05, limits=(0, 0.5), doc="fraction of the codes that are missing, in one run; assumed"
     )
     inl_share: Interval = bounds(
         0.005, 0.03, limits=(0, 0.2), doc="height of the arc of integral non-linearity, of either sign; assumed"

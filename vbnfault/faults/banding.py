@@ -45,7 +45,7 @@ class InterferenceBanding(Fault):
         15.0,
         limits=(0, 255),
         unit="DN of 255",
-        doc="amplitude as it shows, in shares of white; assumed",
+        doc="amplitude as it shows, as a fraction of white; assumed",
     )
     frequency_hz: Interval = bounds(
         500.0, 200e3, limits=(1, 1e9), unit="Hz", doc="of the interference, drawn evenly in its logarithm; assumed"

@@ -39,7 +39,7 @@ class Overflow(Fault):
         0.7, 0.95, limits=(0.01, 1), doc="full well over the sensor's own; 1: only the drain is lost; assumed"
     )
     antiblooming: Interval = bounds(
-        0.0, 0.0, limits=(0, 1), doc="share of the excess that a drain still takes, at most the sensor's own"
+        0.0, 0.0, limits=(0, 1), doc="fraction of the excess that a drain still takes, at most the sensor's own"
     )
 
     def draw(self, context: FaultContext, rng: np.random.Generator) -> Params:

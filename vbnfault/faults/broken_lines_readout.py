@@ -60,7 +60,9 @@ class ReadoutBrokenLines(Fault):
         1, 2, limits=(1, 64), integer=True, unit="px", doc="neighbouring lines that fail together; assumed"
     )
     row_share: float = number(
-        0.5, limits=(0, 1), doc="share of rows; of samples where the architecture has rows or columns only; assumed"
+        0.5,
+        limits=(0, 1),
+        doc="fraction of rows; of samples where a sensor has only rows or only columns; assumed",
     )
     dead_weight: float = number(0.4, limits=(0, 1), doc="weight of dead lines among those that can be; assumed")
     saturated_weight: float = number(0.3, limits=(0, 1), doc="weight of saturated lines; assumed")

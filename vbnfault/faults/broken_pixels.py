@@ -72,10 +72,10 @@ class TextureBrokenPixels(Fault):
         0.4, limits=(0, 1), doc="a line's offset is at most this fraction of its broken pixel's brightness"
     )
     salt_and_pepper_fraction: float = number(
-        0.05, limits=(0, 1), doc="share of broken pixels that are fully dead (0) or fully hot (255)"
+        0.05, limits=(0, 1), doc="fraction of broken pixels that are fully dead (0) or fully hot (255)"
     )
     cluster_fraction: float = number(
-        0.1, limits=(0, 1), doc="share of broken pixels placed within 3×3 pixels of another one"
+        0.1, limits=(0, 1), doc="fraction of broken pixels placed within 3×3 pixels of another one"
     )
     dense_cluster_probability: float = number(
         0.1, limits=(0, 1), doc="chance that an image has four broken pixels within 3×3 pixels"
@@ -90,7 +90,7 @@ class TextureBrokenPixels(Fault):
         extreme = np.where(rng.random(count) < 0.5, 0, 255)
         is_extreme = rng.random(count) < self.salt_and_pepper_fraction
         brightness = np.where(is_extreme, extreme, brightness)
-        share = rng.random(count)
+        fraction = rng.random(count)
         params: Params = {
             "sensor": "ccd" if context.camera.is_ccd else "cmos",
             "x": x,
@@ -102,7 +102,7 @@ class TextureBrokenPixels(Fault):
             # that limit.
             hi = np.minimum(self.line_offset_dn.hi, np.floor(self.line_offset_fraction * brightness + 1e-9))
             lo = np.minimum(self.line_offset_dn.lo, hi)
-            params["line_offset_dn"] = (lo + np.floor(share * (hi - lo + 1))).astype(int).tolist()
+            params["line_offset_dn"] = (lo + np.floor(fraction * (hi - lo + 1))).astype(int).tolist()
             params["line_direction"] = context.camera.readout_direction
         return params
 

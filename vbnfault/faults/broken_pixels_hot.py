@@ -85,12 +85,12 @@ class HotPixels(Fault):
     anneal_days: Interval = bounds(
         7.0, 58.0, limits=(0, 1e4), unit="d", doc="since that dose; beyond 58 days damage stays as it is"
     )
-    clustered_share: float = number(0.1, limits=(0, 1), doc="share of hot pixels born beside another")
+    clustered_share: float = number(0.1, limits=(0, 1), doc="fraction of hot pixels born beside another")
     dead_per_year: float = number(
-        5e-8, limits=(0, 1e-3), unit="1/yr", doc="share of pixels that die in a year on the ground; assumed"
+        5e-8, limits=(0, 1e-3), unit="1/yr", doc="fraction of pixels that die in a year on the ground; assumed"
     )
     stuck_per_year: float = number(
-        2e-8, limits=(0, 1e-3), unit="1/yr", doc="share of pixels that stick in a year on the ground; assumed"
+        2e-8, limits=(0, 1e-3), unit="1/yr", doc="fraction of pixels that stick in a year on the ground; assumed"
     )
     least_dn: float = number(
         0.5, limits=(0.001, 255), unit="DN of 255", doc="defects that add less at this exposure are left out"

@@ -68,7 +68,7 @@ class Contamination(LensFault):
     coating: str = choice(
         "mgf2", ("as_prescribed", "none", "mgf2", "v", "bbar"), doc="of surfaces between glass and air, when whole"
     )
-    haze: Interval = bounds(0.01, 0.1, limits=(0, 0.9), doc="share of the light that a film scatters")
+    haze: Interval = bounds(0.01, 0.1, limits=(0, 0.9), doc="fraction of the light that a film scatters")
     haze_knee: Interval = bounds(
         0.01, 0.05, limits=(1e-3, 1), unit="rad", doc="L of the film's BSDF: where its fall begins"
     )
@@ -88,7 +88,7 @@ class Contamination(LensFault):
     browning_exponent: float = number(
         4.0, limits=(0, 12), doc="p of the fall of that absorption with wavelength; assumed"
     )
-    coating_loss: Interval = bounds(0.0, 0.3, limits=(0, 1), doc="share of the coatings' area that is gone")
+    coating_loss: Interval = bounds(0.0, 0.3, limits=(0, 1), doc="fraction of the coatings' area that is gone")
 
     def draw(self, context: FaultContext, rng: np.random.Generator) -> Params:
         """Return lens, coating, haze, scratches, dose, browning coefficients and coating loss.

@@ -88,7 +88,7 @@ class DefocusedDust(LensFault):
     size_exponent: float = number(
         1.0, limits=(0, 6), doc="p of the number of grains larger than D, ∝ D⁻ᵖ; 0: uniform in log D"
     )
-    transmission: Interval = bounds(0.0, 0.3, limits=(0, 1), doc="share of the light that a grain lets pass")
+    transmission: Interval = bounds(0.0, 0.3, limits=(0, 1), doc="fraction of the light that a grain lets pass")
     window_height_mm: Interval = bounds(
         0.3, 1.0, limits=(1e-3, 100), unit="mm", doc="of the window's dusty side above the sensor"
     )
@@ -461,9 +461,9 @@ def _lobes(radius_mm: F64, core: F64, sun: _Sun, stretch: float) -> tuple[F64, F
     common = (sine**2 + knee**2) ** -1.5 * (_OFFSETS**2 < 2)
     rs, rp, _, _ = reflect_transmit((), 1.0, DUST_INDEX.real, np.minimum(_OFFSETS / 2, 1), D_NM)
     own = -np.multiply.outer((core * radius_mm).sum() * factor, common)
-    for radius, share in zip(radius_mm, core, strict=True):
-        if share > 1e-6:
-            strength = (share * k**2 * radius**4)[:, None]
+    for radius, fraction in zip(radius_mm, core, strict=True):
+        if fraction > 1e-6:
+            strength = (fraction * k**2 * radius**4)[:, None]
             own += strength * _lobe_table(np.multiply.outer(k * radius, sine)) * (common > 0)
     # even a narrow lobe is sampled well at `_OFFSETS`, so its mean over the disc is a sum over rings
     over_disc = _over_disc(sun.radius_rad).T * stretch**4

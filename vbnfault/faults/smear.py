@@ -61,10 +61,13 @@ class FrameTransferSmear(Fault):
         doc="of a row by failing clocks, where the sensor's is shorter; assumed",
     )
     leak: Interval = bounds(
-        1e-3, 1e-2, limits=(0, 1), doc="share of light through the shield of an interline CCD; assumed"
+        1e-3, 1e-2, limits=(0, 1), doc="fraction of light through the shield of an interline CCD; assumed"
     )
     shutter_share: Interval = bounds(
-        2e-3, 2e-2, limits=(0, 1), doc="share of light past the shutter of a full-frame CCD; 1: it is open; assumed"
+        2e-3,
+        2e-2,
+        limits=(0, 1),
+        doc="fraction of light past the shutter of a full-frame CCD; 1: open; assumed",
     )
 
     def draw(self, context: FaultContext, rng: np.random.Generator) -> Params:

@@ -67,10 +67,10 @@ class RadialModel:
         slope = np.linspace(0, _BEYOND * self.end, _CHECKED)[1:]
         if not _polynomial(self._parts[1], slope * slope).min() >= _LEAST_DENOMINATOR:
             return False
-        found, rise, inside = self.distance(slope), self.rise(slope), slope <= self.end
-        exponent = slope[inside] * rise[inside] / found[inside]
+        distances, rise, inside = self.distance(slope), self.rise(slope), slope <= self.end
+        exponent = slope[inside] * rise[inside] / distances[inside]
         return bool(
-            found.min() > 0
+            distances.min() > 0
             and rise.min() > 0
             and _EXPONENTS[0] <= exponent.min() <= exponent.max() <= _EXPONENTS[1]
             and self.distance(np.array(self.end)) >= distance
@@ -99,7 +99,7 @@ def fitted(slope: F64, distance: F64, focal_length_px: float, *, known: int, rea
     spare = None
     for followed in _FOLLOWED:
         inner = (order < known) & (angle <= followed * angle[known - 1])
-        found = []
+        entries = []
         for degree in range(4):
             for weight in _WEIGHTS[: 1 if inner.all() else None]:
                 coefficients = _of_degree(slope, distance, degree, np.where(inner, 1.0, weight))
@@ -111,10 +111,10 @@ def fitted(slope: F64, distance: F64, focal_length_px: float, *, known: int, rea
                 off_px = np.abs(model.distance(slope) - distance)[:known] * focal_length_px
                 entry = max(float(off_px.max()), _ENOUGH_PX), degree, -weight, model
                 if off_px[inner[:known]].max() <= _FOLLOWED_PX:
-                    found.append(entry)
+                    entries.append(entry)
                 spare = entry if spare is None else min(spare, entry, key=lambda e: e[:3])
-        if found:
-            return min(found, key=lambda e: e[:3])[3]
+        if entries:
+            return min(entries, key=lambda e: e[:3])[3]
     return spare[3] if spare else None
 
 
@@ -147,10 +147,10 @@ def _of_degree(slope: F64, distance: F64, degree: int, weight: F64) -> F64 | Non
     below = np.ones_like(slope)
     solution = np.zeros(3 + degree)
     for _ in range(_STEPS if degree else 1):
-        found = _least_squares(columns * (weight / below)[:, None], (distance - slope) * weight / below)
-        if found is None:
+        coefficients = _least_squares(columns * (weight / below)[:, None], (distance - slope) * weight / below)
+        if coefficients is None:
             return None
-        solution = found
+        solution = coefficients
         below = 1 + (powers[:, :degree] * solution[3:]).sum(axis=1)
         if not np.abs(below).min() > 0:
             return None

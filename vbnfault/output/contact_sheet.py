@@ -147,23 +147,23 @@ def _tile(store: Store, index: int, short: Mapping[str, str], masks: bool) -> U8
     """Draw one sample with its caption."""
     spec = store.spec
 
-    def one(name: str) -> Any:
+    def read(name: str) -> Any:
         return store.read(name, index, index + 1)[0]
 
     scale = _TILE_PX / max(spec.height, spec.width)
     size = (max(1, round(spec.width * scale)), max(1, round(spec.height * scale)))
     # a shrunk mask is True where any of its pixels is, so that a single broken pixel stays visible
-    rgb = _resized(one("image")[..., :3], size)
-    injected = one("injected").astype(bool)
+    rgb = _resized(read("image")[..., :3], size)
+    injected = read("injected").astype(bool)
     if masks:
-        small = np.stack([_resized_mask(m, size) for m in one("mask")])
+        small = np.stack([_resized_mask(m, size) for m in read("mask")])
         rgb = overlay(rgb, small, injected.tolist())
     tile = np.full((size[1] + _CAPTION_PX, size[0], 3), _PANEL, np.uint8)
     tile[: size[1]] = rgb
-    site = int(one("site"))
-    place = spec.site_names[site] if 0 <= site < len(spec.site_names) else f"site {site}"
+    site = int(read("site"))
+    site_name = spec.site_names[site] if 0 <= site < len(spec.site_names) else f"site {site}"
     _write(tile, f"#{index}", (8, size[1] + 19), _TEXT, 0.48)
-    right = f"{STRATA[int(one('stratum'))]}  {place}"
+    right = f"{STRATA[int(read('stratum'))]}  {site_name}"
     _write(tile, right, (size[0] - 8 - _text_width(right, 0.4), size[1] + 19), _FAINT, 0.4)
     x = 8
     for k in np.flatnonzero(injected):
@@ -206,16 +206,16 @@ def _grid(tiles: Sequence[U8], columns: int) -> U8:
 def _header(name: str, faults: Sequence[str], short: Mapping[str, str], width: int) -> U8:
     """Draw the name of the store and the legend, which takes as many lines as it needs."""
     entries = [(k, f"{short[f]}  {f.replace('_', ' ')}") for k, f in enumerate(faults)]
-    places, x, line = [], _GAP_PX, 0
+    positions, x, line = [], _GAP_PX, 0
     for _, text in entries:
         needed = _text_width(text, 0.42) + 38
         if x > _GAP_PX and x + needed > width - _GAP_PX:
             x, line = _GAP_PX, line + 1
-        places.append((x, line))
+        positions.append((x, line))
         x += needed
     header = np.full((46 + (line + 1) * _LINE_PX, width, 3), _BACKGROUND, np.uint8)
     _write(header, name, (_GAP_PX, 30), _TEXT, 0.6)
-    for (k, text), (x, line) in zip(entries, places, strict=True):
+    for (k, text), (x, line) in zip(entries, positions, strict=True):
         y, colour = 44 + line * _LINE_PX, COLOURS[k % len(COLOURS)]
         veil = tuple(int(c * 0.55) for c in colour)
         cv2.rectangle(header, (x, y), (x + 14, y + 14), veil, -1)
@@ -224,10 +224,10 @@ def _header(name: str, faults: Sequence[str], short: Mapping[str, str], width: i
     return header
 
 
-def _write(image: U8, text: str, at: tuple[int, int], colour: tuple[int, int, int], scale: float) -> None:
+def _write(image: U8, text: str, position: tuple[int, int], colour: tuple[int, int, int], scale: float) -> None:
     """Draw text into an image; `at`: the lower left corner (x, y)."""
     plain = text.encode("ascii", "replace").decode()  # OpenCV's font has ASCII characters only
-    cv2.putText(image, plain, at, cv2.FONT_HERSHEY_SIMPLEX, scale, colour, 1, cv2.LINE_AA)
+    cv2.putText(image, plain, position, cv2.FONT_HERSHEY_SIMPLEX, scale, colour, 1, cv2.LINE_AA)
 
 
 def _text_width(text: str, scale: float) -> int:

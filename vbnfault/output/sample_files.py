@@ -72,15 +72,15 @@ def annotated(frame: Frame, fault: str) -> NDArray[np.uint8]:
     if marks and sun is not None:
         centre = np.array([frame.camera.width_px / 2, frame.camera.height_px / 2])
 
-        def at(point: NDArray[np.float64]) -> tuple[int, int]:
+        def pixel(point: NDArray[np.float64]) -> tuple[int, int]:
             # pixel centres lie at +0.5 here and at 0 in OpenCV, which counts in 1/16 px with shift = 4
             return round(float(point[0] - 0.5) * 16), round(float(point[1] - 0.5) * 16)
 
         far = sun + 2.2 * (centre - sun)
-        cv2.line(picture, at(sun), at(far), (255, 255, 255), 1, cv2.LINE_AA, 4)
-        cv2.circle(picture, at(sun), 10 * 16, (255, 255, 255), 1, cv2.LINE_AA, 4)
+        cv2.line(picture, pixel(sun), pixel(far), (255, 255, 255), 1, cv2.LINE_AA, 4)
+        cv2.circle(picture, pixel(sun), 10 * 16, (255, 255, 255), 1, cv2.LINE_AA, 4)
         for name, middle, radius in marks:
-            cv2.circle(picture, at(middle), round(radius * 16), colour, 1, cv2.LINE_AA, 4)
+            cv2.circle(picture, pixel(middle), round(radius * 16), colour, 1, cv2.LINE_AA, 4)
             x, y = (round(float(v) - 0.5) for v in middle)
             cv2.drawMarker(picture, (x, y), colour, cv2.MARKER_CROSS, 13, 1)
             cv2.putText(picture, name, (x + 8, y - 6), cv2.FONT_HERSHEY_SIMPLEX, 0.5, colour, 1)
@@ -102,9 +102,9 @@ def _marks(
         for flare in params.get("flares", ())
     ]
     for ghost in params.get("ghosts", ())[:_MARKED_GHOSTS]:
-        place = np.array([ghost["x_px"], ghost["y_px"]])
-        if np.abs(place - centre).max() < width and ghost["rms_radius_px"] < width:
-            marks.append(("-".join(map(str, ghost["pair"])), place, np.sqrt(2) * ghost["rms_radius_px"]))
+        position = np.array([ghost["x_px"], ghost["y_px"]])
+        if np.abs(position - centre).max() < width and ghost["rms_radius_px"] < width:
+            marks.append(("-".join(map(str, ghost["pair"])), position, np.sqrt(2) * ghost["rms_radius_px"]))
     return marks
 
 

@@ -198,7 +198,7 @@ class Session:
     def sites(self) -> Sites:
         """Return the sites of the scene. Each is drawn at its first use."""
         if self.scene.spice.spacecraft:
-            return assemble.way_sites(self.scene, self.body)
+            return assemble.trajectory_sites(self.scene, self.body)
         return choose_sites(self.body, self.scene.dataset.sites, self.scene.dataset.seed)
 
     def terrain(self, site: int) -> Terrain:

@@ -45,8 +45,8 @@ def indirect(surface: TerrainMesh, scene: RenderInput, truth: Truth, *, smooth: 
     This light was reflected 1 to `scene.bounces` times before. `truth` of the same view guides the filter that
     averages neighbouring pixels; `smooth` = False switches it off.
     """
-    found = _Indirect(surface, scene).image()
-    return _smoothed(found, scene, truth) if smooth else found
+    light = _Indirect(surface, scene).image()
+    return _smoothed(light, scene, truth) if smooth else light
 
 
 class _Indirect(Light):
@@ -140,8 +140,8 @@ class _Tiles:
         """Return the pixels' values row after row."""
         pixel = dr.arange(mi.UInt32, self.width * self.rows)
         x, y = pixel % self.width, pixel // self.width
-        place = (y % _TILE) * _TILE + x % _TILE
-        return dr.gather(mi.Float, values, place * self.count + (y // _TILE) * self.across + x // _TILE)
+        position = (y % _TILE) * _TILE + x % _TILE
+        return dr.gather(mi.Float, values, position * self.count + (y // _TILE) * self.across + x // _TILE)
 
 
 class TileStrata(Strata):
@@ -153,9 +153,9 @@ class TileStrata(Strata):
 
     def __init__(self, tiles: _Tiles, rounds: int, round_: int, key: int) -> None:
         wavefront = dr.arange(mi.UInt32, tiles.count * _TILE * _TILE)
-        tile, self._place = wavefront % tiles.count, wavefront // tiles.count
-        x = (tile % tiles.across) * _TILE + self._place % _TILE
-        y = (tile // tiles.across) * _TILE + self._place // _TILE
+        tile, self._position = wavefront % tiles.count, wavefront // tiles.count
+        x = (tile % tiles.across) * _TILE + self._position % _TILE
+        y = (tile // tiles.across) * _TILE + self._position // _TILE
         self.inside = (x < tiles.width) & (y < tiles.rows)
         self.in_rows = y * tiles.width + x
         self.pixel = self.in_rows + dr.opaque(mi.UInt32, tiles.first_row * tiles.width)
@@ -170,8 +170,8 @@ class TileStrata(Strata):
         """Return a uniform point of the unit square within the sample's own stratum."""
         u, v = self.jitter(_FIRST_BOUNCE)
         cells = _TILE * self._rounds_side
-        a = self._round[0] * _TILE + _reversed(self._place % _TILE)
-        b = self._round[1] * _TILE + _reversed(self._place // _TILE)
+        a = self._round[0] * _TILE + _reversed(self._position % _TILE)
+        b = self._round[1] * _TILE + _reversed(self._position // _TILE)
         return (mi.Float(a) + u) / cells, (mi.Float(b) + v) / cells
 
 
@@ -213,7 +213,7 @@ class _Guide:
         self._record = mi.Float(np.ascontiguousarray(record).ravel())
         self._pixel_size = dr.opaque(mi.Float, 1 / float(scene.view.intrinsics[0]))
 
-    def _at(self, x: Any, y: Any) -> tuple[Any, Any, Any]:
+    def _geometry_at(self, x: Any, y: Any) -> tuple[Any, Any, Any]:
         """Return the normal, the position in camera axes and the depth (0 on the sky) at pixels."""
         record = dr.gather(mi.Vector4f, self._record, mi.UInt32(y * self.width + x))
         depth = record.w
@@ -225,15 +225,15 @@ class _Guide:
         """Return the values averaged over 5 × 5 pixels that are `stride` apart and lie on the same surface."""
         pixel = dr.arange(mi.Int32, self.width * self.height)
         x, y = pixel % self.width, pixel // self.width
-        normal, point, depth = self._at(x, y)
+        normal, point, depth = self._geometry_at(x, y)
         per_plane = 1 / (_SIGMA_PLANE_PX * stride * self._pixel_size * dr.maximum(depth, 1e-6))
         total, weights = mi.Float(0), mi.Float(0)
         for j in range(-2, 3):
             for i in range(-2, 3):
                 qx = dr.clip(x + i * stride, 0, self.width - 1)
                 qy = dr.clip(y + j * stride, 0, self.height - 1)
-                other, at, far = self._at(qx, qy)
-                off = dr.dot(normal, at - point) * per_plane
+                other, other_point, far = self._geometry_at(qx, qy)
+                off = dr.dot(normal, other_point - point) * per_plane
                 turn = dr.squared_norm(other - normal) * (1 / _SIGMA_NORMAL**2)
                 weight = _SPLINE[abs(i)] * _SPLINE[abs(j)] * dr.exp(-0.5 * (off * off + turn))
                 weight = dr.select(far > 0, weight, 0)

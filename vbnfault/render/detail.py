@@ -128,8 +128,8 @@ class Detail:
         x, y = x - mi.Float(column), y - mi.Float(row)
         # the texels of the larger levels come first; an index that rounds up to `side` belongs to the next tile
         start, last = (_SIDE * _SIDE - side * side) // 3 * 4, side - 1
-        at = mi.UInt32(start + (row & last) * side + (column & last))
-        corners = dr.gather(mi.Vector4i, self._pyramid, at, shown)
+        texel = mi.UInt32(start + (row & last) * side + (column & last))
+        corners = dr.gather(mi.Vector4i, self._pyramid, texel, shown)
         su, sv = ([mi.Float(c << 16 >> 16 if low else c >> 16) for c in corners] for low in (True, False))
         first, second = (dr.lerp(dr.lerp(of[0], of[1], x), dr.lerp(of[2], of[3], x), y) for of in (su, sv))
         return first * _UNIT, second * _UNIT
@@ -184,7 +184,7 @@ def _pebbles(rng: np.random.Generator) -> NDArray[np.float64]:
     highest = np.zeros((_SIDE, _SIDE))
     for cell in _PEBBLE_CELLS:
         count = _SIDE // cell
-        at = rng.random((2, count, count))
+        position = rng.random((2, count, count))
         radius = cell * (0.15 + 0.25 * rng.random((count, count)) ** 2)
         tall = radius * (0.4 + 0.5 * rng.random((count, count))) * (rng.random((count, count)) < _PEBBLE_SHARE)
         turn, squeeze = rng.random((count, count)) * np.pi, 1 + 0.6 * rng.random((count, count))
@@ -192,7 +192,7 @@ def _pebbles(rng: np.random.Generator) -> NDArray[np.float64]:
             for right in (-1, 0, 1):
                 j, i = row // cell + down, column // cell + right
                 wrapped = (j % count, i % count)
-                y, x = row - cell * (j + at[0][wrapped]), column - cell * (i + at[1][wrapped])
+                y, x = row - cell * (j + position[0][wrapped]), column - cell * (i + position[1][wrapped])
                 c, s = np.cos(turn[wrapped]), np.sin(turn[wrapped])
                 square = ((c * x + s * y) ** 2 + (squeeze[wrapped] * (c * y - s * x)) ** 2) / radius[wrapped] ** 2
                 highest = np.maximum(highest, tall[wrapped] * (1 - square**1.5))

@@ -53,14 +53,14 @@ def truth(
     semantic = dr.select(hit.valid, mi.UInt32(BODY), mi.UInt32(SKY))
     if hit.material is not None:
         semantic = dr.select(hit.on_vehicle, mi.UInt32(SPACECRAFT), semantic)
-    found = {"semantic": semantic, "depth": depth}
+    layers = {"semantic": semantic, "depth": depth}
     if angles:
         pairs = {"incidence": (normal, centre), "emission": (normal, -rays.d), "phase": (centre, -rays.d)}
-        found |= {name: dr.select(hit.valid, _angle_deg(*pair), dr.nan) for name, pair in pairs.items()}
-        found["dust"] = dr.select(hit.valid, hit.dust, dr.nan)
+        layers |= {name: dr.select(hit.valid, _angle_deg(*pair), dr.nan) for name, pair in pairs.items()}
+        layers["dust"] = dr.select(hit.valid, hit.dust, dr.nan)
         if hit.material is not None:
-            found["material"] = dr.select(hit.on_vehicle, mi.Int32(hit.material), mi.Int32(-1))
-    dr.eval(*in_camera, *found.values())
+            layers["material"] = dr.select(hit.on_vehicle, mi.Int32(hit.material), mi.Int32(-1))
+    dr.eval(*in_camera, *layers.values())
     more = {"incidence": "incidence_deg", "emission": "emission_deg", "phase": "phase_deg"}
     more |= {"dust": "dust", "material": "material"}
     classes = semantic.numpy().astype(np.uint8).reshape(shape)
@@ -71,17 +71,17 @@ def truth(
         depth_m=depth.numpy().reshape(shape),
         normal=np.stack([c.numpy() for c in in_camera], axis=-1).astype(np.float16).reshape(*shape, 3),
         semantic=classes,
-        **{to: found[name].numpy().reshape(shape) for name, to in more.items() if name in found},
+        **{to: layers[name].numpy().reshape(shape) for name, to in more.items() if name in layers},
     )
 
 
 def _mark_sun(classes: NDArray[np.uint8], disc: SunInView, projection: Projection) -> None:
     """Set the class of the pixels that hold any of the disc, uint8[y, x], in place."""
-    found, bounds = pixel_sums(disc, projection, (classes.shape[0], classes.shape[1])), bounds_px(disc, projection)
-    if found is None or bounds is None:
+    sums, bounds = pixel_sums(disc, projection, (classes.shape[0], classes.shape[1])), bounds_px(disc, projection)
+    if sums is None or bounds is None:
         return
-    holds = found.values[0] > 0
-    part = classes[found.rows, found.columns]
+    holds = sums.values[0] > 0
+    part = classes[sums.rows, sums.columns]
     part[holds & (part == SKY)] = SUN
     x, y, z = disc.direction_C
     column, row = np.floor(projection.pixel_of(np.array([x / z, y / z]))).astype(int)

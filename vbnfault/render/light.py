@@ -86,13 +86,13 @@ def direct(
     shape = frame if pixels is None else (1, len(pixels))
     if sun is not None and pixels is not None:
         sun = sun.reshape(bands, 1, -1)[:, :, pixels]
-    found = Radiance(
+    radiance = Radiance(
         array=out.reshape(bands, *shape),
         wavelength_nm=scene.wavelength_nm,
         sun=sun,
         disc=None if sun is None else disc,
     )
-    return found, halves.reshape(shape)
+    return radiance, halves.reshape(shape)
 
 
 def sun_in_view(surface: TerrainMesh, view: View, sun: Sunlight) -> SunInView | None:
@@ -123,10 +123,10 @@ def sun_in_view(surface: TerrainMesh, view: View, sun: Sunlight) -> SunInView | 
     # two for the pupil.
     u = (0.5 + index[None, :] * _KRONECKER[:, None]) % 1
     cell = index // several
-    place = 2 * (np.stack([cell % side, cell // side]) + u[:2]) / side - 1
-    place /= np.maximum(np.hypot(*place), 1.0)  # cells beyond the rim move onto it
+    position = 2 * (np.stack([cell % side, cell // side]) + u[:2]) / side - 1
+    position /= np.maximum(np.hypot(*position), 1.0)  # cells beyond the rim move onto it
     sine = np.sin(sun.angular_radius_rad)
-    across = sine * place
+    across = sine * position
     along = np.sqrt(1 - (across**2).sum(axis=0))
     towards_L = np.stack([*across, along], axis=1) @ axes(disc.direction_C) @ view.L_from_C.T
     radius, turn = view.aperture_radius_m * np.sqrt(u[2]), 2 * np.pi * u[3]
@@ -139,9 +139,9 @@ def sun_in_view(surface: TerrainMesh, view: View, sun: Sunlight) -> SunInView | 
     return replace(disc, visible=visible.astype(np.float32))
 
 
-def _columns(rows: NDArray[np.float64]) -> list[Any]:
+def _columns(vectors: NDArray[np.float64]) -> list[Any]:
     """Return the columns of an array as drjit floats."""
-    return [mi.Float(np.ascontiguousarray(column, np.float32)) for column in rows.T]
+    return [mi.Float(np.ascontiguousarray(column, np.float32)) for column in vectors.T]
 
 
 class Light:
@@ -204,9 +204,9 @@ class _Direct(Light):
             strata = Strata(part, spp, self.scene.key)
             terms = self.terms(strata)
             if signal is not None:
-                shares = weights.astype(np.float64) @ signal
+                factors = weights.astype(np.float64) @ signal
                 seen = sum(
-                    (t * dr.opaque(mi.Float, float(s)) for t, s in zip(terms, shares, strict=True)), mi.Float(0)
+                    (t * dr.opaque(mi.Float, float(s)) for t, s in zip(terms, factors, strict=True)), mi.Float(0)
                 )
                 terms = [*terms, seen * strata.checkered()]
             dr.eval(*terms)  # without this, every block sum would trace the rays again

@@ -77,8 +77,8 @@ class Strata:
         h ^= h >> 15
         h *= 0x85EBCA77
         h ^= h >> 13
-        at = ((h & (_DISC_SETS - 1)) << self._shift) + self.index
-        return dr.gather(mi.Point2f, _disc_table(self.samples, dimension), at)
+        index = ((h & (_DISC_SETS - 1)) << self._shift) + self.index
+        return dr.gather(mi.Point2f, _disc_table(self.samples, dimension), index)
 
 
 @dataclass(frozen=True)

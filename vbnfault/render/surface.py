@@ -87,8 +87,8 @@ class TerrainMesh:
         order, low, high = self._boxes_m
         away = np.maximum(np.maximum(low - position_L_m, position_L_m - high), 0)
         runs = np.flatnonzero(np.einsum("ri,ri->r", away, away) <= reach_m**2)
-        places = (runs[:, None] * _RUN + np.arange(_RUN)).ravel()
-        return order[places[places < len(order)]]
+        positions = (runs[:, None] * _RUN + np.arange(_RUN)).ravel()
+        return order[positions[positions < len(order)]]
 
     @cached_property
     def _boxes_m(self) -> tuple[NDArray[np.intp], NDArray[np.float64], NDArray[np.float64]]:
@@ -159,14 +159,14 @@ class Hit:
     material: Any = None
     on_vehicle: Any = None
 
-    def __init__(self, surface: TerrainMesh, rays: Any, found: Any) -> None:
-        self.valid = found.is_valid()
-        self.distance_m = found.t
-        self._surface, self._first = surface, found.prim_index
+    def __init__(self, surface: TerrainMesh, rays: Any, intersection: Any) -> None:
+        self.valid = intersection.is_valid()
+        self.distance_m = intersection.t
+        self._surface, self._first = surface, intersection.prim_index
         self._rays = rays
-        b1, b2 = found.prim_uv.x, found.prim_uv.y
+        b1, b2 = intersection.prim_uv.x, intersection.prim_uv.y
         self._weights = (1 - b1 - b2, b1, b2)
-        first = found.prim_index * 3
+        first = intersection.prim_index * 3
         self._corners = [dr.gather(mi.Vector4f, surface._corners, first + k, self.valid) for k in range(3)]
         w = self._weights
         self.normal = dr.normalize(sum((c.xyz * w[k] for k, c in enumerate(self._corners)), mi.Vector3f(0)))
@@ -230,14 +230,14 @@ def _corner_records(
     corner = dr.arange(mi.UInt32, 3 * len(faces))
     facet = corner // 3
     table = mi.UInt32(np.ascontiguousarray(faces, np.uint32).ravel())
-    places = mi.Float(np.ascontiguousarray(vertices).ravel())
-    a, b, c = (dr.gather(mi.Vector3f, places, dr.gather(mi.UInt32, table, 3 * facet + k)) for k in range(3))
+    coordinates = mi.Float(np.ascontiguousarray(vertices).ravel())
+    a, b, c = (dr.gather(mi.Vector3f, coordinates, dr.gather(mi.UInt32, table, 3 * facet + k)) for k in range(3))
     across = dr.cross(b - a, c - a)
     own = across * dr.rcp(dr.maximum(dr.norm(across), 1e-30))
     vertex = dr.gather(mi.UInt32, table, corner)
     smooth = dr.gather(mi.Vector3f, mi.Float(normals.ravel()), vertex)
     normal = dr.select(dr.gather(mi.Bool, mi.Bool(flat), facet), own, smooth)
-    return dr.ravel(mi.Vector4f(*normal, dr.dot(normal, dr.gather(mi.Vector3f, places, vertex))))
+    return dr.ravel(mi.Vector4f(*normal, dr.dot(normal, dr.gather(mi.Vector3f, coordinates, vertex))))
 
 
 def _vertex_normals(
@@ -249,14 +249,14 @@ def _vertex_normals(
     depend on the order of the threads.
     """
     # axis by axis, because numpy is several times slower on arrays of triples
-    at = [np.ascontiguousarray(faces[~flat, k]) for k in range(3)]
+    corners = [np.ascontiguousarray(faces[~flat, k]) for k in range(3)]
     axes = [np.ascontiguousarray(vertices[:, axis]) for axis in range(3)]
-    one, other = ([of[at[k]] - of[at[0]] for of in axes] for k in (1, 2))
+    first_edge, second_edge = ([of[corners[k]] - of[corners[0]] for of in axes] for k in (1, 2))
     area = [
-        one[1] * other[2] - one[2] * other[1],
-        one[2] * other[0] - one[0] * other[2],
-        one[0] * other[1] - one[1] * other[0],
+        first_edge[1] * second_edge[2] - first_edge[2] * second_edge[1],
+        first_edge[2] * second_edge[0] - first_edge[0] * second_edge[2],
+        first_edge[0] * second_edge[1] - first_edge[1] * second_edge[0],
     ]
-    total = np.stack([np.sum([np.bincount(i, of, len(vertices)) for i in at], axis=0) for of in area], axis=1)
+    total = np.stack([np.sum([np.bincount(i, of, len(vertices)) for i in corners], axis=0) for of in area], axis=1)
     length = np.sqrt(np.einsum("ni,ni->n", total, total))
     return np.asarray(total / np.maximum(length, 1e-300)[:, None], np.float32)

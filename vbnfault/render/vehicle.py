@@ -83,8 +83,8 @@ class World:
 
     def trace(self, rays: Any, active: Any = True, *, coherent: bool = True) -> tuple[Any, ...]:
         """Return the hits on the terrain and on the vehicle, in the form that `hit` needs besides the rays."""
-        found = self.vehicle.scene.ray_intersect_preliminary(self._in_B(rays), coherent=coherent, active=active)
-        return *self.surface.trace(rays, active, coherent=coherent), found
+        hit = self.vehicle.scene.ray_intersect_preliminary(self._in_B(rays), coherent=coherent, active=active)
+        return *self.surface.trace(rays, active, coherent=coherent), hit
 
     def hit(self, rays: Any, traced: tuple[Any, ...]) -> VehicleHit:
         """Return the nearer of the two hits of each ray."""

@@ -83,10 +83,10 @@ def _orbit(table: OrbitTable | None) -> frames.Orbit:
     return frames.ORBIT_67P if table is None else frames.Orbit(**table.model_dump())
 
 
-def epoch_jd(scene: Scene, site: int, share: float) -> float:
-    """Return the TDB Julian date at the fraction `share` in [0, 1] of a site's time on the trajectory."""
+def epoch_jd(scene: Scene, site: int, fraction: float) -> float:
+    """Return the TDB Julian date at the given fraction in [0, 1] of a site's time on the trajectory."""
     start, end = scene.sun.julian_date, scene.spice.until_julian_date
-    return start if end is None else start + (end - start) * (site + share) / scene.dataset.sites
+    return start if end is None else start + (end - start) * (site + fraction) / scene.dataset.sites
 
 
 @file_contents.cached_with_contents(maxsize=256)
@@ -103,7 +103,7 @@ def spacecraft_pose(scene: Scene, julian_date: float) -> spice.SpacecraftState:
     return _spacecraft_pose(scene.spice, julian_date)
 
 
-def way_sites(scene: Scene, body: Body) -> Sites:
+def trajectory_sites(scene: Scene, body: Body) -> Sites:
     """Return the sites of a scene on a spacecraft's trajectory.
 
     A site is the ground at the centre of the image, half-way through the time of the site. If the camera looks past

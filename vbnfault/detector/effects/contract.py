@@ -18,8 +18,8 @@ of a sensor file, and an effect outside vbnfault acts where the sensor has this 
 
 The chain has these effects and steps, in this order. `apply` receives `signal` in electrons, float32[y, x], up to
 and including "analogue", which returns it in DN, float32[y, x]. "converter" receives that and returns whole DN,
-uint16[y, x], which all later effects receive and return. An effect with `after = "full_well"` acts on the charge that the
-wells hold, and what it adds is not clipped.
+uint16[y, x], which all later effects receive and return. An effect with `after = "full_well"` acts on the charge
+that the wells hold, and what it adds is not clipped.
 
     response, light, smear, dark_current, telegraph, pixels, shot_noise, charge, blooming, deep_traps,
     parallel_cti, serial_cti, full_well, analogue, converter, stuck_pixels, raw

@@ -55,9 +55,9 @@ class ParaxialTracer(Tracer):
     ) -> None:
         super().__init__(lens, wavelength_nm, reflections=reflections, routes_=routes_)
         be = backend()
-        found = [along(lens, path, self.wavelength_nm) for path in self._paths]
-        whole = np.stack([m for m, _ in found])  # route, wavelength
-        met = np.concatenate([m for _, m in found])  # step, wavelength
+        factors = [along(lens, path, self.wavelength_nm) for path in self._paths]
+        whole = np.stack([m for m, _ in factors])  # route, wavelength
+        met = np.concatenate([m for _, m in factors])  # step, wavelength
         self._paraxial = {
             "whole": be.Float(whole[:, :, 0, :].transpose(1, 0, 2).astype(np.float32).ravel()),
             "met": be.Float(met[:, :, 0, :].transpose(1, 0, 2).astype(np.float32).ravel()),

@@ -168,7 +168,7 @@ def paraxial_ghosts(
     pupil = np.pi / 4 * first_order(lens).entrance_pupil_diameter_mm ** 2
     side = (np.arange(_GRID) + 0.5) / _GRID * 2 - 1
     square = np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2)
-    found = []
+    ghosts = []
     for pair in pairs(lens):
         path = ghost(lens, *pair)
         matrix, met = along(lens, path, wavelength_nm)
@@ -187,7 +187,7 @@ def paraxial_ghosts(
         on_sensor = matrix[0, 0] * passing + matrix[0, 1] * slope
         centroid = on_sensor.mean(axis=0)
         fraction = transmittance(lens, path, wavelength_nm)
-        found.append(
+        ghosts.append(
             Ghost(
                 pair=pair,
                 flux_fraction=fraction * len(passing) * (2 * radius[least] / _GRID) ** 2 / pupil,
@@ -196,4 +196,4 @@ def paraxial_ghosts(
                 peak_irradiance_fraction=float(fraction * np.cos(np.radians(sun_deg)) / matrix[0, 0] ** 2),
             )
         )
-    return tuple(found)
+    return tuple(ghosts)

@@ -176,7 +176,7 @@ class Sums:
         dr, Float, Int32, UInt32 = be.dr, be.Float, be.Int32, be.UInt32
         ends = cells.ends()
         densities, factors, offsets, _ = ends
-        first, last, _ = cells.rows(ends)
+        first, last, _ = cells.pixel_rows(ends)
         a, b, c, d = (
             (x, y, density, margin, factor, offset)
             for (x, y, _, margin), density, factor, offset in zip(
@@ -202,15 +202,15 @@ class Sums:
         def pixel(x: Any, y: Any, end: Any) -> Any:
             """Add one pixel, and return the next one of the cell."""
             here = x <= end
-            found = [Float(0), Float(EDGE_LOW), Float(0), Float(0)]
+            values_there = [Float(0), Float(EDGE_LOW), Float(0), Float(0)]
             for triangle in triangles:
-                inside, *values = triangle.at(x + 0.5, y + 0.5)
-                found = [dr.select(inside, new, old) for new, old in zip(values, found, strict=True)]
+                inside, *values = triangle.values_at(x + 0.5, y + 0.5)
+                values_there = [dr.select(inside, new, old) for new, old in zip(values, values_there, strict=True)]
             tent = dr.maximum(1 - dr.abs(x + 0.5 - cells.middle[0]), 0)
             tent = tent * dr.maximum(1 - dr.abs(y + 0.5 - cells.middle[1]), 0)
-            value = dr.select(small, tent * splat, found[0] * shade(*found[1:]))
-            at, shown = UInt32(Int32(y)) * width + UInt32(Int32(x)), here & (value != 0)
-            add(value, at, shown)
+            value = dr.select(small, tent * splat, values_there[0] * shade(*values_there[1:]))
+            index, shown = UInt32(Int32(y)) * width + UInt32(Int32(x)), here & (value != 0)
+            add(value, index, shown)
             down = x >= end
             y = dr.select(down, y + 1, y)
             low, high = cells.columns(y)
@@ -285,11 +285,11 @@ class Sums:
             if (placement.weight[:, k] > 0).any()
         ]
 
-        def add(value: Any, at: Any, shown: Any) -> None:
+        def add(value: Any, pixel: Any, shown: Any) -> None:
             for start, weight in bands:
                 # negative numbers wrap around, and wrap back when they are read as signed
                 units = be.UInt64(be.Int64(dr.round(dr.clip(value, -_MOST, _MOST) * weight)))
-                dr.scatter_add(total, units, start + at, shown & (weight > 0), mode=dr.ReduceMode.Auto)
+                dr.scatter_add(total, units, start + pixel, shown & (weight > 0), mode=dr.ReduceMode.Auto)
 
         return add
 
@@ -350,7 +350,7 @@ class _Triangle:
         self._per_area = dr.rcp(dr.maximum(dr.abs(twice), 1e-12))
         self._edges = tuple(_edge(p, q) for p, q in ((b, c), (c, a), (a, b)))
 
-    def at(self, x: Any, y: Any) -> tuple[Any, ...]:
+    def values_at(self, x: Any, y: Any) -> tuple[Any, ...]:
         """Return whether a point lies inside, and the values there."""
         dr = backend().dr
         inside, values = None, [0.0] * (len(self._corners[0]) - 2)
@@ -404,8 +404,10 @@ class _Traced:
             return dr.full(be.Float, 1, dr.width(ix))
         of = dr.gather(be.Float, be.Float(disc.astype(np.float32)), bundle)
         step = 2 / be.Float(side)
-        at = [rounded((be.Float(ix) + dx) * step - 1, (be.Float(iy) + dy) * step - 1, of) for dx, dy in _CORNERS]
-        return _area(*at) / (step * step)
+        corners = [
+            rounded((be.Float(ix) + dx) * step - 1, (be.Float(iy) + dy) * step - 1, of) for dx, dy in _CORNERS
+        ]
+        return _area(*corners) / (step * step)
 
     def _magnified(self) -> Any:
         """Return the signed magnification of area of every cell, `_NO_AREA` beside a lost ray."""
@@ -413,8 +415,10 @@ class _Traced:
         dr, spots = be.dr, self.spots
         bundle, ix, iy, side = lattice_places(self.across - 1, self.across - 1)
         first = dr.gather(be.UInt32, self._first_ray, bundle) + iy * (side + 1) + ix
-        at = [first + dx + dy * (side + 1) for dx, dy in _CORNERS]
-        x, y, margins = ([dr.gather(be.Float, v, k) for k in at] for v in (spots.x_mm, spots.y_mm, spots.margin))
+        corners = [first + dx + dy * (side + 1) for dx, dy in _CORNERS]
+        x, y, margins = (
+            [dr.gather(be.Float, v, k) for k in corners] for v in (spots.x_mm, spots.y_mm, spots.margin)
+        )
         mean = dr.gather(be.Float, be.Float(self.entrance_mm2.astype(np.float32)), bundle)
         area = _area(*zip(x, y, strict=True)) / (mean * dr.maximum(self.entrance(bundle, ix, iy, side), 1e-6))
         out = dr.select(_least(*margins) > _WHOLE, area, _NO_AREA)
@@ -431,16 +435,16 @@ class _Traced:
         dr, spots = be.dr, self.spots
         _, ix, iy, side = lattice_places(self.across, self.across)
         here = dr.arange(be.UInt32, int((self.across**2).sum()))
-        found: list[list[Any]] = [[], []]
-        for at, step in ((ix, be.UInt32(1)), (iy, side)):
-            inside = (at > 0) & (at < side - 1)
+        bends: list[list[Any]] = [[], []]
+        for position, step in ((ix, be.UInt32(1)), (iy, side)):
+            inside = (position > 0) & (position < side - 1)
             before, behind = (dr.select(inside, k, here) for k in (here - step, here + step))
             kept = [dr.gather(be.Float, spots.margin, k) > _WHOLE for k in (before, here, behind)]
-            for of, values in zip(found, (spots.x_mm, spots.y_mm), strict=True):
-                one, two, three = (dr.gather(be.Float, values, k) for k in (before, here, behind))
-                of.append(dr.select(inside & kept[0] & kept[1] & kept[2], one - 2 * two + three, 0))
-        dr.eval(found)
-        return (found[0][0], found[0][1]), (found[1][0], found[1][1])
+            for of, values in zip(bends, (spots.x_mm, spots.y_mm), strict=True):
+                first, second, third = (dr.gather(be.Float, values, k) for k in (before, here, behind))
+                of.append(dr.select(inside & kept[0] & kept[1] & kept[2], first - 2 * second + third, 0))
+        dr.eval(bends)
+        return (bends[0][0], bends[0][1]), (bends[1][0], bends[1][1])
 
 
 class _Lattice:
@@ -461,7 +465,7 @@ class _Lattice:
         # light of a mean cell for a `fraction` of 1, in irradiance × pixels of the level
         self.entrance_mm2 = traced.entrance_mm2[placement.source]
         self.light = self.entrance_mm2 * placement.strength * self.per_mm**2
-        self.places = lattice_places(self.across - 1, self.across - 1)
+        self.numbers = lattice_places(self.across - 1, self.across - 1)
 
     def cells(self, index: Any = None) -> _Cells:
         """Return all cells, or those at an index."""
@@ -475,11 +479,11 @@ class _Cells:
         be = backend()
         dr, Float, UInt32 = be.dr, be.Float, be.UInt32
         self.lattice = lattice
-        places = lattice.places
+        numbers = lattice.numbers
         if index is not None:
-            dr.eval(*places)
-            places = tuple(dr.gather(UInt32, v, index) if dr.width(v) > 1 else v for v in places)
-        self.bundle, self.ix, self.iy, self.side = places
+            dr.eval(*numbers)
+            numbers = tuple(dr.gather(UInt32, v, index) if dr.width(v) > 1 else v for v in numbers)
+        self.bundle, self.ix, self.iy, self.side = numbers
         across = self.side + 1
         first = self.given(lattice.first_ray, UInt32) + self.iy * across + self.ix
         self.rays = [first + dx + (across if dy else 0) for dx, dy in _CORNERS]
@@ -492,7 +496,7 @@ class _Cells:
         self.height, self.width = (self.given(lattice.sides[:, k]) for k in (0, 1))
         spots = lattice.spots
         x, y, fraction, margin = (
-            [dr.gather(Float, v, at) for at in self.rays]
+            [dr.gather(Float, v, ray) for ray in self.rays]
             for v in (spots.x_mm, spots.y_mm, spots.fraction, spots.margin)
         )
         self.valid = _least(*margin) > _WHOLE
@@ -522,7 +526,7 @@ class _Cells:
         The number is 0 for cells without light in the part that is drawn, and for those drawn by points.
         """
         dr, ends = backend().dr, self.ends()
-        number, folds = self.rows(ends)[2], ends[3] & self.valid
+        number, folds = self.pixel_rows(ends)[2], ends[3] & self.valid
         dr.eval(number, folds)
         return number, folds
 
@@ -556,7 +560,7 @@ class _Cells:
         be = backend()
         dr = be.dr
         (xu, xv), (yu, yv) = (
-            [[dr.gather(be.Float, v, at) for at in self.rays] for v in pair]
+            [[dr.gather(be.Float, v, ray) for ray in self.rays] for v in pair]
             for pair in self.lattice.traced.bends_mm
         )
         cos, sin = (dr.opaque(be.Float, v) * self.scale for v in self.lattice.turn)
@@ -572,13 +576,13 @@ class _Cells:
         edge = self.given(self.lattice.placement.kind * _EDGE_NODES, be.UInt32)
         nodes = (_EDGE_NODES - 1) / (EDGE_HIGH - EDGE_LOW)
 
-        def at(margin: Any) -> Any:
+        def light_at(margin: Any) -> Any:
             node = be.UInt32(dr.clip(dr.fma(margin, nodes, 0.5 - EDGE_LOW * nodes), 0, _EDGE_NODES - 1))
             return dr.gather(be.Float, table, edge + node)
 
-        return at
+        return light_at
 
-    def rows(self, ends: tuple[Any, ...]) -> tuple[Any, Any, Any]:
+    def pixel_rows(self, ends: tuple[Any, ...]) -> tuple[Any, Any, Any]:
         """Return the first and last row of pixels whose centres may lie in a cell, and its approximate pixel count.
 
         The last row is -1 for cells without light in the part that is drawn, and for those that fold.

@@ -195,10 +195,10 @@ def scattered_intensity(size_parameter: ArrayLike, cosine: ArrayLike, *, index: 
     """
     x, mu = np.atleast_1d(np.asarray(size_parameter, float)), np.atleast_1d(np.asarray(cosine, float))
     small = x <= _MIE_LARGEST
-    found = np.empty((len(x), len(mu)))
-    found[small] = _mie(x[small], mu, index)
-    found[~small] = _large(x[~small], mu, index)
-    return found
+    intensity_of = np.empty((len(x), len(mu)))
+    intensity_of[small] = _mie(x[small], mu, index)
+    intensity_of[~small] = _large(x[~small], mu, index)
+    return intensity_of
 
 
 def _mie(x: F64, mu: F64, index: complex) -> F64:
@@ -301,10 +301,10 @@ def particle_bsdf(
         return np.zeros(b.shape)
     angles = _intensities(index)[1]
     angle = np.arcsin(np.clip(b, np.sin(angles[0]), 1))
-    found = np.exp(np.interp(np.log(angle), np.log(angles), np.log(intensity)))
+    scattered = np.exp(np.interp(np.log(angle), np.log(angles), np.log(intensity)))
     # radiance is intensity over cosine; beyond 84° a mean cosine of the outermost ring conserves the flux
     cosine = np.where(b * b < 0.99, np.sqrt(np.maximum(1 - b * b, 0)), 0.05)
-    return np.where(b < 1, found / cosine, 0.0)
+    return np.where(b < 1, scattered / cosine, 0.0)
 
 
 def particle_scatter_fraction(

@@ -99,8 +99,8 @@ class StopDefects:
         count = len(self.scratch_length_mm)
         for name in ("scratch_width_mm", "scratch_angle_rad"):
             if len(getattr(self, name)) != count:
-                found = len(getattr(self, name))
-                raise InputError(f"{name}: {found} values: must be as many as scratch_length_mm, {count}")
+                length = len(getattr(self, name))
+                raise InputError(f"{name}: {length} values: must be as many as scratch_length_mm, {count}")
 
     def scaled(self, factor: float) -> StopDefects:
         """Return the defects with every length multiplied by a factor."""
@@ -581,8 +581,8 @@ def _add_scratches(
     # Gauss points of the disc, which is projected onto a line; the weights include 1/k²
     turn = np.arange(1, _DISC_POINTS + 1) * np.pi / (_DISC_POINTS + 1)
     offset = burst.sun_radius_rad * np.cos(turn)
-    share = np.sin(turn) ** 2 / (sine[:, None] + offset) ** 2
-    share /= share.sum(axis=1, keepdims=True)
+    disc_weight = np.sin(turn) ** 2 / (sine[:, None] + offset) ** 2
+    disc_weight /= disc_weight.sum(axis=1, keepdims=True)
     for length, width, angle in zip(
         defects.scratch_length_mm, defects.scratch_width_mm, defects.scratch_angle_rad, strict=True
     ):
@@ -591,7 +591,7 @@ def _add_scratches(
         spike = np.fft.irfft(spike, n=burst.angles, norm="forward").astype(np.float32)
         for table, (nm, weight) in zip(tables, bands, strict=True):
             per_rad = 2e6 * np.pi / nm * width
-            wave = np.exp(1j * sine[:, None] * per_rad) * (share @ np.exp(1j * offset[:, None] * per_rad))
+            wave = np.exp(1j * sine[:, None] * per_rad) * (disc_weight @ np.exp(1j * offset[:, None] * per_rad))
             wave *= np.exp(-((sine[:, None] * per_rad * blur) ** 2 + (per_rad * pixel_rad) ** 2) / 2)
             strength = 2 * length / np.pi * ((1 - wave.real) @ (weight * nm)) * (1e-6 / (4 * np.pi**2))
             table[:, :-1] += strength.astype(np.float32)[:, None] * spike
@@ -611,8 +611,8 @@ def _grains(burst: Starburst, sine: F64, bands: Sequence[tuple[F64, F64]], pixel
     out = np.zeros((len(bands), len(sine)))
     if not len(diameter):
         return out
-    share = np.geomspace(1e-6, 1.0, _GRAIN_POINTS)
-    lag_mm = share * diameter.max()
+    fraction = np.geomspace(1e-6, 1.0, _GRAIN_POINTS)
+    lag_mm = fraction * diameter.max()
     autocorrelation = np.zeros(len(lag_mm))
     for d, count in zip(*np.unique(diameter, return_counts=True), strict=True):
         x = np.minimum(lag_mm / d, 1)
