@@ -176,5 +176,5 @@ def test_mask_any_unites_the_classes_that_a_scene_chooses() -> None:
 
 def test_mask_effect_is_stored_by_default_and_soft_layers_need_their_fault() -> None:
     assert "mask_effect" in sampling.DatasetTable().layers
-    with pytest.raises(InputError, match="'dust_opacity': no fault of the scene has this layer; theirs: none"):
+    with pytest.raises(InputError, match="'dust_opacity': no fault of the scene has it; the faults have: none"):
         Session(config.parse_scene({"title": "t", "dataset": {"layers": ["dust_opacity"]}}, source="test"))

@@ -5,7 +5,7 @@ Each message is one sentence. The errors hold plain strings only, so that they c
 
 from __future__ import annotations
 
-# The most characters of a message and of a value: enough for any key, value and allowed range. A longer text, such
+# The most characters of a message and of a value. Any key, value and allowed range are shorter. A longer text, such
 # as a value in a user's file, loses its middle.
 _LONGEST_MESSAGE = 2000
 _LONGEST_VALUE = 120
@@ -51,7 +51,7 @@ def shown_whole(value: object) -> str:
 
 
 def _without_middle(text: str, length: int) -> str:
-    """Return a text; where it is longer than `length`, cut out its middle and state its length."""
+    """Return a text. If it is longer than `length`, a note of its length replaces its middle."""
     if len(text) <= length:
         return text
     return f"{text[: length * 2 // 3]} … {text[-length // 3 :]} ({len(text)} characters)"

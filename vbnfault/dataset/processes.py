@@ -10,16 +10,16 @@ figure                                this pool       loky                    Lo
 ====================================  ==============  ======================  ============================
 lines of this module, without this    245             171                     50, on top of `dask.py`
 further required packages             none            loky, cloudpickle       dask, distributed and theirs
-24 small samples, processor time      8.0 s           8.0 s                   9.2 s
-a task of 4 small samples, the same   42 ms           43 ms                   124 ms
+processor time of 24 small samples    8.0 s           8.0 s                   9.2 s
+processor time of a task of 4         42 ms           43 ms                   124 ms
 a sample that kills its worker twice  fails alone     the build ends          the build ends
 samples not made in that build        1 of 40         34 of 40                16 of 40
 Ctrl-C from a terminal                one sentence    not measured            tracebacks of its processes
 ====================================  ==============  ======================  ============================
 
-loky kills all workers when one dies and does not say which one it was, so a shard that had no part in it ended the
-build. The workers of the local cluster did not come back within ten minutes. On a cluster that a user runs, Dask
-does replace them (`tests/test_build_dask.py`).
+If one worker dies, loky kills all of them and does not say which one died. A healthy shard was therefore blamed
+and ended the build. The workers of the local cluster did not come back within ten minutes. On a cluster that a user
+runs, Dask does replace them (`tests/test_build_dask.py`).
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ _SECONDS_TO_STOP = 60.0  # for a worker to write its finished samples; a second 
 
 
 def _worker(factory: SessionFactory, path: Path, pipe: connection.Connection) -> None:
-    """Run a worker process: receive tasks from the pipe, send ticks back. It ends when its parent ends."""
+    """Run a worker process: receive tasks from the pipe, and send events back. It ends when its parent ends."""
     with contextlib.suppress(EOFError, OSError, interrupts.Stopped), streams.steady():
         interrupts.obey_parent()
         threading.Thread(target=_die_with_parent, daemon=True).start()
@@ -80,7 +80,7 @@ class _Process:
         self.process = context.Process(target=_worker, args=(factory, path, pipe_of_worker), daemon=True)
         try:
             with _environment(threads), _without_working_folder():
-                # otherwise `start` would start the tracker, and would no longer hold signals back
+                # If `start` had to start the tracker itself, signals would no longer be held back.
                 resource_tracker.ensure_running()
                 with interrupts.held():
                     self.process.start()
@@ -146,7 +146,7 @@ def _environment(threads: int) -> Iterator[None]:
 def _without_working_folder() -> Iterator[None]:
     """Keep the working folder out of the import path of processes started in a `with` block.
 
-    PYTHONSAFEPATH does the same for imports before they receive this path.
+    A process imports modules before it receives this path; PYTHONSAFEPATH protects those imports.
     """
     before = sys.path.copy()
     sys.path[:] = import_path()
@@ -171,9 +171,9 @@ class Pool:
         self._workers: list[_Process] = []
         self._again: deque[int] = deque()
         self._deaths_by_sample: Counter[int] = Counter()
-        # deaths while no sample was in work, since the shard's last sample was made
+        # number of deaths between samples, counted from the shard's last finished sample
         self._deaths_by_shard: Counter[int] = Counter()
-        # by shard, the samples to skip; the tasks of these shards are done with `careful`
+        # The samples to skip of each shard whose worker died. Its tasks have `careful` = True.
         self._given_up: dict[int, frozenset[int]] = {}
 
     def work(self, workers: int) -> None:
@@ -200,7 +200,7 @@ class Pool:
     def _next(self, worker: _Process | None, last: int | None) -> None:
         """Give the next task to a worker, or to a new one if it is None or due for replacement.
 
-        If no task is left, the worker ends. `last`: the shard that it completed.
+        If no task is left, the worker ends. `last` is the shard that it has just completed.
         """
         busy = [w.shard for w in self._workers if w is not worker]
         shard = self._again.popleft() if self._again else self._run.next_shard(last, busy)
@@ -238,7 +238,8 @@ class Pool:
     def _replace_dead(self, worker: _Process) -> None:
         """Replace a worker that died, and do its shard again.
 
-        Raises VbnfaultError at the second death at one shard without a sample in work and none made in between.
+        Raises VbnfaultError if two workers die at one shard while they work on no sample, and no sample of it was
+        finished in between.
         """
         self._workers.remove(worker)
         worker.stop()

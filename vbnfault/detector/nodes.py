@@ -15,15 +15,16 @@ from ..core.errors import InputError
 def node_of(shape: tuple[int, int], nodes: int) -> NDArray[np.uint8]:
     """Return the output node that reads each pixel, uint8[y, x].
 
-    One node is 0. Two nodes are 0 left and 1 right. Four nodes number the quadrants in reading order. The middle
-    row or column of an odd number belongs to the top or left.
+    A single node has the number 0. Of two nodes, 0 reads the left half and 1 the right half. Of four nodes, 0 and
+    1 read the upper quadrants and 2 and 3 the lower ones, from left to right. A middle row belongs to the upper
+    half, a middle column to the left half.
     """
     down, right = halves(shape, nodes)
     return (2 * down[:, None] + right).astype(np.uint8)
 
 
 def halves(shape: tuple[int, int], nodes: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Return, for each row and each column, the half (0 or 1) in which it lies, if the sensor is read in halves."""
+    """Return the half, 0 or 1, in which each row and each column lies; 0 where the sensor is not halved."""
     if nodes not in (1, 2, 4):
         raise InputError(f"nodes is {nodes}, but must be 1, 2 or 4")
     down, right = ((np.arange(n) >= (n + 1) // 2).astype(np.intp) for n in shape)
@@ -31,10 +32,7 @@ def halves(shape: tuple[int, int], nodes: int) -> tuple[NDArray[np.intp], NDArra
 
 
 def readout_steps(shape: tuple[int, int], nodes: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Return how many lines, int[y], and pixels, int[x], the node of each reads before it.
-
-    Nodes sit in the sensor's corners, the first at the top left (assumed), and are read at the same time.
-    """
+    """Return how many rows a node reads before each row, int[y], and pixels before each column, int[x]."""
     down, right = halves(shape, nodes)
     y, x = (np.arange(n) for n in shape)
     return np.where(down, shape[0] - 1 - y, y), np.where(right, shape[1] - 1 - x, x)

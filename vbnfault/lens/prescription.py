@@ -102,7 +102,7 @@ class Surface:
 class Prescription:
     """Describe a lens by its surfaces, front to back, with air in front and behind.
 
-    The sensor stands at the paraxial focus for the d line, wherever the thickness of the last row ends.
+    The sensor stands at the paraxial focus for the d line. The thickness of the last row does not move it.
 
     Attributes
     ----------
@@ -137,10 +137,10 @@ class Prescription:
 
         These lengths are radii, thicknesses (of elements, gaps and plates), rims, stop and aspheric coefficients.
 
-        What a maker or the environment adds to the glass keeps its physical size: layers of coatings in nm, and so
-        their reflectance; roughness in nm; grains of dust in µm; the number of particles per area of a cleanliness
-        level; the absorption of the glass per mm, so that a larger lens absorbs more. Field angles, f-numbers and
-        the paths of ghosts in units of the focal length do not change.
+        Some properties keep their physical size: the layers of coatings in nm and therefore their reflectance,
+        roughness in nm, grains of dust in µm, the number of particles per area at a cleanliness level, and the
+        absorption of the glass per mm. A larger lens therefore absorbs more. Field angles, f-numbers and the paths
+        of ghosts in units of the focal length do not change.
         """
         surfaces = tuple(
             replace(

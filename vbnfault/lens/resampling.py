@@ -1,4 +1,4 @@
-"""Resample a pinhole render to where a lens with rotational symmetry images it.
+"""Resample the render of a pinhole camera to the image that a lens with rotational symmetry makes.
 
 A pixel needs two numbers that depend on its distance from the axis alone: how far to stretch its position, and the
 solid angle from which it receives light. Both are tabulated over the squared distance, in equal steps.
@@ -22,10 +22,10 @@ _MIDWAY: F32 = np.array([[-1 / 16, 9 / 16, 9 / 16, -1 / 16]], dtype=np.float32)
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class RadialTables:
-    """Tabulate, per band, what a pixel needs over its squared distance from the axis, float32[band, step].
+    """Tabulate the two numbers of a pixel per band, float32[band, step], by its squared distance from the axis.
 
-    `stretch` is the tangent of the field angle over the image height in focal lengths; `solid_angle_sr` is
-    irradiance over radiance.
+    `stretch` is the tangent of the field angle divided by the image height in units of the focal length.
+    `solid_angle_sr` is irradiance divided by radiance.
     """
 
     stretch: F32
@@ -34,7 +34,7 @@ class RadialTables:
 
 def table_distances(reach_px: float) -> F64:
     """Return the distances from the axis in pixels at which the tables have their nodes, float64[step]."""
-    # the first step lies beside the axis: avoid a division by 0
+    # the first node lies slightly off the axis, to avoid a division by 0
     square = np.maximum(np.arange(STEPS), 1e-3) / (STEPS - 1)
     return np.asarray(np.sqrt(square) * reach_px)
 

@@ -22,7 +22,8 @@ F64 = NDArray[np.float64]
 _COLOURS = {"R": "tab:red", "G": "tab:green", "B": "tab:blue", "N": "tab:brown", "W": "0.4", "M": "0.2"}
 _LEAST_PIXELS = 16
 _MOST_BINS = 200
-# Variances below this fraction of the largest are not drawn: saturated pixels, whose noise is clipped.
+# Variances below this fraction of the largest one are not drawn. They belong to saturated pixels, whose noise is
+# clipped.
 _LEAST_NOISE = 1e-4
 # title, x axis and y axis of each panel
 _PANELS = (
@@ -69,7 +70,7 @@ class SensorRequest:
 
     @property
     def settings(self) -> Settings:
-        """Return the extent of the measurement."""
+        """Return the numbers of light levels and of images of the measurement."""
         return Settings(points=self.points, stack=self.stack)
 
     @property
@@ -164,7 +165,7 @@ def _draw_signals(panels: Any, name: str, channel: Characterisation, colour: str
     transfer, result = channel.transfer, channel.result
     signal = transfer.mean_dn - transfer.dark_mean_dn
     noise = transfer.variance_dn2 - transfer.dark_variance_dn2
-    noise = np.where(noise > _LEAST_NOISE * noise.max(), noise, np.nan)  # none of a saturated pixel
+    noise = np.where(noise > _LEAST_NOISE * noise.max(), noise, np.nan)  # not for saturated pixels
     panels[0].loglog(signal, noise, ".", color=colour, label=f"{name}: K = {result.gain_dn_per_e:.4g} DN/e")
     panels[0].loglog(signal, result.gain_dn_per_e * signal, "-", lw=0.8, color=colour)
     panels[1].plot(
@@ -201,7 +202,7 @@ def _draw_spatial(panels: Any, name: str, channel: Characterisation, colour: str
 
 
 def _set_ticks(axes: Any) -> None:
-    """Write the ticks as plain numbers, as few as fit."""
+    """Write the ticks as plain numbers, and no more of them than fit."""
     from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
     axes[0, 0].xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))

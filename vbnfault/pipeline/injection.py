@@ -21,7 +21,7 @@ _CLEARLY_VISIBLE_DN = 6.0
 def inject_faults(
     spec: SampleSpec, pose: Pose, rendering: Rendering, exposure: SceneExposure, views: int = 1
 ) -> Injection:
-    """Draw the commanded faults, `views` being the number of views of the sample that were rendered so far.
+    """Draw the commanded faults of a sample. `views` is the number of its views that were rendered so far.
 
     A fault without a visible effect is drawn again a few times, then left out. So the result holds the faults that
     are in the image, and labels never claim more.
@@ -49,7 +49,7 @@ def inject_faults(
 
 
 def fault_context(pose: Pose, rendering: Rendering, exposure: SceneExposure) -> FaultContext:
-    """Return the sample as its faults see it."""
+    """Return the context of the sample that its faults receive."""
     direction_C = pose.L_from_C.T @ pose.sun_L
     sunlight = rendering.scene.sun
     return FaultContext(
@@ -66,7 +66,7 @@ def fault_context(pose: Pose, rendering: Rendering, exposure: SceneExposure) -> 
 def draw_faults(
     spec: SampleSpec, development: Development, commanded: Sequence[str], draws: Draws, attempt: int
 ) -> dict[str, Draw]:
-    """Return the draws, together with one of each commanded fault that they lack; first of those that inform."""
+    """Return the draws, and a new one for each commanded fault without a draw; those that inform others first."""
     complete = dict(draws)
     for name in sorted(commanded, key=lambda n: not informs(spec.faults[n])):
         if name not in complete:
@@ -92,7 +92,7 @@ def _prepare_signals(development: Development, draws: Draws) -> None:
 def _invisible(development: Development, draws: Draws, *, stored: bool) -> list[str]:
     """Return the drawn faults without any effect on the noise-free image.
 
-    `stored` says that the scene stores all effects, so no cheaper test is needed.
+    `stored` is True if the scene stores all effects. They are then computed anyway, and no cheaper test is made.
     """
 
     def is_invisible(name: str) -> bool:
@@ -128,7 +128,7 @@ def _shows_on_some_rows(development: Development, draws: Draws, name: str) -> bo
 
 
 def _doubtful(development: Development, draws: Draws) -> set[str]:
-    """Return the drawn faults that a cheap test does not show to be clearly visible."""
+    """Return the drawn faults of which a cheap test cannot say that they are clearly visible."""
     if not development.leaves_camera(draws):
         return set(draws)
     doubtful = {
@@ -137,7 +137,7 @@ def _doubtful(development: Development, draws: Draws) -> set[str]:
         if draw.fault.effect_mask or not set(MOSAIC_STEPS).isdisjoint(draw.fault.steps)
     }
     optical, context = acting_at(draws, "electrons"), development.context
-    # these pixels are enough to see a clearly visible fault; the whole effect decides about the others
+    # A clearly visible fault shows on this part of the pixels. For the other faults the caller tests all pixels.
     some = (slice(context.shape[0] // 32, None, 16), slice(None, None, 4))
     for k, name in enumerate(optical):
         before, after = (

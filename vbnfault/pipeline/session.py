@@ -125,7 +125,7 @@ def _check_layers(scene: Scene, faults: Mapping[str, Fault], source: str) -> Non
         if layer.endswith(tuple(f"_{kind}" for kind in SOFT_KINDS)) and layer not in soft:
             known = ", ".join(soft) or "none"
             raise InputError(
-                f"{source}: dataset.layers: {layer!r}: no fault of the scene has this layer; theirs: {known}"
+                f"{source}: dataset.layers: {layer!r}: no fault of the scene has it; the faults have: {known}"
             )
     for layer in ("raw", "defects"):
         if layer in scene.dataset.layers and not scene.camera.detector:
@@ -227,8 +227,8 @@ class Session:
             growth=GROWTH_POWER,
             hurst=self.body.roughness.hurst,
         )
-        # for a self-affine surface of Hurst exponent 0.85 the slope of an octave of wavelength λ is 0.44 times the
-        # deviation over λ/4, divided by λ/4: the ratio of the integrals of its spectrum
+        # The slope of an octave of wavelength λ is 0.44 d / (λ/4), where d is the deviation over λ/4. The factor
+        # 0.44 is the ratio of two integrals of the spectrum of a self-affine surface of Hurst exponent 0.85.
         length = fine.longest_m / 4
         slope = 0.44 * float(self.body.roughness.deviation_at(length)) / length
         slope = min(slope, _STEEPEST_DETAIL) * self.scene.patch.relief

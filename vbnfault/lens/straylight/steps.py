@@ -19,7 +19,7 @@ from ..prescription import Surface
 
 _LOST, _FAR = -1e6, -1e4  # margin of rays that do not reach the sensor, and the smallest margin of other rays
 _BEYOND_EDGE = -1.0  # margin at which a soft edge ends in the dark
-_LIMIT_SHARPNESS = 100.0  # of an edge that a missed surface or total reflection makes, not a rim
+_LIMIT_SHARPNESS = 100.0  # sharpness of an edge where rays miss a surface or are totally reflected
 _LEAST_SLOPE = 1e-3  # smallest |dz| of a lost ray
 
 
@@ -38,7 +38,7 @@ class Step:
     eta
         Index before the surface over the index behind it.
     per_rim, sharpness
-        One over the radius of the rim, and one over the width of the rim's soft edge in radii of the rim.
+        1 / (radius of the rim), and 1 / (width of its soft edge, as a fraction of the radius).
     mirror, stop
         Whether the ray is reflected, and whether the surface is the stop.
     onward
@@ -118,8 +118,8 @@ def meet(
     - `paraxial.paraxial_ghosts`, which reads the radii from the prescription and treats the stop as round.
 
     A ray is a tuple of position, direction, fraction and rim values. The rim values are `radius`, the square of the
-    largest relative radius so far, and, if edges are soft, `margin`. If a stop with blades makes the rim values of
-    the mirrored ray different, these follow.
+    largest relative radius so far, and, if edges are soft, `margin`. A stop with blades may give the mirrored ray
+    other rim values than the ray; the rim values of the mirrored ray then follow.
 
     Parameters
     ----------
@@ -139,7 +139,8 @@ def meet(
 
     def real(square: Any) -> Any:
         """Return the root of a square that is negative for lost rays."""
-        # with soft edges a lost ray continues along the limit; with sharp edges the ray is nan from here on
+        # With soft edges, a lost ray continues as the last ray that still meets the surface. With sharp edges, its
+        # values become nan.
         return dr.sqrt(dr.maximum(square, 0) if soft else square)
 
     hit = (_on_conic if special else _on_sphere)(at, ray, sense, real)
@@ -161,8 +162,8 @@ def meet(
         bend = turn * c
         dx, dy, dz = dr.fma(bend, hit.x, keep * dx), dr.fma(bend, hit.y, keep * dy), dr.fma(keep, dz, -turn)
         dz = dr.fma(bend, hit.z, dz)
-    # a ray is also lost if it misses a surface, is totally reflected or turns back; with soft edges the ray then
-    # continues along the limit, so that the limit can be located between rays
+    # A ray is also lost if it misses a surface, is totally reflected or turns back. With soft edges `room` measures
+    # by how much, so that the edge between lost and other rays can be interpolated.
     room = ahead = dz * onward
     if soft:
         room = dr.minimum(dr.minimum(hit.under, dr.select(mirror, 1, left)), 4 * ahead)
@@ -260,7 +261,7 @@ def _rims_after(
         out.append(dr.maximum(radius, dr.select(room < 0, 1e6, beyond)))
         if soft:
             here = dr.minimum((1 - beyond) * (0.5 * at.sharpness), room * _LIMIT_SHARPNESS)
-            # the margins of a lost ray at later surfaces do not locate the edge
+            # keep the margin of the surface at which a ray was lost: later margins say nothing about this edge
             out.append(dr.select(margin[0] < _BEYOND_EDGE, margin[0], dr.minimum(margin[0], here)))
     return out
 
