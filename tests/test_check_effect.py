@@ -11,7 +11,7 @@ import pytest
 from pydantic import Field
 
 from vbnfault import Effect
-from vbnfault.core import tables
+from vbnfault.core.registry import undoing_registrations
 from vbnfault.detector.effects import contract, registry
 from vbnfault.testing import check_effect
 
@@ -21,10 +21,8 @@ PACKAGED = [cls for cls in registry().values() if contract.is_packaged(cls)]
 @pytest.fixture(autouse=True)
 def undone() -> Iterator[None]:
     """The effects that a test defines are gone after it."""
-    before = dict(contract._REGISTRY._classes)
-    yield
-    contract._REGISTRY._classes = before
-    tables.forget_schemas()
+    with undoing_registrations(always=True):
+        yield
 
 
 @pytest.mark.parametrize("effect", PACKAGED, ids=lambda cls: cls.name)
