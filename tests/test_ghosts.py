@@ -22,12 +22,12 @@ try:
 except VbnfaultError as error:
     pytest.skip(f"no usable LLVM: {error}", allow_module_level=True)
 
+from vbnfault.core.llvm import backend
 from vbnfault.lens.straylight.bundles import Rays, Tracer, name_of, routes
 from vbnfault.lens.straylight.ghosts import boxes, traced_ghosts
 from vbnfault.lens.straylight.irradiance import FlareModel, disc_samples
 from vbnfault.lens.straylight.raster import _EDGE_NODES, EDGE_HIGH, EDGE_LOW, edge_profiles
 from vbnfault.lens.straylight.settings import GhostSettings, SensorGrid
-from vbnfault.lens.straylight.steps import backend
 
 LENSES = (
     "nikkor_35_f2p8",
