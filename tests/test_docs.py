@@ -224,6 +224,12 @@ def test_the_reference_has_every_key_of_packaged_files(page: str, folder: str) -
     assert not [key for key in sorted(keys) if f"| `{key}` |" not in text]
 
 
+def test_figures_are_small() -> None:
+    figures = {figure.name: figure.stat().st_size for figure in (DOCS / "figures").glob("*.png")}
+    assert len(figures) >= 8
+    assert not {name: size for name, size in figures.items() if size > blocks.MOST_BYTES}
+
+
 # Numbers without a unit: counts, fractions, ratios, exponents, and coefficients of formulas.
 _DIMENSIONLESS = """
     adc_bits antiblooming asymmetry axis bands bits blade_rounding blades boulder_index bounces camera_axes

@@ -14,12 +14,14 @@ from jsonschema import Draft202012Validator
 
 from vbnfault.core import resources
 from vbnfault.core.errors import InputError
-from vbnfault.detector.sensor import parse_sensor
+from vbnfault.detector.readout import ReadoutSpec
+from vbnfault.detector.sensor import Sensor, parse_sensor
 from vbnfault.faults import registry
 from vbnfault.lens import parse_lens
 from vbnfault.output.schemas import KINDS, file_schema
 from vbnfault.pipeline.session import configure_faults
 from vbnfault.scene.config import parse_scene
+from vbnfault.scene.instrument import OF_A_SENSOR_FILE, CameraTable
 
 FOLDERS = {"scene": "scenes", "lens": "scenes/lenses", "sensor": "scenes/detectors"}
 PACKAGED = [(kind, name) for kind in KINDS for name in resources.packaged(FOLDERS[kind])]
@@ -168,6 +170,15 @@ def test_all_sources_and_all_keys_that_are_missing_are_named_at_once() -> None:
     rows = [{"diameter_mm": 1.0, "thickness_mm": 1.0, "stop": True}, *[{"diameter_mm": 1.0, "radius_mm": 9.0}] * 3]
     with pytest.raises(InputError, match=r"surface\[1\]\.thickness_mm, surface\[2\]\.thickness_mm: are missing"):
         parse_lens({"surface": rows}, source="x.toml")
+
+
+def test_keys_of_a_sensor_file_under_camera_are_told_where_they_belong() -> None:
+    with pytest.raises(InputError, match=r"^x\.toml: camera\.pattern = 'mono': is a key of a sensor.*pattern = "):
+        parse_scene({"title": "t", "camera": {"pattern": "mono"}}, source="x.toml")
+    with pytest.raises(InputError, match=r"camera\.demosaic = 'malvar': is a key of a sensor.*camera\.detector$"):
+        parse_scene({"title": "t", "camera": {"demosaic": "malvar"}}, source="x.toml")
+    assert set(OF_A_SENSOR_FILE) <= {*Sensor.__dataclass_fields__, *ReadoutSpec.__dataclass_fields__}
+    assert not set(OF_A_SENSOR_FILE) & set(CameraTable.model_fields)
 
 
 def test_misspelt_required_keys_are_named_beside_the_missing_ones() -> None:

@@ -41,6 +41,7 @@ _FENCE = re.compile(
 )
 _FILE = re.compile(r"# ([\w./-]+\.(?:toml|py|csv|txt))\n")
 WIDEST_PX = 720
+MOST_BYTES = 250_000
 LANGUAGES = ("sh", "python", "toml", "text", "json")
 
 # pip and the tests are what continuous integration itself runs
@@ -209,10 +210,27 @@ def figures(text: str) -> list[str]:
     return re.findall(r"!\[[^\]]*\]\((?:\.\./)?figures/([\w-]+\.png)\)", text)
 
 
-def main() -> None:
-    """Run one page at full size and keep its figures, at most `WIDEST_PX` wide."""
-    import cv2
+def keep_figure(made: Path, kept: Path) -> None:
+    """Keep an image as a figure, at most `WIDEST_PX` wide and `MOST_BYTES` large.
 
+    A larger one gets a palette, of half as many colours until it is small enough.
+    """
+    from PIL import Image  # comes with matplotlib
+
+    with Image.open(made) as opened:
+        image = opened.convert("RGB")
+    if image.width > WIDEST_PX:
+        size = (WIDEST_PX, round(image.height * WIDEST_PX / image.width))
+        image = image.resize(size, Image.Resampling.BOX, reducing_gap=None)
+    image.save(kept, optimize=True)
+    colours = 256
+    while kept.stat().st_size > MOST_BYTES and colours >= 16:
+        image.quantize(colours, dither=Image.Dither.NONE).save(kept, optimize=True)
+        colours //= 2
+
+
+def main() -> None:
+    """Run one page at full size and keep its figures."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("page", type=Path)
     parser.add_argument("--only", default="", help="run only the blocks that contain this word")
@@ -225,10 +243,7 @@ def main() -> None:
         run_page(chosen, Path(folder))
         made = [name for name in figures(text) if (Path(folder) / name).exists()]
         for name in made:
-            image = cv2.imread(str(Path(folder) / name))
-            scale = min(1.0, WIDEST_PX / image.shape[1])
-            shrunk = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-            cv2.imwrite(str(given.figures / name), shrunk, [cv2.IMWRITE_PNG_COMPRESSION, 9])
+            keep_figure(Path(folder) / name, given.figures / name)
             print(given.figures / name)
 
 

@@ -109,7 +109,7 @@ def render(
     from ..output import sample_files
 
     session = pipeline.Session(source, blocks=blocks, source=scene)
-    session.warn_of_assumptions()
+    session.warn_of_doubts()
     with writing(out):  # before the work
         out.mkdir(parents=True, exist_ok=True)
     for path in sample_files.write_frame(session.frame(sample), out):

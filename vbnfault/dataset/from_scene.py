@@ -135,7 +135,7 @@ def build_scene(
     contents = file_contents.Contents()
     with contents.in_use():
         session = pipeline.Session(scene, blocks=blocks, source=source)
-        session.warn_of_assumptions()
+        session.warn_of_doubts()
         spec = store_spec(session, blocks)
         seconds = estimated_seconds(session)
         description: list[str] = []

@@ -53,11 +53,25 @@ F64 = NDArray[np.float64]
 _ANGLES = 65  # field angles of the tables
 _BEYOND = 1.6  # the tables reach this multiple of the corner's tangent
 _DENSE = 4097  # nodes of the tables over slope
+_CELLS = 256  # cells of a quadrant, along each side, in which the lit part of the frame is counted
 _COLOUR_PX = 4  # extra guard band, since other colours may come from farther out than the d line
 _INSIDE = (slice(REACH_PX, -REACH_PX), slice(REACH_PX, -REACH_PX))
 
 
 # --- the lens --------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, kw_only=True)
+class FrameCoverage:
+    """Say how much of a frame a lens lights.
+
+    `lit_fraction` is the part of the frame that light reaches. `field_deg` is the largest angle from the axis in
+    this part, `corner_deg` that of the frame's corners.
+    """
+
+    lit_fraction: float
+    field_deg: float
+    corner_deg: float
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -245,6 +259,19 @@ class RealLens:
         solid = self._solid_angle_sr(mapped)
         seen = np.interp(mapped.slope_at(distance * self.focal_length_mm), mapped.slope, solid, right=0.0)
         return np.asarray(seen / solid[0])
+
+    @cached_property
+    def coverage(self) -> FrameCoverage:
+        """Return how much of the frame the lens lights."""
+        size = np.array([self.width_px, self.height_px]) / 2 / self.focal_length_px
+        middles = (np.arange(_CELLS) + 0.5) / _CELLS
+        distance = np.hypot(size[0] * middles[None, :], size[1] * middles[:, None]).ravel()
+        lit = self.relative_illumination(distance) > 0
+        ends = np.array([distance[lit].max(initial=0), np.hypot(*size)])
+        field_deg, corner_deg = np.degrees(np.arctan(self.undistorted(ends)))
+        return FrameCoverage(
+            lit_fraction=float(lit.mean()), field_deg=float(field_deg), corner_deg=float(corner_deg)
+        )
 
     @cached_property
     def guard_px(self) -> tuple[int, int]:

@@ -183,11 +183,11 @@ class Session:
         activity.begin("shape of the body")
         return assemble.make_body(self.scene)
 
-    def warn_of_assumptions(self) -> None:
-        """Warn, in one sentence, if a body other than 67P uses values of 67P."""
-        sentence = assemble.assumed_of_67p(self.scene, self.body)
-        if sentence:
-            warnings.warn(sentence, stacklevel=2)
+    def warn_of_doubts(self) -> None:
+        """Warn of values of 67P that another body has, and of a frame that is wider than the lens's field."""
+        for sentence in (assemble.assumed_of_67p(self.scene, self.body), assemble.dark_corners(self.scene)):
+            if sentence:
+                warnings.warn(sentence, stacklevel=2)
 
     @cached_property
     def vehicle(self) -> SpacecraftMesh | None:

@@ -15,10 +15,10 @@ from typing import Annotated, Any
 from pydantic import Field, model_validator
 
 from ..core import path_checks, resources, tables, toml_files
-from ..core.errors import InputError
+from ..core.errors import InputError, shown
 from ..core.tables import Table
 from ..reflectance import is_packaged
-from .instrument import CameraTable, RenderTable
+from .instrument import OF_A_SENSOR_FILE, CameraTable, RenderTable
 from .sampling import DatasetTable, GeometryTable, PlanTable, StratumTable
 from .surroundings import OrbitTable, SkyTable, SpacecraftTable, SpiceTable, SunTable
 from .target import BodyTable, PatchTable
@@ -130,6 +130,14 @@ def parse_scene(table: Mapping[str, Any], *, source: str, overrides: Sequence[st
 
     `overrides` are the dotted keys that replaced values of `source`; the message marks them.
     """
+    camera = table.get("camera")
+    for key in OF_A_SENSOR_FILE if isinstance(camera, Mapping) else ():
+        if key in camera:
+            mono = '; that of a monochrome camera has pattern = "mono"' if key == "pattern" else ""
+            raise InputError(
+                f"{source}: camera.{key} = {shown(camera[key])}: is a key of a sensor file, not of [camera]; write "
+                f"such a file (vbnfault new sensor NAME) and name it by camera.detector{mono}"
+            )
     return tables.parse(Scene, table, source=source, overrides=overrides)
 
 

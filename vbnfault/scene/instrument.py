@@ -26,6 +26,23 @@ OF_THE_DETECTOR = (
 )
 
 
+# Keys of a sensor file that users expect under [camera].
+OF_A_SENSOR_FILE = (
+    "architecture",
+    "bits",
+    "correct_defects",
+    "demosaic",
+    "effects",
+    "individual",
+    "pattern",
+    "quantum_efficiency",
+    "readout",
+    "shutter",
+    "temperature_K",
+    "transfer",
+)
+
+
 class CameraTable(Table):
     """Describe the camera and its exposure."""
 

@@ -283,6 +283,9 @@ def ellipsoid(semi_axes_m: tuple[float, float, float]) -> tuple[F64, NDArray[np.
     return np.asarray(sphere.vertices) * np.array(semi_axes_m), np.asarray(sphere.faces, dtype=np.int32)
 
 
+# A dark part of the frame that is smaller than this is not worth a warning.
+_DARK_FRACTION = 1e-3
+
 # --- camera and spacecraft ----------------------------------------------------------------------------------
 
 
@@ -398,6 +401,19 @@ def real_lens(c: CameraTable, pixel_pitch_um: float) -> RealLens:
         pixel_pitch_um=pixel_pitch_um,
         focus=c.focus,
         focus_distance_m=_focus_distance_m(c),
+    )
+
+
+def dark_corners(scene: Scene) -> str:
+    """Return one sentence if the frame is wider than the field of the scene's lens, or ""."""
+    lens = base_camera(scene).lens.real
+    if lens is None or 1 - lens.coverage.lit_fraction < _DARK_FRACTION:
+        return ""
+    field = lens.coverage
+    return (
+        f"camera.fov_deg = {scene.camera.fov_deg:g}: {lens.name} passes light up to {field.field_deg:.1f} deg from "
+        f"the axis, but the frame's corners lie at {field.corner_deg:.1f} deg, so {1 - field.lit_fraction:.1%} of "
+        "the frame is dark; lower fov_deg or choose a wider camera.lens"
     )
 
 
