@@ -221,11 +221,13 @@ def keep_figure(made: Path, kept: Path) -> None:
         image = opened.convert("RGB")
     if image.width > WIDEST_PX:
         size = (WIDEST_PX, round(image.height * WIDEST_PX / image.width))
-        image = image.resize(size, Image.Resampling.BOX, reducing_gap=None)
+        image = image.resize(size, Image.Resampling.BOX)
     image.save(kept, optimize=True)
     colours = 256
     while kept.stat().st_size > MOST_BYTES and colours >= 16:
-        image.quantize(colours, dither=Image.Dither.NONE).save(kept, optimize=True)
+        # this method keeps the few pixels of the legend's colours
+        palette = image.quantize(colours, Image.Quantize.MAXCOVERAGE, kmeans=2, dither=Image.Dither.NONE)
+        palette.save(kept, optimize=True)
         colours //= 2
 
 
