@@ -130,7 +130,7 @@ def parse_scene(table: Mapping[str, Any], *, source: str, overrides: Sequence[st
 
     `overrides` are the dotted keys that replaced values of `source`; the message marks them.
     """
-    camera = table.get("camera")
+    camera: Any = table.get("camera")
     for key in OF_A_SENSOR_FILE if isinstance(camera, Mapping) else ():
         if key in camera:
             mono = '; that of a monochrome camera has pattern = "mono"' if key == "pattern" else ""
