@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from typing import Any
 
 import cv2
@@ -36,6 +37,7 @@ def disc(centre: F64, radius: float, *, size: int = 160, lit: str = "all") -> tu
     return mean, inside.reshape(size, n, size, n).mean(axis=(1, 3)) > 0.5
 
 
+@cache
 def texture(size: int = 1024, seed: int = 0) -> NDArray[np.float32]:
     """Return noise with detail at scales of 1 to 20 px, from 40 to 210."""
     rng = np.random.default_rng(seed)
@@ -59,7 +61,7 @@ def ground(
     rays = np.column_stack([slopes, np.ones(len(slopes))]) @ camera_from_T
     depth = (_DISTANCE_M - position_T_m @ _NORMAL) / (rays @ _NORMAL)
     points = position_T_m + rays * depth[:, None]
-    for _ in range(25 if relief_m else 0):  # the slopes of the relief are below 1, so the iteration converges
+    for _ in range(15 if relief_m else 0):  # the slopes of the relief are below 1, so the iteration converges
         height = relief_m * np.sin(points[:, 0] / 9) * np.cos(points[:, 1] / 7)
         depth = (_DISTANCE_M + height - position_T_m @ _NORMAL) / (rays @ _NORMAL)
         points = position_T_m + rays * depth[:, None]

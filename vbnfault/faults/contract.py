@@ -80,6 +80,9 @@ class Fault:
     thin_lens_only
         Why the model does not act behind a prescription (`camera.lens`), as the second half of a sentence. "": it
         does.
+    per_exposure
+        True if the fault happens during one exposure, as a cosmic ray does, so that each image of a sequence has
+        its own draw. False: it is a state of the instrument, which lasts.
     effect_mask
         True if the mask holds the pixels that change (see `effect_level_dn`) instead of the footprint.
     soft_layer
@@ -115,6 +118,7 @@ class Fault:
     thin_lens_only: ClassVar[str] = ""
     needs_mosaic: ClassVar[bool] = False
     needs_ccd: ClassVar[bool] = False
+    per_exposure: ClassVar[bool] = False
     effect_mask: ClassVar[bool] = False
     soft_layer: ClassVar[str] = ""
     adds_past_rims: ClassVar[bool] = False

@@ -47,6 +47,7 @@ class Tracks(Fault):
     after = "smear"
     step = "charge"
     needs_mosaic = True
+    per_exposure = True
 
     flux_per_cm2_s: Interval = bounds(
         10.0,

@@ -39,12 +39,15 @@ class Metric:
         What it measures, with its equation.
     source
         Publication that defines it; empty where it needs none.
+    better
+        Which values are the better ones, so that worst and best images can be told.
     """
 
     name: str
     unit: str
     description: str
     source: str = ""
+    better: Literal["low", "high"] = "low"
 
 
 @dataclass(frozen=True, kw_only=True)
