@@ -85,7 +85,7 @@ def limb_error(
 
         RMS = √(Σ (e_image − e_clean)² / N).
 
-    `shift_px` is the common shift that fits the edges best. For a whole circle that moves by s the RMS is |s|/√2.
+    `shift_px` is the common shift that fits the edges best. For a whole circle that moves by s > 0 the RMS is s/√2.
 
     Parameters
     ----------
