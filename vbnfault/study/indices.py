@@ -1,0 +1,526 @@
+r"""Compute the indices of a study from its evaluations, with bootstrap intervals.
+
+All indices of a metric pool the blocks b of a study, which are its seeds and views: each variance and each part of it
+is summed over the blocks before the ratio is formed (the generalised index of Gamboa et al. 2014, doi
+10.1214/14-EJS895). So an index says how the metric varies within one view, and the differences between views do not
+enter it. With one block this is the usual index.
+
+==================  ==========================================================================================
+index               formula, with y_A, y_B, y_Ai the metric at A, B and A with factor i from B
+==================  ==========================================================================================
+first order S1      Σ_b ⟨y_B (y_Ai − y_A)⟩ / Σ_b V_b  (Saltelli et al. 2010, doi 10.1016/j.cpc.2009.09.018)
+total ST            Σ_b ⟨(y_A − y_Ai)²⟩ / 2 Σ_b V_b  (Jansen 1999, doi 10.1016/S0010-4655(98)00154-4)
+total interaction   Σ_b ⟨(y_A − y_Ai) (y_A − y_Aj)⟩ / Σ_b V_b: all terms that contain both i and j (Liu & Owen
+of i and j          2006, doi 10.1198/016214505000001410; Fruth et al. 2014, doi 10.1016/j.jspi.2013.11.007)
+dummy, first order  Σ_b ⟨y_A y_B⟩ / Σ_b V_b  (Khorashadi Zadeh et al. 2017, doi 10.1016/j.envsoft.2017.02.001)
+dummy, total        1 − Σ_b ⟨y_B²⟩ / Σ_b V_b  (the same)
+model form          Σ_b V_m(E[y|m]) / Σ_b V_b, with the law of total variance V = E_m[V(y|m)] + V_m(E[y|m])
+==================  ==========================================================================================
+
+The mean of each block is subtracted first, and V_b is the variance over A and B together. The estimators of S1 and
+ST give nothing but zeros for the dummy factor, because y_Ai = y_A. Those of Khorashadi Zadeh et al. do not cancel:
+their expectation is 0, and their spread shows the noise of a study of this size.
+
+`scipy.stats.sobol_indices` gives the same S1 and ST for one block (a test compares them), but it takes neither
+several blocks nor a number of base samples that is no power of two, which is what failed evaluations leave; and its
+bootstrap takes no seed. The intervals are percentile intervals of `scipy.stats.bootstrap` over base samples. They
+take base samples as independent, so with a Sobol' sequence they are too wide rather than too narrow. Morris and delta
+come from SALib.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import warnings
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .designs import Design, levels, salib, unit_problem
+from .spec import DUMMY, Metric
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+# SALib makes two bootstraps with some twenty density estimates for each resample: minutes for a thousand of them.
+_MOST_RESAMPLES_OF_DELTA = 20
+_LEAST_SAMPLES_OF_DELTA = 100  # SALib refuses to estimate delta from fewer
+_Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Results:
+    """Hold the values of all evaluations of a study.
+
+    Attributes
+    ----------
+    design
+        The design.
+    metrics
+        The metrics.
+    values
+        float64[seed, view, row, model, metric]; nan where an evaluation failed or a metric has no value.
+    """
+
+    design: Design
+    metrics: tuple[Metric, ...]
+    values: _Array
+
+    def blocks(self, metric: int, model: int, seed: int | None = None) -> _Array:
+        """Return the values of a metric with a model, float64[block, row]; of one seed, or of all."""
+        seeds = slice(None) if seed is None else slice(seed, seed + 1)
+        chosen = self.values[seeds, :, :, model, metric]
+        return chosen.reshape(-1, chosen.shape[-1])
+
+
+def compute(results: Results) -> xr.Dataset:
+    """Return the indices of a study by metric, model and factor, the dummy factor last, as labelled arrays."""
+    import xarray as xr
+
+    design = results.design
+    spec = design.spec
+    method = spec.design.method
+    arrays: dict[str, tuple[tuple[str, ...], _Array]] = {}
+    _add_moments(arrays, results)
+    if method == "sobol":
+        _add_sobol(arrays, results)
+    elif method == "morris":
+        _add_morris(arrays, results)
+    elif method == "latin_hypercube":
+        _add_delta(arrays, results)
+    elif method == "grid":
+        _add_grid(arrays, results)
+    else:
+        _add_ranges(arrays, results)
+    if spec.models is not None and method in ("sobol", "latin_hypercube", "grid"):
+        _add_model_share(arrays, results)
+    names = [*spec.keys, DUMMY]
+    coordinates: dict[str, Any] = {
+        "metric": [metric.name for metric in results.metrics],
+        "model": list(spec.model_names),
+        "factor": names,
+        "factor_b": names,
+        "seed": list(spec.scene.seeds),
+        "bound": ["low", "high"],
+    }
+    used = {name for dims, _ in arrays.values() for name in dims}
+    data = xr.Dataset(
+        {name: (dims, values, _attributes(name)) for name, (dims, values) in arrays.items()},
+        {
+            name: (name, np.array(values, dtype=None if name == "seed" else object), {"long_name": name})
+            for name, values in coordinates.items()
+            if name in used
+        },
+    )
+    data["metric"].attrs["units_of_metrics"] = [metric.unit for metric in results.metrics]
+    data["metric"].attrs["descriptions"] = [metric.description for metric in results.metrics]
+    data["factor"].attrs["units_of_factors"] = [*(factor.unit for factor in spec.factors), ""]
+    return data
+
+
+# --- names and units of the variables -----------------------------------------------------------------------------
+
+_LONG_NAMES = {
+    "mean": ("mean of the metric over the design", "units of the metric"),
+    "variance": ("variance of the metric within a block, over the design", "squared units of the metric"),
+    "samples_used": ("number of complete base samples of the design that the indices use", "1"),
+    "samples_left_out": ("number of base samples left out, because an evaluation failed or gave no value", "1"),
+    "S1": ("first-order index: fraction of the variance due to the factor alone", "1"),
+    "ST": ("total index: fraction of the variance due to the factor and its interactions", "1"),
+    "interaction": ("total interaction index: fraction of the variance due to terms with both factors", "1"),
+    "model_share": ("fraction of the variance over factors and models that is due to the model", "1"),
+    "mu": ("mean elementary effect, over the whole range of the factor", "units of the metric"),
+    "mu_star": ("mean absolute elementary effect, over the whole range of the factor", "units of the metric"),
+    "sigma": ("standard deviation of the elementary effects", "units of the metric"),
+    "delta": ("moment-independent index (Borgonovo 2007), bias-reduced (Plischke et al. 2013)", "1"),
+    "range": ("largest minus smallest value with the other factors nominal", "units of the metric"),
+}
+_SUFFIXES = {
+    "_interval": ", confidence interval",
+    "_by_seed": ", of each seed",
+    "_seed_deviation": ", standard deviation over the seeds",
+}
+_FORMULAE = {
+    "S1": "sum_b <y_B (y_AB - y_A)> / sum_b V_b",
+    "ST": "sum_b <(y_A - y_AB)^2> / (2 sum_b V_b)",
+    "interaction": "sum_b <(y_A - y_ABi) (y_A - y_ABj)> / sum_b V_b",
+    "model_share": "sum_b V_m(E[y|m]) / sum_b V_b, where V = E_m[V(y|m)] + V_m(E[y|m]) (law of total variance)",
+}
+
+
+def _attributes(name: str) -> dict[str, str]:
+    """Return long name, units and formula of a variable."""
+    for suffix, text in _SUFFIXES.items():
+        if name.endswith(suffix):
+            long_name, units = _LONG_NAMES[name.removesuffix(suffix)]
+            return {"long_name": long_name + text, "units": units}
+    long_name, units = _LONG_NAMES[name]
+    formula = {"formula": _FORMULAE[name]} if name in _FORMULAE else {}
+    return {"long_name": long_name, "units": units, **formula}
+
+
+# --- bootstrap ------------------------------------------------------------------------------------------------------
+
+
+def _ratios(terms: _Array, whole: _Array) -> _Array:
+    """Return the sums of terms over the sum of `whole`; nan where that sum is 0."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(whole > 0, terms / whole, np.nan)
+
+
+def _intervals(statistic: Any, n: int, design: Design, keys: Sequence[int]) -> _Array:
+    """Return percentile bootstrap intervals, float64[..., 2], over `n` base samples.
+
+    `statistic` gets how often each base sample was drawn, float64[resample, n], and returns the estimates, with the
+    resamples along the last axis. `keys` make the random numbers of each use different.
+    """
+    from scipy.stats import bootstrap
+
+    if n < 2:
+        return np.full((*np.shape(statistic(np.ones((1, n))))[:-1], 2), np.nan)
+
+    def of_indices(index: NDArray[np.int64], axis: int) -> _Array:
+        rows = np.atleast_2d(index)
+        flat = rows + n * np.arange(len(rows))[:, None]
+        counts = np.bincount(flat.ravel(), minlength=n * len(rows)).reshape(len(rows), n)
+        estimates: _Array = statistic(counts.astype(np.float64))
+        return estimates if index.ndim == 2 else estimates[..., 0]
+
+    table = design.spec.design
+    done = bootstrap(
+        (np.arange(n),),
+        of_indices,
+        n_resamples=table.resamples,
+        batch=256,
+        vectorized=True,
+        axis=-1,
+        confidence_level=table.confidence,
+        method="percentile",
+        rng=np.random.default_rng([table.seed, *keys]),
+    )
+    return np.stack([done.confidence_interval.low, done.confidence_interval.high], axis=-1)
+
+
+# --- Sobol' indices ---------------------------------------------------------------------------------------------------
+
+
+def _sobol_terms(blocks: _Array, factors: int) -> tuple[_Array, _Array]:
+    """Return the terms of all indices, float64[index, base], and of the variance, float64[base].
+
+    `blocks`: float64[block, row]. The indices are S1 and ST of each factor, S1 and ST of the dummy factor, and the
+    interaction of each pair. Base samples that are incomplete in all blocks are left out, those that are incomplete
+    in some count there not at all.
+    """
+    y = blocks.reshape(len(blocks), -1, factors + 2)
+    complete = np.isfinite(y).all(axis=-1)
+    y = y[:, complete.any(axis=0)]
+    complete = complete[:, complete.any(axis=0)]
+    y = np.where(complete[..., None], y, 0.0)
+    counts = np.maximum(complete.sum(axis=1), 1)
+    centre = y[..., :2].sum(axis=(1, 2)) / (2 * counts)
+    y = np.where(complete[..., None], y - centre[:, None, None], 0.0)
+    a, b, ab = y[..., 0], y[..., 1], np.moveaxis(y[..., 2:], -1, 0)
+    # blocks with fewer complete samples weigh as much as the others
+    weight = (len(y[0]) / counts)[:, None]
+    d = a - ab
+    pairs = [(weight * d[i] * d[j]).sum(axis=0) for i in range(factors) for j in range(i)]
+    terms = [
+        *(-weight * b * d).sum(axis=1),
+        *(weight * d**2 / 2).sum(axis=1),
+        (weight * a * b).sum(axis=0),
+        (weight * (a**2 - b**2) / 2).sum(axis=0),
+        *pairs,
+    ]
+    return np.array(terms), (weight * (a**2 + b**2) / 2).sum(axis=0)
+
+
+def _sobol_indices(values: _Array, factors: int) -> tuple[_Array, _Array, _Array]:
+    """Return S1 and ST, each [factor, ...] with the dummy factor last, and interaction [factor, factor, ...]."""
+    s1 = np.concatenate([values[:factors], values[2 * factors : 2 * factors + 1]])
+    total = np.concatenate([values[factors : 2 * factors], values[2 * factors + 1 : 2 * factors + 2]])
+    pairs = np.full((factors + 1, factors + 1, *values.shape[1:]), np.nan)
+    lower = np.tril_indices(factors, -1)
+    pairs[lower] = values[2 * factors + 2 :]
+    pairs[lower[::-1]] = values[2 * factors + 2 :]
+    return s1, total, pairs
+
+
+def _add_sobol(arrays: dict[str, tuple[tuple[str, ...], _Array]], results: Results) -> None:
+    """Add S1, ST and the interactions, with intervals and by seed."""
+    factors, (seeds, _, rows, models) = len(results.design.spec.keys), results.design.shape
+    metrics, base = len(results.metrics), rows // (len(results.design.spec.keys) + 2)
+    whole = np.full((metrics, models, factors + 1), np.nan)
+    s1, total = whole.copy(), whole.copy()
+    s1_interval, total_interval = (np.full((*whole.shape, 2), np.nan) for _ in range(2))
+    pairs = np.full((metrics, models, factors + 1, factors + 1), np.nan)
+    pairs_interval = np.full((*pairs.shape, 2), np.nan)
+    s1_by_seed, total_by_seed = (np.full((*whole.shape, seeds), np.nan) for _ in range(2))
+    used = np.zeros((metrics, models))
+    for i in range(metrics):
+        for j in range(models):
+            terms, variance = _sobol_terms(results.blocks(i, j), factors)
+            used[i, j] = len(variance)
+            s1[i, j], total[i, j], pairs[i, j] = _sobol_indices(
+                _ratios(terms.sum(axis=1), variance.sum()), factors
+            )
+
+            def resampled(counts: _Array, terms: _Array = terms, variance: _Array = variance) -> _Array:
+                return _ratios(terms @ counts.T, variance @ counts.T)
+
+            bounds = _intervals(resampled, len(variance), results.design, (i, j))
+            s1_interval[i, j], total_interval[i, j], pairs_interval[i, j] = _sobol_indices(bounds, factors)
+            for k in range(seeds):
+                terms, variance = _sobol_terms(results.blocks(i, j, k), factors)
+                of_seed = _sobol_indices(_ratios(terms.sum(axis=1), variance.sum()), factors)
+                s1_by_seed[i, j, :, k], total_by_seed[i, j, :, k], _ = of_seed
+    dims = ("metric", "model", "factor")
+    arrays["S1"], arrays["S1_interval"] = (dims, s1), ((*dims, "bound"), s1_interval)
+    arrays["ST"], arrays["ST_interval"] = (dims, total), ((*dims, "bound"), total_interval)
+    pair_dims = (*dims, "factor_b")
+    arrays["interaction"] = (pair_dims, pairs)
+    arrays["interaction_interval"] = ((*pair_dims, "bound"), pairs_interval)
+    _add_by_seed(arrays, {"S1": s1_by_seed, "ST": total_by_seed})
+    arrays["samples_used"] = (dims[:2], used)
+    arrays["samples_left_out"] = (dims[:2], base - used)
+
+
+def _add_by_seed(arrays: dict[str, tuple[tuple[str, ...], _Array]], by_seed: dict[str, _Array]) -> None:
+    """Add indices of each seed, and their standard deviation where there are several seeds."""
+    dims = ("metric", "model", "factor")
+    for name, values in by_seed.items():
+        arrays[f"{name}_by_seed"] = ((*dims, "seed"), values)
+        if values.shape[-1] > 1:
+            arrays[f"{name}_seed_deviation"] = (dims, values.std(axis=-1, ddof=1))
+
+
+def half_widths(indices: xr.Dataset) -> xr.DataArray:
+    """Return half the width of the intervals of the total indices, without the dummy factor's."""
+    interval = indices["ST_interval"].drop_sel(factor=DUMMY)
+    return (interval.sel(bound="high") - interval.sel(bound="low")) / 2
+
+
+def least_samples(factors: int, half_width: float, confidence: float) -> int:
+    r"""Return the least n of a Sobol' design that can give the total indices a half-width, as a power of two.
+
+    The total indices sum to at least 1, so the largest of k is at least 1/k. The differences y_A − y_Ai of which it
+    is the mean square are taken as normal: then its standard error is ST √(2/n), and n ≥ 2 (z / (k h))² for a
+    half-width h at the quantile z of the confidence level. This is what the best case needs, where all factors have
+    equal parts and do not interact; where few factors dominate, up to k² times as many are needed.
+    """
+    from scipy.stats import norm
+
+    z = float(norm.ppf(0.5 + confidence / 2))
+    return power_of_two(2 * (z / (factors * half_width)) ** 2)
+
+
+def needed_samples(n: int, reached: float, asked: float) -> int:
+    """Return the n that should reach a half-width, if `n` reached another one: half-widths shrink as 1 / √n."""
+    return power_of_two(n * (reached / asked) ** 2)
+
+
+def power_of_two(n: float) -> int:
+    """Return the smallest power of two that is at least `n`."""
+    return 1 << max(0, int(np.ceil(np.log2(max(n, 1.0)))))
+
+
+# --- the other designs ------------------------------------------------------------------------------------------------
+
+
+def _add_moments(arrays: dict[str, tuple[tuple[str, ...], _Array]], results: Results) -> None:
+    """Add mean and variance of each metric and model: of Sobol' designs over A and B."""
+    base = [i for i, role in enumerate(results.design.roles) if not role.startswith("AB:")]
+    values = results.values[:, :, base]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # a metric that never has a value
+        mean = np.nanmean(values, axis=(0, 1, 2))
+        variance = np.nanmean(np.nanvar(values, axis=2), axis=(0, 1))
+    arrays["mean"] = (("metric", "model"), mean.T)
+    arrays["variance"] = (("metric", "model"), variance.T)
+
+
+@contextlib.contextmanager
+def _steady() -> Iterator[None]:
+    """Keep numpy's global random numbers and the display of warnings, which SALib changes."""
+    state, form = np.random.get_state(), warnings.formatwarning  # noqa: NPY002
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    finally:
+        np.random.set_state(state)  # noqa: NPY002
+        warnings.formatwarning = form
+
+
+def _add_morris(arrays: dict[str, tuple[tuple[str, ...], _Array]], results: Results) -> None:
+    """Add the elementary effects of a Morris design, by SALib.
+
+    Over several blocks, `mu` and `mu_star` are means, `sigma` is the root mean square, and the half-width of the
+    interval is the mean, because all blocks share the trajectories. Incomplete trajectories are left out.
+    """
+    analyze = salib("analyze.morris", "design.method = 'morris'").analyze
+    design, table = results.design, results.design.spec.design
+    problem, steps = unit_problem(design.spec), len(design.spec.keys) + 2
+    seeds, views, _, models = design.shape
+    shape = (len(results.metrics), models, steps - 1, seeds * views)
+    mu, star, sigma, half = (np.full(shape, np.nan) for _ in range(4))
+    used = np.zeros(shape[:2])
+    for i, j in np.ndindex(*shape[:2]):
+        complete = np.zeros(table.n, dtype=bool)
+        for k, y in enumerate(results.blocks(i, j)):
+            whole = np.isfinite(y.reshape(table.n, steps)).all(axis=1)
+            complete |= whole
+            if not whole.any():
+                continue
+            rows = np.repeat(whole, steps)
+            with _steady():
+                found = analyze(
+                    problem,
+                    design.points[rows],
+                    y[rows],
+                    num_resamples=table.resamples,
+                    conf_level=table.confidence,
+                    num_levels=table.levels,
+                    seed=table.seed % 2**32,
+                )
+            mu[i, j, :, k], star[i, j, :, k] = found["mu"], found["mu_star"]
+            sigma[i, j, :, k], half[i, j, :, k] = found["sigma"], found["mu_star_conf"]
+        used[i, j] = complete.sum()
+    dims = ("metric", "model", "factor")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # a metric that never has a value
+        mean_star, mean_half = np.nanmean(star, axis=-1), np.nanmean(half, axis=-1)
+        arrays["mu"] = (dims, np.nanmean(mu, axis=-1))
+        arrays["mu_star"] = (dims, mean_star)
+        arrays["sigma"] = (dims, np.sqrt(np.nanmean(sigma**2, axis=-1)))
+        by_seed = np.nanmean(star.reshape(*shape[:3], seeds, views), axis=-1)
+    arrays["mu_star_interval"] = (
+        (*dims, "bound"),
+        np.stack([mean_star - mean_half, mean_star + mean_half], axis=-1),
+    )
+    _add_by_seed(arrays, {"mu_star": by_seed})
+    arrays["samples_used"] = (dims[:2], used)
+    arrays["samples_left_out"] = (dims[:2], table.n - used)
+
+
+def _add_delta(arrays: dict[str, tuple[tuple[str, ...], _Array]], results: Results) -> None:
+    """Add the moment-independent index delta and the first-order index of given data, by SALib; means over blocks.
+
+    Delta needs 100 samples; from fewer it is nan. Its bootstrap has at most 20 resamples.
+    """
+    analyze = salib("analyze.delta", "design.method = 'latin_hypercube'").analyze
+    design, table = results.design, results.design.spec.design
+    problem = unit_problem(design.spec)
+    # SALib's names: it refuses those that end like the columns of its result
+    problem["names"] = [f"x{i}" for i in range(problem["num_vars"])]
+    seeds, views, _, models = design.shape
+    shape = (len(results.metrics), models, problem["num_vars"], seeds * views)
+    values = {name: np.full(shape, np.nan) for name in ("delta_raw", "delta_raw_conf", "S1", "S1_conf")}
+    used = np.zeros(shape[:2])
+    for i, j in np.ndindex(*shape[:2]):
+        for k, y in enumerate(results.blocks(i, j)):
+            rows = np.isfinite(y)
+            used[i, j] = max(used[i, j], rows.sum())
+            if rows.sum() < 2 or np.ptp(y[rows]) == 0:
+                continue
+            with _steady():
+                found = analyze(
+                    problem,
+                    design.points[rows],
+                    y[rows],
+                    num_resamples=min(table.resamples, _MOST_RESAMPLES_OF_DELTA),
+                    conf_level=table.confidence,
+                    seed=table.seed % (2**32 - 1) + 1,  # SALib takes 0 as no seed
+                    method="all" if rows.sum() >= _LEAST_SAMPLES_OF_DELTA else "sobol",
+                )
+            for name in values.keys() & found.keys():
+                values[name][i, j, :, k] = found[name]
+    dims = ("metric", "model", "factor")
+    for name, key in {"delta": "delta_raw", "S1": "S1"}.items():
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", RuntimeWarning)  # too few samples
+            mean, half = np.nanmean(values[key], axis=-1), np.nanmean(values[f"{key}_conf"], axis=-1)
+            by_seed = np.nanmean(values[key].reshape(*shape[:3], seeds, views), axis=-1)
+        arrays[name] = (dims, mean)
+        arrays[f"{name}_interval"] = ((*dims, "bound"), np.stack([mean - half, mean + half], axis=-1))
+        _add_by_seed(arrays, {name: by_seed})
+    arrays["samples_used"] = (dims[:2], used)
+    arrays["samples_left_out"] = (dims[:2], len(design.roles) - used)
+
+
+def _add_grid(arrays: dict[str, tuple[tuple[str, ...], _Array]], results: Results) -> None:
+    """Add S1 and ST over the points of a grid, exactly, as the analysis of variance of a full factorial design.
+
+    There is nothing to resample, so they have no interval. A metric without a value at a point has no index.
+    """
+    spec, (_, _, _, models) = results.design.spec, results.design.shape
+    axes = [len(axis) for axis in levels(spec)]
+    shape = (len(results.metrics), models, len(axes) + 1)
+    s1, total = np.full(shape, np.nan), np.full(shape, np.nan)
+    for i, j in np.ndindex(*shape[:2]):
+        blocks = results.blocks(i, j)
+        y = blocks[np.isfinite(blocks).all(axis=1)].reshape(-1, *axes)
+        variance = y.reshape(len(y), -1).var(axis=1).sum()
+        s1[i, j, -1] = total[i, j, -1] = 0.0
+        for k in range(len(axes)):
+            others = tuple(a + 1 for a in range(len(axes)) if a != k)
+            s1[i, j, k] = _ratios(y.mean(axis=others).var(axis=1).sum(), variance)
+            total[i, j, k] = _ratios(y.var(axis=k + 1).mean(axis=tuple(range(1, len(axes)))).sum(), variance)
+    arrays["S1"], arrays["ST"] = (("metric", "model", "factor"), s1), (("metric", "model", "factor"), total)
+
+
+def _add_ranges(arrays: dict[str, tuple[tuple[str, ...], _Array]], results: Results) -> None:
+    """Add the range of each metric over the levels of one factor with the others nominal: the mean over blocks."""
+    spec, (_, _, rows, models) = results.design.spec, results.design.shape
+    ends = np.cumsum([1, *(len(axis) for axis in levels(spec))])
+    values = np.full((len(results.metrics), models, len(ends)), np.nan)
+    assert ends[-1] == rows
+    for i, j in np.ndindex(*values.shape[:2]):
+        y = results.blocks(i, j)
+        for k, (first, last) in enumerate(zip(ends[:-1], ends[1:], strict=True)):
+            moved = y[:, [0, *range(first, last)]]
+            moved = moved[np.isfinite(moved).all(axis=1)]
+            values[i, j, k] = np.ptp(moved, axis=1).mean() if len(moved) else np.nan
+        values[i, j, -1] = 0.0
+    arrays["range"] = (("metric", "model", "factor"), values)
+
+
+def _add_model_share(arrays: dict[str, tuple[tuple[str, ...], _Array]], results: Results) -> None:
+    """Add the fraction of the variance that is due to the choice of the model, by the law of total variance.
+
+    All models count equally, and a point counts only where every model has a value. A grid has no interval.
+    """
+    design = results.design
+    rows = np.array([not role.startswith("AB:") for role in design.roles])
+    per_base = 2 if design.spec.design.method == "sobol" else 1
+    share = np.full(len(results.metrics), np.nan)
+    interval = np.full((len(share), 2), np.nan)
+    for i in range(len(share)):
+        y = results.values[:, :, rows, :, i]  # [seed, view, row, model]
+        y = y.reshape(-1, int(rows.sum()) // per_base, per_base * y.shape[-1])
+        complete = np.isfinite(y).all(axis=-1)
+        y, complete = y[:, complete.any(axis=0)], complete[:, complete.any(axis=0)]
+        y = np.where(complete[..., None], y, 0.0)
+        centre = y.sum(axis=(1, 2)) / np.maximum(complete.sum(axis=1), 1) / y.shape[-1]
+        y = np.where(complete[..., None], y - centre[:, None, None], 0.0)
+        y = y.reshape(*y.shape[:2], per_base, -1).swapaxes(1, 2)  # [block, A or B, base, model]
+        count = complete.astype(np.float64)
+
+        def of_counts(counts: _Array, y: _Array = y, count: _Array = count) -> _Array:
+            with np.errstate(divide="ignore", invalid="ignore"):
+                weight = 1 / (count @ counts.T)  # [block, resample]
+                weight = np.where(np.isfinite(weight), weight, 0.0)
+                means = np.einsum("bpnm,rn->mbr", y, counts) * weight / y.shape[1]
+                squares = np.einsum("bpnm,rn->br", y**2, counts) * weight / y.shape[1] / y.shape[-1]
+            between = means.var(axis=0).sum(axis=0)
+            whole = (squares - means.mean(axis=0) ** 2).sum(axis=0)
+            return _ratios(between, whole)[None]
+
+        share[i] = of_counts(np.ones((1, y.shape[2])))[0, 0]
+        if design.spec.design.method != "grid":
+            interval[i] = _intervals(of_counts, y.shape[2], design, (i, 2**20))[0]
+    arrays["model_share"] = (("metric",), share)
+    if design.spec.design.method != "grid":
+        arrays["model_share_interval"] = (("metric", "bound"), interval)
