@@ -541,7 +541,7 @@ def test_two_builds_at_once_are_refused_also_where_the_store_is_replaced(tmp_pat
 
         def simulate(self, index: int) -> Sample:
             if not self.refused:
-                with pytest.raises(VbnfaultError, match="another build is writing") as e:
+                with pytest.raises(VbnfaultError, match="another command is writing") as e:
                     run(out, Session(log=str(log)), overwrite=True)
                 self.refused = str(e.value)
             return Session().simulate(index)
@@ -573,7 +573,9 @@ def test_where_a_file_system_has_no_locks_a_file_names_the_owner(
         os.utime(owner, (0, 0))
         while owner.stat().st_mtime == 0:  # until the next heart-beat
             pass
-        with pytest.raises(VbnfaultError, match=rf"another build .*\(process {os.getpid()} on .*delete .*owner if"):
+        with pytest.raises(
+            VbnfaultError, match=rf"another command .*\(process {os.getpid()} on .*delete .*owner if"
+        ):
             run(out)
     with lock.locked(out):  # another's file in the place of one's own is left alone
         owner.unlink()
@@ -588,7 +590,7 @@ def test_where_a_file_system_has_no_locks_a_file_names_the_owner(
         assert run(out).finished == SAMPLES
         assert not owner.exists()
     owner.write_text("nonsense")
-    with pytest.raises(VbnfaultError, match="another build"):
+    with pytest.raises(VbnfaultError, match="another command"):
         run(out)
 
 
@@ -612,13 +614,13 @@ def test_sites_are_worked_through_one_after_another(tmp_path: Path) -> None:
     store = st.create(tmp_path / "s.zarr", make_spec(), 40)
     plan = tasks.Run(store, np.arange(40) // 4 % 3, progress.Progress(40, shown=False))
     order, last = [], None
-    while (last := plan.next_shard(last)) is not None:
+    while (last := plan.next_task(last)) is not None:
         order.append(plan.lead(last))
     assert order == [0] * 4 + [1] * 3 + [2] * 3
     plan = tasks.Run(store, np.arange(40) // 4 % 3, progress.Progress(40, shown=False))
-    first = plan.next_shard()
+    first = plan.next_task()
     assert first is not None
-    second = plan.next_shard(None, [first])
+    second = plan.next_task(None, [first])
     assert second is not None
     assert plan.lead(second) != plan.lead(first)  # a second worker goes elsewhere
 
@@ -696,7 +698,7 @@ def test_a_store_without_room_for_its_first_file_leaves_nothing(tmp_path: Path) 
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (100, before[1]))
     try:
-        with pytest.raises(VbnfaultError, match=r"no store can be created here: File too large"):
+        with pytest.raises(VbnfaultError, match=r"nothing can be created here: File too large"):
             run(tmp_path / "s.zarr")
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)

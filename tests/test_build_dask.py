@@ -62,7 +62,7 @@ class Disturbing:
 
     def _user_interrupts(self) -> None:
         os.kill(self.client, signal.SIGINT)
-        while not dask._stopped_builds:
+        while not dask._stopped_jobs:
             time.sleep(0.01)
 
     def _client_dies(self) -> None:

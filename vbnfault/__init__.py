@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from .reflectance import DiscReflectance, Reflectance
     from .scene.config import Scene, load_scene
     from .store import open_dataset
+    from .study.run import study
 
 # public name → the module that defines it, and its name there; "": the module itself
 _HOME = {
@@ -61,6 +62,7 @@ _HOME = {
     "path": ("faults", "path"),
     "rows": ("faults", "rows"),
     "simulate": ("pipeline", "simulate"),
+    "study": ("study.run", "study"),
     "text": ("faults", "text"),
     "trace_flare": ("output.flare_images", "trace_flare"),
     "verify": ("dataset", "verify"),
@@ -96,6 +98,7 @@ __all__ = [
     "path",
     "rows",
     "simulate",
+    "study",
     "text",
     "trace_flare",
     "verify",

@@ -30,7 +30,8 @@ from .lock import locked
 from .processes import Pool
 from .progress import Progress, duration_text, size_text
 from .resume import check_same_scene, planned_blocks, with_versions_noted
-from .tasks import Run, SampleMaker, SessionFactory, run_here
+from .tasks import Run, SampleMaker, SampleWorkers, SessionFactory
+from .work import run_here
 
 __all__ = [
     "BuildFailed",
@@ -328,13 +329,14 @@ def _prepared_store(plan: BuildPlan, path: Path, options: BuildOptions) -> Store
 
 def _do_tasks(session_factory: SessionFactory, run: Run, options: BuildOptions) -> None:
     """Do all tasks of a run: on a cluster, in this process, or in worker processes."""
+    workers = SampleWorkers(session_factory, run.path.absolute())
     if options.scheduler is not None:
-        run_on_dask(session_factory, run, options.scheduler)
+        run_on_dask(workers, run, options.scheduler)
     elif options.workers == 1:
-        run_here(session_factory, run)
+        run_here(workers, run)
     else:
         threads = options.threads or max(1, (os.cpu_count() or 1) // options.workers)
-        Pool(session_factory, run, threads, options.recycle_shards).work(options.workers)
+        Pool(workers, run, threads, options.recycle_shards).work(options.workers)
 
 
 def _free_bytes(path: Path) -> int:

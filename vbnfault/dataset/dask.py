@@ -1,11 +1,11 @@
-"""Run the tasks of a build on a Dask cluster. Only this module imports dask.
+"""Run the tasks of a job, such as a build, on a Dask cluster. Only this module imports dask.
 
-The client, which is the process of the build, holds the lock of the store. A worker writes only while its task is
-wanted: if the client ends, or gives the task up, the worker stops at the next sample. After an interrupt the client
-waits until the workers have written their finished samples.
+The client, which is the process of the job, holds the lock of its folder. A worker writes only while its task is
+wanted: if the client ends, or gives the task up, the worker stops at the next item. After an interrupt the client
+waits until the workers have written their finished items.
 
 Dask itself does a task again when its worker dies, on another worker. After several deaths it gives the task up and
-raises KilledWorker. Then the sample that was in work is recorded as failed, and the shard is done without it.
+raises KilledWorker. Then the item that was in work is recorded as failed, and the task is done without it.
 """
 
 from __future__ import annotations
@@ -20,13 +20,11 @@ import time
 import uuid
 from collections import Counter
 from concurrent.futures import CancelledError, ThreadPoolExecutor
-from pathlib import Path
 from typing import Any
 
-from .. import store as store_module
 from ..core.errors import InputError, VbnfaultError
 from ..core.interrupts import Stopped
-from .tasks import Fatal, Lazy, Run, SessionFactory, Task, describe, work
+from .work import Fatal, Job, Worker, WorkerFactory, describe
 
 # Time limits for addresses where nothing listens, or no scheduler. They are long because the scheduler of a busy
 # cluster may need many seconds to answer.
@@ -34,55 +32,54 @@ _SECONDS_TO_CONNECT = 30.0
 _SECONDS_TO_ANSWER = 60.0
 _SECONDS_BETWEEN_CHECKS = 2.0  # of whether the cluster has workers
 _SECONDS_WITHOUT_WORKERS = 600.0  # after which a build ends whose workers have all gone
-_SECONDS_TO_STOP = 60.0  # for the workers to write their finished samples; a second Ctrl-C ends the wait
+_SECONDS_TO_STOP = 60.0  # for the workers to write their finished items; a second Ctrl-C ends the wait
 
 # --- on a worker of the cluster ----------------------------------------------------------------------------------
 
-_BETWEEN_SAMPLES = -1
-_session_lock = threading.Lock()
-_session: dict[bytes, Lazy] = {}
-_stopped_builds: set[str] = set()
+_BETWEEN_ITEMS = -1
+_worker_lock = threading.Lock()
+_worker: dict[bytes, Worker] = {}
+_stopped_jobs: set[str] = set()
 
 
-def _stop_build(build: str) -> None:
-    """Have the tasks of a build on this worker end at their next sample, with what they have made."""
-    _stopped_builds.add(build)
+def _stop_job(job: str) -> None:
+    """Have the tasks of a job on this worker end at their next item, with what they have made."""
+    _stopped_jobs.add(job)
 
 
-def _work_on_cluster(pickled: bytes, path: Path, task: Task, build: str) -> list[tuple[int, str, Any]]:
-    """Do a task on a Dask worker and return its events; the worker's threads share one session, one at a time.
+def _work_on_cluster(pickled: bytes, number: int, task: Any, job: str) -> list[tuple[int, str, Any]]:
+    """Do a task on a Dask worker and return its events; the threads share one `Worker`, one at a time.
 
-    What happens to a sample is also reported at once, under the topic `build` of the cluster's event log. The
+    What happens to an item is also reported at once, under the topic `job` of the cluster's event log. The
     scheduler has received the report before the work goes on, so that it is known what a worker died of.
     """
     import distributed
     from distributed.utils import sync
 
     events: list[tuple[int, str, Any]] = []
-    worker = distributed.get_worker()
-    key = worker.get_current_task()
+    node = distributed.get_worker()
+    key = node.get_current_task()
 
-    def report(sample: int, what: str, text: str) -> None:
-        sync(worker.loop, worker.scheduler.log_event, topic=build, msg=(task.shard, sample, what, text))
+    def report(item: int, what: str, text: str) -> None:
+        sync(node.loop, node.scheduler.log_event, topic=job, msg=(number, item, what, text))
 
-    def tick(sample: int, what: str, text: str) -> None:
-        if build in _stopped_builds:
+    def tick(item: int, what: str, text: str) -> None:
+        if job in _stopped_jobs:
             raise Stopped
-        if not _is_wanted(worker, key):
-            raise OSError("the build that gave this task has ended, or has given it to another worker")
+        if not _is_wanted(node, key):
+            raise OSError("the command that gave this task has ended, or has given it to another worker")
         if what != "kept":
-            report(sample, what, text if what == "stage" else "")
+            report(item, what, text if what == "stage" else "")
         if what not in ("begun", "stage"):
-            events.append((sample, what, text))
+            events.append((item, what, text))
 
-    with _session_lock:
-        report(_BETWEEN_SAMPLES, "started", "")
-        if pickled not in _session:
-            _session.clear()
-            _session[pickled] = Lazy(pickle.loads(pickled))
-        simulate = _session[pickled].simulate
+    with _worker_lock:
+        report(_BETWEEN_ITEMS, "started", "")
+        if pickled not in _worker:
+            _worker.clear()
+            _worker[pickled] = pickle.loads(pickled)()
         try:
-            work(simulate, store_module.open_store(path, "r+"), task, tick)
+            _worker[pickled].do(task, tick)
         except Stopped:
             pass
         except Fatal as fatal:
@@ -102,7 +99,7 @@ def _is_wanted(worker: Any, key: Any) -> bool:
     return task is not None and task.state == "executing" and worker.status.name in ("running", "paused")
 
 
-# --- in the process of the build ---------------------------------------------------------------------------------
+# --- in the process of the job -----------------------------------------------------------------------------------
 
 
 def check_scheduler(address: str) -> None:
@@ -151,14 +148,14 @@ async def _kind_of_dask_node(address: str) -> str:
         return ""
 
 
-def run_on_dask(factory: SessionFactory, run: Run, scheduler: str) -> None:
-    """Do all tasks of a run on the Dask cluster at an address.
+def run_on_dask(factory: WorkerFactory, job: Job, scheduler: str) -> None:
+    """Do all tasks of a job on the Dask cluster at an address.
 
     Raises
     ------
     VbnfaultError
         If the connection to the scheduler is lost, if the cluster loses all its workers, or if workers keep dying
-        while no sample is in work.
+        while no item is in work.
     """
     import distributed
 
@@ -167,34 +164,34 @@ def run_on_dask(factory: SessionFactory, run: Run, scheduler: str) -> None:
     except (OSError, ValueError) as error:
         raise VbnfaultError(f"--scheduler {scheduler}: cannot connect: {error}") from error
     with client:
-        _ClusterRun(client, factory, run, scheduler).work()
+        _ClusterRun(client, factory, job, scheduler).work()
 
 
 class _ClusterRun:
-    """Hand out the tasks of a run on a cluster, collect their events, and repeat tasks whose worker died."""
+    """Hand out the tasks of a job on a cluster, collect their events, and repeat tasks whose worker died."""
 
-    def __init__(self, client: Any, factory: SessionFactory, run: Run, scheduler: str) -> None:
-        self._client, self._run, self._scheduler = client, run, scheduler
+    def __init__(self, client: Any, factory: WorkerFactory, job: Job, scheduler: str) -> None:
+        self._client, self._job, self._scheduler = client, job, scheduler
         self._pickled = pickle.dumps(factory)
-        self._build = f"vbnfault-{uuid.uuid4().hex}"
-        self._shards: dict[Any, int] = {}  # future → shard, of tasks that have not ended
+        self._topic = f"vbnfault-{uuid.uuid4().hex}"
+        self._tasks: dict[Any, int] = {}  # future → number of the task, of those that have not ended
         self._ended: queue.SimpleQueue[Any] = queue.SimpleQueue()  # their futures, as they end
-        # shard → the sample that a worker is making, or _BETWEEN_SAMPLES; only shards that a worker has started
+        # task → the item that a worker is making, or _BETWEEN_ITEMS; only tasks that a worker has started
         self._in_work: dict[int, int] = {}
-        self._given_up: dict[int, frozenset[int]] = {}  # shard → samples that workers do not survive
-        self._deaths_between_samples: Counter[int] = Counter()  # by shard
+        self._given_up: dict[int, frozenset[int]] = {}  # task → items that workers do not survive
+        self._deaths_between_items: Counter[int] = Counter()  # by task
         self._seen_workers = False
         self._without_workers_since: float | None = None
 
     def work(self) -> None:
         """Do all tasks. At an interrupt or an error, let the workers write what they have made."""
-        self._client.subscribe_topic(self._build, self._on_event)
+        self._client.subscribe_topic(self._topic, self._on_event)
         try:
-            shard = self._run.next_shard()
-            while shard is not None:
-                self._submit(shard)
-                shard = self._run.next_shard(shard)
-            while self._shards:
+            number = self._job.next_task()
+            while number is not None:
+                self._submit(number)
+                number = self._job.next_task(number)
+            while self._tasks:
                 self._take(self._next_ended())
         except BaseException:
             with contextlib.suppress(Exception):
@@ -202,31 +199,31 @@ class _ClusterRun:
             raise
         finally:
             with contextlib.suppress(Exception):
-                self._client.cancel(list(self._shards))
+                self._client.cancel(list(self._tasks))
 
-    def _submit(self, shard: int) -> None:
-        """Give the task of a shard to the cluster."""
-        given_up = self._given_up.get(shard)
-        task = self._run.task(shard, given_up or frozenset(), careful=given_up is not None)
+    def _submit(self, number: int) -> None:
+        """Give a task to the cluster."""
+        given_up = self._given_up.get(number)
+        task = self._job.task(number, given_up or frozenset(), careful=given_up is not None)
         future = self._client.submit(
             _work_on_cluster,
             self._pickled,
-            self._run.store.path.absolute(),
+            number,
             task,
-            self._build,
+            self._topic,
             pure=False,
-            priority=-len(self._shards),  # keeps the order of `next_shard`, which groups by site
+            priority=-len(self._tasks),  # keeps the order of `next_task`, which groups by lead
         )
-        self._shards[future] = shard
+        self._tasks[future] = number
         future.add_done_callback(self._ended.put)
 
     def _on_event(self, event: tuple[float, Any]) -> None:
         """Handle an event that a worker reports at once."""
-        shard, sample, what, text = event[1]
+        number, item, what, text = event[1]
         if what == "stage":
-            self._run.progress.stage(text)
+            self._job.progress.stage(text)
         else:
-            self._in_work[shard] = sample if what == "begun" else _BETWEEN_SAMPLES
+            self._in_work[number] = item if what == "begun" else _BETWEEN_ITEMS
 
     def _next_ended(self) -> Any:
         """Wait for the next task to end, and return its future. Raises VbnfaultError if the workers are gone."""
@@ -247,18 +244,20 @@ class _ClusterRun:
             return
         if self._without_workers_since is None:
             self._without_workers_since = time.monotonic()
-            self._run.progress.say(f"--scheduler {self._scheduler}: the cluster has no workers; waiting for some")
+            self._job.progress.say(f"--scheduler {self._scheduler}: the cluster has no workers; waiting for some")
         seconds = time.monotonic() - self._without_workers_since
         if (self._seen_workers or self._in_work) and seconds >= _SECONDS_WITHOUT_WORKERS:
             raise VbnfaultError(
-                f"--scheduler {self._scheduler}: all workers of the cluster have gone; finished samples stay, and "
+                f"--scheduler {self._scheduler}: all workers of the cluster have gone; finished "
+                f"{self._job.item_noun}s stay, and "
                 "the same command resumes"
             )
 
     def _connection_lost(self) -> VbnfaultError:
         """Return the error for a scheduler that does not answer any more."""
         return VbnfaultError(
-            f"--scheduler {self._scheduler}: the connection to the scheduler was lost; finished samples stay, and "
+            f"--scheduler {self._scheduler}: the connection to the scheduler was lost; finished "
+            f"{self._job.item_noun}s stay, and "
             "the same command resumes"
         )
 
@@ -266,55 +265,58 @@ class _ClusterRun:
         """Handle the result of a task that has ended."""
         import distributed
 
-        shard = self._shards.pop(future)
+        number = self._tasks.pop(future)
         try:
             events = future.result()
         except CancelledError as error:  # only the loss of the scheduler cancels a task of ours
             raise self._connection_lost() from error
         except distributed.KilledWorker as error:
-            self._do_again(shard, error.allowed_failures + 1)
+            self._do_again(number, error.allowed_failures + 1)
             return
         except Exception as error:  # the cluster gave up, for example because it could not load vbnfault
             text = describe(error)
-            events = [(i, "failed", text) for i in self._run.store.shard(shard)]
-        self._in_work.pop(shard, None)
-        for sample, what, payload in events:
+            events = [(i, "failed", text) for i in self._job.items(number)]
+        self._in_work.pop(number, None)
+        for item, what, payload in events:
             if what == "fatal":
                 raise payload
-            self._run.tick(sample, what, payload)
+            self._job.tick(item, what, payload)
 
-    def _do_again(self, shard: int, deaths: int) -> None:
-        """Do a shard again after the cluster gave it up, without the sample that its workers died of.
+    def _do_again(self, number: int, deaths: int) -> None:
+        """Do a task again after the cluster gave it up, without the item that its workers died of.
 
         Dask also gives up tasks that only waited on a worker that died; these are submitted again as they were.
-        Raises VbnfaultError at the second time that a task was started and no sample was in work.
+        Raises VbnfaultError at the second time that a task was started and no item was in work.
         """
-        sample = self._in_work.pop(shard, None)
+        item = self._in_work.pop(number, None)
+        task_noun, item_noun = f"{self._job.task_noun} {number}", self._job.item_noun
         how = f"{deaths} workers of the cluster died" if deaths > 1 else "a worker of the cluster died"
-        if sample == _BETWEEN_SAMPLES:
-            self._deaths_between_samples[shard] += 1
-            if self._deaths_between_samples[shard] > 1:
+        if item == _BETWEEN_ITEMS:
+            self._deaths_between_items[number] += 1
+            if self._deaths_between_items[number] > 1:
                 raise VbnfaultError(
-                    f"{self._run.store.path}: shard {shard}: {how} while no sample was in work, for the second "
-                    "time; finished samples stay, and the same command resumes"
+                    f"{self._job.path}: {task_noun}: {how} while no {item_noun} was in work, for the second "
+                    f"time; finished {item_noun}s stay, and the same command resumes"
                 )
-            self._run.progress.say(f"shard {shard}: {how} while no sample was in work; trying again")
-        elif sample is not None:
-            self._run.tick(sample, "failed", f"{how} while it was in work")
-            self._given_up[shard] = self._given_up.get(shard, frozenset()) | {sample}
-        self._submit(shard)
+            self._job.progress.say(f"{task_noun}: {how} while no {item_noun} was in work; trying again")
+        elif item is not None:
+            self._job.tick(item, "failed", f"{how} while it was in work")
+            self._given_up[number] = self._given_up.get(number, frozenset()) | {item}
+        self._submit(number)
 
     def _wind_up(self) -> None:
         """Take back the tasks that no worker has begun, and wait until the others have written what they made."""
         if self._client.status != "running":
             return
         begun = {key for keys in self._client.processing().values() for key in keys}
-        waiting = {future for future in self._shards if future.key in begun}
-        self._client.cancel([future for future in self._shards if future not in waiting])
+        waiting = {future for future in self._tasks if future.key in begun}
+        self._client.cancel([future for future in self._tasks if future not in waiting])
         if not waiting:
             return
-        self._client.run(_stop_build, self._build, on_error="ignore")
-        self._run.progress.say("waiting for the workers of the cluster to write their finished samples")
+        self._client.run(_stop_job, self._topic, on_error="ignore")
+        self._job.progress.say(
+            f"waiting for the workers of the cluster to write their finished {self._job.item_noun}s"
+        )
         deadline = time.monotonic() + _SECONDS_TO_STOP
         while waiting and (seconds := deadline - time.monotonic()) > 0:
             with contextlib.suppress(queue.Empty):

@@ -1,4 +1,4 @@
-"""Lock a store so that only one build writes to it at a time, even if its folder is replaced meanwhile."""
+"""Lock a store or a study: only one command writes to it at a time, even if its folder is replaced meanwhile."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _SECONDS_BETWEEN_BEATS = 10.0
 
 @contextlib.contextmanager
 def locked(path: Path) -> Iterator[None]:
-    """Hold the lock of the store at `path` during a `with` block.
+    """Hold the lock of the store or study at `path` during a `with` block.
 
     The lock is a locked file beside the store, `.NAME.lock`. So it exists before the store does, and it stays when
     the store is replaced. The operating system releases the lock when the process ends.
@@ -41,7 +41,7 @@ def locked(path: Path) -> Iterator[None]:
     Raises
     ------
     VbnfaultError
-        Another build holds the lock.
+        Another command holds the lock.
     InputError
         No lock can be made at this path.
     """
@@ -51,7 +51,7 @@ def locked(path: Path) -> Iterator[None]:
     except OSError as error:
         above = next((p for p in path.absolute().parents if os.path.isfile(p)), None)
         why = f"{above} is a file, not a folder" if above else error.strerror
-        raise InputError(f"{path}: no store can be created here: {why}") from None
+        raise InputError(f"{path}: nothing can be created here: {why}") from None
     with contextlib.ExitStack() as stack:
         if fcntl is None or not _lock_file(path, beside / f".{path.name}.lock", stack):
             _own(path, beside / f".{path.name}.owner", stack)
@@ -66,7 +66,7 @@ def _lock_file(path: Path, file: Path, stack: contextlib.ExitStack) -> bool:
             handle = os.open(file, os.O_RDWR | os.O_CREAT, 0o666)
         except OSError as error:
             if not os.path.isdir(path):
-                raise InputError(f"{path}: no store can be created here: {error.strerror}") from None
+                raise InputError(f"{path}: nothing can be created here: {error.strerror}") from None
             # its parent folder is not writable, so the store cannot be replaced: lock the store's own folder
             handle = os.open(path, os.O_RDONLY)
         with contextlib.ExitStack() as undo:
@@ -176,9 +176,9 @@ def _remove_owner(file: Path, owner: dict[str, Any]) -> None:
 
 
 def _held(path: Path, owner: dict[str, Any], file: Path | None = None) -> VbnfaultError:
-    """Return the error for a lock that another build holds."""
+    """Return the error for a lock that another command holds."""
     by = f" (process {owner['pid']} on {owner['host']})" if {"pid", "host"} <= owner.keys() else ""
-    sentence = f"{path}: another build is writing to it{by}; wait until it ends"
+    sentence = f"{path}: another command is writing to it{by}; wait until it ends"
     if file is not None:
         with contextlib.suppress(OSError):
             beat = time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(file.stat().st_mtime))

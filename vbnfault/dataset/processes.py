@@ -1,6 +1,6 @@
-"""Run the tasks of a build in worker processes on this machine.
+"""Run the tasks of a job, such as a build, in worker processes on this machine.
 
-A worker process is replaced after a number of shards, before it grows too large, and when it dies.
+A worker process is replaced after a number of tasks, before it grows too large, and when it dies.
 
 Two libraries were tried in place of this pool, with the same tasks and tests: `loky` 3.7, and a `LocalCluster` of
 Dask 2026.8 below `dask.py`. Measured with two workers, on two cores that other programs loaded:
@@ -33,28 +33,26 @@ import threading
 from collections import Counter, deque
 from collections.abc import Callable, Iterator
 from multiprocessing import connection, resource_tracker
-from pathlib import Path
 from typing import Any
 
-from .. import store as store_module
 from ..core import interrupts, streams
 from ..core.environment import import_path
 from ..core.errors import VbnfaultError
-from .tasks import Fatal, Lazy, Run, SessionFactory, Task, work
+from .work import Fatal, Job, WorkerFactory
 
-_SECONDS_TO_STOP = 60.0  # for a worker to write its finished samples; a second Ctrl-C ends the wait
+_SECONDS_TO_STOP = 60.0  # for a worker to write its finished items; a second Ctrl-C ends the wait
 
 
-def _worker(factory: SessionFactory, path: Path, pipe: connection.Connection) -> None:
+def _worker(factory: WorkerFactory, pipe: connection.Connection) -> None:
     """Run a worker process: receive tasks from the pipe, and send events back. It ends when its parent ends."""
     with contextlib.suppress(EOFError, OSError, interrupts.Stopped), streams.steady():
         interrupts.obey_parent()
         threading.Thread(target=_die_with_parent, daemon=True).start()
-        session, store = Lazy(factory), store_module.open_store(path, "r+")
+        worker = factory()
         while True:
             task = pipe.recv()
             try:
-                work(session.simulate, store, task, lambda *event: pipe.send(event))
+                worker.do(task, lambda *event: pipe.send(event))
             except Fatal as fatal:
                 pipe.send((-1, "fatal", fatal.error))
             except VbnfaultError as error:  # files cannot be written
@@ -74,10 +72,10 @@ def _die_with_parent() -> None:
 class _Process:
     """Represent a worker process in its parent."""
 
-    def __init__(self, factory: SessionFactory, path: Path, threads: int) -> None:
+    def __init__(self, factory: WorkerFactory, threads: int) -> None:
         context = multiprocessing.get_context("spawn")
         self.pipe, pipe_of_worker = context.Pipe()
-        self.process = context.Process(target=_worker, args=(factory, path, pipe_of_worker), daemon=True)
+        self.process = context.Process(target=_worker, args=(factory, pipe_of_worker), daemon=True)
         try:
             with _environment(threads), _without_working_folder():
                 # If `start` had to start the tracker itself, signals would no longer be held back.
@@ -90,19 +88,19 @@ class _Process:
             raise
         pipe_of_worker.close()
         self.has_reported = False  # whether it has sent anything yet
-        self.shards = 0
-        self.shard = -1
-        self.sample: int | None = None  # the sample it works on
+        self.tasks = 0
+        self.number = -1  # of its task
+        self.item: int | None = None  # the item it works on
 
-    def give(self, task: Task) -> None:
+    def give(self, number: int, task: Any) -> None:
         """Send it a task."""
-        self.shard, self.sample = task.shard, None
-        self.shards += 1
+        self.number, self.item = number, None
+        self.tasks += 1
         with contextlib.suppress(OSError):  # it died; the next `connection.wait` reports that
             self.pipe.send(task)
 
     def stop(self, *, at_once: bool = False) -> None:
-        """Ask it to end: after its task, or at once but with time to write its finished samples."""
+        """Ask it to end: after its task, or at once but with time to write its finished items."""
         if at_once and not self.has_reported:
             self.process.kill()  # it has made nothing yet
         elif at_once:
@@ -157,29 +155,29 @@ def _without_working_folder() -> Iterator[None]:
 
 
 class Pool:
-    """Run worker processes, which are replaced after `recycle` shards, or when they die.
+    """Run worker processes, which are replaced after `recycle` tasks, or when they die.
 
-    If a process dies during a sample, the shard is done again in a new process, which writes each sample as soon as
-    it is made. So a second crash loses only that sample, which is then recorded as failed and skipped. If a process
-    dies while it works on no sample, its shard is done again, too. The build ends if this happens twice to a shard
-    that made no sample in between.
+    If a process dies during an item, the task is done again in a new process, which writes each item as soon as it
+    is made. So a second crash loses only that item, which is then recorded as failed and skipped. If a process dies
+    while it works on no item, its task is done again, too. The job ends if this happens twice to a task that made
+    no item in between.
     """
 
-    def __init__(self, factory: SessionFactory, run: Run, threads: int, recycle: int) -> None:
-        self._new: Callable[[], _Process] = lambda: _Process(factory, run.store.path, threads)
-        self._run, self._recycle = run, recycle
+    def __init__(self, factory: WorkerFactory, job: Job, threads: int, recycle: int) -> None:
+        self._new: Callable[[], _Process] = lambda: _Process(factory, threads)
+        self._job, self._recycle = job, recycle
         self._workers: list[_Process] = []
         self._again: deque[int] = deque()
-        self._deaths_by_sample: Counter[int] = Counter()
-        # number of deaths between samples, counted from the shard's last finished sample
-        self._deaths_by_shard: Counter[int] = Counter()
-        # The samples to skip of each shard whose worker died. Its tasks have `careful` = True.
+        self._deaths_by_item: Counter[int] = Counter()
+        # number of deaths between items, counted from the task's last finished item
+        self._deaths_by_task: Counter[int] = Counter()
+        # The items to skip of each task whose worker died. These tasks have `careful` = True.
         self._given_up: dict[int, frozenset[int]] = {}
 
     def work(self, workers: int) -> None:
-        """Do all tasks of the run with this number of processes."""
+        """Do all tasks of the job with this number of processes."""
         try:
-            for _ in range(min(workers, self._run.store.shards)):
+            for _ in range(min(workers, self._job.tasks)):
                 self._next(None, None)
             while self._workers:
                 by_pipe: dict[Any, _Process] = {worker.pipe: worker for worker in self._workers}
@@ -200,27 +198,27 @@ class Pool:
     def _next(self, worker: _Process | None, last: int | None) -> None:
         """Give the next task to a worker, or to a new one if it is None or due for replacement.
 
-        If no task is left, the worker ends. `last` is the shard that it has just completed.
+        If no task is left, the worker ends. `last` is the task that it has just completed.
         """
-        busy = [w.shard for w in self._workers if w is not worker]
-        shard = self._again.popleft() if self._again else self._run.next_shard(last, busy)
-        if worker is not None and (shard is None or worker.shards >= self._recycle):
+        busy = [w.number for w in self._workers if w is not worker]
+        number = self._again.popleft() if self._again else self._job.next_task(last, busy)
+        if worker is not None and (number is None or worker.tasks >= self._recycle):
             self._workers.remove(worker)
             worker.stop()
             worker.join()
             worker = None
-        if shard is None:
+        if number is None:
             return
         if worker is None:
             worker = self._new()
             self._workers.append(worker)
-        careful = shard in self._given_up
-        worker.give(self._run.task(shard, self._given_up.get(shard, frozenset()), careful=careful))
+        careful = number in self._given_up
+        worker.give(number, self._job.task(number, self._given_up.get(number, frozenset()), careful=careful))
 
     def _receive(self, worker: _Process) -> None:
         """Handle one message from a worker, or its death."""
         try:
-            sample, what, payload = worker.pipe.recv()
+            item, what, payload = worker.pipe.recv()
             worker.has_reported = True
         except (EOFError, OSError):
             self._replace_dead(worker)
@@ -228,38 +226,41 @@ class Pool:
         if what == "fatal":
             raise payload
         if what == "finished":
-            self._next(worker, worker.shard)
+            self._next(worker, worker.number)
         else:
-            worker.sample = sample if what in ("begun", "stage") else None
+            worker.item = item if what in ("begun", "stage") else None
             if what == "built":
-                del self._deaths_by_shard[worker.shard]
-            self._run.tick(sample, what, payload)
+                del self._deaths_by_task[worker.number]
+            self._job.tick(item, what, payload)
 
     def _replace_dead(self, worker: _Process) -> None:
-        """Replace a worker that died, and do its shard again.
+        """Replace a worker that died, and do its task again.
 
-        Raises VbnfaultError if two workers die at one shard while they work on no sample, and no sample of it was
+        Raises VbnfaultError if two workers die at one task while they work on no item, and no item of it was
         finished in between.
         """
         self._workers.remove(worker)
         worker.stop()
         worker.join()
-        sample, shard, how = worker.sample, worker.shard, f"its worker process {worker.exit_reason()}"
-        given_up = self._given_up.setdefault(shard, frozenset())
-        if sample is None:
-            self._deaths_by_shard[shard] += 1
-            if self._deaths_by_shard[shard] > 1:
+        item, number, how = worker.item, worker.number, f"its worker process {worker.exit_reason()}"
+        task_noun, item_noun = f"{self._job.task_noun} {number}", self._job.item_noun
+        given_up = self._given_up.setdefault(number, frozenset())
+        if item is None:
+            self._deaths_by_task[number] += 1
+            if self._deaths_by_task[number] > 1:
                 raise VbnfaultError(
-                    f"{self._run.store.path}: shard {shard}: {how}, twice while no sample was in work; "
-                    f"finished samples stay, and the same command resumes"
+                    f"{self._job.path}: {task_noun}: {how}, twice while no {item_noun} was in work; "
+                    f"finished {item_noun}s stay, and the same command resumes"
                 )
-            self._run.progress.say(f"shard {shard}: {how} while no sample was in work; trying again in a new one")
+            self._job.progress.say(
+                f"{task_noun}: {how} while no {item_noun} was in work; trying again in a new one"
+            )
         else:
-            self._deaths_by_sample[sample] += 1
-            if self._deaths_by_sample[sample] == 1:
-                self._run.progress.say(f"sample {sample}: {how}; trying again in a new one")
+            self._deaths_by_item[item] += 1
+            if self._deaths_by_item[item] == 1:
+                self._job.progress.say(f"{item_noun} {item}: {how}; trying again in a new one")
             else:
-                self._run.tick(sample, "failed", f"{how}, twice")
-                self._given_up[shard] = given_up | {sample}
-        self._again.append(shard)
+                self._job.tick(item, "failed", f"{how}, twice")
+                self._given_up[number] = given_up | {item}
+        self._again.append(number)
         self._next(None, None)

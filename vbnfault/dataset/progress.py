@@ -1,4 +1,4 @@
-"""Show the progress of a build: a bar on a terminal, plain lines elsewhere."""
+"""Show the progress of a build or a study: a bar on a terminal, plain lines elsewhere."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ def duration_text(seconds: float) -> str:
 
 
 class Progress:
-    """Show samples done, rate, time left and the current stage, on standard error."""
+    """Show items done, rate, time left and the current stage, on standard error; `noun`: what the items are."""
 
-    def __init__(self, total: int, *, shown: bool) -> None:
-        self._total, self._shown = total, shown
+    def __init__(self, total: int, *, shown: bool, noun: str = "samples") -> None:
+        self._total, self._shown, self._noun = total, shown, noun
         self._done = self._built = 0
         self._began = self._last_line = time.monotonic()
         self._bar: Any = None
@@ -42,7 +42,7 @@ class Progress:
             columns = (
                 BarColumn(bar_width=None),
                 MofNCompleteColumn(),
-                TextColumn("samples, {task.description}"),
+                TextColumn(f"{self._noun}, {{task.description}}"),
             )
             self._bar = Progress(*columns, console=Console(stderr=True))
             self._task = self._bar.add_task("checking", total=self._total)
@@ -56,20 +56,20 @@ class Progress:
             print(self._line(), file=sys.stderr, flush=True)
 
     def _pace(self) -> str:
-        """Return rate and time left as text; `checking` until a sample has been built."""
+        """Return rate and time left as text; `checking` until an item has been built."""
         seconds = time.monotonic() - self._began
         if not self._built or seconds <= 0:
             return "checking"
         rate = self._built / seconds
-        unit = f"{rate:.2f} samples/s" if rate >= 0.1 else f"{1 / rate:.0f} s/sample"
+        unit = f"{rate:.2f} {self._noun}/s" if rate >= 0.1 else f"{1 / rate:.0f} s/{self._noun.removesuffix('s')}"
         return f"{unit}, {duration_text((self._total - self._done) / rate)} left"
 
     def _line(self) -> str:
         """Return the progress as one line."""
-        return f"{self._done}/{self._total} samples, {self._pace()}"
+        return f"{self._done}/{self._total} {self._noun}, {self._pace()}"
 
     def advance(self, built: bool) -> None:
-        """Count one more sample as done; `built`: it was made now, not kept."""
+        """Count one more item as done; `built`: it was made now, not kept."""
         self._done += 1
         self._built += built
         if self._bar is not None:
@@ -79,7 +79,7 @@ class Progress:
             print(self._line(), file=sys.stderr, flush=True)
 
     def stage(self, text: str) -> None:
-        """Show a stage that may take seconds: beside the bar until the next sample is done, or as a line."""
+        """Show a stage that may take seconds: beside the bar until the next item is done, or as a line."""
         if self._bar is not None:
             self._bar.update(self._task, description=f"{self._pace()}; {text}")
         else:

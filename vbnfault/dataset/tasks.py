@@ -7,9 +7,6 @@ loads the terrain of a site once.
 from __future__ import annotations
 
 import functools
-import heapq
-import traceback
-from collections import Counter, deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,6 +23,7 @@ from ..core.quantities import Sample
 from ..store import Encoded, Planned, SampleDigests, Store
 from .errors import BuildFailed
 from .progress import Progress
+from .work import Fatal, Lazy, Queue, Tick, describe
 
 _HOPELESS = 32  # after so many failures without one success, the build stops: the others would fail, too
 
@@ -39,11 +37,6 @@ class SampleMaker(Protocol):
 
 
 SessionFactory = Callable[[], SampleMaker]
-
-
-# Arguments: the sample; an event: "begun", "stage", "kept", "built" or "failed"; a text. The text is the stage's
-# name, the digest (hex) of a kept or built sample, or one line and the traceback of a failure.
-Tick = Callable[[int, str, str], None]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,6 +60,35 @@ class Task:
     unplanned: frozenset[int] = frozenset()
     skip: frozenset[int] = frozenset()
     careful: bool = False
+
+
+@dataclass(frozen=True)
+class SampleWorkers:
+    """A picklable function that makes a worker of a build: `factory` makes its session, `path` is the store."""
+
+    factory: SessionFactory
+    path: Path
+
+    def __call__(self) -> _SampleWorker:
+        return _SampleWorker(self)
+
+
+class _SampleWorker:
+    """Make the samples of tasks; the session is made when the first sample needs it."""
+
+    def __init__(self, source: SampleWorkers) -> None:
+        self._session, self._path = Lazy(source.factory), source.path
+
+    def do(self, task: Task, tick: Tick) -> None:
+        """Do a task."""
+        work(self._simulate, store_module.open_store(self._path, "r+"), task, tick)
+
+    def _simulate(self, index: int) -> Sample:
+        """Return a sample. Raises Fatal if no session can be made, or if an input file has changed."""
+        try:
+            return self._session().simulate(index)
+        except InputChanged as error:  # every other sample would fail, too
+            raise Fatal(error) from error
 
 
 def work(simulate: Callable[[int], Sample], store: Store, task: Task, tick: Tick) -> None:
@@ -119,18 +141,10 @@ def work(simulate: Callable[[int], Sample], store: Store, task: Task, tick: Tick
         )
 
 
-def describe(error: Exception) -> str:
-    """Return one line on an error, then its traceback."""
-    frame = traceback.extract_tb(error.__traceback__)[-1]
-    if isinstance(error, VbnfaultError):
-        line = str(error)
-    else:
-        line = f"{type(error).__name__}: {error} ({Path(frame.filename).name}:{frame.lineno})"
-    return " ".join(line.split()) + "\n" + "".join(traceback.format_exception(error))
-
-
 class Run:
     """Assign the tasks of a build by site, and collect their results."""
+
+    task_noun, item_noun = "shard", "sample"
 
     def __init__(
         self,
@@ -142,62 +156,44 @@ class Run:
         exact: bool = False,
     ) -> None:
         self.store, self.sites, self.progress = store, sites, progress
+        self.path = store.path
         self._expected, self._exact = expected, exact
         self.built = 0
         self.digests = SampleDigests(store.samples)
         self.failures: dict[int, str] = {}
         self._outcome: dict[int, str] = {}
-        self._by_site: dict[int, deque[int]] = {}
-        for shard in range(store.shards):
-            self._by_site.setdefault(self.lead(shard), deque()).append(shard)
+        self._queue = Queue([self.lead(shard) for shard in range(store.shards)])
         self._begun = frozenset(store.begun())
-        # heap of sites, those with the most shards left first; an entry is updated when it is taken out
-        self._longest = [(-len(queue), site) for site, queue in self._by_site.items()]
-        heapq.heapify(self._longest)
+
+    @property
+    def tasks(self) -> int:
+        """Return the number of shards."""
+        return self.store.shards
+
+    def items(self, number: int) -> Sequence[int]:
+        """Return the samples of a shard."""
+        return self.store.shard(number)
 
     def lead(self, shard: int) -> int:
         """Return the site by which a shard is assigned: that of its first sample."""
         return int(self.sites[self.store.shard(shard).start])
 
-    def task(self, shard: int, skip: frozenset[int] = frozenset(), *, careful: bool = False) -> Task:
+    def task(self, number: int, skip: frozenset[int] = frozenset(), *, careful: bool = False) -> Task:
         """Return the task that completes a shard; for `skip` and `careful` see `Task`."""
-        samples = self.store.shard(shard)
+        shard, samples = number, self.store.shard(number)
         sites = tuple(int(s) for s in self.sites[samples.start : samples.stop])
         unplanned: set[int] = set()
         if self._expected is not None and shard in self._begun:
             unplanned = store_module.unplanned_samples(self.store, shard, self._expected, exact=self._exact)
         return Task(shard=shard, sites=sites, unplanned=frozenset(unplanned), skip=skip, careful=careful)
 
-    def next_shard(self, last: int | None = None, busy: Sequence[int] = ()) -> int | None:
-        """Return the shard that a worker does after the shard `last`; None if none is left.
+    def next_task(self, last: int | None = None, busy: Sequence[int] = ()) -> int | None:
+        """Return the shard that a worker does after the shard `last`, of the same site if one is left."""
+        return self._queue.next(last, busy)
 
-        It is a shard of the same site, if one is left. Otherwise it comes from the site that has the fewest of the
-        `busy` shards, and among equal sites from the one with the most shards left.
-        """
-        if last is None or not self._by_site[self.lead(last)]:
-            site = self._next_site(Counter(self.lead(shard) for shard in busy))
-        else:
-            site = self.lead(last)
-        return None if site is None else self._by_site[site].popleft()
-
-    def _next_site(self, taken: Counter[int]) -> int | None:
-        """Return, among sites with shards left, the one with the fewest `taken`, then with the most left."""
-        passed: list[tuple[int, int]] = []
-        while self._longest:
-            length, site = heapq.heappop(self._longest)
-            left = len(self._by_site[site])
-            if left and left != -length:
-                heapq.heappush(self._longest, (-left, site))
-            elif left:
-                passed.append((length, site))
-                if not taken[site]:
-                    break
-        for entry in passed:
-            heapq.heappush(self._longest, entry)
-        return min(passed, key=lambda entry: (taken[entry[1]], *entry))[1] if passed else None
-
-    def tick(self, sample: int, what: str, text: str) -> None:
+    def tick(self, item: int, what: str, text: str) -> None:
         """Record an event of a sample, see `Tick`. Raises BuildFailed after too many failures without a success."""
+        sample = item
         if what == "begun":
             return
         if what == "stage":
@@ -230,46 +226,3 @@ class Run:
             f"all others are kept, and the same command tries the failed ones again",
             self.failures,
         )
-
-
-class Lazy:
-    """Make a session when the first sample needs it: a complete shard needs none."""
-
-    def __init__(self, factory: SessionFactory) -> None:
-        self._factory = factory
-        self._session: SampleMaker | None = None
-
-    def simulate(self, index: int) -> Sample:
-        """Return a sample. Raises Fatal if no session can be made, or if an input file has changed."""
-        if self._session is None:
-            try:
-                self._session = self._factory()
-            except VbnfaultError as error:
-                raise Fatal(error) from error
-            except Exception as error:
-                check()
-                raise Fatal(VbnfaultError(describe(error).splitlines()[0])) from error
-        try:
-            return self._session.simulate(index)
-        except InputChanged as error:  # every other sample would fail, too
-            raise Fatal(error) from error
-
-
-class Fatal(BaseException):
-    """Carry an error that ends the whole build. As a BaseException it passes the handler of a failed sample."""
-
-    def __init__(self, error: VbnfaultError) -> None:
-        super().__init__(error)
-        self.error = error
-
-
-def run_here(factory: SessionFactory, run: Run) -> None:
-    """Do all tasks of a run in this process."""
-    session = Lazy(factory)
-    shard = run.next_shard()
-    while shard is not None:
-        try:
-            work(session.simulate, run.store, run.task(shard), run.tick)
-        except Fatal as fatal:
-            raise fatal.error from fatal
-        shard = run.next_shard(shard)

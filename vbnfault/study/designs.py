@@ -1,7 +1,7 @@
 """Make the points of a study's design in the unit hypercube, and the evaluations that they need.
 
-Every design has a column for each factor and one more, the last, for the dummy factor. A design depends on the study
-file alone, so that an interrupted study continues with the same points.
+Every design has a column for each factor and one more, the last, for the dummy factor. A design depends on the
+study file alone, so that an interrupted study continues with the same points.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 r"""Compute the indices of a study from its evaluations, with bootstrap intervals.
 
-All indices of a metric pool the blocks b of a study, which are its seeds and views: each variance and each part of it
-is summed over the blocks before the ratio is formed (the generalised index of Gamboa et al. 2014, doi
+All indices of a metric pool the blocks b of a study, which are its seeds and views: each variance and each part of
+it is summed over the blocks before the ratio is formed (the generalised index of Gamboa et al. 2014, doi
 10.1214/14-EJS895). So an index says how the metric varies within one view, and the differences between views do not
 enter it. With one block this is the usual index.
 
@@ -24,15 +24,16 @@ their expectation is 0, and their spread shows the noise of a study of this size
 `scipy.stats.sobol_indices` gives the same S1 and ST for one block (a test compares them), but it takes neither
 several blocks nor a number of base samples that is no power of two, which is what failed evaluations leave; and its
 bootstrap takes no seed. The intervals are percentile intervals of `scipy.stats.bootstrap` over base samples. They
-take base samples as independent, so with a Sobol' sequence they are too wide rather than too narrow. Morris and delta
-come from SALib.
+take base samples as independent, so with a Sobol' sequence they are too wide rather than too narrow. Morris and
+delta come from SALib.
 """
 
 from __future__ import annotations
 
 import contextlib
+import itertools
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -115,10 +116,11 @@ def compute(results: Results) -> xr.Dataset:
             if name in used
         },
     )
-    data["metric"].attrs["units_of_metrics"] = [metric.unit for metric in results.metrics]
-    data["metric"].attrs["descriptions"] = [metric.description for metric in results.metrics]
-    data["factor"].attrs["units_of_factors"] = [*(factor.unit for factor in spec.factors), ""]
-    return data
+    about = {
+        name: ("metric", np.array([getattr(metric, name) for metric in results.metrics], dtype=object))
+        for name in ("unit", "description", "source", "better")
+    }
+    return data.assign_coords(about)
 
 
 # --- names and units of the variables -----------------------------------------------------------------------------
@@ -162,7 +164,7 @@ def _attributes(name: str) -> dict[str, str]:
     return {"long_name": long_name, "units": units, **formula}
 
 
-# --- bootstrap ------------------------------------------------------------------------------------------------------
+# --- bootstrap ----------------------------------------------------------------------------------------------------
 
 
 def _ratios(terms: _Array, whole: _Array) -> _Array:
@@ -171,13 +173,13 @@ def _ratios(terms: _Array, whole: _Array) -> _Array:
         return np.where(whole > 0, terms / whole, np.nan)
 
 
-def _intervals(statistic: Any, n: int, design: Design, keys: Sequence[int]) -> _Array:
+def _intervals(statistic: Any, n: int, design: Design) -> _Array:
     """Return percentile bootstrap intervals, float64[..., 2], over `n` base samples.
 
     `statistic` gets how often each base sample was drawn, float64[resample, n], and returns the estimates, with the
-    resamples along the last axis. `keys` make the random numbers of each use different.
+    resamples along the last axis. All metrics and models get the same resamples.
     """
-    from scipy.stats import bootstrap
+    from scipy.stats import DegenerateDataWarning, bootstrap
 
     if n < 2:
         return np.full((*np.shape(statistic(np.ones((1, n))))[:-1], 2), np.nan)
@@ -190,21 +192,23 @@ def _intervals(statistic: Any, n: int, design: Design, keys: Sequence[int]) -> _
         return estimates if index.ndim == 2 else estimates[..., 0]
 
     table = design.spec.design
-    done = bootstrap(
-        (np.arange(n),),
-        of_indices,
-        n_resamples=table.resamples,
-        batch=256,
-        vectorized=True,
-        axis=-1,
-        confidence_level=table.confidence,
-        method="percentile",
-        rng=np.random.default_rng([table.seed, *keys]),
-    )
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DegenerateDataWarning)  # a metric that does not vary: its interval is nan
+        done = bootstrap(
+            (np.arange(n),),
+            of_indices,
+            n_resamples=table.resamples,
+            batch=256,
+            vectorized=True,
+            axis=-1,
+            confidence_level=table.confidence,
+            method="percentile",
+            rng=np.random.default_rng(table.seed),
+        )
     return np.stack([done.confidence_interval.low, done.confidence_interval.high], axis=-1)
 
 
-# --- Sobol' indices ---------------------------------------------------------------------------------------------------
+# --- Sobol' indices -----------------------------------------------------------------------------------------------
 
 
 def _sobol_terms(blocks: _Array, factors: int) -> tuple[_Array, _Array]:
@@ -215,7 +219,7 @@ def _sobol_terms(blocks: _Array, factors: int) -> tuple[_Array, _Array]:
     in some count there not at all.
     """
     y = blocks.reshape(len(blocks), -1, factors + 2)
-    complete = np.isfinite(y).all(axis=-1)
+    complete = np.asarray(np.isfinite(y).all(axis=-1))
     y = y[:, complete.any(axis=0)]
     complete = complete[:, complete.any(axis=0)]
     y = np.where(complete[..., None], y, 0.0)
@@ -263,14 +267,12 @@ def _add_sobol(arrays: dict[str, tuple[tuple[str, ...], _Array]], results: Resul
         for j in range(models):
             terms, variance = _sobol_terms(results.blocks(i, j), factors)
             used[i, j] = len(variance)
-            s1[i, j], total[i, j], pairs[i, j] = _sobol_indices(
-                _ratios(terms.sum(axis=1), variance.sum()), factors
-            )
+            s1[i, j], total[i, j], pairs[i, j] = _sobol_indices(_ratios(terms.sum(axis=1), variance.sum()), factors)
 
             def resampled(counts: _Array, terms: _Array = terms, variance: _Array = variance) -> _Array:
                 return _ratios(terms @ counts.T, variance @ counts.T)
 
-            bounds = _intervals(resampled, len(variance), results.design, (i, j))
+            bounds = _intervals(resampled, len(variance), results.design)
             s1_interval[i, j], total_interval[i, j], pairs_interval[i, j] = _sobol_indices(bounds, factors)
             for k in range(seeds):
                 terms, variance = _sobol_terms(results.blocks(i, j, k), factors)
@@ -326,7 +328,7 @@ def power_of_two(n: float) -> int:
     return 1 << max(0, int(np.ceil(np.log2(max(n, 1.0)))))
 
 
-# --- the other designs ------------------------------------------------------------------------------------------------
+# --- the other designs --------------------------------------------------------------------------------------------
 
 
 def _add_moments(arrays: dict[str, tuple[tuple[str, ...], _Array]], results: Results) -> None:
@@ -346,8 +348,7 @@ def _steady() -> Iterator[None]:
     """Keep numpy's global random numbers and the display of warnings, which SALib changes."""
     state, form = np.random.get_state(), warnings.formatwarning  # noqa: NPY002
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
+        with warnings.catch_warnings(record=True):  # SALib has its warnings shown, whatever the filters say
             yield
     finally:
         np.random.set_state(state)  # noqa: NPY002
@@ -479,7 +480,7 @@ def _add_ranges(arrays: dict[str, tuple[tuple[str, ...], _Array]], results: Resu
     assert ends[-1] == rows
     for i, j in np.ndindex(*values.shape[:2]):
         y = results.blocks(i, j)
-        for k, (first, last) in enumerate(zip(ends[:-1], ends[1:], strict=True)):
+        for k, (first, last) in enumerate(itertools.pairwise(ends)):
             moved = y[:, [0, *range(first, last)]]
             moved = moved[np.isfinite(moved).all(axis=1)]
             values[i, j, k] = np.ptp(moved, axis=1).mean() if len(moved) else np.nan
@@ -500,7 +501,7 @@ def _add_model_share(arrays: dict[str, tuple[tuple[str, ...], _Array]], results:
     for i in range(len(share)):
         y = results.values[:, :, rows, :, i]  # [seed, view, row, model]
         y = y.reshape(-1, int(rows.sum()) // per_base, per_base * y.shape[-1])
-        complete = np.isfinite(y).all(axis=-1)
+        complete = np.asarray(np.isfinite(y).all(axis=-1))
         y, complete = y[:, complete.any(axis=0)], complete[:, complete.any(axis=0)]
         y = np.where(complete[..., None], y, 0.0)
         centre = y.sum(axis=(1, 2)) / np.maximum(complete.sum(axis=1), 1) / y.shape[-1]
@@ -520,7 +521,7 @@ def _add_model_share(arrays: dict[str, tuple[tuple[str, ...], _Array]], results:
 
         share[i] = of_counts(np.ones((1, y.shape[2])))[0, 0]
         if design.spec.design.method != "grid":
-            interval[i] = _intervals(of_counts, y.shape[2], design, (i, 2**20))[0]
+            interval[i] = _intervals(of_counts, y.shape[2], design)[0]
     arrays["model_share"] = (("metric",), share)
     if design.spec.design.method != "grid":
         arrays["model_share_interval"] = (("metric", "bound"), interval)

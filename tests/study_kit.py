@@ -1,0 +1,51 @@
+"""Studies of functions with known indices, for the tests of the engine."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from vbnfault.study.spec import Evaluation, Metric, StudySpec, parse_study
+
+ANALYTIC_ISHIGAMI = {
+    # Ishigami & Homma 1990 with a = 7, b = 0.1: V = a²/8 + bπ⁴/5 + b²π⁸/18 + 1/2
+    "S1": (0.3139, 0.4424, 0.0),
+    "ST": (0.5576, 0.4424, 0.2437),
+}
+
+
+def spec(count: int = 3, low: float = -math.pi, high: float = math.pi, **tables: Any) -> StudySpec:
+    """Return a study of `count` uniform factors x0, x1, …; keywords replace its tables."""
+    factors = [{"key": f"x{i}", "distribution": "uniform", "low": low, "high": high} for i in range(count)]
+    plain = {"title": "test", "design": {"n": 64}, "factor": factors, "metrics": {"names": ["y"]}}
+    return parse_study(plain | tables, source="test")
+
+
+class Function:
+    """Evaluate a function of the factors; the metric z is the same plus the view and the seed."""
+
+    metrics: Sequence[Metric] = (
+        Metric(name="y", unit="1", description="value of the function"),
+        Metric(name="z", unit="px", description="value plus 100 view plus seed", source="test"),
+    )
+
+    def __init__(self, study: StudySpec) -> None:
+        self.study, self.count = study, 0
+
+    def function(self, x: np.ndarray) -> Any:
+        """Ishigami's function of x[factor]."""
+        return np.sin(x[0]) + 7 * np.sin(x[1]) ** 2 + 0.1 * x[2] ** 4 * np.sin(x[0])
+
+    def check(self) -> Sequence[str]:
+        return ()
+
+    def evaluate(self, evaluation: Evaluation) -> Mapping[str, float]:
+        self.count += 1
+        y = float(self.function(np.array([float(v) for v in evaluation.values.values()])))
+        return {"y": y, "z": y + 100 * evaluation.view + evaluation.seed}
+
+    def timings(self) -> Mapping[str, float]:
+        return {"function": 1e-3 * self.count}

@@ -1,0 +1,362 @@
+"""The engine of sensitivity studies: designs, indices, resuming, failures, and what users may get wrong."""
+
+from __future__ import annotations
+
+import functools
+import json
+import os
+import signal
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import study_kit as kit
+
+import vbnfault
+from vbnfault.core.errors import InputError, VbnfaultError
+from vbnfault.dataset import BuildOptions
+from vbnfault.dataset.errors import Interrupted
+from vbnfault.study import indices, results, run
+from vbnfault.study.designs import make_design
+from vbnfault.study.spec import DUMMY, Evaluation, StudySpec, parse_study
+
+QUIET = BuildOptions(progress=False)
+
+
+def analysed(spec: StudySpec, function: Any) -> Any:
+    """Return the indices of a function that takes the design's points x[factor, row] at once."""
+    design = make_design(spec)
+    y = function(np.array(design.values, dtype=float))
+    values = np.asarray(y)[None, None, :, None, None]
+    return indices.compute(indices.Results(design, tuple(kit.Function.metrics[:1]), values))
+
+
+# ------------------------------------------------------------------------------------ the whole engine
+
+
+def test_ishigami_through_the_whole_engine(tmp_path: Path) -> None:
+    spec = kit.spec(design={"n": 512, "seed": 3, "resamples": 300})
+    data = vbnfault.study(spec, tmp_path / "s", evaluator=kit.Function, progress=False)
+    for name, exact in kit.ANALYTIC_ISHIGAMI.items():
+        low, high = data[f"{name}_interval"].sel(metric="y", model="").values.T
+        assert np.all(low[:3] <= exact), (name, low)
+        assert np.all(exact <= high[:3]), (name, high)
+        assert low[3] < 0 < high[3]  # the noise floor
+    assert data["S1"].dims == ("metric", "model", "factor")
+    assert list(data["factor"].values) == ["x0", "x1", "x2", DUMMY]
+    assert float(data["interaction"].sel(factor="x0", factor_b="x2").squeeze()) == pytest.approx(0.2437, abs=0.05)
+    assert all({"long_name", "units"} <= variable.attrs.keys() for variable in data.data_vars.values())
+    assert results.open_indices(tmp_path / "s").identical(data)
+    table = results.read_table(tmp_path / "s")
+    assert table.num_rows == 512 * 5
+    assert set(table["status"].to_pylist()) == {"ok"}
+    assert table.schema.field("y").metadata[b"units"] == b"1"
+
+
+def test_sobol_indices_are_those_of_scipy() -> None:
+    from scipy.stats import sobol_indices
+
+    spec = kit.spec(design={"n": 256})
+    function = kit.Function(spec).function
+    data = analysed(spec, function)
+    f = function(np.array(make_design(spec).values, dtype=float)).reshape(256, 5).T
+    exact = sobol_indices(func={"f_A": f[None, 0], "f_B": f[None, 1], "f_AB": f[2:, None]}, n=256)
+    np.testing.assert_allclose(data["S1"].values[0, 0, :3], exact.first_order, atol=1e-12)
+    np.testing.assert_allclose(data["ST"].values[0, 0, :3], exact.total_order, atol=1e-12)
+
+
+def test_morris_is_that_of_salib() -> None:
+    from SALib.analyze import morris
+    from SALib.sample import morris as sample
+
+    spec = kit.spec(design={"method": "morris", "n": 10, "seed": 5, "resamples": 200})
+    data = analysed(spec, kit.Function(spec).function)
+    problem = {"num_vars": 4, "names": list("abcd"), "bounds": [[0.0, 1.0]] * 4}
+    points = sample.sample(problem, 10, num_levels=4, seed=5)
+    y = kit.Function(spec).function(np.pi * (2 * points.T - 1))
+    exact = morris.analyze(problem, points, y, num_resamples=200, num_levels=4, seed=5)
+    np.testing.assert_allclose(data["mu_star"].values[0, 0], exact["mu_star"], atol=1e-12)
+    np.testing.assert_allclose(data["sigma"].values[0, 0], exact["sigma"], atol=1e-12)
+    assert data["mu_star"].values[0, 0, -1] == 0
+
+
+def test_a_grid_gives_the_analysis_of_variance() -> None:
+    spec = kit.spec(2, -1.0, 1.0, design={"method": "grid", "n": 3})
+    data = analysed(spec, lambda x: x[0] + x[0] * x[1])  # variances 2/3 and 4/9 over the levels -1, 0, 1
+    np.testing.assert_allclose(data["S1"].values[0, 0], [0.6, 0.0, 0.0], atol=1e-12)
+    np.testing.assert_allclose(data["ST"].values[0, 0], [1.0, 0.4, 0.0], atol=1e-12)
+
+
+def test_one_at_a_time_gives_ranges() -> None:
+    spec = kit.spec(2, -1.0, 3.0, design={"method": "one_at_a_time", "n": 3})
+    design = make_design(spec)
+    assert [list(values) for values in design.values] == [[1, -1, 1, 3, 1, 1, 1], [1, 1, 1, 1, -1, 1, 3]]
+    data = analysed(spec, lambda x: 2 * x[0] - x[1])
+    np.testing.assert_allclose(data["range"].values[0, 0], [8.0, 4.0, 0.0])
+
+
+def test_a_latin_hypercube_gives_delta_and_keeps_the_global_random_numbers() -> None:
+    state = np.random.get_state()[1].copy()  # noqa: NPY002
+    spec = kit.spec(2, 0.0, 1.0, design={"method": "latin_hypercube", "n": 100, "resamples": 100})
+    data = analysed(spec, lambda x: x[0])
+    delta = data["delta"].values[0, 0]
+    assert delta[0] > 0.5 > delta[1]
+    assert np.array_equal(np.random.get_state()[1], state)  # noqa: NPY002
+
+
+def test_the_law_of_total_variance_splits_models_from_factors() -> None:
+    spec = kit.spec(design={"n": 64}, models={"fault": "f", "compare": ["a", "b", "c"]})
+    design = make_design(spec)
+    y = kit.Function(spec).function(np.array(design.values, dtype=float))
+    shifted = np.stack([y, y + 3, y - 3], axis=-1)[None, None, ..., None]
+    data = indices.compute(indices.Results(design, tuple(kit.Function.metrics[:1]), shifted))
+    base = np.array([not role.startswith("AB") for role in design.roles])
+    assert float(data["model_share"][0]) == pytest.approx(6 / (6 + y[base].var()), rel=1e-12)
+    low, high = data["model_share_interval"].values[0]
+    assert low < float(data["model_share"][0]) < high
+
+
+def test_blocks_are_pooled_and_seeds_have_their_own_indices() -> None:
+    spec = kit.spec(2, 0.0, 1.0, design={"n": 256}, scene={"samples": 2, "seeds": [4, 9]})
+    design = make_design(spec)
+    x = np.array(design.values, dtype=float)
+    # the first seed varies with x0 alone, the second with x1 alone, with four times the variance
+    blocks = np.stack([np.stack([x[0], x[0] + 50]), np.stack([2 * x[1], 2 * x[1] - 7])])[..., None, None]
+    data = indices.compute(indices.Results(design, tuple(kit.Function.metrics[:1]), blocks))
+    np.testing.assert_allclose(data["ST"].values[0, 0, :2], [0.2, 0.8], atol=0.02)
+    np.testing.assert_allclose(data["ST_by_seed"].values[0, 0, :2], [[1, 0], [0, 1]], atol=0.02)
+    assert list(data["seed"].values) == [4, 9]
+    assert data["ST_seed_deviation"].values[0, 0, 0] == pytest.approx(2**-0.5, abs=0.02)
+
+
+# ------------------------------------------------------------------------------------ resuming and workers
+
+
+class Stopping(kit.Function):
+    """Send this process a signal at the evaluation `VBNFAULT_TEST_STOP`, once."""
+
+    def evaluate(self, evaluation: Evaluation) -> Mapping[str, float]:
+        at, number, once = os.environ.get("VBNFAULT_TEST_STOP", "-1 15 /").split()
+        if evaluation.index == int(at) and not Path(once).exists():
+            Path(once).touch()
+            os.kill(os.getpid(), int(number))
+        return super().evaluate(evaluation)
+
+
+def table_bytes(folder: Path) -> bytes:
+    return (folder / results.TABLE).read_bytes()
+
+
+@pytest.fixture(scope="module")
+def spec() -> StudySpec:
+    return kit.spec(design={"n": 32, "resamples": 100}, scene={"samples": [0, 3]}, metrics={"names": ["y", "z"]})
+
+
+@pytest.fixture(scope="module")
+def reference(spec: StudySpec, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("study") / "s"
+    run.run_study(spec, folder, QUIET, evaluator=Stopping)
+    return folder
+
+
+@pytest.mark.slow
+def test_two_workers_of_which_one_is_killed_give_the_same_table(
+    spec: StudySpec, reference: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("VBNFAULT_TEST_STOP", f"77 {int(signal.SIGKILL)} {tmp_path / 'once'}")
+    options = BuildOptions(workers=2, progress=False)
+    summary = run.run_study(spec, tmp_path / "s", options, evaluator=Stopping)
+    assert (tmp_path / "once").exists()
+    assert table_bytes(tmp_path / "s") == table_bytes(reference)
+    assert summary.indices.drop_attrs().identical(results.open_indices(reference).drop_attrs())
+    assert summary.seconds_by_stage["function"] > 0
+
+
+@pytest.mark.parametrize("at", [0, 1, 150, 319])
+def test_an_interrupted_study_continues_to_the_same_table(
+    spec: StudySpec, reference: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, at: int
+) -> None:
+    monkeypatch.setenv("VBNFAULT_TEST_STOP", f"{at} {int(signal.SIGTERM)} {tmp_path / 'once'}")
+    with pytest.raises(Interrupted, match=rf"{at} of 320 evaluations are finished, and the same command continues"):
+        run.run_study(spec, tmp_path / "s", QUIET, evaluator=Stopping)
+    assert not (tmp_path / "s" / results.TABLE).exists()
+    summary = run.run_study(spec, tmp_path / "s", QUIET, evaluator=Stopping)
+    assert summary.finished == at
+    assert table_bytes(tmp_path / "s") == table_bytes(reference)
+
+
+def test_a_complete_study_evaluates_nothing_again(spec: StudySpec, reference: Path) -> None:
+    before = table_bytes(reference)
+    (reference / "rows" / ".0000001.json.0.partial").touch()
+    summary = run.run_study(spec, reference, QUIET, evaluator=Stopping)
+    assert (summary.finished, summary.seconds_by_stage) == (320, {})
+    assert table_bytes(reference) == before
+    assert not list((reference / "rows").glob(".*"))
+
+
+# ------------------------------------------------------------------------------------ failures
+
+
+class Failing(kit.Function):
+    """Fail at some evaluations; `worse` fails always."""
+
+    def __init__(self, study: StudySpec, wrong: tuple[int, ...] = (7, 8, 50)) -> None:
+        super().__init__(study)
+        self.wrong = wrong
+
+    def evaluate(self, evaluation: Evaluation) -> Mapping[str, float]:
+        if not self.wrong or evaluation.index in self.wrong:
+            raise RuntimeError(f"no image\nat {evaluation.index}")
+        return super().evaluate(evaluation)
+
+
+def test_evaluations_that_fail_are_marked_and_the_rest_goes_on(tmp_path: Path) -> None:
+    spec = kit.spec(design={"n": 64, "resamples": 100})
+    with pytest.raises(
+        run.StudyFailed, match=r"3 evaluations \(7, 8, 50\) of 320 failed, .*no image at 7"
+    ) as error:
+        run.run_study(spec, tmp_path / "s", QUIET, evaluator=Failing)
+    table = results.read_table(tmp_path / "s").to_pylist()
+    assert [row["evaluation"] for row in table if row["status"] == "failed"] == [7, 8, 50]
+    assert table[7]["error"].startswith("RuntimeError: no image at 7 (test_study_engine.py:")
+    assert np.isnan(table[7]["y"])
+    data = error.value.indices
+    assert float(data["samples_left_out"].squeeze()) == 2  # base samples 1 and 10
+    assert float(data["samples_used"].squeeze()) == 62
+    whole = vbnfault.study(spec, evaluator=kit.Function, progress=False)
+    assert abs(data["ST"] - whole["ST"]).max() < 0.1
+    # the same study tries the failed ones again
+    function = functools.partial(Failing, wrong=(50,))
+    with pytest.raises(run.StudyFailed, match=r"evaluation 50 of 320 failed"):
+        run.run_study(spec, tmp_path / "s", QUIET, evaluator=function)
+
+
+def test_a_study_whose_evaluations_all_fail_is_stopped(tmp_path: Path) -> None:
+    with pytest.raises(run.StudyFailed, match=r"32 evaluations .* before any succeeded, so the study was stopped"):
+        run.run_study(kit.spec(), tmp_path / "s", QUIET, evaluator=functools.partial(Failing, wrong=()))
+
+
+def test_incomplete_blocks_count_where_they_are_complete() -> None:
+    spec = kit.spec(2, 0.0, 1.0, design={"n": 128}, scene={"samples": 2})
+    design = make_design(spec)
+    x = np.array(design.values, dtype=float)
+    y = np.stack([x[0] + x[1], np.full(len(x[0]), np.nan)])[None, ..., None, None]
+    data = indices.compute(indices.Results(design, tuple(kit.Function.metrics[:1]), y))
+    alone = analysed(kit.spec(2, 0.0, 1.0, design={"n": 128}), lambda x: x[0] + x[1])
+    np.testing.assert_allclose(data["ST"].values, alone["ST"].values, atol=1e-12)
+    constant = analysed(kit.spec(2, 0.0, 1.0, design={"n": 8}), lambda x: np.ones_like(x[0]))
+    assert np.isnan(constant["ST"].values[..., :2]).all()
+
+
+# ------------------------------------------------------------------------------------ bad input
+
+
+FACTOR = {"key": "a", "distribution": "uniform", "low": 0.0, "high": 1.0}
+
+
+@pytest.mark.parametrize(
+    ("tables", "sentence"),
+    [
+        ({"factor": [FACTOR | {"low": 3.0}]}, r"factor\[0\].low = 3, high = 1: bounds reversed"),
+        ({"factor": [FACTOR, FACTOR]}, r"factor\[1\].key = 'a': the key is given twice"),
+        ({"factor": [FACTOR | {"key": DUMMY}]}, r"factor\[0\].key = 'dummy': this factor is always added"),
+        ({"factor": [FACTOR | {"distribution": "normal"}]}, r"distribution = 'normal': must be one of"),
+        ({"factor": [FACTOR | {"hihg": 2.0}]}, r"factor\[0\].hihg: unknown key \(did you mean high\?\)"),
+        (
+            {"factor": [{"key": "a", "distribution": "log_uniform", "low": 0.0, "high": 1.0}]},
+            r"low = 0.*above 0",
+        ),
+        (
+            {"factor": [FACTOR | {"distribution": "truncated_normal", "mean": 2.0, "deviation": 1.0}]},
+            r"factor\[0\].mean = 2: must be from low = 0 to high = 1",
+        ),
+        ({"factor": [{"key": "a", "distribution": "categorical", "values": ["x", "x"]}]}, r"'x' is given twice"),
+        ({"metrics": {"names": []}}, r"metrics.names = \[\]: must be a list of at least 1"),
+        ({"metrics": {}}, r"metrics.names: is missing"),
+        ({"design": {"n": 100}}, r"design.n = 100: must be a power of two .* such as 64 or 128"),
+        ({"design": {"n": 8, "method": "morris", "half_width": 0.1}}, r"half_width = 0.1: needs method = 'sobol'"),
+        ({"scene": {"seeds": [1, 1]}}, r"scene.seeds = \[1, 1\]: 1 is given twice"),
+        ({"models": {"fault": "f", "compare": ["a"]}}, r"models.compare = \['a'\]: must be a list of at least 2"),
+    ],
+)
+def test_a_wrong_study_file_is_refused(tables: dict[str, Any], sentence: str) -> None:
+    with pytest.raises(InputError, match=sentence):
+        kit.spec(**tables)
+
+
+def test_too_few_samples_say_how_many_are_needed(tmp_path: Path) -> None:
+    spec = kit.spec(design={"n": 8, "half_width": 0.05})
+    with pytest.raises(
+        InputError, match=r"design.n = 8: too few .*half_width = 0.05, which needs at least n = 512"
+    ):
+        run.run_study(spec, tmp_path / "s", QUIET, evaluator=kit.Function)
+    assert not (tmp_path / "s").exists()
+    spec = kit.spec(design={"n": 128, "half_width": 0.1, "resamples": 200})
+    summary = run.run_study(spec, tmp_path / "s", QUIET, evaluator=kit.Function)
+    (sentence,) = summary.warnings
+    assert "the total index of x0 has a half-width of 0.2" in sentence
+    assert "about design.n = 1024 would be needed" in sentence
+
+
+def test_unknown_metrics_and_columns_of_one_name_are_refused(tmp_path: Path) -> None:
+    for tables, sentence in (
+        ({"metrics": {"names": ["yy"]}}, r"unknown metric 'yy'"),
+        ({"factor": [FACTOR | {"key": "y"}]}, r"'y': the table of the study has another column of this name"),
+        ({"factor": [FACTOR | {"key": "role"}]}, r"'role': the table"),
+    ):
+        with pytest.raises(InputError, match=sentence):
+            run.run_study(kit.spec(**tables), tmp_path / "s", QUIET, evaluator=kit.Function)
+
+
+def test_a_folder_of_another_study_is_refused(spec: StudySpec, reference: Path) -> None:
+    other = spec.model_copy(update={"design": spec.design.model_copy(update={"n": 64})})
+    with pytest.raises(InputError, match=r"holds another study: design.n = 32 \(now 64\); choose another --out"):
+        run.run_study(other, reference, QUIET, evaluator=Stopping)
+    with pytest.raises(InputError, match=r"evaluator = 'test_study_engine.Stopping' \(now 'study_kit.Function'\)"):
+        run.run_study(spec, reference, QUIET, evaluator=kit.Function)
+
+
+def test_a_folder_that_cannot_be_written_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    for out in (tmp_path / "file" / "s", tmp_path / "file"):
+        with pytest.raises(VbnfaultError, match=r"file.*(cannot be|can be) (created|written)"):
+            run.run_study(kit.spec(), out, QUIET, evaluator=kit.Function)
+
+
+def test_a_resolved_study_file_is_read_again(reference: Path, spec: StudySpec) -> None:
+    from vbnfault.study.spec import load_study
+
+    assert load_study(reference / "study.toml") == spec
+    changed = load_study(reference / "study.toml", {"design.n": 8, "scene.camera.width_px": 128})
+    assert (changed.design.n, changed.scene.overrides) == (8, {"camera.width_px": 128})
+    assert json.loads((reference / "identity.json").read_text())["study"]["title"] == "test"
+
+
+# ------------------------------------------------------------------------------------ distributions
+
+
+def test_distributions_go_to_values_and_back() -> None:
+    table = [
+        FACTOR | {"low": -2.0, "high": 6.0},
+        {"key": "b", "distribution": "log_uniform", "low": 0.01, "high": 100.0},
+        {"key": "c", "distribution": "truncated_normal", "mean": 1.0, "deviation": 2.0, "low": 0.0, "high": 9.0},
+        {"key": "d", "distribution": "categorical", "values": ["x", 2.5, "z"]},
+    ]
+    spec = parse_study(
+        {"title": "t", "design": {"n": 1}, "factor": table, "metrics": {"names": ["y"]}}, source="test"
+    )
+    u = np.linspace(0.0, 1.0, 7)
+    for factor in spec.factors[:3]:
+        values = factor.values(u)
+        np.testing.assert_allclose(values[[0, -1]], [factor.low, factor.high], rtol=1e-12)
+        assert values.min() >= factor.low
+        assert values.max() <= factor.high
+        np.testing.assert_allclose(factor.points(values), u, atol=1e-9)
+    uniform, logarithmic, normal, categorical = spec.factors
+    assert uniform.values(0.5) == 2.0
+    assert logarithmic.values(0.5) == pytest.approx(1.0)
+    assert normal.values(normal.nominal()) == pytest.approx(1.0)
+    assert list(categorical.values([0.0, 0.34, 0.99, 1.0])) == ["x", 2.5, "z", "z"]
+    np.testing.assert_allclose(categorical.points(["x", 2.5, "z"]), [1 / 6, 0.5, 5 / 6])

@@ -1,0 +1,174 @@
+"""Define what worker processes do, whatever it is: a build makes samples, a study evaluates points.
+
+A `Job` has numbered tasks; each completes a group of numbered items and says what happens to them by a `Tick`. The
+`Pool` of `processes.py`, `run_on_dask` of `dask.py` and `run_here` have workers do all tasks of a job.
+"""
+
+from __future__ import annotations
+
+import heapq
+import traceback
+from collections import Counter, deque
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, Generic, Protocol, TypeVar
+
+from ..core.errors import VbnfaultError
+from ..core.interrupts import check
+from .progress import Progress
+
+T = TypeVar("T")
+
+# Arguments: the item; an event: "begun", "stage", "kept", "built" or "failed"; a text: the name of the stage,
+# what a job needs to know of a kept or built item, or one line and the traceback of a failure.
+Tick = Callable[[int, str, str], None]
+
+
+class Worker(Protocol):
+    """Do tasks of a job in one process. It may keep costly data between tasks, such as the terrain of a site."""
+
+    def do(self, task: Any, tick: Tick) -> None:
+        """Do a task. What comes of an item must not depend on the tasks done before.
+
+        Raises Fatal, or VbnfaultError where files cannot be written, to end the whole job.
+        """
+        ...
+
+
+# A picklable function that makes a worker, in the process in which it works.
+WorkerFactory = Callable[[], Worker]
+
+
+class Job(Protocol):
+    """Hand out tasks and collect what becomes of their items.
+
+    Attributes
+    ----------
+    path
+        Where the results are written.
+    tasks
+        Number of tasks.
+    task_noun, item_noun
+        What messages call a task and an item.
+    """
+
+    path: Path
+    progress: Progress
+    task_noun: str
+    item_noun: str
+
+    @property
+    def tasks(self) -> int: ...
+
+    def items(self, number: int) -> Sequence[int]:
+        """Return the items of a task."""
+        ...
+
+    def task(self, number: int, skip: frozenset[int] = frozenset(), *, careful: bool = False) -> Any:
+        """Return a task as its worker gets it.
+
+        `skip`: items that must not be tried. `careful`: write every item as soon as it is made, because the process
+        may die at the next one.
+        """
+        ...
+
+    def next_task(self, last: int | None = None, busy: Sequence[int] = ()) -> int | None:
+        """Return the task that a worker does after the task `last`; None if none is left.
+
+        `busy`: tasks that other workers do.
+        """
+        ...
+
+    def tick(self, item: int, what: str, text: str) -> None:
+        """Record an event of an item, see `Tick`."""
+        ...
+
+
+class Queue:
+    """Assign tasks so that a worker stays with one lead, such as a site, whose costly data it keeps."""
+
+    def __init__(self, leads: Sequence[int]) -> None:
+        self._leads = leads
+        self._by_lead: dict[int, deque[int]] = {}
+        for task, lead in enumerate(leads):
+            self._by_lead.setdefault(lead, deque()).append(task)
+        # heap of leads, those with the most tasks left first; an entry is updated when it is taken out
+        self._longest = [(-len(tasks), lead) for lead, tasks in self._by_lead.items()]
+        heapq.heapify(self._longest)
+
+    def next(self, last: int | None = None, busy: Sequence[int] = ()) -> int | None:
+        """Return the task that a worker does after the task `last`; None if none is left.
+
+        It is a task of the same lead, if one is left. Otherwise it comes from the lead that has the fewest of the
+        `busy` tasks, and among equal leads from the one with the most tasks left.
+        """
+        lead = None if last is None else self._leads[last]
+        if lead is None or not self._by_lead[lead]:
+            lead = self._next_lead(Counter(self._leads[task] for task in busy))
+        return None if lead is None else self._by_lead[lead].popleft()
+
+    def _next_lead(self, taken: Counter[int]) -> int | None:
+        """Return, among leads with tasks left, the one with the fewest `taken`, then with the most left."""
+        passed: list[tuple[int, int]] = []
+        while self._longest:
+            length, lead = heapq.heappop(self._longest)
+            left = len(self._by_lead[lead])
+            if left and left != -length:
+                heapq.heappush(self._longest, (-left, lead))
+            elif left:
+                passed.append((length, lead))
+                if not taken[lead]:
+                    break
+        for entry in passed:
+            heapq.heappush(self._longest, entry)
+        return min(passed, key=lambda entry: (taken[entry[1]], *entry))[1] if passed else None
+
+
+class Lazy(Generic[T]):
+    """Make an object when it is first needed: complete tasks need none."""
+
+    def __init__(self, factory: Callable[[], T]) -> None:
+        self._factory = factory
+        self._made: T | None = None
+
+    def __call__(self) -> T:
+        """Return the object. Raises Fatal if it cannot be made."""
+        if self._made is None:
+            try:
+                self._made = self._factory()
+            except VbnfaultError as error:
+                raise Fatal(error) from error
+            except Exception as error:
+                check()
+                raise Fatal(VbnfaultError(describe(error).splitlines()[0])) from error
+        return self._made
+
+
+class Fatal(BaseException):
+    """Carry an error that ends the whole job. As a BaseException it passes the handler of a failed item."""
+
+    def __init__(self, error: VbnfaultError) -> None:
+        super().__init__(error)
+        self.error = error
+
+
+def describe(error: Exception) -> str:
+    """Return one line on an error, then its traceback."""
+    frame = traceback.extract_tb(error.__traceback__)[-1]
+    if isinstance(error, VbnfaultError):
+        line = str(error)
+    else:
+        line = f"{type(error).__name__}: {error} ({Path(frame.filename).name}:{frame.lineno})"
+    return " ".join(line.split()) + "\n" + "".join(traceback.format_exception(error))
+
+
+def run_here(factory: WorkerFactory, job: Job) -> None:
+    """Do all tasks of a job in this process."""
+    worker = factory()
+    number = job.next_task()
+    while number is not None:
+        try:
+            worker.do(job.task(number), job.tick)
+        except Fatal as fatal:
+            raise fatal.error from fatal
+        number = job.next_task(number)

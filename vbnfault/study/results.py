@@ -1,0 +1,180 @@
+"""Write and read what a study has found: the table of its evaluations and the store of its indices.
+
+Both open without vbnfault: `table.parquet` with any reader of Parquet, `indices.zarr` with `xarray.open_zarr`.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import uuid
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ..core.errors import InputError
+from .designs import Design
+from .distributions import Categorical
+from .spec import DUMMY, Metric
+
+if TYPE_CHECKING:
+    import pyarrow
+    import xarray as xr
+
+TABLE = "table.parquet"
+INDICES = "indices.zarr"
+# Columns of the table besides factors and metrics: name → meaning
+COLUMNS = {
+    "evaluation": "number of the evaluation",
+    "seed": "seed of the block",
+    "view": "sample of the scene",
+    "model": "model of the fault; empty where none are compared",
+    "role": "place in the design: A, B, AB:<factor>, morris:<trajectory>:<step> or point",
+    "status": "ok or failed",
+    "error": "why the evaluation failed; empty where it did not",
+}
+
+
+def write_table(
+    path: Path, design: Design, metrics: Sequence[Metric], outcomes: Sequence[Mapping[str, Any]]
+) -> pyarrow.Table:
+    """Write the table of a study, one row for each evaluation in order, and return it.
+
+    The metadata of a column are `kind` (factor or metric), `units`, `description` and `source`.
+
+    Parameters
+    ----------
+    path
+        The Parquet file.
+    outcomes
+        Of each evaluation `values` (by metric) and `error` (empty where it did not fail).
+    """
+    import pyarrow as pa
+    from pyarrow import parquet
+
+    spec = design.spec
+    seeds, views, rows, models = np.unravel_index(np.arange(len(design)), design.shape)
+    failed = [bool(outcome["error"]) for outcome in outcomes]
+    plain: dict[str, Any] = {
+        "evaluation": np.arange(len(design)),
+        "seed": np.array(spec.scene.seeds)[seeds],
+        "view": np.array(spec.scene.views)[views],
+        "model": [spec.model_names[model] for model in models],
+        "role": [design.roles[row] for row in rows],
+        "status": ["failed" if wrong else "ok" for wrong in failed],
+        "error": [outcome["error"] for outcome in outcomes],
+    }
+    columns, fields = [], []
+
+    def add(name: str, values: Any, dtype: Any, **about: str) -> None:
+        columns.append(pa.array(values, type=dtype))
+        fields.append(pa.field(name, dtype, metadata={key: text for key, text in about.items() if text}))
+
+    for name, values in plain.items():
+        add(name, values, pa.int64() if isinstance(values, np.ndarray) else pa.string(), description=COLUMNS[name])
+    for factor, values in zip(spec.factors, design.values, strict=True):
+        words = isinstance(factor, Categorical) and not all(isinstance(c, float) for c in factor.choices)
+        column = [str(value) for value in values[rows]] if words else values[rows].astype(np.float64)
+        about = {"kind": "factor", "units": factor.unit, "description": factor.description}
+        add(factor.key, column, pa.string() if words else pa.float64(), **about)
+    add(DUMMY, design.points[rows, -1], pa.float64(), kind="factor", description="factor that acts on nothing")
+    for metric in metrics:
+        column = np.array([outcome["values"].get(metric.name, np.nan) for outcome in outcomes], dtype=np.float64)
+        about = {"kind": "metric", "units": metric.unit, "description": metric.description, "source": metric.source}
+        add(metric.name, column, pa.float64(), **about)
+    table = pa.Table.from_arrays(columns, schema=pa.schema(fields, metadata={"title": spec.title}))
+    with replacing(path) as temporary:
+        parquet.write_table(table, temporary)
+    return table
+
+
+def read_table(folder: str | Path) -> pyarrow.Table:
+    """Return the table of a study, as `write_table` describes it."""
+    from pyarrow import parquet
+
+    path = Path(folder) / TABLE
+    if not path.is_file():
+        raise InputError(f"{path}: no such file; a study writes it when it is complete")
+    return parquet.read_table(path)
+
+
+def write_indices(path: Path, indices: xr.Dataset) -> None:
+    """Write the indices of a study as a Zarr group, in place of an earlier one."""
+    with replacing(path) as temporary:
+        indices.to_zarr(temporary, mode="w", consolidated=False, zarr_format=3)
+
+
+def open_indices(folder: str | Path) -> xr.Dataset:
+    """Return the indices of a study, in memory."""
+    import xarray as xr
+
+    path = Path(folder) / INDICES
+    if not path.is_dir():
+        raise InputError(f"{path}: no such folder; a study writes it when it is complete")
+    with xr.open_zarr(path, consolidated=False) as stored:
+        return stored.load()
+
+
+class replacing:
+    """Write a file or folder under a temporary name beside it, and rename it at the end of a `with` block."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex}.partial")
+
+    def __enter__(self) -> Path:
+        return self._temporary
+
+    def __exit__(self, kind: Any, *_: object) -> None:
+        if kind is not None:
+            remove(self._temporary)
+            return
+        if self._path.is_dir():
+            shutil.rmtree(self._path)
+        os.replace(self._temporary, self._path)
+
+
+def remove(path: Path) -> None:
+    """Remove a file or a folder, if it exists."""
+    if path.is_dir():
+        shutil.rmtree(path, ignore_errors=True)
+    else:
+        path.unlink(missing_ok=True)
+
+
+# --- finished rows, chunk by chunk ------------------------------------------------------------------------------
+
+
+def chunk_path(folder: Path, chunk: int) -> Path:
+    """Return the file of the finished evaluations of a chunk."""
+    return folder / "rows" / f"{chunk:07d}.json"
+
+
+def write_chunk(folder: Path, chunk: int, outcomes: Mapping[int, Mapping[str, Any]]) -> None:
+    """Write the finished evaluations of a chunk so that a kill leaves the file of before or the whole new one."""
+    path = chunk_path(folder, chunk)
+    with replacing(path) as temporary, open(temporary, "w", encoding="utf-8") as file:
+        json.dump({str(index): outcomes[index] for index in sorted(outcomes)}, file)
+        file.flush()
+        os.fsync(file.fileno())
+
+
+def read_chunk(folder: Path, chunk: int) -> dict[int, dict[str, Any]]:
+    """Return the finished evaluations of a chunk; none where the file is missing or no whole one."""
+    try:
+        outcomes = json.loads(chunk_path(folder, chunk).read_text(encoding="utf-8"))
+        return {
+            int(index): {"values": dict(one["values"]), "error": str(one["error"])}
+            for index, one in outcomes.items()
+        }
+    except (OSError, ValueError, TypeError, KeyError, AttributeError):
+        return {}
+
+
+def partial_files(folder: Path) -> Iterator[Path]:
+    """Return the files that a killed process has left half written."""
+    yield from folder.glob(".*.partial")
+    yield from (folder / "rows").glob(".*.partial")

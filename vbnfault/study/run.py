@@ -1,0 +1,605 @@
+"""Evaluate the design of a study in parallel, compute its indices, and write what was found.
+
+Tasks are chunks of consecutive evaluations of one seed and view, so that a worker keeps what a view costs. The
+finished evaluations of a chunk are a file of their own, so an interrupted study continues where it stopped. The
+results do not depend on the number of workers, on the order of work, or on interruptions.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+import os
+import sys
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from .. import __version__
+from ..core import activity, resources, tables
+from ..core.errors import InputChanged, InputError, VbnfaultError, shown
+from ..core.interrupts import Stopped, check, exit_code, finishing, interruptible
+from ..dataset import BuildOptions
+from ..dataset.dask import check_scheduler, run_on_dask
+from ..dataset.errors import Interrupted
+from ..dataset.identity import versions
+from ..dataset.lock import locked
+from ..dataset.processes import Pool
+from ..dataset.progress import Progress, duration_text
+from ..dataset.work import Fatal, Lazy, Queue, Tick, describe, run_here
+from . import indices as indices_module
+from . import results
+from .designs import Design, make_design
+from .indices import Results
+from .spec import Evaluation, Evaluator, EvaluatorFactory, Metric, StudySpec, load_study
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+_LARGEST_CHUNK = 32  # evaluations in a task, and in a file of finished rows
+_SECONDS_BETWEEN_WRITES = 5.0  # a kill loses no more work of a worker than this
+_HOPELESS = 32  # after so many failures without one success the study stops: the others would fail, too
+_MOST_DIFFERENCES = 5  # named in one message
+
+
+class StudyFailed(VbnfaultError):
+    """Some evaluations failed. All others are in the table, and the indices leave out what is incomplete.
+
+    Attributes
+    ----------
+    failures
+        By evaluation, one line and the traceback, or a sentence on how its worker ended.
+    indices
+        The indices; None if the study was stopped before it was complete.
+    """
+
+    def __init__(self, sentence: str, failures: Mapping[int, str] | None = None, indices: Any = None) -> None:
+        super().__init__(sentence)
+        self.failures, self.indices = dict(failures or {}), indices
+
+
+@dataclass(frozen=True, kw_only=True)
+class StudySummary:
+    """What a study did.
+
+    Attributes
+    ----------
+    indices
+        The indices, as in `indices.zarr`.
+    evaluations, finished
+        Numbers of all evaluations, and of those that existed before.
+    seconds
+        Duration.
+    seconds_by_stage
+        Seconds that the evaluators spent in each of their stages, summed over the workers.
+    warnings
+        Sentences on factors that part of the samples do not read, and on half-widths that were missed.
+    """
+
+    path: Path
+    indices: xr.Dataset
+    evaluations: int
+    finished: int
+    seconds: float
+    seconds_by_stage: Mapping[str, float]
+    warnings: tuple[str, ...] = ()
+
+    def lines(self) -> list[str]:
+        """Return lines that say what was done."""
+        made = self.evaluations - self.finished
+        lines = [f"{self.path}: {self.evaluations} evaluations, {self.finished} of them finished before"]
+        if made:
+            lines.append(f"{made} evaluations in {duration_text(self.seconds)}")
+        stages = sorted(self.seconds_by_stage.items(), key=lambda stage: -stage[1])
+        if stages:
+            listed = ", ".join(f"{name} {duration_text(seconds)}" for name, seconds in stages)
+            lines.append(f"time by stage, summed over the workers: {listed}")
+        if "ST_interval" in self.indices:
+            widest = float(indices_module.half_widths(self.indices).max())
+            if math.isfinite(widest):
+                lines.append(f"half-widths of the total indices: at most {widest:.3g}")
+        return lines
+
+
+def study(
+    study: StudySpec | str | Path,
+    out: str | os.PathLike[str] | None = None,
+    *,
+    overrides: Mapping[str, Any] | None = None,
+    evaluator: EvaluatorFactory | None = None,
+    workers: int = 1,
+    threads: int | None = None,
+    scheduler: str | None = None,
+    progress: bool = True,
+) -> xr.Dataset:
+    """Run a sensitivity study and return its indices; an interrupted study with the same `out` is continued.
+
+    Parameters
+    ----------
+    study : StudySpec, str or Path
+        A study, the path of a study file, or the name of a packaged study.
+    out : str or Path, optional
+        Folder for the table, the indices, the report and its figures; by default nothing is kept.
+    overrides : mapping, optional
+        Values that replace those of the file, by dotted key, such as `{"design.n": 8}`.
+    evaluator : callable, optional
+        Makes, from the study, the object that evaluates its points (`vbnfault.study.spec.Evaluator`). It must be
+        picklable with several workers. By default the points are images of the study's scene.
+    workers : int
+        Number of processes on this machine, 1 to 1024. With 1, this process does the work.
+    threads : int, optional
+        Render threads of each worker process; by default the processor's cores are divided equally.
+    scheduler : str, optional
+        Address of a Dask scheduler, whose workers do the work instead. They must have access to `out`.
+    progress : bool
+        Show the progress on standard error.
+
+    Returns
+    -------
+    xarray.Dataset
+        Indices by metric, model and factor, with intervals; see `vbnfault.study.indices`.
+
+    Raises
+    ------
+    InputError
+        If the study file is wrong, or `out` holds another study.
+    StudyFailed
+        If evaluations failed; its attribute `indices` has the indices without them.
+    Interrupted
+        After Ctrl-C, SIGTERM or SIGHUP; the same call continues.
+    VbnfaultError
+        If the files cannot be written, or the cluster fails.
+    """
+    options = BuildOptions(workers=workers, threads=threads, scheduler=scheduler, progress=progress)
+    if out is not None:
+        return run_study(study, Path(out), options, overrides=overrides, evaluator=evaluator).indices
+    with tempfile.TemporaryDirectory(prefix="vbnfault-study-") as folder:
+        return run_study(study, Path(folder) / "study", options, overrides=overrides, evaluator=evaluator).indices
+
+
+def run_study(
+    study: StudySpec | str | Path,
+    path: Path,
+    options: BuildOptions,
+    *,
+    overrides: Mapping[str, Any] | None = None,
+    evaluator: EvaluatorFactory | None = None,
+) -> StudySummary:
+    """Run or continue the study in the folder `path`, as `study` describes, and say what was done."""
+    spec = study if isinstance(study, StudySpec) else load_study(study, overrides)
+    source = spec.title if isinstance(study, StudySpec) else str(study)
+    factory = evaluator or _scene_evaluator()
+    _check_half_width(spec, source)
+    design = make_design(spec)
+    if options.scheduler is not None:
+        check_scheduler(options.scheduler)
+    began = time.monotonic()
+    contents = resources.Contents()
+    with contents.in_use(), resources.noting() as digests:
+        made = factory(spec)
+    metrics = _chosen_metrics(made, spec, source)
+    identity = _identity(spec, factory, metrics, digests)
+    with interruptible(), locked(path):
+        _prepare_folder(path, spec, identity)
+        job = _StudyJob(path, design, Progress(len(design), shown=options.progress, noun="evaluations"))
+        warnings: list[str] = []
+        try:
+            if job.finished < len(design):
+                with contents.in_use():
+                    warnings += made.check() or ()
+            for sentence in warnings:
+                print(f"warning: {sentence}", file=sys.stderr)
+            source_of_workers = _Workers(factory, spec, path.absolute(), tuple(m.name for m in metrics), contents)
+            with job.progress:
+                _do_tasks(source_of_workers, made, job, options)
+        except (Stopped, KeyboardInterrupt) as stop:
+            with finishing():
+                done = _StudyJob(path, design, job.progress).finished
+            raise Interrupted(
+                f"{path}: interrupted; {done} of {len(design)} evaluations are finished, and the same command "
+                "continues",
+                exit_code(stop),
+            ) from stop
+        outcomes = job.outcomes()
+        data = _indices(Results(design, metrics, _values(design, metrics, outcomes)))
+        data.attrs["timings"] = json.dumps(dict(job.seconds_by_stage))
+        with _writing(path):
+            results.write_table(path / results.TABLE, design, metrics, outcomes)
+            results.write_indices(path / results.INDICES, data)
+        missed = _missed_half_widths(spec, data)
+        for sentence in missed:
+            print(f"warning: {sentence}", file=sys.stderr)
+        job.raise_failures(data)
+    return StudySummary(
+        path=path,
+        indices=data,
+        evaluations=len(design),
+        finished=job.finished,
+        seconds=time.monotonic() - began,
+        seconds_by_stage=dict(job.seconds_by_stage),
+        warnings=(*warnings, *missed),
+    )
+
+
+def _scene_evaluator() -> EvaluatorFactory:
+    """Return the evaluator of images."""
+    from .evaluate import SceneEvaluator
+
+    return SceneEvaluator
+
+
+# --- before the evaluations -----------------------------------------------------------------------------------
+
+
+def _chosen_metrics(evaluator: Evaluator, spec: StudySpec, source: str) -> tuple[Metric, ...]:
+    """Return the metrics that the study names. Raises InputError if the evaluator lacks one."""
+    known = {metric.name: metric for metric in evaluator.metrics}
+    for name in spec.metrics.names:
+        if name not in known:
+            raise InputError(
+                f"{source}: metrics.names: unknown metric {shown(name)}{tables.did_you_mean(name, list(known))}"
+            )
+    for name in (*spec.keys, *spec.metrics.names):
+        if name in results.COLUMNS or (name in spec.keys and name in spec.metrics.names):
+            raise InputError(f"{source}: {shown(name)}: the table of the study has another column of this name")
+    return tuple(known[name] for name in spec.metrics.names)
+
+
+def _check_half_width(spec: StudySpec, source: str) -> None:
+    """Raise InputError if even the best case needs more samples for the half-width that the study asks for."""
+    n, asked = spec.design.n, spec.design.half_width
+    if asked is None:
+        return
+    least = indices_module.least_samples(len(spec.factors), asked, spec.design.confidence)
+    if n < least:
+        raise InputError(
+            f"{source}: design.n = {n}: too few samples for half_width = {asked:g}, which needs at least "
+            f"n = {least}, even if all factors have equal parts of the variance, and more if a few dominate"
+        )
+
+
+def _identity(
+    spec: StudySpec, factory: EvaluatorFactory, metrics: Sequence[Metric], digests: Sequence[str]
+) -> dict[str, Any]:
+    """Return what a folder must have in common with a study that continues it, as plain data."""
+    function: Any = factory.func if isinstance(factory, partial) else factory
+    name = getattr(function, "__qualname__", type(function).__qualname__)
+    return {
+        "study": spec.resolved(),
+        "evaluator": f"{function.__module__}.{name}",
+        "metrics": {metric.name: metric.unit for metric in metrics},
+        "input_files": sorted(set(digests)),
+        "versions": versions(),
+    }
+
+
+def _prepare_folder(path: Path, spec: StudySpec, identity: Mapping[str, Any]) -> None:
+    """Make the folder of a study, or check that it holds this study. Raises InputError."""
+    with _writing(path):
+        (path / "rows").mkdir(parents=True, exist_ok=True)
+        record = path / "identity.json"
+        if record.exists():
+            try:
+                stored = json.loads(record.read_text(encoding="utf-8"))
+            except ValueError:
+                raise InputError(f"{record}: not the record of a study; choose another --out") from None
+            different = _differences(stored, json.loads(json.dumps(identity)))
+            if different:
+                raise InputError(f"{path}: holds another study: {different}; choose another --out")
+        for partial_file in results.partial_files(path):
+            results.remove(partial_file)
+        if not record.exists():
+            (path / "study.toml").write_text(resources.toml_text(spec.resolved()), encoding="utf-8")
+            with results.replacing(record) as temporary:
+                temporary.write_text(json.dumps(identity, indent=1), encoding="utf-8")
+
+
+@contextlib.contextmanager
+def _writing(path: Path) -> Iterator[None]:
+    """Turn an OSError of a block that writes below `path` into an InputError that names it."""
+    try:
+        yield
+    except OSError as error:
+        raise InputError(f"{error.filename or path}: cannot be written: {error.strerror}") from None
+
+
+def _differences(stored: Any, now: Any) -> str:
+    """Return as text where two records differ, by dotted key."""
+    old, new = dict(_flat(stored)), dict(_flat(now))
+    keys = [key for key in {**old, **new} if old.get(key) != new.get(key)]
+    named = [
+        f"{key.removeprefix('study.')} = {shown(old[key]) if key in old else 'absent'} (now "
+        f"{shown(new[key]) if key in new else 'absent'})"
+        for key in keys[:_MOST_DIFFERENCES]
+    ]
+    more = [f"and {len(keys) - len(named)} more"] if len(keys) > len(named) else []
+    return ", ".join(named + more)
+
+
+def _flat(node: Any, above: str = "") -> Iterator[tuple[str, Any]]:
+    """Return the values of nested plain data by dotted key."""
+    if isinstance(node, dict | list):
+        for key, value in node.items() if isinstance(node, dict) else enumerate(node):
+            yield from _flat(value, f"{above}.{key}" if above else str(key))
+    else:
+        yield above, node
+
+
+# --- evaluations ----------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Chunk:
+    """The task to complete one chunk; for `skip` and `careful` see `Job.task`."""
+
+    number: int
+    evaluations: tuple[Evaluation, ...]
+    skip: frozenset[int]
+    careful: bool
+
+
+@dataclass(frozen=True)
+class _Workers:
+    """A picklable function that makes a worker of a study.
+
+    `contents`: the input files as they were when the study was planned.
+    """
+
+    factory: EvaluatorFactory
+    spec: StudySpec
+    path: Path
+    metrics: tuple[str, ...]
+    contents: resources.Contents
+
+    def __call__(self) -> _Worker:
+        return _Worker(self, Lazy(self._make))
+
+    def with_evaluator(self, evaluator: Evaluator) -> _Worker:
+        """Return a worker with an evaluator that exists already."""
+        return _Worker(self, Lazy(lambda: evaluator))
+
+    def _make(self) -> Evaluator:
+        with self.contents.in_use():
+            return self.factory(self.spec)
+
+
+class _Worker:
+    """Evaluate chunks; the evaluator is made when the first evaluation needs it."""
+
+    def __init__(self, source: _Workers, evaluator: Callable[[], Evaluator]) -> None:
+        self._source, self._evaluator = source, evaluator
+        self._seconds: dict[str, float] = {}  # by stage, as reported before
+
+    def do(self, task: _Chunk, tick: Tick) -> None:
+        """Complete a chunk. If an interrupt ends it early, the finished evaluations are still written.
+
+        If `tick` raises OSError, they are not: the study that started this worker has ended.
+        """
+        folder = self._source.path
+        outcomes: dict[int, Mapping[str, Any]] = dict(results.read_chunk(folder, task.number))
+        unwritten, written = 0, time.monotonic()
+        made_before = len(outcomes)
+
+        def write() -> None:
+            with _as_error(folder):
+                results.write_chunk(folder, task.number, outcomes)
+
+        try:
+            for evaluation in task.evaluations:
+                i = evaluation.index
+                if i in outcomes:
+                    tick(i, "kept", "")
+                    continue
+                if i in task.skip:
+                    continue
+                check()
+                tick(i, "begun", "")
+                try:
+                    with activity.reported_to(partial(tick, i, "stage")):
+                        values = self._values(evaluation)
+                except Exception as error:
+                    check()
+                    tick(i, "failed", describe(error))
+                    continue
+                outcomes[i] = {"values": values, "error": ""}
+                unwritten += 1
+                if task.careful or time.monotonic() - written > _SECONDS_BETWEEN_WRITES:
+                    write()
+                    unwritten, written = 0, time.monotonic()
+                tick(i, "built", "")
+        except OSError:
+            unwritten = 0
+            raise
+        finally:
+            with finishing():
+                if unwritten:
+                    write()
+        if len(outcomes) > made_before:
+            self._report_seconds(tick)
+
+    def _values(self, evaluation: Evaluation) -> dict[str, float]:
+        """Return the metrics of an evaluation.
+
+        Raises Fatal if no evaluator can be made, or if an input file has changed.
+        """
+        evaluator = self._evaluator()
+        try:
+            with self._source.contents.in_use():
+                values = evaluator.evaluate(evaluation)
+        except InputChanged as error:  # every other evaluation would fail, too
+            raise Fatal(error) from error
+        return {name: float(values[name]) for name in self._source.metrics}
+
+    def _report_seconds(self, tick: Tick) -> None:
+        """Report the seconds that the evaluator has spent in each stage since the last report."""
+        now = dict(self._evaluator().timings())
+        spent = {stage: seconds - self._seconds.get(stage, 0.0) for stage, seconds in now.items()}
+        self._seconds = now
+        tick(-1, "seconds", json.dumps(spent))
+
+
+@contextlib.contextmanager
+def _as_error(folder: Path) -> Iterator[None]:
+    """Turn an OSError of a block that writes rows into a VbnfaultError."""
+    try:
+        yield
+    except OSError as error:
+        raise VbnfaultError(f"{folder}: cannot be written: {error.strerror}; the same command continues") from error
+
+
+class _StudyJob:
+    """The chunks of a study, and what became of their evaluations."""
+
+    task_noun, item_noun = "chunk", "evaluation"
+
+    def __init__(self, path: Path, design: Design, progress: Progress) -> None:
+        self.path, self.progress, self._design = path, progress, design
+        seeds, views, rows, models = design.shape
+        in_block = rows * models
+        size = min(_LARGEST_CHUNK, max(1, in_block // 64))
+        starts = [*range(0, in_block, size), in_block]
+        self._chunks = [
+            range(block * in_block + first, block * in_block + min(first + size, in_block))
+            for block in range(seeds * views)
+            for first in starts[:-1]
+        ]
+        self._queue = Queue([chunk.start // in_block for chunk in self._chunks])
+        self.finished = sum(
+            len(results.read_chunk(path, number).keys() & set(chunk)) for number, chunk in enumerate(self._chunks)
+        )
+        self.failures: dict[int, str] = {}
+        self.seconds_by_stage: Counter[str] = Counter()
+        self._succeeded = 0
+        self._counted: set[int] = set()
+
+    @property
+    def tasks(self) -> int:
+        """Return the number of chunks."""
+        return len(self._chunks)
+
+    def items(self, number: int) -> Sequence[int]:
+        """Return the evaluations of a chunk."""
+        return self._chunks[number]
+
+    def task(self, number: int, skip: frozenset[int] = frozenset(), *, careful: bool = False) -> _Chunk:
+        """Return the task that completes a chunk."""
+        evaluations = tuple(self._design.evaluation(i) for i in self._chunks[number])
+        return _Chunk(number=number, evaluations=evaluations, skip=skip, careful=careful)
+
+    def next_task(self, last: int | None = None, busy: Sequence[int] = ()) -> int | None:
+        """Return the chunk that a worker does after the chunk `last`, of the same seed and view if one is left."""
+        return self._queue.next(last, busy)
+
+    def tick(self, item: int, what: str, text: str) -> None:
+        """Record an event. Raises StudyFailed after too many failures without a success."""
+        if what == "seconds":
+            self.seconds_by_stage.update(json.loads(text))
+        elif what == "stage":
+            self.progress.stage(text)
+        elif what != "begun":
+            if what == "failed":
+                self.failures[item] = text
+                self.progress.say(f"evaluation {item} failed: {text.splitlines()[0]}")
+            else:
+                self.failures.pop(item, None)
+                self._succeeded += 1
+            if item not in self._counted:
+                self._counted.add(item)
+                self.progress.advance(what == "built")
+            if not self._succeeded and len(self.failures) >= _HOPELESS:
+                self.raise_failures(None, " before any succeeded, so the study was stopped")
+
+    def outcomes(self) -> list[dict[str, Any]]:
+        """Return values and error of each evaluation, in order."""
+        outcomes: list[dict[str, Any]] = []
+        for number, chunk in enumerate(self._chunks):
+            finished = results.read_chunk(self.path, number)
+            for i in chunk:
+                error = self.failures.get(i, "not evaluated").splitlines()[0]
+                outcomes.append(finished.get(i, {"values": {}, "error": error}))
+        return outcomes
+
+    def raise_failures(self, indices: Any, why: str = "") -> None:
+        """Raise StudyFailed with the failed evaluations, if there are any."""
+        if not self.failures:
+            return
+        failed = sorted(self.failures)
+        names = ", ".join(map(str, failed[:8])) + (", ..." if len(failed) > 8 else "")
+        listed = f"evaluation {names}" if len(failed) == 1 else f"{len(failed)} evaluations ({names})"
+        rest = (
+            "all others are in the table, and the indices leave out incomplete base samples"
+            if indices is not None
+            else "finished evaluations stay"
+        )
+        raise StudyFailed(
+            f"{self.path}: {listed} of {len(self._design)} failed{why}, the first with: "
+            f"{self.failures[failed[0]].splitlines()[0]}; {rest}; the same command tries the failed ones again",
+            self.failures,
+            indices,
+        )
+
+
+def _do_tasks(source: _Workers, evaluator: Evaluator, job: _StudyJob, options: BuildOptions) -> None:
+    """Do all chunks: on a cluster, in this process, or in worker processes."""
+    if options.scheduler is not None:
+        run_on_dask(source, job, options.scheduler)
+    elif options.workers == 1:
+        run_here(partial(source.with_evaluator, evaluator), job)
+    else:
+        threads = options.threads or max(1, (os.cpu_count() or 1) // options.workers)
+        Pool(source, job, threads, options.recycle_shards).work(options.workers)
+
+
+# --- after the evaluations ------------------------------------------------------------------------------------
+
+
+def _values(design: Design, metrics: Sequence[Metric], outcomes: Sequence[Mapping[str, Any]]) -> Any:
+    """Return the values of all evaluations, float64[seed, view, row, model, metric]."""
+    values = [[outcome["values"].get(metric.name, np.nan) for metric in metrics] for outcome in outcomes]
+    return np.array(values, dtype=np.float64).reshape(*design.shape, len(metrics))
+
+
+def _indices(found: Results) -> xr.Dataset:
+    """Return the indices with the attributes of the study."""
+    data = indices_module.compute(found)
+    spec = found.design.spec
+    return data.assign_attrs(
+        title=spec.title,
+        description=spec.description,
+        **{f"design_{key}": value for key, value in spec.resolved()["design"].items()},
+        evaluations=len(found.design),
+        formulae=(indices_module.__doc__ or "").strip(),
+        versions=json.dumps(versions()),
+        source=f"vbnfault {__version__}",
+    )
+
+
+def _missed_half_widths(spec: StudySpec, data: xr.Dataset) -> list[str]:
+    """Return one sentence on each metric and model whose total indices are less certain than the study asks."""
+    asked = spec.design.half_width
+    if asked is None:
+        return []
+    sentences = []
+    for metric in data["metric"].values:
+        for model in data["model"].values:
+            widths = indices_module.half_widths(data.sel(metric=[metric], model=[model])).squeeze(
+                ("metric", "model")
+            )
+            if not (widths > asked).any():
+                continue
+            factor, reached = str(widths.idxmax().item()), float(widths.max())
+            needed = indices_module.needed_samples(spec.design.n, reached, asked)
+            of_model = f" with model {model}" if model else ""
+            sentences.append(
+                f"{metric}{of_model}: the total index of {factor} has a half-width of {reached:.3g}, more than "
+                f"half_width = {asked:g}; about design.n = {needed} would be needed"
+            )
+    return sentences
