@@ -429,6 +429,7 @@ def test_list_schema_doctor_and_dry_run(
     assert "straylight / texture" in capsys.readouterr().out
     assert run(monkeypatch, "list", "lenses") == 0
     assert run(monkeypatch, "list", "detectors") == 0
+    assert run(monkeypatch, "list", "studies") == 0
     capsys.readouterr()
     for kind, line in (
         ("effects", "\nfull_well     Limit the charge of each pixel to the full well.\nanalogue "),
@@ -438,7 +439,7 @@ def test_list_schema_doctor_and_dry_run(
         assert run(monkeypatch, "list", kind) == 0
         assert line in capsys.readouterr().out
     assert run(monkeypatch, "list", "cameras") == 2
-    assert "must be one of scenes, lenses, detectors, faults, effects, reflect" in capsys.readouterr().err
+    assert "must be one of scenes, lenses, detectors, studies, faults, effects, reflect" in capsys.readouterr().err
     capsys.readouterr()
     assert run(monkeypatch, "schema") == 0
     schema = json.loads(capsys.readouterr().out)

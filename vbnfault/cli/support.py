@@ -26,12 +26,13 @@ def list_(
     kind: Annotated[
         str,
         typer.Argument(
-            help="One of scenes, lenses, detectors, faults, effects, reflectances and glasses.", metavar="KIND"
+            help="One of scenes, lenses, detectors, studies, faults, effects, reflectances and glasses.",
+            metavar="KIND",
         ),
     ],
     plugins: PluginOption = None,
 ) -> None:
-    """List packaged scenes, lenses or detectors, glasses, or faults, effects and reflectances with their keys."""
+    """List packaged files, such as scenes and lenses, or faults, effects and reflectances with their keys."""
     from ..core import resources, toml_files
 
     registered = {
@@ -40,7 +41,7 @@ def list_(
         "reflectances": _list_reflectances,
         "glasses": _list_glasses,
     }
-    folders = {"scenes": "scenes", "lenses": "scenes/lenses", "detectors": "scenes/detectors"}
+    folders = {"scenes": "scenes", **{name: f"scenes/{name}" for name in ("lenses", "detectors", "studies")}}
     if kind in registered:
         load_plugins(plugins)
         registered[kind]()

@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from .. import __version__
-from ..core import activity, resources, tables
+from ..core import activity, file_contents, tables, toml_files
 from ..core.errors import InputChanged, InputError, VbnfaultError, shown
 from ..core.interrupts import Stopped, check, exit_code, finishing, interruptible
 from ..dataset import BuildOptions
@@ -182,8 +182,8 @@ def run_study(
     if options.scheduler is not None:
         check_scheduler(options.scheduler)
     began = time.monotonic()
-    contents = resources.Contents()
-    with contents.in_use(), resources.noting() as digests:
+    contents = file_contents.Contents()
+    with contents.in_use(), file_contents.noting() as digests:
         made = factory(spec)
     metrics = _chosen_metrics(made, spec, source)
     identity = _identity(spec, factory, metrics, digests)
@@ -297,7 +297,7 @@ def _prepare_folder(path: Path, spec: StudySpec, identity: Mapping[str, Any]) ->
         for partial_file in results.partial_files(path):
             results.remove(partial_file)
         if not record.exists():
-            (path / "study.toml").write_text(resources.toml_text(spec.resolved()), encoding="utf-8")
+            (path / "study.toml").write_text(toml_files.toml_text(spec.resolved()), encoding="utf-8")
             with results.replacing(record) as temporary:
                 temporary.write_text(json.dumps(identity, indent=1), encoding="utf-8")
 
@@ -357,7 +357,7 @@ class _Workers:
     spec: StudySpec
     path: Path
     metrics: tuple[str, ...]
-    contents: resources.Contents
+    contents: file_contents.Contents
 
     def __call__(self) -> _Worker:
         return _Worker(self, Lazy(self._make))
