@@ -64,7 +64,10 @@ class Task:
 
 @dataclass(frozen=True)
 class SampleWorkers:
-    """A picklable function that makes a worker of a build: `factory` makes its session, `path` is the store."""
+    """Make a worker of a build; the object is a function that can be pickled.
+
+    `factory` makes the session of the worker, `path` is the store.
+    """
 
     factory: SessionFactory
     path: Path

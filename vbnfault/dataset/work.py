@@ -58,7 +58,9 @@ class Job(Protocol):
     item_noun: str
 
     @property
-    def tasks(self) -> int: ...
+    def tasks(self) -> int:
+        """Return the number of tasks."""
+        ...
 
     def items(self, number: int) -> Sequence[int]:
         """Return the items of a task."""

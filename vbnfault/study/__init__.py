@@ -15,7 +15,7 @@ from typing import Any
 
 
 class _Callable(ModuleType):
-    """A module that runs a study when it is called."""
+    """Run a study when the module is called."""
 
     def __call__(self, *arguments: Any, **keywords: Any) -> Any:
         """Run a study; see `vbnfault.study.run.study`."""

@@ -51,7 +51,7 @@ _MOST_DIFFERENCES = 5  # named in one message
 
 
 class StudyFailed(VbnfaultError):
-    """Some evaluations failed. All others are in the table, and the indices leave out what is incomplete.
+    """Report that some evaluations failed. All others are in the table; the indices leave out what is incomplete.
 
     Attributes
     ----------
@@ -68,7 +68,7 @@ class StudyFailed(VbnfaultError):
 
 @dataclass(frozen=True, kw_only=True)
 class StudySummary:
-    """What a study did.
+    """Say what a study did.
 
     Attributes
     ----------
@@ -338,7 +338,7 @@ def _flat(node: Any, above: str = "") -> Iterator[tuple[str, Any]]:
 
 @dataclass(frozen=True, kw_only=True)
 class _Chunk:
-    """The task to complete one chunk; for `skip` and `careful` see `Job.task`."""
+    """Describe the task to complete one chunk; for `skip` and `careful` see `Job.task`."""
 
     number: int
     evaluations: tuple[Evaluation, ...]
@@ -348,7 +348,7 @@ class _Chunk:
 
 @dataclass(frozen=True)
 class _Workers:
-    """A picklable function that makes a worker of a study.
+    """Make a worker of a study; the object is a function that can be pickled.
 
     `contents`: the input files as they were when the study was planned.
     """
@@ -456,7 +456,7 @@ def _as_error(folder: Path) -> Iterator[None]:
 
 
 class _StudyJob:
-    """The chunks of a study, and what became of their evaluations."""
+    """Hand out the chunks of a study, and collect what became of their evaluations."""
 
     task_noun, item_noun = "chunk", "evaluation"
 
