@@ -7,6 +7,7 @@ import errno
 import gc
 import io
 import os
+import shutil
 import signal
 import sys
 import tempfile
@@ -37,6 +38,8 @@ settings.register_profile(
 )
 settings.load_profile("vbnfault")
 
+pytest.register_assert_rewrite("synthetic")
+
 REAL_SHAPE = Path(__file__).resolve().parents[2] / "shared/data/shapes/67p_18k.obj"
 
 # The six classes of Gallon et al., in the order of the dataset's `fault` axis.
@@ -60,6 +63,33 @@ def real_shape() -> Path:
     if not REAL_SHAPE.is_file():
         pytest.skip(f"the real shape model is not part of the project: no file {REAL_SHAPE}")
     return REAL_SHAPE
+
+
+@pytest.fixture(scope="session")
+def finished_store(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the path of a finished store of 10 synthetic samples in 3 shards, which no test changes."""
+    from synthetic import filled
+
+    return filled(tmp_path_factory.mktemp("store") / "finished.zarr").path
+
+
+@pytest.fixture
+def whole(finished_store: Path, tmp_path: Path) -> Any:
+    """Return a copy of the finished store, to be damaged."""
+    from vbnfault import store
+
+    return store.open_store(shutil.copytree(finished_store, tmp_path / "s.zarr"), "r+")
+
+
+@pytest.fixture(scope="session")
+def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
+    """Return the path and the digest of an undisturbed build of 18 synthetic samples in one process."""
+    from synthetic import run
+
+    out = tmp_path_factory.mktemp("build") / "undisturbed.zarr"
+    digest = run(out).digest
+    assert digest is not None
+    return out, digest
 
 
 def calls_of(action: Callable[[], Any]) -> int:

@@ -37,7 +37,7 @@ from typing import Any
 import numpy as np
 import trimesh
 import zarr
-from test_store import fake_sample, make_spec
+from synthetic import fake_sample, make_spec
 
 from vbnfault import store as st
 from vbnfault.body import Body, cache, choose_sites

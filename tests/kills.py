@@ -39,19 +39,19 @@ if __name__ == "__mp_main__":
 
 def import_all() -> None:
     """Import what builds and reports need, except the renderer: a forked process would lack its threads."""
-    import test_build  # noqa: F401
+    import synthetic  # noqa: F401
 
     from vbnfault import dataset, store  # noqa: F401
 
 
-def synthetic(out: Path, workers: int) -> None:
+def build_synthetic(out: Path, workers: int) -> None:
     """Build 18 synthetic samples."""
-    import test_build
+    import synthetic
 
-    test_build.run(out, workers=workers)
+    synthetic.run(out, workers=workers)
 
 
-def rendered(out: Path, workers: int) -> None:
+def build_rendered(out: Path, workers: int) -> None:
     """Build 6 rendered samples."""
     from vbnfault import dataset
     from vbnfault.scene import config
@@ -101,7 +101,7 @@ def main() -> int:
     options.add_argument("--rendering", choices=("on", "off"), default="off")
     options.add_argument("--seed", type=int, default=0)
     given = options.parse_args()
-    build = rendered if given.rendering == "on" else synthetic
+    build = build_rendered if given.rendering == "on" else build_synthetic
     os.environ.pop("VICTIM_PLAN", None)
     folder = Path(tempfile.mkdtemp(prefix="kills-"))
     os.environ.setdefault("VBNFAULT_CACHE_DIR", str(folder / "cache"))

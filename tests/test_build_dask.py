@@ -12,15 +12,14 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import pytest
 from dask import config as dask_config
-from test_build import SAMPLES, Broken, Deadly, Session, run, site_of
-from test_store import fake_sample, make_spec
+from synthetic import SAMPLES, Broken, Deadly, Session, fake_sample, make_spec, run, site_of
 
 from vbnfault import store as st
 from vbnfault.core.errors import InputError, VbnfaultError
@@ -31,7 +30,17 @@ from vbnfault.dataset import dask
 distributed = pytest.importorskip("distributed")
 pytestmark = pytest.mark.filterwarnings("default")  # what Dask warns of is not ours
 HERE = Path(__file__).resolve().parent
+MOST_SECONDS = 300  # far longer than any wait on a busy machine
 AT = 6  # the third sample of the second shard, in the order of the work
+
+
+def wait_until(happened: Callable[[], bool]) -> None:
+    """Return as soon as something has happened in this process; the limit only ends a test that would hang."""
+    limit = time.monotonic() + MOST_SECONDS
+    while not happened():
+        if time.monotonic() > limit:
+            raise TimeoutError(f"nothing happened within {MOST_SECONDS} s")
+        time.sleep(0.01)
 
 
 @dataclass(frozen=True)
@@ -62,8 +71,7 @@ class Disturbing:
 
     def _user_interrupts(self) -> None:
         os.kill(self.client, signal.SIGINT)
-        while not dask._stopped_jobs:
-            time.sleep(0.01)
+        wait_until(lambda: bool(dask._stopped_jobs))
 
     def _client_dies(self) -> None:
         os.kill(self.client, signal.SIGKILL)
@@ -83,16 +91,8 @@ class Disturbing:
 
     def _until_unwanted(self) -> None:
         worker = distributed.get_worker()
-        while dask._is_wanted(worker, worker.get_current_task()):
-            time.sleep(0.01)
-
-
-@pytest.fixture(scope="module")
-def reference(tmp_path_factory: pytest.TempPathFactory) -> str:
-    """Return the digest of an undisturbed build in one process."""
-    digest = run(tmp_path_factory.mktemp("dask") / "reference.zarr").digest
-    assert digest is not None
-    return digest
+        task = worker.get_current_task()
+        wait_until(lambda: not dask._is_wanted(worker, task))
 
 
 @pytest.fixture(scope="module")
@@ -133,7 +133,7 @@ def resumed(out: Path) -> str | None:
     return summary.digest
 
 
-def test_a_worker_that_dies_once_is_replaced(processes: Any, reference: str, tmp_path: Path) -> None:
+def test_a_worker_that_dies_once_is_replaced(processes: Any, undisturbed: tuple[Path, str], tmp_path: Path) -> None:
     processes.scheduler.allowed_failures = 1
     try:
         summary = run(
@@ -144,16 +144,18 @@ def test_a_worker_that_dies_once_is_replaced(processes: Any, reference: str, tmp
     finally:
         processes.scheduler.allowed_failures = 0
     assert (tmp_path / "happened").exists()
-    assert (summary.built, summary.digest) == (SAMPLES, reference)
+    assert (summary.built, summary.digest) == (SAMPLES, undisturbed[1])
 
 
-def test_a_sample_that_kills_its_workers_fails_alone(processes: Any, reference: str, tmp_path: Path) -> None:
+def test_a_sample_that_kills_its_workers_fails_alone(
+    processes: Any, undisturbed: tuple[Path, str], tmp_path: Path
+) -> None:
     out = tmp_path / "s.zarr"
     sentence = rf"sample {AT} failed, the first with: a worker of the cluster died while it was in work"
     with pytest.raises(bd.BuildFailed, match=sentence):
         run(out, Disturbing("worker dies", str(tmp_path)), scheduler=processes.scheduler_address)
     assert finished(out) == set(range(SAMPLES)) - {AT}
-    assert resumed(out) == reference
+    assert resumed(out) == undisturbed[1]
 
 
 def test_tasks_that_kill_every_worker_end_the_build(processes: Any, tmp_path: Path) -> None:
@@ -162,7 +164,9 @@ def test_tasks_that_kill_every_worker_end_the_build(processes: Any, tmp_path: Pa
     assert finished(tmp_path / "s.zarr") == set()
 
 
-def test_ctrl_c_waits_until_the_workers_have_written(processes: Any, reference: str, tmp_path: Path) -> None:
+def test_ctrl_c_waits_until_the_workers_have_written(
+    processes: Any, undisturbed: tuple[Path, str], tmp_path: Path
+) -> None:
     out = tmp_path / "s.zarr"
     with pytest.raises(bd.Interrupted, match=r"interrupted; (\d+) of 18 samples are finished") as stopped:
         run(
@@ -174,10 +178,12 @@ def test_ctrl_c_waits_until_the_workers_have_written(processes: Any, reference: 
     done = finished(out)
     assert f" {len(done)} of 18" in str(stopped.value)
     assert done & {4, 5, 6, 7} == {4, 5, 6}  # what the worker had made of its shard, and nothing more
-    assert resumed(out) == reference
+    assert resumed(out) == undisturbed[1]
 
 
-def test_workers_write_nothing_after_the_client_was_killed(processes: Any, reference: str, tmp_path: Path) -> None:
+def test_workers_write_nothing_after_the_client_was_killed(
+    processes: Any, undisturbed: tuple[Path, str], tmp_path: Path
+) -> None:
     """Another build of the same store may have begun by then."""
     out = tmp_path / "s.zarr"
     code = "import sys, test_build_dask; test_build_dask.main(*sys.argv[1:])"
@@ -192,7 +198,7 @@ def test_workers_write_nothing_after_the_client_was_killed(processes: Any, refer
         other.run(until_idle)
     assert finished(out).isdisjoint({4, 5, 6, 7})
     (tmp_path / ".s.zarr.lock").unlink()
-    assert resumed(out) == reference
+    assert resumed(out) == undisturbed[1]
 
 
 def until_idle() -> None:
@@ -214,7 +220,7 @@ def main(out: str, scheduler: str) -> None:
     ],
 )
 def test_a_cluster_that_ends_is_one_sentence(
-    event: str, sentence: str, reference: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    event: str, sentence: str, undisturbed: tuple[Path, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(dask, "_SECONDS_BETWEEN_CHECKS", 0.01)
     monkeypatch.setattr(dask, "_SECONDS_WITHOUT_WORKERS", 0.0)
@@ -226,11 +232,11 @@ def test_a_cluster_that_ends_is_one_sentence(
         pytest.raises(VbnfaultError, match=f"^--scheduler tcp://.*: {sentence}"),
     ):
         run(out, Disturbing(event, str(tmp_path)), scheduler=cluster.scheduler_address)
-    assert resumed(out) == reference
+    assert resumed(out) == undisturbed[1]
 
 
 def test_a_dask_cluster_makes_the_same_bits(
-    reference: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    undisturbed: tuple[Path, str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "s.zarr"
     with distributed.LocalCluster(
@@ -239,11 +245,11 @@ def test_a_dask_cluster_makes_the_same_bits(
         with pytest.raises(bd.BuildFailed, match=r"sample 5 failed.*KeyError"):
             run(out, Session(raises=frozenset({5})), scheduler=cluster.scheduler_address)
         summary = run(out, Session(stage="terrain of"), scheduler=cluster.scheduler_address, progress=True)
-        assert (summary.built, summary.digest) == (1, reference)
+        assert (summary.built, summary.digest) == (1, undisturbed[1])
         with pytest.raises(VbnfaultError, match="no such mesh"):
             run(tmp_path / "t.zarr", Broken(), scheduler=cluster.scheduler_address)
     assert capsys.readouterr().err.splitlines().count("terrain of 5") == 1
-    assert st.digest(out) == reference
+    assert st.digest(out) == undisturbed[1]
 
 
 def test_a_scheduler_is_told_from_a_worker() -> None:

@@ -25,8 +25,7 @@ from hypothesis.stateful import (
     rule,
     run_state_machine_as_test,
 )
-from test_build import Session, site_of
-from test_store import flip, make_spec
+from synthetic import Session, flip, make_spec, site_of
 
 from vbnfault import store
 from vbnfault.dataset import build

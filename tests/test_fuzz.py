@@ -6,6 +6,7 @@ import random
 from pathlib import Path
 
 import fuzz
+import fuzz_inputs
 import pytest
 import typer
 
@@ -47,10 +48,10 @@ def test_damage_is_keyed_and_never_nothing() -> None:
     table = {"a": {"b": [1, 2.5, "text"]}, "c": True}
     differ = 0
     for number in range(200):
-        one, same = (fuzz.changed(table, random.Random(f"s/{number}")) for _ in range(2))
-        assert fuzz.toml_value(one) == fuzz.toml_value(same)
-        differ += fuzz.toml_value(one) != fuzz.toml_value(table)
+        one, same = (fuzz_inputs.changed(table, random.Random(f"s/{number}")) for _ in range(2))
+        assert fuzz_inputs.toml_value(one) == fuzz_inputs.toml_value(same)
+        differ += fuzz_inputs.toml_value(one) != fuzz_inputs.toml_value(table)
     assert differ > 180
     assert table == {"a": {"b": [1, 2.5, "text"]}, "c": True}
     data = bytes(range(256))
-    assert sum(fuzz.flipped(data, random.Random(k), data) != data for k in range(200)) > 180
+    assert sum(fuzz_inputs.flipped(data, random.Random(k), data) != data for k in range(200)) > 180

@@ -8,8 +8,8 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-from test_build import SAMPLES, Session
-from test_build import run as build
+from synthetic import SAMPLES, Session
+from synthetic import run as build
 from test_cli import run
 
 from vbnfault import store

@@ -7,7 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from test_store import FAULTS, fake_sample, make_spec
+from synthetic import FAULTS, fake_sample, make_spec
 
 from vbnfault import store as st
 from vbnfault.core.errors import InputError

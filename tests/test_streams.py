@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, TextIO
 
 import pytest
-from test_build import run as build
+from synthetic import run as build
 from test_cli import run
 
 from vbnfault import cli, store

@@ -3,7 +3,7 @@
     VICTIM_PLAN='{"main": [{"events": ["write"], "count": 7, "signal": "SIGKILL"}]}' python tests/victim.py cli …
 
 So a test interrupts the program at an exact point and does not depend on time. `cli` runs the command line; `build`
-builds synthetic samples (`test_build.main`). The plan has one list of steps for the program itself (`main`) and one
+builds synthetic samples (`synthetic.main`). The plan has one list of steps for the program itself (`main`) and one
 for each of its worker processes (`worker`). A step counts the events of its kinds that concern a name containing
 `text`. When event number `count` begins, the step sends its signal, and the next step follows.
 
@@ -136,9 +136,9 @@ def main() -> None:
     """Run `build` or `cli` with the other arguments."""
     kind, *arguments = sys.argv[1:]
     if kind == "build":
-        import test_build
+        import synthetic
 
-        sys.exit(test_build.main(*arguments))
+        sys.exit(synthetic.main(*arguments))
     from vbnfault import cli
 
     sys.argv = ["vbnfault", *arguments]

@@ -1,12 +1,20 @@
 """Build, resume, repair, extend and check a dataset.
 
 `store_spec`, `scene_identity` and `planned` compute from a scene what the store of its dataset must hold.
+
+Each name loads its module when it is first used, so that a process that only builds or checks a store starts without
+the modules that simulate samples.
 """
 
-from .build import BuildOptions
-from .checking import missing_plugins, verify
-from .from_scene import SessionFactory, build_scene, describe_scene
-from .identity import is_exact, planned, scene_identity, store_spec
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from .build import BuildOptions
+    from .checking import missing_plugins, verify
+    from .from_scene import SessionFactory, build_scene, describe_scene
+    from .identity import is_exact, planned, scene_identity, store_spec
 
 __all__ = [
     "BuildOptions",
@@ -20,3 +28,28 @@ __all__ = [
     "store_spec",
     "verify",
 ]
+
+# public name → the module that defines it
+_HOME = {
+    "BuildOptions": "build",
+    "SessionFactory": "from_scene",
+    "build_scene": "from_scene",
+    "describe_scene": "from_scene",
+    "is_exact": "identity",
+    "missing_plugins": "checking",
+    "planned": "identity",
+    "scene_identity": "identity",
+    "store_spec": "identity",
+    "verify": "checking",
+}
+
+
+def __getattr__(name: str) -> Any:
+    """Return a public name from the module that defines it."""
+    if name not in _HOME:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    import importlib
+
+    value = getattr(importlib.import_module(f".{_HOME[name]}", __name__), name)
+    globals()[name] = value
+    return value

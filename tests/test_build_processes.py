@@ -1,0 +1,209 @@
+"""Builds in several processes, killed and interrupted: the same bits, and no finished sample is lost."""
+
+from __future__ import annotations
+
+import os
+import re
+import resource
+import signal
+import subprocess
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import victim
+from synthetic import SAMPLES, Deadly, Session, make_spec, run
+
+from vbnfault import store as st
+from vbnfault.core.errors import VbnfaultError
+from vbnfault.core.quantities import Sample
+from vbnfault.dataset import build as bd
+
+HERE = Path(__file__).resolve().parent
+
+
+def test_two_workers_make_the_same_bits_and_share_the_work(undisturbed: tuple[Path, str], tmp_path: Path) -> None:
+    log = tmp_path / "log"
+    summary = run(tmp_path / "s.zarr", Session(log=str(log)), workers=2, recycle_shards=2)
+    assert st.digest(tmp_path / "s.zarr") == undisturbed[1]
+    assert summary.digest == undisturbed[1]
+    calls = [line.split() for line in log.read_text().splitlines()]
+    assert sorted(int(i) for _, i in calls) == list(range(SAMPLES))
+    # 5 shards by processes that end after 2 each: at least 3 processes, none of them this one
+    assert len({pid for pid, _ in calls} - {str(os.getpid())}) >= 3
+
+
+def test_workers_run_no_python_files_of_the_working_folder(
+    undisturbed: tuple[Path, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / "data"
+    folder.mkdir()
+    for name in ("random", "signal", "struct", "tempfile", "numpy", "zarr", "numcodecs"):
+        (folder / f"{name}.py").write_text(f"open({str(tmp_path / 'run')!r}, 'a').write('{name} ')")
+    monkeypatch.chdir(folder)
+    monkeypatch.setattr(sys, "path", ["", *sys.path])  # as at the prompt, and under python -m
+    run(tmp_path / "s.zarr", workers=2)
+    assert not (tmp_path / "run").exists(), (tmp_path / "run").read_text()
+    assert st.digest(tmp_path / "s.zarr") == undisturbed[1]
+    assert sys.path[0] == ""
+    assert "PYTHONSAFEPATH" not in os.environ
+
+
+def build_elsewhere(
+    out: Path, workers: int = 1, *, main: Sequence[dict] = (), worker: Sequence[dict] = (), samples: int = SAMPLES
+) -> subprocess.CompletedProcess[str]:
+    """A build of made-up samples in a process that follows a plan of signals; see `victim`."""
+    return victim.run(["build", out, workers, samples], main=main, worker=worker)
+
+
+@pytest.mark.parametrize(("workers", "kills", "samples"), [(1, 4, SAMPLES), (2, 2, 40)])
+def test_kill_9_at_any_operation_then_resuming_makes_the_same_bits(
+    tmp_path: Path, workers: int, kills: int, samples: int
+) -> None:
+    out, progress = tmp_path / "s.zarr", [0]
+    for count in np.random.default_rng(workers).integers(1, 60, kills).tolist():
+        # after the first shard that is new, so that each kill finds a store further on
+        plan = [victim.step("write", text="done/c/", number="SIGCONT")]
+        plan += [victim.step("write", count=count, to="self" if workers == 1 else "parent", torn=True)]
+        done = build_elsewhere(out, workers, samples=samples, **{"main" if workers == 1 else "worker": plan})
+        assert done.returncode == -signal.SIGKILL, done.stderr
+        assert "Traceback" not in done.stderr
+        progress.append(st.open_store(out).finished())
+        assert progress[-1] >= progress[-2]
+    assert 0 < progress[-1] < samples, progress  # else the kills tested nothing
+    assert run(out, samples=samples).built == samples - progress[-1]
+    assert st.verify(out) == []
+    run(tmp_path / "whole.zarr", samples=samples)
+    assert st.digest(out) == st.digest(tmp_path / "whole.zarr")
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["s.zarr", "whole.zarr"]
+    assert not list(out.rglob("*.partial"))
+
+
+@pytest.mark.parametrize("before", ["unlink", "mkdir"])
+def test_a_folder_that_another_worker_makes_at_the_same_time_is_used(
+    undisturbed: tuple[Path, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, before: str
+) -> None:
+    # two workers write their first shards of an array: the other one is always a moment earlier
+    slower = getattr(os, before)
+    made = []
+
+    def late(path: Any, *args: Any, **kwargs: Any) -> None:
+        if Path(path).name == "c" and Path(path).parent.is_dir() and not Path(path).exists():
+            os.makedirs(Path(path).parent / "c2")
+            os.rename(Path(path).parent / "c2", path)
+            made.append(path)
+        slower(path, *args, **kwargs)
+
+    out = tmp_path / "s.zarr"
+    st.create(out, make_spec(attributes={**make_spec().attributes, "blocks": [SAMPLES]}), SAMPLES)
+    monkeypatch.setattr(os, before, late)
+    run(out)
+    assert made
+    assert st.digest(out) == undisturbed[1]
+
+
+def test_the_command_that_kills_builds_finds_none_that_fails() -> None:
+    command = [sys.executable, "-m", "tests.kills", "--count", "3", "--seed", "3"]
+    done = subprocess.run(command, cwd=HERE.parent, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert re.search(r"[3-6] kills in \d rounds, rendering off, seed 3, .*: 0 failures", done.stdout), done.stdout
+
+
+@pytest.mark.parametrize(("workers", "number"), [(1, "SIGINT"), (1, "SIGTERM"), (2, "SIGHUP"), (2, "SIGINT")])
+def test_an_interrupt_keeps_what_was_made(
+    undisturbed: tuple[Path, str], tmp_path: Path, workers: int, number: str
+) -> None:
+    out = tmp_path / "s.zarr"
+    # while the second shard is written, by a process that made others of it before
+    step = victim.step("write", text="done/c/", number=number, to="group" if number != "SIGTERM" else "self")
+    done = build_elsewhere(out, workers, **{"main" if workers == 1 else "worker": [step]})
+    assert done.returncode == 128 + getattr(signal, number), done.stderr
+    assert "Traceback" not in done.stderr
+    match = re.fullmatch(
+        r".*interrupted; (\d+) of 18 samples are finished, and the same command resumes\n", done.stderr
+    )
+    assert match, done.stderr
+    finished = int(match[1])
+    assert 1 <= finished < SAMPLES  # the shard in work was kept
+    assert st.open_store(out).finished() == finished
+    assert run(out).built == SAMPLES - finished
+    assert st.digest(out) == undisturbed[1]
+    assert [p.name for p in tmp_path.iterdir()] == ["s.zarr"]
+
+
+def test_ctrl_c_as_workers_start_twice_leaves_nobody(tmp_path: Path) -> None:
+    # the second one while the first is obeyed: as it kills the workers, which have done nothing yet
+    twice = [victim.step("start", count=2, number="SIGINT", to="group")]
+    twice += [victim.step("kill", number="SIGINT", to="group")]
+    done = build_elsewhere(tmp_path / "s.zarr", 3, main=twice)
+    assert done.returncode == 130
+    assert re.fullmatch(r".*interrupted; 0 of 18 samples .*\n", done.stderr), done.stderr
+    assert run(tmp_path / "s.zarr").built == SAMPLES
+
+
+def test_a_worker_that_dies_costs_its_sample_alone(undisturbed: tuple[Path, str], tmp_path: Path) -> None:
+    out = tmp_path / "s.zarr"
+    with pytest.raises(bd.BuildFailed, match=r"sample 6 failed.*worker process was killed \(signal 9.*twice"):
+        run(out, Session(dies=frozenset({6})), workers=2)
+    assert st.problem_samples(out) == [6]
+    assert run(out).built == 1
+    assert st.digest(out) == undisturbed[1]
+
+
+def test_a_worker_that_dies_once_is_replaced(undisturbed: tuple[Path, str], tmp_path: Path) -> None:
+    session = Session(dies=frozenset({6}), dies_once=str(tmp_path / "died"))
+    assert run(tmp_path / "s.zarr", session, workers=2).built == SAMPLES
+    assert (tmp_path / "died").exists()
+    assert st.digest(tmp_path / "s.zarr") == undisturbed[1]
+
+
+def test_workers_that_die_between_samples_are_replaced(
+    undisturbed: tuple[Path, str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    died = tmp_path / "died"
+    died.mkdir()
+    assert run(tmp_path / "s.zarr", Session(dies_writing=str(died)), workers=2, progress=True).built == SAMPLES
+    assert len(list(died.iterdir())) == 2
+    assert st.digest(tmp_path / "s.zarr") == undisturbed[1]
+    said = capsys.readouterr().err
+    assert "None" not in said
+    for shard in range(2):
+        assert re.search(rf"shard {shard}: .*killed \(signal 9.*while no sample was in work; trying again", said)
+
+
+def test_workers_that_cannot_begin_end_the_build(tmp_path: Path) -> None:
+    with pytest.raises(VbnfaultError, match=r"shard \d: .*killed.* twice while no sample was in work; finished"):
+        run(tmp_path / "s.zarr", Deadly(), workers=2)
+
+
+@dataclass(frozen=True)
+class FullDisk(Session):
+    """From sample 9 on, no file of this process can grow beyond 100 bytes."""
+
+    def simulate(self, index: int) -> Sample:
+        if index == 9:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (100, resource.getrlimit(resource.RLIMIT_FSIZE)[1]))
+        return Session.simulate(self, index)
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_a_full_disk_ends_the_build_and_the_same_command_resumes(
+    undisturbed: tuple[Path, str], tmp_path: Path, workers: int
+) -> None:
+    out, before = tmp_path / "s.zarr", resource.getrlimit(resource.RLIMIT_FSIZE)
+    try:
+        with pytest.raises(
+            VbnfaultError, match=r"File too large while writing samples 8-11; finished .* stay"
+        ) as e:
+            run(out, FullDisk(), workers=workers)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert e.value.exit_code == 1
+    assert not list(out.rglob("*.partial"))
+    finished = st.open_store(out).finished()
+    assert run(out).built == SAMPLES - finished
+    assert st.digest(out) == undisturbed[1]

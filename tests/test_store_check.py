@@ -1,0 +1,315 @@
+"""The check of a store: damage of every kind, contradictory labels and wrong metadata are found and mended."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+
+import numpy as np
+import pytest
+from synthetic import FAULTS, fake_sample, flip, repaired
+
+from vbnfault import store as st
+from vbnfault.core.errors import VbnfaultError
+from vbnfault.core.quantities import Sample
+from vbnfault.store import check, codec
+
+# --- damage ---------------------------------------------------------------------------------------------------
+
+
+def test_a_flipped_byte_of_a_chunk_concerns_one_sample(whole: st.Store) -> None:
+    before = st.digest(whole)
+    flip(whole.file("image", 1), 20)  # within the first chunk of the shard
+    (sentence,) = st.verify(whole)
+    assert re.match(r"sample 4: image cannot be decoded, its chunk in image/c/1/0/0/0", sentence)
+    repaired(whole, [4], before)
+
+
+def test_every_flipped_byte_of_a_shard_is_found(whole: st.Store) -> None:
+    file = whole.file("mask", 2)
+    good = file.read_bytes()
+    for position in range(0, len(good), 7):
+        flip(file, position)
+        assert st.check_shard(whole, 2), position
+        file.write_bytes(good)
+    assert st.check_shard(whole, 2) == []
+
+
+def test_damage_that_decodes_is_found_by_the_stored_checksum(whole: st.Store) -> None:
+    """Another sample's chunk in this one's place is sound in itself."""
+    chunks = whole.chunk("depth_m", 0)
+    other = st.encode(
+        whole.spec,
+        Sample(
+            index=1,
+            layers={**fake_sample(whole.spec, 1).layers, "depth_m": np.ones((24, 32), np.float32)},
+            scalars=fake_sample(whole.spec, 1).scalars,
+        ),
+    )
+    whole.file("depth_m", 0).write_bytes(codec.join_shard({**chunks, 1: other.chunks["depth_m"]}, 4))
+    before_sentence = "sample 1: depth_m in depth_m/c/0/0/0 does not match its stored crc32c"
+    assert st.verify(whole) == [before_sentence]
+
+
+def test_a_missing_chunk_is_found_although_it_reads_as_zeros(whole: st.Store) -> None:
+    before = st.digest(whole)
+    chunks = whole.chunk("mask", 1)
+    del chunks[6]
+    whole.file("mask", 1).write_bytes(codec.join_shard({i - 4: c for i, c in chunks.items()}, 4))
+    assert not whole.read("mask", 6, 7).any()
+    assert st.verify(whole) == ["sample 6: mask has no chunk in mask/c/1/0/0/0"]
+    repaired(whole, [6], before)
+
+
+@pytest.mark.parametrize("name", ["clean", "mask_any", "tries", "parameters", "injected", "crc32c", "done"])
+def test_a_missing_file_concerns_its_shard(whole: st.Store, name: str) -> None:
+    before = st.digest(whole)
+    whole.file(name, 1).unlink()
+    sentences = st.verify(whole)
+    assert any(f"{name} of samples 4-7" in s and f"{name}/c/1" in s for s in sentences)
+    repaired(whole, [4, 5, 6, 7], before)
+
+
+@pytest.mark.parametrize("keep", [0, 1, 40, -1, -70])
+def test_a_truncated_shard_is_found_and_rebuilt(whole: st.Store, keep: int) -> None:
+    before = st.digest(whole)
+    file = whole.file("without_straylight", 2)
+    file.write_bytes(file.read_bytes()[:keep])
+    (sentence,) = st.verify(whole)
+    assert sentence.startswith("without_straylight of samples 8-9: the shard file without_straylight/c/2/0/0/0")
+    repaired(whole, [8, 9], before)
+
+
+@pytest.mark.parametrize("name", ["sun_direction_T", "parameters", "crc32c", "done", "split"])
+def test_a_flipped_byte_of_a_scalar_chunk_is_found(whole: st.Store, name: str) -> None:
+    before = st.digest(whole)
+    for number, concerned in ((0, [0, 1, 2, 3]), (2, [8, 9])):
+        file = whole.file(name, number)
+        flip(file, len(file.read_bytes()) // 2)
+        assert any(s.startswith((name, "samples")) and name in s for s in st.verify(whole))
+        repaired(whole, concerned, before)
+
+
+def test_a_scalar_changed_behind_its_checksum_is_found(whole: st.Store) -> None:
+    whole.array("exposure_s")[5] = 2.0
+    assert st.verify(whole) == ["sample 5: its scalars do not match their crc32c"]
+
+
+# --- labels -------------------------------------------------------------------------------------------------
+
+
+def relabelled(whole: st.Store, index: int, **changes: object) -> list[str]:
+    """Problems after a sample was written again, whole, with other labels."""
+    sample = fake_sample(whole.spec, index)
+    for name, value in changes.items():
+        (sample.scalars if name in st.SCALARS else sample.layers)[name] = value  # type: ignore[index]
+    st.write_samples(whole, [sample])
+    return st.verify(whole)
+
+
+def test_labels_that_contradict_each_other_are_found(whole: st.Store) -> None:
+    sample = fake_sample(whole.spec, 1)
+    on = int(np.flatnonzero(sample.scalars["injected"][:3])[0])
+    off = int(np.flatnonzero(~sample.scalars["injected"])[0])
+    mask = sample.layers["mask"].copy()
+    mask[off, 3, 3] = True
+    any_of = mask[:3].any(0)
+    assert f"sample 1: mask of {FAULTS[off]} is not empty" in relabelled(whole, 1, mask=mask, mask_any=any_of)[0]
+    mask = sample.layers["mask"].copy()
+    mask[on] = False
+    assert f"sample 1: mask of {FAULTS[on]} is empty" in relabelled(whole, 1, mask=mask)[0]
+    any_of = sample.layers["mask"].any(0) ^ True
+    assert "sample 1: mask_any is not the union" in relabelled(whole, 1, mask_any=any_of)[0]
+    (sentence,) = relabelled(whole, 1, parameters={**sample.scalars["parameters"], FAULTS[off]: {"a": 1}})
+    assert sentence == f"sample 1: {FAULTS[off]} has parameters, although not marked in injected"
+    fewer = {k: v for k, v in sample.scalars["parameters"].items() if k != FAULTS[on]}
+    (sentence,) = relabelled(whole, 1, parameters=fewer)
+    assert sentence == f"sample 1: {FAULTS[on]} has no parameters, although marked in injected"
+    (sentence,) = relabelled(whole, 1, split="test")
+    assert sentence == "sample 1: split = test, but sample 0 of the same site site-0 has train"
+    assert relabelled(whole, 1) == []
+
+
+def test_pictures_and_effects_that_contradict_the_labels_are_found(whole: st.Store) -> None:
+    """`injected` is what the pixels hold: a picture or an effect that says otherwise is a problem."""
+    sample = next(s for i in range(10) if not (s := fake_sample(whole.spec, i)).scalars["injected"][2])
+    i, off = sample.index, sample.scalars["injected"].argmin()
+    on = sample.scalars["injected"].argmax()
+    wrong = sample.layers["without_straylight"].copy()
+    wrong[2, 3, 1] ^= 1
+    (sentence,) = relabelled(whole, i, without_straylight=wrong)
+    assert sentence == f"sample {i}: without_straylight differs from image, although straylight is not injected"
+    effect = sample.layers["mask_effect"].copy()
+    effect[off, 3, 3] = True
+    (sentence,) = relabelled(whole, i, mask_effect=effect)
+    assert sentence == f"sample {i}: mask_effect of {FAULTS[off]} is not empty, although it is not injected"
+    effect = sample.layers["mask_effect"].copy()
+    effect[on] = False
+    (sentence,) = relabelled(whole, i, mask_effect=effect)
+    assert sentence == f"sample {i}: mask_effect of {FAULTS[on]} is empty, although it is injected"
+    none = {name: np.zeros_like(sample.layers[name]) for name in ("mask", "mask_effect")}
+    nothing = {**none, "injected": np.zeros(4, bool), "parameters": {}, "without_straylight": wrong, "image": wrong}
+    (sentence,) = relabelled(whole, i, **nothing, clean=sample.layers["image"])
+    assert sentence == f"sample {i}: image differs from clean, although no fault is injected"
+    assert relabelled(whole, i, **nothing, clean=wrong) == []
+
+
+def test_one_pass_gives_problems_digest_and_counts(whole: st.Store, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each chunk is decompressed once, for checksums, labels and digest together."""
+    decoded: list[int] = []
+    decompress = check.decompress
+    monkeypatch.setattr(check, "decompress", lambda data: (decoded.append(1), decompress(data))[1])
+    commanded = np.array([fake_sample(whole.spec, i).scalars["injected"] for i in range(10)])
+    realised = commanded.sum(axis=0)
+    i, off = (int(n[0]) for n in np.nonzero(~commanded))
+    commanded[i, off] = True
+    told: list[int] = []
+    report = st.examine(whole, expected=lambda i, _: {"injected": commanded[i]}, progress=told.append)
+    assert len(decoded) == 10 * len(whole.spec.pixel_layers)
+    assert told == [4, 4, 2]
+    assert report.problems == []
+    assert report.digest == st.digest(whole)
+    assert [report.counts.realised(f) for f in FAULTS] == realised.tolist()
+    assert [report.counts.planned(f) for f in FAULTS] == commanded.sum(axis=0).tolist()
+    assert report.counts.missing == {FAULTS[off]: 1}
+    # sites of three samples take the splits in turn
+    splits = [("train", "val", "test")[i // 3 % 3] for i in range(10)]
+    assert report.counts.samples == {s: splits.count(s) for s in splits}
+    for split in report.counts.samples:
+        rows = [k for k, s in enumerate(splits) if s == split]
+        for k, fault in enumerate(FAULTS):
+            assert report.counts.planned(fault, split) == commanded[rows, k].sum()
+    row = next(line for line in report.counts.lines() if line.startswith(FAULTS[off]))
+    here = commanded[[k for k, s in enumerate(splits) if s == splits[i]], off].sum()
+    assert f"{here - 1} of {here}" in row
+    (sentence,) = st.verify(whole, expected=lambda i, _: {"injected": commanded[i]}, exact=True)
+    assert sentence == f"sample {i}: {FAULTS[off]} is not injected, although the plan commands it"
+
+
+def test_an_unfinished_or_damaged_store_has_no_digest_in_its_report(whole: st.Store) -> None:
+    want = st.digest(whole)
+    added = st.append_samples(whole, 1)
+    assert st.examine(added).digest is None
+    assert st.digest(added) != want  # of what is there
+    flip(added.file("image", 1), 20)
+    assert st.examine(added).digest is None
+    with pytest.raises(VbnfaultError, match=r"sample \d+: image .*; the build command mends it"):
+        st.digest(added)
+
+
+def test_verify_compares_with_the_plan(whole: st.Store) -> None:
+    def plan(i: int, tries: int = 0) -> dict:
+        scalars = fake_sample(whole.spec, i).scalars
+        return {name: scalars[name] for name in ("site", "proposal", "sun_xy_px", "julian_date", "injected")}
+
+    assert st.verify(whole, expected=plan) == []
+    (sentence,) = st.verify(whole, expected=lambda i, _: plan(i) | ({"site": 2} if i == 3 else {}))
+    assert sentence == "sample 3: site = 1 is not as planned (2)"
+    (sentence,) = st.verify(whole, expected=lambda i, _: plan(i) | ({"proposal": "{}"} if i == 3 else {}))
+    assert sentence.startswith('sample 3: proposal = {"sun_elevation_deg": 0.3} is not as planned')
+
+
+def test_a_fault_that_was_not_commanded_is_found(whole: st.Store) -> None:
+    """The sample is labelled soundly in itself, its checksums are right: the plan alone says that it is wrong."""
+    commanded = {i: fake_sample(whole.spec, i).scalars["injected"] for i in range(10)}
+    commanded[4] = np.ones(4, bool)  # what had no effect is not injected, and that is no problem
+    assert st.verify(whole, expected=lambda i, _: {"injected": commanded[i]}) == []
+    sample = fake_sample(whole.spec, 1)
+    off = int(np.flatnonzero(~commanded[1])[0])
+    injected, mask = commanded[1].copy(), sample.layers["mask"].copy()
+    injected[off] = mask[off, 3, 3] = True
+    changes = {"injected": injected, "mask": mask, "mask_effect": mask, "mask_any": mask[:3].any(0)}
+    parameters = {**sample.scalars["parameters"], FAULTS[off]: {"amplitude": 0.1}}
+    assert relabelled(whole, 1, **changes, parameters=parameters) == []
+    (sentence,) = st.verify(whole, expected=lambda i, _: {"injected": commanded[i]})
+    assert sentence == f"sample 1: {FAULTS[off]} is injected, but the plan does not command it"
+
+
+# --- coordinates, attributes and metadata -------------------------------------------------------------------
+
+
+def test_wrong_coordinates_and_attributes_are_found_and_mended(whole: st.Store) -> None:
+    before = st.digest(whole)
+    for name, position, value in (
+        ("fault", 1, "smear"),
+        ("channel", 0, "I"),
+        ("wavelength_nm", 2, 700.0),
+        ("x", 3, 0.0),
+        ("layer", 0, "raw"),
+        ("sample", 5, 6),
+    ):
+        good = whole.array(name)[:]
+        whole.array(name)[position] = value
+        (sentence,) = st.verify(whole.path)
+        assert sentence.startswith(f"array {name}: its value {position} is {value}, not ")
+        st.recover(whole.path)
+        assert st.verify(whole.path) == []
+        np.testing.assert_array_equal(st.open_store(whole.path).array(name)[:], good)
+    for name, key, wrong in (
+        ("mask_any", "faults", ["vignetting"]),
+        ("stratum", "flag_meanings", "a b"),
+        ("site", "names", []),
+        ("depth_m", "units", "km"),
+    ):
+        whole.array(name).update_attributes({key: wrong})
+        (sentence,) = st.verify(whole.path)
+        assert sentence.startswith(f"array {name}: its attribute {key} = {wrong}, not ")
+        st.recover(whole.path)
+    file = whole.path / "mask/zarr.json"
+    meta = json.loads(file.read_text())
+    file.write_text(json.dumps({**meta, "dimension_names": ["sample", "fault", "x", "y"]}))
+    (sentence,) = st.verify(whole.path)
+    assert sentence.startswith("array mask: its dimension_names = ")
+    assert st.problem_samples(st.recover(whole.path)) == []
+    assert st.verify(whole.path) == []
+    assert st.digest(whole.path) == before
+
+
+@pytest.mark.parametrize("damage", ["changed", "absent entry", "foreign entry", "absent", "nonsense"])
+def test_consolidated_metadata_that_differ_are_found_and_mended(whole: st.Store, damage: str) -> None:
+    """xarray and zarr look there first, and would show what the arrays' own metadata do not say."""
+    before, file = st.digest(whole), whole.path / "zarr.json"
+    good = file.read_text()
+    root = json.loads(good)
+    entries = root["consolidated_metadata"]["metadata"]
+    if damage == "changed":
+        entries["depth_m"]["attributes"]["units"] = "km"
+        said = "array depth_m: the consolidated metadata in zarr.json differ from depth_m/zarr.json"
+    elif damage == "absent entry":
+        del entries["mask"]
+        said = "array mask: the consolidated metadata in zarr.json differ from mask/zarr.json"
+    elif damage == "foreign entry":
+        entries["smear"] = entries["mask"]
+        said = "array smear: the consolidated metadata in zarr.json differ from smear/zarr.json"
+    else:
+        root["consolidated_metadata"] = None if damage == "absent" else {"metadata": [3]}
+        said = "zarr.json holds no consolidated metadata"
+    file.write_text(json.dumps(root))
+    assert st.verify(whole.path) == [said]
+    assert st.problem_samples(whole.path) == []
+    st.recover(whole.path)
+    assert json.loads(file.read_text()) == json.loads(good)
+    assert st.verify(whole.path) == []
+    assert st.digest(whole.path) == before
+
+
+@pytest.mark.parametrize("name", ["mask", "done", "parameters", "sample", "fault", "wavelength_nm"])
+def test_a_missing_array_is_one_sentence_and_made_again(whole: st.Store, name: str) -> None:
+    before = st.digest(whole)
+    for damage in ("folder", "zarr.json", "unparsable"):
+        file = whole.path / name / "zarr.json"
+        if damage == "folder":
+            shutil.rmtree(file.parent)
+        elif damage == "zarr.json":
+            file.unlink()
+        else:
+            file.write_text("{")
+        what = "cannot be opened" if damage == "unparsable" else "is missing"
+        (sentence,) = st.verify(whole.path)
+        assert sentence.startswith(f"array {name} {what}")
+        with pytest.raises(VbnfaultError, match=f"array {name} {what}"):
+            st.open_store(whole.path).array(name)
+        store = st.recover(whole.path)
+        lost = damage == "folder" and name in store.spec.arrays
+        repaired(store, list(range(10)) if lost else [], before)
