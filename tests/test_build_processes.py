@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import os
 import re
 import resource
@@ -11,6 +12,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -22,6 +24,7 @@ from vbnfault import store as st
 from vbnfault.core.errors import VbnfaultError
 from vbnfault.core.quantities import Sample
 from vbnfault.dataset import build as bd
+from vbnfault.dataset import processes
 
 HERE = Path(__file__).resolve().parent
 
@@ -117,9 +120,12 @@ def test_the_command_that_kills_builds_finds_none_that_fails() -> None:
 def test_an_interrupt_keeps_what_was_made(
     undisturbed: tuple[Path, str], tmp_path: Path, workers: int, number: str
 ) -> None:
-    out = tmp_path / "s.zarr"
+    out = tmp_path / "stores" / "s.zarr"
+    out.parent.mkdir()
     # while the second shard is written, by a process that made others of it before
-    step = victim.step("write", text="done/c/", number=number, to="group" if number != "SIGTERM" else "self")
+    to = "group" if number != "SIGTERM" else "self"
+    # once: a second signal would end the build without waiting for the workers
+    step = victim.step("write", text="done/c/", number=number, to=to, once=str(tmp_path / "sent"))
     done = build_elsewhere(out, workers, **{"main" if workers == 1 else "worker": [step]})
     assert done.returncode == 128 + getattr(signal, number), done.stderr
     assert "Traceback" not in done.stderr
@@ -132,7 +138,25 @@ def test_an_interrupt_keeps_what_was_made(
     assert st.open_store(out).finished() == finished
     assert run(out).built == SAMPLES - finished
     assert st.digest(out) == undisturbed[1]
-    assert [p.name for p in tmp_path.iterdir()] == ["s.zarr"]
+    assert [p.name for p in out.parent.iterdir()] == ["s.zarr"]
+
+
+@pytest.mark.parametrize(("sent", "signalled"), [(False, "kill"), (True, "terminate")])
+def test_a_worker_that_has_reported_has_time_to_write(
+    monkeypatch: pytest.MonkeyPatch, sent: bool, signalled: str
+) -> None:
+    """Its report counts although the parent has not read it yet."""
+    calls: list[str] = []
+    monkeypatch.setattr(processes._Process, "__init__", lambda self: None)
+    worker = processes._Process()  # type: ignore[call-arg]
+    worker.has_reported = False
+    worker.process = SimpleNamespace(kill=lambda: calls.append("kill"), terminate=lambda: calls.append("terminate"))  # type: ignore[assignment]
+    worker.pipe, other = multiprocessing.Pipe()
+    with other:
+        if sent:
+            other.send((0, "begun", ""))
+        worker.stop(at_once=True)
+    assert calls == [signalled]
 
 
 def test_ctrl_c_as_workers_start_twice_leaves_nobody(tmp_path: Path) -> None:

@@ -11,6 +11,7 @@ events      `write` (a file is opened for writing, renamed, removed or flushed, 
             `open` (of any file), `import` (of a module), `start` (a worker process has been started), `kill` (a
             signal is sent)
 to          `self`, `parent`, or `group`: every process of the command, as a terminal does on Ctrl-C
+once        a path: of several processes that follow the step, only the one that makes this file sends the signal
 torn        if the event opens a file for writing, nonsense is written to that file before the signal
 """
 
@@ -82,7 +83,8 @@ def follow(steps: Sequence[dict[str, Any]], count: Callable[[str, str], None] | 
                 now = left.pop(0)
                 if now.get("torn") and write_to:
                     Path(write_to).write_bytes(b"half a file of nonsense")
-                _send(getattr(signal, now["signal"]), now.get("to", "self"), parent)
+                if _is_first(now.get("once")):
+                    _send(getattr(signal, now["signal"]), now.get("to", "self"), parent)
                 inside[0] = False
 
     def hook(event: str, args: tuple[Any, ...]) -> None:
@@ -113,6 +115,17 @@ def follow(steps: Sequence[dict[str, Any]], count: Callable[[str, str], None] | 
 
     os.fsync = counted_fsync
     multiprocessing.process.BaseProcess.start = counted_start  # type: ignore[method-assign]
+
+
+def _is_first(path: str | None) -> bool:
+    """Return whether this process makes the file `path`; True if there is no path."""
+    if path is None:
+        return True
+    try:
+        os.close(os.open(path, os.O_CREAT | os.O_EXCL))
+    except FileExistsError:
+        return False
+    return True
 
 
 def _send(number: int, to: str, parent: int) -> None:

@@ -101,7 +101,8 @@ class _Process:
 
     def stop(self, *, at_once: bool = False) -> None:
         """Ask it to end: after its task, or at once but with time to write its finished items."""
-        if at_once and not self.has_reported:
+        # what it has sent may still wait in the pipe, on a busy machine
+        if at_once and not (self.has_reported or self.pipe.poll()):
             self.process.kill()  # it has made nothing yet
         elif at_once:
             self.process.terminate()
