@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import gc
+import importlib
 import os
 import signal
 import socket
@@ -19,7 +20,7 @@ from typing import Any
 
 import pytest
 from dask import config as dask_config
-from synthetic import SAMPLES, Broken, Deadly, Session, fake_sample, make_spec, run, site_of
+from synthetic import SAMPLES, Broken, Session, end_unless, fake_sample, make_spec, run, site_of
 
 from vbnfault import store as st
 from vbnfault.core.errors import InputError, VbnfaultError
@@ -93,6 +94,23 @@ class Disturbing:
         worker = distributed.get_worker()
         task = worker.get_current_task()
         wait_until(lambda: not dask._is_wanted(worker, task))
+
+
+@dataclass(frozen=True)
+class Deadly:
+    """A factory that kills every other process that receives it, after the imports that a session needs.
+
+    Dask does not start a worker again that dies while it is still being started.
+    """
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return end_after_imports, (os.getpid(),)
+
+
+def end_after_imports(process: int) -> None:
+    """Import what a session needs, and kill this process unless it is `process`."""
+    importlib.import_module("vbnfault.dataset.from_scene")
+    end_unless(process)
 
 
 @pytest.fixture(scope="module")

@@ -24,8 +24,9 @@ from vbnfault.scene import config, sampling
 PATTERN = next(m.pattern for m in typing.get_args(sampling.Layer)[1].metadata if hasattr(m, "pattern"))
 NAMED = [name for name in re.sub(r"^\^\(|\)\$$", "", PATTERN).split("|") if re.fullmatch(r"[A-Za-z_]+", name)]
 PAPER = {name: {} for name in ("dust_on_optics", "broken_pixels", "broken_lines", "straylight", "vignetting")}
+# grains small enough to leave light in a frame of 0.5 mm: else no other fault shows, and views are drawn in vain
 PHYSICAL = {
-    "dust_on_optics": {"model": "defocused", "surface": -2, "transmission": 0.0, "diameter_um": [100, 300]},
+    "dust_on_optics": {"model": "defocused", "surface": -2, "transmission": 0.0, "diameter_um": [20, 60]},
     "broken_pixels": {"model": "hot_pixels"},
     "straylight": {"model": "paraxial"},
     "vignetting": {"model": "lens", "decentre": [0.4, 0.5]},
