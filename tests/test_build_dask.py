@@ -221,7 +221,7 @@ def test_workers_write_nothing_after_the_client_was_killed(
 
 def until_idle() -> None:
     """Wait until no task runs on a worker."""
-    with dask._session_lock:
+    with dask._worker_lock:
         pass
 
 
