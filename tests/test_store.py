@@ -286,7 +286,7 @@ def test_paths_that_hold_no_store_are_one_sentence(tmp_path: Path, whole: st.Sto
     zarr.open_group(tmp_path / "other.zarr", mode="w", zarr_format=3)
     with pytest.raises(InputError, match="is no vbnfault store"):
         st.verify(tmp_path / "other.zarr")
-    with pytest.raises(InputError, match=r"nothing can be created here: .*file is a file, not a folder"):
+    with pytest.raises(InputError, match=r"no store can be created here: .*file is a file, not a folder"):
         st.create(tmp_path / "file" / "s.zarr", make_spec(), 3)
 
 
