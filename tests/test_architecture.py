@@ -44,7 +44,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "store": {"core", "scene"},
     "dataset": DATASET,
     "study": OUTPUT | {"navigation"},
-    "output": OUTPUT,
+    "output": OUTPUT | {"navigation", "study"},
     "cli": OUTPUT | {"output", "study"},
     "__main__": {"cli"},
 }

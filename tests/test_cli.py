@@ -448,7 +448,7 @@ def test_list_schema_doctor_and_dry_run(
         assert run(monkeypatch, "schema", kind) == 0
         assert key in json.loads(capsys.readouterr().out)["properties"]
     assert run(monkeypatch, "schema", "body") == 2
-    assert "must be one of scene, lens, sensor" in capsys.readouterr().err
+    assert "must be one of scene, lens, sensor, study" in capsys.readouterr().err
     assert run(monkeypatch, "doctor") == 0
     assert "as it should be" in capsys.readouterr().out
     assert run(monkeypatch, "build", scene, "--out", tmp_path / "x.zarr", "--dry-run") == 0

@@ -22,8 +22,9 @@ from vbnfault.output.schemas import KINDS, file_schema
 from vbnfault.pipeline.session import configure_faults
 from vbnfault.scene.config import parse_scene
 from vbnfault.scene.instrument import OF_A_SENSOR_FILE, CameraTable
+from vbnfault.study.spec import parse_study
 
-FOLDERS = {"scene": "scenes", "lens": "scenes/lenses", "sensor": "scenes/detectors"}
+FOLDERS = {"scene": "scenes", "lens": "scenes/lenses", "sensor": "scenes/detectors", "study": "scenes/studies"}
 PACKAGED = [(kind, name) for kind in KINDS for name in resources.packaged(FOLDERS[kind])]
 VALIDATORS = {kind: Draft202012Validator(file_schema(kind)) for kind in KINDS}
 
@@ -37,7 +38,8 @@ def read(kind: str, table: dict[str, Any]) -> None:
     if kind == "scene":
         configure_faults(parse_scene(table, source="x.toml"), "x.toml")
     else:
-        (parse_lens if kind == "lens" else parse_sensor)(table, source="x.toml")
+        parsers = {"lens": parse_lens, "sensor": parse_sensor, "study": parse_study}
+        parsers[kind](table, source="x.toml")
 
 
 @pytest.mark.parametrize("kind", KINDS)

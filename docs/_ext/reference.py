@@ -356,6 +356,14 @@ def sensor() -> str:
     return toml_reference(tables(json_schema(Sensor)), "Top level")
 
 
+def study() -> str:
+    """Return the keys of a study file."""
+    from vbnfault.core.tables import json_schema
+    from vbnfault.study.spec import StudySpec
+
+    return toml_reference(tables(json_schema(StudySpec)), "Top level")
+
+
 # --- faults -------------------------------------------------------------------------------------------------------
 
 
@@ -547,6 +555,7 @@ PAGES: dict[str, Callable[[], str]] = {
     "lens": lens,
     "scene": scene,
     "sensor": sensor,
+    "study": study,
     "store": store,
 }
 

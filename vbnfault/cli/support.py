@@ -139,7 +139,7 @@ def new(
 
 @app.command(rich_help_panel=_PANEL)
 def schema(
-    kind: Annotated[str, typer.Argument(help="One of scene, lens and sensor.", metavar="KIND")] = "scene",
+    kind: Annotated[str, typer.Argument(help="One of scene, lens, sensor and study.", metavar="KIND")] = "scene",
     plugins: PluginOption = None,
 ) -> None:
     """Print the JSON Schema of a kind of TOML file, for editors that check and complete it."""

@@ -10,8 +10,9 @@ from ..core.errors import InputError, shown
 from ..detector import Sensor
 from ..lens.prescription_file import PrescriptionFile
 from ..scene import config
+from ..study.spec import StudySpec
 
-KINDS = ("scene", "lens", "sensor")
+KINDS = ("scene", "lens", "sensor", "study")
 
 
 def file_schema(kind: str) -> dict[str, Any]:
@@ -30,4 +31,6 @@ def file_schema(kind: str) -> dict[str, Any]:
         return tables.json_schema(PrescriptionFile)
     if kind == "sensor":
         return tables.json_schema(Sensor)
+    if kind == "study":
+        return tables.json_schema(StudySpec)
     raise InputError(f"schema {shown(kind)}: must be one of {', '.join(KINDS)}")

@@ -43,7 +43,7 @@ class _Bounded(_Factor):
 class Uniform(_Bounded):
     """Distribute a factor evenly between two bounds."""
 
-    distribution: Literal["uniform"] = "uniform"
+    distribution: Literal["uniform"] = Field(description="name of the distribution")
 
     def values(self, points: ArrayLike) -> NDArray[np.float64]:
         """Return the values at points of the unit interval."""
@@ -62,7 +62,7 @@ class Uniform(_Bounded):
 class LogUniform(_Bounded):
     """Distribute the logarithm of a factor evenly between two bounds above 0."""
 
-    distribution: Literal["log_uniform"] = "log_uniform"
+    distribution: Literal["log_uniform"] = Field(description="name of the distribution")
     low: float = Field(gt=0, description="lower bound, above 0")
 
     def values(self, points: ArrayLike) -> NDArray[np.float64]:
@@ -84,7 +84,7 @@ class LogUniform(_Bounded):
 class TruncatedNormal(_Bounded):
     """Distribute a factor as a normal distribution, cut off at two bounds."""
 
-    distribution: Literal["truncated_normal"] = "truncated_normal"
+    distribution: Literal["truncated_normal"] = Field(description="name of the distribution")
     mean: float = Field(description="mean of the normal distribution before it is cut off")
     deviation: float = Field(gt=0, description="standard deviation of the normal distribution before it is cut off")
 
@@ -120,7 +120,7 @@ class TruncatedNormal(_Bounded):
 class Categorical(_Factor):
     """Choose a factor's value from a list, each with the same probability. The first one is the nominal value."""
 
-    distribution: Literal["categorical"] = "categorical"
+    distribution: Literal["categorical"] = Field(description="name of the distribution")
     choices: tuple[float | _Text, ...] = Field(min_length=2, alias="values", description="the values, at least two")
 
     @model_validator(mode="after")

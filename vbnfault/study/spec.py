@@ -19,7 +19,6 @@ from ..core.tables import Table
 from .distributions import Factor
 
 DUMMY = "dummy"  # the factor that acts on nothing; its index is the noise floor
-METHODS = ("sobol", "morris", "latin_hypercube", "grid", "one_at_a_time")
 _MOST_SAMPLES = 2**20
 _Key = Annotated[str, Field(min_length=1)]
 _Index = Annotated[int, Field(ge=0, le=2**63 - 1)]
@@ -107,9 +106,11 @@ class Evaluator(Protocol):
 
 
 class DesignTable(Table):
-    """Hold the table `[design]`: which points are evaluated, and how certain the indices shall be."""
+    """Hold which points are evaluated, and how certain the indices shall be."""
 
-    method: Literal["sobol", "morris", "latin_hypercube", "grid", "one_at_a_time"] = "sobol"
+    method: Literal["sobol", "morris", "latin_hypercube", "grid", "one_at_a_time"] = Field(
+        "sobol", description="how the points are chosen, and so which indices the study gives"
+    )
     n: int = Field(
         ge=1,
         le=_MOST_SAMPLES,
@@ -137,7 +138,7 @@ class DesignTable(Table):
 
 
 class SceneTable(Table):
-    """Hold the table `[scene]`: the views on which every point is evaluated.
+    """Hold the views on which every point is evaluated.
 
     Further keys replace those of the scene file.
     """
@@ -180,7 +181,7 @@ def _flat(table: Mapping[str, Any], above: str = "") -> dict[str, Any]:
 
 
 class ModelsTable(Table):
-    """Hold the table `[models]`: models of one fault that are compared on the same samples."""
+    """Hold the models of one fault that are compared on the same samples."""
 
     fault: str = Field(min_length=1, description="fault class whose models are compared")
     compare: tuple[_Key, ...] = Field(min_length=2, description="names of the models, at least two")
@@ -192,7 +193,7 @@ class ModelsTable(Table):
 
 
 class MetricsTable(Table):
-    """Hold the table `[metrics]`."""
+    """Hold the metrics of the study."""
 
     names: tuple[_Key, ...] = Field(min_length=1, description="metrics that every evaluation gives, at least one")
 
@@ -216,8 +217,8 @@ class StudySpec(Table):
 
     model_config = ConfigDict(populate_by_name=True)
 
-    title: str
-    description: str = ""
+    title: str = Field(description="title of the study")
+    description: str = Field("", description="what the study asks, in a sentence")
     design: DesignTable
     scene: SceneTable = SceneTable()
     models: ModelsTable | None = None
