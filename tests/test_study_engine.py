@@ -55,6 +55,13 @@ def test_ishigami_through_the_whole_engine(tmp_path: Path) -> None:
     assert table.schema.field("y").metadata[b"units"] == b"1"
 
 
+def test_the_package_can_be_called_and_has_its_public_names() -> None:
+    assert all(getattr(vbnfault.study, name) is not None for name in vbnfault.study.__all__)
+    assert vbnfault.study.StudySpec is StudySpec
+    with pytest.raises(InputError, match=r"neither a file nor a packaged name; studies"):
+        vbnfault.study("nothing")
+
+
 def test_sobol_indices_are_those_of_scipy() -> None:
     from scipy.stats import sobol_indices
 

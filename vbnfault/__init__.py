@@ -62,7 +62,7 @@ _HOME = {
     "path": ("faults", "path"),
     "rows": ("faults", "rows"),
     "simulate": ("pipeline", "simulate"),
-    "study": ("study.run", "study"),
+    "study": ("study", ""),
     "text": ("faults", "text"),
     "trace_flare": ("output.flare_images", "trace_flare"),
     "verify": ("dataset", "verify"),

@@ -1,27 +1,76 @@
 """Run sensitivity studies: which parameters drive a metric, how much depends on the model, with what confidence.
 
-`spec` reads a study file, `distributions` and `designs` make its points, `run` evaluates them, `indices` computes
-indices with intervals, and `results` stores both.
+    indices = vbnfault.study("flare_lens", "results", workers=2)
 
-The package can be called, as `run.study`: whoever imports one of its modules sets the attribute `study` of
-`vbnfault`, which otherwise is that function, to the package.
+The package itself can be called, as its function `study`. Its modules: `spec` reads a study file, `distributions`
+and `designs` make its points, `run` evaluates them, `indices` computes indices with intervals, and `results` stores
+both.
 """
 
 from __future__ import annotations
 
 import sys
 from types import ModuleType
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from .results import open_indices, read_table
+    from .run import StudyFailed, StudySummary, run_study, study
+    from .spec import Evaluation, Evaluator, Metric, StudySpec, load_study, parse_study
+
+# public name → the module that defines it; it is loaded when the name is first used
+_HOME = {
+    "Evaluation": "spec",
+    "Evaluator": "spec",
+    "Metric": "spec",
+    "StudyFailed": "run",
+    "StudySpec": "spec",
+    "StudySummary": "run",
+    "load_study": "spec",
+    "open_indices": "results",
+    "parse_study": "spec",
+    "read_table": "results",
+    "run_study": "run",
+    "study": "run",
+}
+
+__all__ = [
+    "Evaluation",
+    "Evaluator",
+    "Metric",
+    "StudyFailed",
+    "StudySpec",
+    "StudySummary",
+    "load_study",
+    "open_indices",
+    "parse_study",
+    "read_table",
+    "run_study",
+    "study",
+]
+
+
+def __getattr__(name: str) -> Any:
+    """Return a public name from the module that defines it."""
+    if name not in _HOME:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    import importlib
+
+    value = getattr(importlib.import_module(f".{_HOME[name]}", __name__), name)
+    globals()[name] = value
+    return value
 
 
 class _Callable(ModuleType):
-    """Run a study when the module is called."""
+    """Run a study when the module is called.
+
+    The attribute `study` of `vbnfault` cannot be the function: the import of any module of this package sets it to
+    the package.
+    """
 
     def __call__(self, *arguments: Any, **keywords: Any) -> Any:
-        """Run a study; see `vbnfault.study.run.study`."""
-        from . import run
-
-        return run.study(*arguments, **keywords)
+        """Run a study; see `vbnfault.study.study`."""
+        return self.study(*arguments, **keywords)
 
 
 sys.modules[__name__].__class__ = _Callable
