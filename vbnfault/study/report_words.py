@@ -1,0 +1,264 @@
+"""Say in plain words how to read each figure of a study's page, and hold its formulae as MathML."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from .summaries import StudyResults
+
+
+@dataclass(frozen=True)
+class Section:
+    """Hold the title of a kind of figure, and a function that returns how to read it, in two sentences."""
+
+    title: str
+    how: Callable[[StudyResults], str]
+
+
+def _overview(results: StudyResults) -> str:
+    words = results.importance[0]
+    if words == "total index":
+        words = "total index, the fraction of the variance that a factor causes alone and with others"
+    return (
+        f"Each cell shows for one factor (row) and one metric (column): {words}. Read a column to see what drives "
+        "a metric; values like those of the row dummy, a factor that acts on nothing, are noise."
+    )
+
+
+def _indices(results: StudyResults) -> str:
+    level = f"{100 * results.confidence:g} %"
+    floor = (
+        "A factor whose interval lies within the grey band, the noise floor, cannot be told from the dummy factor, "
+        "which acts on nothing."
+    )
+    if results.has("ST"):
+        return (
+            f"Each dot is an index with its {level} interval: the first-order index is the fraction of the "
+            "variance that a factor causes alone, and the total index adds its interactions with other factors. "
+            f"{floor}"
+        )
+    if results.has("delta"):
+        return (
+            f"Each dot is delta with its {level} interval: how much knowing the factor changes the distribution "
+            f"of the metric, from 0 (not at all) to 1. {floor}"
+        )
+    return (
+        f"Each dot is μ*, with its {level} interval: the mean absolute change of the metric when the factor moves "
+        f"over its whole range. {floor}"
+    )
+
+
+def _seeds(_: StudyResults) -> str:
+    return (
+        "Each marker is the index from one seed alone, and the bar is the interval from all seeds together. "
+        "Markers far outside the bar mean that the index depends on what the seed changes, such as terrain and "
+        "noise."
+    )
+
+
+def _tornado(results: StudyResults) -> str:
+    if results.method == "one_at_a_time":
+        return (
+            "Each bar spans the values of the metric along one factor while the others keep their nominal "
+            "values, which the vertical line shows. Triangles mark the factor's lowest and highest value; a bar "
+            "that goes on beyond them has a turning point."
+        )
+    return (
+        "Each bar spans the mean of the metric over the fifths of one factor's range, while the others vary; the "
+        "vertical line is the mean of all. Triangles mark the lowest and the highest fifth, and a bar no longer "
+        "than the grey band, the typical range of a factor that acts on nothing, is noise."
+    )
+
+
+def _responses(results: StudyResults) -> str:
+    level = f"{100 * results.confidence:g} %"
+    if results.method == "one_at_a_time":
+        return (
+            "Each curve is the metric against one factor while the others keep their nominal values; bars of a "
+            f"factor with categories begin at the median. The band is the {level} interval of the median over "
+            "views and seeds."
+        )
+    return (
+        f"Each curve is the median of the metric among points of similar value of one factor, with the {level} "
+        "interval of this median; bars of a factor with categories begin at the median of all points. A curve "
+        "that stays within the noise floor shows nothing that a factor without effect would not show."
+    )
+
+
+def _interactions(results: StudyResults) -> str:
+    if results.has("interaction"):
+        return (
+            "The diagonal is the first-order index of each factor, and each cell below it the total interaction "
+            "of two factors: the fraction of the variance that they cause only together. A dark cell off the "
+            "diagonal means that the effect of one factor depends on the other."
+        )
+    return (
+        "Each cell is the total minus the first-order index of one factor (row) for one metric (column): the "
+        "fraction of the variance that the factor causes only together with others. Small values may be noise, "
+        "since both indices have intervals."
+    )
+
+
+def _models(_: StudyResults) -> str:
+    return (
+        "The left bars divide the variance over factors and models into the part between the models, which is "
+        "the error of choosing one of them, and the parts that the factors cause within each model. The right "
+        "markers show the mean of each model as a multiple of the mean of all models."
+    )
+
+
+def _morris(_: StudyResults) -> str:
+    return (
+        "Each point is a factor: far right means a strong effect, and high up means an effect that depends on "
+        "the other factors or bends. Below the lowest dotted line an effect is almost linear, above the highest "
+        "one it is mostly interaction or curvature."
+    )
+
+
+SECTIONS: dict[str, Section] = {
+    "overview": Section("Which factor drives which metric", _overview),
+    "indices": Section("Indices with intervals", _indices),
+    "morris": Section("Strength and bending of effects", _morris),
+    "models": Section("Model form beside parametric variance", _models),
+    "tornado": Section("Tornado", _tornado),
+    "responses": Section("Response curves", _responses),
+    "interactions": Section("Interactions", _interactions),
+    "seeds": Section("Spread over seeds", _seeds),
+}
+
+
+# ------------------------------------------------------------------------------------ formulae
+
+
+def _i(name: str) -> str:
+    return f"<mi>{name}</mi>"
+
+
+def _o(sign: str) -> str:
+    return f"<mo>{sign}</mo>"
+
+
+def _row(*parts: str) -> str:
+    return f"<mrow>{''.join(parts)}</mrow>"
+
+
+def _sub(base: str, index: str) -> str:
+    return f"<msub>{base}{index}</msub>"
+
+
+def _frac(above: str, below: str) -> str:
+    return f"<mfrac>{above}{below}</mfrac>"
+
+
+def _of(name: str, *inner: str) -> str:
+    return _row(_i(name), _o("("), *inner, _o(")"))
+
+
+def _mean(*inner: str) -> str:
+    return _row(_o("⟨"), *inner, _o("⟩"))
+
+
+def _square(*inner: str) -> str:
+    return f"<msup>{_row(_o('('), *inner, _o(')'))}<mn>2</mn></msup>"
+
+
+def _blocks(*inner: str) -> str:
+    return _row(_sub(_o("∑"), _i("b")), *inner)
+
+
+_Y, _X, _M = _i("y"), _sub(_i("x"), _i("i")), _i("m")
+_YA, _YB = _sub(_Y, _i("A")), _sub(_Y, _i("B"))
+_YAI, _YAJ = _sub(_Y, _row(_i("A"), _i("i"))), _sub(_Y, _row(_i("A"), _i("j")))
+_V = _blocks(_sub(_i("V"), _i("b")))
+_MODEL_MEAN = _of("E", _Y, _o("|"), _M)
+_TOTAL = _row(_of("Var", _Y), _o("="), _sub(_i("E"), _M), _o("["), _of("Var", _Y, _o("|"), _M), _o("]"), _o("+"))
+
+# variables → what they are, in words, and their formula; written where the study has one of the variables
+FORMULAE: dict[tuple[str, ...], tuple[str, str]] = {
+    ("S1",): (
+        "First-order index of factor i: the part of the variance that disappears when the factor is known. A "
+        "Sobol' design estimates it after Saltelli et al. (2010), summed over the blocks b (one seed and one "
+        "view), with the metric at the base points A and B and at A with factor i from B; a grid evaluates the "
+        "definition itself.",
+        _row(
+            _sub(_i("S"), _i("i")),
+            _o("="),
+            _frac(_of("Var", _of("E", _Y, _o("|"), _X)), _of("Var", _Y)),
+            _o("≈"),
+            _frac(_blocks(_mean(_YB, _o("("), _YAI, _o("−"), _YA, _o(")"))), _V),
+        ),
+    ),
+    ("ST",): (
+        "Total index of factor i: the part of the variance that remains when all other factors are known "
+        "(estimator of Jansen 1999).",
+        _row(
+            _sub(_i("S"), _row(_i("T"), _i("i"))),
+            _o("="),
+            _frac(_of("E", _of("Var", _Y, _o("|"), _sub(_i("x"), _row(_o("∼"), _i("i"))))), _of("Var", _Y)),
+            _o("≈"),
+            _frac(_blocks(_mean(_square(_YA, _o("−"), _YAI))), _row("<mn>2</mn>", _V)),
+        ),
+    ),
+    ("interaction",): (
+        "Total interaction of factors i and j: all terms of the variance that contain both (Liu and Owen 2006; "
+        "Fruth et al. 2014).",
+        _row(
+            _sub(_i("S"), _row(_i("i"), _i("j"))),
+            _o("≈"),
+            _frac(
+                _blocks(_mean(_row(_o("("), _YA, _o("−"), _YAI, _o(")"), _o("("), _YA, _o("−"), _YAJ, _o(")")))), _V
+            ),
+        ),
+    ),
+    ("model_share",): (
+        "Law of total variance over the models m, which all count equally: the second term, over the sum, is the "
+        "part that the choice of the model causes.",
+        _row(_TOTAL, _sub(_i("Var"), _M), _o("["), _MODEL_MEAN, _o("]")),
+    ),
+    ("mu_star",): (
+        "Elementary effect of factor i along a trajectory, and its statistics (Morris 1991; Campolongo et al. "
+        "2007).",
+        _row(
+            _sub(_i("d"), _i("i")),
+            _o("="),
+            _frac(
+                _row(_of("y", _i("x"), _o("+"), _i("Δ"), _sub(_i("e"), _i("i"))), _o("−"), _of("y", _i("x"))),
+                _i("Δ"),
+            ),
+            _o(","),
+            _sub(_row(_i("μ"), _o("*")), _i("i")),
+            _o("="),
+            _mean(_o("|"), _sub(_i("d"), _i("i")), _o("|")),
+            _o(","),
+            _sub(_i("σ"), _i("i")),
+            _o("="),
+            _i("std"),
+            _o("("),
+            _sub(_i("d"), _i("i")),
+            _o(")"),
+        ),
+    ),
+    ("delta",): (
+        "Delta of factor i: half the mean distance between the density of the metric and its density when the "
+        "factor is known (Borgonovo 2007; Plischke et al. 2013).",
+        _row(
+            _sub(_i("δ"), _i("i")),
+            _o("="),
+            _frac("<mn>1</mn>", "<mn>2</mn>"),
+            _i("E"),
+            _o("["),
+            _row(_o("∫"), _o("|"), _of("f", _Y), _o("−"), _of("f", _Y, _o("|"), _X), _o("|"), _i("d"), _Y),
+            _o("]"),
+        ),
+    ),
+    ("range",): (
+        "Range of the metric along factor i with the other factors at their nominal values, the mean over the "
+        "blocks.",
+        _row(
+            _sub(_i("r"), _i("i")),
+            _o("="),
+            _mean(_sub(_i("max"), _X), _Y, _o("−"), _sub(_i("min"), _X), _Y),
+        ),
+    ),
+}
