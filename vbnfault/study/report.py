@@ -38,7 +38,8 @@ IMAGES = "images"
 _MOST_DRAWINGS_BYTES = 11_000_000  # of all figures in the page; the largest become PNG above it
 _MOST_IMAGES_BYTES = 4_000_000  # before base64, which adds a third
 _SIDES = (512, 400, 320, 256, 192, 128)  # of the images in the page, px; the files keep their size
-_NARROW_PT = 340.0  # wider figures scroll on a small screen
+_NARROW_PT = 340.0  # a wider figure shrinks to this fraction of its size, and then scrolls on a small screen:
+_LEAST_SCALE = 0.78
 _WHITE = 0.998  # quantile of a pair of images that is shown as white
 _MOST_ROWS = 30  # of failed evaluations and of missed half-widths
 _MOST_LEADING = 4  # factors that the summary names for each metric
@@ -177,16 +178,17 @@ class _Figure:
 
     def markup(self) -> str:
         """Return the figure as an element of the page."""
+        least = 0.0 if self.width_pt <= _NARROW_PT else _LEAST_SCALE * self.width_pt
         words = SECTIONS[self.kind].title + (f": {self.metric}" if self.metric else "")
         if self.as_png:
             data = base64.b64encode(self.png.read_bytes()).decode()
-            style = f"width:{self.width_pt:.0f}pt"
+            style = f"width:{self.width_pt:.0f}pt;min-width:{least:.0f}pt"
             drawn = f'<img alt="{html.escape(words)}" style="{style}" src="data:image/png;base64,{data}">'
         else:
             drawn = inline_svg(self.svg, f"{self.kind}-{self.metric}", words)
-        narrow = " narrow" if self.width_pt <= _NARROW_PT else ""
+            drawn = drawn.replace("<svg", f'<svg style="min-width:{least:.0f}pt"', 1)
         note = f"<figcaption>{html.escape(self.note)}</figcaption>" if self.note else ""
-        return f'<figure class="drawing{narrow}"><div class="scroll">{drawn}</div>{note}</figure>'
+        return f'<figure class="drawing"><div class="scroll">{drawn}</div>{note}</figure>'
 
 
 def inline_svg(text: str, prefix: str, label: str) -> str:
@@ -345,8 +347,8 @@ def _summary(results: StudyResults) -> str:
                 [
                     name,
                     *([_e(model)] if several else []),
-                    _e(_quantity(mean, unit)),
-                    _e(_quantity(deviation, unit)),
+                    _unbroken(_quantity(mean, unit)),
+                    _unbroken(_quantity(deviation, unit)),
                     _leading(results, metric, model),
                 ]
             )
@@ -355,7 +357,7 @@ def _summary(results: StudyResults) -> str:
         "Factors are named, the most important first, where their interval lies above that of the dummy factor, "
         "which acts on nothing."
     )
-    return f"<p>{_e(words)}</p>{_table(heads, rows)}{_model_form(results)}"
+    return f"<p>{_e(words)}</p>{_table(heads, rows, group=len(results.models))}{_model_form(results)}"
 
 
 def _leading(results: StudyResults, metric: str, model: str) -> str:
@@ -593,19 +595,42 @@ def _e(text: object) -> str:
 
 
 def _table(
-    heads: Iterable[str], rows: Sequence[Sequence[str]], *, numbers: Iterable[int] = (), faint: Sequence[bool] = ()
+    heads: Iterable[str],
+    rows: Sequence[Sequence[str]],
+    *,
+    numbers: Iterable[int] = (),
+    faint: Sequence[bool] = (),
+    group: int = 1,
 ) -> str:
-    """Return a table; cells are markup already, headings are text."""
-    right = set(numbers)
-    heads = list(heads)
+    """Return a table.
+
+    Parameters
+    ----------
+    heads, rows
+        Headings as text, cells as markup.
+    numbers
+        Columns of numbers, which are aligned at the right.
+    faint
+        Rows that are written in a fainter colour.
+    group
+        The first cell of every so many rows spans all of them.
+    """
+    heads, right = list(heads), set(numbers)
     classes = [' class="number"' if k in right else "" for k in range(len(heads))]
-    marks = [' class="floor"' if k < len(faint) and faint[k] else "" for k in range(len(rows))]
     head = "".join(f"<th{c}>{_e(text)}</th>" for c, text in zip(classes, heads, strict=True))
-    body = "".join(
-        f"<tr{mark}>" + "".join(f"<td{c}>{cell}</td>" for c, cell in zip(classes, row, strict=True)) + "</tr>"
-        for mark, row in zip(marks, rows, strict=True)
-    )
-    return f'<div class="scroll"><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'
+    body = []
+    for k, row in enumerate(rows):
+        cells = [f"<td{c}>{cell}</td>" for c, cell in zip(classes, row, strict=True)]
+        if group > 1:
+            cells[0] = "" if k % group else cells[0].replace("<td", f'<td rowspan="{group}"', 1)
+        mark = ' class="floor"' if k < len(faint) and faint[k] else ""
+        body.append(f"<tr{mark}>{''.join(cells)}</tr>")
+    return f'<div class="scroll"><table><thead><tr>{head}</tr></thead><tbody>{"".join(body)}</tbody></table></div>'
+
+
+def _unbroken(text: str) -> str:
+    """Return a text as markup that stays on one line."""
+    return f'<span class="unbroken">{_e(text)}</span>'
 
 
 def _minus(text: str) -> str:
@@ -617,7 +642,9 @@ def _quantity(value: float, unit: str) -> str:
     """Return a value with its unit as text."""
     if not np.isfinite(value):
         return "–"
-    return _minus(f"{value:.4g}") + ("" if unit in ("", "1") else f" {unit}")
+    leading, _, power = f"{value:.4g}".partition("e")
+    number = leading if not power else f"{leading}·{sheets.power(int(power))}"
+    return _minus(number) + ("" if unit in ("", "1") else f" {unit}")
 
 
 def _unit_words(unit: str) -> str:
