@@ -211,6 +211,7 @@ def inline_svg(text: str, prefix: str, label: str) -> str:
     text = re.sub(r'(url\(#|href="#)', rf"\g<1>{prefix}-", text)
     for colour, name in _COLOURS.items():
         text = text.replace(f": {colour}", f": var(--{name})")
+    text = re.sub(r"base64,[^\"]*", lambda match: re.sub(r"\s", "", match[0]), text)
     text = re.sub(r"<defs>\s*</defs>", "", re.sub(r"\s+", " ", text))
     return text.replace("<svg", f'<svg role="img" aria-label="{html.escape(label)}"', 1).strip()
 

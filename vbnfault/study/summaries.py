@@ -157,6 +157,8 @@ class Points:
 
     def _shuffled(self, generator: np.random.Generator) -> F64:
         """Return the values in random order; trajectories stay whole, and each begins at a random step."""
+        if self.cluster[-1] == len(self.cluster) - 1:  # every point is a cluster of its own
+            return generator.permutation(self.values)
         first = np.flatnonzero(np.diff(self.cluster, prepend=-1))
         parts = np.split(self.values, first[1:])
         order = generator.permutation(len(parts))
