@@ -36,6 +36,12 @@ def analysed(spec: StudySpec, function: Any) -> Any:
 # ------------------------------------------------------------------------------------ the whole engine
 
 
+@pytest.fixture(autouse=True)
+def _without_report(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Leave out the page, which takes longer than these studies; test_study_report.py writes it."""
+    monkeypatch.setattr(run, "_write_report", lambda *_: None)
+
+
 def test_ishigami_through_the_whole_engine(tmp_path: Path) -> None:
     spec = kit.spec(design={"n": 512, "seed": 3, "resamples": 300})
     data = vbnfault.study(spec, tmp_path / "s", evaluator=kit.Function, progress=False)

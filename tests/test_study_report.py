@@ -14,8 +14,10 @@ import matplotlib
 import numpy as np
 import pyarrow as pa
 import pytest
+import study_kit
 from study_results import IMAGE_METRICS, LENS_FACTORS, Plan, ishigami, made_up
 
+import vbnfault
 from vbnfault.study import plots, report
 from vbnfault.study.report import inline_svg, write_images, write_report
 from vbnfault.study.summaries import StudyResults
@@ -165,6 +167,21 @@ def test_an_inline_drawing_has_themed_colours_and_identifiers_of_its_own() -> No
         '<use href="#tornado-a-m1"/><path clip-path="url(#tornado-a-p2)" style="stroke: #123456"/>'
         '<clipPath id="tornado-a-p2"/></g></svg>'
     )
+
+
+def test_a_study_writes_its_report(tmp_path: Path) -> None:
+    spec = study_kit.spec(design={"n": 128, "half_width": 0.4}, metrics={"names": ["y"]})
+    vbnfault.study(spec, tmp_path, evaluator=study_kit.Function, progress=False)
+    text = (tmp_path / "report.html").read_text(encoding="utf-8")
+    words = " ".join(Page(text).text.split())
+    assert "x0 0.59, x1 0.45" in words.replace("\N{NO-BREAK SPACE}", " ")  # 0.56 and 0.44 in theory
+    assert "uniform, −3.14159 to 3.14159" in words
+    assert "function" in words  # the stage of the evaluator
+    assert "scikit-image" in words  # the versions
+    assert {path.suffix for path in (tmp_path / "plots").iterdir()} == {".png", ".svg"}
+    for name in ("indices_y", "tornado_y", "responses_y", "interactions_y"):
+        assert (tmp_path / "plots" / f"{name}.png").is_file()
+    assert not (tmp_path / "images").exists()  # this evaluator has none
 
 
 # ------------------------------------------------------------------------------------ figures

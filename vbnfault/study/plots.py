@@ -131,7 +131,7 @@ def save(drawing: Drawing, folder: Path) -> tuple[Path, Path]:
 
 @dataclass(frozen=True)
 class _Series:
-    """An index that is drawn as dots with intervals."""
+    """Describe an index that is drawn as dots with intervals."""
 
     name: str
     label: str

@@ -42,6 +42,7 @@ from .indices import Results
 from .spec import Evaluation, Evaluator, EvaluatorFactory, Metric, StudySpec, load_study
 
 if TYPE_CHECKING:
+    import pyarrow
     import xarray as xr
 
 _LARGEST_CHUNK = 32  # evaluations in a task, and in a file of finished rows
@@ -162,7 +163,8 @@ def study(
     if out is not None:
         return run_study(study, Path(out), options, overrides=overrides, evaluator=evaluator).indices
     with tempfile.TemporaryDirectory(prefix="vbnfault-study-") as folder:
-        return run_study(study, Path(folder) / "study", options, overrides=overrides, evaluator=evaluator).indices
+        path = Path(folder) / "study"
+        return run_study(study, path, options, overrides=overrides, evaluator=evaluator, report=False).indices
 
 
 def run_study(
@@ -172,8 +174,12 @@ def run_study(
     *,
     overrides: Mapping[str, Any] | None = None,
     evaluator: EvaluatorFactory | None = None,
+    report: bool = True,
 ) -> StudySummary:
-    """Run or continue the study in the folder `path`, as `study` describes, and say what was done."""
+    """Run or continue the study in the folder `path`, as `study` describes, and say what was done.
+
+    `report`: whether to draw the figures and write the page, too.
+    """
     spec = study if isinstance(study, StudySpec) else load_study(study, overrides)
     source = spec.title if isinstance(study, StudySpec) else str(study)
     factory = evaluator or _scene_evaluator()
@@ -212,8 +218,11 @@ def run_study(
         data = _indices(Results(design, metrics, _values(design, metrics, outcomes)))
         data.attrs["timings"] = json.dumps(dict(job.seconds_by_stage))
         with _writing(path):
-            results.write_table(path / results.TABLE, design, metrics, outcomes)
+            table = results.write_table(path / results.TABLE, design, metrics, outcomes)
             results.write_indices(path / results.INDICES, data)
+            if report:
+                with contents.in_use():
+                    _write_report(path, data, table, spec, made)
         missed = _missed_half_widths(spec, data)
         for sentence in missed:
             print(f"warning: {sentence}", file=sys.stderr)
@@ -580,6 +589,20 @@ def _indices(found: Results) -> xr.Dataset:
         versions=json.dumps(versions()),
         source=f"vbnfault {__version__}",
     )
+
+
+def _write_report(
+    path: Path, data: xr.Dataset, table: pyarrow.Table, spec: StudySpec, evaluator: Evaluator
+) -> None:
+    """Write the extreme images, the figures and the page of a study; without images where one fails."""
+    from .report import write_images, write_report  # loads matplotlib
+
+    plain = spec.resolved()
+    try:
+        write_images(path, data, table, plain, evaluator)
+    except VbnfaultError as error:
+        print(f"warning: {path}: no images of best and worst values: {error}", file=sys.stderr)
+    write_report(path, data, table, plain)
 
 
 def _missed_half_widths(spec: StudySpec, data: xr.Dataset) -> list[str]:
