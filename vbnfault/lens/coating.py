@@ -104,13 +104,18 @@ def reflect_transmit(
     films = [np.full(n0.shape, layer.n + 1j * layer.k) for layer in layers]
     media = [n0, *films, ns]
     runs = [n0 * c0, *(normal(index) for index in media[1:])]
+    # exp(iδ) of each film's phase thickness δ, squared for the way there and back; the same in both polarisations
+    turns = [
+        np.exp(2j * np.pi * run * layer.thickness_nm / wavelength)
+        for run, layer in zip(runs[1:], layers, strict=False)
+    ]
     powers = []
     for p in (False, True):
         # admittance: n cos θ for s polarisation, n / cos θ for p
         y = [index * index / q if p else q for index, q in zip(media, runs, strict=True)]
         r, t = (y[-2] - y[-1]) / (y[-2] + y[-1]), 2 * y[-2] / (y[-2] + y[-1])
         for k in range(len(layers) - 1, -1, -1):
-            turn = np.exp(2j * np.pi * runs[k + 1] * layers[k].thickness_nm / wavelength)
+            turn = turns[k]
             first, through = (y[k] - y[k + 1]) / (y[k] + y[k + 1]), 2 * y[k] / (y[k] + y[k + 1])
             below = 1 + first * r * turn * turn
             r, t = (first + r * turn * turn) / below, through * t * turn / below

@@ -6,7 +6,7 @@ A ray is the vector (height, slope) in a plane through the axis; each step throu
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import reduce
+from functools import lru_cache, reduce
 
 import numpy as np
 from numpy.typing import NDArray
@@ -65,6 +65,7 @@ def system(lens: Prescription, first: int, last: int, wavelength_nm: float = D_N
     return np.asarray(reduce(lambda total, step: step @ total, steps, np.eye(2)))
 
 
+@lru_cache(maxsize=256)
 def first_order(lens: Prescription, wavelength_nm: float = D_NM) -> FirstOrder:
     """Return the first-order properties of a lens at a wavelength.
 

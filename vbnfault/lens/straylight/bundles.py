@@ -18,7 +18,7 @@ import copy
 import gc
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from itertools import combinations
 from types import SimpleNamespace
 from typing import Any, TypedDict, Unpack
@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 
 from ...core.errors import InputError
 from ...core.llvm import backend
-from ..coating import reflect_transmit
+from ..coating import Layer, reflect_transmit
 from ..gaussian import first_order
 from ..prescription import Prescription
 from ..rays import path_of
@@ -239,6 +239,29 @@ class _PathSteps:
         )
 
 
+@lru_cache(maxsize=96)
+def _surface_fractions(
+    films: tuple[Layer, ...], front: tuple[float, ...], back: tuple[float, ...], wavelength_nm: tuple[float, ...]
+) -> F64:
+    """Return the fractions of `Tracer._fractions` for one surface, float64[wavelength, 3, cosine], read-only.
+
+    `front` and `back` are the indices on both sides at each wavelength. Lenses that differ in their geometry alone
+    share these tables, which take most of the time to prepare a lens.
+    """
+    out = np.empty((len(wavelength_nm), 3, _COSINES))
+    cosine = np.maximum(np.linspace(0, 1, _COSINES), 1e-6)[None, :]
+    n_front, n_back, wavelength = (np.array(v)[:, None] for v in (front, back, wavelength_nm))
+    # cosines on both sides, from the cosine in the medium of lower index by Snell's law
+    thin = np.minimum(n_front, n_back)
+    at_front, at_back = (np.sqrt(1 - (thin / n) ** 2 * (1 - cosine**2)) for n in (n_front, n_back))
+    rs, rp, ts, tp = reflect_transmit(films, n_front, n_back, at_front, wavelength)
+    out[:, 0], out[:, 2] = (rs + rp) / 2, (ts + tp) / 2
+    rs, rp, _, _ = reflect_transmit(films[::-1], n_back, n_front, at_back, wavelength)
+    out[:, 1] = (rs + rp) / 2
+    out.setflags(write=False)
+    return out
+
+
 def _aspheric_terms(lens: Prescription) -> F64:
     """Return the aspheric coefficients, float64[term, row], of all surfaces and of the plane sensor."""
     most = max((len(s.aspheric_mm) for s in lens.surfaces), default=0)
@@ -365,19 +388,13 @@ class Tracer:
         angle in the medium of lower index.
         """
         lens = self.lens
-        cosine = np.maximum(np.linspace(0, 1, _COSINES), 1e-6)[None, :]
         out = np.zeros((len(index), len(lens.surfaces) + 1, 3, _COSINES))
-        wavelength = self.wavelength_nm[:, None]
+        wavelengths = tuple(self.wavelength_nm.tolist())
         for k, surface in enumerate(lens.surfaces):
-            front, back = index[:, k, None], index[:, k + 1, None]
-            # cosines on both sides, from the cosine in the medium of lower index by Snell's law
-            thin = np.minimum(front, back)
-            at_front, at_back = (np.sqrt(1 - (thin / n) ** 2 * (1 - cosine**2)) for n in (front, back))
             films = () if bare else surface.coating
-            rs, rp, ts, tp = reflect_transmit(films, front, back, at_front, wavelength)
-            out[:, k, 0], out[:, k, 2] = (rs + rp) / 2, (ts + tp) / 2
-            rs, rp, _, _ = reflect_transmit(films[::-1], back, front, at_back, wavelength)
-            out[:, k, 1] = (rs + rp) / 2
+            out[:, k] = _surface_fractions(
+                films, tuple(index[:, k].tolist()), tuple(index[:, k + 1].tolist()), wavelengths
+            )
         out[:, -1, :2] = lens.sensor_reflectance
         return out
 

@@ -9,6 +9,7 @@ focus, its disc is sampled instead.
 from __future__ import annotations
 
 import copy
+from collections.abc import Collection
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any, Unpack
@@ -22,7 +23,7 @@ from ..prescription import Prescription
 from .bundles import Rays, Spots, TraceOptions, Tracer
 from .ghosts import Arrivals, boxes, named, traced
 from .paraxial import Ghost, along, mean_ghost
-from .raster import LEVELS, PARTS, BundleDrawing, Canvas, Sums, edge_kind
+from .raster import LEVELS, PARTS, BundleDrawing, Canvas, Pyramid, Sums, edge_kind
 from .settings import TRACED, GhostSettings, SensorGrid
 
 F32 = NDArray[np.float32]
@@ -302,6 +303,14 @@ class FlareModel:
         InputError
             The angle is 90° or more.
         """
+        return self._drawn(sun_deg, azimuth_deg, only).irradiance()
+
+    def levels(self, sun_deg: float, azimuth_deg: float = 0.0) -> Pyramid:
+        """Return the irradiance of `image` before its levels are added."""
+        return self._drawn(sun_deg, azimuth_deg, None).levels()
+
+    def _drawn(self, sun_deg: float, azimuth_deg: float, only: tuple[int, int] | None) -> Sums:
+        """Return the sums into which all ghosts are drawn."""
         if not 0 <= sun_deg < 90:
             raise InputError(f"sun_deg = {sun_deg:g}: must be from 0 to below 90")
         turn = float(np.radians(azimuth_deg))
@@ -326,14 +335,27 @@ class FlareModel:
                 drawn, side = drawn.of(each), np.full(len(bundles), _ACROSS_FOCUSED)
             spots = made.trace(bundles, side, detail.width)
             sums.draw(spots, self._place(detail, bundles, drawn, strength), turn)
-        return sums.irradiance()
+        return sums
 
-    def ghosts(self, sun_deg: float, azimuth_deg: float = 0.0, *, across: int = 48) -> tuple[Ghost, ...]:
-        """Return the ghosts of a point Sun that reach the frame, each the mean of all bands."""
+    def ghosts(
+        self,
+        sun_deg: float,
+        azimuth_deg: float = 0.0,
+        *,
+        across: int = 48,
+        only: Collection[tuple[int, ...]] | None = None,
+    ) -> tuple[Ghost, ...]:
+        """Return the ghosts of a point Sun that reach the frame, each the mean of all bands.
+
+        `only` holds the names of the ghosts to trace; default: all.
+        """
         turn = float(np.radians(azimuth_deg))
         made = self._tracer.turned(turn)
         rays, arrivals = boxes(made, sun_deg, self._detail.width, self._reach_mm)
-        rays = rays.take(self._in_frame(arrivals) & (arrivals.peak > _LEAST))
+        shown = self._in_frame(arrivals) & (arrivals.peak > _LEAST)
+        if only is not None:
+            shown &= named(made, rays, only)
+        rays = rays.take(shown)
         by_name: dict[tuple[int, ...], list[tuple[float, Ghost]]] = {}
         for node in range(0, len(self._fine), _SUBDIVISIONS):
             of_node = replace(rays, wavelength=np.full(len(rays), node))

@@ -100,9 +100,8 @@ def along(lens: Prescription, path: Sequence[tuple[int, bool]], wavelength_nm: A
         To each surface met.
     """
     wavelength = np.asarray(wavelength_nm, dtype=np.float64)
-    index = np.stack([np.ones(wavelength.shape), *(s.medium.index(wavelength) for s in lens.surfaces)])
-    sensor_mm = first_order(lens).bfd_mm
-    vertex = np.append(lens.vertices_mm, lens.vertices_mm[-1] + sensor_mm)
+    flat, vertex = _media(lens, tuple(wavelength.ravel().tolist()))
+    index = flat.reshape(len(flat), *wavelength.shape)
     height, slope = (np.broadcast_to(row, (*wavelength.shape, 2)).copy() for row in np.eye(2))
     met, onward, before = [], True, 0
     for row, mirror in path:
@@ -118,6 +117,17 @@ def along(lens: Prescription, path: Sequence[tuple[int, bool]], wavelength_nm: A
         before = row
     height = height + (vertex[-1] - vertex[before]) * slope
     return np.stack([height, slope], axis=-2), np.stack(met)
+
+
+@lru_cache(maxsize=32)
+def _media(lens: Prescription, wavelength_nm: tuple[float, ...]) -> tuple[F64, F64]:
+    """Return the indices of all media, float64[row + 1, wavelength], and the vertices with that of the sensor."""
+    wavelength = np.array(wavelength_nm)
+    index = np.stack([np.ones(wavelength.shape), *(s.medium.index(wavelength) for s in lens.surfaces)])
+    vertex = np.append(lens.vertices_mm, lens.vertices_mm[-1] + first_order(lens).bfd_mm)
+    for array in (index, vertex):
+        array.setflags(write=False)
+    return index, vertex
 
 
 def transmittance(lens: Prescription, path: Sequence[tuple[int, bool]], wavelength_nm: float = D_NM) -> float:

@@ -12,6 +12,7 @@ depend on the order in which threads add.
 from __future__ import annotations
 
 import itertools
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
@@ -293,35 +294,72 @@ class Sums:
 
         return add
 
+    def levels(self) -> Pyramid:
+        """Return the sums of every level and band."""
+        canvas, total = self.canvas, self._total.numpy().view(np.int64)
+        levels = []
+        for level in range(LEVELS):
+            part = total[canvas.starts[level] : canvas.starts[level + 1]]
+            part = part.reshape(canvas.bands, *canvas.sizes[level])
+            levels.append(np.multiply(part, 1 / _UNITS, dtype=np.float32))
+        return Pyramid(canvas=canvas, levels=tuple(levels))
+
     def irradiance(self) -> F32:
         """Return the sum of all levels, float32[band, y, x]."""
-        canvas, total = self.canvas, self._total.numpy().view(np.int64)
-        out = np.empty((canvas.bands, *canvas.shape), dtype=np.float32)
+        return _summed(self.canvas, self.levels().levels)
 
-        def resize_band(band: int) -> None:
-            """Resize and add the levels of one band, from the coarsest to the finest."""
-            below: F32 | None = None
-            for level in range(LEVELS - 1, -1, -1):
-                height, width = (int(v) for v in canvas.sizes[level])
-                first = canvas.starts[level] + band * height * width
-                part = total[first : first + height * width].reshape(height, width)
-                here = np.multiply(part, 1 / _UNITS, dtype=np.float32)
-                if below is not None:
-                    # folds end in steps, which pixel centres sample unevenly
-                    calm = cv2.GaussianBlur(below, (3, 3), _CALM_SIGMA)
-                    bigger = cv2.resize(calm, None, fx=2, fy=2, interpolation=cv2.INTER_LINEAR)
-                    # pixel 0 of a level covers two pixels of the finer level, -M·2 + M and the next
-                    here += bigger[_MARGIN : _MARGIN + height, _MARGIN : _MARGIN + width]
-                below = here
-            assert below is not None
-            rows, columns = (slice(_MARGIN, _MARGIN + n) for n in canvas.shape)
-            # the parts are sampled on different lattices, so that their sum may be slightly negative
-            np.maximum(below[rows, columns], 0, out=out[band])
 
-        # numpy and OpenCV release the interpreter's lock
-        with ThreadPoolExecutor(backend().dr.thread_count()) as pool:
-            list(pool.map(resize_band, range(canvas.bands)))
-        return out
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Pyramid:
+    """Hold the irradiance of all ghosts in levels, float32[band, y, x] each, from the finest to the coarsest."""
+
+    canvas: Canvas
+    levels: tuple[F32, ...]
+
+    @cached_property
+    def flux_mm2(self) -> F64:
+        """Return the flux in the frame, float64[band]; coarse levels end at whole pixels of their own."""
+        flux = np.zeros(self.canvas.bands)
+        for k, level in enumerate(self.levels):
+            inside = level[:, _MARGIN : level.shape[1] - _MARGIN, _MARGIN : level.shape[2] - _MARGIN]
+            flux += inside.sum(axis=(1, 2), dtype=np.float64) * 4**k
+        return np.asarray(flux * self.canvas.pitch_mm**2)
+
+    def mixed(self, weights: F64) -> F32:
+        """Return sums over the bands with weights float64[channel, band], float32[channel, y, x].
+
+        The bands are added before the levels are resized, which is cheaper than `Sums.irradiance` for few channels.
+        """
+        mix = weights.astype(np.float32)
+        return _summed(self.canvas, [np.tensordot(mix, level, 1) for level in self.levels])
+
+
+def _summed(canvas: Canvas, levels: Sequence[F32]) -> F32:
+    """Return the sum of levels float32[layer, y, x] on the pixels of the frame, float32[layer, y, x]."""
+    out = np.empty((len(levels[0]), *canvas.shape), dtype=np.float32)
+
+    def resize(layer: int) -> None:
+        """Resize and add the levels of one layer, from the coarsest to the finest."""
+        below: F32 | None = None
+        for level in range(LEVELS - 1, -1, -1):
+            height, width = (int(v) for v in canvas.sizes[level])
+            here = levels[level][layer]
+            if below is not None:
+                # folds end in steps, which pixel centres sample unevenly
+                calm = cv2.GaussianBlur(below, (3, 3), _CALM_SIGMA)
+                bigger = cv2.resize(calm, None, fx=2, fy=2, interpolation=cv2.INTER_LINEAR)
+                # pixel 0 of a level covers two pixels of the finer level, -M·2 + M and the next
+                here = here + bigger[_MARGIN : _MARGIN + height, _MARGIN : _MARGIN + width]
+            below = here
+        assert below is not None
+        rows, columns = (slice(_MARGIN, _MARGIN + n) for n in canvas.shape)
+        # the parts are sampled on different lattices, so that their sum may be slightly negative
+        np.maximum(below[rows, columns], 0, out=out[layer])
+
+    # numpy and OpenCV release the interpreter's lock
+    with ThreadPoolExecutor(backend().dr.thread_count()) as pool:
+        list(pool.map(resize, range(len(out))))
+    return out
 
 
 def _shared_out(work: NDArray[np.uint32], chosen: NDArray[np.int64]) -> NDArray[np.uint32]:

@@ -359,7 +359,21 @@ class VeilingGlare:
         source's image, which may lie outside the frame. At this position the glare is finite but has no meaning,
         because the direct image is much brighter. The result does not include the cos⁴ of a pixel's field angle.
         """
-        start, step, table = self._lookup
+        index = self.samples(sun_xy_mm, shape, pitch_mm)
+        table = self.table
+        out = np.empty((len(table), *shape), dtype=np.float32)
+        for row, band in zip(table, out, strict=True):
+            np.take(row, index, out=band, mode="clip")
+        return out
+
+    @property
+    def table(self) -> F32:
+        """Return the irradiance at the steps to which `samples` refers, float32[band, step]."""
+        return self._lookup[2]
+
+    def samples(self, sun_xy_mm: tuple[float, float], shape: tuple[int, int], pitch_mm: float) -> NDArray[np.intp]:
+        """Return the step of `table` at each pixel of a frame, [y, x]; it depends on the focal length alone."""
+        start, step, _ = self._lookup
         height, width = shape
         x = ((np.arange(width) - (width - 1) / 2) * pitch_mm / self.efl_mm).astype(np.float32)
         y = ((np.arange(height) - (height - 1) / 2) * pitch_mm / self.efl_mm).astype(np.float32)[:, None]
@@ -372,11 +386,7 @@ class VeilingGlare:
         position -= np.float32(start)
         position *= np.float32(1 / step)
         position += np.float32(0.5)
-        index = position.astype(np.intp)
-        out = np.empty((len(table), height, width), dtype=np.float32)
-        for row, band in zip(table, out, strict=True):
-            np.take(row, index, out=band, mode="clip")
-        return out
+        return np.clip(position.astype(np.intp), 0, _LOOKUP - 1)
 
     @property
     def kept_of_single(self) -> F64:

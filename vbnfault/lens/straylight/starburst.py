@@ -240,6 +240,24 @@ class Starburst:
         """
         wavelength_nm = np.atleast_1d(np.asarray(wavelength_nm, dtype=np.float64))
         tables, mix = self._tables(wavelength_nm, pitch_mm, half_width_nm)
+        if len(tables) == len(mix):
+            return self._remapped(sun_xy_mm, tables, None, shape, pitch_mm)
+        return self._remapped(sun_xy_mm, tables, mix, shape, pitch_mm)
+
+    def layers(
+        self, sun_xy_mm: ArrayLike, wavelength_nm: F64, shape: tuple[int, int], pitch_mm: float
+    ) -> tuple[F32, F64]:
+        """Return the few layers of which `image` is the sum, float32[layer, y, x], and their weights in each band.
+
+        The weights are float64[band, layer]. The parameters are those of `image`.
+        """
+        tables, mix = self._tables(np.atleast_1d(np.asarray(wavelength_nm, dtype=np.float64)), pitch_mm, None)
+        return self._remapped(sun_xy_mm, tables, None, shape, pitch_mm), mix.astype(np.float64)
+
+    def _remapped(
+        self, sun_xy_mm: ArrayLike, tables: F32, mix: F32 | None, shape: tuple[int, int], pitch_mm: float
+    ) -> F32:
+        """Return the tables on the sensor, or their sums with the weights `mix`, float32[table or band, y, x]."""
         height, width = shape
         f, sigma, nearest = self.efl_mm, self.sun_radius_rad, self._sines(pitch_mm)[0]
         sun = np.asarray(sun_xy_mm, dtype=np.float64) / f
@@ -247,7 +265,7 @@ class Starburst:
         sun_u, sun_v = (np.float32(s * sun_cos) for s in sun)
         per_log = np.float32(0.5 * (self.radii - 1) / np.log(_FARTHEST / nearest))
         x = ((np.arange(width) - (width - 1) / 2) * pitch_mm / f).astype(np.float32)[None, :]
-        out = np.empty((len(mix), height, width), dtype=np.float32)
+        out = np.empty((len(tables) if mix is None else len(mix), height, width), dtype=np.float32)
         part = np.empty((len(tables), min(_STRIP, height), width), dtype=np.float32)
         for top in range(0, height, _STRIP):  # the arrays of a strip stay in the cache
             strip = out[:, top : top + _STRIP]
@@ -262,11 +280,11 @@ class Starburst:
             gain = cosine * cosine * np.float32(sun_cos / f**2) / (apart - np.float32(sigma**2))
             angle = np.arctan2(np.abs(dv), np.copysign(du, du * dv)) * np.float32(self.angles / np.pi)
             row = (np.log(apart) - np.float32(2 * np.log(nearest))) * per_log
-            layers = part[:, : strip.shape[1]] if len(tables) < len(mix) else strip
+            layers = strip if mix is None else part[:, : strip.shape[1]]
             for layer, table in zip(layers, tables, strict=True):
                 cv2.remap(table, angle, row, cv2.INTER_LINEAR, dst=layer, borderMode=cv2.BORDER_REPLICATE)
                 layer *= gain
-            if len(tables) < len(mix):
+            if mix is not None:
                 _mixed(layers, mix, strip)
         return out
 

@@ -98,10 +98,17 @@ class StopBlades:
         be, rim = backend(), self.rim
         dr = be.dr
         half = float(np.pi / rim.blades)
-        angle = (dr.atan2(y, x) - dr.opaque(be.Float, self.turn_rad)) * (0.5 / half)
-        beside = (angle - dr.floor(angle)) * (2 * half) - half
-        edge = float(np.cos(half)) / dr.cos(beside)
-        return dr.sqrt(x * x + y * y) / (rim.semi_diameter_mm * (edge + (1 - edge) * rim.blade_rounding))
+
+        def given(value: float) -> Any:
+            """Return a number as an argument of the kernel; as a constant it would make every lens compile one."""
+            return dr.opaque(be.Float, value)
+
+        angle = (dr.atan2(y, x) - given(self.turn_rad)) * given(0.5 / half)
+        beside = (angle - dr.floor(angle)) * given(2 * half) - given(half)
+        edge = given(float(np.cos(half))) / dr.cos(beside)
+        return dr.sqrt(x * x + y * y) / (
+            given(rim.semi_diameter_mm) * (edge + (1 - edge) * given(rim.blade_rounding))
+        )
 
 
 def meet(

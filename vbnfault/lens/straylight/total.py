@@ -28,6 +28,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,9 +36,10 @@ from numpy.typing import NDArray
 from ..gaussian import first_order
 from ..prescription import Prescription
 from ..thin import cos4_map
-from .irradiance import flare_model
+from .irradiance import FlareModel, flare_model
 from .paraxial import axial_transmittance
-from .scatter import Cleanliness, baffle_transmission, scattered_fraction, veiling_glare
+from .raster import Pyramid
+from .scatter import Cleanliness, VeilingGlare, baffle_transmission, scattered_fraction, veiling_glare
 from .settings import DEFAULT, Baffle, DirectPath, SensorGrid, StraylightSettings, SunSource
 from .starburst import Starburst, starburst
 
@@ -98,39 +100,21 @@ def straylight(
     InputError
         A value is out of range.
     """
-    nodes = np.atleast_1d(np.asarray(wavelength_nm, dtype=np.float64))
-    pupil_mm2 = np.pi / 4 * first_order(lens).entrance_pupil_diameter_mm ** 2 * np.cos(np.radians(sun.angle_deg))
-    own = axial_transmittance(lens, nodes)
-    path = DirectPath(transmittance=own, admitted_mm2=float(pupil_mm2)) if path is None else path
-    light = _SunlightInLens(
-        lens=lens,
-        nodes_nm=nodes,
-        sensor=sensor,
-        sun=sun,
-        own=own,
-        passed=np.broadcast_to(path.transmittance, own.shape),
-        beam_fraction=path.beam_fraction,
-        lit=_lit_fraction(lens, settings.baffle, sun.angle_deg),
-        pupil_mm2=float(pupil_mm2),
+    light = SunlightInLens.of(
+        lens, wavelength_nm=wavelength_nm, sensor=sensor, sun=sun, settings=settings, path=path
     )
     burst, burst_beyond = light.starburst()
-    glare, glare_beyond = light.glare(settings.cleanliness)
-    veil, veil_beyond = light.veil(settings.veil_fraction)
-    model = flare_model(lens, tuple(nodes.tolist()), sensor, sun.radius_rad, settings.ghosts)
-    ghosts = model.worn(settings.coating_loss).image(sun.angle_deg, sun.azimuth_deg) * np.float32(light.lit)
-    direct = light.passed * path.admitted_mm2
-    # light that the image path has lost feeds the ghosts; the direct light supplies the rest
-    unpaid = np.maximum(_flux_mm2(ghosts, sensor.pitch_mm) - (1 - light.passed) * path.admitted_mm2, 0)
+    glare, glare_beyond = light.glare()
+    veil, veil_beyond = light.veil()
+    ghosts = light.ghost_model().image(sun.angle_deg, sun.azimuth_deg) * np.float32(light.lit)
     beyond = burst_beyond + glare_beyond + veil_beyond
-    taken = sum(_flux_mm2(layer, sensor.pitch_mm) for layer in (burst, glare, veil)) + beyond + unpaid
-    with np.errstate(divide="ignore", invalid="ignore"):
-        left = np.where(direct > 0, 1 - taken / direct, 1.0)
+    taken = sum(_flux_mm2(layer, sensor.pitch_mm) for layer in (burst, glare, veil)) + beyond
     return Straylight(
         ghosts=ghosts,
         starburst=burst,
         glare=glare,
         veil=veil,
-        direct_fraction=np.clip(left, 0, 1),
+        direct_fraction=light.direct_fraction(_flux_mm2(ghosts, sensor.pitch_mm), taken),
         beyond_mm2=beyond,
     )
 
@@ -151,16 +135,22 @@ def _lit_fraction(lens: Prescription, baffle: Baffle, sun_deg: float) -> float:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class _SunlightInLens:
-    """Hold the Sun's light in a lens, and compute what of it is diffracted and scattered.
+class SunlightInLens:
+    """Hold the Sun's light in a lens, and compute what of it becomes ghosts, starburst, glare and veil.
 
-    Each method returns the irradiance on the sensor, float32[band, y, x], and the flux beyond the frame,
-    float64[band] in mm², both over the Sun's irradiance at the entrance.
+    `starburst`, `glare` and `veil` return the irradiance on the sensor, float32[band, y, x], and the flux beyond
+    the frame, float64[band] in mm², both over the Sun's irradiance at the entrance.
+
+    A study evaluates many lenses that differ in few parameters. For it, `ghost_levels`, `starburst_layers`,
+    `glare_samples` and `glare_light` compute the parts that take time. Each depends on its `…_key` alone; the rest
+    of this class is cheap.
 
     Attributes
     ----------
     own, passed
         float64[band]: transmittance of the lens along its axis, and of the path of the direct image.
+    admitted_mm2, beam_fraction
+        As in `DirectPath`.
     lit
         Fraction of the entrance that the Sun lights.
     pupil_mm2
@@ -171,11 +161,44 @@ class _SunlightInLens:
     nodes_nm: F64
     sensor: SensorGrid
     sun: SunSource
+    settings: StraylightSettings
     own: F64
     passed: F64
+    admitted_mm2: float
     beam_fraction: float
     lit: float
     pupil_mm2: float
+
+    @classmethod
+    def of(
+        cls,
+        lens: Prescription,
+        *,
+        wavelength_nm: F64,
+        sensor: SensorGrid,
+        sun: SunSource,
+        settings: StraylightSettings = DEFAULT,
+        path: DirectPath | None = None,
+    ) -> SunlightInLens:
+        """Return the Sun's light for the parameters of `straylight`."""
+        nodes = np.atleast_1d(np.asarray(wavelength_nm, dtype=np.float64))
+        diameter_mm = first_order(lens).entrance_pupil_diameter_mm
+        pupil_mm2 = float(np.pi / 4 * diameter_mm**2 * np.cos(np.radians(sun.angle_deg)))
+        own = axial_transmittance(lens, nodes)
+        path = DirectPath(transmittance=own, admitted_mm2=pupil_mm2) if path is None else path
+        return cls(
+            lens=lens,
+            nodes_nm=nodes,
+            sensor=sensor,
+            sun=sun,
+            settings=settings,
+            own=own,
+            passed=np.broadcast_to(path.transmittance, own.shape),
+            admitted_mm2=path.admitted_mm2,
+            beam_fraction=path.beam_fraction,
+            lit=_lit_fraction(lens, settings.baffle, sun.angle_deg),
+            pupil_mm2=pupil_mm2,
+        )
 
     @property
     def _efl_mm(self) -> float:
@@ -187,36 +210,194 @@ class _SunlightInLens:
         """Return cos⁴ of the field angle of every pixel."""
         return cos4_map(self.sensor.shape, self._efl_mm / self.sensor.pitch_mm)
 
+    @property
+    def _sun_xy_mm(self) -> tuple[float, float]:
+        """Return the position of the direct image."""
+        return self.sun.xy_mm(self._efl_mm)
+
+    @property
+    def _nodes(self) -> tuple[float, ...]:
+        """Return the nodes in the form that caches need."""
+        return tuple(self.nodes_nm.tolist())
+
+    # --- ghosts
+
+    @property
+    def ghost_key(self) -> tuple[Any, ...]:
+        """Return all that `ghost_levels` depends on."""
+        sun, settings = self.sun, self.settings
+        return (
+            *(self.lens, self._nodes, self.sensor, settings.ghosts, settings.coating_loss),
+            *(sun.angle_deg, sun.azimuth_deg, sun.radius_rad),
+        )
+
+    def ghost_model(self) -> FlareModel:
+        """Return the model of the ghosts."""
+        model = flare_model(self.lens, self._nodes, self.sensor, self.sun.radius_rad, self.settings.ghosts)
+        return model.worn(self.settings.coating_loss)
+
+    def ghost_levels(self) -> Pyramid:
+        """Return the irradiance of the ghosts where the Sun lights the whole entrance."""
+        return self.ghost_model().levels(self.sun.angle_deg, self.sun.azimuth_deg)
+
+    # --- starburst
+
+    @property
+    def starburst_key(self) -> tuple[Any, ...]:
+        """Return all that `starburst_layers` depends on."""
+        lens = self.lens
+        stop, paraxial = lens.surfaces[lens.stop], first_order(lens)
+        outline = stop.semi_diameter_mm, stop.blades, stop.blade_rounding, stop.rotation_deg
+        pupil = paraxial.efl_mm, paraxial.entrance_pupil_diameter_mm
+        return *outline, *pupil, self.sun.radius_rad, self._sun_xy_mm, self._nodes, self.sensor
+
+    def starburst_layers(self) -> Diffraction:
+        """Return the diffracted light of a lens with a transmission of 1."""
+        burst, where = _starburst(self.lens, self.sun.radius_rad), self._sun_xy_mm
+        shape, pitch_mm = self.sensor.shape, self.sensor.pitch_mm
+        layers, mix = burst.layers(where, self.nodes_nm, shape, pitch_mm)
+        return Diffraction(
+            layers=layers,
+            mix=mix,
+            flux_mm2=mix @ _flux_mm2(layers, pitch_mm),
+            beyond_mm2=burst.beyond_mm2(where, self.nodes_nm, shape, pitch_mm),
+        )
+
+    def starburst_gain(self, flux_mm2: F64) -> F64:
+        """Return the factor on diffracted light whose flux on the whole plane is `flux_mm2`, float64[band]."""
+        # diffraction scales with the light that passes the stop, and cannot exceed it
+        return np.asarray(self.lit * self.passed * self.beam_fraction / np.maximum(flux_mm2 / self.pupil_mm2, 1))
+
     def starburst(self) -> tuple[F32, F64]:
         """Return what the stop diffracts."""
-        burst, where = _starburst(self.lens, self.sun.radius_rad), self.sun.xy_mm(self._efl_mm)
+        burst, where = _starburst(self.lens, self.sun.radius_rad), self._sun_xy_mm
         shape, pitch_mm = self.sensor.shape, self.sensor.pitch_mm
         image = burst.image(where, self.nodes_nm, shape, pitch_mm)
         beyond = burst.beyond_mm2(where, self.nodes_nm, shape, pitch_mm)
-        # diffraction scales with the light that passes the stop, and cannot exceed it
-        diffracted = (_flux_mm2(image, pitch_mm) + beyond) / self.pupil_mm2
-        gain = self.lit * self.passed * self.beam_fraction / np.maximum(diffracted, 1)
+        gain = self.starburst_gain(_flux_mm2(image, pitch_mm) + beyond)
         image *= gain[:, None, None].astype(np.float32)
         return image, beyond * gain
 
-    def glare(self, cleanliness: Cleanliness) -> tuple[F32, F64]:
-        """Return what the surfaces scatter."""
-        scattering = veiling_glare(
-            self.lens, sun_deg=self.sun.angle_deg, wavelength_nm=self.nodes_nm, cleanliness=cleanliness
-        )
-        where = self.sun.xy_mm(self._efl_mm)
+    # --- glare
+
+    @property
+    def glare_samples_key(self) -> tuple[Any, ...]:
+        """Return all that `glare_samples` depends on."""
+        return self._efl_mm, self._sun_xy_mm, self.sensor
+
+    def glare_samples(self) -> GlareSamples:
+        """Return the step of the glare's table at each pixel; roughness and dust do not change it."""
+        index = self._scattering().samples(self._sun_xy_mm, self.sensor.shape, self.sensor.pitch_mm)
+        cos4 = self._cos4
+        area = np.bincount(index.ravel(), weights=cos4.ravel()).astype(np.float64) * self.sensor.pitch_mm**2
+        return GlareSamples(index=index.astype(np.int32), cos4=cos4, area_mm2=area)
+
+    @property
+    def glare_key(self) -> tuple[Any, ...]:
+        """Return all that `glare_light` depends on."""
+        return self.lens, self._nodes, self.sensor, self.sun.angle_deg, self._sun_xy_mm, self.settings.cleanliness
+
+    def glare_light(self) -> tuple[F32, F64, F64]:
+        """Return the irradiance at the steps of `glare_samples`, its flux beyond the frame, and its kept fraction.
+
+        The arrays are float32[band, step], float64[band] in mm², and float64[band].
+        """
+        scattering = self._scattering()
+        beyond = scattering.beyond_mm2(self._sun_xy_mm, self.sensor.shape, self.sensor.pitch_mm)
+        return scattering.table, beyond, scattering.kept_of_single
+
+    def glare_gain(self, kept_of_single: F64) -> F64:
+        """Return the factor on the scattered light, float64[band]."""
         # each surface scatters only the light that the others have left (`kept_of_single`)
-        gain = self.lit * self.passed / self.own * scattering.kept_of_single
+        return np.asarray(self.lit * self.passed / self.own * kept_of_single)
+
+    def glare(self) -> tuple[F32, F64]:
+        """Return what the surfaces scatter."""
+        scattering, where = self._scattering(), self._sun_xy_mm
+        gain = self.glare_gain(scattering.kept_of_single)
         image = scattering.image(where, self.sensor.shape, self.sensor.pitch_mm)
         image *= gain[:, None, None].astype(np.float32) * self._cos4
         return image, scattering.beyond_mm2(where, self.sensor.shape, self.sensor.pitch_mm) * gain
 
-    def veil(self, veil_fraction: float) -> tuple[F32, F64]:
+    def _scattering(self) -> VeilingGlare:
+        """Return the scatter of the surfaces."""
+        return veiling_glare(
+            self.lens,
+            sun_deg=self.sun.angle_deg,
+            wavelength_nm=self.nodes_nm,
+            cleanliness=self.settings.cleanliness,
+        )
+
+    # --- veil and direct image
+
+    def veil(self) -> tuple[F32, F64]:
         """Return what mount, barrel and edges scatter."""
-        entering = self.lit * self.passed * self.pupil_mm2 * veil_fraction
-        per_mm2 = self._cos4 * np.float32(1 / (np.pi * self._efl_mm**2))
+        entering, per_mm2 = self.veil_light()
         image = np.asarray(entering[:, None, None].astype(np.float32) * per_mm2)
         return image, entering * (1 - float(per_mm2.sum(dtype=np.float64)) * self.sensor.pitch_mm**2)
+
+    def veil_light(self) -> tuple[F64, F32]:
+        """Return the flux of the veil, float64[band] in mm², and its distribution, float32[y, x] in 1/mm²."""
+        entering = self.lit * self.passed * self.pupil_mm2 * self.settings.veil_fraction
+        return entering, self._cos4 * np.float32(1 / (np.pi * self._efl_mm**2))
+
+    def direct_fraction(self, ghosts_mm2: F64, taken_mm2: F64) -> F64:
+        """Return the fraction of the Sun's direct image that remains, float64[band].
+
+        `ghosts_mm2` is the flux of the ghosts, `taken_mm2` that of starburst, glare and veil on the whole plane.
+        """
+        direct = self.passed * self.admitted_mm2
+        # light that the image path has lost feeds the ghosts; the direct light supplies the rest
+        unpaid = np.maximum(ghosts_mm2 - (1 - self.passed) * self.admitted_mm2, 0)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            left = np.where(direct > 0, 1 - (taken_mm2 + unpaid) / direct, 1.0)
+        return np.clip(left, 0, 1)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Diffraction:
+    """Hold the starburst of a lens with a transmission of 1, over the Sun's irradiance at the entrance.
+
+    The image of a band is the sum of `layers` float32[layer, y, x] with the weights `mix` float64[band, layer].
+    `flux_mm2` and `beyond_mm2` float64[band] are its flux inside and outside the frame.
+    """
+
+    layers: F32
+    mix: F64
+    flux_mm2: F64
+    beyond_mm2: F64
+
+    def mixed(self, weights: F64) -> F32:
+        """Return sums over the bands with weights float64[channel, band], float32[channel, y, x]."""
+        return np.asarray(np.tensordot((weights @ self.mix).astype(np.float32), self.layers, 1))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class GlareSamples:
+    """Hold how the glare's table is laid out on the sensor.
+
+    Attributes
+    ----------
+    index
+        int32[y, x]: step of the table at each pixel.
+    cos4
+        float32[y, x], a factor on the light of the table.
+    area_mm2
+        float64[step]: pixels' area times `cos4` for each step.
+    """
+
+    index: NDArray[np.int32]
+    cos4: F32
+    area_mm2: F64
+
+    def flux_mm2(self, table: F32) -> F64:
+        """Return the flux in the frame of a table float32[band, step], float64[band]."""
+        return np.asarray(table[:, : len(self.area_mm2)] @ self.area_mm2)
+
+    def mixed(self, table: F32, weights: F64) -> F32:
+        """Return sums over the bands with weights float64[channel, band], float32[channel, y, x]."""
+        channels = weights.astype(np.float32) @ table
+        return np.stack([np.take(channel, self.index) * self.cos4 for channel in channels])
 
 
 def scene_veil_fraction(
