@@ -13,6 +13,7 @@ from ..core.quantities import Electrons, Irradiance, Radiance
 from ..core.sundisc import Projection
 from ..detector import Detector, MosaicDetector
 from ..lens import Lens
+from ..lens.changes import Change
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -21,6 +22,9 @@ class Camera:
 
     `architecture` and `readout_direction` (`core.architecture` names their values) are drawn once per
     sample, and broken pixels and broken lines share them. `exposure_s` is above 0.
+
+    `lens_changes` are changes of the prescription that faults trace; a lens of the camera that has surfaces is
+    already changed. Only sensitivity studies use them.
     """
 
     lens: Lens
@@ -28,6 +32,7 @@ class Camera:
     architecture: str = "full_frame_ccd"
     readout_direction: str = "right"
     exposure_s: float = 1e-3
+    lens_changes: tuple[Change, ...] = ()
 
     @property
     def optics(self) -> tuple[Any, ...]:

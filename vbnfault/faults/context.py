@@ -86,6 +86,7 @@ class FaultContext:
             width_px=self.camera.width_px,
             height_px=self.camera.height_px,
             pixel_pitch_um=self.camera.detector.pixel_pitch_um,
+            changes=self.camera.lens_changes,
         )
 
     def once(self, name: str, params: Params, make: Callable[[], T]) -> T:

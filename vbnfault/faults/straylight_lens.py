@@ -30,7 +30,7 @@ from ..core import spectra
 from ..core.quantities import Irradiance
 from ..lens.straylight.scatter import CLEANLINESS_LIMITS, ROUGHNESS_NM_LIMITS, Cleanliness
 from ..lens.straylight.settings import Baffle, DirectPath, GhostSettings, SensorGrid, StraylightSettings, SunSource
-from ..lens.straylight.total import scene_veil_fraction, straylight, veil_of
+from ..lens.straylight.total import SunlightInLens, scene_veil_fraction, veil_of
 from .context import FaultContext, Params
 from .contract import LensFault
 from .fields import Interval, bounds, choice, number
@@ -59,6 +59,32 @@ class _Light(NamedTuple):
     added: F32
     direct_left: F64
     scene_lost: F64
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class LensSunlight:
+    """Hold the Sun's light in the lens of a sample.
+
+    Attributes
+    ----------
+    light
+        The Sun's light in the lens, over the Sun's irradiance at the entrance.
+    irradiance_W_m2_nm
+        float64[band]: irradiance of the visible part of the Sun.
+    weights
+        float64[channel, band]: spectrum of the electrons of each channel under sunlight, with the sum 1.
+    scene_lost
+        float64[channel]: fraction of the scene's image that becomes veil.
+    """
+
+    light: SunlightInLens
+    irradiance_W_m2_nm: F64
+    weights: F64
+    scene_lost: F64
+
+    def channel_mean(self, fraction: F64) -> F64:
+        """Return the mean of a fraction float64[band] in each channel, float64[channel]."""
+        return np.asarray(self.weights @ fraction)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -112,7 +138,13 @@ class _LensStraylight(LensFault):
 
     def draw(self, context: FaultContext, rng: np.random.Generator) -> Params:
         """Return lens, coating, roughness, cleanliness, veil, baffle, mask level and the ghosts in the frame."""
-        params: Params = {
+        params = self.draw_state(rng)
+        params["ghosts"] = self._ghosts(params, context)
+        return params
+
+    def draw_state(self, rng: np.random.Generator) -> Params:
+        """Return the parameters of `draw` without the list of ghosts, which only describes them."""
+        return {
             "lens": self.lens,
             "coating": self.coating,
             "roughness_nm": self.roughness_nm.uniform(rng),
@@ -122,8 +154,6 @@ class _LensStraylight(LensFault):
             "baffle_mm": [float(self.baffle_length_mm), float(self.baffle_radius_mm)],
             "mask_level_dn": float(self.mask_level_dn),
         }
-        params["ghosts"] = self._ghosts(params, context)
-        return params
 
     def apply(self, quantity: Any, params: Params, context: FaultContext) -> Any:
         """Return the expected electrons plus straylight, minus the light that straylight is taken from."""
@@ -163,6 +193,23 @@ class _LensStraylight(LensFault):
 
     def _light(self, params: Params, context: FaultContext) -> _Light | None:
         """Return the straylight of the Sun; None if there is no Sun in front of the camera."""
+        source = self.sunlight(params, context)
+        if source is None:
+            return None
+        camera, light = context.camera, source.light
+        parts = light.total()
+        on_sensor = Irradiance(
+            array=parts.total * source.irradiance_W_m2_nm.astype(np.float32)[:, None, None],
+            wavelength_nm=light.nodes_nm,
+        )
+        return _Light(
+            added=camera.detector.electrons_expected(on_sensor, camera.exposure_s).array,
+            direct_left=source.channel_mean(parts.direct_fraction),
+            scene_lost=source.scene_lost,
+        )
+
+    def sunlight(self, params: Params, context: FaultContext) -> LensSunlight | None:
+        """Return the Sun's light in the lens before any ray is traced; None if no Sun is in front of the camera."""
         sun = _sun(context)
         if sun is None:
             return None
@@ -177,7 +224,7 @@ class _LensStraylight(LensFault):
         passed = camera.lens.transmittance(nodes)
         area_mm2, axial_mm2 = camera.lens.pupil_area_mm2([np.tan(np.radians(theta)), 0.0])
         cleanliness = Cleanliness(roughness_nm=params["roughness_nm"], level=params["cleanliness_level"])
-        sunlight = straylight(
+        light = SunlightInLens.of(
             lens,
             wavelength_nm=nodes,
             sensor=SensorGrid(shape=context.shape, pitch_mm=pitch_mm),
@@ -200,16 +247,15 @@ class _LensStraylight(LensFault):
                 beam_fraction=float(area_mm2 / axial_mm2),
             ),
         )
-        visible = 1.0 if context.sun_visible_fraction is None else float(context.sun_visible_fraction)
-        light = sunlight.total * (irradiance * visible).astype(np.float32)[:, None, None]
-        on_sensor = Irradiance(array=light, wavelength_nm=nodes)
         # the scene and the Sun's image both have the spectrum of sunlight that the lens transmits
         weights = camera.detector.electron_rate_weights(nodes) * irradiance * passed
         weights /= np.maximum(weights.sum(axis=1, keepdims=True), 1e-300)
         lost = scene_veil_fraction(lens, nodes, cleanliness=cleanliness, veil_fraction=params["veil_fraction"])
-        return _Light(
-            added=camera.detector.electrons_expected(on_sensor, camera.exposure_s).array,
-            direct_left=weights @ sunlight.direct_fraction,
+        visible = 1.0 if context.sun_visible_fraction is None else float(context.sun_visible_fraction)
+        return LensSunlight(
+            light=light,
+            irradiance_W_m2_nm=irradiance * visible,
+            weights=weights,
             scene_lost=weights @ lost,
         )
 

@@ -10,7 +10,7 @@ Everything holds for the d line.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 
 import cv2
@@ -21,6 +21,7 @@ from scipy.interpolate import PchipInterpolator
 
 from ..core import file_contents
 from .aperture import stopped_down
+from .changes import OF_COATINGS, Change, changed
 from .gaussian import scaled_to_focal_length
 from .glass import D_NM
 from .imaging import RealLens
@@ -53,12 +54,16 @@ _SHADOW = 64  # cells along each side of a shadow's table
 
 @dataclass(frozen=True, kw_only=True)
 class ImageFrame:
-    """Describe a camera for the tracing of beams: its lens, and its image centred on the axis."""
+    """Describe a camera for the tracing of beams: its lens, and its image centred on the axis.
+
+    `changes` are made in a prescription that is not the camera's own, and in the coatings of its own.
+    """
 
     lens: Lens
     width_px: int
     height_px: int
     pixel_pitch_um: float
+    changes: tuple[Change, ...] = ()
 
     def slopes(self, x_px: NDArray, y_px: NDArray) -> tuple[F32, F32]:
         """Return the tangents of the field angles, to the right and down, float32[y, x] each, of columns and rows.
@@ -81,15 +86,29 @@ class ImageFrame:
         own = self.lens
         if own.real is not None and not name:
             return own.real
-        return _scaled(name or DEFAULT_LENS, own.focal_length_mm, own.f_number, self)
+        fitted = self._fitted(name)
+        return _with_changes(fitted, self.changes) if self.changes else fitted
+
+    def _fitted(self, name: str) -> RealLens:
+        """Return a named lens fitted to the camera, without changes."""
+        frame = replace(self, changes=()) if self.changes else self
+        return _scaled(name or DEFAULT_LENS, self.lens.focal_length_mm, self.lens.f_number, frame)
 
     def prescription(self, name: str, coating: str) -> Prescription:
         """Return the prescription of that lens with a named coating on every surface between glass and air.
 
         With `as_prescribed` the coatings stay.
         """
-        lens = self.real_lens(name).prescription
-        return lens if coating == "as_prescribed" else _coated(lens, coating)
+        if coating == "as_prescribed":
+            return self.real_lens(name).prescription
+        changes = self.changes
+        if self.lens.real is not None and not name:
+            lens = self.lens.real.prescription
+            changes = tuple(change for change in changes if change.quantity in OF_COATINGS)
+        else:
+            lens = self._fitted(name).prescription
+        lens = _coated(lens, coating)
+        return changed(lens, changes) if changes else lens
 
     def beams(self, name: str) -> Beams:
         """Return the beams of that lens, from the axis to slightly beyond the frame's corners."""
@@ -108,6 +127,12 @@ def _scaled(name: str, focal_length_mm: float, f_number: float, frame: ImageFram
         height_px=frame.height_px,
         pixel_pitch_um=frame.pixel_pitch_um,
     )
+
+
+@lru_cache(maxsize=4)
+def _with_changes(lens: RealLens, changes: tuple[Change, ...]) -> RealLens:
+    """Return a lens with a changed prescription."""
+    return replace(lens, prescription=changed(lens.prescription, changes))
 
 
 @lru_cache(maxsize=8)

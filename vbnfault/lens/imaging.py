@@ -87,6 +87,9 @@ class RealLens:
         radius of the spots over the frame is smallest. Both hold for the d line.
     focus_distance_m
         Object distance by which the renderer defocuses the scene.
+    guard
+        Guard band of the renders that the lens images, for a lens that is changed after the render; default: the
+        one that it needs.
     """
 
     prescription: Prescription
@@ -95,6 +98,7 @@ class RealLens:
     pixel_pitch_um: float
     focus: str = "paraxial"
     focus_distance_m: float = float("inf")
+    guard: tuple[int, int] | None = None
 
     resamples: ClassVar[bool] = True
     blurs: ClassVar[bool] = True
@@ -285,6 +289,8 @@ class RealLens:
         InputError
             The lens sees a much wider field than a pinhole render of its focal length can hold.
         """
+        if self.guard is not None:
+            return self.guard
         mapped = self._map(D_NM)
         farthest = self._slopes[-1]
         if self._beams.area_mm2[-1] > 0 and mapped.height(farthest) < self._corner * self.focal_length_mm:

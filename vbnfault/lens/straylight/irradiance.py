@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from ...core.errors import InputError
 from ...core.llvm import backend
+from ..gaussian import first_order
 from ..prescription import Prescription
 from .bundles import Rays, Spots, TraceOptions, Tracer
 from .ghosts import Arrivals, boxes, named, traced
@@ -205,6 +206,7 @@ class FlareModel:
         self._tracer = kind(lens, self._fine, reflections=settings.reflections)
         self._diffraction, self._across = settings.diffraction, settings.across
         self._reach_mm = float(np.hypot(*shape) / 2 * pitch_mm)
+        self._last_boxes: tuple[tuple[float, float], tuple[Tracer, Rays, Arrivals]] | None = None
         self._soften()
 
     def _soften(self) -> None:
@@ -285,6 +287,7 @@ class FlareModel:
             return self
         other = copy.copy(self)
         other._tracer = self._tracer.worn(coating_loss)
+        other._last_boxes = None
         return other
 
     def image(self, sun_deg: float, azimuth_deg: float = 0.0, *, only: tuple[int, int] | None = None) -> F32:
@@ -314,8 +317,7 @@ class FlareModel:
         if not 0 <= sun_deg < 90:
             raise InputError(f"sun_deg = {sun_deg:g}: must be from 0 to below 90")
         turn = float(np.radians(azimuth_deg))
-        made = self._tracer.turned(turn)
-        rays, arrivals = boxes(made, sun_deg, self._detail.width, self._reach_mm)
+        made, rays, arrivals = self._boxes(sun_deg, turn)
         shown = self._in_frame(arrivals) & (arrivals.peak > _LEAST)
         if only is not None:
             shown &= named(made, rays, [only])
@@ -337,25 +339,40 @@ class FlareModel:
             sums.draw(spots, self._place(detail, bundles, drawn, strength), turn)
         return sums
 
-    def ghosts(
-        self,
-        sun_deg: float,
-        azimuth_deg: float = 0.0,
-        *,
-        across: int = 48,
-        only: Collection[tuple[int, ...]] | None = None,
-    ) -> tuple[Ghost, ...]:
-        """Return the ghosts of a point Sun that reach the frame, each the mean of all bands.
+    def _boxes(self, sun_deg: float, turn: float) -> tuple[Tracer, Rays, Arrivals]:
+        """Return the tracer for an azimuth, the boxes of all ghosts, and where they arrive; the last are kept."""
+        key = sun_deg, turn
+        if self._last_boxes is None or self._last_boxes[0] != key:
+            made = self._tracer.turned(turn)
+            self._last_boxes = key, (made, *boxes(made, sun_deg, self._detail.width, self._reach_mm))
+        return self._last_boxes[1]
 
-        `only` holds the names of the ghosts to trace; default: all.
+    def flux_mm2(
+        self, sun_deg: float, azimuth_deg: float, only: Collection[tuple[int, ...]], *, across: int = 48
+    ) -> dict[tuple[int, ...], F64]:
+        """Return the flux of named ghosts of a point Sun on the unbounded sensor plane, float64[band] in mm² each.
+
+        It is divided by the Sun's irradiance at the entrance, and 0 for a ghost whose light the rims block.
         """
         turn = float(np.radians(azimuth_deg))
-        made = self._tracer.turned(turn)
-        rays, arrivals = boxes(made, sun_deg, self._detail.width, self._reach_mm)
-        shown = self._in_frame(arrivals) & (arrivals.peak > _LEAST)
-        if only is not None:
-            shown &= named(made, rays, only)
-        rays = rays.take(shown)
+        made, rays, _ = self._boxes(sun_deg, turn)
+        rays = rays.take(named(made, rays, only))
+        bands = len(self.nodes_nm)
+        flux = {name: np.zeros(bands) for name in only}
+        if len(rays):
+            pupil_mm2 = np.pi / 4 * first_order(self.lens).entrance_pupil_diameter_mm ** 2
+            cosine = float(np.cos(np.radians(sun_deg)))
+            for band in range(bands):
+                of_node = replace(rays, wavelength=np.full(len(rays), band * _SUBDIVISIONS))
+                for ghost in traced(made, of_node, sun_deg, turn, across):
+                    flux[ghost.pair][band] += ghost.flux_fraction * pupil_mm2 * cosine
+        return flux
+
+    def ghosts(self, sun_deg: float, azimuth_deg: float = 0.0, *, across: int = 48) -> tuple[Ghost, ...]:
+        """Return the ghosts of a point Sun that reach the frame, each the mean of all bands."""
+        turn = float(np.radians(azimuth_deg))
+        made, rays, arrivals = self._boxes(sun_deg, turn)
+        rays = rays.take(self._in_frame(arrivals) & (arrivals.peak > _LEAST))
         by_name: dict[tuple[int, ...], list[tuple[float, Ghost]]] = {}
         for node in range(0, len(self._fine), _SUBDIVISIONS):
             of_node = replace(rays, wavelength=np.full(len(rays), node))

@@ -449,6 +449,7 @@ class _Surfaces:
         return sum(harvey.tis for harvey in self.roughness) + dust * int(self.dusty.sum())
 
 
+@lru_cache(maxsize=64)
 def _surfaces(lens: Prescription, wavelength_nm: float, cleanliness: Cleanliness) -> _Surfaces:
     """Return the scatter of a lens's surfaces at a wavelength."""
     level = float(_check("cleanliness_level", cleanliness.level, *CLEANLINESS_LIMITS))

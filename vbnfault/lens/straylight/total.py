@@ -27,7 +27,7 @@ irradiance of its image L A T / f². That standard's index of photographic lense
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
@@ -100,23 +100,9 @@ def straylight(
     InputError
         A value is out of range.
     """
-    light = SunlightInLens.of(
+    return SunlightInLens.of(
         lens, wavelength_nm=wavelength_nm, sensor=sensor, sun=sun, settings=settings, path=path
-    )
-    burst, burst_beyond = light.starburst()
-    glare, glare_beyond = light.glare()
-    veil, veil_beyond = light.veil()
-    ghosts = light.ghost_model().image(sun.angle_deg, sun.azimuth_deg) * np.float32(light.lit)
-    beyond = burst_beyond + glare_beyond + veil_beyond
-    taken = sum(_flux_mm2(layer, sensor.pitch_mm) for layer in (burst, glare, veil)) + beyond
-    return Straylight(
-        ghosts=ghosts,
-        starburst=burst,
-        glare=glare,
-        veil=veil,
-        direct_fraction=light.direct_fraction(_flux_mm2(ghosts, sensor.pitch_mm), taken),
-        beyond_mm2=beyond,
-    )
+    ).total()
 
 
 def _lit_fraction(lens: Prescription, baffle: Baffle, sun_deg: float) -> float:
@@ -198,6 +184,24 @@ class SunlightInLens:
             beam_fraction=path.beam_fraction,
             lit=_lit_fraction(lens, settings.baffle, sun.angle_deg),
             pupil_mm2=pupil_mm2,
+        )
+
+    def total(self) -> Straylight:
+        """Return all straylight, and what it takes from the direct image."""
+        pitch_mm = self.sensor.pitch_mm
+        burst, burst_beyond = self.starburst()
+        glare, glare_beyond = self.glare()
+        veil, veil_beyond = self.veil()
+        ghosts = self.ghost_model().image(self.sun.angle_deg, self.sun.azimuth_deg) * np.float32(self.lit)
+        beyond = burst_beyond + glare_beyond + veil_beyond
+        taken = sum(_flux_mm2(layer, pitch_mm) for layer in (burst, glare, veil)) + beyond
+        return Straylight(
+            ghosts=ghosts,
+            starburst=burst,
+            glare=glare,
+            veil=veil,
+            direct_fraction=self.direct_fraction(_flux_mm2(ghosts, pitch_mm), taken),
+            beyond_mm2=beyond,
         )
 
     @property
@@ -287,7 +291,7 @@ class SunlightInLens:
 
     def glare_samples(self) -> GlareSamples:
         """Return the step of the glare's table at each pixel; roughness and dust do not change it."""
-        index = self._scattering().samples(self._sun_xy_mm, self.sensor.shape, self.sensor.pitch_mm)
+        index = self._scattering.samples(self._sun_xy_mm, self.sensor.shape, self.sensor.pitch_mm)
         cos4 = self._cos4
         area = np.bincount(index.ravel(), weights=cos4.ravel()).astype(np.float64) * self.sensor.pitch_mm**2
         return GlareSamples(index=index.astype(np.int32), cos4=cos4, area_mm2=area)
@@ -302,7 +306,7 @@ class SunlightInLens:
 
         The arrays are float32[band, step], float64[band] in mm², and float64[band].
         """
-        scattering = self._scattering()
+        scattering = self._scattering
         beyond = scattering.beyond_mm2(self._sun_xy_mm, self.sensor.shape, self.sensor.pitch_mm)
         return scattering.table, beyond, scattering.kept_of_single
 
@@ -313,12 +317,13 @@ class SunlightInLens:
 
     def glare(self) -> tuple[F32, F64]:
         """Return what the surfaces scatter."""
-        scattering, where = self._scattering(), self._sun_xy_mm
+        scattering, where = self._scattering, self._sun_xy_mm
         gain = self.glare_gain(scattering.kept_of_single)
         image = scattering.image(where, self.sensor.shape, self.sensor.pitch_mm)
         image *= gain[:, None, None].astype(np.float32) * self._cos4
         return image, scattering.beyond_mm2(where, self.sensor.shape, self.sensor.pitch_mm) * gain
 
+    @cached_property
     def _scattering(self) -> VeilingGlare:
         """Return the scatter of the surfaces."""
         return veiling_glare(
