@@ -100,6 +100,8 @@ def along(lens: Prescription, path: Sequence[tuple[int, bool]], wavelength_nm: A
         To each surface met.
     """
     wavelength = np.asarray(wavelength_nm, dtype=np.float64)
+    if wavelength.ndim == 0:
+        return _along_at(lens, path, float(wavelength))
     flat, vertex = _media(lens, tuple(wavelength.ravel().tolist()))
     index = flat.reshape(len(flat), *wavelength.shape)
     height, slope = (np.broadcast_to(row, (*wavelength.shape, 2)).copy() for row in np.eye(2))
@@ -117,6 +119,29 @@ def along(lens: Prescription, path: Sequence[tuple[int, bool]], wavelength_nm: A
         before = row
     height = height + (vertex[-1] - vertex[before]) * slope
     return np.stack([height, slope], axis=-2), np.stack(met)
+
+
+def _along_at(lens: Prescription, path: Sequence[tuple[int, bool]], wavelength_nm: float) -> tuple[F64, F64]:
+    """Return `along` for one wavelength, with plain numbers: many times faster than arrays of two."""
+    index, vertex = (v.tolist() for v in _media(lens, (wavelength_nm,)))
+    curvatures = [*(s.curvature_per_mm for s in lens.surfaces), 0.0]
+    (h0, h1), (s0, s1) = (1.0, 0.0), (0.0, 1.0)
+    met, onward, before = [], True, 0
+    for row, mirror in path:
+        gap = abs(vertex[row] - vertex[before])
+        h0, h1 = h0 + gap * s0, h1 + gap * s1
+        met.append(((h0, h1), (s0, s1)))
+        sense = curvatures[row] if onward else -curvatures[row]
+        if mirror:
+            bend = 2 * sense
+            s0, s1, onward = s0 + bend * h0, s1 + bend * h1, not onward
+        else:
+            into, out = (index[row][0], index[row + 1][0]) if onward else (index[row + 1][0], index[row][0])
+            power, ratio = (into - out) * sense / out, into / out
+            s0, s1 = power * h0 + ratio * s0, power * h1 + ratio * s1
+        before = row
+    gap = vertex[-1] - vertex[before]
+    return np.array(((h0 + gap * s0, h1 + gap * s1), (s0, s1))), np.array(met).reshape(-1, 2, 2)
 
 
 @lru_cache(maxsize=32)

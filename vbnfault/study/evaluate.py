@@ -1,0 +1,824 @@
+"""Evaluate points of a study at views of a scene, and compute again only what a factor moves.
+
+    render ▶ direct image ▶ exposure ▶ ghosts, starburst, glare, veil ▶ metrics
+
+A view is rendered once; optics, Sun and detector act on its radiance. The results of each stage are kept with all
+that the stage depends on (`Kept`), a few of them at a time, so that the result of an evaluation does not depend on
+those before it. In a Sobol design the points AB differ from their point A in one factor, so most of their stages
+are found there.
+
+The image metrics follow `straylight` alone, whose paths and surfaces `image_metrics` describes; other faults of the
+scene act on the images of the navigation metrics, which pass the whole pipeline. Parameters of a fault that the
+scene gives as intervals are drawn once for a view, with the same random numbers for all points of a block.
+
+Assumptions: the ground is lit as in the rendered view wherever `sun.…` moves the Sun; the guard band and the depth
+of field of the render are those of the nominal lens.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import time
+from collections import Counter, OrderedDict
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..camera import Camera
+from ..core import spectra
+from ..core.errors import InputError
+from ..core.quantities import BODY, Electrons, Radiance, SunInView
+from ..core.sundisc import Pinhole, add_mean
+from ..core.tables import did_you_mean
+from ..faults import Fault, FaultContext, act, from_dict, registry
+from ..lens import Prescription
+from ..lens.changes import changed
+from ..lens.footprint import ImageFrame
+from ..lens.straylight.irradiance import flare_model
+from ..lens.straylight.settings import GhostSettings, SensorGrid
+from ..lens.straylight.total import SunlightInLens
+from ..lens.thin import cos4_map
+from ..pipeline.exposure import exposure_s
+from ..pipeline.injection import fault_context, inject_faults
+from ..pipeline.rendering import render_view
+from ..pipeline.resolve import resolve
+from ..pipeline.session import Session
+from ..pipeline.spec import Injection, Pose, Rendering, SampleSpec, SceneExposure, SceneLight
+from ..pipeline.stars import add_stars
+from ..scene.config import Scene, load_scene
+from . import image_metrics
+from .factors import AFTER_RENDER, Factors, Setting
+from .image_metrics import LitImage
+from .spec import Evaluation, Metric, StudySpec
+
+F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
+T = TypeVar("T")
+
+_FAULT = "straylight"
+_LIT = 0.02  # of the 99th percentile of the ground's signal, above which ground counts as sunlit
+# How many results of each stage are kept beside those of the base row A of a Sobol design; default: two.
+_KEPT = {"render": 1, "exposure": 8}
+
+
+class Kept:
+    """Keep the last results of each stage, and count and time the computations.
+
+    Attributes
+    ----------
+    events
+        How often each stage was computed.
+    seconds
+        How long that took.
+    """
+
+    def __init__(self) -> None:
+        self.events: Counter[str] = Counter()
+        self.seconds: dict[str, float] = {}
+        self._results: dict[str, OrderedDict[Hashable, Any]] = {}
+        self._held: dict[str, set[tuple[str, Hashable]]] = {}
+        self._holder = ""
+
+    @contextlib.contextmanager
+    def holding(self, holder: str) -> Iterator[None]:
+        """Hold what a block uses until the next block of the same holder, in place of what that one used."""
+        self._held[holder], self._holder = set(), holder
+        try:
+            yield
+        finally:
+            self._holder = ""
+
+    def once(self, stage: str, key: Hashable, make: Callable[[], T], part: str = "") -> T:
+        """Return `make()` for a key, from the last results of the stage where it was computed before.
+
+        `part` separates results of one stage that have keys of their own.
+        """
+        name = f"{stage}/{part}"
+        results = self._results.setdefault(name, OrderedDict())
+        if self._holder:
+            self._held[self._holder].add((name, key))
+        if key not in results:
+            with self.timed(stage):
+                results[key] = make()
+            if not part:
+                self.events[stage] += 1
+        value: T = results[key]
+        results.move_to_end(key)
+        held = set().union(*self._held.values())
+        loose = [other for other in results if (name, other) not in held]
+        for other in loose[: max(len(loose) - _KEPT.get(stage, 2), 0)]:
+            del results[other]
+        return value
+
+    @contextlib.contextmanager
+    def timed(self, stage: str) -> Iterator[None]:
+        """Add the duration of a block to a stage."""
+        start = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.seconds[stage] = self.seconds.get(stage, 0.0) + time.perf_counter() - start
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class View:
+    """Hold a rendered view: its sample, pose and radiance."""
+
+    spec: SampleSpec
+    pose: Pose
+    rendering: Rendering
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Exposed:
+    """Hold a view with the camera and the Sun of one evaluation.
+
+    Attributes
+    ----------
+    spec, pose, rendering, exposure
+        As the pipeline has them, with the camera and the Sun changed.
+    clean
+        Expected signal without straylight, float32[channel, y, x] in electrons.
+    lit
+        Indices of the pixels that show sunlit ground.
+    key
+        All that `clean` depends on.
+    """
+
+    spec: SampleSpec
+    pose: Pose
+    rendering: Rendering
+    exposure: SceneExposure
+    scene_e: F32
+    direct_e: F32 | None
+    lit: NDArray[np.intp]
+    key: Hashable
+
+    @property
+    def camera(self) -> Camera:
+        """Return the camera with its exposure."""
+        return self.exposure.camera
+
+    @cached_property
+    def clean(self) -> F32:
+        """Return the expected signal without straylight, float32[channel, y, x] in electrons."""
+        return self.scene_e if self.direct_e is None else self.scene_e + self.direct_e
+
+    @cached_property
+    def context(self) -> FaultContext:
+        """Return the sample as its faults see it."""
+        return fault_context(self.pose, self.rendering, self.exposure)
+
+
+class SceneEvaluator:
+    """Evaluate the points of a study at the views of its scene.
+
+    Parameters
+    ----------
+    spec
+        The study.
+
+    Raises
+    ------
+    InputError
+        The scene, a factor or a metric is unknown or does not fit.
+    """
+
+    def __init__(self, spec: StudySpec) -> None:
+        self.spec = spec
+        self.kept = Kept()
+        self._base = _scene_of(spec)
+        self._session: tuple[Hashable, Session] | None = None
+        self._render_keys: dict[int, tuple[Scene, str]] = {}
+        model = spec.model_names[0]
+        with self._named():
+            faults = dict(self._base.faults)
+            if spec.models is not None:
+                _check_models(spec, faults)
+            camera = Session(self._plain_scene()).base_camera
+            self._nominal_camera = camera
+            self.factors = Factors(spec, self._base, camera, self._nominal_lens(camera, model))
+        self._check_metrics()
+
+    # --- the contract of an evaluator -----------------------------------------------------------------------------
+
+    @cached_property
+    def metrics(self) -> tuple[Metric, ...]:
+        """Return the metrics that the study names."""
+        made = []
+        navigation = _navigation()
+        for name in self.spec.metrics.names:
+            if name in navigation:
+                made.append(navigation[name])
+                continue
+            rank = image_metrics.ghost_rank(name)
+            made.append(image_metrics.metric(name, None if rank is None else self._ghost_pair(rank)))
+        return tuple(made)
+
+    def timings(self) -> Mapping[str, float]:
+        """Return the seconds spent so far in each stage."""
+        return dict(self.kept.seconds)
+
+    def check(self) -> Sequence[str]:
+        """Evaluate every factor at two values on the first view, and return warnings.
+
+        Raises
+        ------
+        InputError
+            A value is out of range, or no model of the study reads a factor.
+        """
+        _ = self.metrics
+        unread: dict[str, list[str]] = {}
+        middle = {f.key: _value(f, f.nominal()) for f in self.spec.factors}
+        for i, factor in enumerate(self.spec.factors):
+            for model in self.spec.model_names:
+                seen = set()
+                for point in (0.02, 0.98):
+                    try:
+                        seen.add(self._fingerprint(model, middle | {factor.key: _value(factor, point)}))
+                    except InputError as error:
+                        raise InputError(f"factor[{i}].key = {factor.key!r}: {error}") from None
+                if len(seen) == 1:
+                    unread.setdefault(factor.key, []).append(model)
+        for i, factor in enumerate(self.spec.factors):
+            if len(unread.get(factor.key, ())) == len(self.spec.model_names):
+                raise InputError(
+                    f"factor[{i}].key = {factor.key!r}: nothing in the images of the study reads it; leave it out"
+                )
+        return [f"factor {key!r} is inactive with the model {', '.join(models)}" for key, models in unread.items()]
+
+    def evaluate(self, evaluation: Evaluation) -> Mapping[str, float]:
+        """Return the value of each metric that the study names."""
+        setting = self.factors.setting(evaluation.values)
+        if evaluation.role == "A":  # the rows AB of this base row differ from it in one factor each
+            with self.kept.holding(evaluation.model):
+                return self._values(evaluation, setting)
+        return self._values(evaluation, setting)
+
+    def _values(self, evaluation: Evaluation, setting: Setting) -> Mapping[str, float]:
+        """Return the value of each metric that the study names."""
+        names = self.spec.metrics.names
+        navigation = _navigation()
+        values: dict[str, float] = {}
+        image_names = [name for name in names if name not in navigation]
+        if image_names:
+            image = self._lit_image(evaluation, setting)
+            with self.kept.timed("metrics"):
+                values |= {name: image_metrics.value(name, image) for name in image_names}
+        own = [name for name in names if name in navigation]
+        if own:
+            values |= self._navigation_values(evaluation, setting, own)
+        return {name: values[name] for name in names}
+
+    def picture(self, evaluation: Evaluation) -> F32:
+        """Return the expected image of an evaluation, float32[y, x, channel] in electrons, without noise."""
+        image = self._lit_image(evaluation, self.factors.setting(evaluation.values))
+        return np.ascontiguousarray(np.moveaxis((image.kept + image.added)[:3], 0, -1))
+
+    # --- the study's scene ----------------------------------------------------------------------------------------
+
+    @contextlib.contextmanager
+    def _named(self) -> Iterator[None]:
+        """Name the study in errors."""
+        try:
+            yield
+        except InputError as error:
+            raise InputError(f"study {self.spec.title!r}: {error}") from None
+
+    def _plain_scene(self) -> Scene:
+        """Return the scene with the first seed and model."""
+        if self.spec.models is None:
+            return self._base
+        name, model = self.spec.models.fault, self.spec.model_names[0]
+        table = {**self._base.faults.get(name, {}), "model": model}
+        fault = registry()[name][model]
+        own = {key: value for key, value in table.items() if key == "model" or key in fault.__dataclass_fields__}
+        return self._base.model_copy(update={"faults": {**self._base.faults, name: own}})
+
+    def _nominal_lens(self, camera: Camera, model: str) -> Prescription:
+        """Return the prescription that the scene's straylight traces, without factors."""
+        table = self._base.faults.get(_FAULT, {})
+        frame = ImageFrame(
+            lens=camera.lens,
+            width_px=camera.width_px,
+            height_px=camera.height_px,
+            pixel_pitch_um=camera.detector.pixel_pitch_um,
+        )
+        return frame.prescription(str(table.get("lens", "")), str(table.get("coating", "as_prescribed")))
+
+    def _check_metrics(self) -> None:
+        """Raise InputError if a metric is unknown, or has nothing to measure in the scene."""
+        navigation = _navigation()
+        known = [*image_metrics.NAMES, *navigation]
+        for name in self.spec.metrics.names:
+            if name in navigation:
+                continue
+            if not image_metrics.is_image_metric(name):
+                raise InputError(
+                    f"study {self.spec.title!r}: metrics.names: {name!r} is unknown{did_you_mean(name, known)}"
+                )
+            if _FAULT not in self._base.faults:
+                raise InputError(
+                    f"study {self.spec.title!r}: metrics.names: {name!r} needs the fault {_FAULT!r}, which the "
+                    f"scene {self.spec.scene.base!r} has not"
+                )
+
+    # --- stages ---------------------------------------------------------------------------------------------------
+
+    def _scene(self, evaluation: Evaluation, setting: Setting) -> Scene:
+        """Return the scene of an evaluation."""
+        changes = tuple(sorted(setting.scene.items()))
+        with self._named():
+            scene: Scene = self.factors.scene_of(evaluation.seed, evaluation.model, changes)
+        return scene
+
+    def _view(self, evaluation: Evaluation, scene: Scene) -> View:
+        """Return a view, rendered where this was not done before for what the renderer reads of the scene."""
+        key = self._render_key(scene), evaluation.view
+        return self.kept.once("render", key, lambda: self._rendered(key[0], scene, evaluation.view))
+
+    def _render_key(self, scene: Scene) -> str:
+        """Return a digest of all that the renderer reads of a scene."""
+        if id(scene) not in self._render_keys or self._render_keys[id(scene)][0] is not scene:
+            if len(self._render_keys) > 64:
+                self._render_keys.clear()
+            self._render_keys[id(scene)] = (scene, _render_key(scene))
+        return self._render_keys[id(scene)][1]
+
+    def _rendered(self, key: Hashable, scene: Scene, index: int) -> View:
+        """Render a view."""
+        if self._session is None or self._session[0] != key:
+            self._session = None  # release the old terrain first
+            self._session = key, Session(scene, source=f"study {self.spec.title!r}")
+        session = self._session[1]
+        if not 0 <= index < len(session.plan):
+            raise InputError(
+                f"study {self.spec.title!r}: scene.samples = {index}: must be from 0 to {len(session.plan) - 1}"
+            )
+        spec = session.spec(index)
+        pose = resolve(spec, 0)
+        return View(spec=spec, pose=pose, rendering=render_view(spec, pose))
+
+    def _exposed(self, evaluation: Evaluation, setting: Setting) -> Exposed:
+        """Return the view of an evaluation with its camera, its Sun and its exposure."""
+        scene = self._scene(evaluation, setting)
+        view = self._view(evaluation, scene)
+        spec = replace(view.spec, scene=scene, faults=_faults(scene))
+        camera = self._camera(spec, setting)
+        pose, rendering = _with_sun(view, camera, setting.sun)
+        far = setting.sun.get("distance_au")
+        place = evaluation.seed, evaluation.view, self._render_key(scene)
+        optics = (*place, camera.lens, _efficiency(camera))
+        per_s = self.kept.once(
+            "direct image", (*optics, far), lambda: _scene_rate(camera, rendering.light.rendered), "scene"
+        )
+        sun_key = (*optics, tuple(sorted(setting.sun.items())))
+        direct = self.kept.once("direct image", sun_key, lambda: _sun_rate(camera, rendering.light.rendered))
+        white = camera.detector.white_e
+        rate = Electrons(array=per_s, white_e=white, past_rims=direct)
+        metered = self.kept.once(
+            "exposure",
+            (*sun_key, white.tobytes(), scene.camera),
+            lambda: exposure_s(scene, camera, rendering.truth, rate.merged),
+        )
+        camera = replace(camera, exposure_s=metered)
+        planes = self.kept.once(
+            "direct image",
+            (*sun_key, metered, white.tobytes()),
+            lambda: (_planes(per_s, metered), None if direct is None else _planes(direct, metered)),
+            "planes",
+        )
+        lit = self.kept.once(
+            "direct image", (*optics, far), lambda: _lit_pixels(per_s, rendering.truth.semantic), "lit"
+        )
+        return Exposed(
+            spec=spec,
+            pose=pose,
+            rendering=rendering,
+            exposure=SceneExposure(camera=camera, light=rendering.light, rate=rate),
+            scene_e=planes[0],
+            direct_e=planes[1],
+            lit=lit,
+            key=(*sun_key, metered),
+        )
+
+    def _camera(self, spec: SampleSpec, setting: Setting) -> Camera:
+        """Return the camera of an evaluation without an exposure."""
+        camera = _with_detector(spec.camera, setting.detector)
+        changes = tuple(setting.lens)
+        if not changes:
+            return camera
+        if camera.lens.real is not None:
+            key = camera.lens, changes
+            real = camera.lens.real
+            lens = self.kept.once(
+                "direct image",
+                key,
+                lambda: replace(real, prescription=changed(real.prescription, changes), guard=real.guard_px),
+                "lens",
+            )
+            camera = replace(camera, lens=lens)
+        return replace(camera, lens_changes=changes)
+
+    # --- light ----------------------------------------------------------------------------------------------------
+
+    def _lit_image(self, evaluation: Evaluation, setting: Setting) -> LitImage:
+        """Return the expected light of an evaluation."""
+        exposed = self._exposed(evaluation, setting)
+        fault = exposed.spec.faults[_FAULT]
+        sunlight = getattr(fault, "sunlight", None)
+        rng = exposed.spec.rng("fault", f"{_FAULT}/0")
+        if sunlight is None:
+            with self.kept.timed("texture"):
+                light = _added_by(fault, exposed, fault.draw(exposed.context, rng))
+        else:
+            light = self._traced(sunlight(fault.draw_state(rng), exposed.context), exposed)  # type: ignore[attr-defined]
+        camera = exposed.camera
+        detector = camera.detector
+        return LitImage(
+            clean=exposed.clean,
+            lit=exposed.lit,
+            dark_e=_dark_e(camera),
+            read_noise_e=detector.read_noise_e_rms,
+            full_well_e=detector.full_well_e,
+            white_e=detector.white_e,
+            mask_level_dn=fault.effect_level_dn,
+            **light,
+        )
+
+    def _traced(self, source: Any, exposed: Exposed) -> dict[str, Any]:
+        """Return the fields of `LitImage` that hold the straylight of a lens; `source` is a `LensSunlight`."""
+        nothing = {"kept": exposed.clean, "added": np.zeros_like(exposed.clean), "parts_e": {}, "ghosts_e": ()}
+        if source is None:
+            return nothing
+        light: SunlightInLens = source.light
+        camera, pitch_mm = exposed.camera, light.sensor.pitch_mm
+        per_s = camera.detector.electron_rate_weights(light.nodes_nm) * source.irradiance_W_m2_nm
+        once = self.kept.once
+        # per band, over the Sun's irradiance
+        levels = once("ghosts", light.ghost_key, light.ghost_levels)
+        burst = once("starburst", light.starburst_key, light.starburst_layers)
+        samples = once("glare", light.glare_samples_key, light.glare_samples, "samples")
+        table, glare_beyond, kept = once("glare", light.glare_key, light.glare_light)
+        # per channel, in electrons per second
+        burst_gain = light.starburst_gain(burst.flux_mm2 + burst.beyond_mm2)
+        glare_gain = light.glare_gain(kept)
+        glare_key = light.glare_key, light.glare_samples_key
+        with self.kept.timed("light"):
+            parts = {
+                "ghosts": self._channels("ghosts", levels.mixed, light.ghost_key, per_s * light.lit),
+                "starburst": self._channels("starburst", burst.mixed, light.starburst_key, per_s * burst_gain),
+                "glare": self._channels("glare", lambda w: samples.mixed(table, w), glare_key, per_s * glare_gain),
+            }
+            entering, veil_plane = light.veil_light()
+            taken = (burst.flux_mm2 + burst.beyond_mm2) * burst_gain + entering
+            taken = taken + (samples.flux_mm2(table) + glare_beyond) * glare_gain
+            direct_left = source.channel_mean(light.direct_fraction(levels.flux_mm2 * light.lit, taken))
+            seconds = np.float32(camera.exposure_s)
+            added = parts["ghosts"][0] + parts["starburst"][0]
+            added += parts["glare"][0]
+            added *= seconds
+            # the veil of the Sun and that of the scene have the same distribution over the frame
+            lost = source.scene_lost
+            scene_e = exposed.scene_e
+            flux = scene_e.sum(axis=(1, 2), dtype=np.float64) * lost
+            focal_px = camera.focal_length_px
+            veil = cos4_map(camera_shape(camera), focal_px) * np.float32(1 / (np.pi * focal_px**2))
+            sun_veil = (per_s @ entering * camera.exposure_s).astype(np.float32)
+            for channel, plane in enumerate(added):
+                plane += veil_plane * sun_veil[channel]
+                plane += veil * np.float32(flux[channel])
+            left = scene_e * (1 - lost).astype(np.float32)[:, None, None]
+            if exposed.direct_e is not None:
+                left += exposed.direct_e * direct_left.astype(np.float32)[:, None, None]
+        ghosts_e = self._single_ghosts(light, per_s * light.lit * camera.exposure_s / pitch_mm**2)
+        totals = {name: float(total.mean() * camera.exposure_s) for name, (_, total) in parts.items()}
+        return {"kept": left, "added": added, "parts_e": totals, "ghosts_e": ghosts_e}
+
+    def _channels(self, name: str, mixed: Callable[[F64], F32], key: Hashable, weights: F64) -> tuple[F32, F64]:
+        """Return a part of straylight in electrons per second, float32[channel, y, x], and its sums by channel."""
+
+        def make() -> tuple[F32, F64]:
+            image = mixed(weights)
+            return image, image.sum(axis=(1, 2), dtype=np.float64)
+
+        return self.kept.once("light", (key, weights.tobytes()), make, name)
+
+    # --- single ghosts --------------------------------------------------------------------------------------------
+
+    @cached_property
+    def _ghost_pairs(self) -> tuple[tuple[int, ...], ...]:
+        """Return the paths of the nominal lens that reach the frame, the one with most flux first.
+
+        The Sun stands at half the half-width of the field, to the right.
+        """
+        camera = self._nominal_camera
+        lens = self._nominal_lens(camera, self.spec.model_names[0])
+        scene = self._base.render
+        nodes = spectra.band_nodes_nm(scene.band_min_nm, scene.band_max_nm, scene.bands)
+        sensor = SensorGrid(shape=camera_shape(camera), pitch_mm=camera.detector.pixel_pitch_um * 1e-3)
+        model = flare_model(
+            lens, (float(nodes[len(nodes) // 2]),), sensor, spectra.sun_angular_radius_rad(1.0), GhostSettings()
+        )
+        ghosts = sorted(model.ghosts(camera.fov_deg / 4), key=lambda ghost: -ghost.flux_fraction)
+        return tuple(ghost.pair for ghost in ghosts)
+
+    def _ghost_pair(self, rank: int) -> tuple[int, ...]:
+        """Return the path of a rank. Raises InputError where the lens has fewer paths."""
+        if rank > len(self._ghost_pairs):
+            raise InputError(
+                f"study {self.spec.title!r}: metrics.names: 'ghost_{rank}_flux_e': of the nominal lens "
+                f"{len(self._ghost_pairs)} ghosts reach the frame"
+            )
+        return self._ghost_pairs[rank - 1]
+
+    def _single_ghosts(self, light: SunlightInLens, e_per_mm2: F64) -> tuple[float, ...]:
+        """Return the flux of the ghosts that the study follows, in electrons."""
+        ranks = [rank for name in self.spec.metrics.names if (rank := image_metrics.ghost_rank(name)) is not None]
+        if not ranks:
+            return ()
+        pairs = tuple(self._ghost_pair(rank) for rank in range(1, max(ranks) + 1))
+
+        def make() -> dict[tuple[int, ...], F64]:
+            return light.ghost_model().flux_mm2(light.sun.angle_deg, light.sun.azimuth_deg, pairs)
+
+        flux = self.kept.once("ghosts", light.ghost_key, make, "single")
+        return tuple(float((e_per_mm2 @ flux[pair]).mean()) for pair in pairs)
+
+    # --- frames for navigation ------------------------------------------------------------------------------------
+
+    def _navigation_values(
+        self, evaluation: Evaluation, setting: Setting, names: Sequence[str]
+    ) -> Mapping[str, float]:
+        """Return the metrics of navigation, from images that pass the whole pipeline."""
+        from . import navigation_metrics as nav
+
+        scene = self._scene(evaluation, setting)
+        view = self._view(evaluation, scene)
+        count = nav.views_needed(names)
+        place = self._render_key(scene), evaluation.view, count
+        sequence = self.kept.once("render", place, lambda: _rendered_sequence(view, count), "sequence")
+        frames = []
+        with self.kept.timed("navigation"):
+            first: Injection | None = None
+            for k, seen in enumerate(sequence):
+                spec = nav.spec_of_view(replace(view.spec, scene=scene, faults=_faults(scene)), k)
+                camera = self._camera(spec, setting)
+                pose, rendering = _with_sun(seen, camera, setting.sun)
+                rate = camera.expose(rendering.light.rendered, 1.0)
+                seconds = exposure_s(scene, camera, rendering.truth, rate.merged)
+                exposed = SceneExposure(
+                    camera=replace(camera, exposure_s=seconds), light=rendering.light, rate=rate
+                )
+                exposed = add_stars(spec, pose, rendering, exposed)
+                if first is None:
+                    first = injection = inject_faults(spec, pose, rendering, exposed)
+                else:
+                    injection = nav.continue_faults(spec, pose, rendering, exposed, first)
+                images = injection.development
+                frames.append(
+                    nav.navigation_frame(
+                        pose,
+                        rendering.truth,
+                        seen.spec.camera,
+                        images.image({}).array,
+                        images.image(injection.draws).array,
+                    )
+                )
+            return nav.navigation_values(frames, names)
+
+    # --- what a factor moves --------------------------------------------------------------------------------------
+
+    def _fingerprint(self, model: str, values: Mapping[str, float | str]) -> str:
+        """Return a digest of all light, noise and images of the first view at a point."""
+        seed, view = self.spec.scene.seeds[0], self.spec.scene.views[0]
+        evaluation = Evaluation(index=0, seed=seed, view=view, model=model, role="check", values=values)
+        digest = hashlib.sha256()
+        navigation = _navigation()
+        if any(name not in navigation for name in self.spec.metrics.names):
+            image = self._lit_image(evaluation, self.factors.setting(values))
+            for array in (image.clean, image.kept, image.added, image.white_e, np.asarray(image.dark_e)):
+                digest.update(np.ascontiguousarray(array).tobytes())
+            digest.update(
+                repr((image.ghosts_e, image.read_noise_e, image.full_well_e, image.mask_level_dn)).encode()
+            )
+        if any(name in navigation for name in self.spec.metrics.names):
+            digest.update(repr(sorted(self.evaluate(evaluation).items())).encode())
+        return digest.hexdigest()
+
+
+def _rendered_sequence(view: View, count: int) -> list[View]:
+    """Return the views of a sequence that begins with a view."""
+    from . import navigation_metrics as nav
+
+    views = [view]
+    for k, pose in enumerate(nav.sequence(view.spec, view.pose, view.rendering, count)[1:], start=1):
+        spec = nav.spec_of_view(view.spec, k)
+        views.append(View(spec=spec, pose=pose, rendering=render_view(spec, pose)))
+    return views
+
+
+# --- the scene ---------------------------------------------------------------------------------------------------
+
+
+def _scene_of(spec: StudySpec) -> Scene:
+    """Return the scene of a study without factors."""
+    scene = load_scene(spec.scene.base, spec.scene.overrides)
+    largest = max(spec.scene.views)
+    if largest >= scene.dataset.samples:
+        raise InputError(
+            f"study {spec.title!r}: scene.samples: sample {largest}: must be below dataset.samples = "
+            f"{scene.dataset.samples} of the scene {spec.scene.base!r}"
+        )
+    return scene
+
+
+def _check_models(spec: StudySpec, faults: Mapping[str, Any]) -> None:
+    """Raise InputError if the fault or a model of the comparison is unknown."""
+    assert spec.models is not None
+    name, known = spec.models.fault, registry()
+    if name not in known:
+        raise InputError(f"models.fault = {name!r}: is unknown{did_you_mean(name, list(known))}")
+    if name not in faults:
+        raise InputError(f"models.fault = {name!r}: the scene {spec.scene.base!r} has no such fault")
+    for model in spec.models.compare:
+        if model not in known[name]:
+            raise InputError(f"models.compare: {model!r} is unknown{did_you_mean(model, list(known[name]))}")
+
+
+def _faults(scene: Scene) -> dict[str, Fault]:
+    """Return the faults of a scene."""
+    return {name: from_dict(name, table, source="scene") for name, table in scene.faults.items()}
+
+
+def _render_key(scene: Scene) -> str:
+    """Return a digest of all that plan and renderer read of a scene."""
+    table = scene.resolved()
+    for key in ("title", "description"):
+        table.pop(key)
+    table["camera"] = {key: value for key, value in table["camera"].items() if key not in AFTER_RENDER}
+    table["faults"] = sorted((name, fault.needs_sun) for name, fault in _faults(scene).items())
+    return hashlib.sha256(json.dumps(table, sort_keys=True).encode()).hexdigest()
+
+
+def _value(factor: Any, point: float) -> float | str:
+    """Return the value of a factor at a point of the unit interval."""
+    value = np.asarray(factor.values(np.array([point])), dtype=object).tolist()[0]
+    return value if isinstance(value, str) else float(value)
+
+
+# --- camera and Sun ----------------------------------------------------------------------------------------------
+
+
+def camera_shape(camera: Camera) -> tuple[int, int]:
+    """Return (height, width) in pixels."""
+    return camera.height_px, camera.width_px
+
+
+def _with_detector(camera: Camera, changes: Mapping[str, Any]) -> Camera:
+    """Return a camera with changed keys of its detector."""
+    if not changes:
+        return camera
+    own: Any = camera.detector
+    if camera.detector.mosaic is None:
+        whole = {key: round(v) if key in ("adc_bits", "bias_dn") else v for key, v in changes.items()}
+        return replace(camera, detector=replace(own, **whole))
+    sensor: Any = camera.detector.mosaic.sensor
+    for key, value in changes.items():
+        sensor = _replaced(sensor, key.split("."), value)
+    return replace(camera, detector=replace(own, sensor=sensor))
+
+
+def _replaced(table: Any, keys: Sequence[str], value: Any) -> Any:
+    """Return a description with one value replaced, which nested descriptions may hold."""
+    first, *rest = keys
+    before = getattr(table, first)
+    if rest:
+        value = _replaced(before, rest, value)
+    elif isinstance(before, int) and not isinstance(before, bool) and float(value).is_integer():
+        value = int(value)
+    return replace(table, **{first: value})
+
+
+def _efficiency(camera: Camera) -> Hashable:
+    """Return all of the detector on which the expected electrons depend."""
+    own: Any = camera.detector
+    efficiency = own.efficiency if own.mosaic is None else own.sensor.efficiency
+    return efficiency, own.pixel_pitch_um, own.width_px, own.height_px
+
+
+def _dark_e(camera: Camera) -> F32 | float:
+    """Return the dark signal in electrons: of each pixel of a device with a mosaic, else the mean."""
+    if camera.detector.mosaic is None:
+        return camera.detector.dark_current_e_s * camera.exposure_s
+    return np.asarray(camera.mosaic.device.dark_rate_e_s * np.float32(camera.exposure_s), dtype=np.float32)
+
+
+def _with_sun(view: View, camera: Camera, sun: Mapping[str, float]) -> tuple[Pose, Rendering]:
+    """Return a view's pose and rendering with the Sun moved as the optics see it, and at another distance."""
+    pose, rendering = view.pose, view.rendering
+    if not sun:
+        return pose, rendering
+    direction_C = pose.L_from_C.T @ pose.sun_L
+    angle = np.arctan2(np.hypot(direction_C[0], direction_C[1]), direction_C[2])
+    azimuth = np.arctan2(direction_C[1], direction_C[0])
+    angle = np.radians(sun.get("angle_deg", np.degrees(angle)))
+    azimuth = np.radians(sun.get("azimuth_deg", np.degrees(azimuth)))
+    moved = np.array([np.sin(angle) * np.cos(azimuth), np.sin(angle) * np.sin(azimuth), np.cos(angle)])
+    if "angle_deg" not in sun and "azimuth_deg" not in sun:
+        moved = direction_C
+    source, scale = rendering.scene.sun, 1.0
+    if "distance_au" in sun:
+        before_au = spectra.SUN_RADIUS_M / (np.sin(source.angular_radius_rad) * spectra.AU_M)
+        scale = float((before_au / sun["distance_au"]) ** 2)
+        source = replace(
+            source,
+            irradiance_W_m2_nm=source.irradiance_W_m2_nm * scale,
+            angular_radius_rad=spectra.sun_angular_radius_rad(sun["distance_au"]),
+        )
+    sun_L = pose.L_from_C @ moved
+    source = replace(source, direction_L=sun_L)
+    light = rendering.light.rendered
+    array = light.array if light.sun is None else np.maximum(light.array - light.sun, 0)
+    disc = SunInView(
+        direction_C=moved,
+        angular_radius_rad=source.angular_radius_rad,
+        radiance_W_m2_sr_nm=source.radiance_W_m2_sr_nm,
+        limb_darkening=source.limb_darkening,
+        visible=np.full((1, 1), pose.sun_visible_fraction, np.float32)
+        if light.disc is None
+        else light.disc.visible,
+        blur_slope=0.0 if light.disc is None else light.disc.blur_slope,
+    )
+    array = array * np.float32(scale)
+    own: F32 | None = np.zeros_like(array)
+    assert own is not None
+    if add_mean(own, disc, Pinhole(rendering.scene.view.intrinsics), range(len(array))) is None:
+        own = None
+    radiance = replace(
+        light, array=array if own is None else array + own, sun=own, disc=None if own is None else disc
+    )
+    return (
+        replace(pose, sun_L=sun_L),
+        replace(
+            rendering,
+            scene=replace(rendering.scene, sun=source),
+            light=SceneLight(lens=rendering.light.lens, rendered=radiance),
+        ),
+    )
+
+
+def _scene_rate(camera: Camera, radiance: Radiance) -> F32:
+    """Return the electrons per second that the scene gives, without the Sun's disc, float32[y, x, channel]."""
+    scene = radiance
+    if radiance.sun is not None:
+        scene = replace(radiance, array=np.maximum(radiance.array - radiance.sun, 0), sun=None, disc=None)
+    return camera.detector.electrons_expected(camera.lens.image(scene), 1.0).array
+
+
+def _sun_rate(camera: Camera, radiance: Radiance) -> F32 | None:
+    """Return the electrons per second of the Sun's direct image, float32[y, x, channel]; None out of view."""
+    if radiance.sun is None:
+        return None
+    sun = replace(radiance, array=radiance.sun, sun=None)
+    on_sensor = camera.lens.image_of_sun(sun, camera.detector.pixel_pitch_um)
+    return camera.detector.electrons_expected(on_sensor, 1.0).array
+
+
+def _planes(per_s: F32, seconds: float) -> F32:
+    """Return electrons, float32[channel, y, x], from electrons per second, float32[y, x, channel]."""
+    planes = np.ascontiguousarray(np.moveaxis(per_s, -1, 0))
+    planes *= np.float32(seconds)
+    return planes
+
+
+def _lit_pixels(per_s: F32, semantic: NDArray[np.uint8]) -> NDArray[np.intp]:
+    """Return the indices of the pixels that show sunlit ground."""
+    ground = np.flatnonzero(semantic.ravel() == BODY)
+    level = per_s.reshape(-1, per_s.shape[-1])[ground].mean(axis=1)
+    if not len(level):
+        return ground
+    return ground[level > _LIT * np.percentile(level, 99)]
+
+
+def _added_by(fault: Fault, exposed: Exposed, params: Any) -> dict[str, Any]:
+    """Return the fields of `LitImage` that hold the straylight of a model that gives one image."""
+    clean = exposed.exposure.rate.scaled(exposed.camera.exposure_s)
+    image = act(fault, clean, params, exposed.context).merged.array
+    added = np.ascontiguousarray(np.moveaxis(image, -1, 0)) - exposed.clean
+    return {"kept": exposed.clean, "added": np.maximum(added, 0), "parts_e": {}, "ghosts_e": ()}
+
+
+def _navigation() -> Mapping[str, Metric]:
+    """Return the metrics of navigation by name."""
+    try:
+        from . import navigation_metrics
+    except ImportError:
+        return {}
+    return {metric.name: metric for metric in navigation_metrics.METRICS}

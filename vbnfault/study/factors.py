@@ -1,0 +1,339 @@
+"""Say what the keys of a study's factors mean, and turn their values into a changed scene, lens, sensor and Sun.
+
+There are four kinds of keys:
+
+`scene.<key>`
+    Any key of the scene file. An interval of a fault, such as `scene.faults.straylight.roughness_nm`, is fixed to
+    the value. A key that the renderer reads makes a render for every value.
+`lens.…`
+    Changes of the prescription that the scene's faults trace, at its final size; a lens of the camera that has
+    surfaces changes with it. Rows count from 0 at the front, as in the names of ghosts.
+    `lens.surface.<row>.radius`, `.thickness`, `.index` and `.semi_diameter` are errors, and so are those of
+    coatings: `lens.surface.<row>.coating.<layer>.thickness` and `.index` of one layer,
+    `lens.surface.<row>.coating.thickness` and `.index` of all layers of a surface, and `lens.coating.thickness` and
+    `.index` of all surfaces. The other keys take values: `lens.stop.blades`, `lens.stop.blade_rounding`, `lens.stop.rotation_deg`,
+    `lens.sensor_reflectance` and `lens.f_number`.
+`detector.<key>`
+    Keys of the sensor's file, such as `detector.readout.full_well_e` or short `detector.full_well_e`; without a
+    sensor's file, those of `[camera]` that describe the detector.
+`sun.angle_deg`, `sun.azimuth_deg`, `sun.distance_au`
+    Angle of the Sun from the axis, its azimuth in the image (0: right, 90: down), and its distance. The first two
+    move the Sun that the optics see; the illumination of the ground stays that of the rendered view, and so does
+    the visible fraction of the disc. The distance r scales the radiance of the scene and the Sun by r⁻², and the
+    radius of the disc by 1/r. No render is needed for any of them.
+"""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from functools import lru_cache
+from typing import Any
+
+from ..camera import Camera
+from ..core import tables
+from ..core.errors import InputError, shown
+from ..core.tables import did_you_mean
+from ..faults import registry
+from ..lens import Prescription
+from ..lens.changes import Change
+from ..scene.config import Scene, parse_scene
+from .spec import StudySpec
+
+# What an evaluation computes, in order. `render` is the only stage that needs the renderer.
+STAGES = ("render", "direct image", "exposure", "ghosts", "starburst", "glare", "veil", "detector")
+
+_SPELLINGS = {"electrons": "e", "e-": "e", "°": "deg", "um": "µm", "AU": "au", "1": "", "fraction": "", "dn": "DN"}
+_ENDINGS = dict(
+    pair.split(":")
+    for pair in "_e_rms:e _e_s:e/s _nm:nm _mm:mm _um:µm _deg:deg _K:K _au:au _dn:DN _px:px _TeV_g:TeV/g _eV:eV _s:s "
+    "_h:h _e:e _m:m".split()
+)
+# Keys of [camera] that describe the detector of a camera without a sensor's file.
+_OF_THREE_COLOURS = (
+    *("full_well_e", "read_noise_e_rms", "dark_current_e_s", "adc_bits", "bias_dn"),
+    *("response", "quantum_efficiency_peak"),
+)
+# Keys of a sensor's file that are no property of its electronics, or that the renderer reads.
+_NOT_OF_A_DETECTOR = (
+    *("name", "source", "sources", "effects", "architecture", "width_px", "height_px", "pixel_pitch_um"),
+    *("pattern", "quantum_efficiency"),
+)
+# Keys of [camera] that act behind the lens or on the exposure, so that the renderer does not read them.
+AFTER_RENDER = (
+    *("exposure_s", "exposure_min_s", "exposure_max_s", "metering_level", "metering_percentile", "transmission"),
+    *("full_well_e", "read_noise_e_rms", "dark_current_e_s", "adc_bits", "bias_dn", "response"),
+    *("quantum_efficiency_peak", "detector_temperature_K"),
+)
+_LENGTHS = ("fraction", "mm")
+
+
+@dataclass(frozen=True)
+class Key:
+    """Describe a key of a factor.
+
+    `units` are the units in which its values may be given, the first one by default; empty: any. `moves` are the
+    stages that have to be computed again when the factor changes. `add` puts a value in a unit into a `Setting`.
+    """
+
+    name: str
+    units: tuple[str, ...]
+    moves: tuple[str, ...]
+    add: Callable[[Setting, Any, str], None]
+
+
+@dataclass
+class Setting:
+    """Collect what one evaluation changes; the keys of `scene` and `detector` are dotted."""
+
+    scene: dict[str, Any] = field(default_factory=dict)
+    lens: list[Change] = field(default_factory=list)
+    detector: dict[str, Any] = field(default_factory=dict)
+    sun: dict[str, float] = field(default_factory=dict)
+
+
+class Factors:
+    """Turn the values of a study's factors into what an evaluation changes.
+
+    Parameters
+    ----------
+    spec
+        The study.
+    scene
+        Its scene, without factors.
+    camera
+        Camera of the scene, without factors.
+    lens
+        Prescription that the faults of the scene trace.
+
+    Raises
+    ------
+    InputError
+        A factor's key is unknown, or its unit does not belong to it.
+    """
+
+    def __init__(self, spec: StudySpec, scene: Scene, camera: Camera, lens: Prescription) -> None:
+        self._spec, self._base = spec, scene
+        self.known = known_keys(spec, scene, camera, lens)
+        self.keys: dict[str, Key] = {}
+        self._units: dict[str, str] = {}
+        for i, factor in enumerate(spec.factors):
+            where = f"factor[{i}].key = {factor.key!r}"
+            key = self.known.get(factor.key) or self.known.get(_long_name(factor.key, self.known))
+            if key is None:
+                raise InputError(
+                    f"{where}: is no key of scene, lens, detector or sun{_suggestion(factor.key, self.known)}"
+                )
+            unit = _SPELLINGS.get(factor.unit, factor.unit)
+            allowed = {_SPELLINGS.get(u, u): u for u in key.units}
+            if factor.unit and key.units and unit not in allowed:
+                raise InputError(f"{where}: unit = {factor.unit!r}: must be {' or '.join(key.units)}")
+            self.keys[factor.key] = key
+            self._units[factor.key] = allowed.get(unit, key.units[0] if key.units else "") if factor.unit else ""
+            self._units[factor.key] = self._units[factor.key] or (key.units[0] if key.units else "")
+        self.scene_of = lru_cache(maxsize=16)(self._scene_of)
+
+    def setting(self, values: Mapping[str, float | str]) -> Setting:
+        """Return what the values of the factors change."""
+        setting = Setting()
+        for name, value in values.items():
+            self.keys[name].add(setting, value, self._units[name])
+        return setting
+
+    def _scene_of(self, seed: int, model: str, changes: tuple[tuple[str, Any], ...]) -> Scene:
+        """Return the scene with a seed, with a model of the compared fault, and with changed keys."""
+        table = copy.deepcopy(self._base.resolved())
+        table["dataset"]["seed"] = seed
+        faults = table["faults"]
+        if self._spec.models is not None and model:
+            name = self._spec.models.fault
+            own = _fields(name, model)
+            faults[name] = {key: v for key, v in faults.get(name, {}).items() if key in own} | {"model": model}
+        for key, value in changes:
+            if key.startswith("faults."):
+                _, name, own_key = key.split(".", 2)
+                if own_key not in _fields(name, faults[name].get("model", "")):
+                    continue  # another model of the comparison has this key
+            tables.replace(table, {key: value}, source=self._spec.title)
+        return parse_scene(table, source=f"study {self._spec.title!r}", overrides=[key for key, _ in changes])
+
+
+def _long_name(name: str, known: Mapping[str, Key]) -> str:
+    """Return the only key of the sensor's file that ends like a short one; else the name itself."""
+    kind, _, leaf = name.partition(".")
+    same = [key for key in known if key.startswith("detector.") and key.rpartition(".")[2] == leaf]
+    return same[0] if kind == "detector" and len(same) == 1 else name
+
+
+def _suggestion(name: str, known: Mapping[str, Key]) -> str:
+    """Return the nearest known key as a suggestion, first among those of its own kind."""
+    kind = name.partition(".")[0]
+    same = [key for key in known if key.startswith(f"{kind}.")]
+    if not same:
+        kinds = ("scene", "lens", "detector", "sun")
+        return (
+            did_you_mean(kind, [f"{k}.…" for k in kinds])
+            if same
+            else "; keys begin with " + "., ".join(kinds) + "."
+        )
+    close = did_you_mean(name, same)
+    return close if close.startswith(" (") else f"; known: {', '.join(same[:12])}, …"
+
+
+def _fields(fault: str, model: str) -> dict[str, str]:
+    """Return the keys of a model of a fault, each with its unit; an empty name stands for the default model."""
+    models = registry().get(fault, {})
+    cls = models.get(model) or next((c for c in models.values() if c.default), None)
+    if cls is None:
+        return {}
+    return {f.name: f.metadata.get("unit", "") for f in dataclasses.fields(cls)}
+
+
+# --- known keys --------------------------------------------------------------------------------------------------
+
+
+def known_keys(spec: StudySpec, scene: Scene, camera: Camera, lens: Prescription) -> dict[str, Key]:
+    """Return all keys that a factor of a study may have, by name."""
+    keys = [*_scene_keys(spec, scene), *_lens_keys(lens, camera.lens.real is not None), *_detector_keys(camera)]
+    return {key.name: key for key in (*keys, *_sun_keys())}
+
+
+def _scene_keys(spec: StudySpec, scene: Scene) -> list[Key]:
+    """Return the keys of the scene; those of faults are the keys of every model in the study."""
+    table = scene.resolved()
+    found = dict.fromkeys(_leaves({key: value for key, value in table.items() if key != "faults"}), "")
+    for name, fault in table["faults"].items():
+        models = [fault.get("model", "")]
+        if spec.models is not None and spec.models.fault == name:
+            models = list(spec.models.compare)
+        for model in models:
+            found |= {f"faults.{name}.{key}": unit for key, unit in _fields(name, model).items()}
+    keys = []
+    for key, unit in found.items():
+        own = unit or _unit_of(key)
+        keys.append(Key(f"scene.{key}", (own,) if own else (), _moved_by(key), _adder("scene", key)))
+    return keys
+
+
+def _moved_by(key: str) -> tuple[str, ...]:
+    """Return the stages that a key of the scene moves."""
+    light = ("ghosts", "starburst", "glare", "veil")
+    if key.startswith("faults."):
+        leaf = key.rpartition(".")[2]
+        own = {
+            "roughness_nm": ("glare", "veil"),
+            "cleanliness_level": ("glare", "veil"),
+            "veil_fraction": ("veil",),
+            "reflections": ("ghosts",),
+            "mask_level_dn": ("detector",),
+            "coating": ("ghosts", "glare"),
+        }
+        return own.get(leaf, light)
+    table, _, leaf = key.partition(".")
+    if table == "camera" and leaf in AFTER_RENDER:
+        return ("direct image", "exposure", *light, "detector")
+    return STAGES
+
+
+def _leaves(table: Mapping[str, Any], above: str = "") -> list[str]:
+    """Return the dotted keys of all values of nested tables."""
+    keys = []
+    for key, value in table.items():
+        keys += _leaves(value, f"{above}{key}.") if isinstance(value, Mapping) else [f"{above}{key}"]
+    return keys
+
+
+def _lens_keys(lens: Prescription, camera_has_surfaces: bool) -> list[Key]:
+    """Return the keys of a prescription."""
+    own = ("direct image", "exposure") if camera_has_surfaces else ()
+    shape = (*own, "ghosts", "starburst", "glare", "veil")
+    films = (*own, "ghosts", "glare", *(("starburst", "veil") if camera_has_surfaces else ()))
+    keys = []
+    for row, surface in enumerate(lens.surfaces):
+        name = f"lens.surface.{row}"
+        if surface.curvature_per_mm:
+            keys.append(_change(f"{name}.radius", _LENGTHS, shape, quantity="radius", row=row))
+        if row < len(lens.surfaces) - 1:
+            keys.append(_change(f"{name}.thickness", _LENGTHS, shape, quantity="thickness", row=row))
+        if surface.medium.nd != 1.0:
+            keys.append(_change(f"{name}.index", ("1",), shape, quantity="index", row=row))
+        keys.append(_change(f"{name}.semi_diameter", _LENGTHS, shape, quantity="semi_diameter", row=row))
+        if surface.coating:
+            keys += _coating_keys(f"{name}.coating", films, row=row)
+            for layer in range(len(surface.coating)):
+                keys += _coating_keys(f"{name}.coating.{layer}", films, row=row, layer=layer)
+    keys += _coating_keys("lens.coating", films)
+    for name, unit in (("blades", ""), ("blade_rounding", ""), ("rotation_deg", "deg")):
+        keys.append(
+            _change(f"lens.stop.{name}", (unit,) if unit else (), (*own, "ghosts", "starburst"), quantity=name)
+        )
+    keys.append(_change("lens.sensor_reflectance", ("fraction",), ("ghosts",), quantity="sensor_reflectance"))
+    keys.append(_change("lens.f_number", (), shape, quantity="f_number"))
+    return keys
+
+
+def _coating_keys(name: str, moves: tuple[str, ...], **where: int) -> list[Key]:
+    """Return the keys of the layers of a coating."""
+    return [
+        _change(f"{name}.thickness", ("fraction", "nm"), moves, quantity="coating_thickness", **where),
+        _change(f"{name}.index", ("1",), moves, quantity="coating_index", **where),
+    ]
+
+
+def _change(name: str, units: tuple[str, ...], moves: tuple[str, ...], **what: Any) -> Key:
+    """Return a key that changes the prescription."""
+
+    def add(setting: Setting, value: Any, unit: str) -> None:
+        if not isinstance(value, int | float):
+            raise InputError(f"{name} = {shown(value)}: must be a number")
+        setting.lens.append(Change(value=float(value), relative=unit == "fraction", **what))
+
+    return Key(name, units, moves, add)
+
+
+def _detector_keys(camera: Camera) -> list[Key]:
+    """Return the keys of the detector."""
+    if camera.detector.mosaic is None:
+        names = list(_OF_THREE_COLOURS)
+    else:
+        plain = dataclasses.asdict(camera.detector.mosaic.sensor)
+        names = _leaves({key: value for key, value in plain.items() if key not in _NOT_OF_A_DETECTOR})
+    light = ("direct image", "exposure", "ghosts", "starburst", "glare", "veil")
+    keys = []
+    for name in names:
+        unit = _unit_of(name)
+        leaf = name.rpartition(".")[2]
+        moves = (
+            (*light, "detector") if leaf in ("quantum_efficiency_peak", "response") else ("exposure", "detector")
+        )
+        keys.append(Key(f"detector.{name}", (unit,) if unit else (), moves, _adder("detector", name)))
+    return keys
+
+
+def _sun_keys() -> list[Key]:
+    """Return the keys of the Sun."""
+    light = ("direct image", "ghosts", "starburst", "glare", "veil")
+    return [
+        Key("sun.angle_deg", ("deg",), light, _adder("sun", "angle_deg")),
+        Key("sun.azimuth_deg", ("deg",), light, _adder("sun", "azimuth_deg")),
+        Key("sun.distance_au", ("au",), (*light, "exposure"), _adder("sun", "distance_au")),
+    ]
+
+
+def _adder(kind: str, key: str) -> Callable[[Setting, Any, str], None]:
+    """Return a function that puts a value into one of the tables of a setting."""
+    limits = {"angle_deg": (0.0, 89.0), "distance_au": (0.02, 1000.0)}.get(key) if kind == "sun" else None
+
+    def add(setting: Setting, value: Any, unit: str) -> None:
+        if limits is not None and not limits[0] <= value <= limits[1]:
+            raise InputError(f"sun.{key} = {shown(value)}: must be from {limits[0]:g} to {limits[1]:g}")
+        getattr(setting, kind)[key] = value
+
+    return add
+
+
+def _unit_of(key: str) -> str:
+    """Return the unit in the ending of a key; empty where it has none."""
+    return next((unit for ending, unit in _ENDINGS.items() if key.endswith(ending)), "")

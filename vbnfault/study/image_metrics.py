@@ -1,0 +1,264 @@
+"""Compute metrics of straylight in an image, in electrons before the converter.
+
+Symbols: S is the expected signal of the scene and the Sun's direct image with straylight, V the light that
+straylight adds (that of the Sun and the veil of the scene), S₀ the signal without straylight, all in electrons per
+pixel and channel. A number "per pixel" is the mean of the channels of the sensor (R, G, B, or those of the mosaic,
+each with the same weight). No noise is drawn: the noise of a pixel is the detector's own model,
+
+    σ² = S + V + D + r²,
+
+with the dark signal D and the read noise r in electrons. A mosaic is not sampled, and no offset, non-linearity or
+code of the converter acts.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .spec import Metric
+
+F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
+
+_GHOST = re.compile(r"ghost_([1-9][0-9]?)_flux_e")
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class LitImage:
+    """Hold the expected light of one evaluation, all signals float32[channel, y, x] in electrons.
+
+    Attributes
+    ----------
+    clean, kept
+        S₀ and S: the signal without straylight, and what straylight leaves of it.
+    added
+        V: the light that straylight adds.
+    parts_e
+        Totals over the frame and the mean of the channels, in electrons, of `ghosts`, `starburst` and `glare`;
+        empty for a model that does not separate them.
+    ghosts_e
+        Flux of single ghosts on the unbounded sensor plane in electrons, the mean of the channels, in the order of
+        the paths that the study follows.
+    lit
+        int[n]: indices, in the flattened frame, of the pixels that show sunlit ground.
+    dark_e
+        D, float32: one number, or float32[y, x].
+    read_noise_e, full_well_e
+        Read noise, and the signal at which a pixel is full.
+    white_e
+        float32[channel]: signal that the 8-bit image shows as 255.
+    mask_level_dn
+        Change of the 8-bit image from which a pixel belongs to the mask.
+    """
+
+    clean: F32
+    kept: F32
+    added: F32
+    parts_e: Mapping[str, float]
+    ghosts_e: tuple[float, ...]
+    lit: NDArray[np.intp]
+    dark_e: F32 | float
+    read_noise_e: float
+    full_well_e: float
+    white_e: F32
+    mask_level_dn: float
+
+    @cached_property
+    def added_mean(self) -> F32:
+        """Return V per pixel, float32[y, x]."""
+        return np.asarray(self.added.mean(axis=0))
+
+    @cached_property
+    def clean_mean(self) -> F32:
+        """Return S₀ per pixel, float32[y, x]."""
+        return np.asarray(self.clean.mean(axis=0))
+
+    @cached_property
+    def on_lit(self) -> tuple[F32, F32, F32]:
+        """Return S, V and the noise variance without the signal, of the lit pixels, float32[n] each."""
+        flat = (v.reshape(len(v), -1)[:, self.lit].mean(axis=0) for v in (self.kept, self.added))
+        kept, added = flat
+        dark = self.dark_e.ravel()[self.lit] if isinstance(self.dark_e, np.ndarray) else np.float32(self.dark_e)
+        return kept, added, np.broadcast_to(dark + np.float32(self.read_noise_e**2), kept.shape)
+
+
+Value = Callable[[LitImage], float]
+
+
+def _straylight_total(image: LitImage) -> float:
+    return float(image.added_mean.sum(dtype=np.float64))
+
+
+def _straylight_peak(image: LitImage) -> float:
+    return float(image.added_mean.max())
+
+
+def _part(name: str) -> Value:
+    """Return the function that gives the total of one part of straylight."""
+    return lambda image: image.parts_e.get(name, float("nan"))
+
+
+def _veil_median(image: LitImage) -> float:
+    values = image.added_mean.ravel()
+    return float(np.partition(values, len(values) // 2)[len(values) // 2])
+
+
+def _contrast_loss(image: LitImage) -> float:
+    if not len(image.lit):
+        return float("nan")
+    kept, added, _ = image.on_lit
+    return float(np.median(added / np.maximum(kept + added, np.float32(1e-30))))
+
+
+def _above_1dn(image: LitImage) -> float:
+    level = image.white_e / np.float32(255)
+    return _fraction(image.added >= level[:, None, None])
+
+
+def _above_noise(image: LitImage) -> float:
+    dark = np.asarray(image.dark_e, dtype=np.float32) + np.float32(image.read_noise_e**2)
+    variance = image.clean_mean + dark
+    return float(np.count_nonzero(image.added_mean * image.added_mean > variance) / variance.size)
+
+
+def _saturated(image: LitImage) -> float:
+    dark = np.asarray(image.dark_e, dtype=np.float32)
+    return _fraction(image.kept + image.added + dark >= np.float32(image.full_well_e))
+
+
+def _snr(image: LitImage) -> float:
+    if not len(image.lit):
+        return float("nan")
+    kept, added, rest = image.on_lit
+    return float(np.median(kept / np.sqrt(np.maximum(kept + added + rest, np.float32(1e-30)))))
+
+
+def _mask_area(image: LitImage) -> float:
+    white = image.white_e[:, None, None]
+    after = np.minimum(image.kept + image.added, white)
+    after -= np.minimum(image.clean, white)
+    return _fraction(np.abs(after) >= white * np.float32(image.mask_level_dn / 255))
+
+
+def _fraction(of_channels: NDArray[np.bool_]) -> float:
+    """Return the fraction of pixels of which any channel is true."""
+    return float(np.count_nonzero(of_channels.any(axis=0)) / of_channels[0].size)
+
+
+def _metric(
+    name: str, unit: str, description: str, value: Value, source: str = "", better: str = "low"
+) -> tuple[Metric, Value]:
+    """Return a metric and the function that computes it."""
+    return Metric(name=name, unit=unit, description=description, source=source, better=better), value
+
+
+_ALL: dict[str, tuple[Metric, Value]] = {
+    entry[0].name: entry
+    for entry in (
+        _metric(
+            "straylight_total_e", "electrons", "Light that straylight adds, Σ V over the frame", _straylight_total
+        ),
+        _metric(
+            "straylight_peak_e", "electrons", "Most light that straylight adds to a pixel, max V", _straylight_peak
+        ),
+        _metric(
+            "ghost_total_e", "electrons", "Light of all ghosts in the frame", _part("ghosts"), "Hullin et al. 2011"
+        ),
+        _metric("starburst_total_e", "electrons", "Light in the frame that the stop diffracts", _part("starburst")),
+        _metric(
+            "glare_total_e",
+            "electrons",
+            "Light in the frame that surfaces scatter",
+            _part("glare"),
+            "Peterson 2004",
+        ),
+        _metric(
+            "veil_median_e", "electrons", "Veil: the median over the frame of V", _veil_median, "ISO 9358:1994"
+        ),
+        _metric(
+            "contrast_loss",
+            "1",
+            "Loss of contrast of the sunlit ground, the median over its pixels of V / (S + V): a modulation m of "
+            "the ground appears as m S / (S + V)",
+            _contrast_loss,
+            "ISO 9358:1994",
+        ),
+        _metric(
+            "pixels_above_1dn",
+            "1",
+            "Fraction of pixels to which straylight adds 1 DN of the 8-bit image or more in a channel",
+            _above_1dn,
+        ),
+        _metric(
+            "pixels_above_noise",
+            "1",
+            "Fraction of pixels to which straylight adds more than the noise without it, V > √(S₀ + D + r²)",
+            _above_noise,
+            "EMVA 1288",
+        ),
+        _metric(
+            "pixels_saturated",
+            "1",
+            "Fraction of pixels of which a channel reaches the full well, S + V + D ≥ full well",
+            _saturated,
+        ),
+        _metric(
+            "snr",
+            "1",
+            "Signal-to-noise ratio of the sunlit ground, the median over its pixels of S / √(S + V + D + r²)",
+            _snr,
+            "EMVA 1288",
+            "high",
+        ),
+        _metric(
+            "mask_area",
+            "1",
+            "Fraction of pixels whose expected 8-bit value changes by mask_level_dn or more in a channel",
+            _mask_area,
+            "Gallon et al.",
+        ),
+    )
+}
+
+NAMES = (*_ALL, "ghost_<k>_flux_e")
+
+
+def ghost_rank(name: str) -> int | None:
+    """Return k of `ghost_<k>_flux_e`; None for another name."""
+    match = _GHOST.fullmatch(name)
+    return int(match[1]) if match else None
+
+
+def is_image_metric(name: str) -> bool:
+    """Return whether a metric is one of this module."""
+    return name in _ALL or ghost_rank(name) is not None
+
+
+def metric(name: str, pair: tuple[int, ...] | None = None) -> Metric:
+    """Return the description of a metric; `pair` are the reflecting rows of the path that a ghost metric follows."""
+    rank = ghost_rank(name)
+    if rank is None:
+        return _ALL[name][0]
+    path = "" if pair is None else f", rows {' and '.join(map(str, pair))}"
+    return _metric(
+        name,
+        "electrons",
+        f"Flux, on the unbounded sensor plane, of the path that is number {rank} in flux of the nominal lens{path}",
+        lambda image: image.ghosts_e[rank - 1],
+        "Hullin et al. 2011",
+    )[0]
+
+
+def value(name: str, image: LitImage) -> float:
+    """Return the value of a metric; nan where it has none."""
+    rank = ghost_rank(name)
+    if rank is None:
+        return _ALL[name][1](image)
+    return image.ghosts_e[rank - 1] if len(image.ghosts_e) >= rank else float("nan")
