@@ -48,8 +48,8 @@ STAGES = ("render", "direct image", "exposure", "ghosts", "starburst", "glare", 
 _SPELLINGS = {"electrons": "e", "e-": "e", "°": "deg", "um": "µm", "AU": "au", "1": "", "fraction": "", "dn": "DN"}
 _ENDINGS = dict(
     pair.split(":")
-    for pair in "_e_rms:e _e_s:e/s _nm:nm _mm:mm _um:µm _deg:deg _K:K _au:au _dn:DN _px:px _TeV_g:TeV/g _eV:eV _s:s "
-    "_h:h _e:e _m:m".split()
+    for pair in "_e_rms:e _e_s:e/s _nm:nm _mm:mm _um:µm _deg:deg _K:K _au:au _dn:DN _px:px _TeV_g:TeV/g _eV:eV "
+    "_s:s _h:h _e:e _m:m".split()
 )
 # Keys of [camera] that describe the detector of a camera without a sensor's file.
 _OF_THREE_COLOURS = (

@@ -153,7 +153,12 @@ def _fraction(of_channels: NDArray[np.bool_]) -> float:
 
 
 def _metric(
-    name: str, unit: str, description: str, value: Value, source: str = "", better: str = "low"
+    name: str,
+    unit: str,
+    description: str,
+    value: Value,
+    source: str = "",
+    better: Literal["low", "high"] = "low",
 ) -> tuple[Metric, Value]:
     """Return a metric and the function that computes it."""
     return Metric(name=name, unit=unit, description=description, source=source, better=better), value
@@ -242,7 +247,7 @@ def is_image_metric(name: str) -> bool:
 
 
 def metric(name: str, pair: tuple[int, ...] | None = None) -> Metric:
-    """Return the description of a metric; `pair` are the reflecting rows of the path that a ghost metric follows."""
+    """Return the description of a metric; `pair` holds the reflecting rows of the path of a single ghost."""
     rank = ghost_rank(name)
     if rank is None:
         return _ALL[name][0]
