@@ -83,7 +83,7 @@ class Kept:
         self.seconds: dict[str, float] = {}
         self._results: dict[str, OrderedDict[Hashable, Any]] = {}
         self._held: dict[str, set[tuple[str, Hashable]]] = {}
-        self._holder = ""
+        self._holder: str | None = None
 
     @contextlib.contextmanager
     def holding(self, holder: str) -> Iterator[None]:
@@ -92,7 +92,7 @@ class Kept:
         try:
             yield
         finally:
-            self._holder = ""
+            self._holder = None
 
     def once(self, stage: str, key: Hashable, make: Callable[[], T], part: str = "") -> T:
         """Return `make()` for a key, from the last results of the stage where it was computed before.
@@ -101,7 +101,7 @@ class Kept:
         """
         name = f"{stage}/{part}"
         results = self._results.setdefault(name, OrderedDict())
-        if self._holder:
+        if self._holder is not None:
             self._held[self._holder].add((name, key))
         if key not in results:
             with self.timed(stage):

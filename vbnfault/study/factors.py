@@ -11,8 +11,8 @@ There are four kinds of keys:
     `lens.surface.<row>.radius`, `.thickness`, `.index` and `.semi_diameter` are errors, and so are those of
     coatings: `lens.surface.<row>.coating.<layer>.thickness` and `.index` of one layer,
     `lens.surface.<row>.coating.thickness` and `.index` of all layers of a surface, and `lens.coating.thickness` and
-    `.index` of all surfaces. The other keys take values: `lens.stop.blades`, `lens.stop.blade_rounding`, `lens.stop.rotation_deg`,
-    `lens.sensor_reflectance` and `lens.f_number`.
+    `.index` of all surfaces. The other keys take values: `lens.stop.blades`, `lens.stop.blade_rounding`,
+    `lens.stop.rotation_deg`, `lens.sensor_reflectance` and `lens.f_number`.
 `detector.<key>`
     Keys of the sensor's file, such as `detector.readout.full_well_e` or short `detector.full_well_e`; without a
     sensor's file, those of `[camera]` that describe the detector.
@@ -46,11 +46,24 @@ from .spec import StudySpec
 STAGES = ("render", "direct image", "exposure", "ghosts", "starburst", "glare", "veil", "detector")
 
 _SPELLINGS = {"electrons": "e", "e-": "e", "°": "deg", "um": "µm", "AU": "au", "1": "", "fraction": "", "dn": "DN"}
-_ENDINGS = dict(
-    pair.split(":")
-    for pair in "_e_rms:e _e_s:e/s _nm:nm _mm:mm _um:µm _deg:deg _K:K _au:au _dn:DN _px:px _TeV_g:TeV/g _eV:eV "
-    "_s:s _h:h _e:e _m:m".split()
-)
+_ENDINGS = {
+    "_e_rms": "e",
+    "_e_s": "e/s",
+    "_TeV_g": "TeV/g",
+    "_deg": "deg",
+    "_nm": "nm",
+    "_mm": "mm",
+    "_um": "µm",
+    "_au": "au",
+    "_dn": "DN",
+    "_px": "px",
+    "_eV": "eV",
+    "_K": "K",
+    "_s": "s",
+    "_h": "h",
+    "_e": "e",
+    "_m": "m",
+}
 # Keys of [camera] that describe the detector of a camera without a sensor's file.
 _OF_THREE_COLOURS = (
     *("full_well_e", "read_noise_e_rms", "dark_current_e_s", "adc_bits", "bias_dn"),
@@ -172,12 +185,7 @@ def _suggestion(name: str, known: Mapping[str, Key]) -> str:
     kind = name.partition(".")[0]
     same = [key for key in known if key.startswith(f"{kind}.")]
     if not same:
-        kinds = ("scene", "lens", "detector", "sun")
-        return (
-            did_you_mean(kind, [f"{k}.…" for k in kinds])
-            if same
-            else "; keys begin with " + "., ".join(kinds) + "."
-        )
+        return "; keys begin with scene., lens., detector. or sun."
     close = did_you_mean(name, same)
     return close if close.startswith(" (") else f"; known: {', '.join(same[:12])}, …"
 
@@ -314,11 +322,11 @@ def _detector_keys(camera: Camera) -> list[Key]:
 
 def _sun_keys() -> list[Key]:
     """Return the keys of the Sun."""
-    light = ("direct image", "ghosts", "starburst", "glare", "veil")
+    light = ("direct image", "exposure", "ghosts", "starburst", "glare", "veil")
     return [
         Key("sun.angle_deg", ("deg",), light, _adder("sun", "angle_deg")),
         Key("sun.azimuth_deg", ("deg",), light, _adder("sun", "azimuth_deg")),
-        Key("sun.distance_au", ("au",), (*light, "exposure"), _adder("sun", "distance_au")),
+        Key("sun.distance_au", ("au",), light, _adder("sun", "distance_au")),
     ]
 
 

@@ -1,0 +1,350 @@
+"""Evaluations of a study: what factors move, what is computed again, and the metrics of straylight."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from conftest import small_scene
+
+from vbnfault.core import llvm
+from vbnfault.core.errors import InputError, VbnfaultError
+from vbnfault.core.llvm import backend
+from vbnfault.faults import act
+from vbnfault.lens import load_lens
+from vbnfault.lens.changes import Change, changed
+from vbnfault.lens.coating import mean_reflectance
+from vbnfault.pipeline.rendering import render_view
+from vbnfault.study import evaluate as evaluate_module
+from vbnfault.study import image_metrics
+from vbnfault.study.evaluate import SceneEvaluator
+from vbnfault.study.image_metrics import LitImage
+from vbnfault.study.spec import Evaluation, StudySpec, load_study, parse_study
+
+try:
+    llvm.find()
+except VbnfaultError as error:
+    pytest.skip(f"no usable LLVM: {error}", allow_module_level=True)
+
+SIZE = 48
+TOTALS = ("straylight_total_e", "ghost_total_e", "starburst_total_e", "glare_total_e", "veil_median_e")
+LENS = {"model": "traced", "lens": "nikkor_35_f2p8_camera", "coating": "bbar"}
+
+
+def factor(key: str, low: float = 0.0, high: float = 1.0, unit: str = "") -> dict[str, Any]:
+    return {"key": key, "distribution": "uniform", "low": low, "high": high, "unit": unit}
+
+
+def study(tmp_path_factory: Any, *factors: dict[str, Any], **tables: Any) -> StudySpec:
+    """A study of a small scene with the Sun in view."""
+    scene = small_scene(
+        dataset={"samples": 2, "sites": 1, "layers": ["clean"]},
+        camera={"width_px": SIZE, "height_px": SIZE, "exposure_s": 0.01, **tables.pop("camera", {})},
+        geometry={"sun_facing": {"sun_elevation_deg": [10, 20], "roll_deg": [-9, 9], "pitch_deg": [-9, 9]}},
+        plan={"mode": "per_class", "faulty_fraction": 1.0},
+    )
+    scene["faults"] = {"straylight": tables.pop("straylight", LENS)}
+    scene["render"] |= tables.pop("render", {})
+    path = tmp_path_factory.mktemp("study") / "scene.toml"
+    path.write_text(toml(scene), encoding="utf-8")
+    plain = {
+        "title": "test",
+        "design": {"method": "sobol", "n": 2},
+        "scene": {"base": str(path), "samples": [0], "seeds": [5]},
+        "factor": list(factors),
+        "metrics": {"names": tables.pop("names", list(TOTALS))},
+        **tables,
+    }
+    return parse_study(plain, source="study")
+
+
+def toml(table: Mapping[str, Any]) -> str:
+    """Plain data as TOML with inline tables."""
+
+    def text(value: Any) -> str:
+        if isinstance(value, Mapping):
+            return "{" + ", ".join(f"{key} = {text(v)}" for key, v in value.items()) + "}"
+        if isinstance(value, list | tuple):
+            return "[" + ", ".join(map(text, value)) + "]"
+        if isinstance(value, bool):
+            return str(value).lower()
+        return f"'{value}'" if isinstance(value, str) else repr(value)
+
+    return "\n".join(f"{key} = {text(value)}" for key, value in table.items()) + "\n"
+
+
+def point(values: Mapping[str, float | str], role: str = "point", model: str = "", view: int = 0) -> Evaluation:
+    return Evaluation(index=0, seed=5, view=view, model=model, role=role, values=values)
+
+
+ALL = (
+    factor("lens.surface.2.radius", -1e-3, 1e-3, "fraction"),
+    factor("lens.coating.thickness", -0.3, 0.3, "fraction"),
+    factor("lens.stop.blades", 0, 9),
+    factor("lens.stop.blade_rounding", 0, 1),
+    factor("scene.faults.straylight.roughness_nm", 0.2, 1.0, "nm"),
+    factor("sun.angle_deg", 2, 20, "deg"),
+    factor("sun.distance_au", 1, 2, "au"),
+    factor("detector.full_well_e", 1e4, 2e4, "e"),
+    factor("detector.read_noise_e_rms", 1, 20, "e"),
+)
+NOMINAL: dict[str, float] = {
+    "lens.surface.2.radius": 0.0,
+    "lens.coating.thickness": 0.0,
+    "lens.stop.blades": 0.0,
+    "lens.stop.blade_rounding": 0.0,
+    "scene.faults.straylight.roughness_nm": 0.5,
+    "sun.angle_deg": 12.0,
+    "sun.distance_au": 1.5,
+    "detector.full_well_e": 13500.0,
+    "detector.read_noise_e_rms": 13.0,
+}
+
+
+@pytest.fixture(scope="module")
+def evaluator(tmp_path_factory: pytest.TempPathFactory) -> SceneEvaluator:
+    """One evaluator for the tests of this module: the render and the kernels are made once."""
+    names = [*TOTALS, "straylight_peak_e", "pixels_saturated", "snr", "mask_area", "ghost_1_flux_e"]
+    return SceneEvaluator(study(tmp_path_factory, *ALL, names=names))
+
+
+# --- what is computed again --------------------------------------------------------------------------------------
+
+
+def test_the_view_is_rendered_once_and_each_factor_moves_only_its_own_stages(
+    evaluator: SceneEvaluator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    renders: list[int] = []
+
+    def counted(*inputs: Any) -> Any:
+        renders.append(1)
+        return render_view(*inputs)
+
+    monkeypatch.setattr(evaluate_module, "render_view", counted)
+    base = evaluator.evaluate(point(NOMINAL, role="A"))
+    events = evaluator.kept.events
+    for key in NOMINAL:
+        before = dict(events)
+        evaluator.evaluate(
+            point(NOMINAL | {key: NOMINAL[key] * 1.01 + 1e-4 + (5 if key.endswith("blades") else 0)})
+        )
+        moved = {stage for stage in events if events[stage] != before.get(stage, 0)}
+        allowed = set(evaluator.factors.keys[key].moves)
+        assert moved <= allowed, key
+        if key.startswith("detector"):
+            assert not moved & {"ghosts", "starburst", "glare"}
+    assert events["render"] <= 1
+    assert len(renders) <= 1
+    # the results of the base row are held, however many rows came in between
+    before = dict(events)
+    assert evaluator.evaluate(point(NOMINAL, role="AB:x")) == base
+    assert events == before
+
+
+def test_new_values_of_a_lens_compile_no_kernel(evaluator: SceneEvaluator) -> None:
+    dr = backend().dr
+    bladed = NOMINAL | {"lens.stop.blades": 7.0}
+    evaluator.evaluate(point(bladed | {"lens.stop.blade_rounding": 0.3}))
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        dr.kernel_history_clear()
+        evaluator.evaluate(point(bladed | {"lens.stop.blade_rounding": 0.35, "lens.surface.2.radius": 5e-4}))
+        kernels = [entry for entry in dr.kernel_history() if entry["type"] == dr.KernelType.JIT]
+    assert kernels
+    assert all(entry["cache_hit"] for entry in kernels)
+
+
+def test_an_evaluation_equals_the_pipelines_own_light(tmp_path_factory: pytest.TempPathFactory) -> None:
+    made = SceneEvaluator(study(tmp_path_factory, factor("lens.sensor_reflectance")))
+    image = made._lit_image(point({}), made.factors.setting({}))
+    exposed = made._exposed(point({}), made.factors.setting({}))
+    fault = exposed.spec.faults["straylight"]
+    params = fault.draw(exposed.context, exposed.spec.rng("fault", "straylight/0"))
+    whole = act(fault, exposed.exposure.rate.scaled(exposed.camera.exposure_s), params, exposed.context).merged
+    own = np.moveaxis(image.kept + image.added, 0, -1)
+    # both are sums of four parts in single precision, added in another order
+    np.testing.assert_allclose(own, whole.array, rtol=2e-4, atol=1e-3)
+
+
+# --- physics -----------------------------------------------------------------------------------------------------
+
+
+def test_flux_falls_with_the_square_of_the_suns_distance(evaluator: SceneEvaluator) -> None:
+    near, far = (evaluator.evaluate(point(NOMINAL | {"sun.distance_au": au})) for au in (1.0, 2.0))
+    # the disc shrinks, too: the edges of ghosts change, and the starburst begins nearer to the Sun
+    for name, within in (("glare_total_e", 1e-5), ("ghost_1_flux_e", 1e-5), ("ghost_total_e", 0.02)):
+        assert near[name] / far[name] == pytest.approx(4, rel=within), name
+
+
+# Two elements of one glass without dispersion, on which a quarter wave of MgF₂ leaves hardly any reflection.
+OF_ONE_GLASS: dict[str, Any] = {
+    "name": "of one glass",
+    "source": "made up",
+    "surface": [
+        {"radius_mm": 60.0, "thickness_mm": 4.0, "nd": 1.9, "diameter_mm": 20.0, "coating": "mgf2"},
+        {"radius_mm": -90.0, "thickness_mm": 3.0, "diameter_mm": 20.0, "coating": "mgf2"},
+        {"stop": True, "thickness_mm": 3.0, "diameter_mm": 8.0},
+        {"radius_mm": 70.0, "thickness_mm": 3.0, "nd": 1.9, "diameter_mm": 20.0, "coating": "mgf2"},
+        {"radius_mm": -100.0, "diameter_mm": 20.0, "coating": "mgf2"},
+    ],
+}
+
+
+def test_ghost_flux_follows_the_square_of_the_mean_reflectance(tmp_path_factory: pytest.TempPathFactory) -> None:
+    path = tmp_path_factory.mktemp("lens") / "lens.toml"
+    path.write_text(toml(OF_ONE_GLASS), encoding="utf-8")
+    spec = study(
+        tmp_path_factory,
+        factor("lens.coating.thickness", 0, 1, "fraction"),
+        factor("sun.angle_deg", 0, 10, "deg"),
+        names=["ghost_total_e"],
+        straylight={"model": "traced", "lens": str(path)},
+        render={"bands": 1},
+    )
+    made = SceneEvaluator(spec)
+    (layer,) = load_lens(path).surfaces[0].coating
+    errors = (0.1, 0.14, 0.18)
+    flux = [
+        made.evaluate(point({"lens.coating.thickness": e, "sun.angle_deg": 3.0}))["ghost_total_e"] for e in errors
+    ]
+    # all surfaces are alike, and angles are so small that reflection is that at normal incidence
+    films = [replace(layer, thickness_nm=layer.thickness_nm * (1 + error)) for error in errors]
+    mean = [float(mean_reflectance([film], 1.0, 1.9, 1.0, 550.0)) for film in films]
+    assert mean[-1] > 2.5 * mean[0]
+    slope = np.polyfit(np.log(mean), np.log(flux), 1)[0]
+    assert slope == pytest.approx(2, rel=0.05)
+
+
+def test_blades_move_the_starburst_alone(evaluator: SceneEvaluator) -> None:
+    round_, bladed = (evaluator.evaluate(point(NOMINAL | {"lens.stop.blades": n})) for n in (0.0, 6.0))
+    assert bladed["starburst_total_e"] != round_["starburst_total_e"]
+    assert bladed["straylight_peak_e"] != round_["straylight_peak_e"]
+    assert bladed["glare_total_e"] == pytest.approx(round_["glare_total_e"], rel=0.05)
+
+
+def test_metrics_are_those_of_their_equations() -> None:
+    clean = np.full((2, 4, 4), 100.0, dtype=np.float32)
+    added = np.zeros_like(clean)
+    added[:, 0, 0], added[0, 1, 1] = 300.0, 0.5
+    image = LitImage(
+        clean=clean,
+        kept=clean * np.float32(0.5),
+        added=added,
+        parts_e={"ghosts": 7.0},
+        ghosts_e=(3.0,),
+        lit=np.arange(1, 16),
+        dark_e=4.0,
+        read_noise_e=3.0,
+        full_well_e=354.0,
+        white_e=np.array([255.0, 127.5], dtype=np.float32),
+        mask_level_dn=30.0,
+    )
+    expected = {
+        "straylight_total_e": 300.25,
+        "straylight_peak_e": 300.0,
+        "ghost_total_e": 7.0,
+        "starburst_total_e": np.nan,
+        "veil_median_e": 0.0,
+        "contrast_loss": 0.0,
+        "pixels_above_1dn": 1 / 16,  # 0.5 e are half a DN of the first channel
+        "pixels_above_noise": 1 / 16,
+        "pixels_saturated": 1 / 16,  # 50 + 300 + 4
+        "snr": 50 / np.sqrt(50 + 4 + 9),
+        "mask_area": 1.0,  # half of 100 e are more than 30 DN everywhere
+        "ghost_1_flux_e": 3.0,
+        "ghost_2_flux_e": np.nan,
+    }
+    assert {name: image_metrics.value(name, image) for name in expected} == pytest.approx(
+        expected, rel=1e-6, nan_ok=True
+    )
+
+
+# --- errors ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("changed_factor", "message"),
+    [
+        (factor("lens.surface.2.radios", unit="fraction"), "did you mean lens.surface.2.radius?"),
+        (factor("scene.faults.straylight.roughness"), "did you mean scene.faults.straylight.roughness_nm?"),
+        (factor("optics.f_number"), "keys begin with scene., lens., detector. or sun."),
+        (factor("lens.surface.2.radius", unit="K"), "unit = 'K': must be fraction or mm"),
+        (factor("sun.distance_au", 1, 2, "m"), "unit = 'm': must be au"),
+    ],
+)
+def test_a_wrong_factor_is_named(
+    tmp_path_factory: pytest.TempPathFactory, changed_factor: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(InputError, match=r"factor\[0\].key") as error:
+        SceneEvaluator(study(tmp_path_factory, changed_factor))
+    assert message in str(error.value)
+
+
+def test_a_factor_that_nothing_reads_is_refused_and_one_of_some_models_is_told(
+    tmp_path_factory: pytest.TempPathFactory,
+) -> None:
+    spec = study(tmp_path_factory, factor("detector.bias_dn", 32, 96, "DN"), names=["veil_median_e"])
+    with pytest.raises(InputError, match=r"factor\[0\].key = 'detector.bias_dn': nothing in the images"):
+        SceneEvaluator(spec).check()
+    spec = study(
+        tmp_path_factory,
+        factor("scene.faults.straylight.roughness_nm", 0.2, 1.0, "nm"),
+        names=["veil_median_e"],
+        models={"fault": "straylight", "compare": ["texture", "paraxial"]},
+    )
+    assert SceneEvaluator(spec).check() == [
+        "factor 'scene.faults.straylight.roughness_nm' is inactive with the model texture"
+    ]
+
+
+def test_an_unknown_metric_or_model_is_named(tmp_path_factory: pytest.TempPathFactory) -> None:
+    with pytest.raises(InputError, match=r"'veil_medium_e' is unknown \(did you mean veil_median_e\?\)"):
+        SceneEvaluator(study(tmp_path_factory, ALL[0], names=["veil_medium_e"]))
+    models = {"fault": "straylight", "compare": ["traced", "trased"]}
+    with pytest.raises(InputError, match=r"models.compare: 'trased' is unknown \(did you mean traced\?\)"):
+        SceneEvaluator(study(tmp_path_factory, ALL[0], models=models))
+
+
+# --- changes of a lens -------------------------------------------------------------------------------------------
+
+
+def test_changes_of_a_lens_are_errors_of_its_rows() -> None:
+    lens = load_lens("nikkor_35_f2p8").coated("bbar")
+    before = lens.surfaces
+    made = changed(
+        lens,
+        [
+            Change(quantity="radius", row=0, value=0.01, relative=True),
+            Change(quantity="thickness", row=1, value=0.5),
+            Change(quantity="index", row=2, value=1e-3),
+            Change(quantity="coating_thickness", row=3, layer=0, value=2.0),
+            Change(quantity="sensor_reflectance", value=0.2),
+        ],
+    ).surfaces
+    assert made[0].radius_mm == pytest.approx(58.0 * 1.01)
+    assert made[1].thickness_mm == pytest.approx(10.51)
+    assert made[2].medium.nd == pytest.approx(1.714)
+    assert made[3].coating[0].thickness_nm == pytest.approx(before[3].coating[0].thickness_nm + 2)
+    assert made[3].coating[1:] == before[3].coating[1:]
+    assert replace(made[4]) == before[4]
+    with pytest.raises(InputError, match=r"surface 1: thickness_mm = 10.01 with an error of -11: must not"):
+        changed(lens, [Change(quantity="thickness", row=1, value=-11.0)])
+
+
+# --- packaged studies --------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["flare_lens", "flare_models"])
+def test_packaged_studies_evaluate_a_point_of_every_model(name: str) -> None:
+    small = {"scene.camera.width_px": 48, "scene.camera.height_px": 48, "scene.patch.facet_m": 8.0}
+    spec = load_study(name, {**small, "scene.samples": [0], "scene.render.bands": 3})
+    made = SceneEvaluator(spec)
+    values = {f.key: np.asarray(f.values(np.array([f.nominal()])), dtype=object).tolist()[0] for f in spec.factors}
+    seed = spec.scene.seeds[0]
+    for model in spec.model_names:
+        found = made.evaluate(Evaluation(index=0, seed=seed, view=0, model=model, role="A", values=values))
+        assert list(found) == list(spec.metrics.names)
+        assert np.isfinite(list(found.values())).all()
+    assert made.kept.events["render"] == 1
