@@ -7,8 +7,8 @@ that the stage depends on (`Kept`), a few of them at a time, so that the result 
 those before it. In a Sobol design the points AB differ from their point A in one factor, so most of their stages
 are found there.
 
-The image metrics follow `straylight` alone, whose paths and surfaces `image_metrics` describes; other faults of the
-scene act on the images of the navigation metrics, which pass the whole pipeline. Parameters of a fault that the
+The image metrics follow the straylight alone, the fault of the scene that adds light; all faults of the scene act
+on the images of the navigation metrics, which pass the whole pipeline. Parameters of a fault that the
 scene gives as intervals are drawn once for a view, with the same random numbers for all points of a block.
 
 Assumptions: the ground is lit as in the rendered view wherever `sun.…` moves the Sun; the guard band and the depth
@@ -61,7 +61,6 @@ F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 T = TypeVar("T")
 
-_FAULT = "straylight"
 _LIT = 0.02  # of the 99th percentile of the ground's signal, above which ground counts as sunlit
 # How many results of each stage are kept beside those of the base row A of a Sobol design; default: two.
 _KEPT = {"render": 1, "exposure": 8}
@@ -291,6 +290,12 @@ class SceneEvaluator:
         except InputError as error:
             raise InputError(f"study {self.spec.title!r}: {error}") from None
 
+    @cached_property
+    def _adding(self) -> str:
+        """Return the fault class of the scene that adds light, by its soft layer; empty where it has none."""
+        adds = [name for name, fault in _faults(self._base).items() if fault.soft_layer.endswith("_added")]
+        return adds[0] if adds else ""
+
     def _plain_scene(self) -> Scene:
         """Return the scene with the first seed and model."""
         if self.spec.models is None:
@@ -303,7 +308,7 @@ class SceneEvaluator:
 
     def _nominal_lens(self, camera: Camera, model: str) -> Prescription:
         """Return the prescription that the scene's straylight traces, without factors."""
-        table = self._base.faults.get(_FAULT, {})
+        table = self._base.faults.get(self._adding, {})
         frame = ImageFrame(
             lens=camera.lens,
             width_px=camera.width_px,
@@ -323,9 +328,9 @@ class SceneEvaluator:
                 raise InputError(
                     f"study {self.spec.title!r}: metrics.names: {name!r} is unknown{did_you_mean(name, known)}"
                 )
-            if _FAULT not in self._base.faults:
+            if not self._adding:
                 raise InputError(
-                    f"study {self.spec.title!r}: metrics.names: {name!r} needs the fault {_FAULT!r}, which the "
+                    f"study {self.spec.title!r}: metrics.names: {name!r} needs a fault that adds light, which the "
                     f"scene {self.spec.scene.base!r} has not"
                 )
 
@@ -431,9 +436,9 @@ class SceneEvaluator:
     def _lit_image(self, evaluation: Evaluation, setting: Setting) -> LitImage:
         """Return the expected light of an evaluation."""
         exposed = self._exposed(evaluation, setting)
-        fault = exposed.spec.faults[_FAULT]
+        fault = exposed.spec.faults[self._adding]
         sunlight = getattr(fault, "sunlight", None)
-        rng = exposed.spec.rng("fault", f"{_FAULT}/0")
+        rng = exposed.spec.rng("fault", f"{self._adding}/0")
         if sunlight is None:
             with self.kept.timed("texture"):
                 light = _added_by(fault, exposed, fault.draw(exposed.context, rng))
