@@ -12,7 +12,7 @@ from scipy import stats
 
 from vbnfault.core import spectra
 from vbnfault.core.quantities import Electrons, Irradiance, RawDN
-from vbnfault.detector import EXACT_POISSON_BELOW_E, Noise, ThreeColourDetector, blocks, poisson_quantile
+from vbnfault.detector import EXACT_POISSON_BELOW_E, Noise, ThreeColourDetector, blocks, poisson, poisson_quantile
 
 SHORT_S = 1e-3
 NODES = spectra.band_nodes_nm(400, 700, 8)
@@ -116,6 +116,15 @@ def test_poisson_quantile_of_random_variates_is_poisson(mean: float) -> None:
     if merged[1][-1] == 0:
         merged = [v[:-1] for v in merged]
     assert stats.chisquare(*merged).pvalue > 1e-3 / len(MEANS)
+
+
+@pytest.mark.parametrize("mean", [1e-6, 0.3, 4.0, 31.7, 5000.0])
+def test_poisson_functions_have_the_bits_of_scipy(mean: float) -> None:
+    count = np.arange(int(mean + 12 * np.sqrt(mean) + 20))
+    np.testing.assert_array_equal(poisson.poisson_probability(count, mean), stats.poisson.pmf(count, mean))
+    np.testing.assert_array_equal(poisson.poisson_cumulative(count, mean), stats.poisson.cdf(count, mean))
+    for upper in (0.9, 0.5, 1e-3, 1e-9):
+        assert poisson.poisson_least_count(1 - upper, mean) == stats.poisson.isf(upper, mean)
 
 
 def test_poisson_of_nothing_is_nothing() -> None:

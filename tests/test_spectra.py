@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+
 import numpy as np
 import pytest
 from colour.characterisation.datasets.cameras.dslr.sensitivities import MSDS_CAMERA_SENSITIVITIES_DSLR
@@ -9,7 +11,7 @@ from colour.plotting.datasets.astm_g_173 import DATA_ASTMG173_ETR
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vbnfault.core import spectra
+from vbnfault.core import resources, spectra
 from vbnfault.core.quantities import LUMINANCE, Irradiance
 from vbnfault.detector import ThreeColourDetector
 
@@ -43,6 +45,10 @@ def test_the_solar_table_is_the_published_one() -> None:
     integral = ((TABLE_W_M2_NM[1:] + TABLE_W_M2_NM[:-1]) / 2 * np.diff(TABLE_NM)).sum()
     assert integral == pytest.approx(1347.9, abs=0.05)  # ASTM G173-03, 280 to 4000 nm
     np.testing.assert_array_equal(spectra.solar_irradiance_W_m2_nm(TABLE_NM), TABLE_W_M2_NM)
+    between = (TABLE_NM[1:] + TABLE_NM[:-1]) / 2  # no row is missing or additional
+    np.testing.assert_array_equal(
+        spectra.solar_irradiance_W_m2_nm(between), np.interp(between, TABLE_NM, TABLE_W_M2_NM)
+    )
     # independent: ASTM E490 averaged by Simpson's rule on samples of its own (W m⁻² µm⁻¹ at 600, 650, 700 nm:
     # 1760, 1582, 1406). Two instruments and the sampling of lines: 3 %.
     red = (TABLE_NM >= 600) & (TABLE_NM <= 700)
@@ -172,6 +178,30 @@ def test_one_band_stands_for_the_visible_range() -> None:
 
 
 # ------------------------------------------------------------------------------------------ response, photons
+
+
+@pytest.mark.parametrize(
+    ("name", "measured"), [("nikon_5100", "Nikon 5100 (NPL)"), ("sigma_sd_merrill", "Sigma SDMerill (NPL)")]
+)
+def test_response_is_the_published_one(name: str, measured: str) -> None:
+    camera = MSDS_CAMERA_SENSITIVITIES_DSLR[measured]
+    wavelength = np.arange(300, 1100, 0.5)  # at every row and between: equal only if the tables have the same rows
+    for curve, column in zip(spectra.response(name, wavelength, 1.0), np.asarray(camera.values).T, strict=True):
+        np.testing.assert_array_equal(
+            curve, np.interp(wavelength, np.asarray(camera.wavelengths), column, left=0, right=0)
+        )
+
+
+def test_the_sources_note_names_every_table() -> None:
+    folder = resources.data_dir("catalogues")
+    note = (folder / "SOURCES.md").read_text(encoding="utf-8")
+    assert {path.name for path in folder.glob("*.csv")} == {
+        "solar_spectrum.csv",
+        *(f"response_{name}.csv" for name in spectra.RESPONSES),
+    }
+    for path in folder.glob("*.csv"):
+        assert f"`{path.name}`" in note
+        assert hashlib.sha256(path.read_bytes()).hexdigest() in note
 
 
 @pytest.mark.parametrize("name", spectra.RESPONSES)

@@ -70,7 +70,7 @@ def write_exr(path: Path, channels: Mapping[str, NDArray[Any]]) -> Path:
 
 def srgb8(linear: ArrayLike) -> NDArray[np.uint8]:
     """Return linear light, clipped to [0, 1], as 8-bit sRGB (IEC 61966-2-1), uint8 in the shape of `linear`."""
-    from colour.models import eotf_inverse_sRGB  # takes a second to import
+    from colour.models import eotf_inverse_sRGB  # takes two seconds to import
 
     encoded = eotf_inverse_sRGB(np.clip(linear, 0, 1))
     return np.asarray(np.rint(255 * encoded), dtype=np.uint8)

@@ -13,7 +13,7 @@ PACKAGE = Path(__file__).resolve().parents[1]
 
 
 def data_dir(kind: str) -> Path:
-    """Return the folder `scenes` or `textures`. Raises InputError where the installation lacks it."""
+    """Return the folder `scenes`, `textures` or `catalogues`. Raises InputError where the installation lacks it."""
     for candidate in (PACKAGE / kind, PACKAGE.parent / kind):
         if candidate.is_dir():
             return candidate

@@ -17,6 +17,8 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
+from .resources import data_dir
+
 PLANCK_J_S = 6.62607015e-34  # SI, exact
 LIGHT_SPEED_M_S = 299792458.0  # SI, exact
 AU_M = 149597870700.0  # IAU 2012, exact
@@ -60,12 +62,19 @@ def hat_weights(nodes_nm: F64, fine_nm: F64) -> F64:
     return np.stack([np.interp(fine_nm, nodes_nm, row) for row in np.eye(len(nodes_nm))])
 
 
+def _packaged_table(name: str) -> F64:
+    """Return the rows of a packaged table, float64[n, column]; the first column is the wavelength in nm.
+
+    colour-science has the same numbers, but it takes two seconds to import. tests/test_spectra.py compares them.
+    """
+    return np.loadtxt(data_dir("catalogues") / f"{name}.csv", delimiter=",", skiprows=1)
+
+
 @lru_cache(maxsize=1)
 def _astm_g173() -> tuple[F64, F64]:
     """Return wavelengths in nm and the extraterrestrial irradiance of ASTM G173-03 in W m⁻² nm⁻¹."""
-    from colour.plotting.datasets.astm_g_173 import DATA_ASTMG173_ETR as table
-
-    return np.array(list(table.keys())), np.array(list(table.values()))
+    wavelength, irradiance = _packaged_table("solar_spectrum").T
+    return wavelength, irradiance
 
 
 def solar_irradiance_W_m2_nm(wavelength_nm: F64, distance_au: float = 1.0) -> F64:
@@ -153,17 +162,12 @@ def reflectance(spec: str | float | Mapping[str, tuple[float, ...]], wavelength_
 @lru_cache(maxsize=8)
 def _response_table(name: str) -> tuple[F64, F64]:
     """Return wavelengths in nm float64[n] and the relative responses of R, G, B float64[n, 3], each with peak 1."""
-    from colour.characterisation.datasets.cameras.dslr.sensitivities import (
-        MSDS_CAMERA_SENSITIVITIES_DSLR as table,
-    )
-
-    sensitivities = table[name]
-    return np.asarray(sensitivities.wavelengths), np.asarray(sensitivities.values)
+    table = _packaged_table(f"response_{name}")
+    return table[:, 0], table[:, 1:]
 
 
-# Relative colour responses measured by NPL, as colour-science ships them (unit peak per channel).
-RESPONSES = {"nikon_5100": "Nikon 5100 (NPL)", "sigma_sd_merrill": "Sigma SDMerill (NPL)"}
-
+# Relative colour responses measured by NPL (unit peak per channel): vbnfault/catalogues/SOURCES.md.
+RESPONSES = ("nikon_5100", "sigma_sd_merrill")
 
 FLAT = "flat"  # no filters: every channel has the peak efficiency at all wavelengths
 
@@ -172,7 +176,7 @@ def response(name: str, wavelength_nm: F64, quantum_efficiency_peak: float) -> F
     """Return the QE of R, G, B at `wavelength_nm`, float64[3, n], from 0 to `quantum_efficiency_peak`."""
     if name == FLAT:
         return np.full((3, len(wavelength_nm)), quantum_efficiency_peak)
-    nodes, values = _response_table(RESPONSES[name])
+    nodes, values = _response_table(name)
     return quantum_efficiency_peak * np.stack(
         [np.interp(wavelength_nm, nodes, column, left=0.0, right=0.0) for column in values.T]
     )

@@ -18,12 +18,11 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
-from scipy.optimize import brentq
 from scipy.special import gammaincc
-from scipy.stats import poisson
 
 from ..core.errors import InputError
 from ..core.tables import table_class
+from .poisson import poisson_probability
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -123,6 +122,8 @@ def doubling_temperature_K(
     InputError
         A value is out of range.
     """
+    from scipy.optimize import brentq  # takes half a second to import; no detector of a build needs it
+
     t = checked("temperature_K", temperature_K, 100.0, 330.0)
     k = BOLTZMANN_EV_K
     if activation_energy_eV is not None:
@@ -242,7 +243,7 @@ def _survival(steps: F64, interactions: float) -> F64:
     spread = 10 * math.sqrt(interactions)
     out = np.zeros(steps.shape)
     for n in range(max(1, int(interactions - spread)), int(interactions + spread) + 60):
-        out += poisson.pmf(n, interactions) * gammaincc(n, steps)
+        out += poisson_probability(n, interactions) * gammaincc(n, steps)
     return out
 
 

@@ -20,9 +20,9 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
 
 from ..detector.cosmic import LEAST_MEV_CM2_G, CosmicRayModel, CosmicRays, stopping_power_MeV_cm2_g
+from ..detector.poisson import poisson_least_count
 from .context import FaultContext, Params
 from .contract import Fault
 from .fields import Interval, bounds, number
@@ -136,7 +136,7 @@ def _poisson_above_0(mean: float, rng: np.random.Generator) -> int:
     The variate is the inverse of the upper tail at a uniform number below the probability of 1 or more.
     """
     chance = -np.expm1(-mean) * (1 - rng.random())
-    return max(int(stats.poisson.isf(chance, mean)), 1)
+    return max(poisson_least_count(1 - chance, mean), 1)
 
 
 def _tracks(

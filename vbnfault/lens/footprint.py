@@ -17,7 +17,6 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import fft
-from scipy.interpolate import PchipInterpolator
 
 from ..core import file_contents
 from .aperture import stopped_down
@@ -186,6 +185,10 @@ class Beams:
 
     def _footprint(self, points: F64) -> Footprint:
         """Return the footprints from the points where the bundle crosses, float64[angle × azimuth × ring, 2]."""
+        from scipy.interpolate import (
+            PchipInterpolator,
+        )  # takes half a second to import: for lenses of surfaces only
+
         shape = (len(self.slope), _AZIMUTHS, _RINGS + 1)
         x, y = np.moveaxis(points.reshape(*shape, 2), 3, 0)
         lit = np.isfinite(x + y).all(axis=(1, 2)) & (self.rim_mm.min(axis=1) > 0)

@@ -32,7 +32,6 @@ from typing import ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.interpolate import PchipInterpolator
 
 from ..core.errors import InputError
 from ..core.quantities import Irradiance, Radiance
@@ -399,6 +398,8 @@ class RealLens:
 
     def _beam_mm2(self, slope: F64) -> F64:
         """Return the area of the beam that passes all rims, float64 like `slope`, which must rise."""
+        from scipy.interpolate import PchipInterpolator  # takes half a second to import
+
         beams = self._beams
         traced = np.clip(slope, beams.slope[0], beams.slope[-1])
         area = np.maximum(PchipInterpolator(beams.slope, beams.area_mm2)(traced), 0)

@@ -10,15 +10,18 @@ every pixel. Outside the frame, and for the shift of one colour against another,
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import CubicSpline
 
 from ..core.errors import InputError
 from .distortion import RadialModel, fitted
 from .prescription import Prescription
 from .rays import Path, trace
+
+if TYPE_CHECKING:
+    from scipy.interpolate import CubicSpline
 
 F64 = NDArray[np.float64]
 
@@ -123,6 +126,8 @@ def chief_heights(
     InputError
         Only rays next to the axis pass the middle of the stop.
     """
+    from scipy.interpolate import CubicSpline  # takes half a second to import: for lenses of surfaces only
+
     height = chief_heights_mm(lens, slope, wavelength_nm=wavelength_nm, sensor_mm=sensor_mm)
     with np.errstate(invalid="ignore"):
         good = np.diff(height) > _STEEPNESS * efl_mm * np.diff(slope)
