@@ -6,6 +6,8 @@ import functools
 import json
 import os
 import signal
+import subprocess
+import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -110,9 +112,12 @@ def test_one_at_a_time_gives_ranges() -> None:
     np.testing.assert_allclose(data["range"].values[0, 0], [8.0, 4.0, 0.0])
 
 
-def test_a_latin_hypercube_gives_delta_and_keeps_the_global_random_numbers() -> None:
+def test_a_latin_hypercube_gives_delta_and_keeps_the_global_random_numbers(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(indices, "_MOST_RESAMPLES_OF_DELTA", 2)
     state = np.random.get_state()[1].copy()  # noqa: NPY002
-    spec = kit.spec(2, 0.0, 1.0, design={"method": "latin_hypercube", "n": 100, "resamples": 100})
+    spec = kit.spec(2, 0.0, 1.0, design={"method": "latin_hypercube", "n": 128, "resamples": 100})
     data = analysed(spec, lambda x: x[0])
     delta = data["delta"].values[0, 0]
     assert delta[0] > 0.5 > delta[1]
@@ -162,9 +167,18 @@ def table_bytes(folder: Path) -> bytes:
     return (folder / results.TABLE).read_bytes()
 
 
+def small_spec() -> StudySpec:
+    return kit.spec(design={"n": 32, "resamples": 100}, scene={"samples": [0, 3]}, metrics={"names": ["y", "z"]})
+
+
+def of_spec(folder: str) -> None:
+    """Run the study of the tests below in a process of its own."""
+    run.run_study(small_spec(), Path(folder), QUIET, evaluator=Stopping)
+
+
 @pytest.fixture(scope="module")
 def spec() -> StudySpec:
-    return kit.spec(design={"n": 32, "resamples": 100}, scene={"samples": [0, 3]}, metrics={"names": ["y", "z"]})
+    return small_spec()
 
 
 @pytest.fixture(scope="module")
@@ -185,6 +199,27 @@ def test_two_workers_of_which_one_is_killed_give_the_same_table(
     assert table_bytes(tmp_path / "s") == table_bytes(reference)
     assert summary.indices.drop_attrs().identical(results.open_indices(reference).drop_attrs())
     assert summary.seconds_by_stage["function"] > 0
+
+
+@pytest.mark.slow
+def test_a_study_that_is_killed_continues_to_the_same_table(
+    spec: StudySpec, reference: Path, tmp_path: Path
+) -> None:
+    # evaluation 150 lies within a chunk: what was finished before it in this chunk has not been written yet
+    done = subprocess.run(
+        [sys.executable, "-c", f"import test_study_engine as t; t.of_spec({str(tmp_path / 's')!r})"],
+        env={
+            **os.environ,
+            "PYTHONPATH": os.pathsep.join([str(Path(__file__).parents[1]), str(Path(__file__).parent)]),
+            "VBNFAULT_TEST_STOP": f"150 {int(signal.SIGKILL)} {tmp_path / 'once'}",
+        },
+        check=False,
+    )
+    assert done.returncode == -signal.SIGKILL
+    assert not (tmp_path / "s" / results.TABLE).exists()
+    summary = run.run_study(spec, tmp_path / "s", QUIET, evaluator=Stopping)
+    assert 140 <= summary.finished <= 150
+    assert table_bytes(tmp_path / "s") == table_bytes(reference)
 
 
 @pytest.mark.parametrize("at", [0, 1, 150, 319])

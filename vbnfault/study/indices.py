@@ -506,22 +506,26 @@ def _add_model_share(arrays: dict[str, tuple[tuple[str, ...], _Array]], results:
         y = np.where(complete[..., None], y, 0.0)
         centre = y.sum(axis=(1, 2)) / np.maximum(complete.sum(axis=1), 1) / y.shape[-1]
         y = np.where(complete[..., None], y - centre[:, None, None], 0.0)
-        y = y.reshape(*y.shape[:2], per_base, -1).swapaxes(1, 2)  # [block, A or B, base, model]
+        y = y.reshape(*y.shape[:2], per_base, -1)  # [block, base, A or B, model]
+        sums, squares = np.moveaxis(y.sum(axis=2), -1, 0), (y**2).sum(axis=(2, 3))
         count = complete.astype(np.float64)
 
-        def of_counts(counts: _Array, y: _Array = y, count: _Array = count) -> _Array:
+        def of_counts(
+            counts: _Array, sums: _Array = sums, squares: _Array = squares, count: _Array = count
+        ) -> _Array:
             with np.errstate(divide="ignore", invalid="ignore"):
                 weight = 1 / (count @ counts.T)  # [block, resample]
                 weight = np.where(np.isfinite(weight), weight, 0.0)
-                means = np.einsum("bpnm,rn->mbr", y, counts) * weight / y.shape[1]
-                squares = np.einsum("bpnm,rn->br", y**2, counts) * weight / y.shape[1] / y.shape[-1]
+                means = (sums @ counts.T) * weight / per_base  # [model, block, resample]
+                mean_squares = (squares @ counts.T) * weight / per_base / len(sums)
             between = means.var(axis=0).sum(axis=0)
-            whole = (squares - means.mean(axis=0) ** 2).sum(axis=0)
+            whole = (mean_squares - means.mean(axis=0) ** 2).sum(axis=0)
             return _ratios(between, whole)[None]
 
-        share[i] = of_counts(np.ones((1, y.shape[2])))[0, 0]
+        n = count.shape[1]
+        share[i] = of_counts(np.ones((1, n)))[0, 0]
         if design.spec.design.method != "grid":
-            interval[i] = _intervals(of_counts, y.shape[2], design)[0]
+            interval[i] = _intervals(of_counts, n, design)[0]
     arrays["model_share"] = (("metric",), share)
     if design.spec.design.method != "grid":
         arrays["model_share_interval"] = (("metric", "bound"), interval)
