@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -49,3 +51,27 @@ class Function:
 
     def timings(self) -> Mapping[str, float]:
         return {"function": 1e-3 * self.count}
+
+
+class Stopping(Function):
+    """Send this process a signal at the evaluation `VBNFAULT_TEST_STOP`, once."""
+
+    def evaluate(self, evaluation: Evaluation) -> Mapping[str, float]:
+        at, number, once = os.environ.get("VBNFAULT_TEST_STOP", "-1 15 /").split()
+        if evaluation.index == int(at) and not Path(once).exists():
+            Path(once).touch()
+            os.kill(os.getpid(), int(number))
+        return super().evaluate(evaluation)
+
+
+def small_spec() -> StudySpec:
+    """Return a study of 320 evaluations in two blocks."""
+    return spec(design={"n": 32, "resamples": 100}, scene={"samples": [0, 3]}, metrics={"names": ["y", "z"]})
+
+
+def of_small_spec(folder: str) -> None:
+    """Run this study in a process of its own."""
+    from vbnfault.dataset import BuildOptions
+    from vbnfault.study.run import run_study
+
+    run_study(small_spec(), Path(folder), BuildOptions(progress=False), report=False, evaluator=Stopping)

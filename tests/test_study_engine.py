@@ -46,7 +46,7 @@ def _without_report(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_ishigami_through_the_whole_engine(tmp_path: Path) -> None:
     spec = kit.spec(design={"n": 512, "seed": 3, "resamples": 300})
-    data = vbnfault.study(spec, tmp_path / "s", evaluator=kit.Function, progress=False)
+    data = run.run_study(spec, tmp_path / "s", QUIET, report=False, evaluator=kit.Function).indices
     for name, exact in kit.ANALYTIC_ISHIGAMI.items():
         low, high = data[f"{name}_interval"].sel(metric="y", model="").values.T
         assert np.all(low[:3] <= exact), (name, low)
@@ -152,39 +152,19 @@ def test_blocks_are_pooled_and_seeds_have_their_own_indices() -> None:
 # ------------------------------------------------------------------------------------ resuming and workers
 
 
-class Stopping(kit.Function):
-    """Send this process a signal at the evaluation `VBNFAULT_TEST_STOP`, once."""
-
-    def evaluate(self, evaluation: Evaluation) -> Mapping[str, float]:
-        at, number, once = os.environ.get("VBNFAULT_TEST_STOP", "-1 15 /").split()
-        if evaluation.index == int(at) and not Path(once).exists():
-            Path(once).touch()
-            os.kill(os.getpid(), int(number))
-        return super().evaluate(evaluation)
-
-
 def table_bytes(folder: Path) -> bytes:
     return (folder / results.TABLE).read_bytes()
 
 
-def small_spec() -> StudySpec:
-    return kit.spec(design={"n": 32, "resamples": 100}, scene={"samples": [0, 3]}, metrics={"names": ["y", "z"]})
-
-
-def of_spec(folder: str) -> None:
-    """Run the study of the tests below in a process of its own."""
-    run.run_study(small_spec(), Path(folder), QUIET, evaluator=Stopping)
-
-
 @pytest.fixture(scope="module")
 def spec() -> StudySpec:
-    return small_spec()
+    return kit.small_spec()
 
 
 @pytest.fixture(scope="module")
 def reference(spec: StudySpec, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("study") / "s"
-    run.run_study(spec, folder, QUIET, evaluator=Stopping)
+    run.run_study(spec, folder, QUIET, report=False, evaluator=kit.Stopping)
     return folder
 
 
@@ -194,7 +174,7 @@ def test_two_workers_of_which_one_is_killed_give_the_same_table(
 ) -> None:
     monkeypatch.setenv("VBNFAULT_TEST_STOP", f"77 {int(signal.SIGKILL)} {tmp_path / 'once'}")
     options = BuildOptions(workers=2, progress=False)
-    summary = run.run_study(spec, tmp_path / "s", options, evaluator=Stopping)
+    summary = run.run_study(spec, tmp_path / "s", options, report=False, evaluator=kit.Stopping)
     assert (tmp_path / "once").exists()
     assert table_bytes(tmp_path / "s") == table_bytes(reference)
     assert summary.indices.drop_attrs().identical(results.open_indices(reference).drop_attrs())
@@ -207,7 +187,7 @@ def test_a_study_that_is_killed_continues_to_the_same_table(
 ) -> None:
     # evaluation 150 lies within a chunk: what was finished before it in this chunk has not been written yet
     done = subprocess.run(
-        [sys.executable, "-c", f"import test_study_engine as t; t.of_spec({str(tmp_path / 's')!r})"],
+        [sys.executable, "-c", f"import study_kit; study_kit.of_small_spec({str(tmp_path / 's')!r})"],
         env={
             **os.environ,
             "PYTHONPATH": os.pathsep.join([str(Path(__file__).parents[1]), str(Path(__file__).parent)]),
@@ -217,7 +197,7 @@ def test_a_study_that_is_killed_continues_to_the_same_table(
     )
     assert done.returncode == -signal.SIGKILL
     assert not (tmp_path / "s" / results.TABLE).exists()
-    summary = run.run_study(spec, tmp_path / "s", QUIET, evaluator=Stopping)
+    summary = run.run_study(spec, tmp_path / "s", QUIET, report=False, evaluator=kit.Stopping)
     assert 140 <= summary.finished <= 150
     assert table_bytes(tmp_path / "s") == table_bytes(reference)
 
@@ -228,9 +208,9 @@ def test_an_interrupted_study_continues_to_the_same_table(
 ) -> None:
     monkeypatch.setenv("VBNFAULT_TEST_STOP", f"{at} {int(signal.SIGTERM)} {tmp_path / 'once'}")
     with pytest.raises(Interrupted, match=rf"{at} of 320 evaluations are finished, and the same command continues"):
-        run.run_study(spec, tmp_path / "s", QUIET, evaluator=Stopping)
+        run.run_study(spec, tmp_path / "s", QUIET, report=False, evaluator=kit.Stopping)
     assert not (tmp_path / "s" / results.TABLE).exists()
-    summary = run.run_study(spec, tmp_path / "s", QUIET, evaluator=Stopping)
+    summary = run.run_study(spec, tmp_path / "s", QUIET, report=False, evaluator=kit.Stopping)
     assert summary.finished == at
     assert table_bytes(tmp_path / "s") == table_bytes(reference)
 
@@ -238,7 +218,7 @@ def test_an_interrupted_study_continues_to_the_same_table(
 def test_a_complete_study_evaluates_nothing_again(spec: StudySpec, reference: Path) -> None:
     before = table_bytes(reference)
     (reference / "rows" / ".0000001.json.0.partial").touch()
-    summary = run.run_study(spec, reference, QUIET, evaluator=Stopping)
+    summary = run.run_study(spec, reference, QUIET, report=False, evaluator=kit.Stopping)
     assert (summary.finished, summary.seconds_by_stage) == (320, {})
     assert table_bytes(reference) == before
     assert not list((reference / "rows").glob(".*"))
@@ -263,9 +243,9 @@ class Failing(kit.Function):
 def test_evaluations_that_fail_are_marked_and_the_rest_goes_on(tmp_path: Path) -> None:
     spec = kit.spec(design={"n": 64, "resamples": 100})
     with pytest.raises(
-        run.StudyFailed, match=r"3 evaluations \(7, 8, 50\) of 320 failed, .*no image at 7"
+        vbnfault.study.StudyFailed, match=r"3 evaluations \(7, 8, 50\) of 320 failed, .*no image at 7"
     ) as error:
-        run.run_study(spec, tmp_path / "s", QUIET, evaluator=Failing)
+        run.run_study(spec, tmp_path / "s", QUIET, report=False, evaluator=Failing)
     table = results.read_table(tmp_path / "s").to_pylist()
     assert [row["evaluation"] for row in table if row["status"] == "failed"] == [7, 8, 50]
     assert table[7]["error"].startswith("RuntimeError: no image at 7 (test_study_engine.py:")
@@ -277,13 +257,17 @@ def test_evaluations_that_fail_are_marked_and_the_rest_goes_on(tmp_path: Path) -
     assert abs(data["ST"] - whole["ST"]).max() < 0.1
     # the same study tries the failed ones again
     function = functools.partial(Failing, wrong=(50,))
-    with pytest.raises(run.StudyFailed, match=r"evaluation 50 of 320 failed"):
-        run.run_study(spec, tmp_path / "s", QUIET, evaluator=function)
+    with pytest.raises(vbnfault.study.StudyFailed, match=r"evaluation 50 of 320 failed"):
+        run.run_study(spec, tmp_path / "s", QUIET, report=False, evaluator=function)
 
 
 def test_a_study_whose_evaluations_all_fail_is_stopped(tmp_path: Path) -> None:
-    with pytest.raises(run.StudyFailed, match=r"32 evaluations .* before any succeeded, so the study was stopped"):
-        run.run_study(kit.spec(), tmp_path / "s", QUIET, evaluator=functools.partial(Failing, wrong=()))
+    with pytest.raises(
+        vbnfault.study.StudyFailed, match=r"32 evaluations .* before any succeeded, so the study was stopped"
+    ):
+        run.run_study(
+            kit.spec(), tmp_path / "s", QUIET, report=False, evaluator=functools.partial(Failing, wrong=())
+        )
 
 
 def test_incomplete_blocks_count_where_they_are_complete() -> None:
@@ -339,10 +323,10 @@ def test_too_few_samples_say_how_many_are_needed(tmp_path: Path) -> None:
     with pytest.raises(
         InputError, match=r"design.n = 8: too few .*half_width = 0.05, which needs at least n = 512"
     ):
-        run.run_study(spec, tmp_path / "s", QUIET, evaluator=kit.Function)
+        run.run_study(spec, tmp_path / "s", QUIET, report=False, evaluator=kit.Function)
     assert not (tmp_path / "s").exists()
     spec = kit.spec(design={"n": 128, "half_width": 0.1, "resamples": 200})
-    summary = run.run_study(spec, tmp_path / "s", QUIET, evaluator=kit.Function)
+    summary = run.run_study(spec, tmp_path / "s", QUIET, report=False, evaluator=kit.Function)
     (sentence,) = summary.warnings
     assert "the total index of x0 has a half-width of 0.2" in sentence
     assert "about design.n = 1024 would be needed" in sentence
@@ -355,22 +339,22 @@ def test_unknown_metrics_and_columns_of_one_name_are_refused(tmp_path: Path) -> 
         ({"factor": [FACTOR | {"key": "role"}]}, r"'role': the table"),
     ):
         with pytest.raises(InputError, match=sentence):
-            run.run_study(kit.spec(**tables), tmp_path / "s", QUIET, evaluator=kit.Function)
+            run.run_study(kit.spec(**tables), tmp_path / "s", QUIET, report=False, evaluator=kit.Function)
 
 
 def test_a_folder_of_another_study_is_refused(spec: StudySpec, reference: Path) -> None:
     other = spec.model_copy(update={"design": spec.design.model_copy(update={"n": 64})})
     with pytest.raises(InputError, match=r"holds another study: design.n = 32 \(now 64\); choose another --out"):
-        run.run_study(other, reference, QUIET, evaluator=Stopping)
-    with pytest.raises(InputError, match=r"evaluator = 'test_study_engine.Stopping' \(now 'study_kit.Function'\)"):
-        run.run_study(spec, reference, QUIET, evaluator=kit.Function)
+        run.run_study(other, reference, QUIET, report=False, evaluator=kit.Stopping)
+    with pytest.raises(InputError, match=r"evaluator = 'study_kit.Stopping' \(now 'study_kit.Function'\)"):
+        run.run_study(spec, reference, QUIET, report=False, evaluator=kit.Function)
 
 
 def test_a_folder_that_cannot_be_written_is_refused(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     for out in (tmp_path / "file" / "s", tmp_path / "file"):
         with pytest.raises(VbnfaultError, match=r"file.*(cannot be|can be) (created|written)"):
-            run.run_study(kit.spec(), out, QUIET, evaluator=kit.Function)
+            run.run_study(kit.spec(), out, QUIET, report=False, evaluator=kit.Function)
 
 
 def test_a_resolved_study_file_is_read_again(reference: Path, spec: StudySpec) -> None:

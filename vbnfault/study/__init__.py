@@ -3,8 +3,8 @@
     indices = vbnfault.study("flare_lens", "results", workers=2)
 
 The package itself can be called, as its function `study`. Its modules: `spec` reads a study file, `distributions`
-and `designs` make its points, `run` evaluates them, `indices` computes indices with intervals, and `results` stores
-both.
+and `designs` make its points, `run` evaluates them in `chunks`, `indices` computes indices with intervals, and
+`results` stores both.
 """
 
 from __future__ import annotations
@@ -14,8 +14,9 @@ from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from .chunks import StudyFailed
     from .results import open_indices, read_table
-    from .run import StudyFailed, StudySummary, run_study, study
+    from .run import StudySummary, run_study, study
     from .spec import Evaluation, Evaluator, Metric, StudySpec, load_study, parse_study
 
 # public name → the module that defines it; it is loaded when the name is first used
@@ -23,7 +24,7 @@ _HOME = {
     "Evaluation": "spec",
     "Evaluator": "spec",
     "Metric": "spec",
-    "StudyFailed": "run",
+    "StudyFailed": "chunks",
     "StudySpec": "spec",
     "StudySummary": "run",
     "load_study": "spec",

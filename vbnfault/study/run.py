@@ -14,8 +14,7 @@ import os
 import sys
 import tempfile
 import time
-from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -24,9 +23,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from .. import __version__
-from ..core import activity, file_contents, tables, toml_files
-from ..core.errors import InputChanged, InputError, VbnfaultError, shown
-from ..core.interrupts import Stopped, check, exit_code, finishing, interruptible
+from ..core import file_contents, tables, toml_files
+from ..core.errors import InputError, VbnfaultError, shown
+from ..core.interrupts import Stopped, exit_code, finishing, interruptible
 from ..dataset import BuildOptions
 from ..dataset.dask import check_scheduler, run_on_dask
 from ..dataset.errors import Interrupted
@@ -34,37 +33,20 @@ from ..dataset.identity import versions
 from ..dataset.lock import locked
 from ..dataset.processes import Pool
 from ..dataset.progress import Progress, duration_text
-from ..dataset.work import Fatal, Lazy, Queue, Tick, describe, run_here
+from ..dataset.work import run_here
 from . import indices as indices_module
 from . import results
+from .chunks import ChunkWorkers, StudyJob
 from .designs import Design, make_design
 from .indices import Results
-from .spec import Evaluation, Evaluator, EvaluatorFactory, Metric, StudySpec, load_study
+from .spec import Evaluator, EvaluatorFactory, Metric, StudySpec, load_study
 
 if TYPE_CHECKING:
     import pyarrow
     import xarray as xr
 
-_LARGEST_CHUNK = 32  # evaluations in a task, and in a file of finished rows
-_SECONDS_BETWEEN_WRITES = 5.0  # a kill loses no more work of a worker than this
-_HOPELESS = 32  # after so many failures without one success the study stops: the others would fail, too
 _MOST_DIFFERENCES = 5  # named in one message
-
-
-class StudyFailed(VbnfaultError):
-    """Report that some evaluations failed. All others are in the table; the indices leave out what is incomplete.
-
-    Attributes
-    ----------
-    failures
-        By evaluation, one line and the traceback, or a sentence on how its worker ended.
-    indices
-        The indices; None if the study was stopped before it was complete.
-    """
-
-    def __init__(self, sentence: str, failures: Mapping[int, str] | None = None, indices: Any = None) -> None:
-        super().__init__(sentence)
-        self.failures, self.indices = dict(failures or {}), indices
+_MOST_EVALUATIONS_OF_A_PROCESS = 4096  # then it is replaced, as `BuildOptions.recycle_shards` explains
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -195,7 +177,7 @@ def run_study(
     identity = _identity(spec, factory, metrics, digests)
     with interruptible(), locked(path):
         _prepare_folder(path, spec, identity)
-        job = _StudyJob(path, design, Progress(len(design), shown=options.progress, noun="evaluations"))
+        job = StudyJob(path, design, Progress(len(design), shown=options.progress, noun="evaluations"))
         warnings: list[str] = []
         try:
             if job.finished < len(design):
@@ -203,12 +185,13 @@ def run_study(
                     warnings += made.check() or ()
             for sentence in warnings:
                 print(f"warning: {sentence}", file=sys.stderr)
-            source_of_workers = _Workers(factory, spec, path.absolute(), tuple(m.name for m in metrics), contents)
+            names = tuple(metric.name for metric in metrics)
+            workers = ChunkWorkers(factory, spec, path.absolute(), names, contents)
             with job.progress:
-                _do_tasks(source_of_workers, made, job, options)
+                _do_tasks(workers, made, job, options)
         except (Stopped, KeyboardInterrupt) as stop:
             with finishing():
-                done = _StudyJob(path, design, job.progress).finished
+                done = StudyJob(path, design, job.progress).finished
             raise Interrupted(
                 f"{path}: interrupted; {done} of {len(design)} evaluations are finished, and the same command "
                 "continues",
@@ -345,218 +328,7 @@ def _flat(node: Any, above: str = "") -> Iterator[tuple[str, Any]]:
 # --- evaluations ----------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Chunk:
-    """Describe the task to complete one chunk; for `skip` and `careful` see `Job.task`."""
-
-    number: int
-    evaluations: tuple[Evaluation, ...]
-    skip: frozenset[int]
-    careful: bool
-
-
-@dataclass(frozen=True)
-class _Workers:
-    """Make a worker of a study; the object is a function that can be pickled.
-
-    `contents`: the input files as they were when the study was planned.
-    """
-
-    factory: EvaluatorFactory
-    spec: StudySpec
-    path: Path
-    metrics: tuple[str, ...]
-    contents: file_contents.Contents
-
-    def __call__(self) -> _Worker:
-        return _Worker(self, Lazy(self._make))
-
-    def with_evaluator(self, evaluator: Evaluator) -> _Worker:
-        """Return a worker with an evaluator that exists already."""
-        return _Worker(self, Lazy(lambda: evaluator))
-
-    def _make(self) -> Evaluator:
-        with self.contents.in_use():
-            return self.factory(self.spec)
-
-
-class _Worker:
-    """Evaluate chunks; the evaluator is made when the first evaluation needs it."""
-
-    def __init__(self, source: _Workers, evaluator: Callable[[], Evaluator]) -> None:
-        self._source, self._evaluator = source, evaluator
-        self._seconds: dict[str, float] = {}  # by stage, as reported before
-
-    def do(self, task: _Chunk, tick: Tick) -> None:
-        """Complete a chunk. If an interrupt ends it early, the finished evaluations are still written.
-
-        If `tick` raises OSError, they are not: the study that started this worker has ended.
-        """
-        folder = self._source.path
-        outcomes: dict[int, Mapping[str, Any]] = dict(results.read_chunk(folder, task.number))
-        unwritten, written = 0, time.monotonic()
-        made_before = len(outcomes)
-
-        def write() -> None:
-            with _as_error(folder):
-                results.write_chunk(folder, task.number, outcomes)
-
-        try:
-            for evaluation in task.evaluations:
-                i = evaluation.index
-                if i in outcomes:
-                    tick(i, "kept", "")
-                    continue
-                if i in task.skip:
-                    continue
-                check()
-                tick(i, "begun", "")
-                try:
-                    with activity.reported_to(partial(tick, i, "stage")):
-                        values = self._values(evaluation)
-                except Exception as error:
-                    check()
-                    tick(i, "failed", describe(error))
-                    continue
-                outcomes[i] = {"values": values, "error": ""}
-                unwritten += 1
-                if task.careful or time.monotonic() - written > _SECONDS_BETWEEN_WRITES:
-                    write()
-                    unwritten, written = 0, time.monotonic()
-                tick(i, "built", "")
-        except OSError:
-            unwritten = 0
-            raise
-        finally:
-            with finishing():
-                if unwritten:
-                    write()
-        if len(outcomes) > made_before:
-            self._report_seconds(tick)
-
-    def _values(self, evaluation: Evaluation) -> dict[str, float]:
-        """Return the metrics of an evaluation.
-
-        Raises Fatal if no evaluator can be made, or if an input file has changed.
-        """
-        evaluator = self._evaluator()
-        try:
-            with self._source.contents.in_use():
-                values = evaluator.evaluate(evaluation)
-        except InputChanged as error:  # every other evaluation would fail, too
-            raise Fatal(error) from error
-        return {name: float(values[name]) for name in self._source.metrics}
-
-    def _report_seconds(self, tick: Tick) -> None:
-        """Report the seconds that the evaluator has spent in each stage since the last report."""
-        now = dict(self._evaluator().timings())
-        spent = {stage: seconds - self._seconds.get(stage, 0.0) for stage, seconds in now.items()}
-        self._seconds = now
-        tick(-1, "seconds", json.dumps(spent))
-
-
-@contextlib.contextmanager
-def _as_error(folder: Path) -> Iterator[None]:
-    """Turn an OSError of a block that writes rows into a VbnfaultError."""
-    try:
-        yield
-    except OSError as error:
-        raise VbnfaultError(f"{folder}: cannot be written: {error.strerror}; the same command continues") from error
-
-
-class _StudyJob:
-    """Hand out the chunks of a study, and collect what became of their evaluations."""
-
-    task_noun, item_noun = "chunk", "evaluation"
-
-    def __init__(self, path: Path, design: Design, progress: Progress) -> None:
-        self.path, self.progress, self._design = path, progress, design
-        seeds, views, rows, models = design.shape
-        in_block = rows * models
-        size = min(_LARGEST_CHUNK, max(1, in_block // 64))
-        starts = [*range(0, in_block, size), in_block]
-        self._chunks = [
-            range(block * in_block + first, block * in_block + min(first + size, in_block))
-            for block in range(seeds * views)
-            for first in starts[:-1]
-        ]
-        self._queue = Queue([chunk.start // in_block for chunk in self._chunks])
-        self.finished = sum(
-            len(results.read_chunk(path, number).keys() & set(chunk)) for number, chunk in enumerate(self._chunks)
-        )
-        self.failures: dict[int, str] = {}
-        self.seconds_by_stage: Counter[str] = Counter()
-        self._succeeded = 0
-        self._counted: set[int] = set()
-
-    @property
-    def tasks(self) -> int:
-        """Return the number of chunks."""
-        return len(self._chunks)
-
-    def items(self, number: int) -> Sequence[int]:
-        """Return the evaluations of a chunk."""
-        return self._chunks[number]
-
-    def task(self, number: int, skip: frozenset[int] = frozenset(), *, careful: bool = False) -> _Chunk:
-        """Return the task that completes a chunk."""
-        evaluations = tuple(self._design.evaluation(i) for i in self._chunks[number])
-        return _Chunk(number=number, evaluations=evaluations, skip=skip, careful=careful)
-
-    def next_task(self, last: int | None = None, busy: Sequence[int] = ()) -> int | None:
-        """Return the chunk that a worker does after the chunk `last`, of the same seed and view if one is left."""
-        return self._queue.next(last, busy)
-
-    def tick(self, item: int, what: str, text: str) -> None:
-        """Record an event. Raises StudyFailed after too many failures without a success."""
-        if what == "seconds":
-            self.seconds_by_stage.update(json.loads(text))
-        elif what == "stage":
-            self.progress.stage(text)
-        elif what != "begun":
-            if what == "failed":
-                self.failures[item] = text
-                self.progress.say(f"evaluation {item} failed: {text.splitlines()[0]}")
-            else:
-                self.failures.pop(item, None)
-                self._succeeded += 1
-            if item not in self._counted:
-                self._counted.add(item)
-                self.progress.advance(what == "built")
-            if not self._succeeded and len(self.failures) >= _HOPELESS:
-                self.raise_failures(None, " before any succeeded, so the study was stopped")
-
-    def outcomes(self) -> list[dict[str, Any]]:
-        """Return values and error of each evaluation, in order."""
-        outcomes: list[dict[str, Any]] = []
-        for number, chunk in enumerate(self._chunks):
-            finished = results.read_chunk(self.path, number)
-            for i in chunk:
-                error = self.failures.get(i, "not evaluated").splitlines()[0]
-                outcomes.append(finished.get(i, {"values": {}, "error": error}))
-        return outcomes
-
-    def raise_failures(self, indices: Any, why: str = "") -> None:
-        """Raise StudyFailed with the failed evaluations, if there are any."""
-        if not self.failures:
-            return
-        failed = sorted(self.failures)
-        names = ", ".join(map(str, failed[:8])) + (", ..." if len(failed) > 8 else "")
-        listed = f"evaluation {names}" if len(failed) == 1 else f"{len(failed)} evaluations ({names})"
-        rest = (
-            "all others are in the table, and the indices leave out incomplete base samples"
-            if indices is not None
-            else "finished evaluations stay"
-        )
-        raise StudyFailed(
-            f"{self.path}: {listed} of {len(self._design)} failed{why}, the first with: "
-            f"{self.failures[failed[0]].splitlines()[0]}; {rest}; the same command tries the failed ones again",
-            self.failures,
-            indices,
-        )
-
-
-def _do_tasks(source: _Workers, evaluator: Evaluator, job: _StudyJob, options: BuildOptions) -> None:
+def _do_tasks(source: ChunkWorkers, evaluator: Evaluator, job: StudyJob, options: BuildOptions) -> None:
     """Do all chunks: on a cluster, in this process, or in worker processes."""
     if options.scheduler is not None:
         run_on_dask(source, job, options.scheduler)
@@ -564,7 +336,8 @@ def _do_tasks(source: _Workers, evaluator: Evaluator, job: _StudyJob, options: B
         run_here(partial(source.with_evaluator, evaluator), job)
     else:
         threads = options.threads or max(1, (os.cpu_count() or 1) // options.workers)
-        Pool(source, job, threads, options.recycle_shards).work(options.workers)
+        tasks = max(options.recycle_shards, _MOST_EVALUATIONS_OF_A_PROCESS // job.chunk_size)
+        Pool(source, job, threads, tasks).work(options.workers)
 
 
 # --- after the evaluations ------------------------------------------------------------------------------------
