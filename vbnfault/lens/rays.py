@@ -34,7 +34,8 @@ class Path:
         float64[n, 3]: unit vectors at the sensor plane.
     relative_radius
         float64[n]: largest distance from the axis at any surface, in semi-diameters of that surface. Above 1 the
-        ray was lost at a rim; it is inf where the ray missed a surface.
+        ray was lost at a rim; it is inf where the ray missed a surface. The blades of a stop are ignored, since the
+        stop counts as round here.
     rows
         The surface that each step met.
     """

@@ -124,6 +124,13 @@ def meet(
       `bundles.Tracer.rims_mm`. For a stop with blades, `StopBlades.relative_radius` gives the rim.
     - `paraxial.paraxial_ghosts`, which reads the radii from the prescription and treats the stop as round.
 
+    Code that uses the rims without clipping a ghost, and that a rim of another shape also concerns:
+    `ghosts._paraxial_boxes` (first boxes of rays), `irradiance.FlareModel._soften` (widths of soft edges), and
+    `scatter._lit` (lit parts of the surfaces).
+
+    The image of the scene and the Sun's direct image do not use these two modules. Their rays are clipped in
+    `lens.rays.trace`, which `lens.spots.field_bundles` (image) and `lens.footprint` (dust) call.
+
     A ray is a tuple of position, direction, fraction and rim values. The rim values are `radius`, the square of the
     largest relative radius so far, and, if edges are soft, `margin`. A stop with blades may give the mirrored ray
     other rim values than the ray; the rim values of the mirrored ray then follow.
