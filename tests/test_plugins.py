@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import pickle
 import re
 import subprocess
@@ -14,7 +15,7 @@ import numpy as np
 import pytest
 from conftest import small_scene
 
-from vbnfault import dataset, faults, pipeline, store
+from vbnfault import dataset, faults, pipeline, store, testing
 from vbnfault.core.errors import InputError
 from vbnfault.faults import models, plugins
 from vbnfault.scene import config
@@ -291,7 +292,53 @@ def test_a_plug_in_of_another_scene_has_to_be_named(tmp_path: Path) -> None:
 
 # --- broken plug-ins ----------------------------------------------------------------------------------------
 
+EFFECT = """
+from vbnfault import Effect
+
+
+class Afterglow(Effect):
+    name = "afterglow"
+    after = "dark_current"
+
+    def apply(self, signal, exposure):
+        return signal
+"""
+LAW = """
+from typing import Literal
+
+from vbnfault.reflectance import DiscReflectance
+
+
+class Law(DiscReflectance):
+    model: Literal["law"] = "law"
+
+    def disc(self, m, cos_i, cos_e, phase_deg):
+        return cos_i
+"""
 BROKEN = {
+    "effect without after": (
+        EFFECT.replace('    after = "dark_current"\n', ""),
+        r"detector effect class Afterglow: states no after \(my_glint.py, line 5\)",
+    ),
+    "effect without name": (
+        EFFECT.replace('    name = "afterglow"\n', ""),
+        r"effect class Afterglow: states no name \(my_glint.py, line 5\)",
+    ),
+    "effect without all": (
+        EFFECT[: EFFECT.index("    name")] + "    pass\n",
+        r"effect class Afterglow: states no name, states no after, has no method apply \(my_glint.py, line 5\)",
+    ),
+    "effect without apply": (EFFECT.replace("def apply", "def aply"), r"Afterglow: has no method apply \(my_gl"),
+    "effect with a typed name": (EFFECT.replace("name =", "name: str ="), r"write name: ClassVar\[str\] = \.\.\. "),
+    "effect with a space": (
+        EFFECT.replace('"afterglow"', '"after glow"'),
+        r"name = 'after glow': must be lower",
+    ),
+    "law without name": (
+        LAW.replace('    model: Literal["law"] = "law"\n', ""),
+        r"ground reflectance class Law: states no model \(my_glint.py, line 7\)",
+    ),
+    "law without hook": (LAW.replace("def disc", "def disk"), r"reflectance class Law: has no method disc \(my_gl"),
     "syntax": ("def f(:\n", r"cannot be loaded: SyntaxError: invalid syntax .*line 1"),
     "import": ("import my_nothing\n", r"ModuleNotFoundError: No module named 'my_nothing' \(my_glint.py, line 1\)"),
     "error": ("\n1 / 0\n", r"ZeroDivisionError: division by zero \(my_glint.py, line 2\)"),
@@ -546,3 +593,44 @@ def test_an_edited_file_is_loaded_again_and_a_broken_edit_leaves_nothing(tmp_pat
     plugin(tmp_path, text.replace("1.4", "1.5") + "# edited\n", "my_a.py")
     config.load_scene(file)
     assert defined(kind) == second
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("import_first", [True, False])
+def test_one_file_is_one_definition_however_it_is_loaded(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str, import_first: bool
+) -> None:
+    """A script may import a plug-in before or after it loads the scene that names it; the later load holds."""
+    text, _ = KINDS[kind]
+    name = f"my_same_{kind}_{import_first}"
+    plugin(tmp_path, text, f"{name}.py")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    file = scene_file(tmp_path, f"{name}.py", faults="")
+
+    def load() -> None:
+        config.load_scene(file)
+
+    steps = [lambda: importlib.import_module(name), load]
+    for step in steps if import_first else steps[::-1]:
+        step()
+    if kind != "glass":  # a glass is a value without a module
+        assert defined(kind).__module__.startswith("vbnfault_plugin_") == import_first
+    imported = sys.modules[name]
+    load()
+    if kind == "fault":
+        assert models.is_registered(imported.Glint)
+        assert models.registry()["glint"]["square"] is imported.Glint
+    if kind == "effect":
+        testing.check_effect(imported.Pedestal, examples=1)
+    load()
+
+
+def test_only_the_plug_ins_own_lines_are_named(tmp_path: Path) -> None:
+    """Neither a frame of pydantic nor one of numpy is of use to the author of a plug-in."""
+    plugin(tmp_path, GROUND, "my_a.py")
+    plugin(tmp_path, GROUND.replace('"glazed"', '"frosted"'), "my_b.py")
+    with pytest.raises(InputError, match=r"pedestal is defined twice: .* \(my_b.py, line 21\)"):
+        config.load_scene(scene_file(tmp_path, "my_a.py", "my_b.py", faults=""))
+    plugin(tmp_path, "import numpy as np\nnp.zeros(2).reshape(3)\nnp.linalg.inv(np.zeros((2, 2)))\n", "my_a.py")
+    with pytest.raises(InputError, match=r"\(my_a.py, line 2\)"):
+        config.load_scene(scene_file(tmp_path, "my_a.py", faults=""))

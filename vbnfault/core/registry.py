@@ -1,15 +1,17 @@
 """Keep what registers itself by being defined: fault models, ground reflectances, detector effects, glasses.
 
 One rule holds for every kind: a name has one definition. A module may define its classes again, as after an edit in
-a notebook. Another module may not, unless the first one is a plug-in's file that the scene in use does not name
-(`allow_replacement`).
+a notebook, and so may another module that was loaded from the same file. Any other module may not, unless the first
+one is a plug-in's file that the scene in use does not name (`allow_replacement`).
 """
 
 from __future__ import annotations
 
 import contextlib
 import importlib
+import os
 import pkgutil
+import re
 import sys
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from typing import Any, NamedTuple, TypeVar
@@ -17,6 +19,8 @@ from typing import Any, NamedTuple, TypeVar
 from . import tables
 
 T = TypeVar("T")
+
+_NAME = re.compile("[a-z][a-z0-9_]*")
 
 _registries: list[Registry[Any]] = []
 # Modules whose definitions may be replaced by those of others.
@@ -35,11 +39,23 @@ class DeclarationError(TypeError):
 
 
 class _Definition(NamedTuple):
-    """Hold a registered entry, the module that defines it, and its name in that module ("": it has none)."""
+    """Hold a registered entry, the module that defines it, and its name in that module ("": it has none).
+
+    `file` is the path of the module's file, or its name where it has none.
+    """
 
     entry: Any
     module: str
     qualname: str
+    file: str
+
+    def may_replace(self, known: _Definition) -> bool:
+        """Return whether this is a newer state of a known definition: from the same file, and of the same name."""
+        same_file = os.path.realpath(self.file) == os.path.realpath(known.file)
+        # a file may be imported and be a scene's plug-in too, which makes two modules of it
+        return same_file and (
+            self.module != known.module or (self.qualname != "" and self.qualname == known.qualname)
+        )
 
 
 class Registry(Mapping[str, T]):
@@ -78,17 +94,18 @@ class Registry(Mapping[str, T]):
         DeclarationError
             Another definition has the name, and its module is not replaceable.
         """
-        self._put(name, _Definition(entry, module, qualname))
+        self._put(name, _Definition(entry, module, qualname, source_file(module)))
         self._forget_results()
 
     def _put(self, name: str, new: _Definition) -> None:
         """Register a definition; see `add`."""
         known = self._definitions.get(name)
         if known is not None and known.module not in _replaceable:
-            if known.entry == new.entry:
+            replaces = new.may_replace(known)
+            if known.entry == new.entry and not replaces:
                 return
-            if not new.qualname or known[1:] != new[1:]:
-                files = dict.fromkeys([_source(known.module), _source(new.module)])
+            if not replaces:
+                files = dict.fromkeys([known.file, new.file])
                 raise DeclarationError([name], f"{self.kind} {name} is defined twice: in {' and in '.join(files)}")
         self._definitions[name] = new
         self._by_module.setdefault(new.module, {})[name] = new
@@ -125,6 +142,15 @@ class Registry(Mapping[str, T]):
     def is_replaceable(self, name: str) -> bool:
         """Return whether other modules may define a registered name again."""
         return self._definitions[name].module in _replaceable
+
+    def holds(self, name: str, cls: type) -> bool:
+        """Return whether a name belongs to a class, or to the same class of the same file, loaded another way."""
+        self.complete()
+        known = self._definitions.get(name)
+        if known is None:
+            return False
+        asked = _Definition(cls, cls.__module__, cls.__qualname__, source_file(cls.__module__))
+        return known.entry is cls or (known.module != asked.module and asked.may_replace(known))
 
     def remove(self, names: Iterable[str]) -> None:
         """Remove entries until `restore` registers their module again."""
@@ -166,9 +192,14 @@ class Registry(Mapping[str, T]):
         return f"{self._definitions[name].module}.".startswith(f"{self.package}.")
 
 
-def _source(module: str) -> str:
+def source_file(module: str) -> str:
     """Return the file of a module, or its name."""
     return str(getattr(sys.modules.get(module), "__file__", None) or module)
+
+
+def is_name(name: object) -> bool:
+    """Return whether a class may register by a name: lower-case letters, digits and underscores."""
+    return isinstance(name, str) and _NAME.fullmatch(name) is not None
 
 
 def allow_replacement(modules: Iterable[str]) -> None:

@@ -8,13 +8,12 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import inspect
-import re
 from collections.abc import Callable, Collection, Iterable, Mapping
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 from ..core.errors import InputError, VbnfaultError, shown
-from ..core.registry import DeclarationError, Registry, chained
+from ..core.registry import DeclarationError, Registry, chained, is_name
 from ..core.registry import undoing_registrations as undoing_all
 from ..core.tables import did_you_mean
 from .fields import field_schema, parse_field
@@ -23,7 +22,6 @@ if TYPE_CHECKING:
     from .contract import Fault
 
 _PACKAGE = __package__ or ""
-_NAME = re.compile("[a-z][a-z0-9_]*")
 
 
 def _forget_orders() -> None:
@@ -47,7 +45,7 @@ def _models() -> dict[str, dict[str, type[Fault]]]:
 def register(cls: type[Fault]) -> None:
     """Add a model to the registry. Raise DeclarationError if its names or declarations contradict the others'."""
     where = f"fault model {cls.fault}/{cls.model}"
-    if not _NAME.fullmatch(cls.fault) or not _NAME.fullmatch(cls.model):
+    if not is_name(cls.fault) or not is_name(cls.model):
         text = f"{where}: its names must consist of lower-case letters, digits and underscores"
         raise DeclarationError([cls.fault], text)
     others = {name: other for name, other in _REGISTRY.registered().items() if other.fault == cls.fault}
@@ -67,6 +65,16 @@ def register(cls: type[Fault]) -> None:
     _REGISTRY.add(name, cls, module=cls.__module__, qualname=cls.__qualname__)
     # a plug-in of another scene may have defined the whole class, with a default model of its own
     _REGISTRY.remove(replaceable - {name})
+
+
+def is_registered(cls: type[Fault]) -> bool:
+    """Return whether the names of a model belong to this class; the same class of the same file is put back."""
+    name = f"{cls.fault}/{cls.model}"
+    if not _REGISTRY.holds(name, cls):
+        return False
+    if _REGISTRY[name] is not cls:
+        register(cls)
+    return True
 
 
 def models_of(condition: Callable[[type[Fault]], bool]) -> tuple[type[Fault], ...]:

@@ -330,8 +330,21 @@ def _line(error: BaseException) -> str:
     """Return the line of a plug-in's code that raised an error, as a clause; empty if it is unknown."""
     if isinstance(error, SyntaxError):
         return ""  # its message has the line
-    ours = os.path.dirname(os.path.dirname(__file__))
-    for frame in reversed(traceback.extract_tb(error.__traceback__)):
-        if not frame.filename.startswith((ours, "<frozen")) and "importlib" not in frame.filename:
-            return f" ({os.path.basename(frame.filename)}, line {frame.lineno})"
-    return ""
+    ours = os.path.join(os.path.dirname(os.path.dirname(__file__)), "")
+    frames = [
+        frame
+        for frame in traceback.extract_tb(error.__traceback__)
+        if not frame.filename.startswith((ours, "<frozen")) and "importlib" not in frame.filename
+    ]
+    if not frames:
+        return ""
+    # the outermost frame is the plug-in's; a library that it calls lies elsewhere
+    folder = os.path.dirname(frames[0].filename)
+    own = [f for f in frames if f.filename == frames[0].filename or _is_beside(f.filename, folder)]
+    return f" ({os.path.basename(own[-1].filename)}, line {own[-1].lineno})"
+
+
+def _is_beside(file: str, folder: str) -> bool:
+    """Return whether a file lies in a plug-in's folder, and this is not the folder of all installed packages."""
+    installed = os.path.basename(folder) in ("site-packages", "dist-packages")
+    return not installed and file.startswith(folder + os.sep) and "site-packages" not in file[len(folder) :]

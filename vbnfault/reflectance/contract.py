@@ -28,7 +28,7 @@ the opposition surge an error of 0.4 % at small phase angles. Hapke's model of 2
 from __future__ import annotations
 
 import json
-from abc import abstractmethod
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
 from types import SimpleNamespace
@@ -40,7 +40,7 @@ from pydantic import Field, GetCoreSchemaHandler, GetJsonSchemaHandler, Validati
 from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema, PydanticCustomError, PydanticUndefined, core_schema
 
-from ..core.registry import Registry
+from ..core.registry import DeclarationError, Registry, is_name
 from ..core.tables import Table, did_you_mean
 
 F64 = NDArray[np.float64]
@@ -85,7 +85,8 @@ class Reflectance(Table):
     """Describe how the ground reflects; the fields are the keys of the table `[body.photometry]`.
 
     A subclass declares `model: Literal["name"] = "name"`, its own fields with `pydantic.Field` (default, bounds,
-    description; the unit is in the name) and the hook `at`.
+    description; the unit is in the name) and the hook `at`. A common base of several models has no name; it derives
+    from `abc.ABC` too. Any other class without a name or a hook raises DeclarationError.
 
     Attributes
     ----------
@@ -108,10 +109,21 @@ class Reflectance(Table):
 
     @classmethod
     def __pydantic_init_subclass__(cls, **kwargs: Any) -> None:
-        """Register the model, unless it is a base class without a name."""
+        """Register the model, unless it is a base class of several."""
         name = cls.model_fields["model"].default
-        if name is not PydanticUndefined:
-            _REGISTRY.add(name, cls, module=cls.__module__, qualname=cls.__qualname__)
+        if name is PydanticUndefined and ABC in cls.__bases__:
+            return
+        where = f"ground reflectance class {cls.__qualname__}"
+        hooks = sorted(cls.__abstractmethods__)
+        missing = ["states no model"] if name is PydanticUndefined else []
+        if hooks:
+            missing.append(f"has no method {' and no '.join(hooks)}")
+        if missing:
+            raise DeclarationError([], f"{where}: {', '.join(missing)}")
+        if not is_name(name):
+            text = f"{where}: model = {name!r}: must be lower-case letters, digits and underscores"
+            raise DeclarationError([], text)
+        _REGISTRY.add(name, cls, module=cls.__module__, qualname=cls.__qualname__)
 
     @abstractmethod
     def at(self, wavelength_nm: F64, reflectance: F64) -> BandReflectance:
@@ -136,7 +148,7 @@ def is_packaged(cls: type[Reflectance]) -> bool:
     return _REGISTRY.is_packaged(cls)
 
 
-class DiscReflectance(Reflectance):
+class DiscReflectance(Reflectance, ABC):
     """Model reflectance, disc function and phase function as a product: r = (A/π) D(i, e, α) 10^(-0.4 β α).
 
     A is the normal reflectance of `body.reflectance`. A subclass gives the disc function D by the hook `disc`.

@@ -14,7 +14,18 @@ import numpy as np
 from ..core.architecture import ARCHITECTURES
 from ..core.errors import InputError
 from ..core.quantities import Electrons
-from ..faults import MOSAIC_STEPS, STEPS, Fault, FaultContext, Params, act, from_dict, physical_order, registry
+from ..faults import (
+    MOSAIC_STEPS,
+    STEPS,
+    Fault,
+    FaultContext,
+    Params,
+    act,
+    from_dict,
+    models,
+    physical_order,
+    registry,
+)
 from .examples import CCDS, draw_context, random_quantity, with_mosaic
 
 _PLAIN = (dict, list, str, int, float, bool, type(None))
@@ -115,8 +126,7 @@ def _draw_fault(
 
 def _check_declaration(model: type[Fault], required: Mapping[str, Any]) -> None:
     """Check the class attributes and the fields of a model."""
-    known = registry().get(model.fault, {}).get(model.model)
-    assert known is model, "is not registered; another class of this name has replaced it"
+    assert models.is_registered(model), "is not registered; another class of this name has replaced it"
     assert model.fault in physical_order([model.fault])
     assert model.__doc__, "has no docstring"
     assert set(model.steps) <= set(STEPS), f"acts at {model.steps}; must be among {STEPS}"

@@ -1,5 +1,16 @@
 """Define the effects of a detector with a mosaic, in their order: one class each, which registers itself."""
 
-from .contract import STEPS, Acts, Effect, Effects, Exposure, chain_of, is_packaged, order, registry
+from .contract import STEPS, Acts, Effect, Effects, Exposure, chain_of, is_packaged, is_registered, order, registry
 
-__all__ = ["STEPS", "Acts", "Effect", "Effects", "Exposure", "chain_of", "is_packaged", "order", "registry"]
+__all__ = [
+    "STEPS",
+    "Acts",
+    "Effect",
+    "Effects",
+    "Exposure",
+    "chain_of",
+    "is_packaged",
+    "is_registered",
+    "order",
+    "registry",
+]

@@ -29,7 +29,7 @@ that the wells hold, and what it adds is not clipped.
 
 from __future__ import annotations
 
-from abc import abstractmethod
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
@@ -40,7 +40,7 @@ from pydantic import GetCoreSchemaHandler, GetJsonSchemaHandler, ValidationError
 from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema, PydanticCustomError, core_schema
 
-from ...core.registry import Registry, chained
+from ...core.registry import DeclarationError, Registry, chained, is_name
 from ...core.tables import Table, did_you_mean
 
 if TYPE_CHECKING:
@@ -107,7 +107,8 @@ class Effect(Table):
     """Change the signal at one place of a detector's chain.
 
     A subclass sets the class attributes, declares its fields with `pydantic.Field` (default, bounds, description;
-    the unit is in the name) and writes `apply`.
+    the unit is in the name) and writes `apply`. A common base of several effects has no name; it derives from
+    `abc.ABC` too. Any other class without a name, `after` or `apply` raises DeclarationError.
 
     Attributes
     ----------
@@ -122,16 +123,34 @@ class Effect(Table):
 
     @classmethod
     def __pydantic_init_subclass__(cls, **kwargs: Any) -> None:
-        """Register the effect, unless it is a base class without a name."""
-        if "name" in cls.__dict__:
-            _REGISTRY.add(cls.name, cls, module=cls.__module__, qualname=cls.__qualname__)
+        """Register the effect, unless it is a base class of several."""
+        name = cls.__dict__.get("name")
+        if name is None and ABC in cls.__bases__:
+            return
+        where = f"detector effect class {cls.__qualname__}"
+        fields = [key for key in ("name", "after") if key in cls.model_fields]
+        if fields:
+            key = fields[0]
+            text = f"{where}: {key} is a key of the sensor file; write {key}: ClassVar[str] = ..."
+            raise DeclarationError([], text)
+        missing = [
+            *(["states no name"] if name is None else []),
+            *(["states no after"] if not isinstance(getattr(cls, "after", None), str) else []),
+            *(["has no method apply"] if "apply" in cls.__abstractmethods__ else []),
+        ]
+        if missing:
+            raise DeclarationError([], f"{where}: {', '.join(missing)}")
+        if not is_name(name):
+            text = f"{where}: name = {name!r}: must be lower-case letters, digits and underscores"
+            raise DeclarationError([], text)
+        _REGISTRY.add(cls.name, cls, module=cls.__module__, qualname=cls.__qualname__)
 
     @abstractmethod
     def apply(self, signal: Any, exposure: Exposure) -> Any:
         """Return the signal [y, x] with this effect; the input may be changed in place only if it is returned."""
 
 
-class FaultStep(Effect):
+class FaultStep(Effect, ABC):
     """Let faults act on the signal at one of `STEPS`; a subclass gives its name and place."""
 
     def apply(self, signal: Any, exposure: Exposure) -> Any:
@@ -150,6 +169,11 @@ def registry() -> dict[str, type[Effect]]:
 def is_packaged(cls: type[Effect]) -> bool:
     """Return whether an effect belongs to vbnfault, so that it acts in every sensor."""
     return _REGISTRY.is_packaged(cls)
+
+
+def is_registered(cls: type[Effect]) -> bool:
+    """Return whether the name of an effect belongs to this class and not to that of another file."""
+    return _REGISTRY.holds(cls.name, cls)
 
 
 def order() -> tuple[str, ...]:
