@@ -19,7 +19,7 @@ from vbnfault.lens.changes import Change, changed
 from vbnfault.lens.coating import mean_reflectance
 from vbnfault.pipeline.rendering import render_view
 from vbnfault.study import evaluate as evaluate_module
-from vbnfault.study import image_metrics
+from vbnfault.study import image_metrics, run
 from vbnfault.study.evaluate import SceneEvaluator
 from vbnfault.study.image_metrics import LitImage
 from vbnfault.study.spec import Evaluation, StudySpec, load_study, parse_study
@@ -295,7 +295,17 @@ def test_a_factor_that_nothing_reads_is_refused_and_one_of_some_models_is_told(
         models={"fault": "straylight", "compare": ["texture", "paraxial"]},
     )
     assert SceneEvaluator(spec).check() == [
-        "factor 'scene.faults.straylight.roughness_nm' is inactive with the model texture"
+        "factor 'scene.faults.straylight.roughness_nm' is inactive where the others are large with the model "
+        "texture and where the others are nominal with the model texture"
+    ]
+
+
+def test_a_factor_that_needs_another_one_is_told(tmp_path_factory: pytest.TempPathFactory) -> None:
+    blades = {"key": "lens.stop.blades", "distribution": "categorical", "values": [0, 6]}
+    rounding = factor("lens.stop.blade_rounding", 0, 0.5)
+    spec = study(tmp_path_factory, blades, rounding, names=["starburst_total_e"], render={"bands": 2})
+    assert SceneEvaluator(spec).check() == [
+        "factor 'lens.stop.blade_rounding' is inactive where the others are nominal"
     ]
 
 
@@ -336,15 +346,21 @@ def test_changes_of_a_lens_are_errors_of_its_rows() -> None:
 # --- packaged studies --------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", ["flare_lens", "flare_models"])
-def test_packaged_studies_evaluate_a_point_of_every_model(name: str) -> None:
-    small = {"scene.camera.width_px": 48, "scene.camera.height_px": 48, "scene.patch.facet_m": 8.0}
-    spec = load_study(name, {**small, "scene.samples": [0], "scene.render.bands": 3})
-    made = SceneEvaluator(spec)
-    values = {f.key: np.asarray(f.values(np.array([f.nominal()])), dtype=object).tolist()[0] for f in spec.factors}
-    seed = spec.scene.seeds[0]
-    for model in spec.model_names:
-        found = made.evaluate(Evaluation(index=0, seed=seed, view=0, model=model, role="A", values=values))
-        assert list(found) == list(spec.metrics.names)
-        assert np.isfinite(list(found.values())).all()
-    assert made.kept.events["render"] == 1
+SMALL = {
+    "scene.camera.width_px": 64,
+    "scene.camera.height_px": 64,
+    "scene.patch.facet_m": 8.0,
+    "scene.render.bands": 2,
+    "scene.samples": [0],
+    "design.n": 1,
+    "design.resamples": 100,
+}
+
+
+@pytest.mark.parametrize(("name", "more"), [("flare_lens", {"design.half_width": 0.99}), ("flare_models", {})])
+def test_packaged_studies_run(name: str, more: dict[str, Any]) -> None:
+    spec = load_study(name, SMALL | more)
+    found = run.study(spec, progress=False)
+    assert list(found["metric"].values) == list(spec.metrics.names)
+    assert list(found["model"].values) == list(spec.model_names)
+    assert np.isfinite(found["mean"].values).all()

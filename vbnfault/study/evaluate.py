@@ -115,6 +115,10 @@ class Kept:
             del results[other]
         return value
 
+    def release(self, holder: str) -> None:
+        """Stop holding what a block used."""
+        self._held.pop(holder, None)
+
     @contextlib.contextmanager
     def timed(self, stage: str) -> Iterator[None]:
         """Add the duration of a block to a stage."""
@@ -195,14 +199,13 @@ class SceneEvaluator:
         self._base = _scene_of(spec)
         self._session: tuple[Hashable, Session] | None = None
         self._render_keys: dict[int, tuple[Scene, str]] = {}
-        model = spec.model_names[0]
         with self._named():
             faults = dict(self._base.faults)
             if spec.models is not None:
                 _check_models(spec, faults)
             camera = Session(self._plain_scene()).base_camera
             self._nominal_camera = camera
-            self.factors = Factors(spec, self._base, camera, self._nominal_lens(camera, model))
+            self.factors = Factors(spec, self._base, camera, self._nominal_lens(camera))
         self._check_metrics()
 
     # --- the contract of an evaluator -----------------------------------------------------------------------------
@@ -225,7 +228,7 @@ class SceneEvaluator:
         return dict(self.kept.seconds)
 
     def check(self) -> Sequence[str]:
-        """Evaluate every factor at two values on the first view, and return warnings.
+        """Evaluate every factor at its nominal and another value on the first view, and return warnings.
 
         Raises
         ------
@@ -233,24 +236,42 @@ class SceneEvaluator:
             A value is out of range, or no model of the study reads a factor.
         """
         _ = self.metrics
-        unread: dict[str, list[str]] = {}
-        middle = {f.key: _value(f, f.nominal()) for f in self.spec.factors}
+        places: dict[str, set[str]] = {}
         for i, factor in enumerate(self.spec.factors):
-            for model in self.spec.model_names:
-                seen = set()
-                for point in (0.02, 0.98):
-                    try:
-                        seen.add(self._fingerprint(model, middle | {factor.key: _value(factor, point)}))
-                    except InputError as error:
-                        raise InputError(f"factor[{i}].key = {factor.key!r}: {error}") from None
-                if len(seen) == 1:
-                    unread.setdefault(factor.key, []).append(model)
-        for i, factor in enumerate(self.spec.factors):
-            if len(unread.get(factor.key, ())) == len(self.spec.model_names):
+            try:
+                places[factor.key] = self._places_without(factor)
+            except InputError as error:
+                raise InputError(f"factor[{i}].key = {factor.key!r}: {error}") from None
+            if len(places[factor.key]) == 2 * len(self.spec.model_names):
                 raise InputError(
                     f"factor[{i}].key = {factor.key!r}: nothing in the images of the study reads it; leave it out"
                 )
-        return [f"factor {key!r} is inactive with the model {', '.join(models)}" for key, models in unread.items()]
+        self.kept.release("check")
+        return [
+            f"factor {key!r} is inactive {' and '.join(sorted(where))}" for key, where in places.items() if where
+        ]
+
+    def _places_without(self, factor: Any) -> set[str]:
+        """Return where in the study a factor changes no bit of the light: two entries for a model that ignores it.
+
+        The others stand at their nominal values, or, where the factor is not read there, near their upper bounds.
+        """
+        places = set()
+        middle = {f.key: _value(f, f.nominal()) for f in self.spec.factors}
+        upper = {f.key: _value(f, 0.9) for f in self.spec.factors}
+        for model in self.spec.model_names:
+            with_model = f" with the model {model}" if model else ""
+            self._refuse(model, middle | {factor.key: _value(factor, 0.0)})
+            with self.kept.holding("check"):
+                base = self._fingerprint(model, middle)
+            if self._fingerprint(model, middle | {factor.key: _value(factor, 0.98)}) != base:
+                continue
+            places.add(f"where the others are nominal{with_model}")
+            if self._fingerprint(model, upper) == self._fingerprint(
+                model, upper | {factor.key: _value(factor, 0.1)}
+            ):
+                places.add(f"where the others are large{with_model}")
+        return places
 
     def evaluate(self, evaluation: Evaluation) -> Mapping[str, float]:
         """Return the value of each metric that the study names."""
@@ -306,7 +327,7 @@ class SceneEvaluator:
         own = {key: value for key, value in table.items() if key == "model" or key in fault.__dataclass_fields__}
         return self._base.model_copy(update={"faults": {**self._base.faults, name: own}})
 
-    def _nominal_lens(self, camera: Camera, model: str) -> Prescription:
+    def _nominal_lens(self, camera: Camera) -> Prescription:
         """Return the prescription that the scene's straylight traces, without factors."""
         table = self._base.faults.get(self._adding, {})
         frame = ImageFrame(
@@ -524,7 +545,7 @@ class SceneEvaluator:
         The Sun stands at half the half-width of the field, to the right.
         """
         camera = self._nominal_camera
-        lens = self._nominal_lens(camera, self.spec.model_names[0])
+        lens = self._nominal_lens(camera)
         scene = self._base.render
         nodes = spectra.band_nodes_nm(scene.band_min_nm, scene.band_max_nm, scene.bands)
         sensor = SensorGrid(shape=camera_shape(camera), pitch_mm=camera.detector.pixel_pitch_um * 1e-3)
@@ -599,6 +620,15 @@ class SceneEvaluator:
             return nav.navigation_values(frames, names)
 
     # --- what a factor moves --------------------------------------------------------------------------------------
+
+    def _refuse(self, model: str, values: Mapping[str, float | str]) -> None:
+        """Raise InputError if a scene, a sensor or a lens cannot have the values of a point."""
+        seed, view = self.spec.scene.seeds[0], self.spec.scene.views[0]
+        evaluation = Evaluation(index=0, seed=seed, view=view, model=model, role="check", values=values)
+        setting = self.factors.setting(values)
+        changed(self._nominal_lens(self._nominal_camera), setting.lens)
+        _with_detector(self._nominal_camera, setting.detector)
+        self._scene(evaluation, setting)
 
     def _fingerprint(self, model: str, values: Mapping[str, float | str]) -> str:
         """Return a digest of all light, noise and images of the first view at a point."""
