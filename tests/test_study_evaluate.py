@@ -47,7 +47,7 @@ def study(tmp_path_factory: Any, *factors: dict[str, Any], **tables: Any) -> Stu
         plan={"mode": "per_class", "faulty_fraction": 1.0},
     )
     scene["faults"] = {"straylight": tables.pop("straylight", LENS)}
-    scene["render"] |= tables.pop("render", {})
+    scene["render"] |= {"bands": 2, **tables.pop("render", {})}
     path = tmp_path_factory.mktemp("study") / "scene.toml"
     path.write_text(toml(scene), encoding="utf-8")
     plain = {
@@ -303,7 +303,7 @@ def test_a_factor_that_nothing_reads_is_refused_and_one_of_some_models_is_told(
 def test_a_factor_that_needs_another_one_is_told(tmp_path_factory: pytest.TempPathFactory) -> None:
     blades = {"key": "lens.stop.blades", "distribution": "categorical", "values": [0, 6]}
     rounding = factor("lens.stop.blade_rounding", 0, 0.5)
-    spec = study(tmp_path_factory, blades, rounding, names=["starburst_total_e"], render={"bands": 2})
+    spec = study(tmp_path_factory, blades, rounding, names=["starburst_total_e"])
     assert SceneEvaluator(spec).check() == [
         "factor 'lens.stop.blade_rounding' is inactive where the others are nominal"
     ]
