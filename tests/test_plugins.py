@@ -214,8 +214,14 @@ def test_a_broken_installed_plug_in_is_named(tmp_path: Path, value: str, sentenc
 EVERY = {"mode": "per_class", "faulty_fraction": 1.0}
 
 
-def test_a_plug_in_through_the_store_and_back(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    source = plugin(tmp_path)
+def test_a_plug_in_through_the_store_and_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(tmp_path))
+    text = GLINT.replace(
+        "        array[4:12, 4:12]", "        from my_tools.size import square\n\n        array[square]"
+    )
+    source = plugin(tmp_path, text)
+    (tmp_path / "my_tools").mkdir()
+    helper = plugin(tmp_path / "my_tools", "square = slice(4, 12), slice(4, 12)\n", "size.py")
     scene = small(scene_file(tmp_path, "my_glint.py"), plan=EVERY)
     out = tmp_path / "store.zarr"
     summary = dataset.build_scene(scene, out, workers=2)
@@ -232,10 +238,15 @@ def test_a_plug_in_through_the_store_and_back(tmp_path: Path, capsys: pytest.Cap
     assert done.returncode == 0, done.stderr
     assert f"the scene uses the plug-in my_glint.py (sha256 {kept['sha256'][:12]}, glint/square)" in done.stderr
 
-    # the plug-in is part of what the store holds
-    plugin(tmp_path, GLINT.replace("4:12", "5:13"))
-    with pytest.raises(InputError, match=r"scene.plugins.my_glint.py.sha256 is '\w+.* in the store and '\w+.* now"):
-        dataset.build_scene(small(tmp_path / "scene.toml", plan=EVERY), out)
+    # the plug-in is part of what the store holds, and so is what it imports from its own folder
+    for changed in (helper, source):
+        kept_text = changed.read_text()
+        changed.write_text(f"{kept_text}# edited\n")
+        differs = r"scene.plugins.my_glint.py.sha256 is '\w+.* in the store and '\w+.* now"
+        with pytest.raises(InputError, match=differs):
+            dataset.build_scene(small(tmp_path / "scene.toml", plan=EVERY), out)
+        changed.write_text(kept_text)
+    assert dataset.build_scene(small(tmp_path / "scene.toml", plan=EVERY), out).built == 0
     source.unlink()
     with pytest.raises(InputError, match=r"my_glint.py: plug-in file not found"):
         config.load_scene(tmp_path / "scene.toml")
@@ -634,3 +645,42 @@ def test_only_the_plug_ins_own_lines_are_named(tmp_path: Path) -> None:
     plugin(tmp_path, "import numpy as np\nnp.zeros(2).reshape(3)\nnp.linalg.inv(np.zeros((2, 2)))\n", "my_a.py")
     with pytest.raises(InputError, match=r"\(my_a.py, line 2\)"):
         config.load_scene(scene_file(tmp_path, "my_a.py", faults=""))
+
+
+def test_an_edited_helper_acts_at_once_and_in_no_other_case_matters(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The digest covers what the plug-in imports from its folder, and what runs is what the digest covers."""
+    monkeypatch.syspath_prepend(str(tmp_path))
+    package = tmp_path / "my_law"
+    package.mkdir()
+    for name, text in {
+        "__init__": "",
+        "base": "from .power import index\n",
+        "power": "index = 1.4\n",
+        "unused": "",
+    }.items():
+        plugin(package, text, f"{name}.py")
+    plugin(tmp_path, "from my_law import base\n" + GLASS.replace("1.4", "base.index"), "my_a.py")
+    file = scene_file(tmp_path, "my_a.py", faults="")
+
+    def load() -> tuple[str, float]:
+        config.load_scene(file)
+        loaded = faults.loaded_plugin("my_a.py")
+        assert loaded is not None
+        return loaded.sha256, defined("glass").coefficients[0]
+
+    importlib.import_module("my_law.power")  # the digest must not depend on what is imported already
+    first = load()
+    assert first[1] == 1.4
+    plugin(package, "edited = True\n", "unused.py")
+    assert load() == first
+    plugin(package, "index = 1.25\n", "power.py")
+    second = load()
+    assert second[0] != first[0]
+    assert second[1] == 1.25
+    plugin(package, "index = 1 / 0\n", "power.py")
+    with pytest.raises(InputError, match=r"division by zero \(power.py, line 1\)"):
+        load()
+    plugin(package, "index = 1.25\n", "power.py")
+    assert load() == second

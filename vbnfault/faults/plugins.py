@@ -7,14 +7,13 @@ A plug-in is a Python module that defines classes of these kinds. It is found in
   a file beside the scene file.
 
 Every process that works on a scene loads its plug-ins by itself. The digest of a plug-in's source belongs to the
-identity of a store: of a file, its contents; of a module, all source files and extensions of its top-level package.
+identity of a store (`plugin_source`).
 """
 
 from __future__ import annotations
 
 import contextlib
 import importlib
-import importlib.machinery
 import importlib.metadata
 import os
 import re
@@ -32,6 +31,7 @@ from ..core.errors import InputError, VbnfaultError, shown
 from ..core.interrupts import check
 from ..detector import effects
 from . import models
+from .plugin_source import digest_of_file, digest_of_module, forget_imports, is_beside
 
 if TYPE_CHECKING:
     from .contract import Fault
@@ -40,7 +40,6 @@ ENTRY_POINTS = "vbnfault.faults"
 # The names of modules that are the files of plug-ins begin with this.
 _FILE_MODULE = "vbnfault_plugin_"
 _MODULE = re.compile(r"[^\W\d]\w*(\.[^\W\d]\w*)*")
-_SUFFIXES = (*importlib.machinery.SOURCE_SUFFIXES, *importlib.machinery.EXTENSION_SUFFIXES)
 
 
 @dataclass(frozen=True)
@@ -135,13 +134,13 @@ def plugins_of(faults: Mapping[str, Fault], named: Sequence[str]) -> tuple[Plugi
                     )
                 wanted[key] = plugin
     for key, plugin in wanted.items():
-        if not plugin.is_file and _digest_of_module(plugin.module) != plugin.sha256:
+        if not plugin.is_file and digest_of_module(plugin.module) != plugin.sha256:
             raise InputError(
                 f"the plug-in {plugin.name} has changed since this process loaded it; start Python again, or the "
                 "workers of the cluster"
             )
         if plugin.is_file:
-            user_files.read_input(key, "plug-in")  # notices a change during a build
+            digest_of_file(key)  # notices a change during a build
     return tuple(sorted(wanted.values(), key=lambda plugin: plugin.name))
 
 
@@ -192,15 +191,16 @@ def _is_path(name: str) -> bool:
 
 
 def _load_file(path: str) -> Plugin:
-    """Return the plug-in of a file, executed again if its contents have changed."""
-    data = user_files.read_input(path, "plug-in", types=(".py",))
-    digest, known = user_files.sha256(data), _loaded.get(path)
+    """Return the plug-in of a file, executed again if it or what it imports from its folder has changed."""
+    digest, known = digest_of_file(path), _loaded.get(path)
     if known is not None and known.sha256 == digest:
         return _registered(known)
     if known is not None:
         registry.forget(known.module)
+    data = user_files.read_input(path, "plug-in")
     stem = re.sub(r"\W", "_", Path(path).stem)
-    name = f"{_FILE_MODULE}{stem}_{user_files.sha256(path.encode() + data)[:16]}"
+    name = f"{_FILE_MODULE}{stem}_{user_files.sha256(f'{path} {digest}'.encode())[:16]}"
+    former_imports = forget_imports(path)
     module = ModuleType(name)
     module.__file__ = path
     sys.modules[name] = module  # a dataclass looks its module up
@@ -208,6 +208,7 @@ def _load_file(path: str) -> Plugin:
         exec(compile(data, path, "exec", dont_inherit=True), module.__dict__)
     except BaseException:
         del sys.modules[name]
+        sys.modules.update(former_imports)
         raise
     return Plugin(Path(path).name, name, digest, models.models_of(lambda cls: _defines(name, cls)))
 
@@ -236,7 +237,7 @@ def _load_module(name: str) -> Plugin:
         raise
     finally:
         sys.path[:] = path
-    return Plugin(name, name, _digest_of_module(name), models.models_of(lambda cls: _defines(name, cls)))
+    return Plugin(name, name, digest_of_module(name), models.models_of(lambda cls: _defines(name, cls)))
 
 
 def _registered(plugin: Plugin) -> Plugin:
@@ -252,23 +253,6 @@ def _defines(module: str, cls: type[Fault]) -> bool:
     if module.startswith(_FILE_MODULE):
         return cls.__module__ == module
     return cls.__module__.split(".")[0] == module.split(".")[0]
-
-
-def _digest_of_module(name: str) -> str:
-    """Return the SHA-256 (hex) of the sources of a module's top-level package."""
-    top = sys.modules[name.split(".")[0]]
-    if not hasattr(top, "__path__"):
-        if top.__file__ is None:
-            raise InputError("has no source file")
-        return user_files.sha256(user_files.read_input(top.__file__, "plug-in"))
-    digests = []
-    for folder in top.__path__:
-        files = [path for path in Path(folder).rglob("*") if path.name.endswith(_SUFFIXES) and path.is_file()]
-        for path in sorted(files, key=lambda path: path.relative_to(folder).as_posix()):
-            if path.stat().st_size:  # an empty __init__.py is usual
-                digest = user_files.sha256(user_files.read_input(path, "plug-in"))
-                digests.append(f"{path.relative_to(folder).as_posix()} {digest}")
-    return user_files.sha256("\n".join(digests).encode())
 
 
 # --- errors -------------------------------------------------------------------------------------------------
@@ -340,11 +324,5 @@ def _line(error: BaseException) -> str:
         return ""
     # the outermost frame is the plug-in's; a library that it calls lies elsewhere
     folder = os.path.dirname(frames[0].filename)
-    own = [f for f in frames if f.filename == frames[0].filename or _is_beside(f.filename, folder)]
+    own = [f for f in frames if f.filename == frames[0].filename or is_beside(f.filename, folder)]
     return f" ({os.path.basename(own[-1].filename)}, line {own[-1].lineno})"
-
-
-def _is_beside(file: str, folder: str) -> bool:
-    """Return whether a file lies in a plug-in's folder, and this is not the folder of all installed packages."""
-    installed = os.path.basename(folder) in ("site-packages", "dist-packages")
-    return not installed and file.startswith(folder + os.sep) and "site-packages" not in file[len(folder) :]
