@@ -369,7 +369,7 @@ def _leading(results: StudyResults, metric: str, model: str) -> str:
         swings = {factor: points.swing(factor).size for factor in results.factors} if points.values.size else {}
         floor = points.chance_swing()
         above = {f: s for f, s in swings.items() if s > max(floor, 0.0)}
-        shown = {f: f"{s:.3g}" for f, s in above.items()}
+        shown = {f: _e(_quantity(s, results.about(metric, "unit"), 2)) for f, s in above.items()}
         order = sorted(above, key=lambda f: -above[f])
     else:
         index, bounds = results.index(name, metric, model), results.index(f"{name}_interval", metric, model)
@@ -379,7 +379,8 @@ def _leading(results: StudyResults, metric: str, model: str) -> str:
         floor = float(np.nan_to_num(highs.sel(factor=DUMMY)))
         order = [f for f in results.factors if float(lows.sel(factor=f)) > floor]
         order.sort(key=lambda f: -float(index.sel(factor=f)))
-        shown = {f: f"{float(index.sel(factor=f)):.2g}" for f in order}
+        unit = results.about(metric, "unit") if name == "mu_star" else ""
+        shown = {f: _e(_quantity(float(index.sel(factor=f)), unit, 2)) for f in order}
     if not order:
         return '<span class="small">none</span>'
     named = ", ".join(f"<code>{_e(f)}</code>&nbsp;{shown[f]}" for f in order[:_MOST_LEADING])
@@ -639,11 +640,11 @@ def _minus(text: str) -> str:
     return text.replace("-", "\N{MINUS SIGN}")
 
 
-def _quantity(value: float, unit: str) -> str:
+def _quantity(value: float, unit: str, digits: int = 4) -> str:
     """Return a value with its unit as text."""
     if not np.isfinite(value):
         return "–"
-    leading, _, power = f"{value:.4g}".partition("e")
+    leading, _, power = f"{value:.{digits}g}".partition("e")
     number = leading if not power else f"{leading}·{sheets.power(int(power))}"
     return _minus(number) + ("" if unit in ("", "1") else f" {unit}")
 

@@ -24,7 +24,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.font_manager import FontProperties
 from matplotlib.patches import Patch
-from matplotlib.textpath import TextPath
+from matplotlib.textpath import text_to_path
 from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, MaxNLocator, NullFormatter, NullLocator
 
 _P = ParamSpec("_P")
@@ -96,11 +96,9 @@ def styled(draw: Callable[_P, _R]) -> Callable[_P, _R]:
 @cache
 def text_width(text: str, size: float = TEXT) -> float:
     """Return the width of a text in points; the widest line of several."""
-    font = FontProperties(family=FAMILY)
-    lines = [line for line in text.split("\n") if line.strip()]
-    return max(
-        (float(TextPath((0, 0), line, size=size, prop=font).get_extents().x1) for line in lines), default=0.0
-    )
+    font = FontProperties(family=FAMILY, size=size)
+    widths = (text_to_path.get_text_width_height_descent(line, font, False)[0] for line in text.split("\n"))
+    return max(map(float, widths))
 
 
 def wrapped(text: str, length: int = LABEL, lines: int = 3) -> str:
