@@ -173,7 +173,8 @@ def indices(results: StudyResults, metric: str) -> tuple[Figure, str] | None:
         heads=results.models,
     )
     label_rows(axes, labels, separate_last=True)
-    low, high = _index_limits(np.concatenate(values, axis=1) / 10.0**exponent, bool(shares))
+    everything = np.concatenate(values, axis=1) / 10.0**exponent
+    low, high = _index_limits(everything[0], everything[1:], bool(shares))
     label = "fraction of the variance" if results.has("ST") or results.has("S1") else "delta (no unit)"
     if not shares:
         label = with_unit("μ*", results.about(metric, "unit"), exponent)
@@ -183,7 +184,6 @@ def indices(results: StudyResults, metric: str) -> tuple[Figure, str] | None:
         set_linear(one.xaxis, 5 if len(axes) == 1 else 4)
         one.axvline(0, color=MUTED, lw=0.7)
         _draw_dots(one, drawn, [v / 10.0**exponent for v in values[k * len(drawn) : (k + 1) * len(drawn)]])
-    everything = np.concatenate(values, axis=1) / 10.0**exponent
     cut = bool(np.nanmax(np.append(everything, 0)) > high or np.nanmin(np.append(everything, 0)) < low)
     return figure, "Intervals that reach the edge of a panel go on beyond it." if cut else ""
 
@@ -202,12 +202,14 @@ def _intervals(results: StudyResults, metric: str, model: str, series: _Series, 
     return values
 
 
-def _index_limits(values: F64, shares: bool) -> tuple[float, float]:
-    """Return the limits of the axis of indices; long intervals of fractions are cut."""
-    finite = values[np.isfinite(values)]
-    low, high = (float(finite.min()), float(finite.max())) if finite.size else (0.0, 1.0)
+def _index_limits(dots: F64, ends: F64, shares: bool) -> tuple[float, float]:
+    """Return the limits of the axis of indices: all dots are within, but long intervals of fractions are cut."""
+    both = [each[np.isfinite(each)] for each in (dots, np.concatenate([dots.ravel(), ends.ravel()]))]
+    if not both[0].size:
+        return (-0.03, 1.03) if shares else (-0.04, 1.04)
+    (least, most), (low, high) = ((float(each.min()), float(each.max())) for each in both)
     if shares:
-        return max(min(low - 0.02, -0.03), -0.3), min(max(high + 0.02, 1.03), 1.3)
+        return max(min(low, 0) - 0.03, min(least - 0.03, -0.3)), min(max(high, 1) + 0.03, max(most + 0.03, 1.3))
     extent = max(high, 0.0) - min(low, 0.0) or 1.0
     return min(low, 0.0) - 0.04 * extent, max(high, 0.0) + 0.04 * extent
 
@@ -217,7 +219,7 @@ def _draw_dots(axes: Axes, drawn: Sequence[_Series], values: Sequence[F64]) -> N
     if not any(np.isfinite(v[0]).any() for v in values):
         write_message(axes, "no values")
         return
-    floor = np.concatenate([v[:, -1] for v in values])
+    floor = values[0][:, -1]
     floor = floor[np.isfinite(floor)]
     if floor.size:
         _draw_floor(axes, float(floor.min()), float(floor.max()))
@@ -278,9 +280,8 @@ def seeds(results: StudyResults, metric: str) -> tuple[Figure, str] | None:
     label_rows(axes, labels, separate_last=True)
     pooled = [_intervals(results, metric, model, series, order) for model in results.models]
     share = name not in [s.name for s in _EFFECTS]
-    everything = np.concatenate([np.stack(pooled).ravel(), every.values.ravel()])
-    exponent = 0 if share else axis_exponent(everything)
-    limits = _index_limits(everything / 10.0**exponent, share)
+    exponent = 0 if share else axis_exponent(every.values)
+    limits = _index_limits(every.values / 10.0**exponent, np.stack(pooled) / 10.0**exponent, share)
     label = with_unit("μ*", results.about(metric, "unit"), exponent) if not share else series.label
     for one, model, (_, low, high) in zip(axes, results.models, pooled, strict=True):
         one.set_xlim(*limits)

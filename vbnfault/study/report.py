@@ -343,7 +343,7 @@ def _summary(results: StudyResults) -> str:
             mean = float(results.dataset["mean"].sel(metric=metric, model=model))
             deviation = float(np.sqrt(results.dataset["variance"].sel(metric=metric, model=model)))
             about = results.about(metric, "description")
-            name = f'<code>{_e(metric)}</code><br><span class="small">{_e(about)}</span>' if k == 0 else ""
+            name = f'<code>{_e(metric)}</code><br><span class="small about">{_e(about)}</span>' if k == 0 else ""
             rows.append(
                 [
                     name,

@@ -29,7 +29,7 @@ def _overview(results: StudyResults) -> str:
 def _indices(results: StudyResults) -> str:
     level = f"{100 * results.confidence:g} %"
     floor = (
-        "A factor whose interval lies within the grey band, the noise floor, cannot be told from the dummy factor, "
+        "A factor whose interval overlaps the grey band, the noise floor, cannot be told from the dummy factor, "
         "which acts on nothing."
     )
     if results.has("ST"):
