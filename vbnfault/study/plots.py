@@ -183,7 +183,12 @@ def indices(results: StudyResults, metric: str) -> tuple[Figure, str] | None:
         one.set_xlabel(label)
         set_linear(one.xaxis, 5 if len(axes) == 1 else 4)
         one.axvline(0, color=MUTED, lw=0.7)
-        _draw_dots(one, drawn, [v / 10.0**exponent for v in values[k * len(drawn) : (k + 1) * len(drawn)]])
+        of_model = [v / 10.0**exponent for v in values[k * len(drawn) : (k + 1) * len(drawn)]]
+        if not any(np.isfinite(v[0]).any() for v in of_model):
+            variance = float(results.dataset["variance"].sel(metric=metric, model=results.models[k]))
+            write_message(one, "no variance" if variance == 0 else "no values")
+            continue
+        _draw_dots(one, drawn, of_model)
     cut = bool(np.nanmax(np.append(everything, 0)) > high or np.nanmin(np.append(everything, 0)) < low)
     return figure, "Intervals that reach the edge of a panel go on beyond it." if cut else ""
 
@@ -216,9 +221,6 @@ def _index_limits(dots: F64, ends: F64, shares: bool) -> tuple[float, float]:
 
 def _draw_dots(axes: Axes, drawn: Sequence[_Series], values: Sequence[F64]) -> None:
     """Draw dots with intervals, and the noise floor over all rows."""
-    if not any(np.isfinite(v[0]).any() for v in values):
-        write_message(axes, "no values")
-        return
     floor = values[0][:, -1]
     floor = floor[np.isfinite(floor)]
     if floor.size:
@@ -409,7 +411,7 @@ def _draw_cells(axes: Axes, values: F64, top: float, *, numbers: bool, empty: An
                 if empty is None or not empty[i, j]:
                     axes.text(j + 0.5, i + 0.5, "–", ha="center", va="center", fontsize=SMALL, color=MUTED)
             elif numbers and value >= 0.005:
-                text = f"{value:.2f}".removeprefix("0") if value < 0.995 else "1.0"
+                text = f"{value:.2f}".removeprefix("0") if value < 0.995 else f"{value:.1f}"
                 colour = _ON_DARK if value / top > 0.55 else _ON_LIGHT
                 axes.text(j + 0.5, i + 0.52, text, ha="center", va="center", fontsize=SMALL, color=colour)
     return mesh

@@ -335,7 +335,7 @@ def _facts(results: StudyResults) -> str:
 def _summary(results: StudyResults) -> str:
     """Return which factors drive each metric, as a table."""
     several = len(results.models) > 1
-    heads = ["metric", *(["model"] if several else []), "mean", "deviation", "factors above the noise floor"]
+    heads = ["metric", *(["model"] if several else []), "factors above the noise floor", "mean", "deviation"]
     rows: list[list[str]] = []
     for metric in results.metrics:
         unit = results.about(metric, "unit")
@@ -348,9 +348,9 @@ def _summary(results: StudyResults) -> str:
                 [
                     name,
                     *([_e(model)] if several else []),
+                    _leading(results, metric, model),
                     _unbroken(_quantity(mean, unit)),
                     _unbroken(_quantity(deviation, unit)),
-                    _leading(results, metric, model),
                 ]
             )
     words = (
