@@ -319,6 +319,7 @@ def test_a_wrong_study_file_is_refused(tables: dict[str, Any], sentence: str) ->
 
 
 def test_too_few_samples_say_how_many_are_needed(tmp_path: Path) -> None:
+    assert kit.spec(design={"n": 8, "half_width": 0}).design.half_width is None  # 0 asks for none
     spec = kit.spec(design={"n": 8, "half_width": 0.05})
     with pytest.raises(
         InputError, match=r"design.n = 8: too few .*half_width = 0.05, which needs at least n = 512"

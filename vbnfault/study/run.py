@@ -254,7 +254,8 @@ def _check_half_width(spec: StudySpec, source: str) -> None:
     if n < least:
         raise InputError(
             f"{source}: design.n = {n}: too few samples for half_width = {asked:g}, which needs at least "
-            f"n = {least}, even if all factors have equal parts of the variance, and more if a few dominate"
+            f"n = {least}, even if all factors have equal parts of the variance, and more if a few dominate; "
+            "design.half_width = 0 asks for none"
         )
 
 

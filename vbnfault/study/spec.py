@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, Protocol
 
-from pydantic import ConfigDict, Field, model_validator
+from pydantic import AfterValidator, ConfigDict, Field, model_validator
 
 from ..core import path_checks, resources, tables, toml_files
 from ..core.errors import shown
@@ -120,8 +120,11 @@ class DesignTable(Table):
     seed: int = Field(1, ge=0, le=2**63 - 1, description="seed of the design and of the bootstrap")
     resamples: int = Field(1000, ge=100, le=100_000, description="number of bootstrap resamples")
     confidence: float = Field(0.95, ge=0.5, le=0.999, description="confidence level of all intervals")
-    half_width: float | None = Field(
-        None, gt=0, lt=1, description="largest half-width that the intervals of the total indices shall have"
+    half_width: Annotated[float | None, AfterValidator(lambda asked: asked or None)] = Field(
+        None,
+        ge=0,
+        lt=1,
+        description="largest half-width that the intervals of the total indices shall have; 0 asks for none",
     )
     levels: int = Field(4, ge=2, le=64, multiple_of=2, description="levels of a Morris design, an even number")
 
