@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,9 @@ from pydantic import Field
 
 from vbnfault import Effect
 from vbnfault.core.registry import undoing_registrations
-from vbnfault.detector.effects import contract, registry
+from vbnfault.detector import load_sensor
+from vbnfault.detector.chain import Device, MosaicNoise
+from vbnfault.detector.effects import Exposure, contract, registry
 from vbnfault.testing import check_effect
 
 PACKAGED = [cls for cls in registry().values() if contract.is_packaged(cls)]
@@ -49,6 +52,10 @@ def by_the_signal(self: Any, signal: Any, exposure: Any) -> Any:
     return signal if rng is None else signal + rng.poisson(signal).astype(np.float32)
 
 
+def traps_by_the_signal(self: Any, signal: Any, exposure: Any) -> Any:
+    return signal + np.float32(exposure.device_rng(self.name).random(int(signal.max()) % 1000).sum())
+
+
 counter = itertools.count(1)
 
 BROKEN: dict[str, tuple[dict[str, Any], str]] = {
@@ -64,6 +71,10 @@ BROKEN: dict[str, tuple[dict[str, Any], str]] = {
     ),
     "draw": ({"apply": lambda _, s, e: s + np.float32(next(counter))}, "another result for the same exposure"),
     "variates": ({"apply": by_the_signal}, "draws a number of variates that depends on the signal"),
+    "variates of the device": (
+        {"apply": traps_by_the_signal},
+        "draws a number of variates that depends on the sig",
+    ),
     "after": ({"after": "dark_curent"}, r"after = 'dark_curent': there is none of this name \(did you mean"),
     "description": ({"fraction": Field(0.1, ge=0, le=1)}, "fraction has no description"),
     "limit": ({"fraction": Field(0.1, ge=0, description="a")}, "fraction has no upper limit"),
@@ -110,3 +121,21 @@ def test_keys_without_limits_to_draw_between_are_given() -> None:
     Named.__qualname__ = "Named"
     globals()["Named"] = Named
     check_effect(Named, required={"label": "a"}, examples=2)
+
+
+def test_an_effect_has_the_same_map_in_every_exposure_of_one_device() -> None:
+    """The map differs between devices and between effects, and the noise-free image has it too."""
+    sensor = load_sensor("generic_cmos")
+    sensor = replace(sensor, readout=replace(sensor.readout, nodes=2))
+
+    def drawn(seed: int, noise_seed: int | None, name: str = "traps") -> bytes:
+        device = Device(sensor, seed, shape=(16, 20))
+        noise = None
+        if noise_seed is not None:
+            noise = MosaicNoise.draw((16, 20), *np.random.default_rng(noise_seed).spawn(3))
+        exposure = Exposure(device=device, exposure_s=0.1, noise=noise, acts={})
+        np.testing.assert_array_equal(exposure.output_node[:, [0, 9, 10, 19]], [[0, 0, 1, 1]] * 16)
+        return exposure.device_rng(name).random(8).tobytes()
+
+    assert drawn(1, None) == drawn(1, 5) == drawn(1, 6)
+    assert len({drawn(1, 5), drawn(2, 5), drawn(1, 5, "other")}) == 3

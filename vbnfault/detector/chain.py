@@ -94,7 +94,7 @@ class Device:
         temperature_K: float | None = None,
         direction: str = "up",
     ) -> None:
-        self.sensor, self.direction = sensor, direction
+        self.sensor, self.seed, self.direction = sensor, seed, direction
         self.shape = (sensor.height_px, sensor.width_px) if shape is None else shape
         self.temperature_K = sensor.temperature_K if temperature_K is None else temperature_K
         self.individual = individual(sensor.individual, self.shape, sensor.pixel_pitch_um, seed)

@@ -374,8 +374,8 @@ def response(individual: Individual) -> F32:
 # --- draws ------------------------------------------------------------------------------------------------------
 
 
-def _stream(seed: int, name: str) -> np.random.Generator:
-    """Return the random generator for (seed, name)."""
+def stream(seed: int, name: str) -> np.random.Generator:
+    """Return the random generator of a device for (seed of the device, name)."""
     return np.random.Generator(np.random.SFC64(np.random.SeedSequence([seed, *name.encode()])))
 
 
@@ -384,22 +384,20 @@ def _pattern(
 ) -> F32:
     """Draw normal variates of mean 0 per pixel, plus others that are constant along a row or a column."""
     if pixel > 0:
-        out = _stream(seed, name).standard_normal(shape, dtype=np.float32)
+        out = stream(seed, name).standard_normal(shape, dtype=np.float32)
         out *= np.float32(pixel)
     else:
         out = np.zeros(shape, dtype=np.float32)
     if row > 0:
-        out += _stream(seed, f"{name} row").standard_normal((shape[0], 1), dtype=np.float32) * np.float32(row)
+        out += stream(seed, f"{name} row").standard_normal((shape[0], 1), dtype=np.float32) * np.float32(row)
     if column > 0:
-        out += _stream(seed, f"{name} column").standard_normal((1, shape[1]), dtype=np.float32) * np.float32(column)
+        out += stream(seed, f"{name} column").standard_normal((1, shape[1]), dtype=np.float32) * np.float32(column)
     return out
 
 
 def _slow(seed: int, shape: tuple[int, int]) -> F32:
     """Draw a smooth field of mean 0 and standard deviation 1 from the same nodes at any resolution."""
-    nodes = _stream(seed, "prnu low").standard_normal(
-        (_LOW_FREQUENCY_CELLS, _LOW_FREQUENCY_CELLS), dtype=np.float32
-    )
+    nodes = stream(seed, "prnu low").standard_normal((_LOW_FREQUENCY_CELLS, _LOW_FREQUENCY_CELLS), dtype=np.float32)
     field = cv2.resize(nodes, shape[::-1], interpolation=cv2.INTER_CUBIC)
     mean, deviation = cv2.meanStdDev(field)
     return np.asarray((field - np.float32(mean[0, 0])) / np.float32(max(deviation[0, 0], 1e-6)), dtype=np.float32)
@@ -420,12 +418,12 @@ def _birth_blocks(rng: np.random.Generator, expected: float) -> Iterator[F64]:
 def _births(seed: int, name: str, expected: float) -> F64:
     """Return all births of `_birth_blocks`. Raises InputError if too many are expected."""
     checked(f"expected number of {name} pixels", expected, 0.0, _MOST_DEFECTS)
-    return np.concatenate([np.zeros(0), *_birth_blocks(_stream(seed, f"{name} birth"), expected)])
+    return np.concatenate([np.zeros(0), *_birth_blocks(stream(seed, f"{name} birth"), expected)])
 
 
 def _uniform(seed: int, name: str, count: int) -> F64:
     """Draw the first `count` numbers of an endless list; a larger count keeps the first numbers."""
-    return _stream(seed, name).random(count)
+    return stream(seed, name).random(count)
 
 
 def _places(seed: int, name: str, count: int, shape: tuple[int, int]) -> tuple[I32, I32]:
@@ -442,7 +440,7 @@ def _damage(
     radiation = spec.radiation(pixel_pitch_um)
     pixels = shape[0] * shape[1]
     expected = checked("expected number of interactions", radiation.interactions * pixels, 0.0, _MOST_DEFECTS)
-    births, places, sizes = (_stream(seed, f"radiation {name}") for name in ("birth", "place", "size"))
+    births, places, sizes = (stream(seed, f"radiation {name}") for name in ("birth", "place", "size"))
     steps = np.zeros(pixels, dtype=np.float32)
     for born in _birth_blocks(births, expected):
         place = (places.random(len(born)) * pixels).astype(np.intp)

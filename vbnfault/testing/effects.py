@@ -43,14 +43,20 @@ class _Recorded(Exposure):
             self.generators.append(generator)
         return generator
 
+    def device_rng(self, name: str) -> np.random.Generator:
+        """Return the generator of `Exposure.device_rng` and remember it."""
+        generator = super().device_rng(name)
+        self.generators.append(generator)
+        return generator
+
     def again(self) -> _Recorded:
         """Return the same exposure, as it was before any effect asked for a generator."""
         return replace(self)
 
     @property
-    def states(self) -> list[Any]:
-        """Return the state of each generator, which says how many variates were drawn."""
-        return [generator.bit_generator.state for generator in self.generators]
+    def states(self) -> list[str]:
+        """Return the state of each generator as text, which says how many variates were drawn."""
+        return [repr(generator.bit_generator.state) for generator in self.generators]
 
 
 def check_effect(
@@ -66,7 +72,8 @@ def check_effect(
     - keeps the shape and the dtype of the signal, and returns finite values: before the full well no negative
       electrons, behind the converter no code above the highest
     - changes the signal that it gets only if it returns the same array
-    - returns the same for the same exposure, and draws a number of variates that does not depend on the signal
+    - returns the same for the same exposure, and draws a number of variates, of the exposure and of the device,
+      that does not depend on the signal
 
     Parameters
     ----------

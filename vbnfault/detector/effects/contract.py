@@ -42,6 +42,8 @@ from pydantic_core import CoreSchema, PydanticCustomError, core_schema
 
 from ...core.registry import DeclarationError, Registry, chained, is_name
 from ...core.tables import Table, did_you_mean
+from ..individual import stream
+from ..nodes import node_of
 
 if TYPE_CHECKING:
     from ..chain import Device, MosaicNoise
@@ -95,6 +97,19 @@ class Exposure:
         if self.noise is None:
             return None
         return np.random.default_rng(np.random.SeedSequence([self.noise.seed, *name.encode()]))
+
+    def device_rng(self, name: str) -> np.random.Generator:
+        """Return the random generator of the device for a name, such as that of an effect.
+
+        It is the same in every exposure of one device, with and without noise: draw from it what belongs to the
+        device, such as a map of its pixels.
+        """
+        return stream(self.device.seed, f"effect {name}")
+
+    @property
+    def output_node(self) -> NDArray[np.uint8]:
+        """Return the number of the output node that reads each pixel, uint8[y, x], as `nodes.node_of`."""
+        return node_of(self.device.shape, self.sensor.readout.nodes)
 
     def acted(self, step: str, array: Any) -> Any:
         """Return an array with the changes that faults make at a step."""
