@@ -2,7 +2,8 @@
 
 from .context import FaultContext, Params
 from .contract import MOSAIC_STEPS, QUANTITIES, STEPS, Fault, act
-from .fields import Interval, bounds, choice, flag, number, path, rows, text
+from .fields import Interval, Severity, bounds, choice, flag, number, path, rows, text
+from .levels import LEVELS
 from .models import (
     dataset_order,
     from_dict,
@@ -11,10 +12,12 @@ from .models import (
     path_fields,
     physical_order,
     registry,
+    without_severity,
 )
 from .plugins import Plugin, belongs_here, load_plugins, loaded_plugin, plugins_of
 
 __all__ = [
+    "LEVELS",
     "MOSAIC_STEPS",
     "QUANTITIES",
     "STEPS",
@@ -23,6 +26,7 @@ __all__ = [
     "Interval",
     "Params",
     "Plugin",
+    "Severity",
     "act",
     "belongs_here",
     "bounds",
@@ -42,4 +46,5 @@ __all__ = [
     "registry",
     "rows",
     "text",
+    "without_severity",
 ]

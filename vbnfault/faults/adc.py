@@ -21,7 +21,7 @@ from ..camera import Camera
 from ..detector.readout import ReadoutSpec
 from .context import FaultContext, Params
 from .contract import Fault, with_sensor
-from .fields import Interval, bounds
+from .fields import Interval, Severity, bounds
 
 # The curve rises everywhere if 4 |quadratic| + 6√3 |cubic| is below the range. Non-linearity may use up to this
 # fraction of the range.
@@ -37,6 +37,7 @@ class ConverterFault(Fault):
     default = True
     after = "banding"
     step = "raw"
+    severity = Severity(key="missing_share", low=1e-3, high=0.5)
     needs_mosaic = True
     localised = False
     effect_mask = True

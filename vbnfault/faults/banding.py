@@ -21,7 +21,7 @@ from ..camera import Camera
 from ..detector.readout import ReadoutSpec
 from .context import FaultContext, Params
 from .contract import Fault, with_sensor
-from .fields import Interval, bounds, flag, number
+from .fields import Interval, Severity, bounds, flag, number
 
 # Least factor of double sampling that is compensated. Near its zeros the amplitude would otherwise diverge.
 _LEAST_PASSED = 1e-3
@@ -36,6 +36,7 @@ class InterferenceBanding(Fault):
     default = True
     after = "cti"
     step = "raw"
+    severity = Severity(key="amplitude_dn", low=0.1, high=255.0)
     needs_mosaic = True
     localised = False
     effect_mask = True

@@ -19,7 +19,7 @@ import numpy as np
 from ..detector.charge import bloom
 from .context import FaultContext, Params
 from .contract import Fault
-from .fields import Interval, bounds
+from .fields import Interval, Severity, bounds
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,6 +31,7 @@ class Overflow(Fault):
     default = True
     after = "cosmic_rays"
     step = "charge"
+    severity = Severity(key="full_well_share", low=1.0, high=0.01)
     needs_mosaic = True
     needs_ccd = True
     effect_mask = True

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from .context import FaultContext, Params
 from .contract import Fault
-from .fields import Interval, bounds, choice, number
+from .fields import Interval, Severity, bounds, choice, number
 
 BOTH_WAYS = ("interline_ccd", "cmos")
 
@@ -37,6 +37,7 @@ class TextureBrokenLines(Fault):
     after = "adc"
     axis = 2
     step = "rgbi"
+    severity = Severity(key="count", low=1, high=500)
 
     count: Interval = bounds(1, 5, limits=(0, 10_000), integer=True, doc="number of broken lines")
     white_count: int | None = number(

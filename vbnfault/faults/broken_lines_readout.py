@@ -28,7 +28,7 @@ from ..detector.nodes import node_of, readout_steps
 from ..detector.raw_damage import Axis, dead_lines, duplicated_lines, lost_node, saturated_lines, shifted_lines
 from .context import FaultContext, Params
 from .contract import Fault
-from .fields import Interval, bounds, number
+from .fields import Interval, Severity, bounds, number
 
 Mask = NDArray[np.bool_]
 Ints = NDArray[np.intp]
@@ -53,6 +53,7 @@ class ReadoutBrokenLines(Fault):
     fault = "broken_lines"
     model = "readout"
     step = "raw"
+    severity = Severity(key="count", low=1, high=500)
     needs_mosaic = True
 
     count: Interval = bounds(1, 5, limits=(0, 10_000), integer=True, doc="number of failures that take lines")

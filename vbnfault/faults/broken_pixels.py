@@ -33,7 +33,7 @@ from numpy.typing import NDArray
 
 from .context import FaultContext, Params
 from .contract import Fault
-from .fields import Interval, bounds, number
+from .fields import Interval, Severity, bounds, number
 from .planes import scale_by_intensity
 
 # Unit steps (dy, dx) of the four readout directions. They also lead to the four von Neumann neighbours.
@@ -55,6 +55,7 @@ class TextureBrokenPixels(Fault):
     after = "vignetting"
     axis = 1
     step = "rgbi"
+    severity = Severity(key="count", low=1, high=10_000)
 
     count: Interval = bounds(10, 150, limits=(0, 10_000), integer=True, doc="number of broken pixels")
     brightness_dn: Interval = bounds(

@@ -38,7 +38,7 @@ from ..detector.individual import Individual, IndividualSpec, RtsPixels, StuckPi
 from ..detector.transfer import passing_dark_e
 from .context import FaultContext, Params
 from .contract import Fault
-from .fields import Interval, bounds, number
+from .fields import Interval, Severity, bounds, number
 
 F32 = NDArray[np.float32]
 
@@ -68,6 +68,7 @@ class HotPixels(Fault):
     fault = "broken_pixels"
     model = "hot_pixels"
     step = "light"
+    severity = Severity(key="growth_factor", low=1.0, high=1e5)
     later_steps = ("pixels", "offsets", "raw")
     needs_mosaic = True
 

@@ -25,7 +25,7 @@ from ..detector.effects import STEPS as MOSAIC_STEPS
 from ..lens import load_lens
 from ..lens.footprint import DEFAULT_LENS
 from .context import FaultContext, Params
-from .fields import Interval, parse_field, path
+from .fields import Interval, Severity, parse_field, path
 from .models import register
 
 Q = TypeVar("Q", Electrons, Charge, Offset, RawMosaic, RGBI)
@@ -80,6 +80,9 @@ class Fault:
     thin_lens_only
         Why the model does not act behind a prescription (`camera.lens`), as the second half of a sentence. "": it
         does.
+    severity
+        The key that makes the model milder or more severe, with its range: what `severity = 3` of a scene sets.
+        None: the model has no levels of severity.
     per_exposure
         True if the fault happens during one exposure, as a cosmic ray does, so that each image of a sequence has
         its own draw. False: it is a state of the instrument, which lasts.
@@ -118,6 +121,7 @@ class Fault:
     thin_lens_only: ClassVar[str] = ""
     needs_mosaic: ClassVar[bool] = False
     needs_ccd: ClassVar[bool] = False
+    severity: ClassVar[Severity | None] = None
     per_exposure: ClassVar[bool] = False
     effect_mask: ClassVar[bool] = False
     soft_layer: ClassVar[str] = ""

@@ -25,7 +25,7 @@ from ..detector.cosmic import LEAST_MEV_CM2_G, CosmicRayModel, CosmicRays, stopp
 from ..detector.poisson import poisson_least_count
 from .context import FaultContext, Params
 from .contract import Fault
-from .fields import Interval, bounds, number
+from .fields import Interval, Severity, bounds, number
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -46,6 +46,7 @@ class Tracks(Fault):
     default = True
     after = "smear"
     step = "charge"
+    severity = Severity(key="flux_per_cm2_s", low=1.0, high=1e6)
     needs_mosaic = True
     per_exposure = True
 

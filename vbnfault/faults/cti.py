@@ -20,7 +20,7 @@ from ..camera import Camera
 from ..detector.charge import TrapSpecies
 from .context import FaultContext, Params
 from .contract import Fault, with_sensor
-from .fields import Interval, bounds
+from .fields import Interval, Severity, bounds
 
 RELEASE_TRANSFERS = (0.5, 2.0, 8.0)
 
@@ -37,6 +37,7 @@ class RadiationTraps(Fault):
     default = True
     after = "blooming"
     step = "charge"
+    severity = Severity(key="parallel_per_px", low=0.01, high=100.0)
     needs_mosaic = True
     needs_ccd = True
     localised = False

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from .context import FaultContext, Params
 from .contract import Fault
-from .fields import Interval, bounds, flag
+from .fields import Interval, Severity, bounds, flag
 
 _LEAST_SIGMA_PX = 0.4
 
@@ -41,6 +41,7 @@ class GaussianDegradation(Fault):
     after = "dust_on_optics"
     axis = 5
     step = "electrons"
+    severity = Severity(key="filter_size_px", low=1, high=201, step=2)
     localised = False
 
     filter_size_px: Interval = bounds(

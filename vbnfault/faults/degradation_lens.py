@@ -42,7 +42,7 @@ from ..lens.footprint import ImageFrame
 from ..lens.straylight.scatter import Harvey
 from .context import FaultContext, Params
 from .contract import LensFault
-from .fields import Interval, bounds, choice, number
+from .fields import Interval, Severity, bounds, choice, number
 from .planes import times
 
 F32 = NDArray[np.float32]
@@ -63,6 +63,7 @@ class Contamination(LensFault):
     fault = "optics_degradation"
     model = "contamination"
     step = "electrons"
+    severity = Severity(key="haze", low=1e-3, high=0.9)
     localised = False
 
     coating: str = choice(

@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 
 from .context import FaultContext, Params
 from .contract import Fault
-from .fields import Interval, bounds, flag, number
+from .fields import Interval, Severity, bounds, flag, number
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,6 +44,7 @@ class GaussianDust(Fault):
     after = "straylight"
     axis = 0
     step = "electrons"
+    severity = Severity(key="count", low=1, high=3000)
     soft_layer = "dust_opacity"
 
     count: Interval = bounds(30, 100, limits=(0, 10_000), integer=True, doc="number of grains in the image")

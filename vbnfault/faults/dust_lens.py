@@ -48,7 +48,7 @@ from ..lens.straylight.paraxial import along
 from ..lens.straylight.scatter import DUST_INDEX
 from .context import FaultContext, Params
 from .contract import LensFault
-from .fields import Interval, bounds, number
+from .fields import Interval, Severity, bounds, number
 from .planes import plus, times
 
 F32 = NDArray[np.float32]
@@ -71,6 +71,7 @@ class DefocusedDust(LensFault):
     fault = "dust_on_optics"
     model = "defocused"
     step = "electrons"
+    severity = Severity(key="count", low=1, high=1000)
     localised = False
     soft_layer = "dust_opacity"
 

@@ -43,6 +43,31 @@ class Interval(NamedTuple):
         return int(rng.integers(int(self.lo), int(self.hi), endpoint=True))
 
 
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Severity:
+    """Name the key by which a model becomes more severe, with the mildest and the most severe value.
+
+    Where less is worse, `low` is above `high`. Values between them are spaced evenly in their logarithm, so both
+    are above 0. A whole number takes steps of `step` from `low`.
+    """
+
+    key: str
+    low: float
+    high: float
+    step: int = 1
+
+    def position(self, value: float) -> float:
+        """Return the position of a value: 0 the mildest, 1 the most severe."""
+        return math.log(value / self.low) / math.log(self.high / self.low)
+
+    def value(self, position: float, *, integer: bool) -> float | int:
+        """Return the value of the key at a position from 0, mildest, to 1, most severe."""
+        value = float(self.low * (self.high / self.low) ** position)
+        if not integer:
+            return float(f"{value:.6g}")
+        return int(self.low + self.step * round((value - self.low) / self.step))
+
+
 def bounds(
     lo: float, hi: float, *, limits: tuple[float, float], doc: str, unit: str = "", integer: bool = False
 ) -> Any:

@@ -17,6 +17,7 @@ from ..core.registry import DeclarationError, Registry, chained, is_name
 from ..core.registry import undoing_registrations as undoing_all
 from ..core.tables import did_you_mean
 from .fields import field_schema, parse_field
+from .levels import severity_schema, with_severity
 
 if TYPE_CHECKING:
     from .contract import Fault
@@ -154,6 +155,25 @@ def _check_fields(cls: type[Fault]) -> None:
                 [cls.fault], f"{where}: {f.name} must be declared with one of the field helpers, such as bounds()"
             )
 
+    _check_severity(cls, where)
+
+
+def _check_severity(cls: type[Fault], where: str) -> None:
+    """Raise DeclarationError if the severity of a model names no number of its, or leaves the number's limits."""
+    severity = cls.severity
+    if severity is None:
+        return
+    declared = {f.name: f.metadata for f in dataclasses.fields(cls) if "limits" in f.metadata}
+    if severity.key not in declared:
+        raise DeclarationError([cls.fault], f"{where}: its severity names {severity.key!r}, no number of it")
+    low, high = declared[severity.key]["limits"]
+    if not all(max(low, 0) <= value <= high and value > 0 for value in (severity.low, severity.high)):
+        raise DeclarationError(
+            [cls.fault],
+            f"{where}: its severity goes from {severity.low:g} to {severity.high:g}: must be above 0 and within "
+            f"the limits [{low:g}, {high:g}] of {severity.key}",
+        )
+
 
 def _defaults() -> dict[str, type[Fault]]:
     """Return the default model of every class. Raise DeclarationError if a class has none."""
@@ -224,6 +244,7 @@ def from_dict(fault_class: str, table: Mapping[str, Any], *, source: str) -> Fau
     if not isinstance(name, str) or name not in models:
         raise InputError(f"{where}.model = {shown(name)}: must be one of {', '.join(models)}")
     cls = models[name]
+    table = with_severity(cls, table, where)
     fields = {f.name: f for f in dataclasses.fields(cls)}
     values: dict[str, Any] = {}
     for key, value in table.items():
@@ -238,6 +259,21 @@ def from_dict(fault_class: str, table: Mapping[str, Any], *, source: str) -> Fau
     except ValueError as error:
         raise InputError(f"{where}: {error}") from None
     return fault
+
+
+def without_severity(faults: Mapping[str, Any], *, source: str) -> dict[str, Any]:
+    """Return the tables of a scene's faults with the values that their keys `severity` stand for.
+
+    What is no known model stays as it is. Raises InputError where a level is wrong.
+    """
+    out = dict(faults)
+    for fault_class, table in faults.items():
+        if isinstance(table, Mapping) and "severity" in table:
+            models = registry().get(fault_class, {})
+            name = table.get("model", next(iter(models), None))
+            if isinstance(name, str) and name in models:
+                out[fault_class] = with_severity(models[name], table, f"{source}: faults.{fault_class}")
+    return out
 
 
 def path_fields(fault_class: str) -> dict[str, str]:
@@ -257,6 +293,8 @@ def json_schema() -> dict[str, Any]:
         options = []
         for name, cls in models.items():
             properties: dict[str, Any] = {"model": {"const": name}}
+            if cls.severity is not None:
+                properties["severity"] = severity_schema(cls.severity)
             for f in dataclasses.fields(cls):
                 properties[f.name] = field_schema(f)
             option = {

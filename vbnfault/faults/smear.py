@@ -24,7 +24,7 @@ import numpy as np
 from ..camera import Camera
 from .context import FaultContext, Params
 from .contract import Fault, with_sensor
-from .fields import Interval, bounds, choice
+from .fields import Interval, Severity, bounds, choice
 
 CAUSES = {
     "frame_transfer_ccd": ("clock", "clear"),
@@ -43,6 +43,7 @@ class FrameTransferSmear(Fault):
     default = True
     after = "broken_pixels"
     step = "pixels"
+    severity = Severity(key="row_transfer_s", low=1e-7, high=1e-2)
     needs_mosaic = True
     needs_ccd = True
     localised = False

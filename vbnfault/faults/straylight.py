@@ -45,7 +45,7 @@ from ..core.resources import data_dir
 from ..core.user_files import read_input
 from .context import FaultContext, Params
 from .contract import Fault
-from .fields import Interval, bounds, number, rows
+from .fields import Interval, Severity, bounds, number, rows
 from .planes import intensity_dn, plus
 
 # Radius of a flare's outline over half the side of its texture, as `benchmarks/flare_textures.py` draws it.
@@ -72,6 +72,7 @@ class TextureStraylight(Fault):
     after = ""
     axis = 3
     step = "electrons"
+    severity = Severity(key="brightness", low=0.01, high=100.0)
     needs_sun = True
     packaged_images = "textures"
     effect_mask = True

@@ -33,7 +33,7 @@ from ..lens.straylight.settings import Baffle, DirectPath, GhostSettings, Sensor
 from ..lens.straylight.total import SunlightInLens, scene_veil_fraction, veil_of
 from .context import FaultContext, Params
 from .contract import LensFault
-from .fields import Interval, bounds, choice, number
+from .fields import Interval, Severity, bounds, choice, number
 from .planes import intensity_dn, plus, times
 
 F32 = NDArray[np.float32]
@@ -96,6 +96,7 @@ class _LensStraylight(LensFault):
     needs_sun = True
     packaged_images = "textures"
     informed = True  # of the coating loss
+    severity = Severity(key="veil_fraction", low=1e-4, high=0.5)
     effect_mask = True
     soft_layer = "straylight_added"
     adds_past_rims = True

@@ -22,7 +22,7 @@ from ..detector.nodes import transmission_order
 from ..detector.raw_damage import Fill, corrupted_packets, lost_lines, lost_packets, packet_count
 from .context import FaultContext, Params
 from .contract import Fault
-from .fields import Interval, bounds, choice
+from .fields import Interval, Severity, bounds, choice
 
 Raw = NDArray[np.uint16]
 Mask = NDArray[np.bool_]
@@ -37,6 +37,7 @@ class PacketTransmission(Fault):
     default = True
     after = "broken_lines"
     step = "raw"
+    severity = Severity(key="lost_count", low=1, high=1000)
     needs_mosaic = True
 
     packet_px: Interval = bounds(

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from ..lens.thin import cos4_map
 from .context import FaultContext, Params
 from .contract import Fault
-from .fields import Interval, bounds, number
+from .fields import Interval, Severity, bounds, number
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,6 +33,7 @@ class Cos4Vignetting(Fault):
     after = "optics_degradation"
     axis = 4
     step = "electrons"
+    severity = Severity(key="on_axis_illuminance_dn", low=255.0, high=2.0)
     localised = False
     soft_layer = "vignetting_factor"
     at_rims = True

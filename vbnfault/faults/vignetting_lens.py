@@ -32,7 +32,7 @@ from numpy.typing import NDArray
 from ..lens.footprint import Beams, ImageFrame
 from .context import FaultContext, Params
 from .contract import LensFault
-from .fields import Interval, bounds, number
+from .fields import Interval, Severity, bounds, number
 from .planes import times
 
 F32 = NDArray[np.float32]
@@ -51,6 +51,7 @@ class LensVignetting(LensFault):
     fault = "vignetting"
     model = "lens"
     step = "electrons"
+    severity = Severity(key="decentre", low=0.02, high=2.0)
     localised = False
     soft_layer = "vignetting_factor"
     at_rims = True

@@ -138,6 +138,11 @@ def parse_scene(table: Mapping[str, Any], *, source: str, overrides: Sequence[st
                 f"{source}: camera.{key} = {shown(camera[key])}: is a key of a sensor file, not of [camera]; write "
                 f"such a file (vbnfault new sensor NAME) and name it by camera.detector{mono}"
             )
+    faults = table.get("faults")
+    if isinstance(faults, Mapping) and any(isinstance(f, Mapping) and "severity" in f for f in faults.values()):
+        from ..faults import without_severity
+
+        table = {**table, "faults": without_severity(faults, source=source)}
     return tables.parse(Scene, table, source=source, overrides=overrides)
 
 
