@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import cv2
@@ -26,6 +27,8 @@ _ORB_BORDER_PX = 16  # the descriptor's patch has a radius of 15 px
 _ORB_LEVELS = 8
 _ORB_SCALE = 1.2
 _LEAST_SIZE_PX = 2 * _ORB_BORDER_PX + 1
+# Two views with their clean twins, whose features several metrics need.
+_IMAGES_KEPT = 4
 
 # A feature is found again within this distance (Mikolajczyk and Schmid 2005; Schmid et al. 2000, 1.5 px).
 REPEATED_WITHIN_PX = 1.5
@@ -229,9 +232,14 @@ def match(first: NDArray[Any], second: NDArray[Any], *, white: float | None = No
 
 def _orb(grey: U8) -> tuple[F64, NDArray[np.int64], U8]:
     """Return positions float64[n, 2], pyramid levels int64[n] and descriptors uint8[n, 32] of ORB features."""
-    nothing = np.empty((0, 2)), np.empty(0, dtype=np.int64), np.empty((0, 32), dtype=np.uint8)
     if min(grey.shape) < _LEAST_SIZE_PX:
-        return nothing
+        return np.empty((0, 2)), np.empty(0, dtype=np.int64), np.empty((0, 32), dtype=np.uint8)
+    return _orb_of((grey.shape[0], grey.shape[1]), grey.tobytes())
+
+
+@lru_cache(maxsize=_IMAGES_KEPT)
+def _orb_of(shape: tuple[int, int], pixels: bytes) -> tuple[F64, NDArray[np.int64], U8]:
+    """Return `_orb` of an image's shape and pixels, read-only."""
     detector = cv2.ORB_create(
         nfeatures=ORB_FEATURES,
         scaleFactor=_ORB_SCALE,
@@ -239,11 +247,13 @@ def _orb(grey: U8) -> tuple[F64, NDArray[np.int64], U8]:
         edgeThreshold=_ORB_BORDER_PX,
         fastThreshold=_ORB_FAST_DN,
     )
-    points, descriptors = detector.detectAndCompute(grey, None)
-    if descriptors is None:
-        return nothing
-    xy = cv2.KeyPoint.convert(points).astype(np.float64) + 0.5
-    return xy, np.array([point.octave for point in points], dtype=np.int64), np.asarray(descriptors)
+    points, descriptors = detector.detectAndCompute(np.frombuffer(pixels, dtype=np.uint8).reshape(shape), None)
+    xy = np.array([point.pt for point in points], dtype=np.float64).reshape(-1, 2) + 0.5
+    level = np.array([point.octave for point in points], dtype=np.int64)
+    described = np.empty((0, 32), dtype=np.uint8) if descriptors is None else np.asarray(descriptors)
+    for array in (xy, level, described):
+        array.flags.writeable = False
+    return xy, level, described
 
 
 def right_matches(
