@@ -6,7 +6,7 @@ import contextlib
 import inspect
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -68,7 +68,7 @@ def _list_faults() -> None:
             cls = faults.registry()[name][model]
             needs = " (needs camera.detector, a CCD)" if cls.needs_ccd else " (needs camera.detector)"
             typer.echo(f"{name} / {model}{needs if cls.needs_mosaic else ''}")
-            _list_keys(keys)
+            _list_keys(keys, [key for key in schema_of_model.get("required", ()) if key in keys])
 
 
 def _list_effects() -> None:
@@ -80,7 +80,8 @@ def _list_effects() -> None:
     for name in effects.order():
         cls = classes[name]
         typer.echo(f"{name:<{width}}  {_summary(cls)}{_origin(effects.is_packaged(cls))}")
-        _list_keys(cls.model_json_schema().get("properties", {}))
+        schema = cls.model_json_schema()
+        _list_keys(schema.get("properties", {}), schema.get("required", ()))
 
 
 def _list_reflectances() -> None:
@@ -89,8 +90,9 @@ def _list_reflectances() -> None:
 
     for name, cls in reflectance.registry().items():
         typer.echo(f"{name}: {_summary(cls)}{_origin(reflectance.is_packaged(cls))}")
-        keys = cls.model_json_schema()["properties"]
-        _list_keys({key: value for key, value in keys.items() if key != "model"})
+        schema = cls.model_json_schema()
+        keys = {key: value for key, value in schema["properties"].items() if key != "model"}
+        _list_keys(keys, schema.get("required", ()))
 
 
 def _list_glasses() -> None:
@@ -102,10 +104,12 @@ def _list_glasses() -> None:
         typer.echo(f"{name:<{width}}  nd {glass.nd:.5f}  Abbe number {glass.vd:.2f}  formula {glass.formula}")
 
 
-def _list_keys(properties: Mapping[str, Any]) -> None:
+def _list_keys(properties: Mapping[str, Any], required: Collection[str]) -> None:
     """Print the keys of a table, from the properties of its JSON Schema, with default and meaning."""
     for key, value in properties.items():
-        value_text = f" = {json.dumps(value['default'])}" if "default" in value else " must be given"
+        value_text = " must be given" if key in required else ""
+        if "default" in value:
+            value_text = f" = {json.dumps(value['default'])}"
         typer.echo(f"    {key}{value_text}    {value.get('description', '')}".rstrip())
 
 
