@@ -17,13 +17,15 @@ from vbnfault.scene import config
 
 
 def small(scene: str = "quickstart") -> vbnfault.Scene:
-    """Return a packaged scene with few pixels, samples and triangles."""
+    """Return a packaged scene with few pixels and samples over coarse terrain."""
     values: dict[str, Any] = {
         "camera.width_px": 48,
         "camera.height_px": 40,
         "dataset.samples": 3,
         "dataset.sites": 1,
-        "patch.max_triangles": 60_000,
+        "patch.facet_m": 12.0,
+        "patch.radius_m": 60.0,
+        "patch.min_boulder_m": 6.0,
         "plan.on_invisible": "drop",
     }
     return vbnfault.load_scene(scene, values)
