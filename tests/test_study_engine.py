@@ -17,6 +17,7 @@ import pytest
 import study_kit as kit
 
 import vbnfault
+from vbnfault.core import toml_files
 from vbnfault.core.errors import InputError, VbnfaultError
 from vbnfault.dataset import BuildOptions
 from vbnfault.dataset.errors import Interrupted
@@ -304,6 +305,10 @@ FACTOR = {"key": "a", "distribution": "uniform", "low": 0.0, "high": 1.0}
             {"factor": [FACTOR | {"distribution": "truncated_normal", "mean": 2.0, "deviation": 1.0}]},
             r"factor\[0\].mean = 2: must be from low = 0 to high = 1",
         ),
+        (
+            {"factor": [FACTOR | {"distribution": "truncated_normal", "mean": 0.5, "deviation": 1e9}]},
+            r"factor\[0\].deviation = 1e\+09: must be at most 1e\+06",
+        ),
         ({"factor": [{"key": "a", "distribution": "categorical", "values": ["x", "x"]}]}, r"'x' is given twice"),
         ({"metrics": {"names": []}}, r"metrics.names = \[\]: must be a list of at least 1"),
         ({"metrics": {}}, r"metrics.names: is missing"),
@@ -331,6 +336,31 @@ def test_too_few_samples_say_how_many_are_needed(tmp_path: Path) -> None:
     (sentence,) = summary.warnings
     assert "the total index of x0 has a half-width of 0.2" in sentence
     assert "about design.n = 1024 would be needed" in sentence
+
+
+def test_the_command_says_what_is_wrong_in_one_sentence(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from vbnfault.cli import main
+
+    file = tmp_path / "study.toml"
+    file.write_text(toml_files.toml_text(kit.spec().resolved()), encoding="utf-8")
+    for name, setting, sentence in (
+        ("nothing", "design.n=8", "nothing: neither a file nor a packaged name; studies: "),
+        (
+            str(file),
+            "design.n=9",
+            "design.n = 9: must be a power of two with method = 'sobol', such as 8 or",
+        ),
+        (str(file), "desing.n=8", "desing: unknown key (did you mean design?)"),
+        (str(file), "metrics.names=[]", "metrics.names = []: must be a list of at least 1"),
+    ):
+        monkeypatch.setattr(sys, "argv", ["vbnfault", "study", name, "--out", "x", "--set", setting])
+        with pytest.raises(SystemExit) as end:
+            main()
+        assert end.value.code == 2
+        (line,) = capsys.readouterr().err.splitlines()
+        assert sentence in line
 
 
 def test_unknown_metrics_and_columns_of_one_name_are_refused(tmp_path: Path) -> None:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from ..core.errors import InputError
 from .distributions import Categorical
-from .spec import DUMMY, Evaluation, StudySpec
+from .spec import Evaluation, StudySpec
 
 _MOST_ROWS = 10_000_000
 
@@ -180,9 +180,13 @@ def _one_at_a_time(spec: StudySpec, dimensions: int) -> tuple[NDArray[np.float64
 
 
 def unit_problem(spec: StudySpec) -> dict[str, Any]:
-    """Return the factors and the dummy factor as SALib names a problem, in the unit hypercube."""
-    names = [*spec.keys, DUMMY]
-    return {"num_vars": len(names), "names": names, "bounds": [[0.0, 1.0]] * len(names)}
+    """Return the factors and the dummy factor as a problem of SALib, in the unit hypercube.
+
+    Their names are x0, x1, …, since SALib does not take every name.
+    """
+    count = len(spec.keys) + 1
+    names = [f"x{i}" for i in range(count)]
+    return {"num_vars": count, "names": names, "bounds": [[0.0, 1.0]] * count}
 
 
 def salib(module: str, needed_by: str) -> Any:

@@ -14,6 +14,7 @@ from pydantic import Field, model_validator
 
 from ..core.tables import Table
 
+_MOST_DEVIATIONS = 1e6
 _Text = Annotated[str, Field(min_length=1)]
 
 
@@ -92,6 +93,12 @@ class TruncatedNormal(_Bounded):
     def _within_reach(self) -> TruncatedNormal:
         if not self.low <= self.mean <= self.high:
             raise ValueError(f"mean = {self.mean:g}: must be from low = {self.low:g} to high = {self.high:g}")
+        widest = _MOST_DEVIATIONS * (self.high - self.low)
+        if self.deviation > widest:  # the probabilities within the bounds would cancel
+            raise ValueError(
+                f"deviation = {self.deviation:g}: must be at most {widest:g}, {_MOST_DEVIATIONS:g} times the "
+                "distance of the bounds; a wider one is uniform"
+            )
         return self
 
     def values(self, points: ArrayLike) -> NDArray[np.float64]:

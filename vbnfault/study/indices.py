@@ -414,8 +414,6 @@ def _add_delta(arrays: dict[str, tuple[tuple[str, ...], _Array]], results: Resul
     analyze = salib("analyze.delta", "design.method = 'latin_hypercube'").analyze
     design, table = results.design, results.design.spec.design
     problem = unit_problem(design.spec)
-    # SALib's names: it refuses those that end like the columns of its result
-    problem["names"] = [f"x{i}" for i in range(problem["num_vars"])]
     seeds, views, _, models = design.shape
     shape = (len(results.metrics), models, problem["num_vars"], seeds * views)
     values = {name: np.full(shape, np.nan) for name in ("delta_raw", "delta_raw_conf", "S1", "S1_conf")}
