@@ -171,7 +171,7 @@ def test_an_inline_drawing_has_themed_colours_and_identifiers_of_its_own() -> No
 
 
 def test_a_study_writes_its_report(tmp_path: Path) -> None:
-    spec = study_kit.spec(design={"n": 128, "half_width": 0.4}, metrics={"names": ["y"]})
+    spec = study_kit.spec(design={"n": 128, "resamples": 100, "half_width": 0.4}, metrics={"names": ["y"]})
     vbnfault.study(spec, tmp_path, evaluator=study_kit.Function, progress=False)
     text = (tmp_path / "report.html").read_text(encoding="utf-8")
     words = " ".join(Page(text).text.split())

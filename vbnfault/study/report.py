@@ -21,7 +21,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.images import srgb8, write_png
+from ..core.images import write_png
 from . import sheets
 from .plots import drawings, save
 from .report_words import FORMULAE, SECTIONS
@@ -41,6 +41,7 @@ _SIDES = (512, 400, 320, 256, 192, 128)  # of the images in the page, px; the fi
 _NARROW_PT = 340.0  # a wider figure shrinks to this fraction of its size, and then scrolls on a small screen:
 _LEAST_SCALE = 0.78
 _WHITE = 0.998  # quantile of a pair of images that is shown as white
+_LINEAR = 0.1  # of the median of a pair: below it, grey values are proportional to electrons
 _MOST_ROWS = 30  # of failed evaluations and of missed half-widths
 _MOST_LEADING = 4  # factors that the summary names for each metric
 
@@ -115,7 +116,8 @@ def write_images(
 ) -> list[Path]:
     """Write the images with the best and the worst value of each metric to `images`; return their paths.
 
-    The two images of a metric have one exposure: the larger of their 99.8 % quantiles is white. An evaluator
+    The two images of a metric have one exposure and one tone curve, arcsinh (Lupton et al. 2004, doi
+    10.1086/382245), which shows ghosts and ground beside the Sun: the 99.8 % quantile of both is white. An evaluator
     without the method `picture`, and a metric whose values are all equal, give none.
 
     Parameters
@@ -153,12 +155,21 @@ def write_images(
         if extremes is None:
             continue
         pair = {"best": image(extremes.best_row), "worst": image(extremes.worst_row)}
-        level = max(float(np.quantile(each, _WHITE)) for each in pair.values())
+        white, dark = _levels(list(pair.values()))
         (Path(folder) / IMAGES).mkdir(parents=True, exist_ok=True)
         for name, each in pair.items():
             path = Path(folder) / IMAGES / f"{metric}_{name}.png"
-            paths.append(write_png(path, srgb8(np.nan_to_num(each) / (level if level > 0 else 1.0))))
+            grey = np.arcsinh(np.nan_to_num(each) / dark) / np.arcsinh(white / dark)
+            paths.append(write_png(path, np.rint(255 * np.clip(grey, 0, 1)).astype(np.uint8)))
     return paths
+
+
+def _levels(images: Sequence[NDArray[np.float32]]) -> tuple[float, float]:
+    """Return the level that is shown as white, and the one below which the tone curve of a pair is linear."""
+    both = np.concatenate([np.nan_to_num(image).ravel() for image in images])
+    white, middle = (float(level) for level in np.quantile(both, [_WHITE, 0.5]))
+    white = white if white > 0 else 1.0
+    return white, min(max(_LINEAR * middle, white * 1e-5), white)
 
 
 # ------------------------------------------------------------------------------------ figures and images
@@ -291,8 +302,9 @@ def _page(results: StudyResults, figures: Sequence[_Figure], images: Path) -> st
     pictures = _images(results, images)
     if pictures:
         how = (
-            "Each pair shows the evaluations with the best and the worst value of a metric, with one exposure for "
-            "both. What differs between the two images is therefore real light, not the display."
+            "Each pair shows the evaluations with the best and the worst value of a metric, with one exposure "
+            "and one curve of brightness (arcsinh), which shows faint light beside the Sun. What differs between "
+            "the two images is therefore light, not the display."
         )
         parts.append(("images", "Best and worst images", f'<p class="how">{_e(how)}</p>{pictures}'))
     parts += [
