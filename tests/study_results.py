@@ -197,6 +197,11 @@ def _indices(plan: Plan, table: pa.Table, generator: np.random.Generator) -> xr.
         found = noisy(0.6 * total) + 0.04
         variables["delta"] = (dims, found)
         variables["delta_interval"] = ((*dims, "bound"), interval(found))
+        variables["S1"], variables["S1_interval"] = (dims, noisy(first)), ((*dims, "bound"), interval(first))
+    elif plan.method == "grid":
+        variables["S1"], variables["ST"] = (dims, first), (dims, total)
+    else:
+        variables["range"] = (dims, first)
     values = {
         name: np.asarray(table.column(name).to_numpy(zero_copy_only=False), float) for name, *_ in plan.metrics
     }

@@ -191,7 +191,7 @@ METHODS = {
     "sobol": {"indices", "seeds", "tornado", "responses", "interactions"},
     "morris": {"indices", "morris", "tornado", "responses"},
     "latin_hypercube": {"indices", "tornado", "responses"},
-    "grid": {"tornado", "responses"},
+    "grid": {"indices", "tornado", "responses", "interactions"},
     "one_at_a_time": {"tornado", "responses"},
 }
 

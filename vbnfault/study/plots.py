@@ -175,7 +175,7 @@ def indices(results: StudyResults, metric: str) -> tuple[Figure, str] | None:
     label_rows(axes, labels, separate_last=True)
     everything = np.concatenate(values, axis=1) / 10.0**exponent
     low, high = _index_limits(everything[0], everything[1:], bool(shares))
-    label = "fraction of the variance" if results.has("ST") or results.has("S1") else "delta (no unit)"
+    label = "index (no unit)" if results.has("delta") else "fraction of the variance"
     if not shares:
         label = with_unit("μ*", results.about(metric, "unit"), exponent)
     for k, one in enumerate(axes):

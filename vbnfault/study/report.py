@@ -117,8 +117,8 @@ def write_images(
     """Write the images with the best and the worst value of each metric to `images`; return their paths.
 
     The two images of a metric have one exposure and one tone curve, arcsinh (Lupton et al. 2004, doi
-    10.1086/382245), which shows ghosts and ground beside the Sun: the 99.8 % quantile of both is white. An evaluator
-    without the method `picture`, and a metric whose values are all equal, give none.
+    10.1086/382245), which shows ghosts and ground beside the Sun: the 99.8 % quantile of both is white. An
+    evaluator without the method `picture`, and a metric whose values are all equal, give none.
 
     Parameters
     ----------
@@ -375,7 +375,7 @@ def _summary(results: StudyResults) -> str:
 
 def _leading(results: StudyResults, metric: str, model: str) -> str:
     """Return the most important factors of a metric as text, or why there is none."""
-    name = next((n for n in ("ST", "S1", "delta", "mu_star") if results.has(n)), None)
+    name = next((n for n in ("ST", "delta", "S1", "mu_star") if results.has(n)), None)
     if name is None:
         points = results.points(metric, model)
         swings = {factor: points.swing(factor).size for factor in results.factors} if points.values.size else {}
@@ -521,7 +521,7 @@ def _quality(results: StudyResults) -> str:
 def _missed(results: StudyResults) -> str:
     """Return the total indices whose intervals are wider than the study asked for."""
     asked = results.spec["design"].get("half_width")
-    if asked is None or "ST_interval" not in results.dataset:
+    if not asked or "ST_interval" not in results.dataset:
         return "<p>The study asked for no width of the intervals.</p>"
     bounds = results.dataset["ST_interval"]
     half = (bounds.sel(bound="high") - bounds.sel(bound="low")) / 2

@@ -32,6 +32,12 @@ def _indices(results: StudyResults) -> str:
         "A factor whose interval overlaps the grey band, the noise floor, cannot be told from the dummy factor, "
         "which acts on nothing."
     )
+    if results.has("ST") and not results.has("ST_interval"):
+        return (
+            "Each dot is an index: the first-order index is the fraction of the variance that a factor causes "
+            "alone, and the total index adds its interactions with other factors. A grid gives both exactly for "
+            "its levels, so they have no interval."
+        )
     if results.has("ST"):
         return (
             f"Each dot is an index with its {level} interval: the first-order index is the fraction of the "
@@ -40,8 +46,9 @@ def _indices(results: StudyResults) -> str:
         )
     if results.has("delta"):
         return (
-            f"Each dot is delta with its {level} interval: how much knowing the factor changes the distribution "
-            f"of the metric, from 0 (not at all) to 1. {floor}"
+            f"Each dot is an index with its {level} interval: delta says how much knowing the factor changes the "
+            "distribution of the metric, from 0 (not at all) to 1, and the first-order index is the fraction of "
+            f"the variance that the factor causes alone. {floor}"
         )
     return (
         f"Each dot is μ*, with its {level} interval: the mean absolute change of the metric when the factor moves "

@@ -336,10 +336,10 @@ class StudyResults:
     def importance(self) -> tuple[str, xr.DataArray]:
         """Return by which index factors are ordered, in words, and its values (metric, model, factor).
 
-        It is the total index where the design gives it, otherwise the first-order index or delta. Mean absolute
+        It is the total index where the design gives it, otherwise delta or the first-order index. Mean absolute
         elementary effects and swings have units, so they are divided by the largest of their metric and model.
         """
-        for name, words in (("ST", "total index"), ("S1", "first-order index"), ("delta", "delta")):
+        for name, words in (("ST", "total index"), ("delta", "delta"), ("S1", "first-order index")):
             if self.has(name):
                 return words, self.dataset[name]
         if self.has("mu_star"):
