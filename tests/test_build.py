@@ -157,6 +157,19 @@ def test_another_scene_is_refused_and_says_what_differs(tmp_path: Path) -> None:
         run(out, spec=make_spec(attributes={**scene, "created": "2031"}))
     assert "scene.body.name is '67P' in the store and '1P' now" in str(e.value)
     assert "scene.sun.deg is absent in the store and [1, 2] now" in str(e.value)
+    effect = {
+        "name": "glow",
+        "note": "a text too long to be shown as a whole, and whose end is ",
+        "level": 1,
+    }
+    nested = {**make_spec().attributes, "detector": {"effects": [effect]}}
+    run(tmp_path / "b.zarr", spec=make_spec(attributes=nested))
+    other = {**effect, "level": 2, "note": f"{effect['note']}another"}
+    nested = {**nested, "detector": {"effects": [other]}}
+    with pytest.raises(InputError) as deep:
+        run(tmp_path / "b.zarr", spec=make_spec(attributes=nested))
+    assert "detector.effects[0].level is 1 in the store and 2 now" in str(deep.value)
+    assert "and whose end is another' now" in str(deep.value)
     assert str(e.value).index("scene.body") < str(e.value).index("scene_hash")
     with pytest.raises(InputError, match="height is 24 in the store and 32 now"):
         run(out, spec=make_spec(32, width=32))

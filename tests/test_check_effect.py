@@ -92,8 +92,9 @@ def define(kind: str, body: dict[str, Any]) -> type[Effect]:
     return made
 
 
-def test_an_effect_that_keeps_the_contract_passes() -> None:
+def test_an_effect_that_keeps_the_contract_passes(capsys: pytest.CaptureFixture[str]) -> None:
     check_effect(define("good", {}))
+    assert capsys.readouterr().out == "detector effect broken_good: keeps the contract in 12 examples\n"
 
 
 @pytest.mark.parametrize("kind", BROKEN)

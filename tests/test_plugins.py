@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import json
 import pickle
 import re
 import subprocess
@@ -487,6 +488,11 @@ def test_a_ground_and_a_detector_effect_come_from_a_plugin(tmp_path: Path) -> No
     assert scene.body.photometry.model_dump()["power"] == 3
     camera = pipeline.Session(scene).base_camera
     assert [effect.model_dump() for effect in camera.mosaic.sensor.effects] == [{"level_e": 2000.0}]
+    assert any(
+        line.startswith("detector: mine with pedestal, cmos") for line in dataset.describe_scene(scene, source="a")
+    )
+    with pytest.raises(InputError, match=r"effects = .*effects belong in the sensor file, as \[effects.NAME\]"):
+        config.load_scene(file, {"effects.pedestal.level_e": 3.0})
     (tmp_path / "scene.pickle").write_bytes(pickle.dumps(scene))
     code = (
         f"import pickle; scene = pickle.load(open({str(tmp_path / 'scene.pickle')!r}, 'rb'))\n"
@@ -516,9 +522,11 @@ def test_a_sensor_with_an_effect_of_a_plugin_is_characterised(tmp_path: Path) ->
     refused = run(tmp_path, "detector", str(sensor), *small)
     assert refused.returncode == 2
     assert "--plugin" in refused.stderr
+    assert not out.exists()
     done = run(tmp_path, "detector", str(sensor), "--plugin", str(path), *small)
     assert done.returncode == 0, done.stderr
-    assert (out / "emva1288.json").is_file()
+    assert ", with pedestal" in done.stdout
+    assert json.loads((out / "emva1288.json").read_text())["effects"] == {"pedestal": {"level_e": 2000.0}}
 
 
 def test_a_plugin_that_defines_a_known_reflectance_is_refused(tmp_path: Path) -> None:

@@ -176,6 +176,9 @@ def test_a_file_is_not_replaced_unless_asked(tmp_path: Path) -> None:
         ("lens", "../a", r"new lens '\.\./a': must be letters, digits, hyphens and underscores"),
         ("lens", "", "new lens '': must be letters"),
         ("fault", "My-fault", "new fault 'My-fault': must be lower-case letters, digits and underscores"),
+        ("effect", "blooming", "new effect 'blooming': vbnfault has one of this name already; choose another"),
+        ("fault", "vignetting", "new fault 'vignetting': vbnfault has one of this name already"),
+        ("reflectance", "lambert", "new reflectance 'lambert': vbnfault has one of this name already"),
         ("effect", "lambda", "new effect 'lambda': must be .* and no keyword of Python"),
     ],
 )

@@ -244,9 +244,10 @@ def detector(
         points=points,
         stack=stack,
     )
+    _ = request.device  # a sensor file that is refused leaves no folder behind
     with writing(out):  # before the work
         out.mkdir(parents=True, exist_ok=True)
-    with typer.progressbar(length=request.images, label="images", file=sys.stderr) as bar:
+    with typer.progressbar(length=request.images, label=f"{request.images} images", file=sys.stderr) as bar:
         report = sensor_report.measure(request, bar.update)
     typer.echo(report.title)
     for line in report.lines():

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core import frames
+from ..detector import Detector
 from ..pipeline import Session
 from ..pipeline.exposure import reference_exposure_s
 from ..scene import plan
@@ -150,7 +151,8 @@ def _camera(session: Session) -> list[str]:
     return [
         f"camera: {camera.width_px} x {camera.height_px} px, {settings.fov_deg:g} deg across; "
         f"lens: {camera.lens.figures['summary']}",
-        f"detector: {camera.detector.name}, {', '.join(architectures)}; exposure: {exposure}",
+        f"detector: {camera.detector.name}{_effects(camera.detector)}, {', '.join(architectures)}; "
+        f"exposure: {exposure}",
     ]
 
 
@@ -168,3 +170,9 @@ def _bounds(pair: tuple[float, float] | None) -> str:
     """Return bounds as text. The bounds are never None, because the scene is resolved."""
     assert pair is not None
     return _range(*pair)
+
+
+def _effects(detector: Detector) -> str:
+    """Return the effects of plug-ins that act in a detector, as a clause."""
+    names = [] if detector.mosaic is None else [effect.name for effect in detector.mosaic.sensor.effects]
+    return f" with {' and '.join(names)}" if names else ""

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterator, Mapping, Sequence
-from typing import Any
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple
 
 from .. import store as store_module
 from ..core.errors import InputError
@@ -68,10 +68,8 @@ def check_same_scene(
 
     `accept_versions`: other versions of the libraries are no difference.
     """
-    stored, wanted = _flat(store.spec), _flat(spec)
-    absent = object()
-    differing = [key for key in {**wanted, **stored} if stored.get(key, absent) != wanted.get(key, absent)]
-    if differing and all(key.startswith("versions.") or key == "scene_hash" for key in differing):
+    differing = list(_differences(_compared(store.spec), _compared(spec)))
+    if differing and all(d.key.startswith("versions.") or d.key == "scene_hash" for d in differing):
         if not accept_versions and spec.attributes.get("versions") not in versions.known(store.attributes):
             changed = versions.differences(store.attributes, spec.attributes)
             raise InputError(
@@ -82,10 +80,8 @@ def check_same_scene(
         differing = []
     if differing:
         # keys of the scene first: they tell a user more than the hashes that follow from them
-        differing.sort(key=lambda key: (not key.startswith("scene."), "hash" in key, key))
-        first = [
-            f"{key} is {_shown(stored, key)} in the store and {_shown(wanted, key)} now" for key in differing[:4]
-        ]
+        differing.sort(key=lambda d: (not d.key.startswith("scene."), "hash" in d.key, d.key))
+        first = [d.text for d in differing[:4]]
         more = f", and {len(differing) - 4} more" if len(differing) > 4 else ""
         raise InputError(
             f"{store.path}: holds another dataset: {'; '.join(first)}{more}; "
@@ -109,25 +105,68 @@ _NOT_COMPARED = {
 }
 
 
-def _flat(spec: StoreSpec) -> dict[str, Any]:
-    """Return what a store and a scene must have in common: each value of a spec by its dotted key."""
+_ABSENT = object()
+_LONGEST_VALUE = 60
+
+
+class _Difference(NamedTuple):
+    """Hold one value that differs between a store and a scene, with its dotted key."""
+
+    key: str
+    stored: Any
+    wanted: Any
+
+    @property
+    def text(self) -> str:
+        """Return the difference in words; long values begin shortly before the part that differs."""
+        texts = ["absent" if value is _ABSENT else repr(value) for value in (self.stored, self.wanted)]
+        equal = next((k for k, pair in enumerate(zip(*texts, strict=False)) if pair[0] != pair[1]), 0)
+        start = max(0, equal - _LONGEST_VALUE // 3)
+        stored, wanted = (_part(text, start) for text in texts)
+        return f"{self.key} is {stored} in the store and {wanted} now"
+
+
+def _part(text: str, start: int) -> str:
+    """Return a text of at most `_LONGEST_VALUE` characters whole, and of a longer one a part from `start`."""
+    if len(text) <= _LONGEST_VALUE:
+        return text
+    start = min(start, len(text) - _LONGEST_VALUE + 6)
+    before, rest = ("..." if start else ""), text[start:]
+    size = _LONGEST_VALUE - 6
+    return f"{before}{rest[:size]}{'...' if len(rest) > size else ''}"
+
+
+def _compared(spec: StoreSpec) -> dict[str, Any]:
+    """Return what a store and a scene must have in common, as plain data."""
     everything = json.loads(json.dumps({**spec.attributes, **spec.plain()}))
-    return dict(_flatten({key: value for key, value in everything.items() if key not in _NOT_COMPARED}))
+    return {key: value for key, value in everything.items() if key not in _NOT_COMPARED}
 
 
-def _shown(values: Mapping[str, Any], key: str) -> str:
-    """Return a value as text of at most 60 characters, or `absent`."""
-    text = repr(values[key]) if key in values else "absent"
-    return text if len(text) <= 60 else text[:57] + "..."
+def _differences(stored: Any, wanted: Any, key: str = "") -> Iterator[_Difference]:
+    """Yield the values that differ, each by its deepest key: `table.key`, and `key[2]` within a list."""
+    if isinstance(stored, dict) and isinstance(wanted, dict):
+        for name in {**wanted, **stored}:
+            below = f"{key}.{name}" if key else str(name)
+            yield from _differences(stored.get(name, _ABSENT), wanted.get(name, _ABSENT), below)
+    elif wanted is _ABSENT and isinstance(stored, dict) and stored:
+        yield from _differences(stored, {}, key)
+    elif stored is _ABSENT and isinstance(wanted, dict) and wanted:
+        yield from _differences({}, wanted, key)
+    elif _same_length(stored, wanted) and (_has_parts(stored) or _has_parts(wanted)):
+        for k, pair in enumerate(zip(stored, wanted, strict=True)):
+            yield from _differences(*pair, f"{key}[{k}]")
+    elif stored is _ABSENT or wanted is _ABSENT or stored != wanted:
+        yield _Difference(key, stored, wanted)
 
 
-def _flatten(value: Any, key: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield each value of nested tables with its dotted key."""
-    if isinstance(value, dict) and value:
-        for name, inner in value.items():
-            yield from _flatten(inner, f"{key}.{name}" if key else str(name))
-    else:
-        yield key, value
+def _same_length(stored: Any, wanted: Any) -> bool:
+    """Return whether two values are lists of one length."""
+    return isinstance(stored, list) and isinstance(wanted, list) and len(stored) == len(wanted)
+
+
+def _has_parts(values: list[Any]) -> bool:
+    """Return whether a list is better compared item by item: it has tables or lists, or is long."""
+    return len(repr(values)) > _LONGEST_VALUE or any(isinstance(value, dict | list) for value in values)
 
 
 def _sum_text(values: Sequence[int]) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -68,6 +69,13 @@ class SensorRequest:
         if self.pixels < _LEAST_PIXELS:
             raise InputError(f"pixels = {self.pixels}: must be at least {_LEAST_PIXELS}")
 
+    @cached_property
+    def device(self) -> Device:
+        """Return the device to measure. Raises InputError if the sensor file is refused."""
+        sensor = load_sensor(self.sensor)
+        shape = min(self.pixels, sensor.height_px), min(self.pixels, sensor.width_px)
+        return Device(sensor, self.individual, shape=shape, temperature_K=self.temperature_K)
+
     @property
     def settings(self) -> Settings:
         """Return the numbers of light levels and of images of the measurement."""
@@ -81,10 +89,14 @@ class SensorRequest:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SensorReport:
-    """Hold the results of a measurement, one for each channel."""
+    """Hold the results of a measurement, one for each channel.
+
+    `effects` are those of plug-ins that act in the sensor, each with its keys.
+    """
 
     request: SensorRequest
     sensor: str
+    effects: Mapping[str, Mapping[str, Any]]
     temperature_K: float
     channels: Mapping[str, Characterisation]
 
@@ -92,6 +104,8 @@ class SensorReport:
     def title(self) -> str:
         """Return a line that names the sensor and the conditions."""
         title = f"{self.sensor}, individual {self.request.individual}, {self.temperature_K:g} K"
+        if self.effects:
+            title += f", with {' and '.join(self.effects)}"
         return title if self.request.wavelength_nm is None else f"{title}, {self.request.wavelength_nm:g} nm"
 
     def write(self, folder: Path) -> list[Path]:
@@ -102,6 +116,7 @@ class SensorReport:
         paths = [folder / "emva1288.json", folder / "emva1288.png"]
         table = {
             "detector": self.sensor,
+            "effects": self.effects,
             "individual": self.request.individual,
             "temperature_K": self.temperature_K,
             "wavelength_nm": self.request.wavelength_nm,
@@ -122,10 +137,7 @@ class SensorReport:
 
 def measure(request: SensorRequest, progress: Callable[[int], None] | None = None) -> SensorReport:
     """Characterise a sensor; `progress` is called with 1 after each image. Raises InputError."""
-    sensor = load_sensor(request.sensor)
-    shape = min(request.pixels, sensor.height_px), min(request.pixels, sensor.width_px)
-    device = Device(sensor, request.individual, shape=shape, temperature_K=request.temperature_K)
-    camera = VirtualCamera(device, wavelength_nm=request.wavelength_nm)
+    camera = VirtualCamera(request.device, wavelength_nm=request.wavelength_nm)
     channels = characterise(
         camera,
         sites=camera.sites,
@@ -133,7 +145,13 @@ def measure(request: SensorRequest, progress: Callable[[int], None] | None = Non
         settings=request.settings,
         progress=progress,
     )
-    return SensorReport(request=request, sensor=sensor.name, temperature_K=device.temperature_K, channels=channels)
+    return SensorReport(
+        request=request,
+        sensor=request.device.sensor.name,
+        effects={effect.name: effect.model_dump(mode="json") for effect in request.device.sensor.effects},
+        temperature_K=request.device.temperature_K,
+        channels=channels,
+    )
 
 
 def draw(channels: Mapping[str, Characterisation], title: str, path: Path) -> None:

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import keyword
 import re
+from collections.abc import Collection
 from pathlib import Path
 
+from .. import faults, reflectance
 from ..core.errors import InputError, shown
+from ..detector import effects
 
 _FOLDER = Path(__file__).parent / "templates"
 # Kind of file → its template. In a template, my_KIND stands for the user's name, and MyKind for that of the class.
@@ -22,6 +25,17 @@ KINDS = tuple(_TEMPLATES)
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}")
 # The name of a plug-in's class is a key of TOML files, and its file a Python module.
 _PLUGIN_NAME = re.compile(r"[a-z][a-z0-9_]{0,63}")
+
+
+def _taken(kind: str) -> Collection[str]:
+    """Return the names that a plug-in's class of this kind may not have."""
+    if kind == "fault":
+        return {name for name, models in faults.registry().items() if any(map(faults.is_packaged, models.values()))}
+    if kind == "effect":
+        return {name for name, cls in effects.registry().items() if effects.is_packaged(cls)}
+    if kind == "reflectance":
+        return {name for name, cls in reflectance.registry().items() if reflectance.is_packaged(cls)}
+    return ()
 
 
 def write_template(kind: str, name: str, folder: Path, *, overwrite: bool = False) -> Path:
@@ -42,7 +56,7 @@ def write_template(kind: str, name: str, folder: Path, *, overwrite: bool = Fals
     Raises
     ------
     InputError
-        If kind or name cannot be used, the file exists, or it cannot be written.
+        If kind or name cannot be used or is vbnfault's own, the file exists, or it cannot be written.
     """
     if kind not in _TEMPLATES:
         raise InputError(f"new {shown(kind)}: must be one of {', '.join(_TEMPLATES)}")
@@ -55,6 +69,8 @@ def write_template(kind: str, name: str, folder: Path, *, overwrite: bool = Fals
         )
     if not _NAME.fullmatch(name):
         raise InputError(f"new {kind} {shown(name)}: must be letters, digits, hyphens and underscores, at most 64")
+    if name in _taken(kind):
+        raise InputError(f"new {kind} {shown(name)}: vbnfault has one of this name already; choose another name")
     text = source.read_text(encoding="utf-8").replace(f"my_{kind}", name)
     class_name = "".join(word.capitalize() for word in name.split("_"))
     path = folder / f"{name}{ending}"

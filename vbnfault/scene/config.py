@@ -130,6 +130,11 @@ def parse_scene(table: Mapping[str, Any], *, source: str, overrides: Sequence[st
 
     `overrides` are the dotted keys that replaced values of `source`; the message marks them.
     """
+    if "effects" in table:
+        raise InputError(
+            f"{source}: effects = {shown(table['effects'])}: effects belong in the sensor file, as [effects.NAME]; "
+            "name that file by camera.detector"
+        )
     camera: Any = table.get("camera")
     for key in OF_A_SENSOR_FILE if isinstance(camera, Mapping) else ():
         if key in camera:

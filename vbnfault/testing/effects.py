@@ -62,7 +62,7 @@ class _Recorded(Exposure):
 def check_effect(
     effect: type[Effect], *, required: Mapping[str, Any] | None = None, examples: int = 12, seed: int = 0
 ) -> None:
-    """Check that a detector effect keeps the contract of `Effect`.
+    """Check that a detector effect keeps the contract of `Effect`, and print a line if it does.
 
     Each example draws the keys of the table `[effects.NAME]` within their limits, a small device, a signal as it is
     at the effect's place in the chain, and an exposure with or without noise. The effect
@@ -111,6 +111,7 @@ def check_effect(
                 f"{title}: {text} (example {k} of seed {seed}: keys {table}; {exposure.sensor.name}, "
                 f"{exposure.sensor.architecture}, {exposure.exposure_s:.3g} s, {noise})"
             ) from error
+    print(f"{title}: keeps the contract in {examples} examples")
 
 
 # --- the class ------------------------------------------------------------------------------------------------

@@ -39,7 +39,7 @@ class _NotInformed:
 def check_fault(
     model: type[Fault], *, required: Mapping[str, Any] | None = None, examples: int = 12, seed: int = 0
 ) -> None:
-    """Check that a fault model keeps the contract of `Fault`.
+    """Check that a fault model keeps the contract of `Fault`, and print a line if it does.
 
     Each example draws the keys of the scene file within their declared bounds, a small camera and a random image.
 
@@ -87,6 +87,7 @@ def check_fault(
                 f"{camera.width_px} x {camera.height_px} px, {camera.architecture}, "
                 f"read out {camera.readout_direction}, Sun at {context.sun_xy_px})"
             ) from error
+    print(f"{name}: keeps the contract in {examples} examples")
 
 
 def draw_table(model: type[Fault], rng: np.random.Generator) -> dict[str, Any]:
