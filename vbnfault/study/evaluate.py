@@ -3,7 +3,7 @@
     render ▶ direct image ▶ exposure ▶ ghosts, starburst, glare, veil ▶ metrics
 
 A view is rendered once; optics, Sun and detector act on its radiance. The results of each stage are kept with all
-that the stage depends on (`Kept`), a few of them at a time, so that the result of an evaluation does not depend on
+that the stage depends on (`kept`), a few of them at a time, so that the result of an evaluation does not depend on
 those before it. In a Sobol design the points AB differ from their point A in one factor, so most of their stages
 are found there.
 
@@ -20,12 +20,10 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
-import time
-from collections import Counter, OrderedDict
 from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,10 +31,9 @@ from numpy.typing import NDArray
 from ..camera import Camera
 from ..core import spectra
 from ..core.errors import InputError
-from ..core.quantities import BODY, Electrons, Radiance, SunInView
-from ..core.sundisc import Pinhole, add_mean
+from ..core.quantities import Electrons
 from ..core.tables import did_you_mean
-from ..faults import Fault, FaultContext, act, from_dict, registry
+from ..faults import Fault, act, from_dict, registry
 from ..lens import Prescription
 from ..lens.changes import changed
 from ..lens.footprint import ImageFrame
@@ -45,138 +42,34 @@ from ..lens.straylight.settings import GhostSettings, SensorGrid
 from ..lens.straylight.total import SunlightInLens
 from ..lens.thin import cos4_map
 from ..pipeline.exposure import exposure_s
-from ..pipeline.injection import fault_context, inject_faults
+from ..pipeline.injection import inject_faults
 from ..pipeline.rendering import render_view
 from ..pipeline.resolve import resolve
 from ..pipeline.session import Session
-from ..pipeline.spec import Injection, Pose, Rendering, SampleSpec, SceneExposure, SceneLight
+from ..pipeline.spec import Injection, SampleSpec, SceneExposure
 from ..pipeline.stars import add_stars
 from ..scene.config import Scene, load_scene
 from . import image_metrics
 from .factors import AFTER_RENDER, Factors, Setting
 from .image_metrics import LitImage
+from .kept import Kept
 from .spec import Evaluation, Metric, StudySpec
+from .views import (
+    Exposed,
+    RenderedView,
+    camera_shape,
+    dark_e,
+    efficiency_key,
+    lit_pixels,
+    planes_of,
+    scene_rate,
+    sun_rate,
+    with_detector,
+    with_sun,
+)
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
-T = TypeVar("T")
-
-_LIT = 0.02  # of the 99th percentile of the ground's signal, above which ground counts as sunlit
-# How many results of each stage are kept beside those of the base row A of a Sobol design; default: two.
-_KEPT = {"render": 1, "exposure": 8}
-
-
-class Kept:
-    """Keep the last results of each stage, and count and time the computations.
-
-    Attributes
-    ----------
-    events
-        How often each stage was computed.
-    seconds
-        How long that took.
-    """
-
-    def __init__(self) -> None:
-        self.events: Counter[str] = Counter()
-        self.seconds: dict[str, float] = {}
-        self._results: dict[str, OrderedDict[Hashable, Any]] = {}
-        self._held: dict[str, set[tuple[str, Hashable]]] = {}
-        self._holder: str | None = None
-
-    @contextlib.contextmanager
-    def holding(self, holder: str) -> Iterator[None]:
-        """Hold what a block uses until the next block of the same holder, in place of what that one used."""
-        self._held[holder], self._holder = set(), holder
-        try:
-            yield
-        finally:
-            self._holder = None
-
-    def once(self, stage: str, key: Hashable, make: Callable[[], T], part: str = "") -> T:
-        """Return `make()` for a key, from the last results of the stage where it was computed before.
-
-        `part` separates results of one stage that have keys of their own.
-        """
-        name = f"{stage}/{part}"
-        results = self._results.setdefault(name, OrderedDict())
-        if self._holder is not None:
-            self._held[self._holder].add((name, key))
-        if key not in results:
-            with self.timed(stage):
-                results[key] = make()
-            if not part:
-                self.events[stage] += 1
-        value: T = results[key]
-        results.move_to_end(key)
-        held = set().union(*self._held.values())
-        loose = [other for other in results if (name, other) not in held]
-        for other in loose[: max(len(loose) - _KEPT.get(stage, 2), 0)]:
-            del results[other]
-        return value
-
-    def release(self, holder: str) -> None:
-        """Stop holding what a block used."""
-        self._held.pop(holder, None)
-
-    @contextlib.contextmanager
-    def timed(self, stage: str) -> Iterator[None]:
-        """Add the duration of a block to a stage."""
-        start = time.perf_counter()
-        try:
-            yield
-        finally:
-            self.seconds[stage] = self.seconds.get(stage, 0.0) + time.perf_counter() - start
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class View:
-    """Hold a rendered view: its sample, pose and radiance."""
-
-    spec: SampleSpec
-    pose: Pose
-    rendering: Rendering
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Exposed:
-    """Hold a view with the camera and the Sun of one evaluation.
-
-    Attributes
-    ----------
-    spec, pose, rendering, exposure
-        As the pipeline has them, with the camera and the Sun changed.
-    clean
-        Expected signal without straylight, float32[channel, y, x] in electrons.
-    lit
-        Indices of the pixels that show sunlit ground.
-    key
-        All that `clean` depends on.
-    """
-
-    spec: SampleSpec
-    pose: Pose
-    rendering: Rendering
-    exposure: SceneExposure
-    scene_e: F32
-    direct_e: F32 | None
-    lit: NDArray[np.intp]
-    key: Hashable
-
-    @property
-    def camera(self) -> Camera:
-        """Return the camera with its exposure."""
-        return self.exposure.camera
-
-    @cached_property
-    def clean(self) -> F32:
-        """Return the expected signal without straylight, float32[channel, y, x] in electrons."""
-        return self.scene_e if self.direct_e is None else self.scene_e + self.direct_e
-
-    @cached_property
-    def context(self) -> FaultContext:
-        """Return the sample as its faults see it."""
-        return fault_context(self.pose, self.rendering, self.exposure)
 
 
 class SceneEvaluator:
@@ -364,7 +257,7 @@ class SceneEvaluator:
             scene: Scene = self.factors.scene_of(evaluation.seed, evaluation.model, changes)
         return scene
 
-    def _view(self, evaluation: Evaluation, scene: Scene) -> View:
+    def _view(self, evaluation: Evaluation, scene: Scene) -> RenderedView:
         """Return a view, rendered where this was not done before for what the renderer reads of the scene."""
         key = self._render_key(scene), evaluation.view
         return self.kept.once("render", key, lambda: self._rendered(key[0], scene, evaluation.view))
@@ -377,7 +270,7 @@ class SceneEvaluator:
             self._render_keys[id(scene)] = (scene, _render_key(scene))
         return self._render_keys[id(scene)][1]
 
-    def _rendered(self, key: Hashable, scene: Scene, index: int) -> View:
+    def _rendered(self, key: Hashable, scene: Scene, index: int) -> RenderedView:
         """Render a view."""
         if self._session is None or self._session[0] != key:
             self._session = None  # release the old terrain first
@@ -389,7 +282,7 @@ class SceneEvaluator:
             )
         spec = session.spec(index)
         pose = resolve(spec, 0)
-        return View(spec=spec, pose=pose, rendering=render_view(spec, pose))
+        return RenderedView(spec=spec, pose=pose, rendering=render_view(spec, pose))
 
     def _exposed(self, evaluation: Evaluation, setting: Setting) -> Exposed:
         """Return the view of an evaluation with its camera, its Sun and its exposure."""
@@ -397,15 +290,15 @@ class SceneEvaluator:
         view = self._view(evaluation, scene)
         spec = replace(view.spec, scene=scene, faults=_faults(scene))
         camera = self._camera(spec, setting)
-        pose, rendering = _with_sun(view, camera, setting.sun)
+        pose, rendering = with_sun(view, camera, setting.sun)
         far = setting.sun.get("distance_au")
         place = evaluation.seed, evaluation.view, self._render_key(scene)
-        optics = (*place, camera.lens, _efficiency(camera))
+        optics = (*place, camera.lens, efficiency_key(camera))
         per_s = self.kept.once(
-            "direct image", (*optics, far), lambda: _scene_rate(camera, rendering.light.rendered), "scene"
+            "direct image", (*optics, far), lambda: scene_rate(camera, rendering.light.rendered), "scene"
         )
         sun_key = (*optics, tuple(sorted(setting.sun.items())))
-        direct = self.kept.once("direct image", sun_key, lambda: _sun_rate(camera, rendering.light.rendered))
+        direct = self.kept.once("direct image", sun_key, lambda: sun_rate(camera, rendering.light.rendered))
         white = camera.detector.white_e
         rate = Electrons(array=per_s, white_e=white, past_rims=direct)
         metered = self.kept.once(
@@ -417,11 +310,11 @@ class SceneEvaluator:
         planes = self.kept.once(
             "direct image",
             (*sun_key, metered, white.tobytes()),
-            lambda: (_planes(per_s, metered), None if direct is None else _planes(direct, metered)),
+            lambda: (planes_of(per_s, metered), None if direct is None else planes_of(direct, metered)),
             "planes",
         )
         lit = self.kept.once(
-            "direct image", (*optics, far), lambda: _lit_pixels(per_s, rendering.truth.semantic), "lit"
+            "direct image", (*optics, far), lambda: lit_pixels(per_s, rendering.truth.semantic), "lit"
         )
         return Exposed(
             spec=spec,
@@ -431,12 +324,11 @@ class SceneEvaluator:
             scene_e=planes[0],
             direct_e=planes[1],
             lit=lit,
-            key=(*sun_key, metered),
         )
 
     def _camera(self, spec: SampleSpec, setting: Setting) -> Camera:
         """Return the camera of an evaluation without an exposure."""
-        camera = _with_detector(spec.camera, setting.detector)
+        camera = with_detector(spec.camera, setting.detector)
         changes = tuple(setting.lens)
         if not changes:
             return camera
@@ -470,7 +362,7 @@ class SceneEvaluator:
         return LitImage(
             clean=exposed.clean,
             lit=exposed.lit,
-            dark_e=_dark_e(camera),
+            dark_e=dark_e(camera),
             read_noise_e=detector.read_noise_e_rms,
             full_well_e=detector.full_well_e,
             white_e=detector.white_e,
@@ -596,7 +488,7 @@ class SceneEvaluator:
             for k, seen in enumerate(sequence):
                 spec = nav.spec_of_view(replace(view.spec, scene=scene, faults=_faults(scene)), k)
                 camera = self._camera(spec, setting)
-                pose, rendering = _with_sun(seen, camera, setting.sun)
+                pose, rendering = with_sun(seen, camera, setting.sun)
                 rate = camera.expose(rendering.light.rendered, 1.0)
                 seconds = exposure_s(scene, camera, rendering.truth, rate.merged)
                 exposed = SceneExposure(
@@ -627,7 +519,7 @@ class SceneEvaluator:
         evaluation = Evaluation(index=0, seed=seed, view=view, model=model, role="check", values=values)
         setting = self.factors.setting(values)
         changed(self._nominal_lens(self._nominal_camera), setting.lens)
-        _with_detector(self._nominal_camera, setting.detector)
+        with_detector(self._nominal_camera, setting.detector)
         self._scene(evaluation, setting)
 
     def _fingerprint(self, model: str, values: Mapping[str, float | str]) -> str:
@@ -648,14 +540,14 @@ class SceneEvaluator:
         return digest.hexdigest()
 
 
-def _rendered_sequence(view: View, count: int) -> list[View]:
+def _rendered_sequence(view: RenderedView, count: int) -> list[RenderedView]:
     """Return the views of a sequence that begins with a view."""
     from . import navigation_metrics as nav
 
     views = [view]
     for k, pose in enumerate(nav.sequence(view.spec, view.pose, view.rendering, count)[1:], start=1):
         spec = nav.spec_of_view(view.spec, k)
-        views.append(View(spec=spec, pose=pose, rendering=render_view(spec, pose)))
+        views.append(RenderedView(spec=spec, pose=pose, rendering=render_view(spec, pose)))
     return views
 
 
@@ -706,140 +598,6 @@ def _value(factor: Any, point: float) -> float | str:
     """Return the value of a factor at a point of the unit interval."""
     value = np.asarray(factor.values(np.array([point])), dtype=object).tolist()[0]
     return value if isinstance(value, str) else float(value)
-
-
-# --- camera and Sun ----------------------------------------------------------------------------------------------
-
-
-def camera_shape(camera: Camera) -> tuple[int, int]:
-    """Return (height, width) in pixels."""
-    return camera.height_px, camera.width_px
-
-
-def _with_detector(camera: Camera, changes: Mapping[str, Any]) -> Camera:
-    """Return a camera with changed keys of its detector."""
-    if not changes:
-        return camera
-    own: Any = camera.detector
-    if camera.detector.mosaic is None:
-        whole = {key: round(v) if key in ("adc_bits", "bias_dn") else v for key, v in changes.items()}
-        return replace(camera, detector=replace(own, **whole))
-    sensor: Any = camera.detector.mosaic.sensor
-    for key, value in changes.items():
-        sensor = _replaced(sensor, key.split("."), value)
-    return replace(camera, detector=replace(own, sensor=sensor))
-
-
-def _replaced(table: Any, keys: Sequence[str], value: Any) -> Any:
-    """Return a description with one value replaced, which nested descriptions may hold."""
-    first, *rest = keys
-    before = getattr(table, first)
-    if rest:
-        value = _replaced(before, rest, value)
-    elif isinstance(before, int) and not isinstance(before, bool) and float(value).is_integer():
-        value = int(value)
-    return replace(table, **{first: value})
-
-
-def _efficiency(camera: Camera) -> Hashable:
-    """Return all of the detector on which the expected electrons depend."""
-    own: Any = camera.detector
-    efficiency = own.efficiency if own.mosaic is None else own.sensor.efficiency
-    return efficiency, own.pixel_pitch_um, own.width_px, own.height_px
-
-
-def _dark_e(camera: Camera) -> F32 | float:
-    """Return the dark signal in electrons: of each pixel of a device with a mosaic, else the mean."""
-    if camera.detector.mosaic is None:
-        return camera.detector.dark_current_e_s * camera.exposure_s
-    return np.asarray(camera.mosaic.device.dark_rate_e_s * np.float32(camera.exposure_s), dtype=np.float32)
-
-
-def _with_sun(view: View, camera: Camera, sun: Mapping[str, float]) -> tuple[Pose, Rendering]:
-    """Return a view's pose and rendering with the Sun moved as the optics see it, and at another distance."""
-    pose, rendering = view.pose, view.rendering
-    if not sun:
-        return pose, rendering
-    direction_C = pose.L_from_C.T @ pose.sun_L
-    angle = np.arctan2(np.hypot(direction_C[0], direction_C[1]), direction_C[2])
-    azimuth = np.arctan2(direction_C[1], direction_C[0])
-    angle = np.radians(sun.get("angle_deg", np.degrees(angle)))
-    azimuth = np.radians(sun.get("azimuth_deg", np.degrees(azimuth)))
-    moved = np.array([np.sin(angle) * np.cos(azimuth), np.sin(angle) * np.sin(azimuth), np.cos(angle)])
-    if "angle_deg" not in sun and "azimuth_deg" not in sun:
-        moved = direction_C
-    source, scale = rendering.scene.sun, 1.0
-    if "distance_au" in sun:
-        before_au = spectra.SUN_RADIUS_M / (np.sin(source.angular_radius_rad) * spectra.AU_M)
-        scale = float((before_au / sun["distance_au"]) ** 2)
-        source = replace(
-            source,
-            irradiance_W_m2_nm=source.irradiance_W_m2_nm * scale,
-            angular_radius_rad=spectra.sun_angular_radius_rad(sun["distance_au"]),
-        )
-    sun_L = pose.L_from_C @ moved
-    source = replace(source, direction_L=sun_L)
-    light = rendering.light.rendered
-    array = light.array if light.sun is None else np.maximum(light.array - light.sun, 0)
-    disc = SunInView(
-        direction_C=moved,
-        angular_radius_rad=source.angular_radius_rad,
-        radiance_W_m2_sr_nm=source.radiance_W_m2_sr_nm,
-        limb_darkening=source.limb_darkening,
-        visible=np.full((1, 1), pose.sun_visible_fraction, np.float32)
-        if light.disc is None
-        else light.disc.visible,
-        blur_slope=0.0 if light.disc is None else light.disc.blur_slope,
-    )
-    array = array * np.float32(scale)
-    own: F32 | None = np.zeros_like(array)
-    assert own is not None
-    if add_mean(own, disc, Pinhole(rendering.scene.view.intrinsics), range(len(array))) is None:
-        own = None
-    radiance = replace(
-        light, array=array if own is None else array + own, sun=own, disc=None if own is None else disc
-    )
-    return (
-        replace(pose, sun_L=sun_L),
-        replace(
-            rendering,
-            scene=replace(rendering.scene, sun=source),
-            light=SceneLight(lens=rendering.light.lens, rendered=radiance),
-        ),
-    )
-
-
-def _scene_rate(camera: Camera, radiance: Radiance) -> F32:
-    """Return the electrons per second that the scene gives, without the Sun's disc, float32[y, x, channel]."""
-    scene = radiance
-    if radiance.sun is not None:
-        scene = replace(radiance, array=np.maximum(radiance.array - radiance.sun, 0), sun=None, disc=None)
-    return camera.detector.electrons_expected(camera.lens.image(scene), 1.0).array
-
-
-def _sun_rate(camera: Camera, radiance: Radiance) -> F32 | None:
-    """Return the electrons per second of the Sun's direct image, float32[y, x, channel]; None out of view."""
-    if radiance.sun is None:
-        return None
-    sun = replace(radiance, array=radiance.sun, sun=None)
-    on_sensor = camera.lens.image_of_sun(sun, camera.detector.pixel_pitch_um)
-    return camera.detector.electrons_expected(on_sensor, 1.0).array
-
-
-def _planes(per_s: F32, seconds: float) -> F32:
-    """Return electrons, float32[channel, y, x], from electrons per second, float32[y, x, channel]."""
-    planes = np.ascontiguousarray(np.moveaxis(per_s, -1, 0))
-    planes *= np.float32(seconds)
-    return planes
-
-
-def _lit_pixels(per_s: F32, semantic: NDArray[np.uint8]) -> NDArray[np.intp]:
-    """Return the indices of the pixels that show sunlit ground."""
-    ground = np.flatnonzero(semantic.ravel() == BODY)
-    level = per_s.reshape(-1, per_s.shape[-1])[ground].mean(axis=1)
-    if not len(level):
-        return ground
-    return ground[level > _LIT * np.percentile(level, 99)]
 
 
 def _added_by(fault: Fault, exposed: Exposed, params: Any) -> dict[str, Any]:

@@ -24,7 +24,8 @@ from ..prescription import Prescription
 from .bundles import Rays, Spots, TraceOptions, Tracer
 from .ghosts import Arrivals, boxes, named, traced
 from .paraxial import Ghost, along, mean_ghost
-from .raster import LEVELS, PARTS, BundleDrawing, Canvas, Pyramid, Sums, edge_kind
+from .pyramid import LEVELS, Canvas, Pyramid
+from .raster import PARTS, BundleDrawing, Sums, edge_kind
 from .settings import TRACED, GhostSettings, SensorGrid
 
 F32 = NDArray[np.float32]

@@ -12,30 +12,25 @@ depend on the order in which threads add.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from ...core.llvm import backend
 from .bundles import Spots, lattice_places, rounded
+from .pyramid import LEVELS, MARGIN, Canvas, Pyramid, summed
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
-LEVELS = 6
 PARTS = ("inner", "edge", "rough")
 # (a, b, c) of each part: light with an edge's profile is a + b × calm, light without it c × calm × rise
 _SHARES = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, -1.0], [1.0, -1.0, 0.0]])
-_MARGIN = 4  # pixels around each level, for cells that lie partly outside
 _UNITS = 2.0**36  # units of the integer sums per unit of irradiance
 _MOST = 1e5  # largest irradiance that one ghost adds to a pixel, far beyond white
-_CALM_SIGMA = 0.8  # sigma by which a coarser level is smoothed, in pixels of this level
 _SMALL = 0.5  # cells below this many pixels are added to the nearest pixels
 EDGE_LOW, EDGE_HIGH = -1.0, 5.0  # range of the profile of a soft edge, in widths of the edge
 _EDGE_NODES = 2049
@@ -46,25 +41,6 @@ _NARROW_PX = 1.5  # cells narrower than this are drawn by points
 _POINTS = 64  # largest number of points along each side of a cell
 _WANDER = 1.0  # largest distance of a cell's points beyond its corners, in sizes of the cell
 _EDGE_KINDS = 9
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Canvas:
-    """Describe a sensor of `shape` (height, width) pixels of `pitch_mm`, centred on the axis, in `bands` bands."""
-
-    shape: tuple[int, int]
-    pitch_mm: float
-    bands: int
-
-    @property
-    def sizes(self) -> NDArray[np.int64]:
-        """Return height and width of each level with its margins, int64[level, 2]."""
-        return np.array([[-(-n // 2**k) + 2 * _MARGIN for n in self.shape] for k in range(LEVELS)])
-
-    @property
-    def starts(self) -> NDArray[np.int64]:
-        """Return the index in a flat array at which each level begins, and the array's length, int64[level + 1]."""
-        return np.concatenate([[0], np.cumsum(self.sizes.prod(axis=1) * self.bands)])
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -306,60 +282,7 @@ class Sums:
 
     def irradiance(self) -> F32:
         """Return the sum of all levels, float32[band, y, x]."""
-        return _summed(self.canvas, self.levels().levels)
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Pyramid:
-    """Hold the irradiance of all ghosts in levels, float32[band, y, x] each, from the finest to the coarsest."""
-
-    canvas: Canvas
-    levels: tuple[F32, ...]
-
-    @cached_property
-    def flux_mm2(self) -> F64:
-        """Return the flux in the frame, float64[band]; coarse levels end at whole pixels of their own."""
-        flux = np.zeros(self.canvas.bands)
-        for k, level in enumerate(self.levels):
-            inside = level[:, _MARGIN : level.shape[1] - _MARGIN, _MARGIN : level.shape[2] - _MARGIN]
-            flux += inside.sum(axis=(1, 2), dtype=np.float64) * 4**k
-        return np.asarray(flux * self.canvas.pitch_mm**2)
-
-    def mixed(self, weights: F64) -> F32:
-        """Return sums over the bands with weights float64[channel, band], float32[channel, y, x].
-
-        The bands are added before the levels are resized, which is cheaper than `Sums.irradiance` for few channels.
-        """
-        mix = weights.astype(np.float32)
-        return _summed(self.canvas, [np.tensordot(mix, level, 1) for level in self.levels])
-
-
-def _summed(canvas: Canvas, levels: Sequence[F32]) -> F32:
-    """Return the sum of levels float32[layer, y, x] on the pixels of the frame, float32[layer, y, x]."""
-    out = np.empty((len(levels[0]), *canvas.shape), dtype=np.float32)
-
-    def resize(layer: int) -> None:
-        """Resize and add the levels of one layer, from the coarsest to the finest."""
-        below: F32 | None = None
-        for level in range(LEVELS - 1, -1, -1):
-            height, width = (int(v) for v in canvas.sizes[level])
-            here = levels[level][layer]
-            if below is not None:
-                # folds end in steps, which pixel centres sample unevenly
-                calm = cv2.GaussianBlur(below, (3, 3), _CALM_SIGMA)
-                bigger = cv2.resize(calm, None, fx=2, fy=2, interpolation=cv2.INTER_LINEAR)
-                # pixel 0 of a level covers two pixels of the finer level, -M·2 + M and the next
-                here = here + bigger[_MARGIN : _MARGIN + height, _MARGIN : _MARGIN + width]
-            below = here
-        assert below is not None
-        rows, columns = (slice(_MARGIN, _MARGIN + n) for n in canvas.shape)
-        # the parts are sampled on different lattices, so that their sum may be slightly negative
-        np.maximum(below[rows, columns], 0, out=out[layer])
-
-    # numpy and OpenCV release the interpreter's lock
-    with ThreadPoolExecutor(backend().dr.thread_count()) as pool:
-        list(pool.map(resize, range(len(out))))
-    return out
+        return summed(self.canvas, self.levels().levels)
 
 
 def _shared_out(work: NDArray[np.uint32], chosen: NDArray[np.int64]) -> NDArray[np.uint32]:
@@ -493,7 +416,7 @@ class _Lattice:
         self.turn = np.cos(azimuth_rad), np.sin(azimuth_rad)
         step = 2.0**placement.level
         self.per_mm = 1 / (canvas.pitch_mm * step)
-        self.middle = [n / 2 / step + _MARGIN for n in canvas.shape[::-1]]
+        self.middle = [n / 2 / step + MARGIN for n in canvas.shape[::-1]]
         self.sides = canvas.sizes[placement.level]
         self.size = self.sides.prod(axis=1)
         self.start = canvas.starts[placement.level]

@@ -38,7 +38,7 @@ from ..prescription import Prescription
 from ..thin import cos4_map
 from .irradiance import FlareModel, flare_model
 from .paraxial import axial_transmittance
-from .raster import Pyramid
+from .pyramid import Pyramid
 from .scatter import Cleanliness, VeilingGlare, baffle_transmission, scattered_fraction, veiling_glare
 from .settings import DEFAULT, Baffle, DirectPath, SensorGrid, StraylightSettings, SunSource
 from .starburst import Starburst, starburst

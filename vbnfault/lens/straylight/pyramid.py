@@ -1,0 +1,93 @@
+"""Add up the levels of an image pyramid, on whose coarser levels images with soft edges are drawn."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import cached_property
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ...core.llvm import backend
+
+F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
+
+LEVELS = 6
+MARGIN = 4  # pixels around each level, for cells that lie partly outside
+_CALM_SIGMA = 0.8  # sigma by which a coarser level is smoothed, in pixels of this level
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Canvas:
+    """Describe a sensor of `shape` (height, width) pixels of `pitch_mm`, centred on the axis, in `bands` bands."""
+
+    shape: tuple[int, int]
+    pitch_mm: float
+    bands: int
+
+    @property
+    def sizes(self) -> NDArray[np.int64]:
+        """Return height and width of each level with its margins, int64[level, 2]."""
+        return np.array([[-(-n // 2**k) + 2 * MARGIN for n in self.shape] for k in range(LEVELS)])
+
+    @property
+    def starts(self) -> NDArray[np.int64]:
+        """Return the index in a flat array at which each level begins, and the array's length, int64[level + 1]."""
+        return np.concatenate([[0], np.cumsum(self.sizes.prod(axis=1) * self.bands)])
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Pyramid:
+    """Hold the irradiance of all ghosts in levels, float32[band, y, x] each, from the finest to the coarsest."""
+
+    canvas: Canvas
+    levels: tuple[F32, ...]
+
+    @cached_property
+    def flux_mm2(self) -> F64:
+        """Return the flux in the frame, float64[band]; coarse levels end at whole pixels of their own."""
+        flux = np.zeros(self.canvas.bands)
+        for k, level in enumerate(self.levels):
+            inside = level[:, MARGIN : level.shape[1] - MARGIN, MARGIN : level.shape[2] - MARGIN]
+            flux += inside.sum(axis=(1, 2), dtype=np.float64) * 4**k
+        return np.asarray(flux * self.canvas.pitch_mm**2)
+
+    def mixed(self, weights: F64) -> F32:
+        """Return sums over the bands with weights float64[channel, band], float32[channel, y, x].
+
+        The bands are added before the levels are resized, which is cheaper than `Sums.irradiance` for few channels.
+        """
+        mix = weights.astype(np.float32)
+        return summed(self.canvas, [np.tensordot(mix, level, 1) for level in self.levels])
+
+
+def summed(canvas: Canvas, levels: Sequence[F32]) -> F32:
+    """Return the sum of levels float32[layer, y, x] on the pixels of the frame, float32[layer, y, x]."""
+    out = np.empty((len(levels[0]), *canvas.shape), dtype=np.float32)
+
+    def resize(layer: int) -> None:
+        """Resize and add the levels of one layer, from the coarsest to the finest."""
+        below: F32 | None = None
+        for level in range(LEVELS - 1, -1, -1):
+            height, width = (int(v) for v in canvas.sizes[level])
+            here = levels[level][layer]
+            if below is not None:
+                # folds end in steps, which pixel centres sample unevenly
+                calm = cv2.GaussianBlur(below, (3, 3), _CALM_SIGMA)
+                bigger = cv2.resize(calm, None, fx=2, fy=2, interpolation=cv2.INTER_LINEAR)
+                # pixel 0 of a level covers two pixels of the finer level, -M·2 + M and the next
+                here = here + bigger[MARGIN : MARGIN + height, MARGIN : MARGIN + width]
+            below = here
+        assert below is not None
+        rows, columns = (slice(MARGIN, MARGIN + n) for n in canvas.shape)
+        # the parts are sampled on different lattices, so that their sum may be slightly negative
+        np.maximum(below[rows, columns], 0, out=out[layer])
+
+    # numpy and OpenCV release the interpreter's lock
+    with ThreadPoolExecutor(backend().dr.thread_count()) as pool:
+        list(pool.map(resize, range(len(out))))
+    return out
