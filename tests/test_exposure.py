@@ -77,6 +77,17 @@ def test_metering_puts_the_percentile_of_the_lit_body_at_its_level_within_its_ra
         assert metered(scene, np.full((32, 32), factor * facet_rate), body)[0] == pytest.approx(limit * reference)
 
 
+def test_ground_that_is_bright_at_zero_phase_is_metered_too() -> None:
+    scene = parsed(camera={"metering_level": 0.5}, body={"photometry": {"phase_slope_mag_deg": 0.04}})
+    body = np.full((32, 32), BODY, dtype=np.uint8)
+    _, reference = metered(scene, np.ones((32, 32)), body)
+    # a facet that faces Sun and camera has no loss by 60 degrees of phase, and a cosine of 1 instead of cos(45)
+    brighter = 10 ** (0.4 * 0.04 * 60) * np.sqrt(2)
+    for factor, want in ((8.0, 1 / 8), (brighter, 1 / brighter), (50.0, 1 / brighter)):
+        lit = np.full((32, 32), factor * 0.5 / reference)
+        assert metered(scene, lit, body)[0] == pytest.approx(want * reference, rel=1e-5)
+
+
 def test_fewer_than_64_lit_pixels_are_not_metered() -> None:
     scene = parsed(camera={"metering_level": 0.5})
     body = np.full((32, 32), BODY, dtype=np.uint8)

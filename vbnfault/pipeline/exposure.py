@@ -15,9 +15,14 @@ from ..scene.config import Scene
 from ..world import assemble
 from .spec import Rendering, SampleSpec, SceneExposure
 
+Direction = tuple[float, float, float]
+
 # The metered exposure stays within these factors of the exposure for a facet lit at 45 degrees. So a small area of
-# grazing light does not make the whole frame noisy.
+# grazing light does not make the whole frame noisy. Dark ground at zero phase is up to nine times as bright as that
+# facet; where this asks for a shorter exposure than the lower factor allows, it is allowed.
 _METERING_RANGE = (0.25, 8.0)
+_AT_45_DEG = ((0.0, 0.5**0.5, 0.5**0.5), (0.5**0.5, 0.0, 0.5**0.5))  # towards the Sun and the camera: 60° of phase
+_AT_ZERO_PHASE = ((0.0, 0.0, 1.0), (0.0, 0.0, 1.0))
 
 
 def meter(spec: SampleSpec, rendering: Rendering) -> SceneExposure:
@@ -35,8 +40,15 @@ def exposure_s(scene: Scene, camera: Camera, truth: Truth, rate: Electrons) -> f
 
 def reference_exposure_s(scene: Scene, camera: Camera) -> float:
     """Return the exposure in s that puts ground whose normal is 45 degrees from the Sun at the metering level."""
-    half = np.sqrt(0.5)
-    reflected = radiance_factor(assemble.ground_reflectance(scene), [0, half, half], [half, 0, half])[:, 0] / np.pi
+    return _exposure_of_facet_s(scene, camera, *_AT_45_DEG)
+
+
+def _exposure_of_facet_s(scene: Scene, camera: Camera, sun: Direction, view: Direction) -> float:
+    """Return the exposure in s that puts a facet of the ground at the metering level.
+
+    `sun` and `view` are the directions towards the Sun and the camera; the normal of the facet is z.
+    """
+    reflected = radiance_factor(assemble.ground_reflectance(scene), sun, view)[:, 0] / np.pi
     sunlight = assemble.sunlight(scene, np.array([0.0, 0.0, -1.0]))  # the direction does not matter
     facet = (reflected * sunlight.irradiance_W_m2_nm).astype(np.float32).reshape(-1, 1, 1)
     wavelength = assemble.wavelengths_nm(scene)
@@ -57,7 +69,8 @@ def metered_exposure_s(scene: Scene, camera: Camera, truth: Truth, rate: Electro
     if len(brightness) >= 64:
         metered = settings.metering_level / float(np.percentile(brightness, settings.metering_percentile))
         low, high = _METERING_RANGE
-        exposure = float(np.clip(metered, low * reference, high * reference))
+        shortest = min(low * reference, _exposure_of_facet_s(scene, camera, *_AT_ZERO_PHASE))
+        exposure = float(np.clip(metered, shortest, high * reference))
     return float(np.clip(exposure, settings.exposure_min_s, settings.exposure_max_s))
 
 
