@@ -234,6 +234,7 @@ HARD = {
     "three models": replace(
         SMALL, metrics=TWO[:1], models=("texture", "paraxial", "traced"), seeds=(1,), pairs=True
     ),
+    "grid": replace(SMALL, method="grid", n=3),
     "morris": replace(SMALL, factors=LENS_FACTORS, metrics=TWO[:1], method="morris", n=8),
 }
 

@@ -141,8 +141,8 @@ class _Series:
 
 _SHARES = (
     _Series("ST", "total index", BLUE, True),
-    _Series("S1", "first-order index", VERMILLION, False),
     _Series("delta", "delta", GREEN, True),
+    _Series("S1", "first-order index", VERMILLION, False),
 )
 _EFFECTS = (_Series("mu_star", "mean absolute elementary effect μ*", BLUE, True),)
 
@@ -339,11 +339,12 @@ def _heat(results: StudyResults, values: F64, title: str, label: str) -> Figure:
     bottom = max(map(text_width, columns)) * math.sin(slant) + 18
     left = max(left, text_width(columns[0]) * math.cos(slant) - cell / 2 + 6)
     top = min(1.0, _largest(values)) or 1.0
+    label = _scale_label(label, row * len(labels))
     figure, axes = sheet(
         title,
         (1, len(results.models)),
         (cell * len(columns), row * len(labels)),
-        Margins(left=left, bottom=bottom, right=66.0, top=8.0, between_columns=16.0),
+        Margins(left=left, bottom=bottom, right=_scale_width(label), top=8.0, between_columns=16.0),
         heads=results.models,
     )
     for j, one in enumerate(axes):
@@ -376,11 +377,18 @@ def interactions(results: StudyResults, metric: str) -> tuple[Figure, str] | Non
             np.fill_diagonal(lower, first.sel(factor=order).values)
         matrices.append(lower)
     top = min(1.0, _largest(matrices)) or 1.0
+    label = _scale_label("fraction of the variance", row * len(order))
     figure, axes = sheet(
         metric,
         (1, len(results.models)),
         (23.0 * len(order), row * len(order)),
-        Margins(left=left, bottom=max(map(text_width, columns)) + 16, right=66.0, top=8.0, between_columns=16.0),
+        Margins(
+            left=left,
+            bottom=max(map(text_width, columns)) + 16,
+            right=_scale_width(label),
+            top=8.0,
+            between_columns=16.0,
+        ),
         heads=results.models,
     )
     for j, (one, matrix) in enumerate(zip(axes, matrices, strict=True)):
@@ -388,7 +396,7 @@ def interactions(results: StudyResults, metric: str) -> tuple[Figure, str] | Non
         mesh = _draw_cells(one, matrix, top, numbers=True, empty=triangle)
         one.set_yticks(np.arange(len(order)) + 0.5, labels if j == 0 else [""] * len(order), linespacing=1.0)
         one.set_xticks(np.arange(len(order)) + 0.5, columns, rotation=90)
-    _draw_scale(figure, axes[-1], mesh, "fraction of the variance")
+    _draw_scale(figure, axes[-1], mesh, label)
     left_out = len(results.factors) > len(order)
     words = results.importance[0]
     return figure, f"Drawn are the {len(order)} factors with the highest {words}." if left_out else ""
@@ -417,6 +425,16 @@ def _draw_cells(axes: Axes, values: F64, top: float, *, numbers: bool, empty: An
     return mesh
 
 
+def _scale_label(label: str, height: float) -> str:
+    """Return the label of a colour scale beside a panel, in lines that fit its height in points."""
+    return wrapped(label, max(12, int(min(height, 150.0) / 5)), 3)
+
+
+def _scale_width(label: str) -> float:
+    """Return the width in points of a colour scale with its label."""
+    return 58.0 + 10.0 * (label.count("\n") + 1)
+
+
 def _draw_scale(figure: Figure, beside: Axes, mesh: Any, label: str) -> None:
     """Draw the colour scale at the right of a panel."""
     box, (width, height) = beside.get_position(), figure.get_size_inches() * 72
@@ -426,7 +444,7 @@ def _draw_scale(figure: Figure, beside: Axes, mesh: Any, label: str) -> None:
     bar.outline.set_visible(False)
     axes.tick_params(length=2, width=0.7, pad=2)
     set_linear(axes.yaxis, 4 if length * height > 60 else 2)
-    axes.set_ylabel(wrapped(label, max(12, int(length * height / 5)), 3), linespacing=1.0)
+    axes.set_ylabel(label, linespacing=1.0)
 
 
 # ------------------------------------------------------------------------------------ models and Morris
