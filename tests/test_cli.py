@@ -433,9 +433,10 @@ def test_list_schema_doctor_and_dry_run(
     assert run(monkeypatch, "list", "scenes") == 0
     assert "quickstart" in capsys.readouterr().out
     assert run(monkeypatch, "list", "faults") == 0
-    assert "straylight / texture" in capsys.readouterr().out
+    assert "straylight / texture (default model)\n" in capsys.readouterr().out
     assert run(monkeypatch, "list", "lenses") == 0
     assert run(monkeypatch, "list", "detectors") == 0
+    assert "rosetta_navcam   Rosetta NAVCAM: 1024 x 1024 px, monochrome\n" in capsys.readouterr().out
     assert run(monkeypatch, "list", "studies") == 0
     capsys.readouterr()
     for kind, line in (

@@ -50,3 +50,16 @@ def test_a_dry_run_and_describe_say_the_same_and_warn_of_missing_classes(tmp_pat
     summary = dataset.build_scene(scene, tmp_path / "none.zarr", source="quickstart", dry_run=True)
     assert summary.lines()[-len(lines) :] == lines
     assert not (tmp_path / "none.zarr").exists()
+
+
+def test_describe_prints_the_size_of_the_body_its_doubts_and_the_values_of_67p_that_it_has() -> None:
+    def lines(*semi_axes_m: float) -> list[str]:
+        scene = config.load_scene("quickstart", {"body.shape": "ellipsoid", "body.semi_axes_m": list(semi_axes_m)})
+        with pytest.warns(UserWarning, match="not 67P, whose values it has for body.name"):
+            return dataset.describe_scene(scene, source="quickstart")
+
+    right = lines(282.5, 267.5, 254.0)
+    assert any("565 x 535 x 508 m along its axes x, y and z, mean radius 267.7 m" in line for line in right)
+    assert not [line for line in right if "body.unit" in line]
+    (doubt,) = (line for line in lines(1.2, 1.1, 1.0) if "body.unit" in line)
+    assert "2.4 m long, has a mean radius below 5 m and is shorter than 3 times patch.radius_m" in doubt

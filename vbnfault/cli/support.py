@@ -54,7 +54,17 @@ def list_(
     width = max((len(name) for name in paths), default=0)
     for name, path in paths.items():
         table = toml_files.read_toml(path)
-        typer.echo(f"{name:<{width}}  {table.get('description') or table.get('name', '')}")
+        text = table.get("description") or table.get("name", "")
+        typer.echo(f"{name:<{width}}  {text}{_size_and_filters(path) if kind == 'detectors' else ''}")
+
+
+def _size_and_filters(path: Path) -> str:
+    """Return the size of a packaged sensor and its colour filter array, as the end of its line."""
+    from ..detector.sensor import load_sensor
+
+    sensor = load_sensor(str(path))
+    filters = "monochrome" if len(sensor.pattern.channels) == 1 else f"{sensor.pattern.name} filters"
+    return f": {sensor.width_px} x {sensor.height_px} px, {filters}"
 
 
 def _list_faults() -> None:
@@ -66,8 +76,11 @@ def _list_faults() -> None:
             keys = dict(schema_of_model["properties"])
             model = keys.pop("model")["const"]
             cls = faults.registry()[name][model]
-            needs = " (needs camera.detector, a CCD)" if cls.needs_ccd else " (needs camera.detector)"
-            typer.echo(f"{name} / {model}{needs if cls.needs_mosaic else ''}")
+            notes = ["default model"] if cls.default else []
+            if cls.needs_mosaic:
+                notes.append("needs camera.detector, a CCD" if cls.needs_ccd else "needs camera.detector")
+            note = f" ({'; '.join(notes)})" if notes else ""
+            typer.echo(f"{name} / {model}{note}")
             _list_keys(keys, [key for key in schema_of_model.get("required", ()) if key in keys])
 
 

@@ -5,6 +5,8 @@ The commands `vbnfault describe` and `vbnfault build --dry-run` print this descr
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -17,6 +19,12 @@ from ..world import assemble
 from .progress import duration_text, size_text
 
 _SITES_DESCRIBED = 8  # a site takes 9 ms on a shape of 20,000 facets
+
+# A body below these bounds perhaps has its size in km where m are meant. Approach scenes look at a body from ten
+# and more of its lengths, so only many more are doubtful.
+_LEAST_RADIUS_M = 5.0
+_PATCH_RADII = 3.0
+_LENGTHS_AWAY = 50.0
 
 
 def describe(session: Session, *, sample_bytes: int, seconds: float) -> list[str]:
@@ -33,11 +41,13 @@ def describe(session: Session, *, sample_bytes: int, seconds: float) -> list[str
     """
     lines = [f"{session.scene.title}: {session.scene.description}".rstrip(": ")]
     lines += _samples(session)
+    lines.append(_body(session))
     lines += _geometry(session)
     lines += _camera(session)
     total = sample_bytes * len(session.plan)
     lines.append(f"size: about {size_text(total)}; time on this machine: about {duration_text(seconds)}")
-    return lines + [f"warning: {text}" for text in plan.shortcomings(session.scene, session.plan)]
+    doubts = plan.shortcomings(session.scene, session.plan) + _small_body(session)
+    return lines + [f"warning: {text}" for text in doubts]
 
 
 def _samples(session: Session) -> list[str]:
@@ -64,6 +74,39 @@ def _samples(session: Session) -> list[str]:
         counts = [int(samples.sum()), *(int((samples & split).sum()) for split in splits.values())]
         lines.append(f"  {name:<{wide}}" + "".join(f"{count:>9}" for count in counts))
     return lines
+
+
+def _body(session: Session) -> str:
+    """Return a line with the size of the body."""
+    axes_m, radius_m = _size_m(session)
+    extent = " x ".join(f"{length:.4g}" for length in axes_m)
+    return f"body: {session.scene.body.name}, {extent} m along its axes x, y and z, mean radius {radius_m:.4g} m"
+
+
+def _size_m(session: Session) -> tuple[NDArray[np.float64], float]:
+    """Return the body's extent along its axes, float64[3], and the radius of a sphere of its volume, both in m."""
+    body = session.body
+    return np.ptp(body.vertices_m, axis=0), float(np.cbrt(3 * body.volume_m3 / (4 * np.pi)))
+
+
+def _small_body(session: Session) -> list[str]:
+    """Return a sentence if the body is so small that its file is perhaps in another unit, otherwise nothing."""
+    axes_m, radius_m = _size_m(session)
+    scene, longest_m = session.scene, float(axes_m.max())
+    reasons = [f"has a mean radius below {_LEAST_RADIUS_M:g} m"] if radius_m < _LEAST_RADIUS_M else []
+    if longest_m < _PATCH_RADII * scene.patch.radius_m:
+        reasons.append(f"is shorter than {_PATCH_RADII:g} times patch.radius_m = {scene.patch.radius_m:g}")
+    height_m = scene.geometry.height_m[0]
+    if not scene.spice.spacecraft and longest_m < height_m / _LENGTHS_AWAY:
+        reasons.append(
+            f"is over {_LENGTHS_AWAY:g} of its lengths below the lowest of geometry.height_m, {height_m:g}"
+        )
+    if not reasons:
+        return []
+    return [
+        f"body.shape = {Path(scene.body.shape).name!r}: the body, {longest_m:.3g} m long, {' and '.join(reasons)}; "
+        "if its size is wrong, give body.unit or body.semi_axes_m"
+    ]
 
 
 def _geometry(session: Session) -> list[str]:

@@ -172,5 +172,6 @@ def describe_scene(scene: Scene, *, source: str) -> list[str]:
     `source`: name of the scene in messages.
     """
     session = pipeline.Session(scene, source=source)
+    session.warn_of_doubts()
     spec = store_spec(session, (scene.dataset.samples,))
     return describe.describe(session, sample_bytes=spec.estimated_sample_bytes, seconds=estimated_seconds(session))

@@ -65,7 +65,7 @@ class InterferenceBanding(Fault):
         None,
         limits=(0, 10),
         unit="s",
-        doc="between two lines; left out: the sensor's, or the time in which its rows are read",
+        doc="between two lines; default: the sensor's, or the time in which its rows are read",
     )
 
     def draw(self, context: FaultContext, rng: np.random.Generator) -> Params:

@@ -41,13 +41,13 @@ class TextureBrokenLines(Fault):
 
     count: Interval = bounds(1, 5, limits=(0, 10_000), integer=True, doc="number of broken lines")
     white_count: int | None = number(
-        None, limits=(0, 10_000), integer=True, doc="how many of them are saturated; left out: drawn"
+        None, limits=(0, 10_000), integer=True, doc="how many of them are saturated; default: drawn"
     )
     black_count: int | None = number(
         None,
         limits=(0, 10_000),
         integer=True,
-        doc="how many are dead; left out: the rest. With both given, their sum is the number of lines",
+        doc="how many are dead; default: the rest. With both given, their sum is the number of lines",
     )
     direction: str = choice(
         "camera",

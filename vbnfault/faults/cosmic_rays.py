@@ -67,7 +67,7 @@ class Tracks(Fault):
         None,
         limits=(0, 3600),
         unit="s",
-        doc="for which charge waits and is hit too; default: of all rows, at least 0.05 (assumed)",
+        doc="for which charge waits and is hit too; default: the readout of all rows, at least 0.05 (assumed)",
     )
     thickness_um: float | None = number(
         None,

@@ -74,8 +74,9 @@ class CameraTable(Table):
     focus_distance_m: float | None = Field(None, gt=0, le=1e12, description="default: infinity")
     detector: str = Field(
         "",
-        description="a packaged detector or a sensor's TOML, with a mosaic; its numbers are those of the keys from "
-        "pixel_pitch_um to quantum_efficiency_peak; default: three colours in every pixel, from these keys",
+        description="a packaged detector or a sensor's TOML, with a colour mosaic or monochrome; its numbers are "
+        "those of the keys from pixel_pitch_um to quantum_efficiency_peak; default: three colours in every pixel, "
+        "from these keys",
     )
     individuals: int = Field(
         1,
