@@ -406,7 +406,8 @@ class GlareSamples:
 
     def flux_mm2(self, table: F32) -> F64:
         """Return the flux in the frame of a table float32[band, step], float64[band]."""
-        return np.asarray(table[:, : len(self.area_mm2)] @ self.area_mm2)
+        # not a product of BLAS, whose bits may depend on the number of threads
+        return np.einsum("bs,s->b", table[:, : len(self.area_mm2)].astype(np.float64), self.area_mm2)
 
     def mixed(self, table: F32, weights: F64) -> F32:
         """Return sums over the bands with weights float64[channel, band], float32[channel, y, x]."""
