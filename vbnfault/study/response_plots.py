@@ -38,7 +38,7 @@ from .sheets import (
     wrapped,
     write_message,
 )
-from .summaries import Curve, Points, StudyResults, Swing
+from .summaries import DesignPoints, ResponseCurve, StudyResults, Swing
 
 _MOST_PANELS = 12
 _PANEL = (134.0, 88.0)  # width and height of a response curve in points
@@ -110,12 +110,12 @@ def is_categorical(results: StudyResults, factor: str) -> bool:
 class _Responses:
     """Hold what the response curves of one metric draw: by model, and by factor and model."""
 
-    points: Mapping[str, Points]
-    curves: Mapping[str, Mapping[str, Curve]]
+    points: Mapping[str, DesignPoints]
+    curves: Mapping[str, Mapping[str, ResponseCurve]]
     chance: Mapping[str, tuple[float, float] | None]
 
     @property
-    def every(self) -> list[Curve]:
+    def every(self) -> list[ResponseCurve]:
         """Return all curves."""
         return [curve for by_model in self.curves.values() for curve in by_model.values()]
 
@@ -237,7 +237,7 @@ def _category(value: float | str) -> str:
     return wrapped(value if isinstance(value, str) else f"{value:g}", 14, 1)
 
 
-def _height_of_categories(curve: Curve) -> float:
+def _height_of_categories(curve: ResponseCurve) -> float:
     """Return the height in points of the names of categories, which stand upright where they are long."""
     names = [_category(x) for x in curve.x] if curve.categorical else []
     return max(map(text_width, names)) + 6 if names and _upright(names) else 14.0
@@ -248,7 +248,7 @@ def _upright(names: Sequence[str]) -> bool:
     return max(map(text_width, names)) + 4 > _PANEL[0] / len(names)
 
 
-def _draw_curves(axes: Axes, curves: Mapping[str, Curve], unit: float, log: bool) -> None:
+def _draw_curves(axes: Axes, curves: Mapping[str, ResponseCurve], unit: float, log: bool) -> None:
     """Draw the median of each model against numbers, with its band."""
     every = [x for curve in curves.values() for x in curve.x if isinstance(x, float)]
     for k, curve in enumerate(curves.values()):

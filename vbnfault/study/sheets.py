@@ -202,6 +202,27 @@ class Margins:
     between_rows: float = 0.0
 
 
+def _draw_legend(
+    figure: Figure, legend: Sequence[Any], rows: Sequence[Sequence[int]], widths: Sequence[float]
+) -> None:
+    """Draw the entries of a legend line by line below the title; `rows` has the entries of each line."""
+    width, height = figure.get_size_inches() * 72
+    for line, members in enumerate(rows):
+        x = 6.0
+        for k in members:
+            y = 1 - (20 + 13.0 * line) / height
+            figure.legend(
+                handles=[legend[k]],
+                loc="upper left",
+                bbox_to_anchor=(x / width, y),
+                borderaxespad=0,
+                borderpad=0.1,
+                handlelength=1.8,
+                handletextpad=0.5,
+            )
+            x += widths[k]
+
+
 def sheet(
     title: str,
     grid: tuple[int, int],
@@ -242,20 +263,7 @@ def sheet(
     figure = Figure(figsize=(width / 72, height / 72))
     FigureCanvasAgg(figure)
     figure.text(6 / width, 1 - 6 / height, title, fontsize=9.5, fontweight="bold", va="top", ha="left")
-    for line, members in enumerate(legend_rows):
-        x = 6.0
-        for k in members:
-            y = 1 - (20 + 13.0 * line) / height
-            figure.legend(
-                handles=[legend[k]],
-                loc="upper left",
-                bbox_to_anchor=(x / width, y),
-                borderaxespad=0,
-                borderpad=0.1,
-                handlelength=1.8,
-                handletextpad=0.5,
-            )
-            x += widths[k]
+    _draw_legend(figure, legend, legend_rows, widths)
     axes = []
     for k in range(rows * columns):
         row, column = divmod(k, columns)

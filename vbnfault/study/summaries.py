@@ -33,7 +33,7 @@ _PARTS = 5  # the factor's range is divided into fifths for its swing
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Curve:
+class ResponseCurve:
     """Hold the conditional median of a metric against one factor.
 
     Attributes
@@ -71,7 +71,7 @@ class Swing:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Points:
+class DesignPoints:
     """Hold the values of one metric with one model at the points of the design.
 
     Attributes
@@ -95,7 +95,7 @@ class Points:
     cluster: I64
     base: Mapping[str, Any] | None
 
-    def curve(self, factor: str, confidence: float) -> Curve:
+    def curve(self, factor: str, confidence: float) -> ResponseCurve:
         """Return the conditional median of the metric against a factor, with bootstrap intervals."""
         generator = np.random.default_rng(0)
         x, rows = [], []
@@ -105,7 +105,7 @@ class Points:
             cluster = self.cluster[members] if len(members) > 1 else np.arange(len(sample))
             rows.append((np.median(sample), *_median_interval(sample, cluster, confidence, generator)))
         median, low, high = np.asarray(rows, dtype=float).reshape(-1, 3).T
-        return Curve(x=tuple(x), median=median, low=low, high=high)
+        return ResponseCurve(x=tuple(x), median=median, low=low, high=high)
 
     def swing(self, factor: str) -> Swing:
         """Return how far the conditional mean of the metric moves along a factor.
@@ -306,7 +306,7 @@ class StudyResults:
             base[factor] = frequent[len(frequent) // 2]
         return base
 
-    def points(self, metric: str, model: str) -> Points:
+    def points(self, metric: str, model: str) -> DesignPoints:
         """Return the values of a metric with one model at the points of the design.
 
         Of a Sobol' design only the matrices A and B are used: points of AB share all values but one with A.
@@ -330,7 +330,7 @@ class StudyResults:
             level = np.nanmean(by_block, axis=0)
             by_block += level.mean() - level
         mean = np.nanmean(by_block, axis=1) if numbers.size else np.zeros(0)
-        return Points(columns=columns, values=mean, by_block=by_block, cluster=cluster, base=self._base)
+        return DesignPoints(columns=columns, values=mean, by_block=by_block, cluster=cluster, base=self._base)
 
     @cached_property
     def importance(self) -> tuple[str, xr.DataArray]:
