@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
-from vbnfault.navigation import View
+from vbnfault.navigation import CameraView
 
 F64 = NDArray[np.float64]
 
@@ -50,11 +50,11 @@ def texture(size: int = 1024, seed: int = 0) -> NDArray[np.float32]:
 
 def ground(
     camera_from_T: F64, position_T_m: F64, *, relief_m: float = 0.0, distortion: Any = None, seed: int = 0
-) -> tuple[NDArray[np.uint8], View]:
+) -> tuple[NDArray[np.uint8], CameraView]:
     """Return an image uint8[y, x] of textured ground, by rays through the pixel centres, and its view."""
     model = {} if distortion is None else {"distortion": np.asarray(distortion)}
     pose = {"camera_from_T": camera_from_T, "camera_position_T_m": position_T_m}
-    view = View(intrinsics=INTRINSICS, **pose, **model)
+    view = CameraView(intrinsics=INTRINSICS, **pose, **model)
     centres = np.arange(SIZE_PX) + 0.5
     x, y = np.meshgrid(centres, centres)
     slopes = view.slopes(np.column_stack([x.ravel(), y.ravel()]))
@@ -68,5 +68,5 @@ def ground(
     texels = texture(seed=seed)
     at = points[:, 1::-1].T * _TEXELS_PER_M + len(texels) / 2 - 0.5
     image = map_coordinates(texels, at, order=3, mode="reflect").reshape(SIZE_PX, SIZE_PX)
-    seen = View(intrinsics=INTRINSICS, depth_m=depth.reshape(SIZE_PX, SIZE_PX), **pose, **model)
+    seen = CameraView(intrinsics=INTRINSICS, depth_m=depth.reshape(SIZE_PX, SIZE_PX), **pose, **model)
     return np.clip(np.rint(image), 0, 255).astype(np.uint8), seen

@@ -106,8 +106,12 @@ def test_identical_images_have_no_error() -> None:
     image = as_type(
         np.clip(clean * (0.6 + 0.4 * texture(160) / 210) + rng.normal(0, 0.01, clean.shape), 0, 1), "uint8"
     )
-    view = navigation.View(intrinsics=[150, 150, 80, 80], camera_from_T=np.eye(3), camera_position_T_m=np.zeros(3),
-                           depth_m=np.where(body, 100.0, np.inf))  # fmt: skip
+    view = navigation.CameraView(
+        intrinsics=[150, 150, 80, 80],
+        camera_from_T=np.eye(3),
+        camera_position_T_m=np.zeros(3),
+        depth_m=np.where(body, 100.0, np.inf),
+    )
     limb = navigation.limb_error(image, image, body)
     assert (limb.rms_px, limb.median_px, limb.lost_fraction) == (0, 0, 0)
     assert not limb.shift_px.any()
@@ -215,7 +219,7 @@ def test_a_track_is_right_only_where_the_ground_moved() -> None:
     assert 1.5 < moving.mean_views <= 2
     stuck = navigation.feature_lifetime([image, image], [first, second])
     assert stuck.mean_views == 1  # as dust does: the features stay in the frame, the ground does not
-    on_the_sky = navigation.View(**{**vars(first), "depth_m": np.full((SIZE_PX, SIZE_PX), np.inf)})
+    on_the_sky = navigation.CameraView(**{**vars(first), "depth_m": np.full((SIZE_PX, SIZE_PX), np.inf)})
     assert navigation.feature_lifetime([image, image], [on_the_sky, first]).mean_views == 0
     assert navigation.match_precision(navigation.match(image, image), on_the_sky, first) == 0
 
@@ -230,7 +234,7 @@ def test_pixels_follow_the_stored_camera_model() -> None:
     translation = -view.camera_from_T @ view.camera_position_T_m
     oracle, _ = cv2.projectPoints(points[:, None], rotation, translation, view.matrix, view.distortion)
     assert view.project(points) == pytest.approx(oracle[:, 0], abs=1e-9)
-    tangential = navigation.View(**{**vars(view), "distortion": np.array([0.1, -0.02, 0.01, -0.02, 0.003])})
+    tangential = navigation.CameraView(**{**vars(view), "distortion": np.array([0.1, -0.02, 0.01, -0.02, 0.003])})
     slopes = tangential.slopes(xy)
     oracle, _ = cv2.projectPoints(
         np.column_stack([slopes, np.ones(200)])[:, None],
@@ -240,7 +244,7 @@ def test_pixels_follow_the_stored_camera_model() -> None:
         tangential.distortion,
     )
     assert oracle[:, 0] == pytest.approx(xy, abs=1e-9)
-    quaternion = navigation.View(**{**vars(view), "camera_from_T": frames.quaternion(view.camera_from_T)})
+    quaternion = navigation.CameraView(**{**vars(view), "camera_from_T": frames.quaternion(view.camera_from_T)})
     assert quaternion.camera_from_T == pytest.approx(view.camera_from_T, abs=1e-12)
 
 
@@ -262,7 +266,7 @@ def test_a_camera_that_turns_only_has_no_direction_of_translation() -> None:
 def test_no_image_is_too_plain_or_too_small(dtype: str, shape: tuple[int, ...]) -> None:
     top = np.iinfo(dtype).max if dtype.startswith("u") else 1.0
     size = shape[:2]
-    view = navigation.View(
+    view = navigation.CameraView(
         intrinsics=INTRINSICS, camera_from_T=np.eye(3), camera_position_T_m=np.zeros(3), depth_m=np.full(size, 9.0)
     )
     noise = (np.random.default_rng(0).random(shape) * top).astype(dtype)
@@ -297,7 +301,7 @@ def test_mistakes_are_named_in_one_sentence() -> None:
         with pytest.raises(InputError) as error:
             call()
         assert str(error.value) == same
-    view = navigation.View(intrinsics=INTRINSICS, camera_from_T=np.eye(3), camera_position_T_m=np.zeros(3))
+    view = navigation.CameraView(intrinsics=INTRINSICS, camera_from_T=np.eye(3), camera_position_T_m=np.zeros(3))
     with pytest.raises(InputError, match=r"^images\[1\]: 9 x 8 .* of images\[0\]$"):
         navigation.feature_lifetime([a, b], [view, view])
     with pytest.raises(InputError, match=r"images: 1, views: 2: must be equally many"):
@@ -313,9 +317,9 @@ def test_mistakes_are_named_in_one_sentence() -> None:
     with pytest.raises(InputError, match=r"search_px = 2: must be from 3 to 64 px"):
         navigation.limb_error(a, a, a > 0, search_px=2)
     with pytest.raises(InputError, match=r"view.intrinsics: shape \(3,\)"):
-        navigation.View(intrinsics=np.ones(3), camera_from_T=np.eye(3), camera_position_T_m=np.zeros(3))
+        navigation.CameraView(intrinsics=np.ones(3), camera_from_T=np.eye(3), camera_position_T_m=np.zeros(3))
     with pytest.raises(InputError, match=r"view.camera_from_T: is no rotation"):
-        navigation.View(intrinsics=INTRINSICS, camera_from_T=np.ones(4), camera_position_T_m=np.zeros(3))
+        navigation.CameraView(intrinsics=INTRINSICS, camera_from_T=np.ones(4), camera_position_T_m=np.zeros(3))
     matches = navigation.Matches(first_xy=np.ones((3, 2)), second_xy=np.ones((3, 2)))
     with pytest.raises(InputError, match=r"view.depth_m: is None"):
         navigation.match_precision(matches, view, view)

@@ -19,12 +19,13 @@ from .features import (
     orb_repeatability,
     right_matches,
 )
-from .geometry import View, relative_motion, reprojected
+from .geometry import CameraView, relative_motion, reprojected
 from .limb import LimbError, limb_error
 from .relative_pose import RelativePose, RelativePoseError, relative_pose, relative_pose_error
 from .tracks import FeatureLifetime, feature_lifetime
 
 __all__ = [
+    "CameraView",
     "CentroidShift",
     "FeatureLifetime",
     "LimbError",
@@ -32,7 +33,6 @@ __all__ = [
     "RelativePose",
     "RelativePoseError",
     "Repeatability",
-    "View",
     "centroid_shift",
     "corner_repeatability",
     "corners",

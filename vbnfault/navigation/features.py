@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from ..core.errors import InputError
-from .geometry import View, reprojected
+from .geometry import CameraView, reprojected
 from .images import F64, U8, eight_bit, intensity, same_shape, white_level
 
 # Corners of a frame, and the least distance between two of them in px, as trackers of space flight use.
@@ -257,7 +257,7 @@ def _orb_of(shape: tuple[int, int], pixels: bytes) -> tuple[F64, NDArray[np.int6
 
 
 def right_matches(
-    matches: Matches, first: View, second: View, *, tolerance_px: float = RIGHT_WITHIN_PX
+    matches: Matches, first: CameraView, second: CameraView, *, tolerance_px: float = RIGHT_WITHIN_PX
 ) -> NDArray[np.bool_]:
     """Return which matches are right, bool[n]: within the tolerance of the true reprojection.
 
@@ -284,7 +284,9 @@ def right_matches(
         return np.asarray(np.hypot(off[:, 0], off[:, 1]) <= tolerance_px)
 
 
-def match_precision(matches: Matches, first: View, second: View, *, tolerance_px: float = RIGHT_WITHIN_PX) -> float:
+def match_precision(
+    matches: Matches, first: CameraView, second: CameraView, *, tolerance_px: float = RIGHT_WITHIN_PX
+) -> float:
     """Return the fraction of the matches that are right, in [0, 1]; NaN where there is no match.
 
     precision = (matches within the tolerance of the true reprojection) / (all matches), by depth, pose and the
@@ -306,7 +308,12 @@ def match_precision(matches: Matches, first: View, second: View, *, tolerance_px
 
 
 def matches_lost(
-    clean: Matches, faulted: Matches, first: View, second: View, *, tolerance_px: float = RIGHT_WITHIN_PX
+    clean: Matches,
+    faulted: Matches,
+    first: CameraView,
+    second: CameraView,
+    *,
+    tolerance_px: float = RIGHT_WITHIN_PX,
 ) -> float:
     """Return the fraction of the clean twins' right matches that the faulted images lack, in [0, 1].
 

@@ -22,7 +22,7 @@ _DIFFERENCE = 1e-6  # step of the numeric derivative, in focal lengths
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class View:
+class CameraView:
     """Describe how a camera saw one image: its model, its true pose, and the depth that it saw.
 
     The names are those of the arrays of a dataset.
@@ -144,7 +144,7 @@ _SHAPES: dict[str, tuple[tuple[int, ...], ...]] = {
 }
 
 
-def reprojected(xy: F64, from_view: View, to_view: View) -> F64:
+def reprojected(xy: F64, from_view: CameraView, to_view: CameraView) -> F64:
     """Return where the ground that pixels of one view see lies in another view.
 
     Parameters
@@ -166,7 +166,7 @@ def reprojected(xy: F64, from_view: View, to_view: View) -> F64:
     return to_view.project(from_view.points_T_m(xy))
 
 
-def relative_motion(first: View, second: View) -> tuple[F64, F64]:
+def relative_motion(first: CameraView, second: CameraView) -> tuple[F64, F64]:
     """Return the true motion between two views: second_from_first float64[3, 3], and its translation in m.
 
     The translation is float64[3]. A point x of the first camera's frame lies at R x + t in the second camera's

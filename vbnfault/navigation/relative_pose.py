@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ..core.errors import InputError
 from .features import Matches
-from .geometry import View, relative_motion, rotation_angle_deg
+from .geometry import CameraView, relative_motion, rotation_angle_deg
 from .images import F64
 
 # An inlier lies as near to its epipolar line as this, in px.
@@ -59,7 +59,7 @@ class RelativePoseError:
     reason: str = ""
 
 
-def relative_pose(matches: Matches, first: View, second: View) -> RelativePose:
+def relative_pose(matches: Matches, first: CameraView, second: CameraView) -> RelativePose:
     """Return rotation and direction of translation between two views from their matches alone.
 
     The essential matrix E = [t]× R, x₂ᵀ E x₁ = 0, is that of five points with the most inliers (RANSAC of a fixed
@@ -87,7 +87,7 @@ def relative_pose(matches: Matches, first: View, second: View) -> RelativePose:
     Fischler and Bolles (1981), Random Sample Consensus, Communications of the ACM 24, 381.
     Faugeras and Lustman (1988), Motion and Structure from Motion in a Piecewise Planar Environment, International
     Journal of Pattern Recognition and Artificial Intelligence 2, 485.
-    Hartley and Zisserman (2004), Multiple View Geometry in Computer Vision, sections 9.6 and 11.4.3.
+    Hartley and Zisserman (2004), Multiple CameraView Geometry in Computer Vision, sections 9.6 and 11.4.3.
     """
     if len(matches.first_xy) != len(matches.second_xy):
         raise InputError(
@@ -149,7 +149,7 @@ def _candidates(a: F64, b: F64, inlier: float) -> Iterator[tuple[F64, F64, NDArr
             yield rotation, translation.ravel() / length, plane
 
 
-def relative_pose_error(matches: Matches, first: View, second: View) -> RelativePoseError:
+def relative_pose_error(matches: Matches, first: CameraView, second: CameraView) -> RelativePoseError:
     """Return the errors of the relative pose that the matches give against the true one.
 
     rotation error = angle of R R*ᵀ;  translation error = angle between t and t*, * being the truth. The direction
@@ -181,7 +181,7 @@ def relative_pose_error(matches: Matches, first: View, second: View) -> Relative
     return RelativePoseError(rotation_deg=turned, translation_deg=float(np.degrees(np.arctan2(sine, cosine))))
 
 
-def _median_depth_m(view: View) -> float:
+def _median_depth_m(view: CameraView) -> float:
     """Return the median depth of the ground in m; 1 where the view has none."""
     if view.depth_m is None:
         return 1.0

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ..core.errors import InputError
 from .features import CORNERS, RIGHT_WITHIN_PX, corners
-from .geometry import View
+from .geometry import CameraView
 from .images import F64, eight_bit, intensity, same_shape, white_level
 
 # Lucas and Kanade's window, and pyramid levels for displacements of up to about a quarter of the frame.
@@ -35,7 +35,7 @@ class FeatureLifetime:
 
 def feature_lifetime(
     images: Sequence[NDArray[Any]],
-    views: Sequence[View],
+    views: Sequence[CameraView],
     *,
     white: float | None = None,
     tolerance_px: float = RIGHT_WITHIN_PX,

@@ -45,7 +45,7 @@ class NavigationFrame:
 
     clean: NDArray[np.uint8]
     image: NDArray[np.uint8]
-    view: navigation.View
+    view: navigation.CameraView
     body: NDArray[np.bool_]
     sky: NDArray[np.bool_]
 
@@ -174,9 +174,9 @@ def navigation_frame(
     )
 
 
-def _view(camera: Camera, pose: Pose, truth: Truth) -> navigation.View:
+def _view(camera: Camera, pose: Pose, truth: Truth) -> navigation.CameraView:
     """Return the camera model and the true pose. The ground's frame is L."""
-    return navigation.View(
+    return navigation.CameraView(
         intrinsics=camera.intrinsics,
         distortion=camera.lens.distortion,
         camera_from_T=pose.L_from_C.T,
@@ -252,7 +252,7 @@ class _Frames:
         self.first = frames[0]
 
     @property
-    def views(self) -> tuple[navigation.View, navigation.View]:
+    def views(self) -> tuple[navigation.CameraView, navigation.CameraView]:
         """Return the first two views."""
         return self.first.view, self.frames[1].view
 
