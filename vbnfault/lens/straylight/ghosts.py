@@ -351,6 +351,19 @@ def traced(made: Tracer, rays: Rays, sun_deg: float, turn_rad: float, across: in
     return tuple(sorted(out, key=lambda g: g.pair))
 
 
+def fluxes_mm2(made: Tracer, rays: Rays, sun_deg: float, across: int) -> F64:
+    """Return the flux of each bundle on the unbounded sensor plane over the Sun's irradiance, float64[bundle].
+
+    The bundles are traced at once, `across` rays wide.
+    """
+    be = backend()
+    spots = made.trace(rays, across, centred=True)
+    weight = be.Float64(spots.fraction * _inside(spots.radius, across))
+    cell = 4 * rays.box_mm[:, 2] * rays.box_mm[:, 3] / across**2
+    total = be.dr.block_sum(weight, across * across).numpy()
+    return np.asarray(total * cell * np.cos(np.radians(sun_deg)))
+
+
 def _traced_together(
     made: Tracer, rays: Rays, across: int, turn: float, pupil_mm2: float, cosine: float
 ) -> list[Ghost]:

@@ -19,10 +19,9 @@ from numpy.typing import NDArray
 
 from ...core.errors import InputError
 from ...core.llvm import backend
-from ..gaussian import first_order
 from ..prescription import Prescription
-from .bundles import Rays, Spots, TraceOptions, Tracer
-from .ghosts import Arrivals, boxes, named, traced
+from .bundles import Rays, Spots, TraceOptions, Tracer, name_of
+from .ghosts import Arrivals, boxes, fluxes_mm2, named, traced
 from .paraxial import Ghost, along, mean_ghost
 from .pyramid import LEVELS, Canvas, Pyramid
 from .raster import PARTS, BundleDrawing, Sums, edge_kind
@@ -361,12 +360,11 @@ class FlareModel:
         bands = len(self.nodes_nm)
         flux = {name: np.zeros(bands) for name in only}
         if len(rays):
-            pupil_mm2 = np.pi / 4 * first_order(self.lens).entrance_pupil_diameter_mm ** 2
-            cosine = float(np.cos(np.radians(sun_deg)))
-            for band in range(bands):
-                of_node = replace(rays, wavelength=np.full(len(rays), band * _SUBDIVISIONS))
-                for ghost in traced(made, of_node, sun_deg, turn, across):
-                    flux[ghost.pair][band] += ghost.flux_fraction * pupil_mm2 * cosine
+            each = np.repeat(np.arange(len(rays)), bands)
+            nodes = np.tile(np.arange(bands) * _SUBDIVISIONS, len(rays))
+            by_band = fluxes_mm2(made, replace(rays.take(each), wavelength=nodes), sun_deg, across)
+            for route, own in zip(rays.route, by_band.reshape(len(rays), bands), strict=True):
+                flux[name_of(made.routes[route])] += own
         return flux
 
     def ghosts(self, sun_deg: float, azimuth_deg: float = 0.0, *, across: int = 48) -> tuple[Ghost, ...]:
