@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,8 @@ from vbnfault.body import Body, Patch, PatchSpec, Site, build_patch, choose_site
 from vbnfault.body.boulders import PER_KM2, SizeLaw, scatter, smallest_at
 from vbnfault.body.shape import check_mesh, signed_volume
 from vbnfault.core.errors import InputError
+from vbnfault.pipeline import Session
+from vbnfault.scene.config import load_scene
 from vbnfault.scene.target import PatchTable
 
 REAL_SHAPE = Path(__file__).parents[2] / "shared/data/shapes/67p_18k.obj"
@@ -210,6 +213,18 @@ def test_density_of_boulders_is_what_was_asked_for(body: Body, site: Site) -> No
     assert not build_patch(body, site, PatchSpec(seed=7, facet_m=12.0, min_boulder_m=1e6)).face_is_boulder.any()
     # Four times the density, Poisson; paving takes the smallest in the densest places.
     assert 2.5 < counts[98.0] / counts[24.5] < 4.6
+
+
+@pytest.mark.parametrize("min_boulder_m", [0.05, 100.0])
+def test_a_warning_counts_the_boulders_that_the_budget_leaves_out(min_boulder_m: float) -> None:
+    changes = {"patch.facet_m": 20.0, "patch.min_boulder_m": min_boulder_m, "patch.max_triangles": 10_000}
+    session = Session(load_scene("quickstart", changes), source="quickstart")
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        patch = session.patch(session.sites[0])
+    kept, drawn = len(patch.boulder_diameter_m), patch.boulders_drawn
+    wanted = [f"site 0: {drawn - kept} of {drawn} boulders are left out"] if min_boulder_m < 1 else []
+    assert [str(w.message).split(",")[0] for w in caught] == wanted
 
 
 def test_bounds(body: Body, site: Site) -> None:

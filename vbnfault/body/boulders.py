@@ -54,6 +54,8 @@ class Boulders:
         float64[k] largest diameters, and float64[k, 3] centres in L.
     smallest_m
         float64[k]: smallest diameter for which the size law was drawn at each boulder's position.
+    drawn
+        Number of boulders that the size law gave, k of which fitted into the budget of triangles.
     """
 
     vertices_m: Float64
@@ -62,6 +64,7 @@ class Boulders:
     diameter_m: Float64
     position_m: Float64
     smallest_m: Float64
+    drawn: int
 
 
 def smallest_at(distance_m: Float64, min_boulder_m: float) -> Float64:
@@ -143,6 +146,7 @@ def add_boulders(ground: GroundMesh, spec: PatchSpec, *, rng: np.random.Generato
         diameter_m=diameter[kept],
         position_m=np.concatenate([np.empty((0, 3)), *positions]),
         smallest_m=least[kept],
+        drawn=len(diameter),
     )
 
 

@@ -60,6 +60,8 @@ class Patch:
         float32[k] largest diameter, and float32[k, 3] centre of each boulder.
     boulder_smallest_m
         float32[k]: smallest diameter for which the size law was drawn at the boulder's position.
+    boulders_drawn
+        Number of boulders that the size law gave; only k of them fitted into `max_triangles`.
     facet_m, radius_m
         Mean edge length of the ground within this distance of the site. Beyond, it grows as the distance to the
         power `GROWTH_POWER`.
@@ -74,6 +76,7 @@ class Patch:
     boulder_diameter_m: Float32
     boulder_position_L_m: Float32
     boulder_smallest_m: Float32
+    boulders_drawn: int
     facet_m: float
     radius_m: float
 
@@ -124,6 +127,7 @@ def build_patch(body: Body, site: Site, spec: PatchSpec) -> Patch:
         boulder_diameter_m=stones.diameter_m.astype(np.float32),
         boulder_position_L_m=stones.position_m.astype(np.float32),
         boulder_smallest_m=stones.smallest_m.astype(np.float32),
+        boulders_drawn=stones.drawn,
         facet_m=limit.facet_m,
         radius_m=limit.radius_m,
     )

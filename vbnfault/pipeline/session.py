@@ -32,6 +32,9 @@ if TYPE_CHECKING:
 
 # Limit of the slope of an octave of the finest relief: steeper relief would look like needles.
 _STEEPEST_DETAIL = 0.12
+# Leaving out the smallest boulders is usual: the packaged scenes keep at least a quarter of those that are drawn. A
+# smaller fraction than this one means that the ground takes nearly all triangles.
+_FEWEST_KEPT = 0.05
 
 
 def simulate(scene: Scene | str | Path, sample: int = 0, *, threads: int | None = None) -> Sample:
@@ -256,7 +259,16 @@ class Session:
             boulders_per_km2=table.boulders_per_km2,
             max_triangles=max(table.max_triangles, 2 * len(self.body.faces)),
         )
-        return cached_patch(self.body, site, spec)
+        patch = cached_patch(self.body, site, spec)
+        kept = len(patch.boulder_diameter_m)
+        if kept < _FEWEST_KEPT * patch.boulders_drawn:
+            drawn, ground = patch.boulders_drawn, np.count_nonzero(~patch.face_is_boulder)
+            warnings.warn(
+                f"site {site.index}: {drawn - kept} of {drawn} boulders are left out, because the ground has {ground} "
+                f"triangles, of {spec.max_triangles} at most; raise patch.max_triangles or patch.facet_m",
+                stacklevel=2,
+            )
+        return patch
 
     def spec(self, index: int) -> SampleSpec:
         """Return everything that `simulate` needs for one sample.
