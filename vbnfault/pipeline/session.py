@@ -264,8 +264,8 @@ class Session:
         if kept < _FEWEST_KEPT * patch.boulders_drawn:
             drawn, ground = patch.boulders_drawn, np.count_nonzero(~patch.face_is_boulder)
             warnings.warn(
-                f"site {site.index}: {drawn - kept} of {drawn} boulders are left out, because the ground has {ground} "
-                f"triangles, of {spec.max_triangles} at most; raise patch.max_triangles or patch.facet_m",
+                f"site {site.index}: {drawn - kept} of {drawn} boulders are left out, because the ground has "
+                f"{ground} triangles, of {spec.max_triangles} at most; raise patch.max_triangles or patch.facet_m",
                 stacklevel=2,
             )
         return patch
