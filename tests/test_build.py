@@ -435,7 +435,7 @@ def test_a_store_without_room_for_its_first_file_leaves_nothing(tmp_path: Path) 
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (100, before[1]))
     try:
-        with pytest.raises(VbnfaultError, match=r"nothing can be created here: File too large"):
+        with pytest.raises(VbnfaultError, match=r"no store can be created here: File too large"):
             run(tmp_path / "s.zarr")
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)

@@ -440,7 +440,7 @@ def test_list_schema_doctor_and_dry_run(
     assert run(monkeypatch, "list", "studies") == 0
     capsys.readouterr()
     for kind, line in (
-        ("effects", "\nfull_well     Limit the charge of each pixel to the full well.\nanalogue "),
+        ("effects", "\nfull_well     Limit the charge of each pixel to the full well.\n"),
         ("reflectances", "\n    phase_slope_mag_deg = 0.0    fading with phase angle"),
         ("glasses", "N-BK7   nd 1.51680  Abbe number 64.17  formula sellmeier\n"),
     ):

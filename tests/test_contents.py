@@ -121,6 +121,7 @@ def test_kernels_are_those_of_the_plan_also_where_a_meta_kernel_names_them(tmp_p
 
 
 @pytest.mark.filterwarnings("ignore:.*67P:UserWarning")  # the body keeps values of 67P
+@pytest.mark.filterwarnings("ignore:.*of the frame is dark:UserWarning")  # the lens has no field of 65 degrees
 @pytest.mark.parametrize("workers", [1, 2])
 def test_a_mesh_replaced_during_a_build_ends_it_with_nothing_wrong_written(
     files: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, workers: int

@@ -422,7 +422,7 @@ def test_two_plug_ins_of_one_name_are_refused(tmp_path: Path) -> None:
 def test_the_command_line_loads_plug_ins(tmp_path: Path) -> None:
     path = plugin(tmp_path)
     listed = run(tmp_path, "list", "faults", "--plugin", str(path))
-    assert "glint / square\n    level = [0.2, 0.9]    added fraction of white" in listed.stdout
+    assert "glint / square (default model)\n    level = [0.2, 0.9]    added fraction of white" in listed.stdout
     plugin(tmp_path, BROKEN["order"][0])
     refused = run(tmp_path, "describe", str(scene_file(tmp_path, "my_glint.py")))
     assert refused.returncode == 2

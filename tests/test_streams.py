@@ -32,8 +32,8 @@ COMMANDS = {
     "schema": "",
     "new": "lens own --out {} --overwrite",
 }
-# they end with the test render, or a sample's files, and print through the same calls
-_WITH_MITSUBA = {"render", "doctor"}
+# they end with the test render, a sample's files, or an evaluated study, and print through the same calls
+_WITH_MITSUBA = {"render", "doctor", "study"}
 
 
 @pytest.fixture(scope="module")
