@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from conftest import small_scene
+from PIL import Image
 
 from vbnfault.core import llvm
 from vbnfault.core.errors import InputError, VbnfaultError
@@ -364,3 +366,30 @@ def test_packaged_studies_run(name: str) -> None:
     assert list(found["metric"].values) == list(spec.metrics.names)
     assert list(found["model"].values) == list(spec.model_names)
     assert np.isfinite(found["mean"].values).all()
+
+
+def test_a_study_of_navigation_alone_is_evaluated_and_reported(tmp_path: Path) -> None:
+    """No fault of the scene adds light, so the images of the report are those that the metrics judge."""
+    scene = small_scene(
+        dataset={"samples": 2, "sites": 1, "layers": ["clean"]},
+        camera={"width_px": 64, "height_px": 64},
+        plan={"mode": "per_class", "faulty_fraction": 1.0},
+    )
+    scene["faults"] = {"broken_lines": {}}
+    (tmp_path / "scene.toml").write_text(toml(scene), encoding="utf-8")
+    lines = {"key": "scene.faults.broken_lines.count", "distribution": "categorical", "values": [1, 12]}
+    spec = parse_study(
+        {
+            "title": "lines",
+            "design": {"method": "one_at_a_time", "n": 2},
+            "scene": {"base": str(tmp_path / "scene.toml"), "samples": [0]},
+            "factor": [lines],
+            "metrics": {"names": ["centroid_shift_px"]},
+        },
+        source="study",
+    )
+    indices = run.study(spec, tmp_path / "out", progress=False)
+    assert indices["range"].sel(factor=lines["key"]).item() > 0
+    images = [np.asarray(Image.open(tmp_path / f"out/images/centroid_shift_px_{k}.png")) for k in ("best", "worst")]
+    assert images[0].shape[:2] == images[1].shape[:2]
+    assert (images[0] != images[1]).any()  # one line against twelve

@@ -50,6 +50,7 @@ from ..pipeline.spec import Injection, SampleSpec, SceneExposure
 from ..pipeline.stars import add_stars
 from ..scene.config import Scene, load_scene
 from . import image_metrics
+from . import navigation_metrics as nav
 from .factors import AFTER_RENDER, Factors, Setting
 from .image_metrics import LitImage
 from .kept import Kept
@@ -70,6 +71,8 @@ from .views import (
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
+
+_NAVIGATION: Mapping[str, Metric] = {metric.name: metric for metric in nav.METRICS}
 
 
 class SceneEvaluator:
@@ -107,10 +110,9 @@ class SceneEvaluator:
     def metrics(self) -> tuple[Metric, ...]:
         """Return the metrics that the study names."""
         made = []
-        navigation = _navigation()
         for name in self.spec.metrics.names:
-            if name in navigation:
-                made.append(navigation[name])
+            if name in _NAVIGATION:
+                made.append(_NAVIGATION[name])
                 continue
             rank = image_metrics.ghost_rank(name)
             made.append(image_metrics.metric(name, None if rank is None else self._ghost_pair(rank)))
@@ -177,21 +179,28 @@ class SceneEvaluator:
     def _values(self, evaluation: Evaluation, setting: Setting) -> Mapping[str, float]:
         """Return the value of each metric that the study names."""
         names = self.spec.metrics.names
-        navigation = _navigation()
         values: dict[str, float] = {}
-        image_names = [name for name in names if name not in navigation]
+        image_names = [name for name in names if name not in _NAVIGATION]
         if image_names:
             image = self._lit_image(evaluation, setting)
             with self.kept.timed("metrics"):
                 values |= {name: image_metrics.value(name, image) for name in image_names}
-        own = [name for name in names if name in navigation]
+        own = [name for name in names if name in _NAVIGATION]
         if own:
             values |= self._navigation_values(evaluation, setting, own)
         return {name: values[name] for name in names}
 
     def picture(self, evaluation: Evaluation) -> F32:
-        """Return the expected image of an evaluation, float32[y, x, channel] in electrons, without noise."""
-        image = self._lit_image(evaluation, self.factors.setting(evaluation.values))
+        """Return an image of an evaluation, float32[y, x, channel].
+
+        Where the study has metrics of navigation, it is the image with all faults that they judge, in DN; otherwise
+        the expected image with straylight, in electrons, without noise.
+        """
+        setting = self.factors.setting(evaluation.values)
+        if any(name in _NAVIGATION for name in self.spec.metrics.names):
+            (frame,) = self._navigation_frames(evaluation, setting, 1)
+            return np.ascontiguousarray(frame.image[..., :3], dtype=np.float32)
+        image = self._lit_image(evaluation, setting)
         return np.ascontiguousarray(np.moveaxis((image.kept + image.added)[:3], 0, -1))
 
     # --- the study's scene ----------------------------------------------------------------------------------------
@@ -233,10 +242,9 @@ class SceneEvaluator:
 
     def _check_metrics(self) -> None:
         """Raise InputError if a metric is unknown, or has nothing to measure in the scene."""
-        navigation = _navigation()
-        known = [*image_metrics.NAMES, *navigation]
+        known = [*image_metrics.NAMES, *_NAVIGATION]
         for name in self.spec.metrics.names:
-            if name in navigation:
+            if name in _NAVIGATION:
                 continue
             if not image_metrics.is_image_metric(name):
                 raise InputError(
@@ -475,11 +483,14 @@ class SceneEvaluator:
         self, evaluation: Evaluation, setting: Setting, names: Sequence[str]
     ) -> Mapping[str, float]:
         """Return the metrics of navigation, from images that pass the whole pipeline."""
-        from . import navigation_metrics as nav
+        frames = self._navigation_frames(evaluation, setting, nav.views_needed(names))
+        with self.kept.timed("navigation"):
+            return nav.navigation_values(frames, names)
 
+    def _navigation_frames(self, evaluation: Evaluation, setting: Setting, count: int) -> list[nav.NavigationFrame]:
+        """Return the clean and the faulted image of the first `count` views of an evaluation's sequence."""
         scene = self._scene(evaluation, setting)
         view = self._view(evaluation, scene)
-        count = nav.views_needed(names)
         place = self._render_key(scene), evaluation.view, count
         sequence = self.kept.once("render", place, lambda: _rendered_sequence(view, count), "sequence")
         frames = []
@@ -509,7 +520,7 @@ class SceneEvaluator:
                         images.image(injection.draws).array,
                     )
                 )
-            return nav.navigation_values(frames, names)
+        return frames
 
     # --- what a factor moves --------------------------------------------------------------------------------------
 
@@ -527,23 +538,20 @@ class SceneEvaluator:
         seed, view = self.spec.scene.seeds[0], self.spec.scene.views[0]
         evaluation = Evaluation(index=0, seed=seed, view=view, model=model, role="check", values=values)
         digest = hashlib.sha256()
-        navigation = _navigation()
-        if any(name not in navigation for name in self.spec.metrics.names):
+        if any(name not in _NAVIGATION for name in self.spec.metrics.names):
             image = self._lit_image(evaluation, self.factors.setting(values))
             for array in (image.clean, image.kept, image.added, image.white_e, np.asarray(image.dark_e)):
                 digest.update(np.ascontiguousarray(array).tobytes())
             digest.update(
                 repr((image.ghosts_e, image.read_noise_e, image.full_well_e, image.mask_level_dn)).encode()
             )
-        if any(name in navigation for name in self.spec.metrics.names):
+        if any(name in _NAVIGATION for name in self.spec.metrics.names):
             digest.update(repr(sorted(self.evaluate(evaluation).items())).encode())
         return digest.hexdigest()
 
 
 def _rendered_sequence(view: RenderedView, count: int) -> list[RenderedView]:
     """Return the views of a sequence that begins with a view."""
-    from . import navigation_metrics as nav
-
     views = [view]
     for k, pose in enumerate(nav.sequence(view.spec, view.pose, view.rendering, count)[1:], start=1):
         spec = nav.spec_of_view(view.spec, k)
@@ -606,12 +614,3 @@ def _added_by(fault: Fault, exposed: Exposed, params: Any) -> dict[str, Any]:
     image = act(fault, clean, params, exposed.context).merged.array
     added = np.ascontiguousarray(np.moveaxis(image, -1, 0)) - exposed.clean
     return {"kept": exposed.clean, "added": np.maximum(added, 0), "parts_e": {}, "ghosts_e": ()}
-
-
-def _navigation() -> Mapping[str, Metric]:
-    """Return the metrics of navigation by name."""
-    try:
-        from . import navigation_metrics
-    except ImportError:
-        return {}
-    return {metric.name: metric for metric in navigation_metrics.METRICS}

@@ -50,7 +50,7 @@ class _Recorded(Exposure):
         return generator
 
     def again(self) -> _Recorded:
-        """Return the same exposure, as it was before any effect asked for a generator."""
+        """Return a copy of the exposure whose generators start anew, for a second call of the same effect."""
         return replace(self)
 
     @property
