@@ -224,11 +224,9 @@ def test_an_interrupted_append_is_reported_and_mended(whole: st.Store, monkeypat
         with pytest.raises(KeyboardInterrupt):
             st.append_samples(st.open_store(whole.path), 4)
         monkeypatch.undo()
-        with warnings.catch_warnings(record=True) as told:
-            warnings.simplefilter("always")
-            assert st.open_store(whole.path).samples == samples
-            assert st.verify(whole.path)[0].startswith(sentence)
-        assert bool(told) is (samples == 14)
+        # a reader may see this state beside a writer that lives, so that opening does not warn: `verify` reports it
+        assert st.open_store(whole.path).samples == samples
+        assert st.verify(whole.path)[0].startswith(sentence)
         store = st.recover(whole.path)
         assert st.problem_samples(store) == list(range(10, samples))
 

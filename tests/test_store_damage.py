@@ -302,6 +302,40 @@ def test_readers_beside_a_writer_never_see_a_wrong_sample_that_is_done(store: Pa
     assert wrong == []
 
 
+def test_a_reader_in_the_middle_of_a_change_of_the_attributes_sees_no_damage(
+    store: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """At each of the renames that change the attributes, and between the reads of a reader, opening warns of
+    nothing (a warning is an error in these tests) and gives the attributes from before or from after."""
+    seen = []
+    replace = os.replace
+    document = st.group.read_document
+
+    def look(source: str, target: str) -> None:
+        seen.append(st.open_store(store).attributes.get("note"))
+        replace(source, target)
+        seen.append(st.open_store(store).attributes.get("note"))
+
+    changes = iter(("one", "two"))
+
+    def change_between(path: Path) -> Any:
+        found = document(path)
+        note = next(changes, None)
+        if note is not None:
+            with monkeypatch.context() as plain:
+                plain.setattr(st.group, "read_document", document)
+                st.open_store(store, "r+").update_attributes({"note": note})
+        return found
+
+    with monkeypatch.context() as patched:
+        patched.setattr(disk.os, "replace", look)
+        st.open_store(store, "r+").update_attributes({"note": "zero"})
+    assert seen == [None, "zero", "zero", "zero"]
+    monkeypatch.setattr(st.group, "read_document", change_between)
+    assert st.open_store(store).attributes["note"] == "one"  # the root from before, the spare of the first change
+    assert st.open_store(store).attributes["note"] == "two"
+
+
 # --- creating ---------------------------------------------------------------------------------------------
 
 

@@ -441,10 +441,19 @@ def _unlock_folder(lock: int | None) -> None:
 
 
 class Root(NamedTuple):
-    """Hold the root attributes of a store, and one sentence for each problem of the files that hold them."""
+    """Hold the root attributes of a store, and one sentence for each problem of the files that hold them.
+
+    `damage` needs a repair. `unfinished` is also what a reader sees while another process changes the attributes.
+    """
 
     attributes: dict[str, Any]
-    problems: tuple[str, ...]
+    damage: tuple[str, ...] = ()
+    unfinished: tuple[str, ...] = ()
+
+    @property
+    def problems(self) -> tuple[str, ...]:
+        """Return the sentences of both kinds."""
+        return self.damage + self.unfinished
 
 
 def read_document(path: Path) -> dict[str, Any] | None:
@@ -456,38 +465,41 @@ def read_document(path: Path) -> dict[str, Any] | None:
     return document if isinstance(document, dict) else None
 
 
-def _attributes_in(path: Path) -> dict[str, Any] | None:
+def _attributes_in(document: dict[str, Any] | None) -> dict[str, Any] | None:
     """Return the root attributes in a group's document, with or without a valid checksum; None if it has none."""
-    attributes = (read_document(path) or {}).get("attributes")
+    attributes = (document or {}).get("attributes")
     return attributes if isinstance(attributes, dict) and attributes.get("format") == "vbnfault" else None
 
 
 def read_root(path: Path) -> Root | None:
     """Return the root attributes of the store at `path`; None if no copy of them is valid.
 
-    If the copy in `spare` is valid, it is used: it is written before the root, so it is never older.
+    If the copy in `spare` is valid, it is used: it is written before the root, so it is never older. Each file is
+    read once and the root first, so that a change by another process makes the root look older, never damaged.
     """
-    files = {DOCUMENT: path / DOCUMENT, f"{SPARE}/{DOCUMENT}": path / SPARE / DOCUMENT}
-    attributes = {name: _attributes_in(file) for name, file in files.items()}
-    whole = {name: value for name, value in attributes.items() if value is not None and is_sealed(value)}
     spare = f"{SPARE}/{DOCUMENT}"
+    files = {DOCUMENT: path / DOCUMENT, spare: path / SPARE / DOCUMENT}
+    documents = {name: read_document(file) for name, file in files.items()}
+    attributes = {name: _attributes_in(document) for name, document in documents.items()}
+    whole = {name: value for name, value in attributes.items() if value is not None and is_sealed(value)}
     # the checksum is that of the attributes; `metadata_problems` compares the rest of the root's document
-    if spare in whole and canonical(read_document(files[spare])) != canonical(group_document(whole[spare])):
+    if spare in whole and canonical(documents[spare]) != canonical(group_document(whole[spare])):
         del whole[spare]
     if not whole:
         # a store made before checksums existed
         root = attributes[DOCUMENT]
         if root is None or CHECKSUM in root or (path / SPARE).exists():
             return None
-        return Root(root, (f"{DOCUMENT} has no checksum and no spare copy",))
-    problems = [
+        return Root(root, damage=(f"{DOCUMENT} has no checksum and no spare copy",))
+    damage = tuple(
         f"{name} is {'damaged' if os.path.lexists(files[name]) else 'missing'}; {other} has the same attributes"
         for name, other in (tuple(files), tuple(reversed(files)))
         if name not in whole
-    ]
+    )
+    unfinished: tuple[str, ...] = ()
     if len(whole) == 2 and len({value[CHECKSUM] for value in whole.values()}) == 2:
-        problems.append(f"{DOCUMENT} is older than {SPARE}/{DOCUMENT}: a change of the attributes was interrupted")
-    return Root(whole.get(f"{SPARE}/{DOCUMENT}") or whole[DOCUMENT], tuple(problems))
+        unfinished = (f"{DOCUMENT} is older than {spare}: a change of the attributes was interrupted",)
+    return Root(whole.get(spare) or whole[DOCUMENT], damage, unfinished)
 
 
 def is_store(path: str | os.PathLike[str]) -> bool:
@@ -498,8 +510,9 @@ def is_store(path: str | os.PathLike[str]) -> bool:
 def open_store(path: str | os.PathLike[str] | Store, mode: str = "r") -> Store:
     """Open a store for reading (`r`) or writing (`r+`).
 
-    If its root is damaged, the copy in `spare` is used. Mode `r` warns if either of them is damaged. An open
-    `Store` is returned as it is.
+    If its root is damaged, the copy in `spare` is used. Mode `r` warns if either of them is damaged; that the root
+    is older than the copy is no damage, since another process may be changing it now. An open `Store` is returned
+    as it is.
     Raises InputError if the path holds no store, or a store of another format version.
     """
     if isinstance(path, Store):
@@ -514,7 +527,7 @@ def open_store(path: str | os.PathLike[str] | Store, mode: str = "r") -> Store:
     except (KeyError, TypeError, ValueError, VbnfaultError) as error:
         raise InputError(f"{path}: {_NO_STORE}") from error
     if mode == "r":
-        for problem in root.problems:
+        for problem in root.damage:
             warnings.warn(f"{path}: {problem}; the build command mends it", UserWarning, stacklevel=2)
     return store
 
