@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import ast
+import importlib
 import importlib.metadata
 import subprocess
 import sys
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -31,12 +34,40 @@ def small(scene: str = "quickstart") -> vbnfault.Scene:
     return vbnfault.load_scene(scene, values)
 
 
-def test_every_public_name_resolves_and_is_listed() -> None:
-    assert set(vbnfault._HOME) | {"__version__"} == set(vbnfault.__all__) == set(dir(vbnfault))
-    for name in vbnfault.__all__:
-        assert getattr(vbnfault, name) is not None
-    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
-        vbnfault.nothing  # noqa: B018
+def imported_for_type_checkers(package: ModuleType) -> dict[str, str]:
+    """Return the names that a package imports under `if TYPE_CHECKING`, with homes as `load_name` takes them."""
+    homes: dict[str, str] = {}
+    for block in ast.parse(Path(str(package.__file__)).read_text()).body:
+        if isinstance(block, ast.If) and ast.unparse(block.test) == "TYPE_CHECKING":
+            for line in block.body:
+                assert isinstance(line, ast.ImportFrom)
+                for name in line.names:
+                    public = name.asname or name.name
+                    module = line.module or f"{name.name}:"
+                    homes[public] = module if public == name.name else f"{module}:{name.name}"
+    return homes
+
+
+@pytest.mark.parametrize("name", ["vbnfault", "vbnfault.dataset", "vbnfault.render", "vbnfault.study"])
+def test_every_public_name_resolves_and_is_listed(name: str) -> None:
+    package = importlib.import_module(name)
+    homes = package._HOMES
+    assert imported_for_type_checkers(package) == homes | ({"study": "study.run"} if name == "vbnfault" else {})
+    assert set(package.__all__) - set(homes) == {"vbnfault": {"__version__"}, "vbnfault.render": {"self_test"}}.get(
+        name, set()
+    )
+    assert set(homes) <= set(package.__all__)
+    for public in package.__all__:
+        assert getattr(package, public) is vars(package)[public] is not None
+    with pytest.raises(AttributeError, match=rf"module '{name}' has no attribute 'nothing'"):
+        package.nothing  # noqa: B018
+
+
+def test_the_package_lists_its_public_names() -> None:
+    assert dir(vbnfault) == vbnfault.__all__
+    assert vbnfault.build is vbnfault.dataset.build_scene  # a name of its own
+    assert vbnfault.navigation is sys.modules["vbnfault.navigation"]  # a module
+    assert callable(vbnfault.study)
 
 
 def test_the_import_loads_nothing_but_itself() -> None:

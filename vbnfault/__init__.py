@@ -32,40 +32,40 @@ if TYPE_CHECKING:
     from .store import open_dataset
     from .study.run import study
 
-# public name → the module that defines it, and its name there; "": the module itself
-_HOME = {
-    "DiscReflectance": ("reflectance", "DiscReflectance"),
-    "Effect": ("detector.effects", "Effect"),
-    "Exposure": ("detector.effects", "Exposure"),
-    "BuildOptions": ("dataset", "BuildOptions"),
-    "Fault": ("faults", "Fault"),
-    "FaultContext": ("faults", "FaultContext"),
-    "Flare": ("output.flare_images", "Flare"),
-    "InputError": ("core.errors", "InputError"),
-    "Interval": ("faults", "Interval"),
-    "Reflectance": ("reflectance", "Reflectance"),
-    "Prescription": ("lens", "Prescription"),
-    "Scene": ("scene.config", "Scene"),
-    "Sensor": ("detector.sensor", "Sensor"),
-    "Session": ("pipeline", "Session"),
-    "VbnfaultError": ("core.errors", "VbnfaultError"),
-    "bounds": ("faults", "bounds"),
-    "build": ("dataset", "build_scene"),
-    "choice": ("faults", "choice"),
-    "flag": ("faults", "flag"),
-    "load_lens": ("lens", "load_lens"),
-    "load_scene": ("scene.config", "load_scene"),
-    "load_sensor": ("detector.sensor", "load_sensor"),
-    "navigation": ("navigation", ""),
-    "number": ("faults", "number"),
-    "open_dataset": ("store", "open_dataset"),
-    "path": ("faults", "path"),
-    "rows": ("faults", "rows"),
-    "simulate": ("pipeline", "simulate"),
-    "study": ("study", ""),
-    "text": ("faults", "text"),
-    "trace_flare": ("output.flare_images", "trace_flare"),
-    "verify": ("dataset", "verify"),
+# public name → the module that defines it, see `load_name`; it is loaded when the name is first used
+_HOMES = {
+    "BuildOptions": "dataset",
+    "DiscReflectance": "reflectance",
+    "Effect": "detector.effects",
+    "Exposure": "detector.effects",
+    "Fault": "faults",
+    "FaultContext": "faults",
+    "Flare": "output.flare_images",
+    "InputError": "core.errors",
+    "Interval": "faults",
+    "Prescription": "lens",
+    "Reflectance": "reflectance",
+    "Scene": "scene.config",
+    "Sensor": "detector.sensor",
+    "Session": "pipeline",
+    "VbnfaultError": "core.errors",
+    "bounds": "faults",
+    "build": "dataset:build_scene",
+    "choice": "faults",
+    "flag": "faults",
+    "load_lens": "lens",
+    "load_scene": "scene.config",
+    "load_sensor": "detector.sensor",
+    "navigation": "navigation:",
+    "number": "faults",
+    "open_dataset": "store",
+    "path": "faults",
+    "rows": "faults",
+    "simulate": "pipeline",
+    "study": "study:",
+    "text": "faults",
+    "trace_flare": "output.flare_images",
+    "verify": "dataset",
 }
 
 __all__ = [
@@ -105,17 +105,13 @@ __all__ = [
 ]
 
 
-def __getattr__(name: str) -> Any:
-    """Return a public name from the module that defines it."""
-    if name not in _HOME:
-        raise AttributeError(f"module 'vbnfault' has no attribute {name!r}")
-    import importlib
+if not TYPE_CHECKING:  # a type checker that saw the function would accept every misspelled name
 
-    module, defined = _HOME[name]
-    loaded = importlib.import_module(f".{module}", __name__)
-    value = getattr(loaded, defined) if defined else loaded
-    globals()[name] = value
-    return value
+    def __getattr__(name: str) -> Any:
+        """Return a public name from the module that defines it."""
+        from .core.lazy_names import load_name  # not above: the import of the package loads no other module
+
+        return load_name(__name__, name, _HOMES)
 
 
 def __dir__() -> list[str]:

@@ -10,6 +10,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from ..core.lazy_names import load_name
+
 if TYPE_CHECKING:
     from .build import BuildOptions
     from .checking import missing_plugins, verify
@@ -29,8 +31,8 @@ __all__ = [
     "verify",
 ]
 
-# public name → the module that defines it
-_HOME = {
+# public name → the module that defines it; it is loaded when the name is first used
+_HOMES = {
     "BuildOptions": "build",
     "SessionFactory": "from_scene",
     "build_scene": "from_scene",
@@ -44,12 +46,8 @@ _HOME = {
 }
 
 
-def __getattr__(name: str) -> Any:
-    """Return a public name from the module that defines it."""
-    if name not in _HOME:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    import importlib
+if not TYPE_CHECKING:  # a type checker that saw the function would accept every misspelled name
 
-    value = getattr(importlib.import_module(f".{_HOME[name]}", __name__), name)
-    globals()[name] = value
-    return value
+    def __getattr__(name: str) -> Any:
+        """Return a public name from the module that defines it."""
+        return load_name(__name__, name, _HOMES)

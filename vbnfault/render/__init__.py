@@ -6,8 +6,9 @@ data and loads without Mitsuba.
 
 from __future__ import annotations
 
-import importlib
 from typing import TYPE_CHECKING, Any
+
+from ..core.lazy_names import load_name
 
 if TYPE_CHECKING:
     from .bounces import indirect
@@ -20,7 +21,8 @@ if TYPE_CHECKING:
     from .surface import TerrainMesh
     from .vehicle import Vehicle
 
-_HOME = {
+# public name → the module that defines it, which loads Mitsuba
+_HOMES = {
     "FineRelief": "detail",
     "TerrainMesh": "surface",
     "Vehicle": "vehicle",
@@ -37,11 +39,11 @@ _HOME = {
 }
 
 
-def __getattr__(name: str) -> Any:
-    """Return a public name from the module that defines it, which loads Mitsuba."""
-    if name not in _HOME:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(importlib.import_module(f".{_HOME[name]}", __name__), name)
+if not TYPE_CHECKING:  # a type checker that saw the function would accept every misspelled name
+
+    def __getattr__(name: str) -> Any:
+        """Return a public name from the module that defines it, which loads Mitsuba."""
+        return load_name(__name__, name, _HOMES)
 
 
 def self_test() -> str:

@@ -13,6 +13,8 @@ import sys
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
+from ..core.lazy_names import load_name
+
 if TYPE_CHECKING:
     from .chunks import StudyFailed
     from .results import open_indices, read_table
@@ -20,7 +22,7 @@ if TYPE_CHECKING:
     from .spec import Evaluation, Evaluator, Metric, StudySpec, load_study, parse_study
 
 # public name → the module that defines it; it is loaded when the name is first used
-_HOME = {
+_HOMES = {
     "Evaluation": "spec",
     "Evaluator": "spec",
     "Metric": "spec",
@@ -51,15 +53,11 @@ __all__ = [
 ]
 
 
-def __getattr__(name: str) -> Any:
-    """Return a public name from the module that defines it."""
-    if name not in _HOME:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    import importlib
+if not TYPE_CHECKING:  # a type checker that saw the function would accept every misspelled name
 
-    value = getattr(importlib.import_module(f".{_HOME[name]}", __name__), name)
-    globals()[name] = value
-    return value
+    def __getattr__(name: str) -> Any:
+        """Return a public name from the module that defines it."""
+        return load_name(__name__, name, _HOMES)
 
 
 class _Callable(ModuleType):
