@@ -19,7 +19,7 @@ import numpy as np
 from optiland.physical_apertures import RadialAperture
 from optiland.rays import RealRays
 
-from vbnfault.lens import Prescription, first_order, load_lens
+from vbnfault.lens import Prescription, load_lens, paraxial_properties
 from vbnfault.lens.glass import D_NM
 from vbnfault.lens.straylight.ghosts import surface_interactions_per_second
 
@@ -41,7 +41,7 @@ def optilands(lens: Prescription, count: int) -> tuple[float, float]:
         surface.aperture = RadialAperture(surface.aperture.r_max)
     across = int(np.ceil(np.sqrt(count)))
     over_disc = int(np.ceil(np.sqrt(count * 4 / np.pi)))  # optiland's uniform grid leaves out the pupil's corners
-    half = first_order(lens).entrance_pupil_diameter_mm / 2 / np.sqrt(2)
+    half = paraxial_properties(lens).entrance_pupil_diameter_mm / 2 / np.sqrt(2)
     x, y = (v.ravel() for v in np.meshgrid(*[np.linspace(-half, half, across)] * 2))
     one, none = np.ones_like(x), np.zeros_like(x)
 

@@ -10,8 +10,8 @@ centre:
 - veil: v A T cos θ / (π f²), which integrates to v;
 - scatter: `lens.straylight.scatter.point_source_transmittance`, with roughness and particles;
 - ghosts: apart from losses, radiance is constant along a path. So a ghost contributes L T_g Ω, where Ω is the solid
-  angle of its beam as seen from the centre of the sensor. To first order the beam ends at r = ±r_max, where its
-  slope is r / M01.
+  angle of its beam as seen from the centre of the sensor. The paraxial beam ends at r = ±r_max, where its slope
+  is r / M01.
 
 `--coating` sets the coatings: the patents state none, and uncoated glass would add 2 to 11 % of ghosts.
 """
@@ -23,7 +23,7 @@ import argparse
 import numpy as np
 
 from vbnfault.core import resources
-from vbnfault.lens import Prescription, first_order, load_lens
+from vbnfault.lens import Prescription, load_lens, paraxial_properties
 from vbnfault.lens.glass import D_NM
 from vbnfault.lens.rays import ghost
 from vbnfault.lens.straylight.paraxial import along, axial_transmittance, pairs, transmittance
@@ -43,9 +43,9 @@ def index_of(
     wavelength_nm: float = D_NM,
 ) -> dict[str, float]:
     """Return the parts of the veiling glare index, `veil`, `scatter` and `ghosts`, as fractions of the field."""
-    order = first_order(lens)
+    optics = paraxial_properties(lens)
     passed = float(axial_transmittance(lens, wavelength_nm)[0])
-    field = passed * np.pi / 4 * order.entrance_pupil_diameter_mm**2 / order.efl_mm**2
+    field = passed * np.pi / 4 * optics.entrance_pupil_diameter_mm**2 / optics.efl_mm**2
     theta = np.radians(ANGLES_DEG)
     rings = 2 * np.pi * np.sin(theta)
     source = np.cos(theta) * field * veil_fraction / np.pi

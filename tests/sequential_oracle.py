@@ -21,7 +21,7 @@ from optiland.optic import Optic
 from optiland.physical_apertures import RadialAperture
 from optiland.rays import RealRays
 
-from vbnfault.lens import Prescription, first_order
+from vbnfault.lens import Prescription, paraxial_properties
 from vbnfault.lens.glass import D_NM
 
 F64 = NDArray[np.float64]
@@ -165,7 +165,7 @@ def system(
             is_stop=surface.stop and happens == "onward",
             **shape,
         )
-    optic.surfaces.add(index=len(steps) + 1, radius=np.inf, z=float(vertex[-1] + first_order(lens).bfd_mm))
+    optic.surfaces.add(index=len(steps) + 1, radius=np.inf, z=float(vertex[-1] + paraxial_properties(lens).bfd_mm))
     optic.set_aperture("float_by_stop_size", 2 * lens.surfaces[lens.stop].semi_diameter_mm)
     optic.fields.set_type("angle")
     optic.fields.add(y=0.0)
@@ -242,7 +242,7 @@ def ghost_truth(
     if corners is None:
         return 0.0, (float("nan"), float("nan")), float("nan")
     low, high = corners
-    scale = _LENGTH_SHARE * first_order(lens).efl_mm
+    scale = _LENGTH_SHARE * paraxial_properties(lens).efl_mm
     cell = (high - low) / grid
     middles = low + (np.stack(np.indices((grid, grid)), axis=-1).reshape(-1, 2) + 0.5) * cell
     parts, _ = _quarters(optic, direction, middles, cell, scale)
@@ -263,7 +263,7 @@ def ghost_truth(
     flux = total[0]
     centroid = total[1:3] / flux
     spread = max(total[3] / flux - centroid @ centroid, 0.0)
-    pupil = np.pi / 4 * first_order(lens).entrance_pupil_diameter_mm ** 2
+    pupil = np.pi / 4 * paraxial_properties(lens).entrance_pupil_diameter_mm ** 2
     x, y = (float(v) for v in centroid * scale)
     return float(flux / pupil), (x, y), float(np.sqrt(spread)) * scale
 
@@ -278,7 +278,7 @@ def round_ghost_truth(
     found = trace_ghost(lens, a, b, places, [0.0, 0.0, 1.0], wavelength_nm=wavelength_nm)
     light = np.where(found.passes, found.transmittance, 0.0) * 2 * radius * step
     spread = light @ np.nan_to_num(found.sensor_mm[:, 0]) ** 2 / light.sum()
-    pupil_radius = first_order(lens).entrance_pupil_diameter_mm / 2
+    pupil_radius = paraxial_properties(lens).entrance_pupil_diameter_mm / 2
     return float(light.sum() / pupil_radius**2), (0.0, 0.0), float(np.sqrt(spread))
 
 

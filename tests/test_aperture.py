@@ -22,9 +22,9 @@ from vbnfault.faults import FaultContext, from_dict
 from vbnfault.lens import (
     Prescription,
     RealLens,
-    first_order,
     load_lens,
     open_f_number,
+    paraxial_properties,
     parse_lens,
     scaled_to_focal_length,
     stopped_down,
@@ -64,7 +64,7 @@ def arrives(lens: Prescription, height_mm: float) -> bool:
 @pytest.mark.parametrize("f_number", [4.0, 16.0, 200.0])
 def test_the_marginal_ray_is_that_of_the_f_number(name: str, f_number: float) -> None:
     lens = stopped_down(load_lens(name), f_number)
-    marginal = first_order(lens).efl_mm / f_number / 2
+    marginal = paraxial_properties(lens).efl_mm / f_number / 2
     # the stop is set by the very ray: what is left is rounding, far below 1e-9
     assert arrives(lens, marginal * (1 - 1e-9))
     assert not arrives(lens, marginal * (1 + 1e-9))
@@ -119,7 +119,9 @@ def test_the_store_says_what_the_lens_became() -> None:
     told = dataset.store_spec(Session(settings.model_copy(update={"faults": faults})), [4]).attributes["optics"]
     focal = SIDE_PX * 88e-3 / 2 / math.tan(math.radians(20))
     assert told["efl_mm"] == pytest.approx(focal, rel=1e-12)
-    assert told["scale"] == pytest.approx(focal / first_order(load_lens("nikkor_35_f2p8")).efl_mm, rel=1e-12)
+    assert told["scale"] == pytest.approx(
+        focal / paraxial_properties(load_lens("nikkor_35_f2p8")).efl_mm, rel=1e-12
+    )
     assert told["f_number"] == pytest.approx(5.6, rel=1e-5)
     assert told["name"] == "Nikkor 35 mm f/2.8"
 
@@ -185,7 +187,7 @@ def test_ghosts_and_starburst_follow_the_stop() -> None:
     lenses = [real("nikkor_35_f2p8", n).prescription for n in (4.0, 16.0)]
     flux = []
     for lens in lenses:
-        pupil_mm2 = math.pi / 4 * first_order(lens).entrance_pupil_diameter_mm ** 2
+        pupil_mm2 = math.pi / 4 * paraxial_properties(lens).entrance_pupil_diameter_mm ** 2
         flux.append({g.pair: g.flux_fraction * pupil_mm2 for g in paraxial_ghosts(lens, 0.0)})
     shared = set(flux[0]) & set(flux[1])
     ratio = np.array([flux[0][pair] / flux[1][pair] for pair in shared])
@@ -213,7 +215,7 @@ def test_a_build_tells_how_a_lens_was_scaled(tmp_path: Path) -> None:
     assert runner.invoke(app, ["lens", "nikkor_35_f2p8", *given]).exit_code == 0
     table = json.loads(made.read_text())
     assert (table["efl_mm"], table["real_f_number"]) == (pytest.approx(7.0), pytest.approx(5.6, rel=1e-6))
-    assert table["scale"] == pytest.approx(7.0 / first_order(load_lens("nikkor_35_f2p8")).efl_mm)
+    assert table["scale"] == pytest.approx(7.0 / paraxial_properties(load_lens("nikkor_35_f2p8")).efl_mm)
     # the same scale and stop by the field that the sensor spans
     by_field = ["--fov-deg", "40", "--sensor-width-mm", str(SIDE_PX * 88e-3), "--f-number", "5.6", *given[4:]]
     assert runner.invoke(app, ["lens", "nikkor_35_f2p8", *by_field]).exit_code == 0
@@ -232,13 +234,13 @@ def test_scaling_keeps_films_roughness_and_grains_and_lengthens_paths_in_glass()
             row["internal_transmittance_10mm"] = 0.9
     lens = parse_lens(rows, source="test")
     small = scaled_to_focal_length(lens, 5.0)
-    factor = 5.0 / first_order(lens).efl_mm
+    factor = 5.0 / paraxial_properties(lens).efl_mm
     assert small.scale == pytest.approx(factor, rel=1e-12)
     assert small.scaled(2.0).scale == pytest.approx(2 * factor, rel=1e-12)
     for before, after in zip(lens.surfaces, small.surfaces, strict=True):
         assert after.coating == before.coating
         assert after.thickness_mm == pytest.approx(before.thickness_mm * factor)
-    figures = [first_order(v) for v in (lens, small)]
+    figures = [paraxial_properties(v) for v in (lens, small)]
     assert figures[1].f_number == pytest.approx(figures[0].f_number, rel=1e-12)
     # absorption per mm: the glass's share to the power of the scale; reflections as before
     clear = [

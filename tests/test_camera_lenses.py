@@ -9,7 +9,7 @@ import pytest
 
 from vbnfault.core import llvm
 from vbnfault.core.errors import VbnfaultError
-from vbnfault.lens import RealLens, first_order, load_lens, scaled_to_field
+from vbnfault.lens import RealLens, load_lens, paraxial_properties, scaled_to_field
 from vbnfault.lens.straylight.settings import SensorGrid, SunSource
 from vbnfault.lens.straylight.total import straylight
 
@@ -25,7 +25,7 @@ def test_plates_shift_the_focus_and_leave_the_lens(name: str) -> None:
     assert lens.surfaces[: count - 1] == bare.surfaces[:-1]
     assert replace(lens.surfaces[count - 1], thickness_mm=0.0) == replace(bare.surfaces[-1], thickness_mm=0.0)
     assert [s.medium.nd > 1 for s in plates] == [True, False, True, False]
-    figures, before = first_order(lens), first_order(bare)
+    figures, before = paraxial_properties(lens), paraxial_properties(bare)
     assert figures.efl_mm == pytest.approx(before.efl_mm, rel=1e-12)
     assert figures.f_number == pytest.approx(before.f_number, rel=1e-12)
     # t (n - 1) / n of every plate

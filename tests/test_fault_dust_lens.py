@@ -19,7 +19,7 @@ from vbnfault.core import spectra
 from vbnfault.core.errors import InputError
 from vbnfault.detector import ThreeColourDetector
 from vbnfault.faults import FaultContext, dust_lens
-from vbnfault.lens import RealLens, ThinLens, first_order, load_lens, scaled_to_field, stopped_down
+from vbnfault.lens import RealLens, ThinLens, load_lens, paraxial_properties, scaled_to_field, stopped_down
 from vbnfault.lens.footprint import ImageFrame, beams, disc_overlap
 from vbnfault.lens.rays import real_pupil_diameter_mm, trace
 
@@ -179,7 +179,7 @@ def test_a_grain_on_the_window_lies_in_the_cone(height: float, grain: float) -> 
     cone = height / f_number
     # the rim's rays come to a focus 5 µm before the sensor: 0.5 and 1.3 % of the heights; the table's cells 1 %
     assert found.max() == pytest.approx(min(1.0, (grain / cone) ** 2), rel=0.025)
-    pupil = first_order(prescription)
+    pupil = paraxial_properties(prescription)
     onto_sensor = 1 / (1 - height / (pupil.bfd_mm - pupil.exit_pupil_mm))
     wide = np.count_nonzero(found[size // 2] > 0.002 * found.max()) * pitch_mm
     assert wide == pytest.approx((grain + cone) * onto_sensor, abs=3 * pitch_mm)
@@ -212,7 +212,7 @@ def test_losses_are_those_of_rays_that_hit_grains(name: str, surface: int, off: 
     # rays towards that pixel, spread evenly over a square that holds the beam
     distance = np.hypot(*(place := np.array([column + 0.5 - 128, row + 0.5 - 128]) / lens.focal_length_px))
     slope = place / distance * float(lens.undistorted(np.array(distance)))
-    middle = -slope * first_order(lens.prescription).entrance_pupil_mm
+    middle = -slope * paraxial_properties(lens.prescription).entrance_pupil_mm
     half = 1.0 * real_pupil_diameter_mm(lens.prescription)
     x, y = (rng(5).uniform(-half, half, (2, 100_000)).T + middle).T
     start = np.column_stack([x, y, np.zeros_like(x)])
@@ -255,7 +255,7 @@ def test_footprints_are_brighter_where_rays_crowd(
     found = float(cover(x, 0.0, a)[0, 0])
     half = real_pupil_diameter_mm(lens.prescription)
     start = rng(7).uniform(-half, half, (100_000, 3)) * [1, 1, 0]
-    start[:, 0] -= slope * first_order(lens.prescription).entrance_pupil_mm
+    start[:, 0] -= slope * paraxial_properties(lens.prescription).entrance_pupil_mm
     rays = trace(lens.prescription, start, np.tile([slope, 0.0, 1.0], (len(start), 1)), sensor_mm=lens.sensor_mm)
     points = rays.points_mm[1 + surface] if surface >= 0 else rays.points_mm[-1]
     if surface < 0:
@@ -297,9 +297,9 @@ def test_the_lens_is_the_cameras_own_or_the_one_named() -> None:
     frame = {"width_px": 256, "height_px": 256, "pixel_pitch_um": 22.0}
     assert ImageFrame(lens=own, **frame).real_lens("") is own
     named = ImageFrame(lens=own, **frame).real_lens("tessar_50_f2p8")
-    assert first_order(named.prescription).efl_mm == pytest.approx(own.focal_length_mm)
+    assert paraxial_properties(named.prescription).efl_mm == pytest.approx(own.focal_length_mm)
     thin = ImageFrame(lens=ThinLens(focal_length_mm=7.0, f_number=5.6), **frame).real_lens("")
-    assert first_order(thin.prescription).efl_mm == pytest.approx(7.0)
+    assert paraxial_properties(thin.prescription).efl_mm == pytest.approx(7.0)
     # the ray at the beam's rim is traced exactly; its width is told on a grid of heights, within 1e-3
     assert real_pupil_diameter_mm(thin.prescription) == pytest.approx(7.0 / 5.6, rel=1e-3)
     wide = ImageFrame(lens=ThinLens(focal_length_mm=7.0, f_number=1.0), **frame).real_lens("")

@@ -12,7 +12,7 @@ from test_faults_kit import flat_electrons, make_context
 from vbnfault.core import llvm, spectra
 from vbnfault.core.errors import InputError, VbnfaultError
 from vbnfault.faults import FaultContext, from_dict, registry
-from vbnfault.lens import first_order, load_lens, scaled_to_focal_length
+from vbnfault.lens import load_lens, paraxial_properties, scaled_to_focal_length
 from vbnfault.lens.coating import mean_reflectance
 from vbnfault.lens.rays import ghost
 from vbnfault.lens.straylight.paraxial import transmittance
@@ -134,7 +134,7 @@ def test_a_slow_camera_closes_the_stop() -> None:
     np.testing.assert_array_equal(added, again)  # the stop opens no farther than the f/2.8 of the prescription
     shared = wide.keys() & narrow.keys()
     assert len(shared) >= 10
-    # to first order a ghost is the stop's image; some are bound by other rims, or all but in focus
+    # a paraxial ghost is the stop's image; some are bound by other rims, or all but in focus
     assert np.median([narrow[pair] / wide[pair] for pair in shared]) == pytest.approx(2.8 / 8, rel=0.1)
 
 
@@ -146,7 +146,7 @@ def test_the_lens_is_the_cameras_own_or_the_one_named() -> None:
     other, _ = light("traced", where, lens="tessar_50_f2p8", coating="as_prescribed")
     assert np.abs(other - named).max() > 0
     scaled = scaled_to_focal_length(load_lens("tessar_50_f2p8"), where.camera.lens.focal_length_mm)
-    assert first_order(scaled).efl_mm == pytest.approx(where.camera.lens.focal_length_mm)
+    assert paraxial_properties(scaled).efl_mm == pytest.approx(where.camera.lens.focal_length_mm)
     assert params["lens"] == "nikkor_35_f2p8"
     with pytest.raises(InputError, match=r"scene\.toml: faults\.straylight|no_such_lens"):
         from_dict("straylight", {"model": "traced", "lens": "no_such_lens"}, source="scene.toml")

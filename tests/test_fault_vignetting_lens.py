@@ -17,7 +17,7 @@ from vbnfault.camera import Camera
 from vbnfault.core.errors import InputError
 from vbnfault.detector import ThreeColourDetector
 from vbnfault.faults import FaultContext
-from vbnfault.lens import RealLens, ThinLens, first_order, load_lens, scaled_to_field
+from vbnfault.lens import RealLens, ThinLens, load_lens, paraxial_properties, scaled_to_field
 from vbnfault.lens.rays import real_pupil_diameter_mm, trace
 
 F64 = NDArray[np.float64]
@@ -105,7 +105,7 @@ def test_a_thin_lens_is_given_the_prescriptions_illumination_once() -> None:
     own = make("vignetting", model="lens")
     # the lens as the camera has it: at its focal length, and closed to f/4
     focal, f_number = where.camera.lens.focal_length_mm, 4.0
-    lens = load_lens("nikkor_28_f2p8").scaled(focal / first_order(load_lens("nikkor_28_f2p8")).efl_mm)
+    lens = load_lens("nikkor_28_f2p8").scaled(focal / paraxial_properties(load_lens("nikkor_28_f2p8")).efl_mm)
     stop = lens.surfaces[lens.stop]
     heights = trace(lens, [[focal / f_number / 2, 0.0, -1.0]], [[0.0, 0.0, 1.0]]).points_mm[1 + lens.stop, 0, 0]
     surfaces = list(lens.surfaces)
@@ -183,7 +183,7 @@ def test_what_is_left_of_a_real_lenss_rays(column: int, row: int) -> None:
     place = np.array([column + 0.5 - SIZE / 2, row + 0.5 - SIZE / 2]) / lens.focal_length_px
     distance = float(np.hypot(*place))
     slope = place / distance * float(lens.undistorted(np.array(distance)))
-    middle = -slope * first_order(lens.prescription).entrance_pupil_mm
+    middle = -slope * paraxial_properties(lens.prescription).entrance_pupil_mm
     half = real_pupil_diameter_mm(lens.prescription)
     x, y = (rng(1).uniform(-half, half, (2, 60_000)).T + middle).T
     start = np.column_stack([x, y, np.zeros_like(x)])

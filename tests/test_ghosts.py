@@ -11,7 +11,7 @@ from test_lens import BACK, GLASS, STOP
 
 from vbnfault.core import llvm
 from vbnfault.core.errors import InputError, VbnfaultError
-from vbnfault.lens import first_order, load_lens, parse_lens, scaled_to_focal_length
+from vbnfault.lens import load_lens, paraxial_properties, parse_lens, scaled_to_focal_length
 from vbnfault.lens.glass import D_NM
 from vbnfault.lens.prescription import Prescription
 from vbnfault.lens.rays import path_of, trace
@@ -41,7 +41,7 @@ LENSES = (
 
 def pixel_mm(lens: Prescription) -> float:
     """Of a camera of 1024 px and 65° across."""
-    return float(2 * first_order(lens).efl_mm * np.tan(np.radians(32.5)) / 1024)
+    return float(2 * paraxial_properties(lens).efl_mm * np.tan(np.radians(32.5)) / 1024)
 
 
 def bundle(route: int, box: tuple[float, float, float, float], direction: Any) -> Rays:
@@ -71,10 +71,10 @@ def both_ways(lens: Prescription, made: Tracer, rays: Rays, across: int) -> tupl
 def test_single_precision_keeps_to_a_hundredth_of_a_pixel(name: str) -> None:
     lens = load_lens(name)
     made = Tracer(lens, np.array([D_NM]), routes_=[()])
-    radius = first_order(lens).entrance_pupil_diameter_mm / 2
+    radius = paraxial_properties(lens).entrance_pupil_diameter_mm / 2
     for degrees in (0.0, 10.0, 20.0):
         slope = np.tan(np.radians(degrees))
-        aim = -slope * first_order(lens).entrance_pupil_mm
+        aim = -slope * paraxial_properties(lens).entrance_pupil_mm
         rays = bundle(0, (aim, 0.0, radius, radius), [slope, 0.0, 1.0])
         single, double, beyond, found = both_ways(lens, made, rays, 31)
         kept = found.arrives
@@ -213,7 +213,7 @@ def test_ghosts_turn_with_the_sun_and_lie_on_the_axis_under_it() -> None:
         assert np.hypot(*ghost.centroid_mm) < 1e-3 * ghost.rms_radius_mm
 
 
-def test_first_order_is_the_limit_of_a_small_stop_and_angle() -> None:
+def test_paraxial_rays_are_the_limit_of_a_small_stop_and_angle() -> None:
     """Flux and place of every ghost: what differs falls as the square of aperture and angle together."""
     lens = load_lens("nikkor_28_f2p8")
     differ = []
@@ -276,11 +276,11 @@ def model(lens: Prescription, **more: Any) -> FlareModel:
 @pytest.mark.parametrize(("kind", "worst"), [("traced", 0.05), ("paraxial", 0.01)])
 def test_a_picture_holds_the_flux_of_its_ghosts(kind: str, worst: float) -> None:
     """Every ghost by itself that lies within the frame: light and place as its rays have them. Cells of a lattice
-    are linear in it: exact for first-order ghosts but for their rims; of the others the most distorted err most."""
+    are linear in it: exact for paraxial ghosts but for their rims; of the others the most distorted err most."""
     lens = load_lens("tessar_50_f2p8")
     pitch, half = 0.5, 120
     made = model(lens, model=kind, pitch_mm=pitch, shape=(2 * half, 2 * half), diffraction=False, across=73)
-    area = np.pi / 4 * first_order(lens).entrance_pupil_diameter_mm ** 2
+    area = np.pi / 4 * paraxial_properties(lens).entrance_pupil_diameter_mm ** 2
     told = (
         {g.pair: g for g in traced_ghosts(lens, 6.0, azimuth_deg=40.0, across=192)}
         if kind == "traced"

@@ -28,9 +28,9 @@ from vbnfault.detector import ThreeColourDetector
 from vbnfault.lens import (
     RealLens,
     ThinLens,
-    first_order,
     imaging,
     load_lens,
+    paraxial_properties,
     parse_lens,
     point_spread,
     resampling,
@@ -90,7 +90,7 @@ def rays(lens: RealLens, slope: Any, x: Any, y: Any, wavelength_nm: float) -> An
 def chief_px(lens: RealLens, slope: F64, wavelength_nm: float) -> F64:
     """Distances of images from the axis, by bisection for the ray through the middle of the stop."""
     first, row = lens.prescription.surfaces[0], 1 + lens.prescription.stop
-    middle, step = -slope * first_order(lens.prescription).entrance_pupil_mm, 0.02 * first.semi_diameter_mm
+    middle, step = -slope * paraxial_properties(lens.prescription).entrance_pupil_mm, 0.02 * first.semi_diameter_mm
 
     def off(x: F64) -> F64:
         return np.asarray(rays(lens, slope, x, np.zeros(1), wavelength_nm).points_mm[row, :, 0])
@@ -248,7 +248,7 @@ def test_a_thin_lens_of_small_aperture_follows_cos4() -> None:
     # the thickness, 2e-4 of the focal length, is what is left of distortion; the rim's table holds 1e-5
     np.testing.assert_allclose(lens.distorted(slope), slope, rtol=2e-4)
     np.testing.assert_allclose(lens.relative_illumination(lens.distorted(slope)), (1 + slope**2) ** -2, rtol=1e-3)
-    assert lens.f_number == pytest.approx(first_order(lens.prescription).efl_mm / 0.5, rel=1e-4)
+    assert lens.f_number == pytest.approx(paraxial_properties(lens.prescription).efl_mm / 0.5, rel=1e-4)
     np.testing.assert_allclose(lens.distortion, 0, atol=1e-3)
 
 
@@ -282,7 +282,7 @@ def test_light_that_lands_on_a_ring_of_the_sensor(name: str, distance_px: float)
 def test_irradiance_on_the_axis(name: str) -> None:
     """E = π T L / (4 N²) with the f-number of real rays; T by the coatings' own function."""
     lens = real(name)
-    n = first_order(lens.prescription).efl_mm / real_pupil_diameter_mm(lens.prescription)
+    n = paraxial_properties(lens.prescription).efl_mm / real_pupil_diameter_mm(lens.prescription)
     index = lens.prescription.indices(D_NM)
     loss = [mean_reflectance((), a, b, 1.0, D_NM) for a, b in itertools.pairwise(index) if a != b]
     share = float(np.prod(1 - np.array(loss)))
@@ -330,7 +330,7 @@ def test_a_stop_with_blades_counts_by_its_area() -> None:
         stop, blades=0, semi_diameter_mm=math.sqrt(hexagon) * stop.semi_diameter_mm
     )
     smaller = replace(lens.prescription, surfaces=tuple(rows))
-    n = first_order(smaller).efl_mm / real_pupil_diameter_mm(smaller)
+    n = paraxial_properties(smaller).efl_mm / real_pupil_diameter_mm(smaller)
     assert bladed.f_number == pytest.approx(n, rel=1e-4)
     assert n > 1.05 * lens.f_number
 
@@ -474,7 +474,7 @@ def test_a_finer_grid_keeps_its_pixels_and_does_not_ripple() -> None:
 
 def test_the_best_focus_has_the_least_spots() -> None:
     paraxial, best = real("nikkor_28_f2p8"), real("nikkor_28_f2p8", focus="best")
-    assert paraxial.sensor_mm == pytest.approx(first_order(paraxial.prescription).bfd_mm, rel=1e-12)
+    assert paraxial.sensor_mm == pytest.approx(paraxial_properties(paraxial.prescription).bfd_mm, rel=1e-12)
     x = np.arange(SIDE_PX) + 0.5 - SIDE_PX / 2
     radius = np.hypot(x[None], x[:, None]) / paraxial.focal_length_px
     angles = np.radians(np.arange(1.0, 42.0, 3.0))

@@ -13,11 +13,11 @@ import pytest
 
 from vbnfault.core import resources
 from vbnfault.core.errors import InputError
-from vbnfault.lens import first_order, load_lens, parse_lens, scaled_to_field, scaled_to_focal_length
+from vbnfault.lens import load_lens, paraxial_properties, parse_lens, scaled_to_field, scaled_to_focal_length
 from vbnfault.lens import rays as trace_module
 from vbnfault.lens.coating import NAMES, Layer, design, mean_reflectance, reflect_transmit
-from vbnfault.lens.gaussian import gap, refraction, system
 from vbnfault.lens.glass import AIR, GLASSES, from_abbe
+from vbnfault.lens.paraxial import gap, refraction, system
 from vbnfault.lens.prescription import Surface
 from vbnfault.lens.rays import ghost, real_pupil_diameter_mm, trace
 from vbnfault.lens.straylight import paraxial
@@ -38,9 +38,9 @@ def test_every_published_lens_is_packaged() -> None:
 
 
 @pytest.mark.parametrize("name", PUBLISHED)
-def test_first_order_properties(name: str) -> None:
+def test_paraxial_properties(name: str) -> None:
     lens = load_lens(name)
-    found = first_order(lens)
+    found = paraxial_properties(lens)
     efl, bfd, f_number = PUBLISHED[name]
     # the published figures are rounded to their last digit
     assert found.efl_mm == pytest.approx(efl, abs=0.006 if efl < 100 else 0.06)
@@ -71,7 +71,7 @@ def test_a_thick_lens_and_two_thin_ones() -> None:
         source="thick",
     )
     power = (n - 1) * (1 / r1 - 1 / r2 + (n - 1) * d / (n * r1 * r2))
-    found = first_order(lens)
+    found = paraxial_properties(lens)
     assert found.efl_mm == pytest.approx(1 / power, rel=1e-12)
     assert found.bfd_mm == pytest.approx((1 - (n - 1) * d / (n * r1)) / power, rel=1e-12)
     assert found.entrance_pupil_mm == pytest.approx(0.0, abs=1e-12)
@@ -82,10 +82,10 @@ def test_a_thick_lens_and_two_thin_ones() -> None:
 def test_scaling() -> None:
     lens = load_lens("nikkor_35_f2p8")
     scaled = scaled_to_focal_length(lens, 7.9)
-    assert first_order(scaled).efl_mm == pytest.approx(7.9, rel=1e-12)
-    assert first_order(scaled).f_number == pytest.approx(first_order(lens).f_number, rel=1e-12)
+    assert paraxial_properties(scaled).efl_mm == pytest.approx(7.9, rel=1e-12)
+    assert paraxial_properties(scaled).f_number == pytest.approx(paraxial_properties(lens).f_number, rel=1e-12)
     wide = scaled_to_field(lens, 65.0, 10.0)
-    assert math.degrees(2 * math.atan(5.0 / first_order(wide).efl_mm)) == pytest.approx(65.0, rel=1e-9)
+    assert math.degrees(2 * math.atan(5.0 / paraxial_properties(wide).efl_mm)) == pytest.approx(65.0, rel=1e-9)
     glass = GLASS | {"conic": -1.0, "aspheric_mm": [1e-5, -2e-8]}
     conic = parse_lens({"surface": [STOP, glass, BACK]}, source="asphere")
     heights = np.array([0.0, 1.0, 4.0])
@@ -231,12 +231,12 @@ def test_a_lens_that_does_not_focus(tmp_path: Path) -> None:
         lens_of(STOP, GLASS | {"radius_mm": -50.0}, BACK | {"radius_mm": 50.0}), source="diverging"
     )
     with pytest.raises(InputError, match=r"no ray reaches the sensor"):
-        first_order(diverging)
+        paraxial_properties(diverging)
     window = parse_lens(
         lens_of(STOP, GLASS | {"radius_mm": math.inf}, BACK | {"radius_mm": math.inf}), source="window"
     )
     with pytest.raises(InputError, match="afocal"):
-        first_order(window)
+        paraxial_properties(window)
     path = tmp_path / "broken.toml"
     path.write_text("surface = ")
     with pytest.raises(InputError, match=r"broken\.toml: not a TOML file"):
@@ -261,14 +261,14 @@ def test_a_lens_that_does_not_focus(tmp_path: Path) -> None:
 )
 def test_f_numbers_of_real_rays(name: str, f_number: float) -> None:
     lens = load_lens(name)
-    assert first_order(lens).efl_mm / real_pupil_diameter_mm(lens) == pytest.approx(f_number, abs=0.006)
+    assert paraxial_properties(lens).efl_mm / real_pupil_diameter_mm(lens) == pytest.approx(f_number, abs=0.006)
 
 
-def test_exact_rays_near_the_axis_are_first_order() -> None:
+def test_exact_rays_near_the_axis_are_paraxial() -> None:
     for name in PUBLISHED:
         lens = load_lens(name)
         theta, height = 1e-4, 1e-3
-        found = first_order(lens)
+        found = paraxial_properties(lens)
         rays = trace(lens, [[height, 0.0, 0.0], [0.0, -height, 0.0]], [[np.tan(theta), 0.0, 1.0], [0.0, 0.0, 1.0]])
         # third order: a millionth of these heights and slopes, over a few of the lens's radii
         assert rays.points_mm[-1, 0, 0] == pytest.approx(found.efl_mm * np.tan(theta), rel=1e-6)
@@ -349,7 +349,7 @@ def test_the_command_draws_and_tabulates(
     assert "cannot be written" in capsys.readouterr().err
 
 
-# --- ghosts to first order --------------------------------------------------------------------------------------
+# --- paraxial ghosts --------------------------------------------------------------------------------------------
 
 
 def test_ghost_matrices_are_the_published_ones() -> None:
@@ -369,7 +369,7 @@ def test_paraxial_ghosts_are_the_limit_of_exact_ones(name: str) -> None:
     rows[lens.stop] = replace(rows[lens.stop], semi_diameter_mm=0.01 * rows[lens.stop].semi_diameter_mm)
     small = replace(lens, surfaces=tuple(rows))
     angle = 0.05
-    pupil = np.pi / 4 * first_order(small).entrance_pupil_diameter_mm ** 2
+    pupil = np.pi / 4 * paraxial_properties(small).entrance_pupil_diameter_mm ** 2
     slope = np.tan(np.radians(angle))
     compared = 0
     for found in paraxial.paraxial_ghosts(small, angle):

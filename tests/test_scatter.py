@@ -16,8 +16,8 @@ from scipy.integrate import quad
 from scipy.special import j1
 
 from vbnfault.core.errors import InputError
-from vbnfault.lens import Prescription, first_order, load_lens, parse_lens
-from vbnfault.lens.gaussian import gap, refraction, system
+from vbnfault.lens import Prescription, load_lens, paraxial_properties, parse_lens
+from vbnfault.lens.paraxial import gap, refraction, system
 from vbnfault.lens.rays import forward
 from vbnfault.lens.straylight import scatter
 from vbnfault.lens.straylight.paraxial import mirrors, transmittance
@@ -234,7 +234,7 @@ def singlet(*before: dict[str, Any]) -> Prescription:
 def test_light_scattered_at_a_surface_lands_where_it_is_said_to(name: str) -> None:
     """A ray turned by β at surface j, through the rest of the lens: at r = β f a_j / a_ent on the sensor."""
     lens = load_lens(name)
-    figures, index = first_order(lens), lens.indices()
+    figures, index = paraxial_properties(lens), lens.indices()
     last = len(lens.surfaces) - 1
     stretch = scatter._surfaces(lens, 587.5618, scatter.POLISHED).stretch
     for row, found in zip(mirrors(lens), stretch, strict=True):
@@ -262,7 +262,7 @@ def test_all_scattered_flux_arrives(name: str) -> None:
     )
     r = glare.efl_mm * glare.offset
     for row, total, nm in zip(glare.irradiance, glare.glare_total_fraction, wavelength, strict=True):
-        figures = first_order(lens, nm)
+        figures = paraxial_properties(lens, nm)
         flux = np.trapezoid(2 * np.pi * r * r * row, x=np.log(r))
         # f on the sensor is that of the d line, the beam's is its own
         entering = np.pi * figures.entrance_pupil_diameter_mm**2 / 4 * (glare.efl_mm / figures.efl_mm) ** 2
@@ -283,7 +283,7 @@ def test_flux_of_an_image() -> None:
     y, x = np.indices(image.shape) - (size - 1) / 2
     within = 2.8
     caught = image[np.hypot(x, y) * pitch < within].sum() * pitch**2
-    figures = first_order(lens)
+    figures = paraxial_properties(lens)
     # the knee at 587.56 nm; the front surface is at the stop, the back one's beam is narrower
     knee = L * 587.5618 / 550.0 * figures.efl_mm
     narrow = 1 - 5.0 * (1 - 1 / 1.6) / 60.0
@@ -299,7 +299,7 @@ def test_an_image_is_the_formula_at_every_pixel() -> None:
     """Pixels against Peterson's sum written out, with the directions' sines from unit vectors."""
     lens = load_lens("tessar_50_f2p8")
     sun = np.array([9.0, -4.0])
-    f = first_order(lens).efl_mm
+    f = paraxial_properties(lens).efl_mm
     angle = np.degrees(np.arctan(np.hypot(*sun) / f))
     glare = veiling_glare(lens, sun_deg=angle, wavelength_nm=[500.0, 700.0], cleanliness=Cleanliness(level=300.0))
     image = glare.image((9.0, -4.0), (40, 60), 0.3)
@@ -308,7 +308,7 @@ def test_an_image_is_the_formula_at_every_pixel() -> None:
     toward_sun = np.array([*sun, f]) / np.linalg.norm([*sun, f])
     lit = scatter._lit(lens, angle)
     for band, nm in enumerate((500.0, 700.0)):
-        figures, index = first_order(lens, nm), lens.indices(nm)
+        figures, index = paraxial_properties(lens, nm), lens.indices(nm)
         na = figures.entrance_pupil_diameter_mm / 2 / figures.efl_mm
         passing = transmittance(lens, forward(lens), nm)
         for row, column in ((0, 0), (39, 59), (10, 50), (20, 30)):
@@ -340,7 +340,7 @@ def test_images_turn_with_the_sun() -> None:
     assert np.unravel_index(image.argmax(), image.shape) == (32, 32)
     assert (np.diff(image[32, 32:]) < 0).all()
     aside = veiling_glare(lens, sun_deg=20.0, wavelength_nm=[450.0, 550.0])
-    far = first_order(lens).efl_mm * np.tan(np.radians(20.0))
+    far = paraxial_properties(lens).efl_mm * np.tan(np.radians(20.0))
     right = aside.image((far, 0.0), (33, 33), 0.2)
     assert (np.diff(right[:, 16], axis=1) > 0).all()  # brighter towards +x, where the Sun is
     np.testing.assert_allclose(aside.image((-far, 0.0), (33, 33), 0.2), right[..., ::-1], rtol=1e-3)

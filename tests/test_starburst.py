@@ -12,7 +12,7 @@ from scipy.ndimage import map_coordinates
 from scipy.special import j0, j1
 
 from vbnfault.core.errors import InputError
-from vbnfault.lens import Prescription, first_order, load_lens, parse_lens, scaled_to_focal_length
+from vbnfault.lens import Prescription, load_lens, paraxial_properties, parse_lens, scaled_to_focal_length
 from vbnfault.lens.straylight.starburst import StopDefects, fraunhofer_psf, starburst
 
 F64 = NDArray[np.float64]
@@ -237,7 +237,7 @@ def test_the_strength_of_a_spike_and_of_a_fan() -> None:
 def test_wide_angles_and_a_pupil_that_is_not_the_stop() -> None:
     """E = cos θ_sun cos⁴θ / f² · 4πa / (k₀³ |Δu|³ λ²) from a round stop, u the direction cosines."""
     lens = scaled_to_focal_length(load_lens("nikkor_35_f2p8"), 8.0)
-    f, radius = 8.0, first_order(lens).entrance_pupil_diameter_mm / 2
+    f, radius = 8.0, paraxial_properties(lens).entrance_pupil_diameter_mm / 2
     assert radius != pytest.approx(lens.surfaces[lens.stop].semi_diameter_mm, rel=0.02)
     sun = np.array([-6.0, 2.0])
     frame = starburst(lens, sun_radius_rad=2e-3).image(sun, np.array([NM]), (241, 321), 0.03, half_width_nm=0)[0]

@@ -17,7 +17,15 @@ from vbnfault.core.errors import VbnfaultError
 from vbnfault.core.quantities import Electrons, Radiance
 from vbnfault.detector import ThreeColourDetector
 from vbnfault.faults import FaultContext, act, from_dict, registry
-from vbnfault.lens import Prescription, RealLens, ThinLens, first_order, load_lens, parse_lens, scaled_to_field
+from vbnfault.lens import (
+    Prescription,
+    RealLens,
+    ThinLens,
+    load_lens,
+    paraxial_properties,
+    parse_lens,
+    scaled_to_field,
+)
 from vbnfault.lens.coating import mean_reflectance
 from vbnfault.lens.straylight.scatter import Cleanliness
 from vbnfault.lens.straylight.settings import DirectPath, GhostSettings, SensorGrid, StraylightSettings, SunSource
@@ -79,7 +87,7 @@ def test_a_flares_direct_image_has_the_lens_transmission(sun_deg: float) -> None
     view = flare_images.FlareRequest(
         lens=lens, sun_deg=sun_deg, azimuth_deg=20.0, fov_deg=60.0, pixels=96, wavelength_nm=NODES, model="paraxial"
     )
-    pupil = np.pi / 4 * first_order(lens).entrance_pupil_diameter_mm ** 2 * np.cos(np.radians(sun_deg))
+    pupil = np.pi / 4 * paraxial_properties(lens).entrance_pupil_diameter_mm ** 2 * np.cos(np.radians(sun_deg))
     direct = flux(flare_images.layers(replace(view, model="texture"))["sun"], view.pitch_mm)
     assert transmitted(lens).max() / transmitted(lens).min() > 1.2  # bands differ
     np.testing.assert_allclose(direct, pupil * transmitted(lens), rtol=1e-5)  # sums of float32
@@ -133,9 +141,9 @@ def test_starburst_glare_and_veil_come_from_the_direct_light(sun_deg: float) -> 
     `beyond_mm2` of the small frame is checked by what the large one holds: no formula is shared.
     """
     lens = load_lens("nikkor_28_f2p8").coated("mgf2")
-    order = first_order(lens)
-    pitch = 2 * order.efl_mm * np.tan(np.radians(10)) / SIZE
-    admitted = np.pi / 4 * order.entrance_pupil_diameter_mm**2 * np.cos(np.radians(sun_deg)) * transmitted(lens)
+    optics = paraxial_properties(lens)
+    pitch = 2 * optics.efl_mm * np.tan(np.radians(10)) / SIZE
+    admitted = np.pi / 4 * optics.entrance_pupil_diameter_mm**2 * np.cos(np.radians(sun_deg)) * transmitted(lens)
     books = []
     for size in (SIZE, 9 * SIZE):
         found = straylight(

@@ -18,7 +18,7 @@ from vbnfault.detector import MosaicDetector, load_sensor
 from vbnfault.detector.chain import Device
 from vbnfault.faults import plugins
 from vbnfault.faults.models import undoing_registrations
-from vbnfault.lens import first_order, load_lens
+from vbnfault.lens import load_lens, paraxial_properties
 from vbnfault.output import template_files
 from vbnfault.output.template_files import write_template
 from vbnfault.pipeline import configure_faults
@@ -76,7 +76,9 @@ def test_the_keys_that_the_scene_shows_as_comments_are_accepted(tmp_path: Path) 
 def test_the_lens_and_the_sensor_are_read(tmp_path: Path) -> None:
     lens = load_lens(write_template("lens", "glass", tmp_path))
     assert lens.name == "glass"
-    assert first_order(lens).efl_mm == pytest.approx(first_order(load_lens("tessar_50_f2p8")).efl_mm)
+    assert paraxial_properties(lens).efl_mm == pytest.approx(
+        paraxial_properties(load_lens("tessar_50_f2p8")).efl_mm
+    )
     sensor = load_sensor(write_template("sensor", "chip", tmp_path))
     assert (sensor.name, sensor.readout.bits) == ("chip", 12)
 

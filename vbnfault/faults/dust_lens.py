@@ -435,7 +435,7 @@ def _glow(params: Params, context: FaultContext) -> F32 | None:
 
 
 def _stretch(lens: RealLens, row: int) -> float:
-    """Return the diameter of the beam at the entrance over that on the row, to first order."""
+    """Return the diameter of the paraxial beam at the entrance over that on the row."""
     marginal = abs(float(along(lens.prescription, forward(lens.prescription))[1][row, 0, 0]))
     return 1 / max(marginal, 1e-6)
 

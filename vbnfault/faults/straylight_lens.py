@@ -1,7 +1,7 @@
 """Simulate straylight by physics: ghosts, starburst and veiling glare of a lens with a known prescription.
 
 There are two models, which differ only in the ghosts. For each path of two reflections (or also of four, if
-`reflections` is 4), `traced` traces exact rays (Hullin et al. 2011), and `paraxial` draws the first-order image of
+`reflections` is 4), `traced` traces exact rays (Hullin et al. 2011), and `paraxial` draws the paraxial image of
 the stop (Lee & Eisemann 2013). The light is added as irradiance on the sensor, in proportion to the Sun's
 irradiance at the camera.
 
@@ -301,7 +301,7 @@ class TracedStraylight(_LensStraylight):
 
 @dataclass(frozen=True, kw_only=True)
 class ParaxialStraylight(_LensStraylight):
-    """Add ghosts computed to first order, starburst and veiling glare."""
+    """Add ghosts of paraxial rays, starburst and veiling glare."""
 
     model = "paraxial"
 

@@ -10,7 +10,7 @@ import numpy as np
 from ..core.errors import InputError
 from .aperture import closed_to
 from .family import relative
-from .gaussian import scaled_to_field, scaled_to_focal_length
+from .paraxial import scaled_to_field, scaled_to_focal_length
 from .prescription import Prescription
 from .prescription_file import load_lens
 

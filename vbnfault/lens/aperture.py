@@ -2,7 +2,7 @@
 
 The f-number is the focal length divided by the diameter of the axial beam that passes all rims (ISO 517). That
 diameter is measured with exact rays, so that the irradiance on the axis is exactly π T L / (4 N²). The paraxial
-f-number of `first_order` differs from it by the aberration of the pupil, by some percent for fast lenses.
+f-number of `paraxial_properties` differs from it by the aberration of the pupil, by some percent for fast lenses.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.errors import InputError
-from .gaussian import first_order
 from .glass import D_NM
+from .paraxial import paraxial_properties
 from .prescription import Prescription
 from .rays import trace
 
@@ -58,7 +58,7 @@ def _passes(lens: Prescription, height_mm: F64, wavelength_nm: float) -> NDArray
 
 def open_f_number(lens: Prescription) -> float:
     """Return the focal length divided by the diameter of the axial beam, with the stop as prescribed."""
-    return first_order(lens).efl_mm / axial_beam_diameter_mm(lens)
+    return paraxial_properties(lens).efl_mm / axial_beam_diameter_mm(lens)
 
 
 def stopped_down(lens: Prescription, f_number: float) -> Prescription:
@@ -71,7 +71,7 @@ def stopped_down(lens: Prescription, f_number: float) -> Prescription:
     stop.
     """
     as_round = lens.with_round_stop()
-    wanted = first_order(as_round).efl_mm / f_number
+    wanted = paraxial_properties(as_round).efl_mm / f_number
     if wanted >= axial_beam_diameter_mm(as_round):
         return lens
     marginal = trace(as_round, [[wanted / 2, 0.0, -1.0]], [[0.0, 0.0, 1.0]])

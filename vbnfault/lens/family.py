@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ..core.errors import InputError
-from .gaussian import first_order, scaled_to_focal_length
+from .paraxial import paraxial_properties, scaled_to_focal_length
 from .prescription import Prescription
 from .prescription_file import parse_lens, to_table
 from .rays import real_pupil_diameter_mm
@@ -46,7 +46,7 @@ def relative(
     for key, value in (("spread", spread), ("index_spread", index_spread)):
         if not 0 <= value <= 0.3:
             raise InputError(f"{key} = {value:g}: must be from 0 to 0.3")
-    efl_mm = first_order(lens).efl_mm
+    efl_mm = paraxial_properties(lens).efl_mm
     why = ""
     for _ in range(_TRIES):
         table = to_table(lens)

@@ -21,11 +21,11 @@ from scipy import fft
 from ..core import file_contents
 from .aperture import stopped_down
 from .changes import OF_COATINGS, Change, changed
-from .gaussian import scaled_to_focal_length
 from .glass import D_NM
 from .imaging import RealLens
 from .interface import Lens
 from .mapping import inclined_rays
+from .paraxial import scaled_to_focal_length
 from .prescription import Prescription
 from .prescription_file import load_lens
 from .rays import Path

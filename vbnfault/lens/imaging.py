@@ -37,9 +37,9 @@ from ..core.errors import InputError
 from ..core.quantities import Irradiance, Radiance
 from ..core.sundisc import Floats, add_mean, pixel_sums
 from .distortion import RadialModel
-from .gaussian import first_order
 from .glass import D_NM
 from .mapping import ChiefHeights, FieldMap, camera_model, chief_heights, field_map
+from .paraxial import paraxial_properties
 from .point_spread import REACH_PX, PointSpreads, Tiles, kernels_of_spots
 from .prescription import Prescription
 from .resampling import RadialTables, Resampling, table_distances
@@ -116,8 +116,8 @@ class RealLens:
     @cached_property
     def sensor_mm(self) -> float:
         """Return the distance of the sensor plane behind the last vertex."""
-        paraxial = first_order(self._round).bfd_mm
-        return paraxial if self.focus == "paraxial" else paraxial + self._best_shift_mm
+        bfd_mm = paraxial_properties(self._round).bfd_mm
+        return bfd_mm if self.focus == "paraxial" else bfd_mm + self._best_shift_mm
 
     @cached_property
     def focal_length_mm(self) -> float:
@@ -125,14 +125,14 @@ class RealLens:
 
         It is the EFL where the sensor stands at the paraxial focus.
         """
-        efl = first_order(self._round).efl_mm
+        efl = paraxial_properties(self._round).efl_mm
         return efl if self.focus == "paraxial" else float(self._chief_rays.rise_mm(np.zeros(1))[0])
 
     @cached_property
     def f_number(self) -> float:
         """Return the EFL divided by the diameter of a disc that has the area of the axial beam."""
         area = float(self._beams.area_mm2[0])
-        return float(first_order(self._round).efl_mm / (2 * np.sqrt(area / np.pi)))
+        return float(paraxial_properties(self._round).efl_mm / (2 * np.sqrt(area / np.pi)))
 
     @property
     def figures(self) -> dict[str, str | float]:
@@ -142,7 +142,7 @@ class RealLens:
         of the stop, and transmission on the axis at the d line.
         """
         lens = self.prescription
-        efl_mm = first_order(lens).efl_mm
+        efl_mm = paraxial_properties(lens).efl_mm
         return {
             "name": lens.name,
             "scale": lens.scale,
@@ -319,7 +319,7 @@ class RealLens:
     def _corner(self) -> float:
         """Return the image height of the frame's corner, with the reach of the point spread, in EFL."""
         half = np.hypot(self.width_px / 2 + REACH_PX, self.height_px / 2 + REACH_PX)
-        return float(half * self.pixel_pitch_um * 1e-3 / first_order(self._round).efl_mm)
+        return float(half * self.pixel_pitch_um * 1e-3 / paraxial_properties(self._round).efl_mm)
 
     @cached_property
     def _slopes(self) -> F64:
@@ -347,12 +347,12 @@ class RealLens:
         Each spot counts with the light that its zone of the frame receives.
         """
         beams, lens = self._zones, self._round
-        order = first_order(lens)
-        spots = spot_diagrams(lens, beams, D_NM, order.bfd_mm)
+        optics = paraxial_properties(lens)
+        spots = spot_diagrams(lens, beams, D_NM, optics.bfd_mm)
         position, slope = spots.centred(spots.position_mm), spots.centred(spots.slope)
         # count the pixels of the frame nearest to each zone's undistorted position
         x, y = (np.abs(np.arange(n) + 0.5 - n / 2) for n in (self.width_px, self.height_px))
-        radius = np.hypot(x[None, ::8], y[::8, None]).ravel() * self.pixel_pitch_um * 1e-3 / order.efl_mm
+        radius = np.hypot(x[None, ::8], y[::8, None]).ravel() * self.pixel_pitch_um * 1e-3 / optics.efl_mm
         edges = (beams.slope[1:] + beams.slope[:-1]) / 2
         lit = radius[radius <= beams.slope[-1]]
         pixels = np.bincount(np.searchsorted(edges, lit), minlength=len(beams.slope))
@@ -373,7 +373,7 @@ class RealLens:
             self._slopes,
             wavelength_nm=wavelength_nm,
             sensor_mm=self.sensor_mm,
-            efl_mm=first_order(lens).efl_mm,
+            efl_mm=paraxial_properties(lens).efl_mm,
             within=within,
         )
 

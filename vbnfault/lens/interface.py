@@ -52,7 +52,7 @@ class Lens(Protocol):
     def falls_off(self) -> bool:
         """Return whether `image` contains the lens's vignetting, natural (cos⁴) and mechanical."""
 
-    # --- first order
+    # --- paraxial properties
 
     @property
     def focal_length_mm(self) -> float:

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .gaussian import first_order
 from .glass import D_NM
+from .paraxial import paraxial_properties
 from .prescription import Prescription, Surface
 
 F64 = NDArray[np.float64]
@@ -99,7 +99,7 @@ def trace(
     """
     steps = forward(lens) if path is None else tuple(path)
     vertex, index = lens.vertices_mm, lens.indices(wavelength_nm)
-    sensor = first_order(lens).bfd_mm if sensor_mm is None else sensor_mm
+    sensor = paraxial_properties(lens).bfd_mm if sensor_mm is None else sensor_mm
     p = np.array(origins_mm, dtype=np.float64).reshape(-1, 3)
     d = np.array(directions, dtype=np.float64).reshape(-1, 3)
     d /= np.linalg.norm(d, axis=1, keepdims=True)

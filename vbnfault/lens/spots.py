@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .aperture import axial_beam_diameter_mm
-from .gaussian import first_order
 from .glass import D_NM
 from .mapping import fan_heights_mm, inclined_rays
+from .paraxial import paraxial_properties
 from .prescription import Prescription
 
 F64 = NDArray[np.float64]
@@ -55,7 +55,7 @@ class FieldBundles:
 
 def field_bundles(lens: Prescription, slope: F64) -> FieldBundles:
     """Return the bundles at the d line; each rim is located between rays that pass and rays that do not."""
-    sensor = first_order(lens).bfd_mm
+    sensor = paraxial_properties(lens).bfd_mm
 
     def beyond(x: F64, y: F64) -> F64:
         """Return the largest relative radius of rays through (x, y), inf for rays that do not arrive."""

@@ -17,7 +17,7 @@ from ..core.images import srgb8, write_exr, write_png
 from ..core.quantities import Electrons
 from ..detector import ThreeColourDetector
 from ..faults import FaultContext, registry
-from ..lens import Prescription, ThinLens, first_order, load_lens
+from ..lens import Prescription, ThinLens, load_lens, paraxial_properties
 from ..lens.straylight.paraxial import Ghost, axial_transmittance, mean_ghost, paraxial_ghosts
 from ..lens.straylight.scatter import Cleanliness
 from ..lens.straylight.settings import VEIL_FRACTION, GhostSettings, SensorGrid, StraylightSettings, SunSource
@@ -105,7 +105,7 @@ class FlareRequest:
     @property
     def pitch_mm(self) -> float:
         """Return the pixel pitch of the image on the sensor plane, in mm."""
-        return 2 * first_order(self.lens).efl_mm * float(np.tan(np.radians(self.fov_deg / 2))) / self.pixels
+        return 2 * paraxial_properties(self.lens).efl_mm * float(np.tan(np.radians(self.fov_deg / 2))) / self.pixels
 
     @property
     def sun(self) -> SunSource:
@@ -119,7 +119,7 @@ class FlareRequest:
     @property
     def sun_xy_mm(self) -> tuple[float, float]:
         """Return the position of the Sun's direct image on the sensor plane, f tan θ from the axis, in mm."""
-        return self.sun.xy_mm(first_order(self.lens).efl_mm)
+        return self.sun.xy_mm(paraxial_properties(self.lens).efl_mm)
 
 
 def wavelengths_nm(single_nm: float | None = None) -> F64:
@@ -279,7 +279,7 @@ def _direct_image(request: FlareRequest) -> F32:
     Its power divided by the Sun's irradiance is T(λ) A cos θ. T is the transmittance of the image path, A the area
     of the paraxial entrance pupil. The fluxes of the ghosts refer to the same A cos θ.
     """
-    optics = first_order(request.lens)
+    optics = paraxial_properties(request.lens)
     radius_px = max(
         optics.efl_mm * spectra.sun_angular_radius_rad(request.sun_distance_au) / request.pitch_mm,
         np.sqrt(1 / np.pi),
@@ -301,7 +301,7 @@ def _direct_image(request: FlareRequest) -> F32:
 
 def _textures(request: FlareRequest) -> F32:
     """Draw the texture model once, with the Sun at the same position; R, G, B in units of white."""
-    focal_px = first_order(request.lens).efl_mm / request.pitch_mm
+    focal_px = paraxial_properties(request.lens).efl_mm / request.pitch_mm
     detector = ThreeColourDetector(width_px=request.pixels, height_px=request.pixels)
     lens = ThinLens(focal_length_mm=focal_px * detector.pixel_pitch_um * 1e-3, f_number=4.0)
     x, y = (v / request.pitch_mm + request.pixels / 2 for v in request.sun_xy_mm)
@@ -361,7 +361,7 @@ def write_picture(flare: Flare, path: Path) -> None:
 def table(flare: Flare) -> dict[str, Any]:
     """Return the ghosts, the lens and the Sun's direction as plain data."""
     request = flare.request
-    optics = first_order(request.lens)
+    optics = paraxial_properties(request.lens)
     return {
         "lens": request.lens.name,
         "model": request.model,

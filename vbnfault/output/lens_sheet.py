@@ -1,4 +1,4 @@
-"""Show a prescription: its first-order properties as a table, and its layout as a figure (`vbnfault lens`)."""
+"""Show a prescription: its paraxial properties as a table, and its layout as a figure (`vbnfault lens`)."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import isotonic_regression
 
-from ..lens import Prescription, first_order, open_f_number
+from ..lens import Prescription, open_f_number, paraxial_properties
 from ..lens.rays import real_pupil_diameter_mm, trace
 from .json_files import write_json
 
@@ -29,8 +29,8 @@ _NUMBER_GAP_PT = 11  # between the centres of two row numbers; two digits are 9 
 
 
 def figures(lens: Prescription) -> dict[str, float]:
-    """Return the first-order properties of a lens, the f-number of its real beam, and its scale."""
-    return asdict(first_order(lens)) | {"real_f_number": open_f_number(lens), "scale": lens.scale}
+    """Return the paraxial properties of a lens, the f-number of its real beam, and its scale."""
+    return asdict(paraxial_properties(lens)) | {"real_f_number": open_f_number(lens), "scale": lens.scale}
 
 
 def write_table(lens: Prescription, path: Path) -> None:
@@ -53,7 +53,7 @@ def layout(lens: Prescription, *, half_field_deg: float = 20.0) -> Figure:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    optics = first_order(lens)
+    optics = paraxial_properties(lens)
     figure = Figure(figsize=(10, 5.6), dpi=120)
     FigureCanvasAgg(figure)
     axes = figure.add_subplot()
@@ -104,7 +104,7 @@ def _draw_surfaces(axes: Any, lens: Prescription) -> list[tuple[float, float]]:
 
 def _draw_rays(axes: Any, lens: Prescription, half_field_deg: float) -> None:
     """Draw the rays of each field that reach the sensor."""
-    optics, pupil = first_order(lens), real_pupil_diameter_mm(lens)
+    optics, pupil = paraxial_properties(lens), real_pupil_diameter_mm(lens)
     front = min(float(z.min()) for z, _ in _edges(lens))
     # rays start on a plane in front of all surfaces and aim at the entrance pupil
     start = front - 0.12 * (lens.vertices_mm[-1] + optics.bfd_mm)

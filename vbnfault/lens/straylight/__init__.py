@@ -7,7 +7,7 @@ Modules:
   modules clip rays at rims.
 - `ghosts` computes the box of the rays that pass the lens, for each ghost, and the table of ghosts (flux, position
   and size) from exact rays.
-- `paraxial` computes the same table to first order, and the transmittance along the axis.
+- `paraxial` computes the same table from paraxial rays, and the transmittance along the axis.
 - `raster` draws bundles of rays on the sensor, and `pyramid` adds up the levels on which they are drawn.
 - `irradiance` renders the image of all ghosts with these modules.
 - `starburst` computes the light that the stop diffracts.

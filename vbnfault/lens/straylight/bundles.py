@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from ...core.errors import InputError
 from ...core.llvm import backend
 from ..coating import Layer, reflect_transmit
-from ..gaussian import first_order
+from ..paraxial import paraxial_properties
 from ..prescription import Prescription
 from ..rays import path_of
 from .paraxial import along, mirrors
@@ -277,7 +277,7 @@ class Tracer:
     `reflections` is 2, or 4 to include the paths of four reflections.
 
     A ray is lost (clipped) outside `rims_mm`, float64[row]: the semi-diameter of each round rim, and infinity for
-    the sensor. `steps.meet` clips at these rims. `irradiance.ParaxialTracer` clips at the same rims to first order.
+    the sensor. `steps.meet` clips at these rims. `irradiance.ParaxialTracer` clips paraxial rays at the same rims.
     A stop with blades does not use `rims_mm` but `steps.StopBlades`. `paraxial.paraxial_ghosts` has separate rims.
     From `rims_mm`, `ghosts` also computes first boxes and `irradiance` the widths of soft edges.
     """
@@ -288,7 +288,7 @@ class Tracer:
         self.lens = lens
         self.wavelength_nm = np.atleast_1d(np.asarray(wavelength_nm, dtype=np.float64))
         self.routes = routes(lens, reflections) if routes_ is None else tuple(routes_)
-        self.sensor_mm = first_order(lens).bfd_mm
+        self.sensor_mm = paraxial_properties(lens).bfd_mm
         self._paths = [path_of(lens, route) for route in self.routes]
         self.first_step = np.concatenate([[0], np.cumsum([len(path) for path in self._paths])])
         middle = float(np.median(self.wavelength_nm))

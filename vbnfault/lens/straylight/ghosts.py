@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...core.llvm import backend
-from ..gaussian import first_order
 from ..glass import D_NM
+from ..paraxial import paraxial_properties
 from ..prescription import Prescription
 from .bundles import Rays, Tracer, name_of
 from .paraxial import Ghost
@@ -119,7 +119,7 @@ def boxes(
 
 
 def _paraxial_boxes(made: Tracer, tangent: float, reach: float) -> F64:
-    """Return boxes, with room, where all rims pass first-order rays; where none pass, that of the narrowest rim."""
+    """Return boxes, with room, where all rims pass paraxial rays; where none pass, that of the narrowest rim."""
     a, b = made.met[:, 0, 0], made.met[:, 0, 1]
     rim = made.rims_mm[made.rows]
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -342,7 +342,7 @@ def named(made: Tracer, rays: Rays, names: Collection[tuple[int, ...]]) -> NDArr
 
 def traced(made: Tracer, rays: Rays, sun_deg: float, turn_rad: float, across: int) -> tuple[Ghost, ...]:
     """Return flux, centroid and spread on the sensor plane of each ghost's ray bundle, `across` rays wide."""
-    pupil = np.pi / 4 * first_order(made.lens).entrance_pupil_diameter_mm ** 2
+    pupil = np.pi / 4 * paraxial_properties(made.lens).entrance_pupil_diameter_mm ** 2
     out = []
     together = max(1, _TOGETHER // across**2)
     for first in range(0, len(rays), together):
@@ -442,7 +442,7 @@ def surface_interactions_per_second(
 
     made = Tracer(lens, np.array([D_NM]), routes_=[()])
     across = int(np.ceil(np.sqrt(rays)))
-    radius = first_order(lens).entrance_pupil_diameter_mm / 2 / np.sqrt(2)
+    radius = paraxial_properties(lens).entrance_pupil_diameter_mm / 2 / np.sqrt(2)
     bundle = Rays(
         route=np.zeros(1, dtype=np.int64),
         wavelength=np.zeros(1, dtype=np.int64),

@@ -1,4 +1,4 @@
-"""Render the ghosts of the Sun as irradiance on the sensor, by exact rays or to first order, per band.
+"""Render the ghosts of the Sun as irradiance on the sensor, by exact or paraxial rays, per band.
 
 A ghost is an image of the openings that its light passes. The Sun's disc and diffraction soften the edges of that
 image by widths that are known for each rim. The Sun's width is the shift, to first order, when the Sun moves by the
@@ -40,7 +40,7 @@ _DISC_RINGS = 3
 _LARGE_PX = 150.0  # radius of a rim's image from which on the image is large
 _PLAIN = 0.03  # edges below this fraction of the summed irradiance are drawn one level coarser
 _RAMP, _RAMP_PX = 7.0, 24.0  # distance from an edge, in its widths and at least in pixels, that is drawn finely
-_SPREAD = 0.25, 256.0  # bounds of the size of rims' images relative to first order
+_SPREAD = 0.25, 256.0  # bounds of the size of rims' images relative to the paraxial size
 _SPREAD_SHARP = 4.0  # upper bound of the same in estimates of sharpness
 _LEAST = 1e-10  # irradiance over the Sun's below which a ghost is omitted
 
@@ -80,7 +80,7 @@ class ParaxialTracer(Tracer):
         width: F64 | None = None,
         **options: Unpack[TraceOptions],
     ) -> Spots:
-        """Trace as `Tracer.trace` does, to first order; the slope of a ray is the tangent of its angle.
+        """Trace paraxial rays as `Tracer.trace` traces exact ones; the slope of a ray is the tangent of its angle.
 
         Here `beyond` and `radius` are relative radii, not squares as in `steps.meet`.
         """
@@ -275,7 +275,7 @@ class FlareModel:
         )
 
     def _spread(self, arrivals: Arrivals, route: NDArray[np.int64]) -> F64:
-        """Return the size of each route's image relative to first order, float64[route], within bounds."""
+        """Return the size of each route's image relative to its paraxial size, float64[route], within bounds."""
         out = np.ones(len(self._tracer.routes))
         first = np.abs(self._tracer.matrix[route, 0, 0])
         out[route] = np.clip(arrivals.magnification / np.maximum(first, 1e-9), *_SPREAD)

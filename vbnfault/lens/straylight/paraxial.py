@@ -1,4 +1,4 @@
-"""Compute ghosts to first order: each path of two reflections is one matrix (Lee & Eisemann 2013, CGF 32, 1).
+"""Compute ghosts of paraxial rays: each path of two reflections is one matrix (Lee & Eisemann 2013, CGF 32, 1).
 
 A ghost's ray leaves the plane of the first vertex at the height r with the Sun's slope θ. It meets surface k of its
 path at the height A_k r + B_k θ, and the sensor at M₀₀ r + M₀₁ θ. Slopes are unfolded at reflections, so heights
@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..coating import mean_reflectance
-from ..gaussian import first_order
 from ..glass import D_NM
+from ..paraxial import paraxial_properties
 from ..prescription import Prescription
 from ..rays import forward, ghost
 
@@ -149,7 +149,7 @@ def _media(lens: Prescription, wavelength_nm: tuple[float, ...]) -> tuple[F64, F
     """Return the indices of all media, float64[row + 1, wavelength], and the vertices with that of the sensor."""
     wavelength = np.array(wavelength_nm)
     index = np.stack([np.ones(wavelength.shape), *(s.medium.index(wavelength) for s in lens.surfaces)])
-    vertex = np.append(lens.vertices_mm, lens.vertices_mm[-1] + first_order(lens).bfd_mm)
+    vertex = np.append(lens.vertices_mm, lens.vertices_mm[-1] + paraxial_properties(lens).bfd_mm)
     for array in (index, vertex):
         array.setflags(write=False)
     return index, vertex
@@ -200,7 +200,7 @@ def paraxial_ghosts(
     """
     turn = np.radians(azimuth_deg)
     slope = np.tan(np.radians(sun_deg)) * np.array([np.cos(turn), np.sin(turn)])
-    pupil = np.pi / 4 * first_order(lens).entrance_pupil_diameter_mm ** 2
+    pupil = np.pi / 4 * paraxial_properties(lens).entrance_pupil_diameter_mm ** 2
     side = (np.arange(_GRID) + 0.5) / _GRID * 2 - 1
     square = np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2)
     ghosts = []

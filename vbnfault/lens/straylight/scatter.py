@@ -18,8 +18,8 @@ from scipy.special import erf, exprel, j1
 from ...core.errors import InputError
 from ..coating import reflect_transmit
 from ..footprint import disc_overlap
-from ..gaussian import first_order
 from ..glass import D_NM, RANGE_NM
+from ..paraxial import paraxial_properties
 from ..prescription import Prescription
 from ..rays import forward
 from ..thin import beyond_frame
@@ -453,7 +453,7 @@ class _Surfaces:
 def _surfaces(lens: Prescription, wavelength_nm: float, cleanliness: Cleanliness) -> _Surfaces:
     """Return the scatter of a lens's surfaces at a wavelength."""
     level = float(_check("cleanliness_level", cleanliness.level, *CLEANLINESS_LIMITS))
-    figures, path = first_order(lens, wavelength_nm), forward(lens)
+    figures, path = paraxial_properties(lens, wavelength_nm), forward(lens)
     rows = list(mirrors(lens))
     index = lens.indices(wavelength_nm)
     marginal = np.abs(along(lens, path, wavelength_nm)[1][rows, 0, 0])
@@ -480,13 +480,13 @@ def _surfaces(lens: Prescription, wavelength_nm: float, cleanliness: Cleanliness
 def _lit(lens: Prescription, sun_deg: float) -> F64:
     """Return the fraction of the beam that a source at an angle lights, float64[surface] by scattering surface.
 
-    The fraction is a first-order estimate of the light that passes all rims up to the surface. At a surface before
+    The fraction is a paraxial estimate of the light that passes all rims up to the surface. At a surface before
     the stop, the beam is the part of the surface that the middle of the sensor receives light from. Behind the
     stop, the sensor receives light from the whole beam.
     """
     _, met = along(lens, forward(lens))
     height, slope = met[:, 0, 0], met[:, 0, 1]
-    radius = first_order(lens).entrance_pupil_diameter_mm / 2
+    radius = paraxial_properties(lens).entrance_pupil_diameter_mm / 2
     # only the stop limits the axial beam; the paraxial beam is larger than the real beam, so widen rims it would
     # touch
     rims = np.maximum([s.semi_diameter_mm for s in lens.surfaces], radius * np.abs(height))
@@ -532,7 +532,7 @@ def veiling_glare(
     return VeilingGlare(
         offset=_OFFSETS,
         irradiance=np.stack([band.irradiance(_OFFSETS, lit) for band in bands]),
-        efl_mm=first_order(lens).efl_mm,
+        efl_mm=paraxial_properties(lens).efl_mm,
         glare_total_fraction=np.array([band.tis for band in bands]),
     )
 

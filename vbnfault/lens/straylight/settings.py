@@ -57,7 +57,7 @@ class GhostSettings:
     Attributes
     ----------
     model
-        'traced' (exact rays) or 'paraxial' (first order).
+        'traced' (exact rays) or 'paraxial' (paraxial rays).
     reflections
         2, or 4 to include ghosts of four reflections.
     diffraction

@@ -47,7 +47,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ...core.errors import InputError
-from ..gaussian import first_order
+from ..paraxial import paraxial_properties
 from ..prescription import Prescription, Surface
 from ..thin import beyond_frame
 
@@ -372,10 +372,10 @@ def starburst(
         raise InputError(f"sun_radius_rad = {sun_radius_rad!r}: must be above 0 and below 0.5")
     if radii < 16 or angles < 64 or angles % 2:
         raise InputError(f"radii = {radii}, angles = {angles}: must be 16 or more, and even and 64 or more")
-    stop, paraxial = lens.surfaces[lens.stop], first_order(lens)
-    radius = paraxial.entrance_pupil_diameter_mm / 2
+    stop, optics = lens.surfaces[lens.stop], paraxial_properties(lens)
+    radius = optics.entrance_pupil_diameter_mm / 2
     return Starburst(
-        efl_mm=paraxial.efl_mm,
+        efl_mm=optics.efl_mm,
         pupil_radius_mm=radius,
         sun_radius_rad=sun_radius_rad,
         stop=stop,

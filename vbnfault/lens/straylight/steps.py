@@ -120,7 +120,7 @@ def meet(
     rim values; `ghosts` and `raster` then leave out the light of lost rays, see `bundles.Spots`. Code that applies
     rims to ghosts:
 
-    - `meet` (for exact rays) and `irradiance.ParaxialTracer.trace` (to first order). Round rims have the radii
+    - `meet` (for exact rays) and `irradiance.ParaxialTracer.trace` (for paraxial rays). Round rims have the radii
       `bundles.Tracer.rims_mm`. For a stop with blades, `StopBlades.relative_radius` gives the rim.
     - `paraxial.paraxial_ghosts`, which reads the radii from the prescription and treats the stop as round.
 

@@ -33,7 +33,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..gaussian import first_order
+from ..paraxial import paraxial_properties
 from ..prescription import Prescription
 from ..thin import cos4_map
 from .irradiance import FlareModel, flare_model
@@ -168,7 +168,7 @@ class SunlightInLens:
     ) -> SunlightInLens:
         """Return the Sun's light for the parameters of `straylight`."""
         nodes = np.atleast_1d(np.asarray(wavelength_nm, dtype=np.float64))
-        diameter_mm = first_order(lens).entrance_pupil_diameter_mm
+        diameter_mm = paraxial_properties(lens).entrance_pupil_diameter_mm
         pupil_mm2 = float(np.pi / 4 * diameter_mm**2 * np.cos(np.radians(sun.angle_deg)))
         own = axial_transmittance(lens, nodes)
         path = DirectPath(transmittance=own, admitted_mm2=pupil_mm2) if path is None else path
@@ -207,7 +207,7 @@ class SunlightInLens:
     @property
     def _efl_mm(self) -> float:
         """Return the focal length."""
-        return first_order(self.lens).efl_mm
+        return paraxial_properties(self.lens).efl_mm
 
     @property
     def _cos4(self) -> F32:
@@ -250,9 +250,9 @@ class SunlightInLens:
     def starburst_key(self) -> tuple[Any, ...]:
         """Return all that `starburst_layers` depends on."""
         lens = self.lens
-        stop, paraxial = lens.surfaces[lens.stop], first_order(lens)
+        stop, optics = lens.surfaces[lens.stop], paraxial_properties(lens)
         outline = stop.semi_diameter_mm, stop.blades, stop.blade_rounding, stop.rotation_deg
-        pupil = paraxial.efl_mm, paraxial.entrance_pupil_diameter_mm
+        pupil = optics.efl_mm, optics.entrance_pupil_diameter_mm
         return *outline, *pupil, self.sun.radius_rad, self._sun_xy_mm, self._nodes, self.sensor
 
     def starburst_layers(self) -> Diffraction:

@@ -1,4 +1,4 @@
-"""Compute the first-order optics of a prescription: focal length, focus, pupils and f-number.
+"""Compute the paraxial optics of a prescription: focal length, focus, pupils and f-number.
 
 A ray is the vector (height, slope) in a plane through the axis; each step through the lens is a 2 × 2 matrix.
 """
@@ -19,8 +19,8 @@ F64 = NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True)
-class FirstOrder:
-    """Hold the first-order properties of a lens, lengths in mm.
+class ParaxialProperties:
+    """Hold the paraxial properties of a lens, lengths in mm.
 
     Attributes
     ----------
@@ -66,8 +66,8 @@ def system(lens: Prescription, first: int, last: int, wavelength_nm: float = D_N
 
 
 @lru_cache(maxsize=256)
-def first_order(lens: Prescription, wavelength_nm: float = D_NM) -> FirstOrder:
-    """Return the first-order properties of a lens at a wavelength.
+def paraxial_properties(lens: Prescription, wavelength_nm: float = D_NM) -> ParaxialProperties:
+    """Return the paraxial properties of a lens at a wavelength.
 
     Raises
     ------
@@ -90,7 +90,7 @@ def first_order(lens: Prescription, wavelength_nm: float = D_NM) -> FirstOrder:
         front = gap(lens.surfaces[stop - 1].thickness_mm) @ front
     back = system(lens, stop, last, wavelength_nm)
     entrance_diameter = float(2 * abs(radius / front[0, 0]))
-    return FirstOrder(
+    return ParaxialProperties(
         efl_mm=efl,
         bfd_mm=bfd,
         entrance_pupil_mm=float(front[0, 1] / front[0, 0]),
@@ -106,7 +106,7 @@ def scaled_to_focal_length(lens: Prescription, efl_mm: float) -> Prescription:
 
     `Prescription.scaled` lists what keeps its size.
     """
-    return lens.scaled(efl_mm / first_order(lens).efl_mm)
+    return lens.scaled(efl_mm / paraxial_properties(lens).efl_mm)
 
 
 def scaled_to_field(lens: Prescription, fov_deg: float, sensor_mm: float) -> Prescription:
