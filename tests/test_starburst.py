@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -13,7 +14,8 @@ from scipy.special import j0, j1
 
 from vbnfault.core.errors import InputError
 from vbnfault.lens import Prescription, load_lens, paraxial_properties, parse_lens, scaled_to_focal_length
-from vbnfault.lens.straylight.starburst import StopDefects, fraunhofer_psf, starburst
+from vbnfault.lens.straylight.settings import SensorGrid
+from vbnfault.lens.straylight.starburst import StarburstFrame, StopDefects, fraunhofer_psf, starburst
 
 F64 = NDArray[np.float64]
 
@@ -32,6 +34,23 @@ def lens_with(
     scaled = scaled_to_focal_length(lens, efl_mm)
     rows = tuple(replace(s, semi_diameter_mm=DIAMETER_MM / 2) if s.stop else s for s in scaled.surfaces)
     return replace(scaled, surfaces=rows)
+
+
+def frame_at(
+    sun_xy_mm: Sequence[float] | F64,
+    wavelength_nm: F64,
+    shape: tuple[int, int],
+    pitch_mm: float,
+    *,
+    half_width_nm: float | None = None,
+) -> StarburstFrame:
+    """Return a frame with the Sun's image at a position in mm from its middle."""
+    return StarburstFrame(
+        sun_xy_mm=(float(sun_xy_mm[0]), float(sun_xy_mm[1])),
+        wavelength_nm=wavelength_nm,
+        sensor=SensorGrid(shape=shape, pitch_mm=pitch_mm),
+        half_width_nm=half_width_nm,
+    )
 
 
 def airy(v: F64) -> F64:
@@ -87,7 +106,7 @@ def test_even_blades_give_as_many_spikes_and_odd_ones_twice_as_many(blades: int)
     rings = map_coordinates(psf, [256 + radius * np.sin(angle), 256 + radius * np.cos(angle)], order=1)
     assert count_spikes((rings * radius**2).mean(axis=0)) == expected
     frame = starburst(lens_with(blades), sun_radius_rad=1e-3, angles=1024).image(
-        (0, 0), np.array([NM]), (401, 401), 0.02
+        frame_at((0, 0), np.array([NM]), (401, 401), 0.02)
     )[0]
     circle = map_coordinates(frame, [200 + 180 * np.sin(angle), 200 + 180 * np.cos(angle)], order=1)
     assert count_spikes(circle) == expected
@@ -105,7 +124,9 @@ def test_the_pattern_grows_with_the_wavelength_and_turns_with_the_stop() -> None
     # three blades, the first corner at 17°: normals of edges at 77° and every 60° from there on
     turned = lens_with(3, rotation_deg=17.0)
     psf, _ = fraunhofer_psf(turned.surfaces[0], DIAMETER_MM, 100.0, NM, samples=513, across=128)
-    frame = starburst(turned, sun_radius_rad=1e-3, angles=1024).image((0, 0), np.array([NM]), (513, 513), 0.02)[0]
+    frame = starburst(turned, sun_radius_rad=1e-3, angles=1024).image(
+        frame_at((0, 0), np.array([NM]), (513, 513), 0.02)
+    )[0]
     for picture in (psf, frame):
         r, angle = distance_and_angle(picture.shape)
         ring = (r > 120) & (r < 200)
@@ -138,7 +159,7 @@ def by_transform(lens: Prescription, sun_airy: float, defects: StopDefects | Non
 def frame_of(lens: Prescription, sun_airy: float, pitch: float, defects: StopDefects | None = None) -> F64:
     sun = sun_airy * NM * 1e-6 / DIAMETER_MM
     burst = starburst(lens, sun_radius_rad=sun, defects=defects, angles=1024)  # 30 to σ / θ at the corners
-    return burst.image((0, 0), np.array([NM]), (481, 481), pitch, half_width_nm=0)[0].astype(np.float64)
+    return burst.image(frame_at((0, 0), np.array([NM]), (481, 481), pitch, half_width_nm=0))[0].astype(np.float64)
 
 
 @pytest.mark.parametrize(
@@ -200,7 +221,7 @@ def test_the_flux_beyond_a_radius_of_a_round_stop() -> None:
     """1 - J₀² - J₁² of the flux lies within v, so 2 / πv beyond it on average (Born & Wolf, 8.5.2)."""
     sun, pitch, f = 1e-3, 0.02, 100.0
     frame = starburst(lens_with(), sun_radius_rad=sun).image(
-        (0, 0), np.array([NM]), (401, 401), pitch, half_width_nm=0
+        frame_at((0, 0), np.array([NM]), (401, 401), pitch, half_width_nm=0)
     )
     r, _ = distance_and_angle(frame[0].shape, pitch / f)
     v = math.pi * DIAMETER_MM / (NM * 1e-6) * np.array([0.01, 0.04])
@@ -216,7 +237,7 @@ def test_the_strength_of_a_spike_and_of_a_fan() -> None:
     sun, pitch, f, row = 1e-3, 0.01, 100.0, 200
     k0 = 2e6 * math.pi / NM
     spiky = starburst(lens_with(6, rotation_deg=30.0), sun_radius_rad=sun, angles=2048)
-    frame = spiky.image((-4.0, 0), np.array([NM]), (401, 401), pitch, half_width_nm=0)[0]
+    frame = spiky.image(frame_at((-4.0, 0), np.array([NM]), (401, 401), pitch, half_width_nm=0))[0]
     theta = (np.arange(401) - 200) * pitch / f + 4.0 / f
     strength = frame[row - 25 : row + 26].sum(axis=0) * pitch * k0 / f * (NM * 1e-6 * f) ** 2
     edge = DIAMETER_MM / 2
@@ -228,7 +249,7 @@ def test_the_strength_of_a_spike_and_of_a_fan() -> None:
     apothem = DIAMETER_MM / 2 * (0.5 * math.cos(half) + 0.5)
     bend = apothem**2 / (0.5 * DIAMETER_MM / 2)  # of r = R (½ cos h / cos β + ½) at β = 0
     fan = starburst(lens_with(6, 0.5, 30.0), sun_radius_rad=sun, angles=1024)
-    frame = fan.image((-4.0, 0), np.array([NM]), (401, 401), pitch, half_width_nm=0)[0]
+    frame = fan.image(frame_at((-4.0, 0), np.array([NM]), (401, 401), pitch, half_width_nm=0))[0]
     expected = 2 * 2 * math.pi * bend / (k0 * theta) ** 3 / (NM * 1e-6 * f) ** 2
     # the mean of 1/θ³ over the disc, and the curvature that falls towards the corners: some (σ / θ)² = 1/400 each
     np.testing.assert_allclose(frame[row], expected, rtol=0.02)
@@ -240,7 +261,9 @@ def test_wide_angles_and_a_pupil_that_is_not_the_stop() -> None:
     f, radius = 8.0, paraxial_properties(lens).entrance_pupil_diameter_mm / 2
     assert radius != pytest.approx(lens.surfaces[lens.stop].semi_diameter_mm, rel=0.02)
     sun = np.array([-6.0, 2.0])
-    frame = starburst(lens, sun_radius_rad=2e-3).image(sun, np.array([NM]), (241, 321), 0.03, half_width_nm=0)[0]
+    frame = starburst(lens, sun_radius_rad=2e-3).image(
+        frame_at(sun, np.array([NM]), (241, 321), 0.03, half_width_nm=0)
+    )[0]
     y, x = np.mgrid[:241, :321]
     place = np.stack([(x - 160) * 0.03, (y - 120) * 0.03], axis=-1)
     cosine = f / np.sqrt(f**2 + np.sum(place**2, axis=-1))
@@ -267,7 +290,8 @@ def test_a_pattern_scales_with_the_wavelength_when_the_disc_does() -> None:
         burst = starburst(lens_with(7, 0.2, 5.0), sun_radius_rad=1e-3 * nm / 450, defects=defects)
         pitch = 0.02 * nm / 450
         frames.append(
-            burst.image((15 * pitch, 10 * pitch), np.array([nm]), (201, 201), pitch, half_width_nm=0)[0] * nm**2
+            burst.image(frame_at((15 * pitch, 10 * pitch), np.array([nm]), (201, 201), pitch, half_width_nm=0))[0]
+            * nm**2
         )
     # rows of the two tables lie elsewhere, 3 % apart, up to a fifth of a grain's ring: (2π / 5)² / 16 of its height
     lit = frames[0] > 0
@@ -279,7 +303,7 @@ def test_a_spike_is_as_wide_as_the_sun_at_every_wavelength() -> None:
     """Half of √(1 - t² / σ²) is reached at t = σ √3 / 2."""
     sun, pitch = 2e-3, 0.01
     burst = starburst(lens_with(6, rotation_deg=30.0), sun_radius_rad=sun, angles=2048)
-    frames = burst.image((-3.0, 0.0), np.array([450.0, 675.0]), (121, 201), pitch, half_width_nm=0)
+    frames = burst.image(frame_at((-3.0, 0.0), np.array([450.0, 675.0]), (121, 201), pitch, half_width_nm=0))
     for frame in frames:
         profile = frame[:, 150]
         # linear between pixels
@@ -306,7 +330,7 @@ def extra(defects: StopDefects) -> tuple[F64, F64, F64]:
     f, pitch, nodes = 20.0, 0.02, np.array([480.0, 540.0, 600.0])
     frames = [
         starburst(lens_with(efl_mm=f), sun_radius_rad=SUN_RAD, defects=d, radii=800, angles=1024).image(
-            (0, 0), nodes, (401, 401), pitch
+            frame_at((0, 0), nodes, (401, 401), pitch)
         )[1]
         for d in (defects, None)
     ]
@@ -354,7 +378,7 @@ def test_a_scratch_averaged_over_disc_and_band() -> None:
 
 def test_the_pattern_stands_where_the_sun_does_and_has_no_hole() -> None:
     burst = starburst(lens_with(7), sun_radius_rad=4.65e-3, angles=1024)
-    frame = burst.image((1.0, 0.5), np.array([500.0, 600.0]), (201, 301), 0.02)
+    frame = burst.image(frame_at((1.0, 0.5), np.array([500.0, 600.0]), (201, 301), 0.02))
     assert frame.shape == (2, 201, 301)
     assert frame.dtype == np.float32
     # the brightest pixels are those in and next to the Sun's image: none darker than a disc twice as wide
@@ -363,7 +387,7 @@ def test_the_pattern_stands_where_the_sun_does_and_has_no_hole() -> None:
     assert frame[0][r < radius_px + 1].min() > np.median(frame[0][(r > 2 * radius_px) & (r < 2.2 * radius_px)])
     y, x = np.nonzero(frame[0] > 0.5 * frame[0].max())
     assert (x.mean() - 150, y.mean() - 100) == pytest.approx((50, 25), abs=0.5)
-    outside = burst.image((4.0, 0.0), np.array([500.0, 600.0]), (201, 301), 0.02)
+    outside = burst.image(frame_at((4.0, 0.0), np.array([500.0, 600.0]), (201, 301), 0.02))
     assert outside.min() > 0
     assert np.isfinite(outside).all()
     # towards the Sun it gets brighter
@@ -373,12 +397,12 @@ def test_the_pattern_stands_where_the_sun_does_and_has_no_hole() -> None:
 def test_a_lone_band_is_wide_and_a_hat_is_a_mean() -> None:
     burst = starburst(lens_with(6, 0.1), sun_radius_rad=2e-3, radii=128, angles=512)
     shape, pitch = (101, 101), 0.05
-    wide = burst.image((0, 0), np.array([550.0]), shape, pitch)[0]
-    narrow = burst.image((0, 0), np.linspace(415, 685, 10), shape, pitch, half_width_nm=0).mean(axis=0)
+    wide = burst.image(frame_at((0, 0), np.array([550.0]), shape, pitch))[0]
+    narrow = burst.image(frame_at((0, 0), np.linspace(415, 685, 10), shape, pitch, half_width_nm=0)).mean(axis=0)
     np.testing.assert_allclose(wide, narrow, rtol=0.01)
-    hats = burst.image((0, 0), np.array([450.0, 550.0, 650.0]), shape, pitch)
+    hats = burst.image(frame_at((0, 0), np.array([450.0, 550.0, 650.0]), shape, pitch))
     # the first band is half a hat, its mean a third of the way to the next node; rims go with λ
-    pure = burst.image((0, 0), np.array([450.0 + 100 / 3]), shape, pitch, half_width_nm=0)[0]
+    pure = burst.image(frame_at((0, 0), np.array([450.0 + 100 / 3]), shape, pitch, half_width_nm=0))[0]
     r, _ = distance_and_angle(shape)
     bright = (pure > np.median(pure)) & (r > 10)
     np.testing.assert_allclose(hats[0][bright], pure[bright], rtol=0.01)
@@ -389,9 +413,9 @@ def test_eight_bands_are_what_each_is_alone(blades: int, rounding: float) -> Non
     """Together they share tables, and bent edges' corners are a parabola in λ: 3 and 15 thousandths."""
     burst = starburst(lens_with(blades, rounding), sun_radius_rad=1.3e-3, radii=64, angles=1024)
     nodes = np.linspace(420.0, 680.0, 8)
-    together = burst.image((0.1, 0), nodes, (101, 101), 0.08, half_width_nm=0)
+    together = burst.image(frame_at((0.1, 0), nodes, (101, 101), 0.08, half_width_nm=0))
     for k in (0, 2, 5):
-        alone = burst.image((0.1, 0), nodes[k : k + 1], (101, 101), 0.08, half_width_nm=0)[0]
+        alone = burst.image(frame_at((0.1, 0), nodes[k : k + 1], (101, 101), 0.08, half_width_nm=0))[0]
         lit = alone > 0
         np.testing.assert_allclose(together[k][lit], alone[lit], rtol=0.02)
 
@@ -408,6 +432,4 @@ def test_what_does_not_fit_is_refused() -> None:
     with pytest.raises(InputError, match="across = 2048"):
         fraunhofer_psf(lens_with().surfaces[0], 5.0, 100.0, NM, across=2048)
     with pytest.raises(InputError, match=r"wavelength_nm = \[600.0, 500.0\]"):
-        starburst(lens_with(), sun_radius_rad=1e-3, angles=1024).image(
-            (0, 0), np.array([600.0, 500.0]), (8, 8), 0.01
-        )
+        frame_at((0, 0), np.array([600.0, 500.0]), (8, 8), 0.01)

@@ -44,12 +44,13 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from ...core.errors import InputError
 from ..paraxial import paraxial_properties
 from ..prescription import Prescription, Surface
 from ..thin import beyond_frame
+from .settings import SensorGrid
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -63,7 +64,7 @@ _STRIP = 64  # rows of the frame that are computed at a time
 _ROW_BLUR = 0.5  # blur of fringes along the radius, in rows of the table
 _NARROW = 1 / 8  # ratio of the disc's radius to the distance below which sin φ = φ across a spike
 _WING_SUNS = 12.0  # distance from an edge's normal, in radii of the disc, beyond which cot² is not averaged
-_WING_STEP, _WING_POINTS, _WING_PLACES = 0.05, 1200, 241
+_WING_STEP, _WING_POINTS, _WING_COLUMNS = 0.05, 1200, 241
 _STRAIGHT_PER_MM = 1e-9
 _LEAST_CORNER_RAD = 1e-3
 _LONE_BAND_NM = 150.0  # half width of a single band, as in vbnfault.core.spectra
@@ -180,6 +181,37 @@ def _block(open_: F64, x: NDArray[Any], y: NDArray[Any], defects: StopDefects, p
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
+class StarburstFrame:
+    """Describe where and in which bands a starburst is computed. Raises InputError if the nodes do not rise.
+
+    Attributes
+    ----------
+    sun_xy_mm
+        Position of the image of the Sun's centre, from the middle of the frame. As in the lens, x points to the
+        right and y points down. The position may lie outside the frame.
+    wavelength_nm
+        Nodes of the bands, float64[band], rising. The weight of a band is a triangle that ends at its neighbours.
+    sensor
+        Size of the frame and pitch of its pixels.
+    half_width_nm
+        Half width of the triangles. With None, each triangle ends at the neighbouring nodes, and a single band has
+        constant weight over 150 nm on each side. With 0, each band is monochromatic.
+    """
+
+    sun_xy_mm: tuple[float, float]
+    wavelength_nm: F64
+    sensor: SensorGrid
+    half_width_nm: float | None = None
+
+    def __post_init__(self) -> None:
+        """Convert the nodes to a float64 array and check them."""
+        nodes = np.atleast_1d(np.asarray(self.wavelength_nm, dtype=np.float64))
+        if not (nodes > 0).all() or not (np.diff(nodes) > 0).all():
+            raise InputError(f"wavelength_nm = {nodes.tolist()}: must be above 0 and rise")
+        object.__setattr__(self, "wavelength_nm", nodes)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Starburst:
     """Compute the light that diffraction at a stop spreads over the sensor, averaged over the Sun's disc.
 
@@ -210,57 +242,28 @@ class Starburst:
     angles: int
     _memo: dict[Any, tuple[F32, F32]] = field(default_factory=dict, init=False, repr=False)
 
-    def image(
-        self,
-        sun_xy_mm: ArrayLike,
-        wavelength_nm: F64,
-        shape: tuple[int, int],
-        pitch_mm: float,
-        *,
-        half_width_nm: float | None = None,
-    ) -> F32:
+    def image(self, frame: StarburstFrame) -> F32:
         """Return the irradiance on the sensor over the Sun's irradiance at the entrance, float32[band, y, x].
 
-        The result holds for a lens with a transmission of 1.
-
-        Parameters
-        ----------
-        sun_xy_mm
-            Position of the image of the Sun's centre, from the middle of the frame. As in the lens, x points to the
-            right and y points down. The position may lie outside the frame. Inside the image of the Sun's disc, the
-            result has the value from just outside the disc; the direct image, which other code draws, is brighter.
-        wavelength_nm
-            Nodes of the bands, float64[band], rising. The weight of a band is a triangle that ends at its
-            neighbours.
-        shape, pitch_mm
-            (height, width) of the frame in pixels, and the pitch of the pixels.
-        half_width_nm
-            Half width of the triangles. With None, each triangle ends at the neighbouring nodes, and a single band
-            has constant weight over 150 nm on each side. With 0, each band is monochromatic.
+        The result holds for a lens with a transmission of 1. Inside the image of the Sun's disc, the result has the
+        value from just outside the disc; the direct image, which other code draws, is brighter.
         """
-        wavelength_nm = np.atleast_1d(np.asarray(wavelength_nm, dtype=np.float64))
-        tables, mix = self._tables(wavelength_nm, pitch_mm, half_width_nm)
-        if len(tables) == len(mix):
-            return self._remapped(sun_xy_mm, tables, None, shape, pitch_mm)
-        return self._remapped(sun_xy_mm, tables, mix, shape, pitch_mm)
+        tables, mix = self._tables(frame)
+        return self._remapped(frame, tables, None if len(tables) == len(mix) else mix)
 
-    def layers(
-        self, sun_xy_mm: ArrayLike, wavelength_nm: F64, shape: tuple[int, int], pitch_mm: float
-    ) -> tuple[F32, F64]:
+    def layers(self, frame: StarburstFrame) -> tuple[F32, F64]:
         """Return the few layers of which `image` is the sum, float32[layer, y, x], and their weights in each band.
 
-        The weights are float64[band, layer]. The parameters are those of `image`.
+        The weights are float64[band, layer].
         """
-        tables, mix = self._tables(np.atleast_1d(np.asarray(wavelength_nm, dtype=np.float64)), pitch_mm, None)
-        return self._remapped(sun_xy_mm, tables, None, shape, pitch_mm), mix.astype(np.float64)
+        tables, mix = self._tables(frame)
+        return self._remapped(frame, tables, None), mix.astype(np.float64)
 
-    def _remapped(
-        self, sun_xy_mm: ArrayLike, tables: F32, mix: F32 | None, shape: tuple[int, int], pitch_mm: float
-    ) -> F32:
+    def _remapped(self, frame: StarburstFrame, tables: F32, mix: F32 | None) -> F32:
         """Return the tables on the sensor, or their sums with the weights `mix`, float32[table or band, y, x]."""
-        height, width = shape
+        (height, width), pitch_mm = frame.sensor.shape, frame.sensor.pitch_mm
         f, sigma, nearest = self.efl_mm, self.sun_radius_rad, self._sines(pitch_mm)[0]
-        sun = np.asarray(sun_xy_mm, dtype=np.float64) / f
+        sun = np.asarray(frame.sun_xy_mm, dtype=np.float64) / f
         sun_cos = float(1 / np.sqrt(1 + sun @ sun))
         sun_u, sun_v = (np.float32(s * sun_cos) for s in sun)
         per_log = np.float32(0.5 * (self.radii - 1) / np.log(_FARTHEST / nearest))
@@ -288,29 +291,20 @@ class Starburst:
                 _mixed(layers, mix, strip)
         return out
 
-    def beyond_mm2(
-        self,
-        sun_xy_mm: ArrayLike,
-        wavelength_nm: F64,
-        shape: tuple[int, int],
-        pitch_mm: float,
-        *,
-        half_width_nm: float | None = None,
-    ) -> F64:
+    def beyond_mm2(self, frame: StarburstFrame) -> F64:
         """Return the flux on the sensor plane outside the frame, float64[band] in mm².
 
         The flux is divided by the Sun's irradiance at the entrance and holds for a lens with a transmission of 1.
-        The parameters are those of `image`.
         """
-        wavelength_nm = np.atleast_1d(np.asarray(wavelength_nm, dtype=np.float64))
-        tables, mix = self._tables(wavelength_nm, pitch_mm, half_width_nm)
+        tables, mix = self._tables(frame)
+        (height, width), pitch_mm = frame.sensor.shape, frame.sensor.pitch_mm
         sine = self._sines(pitch_mm)
-        slope = np.asarray(sun_xy_mm, dtype=np.float64) / self.efl_mm
+        slope = np.asarray(frame.sun_xy_mm, dtype=np.float64) / self.efl_mm
         half = self.angles // math.gcd(self.angles, _OUTER_STEPS)
         # average over steps of several angles: a spike is narrower than a step, but the frame is much wider
         means = tables[..., :-1].reshape(len(tables), len(sine), half, -1).mean(axis=-1, dtype=np.float64)
         angle = (np.arange(2 * half) + 0.5) * np.pi / half
-        half_slope = (shape[1] / 2 * pitch_mm / self.efl_mm, shape[0] / 2 * pitch_mm / self.efl_mm)
+        half_slope = (width / 2 * pitch_mm / self.efl_mm, height / 2 * pitch_mm / self.efl_mm)
         missing = beyond_frame(slope, sine, angle, half_slope)
         missing_half = (missing[:, :half].astype(np.float64) + missing[:, half:]) * (np.pi / half)
         per_radius = np.einsum("tra,ra->tr", means, missing_half) / (sine**2 - self.sun_radius_rad**2)
@@ -324,18 +318,17 @@ class Starburst:
         nearest = self.sun_radius_rad + 0.9 * pitch_mm / self.efl_mm
         return np.asarray(np.geomspace(nearest, _FARTHEST, self.radii))
 
-    def _tables(self, wavelength_nm: F64, pitch_mm: float, half_width_nm: float | None) -> tuple[F32, F32]:
+    def _tables(self, frame: StarburstFrame) -> tuple[F32, F32]:
         """Return tables of (θ² - σ²) |A|² / λ² in mm², and the weight of each table in each band.
 
         The tables are float32[table, radius, angle + 1], where the last angle repeats the first; the weights are
         float32[band, table].
         """
-        key = (tuple(wavelength_nm), pitch_mm, half_width_nm)
+        pitch_mm = frame.sensor.pitch_mm
+        key = (tuple(frame.wavelength_nm), pitch_mm, frame.half_width_nm)
         tables = self._memo.get(key)
         if tables is None:
-            if not (wavelength_nm > 0).all() or not (np.diff(wavelength_nm) > 0).all():
-                raise InputError(f"wavelength_nm = {wavelength_nm.tolist()}: must be above 0 and rise")
-            bands = _hats(wavelength_nm, half_width_nm)
+            bands = _hats(frame.wavelength_nm, frame.half_width_nm)
             tables = _fewest(_polar(self, self._sines(pitch_mm), bands, pitch_mm / self.efl_mm / np.sqrt(12)))
             self._memo.clear()
             self._memo[key] = tables
@@ -526,11 +519,40 @@ def _corner(
     """Return k⁴ |A|² of one corner without the light along its edges' normals, float64[wavelength, radius, angle].
 
     The angle counts from the direction of the corner. The normals of the two edges have the angles -`opening` and
-    +`opening`.
+    +`opening`. Near a normal, `_wing_means` replaces 1/q and 1/q², where q = θ sin ψ / σ'.
+    """
+    radius = float(np.hypot(burst.sun_radius_rad, 2 * pixel_rad))
+    per_radius = sine[:, None] / radius
+    means = _wing_means(burst, sine, opening, curvature_per_mm, wavelength_mm, pixel_rad)
+    angle = np.arange(burst.angles // 2 + 1) * np.pi / burst.angles  # the other half mirrors this half
+    total = np.full((len(wavelength_mm), len(sine), len(angle)), 2.0)
+    for psi in (opening - angle, opening + angle):
+        psi = np.mod(psi + np.pi / 2, np.pi) - np.pi / 2
+        q = per_radius * np.sin(psi)
+        near = np.nonzero(np.abs(q) < _WING_SUNS)
+        column = (q[near] + _WING_SUNS) * ((_WING_COLUMNS - 1) / _WING_SUNS)
+        below = np.minimum(column.astype(np.intp), 2 * _WING_COLUMNS - 3)
+        part = column - below
+        with np.errstate(divide="ignore"):
+            inverse = 1 / q
+        cot_scale = np.cos(psi) * per_radius
+        scales = 2 / np.tan(2 * opening) * cot_scale, cot_scale**2
+        for power, scale, tables in zip((1, 2), scales, means, strict=True):
+            for out, table in zip(total, tables, strict=True):
+                mean = inverse**power
+                mean[near] = table[near[0], below] * (1 - part) + table[near[0], below + 1] * part
+                out += scale * mean
+    return np.concatenate([total, total[..., -2:0:-1]], axis=-1)
 
-    The average over the disc and a pixel turns 1 / sin ψ and its square into integrals over the coherence μ(y).
-    Disc and pixel together have the radius σ'. Bent edges add the terms of Fresnel's integral, with τ. With
-    q = θ sin ψ / σ' for each edge, τ = θ / (2 ρ σ'² k₀) and δ = q₁ + q₂, the averages are
+
+def _wing_means(
+    burst: Starburst, sine: F64, opening: float, curvature_per_mm: float, wavelength_mm: F64, pixel_rad: float
+) -> list[F64]:
+    """Return 1/q and 1/q² averaged over the disc and a pixel, each float64[wavelength, radius, q].
+
+    The values of q = θ sin ψ / σ' rise evenly from -`_WING_SUNS` to +`_WING_SUNS`. The averages are integrals over
+    the coherence μ(y). Disc and pixel together have the radius σ'. Bent edges add the terms of Fresnel's integral,
+    with τ = θ / (2 ρ σ'² k₀) and δ = q₁ + q₂, the sum for the two edges:
 
         1/q → ∫ μ(y) sin(qy + τy²) / (1 + 2τy/δ) dy,     1/q² → -∫ μ(y) [sin(qy + τy²) - sin(qy)] / (τy) dy.
 
@@ -541,7 +563,7 @@ def _corner(
     radius = float(np.hypot(burst.sun_radius_rad, 2 * pixel_rad))
     per_radius = sine[:, None] / radius
     y = (np.arange(_WING_POINTS) + 0.5) * _WING_STEP
-    q = np.linspace(0, _WING_SUNS, _WING_PLACES)
+    q = np.linspace(0, _WING_SUNS, _WING_COLUMNS)
     s = y * burst.sun_radius_rad / radius
     # the term 0.05 y blurs by a twentieth of the radius; without this blur the limb would leave a cusp
     coherence = 2 * j1(s) / s * np.exp(-((y * pixel_rad / radius) ** 2 + (0.05 * y) ** 2) / 2) * _WING_STEP
@@ -559,28 +581,8 @@ def _corner(
         single = integral(chirp / (1 + tau * y / (per_radius * np.sin(opening))))
     else:
         square, single = -integral(1j * y[None, None]), integral(np.ones((1, 1, len(y)), dtype=np.complex128))
-    places = (len(wavelength_mm), len(sine), 2 * len(q) - 1)
-    kernels = [np.ascontiguousarray(np.broadcast_to(kernel, places)) for kernel in (single, square)]
-
-    angle = np.arange(burst.angles // 2 + 1) * np.pi / burst.angles  # the other half mirrors this half
-    total = np.full((len(wavelength_mm), len(sine), len(angle)), 2.0)
-    for psi in (opening - angle, opening + angle):
-        psi = np.mod(psi + np.pi / 2, np.pi) - np.pi / 2
-        at = per_radius * np.sin(psi)
-        near = np.nonzero(np.abs(at) < _WING_SUNS)
-        place = (at[near] + _WING_SUNS) * ((len(q) - 1) / _WING_SUNS)
-        below = np.minimum(place.astype(np.intp), 2 * len(q) - 3)
-        part = place - below
-        with np.errstate(divide="ignore"):
-            inverse = 1 / at
-        cot_scale = np.cos(psi) * per_radius
-        scales = 2 / np.tan(2 * opening) * cot_scale, cot_scale**2
-        for power, scale, kernel in zip((1, 2), scales, kernels, strict=True):
-            for out, table in zip(total, kernel, strict=True):
-                mean = inverse**power
-                mean[near] = table[near[0], below] * (1 - part) + table[near[0], below + 1] * part
-                out += scale * mean
-    return np.concatenate([total, total[..., -2:0:-1]], axis=-1)
+    shape = (len(wavelength_mm), len(sine), 2 * len(q) - 1)
+    return [np.ascontiguousarray(np.broadcast_to(mean, shape)) for mean in (single, square)]
 
 
 def _add_scratches(

@@ -41,7 +41,7 @@ from .paraxial import axial_transmittance
 from .pyramid import Pyramid
 from .scatter import Cleanliness, VeilingGlare, baffle_transmission, scattered_fraction, veiling_glare
 from .settings import DEFAULT, Baffle, DirectPath, SensorGrid, StraylightSettings, SunSource
-from .starburst import Starburst, starburst
+from .starburst import Starburst, StarburstFrame, starburst
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -255,20 +255,24 @@ class SunlightInLens:
         pupil = optics.efl_mm, optics.entrance_pupil_diameter_mm
         return *outline, *pupil, self.sun.radius_rad, self._sun_xy_mm, self._nodes, self.sensor
 
+    @property
+    def _starburst_frame(self) -> StarburstFrame:
+        """Return where and in which bands the starburst is computed."""
+        return StarburstFrame(sun_xy_mm=self._sun_xy_mm, wavelength_nm=self.nodes_nm, sensor=self.sensor)
+
     def starburst_layers(self) -> Diffraction:
         """Return the diffracted light of a lens with a transmission of 1.
 
         Its tables are coarser than those of `starburst`: in a frame of 1024 pixels the spikes in the corner are a
         pixel wider.
         """
-        burst, where = _coarse_starburst(self.lens, self.sun.radius_rad), self._sun_xy_mm
-        shape, pitch_mm = self.sensor.shape, self.sensor.pitch_mm
-        layers, mix = burst.layers(where, self.nodes_nm, shape, pitch_mm)
+        burst, frame = _coarse_starburst(self.lens, self.sun.radius_rad), self._starburst_frame
+        layers, mix = burst.layers(frame)
         return Diffraction(
             layers=layers,
             mix=mix,
-            flux_mm2=mix @ _flux_mm2(layers, pitch_mm),
-            beyond_mm2=burst.beyond_mm2(where, self.nodes_nm, shape, pitch_mm),
+            flux_mm2=mix @ _flux_mm2(layers, self.sensor.pitch_mm),
+            beyond_mm2=burst.beyond_mm2(frame),
         )
 
     def starburst_gain(self, flux_mm2: F64) -> F64:
@@ -278,11 +282,9 @@ class SunlightInLens:
 
     def starburst(self) -> tuple[F32, F64]:
         """Return what the stop diffracts."""
-        burst, where = _starburst(self.lens, self.sun.radius_rad), self._sun_xy_mm
-        shape, pitch_mm = self.sensor.shape, self.sensor.pitch_mm
-        image = burst.image(where, self.nodes_nm, shape, pitch_mm)
-        beyond = burst.beyond_mm2(where, self.nodes_nm, shape, pitch_mm)
-        gain = self.starburst_gain(_flux_mm2(image, pitch_mm) + beyond)
+        burst, frame = _starburst(self.lens, self.sun.radius_rad), self._starburst_frame
+        image, beyond = burst.image(frame), burst.beyond_mm2(frame)
+        gain = self.starburst_gain(_flux_mm2(image, self.sensor.pitch_mm) + beyond)
         image *= gain[:, None, None].astype(np.float32)
         return image, beyond * gain
 
