@@ -209,26 +209,34 @@ def _print_ghosts(name: str, ghosts: tuple[Ghost, ...]) -> None:
         )
 
 
-@app.command(rich_help_panel=_PANEL)
-def detector(
-    detector: Annotated[str, typer.Argument(help="Path of a sensor file, or name of a packaged detector.")],
-    out: Annotated[Path, typer.Option(help="Folder for emva1288.json and emva1288.png.")],
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class DetectorOptions:
+    """Hold the options that describe the measurement of a sensor; see `output.sensor_report.SensorRequest`."""
+
     seed: Annotated[
         int,
         whole(0, MOST_SEED, "Seed of the device that is measured: each has its own defects."),
-    ] = 1,
+    ] = 1
     pixels: Annotated[
         int,
         whole(64, 4096, "Width and height in pixels of the part that is measured, at most the sensor."),
-    ] = 512,
+    ] = 512
     wavelength_nm: Annotated[
         float | None, number(300, 1100, "Wavelength of the light in nm.", unset="the best one of each channel")
-    ] = None,
+    ] = None
     temperature_k: Annotated[
         float | None, number(100, 400, "Temperature of the sensor in kelvin.", unset="that of its file")
-    ] = None,
-    points: Annotated[int, whole(8, 2000, "Number of light levels of the photon transfer.")] = 40,
-    stack: Annotated[int, whole(2, 2000, "Number of images that are averaged for DSNU, PRNU and spectra.")] = 24,
+    ] = None
+    points: Annotated[int, whole(8, 2000, "Number of light levels of the photon transfer.")] = 40
+    stack: Annotated[int, whole(2, 2000, "Number of images that are averaged for DSNU, PRNU and spectra.")] = 24
+
+
+@app.command(rich_help_panel=_PANEL)
+@grouped
+def detector(
+    detector: Annotated[str, typer.Argument(help="Path of a sensor file, or name of a packaged detector.")],
+    out: Annotated[Path, typer.Option(help="Folder for emva1288.json and emva1288.png.")],
+    options: DetectorOptions,
     plugins: PluginOption = None,
 ) -> None:
     """Characterise a virtual sensor as EMVA 1288 defines, with plots."""
@@ -237,12 +245,12 @@ def detector(
     load_plugins(plugins)
     request = sensor_report.SensorRequest(
         sensor=detector,
-        individual=seed,
-        pixels=pixels,
-        wavelength_nm=wavelength_nm,
-        temperature_K=temperature_k,
-        points=points,
-        stack=stack,
+        individual=options.seed,
+        pixels=options.pixels,
+        wavelength_nm=options.wavelength_nm,
+        temperature_K=options.temperature_k,
+        points=options.points,
+        stack=options.stack,
     )
     _ = request.device  # a sensor file that is refused leaves no folder behind
     with writing(out):  # before the work

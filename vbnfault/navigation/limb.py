@@ -44,7 +44,9 @@ class LimbError:
     Attributes
     ----------
     rms_px
-        Root mean square of the edges' displacements along the normals. NaN where `reason` says why there is none.
+        Root mean square of the edges' displacements along the normals, √(Σ (e_image − e_clean)² / N) for the
+        positions e of the N edges that both images show. For a whole circle that moves by s > 0 it is s/√2. NaN
+        where `reason` says why there is none.
     median_px
         Median of their absolute values.
     shift_px
@@ -79,13 +81,9 @@ def limb_error(
 ) -> LimbError:
     """Return how far the lit limb of the image lies from that of its clean twin, in px along the limb's normals.
 
-    The true mask gives pixels of the limb and their normals. On each normal n the intensity, differentiated by a
-    Gaussian of 1 px, gives the edge: the first maximum that reaches half of the strongest one, coming from the sky,
-    with sub-pixel position e by a parabola. Over the N edges in both images
-
-        RMS = √(Σ (e_image − e_clean)² / N).
-
-    `shift_px` is the common shift that fits the edges best. For a whole circle that moves by s > 0 the RMS is s/√2.
+    The true mask gives pixels of the limb and their normals. Along each normal, coming from the sky, the edge is
+    the first maximum of the intensity's gradient (by a Gaussian of 1 px) that reaches half of the strongest one. A
+    parabola gives its sub-pixel position.
 
     Parameters
     ----------
@@ -94,57 +92,69 @@ def limb_error(
     body
         bool[y, x]: pixels that truly show the body.
     sky
-        bool[y, x]: pixels that truly show the sky; default: all others. A limb is between body and sky; leave out
-        of both what else is in the frame, such as the Sun or the spacecraft.
+        bool[y, x]: pixels that truly show the sky; default: all others. Pixels that show something else, such as
+        the Sun or the spacecraft, belong to neither.
     search_px
         Half the length of a normal: the largest error that can be measured, from 3 to 64 px.
 
     Returns
     -------
     LimbError
-        With NaN and a reason where no limb is in the frame, as where the body fills it, or where no image shows it.
+        With NaN and a reason where the frame holds no limb, or where one of the images does not show it.
 
     Raises
     ------
     InputError
         An array is no image, the sizes differ, or `search_px` is out of range.
 
-    References ---------- Christian (2017), Accurate Planetary Limb Localization for Image-Based Spacecraft
-    Navigation, Journal of Spacecraft and Rockets 54, 708. Mortari, D'Souza and Zanetti (2016), Image Processing of
-    Illuminated Ellipsoid, Journal of Spacecraft and Rockets 53, 448.
+    References
+    ----------
+    Christian (2017), Accurate Planetary Limb Localization for Image-Based Spacecraft Navigation, Journal of
+    Spacecraft and Rockets 54, 708.
+    Mortari, D'Souza and Zanetti (2016), Image Processing of Illuminated Ellipsoid, Journal of Spacecraft and
+    Rockets 53, 448.
     """
     if not 3 <= search_px <= 64:
         raise InputError(f"search_px = {search_px:g}: must be from 3 to 64 px")
     before, after = intensity(clean, "clean"), intensity(image, "image")
     same_shape(before, after, "clean", "image")
-    body = np.asarray(body, dtype=bool)
-    beside = ~body if sky is None else np.asarray(sky, dtype=bool)
-    same_shape(before, body, "clean", "body")
-    same_shape(before, beside, "clean", "sky")
-    xy, normals = limb_normals(body, beside, margin_px=search_px + 3 * _SIGMA_PX)
+    body, sky = _masks(before, body, sky)
+    xy, normals = limb_normals(body, sky, margin_px=search_px + 3 * _SIGMA_PX)
     if len(xy) < _LEAST_NORMALS:
         return LimbError(reason="no limb is in the frame: it shows no edge between body and sky")
-    own, own_strength, own_noise = _edges(before, xy, normals, search_px)
-    strong = float(np.percentile(own_strength, 95))
-    lit = (own_strength > max(_NOISE_FACTOR * own_noise, _LIT_FRACTION * strong)) & (np.abs(own) <= _NEAR_PX)
-    if np.count_nonzero(lit) < _LEAST_NORMALS:
+    xy, normals, clean_edge_px = _lit_edges(before, xy, normals, search_px)
+    if len(xy) < _LEAST_NORMALS:
         return LimbError(reason="the clean twin shows no lit limb")
-    xy, normals, own = xy[lit], normals[lit], own[lit]
-    moved, strength, noise = _edges(after, xy, normals, search_px)
+    edge_px, strength, noise = _edges(after, xy, normals, search_px)
     kept = strength > _NOISE_FACTOR * noise
-    lost = float(1 - np.count_nonzero(kept) / len(kept))
+    lost = 1 - np.count_nonzero(kept) / len(kept)
     if np.count_nonzero(kept) < _LEAST_NORMALS:
         return LimbError(lost_fraction=lost, reason="the image shows no limb where the clean twin has it")
-    normals, error = normals[kept], (moved - own)[kept]
-    clean_xy = xy[kept] + own[kept, None] * normals
+    xy, normals = xy[kept] + clean_edge_px[kept, None] * normals[kept], normals[kept]
+    return _summarised(xy, normals, (edge_px - clean_edge_px)[kept], lost)
+
+
+def _masks(
+    image: F32, body: NDArray[np.bool_], sky: NDArray[np.bool_] | None
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Return the masks of body and sky, by default all that is not body. Raises InputError if a size differs."""
+    body = np.asarray(body, dtype=bool)
+    sky = ~body if sky is None else np.asarray(sky, dtype=bool)
+    same_shape(image, body, "clean", "body")
+    same_shape(image, sky, "clean", "sky")
+    return body, sky
+
+
+def _summarised(clean_xy: F64, normals: F64, displacements_px: F64, lost_fraction: float) -> LimbError:
+    """Return the error of displacements along the normals from edges of the clean twin."""
     return LimbError(
-        rms_px=float(np.sqrt(np.mean(error**2))),
-        median_px=float(np.median(np.abs(error))),
-        shift_px=_common_shift(clean_xy, normals, clean_xy + error[:, None] * normals),
-        lost_fraction=lost,
+        rms_px=float(np.sqrt(np.mean(displacements_px**2))),
+        median_px=float(np.median(np.abs(displacements_px))),
+        shift_px=_common_shift(clean_xy, normals, clean_xy + displacements_px[:, None] * normals),
+        lost_fraction=lost_fraction,
         xy=clean_xy,
         normals=normals,
-        displacements_px=error,
+        displacements_px=displacements_px,
     )
 
 
@@ -216,6 +226,14 @@ def _edges(image: F32, xy: F64, normals: F64, search_px: float) -> tuple[F64, F6
     sky = fall[:, -int(_SKY_FRACTION * len(along)) :]
     noise = 1.4826 * float(np.median(np.abs(sky - np.median(sky, axis=1, keepdims=True))))
     return positions, here, noise
+
+
+def _lit_edges(clean: F32, xy: F64, normals: F64, search_px: float) -> tuple[F64, F64, F64]:
+    """Return the pixels and normals at which the clean twin shows the lit limb, and its edges' positions in px."""
+    positions, strength, noise = _edges(clean, xy, normals, search_px)
+    strong = float(np.percentile(strength, 95))
+    lit = (strength > max(_NOISE_FACTOR * noise, _LIT_FRACTION * strong)) & (np.abs(positions) <= _NEAR_PX)
+    return xy[lit], normals[lit], positions[lit]
 
 
 def _first_maximum(fall: F64, least: F64) -> NDArray[np.int64]:

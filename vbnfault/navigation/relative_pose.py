@@ -62,12 +62,12 @@ class RelativePoseError:
 def relative_pose(matches: Matches, first: CameraView, second: CameraView) -> RelativePose:
     """Return rotation and direction of translation between two views from their matches alone.
 
-    The essential matrix E = [t]× R, x₂ᵀ E x₁ = 0, is that of five points with the most inliers (RANSAC of a fixed
-    seed, so that equal matches give equal poses); of its four decompositions that one is taken for which most
-    points lie before both cameras, and refined over the inliers by the Sampson distances. Plane ground has two such
-    motions, and nearly plane ground almost so: the two of the homography compete with the motion of the essential
-    matrix by the sum of squared distances, cut at 1 px. Where they fit equally well, within 1 %, the one that turns
-    least is taken.
+    The essential matrix E = [t]× R, x₂ᵀ E x₁ = 0, is that of five points with the most inliers. RANSAC of a fixed
+    seed finds it, so that equal matches give equal poses. Of its four decompositions the code takes the one that
+    puts most points before both cameras, and refines it over the inliers by the Sampson distances. On plane ground
+    two motions fit, and on nearly plane ground almost so. The two motions of the homography therefore compete with
+    that of the essential matrix by the sum of squared distances, cut at 1 px. Of motions that fit equally well,
+    within 1 %, the one that turns least is taken.
 
     Parameters
     ----------
@@ -87,7 +87,7 @@ def relative_pose(matches: Matches, first: CameraView, second: CameraView) -> Re
     Fischler and Bolles (1981), Random Sample Consensus, Communications of the ACM 24, 381.
     Faugeras and Lustman (1988), Motion and Structure from Motion in a Piecewise Planar Environment, International
     Journal of Pattern Recognition and Artificial Intelligence 2, 485.
-    Hartley and Zisserman (2004), Multiple CameraView Geometry in Computer Vision, sections 9.6 and 11.4.3.
+    Hartley and Zisserman (2004), Multiple View Geometry in Computer Vision, sections 9.6 and 11.4.3.
     """
     if len(matches.first_xy) != len(matches.second_xy):
         raise InputError(
@@ -98,16 +98,10 @@ def relative_pose(matches: Matches, first: CameraView, second: CameraView) -> Re
     a, b = first.slopes(matches.first_xy), second.slopes(matches.second_xy)
     inlier = _INLIER_PX / float(np.mean([first.intrinsics[:2], second.intrinsics[:2]]))
     motions, distances = [], []
-    for rotation, direction, near in _candidates(a, b, inlier):
-        for _ in range(_ROUNDS):
-            rotation, direction = _refined(rotation, direction, a[near], b[near])
-            distance = _sampson(rotation, direction, _homogeneous(a), _homogeneous(b))
-            near = np.abs(distance) <= inlier
-            # wrong matches that lie near their epipolar line by chance are farther from it than the right ones
-            middle = float(np.median(np.abs(distance[near]))) if near.any() else 0.0
-            near &= np.abs(distance) <= max(_EXACT * inlier, _DEVIATIONS * middle)
+    for candidate in _candidates(a, b, inlier):
+        rotation, direction, distance = _refined_on_inliers(*candidate, a, b, inlier)
         motions.append((rotation, direction))
-        distances.append(np.minimum(np.abs(distance), inlier))
+        distances.append(np.minimum(distance, inlier))
     if not motions or max(np.count_nonzero(d < inlier) for d in distances) < _LEAST_MATCHES:
         return RelativePose(reason="no motion agrees with eight of the matches")
     # wrong matches fit no motion, and would make all sums alike
@@ -188,6 +182,20 @@ def _median_depth_m(view: CameraView) -> float:
     depth = np.asarray(view.depth_m)[::4, ::4]
     depth = depth[np.isfinite(depth)]
     return float(np.median(depth)) if len(depth) else 1.0
+
+
+def _refined_on_inliers(
+    rotation: F64, direction: F64, near: NDArray[np.bool_], a: F64, b: F64, inlier: float
+) -> tuple[F64, F64, F64]:
+    """Return a motion refined over its inliers, which are chosen anew, and the matches' distances, float64[n]."""
+    for _ in range(_ROUNDS):
+        rotation, direction = _refined(rotation, direction, a[near], b[near])
+        distance = np.abs(_sampson(rotation, direction, _homogeneous(a), _homogeneous(b)))
+        near = distance <= inlier
+        # wrong matches that lie near their epipolar line by chance are farther from it than the right ones
+        middle = float(np.median(distance[near])) if near.any() else 0.0
+        near &= distance <= max(_EXACT * inlier, _DEVIATIONS * middle)
+    return rotation, direction, distance
 
 
 def _refined(rotation: F64, direction: F64, a: F64, b: F64) -> tuple[F64, F64]:

@@ -25,7 +25,8 @@ _LEAST_LEVEL_PX = 32  # the coarsest level is not narrower
 class FeatureLifetime:
     """Hold for how many views features are tracked.
 
-    `mean_views` is the mean of `views` int64[feature]; NaN where `reason` says why there is none.
+    `mean_views` is the mean of `views` int64[feature]; NaN where `reason` says why there is none. A corner on the
+    sky has no point of the ground, so its lifetime is 0.
     """
 
     mean_views: float
@@ -43,9 +44,8 @@ def feature_lifetime(
     """Return for how many consecutive views the corners of the first one are tracked rightly.
 
     Corners of the first image (`corners`) are tracked from image to image by the method of Lucas and Kanade in a
-    pyramid. A feature lives as long as its track lies within the tolerance of the true reprojection of its point of
-    the ground, and within the frame; L_i counts the views from the first on, and the metric is the mean of L_i. A
-    corner on the sky has no point of the ground, so its lifetime is 0.
+    pyramid. A feature lives as long as its track lies within the frame and within the tolerance of the true
+    reprojection of its point of the ground. The metric is the mean number of views, the first included.
 
     Parameters
     ----------
@@ -76,31 +76,39 @@ def feature_lifetime(
     """
     if not len(images) or len(images) != len(views):
         raise InputError(f"images: {len(images)}, views: {len(views)}: must be equally many, at least 1")
-    for k, image in enumerate(images[1:], start=1):
-        same_shape(intensity(images[0], "images[0]"), intensity(image, f"images[{k}]"), "images[0]", f"images[{k}]")
+    _check_sizes(images)
     level = white_level(images[0]) if white is None else white
-    xy = corners(images[0], white=level, count=CORNERS)
-    if not len(xy):
+    track = corners(images[0], white=level, count=CORNERS)
+    if not len(track):
         return FeatureLifetime(mean_views=float("nan"), reason="the first image has no corner")
-    points_T_m = views[0].points_T_m(xy)
-    height, width = intensity(images[0]).shape
+    points_T_m = views[0].points_T_m(track)
     alive = np.isfinite(points_T_m).all(axis=1)
     lifetime = alive.astype(np.int64)
-    track = xy
     before = eight_bit(images[0], level)
     for image, view in zip(images[1:], views[1:], strict=True):
         if not alive.any():
             break
         after = eight_bit(image, level)
         track, tracked = _tracked(before, after, track)
-        with np.errstate(invalid="ignore"):
-            off = track - view.project(points_T_m)
-            near = np.hypot(off[:, 0], off[:, 1]) <= tolerance_px
-        inside = (track >= 0).all(axis=1) & (track[:, 0] < width) & (track[:, 1] < height)
-        alive = alive & tracked & near & inside
+        alive = alive & tracked & _is_right(track, view.project(points_T_m), after.shape, tolerance_px)
         lifetime = lifetime + alive.astype(np.int64)
         before = after
     return FeatureLifetime(mean_views=float(lifetime.mean()), views=np.asarray(lifetime))
+
+
+def _check_sizes(images: Sequence[NDArray[Any]]) -> None:
+    """Raise InputError if an array is no image, or if the sizes differ."""
+    first = intensity(images[0], "images[0]")
+    for k, image in enumerate(images[1:], start=1):
+        same_shape(first, intensity(image, f"images[{k}]"), "images[0]", f"images[{k}]")
+
+
+def _is_right(xy: F64, true_xy: F64, shape: tuple[int, ...], tolerance_px: float) -> NDArray[np.bool_]:
+    """Return whether positions lie within the frame and the tolerance of the true ones, bool[n]."""
+    with np.errstate(invalid="ignore"):
+        off = xy - true_xy
+        near = np.hypot(off[:, 0], off[:, 1]) <= tolerance_px
+    return near & (xy >= 0).all(axis=1) & (xy[:, 0] < shape[1]) & (xy[:, 1] < shape[0])
 
 
 def _tracked(before: NDArray[np.uint8], after: NDArray[np.uint8], xy: F64) -> tuple[F64, NDArray[np.bool_]]:

@@ -14,5 +14,5 @@ Modules:
 - `scatter` computes the glare, which surfaces and dust scatter, and the transmission of a baffle.
 - `total` adds the veil, and returns the sum of all straylight and the remaining fraction of the direct image.
 
-To change where ghosts are clipped, see `steps.meet`, which lists all code that does so.
+To change where ghosts are clipped, see `steps`, which lists all code that does so.
 """

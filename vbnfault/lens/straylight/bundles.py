@@ -9,7 +9,7 @@ A route is the sequence of reflecting surfaces, which are numbered by their row 
 route is the sequence of all surfaces that a ray meets; each of them is one step.
 
 A ray is lost (clipped) outside the rim of any surface. `Tracer.rims_mm` holds the radii of round rims;
-`steps.meet`, which clips, lists the other code that applies rims.
+`steps.meet` clips; its module lists the other code that applies rims.
 """
 
 from __future__ import annotations

@@ -49,7 +49,7 @@ class ParaxialTracer(Tracer):
     """Trace rays by matrices instead of surfaces (Lee & Eisemann's model), with the tables of `Tracer`.
 
     A ray is lost (clipped) outside the rims of `Tracer.rims_mm`, or outside the blades of the stop (`StopBlades`).
-    `steps.meet` does the same for exact rays and lists all code that applies rims.
+    `steps.meet` does the same for exact rays; its module lists all code that applies rims.
     """
 
     def __init__(

@@ -195,7 +195,7 @@ def paraxial_ghosts(
     """Return the ghosts of a far point source at an angle from the axis, towards an azimuth (0: +x).
 
     A ray is lost (clipped) outside the round rim of any surface, whose radius is `semi_diameter_mm`; blades of the
-    stop are ignored. These rims are separate from those of the tracers, which `steps.meet` lists. Ghosts without
+    stop are ignored. These rims are separate from those of the tracers, which `steps` lists. Ghosts without
     rays are left out.
     """
     turn = np.radians(azimuth_deg)

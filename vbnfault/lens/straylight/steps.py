@@ -4,6 +4,21 @@
 
 All values are drjit arrays with one lane for each ray, in single precision. Positions are relative to the vertex of
 the surface that a ray has just met.
+
+Rims. A ray is lost (clipped) outside the rim of a surface. The code still follows a lost ray and only records the
+rim values; `ghosts` and `raster` then leave out the light of lost rays, see `bundles.Spots`. Code that applies rims
+to ghosts:
+
+- `meet` (for exact rays) and `irradiance.ParaxialTracer.trace` (for paraxial rays). Round rims have the radii
+  `bundles.Tracer.rims_mm`. For a stop with blades, `StopBlades.relative_radius` gives the rim.
+- `paraxial.paraxial_ghosts`, which reads the radii from the prescription and treats the stop as round.
+
+Code that uses the rims without clipping a ghost, and that a rim of another shape also concerns:
+`ghosts._paraxial_boxes` (first boxes of rays), `irradiance.FlareModel._soften` (widths of soft edges), and
+`scatter._lit` (lit parts of the surfaces).
+
+The image of the scene and the Sun's direct image do not use these two modules. Their rays are clipped in
+`lens.rays.trace`, which `lens.spots.field_bundles` (image) and `lens.footprint` (dust) call.
 """
 
 from __future__ import annotations
@@ -87,7 +102,7 @@ class StopBlades:
     """Describe the shape of a stop with blades; `turn_rad` is the direction of its first corner from +x.
 
     A ray is lost (clipped) outside this rim. The stop's `semi_diameter_mm` is the distance of the corners from the
-    axis. For round rims see `bundles.Tracer`; `meet` lists all code that applies rims.
+    axis. For round rims see `bundles.Tracer`.
     """
 
     rim: Surface
@@ -115,21 +130,6 @@ def meet(
     at: Step, ray: Sequence[Any], *, soft: bool, special: bool, blades: StopBlades | None, light: bool = True
 ) -> tuple[Any, ...]:
     """Advance rays to the next surface of their path, refract or reflect them there, and clip them at its rim.
-
-    A ray is lost (clipped) outside the rim of this surface. The code still follows a lost ray and only records the
-    rim values; `ghosts` and `raster` then leave out the light of lost rays, see `bundles.Spots`. Code that applies
-    rims to ghosts:
-
-    - `meet` (for exact rays) and `irradiance.ParaxialTracer.trace` (for paraxial rays). Round rims have the radii
-      `bundles.Tracer.rims_mm`. For a stop with blades, `StopBlades.relative_radius` gives the rim.
-    - `paraxial.paraxial_ghosts`, which reads the radii from the prescription and treats the stop as round.
-
-    Code that uses the rims without clipping a ghost, and that a rim of another shape also concerns:
-    `ghosts._paraxial_boxes` (first boxes of rays), `irradiance.FlareModel._soften` (widths of soft edges), and
-    `scatter._lit` (lit parts of the surfaces).
-
-    The image of the scene and the Sun's direct image do not use these two modules. Their rays are clipped in
-    `lens.rays.trace`, which `lens.spots.field_bundles` (image) and `lens.footprint` (dust) call.
 
     A ray is a tuple of position, direction, fraction and rim values. The rim values are `radius`, the square of the
     largest relative radius so far, and, if edges are soft, `margin`. A stop with blades may give the mirrored ray
