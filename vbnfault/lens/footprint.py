@@ -24,7 +24,7 @@ from .changes import OF_COATINGS, Change, changed
 from .glass import D_NM
 from .imaging import RealLens
 from .interface import Lens
-from .mapping import inclined_rays
+from .mapping import inclined_rays, relative_radii
 from .paraxial import scaled_to_focal_length
 from .prescription import Prescription
 from .prescription_file import load_lens
@@ -243,13 +243,6 @@ def _fitted(x: F64, y: F64, area: F64, light: F64) -> F64:
     return np.asarray(coefficients / scale[:, None] ** np.array([0, 1, 2, 2]))
 
 
-def _beyond(lens: Prescription, sensor_mm: float, slope: F64, x: F64, y: F64) -> F64:
-    """Return each ray's largest distance from the axis in semi-diameters; inf for a ray that does not arrive."""
-    path, shape = inclined_rays(lens, slope, x, y, D_NM, sensor_mm)
-    lost = ~np.isfinite(path.points_mm[-1, :, 0])
-    return np.where(lost, np.inf, path.relative_radius).reshape(shape)
-
-
 @lru_cache(maxsize=8)
 def beams(lens: Prescription, largest_slope: float, sensor_mm: float) -> Beams:
     """Return the beams of a lens up to a tangent of the field angle, or up to where the lens is dark.
@@ -272,7 +265,7 @@ def beams(lens: Prescription, largest_slope: float, sensor_mm: float) -> Beams:
     for _ in range(_HALVINGS):
         half = (low + high) / 2
         x, y = centre[:, None] + half * np.cos(azimuth), half * np.sin(azimuth)
-        beyond = _beyond(lens, sensor_mm, slope[:, None], x, y)
+        beyond = relative_radii(lens, slope[:, None], x, y, sensor_mm)
         passes = beyond <= 1
         low, inside = np.where(passes, half, low), np.where(passes, beyond, inside)
         high, outside = np.where(passes, high, half), np.where(passes, outside, beyond)
@@ -286,12 +279,11 @@ def _innermost(lens: Prescription, sensor_mm: float, slope: F64) -> tuple[F64, F
 
     The width is 0 where no light passes.
     """
-    first = lens.surfaces[0]
-    reach = first.semi_diameter_mm + np.abs(first.sag_mm(first.semi_diameter_mm)) * slope
+    reach = lens.surfaces[0].reach_mm(slope)
     middle, width = np.zeros_like(slope), np.zeros_like(slope)
     for _ in range(_FANS):
         heights = middle[:, None] + reach[:, None] * np.linspace(-1, 1, _HEIGHTS)
-        outside = _beyond(lens, sensor_mm, slope[:, None], heights, np.zeros(1))
+        outside = relative_radii(lens, slope[:, None], heights, np.zeros(1), sensor_mm)
         middle = heights[np.arange(len(slope)), np.argmin(outside, axis=1)]
         step = heights[:, 1] - heights[:, 0]
         passing = (outside <= 1).sum(axis=1)

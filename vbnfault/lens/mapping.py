@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from ..core.errors import InputError
 from .distortion import RadialModel, fitted
+from .glass import D_NM
 from .prescription import Prescription
 from .rays import Path, trace
 
@@ -52,11 +53,20 @@ def inclined_rays(
     return path, x.shape
 
 
+def relative_radii(lens: Prescription, slope: F64, x: F64, y: F64, sensor_mm: float) -> F64:
+    """Return each ray's `Path.relative_radius` at the d line; inf for a ray that does not reach the sensor plane.
+
+    The rays are those of `inclined_rays`, and the result has the common shape of the arguments. A value above 1
+    means that a rim clips the ray.
+    """
+    path, shape = inclined_rays(lens, slope, x, y, D_NM, sensor_mm)
+    lost = ~np.isfinite(path.points_mm[-1, :, 0])
+    return np.where(lost, np.inf, path.relative_radius).reshape(shape)
+
+
 def fan_heights_mm(lens: Prescription, slope: F64) -> F64:
     """Return heights in the first vertex's plane, float64[angle, height] mm, that cover the whole first surface."""
-    first = lens.surfaces[0]
-    reach = first.semi_diameter_mm + np.abs(first.sag_mm(first.semi_diameter_mm)) * slope
-    return np.asarray(reach[:, None] * np.linspace(-1, 1, _HEIGHTS))
+    return np.asarray(lens.surfaces[0].reach_mm(slope)[:, None] * np.linspace(-1, 1, _HEIGHTS))
 
 
 def chief_heights_mm(lens: Prescription, slope: F64, *, wavelength_nm: float, sensor_mm: float) -> F64:

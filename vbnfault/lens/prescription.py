@@ -79,6 +79,13 @@ class Surface:
             sag = sag + a * r2 ** (k + 2)
         return np.asarray(sag)
 
+    def reach_mm(self, slope: F64) -> F64:
+        """Return the largest distance from the axis, in the plane of the vertex, of a ray that meets the surface.
+
+        `slope` is the ray's dx/dz, at least 0.
+        """
+        return np.asarray(self.semi_diameter_mm + np.abs(self.sag_mm(self.semi_diameter_mm)) * slope)
+
     def absorption_per_mm(self, wavelength_nm: float) -> float:
         """Return the absorption coefficient of the medium behind the surface, in 1 / mm."""
         fraction = float(np.interp(wavelength_nm, *self.internal_transmittance_10mm))

@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .aperture import axial_beam_diameter_mm
-from .glass import D_NM
-from .mapping import fan_heights_mm, inclined_rays
+from .mapping import fan_heights_mm, inclined_rays, relative_radii
 from .paraxial import paraxial_properties
 from .prescription import Prescription
 
@@ -58,10 +57,8 @@ def field_bundles(lens: Prescription, slope: F64) -> FieldBundles:
     sensor = paraxial_properties(lens).bfd_mm
 
     def beyond(x: F64, y: F64) -> F64:
-        """Return the largest relative radius of rays through (x, y), inf for rays that do not arrive."""
-        path, shape = inclined_rays(lens, slope.reshape(-1, *(1,) * (x.ndim - 1)), x, y, D_NM, sensor)
-        lost = ~np.isfinite(path.points_mm[-1, :, 0])
-        return np.where(lost, np.inf, path.relative_radius).reshape(shape)
+        """Return the relative radii of rays through (x, y), whose first axis is the field angle."""
+        return relative_radii(lens, slope.reshape(-1, *(1,) * (x.ndim - 1)), x, y, sensor)
 
     heights = fan_heights_mm(lens, slope)
     outside = beyond(heights, np.zeros(1))

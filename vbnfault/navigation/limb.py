@@ -109,10 +109,9 @@ def limb_error(
 
     References
     ----------
-    Christian (2017), Accurate Planetary Limb Localization for Image-Based Spacecraft Navigation, Journal of
-    Spacecraft and Rockets 54, 708.
-    Mortari, D'Souza and Zanetti (2016), Image Processing of Illuminated Ellipsoid, Journal of Spacecraft and
-    Rockets 53, 448.
+    Christian (2017), Accurate Planetary Limb Localization for Image-Based Spacecraft Navigation, J. Spacecraft
+    Rockets 54, 708.
+    Mortari, D'Souza and Zanetti (2016), Image Processing of Illuminated Ellipsoid, J. Spacecraft Rockets 53, 448.
     """
     if not 3 <= search_px <= 64:
         raise InputError(f"search_px = {search_px:g}: must be from 3 to 64 px")

@@ -93,8 +93,7 @@ def boxes(
     """
     tangent = np.tan(np.radians(sun_deg))
     direction = np.array([np.sin(np.radians(sun_deg)), 0.0, np.cos(np.radians(sun_deg))])
-    front = made.lens.surfaces[0]
-    reach = front.semi_diameter_mm + abs(float(front.sag_mm(front.semi_diameter_mm))) * tangent
+    reach = float(made.lens.surfaces[0].reach_mm(tangent))
     count = len(made.routes)
     everywhere = np.tile([0.0, 0.0, reach, reach], (count, 1))
     box = np.concatenate([everywhere, _paraxial_boxes(made, tangent, reach)])

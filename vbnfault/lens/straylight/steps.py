@@ -17,8 +17,12 @@ Code that uses the rims without clipping a ghost, and that a rim of another shap
 `ghosts._paraxial_boxes` (first boxes of rays), `irradiance.FlareModel._soften` (widths of soft edges), and
 `scatter._lit` (lit parts of the surfaces).
 
+The tracers of exact and of paraxial rays do not share more than `StopBlades`: one works with squares of relative
+radii and margins of lost rays, the other with radii, and a common form would change the last bits of either.
+
 The image of the scene and the Sun's direct image do not use these two modules. Their rays are clipped in
-`lens.rays.trace`, which `lens.spots.field_bundles` (image) and `lens.footprint` (dust) call.
+`lens.rays.trace`, and `lens.mapping.relative_radii` passes the result to `lens.spots` (image) and `lens.footprint`
+(dust).
 """
 
 from __future__ import annotations
