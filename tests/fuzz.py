@@ -1,10 +1,10 @@
 """Run the program on many malformed inputs: `python -m tests.fuzz --count 5000 --seed 7`.
 
-Each case damages a valid input: a scene, lens or sensor file, a mesh of any format, a spacecraft, a texture, a
-SPICE kernel or DSK, options and environment variables, or a store. The program then runs as from the command line.
-It may succeed or refuse the input: exit code 0, 1 or 2, with a short message if it is not 0. A case fails if it
-ends with a traceback or a signal, or uses more than 20 s of processor time or 2 GiB of memory. A failure is printed
-with the command that repeats it (`--only N`).
+Each case damages a valid input: a scene, study, lens or sensor file, a mesh of any format, a spacecraft, a texture,
+a SPICE kernel or DSK, options and environment variables, or a store. The program then runs as from the command
+line. It may succeed or refuse the input: exit code 0, 1 or 2, with a short message if it is not 0. A case fails if
+it ends with a traceback or a signal, or uses more than 20 s of processor time or 2 GiB of memory. A failure is
+printed with the command that repeats it (`--only N`). `--kinds study lens` runs cases of these kinds only.
 
 A few processes run all cases, so that the imports are paid once; a process that dies is replaced. A case depends
 only on the seed and its number. The default seed is a hash of the package's sources.
@@ -44,6 +44,7 @@ MEMORY_BYTES = 2 << 30
 # on a busy machine.
 BLOCKED_S = 600
 LONGEST_MESSAGE = 3000
+KINDS = len(CASES)
 
 
 # --- one case -------------------------------------------------------------------------------------------------
@@ -169,7 +170,7 @@ class Process:
             "OPENBLAS_NUM_THREADS": "1",
         }
         self.process = subprocess.Popen(
-            [sys.executable, "-m", "tests.fuzz", "--worker", str(folder), "--seed", seed],
+            [sys.executable, "-m", "tests.fuzz", "--worker", str(folder), "--seed", seed, "--kinds", *CASES],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
@@ -268,7 +269,8 @@ def report(result: dict[str, Any], seed: str) -> None:
     for key in ("arguments", "variables", "text"):
         if result.get(key):
             print(f"  {key}: {result[key]}")
-    print(f"  repeat: python -m tests.fuzz --seed {seed} --only {result['number']}", flush=True)
+    kinds = f" --kinds {' '.join(CASES)}" if len(CASES) < KINDS else ""
+    print(f"  repeat: python -m tests.fuzz --seed {seed} --only {result['number']}{kinds}", flush=True)
 
 
 def source_hash() -> str:
@@ -285,10 +287,13 @@ def main() -> None:
     parser.add_argument("--count", type=int, default=500)
     parser.add_argument("--seed", default=None, help="default: a hash of the sources")
     parser.add_argument("--processes", type=int, default=os.cpu_count() or 1)
+    parser.add_argument("--kinds", nargs="+", choices=list(CASES), default=list(CASES), metavar="KIND")
     parser.add_argument("--only", type=int, help="one case, in this process, its files kept")
     parser.add_argument("--worker", type=Path, help=argparse.SUPPRESS)
     given = parser.parse_args()
     seed = given.seed or source_hash()
+    for kind in CASES.keys() - set(given.kinds):
+        del CASES[kind]
     if given.worker:
         worker(given.worker, seed)
     elif given.only is not None:

@@ -67,6 +67,30 @@ def case_sensor(seeds: Seeds, rng: random.Random, here: Path) -> Case:
     return dry(whole_scene(seeds, here, camera=camera, faults={"cosmic_rays": {}})), {}
 
 
+def case_study(seeds: Seeds, rng: random.Random, here: Path) -> Case:
+    """Damage a study file, its scene, or values given by `--set`.
+
+    Most cases are dry runs. The others evaluate a few points of a tiny scene, whatever the file asks for.
+    """
+    scene = whole_scene(seeds, here, faults={"straylight": {"model": "texture"}})
+    path, settings = here / "study.toml", []
+    table, sound = rng.choice(seeds.studies), rng.random() < 0.2
+    path.write_bytes(toml(table) if sound else any_toml(table, rng))
+    for _ in range(rng.choice((1, 1, 2)) if sound else rng.choice((0, 0, 0, 1))):
+        keys = [".".join(map(str, where)) for where in places(table)]
+        settings.append(f"{rng.choice([*keys, 'scene.a.b.c', 'design', ''])}={toml_value(hostile(rng))}")
+    if rng.random() < 0.15:
+        small = {"design.n": 1, "design.method": "one_at_a_time", "design.half_width": 0, "scene.samples": 1}
+        small |= {"scene.base": str(scene), "scene.camera.width_px": 32, "scene.camera.height_px": 32}
+        settings += [f"{key}={toml_value(value)}" for key, value in small.items()]
+    else:
+        settings.append("--dry-run")
+    arguments = ["study", str(path), "--out", str(here / "study")]
+    for setting in settings:
+        arguments += [setting] if setting == "--dry-run" else ["--set", setting.replace("\0", "")]
+    return arguments, {}
+
+
 def _damaged_mesh(name: str, data: bytes, rng: random.Random, seeds: Seeds) -> bytes:
     """Return a damaged mesh file: in most cases with damaged values, otherwise with damaged bytes."""
     if rng.random() < 0.6:
@@ -280,15 +304,16 @@ def case_store(seeds: Seeds, rng: random.Random, here: Path) -> Case:
 
 
 CASES: dict[str, tuple[Callable[[Seeds, random.Random, Path], Case], int]] = {  # function, percentage of cases
-    "scene": (case_scene, 17),
-    "fault": (case_fault, 12),
+    "scene": (case_scene, 15),
+    "fault": (case_fault, 11),
     "lens": (case_lens, 12),
-    "sensor": (case_sensor, 10),
-    "mesh": (case_mesh, 14),
-    "spacecraft": (case_spacecraft, 9),
+    "sensor": (case_sensor, 9),
+    "study": (case_study, 8),
+    "mesh": (case_mesh, 12),
+    "spacecraft": (case_spacecraft, 8),
     "texture": (case_texture, 5),
     "kernel": (case_kernel, 3),
     "special": (case_special, 4),
-    "options": (case_options, 9),
+    "options": (case_options, 8),
     "store": (case_store, 5),
 }

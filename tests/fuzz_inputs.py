@@ -174,12 +174,38 @@ class Seeds:
         self.scene: dict[str, Any] = scene
         packaged = ROOT / "scenes"
         self.scenes = [scene, *(tomllib.loads(p.read_text()) for p in sorted(packaged.glob("*.toml")))]
+        self.study = _study()
+        studies = sorted((packaged / "studies").glob("*.toml"))
+        self.studies = [self.study, self.study, *(tomllib.loads(p.read_text()) for p in studies)]
         self.lenses = [tomllib.loads(p.read_text()) for p in sorted((packaged / "lenses").glob("*.toml"))]
         self.sensors = [tomllib.loads(p.read_text()) for p in sorted((packaged / "detectors").glob("*.toml"))]
         self.store = folder / "seed.zarr"
         self.meshes = _meshes(folder)
         self.kernels = _kernels(folder)
         self.textures = _textures()
+
+
+def _study() -> dict[str, Any]:
+    """Return a small valid study with factors of every distribution and kind."""
+    return {
+        "title": "fuzz",
+        "design": {"method": "sobol", "n": 2, "seed": 3, "resamples": 100, "confidence": 0.9, "half_width": 0.0},
+        "scene": {"base": "scene.toml", "samples": [0], "seeds": [1], "camera": {"exposure_s": 0.01}},
+        "factor": [
+            {"key": "sun.distance_au", "distribution": "uniform", "low": 1.0, "high": 2.0, "unit": "au"},
+            {"key": "detector.full_well_e", "distribution": "log_uniform", "low": 1e4, "high": 2e4, "unit": "e"},
+            {
+                "key": "scene.faults.straylight.brightness",
+                "distribution": "truncated_normal",
+                "mean": 2.0,
+                "deviation": 0.2,
+                "low": 1.5,
+                "high": 2.5,
+            },
+            {"key": "scene.camera.fov_deg", "distribution": "categorical", "values": [40.0, 50]},
+        ],
+        "metrics": {"names": ["straylight_total_e", "snr", "mask_area"]},
+    }
 
 
 def _meshes(folder: Path) -> dict[str, bytes]:

@@ -1,4 +1,4 @@
-"""Builds on a Dask cluster: the same bits, and a sentence for whatever happens to client, scheduler and workers."""
+"""Builds and studies on a Dask cluster: the same bits, and a sentence for whatever happens to it."""
 
 from __future__ import annotations
 
@@ -15,18 +15,28 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import pytest
+import study_kit
+import test_plugins
+from conftest import small_scene
 from dask import config as dask_config
 from synthetic import SAMPLES, Broken, Session, end_unless, fake_sample, make_spec, run, site_of
 
 from vbnfault import store as st
+from vbnfault.core import toml_files
 from vbnfault.core.errors import InputError, VbnfaultError
 from vbnfault.core.quantities import Sample
+from vbnfault.dataset import BuildOptions, build_scene, dask
 from vbnfault.dataset import build as bd
-from vbnfault.dataset import dask
+from vbnfault.faults import models, plugins
+from vbnfault.scene.config import load_scene
+from vbnfault.study import results
+from vbnfault.study.run import run_study
+from vbnfault.study.spec import parse_study
 
 distributed = pytest.importorskip("distributed")
 pytestmark = pytest.mark.filterwarnings("default")  # what Dask warns of is not ours
@@ -268,6 +278,79 @@ def test_a_dask_cluster_makes_the_same_bits(
             run(tmp_path / "t.zarr", Broken(), scheduler=cluster.scheduler_address)
     assert capsys.readouterr().err.splitlines().count("terrain of 5") == 1
     assert st.digest(out) == undisturbed[1]
+
+
+def table_of_study(folder: Path, study: Any, scheduler: str | None = None, **given: Any) -> bytes:
+    """Run a study and return its table."""
+    options = BuildOptions(scheduler=scheduler, progress=False)
+    run_study(study, folder, options, report=False, **given)
+    return (folder / results.TABLE).read_bytes()
+
+
+def test_a_study_on_a_cluster_gives_the_same_table(
+    processes: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    spec, made = study_kit.small_spec(), study_kit.Stopping
+    here = table_of_study(tmp_path / "here", spec, evaluator=made)
+    assert table_of_study(tmp_path / "there", spec, processes.scheduler_address, evaluator=made) == here
+    # a worker that dies is replaced; what it had not written is evaluated again
+    processes.scheduler.allowed_failures = 1
+    try:
+        deadly = partial(Dying, folder=str(tmp_path))
+        assert table_of_study(tmp_path / "again", spec, processes.scheduler_address, evaluator=deadly) == here
+    finally:
+        processes.scheduler.allowed_failures = 0
+    assert (tmp_path / "happened").exists()
+
+
+class Dying(study_kit.Stopping):
+    """End the process at evaluation 77, once."""
+
+    def __init__(self, study: Any, folder: str) -> None:
+        super().__init__(study)
+        self.happened = Path(folder) / "happened"
+
+    def evaluate(self, evaluation: Any) -> Any:
+        if evaluation.index == 77 and not self.happened.exists():
+            self.happened.touch()
+            os.kill(os.getpid(), signal.SIGKILL)
+        return super().evaluate(evaluation)
+
+
+def test_a_plug_in_reaches_the_workers_of_a_cluster(processes: Any, tmp_path: Path) -> None:
+    """The scene names it by a path, which the workers read for themselves."""
+    (tmp_path / "my_glint.py").write_text(test_plugins.GLINT, encoding="utf-8")
+    tables = small_scene(
+        dataset={"samples": 1, "sites": 1, "layers": ["clean"]},
+        camera={"width_px": 32, "height_px": 32},
+        plan={"mode": "per_class", "faulty_fraction": 1.0},
+    )
+    scene = tmp_path / "scene.toml"
+    named = {"plugins": ["my_glint.py"], "faults": {"glint": {}}}
+    scene.write_text(toml_files.toml_text(tables | named), encoding="utf-8")
+    level = {"key": "scene.faults.glint.level", "distribution": "uniform", "low": 0.2, "high": 0.9}
+    study = {
+        "title": "glint",
+        "design": {"method": "one_at_a_time", "n": 2},
+        "scene": {"base": str(scene)},
+        "factor": [level],
+        "metrics": {"names": ["centroid_shift_px"]},
+    }
+    address = processes.scheduler_address
+    with models.undoing_registrations(always=True):
+        digests = [
+            build_scene(load_scene(scene), tmp_path / f"{name}.zarr", BuildOptions(**given, progress=False)).digest
+            for name, given in (("there", {"scheduler": address}), ("here", {}))
+        ]
+        assert digests[0] == digests[1]
+        made = [
+            table_of_study(tmp_path / name, parse_study(study, source="test"), scheduler)
+            for name, scheduler in (("study there", address), ("study here", None))
+        ]
+        assert made[0] == made[1]
+        shifts = results.read_table(tmp_path / "study here")["centroid_shift_px"].to_numpy()
+        assert len(set(shifts)) == 3  # the level was read
+        plugins.forget_all()
 
 
 def test_a_scheduler_is_told_from_a_worker() -> None:

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from vbnfault import faults
-from vbnfault.core import resources
+from vbnfault.core import resources, tables
 from vbnfault.core.errors import InputError
 from vbnfault.scene import config, keyed_random
 from vbnfault.scene.config import Scene, load_scene, parse_scene
@@ -289,6 +289,19 @@ def test_overrides_replace_the_file(tmp_path: Path) -> None:
     assert load_scene(path).camera.fov_deg == 30
     assert "camera.fov_deg = 'x':" in refusal(path.read_bytes(), tmp_path, **{"camera.fov_deg": "x"})
     assert "unknown key" in refusal(path.read_bytes(), tmp_path, **{"camera.nothing": 1})
+
+
+def test_an_override_replaces_an_entry_of_a_list() -> None:
+    table = {"factor": [{"low": 1}, {"low": 2}], "names": ["a", ["b"]]}
+    tables.replace(table, {"factor[0].low": 3, "factor.1.high": 4, "names[1][0]": "c"}, source="file")
+    assert table == {"factor": [{"low": 3}, {"low": 2, "high": 4}], "names": ["a", ["c"]]}
+    for key, sentence in (
+        ("factor[2].low", r"file: factor\[2\].low = 5: factor is a list; its entries are 0 to 1"),
+        ("factor.x", r"file: factor.x = 5: factor is a list"),
+        ("names[0].low", r"file: names\[0\].low = 5: 0 is a value, not a table"),
+    ):
+        with pytest.raises(InputError, match=sentence):
+            tables.replace(table, {key: 5}, source="file")
 
 
 @pytest.mark.parametrize("key", ["title.a", "camera.fov_deg.x"])

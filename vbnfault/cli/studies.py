@@ -33,6 +33,9 @@ def study(
         str | None,
         typer.Option(help="Address of a Dask scheduler whose workers evaluate, such as tcp://host:8786."),
     ] = None,
+    dry_run: Annotated[
+        bool, typer.Option(help="Check the study and say how much it would evaluate, but evaluate nothing.")
+    ] = False,
     settings: Annotated[
         list[str] | None,
         typer.Option(
@@ -46,8 +49,12 @@ def study(
     choice of the model matters. The same command continues an interrupted study.
     """
     from ..dataset import BuildOptions
-    from ..study.run import run_study
+    from ..study.run import describe_study, run_study
 
+    if dry_run:
+        for line in describe_study(name, overrides=overrides(settings)):
+            typer.echo(line)
+        return
     options = BuildOptions(workers=workers, threads=threads, scheduler=scheduler)
     for line in run_study(name, out, options, overrides=overrides(settings)).lines():
         typer.echo(line)

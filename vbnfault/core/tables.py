@@ -121,22 +121,45 @@ def parse(kind: type[T], plain: Mapping[str, Any], *, source: str, overrides: Se
     except ValidationError as error:
         located = [known["loc"] for known in errors]
         errors += [detail for detail in error.errors(include_url=False) if detail["loc"] not in located]
-    wrong = ".".join(map(str, errors[0]["loc"]))
-    replaced = any(wrong.startswith(key) or key.startswith(f"{wrong}.") for key in overrides)
+    keys, _ = _locate(errors[0]["loc"], _schema(model))
+    wrong = ".".join(map(str, keys))
+    replaced = any(wrong.startswith(key) or key.startswith(f"{wrong}.") for key in map(dotted, overrides))
     mark = " (set in place of the file)" if replaced else ""
     raise InputError(f"{source}: {sentence(errors, _schema(model))}{mark}")
 
 
 def replace(table: dict[str, Any], values: Mapping[str, Any], *, source: str) -> None:
-    """Replace values of plain data, given by dotted key. Raises InputError where a key leads through a value."""
+    """Replace values of plain data, given by dotted key. Raises InputError where a key leads through a value.
+
+    An entry of a list is named as in messages, `factor[0].low`, or by a dot, `factor.0.low`.
+    """
     for key, value in values.items():
-        *parents, leaf = key.split(".")
-        node = table
-        for parent in parents:
-            node = node.setdefault(parent, {})
-            if not isinstance(node, dict):
+        *parents, leaf = dotted(key).split(".")
+        node: Any = table
+        for i, parent in enumerate(parents):
+            if isinstance(node, list):
+                node = node[_entry(node, parent, ".".join(parents[:i]), f"{source}: {key} = {shown(value)}")]
+            else:
+                node = node.setdefault(parent, {})
+            if not isinstance(node, dict | list):
                 raise InputError(f"{source}: {key} = {shown(value)}: {parent} is a value, not a table")
-        node[leaf] = value
+        if isinstance(node, list):
+            node[_entry(node, leaf, ".".join(parents), f"{source}: {key} = {shown(value)}")] = value
+        else:
+            node[leaf] = value
+
+
+def dotted(key: str) -> str:
+    """Return a key with dots before the numbers of entries of lists: `factor[0].low` as `factor.0.low`."""
+    return re.sub(r"\[(\d+)\]", r".\1", key)
+
+
+def _entry(entries: Sequence[Any], part: str, where: str, what: str) -> int:
+    """Return the index of an entry of a list. Raises InputError, which begins with `what`, where it has none."""
+    if re.fullmatch(r"\d{1,9}", part) and int(part) < len(entries):
+        return int(part)
+    known = f"its entries are 0 to {len(entries) - 1}" if entries else "it is empty"
+    raise InputError(f"{what}: {where} is a list; {known}")
 
 
 def check(checks: TypeAdapter[Any], value: Any, where: str, *, whole_value: bool = False) -> Any:

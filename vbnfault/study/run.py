@@ -162,21 +162,13 @@ def run_study(
 
     `report`: whether to draw the figures and write the page, too.
     """
-    spec = study if isinstance(study, StudySpec) else load_study(study, overrides)
-    source = spec.title if isinstance(study, StudySpec) else str(study)
-    factory = evaluator or _scene_evaluator()
-    _check_half_width(spec, source)
-    design = make_design(spec)
+    plan = _plan(study, overrides, evaluator)
+    spec, design, metrics, contents, made = plan.spec, plan.design, plan.metrics, plan.contents, plan.evaluator
     if options.scheduler is not None:
         check_scheduler(options.scheduler)
     began = time.monotonic()
-    contents = file_contents.Contents()
-    with contents.in_use(), file_contents.noting() as digests:
-        made = factory(spec)
-    metrics = _chosen_metrics(made, spec, source)
-    identity = _identity(spec, factory, metrics, digests)
     with interruptible(), locked(path):
-        _prepare_folder(path, spec, identity)
+        _prepare_folder(path, spec, plan.identity)
         job = StudyJob(path, design, Progress(len(design), shown=options.progress, noun="evaluations"))
         warnings: list[str] = []
         try:
@@ -186,7 +178,7 @@ def run_study(
             for sentence in warnings:
                 print(f"warning: {sentence}", file=sys.stderr)
             names = tuple(metric.name for metric in metrics)
-            workers = ChunkWorkers(factory, spec, path.absolute(), names, contents)
+            workers = ChunkWorkers(plan.factory, spec, path.absolute(), names, contents)
             with job.progress:
                 _do_tasks(workers, made, job, options)
         except (Stopped, KeyboardInterrupt) as stop:
@@ -218,6 +210,69 @@ def run_study(
         seconds=time.monotonic() - began,
         seconds_by_stage=dict(job.seconds_by_stage),
         warnings=(*warnings, *missed),
+    )
+
+
+def describe_study(study: StudySpec | str | Path, *, overrides: Mapping[str, Any] | None = None) -> list[str]:
+    """Return lines that say what a study of a scene would do. Nothing is evaluated or written.
+
+    Raises InputError where the study, its scene, a factor or a metric is wrong. Whether the images of the scene
+    read every factor is found only when the study runs.
+    """
+    plan = _plan(study, overrides, None)
+    spec = plan.spec
+    seeds, views, points, models = plan.design.shape
+    counts = [(points, "point"), (views, "view"), (seeds, "seed"), (models, "model")]
+    product = " × ".join(f"{count} {noun}{'s' if count > 1 else ''}" for count, noun in counts)
+    factors = [_with_unit(factor.key, factor.unit) for factor in spec.factors]
+    metrics = [_with_unit(metric.name, metric.unit) for metric in plan.metrics]
+    return [
+        f"{spec.title}: {spec.description}" if spec.description else spec.title,
+        f"{spec.design.method}, n = {spec.design.n}: {product} = {len(plan.design)} evaluations",
+        f"factors: {', '.join(factors)}",
+        f"metrics: {', '.join(metrics)}",
+    ]
+
+
+def _with_unit(name: str, unit: str) -> str:
+    """Return a name, and its unit where it has one."""
+    return name if unit in ("", "1") else f"{name} ({unit})"
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Plan:
+    """Hold what is known of a study before its first evaluation; `evaluator` is that of this process."""
+
+    spec: StudySpec
+    factory: EvaluatorFactory
+    design: Design
+    evaluator: Evaluator
+    metrics: tuple[Metric, ...]
+    contents: file_contents.Contents
+    identity: Mapping[str, Any]
+
+
+def _plan(
+    study: StudySpec | str | Path, overrides: Mapping[str, Any] | None, evaluator: EvaluatorFactory | None
+) -> _Plan:
+    """Return the checked study with its design and the evaluator of this process. Raises InputError."""
+    spec = study if isinstance(study, StudySpec) else load_study(study, overrides)
+    source = spec.title if isinstance(study, StudySpec) else str(study)
+    factory = evaluator or _scene_evaluator()
+    _check_half_width(spec, source)
+    design = make_design(spec)
+    contents = file_contents.Contents()
+    with contents.in_use(), file_contents.noting() as digests:
+        made = factory(spec)
+    metrics = _chosen_metrics(made, spec, source)
+    return _Plan(
+        spec=spec,
+        factory=factory,
+        design=design,
+        evaluator=made,
+        metrics=metrics,
+        contents=contents,
+        identity=_identity(spec, factory, metrics, digests),
     )
 
 

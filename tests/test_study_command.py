@@ -1,0 +1,59 @@
+"""The command `vbnfault study`: dry runs, values set in place of the file, and bad input in one sentence."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import pytest
+
+from vbnfault.cli import main
+
+
+def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], *words: str) -> tuple[int, str, str]:
+    """Run the program in this process; return its exit code, standard output and standard error."""
+    monkeypatch.setattr(sys, "argv", ["vbnfault", *words])
+    code = 0
+    try:
+        main()
+    except SystemExit as end:
+        code = int(end.code or 0)
+    said = capsys.readouterr()
+    return code, said.out, said.err
+
+
+def test_a_dry_run_says_how_much_a_study_evaluates_and_writes_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    words = ("study", "flare_models", "--out", str(out), "--dry-run", "--set", "design.n=8")
+    code, said, errors = run(monkeypatch, capsys, *words)
+    assert (code, errors, out.exists()) == (0, "", False)
+    lines = said.splitlines()
+    assert lines[1] == ("latin_hypercube, n = 8: 8 points × 200 views × 1 seed × 3 models = 4800 evaluations")
+    assert lines[2].startswith("factors: sun.distance_au (au), ")
+    assert "straylight_total_e (electrons), " in lines[3]
+
+
+@pytest.mark.parametrize(
+    ("setting", "sentence"),
+    [
+        ("factor[4].high=-0.5", "factor[4].low = -0.03, high = -0.5: bounds reversed or equal"),
+        ("factor.4.key=lens.coating.thicknes", "did you mean lens.coating.thickness?"),
+        ("factor[12].low=1", "factor[12].low = 1: factor is a list; its entries are 0 to 11"),
+        ("metrics.names[0]=straylight_total", "did you mean straylight_total_e?"),
+        ("scene.samples=[999]", "scene.samples: sample 999: must be below dataset.samples = "),
+    ],
+)
+def test_what_is_wrong_is_one_sentence(
+    setting: str,
+    sentence: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    words = ("study", "flare_lens", "--out", str(tmp_path / "out"), "--dry-run", "--set", setting)
+    code, said, errors = run(monkeypatch, capsys, *words)
+    assert (code, said) == (2, "")
+    (line,) = errors.splitlines()
+    assert sentence in line
