@@ -18,8 +18,9 @@ import study_kit
 from study_results import IMAGE_METRICS, LENS_FACTORS, Plan, ishigami, made_up
 
 import vbnfault
-from vbnfault.study import plots, report
-from vbnfault.study.report import inline_svg, write_images, write_report
+from vbnfault.study import extreme_images, plots, report
+from vbnfault.study.extreme_images import write_images
+from vbnfault.study.report import inline_svg, write_report
 from vbnfault.study.summaries import StudyResults
 
 FEW = (LENS_FACTORS[0], LENS_FACTORS[9], LENS_FACTORS[7])  # normal, categorical, log-uniform
@@ -376,3 +377,16 @@ def test_images_are_those_of_the_extremes_with_one_exposure(tmp_path: Path) -> N
     )
     assert evaluation.values == {key: row[key] for key, *_ in FEW}
     assert write_images(tmp_path, results.dataset, results.table, results.spec, object()) == []
+
+
+def test_images_of_8_bits_stay_as_they_are_and_others_have_a_middle_that_is_seen() -> None:
+    stored = [np.full((4, 4, 3), level, dtype=np.uint8) for level in (7, 255)]
+    assert all((shown == image).all() for shown, image in zip(extreme_images._shown(stored), stored, strict=True))
+    # ground a thousand times fainter than the Sun, and a veil that is nearly as bright as everything else
+    for faint in (1e-3, 0.6):
+        pair = [np.full((20, 20), faint * 1e6, dtype=np.float32) for _ in range(2)]
+        pair[0][0, :5], pair[1][0, :5] = 1e6, 0.5e6
+        best, worst = extreme_images._shown(pair)
+        assert best.max() == 255
+        assert worst[0, 0] < 255
+        assert 0.25 * 255 < np.median(best) == np.median(worst) < 0.65 * 255

@@ -190,16 +190,16 @@ class SceneEvaluator:
             values |= self._navigation_values(evaluation, setting, own)
         return {name: values[name] for name in names}
 
-    def picture(self, evaluation: Evaluation) -> F32:
-        """Return an image of an evaluation, float32[y, x, channel].
+    def picture(self, evaluation: Evaluation) -> NDArray[Any]:
+        """Return an image of an evaluation, [y, x, channel].
 
-        Where the study has metrics of navigation, it is the image with all faults that they judge, in DN; otherwise
-        the expected image with straylight, in electrons, without noise.
+        Where the study has metrics of navigation, it is the image with all faults that they judge, uint8 as stored;
+        otherwise the expected image with straylight, float32 in electrons, without noise.
         """
         setting = self.factors.setting(evaluation.values)
         if any(name in _NAVIGATION for name in self.spec.metrics.names):
             (frame,) = self._navigation_frames(evaluation, setting, 1)
-            return np.ascontiguousarray(frame.image[..., :3], dtype=np.float32)
+            return np.ascontiguousarray(frame.image[..., :3])
         image = self._lit_image(evaluation, setting)
         return np.ascontiguousarray(np.moveaxis((image.kept + image.added)[:3], 0, -1))
 

@@ -1,7 +1,7 @@
-"""Write the report of a study: figures, images of the extremes, and one page that needs no other file.
+"""Write the report of a study: figures, and one page that needs no other file.
 
-`write_report` draws every figure into `DIR/plots` and writes `DIR/report.html`. `write_images` makes the worst and
-the best image of each metric before that. Both need only what a study leaves in its folder.
+`write_report` draws every figure into `DIR/plots` and writes `DIR/report.html`. It needs only what a study leaves
+in its folder, with the images that `extreme_images` has made before.
 """
 
 from __future__ import annotations
@@ -19,10 +19,9 @@ from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from ..core.images import write_png
 from . import sheets
+from .extreme_images import IMAGES
 from .plots import drawings, save
 from .report_words import FORMULAE, SECTIONS
 from .summaries import DUMMY, StudyResults
@@ -33,15 +32,12 @@ if TYPE_CHECKING:
 
 PAGE = "report.html"
 PLOTS = "plots"
-IMAGES = "images"
 
 _MOST_DRAWINGS_BYTES = 11_000_000  # of all figures in the page; the largest become PNG above it
 _MOST_IMAGES_BYTES = 4_000_000  # before base64, which adds a third
 _SIDES = (512, 400, 320, 256, 192, 128)  # of the images in the page, px; the files keep their size
 _NARROW_PT = 340.0  # a wider figure shrinks to this fraction of its size, and then scrolls on a small screen:
 _LEAST_SCALE = 0.78
-_WHITE = 0.998  # quantile of a pair of images that is shown as white
-_LINEAR = 0.1  # of the median of a pair: below it, grey values are proportional to electrons
 _MOST_ROWS = 30  # of failed evaluations and of missed half-widths
 _MOST_LEADING = 4  # factors that the summary names for each metric
 
@@ -109,67 +105,6 @@ def write_report(
     temporary.write_text(page, encoding="utf-8")
     temporary.replace(path)
     return path
-
-
-def write_images(
-    folder: str | os.PathLike[str], dataset: xr.Dataset, table: pa.Table, spec: Mapping[str, Any], evaluator: Any
-) -> list[Path]:
-    """Write the images with the best and the worst value of each metric to `images`; return their paths.
-
-    The two images of a metric have one exposure and one tone curve, arcsinh (Lupton et al. 2004, doi
-    10.1086/382245), which shows ghosts and ground beside the Sun: the 99.8 % quantile of both is white. An
-    evaluator without the method `picture`, and a metric whose values are all equal, give none.
-
-    Parameters
-    ----------
-    folder, dataset, table, spec
-        As for `write_report`.
-    evaluator
-        Evaluator of the study; `picture(evaluation)` returns an image in electrons, linear, [y, x] or [y, x, 3].
-    """
-    from .spec import Evaluation
-
-    picture = getattr(evaluator, "picture", None)
-    if picture is None:
-        return []
-    results = StudyResults(dataset=dataset, table=table, spec=spec)
-    paths: list[Path] = []
-    kept: dict[int, NDArray[np.float32]] = {}
-
-    def image(row: int) -> NDArray[np.float32]:
-        if row not in kept:
-            values = table.slice(row, 1).to_pylist()[0]
-            evaluation = Evaluation(
-                index=int(values["evaluation"]),
-                seed=int(values["seed"]),
-                view=int(values["view"]),
-                model=str(values["model"]),
-                role=str(values["role"]),
-                values={factor: values[factor] for factor in results.factors},
-            )
-            kept[row] = np.asarray(picture(evaluation), dtype=np.float32)
-        return kept[row]
-
-    for metric in results.metrics:
-        extremes = results.extremes(metric)
-        if extremes is None:
-            continue
-        pair = {"best": image(extremes.best_row), "worst": image(extremes.worst_row)}
-        white, dark = _levels(list(pair.values()))
-        (Path(folder) / IMAGES).mkdir(parents=True, exist_ok=True)
-        for name, each in pair.items():
-            path = Path(folder) / IMAGES / f"{metric}_{name}.png"
-            grey = np.arcsinh(np.nan_to_num(each) / dark) / np.arcsinh(white / dark)
-            paths.append(write_png(path, np.rint(255 * np.clip(grey, 0, 1)).astype(np.uint8)))
-    return paths
-
-
-def _levels(images: Sequence[NDArray[np.float32]]) -> tuple[float, float]:
-    """Return the level that is shown as white, and the one below which the tone curve of a pair is linear."""
-    both = np.concatenate([np.nan_to_num(image).ravel() for image in images])
-    white, middle = (float(level) for level in np.quantile(both, [_WHITE, 0.5]))
-    white = white if white > 0 else 1.0
-    return white, min(max(_LINEAR * middle, white * 1e-5), white)
 
 
 # ------------------------------------------------------------------------------------ figures and images
@@ -302,9 +237,10 @@ def _page(results: StudyResults, figures: Sequence[_Figure], images: Path) -> st
     pictures = _images(results, images)
     if pictures:
         how = (
-            "Each pair shows the evaluations with the best and the worst value of a metric, with one exposure "
-            "and one curve of brightness (arcsinh), which shows faint light beside the Sun. What differs between "
-            "the two images is therefore light, not the display."
+            "Each pair shows the evaluations with the best and the worst value of a metric. Images of 8 bits, "
+            "which metrics of navigation judge, are shown as they are stored. Expected light in electrons is shown "
+            "with one exposure for both images and one curve of brightness (arcsinh), which shows faint light "
+            "beside the Sun: what differs between the two is light, not the display."
         )
         parts.append(("images", "Best and worst images", f'<p class="how">{_e(how)}</p>{pictures}'))
     parts += [
