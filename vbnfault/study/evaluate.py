@@ -564,7 +564,11 @@ def _rendered_sequence(view: RenderedView, count: int) -> list[RenderedView]:
 
 def _scene_of(spec: StudySpec) -> Scene:
     """Return the scene of a study without factors."""
-    scene = load_scene(spec.scene.base, spec.scene.overrides)
+    values = {key: value for key, value in spec.scene.overrides.items() if value != {}}
+    scene = load_scene(spec.scene.base, values)
+    missing = {key: {} for key in spec.scene.overrides.keys() - values.keys() if not _has_table(scene, key)}
+    if missing:
+        scene = load_scene(spec.scene.base, values | dict(sorted(missing.items())))
     largest = max(spec.scene.views)
     if largest >= scene.dataset.samples:
         raise InputError(
@@ -572,6 +576,14 @@ def _scene_of(spec: StudySpec) -> Scene:
             f"{scene.dataset.samples} of the scene {spec.scene.base!r}"
         )
     return scene
+
+
+def _has_table(scene: Scene, key: str) -> bool:
+    """Return whether a scene has the table of a dotted key."""
+    node: Any = scene.resolved()
+    for part in key.split("."):
+        node = node.get(part) if isinstance(node, dict) else None
+    return isinstance(node, dict)
 
 
 def _check_models(spec: StudySpec, faults: Mapping[str, Any]) -> None:
