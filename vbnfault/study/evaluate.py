@@ -566,7 +566,9 @@ def _scene_of(spec: StudySpec) -> Scene:
     """Return the scene of a study without factors."""
     values = {key: value for key, value in spec.scene.overrides.items() if value != {}}
     scene = load_scene(spec.scene.base, values)
-    missing = {key: {} for key in spec.scene.overrides.keys() - values.keys() if not _has_table(scene, key)}
+    missing: dict[str, Any] = {
+        key: {} for key in spec.scene.overrides.keys() - values.keys() if not _has_table(scene, key)
+    }
     if missing:
         scene = load_scene(spec.scene.base, values | dict(sorted(missing.items())))
     largest = max(spec.scene.views)
