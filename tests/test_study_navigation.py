@@ -151,6 +151,12 @@ def test_only_what_is_asked_for_is_computed(
     assert list(values) == NAMES[:8]
     assert 0 < values["matches_lost"] <= 1
     assert 0 < values["corner_repeatability"] < 1
+    ten = [*frames, *[frames[1]] * 8]
+    lost = bridge.navigation_values(ten, NAMES[4:])
+    clean = bridge.navigation_values([replace(frame, image=frame.clean) for frame in ten], NAMES[4:])
+    for name, kept in (("match_precision_lost", NAMES[4]), ("feature_lifetime_lost_views", NAMES[8])):
+        assert lost[name] == clean[kept] - lost[kept]
+        assert lost["feature_lifetime_lost_views"] != 0
     calls = []
     monkeypatch.setattr(navigation, "match", lambda *images: calls.append(images))
     assert bridge.navigation_values(frames, NAMES[2:4]) == {name: values[name] for name in NAMES[2:4]}
@@ -160,7 +166,7 @@ def test_only_what_is_asked_for_is_computed(
 def test_clean_frames_have_no_error(taken: list[tuple[Injection, bridge.NavigationFrame]]) -> None:
     frames = [replace(frame, image=frame.clean) for _, frame in taken]
     values = bridge.navigation_values([*frames, *[frames[1]] * 8], NAMES)
-    for name in ("centroid_shift_px", "matches_lost", "rotation_error_deg", "translation_error_deg"):
+    for name in ("centroid_shift_px", "matches_lost", "rotation_error_deg", "translation_error_deg", *NAMES[9:]):
         assert values[name] == 0
     assert values["limb_error_px"] == 0 or np.isnan(values["limb_error_px"])
     assert values["corner_repeatability"] == values["orb_repeatability"] == 1
@@ -176,7 +182,8 @@ def test_every_metric_has_unit_meaning_and_source() -> None:
         "orb_repeatability",
         "match_precision",
     ]
-    assert NAMES[5:] == ["matches_lost", "rotation_error_deg", "translation_error_deg", "feature_lifetime_views"]
+    assert NAMES[5:9] == ["matches_lost", "rotation_error_deg", "translation_error_deg", "feature_lifetime_views"]
+    assert NAMES[9:] == ["match_precision_lost", "feature_lifetime_lost_views"]
     for metric in bridge.METRICS:
         assert metric.unit in ("px", "1", "deg", "views")
         assert metric.description

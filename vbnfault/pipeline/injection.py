@@ -19,14 +19,21 @@ _CLEARLY_VISIBLE_DN = 6.0
 
 
 def inject_faults(
-    spec: SampleSpec, pose: Pose, rendering: Rendering, exposure: SceneExposure, views: int = 1
+    spec: SampleSpec,
+    pose: Pose,
+    rendering: Rendering,
+    exposure: SceneExposure,
+    views: int = 1,
+    commanded: Sequence[str] | None = None,
 ) -> Injection:
     """Draw the commanded faults of a sample. `views` is the number of its views that were rendered so far.
+
+    `commanded` are the faults; by default those that the plan commands.
 
     A fault without a visible effect is drawn again a few times, then left out. So the result holds the faults that
     are in the image, and labels never claim more.
     """
-    commanded = list(spec.commanded)
+    commanded = list(spec.commanded if commanded is None else commanded)
     if not pose.resolved or pose.sun_visible_fraction == 0:
         commanded = [name for name in commanded if not spec.faults[name].needs_sun]
     development = Development(exposure=exposure, context=fault_context(pose, rendering, exposure), rng=spec.rng)

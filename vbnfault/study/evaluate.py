@@ -21,7 +21,7 @@ import contextlib
 import hashlib
 import json
 from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -41,15 +41,16 @@ from ..lens.straylight.irradiance import flare_model
 from ..lens.straylight.settings import GhostSettings, SensorGrid
 from ..lens.straylight.total import SunlightInLens
 from ..lens.thin import cos4_map
+from ..pipeline.development import Development
 from ..pipeline.exposure import exposure_s
-from ..pipeline.injection import inject_faults
+from ..pipeline.injection import fault_context, inject_faults
 from ..pipeline.rendering import render_view
 from ..pipeline.resolve import resolve
-from ..pipeline.session import Session
-from ..pipeline.spec import Injection, SampleSpec, SceneExposure
+from ..pipeline.session import Session, configure_faults
+from ..pipeline.spec import Injection, Pose, Rendering, SampleSpec, SceneExposure
 from ..pipeline.stars import add_stars
 from ..scene.config import Scene, load_scene
-from . import image_metrics
+from . import chosen_fault, image_metrics
 from . import navigation_metrics as nav
 from .factors import AFTER_RENDER, Factors, Setting
 from .image_metrics import LitImage
@@ -102,6 +103,10 @@ class SceneEvaluator:
             camera = Session(self._plain_scene()).base_camera
             self._nominal_camera = camera
             self.factors = Factors(spec, self._base, camera, self._nominal_lens(camera))
+            self._chosen_faults = chosen_fault.choices(spec)
+            for choice in self._chosen_faults:
+                scene = self.factors.scene_of(spec.scene.seeds[0], "", ((chosen_fault.SCENE_KEY, choice),))
+                configure_faults(scene, f"{chosen_fault.KEY} = {choice!r}")
         self._check_metrics()
 
     # --- the contract of an evaluator -----------------------------------------------------------------------------
@@ -133,6 +138,8 @@ class SceneEvaluator:
         _ = self.metrics
         places: dict[str, set[str]] = {}
         for i, factor in enumerate(self.spec.factors):
+            if factor.key == chosen_fault.KEY:
+                continue  # a fault need not act in the first view
             try:
                 places[factor.key] = self._places_without(factor)
             except InputError as error:
@@ -249,6 +256,11 @@ class SceneEvaluator:
             if not image_metrics.is_image_metric(name):
                 raise InputError(
                     f"study {self.spec.title!r}: metrics.names: {name!r} is unknown{did_you_mean(name, known)}"
+                )
+            if self._chosen_faults:
+                raise InputError(
+                    f"study {self.spec.title!r}: metrics.names: {name!r} measures the straylight of the scene; "
+                    f"with the factor {chosen_fault.KEY} use metrics of navigation: {', '.join(_NAVIGATION)}"
                 )
             if not self._adding:
                 raise InputError(
@@ -484,43 +496,69 @@ class SceneEvaluator:
     ) -> Mapping[str, float]:
         """Return the metrics of navigation, from images that pass the whole pipeline."""
         frames = self._navigation_frames(evaluation, setting, nav.views_needed(names))
+        if not frames:
+            return dict.fromkeys(names, float("nan"))
         with self.kept.timed("navigation"):
             return nav.navigation_values(frames, names)
 
     def _navigation_frames(self, evaluation: Evaluation, setting: Setting, count: int) -> list[nav.NavigationFrame]:
-        """Return the clean and the faulted image of the first `count` views of an evaluation's sequence."""
+        """Return the clean and the faulted image of the first `count` views of an evaluation's sequence.
+
+        There are none where the fault that a factor chooses cannot act, or does not show.
+        """
         scene = self._scene(evaluation, setting)
+        faults = _faults(scene)
+        frames: list[nav.NavigationFrame] = []
+        first: Injection | None = None
+        for clean in self._clean_views(evaluation, setting, count):
+            with self.kept.timed("faults"):
+                spec = replace(clean.spec, scene=scene, faults=faults)
+                view = spec, clean.pose, clean.rendering, clean.exposure
+                if first is None:
+                    chosen = chosen_fault.acting(faults, spec, clean.pose) if self._chosen_faults else None
+                    first = injection = inject_faults(*view, commanded=chosen)
+                    if self._chosen_faults and not first.draws:
+                        return []
+                else:
+                    injection = nav.continue_faults(*view, first)
+                image = injection.development.image(injection.draws).array
+                camera = clean.nominal_camera
+                frames.append(nav.navigation_frame(clean.pose, clean.rendering.truth, camera, clean.image, image))
+        return frames
+
+    def _clean_views(self, evaluation: Evaluation, setting: Setting, count: int) -> list[_CleanView]:
+        """Return the first `count` views of an evaluation's sequence without faults."""
+        without = replace(setting, scene={k: v for k, v in setting.scene.items() if k != chosen_fault.SCENE_KEY})
+        scene = self._scene(evaluation, without)
         view = self._view(evaluation, scene)
         place = self._render_key(scene), evaluation.view, count
         sequence = self.kept.once("render", place, lambda: _rendered_sequence(view, count), "sequence")
-        frames = []
-        with self.kept.timed("navigation"):
-            first: Injection | None = None
-            for k, seen in enumerate(sequence):
-                spec = nav.spec_of_view(replace(view.spec, scene=scene, faults=_faults(scene)), k)
-                camera = self._camera(spec, setting)
-                pose, rendering = with_sun(seen, camera, setting.sun)
-                rate = camera.expose(rendering.light.rendered, 1.0)
-                seconds = exposure_s(scene, camera, rendering.truth, rate.merged)
-                exposed = SceneExposure(
-                    camera=replace(camera, exposure_s=seconds), light=rendering.light, rate=rate
-                )
-                exposed = add_stars(spec, pose, rendering, exposed)
-                if first is None:
-                    first = injection = inject_faults(spec, pose, rendering, exposed)
-                else:
-                    injection = nav.continue_faults(spec, pose, rendering, exposed, first)
-                images = injection.development
-                frames.append(
-                    nav.navigation_frame(
-                        pose,
-                        rendering.truth,
-                        seen.spec.camera,
-                        images.image({}).array,
-                        images.image(injection.draws).array,
-                    )
-                )
-        return frames
+        sun, detector = tuple(sorted(setting.sun.items())), tuple(sorted(setting.detector.items()))
+
+        def make() -> list[_CleanView]:
+            return [self._clean_view(k, seen, scene, setting) for k, seen in enumerate(sequence)]
+
+        return self.kept.once("clean twins", (*place, scene.camera, tuple(setting.lens), detector, sun), make)
+
+    def _clean_view(self, k: int, seen: RenderedView, scene: Scene, setting: Setting) -> _CleanView:
+        """Return a view of a sequence, counted by `k`, with its exposure and its clean twin."""
+        spec = replace(seen.spec, scene=scene, faults=_faults(scene))
+        camera = self._camera(spec, setting)
+        pose, rendering = with_sun(seen, camera, setting.sun)
+        rate = camera.expose(rendering.light.rendered, 1.0)
+        seconds = exposure_s(scene, camera, rendering.truth, rate.merged)
+        exposed = SceneExposure(camera=replace(camera, exposure_s=seconds), light=rendering.light, rate=rate)
+        exposed = add_stars(spec, pose, rendering, exposed)
+        context = fault_context(pose, rendering, exposed)
+        clean = Development(exposure=exposed, context=context, rng=spec.rng).image({}).array
+        return _CleanView(
+            spec=spec,
+            pose=pose,
+            rendering=rendering,
+            exposure=exposed,
+            nominal_camera=seen.spec.camera,
+            image=clean,
+        )
 
     # --- what a factor moves --------------------------------------------------------------------------------------
 
@@ -548,6 +586,18 @@ class SceneEvaluator:
         if any(name in _NAVIGATION for name in self.spec.metrics.names):
             digest.update(repr(sorted(self.evaluate(evaluation).items())).encode())
         return digest.hexdigest()
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _CleanView:
+    """Hold a view of a sequence as far as no fault changes it; `image` uint8[y, x, 4] is its clean twin."""
+
+    spec: SampleSpec
+    pose: Pose
+    rendering: Rendering
+    exposure: SceneExposure
+    nominal_camera: Camera
+    image: NDArray[np.uint8]
 
 
 def _rendered_sequence(view: RenderedView, count: int) -> list[RenderedView]:

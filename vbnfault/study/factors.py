@@ -4,7 +4,8 @@ There are four kinds of keys:
 
 `scene.<key>`
     Any key of the scene file. An interval of a fault, such as `scene.faults.straylight.roughness_nm`, is fixed to
-    the value. A key that the renderer reads makes a render for every value.
+    the value. A key that the renderer reads makes a render for every value. `scene.fault` chooses the fault that
+    acts (`chosen_fault`).
 `lens.…`
     Changes of the prescription that the scene's faults trace, at its final size; a lens of the camera that has
     surfaces changes with it. Rows count from 0 at the front, as in the names of ghosts.
@@ -40,6 +41,7 @@ from ..faults import registry
 from ..lens import Prescription
 from ..lens.changes import Change
 from ..scene.config import Scene, parse_scene
+from . import chosen_fault
 from .spec import StudySpec
 
 # What an evaluation computes, in order. `render` is the only stage that needs the renderer.
@@ -159,16 +161,21 @@ class Factors:
         """Return the scene with a seed, with a model of the compared fault, and with changed keys."""
         table = copy.deepcopy(self._base.resolved())
         table["dataset"]["seed"] = seed
+        if chosen_fault.KEY in self._spec.keys:
+            choice = dict(changes).get(chosen_fault.SCENE_KEY)
+            table["faults"] = chosen_fault.table_of(table["faults"], choice) if choice else {}
+            table["dataset"] |= {"layers": ["clean"], "mask_any": None}  # other layers may need other faults
         faults = table["faults"]
         if self._spec.models is not None and model:
             name = self._spec.models.fault
             own = _fields(name, model)
             faults[name] = {key: v for key, v in faults.get(name, {}).items() if key in own} | {"model": model}
+        changes = tuple((key, value) for key, value in changes if key != chosen_fault.SCENE_KEY)
         for key, value in changes:
             if key.startswith("faults."):
                 _, name, own_key = key.split(".", 2)
-                if own_key not in _fields(name, faults[name].get("model", "")):
-                    continue  # another model of the comparison has this key
+                if name not in faults or own_key not in _fields(name, faults[name].get("model", "")):
+                    continue  # another fault or model of the comparison has this key
             tables.replace(table, {key: value}, source=self._spec.title)
         return parse_scene(table, source=f"study {self._spec.title!r}", overrides=[key for key, _ in changes])
 
@@ -218,7 +225,8 @@ def _scene_keys(spec: StudySpec, scene: Scene) -> list[Key]:
             models = list(spec.models.compare)
         for model in models:
             found |= {f"faults.{name}.{key}": unit for key, unit in _fields(name, model).items()}
-    keys = []
+    light = ("direct image", "exposure", "ghosts", "starburst", "glare", "veil", "detector")
+    keys = [Key(chosen_fault.KEY, (), light, _adder("scene", chosen_fault.SCENE_KEY))]
     for key, unit in found.items():
         own = unit or _unit_of(key)
         keys.append(Key(f"scene.{key}", (own,) if own else (), _moved_by(key), _adder("scene", key)))

@@ -40,6 +40,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from . import chosen_fault, ranking
 from .designs import Design, levels, salib, unit_problem
 from .spec import DUMMY, Metric
 
@@ -98,6 +99,8 @@ def compute(results: Results) -> xr.Dataset:
         _add_ranges(arrays, results)
     if spec.models is not None and method in ("sobol", "latin_hypercube", "grid"):
         _add_model_share(arrays, results)
+    if chosen_fault.KEY in spec.keys:
+        ranking.add(arrays, results)
     names = [*spec.keys, DUMMY]
     coordinates: dict[str, Any] = {
         "metric": [metric.name for metric in results.metrics],
@@ -106,12 +109,15 @@ def compute(results: Results) -> xr.Dataset:
         "factor_b": names,
         "seed": list(spec.scene.seeds),
         "bound": ["low", "high"],
+        "fault": list(chosen_fault.choices(spec)),
+        "fault_b": list(chosen_fault.choices(spec)),
+        "quantile": list(ranking.QUANTILES),
     }
     used = {name for dims, _ in arrays.values() for name in dims}
     data = xr.Dataset(
         {name: (dims, values, _attributes(name)) for name, (dims, values) in arrays.items()},
         {
-            name: (name, np.array(values, dtype=None if name == "seed" else object), {"long_name": name})
+            name: (name, np.array(values, dtype=None if name in _NUMBERS else object), {"long_name": name})
             for name, values in coordinates.items()
             if name in used
         },
@@ -139,7 +145,9 @@ _LONG_NAMES = {
     "sigma": ("standard deviation of the elementary effects", "units of the metric"),
     "delta": ("moment-independent index (Borgonovo 2007), bias-reduced (Plischke et al. 2013)", "1"),
     "range": ("largest minus smallest value with the other factors nominal", "units of the metric"),
+    **ranking.LONG_NAMES,
 }
+_NUMBERS = ("seed", "quantile")  # coordinates that are no words
 _SUFFIXES = {
     "_interval": ", confidence interval",
     "_by_seed": ", of each seed",
@@ -156,7 +164,7 @@ _FORMULAE = {
 def _attributes(name: str) -> dict[str, str]:
     """Return long name, units and formula of a variable."""
     for suffix, text in _SUFFIXES.items():
-        if name.endswith(suffix):
+        if name.endswith(suffix) and name not in _LONG_NAMES:
             long_name, units = _LONG_NAMES[name.removesuffix(suffix)]
             return {"long_name": long_name + text, "units": units}
     long_name, units = _LONG_NAMES[name]
@@ -460,7 +468,10 @@ def _add_grid(arrays: dict[str, tuple[tuple[str, ...], _Array]], results: Result
     s1, total = np.full(shape, np.nan), np.full(shape, np.nan)
     for i, j in np.ndindex(*shape[:2]):
         blocks = results.blocks(i, j)
-        y = blocks[np.isfinite(blocks).all(axis=1)].reshape(-1, *axes)
+        complete = np.isfinite(blocks).all(axis=1)
+        if not complete.any():
+            continue
+        y = blocks[complete].reshape(-1, *axes)
         variance = y.reshape(len(y), -1).var(axis=1).sum()
         s1[i, j, -1] = total[i, j, -1] = 0.0
         for k in range(len(axes)):

@@ -296,6 +296,10 @@ class _Frames:
         """Return the fraction of the matches that are right."""
         return navigation.match_precision(self.matches, *self.views)
 
+    def match_precision_lost(self) -> float:
+        """Return how much smaller the fraction of the matches that are right is than in the clean twins."""
+        return navigation.match_precision(self.clean_matches, *self.views) - self.match_precision()
+
     def matches_lost(self) -> float:
         """Return the fraction of the right matches that are lost."""
         return navigation.matches_lost(self.clean_matches, self.matches, *self.views)
@@ -310,7 +314,14 @@ class _Frames:
 
     def feature_lifetime_views(self) -> float:
         """Return the mean lifetime of a feature in views."""
-        images = [frame.image for frame in self.frames[:VIEWS]]
+        return self._lifetime_views([frame.image for frame in self.frames[:VIEWS]])
+
+    def feature_lifetime_lost_views(self) -> float:
+        """Return how much shorter the mean lifetime of a feature is than in the clean twins, in views."""
+        return self._lifetime_views([frame.clean for frame in self.frames[:VIEWS]]) - self.feature_lifetime_views()
+
+    def _lifetime_views(self, images: Sequence[NDArray[np.uint8]]) -> float:
+        """Return the mean lifetime of a feature in some images of the views."""
         return navigation.feature_lifetime(images, [frame.view for frame in self.frames[:VIEWS]]).mean_views
 
 
@@ -415,6 +426,22 @@ _ROWS: tuple[_Row, ...] = (
         "mean number of consecutive views, of ten, in which corners are tracked within 3 px of the truth",
         _TRACKS,
         "high",
+        VIEWS,
+    ),
+    (
+        "match_precision_lost",
+        "1",
+        "fraction of right ORB matches of two views, clean twins minus faulted images",
+        _PRECISION,
+        "low",
+        2,
+    ),
+    (
+        "feature_lifetime_lost_views",
+        "views",
+        "mean number of consecutive views, of ten, in which corners are tracked, clean twins minus faulted images",
+        _TRACKS,
+        "low",
         VIEWS,
     ),
 )

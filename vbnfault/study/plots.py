@@ -27,6 +27,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
+from .ranking_plots import ranking
 from .response_plots import responses, tornado
 from .sheets import (
     BAND,
@@ -72,8 +73,8 @@ class Drawing:
     Attributes
     ----------
     kind
-        Section of the page: `overview`, `indices`, `morris`, `seeds`, `tornado`, `responses`, `interactions` or
-        `models`.
+        Section of the page: `ranking`, `overview`, `indices`, `morris`, `seeds`, `tornado`, `responses`,
+        `interactions` or `models`.
     metric
         Metric that the figure is about; empty where it is about all.
     figure
@@ -95,6 +96,10 @@ class Drawing:
 
 def drawings(results: StudyResults) -> Iterator[Drawing]:
     """Yield every figure that the results give, section by section."""
+    if results.has("fault_quantile"):
+        yield Drawing(kind="ranking", metric="", figure=ranking(results))
+        if len(results.factors) == 1:
+            return  # nothing else varies
     many = len(results.metrics) > 1 and len(results.factors) > 1
     if many:
         yield Drawing(kind="overview", metric="", figure=overview(results))

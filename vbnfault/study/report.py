@@ -23,6 +23,7 @@ import numpy as np
 from . import sheets
 from .extreme_images import IMAGES
 from .plots import drawings, save
+from .ranking_plots import ranking_rows
 from .report_words import FORMULAE, SECTIONS
 from .summaries import DUMMY, StudyResults
 
@@ -39,6 +40,7 @@ _SIDES = (512, 400, 320, 256, 192, 128)  # of the images in the page, px; the fi
 _NARROW_PT = 340.0  # a wider figure shrinks to this fraction of its size, and then scrolls on a small screen:
 _LEAST_SCALE = 0.78
 _MOST_ROWS = 30  # of failed evaluations and of missed half-widths
+_SWAP = "probability that the next is worse"  # heading of a column
 _MOST_LEADING = 4  # factors that the summary names for each metric
 
 _COLOURS = {
@@ -227,13 +229,14 @@ def _where(results: StudyResults, row: int) -> str:
 def _page(results: StudyResults, figures: Sequence[_Figure], images: Path) -> str:
     """Return the whole page."""
     style = resources.files(__package__).joinpath("report.css").read_text(encoding="utf-8")
-    parts: list[tuple[str, str, str]] = [("summary", "In short", _summary(results))]
+    only_faults = results.has("fault_quantile") and len(results.factors) == 1
+    parts: list[tuple[str, str, str]] = [] if only_faults else [("summary", "In short", _summary(results))]
     for kind, section in SECTIONS.items():
         members = [figure.markup() for figure in figures if figure.kind == kind]
         if members:
             how = section.how(results)
             body = f'<p class="how">{_e(how)}</p><div class="figures">{"".join(members)}</div>'
-            parts.append((kind, section.title, body))
+            parts.append((kind, section.title, body + (_ranking(results) if kind == "ranking" else "")))
     pictures = _images(results, images)
     if pictures:
         how = (
@@ -243,8 +246,9 @@ def _page(results: StudyResults, figures: Sequence[_Figure], images: Path) -> st
             "beside the Sun: what differs between the two is light, not the display."
         )
         parts.append(("images", "Best and worst images", f'<p class="how">{_e(how)}</p>{pictures}'))
+    if not only_faults:
+        parts.append(("tables", "Tables of indices", _index_tables(results)))
     parts += [
-        ("tables", "Tables of indices", _index_tables(results)),
         ("asked", "What was asked", _asked(results)),
         ("quality", "What to watch", _quality(results)),
         ("formulae", "Formulae", _formulae(results)),
@@ -352,6 +356,25 @@ def _model_form(results: StudyResults) -> str:
         parts.append(f"<code>{_e(metric)}</code>&nbsp;{100 * share:.0f}{interval}&nbsp;%")
     listed = ", ".join(parts)
     return f"<p>The choice of the model causes this part of the variance: {listed}.</p>" if parts else ""
+
+
+def _ranking(results: StudyResults) -> str:
+    """Return the tables of faults, the worst first, one for each metric."""
+    parts = []
+    for metric in results.metrics:
+        unit = results.about(metric, "unit")
+        end = "" if unit in ("", "1") else f" / {unit}"
+        heads = ["rank", "fault", "views", f"median{end}", f"middle half{end}", _SWAP]
+        rows = [[_e(cell) for cell in row] for row in ranking_rows(results, metric)]
+        about = _e(results.about(metric, "description"))
+        table = _table(heads, rows, numbers=[0, 2, 3, 4, 5])
+        parts.append(f'<h3><code>{_e(metric)}</code></h3><p class="small">{about}</p>{table}')
+    words = (
+        f"Brackets hold the {100 * results.confidence:g} % interval over views. Views: those in which the metric "
+        "has a value, of those in which the fault acts. The last column is the fraction of the resamples in which "
+        "the median of the next fault is the worse one."
+    )
+    return f'<p class="how">{_e(words)}</p>{"".join(parts)}'
 
 
 def _index_tables(results: StudyResults) -> str:

@@ -16,6 +16,15 @@ class Section:
     how: Callable[[StudyResults], str]
 
 
+def _ranking(results: StudyResults) -> str:
+    level = f"{100 * results.confidence:g} %"
+    return (
+        f"Each dot is the median of a metric over the views in which a fault acts, with its {level} interval, and "
+        "the thin line spans the middle half of these views; the number in brackets counts them. The worst fault "
+        "stands on top, the right side is the worse one, and the vertical line is what the clean twin has."
+    )
+
+
 def _overview(results: StudyResults) -> str:
     words = results.importance[0]
     if words == "total index":
@@ -124,6 +133,7 @@ def _morris(_: StudyResults) -> str:
 
 
 SECTIONS: dict[str, Section] = {
+    "ranking": Section("Cost of each fault", _ranking),
     "overview": Section("Which factor drives which metric", _overview),
     "indices": Section("Indices with intervals", _indices),
     "morris": Section("Strength and bending of effects", _morris),

@@ -1,0 +1,171 @@
+"""Draw and tabulate what each fault costs navigation, from the indices of a study that ranks faults."""
+
+from __future__ import annotations
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
+from numpy.typing import NDArray
+
+from ..faults import registry
+from .ranking import QUANTILES
+from .sheets import (
+    BLUE,
+    INK,
+    MUTED,
+    SMALL,
+    VERMILLION,
+    Margins,
+    set_linear,
+    sheet,
+    styled,
+    text_width,
+    with_unit,
+    write_message,
+)
+from .summaries import StudyResults
+
+F64 = NDArray[np.float64]
+
+_COLUMNS = 3
+_WIDTH, _ROW = 128.0, 13.0  # of a panel and of its rows, points
+_LOG_RATIO = 30.0  # of the largest to the median cost, above which an axis is logarithmic beyond its linear part
+_LOW, _MEDIAN, _HIGH = range(len(QUANTILES))
+
+
+@styled
+def ranking(results: StudyResults) -> Figure:
+    """Draw the median cost of each fault with its interval, one panel for each metric, the worst fault on top.
+
+    The thin line spans the middle half of the views. Where a large value is the better one, the axis is reversed,
+    so that the right side is the worse one in every panel.
+    """
+    names = [str(name) for name in results.dataset["fault"].values]
+    model, count = results.models[0], len(results.metrics)
+    columns = min(_COLUMNS, count)
+    label_width = max(text_width(_label(name, 1000), SMALL) for name in names) + 8
+    level = f"{100 * results.confidence:g} %"
+    legend = [
+        _handle(BLUE, "class of Gallon et al. (2025): median"),
+        _handle(VERMILLION, "other class: median"),
+        Line2D([], [], color=INK, lw=2.6, label=f"its {level} interval"),
+        Line2D([], [], color=MUTED, lw=0.9, label="middle half of the views"),
+    ]
+    figure, axes = sheet(
+        "Cost of each fault to navigation",
+        (-(-count // columns), columns),
+        (_WIDTH, _ROW * len(names)),
+        Margins(left=label_width + 4, top=22.0, between_columns=label_width + 16, between_rows=52.0, right=14.0),
+        legend=legend,
+    )
+    for panel, metric in zip(axes, results.metrics, strict=False):
+        _draw_panel(panel, results, metric, model)
+    for panel in axes[count:]:
+        panel.set_axis_off()
+    return figure
+
+
+def _label(name: str, views: int) -> str:
+    """Return the label of a row: the fault, and the number of views behind it."""
+    return f"{name} ({views})"
+
+
+def _handle(colour: str, label: str) -> Line2D:
+    """Return the entry of the legend for a median."""
+    return Line2D([], [], color=colour, marker="o", ms=4.2, ls="none", label=label)
+
+
+def _of_paper(name: str) -> bool:
+    """Return whether a fault is of a class of Gallon et al."""
+    return any(model.axis is not None for model in registry().get(name.partition("/")[0], {}).values())
+
+
+def worst_first(results: StudyResults, metric: str) -> list[str]:
+    """Return the faults with a median of a metric, the worst first."""
+    rank = results.dataset["fault_rank"].sel(metric=metric, model=results.models[0])
+    names = [str(name) for name in rank["fault"].values if np.isfinite(rank.sel(fault=name))]
+    return sorted(names, key=lambda name: float(rank.sel(fault=name)))
+
+
+def _draw_panel(axes: Axes, results: StudyResults, metric: str, model: str) -> None:
+    """Draw the faults of one metric."""
+    order = worst_first(results, metric)
+    reverse = results.about(metric, "better") == "high"
+    axes.set_title(metric, pad=4, fontweight="bold")
+    axes.set_xlabel(with_unit("median over views", results.about(metric, "unit")), labelpad=2)
+    if not order:
+        write_message(axes, "no values")
+        axes.set_yticks([])
+        return
+    chosen = results.dataset.sel(metric=metric, model=model, fault=order)
+    values, interval = chosen["fault_quantile"].values, chosen["fault_quantile_interval"].values[:, _MEDIAN]
+    views = chosen["fault_views"].values.astype(int)
+    total = results.dataset.sizes["fault"]
+    axes.set_ylim(total - 0.4, -0.6)
+    axes.set_yticks(range(len(order)), [_label(n, k) for n, k in zip(order, views, strict=True)], fontsize=SMALL)
+    axes.tick_params(axis="y", length=0)
+    axes.spines["left"].set_visible(False)
+    axes.grid(axis="x", zorder=0)
+    axes.set_axisbelow(True)
+    _set_scale(axes, values, interval, reverse=reverse)
+    zero = 1.0 if reverse else 0.0
+    axes.axvline(zero, color=MUTED, lw=0.7, zorder=1)
+    for y, name in enumerate(order):
+        colour = BLUE if _of_paper(name) else VERMILLION
+        axes.hlines(y, values[y, _LOW], values[y, _HIGH], color=MUTED, lw=0.9, zorder=2)
+        axes.hlines(y, *interval[y], color=colour, lw=2.6, alpha=0.6, zorder=3)
+        axes.plot(values[y, _MEDIAN], y, "o", ms=4.2, color=colour, mew=0, zorder=4)
+
+
+def _set_scale(axes: Axes, values: F64, interval: F64, *, reverse: bool) -> None:
+    """Set scale and limits of the axis: linear, or logarithmic beyond a linear part around 0."""
+    ends = np.concatenate([values.ravel(), interval.ravel()])
+    ends = ends[np.isfinite(ends)]
+    low, high = float(min(ends.min(), 1.0 if reverse else 0.0)), float(max(ends.max(), 1.0 if reverse else 0.0))
+    sizes = np.abs(values[:, _MEDIAN])
+    sizes = sizes[sizes > 0]
+    if reverse or not len(sizes) or max(abs(low), high) < _LOG_RATIO * float(np.median(sizes)):
+        extent = high - low or 1.0
+        axes.set_xlim(low - 0.03 * extent, high + 0.03 * extent)
+        set_linear(axes.xaxis, 4)
+        if reverse:
+            axes.invert_xaxis()
+        return
+    linear = 10.0 ** np.floor(np.log10(max(float(np.quantile(sizes, 0.25)), 1e-3 * max(abs(low), high))))
+    axes.set_xscale("symlog", linthresh=linear, linscale=0.6)
+    axes.set_xlim(low * 1.3 if low < 0 else -0.12 * linear, high * 1.3)
+    powers = linear * 10.0 ** np.arange(0, 8)
+    ticks = [-p for p in powers[::-1] if -p >= low] + [0.0] + [p for p in powers if p <= high]
+    axes.xaxis.set_major_locator(FixedLocator(ticks if len(ticks) < 7 else ticks[::2]))
+    axes.xaxis.set_minor_locator(NullLocator())
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda v, _: f"{v:g}".replace("-", "\N{MINUS SIGN}")))
+
+
+def ranking_rows(results: StudyResults, metric: str) -> list[list[str]]:
+    """Return the faults of a metric, the worst first, as texts.
+
+    A row has rank, fault, views, median with its interval, lower and upper quartile, and the probability that the
+    next fault is worse.
+    """
+    order, model = worst_first(results, metric), results.models[0]
+    chosen = results.dataset.sel(metric=metric, model=model)
+    rows = []
+    for k, name in enumerate(order):
+        of_fault = chosen.sel(fault=name)
+        low, median, high = (_number(v) for v in of_fault["fault_quantile"].values)
+        ends = [_number(v) for v in of_fault["fault_quantile_interval"].values[_MEDIAN]]
+        swap = ""
+        if k + 1 < len(order):
+            swap = f"{float(chosen['fault_worse'].sel(fault=order[k + 1], fault_b=name)):.2f}"
+        rank = f"{int(of_fault['fault_rank'])}"
+        views = f"{int(of_fault['fault_views'])} of {int(of_fault['fault_acts'])}"
+        rows.append([rank, name, views, f"{median} [{ends[0]}, {ends[1]}]", f"{low} to {high}", swap])
+    return rows
+
+
+def _number(value: float) -> str:
+    """Return a number with three digits and a real minus sign."""
+    text = f"{value:.3f}" if 0.001 <= abs(value) < 1 else f"{value:.3g}"
+    return text.replace("-", "\N{MINUS SIGN}")
