@@ -498,8 +498,9 @@ class SceneEvaluator:
         frames = self._navigation_frames(evaluation, setting, nav.views_needed(names))
         if not frames:
             return dict.fromkeys(names, float("nan"))
+        clean = self._clean_views(evaluation, setting, len(frames))
         with self.kept.timed("navigation"):
-            return nav.navigation_values(frames, names)
+            return nav.navigation_values(frames, names, clean.twins)
 
     def _navigation_frames(self, evaluation: Evaluation, setting: Setting, count: int) -> list[nav.NavigationFrame]:
         """Return the clean and the faulted image of the first `count` views of an evaluation's sequence.
@@ -510,7 +511,7 @@ class SceneEvaluator:
         faults = _faults(scene)
         frames: list[nav.NavigationFrame] = []
         first: Injection | None = None
-        for clean in self._clean_views(evaluation, setting, count):
+        for clean in self._clean_views(evaluation, setting, count).views:
             with self.kept.timed("faults"):
                 spec = replace(clean.spec, scene=scene, faults=faults)
                 view = spec, clean.pose, clean.rendering, clean.exposure
@@ -522,11 +523,10 @@ class SceneEvaluator:
                 else:
                     injection = nav.continue_faults(*view, first)
                 image = injection.development.image(injection.draws).array
-                camera = clean.nominal_camera
-                frames.append(nav.navigation_frame(clean.pose, clean.rendering.truth, camera, clean.image, image))
+                frames.append(replace(clean.frame, image=image))
         return frames
 
-    def _clean_views(self, evaluation: Evaluation, setting: Setting, count: int) -> list[_CleanView]:
+    def _clean_views(self, evaluation: Evaluation, setting: Setting, count: int) -> _CleanSequence:
         """Return the first `count` views of an evaluation's sequence without faults."""
         without = replace(setting, scene={k: v for k, v in setting.scene.items() if k != chosen_fault.SCENE_KEY})
         scene = self._scene(evaluation, without)
@@ -535,13 +535,15 @@ class SceneEvaluator:
         sequence = self.kept.once("render", place, lambda: _rendered_sequence(view, count), "sequence")
         sun, detector = tuple(sorted(setting.sun.items())), tuple(sorted(setting.detector.items()))
 
-        def make() -> list[_CleanView]:
-            return [self._clean_view(k, seen, scene, setting) for k, seen in enumerate(sequence)]
+        def make() -> _CleanSequence:
+            views = [self._clean_view(seen, scene, setting) for seen in sequence]
+            twins = nav.CleanTwins([view.frame.clean for view in views], [view.frame.view for view in views])
+            return _CleanSequence(views=views, twins=twins)
 
         return self.kept.once("clean twins", (*place, scene.camera, tuple(setting.lens), detector, sun), make)
 
-    def _clean_view(self, k: int, seen: RenderedView, scene: Scene, setting: Setting) -> _CleanView:
-        """Return a view of a sequence, counted by `k`, with its exposure and its clean twin."""
+    def _clean_view(self, seen: RenderedView, scene: Scene, setting: Setting) -> _CleanView:
+        """Return a view of a sequence with its exposure and its clean twin."""
         spec = replace(seen.spec, scene=scene, faults=_faults(scene))
         camera = self._camera(spec, setting)
         pose, rendering = with_sun(seen, camera, setting.sun)
@@ -551,14 +553,8 @@ class SceneEvaluator:
         exposed = add_stars(spec, pose, rendering, exposed)
         context = fault_context(pose, rendering, exposed)
         clean = Development(exposure=exposed, context=context, rng=spec.rng).image({}).array
-        return _CleanView(
-            spec=spec,
-            pose=pose,
-            rendering=rendering,
-            exposure=exposed,
-            nominal_camera=seen.spec.camera,
-            image=clean,
-        )
+        frame = nav.navigation_frame(pose, rendering.truth, seen.spec.camera, clean, clean)
+        return _CleanView(spec=spec, pose=pose, rendering=rendering, exposure=exposed, frame=frame)
 
     # --- what a factor moves --------------------------------------------------------------------------------------
 
@@ -590,14 +586,21 @@ class SceneEvaluator:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _CleanView:
-    """Hold a view of a sequence as far as no fault changes it; `image` uint8[y, x, 4] is its clean twin."""
+    """Hold a view of a sequence as far as no fault changes it; both images of `frame` are its clean twin."""
 
     spec: SampleSpec
     pose: Pose
     rendering: Rendering
     exposure: SceneExposure
-    nominal_camera: Camera
-    image: NDArray[np.uint8]
+    frame: nav.NavigationFrame
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _CleanSequence:
+    """Hold the views of a sequence, and what the metrics need of their clean twins."""
+
+    views: Sequence[_CleanView]
+    twins: nav.CleanTwins
 
 
 def _rendered_sequence(view: RenderedView, count: int) -> list[RenderedView]:

@@ -244,22 +244,53 @@ def _sun_visible(spec: SampleSpec, pose: Pose, positions: F64) -> F64:
 # --- values ------------------------------------------------------------------------------------------------------
 
 
+class CleanTwins:
+    """Compute what the metrics need of the clean twins of a sequence once, for all faults on its views.
+
+    Parameters
+    ----------
+    images
+        uint8[y, x, 4] each: the clean twins.
+    views
+        Their views.
+    """
+
+    def __init__(self, images: Sequence[NDArray[np.uint8]], views: Sequence[navigation.CameraView]) -> None:
+        self.images, self.views = images, views
+
+    @cached_property
+    def matches(self) -> navigation.Matches:
+        """Return the matches of the first two."""
+        return navigation.match(*self.images[:2])
+
+    @cached_property
+    def precision(self) -> float:
+        """Return the fraction of these matches that are right."""
+        return navigation.match_precision(self.matches, *self.views[:2])
+
+    @cached_property
+    def pose_error(self) -> navigation.RelativePoseError:
+        """Return the errors of the relative pose from these matches."""
+        return navigation.relative_pose_error(self.matches, *self.views[:2])
+
+    @cached_property
+    def lifetime_views(self) -> float:
+        """Return the mean lifetime of a feature in views."""
+        return navigation.feature_lifetime(self.images[:VIEWS], self.views[:VIEWS]).mean_views
+
+
 class _Frames:
     """Compute the metrics of a sequence; what several metrics need is computed once."""
 
-    def __init__(self, frames: Sequence[NavigationFrame]) -> None:
+    def __init__(self, frames: Sequence[NavigationFrame], clean: CleanTwins) -> None:
         self.frames = frames
         self.first = frames[0]
+        self.clean = clean
 
     @property
     def views(self) -> tuple[navigation.CameraView, navigation.CameraView]:
         """Return the first two views."""
         return self.first.view, self.frames[1].view
-
-    @cached_property
-    def clean_matches(self) -> navigation.Matches:
-        """Return the matches of the first two clean twins."""
-        return navigation.match(*(frame.clean for frame in self.frames[:2]))
 
     @cached_property
     def matches(self) -> navigation.Matches:
@@ -269,10 +300,7 @@ class _Frames:
     @cached_property
     def pose_errors(self) -> tuple[float, float]:
         """Return how much more rotation and direction of translation are off in the faulted images, in deg."""
-        errors = [
-            navigation.relative_pose_error(matches, *self.views) for matches in (self.matches, self.clean_matches)
-        ]
-        faulted, clean = errors
+        faulted, clean = navigation.relative_pose_error(self.matches, *self.views), self.clean.pose_error
         return faulted.rotation_deg - clean.rotation_deg, faulted.translation_deg - clean.translation_deg
 
     def limb_error_px(self) -> float:
@@ -298,11 +326,11 @@ class _Frames:
 
     def match_precision_lost(self) -> float:
         """Return how much smaller the fraction of the matches that are right is than in the clean twins."""
-        return navigation.match_precision(self.clean_matches, *self.views) - self.match_precision()
+        return self.clean.precision - self.match_precision()
 
     def matches_lost(self) -> float:
         """Return the fraction of the right matches that are lost."""
-        return navigation.matches_lost(self.clean_matches, self.matches, *self.views)
+        return navigation.matches_lost(self.clean.matches, self.matches, *self.views)
 
     def rotation_error_deg(self) -> float:
         """Return how much more the rotation is off, in deg."""
@@ -314,18 +342,17 @@ class _Frames:
 
     def feature_lifetime_views(self) -> float:
         """Return the mean lifetime of a feature in views."""
-        return self._lifetime_views([frame.image for frame in self.frames[:VIEWS]])
+        frames = self.frames[:VIEWS]
+        return navigation.feature_lifetime([f.image for f in frames], [f.view for f in frames]).mean_views
 
     def feature_lifetime_lost_views(self) -> float:
         """Return how much shorter the mean lifetime of a feature is than in the clean twins, in views."""
-        return self._lifetime_views([frame.clean for frame in self.frames[:VIEWS]]) - self.feature_lifetime_views()
-
-    def _lifetime_views(self, images: Sequence[NDArray[np.uint8]]) -> float:
-        """Return the mean lifetime of a feature in some images of the views."""
-        return navigation.feature_lifetime(images, [frame.view for frame in self.frames[:VIEWS]]).mean_views
+        return self.clean.lifetime_views - self.feature_lifetime_views()
 
 
-def navigation_values(frames: Sequence[NavigationFrame], names: Collection[str]) -> dict[str, float]:
+def navigation_values(
+    frames: Sequence[NavigationFrame], names: Collection[str], clean: CleanTwins | None = None
+) -> dict[str, float]:
     """Return the named metrics of a sequence of views by name; nan where a metric has no value.
 
     Only what the names ask for is computed; names of other metrics are left out.
@@ -336,6 +363,8 @@ def navigation_values(frames: Sequence[NavigationFrame], names: Collection[str])
         At least `views_needed(names)` views, in the order of `sequence`.
     names
         Names of metrics.
+    clean
+        Their clean twins, where several faults are compared on the same views.
 
     Raises
     ------
@@ -347,7 +376,7 @@ def navigation_values(frames: Sequence[NavigationFrame], names: Collection[str])
         raise ValueError(f"{len(frames)} views: these metrics need {needed}")
     if not needed:
         return {}
-    computed = _Frames(frames)
+    computed = _Frames(frames, clean or CleanTwins([f.clean for f in frames], [f.view for f in frames]))
     return {name: float(_COMPUTED[name](computed)) for name in names if name in _COMPUTED}
 
 
