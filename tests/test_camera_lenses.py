@@ -11,7 +11,7 @@ from vbnfault.core import llvm
 from vbnfault.core.errors import VbnfaultError
 from vbnfault.lens import RealLens, load_lens, paraxial_properties, scaled_to_field
 from vbnfault.lens.straylight.settings import SensorGrid, SunSource
-from vbnfault.lens.straylight.total import straylight
+from vbnfault.lens.straylight.total import SunlightInLens
 
 LENSES = ("nikkor_28_f2p8", "nikkor_35_f2p8")
 SENSOR_MM = 5.632  # 1024 pixels of 5.5 µm
@@ -57,12 +57,12 @@ def test_the_sensor_raises_ghosts_near_the_axis(name: str) -> None:
     near = np.hypot(at, at[:, None]) < 4
     light = []
     for reflectance in (0.0, 0.05, 0.1):
-        found = straylight(
+        found = SunlightInLens.of(
             replace(lens, sensor_reflectance=reflectance),
             wavelength_nm=np.array([450.0, 650.0]),
             sensor=SensorGrid(shape=(32, 32), pitch_mm=SENSOR_MM / 32),
             sun=SunSource(angle_deg=3.0, radius_rad=4.65e-3),
-        )
+        ).total()
         light.append(float(found.ghosts[:, near].sum()))
     # of two reflections one is the sensor's: linear in its reflectance; brighter ghosts are drawn with more rays,
     # and a spot of half a pixel may move across the circle's edge (3 % met)

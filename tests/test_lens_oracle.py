@@ -159,6 +159,14 @@ def test_rays_of_aspheres() -> None:
             agree(lens, ours, oracle.trace_ghost(lens, *pair, places, direction), least=20)
 
 
+def starts(lens: Prescription, corners: tuple[oracle.F64, oracle.F64], direction: oracle.F64) -> oracle.F64:
+    """Return float64[225, 3], points of a square of the entrance, a focal length before it along the light."""
+    low, high = corners
+    side = (np.arange(15) + 0.5) / 15
+    x, y = (a.ravel() for a in np.meshgrid(*(low + (high - low) * side[:, None]).T))
+    return np.column_stack([x, y, np.zeros_like(x)]) - paraxial_properties(lens).efl_mm * direction
+
+
 @pytest.mark.parametrize("name", PAIRS)
 def test_rays_of_ghosts(name: str) -> None:
     lens = load_lens(name)
@@ -168,10 +176,7 @@ def test_rays_of_ghosts(name: str) -> None:
             optic = oracle.system(lens, oracle.unfolded(lens, *pair))
             corners = oracle.entrance(optic, direction)
             assert corners is not None
-            low, high = corners
-            side = (np.arange(15) + 0.5) / 15
-            x, y = (a.ravel() for a in np.meshgrid(*(low + (high - low) * side[:, None]).T))
-            places = np.column_stack([x, y, np.zeros_like(x)]) - paraxial_properties(lens).efl_mm * direction
+            places = starts(lens, corners, direction)
             ours = trace(lens, places, np.tile(direction, (len(places), 1)), path=ghost(lens, *pair))
             theirs = oracle.trace(optic, places, direction)
             agree(lens, ours, theirs, least=80)
@@ -395,10 +400,7 @@ def test_rays_of_ghosts_through_plates_and_off_the_sensor(name: str) -> None:
             direction = oracle.sunlight(off_axis, AZIMUTH_DEG)
             corners = oracle.entrance(optic, direction)
             assert corners is not None
-            low, high = corners
-            side = (np.arange(15) + 0.5) / 15
-            x, y = (a.ravel() for a in np.meshgrid(*(low + (high - low) * side[:, None]).T))
-            places = np.column_stack([x, y, np.zeros_like(x)]) - paraxial_properties(lens).efl_mm * direction
+            places = starts(lens, corners, direction)
             ours = trace(system, places, np.tile(direction, (len(places), 1)), path=ghost(system, *pair))
             agree(system, ours, oracle.trace(optic, places, direction), least=60)
 

@@ -200,7 +200,8 @@ def size_bounds(draw: st.DrawFn) -> tuple[int, int]:
 
 @given(st.integers(1, 300), subsets, fractions, st.integers(0, 2**32))
 def test_per_class_gives_every_class_its_exact_share(n: int, faults: tuple[str, ...], p: float, seed: int) -> None:
-    matrix = plan.fault_matrix_per_class(n, faults, p, np.random.default_rng(seed), need_sun=(STRAYLIGHT,))
+    spec = plan.MatrixSpec(samples=n, faults=faults, fraction=p, need_sun=(STRAYLIGHT,))
+    matrix = plan.fault_matrix_per_class(spec, np.random.default_rng(seed))
     assert matrix.shape == (n, len(faults))
     assert matrix.dtype == bool
     for k, fault in enumerate(faults):
@@ -213,7 +214,8 @@ def test_per_class_gives_every_class_its_exact_share(n: int, faults: tuple[str, 
 def test_per_sample_gives_exactly_the_faulty_samples(
     n: int, faults: tuple[str, ...], p: float, seed: int, sizes: tuple[int, int]
 ) -> None:
-    matrix = plan.fault_matrix_per_sample(n, faults, p, np.random.default_rng(seed), sizes, (STRAYLIGHT,))
+    spec = plan.MatrixSpec(samples=n, faults=faults, fraction=p, sizes=sizes, need_sun=(STRAYLIGHT,))
+    matrix = plan.fault_matrix_per_sample(spec, np.random.default_rng(seed))
     assert matrix.shape == (n, len(faults))
     assert matrix.dtype == bool
     in_row = matrix.sum(axis=1)
@@ -233,7 +235,8 @@ def test_per_sample_gives_exactly_the_faulty_samples(
 def test_samples_of_every_fault_that_needs_the_sun_come_first(make_matrix: Any) -> None:
     """A class of a plug-in may need the Sun, too: its draws do not depend on those of straylight."""
     n, two = 4000, (STRAYLIGHT, "vignetting")
-    matrix = make_matrix(n, ALL_FAULTS, 0.5, np.random.default_rng(3), (1, 6), two)
+    spec = plan.MatrixSpec(samples=n, faults=ALL_FAULTS, fraction=0.5, need_sun=two)
+    matrix = make_matrix(spec, np.random.default_rng(3))
     columns = matrix[:, [ALL_FAULTS.index(name) for name in two]]
     facing = columns.any(axis=1)
     np.testing.assert_array_equal(facing, np.arange(n) < facing.sum())
@@ -245,7 +248,8 @@ def test_samples_of_every_fault_that_needs_the_sun_come_first(make_matrix: Any) 
 @pytest.mark.parametrize(("sizes", "classes"), [((1, 6), 6), ((2, 4), 6), ((1, 6), 3), ((3, 3), 5)])
 def test_per_sample_subset_sizes_are_uniform(sizes: tuple[int, int], classes: int) -> None:
     faults = ALL_FAULTS[:classes]
-    matrix = plan.fault_matrix_per_sample(6000, faults, 1.0, np.random.default_rng(5), sizes)
+    spec = plan.MatrixSpec(samples=6000, faults=faults, fraction=1.0, sizes=sizes)
+    matrix = plan.fault_matrix_per_sample(spec, np.random.default_rng(5))
     lo, hi = (min(s, classes) for s in sizes)
     counts = np.bincount(matrix.sum(axis=1), minlength=hi + 1)[lo:]
     assert counts.sum() == 6000
@@ -257,7 +261,8 @@ def test_per_sample_rows_are_shuffled() -> None:
     # without straylight neither the faulty rows nor their sizes depend on the place: rank correlations of
     # spread 1/√n
     n = 4000
-    matrix = plan.fault_matrix_per_sample(n, ALL_FAULTS[:3], 0.5, np.random.default_rng(5))
+    spec = plan.MatrixSpec(samples=n, faults=ALL_FAULTS[:3], fraction=0.5)
+    matrix = plan.fault_matrix_per_sample(spec, np.random.default_rng(5))
     rank = np.arange(n)
     for column in (matrix.any(axis=1), *matrix.T):
         assert abs(stats.spearmanr(rank, column).statistic) < 4.5 / np.sqrt(n)

@@ -29,7 +29,7 @@ from vbnfault.lens import (
 from vbnfault.lens.coating import mean_reflectance
 from vbnfault.lens.straylight.scatter import Cleanliness
 from vbnfault.lens.straylight.settings import DirectPath, GhostSettings, SensorGrid, StraylightSettings, SunSource
-from vbnfault.lens.straylight.total import straylight
+from vbnfault.lens.straylight.total import SunlightInLens
 from vbnfault.output import flare_images
 
 try:
@@ -146,7 +146,7 @@ def test_starburst_glare_and_veil_come_from_the_direct_light(sun_deg: float) -> 
     admitted = np.pi / 4 * optics.entrance_pupil_diameter_mm**2 * np.cos(np.radians(sun_deg)) * transmitted(lens)
     books = []
     for size in (SIZE, 9 * SIZE):
-        found = straylight(
+        found = SunlightInLens.of(
             lens,
             wavelength_nm=NODES,
             sensor=SensorGrid(shape=(size, size), pitch_mm=pitch),
@@ -154,7 +154,7 @@ def test_starburst_glare_and_veil_come_from_the_direct_light(sun_deg: float) -> 
             settings=StraylightSettings(
                 ghosts=GhostSettings(model="paraxial"), cleanliness=Cleanliness(level=300.0), veil_fraction=0.02
             ),
-        )
+        ).total()
         strayed = sum(flux(layer, pitch) for layer in (found.starburst, found.glare, found.veil))
         books.append((strayed, found.beyond_mm2, found.direct_fraction))
         # 1e-6: sums of float32
@@ -237,7 +237,7 @@ def test_a_frame_with_all_straylight_holds_what_enters(camera: str, sun_deg: flo
     lens = where.frame.prescription(params["lens"], params["coating"])
     area = where.camera.lens.pupil_area_mm2([np.tan(np.radians(sun_deg)), 0.0])
     assert where.sun_xy_px is not None
-    found = straylight(
+    found = SunlightInLens.of(
         lens,
         wavelength_nm=NODES,
         sensor=SensorGrid(shape=where.shape, pitch_mm=pitch_mm),
@@ -252,7 +252,7 @@ def test_a_frame_with_all_straylight_holds_what_enters(camera: str, sun_deg: flo
             admitted_mm2=float(area[0] * np.cos(np.radians(sun_deg))),
             beam_fraction=float(area[0] / area[1]),
         ),
-    )
+    ).total()
     assert where.sun_irradiance_W_m2_nm is not None
     to_e = where.camera.detector.electron_rate_weights(NODES) * where.sun_irradiance_W_m2_nm
     to_e *= where.camera.exposure_s / pitch_mm**2

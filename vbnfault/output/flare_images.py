@@ -21,7 +21,7 @@ from ..lens import Prescription, ThinLens, load_lens, paraxial_properties
 from ..lens.straylight.paraxial import Ghost, axial_transmittance, mean_ghost, paraxial_ghosts
 from ..lens.straylight.scatter import Cleanliness
 from ..lens.straylight.settings import VEIL_FRACTION, GhostSettings, SensorGrid, StraylightSettings, SunSource
-from ..lens.straylight.total import straylight
+from ..lens.straylight.total import SunlightInLens
 from ..scene import keyed_random
 from .json_files import write_json
 
@@ -148,7 +148,7 @@ def layers(request: FlareRequest) -> dict[str, F32]:
     sun = _direct_image(request)
     if request.model == "texture":
         return {"sun": sun, "texture": _textures(request)}
-    light = straylight(
+    light = SunlightInLens.of(
         request.lens,
         wavelength_nm=request.wavelength_nm,
         sensor=SensorGrid(shape=(request.pixels, request.pixels), pitch_mm=request.pitch_mm),
@@ -158,7 +158,7 @@ def layers(request: FlareRequest) -> dict[str, F32]:
             cleanliness=Cleanliness(roughness_nm=request.roughness_nm, level=request.cleanliness_level),
             veil_fraction=request.veil_fraction,
         ),
-    )
+    ).total()
     sun *= light.direct_fraction[:, None, None].astype(np.float32)
     return {
         "sun": sun,

@@ -303,7 +303,10 @@ def _block(
     rng = keyed_random.rng(scene.dataset.seed, start, "plan", f"fault_matrix/{number}")
     make = fault_matrix_per_class if scene.plan.mode == "per_class" else fault_matrix_per_sample
     lo, hi = scene.plan.classes_per_sample
-    injected = make(n, faults, scene.plan.faulty_fraction, rng, (lo, hi), need_sun)
+    spec = MatrixSpec(
+        samples=n, faults=faults, fraction=scene.plan.faulty_fraction, sizes=(lo, hi), need_sun=need_sun
+    )
+    injected = make(spec, rng)
     towards_sun = int(_with_any(injected, faults, need_sun).sum())
     nominal = round(scene.plan.sun_facing_nominal_fraction * n)
     if towards_sun + nominal > n:
@@ -323,50 +326,61 @@ def _with_any(matrix: NDArray[np.bool_], faults: Sequence[str], wanted: Collecti
     return np.asarray(matrix[:, [name in wanted for name in faults]].any(axis=1))
 
 
-def fault_matrix_per_class(
-    n: int,
-    faults: tuple[str, ...],
-    p: float,
-    rng: np.random.Generator,
-    sizes: tuple[int, int] = (1, 6),
-    need_sun: Collection[str] = (),
-) -> NDArray[np.bool_]:
-    """Return bool[n, fault] with every class in exactly round(p·n) rows; rows with `need_sun` come first."""
-    count = round(p * n)
-    matrix = np.zeros((n, len(faults)), dtype=bool)
-    first = next((name for name in faults if name in need_sun), None)
-    for f, name in enumerate(faults):
+@dataclass(frozen=True, kw_only=True)
+class MatrixSpec:
+    """Describe a fault matrix: how many samples have which faults.
+
+    Attributes
+    ----------
+    samples
+        Number of samples n.
+    faults
+        The classes, one for each column of the fault matrix.
+    fraction
+        Fraction p, in [0, 1], of the samples that have a class (`fault_matrix_per_class`), or that have at least
+        one class (`fault_matrix_per_sample`).
+    sizes
+        Least and greatest number of classes in a faulty sample; only `fault_matrix_per_sample` uses it.
+    need_sun
+        Classes that need the Sun in view; their samples come first.
+    """
+
+    samples: int
+    faults: tuple[str, ...]
+    fraction: float
+    sizes: tuple[int, int] = (1, 6)
+    need_sun: Collection[str] = ()
+
+
+def fault_matrix_per_class(spec: MatrixSpec, rng: np.random.Generator) -> NDArray[np.bool_]:
+    """Return bool[n, fault] with every class in exactly round(p·n) rows."""
+    n, count = spec.samples, round(spec.fraction * spec.samples)
+    matrix = np.zeros((n, len(spec.faults)), dtype=bool)
+    first = next((name for name in spec.faults if name in spec.need_sun), None)
+    for f, name in enumerate(spec.faults):
         rows = np.arange(count) if name == first else rng.permutation(n)[:count]
         matrix[rows, f] = True
-    return matrix[np.argsort(~_with_any(matrix, faults, need_sun), kind="stable")]
+    return matrix[np.argsort(~_with_any(matrix, spec.faults, spec.need_sun), kind="stable")]
 
 
-def fault_matrix_per_sample(
-    n: int,
-    faults: tuple[str, ...],
-    p: float,
-    rng: np.random.Generator,
-    sizes: tuple[int, int] = (1, 6),
-    need_sun: Collection[str] = (),
-) -> NDArray[np.bool_]:
+def fault_matrix_per_sample(spec: MatrixSpec, rng: np.random.Generator) -> NDArray[np.bool_]:
     """Return bool[n, fault] with exactly round(p·n) faulty rows, each with a non-empty subset of the classes.
 
     Subset sizes are uniform in `sizes` (at most the number of classes). All subsets of one size have the same
-    probability, until some are changed so that the counts of any two classes differ by at most one. Rows with a
-    class of `need_sun` come first.
+    probability, until some are changed so that the counts of any two classes differ by at most one.
     """
-    classes = len(faults)
+    n, classes = spec.samples, len(spec.faults)
     matrix = np.zeros((n, classes), dtype=bool)
-    faulty = round(p * n)
+    faulty = round(spec.fraction * n)
     if classes == 0 or faulty == 0:
         return matrix
-    lo, hi = (min(s, classes) for s in sizes)
+    lo, hi = (min(s, classes) for s in spec.sizes)
     size = rng.integers(lo, hi, faulty, endpoint=True)
     # the classes with the `size` smallest random keys are a random subset of that size
     rank = np.argsort(np.argsort(rng.random((faulty, classes), dtype=np.float32), axis=1), axis=1)
     rows = rank < size[:, None]
     _level(rows, rng)
-    first = _with_any(rows, faults, need_sun)
+    first = _with_any(rows, spec.faults, spec.need_sun)
     towards_sun = int(first.sum())
     matrix[:towards_sun] = rows[first]
     others = towards_sun + rng.permutation(n - towards_sun)[: faulty - towards_sun]

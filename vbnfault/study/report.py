@@ -77,12 +77,8 @@ def write_report(
     ----------
     folder
         Folder of the study. The figures go to its folder `plots`; images are taken from its folder `images`.
-    dataset
-        Indices, as in `indices.zarr`.
-    table
-        Evaluations, as in `table.parquet`.
-    spec
-        The resolved study as plain data, as in `study.toml`.
+    dataset, table, spec
+        As in `summaries.StudyResults`.
 
     Raises
     ------

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import pickle
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -15,6 +14,7 @@ from pydantic import ValidationError
 from ..detector import load_sensor
 from ..detector.chain import Device, MosaicNoise
 from ..detector.effects import Effect, Exposure, is_packaged, is_registered, order
+from .contract import naming, pickled
 
 _MAX_DRAWS = 100
 _SHAPE = (24, 40)
@@ -81,10 +81,8 @@ def check_effect(
         The class of the effect.
     required
         Keys without which the sensor file is refused and that have no limits to draw between.
-    examples
-        Number of random examples.
-    seed
-        Seed of the examples.
+    examples, seed
+        As in `check_fault`.
 
     Raises
     ------
@@ -101,16 +99,14 @@ def check_effect(
         rng = np.random.default_rng([seed, k])
         made, table = _draw_effect(effect, given, rng)
         exposure = _draw_exposure(made, k, rng)
-        try:
+        noise = "without noise" if exposure.noise is None else "with noise"
+        example = (
+            f"example {k} of seed {seed}: keys {table}; {exposure.sensor.name}, {exposure.sensor.architecture}, "
+            f"{exposure.exposure_s:.3g} s, {noise}"
+        )
+        with naming(title, example):
             _check_round_trips(made)
             _check_apply(made, exposure, rng)
-        except Exception as error:
-            text = str(error) if isinstance(error, AssertionError) else f"raised {type(error).__name__}: {error}"
-            noise = "without noise" if exposure.noise is None else "with noise"
-            raise AssertionError(
-                f"{title}: {text} (example {k} of seed {seed}: keys {table}; {exposure.sensor.name}, "
-                f"{exposure.sensor.architecture}, {exposure.exposure_s:.3g} s, {noise})"
-            ) from error
     print(f"{title}: keeps the contract in {examples} examples")
 
 
@@ -245,11 +241,7 @@ def _check_round_trips(effect: Effect) -> None:
     plain = json.dumps(effect.model_dump(mode="json"))
     again = type(effect).model_validate_json(plain, strict=True)
     assert again == effect, "the keys of the sensor file give another effect"
-    try:
-        pickled = pickle.loads(pickle.dumps(effect))
-    except (pickle.PicklingError, AttributeError) as error:
-        raise AssertionError(f"cannot be pickled: {error}; define its class at the top of a module") from None
-    assert pickled == effect, "pickle gives another effect"
+    assert pickled(effect) == effect, "pickle gives another effect"
     try:
         assert hash(again) == hash(effect), "equal effects have different hashes"
     except TypeError as error:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import pickle
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
@@ -26,6 +25,7 @@ from ..faults import (
     physical_order,
     registry,
 )
+from .contract import naming, pickled
 from .examples import CCDS, draw_context, random_quantity, with_mosaic
 
 _PLAIN = (dict, list, str, int, float, bool, type(None))
@@ -59,12 +59,12 @@ def check_fault(
     AssertionError
         If the model breaks the contract. The message says how, and with which example.
     """
-    name = f"fault model {model.fault}/{model.model}"
+    title = f"fault model {model.fault}/{model.model}"
     given = dict(required or {})
     try:
         _check_declaration(model, given)
     except AssertionError as error:
-        raise AssertionError(f"{name}: {error}") from None
+        raise AssertionError(f"{title}: {error}") from None
     for k in range(examples):
         rng = np.random.default_rng([seed, k])
         fault, table = _draw_fault(model, given, rng)
@@ -74,20 +74,17 @@ def check_fault(
         if not model.informed:
             not_informed: Any = _NotInformed()
             context = replace(context, coating_loss=not_informed)
-        try:
+        camera = context.camera
+        example = (
+            f"example {k} of seed {seed}: keys {table}; {camera.width_px} x {camera.height_px} px, "
+            f"{camera.architecture}, read out {camera.readout_direction}, Sun at {context.sun_xy_px}"
+        )
+        with naming(title, example):
             _check_round_trips(fault)
             _check_instrument(fault, context, k)
             for step in fault.steps:
                 _check_step(step, fault, context, k)
-        except Exception as error:
-            camera = context.camera
-            text = str(error) if isinstance(error, AssertionError) else f"raised {type(error).__name__}: {error}"
-            raise AssertionError(
-                f"{name}: {text} (example {k} of seed {seed}: keys {table}; "
-                f"{camera.width_px} x {camera.height_px} px, {camera.architecture}, "
-                f"read out {camera.readout_direction}, Sun at {context.sun_xy_px})"
-            ) from error
-    print(f"{name}: keeps the contract in {examples} examples")
+    print(f"{title}: keeps the contract in {examples} examples")
 
 
 def draw_table(model: type[Fault], rng: np.random.Generator) -> dict[str, Any]:
@@ -148,11 +145,7 @@ def _check_round_trips(fault: Fault) -> None:
     """Check that a fault survives the scene file and another process."""
     plain = json.loads(json.dumps(fault.to_dict()))
     assert from_dict(fault.fault, plain, source="check_fault") == fault, "to_dict and from_dict give another fault"
-    try:
-        again = pickle.loads(pickle.dumps(fault))
-    except (pickle.PicklingError, AttributeError) as error:
-        raise AssertionError(f"cannot be pickled: {error}; define its class at the top of a module") from None
-    assert again == fault, "pickle gives another fault"
+    assert pickled(fault) == fault, "pickle gives another fault"
 
 
 def _check_instrument(fault: Fault, context: FaultContext, key: int) -> None:

@@ -75,36 +75,6 @@ class Straylight:
         return np.asarray(self.ghosts + self.starburst + self.glare + self.veil)
 
 
-def straylight(
-    lens: Prescription,
-    *,
-    wavelength_nm: F64,
-    sensor: SensorGrid,
-    sun: SunSource,
-    settings: StraylightSettings = DEFAULT,
-    path: DirectPath | None = None,
-) -> Straylight:
-    """Return the Sun's straylight on a sensor.
-
-    Parameters
-    ----------
-    lens
-        At its final size.
-    wavelength_nm
-        float64[band], nodes of the bands.
-    path
-        The path that forms the direct image; default: the lens along its axis, with its paraxial entrance pupil.
-
-    Raises
-    ------
-    InputError
-        A value is out of range.
-    """
-    return SunlightInLens.of(
-        lens, wavelength_nm=wavelength_nm, sensor=sensor, sun=sun, settings=settings, path=path
-    ).total()
-
-
 def _lit_fraction(lens: Prescription, baffle: Baffle, sun_deg: float) -> float:
     """Return the fraction of the lens's entrance that the Sun lights through a baffle."""
     if baffle.length_mm <= 0:
@@ -166,7 +136,22 @@ class SunlightInLens:
         settings: StraylightSettings = DEFAULT,
         path: DirectPath | None = None,
     ) -> SunlightInLens:
-        """Return the Sun's light for the parameters of `straylight`."""
+        """Return the Sun's light in a lens.
+
+        Parameters
+        ----------
+        lens
+            At its final size.
+        wavelength_nm
+            float64[band], nodes of the bands.
+        path
+            Path that forms the direct image; default: the lens along its axis, with its paraxial entrance pupil.
+
+        Raises
+        ------
+        InputError
+            A value is out of range.
+        """
         nodes = np.atleast_1d(np.asarray(wavelength_nm, dtype=np.float64))
         diameter_mm = paraxial_properties(lens).entrance_pupil_diameter_mm
         pupil_mm2 = float(np.pi / 4 * diameter_mm**2 * np.cos(np.radians(sun.angle_deg)))
