@@ -248,10 +248,10 @@ def test_footprints_are_brighter_where_rays_crowd(
     assert isinstance(lens, RealLens)
     known = beams(lens.prescription, 0.75, lens.sensor_mm)
     table = known.on_row(surface) if surface >= 0 else known.above_sensor(0.65)
-    places = table.places(np.full((1, 1), slope), np.zeros((1, 1)))
-    size = float(np.sqrt(places.area_mm2[0, 0] / np.pi))
-    x, a = float(places.centre_mm[0, 0]) + off * size, radius * size
-    cover = places.covered if surface >= 0 else places.covered_nearby
+    footprints = table.towards(np.full((1, 1), slope), np.zeros((1, 1)))
+    size = float(np.sqrt(footprints.area_mm2[0, 0] / np.pi))
+    x, a = float(footprints.centre_mm[0, 0]) + off * size, radius * size
+    cover = footprints.covered if surface >= 0 else footprints.covered_nearby
     found = float(cover(x, 0.0, a)[0, 0])
     half = real_pupil_diameter_mm(lens.prescription)
     start = rng(7).uniform(-half, half, (100_000, 3)) * [1, 1, 0]

@@ -18,8 +18,7 @@ from .resources import PACKAGE
 
 _R = TypeVar("_R")
 
-# Begins the keys of vbnfault's own files.
-_OWN = "vbnfault:"
+_OWN = "vbnfault:"  # prefix of the keys of vbnfault's own files
 
 
 class Contents:
@@ -35,10 +34,10 @@ class Contents:
         self._complete = False
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**vars(self), "_status": {}}  # it holds on one machine only
+        return {**vars(self), "_status": {}}  # a file's status has no meaning on another machine
 
     def complete(self) -> None:
-        """Record that the run is planned: by now, all its files have been read."""
+        """Record that the run is planned, so that all its files have been read."""
         self._complete = True
 
     def knows(self, path: str | Path) -> bool:

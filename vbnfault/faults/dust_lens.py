@@ -260,25 +260,25 @@ def _sums(
     x_px, y_px = ((np.arange(n) - 0.5) * step for n in (columns, rows))
     sums = np.zeros((1 if lit is None else 3, rows, columns), dtype=np.float32)
     # compute the footprints of a coarse grid once; on the pixel grid, compute only those near each grain
-    whole = footprint.places(*frame.slopes(x_px, y_px)) if step > 1 else None
+    whole = footprint.towards(*frame.slopes(x_px, y_px)) if step > 1 else None
     for k, (top, bottom, left, right) in enumerate(_windows(grains, footprint, frame, x_px, y_px)):
         if top >= bottom or left >= right:
             continue
         part = (slice(top, bottom), slice(left, right))
-        places = (
-            footprint.places(*frame.slopes(x_px[left:right], y_px[top:bottom]), light=not on_window)
+        footprints = (
+            footprint.towards(*frame.slopes(x_px[left:right], y_px[top:bottom]), light=not on_window)
             if whole is None
             else whole.part(part)
         )
         radius = float(grains.radius_mm[k])
         # near the sensor the cone is narrow: shadows are small, and at the frame's corners footprints are far from
         # round
-        cover = places.covered_nearby if on_window else places.covered
+        cover = footprints.covered_nearby if on_window else footprints.covered
         covered = cover(float(grains.x_mm[k]), float(grains.y_mm[k]), radius)
         covered *= np.float32(grains.taken[k])
         sums[0][part] += covered
         if lit is not None and lit[k] > 0:
-            covered *= places.area_mm2
+            covered *= footprints.area_mm2
             sums[1][part] += covered * np.float32(lit[k] / (np.pi * radius))
             sums[2][part] += covered * np.float32(lit[k] / np.pi)
     finer = [_finer(v, step, (height, width)) for v in sums]
@@ -290,14 +290,14 @@ def _windows(
 ) -> list[tuple[int, int, int, int]]:
     """Return for each grain the start and stop of rows and columns; outside of them it touches no footprint."""
     x, y = (np.linspace(v[0], v[-1], min(_NODES, len(v))) for v in (x_px, y_px))
-    places = footprint.places(*frame.slopes(x, y), light=False)
-    at_x, at_y = places.centre_mm * places.cos, places.centre_mm * places.sin
+    footprints = footprint.towards(*frame.slopes(x, y), light=False)
+    at_x, at_y = footprints.centre_mm * footprints.cos, footprints.centre_mm * footprints.sin
     # distance from a node to the farthest position that has it as its nearest node
     apart = sum(float(np.hypot(np.diff(at_x, axis=a), np.diff(at_y, axis=a)).max(initial=0)) for a in (0, 1))
     reach = footprint.largest_mm + grains.radius_mm + 0.55 * apart
     grain_x, grain_y, square = (v.astype(np.float32)[:, None, None] for v in (grains.x_mm, grains.y_mm, reach**2))
     near: Any = (at_x - grain_x) ** 2 + (at_y - grain_y) ** 2 < square
-    near &= places.area_mm2 > 0
+    near &= footprints.area_mm2 > 0
     spans = []
     for fine, coarse, touched in ((y_px, y, near.any(axis=2)), (x_px, x, near.any(axis=1))):
         gap = coarse[1] - coarse[0] if len(coarse) > 1 else 1.0
@@ -348,9 +348,9 @@ def _in_suns_beam(params: Params, context: FaultContext, grains: _Grains, sun: _
     footprint = _footprint(context.frame, params["lens"], params["surface"], 0.0)
     if np.hypot(*sun.slope) > footprint.slope[-1]:
         return np.zeros(len(grains.x_mm))
-    places = footprint.places(*sun.slope.reshape(2, 1, 1))
+    footprints = footprint.towards(*sun.slope.reshape(2, 1, 1))
     shares = [
-        float((places.covered(x, y, a) * places.area_mm2)[0, 0]) / (np.pi * a * a)
+        float((footprints.covered(x, y, a) * footprints.area_mm2)[0, 0]) / (np.pi * a * a)
         for x, y, a, _ in zip(*grains, strict=True)
     ]
     return np.array(shares)

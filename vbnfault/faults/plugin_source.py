@@ -1,11 +1,11 @@
 """Determine the files that hold the code of a plug-in, and their digest.
 
-- A file, or a module that is one file: the file itself, and what it imports from its own folder, directly or
-  through another such module: `import traps` means `traps.py` or `traps/__init__.py` beside it.
-- A module within a package: all source files and extensions of its top-level package.
+- The code of a plug-in that is one file is this file and all files of its own folder that it imports, directly or
+  through each other. `import traps` imports `traps.py` or `traps/__init__.py` of this folder.
+- The code of a module within a package is all source files and extensions of the top-level package.
 
-The imports are read from the source, so the digest does not depend on what a process has imported before. An import
-by a computed name is not seen. A folder of installed packages is no plug-in's own folder.
+The imports are read from the source, so the digest does not depend on what a process has imported before. Imports
+by a computed name are not noticed. A file in a folder of installed packages has no folder of its own.
 """
 
 from __future__ import annotations
@@ -59,9 +59,9 @@ def digest_of_module(name: str) -> str:
 
 
 def forget_imports(path: str) -> dict[str, ModuleType]:
-    """Remove from `sys.modules` what a plug-in's file imports from its folder, so that its import reads it again.
+    """Remove the modules that a plug-in's file imports from its own folder from `sys.modules`, and return them.
 
-    Return the modules that were removed, by their names.
+    The next import of the plug-in then reads their files again. The result has the modules by their names.
     """
     helpers = _imported_beside(path, user_files.read_input(path, "plug-in"))
     tops, folder = {name.split("/")[0].split(".")[0] for name in helpers}, os.path.dirname(path)
@@ -101,11 +101,11 @@ def _imported_beside(path: str, data: bytes) -> dict[str, str]:
 
 
 def _imported_names(source: bytes, package: str) -> Iterator[str]:
-    """Yield the dotted names that a module imports; a name may be that of a class or a function in the module."""
+    """Yield the dotted names that a source file imports: modules, and classes or functions within modules."""
     try:
         tree = ast.parse(source)
     except (SyntaxError, ValueError):
-        return  # its execution says what is wrong
+        return  # the import of the module will report the error
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
@@ -116,7 +116,7 @@ def _imported_names(source: bytes, package: str) -> Iterator[str]:
 
 
 def _files_of(folder: Path, dotted: str) -> Iterator[tuple[Path, str]]:
-    """Yield the files below a folder that the import of a dotted name executes, each with its package."""
+    """Yield each file below a folder that the import of a dotted name executes, and the package of the file."""
     parts = dotted.split(".")
     if parts[0] == PACKAGE.name:
         return

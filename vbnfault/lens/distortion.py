@@ -21,8 +21,8 @@ COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 
 # Residuals below this count as equal. The lowest degree then wins: its coefficients are better determined.
 _ENOUGH_PX = 0.001
-# Where no model follows all heights of the lens and continues without folding, the outermost heights get less
-# weight, until the model meets the others to this.
+# A model that follows all heights of the lens may fold. Then the outermost heights get less weight, until a model
+# that does not fold follows the others to this distance.
 _FOLLOWED_PX = 0.01
 _FOLLOWED = tuple(k / 16 for k in range(16, 7, -1))  # fractions of the angle of the last height
 _WEIGHTS = (1.0, 0.1, 0.01, 1e-3, 1e-4, 1e-5)  # of the outermost heights
@@ -91,7 +91,8 @@ def fitted(slope: F64, distance: F64, focal_length_px: float, *, known: int, rea
     slope, distance
         float64[n], rising, above 0: tangents of field angles, and distances from the axis in focal lengths.
     known
-        How many of them, at least 8, the lens itself gives; the others only suggest how the model may continue.
+        Number of points, at least 8, that rays through the lens give. The points behind them only suggest how the
+        model may continue.
     reach
         Distance that the model must reach, in focal lengths; at most the last of `distance`.
     """
@@ -163,8 +164,8 @@ def _of_degree(slope: F64, distance: F64, degree: int, weight: F64) -> F64 | Non
 def _least_squares(columns: F64, right: F64) -> F64 | None:
     """Solve a least-squares problem by Gram-Schmidt factorisation; None where columns depend on one another.
 
-    Sums run in one fixed order: a threaded library would not give the same bits on every machine, and stores keep
-    them.
+    Sums run in one fixed order, because stores keep the result, and a threaded library would not give the same bits
+    on every machine.
     """
     count = columns.shape[1]
     scale = np.sqrt((columns**2).sum(axis=0))

@@ -1,8 +1,9 @@
 """Compute where a lens's beams cross its surfaces and other planes, with exact rays.
 
-The light of a far point that passes all rims is a beam. Where the beam crosses a surface is its footprint there. By
-rotational symmetry one table over the field angle holds all footprints: a footprint's middle lies in the plane of
-the axis and the point, and its rim is given by its distance from that middle.
+A beam is the light of a far point that passes all rims. The part of a surface that the beam crosses is its
+footprint on this surface. The lens has rotational symmetry, so one table over the field angle holds all footprints.
+The middle of a footprint lies in the plane of the axis and the far point; the table gives the distance of the rim
+from this middle.
 
 Positions have the image's axes: x to the right, y down. Light of a point to the right of the axis travels to +x.
 Everything holds for the d line.
@@ -55,7 +56,8 @@ _SHADOW = 64  # cells along each side of a shadow's table
 class ImageFrame:
     """Describe a camera for the tracing of beams: its lens, and its image centred on the axis.
 
-    `changes` are made in a prescription that is not the camera's own, and in the coatings of its own.
+    The camera's own lens already has the `changes`, and another prescription gets all of them. Where `prescription`
+    replaces the coatings of the own lens, it repeats the changes of coatings.
     """
 
     lens: Lens
@@ -65,9 +67,9 @@ class ImageFrame:
     changes: tuple[Change, ...] = ()
 
     def slopes(self, x_px: NDArray, y_px: NDArray) -> tuple[F32, F32]:
-        """Return the tangents of the field angles, to the right and down, float32[y, x] each, of columns and rows.
+        """Return the tangents of the field angles of pixels, to the right and down, float32[y, x] each.
 
-        `x_px` float64[x] and `y_px` float64[y] are pixel positions in the image.
+        `x_px` float64[x] and `y_px` float64[y] are the positions of columns and rows in the image.
         """
         per_px = self.pixel_pitch_um * 1e-3 / self.lens.focal_length_mm
         x, y = np.broadcast_arrays(
@@ -94,9 +96,9 @@ class ImageFrame:
         return _scaled(name or DEFAULT_LENS, self.lens.focal_length_mm, self.lens.f_number, frame)
 
     def prescription(self, name: str, coating: str) -> Prescription:
-        """Return the prescription of that lens with a named coating on every surface between glass and air.
+        """Return the prescription of `real_lens(name)` with a named coating on every surface between glass and air.
 
-        With `as_prescribed` the coatings stay.
+        With the coating `as_prescribed`, the coatings stay.
         """
         if coating == "as_prescribed":
             return self.real_lens(name).prescription
@@ -110,7 +112,7 @@ class ImageFrame:
         return changed(lens, changes) if changes else lens
 
     def beams(self, name: str) -> Beams:
-        """Return the beams of that lens, from the axis to slightly beyond the frame's corners."""
+        """Return the beams of `real_lens(name)`, from the axis to slightly beyond the frame's corners."""
         slope = np.hypot(*self.slopes(np.array([self.width_px]), np.array([self.height_px])))
         lens = self.real_lens(name)
         return beams(lens.prescription, _MARGIN * float(slope[0, 0]), lens.sensor_mm)
@@ -185,9 +187,7 @@ class Beams:
 
     def _footprint(self, points: F64) -> Footprint:
         """Return the footprints from the points where the bundle crosses, float64[angle × azimuth × ring, 2]."""
-        from scipy.interpolate import (
-            PchipInterpolator,
-        )  # takes half a second to import: for lenses of surfaces only
+        from scipy.interpolate import PchipInterpolator  # not above: the import takes half a second
 
         shape = (len(self.slope), _AZIMUTHS, _RINGS + 1)
         x, y = np.moveaxis(points.reshape(*shape, 2), 3, 0)
@@ -321,7 +321,7 @@ class Footprint:
     area_mm2: F64
     brightness: F64
 
-    def places(self, slope_x: NDArray, slope_y: NDArray, *, light: bool = True) -> Places:
+    def towards(self, slope_x: NDArray, slope_y: NDArray, *, light: bool = True) -> Footprints:
         """Return the footprints of the directions (slope_x, slope_y), float[y, x] each.
 
         `light`: whether the brightness within the footprints is included.
@@ -329,7 +329,7 @@ class Footprint:
         slope = np.hypot(slope_x, slope_y).astype(np.float32)
         row = np.minimum(slope * np.float32(1 / self.slope[1]), np.float32(_DENSE - 1))
         per = 1 / np.maximum(slope, np.float32(1e-12))
-        return Places(
+        return Footprints(
             cos=np.asarray(slope_x * per, dtype=np.float32),
             sin=np.asarray(slope_y * per, dtype=np.float32),
             centre_mm=_looked_up(self.centre_mm.astype(np.float32)[:, None], row),
@@ -383,7 +383,7 @@ class Footprint:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Places:
+class Footprints:
     """Hold the footprints of an array of directions.
 
     They have an azimuth (cos, sin), a middle along it, an area, and a fractional row in the table `table`.
@@ -397,12 +397,12 @@ class Places:
     brightness: tuple[F32, ...]
     table: Footprint
 
-    def part(self, where: tuple[slice, slice]) -> Places:
+    def part(self, where: tuple[slice, slice]) -> Footprints:
         """Return the footprints of some of the directions."""
         names = ("cos", "sin", "centre_mm", "area_mm2", "row")
         parts: dict[str, F32] = {name: np.ascontiguousarray(getattr(self, name)[where]) for name in names}
         brightness = tuple(np.ascontiguousarray(c[where]) for c in self.brightness)
-        return Places(**parts, brightness=brightness, table=self.table)
+        return Footprints(**parts, brightness=brightness, table=self.table)
 
     def _from_middle(self, x_mm: float, y_mm: float) -> tuple[F32, F32]:
         """Return a position on the surface relative to the footprints' middles, along their azimuths and across."""
@@ -412,11 +412,11 @@ class Places:
     def covered(self, x_mm: float, y_mm: float, radius_mm: float) -> F32:
         """Return the fraction of each footprint's light that a disc covers, in [0, 1].
 
-        The footprint is taken as round, with the distance of the true rim from the middle in the disc's direction
-        as its radius. The disc's overlap with it, relative to the largest possible overlap, multiplies the largest
-        fraction that the disc can cover of the true footprint (`most_covered`). The result is exact for round
-        footprints, and for all others where the disc lies wholly inside or hides the footprint. It is then
-        corrected for the brightness at the disc.
+        The footprint is replaced by a round one. Its radius is the distance of the true rim from the middle in the
+        direction of the disc. The fraction is the product of two factors: the disc's overlap with the round
+        footprint over the largest possible overlap, and the largest fraction that the disc can cover of the true
+        footprint (`most_covered`). The product is exact for round footprints, and for all others where the disc
+        lies wholly inside or hides the footprint. A correction for the brightness at the disc follows.
         """
         a = np.float32(radius_mm)
         along, across = self._from_middle(x_mm, y_mm)
@@ -436,9 +436,9 @@ class Places:
         return np.clip(out, 0, 1, out=out)
 
     def covered_nearby(self, x_mm: float, y_mm: float, radius_mm: float) -> F32:
-        """Return the fraction as `covered` does, for footprints of any shape that are alike around the disc.
+        """Return the same fraction as `covered`, where all footprints near the disc have nearly the same shape.
 
-        Their common shape is that of the footprint whose middle is as far from the axis as the disc.
+        The shape may be any. It is that of the footprint whose middle is as far from the axis as the disc.
         """
         table, per_mm = self.table.shadow(float(np.hypot(x_mm, y_mm)), radius_mm)
         along, across = (v * np.float32(per_mm) + np.float32(_SHADOW // 2) for v in self._from_middle(x_mm, y_mm))

@@ -29,7 +29,7 @@ from .surface import TerrainMesh
 Image = NDArray[np.float32]
 
 _TILE = 8
-_SHARE = 16  # samples of direct light per sample of indirect light
+_DIRECT_PER_INDIRECT = 16  # samples of direct light per sample of indirect light
 _FIRST_BOUNCE = 2  # the first free dimension of a sample's random numbers; each bounce uses three
 # The filter's weights fall with the angle between normals and with the distance from the pixel's plane.
 _SIGMA_NORMAL = 0.3
@@ -40,10 +40,10 @@ _COLOUR_PX = 12  # standard deviation; colour varies less than brightness, so it
 
 
 def indirect(surface: TerrainMesh, scene: RenderInput, truth: Truth, *, smooth: bool = True) -> Image:
-    """Return the radiance due to light that reaches the ground in view by reflection, float32[band, y, x].
+    """Return the radiance of ground that other ground lights, float32[band, y, x].
 
-    This light was reflected 1 to `scene.bounces` times before. `truth` of the same view guides the filter that
-    averages neighbouring pixels; `smooth` = False switches it off.
+    The light was reflected 1 to `scene.bounces` times before it reaches the ground in view. `truth` of the same
+    view guides the filter that averages neighbouring pixels; `smooth` = False switches the filter off.
     """
     light = _Indirect(surface, scene).image()
     return _smoothed(light, scene, truth) if smooth else light
@@ -54,7 +54,7 @@ class _Indirect(Light):
 
     def __init__(self, surface: TerrainMesh, scene: RenderInput) -> None:
         super().__init__(surface, scene, banded=scene.bounces > 1 or has_bands(surface, scene))
-        self.samples_per_pixel = max(1, scene.samples_per_pixel // _SHARE)
+        self.samples_per_pixel = max(1, scene.samples_per_pixel // _DIRECT_PER_INDIRECT)
         sun, model = scene.sun, scene.reflectance
         if self.banded:
             self.weights = np.diag(sun.irradiance_W_m2_nm)
@@ -68,7 +68,7 @@ class _Indirect(Light):
         out = np.zeros((weights.shape[1], view.height_px, view.width_px), dtype=np.float32)
         key = self.scene.key ^ 0x5BD1E995
         for tiles in _Tiles.cover(view.width_px, view.height_px, len(weights)):
-            # camera rays are traced in rows, where neighbours are coherent, whatever the order of later rays
+            # camera rays are traced in rows, where neighbours are coherent; later rays have another order
             pixels = Pixels(view.width_px * tiles.rows, first=view.width_px * tiles.first_row)
             rows = slice(tiles.first_row, tiles.first_row + tiles.rows)
             for round_ in range(spp):
@@ -86,7 +86,10 @@ class _Indirect(Light):
         return out
 
     def terms(self, strata: TileStrata, first: tuple[Any, ...]) -> list[Any]:
-        """Return what each sample adds to each term; `first` holds the hits of its ray from the camera."""
+        """Return the light of each sample, an array for each row of `weights`.
+
+        `first` holds the hits of the rays from the camera.
+        """
         rays = self.optics.camera_rays(strata)
         hit = self.world.hit(rays, first)
         hit.valid &= strata.inside
@@ -102,8 +105,8 @@ class _Indirect(Light):
             # a facet seen from behind reflects no light
             hit.valid &= dr.dot(hit.normal, rays.d) < 0
             if on_vehicle is not None:
-                # A vehicle some metres wide adds far less than 1e-3 of the light at tens of metres. Only one ray in
-                # thousands would hit it, and would make a bright speck, so these hits are dropped.
+                # A vehicle some metres wide, tens of metres away, adds far less than 1e-3 of the light. Only one
+                # ray in thousands hits it, and then makes a bright speck, so these hits are dropped.
                 hit.valid &= on_vehicle | ~hit.on_vehicle
             towards, lit = self.lit(hit, strata.disc(SUN_DIMENSION + dimension + 2), coherent=False)
             sent = _product(carried, self.reflection(hit, rays).terms(towards))
@@ -119,9 +122,9 @@ def _product(a: list[Any], b: list[Any]) -> list[Any]:
 
 
 class _Tiles:
-    """Order one sample per pixel by position within the tile, then by tile, for some rows of tiles.
+    """Order the samples of some rows of tiles: all samples of one position in their tile follow each other.
 
-    Neighbours in the wavefront then have the same position in neighbouring tiles.
+    Each pixel has one sample. Neighbours in the wavefront have the same position in neighbouring tiles.
     """
 
     def __init__(self, width: int, first_row: int, rows: int) -> None:
