@@ -20,7 +20,17 @@ from .gravity import PolyhedronGravity
 from .nucleus import embedded_nucleus
 from .patch import Patch, build_patch
 from .roughness import Roughness, model_roughness
-from .shape import Float64, Int32, Unit, centre_of_mass, check_mesh, load_shape, signed_volume
+from .shape import (
+    Float64,
+    Int32,
+    Unit,
+    centre_of_mass,
+    check_mesh,
+    face_normals_areas,
+    load_shape,
+    signed_volume,
+    vertex_normals,
+)
 from .sites import Site, Sites, choose_sites, local_level, site_at
 from .spec import PatchSpec
 
@@ -93,6 +103,16 @@ class Body:
     def centre_of_mass_T_m(self) -> Float64:
         """Return the centre of mass of the homogeneous body in T, float64[3] in m."""
         return centre_of_mass(self.vertices_m, self.faces)
+
+    @cached_property
+    def area_m2(self) -> float:
+        """Return the area of the surface."""
+        return float(face_normals_areas(self.vertices_m, self.faces)[1].sum())
+
+    @cached_property
+    def vertex_normals(self) -> Float64:
+        """Return the outward unit normals at the vertices, float64[n, 3]."""
+        return vertex_normals(self.vertices_m, self.faces)
 
     @cached_property
     def gravity(self) -> PolyhedronGravity:

@@ -17,9 +17,6 @@ from .spec import INDEX, PER_KM2, PatchSpec
 
 REFERENCE_M = 7.0
 LARGEST_M = 45.0
-# Up to this distance the smallest drawn diameter is constant. Beyond, it grows with the distance, so that its
-# angular size is constant.
-NEAR_M = 20.0
 # The steep size law, continued to a few decimetres, would cover the ground many times over. Where boulders cover
 # this fraction of the ground (above 1 they form heaps), smaller ones are left out.
 _MOST_COVER = 1.2
@@ -67,9 +64,13 @@ class Boulders:
     drawn: int
 
 
-def smallest_at(distance_m: Float64, min_boulder_m: float) -> Float64:
-    """Return the smallest diameter drawn at a distance from the site, metres."""
-    return min_boulder_m * np.maximum(np.asarray(distance_m) / NEAR_M, 1.0)
+def smallest_at(distance_m: Float64, min_boulder_m: float, near_m: float = 20.0) -> Float64:
+    """Return the smallest diameter drawn at a distance from the site, metres.
+
+    It is constant up to the distance `near_m`. Beyond, it grows with the distance, so that its angular size for a
+    camera near the site is constant.
+    """
+    return min_boulder_m * np.maximum(np.asarray(distance_m) / near_m, 1.0)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -108,7 +109,7 @@ def add_boulders(ground: GroundMesh, spec: PatchSpec, *, rng: np.random.Generato
     normals, _ = face_normals_areas(points, faces)
     centre = points[faces].mean(axis=1)
     distance = np.sqrt(np.einsum("ni,ni->n", centre, centre))
-    smallest = smallest_at(distance, spec.min_boulder_m)
+    smallest = smallest_at(distance, spec.min_boulder_m, spec.boulder_near_m)
     bearing = smallest < LARGEST_M
     favour = np.zeros(len(faces))
     favour[bearing] = _favour(ground, normals[bearing], faces[bearing], spec.seed)

@@ -38,8 +38,14 @@ class PatchSpec:
         default=0.25,
         ge=0.05,
         le=1e6,
-        description="diameter of the smallest boulder near the site. It grows with the distance beyond 20 m, and "
-        "where boulders would cover the ground",
+        description="diameter of the smallest boulder near the site. It grows with the distance beyond "
+        "boulder_near_m, and where boulders would cover the ground",
+    )
+    boulder_near_m: float = Field(
+        default=20.0,
+        ge=20,
+        le=1e8,
+        description="distance from the site up to which the smallest boulder has the diameter min_boulder_m",
     )
     max_triangles: int = Field(
         default=1_600_000,

@@ -32,6 +32,7 @@ LIMIT_BYTES: dict[str, int] = {
     "spacecraft": 512 * MIB,
     "texture": 256 * MIB,
     "data": 1024 * MIB,
+    "trajectory": 256 * MIB,
     "plug-in": 64 * MIB,
     "SPICE kernel": 8192 * MIB,
     "star catalogue": 64 * MIB,

@@ -15,7 +15,8 @@ from ..detector import Detector
 from ..pipeline import Session
 from ..pipeline.exposure import reference_exposure_s
 from ..scene import plan
-from ..world import assemble
+from ..scene.trajectory import Trajectory
+from ..world import assemble, ground
 from .progress import duration_text, size_text
 
 _SITES_DESCRIBED = 8  # a site takes 9 ms on a shape of 20,000 facets
@@ -25,6 +26,7 @@ _SITES_DESCRIBED = 8  # a site takes 9 ms on a shape of 20,000 facets
 _LEAST_RADIUS_M = 5.0
 _PATCH_RADII = 3.0
 _LENGTHS_AWAY = 50.0
+_POSES_DESCRIBED = 200  # rows of a trajectory whose distance from the ground is computed
 
 
 def describe(session: Session, *, sample_bytes: int, seconds: float) -> list[str]:
@@ -97,7 +99,7 @@ def _small_body(session: Session) -> list[str]:
     if longest_m < _PATCH_RADII * scene.patch.radius_m:
         reasons.append(f"is shorter than {_PATCH_RADII:g} times patch.radius_m = {scene.patch.radius_m:g}")
     height_m = scene.geometry.height_m[0]
-    if not scene.spice.spacecraft and longest_m < height_m / _LENGTHS_AWAY:
+    if not scene.is_flown and longest_m < height_m / _LENGTHS_AWAY:
         reasons.append(
             f"is over {_LENGTHS_AWAY:g} of its lengths below the lowest of geometry.height_m, {height_m:g}"
         )
@@ -113,6 +115,8 @@ def _geometry(session: Session) -> list[str]:
     """Return lines about the camera's positions and attitudes (or its SPICE trajectory) and about the Sun."""
     scene, table = session.scene, session.plan
     geometry, camera = scene.geometry, scene.camera
+    if session.trajectory is not None:
+        return _trajectory(session, session.trajectory)
     sun = f"Sun: {assemble.sun_distance_au(scene):.4g} au away"
     if scene.spice.spacecraft:
         until = scene.spice.until_julian_date or scene.sun.julian_date
@@ -153,6 +157,31 @@ def _geometry(session: Session) -> list[str]:
         f"{hidden}; a fault that cannot show {unseen}"
     )
     return lines
+
+
+def _trajectory(session: Session, table: Trajectory) -> list[str]:
+    """Return lines about a table of poses: its rows, distances and dates, and the terrains that they need."""
+    body, count = session.body, len(session.plan)
+    from_body = body.vertices_m[None] - table.camera_position_T_m[: min(count, _POSES_DESCRIBED), None]
+    range_m = np.linalg.norm(from_body, axis=2).min(axis=1)
+    phase = [
+        np.degrees(np.arccos(np.clip(frames.unit(position) @ sun, -1, 1)))
+        for position, sun in zip(
+            table.camera_position_T_m[:count] - body.centre_of_mass_T_m, table.sun_direction_T[:count], strict=True
+        )
+    ]
+    first = f" (first {len(range_m)} rows)" if len(range_m) < count else ""
+    date = table.julian_date[:count]
+    distance = table.sun_distance_au[:count]
+    return [
+        f"trajectory: {count} of {len(table)} rows of {Path(table.source).name}, from {table.name[0]} to "
+        f"{table.name[count - 1]}; a site stands for {session.scene.dataset.shard_samples} rows side by side; "
+        "poses are kept, and faults that cannot show are recorded as not injected",
+        f"nearest ground: {_span(range_m.min(), range_m.max())} m from the camera{first}, "
+        f"{_span(*(ground.pixel_rad(session.scene) * range_m[[range_m.argmin(), range_m.argmax()]]))} m a pixel; "
+        f"phase angle at the centre of mass {_span(min(phase), max(phase))} deg",
+        f"Sun: {_span(distance.min(), distance.max())} au away, dates {date.min():.5f} to {date.max():.5f} TDB",
+    ]
 
 
 # The references of attitude (`geometry.sun_facing.reference`) in words.

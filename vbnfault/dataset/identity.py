@@ -70,6 +70,10 @@ def scene_identity(session: pipeline.Session) -> dict[str, Any]:
         images = sorted(resources.data_dir(folder).glob("*.png"))
         data = b"".join(user_files.read_input(path, "texture") for path in images)
         scene[f"{folder}_sha256"] = user_files.sha256(data)
+    if session.scene.trajectory is None:
+        del scene["trajectory"]  # stores of scenes without one stay as they were
+    else:
+        scene["trajectory"]["file"] = _digest(session.scene.trajectory.file, "trajectory")
     del scene["plugins"]
     plugins = plugins_of(session.faults, session.scene.plugins)
     if plugins:
@@ -204,6 +208,7 @@ def store_spec(session: pipeline.Session, blocks: Sequence[int]) -> StoreSpec:
         else (camera.detector.name,),
         radiance_dtype="float32",
         shard_samples=dataset.shard_samples,
+        sample_names=() if session.trajectory is None else session.trajectory.name,
         attributes=attributes,
     )
 
@@ -240,13 +245,14 @@ def is_exact(attributes: Mapping[str, Any]) -> bool:
     """Return whether a stored scene must inject every commanded fault.
 
     A fault that is invisible in a view can be injected only if the view is drawn again. The result is therefore
-    False if `plan.on_invisible` is not `redraw_view`, if SPICE places the camera, or if `geometry.sun_visibility`
-    is `as_drawn`.
+    False if `plan.on_invisible` is not `redraw_view`, if SPICE or a table of poses places the camera, or if
+    `geometry.sun_visibility` is `as_drawn`.
     """
     scene = attributes["scene"]
     redraws = scene.get("plan", {}).get("on_invisible") == "redraw_view"
     as_drawn = scene.get("geometry", {}).get("sun_visibility") == "as_drawn"
-    return bool(redraws and not as_drawn and not scene.get("spice", {}).get("spacecraft"))
+    flown = scene.get("spice", {}).get("spacecraft") or scene.get("trajectory")
+    return bool(redraws and not as_drawn and not flown)
 
 
 def stored_scene(attributes: Mapping[str, Any]) -> Scene:
@@ -299,9 +305,9 @@ def planned(attributes: Mapping[str, Any], faults: Sequence[str]) -> Callable[[i
 
     def expected(index: int, tries: int) -> dict[str, Any]:
         drawn = table.view(scene, index, tries - 1)
-        # if SPICE sets the positions of camera and Sun, the plan does not set these angles
+        # if a trajectory sets the positions of camera and Sun, the plan does not set these angles
         names = ("sun_azimuth_deg", "sun_elevation_deg", "roll_deg", "pitch_deg", "yaw_deg")
-        angles = () if scene.spice.spacecraft else names
+        angles = () if scene.is_flown else names
         return {
             **{name: drawn[name] for name in angles},
             "stratum": int(table.stratum[index]),

@@ -69,7 +69,7 @@ def _geometry(frame: Frame) -> dict[str, Any]:
     sun_T = T_from_L @ pose.sun_L
     sun_xy = frame.context.sun_xy_px
     roll, pitch, yaw = (pose.variables[name] for name in ("roll_deg", "pitch_deg", "yaw_deg"))
-    if spec.scene.spice.spacecraft:
+    if spec.scene.is_flown:
         roll, pitch, yaw = frames.roll_pitch_yaw_deg(pose.sun_L, pose.L_from_C)
     return {
         "camera_position_T_m": site.position_T_m + T_from_L @ pose.position_L_m,
@@ -139,7 +139,7 @@ def proposal(scene: Scene, table: plan.Plan, index: int, variables: Mapping[str,
     """Return the plan's values for a sample and for the view that was kept, whose `variables` are given."""
     camera = scene.camera
     return {
-        **variables,
+        **({} if scene.trajectory else variables),  # poses of a table are not drawn
         "injected": list(table.commanded(index)),
         # a named detector has its own architecture
         **({} if camera.detector else {"architecture": camera.architectures[int(table.architecture[index])]}),

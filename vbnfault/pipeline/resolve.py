@@ -13,6 +13,7 @@ from ..core import frames
 from ..core.errors import VbnfaultError
 from ..render.description import Sunlight
 from ..scene import plan
+from ..scene.trajectory import FlownPose
 from ..world import assemble
 from ..world.spacecraft import SpacecraftMesh
 from .spec import Pose, SampleSpec, Terrain
@@ -38,15 +39,15 @@ def resolve(spec: SampleSpec, first_try: int = 0) -> Pose:
     - if `sun_visibility` is "required", a sample whose faults need the Sun sees the whole Sun
     - enough of the frame is sunlit ground
 
-    A spacecraft that SPICE places keeps its pose.
+    A pose of a trajectory, from SPICE or from a table, is kept.
 
     Raises
     ------
     VbnfaultError
         No view meets the conditions; the message names the sample and the unmet conditions.
     """
-    if spec.scene.spice.spacecraft:
-        return _on_the_trajectory(spec)
+    if spec.scene.is_flown:
+        return _on_the_trajectory(spec, spec.flown or assemble.flown_pose(spec.scene))
     max_tries = spec.scene.geometry.max_tries
     unmet: dict[str, int] = {}
     for start in range(first_try, first_try + max_tries, _BATCH):
@@ -213,30 +214,30 @@ def _hidden_by(vehicle: SpacecraftMesh, fov_deg: float, height_over_width: float
     return vehicle.blocked(_grid_rays_C(fov_deg, height_over_width))
 
 
-def _on_the_trajectory(spec: SampleSpec) -> Pose:
-    """Return the pose that SPICE gives at the epoch of the sample.
+def _on_the_trajectory(spec: SampleSpec, flown: FlownPose) -> Pose:
+    """Return the pose of a trajectory, from SPICE or from a table, in L.
 
-    This pose was flown, so no other view is tried. A camera within the clearance of the ground shows that kernels
+    This pose was flown, so no other view is tried. A camera within the clearance of the ground shows that poses
     and shape do not belong together; this raises VbnfaultError. If a fault needs the Sun, but the Sun is hidden or
     behind the camera, the pose is marked as not resolved and the fault is not injected.
     """
     from .. import render
 
     scene, site, surface = spec.scene, spec.terrain.site, spec.terrain.surface
-    spacecraft = assemble.spacecraft_pose(scene, scene.sun.julian_date)
-    sun_J_au, T_from_J = assemble.ephemeris(scene)
     L_from_T = site.T_from_L.T
-    position = L_from_T @ (spacecraft.camera_position_T_m - site.position_T_m)
-    axes, sun_L = L_from_T @ spacecraft.T_from_C, L_from_T @ T_from_J @ frames.unit(sun_J_au)
+    position = L_from_T @ (flown.camera_position_T_m - site.position_T_m)
+    axes, sun_L = L_from_T @ flown.T_from_C, L_from_T @ flown.sun_direction_T
     light = assemble.sunlight(scene, sun_L)
     visible = float(render.sun_visible_fraction(surface, position[None], [light], axes[None])[0])
     azimuth, elevation = frames.azimuth_elevation_deg(sun_L)
     clearance = scene.geometry.clearance_m
     if not render.is_clear(surface, position[None], clearance)[0]:
+        change = "poses" if scene.trajectory else "dates"
+        made_for = "poses" if scene.trajectory else "kernels"
         raise VbnfaultError(
-            f"sample {spec.index}: at Julian date {scene.sun.julian_date:.6f} spice.spacecraft = "
-            f"{scene.spice.spacecraft!r} is within geometry.clearance_m = {clearance:g} m of the ground; choose "
-            f"other dates, or the body.shape that the kernels were made for"
+            f"sample {spec.index}: at Julian date {flown.julian_date:.6f} {flown.name} is within "
+            f"geometry.clearance_m = {clearance:g} m of the ground; choose other {change}, or the body.shape that "
+            f"the {made_for} were made for"
         )
     needs_sun = any(spec.faults[name].needs_sun for name in spec.commanded)
     return Pose(

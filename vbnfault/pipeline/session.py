@@ -21,7 +21,9 @@ from ..faults import Fault, dataset_order, from_dict, load_plugins, plugins_of
 from ..scene import config, plan
 from ..scene.config import Scene
 from ..scene.keyed_random import keyed_uniform
+from ..scene.trajectory import Trajectory, as_trajectory, load_trajectory, with_rows
 from ..world import assemble
+from ..world.ground import GroundDetail, ground_details
 from ..world.spacecraft import SpacecraftMesh
 from .record import to_sample
 from .spec import DEFAULT_TWINS, Frame, SampleSpec, Terrain
@@ -37,7 +39,9 @@ _STEEPEST_DETAIL = 0.12
 _FEWEST_KEPT = 0.05
 
 
-def simulate(scene: Scene | str | Path, sample: int = 0, *, threads: int | None = None) -> Sample:
+def simulate(
+    scene: Scene | str | Path, sample: int = 0, *, poses: object = None, threads: int | None = None
+) -> Sample:
     """Return one sample of a scene as the store would hold it.
 
     Each call makes the terrain and compiles the kernels anew; a `Session` keeps them for further samples.
@@ -47,7 +51,10 @@ def simulate(scene: Scene | str | Path, sample: int = 0, *, threads: int | None 
     scene
         A scene, the path of a scene file, or the name of a packaged scene.
     sample
-        Index of the sample, from 0 to below `dataset.samples`.
+        Index of the sample, from 0 to below `dataset.samples`, or a row of `poses`.
+    poses
+        Table of poses, each row of which is a sample: the path of a CSV or Parquet file, or a mapping from columns
+        to values, such as a data frame. It replaces the table `[trajectory]` of the scene, which has these columns.
     threads
         Render threads; by default every core.
 
@@ -60,7 +67,7 @@ def simulate(scene: Scene | str | Path, sample: int = 0, *, threads: int | None 
         source, scene = str(scene), config.load_scene(scene)
     else:
         source = "scene"
-    session = Session(scene, threads=threads, source=source)
+    session = Session(scene, threads=threads, source=source, poses=poses)
     if not 0 <= sample < len(session.plan):
         raise InputError(f"{source}: sample {sample}: must be from 0 to {len(session.plan) - 1}")
     return session.simulate(sample)
@@ -152,11 +159,13 @@ class Session:
         Render threads of this process.
     source
         Name of the scene in messages.
+    poses
+        Table of poses in place of that of the scene, as for `simulate`.
 
     Raises
     ------
     InputError
-        The scene cannot be used.
+        The scene cannot be used, or plans more samples than its table of poses has rows.
     """
 
     def __init__(
@@ -166,13 +175,26 @@ class Session:
         blocks: Sequence[int] | None = None,
         threads: int | None = None,
         source: str = "scene",
+        poses: object = None,
     ) -> None:
-        self.scene = scene
+        self.trajectory: Trajectory | None = None
+        if poses is not None:
+            self.trajectory = as_trajectory(poses)
+        elif scene.trajectory is not None:
+            self.trajectory = load_trajectory(scene.trajectory.file)
+        self.scene = scene = with_rows(scene, None if poses is None else self.trajectory)
         self.faults = configure_faults(scene, source)
         need_sun = [name for name, fault in self.faults.items() if fault.needs_sun]
         self.plan = plan.make_plan(scene, list(self.faults), blocks, need_sun=need_sun)
+        if self.trajectory is not None and len(self.plan) > len(self.trajectory):
+            raise InputError(
+                f"{source}: {len(self.plan)} samples are planned, but {self.trajectory.source} has "
+                f"{len(self.trajectory)} rows, and each is a sample; append at most its further rows"
+            )
         self._threads = threads
+        self._ground: dict[int, list[GroundDetail]] = {}  # of the rows of a site
         self._terrain: Terrain | None = None
+        self._terrain_key: int | GroundDetail | None = None
         self._compiled = False  # the first sample compiles the kernels
 
     @cached_property
@@ -206,17 +228,43 @@ class Session:
 
     def terrain(self, site: int) -> Terrain:
         """Return the terrain of a site. Only the last one is kept."""
-        if self._terrain is None or self._terrain.site.index != site:
-            from .. import render
-
-            if self._threads is not None:
-                render.set_threads(self._threads)
+        if self._terrain is None or self._terrain_key != site:
             self._terrain = None  # release the old one first: a small machine has no memory for two
-            activity.begin(f"terrain of site {site}")
-            patch = self.patch(self.sites[site])
-            surface = self.surface(patch)
-            self._terrain = Terrain(body=self.body, site=patch.site, surface=surface, vehicle=self.vehicle)
+            self._terrain = self._new_terrain(self.sites[site])
+            self._terrain_key = site
         return self._terrain
+
+    def flown_terrain(self, index: int) -> Terrain:
+        """Return the terrain of a row of the table of poses. Rows share terrains; only the last one is kept."""
+        detail = self.ground_detail(index)
+        if self._terrain is None or self._terrain_key != detail:
+            self._terrain = None
+            self._terrain = self._new_terrain(detail.site(self.body, 0), detail)
+            self._terrain_key = detail
+        return self._terrain
+
+    def ground_detail(self, index: int) -> GroundDetail:
+        """Return where and how finely the terrain of a row of the table of poses is refined."""
+        trajectory = self.trajectory
+        assert trajectory is not None
+        number, row = divmod(index, self.scene.dataset.shard_samples)
+        if number not in self._ground:
+            first = index - row
+            last = min(first + self.scene.dataset.shard_samples, len(trajectory))
+            poses = [trajectory.pose(k) for k in range(first, last)]
+            self._ground[number] = ground_details(self.scene, self.body, poses)
+        return self._ground[number][row]
+
+    def _new_terrain(self, site: Site, detail: GroundDetail | None = None) -> Terrain:
+        """Return the terrain of a site, for a pose of a table with its own detail."""
+        from .. import render
+
+        if self._threads is not None:
+            render.set_threads(self._threads)
+        activity.begin(f"terrain of site {site.index}")
+        patch = self.patch(site, detail)
+        surface = self.surface(patch)
+        return Terrain(body=self.body, site=patch.site, surface=surface, vehicle=self.vehicle)
 
     def surface(self, patch: Patch) -> TerrainMesh:
         """Return the renderer's copy of a patch, with relief finer than its facets and the scene's spacecraft."""
@@ -244,8 +292,11 @@ class Session:
             fine=replace(fine, slope=slope),
         )
 
-    def patch(self, site: Site) -> Patch:
-        """Return the ground of a site, from the cache if it was built before."""
+    def patch(self, site: Site, detail: GroundDetail | None = None) -> Patch:
+        """Return the ground of a site, from the cache if it was built before.
+
+        `detail`: facets and boulders for a pose of a table, in place of those of the scene.
+        """
         table = self.scene.patch
         spec = PatchSpec(
             seed=self.scene.dataset.seed,
@@ -259,6 +310,14 @@ class Session:
             boulders_per_km2=table.boulders_per_km2,
             max_triangles=max(table.max_triangles, 2 * len(self.body.faces)),
         )
+        if detail is not None:
+            spec = replace(
+                spec,
+                facet_m=detail.facet_m,
+                radius_m=detail.radius_m,
+                min_boulder_m=detail.boulder_m if table.boulders else 1e6,
+                boulder_near_m=max(detail.radius_m, spec.boulder_near_m),
+            )
         patch = cached_patch(self.body, site, spec)
         kept = len(patch.boulder_diameter_m)
         if kept < _FEWEST_KEPT * patch.boulders_drawn:
@@ -273,13 +332,24 @@ class Session:
     def spec(self, index: int) -> SampleSpec:
         """Return everything that `simulate` needs for one sample.
 
-        On a spacecraft's trajectory every sample has its own date.
+        On a trajectory every sample has its own date, and with a table of poses its own distance of the Sun.
         """
         scene, site = self.scene, int(self.plan.site[index])
         if scene.spice.spacecraft:
             fraction = float(keyed_uniform(scene.dataset.seed, np.array([index]), "plan", "epoch")[0])
             sun = scene.sun.model_copy(update={"julian_date": assemble.epoch_jd(scene, site, fraction)})
             scene = scene.model_copy(update={"sun": sun})
+        if self.trajectory is not None:
+            flown = self.trajectory.pose(index)
+            values = {"julian_date": flown.julian_date, "distance_au": flown.sun_distance_au}
+            return SampleSpec(
+                index=index,
+                scene=scene.model_copy(update={"sun": scene.sun.model_copy(update=values)}),
+                plan=self.plan,
+                faults=self.faults,
+                terrain=self.flown_terrain(index),
+                flown=flown,
+            )
         return SampleSpec(index=index, scene=scene, plan=self.plan, faults=self.faults, terrain=self.terrain(site))
 
     def simulate(self, index: int) -> Sample:

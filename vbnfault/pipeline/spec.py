@@ -18,6 +18,7 @@ from ..lens import Lens
 from ..render.description import RenderInput
 from ..scene import keyed_random, plan
 from ..scene.config import DatasetTable, Scene
+from ..scene.trajectory import FlownPose
 from ..world import assemble
 from ..world.spacecraft import SpacecraftMesh
 
@@ -44,8 +45,8 @@ class Pose:
     """Hold the outcome of `resolve`: the position and attitude of the camera, and the Sun.
 
     `tries` counts the views drawn; this is the last of them. `variables` are the values of the plan, by the names
-    of `plan.VARIABLES`. `resolved` says whether every condition is met. It is False only if SPICE places the
-    camera, a fault of the sample needs the Sun, and the camera does not see the whole Sun ahead.
+    of `plan.VARIABLES`. `resolved` says whether every condition is met. It is False only if a trajectory places
+    the camera, a fault of the sample needs the Sun, and the camera does not see the whole Sun ahead.
     """
 
     position_L_m: F64
@@ -61,13 +62,17 @@ class Pose:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SampleSpec:
-    """Hold one sample of a plan, with everything that `simulate` needs."""
+    """Hold one sample of a plan, with everything that `simulate` needs.
+
+    `flown` is the pose of the sample if a table of poses gives it.
+    """
 
     index: int
     scene: Scene
     plan: plan.Plan
     faults: Mapping[str, Fault]
     terrain: Terrain
+    flown: FlownPose | None = None
 
     @property
     def seed(self) -> int:

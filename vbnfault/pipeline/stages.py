@@ -101,7 +101,7 @@ def _take_view(spec: SampleSpec, run: StageRunner, *, views: int, first_try: int
 def _asking_for_another_view(spec: SampleSpec, injection: Injection) -> list[str]:
     """Return the commanded faults that are not in the image, but that another view of the sample might show."""
     scene = spec.scene
-    if scene.plan.on_invisible == "drop" or scene.spice.spacecraft:
+    if scene.plan.on_invisible == "drop" or scene.is_flown:
         return []
     # with "as_drawn" the Sun may be hidden, so faults that need it may be absent
     as_drawn = scene.geometry.sun_visibility == "as_drawn"

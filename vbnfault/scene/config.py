@@ -22,6 +22,7 @@ from .instrument import OF_A_SENSOR_FILE, CameraTable, RenderTable
 from .sampling import DatasetTable, GeometryTable, PlanTable, StratumTable
 from .surroundings import OrbitTable, SkyTable, SpacecraftTable, SpiceTable, SunTable
 from .target import BodyTable, PatchTable
+from .trajectory import TrajectoryTable, with_rows
 
 # Values of body.shape and of spacecraft.model that do not name a file.
 _SHAPES = ("embedded", "ellipsoid")
@@ -47,6 +48,7 @@ class Scene(Table):
     sun: SunTable = SunTable()
     orbit: OrbitTable | None = None
     spice: SpiceTable = SpiceTable()
+    trajectory: TrajectoryTable | None = None
     spacecraft: SpacecraftTable = SpacecraftTable()
     sky: SkyTable = SkyTable()
     camera: CameraTable = CameraTable()
@@ -64,6 +66,20 @@ class Scene(Table):
                 f"has {width_px * height_px * bands} radiances; must be at most {_MOST_RADIANCES}, 1 GiB"
             )
         return self
+
+    @model_validator(mode="after")
+    def _one_trajectory(self) -> Scene:
+        if self.trajectory is not None and self.spice.spacecraft:
+            raise ValueError(
+                f"trajectory.file = {self.trajectory.file!r}: spice.spacecraft = {self.spice.spacecraft!r} gives "
+                "poses, too; leave one out"
+            )
+        return self
+
+    @property
+    def is_flown(self) -> bool:
+        """Return whether poses and Sun are those of a trajectory: of a table of poses, or of SPICE."""
+        return self.trajectory is not None or bool(self.spice.spacecraft)
 
     @model_validator(mode="after")
     def _strata(self) -> Scene:
@@ -122,7 +138,11 @@ def load_scene(name_or_path: str | Path, overrides: Mapping[str, Any] | None = N
         _anchor_paths(table, path.parent, overrides or ())
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
-    return parse_scene(table, source=str(path), overrides=tuple(overrides or ()))
+    scene = parse_scene(table, source=str(path), overrides=tuple(overrides or ()))
+    try:
+        return with_rows(scene)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
 
 
 def parse_scene(table: Mapping[str, Any], *, source: str, overrides: Sequence[str] = ()) -> Scene:
@@ -178,6 +198,7 @@ def _anchor_paths(table: dict[str, Any], folder: Path, overrides: Collection[str
     anchor(table.get("spacecraft"), "spacecraft.model", _VEHICLES)
     anchor_file(table.get("camera"), "camera.lens")
     anchor_file(table.get("camera"), "camera.detector")
+    anchor(table.get("trajectory"), "trajectory.file")
     kernels = table.get("spice")
     if isinstance(kernels, dict) and isinstance(kernels.get("kernels"), list):
         kernels["kernels"] = [

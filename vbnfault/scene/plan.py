@@ -467,6 +467,8 @@ def _shard_sites(scene: Scene, shards: int) -> NDArray[np.int32]:
     Sites come in shuffled rounds, so they are used evenly. In the order of the first round, every split comes as
     early as possible.
     """
+    if scene.trajectory is not None:  # a site stands for the rows of a shard, which lie side by side
+        return np.arange(shards, dtype=np.int32)
     sites = scene.dataset.sites
     rounds = -(-shards // sites)
     key = keyed_random.keyed_uniform(scene.dataset.seed, np.arange(rounds * sites, dtype=np.int64), "plan", "sites")

@@ -63,7 +63,8 @@ def root_attributes(spec: StoreSpec, samples: int) -> dict[str, Any]:
             "format_version": FORMAT_VERSION,
             "store": json.loads(json.dumps(spec.plain())),
             "samples": samples,
-            "coordinates": "wavelength_nm",  # xarray then shows it as a coordinate of `band`
+            # xarray then shows them as coordinates of `band` and `sample`
+            "coordinates": "wavelength_nm name" if spec.sample_names else "wavelength_nm",
         }
     )
 

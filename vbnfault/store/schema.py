@@ -211,6 +211,9 @@ class StoreSpec:
         For each of `faults`, the name of its soft layer, or "".
     site_names, lens_names, detector_names
         Names that the integer arrays `site`, `lens` and `detector_individual` index.
+    sample_names
+        Names of the samples, at least as many as there are samples, if the rows of a trajectory name them; they
+        become the coordinate `name`.
     distortion_residual_px
         Root mean square and maximum deviation of the stored distortion coefficients from the lens's chief rays,
         over the lit frame.
@@ -247,6 +250,7 @@ class StoreSpec:
     attitude_references: tuple[str, ...] = ("sun", "sun")
     centre_of_mass_T_m: tuple[float, float, float] | None = None
     detector_names: tuple[str, ...] = ()
+    sample_names: tuple[str, ...] = ()
     radiance_dtype: str = "float16"
     shard_samples: int = 0
     attributes: Mapping[str, Any] = field(default_factory=dict)
@@ -371,6 +375,11 @@ class StoreSpec:
             "layer": _coordinate("layer", self.checked, long_name="what a checksum covers"),
             **{name: _coordinate(name, tuple(labels), long_name=name) for name, labels in _LABELS.items()},
             **(bands if self.wavelength_nm else {}),
+            **(
+                {"name": _coordinate("sample", self.sample_names[:samples], long_name="name of the sample")}
+                if self.sample_names
+                else {}
+            ),
             "sample": _coordinate("sample", np.arange(samples, dtype=np.int64), long_name="sample"),
         }
 
@@ -388,7 +397,10 @@ class StoreSpec:
     def plain(self) -> dict[str, Any]:
         """Return the fields as plain data, without the root attributes; `spec_from_plain` reads them back."""
         # asdict would copy the whole scene first
-        return {f.name: getattr(self, f.name) for f in fields(self) if f.name != "attributes"}
+        plain = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "attributes"}
+        if not self.sample_names:
+            del plain["sample_names"]  # stores without names stay as they were
+        return plain
 
 
 def spec_from_plain(plain: Mapping[str, Any], attributes: Mapping[str, Any]) -> StoreSpec:

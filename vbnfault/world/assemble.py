@@ -24,7 +24,9 @@ from ..scene.instrument import THIN_LENS, CameraTable
 from ..scene.keyed_random import rng
 from ..scene.surroundings import OrbitTable, PoseTable, SpiceTable, SunTable
 from ..scene.target import BodyTable
+from ..scene.trajectory import FlownPose
 from . import sky
+from .ground import looked_at
 from .spacecraft import HingePose, ModelPlacement, Spacecraft, SpacecraftMesh, default_spacecraft, load_spacecraft
 
 if TYPE_CHECKING:
@@ -117,20 +119,18 @@ def trajectory_sites(scene: Scene, body: Body) -> Sites:
     return Sites(scene.dataset.sites, site)
 
 
-def looked_at(body: Body, origin_T_m: F64, direction_T: F64) -> F64:
-    """Return where a ray first meets the body's shape model, float64[3] in m in T, or else the nearest vertex."""
-    a, b, c = (body.vertices_m[body.faces[:, k]] - origin_T_m for k in range(3))
-    normal = np.cross(b - a, c - a)
-    turn = np.stack([np.cross(p, q) @ direction_T for p, q in ((a, b), (b, c), (c, a))])
-    facing = normal @ direction_T
-    with np.errstate(divide="ignore", invalid="ignore"):
-        distance = np.einsum("ni,ni->n", a, normal) / facing
-    hit = ((turn >= 0).all(axis=0) | (turn <= 0).all(axis=0)) & (distance > 0)
-    if hit.any():
-        return np.asarray(origin_T_m + distance[hit].min() * direction_T)
-    away = body.vertices_m - origin_T_m
-    along = np.maximum(away @ direction_T, 0)
-    return np.asarray(body.vertices_m[np.argmin(np.linalg.norm(away - along[:, None] * direction_T, axis=1))])
+def flown_pose(scene: Scene) -> FlownPose:
+    """Return camera and Sun in T from SPICE, at the scene's date. Raises InputError if kernels lack the data."""
+    spacecraft = spacecraft_pose(scene, scene.sun.julian_date)
+    sun_J_au, T_from_J = ephemeris(scene)
+    return FlownPose(
+        name=f"spice.spacecraft = {scene.spice.spacecraft!r}",
+        julian_date=scene.sun.julian_date,
+        camera_position_T_m=spacecraft.camera_position_T_m,
+        T_from_C=spacecraft.T_from_C,
+        sun_direction_T=T_from_J @ frames.unit(sun_J_au),
+        sun_distance_au=sun_distance_au(scene),
+    )
 
 
 def sun_distance_au(scene: Scene) -> float:
@@ -159,7 +159,7 @@ def target_attitude(scene: Scene, sun_T: F64) -> F64:
 
 def attitude_references(scene: Scene) -> tuple[str, str]:
     """Return the references of attitudes ("sun", "nadir" or "centre"): Sun-facing stratum, Sun-averted stratum."""
-    if scene.spice.spacecraft:  # the kernels give the attitude, and it is stored relative to the Sun
+    if scene.is_flown:  # the attitude was not drawn, and it is stored relative to the Sun
         return "sun", "sun"
     facing, averted = scene.geometry.sun_facing, scene.geometry.sun_averted
     assert facing is not None

@@ -1,0 +1,316 @@
+"""Read a table of poses: each row is a sample with its camera, its Sun, its date and its name.
+
+The frames are those of `core.frames`. T is the body-fixed frame of the shape file. The camera's axes C are x image
+right, y image down, z boresight. The quaternion `camera_from_T` (w first) takes the components of a vector from T
+to C, so that a point p of the body lies at R(camera_from_T) · (p - camera_T_m) in C.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from ..core import file_contents, user_files
+from ..core.errors import InputError, shown
+from ..core.tables import Table
+
+if TYPE_CHECKING:
+    from .config import Scene
+
+F64 = NDArray[np.float64]
+
+TYPES = (".csv", ".parquet")
+# Numeric column → its allowed range. Quaternion and Sun may exceed 1 by rounding; their norms are checked below.
+_UNIT = (-1.001, 1.001)
+_NUMBERS: dict[str, tuple[float, float]] = {
+    "julian_date": (1_000_000, 5_000_000),
+    **dict.fromkeys(("camera_x_T_m", "camera_y_T_m", "camera_z_T_m"), (-1e12, 1e12)),
+    **dict.fromkeys((f"camera_from_T_{axis}" for axis in "wxyz"), _UNIT),
+    **dict.fromkeys(("sun_x_T", "sun_y_T", "sun_z_T"), _UNIT),
+    "sun_distance_au": (0.01, 1000),
+}
+COLUMNS = ("name", *_NUMBERS)
+# Largest deviation of the norm of a quaternion or of the Sun's direction from 1; they are then scaled to 1. Four
+# decimals, as in many labels of images, keep it below 2e-4.
+NORM_TOLERANCE = 1e-3
+_LONGEST_NAME = 200
+_MOST_SITES = 100_000  # of `dataset.sites`
+_IN_PYTHON = "poses"  # stands for the file's name where the table was given in Python
+
+
+class TrajectoryTable(Table):
+    """Name a table of poses. Every row is a sample, seen from there: its camera, its Sun, its date and its name.
+
+    `dataset.samples` is then the number of rows by default, and `[geometry]` with its bounds does not apply.
+    """
+
+    file: str = Field(
+        min_length=1,
+        description="CSV or Parquet file with the columns name, julian_date, camera_x_T_m, camera_y_T_m, "
+        "camera_z_T_m, camera_from_T_w, camera_from_T_x, camera_from_T_y, camera_from_T_z, sun_x_T, sun_y_T, "
+        "sun_z_T and sun_distance_au",
+    )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FlownPose:
+    """Hold one row: camera and Sun in T.
+
+    `T_from_C` float64[3, 3] has the camera's axes as columns. `sun_direction_T` float64[3] is a unit vector towards
+    the Sun.
+    """
+
+    name: str
+    julian_date: float
+    camera_position_T_m: F64
+    T_from_C: F64
+    sun_direction_T: F64
+    sun_distance_au: float
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Trajectory:
+    """Hold a table of n poses.
+
+    Attributes
+    ----------
+    source
+        The file, for messages.
+    name
+        n different texts.
+    julian_date
+        float64[n], TDB.
+    camera_position_T_m
+        float64[n, 3].
+    camera_from_T
+        float64[n, 4], unit quaternions, w first.
+    sun_direction_T
+        float64[n, 3], unit vectors towards the Sun.
+    sun_distance_au
+        float64[n].
+    """
+
+    source: str
+    name: tuple[str, ...]
+    julian_date: F64
+    camera_position_T_m: F64
+    camera_from_T: F64
+    sun_direction_T: F64
+    sun_distance_au: F64
+
+    def __len__(self) -> int:
+        return len(self.name)
+
+    def pose(self, index: int) -> FlownPose:
+        """Return one row, counted from 0."""
+        w, x, y, z = self.camera_from_T[index]
+        camera_from_T = np.array(
+            [
+                [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+                [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+                [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+            ]
+        )
+        return FlownPose(
+            name=self.name[index],
+            julian_date=float(self.julian_date[index]),
+            camera_position_T_m=self.camera_position_T_m[index],
+            T_from_C=camera_from_T.T,
+            sun_direction_T=self.sun_direction_T[index],
+            sun_distance_au=float(self.sun_distance_au[index]),
+        )
+
+
+def with_rows(scene: Scene, trajectory: Trajectory | None = None) -> Scene:
+    """Return the scene with the numbers of samples and sites that its table of poses has.
+
+    A sample is a row. A site stands for `dataset.shard_samples` consecutive rows, which share a split.
+
+    Parameters
+    ----------
+    scene
+        The scene. Without a trajectory it is returned as it is.
+    trajectory
+        Table given in Python, which replaces that of the scene: all its rows are samples.
+
+    Raises
+    ------
+    InputError
+        The table is wrong, or has fewer rows than the scene has samples.
+    """
+    if trajectory is not None:
+        scene = scene.model_copy(update={"trajectory": TrajectoryTable(file=_IN_PYTHON)})
+        samples: int | None = len(trajectory)
+    elif scene.trajectory is None:
+        return scene
+    else:
+        trajectory = load_trajectory(scene.trajectory.file)
+        samples = scene.dataset.samples if "samples" in scene.dataset.model_fields_set else len(trajectory)
+        if samples > len(trajectory):
+            raise InputError(
+                f"dataset.samples = {samples}: {trajectory.source} has {len(trajectory)} rows, and each is a "
+                f"sample; must be from 1 to {len(trajectory)}, or be left out"
+            )
+    sites = -(-len(trajectory) // scene.dataset.shard_samples)
+    if sites > _MOST_SITES:
+        raise InputError(
+            f"{trajectory.source}: has {len(trajectory)} rows; must have at most "
+            f"{_MOST_SITES * scene.dataset.shard_samples}, {_MOST_SITES} times dataset.shard_samples"
+        )
+    return scene.model_copy(
+        update={"dataset": scene.dataset.model_copy(update={"samples": samples, "sites": sites})}
+    )
+
+
+@file_contents.cached_with_contents(maxsize=4)
+def load_trajectory(path: str) -> Trajectory:
+    """Return the poses in a CSV or Parquet file. Raises InputError."""
+    data = user_files.read_input(path, "trajectory", types=TYPES)
+    columns = _csv_columns(data, path) if Path(path).suffix.lower() == ".csv" else _parquet_columns(data, path)
+    return _checked(columns, path)
+
+
+def as_trajectory(poses: Trajectory | str | Path | Mapping[str, Sequence[Any]] | Any) -> Trajectory:
+    """Return poses as a `Trajectory`.
+
+    Parameters
+    ----------
+    poses
+        A trajectory, the path of a CSV or Parquet file, or a table in memory: a mapping from the names of the
+        columns to their values, such as a pandas data frame.
+
+    Raises
+    ------
+    InputError
+        The poses are no such table, or a value is wrong.
+    """
+    if isinstance(poses, Trajectory):
+        return poses
+    if isinstance(poses, str | Path):
+        return load_trajectory(str(poses))
+    try:
+        columns = {str(name): list(poses[name]) for name in poses}
+    except (TypeError, KeyError, IndexError, ValueError):
+        raise InputError(
+            f"poses = {shown(poses)}: must be a path, a data frame, or a mapping from columns to values"
+        ) from None
+    return _checked(columns, _IN_PYTHON)
+
+
+def _csv_columns(data: bytes, source: str) -> dict[str, list[Any]]:
+    """Return the columns of a CSV file, as texts. Raises InputError."""
+    try:
+        rows = [row for row in csv.reader(io.StringIO(data.decode("utf-8-sig"), newline=""), strict=True) if row]
+    except UnicodeDecodeError as error:
+        raise InputError(f"{source}: byte {error.start} is no UTF-8; a CSV file must be UTF-8 text") from None
+    except csv.Error as error:
+        raise InputError(f"{source}: is no CSV file: {error}") from None
+    header = [name.strip() for name in rows[0]] if rows else []
+    twice = next((name for k, name in enumerate(header) if name in header[:k]), None)
+    if twice is not None:
+        raise InputError(f"{source}: column {shown(twice)} stands twice in the first line; must stand once")
+    for number, row in enumerate(rows[1:], 1):
+        if len(row) != len(header):
+            raise InputError(
+                f"{source}: row {number} has {len(row)} values; must have {len(header)}, as the first line has"
+            )
+    return {name: [row[k].strip() for row in rows[1:]] for k, name in enumerate(header)}
+
+
+def _parquet_columns(data: bytes, source: str) -> dict[str, list[Any]]:
+    """Return the columns of a Parquet file. Raises InputError."""
+    import pyarrow
+    import pyarrow.parquet
+
+    try:
+        table = pyarrow.parquet.read_table(io.BytesIO(data))
+        return {name: table.column(k).to_pylist() for k, name in enumerate(table.column_names)}
+    except (pyarrow.ArrowException, OSError, ValueError) as error:
+        raise InputError(f"{source}: is no Parquet file: {' '.join(str(error).split())[:200]}") from None
+
+
+def _checked(columns: Mapping[str, Sequence[Any]], source: str) -> Trajectory:
+    """Return columns as a trajectory. Raises InputError for a wrong column or value."""
+    missing = [name for name in COLUMNS if name not in columns]
+    unknown = [name for name in columns if name not in COLUMNS]
+    if missing or unknown:
+        clauses = [f"columns are missing: {', '.join(missing)}"] if missing else []
+        clauses += [f"unknown columns: {', '.join(shown(name) for name in unknown[:5])}"] if unknown else []
+        raise InputError(f"{source}: {'; '.join(clauses)}; must have exactly the columns {', '.join(COLUMNS)}")
+    count = len(columns["name"])
+    if not count:
+        raise InputError(f"{source}: has no rows; must have at least 1, each a pose")
+    for name in COLUMNS:
+        if len(columns[name]) != count:
+            raise InputError(
+                f"{source}: column {name} has {len(columns[name])} rows; must have {count}, as name has"
+            )
+    values = {name: _numbers(columns[name], name, source) for name in _NUMBERS}
+    return Trajectory(
+        source=source,
+        name=_names(columns["name"], source),
+        julian_date=values["julian_date"],
+        camera_position_T_m=np.stack([values[f"camera_{axis}_T_m"] for axis in "xyz"], axis=1),
+        camera_from_T=_units(values, [f"camera_from_T_{axis}" for axis in "wxyz"], source),
+        sun_direction_T=_units(values, [f"sun_{axis}_T" for axis in "xyz"], source),
+        sun_distance_au=values["sun_distance_au"],
+    )
+
+
+def _names(column: Sequence[Any], source: str) -> tuple[str, ...]:
+    """Return the names of the rows. Raises InputError for one that is no text, empty, too long or used before."""
+    first: dict[str, int] = {}
+    for row, name in enumerate(column, 1):
+        if not isinstance(name, str) or not 1 <= len(name) <= _LONGEST_NAME or not name.isprintable():
+            raise InputError(
+                f"{source}: row {row}: name = {shown(name)}: must be a printable text of 1 to {_LONGEST_NAME} "
+                "characters"
+            )
+        if first.setdefault(name, row) != row:
+            raise InputError(
+                f"{source}: row {row}: name = {shown(name)}: row {first[name]} has this name; must differ in every "
+                "row"
+            )
+    return tuple(column)
+
+
+def _numbers(column: Sequence[Any], name: str, source: str) -> F64:
+    """Return a column as float64[n]. Raises InputError for a value that is no number, or out of its range."""
+    low, high = _NUMBERS[name]
+    out = np.empty(len(column))
+    for row, value in enumerate(column):
+        try:
+            if isinstance(value, bool) or (isinstance(value, str) and "_" in value):
+                raise ValueError
+            out[row] = float(value)
+        except (TypeError, ValueError, OverflowError):
+            out[row] = np.nan
+    wrong = np.flatnonzero(~((out >= low) & (out <= high)))
+    if len(wrong):
+        value = column[int(wrong[0])]
+        raise InputError(
+            f"{source}: row {wrong[0] + 1}: {name} = {value if isinstance(value, float) else shown(value)}: must "
+            f"be a number from {low:.10g} to {high:.10g}"
+        )
+    return out
+
+
+def _units(values: Mapping[str, F64], names: Sequence[str], source: str) -> F64:
+    """Return columns as unit vectors float64[n, k]. Raises InputError where a norm is not nearly 1."""
+    vectors = np.stack([values[name] for name in names], axis=1)
+    norm = np.linalg.norm(vectors, axis=1)
+    wrong = np.flatnonzero(np.abs(norm - 1) > NORM_TOLERANCE)
+    if len(wrong):
+        raise InputError(
+            f"{source}: row {wrong[0] + 1}: {', '.join(names)}: their norm is {norm[wrong[0]]:.6g}; must be from "
+            f"{1 - NORM_TOLERANCE:g} to {1 + NORM_TOLERANCE:g}"
+        )
+    return np.asarray(vectors / norm[:, None])

@@ -1,0 +1,192 @@
+"""Choose the terrain for poses of a trajectory, so that its facets are about a pixel wide, from any distance.
+
+Far away, the whole body is refined evenly, and all poses share it. Where this would take too many triangles, the
+terrain is refined where the camera looks, as at a site of `[geometry]`: evenly over the ground in the frame, and
+beyond with facets that grow with the distance. Near the ground, `[patch]` sets the smallest facets. There is no
+border between these cases: facets are about a pixel wide in all of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..body import Body, Site, site_at
+from ..scene.config import Scene
+from ..scene.trajectory import FlownPose
+
+F64 = NDArray[np.float64]
+
+# Mean edge of a facet, in pixels of the nearest ground in the frame.
+FACET_PX = 1.0
+# Smallest boulder, in pixels of the nearest ground in the frame.
+_BOULDER_PX = 2.0
+# Area of an equilateral triangle with edges of length 1.
+_TRIANGLE = 3**0.5 / 4
+# Fraction of the triangles for the even ground. The ground takes 0.66 of them (`body.patch`). Where one terrain
+# serves several poses, half of this is left to the ground around.
+_EVEN_FRACTION, _SHARED_FRACTION = 0.66, 0.33
+# Rays across the frame, on each side, that look for ground between the vertices of a coarse shape model.
+_RAYS = 3
+# Distances are rounded down to a power of this, so that poses at nearly the same distance share a terrain.
+_STEP = 2**0.5
+
+
+@dataclass(frozen=True, kw_only=True)
+class GroundDetail:
+    """Describe where and how finely the terrain of poses is refined. Equal objects mean the same terrain.
+
+    `position_T_m` is the origin of L. Facets measure `facet_m` within `radius_m` of it, boulders at least
+    `boulder_m`.
+    """
+
+    position_T_m: tuple[float, float, float]
+    facet_m: float
+    radius_m: float
+    boulder_m: float
+
+    def site(self, body: Body, index: int) -> Site:
+        """Return the site at the origin of L."""
+        return site_at(body, index, self.position_T_m)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Seen:
+    """Hold ground points in a frame, float64[k, 3] in T, and their distances from the camera, float64[k]."""
+
+    points_T_m: F64
+    distance_m: F64
+
+
+def ground_details(scene: Scene, body: Body, poses: Sequence[FlownPose]) -> list[GroundDetail]:
+    """Return the terrain of each of several consecutive poses.
+
+    Neighbours share a terrain where its triangles suffice for them. The result depends on scene, body and these
+    poses only.
+    """
+    whole = [_whole_body(scene, body, pose) for pose in poses]
+    details: list[GroundDetail | None] = list(whole)
+    group: list[int] = []
+    seen: list[_Seen] = []
+
+    def close() -> None:
+        if group:
+            shared = _around(scene, seen)
+            for k in group:
+                details[k] = shared
+            group.clear()
+            seen.clear()
+
+    budget = _SHARED_FRACTION * scene.patch.max_triangles
+    for k, pose in enumerate(poses):
+        if whole[k] is not None:
+            continue
+        here = _seen(scene, body, pose)
+        if group and _even_triangles(_around(scene, [*seen, here])) > budget:
+            close()
+        group.append(k)
+        seen.append(here)
+    close()
+    return [detail for detail in details if detail is not None]
+
+
+def pixel_rad(scene: Scene) -> float:
+    """Return the angle that a pixel in the middle of the frame subtends."""
+    return float(2 * np.tan(np.radians(scene.camera.fov_deg) / 2) / scene.camera.width_px)
+
+
+def _rounded(length_m: float) -> float:
+    """Return a length rounded down to a power of `_STEP`."""
+    return float(_STEP ** np.floor(np.log(max(length_m, 1e-3)) / np.log(_STEP) + 1e-9))
+
+
+def _whole_body(scene: Scene, body: Body, pose: FlownPose) -> GroundDetail | None:
+    """Return the terrain that is even all over the body, or None if it would take too many triangles.
+
+    Its origin is the vertex with the largest x in T, the same for all poses.
+    """
+    nearest_m = float(np.linalg.norm(body.vertices_m - pose.camera_position_T_m, axis=1).min())
+    facet_m = max(scene.patch.facet_m, FACET_PX * pixel_rad(scene) * _rounded(nearest_m))
+    if body.area_m2 > _EVEN_FRACTION * scene.patch.max_triangles * _TRIANGLE * facet_m**2:
+        return None
+    origin = body.vertices_m[np.argmax(body.vertices_m[:, 0])]
+    return _detail(scene, origin, facet_m, float(np.linalg.norm(body.vertices_m - origin, axis=1).max()))
+
+
+def _around(scene: Scene, seen: Sequence[_Seen]) -> GroundDetail:
+    """Return the terrain for the ground in several frames.
+
+    Its origin is the ground nearest to a camera. A point at the distance d from its camera and s from the origin
+    has facets of a pixel if the even radius is at least s · d_nearest / d.
+    """
+    points = np.concatenate([part.points_T_m for part in seen])
+    distance = np.concatenate([part.distance_m for part in seen])
+    nearest = int(np.argmin(distance))
+    origin, least_m = points[nearest], float(distance[nearest])
+    radius_m = float((np.linalg.norm(points - origin, axis=1) * least_m / distance).max())
+    facet_m = max(scene.patch.facet_m, FACET_PX * pixel_rad(scene) * _rounded(least_m))
+    return _detail(scene, origin, facet_m, max(radius_m, scene.patch.radius_m))
+
+
+def _detail(scene: Scene, origin_T_m: F64, facet_m: float, radius_m: float) -> GroundDetail:
+    """Return a terrain with the boulders that facets of this size can show."""
+    x, y, z = (float(v) for v in origin_T_m)
+    boulder_m = max(scene.patch.min_boulder_m, _BOULDER_PX * facet_m / FACET_PX)
+    if facet_m == scene.patch.facet_m:  # pixels are smaller than facets
+        boulder_m = scene.patch.min_boulder_m
+    return GroundDetail(position_T_m=(x, y, z), facet_m=facet_m, radius_m=radius_m, boulder_m=boulder_m)
+
+
+def _even_triangles(detail: GroundDetail) -> float:
+    """Return about how many triangles the even ground takes."""
+    return float(np.pi * detail.radius_m**2 / (_TRIANGLE * detail.facet_m**2))
+
+
+def _seen(scene: Scene, body: Body, pose: FlownPose) -> _Seen:
+    """Return the ground in a frame: the vertices that face the camera, and what a few rays meet.
+
+    Ground behind other ground may be included. If there is none, it is the vertex nearest to the line of sight.
+    """
+    camera = scene.camera
+    slope = np.tan(np.radians(camera.fov_deg) / 2)
+    slopes = slope * np.array([1.0, camera.height_px / camera.width_px])
+    away = body.vertices_m - pose.camera_position_T_m
+    x, y, z = (away @ pose.T_from_C).T
+    framed = (z > 0) & (np.abs(x) <= slopes[0] * z) & (np.abs(y) <= slopes[1] * z)
+    facing = np.einsum("ni,ni->n", body.vertex_normals, away) < 0
+    points = [body.vertices_m[framed & facing]]
+    for across in np.linspace(-slopes[0], slopes[0], _RAYS):
+        for down in np.linspace(-slopes[1], slopes[1], _RAYS):
+            towards = pose.T_from_C @ np.array([across, down, 1.0])
+            hit = first_hit(body, pose.camera_position_T_m, towards / np.linalg.norm(towards))
+            points += [] if hit is None else [hit[None]]
+    ground = np.concatenate(points)
+    if not len(ground):
+        ground = looked_at(body, pose.camera_position_T_m, pose.T_from_C[:, 2])[None]
+    distance = np.linalg.norm(ground - pose.camera_position_T_m, axis=1)
+    return _Seen(points_T_m=ground, distance_m=np.maximum(distance, 1e-3))
+
+
+def looked_at(body: Body, origin_T_m: F64, direction_T: F64) -> F64:
+    """Return where a ray first meets the body's shape model, float64[3] in m in T, or else the nearest vertex."""
+    hit = first_hit(body, origin_T_m, direction_T)
+    if hit is not None:
+        return hit
+    away = body.vertices_m - origin_T_m
+    along = np.maximum(away @ direction_T, 0)
+    return np.asarray(body.vertices_m[np.argmin(np.linalg.norm(away - along[:, None] * direction_T, axis=1))])
+
+
+def first_hit(body: Body, origin_T_m: F64, direction_T: F64) -> F64 | None:
+    """Return where a ray first meets the body's shape model, float64[3] in m in T; None where it misses."""
+    a, b, c = (body.vertices_m[body.faces[:, k]] - origin_T_m for k in range(3))
+    normal = np.cross(b - a, c - a)
+    turn = np.stack([np.cross(p, q) @ direction_T for p, q in ((a, b), (b, c), (c, a))])
+    facing = normal @ direction_T
+    with np.errstate(divide="ignore", invalid="ignore"):
+        distance = np.einsum("ni,ni->n", a, normal) / facing
+    hit = ((turn >= 0).all(axis=0) | (turn <= 0).all(axis=0)) & (distance > 0)
+    return np.asarray(origin_T_m + distance[hit].min() * direction_T) if hit.any() else None
