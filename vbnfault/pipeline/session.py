@@ -183,14 +183,15 @@ class Session:
         elif scene.trajectory is not None:
             self.trajectory = load_trajectory(scene.trajectory.file)
         self.scene = scene = with_rows(scene, None if poses is None else self.trajectory)
+        planned = sum(blocks or (scene.dataset.samples,))
+        if self.trajectory is not None and planned > len(self.trajectory):
+            raise InputError(
+                f"{source}: {planned} samples are planned, but {self.trajectory.source} has "
+                f"{len(self.trajectory)} rows, and each is a sample; append at most its further rows"
+            )
         self.faults = configure_faults(scene, source)
         need_sun = [name for name, fault in self.faults.items() if fault.needs_sun]
         self.plan = plan.make_plan(scene, list(self.faults), blocks, need_sun=need_sun)
-        if self.trajectory is not None and len(self.plan) > len(self.trajectory):
-            raise InputError(
-                f"{source}: {len(self.plan)} samples are planned, but {self.trajectory.source} has "
-                f"{len(self.trajectory)} rows, and each is a sample; append at most its further rows"
-            )
         self._threads = threads
         self._ground: dict[int, list[GroundDetail]] = {}  # of the rows of a site
         self._terrain: Terrain | None = None

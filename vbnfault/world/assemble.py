@@ -264,8 +264,9 @@ def assumed_of_67p(scene: Scene, body: Body) -> str:
     assumed += [
         f"body.photometry.{key} = {getattr(table.photometry, key)!r}" for key in table.photometry.keys_of_67p
     ]
-    # if the scene gives a distance, the orbit only rotates the stars
-    if scene.orbit is None and not scene.spice.kernels and scene.sun.distance_au is None:
+    # if the scene or its table of poses gives a distance, the orbit only rotates the stars
+    given = scene.sun.distance_au is not None or scene.trajectory is not None
+    if scene.orbit is None and not scene.spice.kernels and not given:
         assumed.append("[orbit]")
     if not assumed:
         return ""

@@ -29,6 +29,8 @@ _TRIANGLE = 3**0.5 / 4
 # Fraction of the triangles for the even ground. The ground takes 0.66 of them (`body.patch`). Where one terrain
 # serves several poses, half of this is left to the ground around.
 _EVEN_FRACTION, _SHARED_FRACTION = 0.66, 0.33
+# A pose also shares a terrain if it needs at most this many times the triangles that it needs alone.
+_MORE = 1.3
 # Rays across the frame, on each side, that look for ground between the vertices of a coarse shape model.
 _RAYS = 3
 # Distances are rounded down to a power of this, so that poses at nearly the same distance share a terrain.
@@ -85,7 +87,8 @@ def ground_details(scene: Scene, body: Body, poses: Sequence[FlownPose]) -> list
         if whole[k] is not None:
             continue
         here = _seen(scene, body, pose)
-        if group and _even_triangles(_around(scene, [*seen, here])) > budget:
+        enough = max(budget, _MORE * _even_triangles(_around(scene, [here])))
+        if group and _even_triangles(_around(scene, [*seen, here])) > enough:
             close()
         group.append(k)
         seen.append(here)

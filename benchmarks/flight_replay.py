@@ -1,0 +1,388 @@
+"""Replay flight images: render a table of poses and compare each image with the real frame of its row.
+
+    python benchmarks/flight_replay.py --frames FOLDER --shape SHAPE --out replay
+    python benchmarks/flight_replay.py --frames FOLDER --out replay --rows 0,5,18 --set render.bounces=1
+    python benchmarks/flight_replay.py --frames FOLDER --poses other.csv --scene my_scene.toml --out replay
+
+FOLDER holds `poses.csv` (the columns of `[trajectory]`) and for each row an 8-bit image NAME.png. The camera is
+that of the scene, by default `navcam67p` with its detector, without its faults, at the frames' own size. The raw
+mosaic is compared, where the detector has one, because the image of a store has lost its bias. The labels of flight
+images are some pixels off, so every image is aligned by a shift first.
+
+Stretch and exposure of the frames are unknown. So the rendered image is scaled to the brightness of the frame and
+rounded to 8 bits, and brightness is compared as (image - background) / (bright - background): `background` is the
+median of the sky, `bright` the 99th percentile of the body. Printed are, over all frames, the median and the worst
+5 % of:
+
+- `iou`: lit silhouettes, intersection over union. Lit is a brightness above 0.12.
+- `limb_px`: median distance between the bright limbs, both ways.
+- `rank`: Spearman's correlation of brightness where both are lit.
+- `power_4_8` to `power_32_64`: rendered over real variance of brightness at wavelengths of that many pixels.
+- `sky`, `glow_0.5` to `glow_3`: background level, and brightness of the sky at distances of so many nucleus radii,
+  as fractions of `bright`; rendered and real. Frames whose sky is clipped to 0 are left out.
+- `noise`, `column`: deviation of the sky from its local median, and of its columns' medians from a smooth curve, as
+  fractions of `bright`.
+- `tracks`: bright spots and streaks in the sky, of 2 px or more.
+
+`replay.json` holds all figures, `sheet.png` the pairs real | rendered at full size, with the same stretch.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage, stats
+
+import vbnfault
+from vbnfault.cli import options
+from vbnfault.core import user_files
+from vbnfault.scene.trajectory import Trajectory, load_trajectory
+
+F32 = NDArray[np.float32]
+Mask = NDArray[np.bool_]
+
+LIT = 0.12
+_BRIGHT_PERCENTILE = 99.0
+_BODY_LEVEL = 0.3  # of the brightest pixels: surely the body, to begin with
+_OCTAVES_PX = ((4, 8), (8, 16), (16, 32), (32, 64))
+_GLOW_RADII = ((0.05, 0.5), (0.5, 1.0), (1.0, 2.0), (2.0, 3.0))
+_TRACK_SIGMAS = 6.0
+_SEARCH_PX = 16  # largest shift, for frames of 512 px
+_CLIPPED = 0.5  # of the sky at 0: such a frame tells nothing of its background
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Look:
+    """Hold an image with its background and brightness, and what follows from them.
+
+    `level` float32[y, x] is the brightness, 0 in the background and 1 at the 99th percentile of the lit body; `lit`
+    bool[y, x] the lit silhouette, `sky` bool[y, x] what lies well outside it.
+    """
+
+    image: F32
+    background: float
+    bright: float
+    level: F32
+    lit: Mask
+    sky: Mask
+
+    @property
+    def clipped(self) -> bool:
+        """Return whether most of the sky is 0."""
+        return bool((self.image[self.sky] == 0).mean() > _CLIPPED)
+
+
+def look(image: NDArray[Any]) -> Look:
+    """Return an image's brightness, lit silhouette and sky."""
+    image = np.asarray(image, dtype=np.float32)
+    body = image > _BODY_LEVEL * np.percentile(image, 99.5)
+    far = ndimage.distance_transform_edt(~body) > 0.1 * np.sqrt(body.sum())
+    background = float(np.median(image[far])) if far.any() else 0.0
+    bright = float(np.percentile(image[body], _BRIGHT_PERCENTILE)) if body.any() else 1.0
+    level = (image - background) / max(bright - background, 1e-6)
+    # spots of the sky are no body: keep what is at least a thousandth of the whole
+    labels, _ = ndimage.label(ndimage.median_filter(level, 3) > LIT)
+    sizes = np.bincount(labels.ravel())
+    sizes[0] = 0
+    lit = (level > LIT) & ndimage.binary_dilation((sizes >= max(4, 1e-3 * sizes.sum()))[labels], iterations=2)
+    sky = ndimage.distance_transform_edt(~lit) > max(3.0, 0.05 * np.sqrt(lit.sum() / np.pi))
+    return Look(image=image, background=background, bright=bright, level=level, lit=lit, sky=sky)
+
+
+def shift_between(real: Look, rendered: Look, *, search_px: int) -> tuple[float, float]:
+    """Return the shift (x, y) in px that moves the rendered image onto the real one, to a tenth of a pixel.
+
+    It maximises the correlation of the two lit silhouettes.
+    """
+    a, b = (ndimage.gaussian_filter(one.lit.astype(np.float32), 1.0) for one in (real, rendered))
+    product = np.fft.rfft2(a) * np.conj(np.fft.rfft2(b))
+    correlation = np.fft.irfft2(product, a.shape)
+    correlation = np.roll(correlation, (search_px, search_px), (0, 1))[: 2 * search_px + 1, : 2 * search_px + 1]
+    y, x = np.unravel_index(np.argmax(correlation), correlation.shape)
+    fine = [0.0, 0.0]
+    for axis, (k, line) in enumerate(((x, correlation[y]), (y, correlation[:, x]))):
+        if 0 < k < len(line) - 1:
+            low, middle, high = (float(line[k + d]) for d in (-1, 0, 1))
+            fine[axis] = 0.5 * (low - high) / min(low - 2 * middle + high, -1e-12)
+    return float(x - search_px + fine[0]), float(y - search_px + fine[1])
+
+
+def shifted(image: NDArray[Any], shift_xy: tuple[float, float], outside: float) -> F32:
+    """Return an image moved by a shift in px, with `outside` where it had no pixels."""
+    move = np.array([[1, 0, shift_xy[0]], [0, 1, shift_xy[1]]], dtype=np.float64)
+    size = (image.shape[1], image.shape[0])
+    moved = cv2.warpAffine(
+        np.asarray(image, np.float32), move, size, flags=cv2.INTER_LANCZOS4, borderValue=(outside,)
+    )
+    return np.asarray(np.clip(moved, 0, None), dtype=np.float32)
+
+
+# --- figures --------------------------------------------------------------------------------------------------
+
+
+def limb_px(a: Mask, b: Mask, sun_xy: NDArray[np.float64]) -> float:
+    """Return the median distance between the bright limbs of two lit silhouettes, both ways, in px.
+
+    The bright limb is the edge whose outward normal lies within 45° of the Sun's direction in the image.
+    """
+    edges = []
+    for lit in (a, b):
+        whole = ndimage.binary_fill_holes(lit)
+        gradient = [
+            -ndimage.gaussian_filter(whole.astype(np.float32), 3.0, order=order) for order in ((0, 1), (1, 0))
+        ]
+        length = np.hypot(*gradient)
+        towards = (gradient[0] * sun_xy[0] + gradient[1] * sun_xy[1]) / np.maximum(length, 1e-9)
+        edge = whole & ~ndimage.binary_erosion(whole, border_value=1)
+        edges.append(edge & (towards > 0.5**0.5))
+    if not edges[0].any() or not edges[1].any():
+        return float("nan")
+    far = [ndimage.distance_transform_edt(~edge) for edge in edges]
+    return float(np.median(np.concatenate([far[1][edges[0]], far[0][edges[1]]])))
+
+
+def octave_variances(level: F32, inside: Mask) -> dict[str, float]:
+    """Return the variance of brightness over its mean, inside a mask, in octaves of wavelength.
+
+    Octaves are differences of Gaussians that see the pixels of the mask only.
+    """
+
+    def smooth(sigma: float) -> NDArray[np.float64]:
+        weight = ndimage.gaussian_filter(inside.astype(np.float64), sigma)
+        return np.asarray(
+            ndimage.gaussian_filter(np.where(inside, level, 0.0).astype(np.float64), sigma)
+            / np.maximum(weight, 1e-9)
+        )
+
+    mean = float(level[inside].mean()) if inside.any() else 1.0
+    out = {}
+    for short, long in _OCTAVES_PX:
+        # a Gaussian of deviation s passes half the amplitude at the wavelength 2 π s / sqrt(2 ln 2)
+        low, high = (length * np.sqrt(2 * np.log(2)) / (2 * np.pi) for length in (short, long))
+        band = (smooth(low) - smooth(high))[inside] / mean
+        out[f"power_{short}_{long}"] = float(band.var()) if band.size else float("nan")
+    return out
+
+
+def sky_figures(one: Look, around: Mask) -> dict[str, float]:
+    """Return background, glow, noise, column texture and tracks of the sky outside `around`, see the module."""
+    scale = max(one.bright - one.background, 1e-6)
+    radius_px = float(np.sqrt(around.sum() / np.pi))
+    away = ndimage.distance_transform_edt(~around) / max(radius_px, 1.0)
+    sky = one.sky & (away > 0.05)
+    image = one.image
+    residual = image - ndimage.median_filter(image, 5)
+    ordinary = np.abs(residual[sky]) < 4 * max(float(np.std(residual[sky])), 1e-6)
+    noise = float(np.std(residual[sky][ordinary]))
+    out = {"sky": one.background / max(one.bright, 1e-6)}
+    for low, high in _GLOW_RADII:
+        ring = sky & (away > low) & (away <= high)
+        out[f"glow_{high:g}"] = (
+            float(image[ring].mean()) / max(one.bright, 1e-6) if ring.sum() > 100 else float("nan")
+        )
+    out["noise"] = noise / scale
+    with np.errstate(all="ignore"):
+        columns = np.array(
+            [image[sky[:, k], k].mean() if sky[:, k].sum() > 20 else np.nan for k in range(image.shape[1])]
+        )
+    known = np.isfinite(columns)
+    texture = columns[known] - ndimage.median_filter(columns[known], 31)
+    deviation = texture - np.median(texture)
+    out["column"] = float(1.4826 * np.median(np.abs(deviation))) / scale if known.any() else float("nan")
+    spots, _ = ndimage.label((residual > _TRACK_SIGMAS * max(noise, 0.5)) & sky, np.ones((3, 3)))
+    out["tracks"] = float((np.bincount(spots.ravel())[1:] >= 2).sum())
+    return out
+
+
+def compare(real: Look, rendered: Look, sun_xy: NDArray[np.float64]) -> dict[str, float]:
+    """Return all figures of one aligned pair; those of the sky as `NAME real` and `NAME rendered`."""
+    both, either = real.lit & rendered.lit, real.lit | rendered.lit
+    inside = ndimage.binary_erosion(both, iterations=3)
+    out = {
+        "iou": float(both.sum() / max(either.sum(), 1)),
+        "limb_px": limb_px(real.lit, rendered.lit, sun_xy),
+        "rank": float(stats.spearmanr(real.level[both], rendered.level[both]).statistic),
+    }
+    spectra = [octave_variances(one.level, inside) for one in (real, rendered)]
+    out |= {name: spectra[1][name] / max(spectra[0][name], 1e-12) for name in spectra[0]}
+    for which, one in (("real", real), ("rendered", rendered)):
+        unusable = real.clipped
+        out |= {
+            f"{name} {which}": float("nan") if unusable and name != "tracks" else value
+            for name, value in sky_figures(one, either).items()
+        }
+    return out
+
+
+def summary(figures: Sequence[Mapping[str, float]]) -> dict[str, tuple[float, float]]:
+    """Return median and worst 5 % of each figure: the 5th percentile, or the 95th where less is better."""
+    out = {}
+    for name in figures[0]:
+        values = np.array([one[name] for one in figures])
+        values = values[np.isfinite(values)]
+        worst = 5 if name in ("iou", "rank") else 95
+        out[name] = (
+            (float(np.median(values)), float(np.percentile(values, worst))) if len(values) else (np.nan, np.nan)
+        )
+    return out
+
+
+# --- rendering ------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Pair:
+    """Hold a real frame, the image rendered for it and moved onto it, and their figures."""
+
+    name: str
+    real: Look
+    rendered: Look
+    figures: dict[str, float]
+    shift_xy: tuple[float, float]
+    seconds: float
+
+
+def replay_scene(name: str, size_px: tuple[int, int], overrides: Mapping[str, Any]) -> vbnfault.Scene:
+    """Return a scene without faults, at a size of (width, height) in px, that stores nothing but images."""
+    values = {"camera.width_px": size_px[0], "camera.height_px": size_px[1], "dataset.layers": ["clean"]}
+    scene = vbnfault.load_scene(name, {**values, **overrides})
+    layers = ("clean", "raw") if scene.camera.detector else ("clean",)
+    dataset = scene.dataset.model_copy(update={"layers": layers, "mask_any": None})
+    return scene.model_copy(update={"faults": {}, "dataset": dataset})
+
+
+def replay(session: vbnfault.Session, trajectory: Trajectory, row: int, frame: NDArray[np.uint8]) -> Pair:
+    """Render a row, align it with its real frame, and compare the two."""
+    start = time.perf_counter()
+    layers = session.simulate(row).layers
+    image = layers.get("raw", layers["clean"][..., 3])
+    seconds = time.perf_counter() - start
+    real, raw = look(frame), look(image)
+    search_px = max(4, round(_SEARCH_PX * frame.shape[1] / 512))
+    shift = shift_between(real, raw, search_px=search_px)
+    bright = real.bright / max(raw.bright, 1e-6)
+    moved = shifted(raw.image * bright, shift, raw.background * bright)
+    rendered = look(np.clip(np.round(moved), 0, 255))
+    pose = trajectory.pose(row)
+    sun_C = pose.T_from_C.T @ pose.sun_direction_T
+    sun_xy = sun_C[:2] / max(float(np.linalg.norm(sun_C[:2])), 1e-9)
+    return Pair(
+        name=trajectory.name[row],
+        real=real,
+        rendered=rendered,
+        figures=compare(real, rendered, sun_xy),
+        shift_xy=shift,
+        seconds=seconds,
+    )
+
+
+def reduced(frame: NDArray[np.uint8], width_px: int) -> NDArray[np.uint8]:
+    """Return a frame at another width, by the means of areas."""
+    height_px = round(frame.shape[0] * width_px / frame.shape[1])
+    return np.asarray(cv2.resize(frame, (width_px, height_px), interpolation=cv2.INTER_AREA), dtype=np.uint8)
+
+
+def read_frame(folder: Path, name: str) -> NDArray[np.uint8]:
+    """Return a real frame, uint8[y, x]. Raises InputError."""
+    path = folder / f"{name}.png"
+    data = user_files.read_input(path, "texture", types=(".png",))
+    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE)
+    if image is None:
+        raise vbnfault.InputError(f"{path}: is no PNG image")
+    return np.asarray(image, dtype=np.uint8)
+
+
+def sheet(pairs: Sequence[Pair], across: int = 3) -> NDArray[np.uint8]:
+    """Return the pairs real | rendered at full size, uint8[y, x], with the same stretch and their names."""
+    cells = []
+    for pair in pairs:
+        # the square root shows the terminator and the sky beside the bright ground
+        halves = [
+            np.sqrt(np.clip(0.85 * one.image / max(one.bright, 1e-6), 0, 1)) * 255
+            for one in (pair.real, pair.rendered)
+        ]
+        cell = np.hstack(halves).astype(np.uint8)
+        f = pair.figures
+        text = f"{pair.name}  IoU {f['iou']:.3f}  rank {f['rank']:.2f}  limb {f['limb_px']:.1f} px"
+        cv2.putText(cell, text, (6, 14), cv2.FONT_HERSHEY_SIMPLEX, 0.42, 255, 1, cv2.LINE_AA)
+        cells.append(cv2.copyMakeBorder(cell, 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=(90,)))
+    cells += [np.zeros_like(cells[0])] * (-len(cells) % across)
+    rows = [np.hstack(cells[k : k + across]) for k in range(0, len(cells), across)]
+    return np.asarray(np.vstack(rows), dtype=np.uint8)
+
+
+def table(figures: Mapping[str, tuple[float, float]]) -> list[str]:
+    """Return the summary as lines of text."""
+    lines = [f"{'figure':<16}{'median':>10}{'worst 5 %':>11}"]
+    lines += [
+        f"{name:<16}{median:>10.4g}{worst:>11.4g}"
+        for name, (median, worst) in figures.items()
+        if not name.endswith((" real", " rendered"))
+    ]
+    lines.append(f"{'of the sky':<16}{'real':>10}{'rendered':>11}")
+    for name in figures:
+        if name.endswith(" real"):
+            plain = name.removesuffix(" real")
+            lines.append(f"{plain:<16}{figures[name][0]:>10.4g}{figures[f'{plain} rendered'][0]:>11.4g}")
+    return lines
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Replay the frames of a folder."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--frames", type=Path, required=True, help="folder of NAME.png and poses.csv")
+    parser.add_argument("--poses", type=Path, help="table of poses; default: poses.csv in the folder")
+    parser.add_argument("--shape", help="shape model of the body; default: that of the scene")
+    parser.add_argument("--scene", default="navcam67p", help="scene with camera and ground")
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="a key of the scene")
+    parser.add_argument("--rows", help="rows to replay, such as 0,5,18; default: all")
+    parser.add_argument("--width", type=int, help="width in px; default: that of the frames")
+    parser.add_argument("--threads", type=int, help="render threads; default: every core")
+    parser.add_argument("--out", type=Path, required=True, help="folder for replay.json and sheet.png")
+    given = parser.parse_args(arguments)
+
+    trajectory = load_trajectory(str((given.poses or given.frames / "poses.csv").resolve()))
+    rows = [int(k) for k in given.rows.split(",")] if given.rows else list(range(len(trajectory)))
+    overrides = options.overrides(given.set)
+    if given.shape:
+        overrides["body.shape"] = given.shape
+    frames = {row: read_frame(given.frames, trajectory.name[row]) for row in rows}
+    if given.width:
+        frames = {row: reduced(frame, given.width) for row, frame in frames.items()}
+    height, width = frames[rows[0]].shape
+    scene = replay_scene(given.scene, (width, height), overrides)
+    session = vbnfault.Session(scene, threads=given.threads, poses=trajectory)
+    pairs = []
+    for row in rows:
+        pair = replay(session, trajectory, row, frames[row])
+        f = pair.figures
+        print(
+            f"{pair.name}: IoU {f['iou']:.4f}, rank {f['rank']:.3f}, limb {f['limb_px']:.2f} px, shift "
+            f"{pair.shift_xy[0]:+.1f} {pair.shift_xy[1]:+.1f} px, {pair.seconds:.1f} s",
+            file=sys.stderr,
+            flush=True,
+        )
+        pairs.append(pair)
+    figures = summary([pair.figures for pair in pairs])
+    given.out.mkdir(parents=True, exist_ok=True)
+    result = {
+        "summary": {name: list(pair) for name, pair in figures.items()},
+        "frames": {pair.name: {**pair.figures, "shift_xy_px": pair.shift_xy} for pair in pairs},
+    }
+    (given.out / "replay.json").write_text(json.dumps(result, indent=1))
+    cv2.imwrite(str(given.out / "sheet.png"), sheet(pairs))
+    print("\n".join(table(figures)))
+
+
+if __name__ == "__main__":
+    main()

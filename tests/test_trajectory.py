@@ -1,0 +1,341 @@
+"""Tables of poses: what is read and refused, the views that follow, and stores made of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import vbnfault
+from vbnfault import dataset
+from vbnfault.core.errors import InputError
+from vbnfault.scene import config
+from vbnfault.scene.trajectory import COLUMNS, FlownPose, as_trajectory, load_trajectory
+from vbnfault.world import assemble, ground
+
+Rows = list[dict[str, Any]]
+RADIUS_M = 500.0
+
+
+def looking_at_the_origin(camera_T_m: np.ndarray, roll_deg: float = 0.0) -> np.ndarray:
+    """Return camera_from_T, w first, of a camera whose boresight meets the origin of T."""
+    z = -camera_T_m / np.linalg.norm(camera_T_m)
+    x = np.cross([0.3, 0.5, 0.8], z)
+    x /= np.linalg.norm(x)
+    camera_from_T = np.stack([x, np.cross(z, x), z])
+    camera_from_T = Rotation.from_euler("z", roll_deg, degrees=True).as_matrix() @ camera_from_T
+    return Rotation.from_matrix(camera_from_T).as_quat(scalar_first=True)
+
+
+def row(name: str, camera_T_m: Any, sun_T: Any = (0.0, 0.6, 0.8), **values: Any) -> dict[str, Any]:
+    """Return one row of a table; the camera looks at the origin of T."""
+    camera = np.array(camera_T_m, dtype=float)
+    numbers = [2457000.5, *camera, *looking_at_the_origin(camera), *sun_T, 2.5]
+    return {**dict(zip(COLUMNS, [name, *numbers], strict=True)), **values}
+
+
+def rows() -> Rows:
+    """Return five rows around the sphere, from 0.2 to 60 of its radii above the ground."""
+    return [
+        row("near", (600.0, 0, 0), (0.8, 0.6, 0)),
+        row("side", (0, 1500.0, 300.0)),
+        row("far", (0, 0, 30e3), (0.6, 0, 0.8)),
+        row("night", (0, -5e3, 0), (0.0, 1.0, 0.0)),
+        row("last", (9e3, 9e3, -9e3), julian_date=2457001.25, sun_distance_au=3.1),
+    ]
+
+
+def write(path: Path, table: Rows, columns: tuple[str, ...] = COLUMNS) -> Path:
+    """Write a table as CSV with all digits."""
+    text = [",".join(columns)]
+    for values in table:
+        text.append(",".join(v if isinstance(v, str) else repr(float(v)) for v in (values[c] for c in columns)))
+    path.write_text("\n".join(text) + "\n")
+    return path
+
+
+def columns_of(table: Rows) -> dict[str, list[Any]]:
+    """Return a table as columns."""
+    return {name: [values[name] for values in table] for name in COLUMNS}
+
+
+@pytest.fixture(scope="module")
+def sphere(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """Return the path of a sphere of 5120 triangles, whose vertices and centres of facets enclose its radius."""
+    import trimesh
+
+    path = tmp_path_factory.mktemp("sphere") / "sphere.obj"
+    trimesh.creation.icosphere(subdivisions=4, radius=RADIUS_M * 1.0008).export(path)
+    return str(path)
+
+
+SMALL: dict[str, Any] = {
+    "title": "flown",
+    "body": {
+        "unit": "m",
+        "name": "sphere",
+        "density_kg_m3": 500.0,
+        "rotation_period_h": 10.0,
+        "pole_ra_deg": 0.0,
+        "pole_dec_deg": 90.0,
+        "prime_meridian_deg": 0.0,
+        "reflectance": 0.06,
+    },
+    "patch": {"facet_m": 10.0, "radius_m": 40.0, "relief": 0.0, "boulders": False, "max_triangles": 60_000},
+    "camera": {"fov_deg": 40.0, "width_px": 40, "height_px": 32},
+    "dataset": {"shard_samples": 2, "layers": ["depth_m"]},
+    "render": {"bands": 2, "samples_per_pixel": 1},
+}
+
+
+def small(sphere: str, **camera: Any) -> vbnfault.Scene:
+    """Return the scene without a table."""
+    content = {**SMALL, "body": {**SMALL["body"], "shape": sphere}, "camera": {**SMALL["camera"], **camera}}
+    return config.parse_scene(content, source="test")
+
+
+def scene_file(folder: Path, sphere: str, table: Rows | None = None) -> Path:
+    """Write a scene of a sphere with a table of poses beside it."""
+    import tomli_w
+
+    write(folder / "poses.csv", rows() if table is None else table)
+    content = {**SMALL, "body": {**SMALL["body"], "shape": sphere}, "trajectory": {"file": "poses.csv"}}
+    path = folder / "flown.toml"
+    path.write_text(tomli_w.dumps(content))
+    return path
+
+
+# ------------------------------------------------------------------------------------------------ the table
+
+
+def test_csv_parquet_data_frame_and_mapping_are_the_same_table(tmp_path: Path) -> None:
+    import pyarrow
+    import pyarrow.parquet
+
+    table = rows()
+    written = load_trajectory(str(write(tmp_path / "a.csv", table)))
+    shuffled = write(tmp_path / "b.csv", table, tuple(reversed(COLUMNS)))
+    shuffled.write_bytes(b"\xef\xbb\xbf" + shuffled.read_bytes().replace(b"\n", b"\r\n"))  # as spreadsheets do
+    pyarrow.parquet.write_table(pyarrow.table(columns_of(table)), tmp_path / "c.parquet")
+    others = [load_trajectory(str(shuffled)), load_trajectory(str(tmp_path / "c.parquet"))]
+    others += [as_trajectory(columns_of(table)), as_trajectory(tmp_path / "a.csv")]
+    assert written.name == ("near", "side", "far", "night", "last")
+    for other in others:
+        assert other.name == written.name
+        for key in ("julian_date", "camera_position_T_m", "camera_from_T", "sun_direction_T", "sun_distance_au"):
+            np.testing.assert_array_equal(getattr(other, key), getattr(written, key))
+
+
+def test_the_quaternion_takes_vectors_of_t_to_the_camera() -> None:
+    """Against scipy, and a turn by hand: 90° about z takes T's +x to the camera's +y, downwards in the image."""
+    half = 0.5**0.5
+    turned = row("a", (0, 0, -10.0))
+    turned |= dict(zip(COLUMNS[5:9], (half, 0.0, 0.0, half), strict=True))
+    pose = as_trajectory(columns_of([turned])).pose(0)
+    np.testing.assert_allclose(pose.T_from_C.T @ [1, 0, 0], [0, 1, 0], atol=1e-15)
+    trajectory = as_trajectory(columns_of(rows()))
+    for k in range(len(trajectory)):
+        expected = Rotation.from_quat(trajectory.camera_from_T[k], scalar_first=True).as_matrix().T
+        np.testing.assert_allclose(trajectory.pose(k).T_from_C, expected, atol=1e-14)
+
+
+def change(index: int, **values: Any) -> Callable[[Rows], None]:
+    """Return a function that changes a row."""
+    return lambda table: table[index].update(values)
+
+
+@pytest.mark.parametrize(
+    ("alter", "sentence"),
+    [
+        (change(1, camera_x_T_m="far"), r"row 2: camera_x_T_m = 'far': must be a number from -1e.12 to 1e"),
+        (
+            change(1, julian_date=float("nan")),
+            r"row 2: julian_date = 'nan': must be a number from 1000000 to 5000000",
+        ),
+        (change(3, sun_distance_au=0), r"row 4: sun_distance_au = '0.0': must be a number from 0.01 to 1000"),
+        (change(0, camera_from_T_w=1.2), r"row 1: camera_from_T_w = '1.2': must be a number from -1.001 to 1.001"),
+        (
+            change(2, sun_x_T=0.0),
+            r"row 3: sun_x_T, sun_y_T, sun_z_T: their norm is 0.8; must be from 0.999 to 1.001",
+        ),
+        (change(4, name="near"), r"row 5: name = 'near': row 1 has this name; must differ in every row"),
+        (change(4, name=""), r"row 5: name = '': must be a printable text of 1 to 200 characters"),
+        (lambda table: table.clear(), r"has no rows; must have at least 1, each a pose"),
+    ],
+)
+def test_a_wrong_value_is_named_with_its_row_and_range(tmp_path: Path, alter: Any, sentence: str) -> None:
+    table = rows()
+    alter(table)
+    with pytest.raises(InputError, match=rf"poses\.csv: {sentence}"):
+        load_trajectory(str(write(tmp_path / "poses.csv", table)))
+
+
+@pytest.mark.parametrize(
+    ("change_text", "sentence"),
+    [
+        (
+            lambda t: t.replace("sun_distance_au", "sun_distance_km"),
+            r"columns are missing: sun_distance_au; unknown ",
+        ),
+        (lambda t: t.replace("name,", "name,name,"), r"column 'name' stands twice in the first line"),
+        (lambda t: t + "more,1\n", r"row 6 has 2 values; must have 13, as the first line has"),
+        (lambda t: "\n", r"columns are missing: name, julian_date, "),
+        (lambda t: t + '"open', r"is no CSV file: "),
+        (lambda t: t.encode() + b"\xff", r"byte \d+ is no UTF-8"),
+    ],
+)
+def test_a_malformed_file_is_refused_in_a_sentence(tmp_path: Path, change_text: Any, sentence: str) -> None:
+    path = write(tmp_path / "poses.csv", rows())
+    text = change_text(path.read_text())
+    path.write_bytes(text if isinstance(text, bytes) else text.encode())
+    with pytest.raises(InputError, match=rf"poses\.csv: {sentence}"):
+        load_trajectory(str(path))
+    other = tmp_path / "poses.parquet"
+    other.write_bytes(b"PAR1 and no more")
+    with pytest.raises(InputError, match=r"poses\.parquet: is no Parquet file: "):
+        load_trajectory(str(other))
+    with pytest.raises(InputError, match=r"unsupported trajectory type '\.txt'; allowed are \.csv, \.parquet"):
+        load_trajectory(str(path.rename(tmp_path / "poses.txt")))
+
+
+def test_rows_set_the_samples_and_too_many_are_refused(tmp_path: Path, sphere: str) -> None:
+    path = scene_file(tmp_path, sphere)
+    scene = config.load_scene(path)
+    assert (scene.dataset.samples, scene.dataset.sites) == (5, 3)
+    assert config.load_scene(path, {"dataset.samples": 2}).dataset.samples == 2
+    with pytest.raises(
+        InputError, match=r"dataset\.samples = 6: .*poses\.csv has 5 rows.*; must be from 1 to 5, or"
+    ):
+        config.load_scene(path, {"dataset.samples": 6})
+    spice = {"kernels": ["k"], "spacecraft": "X", "frame": "F", "camera_frame": "C"}
+    with pytest.raises(InputError, match=r"trajectory\.file = .*: spice\.spacecraft = 'X' gives poses, too"):
+        config.load_scene(path, {f"spice.{key}": value for key, value in spice.items()})
+    with pytest.raises(InputError, match=r"poses = 3: must be a path, a data frame, or a mapping"):
+        vbnfault.Session(scene, poses=3)
+
+
+# ------------------------------------------------------------------------------------------------ the views
+
+
+def test_a_sphere_has_its_size_and_place_from_any_distance(sphere: str) -> None:
+    """The limb of a sphere of radius R at the distance d lies f R / sqrt(d² - R²) px from its centre.
+
+    From 2 to 50 radii; the 1280 sight lines of a frame tell the area of the mesh to 3 %.
+    """
+    far = [row(f"{k}", np.array([k, 0.2 * k, -0.1 * k]) * RADIUS_M) for k in (30.0, 50.0)]
+    close = [row("2.0", np.array([0.2, -2.0, 0.4]) * RADIUS_M)]
+    for setting, part in ((small(sphere, fov_deg=5.0), far), (small(sphere, fov_deg=90.0), close)):
+        session = vbnfault.Session(setting, poses=columns_of(part))
+        for k, values in enumerate(part):
+            depth = session.simulate(k).layers["depth_m"]
+            distance = np.linalg.norm([values[f"camera_{axis}_T_m"] for axis in "xyz"])
+            focal_px = 20 / np.tan(np.radians(setting.camera.fov_deg / 2))
+            limb_px = focal_px * RADIUS_M / np.sqrt(distance**2 - RADIUS_M**2)
+            y, x = np.nonzero(np.isfinite(depth))
+            assert len(x) == pytest.approx(np.pi * limb_px**2, rel=0.03, abs=12)
+            assert (x.mean() + 0.5, y.mean() + 0.5) == pytest.approx((20, 16), abs=0.15)
+            assert depth.min() == pytest.approx(distance - RADIUS_M, rel=2e-3)
+
+
+def test_terrain_is_whole_from_afar_and_shared_and_a_patch_near_the_ground(tmp_path: Path, sphere: str) -> None:
+    scene = config.load_scene(scene_file(tmp_path, sphere), {"patch.facet_m": 0.2, "camera.width_px": 1024})
+    body = assemble.make_body(scene)
+
+    def detail(*cameras_T_m: Any) -> list[ground.GroundDetail]:
+        trajectory = as_trajectory(columns_of([row(f"{k}", c) for k, c in enumerate(cameras_T_m)]))
+        return ground.ground_details(scene, body, [trajectory.pose(k) for k in range(len(trajectory))])
+
+    far = detail((0, 0, 60e3), (61e3, 0, 0), (0, -59e3, 0))
+    assert far[0] == far[1] == far[2]  # all sides
+    assert far[0].facet_m == pytest.approx(60e3 * ground.pixel_rad(scene), rel=0.3)
+    assert far[0].radius_m >= 1.99 * RADIUS_M  # even over the whole body
+    one, other = detail((0, 0, 503.0), (0, 0, -503.0))
+    assert one != other  # two sides of a small body, from near: each has its own
+    assert one.position_T_m == pytest.approx((0, 0, 500), abs=1)
+    assert (one.facet_m, one.radius_m) == (0.2, 40.0)  # as near the ground without a table
+    together = detail((0, 0, 503.0), (0.5, 0, 503.0))
+    assert together[0] == together[1]
+    # half-way, the facets in the frame are about a pixel wide, up to a quarter more
+    (middle,) = detail((0, 0, 1500.0))
+    assert middle.position_T_m[2] > 450
+    assert 0.7 < middle.facet_m / (1000 * ground.pixel_rad(scene)) < 1.25
+
+
+# ------------------------------------------------------------------------------------------------ stores
+
+
+def build(path: Path, out: Path, **keywords: Any) -> Any:
+    """Build a scene's store without its progress."""
+    return vbnfault.build(path, out, progress=False, **keywords)
+
+
+def test_a_store_of_a_table_is_built_resumed_extended_and_read(tmp_path: Path, sphere: str) -> None:
+    path, out = scene_file(tmp_path, sphere), tmp_path / "s.zarr"
+    assert build(path, out, samples=3).built == 3
+    with pytest.raises(InputError, match=r"7 samples are planned, but .*poses\.csv has 5 rows"):
+        build(path, out, samples=3, append=4)
+    assert build(path, out, samples=3, append=2).built == 2
+    assert build(path, out, samples=3).built == 0
+    report = vbnfault.verify(out)
+    assert report.problems == []
+    table = rows()
+    with vbnfault.open_dataset(out) as data:
+        assert list(data.coords["name"].values) == [values["name"] for values in table]
+        assert data["name"].dims == ("sample",)
+        np.testing.assert_array_equal(data["julian_date"], [values["julian_date"] for values in table])
+        np.testing.assert_array_equal(data["sun_distance_au"], [values["sun_distance_au"] for values in table])
+        for name, columns in (
+            ("camera_position_T_m", COLUMNS[2:5]),
+            ("camera_from_T", COLUMNS[5:9]),
+            ("sun_direction_T", COLUMNS[9:12]),
+        ):
+            wanted = np.array([[values[column] for column in columns] for values in table])
+            wanted *= np.where(wanted[:, :1] < 0, -1, 1) if name == "camera_from_T" else 1  # stored with w >= 0
+            np.testing.assert_allclose(data[name], wanted, rtol=0, atol=1e-6 if "_m" in name else 1e-12)
+        assert data["site"].values.tolist() == [0, 0, 1, 1, 2]  # two rows each, in order
+        assert data["image"][3].values[..., 3].max() < 3  # the night side
+        assert data["image"][2].values[..., 3].max() > 50
+        again = vbnfault.simulate(path, 4)
+        given = vbnfault.simulate(path, 4, poses=columns_of(table))
+        for sample in (again, given):
+            np.testing.assert_array_equal(sample.layers["image"], data["image"][4])
+            np.testing.assert_array_equal(sample.layers["depth_m"], data["depth_m"][4])
+    # other poses are another dataset, the same poses in another file are not
+    renamed = tmp_path / "same.csv"
+    renamed.write_bytes((tmp_path / "poses.csv").read_bytes())
+    moved = config.load_scene(path, {"trajectory.file": str(renamed)})
+    assert vbnfault.build(moved, out, progress=False, samples=3).built == 0
+    write(tmp_path / "poses.csv", [{**values, "sun_distance_au": 2.6} for values in table])
+    with pytest.raises(InputError, match=r"holds another dataset: .*trajectory\.file"):
+        build(path, out, samples=3)
+
+
+def test_the_description_shows_names_dates_and_distances(tmp_path: Path, sphere: str) -> None:
+    text = "\n".join(dataset.describe_scene(config.load_scene(scene_file(tmp_path, sphere)), source="flown"))
+    assert "samples: 5 at 3 of 3 sites, 1 to 2 at each" in text
+    assert "trajectory: 5 of 5 rows of poses.csv, from near to last; a site stands for 2 rows side by side" in text
+    assert "nearest ground: 100 to 29500 m from the camera" in text
+    assert "Sun: 2.5 to 3.1 au away, dates 2457000.50000 to 2457001.25000 TDB" in text
+
+
+def test_a_camera_in_the_ground_is_named_with_its_row(tmp_path: Path, sphere: str) -> None:
+    path = scene_file(tmp_path, sphere, [row("inside", (RADIUS_M - 0.2, 0, 0))])
+    with pytest.raises(
+        vbnfault.VbnfaultError, match=r"sample 0: at Julian date .* inside is within .* the poses were"
+    ):
+        vbnfault.simulate(path, 0)
+
+
+def test_a_view_past_the_body_uses_the_ground_nearest_to_the_line_of_sight(sphere: str) -> None:
+    scene = small(sphere)
+    body = assemble.make_body(scene)
+    pose = as_trajectory(columns_of([row("away", (0, 0, 520.0))])).pose(0)
+    away: FlownPose = replace(pose, T_from_C=pose.T_from_C @ np.diag([1.0, -1.0, -1.0]))
+    scene = scene.model_copy(update={"patch": scene.patch.model_copy(update={"facet_m": 0.05})})
+    (detail,) = ground.ground_details(scene, body, [away])
+    assert detail.position_T_m == pytest.approx((0, 0, 500), abs=20)
