@@ -57,6 +57,9 @@ _BODY_LEVEL = 0.3  # of the brightest pixels: surely the body, to begin with
 _OCTAVES_PX = ((4, 8), (8, 16), (16, 32), (32, 64))
 _GLOW_RADII = ((0.05, 0.5), (0.5, 1.0), (1.0, 2.0), (2.0, 3.0))
 _TRACK_SIGMAS = 6.0
+# Lit parts belong to the body if they have this fraction of all lit pixels, or lie as near to the largest part as
+# this, in radii of a disc of its area.
+_LARGE_PART, _NEAR_BODY = 0.02, 0.4
 _SEARCH_PX = 16  # largest shift, for frames of 512 px
 _CLIPPED = 0.5  # of the sky at 0: such a frame tells nothing of its background
 
@@ -90,11 +93,15 @@ def look(image: NDArray[Any]) -> Look:
     background = float(np.median(image[far])) if far.any() else 0.0
     bright = float(np.percentile(image[body], _BRIGHT_PERCENTILE)) if body.any() else 1.0
     level = (image - background) / max(bright - background, 1e-6)
-    # spots of the sky are no body: keep what is at least a thousandth of the whole
-    labels, _ = ndimage.label(ndimage.median_filter(level, 3) > LIT)
-    sizes = np.bincount(labels.ravel())
+    # spots of the sky are no body: keep what is large, or near the largest part
+    labels, count = ndimage.label(ndimage.median_filter(level, 3) > LIT)
+    sizes = np.bincount(labels.ravel(), minlength=count + 1)
     sizes[0] = 0
-    lit = (level > LIT) & ndimage.binary_dilation((sizes >= max(4, 1e-3 * sizes.sum()))[labels], iterations=2)
+    away = ndimage.distance_transform_edt(labels != np.argmax(sizes))
+    near = ndimage.minimum(away, labels, np.arange(count + 1)) < _NEAR_BODY * np.sqrt(sizes.max() / np.pi)
+    kept = (sizes >= _LARGE_PART * sizes.sum()) | near
+    kept[0] = False
+    lit = (level > LIT) & ndimage.binary_dilation(kept[labels], iterations=2)
     sky = ndimage.distance_transform_edt(~lit) > max(3.0, 0.05 * np.sqrt(lit.sum() / np.pi))
     return Look(image=image, background=background, bright=bright, level=level, lit=lit, sky=sky)
 

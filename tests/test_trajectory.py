@@ -324,7 +324,7 @@ def test_the_description_shows_names_dates_and_distances(tmp_path: Path, sphere:
 
 
 def test_a_camera_in_the_ground_is_named_with_its_row(tmp_path: Path, sphere: str) -> None:
-    path = scene_file(tmp_path, sphere, [row("inside", (RADIUS_M - 0.2, 0, 0))])
+    path = scene_file(tmp_path, sphere, [row("inside", (RADIUS_M - 5, 0, 0))])
     with pytest.raises(
         vbnfault.VbnfaultError, match=r"sample 0: at Julian date .* inside is within .* the poses were"
     ):
