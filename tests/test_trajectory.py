@@ -319,7 +319,7 @@ def test_the_description_shows_names_dates_and_distances(tmp_path: Path, sphere:
     text = "\n".join(dataset.describe_scene(config.load_scene(scene_file(tmp_path, sphere)), source="flown"))
     assert "samples: 5 at 3 of 3 sites, 1 to 2 at each" in text
     assert "trajectory: 5 of 5 rows of poses.csv, from near to last; a site stands for 2 rows side by side" in text
-    assert "nearest ground: 100 to 29500 m from the camera" in text
+    assert "nearest ground: 99.6 to 29500 m from the camera" in text
     assert "Sun: 2.5 to 3.1 au away, dates 2457000.50000 to 2457001.25000 TDB" in text
 
 
