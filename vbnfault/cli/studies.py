@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from .app import app
-from .options import MOST_PROCESSES, overrides
+from .options import MOST_PROCESSES, SceneArgument, check_image_path, grouped, number, overrides, writing
 
 _PANEL = "Studies"
 
@@ -57,4 +58,67 @@ def study(
         return
     options = BuildOptions(workers=workers, threads=threads, scheduler=scheduler)
     for line in run_study(name, out, options, overrides=overrides(settings)).lines():
+        typer.echo(line)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class _SeverityOptions:
+    """Hold the options of `severity` on what is tested on which views."""
+
+    models: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--model",
+            metavar="NAME",
+            help="Fault class, model as vignetting/cos4, or all; may be repeated.",
+            show_default="the scene's",
+        ),
+    ] = None
+    lenses: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--lens",
+            metavar="LENS",
+            help="Lens of the views: a prescription's path or packaged name, or thin; may be repeated.",
+            show_default="the scene's",
+        ),
+    ] = None
+    views: Annotated[int, typer.Option(min=1, max=100_000, help="Number of views behind each lens.")] = 64
+    settings: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--set",
+            metavar="KEY=VALUE",
+            help="Replace a value of the scene, such as camera.width_px=256; may be repeated.",
+        ),
+    ] = None
+
+
+@app.command(rich_help_panel=_PANEL)
+@grouped
+def severity(
+    scene: SceneArgument,
+    out: Annotated[Path, typer.Option(help="TOML file to write.")],
+    tested: _SeverityOptions,
+    metric: Annotated[str, typer.Option(help="Metric of navigation that is the error.")] = "matches_lost",
+    quantile: Annotated[float, number(0, 1, "Quantile of the error over the views.")] = 0.5,
+    workers: Annotated[int, typer.Option(min=1, max=MOST_PROCESSES, help="Number of processes.")] = 1,
+) -> None:
+    """Compute levels of severity: for each fault model five values that cost navigation the same. A scene reads
+    them by `file` in its table [severity], and `severity = 3` in the table of a fault. Models that the file has
+    already stay in it.
+    """
+    from ..dataset import BuildOptions
+    from ..study import severity as study
+
+    check_image_path(out, ".toml")
+    values = overrides(tested.settings)
+    lenses = tuple("" if lens == "thin" else lens for lens in tested.lenses or ())
+    criterion = study.Criterion(metric=metric, quantile=quantile)
+    models = study.models_of(scene, tested.models or (), values)
+    views = study.ViewOptions(scene=scene, overrides=values, lenses=lenses, views=tested.views)
+    table = study.compute_levels(models, views, criterion, BuildOptions(workers=workers), out)
+    with writing(out):
+        study.write_table(out, table)
+    for line in study.lines_of(table):
         typer.echo(line)

@@ -3,7 +3,7 @@
 from .context import FaultContext, Params
 from .contract import MOSAIC_STEPS, QUANTITIES, STEPS, Fault, act
 from .fields import Interval, Severity, bounds, choice, flag, number, path, rows, text
-from .levels import LEVELS
+from .levels import LEVELS, Levels, ModelLevels, SeverityTable, read_table
 from .models import (
     dataset_order,
     from_dict,
@@ -24,9 +24,12 @@ __all__ = [
     "Fault",
     "FaultContext",
     "Interval",
+    "Levels",
+    "ModelLevels",
     "Params",
     "Plugin",
     "Severity",
+    "SeverityTable",
     "act",
     "belongs_here",
     "bounds",
@@ -43,6 +46,7 @@ __all__ = [
     "path_fields",
     "physical_order",
     "plugins_of",
+    "read_table",
     "registry",
     "rows",
     "text",

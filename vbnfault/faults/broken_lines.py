@@ -37,7 +37,7 @@ class TextureBrokenLines(Fault):
     after = "adc"
     axis = 2
     step = "rgbi"
-    severity = Severity(key="count", low=1, high=500)
+    severity = Severity(key="count", low=1, high=500, width_power=1)
 
     count: Interval = bounds(1, 5, limits=(0, 10_000), integer=True, doc="number of broken lines")
     white_count: int | None = number(

@@ -55,7 +55,7 @@ class TextureBrokenPixels(Fault):
     after = "vignetting"
     axis = 1
     step = "rgbi"
-    severity = Severity(key="count", low=1, high=10_000)
+    severity = Severity(key="count", low=1, high=10_000, width_power=1)
 
     count: Interval = bounds(10, 150, limits=(0, 10_000), integer=True, doc="number of broken pixels")
     brightness_dn: Interval = bounds(

@@ -37,7 +37,7 @@ class RadiationTraps(Fault):
     default = True
     after = "blooming"
     step = "charge"
-    severity = Severity(key="parallel_per_px", low=0.01, high=100.0)
+    severity = Severity(key="parallel_per_px", low=0.01, high=100.0, width_power=-1)
     needs_mosaic = True
     needs_ccd = True
     localised = False

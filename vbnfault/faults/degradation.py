@@ -41,7 +41,8 @@ class GaussianDegradation(Fault):
     after = "dust_on_optics"
     axis = 5
     step = "electrons"
-    severity = Severity(key="filter_size_px", low=1, high=201, step=2)
+    # σ of the filter is 0.15 (size + 7/3) px of a 1024 px wide image
+    severity = Severity(key="filter_size_px", low=1, high=201, step=2, width_power=-1, offset=7 / 3)
     localised = False
 
     filter_size_px: Interval = bounds(

@@ -43,29 +43,67 @@ class Interval(NamedTuple):
         return int(rng.integers(int(self.lo), int(self.hi), endpoint=True))
 
 
+# Width of the frame in px to which keys in pixels, and the range of a severity, refer.
+REFERENCE_WIDTH_PX = 1024
+
+
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Severity:
     """Name the key by which a model becomes more severe, with the mildest and the most severe value.
 
     Where less is worse, `low` is above `high`. Values between them are spaced evenly in their logarithm, so both
-    are above 0. A whole number takes steps of `step` from `low`.
+    are above 0. They hold for a frame of 1024 px.
+
+    Attributes
+    ----------
+    step
+        Step of a whole number.
+    width_power, offset
+        How a value changes with the width of the frame, so that pixels and their neighbourhood are harmed alike:
+        (value + offset) ∝ width^width_power. 0: a value has the same effect in frames of all widths; 1: as a number
+        of lines, of which frames of all widths then have the same fraction; 2: as a number of pixels; -1: as a size
+        that is given for 1024 px.
     """
 
     key: str
     low: float
     high: float
     step: int = 1
+    width_power: float = 0.0
+    offset: float = 0.0
 
-    def position(self, value: float) -> float:
-        """Return the position of a value: 0 the mildest, 1 the most severe."""
+    def position(self, value: float, width_px: int = REFERENCE_WIDTH_PX) -> float:
+        """Return the position of a value for frames of a width: 0 the mildest, 1 the most severe."""
+        value = self.at_width(value, REFERENCE_WIDTH_PX, given_for_px=width_px)
         return math.log(value / self.low) / math.log(self.high / self.low)
 
-    def value(self, position: float, *, integer: bool) -> float | int:
-        """Return the value of the key at a position from 0, mildest, to 1, most severe."""
-        value = float(self.low * (self.high / self.low) ** position)
-        if not integer:
+    def value(self, position: float, width_px: int = REFERENCE_WIDTH_PX) -> float:
+        """Return the value for frames of a width at a position from 0, mildest, to 1, most severe."""
+        return self.at_width(self.low * (self.high / self.low) ** position, width_px)
+
+    def at_width(self, value: float, width_px: int, *, given_for_px: int = REFERENCE_WIDTH_PX) -> float:
+        """Return the value that does to frames of one width what `value` does to frames of another."""
+        return float((value + self.offset) * (width_px / given_for_px) ** self.width_power - self.offset)
+
+    def setting(self, value: float, declared: Mapping[str, Any]) -> float | int | list[int]:
+        """Return what a scene sets the key to, so that the value is the mean of the draws.
+
+        A whole number is rounded to halves of a step: a half is drawn from both of its neighbours.
+
+        Parameters
+        ----------
+        value
+            The value.
+        declared
+            Metadata of the key's field.
+        """
+        if not declared.get("integer"):
             return float(f"{value:.6g}")
-        return int(self.low + self.step * round((value - self.low) / self.step))
+        # whole numbers are 1, 1 + step, …: none of something is no fault
+        halves = max(round(2 * (value - 1) / self.step), 0)
+        low = 1 + self.step * (halves // 2)
+        drawn = declared["kind"] == "bounds" and halves % 2
+        return [low, low + self.step] if drawn else low
 
 
 def bounds(

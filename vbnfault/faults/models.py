@@ -17,7 +17,7 @@ from ..core.registry import DeclarationError, Registry, chained, is_name
 from ..core.registry import undoing_registrations as undoing_all
 from ..core.tables import did_you_mean
 from .fields import field_schema, parse_field
-from .levels import severity_schema, with_severity
+from .levels import Levels, severity_schema, with_severity
 
 if TYPE_CHECKING:
     from .contract import Fault
@@ -261,10 +261,11 @@ def from_dict(fault_class: str, table: Mapping[str, Any], *, source: str) -> Fau
     return fault
 
 
-def without_severity(faults: Mapping[str, Any], *, source: str) -> dict[str, Any]:
+def without_severity(faults: Mapping[str, Any], *, source: str, levels: Levels | None = None) -> dict[str, Any]:
     """Return the tables of a scene's faults with the values that their keys `severity` stand for.
 
-    What is no known model stays as it is. Raises InputError where a level is wrong.
+    What is no known model stays as it is. `levels`: default: those of the package for frames of 1024 px. Raises
+    InputError where a level is wrong.
     """
     out = dict(faults)
     for fault_class, table in faults.items():
@@ -272,7 +273,7 @@ def without_severity(faults: Mapping[str, Any], *, source: str) -> dict[str, Any
             models = registry().get(fault_class, {})
             name = table.get("model", next(iter(models), None))
             if isinstance(name, str) and name in models:
-                out[fault_class] = with_severity(models[name], table, f"{source}: faults.{fault_class}")
+                out[fault_class] = with_severity(models[name], table, f"{source}: faults.{fault_class}", levels)
     return out
 
 

@@ -43,7 +43,7 @@ class FrameTransferSmear(Fault):
     default = True
     after = "broken_pixels"
     step = "pixels"
-    severity = Severity(key="row_transfer_s", low=1e-7, high=1e-2)
+    severity = Severity(key="row_transfer_s", low=1e-7, high=1e-2, width_power=-1)
     needs_mosaic = True
     needs_ccd = True
     localised = False

@@ -37,7 +37,7 @@ class PacketTransmission(Fault):
     default = True
     after = "broken_lines"
     step = "raw"
-    severity = Severity(key="lost_count", low=1, high=1000)
+    severity = Severity(key="lost_count", low=1, high=1000, width_power=2)
     needs_mosaic = True
 
     packet_px: Interval = bounds(

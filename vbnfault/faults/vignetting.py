@@ -3,8 +3,10 @@
     factor(θ) = E0 / 255 · cos⁴θ,     tan θ = r / f,
 
 where r is the distance of a pixel's centre from the middle of the frame and f is the focal length in pixels. If E0
-is below 255, the whole image becomes darker, like the paper's texture. The factor acts on the expected
-photo-electrons of all channels alike. The thin lens applies no cos⁴ of its own, so nothing is counted twice.
+is below 255, the whole image becomes darker, like the paper's texture. In place of E0, a scene may set the mean of
+255 factor over the frame, which says how much light is lost whatever the field of view. The factor acts on the
+expected photo-electrons of all channels alike. The thin lens applies no cos⁴ of its own, so nothing is counted
+twice.
 """
 
 from __future__ import annotations
@@ -33,7 +35,7 @@ class Cos4Vignetting(Fault):
     after = "optics_degradation"
     axis = 4
     step = "electrons"
-    severity = Severity(key="on_axis_illuminance_dn", low=255.0, high=2.0)
+    severity = Severity(key="frame_illuminance_dn", low=255.0, high=2.0)
     localised = False
     soft_layer = "vignetting_factor"
     at_rims = True
@@ -42,12 +44,22 @@ class Cos4Vignetting(Fault):
     on_axis_illuminance_dn: Interval = bounds(
         105, 255, limits=(0, 255), unit="DN of 255", doc="E0: 255 leaves the centre as it is"
     )
+    frame_illuminance_dn: float | None = number(
+        None,
+        limits=(0, 255),
+        unit="DN of 255",
+        doc="mean over the frame, in place of E0, which is then at most 255",
+    )
     mask_loss: float = number(0.1, limits=(0, 1), doc="the mask holds the pixels that lose at least this fraction")
 
     def draw(self, context: FaultContext, rng: np.random.Generator) -> Params:
         """Return E0, and the least loss of the pixels in the mask."""
+        e0 = self.on_axis_illuminance_dn.uniform(rng)
+        if self.frame_illuminance_dn is not None:
+            mean = float(cos4_map(context.shape, context.camera.focal_length_px).mean(dtype=np.float64))
+            e0 = min(self.frame_illuminance_dn / mean, 255.0)
         return {
-            "on_axis_illuminance_dn": self.on_axis_illuminance_dn.uniform(rng),
+            "on_axis_illuminance_dn": e0,
             "mask_loss": float(self.mask_loss),
         }
 

@@ -31,6 +31,16 @@ _VEHICLES = ("none", "default")
 _MOST_RADIANCES = 2**28
 
 
+class SeverityLevels(Table):
+    """Name the table that the levels of severity are read from."""
+
+    file: str = Field(
+        min_length=1,
+        description="table of levels, as vbnfault severity writes it, from the scene file's folder; default: the "
+        "packaged one",
+    )
+
+
 class Scene(Table):
     """Hold a whole scene file with all defaults filled in."""
 
@@ -56,6 +66,8 @@ class Scene(Table):
     geometry: GeometryTable = GeometryTable()
     plan: PlanTable = PlanTable()
     faults: dict[str, dict[str, Any]] = Field(default_factory=dict)
+    # when a scene is read, each level is replaced by its value: this table is of no use afterwards
+    severity: SeverityLevels | None = Field(None, exclude=True)
 
     @model_validator(mode="after")
     def _fits(self) -> Scene:
@@ -164,11 +176,29 @@ def parse_scene(table: Mapping[str, Any], *, source: str, overrides: Sequence[st
                 f"such a file (vbnfault new sensor NAME) and name it by camera.detector{mono}"
             )
     faults = table.get("faults")
-    if isinstance(faults, Mapping) and any(isinstance(f, Mapping) and "severity" in f for f in faults.values()):
-        from ..faults import without_severity
-
-        table = {**table, "faults": without_severity(faults, source=source)}
+    if "severity" in table or (
+        isinstance(faults, Mapping) and any(isinstance(f, Mapping) and "severity" in f for f in faults.values())
+    ):
+        table = _without_levels(table, source, overrides)
     return tables.parse(Scene, table, source=source, overrides=overrides)
+
+
+def _without_levels(table: Mapping[str, Any], source: str, overrides: Sequence[str]) -> dict[str, Any]:
+    """Return the table of a scene with the values that levels of severity stand for. Raises InputError."""
+    from ..faults import Levels, without_severity
+
+    faults = table.get("faults", {})
+    rest = tables.parse(Scene, {**table, "faults": {}}, source=source, overrides=overrides)
+    path = None if rest.severity is None else Path(rest.severity.file)
+    levels = Levels(path=path, width_px=rest.camera.width_px)
+    if path is not None:
+        try:
+            levels.table()  # a wrong file is refused even if no fault names a level
+        except InputError as error:
+            raise InputError(f"{source}: severity.file: {error}") from None
+    if isinstance(faults, Mapping):
+        faults = without_severity(faults, source=source, levels=levels)
+    return {key: value for key, value in table.items() if key != "severity"} | {"faults": faults}
 
 
 def _anchor_paths(table: dict[str, Any], folder: Path, overrides: Collection[str]) -> None:
@@ -196,6 +226,7 @@ def _anchor_paths(table: dict[str, Any], folder: Path, overrides: Collection[str
 
     anchor(table.get("body"), "body.shape", _SHAPES)
     anchor(table.get("spacecraft"), "spacecraft.model", _VEHICLES)
+    anchor(table.get("severity"), "severity.file")
     anchor_file(table.get("camera"), "camera.lens")
     anchor_file(table.get("camera"), "camera.detector")
     anchor(table.get("trajectory"), "trajectory.file")

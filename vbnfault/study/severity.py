@@ -1,37 +1,48 @@
 """Compute levels of severity: for each fault model five values of one key that cost navigation the same.
 
-The error is a quantile over views of one metric of navigation. Each model's error rises with the key that its
-`Fault.severity` names; the value with the wanted error is searched by bisection. All values of a model are
-evaluated on the same views with the same random numbers, so the error changes by the key alone.
+The error is a quantile over views of one metric of navigation. On each view, the error of a model is measured at
+some values of the key that its `Fault.severity` names, and joined to a curve that rises with the severity. A level
+is the root of the quantile of these curves minus the wanted error. The views may lie behind several lenses, so that
+the levels belong to none of them. The interval of the error comes from a bootstrap over the views.
 """
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, fields
+import os
+import shlex
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import tomli_w
+from numpy.typing import NDArray
 from scipy.optimize import isotonic_regression
 
-from ..core.errors import InputError, VbnfaultError
-from ..faults import LEVELS, Fault, registry
-from ..pipeline import Session
-from ..pipeline.development import Development
-from ..pipeline.injection import fault_context
-from ..pipeline.spec import Draw, Pose, Rendering, SampleSpec, SceneExposure
-from ..pipeline.stages import add_stars, meter, render_view, resolve
+from ..core import toml_files
+from ..core.errors import InputError, VbnfaultError, shown
+from ..core.interrupts import Stopped, exit_code, interruptible
+from ..core.tables import did_you_mean
+from ..dataset import BuildOptions
+from ..dataset.errors import Interrupted
+from ..dataset.processes import Pool
+from ..dataset.progress import Progress
+from ..dataset.work import run_here
+from ..faults import LEVELS, ModelLevels, Severity, SeverityTable, dataset_order, read_table, registry
 from ..scene import config
+from ..world import assemble
 from . import navigation_metrics
+from .severity_views import TRIES, ModelUnderTest, SeverityJob, ViewGroup, ViewWorkers
 
-# Severities at which a model is evaluated first, and halvings of the interval around a level.
-_COARSE = 7
-_WITHIN = 0.2  # of the wanted error; a level is reached if its error is as near as this
-_BISECTIONS = 6
-_NEAR = 0.05  # of the wanted error; nearer than this, the search ends
+F64 = NDArray[np.float64]
+
+_WITHIN = 0.1  # of the wanted error; a level exists if its error is as near as this
+_GRID = 1001  # positions at which the quantile of the curves is computed
+_RESAMPLES = 1000
+_CONFIDENCE = 0.95
+_MOSAIC = "generic_ccd"  # for models that the scene's camera cannot have
+_ALL = "all"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,12 +54,12 @@ class Criterion:
 
     metric: str = "matches_lost"
     quantile: float = 0.5
-    errors: tuple[float, ...] = (0.15, 0.3, 0.45, 0.6, 0.75)
+    errors: tuple[float, ...] = (0.2, 0.35, 0.5, 0.65, 0.8)
 
     def __post_init__(self) -> None:
         known = [metric.name for metric in navigation_metrics.METRICS if metric.better == "low"]
         if self.metric not in known:
-            raise InputError(f"metric = {self.metric!r}: must be one of {', '.join(known)}")
+            raise InputError(f"metric = {shown(self.metric)}: must be one of {', '.join(known)}")
         if not 0 <= self.quantile <= 1:
             raise InputError(f"quantile = {self.quantile:g}: must be from 0 to 1")
         if len(self.errors) != LEVELS or not all(
@@ -58,261 +69,371 @@ class Criterion:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Levels:
-    """Hold the levels of one model: the values of `key`, mildest first, and the error of each.
+class ViewOptions:
+    """State on which views the models are evaluated.
 
-    Both are NaN where no value has an error within 20 % of the level's: where the model reaches no such error, or
-    where the steps of a whole number are too coarse.
-    """
-
-    fault: str
-    model: str
-    key: str
-    values: tuple[float, ...]
-    errors: tuple[float, ...]
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _View:
-    """Hold one view of a sequence as far as no fault changes it."""
-
-    spec: SampleSpec
-    pose: Pose
-    rendering: Rendering
-    exposure: SceneExposure
-    clean: np.ndarray[Any, np.dtype[np.uint8]]
-
-    def frame(self, fault: Fault | None) -> navigation_metrics.NavigationFrame:
-        """Return the view with a fault, drawn by the key of the sample; None: without any."""
-        image = self.clean
-        if fault is not None:
-            development = self.development()
-            context = development.context_of(fault, {})
-            params = fault.draw(context, self.spec.rng("fault", f"{fault.fault}/0"))
-            image = development.image({fault.fault: Draw(fault=fault, attempt=0, params=params)}).array
-        return navigation_metrics.navigation_frame(
-            self.pose, self.rendering.truth, self.spec.camera, self.clean, image
-        )
-
-    def development(self) -> Development:
-        """Return what develops images of this view."""
-        context = fault_context(self.pose, self.rendering, self.exposure)
-        return Development(exposure=self.exposure, context=context, rng=self.spec.rng)
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class ViewSet:
-    """Hold short sequences of views, rendered once, on which models are evaluated."""
-
-    sequences: tuple[tuple[_View, ...], ...]
-    criterion: Criterion = field(default_factory=Criterion)
-
-    def error(self, fault: Fault) -> float:
-        """Return the criterion's quantile over the views of its metric with a fault; NaN where no view has one."""
-        values = [_value([view.frame(fault) for view in views], self.criterion.metric) for views in self.sequences]
-        finite = [value for value in values if np.isfinite(value)]
-        return float(np.quantile(finite, self.criterion.quantile)) if finite else float("nan")
-
-
-def _value(frames: Sequence[navigation_metrics.NavigationFrame], metric: str) -> float:
-    """Return one metric of a sequence."""
-    return navigation_metrics.navigation_values(frames, [metric])[metric]
-
-
-def view_set(
-    scene: str,
-    count: int,
-    *,
-    criterion: Criterion | None = None,
-    facing_sun: bool = False,
-    overrides: Mapping[str, Any] | None = None,
-) -> ViewSet:
-    """Render views of a scene, each with as many further views of its site as the metric needs.
-
-    Parameters
+    Attributes
     ----------
     scene
         Path or packaged name. Its faults are left out.
-    count
-        Number of views.
-    criterion
-        The metric.
-    facing_sun
-        True: views with the whole Sun before the camera; False: views that look away from it.
     overrides
         Values that replace those of the scene, by dotted key.
-
-    Raises
-    ------
-    VbnfaultError
-        Fewer than half of the samples have a view and a value of the metric.
+    lenses
+        Packaged names or paths of lenses, "" for a thin lens; empty: that of the scene.
+    views
+        Number of views behind each lens.
     """
-    criterion = criterion or Criterion()
-    values = {
-        **(overrides or {}),
-        "faults": {},
-        "dataset.samples": 4 * count,
-        "dataset.layers": ["clean"],
-        "plan.sun_facing_nominal_fraction": float(facing_sun),
-        "plan.on_invisible": "drop",
-    }
-    session = Session(config.load_scene(scene, values), source=scene)
-    needed = navigation_metrics.views_needed([criterion.metric])
-    sequences: list[tuple[_View, ...]] = []
-    for index in range(4 * count):
-        try:
-            views = tuple(_views(session.spec(index), needed, facing_sun))
-        except VbnfaultError:  # no pose, or no track, meets the conditions
-            continue
-        frames = [view.frame(None) for view in views]
-        if frames and np.isfinite(
-            navigation_metrics.navigation_values(frames, [criterion.metric])[criterion.metric]
-        ):
-            sequences.append(views)
-        if len(sequences) == count:
-            return ViewSet(sequences=tuple(sequences), criterion=criterion)
-    if 2 * len(sequences) < count:
-        raise VbnfaultError(
-            f"{scene}: only {len(sequences)} of {4 * count} samples have a value of {criterion.metric} without "
-            "faults; take another scene, or more pixels"
-        )
-    return ViewSet(sequences=tuple(sequences), criterion=criterion)
+
+    scene: str
+    overrides: Mapping[str, Any] = field(default_factory=dict)
+    lenses: tuple[str, ...] = ()
+    views: int = 64
 
 
-def _views(spec: SampleSpec, count: int, facing_sun: bool) -> Iterator[_View]:
-    """Render the views of a sequence; none where the Sun should be before the camera, but is not wholly visible."""
-    pose = resolve(spec)
-    if facing_sun and not (pose.sun_visible_fraction == 1 and pose.L_from_C[:, 2] @ pose.sun_L > 0):
-        return
-    rendering = render_view(spec, pose)
-    for k, at in enumerate(navigation_metrics.sequence(spec, pose, rendering, count)):
-        here = navigation_metrics.spec_of_view(spec, k)
-        seen = rendering if k == 0 else render_view(here, at)
-        exposure = add_stars(here, at, seen, meter(here, seen))
-        development = Development(exposure=exposure, context=fault_context(at, seen, exposure), rng=here.rng)
-        yield _View(spec=here, pose=at, rendering=seen, exposure=exposure, clean=development.image({}).array)
+# --- from evaluations to levels ----------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class RisingCurve:
     """Hold the rising curve nearest to some evaluations of an error, float64[n] each, both rising."""
 
-    positions: np.ndarray[Any, np.dtype[np.float64]]
-    errors: np.ndarray[Any, np.dtype[np.float64]]
+    positions: F64
+    errors: F64
 
     @staticmethod
-    def through(evaluated: Mapping[float, float]) -> RisingCurve:
-        """Return the curve by isotonic regression of position → error; each block lies at its mean position."""
+    def through(evaluated: Mapping[float, float]) -> RisingCurve | None:
+        """Return the curve by isotonic regression of position → error; each block lies at its mean position.
+
+        None where no error is finite.
+        """
         order = sorted(position for position, error in evaluated.items() if np.isfinite(error))
         if not order:
-            return RisingCurve(positions=np.zeros(1), errors=np.zeros(1))
+            return None
         fit = isotonic_regression([evaluated[position] for position in order])
         ends = fit.blocks
         middle = [float(np.mean(order[start:end])) for start, end in itertools.pairwise(ends)]
         return RisingCurve(positions=np.array(middle), errors=np.asarray(fit.x)[ends[:-1]])
 
-    def position(self, error: float) -> float:
-        """Return the position with an error, the first or the last one where the curve does not reach it."""
-        return float(np.interp(error, self.errors, self.positions))
-
-    def error(self, position: float) -> float:
-        """Return the error at a position."""
-        return float(np.interp(position, self.positions, self.errors))
+    def at(self, positions: F64) -> F64:
+        """Return the errors at positions."""
+        return np.asarray(np.interp(positions, self.positions, self.errors))
 
 
 def levels_of(
-    model: type[Fault],
-    views: ViewSet,
-    *,
-    table: Mapping[str, Any] | None = None,
-    said: Callable[[str], None] = print,
-) -> Levels:
-    """Return the levels of one model, by bisection of its severity on the same views and random numbers.
-
-    The values of the levels are read from the rising curve that comes nearest to all evaluations, since the error
-    of a few views is noisy. The error is evaluated at seven severities, evenly spaced in the logarithm of the key.
-    Noise of the metric may make it fall a little; the search takes its running maximum as the rising curve, and
-    bisects the interval in which that passes the error of a level.
+    model: ModelUnderTest,
+    by_view: Sequence[Sequence[tuple[float, float]]],
+    criterion: Criterion,
+    width_px: int,
+    detector: str = "",
+) -> ModelLevels:
+    """Return the levels of one model.
 
     Parameters
     ----------
     model
-        A fault model with `severity`.
-    views
-        Where it is evaluated.
-    table
-        Further keys of the fault.
-    said
-        Gets a sentence on each evaluation.
+        The model.
+    by_view
+        Value of the severity's key and error of each evaluation, for each view.
+    criterion
+        What a level means.
+    width_px
+        Width of the frames.
+    detector
+        Packaged sensor of the views; "": the scene's.
+
+    Raises
+    ------
+    VbnfaultError
+        No view has a finite error.
+    """
+    severity = model.severity
+    grid = np.linspace(0, 1, _GRID)
+    curves = [
+        RisingCurve.through({severity.position(value, width_px): error for value, error in view})
+        for view in by_view
+    ]
+    errors = np.array([curve.at(grid) for curve in curves if curve is not None])
+    if not len(errors):
+        raise VbnfaultError(f"{model.name}: {criterion.metric} has no value on any view")
+    quantiles = np.quantile(errors, criterion.quantile, axis=0)
+    values = np.full(LEVELS, np.nan)
+    reached = np.full((LEVELS, 3), np.nan)  # error, and its interval
+    for k, wanted in enumerate(criterion.errors):
+        value = severity.value(float(np.interp(wanted, quantiles, grid)), width_px)
+        column = _nearest(severity, model.at(value)[1], width_px)
+        if abs(quantiles[column] - wanted) <= _WITHIN * wanted and value not in values:
+            values[k], reached[k] = value, error_with_interval(errors[:, column], criterion.quantile)
+    return ModelLevels(
+        key=severity.key,
+        values=tuple(float(f"{value:.4g}") for value in values),
+        errors=tuple(round(float(error), 4) for error in reached[:, 0]),
+        intervals=tuple((round(float(low), 4), round(float(high), 4)) for _, low, high in reached),
+        reach=(round(float(quantiles[0]), 4), round(float(quantiles[-1]), 4)),
+        views=len(errors),
+        detector=detector,
+    )
+
+
+def _nearest(severity: Severity, value: float, width_px: int) -> int:
+    """Return the index on the grid of the position that is nearest to that of a value."""
+    return int(np.clip(round(severity.position(value, width_px) * (_GRID - 1)), 0, _GRID - 1))
+
+
+def _resampled(count: int) -> NDArray[np.intp]:
+    """Return indices of resamples of `count` views, intp[resample, view], always the same."""
+    rng = np.random.default_rng(0)
+    return rng.integers(count, size=(_RESAMPLES, count))
+
+
+def error_with_interval(errors: Sequence[float] | F64, quantile: float) -> tuple[float, float, float]:
+    """Return the quantile over views of an error, and its 95 % interval by a bootstrap over the views."""
+    finite = np.array([error for error in errors if np.isfinite(error)])
+    if not len(finite):
+        return np.nan, np.nan, np.nan
+    spread = np.quantile(finite[_resampled(len(finite))], quantile, axis=1)
+    tail = (1 - _CONFIDENCE) / 2
+    low, high = np.quantile(spread, [tail, 1 - tail])
+    return float(np.quantile(finite, quantile)), float(low), float(high)
+
+
+# --- the whole table ---------------------------------------------------------------------------------------------
+
+
+def models_of(
+    scene: str, names: Sequence[str] = (), overrides: Mapping[str, Any] | None = None
+) -> list[ModelUnderTest]:
+    """Return models that have a severity, in the order of the dataset.
+
+    Parameters
+    ----------
+    scene
+        Path or packaged name of a scene, whose keys of a model are kept.
+    names
+        Names as `vignetting/cos4`, or of classes, of which then all models count, or "all"; empty: the models of
+        the scene.
+    overrides
+        Values that replace those of the scene, by dotted key.
 
     Raises
     ------
     InputError
-        The model has no severity, or the table is wrong.
+        A name is unknown or has no severity, or the scene has no such model.
     """
-    severity = model.severity
-    if severity is None:
-        raise InputError(f"{model.fault}/{model.model}: has no severity; declare its key in the class")
-    declared = next(f.metadata for f in fields(model) if f.name == severity.key)
-    known: dict[float, float] = {}
+    tables = config.load_scene(scene, overrides).faults
+    known: dict[str, ModelUnderTest] = {}
+    of_scene = []
+    for fault, models in registry().items():
+        for name, cls in models.items():
+            table = dict(tables.get(fault, {}))
+            is_of_scene = fault in tables and table.pop("model", next(iter(models))) == name
+            if cls.severity is None:
+                continue
+            keys = {k: v for k, v in table.items() if k != cls.severity.key} if is_of_scene else {}
+            known[f"{fault}/{name}"] = ModelUnderTest(fault=fault, model=name, keys=keys)
+            if is_of_scene:
+                of_scene.append(f"{fault}/{name}")
+    if not names and not of_scene:
+        raise InputError(f"{scene}: none of its faults has a severity; name models, such as vignetting/cos4")
+    chosen: set[str] = set(of_scene if not names else ())
+    for name in names:
+        fits = [key for key in known if name in (_ALL, key, key.partition("/")[0])]
+        if not fits:
+            raise InputError(f"model {shown(name)}: no such model with a severity{did_you_mean(name, list(known))}")
+        chosen.update(fits)
+    return [model for key, model in known.items() if key in chosen]
 
-    def value(position: float) -> float | int:
-        return severity.value(position, integer=bool(declared.get("integer")))
 
-    def error(position: float) -> float:
-        at = value(position)
-        if at not in known:
-            fault = model(**{**(table or {}), severity.key: at})
-            fault.validate()
-            known[at] = views.error(fault)
-            said(f"{model.fault}/{model.model}: {severity.key} = {at:g}: {known[at]:.4f}")
-        return known[at]
+def evaluate_models(
+    models: Sequence[ModelUnderTest],
+    views: ViewOptions,
+    metric: str,
+    options: BuildOptions,
+    path: Path | None = None,
+) -> tuple[SeverityJob, dict[str, str]]:
+    """Render the views and evaluate models on them.
 
-    positions = np.linspace(0, 1, _COARSE)
-    rising = np.fmax.accumulate([error(position) for position in positions])
-    for wanted in views.criterion.errors:
-        above = np.flatnonzero(rising >= wanted)
-        low, high = (positions[max(above[0] - 1, 0)], positions[above[0]]) if len(above) else (1.0, 1.0)
-        for _ in range(_BISECTIONS):
-            middle = (low + high) / 2
-            if abs(error(middle) - wanted) <= _NEAR * wanted:
-                break
-            low, high = (low, middle) if error(middle) >= wanted else (middle, high)
-    curve = RisingCurve.through({severity.position(at): found for at, found in known.items()})
-    values: list[float] = []
-    errors: list[float] = []
-    for wanted in views.criterion.errors:
-        at = value(curve.position(wanted))
-        reached = curve.error(severity.position(at))
-        missed = abs(reached - wanted) > _WITHIN * wanted or at in values
-        values.append(float("nan") if missed else at)
-        errors.append(float("nan") if missed else reached)
-    return Levels(
-        fault=model.fault, model=model.model, key=severity.key, values=tuple(values), errors=tuple(errors)
+    Parameters
+    ----------
+    models
+        The models.
+    views
+        On which views.
+    metric
+        Metric of navigation.
+    options
+        Number of processes and threads, and whether progress is shown.
+    path
+        File that is made, for messages.
+
+    Returns
+    -------
+    SeverityJob
+        The errors of each model on each view.
+    dict
+        The packaged sensor by model; "": the scene's own.
+
+    Raises
+    ------
+    InputError
+        The scene cannot be used.
+    Interrupted
+        After Ctrl-C, SIGTERM or SIGHUP.
+    VbnfaultError
+        Fewer than half of the views exist.
+    """
+    detectors = {model.name: _detector(model, views) for model in models}
+    groups = _groups(models, views, detectors)
+    planned = sum(group.count for group in groups)
+    job = SeverityJob(path or Path(views.scene), groups, Progress(planned, shown=options.progress, noun="views"))
+    workers = ViewWorkers(metric=metric)
+    try:
+        with interruptible(), job.progress:
+            if options.workers == 1:
+                run_here(workers, job)
+            else:
+                threads = options.threads or max(1, (os.cpu_count() or 1) // options.workers)
+                Pool(workers, job, threads, options.recycle_shards).work(options.workers)
+    except (Stopped, KeyboardInterrupt) as stop:
+        raise Interrupted(f"{job.path}: interrupted; nothing was written", exit_code(stop)) from stop
+    if 2 * len(job.errors) < planned:
+        raise VbnfaultError(
+            f"{views.scene}: only {len(job.errors)} of {planned} views have {metric} without faults; take another "
+            "scene, or more pixels"
+        )
+    return job, detectors
+
+
+def compute_levels(
+    models: Sequence[ModelUnderTest],
+    views: ViewOptions,
+    criterion: Criterion,
+    options: BuildOptions | None = None,
+    path: Path | None = None,
+) -> SeverityTable:
+    """Return the levels of models as a table that scenes read. If the file `path` exists, its other models stay.
+
+    Parameters and errors: as `evaluate_models`. Raises InputError, too, if the file was made in another manner.
+    """
+    camera = config.load_scene(views.scene, views.overrides).camera
+    lenses = views.lenses or (camera.lens,)
+    table = SeverityTable(
+        description="values that cost navigation the same, by fault class and model",
+        commands=(_command(models, views, criterion),),
+        metric=criterion.metric,
+        quantile=criterion.quantile,
+        errors=criterion.errors,
+        scene=views.scene,
+        lenses=lenses,
+        width_px=camera.width_px,
+        levels={},
     )
+    if path is not None:
+        merged(path, table)  # refuses another table before the work
+    job, detectors = evaluate_models(models, views, criterion.metric, options or BuildOptions(), path)
+    levels: dict[str, dict[str, ModelLevels]] = {}
+    for model in models:
+        by_view = [view for lens in range(len(lenses)) for view in job.of_lens(lens, model.name)]
+        levels.setdefault(model.fault, {})[model.model] = levels_of(
+            model, by_view, criterion, camera.width_px, detectors[model.name]
+        )
+    table = table.model_copy(update={"levels": levels})
+    return table if path is None else merged(path, table)
 
 
-def write_levels(path: str | Path, levels: Sequence[Levels], criterion: Criterion, scene: str, views: int) -> None:
-    """Write levels as the table that scenes read by the key `severity` of a fault."""
-    table: dict[str, Any] = {
-        "description": "values that cost navigation the same, by fault class and model; made by "
-        "benchmarks/severity_levels.py",
-        "metric": criterion.metric,
-        "quantile": criterion.quantile,
-        "errors": list(criterion.errors),
-        "scene": scene,
-        "views": views,
-        "levels": {},
-    }
-    for entry in levels:
-        table["levels"].setdefault(entry.fault, {})[entry.model] = {
-            "key": entry.key,
-            "values": list(entry.values),
-            "errors": [round(error, 4) for error in entry.errors],
-        }
-    Path(path).write_text(tomli_w.dumps(table), encoding="utf-8")
+def _command(models: Sequence[ModelUnderTest], views: ViewOptions, criterion: Criterion) -> str:
+    """Return the command line that computes levels."""
+    words = ["vbnfault", "severity", views.scene, "--views", str(views.views)]
+    words += ["--metric", criterion.metric, "--quantile", f"{criterion.quantile:g}"]
+    for model in models:
+        words += ["--model", model.name]
+    for lens in views.lenses:
+        words += ["--lens", lens or "thin"]
+    for key, value in views.overrides.items():
+        words += ["--set", f"{key}={value}"]
+    return shlex.join(words)
 
 
-def models_with_severity() -> list[type[Fault]]:
-    """Return the registered models that have a severity, in the order of the dataset."""
-    return [model for models in registry().values() for model in models.values() if model.severity is not None]
+def merged(path: Path, table: SeverityTable) -> SeverityTable:
+    """Return a table with the levels of further models from the file `path`, if it exists.
+
+    Raises InputError where the file has levels of another metric, quantile, scene, lens or width.
+    """
+    if not path.exists():
+        return table
+    before = read_table(path)
+    for name in ("metric", "quantile", "errors", "scene", "lenses", "width_px"):
+        old, new = getattr(before, name), getattr(table, name)
+        if old != new:
+            raise InputError(
+                f"{path}: has levels with {name} = {shown(old)}, not {shown(new)}; choose another file"
+            )
+    levels = {fault: dict(models) for fault, models in before.levels.items()}
+    for fault, models in table.levels.items():
+        levels.setdefault(fault, {}).update(models)
+    ordered = {fault: levels[fault] for fault in dataset_order(levels)}
+    return table.model_copy(update={"levels": ordered, "commands": (*before.commands, *table.commands)})
+
+
+def write_table(path: Path, table: SeverityTable) -> None:
+    """Write a table of levels, with `nan` for levels that do not exist."""
+    path.write_text(toml_files.toml_text(table.model_dump(mode="python")), encoding="utf-8")
+
+
+def lines_of(table: SeverityTable) -> list[str]:
+    """Return lines that show a table of levels."""
+    lines = [f"{table.metric}, quantile {table.quantile:g} over views: {', '.join(f'{e:g}' for e in table.errors)}"]
+    for fault, models in table.levels.items():
+        for model, levels in models.items():
+            values = ", ".join("none" if np.isnan(value) else f"{value:g}" for value in levels.values)
+            lines.append(f"{fault}/{model}: {levels.key} = {values} ({levels.views} views)")
+    return lines
+
+
+def _detector(model: ModelUnderTest, views: ViewOptions) -> str:
+    """Return the packaged sensor of a model that the scene's camera cannot have, else ""."""
+    camera = config.load_scene(views.scene, views.overrides).camera
+    cls = model.type
+    if cls.needs_mosaic and not camera.detector:
+        return _MOSAIC
+    if cls.needs_ccd and camera.detector and assemble.mosaic_sensor(camera).architecture == "cmos":
+        return _MOSAIC
+    return ""
+
+
+def _groups(models: Sequence[ModelUnderTest], views: ViewOptions, detectors: Mapping[str, str]) -> list[ViewGroup]:
+    """Return the groups of views: for each lens, sensor and side of the sky one for each site."""
+    scene = config.load_scene(views.scene, views.overrides)
+    groups: list[ViewGroup] = []
+    first = 0
+    for lens, name in enumerate(views.lenses or (scene.camera.lens,)):
+        fitting = [model for model in models if not (name and model.type.thin_lens_only)]
+        kinds = dict.fromkeys((detectors[model.name], model.type.needs_sun) for model in fitting)
+        for detector, facing_sun in kinds:
+            values = {**views.overrides, "dataset.samples": TRIES * views.views, "camera.lens": name}
+            if detector:
+                values["camera.detector"] = detector
+            chosen = tuple(
+                model
+                for model in fitting
+                if (detectors[model.name], model.type.needs_sun) == (detector, facing_sun)
+            )
+            sites = min(scene.dataset.sites, views.views)
+            for site in range(sites):
+                count = views.views // sites + (site < views.views % sites)
+                groups.append(
+                    ViewGroup(
+                        scene=views.scene,
+                        overrides=values,
+                        lens=lens,
+                        facing_sun=facing_sun,
+                        site=site,
+                        first=first,
+                        count=count,
+                        models=chosen,
+                    )
+                )
+                first += count
+    for model in models:
+        if not any(model in group.models for group in groups):
+            raise InputError(f"{views.scene}: {model.name} needs a thin lens; add one with --lens thin")
+    return groups

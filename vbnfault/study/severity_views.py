@@ -1,0 +1,352 @@
+"""Measure on rendered views what fault models cost navigation, as a function of their severity.
+
+Each view is a short sequence of images of one site. It is rendered once for all models; all severities of a model
+use the same random numbers. A task of a worker process are the views of one site behind one lens.
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .. import navigation
+from ..core.errors import VbnfaultError
+from ..core.interrupts import check
+from ..dataset.progress import Progress
+from ..dataset.work import Fatal, Queue, Tick
+from ..faults import Fault, Severity, from_dict, registry
+from ..pipeline import Session
+from ..pipeline.development import Development
+from ..pipeline.injection import fault_context
+from ..pipeline.spec import Draw, Pose, Rendering, SampleSpec, SceneExposure
+from ..pipeline.stages import add_stars, meter, render_view, resolve
+from ..scene import config
+from . import navigation_metrics
+
+# Evaluations of a model on a view: first at evenly spaced positions, then where the error rises most.
+_FIRST_EVALUATIONS = 5
+_EVALUATIONS = 10
+# Matches of a view's clean twins: of fewer, the fraction that is lost is too coarse.
+_FEWEST_MATCHES = 50
+# Samples that are tried for each view: some see no lit ground, or too little of it.
+TRIES = 8
+
+
+@dataclass(frozen=True, kw_only=True)
+class ModelUnderTest:
+    """Name a fault model with the keys that stay as they are.
+
+    `values` are the values of its severity's key at which it is evaluated; empty: they are searched.
+    """
+
+    fault: str
+    model: str
+    keys: Mapping[str, Any]
+    values: tuple[float, ...] = ()
+
+    @property
+    def name(self) -> str:
+        """Return class and model, as `vignetting/cos4`."""
+        return f"{self.fault}/{self.model}"
+
+    @property
+    def type(self) -> type[Fault]:
+        """Return the class of the model."""
+        return registry()[self.fault][self.model]
+
+    @property
+    def severity(self) -> Severity:
+        """Return the severity of the model."""
+        severity = self.type.severity
+        assert severity is not None
+        return severity
+
+    def at(self, value: float) -> tuple[Fault, float]:
+        """Return the fault with a value of the severity's key, and the mean of what is then drawn.
+
+        The value is clipped to the limits of the key, and a whole number is rounded.
+        """
+        declared = next(f.metadata for f in fields(self.type) if f.name == self.severity.key)
+        setting = self.severity.setting(float(np.clip(value, *declared["limits"])), declared)
+        table = {"model": self.model, **self.keys, self.severity.key: setting}
+        return from_dict(self.fault, table, source=f"severity of {self.name}"), float(np.mean(setting))
+
+
+@dataclass(frozen=True, kw_only=True)
+class ViewGroup:
+    """Describe the views of one site behind one lens, `count` of them, and the models evaluated on them.
+
+    Attributes
+    ----------
+    scene, overrides
+        Path or packaged name of the scene, and the values that replace its own.
+    lens
+        Index of the lens.
+    facing_sun
+        Whether the whole Sun is before the camera; else the views look away from it.
+    site
+        Index of the site.
+    first
+        Number of the first view.
+    """
+
+    scene: str
+    overrides: Mapping[str, Any]
+    lens: int
+    facing_sun: bool
+    site: int
+    first: int
+    count: int
+    models: tuple[ModelUnderTest, ...]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SequenceView:
+    """Hold one image of a sequence as far as no fault changes it."""
+
+    spec: SampleSpec
+    pose: Pose
+    rendering: Rendering
+    exposure: SceneExposure
+    clean: np.ndarray[Any, np.dtype[np.uint8]]
+
+    def image(self, fault: Fault | None) -> np.ndarray[Any, np.dtype[np.uint8]]:
+        """Return the image with a fault, drawn by the key of the sample, uint8[y, x, 4]; None: without any."""
+        if fault is None:
+            return self.clean
+        context = fault_context(self.pose, self.rendering, self.exposure)
+        development = Development(exposure=self.exposure, context=context, rng=self.spec.rng)
+        params = fault.draw(development.context_of(fault, {}), self.spec.rng("fault", f"{fault.fault}/0"))
+        return development.image({fault.fault: Draw(fault=fault, attempt=0, params=params)}).array
+
+    def frame(self, fault: Fault | None) -> navigation_metrics.NavigationFrame:
+        """Return the view with a fault as the metrics need it."""
+        return navigation_metrics.navigation_frame(
+            self.pose, self.rendering.truth, self.spec.camera, self.clean, self.image(fault)
+        )
+
+
+def sequences(group: ViewGroup, metric: str, session: Session) -> Iterator[tuple[SequenceView, ...]]:
+    """Render the views of a group one by one; fewer than its `count` where the scene has no more.
+
+    A view counts if it has a value of the metric without faults, and enough matches where matches are compared.
+    """
+    needed = navigation_metrics.views_needed([metric])
+    made = 0
+    for index in np.flatnonzero(session.plan.site == group.site):
+        if made == group.count:
+            return
+        try:
+            views = tuple(_views(session.spec(int(index)), needed, group.facing_sun))
+        except VbnfaultError:  # no pose, or no track, meets the conditions
+            continue
+        if views and _counts([view.frame(None) for view in views], metric):
+            made += 1
+            yield views
+
+
+def session_of(group: ViewGroup) -> Session:
+    """Return the session that renders a group."""
+    values = {
+        **group.overrides,
+        "faults": {},
+        "dataset.layers": ["clean"],
+        "plan.sun_facing_nominal_fraction": float(group.facing_sun),
+        "plan.on_invisible": "drop",
+    }
+    return Session(config.load_scene(group.scene, values), source=group.scene)
+
+
+def _views(spec: SampleSpec, count: int, facing_sun: bool) -> Iterator[SequenceView]:
+    """Render the views of a sequence; none where the Sun should be before the camera, but is not wholly visible."""
+    pose = resolve(spec)
+    if facing_sun and not (pose.sun_visible_fraction == 1 and pose.L_from_C[:, 2] @ pose.sun_L > 0):
+        return
+    rendering = render_view(spec, pose)
+    for k, pose_k in enumerate(navigation_metrics.sequence(spec, pose, rendering, count)):
+        spec_k = navigation_metrics.spec_of_view(spec, k)
+        rendering_k = rendering if k == 0 else render_view(spec_k, pose_k)
+        exposure = add_stars(spec_k, pose_k, rendering_k, meter(spec_k, rendering_k))
+        context = fault_context(pose_k, rendering_k, exposure)
+        development = Development(exposure=exposure, context=context, rng=spec_k.rng)
+        yield SequenceView(
+            spec=spec_k,
+            pose=pose_k,
+            rendering=rendering_k,
+            exposure=exposure,
+            clean=development.image({}).array,
+        )
+
+
+def _counts(frames: Sequence[navigation_metrics.NavigationFrame], metric: str) -> bool:
+    """Return whether a sequence without faults has a value of the metric, and enough matches."""
+    if not np.isfinite(navigation_metrics.navigation_values(frames, [metric])[metric]):
+        return False
+    if navigation_metrics.views_needed([metric]) != 2:
+        return True
+    first, second = frames
+    matches = navigation.match(first.clean, second.clean)
+    return int(navigation.right_matches(matches, first.view, second.view).sum()) >= _FEWEST_MATCHES
+
+
+# --- the error as a function of severity -------------------------------------------------------------------------
+
+
+def error_of(fault: Fault, views: Sequence[SequenceView], metric: str) -> float:
+    """Return the metric of a sequence of views with a fault."""
+    frames = [view.frame(fault) for view in views]
+    return navigation_metrics.navigation_values(frames, [metric])[metric]
+
+
+def measure(model: ModelUnderTest, width_px: int, error: Callable[[Fault], float]) -> list[tuple[float, float]]:
+    """Return (value of the severity's key, error) of a model on one view, in the order of evaluation.
+
+    Where the model names no values, they are searched: five, spaced evenly in position, then always the middle of
+    those two neighbours between which the error changes most.
+    """
+    known: dict[float, float] = {}
+
+    def evaluate(value: float) -> bool:
+        fault, mean = model.at(value)
+        if mean in known:
+            return False
+        check()
+        known[mean] = error(fault)
+        return True
+
+    for value in model.values:
+        evaluate(value)
+    if model.values:
+        return list(known.items())
+    severity = model.severity
+    for position in np.linspace(0, 1, _FIRST_EVALUATIONS):
+        evaluate(severity.value(position, width_px))
+    closed: set[tuple[float, float]] = set()  # neighbours without a whole number between them
+    while len(known) < _EVALUATIONS:
+        order = sorted(known, key=lambda value: severity.position(value, width_px))
+        gaps = [pair for pair in itertools.pairwise(order) if pair not in closed]
+        if not gaps:
+            break
+        widest = max(gaps, key=lambda pair: abs(np.nan_to_num(known[pair[1]] - known[pair[0]])))
+        middle = sum(severity.position(value, width_px) for value in widest) / 2
+        if not evaluate(severity.value(middle, width_px)):
+            closed.add(widest)
+    return list(known.items())
+
+
+# --- work --------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, kw_only=True)
+class GroupTask:
+    """Describe the task to evaluate one group; for `skip` see `dataset.work.Job.task`."""
+
+    group: ViewGroup
+    skip: frozenset[int]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ViewWorkers:
+    """Make a worker; the object is a function that can be pickled."""
+
+    metric: str
+
+    def __call__(self) -> ViewWorker:
+        return ViewWorker(self.metric)
+
+
+class ViewWorker:
+    """Render the views of groups and evaluate models on them."""
+
+    def __init__(self, metric: str) -> None:
+        self._metric = metric
+        self._session: tuple[Any, Session] | None = None
+
+    def do(self, task: GroupTask, tick: Tick) -> None:
+        """Evaluate the models on each view of a group, and report the values and errors as JSON.
+
+        The text is empty for a view that the scene does not have.
+        """
+        group = task.group
+        try:
+            session = self._session_of(group)
+        except VbnfaultError as error:  # all views would fail
+            raise Fatal(error) from error
+        views = sequences(group, self._metric, session)
+        for number in range(group.first, group.first + group.count):
+            if number in task.skip:
+                return
+            tick(number, "begun", "")
+            sequence = next(views, None)
+            tick(number, "built", "" if sequence is None else json.dumps(self._errors(group, sequence)))
+
+    def _session_of(self, group: ViewGroup) -> Session:
+        """Return the session of a group, which is kept for the next group of its camera."""
+        key = group.scene, tuple(sorted(group.overrides.items())), group.facing_sun
+        if self._session is None or self._session[0] != key:
+            self._session = key, session_of(group)
+        return self._session[1]
+
+    def _errors(self, group: ViewGroup, views: Sequence[SequenceView]) -> dict[str, list[tuple[float, float]]]:
+        """Return the values and errors of each model, by its name."""
+        width_px = views[0].spec.scene.camera.width_px
+        return {
+            model.name: measure(model, width_px, lambda fault: error_of(fault, views, self._metric))
+            for model in group.models
+        }
+
+
+class SeverityJob:
+    """Hand out groups of views, and collect the errors of each model on each view."""
+
+    task_noun, item_noun = "group of views", "view"
+
+    def __init__(self, path: Path, groups: Sequence[ViewGroup], progress: Progress) -> None:
+        self.path, self.progress, self._groups = path, progress, groups
+        self._queue = Queue([0] * len(groups))
+        self.errors: dict[int, dict[str, list[tuple[float, float]]]] = {}
+
+    @property
+    def tasks(self) -> int:
+        """Return the number of groups."""
+        return len(self._groups)
+
+    def items(self, number: int) -> Sequence[int]:
+        """Return the views of a group."""
+        group = self._groups[number]
+        return range(group.first, group.first + group.count)
+
+    def task(self, number: int, skip: frozenset[int] = frozenset(), *, careful: bool = False) -> GroupTask:
+        """Return the task that evaluates a group."""
+        return GroupTask(group=self._groups[number], skip=skip)
+
+    def next_task(self, last: int | None = None, busy: Sequence[int] = ()) -> int | None:
+        """Return the next group."""
+        return self._queue.next(last, busy)
+
+    def tick(self, item: int, what: str, text: str) -> None:
+        """Record an event of a view."""
+        if what == "stage":
+            self.progress.stage(text)
+        elif what == "failed":
+            self.progress.say(f"view {item} failed: {text.splitlines()[0]}")
+        elif what == "built":
+            if text:
+                self.errors[item] = json.loads(text)
+            self.progress.advance(True)
+
+    def of_lens(self, lens: int, name: str) -> list[list[tuple[float, float]]]:
+        """Return the values and errors of a model on each view behind a lens, in the order of the views."""
+        return [
+            [(value, error) for value, error in self.errors[item][name]]
+            for group in self._groups
+            if group.lens == lens and name in {model.name for model in group.models}
+            for item in range(group.first, group.first + group.count)
+            if item in self.errors
+        ]
