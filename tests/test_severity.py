@@ -95,7 +95,7 @@ def test_the_packaged_levels_fit_the_models_and_cost_the_same() -> None:
             for k in np.flatnonzero(reached):
                 assert levels.intervals[k][0] <= levels.errors[k] <= levels.intervals[k][1]
             if f"{fault}/{model}" in PAPER:
-                assert reached[1:].all(), (fault, model)
+                assert reached.sum() >= 4, (fault, model)
 
 
 def test_a_scene_names_a_level() -> None:
