@@ -324,11 +324,15 @@ def test_the_description_shows_names_dates_and_distances(tmp_path: Path, sphere:
 
 
 def test_a_camera_in_the_ground_is_named_with_its_row(tmp_path: Path, sphere: str) -> None:
-    path = scene_file(tmp_path, sphere, [row("inside", (RADIUS_M - 5, 0, 0))])
-    with pytest.raises(
-        vbnfault.VbnfaultError, match=r"sample 0: at Julian date .* inside is within .* the poses were"
-    ):
-        vbnfault.simulate(path, 0)
+    path = scene_file(tmp_path, sphere, [row("inside", (RADIUS_M - 50, 0, 0)), row("deep", (20.0, 0, 0))])
+    session = vbnfault.Session(config.load_scene(path))
+    for k, name in enumerate(("inside", "deep")):
+        sentence = rf"sample {k}: at Julian date .* {name} is within .* the ground, or below it; .* the poses were"
+        with pytest.raises(vbnfault.VbnfaultError, match=sentence):
+            session.simulate(k)
+    body = session.body
+    assert not ground.encloses(body, np.array([0.0, 0.0, RADIUS_M + 1]))
+    assert not ground.encloses(body, np.array([400.0, 400.0, 400.0]))  # in the bounding box, but outside
 
 
 def test_a_view_past_the_body_uses_the_ground_nearest_to_the_line_of_sight(sphere: str) -> None:

@@ -15,6 +15,7 @@ from ..render.description import Sunlight
 from ..scene import plan
 from ..scene.trajectory import FlownPose
 from ..world import assemble
+from ..world.ground import encloses
 from ..world.spacecraft import SpacecraftMesh
 from .spec import Pose, SampleSpec, Terrain
 
@@ -231,13 +232,14 @@ def _on_the_trajectory(spec: SampleSpec, flown: FlownPose) -> Pose:
     visible = float(render.sun_visible_fraction(surface, position[None], [light], axes[None])[0])
     azimuth, elevation = frames.azimuth_elevation_deg(sun_L)
     clearance = scene.geometry.clearance_m
-    if not render.is_clear(surface, position[None], clearance)[0]:
+    clear = render.is_clear(surface, position[None], clearance)[0]
+    if not clear or encloses(spec.terrain.body, flown.camera_position_T_m):
         change = "poses" if scene.trajectory else "dates"
         made_for = "poses" if scene.trajectory else "kernels"
         raise VbnfaultError(
             f"sample {spec.index}: at Julian date {flown.julian_date:.6f} {flown.name} is within "
-            f"geometry.clearance_m = {clearance:g} m of the ground; choose other {change}, or the body.shape that "
-            f"the {made_for} were made for"
+            f"geometry.clearance_m = {clearance:g} m of the ground, or below it; choose other {change}, or the "
+            f"body.shape that the {made_for} were made for"
         )
     needs_sun = any(spec.faults[name].needs_sun for name in spec.commanded)
     return Pose(

@@ -173,6 +173,21 @@ def _seen(scene: Scene, body: Body, pose: FlownPose) -> _Seen:
     return _Seen(points_T_m=ground, distance_m=np.maximum(distance, 1e-3))
 
 
+def encloses(body: Body, point_T_m: F64) -> bool:
+    """Return whether a point, float64[3] in T, lies inside the body's shape model.
+
+    The facets then subtend the full sphere (van Oosterom & Strackee 1983, IEEE Trans. Biomed. Eng. 30, 125).
+    """
+    if ((point_T_m < body.vertices_m.min(axis=0)) | (point_T_m > body.vertices_m.max(axis=0))).any():
+        return False
+    a, b, c = (body.vertices_m[body.faces[:, k]] - point_T_m for k in range(3))
+    la, lb, lc = (np.linalg.norm(v, axis=1) for v in (a, b, c))
+    volume = np.einsum("ni,ni->n", a, np.cross(b, c))
+    dots = [np.einsum("ni,ni->n", p, q) for p, q in ((a, b), (a, c), (b, c))]
+    half = np.arctan2(volume, la * lb * lc + dots[0] * lc + dots[1] * lb + dots[2] * la)
+    return bool(half.sum() > np.pi)  # half of the solid angle: 2 π inside, 0 outside
+
+
 def looked_at(body: Body, origin_T_m: F64, direction_T: F64) -> F64:
     """Return where a ray first meets the body's shape model, float64[3] in m in T, or else the nearest vertex."""
     hit = first_hit(body, origin_T_m, direction_T)
