@@ -65,6 +65,15 @@ def test_a_mask_over_the_whole_frame_is_a_border() -> None:
     assert near(out, contact_sheet.COLOURS[3]) > 200
 
 
+def test_a_class_that_marks_whole_images_is_a_border_however_much_its_mask_covers() -> None:
+    rgb = np.full((60, 80, 3), 100, np.uint8)
+    mask = np.zeros((1, 60, 80), bool)
+    mask[0, ::2] = True
+    out = contact_sheet.overlay(rgb, mask, [True], localised=[False])
+    np.testing.assert_array_equal(out[10:50, 10:70], 100)
+    assert near(out, contact_sheet.COLOURS[0]) > 200
+
+
 def test_a_lone_broken_pixel_survives_shrinking() -> None:
     mask = np.zeros((1024, 1024), bool)
     mask[517, 301] = True

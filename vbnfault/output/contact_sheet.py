@@ -39,7 +39,7 @@ _BACKGROUND, _PANEL, _TEXT, _FAINT = (18, 20, 24), (30, 33, 39), (225, 228, 232)
 _TILE_PX = 320  # longer side of a tile
 _GAP_PX, _CAPTION_PX, _LINE_PX = 14, 46, 24
 _FILL = 0.30  # opacity of a mask
-_WHOLE_FRAME = 0.98  # a mask that covers more than this fraction is drawn as a border, not as a tint
+_WHOLE_FRAME = 0.98  # a localised class whose mask covers more than this fraction is drawn as a border, too
 
 
 def preview(
@@ -110,11 +110,13 @@ def abbreviations(faults: Sequence[str]) -> dict[str, str]:
     return short
 
 
-def overlay(rgb: U8, mask: NDArray[np.bool_], injected: Sequence[bool]) -> U8:
+def overlay(
+    rgb: U8, mask: NDArray[np.bool_], injected: Sequence[bool], localised: Sequence[bool] | None = None
+) -> U8:
     """Return an RGB image with the masks of the injected faults drawn on it, each as a tint and an outline.
 
-    A mask that covers nearly the whole image is drawn as a border instead, so that the image and the other masks
-    stay visible. Several borders are nested.
+    A class that is not localised, such as banding, and a mask that covers nearly the whole image are drawn as a
+    border instead, so that the image and the other masks stay visible. Several borders are nested.
 
     Parameters
     ----------
@@ -124,6 +126,8 @@ def overlay(rgb: U8, mask: NDArray[np.bool_], injected: Sequence[bool]) -> U8:
         Masks, bool[fault, y, x].
     injected
         Which faults are injected, bool[fault].
+    localised
+        Which classes mark parts of an image, bool[fault]; by default all.
     """
     out = rgb.copy()
     height, width = rgb.shape[:2]
@@ -131,7 +135,8 @@ def overlay(rgb: U8, mask: NDArray[np.bool_], injected: Sequence[bool]) -> U8:
     borders = 0
     for k in sorted(np.flatnonzero(injected).tolist(), key=lambda k: -int(mask[k].sum())):
         colour = COLOURS[k % len(COLOURS)]
-        if mask[k].mean() > _WHOLE_FRAME:
+        whole = localised is not None and not localised[k]
+        if whole or mask[k].mean() > _WHOLE_FRAME:
             inset = borders * 3 * line + line
             cv2.rectangle(out, (inset, inset), (width - 1 - inset, height - 1 - inset), colour, 2 * line)
             borders += 1
@@ -157,7 +162,8 @@ def _tile(store: Store, index: int, short: Mapping[str, str], masks: bool) -> U8
     injected = read("injected").astype(bool)
     if masks:
         small = np.stack([_resized_mask(m, size) for m in read("mask")])
-        rgb = overlay(rgb, small, injected.tolist())
+        localised = [fault in (spec.localised_faults or ()) for fault in spec.faults]
+        rgb = overlay(rgb, small, injected.tolist(), localised)
     tile = np.full((size[1] + _CAPTION_PX, size[0], 3), _PANEL, np.uint8)
     tile[: size[1]] = rgb
     site = int(read("site"))
