@@ -24,7 +24,7 @@ from . import sheets
 from .extreme_images import IMAGES
 from .plots import drawings, save
 from .ranking_plots import ranking_rows
-from .report_words import FORMULAE, SECTIONS
+from .report_words import EXACT, FORMULAE, SECTIONS, sample
 from .summaries import DUMMY, StudyResults
 
 if TYPE_CHECKING:
@@ -230,7 +230,7 @@ def _page(results: StudyResults, figures: Sequence[_Figure], images: Path) -> st
     for kind, section in SECTIONS.items():
         members = [figure.markup() for figure in figures if figure.kind == kind]
         if members:
-            how = section.how(results)
+            how = f"{section.how(results)} {sample(results, kind)}"
             body = f'<p class="how">{_e(how)}</p><div class="figures">{"".join(members)}</div>'
             parts.append((kind, section.title, body + (_ranking(results) if kind == "ranking" else "")))
     pictures = _images(results, images)
@@ -283,7 +283,9 @@ def _facts(results: StudyResults) -> str:
 def _summary(results: StudyResults) -> str:
     """Return which factors drive each metric, as a table."""
     several = len(results.models) > 1
-    heads = ["metric", *(["model"] if several else []), "factors above the noise floor", "mean", "deviation"]
+    exact = results.method in EXACT
+    leading = "strongest factors" if exact else "factors above the noise floor"
+    heads = ["metric", *(["model"] if several else []), leading, "mean", "deviation"]
     rows: list[list[str]] = []
     for metric in results.metrics:
         unit = results.about(metric, "unit")
@@ -303,9 +305,9 @@ def _summary(results: StudyResults) -> str:
             )
     words = (
         "Means and deviations are over the factors within one view; differences between views are left out. "
-        "Factors are named, the most important first, where their interval lies above that of the dummy factor, "
-        "which acts on nothing."
+        "Factors are named, the most important first"
     )
+    words += "." if exact else ", where their interval lies above that of the dummy factor, which acts on nothing."
     return f"<p>{_e(words)}</p>{_table(heads, rows, group=len(results.models))}{_model_form(results)}"
 
 

@@ -5,7 +5,33 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import numpy as np
+
 from .summaries import StudyResults
+
+# designs in which a factor that acts on nothing has indices of exactly 0, so that it shows no noise
+EXACT = ("morris", "grid", "one_at_a_time")
+
+
+def sample(results: StudyResults, kind: str) -> str:
+    """Return in a sentence from how many evaluations the figures of a section come."""
+    count, n = len(np.unique(results.column("role"))), int(results.spec["design"]["n"])
+    points = results.table.num_rows // (len(np.unique(results.blocks)) * len(results.models))
+    nouns = {
+        "sobol": f"{n} base samples of {count} points",
+        "morris": f"{n} trajectories of {points // n} points",
+    }
+    noun = nouns.get(results.method, f"{points} points")
+    if results.method == "sobol" and kind in ("tornado", "responses"):
+        noun = f"{2 * n} points, the matrices A and B of the design"
+    views, seeds = len(np.unique(results.column("view"))), len(np.unique(results.column("seed")))
+    blocks = f"{views} view{'s' if views > 1 else ''} and {seeds} seed{'s' if seeds > 1 else ''}"
+    resamples = results.spec["design"].get("resamples")
+    drawn = kind in ("indices", "seeds") and any(
+        f"{name}_interval" in results.dataset for name in ("ST", "mu_star", "delta")
+    )
+    boot = f"; intervals from {resamples} bootstrap resamples" if resamples and drawn else ""
+    return f"n: {noun}, with {blocks}{boot}."
 
 
 @dataclass(frozen=True)
@@ -29,9 +55,14 @@ def _overview(results: StudyResults) -> str:
     words = results.importance[0]
     if words == "total index":
         words = "total index, the fraction of the variance that a factor causes alone and with others"
+    floor = (
+        "The row dummy, a factor that acts on nothing, is exactly 0 in this design."
+        if results.method in EXACT
+        else "Values like those of the row dummy, a factor that acts on nothing, are noise."
+    )
     return (
         f"Each cell shows for one factor (row) and one metric (column): {words}. Read a column to see what drives "
-        "a metric; values like those of the row dummy, a factor that acts on nothing, are noise."
+        f"a metric. {floor}"
     )
 
 
@@ -61,7 +92,8 @@ def _indices(results: StudyResults) -> str:
         )
     return (
         f"Each dot is μ*, with its {level} interval: the mean absolute change of the metric when the factor moves "
-        f"over its whole range. {floor}"
+        "over its whole range. The effects of the dummy factor, which acts on nothing, are exactly 0 in this "
+        "design; compare factors by their intervals."
     )
 
 
