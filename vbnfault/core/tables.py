@@ -340,14 +340,25 @@ def _interval(schema: Mapping[str, Any]) -> str:
     """Return the limits of a number in words; empty where it has none."""
     lo, hi = schema.get("minimum"), schema.get("maximum")
     above, below = schema.get("exclusiveMinimum"), schema.get("exclusiveMaximum")
-    parts = [f"from {lo:g}"] if lo is not None else [f"above {above:g}"] if above is not None else []
+    parts = [f"from {_plain(lo)}"] if lo is not None else [f"above {_plain(above)}"] if above is not None else []
     if hi is not None:
-        parts.append(f"to {hi:g}" if lo is not None else f"and at most {hi:g}" if parts else f"up to {hi:g}")
+        parts.append(
+            f"to {_plain(hi)}"
+            if lo is not None
+            else f"and at most {_plain(hi)}"
+            if parts
+            else f"up to {_plain(hi)}"
+        )
     elif below is not None:
-        parts.append(f"and below {below:g}" if parts else f"below {below:g}")
+        parts.append(f"and below {_plain(below)}" if parts else f"below {_plain(below)}")
     elif lo is not None:
-        return f"of at least {lo:g}"
+        return f"of at least {_plain(lo)}"
     return " ".join(parts)
+
+
+def _plain(bound: float) -> str:
+    """Return a bound as text: up to seven digits before the point in full."""
+    return str(int(bound)) if abs(bound) < 1e7 and bound == int(bound) else f"{bound:g}"
 
 
 # --- the schema at the location of an error ---------------------------------------------------------------------

@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 
 from ..camera import Camera
 from ..core import spectra
-from ..core.errors import InputError
+from ..core.errors import InputError, shown
 from ..core.quantities import Electrons
 from ..core.tables import did_you_mean
 from ..faults import Fault, act, from_dict, registry
@@ -143,10 +143,11 @@ class SceneEvaluator:
             try:
                 places[factor.key] = self._places_without(factor)
             except InputError as error:
-                raise InputError(f"factor[{i}].key = {factor.key!r}: {error}") from None
+                raise InputError(f"factor[{i}].key = {shown(factor.key)}: {error}") from None
             if len(places[factor.key]) == 2 * len(self.spec.model_names):
                 raise InputError(
-                    f"factor[{i}].key = {factor.key!r}: nothing in the images of the study reads it; leave it out"
+                    f"factor[{i}].key = {shown(factor.key)}: nothing in the images of the study reads it; "
+                    "leave it out"
                 )
         self.kept.release("check")
         return [
@@ -218,7 +219,7 @@ class SceneEvaluator:
         try:
             yield
         except InputError as error:
-            raise InputError(f"study {self.spec.title!r}: {error}") from None
+            raise InputError(f"study {shown(self.spec.title)}: {error}") from None
 
     @cached_property
     def _adding(self) -> str:
@@ -255,7 +256,8 @@ class SceneEvaluator:
                 continue
             if not image_metrics.is_image_metric(name):
                 raise InputError(
-                    f"study {self.spec.title!r}: metrics.names: {name!r} is unknown{did_you_mean(name, known)}"
+                    f"study {shown(self.spec.title)}: metrics.names: {shown(name)} is unknown"
+                    f"{did_you_mean(name, known)}"
                 )
             if self._chosen_faults:
                 raise InputError(
@@ -264,8 +266,8 @@ class SceneEvaluator:
                 )
             if not self._adding:
                 raise InputError(
-                    f"study {self.spec.title!r}: metrics.names: {name!r} needs a fault that adds light, which the "
-                    f"scene {self.spec.scene.base!r} has not"
+                    f"study {shown(self.spec.title)}: metrics.names: {shown(name)} needs a fault that adds light, "
+                    f"which the scene {shown(self.spec.scene.base)} has not"
                 )
 
     # --- stages ---------------------------------------------------------------------------------------------------
@@ -294,11 +296,12 @@ class SceneEvaluator:
         """Render a view."""
         if self._session is None or self._session[0] != key:
             self._session = None  # release the old terrain first
-            self._session = key, Session(scene, source=f"study {self.spec.title!r}")
+            self._session = key, Session(scene, source=f"study {shown(self.spec.title)}")
         session = self._session[1]
         if not 0 <= index < len(session.plan):
             raise InputError(
-                f"study {self.spec.title!r}: scene.samples = {index}: must be from 0 to {len(session.plan) - 1}"
+                f"study {shown(self.spec.title)}: scene.samples = {index}: must be from 0 to "
+                f"{len(session.plan) - 1}"
             )
         spec = session.spec(index)
         pose = resolve(spec, 0)
@@ -471,7 +474,7 @@ class SceneEvaluator:
         """Return the path of a rank. Raises InputError where the lens has fewer paths."""
         if rank > len(self._ghost_pairs):
             raise InputError(
-                f"study {self.spec.title!r}: metrics.names: 'ghost_{rank}_flux_e': of the nominal lens "
+                f"study {shown(self.spec.title)}: metrics.names: 'ghost_{rank}_flux_e': of the nominal lens "
                 f"{len(self._ghost_pairs)} ghosts reach the frame"
             )
         return self._ghost_pairs[rank - 1]
@@ -627,8 +630,8 @@ def _scene_of(spec: StudySpec) -> Scene:
     largest = max(spec.scene.views)
     if largest >= scene.dataset.samples:
         raise InputError(
-            f"study {spec.title!r}: scene.samples: sample {largest}: must be below dataset.samples = "
-            f"{scene.dataset.samples} of the scene {spec.scene.base!r}"
+            f"study {shown(spec.title)}: scene.samples: sample {largest}: must be below dataset.samples = "
+            f"{scene.dataset.samples} of the scene {shown(spec.scene.base)}"
         )
     return scene
 
@@ -646,12 +649,12 @@ def _check_models(spec: StudySpec, faults: Mapping[str, Any]) -> None:
     assert spec.models is not None
     name, known = spec.models.fault, registry()
     if name not in known:
-        raise InputError(f"models.fault = {name!r}: is unknown{did_you_mean(name, list(known))}")
+        raise InputError(f"models.fault = {shown(name)}: is unknown{did_you_mean(name, list(known))}")
     if name not in faults:
-        raise InputError(f"models.fault = {name!r}: the scene {spec.scene.base!r} has no such fault")
+        raise InputError(f"models.fault = {shown(name)}: the scene {shown(spec.scene.base)} has no such fault")
     for model in spec.models.compare:
         if model not in known[name]:
-            raise InputError(f"models.compare: {model!r} is unknown{did_you_mean(model, list(known[name]))}")
+            raise InputError(f"models.compare: {shown(model)} is unknown{did_you_mean(model, list(known[name]))}")
 
 
 def _faults(scene: Scene) -> dict[str, Fault]:

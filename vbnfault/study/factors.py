@@ -135,7 +135,7 @@ class Factors:
         self.keys: dict[str, Key] = {}
         self._units: dict[str, str] = {}
         for i, factor in enumerate(spec.factors):
-            where = f"factor[{i}].key = {factor.key!r}"
+            where = f"factor[{i}].key = {shown(factor.key)}"
             key = self.known.get(factor.key) or self.known.get(_long_name(factor.key, self.known))
             if key is None:
                 raise InputError(
@@ -144,7 +144,7 @@ class Factors:
             unit = _SPELLINGS.get(factor.unit, factor.unit)
             allowed = {_SPELLINGS.get(u, u): u for u in key.units}
             if factor.unit and key.units and unit not in allowed:
-                raise InputError(f"{where}: unit = {factor.unit!r}: must be {' or '.join(key.units)}")
+                raise InputError(f"{where}: unit = {shown(factor.unit)}: must be {' or '.join(key.units)}")
             self.keys[factor.key] = key
             self._units[factor.key] = allowed.get(unit, key.units[0] if key.units else "") if factor.unit else ""
             self._units[factor.key] = self._units[factor.key] or (key.units[0] if key.units else "")
@@ -177,7 +177,7 @@ class Factors:
                 if name not in faults or own_key not in _fields(name, faults[name].get("model", "")):
                     continue  # another fault or model of the comparison has this key
             tables.replace(table, {key: value}, source=self._spec.title)
-        return parse_scene(table, source=f"study {self._spec.title!r}", overrides=[key for key, _ in changes])
+        return parse_scene(table, source=f"study {shown(self._spec.title)}", overrides=[key for key, _ in changes])
 
 
 def _long_name(name: str, known: Mapping[str, Key]) -> str:
