@@ -203,7 +203,10 @@ def lens_of(*rows: dict[str, Any], **more: Any) -> dict[str, Any]:
         (lens_of(GLASS, BACK), ["stop", "none has"]),
         (lens_of(STOP, GLASS, BACK | {"thickness_mm": 1.0}, STOP), ["stop", "surfaces 0, 3"]),
         (lens_of(STOP, GLASS | {"radius_mm": 9.0}, BACK), ["surface[1]", "diameter_mm = 20", "radius_mm = 9"]),
-        (lens_of(STOP, GLASS | {"thickness_mm": -1.0}, BACK), ["surface[1]", "thickness_mm = -1.0", "0 to 1000000"]),
+        (
+            lens_of(STOP, GLASS | {"thickness_mm": -1.0}, BACK),
+            ["surface[1]", "thickness_mm = -1.0", "0 to 1000000"],
+        ),
         (lens_of(STOP, GLASS | {"thickness_mm": 0.5}, BACK), ["surface[1]", "thickness_mm = 0.5", "cross"]),
         (lens_of(STOP, GLASS | {"nd": 0.9}, BACK), ["surface[1]", "nd = 0.9", "from 1 to 5"]),
         (lens_of(STOP, GLASS | {"coating": "gold"}, BACK), ["surface[1]", "'gold'", "mgf2"]),

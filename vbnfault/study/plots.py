@@ -174,7 +174,7 @@ def indices(results: StudyResults, metric: str) -> tuple[Figure, str] | None:
         (1, len(results.models)),
         (panel_width(len(results.models)), row * len(order)),
         Margins(left=left),
-        legend=[*handles, NOISE],
+        legend=[*handles, NOISE] if results.has_noise_floor else handles,
         heads=results.models,
     )
     label_rows(axes, labels, separate_last=True)
@@ -240,11 +240,11 @@ def _draw_dots(axes: Axes, drawn: Sequence[_Series], values: Sequence[F64]) -> N
 
 
 def _draw_floor(axes: Axes, low: float, high: float) -> None:
-    """Draw the noise floor as a band; as a line where its width is below a pixel."""
+    """Draw the noise floor as a band; as a line where its width is below a pixel, and not at all where it is 0."""
     left, right = axes.get_xlim()
     if high - low > 0.004 * (right - left):
         axes.axvspan(low, high, color=BAND, alpha=0.75, lw=0, zorder=1)
-    else:
+    elif high > low:
         axes.axvline((low + high) / 2, color=BAND, lw=3, zorder=1)
 
 
@@ -545,7 +545,6 @@ def morris(results: StudyResults, metric: str) -> tuple[Figure, str] | None:
         legend=[
             Line2D([], [], color=BLUE, marker="o", ms=4, ls="none", label="factor"),
             Line2D([], [], color=MUTED, lw=0.8, ls=":", label="σ = 0.1, 0.5 and 1 times μ*"),
-            NOISE,
         ],
         heads=results.models,
     )
@@ -566,9 +565,6 @@ def morris(results: StudyResults, metric: str) -> tuple[Figure, str] | None:
             one.set_yticklabels([])
         for slope in (0.1, 0.5, 1.0):
             one.plot([0, top], [0, slope * top], color=MUTED, lw=0.8, ls=":", zorder=2)
-        floor = _intervals(results, metric, model, _EFFECTS[0], [DUMMY])[:, 0] / 10.0**exponent
-        if np.isfinite(floor[0]):
-            _draw_floor(one, 0.0, float(np.nanmax(floor)))
         if not np.isfinite(mu_star).any():
             write_message(one, "no values")
             continue

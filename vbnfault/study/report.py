@@ -24,7 +24,7 @@ from . import sheets
 from .extreme_images import IMAGES
 from .plots import drawings, save
 from .ranking_plots import ranking_rows
-from .report_words import EXACT, FORMULAE, SECTIONS, sample
+from .report_words import FORMULAE, SECTIONS, sample
 from .summaries import DUMMY, StudyResults
 
 if TYPE_CHECKING:
@@ -39,6 +39,7 @@ _MOST_IMAGES_BYTES = 4_000_000  # before base64, which adds a third
 _SIDES = (512, 400, 320, 256, 192, 128)  # of the images in the page, px; the files keep their size
 _NARROW_PT = 340.0  # a wider figure shrinks to this fraction of its size, and then scrolls on a small screen:
 _LEAST_SCALE = 0.78
+_COARSE_PX = 200  # an image that is narrower than this shows its pixels as squares
 _MOST_ROWS = 30  # of failed evaluations and of missed half-widths
 _SWAP = "probability that the next is worse"  # heading of a column
 _MOST_LEADING = 4  # factors that the summary names for each metric
@@ -193,12 +194,18 @@ def _images(results: StudyResults, folder: Path) -> str:
         for name, path, (value, row) in zip(("best", "worst"), paths, ends, strict=True):
             where = _where(results, row)
             source = base64.b64encode(data[path]).decode()
+            coarse = ' class="coarse"' if _width(data[path]) < _COARSE_PX else ""
             items.append(
-                f'<div><img alt="{name} image of {_e(metric)}" src="data:image/png;base64,{source}">'
+                f'<div><img{coarse} alt="{name} image of {_e(metric)}" src="data:image/png;base64,{source}">'
                 f'<span class="small"><b>{name}</b>: {_e(_quantity(value, unit))}<br>{_e(where)}</span></div>'
             )
         parts.append(f'<figure><h3><code>{_e(metric)}</code></h3><div class="pair">{"".join(items)}</div></figure>')
     return f'<div class="figures">{"".join(parts)}</div>' if parts else ""
+
+
+def _width(png: bytes) -> int:
+    """Return the width of a PNG file in pixels, which stands in its header."""
+    return int.from_bytes(png[16:20], "big")
 
 
 def _reduced(path: Path, side: int) -> bytes:
@@ -283,8 +290,7 @@ def _facts(results: StudyResults) -> str:
 def _summary(results: StudyResults) -> str:
     """Return which factors drive each metric, as a table."""
     several = len(results.models) > 1
-    exact = results.method in EXACT
-    leading = "strongest factors" if exact else "factors above the noise floor"
+    leading = "factors above the noise floor" if results.has_noise_floor else "strongest factors"
     heads = ["metric", *(["model"] if several else []), leading, "mean", "deviation"]
     rows: list[list[str]] = []
     for metric in results.metrics:
@@ -307,8 +313,9 @@ def _summary(results: StudyResults) -> str:
         "Means and deviations are over the factors within one view; differences between views are left out. "
         "Factors are named, the most important first"
     )
-    words += "." if exact else ", where their interval lies above that of the dummy factor, which acts on nothing."
-    return f"<p>{_e(words)}</p>{_table(heads, rows, group=len(results.models))}{_model_form(results)}"
+    if results.has_noise_floor:
+        words += ", where their interval lies above that of the dummy factor, which acts on nothing"
+    return f"<p>{_e(words)}.</p>{_table(heads, rows, group=len(results.models))}{_model_form(results)}"
 
 
 def _leading(results: StudyResults, metric: str, model: str) -> str:
@@ -330,7 +337,10 @@ def _leading(results: StudyResults, metric: str, model: str) -> str:
         order = [f for f in results.factors if float(lows.sel(factor=f)) > floor]
         order.sort(key=lambda f: -float(index.sel(factor=f)))
         unit = results.about(metric, "unit") if name == "mu_star" else ""
-        shown = {f: _e(_quantity(float(index.sel(factor=f)), unit, 2)) for f in order}
+        values = {f: float(index.sel(factor=f)) for f in order}
+        shown = {
+            f: _e(_quantity(v, unit, 2) if name == "mu_star" else _minus(f"{v:.2f}")) for f, v in values.items()
+        }
     if not order:
         return '<span class="small">none</span>'
     named = ", ".join(f"<code>{_e(f)}</code>&nbsp;{shown[f]}" for f in order[:_MOST_LEADING])
@@ -399,7 +409,9 @@ def _index_tables(results: StudyResults) -> str:
             floors.append(factor == DUMMY)
         table = _table(heads, rows, numbers=range(1, len(heads)), faint=floors)
         parts.append(f"<h3><code>{_e(metric)}</code></h3>{table}")
-    words = f"Brackets hold the {100 * results.confidence:g} % interval. The last row is the dummy factor."
+    words = "The last row is the dummy factor."
+    if any(f"{name}_interval" in results.dataset for name in names):
+        words = f"Brackets hold the {100 * results.confidence:g}\N{NO-BREAK SPACE}% interval. {words}"
     return f'<p class="how">{_e(words)}</p>{"".join(parts)}'
 
 
@@ -609,7 +621,7 @@ def _minus(text: str) -> str:
     return text.replace("-", "\N{MINUS SIGN}")
 
 
-def _quantity(value: float, unit: str, digits: int = 4) -> str:
+def _quantity(value: float, unit: str, digits: int = 3) -> str:
     """Return a value with its unit as text."""
     if not np.isfinite(value):
         return "–"

@@ -9,9 +9,6 @@ import numpy as np
 
 from .summaries import StudyResults
 
-# designs in which a factor that acts on nothing has indices of exactly 0, so that it shows no noise
-EXACT = ("morris", "grid", "one_at_a_time")
-
 
 def sample(results: StudyResults, kind: str) -> str:
     """Return in a sentence from how many evaluations the figures of a section come."""
@@ -57,7 +54,7 @@ def _overview(results: StudyResults) -> str:
         words = "total index, the fraction of the variance that a factor causes alone and with others"
     floor = (
         "The row dummy, a factor that acts on nothing, is exactly 0 in this design."
-        if results.method in EXACT
+        if not results.has_noise_floor
         else "Values like those of the row dummy, a factor that acts on nothing, are noise."
     )
     return (
@@ -67,7 +64,7 @@ def _overview(results: StudyResults) -> str:
 
 
 def _indices(results: StudyResults) -> str:
-    level = f"{100 * results.confidence:g} %"
+    level = f"{100 * results.confidence:g}\N{NO-BREAK SPACE}%"
     floor = (
         "A factor whose interval overlaps the grey band, the noise floor, cannot be told from the dummy factor, "
         "which acts on nothing."
@@ -89,6 +86,11 @@ def _indices(results: StudyResults) -> str:
             f"Each dot is an index with its {level} interval: delta says how much knowing the factor changes the "
             "distribution of the metric, from 0 (not at all) to 1, and the first-order index is the fraction of "
             f"the variance that the factor causes alone. {floor}"
+        )
+    if results.has("S1"):
+        return (
+            f"Each dot is the first-order index with its {level} interval: the fraction of the variance that the "
+            f"factor causes alone. These are too few points for delta. {floor}"
         )
     return (
         f"Each dot is μ*, with its {level} interval: the mean absolute change of the metric when the factor moves "
@@ -112,25 +114,30 @@ def _tornado(results: StudyResults) -> str:
             "values, which the vertical line shows. Triangles mark the factor's lowest and highest value; a bar "
             "that goes on beyond them has a turning point."
         )
+    floor = ", and a bar no longer than the grey band, the typical range of a factor that acts on nothing, is noise"
     return (
-        "Each bar spans the mean of the metric over the fifths of one factor's range, while the others vary; the "
-        "vertical line is the mean of all. Triangles mark the lowest and the highest fifth, and a bar no longer "
-        "than the grey band, the typical range of a factor that acts on nothing, is noise."
+        "Each bar spans the mean of the metric over the levels or the fifths of one factor's range, while the "
+        "others vary; the vertical line is the mean of all. Triangles mark the lowest and the highest of them"
+        f"{floor if results.shows_chance('tornado') else ''}."
     )
 
 
 def _responses(results: StudyResults) -> str:
-    level = f"{100 * results.confidence:g} %"
+    level = f"{100 * results.confidence:g}\N{NO-BREAK SPACE}%"
     if results.method == "one_at_a_time":
         return (
             "Each curve is the metric against one factor while the others keep their nominal values; bars of a "
             f"factor with categories begin at the median. The band is the {level} interval of the median over "
             "views and seeds."
         )
+    floor = (
+        " A curve that stays within the noise floor shows nothing that a factor without effect would not show."
+        if results.shows_chance("responses")
+        else ""
+    )
     return (
         f"Each curve is the median of the metric among points of similar value of one factor, with the {level} "
-        "interval of this median; bars of a factor with categories begin at the median of all points. A curve "
-        "that stays within the noise floor shows nothing that a factor without effect would not show."
+        f"interval of this median; bars of a factor with categories begin at the median of all points.{floor}"
     )
 
 
@@ -141,10 +148,10 @@ def _interactions(results: StudyResults) -> str:
             "of two factors: the fraction of the variance that they cause only together. A dark cell off the "
             "diagonal means that the effect of one factor depends on the other."
         )
+    noise = " Small values may be noise, since both indices have intervals." if results.has("ST_interval") else ""
     return (
         "Each cell is the total minus the first-order index of one factor (row) for one metric (column): the "
-        "fraction of the variance that the factor causes only together with others. Small values may be noise, "
-        "since both indices have intervals."
+        f"fraction of the variance that the factor causes only together with others.{noise}"
     )
 
 

@@ -65,7 +65,7 @@ def tornado(results: StudyResults, metric: str) -> tuple[Figure, str]:
             Patch(facecolor=SKY, alpha=0.6, lw=0, label="range of the mean"),
             Line2D([], [], color=VERMILLION, marker="<", ms=5, ls="none", label="lowest values of the factor"),
             Line2D([], [], color=BLUE, marker=">", ms=5, ls="none", label="highest values"),
-            NOISE,
+            *([NOISE] if results.shows_chance("tornado") else []),
         ],
         heads=results.models,
     )

@@ -30,6 +30,7 @@ _MOST_LEVELS = 12  # a factor with more different values is divided into bins
 _LEAST_IN_BIN = 8
 _MOST_BINS = 12
 _PARTS = 5  # the factor's range is divided into fifths for its swing
+_LEAST_OF_SWING, _LEAST_OF_BAND = 2 * _PARTS, 2 * _LEAST_IN_BIN  # points, for noise floors
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -127,9 +128,9 @@ class DesignPoints:
     def chance_swing(self) -> float:
         """Return the median swing of factors that act on nothing: of the values in random order.
 
-        A one-at-a-time design has no such noise: 0.
+        A one-at-a-time design has no such noise, and a few points show none: 0.
         """
-        if self.base is not None or len(self.values) < 2 * _PARTS:
+        if self.base is not None or len(self.values) < _LEAST_OF_SWING:
             return 0.0
         generator = np.random.default_rng(1)
         swings = []
@@ -143,7 +144,7 @@ class DesignPoints:
 
     def chance_band(self, confidence: float) -> tuple[float, float] | None:
         """Return the interval of medians along a factor that acts on nothing; None where there is no noise."""
-        if self.base is not None or len(self.values) < 2 * _LEAST_IN_BIN:
+        if self.base is not None or len(self.values) < _LEAST_OF_BAND:
             return None
         generator = np.random.default_rng(2)
         medians = []
@@ -245,6 +246,11 @@ class StudyResults:
         return str(self.spec["design"]["method"])
 
     @property
+    def has_noise_floor(self) -> bool:
+        """Return whether the indices of the dummy factor show noise; in some designs they are exactly 0."""
+        return self.method not in ("morris", "grid", "one_at_a_time")
+
+    @property
     def confidence(self) -> float:
         """Return the confidence of the intervals."""
         return float(self.spec["design"].get("confidence", 0.95))
@@ -282,6 +288,12 @@ class StudyResults:
     def blocks(self) -> I64:
         """Return the number of the block, a seed and a view, of each row."""
         return _numbered([self.column("seed"), self.column("view")])
+
+    def shows_chance(self, kind: str) -> bool:
+        """Return whether tornado or responses have enough points for the noise floor of chance."""
+        least = {"tornado": _LEAST_OF_SWING, "responses": _LEAST_OF_BAND}[kind]
+        sizes = (len(self.points(metric, model).values) for metric in self.metrics for model in self.models)
+        return self.method != "one_at_a_time" and max(sizes) >= least
 
     @cached_property
     def _points(self) -> I64:
