@@ -178,57 +178,17 @@ def read_icq(data: bytes, source: str) -> Mesh:
         With the line: a token is not a number, the number of vertices does not fit Q, or edges do not meet.
     """
     table = _numbers(data, source)
-    q = int(table[0]) if 1 <= table[0] < 2**15 and table[0] == np.floor(table[0]) else 0
-    if q == 0:
-        raise InputError(
-            f"{source}: line {_token_line(data, 0)}: expected Q, a positive integer, found {table[0]:g}."
-        )
-    count = 6 * (q + 1) ** 2
-    if len(table) - 1 not in (3 * count, 4 * count):
-        raise InputError(
-            f"{source}: line {_token_line(data, len(table) - 1)}: expected {count} vertices of three numbers "
-            f"for Q = {q}, found {len(table) - 1} numbers."
-        )
-    rows = table[1:].reshape(count, -1)[:, :3]
-
-    # Positions of the vertices (i, j) of each face on a cube of side Q; i runs fastest. Exactly those vertices
-    # coincide that the format declares to be the same.
-    j, i = np.meshgrid(np.arange(q + 1), np.arange(q + 1), indexing="ij")
-    zero, full = np.zeros_like(i), np.full_like(i, q)
-    cube = np.stack(
-        [
-            np.stack(face, axis=-1)
-            for face in (
-                (i, j, full),
-                (i, full, q - j),
-                (zero, i, q - j),
-                (q - i, zero, q - j),
-                (full, q - i, q - j),
-                (i, q - j, zero),
-            )
-        ]
-    ).reshape(-1, 3)
-    key = (cube[:, 0] * (q + 1) + cube[:, 1]) * (q + 1) + cube[:, 2]
-    _, first, shared = np.unique(key, return_index=True, return_inverse=True)
-    shared = shared.ravel()
-    vertices = rows[first]
-    gap = np.abs(rows - vertices[shared]).max(axis=1)
+    q, width = _icq_size(table, data, source)
+    listed = table[1:].reshape(-1, width)[:, :3]
+    _, first, vertex = np.unique(_icq_positions(q), return_index=True, return_inverse=True)
+    vertex = vertex.ravel()
+    vertices = listed[first]
+    gap = np.abs(listed - vertices[vertex]).max(axis=1)
     worst = int(np.argmax(gap))
-    if gap[worst] > _ICQ_GAP_FRACTION * np.ptp(rows, axis=0).max():
-        at = _token_line(data, 1 + worst * (len(table) - 1) // count)
-        raise InputError(f"{source}: line {at}: expected the vertex that the neighbouring face has there.")
-
-    grid = shared.reshape(6, q + 1, q + 1)
-    a, b, c, d = (grid[:, j0 : j0 + q, i0 : i0 + q].ravel() for j0, i0 in ((0, 0), (0, 1), (1, 1), (1, 0)))
-    ac = np.linalg.norm(vertices[a] - vertices[c], axis=1)
-    bd = np.linalg.norm(vertices[b] - vertices[d], axis=1)
-    along_ac = (ac <= bd)[:, None]
-    faces = np.concatenate(
-        [
-            np.where(along_ac, np.stack([a, b, c], axis=1), np.stack([a, b, d], axis=1)),
-            np.where(along_ac, np.stack([a, c, d], axis=1), np.stack([b, c, d], axis=1)),
-        ]
-    )
+    if gap[worst] > _ICQ_GAP_FRACTION * np.ptp(listed, axis=0).max():
+        line = _token_line(data, 1 + worst * width)
+        raise InputError(f"{source}: line {line}: expected the vertex that the neighbouring face has there.")
+    faces = _icq_triangles(vertices, vertex.reshape(6, q + 1, q + 1))
     corners = vertices[faces]
     if np.sum(corners[:, 0] * np.cross(corners[:, 1], corners[:, 2])) < 0:  # six times the signed volume
         faces = faces[:, ::-1]
@@ -255,7 +215,7 @@ def read_vrml(data: bytes, source: str) -> Mesh:
     vertices: list[Float64] = []
     faces: list[Int64] = []
     base = 0
-    for points, index in _face_sets(text, source):
+    for points, index in _FaceSetScanner(text, source).face_sets():
         coordinates = _list_numbers(text, points, source)
         if len(coordinates) % 3 or len(coordinates) == 0:
             raise InputError(
@@ -457,6 +417,58 @@ def _table_error(data: bytes, table: Float64, source: str) -> InputError:
     )
 
 
+# --- ICQ ----------------------------------------------------------------------------------------------------
+
+
+def _icq_size(table: Float64, data: bytes, source: str) -> tuple[int, int]:
+    """Return Q and the number of columns of an ICQ's table of vertices, 3 or 4. Raises InputError."""
+    q = int(table[0]) if 1 <= table[0] < 2**15 and table[0] == np.floor(table[0]) else 0
+    if q == 0:
+        raise InputError(
+            f"{source}: line {_token_line(data, 0)}: expected Q, a positive integer, found {table[0]:g}."
+        )
+    count = 6 * (q + 1) ** 2
+    if len(table) - 1 not in (3 * count, 4 * count):
+        raise InputError(
+            f"{source}: line {_token_line(data, len(table) - 1)}: expected {count} vertices of three numbers "
+            f"for Q = {q}, found {len(table) - 1} numbers."
+        )
+    return q, (len(table) - 1) // count
+
+
+def _icq_positions(q: int) -> Int64:
+    """Return a number for the position of each listed vertex on a cube of side Q, int64[6(Q + 1)²].
+
+    Vertex (i, j) of each face is listed with i running fastest. Exactly those vertices get equal numbers that the
+    format declares to be the same.
+    """
+    j, i = np.meshgrid(np.arange(q + 1), np.arange(q + 1), indexing="ij")
+    zero, full = np.zeros_like(i), np.full_like(i, q)
+    faces = (
+        (i, j, full),
+        (i, full, q - j),
+        (zero, i, q - j),
+        (q - i, zero, q - j),
+        (full, q - i, q - j),
+        (i, q - j, zero),
+    )
+    return np.concatenate([((x * (q + 1) + y) * (q + 1) + z).ravel() for x, y, z in faces])
+
+
+def _icq_triangles(vertices: Float64, grid: Int64) -> Int64:
+    """Split the quadrilaterals of the six faces, indices int64[6, Q + 1, Q + 1], along their shorter diagonals."""
+    a, b, c, d = (part.ravel() for part in (grid[:, :-1, :-1], grid[:, :-1, 1:], grid[:, 1:, 1:], grid[:, 1:, :-1]))
+    ac = np.linalg.norm(vertices[a] - vertices[c], axis=1)
+    bd = np.linalg.norm(vertices[b] - vertices[d], axis=1)
+    along_ac = (ac <= bd)[:, None]
+    return np.concatenate(
+        [
+            np.where(along_ac, np.stack([a, b, c], axis=1), np.stack([a, b, d], axis=1)),
+            np.where(along_ac, np.stack([a, c, d], axis=1), np.stack([b, c, d], axis=1)),
+        ]
+    )
+
+
 # --- v and f lines -------------------------------------------------------------------------------------------
 
 
@@ -525,70 +537,94 @@ class _Node:
     values: dict[bytes, list[float]] = field(default_factory=dict)
 
 
-def _face_sets(text: bytes, source: str) -> Iterator[tuple[Match, Match]]:
-    """Yield the lists of points and of indices of every IndexedFaceSet, in order."""
-    stack = [_Node(b"", None, 0)]
-    named: dict[bytes, Match | None] = {}
-    shapes: set[bytes] = set()
-    current: Match | None = None  # in VRML 1, the last Coordinate3 applies to what follows
-    before = [b"", b"", b""]
-    key = b""
+class _FaceSetScanner:
+    """Read a VRML text token by token and find its IndexedFaceSets."""
 
-    def error(offset: int, expected: str, found: str) -> InputError:
-        return InputError(f"{source}: line {_line(text, offset)}: expected {expected}, found {found}.")
+    def __init__(self, text: bytes, source: str) -> None:
+        self.text, self.source = text, source
+        self.open_nodes = [_Node(b"", None, 0)]  # the outermost one is the file
+        self.points_of_name: dict[bytes, Match | None] = {}
+        self.names_with_faces: set[bytes] = set()
+        self.last_points: Match | None = None  # in VRML 1, the last Coordinate3 applies to what follows
+        self.before = [b"", b"", b""]  # the last three tokens
+        self.field = b""
 
-    for match in _TOKEN.finditer(text):
-        token, node = match[0], stack[-1]
-        if token == b"{":
-            name = before[-2] if before[-3] == b"DEF" else None
-            stack.append(_Node(before[-1], name, match.start()))
-            key = b""
-        elif token == b"}":
-            if len(stack) == 1:
-                raise error(match.start(), "a node", "'}' that closes none")
-            stack.pop()
-            parent = stack[-1]
-            if node.kind in (b"Coordinate", b"Coordinate3"):
-                current = parent.points = node.points
-                if node.name is not None:
-                    named[node.name] = node.points
-            elif node.kind in _TRANSFORMS:
-                _check_identity(node, text, source)
-            elif node.kind == b"IndexedFaceSet" and node.index is not None:
-                points = node.points or current
-                if points is None:
-                    raise error(node.start, "points for the IndexedFaceSet", "none")
-                node.has_faces = True
-                yield points, node.index
-            if node.has_faces and node.name is not None:
-                shapes.add(node.name)
-            parent.has_faces |= node.has_faces
-            key = b""
-        elif token.startswith(b"[") and token.endswith(b"]"):
-            if before[-1] == b"point":
-                node.points = match
-            elif before[-1] == b"coordIndex":
-                node.index = match
-            elif before[-1] == b"children" and b"USE" in token.split():
-                raise error(match.start(), "geometry written out", "geometry used again by USE")
-        elif token == b"[":
-            if before[-1] in (b"point", b"coordIndex"):
-                raise error(
-                    match.start(), f"a list of numbers closed by ']' after {before[-1].decode()}", "no such end"
+    def face_sets(self) -> Iterator[tuple[Match, Match]]:
+        """Yield the lists of points and of indices of every IndexedFaceSet, in order."""
+        for match in _TOKEN.finditer(self.text):
+            token = match[0]
+            if token == b"{":
+                name = self.before[-2] if self.before[-3] == b"DEF" else None
+                self.open_nodes.append(_Node(self.before[-1], name, match.start()))
+                self.field = b""
+            elif token == b"}":
+                node = self._closed_node(match)
+                if node.points is not None and node.index is not None and node.kind == b"IndexedFaceSet":
+                    yield node.points, node.index
+            elif token.startswith(b"["):
+                self._read_list(match)
+            else:
+                self._read_word(match)
+            self.before = [*self.before[1:], token]
+        if len(self.open_nodes) > 1:
+            node = self.open_nodes[-1]
+            kind, line = node.kind.decode("ascii", "replace"), _line(self.text, node.start)
+            raise self._error(len(self.text.rstrip()), f"'}}' for {kind!r} of line {line}", "the end")
+
+    def _error(self, offset: int, expected: str, given: str) -> InputError:
+        """Return the error at a byte offset."""
+        return InputError(f"{self.source}: line {_line(self.text, offset)}: expected {expected}, found {given}.")
+
+    def _closed_node(self, match: Match) -> _Node:
+        """Close the innermost node and return it; note what its parent and later references need of it."""
+        if len(self.open_nodes) == 1:
+            raise self._error(match.start(), "a node", "'}' that closes none")
+        node, parent = self.open_nodes.pop(), self.open_nodes[-1]
+        if node.kind in (b"Coordinate", b"Coordinate3"):
+            self.last_points = parent.points = node.points
+            if node.name is not None:
+                self.points_of_name[node.name] = node.points
+        elif node.kind in _TRANSFORMS:
+            _check_identity(node, self.text, self.source)
+        elif node.kind == b"IndexedFaceSet" and node.index is not None:
+            node.points = node.points or self.last_points
+            if node.points is None:
+                raise self._error(node.start, "points for the IndexedFaceSet", "none")
+            node.has_faces = True
+        if node.has_faces and node.name is not None:
+            self.names_with_faces.add(node.name)
+        parent.has_faces |= node.has_faces
+        self.field = b""
+        return node
+
+    def _read_list(self, match: Match) -> None:
+        """Note a list of points or indices in its node, and refuse a list that is not closed."""
+        token, name, node = match[0], self.before[-1], self.open_nodes[-1]
+        if token == b"[":
+            if name in (b"point", b"coordIndex"):
+                raise self._error(
+                    match.start(), f"a list of numbers closed by ']' after {name.decode()}", "no such end"
                 )
-        elif before[-1] == b"USE":
-            if token in named and before[-2] == b"coord":
-                node.points = named[token]
-            elif token in shapes or before[-2] == b"coord":
-                raise error(match.start(), "geometry written out", f"USE {token.decode('ascii', 'replace')}")
+        elif name == b"point":
+            node.points = match
+        elif name == b"coordIndex":
+            node.index = match
+        elif name == b"children" and b"USE" in token.split():
+            raise self._error(match.start(), "geometry written out", "geometry used again by USE")
+
+    def _read_word(self, match: Match) -> None:
+        """Follow a reference, note a number of a transform, or start a field."""
+        token, node = match[0], self.open_nodes[-1]
+        if self.before[-1] == b"USE":
+            for_points = self.before[-2] == b"coord"
+            if for_points and token in self.points_of_name:
+                node.points = self.points_of_name[token]
+            elif for_points or token in self.names_with_faces:
+                raise self._error(match.start(), "geometry written out", f"USE {token.decode('ascii', 'replace')}")
         elif node.kind in _TRANSFORMS and re.fullmatch(_NUMBER, token):
-            node.values.setdefault(key, []).append(float(token))
+            node.values.setdefault(self.field, []).append(float(token))
         else:
-            key = token
-        before = [*before[1:], token]
-    if len(stack) > 1:
-        kind = stack[-1].kind.decode("ascii", "replace")
-        raise error(len(text.rstrip()), f"'}}' for {kind!r} of line {_line(text, stack[-1].start)}", "the end")
+            self.field = token
 
 
 def _check_identity(node: _Node, text: bytes, source: str) -> None:

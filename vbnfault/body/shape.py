@@ -135,52 +135,69 @@ def check_mesh(vertices: NDArray, faces: NDArray, source: str) -> tuple[Float64,
     vertices = np.array(vertices, dtype=np.float64)
     faces = np.array(faces, dtype=np.int64)
     _check_arrays(vertices, faces, source)
-    mended: list[str] = []
-
     vertices, faces, merged = _weld(vertices, faces)
-    if merged:
-        mended.append(f"merged {merged} duplicate vertices")
+    repairs = [f"merged {merged} duplicate vertices"] if merged else []
+    faces, dropped = _without_useless_faces(vertices, faces, source)
+    faces, filled = _closed(vertices, faces, source)
+    faces, turned = _wound_outwards(vertices, faces, source)
+    repairs += dropped + filled + turned
+    if repairs:
+        warnings.warn(f"{source}: mended the mesh: {', '.join(repairs)}.", UserWarning, stacklevel=2)
+
+    used, index = np.unique(faces, return_inverse=True)
+    return np.ascontiguousarray(vertices[used]), np.ascontiguousarray(index.reshape(-1, 3).astype(np.int32))
+
+
+def _without_useless_faces(vertices: Float64, faces: NDArray, source: str) -> tuple[NDArray, list[str]]:
+    """Drop degenerate and loose faces, and return also the list of repairs. Raises InputError if none remains."""
+    repairs = []
     sound = _sound_faces(vertices, faces)
     if not sound.all():
-        mended.append(f"dropped {int((~sound).sum())} degenerate faces")
+        repairs.append(f"dropped {int((~sound).sum())} degenerate faces")
         faces = faces[sound]
     if len(faces) == 0:
         raise InputError(f"{source}: mesh has only degenerate faces.")
-
     loose = _loose_faces(faces)
     if loose.any() and not loose.all():
-        mended.append(f"dropped {int(loose.sum())} loose faces")
+        repairs.append(f"dropped {int(loose.sum())} loose faces")
         faces = faces[~loose]
+    return faces, repairs
+
+
+def _closed(vertices: Float64, faces: NDArray, source: str) -> tuple[NDArray, list[str]]:
+    """Fill small holes, and return also the list of repairs. Raises InputError for open or non-manifold edges."""
+    repairs = []
     counts = _undirected_counts(faces)
     if (counts == 1).any():
         filled = _fill_holes(faces)
         if len(filled) > len(faces) and _sound_faces(vertices, filled).all():
-            mended.append(f"filled holes with {len(filled) - len(faces)} faces")
+            repairs.append(f"filled holes with {len(filled) - len(faces)} faces")
             faces = filled
             counts = _undirected_counts(faces)
     if (counts == 1).any():
         raise InputError(f"{source}: mesh is open, {int((counts == 1).sum())} boundary edges.")
     if (counts > 2).any():
         raise InputError(f"{source}: mesh has {int((counts > 2).sum())} edges shared by more than two faces.")
+    return faces, repairs
 
+
+def _wound_outwards(vertices: Float64, faces: NDArray, source: str) -> tuple[NDArray, list[str]]:
+    """Wind all faces outwards, and return also the list of repairs. Raises InputError if that is impossible."""
+    repairs = []
     if not _consistent(faces):
         mesh = trimesh.Trimesh(vertices, faces, process=False)
         trimesh.repair.fix_winding(mesh)
         faces = np.array(mesh.faces, dtype=np.int64)
         if not _consistent(faces):
             raise InputError(f"{source}: mesh cannot be wound consistently (it is not orientable).")
-        mended.append("made the winding consistent")
+        repairs.append("made the winding consistent")
     volume = signed_volume(vertices, faces)
     if volume < 0:
         faces = faces[:, ::-1]
-        mended.append("turned the winding outwards")
+        repairs.append("turned the winding outwards")
     if abs(volume) <= 1e-12 * float(np.ptp(vertices, axis=0).max()) ** 3:
         raise InputError(f"{source}: mesh encloses no volume.")
-    if mended:
-        warnings.warn(f"{source}: mended the mesh: {', '.join(mended)}.", UserWarning, stacklevel=2)
-
-    used, index = np.unique(faces, return_inverse=True)
-    return np.ascontiguousarray(vertices[used]), np.ascontiguousarray(index.reshape(-1, 3).astype(np.int32))
+    return faces, repairs
 
 
 def signed_volume(vertices: NDArray, faces: NDArray) -> float:
