@@ -170,7 +170,10 @@ def characterise(
     darks = [_pair(take, 0.0, t, sites) for t in (use.exposure_s, *use.dark_exposures_s)]
     half = _half_saturation(photons, flats, next(iter(sites)))
     stacks = {"flat": _stack(take, half, use), "dark": _stack(take, 0.0, use)}
-    return {name: _channel(name, site, photons, flats, darks, stacks, use) for name, site in sites.items()}
+    return {
+        name: _characterisation(_measurement(name, site, photons, flats, darks, stacks, use))
+        for name, site in sites.items()
+    }
 
 
 def pictures(settings: Settings) -> int:
@@ -212,7 +215,31 @@ def _stack(take: Take, photons: float, use: Settings) -> tuple[F64, F64]:
     return mean, np.maximum(square / use.stack - mean * mean, 0) * use.stack / (use.stack - 1)
 
 
-def _channel(
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Measurement:
+    """Hold what the images of one channel give: means and variances of pairs, and the mean images of stacks.
+
+    `dark_*` are float64[exposure]. `flat_dn` and `dark_dn` are float64[y, x]; the spatial variances are those of
+    these images without the part that comes from the temporal noise.
+    """
+
+    channel: str
+    transfer: PhotonTransfer
+    dark_mean_dn: F64
+    dark_variance_dn2: F64
+    dark_exposure_s: F64
+    flat_dn: F64
+    dark_dn: F64
+    flat_spatial_dn2: float
+    dark_spatial_dn2: float
+
+    @property
+    def light_dn(self) -> float:
+        """Return the mean signal of the light in the flat image of the stack."""
+        return float(self.flat_dn.mean() - self.dark_dn.mean())
+
+
+def _measurement(
     name: str,
     site: Site,
     photons: F64,
@@ -220,66 +247,90 @@ def _channel(
     darks: list[Pair],
     stacks: dict[str, tuple[F64, F64]],
     use: Settings,
-) -> Characterisation:
-    """Return the characterisation of one channel from the pairs and stacks of images."""
+) -> _Measurement:
+    """Return what the pairs and stacks of images give for one channel."""
     mean, variance = (np.array([pair[name][k] for pair in flats]) for k in (0, 1))
-    (dark_mean, dark_variance), *later = (pair[name] for pair in darks)
-    # saturation: where the variance is largest (section 6.6)
-    last = int(np.argmax(variance))
-    if last < 3:
-        raise InputError(
-            f"channel {name}: it saturates within the first three exposures, so that no line can be fitted"
-        )
-    linear = mean - dark_mean <= _LINEAR_RANGE * (mean[last] - dark_mean)
-    linear &= np.arange(len(mean)) <= last
-    gain, response = _slopes(photons[linear], (mean - dark_mean)[linear], (variance - dark_variance)[linear])
-    efficiency = response / gain
-    dark_noise_dn = float(np.sqrt(max(dark_variance, 0.24)))  # below this, rounding hides the noise (eq. 56)
-    dark_noise_e = float(np.sqrt(max(dark_variance - _QUANTISATION_DN2, 0.0)) / gain)
-    saturation_photons = float(photons[last])
-    saturation_e = efficiency * saturation_photons
-    least = (np.sqrt(dark_noise_e**2 + _QUANTISATION_DN2 / gain**2 + 0.25) + 0.5) / efficiency
-    exposure = np.array([use.exposure_s, *use.dark_exposures_s])
-    dark_means, dark_variances = (np.array([darks[0][name][k], *(p[k] for p in later)]) for k in (0, 1))
-    slope_mean, slope_variance = (np.polyfit(exposure, v, 1)[0] for v in (dark_means, dark_variances))
+    dark_means, dark_variances = (np.array([pair[name][k] for pair in darks]) for k in (0, 1))
     (flat, flat_var), (dark, dark_var) = ((v[site] for v in stacks[kind]) for kind in ("flat", "dark"))
     flat_spatial, dark_spatial = (
         max(float(v.var(ddof=1) - in_time.mean() / use.stack), 0.0)
         for v, in_time in ((flat, flat_var), (dark, dark_var))
     )
-    of_light = flat.mean() - dark.mean()
-    return Characterisation(
+    return _Measurement(
         channel=name,
-        result=Result(
-            gain_dn_per_e=gain,
-            quantum_efficiency=efficiency,
-            dark_noise_e=dark_noise_e,
-            dark_noise_dn=dark_noise_dn,
-            saturation_e=saturation_e,
-            full_well_e=float((mean.max() - dark_mean) / gain),
-            saturation_photons=saturation_photons,
-            snr_max=float(np.sqrt(saturation_e)),
-            dynamic_range=float(saturation_photons / least),
-            linearity_error_percent=_linearity(photons, mean - dark_mean, last),
-            dark_current_mean_e_s=float(slope_mean / gain),
-            dark_current_variance_e_s=float(slope_variance / gain**2),
-            dsnu_e=float(np.sqrt(dark_spatial) / gain),
-            prnu_percent=float(100 * (np.sqrt(max(flat_spatial - dark_spatial, 0.0)) / of_light)),
-            black_level_dn=float(dark_mean),
-        ),
         transfer=PhotonTransfer(
             photons=photons,
             mean_dn=mean,
             variance_dn2=variance,
-            dark_mean_dn=float(dark_mean),
-            dark_variance_dn2=float(dark_variance),
+            dark_mean_dn=float(dark_means[0]),
+            dark_variance_dn2=float(dark_variances[0]),
         ),
         dark_mean_dn=dark_means,
         dark_variance_dn2=dark_variances,
-        dark_exposure_s=exposure,
+        dark_exposure_s=np.array([use.exposure_s, *use.dark_exposures_s]),
+        flat_dn=flat,
+        dark_dn=dark,
+        flat_spatial_dn2=flat_spatial,
+        dark_spatial_dn2=dark_spatial,
+    )
+
+
+def _result(measured: _Measurement) -> Result:
+    """Return the parameters of one channel. Raises InputError if it saturates too early."""
+    transfer = measured.transfer
+    photons, signal = transfer.photons, transfer.mean_dn - transfer.dark_mean_dn
+    dark_variance = transfer.dark_variance_dn2
+    # saturation: where the variance is largest (section 6.6)
+    last = int(np.argmax(transfer.variance_dn2))
+    if last < 3:
+        raise InputError(
+            f"channel {measured.channel}: it saturates within the first three exposures, so that no line can be "
+            "fitted"
+        )
+    linear = signal <= _LINEAR_RANGE * signal[last]
+    linear &= np.arange(len(signal)) <= last
+    gain, response = _slopes(photons[linear], signal[linear], (transfer.variance_dn2 - dark_variance)[linear])
+    efficiency = response / gain
+    dark_noise_e = float(np.sqrt(max(dark_variance - _QUANTISATION_DN2, 0.0)) / gain)
+    saturation_photons = float(photons[last])
+    saturation_e = efficiency * saturation_photons
+    least = (np.sqrt(dark_noise_e**2 + _QUANTISATION_DN2 / gain**2 + 0.25) + 0.5) / efficiency
+    slope_mean, slope_variance = (
+        np.polyfit(measured.dark_exposure_s, v, 1)[0] for v in (measured.dark_mean_dn, measured.dark_variance_dn2)
+    )
+    prnu_dn = np.sqrt(max(measured.flat_spatial_dn2 - measured.dark_spatial_dn2, 0.0))
+    return Result(
+        gain_dn_per_e=gain,
+        quantum_efficiency=efficiency,
+        dark_noise_e=dark_noise_e,
+        dark_noise_dn=float(np.sqrt(max(dark_variance, 0.24))),  # below this, rounding hides the noise (eq. 56)
+        saturation_e=saturation_e,
+        full_well_e=float(signal.max() / gain),
+        saturation_photons=saturation_photons,
+        snr_max=float(np.sqrt(saturation_e)),
+        dynamic_range=float(saturation_photons / least),
+        linearity_error_percent=_linearity(photons, signal, last),
+        dark_current_mean_e_s=float(slope_mean / gain),
+        dark_current_variance_e_s=float(slope_variance / gain**2),
+        dsnu_e=float(np.sqrt(measured.dark_spatial_dn2) / gain),
+        prnu_percent=float(100 * (prnu_dn / measured.light_dn)),
+        black_level_dn=transfer.dark_mean_dn,
+    )
+
+
+def _characterisation(measured: _Measurement) -> Characterisation:
+    """Return the characterisation of one channel. Raises InputError if it saturates too early."""
+    flat, dark = measured.flat_dn, measured.dark_dn
+    return Characterisation(
+        channel=measured.channel,
+        result=_result(measured),
+        transfer=measured.transfer,
+        dark_mean_dn=measured.dark_mean_dn,
+        dark_variance_dn2=measured.dark_variance_dn2,
+        dark_exposure_s=measured.dark_exposure_s,
         spectrum=_spectrum(flat, dark),
         dsnu_map_dn=dark - dark.mean(),
-        prnu_map=(flat - dark) / of_light - 1,
+        prnu_map=(flat - dark) / measured.light_dn - 1,
     )
 
 

@@ -13,7 +13,9 @@ import re
 import struct
 import warnings
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import cached_property
+from itertools import islice
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
@@ -89,77 +91,111 @@ def read_obj(data: bytes, source: str, *, name: str = "") -> list[MeshPart]:
         (numbers count from 1, or backwards from -1); the message gives the line. Or the file has more than 20
         million triangles or 10,000 parts.
     """
-    text = re.sub(rb"\\\r?\n", lambda end: b" " * len(end[0]), data)  # join continued lines; offsets stay
-
-    def line(pattern: re.Pattern[bytes], row: int) -> int:
-        offset = next(match.start() for k, match in enumerate(pattern.finditer(text)) if k == row)
-        return data.count(b"\n", 0, offset) + 1
-
-    def error(pattern: re.Pattern[bytes], row: int, expected: str, given: object) -> InputError:
-        return InputError(f"{source}: line {line(pattern, row)}: expected {expected}, found {given}.")
-
-    vertex_lines = _VERTEX.findall(text)
-    values, ends = _values(vertex_lines)
-    width = np.diff(ends, prepend=-1) - 1
-    sound = len(ends) == len(vertex_lines) and bool(np.isin(width, _VERTEX_WIDTHS).all())
-    first = ends - width
-    vertices = values[first[:, None] + np.arange(3)] if sound and len(vertex_lines) else np.empty((0, 3))
-    if vertex_lines and not (sound and np.isfinite(vertices).all()):
-        for k, row in enumerate(vertex_lines):
-            numbers, end = _values([row])
-            if len(end) != 1 or end[0] not in _VERTEX_WIDTHS or not np.isfinite(numbers[:3]).all():
-                what = row.decode("utf-8", "replace").strip()
-                raise error(_VERTEX, k, "'v x y z', finite numbers", shown(what))
-
-    stretches: dict[tuple[str, str], list[bytes]] = {}
-    faces: dict[tuple[str, str], list[int]] = {}  # index of each face in the file
-    count = 0
-    for key, piece in _stretches(text, name):
-        face_lines = _FACE.findall(piece)
-        if face_lines:
-            stretches.setdefault(key, []).extend(face_lines)
-            faces.setdefault(key, []).extend(range(count, count + len(face_lines)))
-            count += len(face_lines)
-    if len(stretches) > MAX_PARTS:
-        raise InputError(f"{source}: has {len(stretches)} objects and groups; at most {MAX_PARTS} are read.")
-    before: I64 | None = None
-    parts = []
+    file = _ObjFile(data, source)
+    vertices = file.vertices()
+    parts: list[MeshPart] = []
     triangles_n = 0
-    for key, face_lines in stretches.items():
-        number = np.array(faces[key])
-        corners, corner_ends = _values(
-            [_TEXTURE_AND_NORMAL.sub(b"", row) if b"/" in row else row for row in face_lines]
-        )
-        lengths = np.diff(corner_ends, prepend=-1) - 1
-        if len(corner_ends) != len(face_lines) or (lengths < 3).any() or (corners % 1 > 0).any():
-            for k, row in enumerate(face_lines):
-                tokens = row.split()
-                if len(tokens) < 3 or not all(map(_CORNER.fullmatch, tokens)):
-                    what = shown(row.decode("utf-8", "replace").strip())
-                    raise error(_FACE, int(number[k]), "'f a b c', three vertex numbers or more", what)
-        face = np.repeat(number, lengths)
-        index = np.delete(corners, corner_ends)
-        if (index < 0).any():  # counted back from the last vertex above the face
-            if before is None:
-                above = np.array([match.start() for match in _VERTEX.finditer(text)])
-                before = np.searchsorted(above, [match.start() for match in _FACE.finditer(text)])
-            index = np.where(index < 0, before[face] + index + 1, index)
-        outside = ~((index >= 1) & (index <= len(vertex_lines)))
-        if outside.any():
-            k = int(np.argmax(outside))
-            what = f"{np.delete(corners, corner_ends)[k]:g}"
-            raise error(_FACE, int(face[k]), f"vertex numbers from 1 to {len(vertex_lines)}", what)
-        triangles = _fans(index.astype(np.int64) - 1, lengths)
+    for (part, material), faces in file.faces_of_parts(name).items():
+        triangles = file.triangles(faces, len(vertices))
         triangles_n += len(triangles)
         if triangles_n > MAX_FACES:
             raise InputError(f"{source}: has {triangles_n} triangles or more; at most {MAX_FACES} are read.")
         used, compact = np.unique(triangles, return_inverse=True)
-        parts.append(
-            MeshPart(
-                name=key[0], material=key[1], vertices=vertices[used], faces=compact.reshape(-1, 3).astype(np.int64)
-            )
-        )
+        compact = compact.reshape(-1, 3).astype(np.int64)
+        parts.append(MeshPart(name=part, material=material, vertices=vertices[used], faces=compact))
     return parts
+
+
+@dataclass
+class _ObjFaces:
+    """Hold the text of a part's faces, and the index of each of these faces among all faces of the file."""
+
+    lines: list[bytes] = field(default_factory=list)
+    indices: list[int] = field(default_factory=list)
+
+
+class _ObjFile:
+    """Read the statements of an OBJ file."""
+
+    def __init__(self, data: bytes, source: str) -> None:
+        self.data, self.source = data, source
+        # join continued lines; offsets stay
+        self.text = re.sub(rb"\\\r?\n", lambda end: b" " * len(end[0]), data)
+
+    def vertices(self) -> F64:
+        """Return the positions of all vertices, float64[n, 3]. Raises InputError with the line of a wrong one."""
+        lines = _VERTEX.findall(self.text)
+        if not lines:
+            return np.empty((0, 3))
+        values, ends = _values(lines)
+        width = np.diff(ends, prepend=-1) - 1
+        if len(ends) == len(lines) and np.isin(width, _VERTEX_WIDTHS).all():
+            vertices = values[(ends - width)[:, None] + np.arange(3)]
+        else:
+            vertices = np.full((len(lines), 3), np.nan)
+        if not np.isfinite(vertices).all():
+            self._refuse_wrong_vertex(lines)
+        return vertices
+
+    def _refuse_wrong_vertex(self, lines: list[bytes]) -> None:
+        """Raise InputError for the first vertex without finite coordinates."""
+        for k, line in enumerate(lines):
+            numbers, end = _values([line])
+            if len(end) != 1 or end[0] not in _VERTEX_WIDTHS or not np.isfinite(numbers[:3]).all():
+                text = shown(line.decode("utf-8", "replace").strip())
+                raise self._error(_VERTEX, k, "'v x y z', finite numbers", text)
+
+    def faces_of_parts(self, name: str) -> dict[tuple[str, str], _ObjFaces]:
+        """Return the faces by the name and material of their part; `name` is that of faces outside every object."""
+        parts: dict[tuple[str, str], _ObjFaces] = {}
+        count = 0
+        for key, stretch in _stretches(self.text, name):
+            lines = _FACE.findall(stretch)
+            if lines:
+                part = parts.setdefault(key, _ObjFaces())
+                part.lines += lines
+                part.indices += range(count, count + len(lines))
+                count += len(lines)
+        if len(parts) > MAX_PARTS:
+            raise InputError(f"{self.source}: has {len(parts)} objects and groups; at most {MAX_PARTS} are read.")
+        return parts
+
+    def triangles(self, faces: _ObjFaces, vertices_n: int) -> I64:
+        """Return faces as triangles, int64[m, 3] from 0. Raises InputError with the line of a wrong face."""
+        corners, ends = _values([_TEXTURE_AND_NORMAL.sub(b"", f) if b"/" in f else f for f in faces.lines])
+        lengths = np.diff(ends, prepend=-1) - 1
+        if len(ends) != len(faces.lines) or (lengths < 3).any() or (corners % 1 > 0).any():
+            self._refuse_wrong_face(faces)
+        written = np.delete(corners, ends)
+        face = np.repeat(np.array(faces.indices), lengths)
+        number = written
+        if (written < 0).any():  # counted back from the last vertex above the face
+            number = np.where(written < 0, self._vertices_above_face[face] + written + 1, written)
+        outside = ~((number >= 1) & (number <= vertices_n))
+        if outside.any():
+            k = int(np.argmax(outside))
+            raise self._error(_FACE, int(face[k]), f"vertex numbers from 1 to {vertices_n}", f"{written[k]:g}")
+        return _fans(number.astype(np.int64) - 1, lengths)
+
+    def _refuse_wrong_face(self, faces: _ObjFaces) -> None:
+        """Raise InputError for the first face that is no list of at least three vertex numbers."""
+        for index, line in zip(faces.indices, faces.lines, strict=True):
+            corners = line.split()
+            if len(corners) < 3 or not all(map(_CORNER.fullmatch, corners)):
+                text = shown(line.decode("utf-8", "replace").strip())
+                raise self._error(_FACE, index, "'f a b c', three vertex numbers or more", text)
+
+    @cached_property
+    def _vertices_above_face(self) -> I64:
+        """Return how many vertices the file lists above each face, int64[face]."""
+        vertices, faces = ([match.start() for match in p.finditer(self.text)] for p in (_VERTEX, _FACE))
+        return np.searchsorted(np.array(vertices), faces)
+
+    def _error(self, statement: re.Pattern[bytes], index: int, expected: str, given: str) -> InputError:
+        """Return the error for the statement of this kind and index, with its line."""
+        match = next(islice(statement.finditer(self.text), index, None))
+        line = self.data.count(b"\n", 0, match.start()) + 1
+        return InputError(f"{self.source}: line {line}: expected {expected}, found {given}.")
 
 
 def _stretches(text: bytes, name: str) -> Iterator[tuple[tuple[str, str], bytes]]:

@@ -224,24 +224,8 @@ def _sums(
     x, dx, column = _cells(bounds[0, 0] + shift[0], bounds[1, 0] + shift[0], left, right)
     y, dy, row = _cells(bounds[0, 1] + shift[1], bounds[1, 1] + shift[1], top, bottom)
     x, y = x - shift[0], y - shift[1]
-    across, down, z = axes(disc.direction_C)
-    sine = np.sin(disc.angular_radius_rad)
-
-    def on_disc(slopes: F64) -> F64:
-        """Return positions on the unit disc, float64[y, x, 2]: the disc seen along its own direction."""
-        length = np.sqrt(1 + (slopes**2).sum(axis=-1))
-        coordinates = [
-            (slopes[..., 0] * a[0] + slopes[..., 1] * a[1] + a[2]) / (sine * length) for a in (across, down)
-        ]
-        return np.stack(coordinates, axis=-1)
-
-    middle, quarter = bounds.mean(axis=0), (bounds[1] - bounds[0]) / 4
-    near = on_disc(
-        projection.slopes_at(*(m + q * np.array([-1.0, 1.0]) for m, q in zip(middle, quarter, strict=True)))
-    )
-    # change of the position on the disc per pixel, along x and along y
-    per_x = (near[:, 1] - near[:, 0]).mean(axis=0) / (2 * quarter[0])
-    per_y = (near[1] - near[0]).mean(axis=0) / (2 * quarter[1])
+    on_disc = _DiscPosition(axes(disc.direction_C), float(np.sin(disc.angular_radius_rad)))
+    per_px = on_disc.change_per_px(projection, bounds)
     out = np.zeros((len(profiles), bottom - top, right - left))
     total = np.zeros(len(profiles))
     starts = np.flatnonzero(np.diff(column, prepend=-2))
@@ -251,13 +235,7 @@ def _sums(
         strip = slice(first, first + strips)
         slopes = projection.slopes_at(x, y[strip])
         position = on_disc(slopes)
-        r = np.maximum(np.hypot(position[..., 0], position[..., 1]), 1e-12)
-        a = np.abs(position @ per_x) / r * dx
-        b = np.abs(position @ per_y) / r * dy[strip, None]
-        covered = _covered(1 - r, a, b)
-        # mean distance from the rim of the cell's part inside the disc
-        depth = np.where(covered < 1, covered * (a + b) / 2, 1 - r)
-        mu = np.sqrt(np.clip(1 - (1 - depth) ** 2, 0, 1))
+        covered, mu = _cells_on_disc(position, per_px, dx, dy[strip, None])
         weight = covered * projection.solid_angle_sr(slopes) * dx * dy[strip, None]
         shown = weight * _visible(disc.visible, position)
         if gain is not None:
@@ -271,7 +249,52 @@ def _sums(
             np.add.at(for_rows, row[strip][inside], of_columns)
             out[k][:, column[starts][of_frame]] += for_rows
     mean = profiles @ (2 / (np.arange(profiles.shape[1]) + 2))  # of each profile over the disc
-    return np.asarray(out * (np.pi * sine**2 * z[2] * mean / total)[:, None, None])
+    return np.asarray(out * (np.pi * on_disc.sine**2 * on_disc.axes[2, 2] * mean / total)[:, None, None])
+
+
+@dataclass(frozen=True, eq=False)
+class _DiscPosition:
+    """Map tangents x/z and y/z to positions on the unit disc, which is the disc seen along its own direction.
+
+    `axes` are those of the disc, float64[3, 3]; `sine` is that of its angular radius.
+    """
+
+    axes: F64
+    sine: float
+
+    def __call__(self, slopes: F64) -> F64:
+        """Return the positions, float64[y, x, 2]."""
+        length = np.sqrt(1 + (slopes**2).sum(axis=-1))
+        coordinates = [
+            (slopes[..., 0] * a[0] + slopes[..., 1] * a[1] + a[2]) / (self.sine * length) for a in self.axes[:2]
+        ]
+        return np.stack(coordinates, axis=-1)
+
+    def change_per_px(self, projection: Projection, bounds: F64) -> tuple[F64, F64]:
+        """Return the change of the position per pixel along x and along y, both float64[2]."""
+        middle, quarter = bounds.mean(axis=0), (bounds[1] - bounds[0]) / 4
+        near = self(
+            projection.slopes_at(*(m + q * np.array([-1.0, 1.0]) for m, q in zip(middle, quarter, strict=True)))
+        )
+        return (
+            (near[:, 1] - near[:, 0]).mean(axis=0) / (2 * quarter[0]),
+            (near[1] - near[0]).mean(axis=0) / (2 * quarter[1]),
+        )
+
+
+def _cells_on_disc(position: F64, per_px: tuple[F64, F64], dx: F64, dy: F64) -> tuple[F64, F64]:
+    """Return the fraction of each cell that lies on the disc, and the mean μ of that part, both float64[y, x].
+
+    `position` is that of the cells' centres on the unit disc, `per_px` its change per pixel. `dx` and `dy` are the
+    sizes of the cells in pixels.
+    """
+    r = np.maximum(np.hypot(position[..., 0], position[..., 1]), 1e-12)
+    a = np.abs(position @ per_px[0]) / r * dx
+    b = np.abs(position @ per_px[1]) / r * dy
+    covered = _covered(1 - r, a, b)
+    # mean distance from the rim of the cell's part inside the disc
+    depth = np.where(covered < 1, covered * (a + b) / 2, 1 - r)
+    return covered, np.sqrt(np.clip(1 - (1 - depth) ** 2, 0, 1))
 
 
 def _covered(depth: F64, a: F64, b: F64) -> F64:
