@@ -268,21 +268,9 @@ def build(
         try:
             with locked(path):
                 summary = _outlook(plan, path, options)  # another build may have ended before the lock was free
-                store = _prepared_store(plan, path, options)
-                progress = Progress(len(plan.site), shown=options.progress)
-                run = Run(store, plan.site, progress, plan.expected, exact=plan.exact)
-                with run.progress:
-                    for line in summary.outlook():
-                        run.progress.say(line)
-                    _do_tasks(session_factory, run, options)
+                run = _run(session_factory, plan, options, summary)
         except (Stopped, KeyboardInterrupt) as stop:
-            with finishing():
-                done = store_module.open_store(path).finished() if store_module.is_store(path) else 0
-            raise Interrupted(
-                f"{path}: interrupted; {done} of {len(plan.site)} samples are finished, and the same command "
-                "resumes",
-                exit_code(stop),
-            ) from stop
+            raise _interrupted(path, len(plan.site), stop) from stop
         run.raise_failures()
         store = store_module.open_store(path)
         return replace(
@@ -293,6 +281,28 @@ def build(
             # every sample was read or made in this run, so its digest is known already
             digest=run.digests.of(store) if run.digests.complete else None,
         )
+
+
+def _run(session_factory: SessionFactory, plan: BuildPlan, options: BuildOptions, summary: Summary) -> Run:
+    """Prepare the store, do all tasks, and return the run with its results. The caller holds the store's lock."""
+    store = _prepared_store(plan, summary.path, options)
+    progress = Progress(len(plan.site), shown=options.progress)
+    run = Run(store, plan.site, progress, plan.expected, exact=plan.exact)
+    with run.progress:
+        for line in summary.outlook():
+            run.progress.say(line)
+        _do_tasks(session_factory, run, options)
+    return run
+
+
+def _interrupted(path: Path, samples: int, stop: Stopped | KeyboardInterrupt) -> Interrupted:
+    """Return the error that says how many samples are finished after an interruption."""
+    with finishing():
+        done = store_module.open_store(path).finished() if store_module.is_store(path) else 0
+    return Interrupted(
+        f"{path}: interrupted; {done} of {samples} samples are finished, and the same command resumes",
+        exit_code(stop),
+    )
 
 
 def _outlook(plan: BuildPlan, path: Path, options: BuildOptions) -> Summary:

@@ -129,18 +129,23 @@ def build_scene(
         llvm.find()  # raises VbnfaultError: without LLVM every sample would fail
     if append and samples is None and not options.overwrite and store.is_store(out):
         samples = int(store.open_store(out).attributes["blocks"][0])
-    if samples is not None:
-        scene = _with_samples(scene, samples)
+    scene = _with_samples(scene, samples)
     blocks = build.planned_blocks(out, scene.dataset.samples, append=append or 0, overwrite=options.overwrite)
+    factory, build_plan, description = _prepared(scene, blocks, source, options)
+    summary = build.build(factory, build_plan, out, options)
+    return dataclasses.replace(summary, description=tuple(description))
+
+
+def _prepared(
+    scene: Scene, blocks: tuple[int, ...], source: str, options: build.BuildOptions
+) -> tuple[SessionFactory, build.BuildPlan, list[str]]:
+    """Return what makes the sessions of a build, what it builds, and the lines of a dry run. Warns of doubts."""
     contents = file_contents.Contents()
     with contents.in_use():
         session = pipeline.Session(scene, blocks=blocks, source=source)
         session.warn_of_doubts()
         spec = store_spec(session, blocks)
-        seconds = estimated_seconds(session)
-        description: list[str] = []
-        if options.dry_run:
-            description = describe.describe(session, sample_bytes=spec.estimated_sample_bytes, seconds=seconds)
+        description = _description(session, spec) if options.dry_run else []
     contents.complete()
     if not options.dry_run:
         for sentence in plan.shortcomings(scene, session.plan):
@@ -152,15 +157,20 @@ def build_scene(
         planned_faults=session.plan.injected,
         expected=planned(spec.attributes, spec.faults),
         exact=is_exact(spec.attributes),
-        estimated_seconds=seconds,
+        estimated_seconds=estimated_seconds(session),
     )
-    factory = SessionFactory(scene, blocks, options.threads, contents)
-    summary = build.build(factory, build_plan, out, options)
-    return dataclasses.replace(summary, description=tuple(description))
+    return SessionFactory(scene, blocks, options.threads, contents), build_plan, description
 
 
-def _with_samples(scene: Scene, samples: int) -> Scene:
-    """Return the scene with another number of samples. Raises InputError if it is outside its range."""
+def _description(session: pipeline.Session, spec: store.StoreSpec) -> list[str]:
+    """Return lines that describe what a session's scene will photograph."""
+    return describe.describe(session, sample_bytes=spec.estimated_sample_bytes, seconds=estimated_seconds(session))
+
+
+def _with_samples(scene: Scene, samples: int | None) -> Scene:
+    """Return the scene with another number of samples, if one is given. Raises InputError outside its range."""
+    if samples is None:
+        return scene
     if type(samples) is not int or not 1 <= samples <= _MOST_SAMPLES:
         raise InputError(f"--samples {shown(samples)}: must be from 1 to {_MOST_SAMPLES}")
     return scene.model_copy(update={"dataset": scene.dataset.model_copy(update={"samples": samples})})
@@ -173,5 +183,4 @@ def describe_scene(scene: Scene, *, source: str) -> list[str]:
     """
     session = pipeline.Session(scene, source=source)
     session.warn_of_doubts()
-    spec = store_spec(session, (scene.dataset.samples,))
-    return describe.describe(session, sample_bytes=spec.estimated_sample_bytes, seconds=estimated_seconds(session))
+    return _description(session, store_spec(session, (scene.dataset.samples,)))

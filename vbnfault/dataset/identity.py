@@ -166,25 +166,7 @@ def store_spec(session: pipeline.Session, blocks: Sequence[int]) -> StoreSpec:
     individuals = scene.camera.individuals
     _check_origins(session.faults)
     kinds = tuple(masks.kind(fault, is_ccd=camera.is_ccd) for fault in session.faults.values())
-    identity, made_with = scene_identity(session), versions()
     references = assemble.attitude_references(scene)
-    if scene.spice.kernels:
-        made_with["spiceypy"] = importlib.metadata.version("spiceypy")
-    attributes: dict[str, Any] = {
-        "title": scene.title,
-        "description": scene.description,
-        "scene": identity,
-        "scene_hash": content_hash(identity, made_with),
-        "seed": dataset.seed,
-        "blocks": list(blocks),
-        "versions": made_with,
-        "licence": dataset.licence,
-        "citation": dataset.citation,
-        "intensity_channel": _intensity(camera.detector),
-        "optics": camera.lens.figures,
-        "detector": camera.detector.description,
-        "fault_models": {name: fault.model for name, fault in session.faults.items()},
-    }
     return StoreSpec(
         height=camera.height_px,
         width=camera.width_px,
@@ -209,8 +191,31 @@ def store_spec(session: pipeline.Session, blocks: Sequence[int]) -> StoreSpec:
         radiance_dtype="float32",
         shard_samples=dataset.shard_samples,
         sample_names=() if session.trajectory is None else session.trajectory.name,
-        attributes=attributes,
+        attributes=_root_attributes(session, blocks),
     )
+
+
+def _root_attributes(session: pipeline.Session, blocks: Sequence[int]) -> dict[str, Any]:
+    """Return the root attributes of the store of a scene whose samples are planned in `blocks`."""
+    scene, camera = session.scene, session.base_camera
+    identity, made_with = scene_identity(session), versions()
+    if scene.spice.kernels:
+        made_with["spiceypy"] = importlib.metadata.version("spiceypy")
+    return {
+        "title": scene.title,
+        "description": scene.description,
+        "scene": identity,
+        "scene_hash": content_hash(identity, made_with),
+        "seed": scene.dataset.seed,
+        "blocks": list(blocks),
+        "versions": made_with,
+        "licence": scene.dataset.licence,
+        "citation": scene.dataset.citation,
+        "intensity_channel": _intensity(camera.detector),
+        "optics": camera.lens.figures,
+        "detector": camera.detector.description,
+        "fault_models": {name: fault.model for name, fault in session.faults.items()},
+    }
 
 
 def _check_origins(faults: Mapping[str, Fault]) -> None:
