@@ -387,7 +387,9 @@ def test_the_first_look_misses_no_edge(method: str, monkeypatch: pytest.MonkeyPa
             known = {"black": 2.0, "noise": 3.0, "clipped": raw > 2e4}
             some = bounded(raw, p, method, **known)
             with monkeypatch.context() as everywhere:
-                everywhere.setattr(module, "_blocks_with_edges", lambda rgb, *_: np.arange(0, len(rgb), 64))
+                everywhere.setattr(
+                    module._Edges, "starts_of_blocks", lambda _self, rgb, *_: np.arange(0, len(rgb), 64)
+                )
                 np.testing.assert_array_equal(some, bounded(raw, p, method, **known))
 
 

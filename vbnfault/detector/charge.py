@@ -251,28 +251,18 @@ def cti(
     own pixel, and of `transfers_before` pixels ahead of them (a store, a prescan). All traps are empty when readout
     starts.
 
-    The computation is an express approximation: a packet's cloud keeps its size during a pass, instead of shrinking
-    from pixel to pixel. Then the sum over all transfers has a closed form. With V_j(i) the largest cloud among the
-    packets i−j … i and f(j) = Σ ρ exp(−j t/τ), the traps hold Σ_j V_j [f(j) + (f(j) − f(j+1)) (i − j)] electrons
-    after packet i. Packet i leaves with its charge plus the change of that sum. A packet never gives more than it
-    has.
-
-    A trail ends where `trail_left_out` of the trapped charge is left: f is lowered by a constant to reach 0 there
-    and scaled to keep f(0), so that nothing is lost. The cost rises with the longest release time. The total charge
-    is conserved, except for charge that is still trapped when the last row has left.
+    The computation is an express approximation: a packet's cloud keeps its size during a pass (`_clock`). The cost
+    rises with the longest release time. The total charge is conserved, except for charge that is still trapped when
+    the last row has left.
 
     Parameters
     ----------
     signal_e
         Electrons, float32[y, x].
-    species
-        Kinds of traps.
-    cloud
-        Charge cloud of a packet.
-    transfer_s
-        Time per transfer in s, above 0.
-    direction
-        Direction of the charge.
+    species, cloud
+        Kinds of traps, and the charge cloud of a packet.
+    transfer_s, direction
+        Time per transfer in s, above 0, and direction of the charge.
     transfers_before
         Pixels with traps ahead of row 0, at least 0.
     passes
@@ -288,12 +278,7 @@ def cti(
         A value is out of range.
     """
     _above_0(transfer_s=transfer_s)
-    if transfers_before < 0:
-        raise InputError(f"transfers_before = {transfers_before}: must be at least 0")
-    if passes < 1:
-        raise InputError(f"passes = {passes}: must be at least 1")
-    if not 0 < trail_left_out < 1:
-        raise InputError(f"trail_left_out = {trail_left_out:g}: must be between 0 and 1")
+    _check_transfers(transfers_before, passes, trail_left_out)
     species = [s for s in species if s.density_per_px > 0]
     image = _facing(signal_e.copy() if direction == "up" else signal_e, direction)
     if not species or image.shape[0] == 0:
@@ -307,8 +292,22 @@ def cti(
     return _facing(image, direction, back=True)
 
 
+def _check_transfers(transfers_before: int, passes: int, trail_left_out: float) -> None:
+    """Raise InputError for a value of `cti` that is out of range."""
+    if transfers_before < 0:
+        raise InputError(f"transfers_before = {transfers_before}: must be at least 0")
+    if passes < 1:
+        raise InputError(f"passes = {passes}: must be at least 1")
+    if not 0 < trail_left_out < 1:
+        raise InputError(f"trail_left_out = {trail_left_out:g}: must be between 0 and 1")
+
+
 def _trapped(species: Iterable[TrapSpecies], transfer_s: float, height: int, left_out: float) -> F64:
-    """Return f of `cti`, float64[j]: electrons that a pixel's traps in a cloud hold j transfers after the cloud."""
+    """Return f(j) = Σ ρ exp(−j t/τ), float64[j]: electrons that a pixel's traps hold j transfers after a cloud.
+
+    The trail ends where the fraction `left_out` of the trapped charge is left: f is lowered by a constant to reach
+    0 there and scaled to keep f(0), so that nothing is lost.
+    """
     f = np.zeros(height + 1)
     for s in species:
         f += s.density_per_px * np.exp(-np.arange(height + 1) * (transfer_s / s.release_time_s))
@@ -321,7 +320,10 @@ def _trapped(species: Iterable[TrapSpecies], transfer_s: float, height: int, lef
 def _clock(image: F32, cloud: ChargeCloud, per_cloud: F32, trapped: F64, before: int) -> None:
     """Run one pass of `cti` towards row 0, in place, in blocks of rows.
 
-    `per_cloud` float32[y, 1] limits a cloud to the charge that its packet has.
+    A packet's cloud keeps its size during the pass, instead of shrinking from pixel to pixel. Then the sum over all
+    transfers has a closed form. With V_j(i) the largest cloud among the packets i−j … i and f = `trapped`, the
+    traps hold Σ_j V_j [f(j) + (f(j) − f(j+1)) (i − j)] electrons after packet i. Packet i leaves with its charge
+    plus the change of that sum. `per_cloud` float32[y, 1] limits a cloud to the charge that its packet has.
     """
     height = len(image)
     volume = np.empty(image.shape, dtype=np.float32)

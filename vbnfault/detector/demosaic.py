@@ -8,6 +8,7 @@ Normalised convolution needs no mirror: it uses only the pixels inside the mosai
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, Literal, get_args
 
@@ -124,9 +125,7 @@ def bounded_at_edges(
     measured values within one pixel: never below the least, and on the dark side of the edge never above the
     greatest.
 
-    An edge is hard where the pixels of the method's `footprint` span more than noise can (16 standard deviations)
-    and more than 8:1 above black, or 2:1 where the value is below black. A clipped pixel may have any brightness,
-    so an edge beside it is always hard. Elsewhere values stay as published: a bound there would change the noise.
+    `_Edges` says where an edge is hard. Elsewhere values stay as published: a bound there would change the noise.
 
     Parameters
     ----------
@@ -136,10 +135,8 @@ def bounded_at_edges(
         The mosaic [y, x], in the same unit.
     pattern, method
         As in `demosaic`.
-    black
-        Black level of `raw`.
-    noise
-        Standard deviation of the noise in the dark, in the unit of `raw`.
+    black, noise
+        Black level of `raw`, and standard deviation of its noise in the dark, in the unit of `raw`.
     clipped
         bool[y, x], pixels of `raw` that are saturated; None: no pixel.
 
@@ -154,62 +151,84 @@ def bounded_at_edges(
     bright = signal
     if clipped is not None and clipped.any():
         bright = np.where(clipped, np.float32(np.inf), signal)
-    halo = _HALO_PX[method]
-    starts = _blocks_with_edges(rgb, signal, bright, method, black, noise)
+    edges = _Edges(pattern, method, black, noise)
+    starts = edges.starts_of_blocks(rgb, signal, bright)
     if not len(starts):
         return rgb
+    halo = _HALO_PX[method]
     measured = cv2.copyMakeBorder(signal, halo, halo, halo, halo, _MIRROR)
     brightest = measured if bright is signal else cv2.copyMakeBorder(bright, halo, halo, halo, halo, _MIRROR)
 
-    def bound(start: int) -> None:
+    def bound_block(start: int) -> None:
         block = rgb[start : start + _ROWS_PER_BLOCK]
         rows = slice(start, start + len(block) + 2 * halo)
-        inner = np.s_[halo:-halo, halo:-halo]
-        top = cv2.dilate(brightest[rows], _support(method))[inner]
-        lowest = cv2.erode(measured[rows], np.ones((3, 3), np.uint8))[inner]
-        # the few pixels where an edge may be hard for one of the colours
-        y, x = np.nonzero((top - lowest > _HARD_NOISE * noise) & (top - lowest > lowest - black))
-        least = _malvar(measured[rows], pattern, filtered=_least_beside)
-        greatest = _malvar(measured[rows], pattern, filtered=_greatest_beside)
-        top, own = top[y, x], brightest[rows][inner][y, x] - black
-        for k in range(3):
-            value, low, high = block[y, x, k], least[k][inner][y, x], greatest[k][inner][y, x]
-            span, dark = top - low, low - black
-            ratio = (span > (_HARD_RATIO - 1) * dark) | ((value < black) & (span > dark))
-            hard = (span > _HARD_NOISE * noise) & ratio
-            dark_side = hard & (_HARD_RATIO * own < top - black)
-            value = np.where(hard & (value < low), low, value)
-            block[y, x, k] = np.where(dark_side & (value > high), high, value)
+        edges.bound(block, measured[rows], brightest[rows])
 
-    list(pool().map(bound, starts))
+    list(pool().map(bound_block, starts))
     return rgb
 
 
-def _blocks_with_edges(
-    rgb: F32, signal: F32, bright: F32, method: Method, black: float, noise: float
-) -> NDArray[np.intp]:
-    """Return the first rows, int[n], of the blocks of rows that may hold a hard edge.
+@dataclass(frozen=True)
+class _Edges:
+    """Find hard edges and correct the values beside them for `bounded_at_edges`.
 
-    This is a cheap first look, at the extremes of groups of rows: it finds every pixel that `bounded_at_edges`
-    changes, since the extremes of the groups are at least as far apart as those of the pixels that decide.
+    An edge is hard where the pixels of the method's `footprint` span more than noise can (16 standard deviations)
+    and more than 8:1 above black, or 2:1 where the value is below black. A clipped pixel may have any brightness,
+    so an edge beside it is always hard.
     """
-    group, reach = _ROWS_PER_LOOK[method], _HALO_PX[method]
-    # a group and the two beside it hold all rows within reach
-    top = cv2.dilate(_by_groups(np.max, bright, group), np.ones((3, 2 * reach + 1), np.uint8))
-    low = cv2.erode(_by_groups(np.min, signal, group), np.ones((3, 3), np.uint8))
-    span, dark = top - low, low - black
-    clear = span > _HARD_NOISE * noise
-    blocks = np.arange(0, len(span), _ROWS_PER_BLOCK // group)
-    hard, negative = (
-        np.logical_or.reduceat((clear & (span > ratio * dark)).any(axis=1), blocks)
-        for ratio in (_HARD_RATIO - 1, 1)
-    )
-    starts = range(0, len(signal), _ROWS_PER_BLOCK)
-    with_edges = [
-        hard[i] or (negative[i] and rgb[start : start + _ROWS_PER_BLOCK].min() < black)
-        for i, start in enumerate(starts)
-    ]
-    return np.flatnonzero(with_edges) * _ROWS_PER_BLOCK
+
+    pattern: Pattern
+    method: Method
+    black: float
+    noise: float
+
+    def bound(self, block: F32, measured: F32, brightest: F32) -> None:
+        """Keep the values of a block of rows, float32[y, x, 3], within their bounds, in place.
+
+        `measured` and `brightest` are the mosaic with a halo around the block; in `brightest`, clipped pixels are
+        infinite.
+        """
+        halo = _HALO_PX[self.method]
+        inner = np.s_[halo:-halo, halo:-halo]
+        top = cv2.dilate(brightest, _support(self.method))[inner]
+        lowest = cv2.erode(measured, np.ones((3, 3), np.uint8))[inner]
+        # the few pixels where an edge may be hard for one of the colours
+        y, x = np.nonzero((top - lowest > _HARD_NOISE * self.noise) & (top - lowest > lowest - self.black))
+        least = _malvar(measured, self.pattern, filtered=_least_beside)
+        greatest = _malvar(measured, self.pattern, filtered=_greatest_beside)
+        top, own = top[y, x], brightest[inner][y, x] - self.black
+        for k in range(3):
+            value, low, high = block[y, x, k], least[k][inner][y, x], greatest[k][inner][y, x]
+            span, dark = top - low, low - self.black
+            ratio = (span > (_HARD_RATIO - 1) * dark) | ((value < self.black) & (span > dark))
+            hard = (span > _HARD_NOISE * self.noise) & ratio
+            dark_side = hard & (_HARD_RATIO * own < top - self.black)
+            value = np.where(hard & (value < low), low, value)
+            block[y, x, k] = np.where(dark_side & (value > high), high, value)
+
+    def starts_of_blocks(self, rgb: F32, signal: F32, bright: F32) -> NDArray[np.intp]:
+        """Return the first rows, int[n], of the blocks of rows that may hold a hard edge.
+
+        This is a cheap first look, at the extremes of groups of rows: it finds every pixel that `bound` changes,
+        since the extremes of the groups are at least as far apart as those of the pixels that decide.
+        """
+        group, reach = _ROWS_PER_LOOK[self.method], _HALO_PX[self.method]
+        # a group and the two beside it hold all rows within reach
+        top = cv2.dilate(_by_groups(np.max, bright, group), np.ones((3, 2 * reach + 1), np.uint8))
+        low = cv2.erode(_by_groups(np.min, signal, group), np.ones((3, 3), np.uint8))
+        span, dark = top - low, low - self.black
+        clear = span > _HARD_NOISE * self.noise
+        blocks = np.arange(0, len(span), _ROWS_PER_BLOCK // group)
+        hard, negative = (
+            np.logical_or.reduceat((clear & (span > ratio * dark)).any(axis=1), blocks)
+            for ratio in (_HARD_RATIO - 1, 1)
+        )
+        starts = range(0, len(signal), _ROWS_PER_BLOCK)
+        with_edges = [
+            hard[i] or (negative[i] and rgb[start : start + _ROWS_PER_BLOCK].min() < self.black)
+            for i, start in enumerate(starts)
+        ]
+        return np.flatnonzero(with_edges) * _ROWS_PER_BLOCK
 
 
 def _by_groups(extreme: Callable[..., F32], array: F32, rows: int) -> F32:
@@ -496,6 +515,23 @@ _TWO_APART = _row(0, 0, 1, 0, -1)
 _COLOUR_DIFFERENCE = _row(0.25, -0.5, 0.5, -0.5, 0.25)
 
 
+def _along_row(array: F32, kernel: F32) -> F32:
+    """Return an array filtered with a kernel as it is written, for the direction of the rows."""
+    return cv2.filter2D(array, -1, kernel)
+
+
+def _along_column(array: F32, kernel: F32) -> F32:
+    """Return an array filtered with the transposed kernel."""
+    return cv2.filter2D(array, -1, np.ascontiguousarray(kernel.T))
+
+
+def _roughness(difference: F32, along: Callable[[F32, F32], F32]) -> F32:
+    """Return how much colour differences vary along one direction around each pixel."""
+    step = along(difference, _TWO_APART)
+    np.abs(step, out=step)
+    return along(step, _ROUGHNESS)
+
+
 def _menon(raw: F32, pattern: Pattern) -> list[F32]:
     """Return R, G, B by Menon's method, which interpolates colour differences.
 
@@ -507,32 +543,22 @@ def _menon(raw: F32, pattern: Pattern) -> list[F32]:
     # green pixels of the red rows and of the blue rows
     green_r, green_b = (red[0], blue[1]), (blue[0], red[1])
 
-    def along_row(array: F32, kernel: F32) -> F32:
-        return cv2.filter2D(array, -1, kernel)
-
-    def along_column(array: F32, kernel: F32) -> F32:
-        return cv2.filter2D(array, -1, np.ascontiguousarray(kernel.T))
-
     def clear_green(array: F32) -> F32:
         array[green_r] = 0
         array[green_b] = 0
         return array
 
-    def roughness(difference: F32, along: Any, kernel: F32) -> F32:
-        step = along(difference, _TWO_APART)
-        np.abs(step, out=step)
-        return cv2.filter2D(step, -1, kernel)
-
-    k_row, k_column = (clear_green(along(raw, _COLOUR_DIFFERENCE)) for along in (along_row, along_column))
-    rough_row = roughness(k_row, along_row, _ROUGHNESS)
-    rough_column = roughness(k_column, along_column, np.ascontiguousarray(_ROUGHNESS.T))
+    k_row, k_column = (clear_green(along(raw, _COLOUR_DIFFERENCE)) for along in (_along_row, _along_column))
+    rough_row, rough_column = (
+        _roughness(k, along) for k, along in ((k_row, _along_row), (k_column, _along_column))
+    )
     take_row = cv2.compare(rough_column, rough_row, cv2.CMP_GE)
 
     def chosen(row: F32, column: F32) -> F32:
         return cv2.copyTo(row, take_row, column)  # into `column`
 
     def beside(k: F32) -> tuple[F32, F32]:
-        return along_row(k, _BESIDE), along_column(k, _BESIDE)
+        return _along_row(k, _BESIDE), _along_column(k, _BESIDE)
 
     def red_minus_blue(row: F32, column: F32) -> F32:
         # at a green pixel of a red row, red pixels are neighbours along the row and blue ones along the column
@@ -549,12 +575,12 @@ def _menon(raw: F32, pattern: Pattern) -> list[F32]:
     # refining step: green from the mean of three colour differences along the chosen direction
     for full in (row, column):
         full[red], full[blue] = k[red], k[blue]
-    k = clear_green(chosen(along_row(row, _THIRDS), along_column(column, _THIRDS)))
+    k = clear_green(chosen(_along_row(row, _THIRDS), _along_column(column, _THIRDS)))
     green = raw - k
     row, column = beside(k)
     l_all = red_minus_blue(row, column)
     l_all[red], l_all[blue] = l_first[red], l_first[blue]
-    l_all = chosen(along_row(l_all, _THIRDS), along_column(l_all, _THIRDS))
+    l_all = chosen(_along_row(l_all, _THIRDS), _along_column(l_all, _THIRDS))
 
     out_red, out_blue = np.empty_like(raw), np.empty_like(raw)
     out_red[red], out_blue[blue] = raw[red], raw[blue]
