@@ -500,25 +500,10 @@ def with_stars(
     A lens with a point spread blurs the stars itself. For it they are drawn with `_STAR_SIGMA_PX`, whatever
     `sky.sigma_px` is.
     """
-    table = scene.sky
-    if table.stars == "off" or not open_sky.any():
+    if scene.sky.stars == "off" or not open_sky.any():
         return radiance
-    lens = camera.lens
-    sigma_px = _STAR_SIGMA_PX if lens.blurs else table.sigma_px
-    faintest = table.limiting_magnitude
-    if table.stars == "auto":
-        faintest = min(
-            faintest,
-            sky.limiting_magnitude(
-                electron_rate_weights=camera.detector.electron_rate_weights(radiance.wavelength_nm),
-                wavelength_nm=radiance.wavelength_nm,
-                irradiance_per_radiance=np.pi * lens.transmission / (4 * lens.f_number**2),
-                focal_length_px=camera.focal_length_px,
-                exposure_s=camera.exposure_s,
-                sigma_px=sigma_px,
-                threshold_e=_STAR_OVER_READ_NOISE * max(camera.detector.read_noise_e_rms, 1.0),
-            ),
-        )
+    sigma_px = _STAR_SIGMA_PX if camera.lens.blurs else scene.sky.sigma_px
+    faintest = _faintest_star(scene, camera, radiance.wavelength_nm, sigma_px)
     if faintest < sky.BRIGHTEST_V:
         return radiance
     grid = camera if view is None else view
@@ -531,6 +516,24 @@ def with_stars(
         sigma_px=sigma_px,
         julian_date=scene.sun.julian_date,
         sky=open_sky,
-        lens_falloff=lens.falls_off,
+        lens_falloff=camera.lens.falls_off,
     )
     return stars.added_to(radiance)
+
+
+def _faintest_star(scene: Scene, camera: Camera, wavelength_nm: F64, sigma_px: float) -> float:
+    """Return the magnitude of the faintest star to draw: the scene's limit, or that of the exposure for "auto"."""
+    limit = scene.sky.limiting_magnitude
+    if scene.sky.stars != "auto":
+        return limit
+    lens, detector = camera.lens, camera.detector
+    visible = sky.limiting_magnitude(
+        electron_rate_weights=detector.electron_rate_weights(wavelength_nm),
+        wavelength_nm=wavelength_nm,
+        irradiance_per_radiance=np.pi * lens.transmission / (4 * lens.f_number**2),
+        focal_length_px=camera.focal_length_px,
+        exposure_s=camera.exposure_s,
+        sigma_px=sigma_px,
+        threshold_e=_STAR_OVER_READ_NOISE * max(detector.read_noise_e_rms, 1.0),
+    )
+    return min(limit, visible)

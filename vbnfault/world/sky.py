@@ -262,14 +262,7 @@ def star_radiance(
 ) -> StarRadiance:
     """Return the radiance that the stars add to each pixel, averaged over the pixel and summed over the stars.
 
-    A star of irradiance E at the angle θ from the boresight sends the flux T E A cos θ through an aperture of area
-    A = π (f/2N)². A pixel of radiance L receives π T L / (4N²) times its own area from `lens.ThinLens`, which has
-    no falloff. Equal flux requires that the radiances of a star sum to
-
-        Σ L = E fx fy cos θ          (`lens_falloff` False: the lens adds no factor)
-        Σ L = E fx fy / cos³ θ       (`lens_falloff` True: a lens or a later stage multiplies by cos⁴ θ)
-
-    The second sum is E over the solid angle of the pixel. The star gives the same electrons in both cases.
+    A star gives the same electrons whether `lens_falloff` is set or not.
 
     Parameters
     ----------
@@ -302,25 +295,44 @@ def star_radiance(
     if sky is not None and sky.shape != (frame.height_px, frame.width_px):
         raise ValueError(f"sky has shape {sky.shape}, the frame {(frame.height_px, frame.width_px)}")
     position, cosines, ahead = frame.positions_px(catalogue.direction_J(julian_date))
-    size = np.array([frame.width_px, frame.height_px])
-    reach = REACH_SIGMA * sigma_px
-    inside = np.asarray(((position >= -reach) & (position < size + reach)).all(axis=1))
-    if sky is not None:
-        column, row = np.clip(np.floor(position[inside]).astype(np.int64), 0, size - 1).T
-        outside = ((position[inside] < 0) | (position[inside] >= size)).any(axis=1)
-        inside[inside] = outside | sky[row, column]
-    position, stars = position[inside], ahead[inside]
+    visible = _visible(position, frame, REACH_SIGMA * sigma_px, sky)
+    position, stars = position[visible], ahead[visible]
 
-    cosine = cosines[stars]
-    fx, fy = (float(v) for v in frame.intrinsics[:2])
     irradiance = star_irradiance_W_m2_nm(catalogue.magnitude_V[stars], catalogue.colour_BV[stars], wavelength_nm)
-    total = irradiance * (fx * fy * (cosine**-3 if lens_falloff else cosine))[:, None]
-    pixels, spread = _spread_over_pixels(position, size, sigma_px)
+    total = irradiance * _radiance_px_per_irradiance(frame, cosines[stars], lens_falloff)[:, None]
+    pixels, spread = _spread_over_pixels(position, np.array([frame.width_px, frame.height_px]), sigma_px)
     return StarRadiance(
         rows=pixels // frame.width_px,
         columns=pixels % frame.width_px,
         radiance=np.ascontiguousarray((spread @ total).T, dtype=np.float32),
     )
+
+
+def _visible(position: F64, frame: SkyFrame, reach_px: float, sky: NDArray[np.bool_] | None) -> NDArray[np.bool_]:
+    """Return which stars at positions float64[n, 2] are within reach of the frame and behind no body, bool[n]."""
+    size = np.array([frame.width_px, frame.height_px])
+    visible = np.asarray(((position >= -reach_px) & (position < size + reach_px)).all(axis=1))
+    if sky is not None:
+        column, row = np.clip(np.floor(position[visible]).astype(np.int64), 0, size - 1).T
+        outside = ((position[visible] < 0) | (position[visible] >= size)).any(axis=1)
+        visible[visible] = outside | sky[row, column]
+    return visible
+
+
+def _radiance_px_per_irradiance(frame: SkyFrame, cosine: F64, lens_falloff: bool) -> F64:
+    """Return the sum over pixels of a star's radiance over its irradiance, float64[n] in sr⁻¹.
+
+    A star of irradiance E at the angle θ from the boresight sends the flux T E A cos θ through an aperture of area
+    A = π (f/2N)². A pixel of radiance L receives π T L / (4N²) times its own area from `lens.ThinLens`, which has
+    no falloff. Equal flux requires that the radiances of a star sum to
+
+        Σ L = E fx fy cos θ          (`lens_falloff` False: the lens adds no factor)
+        Σ L = E fx fy / cos³ θ       (`lens_falloff` True: a lens or a later stage multiplies by cos⁴ θ)
+
+    The second sum is E over the solid angle of the pixel.
+    """
+    fx, fy = (float(v) for v in frame.intrinsics[:2])
+    return np.asarray(fx * fy * (cosine**-3 if lens_falloff else cosine))
 
 
 def _spread_over_pixels(position: F64, size: I64, sigma_px: float) -> tuple[I64, csr_array]:

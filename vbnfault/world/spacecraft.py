@@ -342,20 +342,36 @@ def load_spacecraft(
     placement = placement or ModelPlacement()
     if not np.isfinite((placement.B_from_V.sum(), *placement.translation_B_m)).all():
         raise InputError(f"{path}: placement has numbers that are not finite")
-    pieces = [piece for piece in map(_without_degenerate_faces, _read(path)) if len(piece.faces)]
-    if not pieces:
-        raise InputError(f"{path}: no face has an area")
-
+    pieces = _read(path)
     extent_m = METRES_PER[unit] * float(np.ptp(np.concatenate([p.vertices for p in pieces]), axis=0).max())
     if extent_m > LARGEST_EXTENT_M:
         raise InputError(
             f"{path}: the vehicle measures {extent_m:g} m in the unit {unit!r}; it must be at most"
             f" {LARGEST_EXTENT_M:g} m, so give the file's own unit: {', '.join(METRES_PER)}"
         )
-    settings = {key: make_material(value, key) for key, value in (materials or {}).items()}
+    B_from_V, translation = placement.B_from_V, np.array(placement.translation_B_m, dtype=np.float64)
+    parts = tuple(
+        Part(
+            name=piece.name,
+            vertices_B_m=METRES_PER[unit] * piece.vertices @ B_from_V.T + translation,
+            faces=piece.faces,
+            material=material,
+        )
+        for piece, material in zip(pieces, _materials(pieces, materials or {}, default_material), strict=True)
+    )
+    return Spacecraft(parts=parts).posed(poses or {})
+
+
+def _materials(
+    pieces: list[MeshPart],
+    table: Mapping[str, str | float | Mapping[str, Any]],
+    default: str | float | Mapping[str, Any],
+) -> list[Material]:
+    """Return the material of each piece, as `load_spacecraft` describes. Raises InputError for an unknown key."""
+    settings = {key: make_material(value, key) for key, value in table.items()}
     known = [key for piece in pieces for key in (*_keys(piece.name), piece.material) if key]
     _refuse_unknown(settings, known, "material")
-    otherwise = make_material(default_material)
+    otherwise = make_material(default)
 
     def material_of(piece: MeshPart) -> Material:
         for key in (*_keys(piece.name), piece.material):
@@ -363,21 +379,14 @@ def load_spacecraft(
                 return settings[key]
         return make_material(piece.material) if piece.material in NAMED_REFLECTANCES else otherwise
 
-    B_from_V, translation = placement.B_from_V, np.array(placement.translation_B_m, dtype=np.float64)
-    parts = tuple(
-        Part(
-            name=piece.name,
-            vertices_B_m=METRES_PER[unit] * piece.vertices @ B_from_V.T + translation,
-            faces=piece.faces,
-            material=material_of(piece),
-        )
-        for piece in pieces
-    )
-    return Spacecraft(parts=parts).posed(poses or {})
+    return [material_of(piece) for piece in pieces]
 
 
 def _read(path: Path) -> list[MeshPart]:
-    """Read the parts of a file. Raises InputError for missing faces or coordinates out of range."""
+    """Read the parts of a file, without faces of zero area.
+
+    Raises InputError if no face is left, or for coordinates out of range.
+    """
     data = user_files.read_input(path, "spacecraft", types=FILE_TYPES)
     if path.suffix.lower() == ".obj":
         pieces = meshes.read_obj(data, str(path), name=path.stem)
@@ -393,6 +402,9 @@ def _read(path: Path) -> list[MeshPart]:
             raise InputError(
                 f"{path}: part {piece.name!r} has vertices with coordinates such as {far:g}; at most {_FARTHEST:g}"
             )
+    pieces = [piece for piece in map(_without_degenerate_faces, pieces) if len(piece.faces)]
+    if not pieces:
+        raise InputError(f"{path}: no face has an area")
     return pieces
 
 
@@ -426,74 +438,110 @@ _CORNERS = {
 @lru_cache(maxsize=1)
 def _default_at_rest() -> Spacecraft:
     """Build the default vehicle with all joints at angle 0."""
-    hinges: dict[str, HingePose] = {}
-    parts: list[Part] = []
+    arrays = [_solar_array(side, sign) for side, sign in (("left", -1.0), ("right", 1.0))]
+    legs = [_leg(name, x, z) for name, (x, z) in _CORNERS.items()]
+    groups = [_bus(), *arrays, *legs, _antenna()]
+    return Spacecraft(
+        parts=tuple(part for group in groups for part in group.parts),
+        hinges={name: hinge for group in groups for name, hinge in group.hinges.items()},
+    )
 
-    def add(name: str, mesh: trimesh.Trimesh, material: str) -> None:
-        parts.append(
-            Part(
-                name=name,
-                vertices_B_m=np.array(mesh.vertices, dtype=np.float64),
-                faces=np.array(mesh.faces, dtype=np.int64),
-                material=make_material(material),
-            )
-        )
 
-    def box(centre: tuple[float, ...], size: tuple[float, ...]) -> trimesh.Trimesh:
-        return trimesh.creation.box(size, trimesh.transformations.translation_matrix(centre))
-
-    def rod(start: tuple[float, ...], end: tuple[float, ...], radius: float, sections: int = 20) -> trimesh.Trimesh:
-        return trimesh.creation.cylinder(radius, segment=np.array([start, end]), sections=sections)
-
-    def revolved(
-        profile: list[tuple[float, float]], apex: tuple[float, ...], towards: tuple[float, ...]
-    ) -> trimesh.Trimesh:
-        mesh = trimesh.creation.revolve(np.array(profile), sections=32)
-        mesh.apply_transform(trimesh.geometry.align_vectors((0, 0, 1), np.array(towards) / np.linalg.norm(towards)))
-        return mesh.apply_translation(apex)
-
-    add("bus/body", box(BUS_CENTRE_M, BUS_SIZE_M), "gold_mli")
-    add("bus/radiator", box((0.0, -0.25, -0.055), (0.9, 0.35, 0.02)), "white_paint")
-    add("bus/camera_barrel", rod((0, 0, -0.08), (0, 0, -0.01), BARREL_RADIUS_M, 32), "black_paint")
+def _bus() -> Spacecraft:
+    """Return the bus with radiator, camera barrel and engine."""
     # the bell opens downwards and has a wall of 1 cm
     bell = [(0.0, 0.0), (0.06, 0.0), (0.21, 0.3), (0.2, 0.3), (0.05, 0.01), (0.0, 0.01)]
-    add("bus/engine", revolved(bell, (0.0, 0.48, -0.66), (0, 1, 0)), "black_paint")
-
-    for side, sign in (("left", -1.0), ("right", 1.0)):
-        wing = f"solar_array_{side}"
-        hinges[wing] = HingePose(hinge_B_m=(sign * 0.6, 0.0, ARRAY_HINGE_Z_M), axis_B=(1.0, 0.0, 0.0))
-        add(
-            f"{wing}/yoke",
-            rod((sign * 0.58, 0, ARRAY_HINGE_Z_M), (sign * 0.96, 0, ARRAY_HINGE_Z_M), 0.025),
-            "aluminium",
+    return Spacecraft(
+        parts=(
+            _part("bus/body", _box(BUS_CENTRE_M, BUS_SIZE_M), "gold_mli"),
+            _part("bus/radiator", _box((0.0, -0.25, -0.055), (0.9, 0.35, 0.02)), "white_paint"),
+            _part("bus/camera_barrel", _rod((0, 0, -0.08), (0, 0, -0.01), BARREL_RADIUS_M, 32), "black_paint"),
+            _part("bus/engine", _revolved(bell, (0.0, 0.48, -0.66), (0, 1, 0)), "black_paint"),
         )
-        # at rest the cells face up (-y); they are a thin sheet on the panel
-        add(f"{wing}/panel", box((sign * 1.95, 0, ARRAY_HINGE_Z_M), (2.0, 0.02, 0.9)), "black_paint")
-        add(f"{wing}/cells", box((sign * 1.95, -0.011, ARRAY_HINGE_Z_M), (1.96, 0.006, 0.86)), "solar_cell")
+    )
 
-    for name, (x, z) in _CORNERS.items():
-        leg = f"leg_{name}"
-        # the front pads stand forward, so that they show in the lower corners of a wide field
-        pad = (0.8 * x, 0.95, 1.5) if z > 0 else (0.95 * x, 0.95, -1.75)
-        hip_z = -0.12 if z > 0 else -1.2
-        hip = (0.58 * x, 0.46, hip_z)
-        hinges[leg] = HingePose(hinge_B_m=hip, axis_B=(1.0, 0.0, 0.0))
-        add(f"{leg}/strut", rod(hip, (pad[0], pad[1] - 0.02, pad[2]), 0.025), "aluminium")
-        brace = tuple(0.45 * h + 0.55 * p for h, p in zip(hip, pad, strict=True))
-        add(f"{leg}/brace", rod((0.3 * x, 0.48, hip_z), brace, 0.015), "aluminium")
-        add(f"{leg}/footpad", rod((pad[0], pad[1] - 0.04, pad[2]), pad, 0.14, 32), "black_mli")
 
-    hinges["antenna"] = HingePose(hinge_B_m=(0.0, -0.75, -0.95), axis_B=(1.0, 0.0, 0.0))
-    add("antenna_mast", rod((0.0, -0.48, -0.95), (0.0, -0.75, -0.95), 0.03), "aluminium")
+def _solar_array(side: str, sign: float) -> Spacecraft:
+    """Return the solar array of a side; `sign` is that of its x coordinates. Its cells face up (-y)."""
+    name, z = f"solar_array_{side}", ARRAY_HINGE_Z_M
+    yoke = _rod((sign * 0.58, 0, z), (sign * 0.96, 0, z), 0.025)
+    panel = _box((sign * 1.95, 0, z), (2.0, 0.02, 0.9))
+    cells = _box((sign * 1.95, -0.011, z), (1.96, 0.006, 0.86))  # a thin sheet on the panel
+    return Spacecraft(
+        parts=(
+            _part(f"{name}/yoke", yoke, "aluminium"),
+            _part(f"{name}/panel", panel, "black_paint"),
+            _part(f"{name}/cells", cells, "solar_cell"),
+        ),
+        hinges={name: HingePose(hinge_B_m=(sign * 0.6, 0.0, z), axis_B=(1.0, 0.0, 0.0))},
+    )
+
+
+def _leg(corner: str, x: float, z: float) -> Spacecraft:
+    """Return the leg at a corner of the bus; `x` and `z` are the signs of the corner's coordinates."""
+    # the front pads stand forward, so that they show in the lower corners of a wide field
+    pad = (0.8 * x, 0.95, 1.5) if z > 0 else (0.95 * x, 0.95, -1.75)
+    hip = (0.58 * x, 0.46, -0.12 if z > 0 else -1.2)
+    middle = tuple(0.45 * h + 0.55 * p for h, p in zip(hip, pad, strict=True))
+    strut = _rod(hip, (pad[0], pad[1] - 0.02, pad[2]), 0.025)
+    brace = _rod((0.3 * x, 0.48, hip[2]), middle, 0.015)
+    footpad = _rod((pad[0], pad[1] - 0.04, pad[2]), pad, 0.14, 32)
+    return Spacecraft(
+        parts=(
+            _part(f"leg_{corner}/strut", strut, "aluminium"),
+            _part(f"leg_{corner}/brace", brace, "aluminium"),
+            _part(f"leg_{corner}/footpad", footpad, "black_mli"),
+        ),
+        hinges={f"leg_{corner}": HingePose(hinge_B_m=hip, axis_B=(1.0, 0.0, 0.0))},
+    )
+
+
+def _antenna() -> Spacecraft:
+    """Return the antenna: a fixed mast, and the dish with its feed."""
+    mast = _rod((0.0, -0.48, -0.95), (0.0, -0.75, -0.95), 0.03)
     radius = np.linspace(0.0, 0.45, 10)
     bowl = [(float(r), float(r**2)) for r in radius]  # focal length 0.25 m
-    dish = [*bowl, *((r, h + 0.01) for r, h in reversed(bowl))]
+    wall = [*bowl, *((r, h + 0.01) for r, h in reversed(bowl))]
     up_and_back = (0.0, -1.0, -0.35)
-    add("antenna/dish", revolved(dish, (0.0, -0.74, -0.95), up_and_back), "white_paint")
     axis = np.array(up_and_back) / np.linalg.norm(up_and_back)
     feed = np.array((0.0, -0.74, -0.95)) + np.outer((0.005, 0.26), axis)
-    add("antenna/feed", rod(tuple(feed[0]), tuple(feed[1]), 0.02), "black_paint")
-    return Spacecraft(parts=tuple(parts), hinges=hinges)
+    return Spacecraft(
+        parts=(
+            _part("antenna_mast", mast, "aluminium"),
+            _part("antenna/dish", _revolved(wall, (0.0, -0.74, -0.95), up_and_back), "white_paint"),
+            _part("antenna/feed", _rod(tuple(feed[0]), tuple(feed[1]), 0.02), "black_paint"),
+        ),
+        hinges={"antenna": HingePose(hinge_B_m=(0.0, -0.75, -0.95), axis_B=(1.0, 0.0, 0.0))},
+    )
+
+
+def _part(name: str, mesh: trimesh.Trimesh, material: str) -> Part:
+    """Return a part with a named material."""
+    return Part(
+        name=name,
+        vertices_B_m=np.array(mesh.vertices, dtype=np.float64),
+        faces=np.array(mesh.faces, dtype=np.int64),
+        material=make_material(material),
+    )
+
+
+def _box(centre: tuple[float, ...], size: tuple[float, ...]) -> trimesh.Trimesh:
+    """Return a box along the axes."""
+    return trimesh.creation.box(size, trimesh.transformations.translation_matrix(centre))
+
+
+def _rod(start: tuple[float, ...], end: tuple[float, ...], radius: float, sections: int = 20) -> trimesh.Trimesh:
+    """Return a cylinder between two points."""
+    return trimesh.creation.cylinder(radius, segment=np.array([start, end]), sections=sections)
+
+
+def _revolved(
+    profile: list[tuple[float, float]], apex: tuple[float, ...], towards: tuple[float, ...]
+) -> trimesh.Trimesh:
+    """Return the surface of a profile (radius, height) turned about the axis from `apex` along `towards`."""
+    mesh = trimesh.creation.revolve(np.array(profile), sections=32)
+    mesh.apply_transform(trimesh.geometry.align_vectors((0, 0, 1), np.array(towards) / np.linalg.norm(towards)))
+    return mesh.apply_translation(apex)
 
 
 def default_spacecraft(
