@@ -22,7 +22,7 @@ import hashlib
 import json
 from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
@@ -95,7 +95,7 @@ class SceneEvaluator:
         self.kept = Kept()
         self._base = _scene_of(spec)
         self._session: tuple[Hashable, Session] | None = None
-        self._render_keys: dict[int, tuple[Scene, str]] = {}
+        self._kept_scene = lru_cache(maxsize=16)(self._made_scene)
         with self._named():
             faults = dict(self._base.faults)
             if spec.models is not None:
@@ -272,25 +272,19 @@ class SceneEvaluator:
 
     # --- stages ---------------------------------------------------------------------------------------------------
 
-    def _scene(self, evaluation: Evaluation, setting: Setting) -> Scene:
+    def _scene(self, evaluation: Evaluation, setting: Setting) -> _StudyScene:
         """Return the scene of an evaluation."""
-        changes = tuple(sorted(setting.scene.items()))
+        return self._kept_scene(evaluation.seed, evaluation.model, tuple(sorted(setting.scene.items())))
+
+    def _made_scene(self, seed: int, model: str, changes: tuple[tuple[str, Any], ...]) -> _StudyScene:
+        """Return the scene with a seed, with a model of the compared fault, and with changed keys."""
         with self._named():
-            scene: Scene = self.factors.scene_of(evaluation.seed, evaluation.model, changes)
-        return scene
+            return _StudyScene(self.factors.scene_of(seed, model, changes))
 
-    def _view(self, evaluation: Evaluation, scene: Scene) -> RenderedView:
+    def _view(self, evaluation: Evaluation, made: _StudyScene) -> RenderedView:
         """Return a view, rendered where this was not done before for what the renderer reads of the scene."""
-        key = self._render_key(scene), evaluation.view
-        return self.kept.once("render", key, lambda: self._rendered(key[0], scene, evaluation.view))
-
-    def _render_key(self, scene: Scene) -> str:
-        """Return a digest of all that the renderer reads of a scene."""
-        if id(scene) not in self._render_keys or self._render_keys[id(scene)][0] is not scene:
-            if len(self._render_keys) > 64:
-                self._render_keys.clear()
-            self._render_keys[id(scene)] = (scene, _render_key(scene))
-        return self._render_keys[id(scene)][1]
+        key = made.render_key, evaluation.view
+        return self.kept.once("render", key, lambda: self._rendered(key[0], made.scene, evaluation.view))
 
     def _rendered(self, key: Hashable, scene: Scene, index: int) -> RenderedView:
         """Render a view."""
@@ -309,14 +303,14 @@ class SceneEvaluator:
 
     def _exposed(self, evaluation: Evaluation, setting: Setting) -> Exposed:
         """Return the view of an evaluation with its camera, its Sun and its exposure."""
-        scene = self._scene(evaluation, setting)
-        view = self._view(evaluation, scene)
+        made = self._scene(evaluation, setting)
+        scene, view = made.scene, self._view(evaluation, made)
         spec = replace(view.spec, scene=scene, faults=_faults(scene))
         camera = self._camera(spec, setting)
         pose, rendering = with_sun(view, camera, setting.sun)
         far = setting.sun.get("distance_au")
-        place = evaluation.seed, evaluation.view, self._render_key(scene)
-        optics = (*place, camera.lens, efficiency_key(camera))
+        view_key = evaluation.seed, evaluation.view, made.render_key
+        optics = (*view_key, camera.lens, efficiency_key(camera))
         per_s = self.kept.once(
             "direct image", (*optics, far), lambda: scene_rate(camera, rendering.light.rendered), "scene"
         )
@@ -510,7 +504,7 @@ class SceneEvaluator:
 
         There are none where the fault that a factor chooses cannot act, or does not show.
         """
-        scene = self._scene(evaluation, setting)
+        scene = self._scene(evaluation, setting).scene
         faults = _faults(scene)
         frames: list[nav.NavigationFrame] = []
         first: Injection | None = None
@@ -532,10 +526,10 @@ class SceneEvaluator:
     def _clean_views(self, evaluation: Evaluation, setting: Setting, count: int) -> _CleanSequence:
         """Return the first `count` views of an evaluation's sequence without faults."""
         without = replace(setting, scene={k: v for k, v in setting.scene.items() if k != chosen_fault.SCENE_KEY})
-        scene = self._scene(evaluation, without)
-        view = self._view(evaluation, scene)
-        place = self._render_key(scene), evaluation.view, count
-        sequence = self.kept.once("render", place, lambda: _rendered_sequence(view, count), "sequence")
+        made = self._scene(evaluation, without)
+        scene, view = made.scene, self._view(evaluation, made)
+        key = made.render_key, evaluation.view, count
+        sequence = self.kept.once("render", key, lambda: _rendered_sequence(view, count), "sequence")
         sun, detector = tuple(sorted(setting.sun.items())), tuple(sorted(setting.detector.items()))
 
         def make() -> _CleanSequence:
@@ -543,7 +537,7 @@ class SceneEvaluator:
             twins = nav.CleanTwins([view.frame.clean for view in views], [view.frame.view for view in views])
             return _CleanSequence(views=views, twins=twins)
 
-        return self.kept.once("clean twins", (*place, scene.camera, tuple(setting.lens), detector, sun), make)
+        return self.kept.once("clean twins", (*key, scene.camera, tuple(setting.lens), detector, sun), make)
 
     def _clean_view(self, seen: RenderedView, scene: Scene, setting: Setting) -> _CleanView:
         """Return a view of a sequence with its exposure and its clean twin."""
@@ -618,6 +612,23 @@ def _rendered_sequence(view: RenderedView, count: int) -> list[RenderedView]:
 # --- the scene ---------------------------------------------------------------------------------------------------
 
 
+@dataclass(frozen=True)
+class _StudyScene:
+    """Hold a scene of a study, and what identifies its renders."""
+
+    scene: Scene
+
+    @cached_property
+    def render_key(self) -> str:
+        """Return a digest of all that plan and renderer read of the scene."""
+        table = self.scene.resolved()
+        for key in ("title", "description"):
+            table.pop(key)
+        table["camera"] = {key: value for key, value in table["camera"].items() if key not in AFTER_RENDER}
+        table["faults"] = sorted((name, fault.needs_sun) for name, fault in _faults(self.scene).items())
+        return hashlib.sha256(json.dumps(table, sort_keys=True).encode()).hexdigest()
+
+
 def _scene_of(spec: StudySpec) -> Scene:
     """Return the scene of a study without factors."""
     values = {key: value for key, value in spec.scene.overrides.items() if value != {}}
@@ -660,16 +671,6 @@ def _check_models(spec: StudySpec, faults: Mapping[str, Any]) -> None:
 def _faults(scene: Scene) -> dict[str, Fault]:
     """Return the faults of a scene."""
     return {name: from_dict(name, table, source="scene") for name, table in scene.faults.items()}
-
-
-def _render_key(scene: Scene) -> str:
-    """Return a digest of all that plan and renderer read of a scene."""
-    table = scene.resolved()
-    for key in ("title", "description"):
-        table.pop(key)
-    table["camera"] = {key: value for key, value in table["camera"].items() if key not in AFTER_RENDER}
-    table["faults"] = sorted((name, fault.needs_sun) for name, fault in _faults(scene).items())
-    return hashlib.sha256(json.dumps(table, sort_keys=True).encode()).hexdigest()
 
 
 def _value(factor: Any, point: float) -> float | str:

@@ -30,7 +30,6 @@ import copy
 import dataclasses
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from functools import lru_cache
 from typing import Any
 
 from ..camera import Camera
@@ -148,7 +147,6 @@ class Factors:
             self.keys[factor.key] = key
             self._units[factor.key] = allowed.get(unit, key.units[0] if key.units else "") if factor.unit else ""
             self._units[factor.key] = self._units[factor.key] or (key.units[0] if key.units else "")
-        self.scene_of = lru_cache(maxsize=16)(self._scene_of)
 
     def setting(self, values: Mapping[str, float | str]) -> Setting:
         """Return what the values of the factors change."""
@@ -157,7 +155,7 @@ class Factors:
             self.keys[name].add(setting, value, self._units[name])
         return setting
 
-    def _scene_of(self, seed: int, model: str, changes: tuple[tuple[str, Any], ...]) -> Scene:
+    def scene_of(self, seed: int, model: str, changes: tuple[tuple[str, Any], ...]) -> Scene:
         """Return the scene with a seed, with a model of the compared fault, and with changed keys."""
         table = copy.deepcopy(self._base.resolved())
         table["dataset"]["seed"] = seed
