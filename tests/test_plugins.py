@@ -18,6 +18,7 @@ from conftest import small_scene
 
 from vbnfault import dataset, faults, pipeline, store, testing
 from vbnfault.core.errors import InputError
+from vbnfault.detector import effects
 from vbnfault.faults import models, plugins
 from vbnfault.scene import config
 
@@ -302,6 +303,39 @@ def test_a_plug_in_of_another_scene_has_to_be_named(tmp_path: Path) -> None:
         pipeline.configure_faults(both)
 
 
+@pytest.mark.parametrize("kind", ["fault", "effect"])
+def test_a_plug_in_of_another_scene_has_no_place_in_the_order(tmp_path: Path, kind: str) -> None:
+    """What a scene may name by `after`, and what it is refused for, do not depend on scenes loaded before it."""
+    text, own, root = {"fault": (GLINT, "glint", "straylight"), "effect": (EFFECT, "afterglow", "dark_current")}[
+        kind
+    ]
+
+    def write(name: str, after: str, known: str | None = None) -> None:
+        changed = text.replace(f'"{own}"', f'"{name}"').replace(f'"{root}"', f'"{after}"')
+        plugin(tmp_path, changed if known is None else f"# {name} is {known}\n", f"my_{name}.py")
+
+    def load(*names: str) -> None:
+        config.load_scene(scene_file(tmp_path, *(f"my_{name}.py" for name in names), faults=""))
+
+    def order() -> list[str]:
+        known = faults.physical_order(faults.registry()) if kind == "fault" else effects.order()
+        return [name for name in known if name in ("one", "two", "three")]
+
+    write("one", root)
+    write("two", "one")
+    write("three", "one")
+    load("one", "two")
+    assert order() == ["one", "two"]
+    with pytest.raises(InputError, match=r"my_three.py': .* three: after = 'one': there is none of this name"):
+        load("three")  # a fresh process knows no `one`
+    load("two", "one")
+    write("one", root, known="gone")
+    load("one")  # `two` of the earlier scene comes after nothing now, which is not this scene's fault
+    assert order() == []
+    with pytest.raises(InputError, match=r"two: after = 'one': there is none of this name"):
+        load("one", "two")
+
+
 # --- broken plug-ins ----------------------------------------------------------------------------------------
 
 EFFECT = """
@@ -557,7 +591,6 @@ KINDS = {
 def defined(kind: str) -> Any:
     """Return what the kind's plug-in has registered."""
     from vbnfault import reflectance
-    from vbnfault.detector import effects
     from vbnfault.lens.glass import GLASSES
 
     if kind == "fault":

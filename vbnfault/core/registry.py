@@ -2,7 +2,7 @@
 
 One rule holds for every kind: a name has one definition. A module may define its classes again, as after an edit in
 a notebook, and so may another module that was loaded from the same file. Any other module may not, unless the first
-one is a plug-in's file that the scene in use does not name (`allow_replacement`).
+one is a plug-in's file that the scene in use does not name (`set_aside`).
 """
 
 from __future__ import annotations
@@ -23,7 +23,9 @@ T = TypeVar("T")
 _NAME = re.compile("[a-z][a-z0-9_]*")
 
 _registries: list[Registry[Any]] = []
-# Modules whose definitions may be replaced by those of others.
+# Modules and packages of plug-ins that the scene in use does not name, and the modules among them whose definitions
+# others may replace.
+_unused: set[str] = set()
 _replaceable: set[str] = set()
 
 
@@ -95,7 +97,7 @@ class Registry(Mapping[str, T]):
             Another definition has the name, and its module is not replaceable.
         """
         self._put(name, _Definition(entry, module, qualname, source_file(module)))
-        self._forget_results()
+        self.forget_results()
 
     def _put(self, name: str, new: _Definition) -> None:
         """Register a definition; see `add`."""
@@ -110,7 +112,7 @@ class Registry(Mapping[str, T]):
         self._definitions[name] = new
         self._by_module.setdefault(new.module, {})[name] = new
 
-    def _forget_results(self) -> None:
+    def forget_results(self) -> None:
         """Forget what was computed from the entries, such as the schemas of tables that take any of them."""
         tables.forget_schemas()
         self._changed()
@@ -143,6 +145,14 @@ class Registry(Mapping[str, T]):
         """Return whether other modules may define a registered name again."""
         return self._definitions[name].module in _replaceable
 
+    def unused(self) -> set[str]:
+        """Return the registered names that belong to plug-ins which the scene in use does not name."""
+        return {
+            name
+            for name, definition in self._definitions.items()
+            if definition.module in _unused or definition.module.split(".")[0] in _unused
+        }
+
     def holds(self, name: str, cls: type) -> bool:
         """Return whether a name belongs to a class, or to the same class of the same file, loaded another way."""
         self.complete()
@@ -156,20 +166,20 @@ class Registry(Mapping[str, T]):
         """Remove entries until `restore` registers their module again."""
         for name in list(names):
             del self._definitions[name]
-        self._forget_results()
+        self.forget_results()
 
     def restore(self, module: str) -> None:
         """Register the entries of a module again, which another scene may have replaced."""
         for name, definition in self._by_module.get(module, {}).items():
             self._put(name, definition)
-        self._forget_results()
+        self.forget_results()
 
     def forget(self, module: str) -> None:
         """Remove the entries of a module for good."""
         for name, definition in self._by_module.pop(module, {}).items():
             if self._definitions.get(name) is definition:
                 del self._definitions[name]
-        self._forget_results()
+        self.forget_results()
 
     def snapshot(self) -> Callable[[], None]:
         """Return a function that undoes all later registrations, except those of vbnfault."""
@@ -179,7 +189,7 @@ class Registry(Mapping[str, T]):
         def undo() -> None:
             self._definitions = {n: d for n, d in self._definitions.items() if self._is_ours(n)} | definitions
             self._by_module = by_module
-            self._forget_results()
+            self.forget_results()
 
         return undo
 
@@ -202,11 +212,19 @@ def is_name(name: object) -> bool:
     return isinstance(name, str) and _NAME.fullmatch(name) is not None
 
 
-def allow_replacement(modules: Iterable[str]) -> None:
-    """Let other modules replace the definitions of these modules, and of no others."""
-    wanted = set(modules)
-    _replaceable.clear()
-    _replaceable.update(wanted)
+def set_aside(unused: Iterable[str], replaceable: Iterable[str]) -> None:
+    """Say which modules belong to plug-ins that the scene in use does not name.
+
+    The orders of effects do not depend on them. Others may define again what those in `replaceable` define.
+    """
+    wanted = set(unused), set(replaceable)
+    if wanted == (_unused, _replaceable):
+        return
+    for names, kept in zip(wanted, (_unused, _replaceable), strict=True):
+        kept.clear()
+        kept.update(names)
+    for registry in _registries:
+        registry.forget_results()
 
 
 def restore(module: str) -> None:
@@ -226,23 +244,27 @@ def undoing_registrations(*, always: bool = False) -> Iterator[None]:
     """Forget what a block registers, of every kind, if the block raises an exception, or `always`."""
     known = list(_registries)
     undos = [registry.snapshot() for registry in known]
-    replaceable = set(_replaceable)
+    before = set(_unused), set(_replaceable)
     undo = True
     try:
         yield
         undo = always
     finally:
         if undo:
-            allow_replacement(replaceable)
+            set_aside(*before)
             for put_back in undos:
                 put_back()
 
 
-def chained(after: Mapping[str, str], packaged: Collection[str], kind: str) -> tuple[str, ...]:
+def chained(
+    after: Mapping[str, str], packaged: Collection[str], kind: str, unused: Collection[str] = ()
+) -> tuple[str, ...]:
     """Return names in the order that follows from what each comes after.
 
     The names form a tree with one root, which comes after "". Those in `packaged` are one long branch of it; any
-    other comes directly behind the name that it comes after, in alphabetical order.
+    other comes directly behind the name that it comes after, in alphabetical order. Names in `unused` belong to
+    plug-ins that the scene in use does not name: no other name may come after them, and those without a place are
+    left out.
 
     Raises
     ------
@@ -250,19 +272,20 @@ def chained(after: Mapping[str, str], packaged: Collection[str], kind: str) -> t
         A name comes after one that does not exist, or names come after each other in a circle. `kind` says in the
         message what the names are.
     """
+    used = {name: after[name] for name in after if name not in unused}
     followers: dict[str, list[str]] = {"": [], **{name: [] for name in after}}
     for name in sorted(after, key=lambda name: (name in packaged, name)):
-        if after[name] not in followers:
-            hint = tables.did_you_mean(after[name], list(after))
+        if name in used and after[name] not in ("", *used):
+            hint = tables.did_you_mean(after[name], list(used))
             text = f"{kind} {name}: after = {after[name]!r}: there is none of this name{hint}"
             raise DeclarationError([name], text)
-        followers[after[name]].append(name)
+        followers.get(after[name], []).append(name)
     order: list[str] = []
     pending = followers[""][::-1]
     while pending:
         order.append(pending.pop())
         pending += followers[order[-1]][::-1]
-    circle = sorted(set(after) - set(order))
+    circle = sorted(set(used) - set(order))
     if circle:
         raise DeclarationError(circle, f"{kind}: what {', '.join(circle)} state by `after` runs in a circle")
     return tuple(order)

@@ -98,7 +98,8 @@ def registry() -> dict[str, dict[str, type[Fault]]]:
     """Return fault class → model → type, with the classes in the order of the dataset.
 
     The first model of each class is its default. The others are sorted by module, those of this package first,
-    whatever the order of imports. Models of installed plug-ins are among them.
+    whatever the order of imports. Models of installed plug-ins are among them. A class from a plug-in of another
+    scene is missing if it has no place in the physical order any more.
 
     Raises
     ------
@@ -134,10 +135,10 @@ def _sorted_registry() -> dict[str, dict[str, type[Fault]]]:
 
     for cls in _REGISTRY.registered().values():
         _check_fields(cls)
-    _physical_order()
     known = _models()
     return {
-        name: {cls.model: cls for cls in sorted(known[name].values(), key=position)} for name in _on_axis(known)
+        name: {cls.model: cls for cls in sorted(known[name].values(), key=position)}
+        for name in _on_axis(_physical_order())
     }
 
 
@@ -196,7 +197,9 @@ def _physical_order() -> tuple[str, ...]:
     """
     defaults = _defaults()
     packaged = {name for name, cls in defaults.items() if is_packaged(cls)}
-    return chained({name: str(cls.after) for name, cls in defaults.items()}, packaged, "fault class")
+    of_others = _REGISTRY.unused()
+    unused = {name for name, cls in defaults.items() if f"{name}/{cls.model}" in of_others}
+    return chained({name: str(cls.after) for name, cls in defaults.items()}, packaged, "fault class", unused)
 
 
 def dataset_order(names: Iterable[str]) -> list[str]:

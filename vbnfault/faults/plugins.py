@@ -19,7 +19,7 @@ import os
 import re
 import sys
 import traceback
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -98,11 +98,22 @@ def load_plugins(names: Sequence[str]) -> None:
     models.registry()  # first the faults that every scene has
     paths = {name for name in names if _is_path(name)}
     with _undoing():
-        registry.allow_replacement(p.module for key, p in _loaded.items() if p.is_file and key not in paths)
+        _set_others_aside(names)
         for name in names:
             with _errors_named(f"plugins = {shown(name)}"):
                 _loaded[name] = _load_file(name) if name in paths else _load_module(name)
         _check_together({f"plugins = {shown(name)}": _loaded[name] for name in names})
+
+
+def _set_others_aside(names: Collection[str]) -> None:
+    """Tell the registries which of the loaded plug-ins a scene does not name; installed ones count as named."""
+    others = [plugin for key, plugin in _loaded.items() if key not in names and key not in _installed()]
+    # a plug-in that is a module defines what its top-level package defines
+    in_use = {name.split(".")[0] for name in (*names, *_installed())}
+    registry.set_aside(
+        {plugin.module.split(".")[0] for plugin in others} - in_use,
+        {plugin.module for plugin in others if plugin.is_file},
+    )
 
 
 def plugins_of(faults: Mapping[str, Fault], named: Sequence[str]) -> tuple[Plugin, ...]:
