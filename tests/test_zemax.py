@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -357,3 +358,30 @@ def test_a_glass_and_a_formula_register_in_one_place() -> None:
             dispersion("flat", 1)(lambda um2, c: um2)
     assert "jelly" not in GLASSES
     assert "flat" not in DISPERSIONS
+
+
+@pytest.mark.parametrize(
+    ("wrong", "sentence"),
+    [
+        ({"formula": "cauchi"}, r"glass.formula = 'cauchi': must be one of "),
+        ({"coefficients": (1.4,)}, r"glass.coefficients: cauchy takes 2 numbers; got 1"),
+        ({"coefficients": (1.4, "0")}, r"glass 'jelly': coefficients = .*: must be numbers"),
+        (
+            {"coefficients": (1.4, float("nan"))},
+            r"glass 'jelly': its index must be from 1 to 5 between .*; got nan",
+        ),
+        ({"formula": "sellmeier", "coefficients": (-9.0,) * 6}, r"glass 'jelly': its index must be .*; got nan"),
+        ({"coefficients": (0.4, 0.0)}, r"glass 'jelly': its index must be from 1 to 5 between 400 .*; got 0.4"),
+        ({"internal_transmittance_10mm": ((500.0, 400.0), (1.0, 1.0))}, r"needs rising wavelengths and as many"),
+        (
+            {"internal_transmittance_10mm": ((400.0,), (1.2,))},
+            r"internal_transmittance_10mm = \[1.2\]: must be from",
+        ),
+        ({"name": ""}, r"glass '': its name must be a text that is not empty"),
+    ],
+)
+def test_a_wrong_glass_is_refused_and_stays_unknown(wrong: dict[str, Any], sentence: str) -> None:
+    before = dict(GLASSES)
+    with pytest.raises(InputError, match=sentence):
+        register(Glass(**{"name": "jelly", "formula": "cauchy", "coefficients": (1.4, 0.0)} | wrong))
+    assert dict(GLASSES) == before

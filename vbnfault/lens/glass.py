@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..core.errors import InputError
+from ..core.errors import InputError, shown
 from ..core.registry import Registry
 
 F64 = NDArray[np.float64]
@@ -25,6 +25,7 @@ Formula = Callable[[F64, Sequence[float]], F64]
 D_NM, F_NM, C_NM = 587.5618, 486.1327, 656.2725  # Fraunhofer lines: He d, H F and C
 RANGE_NM = (250.0, 2500.0)
 CLEAR: Transmittance = ((D_NM,), (1.0,))
+_INDEX_RANGE = (1.0, 5.0)
 
 
 # --- dispersion formulas --------------------------------------------------------------------------------------
@@ -185,12 +186,37 @@ def register(glass: Glass) -> Glass:
     DeclarationError
         Another glass has the name.
     InputError
-        The formula is unknown or takes another number of coefficients.
+        The formula is unknown or takes another number of coefficients, the index is not from 1 to 5 between 400 and
+        1000 nm, or the internal transmittance is not from 0 to 1 at rising wavelengths. The glass is then unknown.
     """
-    from_coefficients(glass.formula, glass.coefficients)
+    _check_glass(glass)
     # a glass is a value, which does not know its module as a class does
     GLASSES.add(glass.name, glass, module=sys._getframe(1).f_globals["__name__"])
     return glass
+
+
+def check_index(glass: Glass, where: str) -> None:
+    """Raise InputError, which begins with `where`, unless the index is from 1 to 5 between 400 and 1000 nm."""
+    with np.errstate(all="ignore"):  # a formula may divide by 0 or take the root of a negative number
+        index = glass.index(np.linspace(400, 1000, 61))
+    if not (np.isfinite(index).all() and index.min() >= _INDEX_RANGE[0] and index.max() <= _INDEX_RANGE[1]):
+        raise InputError(f"{where}: its index must be from 1 to 5 between 400 and 1000 nm; got {index.min():g}")
+
+
+def _check_glass(glass: Glass) -> None:
+    """Raise InputError unless a lens file can use a glass."""
+    where = f"glass {shown(glass.name)}"
+    if not isinstance(glass.name, str) or not glass.name:
+        raise InputError(f"{where}: its name must be a text that is not empty")
+    if not all(isinstance(c, int | float) for c in glass.coefficients):
+        raise InputError(f"{where}: coefficients = {shown(glass.coefficients)}: must be numbers")
+    from_coefficients(glass.formula, glass.coefficients)
+    check_index(glass, where)
+    nodes, values = (np.asarray(column, dtype=np.float64) for column in glass.internal_transmittance_10mm)
+    if nodes.ndim != 1 or nodes.shape != values.shape or not len(nodes) or not (np.diff(nodes) > 0).all():
+        raise InputError(f"{where}: internal_transmittance_10mm: needs rising wavelengths and as many values")
+    if not ((values >= 0) & (values <= 1)).all():
+        raise InputError(f"{where}: internal_transmittance_10mm = {shown(values.tolist())}: must be from 0 to 1")
 
 
 def from_abbe(nd: float, vd: float | None) -> Glass:

@@ -18,11 +18,10 @@ from ..core import resources, tables, toml_files
 from ..core.errors import InputError
 from ..core.tables import Fraction, Table
 from .coating import Layer
-from .glass import AIR, CLEAR, D_NM, GLASSES, Glass, Transmittance, from_abbe, from_coefficients
+from .glass import AIR, CLEAR, D_NM, GLASSES, Glass, Transmittance, check_index, from_abbe, from_coefficients
 from .prescription import Prescription, Surface, facing_air
 from .zemax import LENS_SUFFIX, GlassCatalogue, read_catalogue, read_lens
 
-_INDEX_RANGE = (1.0, 5.0)
 _RIM_POINTS = 65
 _OF_THE_STOP = ("blades", "blade_rounding", "rotation_deg")
 
@@ -256,11 +255,7 @@ def _medium(row: SurfaceRow, where: str, catalogues: Sequence[GlassCatalogue]) -
             return AIR
     except InputError as error:
         raise InputError(f"{where}.{error}") from None
-    index = medium.index(np.linspace(400, 1000, 61))
-    if not (np.isfinite(index).all() and index.min() >= _INDEX_RANGE[0] and index.max() <= _INDEX_RANGE[1]):
-        raise InputError(
-            f"{where}.glass: its index must be from 1 to 5 between 400 and 1000 nm; got {index.min():g}"
-        )
+    check_index(medium, f"{where}.glass")
     return medium
 
 
