@@ -167,9 +167,9 @@ def parse_scene(table: Mapping[str, Any], *, source: str, overrides: Sequence[st
             f"{source}: effects = {shown(table['effects'])}: effects belong in the sensor file, as [effects.NAME]; "
             "name that file by camera.detector"
         )
-    camera: Any = table.get("camera")
-    for key in OF_A_SENSOR_FILE if isinstance(camera, Mapping) else ():
-        if key in camera:
+    camera = table.get("camera")
+    for key in OF_A_SENSOR_FILE:
+        if isinstance(camera, Mapping) and key in camera:
             mono = '; that of a monochrome camera has pattern = "mono"' if key == "pattern" else ""
             raise InputError(
                 f"{source}: camera.{key} = {shown(camera[key])}: is a key of a sensor file, not of [camera]; write "

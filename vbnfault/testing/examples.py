@@ -29,7 +29,9 @@ def make_context(
     sun_xy_px: tuple[float, float] | None = None,
     sun_visible_fraction: float = 1.0,
     fov_deg: float = 40.0,
-    **camera: Any,
+    architecture: str = "full_frame_ccd",
+    readout_direction: str = "right",
+    exposure_s: float = 1e-3,
 ) -> FaultContext:
     """Return a context with a thin lens and a detector without a mosaic.
 
@@ -43,13 +45,19 @@ def make_context(
         Fraction of the Sun's disc that is not covered, in [0, 1].
     fov_deg
         Field of view across the width.
-    **camera
-        Further fields of `Camera`: architecture, readout_direction, exposure_s.
+    architecture, readout_direction, exposure_s
+        Fields of `Camera`.
     """
     detector = ThreeColourDetector(width_px=width_px, height_px=height_px or width_px)
     focal = focal_length_mm(fov_deg, width_px, detector.pixel_pitch_um)
     return FaultContext(
-        camera=Camera(lens=ThinLens(focal_length_mm=focal, f_number=4.0), detector=detector, **camera),
+        camera=Camera(
+            lens=ThinLens(focal_length_mm=focal, f_number=4.0),
+            detector=detector,
+            architecture=architecture,
+            readout_direction=readout_direction,
+            exposure_s=exposure_s,
+        ),
         sun_xy_px=None if sun_xy_px is None else np.array(sun_xy_px),
         sun_visible_fraction=None if sun_xy_px is None else sun_visible_fraction,
     )
