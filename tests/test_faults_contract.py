@@ -5,15 +5,18 @@ from __future__ import annotations
 import dataclasses
 import json
 import pickle
+from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 from conftest import ALL_FAULTS
-from test_faults_kit import make_context, noisy, with_mosaic
+from test_faults_kit import make, make_context, noisy, with_mosaic
 
 from vbnfault.core.errors import InputError
+from vbnfault.core.quantities import RGBI
+from vbnfault.detector.mosaic import pattern
 from vbnfault.faults import (
     MOSAIC_STEPS,
     STEPS,
@@ -252,6 +255,30 @@ def test_scale_by_intensity() -> None:
     assert scale_by_intensity(pixels, wanted).tolist() == expected
     unchanged = scale_by_intensity(pixels[[0, 3]], np.array([60, 100], np.float32))
     assert np.array_equal(unchanged, pixels[[0, 3]])
+
+
+@pytest.mark.parametrize(
+    ("fault", "table"),
+    [
+        ("broken_pixels", {"model": "texture", "count": 400}),
+        ("pixel_overwriting", {"channels": "I", "blend": "mixture", "strength": 0.5}),
+    ],
+)
+def test_an_image_without_colours_stays_without_colours(fault: str, table: dict[str, Any], tmp_path: Path) -> None:
+    """All channels of a camera without colour filters are the same, also where an intensity is half a DN."""
+    if fault == "pixel_overwriting":
+        table = table | {"texture_file": str(tmp_path / "half.png")}
+        cv2.imwrite(table["texture_file"], np.tile(np.arange(256, dtype=np.uint8), (8, 1)))
+    context = with_mosaic(make_context(256, architecture="cmos"), pattern=pattern("mono"))
+    made = make(fault, **table)
+    image = np.repeat(np.arange(256, dtype=np.uint8)[:, None, None], 256, axis=1).repeat(4, axis=2)
+    params = made.draw(context, np.random.default_rng(2))
+    given = RGBI(array=image)
+    changed = made.apply(given, params, context).array
+    assert (changed != image).any()
+    assert (changed == changed[..., 3:]).all()
+    coloured = made.apply(given, params, make_context(256, architecture="cmos")).array
+    np.testing.assert_array_equal(changed[..., 3], coloured[..., 3])  # I itself is as for any camera
 
 
 LIMITS = [

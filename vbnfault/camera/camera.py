@@ -70,6 +70,11 @@ class Camera:
         return self.architecture != "cmos"
 
     @property
+    def is_monochrome(self) -> bool:
+        """Return whether no pixel has a colour filter: R, G, B and I of an image are then the same."""
+        return self.detector.channels == ("W",)
+
+    @property
     def focal_length_px(self) -> float:
         """Return the focal length in pixels, for the image near the axis: the OpenCV intrinsics fx = fy."""
         return self.lens.focal_length_mm * 1e3 / self.detector.pixel_pitch_um

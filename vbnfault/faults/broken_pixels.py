@@ -137,9 +137,11 @@ class TextureBrokenPixels(Fault):
         """Return the image with lines, neighbours and defects. All other pixels stay bit for bit the same."""
         layout = _layout_once(params, context)
         out = np.array(quantity.array, order="C")
+        grey = context.camera.is_monochrome
         if len(layout.line):
             touched = _gather(out, layout.line)
-            _scatter(out, layout.line, scale_by_intensity(touched, touched[:, 3] + layout.line_offset))
+            intensity = touched[:, 3] + layout.line_offset
+            _scatter(out, layout.line, scale_by_intensity(touched, intensity, monochrome=grey))
         as_read = out.reshape(-1, 4)[:, 3]
         defect = np.asarray(params["brightness_dn"], dtype=np.float32)
         far = as_read[layout.far].astype(np.float32)
@@ -150,7 +152,8 @@ class TextureBrokenPixels(Fault):
         counts = np.bincount(layout.neighbour_of, minlength=len(layout.neighbour))
         halo = (sums / np.maximum(counts, 1)).astype(np.float32)
         index = np.concatenate([layout.neighbour, layout.defect])
-        _scatter(out, index, scale_by_intensity(_gather(out, index), np.concatenate([halo, defect])))
+        intensity = np.concatenate([halo, defect])
+        _scatter(out, index, scale_by_intensity(_gather(out, index), intensity, monochrome=grey))
         return quantity.with_array(out)
 
     def footprint(self, params: Params, context: FaultContext) -> NDArray[np.bool_]:

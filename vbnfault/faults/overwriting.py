@@ -88,7 +88,8 @@ class TextureOverwriting(Fault):
         blended = _blend(before, t, params["blend"], params["strength"])
         after = before + a * (blended - before)
         if params["channels"] == "I":
-            flat[where] = scale_by_intensity(flat[where], np.clip(after[:, 3], 0, 255))
+            intensity, grey = np.clip(after[:, 3], 0, 255), context.camera.is_monochrome
+            flat[where] = scale_by_intensity(flat[where], intensity, monochrome=grey)
         else:
             for channel in params["channels"]:
                 c = CHANNELS.index(channel)

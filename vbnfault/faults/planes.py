@@ -43,13 +43,16 @@ def intensity_dn(electrons: NDArray[np.float32], camera: Camera) -> NDArray[np.f
     return np.asarray(electrons @ (weights * 255 / white_e), dtype=np.float32)
 
 
-def scale_by_intensity(rgbi: NDArray[np.uint8], intensity: NDArray[np.float32]) -> NDArray[np.uint8]:
+def scale_by_intensity(
+    rgbi: NDArray[np.uint8], intensity: NDArray[np.float32], *, monochrome: bool = False
+) -> NDArray[np.uint8]:
     """Return RGBI uint8[..., 4] with I set to `intensity` (0-255) and RGB scaled by the same ratio.
 
-    Where I was 0, R, G and B become the new I. Values that overflow are clipped in each channel.
+    Where I was 0, R, G and B become the new I. Values that overflow are clipped in each channel. With `monochrome`,
+    R, G and B always become the new I: scaled by the ratio, they could be rounded to another number.
     """
     before = rgbi[..., 3]
-    dark = before == 0
+    dark = np.ones_like(before, dtype=bool) if monochrome else before == 0
     ratio = intensity / np.maximum(before, np.float32(1))
     out = np.empty_like(rgbi)
     for channel in range(4):
