@@ -5,7 +5,9 @@
 - The code of a module within a package is all source files and extensions of the top-level package.
 
 The imports are read from the source, so the digest does not depend on what a process has imported before. Imports
-by a computed name are not noticed. A file in a folder of installed packages has no folder of its own.
+by a computed name are not noticed. Modules from another folder, such as the working folder or one that PYTHONPATH
+names, do not count: they may belong to the user's own program, which must not be executed again with the plug-in. A
+file in a folder of installed packages has no folder of its own.
 """
 
 from __future__ import annotations
