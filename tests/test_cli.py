@@ -324,7 +324,7 @@ def test_the_real_shape_is_67ps(real_shape: Path) -> None:
 
     for settings in ({}, {"body.shape": str(real_shape)}):
         scene = config.load_scene("quickstart", settings)
-        assert assemble.assumed_of_67p(scene, assemble.make_body(scene)) == ""
+        assert assemble.values_of_another_body(scene, assemble.make_body(scene)) == ""
 
 
 @pytest.mark.parametrize(
@@ -434,6 +434,8 @@ def test_list_schema_doctor_and_dry_run(
     assert "quickstart" in capsys.readouterr().out
     assert run(monkeypatch, "list", "faults") == 0
     assert "straylight / texture (default model)\n" in capsys.readouterr().out
+    assert run(monkeypatch, "list", "bodies") == 0
+    assert "bennu    asteroid Bennu, the target of OSIRIS-REx" in capsys.readouterr().out
     assert run(monkeypatch, "list", "lenses") == 0
     assert run(monkeypatch, "list", "detectors") == 0
     assert "rosetta_navcam   Rosetta NAVCAM: 1024 x 1024 px, monochrome\n" in capsys.readouterr().out

@@ -101,7 +101,8 @@ def test_truth_angles_are_those_of_the_points(samples: tuple[Session, list[Frame
             atol = 1e-3 if name == "phase_deg" else 0.1
             np.testing.assert_allclose(sample.layers[name][on], expected, atol=atol)
         albedo = sample.layers["albedo"][on]
-        bare = assemble.normal_albedo(frame.spec.scene, np.zeros(1, np.float32))[0]
+        bare_ground = dataclasses.replace(frame.rendering.truth, dust=np.zeros(1, np.float32), material=None)
+        bare = assemble.normal_albedo(frame.spec.scene, bare_ground)[0]
         assert albedo.min() >= bare * (1 - 1e-5)
         assert albedo.max() <= bare * 1.16 * (1 + 1e-5)
 

@@ -528,11 +528,13 @@ def _module(name: str) -> str:
 
 
 def catalogue() -> str:
-    """Return the packaged scenes, lenses and detectors with their descriptions, and the figures of the scenes."""
+    """Return the packaged scenes, bodies, lenses and detectors with descriptions, and the figures of the scenes."""
     from vbnfault.core import resources
 
     parts = []
-    for title, folder in (("Scenes", "scenes"), ("Lenses", "scenes/lenses"), ("Detectors", "scenes/detectors")):
+    kinds = [("Scenes", "scenes")]
+    kinds += [(name.capitalize(), f"scenes/{name}") for name in ("bodies", "lenses", "detectors")]
+    for title, folder in kinds:
         rows, figures = [], []
         for file in sorted(resources.data_dir(folder).glob("*.toml")):
             table = tomllib.loads(file.read_text(encoding="utf-8"))

@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike
 
 from ..core.errors import InputError
 from .cache import cached_patch
+from .ellipsoid import ellipsoid
 from .gravity import PolyhedronGravity
 from .nucleus import embedded_nucleus
 from .patch import Patch, build_patch
@@ -45,6 +46,7 @@ __all__ = [
     "cached_patch",
     "check_mesh",
     "choose_sites",
+    "ellipsoid",
     "embedded_nucleus",
     "load_body",
     "load_shape",

@@ -26,7 +26,7 @@ def list_(
     kind: Annotated[
         str,
         typer.Argument(
-            help="One of scenes, lenses, detectors, studies, faults, effects, reflectances and glasses.",
+            help="One of scenes, bodies, lenses, detectors, studies, faults, effects, reflectances and glasses.",
             metavar="KIND",
         ),
     ],
@@ -41,7 +41,10 @@ def list_(
         "reflectances": _list_reflectances,
         "glasses": _list_glasses,
     }
-    folders = {"scenes": "scenes", **{name: f"scenes/{name}" for name in ("lenses", "detectors", "studies")}}
+    folders = {
+        "scenes": "scenes",
+        **{name: f"scenes/{name}" for name in ("bodies", "lenses", "detectors", "studies")},
+    }
     if kind in registered:
         load_plugins(plugins)
         registered[kind]()

@@ -217,6 +217,7 @@ class Truth:
     - `incidence_deg`, `emission_deg` float32[y, x]: angles from the normal to the Sun and to the camera.
     - `phase_deg` float32[y, x]: angle between the directions to the Sun and to the camera.
     - `dust` float32[y, x]: fraction in [0, 1] of the ground that dust covers.
+    - `albedo_factor` float32[y, x]: factor of the map of the albedo, None without a map.
     - `material` int32[y, x]: index of the spacecraft's material that a pixel shows, -1 where there is none.
 
     The angles and `dust` are NaN on the sky and None unless asked for; `material` is None without a spacecraft.
@@ -230,6 +231,7 @@ class Truth:
     phase_deg: NDArray[np.float32] | None = None
     dust: NDArray[np.float32] | None = None
     material: NDArray[np.int32] | None = None
+    albedo_factor: NDArray[np.float32] | None = None
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

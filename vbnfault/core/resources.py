@@ -21,7 +21,7 @@ def data_dir(kind: str) -> Path:
 
 
 def packaged(kind: str) -> dict[str, Path]:
-    """Return name → path of every packaged TOML of a kind: `scenes`, `scenes/lenses`, `scenes/detectors`."""
+    """Return name → path of every packaged TOML of a kind: such as `scenes` or `scenes/lenses`."""
     top, *rest = kind.split("/")
     folder = data_dir(top).joinpath(*rest)
     return {p.stem: p for p in sorted(folder.glob("*.toml"))}

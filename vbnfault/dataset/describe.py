@@ -15,6 +15,7 @@ from ..detector import Detector
 from ..pipeline import Session
 from ..pipeline.exposure import reference_exposure_s
 from ..scene import plan
+from ..scene.bodies import named_body
 from ..scene.trajectory import Trajectory
 from ..world import assemble, ground
 from .progress import duration_text, size_text
@@ -43,7 +44,7 @@ def describe(session: Session, *, sample_bytes: int, seconds: float) -> list[str
     """
     lines = [f"{session.scene.title}: {session.scene.description}".rstrip(": ")]
     lines += _samples(session)
-    lines.append(_body(session))
+    lines += _body(session)
     lines += _geometry(session)
     lines += _camera(session)
     total = sample_bytes * len(session.plan)
@@ -78,11 +79,18 @@ def _samples(session: Session) -> list[str]:
     return lines
 
 
-def _body(session: Session) -> str:
-    """Return a line with the size of the body."""
+def _body(session: Session) -> list[str]:
+    """Return a line with the size of the body, and one with the keys that a packaged table sets."""
     axes_m, radius_m = _size_m(session)
+    table = session.scene.body
     extent = " x ".join(f"{length:.4g}" for length in axes_m)
-    return f"body: {session.scene.body.name}, {extent} m along its axes x, y and z, mean radius {radius_m:.4g} m"
+    lines = [f"body: {table.name}, {extent} m along its axes x, y and z, mean radius {radius_m:.4g} m"]
+    named = named_body(table.name)
+    if named is not None:
+        packaged = type(table).model_validate(named.body)
+        keys = [key for key in named.body if getattr(table, key) == getattr(packaged, key)]
+        lines.append(f"  as in the packaged table of {named.name}: {', '.join(keys) or 'nothing'}")
+    return lines
 
 
 def _size_m(session: Session) -> tuple[NDArray[np.float64], float]:

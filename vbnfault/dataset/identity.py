@@ -125,6 +125,8 @@ def _contents_of_files(identity: dict[str, Any], scene: Scene) -> None:
         identity["camera"]["detector"] = _digest(
             resources.find("scenes/detectors", scene.camera.detector), "detector"
         )
+    if scene.body.albedo_map is not None:
+        identity["body"]["albedo_map"]["file"] = _digest(scene.body.albedo_map.file, "texture")
     if scene.spacecraft.model not in ("none", "default"):
         with (
             file_contents.noting() as digests

@@ -51,9 +51,8 @@ def _layers(frame: Frame) -> dict[str, NDArray[Any]]:
             layers[name] = getattr(images, name)
         elif name == "radiance":
             layers[name] = frame.exposure.light.on_image.array
-        elif name == "albedo" and frame.rendering.truth.dust is not None:
-            dust, material = frame.rendering.truth.dust, frame.rendering.truth.material
-            layers[name] = assemble.normal_albedo(spec.scene, dust, material, spec.terrain.vehicle)
+        elif name == "albedo":
+            layers[name] = assemble.normal_albedo(spec.scene, frame.rendering.truth, spec.terrain.vehicle)
         elif name == "point_T_m":
             layers[name] = points_T_m(frame)
         elif name in _TRUTH_LAYERS:

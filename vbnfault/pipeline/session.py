@@ -210,8 +210,8 @@ class Session:
         return assemble.make_body(self.scene)
 
     def warn_of_doubts(self) -> None:
-        """Warn of values of 67P that another body has, and of a frame that is wider than the lens's field."""
-        for sentence in (assemble.assumed_of_67p(self.scene, self.body), assemble.dark_corners(self.scene)):
+        """Warn of values of a named body that another has, and of a frame wider than the lens's field."""
+        for sentence in (assemble.values_of_another_body(self.scene, self.body), assemble.dark_corners(self.scene)):
             if sentence:
                 warnings.warn(sentence, stacklevel=2)
 
@@ -291,6 +291,7 @@ class Session:
             dust=patch.dust,
             vehicle=vehicle,
             fine=replace(fine, slope=slope),
+            albedo=assemble.render_albedo(self.scene, patch.site),
         )
 
     def patch(self, site: Site, detail: GroundDetail | None = None) -> Patch:

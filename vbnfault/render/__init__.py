@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 from ..core.lazy_names import load_name
 
 if TYPE_CHECKING:
+    from .albedo import AlbedoMap
     from .bounces import indirect
     from .detail import FineRelief
     from .integrate import radiance
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
 
 # public name → the module that defines it, which loads Mitsuba
 _HOMES = {
+    "AlbedoMap": "albedo",
     "FineRelief": "detail",
     "TerrainMesh": "surface",
     "Vehicle": "vehicle",
@@ -81,6 +83,7 @@ def self_test() -> str:
 
 
 __all__ = [
+    "AlbedoMap",
     "FineRelief",
     "TerrainMesh",
     "Vehicle",

@@ -18,7 +18,8 @@ from .surface import TerrainMesh, facing
 
 def has_bands(surface: TerrainMesh, scene: RenderInput) -> bool:
     """Return whether bands differ by more than a factor, so that each needs its own term."""
-    return scene.reflectance.terms > 1 or scene.dust_contrast is not None or surface.vehicle is not None
+    coloured = surface.albedo is not None and surface.albedo.coloured
+    return scene.reflectance.terms > 1 or scene.dust_contrast is not None or surface.vehicle is not None or coloured
 
 
 class Reflection:
@@ -33,6 +34,10 @@ class Reflection:
     ) -> None:
         self._scene, self._hit, self._banded = scene, hit, banded
         self._vehicle = surface.vehicle
+        self._factors = None
+        if surface.albedo is not None:
+            spacing = 1 / (float(scene.view.intrinsics[0]) * scene.samples_per_pixel**0.5)
+            self._factors = surface.albedo.factors(hit.point, hit.distance_m * spacing, hit.valid)
         self._frame = mi.Frame3f(facing(normal, view))
         self._view = _triple(self._frame.to_local(view))
 
@@ -52,7 +57,7 @@ class Reflection:
         model, contrast = self._scene.reflectance, self._scene.dust_contrast
         terms = model.evaluate(dr, _triple(light), self._view)
         if not self._banded:
-            return terms
+            return terms if self._factors is None else [terms[0] * self._factors[0]]
         if model.terms == 1:
             terms = [terms[0] * dr.opaque(mi.Float, float(w)) for w in model.weights[0]]
         if contrast is not None:
@@ -60,6 +65,9 @@ class Reflection:
             terms = [
                 t * dr.fma(dust, dr.opaque(mi.Float, float(c)), 1) for t, c in zip(terms, contrast, strict=True)
             ]
+        if self._factors is not None:
+            each = self._factors * (len(terms) // len(self._factors))
+            terms = [t * factor for t, factor in zip(terms, each, strict=True)]
         if self._vehicle is not None:
             on, lambert = self._hit.on_vehicle, dr.maximum(light.z, 0) * dr.inv_pi
             albedo = self._vehicle.albedo(self._hit.material, on)

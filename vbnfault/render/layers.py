@@ -58,11 +58,15 @@ def truth(
         pairs = {"incidence": (normal, centre), "emission": (normal, -rays.d), "phase": (centre, -rays.d)}
         layers |= {name: dr.select(hit.valid, _angle_deg(*pair), dr.nan) for name, pair in pairs.items()}
         layers["dust"] = dr.select(hit.valid, hit.dust, dr.nan)
+        if surface.albedo is not None:
+            footprint_m = hit.distance_m / float(view.intrinsics[0])
+            factor = surface.albedo.at_reference(hit.point, footprint_m, hit.valid)
+            layers["albedo_factor"] = dr.select(hit.valid, factor, dr.nan)
         if hit.material is not None:
             layers["material"] = dr.select(hit.on_vehicle, mi.Int32(hit.material), mi.Int32(-1))
     dr.eval(*in_camera, *layers.values())
     more = {"incidence": "incidence_deg", "emission": "emission_deg", "phase": "phase_deg"}
-    more |= {"dust": "dust", "material": "material"}
+    more |= {name: name for name in ("dust", "material", "albedo_factor")}
     classes = semantic.numpy().astype(np.uint8).reshape(shape)
     disc = sun_in_view(surface, view, sun)
     if disc is not None:

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from .albedo import AlbedoMap
 from .description import View
 from .detail import Detail, FineRelief
 from .mesh import mesh_scene
@@ -54,6 +55,8 @@ class TerrainMesh:
         The spacecraft with the camera.
     fine
         Relief finer than the facets.
+    albedo
+        Map of factors on the albedo of the ground. None: 1 everywhere.
     """
 
     def __init__(
@@ -64,6 +67,7 @@ class TerrainMesh:
         dust: NDArray[np.float32] | None = None,
         vehicle: Vehicle | None = None,
         fine: FineRelief | None = None,
+        albedo: AlbedoMap | None = None,
     ) -> None:
         vertices_m, faces = np.asarray(vertices_m, dtype=np.float32), np.asarray(faces, dtype=np.int32)
         with ThreadPoolExecutor(1) as aside:  # the last steps of building the tree keep only one core busy
@@ -72,7 +76,7 @@ class TerrainMesh:
         self._corners = _corner_records(vertices_m, faces, flat, normals.result())
         self._dust = mi.Float(0.0 if dust is None else np.ascontiguousarray(_with_a_fourth(dust[faces])).ravel())
         dr.eval(self._corners, self._dust)
-        self.vehicle, self.fine = vehicle, fine
+        self.vehicle, self.fine, self.albedo = vehicle, fine, albedo
         self._vertices_m, self._faces = vertices_m, faces
 
     def corners_m(self, facets: NDArray[np.intp]) -> NDArray[np.float64]:
@@ -179,6 +183,11 @@ class Hit:
             return mi.Float(0)
         corners = dr.gather(mi.Vector4f, table, self._first, self.valid)
         return sum((corners[k] * w for k, w in enumerate(self._weights)), mi.Float(0))
+
+    @property
+    def point(self) -> Any:
+        """Return the positions of the hits in L."""
+        return self._rays(self.distance_m)
 
     def shading_normal(self, detail: Detail | None, dither: Any) -> Any:
         """Return the normal turned by the relief finer than facets; `dither` in [0, 1) is one number per pixel."""

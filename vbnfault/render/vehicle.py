@@ -131,6 +131,11 @@ class VehicleHit:
         """Return the dust cover of the ground; 0 on the vehicle."""
         return dr.select(self.on_vehicle, 0, self._ground.dust)
 
+    @property
+    def point(self) -> Any:
+        """Return the positions of the hits in L."""
+        return self._rays(self.distance_m)
+
     def shading_normal(self, detail: Detail | None, dither: Any) -> Any:
         """Return the ground's shading normal; the vehicle has no finer relief."""
         return dr.select(self.on_vehicle, self.normal, self._ground.shading_normal(detail, dither))

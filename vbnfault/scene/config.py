@@ -18,6 +18,7 @@ from ..core import path_checks, resources, tables, toml_files
 from ..core.errors import InputError, shown
 from ..core.tables import Table
 from ..reflectance import is_packaged
+from .bodies import with_named_body
 from .instrument import OF_A_SENSOR_FILE, CameraTable, RenderTable
 from .sampling import DatasetTable, GeometryTable, PlanTable, StratumTable
 from .surroundings import OrbitTable, SkyTable, SpacecraftTable, SpiceTable, SunTable
@@ -176,6 +177,7 @@ def parse_scene(table: Mapping[str, Any], *, source: str, overrides: Sequence[st
                 f"such a file (vbnfault new sensor NAME) and name it by camera.detector{mono}"
             )
     faults = table.get("faults")
+    table = with_named_body(table, source=source)
     if "severity" in table or (
         isinstance(faults, Mapping) and any(isinstance(f, Mapping) and "severity" in f for f in faults.values())
     ):
@@ -225,6 +227,8 @@ def _anchor_paths(table: dict[str, Any], folder: Path, overrides: Collection[str
             anchor(node, where)  # without a suffix it is a packaged name
 
     anchor(table.get("body"), "body.shape", _SHAPES)
+    body = table.get("body")
+    anchor(body.get("albedo_map") if isinstance(body, dict) else None, "body.albedo_map.file")
     anchor(table.get("spacecraft"), "spacecraft.model", _VEHICLES)
     anchor(table.get("severity"), "severity.file")
     anchor_file(table.get("camera"), "camera.lens")

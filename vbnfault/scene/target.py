@@ -14,6 +14,8 @@ from ..reflectance.disc import Lambert
 
 # The most rows of a spectrum or of Hapke's parameters.
 _MOST_ROWS = 10_000
+# Relief that is higher than this fraction of the shortest semi-axis would fold the surface over itself.
+_MOST_RELIEF = 0.1
 Wavelength = Annotated[float, Field(gt=0, le=1e5)]
 SemiAxis = Annotated[float, Field(gt=0, le=1e9)]
 
@@ -37,10 +39,35 @@ class SpectrumTable(Table):
         return self
 
 
+class AlbedoMapTable(Table):
+    """Give a map whose values multiply the albedo of the body: an equirectangular image of the whole body.
+
+    Columns are longitudes, which increase to the east (right); rows are planetocentric latitudes from 90° north
+    (top) to 90° south. Both are those of the body-fixed frame T: longitude 0 on +x, the north pole on +z.
+    """
+
+    file: str = Field(description="PNG or TIFF file, grey or RGB, 8, 16 or 32 bits, twice as wide as high")
+    left_longitude_deg: float = Field(
+        -180.0, ge=-360, le=360, description="east longitude of the left edge; 0 for a map from 0 to 360°"
+    )
+    encoding: Literal["linear", "srgb"] = Field(
+        "linear", description="of the values: proportional to the albedo, or sRGB as in pictures"
+    )
+    neutral: Literal["mean"] | Annotated[float, Field(gt=0, le=1e6)] = Field(
+        "mean",
+        description="value of the map, after decoding, at which the albedo is that of [body]; whole numbers count "
+        "as fractions of the largest one. 'mean': the mean over the body",
+    )
+
+
 class BodyTable(Table):
     """Describe the target body in its body-fixed frame T."""
 
-    name: str = Field("67P/Churyumov-Gerasimenko", description="name of the body, for messages and attributes")
+    name: str = Field(
+        "67P/Churyumov-Gerasimenko",
+        description="name of the body. The short name of a packaged one (`vbnfault list bodies`), such as 'Bennu' "
+        "or '67P', gives the values of its table to all keys of [body], [orbit] and [spice] that are left out",
+    )
     shape: str = Field(
         "embedded",
         description="'embedded', 'ellipsoid', or a shape file: OBJ, PLY, STL, GLB, PDS TAB, ICQ, WRL, BDS",
@@ -48,6 +75,9 @@ class BodyTable(Table):
     unit: Literal["auto", "m", "km"] = Field("auto", description="of the shape file; auto: from its size")
     semi_axes_m: tuple[SemiAxis, SemiAxis, SemiAxis] = Field(
         (1000.0, 1000.0, 1000.0), description="of an 'ellipsoid'"
+    )
+    relief_m: float = Field(
+        0.0, ge=0, le=1e8, description="root mean square height of random relief on an 'ellipsoid'; 0: smooth"
     )
     density_kg_m3: float = Field(537.8, gt=0, le=30_000, description="of the homogeneous body, for its gravity")
     rotation_period_h: float = Field(
@@ -60,6 +90,16 @@ class BodyTable(Table):
         "67p", description="a named reflectance, a grey value, or a table of values at wavelengths"
     )
     photometry: AnyReflectance = Field(Lambert(), description="how the ground reflects")
+    albedo_map: AlbedoMapTable | None = Field(None, description="a map that multiplies the albedo; default: none")
+
+    @model_validator(mode="after")
+    def _gentle(self) -> BodyTable:
+        if self.shape == "ellipsoid" and self.relief_m > _MOST_RELIEF * min(self.semi_axes_m):
+            raise ValueError(
+                f"relief_m = {self.relief_m:g}: must be at most {_MOST_RELIEF:g} of the shortest of semi_axes_m, "
+                f"{min(self.semi_axes_m):g}"
+            )
+        return self
 
     @model_validator(mode="after")
     def _known(self) -> BodyTable:

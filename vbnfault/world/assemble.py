@@ -10,15 +10,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .. import camera as cameras
-from ..body import Body, Site, Sites, load_body, site_at
+from ..body import Body, Site, Sites, ellipsoid, load_body, site_at
 from ..camera import Camera
 from ..core import file_contents, frames, spectra, spice
 from ..core.errors import InputError
-from ..core.quantities import Radiance
+from ..core.quantities import Radiance, Truth
 from ..detector import Detector, MosaicDetector, Sensor, ThreeColourDetector, load_sensor
 from ..lens import RealLens, ThinLens, closed_to, coating, load_lens, scaled_to_focal_length
 from ..reflectance import REFERENCE_NM, BandReflectance, radiance_factor
 from ..render.description import Sunlight, View
+from ..scene import bodies
 from ..scene.config import Scene
 from ..scene.instrument import THIN_LENS, CameraTable
 from ..scene.keyed_random import rng
@@ -28,9 +29,10 @@ from ..scene.trajectory import FlownPose
 from . import sky
 from .ground import looked_at
 from .spacecraft import HingePose, ModelPlacement, Spacecraft, SpacecraftMesh, default_spacecraft, load_spacecraft
+from .surface_map import load_albedo_map
 
 if TYPE_CHECKING:
-    from ..render import Vehicle
+    from ..render import AlbedoMap, Vehicle
 
 F64 = NDArray[np.float64]
 
@@ -190,35 +192,53 @@ def dust_contrast(scene: Scene) -> F64 | None:
     return contrast if np.any(contrast) else None
 
 
-def normal_albedo(
-    scene: Scene,
-    dust: NDArray[np.float32],
-    material: NDArray[np.int32] | None = None,
-    vehicle: SpacecraftMesh | None = None,
-) -> NDArray[np.float32]:
-    """Return I/F at normal incidence and emission, at the band node nearest to 649 nm, float32 like `dust`.
+def normal_albedo(scene: Scene, truth: Truth, vehicle: SpacecraftMesh | None = None) -> NDArray[np.float32]:
+    """Return I/F at normal incidence and emission, at the band node nearest to 649 nm, float32[y, x].
 
     Parameters
     ----------
     scene
         The scene.
-    dust
-        Dust cover of the ground, in [0, 1]; NaN where there is no surface.
-    material
-        Index of the spacecraft's material in each pixel, -1 where there is none. It is a Lambert surface, so its
-        I/F is its reflectance. Default: no spacecraft.
+    truth
+        Truth with the dust cover, which is NaN where there is no surface, and with the factor of a map and the
+        spacecraft's materials if there are any.
     vehicle
-        The spacecraft with these materials.
+        The spacecraft with these materials. It is a Lambert surface, so its I/F is its reflectance.
     """
-    nodes = wavelengths_nm(scene)
-    band = int(np.argmin(np.abs(nodes - REFERENCE_NM)))
+    assert truth.dust is not None
+    nodes, band = wavelengths_nm(scene), reference_band(scene)
     contrast = dust_contrast(scene)
     bare = radiance_factor(ground_reflectance(scene), [0, 0, 1], [0, 0, 1])[band, 0]
-    ground = np.asarray(bare * (1 + (0 if contrast is None else contrast[band]) * dust), dtype=np.float32)
-    if material is None or vehicle is None:
+    dusty = 1 + (0 if contrast is None else contrast[band]) * truth.dust
+    ground = np.asarray(bare * dusty, dtype=np.float32)
+    if truth.albedo_factor is not None:
+        ground = ground * truth.albedo_factor
+    if truth.material is None or vehicle is None:
         return ground
     reflectance = vehicle.reflectance(nodes)[:, band].astype(np.float32)
-    return np.where(material >= 0, reflectance[material], ground)
+    return np.where(truth.material >= 0, reflectance[truth.material], ground)
+
+
+def reference_band(scene: Scene) -> int:
+    """Return the index of the band node nearest to 649 nm."""
+    return int(np.argmin(np.abs(wavelengths_nm(scene) - REFERENCE_NM)))
+
+
+def render_albedo(scene: Scene, site: Site) -> AlbedoMap | None:
+    """Return the renderer's copy of the scene's map of the albedo, or None if it has none. Raises InputError."""
+    if scene.body.albedo_map is None:
+        return None
+    from .. import render
+
+    loaded = load_albedo_map(scene.body.albedo_map)
+    return render.AlbedoMap(
+        loaded.levels,
+        loaded.left_longitude_deg,
+        wavelength_nm=wavelengths_nm(scene),
+        reference_band=reference_band(scene),
+        T_from_L=site.T_from_L,
+        site_T_m=site.position_T_m,
+    )
 
 
 def make_body(scene: Scene) -> Body:
@@ -229,59 +249,65 @@ def make_body(scene: Scene) -> Body:
         "rotation_period_s": table.rotation_period_h * 3600,
     }
     if table.shape == "ellipsoid":
-        vertices, faces = ellipsoid(table.semi_axes_m)
+        vertices, faces = ellipsoid(table.semi_axes_m, table.relief_m)
         return Body(name=table.name, vertices_m=vertices, faces=faces, **physical)
     return load_body(table.shape, unit=table.unit, name=table.name, **physical)
 
 
-# Volume and longest extent of 67P (Preusker et al. 2015, A&A 583, A33). A shape that differs by more than these
-# fractions belongs to another body.
-_67P_VOLUME_M3, _67P_LENGTH_M = 18.7e9, 5.0e3
-_VOLUME_SHARE, _LENGTH_SHARE = 0.25, 0.2
+# A shape that differs by more than these fractions in volume or longest extent belongs to another body.
+_VOLUME_FRACTION, _LENGTH_FRACTION = 0.25, 0.2
 
 
-def assumed_of_67p(scene: Scene, body: Body) -> str:
-    """Return one sentence that lists values of 67P in use for another body, or "" if there are none.
+def values_of_another_body(scene: Scene, body: Body) -> str:
+    """Return one sentence that lists values of the named body in use for another body, or "" if there are none.
 
-    A value counts whether the scene sets it or leaves its default. The size of the shape model decides whether the
-    body is 67P.
+    The named body is that of a packaged table, and 67P in all other scenes. A value counts whether the scene sets
+    it or leaves its default. The size of the shape model decides whether it is that body.
     """
+    table, named = scene.body, bodies.named_body(scene.body.name)
+    known = named or bodies.packaged_bodies()[bodies.DEFAULT]
+    reference = BodyTable() if named is None else BodyTable.model_validate(named.body)
     length_m = float(np.ptp(body.vertices_m, axis=0).max())
-    if (
-        abs(body.volume_m3 / _67P_VOLUME_M3 - 1) <= _VOLUME_SHARE
-        and abs(length_m / _67P_LENGTH_M - 1) <= _LENGTH_SHARE
-    ):
+    same_volume = abs(body.volume_m3 * 3 / (4 * np.pi * known.mean_radius_m**3) - 1) <= _VOLUME_FRACTION
+    if same_volume and abs(length_m / known.length_m - 1) <= _LENGTH_FRACTION:
+        if named is None and table.shape == "embedded" and table.name != reference.name:
+            packaged = ", ".join(bodies.packaged_bodies())
+            return (
+                f"body.name = {table.name!r}: no packaged body ({packaged}), so the body has the shape of 67P and "
+                "those of its values that the scene does not give"
+            )
         return ""
-    table = scene.body
-    keys = ["name", "density_kg_m3", "rotation_period_h"]
+    keys = ["name"] if named is None else []
+    keys += ["density_kg_m3", "rotation_period_h"]
     keys += [] if scene.spice.frame else ["pole_ra_deg", "pole_dec_deg", "prime_meridian_deg"]
     keys += ["reflectance"] if table.photometry.scales_reflectance else []
     # compare values, not whether they were set: a packaged scene of 67P sets them, and its shape may be replaced
-    values = [
-        (key, getattr(table, key)) for key in keys if getattr(table, key) == BodyTable.model_fields[key].default
-    ]
-    assumed = [f"body.{key} = {v:.6g}" if isinstance(v, float) else f"body.{key} = {v!r}" for key, v in values]
-    assumed += [
-        f"body.photometry.{key} = {getattr(table.photometry, key)!r}" for key in table.photometry.keys_of_67p
-    ]
+    values = [(key, getattr(table, key)) for key in keys if getattr(table, key) == getattr(reference, key)]
+    assumed = [f"body.{key}{_short(value)}" for key, value in values]
+    if named is not None:
+        assumed += ["[body.photometry]"] if table.photometry == reference.photometry else []
+    else:
+        of_67p = table.photometry.keys_of_67p
+        assumed += [f"body.photometry.{key} = {getattr(table.photometry, key)!r}" for key in of_67p]
     # if the scene or its table of poses gives a distance, the orbit only rotates the stars
-    given = scene.sun.distance_au is not None or scene.trajectory is not None
-    if scene.orbit is None and not scene.spice.kernels and not given:
+    has_distance = scene.sun.distance_au is not None or scene.trajectory is not None
+    own_orbit = None if known.orbit is None else OrbitTable.model_validate(known.orbit)
+    if scene.orbit == own_orbit and not scene.spice.kernels and not has_distance:
         assumed.append("[orbit]")
     if not assumed:
         return ""
+    size = f"{body.volume_m3 * 1e-9:.3g} km³ and is {length_m * 1e-3:.3g} km long"
     return (
-        f"body.shape = {Path(table.shape).name!r} has {body.volume_m3 * 1e-9:.3g} km³ and is {length_m * 1e-3:.3g} "
-        f"km long: not 67P, whose values it has for {', '.join(assumed)}; give the body's own"
+        f"body.shape = {Path(table.shape).name!r} has {size}: not {known.name.split('/')[0]}, whose values it has "
+        f"for {', '.join(assumed)}; give the body's own"
     )
 
 
-def ellipsoid(semi_axes_m: tuple[float, float, float]) -> tuple[F64, NDArray[np.int32]]:
-    """Return a triaxial ellipsoid as a closed mesh of 82,000 triangles: vertices float64[n, 3], m; faces int32."""
-    import trimesh
-
-    sphere = trimesh.creation.icosphere(subdivisions=6)
-    return np.asarray(sphere.vertices) * np.array(semi_axes_m), np.asarray(sphere.faces, dtype=np.int32)
+def _short(value: object) -> str:
+    """Return " = value" for a message, or "" for a table."""
+    if isinstance(value, str | float):
+        return f" = {value:.6g}" if isinstance(value, float) else f" = {value!r}"
+    return ""
 
 
 # A dark part of the frame that is smaller than this is not worth a warning.

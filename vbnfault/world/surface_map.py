@@ -1,0 +1,117 @@
+"""Read a map of a body's albedo and prepare it for filtered look-ups.
+
+A map is a simple cylindrical (equirectangular) image of the whole body: columns are planetocentric longitudes that
+increase to the east, rows are planetocentric latitudes from the north pole (top) to the south pole.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core import file_contents, user_files
+from ..core.errors import InputError
+from ..core.images import decoded_image
+from ..scene.target import AlbedoMapTable
+
+Float32 = NDArray[np.float32]
+
+TYPES = (".png", ".tif", ".tiff")
+_LEAST_ROWS = 4
+_MOST_VALUES = 2**27  # pixels times channels: 512 MiB in memory
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SurfaceMap:
+    """Hold factors on the albedo at decreasing resolution.
+
+    Attributes
+    ----------
+    levels
+        Each float32[row, column, channel], of one channel or of R, G, B. The first has the resolution of the file,
+        each other half of the one before it. Every level has one row more at each pole: its value there.
+    left_longitude_deg
+        East longitude of the left edge of the first column.
+    """
+
+    levels: tuple[Float32, ...]
+    left_longitude_deg: float
+
+
+@file_contents.cached_with_contents(maxsize=2)
+def load_albedo_map(table: AlbedoMapTable) -> SurfaceMap:
+    """Return the map that a scene names. Raises InputError."""
+    return _prepared(table, _factors(table))
+
+
+def _factors(table: AlbedoMapTable) -> Float32:
+    """Return the factors on the albedo, float32[row, column, channel], without filtering."""
+    path = table.file
+    image = decoded_image(user_files.read_input(path, "texture", types=TYPES))
+    if image is None:
+        raise InputError(f"body.albedo_map.file = {path!r}: not a readable PNG or TIFF image")
+    values = image[:, :, None] if image.ndim == 2 else image[:, :, :3]
+    rows, columns, channels = values.shape
+    if columns != 2 * rows or rows < _LEAST_ROWS:
+        raise InputError(
+            f"body.albedo_map.file = {path!r}: has {columns} x {rows} pixels; a map of the whole body has twice as "
+            f"many columns as rows, and at least {_LEAST_ROWS} rows"
+        )
+    if values.size > _MOST_VALUES:
+        raise InputError(f"body.albedo_map.file = {path!r}: has {values.size} values; at most {_MOST_VALUES}")
+    if values.dtype.kind == "u":
+        values = values.astype(np.float32) / np.float32(np.iinfo(values.dtype).max)
+    values = values.astype(np.float32)
+    if not np.isfinite(values).all() or values.min() < 0:
+        raise InputError(f"body.albedo_map.file = {path!r}: has values that are negative or not finite")
+    if (
+        channels == 3
+        and np.array_equal(values[..., 0], values[..., 1])
+        and np.array_equal(values[..., 0], values[..., 2])
+    ):
+        values = values[..., :1]
+    if table.encoding == "srgb":  # IEC 61966-2-1
+        values = np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4).astype(np.float32)
+    neutral = table.neutral
+    if neutral == "mean":  # over the area, and over the channels, so that a map keeps its colour
+        latitude = (0.5 - (np.arange(rows) + 0.5) / rows) * np.pi
+        neutral = float(np.average(values.mean(axis=(1, 2)), weights=np.cos(latitude)))
+        if neutral <= 0:
+            raise InputError(f"body.albedo_map.file = {path!r}: is black; give body.albedo_map.neutral")
+    return np.asarray(values / neutral, dtype=np.float32)
+
+
+def _prepared(table: AlbedoMapTable, factors: Float32) -> SurfaceMap:
+    """Return the map with its levels of resolution."""
+    factors = _even_at_the_poles(factors)
+    levels = [_with_poles(factors)]
+    while min(factors.shape[:2]) >= 2 * _LEAST_ROWS and factors.shape[0] % 2 == 0:
+        factors = 0.25 * (factors[::2, ::2] + factors[1::2, ::2] + factors[::2, 1::2] + factors[1::2, 1::2])
+        levels.append(_with_poles(factors))
+    return SurfaceMap(levels=tuple(levels), left_longitude_deg=table.left_longitude_deg)
+
+
+def _even_at_the_poles(factors: Float32) -> Float32:
+    """Return the map averaged along each row over the width, in columns, of a pixel at the equator.
+
+    Columns converge towards the poles. Without this average, a pixel of the image there would pick one of many.
+    """
+    rows, columns = factors.shape[:2]
+    latitude = (0.5 - (np.arange(rows) + 0.5) / rows) * np.pi
+    widths = np.minimum(np.floor(1 / np.cos(latitude)), columns).astype(int)
+    out = factors.copy()
+    for row in np.flatnonzero(widths > 1):
+        half = min(widths[row] // 2, columns // 2 - 1)
+        around = np.concatenate([factors[row, -half:], factors[row], factors[row, :half]])[None]
+        mean = cv2.blur(around, (2 * half + 1, 1)).reshape(1, columns + 2 * half, -1)
+        out[row] = mean[0, half : half + columns]
+    return out
+
+
+def _with_poles(factors: Float32) -> Float32:
+    """Return the map with a row for each pole, which has the mean of the row beside it."""
+    ends = [np.broadcast_to(factors[k].mean(axis=0), factors[k].shape) for k in (0, -1)]
+    return np.concatenate([ends[0][None], factors, ends[1][None]]).astype(np.float32)
