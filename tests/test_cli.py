@@ -449,7 +449,10 @@ def test_list_schema_doctor_and_dry_run(
         assert run(monkeypatch, "list", kind) == 0
         assert line in capsys.readouterr().out
     assert run(monkeypatch, "list", "cameras") == 2
-    assert "must be one of scenes, bodies, lenses, detectors, studies, faults, effects, reflect" in capsys.readouterr().err
+    assert (
+        "must be one of scenes, bodies, lenses, detectors, studies, faults, effects, reflect"
+        in capsys.readouterr().err
+    )
     capsys.readouterr()
     assert run(monkeypatch, "schema") == 0
     schema = json.loads(capsys.readouterr().out)
