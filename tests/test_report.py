@@ -7,6 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from conftest import ALL_FAULTS
 from synthetic import FAULTS, fake_sample, make_spec
 
 from vbnfault import store as st
@@ -83,15 +84,7 @@ def test_a_lone_broken_pixel_survives_shrinking() -> None:
 
 
 def test_abbreviations_are_short_and_distinct() -> None:
-    classes = (
-        "dust_on_optics",
-        "broken_pixels",
-        "broken_lines",
-        "straylight",
-        "vignetting",
-        "optics_degradation",
-    )
-    short = contact_sheet.abbreviations((*classes, "dark_offset"))
+    short = contact_sheet.abbreviations((*ALL_FAULTS, "dark_offset"))
     assert short["dust_on_optics"] == "DO"
     assert short["straylight"] == "St"
     assert len(set(short.values())) == 7
