@@ -55,9 +55,11 @@ def mean_ghost(rows: Sequence[tuple[float, Ghost]]) -> Ghost:
     """Return the mean over wavelengths of one ghost, from (fraction of the entering light, ghost) for each."""
     fraction = np.array([weight for weight, _ in rows])
     flux = fraction * [ghost.flux_fraction for _, ghost in rows]
-    place = np.array([ghost.centroid_mm for _, ghost in rows])
-    centre = flux @ place / flux.sum()
-    square = [g.rms_radius_mm**2 + float(((p - centre) ** 2).sum()) for (_, g), p in zip(rows, place, strict=True)]
+    centroids = np.array([ghost.centroid_mm for _, ghost in rows])
+    centre = flux @ centroids / flux.sum()
+    square = [
+        g.rms_radius_mm**2 + float(((p - centre) ** 2).sum()) for (_, g), p in zip(rows, centroids, strict=True)
+    ]
     return replace(
         rows[0][1],
         flux_fraction=float(flux.sum()),
@@ -214,9 +216,9 @@ def paraxial_ghosts(
             radius = rims / np.abs(met[:, 0, 0])
         least = int(np.argmin(radius))
         middle = -met[least, 0, 1] / met[least, 0, 0] * slope
-        places = middle + radius[least] * square
-        heights = met[:, 0, 0, None, None] * places + met[:, 0, 1, None, None] * slope
-        passing = places[(np.einsum("knc,knc->kn", heights, heights) <= rims[:, None] ** 2).all(axis=0)]
+        positions = middle + radius[least] * square
+        heights = met[:, 0, 0, None, None] * positions + met[:, 0, 1, None, None] * slope
+        passing = positions[(np.einsum("knc,knc->kn", heights, heights) <= rims[:, None] ** 2).all(axis=0)]
         if not len(passing):
             continue
         on_sensor = matrix[0, 0] * passing + matrix[0, 1] * slope

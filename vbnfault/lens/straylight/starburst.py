@@ -59,7 +59,7 @@ _EDGE_POINTS = 2049  # points along the edge of one blade, or around a round rim
 _SUPERSAMPLING = 4  # finer samples along each side of a sample
 _GOLDEN_RAD = np.pi * (3 - np.sqrt(5))
 _FARTHEST = 2.0  # largest distance between two directions, in direction cosines
-_SHARE_LOST = 3e-3  # largest error of a mix of fewer tables, relative to the mean of the bands
+_MIX_ERROR = 3e-3  # largest error of a mix of fewer tables, relative to the mean of the bands
 _STRIP = 64  # rows of the frame that are computed at a time
 _ROW_BLUR = 0.5  # blur of fringes along the radius, in rows of the table
 _NARROW = 1 / 8  # ratio of the disc's radius to the distance below which sin φ = φ across a spike
@@ -165,8 +165,8 @@ def _block(open_: F64, x: NDArray[Any], y: NDArray[Any], defects: StopDefects, p
     # a sunflower's arrangement keeps the defects apart and off the rim; the longest defect is in the middle
     seed = np.argsort(np.argsort(-np.concatenate([grains, scratches]), kind="stable"), kind="stable")
     radius = 0.85 * np.sqrt(seed / max(count, 1))
-    places = radius * np.cos(seed * _GOLDEN_RAD), radius * np.sin(seed * _GOLDEN_RAD)
-    for k, (px, py) in enumerate(zip(*places, strict=True)):
+    positions = radius * np.cos(seed * _GOLDEN_RAD), radius * np.sin(seed * _GOLDEN_RAD)
+    for k, (px, py) in enumerate(zip(*positions, strict=True)):
         if k < len(grains):
             cover = within(grains[k] / 2, np.hypot(x - px, y - py))
         else:
@@ -483,7 +483,7 @@ def _fewest(tables: F32) -> tuple[F32, F32]:
     mix = mix[:, ::-1]
     for count in range(1, len(tables) // 2):  # a mix of more tables would save nothing
         kept = mix[:, :count]
-        if np.abs(sample - kept @ (kept.T @ sample)).max() < _SHARE_LOST:
+        if np.abs(sample - kept @ (kept.T @ sample)).max() < _MIX_ERROR:
             return np.tensordot(kept.T.astype(np.float32), tables, 1), kept.astype(np.float32)
     return tables, np.eye(len(tables), dtype=np.float32)
 

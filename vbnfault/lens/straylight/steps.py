@@ -131,7 +131,7 @@ class StopBlades:
 
 
 def meet(
-    at: Step, ray: Sequence[Any], *, soft: bool, special: bool, blades: StopBlades | None, light: bool = True
+    step: Step, ray: Sequence[Any], *, soft: bool, special: bool, blades: StopBlades | None, light: bool = True
 ) -> tuple[Any, ...]:
     """Advance rays to the next surface of their path, refract or reflect them there, and clip them at its rim.
 
@@ -152,8 +152,8 @@ def meet(
     """
     dr = backend().dr
     *_, dx, dy, dz, fraction = ray[:7]
-    c, eta, mirror = at.curvature, at.eta, at.mirror
-    sense = dr.copysign(1, dz) if at.onward is None else at.onward
+    c, eta, mirror = step.curvature, step.eta, step.mirror
+    sense = dr.copysign(1, dz) if step.onward is None else step.onward
 
     def real(square: Any) -> Any:
         """Return the root of a square that is negative for lost rays."""
@@ -161,14 +161,14 @@ def meet(
         # values become nan.
         return dr.sqrt(dr.maximum(square, 0) if soft else square)
 
-    hit = (_on_conic if special else _on_sphere)(at, ray, sense, real)
-    if light and at.absorption is not None:
-        fraction = fraction * dr.exp(-at.absorption * dr.abs(hit.length))
+    hit = (_on_conic if special else _on_sphere)(step, ray, sense, real)
+    if light and step.absorption is not None:
+        fraction = fraction * dr.exp(-step.absorption * dr.abs(hit.length))
     # square of the cosine of refraction; negative for total reflection
     left = dr.fma(eta * eta, hit.cosine * hit.cosine, 1 - eta * eta)
     out_cosine = real(left)
     if light:
-        passed = at.passed(dr.clip(dr.select(eta > 1, out_cosine, hit.cosine), 0, 1))
+        passed = step.passed(dr.clip(dr.select(eta > 1, out_cosine, hit.cosine), 0, 1))
         fraction = fraction * dr.select((left < 0) & mirror, 1, passed)
     turn = hit.facing * dr.select(mirror, 2 * hit.cosine, dr.fma(eta, hit.cosine, -out_cosine))
     keep = dr.select(mirror, 1, eta)
@@ -186,18 +186,18 @@ def meet(
     if soft:
         room = dr.minimum(dr.minimum(hit.under, dr.select(mirror, 1, left)), 4 * ahead)
         dz = onward * dr.maximum(ahead, _LEAST_SLOPE)
-    return hit.x, hit.y, hit.z, dx, dy, dz, fraction, *_rims_after(at, soft, hit, room, ray[7:], blades)
+    return hit.x, hit.y, hit.z, dx, dy, dz, fraction, *_rims_after(step, soft, hit, room, ray[7:], blades)
 
 
-def _on_sphere(at: Step, ray: Sequence[Any], sense: Any, real: Callable[[Any], Any]) -> _Hit:
+def _on_sphere(step: Step, ray: Sequence[Any], sense: Any, real: Callable[[Any], Any]) -> _Hit:
     """Return where rays meet a sphere.
 
     On a sphere, the normal has length 1, and the root of the quadratic equation is the cosine of incidence.
     """
     dr = backend().dr
     x, y, z, dx, dy, dz = ray[:6]
-    c = at.curvature
-    z = z + at.gap
+    c = step.curvature
+    z = z + step.gap
     b = dr.fma(-c, dr.fma(x, dx, dr.fma(y, dy, z * dz)), dz)
     e = dr.fma(c, dr.fma(x, x, dr.fma(y, y, z * z)), -2 * z)
     under = dr.fma(b, b, -c * e)
@@ -207,24 +207,24 @@ def _on_sphere(at: Step, ray: Sequence[Any], sense: Any, real: Callable[[Any], A
     return _Hit(x, y, z, length, cosine, sense, under)
 
 
-def _on_conic(at: Step, ray: Sequence[Any], sense: Any, real: Callable[[Any], Any]) -> _Hit:
+def _on_conic(step: Step, ray: Sequence[Any], sense: Any, real: Callable[[Any], Any]) -> _Hit:
     """Return where rays meet a conic or an asphere; the rays advance to the vertex plane first."""
     dr = backend().dr
     x, y, z, dx, dy, dz = ray[:6]
-    c = at.curvature
-    z = z + at.gap
+    c = step.curvature
+    z = z + step.gap
     to_plane = -z / dz
     x, y = dr.fma(to_plane, dx, x), dr.fma(to_plane, dy, y)
-    a = c * (dx * dx + dy * dy + at.conic * dz * dz)
+    a = c * (dx * dx + dy * dy + step.conic * dz * dz)
     b = c * (x * dx + y * dy) - dz
     e = c * (x * x + y * y)
     under = b * b - a * e
     t_hit = e / (sense * real(under) - b)
     x, y, z = dr.fma(t_hit, dx, x), dr.fma(t_hit, dy, y), t_hit * dz
     length = t_hit + to_plane
-    nx, ny, nz = c * x, c * y, c * at.conic * z - 1
-    if at.aspheric:
-        x, y, z, nx, ny, nz, more = _to_asphere(at, x, y, z, dx, dy, dz)
+    nx, ny, nz = c * x, c * y, c * step.conic * z - 1
+    if step.aspheric:
+        x, y, z, nx, ny, nz, more = _to_asphere(step, x, y, z, dx, dy, dz)
         length = length + more
     norm = dr.rsqrt(nx * nx + ny * ny + nz * nz)
     along_normal = (nx * dx + ny * dy + nz * dz) * norm
@@ -234,11 +234,11 @@ def _on_conic(at: Step, ray: Sequence[Any], sense: Any, real: Callable[[Any], An
     return _Hit(x, y, z, length, cosine, facing, under, (nx, ny, nz))
 
 
-def _to_asphere(at: Step, x: Any, y: Any, z: Any, dx: Any, dy: Any, dz: Any) -> tuple[Any, ...]:
+def _to_asphere(step: Step, x: Any, y: Any, z: Any, dx: Any, dy: Any, dz: Any) -> tuple[Any, ...]:
     """Move rays from a conic to the asphere near it by Newton's method; return position, normal and length."""
     be = backend()
     dr = be.dr
-    c, conic, terms = at.curvature, at.conic, at.aspheric
+    c, conic, terms = step.curvature, step.conic, step.aspheric
     length = 0 * x
     for k in range(5):
         r2 = x * x + y * y
@@ -251,14 +251,14 @@ def _to_asphere(at: Step, x: Any, y: Any, z: Any, dx: Any, dy: Any, dz: Any) -> 
         nx, ny = slope * x, slope * y
         if k == 4:
             return x, y, z, nx, ny, 0 * x - 1, length
-        step = (z - sag) / (nx * dx + ny * dy - dz)
-        x, y, z = dr.fma(step, dx, x), dr.fma(step, dy, y), dr.fma(step, dz, z)
-        length = length + step
+        advance = (z - sag) / (nx * dx + ny * dy - dz)
+        x, y, z = dr.fma(advance, dx, x), dr.fma(advance, dy, y), dr.fma(advance, dz, z)
+        length = length + advance
     raise AssertionError("unreachable")
 
 
 def _rims_after(
-    at: Step, soft: bool, hit: _Hit, room: Any, rims: Sequence[Any], blades: StopBlades | None
+    step: Step, soft: bool, hit: _Hit, room: Any, rims: Sequence[Any], blades: StopBlades | None
 ) -> list[Any]:
     """Return the rim values of the rays after a surface.
 
@@ -272,13 +272,13 @@ def _rims_after(
     for k in range(sides):
         radius, *margin = rims[k * len(rims) // sides : (k + 1) * len(rims) // sides]
         # near a rim 1 - r² is twice 1 - r; the factor 0.5 below corrects for this
-        beyond = dr.fma(x, x, y * y) * (at.per_rim * at.per_rim)
-        if blades is not None and at.stop is not False:
+        beyond = dr.fma(x, x, y * y) * (step.per_rim * step.per_rim)
+        if blades is not None and step.stop is not False:
             blade = blades.relative_radius(x, -y if k else y)
-            beyond = dr.select(at.stop, blade * blade, beyond)
+            beyond = dr.select(step.stop, blade * blade, beyond)
         out.append(dr.maximum(radius, dr.select(room < 0, 1e6, beyond)))
         if soft:
-            here = dr.minimum((1 - beyond) * (0.5 * at.sharpness), room * _LIMIT_SHARPNESS)
+            here = dr.minimum((1 - beyond) * (0.5 * step.sharpness), room * _LIMIT_SHARPNESS)
             # keep the margin of the surface at which a ray was lost: later margins say nothing about this edge
             out.append(dr.select(margin[0] < _BEYOND_EDGE, margin[0], dr.minimum(margin[0], here)))
     return out
