@@ -32,6 +32,7 @@ F64 = NDArray[np.float64]
 _COLUMNS = 3
 _WIDTH, _ROW = 128.0, 13.0  # of a panel and of its rows, points
 _LOG_RATIO = 30.0  # of the largest to the median cost, above which an axis is logarithmic beyond its linear part
+_BELOW = 0.02  # of the largest cost: a cost further below 0 needs a linear axis
 _LOW, _MEDIAN, _HIGH = range(len(QUANTILES))
 
 
@@ -48,7 +49,7 @@ def ranking(results: StudyResults) -> Figure:
     label_width = max(text_width(_label(name, 1000), SMALL) for name in names) + 8
     level = f"{100 * results.confidence:g} %"
     legend = [
-        _handle(BLUE, "class of Gallon et al. (2025): median"),
+        _handle(BLUE, "class of Gallon et al.: median"),
         _handle(VERMILLION, "other class: median"),
         Line2D([], [], color=INK, lw=2.6, label=f"its {level} interval"),
         Line2D([], [], color=MUTED, lw=0.9, label="middle half of the views"),
@@ -120,25 +121,27 @@ def _draw_panel(axes: Axes, results: StudyResults, metric: str, model: str) -> N
 
 
 def _set_scale(axes: Axes, values: F64, interval: F64, *, reverse: bool) -> None:
-    """Set scale and limits of the axis: linear, or logarithmic beyond a linear part around 0."""
+    """Set scale and limits of the axis: linear, or logarithmic beyond a linear part next to 0.
+
+    Costs of both signs, those around 0, are always on a linear axis.
+    """
     ends = np.concatenate([values.ravel(), interval.ravel()])
     ends = ends[np.isfinite(ends)]
     low, high = float(min(ends.min(), 1.0 if reverse else 0.0)), float(max(ends.max(), 1.0 if reverse else 0.0))
     sizes = np.abs(values[:, _MEDIAN])
     sizes = sizes[sizes > 0]
-    if reverse or not len(sizes) or max(abs(low), high) < _LOG_RATIO * float(np.median(sizes)):
+    both_signs = low < -_BELOW * high
+    if reverse or both_signs or not len(sizes) or high < _LOG_RATIO * float(np.median(sizes)):
         extent = high - low or 1.0
         axes.set_xlim(low - 0.03 * extent, high + 0.03 * extent)
         set_linear(axes.xaxis, 4)
         if reverse:
             axes.invert_xaxis()
         return
-    linear = 10.0 ** np.floor(np.log10(max(float(np.quantile(sizes, 0.25)), 1e-3 * max(abs(low), high))))
+    linear = 10.0 ** np.floor(np.log10(max(float(np.quantile(sizes, 0.25)), 1e-3 * high)))
     axes.set_xscale("symlog", linthresh=linear, linscale=0.6)
-    axes.set_xlim(low * 1.3 if low < 0 else -0.12 * linear, high * 1.3)
-    powers = linear * 10.0 ** np.arange(0, 8)
-    ticks = [-p for p in powers[::-1] if -p >= low] + [0.0] + [p for p in powers if p <= high]
-    axes.xaxis.set_major_locator(FixedLocator(ticks if len(ticks) < 7 else ticks[::2]))
+    axes.set_xlim(min(low, -0.12 * linear), high * 1.3)
+    axes.xaxis.set_major_locator(FixedLocator([0.0, *(p for p in linear * 10.0 ** np.arange(8) if p <= high)]))
     axes.xaxis.set_minor_locator(NullLocator())
     axes.xaxis.set_major_formatter(FuncFormatter(lambda v, _: f"{v:g}".replace("-", "\N{MINUS SIGN}")))
 
