@@ -12,11 +12,11 @@ import numpy as np
 
 from vbnfault.study.spec import Evaluation, Metric, StudySpec, parse_study
 
-ANALYTIC_ISHIGAMI = {
-    # Ishigami & Homma 1990 with a = 7, b = 0.1: V = a²/8 + bπ⁴/5 + b²π⁸/18 + 1/2
-    "S1": (0.3139, 0.4424, 0.0),
-    "ST": (0.5576, 0.4424, 0.2437),
-}
+_VARIANCE = 49 / 8 + 0.1 * math.pi**4 / 5 + 0.01 * math.pi**8 / 18 + 0.5
+_FIRST = ((1 + 0.1 * math.pi**4 / 5) ** 2 / 2 / _VARIANCE, 49 / 8 / _VARIANCE, 0.0)
+_BOTH = 8 * 0.01 * math.pi**8 / 225 / _VARIANCE  # of the first and the third factor together
+# Ishigami & Homma 1990 with a = 7, b = 0.1
+ANALYTIC_ISHIGAMI = {"S1": _FIRST, "ST": (_FIRST[0] + _BOTH, _FIRST[1], _BOTH)}
 
 
 def spec(count: int = 3, low: float = -math.pi, high: float = math.pi, **tables: Any) -> StudySpec:

@@ -4,7 +4,7 @@
 
 The package itself can be called, as its function `study`. Its modules: `spec` reads a study file, `distributions`
 and `designs` make its points, `run` evaluates them in `chunks`, `indices` computes indices with intervals, and
-`results` stores both.
+with surrogates as `control_variates`, and `results` stores both.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from ..core.lazy_names import load_name
 if TYPE_CHECKING:
     from .chunks import StudyFailed
     from .results import open_indices, read_table
-    from .run import StudySummary, run_study, study
+    from .run import StudySummary, recompute, run_study, study
     from .spec import Evaluation, Evaluator, Metric, StudySpec, load_study, parse_study
 
 # public name → the module that defines it; it is loaded when the name is first used
@@ -33,6 +33,7 @@ _HOMES = {
     "open_indices": "results",
     "parse_study": "spec",
     "read_table": "results",
+    "recompute": "run",
     "run_study": "run",
     "study": "run",
 }
@@ -48,6 +49,7 @@ __all__ = [
     "open_indices",
     "parse_study",
     "read_table",
+    "recompute",
     "run_study",
     "study",
 ]

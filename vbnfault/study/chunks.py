@@ -7,7 +7,6 @@ evaluations are a file of their own, which is replaced every few seconds.
 from __future__ import annotations
 
 import contextlib
-import json
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -86,7 +85,7 @@ class ChunkWorker:
 
     def __init__(self, source: ChunkWorkers, evaluator: Callable[[], Evaluator]) -> None:
         self._source, self._evaluator = source, evaluator
-        self._seconds: dict[str, float] = {}  # by stage, as reported before
+        self._seconds: Counter[str] = Counter()  # by stage, as written before
 
     def do(self, task: Chunk, tick: Tick) -> None:
         """Complete a chunk. If an interrupt ends it early, the finished evaluations are still written.
@@ -96,11 +95,16 @@ class ChunkWorker:
         folder = self._source.path
         outcomes: dict[int, Mapping[str, Any]] = dict(results.read_chunk(folder, task.number))
         unwritten, written = 0, time.monotonic()
-        made_before = len(outcomes)
+        seconds_before = results.read_seconds(folder, task.number)
 
         def write() -> None:
+            now = Counter(self._evaluator().timings())
+            spent = Counter(seconds_before)
+            spent.update({stage: seconds - self._seconds[stage] for stage, seconds in now.items()})
             with _as_error(folder):
-                results.write_chunk(folder, task.number, outcomes)
+                results.write_chunk(folder, task.number, outcomes, spent)
+            seconds_before.update(spent)
+            self._seconds = now
 
         try:
             for evaluation in task.evaluations:
@@ -132,8 +136,6 @@ class ChunkWorker:
             with finishing():
                 if unwritten:
                     write()
-        if len(outcomes) > made_before:
-            self._report_seconds(tick)
 
     def _values(self, evaluation: Evaluation) -> dict[str, float]:
         """Return the metrics of an evaluation.
@@ -147,13 +149,6 @@ class ChunkWorker:
         except InputChanged as error:  # every other evaluation would fail, too
             raise Fatal(error) from error
         return {name: float(values[name]) for name in self._source.metrics}
-
-    def _report_seconds(self, tick: Tick) -> None:
-        """Report the seconds that the evaluator has spent in each stage since the last report."""
-        now = dict(self._evaluator().timings())
-        spent = {stage: seconds - self._seconds.get(stage, 0.0) for stage, seconds in now.items()}
-        self._seconds = now
-        tick(-1, "seconds", json.dumps(spent))
 
 
 @contextlib.contextmanager
@@ -171,7 +166,7 @@ class StudyJob:
     task_noun, item_noun = "chunk", "evaluation"
 
     def __init__(self, path: Path, design: Design, progress: Progress) -> None:
-        self.path, self.progress, self._design = path, progress, design
+        self.path, self.progress, self.design = path, progress, design
         seeds, views, rows, models = design.shape
         in_block = rows * models
         self.chunk_size = size = min(_LARGEST_CHUNK, max(1, in_block // 64))
@@ -185,7 +180,6 @@ class StudyJob:
             len(results.read_chunk(path, number).keys() & set(chunk)) for number, chunk in enumerate(self._chunks)
         )
         self.failures: dict[int, str] = {}
-        self.seconds_by_stage: Counter[str] = Counter()
         self._succeeded = 0
         self._counted: set[int] = set()
 
@@ -200,7 +194,7 @@ class StudyJob:
 
     def task(self, number: int, skip: frozenset[int] = frozenset(), *, careful: bool = False) -> Chunk:
         """Return the task that completes a chunk."""
-        evaluations = tuple(self._design.evaluation(i) for i in self._chunks[number])
+        evaluations = tuple(self.design.evaluation(i) for i in self._chunks[number])
         return Chunk(number=number, evaluations=evaluations, skip=skip, careful=careful)
 
     def next_task(self, last: int | None = None, busy: Sequence[int] = ()) -> int | None:
@@ -209,9 +203,7 @@ class StudyJob:
 
     def tick(self, item: int, what: str, text: str) -> None:
         """Record an event. Raises StudyFailed after too many failures without a success."""
-        if what == "seconds":
-            self.seconds_by_stage.update(json.loads(text))
-        elif what == "stage":
+        if what == "stage":
             self.progress.stage(text)
         elif what != "begun":
             if what == "failed":
@@ -236,6 +228,13 @@ class StudyJob:
                 outcomes.append(finished.get(i, {"values": {}, "error": error}))
         return outcomes
 
+    def seconds_by_stage(self) -> dict[str, float]:
+        """Return the seconds that all finished evaluations took, by stage, in this run and in those before."""
+        seconds: Counter[str] = Counter()
+        for number in range(self.tasks):
+            seconds.update(results.read_seconds(self.path, number))
+        return dict(seconds)
+
     def raise_failures(self, indices: Any, why: str = "") -> None:
         """Raise StudyFailed with the failed evaluations, if there are any."""
         if not self.failures:
@@ -249,7 +248,7 @@ class StudyJob:
             else "finished evaluations stay"
         )
         raise StudyFailed(
-            f"{self.path}: {listed} of {len(self._design)} failed{why}, the first with: "
+            f"{self.path}: {listed} of {len(self.design)} failed{why}, the first with: "
             f"{self.failures[failed[0]].splitlines()[0]}; {rest}; the same command tries the failed ones again",
             self.failures,
             indices,

@@ -15,6 +15,8 @@ from pydantic import Field, model_validator
 from ..core.tables import Table
 
 _MOST_DEVIATIONS = 1e6
+_NODES = 64  # of a quadrature
+_TAIL = 8.0  # standard deviations beyond which a normal distribution has no probability in double precision
 _Text = Annotated[str, Field(min_length=1)]
 
 
@@ -27,10 +29,23 @@ class _Factor(Table):
 
 
 class _Bounded(_Factor):
-    """Hold a factor with a lower and an upper bound."""
+    """Hold a factor with a lower and an upper bound.
+
+    Expansions in polynomials need, of each distribution, a coordinate from -1 to 1 in which a metric is likely to
+    be smooth, and the distribution of this coordinate as nodes and weights of a quadrature.
+    """
 
     low: float = Field(description="lower bound")
     high: float = Field(description="upper bound")
+
+    def coordinates(self, points: ArrayLike) -> NDArray[np.float64]:
+        """Return the coordinates, from -1 to 1, of points of the unit interval."""
+        return 2 * np.asarray(points, dtype=np.float64) - 1
+
+    def quadrature(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return nodes in the coordinate, and weights that sum to 1."""
+        nodes, weights = np.polynomial.legendre.leggauss(_NODES)
+        return nodes, weights / 2
 
     @model_validator(mode="after")
     def _ordered(self) -> _Bounded:
@@ -119,6 +134,24 @@ class TruncatedNormal(_Bounded):
         """Return the point of the unit interval at which a one-at-a-time design holds the factor: the mean."""
         return float(self.points(self.mean))
 
+    def coordinates(self, points: ArrayLike) -> NDArray[np.float64]:
+        """Return the coordinates, from -1 to 1, of points of the unit interval: the values, scaled."""
+        low, high = self._reach()
+        return np.clip(2 * (self.values(points) - low) / (high - low) - 1, -1.0, 1.0)
+
+    def quadrature(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return nodes in the coordinate, and weights that sum to 1."""
+        low, high = self._reach()
+        nodes, weights = np.polynomial.legendre.leggauss(_NODES)
+        scores = (low + (high - low) * (nodes + 1) / 2 - self.mean) / self.deviation
+        weights = weights * np.exp(-(scores**2) / 2)
+        return nodes, weights / weights.sum()
+
+    def _reach(self) -> tuple[float, float]:
+        """Return the bounds, or the ends of the normal distribution's tails where these are nearer to the mean."""
+        tail = _TAIL * self.deviation
+        return max(self.low, self.mean - tail), min(self.high, self.mean + tail)
+
     def _limits(self) -> tuple[float, float]:
         """Return the bounds in standard deviations from the mean."""
         return (self.low - self.mean) / self.deviation, (self.high - self.mean) / self.deviation
@@ -151,6 +184,17 @@ class Categorical(_Factor):
     def nominal(self) -> float:
         """Return the point of the unit interval at which a one-at-a-time design holds the factor."""
         return 0.5 / len(self.choices)
+
+    def coordinates(self, points: ArrayLike) -> NDArray[np.float64]:
+        """Return the coordinates, from -1 to 1, of points of the unit interval: numbers of the values, scaled."""
+        count = len(self.choices)
+        index = np.clip(np.floor(np.asarray(points, dtype=np.float64) * count), 0, count - 1)
+        return 2 * index / (count - 1) - 1
+
+    def quadrature(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the coordinate of each value, and equal weights that sum to 1."""
+        count = len(self.choices)
+        return np.linspace(-1.0, 1.0, count), np.full(count, 1 / count)
 
 
 Factor = Annotated[Uniform | LogUniform | TruncatedNormal | Categorical, Field(discriminator="distribution")]

@@ -21,11 +21,13 @@ The mean of each block is subtracted first, and V_b is the variance over A and B
 ST give nothing but zeros for the dummy factor, because y_Ai = y_A. Those of Khorashadi Zadeh et al. do not cancel:
 their expectation is 0, and their spread shows the noise of a study of this size.
 
-`scipy.stats.sobol_indices` gives the same S1 and ST for one block (a test compares them), but it takes neither
-several blocks nor a number of base samples that is no power of two, which is what failed evaluations leave; and its
-bootstrap takes no seed. The intervals are percentile intervals of `scipy.stats.bootstrap` over base samples. They
-take base samples as independent, so with a Sobol' sequence they are too wide rather than too narrow. Morris and
-delta come from SALib.
+Surrogates of the metric reduce the variance of all these means, as control variates (`control_variates` and
+`sobol_terms` have the formulae and the conditions). With them the intervals are symmetric bootstrap-t intervals
+(Hall 1988, doi 10.1111/j.2517-6161.1988.tb01706.x). Without them, the intervals are percentile intervals, and S1
+and ST are those of `scipy.stats.sobol_indices` for one block (a test compares them). That function takes neither
+several blocks nor a number of base samples that is no power of two, as failed evaluations leave, and its bootstrap
+takes no seed. Both kinds of intervals come from `scipy.stats.bootstrap` over base samples, as if these were
+independent, so with a Sobol' sequence they are too wide rather than too narrow. Morris and delta come from SALib.
 """
 
 from __future__ import annotations
@@ -41,7 +43,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from . import chosen_fault, ranking
+from .control_variates import LEAST_SAMPLES, Surrogates, fit, make_basis
 from .designs import Design, levels, salib, unit_problem
+from .sobol_terms import SobolTerms, complete_samples, explained_variance, ratios, sobol_terms, split
 from .spec import DUMMY, Metric
 
 if TYPE_CHECKING:
@@ -50,6 +54,7 @@ if TYPE_CHECKING:
 # SALib makes two bootstraps with some twenty density estimates for each resample: minutes for a thousand of them.
 _MOST_RESAMPLES_OF_DELTA = 20
 _LEAST_SAMPLES_OF_DELTA = 100  # SALib refuses to estimate delta from fewer
+_ROUNDING = 1e-9  # of indices
 _Array = NDArray[np.float64]
 
 
@@ -139,6 +144,11 @@ _LONG_NAMES = {
     "S1": ("first-order index: fraction of the variance due to the factor alone", "1"),
     "ST": ("total index: fraction of the variance due to the factor and its interactions", "1"),
     "interaction": ("total interaction index: fraction of the variance due to terms with both factors", "1"),
+    "explained": (
+        "fraction of the variance that the surrogates of the control variates explain at samples that they were "
+        "not fitted to; nan where control variates are not used",
+        "1",
+    ),
     "model_share": ("fraction of the variance over factors and models that is due to the model", "1"),
     "mu": ("mean elementary effect, over the whole range of the factor", "units of the metric"),
     "mu_star": ("mean absolute elementary effect, over the whole range of the factor", "units of the metric"),
@@ -175,22 +185,44 @@ def _attributes(name: str) -> dict[str, str]:
 # --- bootstrap ----------------------------------------------------------------------------------------------------
 
 
-def _ratios(terms: _Array, whole: _Array) -> _Array:
-    """Return the sums of terms over the sum of `whole`; nan where that sum is 0."""
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return np.where(whole > 0, terms / whole, np.nan)
-
-
 def _intervals(statistic: Any, n: int, design: Design) -> _Array:
     """Return percentile bootstrap intervals, float64[..., 2], over `n` base samples.
 
     `statistic` gets how often each base sample was drawn, float64[resample, n], and returns the estimates, with the
     resamples along the last axis. All metrics and models get the same resamples.
     """
-    from scipy.stats import DegenerateDataWarning, bootstrap
-
     if n < 2:
         return np.full((*np.shape(statistic(np.ones((1, n))))[:-1], 2), np.nan)
+    interval = _bootstrap(statistic, n, design).confidence_interval
+    return np.stack([interval.low, interval.high], axis=-1)
+
+
+def _studentised_intervals(terms: SobolTerms, design: Design) -> _Array:
+    """Return symmetric bootstrap-t intervals of indices, float64[index, 2] (Hall 1988).
+
+    The half-width is the standard error times the quantile of |θ* − θ| / (standard error of θ*) over resamples,
+    with θ* the index of a resample: percentile intervals would be too narrow, because few samples decide how far
+    surrogates err.
+    """
+    n = len(terms.variance)
+    once = np.ones((1, n))
+    index, deviation = terms.estimates(once), terms.deviations(once)
+
+    def distances(counts: _Array) -> _Array:
+        with np.errstate(divide="ignore", invalid="ignore"):
+            ratio = np.abs(terms.estimates(counts) - index) / terms.deviations(counts)
+        return np.where(np.isfinite(ratio), ratio, 0.0)
+
+    drawn = _bootstrap(distances, n, design).bootstrap_distribution
+    half = np.quantile(drawn, design.spec.design.confidence, axis=-1) * deviation[:, 0]
+    # an index of which the surrogates know all is exact up to rounding
+    half = np.maximum(half, _ROUNDING)
+    return np.stack([index[:, 0] - half, index[:, 0] + half], axis=-1)
+
+
+def _bootstrap(statistic: Any, n: int, design: Design) -> Any:
+    """Return what `scipy.stats.bootstrap` makes of a statistic, as `_intervals` describes it."""
+    from scipy.stats import DegenerateDataWarning, bootstrap
 
     def of_indices(index: NDArray[np.int64], axis: int) -> _Array:
         rows = np.atleast_2d(index)
@@ -202,7 +234,7 @@ def _intervals(statistic: Any, n: int, design: Design) -> _Array:
     table = design.spec.design
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DegenerateDataWarning)  # a metric that does not vary: its interval is nan
-        done = bootstrap(
+        return bootstrap(
             (np.arange(n),),
             of_indices,
             n_resamples=table.resamples,
@@ -213,56 +245,31 @@ def _intervals(statistic: Any, n: int, design: Design) -> _Array:
             method="percentile",
             rng=np.random.default_rng(table.seed),
         )
-    return np.stack([done.confidence_interval.low, done.confidence_interval.high], axis=-1)
 
 
 # --- Sobol' indices -----------------------------------------------------------------------------------------------
 
 
-def _sobol_terms(blocks: _Array, factors: int) -> tuple[_Array, _Array]:
-    """Return the terms of all indices, float64[index, base], and of the variance, float64[base].
+def _surrogates(results: Results) -> dict[tuple[int, int], list[Surrogates | None]]:
+    """Return, by metric and model, the surrogates of each block; None where it has too few complete samples."""
+    factors, models = results.design.spec.factors, results.design.shape[3]
+    if len(results.design.roles) // (len(factors) + 2) < LEAST_SAMPLES:
+        basis = None
+    else:
+        basis = make_basis(factors, results.design.points[:, :-1])
 
-    `blocks`: float64[block, row]. The indices are S1 and ST of each factor, S1 and ST of the dummy factor, and the
-    interaction of each pair. Base samples that are incomplete in all blocks are left out, those that are incomplete
-    in some count there not at all.
-    """
-    y = blocks.reshape(len(blocks), -1, factors + 2)
-    complete = np.asarray(np.isfinite(y).all(axis=-1))
-    y = y[:, complete.any(axis=0)]
-    complete = complete[:, complete.any(axis=0)]
-    y = np.where(complete[..., None], y, 0.0)
-    counts = np.maximum(complete.sum(axis=1), 1)
-    centre = y[..., :2].sum(axis=(1, 2)) / (2 * counts)
-    y = np.where(complete[..., None], y - centre[:, None, None], 0.0)
-    a, b, ab = y[..., 0], y[..., 1], np.moveaxis(y[..., 2:], -1, 0)
-    # blocks with fewer complete samples weigh as much as the others
-    weight = (len(y[0]) / counts)[:, None]
-    d = a - ab
-    pairs = [(weight * d[i] * d[j]).sum(axis=0) for i in range(factors) for j in range(i)]
-    terms = [
-        *(-weight * b * d).sum(axis=1),
-        *(weight * d**2 / 2).sum(axis=1),
-        (weight * a * b).sum(axis=0),
-        (weight * (a**2 - b**2) / 2).sum(axis=0),
-        *pairs,
-    ]
-    return np.array(terms), (weight * (a**2 + b**2) / 2).sum(axis=0)
+    def of_block(y: _Array) -> Surrogates | None:
+        complete = complete_samples(y.reshape(-1, len(factors) + 2))
+        return None if basis is None or complete.sum() < LEAST_SAMPLES else fit(basis, y, complete)
 
-
-def _sobol_indices(values: _Array, factors: int) -> tuple[_Array, _Array, _Array]:
-    """Return S1 and ST, each [factor, ...] with the dummy factor last, and interaction [factor, factor, ...]."""
-    s1 = np.concatenate([values[:factors], values[2 * factors : 2 * factors + 1]])
-    total = np.concatenate([values[factors : 2 * factors], values[2 * factors + 1 : 2 * factors + 2]])
-    pairs = np.full((factors + 1, factors + 1, *values.shape[1:]), np.nan)
-    lower = np.tril_indices(factors, -1)
-    pairs[lower] = values[2 * factors + 2 :]
-    pairs[lower[::-1]] = values[2 * factors + 2 :]
-    return s1, total, pairs
+    return {
+        (i, j): [of_block(y) for y in results.blocks(i, j)] for i, j in np.ndindex(len(results.metrics), models)
+    }
 
 
 def _add_sobol(arrays: dict[str, tuple[tuple[str, ...], _Array]], results: Results) -> None:
     """Add S1, ST and the interactions, with intervals and by seed."""
-    factors, (seeds, _, rows, models) = len(results.design.spec.keys), results.design.shape
+    factors, (seeds, views, rows, models) = len(results.design.spec.keys), results.design.shape
     metrics, base = len(results.metrics), rows // (len(results.design.spec.keys) + 2)
     whole = np.full((metrics, models, factors + 1), np.nan)
     s1, total = whole.copy(), whole.copy()
@@ -270,22 +277,25 @@ def _add_sobol(arrays: dict[str, tuple[tuple[str, ...], _Array]], results: Resul
     pairs = np.full((metrics, models, factors + 1, factors + 1), np.nan)
     pairs_interval = np.full((*pairs.shape, 2), np.nan)
     s1_by_seed, total_by_seed = (np.full((*whole.shape, seeds), np.nan) for _ in range(2))
-    used = np.zeros((metrics, models))
-    for i in range(metrics):
-        for j in range(models):
-            terms, variance = _sobol_terms(results.blocks(i, j), factors)
-            used[i, j] = len(variance)
-            s1[i, j], total[i, j], pairs[i, j] = _sobol_indices(_ratios(terms.sum(axis=1), variance.sum()), factors)
-
-            def resampled(counts: _Array, terms: _Array = terms, variance: _Array = variance) -> _Array:
-                return _ratios(terms @ counts.T, variance @ counts.T)
-
-            bounds = _intervals(resampled, len(variance), results.design)
-            s1_interval[i, j], total_interval[i, j], pairs_interval[i, j] = _sobol_indices(bounds, factors)
-            for k in range(seeds):
-                terms, variance = _sobol_terms(results.blocks(i, j, k), factors)
-                of_seed = _sobol_indices(_ratios(terms.sum(axis=1), variance.sum()), factors)
-                s1_by_seed[i, j, :, k], total_by_seed[i, j, :, k], _ = of_seed
+    used, explained = np.zeros((metrics, models)), np.full((metrics, models), np.nan)
+    for (i, j), surrogates in _surrogates(results).items():
+        blocks = results.blocks(i, j).reshape(-1, base, factors + 2)
+        explained[i, j] = explained_variance(blocks, surrogates)
+        if np.isnan(explained[i, j]):
+            surrogates = [None] * len(surrogates)
+        terms = sobol_terms(blocks, surrogates)
+        used[i, j] = n = len(terms.variance)
+        s1[i, j], total[i, j], pairs[i, j] = split(terms.estimates(np.ones((1, n)))[:, 0], factors)
+        if np.isnan(explained[i, j]):
+            bounds = _intervals(terms.estimates, n, results.design)
+        else:
+            bounds = _studentised_intervals(terms, results.design)
+        s1_interval[i, j], total_interval[i, j], pairs_interval[i, j] = split(bounds, factors)
+        for k in range(seeds):
+            of_seed = slice(k * views, (k + 1) * views)
+            terms = sobol_terms(blocks[of_seed], surrogates[of_seed])
+            alone = terms.estimates(np.ones((1, len(terms.variance))))[:, 0]
+            s1_by_seed[i, j, :, k], total_by_seed[i, j, :, k], _ = split(alone, factors)
     dims = ("metric", "model", "factor")
     arrays["S1"], arrays["S1_interval"] = (dims, s1), ((*dims, "bound"), s1_interval)
     arrays["ST"], arrays["ST_interval"] = (dims, total), ((*dims, "bound"), total_interval)
@@ -295,6 +305,7 @@ def _add_sobol(arrays: dict[str, tuple[tuple[str, ...], _Array]], results: Resul
     _add_by_seed(arrays, {"S1": s1_by_seed, "ST": total_by_seed})
     arrays["samples_used"] = (dims[:2], used)
     arrays["samples_left_out"] = (dims[:2], base - used)
+    arrays["explained"] = (dims[:2], explained)
 
 
 def _add_by_seed(arrays: dict[str, tuple[tuple[str, ...], _Array]], by_seed: dict[str, _Array]) -> None:
@@ -315,19 +326,22 @@ def half_widths(indices: xr.Dataset) -> xr.DataArray:
 def least_samples(factors: int, half_width: float, confidence: float) -> int:
     r"""Return the least n of a Sobol' design that can give the total indices a half-width, as a power of two.
 
-    The total indices sum to at least 1, so the largest of k is at least 1/k. The differences y_A − y_Ai of which it
-    is the mean square are taken as normal: then its standard error is ST √(2/n), and n ≥ 2 (z / (k h))² for a
-    half-width h at the quantile z of the confidence level. This is what the best case needs, where all factors have
-    equal parts and do not interact; where few factors dominate, up to k² times as many are needed.
+    With enough samples for surrogates (`control_variates.LEAST_SAMPLES`), it depends on the metric alone how
+    certain its indices are. With fewer, the total indices sum to at least 1, so the largest of k is at least 1/k.
+    The differences y_A − y_Ai of which it is the mean square are taken as normal: then its standard error is
+    ST √(2/n), and n ≥ 2 (z / (k h))² for a half-width h at the quantile z of the confidence level.
     """
     from scipy.stats import norm
 
     z = float(norm.ppf(0.5 + confidence / 2))
-    return power_of_two(2 * (z / (factors * half_width)) ** 2)
+    return min(LEAST_SAMPLES, power_of_two(2 * (z / (factors * half_width)) ** 2))
 
 
 def needed_samples(n: int, reached: float, asked: float) -> int:
-    """Return the n that should reach a half-width, if `n` reached another one: half-widths shrink as 1 / √n."""
+    """Return the n that should reach a half-width, if `n` reached another one.
+
+    Half-widths shrink as 1 / √n, or faster where surrogates get better with more samples.
+    """
     return power_of_two(n * (reached / asked) ** 2)
 
 
@@ -476,8 +490,8 @@ def _add_grid(arrays: dict[str, tuple[tuple[str, ...], _Array]], results: Result
         s1[i, j, -1] = total[i, j, -1] = 0.0
         for k in range(len(axes)):
             others = tuple(a + 1 for a in range(len(axes)) if a != k)
-            s1[i, j, k] = _ratios(y.mean(axis=others).var(axis=1).sum(), variance)
-            total[i, j, k] = _ratios(y.var(axis=k + 1).mean(axis=tuple(range(1, len(axes)))).sum(), variance)
+            s1[i, j, k] = ratios(y.mean(axis=others).var(axis=1).sum(), variance)
+            total[i, j, k] = ratios(y.var(axis=k + 1).mean(axis=tuple(range(1, len(axes)))).sum(), variance)
     arrays["S1"], arrays["ST"] = (("metric", "model", "factor"), s1), (("metric", "model", "factor"), total)
 
 
@@ -529,7 +543,7 @@ def _add_model_share(arrays: dict[str, tuple[tuple[str, ...], _Array]], results:
                 mean_squares = (squares @ counts.T) * weight / per_base / len(sums)
             between = means.var(axis=0).sum(axis=0)
             whole = (mean_squares - means.mean(axis=0) ** 2).sum(axis=0)
-            return _ratios(between, whole)[None]
+            return ratios(between, whole)[None]
 
         n = count.shape[1]
         share[i] = of_counts(np.ones((1, n)))[0, 0]

@@ -511,8 +511,8 @@ def _missed(results: StudyResults) -> str:
     ]
     more = f"<p class='small'>and {len(missed) - _MOST_ROWS} more</p>" if len(missed) > _MOST_ROWS else ""
     words = (
-        f"{len(missed)} total indices have a half-width above {asked:g}. The widest would need about n = {needed} "
-        f"in place of n = {n}."
+        f"{len(missed)} total indices have a half-width above {asked:g}. The widest would need at most about "
+        f"n = {needed} in place of n = {n}."
     )
     table = _table(["metric", "model", "factor", "half-width"], rows, numbers=[3])
     return f'<div class="warning"><p>{_e(words)}</p></div>{table}{more}'
@@ -562,7 +562,7 @@ def _provenance(results: StudyResults) -> str:
             for stage, seconds in sorted(timings.items(), key=lambda entry: -entry[1])
         ]
         table = _table(["stage", "time / s", "fraction / %"], rows, numbers=[1, 2])
-        parts.append(f"<p>Time by stage, summed over the processes.</p>{table}")
+        parts.append(f"<p>Time by stage, summed over all processes and all runs of the study.</p>{table}")
     if versions:
         named = ", ".join(f"{_e(name)}&nbsp;{_e(str(version))}" for name, version in versions.items())
         parts.append(f"<p>Versions: {named}.</p>")

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 
 TABLE = "table.parquet"
 INDICES = "indices.zarr"
+_SECONDS = "seconds"  # in the file of a chunk, beside the numbers of its evaluations
 # Columns of the table besides factors and metrics: name → meaning
 COLUMNS = {
     "evaluation": "number of the evaluation",
@@ -101,6 +102,35 @@ def read_table(folder: str | Path) -> pyarrow.Table:
     return parquet.read_table(path)
 
 
+def holds_design(table: pyarrow.Table, design: Design) -> bool:
+    """Return whether the rows of a table are the evaluations of a design, with the same values of all factors."""
+    if table.num_rows != len(design):
+        return False
+    rows = np.unravel_index(np.arange(len(design)), design.shape)[2]
+    return all(
+        key in table.column_names
+        and (
+            np.allclose(table[key].to_numpy(), values[rows].astype(np.float64), rtol=1e-9, atol=0.0)
+            if table.schema.field(key).type == "double"
+            else table[key].to_pylist() == [str(value) for value in values[rows]]
+        )
+        for key, values in zip(design.spec.keys, design.values, strict=True)
+    )
+
+
+def metrics_of(indices: xr.Dataset) -> tuple[Metric, ...]:
+    """Return the metrics of stored indices."""
+    texts = ("unit", "description", "source")
+    return tuple(
+        Metric(
+            name=str(metric["metric"].item()),
+            **{key: str(metric[key].item()) for key in texts},
+            better="high" if metric["better"].item() == "high" else "low",
+        )
+        for metric in (indices.sel(metric=name) for name in indices["metric"].values)
+    )
+
+
 def write_indices(path: Path, indices: xr.Dataset) -> None:
     """Write the indices of a study as a Zarr group, in place of an earlier one."""
     with replacing(path) as temporary:
@@ -153,11 +183,17 @@ def chunk_path(folder: Path, chunk: int) -> Path:
     return folder / "rows" / f"{chunk:07d}.json"
 
 
-def write_chunk(folder: Path, chunk: int, outcomes: Mapping[int, Mapping[str, Any]]) -> None:
-    """Write the finished evaluations of a chunk so that a kill leaves the file of before or the whole new one."""
+def write_chunk(
+    folder: Path, chunk: int, outcomes: Mapping[int, Mapping[str, Any]], seconds: Mapping[str, float]
+) -> None:
+    """Write the finished evaluations of a chunk so that a kill leaves the file of before or the whole new one.
+
+    `seconds`: what they took, by stage.
+    """
     path = chunk_path(folder, chunk)
+    record = {str(index): outcomes[index] for index in sorted(outcomes)} | {_SECONDS: dict(seconds)}
     with replacing(path) as temporary, open(temporary, "w", encoding="utf-8") as file:
-        json.dump({str(index): outcomes[index] for index in sorted(outcomes)}, file)
+        json.dump(record, file)
         file.flush()
         os.fsync(file.fileno())
 
@@ -165,13 +201,26 @@ def write_chunk(folder: Path, chunk: int, outcomes: Mapping[int, Mapping[str, An
 def read_chunk(folder: Path, chunk: int) -> dict[int, dict[str, Any]]:
     """Return the finished evaluations of a chunk; none where the file is missing or no whole one."""
     try:
-        outcomes = json.loads(chunk_path(folder, chunk).read_text(encoding="utf-8"))
         return {
-            int(index): {"values": dict(one["values"]), "error": str(one["error"])}
-            for index, one in outcomes.items()
+            int(index): {"values": dict(outcome["values"]), "error": str(outcome["error"])}
+            for index, outcome in _chunk(folder, chunk).items()
+            if index != _SECONDS
         }
     except (OSError, ValueError, TypeError, KeyError, AttributeError):
         return {}
+
+
+def read_seconds(folder: Path, chunk: int) -> dict[str, float]:
+    """Return what the finished evaluations of a chunk took, by stage; nothing where this is not known."""
+    try:
+        return {str(stage): float(seconds) for stage, seconds in _chunk(folder, chunk).get(_SECONDS, {}).items()}
+    except (OSError, ValueError, TypeError, AttributeError):
+        return {}
+
+
+def _chunk(folder: Path, chunk: int) -> Any:
+    """Return the record of a chunk."""
+    return json.loads(chunk_path(folder, chunk).read_text(encoding="utf-8"))
 
 
 def partial_files(folder: Path) -> Iterator[Path]:

@@ -62,7 +62,8 @@ class StudySummary:
     seconds
         Duration.
     seconds_by_stage
-        Seconds that the evaluators spent in each of their stages, summed over the workers.
+        Seconds that the evaluators spent in each of their stages, summed over the workers and over all runs of a
+        study that was continued.
     warnings
         Sentences on factors that part of the samples do not read, and on half-widths that were missed.
     """
@@ -84,7 +85,7 @@ class StudySummary:
         stages = sorted(self.seconds_by_stage.items(), key=lambda stage: -stage[1])
         if stages:
             listed = ", ".join(f"{name} {duration_text(seconds)}" for name, seconds in stages)
-            lines.append(f"time by stage, summed over the workers: {listed}")
+            lines.append(f"time by stage, summed over workers and runs: {listed}")
         if "ST_interval" in self.indices:
             widest = float(indices_module.half_widths(self.indices).max())
             if math.isfinite(widest):
@@ -170,28 +171,12 @@ def run_study(
     with interruptible(), locked(path):
         _prepare_folder(path, spec, plan.identity)
         job = StudyJob(path, design, Progress(len(design), shown=options.progress, noun="evaluations"))
-        warnings: list[str] = []
-        try:
-            if job.finished < len(design):
-                with contents.in_use():
-                    warnings += made.check() or ()
-            for sentence in warnings:
-                print(f"warning: {sentence}", file=sys.stderr)
-            names = tuple(metric.name for metric in metrics)
-            workers = ChunkWorkers(plan.factory, spec, path.absolute(), names, contents)
-            with job.progress:
-                _do_tasks(workers, made, job, options)
-        except (Stopped, KeyboardInterrupt) as stop:
-            with finishing():
-                done = StudyJob(path, design, job.progress).finished
-            raise Interrupted(
-                f"{path}: interrupted; {done} of {len(design)} evaluations are finished, and the same command "
-                "continues",
-                exit_code(stop),
-            ) from stop
-        outcomes = job.outcomes()
+        names = tuple(metric.name for metric in metrics)
+        workers = ChunkWorkers(plan.factory, spec, path.absolute(), names, contents)
+        checked = _evaluate(workers, made, job, options)
+        outcomes, seconds = job.outcomes(), job.seconds_by_stage()
         data = _indices(Results(design, metrics, _values(design, metrics, outcomes)))
-        data.attrs["timings"] = json.dumps(dict(job.seconds_by_stage))
+        data.attrs["timings"] = json.dumps(seconds)
         with _writing(path):
             table = results.write_table(path / results.TABLE, design, metrics, outcomes)
             results.write_indices(path / results.INDICES, data)
@@ -199,8 +184,7 @@ def run_study(
                 with contents.in_use():
                     _write_report(path, data, table, spec, made)
         missed = _missed_half_widths(spec, data)
-        for sentence in missed:
-            print(f"warning: {sentence}", file=sys.stderr)
+        _warn(missed)
         job.raise_failures(data)
     return StudySummary(
         path=path,
@@ -208,8 +192,8 @@ def run_study(
         evaluations=len(design),
         finished=job.finished,
         seconds=time.monotonic() - began,
-        seconds_by_stage=dict(job.seconds_by_stage),
-        warnings=(*warnings, *missed),
+        seconds_by_stage=seconds,
+        warnings=(*checked, *missed),
     )
 
 
@@ -276,6 +260,44 @@ def _plan(
     )
 
 
+def recompute(folder: str | Path) -> xr.Dataset:
+    """Compute the indices and the report of a finished study again from its table, without any evaluation.
+
+    This brings the estimators of another version of vbnfault to a study. The images of `folder` stay.
+
+    Parameters
+    ----------
+    folder : str or Path
+        Folder of a study that was run to its end.
+
+    Returns
+    -------
+    xarray.Dataset
+        The indices, as `study` returns them.
+
+    Raises
+    ------
+    InputError
+        If the folder holds no finished study, or one with the points of another version of vbnfault.
+    """
+    path = Path(folder)
+    spec = load_study(path / "study.toml")
+    table, before = results.read_table(path), results.open_indices(path)
+    design = make_design(spec)
+    if not results.holds_design(table, design):
+        raise InputError(f"{path / results.TABLE}: its points are not those of {path / 'study.toml'}")
+    metrics = results.metrics_of(before)
+    values = np.stack([table[metric.name].to_numpy() for metric in metrics], axis=-1)
+    data = _indices(Results(design, metrics, values.reshape(*design.shape, len(metrics))))
+    data.attrs["timings"] = before.attrs["timings"]
+    with locked(path), _writing(path):
+        from .report import write_report  # loads matplotlib
+
+        results.write_indices(path / results.INDICES, data)
+        write_report(path, data, table, spec.resolved())
+    return data
+
+
 def _scene_evaluator() -> EvaluatorFactory:
     """Return the evaluator of images."""
     from .evaluate import SceneEvaluator
@@ -301,7 +323,7 @@ def _chosen_metrics(evaluator: Evaluator, spec: StudySpec, source: str) -> tuple
 
 
 def _check_half_width(spec: StudySpec, source: str) -> None:
-    """Raise InputError if even the best case needs more samples for the half-width that the study asks for."""
+    """Raise InputError if the study asks for a half-width that needs more samples even in the best case."""
     n, asked = spec.design.n, spec.design.half_width
     if asked is None:
         return
@@ -309,8 +331,8 @@ def _check_half_width(spec: StudySpec, source: str) -> None:
     if n < least:
         raise InputError(
             f"{source}: design.n = {n}: too few samples for half_width = {asked:g}, which needs at least "
-            f"n = {least}, even if all factors have equal parts of the variance, and more if a few dominate; "
-            "design.half_width = 0 asks for none"
+            f"n = {least}, and more where the metric is no smooth function of the factors; design.half_width = 0 "
+            "asks for none"
         )
 
 
@@ -384,16 +406,38 @@ def _flat(node: Any, above: str = "") -> Iterator[tuple[str, Any]]:
 # --- evaluations ----------------------------------------------------------------------------------------------
 
 
-def _do_tasks(source: ChunkWorkers, evaluator: Evaluator, job: StudyJob, options: BuildOptions) -> None:
-    """Do all chunks: on a cluster, in this process, or in worker processes."""
-    if options.scheduler is not None:
-        run_on_dask(source, job, options.scheduler)
-    elif options.workers == 1:
-        run_here(partial(source.with_evaluator, evaluator), job)
-    else:
-        threads = options.threads or max(1, (os.cpu_count() or 1) // options.workers)
-        tasks = max(options.recycle_shards, _MOST_EVALUATIONS_OF_A_PROCESS // job.chunk_size)
-        Pool(source, job, threads, tasks).work(options.workers)
+def _evaluate(source: ChunkWorkers, evaluator: Evaluator, job: StudyJob, options: BuildOptions) -> tuple[str, ...]:
+    """Do all chunks on a cluster, here, or in worker processes, and return the warnings of the evaluator."""
+    warnings: tuple[str, ...] = ()
+    try:
+        if job.finished < len(job.design):
+            with source.contents.in_use():
+                warnings = tuple(evaluator.check() or ())
+        _warn(warnings)
+        with job.progress:
+            if options.scheduler is not None:
+                run_on_dask(source, job, options.scheduler)
+            elif options.workers == 1:
+                run_here(partial(source.with_evaluator, evaluator), job)
+            else:
+                threads = options.threads or max(1, (os.cpu_count() or 1) // options.workers)
+                tasks = max(options.recycle_shards, _MOST_EVALUATIONS_OF_A_PROCESS // job.chunk_size)
+                Pool(source, job, threads, tasks).work(options.workers)
+    except (Stopped, KeyboardInterrupt) as stop:
+        with finishing():
+            done = StudyJob(job.path, job.design, job.progress).finished
+        raise Interrupted(
+            f"{job.path}: interrupted; {done} of {len(job.design)} evaluations are finished, and the same command "
+            "continues",
+            exit_code(stop),
+        ) from stop
+    return warnings
+
+
+def _warn(sentences: Sequence[str]) -> None:
+    """Print warnings to standard error."""
+    for sentence in sentences:
+        print(f"warning: {sentence}", file=sys.stderr)
 
 
 # --- after the evaluations ------------------------------------------------------------------------------------
@@ -453,6 +497,6 @@ def _missed_half_widths(spec: StudySpec, data: xr.Dataset) -> list[str]:
             of_model = f" with model {model}" if model else ""
             sentences.append(
                 f"{metric}{of_model}: the total index of {factor} has a half-width of {reached:.3g}, more than "
-                f"half_width = {asked:g}; about design.n = {needed} would be needed"
+                f"half_width = {asked:g}; at most about design.n = {needed} would be needed"
             )
     return sentences
