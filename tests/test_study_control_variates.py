@@ -120,7 +120,7 @@ def test_incomplete_samples_and_several_blocks_have_control_variates() -> None:
     blocks[0, 1, 40:60] = np.nan
     found = indices.compute(indices.Results(design, tuple(kit.Function.metrics[:1]), blocks[..., None, None]))
     np.testing.assert_allclose(found["ST"].values[0, 0, :2], [0.2, 0.8], atol=1e-3)
-    np.testing.assert_allclose(found["ST_by_seed"].values[0, 0, :2], [[1, 0], [0, 1]], atol=1e-6)
+    np.testing.assert_allclose(found["ST_by_seed"].values[0, 0, :2], [[1, 0], [0, 1]], atol=1e-2)
     assert float(found["explained"].squeeze()) == pytest.approx(1.0)
 
 

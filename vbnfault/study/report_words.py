@@ -272,7 +272,8 @@ FORMULAE: dict[tuple[str, ...], tuple[str, str]] = {
         "same term of a polynomial that is fitted to the other base samples, whose expectation is known exactly "
         "(Sudret 2008), and β is the coefficient of the regression of T on H, from 0 to 1. It is 0 where the "
         "polynomials explain less than half of the variance at samples that they were not fitted to, or where the "
-        "metric has heavy tails. Intervals are symmetric bootstrap-t intervals, or percentile intervals where β is 0.",
+        "metric has heavy tails. Intervals are symmetric bootstrap-t intervals, or percentile intervals where β is "
+        "0.",
         _row(_mean(_i("T")), _o("−"), _i("β"), _o("("), _mean(_i("H")), _o("−"), _of("E", _i("H")), _o(")")),
     ),
     ("model_share",): (
