@@ -37,7 +37,8 @@ class TextureBrokenLines(Fault):
     after = "adc"
     axis = 2
     step = "rgbi"
-    severity = Severity(key="count", low=1, high=500, width_power=1)
+    # measured from 256 to 512 px: of many features the strongest count, and lines are strong
+    severity = Severity(key="count", low=1, high=500, width_power=0.3)
 
     count: Interval = bounds(1, 5, limits=(0, 10_000), integer=True, doc="number of broken lines")
     white_count: int | None = number(

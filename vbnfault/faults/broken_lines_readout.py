@@ -53,7 +53,8 @@ class ReadoutBrokenLines(Fault):
     fault = "broken_lines"
     model = "readout"
     step = "raw"
-    severity = Severity(key="count", low=1, high=500, width_power=1)
+    # measured from 256 to 512 px: of many features the strongest count, and lines are strong
+    severity = Severity(key="count", low=1, high=500, width_power=0.3)
     needs_mosaic = True
 
     count: Interval = bounds(1, 5, limits=(0, 10_000), integer=True, doc="number of failures that take lines")

@@ -44,7 +44,8 @@ class GaussianDust(Fault):
     after = "straylight"
     axis = 0
     step = "electrons"
-    severity = Severity(key="count", low=1, high=3000)
+    # the power is measured from 256 to 512 px
+    severity = Severity(key="count", low=1, high=3000, width_power=0.5)
     soft_layer = "dust_opacity"
 
     count: Interval = bounds(30, 100, limits=(0, 10_000), integer=True, doc="number of grains in the image")

@@ -59,10 +59,9 @@ class Severity:
     step
         Step of a whole number.
     width_power, offset
-        How a value changes with the width of the frame, so that pixels and their neighbourhood are harmed alike:
-        (value + offset) ∝ width^width_power. 0: a value has the same effect in frames of all widths; 1: as a number
-        of lines, of which frames of all widths then have the same fraction; 2: as a number of pixels; -1: as a size
-        that is given for 1024 px.
+        How a value changes with the width of the frame, so that it costs navigation the same:
+        (value + offset) ∝ width^width_power. 0: a value costs the same in frames of all widths; 1: it does if it
+        rises with the width, as a number of defects that each take a line.
     """
 
     key: str
