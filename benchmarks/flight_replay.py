@@ -33,6 +33,7 @@ import argparse
 import json
 import sys
 import time
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -60,6 +61,7 @@ _TRACK_SIGMAS = 6.0
 # Lit parts belong to the body if they have this fraction of all lit pixels, or lie as near to the largest part as
 # this, in radii of a disc of its area.
 _LARGE_PART, _NEAR_BODY = 0.02, 0.4
+_SMEAR = 0.1  # of the brightness: columns whose sky differs by more are smeared
 _SEARCH_PX = 16  # largest shift, for frames of 512 px
 _CLIPPED = 0.5  # of the sky at 0: such a frame tells nothing of its background
 
@@ -92,7 +94,7 @@ def look(image: NDArray[Any]) -> Look:
     far = ndimage.distance_transform_edt(~body) > 0.1 * np.sqrt(body.sum())
     background = float(np.median(image[far])) if far.any() else 0.0
     bright = float(np.percentile(image[body], _BRIGHT_PERCENTILE)) if body.any() else 1.0
-    level = (image - background) / max(bright - background, 1e-6)
+    level = (image - _column_background(image, far, background, bright)) / max(bright - background, 1e-6)
     # spots of the sky are no body: keep what is large, or near the largest part
     labels, count = ndimage.label(ndimage.median_filter(level, 3) > LIT)
     sizes = np.bincount(labels.ravel(), minlength=count + 1)
@@ -104,6 +106,16 @@ def look(image: NDArray[Any]) -> Look:
     lit = (level > LIT) & ndimage.binary_dilation(kept[labels], iterations=2)
     sky = ndimage.distance_transform_edt(~lit) > max(3.0, 0.05 * np.sqrt(lit.sum() / np.pi))
     return Look(image=image, background=background, bright=bright, level=level, lit=lit, sky=sky)
+
+
+def _column_background(image: F32, sky: Mask, background: float, bright: float) -> F32:
+    """Return the background of each column, float32[x]: the same for all, unless smear or lost columns show."""
+    with np.errstate(all="ignore"), warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # of columns without sky
+        columns = np.nanmedian(np.where(sky, image, np.nan), axis=0)
+    columns = np.where(np.isfinite(columns), columns, background)
+    smeared = np.abs(columns - background).max() > _SMEAR * (bright - background)
+    return np.asarray(columns if smeared else np.full_like(columns, background), dtype=np.float32)
 
 
 def shift_between(real: Look, rendered: Look, *, search_px: int) -> tuple[float, float]:

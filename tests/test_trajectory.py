@@ -260,6 +260,13 @@ def test_terrain_is_whole_from_afar_and_shared_and_a_patch_near_the_ground(tmp_p
     assert (one.facet_m, one.radius_m) == (0.2, 40.0)  # as near the ground without a table
     together = detail((0, 0, 503.0), (0.5, 0, 503.0))
     assert together[0] == together[1]
+    # few triangles: the body's area, shared among two thirds of them, sets the facets
+    poor = scene.model_copy(update={"patch": scene.patch.model_copy(update={"max_triangles": 20_000})})
+    near_enough = as_trajectory(columns_of([row("a", (0, 0, 4e3))])).pose(0)
+    (coarse,) = ground.ground_details(poor, body, [near_enough])
+    assert coarse.facet_m > 1.5 * detail((0, 0, 4e3))[0].facet_m
+    triangles = min(np.pi * coarse.radius_m**2, body.area_m2) / (3**0.5 / 4 * coarse.facet_m**2)
+    assert triangles == pytest.approx(0.66 * 20_000, rel=1e-6)
     # half-way, the facets in the frame are about a pixel wide, up to a quarter more
     (middle,) = detail((0, 0, 1500.0))
     assert middle.position_T_m[2] > 450

@@ -9,7 +9,7 @@ border between these cases: facets are about a pixel wide in all of them.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -76,7 +76,7 @@ def ground_details(scene: Scene, body: Body, poses: Sequence[FlownPose]) -> list
 
     def close() -> None:
         if group:
-            shared = _around(scene, seen)
+            shared = _affordable(scene, body, _around(scene, seen))
             for k in group:
                 details[k] = shared
             group.clear()
@@ -132,6 +132,18 @@ def _around(scene: Scene, seen: Sequence[_Seen]) -> GroundDetail:
     radius_m = float((np.linalg.norm(points - origin, axis=1) * least_m / distance).max())
     facet_m = max(scene.patch.facet_m, FACET_PX * pixel_rad(scene) * _rounded(least_m))
     return _detail(scene, origin, facet_m, max(radius_m, scene.patch.radius_m))
+
+
+def _affordable(scene: Scene, body: Body, detail: GroundDetail) -> GroundDetail:
+    """Return a terrain with larger facets where its even ground would take too many triangles.
+
+    Where the even ground is no larger than at a site, `body.patch` keeps to the number of triangles itself.
+    """
+    if detail.radius_m <= scene.patch.radius_m:
+        return detail
+    even_m2 = min(np.pi * detail.radius_m**2, body.area_m2)
+    most = _EVEN_FRACTION * scene.patch.max_triangles
+    return replace(detail, facet_m=max(detail.facet_m, float(np.sqrt(even_m2 / (most * _TRIANGLE)))))
 
 
 def _detail(scene: Scene, origin_T_m: F64, facet_m: float, radius_m: float) -> GroundDetail:
