@@ -274,7 +274,7 @@ def _facts(results: StudyResults) -> str:
     design, scene = results.spec["design"], results.spec.get("scene", {})
     failed = int((~results.succeeded).sum())
     facts = {
-        "Design": f"{results.method.replace('_', ' ')}, n = {design['n']}",
+        "Design": f"{results.method.replace('_', ' ')}, n\N{NO-BREAK SPACE}=\N{NO-BREAK SPACE}{design['n']}",
         "Factors": str(len(results.factors)),
         "Metrics": str(len(results.metrics)),
         "Models": ", ".join(results.models) if len(results.models) > 1 else "one",
@@ -342,7 +342,8 @@ def _leading(results: StudyResults, metric: str, model: str) -> str:
             f: _e(_quantity(v, unit, 2) if name == "mu_star" else _minus(f"{v:.2f}")) for f, v in values.items()
         }
     if not order:
-        return '<span class="small">none</span>'
+        constant = float(results.dataset["variance"].sel(metric=metric, model=model)) == 0
+        return f'<span class="small">{"constant" if constant else "none"}</span>'
     named = ", ".join(f"<code>{_e(f)}</code>&nbsp;{shown[f]}" for f in order[:_MOST_LEADING])
     more = len(order) - _MOST_LEADING
     return named + (f" and {more} more" if more > 0 else "")
