@@ -268,7 +268,8 @@ def test_terrain_is_whole_from_afar_and_shared_and_a_patch_near_the_ground(tmp_p
     triangles = min(np.pi * coarse.radius_m**2, body.area_m2) / (3**0.5 / 4 * coarse.facet_m**2)
     assert triangles == pytest.approx(0.66 * 20_000, rel=1e-6)
     # half-way, the facets in the frame are about a pixel wide, up to a quarter more
-    (middle,) = detail((0, 0, 1500.0))
+    rich = scene.model_copy(update={"patch": scene.patch.model_copy(update={"max_triangles": 20_000_000})})
+    (middle,) = ground.ground_details(rich, body, [as_trajectory(columns_of([row("b", (0, 0, 1500.0))])).pose(0)])
     assert middle.position_T_m[2] > 450
     assert 0.7 < middle.facet_m / (1000 * ground.pixel_rad(scene)) < 1.25
 
