@@ -238,9 +238,9 @@ _DIMENSIONLESS = """
     default_material dust_contrast eccentricity f_number faulty_fraction fill_power hot_clustered_share
     hot_offset_share hurst individuals internal_transmittance_10mm iso iso_power k leak log10_scale
     max_samples_per_pixel max_triangles max_tries max_views metering_level min_lit_fraction missing_codes n nd
-    node_gains noise_fraction porosity_factor prnu prnu_column prnu_low prnu_row quantum_efficiency_peak
+    neutral node_gains noise_fraction porosity_factor prnu prnu_column prnu_low prnu_row quantum_efficiency_peak
     reflectance relief rts_per_interaction rts_share samples samples_per_pixel seed shadow_hiding_amplitude
-    shadow_hiding_width shard_samples shutter_transmission single_scattering_albedo sites size_power
+    shadow_hiding_width shard_samples shutter_transmission single_scattering_albedo sites size_power slope_parameter
     stuck_bits stuck_share sun_facing_nominal_fraction test tile train transmission trap_share val value vd
 """
 

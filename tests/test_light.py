@@ -12,6 +12,7 @@ import pytest
 from test_reflectance import SETS, by_angles, directions
 from test_render import NODES, UP, join, plane, sun, view
 
+import vbnfault.render.bsdf  # noqa: F401 - registers Mitsuba's plug-ins
 from vbnfault import render
 from vbnfault.core import frames, spectra
 from vbnfault.reflectance import BandReflectance, DiscReflectance, radiance_factor, registry

@@ -32,8 +32,8 @@ COMMANDS = {
     "schema": "",
     "new": "lens own --out {} --overwrite",
 }
-# they end with the test render, a sample's files, or an evaluated study, and print through the same calls
-_WITH_MITSUBA = {"render", "doctor", "study"}
+# they end with the test render, a sample's files, an evaluated study or levels, and print through the same calls
+_WITH_MITSUBA = {"render", "doctor", "study", "severity"}
 
 
 @pytest.fixture(scope="module")
