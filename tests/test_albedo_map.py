@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import struct
 from pathlib import Path
 from typing import Any
 
@@ -190,13 +191,18 @@ def test_the_mean_is_over_the_area_of_the_body(tmp_path: Path) -> None:
         (np.zeros((2, 4), np.uint8), "and at least 4 rows"),
         (np.zeros((8, 16), np.uint8), r"is black; give body\.albedo_map\.neutral"),
         (np.full((8, 16), -1, np.float32), "has values that are negative or not finite"),
-        (None, "not a readable PNG or TIFF image"),
+        (b"II*\0 no image", "not a readable PNG or TIFF image"),
+        # the header alone of 65536 x 32768 pixels: refused before anything is decoded
+        (
+            b"\x89PNG\r\n\x1a\n" + struct.pack(">I4sII", 13, b"IHDR", 65536, 32768),
+            r"has 65536 x 32768 pixels of 1 channel\(s\); pixels times channels must be at most 134217728",
+        ),
     ],
 )
-def test_a_wrong_map_is_refused(tmp_path: Path, image: NDArray[Any] | None, sentence: str) -> None:
+def test_a_wrong_map_is_refused(tmp_path: Path, image: NDArray[Any] | bytes, sentence: str) -> None:
     path = tmp_path / "map.tif"
-    if image is None:
-        path.write_bytes(b"II*\0 no image")
+    if isinstance(image, bytes):
+        path.write_bytes(image)
     else:
         written(path, image)
     with pytest.raises(InputError, match=f"body.albedo_map.file = {re.escape(repr(str(path)))}: .*{sentence}"):

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from vbnfault.core.images import decoded_image, srgb8, write_png
+from vbnfault.core.images import decoded_image, image_size_px, srgb8, write_png
 
 
 @pytest.mark.parametrize("channels", [0, 3, 4])
@@ -30,6 +30,33 @@ def test_a_png_holds_red_first(channels: int, dtype: type, tmp_path: Path) -> No
 def test_other_data_are_no_image() -> None:
     assert decoded_image(b"") is None
     assert decoded_image(b"no image") is None
+
+
+def test_a_png_that_claims_more_than_it_holds_is_no_image(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """OpenCV would allocate what a chunk claims to hold, here 1.7 GiB, before it finds the file shorter."""
+    good = write_png(tmp_path / "image.png", np.arange(35, dtype=np.uint8).reshape(5, 7)).read_bytes()
+    start = good.index(b"IDAT") - 4
+    wrong = [
+        good[:start] + (0x6CE00183).to_bytes(4, "big") + good[start + 4 :],
+        good[:-4],
+        good[: good.index(b"IEND") - 4],
+    ]
+    assert decoded_image(good + b"and more") is not None
+    decoded: list[bytes] = []
+    monkeypatch.setattr(cv2, "imdecode", lambda data, flags: decoded.append(data.tobytes()))
+    for data in wrong:
+        assert decoded_image(data) is None
+    assert decoded == []
+
+
+def test_the_size_is_in_the_header(tmp_path: Path) -> None:
+    image = np.zeros((5, 7, 3), np.uint8)
+    assert image_size_px(write_png(tmp_path / "image.png", image).read_bytes()) == (7, 5)
+    done, tiff = cv2.imencode(".tiff", image)
+    assert done
+    assert image_size_px(tiff.tobytes()) == (7, 5)
+    assert image_size_px(b"no image") == (0, 0)
+    assert image_size_px(tiff.tobytes()[:7]) == (0, 0)
 
 
 def test_srgb_has_the_values_of_its_standard() -> None:

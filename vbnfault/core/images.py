@@ -5,6 +5,7 @@ Arrays have their channels in the order R, G, B, alpha.
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -15,17 +16,56 @@ from numpy.typing import ArrayLike, NDArray
 
 from .errors import VbnfaultError
 
+_PNG = b"\x89PNG\r\n\x1a\n"
 # Channels of OpenCV's order B, G, R, alpha in the order R, G, B, alpha, and back.
 _SWAPPED = {3: [2, 1, 0], 4: [2, 1, 0, 3]}
 
 
 def decoded_image(data: bytes) -> NDArray[Any] | None:
-    """Return the pixels of a PNG or TIFF file as stored, [y, x] or [y, x, channel]; None for any other data."""
+    """Return the pixels of a PNG or TIFF file as stored, [y, x] or [y, x, channel]; None for any other data.
+
+    A small file can hold a huge image: compare `image_size_px` with a limit first.
+    """
+    # OpenCV allocates what a chunk of a PNG claims to hold, up to 2 GiB, before it finds the file shorter
+    if not data or (data.startswith(_PNG) and not _holds_its_chunks(data)):
+        return None
     try:
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if data else None
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error:  # more pixels than OpenCV accepts
         return None
     return None if image is None else _swapped(np.asarray(image))
+
+
+def image_size_px(data: bytes) -> tuple[int, int]:
+    """Return the width and height in the header of a PNG or TIFF file; (0, 0) if the file is neither."""
+    if data.startswith(_PNG) and len(data) >= 24:
+        width_px, height_px = struct.unpack(">II", data[16:24])
+        return width_px, height_px
+    if data[:4] not in (b"II*\0", b"MM\0*"):
+        return 0, 0
+    order = "<" if data[:1] == b"I" else ">"
+    try:
+        (start,) = struct.unpack_from(f"{order}I", data, 4)
+        (count,) = struct.unpack_from(f"{order}H", data, start)
+        sides: dict[int, int] = {}
+        for k in range(count):
+            tag, kind, _ = struct.unpack_from(f"{order}HHI", data, start + 2 + 12 * k)
+            (value,) = struct.unpack_from(f"{order}{'H' if kind == 3 else 'I'}", data, start + 10 + 12 * k)
+            sides[tag] = value
+    except struct.error:  # truncated file
+        return 0, 0
+    return sides.get(256, 0), sides.get(257, 0)
+
+
+def _holds_its_chunks(png: bytes) -> bool:
+    """Return whether a PNG file has the length that the headers of its chunks claim, as far as its last chunk."""
+    start = len(_PNG)
+    while start + 12 <= len(png):
+        length, kind = struct.unpack_from(">I4s", png, start)
+        start += 12 + length
+        if kind == b"IEND":
+            return start <= len(png)
+    return False
 
 
 def write_png(path: Path, image: NDArray[Any], *, smallest: bool = False) -> Path:

@@ -17,7 +17,6 @@ with a strength above 0).
 
 from __future__ import annotations
 
-import struct
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
@@ -28,7 +27,7 @@ from numpy.typing import NDArray
 
 from ..core import user_files
 from ..core.errors import InputError, shown
-from ..core.images import decoded_image
+from ..core.images import decoded_image, image_size_px
 from ..core.quantities import CHANNELS, LUMINANCE
 from .context import FaultContext, Params
 from .contract import Fault
@@ -162,7 +161,7 @@ def load(path: str, sha256: str | None = None) -> tuple[NDArray[np.float32], NDA
         raise InputError(f"{where}: {str(error).removeprefix(f'{path}: ')}") from None
     if sha256 and user_files.sha256(data) != sha256:
         raise InputError(f"{where}: its content has changed since the parameters were drawn")
-    width_px, height_px = _size_px(data)
+    width_px, height_px = image_size_px(data)
     if width_px * height_px > LARGEST_TEXTURE_PIXELS:  # check before decoding: a small file can hold a huge image
         raise InputError(
             f"{where}: has {width_px} × {height_px} pixels; must have at most {LARGEST_TEXTURE_PIXELS} in all"
@@ -178,24 +177,3 @@ def load(path: str, sha256: str | None = None) -> tuple[NDArray[np.float32], NDA
     rgb = plain[..., :3] if plain.shape[2] >= 3 else np.repeat(plain[..., :1], 3, axis=2)
     intensity = rgb @ LUMINANCE if plain.shape[2] >= 3 else plain[..., 0]
     return np.concatenate([rgb, intensity[..., None]], axis=2) * np.float32(255), alpha
-
-
-def _size_px(data: bytes) -> tuple[int, int]:
-    """Return the width and height in the header of a PNG or TIFF file; (0, 0) if the file is neither."""
-    if data[:8] == b"\x89PNG\r\n\x1a\n" and len(data) >= 24:
-        width_px, height_px = struct.unpack(">II", data[16:24])
-        return width_px, height_px
-    if data[:4] not in (b"II*\0", b"MM\0*"):
-        return 0, 0
-    order = "<" if data[:1] == b"I" else ">"
-    try:
-        (start,) = struct.unpack_from(f"{order}I", data, 4)
-        (count,) = struct.unpack_from(f"{order}H", data, start)
-        sides: dict[int, int] = {}
-        for k in range(count):
-            tag, kind, _ = struct.unpack_from(f"{order}HHI", data, start + 2 + 12 * k)
-            (value,) = struct.unpack_from(f"{order}{'H' if kind == 3 else 'I'}", data, start + 10 + 12 * k)
-            sides[tag] = value
-    except struct.error:  # truncated file
-        return 0, 0
-    return sides.get(256, 0), sides.get(257, 0)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from ..core import file_contents, user_files
 from ..core.errors import InputError
-from ..core.images import decoded_image
+from ..core.images import decoded_image, image_size_px
 from ..scene.target import AlbedoMapTable
 
 Float32 = NDArray[np.float32]
@@ -50,18 +50,20 @@ def load_albedo_map(table: AlbedoMapTable) -> SurfaceMap:
 def _factors(table: AlbedoMapTable) -> Float32:
     """Return the factors on the albedo, float32[row, column, channel], without filtering."""
     path = table.file
-    image = decoded_image(user_files.read_input(path, "texture", types=TYPES))
+    data = user_files.read_input(path, "texture", types=TYPES)
+    columns, rows = image_size_px(data)
+    _check_values(path, rows, columns, 1)  # before decoding: a small file can hold a huge image
+    image = decoded_image(data) if columns else None
     if image is None:
         raise InputError(f"body.albedo_map.file = {path!r}: not a readable PNG or TIFF image")
     values = image[:, :, None] if image.ndim == 2 else image[:, :, :3]
     rows, columns, channels = values.shape
+    _check_values(path, rows, columns, channels)
     if columns != 2 * rows or rows < _LEAST_ROWS:
         raise InputError(
             f"body.albedo_map.file = {path!r}: has {columns} x {rows} pixels; a map of the whole body has twice as "
             f"many columns as rows, and at least {_LEAST_ROWS} rows"
         )
-    if values.size > _MOST_VALUES:
-        raise InputError(f"body.albedo_map.file = {path!r}: has {values.size} values; at most {_MOST_VALUES}")
     if values.dtype.kind == "u":
         values = values.astype(np.float32) / np.float32(np.iinfo(values.dtype).max)
     values = values.astype(np.float32)
@@ -82,6 +84,15 @@ def _factors(table: AlbedoMapTable) -> Float32:
         if neutral <= 0:
             raise InputError(f"body.albedo_map.file = {path!r}: is black; give body.albedo_map.neutral")
     return np.asarray(values / neutral, dtype=np.float32)
+
+
+def _check_values(path: str, rows: int, columns: int, channels: int) -> None:
+    """Raise InputError if a map has too many values."""
+    if rows * columns * channels > _MOST_VALUES:
+        raise InputError(
+            f"body.albedo_map.file = {path!r}: has {columns} x {rows} pixels of {channels} channel(s); pixels "
+            f"times channels must be at most {_MOST_VALUES}"
+        )
 
 
 def _prepared(table: AlbedoMapTable, factors: Float32) -> SurfaceMap:
