@@ -144,12 +144,40 @@ def case_spacecraft(seeds: Seeds, rng: random.Random, here: Path) -> Case:
 
 
 def case_texture(seeds: Seeds, rng: random.Random, here: Path) -> Case:
-    """Damage the texture of a fault."""
+    """Damage the texture of a fault, or the map of the body's albedo."""
     name = rng.choice(list(seeds.textures))
     path = here / name
     path.write_bytes(flipped(seeds.textures[name], rng, seeds.textures["a.png"]))
+    if rng.random() < 0.4:
+        table = {"file": str(path)}
+        body = {**seeds.scene["body"], "albedo_map": changed(table, rng) if rng.random() < 0.2 else table}
+        return dry(whole_scene(seeds, here, body=body)), {}
     faults = {"pixel_overwriting": {"texture_file": str(path), "blend": "add"}}
     return dry(whole_scene(seeds, here, faults=faults)), {}
+
+
+def case_poses(seeds: Seeds, rng: random.Random, here: Path) -> Case:
+    """Damage a table of poses: values of a CSV file, or bytes of either kind of file."""
+    name = rng.choice(list(seeds.poses))
+    data = seeds.poses[name]
+    if name.endswith(".csv") and rng.random() < 0.6:
+        rows = [row.split(",") for row in data.decode().split("\n")]
+        for _ in range(rng.choice((1, 1, 3))):
+            row = rng.choice(rows)
+            row[rng.randrange(len(row))] = rng.choice(
+                [*map(str, NUMBERS[:16]), "x", "nan", "", "1e400", '"', "name"]
+            )
+        data = "\n".join(map(",".join, rows)).encode()
+    else:
+        data = flipped(data, rng, rng.choice(list(seeds.poses.values())))
+    (here / name).write_bytes(data)
+    scene = {key: table for key, table in seeds.scene.items() if key not in ("faults", "geometry")}
+    scene["dataset"] = {key: value for key, value in scene["dataset"].items() if key != "samples"}
+    table = {"file": str(here / name)}
+    scene["trajectory"] = changed(table, rng) if rng.random() < 0.1 else table
+    path = here / "scene.toml"
+    path.write_bytes(toml(scene))
+    return dry(path), {}
 
 
 def case_kernel(seeds: Seeds, rng: random.Random, here: Path) -> Case:
@@ -304,7 +332,7 @@ def case_store(seeds: Seeds, rng: random.Random, here: Path) -> Case:
 
 
 CASES: dict[str, tuple[Callable[[Seeds, random.Random, Path], Case], int]] = {  # function, percentage of cases
-    "scene": (case_scene, 15),
+    "scene": (case_scene, 12),
     "fault": (case_fault, 11),
     "lens": (case_lens, 12),
     "sensor": (case_sensor, 9),
@@ -312,6 +340,7 @@ CASES: dict[str, tuple[Callable[[Seeds, random.Random, Path], Case], int]] = {  
     "mesh": (case_mesh, 12),
     "spacecraft": (case_spacecraft, 8),
     "texture": (case_texture, 5),
+    "poses": (case_poses, 3),
     "kernel": (case_kernel, 3),
     "special": (case_special, 4),
     "options": (case_options, 8),

@@ -183,6 +183,7 @@ class Seeds:
         self.meshes = _meshes(folder)
         self.kernels = _kernels(folder)
         self.textures = _textures()
+        self.poses = _poses()
 
 
 def _study() -> dict[str, Any]:
@@ -306,3 +307,23 @@ def _textures() -> dict[str, bytes]:
         image = rng.integers(0, 255, shape).astype(dtype)
         found[name] = cv2.imencode(name[-4:], image)[1].tobytes()
     return found
+
+
+def _poses() -> dict[str, bytes]:
+    """Return one table of two poses as CSV and as Parquet, by file name."""
+    import io
+
+    import pyarrow
+    import pyarrow.parquet
+
+    from vbnfault.scene.trajectory import COLUMNS
+
+    rows = [
+        ("a", 2456875.4, 0.0, 0.0, 9000.0, 0.0, 1.0, 0.0, 0.0, 0.6, 0.0, 0.8, 3.6),
+        ("b", 2456876.4, 0.0, 0.0, 900.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.6, 0.8, 3.6),
+    ]
+    lines = [",".join(COLUMNS), *(",".join(map(str, row)) for row in rows)]
+    file = io.BytesIO()
+    columns = dict(zip(COLUMNS, map(list, zip(*rows, strict=True)), strict=True))
+    pyarrow.parquet.write_table(pyarrow.table(columns), file)
+    return {"poses.csv": "\n".join(lines).encode(), "poses.parquet": file.getvalue()}

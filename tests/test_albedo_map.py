@@ -209,6 +209,13 @@ def test_a_wrong_map_is_refused(tmp_path: Path, image: NDArray[Any] | bytes, sen
         load_albedo_map(AlbedoMapTable(file=str(path)))
 
 
+def test_a_wrong_map_is_refused_before_any_sample_is_rendered(tmp_path: Path) -> None:
+    written(tmp_path / "map.tif", np.zeros((10, 30), np.uint8))
+    scene = config.parse_scene(orbit_scene(tmp_path / "map.tif"), source="map.toml")
+    with pytest.raises(InputError, match="has 30 x 10 pixels"):
+        dataset.build_scene(scene, tmp_path / "s.zarr", source="map.toml", dry_run=True)
+
+
 def test_the_identity_of_a_store_is_of_the_contents_of_its_map(tmp_path: Path) -> None:
     def identity(name: str, image: NDArray[np.uint8]) -> dict[str, Any]:
         table = orbit_scene(written(tmp_path / name, image))

@@ -257,6 +257,19 @@ def test_data_are_on_the_device_before_done_is(store: Path, monkeypatch: pytest.
     assert calls[-1] == ("fsync", str(Path(done).parent))
 
 
+# --- files that are something else ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("file", ["image/zarr.json", "image/c/0/0/0/0", "exposure_s/c/0", "exposure_s/zarr.json"])
+def test_a_link_in_a_files_place_is_not_followed(store: Path, tmp_path: Path, file: str) -> None:
+    """zarr would follow it, at worst to a device without end; here the link leads to the right content."""
+    assert st.open_store(store).read_sample(0).index == 0
+    shutil.move(store / file, tmp_path / "moved")
+    (store / file).symlink_to(tmp_path / "moved")
+    with pytest.raises(VbnfaultError, match=file.split("/")[0]):
+        st.open_store(store).read_sample(0)
+
+
 # --- readers beside a writer ------------------------------------------------------------------------------
 
 

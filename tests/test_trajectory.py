@@ -182,7 +182,7 @@ def test_a_wrong_value_is_named_with_its_row_and_range(tmp_path: Path, alter: An
             lambda t: t.replace("sun_distance_au", "sun_distance_km"),
             r"columns are missing: sun_distance_au; unknown ",
         ),
-        (lambda t: t.replace("name,", "name,name,"), r"column 'name' stands twice in the first line"),
+        (lambda t: t.replace("name,", "name,name,"), r"column 'name' stands twice; must stand once"),
         (lambda t: t + "more,1\n", r"row 6 has 2 values; must have 13, as the first line has"),
         (lambda t: "\n", r"columns are missing: name, julian_date, "),
         (lambda t: t + '"open', r"is no CSV file: "),

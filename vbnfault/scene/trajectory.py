@@ -43,6 +43,7 @@ COLUMNS = ("name", *_NUMBERS)
 NORM_TOLERANCE = 1e-3
 _LONGEST_NAME = 200
 _MOST_SITES = 100_000  # of `dataset.sites`
+_MOST_ROWS = 1_000_000
 _IN_PYTHON = "poses"  # stands for the file's name where the table was given in Python
 
 
@@ -214,9 +215,7 @@ def _csv_columns(data: bytes, source: str) -> dict[str, list[Any]]:
     except csv.Error as error:
         raise InputError(f"{source}: is no CSV file: {error}") from None
     header = [name.strip() for name in rows[0]] if rows else []
-    twice = next((name for k, name in enumerate(header) if name in header[:k]), None)
-    if twice is not None:
-        raise InputError(f"{source}: column {shown(twice)} stands twice in the first line; must stand once")
+    _check_names(header, source)
     for number, row in enumerate(rows[1:], 1):
         if len(row) != len(header):
             raise InputError(
@@ -231,20 +230,32 @@ def _parquet_columns(data: bytes, source: str) -> dict[str, list[Any]]:
     import pyarrow.parquet
 
     try:
-        table = pyarrow.parquet.read_table(io.BytesIO(data))
-        return {name: table.column(k).to_pylist() for k, name in enumerate(table.column_names)}
+        file = pyarrow.parquet.ParquetFile(io.BytesIO(data))
+        _check_names(file.schema_arrow.names, source)
+        if file.metadata.num_rows > _MOST_ROWS:  # before reading: a small file can hold a huge table
+            raise InputError(f"{source}: has {file.metadata.num_rows} rows; must have at most {_MOST_ROWS}")
+        table = file.read()
+        return {name: table.column(name).to_pylist() for name in COLUMNS}
     except (pyarrow.ArrowException, OSError, ValueError) as error:
         raise InputError(f"{source}: is no Parquet file: {' '.join(str(error).split())[:200]}") from None
 
 
-def _checked(columns: Mapping[str, Sequence[Any]], source: str) -> Trajectory:
-    """Return columns as a trajectory. Raises InputError for a wrong column or value."""
-    missing = [name for name in COLUMNS if name not in columns]
-    unknown = [name for name in columns if name not in COLUMNS]
+def _check_names(names: Sequence[str], source: str) -> None:
+    """Raise InputError unless each column of a table of poses is there once, and no other."""
+    twice = next((name for k, name in enumerate(names) if name in names[:k]), None)
+    if twice is not None:
+        raise InputError(f"{source}: column {shown(twice)} stands twice; must stand once")
+    missing = [name for name in COLUMNS if name not in names]
+    unknown = [name for name in names if name not in COLUMNS]
     if missing or unknown:
         clauses = [f"columns are missing: {', '.join(missing)}"] if missing else []
         clauses += [f"unknown columns: {', '.join(shown(name) for name in unknown[:5])}"] if unknown else []
         raise InputError(f"{source}: {'; '.join(clauses)}; must have exactly the columns {', '.join(COLUMNS)}")
+
+
+def _checked(columns: Mapping[str, Sequence[Any]], source: str) -> Trajectory:
+    """Return columns as a trajectory. Raises InputError for a wrong column or value."""
+    _check_names(list(columns), source)
     count = len(columns["name"])
     if not count:
         raise InputError(f"{source}: has no rows; must have at least 1, each a pose")

@@ -88,6 +88,16 @@ def read(path: Path) -> bytes:
     return parts[0] if len(parts) == 1 else b"".join(parts)
 
 
+def expect_file(path: Path) -> None:
+    """Raise Misplaced if the path is a folder, a link, a pipe or a device, which other libraries would read."""
+    try:
+        status = os.lstat(path)
+    except OSError:  # missing: the reader says so
+        return
+    if not stat.S_ISREG(status.st_mode):
+        raise Misplaced(errno.EISDIR, "it is not a regular file", str(path))
+
+
 def names(folder: Path) -> list[str]:
     """Return the names in a folder; an empty list if there is no such folder.
 

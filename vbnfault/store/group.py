@@ -77,6 +77,7 @@ class Store:
         """Return the zarr array. Raises VbnfaultError if it is missing or its metadata cannot be read."""
         if name not in self._arrays:
             try:
+                disk.expect_file(self.path / name / DOCUMENT)
                 self._arrays[name] = zarr.open_array(self.path / name, mode=self._mode, zarr_format=3)
             except PermissionError as error:
                 raise disk.denied(error, self.path / name) from error
@@ -95,14 +96,17 @@ class Store:
 
     def why_closed(self, name: str) -> str:
         """Return why `array` cannot open an array, as a clause."""
-        if not (self.path / name / "zarr.json").is_file():
+        if not os.path.lexists(self.path / name / DOCUMENT):
             return f"array {name} is missing"
-        return f"array {name} cannot be opened, {name}/zarr.json is damaged"
+        return f"array {name} cannot be opened, {name}/{DOCUMENT} is damaged"
 
     def read(self, name: str, start: int = 0, stop: int | None = None) -> NDArray[Any]:
         """Return samples `start` to `stop` - 1 of an array. Raises VbnfaultError if they cannot be decoded."""
         stop = self.samples if stop is None else stop
         try:
+            if name in self.spec.arrays:
+                for number in range(start // self.spec.shard_samples, -(-stop // self.spec.shard_samples)):
+                    disk.expect_file(self.file(name, number))
             values = self.array(name)[start:stop]
         except VbnfaultError:
             raise

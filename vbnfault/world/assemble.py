@@ -242,8 +242,10 @@ def render_albedo(scene: Scene, site: Site) -> AlbedoMap | None:
 
 
 def make_body(scene: Scene) -> Body:
-    """Return the scene's body. Raises InputError."""
+    """Return the scene's body. Raises InputError, also for a wrong map of its albedo."""
     table = scene.body
+    if table.albedo_map is not None:
+        load_albedo_map(table.albedo_map)  # refused before any sample is rendered
     physical = {
         "density_kg_m3": table.density_kg_m3,
         "rotation_period_s": table.rotation_period_h * 3600,
