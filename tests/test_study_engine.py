@@ -214,7 +214,7 @@ def test_an_interrupted_study_continues_to_the_same_table(
     assert not (tmp_path / "s" / results.TABLE).exists()
     summary = run.run_study(spec, tmp_path / "s", QUIET, report=False, evaluator=kit.Stopping)
     assert summary.finished == at
-    # of both runs together, which finished each evaluation once
+    # of both runs together, which finished each evaluation once; an evaluation counts as 1 ms, however long it took
     assert summary.seconds_by_stage["function"] == pytest.approx(0.32, abs=2e-3)
     assert table_bytes(tmp_path / "s") == table_bytes(reference)
 

@@ -613,7 +613,7 @@ class _FaceSetScanner:
             raise self._error(match.start(), "geometry written out", "geometry used again by USE")
 
     def _read_word(self, match: Match) -> None:
-        """Follow a reference, note a number of a transform, or start a field."""
+        """Read a word: a reference to a named node, a number of a transform, or the name of a field."""
         token, node = match[0], self.open_nodes[-1]
         if self.before[-1] == b"USE":
             for_points = self.before[-2] == b"coord"

@@ -53,6 +53,12 @@ def number(low: float, high: float, text: str, *names: str, unset: str | None = 
     return typer.Option(*names, callback=finite, min=low, max=high, help=text, show_default=unset or True)
 
 
+def replaced(what: str, example: str) -> Any:
+    """Return the option that replaces values of a file: of what, and an example."""
+    text = f"Replace a value of the {what}, such as {example}; may be repeated."
+    return typer.Option("--set", metavar="KEY=VALUE", help=text)
+
+
 def whole(low: int, high: int, text: str, *, unset: str | None = None) -> Any:
     """Return an option that takes a whole number from `low` to `high`; for `unset` see `number`."""
     return typer.Option(min=low, max=high, help=text, show_default=unset or True)
@@ -114,11 +120,7 @@ class SceneOptions:
     ] = None
     settings: Annotated[
         list[str] | None,
-        typer.Option(
-            "--set",
-            metavar="KEY=VALUE",
-            help="Replace a value of the scene, such as body.shape=comet.obj; may be repeated.",
-        ),
+        replaced("scene", "body.shape=comet.obj"),
     ] = None
 
     def load(self, scene: str) -> Scene:

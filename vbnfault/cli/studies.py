@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from .app import app
-from .options import MOST_PROCESSES, SceneArgument, check_image_path, grouped, number, overrides, writing
+from .options import MOST_PROCESSES, SceneArgument, check_image_path, grouped, number, overrides, replaced, writing
 
 _PANEL = "Studies"
 
@@ -39,11 +39,7 @@ def study(
     ] = False,
     settings: Annotated[
         list[str] | None,
-        typer.Option(
-            "--set",
-            metavar="KEY=VALUE",
-            help="Replace a value of the study, such as design.n=8 or scene.camera.width_px=128; may be repeated.",
-        ),
+        replaced("study", "design.n=8 or scene.camera.width_px=128"),
     ] = None,
 ) -> None:
     """Run a sensitivity study: which parameters drive each metric, with confidence intervals, and how much the
@@ -86,11 +82,7 @@ class _SeverityOptions:
     views: Annotated[int, typer.Option(min=1, max=100_000, help="Number of views behind each lens.")] = 64
     settings: Annotated[
         list[str] | None,
-        typer.Option(
-            "--set",
-            metavar="KEY=VALUE",
-            help="Replace a value of the scene, such as camera.width_px=256; may be repeated.",
-        ),
+        replaced("scene", "camera.width_px=256"),
     ] = None
 
 

@@ -43,7 +43,7 @@ class Interval(NamedTuple):
         return int(rng.integers(int(self.lo), int(self.hi), endpoint=True))
 
 
-# Width of the frame in px to which keys in pixels, and the range of a severity, refer.
+# Keys in pixels and the range of a severity are given for a frame of this width; other widths scale them.
 REFERENCE_WIDTH_PX = 1024
 
 

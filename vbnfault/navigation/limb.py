@@ -228,7 +228,7 @@ def _edges(image: F32, xy: F64, normals: F64, search_px: float) -> tuple[F64, F6
 
 
 def _lit_edges(clean: F32, xy: F64, normals: F64, search_px: float) -> tuple[F64, F64, F64]:
-    """Return the pixels and normals at which the clean twin shows the lit limb, and its edges' positions in px."""
+    """Return where the clean twin shows a lit limb: pixels [n, 2], normals [n, 2], offsets of its edges, px [n]."""
     positions, strength, noise = _edges(clean, xy, normals, search_px)
     strong = float(np.percentile(strength, 95))
     lit = (strength > max(_NOISE_FACTOR * noise, _LIT_FRACTION * strong)) & (np.abs(positions) <= _NEAR_PX)

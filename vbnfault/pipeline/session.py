@@ -210,7 +210,7 @@ class Session:
         return assemble.make_body(self.scene)
 
     def warn_of_doubts(self) -> None:
-        """Warn of values of a named body that another has, and of a frame wider than the lens's field."""
+        """Warn if the body has values of another, named one, and if the frame is wider than the lens's field."""
         for sentence in (assemble.values_of_another_body(self.scene, self.body), assemble.dark_corners(self.scene)):
             if sentence:
                 warnings.warn(sentence, stacklevel=2)

@@ -179,13 +179,12 @@ class DiscReflectance(Reflectance, ABC):
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Diffuse:
-    """Evaluate a `DiscReflectance` in the bands of a scene: a single term with a weight per band.
+class SingleTerm:
+    """Hold what the reflectances of a single term share: the weight of the term in each band of a scene.
 
-    `reflectance` float64[band] in [0, 1] is the normal reflectance A at zero phase.
+    `reflectance` float64[band] in [0, 1] is A, the reflectance that the model scales.
     """
 
-    model: DiscReflectance
     reflectance: F64
 
     terms: ClassVar[int] = 1
@@ -194,6 +193,13 @@ class Diffuse:
     def weights(self) -> F64:
         """Return the reflectance r of each band per unit of the term, float64[1, band]."""
         return self.reflectance[None, :] / np.pi
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Diffuse(SingleTerm):
+    """Evaluate a `DiscReflectance` in the bands of a scene; A is the normal reflectance at zero phase."""
+
+    model: DiscReflectance
 
     def evaluate(self, m: Any, light: Triple, view: Triple) -> list[Any]:
         """Return the single term π r / A; it is 0 where the light comes from below the surface."""

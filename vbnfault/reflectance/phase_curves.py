@@ -11,13 +11,13 @@ from __future__ import annotations
 import itertools
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from .contract import LEAST_COSINE, Reflectance, Triple, tan_half_phase
+from .contract import LEAST_COSINE, Reflectance, SingleTerm, Triple, tan_half_phase
 
 F64 = NDArray[np.float64]
 
@@ -42,21 +42,10 @@ class SphereCurve(Reflectance, ABC):
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class SphereDiffuse:
-    """Evaluate a `SphereCurve` in the bands of a scene: a single term with a weight per band.
-
-    `reflectance` float64[band] in [0, 1] is the geometric albedo of a sphere.
-    """
+class SphereDiffuse(SingleTerm):
+    """Evaluate a `SphereCurve` in the bands of a scene; A is the geometric albedo of a sphere."""
 
     model: SphereCurve
-    reflectance: F64
-
-    terms: ClassVar[int] = 1
-
-    @property
-    def weights(self) -> F64:
-        """Return the reflectance r of each band per unit of the term, float64[1, band]."""
-        return self.reflectance[None, :] / np.pi
 
     def evaluate(self, m: Any, light: Triple, view: Triple) -> list[Any]:
         """Return the single term π r / A; it is 0 where the light comes from below the surface."""

@@ -66,7 +66,7 @@ class AlbedoMap:
         self._site = [float(x) for x in site_T_m]
 
     def factors(self, point_L_m: Any, footprint_m: Any, valid: Any) -> list[Any]:
-        """Return a factor per band at the valid points in L, or a single one if the map is grey.
+        """Return the factors on the albedo at points in L: one for each band, or a single one if the map is grey.
 
         `footprint_m` is the distance between neighbouring rays at the points. Details of the map that are finer are
         averaged.

@@ -43,6 +43,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from . import chosen_fault, ranking
+from .bootstrap import bootstrap
 from .control_variates import LEAST_SAMPLES, Surrogates, fit, make_basis
 from .designs import Design, levels, salib, unit_problem
 from .sobol_terms import SobolTerms, complete_samples, explained_variance, ratios, sobol_terms, split
@@ -188,12 +189,11 @@ def _attributes(name: str) -> dict[str, str]:
 def _intervals(statistic: Any, n: int, design: Design) -> _Array:
     """Return percentile bootstrap intervals, float64[..., 2], over `n` base samples.
 
-    `statistic` gets how often each base sample was drawn, float64[resample, n], and returns the estimates, with the
-    resamples along the last axis. All metrics and models get the same resamples.
+    `statistic` is that of `bootstrap`. All metrics and models get the same resamples.
     """
     if n < 2:
         return np.full((*np.shape(statistic(np.ones((1, n))))[:-1], 2), np.nan)
-    interval = _bootstrap(statistic, n, design).confidence_interval
+    interval = bootstrap(statistic, n, design.spec.design).confidence_interval
     return np.stack([interval.low, interval.high], axis=-1)
 
 
@@ -213,38 +213,11 @@ def _studentised_intervals(terms: SobolTerms, design: Design) -> _Array:
             ratio = np.abs(terms.estimates(counts) - index) / terms.deviations(counts)
         return np.where(np.isfinite(ratio), ratio, 0.0)
 
-    drawn = _bootstrap(distances, n, design).bootstrap_distribution
+    drawn = bootstrap(distances, n, design.spec.design).bootstrap_distribution
     half = np.quantile(drawn, design.spec.design.confidence, axis=-1) * deviation[:, 0]
     # an index of which the surrogates know all is exact up to rounding
     half = np.maximum(half, _ROUNDING)
     return np.stack([index[:, 0] - half, index[:, 0] + half], axis=-1)
-
-
-def _bootstrap(statistic: Any, n: int, design: Design) -> Any:
-    """Return what `scipy.stats.bootstrap` makes of a statistic, as `_intervals` describes it."""
-    from scipy.stats import DegenerateDataWarning, bootstrap
-
-    def of_indices(index: NDArray[np.int64], axis: int) -> _Array:
-        rows = np.atleast_2d(index)
-        flat = rows + n * np.arange(len(rows))[:, None]
-        counts = np.bincount(flat.ravel(), minlength=n * len(rows)).reshape(len(rows), n)
-        estimates: _Array = statistic(counts.astype(np.float64))
-        return estimates if index.ndim == 2 else estimates[..., 0]
-
-    table = design.spec.design
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DegenerateDataWarning)  # a metric that does not vary: its interval is nan
-        return bootstrap(
-            (np.arange(n),),
-            of_indices,
-            n_resamples=table.resamples,
-            batch=256,
-            vectorized=True,
-            axis=-1,
-            confidence_level=table.confidence,
-            method="percentile",
-            rng=np.random.default_rng(table.seed),
-        )
 
 
 # --- Sobol' indices -----------------------------------------------------------------------------------------------

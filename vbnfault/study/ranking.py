@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from . import chosen_fault
+from .bootstrap import bootstrap
 
 if TYPE_CHECKING:
     from .indices import Results
@@ -95,34 +96,16 @@ def _resampled(values: F64, results: Results) -> tuple[F64, F64, F64]:
 
     `values` is [fault, view].
     """
-    from scipy.stats import bootstrap
-
     count = values.shape[1]
     quantiles = np.stack([weighted_quantiles(row, np.ones((1, count)))[:, 0] for row in values])
     table = results.design.spec.design
     if count < 2:
         return quantiles, np.full((*quantiles.shape, 2), np.nan), quantiles[:, [QUANTILES.index(0.5)]]
 
-    def of_views(index: NDArray[np.int64], axis: int) -> F64:
-        drawn = np.atleast_2d(index)
-        flat = drawn + count * np.arange(len(drawn))[:, None]
-        times = np.bincount(flat.ravel(), minlength=count * len(drawn)).reshape(len(drawn), count)
-        estimates = np.stack([weighted_quantiles(row, times.astype(np.float64)) for row in values])
-        return estimates if index.ndim == 2 else estimates[..., 0]
+    def of_views(counts: F64) -> F64:
+        return np.stack([weighted_quantiles(row, counts) for row in values])
 
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # scipy's own on equal values: the interval is that value
-        done = bootstrap(
-            (np.arange(count),),
-            of_views,
-            n_resamples=table.resamples,
-            batch=256,
-            vectorized=True,
-            axis=-1,
-            confidence_level=table.confidence,
-            method="percentile",
-            rng=np.random.default_rng(table.seed),
-        )
+    done = bootstrap(of_views, count, table)
     medians = done.bootstrap_distribution[:, QUANTILES.index(0.5)]
     return quantiles, _interval(done.bootstrap_distribution, table.confidence), medians
 

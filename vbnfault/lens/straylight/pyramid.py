@@ -66,7 +66,7 @@ class Pyramid:
 
 
 def summed(canvas: Canvas, levels: Sequence[F32]) -> F32:
-    """Return the sum of levels float32[layer, y, x] on the pixels of the frame, float32[layer, y, x]."""
+    """Return the sum of levels of resolution, each resized to the frame; both are float32[layer, y, x]."""
     out = np.empty((len(levels[0]), *canvas.shape), dtype=np.float32)
 
     def resize(layer: int) -> None:
