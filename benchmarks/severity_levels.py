@@ -33,6 +33,8 @@ def reproduced(
             for value in levels.values
             if not math.isnan(value)
         )
+        if not values:  # the model reaches no level
+            continue
         tested.append(severity.ModelUnderTest(fault=model.fault, model=model.model, keys={}, values=values))
     job, _ = severity.evaluate_models(tested, views, table.metric, BuildOptions(workers=workers))
     errors: dict[str, dict[str, list[tuple[float, float, float]]]] = {}
@@ -54,23 +56,24 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--table", type=Path, required=True, help="table of levels")
     parser.add_argument("--models", nargs="*", default=["all"], help="models or classes; default: all of the table")
-    parser.add_argument("--lenses", nargs="*", default=["thin", "distagon_25_f2p8"], help="lenses")
+    parser.add_argument("--lenses", nargs="*", help="lenses; default: those of the table")
     parser.add_argument("--views", type=int, default=64, help="number of views behind each lens")
     parser.add_argument("--seed", type=int, default=99, help="seed of views and sites")
-    parser.add_argument("--width-px", type=int, default=256, help="width and height of the images")
+    parser.add_argument("--width-px", type=int, help="width and height of the images; default: that of the table")
     parser.add_argument("--fov-deg", type=float, default=65.0, help="field of view")
     parser.add_argument("--workers", type=int, default=1, help="number of processes")
     parser.add_argument("--json", type=Path, help="file for the figures")
     given = parser.parse_args()
     table = read_table(given.table)
+    width_px = given.width_px or table.width_px
     overrides = {
-        "camera.width_px": given.width_px,
-        "camera.height_px": given.width_px,
+        "camera.width_px": width_px,
+        "camera.height_px": width_px,
         "camera.fov_deg": given.fov_deg,
         "dataset.seed": given.seed,
         "patch.max_triangles": 200_000,
     }
-    lenses = tuple("" if lens == "thin" else lens for lens in given.lenses)
+    lenses = tuple("" if lens == "thin" else lens for lens in given.lenses or table.lenses)
     views = severity.ViewOptions(scene=table.scene, overrides=overrides, lenses=lenses, views=given.views)
     errors = reproduced(table, views, given.models, given.workers)
     print("| model | lens | level: error / error of the level [95 % interval] |\n|---|---|---|")

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import math
+import shlex
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +17,7 @@ from typer.testing import CliRunner
 
 import vbnfault
 from vbnfault.cli import app
+from vbnfault.cli.options import overrides as read_overrides
 from vbnfault.core.errors import InputError, VbnfaultError
 from vbnfault.core.registry import DeclarationError
 from vbnfault.faults import Fault, Levels, Severity, SeverityTable, from_dict, number, read_table, registry
@@ -36,7 +39,7 @@ NAN = float("nan")
 
 
 def packaged() -> SeverityTable:
-    return Levels().table()
+    return Levels().table
 
 
 def table_file(folder: Path, **changes: Any) -> Path:
@@ -374,6 +377,30 @@ def test_models_are_named() -> None:
         severity.models_of("quickstart", ["vigneting"])
     with pytest.raises(InputError, match=r"flares: none of its faults|quickstart: none of its faults"):
         severity.models_of("quickstart", overrides={"faults": {}})
+
+
+def test_a_model_without_a_value_does_not_cost_the_levels_of_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Job:
+        def of_lens(self, lens: int, name: str) -> list[list[tuple[float, float]]]:
+            return measured(curve(0.8), curve(1.0), curve(1.3)) if name == DUST.name else []
+
+    lines = ModelUnderTest(fault="broken_lines", model="texture", keys={})
+    monkeypatch.setattr(severity, "evaluate_models", lambda models, *_: (Job(), {m.name: "" for m in models}))
+    views = severity.ViewOptions(scene="quickstart", overrides={"camera.width_px": 256, "patch.boulders": False})
+    with pytest.warns(UserWarning, match="broken_lines/texture: matches_lost has no value on any view; it gets no"):
+        table = severity.compute_levels([lines, DUST], views, Criterion())
+    assert {fault: list(models) for fault, models in table.levels.items()} == {"dust_on_optics": ["gaussian"]}
+    with pytest.raises(VbnfaultError, match="has no value on any view"):
+        severity.compute_levels([lines], views, Criterion())
+
+
+def test_the_recorded_command_has_values_as_the_command_line_reads_them() -> None:
+    overrides = {"dataset.layers": ["clean"], "plan.pair_strata": True, "camera.detector": "generic_ccd"}
+    command = severity._command([DUST], severity.ViewOptions(scene="a b", overrides=overrides), Criterion())
+    words = shlex.split(command)
+    assert words[:3] == ["vbnfault", "severity", "a b"]
+    given = [word for option, word in itertools.pairwise(words) if option == "--set"]
+    assert read_overrides(given) == overrides
 
 
 def test_tables_are_merged_if_they_were_made_alike(tmp_path: Path) -> None:

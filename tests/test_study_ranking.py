@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,8 @@ from conftest import small_scene
 
 from vbnfault.core.errors import InputError
 from vbnfault.faults import registry
-from vbnfault.study import plots, ranking, report, results, run
+from vbnfault.scene import plan
+from vbnfault.study import chosen_fault, plots, ranking, report, results, run
 from vbnfault.study.evaluate import SceneEvaluator
 from vbnfault.study.spec import Evaluation, Metric, StudySpec, load_study, parse_study
 from vbnfault.study.summaries import StudyResults
@@ -158,6 +160,33 @@ def test_a_view_is_rendered_once_for_all_faults_and_a_fault_that_cannot_act_has_
     scene_of = made.factors.scene_of(5, "", (("fault", "broken_lines"),))
     assert scene_of.faults == {"broken_lines": {"model": "texture", "count": [9, 9]}}  # the scene's own bounds
     assert made.factors.scene_of(5, "", ()).faults == {}
+
+
+def test_a_key_of_any_chosen_fault_is_read(tmp_path: Path) -> None:
+    """Neither where the others are nominal nor where they are large does the fault with this key act."""
+    scene = small_scene(dataset={"samples": 1, "sites": 1}, camera={"width_px": 64, "height_px": 64})
+    (tmp_path / "scene.toml").write_text(tomli_w.dumps(scene), encoding="utf-8")
+    values = ["dust_on_optics", "broken_lines", "vignetting"]
+    count = {"key": "scene.faults.broken_lines.count", "distribution": "uniform", "low": 1.0, "high": 9.0}
+    made = SceneEvaluator(
+        spec(
+            scene={"base": str(tmp_path / "scene.toml"), "samples": [0], "seeds": [5]},
+            factor=[CHOICE | {"values": values}, count],
+            metrics={"names": ["centroid_shift_px"]},
+        )
+    )
+    assert made.check() == []
+
+
+@pytest.mark.parametrize("is_flown", [True, False])
+def test_on_a_trajectory_the_sun_alone_decides(is_flown: bool) -> None:
+    """Poses of a table or of SPICE have no strata: all count as averted from the Sun."""
+    view: Any = SimpleNamespace(
+        index=0, scene=SimpleNamespace(is_flown=is_flown), plan=SimpleNamespace(stratum=[plan.SUN_AVERTED])
+    )
+    pose: Any = SimpleNamespace(sun_visible_fraction=1.0, L_from_C=np.eye(3), sun_L=np.array([0.0, 0.0, 1.0]))
+    faults: Any = {"straylight": SimpleNamespace(needs_sun=True), "vignetting": SimpleNamespace(needs_sun=False)}
+    assert chosen_fault.acting(faults, view, pose) == (["straylight"] if is_flown else []) + ["vignetting"]
 
 
 def test_the_packaged_ranking_names_every_class_that_its_camera_can_have() -> None:

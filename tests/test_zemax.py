@@ -372,7 +372,9 @@ def test_a_glass_and_a_formula_register_in_one_place() -> None:
         ),
         ({"formula": "sellmeier", "coefficients": (-9.0,) * 6}, r"glass 'jelly': its index must be .*; got nan"),
         ({"coefficients": (0.4, 0.0)}, r"glass 'jelly': its index must be from 1 to 5 between 400 .*; got 0.4"),
+        ({"coefficients": (6.5, 0.0)}, r"glass 'jelly': its index must be from 1 to 5 between 400 .*; got 6.5"),
         ({"internal_transmittance_10mm": ((500.0, 400.0), (1.0, 1.0))}, r"needs rising wavelengths and as many"),
+        ({"internal_transmittance_10mm": 0.9}, r"internal_transmittance_10mm: must be wavelengths and values"),
         (
             {"internal_transmittance_10mm": ((400.0,), (1.2,))},
             r"internal_transmittance_10mm = \[1.2\]: must be from",

@@ -6,6 +6,7 @@ The packaged table is `scenes/severity/levels.toml`. `vbnfault severity` writes 
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 from collections.abc import Mapping
 from pathlib import Path
@@ -65,8 +66,9 @@ class Levels:
     path: Path | None = None
     width_px: int = REFERENCE_WIDTH_PX
 
+    @functools.cached_property
     def table(self) -> SeverityTable:
-        """Return the table. Raises InputError where the file is missing or wrong."""
+        """Return the table, read at the first use. Raises InputError if the file is missing or wrong."""
         return read_table(self.path or resources.find("scenes/severity", "levels"))
 
 
@@ -111,7 +113,7 @@ def with_severity(
 
 def _value(levels: Levels, model: type[Fault], severity: Severity, level: int, where: str) -> float:
     """Return the value of a level for the width of the frames. Raises InputError, which begins with `where`."""
-    table = levels.table()
+    table = levels.table
     of_model = table.levels.get(model.fault, {}).get(model.model)
     if of_model is None:
         source = levels.path or "the packaged table"

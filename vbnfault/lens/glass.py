@@ -200,7 +200,8 @@ def check_index(glass: Glass, where: str) -> None:
     with np.errstate(all="ignore"):  # a formula may divide by 0 or take the root of a negative number
         index = glass.index(np.linspace(400, 1000, 61))
     if not (np.isfinite(index).all() and index.min() >= _INDEX_RANGE[0] and index.max() <= _INDEX_RANGE[1]):
-        raise InputError(f"{where}: its index must be from 1 to 5 between 400 and 1000 nm; got {index.min():g}")
+        wrong = index.max() if index.max() > _INDEX_RANGE[1] else index.min()
+        raise InputError(f"{where}: its index must be from 1 to 5 between 400 and 1000 nm; got {wrong:g}")
 
 
 def _check_glass(glass: Glass) -> None:
@@ -212,7 +213,10 @@ def _check_glass(glass: Glass) -> None:
         raise InputError(f"{where}: coefficients = {shown(glass.coefficients)}: must be numbers")
     from_coefficients(glass.formula, glass.coefficients)
     check_index(glass, where)
-    nodes, values = (np.asarray(column, dtype=np.float64) for column in glass.internal_transmittance_10mm)
+    try:
+        nodes, values = (np.asarray(column, dtype=np.float64) for column in glass.internal_transmittance_10mm)
+    except (TypeError, ValueError):
+        raise InputError(f"{where}: internal_transmittance_10mm: must be wavelengths and values") from None
     if nodes.ndim != 1 or nodes.shape != values.shape or not len(nodes) or not (np.diff(nodes) > 0).all():
         raise InputError(f"{where}: internal_transmittance_10mm: needs rising wavelengths and as many values")
     if not ((values >= 0) & (values <= 1)).all():

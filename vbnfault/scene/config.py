@@ -195,7 +195,7 @@ def _without_levels(table: Mapping[str, Any], source: str, overrides: Sequence[s
     levels = Levels(path=path, width_px=rest.camera.width_px)
     if path is not None:
         try:
-            levels.table()  # a wrong file is refused even if no fault names a level
+            _ = levels.table  # a wrong file is refused even if no fault names a level
         except InputError as error:
             raise InputError(f"{source}: severity.file: {error}") from None
     if isinstance(faults, Mapping):

@@ -85,5 +85,5 @@ def acting(faults: Mapping[str, Fault], spec: SampleSpec, pose: Pose) -> Sequenc
     is before the camera. A trajectory has no such views, so there the Sun alone decides.
     """
     ahead = pose.sun_visible_fraction == 1 and float(pose.L_from_C[:, 2] @ pose.sun_L) > 0
-    faces = bool(spec.scene.spice.spacecraft) or spec.plan.stratum[spec.index] == plan.SUN_FACING
+    faces = spec.scene.is_flown or spec.plan.stratum[spec.index] == plan.SUN_FACING
     return [name for name, fault in faults.items() if (ahead and faces) or not fault.needs_sun]

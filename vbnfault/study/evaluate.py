@@ -144,7 +144,8 @@ class SceneEvaluator:
                 places[factor.key] = self._places_without(factor)
             except InputError as error:
                 raise InputError(f"factor[{i}].key = {shown(factor.key)}: {error}") from None
-            if len(places[factor.key]) == 2 * len(self.spec.model_names):
+            # with a chosen fault, that may only mean that no fault with this key acts in the first view
+            if len(places[factor.key]) == 2 * len(self.spec.model_names) and not self._chosen_faults:
                 raise InputError(
                     f"factor[{i}].key = {shown(factor.key)}: nothing in the images of the study reads it; "
                     "leave it out"
@@ -165,16 +166,22 @@ class SceneEvaluator:
         for model in self.spec.model_names:
             with_model = f" with the model {model}" if model else ""
             self._refuse(model, middle | {factor.key: _value(factor, 0.0)})
-            with self.kept.holding("check"):
-                base = self._fingerprint(model, middle)
-            if self._fingerprint(model, middle | {factor.key: _value(factor, 0.98)}) != base:
+            if self._acts(model, middle, factor.key, _value(factor, 0.98)):
                 continue
             places.add(f"where the others are nominal{with_model}")
-            if self._fingerprint(model, upper) == self._fingerprint(
-                model, upper | {factor.key: _value(factor, 0.1)}
-            ):
+            if not self._acts(model, upper, factor.key, _value(factor, 0.1)):
                 places.add(f"where the others are large{with_model}")
         return places
+
+    def _acts(self, model: str, point: Mapping[str, float | str], key: str, value: float | str) -> bool:
+        """Return whether another value of a factor changes a bit of the light at a point, with any chosen fault."""
+        for choice in self._chosen_faults or ("",):
+            at = {**point, chosen_fault.KEY: choice} if choice else point
+            with self.kept.holding("check"):
+                base = self._fingerprint(model, at)
+            if self._fingerprint(model, {**at, key: value}) != base:
+                return True
+        return False
 
     def evaluate(self, evaluation: Evaluation) -> Mapping[str, float]:
         """Return the value of each metric that the study names."""

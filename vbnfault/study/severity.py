@@ -11,6 +11,7 @@ from __future__ import annotations
 import itertools
 import os
 import shlex
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -331,17 +332,25 @@ def compute_levels(
         merged(path, table)  # refuses another table before the work
     job, detectors = evaluate_models(models, views, criterion.metric, options or BuildOptions(), path)
     levels: dict[str, dict[str, ModelLevels]] = {}
+    without: list[VbnfaultError] = []
     for model in models:
         by_view = [view for lens in range(len(lenses)) for view in job.of_lens(lens, model.name)]
-        levels.setdefault(model.fault, {})[model.model] = levels_of(
-            model, by_view, criterion, camera.width_px, detectors[model.name]
-        )
+        try:
+            found = levels_of(model, by_view, criterion, camera.width_px, detectors[model.name])
+        except VbnfaultError as error:  # the levels of the other models are not lost
+            without.append(error)
+            continue
+        levels.setdefault(model.fault, {})[model.model] = found
+    if not levels:
+        raise without[0]
+    for reason in without:
+        warnings.warn(f"{reason}; it gets no levels", stacklevel=2)
     table = table.model_copy(update={"levels": levels})
     return table if path is None else merged(path, table)
 
 
 def _command(models: Sequence[ModelUnderTest], views: ViewOptions, criterion: Criterion) -> str:
-    """Return the command line that computes levels."""
+    """Return the command line that computes levels, without the name of its file."""
     words = ["vbnfault", "severity", views.scene, "--views", str(views.views)]
     words += ["--metric", criterion.metric, "--quantile", f"{criterion.quantile:g}"]
     for model in models:
@@ -349,7 +358,7 @@ def _command(models: Sequence[ModelUnderTest], views: ViewOptions, criterion: Cr
     for lens in views.lenses:
         words += ["--lens", lens or "thin"]
     for key, value in views.overrides.items():
-        words += ["--set", f"{key}={value}"]
+        words += ["--set", f"{key}={toml_files.toml_text({'value': value}).partition(' = ')[2].strip()}"]
     return shlex.join(words)
 
 
