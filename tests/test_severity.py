@@ -20,12 +20,13 @@ from vbnfault.cli import app
 from vbnfault.cli.options import overrides as read_overrides
 from vbnfault.core.errors import InputError, VbnfaultError
 from vbnfault.core.registry import DeclarationError
+from vbnfault.dataset.progress import Progress
 from vbnfault.faults import Fault, Levels, Severity, SeverityTable, from_dict, number, read_table, registry
 from vbnfault.faults.models import undoing_registrations
 from vbnfault.lens.thin import cos4_map
-from vbnfault.study import severity
+from vbnfault.study import severity, severity_views
 from vbnfault.study.severity import Criterion, levels_of
-from vbnfault.study.severity_views import ModelUnderTest, measure
+from vbnfault.study.severity_views import ModelUnderTest, SeverityJob, ViewGroup, ViewWorker, measure
 
 PAPER = {
     "dust_on_optics/gaussian",
@@ -401,6 +402,30 @@ def test_the_recorded_command_has_values_as_the_command_line_reads_them() -> Non
     assert words[:3] == ["vbnfault", "severity", "a b"]
     given = [word for option, word in itertools.pairwise(words) if option == "--set"]
     assert read_overrides(given) == overrides
+
+
+def test_a_group_done_again_counts_each_view_once_and_names_those_left_out(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    group = ViewGroup(
+        scene="quickstart", overrides={}, lens=0, facing_sun=False, site=0, first=3, count=4, models=(DUST,)
+    )
+    progress = Progress(4, shown=False)
+    advanced: list[bool] = []
+    said: list[str] = []
+    monkeypatch.setattr(progress, "advance", advanced.append)
+    monkeypatch.setattr(progress, "say", said.append)
+    job = SeverityJob(tmp_path, [group], progress)
+    worker = ViewWorker("matches_lost")
+    monkeypatch.setattr(worker, "_session_of", lambda _: None)
+    monkeypatch.setattr(worker, "_errors", lambda *_: {DUST.name: [(1.0, 0.5)]})
+    monkeypatch.setattr(severity_views, "sequences", lambda *_: iter([()] * 4))
+    job.tick(3, "built", '{"dust_on_optics/gaussian": [[1.0, 0.5]]}')
+    job.tick(4, "failed", "the process ended")  # as the pool reports a view whose process died twice
+    worker.do(job.task(0, frozenset({4})), job.tick)
+    assert advanced == [True, False, False, False]
+    assert [line.partition(" failed")[0] for line in said] == ["view 4", "view 5", "view 6"]
+    assert job.of_lens(0, DUST.name) == [[(1.0, 0.5)]]
 
 
 def test_tables_are_merged_if_they_were_made_alike(tmp_path: Path) -> None:

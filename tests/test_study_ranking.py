@@ -167,7 +167,7 @@ def test_a_key_of_any_chosen_fault_is_read(tmp_path: Path) -> None:
     scene = small_scene(dataset={"samples": 1, "sites": 1}, camera={"width_px": 64, "height_px": 64})
     (tmp_path / "scene.toml").write_text(tomli_w.dumps(scene), encoding="utf-8")
     values = ["dust_on_optics", "broken_lines", "vignetting"]
-    count = {"key": "scene.faults.broken_lines.count", "distribution": "uniform", "low": 1.0, "high": 9.0}
+    count = {"key": "scene.faults.broken_lines.count", "distribution": "categorical", "values": [1, 9]}
     made = SceneEvaluator(
         spec(
             scene={"base": str(tmp_path / "scene.toml"), "samples": [0], "seeds": [5]},

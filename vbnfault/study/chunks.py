@@ -73,7 +73,7 @@ class ChunkWorkers:
 
     def with_evaluator(self, evaluator: Evaluator) -> ChunkWorker:
         """Return a worker with an evaluator that exists already."""
-        return ChunkWorker(self, Lazy(lambda: evaluator))
+        return ChunkWorker(self, Lazy(lambda: evaluator), evaluator.timings())
 
     def _make(self) -> Evaluator:
         with self.contents.in_use():
@@ -83,9 +83,11 @@ class ChunkWorkers:
 class ChunkWorker:
     """Evaluate chunks; the evaluator is made when the first evaluation needs it."""
 
-    def __init__(self, source: ChunkWorkers, evaluator: Callable[[], Evaluator]) -> None:
+    def __init__(
+        self, source: ChunkWorkers, evaluator: Callable[[], Evaluator], seconds: Mapping[str, float] | None = None
+    ) -> None:
         self._source, self._evaluator = source, evaluator
-        self._seconds: Counter[str] = Counter()  # by stage, as written before
+        self._seconds = Counter[str](seconds)  # by stage, spent before this worker or written already
 
     def do(self, task: Chunk, tick: Tick) -> None:
         """Complete a chunk. If an interrupt ends it early, the finished evaluations are still written.

@@ -32,6 +32,7 @@ from ..dataset.progress import Progress
 from ..dataset.work import run_here
 from ..faults import LEVELS, ModelLevels, Severity, SeverityTable, dataset_order, read_table, registry
 from ..scene import config
+from ..scene.instrument import CameraTable
 from ..world import assemble
 from . import navigation_metrics
 from .severity_views import TRIES, ModelUnderTest, SeverityJob, ViewGroup, ViewWorkers
@@ -282,7 +283,8 @@ def evaluate_models(
     VbnfaultError
         Fewer than half of the views exist.
     """
-    detectors = {model.name: _detector(model, views) for model in models}
+    camera = config.load_scene(views.scene, views.overrides).camera
+    detectors = {model.name: _detector(model, camera) for model in models}
     groups = _groups(models, views, detectors)
     planned = sum(group.count for group in groups)
     job = SeverityJob(path or Path(views.scene), groups, Progress(planned, shown=options.progress, noun="views"))
@@ -398,9 +400,8 @@ def lines_of(table: SeverityTable) -> list[str]:
     return lines
 
 
-def _detector(model: ModelUnderTest, views: ViewOptions) -> str:
+def _detector(model: ModelUnderTest, camera: CameraTable) -> str:
     """Return the packaged sensor of a model that the scene's camera cannot have, else ""."""
-    camera = config.load_scene(views.scene, views.overrides).camera
     cls = model.type
     if cls.needs_mosaic and not camera.detector:
         return _MOSAIC

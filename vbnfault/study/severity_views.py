@@ -198,10 +198,12 @@ def _counts(frames: Sequence[navigation_metrics.NavigationFrame], metric: str) -
 # --- the error as a function of severity -------------------------------------------------------------------------
 
 
-def error_of(fault: Fault, views: Sequence[SequenceView], metric: str) -> float:
-    """Return the metric of a sequence of views with a fault."""
+def error_of(
+    fault: Fault, views: Sequence[SequenceView], metric: str, clean: navigation_metrics.CleanTwins
+) -> float:
+    """Return the metric of a sequence of views with a fault; `clean` are their twins without any."""
     frames = [view.frame(fault) for view in views]
-    return navigation_metrics.navigation_values(frames, [metric])[metric]
+    return navigation_metrics.navigation_values(frames, [metric], clean)[metric]
 
 
 def measure(model: ModelUnderTest, width_px: int, error: Callable[[Fault], float]) -> list[tuple[float, float]]:
@@ -281,7 +283,10 @@ class ViewWorker:
         views = sequences(group, self._metric, session)
         for number in range(group.first, group.first + group.count):
             if number in task.skip:
-                return
+                continue
+            if any(skipped < number for skipped in task.skip):  # the views of a site are found one after the other
+                tick(number, "failed", "left out: an earlier view of its site ended its process")
+                continue
             tick(number, "begun", "")
             sequence = next(views, None)
             tick(number, "built", "" if sequence is None else json.dumps(self._errors(group, sequence)))
@@ -296,8 +301,9 @@ class ViewWorker:
     def _errors(self, group: ViewGroup, views: Sequence[SequenceView]) -> dict[str, list[tuple[float, float]]]:
         """Return the values and errors of each model, by its name."""
         width_px = views[0].spec.scene.camera.width_px
+        clean = navigation_metrics.CleanTwins([v.clean for v in views], [v.frame(None).view for v in views])
         return {
-            model.name: measure(model, width_px, lambda fault: error_of(fault, views, self._metric))
+            model.name: measure(model, width_px, lambda fault: error_of(fault, views, self._metric, clean))
             for model in group.models
         }
 
@@ -311,6 +317,7 @@ class SeverityJob:
         self.path, self.progress, self._groups = path, progress, groups
         self._queue = Queue([0] * len(groups))
         self.errors: dict[int, dict[str, list[tuple[float, float]]]] = {}
+        self._counted: set[int] = set()
 
     @property
     def tasks(self) -> int:
@@ -336,10 +343,11 @@ class SeverityJob:
             self.progress.stage(text)
         elif what == "failed":
             self.progress.say(f"view {item} failed: {text.splitlines()[0]}")
-        elif what == "built":
-            if text:
-                self.errors[item] = json.loads(text)
-            self.progress.advance(True)
+        elif what == "built" and text:
+            self.errors[item] = json.loads(text)
+        if what in ("built", "failed") and item not in self._counted:  # a task whose process died is done again
+            self._counted.add(item)
+            self.progress.advance(what == "built")
 
     def of_lens(self, lens: int, name: str) -> list[list[tuple[float, float]]]:
         """Return the values and errors of a model on each view behind a lens, in the order of the views."""
