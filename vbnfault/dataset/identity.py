@@ -70,8 +70,10 @@ def scene_identity(session: pipeline.Session) -> dict[str, Any]:
         images = sorted(resources.data_dir(folder).glob("*.png"))
         data = b"".join(user_files.read_input(path, "texture") for path in images)
         scene[f"{folder}_sha256"] = user_files.sha256(data)
+    if session.scene.coma is None:
+        del scene["coma"]  # stores of scenes without one stay as they were
     if session.scene.trajectory is None:
-        del scene["trajectory"]  # stores of scenes without one stay as they were
+        del scene["trajectory"]
     else:
         scene["trajectory"]["file"] = _digest(session.scene.trajectory.file, "trajectory")
     del scene["plugins"]

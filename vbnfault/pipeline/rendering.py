@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from ..core.quantities import SKY, Radiance, Truth
 from ..render.description import RenderInput, View
 from ..world import assemble
+from .coma import add_coma
 from .exposure import exposure_s, rate_on_axis
 from .spec import Pose, Rendering, SampleSpec, SceneLight
 
@@ -59,7 +60,8 @@ def render_view(spec: SampleSpec, pose: Pose) -> Rendering:
     camera, scene, surface = spec.camera, describe(spec, pose), spec.terrain.surface
     angles = bool(_ANGLE_LAYERS & set(spec.scene.dataset.layers))
     stars = spec.scene.sky.stars != "off"
-    guide: Truth | None  # truth on the grid of the render, which light between surfaces and stars need
+    has_coma = spec.scene.coma is not None
+    guide: Truth | None  # truth on the grid of the render, which bounces, stars and a coma need
     if camera.lens.resamples:
         truth = render.truth(
             surface,
@@ -69,7 +71,8 @@ def render_view(spec: SampleSpec, pose: Pose) -> Rendering:
             slopes=camera.seen_slopes,
             projection=camera.projection,
         )
-        guide = render.truth(surface, scene.view, scene.sun) if scene.bounces or stars else None
+        needed = scene.bounces or stars or has_coma
+        guide = render.truth(surface, scene.view, scene.sun) if needed else None
     else:
         truth = guide = render.truth(surface, scene.view, scene.sun, angles=angles)
     if spec.scene.render.noise_fraction is None:
@@ -78,9 +81,12 @@ def render_view(spec: SampleSpec, pose: Pose) -> Rendering:
         )
     else:
         sampled = sample_to_noise(spec, scene, truth, guide, spec.scene.render.noise_fraction)
+    rendered = sampled.radiance
+    if has_coma and guide is not None:
+        rendered = add_coma(spec, pose, scene, guide, rendered)
     return Rendering(
         scene=scene,
-        light=SceneLight(lens=camera.lens, rendered=sampled.radiance),
+        light=SceneLight(lens=camera.lens, rendered=rendered),
         truth=truth,
         open_sky=guide.semantic == SKY if stars and guide is not None else None,
         samples_per_pixel=sampled.samples_per_pixel,

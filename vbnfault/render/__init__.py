@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from .light import direct
     from .resolve import ground_height_m, is_between, is_clear, sun_visible_fraction, sunlit_ground
     from .runtime import set_threads
+    from .sun_heights import heights_towards_sun
     from .surface import TerrainMesh
     from .vehicle import Vehicle
 
@@ -30,6 +31,7 @@ _HOMES = {
     "Vehicle": "vehicle",
     "direct": "light",
     "ground_height_m": "resolve",
+    "heights_towards_sun": "sun_heights",
     "indirect": "bounces",
     "is_between": "resolve",
     "is_clear": "resolve",
@@ -89,6 +91,7 @@ __all__ = [
     "Vehicle",
     "direct",
     "ground_height_m",
+    "heights_towards_sun",
     "indirect",
     "is_between",
     "is_clear",

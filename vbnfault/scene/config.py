@@ -19,6 +19,7 @@ from ..core.errors import InputError, shown
 from ..core.tables import Table
 from ..reflectance import is_packaged
 from .bodies import with_named_body
+from .coma import ComaTable
 from .instrument import OF_A_SENSOR_FILE, CameraTable, RenderTable
 from .sampling import DatasetTable, GeometryTable, PlanTable, StratumTable
 from .surroundings import OrbitTable, SkyTable, SpacecraftTable, SpiceTable, SunTable
@@ -56,6 +57,7 @@ class Scene(Table):
     dataset: DatasetTable = DatasetTable()
     body: BodyTable = BodyTable()
     patch: PatchTable = PatchTable()
+    coma: ComaTable | None = None
     sun: SunTable = SunTable()
     orbit: OrbitTable | None = None
     spice: SpiceTable = SpiceTable()

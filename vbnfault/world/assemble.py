@@ -27,6 +27,7 @@ from ..scene.surroundings import OrbitTable, PoseTable, SpiceTable, SunTable
 from ..scene.target import BodyTable
 from ..scene.trajectory import FlownPose
 from . import sky
+from .coma import check_coma
 from .ground import looked_at
 from .spacecraft import HingePose, ModelPlacement, Spacecraft, SpacecraftMesh, default_spacecraft, load_spacecraft
 from .surface_map import load_albedo_map
@@ -242,7 +243,15 @@ def render_albedo(scene: Scene, site: Site) -> AlbedoMap | None:
 
 
 def make_body(scene: Scene) -> Body:
-    """Return the scene's body. Raises InputError, also for a wrong map of its albedo."""
+    """Return the scene's body. Raises InputError, also for a wrong map of its albedo or a coma it cannot have."""
+    body = _body(scene)
+    if scene.coma is not None:
+        check_coma(body, sun_distance_au(scene))
+    return body
+
+
+def _body(scene: Scene) -> Body:
+    """Return the scene's body without a check of its coma."""
     table = scene.body
     if table.albedo_map is not None:
         load_albedo_map(table.albedo_map)  # refused before any sample is rendered

@@ -1,0 +1,459 @@
+"""Compute the sunlight that optically thin dust around a body scatters along lines of sight.
+
+The dust flows out freely and evenly in time from the body's centre of mass (the density part of Haser 1957). In the
+direction u from the centre and at the distance r its density is proportional to G(u) / r². A line that passes the
+centre at the distance b, seen from there, sweeps the angle θ, and a piece of it contributes G dθ / b: the angle is
+the variable in which all integrals are taken. Afρ (A'Hearn et al. 1984, AJ 89, 579) sets the scale. Its definition,
+Afρ = (2 Δ r_h)² F / (ρ F☉), and a column that falls as 1/b make the radiance of a line without ends, with G = 1,
+
+    L = E Afρ Φ(α) / (8 π b),
+
+with the Sun's irradiance E at the comet and the phase function Φ, which is 1 at zero phase. So a piece of the line
+that sweeps the angle θ contributes E Afρ Φ θ / (8 π² b). The mean of G over all directions is 1 without jets:
+
+    G = 1 - f + 3 f (1 + u·s)² / 4 + Σ_j w_j max(a_j·s, 0) N_j exp(k_j (u·a_j - 1)),
+
+with the direction s to the Sun, the fraction f of dust that leaves towards the Sun, and jets of strength w_j around
+the axes a_j; N_j makes the mean of their shape 1. The square (an assumed form) is 3 below the Sun, 3/4 at the
+terminator and 0 at midnight: gas that leaves sunlit ground expands sideways, too. The part of a line that lies in
+the body's shadow is taken away.
+
+Left out: extinction and multiple scattering, since the optical depth is small (Afρ / (2 A b) with A four times the
+grains' geometric albedo: 0.0016 for each metre of Afρ at 2 km with an albedo of 0.04); the curved trajectories of
+dust under radiation pressure, thousands of kilometres away; the acceleration region within some body radii (Gerig
+et al. 2018, Icarus 311, 1); and the Sun's angular radius in the shadow.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from ..body import Body, Site
+from ..core import spectra
+from ..core.errors import InputError
+from ..core.frames import unit
+from ..scene.coma import ComaTable
+from ..scene.keyed_random import rng
+from .dust_phase import relative_phase
+
+F64 = NDArray[np.float64]
+F32 = NDArray[np.float32]
+
+REFERENCE_NM = 550.0
+# Within this fraction of the radius of a sphere of the body's volume, the density stays as it is there. Only lines
+# that pass a body which does not hold its own centre of mass are ever so near.
+_CORE = 0.1
+# Cells along each side of the map of the shadow, and its half width over the greatest radius of the body.
+SHADOW_CELLS = 384
+_SHADOW_MARGIN = 1.06
+# Steps along the part of a line of sight that the shadow can reach.
+_SHADOW_STEPS = 48
+# Nodes of Gauss and Legendre across a jet, which cover it down to this logarithm of its density. Compared with
+# `scipy.integrate.quad` the error is below 1e-5 of the light of the line.
+_JET_NODES, _JET_DEPTH = 16, 14.0
+# A jet that is fainter than this, of its density on the axis, is left out.
+_FAINTEST = 1e-7
+# Lines of sight that pass the centre at less than this, in units of the camera's distance from it, count as passing
+# at it; the formulas divide by it.
+_LEAST_SINE = 1e-6
+# Lines of sight that are computed at once, to bound memory.
+_LINES_AT_ONCE = 1 << 13
+# Speed of the gas at 1 au, which falls with the root of the Sun's distance (Cochran & Schleicher 1993, Icarus 105,
+# 235). Dust is slower. A body with a greater escape speed keeps it, and has no coma of this kind.
+_GAS_SPEED_M_S = 850.0
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Lines:
+    """Hold n lines of sight by the angle that they sweep, seen from the centre.
+
+    A point of a line lies in the direction `nearest` cos θ + `along` sin θ from the centre.
+
+    Attributes
+    ----------
+    nearest, along
+        float64[n, 3]: unit vectors from the centre to the line's nearest point, and along the line.
+    distance_m
+        float64[n]: distance of this point from the centre.
+    start_rad, swept_rad
+        float64[n]: θ of the camera, and the angle between the camera and the line's end.
+    """
+
+    nearest: F64
+    along: F64
+    distance_m: F64
+    start_rad: F64
+    swept_rad: F64
+
+    @classmethod
+    def between(cls, camera_m: F64, directions: F64, length_m: F64) -> Lines:
+        """Return lines from the camera, float64[3] from the centre, of a length that may be infinite."""
+        start = directions @ camera_m
+        offset = camera_m - start[:, None] * directions
+        distance = np.linalg.norm(offset, axis=1)
+        floor = _LEAST_SINE * max(float(np.linalg.norm(camera_m)), 1e-3)
+        # any vector at right angles to the line serves where the line meets the centre
+        other = np.cross(directions, np.eye(3)[np.argmin(np.abs(directions), axis=1)])
+        nearest = np.where((distance > floor)[:, None], offset, other)
+        distance = np.maximum(distance, floor)
+        endless = np.isinf(length_m)
+        length = np.where(endless, 0, length_m)
+        ended = np.arctan2(distance * length, distance**2 + start * (start + length))
+        angle = np.arctan2(start, distance)
+        return cls(
+            nearest=nearest / np.linalg.norm(nearest, axis=1, keepdims=True),
+            along=directions,
+            distance_m=distance,
+            start_rad=angle,
+            swept_rad=np.where(endless, np.pi / 2 - angle, ended),
+        )
+
+    def chosen(self, which: NDArray[np.bool_]) -> Lines:
+        """Return some of the lines."""
+        return Lines(
+            nearest=self.nearest[which],
+            along=self.along[which],
+            distance_m=self.distance_m[which],
+            start_rad=self.start_rad[which],
+            swept_rad=self.swept_rad[which],
+        )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Outflow:
+    """Describe the density of the dust by direction, in units of its mean without jets: G of the module docstring.
+
+    Attributes
+    ----------
+    sun
+        float64[3]: unit vector towards the Sun.
+    sunlit_fraction
+        Fraction of the dust that leaves towards the Sun.
+    axes, concentration, strength
+        float64[jet, 3], float64[jet], float64[jet]: unit vectors along the jets, k_j, and strengths, which include
+        the Sun's zenith angle.
+    """
+
+    sun: F64
+    sunlit_fraction: float
+    axes: F64
+    concentration: F64
+    strength: F64
+
+    def density(self, directions: F64) -> F64:
+        """Return the density in unit directions float64[n, 3], float64[n]."""
+        f = self.sunlit_fraction
+        total = 1 - f + 0.75 * f * (1 + directions @ self.sun) ** 2
+        for axis, k, peak in zip(self.axes, self.concentration, self._peaks, strict=True):
+            exponent = k * (directions @ axis - 1)
+            near = exponent > np.log(_FAINTEST)
+            total[near] += peak * np.exp(exponent[near])
+        return np.asarray(total)
+
+    def swept(self, lines: Lines) -> F64:
+        """Return the integral of the density over the angle that each line sweeps, float64[n]."""
+        f = self.sunlit_fraction
+        total = (1 - f) * lines.swept_rad
+        # u·s = A cos x along a line
+        x, y = lines.nearest @ self.sun, lines.along @ self.sun
+        amplitude = np.hypot(x, y)
+        middle = lines.start_rad + lines.swept_rad / 2 - np.arctan2(y, x)
+        first = np.cos(middle) * 2 * np.sin(lines.swept_rad / 2)
+        second = np.cos(2 * middle) * np.sin(lines.swept_rad)
+        square = (1 + amplitude**2 / 2) * lines.swept_rad + 2 * amplitude * first + amplitude**2 / 2 * second
+        total = total + 0.75 * f * square
+        for axis, k, peak in zip(self.axes, self.concentration, self._peaks, strict=True):
+            total = total + peak * _jet_integral(lines, axis, k)
+        return np.asarray(total)
+
+    @property
+    def _peaks(self) -> F64:
+        """Return the density on the axis of each jet, float64[jet]."""
+        k = self.concentration
+        return np.asarray(self.strength * 2 * k / -np.expm1(-2 * k))
+
+
+def _jet_integral(lines: Lines, axis: F64, concentration: float) -> F64:
+    """Return the integral of exp(k (u·a - 1)) over the angle that each line sweeps, float64[n]."""
+    x, y = lines.nearest @ axis, lines.along @ axis
+    amplitude = np.hypot(x, y)
+    out = np.zeros(len(amplitude))
+    near = np.flatnonzero(concentration * (1 - amplitude) < -np.log(_FAINTEST))
+    middle, amplitude = np.arctan2(y, x)[near], amplitude[near]
+    start = np.mod(lines.start_rad[near] - middle + np.pi, 2 * np.pi) - np.pi
+    reach = np.arccos(np.maximum(1 - _JET_DEPTH / np.maximum(concentration * amplitude, 1e-12), -1))
+    nodes, weights = _gauss_legendre()
+    total = np.zeros(len(near))
+    for turn in (0.0, 2 * np.pi):  # a line that begins past the jet's back may reach it from the other side
+        low = np.clip(start, turn - reach, turn + reach)
+        high = np.clip(start + lines.swept_rad[near], turn - reach, turn + reach)
+        half = (high - low) / 2
+        for node, weight in zip(nodes, weights, strict=True):
+            angle = low + half * (1 + node)
+            total += weight * half * np.exp(concentration * (amplitude * np.cos(angle) - 1))
+    out[near] = total
+    return out
+
+
+@lru_cache(maxsize=1)
+def _gauss_legendre() -> tuple[F64, F64]:
+    """Return nodes in [-1, 1] and weights of the quadrature across a jet."""
+    nodes, weights = np.polynomial.legendre.leggauss(_JET_NODES)
+    return nodes, weights
+
+
+# --- shadow -------------------------------------------------------------------------------------------------
+
+
+def sun_axes(sun: F64) -> F64:
+    """Return two unit vectors at right angles to the Sun's direction, and this one, float64[3, 3], as rows."""
+    first = unit(np.cross(sun, np.eye(3)[np.argmin(np.abs(sun))]))
+    return np.stack([first, np.cross(sun, first), sun])
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Shadow:
+    """Hold where the body keeps sunlight from the dust, for a Sun at infinity.
+
+    A point is lit if it lies nearer to the Sun than the body on the same line to the Sun, or outside its outline.
+
+    Attributes
+    ----------
+    axes
+        float64[3, 3], as of `sun_axes`.
+    half_m
+        Half the width of the map around the centre.
+    maps
+        float32[cell, cell, 2]: height of the body towards the Sun, and the distance from its outline, which is
+        negative within it. Columns run along the first axis, rows along the second.
+    """
+
+    axes: F64
+    half_m: float
+    maps: F32
+
+    @classmethod
+    def of(cls, heights_m: F32, axes: F64, half_m: float) -> Shadow:
+        """Return the shadow of a body by its heights towards the Sun, float32[cell, cell]; -inf where it is not."""
+        inside = np.isfinite(heights_m)
+        cell_m = 2 * half_m / len(heights_m)
+        if not inside.any():
+            filled, outline = np.zeros_like(heights_m), np.full_like(heights_m, half_m)
+            return cls(axes=axes, half_m=half_m, maps=np.stack([filled, outline], axis=-1))
+        away, nearest = ndimage.distance_transform_edt(~inside, return_indices=True)
+        within = ndimage.distance_transform_edt(inside)
+        outline = np.where(inside, 0.5 - within, away - 0.5) * cell_m
+        # heights go on beyond the outline, so that interpolation near it does not mix in what is not there
+        filled = heights_m[tuple(nearest)]
+        return cls(axes=axes, half_m=half_m, maps=np.stack([filled, outline], axis=-1).astype(np.float32))
+
+    def clearance_m(self, across: F32, down: F32, height: F32) -> F32:
+        """Return a number that is positive where points are lit, float32[n, k].
+
+        The points are given by their coordinates along the axes, float32[n, k] each. Near the edge of the shadow
+        the number is about the distance from it, in m.
+        """
+        cells = len(self.maps)
+        to_cell = np.float32(cells / (2 * self.half_m))
+        columns, rows = (v * to_cell + np.float32(cells / 2 - 0.5) for v in (across, down))
+        maps = cv2.remap(self.maps, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        return np.asarray(np.maximum(height - maps[..., 0], maps[..., 1]), dtype=np.float32)
+
+    def swept(self, lines: Lines, outflow: Outflow) -> F64:
+        """Return the integral of the density over the part of the angle that lies in shadow, float64[n]."""
+        out = np.zeros(len(lines.distance_m))
+        low, high = self._reach(lines)
+        met = high > low
+        if not met.any():
+            return out
+        part, low, high = lines.chosen(met), low[met], high[met]
+        angles = low[:, None] + (high - low)[:, None] * np.linspace(0, 1, _SHADOW_STEPS + 1)
+        limited = np.clip(angles, -np.pi / 2 + 1e-5, np.pi / 2 - 1e-5).astype(np.float32)
+        position = np.tan(limited) * part.distance_m.astype(np.float32)[:, None]
+        nearest, along = (v @ self.axes.T for v in (part.nearest * part.distance_m[:, None], part.along))
+        coordinates = [
+            nearest[:, k, None].astype(np.float32) + position * along[:, k, None].astype(np.float32)
+            for k in range(3)
+        ]
+        dark = 1 - _positive_fraction(self.clearance_m(*coordinates))
+        line, step = np.nonzero(dark > 0)
+        middle = (angles[line, step] + angles[line, step + 1]) / 2
+        directions = part.nearest[line] * np.cos(middle)[:, None] + part.along[line] * np.sin(middle)[:, None]
+        width = (high - low)[line] / _SHADOW_STEPS
+        sums = np.bincount(line, dark[line, step] * width * outflow.density(directions), len(low))
+        out[met] = sums
+        return out
+
+    def _reach(self, lines: Lines) -> tuple[F64, F64]:
+        """Return between which angles each line is where the body's shadow may lie, float64[n] each.
+
+        This is a cylinder around the body, open away from the Sun.
+        """
+        nearest, along = lines.nearest @ self.axes.T, lines.along @ self.axes.T
+        offset = lines.distance_m[:, None] * nearest
+        a = np.maximum(along[:, 0] ** 2 + along[:, 1] ** 2, 1e-18)
+        b = np.einsum("nk,nk->n", offset[:, :2], along[:, :2])
+        c = offset[:, 0] ** 2 + offset[:, 1] ** 2 - self.half_m**2
+        root = np.sqrt(np.maximum(b * b - a * c, 0))
+        low, high = (-b - root) / a, (-b + root) / a
+        rise = np.where(along[:, 2] < 0, -1.0, 1.0) * np.maximum(np.abs(along[:, 2]), 1e-12)
+        top = (self.half_m - offset[:, 2]) / rise
+        low, high = np.where(rise < 0, np.maximum(low, top), low), np.where(rise > 0, np.minimum(high, top), high)
+        high = np.where(b * b > a * c, high, low)
+        low, high = (np.arctan2(v, lines.distance_m) for v in (low, high))
+        return np.maximum(low, lines.start_rad), np.minimum(high, lines.start_rad + lines.swept_rad)
+
+
+def _positive_fraction(values: F32) -> F32:
+    """Return the fraction of each step in which the line between two values is positive, float32[n, step]."""
+    before, after = values[:, :-1], values[:, 1:]
+    rest = np.maximum(np.abs(before) + np.abs(after), np.float32(1e-20))
+    return np.asarray((np.maximum(before, 0) + np.maximum(after, 0)) / rest, dtype=np.float32)
+
+
+# --- coma ---------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Coma:
+    """Hold the dust around a body at one time, in L axes.
+
+    Attributes
+    ----------
+    centre_L_m
+        float64[3]: the body's centre of mass.
+    reach_m
+        Greatest distance of the body's surface from the centre, with a margin.
+    core_m
+        Distance within which the density stays constant.
+    afrho_m
+        A(0°)fρ at the Sun's distance.
+    outflow
+        Density by direction.
+    table
+        Table of the scene.
+    """
+
+    centre_L_m: F64
+    reach_m: float
+    core_m: float
+    afrho_m: float
+    outflow: Outflow
+    table: ComaTable
+
+    def colour(self, wavelength_nm: F64) -> F64:
+        """Return the dust's reflectance over that at 550 nm, float64[band]."""
+        slope = self.table.reddening_per_100nm * (wavelength_nm - REFERENCE_NM) / 100
+        return np.asarray(np.maximum(1 + slope, 0))
+
+    def phase(self, cosine: NDArray[np.floating]) -> F64:
+        """Return the phase function where lines of sight make angles of this cosine with the Sun's direction."""
+        away = np.maximum(1 + np.asarray(cosine, dtype=np.float64), 0)
+        half = np.arctan2(np.sqrt(away), np.sqrt(np.maximum(2 - away, 0)))
+        return relative_phase(self.table.phase_function, np.degrees(2 * half))
+
+    def column(self, start_m: F64, distance_m: F64, length_m: F64) -> F64:
+        """Return the integral of 1 / max(r, core)² along lines, in 1/m, float64[n].
+
+        `start_m` is the camera's coordinate along the line, counted from the point nearest to the centre.
+        """
+        half = np.sqrt(np.maximum(self.core_m**2 - distance_m**2, 0))
+        end_m = start_m + length_m
+        inside = np.clip(end_m, -half, half) - np.clip(start_m, -half, half)
+        outside = [
+            np.arctan2(high, distance_m) - np.arctan2(low, distance_m)
+            for low, high in (
+                (np.minimum(start_m, -half), np.minimum(end_m, -half)),
+                (np.maximum(start_m, half), np.maximum(end_m, half)),
+            )
+        ]
+        return np.asarray((outside[0] + outside[1]) / distance_m + inside / self.core_m**2)
+
+    def relative_light(self, camera_m: F64, directions: F64, length_m: F64, shadow: Shadow | None) -> F64:
+        """Return the light of lines over that with G = 1 and without shadow and phase function, float64[n].
+
+        Parameters
+        ----------
+        camera_m
+            float64[3]: position of the camera from the centre.
+        directions
+            float64[n, 3]: unit vectors from the camera.
+        length_m
+            float64[n]: length of the lines, which may be infinite.
+        shadow
+            The body's shadow. None: there is none.
+        """
+        out = np.empty(len(directions))
+        for first in range(0, len(out), _LINES_AT_ONCE):
+            part = slice(first, first + _LINES_AT_ONCE)
+            lines = Lines.between(camera_m, directions[part], length_m[part])
+            lit = self.outflow.swept(lines)
+            if shadow is not None:
+                lit = lit - shadow.swept(lines, self.outflow)
+            out[part] = np.maximum(lit, 0) / np.maximum(lines.swept_rad, 1e-300)
+        return out
+
+
+def make_coma(table: ComaTable, body: Body, site: Site, sun_L: F64, sun_distance_au: float, seed: int) -> Coma:
+    """Return the coma of a scene's table for a site, a direction to the Sun in L, and a seed of random jets."""
+    centre_L = site.T_from_L.T @ (body.centre_of_mass_T_m - site.position_T_m)
+    axes_T, width_deg, strength = _jets(table, seed)
+    axes_L, sun = axes_T @ site.T_from_L, unit(sun_L)
+    lit = strength * np.maximum(axes_L @ sun, 0)
+    active = lit > 0
+    return Coma(
+        centre_L_m=centre_L,
+        reach_m=_SHADOW_MARGIN * _greatest_radius_m(body),
+        core_m=_CORE * (3 * body.volume_m3 / (4 * np.pi)) ** (1 / 3),
+        afrho_m=0.01 * table.afrho_cm * (sun_distance_au / table.reference_au) ** -table.distance_exponent,
+        outflow=Outflow(
+            sun=sun,
+            sunlit_fraction=table.sunlit_fraction,
+            axes=axes_L[active],
+            concentration=np.log(2) / (1 - np.cos(np.radians(width_deg[active]) / 2)),
+            strength=lit[active],
+        ),
+        table=table,
+    )
+
+
+def _greatest_radius_m(body: Body) -> float:
+    """Return the greatest distance of the surface from the centre of mass."""
+    return float(np.linalg.norm(body.vertices_m - body.centre_of_mass_T_m, axis=1).max())
+
+
+def _jets(table: ComaTable, seed: int) -> tuple[F64, F64, F64]:
+    """Return axes in T, float64[jet, 3], widths in degrees and strengths of the given jets and the random ones."""
+    generator = rng(seed, 0, "coma", "jets")
+    draws = generator.random((table.random_jets, 4))
+    sine = [np.sin(np.radians(jet.latitude_deg)) for jet in table.jets]
+    turn = [np.radians(jet.longitude_deg) for jet in table.jets]
+    z = np.concatenate([np.array(sine), 2 * draws[:, 0] - 1])
+    longitude = np.concatenate([np.array(turn), 2 * np.pi * draws[:, 1]])
+    level = np.sqrt(1 - z * z)
+    bounds = (table.random_jet_width_deg, table.random_jet_strength)
+    drawn = [low + (high - low) * draws[:, 2 + k] for k, (low, high) in enumerate(bounds)]
+    return (
+        np.stack([level * np.cos(longitude), level * np.sin(longitude), z], axis=1),
+        np.concatenate([np.array([jet.width_deg for jet in table.jets]), drawn[0]]),
+        np.concatenate([np.array([jet.strength for jet in table.jets]), drawn[1]]),
+    )
+
+
+def check_coma(body: Body, sun_distance_au: float) -> None:
+    """Raise InputError if the body's gravity holds its dust back."""
+    radius_m = (3 * body.volume_m3 / (4 * np.pi)) ** (1 / 3)
+    mass_kg = body.density_kg_m3 * body.volume_m3
+    escape_m_s = float(np.sqrt(2 * spectra.GRAVITATION_SI * mass_kg / radius_m))
+    gas_m_s = _GAS_SPEED_M_S / np.sqrt(sun_distance_au)
+    if escape_m_s > gas_m_s:
+        raise InputError(
+            f"coma.afrho_cm: {body.name} has an escape speed of {escape_m_s:.0f} m/s, so dust cannot flow out "
+            f"freely; must be at most {gas_m_s:.0f} m/s, as the gas at {sun_distance_au:.3g} au; leave [coma] out"
+        )

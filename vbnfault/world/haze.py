@@ -1,0 +1,271 @@
+"""Compute the image of a coma: the sunlight that its dust scatters into every pixel.
+
+In each pixel the integral of 1 / r² along the line of sight is exact, for the distance of the ground that the pixel
+shows. It is multiplied by what varies slowly: the mean density along the line, the fraction of it in sunlight, and
+the phase function. These are computed on coarse grids and interpolated. Lines to the sky share a grid of directions
+around the direction to the body's centre, with steps that grow with the angle from it; lines that end at the ground
+share a grid of pixels. Neither grid crosses the body's limb, so the limb stays sharp. There are no random numbers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from ..core.frames import unit
+from ..core.quantities import BODY, SKY, SUN
+from ..render.description import View
+from .coma import Coma, Shadow
+
+F64 = NDArray[np.float64]
+F32 = NDArray[np.float32]
+Mask = NDArray[np.bool_]
+
+# Directions to the sky: steps of the angle from the centre, and turns about it.
+_SKY_STEPS, _SKY_TURNS = 56, 288
+_WRAPPED = 4  # turns that are repeated at both ends for the interpolation
+# The sky has this many nodes across the frame, to which these directions are interpolated. Around the body's
+# centre, where details are finer, every pixel is a node.
+_SKY_NODES = 256
+_FINE_STRIDES = 24
+# The most nodes on the ground.
+_GROUND_NODES = 9000
+_PAD = 2  # nodes beyond the frame
+# Most of tan(ψ/2), where ψ is the angle from the centre: all directions beyond look away from it.
+_MOST_TANGENT = 1e4
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Frame:
+    """Hold a camera beside a coma: its view, and directions to the body's centre and at right angles to it in C.
+
+    `camera_m` float64[3] is the camera's position from the centre in L, `distance_m` its length.
+    """
+
+    coma: Coma
+    shadow: Shadow | None
+    view: View
+
+    @cached_property
+    def camera_m(self) -> F64:
+        return np.asarray(self.view.position_L_m - self.coma.centre_L_m)
+
+    @cached_property
+    def distance_m(self) -> float:
+        return max(float(np.linalg.norm(self.camera_m)), 1e-3)
+
+    @cached_property
+    def axes_L(self) -> F64:
+        """Return two unit vectors at right angles to the direction to the centre, and this one, as rows."""
+        centre = -self.camera_m / self.distance_m
+        first = unit(np.cross(centre, np.eye(3)[np.argmin(np.abs(centre))]))
+        return np.stack([first, np.cross(centre, first), centre])
+
+    def slopes(self, x_px: F64, y_px: F64) -> tuple[F64, F64]:
+        """Return the tangents x/z and y/z of image positions."""
+        fx, fy, cx, cy = self.view.intrinsics
+        return (x_px - cx) / fx, (y_px - cy) / fy
+
+    def components(self, x_px: F64, y_px: F64) -> list[F32]:
+        """Return the components along `axes_L` of unit vectors to a grid of image positions, float32[y, x] each."""
+        x, y = self.slopes(x_px, y_px)
+        length = np.sqrt(1 + x[None, :] ** 2 + y[:, None] ** 2)
+        axes_C = self.axes_L @ self.view.L_from_C
+        return [
+            ((a * x)[None, :] + (b * y + c)[:, None]).astype(np.float32) / length.astype(np.float32)
+            for a, b, c in axes_C
+        ]
+
+    def directions(self, x_px: F64, y_px: F64) -> F64:
+        """Return unit vectors in L to a grid of image positions, float64[y · x, 3]."""
+        x, y = np.meshgrid(*self.slopes(x_px, y_px))
+        rays = np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3) @ self.view.L_from_C.T
+        return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))
+
+    def light(self, directions: F64, length_m: F64) -> F64:
+        """Return what `Coma.relative_light` returns, times the phase function."""
+        relative = self.coma.relative_light(self.camera_m, directions, length_m, self.shadow)
+        return np.asarray(relative * self.coma.phase(directions @ self.coma.outflow.sun))
+
+
+def haze(coma: Coma, shadow: Shadow | None, view: View, depth_m: F32, semantic: NDArray[np.uint8]) -> F32:
+    """Return the radiance of the dust over the Sun's irradiance at 550 nm, in 1/sr, float32[y, x].
+
+    Parameters
+    ----------
+    coma
+        The dust.
+    shadow
+        The body's shadow in it. None: there is none.
+    view
+        The camera.
+    depth_m, semantic
+        Depth along the boresight and class of what each pixel shows, as in `Truth`, on the grid of the view.
+    """
+    frame = _Frame(coma=coma, shadow=shadow, view=view)
+    x_px, y_px = _positions_px(0, view.width_px), _positions_px(0, view.height_px)
+    sky = (semantic == SKY) | (semantic == SUN)
+    first, second, cosine = frame.components(x_px, y_px)
+    sine = np.maximum(np.sqrt(first * first + second * second), np.float32(1e-6))
+    x, y = frame.slopes(x_px, y_px)
+    length = np.where(sky, 0, depth_m) * np.sqrt(1 + x[None, :] ** 2 + y[:, None] ** 2).astype(np.float32)
+    out = _columns(coma, frame.distance_m, sine, cosine, length, sky)
+    if sky.any():
+        towards_sky = _on_sky(frame, sky, sine, cosine)
+        out *= towards_sky if sky.all() else np.where(sky, towards_sky, 1)
+    if not sky.all():
+        rows, columns = (_bounds(np.any(~sky, axis=axis)) for axis in (1, 0))
+        part = (slice(*rows), slice(*columns))
+        ground = _on_ground(frame, rows, columns, length[part], (semantic == BODY)[part])
+        out[part] *= np.where(sky[part], 1, ground)
+        _soften_limb(out, sky)
+    out *= np.float32(coma.afrho_m / (8 * np.pi**2))
+    return out
+
+
+def _columns(coma: Coma, distance_m: float, sine: F32, cosine: F32, length_m: F32, endless: Mask) -> F32:
+    """Return the integral of 1 / r² along each line of sight, in 1/m, float32[y, x].
+
+    `sine` and `cosine` are those of the angle between the line and the direction to the centre.
+    """
+    # in units of the camera's distance from the centre: the line begins at -cosine and passes at the sine
+    along = length_m * np.float32(1 / distance_m)
+    height = np.where(endless, sine, sine * along)
+    width = np.where(endless, -cosine, sine * sine - cosine * (along - cosine))
+    out = np.arctan2(height, width) / (sine * np.float32(distance_m))
+    inner = (sine * distance_m < coma.core_m) & (cosine > 0)
+    inner &= endless | (length_m > cosine * distance_m - coma.core_m)
+    if inner.any():
+        start, ends = -cosine[inner].astype(np.float64) * distance_m, length_m[inner].astype(np.float64)
+        ends[endless[inner]] = np.inf
+        out[inner] = coma.column(start, sine[inner].astype(np.float64) * distance_m, ends)
+    return np.asarray(out, dtype=np.float32)
+
+
+def _bounds(any_of: Mask) -> tuple[int, int]:
+    """Return the first index that is set, and the one behind the last."""
+    found = np.flatnonzero(any_of)
+    return int(found[0]), int(found[-1]) + 1
+
+
+def _soften_limb(image: F32, sky: Mask) -> None:
+    """Average the pixels on both sides of the body's limb, in place: depth and class are those of pixel centres."""
+    kernel = np.ones((3, 3), np.uint8)
+    plain = sky.astype(np.uint8)
+    edge = cv2.dilate(plain, kernel) != cv2.erode(plain, kernel)
+    image[edge] = cv2.GaussianBlur(image, (3, 3), 0.6, borderType=cv2.BORDER_REPLICATE)[edge]
+
+
+def _positions_px(first: int, last: int, stride: int = 1) -> F64:
+    """Return the middles of the pixels from `first` to before `last`, or of groups of `stride` pixels."""
+    return np.asarray((np.arange(first, last) + 0.5) * stride, dtype=np.float64)
+
+
+# --- coarse grids -------------------------------------------------------------------------------------------
+
+
+def _on_sky(frame: _Frame, sky: Mask, sine: F32, cosine: F32) -> F32:
+    """Return the light of lines without end, over that of a line with G = 1, float32[y, x]."""
+    # the tangent of half the angle from the centre, by a formula without cancellation
+    tangent = sine[sky] / np.maximum(1 + cosine[sky], np.float32(1 / _MOST_TANGENT))
+    low, high = (float(np.log(v)) for v in (float(tangent.min()), float(tangent.max())))
+    margin = 0.05 + 0.02 * (high - low)
+    table = _sky_table(frame, low - margin, high + margin)
+    step = (high - low + 2 * margin) / (_SKY_STEPS - 1)
+    sun = frame.axes_L @ frame.coma.outflow.sun
+
+    def at(x_px: F64, y_px: F64) -> F32:
+        first, second, along = frame.components(x_px, y_px)
+        across = np.sqrt(first * first + second * second)
+        angle = np.log(np.maximum(across, 1e-9) / np.maximum(1 + along, 1 / _MOST_TANGENT))
+        turn = np.arctan2(second, first) * (_SKY_TURNS / (2 * np.pi)) + _SKY_TURNS / 2 + _WRAPPED
+        where = np.stack([(angle - low + margin) / step, turn])
+        light = ndimage.map_coordinates(table, where, order=3, mode="nearest", prefilter=False)
+        phase = frame.coma.phase(first * sun[0] + second * sun[1] + along * sun[2])
+        return np.asarray(np.maximum(light, 0) * phase, dtype=np.float32)
+
+    height, width = sky.shape
+    stride = max(1, max(height, width) // _SKY_NODES)
+    out = _enlarged(at, height, width, stride)
+    if stride > 1:  # near the centre every pixel counts
+        x, y, z = frame.view.L_from_C.T @ frame.axes_L[2]
+        if z > 0:
+            fx, fy, cx, cy = frame.view.intrinsics
+            reach = _FINE_STRIDES * stride
+            rows, columns = (
+                (max(round(middle - reach), 0), min(round(middle + reach), size))
+                for middle, size in ((fy * y / z + cy, height), (fx * x / z + cx, width))
+            )
+            if rows[0] < rows[1] and columns[0] < columns[1]:
+                out[slice(*rows), slice(*columns)] = at(_positions_px(*columns), _positions_px(*rows))
+    return out
+
+
+def _sky_table(frame: _Frame, low: float, high: float) -> F64:
+    """Return spline coefficients of the light without phase function, float64[angle, turn].
+
+    Rows are steps of the logarithm of tan(ψ/2) from `low` to `high`, where ψ is the angle from the centre; columns
+    are turns about the centre from -π, with some repeated at both ends.
+    """
+    tangent = np.exp(np.linspace(low, high, _SKY_STEPS))
+    turn = 2 * np.pi * np.arange(_SKY_TURNS) / _SKY_TURNS - np.pi
+    sine, cosine = (v / (1 + tangent**2) for v in (2 * tangent, 1 - tangent**2))
+    first = sine[:, None] * np.cos(turn)
+    second = sine[:, None] * np.sin(turn)
+    local = np.stack([first, second, np.broadcast_to(cosine[:, None], first.shape)], axis=-1)
+    directions = local.reshape(-1, 3) @ frame.axes_L
+    light = frame.coma.relative_light(
+        frame.camera_m, directions, np.full(len(directions), np.inf), frame.shadow
+    ).reshape(first.shape)
+    coefficients = ndimage.spline_filter1d(light, order=3, axis=1, mode="grid-wrap")
+    coefficients = ndimage.spline_filter1d(coefficients, order=3, axis=0, mode="mirror")
+    return np.concatenate([coefficients[:, -_WRAPPED:], coefficients, coefficients[:, :_WRAPPED]], axis=1)
+
+
+def _on_ground(frame: _Frame, rows: tuple[int, int], columns: tuple[int, int], length_m: F32, body: Mask) -> F32:
+    """Return the light of lines that end at the ground over that of lines with G = 1, float32[y, x] of a part.
+
+    The nodes take the mean length of the lines around them. What is not the body has the values of its neighbours.
+    """
+    height, width = length_m.shape
+    count = max(int(np.count_nonzero(body)), 1)
+    stride = max(1, int(np.ceil(np.sqrt(count / _GROUND_NODES))))
+    below, right = -height % stride, -width % stride
+    size = ((width + right) // stride, (height + below) // stride)
+
+    def means(image: NDArray[np.generic]) -> F32:
+        padded = cv2.copyMakeBorder(image.astype(np.float32), 0, below, 0, right, cv2.BORDER_CONSTANT, value=0)
+        return np.asarray(cv2.resize(padded, size, interpolation=cv2.INTER_AREA))
+
+    share = means(body)
+    seen = share > 0
+    if not seen.any():
+        return np.ones((height, width), dtype=np.float32)
+    lengths = (means(np.where(body, length_m, 0)) / np.maximum(share, 1e-9))[seen]
+    x_px, y_px = (first + _positions_px(0, n, stride) for first, n in zip((columns[0], rows[0]), size, strict=True))
+    directions = frame.directions(x_px, y_px)[seen.ravel()]
+    nodes = np.zeros(seen.shape, dtype=np.float32)
+    nodes[seen] = frame.light(directions, lengths.astype(np.float64))
+    nearest = ndimage.distance_transform_edt(~seen, return_distances=False, return_indices=True)
+    full = cv2.resize(nodes[tuple(nearest)], (size[0] * stride, size[1] * stride), interpolation=cv2.INTER_LINEAR)
+    return np.asarray(full[:height, :width])
+
+
+def _enlarged(at: Callable[[F64, F64], F32], height: int, width: int, stride: int) -> F32:
+    """Return an image, float32[y, x], interpolated between nodes every `stride` px where `at` is evaluated.
+
+    `at` takes the image positions of columns and rows in px.
+    """
+    if stride == 1:
+        return at(_positions_px(0, width), _positions_px(0, height))
+    x_px, y_px = (_positions_px(-_PAD, -(-size // stride) + _PAD, stride) for size in (width, height))
+    nodes = at(x_px, y_px)
+    full = cv2.resize(nodes, (len(x_px) * stride, len(y_px) * stride), interpolation=cv2.INTER_CUBIC)
+    first = _PAD * stride
+    return np.ascontiguousarray(full[first : first + height, first : first + width])
