@@ -30,10 +30,18 @@ from vbnfault.scene import config
 U8 = NDArray[np.uint8]
 
 # Samples of each contact sheet.
-SHEETS = {"earth_observation": 12, "interplanetary": 12, "landing": 12, "quickstart": 16, "sssb_exploration": 12}
+SHEETS = {
+    "approach": 16,
+    "earth_observation": 12,
+    "interplanetary": 12,
+    "landing": 12,
+    "quickstart": 16,
+    "sssb_exploration": 12,
+}
 SHEET_PX = 512
 SHEET_TRIANGLES = 800_000
 SHEET_WIDTH_PX = 1080
+NARROW_PX = {"approach": 700}  # the sheet of a page that people load
 # Samples with many fault classes; several share a site, whose terrain is then built once.
 FLARES, NAVCAM, PHYSICAL = (1, 2, 3), (5, 6, 12, 15), (7, 4)
 
@@ -99,7 +107,7 @@ SINGLE = {"flares": flares, "navcam67p": navcam67p, "paper_example": paper_examp
 
 
 def sheet(scene: str) -> U8:
-    """Return the contact sheet of a scene, shrunk to SHEET_WIDTH_PX."""
+    """Return the contact sheet of a scene, shrunk to SHEET_WIDTH_PX or to its own width."""
     own = config.load_scene(scene)
     small = {
         "dataset.samples": SHEETS[scene],
@@ -112,7 +120,8 @@ def sheet(scene: str) -> U8:
         dataset.build_scene(config.load_scene(scene, small), path, source=scene)
         contact_sheet.preview(path, path.with_suffix(".png"))
         whole = decoded_image(path.with_suffix(".png").read_bytes())
-    size = (SHEET_WIDTH_PX, round(SHEET_WIDTH_PX * whole.shape[0] / whole.shape[1]))
+    width_px = NARROW_PX.get(scene, SHEET_WIDTH_PX)
+    size = (width_px, round(width_px * whole.shape[0] / whole.shape[1]))
     return np.asarray(cv2.resize(whole, size, interpolation=cv2.INTER_AREA))
 
 

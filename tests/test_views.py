@@ -16,7 +16,7 @@ from vbnfault import dataset, pipeline, render
 from vbnfault.body import load_body
 from vbnfault.core import frames
 from vbnfault.core.errors import InputError, VbnfaultError
-from vbnfault.pipeline import Session, resolve
+from vbnfault.pipeline import Session, resolve, sight
 from vbnfault.pipeline.record import to_sample
 from vbnfault.pipeline.rendering import render_view
 from vbnfault.pipeline.spec import Frame, Pose, SampleSpec, Terrain
@@ -375,7 +375,7 @@ def test_a_flown_pose_is_kept_with_its_sun_hidden_and_refused_within_the_ground(
 @pytest.mark.parametrize(("fov_deg", "height_over_width"), [(90.0, 1.0), (40.0, 0.5), (65.0, 1.5)])
 def test_rays_that_look_for_lit_ground_cover_the_frame(fov_deg: float, height_over_width: float) -> None:
     """Unit directions through the centres of equal cells: their slopes are symmetric, evenly spaced, row by row."""
-    rays = resolve._grid_rays_C(fov_deg, height_over_width)
+    rays = sight.grid_rays_C(fov_deg, height_over_width)
     n = round(np.sqrt(len(rays)))
     assert rays.shape == (n * n, 3)
     np.testing.assert_allclose(np.linalg.norm(rays, axis=1), 1, rtol=1e-14)

@@ -14,7 +14,7 @@ from ..core import frames
 from ..detector import Detector
 from ..pipeline import Session
 from ..pipeline.exposure import reference_exposure_s
-from ..scene import plan
+from ..scene import aims, plan
 from ..scene.bodies import named_body
 from ..scene.trajectory import Trajectory
 from ..world import assemble, ground
@@ -106,11 +106,10 @@ def _small_body(session: Session) -> list[str]:
     reasons = [f"has a mean radius below {_LEAST_RADIUS_M:g} m"] if radius_m < _LEAST_RADIUS_M else []
     if longest_m < _PATCH_RADII * scene.patch.radius_m:
         reasons.append(f"is shorter than {_PATCH_RADII:g} times patch.radius_m = {scene.patch.radius_m:g}")
-    height_m = scene.geometry.height_m[0]
+    key = "distance_m" if scene.is_aimed else "height_m"
+    height_m = getattr(scene.geometry, key)[0]
     if not scene.is_flown and longest_m < height_m / _LENGTHS_AWAY:
-        reasons.append(
-            f"is over {_LENGTHS_AWAY:g} of its lengths below the lowest of geometry.height_m, {height_m:g}"
-        )
+        reasons.append(f"is over {_LENGTHS_AWAY:g} of its lengths below the lowest of geometry.{key}, {height_m:g}")
     if not reasons:
         return []
     return [
@@ -133,6 +132,8 @@ def _geometry(session: Session) -> list[str]:
             "poses are kept, and faults that cannot show are recorded as not injected",
             sun,
         ]
+    if table.aim is not None:
+        return _aims(session, table.aim)
     low, high = geometry.height_m
     above = "the ground below the camera" if geometry.height_reference == "local_ground" else "the site"
     across = 2 * np.tan(np.radians(camera.fov_deg) / 2)
@@ -156,15 +157,40 @@ def _geometry(session: Session) -> list[str]:
             f"{_bounds(stratum.sun_azimuth_deg)} deg; camera from {towards} by roll {_bounds(stratum.roll_deg)}, "
             f"pitch {_bounds(stratum.pitch_deg)}, yaw {_bounds(stratum.yaw_deg)} deg; {lit}"
         )
+    return [*lines, _redrawn(session)]
+
+
+def _aims(session: Session, aim: NDArray[np.uint8]) -> list[str]:
+    """Return lines about the aims of the samples (uint8[n]), their distances and the Sun."""
+    scene = session.scene
+    geometry, (low, high) = scene.geometry, scene.geometry.distance_m
+    counts = np.bincount(aim, minlength=len(aims.AIMS))
+    mixed = ", ".join(f"{name} {count}" for name, count in zip(aims.AIMS, counts, strict=True) if count)
+    pixel = ground.pixel_rad(scene)
+    kept_away = plan.sun_elongation_deg(scene)
+    return [
+        f"aims: {mixed}; {geometry.pointing_error_deg:g} deg of pointing error about each axis, any turn about the "
+        "boresight; roll, pitch and yaw are stored relative to the Sun",
+        f"distances: {low:g} to {high:g} m from the site, evenly in their logarithm; at the site "
+        f"{_span(pixel * low, pixel * high)} m a pixel",
+        f"Sun: {assemble.sun_distance_au(scene):.4g} au away, date {scene.sun.julian_date:.1f} TDB; phase angle at "
+        f"the site {_bounds(geometry.phase_deg)} deg, {_span(*kept_away)} deg from the boresight unless it is "
+        "the aim",
+        _redrawn(session),
+    ]
+
+
+def _redrawn(session: Session) -> str:
+    """Return a line about the views that are drawn again."""
+    scene, geometry = session.scene, session.scene.geometry
     hidden = "is drawn again" if geometry.sun_visibility == "required" else "is kept, without this fault"
     unseen = f"gets another view, of {scene.plan.max_views} at most"
     if scene.plan.on_invisible == "drop":
         unseen = "is recorded as not injected"
-    lines.append(
+    return (
         f"views: nothing within {geometry.clearance_m:g} m; a view whose fault needs the Sun, which is hidden, "
         f"{hidden}; a fault that cannot show {unseen}"
     )
-    return lines
 
 
 def _trajectory(session: Session, table: Trajectory) -> list[str]:

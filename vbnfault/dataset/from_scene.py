@@ -59,8 +59,8 @@ def estimated_seconds(session: pipeline.Session) -> float:
 
     The model follows the README's table and assumes that all cores work. In processor time, a sample takes 0.3 s.
     Each megapixel adds 1.2 s for truth, images, labels and the store, and 0.25 s for each ray of a pixel, times
-    1 + bounces. The terrain of a site takes 16 s for 1.6 million triangles. Adaptive sampling counts as four times
-    the minimum number of rays, but not more than the maximum.
+    1 + bounces. The terrain of a site, or of a view that aims, takes 16 s for 1.6 million triangles. Adaptive
+    sampling counts as four times the minimum number of rays, but not more than the maximum.
     """
     scene = session.scene
     render, camera = scene.render, scene.camera
@@ -70,8 +70,8 @@ def estimated_seconds(session: pipeline.Session) -> float:
     megapixels = camera.width_px * camera.height_px / 1e6
     sample_s = 0.3 + megapixels * (1.2 + 0.25 * rays * (1 + render.bounces))
     patch_s = 16 * scene.patch.max_triangles / 1.6e6
-    sites = len(np.unique(session.plan.site))
-    return (len(session.plan) * sample_s + sites * patch_s) / (os.cpu_count() or 1)
+    terrains = len(session.plan) if scene.is_aimed else len(np.unique(session.plan.site))
+    return (len(session.plan) * sample_s + terrains * patch_s) / (os.cpu_count() or 1)
 
 
 def build_scene(

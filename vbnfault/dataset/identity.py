@@ -28,6 +28,7 @@ from ..scene import config, plan
 from ..scene.config import Scene
 from ..scene.hashing import content_hash
 from ..scene.instrument import OF_THE_DETECTOR
+from ..scene.sampling import OF_AN_AIM
 from ..store import StoreSpec
 from ..world import assemble
 
@@ -76,6 +77,9 @@ def scene_identity(session: pipeline.Session) -> dict[str, Any]:
         del scene["trajectory"]
     else:
         scene["trajectory"]["file"] = _digest(session.scene.trajectory.file, "trajectory")
+    if not session.scene.is_aimed:
+        for key in OF_AN_AIM:
+            del scene["geometry"][key]
     del scene["plugins"]
     plugins = plugins_of(session.faults, session.scene.plugins)
     if plugins:
@@ -314,9 +318,9 @@ def planned(attributes: Mapping[str, Any], faults: Sequence[str]) -> Callable[[i
 
     def expected(index: int, tries: int) -> dict[str, Any]:
         drawn = table.view(scene, index, tries - 1)
-        # if a trajectory sets the positions of camera and Sun, the plan does not set these angles
+        # the plan does not set these angles if a trajectory places camera and Sun, or if the camera aims
         names = ("sun_azimuth_deg", "sun_elevation_deg", "roll_deg", "pitch_deg", "yaw_deg")
-        angles = () if scene.is_flown else names
+        angles = () if scene.is_flown or scene.is_aimed else names
         return {
             **{name: drawn[name] for name in angles},
             "stratum": int(table.stratum[index]),

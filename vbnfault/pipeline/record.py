@@ -67,9 +67,10 @@ def _geometry(frame: Frame) -> dict[str, Any]:
     T_from_L = site.T_from_L
     sun_T = T_from_L @ pose.sun_L
     sun_xy = frame.context.sun_xy_px
-    roll, pitch, yaw = (pose.variables[name] for name in ("roll_deg", "pitch_deg", "yaw_deg"))
-    if spec.scene.is_flown:
+    if spec.scene.is_flown or spec.scene.is_aimed:
         roll, pitch, yaw = frames.roll_pitch_yaw_deg(pose.sun_L, pose.L_from_C)
+    else:
+        roll, pitch, yaw = (pose.variables[name] for name in ("roll_deg", "pitch_deg", "yaw_deg"))
     return {
         "camera_position_T_m": site.position_T_m + T_from_L @ pose.position_L_m,
         "position_L_m": pose.position_L_m,
@@ -139,6 +140,7 @@ def proposal(scene: Scene, table: plan.Plan, index: int, variables: Mapping[str,
     camera = scene.camera
     return {
         **({} if scene.trajectory else variables),  # poses of a table are not drawn
+        **({"aim": table.aim_of(index)} if scene.is_aimed else {}),
         "injected": list(table.commanded(index)),
         # a named detector has its own architecture
         **({} if camera.detector else {"architecture": camera.architectures[int(table.architecture[index])]}),

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +15,8 @@ from ..scene import plan
 from ..scene.trajectory import FlownPose
 from ..world import assemble
 from ..world.ground import encloses
-from ..world.spacecraft import SpacecraftMesh
+from .aimed import resolve_aimed
+from .sight import lit_fraction, no_view, placed
 from .spec import Pose, SampleSpec, Terrain
 
 F64 = NDArray[np.float64]
@@ -24,9 +24,6 @@ Mask = NDArray[np.bool_]
 
 # Number of views tried at once. Batches of one size share one compiled kernel.
 _BATCH = 8
-# Rays per direction that sample the frame for sunlit ground: 576 in total, so a fraction of 5 % has an error of
-# 0.9 %.
-_LIT_GRID = 24
 
 
 def resolve(spec: SampleSpec, first_try: int = 0) -> Pose:
@@ -40,7 +37,8 @@ def resolve(spec: SampleSpec, first_try: int = 0) -> Pose:
     - if `sun_visibility` is "required", a sample whose faults need the Sun sees the whole Sun
     - enough of the frame is sunlit ground
 
-    A pose of a trajectory, from SPICE or from a table, is kept.
+    A pose of a trajectory, from SPICE or from a table, is kept. Where the camera aims, `resolve_aimed` says which
+    conditions hold.
 
     Raises
     ------
@@ -49,6 +47,8 @@ def resolve(spec: SampleSpec, first_try: int = 0) -> Pose:
     """
     if spec.scene.is_flown:
         return _on_the_trajectory(spec, spec.flown or assemble.flown_pose(spec.scene))
+    if spec.scene.is_aimed:
+        return resolve_aimed(spec, first_try)
     max_tries = spec.scene.geometry.max_tries
     unmet: dict[str, int] = {}
     for start in range(first_try, first_try + max_tries, _BATCH):
@@ -57,13 +57,7 @@ def resolve(spec: SampleSpec, first_try: int = 0) -> Pose:
         chosen = _first_usable(spec, views, count, unmet)
         if chosen is not None:
             return views.pose(chosen, start)
-    conditions = "; ".join(f"{text} ({n} of {max_tries} tries did not)" for text, n in unmet.items())
-    stratum = plan.STRATA[spec.plan.stratum[spec.index]]
-    raise VbnfaultError(
-        f"sample {spec.index} ({stratum}, site {spec.plan.site[spec.index]}): no view met every condition in "
-        f"geometry.max_tries = {max_tries} tries: {conditions}; widen the bounds of [geometry], relax the "
-        f"condition, or raise max_tries"
-    )
+    raise no_view(spec, plan.STRATA[spec.plan.stratum[spec.index]], unmet)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -187,32 +181,9 @@ def _first_usable(spec: SampleSpec, views: _Views, count: int, unmet: dict[str, 
 
 
 def _lit_fraction(spec: SampleSpec, views: _Views) -> F64:
-    """Return the fraction of each view's frame that shows sunlit ground, from a grid of pinhole camera rays."""
-    from .. import render
-
-    camera, vehicle = spec.scene.camera, spec.terrain.vehicle
-    rays_C = _grid_rays_C(camera.fov_deg, camera.height_px / camera.width_px)
-    rays_L = np.einsum("vij,nj->vni", views.L_from_C, rays_C)
+    """Return the fraction of each view's frame that shows sunlit ground, float64[view]."""
     sun_L = np.stack([sun.direction_L for sun in views.suns])
-    lit = render.sunlit_ground(spec.terrain.surface, views.position_L_m, rays_L, sun_L)
-    if vehicle is not None:
-        lit &= ~_hidden_by(vehicle, camera.fov_deg, camera.height_px / camera.width_px)
-    return np.asarray(lit.mean(axis=1))
-
-
-def _grid_rays_C(fov_deg: float, height_over_width: float) -> F64:
-    """Return unit directions through the centres of a grid of cells over the frame, float64[ray, 3]."""
-    centres = (np.arange(_LIT_GRID) + 0.5) / _LIT_GRID * 2 - 1
-    slope = np.tan(np.radians(fov_deg) / 2)
-    x, y = np.meshgrid(slope * centres, slope * height_over_width * centres)
-    rays = np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3)
-    return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))
-
-
-@lru_cache(maxsize=4)
-def _hidden_by(vehicle: SpacecraftMesh, fov_deg: float, height_over_width: float) -> Mask:
-    """Return which rays of the grid meet the spacecraft, bool[ray]. They are the same in every view."""
-    return vehicle.blocked(_grid_rays_C(fov_deg, height_over_width))
+    return lit_fraction(spec.scene.camera, spec.terrain, views.position_L_m, views.L_from_C, sun_L)
 
 
 def _on_the_trajectory(spec: SampleSpec, flown: FlownPose) -> Pose:
@@ -224,15 +195,10 @@ def _on_the_trajectory(spec: SampleSpec, flown: FlownPose) -> Pose:
     """
     from .. import render
 
-    scene, site, surface = spec.scene, spec.terrain.site, spec.terrain.surface
-    L_from_T = site.T_from_L.T
-    position = L_from_T @ (flown.camera_position_T_m - site.position_T_m)
-    axes, sun_L = L_from_T @ flown.T_from_C, L_from_T @ flown.sun_direction_T
-    light = assemble.sunlight(scene, sun_L)
-    visible = float(render.sun_visible_fraction(surface, position[None], [light], axes[None])[0])
-    azimuth, elevation = frames.azimuth_elevation_deg(sun_L)
+    scene, surface = spec.scene, spec.terrain.surface
+    pose = placed(spec, spec.terrain, flown)
     clearance = scene.geometry.clearance_m
-    clear = render.is_clear(surface, position[None], clearance)[0]
+    clear = render.is_clear(surface, pose.position_L_m[None], clearance)[0]
     if not clear or encloses(spec.terrain.body, flown.camera_position_T_m):
         change = "poses" if scene.trajectory else "dates"
         made_for = "poses" if scene.trajectory else "kernels"
@@ -242,14 +208,5 @@ def _on_the_trajectory(spec: SampleSpec, flown: FlownPose) -> Pose:
             f"body.shape that the {made_for} were made for"
         )
     needs_sun = any(spec.faults[name].needs_sun for name in spec.commanded)
-    return Pose(
-        position_L_m=position,
-        L_from_C=axes,
-        sun_L=sun_L,
-        sun_azimuth_deg=azimuth,
-        sun_elevation_deg=elevation,
-        sun_visible_fraction=visible,
-        tries=1,
-        variables=spec.plan.view(scene, spec.index, 0),
-        resolved=not needs_sun or (visible == 1.0 and float(axes[:, 2] @ sun_L) > 0),
-    )
+    sees_sun = pose.sun_visible_fraction == 1.0 and float(pose.L_from_C[:, 2] @ pose.sun_L) > 0
+    return replace(pose, resolved=sees_sun or not needs_sun)

@@ -21,7 +21,7 @@ from ..faults import Fault, dataset_order, from_dict, load_plugins, plugins_of
 from ..scene import config, plan
 from ..scene.config import Scene
 from ..scene.keyed_random import keyed_uniform
-from ..scene.trajectory import Trajectory, as_trajectory, load_trajectory, with_rows
+from ..scene.trajectory import FlownPose, Trajectory, as_trajectory, load_trajectory, with_rows
 from ..world import assemble
 from ..world.ground import GroundDetail, ground_details
 from ..world.spacecraft import SpacecraftMesh
@@ -196,6 +196,7 @@ class Session:
         self._ground: dict[int, list[GroundDetail]] = {}  # of the rows of a site
         self._terrain: Terrain | None = None
         self._terrain_key: int | GroundDetail | None = None
+        self._model: Terrain | None = None
         self._compiled = False  # the first sample compiles the kernels
 
     @cached_property
@@ -256,8 +257,30 @@ class Session:
             self._ground[number] = ground_details(self.scene, self.body, poses)
         return self._ground[number][row]
 
+    def aimed_terrain(self, pose: FlownPose) -> Terrain:
+        """Return the terrain for a pose of a camera that aims. Only the last one is kept."""
+        (detail,) = ground_details(self.scene, self.body, [pose])
+        if self._terrain is None or self._terrain_key != detail:
+            self._terrain = None
+            self._terrain = self._new_terrain(detail.site(self.body, 0), detail)
+            self._terrain_key = detail
+        return self._terrain
+
+    def model_terrain(self, index: int) -> Terrain:
+        """Return the shape model as it is as the terrain of a site. Only the last one is kept."""
+        from .. import render
+
+        if self._model is None or self._model.site.index != index:
+            body, site = self.body, self.sites[index]
+            vertices = ((body.vertices_m - site.position_T_m) @ site.T_from_L).astype(np.float32)
+            smooth = np.zeros(len(body.faces), dtype=bool)
+            vehicle = None if self.vehicle is None else assemble.render_vehicle(self.scene, self.vehicle)
+            surface = render.TerrainMesh(vertices, body.faces, smooth, vehicle=vehicle)
+            self._model = Terrain(body=body, site=site, surface=surface, vehicle=self.vehicle)
+        return self._model
+
     def _new_terrain(self, site: Site, detail: GroundDetail | None = None) -> Terrain:
-        """Return the terrain of a site, for a pose of a table with its own detail."""
+        """Return the terrain of a site, for a pose of a table or of a camera that aims with its own detail."""
         from .. import render
 
         if self._threads is not None:
@@ -322,7 +345,8 @@ class Session:
             )
         patch = cached_patch(self.body, site, spec)
         kept = len(patch.boulder_diameter_m)
-        if kept < _FEWEST_KEPT * patch.boulders_drawn:
+        # for a pose, the number of triangles sets the facets, so more triangles would not keep all boulders either
+        if detail is None and kept < _FEWEST_KEPT * patch.boulders_drawn:
             drawn, ground = patch.boulders_drawn, np.count_nonzero(~patch.face_is_boulder)
             warnings.warn(
                 f"site {site.index}: {drawn - kept} of {drawn} boulders are left out, because the ground has "
@@ -352,7 +376,15 @@ class Session:
                 terrain=self.flown_terrain(index),
                 flown=flown,
             )
-        return SampleSpec(index=index, scene=scene, plan=self.plan, faults=self.faults, terrain=self.terrain(site))
+        aims = scene.is_aimed
+        return SampleSpec(
+            index=index,
+            scene=scene,
+            plan=self.plan,
+            faults=self.faults,
+            terrain=self.model_terrain(site) if aims else self.terrain(site),
+            terrain_of=self.aimed_terrain if aims else None,
+        )
 
     def simulate(self, index: int) -> Sample:
         """Return one finished sample."""

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -46,7 +46,8 @@ class Pose:
 
     `tries` counts the views drawn; this is the last of them. `variables` are the values of the plan, by the names
     of `plan.VARIABLES`. `resolved` says whether every condition is met. It is False only if a trajectory places
-    the camera, a fault of the sample needs the Sun, and the camera does not see the whole Sun ahead.
+    the camera, a fault of the sample needs the Sun, and the camera does not see the whole Sun ahead. `terrain` is
+    the terrain that was made for this pose, if it is not that of the specification.
     """
 
     position_L_m: F64
@@ -58,13 +59,15 @@ class Pose:
     tries: int
     variables: Mapping[str, float]
     resolved: bool
+    terrain: Terrain | None = None
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SampleSpec:
     """Hold one sample of a plan, with everything that `simulate` needs.
 
-    `flown` is the pose of the sample if a table of poses gives it.
+    `flown` is the pose of the sample if a table of poses gives it. If the camera aims, `terrain` is the shape model
+    as it is, and `terrain_of` makes the terrain of a pose.
     """
 
     index: int
@@ -73,6 +76,11 @@ class SampleSpec:
     faults: Mapping[str, Fault]
     terrain: Terrain
     flown: FlownPose | None = None
+    terrain_of: Callable[[FlownPose], Terrain] | None = None
+
+    def at(self, pose: Pose) -> SampleSpec:
+        """Return the specification with the terrain of a pose."""
+        return self if pose.terrain is None else replace(self, terrain=pose.terrain)
 
     @property
     def seed(self) -> int:

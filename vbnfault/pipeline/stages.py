@@ -39,8 +39,9 @@ def run_stage(stage: Callable[P, T], /, *inputs: P.args, **options: P.kwargs) ->
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _RenderedView:
-    """Hold the outcomes of the stages that run for every view of a sample."""
+    """Hold the outcomes of the stages that run for every view of a sample; `spec` has the terrain of the pose."""
 
+    spec: SampleSpec
     pose: Pose
     rendering: Rendering
     exposure: SceneExposure
@@ -76,6 +77,7 @@ def simulate_frame(spec: SampleSpec, run: StageRunner = run_stage) -> Frame:
         views, first_try = views + 1, view.pose.tries
         del view  # release its memory before the next render
         view = _take_view(spec, run, views=views, first_try=first_try)
+    spec = view.spec
     return Frame(
         spec=spec,
         views=views,
@@ -91,11 +93,12 @@ def simulate_frame(spec: SampleSpec, run: StageRunner = run_stage) -> Frame:
 def _take_view(spec: SampleSpec, run: StageRunner, *, views: int, first_try: int) -> _RenderedView:
     """Run the stages of one view; `first_try` views of the plan were drawn before it."""
     pose = run(resolve, spec, first_try)
+    spec = spec.at(pose)
     rendering = run(render_view, spec, pose)
     metered = run(meter, spec, rendering)
     exposure = run(add_stars, spec, pose, rendering, metered)
     injection = run(inject_faults, spec, pose, rendering, exposure, views)
-    return _RenderedView(pose=pose, rendering=rendering, exposure=exposure, injection=injection)
+    return _RenderedView(spec=spec, pose=pose, rendering=rendering, exposure=exposure, injection=injection)
 
 
 def _asking_for_another_view(spec: SampleSpec, injection: Injection) -> list[str]:

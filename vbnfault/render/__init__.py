@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from .integrate import radiance
     from .layers import truth
     from .light import direct
-    from .resolve import ground_height_m, is_between, is_clear, sun_visible_fraction, sunlit_ground
+    from .resolve import first_ground, ground_height_m, is_between, is_clear, sun_visible_fraction, sunlit_ground
     from .runtime import set_threads
     from .sun_heights import heights_towards_sun
     from .surface import TerrainMesh
@@ -30,6 +30,7 @@ _HOMES = {
     "TerrainMesh": "surface",
     "Vehicle": "vehicle",
     "direct": "light",
+    "first_ground": "resolve",
     "ground_height_m": "resolve",
     "heights_towards_sun": "sun_heights",
     "indirect": "bounces",
@@ -90,6 +91,7 @@ __all__ = [
     "TerrainMesh",
     "Vehicle",
     "direct",
+    "first_ground",
     "ground_height_m",
     "heights_towards_sun",
     "indirect",

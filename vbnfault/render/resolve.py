@@ -83,6 +83,36 @@ def _distance_m(corners: F64) -> F64:
     return np.where(within, plane, nearest)
 
 
+def first_ground(surface: TerrainMesh, position_L_m: F64, direction_L: F64) -> tuple[float, bool]:
+    """Return the distance of the first surface on a ray, and whether the ray meets it from outside.
+
+    Parameters
+    ----------
+    surface
+        The terrain; its spacecraft is ignored.
+    position_L_m, direction_L
+        float64[3] each; the direction is a unit vector.
+
+    Returns
+    -------
+    tuple[float, bool]
+        The distance in m, infinite without a surface, and False only if the ray begins below the ground.
+    """
+    start, towards = (
+        [mi.Float(np.array([value], dtype=np.float32)) for value in vector]
+        for vector in (position_L_m, direction_L)
+    )
+    (met,) = surface.trace(mi.Ray3f(mi.Point3f(*start), mi.Vector3f(*towards)))
+    distance, facet, valid = met.t, met.prim_index, met.is_valid()
+    dr.eval(distance, facet, valid)
+    if not valid.numpy()[0]:
+        return float("inf"), True
+    # the facet's own normal: the interpolated one may face away where the ray grazes the ground
+    (corners,) = surface.corners_m(facet.numpy().astype(np.intp))
+    outward = np.cross(corners[1] - corners[0], corners[2] - corners[0])
+    return float(distance.numpy()[0]), bool(outward @ direction_L < 0)
+
+
 def is_between(surface: TerrainMesh, origin_L_m: F64, points_L_m: F64) -> bool:
     """Return whether any surface lies between `origin_L_m`, float64[3], and any of the points, float64[n, 3]."""
     ray = points_L_m - origin_L_m

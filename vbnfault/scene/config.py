@@ -96,6 +96,34 @@ class Scene(Table):
         """Return whether poses and Sun are those of a trajectory: of a table of poses, or of SPICE."""
         return self.trajectory is not None or bool(self.spice.spacecraft)
 
+    @property
+    def is_aimed(self) -> bool:
+        """Return whether the camera aims at what `geometry.aim` names."""
+        return self.geometry.aim is not None
+
+    @model_validator(mode="after")
+    def _aimed_alone(self) -> Scene:
+        if not self.is_aimed:
+            return self
+        given = self.geometry
+        for key in ("x_m", "y_m", "height_m", "height_reference"):
+            if getattr(given, key) != type(given).model_fields[key].default:
+                raise ValueError(
+                    f"geometry.{key} = {shown(getattr(given, key))}: does not apply beside geometry.aim, where "
+                    "geometry.distance_m sets the distance; leave it out"
+                )
+        rivals = {
+            "a trajectory": self.is_flown,
+            f"plan.pair_strata = {str(self.plan.pair_strata).lower()}": self.plan.pair_strata,
+            f"plan.sun_facing_nominal_fraction = {self.plan.sun_facing_nominal_fraction:g}": (
+                self.plan.sun_facing_nominal_fraction > 0
+            ),
+        }
+        for rival, is_there in rivals.items():
+            if is_there:
+                raise ValueError(f"geometry.aim: does not apply beside {rival}; leave one out")
+        return self
+
     @model_validator(mode="after")
     def _strata(self) -> Scene:
         half, full = self.camera.fov_deg / 2, 360.0
@@ -104,13 +132,16 @@ class Scene(Table):
             "sun_facing": {"sun_elevation_deg": (-30.0, 30.0), "roll_deg": near, "pitch_deg": near},
             "sun_averted": {"sun_elevation_deg": (-30.0, 90.0), "roll_deg": far, "pitch_deg": far},
         }
-        strata = {}
+        strata, unbounded = {}, StratumTable()
         for name, bounds in paper.items():
-            given = getattr(self.geometry, name) or StratumTable()
+            given = getattr(self.geometry, name) or unbounded
             bounds |= {"sun_azimuth_deg": turn, "yaw_deg": turn}
             bounds["min_lit_fraction"] = self.geometry.min_lit_fraction
             unset = {key: value for key, value in bounds.items() if getattr(given, key) is None}
             strata[name] = given.model_copy(update=unset)
+            # compare values, not whether they were set: the scene of a store has all of them
+            if self.is_aimed and strata[name] != unbounded.model_copy(update=bounds):
+                raise ValueError(f"geometry.{name}: does not apply beside geometry.aim; leave it out")
         object.__setattr__(self, "geometry", self.geometry.model_copy(update=strata))
         if self.plan.pair_strata and self.geometry.sun_visibility != "as_drawn":
             raise ValueError(

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from ..core import frames
 from ..core.errors import InputError
-from . import keyed_random
+from . import aims, keyed_random
 from .config import Scene
 from .sampling import StratumTable
 
@@ -45,13 +45,15 @@ _MAX_EXCHANGES = 200
 class Plan:
     """Hold the plan of n samples.
 
-    - `variables` maps the names of VARIABLES to float64[n], the values of each sample's first view.
+    - `variables` maps the names of VARIABLES, or of `aims.AIM_VARIABLES` if the camera aims, to float64[n], the
+      values of each sample's first view.
     - `injected` bool[n, fault], in the order of `faults`, is the fault matrix.
     - `stratum`, `site` and `split` (index in SPLITS) are integers[n].
     - `architecture` and `readout_direction` integers[n] are indices into the scene's lists of allowed values.
     - `individual` integers[n] is the device of the detector.
     - `light` int64[n] is the sample whose Sun each sample has: itself, or the Sun-facing sample of its pair.
     - `paired` bool[n] marks the samples of pairs (`plan.pair_strata`).
+    - `aim` uint8[n] is the aim, an index in `aims.AIMS`; None without `geometry.aim`.
     """
 
     faults: tuple[str, ...]
@@ -65,6 +67,7 @@ class Plan:
     individual: NDArray[np.int32]
     light: NDArray[np.int64]
     paired: NDArray[np.bool_]
+    aim: NDArray[np.uint8] | None = None
 
     def __len__(self) -> int:
         return len(self.stratum)
@@ -83,15 +86,24 @@ class Plan:
     def view(self, scene: Scene, index: int, attempt: int) -> dict[str, float]:
         """Return the variables of a sample's view at a try, counted from 0, under the names of VARIABLES.
 
-        `scene` is the scene of the plan. The stratum, the site and the device of the sample do not change.
+        If the camera aims, the names are those of `aims.AIM_VARIABLES` that the sample's aim needs. `scene` is the
+        scene of the plan. The stratum, the site, the device and the aim of the sample do not change.
         """
-        if attempt == 0:
-            return {name: float(values[index]) for name, values in self.variables.items()}
         row = slice(index, index + 1)
-        drawn = _views(
-            scene, np.array([index]), self.stratum[row], self.light[row], self.paired[row], attempt=attempt
-        )
-        return {name: float(values[0]) for name, values in drawn.items()}
+        if attempt == 0:
+            drawn = {name: values[row] for name, values in self.variables.items()}
+        elif self.aim is not None:
+            drawn = aims.draw(scene, np.array([index]), self.aim[row], attempt)
+        else:
+            drawn = _views(
+                scene, np.array([index]), self.stratum[row], self.light[row], self.paired[row], attempt=attempt
+            )
+        values = {name: float(column[0]) for name, column in drawn.items()}
+        return values if self.aim is None else aims.of_aim(values, self.aim_of(index))
+
+    def aim_of(self, index: int) -> str:
+        """Return the name of a sample's aim; "" without `geometry.aim`."""
+        return "" if self.aim is None else aims.AIMS[int(self.aim[index])]
 
 
 def make_plan(
@@ -116,9 +128,12 @@ def make_plan(
     injected = np.concatenate([p[0] for p in parts])
     stratum = np.concatenate([p[1] for p in parts])
     light, paired = _pairs(scene, samples, stratum, shard)
+    aim = np.concatenate([p[2] for p in parts]) if scene.is_aimed else None
     return Plan(
         faults=tuple(faults),
-        variables=_views(scene, samples, stratum, light, paired),
+        variables=(
+            _views(scene, samples, stratum, light, paired) if aim is None else aims.draw(scene, samples, aim, 0)
+        ),
         injected=injected,
         stratum=stratum,
         site=site,
@@ -128,6 +143,7 @@ def make_plan(
         individual=_individuals(scene, samples, split),
         light=light,
         paired=paired,
+        aim=aim,
     )
 
 
@@ -163,6 +179,12 @@ def least_sun_angle_deg(scene: Scene) -> float:
     camera = scene.camera
     diagonal = np.hypot(1.0, camera.height_px / camera.width_px) * np.tan(np.radians(camera.fov_deg) / 2)
     return float(max(np.sqrt(2) * camera.fov_deg / 2, np.degrees(np.arctan(diagonal))))
+
+
+def sun_elongation_deg(scene: Scene) -> tuple[float, float]:
+    """Return the allowed angles between boresight and Sun where the camera aims, but not at the Sun."""
+    given = scene.geometry.sun_elongation_deg
+    return (least_sun_angle_deg(scene), 180.0) if given is None else (given[0], given[1])
 
 
 def strata(scene: Scene) -> tuple[StratumTable, StratumTable]:
@@ -291,8 +313,8 @@ def _block(
     block: tuple[int, int],
     shard: NDArray[np.int64],
     split: NDArray[np.uint8],
-) -> tuple[NDArray[np.bool_], NDArray[np.uint8]]:
-    """Return the fault matrix bool[n, fault] and the strata uint8[n] of a block.
+) -> tuple[NDArray[np.bool_], NDArray[np.uint8], NDArray[np.uint8]]:
+    """Return the fault matrix bool[n, fault], the strata uint8[n] and, if the camera aims, the aims uint8[n].
 
     `classes` are the faults, and those of them that need the Sun. `block` is the number of the block and its first
     sample.
@@ -309,6 +331,8 @@ def _block(
     injected = make(spec, rng)
     towards_sun = int(_with_any(injected, faults, need_sun).sum())
     nominal = round(scene.plan.sun_facing_nominal_fraction * n)
+    if scene.is_aimed:
+        nominal = aims.samples_towards_sun(scene, n, towards_sun) - towards_sun
     if towards_sun + nominal > n:
         names = " or ".join(name for name in faults if name in need_sun)
         raise InputError(
@@ -318,7 +342,9 @@ def _block(
     stratum = np.full(n, SUN_AVERTED, dtype=np.uint8)
     stratum[: towards_sun + nominal] = SUN_FACING
     order = _dealt(injected, stratum, shard, split, rng)
-    return injected[order], stratum[order]
+    stratum = stratum[order]
+    aim = aims.deal(scene, stratum == SUN_FACING, rng) if scene.is_aimed else stratum[:0]
+    return injected[order], stratum, aim
 
 
 def _with_any(matrix: NDArray[np.bool_], faults: Sequence[str], wanted: Collection[str]) -> NDArray[np.bool_]:

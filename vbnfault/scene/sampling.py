@@ -90,8 +90,41 @@ class StratumTable(Table):
     )
 
 
+class AimTable(Table):
+    """Mix what the camera aims at, by weights: a weight of 2 gives twice as many samples as a weight of 1.
+
+    `geometry.aim = "limb"` is short for the weight 1 of `limb` alone.
+    """
+
+    sun: float = Field(
+        0.0,
+        ge=0,
+        le=1e6,
+        description="from above the site, with the Sun anywhere in the frame and the body's limb near it. Samples "
+        "whose faults need the Sun have this aim, even if they are more",
+    )
+    nadir: float = Field(0.0, ge=0, le=1e6, description="straight down at the site, from above it")
+    limb: float = Field(
+        0.0, ge=0, le=1e6, description="at the body's outline in any direction, from above the site"
+    )
+    site: float = Field(0.0, ge=0, le=1e6, description="at the site, from a direction within zenith_deg")
+    random: float = Field(
+        0.0, ge=0, le=1e6, description="in any direction that leaves some of the body in the frame"
+    )
+
+    @model_validator(mode="after")
+    def _some(self) -> AimTable:
+        if not any(self.model_dump().values()):
+            raise ValueError("all weights are 0; one of sun, nadir, limb, site, random must be above 0")
+        return self
+
+
 class GeometryTable(Table):
-    """Set where the camera is and looks. Unset bounds follow the paper's table for the camera's field of view."""
+    """Set where the camera is and looks. Unset bounds follow the paper's table for the camera's field of view.
+
+    Without `aim`, positions and attitudes are drawn within bounds, as in the paper. With `aim`, the camera flies at
+    `distance_m` from a site and looks at what `aim` names, and terrain is as fine as the pixels from any distance.
+    """
 
     x_m: pair_within(-1e9, 1e9) = Field(  # type: ignore[valid-type]
         (-150.0, 150.0), description="the camera's position north of the site"
@@ -121,8 +154,39 @@ class GeometryTable(Table):
     max_tries: int = Field(
         256, ge=1, le=100_000, description="views drawn until one meets all conditions; the sample fails after them"
     )
+    aim: Literal["sun", "nadir", "limb", "site", "random"] | AimTable | None = Field(
+        None,
+        description="what the camera looks at: one name, or a table of weights. Default: bounds of roll, pitch and "
+        "yaw, as in the paper. With it, x_m, y_m, height_m, height_reference, sun_facing and sun_averted do not "
+        "apply",
+    )
+    distance_m: pair_within(0.1, 1e10) = Field(  # type: ignore[valid-type]
+        (100.0, 10e3),
+        description="with aim: from the camera to the site; equally many samples in each octave",
+    )
+    zenith_deg: pair_within(0, 89) = Field(  # type: ignore[valid-type]
+        (0.0, 60.0), description="with aim 'site': angle at the site from straight up to the camera"
+    )
+    phase_deg: pair_within(0, 180) = Field(  # type: ignore[valid-type]
+        (0.0, 120.0), description="with aim, but not 'sun': angle at the site between camera and Sun"
+    )
+    sun_elongation_deg: pair_within(0, 180) | None = Field(  # type: ignore[valid-type]
+        None,
+        description="with aim, but not 'sun': allowed angle between boresight and Sun, else drawn again; default: "
+        "from the angle that keeps the Sun out of the frame to 180",
+    )
+    pointing_error_deg: float = Field(
+        0.1,
+        ge=0,
+        le=20,
+        description="with aim: standard deviation of the boresight from its target, about x and about y each",
+    )
     sun_facing: StratumTable | None = Field(None, description="bounds of the samples that face the Sun")
     sun_averted: StratumTable | None = Field(None, description="bounds of the samples that do not face the Sun")
+
+
+# The keys of [geometry] that only matter for a camera that aims.
+OF_AN_AIM = ("aim", "distance_m", "zenith_deg", "phase_deg", "sun_elongation_deg", "pointing_error_deg")
 
 
 class PlanTable(Table):

@@ -306,6 +306,7 @@ class SceneEvaluator:
             )
         spec = session.spec(index)
         pose = resolve(spec, 0)
+        spec = spec.at(pose)
         return RenderedView(spec=spec, pose=pose, rendering=render_view(spec, pose))
 
     def _exposed(self, evaluation: Evaluation, setting: Setting) -> Exposed:

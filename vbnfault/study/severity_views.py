@@ -166,6 +166,7 @@ def session_of(group: ViewGroup) -> Session:
 def _views(spec: SampleSpec, count: int, facing_sun: bool) -> Iterator[SequenceView]:
     """Render the views of a sequence; none where the Sun should be before the camera, but is not wholly visible."""
     pose = resolve(spec)
+    spec = spec.at(pose)
     if facing_sun and not (pose.sun_visible_fraction == 1 and pose.L_from_C[:, 2] @ pose.sun_L > 0):
         return
     rendering = render_view(spec, pose)

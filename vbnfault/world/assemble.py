@@ -162,7 +162,7 @@ def target_attitude(scene: Scene, sun_T: F64) -> F64:
 
 def attitude_references(scene: Scene) -> tuple[str, str]:
     """Return the references of attitudes ("sun", "nadir" or "centre"): Sun-facing stratum, Sun-averted stratum."""
-    if scene.is_flown:  # the attitude was not drawn, and it is stored relative to the Sun
+    if scene.is_flown or scene.is_aimed:  # no bounds of the attitude; it is stored relative to the Sun
         return "sun", "sun"
     facing, averted = scene.geometry.sun_facing, scene.geometry.sun_averted
     assert facing is not None

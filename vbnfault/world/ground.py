@@ -33,6 +33,8 @@ _EVEN_FRACTION, _SHARED_FRACTION = 0.66, 0.33
 _MORE = 1.3
 # Rays across the frame, on each side, that look for ground between the vertices of a coarse shape model.
 _RAYS = 3
+# Points in the frame that are compared as the origin of a terrain.
+_ORIGINS = 100
 # Distances are rounded down to a power of this, so that poses at nearly the same distance share a terrain.
 _STEP = 2**0.5
 
@@ -122,14 +124,23 @@ def _whole_body(scene: Scene, body: Body, pose: FlownPose) -> GroundDetail | Non
 def _around(scene: Scene, seen: Sequence[_Seen]) -> GroundDetail:
     """Return the terrain for the ground in several frames.
 
-    Its origin is the ground nearest to a camera. A point at the distance d from its camera and s from the origin
-    has facets of a pixel if the even radius is at least s · d_nearest / d.
+    A point at the distance d from its camera and s from the origin has facets of a pixel if the even radius is at
+    least s · d_nearest / d. The origin is the point for which this radius is smallest, or the ground nearest to a
+    camera where `patch.radius_m` suffices.
     """
     points = np.concatenate([part.points_T_m for part in seen])
     distance = np.concatenate([part.distance_m for part in seen])
-    nearest = int(np.argmin(distance))
-    origin, least_m = points[nearest], float(distance[nearest])
-    radius_m = float((np.linalg.norm(points - origin, axis=1) * least_m / distance).max())
+    least_m = float(distance.min())
+
+    def needed_radius_m(origin: F64) -> float:
+        return float((np.linalg.norm(points - origin, axis=1) * least_m / distance).max())
+
+    origin = points[np.argmin(distance)]
+    radius_m = needed_radius_m(origin)
+    if radius_m > scene.patch.radius_m:
+        spread = points[np.linspace(0, len(points) - 1, min(len(points), _ORIGINS)).astype(int)]
+        origin = min(spread, key=needed_radius_m)
+        radius_m = needed_radius_m(origin)
     facet_m = max(scene.patch.facet_m, FACET_PX * pixel_rad(scene) * _rounded(least_m))
     return _detail(scene, origin, facet_m, max(radius_m, scene.patch.radius_m))
 
