@@ -97,7 +97,7 @@ def test_lines_agree_with_adaptive_quadrature() -> None:
         want = sum(quad(piece, a, b, (ray,), limit=200)[0] for a, b in itertools.pairwise(stops))
         if np.isinf(length):  # far away the direction from the centre is that of the line
             want += flow.density(ray[None])[0] / end
-        assert value == pytest.approx(want, rel=2e-6)
+        assert value == pytest.approx(want, rel=1e-4)
 
 
 def test_the_column_through_the_core_is_exact() -> None:
@@ -161,7 +161,7 @@ def test_the_shadow_agrees_with_rays_to_the_sun() -> None:
     surface = TerrainMesh(vertices.astype(np.float32), faces, np.zeros(len(faces), dtype=bool))
     reach = 1.06 * float(np.linalg.norm(vertices, axis=1).max())
     axes = sun_axes(SUN)
-    shadow = Shadow.of(heights_towards_sun(surface, np.zeros(3), axes, reach, 384), axes, reach)
+    shadow = Shadow.of(heights_towards_sun(surface, np.zeros(3), axes, reach, 256), axes, reach)
     flow, camera = outflow(), np.array([-3e3, 9e3, 2e3])
     behind = -SUN * np.linspace(1500, 20e3, 40)[:, None] + 1500 * directions(40, seed=5)
     rays = (behind - camera) / np.linalg.norm(behind - camera, axis=1, keepdims=True)
@@ -183,7 +183,7 @@ def test_the_shadow_agrees_with_rays_to_the_sun() -> None:
 
 def sphere_shadow(half_m: float) -> Shadow:
     """Return the shadow of the sphere of 1 km."""
-    along = (np.arange(384) + 0.5) * 2 * half_m / 384 - half_m
+    along = (np.arange(256) + 0.5) * 2 * half_m / 256 - half_m
     square = along[None] ** 2 + along[:, None] ** 2
     heights = np.where(square < RADIUS_M**2, np.sqrt(np.maximum(RADIUS_M**2 - square, 0)), -np.inf)
     return Shadow.of(heights.astype(np.float32), sun_axes(SUN), half_m)

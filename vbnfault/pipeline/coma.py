@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 
 from ..core.quantities import Radiance, Truth
@@ -30,9 +31,8 @@ def add_coma(spec: SampleSpec, pose: Pose, scene: RenderInput, truth: Truth, rad
     heights = render.heights_towards_sun(terrain.surface, coma.centre_L_m, axes, coma.reach_m, SHADOW_CELLS)
     shadow = Shadow.of(heights, axes, coma.reach_m)
     light = haze(coma, shadow, scene.view, truth.depth_m, truth.semantic)
-    bands = (scene.sun.irradiance_W_m2_nm * coma.colour(scene.wavelength_nm)).astype(np.float32)
+    bands = scene.sun.irradiance_W_m2_nm * coma.colour(scene.wavelength_nm)
     array = np.empty_like(radiance.array)
     for band, factor in enumerate(bands):
-        np.multiply(light, factor, out=array[band])
-        array[band] += radiance.array[band]
+        cv2.scaleAdd(light, float(factor), radiance.array[band], array[band])
     return replace(radiance, array=array)

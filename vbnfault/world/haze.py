@@ -9,7 +9,6 @@ share a grid of pixels. Neither grid crosses the body's limb, so the limb stays 
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -35,7 +34,7 @@ _WRAPPED = 4  # turns that are repeated at both ends for the interpolation
 _SKY_NODES = 256
 _FINE_STRIDES = 24
 # The most nodes on the ground.
-_GROUND_NODES = 9000
+_GROUND_NODES = 6000
 _PAD = 2  # nodes beyond the frame
 # Most of tan(ψ/2), where ψ is the angle from the centre: all directions beyond look away from it.
 _MOST_TANGENT = 1e4
@@ -62,9 +61,15 @@ class _Frame:
 
     @cached_property
     def axes_L(self) -> F64:
-        """Return two unit vectors at right angles to the direction to the centre, and this one, as rows."""
-        centre = -self.camera_m / self.distance_m
-        first = unit(np.cross(centre, np.eye(3)[np.argmin(np.abs(centre))]))
+        """Return two unit vectors at right angles to the direction to the centre, and this one, as rows.
+
+        The first one points to the side of the boresight, so that turns are counted from there.
+        """
+        centre, boresight = -self.camera_m / self.distance_m, self.view.L_from_C[:, 2]
+        beside = boresight - (boresight @ centre) * centre
+        if np.linalg.norm(beside) < 1e-6:
+            beside = np.cross(centre, np.eye(3)[np.argmin(np.abs(centre))])
+        first = unit(beside)
         return np.stack([first, np.cross(centre, first), centre])
 
     def slopes(self, x_px: F64, y_px: F64) -> tuple[F64, F64]:
@@ -174,58 +179,86 @@ def _on_sky(frame: _Frame, sky: Mask, sine: F32, cosine: F32) -> F32:
     """Return the light of lines without end, over that of a line with G = 1, float32[y, x]."""
     # the tangent of half the angle from the centre, by a formula without cancellation
     tangent = sine[sky] / np.maximum(1 + cosine[sky], np.float32(1 / _MOST_TANGENT))
-    low, high = (float(np.log(v)) for v in (float(tangent.min()), float(tangent.max())))
-    margin = 0.05 + 0.02 * (high - low)
-    table = _sky_table(frame, low - margin, high + margin)
-    step = (high - low + 2 * margin) / (_SKY_STEPS - 1)
-    sun = frame.axes_L @ frame.coma.outflow.sun
-
-    def at(x_px: F64, y_px: F64) -> F32:
-        first, second, along = frame.components(x_px, y_px)
-        across = np.sqrt(first * first + second * second)
-        angle = np.log(np.maximum(across, 1e-9) / np.maximum(1 + along, 1 / _MOST_TANGENT))
-        turn = np.arctan2(second, first) * (_SKY_TURNS / (2 * np.pi)) + _SKY_TURNS / 2 + _WRAPPED
-        where = np.stack([(angle - low + margin) / step, turn])
-        light = ndimage.map_coordinates(table, where, order=3, mode="nearest", prefilter=False)
-        phase = frame.coma.phase(first * sun[0] + second * sun[1] + along * sun[2])
-        return np.asarray(np.maximum(light, 0) * phase, dtype=np.float32)
-
+    bounds = np.log(float(tangent.min())), np.log(float(tangent.max()))
     height, width = sky.shape
     stride = max(1, max(height, width) // _SKY_NODES)
-    out = _enlarged(at, height, width, stride)
-    if stride > 1:  # near the centre every pixel counts
-        x, y, z = frame.view.L_from_C.T @ frame.axes_L[2]
-        if z > 0:
-            fx, fy, cx, cy = frame.view.intrinsics
-            reach = _FINE_STRIDES * stride
-            rows, columns = (
-                (max(round(middle - reach), 0), min(round(middle + reach), size))
-                for middle, size in ((fy * y / z + cy, height), (fx * x / z + cx, width))
-            )
-            if rows[0] < rows[1] and columns[0] < columns[1]:
-                out[slice(*rows), slice(*columns)] = at(_positions_px(*columns), _positions_px(*rows))
+    x_px, y_px = (_positions_px(-_PAD, -(-size // stride) + _PAD, stride) for size in (width, height))
+    first, second, _ = frame.components(x_px, y_px)
+    table = _SkyTable.of(frame, bounds, float(np.abs(np.arctan2(second, first)).max()))
+    nodes = table.at(x_px, y_px)
+    full = cv2.resize(nodes, (len(x_px) * stride, len(y_px) * stride), interpolation=cv2.INTER_CUBIC)
+    out = np.ascontiguousarray(full[_PAD * stride :, _PAD * stride :][:height, :width])
+    x, y, z = frame.view.L_from_C.T @ frame.axes_L[2]
+    if stride > 1 and z > 0:  # near the centre every pixel counts
+        fx, fy, cx, cy = frame.view.intrinsics
+        reach = _FINE_STRIDES * stride
+        rows, columns = (
+            (max(round(middle - reach), 0), min(round(middle + reach), size))
+            for middle, size in ((fy * y / z + cy, height), (fx * x / z + cx, width))
+        )
+        if rows[0] < rows[1] and columns[0] < columns[1]:
+            out[slice(*rows), slice(*columns)] = table.at(_positions_px(*columns), _positions_px(*rows))
     return out
 
 
-def _sky_table(frame: _Frame, low: float, high: float) -> F64:
-    """Return spline coefficients of the light without phase function, float64[angle, turn].
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _SkyTable:
+    """Hold the light of lines without end for directions around that to the centre.
 
-    Rows are steps of the logarithm of tan(ψ/2) from `low` to `high`, where ψ is the angle from the centre; columns
-    are turns about the centre from -π, with some repeated at both ends.
+    Rows are steps of the logarithm of tan(ψ/2), where ψ is the angle from the centre, from `low` on; columns are
+    turns about the centre in steps of 2 π / `_SKY_TURNS`, from `first_turn` on. `coefficients` float64[row, column]
+    are those of a cubic spline.
     """
-    tangent = np.exp(np.linspace(low, high, _SKY_STEPS))
-    turn = 2 * np.pi * np.arange(_SKY_TURNS) / _SKY_TURNS - np.pi
-    sine, cosine = (v / (1 + tangent**2) for v in (2 * tangent, 1 - tangent**2))
-    first = sine[:, None] * np.cos(turn)
-    second = sine[:, None] * np.sin(turn)
-    local = np.stack([first, second, np.broadcast_to(cosine[:, None], first.shape)], axis=-1)
-    directions = local.reshape(-1, 3) @ frame.axes_L
-    light = frame.coma.relative_light(
-        frame.camera_m, directions, np.full(len(directions), np.inf), frame.shadow
-    ).reshape(first.shape)
-    coefficients = ndimage.spline_filter1d(light, order=3, axis=1, mode="grid-wrap")
-    coefficients = ndimage.spline_filter1d(coefficients, order=3, axis=0, mode="mirror")
-    return np.concatenate([coefficients[:, -_WRAPPED:], coefficients, coefficients[:, :_WRAPPED]], axis=1)
+
+    frame: _Frame
+    low: float
+    step: float
+    first_turn: float
+    coefficients: F64
+
+    @classmethod
+    def of(cls, frame: _Frame, bounds: tuple[float, float], turn_rad: float) -> _SkyTable:
+        """Return the table between two logarithms and for turns up to an angle in both directions."""
+        margin = 0.05 + 0.02 * (bounds[1] - bounds[0])
+        angles = np.linspace(bounds[0] - margin, bounds[1] + margin, _SKY_STEPS)
+        step = 2 * np.pi / _SKY_TURNS
+        half = int(np.ceil(turn_rad / step)) + 2 * _WRAPPED
+        whole = 2 * half >= _SKY_TURNS
+        half = _SKY_TURNS // 2 if whole else half
+        turns = step * np.arange(-half, half if whole else half + 1)
+        tangent = np.exp(angles)
+        sine, cosine = (v / (1 + tangent**2) for v in (2 * tangent, 1 - tangent**2))
+        across = [sine[:, None] * v for v in (np.cos(turns), np.sin(turns))]
+        local = np.stack([*across, np.broadcast_to(cosine[:, None], across[0].shape)], axis=-1)
+        directions = local.reshape(-1, 3) @ frame.axes_L
+        light = frame.coma.relative_light(
+            frame.camera_m, directions, np.full(len(directions), np.inf), frame.shadow
+        ).reshape(across[0].shape)
+        table = ndimage.spline_filter1d(light, order=3, axis=0, mode="mirror")
+        table = ndimage.spline_filter1d(table, order=3, axis=1, mode="grid-wrap" if whole else "mirror")
+        first = -half * step
+        if whole:
+            table = np.concatenate([table[:, -_WRAPPED:], table, table[:, :_WRAPPED]], axis=1)
+            first -= _WRAPPED * step
+        return cls(
+            frame=frame,
+            low=float(angles[0]),
+            step=float(angles[1] - angles[0]),
+            first_turn=first,
+            coefficients=table,
+        )
+
+    def at(self, x_px: F64, y_px: F64) -> F32:
+        """Return the light, with the phase function, in a grid of image positions, float32[y, x]."""
+        first, second, along = self.frame.components(x_px, y_px)
+        across = np.sqrt(first * first + second * second)
+        angle = np.log(np.maximum(across, 1e-9) / np.maximum(1 + along, 1 / _MOST_TANGENT))
+        turn = (np.arctan2(second, first) - self.first_turn) * (_SKY_TURNS / (2 * np.pi))
+        where = np.stack([(angle - self.low) / self.step, turn])
+        light = ndimage.map_coordinates(self.coefficients, where, order=3, mode="nearest", prefilter=False)
+        sun = self.frame.axes_L @ self.frame.coma.outflow.sun
+        phase = self.frame.coma.phase(first * sun[0] + second * sun[1] + along * sun[2])
+        return np.asarray(np.maximum(light, 0) * phase, dtype=np.float32)
 
 
 def _on_ground(frame: _Frame, rows: tuple[int, int], columns: tuple[int, int], length_m: F32, body: Mask) -> F32:
@@ -255,17 +288,3 @@ def _on_ground(frame: _Frame, rows: tuple[int, int], columns: tuple[int, int], l
     nearest = ndimage.distance_transform_edt(~seen, return_distances=False, return_indices=True)
     full = cv2.resize(nodes[tuple(nearest)], (size[0] * stride, size[1] * stride), interpolation=cv2.INTER_LINEAR)
     return np.asarray(full[:height, :width])
-
-
-def _enlarged(at: Callable[[F64, F64], F32], height: int, width: int, stride: int) -> F32:
-    """Return an image, float32[y, x], interpolated between nodes every `stride` px where `at` is evaluated.
-
-    `at` takes the image positions of columns and rows in px.
-    """
-    if stride == 1:
-        return at(_positions_px(0, width), _positions_px(0, height))
-    x_px, y_px = (_positions_px(-_PAD, -(-size // stride) + _PAD, stride) for size in (width, height))
-    nodes = at(x_px, y_px)
-    full = cv2.resize(nodes, (len(x_px) * stride, len(y_px) * stride), interpolation=cv2.INTER_CUBIC)
-    first = _PAD * stride
-    return np.ascontiguousarray(full[first : first + height, first : first + width])
