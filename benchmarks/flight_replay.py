@@ -9,10 +9,10 @@ that of the scene, by default `navcam67p` with its detector, without its faults,
 mosaic is compared, where the detector has one, because the image of a store has lost its bias. The labels of flight
 images are some pixels off, so every image is aligned by a shift first.
 
-Stretch and exposure of the frames are unknown. So the rendered image is scaled to the brightness of the frame and
-rounded to 8 bits, and brightness is compared as (image - background) / (bright - background): `background` is the
-median of the sky, `bright` the 99th percentile of the body. Printed are, over all frames, the median and the worst
-5 % of:
+Stretch and exposure of the frames are unknown, and most of their background was subtracted. So the rendered image
+loses the bias of its sensor, is scaled to the brightness of the frame above `PEDESTAL` and rounded to 8 bits.
+Brightness is compared as (image - background) / (bright - background): `background` is the median of the sky,
+`bright` the 99th percentile of the body. Printed are, over all frames, the median and the worst 5 % of:
 
 - `iou`: lit silhouettes, intersection over union. Lit is a brightness above 0.12.
 - `limb_px`: median distance between the bright limbs, both ways.
@@ -23,6 +23,11 @@ median of the sky, `bright` the 99th percentile of the body. Printed are, over a
 - `noise`, `column`: deviation of the sky from its local median, and of its columns' medians from a smooth curve, as
   fractions of `bright`.
 - `tracks`: bright spots and streaks in the sky, of 2 px or more.
+
+The scene gets a coma (`HAZE`) unless it has one. Its Afρ reproduces the haze of the frames, which falls as one over
+the distance from the centre and is brighter towards the Sun. An aperture of 10,000 km would then see 500 times the
+light of the nucleus, but until June 2014 the comet exceeded the light of its nucleus only somewhat (Tubiana et al.
+2015, A&A 573, A62). So most of this haze is light that the camera scatters. `--afrho-cm 0` leaves it out.
 
 `replay.json` holds all figures, `sheet.png` the pairs real | rendered at full size, with the same stretch.
 """
@@ -64,6 +69,10 @@ _LARGE_PART, _NEAR_BODY = 0.02, 0.4
 _SMEAR = 0.1  # of the brightness: columns whose sky differs by more are smeared
 _SEARCH_PX = 16  # largest shift, for frames of 512 px
 _CLIPPED = 0.5  # of the sky at 0: such a frame tells nothing of its background
+# Fitted to the glow of eight frames, as this plus a term that falls as one over the distance from the centre.
+PEDESTAL = 0.005
+AFRHO_CM = 4800.0
+HAZE = {"reference_au": 3.6, "sunlit_fraction": 0.4, "distance_exponent": 0.0}
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -284,13 +293,15 @@ def replay(session: vbnfault.Session, trajectory: Trajectory, row: int, frame: N
     """Render a row, align it with its real frame, and compare the two."""
     start = time.perf_counter()
     layers = session.simulate(row).layers
-    image = layers.get("raw", layers["clean"][..., 3])
+    image = layers["clean"][..., 3]
+    if "raw" in layers:
+        image = layers["raw"].astype(np.float32) - float(session.base_camera.detector.description["bias_dn"])
     seconds = time.perf_counter() - start
     real, raw = look(frame), look(image)
     search_px = max(4, round(_SEARCH_PX * frame.shape[1] / 512))
     shift = shift_between(real, raw, search_px=search_px)
-    bright = real.bright / max(raw.bright, 1e-6)
-    moved = shifted(raw.image * bright, shift, raw.background * bright)
+    gain, offset = (1 - PEDESTAL) * real.bright / max(raw.bright, 1e-6), PEDESTAL * real.bright
+    moved = shifted(raw.image * gain + offset, shift, raw.background * gain + offset)
     rendered = look(np.clip(np.round(moved), 0, 255))
     pose = trajectory.pose(row)
     sun_C = pose.T_from_C.T @ pose.sun_direction_T
@@ -364,6 +375,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--shape", help="shape model of the body; default: that of the scene")
     parser.add_argument("--scene", default="navcam67p", help="scene with camera and ground")
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="a key of the scene")
+    parser.add_argument(
+        "--afrho-cm", type=float, default=AFRHO_CM, help="of the haze; 0: none (default %(default)s)"
+    )
     parser.add_argument("--rows", help="rows to replay, such as 0,5,18; default: all")
     parser.add_argument("--width", type=int, help="width in px; default: that of the frames")
     parser.add_argument("--threads", type=int, help="render threads; default: every core")
@@ -379,6 +393,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if given.width:
         frames = {row: reduced(frame, given.width) for row, frame in frames.items()}
     height, width = frames[rows[0]].shape
+    if given.afrho_cm and vbnfault.load_scene(given.scene).coma is None:
+        overrides = {"coma": {**HAZE, "afrho_cm": given.afrho_cm}, **overrides}
     scene = replay_scene(given.scene, (width, height), overrides)
     session = vbnfault.Session(scene, threads=given.threads, poses=trajectory)
     pairs = []
