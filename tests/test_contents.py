@@ -14,7 +14,7 @@ import trimesh
 from conftest import small_scene
 
 from vbnfault import dataset, pipeline, store
-from vbnfault.core import file_contents, resources, spice
+from vbnfault.core import file_contents, resources, spice, user_files
 from vbnfault.core.errors import InputChanged, InputError
 from vbnfault.dataset import build
 from vbnfault.scene import config
@@ -169,3 +169,33 @@ def test_renamed_files_of_equal_content_make_the_same_store(files: dict[str, Pat
         changed = dataset.store_spec(pipeline.Session(scene_of(renamed)), (4,))
         assert changed.attributes["scene_hash"] != after.attributes["scene_hash"]
         after = changed
+
+
+# --- results kept outside a run ---------------------------------------------------------------------------
+
+
+def test_a_result_is_kept_until_a_file_that_it_was_read_from_changes(tmp_path: Path) -> None:
+    path, calls = tmp_path / "lens.toml", []
+
+    @file_contents.cached_with_contents(maxsize=4)
+    def text(name: str) -> str:
+        calls.append("text")
+        return user_files.read_input(name, "lens").decode()
+
+    @file_contents.cached_with_contents(maxsize=4)
+    def size(name: str) -> int:
+        calls.append("size")
+        return len(text(name))
+
+    with pytest.raises(InputError, match="not found"):
+        size(str(path))
+    calls.clear()
+    for content in ("a", "bcd"):
+        path.write_text(content)
+        text(str(path))  # the outer function then finds this result and must still know its file
+        assert [size(str(path)) for _ in range(3)] == [len(content)] * 3
+    assert calls == ["text", "size"] * 2
+    with file_contents.Contents().in_use():  # a run compares the contents itself, and keeps its results
+        assert size(str(path)) == 3
+        path.write_text("ef")
+        assert size(str(path)) == 3

@@ -59,7 +59,7 @@ class Contents:
         `status` is given for a large file: its digest is then computed only where the status has changed.
         """
         key = _key(path)
-        status_now = None if status is None else (status.st_dev, status.st_ino, status.st_size, status.st_mtime_ns)
+        status_now = None if status is None else _identity(status)
         if status_now is not None and self._status.get(key) == status_now:
             return
         digest_now = digest()
@@ -73,6 +73,8 @@ class Contents:
 
 _in_use: ContextVar[Contents | None] = ContextVar("contents", default=None)
 _noted: ContextVar[list[str] | None] = ContextVar("noted", default=None)
+# Status of each file that the innermost cached function in work has read.
+_statuses: ContextVar[dict[str, tuple[int, ...] | None] | None] = ContextVar("statuses", default=None)
 
 
 def _key(path: str | Path) -> str:
@@ -102,8 +104,13 @@ def changed(sentence: str, path: str | Path, what: str) -> InputChanged:
 def check_contents(
     path: str | Path, what: str, digest: Callable[[], str], status: os.stat_result | None = None
 ) -> None:
-    """Pass the digest of a file to the `Contents` in use and to `noting`, where they are active."""
-    contents, noted = _in_use.get(), _noted.get()
+    """Pass the digest of a file to the `Contents` in use and to `noting`, where they are active.
+
+    The function in work that `cached_with_contents` decorates notes the file's status, too.
+    """
+    contents, noted, statuses = _in_use.get(), _noted.get(), _statuses.get()
+    if statuses is not None:
+        statuses[os.path.abspath(path)] = _status(os.path.abspath(path))
     if contents is not None:
         contents.check(path, what, digest, status)
     if noted is not None:
@@ -122,17 +129,63 @@ def noting() -> Iterator[list[str]]:
 
 
 def cached_with_contents(maxsize: int) -> Callable[[Callable[..., _R]], Callable[..., _R]]:
-    """Return a decorator like `lru_cache` for functions of file names; each run (`Contents`) has its own cache."""
+    """Return a decorator like `lru_cache` for functions of file names; each run (`Contents`) has its own cache.
+
+    Outside a run, as in a notebook, a result is computed again when a file that it was read from has changed.
+    """
 
     def decorate(function: Callable[..., _R]) -> Callable[..., _R]:
         @lru_cache(maxsize=maxsize)
-        def cached(_contents: Contents | None, /, *args: Any) -> _R:
-            return function(*args)
+        def result_of(_contents: Contents | None, /, *args: Any) -> _CachedResult:
+            return _CachedResult()
 
         @wraps(function)
         def wrapper(*args: Any) -> _R:
-            return cached(_in_use.get(), *args)
+            contents = _in_use.get()
+            result = result_of(contents, *args)
+            if not result.is_known or (contents is None and result.is_outdated()):
+                result.compute(lambda: function(*args))
+            around = _statuses.get()
+            if around is not None:
+                around.update(result.statuses)
+            value: _R = result.value
+            return value
 
         return wrapper
 
     return decorate
+
+
+class _CachedResult:
+    """Hold a result, and the status of each file that it was read from."""
+
+    def __init__(self) -> None:
+        self.is_known = False
+        self.value: Any = None
+        self.statuses: dict[str, tuple[int, ...] | None] = {}
+
+    def is_outdated(self) -> bool:
+        """Return whether a file has changed since the result was computed."""
+        return any(_status(path) != status for path, status in self.statuses.items())
+
+    def compute(self, function: Callable[[], Any]) -> None:
+        """Compute the result and note the files that are read."""
+        statuses: dict[str, tuple[int, ...] | None] = {}
+        before = _statuses.set(statuses)
+        try:
+            self.value, self.statuses, self.is_known = function(), statuses, True
+        finally:
+            _statuses.reset(before)
+
+
+def _status(path: str) -> tuple[int, ...] | None:
+    """Return what changes with a file's contents: device, inode, size and time; None if the file is missing."""
+    try:
+        return _identity(os.stat(path))
+    except OSError:
+        return None
+
+
+def _identity(status: os.stat_result) -> tuple[int, ...]:
+    """Return the parts of a file's status that change with its contents."""
+    return status.st_dev, status.st_ino, status.st_size, status.st_mtime_ns
