@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+import tracemalloc
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -14,6 +16,7 @@ from scipy.spatial.transform import Rotation
 import vbnfault
 from vbnfault import dataset
 from vbnfault.core.errors import InputError
+from vbnfault.dataset import describe
 from vbnfault.scene import config
 from vbnfault.scene.trajectory import COLUMNS, FlownPose, as_trajectory, load_trajectory
 from vbnfault.world import assemble, ground
@@ -219,6 +222,11 @@ def test_rows_set_the_samples_and_too_many_are_refused(tmp_path: Path, sphere: s
         vbnfault.Session(scene, poses=3)
 
 
+def test_an_edited_table_is_read_again(tmp_path: Path, sphere: str) -> None:
+    assert config.load_scene(scene_file(tmp_path, sphere)).dataset.samples == 5
+    assert config.load_scene(scene_file(tmp_path, sphere, rows()[:2])).dataset.samples == 2
+
+
 # ------------------------------------------------------------------------------------------------ the views
 
 
@@ -329,6 +337,34 @@ def test_the_description_shows_names_dates_and_distances(tmp_path: Path, sphere:
     assert "trajectory: 5 of 5 rows of poses.csv, from near to last; a site stands for 2 rows side by side" in text
     assert "nearest ground: 99.6 to 29500 m from the camera" in text
     assert "Sun: 2.5 to 3.1 au away, dates 2457000.50000 to 2457001.25000 TDB" in text
+
+
+def test_the_description_has_the_exposure_at_the_distances_of_the_table(tmp_path: Path, sphere: str) -> None:
+    def exposure_s(table: Rows) -> list[float]:
+        scene = config.load_scene(scene_file(tmp_path, sphere, table))
+        text = "\n".join(dataset.describe_scene(scene, source="flown"))
+        (about,) = re.findall(r"metered, about (.*?) s for ground", text)
+        return [float(number) for number in about.split(" to ")]
+
+    (one,) = exposure_s([row("a", (0, 0, 2000.0), sun_distance_au=1.0)])
+    near, far = exposure_s(
+        [row("a", (0, 0, 2000.0), sun_distance_au=1.0), row("b", (0, 0, 2e3), sun_distance_au=3.0)]
+    )
+    assert (near, far) == pytest.approx((one, 9 * one), rel=0.01)
+
+
+def test_the_description_takes_one_pose_after_the_other(tmp_path: Path, sphere: str) -> None:
+    """All vertices from 200 poses at once would take gigabytes for a detailed shape."""
+    table = [row(f"{k}", (0, 0, 2000.0 + k)) for k in range(250)]
+    scene = config.load_scene(scene_file(tmp_path, sphere, table))
+    session = vbnfault.Session(scene)
+    vertices = len(session.body.vertices_m)
+    tracemalloc.start()
+    lines = describe._trajectory(session, session.trajectory)
+    _, peak_bytes = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak_bytes < 20 * vertices * 24
+    assert "m from the camera (first 200 rows)" in lines[1]
 
 
 def test_a_camera_in_the_ground_is_named_with_its_row(tmp_path: Path, sphere: str) -> None:

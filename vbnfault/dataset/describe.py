@@ -16,6 +16,7 @@ from ..pipeline import Session
 from ..pipeline.exposure import reference_exposure_s
 from ..scene import aims, plan
 from ..scene.bodies import named_body
+from ..scene.config import Scene
 from ..scene.trajectory import Trajectory
 from ..world import assemble, ground
 from .progress import duration_text, size_text
@@ -196,8 +197,9 @@ def _redrawn(session: Session) -> str:
 def _trajectory(session: Session, table: Trajectory) -> list[str]:
     """Return lines about a table of poses: its rows, distances and dates, and the terrains that they need."""
     body, count = session.body, len(session.plan)
-    from_body = body.vertices_m[None] - table.camera_position_T_m[: min(count, _POSES_DESCRIBED), None]
-    range_m = np.linalg.norm(from_body, axis=2).min(axis=1)
+    first_poses = table.camera_position_T_m[: min(count, _POSES_DESCRIBED)]
+    # pose by pose: all at once would take gigabytes for a detailed shape
+    range_m = np.array([np.linalg.norm(body.vertices_m - camera, axis=1).min() for camera in first_poses])
     phase = [
         np.degrees(np.arccos(np.clip(frames.unit(position) @ sun, -1, 1)))
         for position, sun in zip(
@@ -245,11 +247,11 @@ def _camera(session: Session) -> list[str]:
     scene, camera = session.scene, session.base_camera
     settings = scene.camera
     if settings.exposure_s == "auto":
-        about = reference_exposure_s(scene, camera)
-        clipped = float(np.clip(about, settings.exposure_min_s, settings.exposure_max_s))
+        about = [reference_exposure_s(scene_there, camera) for scene_there in _at_least_and_most_sun(session)]
+        clipped = np.clip(about, settings.exposure_min_s, settings.exposure_max_s)
         exposure = (
-            f"metered, about {clipped:.3g} s for ground lit and seen at 45 deg, 60 deg of phase, "
-            f"from {settings.exposure_min_s:g} to {settings.exposure_max_s:g} s"
+            f"metered, about {_span(clipped.min(), clipped.max())} s for ground lit and seen at 45 deg, 60 deg of "
+            f"phase, from {settings.exposure_min_s:g} to {settings.exposure_max_s:g} s"
         )
     else:
         exposure = f"{settings.exposure_s:g} s"
@@ -260,6 +262,16 @@ def _camera(session: Session) -> list[str]:
         f"detector: {camera.detector.name}{_effects(camera.detector)}, {', '.join(architectures)}; "
         f"exposure: {exposure}",
     ]
+
+
+def _at_least_and_most_sun(session: Session) -> list[Scene]:
+    """Return the scene; with a table of poses, the scene at the least and at the greatest distance of the Sun."""
+    scene = session.scene
+    if session.trajectory is None:
+        return [scene]
+    distance = session.trajectory.sun_distance_au[: len(session.plan)]
+    suns = [scene.sun.model_copy(update={"distance_au": float(d)}) for d in (distance.min(), distance.max())]
+    return [scene.model_copy(update={"sun": sun}) for sun in suns]
 
 
 def _range(low: float, high: float) -> str:
