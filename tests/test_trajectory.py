@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 
 import vbnfault
 from vbnfault import dataset
+from vbnfault.body import PatchSpec
 from vbnfault.core.errors import InputError
 from vbnfault.dataset import describe
 from vbnfault.scene import config
@@ -248,6 +249,22 @@ def test_a_sphere_has_its_size_and_place_from_any_distance(sphere: str) -> None:
             assert len(x) == pytest.approx(np.pi * limb_px**2, rel=0.03, abs=12)
             assert (x.mean() + 0.5, y.mean() + 0.5) == pytest.approx((20, 16), abs=0.15)
             assert depth.min() == pytest.approx(distance - RADIUS_M, rel=2e-3)
+
+
+def test_a_wide_camera_may_be_any_distance_away(sphere: str) -> None:
+    """A pixel of 18 mrad covers 18,000 km from a million km away, more than the largest facet of a patch."""
+    distances_m = (1e9, 1e12)
+    session = vbnfault.Session(
+        small(sphere), poses=columns_of([row(f"{d:g}", (0, 0, d), (0.6, 0, 0.8)) for d in distances_m])
+    )
+    assert session.ground_detail(0) == session.ground_detail(1)
+    assert np.isinf(session.simulate(0).layers["depth_m"]).mean() > 0.99
+    moon = assemble.make_body(config.parse_scene({"title": "", "body": {"name": "Moon"}}, source="test"))
+    budget = {"patch": session.scene.patch.model_copy(update={"max_triangles": 1000})}
+    for scene in (session.scene, session.scene.model_copy(update=budget)):
+        for pose in (session.trajectory.pose(k) for k in range(2)):
+            (detail,) = ground.ground_details(scene, moon, [pose])
+            PatchSpec(seed=0, facet_m=detail.facet_m, radius_m=detail.radius_m, min_boulder_m=detail.boulder_m)
 
 
 def test_terrain_is_whole_from_afar_and_shared_and_a_patch_near_the_ground(tmp_path: Path, sphere: str) -> None:

@@ -35,6 +35,9 @@ _MORE = 1.3
 _RAYS = 3
 # Points in the frame that are compared as the origin of a terrain.
 _ORIGINS = 100
+# Largest facets, boulders and radius that a patch takes (`body.PatchSpec`). Facets of a shape model are smaller, so
+# that a patch with these facets is the model itself.
+_LARGEST_FACET_M, _LARGEST_RADIUS_M = 1e6, 1e8
 # Distances are rounded down to a power of this, so that poses at nearly the same distance share a terrain.
 _STEP = 2**0.5
 
@@ -154,7 +157,8 @@ def _affordable(scene: Scene, body: Body, detail: GroundDetail) -> GroundDetail:
         return detail
     even_m2 = min(np.pi * detail.radius_m**2, body.area_m2)
     most = _EVEN_FRACTION * scene.patch.max_triangles
-    return replace(detail, facet_m=max(detail.facet_m, float(np.sqrt(even_m2 / (most * _TRIANGLE)))))
+    facet_m = max(detail.facet_m, float(np.sqrt(even_m2 / (most * _TRIANGLE))))
+    return replace(detail, facet_m=min(facet_m, _LARGEST_FACET_M))
 
 
 def _detail(scene: Scene, origin_T_m: F64, facet_m: float, radius_m: float) -> GroundDetail:
@@ -163,7 +167,12 @@ def _detail(scene: Scene, origin_T_m: F64, facet_m: float, radius_m: float) -> G
     boulder_m = max(scene.patch.min_boulder_m, _BOULDER_PX * facet_m / FACET_PX)
     if facet_m == scene.patch.facet_m:  # pixels are smaller than facets
         boulder_m = scene.patch.min_boulder_m
-    return GroundDetail(position_T_m=(x, y, z), facet_m=facet_m, radius_m=radius_m, boulder_m=boulder_m)
+    return GroundDetail(
+        position_T_m=(x, y, z),
+        facet_m=min(facet_m, _LARGEST_FACET_M),
+        radius_m=min(radius_m, _LARGEST_RADIUS_M),
+        boulder_m=min(boulder_m, _LARGEST_FACET_M),
+    )
 
 
 def _even_triangles(detail: GroundDetail) -> float:
