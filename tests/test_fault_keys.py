@@ -38,9 +38,14 @@ COMPANIONS: dict[tuple[str, str], dict[str, Any]] = {
     ("broken_lines", "saturated_weight"): {"count": 20},
     ("broken_lines", "duplicated_weight"): {"count": 20},
     ("pixel_overwriting", "strength"): {"blend": "mixture"},
+    ("particles", "farthest_m"): {"nearest_m": 0.05},
 }
-# A packet is by default half of the small picture.
-CLASS_KEYS: dict[str, dict[str, Any]] = {"transmission": {"packet_px": 64}}
+# A packet is by default half of the small picture; a small picture shows few grains, and before the Sun only their
+# night sides.
+CLASS_KEYS: dict[str, dict[str, Any]] = {
+    "transmission": {"packet_px": 64},
+    "particles": {"density_per_m3": 100.0, "phase_slope_mag_deg": 0.0},
+}
 ARCHITECTURES = {
     "leak": "interline_ccd",
     "shutter_share": "full_frame_ccd",

@@ -138,6 +138,7 @@ def test_orders() -> None:
     # light first meets the optics, then the pixels, then the readout (design document, "Order"); within the
     # detector: charge collected, moved, read, converted, assembled and sent
     assert order == [
+        "particles",
         "straylight",
         "dust_on_optics",
         "optics_degradation",
@@ -176,8 +177,9 @@ def test_a_class_acts_directly_behind_the_class_that_it_names() -> None:
         declare("on_a_of_a_test", after="a_of_a_test")
         declare("first_of_all", after="")
         order = physical_order(registry())
-        assert order[:5] == ["first_of_all", "straylight", "a_of_a_test", "on_a_of_a_test", "b_of_a_test"]
-        assert order[5:] == before[1:]
+        first = ["first_of_all", "particles", "straylight", "a_of_a_test", "on_a_of_a_test", "b_of_a_test"]
+        assert order[:6] == first
+        assert order[6:] == before[2:]
         assert list(registry())[: len(ALL_FAULTS)] == list(ALL_FAULTS)
     assert physical_order(registry()) == before
 

@@ -126,5 +126,5 @@ def _counts_of_one_mean(mean: float, normal: F32) -> F32:
 def _normal_steps(mean: float) -> tuple[np.float32, ...]:
     """Return the normal variates at which the Poisson count of this mean increases by one."""
     # ±6 includes every float32 normal variate that a generator gives in practice (1 in 5e8 lies outside)
-    last = poisson_least_count(float(ndtr(6.0)), mean) if mean > 0 else 0
+    last = int(poisson_least_count(float(ndtr(6.0)), mean)) if mean > 0 else 0
     return tuple(np.float32(z) for z in ndtri(poisson_cumulative(np.arange(last), mean)))

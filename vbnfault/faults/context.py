@@ -23,7 +23,8 @@ REFERENCE_WIDTH_PX = 1024
 class FaultContext:
     """Describe the sample that a fault acts on.
 
-    The fields of the Sun are None where they are unknown, for example for a user's own image without a pose.
+    The fields of the Sun and of the scene are None where they are unknown, for example for a user's own image
+    without a pose.
 
     Attributes
     ----------
@@ -38,6 +39,10 @@ class FaultContext:
         Fraction of the Sun's disc that is not covered, in [0, 1].
     sun_angular_radius_rad
         Angular radius of the Sun's disc.
+    depth_m
+        float[y, x]: depth of the scene along the boresight at the pixel centres, inf on the sky.
+    up_C
+        float64[3]: unit vector in C away from the body, along the vertical of the site.
     coating_loss
         Fraction of the coatings' area that another fault of the sample has removed, in [0, 1]. Only a model with
         `Fault.informed` gets it; for the others it is 0.
@@ -50,6 +55,8 @@ class FaultContext:
     wavelength_nm: NDArray[np.float64] | None = None
     sun_visible_fraction: float | None = None
     sun_angular_radius_rad: float | None = None
+    depth_m: NDArray[np.floating[Any]] | None = None
+    up_C: NDArray[np.float64] | None = None
     coating_loss: float = 0.0
     # `init=False`, because `dataclasses.replace` must not copy results of one frame to another
     _memo: dict[Any, Any] = field(default_factory=dict, init=False, repr=False)

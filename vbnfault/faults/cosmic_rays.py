@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..detector.cosmic import LEAST_MEV_CM2_G, CosmicRayModel, CosmicRays, stopping_power_MeV_cm2_g
-from ..detector.poisson import poisson_least_count
+from ..detector.poisson import poisson_above_0
 from .context import FaultContext, Params
 from .contract import Fault
 from .fields import Interval, Severity, bounds, number
@@ -103,7 +103,7 @@ class Tracks(Fault):
         }
         model = _model(params, context)
         mean = model.expected_count(context.shape, params["time_s"])
-        count = min(_poisson_above_0(mean, rng), int(self.most_tracks))
+        count = min(int(poisson_above_0(mean, rng.random())), int(self.most_tracks))
         params["mean_count"], params["count"] = float(mean), count
         energy = np.round(self.energy_MeV.power_law(rng.random(count), self.spectral_index - 1), 2)
         tracks = _tracks(model, context.shape, count, energy, rng).params
@@ -129,15 +129,6 @@ def _model(params: Params, context: FaultContext) -> CosmicRayModel:
         flux_per_cm2_s=params["flux_per_cm2_s"],
         diffusion_um=params["diffusion_um"],
     )
-
-
-def _poisson_above_0(mean: float, rng: np.random.Generator) -> int:
-    """Return a Poisson variate, given that it is not 0.
-
-    The variate is the inverse of the upper tail at a uniform number below the probability of 1 or more.
-    """
-    chance = -np.expm1(-mean) * (1 - rng.random())
-    return max(poisson_least_count(1 - chance, mean), 1)
 
 
 def _tracks(

@@ -69,7 +69,7 @@ class TextureStraylight(Fault):
     fault = "straylight"
     model = "texture"
     default = True
-    after = ""
+    after = "particles"
     axis = 3
     step = "electrons"
     severity = Severity(key="brightness", low=0.01, high=100.0)

@@ -102,6 +102,7 @@ class RealLens:
     resamples: ClassVar[bool] = True
     blurs: ClassVar[bool] = True
     falls_off: ClassVar[bool] = True
+    border_px: ClassVar[int] = REACH_PX
 
     @property
     def real(self) -> RealLens:
@@ -416,6 +417,13 @@ class RealLens:
         """Return the irradiance that a radiance gives on the axis; the pixels' positions do not matter."""
         factor = self.axial_solid_angle_sr(radiance.wavelength_nm).astype(np.float32)
         return Irradiance(array=radiance.array * factor[:, None, None], wavelength_nm=radiance.wavelength_nm)
+
+    def spread(self, light: F32, wavelength_nm: float) -> F32:
+        """Return light on the pixels of the frame, float32[y, x], after the point spread of one wavelength.
+
+        `light` lies on the grid of the image, with `border_px` more pixels beyond each side of the frame.
+        """
+        return _spreads(self, (float(wavelength_nm),)).applied(light, 0)[_INSIDE]
 
     def image(self, radiance: Radiance) -> Irradiance:
         """Return the irradiance on the sensor, float32[band, y, x], of a render with its guard band."""

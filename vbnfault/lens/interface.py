@@ -17,6 +17,7 @@ from ..core.sundisc import Projection
 if TYPE_CHECKING:
     from .imaging import RealLens
 
+F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
 
@@ -107,6 +108,16 @@ class Lens(Protocol):
         """Return how many pixels beyond each side of the frame, in x and in y, the lens needs from a render."""
 
     # --- images
+
+    @property
+    def border_px(self) -> int:
+        """Return how many pixels beyond each side of the frame `spread` needs."""
+
+    def spread(self, light: F32, wavelength_nm: float) -> F32:
+        """Return light on the pixels of the frame, float32[y, x], after the point spread of one wavelength.
+
+        `light` lies on the grid of the image, with `border_px` more pixels beyond each side of the frame.
+        """
 
     def image(self, radiance: Radiance) -> Irradiance:
         """Return the irradiance on the sensor, float32[band, y, x], of a render with its guard band."""

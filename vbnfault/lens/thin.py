@@ -45,6 +45,7 @@ class ThinLens:
     blurs: ClassVar[bool] = False
     falls_off: ClassVar[bool] = False
     guard_px: ClassVar[tuple[int, int]] = (0, 0)
+    border_px: ClassVar[int] = 0
     distortion_residual_px: ClassVar[tuple[float, float]] = (0.0, 0.0)
 
     @property
@@ -99,6 +100,10 @@ class ThinLens:
     def on_frame(self, radiance: Radiance) -> Radiance:
         """Return the radiance itself: the image has the grid of the render."""
         return radiance
+
+    def spread(self, light: F32, wavelength_nm: float) -> F32:
+        """Return the light itself: the lens has no point spread."""
+        return light
 
     def image(self, radiance: Radiance) -> Irradiance:
         """Return the irradiance on the sensor plane, E = π T L / (4 N²), per band.

@@ -67,6 +67,8 @@ def fault_context(pose: Pose, rendering: Rendering, exposure: SceneExposure) -> 
         wavelength_nm=exposure.light.rendered.wavelength_nm,
         sun_angular_radius_rad=sunlight.angular_radius_rad,
         sun_visible_fraction=pose.sun_visible_fraction,
+        depth_m=rendering.truth.depth_m,
+        up_C=-pose.L_from_C[2],
     )
 
 
