@@ -34,7 +34,7 @@ LEAST_RADIUS_PX = 0.3
 
 _LEAST_LENGTH_PX = 0.02  # of a streak: that of a point at rest
 _FINEST, _COARSEST = 10, 2  # points within a pixel, along each axis
-_POINTS_ACROSS = 6  # points across the diameter of a figure, up to the finest grid
+_POINTS_ACROSS = 24  # points across the diameter of a figure, up to the finest grid
 _DIRECTIONS = 48  # normals of the polygons
 _ROUND_BELOW_PX = 1.5  # figures of a smaller radius are drawn round
 _MOST_AT_ONCE = 1 << 19  # pixels drawn at once, to bound the memory
