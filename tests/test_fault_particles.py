@@ -130,13 +130,13 @@ def test_the_faintest_and_the_rarest() -> None:
     c = context()
     few = make("particles", density_per_m3=1e-9)
     assert [few.draw(c, rng(seed))["count"] for seed in range(5)] == [1] * 5
-    fault = make("particles", density_per_m3=0.05, least_noise=2.0)
+    fault = make("particles", density_per_m3=0.002, least_noise=2.0)
     bright = fault.draw(c, rng(1))
     fainter = replace(fault, least_noise=0.5).draw(c, rng(1))
     assert 0 < bright["count"] < fainter["count"]
     most = replace(fault, most_grains=5).draw(c, rng(1))
     at = [bright["x_px"].index(x) for x in most["x_px"]]
-    population = _Population(fault, c, density=0.05, camera_velocity=np.zeros(3), up=np.array([1.0, 0, 0]))
+    population = _Population(fault, c, density=0.002, camera_velocity=np.zeros(3), up=np.array([1.0, 0, 0]))
     names = population._candidates(1, rng())._fields
     grains = type(population._candidates(1, rng()))(*(np.array(bright[name]) for name in names))
     levels = population._level_e(grains)
