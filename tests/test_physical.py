@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,14 +18,16 @@ from vbnfault.core.errors import InputError
 from vbnfault.core.quantities import BODY, SKY, SPACECRAFT
 from vbnfault.pipeline import Session
 from vbnfault.pipeline.exposure import meter
+from vbnfault.pipeline.noise_budget import green_per_second
 from vbnfault.pipeline.record import to_sample
-from vbnfault.pipeline.rendering import describe, green_per_second, render_view
+from vbnfault.pipeline.rendering import describe, render_view
 from vbnfault.pipeline.resolve import resolve
 from vbnfault.pipeline.spec import Frame
 from vbnfault.pipeline.stars import add_stars
-from vbnfault.reflectance.hapke import hapke_at
-from vbnfault.render import light, sampling
+from vbnfault.render import sampling
 from vbnfault.render.detail import _LEVELS, _SIDE, _UNIT, _pyramid
+from vbnfault.render.runtime import dr, mi
+from vbnfault.render.vehicle import World
 from vbnfault.scene import config
 from vbnfault.world import assemble, sky
 
@@ -171,6 +174,47 @@ def test_spacecraft_casts_its_shadow() -> None:
     assert columns.mean() + 0.5 == pytest.approx(64, abs=0.5)
 
 
+class CountedScene:
+    """Trace rays through a scene of Mitsuba's and count those that are active."""
+
+    def __init__(self, traced: Any) -> None:
+        self.traced, self.rays = traced, 0
+
+    def ray_intersect_preliminary(self, rays: Any, *, coherent: bool, active: Any) -> Any:
+        self.rays += int(dr.count(active)[0])
+        return self.traced.ray_intersect_preliminary(rays, coherent=coherent, active=active)
+
+    def ray_test(self, rays: Any, coherent: bool, active: Any) -> Any:
+        self.rays += int(dr.count(active)[0])
+        return self.traced.ray_test(rays, coherent, active)
+
+
+@pytest.mark.parametrize("look", [-UP, np.array([1.0, 0.0, 0.6])])
+def test_only_rays_that_may_meet_the_spacecraft_search_for_it(
+    monkeypatch: pytest.MonkeyPatch, look: np.ndarray
+) -> None:
+    """A plate in the corner of the view and one behind the camera: the same bits with a tenth of the rays."""
+    behind = np.array([[-1, -1, -5], [1, -1, -5], [1, 1, -5], [-1, 1, -5]])
+    ahead = np.array([[0.5, 0.5, 2], [1.5, 0.5, 2], [1.5, 1.5, 2.5], [0.5, 1.5, 2.5]])
+    vertices = np.concatenate([behind, ahead]).astype(np.float32)
+    faces = np.array([[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7]], np.int32)
+    a_view = view(40 * UP, look, width=64, fov_deg=40.0, aperture_radius_m=1e-3)
+    lit = dataclasses.replace(scene(a_view, sun(UP, 2.0), 0.06), bounces=1)
+    images, rays = [], []
+    for culled in (True, False):
+        vehicle = render.Vehicle(vertices, faces, np.zeros(4, np.int32), np.full((1, len(NODES)), 0.5))
+        vehicle.scene = counted = CountedScene(vehicle.scene)
+        if not culled:
+            monkeypatch.setattr(World, "_may_meet", lambda self, rays: mi.Bool(True) & (rays.o.x == rays.o.x))
+            monkeypatch.setattr(vehicle, "slopes_in", lambda view: np.array([[-9.0, -9.0], [9.0, 9.0]]))
+        surface = render.TerrainMesh(*plane(), np.ones(2, bool), vehicle=vehicle)
+        images.append(render.radiance(surface, lit).array)
+        rays.append(counted.rays)
+    np.testing.assert_array_equal(*images)
+    assert images[0].std() > 0
+    assert 0 < rays[0] < 0.35 * rays[1]
+
+
 def test_stars_fall_where_the_catalogue_says() -> None:
     table = physical(
         sky={"stars": "on", "limiting_magnitude": 3.0, "sigma_px": 0.7},
@@ -220,7 +264,7 @@ def test_noise_of_sampling_stays_below_the_sensors() -> None:
         exposure = add_stars(spec, pose, rendering, meter(spec, rendering))
         camera, light = exposure.camera, exposure.light.on_image
         described = dataclasses.replace(describe(spec, pose), samples_per_pixel=4096, key=99)
-        converged, _ = render.direct(spec.terrain.surface, described)
+        converged = render.direct(spec.terrain.surface, described)
         to_e = camera.exposure_s * green_per_second(spec)
         signal, error = (np.einsum("b,byx->yx", to_e, a) for a in (converged.array, light.array))
         detector = camera.detector
@@ -237,29 +281,6 @@ def test_noise_of_sampling_stays_below_the_sensors() -> None:
         assert np.mean(share > 3 * 0.3) < 0.02
         assert rendering.samples_per_pixel > 16
     assert judged >= 3
-
-
-def test_listed_pixels_are_the_frames_own() -> None:
-    surface = join(plane())
-    a_scene = scene(view(10 * UP, -UP), sun(frames.direction_L(30, 20)), hapke_at(NODES))
-    whole, halves = render.direct(surface, a_scene, np.ones(len(NODES)))
-    chosen = np.array([5, 64, 1000, 4095], dtype=np.uint32)
-    some, some_halves = render.direct(surface, a_scene, np.ones(len(NODES)), chosen)
-    np.testing.assert_array_equal(some.array[:, 0], whole.array.reshape(len(NODES), -1)[:, chosen])
-    np.testing.assert_array_equal(some_halves[0], halves.ravel()[chosen])
-
-
-def test_later_passes_use_the_suns_part_of_the_first(monkeypatch: pytest.MonkeyPatch) -> None:
-    towards = frames.direction_L(30, 20)
-    surface = join(plane())
-    a_scene = scene(view(10 * UP, towards), sun(towards, 0.02), hapke_at(NODES))
-    first, _ = render.direct(surface, a_scene)
-    assert first.sun is not None
-    chosen = np.flatnonzero(first.sun[0] > 0).astype(np.uint32)
-    assert len(chosen)
-    monkeypatch.setattr(light, "sun_in_view", lambda *_: pytest.fail("the disc was traced again"))
-    again, _ = render.direct(surface, a_scene, None, chosen, first)
-    np.testing.assert_array_equal(again.array[:, 0], first.array.reshape(len(NODES), -1)[:, chosen])
 
 
 def test_tables_of_an_adaptive_render_are_made_once(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from ..camera import Camera
 from ..core.quantities import BODY, Electrons, Radiance, Truth
 from ..reflectance import radiance_factor
+from ..render.description import View
 from ..scene.config import Scene
 from ..world import assemble
 from .spec import Rendering, SampleSpec, SceneExposure
@@ -59,11 +60,40 @@ def _exposure_of_facet_s(scene: Scene, camera: Camera, sun: Direction, view: Dir
 
 def metered_exposure_s(scene: Scene, camera: Camera, truth: Truth, rate: Electrons) -> float:
     """Return the exposure in s that puts a percentile of the sunlit ground at the metering level, within limits."""
-    settings = scene.camera
-    reference = reference_exposure_s(scene, camera)
     # every second row and column is enough for a percentile
     body = truth.semantic[::2, ::2] == BODY
-    brightness = _brightness(rate.array[::2, ::2], rate.white_e)[body]
+    return _metered_s(scene, camera, _brightness(rate.array[::2, ::2], rate.white_e)[body])
+
+
+def foreseen_exposure_s(scene: Scene, camera: Camera, truth: Truth, view: View, radiance: Radiance) -> float:
+    """Return `exposure_s` before the lens has imaged a radiance, with an error of a few percent.
+
+    Each pixel takes the radiance that its chief ray meets. The lens's point spread and lateral colour are left out.
+    """
+    fixed = scene.camera.exposure_s
+    if fixed != "auto":
+        return float(fixed)
+    fx, fy, cx, cy = view.intrinsics
+    slopes = camera.seen_slopes[::2, ::2]
+    column = np.clip((slopes[..., 0] * fx + cx).astype(np.intp), 0, view.width_px - 1)
+    row = np.clip((slopes[..., 1] * fy + cy).astype(np.intp), 0, view.height_px - 1)
+    body = truth.semantic[::2, ::2] == BODY
+    seen = radiance.array.reshape(len(radiance.array), -1)[:, (row * view.width_px + column)[body]]
+    rate = rate_on_axis(camera, Radiance(array=seen[:, None], wavelength_nm=radiance.wavelength_nm))
+    brightness = _brightness(rate.array, rate.white_e)[0]
+    if camera.lens.real is not None:
+        y, x = (
+            np.abs(np.arange(0, n, 2) + 0.5 - n / 2) / camera.focal_length_px
+            for n in (camera.height_px, camera.width_px)
+        )
+        brightness = brightness * camera.lens.real.relative_illumination(np.hypot(x[None, :], y[:, None])[body])
+    return _metered_s(scene, camera, brightness)
+
+
+def _metered_s(scene: Scene, camera: Camera, brightness: NDArray[np.float32]) -> float:
+    """Return the metered exposure in s from the brightness of ground after one second, float32[pixel]."""
+    settings = scene.camera
+    reference = reference_exposure_s(scene, camera)
     brightness = brightness[brightness > 0.02 / reference]  # sunlit: above a fiftieth of the reference facet
     exposure = reference
     if len(brightness) >= 64:

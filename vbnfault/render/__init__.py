@@ -13,10 +13,11 @@ from ..core.lazy_names import load_name
 if TYPE_CHECKING:
     from .albedo import AlbedoMap
     from .bounces import indirect
+    from .cells import Cells, direct_in_cells
     from .detail import FineRelief
     from .integrate import radiance
     from .layers import truth
-    from .light import direct
+    from .light import Sampled, direct, direct_by_sample
     from .resolve import first_ground, ground_height_m, is_between, is_clear, sun_visible_fraction, sunlit_ground
     from .runtime import set_threads
     from .sun_heights import heights_towards_sun
@@ -26,11 +27,15 @@ if TYPE_CHECKING:
 # public name → the module that defines it, which loads Mitsuba
 _HOMES = {
     "AlbedoMap": "albedo",
+    "Cells": "cells",
     "FineRelief": "detail",
+    "Sampled": "light",
     "TerrainMesh": "surface",
     "Vehicle": "vehicle",
     "direct": "light",
     "first_ground": "resolve",
+    "direct_by_sample": "light",
+    "direct_in_cells": "cells",
     "ground_height_m": "resolve",
     "heights_towards_sun": "sun_heights",
     "indirect": "bounces",
@@ -87,10 +92,14 @@ def self_test() -> str:
 
 __all__ = [
     "AlbedoMap",
+    "Cells",
     "FineRelief",
+    "Sampled",
     "TerrainMesh",
     "Vehicle",
     "direct",
+    "direct_by_sample",
+    "direct_in_cells",
     "first_ground",
     "ground_height_m",
     "heights_towards_sun",

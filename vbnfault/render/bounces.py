@@ -21,9 +21,9 @@ from numpy.typing import NDArray
 from ..core.quantities import Truth
 from .bsdf import has_bands
 from .description import RenderInput
-from .light import SUN_DIMENSION, WAVEFRONT, Light
+from .light import WAVEFRONT, Light
 from .runtime import dr, mi
-from .sampling import Optics, Pixels, Strata
+from .sampling import SUN_DIMENSION, Optics, Pixels, Strata
 from .surface import TerrainMesh
 
 Image = NDArray[np.float32]
@@ -165,7 +165,8 @@ class TileStrata(Strata):
         self.index = mi.UInt32(0)
         self.side, self.samples, self._shift = 1, 1, 0
         self._key = dr.opaque(mi.UInt32, key & 0xFFFFFFFF)
-        self._wavefront = self.pixel
+        self._wavefront = self._number = self.pixel
+        self.limb = None
         self._rounds_side = round(rounds**0.5)
         self._round = [dr.opaque(mi.UInt32, k) for k in divmod(round_, self._rounds_side)]
 

@@ -15,7 +15,7 @@ def radiance(surface: TerrainMesh, scene: RenderInput, guide: Truth | None = Non
 
     `guide` is the `truth` of the view, which light between surfaces needs; it is computed if it is not given.
     """
-    image, _ = direct(surface, scene)
+    image = direct(surface, scene)
     if not scene.bounces:
         return image
     guide = truth(surface, scene.view, scene.sun) if guide is None else guide

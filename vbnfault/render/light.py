@@ -9,7 +9,7 @@ that `spectra` defines. There is no film: the samples of a pixel are summed as a
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -22,15 +22,12 @@ from .description import RenderInput, Sunlight, View
 from .detail import Detail
 from .emitter import Limb, SunDisc, mu, polynomial
 from .runtime import dr, mi
-from .sampling import Optics, Pixels, Strata
+from .sampling import SUN_DIMENSION, Optics, Pixels, Strata
 from .surface import TerrainMesh
 
 # Number of values (samples × terms) kept at once. Larger images are divided into parts, so that memory is bounded
 # and the values are summed while they are still near the processor.
 WAVEFRONT = 1 << 23
-
-# Dimension of a sample's random numbers for the Sun's disc. The lens uses dimension 1, bounces use the later ones.
-SUN_DIMENSION = 0
 
 # Least and greatest number of cells along each side of the grid over the Sun's disc; rays to each cell show whether
 # it is hidden.
@@ -42,57 +39,61 @@ _PUPIL_POINTS = 4
 _KRONECKER = 1.1673039782614187 ** -np.arange(1.0, 5.0)
 
 
-def direct(
-    surface: TerrainMesh,
-    scene: RenderInput,
-    weights: NDArray[np.float64] | None = None,
-    pixels: NDArray[np.uint32] | None = None,
-    first: Radiance | None = None,
-) -> tuple[Radiance, NDArray[np.float32]]:
-    """Return the radiance of the Sun's disc and of sunlight reflected once, and an estimate of its random error.
+def direct(surface: TerrainMesh, scene: RenderInput) -> Radiance:
+    """Return the radiance of the Sun's disc and of sunlight reflected once, [band, y, x]."""
+    array, _ = Direct(surface, scene).image()
+    return _with_sun(surface, scene, array)
 
-    Parameters
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Sampled:
+    """Hold the radiance of `direct` with its samples.
+
+    Attributes
     ----------
-    weights
-        float64[band]: weights of the bands in the signal whose error is estimated. None: the error is 0.
-    pixels
-        uint32[pixel]: row-major numbers of the wanted pixels. None: all pixels.
-    first
-        Earlier output for all pixels of the same view and Sun. Its part of the Sun, which depends on no samples, is
-        used again. None: that part is computed.
-
-    Returns
-    -------
-    Radiance
-        Array [band, y, x], or [band, 1, pixel] for listed pixels.
     error
-        float32[y, x] or [1, pixel]: half the signed difference between the mean signals of two halves of the
-        pixel's samples. Its variance is that of the pixel's own error or slightly larger, because half as many
-        strata leave more to chance. The Sun's disc is exact.
+        float32[y, x]: half the signed difference between the mean signals of two halves of the pixel's samples. Its
+        variance is that of the pixel's own error or slightly larger, because half as many strata leave more to
+        chance. The Sun's disc is exact.
+    samples
+        float16[pixel, sample]: the signal of each sample over that of a white Lambert surface that faces the Sun.
+        The samples of a pixel are those of its strata, row by row.
     """
+
+    radiance: Radiance
+    error: NDArray[np.float32]
+    samples: NDArray[np.float16]
+
+
+def direct_by_sample(surface: TerrainMesh, scene: RenderInput, weights: NDArray[np.float64]) -> Sampled:
+    """Return the radiance of `direct` with an estimate of its random error and the signal of each sample.
+
+    `weights`, float64[band], are those of the bands in the signal. Points of the Sun's disc are chosen by its limb
+    darkening, so that the signals of two samples differ only by what they see.
+    """
+    array, signals = Direct(surface, scene).image(weights)
+    assert signals is not None
+    halves, samples = signals
     view = scene.view
-    wanted = Pixels(view.width_px * view.height_px) if pixels is None else Pixels(len(pixels), listed=pixels)
-    out, halves = _Direct(surface, scene).image(wanted, weights)
-    bands, frame = len(scene.wavelength_nm), (view.height_px, view.width_px)
+    return Sampled(
+        radiance=_with_sun(surface, scene, array),
+        error=halves.reshape(view.height_px, view.width_px),
+        samples=samples,
+    )
+
+
+def _with_sun(surface: TerrainMesh, scene: RenderInput, array: NDArray[np.float32]) -> Radiance:
+    """Return the radiance float32[band, pixel] with the Sun's disc added, which depends on no samples."""
+    view, bands = scene.view, len(scene.wavelength_nm)
+    array = array.reshape(bands, view.height_px, view.width_px)
     sun: NDArray[np.float32] | None = None
-    if first is not None:
-        disc, sun = first.disc, first.sun
-    elif (disc := sun_in_view(surface, view, scene.sun)) is not None:
-        sun = np.zeros((bands, *frame), dtype=np.float32)
+    if (disc := sun_in_view(surface, view, scene.sun)) is not None:
+        sun = np.zeros_like(array)
         if add_mean(sun, disc, Pinhole(view.intrinsics), range(bands)) is None:
             sun = None
-    if sun is not None:
-        out += sun.reshape(bands, -1) if pixels is None else sun.reshape(bands, -1)[:, pixels]
-    shape = frame if pixels is None else (1, len(pixels))
-    if sun is not None and pixels is not None:
-        sun = sun.reshape(bands, 1, -1)[:, :, pixels]
-    radiance = Radiance(
-        array=out.reshape(bands, *shape),
-        wavelength_nm=scene.wavelength_nm,
-        sun=sun,
-        disc=None if sun is None else disc,
-    )
-    return radiance, halves.reshape(shape)
+        else:
+            array += sun
+    return Radiance(array=array, wavelength_nm=scene.wavelength_nm, sun=sun, disc=None if sun is None else disc)
 
 
 def sun_in_view(surface: TerrainMesh, view: View, sun: Sunlight) -> SunInView | None:
@@ -176,7 +177,7 @@ class Light:
         return Reflection(self.surface, self.scene, hit, normal, -rays.d, banded=self.banded)
 
 
-class _Direct(Light):
+class Direct(Light):
     """Compute samples of pixels and sum their terms.
 
     `weights` [term, band] is the radiance per unit of each term.
@@ -192,37 +193,58 @@ class _Direct(Light):
             self.weights = self.limb.weights * (model.weights[0] * sun.irradiance_W_m2_nm)
 
     def image(
-        self, pixels: Pixels, signal: NDArray[np.float64] | None
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Return the radiance float32[band, pixel], and float32[pixel] half the difference of the sample halves."""
-        spp = self.scene.samples_per_pixel
+        self, signal: NDArray[np.float64] | None = None
+    ) -> tuple[NDArray[np.float32], tuple[NDArray[np.float32], NDArray[np.float16]] | None]:
+        """Return the radiance of all pixels float32[band, pixel], and the signals of their samples.
+
+        With weights `signal` of the bands, float64[band], the signals are `Sampled.error`, float32[pixel], and
+        `Sampled.samples`; otherwise None.
+        """
+        spp, view = self.scene.samples_per_pixel, self.scene.view
+        pixels = Pixels(view.width_px * view.height_px)
         weights = (self.weights / spp).astype(np.float32)
         out = np.zeros((weights.shape[1], pixels.count), dtype=np.float32)
-        halves = np.zeros(pixels.count, dtype=np.float32)
-        done = 0
+        signals, factors, limb = None, None, None
+        if signal is not None:
+            signals = np.zeros(pixels.count, np.float32), np.empty((pixels.count, spp), np.float16)
+            factors, limb = weights.astype(np.float64) @ signal, self.mean_limb(signal)
+            white = float(signal @ self.scene.sun.irradiance_W_m2_nm) / np.pi
         for part in pixels.parts(max(1, WAVEFRONT // (spp * len(weights)))):
-            strata = Strata(part, spp, self.scene.key)
+            strata = Strata(part, spp, self.scene.key, limb)
             terms = self.terms(strata)
-            if signal is not None:
-                factors = weights.astype(np.float64) @ signal
-                seen = sum(
-                    (t * dr.opaque(mi.Float, float(s)) for t, s in zip(terms, factors, strict=True)), mi.Float(0)
-                )
-                terms = [*terms, seen * strata.checkered()]
+            if factors is not None:
+                seen = self.signal(terms, factors)
+                terms += [seen * strata.checkered(), seen * dr.opaque(mi.Float, spp / white)]
             dr.eval(*terms)  # without this, every block sum would trace the rays again
+            span = slice(part.first, part.first + part.count)
+            if signals is not None:
+                signals[1][span] = terms.pop().numpy().reshape(-1, spp)
             sums = [dr.block_sum(term, spp) for term in terms]
             dr.eval(*sums)
-            span = slice(done, done + part.count)
-            done += part.count
             for row, total in zip(weights, sums, strict=False):
                 values = total.numpy()
                 if not values.any():
                     continue
                 for band in np.flatnonzero(row):
                     out[band, span] += values * row[band]
-            if signal is not None:
-                halves[span] = sums[-1].numpy()
-        return out, halves
+            if signals is not None:
+                signals[0][span] = sums[-1].numpy()
+        return out, signals
+
+    def mean_limb(self, signal: NDArray[np.float64]) -> tuple[float, ...] | None:
+        """Return the limb darkening of a signal float64[band], as coefficients of powers of μ; None for none.
+
+        Samples whose points of the Sun are chosen by it have no noise of limb darkening in this signal.
+        """
+        if self.limb.profiles is None:
+            return None
+        light = signal * self.scene.sun.irradiance_W_m2_nm
+        return tuple((light @ self.limb.profiles / light.sum()).tolist())
+
+    @staticmethod
+    def signal(terms: list[Any], factors: NDArray[np.float64]) -> Any:
+        """Return the signal of each sample: the sum of its terms with factors float64[term]."""
+        return sum((t * dr.opaque(mi.Float, float(s)) for t, s in zip(terms, factors, strict=True)), mi.Float(0))
 
     def terms(self, strata: Strata) -> list[Any]:
         """Return what each sample adds to each term."""
@@ -235,6 +257,9 @@ class _Direct(Light):
             terms = [terms[0] * profile for profile in self.limb.terms(mu(point))]
         elif self.limb.profiles is not None:
             terms = [t * polynomial(c, mu(point)) for t, c in zip(terms, self.limb.profiles, strict=True)]
+        if strata.limb is not None:
+            inverse = dr.rcp(polynomial(np.array(strata.limb), mu(point)))
+            terms = [term * inverse for term in terms]
         return [dr.select(lit, term, 0) for term in terms]
 
 

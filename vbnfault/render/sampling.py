@@ -17,6 +17,9 @@ from numpy.typing import NDArray
 from .description import View
 from .runtime import dr, mi
 
+# Dimension of a sample's random numbers for the Sun's disc. The lens uses dimension 1, bounces use the later ones.
+SUN_DIMENSION = 0
+
 _TO_UNIT = 2.0**-32
 
 
@@ -24,23 +27,24 @@ class Strata:
     """Provide jittered strata of all pixels.
 
     `pixel` is the number of each sample's pixel and `index` its number within the pixel. The methods give points of
-    the pixel's area and of unit discs (the lens, the Sun), stratified over the samples of a pixel.
+    the pixel's area and of unit discs (the lens, the Sun), stratified over the samples of a pixel. `limb` holds the
+    coefficients of the limb darkening by which points of the Sun are chosen; None: evenly.
     """
 
-    def __init__(self, pixels: Pixels, samples_per_pixel: int, key: int) -> None:
+    def __init__(
+        self, pixels: Pixels, samples_per_pixel: int, key: int, limb: tuple[float, ...] | None = None
+    ) -> None:
         self.side = round(samples_per_pixel**0.5)
         self.samples = samples_per_pixel
         self._shift = int(samples_per_pixel).bit_length() - 1
         wavefront = dr.arange(mi.UInt32, pixels.count * samples_per_pixel)
-        if pixels.listed is None:
-            wavefront += dr.opaque(mi.UInt32, pixels.first * samples_per_pixel)
-        else:
-            pixel = dr.gather(mi.UInt32, mi.UInt32(pixels.listed), wavefront >> self._shift)
-            wavefront = (pixel << self._shift) + (wavefront & (samples_per_pixel - 1))
-        self.pixel = wavefront >> self._shift
+        self.pixel = (wavefront >> self._shift) + dr.opaque(mi.UInt32, pixels.first)
         self.index = wavefront & (samples_per_pixel - 1)
+        # this number selects random numbers; it may wrap around, so the pixel must not be derived from it
+        wavefront = (self.pixel << self._shift) + self.index
         self._key = dr.opaque(mi.UInt32, key & 0xFFFFFFFF)
-        self._wavefront = wavefront
+        self._wavefront, self._number = wavefront, self.pixel
+        self.limb = limb
 
     def square(self, dimension: int = 0) -> tuple[Any, Any]:
         """Return a uniform point of each stratum of the unit square, x and y in [0, 1].
@@ -71,45 +75,62 @@ class Strata:
     def disc(self, dimension: int) -> Any:
         """Return a point of the unit disc; the samples of a pixel share one of 256 even sets, chosen by a hash.
 
-        `dimension` separates uses: each takes different sets, in different orders.
+        `dimension` separates uses: each takes different sets, in different orders. If `limb` is given, points of
+        the Sun lie more densely where its disc is brighter.
         """
-        h = (self.pixel ^ self._key) * (0x9E3779B1 + 2 * dimension)
+        h = (self._number ^ self._key) * (0x9E3779B1 + 2 * dimension)
         h ^= h >> 15
         h *= 0x85EBCA77
         h ^= h >> 13
         index = ((h & (_DISC_SETS - 1)) << self._shift) + self.index
-        return dr.gather(mi.Point2f, _disc_table(self.samples, dimension), index)
+        limb = self.limb if dimension == SUN_DIMENSION else None
+        return dr.gather(mi.Point2f, _disc_table(self.samples, dimension, limb), index)
 
 
 @dataclass(frozen=True)
 class Pixels:
-    """Select pixels of a frame by row-major number: `count` of them from `first` on, or those `listed`."""
+    """Select `count` pixels of a frame by row-major number, from `first` on."""
 
     count: int
     first: int = 0
-    listed: NDArray[np.uint32] | None = None
 
     def parts(self, most: int) -> Iterator[Pixels]:
         """Yield the same pixels in parts of at most `most`."""
         for start in range(0, self.count, most):
-            count = min(most, self.count - start)
-            if self.listed is None:
-                yield Pixels(count, self.first + start)
-            else:
-                yield Pixels(count, listed=self.listed[start : start + count])
+            yield Pixels(min(most, self.count - start), self.first + start)
 
 
 _DISC_SETS = 256
 
 
-# An adaptive render with an aperture and bounces needs three tables for each of five to seven sample counts. A
-# table has 2 KiB per sample.
+# An adaptive render with an aperture and bounces needs two or three tables for each of up to nine sample counts.
+# A table has 2 KiB per sample.
 @lru_cache(maxsize=32)
-def _disc_table(samples: int, dimension: int) -> Any:
+def _disc_table(samples: int, dimension: int, limb: tuple[float, ...] | None = None) -> Any:
     """Return stratified points of the unit disc: `_DISC_SETS` sets of `samples`, each set in its own order."""
-    table = mi.Float(disc_sets(samples, dimension).astype(np.float32).ravel())
+    points = disc_sets(samples, dimension) if limb is None else limb_sets(samples, dimension, limb)
+    table = mi.Float(points.astype(np.float32).ravel())
     dr.eval(table)
     return table
+
+
+def limb_sets(samples: int, dimension: int, limb: tuple[float, ...]) -> NDArray[np.float64]:
+    """Return points of the unit disc, float64[set, sample, 2], as dense as a limb-darkened disc is bright.
+
+    `limb` holds the coefficients of the powers of μ. The points are those of `disc_sets` with other radii: each
+    ring has the same light, and the sets together cover it evenly, so their mean holds for few samples, too.
+    """
+    points = disc_sets(samples, dimension)
+    radius = np.linalg.norm(points, axis=-1)
+    ring = radius.argsort(axis=1, kind="stable").argsort(axis=1, kind="stable")
+    rng = np.random.Generator(np.random.Philox(np.random.SeedSequence((samples, dimension, 1))))
+    offset = rng.permuted(np.tile((np.arange(_DISC_SETS) + 0.5) / _DISC_SETS, (samples, 1)), axis=1).T
+    within = (ring + np.take_along_axis(offset, ring, axis=1)) / samples
+    # light within the circle on which the cosine is μ: ∫ Σ A_k μ^k d(μ²) from μ to 1
+    cosine, power = np.linspace(0, 1, 4097), np.arange(len(limb)) + 2
+    light = (np.array(limb) * 2 / power) @ (1 - cosine ** power[:, None])
+    wanted = np.sqrt(1 - np.interp(within * light[0], light[::-1], cosine[::-1]) ** 2)
+    return np.asarray(points * (wanted / np.maximum(radius, 1e-12))[..., None])
 
 
 def disc_sets(samples: int, dimension: int) -> NDArray[np.float64]:
@@ -138,7 +159,7 @@ def disc_sets(samples: int, dimension: int) -> NDArray[np.float64]:
     turn = 2 * np.pi * (sector + rng.random(sector.shape)) / samples
     points = radius[..., None] * np.stack([np.cos(turn), np.sin(turn)], axis=-1)
     # decide which points go to the white squares, and which to the black ones
-    colour = (k ^ (k >> bits // 2)) & 1
+    colour = (k ^ (k >> (bits + 1) // 2)) & 1
     out = np.empty_like(points)
     swap = rng.integers(2, size=_DISC_SETS)
     for parity in (0, 1):

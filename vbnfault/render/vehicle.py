@@ -25,6 +25,9 @@ if TYPE_CHECKING:
 # size.
 _OFFSET_M = 5e-4
 
+# Rays that start this close to the camera's centre, or within its aperture, are rays of the camera.
+_AT_CAMERA_M = 1e-6
+
 
 class Vehicle:
     """Hold a spacecraft of diffuse facets in B, which are visible and reflect on both sides.
@@ -47,6 +50,10 @@ class Vehicle:
         reflectance: NDArray[np.float64],
     ) -> None:
         self.scene = mesh_scene("vehicle", vertices_m, faces)
+        self._corners_m = vertices_m[faces].astype(np.float64)
+        used = self._corners_m.reshape(-1, 3)
+        self.centre_m = (used.min(axis=0) + used.max(axis=0)) / 2
+        self.radius_m = 1.001 * float(np.linalg.norm(used - self.centre_m, axis=1).max()) + 1e-3
         a, b, c = (vertices_m[faces[:, k]].astype(np.float64) for k in range(3))
         normal = np.cross(b - a, c - a)
         normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
@@ -59,6 +66,30 @@ class Vehicle:
         """Return the normal in B and the material of facets."""
         record = dr.gather(mi.Vector4f, self._facets, index, active)
         return mi.Vector3f(record.xyz), mi.UInt32(record.w)
+
+    def slopes_in(self, view: View) -> NDArray[np.float64]:
+        """Return bounds of x/z and y/z in B beyond which no ray of a camera meets a part, float64[2, axis].
+
+        The lower bounds lie above the upper ones if the camera sees no part.
+        """
+        fx, fy, cx, cy = view.intrinsics
+        low = np.array([-cx / fx, -cy / fy])
+        high = np.array([(view.width_px - cx) / fx, (view.height_px - cy) / fy])
+        aperture, corners = view.aperture_radius_m, self._corners_m
+        z = corners[..., 2]
+        # a facet is out of sight if all its corners lie behind the camera or beyond the same side of the field
+        hidden = (z <= 0).all(axis=1)
+        for axis in (0, 1):
+            x = corners[..., axis]
+            hidden |= (x + aperture < low[axis] * z).all(axis=1) | (x - aperture > high[axis] * z).all(axis=1)
+        seen = corners[~hidden]
+        if not len(seen):
+            return np.array([high + 1, low - 1])
+        if (seen[..., 2] < 1e-2).any():
+            return np.array([low - 1, high + 1])
+        slopes, margin = seen[..., :2] / seen[..., 2:], aperture / seen[..., 2:]
+        least, most = (slopes - margin).min(axis=(0, 1)), (slopes + margin).max(axis=(0, 1))
+        return np.array([least - 1e-3, most + 1e-3])
 
     def occluded(self, rays: Any, active: Any, *, coherent: bool = True) -> Any:
         """Return whether any part lies along rays in B."""
@@ -76,6 +107,10 @@ class World:
         self.surface, self.vehicle = surface, vehicle
         self._origin = opaque_vector(mi.Point3f, view.position_L_m)
         self._axes = [opaque_vector(mi.Vector3f, view.L_from_C[:, k]) for k in range(3)]  # B coincides with C
+        self._centre = opaque_vector(mi.Point3f, vehicle.centre_m)
+        self._radius2 = dr.opaque(mi.Float, vehicle.radius_m**2)
+        self._pupil2 = dr.opaque(mi.Float, (1.01 * view.aperture_radius_m + _AT_CAMERA_M) ** 2)
+        self._low, self._high = (opaque_vector(mi.Vector2f, bound) for bound in vehicle.slopes_in(view))
 
     def intersect(self, rays: Any, active: Any = True, *, coherent: bool = True) -> VehicleHit:
         """Return the closest hits on either; `on_vehicle` marks those on the vehicle."""
@@ -83,7 +118,14 @@ class World:
 
     def trace(self, rays: Any, active: Any = True, *, coherent: bool = True) -> tuple[Any, ...]:
         """Return the hits on the terrain and on the vehicle, in the form that `hit` needs besides the rays."""
-        hit = self.vehicle.scene.ray_intersect_preliminary(self._in_B(rays), coherent=coherent, active=active)
+        in_B = self._in_B(rays)
+        near = self._may_meet(in_B)
+        # the camera may stand among the parts, but see none of them in most of its field
+        d, from_camera = in_B.d, dr.squared_norm(mi.Vector3f(in_B.o)) <= self._pupil2
+        within = (d.x >= self._low.x * d.z) & (d.x <= self._high.x * d.z)
+        within &= (d.y >= self._low.y * d.z) & (d.y <= self._high.y * d.z)
+        near &= ~from_camera | within | (d.z <= 0)
+        hit = self.vehicle.scene.ray_intersect_preliminary(in_B, coherent=coherent, active=active & near)
         return *self.surface.trace(rays, active, coherent=coherent), hit
 
     def hit(self, rays: Any, traced: tuple[Any, ...]) -> VehicleHit:
@@ -97,8 +139,16 @@ class World:
 
     def occluded(self, rays: Any, active: Any, *, coherent: bool = True) -> Any:
         """Return whether anything lies along the rays."""
-        behind = self.vehicle.occluded(self._in_B(rays), active, coherent=coherent)
+        in_B = self._in_B(rays)
+        behind = self.vehicle.occluded(in_B, active & self._may_meet(in_B), coherent=coherent)
         return behind | self.surface.occluded(rays, active & ~behind, coherent=coherent)
+
+    def _may_meet(self, rays: Any) -> Any:
+        """Return whether rays in B pass through the sphere around all parts; the others need no search."""
+        towards = mi.Vector3f(self._centre - rays.o)
+        inside, ahead = dr.squared_norm(towards) <= self._radius2, dr.dot(towards, rays.d) > 0
+        # far away, the difference of squares would lose more digits than the cross product
+        return inside | (ahead & (dr.squared_norm(dr.cross(towards, rays.d)) <= self._radius2))
 
     def _in_B(self, rays: Any) -> Any:
         """Return rays transformed into B."""

@@ -1,0 +1,263 @@
+"""Render with as many samples as the sensor's noise asks for.
+
+The first samples of all pixels show where light varies within a pixel, cell by cell. Pixels whose error would show
+above the sensor's own noise are rendered again: one sample in each cell in which light hardly varies, and many in
+those that an edge crosses. New samples are drawn each time, because the earlier ones chose the pixels and the
+cells, so keeping them would be a bias.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core.quantities import Radiance, Truth
+from ..render.description import RenderInput
+from ..world import assemble
+from .exposure import foreseen_exposure_s, rate_on_axis
+from .spec import SampleSpec
+
+if TYPE_CHECKING:
+    from ..render import Sampled
+
+F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+# Fraction of the full well above which a pixel counts as lit when sampling noise is measured.
+_LIT_FRACTION = 0.01
+# Fraction of the lit pixels that may keep more sampling noise than the scene allows.
+_NOISY_FRACTION = 0.01
+# Most rounds of samples in cells. A third changes few pixels.
+_ROUNDS = 3
+# Variance aimed at, over that allowed: few pixels then need another round.
+_AIM = 0.65
+# A pixel is rendered again if it gets this many times its samples.
+_WORTH = 1.2
+# Octaves by which the number of samples of a cell may be rounded down to a power of two.
+_DOWN = 0.25
+# Rows of pixels whose samples are compared with their neighbours at a time, to bound memory.
+_STRIP = 128
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SampledRadiance:
+    """Hold a rendered radiance with its number of samples and its noise, as in `Rendering`."""
+
+    radiance: Radiance
+    samples_per_pixel: float
+    noise_fraction_p99: float = float("nan")
+
+
+def sample_to_noise(
+    spec: SampleSpec, scene: RenderInput, truth: Truth, guide: Truth | None, fraction: float
+) -> SampledRadiance:
+    """Render with more samples where sampling noise would show: above `fraction` of the sensor's own noise.
+
+    The error of a pixel comes from two halves of its samples, averaged over 3×3 pixels. Where it is too large, the
+    cells of the pixel get as many samples as the variation of light in each of them asks for. This is done again
+    for pixels that need still more, at most `_ROUNDS` times, until at most 1 % of the lit pixels are left. All of
+    it follows from scene and sample, so the result does not depend on how a build runs.
+    """
+    from .. import render
+
+    camera = spec.camera
+    electron_rate = green_per_second(spec)
+    sampled = render.direct_by_sample(spec.terrain.surface, scene, electron_rate)
+    first = sampled.radiance
+    indirect = (
+        np.zeros_like(first.array)
+        if guide is None or not scene.bounces
+        else render.indirect(spec.terrain.surface, scene, guide)
+    )
+    whole = first.with_array(first.array + indirect)
+    exposure = foreseen_exposure_s(spec.scene, camera, truth, scene.view, whole)
+    signal_e = np.einsum("b,byx->yx", electron_rate * exposure, whole.array)
+    detector = camera.detector
+    sensor_e = np.sqrt(
+        np.maximum(signal_e, 0) + detector.dark_current_e_s * exposure + detector.read_noise_e_rms**2
+    )
+    # dark pixels and saturated pixels do not show this noise; saturated pixels still count as lit
+    lit = signal_e > _LIT_FRACTION * detector.full_well_e
+    shows = lit & (signal_e - 4 * np.abs(sampled.error) * exposure < detector.full_well_e)
+    near = cv2.dilate(shows.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    refined = _Refined(
+        spec=spec,
+        scene=scene,
+        signal=electron_rate * exposure,
+        sensor_e=sensor_e.astype(np.float32),
+        sampled=sampled,
+        exposure_s=exposure,
+    )
+
+    def noise() -> F32:
+        """Return the noise of sampling over the sensor's, float32[y, x]."""
+        return np.sqrt(np.maximum(cv2.blur(np.where(near, refined.variance, 0), (3, 3)), 0))
+
+    def is_over(now: F32) -> bool:
+        """Return whether too many lit pixels have too much noise."""
+        over = np.count_nonzero((now > fraction) & shows)
+        return bool(over > _NOISY_FRACTION * np.count_nonzero(lit))
+
+    for _ in range(_ROUNDS):
+        if not is_over(now := noise()):
+            break
+        refined.refine((now > fraction) & near, fraction)
+    now = noise()
+    return SampledRadiance(
+        # the Sun's own part depends on no rays, so the first one holds
+        radiance=replace(first, array=refined.array + indirect),
+        samples_per_pixel=float(refined.used.mean()),
+        noise_fraction_p99=float(np.percentile(np.where(shows, now, 0)[lit], 99)) if lit.any() else 0.0,
+    )
+
+
+class _Refined:
+    """Hold the light of a view while pixels are rendered again with more samples.
+
+    Attributes
+    ----------
+    array
+        float32[band, y, x]: the radiance so far.
+    variance
+        float32[y, x]: an estimate of the variance of each pixel, in units of the sensor's.
+    used
+        float32[y, x]: number of samples of each pixel.
+    """
+
+    def __init__(
+        self,
+        *,
+        spec: SampleSpec,
+        scene: RenderInput,
+        signal: F64,
+        sensor_e: F32,
+        sampled: Sampled,
+        exposure_s: float,
+    ) -> None:
+        self._scene, self._surface, self._signal = scene, spec.terrain.surface, signal
+        self._sensor_e, self._sun = sensor_e, sampled.radiance.sun
+        self._most = spec.scene.render.max_samples_per_pixel
+        self._samples = samples = sampled.samples
+        self._white_e = float(scene.sun.irradiance_W_m2_nm @ signal) / np.pi
+        self.array = sampled.radiance.array.copy()
+        self.variance = (sampled.error * (exposure_s / sensor_e)) ** 2
+        height, width = self.array.shape[1:]
+        cells = samples.shape[1]
+        self.used = np.full((height, width), float(cells), dtype=np.float32)
+        self._rounds = 0
+        self._range = _ranges(samples, (height, width))
+        # Variance of a pixel with one sample in each cell. The square of the range is proportional to it; `refine`
+        # finds the factor.
+        square = np.einsum("pc,pc->p", self._range, self._range, dtype=np.float32) / cells**2
+        self._single = square.reshape(height, width) * (self._white_e / sensor_e) ** 2
+        # what the later samples of a pixel leave of it
+        self._left = np.ones_like(self._single)
+
+    def _next(self, samples: int, use: int = 0) -> RenderInput:
+        """Return the scene with a number of samples, and with random numbers that no earlier render had."""
+        key = (self._scene.key + 0x9E3779B9 * (16 * self._rounds + use + 1)) & 0xFFFFFFFF
+        return replace(self._scene, samples_per_pixel=samples, key=key)
+
+    def refine(self, chosen: Mask, fraction: float) -> None:
+        """Render those of the chosen pixels again whose own variance is too large."""
+        # the error over 3×3 pixels corrects what the ranges let expect
+        measured, foreseen = (cv2.blur(v, (3, 3)) for v in (self.variance, self._single * self._left))
+        self._single *= np.clip(measured / np.maximum(foreseen, 1e-12), 0.05, 20)
+        goal = _AIM * fraction**2 / np.maximum(self._single, 1e-12)
+        pixels = np.flatnonzero(chosen & (goal < 1))
+        cells = self._samples.shape[1]
+        squares = self._range[pixels].astype(np.float32) ** 2
+        numbers = _allocated(squares, goal.ravel()[pixels], self._most // cells)
+        more = numbers.sum(axis=1) > _WORTH * self.used.ravel()[pixels]
+        pixels, squares, numbers = pixels[more], squares[more], numbers[more]
+        self._rounds += 1
+        light, variance = self._sampled(pixels.astype(np.uint32), numbers)
+        if self._sun is not None:
+            light += self._sun.reshape(len(light), -1)[:, pixels]
+        self.array.reshape(len(light), -1)[:, pixels] = light
+        self.variance.ravel()[pixels] = variance / self._sensor_e.ravel()[pixels] ** 2
+        self.used.ravel()[pixels] = numbers.sum(axis=1)
+        left = (squares * numbers**-1.5).sum(axis=1) / np.maximum(squares.sum(axis=1), 1e-30)
+        self._left.ravel()[pixels] = left
+
+    def _sampled(self, pixels: NDArray[np.uint32], numbers: NDArray[np.int32]) -> tuple[F32, F64]:
+        """Return the radiance float32[band, pixel] with these numbers of samples in the cells, and its variance."""
+        from .. import render
+
+        count, cells = numbers.shape
+        side = round(cells**0.5)
+        total = np.zeros((len(self.array), count), dtype=np.float32)
+        variance = np.zeros(count)
+        for samples in np.unique(numbers).tolist():
+            owner, cell = np.nonzero(numbers == samples)
+            listed = render.Cells(pixel=pixels[owner], cell=cell.astype(np.uint32), side=side)
+            scene = self._next(cells * samples, samples.bit_length())
+            light, signal, error = render.direct_in_cells(self._surface, scene, self._signal, listed, samples)
+            for band, values in zip(total, light, strict=True):
+                band += np.bincount(owner, values, count)
+            if samples == 1:
+                # half the squared difference of two single samples is the variance of one
+                before = self._samples[listed.pixel, cell].astype(np.float32)
+                apart = np.abs(signal / self._white_e - before)
+                variance += np.bincount(owner, (apart * self._white_e) ** 2 / 2, count)
+                known = self._range[listed.pixel, cell]
+                self._range[listed.pixel, cell] = np.maximum(known, apart.astype(np.float16))
+            elif samples == 2:
+                # the two halves of a cell lie side by side: alternating signs cancel what changes evenly
+                sign = 1 - 2 * ((cell % side + cell // side) % 2)
+                variance += np.bincount(owner, sign * error, count) ** 2
+            else:
+                variance += np.bincount(owner, error.astype(np.float64) ** 2, count)
+        return total / cells, variance / cells**2
+
+
+def _ranges(samples: NDArray[np.float16], shape: tuple[int, int]) -> NDArray[np.float16]:
+    """Return the range of each sample and its neighbours, also those of adjacent pixels, float16[pixel, cell]."""
+    (height, width), side = shape, round(samples.shape[1] ** 0.5)
+    out = np.empty((height, width, side, side), dtype=np.float16)
+    by_row = samples.reshape(height, width, side, side)
+    kernel = np.ones((3, 3), np.uint8)
+    for start in range(0, height, _STRIP):
+        stop = min(start + _STRIP, height)
+        low, high = max(start - 1, 0), min(stop + 1, height)
+        grid = np.ascontiguousarray(by_row[low:high].transpose(0, 2, 1, 3), np.float32)
+        grid = grid.reshape((high - low) * side, width * side)
+        spread = cv2.dilate(grid, kernel) - cv2.erode(grid, kernel)
+        spread = spread[(start - low) * side : (stop - low) * side].reshape(stop - start, side, width, side)
+        out[start:stop] = spread.transpose(0, 2, 1, 3)
+    return out.reshape(height * width, side * side)
+
+
+def _allocated(squares: F32, goal: F32, most: int) -> NDArray[np.int32]:
+    """Return the number of samples of each cell, a power of two, int32[pixel, cell].
+
+    Along an edge, the variance of a cell falls as its number of samples to the power of -3/2. The numbers with the
+    least sum that bring the variance of the pixel to `goal` times that with one sample in each cell are then
+    proportional to the power 2/5 of the cells' variances.
+
+    Parameters
+    ----------
+    squares
+        float32[pixel, cell]: variance of a single sample, in any unit.
+    goal
+        float32[pixel].
+    most
+        Greatest number of samples of a cell.
+    """
+    power = squares**0.4
+    total = np.maximum(squares.sum(axis=1) * goal, 1e-30)
+    wanted = power * ((power.sum(axis=1) / total) ** (2 / 3))[:, None]
+    level = np.clip(np.ceil(np.log2(np.maximum(wanted, 1)) - _DOWN), 0, most.bit_length() - 1)
+    return np.left_shift(1, level.astype(np.int32)).astype(np.int32)
+
+
+def green_per_second(spec: SampleSpec) -> F64:
+    """Return electrons per second of the green pixels for unit radiance in each band, float64[band]."""
+    nodes = assemble.wavelengths_nm(spec.scene)
+    unit = Radiance(array=np.eye(len(nodes), dtype=np.float32)[:, :, None], wavelength_nm=nodes)
+    return np.asarray(rate_on_axis(spec.camera, unit).array[:, 0, 1], dtype=np.float64)
