@@ -207,6 +207,28 @@ def test_a_malformed_file_is_refused_in_a_sentence(tmp_path: Path, change_text: 
         load_trajectory(str(path.rename(tmp_path / "poses.txt")))
 
 
+@pytest.mark.parametrize(
+    ("column", "kind"), [("julian_date", "date32"), ("julian_date", "duration"), ("name", "binary")]
+)
+def test_a_parquet_column_that_holds_no_numbers_or_texts_is_refused(tmp_path: Path, column: str, kind: str) -> None:
+    """A date beyond the year 9999 has no equivalent in Python."""
+    import pyarrow
+    import pyarrow.parquet
+
+    values = {
+        "date32": pyarrow.array([2**31 - 1] * 5, pyarrow.int32()).cast(pyarrow.date32()),
+        "duration": pyarrow.array([2**53] * 5, pyarrow.duration("s")),
+        "binary": pyarrow.array([b"a", b"b", b"c", b"d", b"e"]),
+    }[kind]
+    path = tmp_path / "poses.parquet"
+    pyarrow.parquet.write_table(pyarrow.table({**columns_of(rows()), column: values}), path)
+    wanted = "texts" if column == "name" else "numbers"
+    with pytest.raises(
+        InputError, match=rf"poses\.parquet: column {column} has the type {kind}.*; must hold {wanted}"
+    ):
+        load_trajectory(str(path))
+
+
 def test_rows_set_the_samples_and_too_many_are_refused(tmp_path: Path, sphere: str) -> None:
     path = scene_file(tmp_path, sphere)
     scene = config.load_scene(path)

@@ -234,10 +234,23 @@ def _parquet_columns(data: bytes, source: str) -> dict[str, list[Any]]:
         _check_names(file.schema_arrow.names, source)
         if file.metadata.num_rows > _MOST_ROWS:  # before reading: a small file can hold a huge table
             raise InputError(f"{source}: has {file.metadata.num_rows} rows; must have at most {_MOST_ROWS}")
+        _check_types(file.schema_arrow, source)
         table = file.read()
         return {name: table.column(name).to_pylist() for name in COLUMNS}
     except (pyarrow.ArrowException, OSError, ValueError) as error:
         raise InputError(f"{source}: is no Parquet file: {' '.join(str(error).split())[:200]}") from None
+
+
+def _check_types(schema: Any, source: str) -> None:
+    """Raise InputError for a column of a Parquet file whose values are neither numbers nor texts."""
+    from pyarrow import types
+
+    for column in schema:
+        kind = column.type.value_type if types.is_dictionary(column.type) else column.type
+        checks = (types.is_floating, types.is_integer, types.is_decimal, types.is_string, types.is_large_string)
+        if not any(check(kind) for check in checks):
+            wanted = "texts" if column.name == "name" else "numbers"
+            raise InputError(f"{source}: column {column.name} has the type {kind}; must hold {wanted}")
 
 
 def _check_names(names: Sequence[str], source: str) -> None:
