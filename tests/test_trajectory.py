@@ -378,6 +378,14 @@ def test_the_description_shows_names_dates_and_distances(tmp_path: Path, sphere:
     assert "Sun: 2.5 to 3.1 au away, dates 2457000.50000 to 2457001.25000 TDB" in text
 
 
+def test_a_scene_made_in_python_has_the_samples_of_its_table(tmp_path: Path, sphere: str) -> None:
+    path = scene_file(tmp_path, sphere)
+    scene = small(sphere).model_copy(update={"trajectory": config.load_scene(path).trajectory})
+    assert scene.dataset.samples != 5
+    assert vbnfault.build(scene, tmp_path / "o.zarr", dry_run=True, progress=False).samples == 5
+    assert "samples: 5 at 3 of 3 sites, 1 to 2 at each" in dataset.describe_scene(scene, source="flown")
+
+
 def test_the_description_has_the_exposure_at_the_distances_of_the_table(tmp_path: Path, sphere: str) -> None:
     def exposure_s(table: Rows) -> list[float]:
         scene = config.load_scene(scene_file(tmp_path, sphere, table))

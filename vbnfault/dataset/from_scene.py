@@ -16,6 +16,7 @@ from ..core.errors import InputError, shown
 from ..core.quantities import Sample
 from ..scene import config, plan
 from ..scene.config import Scene
+from ..scene.trajectory import with_rows
 from . import build, describe
 from .identity import is_exact, planned, store_spec
 
@@ -129,7 +130,7 @@ def build_scene(
         llvm.find()  # raises VbnfaultError: without LLVM every sample would fail
     if append and samples is None and not options.overwrite and store.is_store(out):
         samples = int(store.open_store(out).attributes["blocks"][0])
-    scene = _with_samples(scene, samples)
+    scene = with_rows(_with_samples(scene, samples))
     blocks = build.planned_blocks(out, scene.dataset.samples, append=append or 0, overwrite=options.overwrite)
     factory, build_plan, description = _prepared(scene, blocks, source, options)
     summary = build.build(factory, build_plan, out, options)
@@ -183,4 +184,4 @@ def describe_scene(scene: Scene, *, source: str) -> list[str]:
     """
     session = pipeline.Session(scene, source=source)
     session.warn_of_doubts()
-    return _description(session, store_spec(session, (scene.dataset.samples,)))
+    return _description(session, store_spec(session, (session.scene.dataset.samples,)))
