@@ -145,6 +145,10 @@ def test_the_light_of_a_sphere_falls_to_nothing_behind_150_deg() -> None:
         ({"phase_deg": [1, 10], "magnitude": [0, 1]}, r"phase_deg\[0\] = 1, magnitude\[0\] = 0: must both be 0"),
         ({"phase_deg": [0, 10, 10], "magnitude": [0, 1, 2]}, "must increase"),
         ({"phase_deg": [0, 160], "magnitude": [0, 1]}, r"phase_deg\[1\] = 160: must be a number from 0 to 150"),
+        (
+            {"phase_deg": [0, 5, 10], "magnitude": [0, 1, 0.9]},
+            r"magnitude\[-1\] = 0\.9: the last slope continues to -1\.9 at 150 deg; must be at least -1 there",
+        ),
     ],
 )
 def test_a_wrong_phase_curve_is_refused(keys: dict[str, Any], sentence: str) -> None:

@@ -24,9 +24,11 @@ F64 = NDArray[np.float64]
 _DEG_PER_HALF = float(np.degrees(2.0))  # degrees of an angle per radian of its half
 _DECAY_PER_MAG = float(0.4 * np.log(10))
 # f keeps its value at 150° beyond that phase angle. There Φ_LS falls towards 0 at 180° and Φ is hardly measured.
-_LAST_TANGENT = float(np.tan(np.radians(75)))
+_LAST_DEG = 150.0
+_LAST_TANGENT = float(np.tan(np.radians(_LAST_DEG / 2)))
 _LEAST_TANGENT = 1e-6  # keeps the logarithm finite at opposition
 _MOST_ROWS = 1000
+_LEAST_MAGNITUDE = -1.0
 
 
 class SphereCurve(Reflectance, ABC):
@@ -84,8 +86,8 @@ class HG(SphereCurve):
         return (1 - self.slope_parameter) * parts[0] + self.slope_parameter * parts[1]
 
 
-Phase = Annotated[float, Field(ge=0, le=150)]
-Magnitude = Annotated[float, Field(ge=-1, le=30)]
+Phase = Annotated[float, Field(ge=0, le=_LAST_DEG)]
+Magnitude = Annotated[float, Field(ge=_LEAST_MAGNITUDE, le=30)]
 
 
 class PhaseCurve(SphereCurve):
@@ -119,6 +121,13 @@ class PhaseCurve(SphereCurve):
             )
         if any(a >= b for a, b in itertools.pairwise(self.phase_deg)):
             raise ValueError(f"phase_deg = {list(self.phase_deg)}: must increase")
+        slope = (self.magnitude[-1] - self.magnitude[-2]) / (self.phase_deg[-1] - self.phase_deg[-2])
+        at_the_end = self.magnitude[-1] + slope * (_LAST_DEG - self.phase_deg[-1])
+        if at_the_end < _LEAST_MAGNITUDE:
+            raise ValueError(
+                f"magnitude[-1] = {self.magnitude[-1]:g}: the last slope continues to {at_the_end:.3g} at "
+                f"{_LAST_DEG:g} deg; must be at least {_LEAST_MAGNITUDE:g} there"
+            )
         return self
 
     def curve(self, m: Any, tan_half: Any) -> Any:
