@@ -155,6 +155,39 @@ def test_a_map_finer_than_the_pixels_is_averaged(tmp_path: Path) -> None:
     np.testing.assert_allclose(looked_up(albedo, longitude, latitude, 4 * texel_m), 0.5, atol=0.01)
 
 
+@pytest.mark.parametrize("rows", [181, 180])
+def test_a_map_of_any_number_of_rows_has_coarser_levels(tmp_path: Path, rows: int) -> None:
+    """181 rows have no even half, 180 have the half of a half of 45."""
+    board = np.indices((rows, 2 * rows)).sum(axis=0) % 2 * 255
+    map_file = written(tmp_path / "m.png", board.astype(np.uint8))
+    loaded = load_albedo_map(AlbedoMapTable(file=str(map_file), neutral=1.0))
+    assert [level.shape[0] - 2 for level in loaded.levels] == [
+        rows,
+        *((91, 46, 23, 12, 6) if rows == 181 else (90, 45, 23, 12, 6)),
+    ]
+    assert all(level.shape[1] == 2 * (level.shape[0] - 2) for level in loaded.levels)
+    longitude, latitude = np.random.default_rng(2).uniform(-60, 60, (2, 500))
+    for texels in (8, 32):
+        values = looked_up(device_map(map_file), longitude, latitude, texels * np.pi * 1000 / rows)
+        np.testing.assert_allclose(values, 0.5, atol=0.02)
+    # east is where it was: the bright quadrant keeps its borders in every level
+    image = np.zeros((rows, 2 * rows), dtype=np.uint8)
+    image[:, rows:] = 255
+    halves = load_albedo_map(AlbedoMapTable(file=str(written(tmp_path / "half.png", image)), neutral=1.0))
+    for level in halves.levels:
+        assert level[1:-1].mean() == pytest.approx(0.5, abs=1e-5)
+        assert level[1:-1, level.shape[1] // 2 :].mean() > 0.9
+
+
+@pytest.mark.parametrize("kind", [np.int8, np.int16, np.int32])
+def test_signed_whole_numbers_count_as_fractions_of_the_largest_too(tmp_path: Path, kind: type) -> None:
+    image = np.full((8, 16), np.iinfo(kind).max, dtype=kind)
+    image[:4] //= 2
+    loaded = load_albedo_map(AlbedoMapTable(file=str(written(tmp_path / "m.tif", image)), neutral=1.0))
+    assert loaded.levels[0][-2, 0, 0] == 1
+    assert loaded.levels[0][1, 0, 0] == pytest.approx(0.5, abs=0.01)
+
+
 def test_a_coloured_map_acts_on_its_bands(tmp_path: Path) -> None:
     image = np.zeros((8, 16, 3), dtype=np.uint8)
     image[:] = (255, 102, 51)

@@ -32,7 +32,8 @@ class SurfaceMap:
     ----------
     levels
         Each float32[row, column, channel], of one channel or of R, G, B. The first has the resolution of the file,
-        each other half of the one before it. Every level has one row more at each pole: its value there.
+        each other half of the one before it, rounded up. Every level has one row more at each pole: its value
+        there.
     left_longitude_deg
         East longitude of the left edge of the first column.
     """
@@ -64,7 +65,7 @@ def _factors(table: AlbedoMapTable) -> Float32:
             f"body.albedo_map.file = {path!r}: has {columns} x {rows} pixels; a map of the whole body has twice as "
             f"many columns as rows, and at least {_LEAST_ROWS} rows"
         )
-    if values.dtype.kind == "u":
+    if values.dtype.kind in "iu":
         values = values.astype(np.float32) / np.float32(np.iinfo(values.dtype).max)
     values = values.astype(np.float32)
     if not np.isfinite(values).all() or values.min() < 0:
@@ -99,10 +100,18 @@ def _prepared(table: AlbedoMapTable, factors: Float32) -> SurfaceMap:
     """Return the map with its levels of resolution."""
     factors = _even_at_the_poles(factors)
     levels = [_with_poles(factors)]
-    while min(factors.shape[:2]) >= 2 * _LEAST_ROWS and factors.shape[0] % 2 == 0:
-        factors = 0.25 * (factors[::2, ::2] + factors[1::2, ::2] + factors[::2, 1::2] + factors[1::2, 1::2])
+    while len(factors) >= 2 * _LEAST_ROWS:
+        factors = _halved(factors)
         levels.append(_with_poles(factors))
     return SurfaceMap(levels=tuple(levels), left_longitude_deg=table.left_longitude_deg)
+
+
+def _halved(factors: Float32) -> Float32:
+    """Return the map with half as many rows and columns, rounded up; each value is the mean over its area."""
+    if len(factors) % 2 == 0:
+        return 0.25 * (factors[::2, ::2] + factors[1::2, ::2] + factors[::2, 1::2] + factors[1::2, 1::2])
+    rows = (len(factors) + 1) // 2
+    return cv2.resize(factors, (2 * rows, rows), interpolation=cv2.INTER_AREA).reshape(rows, 2 * rows, -1)
 
 
 def _even_at_the_poles(factors: Float32) -> Float32:
