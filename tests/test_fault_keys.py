@@ -15,7 +15,7 @@ from test_faults_kit import make_context, noisy, with_mosaic
 
 from vbnfault.core import spectra
 from vbnfault.core.errors import InputError
-from vbnfault.core.quantities import Electrons
+from vbnfault.core.quantities import Electrons, Radiance
 from vbnfault.detector import MosaicDetector
 from vbnfault.faults import Fault, FaultContext, act, from_dict, registry
 from vbnfault.pipeline import masks
@@ -96,6 +96,7 @@ def context(fault: Fault, key: str) -> FaultContext:
         wavelength_nm=nodes,
         sun_irradiance_W_m2_nm=spectra.solar_band_irradiance_W_m2_nm(nodes, 1.0),
         sun_angular_radius_rad=spectra.sun_angular_radius_rad(1.0),
+        radiance=Radiance(array=np.full((3, SIZE, SIZE), 10.0, np.float32), wavelength_nm=nodes),
     )
     # long enough for dark current
     if not fault.needs_mosaic:

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..camera import Camera
+from ..core.quantities import Radiance
 from ..lens.footprint import ImageFrame
 
 Params = dict[str, Any]
@@ -43,6 +44,9 @@ class FaultContext:
         float[y, x]: depth of the scene along the boresight at the pixel centres, inf on the sky.
     up_C
         float64[3]: unit vector in C away from the body, along the vertical of the site.
+    radiance
+        Radiance of the scene on the grid of its render, that of a pinhole camera with a guard band. None for a
+        user's own image.
     coating_loss
         Fraction of the coatings' area that another fault of the sample has removed, in [0, 1]. Only a model with
         `Fault.informed` gets it; for the others it is 0.
@@ -57,6 +61,7 @@ class FaultContext:
     sun_angular_radius_rad: float | None = None
     depth_m: NDArray[np.floating[Any]] | None = None
     up_C: NDArray[np.float64] | None = None
+    radiance: Radiance | None = None
     coating_loss: float = 0.0
     # `init=False`, because `dataclasses.replace` must not copy results of one frame to another
     _memo: dict[Any, Any] = field(default_factory=dict, init=False, repr=False)

@@ -5,6 +5,11 @@ There are two models, which differ only in the ghosts. For each path of two refl
 the stop (Lee & Eisemann 2013). The light is added as irradiance on the sensor, in proportion to the Sun's
 irradiance at the camera.
 
+With `sources = "scene"` the sunlit body, the spacecraft and everything else that is rendered are sources too, each
+part of them like a small Sun (`lens.straylight.scene`). Their light is linear in the rendered radiance, so that it
+needs no second render. The fault then acts without a Sun in view. A user's own image has no radiance, so there the
+scattered light of the scene returns as a veil, as with `sources = "sun"`.
+
 The image loses the light that becomes straylight (`lens.straylight`). Starburst, glare and veil of the Sun are
 subtracted from the Sun's direct image. The image of the scene loses the fraction that is scattered, which returns
 as a veil over the whole frame.
@@ -29,6 +34,7 @@ from numpy.typing import NDArray
 from ..core import spectra
 from ..core.quantities import Irradiance
 from ..lens.straylight.scatter import CLEANLINESS_LIMITS, ROUGHNESS_NM_LIMITS, Cleanliness
+from ..lens.straylight.scene import RenderGrid, SceneInLens
 from ..lens.straylight.settings import Baffle, DirectPath, GhostSettings, SensorGrid, StraylightSettings, SunSource
 from ..lens.straylight.total import SunlightInLens, scene_veil_fraction, veil_of
 from .context import FaultContext, Params
@@ -53,12 +59,15 @@ class _Light(NamedTuple):
     direct_left
         float64[channel]: remaining fraction of the Sun's direct image.
     scene_lost
-        float64[channel]: fraction of the scene's image that becomes veil.
+        float64[channel]: fraction of the scene's image that becomes straylight.
+    scene_added
+        Whether `added` contains the straylight of the scene.
     """
 
     added: F32
     direct_left: F64
     scene_lost: F64
+    scene_added: bool
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -119,6 +128,11 @@ class _LensStraylight(LensFault):
         doc="fraction of the light that mount, barrel and edges scatter over the sensor: their veiling glare index "
         "(ISO 9358)",
     )
+    sources: str = choice(
+        "sun",
+        ("sun", "scene"),
+        doc="of ghosts and glare: the Sun alone, or the whole rendered scene and the Sun where it is in view",
+    )
     reflections: int = number(2, limits=(2, 4), integer=True, doc="of the ghosts: 2, or 4 for those of four too")
     baffle_length_mm: float = number(0.0, limits=(0, 1e4), unit="mm", doc="of a tube in front of the lens")
     baffle_radius_mm: float = number(0.0, limits=(0, 1e4), unit="mm", doc="of that tube")
@@ -128,6 +142,12 @@ class _LensStraylight(LensFault):
         unit="DN of 255",
         doc="the mask holds the pixels that the noise-free image changes in by at least this much",
     )
+
+    def __post_init__(self) -> None:
+        """Check every field; light of the scene needs no Sun in view."""
+        super().__post_init__()
+        if self.sources == "scene":
+            object.__setattr__(self, "needs_sun", False)
 
     def validate(self) -> None:
         """Raise ValueError if `reflections` is neither 2 nor 4, or a baffle has no radius."""
@@ -145,7 +165,7 @@ class _LensStraylight(LensFault):
 
     def draw_state(self, rng: np.random.Generator) -> Params:
         """Return the parameters of `draw` without the list of ghosts, which only describes them."""
-        return {
+        params: Params = {
             "lens": self.lens,
             "coating": self.coating,
             "roughness_nm": self.roughness_nm.uniform(rng),
@@ -155,23 +175,26 @@ class _LensStraylight(LensFault):
             "baffle_mm": [float(self.baffle_length_mm), float(self.baffle_radius_mm)],
             "mask_level_dn": float(self.mask_level_dn),
         }
+        if self.sources != "sun":  # so that the stored parameters of other scenes stay as they are
+            params["sources"] = self.sources
+        return params
 
     def apply(self, quantity: Any, params: Params, context: FaultContext) -> Any:
         """Return the expected electrons plus straylight, minus the light that straylight is taken from."""
         light = self._light_once(params, context)
         if light is None:
             return quantity
-        flux = quantity.array.sum(axis=(0, 1), dtype=np.float64) * light.scene_lost
-        scene = times(quantity.array, 1 - light.scene_lost)
-        veil = veil_of(flux, context.shape, context.camera.focal_length_px)
-        added = plus(light.added, veil)
+        scene, added = times(quantity.array, 1 - light.scene_lost), light.added
+        if not light.scene_added:
+            flux = quantity.array.sum(axis=(0, 1), dtype=np.float64) * light.scene_lost
+            added = plus(added, veil_of(flux, context.shape, context.camera.focal_length_px))
         if quantity.past_rims is None:
             return quantity.with_array(plus(scene, added))
         past = plus(times(quantity.past_rims, light.direct_left), added)
         return replace(quantity, array=scene, past_rims=past)
 
     def footprint(self, params: Params, context: FaultContext) -> NDArray[np.bool_]:
-        """Return the pixels where any channel gains at least `mask_level_dn` of the Sun's light, bool[y, x]."""
+        """Return the pixels where any channel gains at least `mask_level_dn` of straylight, bool[y, x]."""
         light = self._light_once(params, context)
         if light is None:
             return np.zeros(context.shape, dtype=bool)
@@ -179,7 +202,7 @@ class _LensStraylight(LensFault):
         return np.asarray((light.added >= white * np.float32(params["mask_level_dn"] / 255)).any(axis=2))
 
     def soft(self, params: Params, context: FaultContext) -> F32:
-        """Return the intensity of the Sun's straylight, float32[y, x] in DN of 255."""
+        """Return the intensity of the straylight, float32[y, x] in DN of 255."""
         light = self._light_once(params, context)
         return np.zeros(context.shape, np.float32) if light is None else intensity_dn(light.added, context.camera)
 
@@ -193,21 +216,45 @@ class _LensStraylight(LensFault):
         return context.once("straylight.lens", params, lambda: self._light(params, context))
 
     def _light(self, params: Params, context: FaultContext) -> _Light | None:
-        """Return the straylight of the Sun; None if there is no Sun in front of the camera."""
-        source = self.sunlight(params, context)
+        """Return the straylight; None if there is no Sun in front of the camera and no light of the scene."""
+        source, scene = self.sunlight(params, context), self.scene_light(params, context)
         if source is None:
-            return None
+            if scene is None:
+                return None
+            lost = self.scene_lost(params, context)
+            return _Light(added=scene, direct_left=1 - lost, scene_lost=lost, scene_added=True)
         camera, light = context.camera, source.light
         parts = light.total()
         on_sensor = Irradiance(
             array=parts.total * source.irradiance_W_m2_nm.astype(np.float32)[:, None, None],
             wavelength_nm=light.nodes_nm,
         )
+        added = camera.detector.electrons_expected(on_sensor, camera.exposure_s).array
         return _Light(
-            added=camera.detector.electrons_expected(on_sensor, camera.exposure_s).array,
+            added=added if scene is None else plus(added, scene),
             direct_left=source.channel_mean(parts.direct_fraction),
             scene_lost=source.scene_lost,
+            scene_added=scene is not None,
         )
+
+    def scene_light(self, params: Params, context: FaultContext) -> F32 | None:
+        """Return the straylight of the rendered scene, electrons float32[y, x, channel]; None if there is none."""
+        radiance, camera = context.radiance, context.camera
+        if params.get("sources") != "scene" or radiance is None:
+            return None
+        array = radiance.array if radiance.sun is None else np.maximum(radiance.array - radiance.sun, 0)
+        nodes = radiance.wavelength_nm
+        in_lens = SceneInLens(
+            lens=context.frame.prescription(params["lens"], params["coating"]),
+            nodes_nm=nodes,
+            sensor=_sensor_grid(context),
+            render=RenderGrid(shape=(int(array.shape[1]), int(array.shape[2])), focal_px=camera.focal_length_px),
+            image=camera.lens,
+            settings=self._settings(params, context),
+            passed=camera.lens.transmittance(nodes),
+        )
+        weights = camera.detector.electron_rate_weights(nodes).astype(np.float64) * camera.exposure_s
+        return np.ascontiguousarray(in_lens.straylight(array, weights).total.transpose(1, 2, 0))
 
     def sunlight(self, params: Params, context: FaultContext) -> LensSunlight | None:
         """Return the Sun's light in the lens before any ray is traced; None if no Sun is in front of the camera."""
@@ -217,48 +264,57 @@ class _LensStraylight(LensFault):
         theta, azimuth = sun
         camera = context.camera
         nodes, irradiance = _sunlight(context)
-        pitch_mm = camera.detector.pixel_pitch_um * 1e-3
+        sensor = _sensor_grid(context)
         assert context.sun_xy_px is not None
         middle = np.array([camera.width_px / 2, camera.height_px / 2])
-        x, y = (np.asarray(context.sun_xy_px) - middle) * pitch_mm
-        lens = context.frame.prescription(params["lens"], params["coating"])
+        x, y = (np.asarray(context.sun_xy_px) - middle) * sensor.pitch_mm
         passed = camera.lens.transmittance(nodes)
         area_mm2, axial_mm2 = camera.lens.pupil_area_mm2([np.tan(np.radians(theta)), 0.0])
-        cleanliness = Cleanliness(roughness_nm=params["roughness_nm"], level=params["cleanliness_level"])
         light = SunlightInLens.of(
-            lens,
+            context.frame.prescription(params["lens"], params["coating"]),
             wavelength_nm=nodes,
-            sensor=SensorGrid(shape=context.shape, pitch_mm=pitch_mm),
+            sensor=sensor,
             sun=SunSource(
                 angle_deg=theta,
                 azimuth_deg=azimuth,
                 radius_rad=_sun_radius_rad(context),
                 image_xy_mm=(float(x), float(y)),
             ),
-            settings=StraylightSettings(
-                ghosts=GhostSettings(model=self.model, reflections=params["reflections"]),
-                cleanliness=cleanliness,
-                baffle=Baffle(length_mm=params["baffle_mm"][0], radius_mm=params["baffle_mm"][1]),
-                coating_loss=context.coating_loss,
-                veil_fraction=params["veil_fraction"],
-            ),
+            settings=self._settings(params, context),
             path=DirectPath(
                 transmittance=passed,
                 admitted_mm2=float(area_mm2 * np.cos(np.radians(theta))),
                 beam_fraction=float(area_mm2 / axial_mm2),
             ),
         )
-        # the scene and the Sun's image both have the spectrum of sunlight that the lens transmits
-        weights = camera.detector.electron_rate_weights(nodes) * irradiance * passed
-        weights /= np.maximum(weights.sum(axis=1, keepdims=True), 1e-300)
-        lost = scene_veil_fraction(lens, nodes, cleanliness=cleanliness, veil_fraction=params["veil_fraction"])
         visible = 1.0 if context.sun_visible_fraction is None else float(context.sun_visible_fraction)
         return LensSunlight(
             light=light,
             irradiance_W_m2_nm=irradiance * visible,
-            weights=weights,
-            scene_lost=weights @ lost,
+            weights=_channel_weights(context),
+            scene_lost=self.scene_lost(params, context),
         )
+
+    def _settings(self, params: Params, context: FaultContext) -> StraylightSettings:
+        """Return the state of the lens."""
+        return StraylightSettings(
+            ghosts=GhostSettings(model=self.model, reflections=params["reflections"]),
+            cleanliness=Cleanliness(roughness_nm=params["roughness_nm"], level=params["cleanliness_level"]),
+            baffle=Baffle(length_mm=params["baffle_mm"][0], radius_mm=params["baffle_mm"][1]),
+            coating_loss=context.coating_loss,
+            veil_fraction=params["veil_fraction"],
+        )
+
+    def scene_lost(self, params: Params, context: FaultContext) -> F64:
+        """Return the fraction of the scene's image that becomes straylight, float64[channel]."""
+        settings = self._settings(params, context)
+        lost = scene_veil_fraction(
+            context.frame.prescription(params["lens"], params["coating"]),
+            _sunlight(context)[0],
+            cleanliness=settings.cleanliness,
+            veil_fraction=settings.veil_fraction,
+        )
+        return np.asarray(_channel_weights(context) @ lost)
 
     def _ghosts(self, params: Params, context: FaultContext) -> list[dict[str, Any]]:
         """Return the brightest ghosts in the frame as plain data."""
@@ -268,11 +324,12 @@ class _LensStraylight(LensFault):
         if sun is None:
             return []
         camera = context.camera
-        pitch_mm = camera.detector.pixel_pitch_um * 1e-3
+        sensor = _sensor_grid(context)
+        pitch_mm = sensor.pitch_mm
         made = flare_model(
             context.frame.prescription(params["lens"], params["coating"]),
             tuple(float(v) for v in _sunlight(context)[0]),
-            SensorGrid(shape=context.shape, pitch_mm=pitch_mm),
+            sensor,
             _sun_radius_rad(context),
             GhostSettings(model=self.model, reflections=params["reflections"]),
         )
@@ -315,6 +372,22 @@ def _sun(context: FaultContext) -> tuple[float, float] | None:
         return None
     theta = float(np.degrees(np.arctan2(np.hypot(direction[0], direction[1]), direction[2])))
     return (theta, float(np.degrees(np.arctan2(direction[1], direction[0])))) if theta < 89.9 else None
+
+
+def _sensor_grid(context: FaultContext) -> SensorGrid:
+    """Return the pixels of the camera."""
+    return SensorGrid(shape=context.shape, pitch_mm=context.camera.detector.pixel_pitch_um * 1e-3)
+
+
+def _channel_weights(context: FaultContext) -> F64:
+    """Return the spectrum of each channel's electrons under sunlight, float64[channel, band], with the sum 1.
+
+    The scene and the Sun's image both have the spectrum of sunlight that the lens transmits.
+    """
+    camera, (nodes, irradiance) = context.camera, _sunlight(context)
+    weights = camera.detector.electron_rate_weights(nodes) * irradiance * camera.lens.transmittance(nodes)
+    weights /= np.maximum(weights.sum(axis=1, keepdims=True), 1e-300)
+    return np.asarray(weights)
 
 
 def _sunlight(context: FaultContext) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -69,6 +69,7 @@ def fault_context(pose: Pose, rendering: Rendering, exposure: SceneExposure) -> 
         sun_visible_fraction=pose.sun_visible_fraction,
         depth_m=rendering.truth.depth_m,
         up_C=-pose.L_from_C[2],
+        radiance=exposure.light.rendered,
     )
 
 

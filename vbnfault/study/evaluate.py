@@ -33,7 +33,7 @@ from ..core import spectra
 from ..core.errors import InputError, shown
 from ..core.quantities import Electrons
 from ..core.tables import did_you_mean
-from ..faults import Fault, act, from_dict, registry
+from ..faults import Fault, Params, act, from_dict, registry
 from ..lens import Prescription
 from ..lens.changes import changed
 from ..lens.footprint import ImageFrame
@@ -381,7 +381,7 @@ class SceneEvaluator:
             with self.kept.timed("texture"):
                 light = _added_by(fault, exposed, fault.draw(exposed.context, rng))
         else:
-            light = self._traced(sunlight(fault.draw_state(rng), exposed.context), exposed)  # type: ignore[attr-defined]
+            light = self._traced(fault, fault.draw_state(rng), exposed)  # type: ignore[attr-defined]
         camera = exposed.camera
         detector = camera.detector
         return LitImage(
@@ -395,11 +395,18 @@ class SceneEvaluator:
             **light,
         )
 
-    def _traced(self, source: Any, exposed: Exposed) -> dict[str, Any]:
-        """Return the fields of `LitImage` that hold the straylight of a lens; `source` is a `LensSunlight`."""
-        nothing = {"kept": exposed.clean, "added": np.zeros_like(exposed.clean), "parts_e": {}, "ghosts_e": ()}
+    def _traced(self, fault: Any, params: Params, exposed: Exposed) -> dict[str, Any]:
+        """Return the fields of `LitImage` that hold the straylight of a lens; `fault` is a model that traces it."""
+        source = fault.sunlight(params, exposed.context)
+        with self.kept.timed("light"):
+            scene = fault.scene_light(params, exposed.context)
+            of_scene = None if scene is None else np.ascontiguousarray(scene.transpose(2, 0, 1))
         if source is None:
-            return nothing
+            if of_scene is None:
+                unchanged = {"kept": exposed.clean, "added": np.zeros_like(exposed.clean)}
+                return {**unchanged, "parts_e": {}, "ghosts_e": ()}
+            remaining = 1 - fault.scene_lost(params, exposed.context).astype(np.float32)[:, None, None]
+            return {"kept": exposed.clean * remaining, "added": of_scene, "parts_e": {}, "ghosts_e": ()}
         light: SunlightInLens = source.light
         camera, pitch_mm = exposed.camera, light.sensor.pitch_mm
         per_s = camera.detector.electron_rate_weights(light.nodes_nm) * source.irradiance_W_m2_nm
@@ -430,13 +437,15 @@ class SceneEvaluator:
             # the veil of the Sun and that of the scene have the same distribution over the frame
             lost = source.scene_lost
             scene_e = exposed.scene_e
-            flux = scene_e.sum(axis=(1, 2), dtype=np.float64) * lost
+            flux = scene_e.sum(axis=(1, 2), dtype=np.float64) * (lost if of_scene is None else 0 * lost)
             focal_px = camera.focal_length_px
             veil = cos4_map(camera_shape(camera), focal_px) * np.float32(1 / (np.pi * focal_px**2))
             sun_veil = (per_s @ entering * camera.exposure_s).astype(np.float32)
             for channel, plane in enumerate(added):
                 plane += veil_plane * sun_veil[channel]
                 plane += veil * np.float32(flux[channel])
+                if of_scene is not None:
+                    plane += of_scene[channel]
             left = scene_e * (1 - lost).astype(np.float32)[:, None, None]
             if exposed.direct_e is not None:
                 left += exposed.direct_e * direct_left.astype(np.float32)[:, None, None]

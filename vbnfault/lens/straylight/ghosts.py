@@ -20,7 +20,7 @@ from ...core.llvm import backend
 from ..glass import D_NM
 from ..paraxial import paraxial_properties
 from ..prescription import Prescription
-from .bundles import Rays, Tracer, name_of
+from .bundles import Rays, Spots, Tracer, name_of
 from .paraxial import Ghost
 
 F64 = NDArray[np.float64]
@@ -357,10 +357,15 @@ def fluxes_mm2(made: Tracer, rays: Rays, sun_deg: float, across: int) -> F64:
     """
     be = backend()
     spots = made.trace(rays, across, centred=True)
-    weight = be.Float64(spots.fraction * _inside(spots.radius, across))
+    weight = be.Float64(lit_cells(spots, across))
     cell = 4 * rays.box_mm[:, 2] * rays.box_mm[:, 3] / across**2
     total = be.dr.block_sum(weight, across * across).numpy()
     return np.asarray(total * cell * np.cos(np.radians(sun_deg)))
+
+
+def lit_cells(spots: Spots, across: int) -> Any:
+    """Return the fraction of the light through each cell of a grid of rays that arrives, a device array."""
+    return spots.fraction * _inside(spots.radius, across)
 
 
 def _traced_together(
@@ -370,7 +375,7 @@ def _traced_together(
     be = backend()
     dr, Float64 = be.dr, be.Float64
     spots = made.trace(rays, across, centred=True)
-    weight = Float64(spots.fraction * _inside(spots.radius, across))
+    weight = Float64(lit_cells(spots, across))
     x, y = Float64(spots.x_mm), Float64(spots.y_mm)
     parts = (weight, weight * x, weight * y, weight * (x * x + y * y))
     dr.eval(*parts)

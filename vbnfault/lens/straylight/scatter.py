@@ -442,6 +442,16 @@ class _Surfaces:
             total += part * stretch**2 * bsdf
         return self.scale * total
 
+    def of_each(self, offset: F64) -> F64:
+        """Return `irradiance` of every surface alone where the whole beam is lit, float64[surface, sample]."""
+        out = []
+        for stretch, harvey, dusty in zip(self.stretch, self.roughness, self.dusty, strict=True):
+            bsdf = harvey.bsdf(stretch * offset)
+            if dusty:
+                bsdf = bsdf + particle_bsdf(self.level, self.wavelength_nm, stretch * offset)
+            out.append(self.scale * stretch**2 * bsdf)
+        return np.array(out).reshape(len(out), len(offset))
+
     @property
     def tis(self) -> float:
         """Return the sum of the TIS of all surfaces."""
@@ -504,6 +514,13 @@ def _lit(lens: Prescription, sun_deg: float) -> F64:
     return np.array(fractions)
 
 
+@lru_cache(maxsize=8)
+def _lit_at(lens: Prescription, slopes: tuple[float, ...]) -> F64:
+    """Return cos θ times the fraction of the beam that sources light, float64[angle, surface]; it is cached."""
+    angle = np.arctan(slopes)
+    return np.stack([np.cos(a) * _lit(lens, float(np.degrees(a))) for a in angle])
+
+
 def _surfaces_of_bands(lens: Prescription, wavelength_nm: ArrayLike, cleanliness: Cleanliness) -> list[_Surfaces]:
     """Return the scatter of a lens's surfaces at each wavelength."""
     return [
@@ -535,6 +552,29 @@ def veiling_glare(
         efl_mm=paraxial_properties(lens).efl_mm,
         glare_total_fraction=np.array([band.tis for band in bands]),
     )
+
+
+def glare_kernels(
+    lens: Prescription, slope: F64, *, wavelength_nm: ArrayLike, cleanliness: Cleanliness = POLISHED
+) -> tuple[F64, F64]:
+    """Return the glare of far point sources at many field angles.
+
+    Parameters
+    ----------
+    slope
+        float64[angle]: tangents of the field angles.
+    wavelength_nm, cleanliness
+        As in `veiling_glare`.
+
+    Returns
+    -------
+    offset : float64[sample]
+    irradiance : float64[band, angle, sample]
+        As in `VeilingGlare`; the cos⁴ of a pixel's field angle is not included.
+    """
+    lit = _lit_at(lens, tuple(np.asarray(slope, dtype=np.float64).tolist()))
+    bands = _surfaces_of_bands(lens, wavelength_nm, cleanliness)
+    return _OFFSETS, np.stack([np.einsum("aj,js->as", lit, band.of_each(_OFFSETS)) for band in bands])
 
 
 def scattered_fraction(lens: Prescription, wavelength_nm: ArrayLike, *, cleanliness: Cleanliness = POLISHED) -> F64:

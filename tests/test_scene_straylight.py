@@ -1,0 +1,282 @@
+"""Straylight of the whole scene: against every lit pixel as a source, energy, and what the fault makes of it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from test_faults_kit import flat_electrons, make_context
+
+from vbnfault.core import llvm, spectra
+from vbnfault.core.errors import VbnfaultError
+from vbnfault.core.quantities import Electrons, Radiance
+from vbnfault.faults import FaultContext, from_dict
+from vbnfault.lens import ThinLens, load_lens, paraxial_properties
+from vbnfault.lens.prescription import Prescription
+from vbnfault.lens.straylight.bundles import Tracer
+from vbnfault.lens.straylight.ghosts import boxes, lit_cells, traced_ghosts
+from vbnfault.lens.straylight.scatter import Cleanliness
+from vbnfault.lens.straylight.scene import RenderGrid, SceneInLens
+from vbnfault.lens.straylight.settings import Baffle, DirectPath, SensorGrid, StraylightSettings, SunSource
+from vbnfault.lens.straylight.total import SunlightInLens
+
+try:
+    llvm.find()
+except VbnfaultError as error:
+    pytest.skip(f"no usable LLVM: {error}", allow_module_level=True)
+
+F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
+
+NODES = np.array([550.0])
+SINGLET = """
+name = "singlet"
+source = "test"
+surface = [
+  { radius_mm = 60.0, thickness_mm = 4.0, nd = 1.6, vd = 45.0, diameter_mm = 16.0 },
+  { radius_mm = -60.0, thickness_mm = 2.0, diameter_mm = 16.0 },
+  { stop = true, thickness_mm = 0.0, diameter_mm = 10.0 },
+]
+"""
+
+
+def behind(
+    lens: Prescription, size: int, fov_deg: float, *, guard: int = 0, nodes: F64 = NODES, **settings: Any
+) -> SceneInLens:
+    """A square frame behind a lens, and a render of it with a guard band."""
+    efl_mm = paraxial_properties(lens).efl_mm
+    focal_px = size / 2 / np.tan(np.radians(fov_deg / 2))
+    return SceneInLens(
+        lens=lens,
+        nodes_nm=nodes,
+        sensor=SensorGrid(shape=(size, size), pitch_mm=efl_mm / focal_px),
+        render=RenderGrid(shape=(size + 2 * guard, size + 2 * guard), focal_px=float(focal_px)),
+        image=ThinLens(focal_length_mm=efl_mm, f_number=2.8),
+        settings=StraylightSettings(**settings),
+        passed=np.full(len(nodes), 0.8),
+    )
+
+
+def disc(shape: tuple[int, int], x: float, y: float, radius: float) -> F32:
+    """A lit disc, in fractions of the width, float32[1, y, x]."""
+    height, width = shape
+    row, column = np.mgrid[:height, :width] + 0.5
+    lit = (np.hypot(column / width - x, row / height - y) < radius).astype(np.float32)
+    return lit[None]
+
+
+def points(scene: SceneInLens, radiance: F32, within: int) -> list[tuple[float, float, F64]]:
+    """Slopes and irradiance float64[band] of points in all lit pixels, `within`² in each."""
+    height, width = scene.render.shape
+    focal = scene.render.focal_px
+    offsets = (np.arange(within) + 0.5) / within
+    out = []
+    for row, column in zip(*np.nonzero(radiance.any(axis=0)), strict=True):
+        for dy in offsets:
+            for dx in offsets:
+                x, y = (column + dx - width / 2) / focal, (row + dy - height / 2) / focal
+                solid_sr = (1 + x * x + y * y) ** -1.5 / focal**2 / within**2
+                out.append((x, y, radiance[:, row, column] * solid_sr))
+    return out
+
+
+def ghosts_of_every_pixel(scene: SceneInLens, radiance: F32, across: int = 64, within: int = 3) -> F64:
+    """Ghosts of points in all lit pixels, by exact rays that are counted in the pixels that they meet."""
+    made = Tracer(scene.lens, scene.nodes_nm)
+    (height, width), pitch = scene.sensor.shape, scene.sensor.pitch_mm
+    bands = len(scene.nodes_nm)
+    out = np.zeros((bands, height * width))
+    for x, y, irradiance in points(scene, radiance, within):
+        slope, azimuth = np.hypot(x, y), np.arctan2(y, x)
+        rays, _ = boxes(made, float(np.degrees(np.arctan(slope))))
+        cosine = 1 / np.hypot(1, slope)
+        for band in range(bands):
+            rays = replace(rays, wavelength=np.full(len(rays), band))
+            spots = made.trace(rays, across, centred=True)
+            cell = 4 * rays.box_mm[:, 2] * rays.box_mm[:, 3] / across**2 * cosine
+            light = (lit_cells(spots, across).numpy().reshape(len(rays), -1) * cell[:, None]).ravel()
+            sx, sy = spots.x_mm.numpy(), spots.y_mm.numpy()
+            column = np.floor((sx * np.cos(azimuth) - sy * np.sin(azimuth)) / pitch + width / 2).astype(int)
+            row = np.floor((sx * np.sin(azimuth) + sy * np.cos(azimuth)) / pitch + height / 2).astype(int)
+            seen = (column >= 0) & (column < width) & (row >= 0) & (row < height) & (light > 0)
+            pixel = row[seen] * width + column[seen]
+            out[band] += irradiance[band] * np.bincount(pixel, weights=light[seen], minlength=height * width)
+    return out.reshape(bands, height, width) / pitch**2
+
+
+def scattered_of_every_pixel(scene: SceneInLens, radiance: F32, within: int = 3) -> tuple[F64, F64]:
+    """Glare and veil of points in all lit pixels, each computed as that of a Sun."""
+    glare = np.zeros((len(scene.nodes_nm), *scene.sensor.shape))
+    veil = np.zeros_like(glare)
+    for x, y, irradiance in points(scene, radiance, within):
+        sun = SunSource(
+            angle_deg=float(np.degrees(np.arctan(np.hypot(x, y)))), azimuth_deg=float(np.degrees(np.arctan2(y, x)))
+        )
+        light = SunlightInLens.of(
+            scene.lens,
+            wavelength_nm=scene.nodes_nm,
+            sensor=scene.sensor,
+            sun=sun,
+            settings=scene.settings,
+            path=DirectPath(transmittance=scene.passed, admitted_mm2=1.0),
+        )
+        glare += irradiance[:, None, None] * light.glare()[0]
+        veil += irradiance[:, None, None] * light.veil()[0]
+    return glare, veil
+
+
+def test_every_lit_pixel_as_a_source() -> None:
+    """The added light is that of every lit pixel as a source, within 2 % of it, pixel by pixel."""
+    scene = behind(
+        load_lens("tessar_50_f2p8"),
+        32,
+        35.0,
+        cleanliness=Cleanliness(roughness_nm=1.0, level=100),
+        veil_fraction=0.01,
+    )
+    radiance = disc(scene.render.shape, 0.7, 0.4, 0.075)
+    assert np.count_nonzero(radiance) > 10
+    found = scene.straylight(radiance, np.eye(1))
+    glare, veil = scattered_of_every_pixel(scene, radiance)
+    oracle = ghosts_of_every_pixel(scene, radiance) + glare + veil
+    # rays that are counted in pixels leave 1 %, and ghosts that are spread by half a pixel as much
+    assert np.abs(found.total - oracle).sum() < 0.02 * oracle.sum()
+    # the sum over the pixels has neither error
+    assert found.total.sum() == pytest.approx(oracle.sum(), rel=0.005)
+
+
+def test_the_response_has_the_flux_of_the_traced_ghosts(singlet: Prescription) -> None:
+    """On a sensor that holds the whole ghost, for every field angle."""
+    scene = behind(singlet, 32, 150.0)
+    response = scene.response
+    slopes = np.array(response.cells.slopes)
+    pupil_mm2 = np.pi / 4 * paraxial_properties(singlet).entrance_pupil_diameter_mm ** 2
+    for ring in (0, 1, 2, 3):
+        angle_deg = float(np.degrees(np.arctan(slopes[ring])))
+        ghosts = traced_ghosts(singlet, angle_deg, wavelength_nm=550.0)
+        flux_mm2 = sum(g.flux_fraction for g in ghosts) * pupil_mm2 * np.cos(np.radians(angle_deg))
+        # the flux falls between neighbouring rings, over which a ring is the mean, by about 1 %
+        assert response.flux_mm2[0, ring] == pytest.approx(flux_mm2, rel=0.02)
+
+
+def test_worn_coatings_are_a_polynomial_in_the_loss(singlet: Prescription) -> None:
+    """So a loss that was not traced has the flux of one that is."""
+    coated = singlet.coated("mgf2")
+    for loss in (0.3, 1.0):
+        scene = behind(coated, 16, 30.0, coating_loss=loss)
+        made = Tracer(coated, NODES).worn(loss)
+        x = 0.5 * scene.response.cells.slopes[-1]
+        ring = int(np.argmin(np.abs(np.array(scene.response.cells.slopes) - x)))
+        rays, _ = boxes(made, float(np.degrees(np.arctan(scene.response.cells.slopes[ring]))))
+        spots = made.trace(rays, 200, centred=True)
+        cell = 4 * rays.box_mm[:, 2] * rays.box_mm[:, 3] / 200**2
+        near = np.hypot(spots.x_mm.numpy(), spots.y_mm.numpy()) < 0.8 * scene.response.cells.reach_mm
+        exact = (lit_cells(spots, 200).numpy() * near).sum() * cell[0]
+        table = scene.response.table[0, 0, :, ring] / scene.response.cells.azimuths
+        radius = (np.arange(len(table)) + 0.5) * scene.response.cells.ring_mm
+        inside = radius < 0.8 * scene.response.cells.reach_mm
+        flux = (table * 2 * np.pi * radius * scene.response.cells.ring_mm)[inside].sum()
+        edge = radius[inside][-1] + scene.response.cells.ring_mm / 2
+        flux *= (0.8 * scene.response.cells.reach_mm / edge) ** 2
+        assert flux == pytest.approx(exact, rel=0.02)
+
+
+def test_nothing_reflects_nothing_scatters_nothing_is_added(singlet: Prescription) -> None:
+    """A single surface has no pair that reflects; a smooth and clean one scatters nothing."""
+    glass = singlet.surfaces[0].medium
+    single = replace(singlet, surfaces=tuple(replace(s, medium=glass) for s in singlet.surfaces))
+    for lens, has_ghosts in ((single, False), (singlet, True)):
+        scene = behind(lens, 16, 30.0, cleanliness=Cleanliness(roughness_nm=0.0, level=0), veil_fraction=0.0)
+        found = scene.straylight(disc(scene.render.shape, 0.6, 0.4, 0.2), np.eye(1))
+        assert found.ghosts.any() == has_ghosts
+        assert not found.glare.any()
+        assert not found.veil.any()
+
+
+def test_linear_in_the_radiance(singlet: Prescription) -> None:
+    """Twice the light is twice the straylight, bit for bit; two sources add up."""
+    scene = behind(singlet, 32, 30.0, guard=4, cleanliness=Cleanliness(roughness_nm=1.0, level=100))
+    one, other = (disc(scene.render.shape, *place) for place in ((0.7, 0.4, 0.1), (0.02, 0.9, 0.05)))
+    light = scene.straylight(one, np.eye(1)).total
+    np.testing.assert_array_equal(scene.straylight(2 * one, np.eye(1)).total, 2 * light)
+    both = scene.straylight(one + other, np.eye(1)).total
+    np.testing.assert_allclose(both, light + scene.straylight(other, np.eye(1)).total, rtol=1e-4)
+    assert not scene.straylight(0 * one, np.eye(1)).total.any()
+
+
+def test_light_of_the_guard_band_counts_and_a_baffle_keeps_it_out(singlet: Prescription) -> None:
+    open_ = behind(singlet, 32, 30.0, guard=8, cleanliness=Cleanliness(roughness_nm=1.0, level=100))
+    beyond = np.zeros((1, *open_.render.shape), dtype=np.float32)
+    beyond[:, :, :8] = 1
+    assert open_.straylight(beyond, np.eye(1)).total.min() > 0
+    tube = Baffle(length_mm=18.0, radius_mm=8.0)
+    behind_tube = replace(open_, settings=replace(open_.settings, baffle=tube))
+    added, less = (scene.straylight(beyond, np.eye(1)) for scene in (open_, behind_tube))
+    # at the edge of the guard band, 22 degrees, the tube lights 43 % of the entrance
+    for part in ("ghosts", "glare", "veil"):
+        assert 0.2 < getattr(less, part).sum() / getattr(added, part).sum() < 0.6
+
+
+# --- the fault --------------------------------------------------------------------------------------------------
+
+
+def context(sun: tuple[float, float] | None, *, lit: bool = True, size: int = 64) -> FaultContext:
+    """A frame with a lit disc in it, or a user's own image without a radiance."""
+    made = make_context(size, sun=sun, exposure_s=1e-3)
+    nodes = spectra.band_nodes_nm(400.0, 700.0, 2)
+    lit_disc = np.repeat(disc((size, size), 0.6, 0.6, 0.25), 2, axis=0) * np.float32(10)
+    return replace(
+        made,
+        wavelength_nm=nodes,
+        sun_irradiance_W_m2_nm=spectra.solar_band_irradiance_W_m2_nm(nodes, 3.0),
+        sun_angular_radius_rad=spectra.sun_angular_radius_rad(3.0),
+        radiance=Radiance(array=lit_disc, wavelength_nm=nodes) if lit else None,
+    )
+
+
+def injected(where: FaultContext, light: Electrons, **keys: Any) -> tuple[F32, Any]:
+    """The light after straylight, [y, x, channel], and the fault."""
+    fault = from_dict("straylight", {"model": "traced", "lens": "tessar_50_f2p8", **keys}, source="test.toml")
+    params = fault.draw(where, np.random.default_rng(3))
+    return fault.apply(light, params, where).array, fault
+
+
+def test_the_scene_adds_light_without_a_sun() -> None:
+    where = context(None)
+    black = flat_electrons(where, 0.0)
+    nothing, of_sun = injected(where, black)
+    added, of_scene = injected(where, black, sources="scene")
+    assert not nothing.any()
+    assert added.min() > 0
+    assert of_sun.needs_sun
+    assert not of_scene.needs_sun
+    grey = flat_electrons(where, 0.5)
+    left = injected(where, grey, sources="scene")[0] - added
+    lost = 1 - left / grey.array
+    assert (lost > 0.004).all()  # the veil takes at least 0.5 % of the image
+    assert (lost < 0.04).all()
+
+
+def test_the_scene_comes_on_top_of_the_sun() -> None:
+    sun, both = (
+        injected(context((50.0, 20.0)), flat_electrons(context(None), 0.0), sources=s)[0] for s in ("sun", "scene")
+    )
+    alone = injected(context(None), flat_electrons(context(None), 0.0), sources="scene")[0]
+    np.testing.assert_allclose(both, sun + alone, rtol=1e-5)
+
+
+def test_an_image_without_a_radiance_gets_the_veil_of_its_own_light() -> None:
+    where = context((50.0, 20.0), lit=False)
+    grey = flat_electrons(where, 0.5)
+    np.testing.assert_array_equal(injected(where, grey, sources="scene")[0], injected(where, grey)[0])
+
+
+@pytest.fixture(scope="module")
+def singlet(tmp_path_factory: pytest.TempPathFactory) -> Prescription:
+    path: Path = tmp_path_factory.mktemp("lens") / "singlet.toml"
+    path.write_text(SINGLET)
+    return load_lens(path)

@@ -1,0 +1,457 @@
+"""Compute the ghosts of an extended scene from a stored response to each field angle of a lens.
+
+A lens with rotational symmetry has the same ghosts for all sources at one field angle, turned with the azimuth of
+the source. So the ghosts of a scene are, for each field angle, a convolution over azimuth. With sources in polar
+cells (ring k at the slope t_k, azimuth φ) and the sensor in polar coordinates (r, φ), this is a product for each
+azimuthal harmonic n:
+
+    E_n(r_m) = Σ_k T_n(r_m, t_k) S_n(t_k).
+
+`ghost_response` traces T once for a lens, from rays through the boxes of all ghosts (`ghosts.boxes`), and
+`GhostResponse` applies it. A source counts in the two rings and the two azimuths next to it, with linear weights.
+The light of each ray is spread over the sensor by a Gaussian that is as wide as the distance of the rays, at least
+half a ring. Ghosts that are sharper than a ring are therefore smooth on this scale.
+
+A stop with blades is replaced by a round one of the same area, as in the image of the scene.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ..prescription import Prescription
+from .bundles import Rays, Tracer
+from .ghosts import boxes, lit_cells
+from .irradiance import ParaxialTracer
+from .settings import GhostSettings, SensorGrid
+
+F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
+
+_COARSE = 12  # rays along each side of the lattice by which colours and boxes are known
+_ACROSS = (8, 16, 24, 32, 48, 64)  # rays along each side of the lattice over one half of a ghost
+_CLOSE, _CLOSE_FRACTION = 1.0, 0.03  # wanted distance of rays on the sensor in rings, and over the number of rings
+_WITHIN = 2  # field angles traced for each ring of sources
+_BOXES = 2  # boxes are computed for every second ring of sources, and united with those of the neighbours
+_LEVELS = 5  # widths of the Gaussian, each twice the one before
+_SIGMA = 0.5  # the least width, in rings
+_SIGMAS = 3.5  # distance at which the Gaussian is cut off, in its widths
+_BEYOND = 34  # rings beyond the frame's corner, from which the widest Gaussian spreads light into the frame
+
+
+@dataclass(frozen=True, kw_only=True)
+class PolarCells:
+    """Describe the polar cells of sources and of the sensor.
+
+    Attributes
+    ----------
+    slopes
+        Tangents of the field angles of the rings of sources, rising from 0.
+    reach_mm
+        Distance of the frame's corner from the axis.
+    rings, azimuths
+        Rings of the sensor, and azimuths of both sources and sensor (a power of two).
+    """
+
+    slopes: tuple[float, ...]
+    reach_mm: float
+    rings: int
+    azimuths: int
+
+    @property
+    def ring_mm(self) -> float:
+        """Return the distance of neighbouring rings on the sensor; the first lies at half of it."""
+        return self.reach_mm / (self.rings - 1)
+
+    def source_weights(self, slope_x: F64, slope_y: F64) -> Any:
+        """Return a sparse matrix, float32[ring × azimuth, source], that puts sources into the cells."""
+        from scipy.sparse import csr_matrix
+
+        count, turns = len(self.slopes), self.azimuths
+        ring = np.interp(np.hypot(slope_x, slope_y), self.slopes, np.arange(count))
+        azimuth = np.arctan2(slope_y, slope_x) / (2 * np.pi) * turns
+        inner = np.minimum(ring.astype(np.int64), count - 2)
+        before = np.floor(azimuth).astype(np.int64)
+        part, turn = ring - inner, azimuth - before
+        source = np.arange(len(ring))
+        weights, cells = [], []
+        for k, across in ((0, 1 - part), (1, part)):
+            for j, along in ((0, 1 - turn), (1, turn)):
+                weights.append((across * along).astype(np.float32))
+                cells.append((inner + k) * turns + (before + j) % turns)
+        shape = count * turns, len(ring)
+        return csr_matrix((np.concatenate(weights), (np.concatenate(cells), np.tile(source, 4))), shape=shape)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class GhostResponse:
+    """Hold the ghosts of sources at every ring of `cells`, for irradiance 1 across each source's direction.
+
+    Attributes
+    ----------
+    table
+        float32[band, harmonic, ring, source ring].
+    """
+
+    cells: PolarCells
+    table: F32
+
+    @property
+    def flux_mm2(self) -> F64:
+        """Return the flux of the ghosts on all rings of the sensor, float64[band, source ring]."""
+        ring_mm = self.cells.ring_mm
+        area_mm2 = 2 * np.pi * (np.arange(self.cells.rings) + 0.5) * ring_mm**2
+        mean = self.table[:, 0].astype(np.float64) / self.cells.azimuths
+        return np.einsum("bmk,m->bk", mean, area_mm2)
+
+    def harmonics(self, sources: F32, weights: F64) -> NDArray[np.complex64]:
+        """Return the azimuthal harmonics of the ghosts on the sensor's rings, complex64[channel, harmonic, ring].
+
+        Parameters
+        ----------
+        sources
+            float32[ring, azimuth, band]: irradiance of the sources in each cell.
+        weights
+            float64[channel, band], with which the bands are added.
+        """
+        from scipy.fft import rfft
+
+        turned = rfft(sources, axis=1)
+        mixed = []
+        # sums by einsum, because the bits of BLAS may depend on the number of threads
+        for part in (turned.real, turned.imag):
+            rings = np.ascontiguousarray(part.transpose(2, 1, 0))
+            light = np.einsum("bnmk,bnk->bnm", self.table, rings)
+            mixed.append(np.einsum("cb,bnm->cnm", weights.astype(np.float32), light))
+        return np.asarray(mixed[0] + 1j * mixed[1], dtype=np.complex64)
+
+    def image(self, sources: F32, weights: F64, sensor: SensorGrid) -> F32:
+        """Return the irradiance of the ghosts on the sensor, float32[channel, y, x]; arguments as `harmonics`."""
+        from scipy.fft import irfft
+
+        turns = self.cells.azimuths
+        polar = irfft(self.harmonics(sources, weights), n=turns, axis=1)  # channel, azimuth, ring
+        column, row = _polar_positions(self.cells, sensor)
+        out = np.empty((len(polar), *sensor.shape), dtype=np.float32)
+        for light, image in zip(polar, out, strict=True):
+            rings = np.asarray(light.T, dtype=np.float32)
+            # across the axis a ring continues on the other side
+            opposite = np.roll(rings[:1], turns // 2, axis=1)
+            padded = np.concatenate([opposite, rings])
+            padded = np.concatenate([padded, padded[:, :1]], axis=1)
+            cv2.remap(padded, column, row, cv2.INTER_LINEAR, dst=image, borderMode=cv2.BORDER_REPLICATE)
+        # harmonics are cut off, so their sum may be slightly negative where there is no light
+        return np.maximum(out, 0, out=out)
+
+
+@lru_cache(maxsize=2)
+def _polar_positions(cells: PolarCells, sensor: SensorGrid) -> tuple[F32, F32]:
+    """Return azimuth and ring of every pixel as columns and rows of `GhostResponse.image`, float32[y, x] each."""
+    height, width = sensor.shape
+    x = (np.arange(width) + 0.5 - width / 2) * sensor.pitch_mm
+    y = ((np.arange(height) + 0.5 - height / 2) * sensor.pitch_mm)[:, None]
+    azimuth = np.arctan2(y, x + 0 * y) / (2 * np.pi) * cells.azimuths
+    ring = np.hypot(x, y) / cells.ring_mm + 0.5
+    return np.mod(azimuth, cells.azimuths).astype(np.float32), ring.astype(np.float32)
+
+
+@dataclass(frozen=True, eq=False)
+class _Smoothing:
+    """Hold a Gaussian on the sensor in polar harmonics.
+
+    A point of flux 1 at the radius r₀ and azimuth 0 has the n-th coefficient
+
+        c_n(r) = exp(-(r - r₀)² / 2σ²) e^(-z) I_n(z) / (2π σ²), with z = r r₀ / σ².
+
+    `weights[d + half]` float32[harmonic, ring] is this coefficient times the number of azimuths, for
+    r₀ = r_(m + d).
+    """
+
+    half: int
+    weights: F32
+
+    @classmethod
+    def of(cls, cells: PolarCells, level: int) -> _Smoothing:
+        """Return the Gaussian of a level."""
+        from scipy.special import ive
+
+        sigma = _SIGMA * 2**level  # in rings
+        half = int(np.ceil(_SIGMAS * sigma))
+        radius = np.arange(cells.rings) + 0.5
+        harmonic = np.arange(cells.azimuths // 2 + 1)[:, None]
+        weights = np.zeros((2 * half + 1, len(harmonic), cells.rings), dtype=np.float32)
+        for d in range(-half, half + 1):
+            from_ = radius + d
+            z = radius * np.maximum(from_, 0) / sigma**2
+            factor = cells.azimuths / (2 * np.pi * (sigma * cells.ring_mm) ** 2)
+            weights[d + half] = np.where(from_ > 0, factor * np.exp(-(d**2) / (2 * sigma**2)) * ive(harmonic, z), 0)
+        return cls(half, weights)
+
+    def add(self, flux: F32, out: F32) -> None:
+        """Add the light of rings of flux, float32[band, harmonic, all rings], to `out` [band, harmonic, ring]."""
+        rings, every = out.shape[-1], flux.shape[-1]
+        for d in range(-self.half, self.half + 1):
+            first, last = max(0, -d), min(rings, every - d)
+            if first < last:
+                out[..., first:last] += self.weights[d + self.half][:, first:last] * flux[..., first + d : last + d]
+
+
+class _Tracing:
+    """Trace the response of a lens, ring by ring of the sources.
+
+    Positions of rays on the sensor are traced at the middle band only. The light of each band is in proportion to
+    the flux of a coarse lattice. The colours of a ghost are apart by some parts in a hundred of its size, less than
+    the width of its Gaussian.
+    """
+
+    def __init__(
+        self, lens: Prescription, wavelength_nm: F64, cells: PolarCells, settings: GhostSettings, loss: float
+    ) -> None:
+        self.cells, self.bands = cells, len(wavelength_nm)
+        kind = Tracer if settings.model == "traced" else ParaxialTracer
+        whole = kind(lens.with_round_stop(), wavelength_nm, reflections=settings.reflections)
+        self.routes = len(whole.routes)
+        self.tracer = whole.worn(loss) if loss and self.routes else whole
+        self.rings = cells.rings + _BEYOND
+        self.nodes = cells.azimuths // 2 + 1
+
+    @cached_property
+    def smoothing(self) -> list[_Smoothing]:
+        """Return the Gaussians of all levels."""
+        return [_Smoothing.of(self.cells, level) for level in range(_LEVELS)]
+
+    @cached_property
+    def boxes(self) -> list[F64]:
+        """Return the boxes of all routes for every second ring, float64[route, 4]; nan where no light passes."""
+        out = []
+        for slope in self.cells.slopes[::_BOXES] + self.cells.slopes[-1:]:
+            box = np.full((self.routes, 4), np.nan)
+            rays, _ = boxes(self.tracer, float(np.degrees(np.arctan(slope))))
+            box[rays.route] = rays.box_mm
+            out.append(box)
+        return out
+
+    def ring(self, ring: int) -> F32:
+        """Return one ring's part of the table, float32[band, harmonic, ring].
+
+        The field angles traced lie between the neighbouring rings, as densely as a source counts in this ring.
+        """
+        slopes = np.array(self.cells.slopes)
+        out = np.zeros((self.bands, self.nodes, self.cells.rings), dtype=np.float32)
+        ghosts = self._near(*self._united(ring), float(slopes[ring]))
+        if not len(ghosts):
+            return out
+        ends = slopes[max(ring - 1, 0)], slopes[min(ring + 1, len(slopes) - 1)]
+        colours = self._colours(ghosts, float(slopes[ring]))
+        flux = np.zeros((_LEVELS * self.rings * self.nodes, self.bands), dtype=np.float32)
+        for offset in _within(_WITHIN):
+            position = ring + offset
+            slope = float(np.interp(abs(position), np.arange(len(slopes)), slopes))
+            for across in np.unique(ghosts.across):
+                chosen = ghosts.take(ghosts.across == across)
+                arrived = self._traced(chosen, int(across), slope, float(ends[1] - ends[0]) / 2 / _WITHIN)
+                # the source on the other side of the axis has its ghosts on the other side too
+                flux += self._in_cells(arrived, colours[ghosts.across == across] / _WITHIN, mirrored=position < 0)
+        levels = flux.reshape(_LEVELS, self.rings, self.nodes, self.bands)
+        for level in np.flatnonzero(levels.any(axis=(1, 2, 3))):
+            self.smoothing[level].add(_cosines(levels[level].transpose(2, 1, 0)), out)
+        return out
+
+    def _united(self, ring: int) -> tuple[NDArray[np.int64], F64]:
+        """Return the routes that pass light at a ring or its neighbours, and half the boxes around their rays.
+
+        The half boxes have y > 0; the other halves are their mirror images.
+        """
+        near = np.stack(self.boxes[max((ring - 1) // _BOXES, 0) : (ring + 1) // _BOXES + 2])
+        seen = np.isfinite(near[..., 0])
+        route = np.flatnonzero(seen.any(axis=0))
+        low = np.where(seen, near[..., 0] - near[..., 2], np.inf).min(axis=0)[route]
+        high = np.where(seen, near[..., 0] + near[..., 2], -np.inf).max(axis=0)[route]
+        wide = np.where(seen, near[..., 3], 0).max(axis=0)[route]
+        return route, np.column_stack([(low + high) / 2, wide / 2, (high - low) / 2, wide / 2])
+
+    def _bundles(self, route: NDArray[np.int64], box: F64, slope: float, bands: Sequence[int]) -> Rays:
+        """Return the bundles of routes in some bands, the bands of one route side by side."""
+        cosine, count = 1 / np.hypot(1, slope), len(route) * len(bands)
+        return Rays(
+            route=np.repeat(route, len(bands)),
+            wavelength=np.tile(np.array(bands), len(route)),
+            box_mm=np.repeat(box, len(bands), axis=0),
+            direction=np.tile([slope * cosine, 0.0, cosine], (count, 1)),
+        )
+
+    def _near(self, route: NDArray[np.int64], box: F64, slope: float) -> _Ghosts:
+        """Return the routes with rays that arrive within the rings, and how they are traced."""
+        if not len(route):
+            return _Ghosts(route, box, np.zeros(0, dtype=np.int64))
+        shape = len(route), _COARSE, _COARSE
+        rays = self._bundles(route, box, slope, [self.bands // 2])
+        spots = self.tracer.trace(rays, _COARSE, centred=True, halved=False)
+        x, y, radius = (v.numpy().reshape(shape) for v in (spots.x_mm, spots.y_mm, spots.radius))
+        # a margin of one ray, because a rim may lie between two
+        near = (np.hypot(x, y) < (self.rings + 1) * self.cells.ring_mm) & (radius < 2)
+        seen = near.any(axis=(1, 2))
+        parts = []
+        for lit, k in ((near.any(axis=1)[seen], 0), (near.any(axis=2)[seen], 1)):
+            first = np.maximum(np.argmax(lit, axis=1) - 1, 0)
+            last = np.minimum(_COARSE - np.argmax(lit[:, ::-1], axis=1) + 1, _COARSE)
+            low, width = box[seen, k] - box[seen, 2 + k], 2 * box[seen, 2 + k] / _COARSE
+            parts.append((low + (first + last) / 2 * width, (last - first) / 2 * width, last - first))
+        (cx, hx, rows), (cy, hy, columns) = parts
+        rings = _spacing(x[seen], y[seen], near[seen]) / self.cells.ring_mm * np.maximum(rows, columns)
+        wanted = np.searchsorted(_ACROSS, rings / max(_CLOSE, _CLOSE_FRACTION * self.cells.rings))
+        across = np.array(_ACROSS)[np.minimum(wanted, len(_ACROSS) - 1)]
+        return _Ghosts(route[seen], np.column_stack([cx, cy, hx, hy]), across)
+
+    def _colours(self, ghosts: _Ghosts, slope: float) -> F32:
+        """Return the flux of each ghost in every band over that in the middle band, float32[ghost, band]."""
+        rays = self._bundles(ghosts.route, ghosts.box_mm, slope, range(self.bands))
+        spots = self.tracer.trace(rays, _COARSE, centred=True, halved=False)
+        lit = lit_cells(spots, _COARSE).numpy().reshape(len(ghosts), self.bands, -1).sum(axis=2)
+        middle = lit[:, self.bands // 2, None]
+        return np.asarray(np.where(middle > 0, lit / np.where(middle > 0, middle, 1), 1.0), dtype=np.float32)
+
+    def _traced(self, ghosts: _Ghosts, across: int, slope: float, spacing: float) -> _Arrived:
+        """Return where the rays of one field angle arrive, for the half of each box with y > 0."""
+        rays = self._bundles(ghosts.route, ghosts.box_mm, slope, [self.bands // 2])
+        shape = len(ghosts), across, across
+        spots = self.tracer.trace(rays, across, centred=True, halved=False)
+        lit = lit_cells(spots, across).numpy().reshape(shape)
+        x, y = (v.numpy().reshape(shape) for v in (spots.x_mm, spots.y_mm))
+        # the Sun's beam is inclined, and both halves of the box count
+        area = 2 * 4 * rays.box_mm[:, 2] * rays.box_mm[:, 3] / across**2 / np.hypot(1, slope)
+        move = np.abs(self.tracer.matrix[ghosts.route, 0, 1]) * spacing
+        apart = np.maximum(_spacing(x, y, lit > 0), move) / self.cells.ring_mm
+        level = np.clip(np.ceil(np.log2(np.maximum(apart, 1e-9))), 0, _LEVELS - 1).astype(np.int64)
+        return _Arrived(x, y, lit * area[:, None, None].astype(np.float32), level)
+
+    def _in_cells(self, arrived: _Arrived, colours: F32, *, mirrored: bool) -> F32:
+        """Return the light in the cells of the half turn, both sides together, float32[cell, band]."""
+        from scipy.sparse import csc_matrix
+
+        rings, nodes = self.rings, self.nodes
+        radius = np.hypot(arrived.x_mm, arrived.y_mm) / np.float32(self.cells.ring_mm) - np.float32(0.5)
+        chosen = (arrived.light > 0) & (radius < rings - 1)
+        ghost = np.nonzero(chosen)[0]
+        x = -arrived.x_mm[chosen] if mirrored else arrived.x_mm[chosen]
+        turn = np.arctan2(np.abs(arrived.y_mm[chosen]), x) * np.float32((nodes - 1) / np.pi)
+        radius = np.maximum(radius[chosen], 0)
+        ring, node = radius.astype(np.int64), np.minimum(turn.astype(np.int64), nodes - 2)
+        across, along = radius - ring, turn - node
+        first = (arrived.level[ghost] * rings + ring) * nodes + node
+        cells = np.column_stack([first, first + 1, first + nodes, first + nodes + 1])
+        weights = np.column_stack(
+            [(1 - across) * (1 - along), (1 - across) * along, across * (1 - along), across * along]
+        )
+        spread = csc_matrix(
+            (weights.astype(np.float32).ravel(), cells.ravel(), np.arange(0, 4 * len(first) + 1, 4)),
+            shape=(_LEVELS * rings * nodes, len(first)),
+        )
+        return np.asarray(spread @ (arrived.light[chosen][:, None] * colours[ghost]))
+
+
+@dataclass(frozen=True, eq=False)
+class _Ghosts:
+    """Hold the routes to trace, half the boxes of their rays, float64[ghost, 4], and the rays along their sides."""
+
+    route: NDArray[np.int64]
+    box_mm: F64
+    across: NDArray[np.int64]
+
+    def __len__(self) -> int:
+        return len(self.route)
+
+    def take(self, chosen: NDArray[np.bool_]) -> _Ghosts:
+        """Return some of the ghosts."""
+        return _Ghosts(self.route[chosen], self.box_mm[chosen], self.across[chosen])
+
+
+@dataclass(frozen=True, eq=False)
+class _Arrived:
+    """Hold positions and flux of rays on the sensor, [ghost, y, x], and the level of each ghost's Gaussian."""
+
+    x_mm: F32
+    y_mm: F32
+    light: F32
+    level: NDArray[np.int64]
+
+
+def _spacing(x: F32, y: F32, lit: NDArray[np.bool_]) -> F64:
+    """Return the mean distance of neighbouring lit rays, of rows or columns, the larger of both, float64[ghost]."""
+    apart = np.zeros(len(x))
+    for axis in (1, 2):
+        before, behind = (
+            tuple(slice(n, n - 1 or None) if k == axis else slice(None) for k in range(3)) for n in (0, 1)
+        )
+        both = lit[before] & lit[behind]
+        step = np.hypot(x[behind] - x[before], y[behind] - y[before])
+        apart = np.maximum(apart, np.where(both, step, 0).sum(axis=(1, 2)) / np.maximum(both.sum(axis=(1, 2)), 1))
+    return apart
+
+
+def _within(count: int) -> F64:
+    """Return offsets between neighbouring rings, as densely as the linear weight of a source falls off."""
+    part = (np.arange(count) + 0.5) / count
+    return np.where(part < 0.5, np.sqrt(2 * part) - 1, 1 - np.sqrt(2 * (1 - part)))
+
+
+def _cosines(lit: F32) -> F32:
+    """Return the harmonics of light that is symmetric about azimuth 0, float32[band, harmonic, ring].
+
+    `lit` [band, node, ring] is the light at the nodes of the half turn, both sides together.
+    """
+    from scipy.fft import dct
+
+    # DCT-I counts the inner nodes twice
+    lit = lit.copy()
+    lit[:, 1:-1] /= 2
+    return np.asarray(dct(lit, type=1, axis=1), dtype=np.float32)
+
+
+def ghost_response(
+    lens: Prescription,
+    wavelength_nm: tuple[float, ...],
+    cells: PolarCells,
+    settings: GhostSettings,
+    coating_loss: float = 0.0,
+) -> GhostResponse:
+    """Return the ghosts of a lens for sources at every field angle.
+
+    With worn coatings, each reflectance is linear in the loss, so that ghosts of two reflections are a polynomial
+    of degree two in it. The response is therefore traced at three losses (five for ghosts of four reflections) at
+    most, whatever loss is asked for.
+    """
+    if not coating_loss:
+        return _response(lens, wavelength_nm, cells, settings, 0.0)
+    losses = np.linspace(0, 1, settings.reflections + 1)
+    parts = [_response(lens, wavelength_nm, cells, settings, loss) for loss in losses.tolist()]
+    others = losses[None, :] + np.where(np.eye(len(losses)) > 0, np.nan, 0)
+    weights = np.nanprod((coating_loss - others) / (losses[:, None] - others), axis=1)
+    table = sum(np.float32(w) * part.table for w, part in zip(weights, parts, strict=True))
+    return GhostResponse(cells=cells, table=np.asarray(table))
+
+
+@lru_cache(maxsize=5)
+def _response(
+    lens: Prescription,
+    wavelength_nm: tuple[float, ...],
+    cells: PolarCells,
+    settings: GhostSettings,
+    coating_loss: float,
+) -> GhostResponse:
+    """Return the response at one coating loss; it is cached."""
+    tracing = _Tracing(lens, np.array(wavelength_nm), cells, settings, coating_loss)
+    count = len(cells.slopes)
+    table = np.zeros((len(wavelength_nm), tracing.nodes, cells.rings, count), dtype=np.float32)
+    if tracing.routes:
+        for ring in range(count):
+            table[..., ring] = tracing.ring(ring)
+    table.setflags(write=False)
+    return GhostResponse(cells=cells, table=table)
