@@ -1,4 +1,4 @@
-"""Compute the Sun's straylight on the sensor: ghosts, starburst, glare, veil, and their sum.
+"""Compute straylight on the sensor: ghosts, starburst, glare and veil of the Sun, and of a whole scene.
 
 Modules:
 
@@ -13,6 +13,8 @@ Modules:
 - `starburst` computes the light that the stop diffracts.
 - `scatter` computes the glare, which surfaces and dust scatter, and the transmission of a baffle.
 - `total` adds the veil, and returns the sum of all straylight and the remaining fraction of the direct image.
+- `scene` computes ghosts, glare and veil of everything that a render shows, with `ghost_response` (ghosts of every
+  field angle, traced once for a lens) and `scene_scatter` (glare as a convolution).
 
 To change where ghosts are clipped, see `steps`, which lists all code that does so.
 """
