@@ -7,8 +7,8 @@ long a render and the straylight of the scene take, the median of three rounds e
 a lens takes, for which its response is traced. `--figure` draws the image without and with straylight, on a
 logarithmic scale of four decades.
 
-`--every-pixel` instead compares the ghosts of a half-lit disc in a frame of this many pixels with those of every lit
-pixel as a source, traced with exact rays and counted in pixels. It takes minutes.
+`--every-pixel` instead compares the ghosts of a half-lit disc in a frame of this many pixels with those of every
+lit pixel as a source, traced with exact rays and counted in pixels. It takes minutes.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from __future__ import annotations
 import argparse
 import statistics
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -119,11 +120,14 @@ def compare(size: int, within: int = 2, across: int = 64) -> None:
     lit = (np.hypot(column - 0.65, row - 0.4) < 0.12) * np.clip((column - 0.65) / 0.12, 0, 1)
     found = scene.straylight(lit[None].astype(np.float32), np.eye(1)).ghosts[0]
     made, oracle = Tracer(lens, scene.nodes_nm), np.zeros(size * size)
-    offsets = (np.arange(within) + 0.5) / within
+    offsets, rng = (np.arange(within) + 0.5) / within, np.random.default_rng(1)
     for i, j in zip(*np.nonzero(lit), strict=True):
         for x, y in ((j + dx - size / 2, i + dy - size / 2) for dx in offsets for dy in offsets):
             slope, azimuth = np.hypot(x, y) / focal_px, np.arctan2(y, x)
             rays, _ = boxes(made, float(np.degrees(np.arctan(slope))))
+            # the same lattice for all sources would leave rings in the sum
+            shift = rays.box_mm[:, 2:] * rng.uniform(-1, 1, (len(rays), 2)) / across
+            rays = replace(rays, box_mm=rays.box_mm + np.pad(shift, ((0, 0), (0, 2))))
             spots = made.trace(rays, across, centred=True)
             solid_sr = (1 + slope**2) ** -1.5 / focal_px**2 / within**2
             cell = 4 * rays.box_mm[:, 2] * rays.box_mm[:, 3] / across**2 / np.hypot(1, slope) * solid_sr * lit[i, j]

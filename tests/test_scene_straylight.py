@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from conftest import small_scene
 from numpy.typing import NDArray
 from test_faults_kit import flat_electrons, make_context
 
+import vbnfault
 from vbnfault.core import llvm, spectra
 from vbnfault.core.errors import VbnfaultError
 from vbnfault.core.quantities import Electrons, Radiance
@@ -23,6 +26,8 @@ from vbnfault.lens.straylight.scatter import Cleanliness
 from vbnfault.lens.straylight.scene import RenderGrid, SceneInLens
 from vbnfault.lens.straylight.settings import Baffle, DirectPath, SensorGrid, StraylightSettings, SunSource
 from vbnfault.lens.straylight.total import SunlightInLens
+from vbnfault.pipeline.record import to_sample
+from vbnfault.scene import config
 
 try:
     llvm.find()
@@ -89,13 +94,17 @@ def ghosts_of_every_pixel(scene: SceneInLens, radiance: F32, across: int = 64, w
     made = Tracer(scene.lens, scene.nodes_nm)
     (height, width), pitch = scene.sensor.shape, scene.sensor.pitch_mm
     bands = len(scene.nodes_nm)
-    out = np.zeros((bands, height * width))
+    out, rng = np.zeros((bands, height * width)), np.random.default_rng(1)
     for x, y, irradiance in points(scene, radiance, within):
         slope, azimuth = np.hypot(x, y), np.arctan2(y, x)
         rays, _ = boxes(made, float(np.degrees(np.arctan(slope))))
         cosine = 1 / np.hypot(1, slope)
         for band in range(bands):
-            rays = replace(rays, wavelength=np.full(len(rays), band))
+            # the same lattice for all sources would leave rings in the sum
+            box = rays.box_mm + np.pad(
+                rays.box_mm[:, 2:] * rng.uniform(-1, 1, (len(rays), 2)) / across, ((0, 0), (0, 2))
+            )
+            rays = replace(rays, wavelength=np.full(len(rays), band), box_mm=box)
             spots = made.trace(rays, across, centred=True)
             cell = 4 * rays.box_mm[:, 2] * rays.box_mm[:, 3] / across**2 * cosine
             light = (lit_cells(spots, across).numpy().reshape(len(rays), -1) * cell[:, None]).ravel()
@@ -280,3 +289,33 @@ def singlet(tmp_path_factory: pytest.TempPathFactory) -> Prescription:
     path: Path = tmp_path_factory.mktemp("lens") / "singlet.toml"
     path.write_text(SINGLET)
     return load_lens(path)
+
+
+# --- a dataset --------------------------------------------------------------------------------------------------
+
+
+def test_a_store_holds_the_straylight_of_the_scene(tmp_path: Path) -> None:
+    """Built, verified and simulated again: the same pixels, and labels that belong to them."""
+    table = small_scene(
+        dataset={
+            "samples": 2,
+            "layers": ["clean", "without_straylight", "mask_effect", "straylight_added"],
+        },
+        camera={"width_px": 64, "height_px": 48},
+        plan={"faulty_fraction": 1.0},
+        geometry={"min_lit_fraction": 0.2},
+    )
+    table["faults"] = {"straylight": {"model": "traced", "sources": "scene", "lens": "tessar_50_f2p8"}}
+    scene = config.parse_scene(table, source="test")
+    out = tmp_path / "scene.zarr"
+    assert vbnfault.build(scene, out, progress=False).built == 2
+    assert vbnfault.verify(out).problems == []
+    data = vbnfault.open_dataset(out)
+    session = vbnfault.Session(scene)
+    for index in range(2):
+        stored, sample = data.isel(sample=index), to_sample(session.frame(index))
+        for name in ("image", "clean", "mask", "mask_effect", "straylight_added"):
+            np.testing.assert_array_equal(stored[name].values, sample.layers[name])
+        assert stored["injected"].values.all()
+        assert json.loads(str(stored["parameters"].values))["straylight"]["sources"] == "scene"
+        assert (stored["straylight_added"].values > 0).all()

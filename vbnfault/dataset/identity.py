@@ -87,12 +87,18 @@ def scene_identity(session: pipeline.Session) -> dict[str, Any]:
             plugin.name: {
                 "sha256": plugin.sha256,
                 "models": plugin.model_names,
-                "needs_sun": sorted({cls.fault for cls in plugin.models if cls.needs_sun}),
+                "needs_sun": sorted({cls.fault for cls in plugin.models if _needs_sun(cls, session.faults)}),
             }
             for plugin in plugins
         }
     del scene["dataset"]["samples"]
     return scene
+
+
+def _needs_sun(cls: type[Fault], faults: Mapping[str, Fault]) -> bool:
+    """Return whether a model needs the Sun, with its keys in the scene if the scene has it."""
+    fault = faults.get(cls.fault)
+    return fault.needs_sun if type(fault) is cls else cls.needs_sun
 
 
 def _contents_of_fault(table: dict[str, Any], fault: Fault, scene: Scene) -> None:
@@ -295,7 +301,7 @@ def classes_that_need_sun(attributes: Mapping[str, Any]) -> list[str]:
     classes = {name for plugin in plugins.values() for name in plugin["needs_sun"]}
     for name, model in attributes["fault_models"].items():
         cls = registry().get(name, {}).get(model)
-        if cls is not None and is_packaged(cls) and cls.needs_sun:
+        if cls is not None and is_packaged(cls) and cls.needs_sun_with(attributes["scene"]["faults"].get(name, {})):
             classes.add(name)
     return sorted(classes)
 

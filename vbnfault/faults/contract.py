@@ -11,7 +11,7 @@ To add a fault, write one file beside this one and one test, or a plug-in outsid
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar, TypeVar
 
@@ -156,6 +156,14 @@ class Fault:
         for f in dataclasses.fields(self):
             where = f"{self.fault}.{f.name}"
             object.__setattr__(self, f.name, parse_field(getattr(self, f.name), f, where))
+        needs_sun = self.needs_sun_with({f.name: getattr(self, f.name) for f in dataclasses.fields(self)})
+        if needs_sun != self.needs_sun:
+            object.__setattr__(self, "needs_sun", needs_sun)
+
+    @classmethod
+    def needs_sun_with(cls, table: Mapping[str, Any]) -> bool:
+        """Return whether the model needs the Sun with the keys of a table; a fault has this as its `needs_sun`."""
+        return cls.needs_sun
 
     def draw(self, context: FaultContext, rng: np.random.Generator) -> Params:
         """Return the drawn parameters: plain, JSON-able data, sufficient to inject the same fault again."""

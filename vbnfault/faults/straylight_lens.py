@@ -25,6 +25,7 @@ were the only ghost: `pair` (the reflecting rows of the prescription), `flux_fra
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -143,11 +144,10 @@ class _LensStraylight(LensFault):
         doc="the mask holds the pixels that the noise-free image changes in by at least this much",
     )
 
-    def __post_init__(self) -> None:
-        """Check every field; light of the scene needs no Sun in view."""
-        super().__post_init__()
-        if self.sources == "scene":
-            object.__setattr__(self, "needs_sun", False)
+    @classmethod
+    def needs_sun_with(cls, table: Mapping[str, Any]) -> bool:
+        """Return whether the Sun is the only source."""
+        return table.get("sources", "sun") == "sun"
 
     def validate(self) -> None:
         """Raise ValueError if `reflections` is neither 2 nor 4, or a baffle has no radius."""

@@ -37,7 +37,8 @@ F64 = NDArray[np.float64]
 
 _COARSE = 12  # rays along each side of the lattice by which colours and boxes are known
 _ACROSS = (8, 16, 24, 32, 48, 64)  # rays along each side of the lattice over one half of a ghost
-_CLOSE, _CLOSE_FRACTION = 1.0, 0.03  # wanted distance of rays on the sensor in rings, and over the number of rings
+_ENOUGH = 32  # rays across a ghost whose edges need not be sharper
+_CLOSE = 0.03  # wanted distance of rays of larger ghosts on the sensor, over the number of rings
 _WITHIN = 2  # field angles traced for each ring of sources
 _BOXES = 2  # boxes are computed for every second ring of sources, and united with those of the neighbours
 _LEVELS = 5  # widths of the Gaussian, each twice the one before
@@ -306,8 +307,8 @@ class _Tracing:
             parts.append((low + (first + last) / 2 * width, (last - first) / 2 * width, last - first))
         (cx, hx, rows), (cy, hy, columns) = parts
         rings = _spacing(x[seen], y[seen], near[seen]) / self.cells.ring_mm * np.maximum(rows, columns)
-        wanted = np.searchsorted(_ACROSS, rings / max(_CLOSE, _CLOSE_FRACTION * self.cells.rings))
-        across = np.array(_ACROSS)[np.minimum(wanted, len(_ACROSS) - 1)]
+        wanted = np.maximum(np.minimum(rings, _ENOUGH), rings / (_CLOSE * self.cells.rings))
+        across = np.array(_ACROSS)[np.minimum(np.searchsorted(_ACROSS, wanted), len(_ACROSS) - 1)]
         return _Ghosts(route[seen], np.column_stack([cx, cy, hx, hy]), across)
 
     def _colours(self, ghosts: _Ghosts, slope: float) -> F32:
@@ -384,15 +385,20 @@ class _Arrived:
 
 
 def _spacing(x: F32, y: F32, lit: NDArray[np.bool_]) -> F64:
-    """Return the mean distance of neighbouring lit rays, of rows or columns, the larger of both, float64[ghost]."""
+    """Return the median distance of neighbouring lit rays, of rows or columns, the larger of both, float64[ghost].
+
+    The rays of a ghost that is nearly in focus have long tails, in which there is little light.
+    """
     apart = np.zeros(len(x))
     for axis in (1, 2):
         before, behind = (
             tuple(slice(n, n - 1 or None) if k == axis else slice(None) for k in range(3)) for n in (0, 1)
         )
-        both = lit[before] & lit[behind]
-        step = np.hypot(x[behind] - x[before], y[behind] - y[before])
-        apart = np.maximum(apart, np.where(both, step, 0).sum(axis=(1, 2)) / np.maximum(both.sum(axis=(1, 2)), 1))
+        both = (lit[before] & lit[behind]).reshape(len(x), -1)
+        step = np.hypot(x[behind] - x[before], y[behind] - y[before]).reshape(len(x), -1)
+        ordered = np.sort(np.where(both, step, np.inf), axis=1)
+        middle = np.take_along_axis(ordered, both.sum(axis=1)[:, None] // 2, axis=1)[:, 0]
+        apart = np.maximum(apart, np.where(np.isfinite(middle), middle, 0))
     return apart
 
 
