@@ -18,7 +18,7 @@ from vbnfault.camera import Camera
 from vbnfault.core import spectra
 from vbnfault.core.errors import InputError
 from vbnfault.core.quantities import Electrons
-from vbnfault.detector import ThreeColourDetector
+from vbnfault.detector import MosaicDetector, ThreeColourDetector, load_sensor
 from vbnfault.faults import FaultContext, act
 from vbnfault.faults.particles import _Population
 from vbnfault.lens import RealLens, ThinLens, load_lens, scaled_to_field
@@ -272,6 +272,28 @@ def test_a_grain_hides_what_is_behind_it_and_the_ground_hides_a_grain() -> None:
     drawn = fault.draw(replace(c, depth_m=np.full(c.shape, 50.0, np.float32)), rng(1))
     assert drawn["count"] > 0
     assert max(drawn["depth_m"]) < 50.0
+
+
+def test_tracks_in_a_navigation_camera() -> None:
+    """Published loss of dust, sizes and albedo give some tens of tracks at perihelion, hardly one at 3.6 au."""
+    detector = MosaicDetector(
+        sensor=load_sensor("rosetta_navcam"), seed=3, width_px=1024, height_px=1024, direction="up"
+    )
+    lens = ThinLens(focal_length_mm=152.5, f_number=5.1, transmission=0.0083)
+    camera = Camera(lens=lens, detector=detector, architecture="frame_transfer_ccd", exposure_s=3.0)
+    nodes = spectra.band_nodes_nm(400.0, 1000.0, 8)
+    noise_e = detector.read_noise_e_rms
+    tracks = []
+    for distance_au, per_m3 in ((1.25, 0.014), (3.6, 6e-4)):
+        sunlight = spectra.solar_band_irradiance_W_m2_nm(nodes, distance_au)
+        c = context(wavelength_nm=nodes, sun_irradiance_W_m2_nm=sunlight, sun_direction_C=np.array([0, -1, 0.0]))
+        c = replace(c, camera=camera)
+        # the number whose mean signal over their figures reaches five times the noise
+        fault = make("particles", density_per_m3=per_m3, least_noise=5.0)
+        tracks.append(np.mean([fault.draw(c, rng(seed))["count"] for seed in range(4)]))
+    assert noise_e == 15
+    assert 10 < tracks[0] < 60
+    assert tracks[1] < 6
 
 
 def test_masks_sit_on_the_grains() -> None:
