@@ -29,6 +29,7 @@ from ..scene.config import Scene
 from ..scene.hashing import content_hash
 from ..scene.instrument import OF_THE_DETECTOR
 from ..scene.sampling import OF_AN_AIM
+from ..scene.target import EARTH
 from ..store import StoreSpec
 from ..world import assemble
 
@@ -71,8 +72,10 @@ def scene_identity(session: pipeline.Session) -> dict[str, Any]:
         images = sorted(resources.data_dir(folder).glob("*.png"))
         data = b"".join(user_files.read_input(path, "texture") for path in images)
         scene[f"{folder}_sha256"] = user_files.sha256(data)
+    if session.scene.body.atmosphere is None:
+        del scene["body"]["atmosphere"]  # stores of scenes without one stay as they were
     if session.scene.coma is None:
-        del scene["coma"]  # stores of scenes without one stay as they were
+        del scene["coma"]
     if session.scene.trajectory is None:
         del scene["trajectory"]
     else:
@@ -137,7 +140,7 @@ def _contents_of_files(identity: dict[str, Any], scene: Scene) -> None:
         identity["camera"]["detector"] = _digest(
             resources.find("scenes/detectors", scene.camera.detector), "detector"
         )
-    if scene.body.albedo_map is not None:
+    if scene.body.albedo_map is not None and scene.body.albedo_map.file != EARTH:
         identity["body"]["albedo_map"]["file"] = _digest(scene.body.albedo_map.file, "texture")
     if scene.spacecraft.model not in ("none", "default"):
         with (

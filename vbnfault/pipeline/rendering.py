@@ -7,6 +7,7 @@ import numpy as np
 from ..core.quantities import SKY, Truth
 from ..render.description import RenderInput, View
 from ..world import assemble
+from .atmosphere import add_atmosphere
 from .coma import add_coma
 from .noise_budget import SampledRadiance, sample_to_noise
 from .spec import Pose, Rendering, SampleSpec, SceneLight
@@ -51,7 +52,8 @@ def render_view(spec: SampleSpec, pose: Pose) -> Rendering:
     angles = bool(_ANGLE_LAYERS & set(spec.scene.dataset.layers))
     stars = spec.scene.sky.stars != "off"
     has_coma = spec.scene.coma is not None
-    guide: Truth | None  # truth on the grid of the render, which bounces, stars and a coma need
+    has_air = spec.scene.body.atmosphere is not None
+    guide: Truth | None  # truth on the grid of the render, which bounces, stars, a coma and air need
     if camera.lens.resamples:
         truth = render.truth(
             surface,
@@ -61,7 +63,7 @@ def render_view(spec: SampleSpec, pose: Pose) -> Rendering:
             slopes=camera.seen_slopes,
             projection=camera.projection,
         )
-        needed = scene.bounces or stars or has_coma
+        needed = scene.bounces or stars or has_coma or has_air
         guide = render.truth(surface, scene.view, scene.sun) if needed else None
     else:
         truth = guide = render.truth(surface, scene.view, scene.sun, angles=angles)
@@ -72,6 +74,8 @@ def render_view(spec: SampleSpec, pose: Pose) -> Rendering:
     else:
         sampled = sample_to_noise(spec, scene, truth, guide, spec.scene.render.noise_fraction)
     rendered = sampled.radiance
+    if has_air and guide is not None:
+        rendered = add_atmosphere(spec, scene, guide, rendered)
     if has_coma and guide is not None:
         rendered = add_coma(spec, pose, scene, guide, rendered)
     return Rendering(

@@ -12,9 +12,11 @@ from ..core.lazy_names import load_name
 
 if TYPE_CHECKING:
     from .albedo import AlbedoMap
+    from .atmosphere import Air, air_light
     from .bounces import indirect
     from .cells import Cells, direct_in_cells
     from .detail import FineRelief
+    from .earth import EarthAlbedo
     from .integrate import radiance
     from .layers import truth
     from .light import Sampled, direct, direct_by_sample
@@ -26,12 +28,15 @@ if TYPE_CHECKING:
 
 # public name → the module that defines it, which loads Mitsuba
 _HOMES = {
+    "Air": "atmosphere",
     "AlbedoMap": "albedo",
     "Cells": "cells",
+    "EarthAlbedo": "earth",
     "FineRelief": "detail",
     "Sampled": "light",
     "TerrainMesh": "surface",
     "Vehicle": "vehicle",
+    "air_light": "atmosphere",
     "direct": "light",
     "first_ground": "resolve",
     "direct_by_sample": "light",
@@ -91,12 +96,15 @@ def self_test() -> str:
 
 
 __all__ = [
+    "Air",
     "AlbedoMap",
     "Cells",
+    "EarthAlbedo",
     "FineRelief",
     "Sampled",
     "TerrainMesh",
     "Vehicle",
+    "air_light",
     "direct",
     "direct_by_sample",
     "direct_in_cells",

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from .albedo import AlbedoMap
 from .description import View
 from .detail import Detail, FineRelief
+from .earth import EarthAlbedo
 from .mesh import mesh_scene
 from .runtime import dr, mi
 from .vehicle import Vehicle, World
@@ -67,7 +68,7 @@ class TerrainMesh:
         dust: NDArray[np.float32] | None = None,
         vehicle: Vehicle | None = None,
         fine: FineRelief | None = None,
-        albedo: AlbedoMap | None = None,
+        albedo: AlbedoMap | EarthAlbedo | None = None,
     ) -> None:
         vertices_m, faces = np.asarray(vertices_m, dtype=np.float32), np.asarray(faces, dtype=np.int32)
         with ThreadPoolExecutor(1) as aside:  # the last steps of building the tree keep only one core busy

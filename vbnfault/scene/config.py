@@ -23,7 +23,7 @@ from .coma import ComaTable
 from .instrument import OF_A_SENSOR_FILE, CameraTable, RenderTable
 from .sampling import DatasetTable, GeometryTable, PlanTable, StratumTable
 from .surroundings import OrbitTable, SkyTable, SpacecraftTable, SpiceTable, SunTable
-from .target import BodyTable, PatchTable
+from .target import EARTH, BodyTable, PatchTable
 from .trajectory import TrajectoryTable, with_rows
 
 # Values of body.shape and of spacecraft.model that do not name a file.
@@ -261,7 +261,7 @@ def _anchor_paths(table: dict[str, Any], folder: Path, overrides: Collection[str
 
     anchor(table.get("body"), "body.shape", _SHAPES)
     body = table.get("body")
-    anchor(body.get("albedo_map") if isinstance(body, dict) else None, "body.albedo_map.file")
+    anchor(body.get("albedo_map") if isinstance(body, dict) else None, "body.albedo_map.file", (EARTH,))
     anchor(table.get("spacecraft"), "spacecraft.model", _VEHICLES)
     anchor(table.get("severity"), "severity.file")
     anchor_file(table.get("camera"), "camera.lens")

@@ -39,6 +39,10 @@ class SpectrumTable(Table):
         return self
 
 
+# Value of body.albedo_map.file that names no file: a procedural Earth.
+EARTH = "earth"
+
+
 class AlbedoMapTable(Table):
     """Give a map whose values multiply the albedo of the body: an equirectangular image of the whole body.
 
@@ -46,7 +50,11 @@ class AlbedoMapTable(Table):
     (top) to 90° south. Both are those of the body-fixed frame T: longitude 0 on +x, the north pole on +z.
     """
 
-    file: str = Field(description="PNG or TIFF file, grey or RGB, 8, 16 or 32 bits, twice as wide as high")
+    file: str = Field(
+        description="PNG or TIFF file, grey or RGB, 8, 16 or 32 bits, twice as wide as high; or 'earth': a "
+        "procedural Earth with oceans, continents, ice and clouds, sharp at any distance, whose mean albedo is "
+        "that of [body]"
+    )
     left_longitude_deg: float = Field(
         -180.0, ge=-360, le=360, description="east longitude of the left edge; 0 for a map from 0 to 360°"
     )
@@ -57,6 +65,33 @@ class AlbedoMapTable(Table):
         "mean",
         description="value of the map, after decoding, at which the albedo is that of [body]; whole numbers count "
         "as fractions of the largest one. 'mean': the mean over the body",
+    )
+
+    @model_validator(mode="after")
+    def _one_earth(self) -> AlbedoMapTable:
+        if self.file == EARTH and (self.left_longitude_deg, self.encoding, self.neutral) != (
+            -180,
+            "linear",
+            "mean",
+        ):
+            raise ValueError(
+                "file = 'earth': takes no left_longitude_deg, encoding or neutral, which are for files; leave them "
+                "out"
+            )
+        return self
+
+
+class AtmosphereTable(Table):
+    """Put air above an 'ellipsoid': single scattering after Rayleigh, with the density exp(-h / H) at height h.
+
+    The optical depth goes with the wavelength as that of air (Hansen & Travis 1974).
+    """
+
+    optical_depth: float = Field(
+        0.0973, gt=0, le=1, description="of the whole atmosphere at 550 nm, straight up; default: Earth's"
+    )
+    scale_height_m: float = Field(
+        8430.0, gt=0, le=1e6, description="H; default: of air at 288 K, as in the US Standard Atmosphere 1976"
     )
 
 
@@ -91,6 +126,14 @@ class BodyTable(Table):
     )
     photometry: AnyReflectance = Field(Lambert(), description="how the ground reflects")
     albedo_map: AlbedoMapTable | None = Field(None, description="a map that multiplies the albedo; default: none")
+
+    atmosphere: AtmosphereTable | None = Field(None, description="light that air scatters; default: no air")
+
+    @model_validator(mode="after")
+    def _round(self) -> BodyTable:
+        if self.atmosphere is not None and (self.shape != "ellipsoid" or self.relief_m):
+            raise ValueError("atmosphere: needs shape = 'ellipsoid' without relief_m")
+        return self
 
     @model_validator(mode="after")
     def _gentle(self) -> BodyTable:

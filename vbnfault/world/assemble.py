@@ -24,7 +24,7 @@ from ..scene.config import Scene
 from ..scene.instrument import THIN_LENS, CameraTable
 from ..scene.keyed_random import rng
 from ..scene.surroundings import OrbitTable, PoseTable, SpiceTable, SunTable
-from ..scene.target import BodyTable
+from ..scene.target import EARTH, BodyTable
 from ..scene.trajectory import FlownPose
 from . import sky
 from .coma import check_coma
@@ -33,7 +33,7 @@ from .spacecraft import HingePose, ModelPlacement, Spacecraft, SpacecraftMesh, d
 from .surface_map import load_albedo_map
 
 if TYPE_CHECKING:
-    from ..render import AlbedoMap, Vehicle
+    from ..render import AlbedoMap, EarthAlbedo, Vehicle
 
 F64 = NDArray[np.float64]
 
@@ -225,12 +225,20 @@ def reference_band(scene: Scene) -> int:
     return int(np.argmin(np.abs(wavelengths_nm(scene) - REFERENCE_NM)))
 
 
-def render_albedo(scene: Scene, site: Site) -> AlbedoMap | None:
+def render_albedo(scene: Scene, site: Site) -> AlbedoMap | EarthAlbedo | None:
     """Return the renderer's copy of the scene's map of the albedo, or None if it has none. Raises InputError."""
     if scene.body.albedo_map is None:
         return None
     from .. import render
 
+    if scene.body.albedo_map.file == EARTH:
+        return render.EarthAlbedo(
+            float(np.linalg.norm(site.position_T_m)),
+            wavelength_nm=wavelengths_nm(scene),
+            reference_band=reference_band(scene),
+            T_from_L=site.T_from_L,
+            site_T_m=site.position_T_m,
+        )
     loaded = load_albedo_map(scene.body.albedo_map)
     return render.AlbedoMap(
         loaded.levels,
@@ -253,7 +261,7 @@ def make_body(scene: Scene) -> Body:
 def _body(scene: Scene) -> Body:
     """Return the scene's body without a check of its coma."""
     table = scene.body
-    if table.albedo_map is not None:
+    if table.albedo_map is not None and table.albedo_map.file != EARTH:
         load_albedo_map(table.albedo_map)  # refused before any sample is rendered
     physical = {
         "density_kg_m3": table.density_kg_m3,

@@ -1,0 +1,199 @@
+"""The procedural Earth and its air: land and albedo, scattered light against closed forms and quadrature."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from vbnfault import dataset, render
+from vbnfault.core.errors import InputError
+from vbnfault.pipeline import Session
+from vbnfault.render import atmosphere, earth
+from vbnfault.render.description import View
+from vbnfault.render.runtime import mi
+from vbnfault.scene import config
+
+F64 = NDArray[np.float64]
+RADIUS_M, SCALE_M = 6.371e6, 8430.0
+
+
+def points(count: int) -> Any:
+    """Return directions that cover the sphere evenly (Fibonacci's lattice)."""
+    k = np.arange(count) + 0.5
+    z, turn = 1 - 2 * k / count, k * np.pi * (3 - 5**0.5)
+    r = np.sqrt(1 - z * z)
+    return mi.Vector3f(*(mi.Float(c.astype(np.float32)) for c in (r * np.cos(turn), r * np.sin(turn), z)))
+
+
+def test_land_covers_29_percent_and_the_mean_albedo_is_the_neutral_one() -> None:
+    """200,000 points: the lattice's error is far below the tolerances, those of the stated digits."""
+    up, footprint = points(200_000), mi.Float(0.004)
+    land = np.array(earth.height_at(up, footprint)) > earth.SEA_LEVEL
+    assert land.mean() == pytest.approx(0.29, abs=0.005)
+    colour = np.stack([np.array(c) for c in earth.colour_at(up, footprint)])
+    assert colour.mean() == pytest.approx(earth.MEAN_ALBEDO, rel=0.01)
+    assert colour.min() > 0
+    assert colour.max() < 1
+    # white at the poles, blue between them, and green and brown land
+    z = np.array(up.z)
+    assert colour[:, np.abs(z) > 0.99].mean() > 0.5
+    water = (colour[2] > 1.3 * colour[0]) & (colour.mean(axis=0) < 0.12)
+    green = (colour[1] > 1.15 * colour[0]) & (colour[1] > 1.15 * colour[2])
+    sand = (colour[0] > 1.25 * colour[2]) & (colour[0] > 0.2)
+    assert water.mean() > 0.2
+    assert green.mean() > 0.005
+    assert sand.mean() > 0.02
+
+
+def test_coarse_pixels_show_the_mean_of_fine_ones() -> None:
+    """A pixel of 0.02 rad against the mean of 400 fine points in it: noise finer than the pixel averages out.
+
+    Thresholds make coasts and clouds sharper than their fields, so single pixels differ: they correlate by 0.87.
+    The mean does not, within 10 %.
+    """
+    rng = np.random.default_rng(5)
+    centre = rng.normal(size=(3, 300))
+    centre /= np.linalg.norm(centre, axis=0)
+    spread = centre[:, :, None] + rng.uniform(-0.01, 0.01, size=(3, 300, 400))
+    spread /= np.linalg.norm(spread, axis=0)
+    fine_up = mi.Vector3f(*(mi.Float(c.ravel().astype(np.float32)) for c in spread))
+    fine = np.array(earth.colour_at(fine_up, mi.Float(1e-4))[1]).reshape(300, 400).mean(axis=1)
+    coarse_up = mi.Vector3f(*(mi.Float(c.astype(np.float32)) for c in centre))
+    coarse = np.array(earth.colour_at(coarse_up, mi.Float(0.02))[1])
+    assert np.corrcoef(fine, coarse)[0, 1] > 0.85
+    assert coarse.mean() == pytest.approx(fine.mean(), rel=0.1)
+
+
+def test_chapmans_function_against_quadrature() -> None:
+    """The asymptotic form is within 1 / x = 0.13 % or a few times that, also below the horizon."""
+    x = RADIUS_M / SCALE_M
+    for start in (x, x + 3):
+        for zenith_deg in (0, 30, 60, 80, 85, 88, 90, 91, 92):
+            cosine = np.cos(np.radians(zenith_deg))
+            along = np.linspace(0, 500, 200_001)
+            height = np.sqrt(start**2 + along**2 + 2 * start * along * cosine) - start
+            exact = np.trapezoid(np.exp(-height), along)
+            assert float(atmosphere.chapman(start, cosine, np)) == pytest.approx(exact, rel=0.005)
+
+
+def light(towards: F64, sun: F64, optical_depth: float, camera_m: float = 7e6) -> tuple[float, float]:
+    """Return what one line of sight gets from a camera on the x axis above a sphere, and what it leaves."""
+    z = towards / np.linalg.norm(towards)
+    x = np.cross([0.0, 0.0, 1.0], z)
+    x /= np.linalg.norm(x)
+    view = View(
+        position_L_m=np.array([camera_m, 0.0, 0.0]),
+        L_from_C=np.stack([x, np.cross(z, x), z], axis=1),
+        intrinsics=np.array([1e3, 1e3, 0.5, 0.5]),
+        width_px=1,
+        height_px=1,
+    )
+    air = render.Air(
+        semi_axes_m=np.full(3, RADIUS_M),
+        centre_L_m=np.zeros(3),
+        T_from_L=np.eye(3),
+        optical_depth=np.array([optical_depth]),
+        scale_height_m=SCALE_M,
+    )
+    along = -camera_m * z[0]
+    miss2 = camera_m**2 - along**2
+    hits = miss2 < RADIUS_M**2 and along > 0
+    depth = along - np.sqrt(RADIUS_M**2 - miss2) if hits else np.inf
+    added, left = render.air_light(air, view, sun, np.array([[depth]], dtype=np.float32), np.array([[hits]]))
+    return float(added[0, 0, 0]), float(left[0, 0, 0])
+
+
+def test_thin_air_has_its_closed_forms_at_nadir_and_limb() -> None:
+    """Nadir: P(180°) τ / 4π. Limb at the height h: β exp(-h/H) √(2π (R + h) H), to H / R = 0.1 % and float32."""
+    depth = 1e-6
+    added, left = light(np.array([-1.0, 0, 0]), np.array([1.0, 0, 0]), depth)
+    assert added == pytest.approx(0.75 * 2 * depth / (4 * np.pi), rel=2e-3)
+    assert left == pytest.approx(1, abs=1e-5)
+    for height_m in (5e3, 20e3, 50e3):
+        miss = RADIUS_M + height_m
+        towards = np.array([-np.sqrt(1 - (miss / 7e6) ** 2), miss / 7e6, 0.0])
+        added, _ = light(towards, np.array([0.0, 1.0, 0.0]), depth)  # the Sun above the middle of the line
+        cosine = towards[1]
+        column = depth / SCALE_M * np.exp(-height_m / SCALE_M) * np.sqrt(2 * np.pi * miss * SCALE_M)
+        assert added == pytest.approx(0.75 * (1 + cosine**2) / (4 * np.pi) * column, rel=0.01)
+
+
+def test_scattered_light_against_quadrature() -> None:
+    """Brute force: 4000 steps on the line, each with 2000 towards the Sun and the sphere's shadow; 1 %."""
+    optical_depth = 0.2
+    for tangent_m, sun_deg in ((-2e6, 20.0), (-3e5, 70.0), (8e3, 60.0), (15e3, 95.0), (10e3, 150.0)):
+        miss = RADIUS_M + tangent_m
+        towards = np.array([-np.sqrt(1 - (miss / 7e6) ** 2), miss / 7e6, 0.0])
+        sun = np.array([np.cos(np.radians(sun_deg)), np.sin(np.radians(sun_deg)), 0.0])
+        along = 7e6 * -towards[0]
+        half = np.sqrt(max((RADIUS_M + 12 * SCALE_M) ** 2 - miss**2, 0))
+        end = along - np.sqrt(RADIUS_M**2 - miss**2) if tangent_m < 0 else along + half
+        edges = np.linspace(max(along - half, 0), end, 4001)
+        s, step = 0.5 * (edges[1:] + edges[:-1]), np.diff(edges)
+        point = np.array([7e6, 0, 0])[:, None] + towards[:, None] * s
+        beta = optical_depth / SCALE_M * np.exp(-(np.linalg.norm(point, axis=0) - RADIUS_M) / SCALE_M)
+        before = np.cumsum(beta * step) - 0.5 * beta * step
+        t = np.linspace(0, 2.5e6, 2001)
+        path = np.linalg.norm(point[:, :, None] + sun[:, None, None] * t, axis=0)
+        shadowed = (path < RADIUS_M - 1).any(axis=1)
+        sunward = optical_depth / SCALE_M * np.trapezoid(np.exp(-(path - RADIUS_M) / SCALE_M), t, axis=1)
+        total = float((beta * step * np.where(shadowed, 0, np.exp(-sunward - before))).sum())
+        exact = 0.75 * (1 + (towards @ sun) ** 2) / (4 * np.pi) * total
+        added, left = light(towards, sun, optical_depth)
+        assert added == pytest.approx(exact, rel=0.01, abs=1e-7)
+        if tangent_m < 0:
+            assert left == pytest.approx(np.exp(-0.5 * (sunward[-1] + (beta * step).sum())), rel=0.02)
+
+
+def test_the_optical_depth_of_air_follows_its_published_values() -> None:
+    """Hansen & Travis 1974: 0.008569 λ⁻⁴ (1 + 0.0113 λ⁻² + 0.00013 λ⁻⁴), λ in µm; 0.0973 at 550 nm."""
+    nm = np.array([400.0, 550.0, 700.0])
+    um = nm / 1000
+    published = 0.008569 / um**4 * (1 + 0.0113 / um**2 + 0.00013 / um**4)
+    np.testing.assert_allclose(atmosphere.rayleigh_depth(nm, 0.0973), published, rtol=1e-3)
+
+
+def test_the_limb_of_the_scene_is_blue_and_thin_and_samples_repeat() -> None:
+    small = {"camera.width_px": 48, "camera.height_px": 48, "render.samples_per_pixel": 1, "dataset.sites": 1}
+    layers = {"dataset.layers": ["clean", "radiance", "semantic", "albedo"]}
+    scene = config.load_scene("earth_observation", {**small, **layers})
+    session = Session(scene)
+    facing = int(np.flatnonzero(session.plan.stratum == 0)[0])
+    one, other = session.simulate(facing), Session(scene).simulate(facing)
+    for name in one.layers:
+        np.testing.assert_array_equal(one.layers[name], other.layers[name])
+    radiance, sky = one.layers["radiance"], one.layers["semantic"] == 0
+    glow = radiance[:, sky]
+    air = glow[:, glow.sum(axis=0) > 0]
+    assert air.shape[1] > 0
+    assert air[1].sum() > 2 * air[-2].sum()  # blue before red
+    albedo = one.layers["albedo"][one.layers["semantic"] == 1]
+    assert ((albedo > 0) & (albedo < 1.1)).all()
+    identity = dataset.scene_identity(session)
+    assert identity["body"]["albedo_map"]["file"] == "earth"
+
+
+@pytest.mark.parametrize(
+    ("table", "sentence"),
+    [
+        ({"atmosphere": {}}, r"body\.atmosphere: needs shape = 'ellipsoid' without relief_m"),
+        (
+            {"shape": "ellipsoid", "relief_m": 5.0, "atmosphere": {}},
+            r"body\.atmosphere: needs shape = 'ellipsoid' ",
+        ),
+        (
+            {"shape": "ellipsoid", "atmosphere": {"optical_depth": 3}},
+            r"body\.atmosphere\.optical_depth = 3: must be a number above 0 and at most 1",
+        ),
+        (
+            {"albedo_map": {"file": "earth", "neutral": 0.4}},
+            r"body\.albedo_map\.file = 'earth': takes no left_long",
+        ),
+    ],
+)
+def test_wrong_keys_are_refused_in_a_sentence(table: dict[str, Any], sentence: str) -> None:
+    with pytest.raises(InputError, match=rf"test: {sentence}"):
+        config.parse_scene({"title": "t", "body": table}, source="test")

@@ -1,0 +1,211 @@
+"""Compute the albedo of a procedural Earth: oceans, continents, deserts, forests, ice and clouds.
+
+All fields are fractal sums of gradient noise (Perlin 2002, ACM Trans. Graph. 21, 681) on the unit sphere, down to
+the footprint of a pixel, so that the ground is sharp from orbit and smooth from afar. Land covers 29 % of the
+sphere, as on Earth. The albedos of surfaces are near typical ones (Hartmann 1994,
+Global Physical Climatology, chapter 4); their colours, the belts of climate, the fraction of clouds and their
+shapes are assumed.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .runtime import dr, mi
+
+F64 = NDArray[np.float64]
+
+# Albedo at 650, 550 and 450 nm.
+_RGB_NM = (650.0, 550.0, 450.0)
+_OCEAN, _SHELF = (0.022, 0.035, 0.060), (0.035, 0.075, 0.095)
+_FOREST, _STEPPE = (0.050, 0.072, 0.034), (0.170, 0.150, 0.085)
+_DESERT, _ROCK = (0.420, 0.315, 0.200), (0.230, 0.185, 0.140)
+_TUNDRA, _ICE = (0.145, 0.140, 0.110), (0.760, 0.790, 0.820)
+_CLOUD = 0.72
+# Mean albedo of this Earth over the sphere and the three wavelengths, at which the factor is 1.
+MEAN_ALBEDO = 0.238
+
+SEA_LEVEL = 0.19  # with 29 % of the sphere above it
+_LACUNARITY = 2.03  # not 2, so that the lattices of octaves do not coincide
+_MOST_OCTAVES = 18
+_SMALLEST_RAD = 1e-6  # 6 m on the ground: no finer detail
+# Storms: axis as longitude and latitude in degrees, radius in rad, turns.
+_STORMS = (
+    (-35, 47, 0.17, 0.55),
+    (20, -52, 0.19, -0.6),
+    (150, 43, 0.15, 0.5),
+    (-140, 50, 0.17, 0.6),
+    (95, -47, 0.16, -0.5),
+    (-100, -54, 0.18, -0.6),
+    (-60, 22, 0.05, 0.9),
+    (130, 17, 0.05, 0.9),
+)
+
+
+class EarthAlbedo:
+    """Compute factors on the albedo in the way of `albedo.AlbedoMap`.
+
+    Parameters
+    ----------
+    radius_m
+        Radius of the body.
+    wavelength_nm
+        Bands, float64[band].
+    reference_band
+        Index of the band of `at_reference`.
+    T_from_L, site_T_m
+        Rotation float64[3, 3] and position float64[3] in m of the axes L in the body-fixed frame T.
+    """
+
+    coloured = True
+
+    def __init__(
+        self, radius_m: float, *, wavelength_nm: F64, reference_band: int, T_from_L: F64, site_T_m: F64
+    ) -> None:
+        order = np.argsort(_RGB_NM)
+        hats = [np.interp(wavelength_nm, np.array(_RGB_NM)[order], np.eye(3)[k][order]) for k in range(3)]
+        self._weights = np.stack(hats, axis=1) / MEAN_ALBEDO
+        self._reference = reference_band
+        self._radius_m = radius_m
+        self._axes = [mi.Vector3f(*map(float, row)) for row in T_from_L]
+        self._site = [float(x) for x in site_T_m]
+
+    def factors(self, point_L_m: Any, footprint_m: Any, valid: Any) -> list[Any]:
+        """Return the factors on the albedo at points in L, one for each band.
+
+        `footprint_m` is the distance between neighbouring rays at the points. Finer details are left out.
+        """
+        colour = self._colour(point_L_m, footprint_m, valid)
+        return [_weighted(row, colour) for row in self._weights]
+
+    def at_reference(self, point_L_m: Any, footprint_m: Any, valid: Any) -> Any:
+        """Return the factor in the reference band."""
+        return _weighted(self._weights[self._reference], self._colour(point_L_m, footprint_m, valid))
+
+    def _colour(self, point_L_m: Any, footprint_m: Any, valid: Any) -> Any:
+        """Return the albedo at 650, 550 and 450 nm."""
+        point = dr.select(valid, mi.Vector3f(point_L_m), 0)
+        up = dr.normalize(
+            mi.Vector3f(*(dr.dot(axis, point) + s for axis, s in zip(self._axes, self._site, strict=True)))
+        )
+        footprint = dr.maximum(dr.select(valid, footprint_m, 1e3) / self._radius_m, _SMALLEST_RAD)
+        return colour_at(up, footprint)
+
+
+def colour_at(up: Any, footprint_rad: Any) -> Any:
+    """Return the albedo at 650, 550 and 450 nm at directions from the body's centre in T."""
+    ground = _ground(up, footprint_rad)
+    opacity, albedo = _clouds(up, footprint_rad)
+    return dr.lerp(ground, mi.Color3f(albedo), opacity)
+
+
+def height_at(up: Any, footprint: Any) -> Any:
+    """Return the height of the ground in units of its own; land is above `SEA_LEVEL`."""
+    warp = 0.25 * mi.Vector3f(*(_fractal(1.7 * up + 9.1 * k, footprint / 1.7, 11 + k, 0.5, 4) for k in range(3)))
+    return _fractal(1.15 * (up + warp), footprint / 1.15, 3, 0.54, 14)
+
+
+def _ground(up: Any, footprint: Any) -> Any:
+    """Return the albedo of land, ice and water."""
+    height = height_at(up, footprint)
+    land = _step(height, SEA_LEVEL, 0.004)
+    shelf = _step(height, SEA_LEVEL - 0.02, 0.02)
+    latitude = dr.abs(up.z)
+    rough = _fractal(9.0 * up, footprint / 9.0, 5, 0.63, 13)
+    fine = _fractal(70.0 * up, footprint / 70.0, 53, 0.72, 10)
+    wet = _fractal(2.6 * up, footprint / 2.6, 7, 0.55, 12)
+    mountain = dr.clip((height - SEA_LEVEL - 0.1) * 4 + 1.2 * rough * dr.clip((height - SEA_LEVEL) * 8, 0, 1), 0, 1)
+    # belts by sine of the latitude: wet at the equator, dry near 25°, wet near 50°, tundra towards 70°
+    dry = dr.exp(-dr.square((latitude - 0.42) / 0.17))
+    dryness = dry * 0.9 - 0.25 + 1.5 * wet + 0.25 * rough
+    colour = dr.lerp(mi.Color3f(*_FOREST), mi.Color3f(*_STEPPE), _step(dryness, 0.10, 0.14))
+    colour = dr.lerp(colour, mi.Color3f(*_DESERT), _step(dryness, 0.38, 0.16))
+    colour = dr.lerp(colour, mi.Color3f(*_TUNDRA), _step(latitude + 0.25 * wet, 0.86, 0.05))
+    colour = dr.lerp(colour, mi.Color3f(*_ROCK), 0.8 * mountain) * (1 + 0.8 * rough + 0.5 * fine)
+    cold = latitude + 0.13 * mountain + 0.10 * wet + 0.06 * rough
+    colour = dr.lerp(colour, mi.Color3f(*_ICE), _step(cold, 0.935, 0.025))
+    water = dr.lerp(mi.Color3f(*_OCEAN), mi.Color3f(*_SHELF), shelf)
+    water = dr.lerp(water, mi.Color3f(*_ICE), 0.9 * _step(latitude + 0.05 * wet + 0.05 * rough, 0.972, 0.008))
+    return dr.lerp(water, colour, land)
+
+
+def _clouds(up: Any, footprint: Any) -> Any:
+    """Return the opacity of the clouds in [0, 1], and their albedo."""
+    turned = up
+    for longitude_deg, latitude_deg, radius, turns in _STORMS:
+        lon, lat = np.radians([longitude_deg, latitude_deg])
+        axis = mi.Vector3f(*map(float, (np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat))))
+        near = dr.exp(-dr.squared_norm(up - axis) / radius**2)
+        angle = 2 * np.pi * turns * near * near
+        s, c = dr.sincos(angle)
+        turned = turned * c + dr.cross(axis, turned) * s + axis * (dr.dot(axis, turned) * (1 - c))
+    flat = turned * mi.Vector3f(1, 1, 1.7)  # drawn out along the parallels
+    warp = 0.20 * mi.Vector3f(*(_fractal(2.5 * flat + 5.3 * k, footprint / 2.5, 31 + k, 0.55, 9) for k in range(3)))
+    large = _fractal(2.4 * (flat + warp), footprint / 2.4, 41, 0.55, 14)
+    small = _fractal(26.0 * (flat + 0.6 * warp), footprint / 26.0, 43, 0.66, 12)
+    cells = _fractal(170.0 * (flat + 0.3 * warp), footprint / 170.0, 47, 0.70, 9)
+    latitude = dr.abs(up.z)
+    belts = 0.10 * dr.exp(-dr.square(up.z / 0.10)) + 0.13 * dr.exp(-dr.square((latitude - 0.80) / 0.16))
+    belts -= 0.09 * dr.exp(-dr.square((latitude - 0.40) / 0.14))
+    cover = 0.8 * large + 0.40 * small + 0.16 * cells + belts
+    thick = _step(cover, 0.24, 0.20)
+    wisps = 0.4 * _step(0.5 * large + 0.5 * small + 0.2 * cells + belts, 0.10, 0.14)
+    albedo = dr.clip(_CLOUD * (0.72 + 0.45 * cover + 0.35 * small + 0.25 * cells), 0.3, 0.85)
+    return dr.clip(thick + wisps * (1 - thick), 0, 1), albedo
+
+
+def _step(value: Any, middle: float, half_width: float) -> Any:
+    """Return 0 below, 1 above, and a smooth step within `half_width` of the middle."""
+    t = dr.clip((value - (middle - half_width)) / (2 * half_width), 0, 1)
+    return t * t * (3 - 2 * t)
+
+
+def _fractal(point: Any, footprint: Any, seed: int, gain: float, octaves: int) -> Any:
+    """Return a sum of octaves of noise, each `gain` times the one before it, without those below the footprint."""
+
+    def more(octave: Any, _point: Any, _footprint: Any, _amplitude: Any, _total: Any) -> Any:
+        return octave < min(octaves, _MOST_OCTAVES)
+
+    def add(octave: Any, point: Any, footprint: Any, amplitude: Any, total: Any) -> Any:
+        shown = dr.clip((1 / footprint - 1) * 0.5, 0, 1)
+        total = total + amplitude * shown * _noise(point, mi.UInt32(seed) + 101 * octave)
+        # a turn keeps the axes of the lattices apart
+        turned = mi.Vector3f(
+            0.36 * point.x + 0.48 * point.y - 0.8 * point.z,
+            -0.8 * point.x + 0.6 * point.y,
+            0.48 * point.x + 0.64 * point.y + 0.6 * point.z,
+        )
+        return octave + 1, turned * _LACUNARITY + 7.31, footprint * _LACUNARITY, amplitude * gain, total
+
+    state = (mi.UInt32(0), mi.Vector3f(point), mi.Float(footprint), mi.Float(1.0), mi.Float(0.0))
+    return dr.while_loop(state, more, add)[-1]
+
+
+def _noise(point: Any, seed: Any) -> Any:
+    """Return gradient noise of unit wavelength; it is 0 on average, with a standard deviation of about 0.2."""
+    low = dr.floor(point)
+    cell, part = mi.Vector3i(low), point - low
+    fade = part * part * part * (part * (part * 6 - 15) + 10)
+    value = mi.Float(0)
+    for corner in np.ndindex(2, 2, 2):
+        offset = mi.Vector3i(*map(int, corner))
+        index = mi.Vector3u(cell + offset)
+        word = index.x * 0x8DA6B343 + index.y * 0xD8163841 + index.z * 0xCB1AB31F + seed * 0x9E3779B1
+        word = (word ^ (word >> 15)) * 0x2C1B3C6D
+        word = (word ^ (word >> 12)) * 0x297A2D39
+        word = word ^ (word >> 15)
+        gradient = mi.Vector3f((word & 0x3FF), (word >> 10) & 0x3FF, (word >> 20) & 0x3FF) * (2 / 1023) - 1
+        weight = mi.Float(1)
+        for axis, side in zip("xyz", corner, strict=True):
+            w = getattr(fade, axis)
+            weight *= w if side else 1 - w
+        value += weight * dr.dot(gradient, part - mi.Vector3f(offset))
+    return value
+
+
+def _weighted(weights: F64, colour: Any) -> Any:
+    """Return the weighted sum of three channels."""
+    return sum((c * float(w) for w, c in zip(weights, colour, strict=True) if w), mi.Float(0))
