@@ -41,7 +41,7 @@ SHEETS = {
 SHEET_PX = 512
 SHEET_TRIANGLES = 800_000
 SHEET_WIDTH_PX = 1080
-NARROW_PX = {"approach": 700}  # the sheet of a page that people load
+NARROW_PX = {"approach": 700, "earth_observation": 700}  # sheets that pages of the documentation show
 # Samples with many fault classes; several share a site, whose terrain is then built once.
 FLARES, NAVCAM, PHYSICAL = (1, 2, 3), (5, 6, 12, 15), (7, 4)
 
