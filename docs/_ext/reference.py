@@ -43,6 +43,7 @@ _UNITS = {
     "_m": "m",
     "_magnitude": "mag",
     "_mm": "mm",
+    "_cm": "cm",
     "_nA_cm2": "nA/cm²",
     "_nm": "nm",
     "_per_100nm": "1/(100 nm)",

@@ -53,7 +53,7 @@ _CORE = 0.1
 SHADOW_CELLS = 256
 _SHADOW_MARGIN = 1.06
 # Steps along the part of a line of sight that the shadow can reach.
-_SHADOW_STEPS = 32
+_SHADOW_STEPS = 48
 # Nodes of Gauss and Legendre across a jet, which cover it down to this logarithm of its density. Compared with
 # `scipy.integrate.quad` the error is below 1e-4 of the light of the line.
 _JET_NODES, _JET_DEPTH = 11, 10.0
