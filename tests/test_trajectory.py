@@ -241,6 +241,8 @@ def test_rows_set_the_samples_and_too_many_are_refused(tmp_path: Path, sphere: s
     spice = {"kernels": ["k"], "spacecraft": "X", "frame": "F", "camera_frame": "C"}
     with pytest.raises(InputError, match=r"trajectory\.file = .*: spice\.spacecraft = 'X' gives poses, too"):
         config.load_scene(path, {f"spice.{key}": value for key, value in spice.items()})
+    with pytest.raises(InputError, match=r"trajectory\.file = '': must be a string that is not empty"):
+        config.load_scene(path, {"trajectory.file": ""})
     with pytest.raises(InputError, match=r"poses = 3: must be a path, a data frame, or a mapping"):
         vbnfault.Session(scene, poses=3)
 
@@ -271,6 +273,13 @@ def test_a_sphere_has_its_size_and_place_from_any_distance(sphere: str) -> None:
             assert len(x) == pytest.approx(np.pi * limb_px**2, rel=0.03, abs=12)
             assert (x.mean() + 0.5, y.mean() + 0.5) == pytest.approx((20, 16), abs=0.15)
             assert depth.min() == pytest.approx(distance - RADIUS_M, rel=2e-3)
+
+
+def test_a_body_may_be_smaller_than_a_patch() -> None:
+    keys = {**SMALL["body"], "shape": "ellipsoid", "semi_axes_m": [0.1, 0.1, 0.1]}
+    scene = config.parse_scene({**SMALL, "body": keys}, source="test")
+    session = vbnfault.Session(scene, poses=columns_of([row("a", (2.0, 0, 0))]))
+    assert session.simulate(0).layers["depth_m"].min() == pytest.approx(1.9, abs=0.01)
 
 
 def test_a_wide_camera_may_be_any_distance_away(sphere: str) -> None:

@@ -333,6 +333,8 @@ def _kind(schema: Mapping[str, Any], root: Mapping[str, Any]) -> str:
         kind = _kind(_choices(schema.get("items", {}), root)[0], root)
         plural = {"a table": " of tables", "a string": " of strings"}.get(kind, "")
         return f"a list{count or plural}"
+    if schema.get("type") == "string" and schema.get("minLength"):
+        return "a string that is not empty"
     return {"string": "a string", "object": "a table", "boolean": "true or false"}.get(schema.get("type", ""), "")
 
 

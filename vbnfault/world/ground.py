@@ -35,9 +35,9 @@ _MORE = 1.3
 _RAYS = 3
 # Points in the frame that are compared as the origin of a terrain.
 _ORIGINS = 100
-# Largest facets, boulders and radius that a patch takes (`body.PatchSpec`). Facets of a shape model are smaller, so
-# that a patch with these facets is the model itself.
-_LARGEST_FACET_M, _LARGEST_RADIUS_M = 1e6, 1e8
+# Largest facets and boulders, and range of the radius, that a patch takes (`body.PatchSpec`). Facets of a shape
+# model are smaller, so that a patch with these facets is the model itself.
+_LARGEST_FACET_M, _RADIUS_M = 1e6, (1.0, 1e8)
 # Distances are rounded down to a power of this, so that poses at nearly the same distance share a terrain.
 _STEP = 2**0.5
 
@@ -170,7 +170,7 @@ def _detail(scene: Scene, origin_T_m: F64, facet_m: float, radius_m: float) -> G
     return GroundDetail(
         position_T_m=(x, y, z),
         facet_m=min(facet_m, _LARGEST_FACET_M),
-        radius_m=min(radius_m, _LARGEST_RADIUS_M),
+        radius_m=float(np.clip(radius_m, *_RADIUS_M)),
         boulder_m=min(boulder_m, _LARGEST_FACET_M),
     )
 
