@@ -122,7 +122,7 @@ def test_thin_air_has_its_closed_forms_at_nadir_and_limb() -> None:
 
 
 def test_scattered_light_against_quadrature() -> None:
-    """Brute force: 4000 steps on the line, each with 2000 towards the Sun and the sphere's shadow; 1 %."""
+    """Brute force: 1500 steps on the line, each with 800 towards the Sun and the sphere's shadow; 1 %."""
     optical_depth = 0.2
     for tangent_m, sun_deg in ((-2e6, 20.0), (-3e5, 70.0), (8e3, 60.0), (15e3, 95.0), (10e3, 150.0)):
         miss = RADIUS_M + tangent_m
@@ -131,12 +131,12 @@ def test_scattered_light_against_quadrature() -> None:
         along = 7e6 * -towards[0]
         half = np.sqrt(max((RADIUS_M + 12 * SCALE_M) ** 2 - miss**2, 0))
         end = along - np.sqrt(RADIUS_M**2 - miss**2) if tangent_m < 0 else along + half
-        edges = np.linspace(max(along - half, 0), end, 4001)
+        edges = np.linspace(max(along - half, 0), end, 1501)
         s, step = 0.5 * (edges[1:] + edges[:-1]), np.diff(edges)
         point = np.array([7e6, 0, 0])[:, None] + towards[:, None] * s
         beta = optical_depth / SCALE_M * np.exp(-(np.linalg.norm(point, axis=0) - RADIUS_M) / SCALE_M)
         before = np.cumsum(beta * step) - 0.5 * beta * step
-        t = np.linspace(0, 2.5e6, 2001)
+        t = 2.5e6 * np.linspace(0, 1, 801) ** 2
         path = np.linalg.norm(point[:, :, None] + sun[:, None, None] * t, axis=0)
         shadowed = (path < RADIUS_M - 1).any(axis=1)
         sunward = optical_depth / SCALE_M * np.trapezoid(np.exp(-(path - RADIUS_M) / SCALE_M), t, axis=1)
