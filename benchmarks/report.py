@@ -39,19 +39,19 @@ def targets(seconds: Mapping[str, float]) -> list[Target]:
             limit=0.7,
             least=True,
         ),
-        Target(what="all that follows, over the render", ratio=after / seconds["render"], limit=0.25, least=False),
+        Target(what="all that follows, over the render", ratio=after / seconds["render"], limit=0.2, least=False),
     ]
     found += [
         Target(
             what="the same with Hapke's photometry",
             ratio=seconds["bound"] / seconds["hapke"],
-            limit=0.7,
+            limit=0.8,
             least=True,
         ),
         Target(
             what="light between surfaces, over Hapke's render",
             ratio=seconds["bounce"] / seconds["hapke"] - 1,
-            limit=0.6,
+            limit=0.4,
             least=False,
         ),
     ]

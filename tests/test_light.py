@@ -10,7 +10,7 @@ import sys
 import numpy as np
 import pytest
 from test_reflectance import SETS, by_angles, directions
-from test_render import NODES, UP, join, plane, sun, view
+from test_render import NODES, UP, CountedScene, join, plane, sun, view
 
 import vbnfault.render.bsdf  # noqa: F401 - registers Mitsuba's plug-ins
 from vbnfault import render
@@ -262,6 +262,20 @@ def _strip_factor(d: float, h: float, half_length: float) -> float:
     # (1/2π)[atan(b/d) - d/√(d²+h²) · atan(b/√(d²+h²))] twice, for the two halves (Howell, C-4)
     r = np.hypot(d, h)
     return float(2 / (2 * np.pi) * (np.arctan(half_length / d) - d / r * np.arctan(half_length / r)))
+
+
+@pytest.mark.parametrize("bounces", [1, 2])
+def test_light_between_surfaces_takes_few_rays(bounces: int) -> None:
+    """For each pixel of half the resolution: one ray to it, and for each bounce one ray and one to the Sun."""
+    surface, light = wall_and_floor()
+    a_view = view(np.array([20.0, 0.0, -5.0]), np.array([-1.0, 0.0, 0.0]), width=61)
+    a_scene = scene(a_view, light, 0.3, bounces=bounces)
+    guide = render.truth(surface, a_scene.view, a_scene.sun)
+    surface.scene = counted = CountedScene(surface.scene)
+    image = render.indirect(surface, a_scene, guide)
+    assert image.shape == (len(NODES), 61, 61)
+    assert image.any()
+    assert 0 < counted.rays <= 31 * 31 * (1 + 2 * bounces)
 
 
 def test_dust_colours_its_ground() -> None:

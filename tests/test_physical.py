@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
 
 import numpy as np
 import pytest
 from conftest import small_scene
 from scipy.spatial.transform import Rotation
 from test_light import scene
-from test_render import NODES, UP, join, plane, sun, view
+from test_render import NODES, UP, CountedScene, join, plane, sun, view
 
 from vbnfault import render
 from vbnfault.core import frames
@@ -26,7 +25,7 @@ from vbnfault.pipeline.spec import Frame
 from vbnfault.pipeline.stars import add_stars
 from vbnfault.render import sampling
 from vbnfault.render.detail import _LEVELS, _SIDE, _UNIT, _pyramid
-from vbnfault.render.runtime import dr, mi
+from vbnfault.render.runtime import mi
 from vbnfault.render.vehicle import World
 from vbnfault.scene import config
 from vbnfault.world import assemble, sky
@@ -172,21 +171,6 @@ def test_spacecraft_casts_its_shadow() -> None:
     rows, columns = np.nonzero(dark)
     assert rows.mean() + 0.5 == pytest.approx(64, abs=0.5)
     assert columns.mean() + 0.5 == pytest.approx(64, abs=0.5)
-
-
-class CountedScene:
-    """Trace rays through a scene of Mitsuba's and count those that are active."""
-
-    def __init__(self, traced: Any) -> None:
-        self.traced, self.rays = traced, 0
-
-    def ray_intersect_preliminary(self, rays: Any, *, coherent: bool, active: Any) -> Any:
-        self.rays += int(dr.count(active)[0])
-        return self.traced.ray_intersect_preliminary(rays, coherent=coherent, active=active)
-
-    def ray_test(self, rays: Any, coherent: bool, active: Any) -> Any:
-        self.rays += int(dr.count(active)[0])
-        return self.traced.ray_test(rays, coherent, active)
 
 
 @pytest.mark.parametrize("look", [-UP, np.array([1.0, 0.0, 0.6])])

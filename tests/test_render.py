@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,10 +14,29 @@ from vbnfault.detector import ThreeColourDetector
 from vbnfault.lens import ThinLens
 from vbnfault.reflectance.disc import Lambert
 from vbnfault.render.description import RenderInput, Sunlight, View
-from vbnfault.render.runtime import dr
+from vbnfault.render.runtime import dr, mi
 
 UP = np.array([0.0, 0.0, -1.0])
 NODES = spectra.band_nodes_nm(400.0, 700.0, 8)
+
+
+class CountedScene:
+    """Trace rays through a scene of Mitsuba's and count those that are active."""
+
+    def __init__(self, traced: Any) -> None:
+        self.traced, self.rays = traced, 0
+
+    def ray_intersect_preliminary(self, rays: Any, *, coherent: bool, active: Any) -> Any:
+        self._count(rays, active)
+        return self.traced.ray_intersect_preliminary(rays, coherent=coherent, active=active)
+
+    def ray_test(self, rays: Any, coherent: bool, active: Any) -> Any:
+        self._count(rays, active)
+        return self.traced.ray_test(rays, coherent, active)
+
+    def _count(self, rays: Any, active: Any) -> None:
+        each = mi.Bool(active) & (rays.d.x == rays.d.x)
+        self.rays += int(dr.count(each)[0])
 
 
 def plane(half_m: float = 500.0, height_m: float = 0.0) -> tuple[np.ndarray, np.ndarray]:

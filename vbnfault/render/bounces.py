@@ -1,7 +1,7 @@
 """Compute the light that the ground reflects onto itself.
 
-This light is about a hundredth of the direct light, and smooth except near contacts. It therefore takes one sample
-where direct light takes sixteen, and a filter averages neighbouring pixels.
+This light is about a hundredth of the direct light, and smooth except near contacts. It is therefore computed on a
+grid of half the resolution, with one sample where direct light takes 64, and a filter averages neighbouring pixels.
 
 The directions of the first reflection are strata of the cosine-weighted hemisphere, distributed over tiles of 8 × 8
 pixels (interleaved sampling: Keller & Heidrich 2001, EGWR, 269). All pixels at the same position in their tile have
@@ -12,6 +12,7 @@ edges of surfaces (à trous: Dammertz et al. 2010, HPG, 67) then averages over n
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
 
 import cv2
@@ -20,37 +21,80 @@ from numpy.typing import NDArray
 
 from ..core.quantities import Truth
 from .bsdf import has_bands
-from .description import RenderInput
+from .cells import Cells, CellStrata
+from .description import RenderInput, View
 from .light import WAVEFRONT, Light
 from .runtime import dr, mi
-from .sampling import SUN_DIMENSION, Optics, Pixels, Strata
-from .surface import TerrainMesh
+from .sampling import SUN_DIMENSION, Optics, Strata
+from .surface import TerrainMesh, facing
 
 Image = NDArray[np.float32]
 
 _TILE = 8
-_DIRECT_PER_INDIRECT = 16  # samples of direct light per sample of indirect light
+_DIRECT_PER_INDIRECT = 16  # samples of a pixel's direct light per sample of a coarser pixel's indirect light
+# Samples of a coarser pixel that sees the spacecraft, whose parts light each other far more than ground does.
+_ON_VEHICLE = 16
 _FIRST_BOUNCE = 2  # the first free dimension of a sample's random numbers; each bounce uses three
 # The filter's weights fall with the angle between normals and with the distance from the pixel's plane.
 _SIGMA_NORMAL = 0.3
 _SIGMA_PLANE_PX = 3.0
 _SPLINE = (3 / 8, 1 / 4, 1 / 16)
 _STRIDES = (1, 2, 4)
-_COLOUR_PX = 12  # standard deviation; colour varies less than brightness, so it is averaged more widely
+_COLOUR_PX = 6  # standard deviation, on the coarser grid
 
 
-def indirect(surface: TerrainMesh, scene: RenderInput, truth: Truth, *, smooth: bool = True) -> Image:
+def indirect(surface: TerrainMesh, scene: RenderInput, truth: Truth) -> Image:
     """Return the radiance of ground that other ground lights, float32[band, y, x].
 
     The light was reflected 1 to `scene.bounces` times before it reaches the ground in view. `truth` of the same
-    view guides the filter that averages neighbouring pixels; `smooth` = False switches the filter off.
+    view guides the interpolation between the pixels of the coarser grid.
     """
-    light = _Indirect(surface, scene).image()
-    return _smoothed(light, scene, truth) if smooth else light
+    coarse = replace(scene, view=_halved(scene.view))
+    tracer = _Indirect(surface, coarse)
+    guide, on_vehicle = tracer.guide()
+    light = tracer.image()
+    if len(on_vehicle):
+        light.reshape(len(light), -1)[:, on_vehicle] = tracer.of_pixels(on_vehicle)
+    brightness = light.sum(axis=0)
+    out = np.zeros((len(light), scene.view.height_px, scene.view.width_px), dtype=np.float32)
+    if not brightness.any():
+        return out
+    smooth = mi.Float(brightness.ravel())
+    for stride in _STRIDES:
+        smooth = guide.filtered(smooth, stride)
+        dr.eval(smooth)
+    bright = guide.interpolated(smooth, _Guide.of(scene.view, truth)).numpy().reshape(out.shape[1:])
+    # colour varies less than brightness, so it is averaged more widely
+    colours = np.stack([_averaged(band) for band in light])
+    colours /= np.maximum(colours.sum(axis=0), 1e-6 * brightness.max())
+    for band, colour in zip(out, colours, strict=True):
+        wide = cv2.resize(colour, (2 * coarse.view.width_px, 2 * coarse.view.height_px))
+        np.multiply(wide[: out.shape[1], : out.shape[2]], bright, out=band)
+    return out
+
+
+def _halved(view: View) -> View:
+    """Return a view with pixels of twice the size, which covers at least the same field."""
+    return replace(
+        view,
+        intrinsics=view.intrinsics / 2,
+        width_px=-(-view.width_px // 2),
+        height_px=-(-view.height_px // 2),
+    )
+
+
+def _averaged(band: Image) -> Image:
+    """Return the band averaged over a wide window, on every second pixel in x and y."""
+    height, width = band.shape
+    small = cv2.resize(band, (-(-width // 2), -(-height // 2)), interpolation=cv2.INTER_AREA)
+    return np.asarray(cv2.GaussianBlur(small, (0, 0), _COLOUR_PX / 2))
 
 
 class _Indirect(Light):
-    """Trace the light between surfaces of one scene."""
+    """Trace the light between surfaces of one scene, seen along the rays through the pixels' centres.
+
+    These rays are traced once: the filter's guide and all samples share their hits.
+    """
 
     def __init__(self, surface: TerrainMesh, scene: RenderInput) -> None:
         super().__init__(surface, scene, banded=scene.bounces > 1 or has_bands(surface, scene))
@@ -60,6 +104,19 @@ class _Indirect(Light):
             self.weights = np.diag(sun.irradiance_W_m2_nm)
         else:
             self.weights = (model.weights[0] ** 2 * sun.irradiance_W_m2_nm)[None, :]
+        self._first = self.world.trace(self.optics.centre_rays())
+        dr.eval(*self._first)
+
+    def guide(self) -> tuple[_Guide, NDArray[np.uint32]]:
+        """Return the guide of the view, and the pixels that see the spacecraft."""
+        rays = self.optics.centre_rays()
+        hit = self.world.hit(rays, self._first)
+        normal, (x, y, z) = facing(hit.normal, -rays.d), self.optics.axes
+        in_camera = (dr.dot(normal, x), dr.dot(normal, y), dr.dot(normal, z), hit.distance_m * dr.dot(rays.d, z))
+        record = dr.ravel(mi.Vector4f(*(dr.select(hit.valid, value, 0) for value in in_camera)))
+        on_vehicle = mi.Bool(False) if hit.on_vehicle is None else hit.on_vehicle
+        dr.eval(record, on_vehicle)
+        return _Guide(self.scene.view, record), np.flatnonzero(on_vehicle.numpy()).astype(np.uint32)
 
     def image(self) -> Image:
         """Return the unfiltered radiance, float32[band, y, x]."""
@@ -68,14 +125,9 @@ class _Indirect(Light):
         out = np.zeros((weights.shape[1], view.height_px, view.width_px), dtype=np.float32)
         key = self.scene.key ^ 0x5BD1E995
         for tiles in _Tiles.cover(view.width_px, view.height_px, len(weights)):
-            # camera rays are traced in rows, where neighbours are coherent; later rays have another order
-            pixels = Pixels(view.width_px * tiles.rows, first=view.width_px * tiles.first_row)
             rows = slice(tiles.first_row, tiles.first_row + tiles.rows)
             for round_ in range(spp):
-                first = self.world.trace(self.optics.camera_rays(Strata(pixels, 1, key + round_)))
-                dr.eval(*first)
-                strata = TileStrata(tiles, spp, round_, key + round_)
-                terms = self.terms(strata, dr.gather(type(first), first, strata.in_rows, strata.inside))
+                terms = self.terms(TileStrata(tiles, spp, round_, key + round_))
                 dr.eval(*terms)
                 ordered = [tiles.in_rows(term) for term in terms]
                 dr.eval(*ordered)
@@ -85,12 +137,23 @@ class _Indirect(Light):
                         out[band, rows] += values * row[band]
         return out
 
-    def terms(self, strata: TileStrata, first: tuple[Any, ...]) -> list[Any]:
-        """Return the light of each sample, an array for each row of `weights`.
+    def of_pixels(self, pixels: NDArray[np.uint32]) -> Image:
+        """Return the unfiltered radiance of listed pixels, float32[band, pixel], from more samples."""
+        listed = Cells(pixel=pixels, cell=np.zeros_like(pixels), side=1)
+        weights = (self.weights / _ON_VEHICLE).astype(np.float32)
+        parts = []
+        for part in listed.parts(WAVEFRONT // (_ON_VEHICLE * len(weights))):
+            strata = _PixelStrata(part, _ON_VEHICLE, self.scene.key ^ 0x27D4EB2F, None)
+            terms = self.terms(strata)
+            dr.eval(*terms)
+            sums = [dr.block_sum(term, _ON_VEHICLE) for term in terms]
+            parts.append(weights.T @ np.stack([of.numpy() for of in sums]))
+        return np.concatenate(parts, axis=1)
 
-        `first` holds the hits of the rays from the camera.
-        """
-        rays = self.optics.camera_rays(strata)
+    def terms(self, strata: TileStrata | _PixelStrata) -> list[Any]:
+        """Return the light of each sample, an array for each row of `weights`."""
+        rays = self.optics.centre_rays(strata.pixel)
+        first = dr.gather(type(self._first), self._first, strata.pixel, strata.inside)
         hit = self.world.hit(rays, first)
         hit.valid &= strata.inside
         total, carried = None, None
@@ -160,8 +223,7 @@ class TileStrata(Strata):
         x = (tile % tiles.across) * _TILE + self._position % _TILE
         y = (tile // tiles.across) * _TILE + self._position // _TILE
         self.inside = (x < tiles.width) & (y < tiles.rows)
-        self.in_rows = y * tiles.width + x
-        self.pixel = self.in_rows + dr.opaque(mi.UInt32, tiles.first_row * tiles.width)
+        self.pixel = y * tiles.width + x + dr.opaque(mi.UInt32, tiles.first_row * tiles.width)
         self.index = mi.UInt32(0)
         self.side, self.samples, self._shift = 1, 1, 0
         self._key = dr.opaque(mi.UInt32, key & 0xFFFFFFFF)
@@ -179,43 +241,43 @@ class TileStrata(Strata):
         return (mi.Float(a) + u) / cells, (mi.Float(b) + v) / cells
 
 
+class _PixelStrata(CellStrata):
+    """Provide samples of listed pixels, with strata of directions."""
+
+    inside = True
+
+    def directions(self) -> tuple[Any, Any]:
+        """Return a uniform point of each stratum of the unit square; a hash of the pixel chooses their order."""
+        u, v = self.jitter(_FIRST_BOUNCE)
+        order = self.index ^ (((self.pixel ^ self._key) * 0x9E3779B1) >> 16)
+        side = round(_ON_VEHICLE**0.5)
+        x, y = order & (side - 1), (order >> (side.bit_length() - 1)) & (side - 1)
+        return (mi.Float(x) + u) / side, (mi.Float(y) + v) / side
+
+
 def _reversed(three_bits: Any) -> Any:
     """Return three bits in reverse order, so that neighbouring pixels of a tile get distant strata."""
     return ((three_bits & 1) << 2) | (three_bits & 2) | (three_bits >> 2)
 
 
-def _smoothed(image: Image, scene: RenderInput, truth: Truth) -> Image:
-    """Return the radiance with brightness filtered along surfaces and colour averaged over a wider window."""
-    brightness = image.sum(axis=0)
-    if not brightness.any():
-        return image
-    guide = _Guide(scene, truth)
-    smooth = mi.Float(brightness.ravel())
-    for stride in _STRIDES:
-        smooth = guide.filtered(smooth, stride)
-        dr.eval(smooth)
-    bands = np.stack([_coarse(band) for band in image])
-    colour = bands / np.maximum(bands.sum(axis=0), 1e-6 * brightness.max())
-    shape, bright = brightness.shape[::-1], smooth.numpy().reshape(brightness.shape)
-    return np.stack([cv2.resize(c, shape, interpolation=cv2.INTER_LINEAR) * bright for c in colour])
-
-
-def _coarse(band: Image) -> Image:
-    """Return the band averaged over a wide window, on every fourth pixel in x and y."""
-    small = cv2.resize(band, None, fx=1 / 4, fy=1 / 4, interpolation=cv2.INTER_AREA)
-    return np.asarray(cv2.GaussianBlur(small, (0, 0), _COLOUR_PX / 4))
-
-
 class _Guide:
-    """Hold the normals and depths that show which neighbours lie on the same surface."""
+    """Hold the normals and depths of a view's pixels, which show which neighbours lie on the same surface.
 
-    def __init__(self, scene: RenderInput, truth: Truth) -> None:
-        self.optics = Optics(scene.view)
-        self.width, self.height = scene.view.width_px, scene.view.height_px
+    `record` holds, for each pixel, the normal in camera axes and the depth; the depth is 0 on the sky.
+    """
+
+    def __init__(self, view: View, record: Any) -> None:
+        self.optics = Optics(view)
+        self.width, self.height = view.width_px, view.height_px
+        self._record = record
+        self._pixel_size = dr.opaque(mi.Float, 1 / float(view.intrinsics[0]))
+
+    @classmethod
+    def of(cls, view: View, truth: Truth) -> _Guide:
+        """Return the guide of a view's truth."""
         record = np.concatenate([truth.normal.astype(np.float32), truth.depth_m[..., None]], axis=2)
         record[~np.isfinite(truth.depth_m)] = 0
-        self._record = mi.Float(np.ascontiguousarray(record).ravel())
-        self._pixel_size = dr.opaque(mi.Float, 1 / float(scene.view.intrinsics[0]))
+        return cls(view, mi.Float(record.ravel()))
 
     def _geometry_at(self, x: Any, y: Any) -> tuple[Any, Any, Any]:
         """Return the normal, the position in camera axes and the depth (0 on the sky) at pixels."""
@@ -244,3 +306,28 @@ class _Guide:
                 total += weight * dr.gather(mi.Float, values, mi.UInt32(qy * self.width + qx))
                 weights += weight
         return dr.select((depth > 0) & (weights > 0), total / dr.maximum(weights, 1e-20), values)
+
+    def interpolated(self, values: Any, finer: _Guide) -> Any:
+        """Return the values at pixels of half the size, from neighbours on the same surface."""
+        pixel = dr.arange(mi.Int32, finer.width * finer.height)
+        x, y = pixel % finer.width, pixel // finer.width
+        normal, point, depth = finer._geometry_at(x, y)
+        per_plane = 1 / (_SIGMA_PLANE_PX * self._pixel_size * dr.maximum(depth, 1e-6))
+        total, weights, plain, count = mi.Float(0), mi.Float(0), mi.Float(0), mi.Float(0)
+        # the nearest pixel of the coarser grid has 3/4 of the weight along each axis, that on the other side 1/4
+        for down in (0, 1):
+            for right in (0, 1):
+                qx = dr.clip((x >> 1) + right * (2 * (x & 1) - 1), 0, self.width - 1)
+                qy = dr.clip((y >> 1) + down * (2 * (y & 1) - 1), 0, self.height - 1)
+                other, other_point, far = self._geometry_at(qx, qy)
+                off = dr.dot(normal, other_point - point) * per_plane
+                turn = dr.squared_norm(other - normal) * (1 / _SIGMA_NORMAL**2)
+                near = dr.select(far > 0, (3 - 2 * right) * (3 - 2 * down), 0.0)
+                value = dr.gather(mi.Float, values, mi.UInt32(qy * self.width + qx))
+                weight = near * dr.exp(-0.5 * (off * off + turn))
+                total, weights = total + weight * value, weights + weight
+                plain, count = plain + near * value, count + near
+        # a pixel whose surface no neighbour shares takes their mean
+        alike = weights > 1e-4
+        mean = dr.select(alike, total, plain) / dr.maximum(dr.select(alike, weights, count), 1e-20)
+        return dr.select(depth > 0, mean, 0)

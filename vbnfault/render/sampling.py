@@ -206,9 +206,10 @@ class Optics:
         on_aperture = strata.disc(1) if self.aperture > 0 else None
         return mi.Ray3f(*self.direction(x, y, on_aperture))
 
-    def centre_rays(self) -> Any:
-        """Return one pinhole ray through every pixel centre."""
-        pixel = dr.arange(mi.UInt32, self.width * self.height)
+    def centre_rays(self, pixel: Any = None) -> Any:
+        """Return pinhole rays through the centres of pixels, given by row-major number; default: all pixels."""
+        if pixel is None:
+            pixel = dr.arange(mi.UInt32, self.width * self.height)
         x = mi.Float(pixel % self.width) + 0.5
         y = mi.Float(pixel // self.width) + 0.5
         return mi.Ray3f(*self.direction(x, y))
