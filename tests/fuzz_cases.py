@@ -23,9 +23,20 @@ def dry(scene: Path, *settings: str) -> list[str]:
     return ["build", str(scene), "--out", out, "--dry-run", *(x for s in settings for x in ("--set", s))]
 
 
+COMA: dict[str, Any] = {
+    "afrho_cm": 900.0,
+    "phase_function": {"phase_deg": [0.0, 90.0, 180.0], "value": [1.0, 0.4, 5.0]},
+    "jets": [{"latitude_deg": 10.0, "longitude_deg": 20.0, "width_deg": 9.0, "strength": 0.2}],
+    "random_jets": 3,
+    "random_jet_width_deg": [5.0, 10.0],
+}
+
+
 def case_scene(seeds: Seeds, rng: random.Random, here: Path) -> Case:
     """Damage a scene file: the small one or a packaged one."""
     table = rng.choice([seeds.scene, seeds.scene, *seeds.scenes])
+    if rng.random() < 0.2:
+        table = {**table, "coma": COMA}
     path = here / "scene.toml"
     path.write_bytes(any_toml(table, rng))
     return dry(path), {}

@@ -9,6 +9,7 @@ share a grid of pixels. Neither grid crosses the body's limb, so the limb stays 
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -120,16 +121,15 @@ def haze(coma: Coma, shadow: Shadow | None, view: View, depth_m: F32, semantic: 
     sine = np.maximum(np.sqrt(first * first + second * second), np.float32(1e-6))
     x, y = frame.slopes(x_px, y_px)
     length = np.where(sky, 0, depth_m) * np.sqrt(1 + x[None, :] ** 2 + y[:, None] ** 2).astype(np.float32)
-    out = _columns(coma, frame.distance_m, sine, cosine, length, sky)
-    if sky.any():
-        towards_sky = _on_sky(frame, sky, sine, cosine)
-        out *= towards_sky if sky.all() else np.where(sky, towards_sky, 1)
-    if not sky.all():
-        rows, columns = (_bounds(np.any(~sky, axis=axis)) for axis in (1, 0))
-        part = (slice(*rows), slice(*columns))
-        ground = _on_ground(frame, rows, columns, length[part], (semantic == BODY)[part])
-        out[part] *= np.where(sky[part], 1, ground)
-        _soften_limb(out, sky)
+    rows, columns = (_bounds(np.any(~sky, axis=axis)) for axis in (1, 0))
+    part = (slice(*rows), slice(*columns))
+    with ThreadPoolExecutor(2) as aside:  # numpy leaves the interpreter to others in the meantime
+        towards_sky = aside.submit(_on_sky, frame, sky, sine, cosine)
+        ground = aside.submit(_on_ground, frame, rows, columns, length[part], (semantic == BODY)[part])
+        out = _columns(coma, frame.distance_m, sine, cosine, length, sky)
+    out *= np.where(sky, towards_sky.result(), 1)
+    out[part] *= np.where(sky[part], 1, ground.result())
+    _soften_limb(out, sky)
     out *= np.float32(coma.afrho_m / (8 * np.pi**2))
     return out
 
@@ -154,9 +154,9 @@ def _columns(coma: Coma, distance_m: float, sine: F32, cosine: F32, length_m: F3
 
 
 def _bounds(any_of: Mask) -> tuple[int, int]:
-    """Return the first index that is set, and the one behind the last."""
+    """Return the first index that is set, and the one behind the last; 0 and 0 if none is."""
     found = np.flatnonzero(any_of)
-    return int(found[0]), int(found[-1]) + 1
+    return (int(found[0]), int(found[-1]) + 1) if len(found) else (0, 0)
 
 
 def _soften_limb(image: F32, sky: Mask) -> None:
@@ -177,6 +177,8 @@ def _positions_px(first: int, last: int, stride: int = 1) -> F64:
 
 def _on_sky(frame: _Frame, sky: Mask, sine: F32, cosine: F32) -> F32:
     """Return the light of lines without end, over that of a line with G = 1, float32[y, x]."""
+    if not sky.any():
+        return np.ones(sky.shape, dtype=np.float32)
     # the tangent of half the angle from the centre, by a formula without cancellation
     tangent = sine[sky] / np.maximum(1 + cosine[sky], np.float32(1 / _MOST_TANGENT))
     bounds = np.log(float(tangent.min())), np.log(float(tangent.max()))
@@ -267,7 +269,9 @@ def _on_ground(frame: _Frame, rows: tuple[int, int], columns: tuple[int, int], l
     The nodes take the mean length of the lines around them. What is not the body has the values of its neighbours.
     """
     height, width = length_m.shape
-    count = max(int(np.count_nonzero(body)), 1)
+    if not body.any():
+        return np.ones((height, width), dtype=np.float32)
+    count = int(np.count_nonzero(body))
     stride = max(1, int(np.ceil(np.sqrt(count / _GROUND_NODES))))
     below, right = -height % stride, -width % stride
     size = ((width + right) // stride, (height + below) // stride)
@@ -278,8 +282,6 @@ def _on_ground(frame: _Frame, rows: tuple[int, int], columns: tuple[int, int], l
 
     share = means(body)
     seen = share > 0
-    if not seen.any():
-        return np.ones((height, width), dtype=np.float32)
     lengths = (means(np.where(body, length_m, 0)) / np.maximum(share, 1e-9))[seen]
     x_px, y_px = (first + _positions_px(0, n, stride) for first, n in zip((columns[0], rows[0]), size, strict=True))
     directions = frame.directions(x_px, y_px)[seen.ravel()]
