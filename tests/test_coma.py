@@ -13,7 +13,7 @@ from scipy.integrate import quad
 
 import vbnfault
 from vbnfault import pipeline
-from vbnfault.body import ellipsoid
+from vbnfault.body import Body, ellipsoid, site_at
 from vbnfault.core import spectra
 from vbnfault.core.errors import InputError
 from vbnfault.core.quantities import BODY, SKY
@@ -22,7 +22,7 @@ from vbnfault.render.description import View
 from vbnfault.scene import config
 from vbnfault.scene.coma import ComaTable, PhaseFunctionTable
 from vbnfault.scene.trajectory import as_trajectory
-from vbnfault.world.coma import Coma, Lines, Outflow, Shadow, sun_axes
+from vbnfault.world.coma import Coma, Lines, Outflow, Shadow, make_coma, sun_axes
 from vbnfault.world.dust_phase import relative_phase
 from vbnfault.world.haze import haze
 
@@ -163,8 +163,13 @@ def test_the_shadow_agrees_with_rays_to_the_sun() -> None:
     axes = sun_axes(SUN)
     shadow = Shadow.of(heights_towards_sun(surface, np.zeros(3), axes, reach, 256), axes, reach)
     flow, camera = outflow(), np.array([-3e3, 9e3, 2e3])
-    behind = -SUN * np.linspace(1500, 20e3, 40)[:, None] + 1500 * directions(40, seed=5)
-    rays = (behind - camera) / np.linalg.norm(behind - camera, axis=1, keepdims=True)
+    behind = -SUN * np.linspace(1500, 20e3, 60)[:, None] + 1500 * directions(60, seed=5)
+    before = 1700 * directions(60, seed=6) + 600 * SUN  # also between the spheres
+    rays = np.concatenate([behind, before]) - camera
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    for centre, radius in ((np.zeros(3), RADIUS_M), (RADIUS_M * np.array([1.2, 0.9, 0.4]), 0.5 * RADIUS_M)):
+        rays = rays[np.linalg.norm(np.cross(centre - camera, rays), axis=1) > 1.02 * radius]
+    rays = rays[:: len(rays) // 40][:40]
     lines = Lines.between(camera, rays, np.full(40, np.inf))
     lit = 1 - shadow.swept(lines, flow) / flow.swept(lines)
     angle = lines.start_rad[:, None] + lines.swept_rad[:, None] * (np.arange(4000) + 0.5) / 4000
@@ -369,7 +374,9 @@ def test_jets_turn_with_the_body_and_stop_at_night() -> None:
     opposite = 64 - place
     at, mirrored = ((int(p[1]), int(p[0])) for p in (place, opposite))
     assert day[at] > 5 * day[mirrored]
-    assert night[at] < 1.2 * night[mirrored]
+    # at night the jet is off, and its axis is that of the shadow: of a line across it, 2 atan(R/b) of π is dark
+    b_m = np.hypot(at[1] + 0.5 - 32, at[0] + 0.5 - 32) / focal * 120e3
+    assert night[at] / night[mirrored] == pytest.approx(1 - 2 * np.arctan(RADIUS_M / b_m) / np.pi, rel=0.04)
     # the axis is where the light is: the brightest pixel of a ring lies on it
     row, column = np.indices(day.shape) + 0.5
     radius = np.hypot(row - 32, column - 32)
@@ -401,6 +408,23 @@ def test_a_store_holds_the_coma_and_scenes_without_one_stay_as_they_are(tmp_path
     other = pipeline.Session(without).simulate(1)
     assert (other.layers["radiance"] < sample.layers["radiance"]).all()  # dust before every pixel
     np.testing.assert_array_equal(other.layers["semantic"], sample.layers["semantic"])
+
+
+def test_a_jet_follows_the_cosine_of_the_suns_zenith_angle_and_the_distance_its_power() -> None:
+    vertices, faces = ellipsoid((RADIUS_M, RADIUS_M, RADIUS_M))
+    body = Body(name="sphere", vertices_m=vertices, faces=faces)
+    site = site_at(body, 0, (RADIUS_M, 0.0, 0.0))
+    jets = [{"latitude_deg": 0.0, "longitude_deg": turn, "strength": 0.5} for turn in (0.0, 60.0, 200.0)]
+    table = ComaTable.model_validate({"afrho_cm": 200.0, "jets": jets, "random_jets": 5, "reference_au": 2.0})
+    dust = make_coma(table, body, site, site.T_from_L.T @ np.array([1.0, 0, 0]), 4.0, 7)
+    np.testing.assert_allclose(dust.outflow.strength[:2], [0.5, 0.25], rtol=1e-6)  # the third is at night
+    np.testing.assert_allclose(site.T_from_L @ dust.outflow.axes[1], [0.5, 0.75**0.5, 0], atol=1e-9)
+    assert dust.afrho_m == pytest.approx(2 * 2.0**-4.15)
+    same, other = (make_coma(table, body, site, site.T_from_L.T @ np.array([1.0, 0, 0]), 4.0, k) for k in (7, 8))
+    np.testing.assert_array_equal(same.outflow.axes, dust.outflow.axes)
+    assert other.outflow.axes.shape != dust.outflow.axes.shape or not np.allclose(
+        other.outflow.axes[2:], dust.outflow.axes[2:]
+    )
 
 
 @pytest.mark.parametrize(
