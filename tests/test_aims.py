@@ -202,6 +202,33 @@ def test_pointing_errors_are_normal_and_turns_uniform() -> None:
         assert np.abs(np.sort(drawn[name]) / high - (np.arange(2000) + 0.5) / 2000).max() < 0.035
 
 
+def test_ground_that_other_ground_hides_is_found_and_does_not_make_facets_coarser() -> None:
+    """Against a search through all facets, from above a site between the lobes of the nucleus."""
+    from vbnfault import render
+
+    body, wanted = nucleus(), scene(patch={"facet_m": 0.05, "max_triangles": 1_000_000})
+    smooth = np.zeros(len(body.faces), dtype=bool)
+    model = render.TerrainMesh(body.vertices_m.astype(np.float32), body.faces, smooth)
+    camera = np.array([900.0, 300.0, 2500.0])
+    facing = np.einsum("ni,ni->n", body.vertex_normals, body.vertices_m - camera) < 0
+    points = body.vertices_m[facing][::60]
+    expected = []
+    for point in points:
+        distance = np.linalg.norm(point - camera)
+        hit = ground.first_hit(body, camera, (point - camera) / distance)
+        expected.append(hit is not None and np.linalg.norm(hit - camera) < 0.999 * distance)
+    hidden = render.hidden_points(model, camera, points)
+    assert 5 < hidden.sum() < len(points) - 5
+    assert (hidden != expected).sum() <= 0.01 * len(points)  # float32
+    # straight down, the ground in the frame is about as far as the site: facets of a pixel, or somewhat more
+    site = site_at(body, 0, body.vertices_m[np.argmax(body.vertices_m[:, 2])])
+    values = {"distance_m": 700.0, "target_x_deg": 0.0, "target_y_deg": 0.0, "camera_turn_deg": 0.0}
+    pose = aiming.aimed_view(wanted, body, site, "nadir", values | {"phase_deg": 30.0, "sun_turn_deg": 0.0}).pose
+    (detail,) = ground.ground_details(wanted, body, [pose])
+    assert detail.radius_m < 2 * 700 * np.tan(np.radians(FOV_DEG / 2))
+    assert detail.facet_m < 1.1 * 700 * ground.pixel_rad(wanted)
+
+
 # ------------------------------------------------------------------------------------------- stored samples
 
 

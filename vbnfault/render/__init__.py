@@ -20,7 +20,15 @@ if TYPE_CHECKING:
     from .integrate import radiance
     from .layers import truth
     from .light import Sampled, direct, direct_by_sample
-    from .resolve import first_ground, ground_height_m, is_between, is_clear, sun_visible_fraction, sunlit_ground
+    from .resolve import (
+        first_ground,
+        ground_height_m,
+        hidden_points,
+        is_between,
+        is_clear,
+        sun_visible_fraction,
+        sunlit_ground,
+    )
     from .runtime import set_threads
     from .sun_heights import heights_towards_sun
     from .surface import TerrainMesh
@@ -43,6 +51,7 @@ _HOMES = {
     "direct_in_cells": "cells",
     "ground_height_m": "resolve",
     "heights_towards_sun": "sun_heights",
+    "hidden_points": "resolve",
     "indirect": "bounces",
     "is_between": "resolve",
     "is_clear": "resolve",
@@ -111,6 +120,7 @@ __all__ = [
     "first_ground",
     "ground_height_m",
     "heights_towards_sun",
+    "hidden_points",
     "indirect",
     "is_between",
     "is_clear",

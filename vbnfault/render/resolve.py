@@ -120,6 +120,16 @@ def is_between(surface: TerrainMesh, origin_L_m: F64, points_L_m: F64) -> bool:
     return bool(_any_hit(surface, origin_L_m[None], (ray / length[:, None])[None], length).any())
 
 
+def hidden_points(surface: TerrainMesh, origin_m: F64, points_m: F64) -> NDArray[np.bool_]:
+    """Return which points of the surface, float64[n, 3], other parts of it hide from `origin_m`, bool[n].
+
+    Parts within 0.1 % of the distance in front of a point count as the point itself.
+    """
+    ray = points_m - origin_m
+    length = np.maximum(np.linalg.norm(ray, axis=1), 1e-9)
+    return _any_hit(surface, origin_m[None], (ray / length[:, None])[None], 0.999 * length)[0]
+
+
 def sun_visible_fraction(
     surface: TerrainMesh, position_L_m: F64, suns: list[Sunlight], L_from_C: F64 | None = None
 ) -> F64:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +18,9 @@ from numpy.typing import NDArray
 from ..body import Body, Site, site_at
 from ..scene.config import Scene
 from ..scene.trajectory import FlownPose
+
+if TYPE_CHECKING:
+    from ..render import TerrainMesh
 
 F64 = NDArray[np.float64]
 
@@ -87,11 +91,17 @@ def ground_details(scene: Scene, body: Body, poses: Sequence[FlownPose]) -> list
             group.clear()
             seen.clear()
 
+    from .. import render
+
+    model: TerrainMesh | None = None
     budget = _SHARED_FRACTION * scene.patch.max_triangles
     for k, pose in enumerate(poses):
         if whole[k] is not None:
             continue
-        here = _seen(scene, body, pose)
+        if model is None:
+            smooth = np.zeros(len(body.faces), dtype=bool)
+            model = render.TerrainMesh(body.vertices_m.astype(np.float32), body.faces, smooth)
+        here = _seen(scene, body, pose, model)
         enough = max(budget, _MORE * _even_triangles(_around(scene, [here])))
         if group and _even_triangles(_around(scene, [*seen, here])) > enough:
             close()
@@ -180,11 +190,13 @@ def _even_triangles(detail: GroundDetail) -> float:
     return float(np.pi * detail.radius_m**2 / (_TRIANGLE * detail.facet_m**2))
 
 
-def _seen(scene: Scene, body: Body, pose: FlownPose) -> _Seen:
-    """Return the ground in a frame: the vertices that face the camera, and what a few rays meet.
+def _seen(scene: Scene, body: Body, pose: FlownPose, model: TerrainMesh) -> _Seen:
+    """Return the ground in a frame: the vertices that no other ground hides, and what a few rays meet.
 
-    Ground behind other ground may be included. If there is none, it is the vertex nearest to the line of sight.
+    If there is none, it is the vertex nearest to the line of sight. `model` is the shape model in T.
     """
+    from .. import render
+
     camera = scene.camera
     slope = np.tan(np.radians(camera.fov_deg) / 2)
     slopes = slope * np.array([1.0, camera.height_px / camera.width_px])
@@ -192,13 +204,14 @@ def _seen(scene: Scene, body: Body, pose: FlownPose) -> _Seen:
     x, y, z = (away @ pose.T_from_C).T
     framed = (z > 0) & (np.abs(x) <= slopes[0] * z) & (np.abs(y) <= slopes[1] * z)
     facing = np.einsum("ni,ni->n", body.vertex_normals, away) < 0
-    points = [body.vertices_m[framed & facing]]
+    vertices = body.vertices_m[framed & facing]
+    points = [vertices[~render.hidden_points(model, pose.camera_position_T_m, vertices)]] if len(vertices) else []
     for across in np.linspace(-slopes[0], slopes[0], _RAYS):
         for down in np.linspace(-slopes[1], slopes[1], _RAYS):
             towards = pose.T_from_C @ np.array([across, down, 1.0])
             hit = first_hit(body, pose.camera_position_T_m, towards / np.linalg.norm(towards))
             points += [] if hit is None else [hit[None]]
-    ground = np.concatenate(points)
+    ground = np.concatenate(points) if points else np.zeros((0, 3))
     if not len(ground):
         ground = looked_at(body, pose.camera_position_T_m, pose.T_from_C[:, 2])[None]
     distance = np.linalg.norm(ground - pose.camera_position_T_m, axis=1)
