@@ -9,8 +9,8 @@ azimuthal harmonic n:
 
 `ghost_response` traces T once for a lens, from rays through the boxes of all ghosts (`ghosts.boxes`), and
 `GhostResponse` applies it. A source counts in the two rings and the two azimuths next to it, with linear weights.
-The light of each ray is spread over the sensor by a Gaussian that is as wide as the distance of the rays, at least
-half a ring. Ghosts that are sharper than a ring are therefore smooth on this scale.
+The light of each ray is spread over the sensor by a Gaussian that is as wide as the distance of its neighbours, at
+least half a ring. Ghosts that are sharper than a ring are therefore smooth on this scale.
 
 A stop with blades is replaced by a round one of the same area, as in the image of the scene.
 """
@@ -306,7 +306,8 @@ class _Tracing:
             low, width = box[seen, k] - box[seen, 2 + k], 2 * box[seen, 2 + k] / _COARSE
             parts.append((low + (first + last) / 2 * width, (last - first) / 2 * width, last - first))
         (cx, hx, rows), (cy, hy, columns) = parts
-        rings = _spacing(x[seen], y[seen], near[seen]) / self.cells.ring_mm * np.maximum(rows, columns)
+        spacing = _median(_spacing(x[seen], y[seen], near[seen]), near[seen])
+        rings = spacing / self.cells.ring_mm * np.maximum(rows, columns)
         wanted = np.maximum(np.minimum(rings, _ENOUGH), rings / (_CLOSE * self.cells.rings))
         across = np.array(_ACROSS)[np.minimum(np.searchsorted(_ACROSS, wanted), len(_ACROSS) - 1)]
         return _Ghosts(route[seen], np.column_stack([cx, cy, hx, hy]), across)
@@ -329,7 +330,7 @@ class _Tracing:
         # the Sun's beam is inclined, and both halves of the box count
         area = 2 * 4 * rays.box_mm[:, 2] * rays.box_mm[:, 3] / across**2 / np.hypot(1, slope)
         move = np.abs(self.tracer.matrix[ghosts.route, 0, 1]) * spacing
-        apart = np.maximum(_spacing(x, y, lit > 0), move) / self.cells.ring_mm
+        apart = np.maximum(_spacing(x, y, lit > 0), move[:, None, None]) / self.cells.ring_mm
         level = np.clip(np.ceil(np.log2(np.maximum(apart, 1e-9))), 0, _LEVELS - 1).astype(np.int64)
         return _Arrived(x, y, lit * area[:, None, None].astype(np.float32), level)
 
@@ -346,7 +347,7 @@ class _Tracing:
         radius = np.maximum(radius[chosen], 0)
         ring, node = radius.astype(np.int64), np.minimum(turn.astype(np.int64), nodes - 2)
         across, along = radius - ring, turn - node
-        first = (arrived.level[ghost] * rings + ring) * nodes + node
+        first = (arrived.level[chosen] * rings + ring) * nodes + node
         cells = np.column_stack([first, first + 1, first + nodes, first + nodes + 1])
         weights = np.column_stack(
             [(1 - across) * (1 - along), (1 - across) * along, across * (1 - along), across * along]
@@ -376,7 +377,7 @@ class _Ghosts:
 
 @dataclass(frozen=True, eq=False)
 class _Arrived:
-    """Hold positions and flux of rays on the sensor, [ghost, y, x], and the level of each ghost's Gaussian."""
+    """Hold positions and flux of rays on the sensor, and the level of the Gaussian of each, [ghost, y, x] each."""
 
     x_mm: F32
     y_mm: F32
@@ -385,21 +386,32 @@ class _Arrived:
 
 
 def _spacing(x: F32, y: F32, lit: NDArray[np.bool_]) -> F64:
-    """Return the median distance of neighbouring lit rays, of rows or columns, the larger of both, float64[ghost].
+    """Return the distance of each ray from its lit neighbours, float64[ghost, y, x]; 0 where there are none.
 
-    The rays of a ghost that is nearly in focus have long tails, in which there is little light.
+    It is the mean over both neighbours in the row or in the column, the larger of both. In a caustic the rays of a
+    ghost are much closer than elsewhere.
     """
-    apart = np.zeros(len(x))
+    apart = np.zeros(x.shape)
     for axis in (1, 2):
         before, behind = (
             tuple(slice(n, n - 1 or None) if k == axis else slice(None) for k in range(3)) for n in (0, 1)
         )
-        both = (lit[before] & lit[behind]).reshape(len(x), -1)
-        step = np.hypot(x[behind] - x[before], y[behind] - y[before]).reshape(len(x), -1)
-        ordered = np.sort(np.where(both, step, np.inf), axis=1)
-        middle = np.take_along_axis(ordered, both.sum(axis=1)[:, None] // 2, axis=1)[:, 0]
-        apart = np.maximum(apart, np.where(np.isfinite(middle), middle, 0))
+        both = lit[before] & lit[behind]
+        step = np.where(both, np.hypot(x[behind] - x[before], y[behind] - y[before]), 0)
+        total, count = np.zeros(x.shape), np.zeros(x.shape)
+        for part in (before, behind):
+            total[part] += step
+            count[part] += both
+        apart = np.maximum(apart, total / np.maximum(count, 1))
     return apart
+
+
+def _median(values: F64, lit: NDArray[np.bool_]) -> F64:
+    """Return the median over the lit rays of each ghost, float64[ghost]; 0 where none is lit."""
+    ordered = np.sort(np.where(lit, values, np.inf).reshape(len(values), -1), axis=1)
+    count = lit.reshape(len(lit), -1).sum(axis=1)
+    middle = np.take_along_axis(ordered, np.minimum(count // 2, ordered.shape[1] - 1)[:, None], axis=1)[:, 0]
+    return np.where(count > 0, middle, 0.0)
 
 
 def _within(count: int) -> F64:
