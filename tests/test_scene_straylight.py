@@ -23,7 +23,7 @@ from vbnfault.lens.prescription import Prescription
 from vbnfault.lens.straylight.bundles import Tracer
 from vbnfault.lens.straylight.ghosts import boxes, lit_cells, traced_ghosts
 from vbnfault.lens.straylight.scatter import Cleanliness
-from vbnfault.lens.straylight.scene import RenderGrid, SceneInLens
+from vbnfault.lens.straylight.scene import RenderGrid, SceneInLens, surrounding_grids
 from vbnfault.lens.straylight.settings import Baffle, DirectPath, SensorGrid, StraylightSettings, SunSource
 from vbnfault.lens.straylight.total import SunlightInLens
 from vbnfault.pipeline.record import to_sample
@@ -74,10 +74,10 @@ def disc(shape: tuple[int, int], x: float, y: float, radius: float) -> F32:
     return lit[None]
 
 
-def points(scene: SceneInLens, radiance: F32, within: int) -> list[tuple[float, float, F64]]:
+def points(grid: RenderGrid, radiance: F32, within: int) -> list[tuple[float, float, F64]]:
     """Slopes and irradiance float64[band] of points in all lit pixels, `within`² in each."""
-    height, width = scene.render.shape
-    focal = scene.render.focal_px
+    height, width = grid.shape
+    focal = grid.focal_px
     offsets = (np.arange(within) + 0.5) / within
     out = []
     for row, column in zip(*np.nonzero(radiance.any(axis=0)), strict=True):
@@ -89,13 +89,15 @@ def points(scene: SceneInLens, radiance: F32, within: int) -> list[tuple[float, 
     return out
 
 
-def ghosts_of_every_pixel(scene: SceneInLens, radiance: F32, across: int = 64, within: int = 3) -> F64:
+def ghosts_of_every_pixel(
+    scene: SceneInLens, radiance: F32, across: int = 64, within: int = 3, grid: RenderGrid | None = None
+) -> F64:
     """Ghosts of points in all lit pixels, by exact rays that are counted in the pixels that they meet."""
     made = Tracer(scene.lens, scene.nodes_nm)
     (height, width), pitch = scene.sensor.shape, scene.sensor.pitch_mm
     bands = len(scene.nodes_nm)
     out, rng = np.zeros((bands, height * width)), np.random.default_rng(1)
-    for x, y, irradiance in points(scene, radiance, within):
+    for x, y, irradiance in points(grid or scene.render, radiance, within):
         slope, azimuth = np.hypot(x, y), np.arctan2(y, x)
         rays, _ = boxes(made, float(np.degrees(np.arctan(slope))))
         cosine = 1 / np.hypot(1, slope)
@@ -117,11 +119,13 @@ def ghosts_of_every_pixel(scene: SceneInLens, radiance: F32, across: int = 64, w
     return out.reshape(bands, height, width) / pitch**2
 
 
-def scattered_of_every_pixel(scene: SceneInLens, radiance: F32, within: int = 3) -> tuple[F64, F64]:
+def scattered_of_every_pixel(
+    scene: SceneInLens, radiance: F32, within: int = 2, grid: RenderGrid | None = None
+) -> tuple[F64, F64]:
     """Glare and veil of points in all lit pixels, each computed as that of a Sun."""
     glare = np.zeros((len(scene.nodes_nm), *scene.sensor.shape))
     veil = np.zeros_like(glare)
-    for x, y, irradiance in points(scene, radiance, within):
+    for x, y, irradiance in points(grid or scene.render, radiance, within):
         sun = SunSource(
             angle_deg=float(np.degrees(np.arctan(np.hypot(x, y)))), azimuth_deg=float(np.degrees(np.arctan2(y, x)))
         )
@@ -215,6 +219,45 @@ def test_linear_in_the_radiance(singlet: Prescription) -> None:
     both = scene.straylight(one + other, np.eye(1)).total
     np.testing.assert_allclose(both, light + scene.straylight(other, np.eye(1)).total, rtol=1e-4)
     assert not scene.straylight(0 * one, np.eye(1)).total.any()
+
+
+def test_sources_out_of_the_field() -> None:
+    """A lit patch beside the frame, in a coarse render around it, as points of that patch."""
+    scene = behind(
+        load_lens("tessar_50_f2p8"),
+        32,
+        35.0,
+        cleanliness=Cleanliness(roughness_nm=1.0, level=100),
+        veil_fraction=0.01,
+    )
+    grids = surrounding_grids(scene.render)
+    scene = replace(scene, around=grids)
+    dark = np.zeros((1, *scene.render.shape), np.float32)
+    around = [np.zeros((1, *grid.shape), np.float32) for grid in grids]
+    # the frame covers ± 16 of these pixels
+    around[0][0, 60:64, 84:88] = 1
+    assert grids[0].outside[62, 86] == 1
+    found = scene.straylight(dark, np.eye(1), around)
+    glare, veil = scattered_of_every_pixel(scene, around[0], grid=grids[0])
+    ghosts = ghosts_of_every_pixel(scene, around[0], within=2, grid=grids[0])
+    for own, oracle in ((found.ghosts, ghosts), (found.glare, glare), (found.veil, veil)):
+        assert oracle.any()
+        # cells of sources are as coarse as the pixels of the patch
+        assert own.sum() == pytest.approx(oracle.sum(), rel=0.03)
+        assert np.corrcoef(own.ravel(), oracle.ravel())[0, 1] > 0.99
+
+
+def test_what_two_renders_show_counts_once() -> None:
+    """A sky of one brightness: the pixels of all renders together have its projected solid angle, π sin² of 75°."""
+    main = RenderGrid(shape=(48, 64), focal_px=600.0)
+    total = 0.0
+    for grid in (main, *surrounding_grids(main)):
+        slope = np.hypot(*grid.slopes)
+        sky = grid.irradiance(np.ones((1, *grid.shape), np.float32))[0]
+        inside = slope < np.tan(np.radians(70))
+        total += float((sky / np.hypot(1, slope))[inside].sum())
+    # pixels at the edge of the circle count whole or not at all
+    assert total == pytest.approx(np.pi * np.sin(np.radians(70)) ** 2, rel=0.005)
 
 
 def test_light_of_the_guard_band_counts_and_a_baffle_keeps_it_out(singlet: Prescription) -> None:

@@ -47,6 +47,9 @@ class FaultContext:
     radiance
         Radiance of the scene on the grid of its render, that of a pinhole camera with a guard band. None for a
         user's own image.
+    surroundings
+        Radiance around that render, on the grids of `lens.straylight.scene.surrounding_grids`; empty if no fault of
+        the sample needs it.
     coating_loss
         Fraction of the coatings' area that another fault of the sample has removed, in [0, 1]. Only a model with
         `Fault.informed` gets it; for the others it is 0.
@@ -62,6 +65,7 @@ class FaultContext:
     depth_m: NDArray[np.floating[Any]] | None = None
     up_C: NDArray[np.float64] | None = None
     radiance: Radiance | None = None
+    surroundings: tuple[Radiance, ...] = ()
     coating_loss: float = 0.0
     # `init=False`, because `dataclasses.replace` must not copy results of one frame to another
     _memo: dict[Any, Any] = field(default_factory=dict, init=False, repr=False)

@@ -74,6 +74,8 @@ class Fault:
         False if the footprint covers about the whole frame.
     needs_sun
         True if the model needs the Sun's position.
+    lit_by_surroundings
+        True if light from out of the field acts on the image, so that it is rendered too.
     informed
         True if the model reads a field of the context that another fault of the sample changes by `inform`. The
         other models get the context without such changes.
@@ -117,6 +119,7 @@ class Fault:
     steps: ClassVar[tuple[str, ...]]
     localised: ClassVar[bool] = True
     needs_sun: ClassVar[bool] = False
+    lit_by_surroundings: ClassVar[bool] = False
     informed: ClassVar[bool] = False
     thin_lens_only: ClassVar[str] = ""
     needs_mosaic: ClassVar[bool] = False

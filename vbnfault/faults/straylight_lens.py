@@ -33,9 +33,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core import spectra
-from ..core.quantities import Irradiance
+from ..core.quantities import Irradiance, Radiance
 from ..lens.straylight.scatter import CLEANLINESS_LIMITS, ROUGHNESS_NM_LIMITS, Cleanliness
-from ..lens.straylight.scene import RenderGrid, SceneInLens
+from ..lens.straylight.scene import RenderGrid, SceneInLens, surrounding_grids
 from ..lens.straylight.settings import Baffle, DirectPath, GhostSettings, SensorGrid, StraylightSettings, SunSource
 from ..lens.straylight.total import SunlightInLens, scene_veil_fraction, veil_of
 from .context import FaultContext, Params
@@ -149,6 +149,11 @@ class _LensStraylight(LensFault):
         """Return whether the Sun is the only source."""
         return table.get("sources", "sun") == "sun"
 
+    def __post_init__(self) -> None:
+        """Check every field."""
+        super().__post_init__()
+        object.__setattr__(self, "lit_by_surroundings", self.sources == "scene")
+
     def validate(self) -> None:
         """Raise ValueError if `reflections` is neither 2 nor 4, or a baffle has no radius."""
         super().validate()
@@ -242,19 +247,21 @@ class _LensStraylight(LensFault):
         radiance, camera = context.radiance, context.camera
         if params.get("sources") != "scene" or radiance is None:
             return None
-        array = radiance.array if radiance.sun is None else np.maximum(radiance.array - radiance.sun, 0)
-        nodes = radiance.wavelength_nm
+        array, nodes = _without_sun(radiance), radiance.wavelength_nm
+        render = RenderGrid(shape=(int(array.shape[1]), int(array.shape[2])), focal_px=camera.focal_length_px)
         in_lens = SceneInLens(
             lens=context.frame.prescription(params["lens"], params["coating"]),
             nodes_nm=nodes,
             sensor=_sensor_grid(context),
-            render=RenderGrid(shape=(int(array.shape[1]), int(array.shape[2])), focal_px=camera.focal_length_px),
+            render=render,
+            around=surrounding_grids(render)[: len(context.surroundings)],
             image=camera.lens,
             settings=self._settings(params, context),
             passed=camera.lens.transmittance(nodes),
         )
         weights = camera.detector.electron_rate_weights(nodes).astype(np.float64) * camera.exposure_s
-        return np.ascontiguousarray(in_lens.straylight(array, weights).total.transpose(1, 2, 0))
+        around = [_without_sun(one) for one in context.surroundings]
+        return np.ascontiguousarray(in_lens.straylight(array, weights, around).total.transpose(1, 2, 0))
 
     def sunlight(self, params: Params, context: FaultContext) -> LensSunlight | None:
         """Return the Sun's light in the lens before any ray is traced; None if no Sun is in front of the camera."""
@@ -372,6 +379,11 @@ def _sun(context: FaultContext) -> tuple[float, float] | None:
         return None
     theta = float(np.degrees(np.arctan2(np.hypot(direction[0], direction[1]), direction[2])))
     return (theta, float(np.degrees(np.arctan2(direction[1], direction[0])))) if theta < 89.9 else None
+
+
+def _without_sun(radiance: Radiance) -> F32:
+    """Return the radiance without the Sun's disc, float32[band, y, x]."""
+    return radiance.array if radiance.sun is None else np.maximum(radiance.array - radiance.sun, 0)
 
 
 def _sensor_grid(context: FaultContext) -> SensorGrid:

@@ -70,6 +70,7 @@ def fault_context(pose: Pose, rendering: Rendering, exposure: SceneExposure) -> 
         depth_m=rendering.truth.depth_m,
         up_C=-pose.L_from_C[2],
         radiance=exposure.light.rendered,
+        surroundings=rendering.surroundings,
     )
 
 

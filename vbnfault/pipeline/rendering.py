@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
-from ..core.quantities import SKY, Truth
+from ..core.quantities import SKY, Radiance, Truth
+from ..lens.straylight.scene import RenderGrid, surrounding_grids
 from ..render.description import RenderInput, View
 from ..world import assemble
 from .atmosphere import add_atmosphere
@@ -12,6 +15,7 @@ from .coma import add_coma
 from .noise_budget import SampledRadiance, sample_to_noise
 from .spec import Pose, Rendering, SampleSpec, SceneLight
 
+_SURROUNDING_SAMPLES = 4  # of each pixel of the coarse renders around a view
 _ANGLE_LAYERS = {"incidence_deg", "emission_deg", "phase_deg", "albedo"}
 
 
@@ -85,4 +89,31 @@ def render_view(spec: SampleSpec, pose: Pose) -> Rendering:
         open_sky=guide.semantic == SKY if stars and guide is not None else None,
         samples_per_pixel=sampled.samples_per_pixel,
         noise_fraction_p99=sampled.noise_fraction_p99,
+        surroundings=_surroundings(spec, scene),
     )
+
+
+def _surroundings(spec: SampleSpec, scene: RenderInput) -> tuple[Radiance, ...]:
+    """Render what lies around the view, coarsely, if a fault of the sample needs it."""
+    from .. import render
+
+    if not any(spec.faults[name].lit_by_surroundings for name in spec.commanded):
+        return ()
+    view, out = scene.view, []
+    own = RenderGrid(shape=(view.height_px, view.width_px), focal_px=float(view.intrinsics[0]))
+    for grid in surrounding_grids(own):
+        height, width = grid.shape
+        wide = replace(
+            view,
+            intrinsics=np.array([grid.focal_px, grid.focal_px, width / 2, height / 2]),
+            width_px=width,
+            height_px=height,
+            aperture_radius_m=0.0,
+        )
+        out.append(
+            render.radiance(
+                spec.terrain.surface,
+                replace(scene, view=wide, bounces=0, samples_per_pixel=_SURROUNDING_SAMPLES),
+            )
+        )
+    return tuple(out)

@@ -144,6 +144,8 @@ class Rendering:
     noise_fraction_p99
         99th percentile over the lit pixels of the sampling noise as a fraction of the sensor's noise. NaN if
         `render.noise_fraction` is not set.
+    surroundings
+        Radiance around the render, for the faults that need it; empty if the sample has none.
     """
 
     scene: RenderInput
@@ -152,6 +154,7 @@ class Rendering:
     open_sky: Mask | None
     samples_per_pixel: float
     noise_fraction_p99: float = float("nan")
+    surroundings: tuple[Radiance, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -8,11 +8,15 @@ in the radiance L, so that it is computed from responses that depend on the lens
 - glare by `scene_scatter`, as convolutions over direction cosines;
 - the veil of mount, barrel and edges by its closed form (`total`), from the flux that enters the lens.
 
+Sources out of the field are in coarse renders around the first one (`surrounding_grids`), each four times as wide
+as the one before and without what that one shows.
+
 The Sun's disc is not part of the scene; `total` computes its straylight.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import Any
@@ -32,20 +36,45 @@ from .settings import Baffle, SensorGrid, StraylightSettings
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
+Sources = tuple["RenderGrid", F32]
 
 # Sizes of the cells of ghosts, in rings from the axis to the corner. Halving them changes the ghosts of
 # `nikkor_28_f2p8_camera` by less than 1 % of their light.
 SOURCE_RINGS, SENSOR_RINGS, AZIMUTHS = 64, 96, 512
 _MOST_SOURCES = 512  # along each side of a render; the pixels of a larger one are added up in blocks
 _ANGLES = 17  # field angles of the kernels of glare
+_WIDER = 4.0  # half the width of a surrounding render over that of the render within it
+_SURROUNDING_PX = 128
+_WIDEST_DEG = 75.0
+_RING_RATIO = 1.15  # ratio of the slopes of neighbouring rings of sources out of the field
 
 
 @dataclass(frozen=True, kw_only=True)
 class RenderGrid:
-    """Describe the pinhole render of a scene: (height, width) with its guard band, and focal length in pixels."""
+    """Describe the pinhole render of a scene: (height, width) with its guard band, and focal length in pixels.
+
+    `inner` are half the width and half the height, as tangents, of what another render shows; its light does not
+    count here.
+    """
 
     shape: tuple[int, int]
     focal_px: float
+    inner: tuple[float, float] = (0.0, 0.0)
+
+    @property
+    def half(self) -> tuple[float, float]:
+        """Return half the width and half the height as tangents."""
+        height, width = self.shape
+        return width / 2 / self.focal_px, height / 2 / self.focal_px
+
+    @cached_property
+    def outside(self) -> F32:
+        """Return the fraction of each pixel that lies outside `inner`, float32[y, x]."""
+        covered = []
+        for size, half in zip(self.shape[::-1], self.inner, strict=True):
+            edges = np.clip((np.arange(size + 1) - size / 2) / self.focal_px, -half, half)
+            covered.append(np.diff(edges) * self.focal_px)
+        return np.asarray(1 - covered[1][:, None] * covered[0], dtype=np.float32)
 
     @property
     def block(self) -> int:
@@ -70,12 +99,30 @@ class RenderGrid:
         rows, columns = -(-height // side), -(-width // side)
         # cos³ over f²: the solid angle of a pixel
         solid = (cos4_map(self.shape, self.focal_px) ** np.float32(0.75)) / np.float32(self.focal_px**2)
+        if any(self.inner):
+            solid = solid * self.outside
         out = np.empty((len(radiance), rows, columns), dtype=np.float32)
         padded = np.zeros((rows * side, columns * side), dtype=np.float32)
         for band, sources in zip(radiance, out, strict=True):
             np.multiply(band, solid, out=padded[:height, :width])
             sources[:] = padded.reshape(rows, side, columns, side).sum(axis=(1, 3))
         return out.reshape(len(radiance), -1)
+
+
+def surrounding_grids(render: RenderGrid) -> tuple[RenderGrid, ...]:
+    """Return the grids of coarse renders that show what lies around a render, up to 75 degrees from the axis."""
+    grids: list[RenderGrid] = []
+    widest = float(np.tan(np.radians(_WIDEST_DEG)))
+    inner = render.half
+    while min(inner) < widest:
+        half = min(_WIDER * max(inner), widest)
+        grids.append(
+            RenderGrid(shape=(_SURROUNDING_PX, _SURROUNDING_PX), focal_px=_SURROUNDING_PX / 2 / half, inner=inner)
+        )
+        if half == widest:
+            break
+        inner = half, half
+    return tuple(grids)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -112,6 +159,8 @@ class SceneInLens:
         State of the lens.
     passed
         float64[band]: transmittance of the path that forms the image, as `DirectPath.transmittance`.
+    around
+        Grids of the renders around that of the scene.
     rings
         Largest number of rings of sources and of the sensor, and of azimuths, of the cells of ghosts.
     """
@@ -123,9 +172,10 @@ class SceneInLens:
     image: Lens
     settings: StraylightSettings
     passed: F64
+    around: tuple[RenderGrid, ...] = ()
     rings: tuple[int, int, int] = (SOURCE_RINGS, SENSOR_RINGS, AZIMUTHS)
 
-    def straylight(self, radiance: F32, weights: F64) -> SceneStraylight:
+    def straylight(self, radiance: F32, weights: F64, around: Sequence[F32] = ()) -> SceneStraylight:
         """Return the straylight of a scene.
 
         Parameters
@@ -134,50 +184,58 @@ class SceneInLens:
             float32[band, y, x] on the grid of the render, without the Sun's disc.
         weights
             float64[channel, band], with which the bands are added.
+        around
+            The same of the renders around it, on the grids `around`.
         """
-        irradiance = self.render.irradiance(radiance)
+        renders = zip((self.render, *self.around), (radiance, *around), strict=True)
+        sources = [(render, render.irradiance(array)) for render, array in renders]
         return SceneStraylight(
-            ghosts=self.ghosts(irradiance, weights),
-            glare=self.glare(irradiance, weights),
-            veil=self.veil(irradiance, weights),
+            ghosts=self.ghosts(sources, weights),
+            glare=self.glare(sources, weights),
+            veil=self.veil(sources, weights),
         )
 
-    def ghosts(self, irradiance: F32, weights: F64) -> F32:
-        """Return the ghosts of sources with an irradiance float32[band, source], float32[channel, y, x]."""
+    def ghosts(self, sources: Sequence[Sources], weights: F64) -> F32:
+        """Return the ghosts of sources, float32[channel, y, x].
+
+        `sources` are grids and irradiances float32[band, source] of the sources on them.
+        """
         response = self.response
         cells = response.cells
         if not response.table.any():
             return np.zeros((len(weights), *self.sensor.shape), dtype=np.float32)
-        light = self._places.polar @ irradiance.T
-        light = light.reshape(len(cells.slopes), cells.azimuths, len(irradiance))
+        light = sum(self._places(grid).polar @ irradiance.T for grid, irradiance in sources)
+        light = light.reshape(len(cells.slopes), cells.azimuths, len(self.nodes_nm))
         light *= self._lit(np.array(cells.slopes)).astype(np.float32)[:, None, None]
         return response.image(light, weights, self.sensor)
 
-    def glare(self, irradiance: F32, weights: F64) -> F32:
+    def glare(self, sources: Sequence[Sources], weights: F64) -> F32:
         """Return what the surfaces scatter; arguments and result as those of `ghosts`."""
-        kernel, places = self._kernel, self._places
-        zero = np.zeros((len(weights), *self.sensor.shape), dtype=np.float32)
-        terms = []
-        for of_source, of_offset in zip(kernel.of_source, kernel.of_offset, strict=True):
-            light = np.zeros((len(weights), irradiance.shape[1]), dtype=np.float32)
-            for band, own in enumerate(irradiance):
-                gain = weights[:, band, None] * of_source[band] * self._lit(kernel.slope)
-                for channel, one in zip(light, gain, strict=True):
-                    channel += own * places.at_angle(one)
-            terms.append((light, places.directions.spectrum(kernel.offset, of_offset)))
-        if not terms:
-            return zero
-        scattered = places.directions.convolved(terms) * cos4_map(self.sensor.shape, self._efl_px)
+        scattered = np.zeros((len(weights), *self.sensor.shape), dtype=np.float32)
+        for grid, irradiance in sources:
+            places, kernel = self._places(grid), self._kernel(grid)
+            terms = []
+            for of_source, of_offset in zip(kernel.of_source, kernel.of_offset, strict=True):
+                light = np.zeros((len(weights), irradiance.shape[1]), dtype=np.float32)
+                for band, own in enumerate(irradiance):
+                    gain = weights[:, band, None] * of_source[band] * self._lit(kernel.slope)
+                    for channel, one in zip(light, gain, strict=True):
+                        channel += own * places.at_angle(one)
+                terms.append((light, places.directions.spectrum(kernel.offset, of_offset)))
+            if terms and irradiance.any():
+                scattered += places.directions.convolved(terms)
         # the transform leaves rounding errors where there is no light
-        return np.maximum(scattered, 0, out=zero)
+        return np.maximum(scattered * cos4_map(self.sensor.shape, self._efl_px), 0, out=scattered)
 
-    def veil(self, irradiance: F32, weights: F64) -> F32:
+    def veil(self, sources: Sequence[Sources], weights: F64) -> F32:
         """Return what mount, barrel and edges scatter; arguments and result as those of `ghosts`."""
         properties = paraxial_properties(self.lens)
-        slope = self._places.slope
-        cosine = (self._lit(slope) / np.hypot(1, slope)).astype(np.float32)
-        pupil_mm2 = np.pi / 4 * properties.entrance_pupil_diameter_mm**2
-        entering = np.einsum("bs,s->b", irradiance, cosine, dtype=np.float64) * pupil_mm2
+        entering = np.zeros(len(self.nodes_nm))
+        for grid, irradiance in sources:
+            slope = self._places(grid).slope
+            cosine = (self._lit(slope) / np.hypot(1, slope)).astype(np.float32)
+            entering += np.einsum("bs,s->b", irradiance, cosine, dtype=np.float64)
+        entering *= np.pi / 4 * properties.entrance_pupil_diameter_mm**2
         flux = np.einsum("cb,b->c", weights, entering * self.passed * self.settings.veil_fraction)
         per_mm2 = cos4_map(self.sensor.shape, self._efl_px) * np.float32(1 / (np.pi * properties.efl_mm**2))
         return np.asarray(per_mm2 * flux.astype(np.float32)[:, None, None])
@@ -198,8 +256,12 @@ class SceneInLens:
         corner_px = float(np.hypot(*self.sensor.shape)) / 2
         most = 2 * int(np.ceil(corner_px)), 2 * int(np.ceil(corner_px)), 2 << int(np.log2(2 * np.pi * corner_px))
         sources, rings, azimuths = (min(pair) for pair in zip(self.rings, most, strict=True))
+        slopes = np.linspace(0, float(np.hypot(x, y).max()), sources).tolist()
+        farthest = max((float(np.hypot(*grid.slopes).max()) for grid in self.around), default=0.0)
+        while slopes[-1] < farthest:
+            slopes.append(min(max(_RING_RATIO * slopes[-1], slopes[-1] + slopes[1]), farthest))
         return PolarCells(
-            slopes=tuple(np.linspace(0, float(np.hypot(x, y).max()), sources).tolist()),
+            slopes=tuple(slopes),
             reach_mm=corner_px * self.sensor.pitch_mm,
             rings=rings,
             azimuths=azimuths,
@@ -210,15 +272,14 @@ class SceneInLens:
         """Return the focal length of the lens in pixels of the sensor."""
         return paraxial_properties(self.lens).efl_mm / self.sensor.pitch_mm
 
-    @property
-    def _places(self) -> _Places:
-        """Return where the sources lie."""
-        return _places(self.render, self.sensor, self.image, self._cells, self._efl_px)
+    def _places(self, grid: RenderGrid) -> _Places:
+        """Return where the sources on a grid lie."""
+        field = float(np.hypot(*self.render.half))
+        return _places(grid, field, self.sensor, self.image, self._cells, self._efl_px)
 
-    @cached_property
-    def _kernel(self) -> SeparatedKernel:
-        """Return the glare of a source, with all losses but those at the baffle."""
-        slope = np.tan(np.linspace(0, np.arctan(self._places.slope.max()), _ANGLES))
+    def _kernel(self, grid: RenderGrid) -> SeparatedKernel:
+        """Return the glare of sources on a grid, with all losses but those at the baffle."""
+        slope = np.tan(np.linspace(0, np.arctan(self._places(grid).slope.max()), _ANGLES))
         cleanliness = self.settings.cleanliness
         offset, kernels = glare_kernels(self.lens, slope, wavelength_nm=self.nodes_nm, cleanliness=cleanliness)
         gain = self.passed / axial_transmittance(self.lens, self.nodes_nm) * self._kept_of_single
@@ -276,14 +337,18 @@ class _Places:
         return table[self.angle] + self.rest * np.diff(table)[self.angle]
 
 
-@lru_cache(maxsize=2)
-def _places(render: RenderGrid, sensor: SensorGrid, image: Lens, cells: PolarCells, efl_px: float) -> _Places:
-    """Return where the sources of a render lie; it is cached for the camera."""
+@lru_cache(maxsize=8)
+def _places(
+    render: RenderGrid, field: float, sensor: SensorGrid, image: Lens, cells: PolarCells, efl_px: float
+) -> _Places:
+    """Return where the sources of a render lie; it is cached for the camera.
+
+    The lens's distortion is known up to the slope `field`.
+    """
     x, y = render.slopes
     slope = np.hypot(x, y)
-    stretch = np.ones(len(slope))
-    off_axis = slope > 1e-9
-    stretch[off_axis] = image.distorted(slope[off_axis]) / slope[off_axis]
+    known = np.clip(slope, 1e-9, field)
+    stretch = image.distorted(known) / known
     stretch *= image.focal_length_mm / sensor.pitch_mm / efl_px
     position = np.arctan(slope) / np.arctan(slope.max()) * (_ANGLES - 1)
     angle = np.minimum(position.astype(np.int64), _ANGLES - 2)
