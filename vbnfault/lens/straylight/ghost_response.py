@@ -35,6 +35,7 @@ from .settings import GhostSettings, SensorGrid
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
+_NARROWINGS = 3  # times that the box of a ghost's rays is narrowed to those that arrive near the sensor
 _COARSE = 12  # rays along each side of the lattice by which colours and boxes are known
 _ACROSS = (8, 16, 24, 32, 48, 64)  # rays along each side of the lattice over one half of a ghost
 _ENOUGH = 32  # rays across a ghost whose edges need not be sharper
@@ -289,28 +290,46 @@ class _Tracing:
         )
 
     def _near(self, route: NDArray[np.int64], box: F64, slope: float) -> _Ghosts:
-        """Return the routes with rays that arrive within the rings, and how they are traced."""
-        if not len(route):
-            return _Ghosts(route, box, np.zeros(0, dtype=np.int64))
+        """Return the routes with rays that arrive within the rings, and how they are traced.
+
+        The boxes are narrowed to these rays, again as long as a ghost is much larger than the sensor.
+        """
+        across = np.zeros(len(route), dtype=np.int64)
+        for _ in range(_NARROWINGS):
+            if not len(route):
+                break
+            route, box, across, fraction = self._narrowed(route, box, slope)
+            if (fraction > 0.5).all():
+                break
+        return _Ghosts(route, box, across)
+
+    def _narrowed(
+        self, route: NDArray[np.int64], box: F64, slope: float
+    ) -> tuple[NDArray[np.int64], F64, NDArray[np.int64], F64]:
+        """Return routes, boxes and rays along their sides of `_Ghosts`, and how much each box became smaller."""
         shape = len(route), _COARSE, _COARSE
         rays = self._bundles(route, box, slope, [self.bands // 2])
         spots = self.tracer.trace(rays, _COARSE, centred=True, halved=False)
         x, y, radius = (v.numpy().reshape(shape) for v in (spots.x_mm, spots.y_mm, spots.radius))
-        # a margin of one ray, because a rim may lie between two
-        near = (np.hypot(x, y) < (self.rings + 1) * self.cells.ring_mm) & (radius < 2)
+        # a rim may lie between two rays, and so may the whole sensor
+        passes = radius < 2
+        spacing = _spacing(x, y, passes)
+        near = passes & (np.hypot(x, y) - spacing < self.rings * self.cells.ring_mm)
         seen = near.any(axis=(1, 2))
-        parts = []
-        for lit, k in ((near.any(axis=1)[seen], 0), (near.any(axis=2)[seen], 1)):
+        near, box = near[seen], box[seen]
+        out, fraction, most = np.empty_like(box), np.ones(len(box)), np.zeros(len(box), dtype=np.int64)
+        for lit, k in ((near.any(axis=1), 0), (near.any(axis=2), 1)):
             first = np.maximum(np.argmax(lit, axis=1) - 1, 0)
             last = np.minimum(_COARSE - np.argmax(lit[:, ::-1], axis=1) + 1, _COARSE)
-            low, width = box[seen, k] - box[seen, 2 + k], 2 * box[seen, 2 + k] / _COARSE
-            parts.append((low + (first + last) / 2 * width, (last - first) / 2 * width, last - first))
-        (cx, hx, rows), (cy, hy, columns) = parts
-        spacing = _median(_spacing(x[seen], y[seen], near[seen]), near[seen])
-        rings = spacing / self.cells.ring_mm * np.maximum(rows, columns)
+            width = 2 * box[:, 2 + k] / _COARSE
+            out[:, k] = box[:, k] - box[:, 2 + k] + (first + last) / 2 * width
+            out[:, 2 + k] = (last - first) / 2 * width
+            most = np.maximum(most, last - first)
+            fraction = np.minimum(fraction, (last - first) / _COARSE)
+        rings = _median(spacing[seen], near) / self.cells.ring_mm * most
         wanted = np.maximum(np.minimum(rings, _ENOUGH), rings / (_CLOSE * self.cells.rings))
         across = np.array(_ACROSS)[np.minimum(np.searchsorted(_ACROSS, wanted), len(_ACROSS) - 1)]
-        return _Ghosts(route[seen], np.column_stack([cx, cy, hx, hy]), across)
+        return route[seen], out, across, fraction
 
     def _colours(self, ghosts: _Ghosts, slope: float) -> F32:
         """Return the flux of each ghost in every band over that in the middle band, float32[ghost, band]."""
@@ -408,9 +427,10 @@ def _spacing(x: F32, y: F32, lit: NDArray[np.bool_]) -> F64:
 
 def _median(values: F64, lit: NDArray[np.bool_]) -> F64:
     """Return the median over the lit rays of each ghost, float64[ghost]; 0 where none is lit."""
-    ordered = np.sort(np.where(lit, values, np.inf).reshape(len(values), -1), axis=1)
-    count = lit.reshape(len(lit), -1).sum(axis=1)
-    middle = np.take_along_axis(ordered, np.minimum(count // 2, ordered.shape[1] - 1)[:, None], axis=1)[:, 0]
+    rays = values.shape[1] * values.shape[2]
+    ordered = np.sort(np.where(lit, values, np.inf).reshape(len(values), rays), axis=1)
+    count = lit.sum(axis=(1, 2))
+    middle = np.take_along_axis(ordered, np.minimum(count // 2, rays - 1)[:, None], axis=1)[:, 0]
     return np.where(count > 0, middle, 0.0)
 
 
