@@ -183,10 +183,9 @@ def test_sources_without_ghosts_on_the_sensor(singlet: Prescription) -> None:
     scene = replace(scene, around=surrounding_grids(scene.render))
     table = scene.response.table
     (ghost,) = paraxial_ghosts(singlet, 0.0, wavelength_nm=550.0)
-    # near the axis exact rays are paraxial
-    assert table[0, 0, 0, 0] / scene.response.cells.azimuths == pytest.approx(
-        ghost.peak_irradiance_fraction, rel=0.01
-    )
+    # near the axis exact rays are paraxial; rings are sums over few rays each
+    irradiance = table[0, 0, :, 0].mean() / scene.response.cells.azimuths
+    assert irradiance == pytest.approx(ghost.peak_irradiance_fraction, rel=0.01)
     assert not table[..., -1].any()
 
 

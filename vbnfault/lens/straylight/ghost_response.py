@@ -36,6 +36,7 @@ F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
 _NARROWINGS = 3  # times that the box of a ghost's rays is narrowed to those that arrive near the sensor
+_THIN = 3.0  # distance of rays over the ghost's median, from which on light is thin
 _COARSE = 12  # rays along each side of the lattice by which colours and boxes are known
 _ACROSS = (8, 16, 24, 32, 48, 64)  # rays along each side of the lattice over one half of a ghost
 _ENOUGH = 32  # rays across a ghost whose edges need not be sharper
@@ -311,10 +312,11 @@ class _Tracing:
         rays = self._bundles(route, box, slope, [self.bands // 2])
         spots = self.tracer.trace(rays, _COARSE, centred=True, halved=False)
         x, y, radius = (v.numpy().reshape(shape) for v in (spots.x_mm, spots.y_mm, spots.radius))
-        # a rim may lie between two rays, and so may the whole sensor
+        # a rim may lie between two rays, and so may the whole sensor, but not where the light is very thin
         passes = radius < 2
         spacing = _spacing(x, y, passes)
-        near = passes & (np.hypot(x, y) - spacing < self.rings * self.cells.ring_mm)
+        margin = np.minimum(spacing, _THIN * _median(spacing, passes)[:, None, None])
+        near = passes & (np.hypot(x, y) - margin < self.rings * self.cells.ring_mm)
         seen = near.any(axis=(1, 2))
         near, box = near[seen], box[seen]
         out, fraction, most = np.empty_like(box), np.ones(len(box)), np.zeros(len(box), dtype=np.int64)
