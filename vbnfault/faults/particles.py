@@ -54,7 +54,7 @@ from ..detector.poisson import poisson_above_0
 from ..lens.streaks import Streaks, drawn, inside, pupil_support
 from .context import FaultContext, Params
 from .contract import Fault
-from .fields import Interval, Severity, bounds, number
+from .fields import Interval, bounds, number
 from .planes import plus, times
 
 F32 = NDArray[np.float32]
@@ -75,7 +75,6 @@ class _Particles(Fault):
 
     fault = "particles"
     step = "electrons"
-    severity = Severity(key="density_per_m3", low=1e-3, high=1e3)
     per_exposure = True
     effect_mask = True
 
@@ -209,7 +208,7 @@ class Debris(_Particles):
 # --- light -----------------------------------------------------------------------------------------------------
 
 
-class _Light(NamedTuple):
+class _GrainLight(NamedTuple):
     """Hold what the grains do to the light.
 
     Attributes
@@ -295,15 +294,15 @@ def _pupil_per_pixel(context: FaultContext, slopes: F64) -> F64:
     return np.asarray(area / (camera.detector.pixel_pitch_um * 1e-3) ** 2)
 
 
-def _light_once(params: Params, context: FaultContext) -> _Light | None:
+def _light_once(params: Params, context: FaultContext) -> _GrainLight | None:
     """Return the light of the grains, computed once for each sample; None if there is no grain."""
     return context.once("particles.light", params, lambda: _light(params, context)) if params["count"] else None
 
 
-def _light(params: Params, context: FaultContext) -> _Light:
+def _light(params: Params, context: FaultContext) -> _GrainLight:
     """Return the light of the grains, after the lens's point spread."""
     camera = context.camera
-    grains = _Grains(*(np.asarray(params[name], dtype=np.float64) for name in _Grains._fields))
+    grains = _GrainsInView(*(np.asarray(params[name], dtype=np.float64) for name in _GrainsInView._fields))
     slopes = np.column_stack([grains.slope_x, grains.slope_y])
     border = camera.lens.border_px
     streaks = _streaks(grains, context, pupil_support(context.frame, slopes)).moved(border, border)
@@ -314,7 +313,7 @@ def _light(params: Params, context: FaultContext) -> _Light:
     planes = drawn(streaks, np.stack([irradiance, shadow_px2]), shape, depth).astype(np.float32)
     light, covered = (camera.lens.spread(plane, _REFERENCE_NM) for plane in planes)
     electrons = _electrons_per_irradiance(context, _Sunlight.of(context), params["reddening_per_100nm"])
-    return _Light(
+    return _GrainLight(
         added=np.maximum(light, 0)[..., None] * electrons.astype(np.float32),
         passes=np.clip(1 - covered, 0, 1).astype(np.float32),
     )
@@ -323,7 +322,7 @@ def _light(params: Params, context: FaultContext) -> _Light:
 # --- grains ----------------------------------------------------------------------------------------------------
 
 
-class _Grains(NamedTuple):
+class _GrainsInView(NamedTuple):
     """Hold the grains, float64[n] each.
 
     `x_px` and `y_px` are the middles of their streaks, `dx_px` and `dy_px` the extents without the discs. `slope_x`
@@ -343,22 +342,22 @@ class _Grains(NamedTuple):
     slope_y: F64
     irradiance_W_m2: F64
 
-    def select(self, keep: NDArray[Any]) -> _Grains:
+    def select(self, keep: NDArray[Any]) -> _GrainsInView:
         """Return the grains that a mask, a slice or indices select."""
-        return _Grains(*(values[keep] for values in self))
+        return _GrainsInView(*(values[keep] for values in self))
 
     @classmethod
-    def joined(cls, parts: list[_Grains]) -> _Grains:
+    def joined(cls, parts: list[_GrainsInView]) -> _GrainsInView:
         """Return the grains of several arrays."""
         return cls(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
 
-def _image_radius_px(grains: _Grains, context: FaultContext) -> F64:
+def _image_radius_px(grains: _GrainsInView, context: FaultContext) -> F64:
     """Return the radius of the sharp image of each grain, float64[n]."""
     return np.asarray(grains.radius_mm * 1e-3 / grains.depth_m * context.camera.focal_length_px)
 
 
-def _streaks(grains: _Grains, context: FaultContext, support: F64 | None = None) -> Streaks:
+def _streaks(grains: _GrainsInView, context: FaultContext, support: F64 | None = None) -> Streaks:
     """Return the grains as figures on the frame, with outlines `support`.
 
     The radius has the mean square of defocus, grain and diffraction together; a disc of the radius r has r²/4 along
@@ -469,7 +468,7 @@ class _Population:
             4 * reach**2 * (high - low),
         )
 
-    def drawn(self, rng: np.random.Generator) -> _Grains:
+    def drawn(self, rng: np.random.Generator) -> _GrainsInView:
         """Return the grains that show: Poisson in number, but at least one where any can show."""
         none = self._candidates(0, rng)
         if self.mean < 1e-300 or self.electrons <= 0:
@@ -481,7 +480,7 @@ class _Population:
                     return grains.select(np.sort(brightest[: int(self.fault.most_grains)]))
         return none
 
-    def _experiments(self, rng: np.random.Generator) -> Iterator[_Grains]:
+    def _experiments(self, rng: np.random.Generator) -> Iterator[_GrainsInView]:
         """Return the grains that show in independent draws of at least one candidate each, some at once if few."""
         experiments = int(np.clip(4096 / max(self.mean, 1), 1, 4096))
         counts = poisson_above_0(self.mean, rng.random(experiments))
@@ -493,11 +492,11 @@ class _Population:
             keep = self._shows(grains)
             shown.append(grains.select(keep))
             owners.append(of[keep])
-        whole, of = _Grains.joined(shown), np.concatenate(owners)
+        whole, of = _GrainsInView.joined(shown), np.concatenate(owners)
         for k in np.unique(of):
             yield whole.select(of == k)
 
-    def _candidates(self, count: int, rng: np.random.Generator) -> _Grains:
+    def _candidates(self, count: int, rng: np.random.Generator) -> _GrainsInView:
         """Return grains of the whole volume, each with its motion and its light."""
         fault, camera = self.fault, self.context.camera
         uniform = rng.random((8, count))
@@ -515,7 +514,7 @@ class _Population:
         albedo = fault.albedo.uniform(rng, count)
         light = albedo * phase_function(self.sun.phase_deg(towards), fault.phase_slope_mag_deg)
         focus = abs(1 / depth - 1 / camera.lens.focus_distance_m)
-        return _Grains(
+        return _GrainsInView(
             x_px=(first[:, 0] + last[:, 0]) / 2,
             y_px=(first[:, 1] + last[:, 1]) / 2,
             dx_px=last[:, 0] - first[:, 0],
@@ -542,7 +541,7 @@ class _Population:
         power = 3.0 - (choice > below[:2]).sum(axis=0)
         return np.clip((low**power + uniform * (high**power - low**power)) ** (1 / power), low, high)
 
-    def _shows(self, grains: _Grains) -> NDArray[np.bool_]:
+    def _shows(self, grains: _GrainsInView) -> NDArray[np.bool_]:
         """Return which grains are bright enough, reach the frame, and are not behind the ground, bool[n]."""
         first, last = inside(_streaks(grains, self.context), self.context.shape)
         keep = (self._level_e(grains) >= self.least_e) & (last > first)
@@ -553,7 +552,7 @@ class _Population:
             keep &= self.context.depth_m[row, column] > grains.depth_m
         return np.asarray(keep)
 
-    def _level_e(self, grains: _Grains) -> F64:
+    def _level_e(self, grains: _GrainsInView) -> F64:
         """Return the electrons of each grain, spread evenly over its figure of at least a pixel, float64[n]."""
         streaks = _streaks(grains, self.context)
         slopes = np.column_stack([grains.slope_x, grains.slope_y])
