@@ -1,9 +1,9 @@
 """Choose the terrain for poses of a trajectory, so that its facets are about a pixel wide, from any distance.
 
-Far away, the whole body is refined evenly, and all poses share it. Where this would take too many triangles, the
-terrain is refined where the camera looks, as at a site of `[geometry]`: evenly over the ground in the frame, and
-beyond with facets that grow with the distance. Near the ground, `[patch]` sets the smallest facets. There is no
-border between these cases: facets are about a pixel wide in all of them.
+Far away, the whole body is refined evenly, and poses at nearly the same distance share it. Where this would take
+too many triangles, the terrain is refined where the camera looks, as at a site of `[geometry]`: evenly over the
+ground in the frame, and beyond with facets that grow with the distance. Near the ground, `[patch]` sets the
+smallest facets. There is no border between these cases: facets are about a pixel wide in all of them.
 """
 
 from __future__ import annotations
