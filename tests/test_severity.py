@@ -301,7 +301,7 @@ def test_levels_are_roots_of_the_quantile(scale: float) -> None:
     assert np.divide(other.values, levels.values)[:4] == pytest.approx(np.full(4, 3), rel=0.12)
 
 
-def test_a_search_spends_its_evaluations_where_the_error_rises() -> None:
+def test_a_model_is_evaluated_at_the_same_values_on_every_view() -> None:
     calls: list[Any] = []
 
     def steep(fault: Any) -> float:
@@ -309,15 +309,38 @@ def test_a_search_spends_its_evaluations_where_the_error_rises() -> None:
         return float(np.mean(fault.count) > 300)
 
     (values,) = measured(steep)
-    assert len(calls) == len(values) == 10 == len(dict(values))  # no value is evaluated twice
-    inner = sorted(value for value, _ in values)
-    below, above = max(v for v in inner if v <= 300), min(v for v in inner if v > 300)
-    assert above / below < 1.2
+    assert len(calls) == len(values) == 21 == len(dict(values))  # no value is evaluated twice
+    assert [value for value, _ in values] == [value for value, _ in measured(curve(1.0))[0]]
     given = ModelUnderTest(fault="dust_on_optics", model="gaussian", keys={"peak_dn": 150}, values=(10.0, 20.5))
     assert [value for value, _ in measure(given, 1024, lambda fault: float(fault.peak_dn.lo))] == [10, 20.5]
-    # few whole numbers lie between two lines and three
+    # few whole numbers lie between one line and three
     lines = ModelUnderTest(fault="broken_lines", model="texture", keys={})
-    assert len(measure(lines, 64, lambda fault: float(np.mean(fault.count) > 2.1))) <= 10
+    counts = [value for value, _ in measure(lines, 64, lambda fault: float(np.mean(fault.count)))]
+    assert counts == sorted(set(counts))
+    assert len(counts) < 21
+
+
+def test_levels_are_those_of_steps_too() -> None:
+    """On each view the error jumps, once: its quantile over many views rises smoothly all the same.
+
+    Joining the evaluations of each view first would even out the jumps, and with them the levels.
+    """
+    rng = np.random.default_rng(3)
+    jumps = 60.0 * np.exp(rng.normal(size=400))  # number of grains at which half of the matches are lost
+    heights = rng.uniform(size=400)
+    views = measured(
+        *(
+            lambda fault, jump=jump, height=height: 0.6 * height * (np.mean(fault.count) > jump)
+            for jump, height in zip(jumps, heights, strict=True)
+        )
+    )
+    criterion = Criterion(quantile=0.8, errors=(0.2, 0.25, 0.3, 0.35, 0.4))
+    levels = levels_of(DUST, views, criterion, 1024)
+    for value, wanted in zip(levels.values, criterion.errors, strict=True):
+        if not math.isnan(value):
+            exact = np.quantile(0.6 * heights * (value > jumps), 0.8)
+            assert exact == pytest.approx(wanted, rel=0.1)
+    assert np.isfinite(levels.values).sum() >= 4
 
 
 def test_levels_end_where_the_model_does_not_reach_them() -> None:
@@ -343,12 +366,18 @@ def test_intervals_hold_the_truth_at_their_rate() -> None:
 
 
 def test_a_rising_curve_evens_out_noise() -> None:
-    rising = severity.RisingCurve.through({0.0: 0.1, 0.2: 0.4, 0.3: 0.2, 0.8: 0.7, 1.0: NAN})
+    by_view = [{0.0: 0.1, 0.2: 0.4, 0.3: 0.2, 0.8: 0.7, 1.0: NAN}, {}, {0.2: NAN, 0.3: 0.2}]
+    rising = severity.RisingCurve.over(by_view, 0.5)
     assert rising is not None
-    assert rising.errors == pytest.approx([0.1, 0.3, 0.7])  # 0.4 and 0.2 in the wrong order count as their mean
-    assert rising.positions == pytest.approx([0, 0.25, 0.8])
-    assert rising.at(np.array([0.525, 0.9])) == pytest.approx([0.5, 0.7])
-    assert severity.RisingCurve.through({0.5: NAN}) is None
+    assert rising.errors.shape == (2, 4)  # the view and the position without a value are left out
+    # 0.4 and 0.2 in the wrong order count as their mean
+    assert rising.at(np.array([0, 0.2, 0.3, 0.55, 0.8, 0.9])) == pytest.approx([0.1, 0.3, 0.3, 0.5, 0.7, 0.7])
+    assert rising.interval(0.55) == pytest.approx((0.45, 0.45))  # of two views with the same errors
+    assert severity.RisingCurve.over([{0.5: NAN}], 0.5) is None
+    single = severity.RisingCurve.over([{0.5: 0.25}], 0.5)
+    assert single is not None
+    assert single.at(np.array([0.0, 1.0])) == pytest.approx([0.25, 0.25])
+    assert single.interval(0.7) == pytest.approx((0.25, 0.25))
 
 
 def test_a_criterion_is_checked() -> None:

@@ -1,19 +1,19 @@
 """Compute levels of severity: for each fault model five values of one key that cost navigation the same.
 
-The error is a quantile over views of one metric of navigation. On each view, the error of a model is measured at
-some values of the key that its `Fault.severity` names, and joined to a curve that rises with the severity. A level
-is the root of the quantile of these curves minus the wanted error. The views may lie behind several lenses, so that
-the levels belong to none of them. The interval of the error comes from a bootstrap over the views.
+The error is a quantile over views of one metric of navigation. It is measured at some values of the key that the
+model's `Fault.severity` names, the same on every view, and joined to a curve that rises with the severity. A level
+is the root of this curve minus the wanted error. The views may lie behind several lenses, so that the levels belong
+to none of them. The interval of the error comes from a bootstrap over the views.
 """
 
 from __future__ import annotations
 
-import itertools
 import os
 import shlex
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +30,7 @@ from ..dataset.errors import Interrupted
 from ..dataset.processes import Pool
 from ..dataset.progress import Progress
 from ..dataset.work import run_here
-from ..faults import LEVELS, ModelLevels, Severity, SeverityTable, dataset_order, read_table, registry
+from ..faults import LEVELS, ModelLevels, SeverityTable, dataset_order, read_table, registry
 from ..scene import config
 from ..scene.instrument import CameraTable
 from ..world import assemble
@@ -97,28 +97,54 @@ class ViewOptions:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class RisingCurve:
-    """Hold the rising curve nearest to some evaluations of an error, float64[n] each, both rising."""
+    """Hold a quantile over views of an error as a function of severity, which rises.
+
+    It lies nearest to the quantiles at the evaluated values (isotonic regression), and is linear between them.
+
+    Attributes
+    ----------
+    positions
+        float64[value], rising: positions of the evaluated values.
+    errors
+        float64[view, value]: errors there; nan where a view has none.
+    quantile
+        The quantile.
+    """
 
     positions: F64
     errors: F64
+    quantile: float
 
     @staticmethod
-    def through(evaluated: Mapping[float, float]) -> RisingCurve | None:
-        """Return the curve by isotonic regression of position → error; each block lies at its mean position.
-
-        None where no error is finite.
-        """
-        order = sorted(position for position, error in evaluated.items() if np.isfinite(error))
-        if not order:
+    def over(by_view: Sequence[Mapping[float, float]], quantile: float) -> RisingCurve | None:
+        """Return the curve of views with their errors by position; None where no error is finite."""
+        known = sorted({position for view in by_view for position in view})
+        positions = np.array(known)
+        errors = np.array([[view.get(position, np.nan) for position in known] for view in by_view])
+        errors[~np.isfinite(errors)] = np.nan
+        has_value = np.isfinite(errors)
+        if not has_value.any():
             return None
-        fit = isotonic_regression([evaluated[position] for position in order])
-        ends = fit.blocks
-        middle = [float(np.mean(order[start:end])) for start, end in itertools.pairwise(ends)]
-        return RisingCurve(positions=np.array(middle), errors=np.asarray(fit.x)[ends[:-1]])
+        errors = errors[np.ix_(has_value.any(axis=1), has_value.any(axis=0))]
+        return RisingCurve(positions=positions[has_value.any(axis=0)], errors=errors, quantile=quantile)
 
     def at(self, positions: F64) -> F64:
-        """Return the errors at positions."""
-        return np.asarray(np.interp(positions, self.positions, self.errors))
+        """Return the quantile at positions."""
+        return np.asarray(np.interp(positions, self.positions, self._rising))
+
+    @cached_property
+    def _rising(self) -> F64:
+        """Return the quantile at the evaluated values, made to rise, float64[value]."""
+        return np.asarray(isotonic_regression(np.nanquantile(self.errors, self.quantile, axis=0)).x)
+
+    def interval(self, position: float) -> tuple[float, float]:
+        """Return the 95 % interval of the quantile at a position, by a bootstrap over the views."""
+        after = int(np.clip(np.searchsorted(self.positions, position), 1, max(len(self.positions) - 1, 1)))
+        columns = [after - 1, after] if len(self.positions) > 1 else [0]
+        resampled = np.stack([_quantiles_of_resamples(self.errors[:, k], self.quantile) for k in columns])
+        low, high = self.positions[columns[0]], self.positions[columns[-1]]
+        weight = float(np.clip((position - low) / (high - low), 0, 1)) if high > low else 0.0
+        return _middle((1 - weight) * resampled[0] + weight * resampled[-1])
 
 
 def levels_of(
@@ -149,42 +175,47 @@ def levels_of(
         No view has a finite error.
     """
     severity = model.severity
-    grid = np.linspace(0, 1, _GRID)
-    curves = [
-        RisingCurve.through({severity.position(value, width_px): error for value, error in view})
-        for view in by_view
-    ]
-    errors = np.array([curve.at(grid) for curve in curves if curve is not None])
-    if not len(errors):
+    curve = RisingCurve.over(
+        [{severity.position(value, width_px): error for value, error in view} for view in by_view],
+        criterion.quantile,
+    )
+    if curve is None:
         raise VbnfaultError(f"{model.name}: {criterion.metric} has no value on any view")
-    quantiles = np.quantile(errors, criterion.quantile, axis=0)
+    grid = np.linspace(0, 1, _GRID)
+    quantiles = curve.at(grid)
     values = np.full(LEVELS, np.nan)
     reached = np.full((LEVELS, 3), np.nan)  # error, and its interval
     for k, wanted in enumerate(criterion.errors):
         value = severity.value(float(np.interp(wanted, quantiles, grid)), width_px)
-        column = _nearest(severity, model.at(value)[1], width_px)
-        if abs(quantiles[column] - wanted) <= _WITHIN * wanted and value not in values:
-            values[k], reached[k] = value, error_with_interval(errors[:, column], criterion.quantile)
+        position = severity.position(model.at(value)[1], width_px)  # a whole number is rounded
+        error = float(curve.at(np.array(position)))
+        if abs(error - wanted) <= _WITHIN * wanted and value not in values:
+            values[k], reached[k] = value, (error, *curve.interval(position))
     return ModelLevels(
         key=severity.key,
         values=tuple(float(f"{value:.4g}") for value in values),
         errors=tuple(round(float(error), 4) for error in reached[:, 0]),
         intervals=tuple((round(float(low), 4), round(float(high), 4)) for _, low, high in reached),
         reach=(round(float(quantiles[0]), 4), round(float(quantiles[-1]), 4)),
-        views=len(errors),
+        views=len(curve.errors),
         detector=detector,
     )
 
 
-def _nearest(severity: Severity, value: float, width_px: int) -> int:
-    """Return the index on the grid of the position that is nearest to that of a value."""
-    return int(np.clip(round(severity.position(value, width_px) * (_GRID - 1)), 0, _GRID - 1))
-
-
-def _resampled(count: int) -> NDArray[np.intp]:
-    """Return indices of resamples of `count` views, intp[resample, view], always the same."""
+def _quantiles_of_resamples(errors: F64, quantile: float) -> F64:
+    """Return the quantile of each resample of the finite errors, float64[resample]; always the same resamples."""
+    finite = errors[np.isfinite(errors)]
     rng = np.random.default_rng(0)
-    return rng.integers(count, size=(_RESAMPLES, count))
+    return np.asarray(
+        np.quantile(finite[rng.integers(len(finite), size=(_RESAMPLES, len(finite)))], quantile, axis=1)
+    )
+
+
+def _middle(resampled: F64) -> tuple[float, float]:
+    """Return the middle 95 % of resampled values."""
+    tail = (1 - _CONFIDENCE) / 2
+    low, high = np.quantile(resampled, [tail, 1 - tail])
+    return float(low), float(high)
 
 
 def error_with_interval(errors: Sequence[float] | F64, quantile: float) -> tuple[float, float, float]:
@@ -192,10 +223,7 @@ def error_with_interval(errors: Sequence[float] | F64, quantile: float) -> tuple
     finite = np.array([error for error in errors if np.isfinite(error)])
     if not len(finite):
         return np.nan, np.nan, np.nan
-    spread = np.quantile(finite[_resampled(len(finite))], quantile, axis=1)
-    tail = (1 - _CONFIDENCE) / 2
-    low, high = np.quantile(spread, [tail, 1 - tail])
-    return float(np.quantile(finite, quantile)), float(low), float(high)
+    return float(np.quantile(finite, quantile)), *_middle(_quantiles_of_resamples(finite, quantile))
 
 
 # --- the whole table ---------------------------------------------------------------------------------------------
