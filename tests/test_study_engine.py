@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 import study_kit as kit
+import xarray
 
 import vbnfault
 from vbnfault.core import toml_files
@@ -58,6 +59,8 @@ def test_ishigami_through_the_whole_engine(tmp_path: Path) -> None:
     assert float(data["interaction"].sel(factor="x0", factor_b="x2").squeeze()) == pytest.approx(0.2437, abs=0.05)
     assert all({"long_name", "units"} <= variable.attrs.keys() for variable in data.data_vars.values())
     assert results.open_indices(tmp_path / "s").identical(data)
+    with xarray.open_zarr(tmp_path / "s" / "indices.zarr") as plain:  # without a warning
+        assert plain.load().identical(data)
     table = results.read_table(tmp_path / "s")
     assert table.num_rows == 512 * 5
     assert set(table["status"].to_pylist()) == {"ok"}

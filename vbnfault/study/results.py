@@ -9,6 +9,7 @@ import json
 import os
 import shutil
 import uuid
+import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -132,9 +133,13 @@ def metrics_of(indices: xr.Dataset) -> tuple[Metric, ...]:
 
 
 def write_indices(path: Path, indices: xr.Dataset) -> None:
-    """Write the indices of a study as a Zarr group, in place of an earlier one."""
-    with replacing(path) as temporary:
-        indices.to_zarr(temporary, mode="w", consolidated=False, zarr_format=3)
+    """Write the indices of a study as a Zarr group, in place of an earlier one.
+
+    Its metadata are consolidated, so that `xarray.open_zarr` opens it without a warning.
+    """
+    with replacing(path) as temporary, warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "Consolidated metadata is currently not part in the Zarr format 3")
+        indices.to_zarr(temporary, mode="w", consolidated=True, zarr_format=3)
 
 
 def open_indices(folder: str | Path) -> xr.Dataset:
