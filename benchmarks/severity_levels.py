@@ -58,6 +58,7 @@ def main() -> None:
     parser.add_argument("--models", nargs="*", default=["all"], help="models or classes; default: all of the table")
     parser.add_argument("--lenses", nargs="*", help="lenses; default: those of the table")
     parser.add_argument("--views", type=int, default=64, help="number of views behind each lens")
+    parser.add_argument("--sites", type=int, default=32, help="number of sites")
     parser.add_argument("--seed", type=int, default=99, help="seed of views and sites")
     parser.add_argument("--width-px", type=int, help="width and height of the images; default: that of the table")
     parser.add_argument("--fov-deg", type=float, default=65.0, help="field of view")
@@ -71,6 +72,7 @@ def main() -> None:
         "camera.height_px": width_px,
         "camera.fov_deg": given.fov_deg,
         "dataset.seed": given.seed,
+        "dataset.sites": given.sites,
         "patch.max_triangles": 200_000,
     }
     lenses = tuple("" if lens == "thin" else lens for lens in given.lenses or table.lenses)
