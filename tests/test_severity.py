@@ -113,6 +113,17 @@ def test_a_scene_names_a_level() -> None:
     assert fault == from_dict("vignetting", {"frame_illuminance_dn": low}, source="s")
 
 
+def test_a_level_holds_further_keys_that_the_scene_does_not_set() -> None:
+    levels = packaged().levels["straylight"]["texture"]
+    found = vbnfault.load_scene("quickstart", {"faults.straylight.severity": 2}).faults["straylight"]
+    assert found["radius"] == [0.3, 0.6]
+    assert found["brightness"] == levels.values[1]
+    kept = vbnfault.load_scene("quickstart", {"faults.straylight": {"severity": 2, "radius": 0.1}})
+    assert kept.faults["straylight"]["radius"] == 0.1
+    under_test = ModelUnderTest(fault="straylight", model="texture", keys={})
+    assert vars(under_test.at(1.0)[0])["radius"].hi == 0.6
+
+
 def test_a_level_means_the_same_in_frames_of_all_widths(tmp_path: Path) -> None:
     path = table_file(tmp_path)
 
@@ -257,6 +268,7 @@ def test_illuminance_of_the_frame_does_not_depend_on_the_field(fov_deg: float) -
         (Severity(key="nothing", low=1.0, high=2.0), "its severity names 'nothing', no number of it"),
         (Severity(key="amount", low=1.0, high=11.0), "must be above 0 and within the limits"),
         (Severity(key="amount", low=0.0, high=2.0), "must be above 0 and within the limits"),
+        (Severity(key="amount", low=1.0, high=2.0, keys={"none": 1}), "its severity holds 'none', no key of it"),
     ],
 )
 def test_a_wrong_declaration_is_refused(declared: Severity, message: str) -> None:

@@ -62,6 +62,8 @@ class Severity:
         How a value changes with the width of the frame, so that it costs navigation the same:
         (value + offset) ∝ width^width_power. 0: a value costs the same in frames of all widths; 1: it does if it
         rises with the width, as a number of defects that each take a line.
+    keys
+        Other keys of the model that hold at every level, unless the scene sets them.
     """
 
     key: str
@@ -70,6 +72,7 @@ class Severity:
     step: int = 1
     width_power: float = 0.0
     offset: float = 0.0
+    keys: Mapping[str, Any] = field(default_factory=dict, hash=False)
 
     def position(self, value: float, width_px: int = REFERENCE_WIDTH_PX) -> float:
         """Return the position of a value for frames of a width: 0 the mildest, 1 the most severe."""

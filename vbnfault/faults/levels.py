@@ -82,6 +82,8 @@ def with_severity(
 ) -> Mapping[str, Any]:
     """Return the table of a fault with the value that its key `severity` stands for, instead of this key.
 
+    The model's severity may hold further keys at every level; those that the table sets itself stay.
+
     Parameters
     ----------
     model, table
@@ -108,7 +110,7 @@ def with_severity(
     value = _value(levels, model, severity, level, f"{where}.severity = {level}")
     declared = next(f.metadata for f in dataclasses.fields(model) if f.name == severity.key)
     rest = {key: value for key, value in table.items() if key != "severity"}
-    return rest | {severity.key: severity.setting(value, declared)}
+    return {**severity.keys, **rest, severity.key: severity.setting(value, declared)}
 
 
 def _value(levels: Levels, model: type[Fault], severity: Severity, level: int, where: str) -> float:
@@ -140,7 +142,7 @@ def _value(levels: Levels, model: type[Fault], severity: Severity, level: int, w
 def severity_schema(severity: Severity) -> dict[str, Any]:
     """Return the JSON Schema of the key `severity` of a model."""
     return {
-        "description": f"level of severity, which sets {severity.key}; equal levels cost navigation the same",
+        "description": f"level of severity, which sets {' and '.join([severity.key, *severity.keys])}; equal levels cost navigation the same",
         "type": "integer",
         "minimum": 1,
         "maximum": LEVELS,

@@ -167,6 +167,9 @@ def _check_severity(cls: type[Fault], where: str) -> None:
     declared = {f.name: f.metadata for f in dataclasses.fields(cls) if "limits" in f.metadata}
     if severity.key not in declared:
         raise DeclarationError([cls.fault], f"{where}: its severity names {severity.key!r}, no number of it")
+    unknown = severity.keys.keys() - {f.name for f in dataclasses.fields(cls)}
+    if unknown:
+        raise DeclarationError([cls.fault], f"{where}: its severity holds {min(unknown)!r}, no key of it")
     low, high = declared[severity.key]["limits"]
     if not all(max(low, 0) <= value <= high and value > 0 for value in (severity.low, severity.high)):
         raise DeclarationError(

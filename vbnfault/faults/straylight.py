@@ -72,7 +72,8 @@ class TextureStraylight(Fault):
     after = "particles"
     axis = 3
     step = "electrons"
-    severity = Severity(key="brightness", low=0.01, high=100.0)
+    # small flares leave parts of the frame free, however bright they are
+    severity = Severity(key="brightness", low=0.01, high=100.0, keys={"radius": [0.3, 0.6]})
     needs_sun = True
     packaged_images = "textures"
     effect_mask = True

@@ -73,7 +73,7 @@ class ModelUnderTest:
         """
         declared = next(f.metadata for f in fields(self.type) if f.name == self.severity.key)
         setting = self.severity.setting(float(np.clip(value, *declared["limits"])), declared)
-        table = {"model": self.model, **self.keys, self.severity.key: setting}
+        table = {"model": self.model, **self.severity.keys, **self.keys, self.severity.key: setting}
         return from_dict(self.fault, table, source=f"severity of {self.name}"), float(np.mean(setting))
 
 
