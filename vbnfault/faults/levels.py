@@ -141,8 +141,9 @@ def _value(levels: Levels, model: type[Fault], severity: Severity, level: int, w
 
 def severity_schema(severity: Severity) -> dict[str, Any]:
     """Return the JSON Schema of the key `severity` of a model."""
+    keys = " and ".join([severity.key, *severity.keys])
     return {
-        "description": f"level of severity, which sets {' and '.join([severity.key, *severity.keys])}; equal levels cost navigation the same",
+        "description": f"level of severity, which sets {keys}; equal levels cost navigation the same",
         "type": "integer",
         "minimum": 1,
         "maximum": LEVELS,
