@@ -56,7 +56,7 @@ class Criterion:
 
     metric: str = "matches_lost"
     quantile: float = 0.5
-    errors: tuple[float, ...] = (0.2, 0.35, 0.5, 0.65, 0.8)
+    errors: tuple[float, ...] = (0.35, 0.45, 0.55, 0.65, 0.8)
 
     def __post_init__(self) -> None:
         known = [metric.name for metric in navigation_metrics.METRICS if metric.better == "low"]
