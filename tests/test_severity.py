@@ -99,7 +99,7 @@ def test_the_packaged_levels_fit_the_models_and_cost_the_same() -> None:
             for k in np.flatnonzero(reached):
                 assert levels.intervals[k][0] <= levels.errors[k] <= levels.intervals[k][1]
             if f"{fault}/{model}" in PAPER:
-                assert reached.sum() >= 4, (fault, model)
+                assert reached.all(), (fault, model)
 
 
 def test_a_scene_names_a_level() -> None:
@@ -361,7 +361,7 @@ def test_levels_end_where_the_model_does_not_reach_them() -> None:
     assert np.isnan(levels.values).tolist() == [False, False, False, True, True]
     assert levels.reach == pytest.approx((0.0, 0.54), abs=0.01)
     steep = levels_of(DUST, measured(curve(20, least=0.4)), Criterion(), 1024)
-    assert np.isnan(steep.values).tolist() == [True, True, False, True, True]
+    assert np.isnan(steep.values).tolist() == [True, False, False, True, True]
     with pytest.raises(VbnfaultError, match="dust_on_optics/gaussian: matches_lost has no value on any view"):
         levels_of(DUST, measured(lambda fault: NAN), Criterion(), 1024)
 

@@ -186,8 +186,9 @@ def levels_of(
     values = np.full(LEVELS, np.nan)
     reached = np.full((LEVELS, 3), np.nan)  # error, and its interval
     for k, wanted in enumerate(criterion.errors):
-        value = severity.value(float(np.interp(wanted, quantiles, grid)), width_px)
-        position = severity.position(model.at(value)[1], width_px)  # a whole number is rounded
+        root = severity.value(float(np.interp(wanted, quantiles, grid)), width_px)
+        value = model.at(root)[1]  # a whole number is rounded
+        position = severity.position(value, width_px)
         error = float(curve.at(np.array(position)))
         if abs(error - wanted) <= _WITHIN * wanted and value not in values:
             values[k], reached[k] = value, (error, *curve.interval(position))
