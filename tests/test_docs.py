@@ -238,11 +238,12 @@ _DIMENSIONLESS = """
     default_material distance_exponent dust_contrast eccentricity f_number faulty_fraction fill_power
     hot_clustered_share hot_offset_share hurst individuals internal_transmittance_10mm iso iso_power k leak limb
     log10_scale max_samples_per_pixel max_triangles max_tries max_views metering_level min_lit_fraction
-    missing_codes n nadir nd neutral node_gains noise_fraction porosity_factor prnu prnu_column prnu_low prnu_row
-    quantum_efficiency_peak random random_jet_strength random_jets reflectance relief rts_per_interaction rts_share
-    samples samples_per_pixel seed shadow_hiding_amplitude shadow_hiding_width shard_samples shutter_transmission
-    single_scattering_albedo site sites size_power slope_parameter strength stuck_bits stuck_share sun
-    sun_facing_nominal_fraction sunlit_fraction test tile train transmission trap_share val value vd
+    missing_codes n nadir nd neutral node_gains noise_fraction optical_depth porosity_factor prnu prnu_column
+    prnu_low prnu_row quantum_efficiency_peak random random_jet_strength random_jets reflectance relief
+    rts_per_interaction rts_share samples samples_per_pixel seed shadow_hiding_amplitude shadow_hiding_width
+    shard_samples shutter_transmission single_scattering_albedo site sites size_power slope_parameter strength
+    stuck_bits stuck_share sun sun_facing_nominal_fraction sunlit_fraction test tile train transmission trap_share
+    val value vd
 """
 
 
