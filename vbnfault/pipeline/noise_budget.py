@@ -36,6 +36,8 @@ _NOISY_FRACTION = 0.01
 _ROUNDS = 3
 # Variance aimed at, over that allowed: few pixels then need another round.
 _AIM = 0.65
+# Noise over that allowed at which the range of its samples alone is a reason to render a pixel again.
+_SURELY = 1.5
 # A pixel is rendered again if it gets this many times its samples.
 _WORTH = 1.2
 # Octaves by which the number of samples of a cell may be rounded down to a power of two.
@@ -58,23 +60,22 @@ def sample_to_noise(
 ) -> SampledRadiance:
     """Render with more samples where sampling noise would show: above `fraction` of the sensor's own noise.
 
-    The error of a pixel comes from two halves of its samples, averaged over 3×3 pixels. Where it is too large, the
-    cells of the pixel get as many samples as the variation of light in each of them asks for. This is done again
-    for pixels that need still more, at most `_ROUNDS` times, until at most 1 % of the lit pixels are left. All of
-    it follows from scene and sample, so the result does not depend on how a build runs.
+    The error of a pixel comes at first from two halves of its samples, averaged over 3×3 pixels. Where it is too
+    large, the cells of the pixel get as many samples as the variation of light in each of them asks for. This is
+    done again for pixels that need still more, at most `_ROUNDS` times, until at most 1 % of the lit pixels are
+    left. All of it follows from scene and sample, so the result does not depend on how a build runs.
     """
     from .. import render
 
     camera = spec.camera
     electron_rate = green_per_second(spec)
     sampled = render.direct_by_sample(spec.terrain.surface, scene, electron_rate)
-    first = sampled.radiance
-    indirect = (
-        np.zeros_like(first.array)
-        if guide is None or not scene.bounces
-        else render.indirect(spec.terrain.surface, scene, guide)
-    )
-    whole = first.with_array(first.array + indirect)
+    indirect = None
+    if guide is not None and scene.bounces:
+        indirect = render.indirect(spec.terrain.surface, scene, guide)
+    light = sampled.radiance.array.copy() if indirect is None else sampled.radiance.array + indirect
+    whole = sampled.radiance.with_array(light.view())
+    sampled = replace(sampled, radiance=whole)  # a copy in all bands takes 37 MB for a frame of 1024 pixels
     exposure = foreseen_exposure_s(spec.scene, camera, truth, scene.view, whole)
     signal_e = np.einsum("b,byx->yx", electron_rate * exposure, whole.array)
     detector = camera.detector
@@ -91,12 +92,18 @@ def sample_to_noise(
         signal=electron_rate * exposure,
         sensor_e=sensor_e.astype(np.float32),
         sampled=sampled,
+        array=light,
+        indirect=indirect,
         exposure_s=exposure,
     )
 
     def noise() -> F32:
         """Return the noise of sampling over the sensor's, float32[y, x]."""
-        return np.sqrt(np.maximum(cv2.blur(np.where(near, refined.variance, 0), (3, 3)), 0))
+        # two halves tell little of a single pixel, so neighbours are averaged; cells tell enough
+        by_halves = near & ~refined.by_cells
+        count = cv2.blur(by_halves.astype(np.float32), (3, 3))
+        mean = cv2.blur(np.where(by_halves, refined.variance, 0), (3, 3)) / np.maximum(count, 1e-6)
+        return np.sqrt(np.where(refined.by_cells, refined.variance, np.maximum(mean, 0)))
 
     def is_over(now: F32) -> bool:
         """Return whether too many lit pixels have too much noise."""
@@ -106,27 +113,27 @@ def sample_to_noise(
     for _ in range(_ROUNDS):
         if not is_over(now := noise()):
             break
-        refined.refine((now > fraction) & near, fraction)
+        refined.refine(now > fraction, near, fraction)
     now = noise()
     return SampledRadiance(
         # the Sun's own part depends on no rays, so the first one holds
-        radiance=replace(first, array=refined.array + indirect),
+        radiance=whole,
         samples_per_pixel=float(refined.used.mean()),
         noise_fraction_p99=float(np.percentile(np.where(shows, now, 0)[lit], 99)) if lit.any() else 0.0,
     )
 
 
 class _Refined:
-    """Hold the light of a view while pixels are rendered again with more samples.
+    """Hold the light of a view while pixels are rendered again with more samples, which change it in place.
 
     Attributes
     ----------
-    array
-        float32[band, y, x]: the radiance so far.
     variance
         float32[y, x]: an estimate of the variance of each pixel, in units of the sensor's.
     used
         float32[y, x]: number of samples of each pixel.
+    by_cells
+        bool[y, x]: pixels that were rendered again, cell by cell.
     """
 
     def __init__(
@@ -137,6 +144,8 @@ class _Refined:
         signal: F64,
         sensor_e: F32,
         sampled: Sampled,
+        array: F32,
+        indirect: F32 | None,
         exposure_s: float,
     ) -> None:
         self._scene, self._surface, self._signal = scene, spec.terrain.surface, signal
@@ -144,11 +153,12 @@ class _Refined:
         self._most = spec.scene.render.max_samples_per_pixel
         self._samples = samples = sampled.samples
         self._white_e = float(scene.sun.irradiance_W_m2_nm @ signal) / np.pi
-        self.array = sampled.radiance.array.copy()
+        self._array, self._indirect = array, indirect
         self.variance = (sampled.error * (exposure_s / sensor_e)) ** 2
-        height, width = self.array.shape[1:]
+        height, width = self._array.shape[1:]
         cells = samples.shape[1]
         self.used = np.full((height, width), float(cells), dtype=np.float32)
+        self.by_cells = np.zeros((height, width), dtype=bool)
         self._rounds = 0
         self._range = _ranges(samples, (height, width))
         # Variance of a pixel with one sample in each cell. The square of the range is proportional to it; `refine`
@@ -163,27 +173,33 @@ class _Refined:
         key = (self._scene.key + 0x9E3779B9 * (16 * self._rounds + use + 1)) & 0xFFFFFFFF
         return replace(self._scene, samples_per_pixel=samples, key=key)
 
-    def refine(self, chosen: Mask, fraction: float) -> None:
-        """Render those of the chosen pixels again whose own variance is too large."""
-        # the error over 3×3 pixels corrects what the ranges let expect
-        measured, foreseen = (cv2.blur(v, (3, 3)) for v in (self.variance, self._single * self._left))
-        self._single *= np.clip(measured / np.maximum(foreseen, 1e-12), 0.05, 20)
+    def refine(self, noisy: Mask, near: Mask, fraction: float) -> None:
+        """Render those of the noisy pixels again whose own variance is too large, if their noise shows (`near`)."""
+        if not self._rounds:
+            # the error over 3×3 pixels corrects what the ranges let expect
+            measured, foreseen = (cv2.blur(v, (3, 3)) for v in (self.variance, self._single))
+            self._single *= np.clip(measured / np.maximum(foreseen, 1e-12), 0.05, 20)
+        self._single = np.where(self.by_cells, self.variance / self._left, self._single)
         goal = _AIM * fraction**2 / np.maximum(self._single, 1e-12)
-        pixels = np.flatnonzero(chosen & (goal < 1))
-        cells = self._samples.shape[1]
+        # halves may agree by chance where the range of the samples is large
+        noisy = noisy | (self._single > (_SURELY * fraction) ** 2)
+        pixels = np.flatnonzero(noisy & near & (goal < 1))
         squares = self._range[pixels].astype(np.float32) ** 2
-        numbers = _allocated(squares, goal.ravel()[pixels], self._most // cells)
+        numbers = _allocated(squares, goal.ravel()[pixels], self._most)
         more = numbers.sum(axis=1) > _WORTH * self.used.ravel()[pixels]
         pixels, squares, numbers = pixels[more], squares[more], numbers[more]
         self._rounds += 1
         light, variance = self._sampled(pixels.astype(np.uint32), numbers)
         if self._sun is not None:
             light += self._sun.reshape(len(light), -1)[:, pixels]
-        self.array.reshape(len(light), -1)[:, pixels] = light
+        if self._indirect is not None:
+            light += self._indirect.reshape(len(light), -1)[:, pixels]
+        self._array.reshape(len(light), -1)[:, pixels] = light
         self.variance.ravel()[pixels] = variance / self._sensor_e.ravel()[pixels] ** 2
         self.used.ravel()[pixels] = numbers.sum(axis=1)
         left = (squares * numbers**-1.5).sum(axis=1) / np.maximum(squares.sum(axis=1), 1e-30)
         self._left.ravel()[pixels] = left
+        self.by_cells.ravel()[pixels] = True
 
     def _sampled(self, pixels: NDArray[np.uint32], numbers: NDArray[np.int32]) -> tuple[F32, F64]:
         """Return the radiance float32[band, pixel] with these numbers of samples in the cells, and its variance."""
@@ -191,7 +207,7 @@ class _Refined:
 
         count, cells = numbers.shape
         side = round(cells**0.5)
-        total = np.zeros((len(self.array), count), dtype=np.float32)
+        total = np.zeros((len(self._array), count), dtype=np.float32)
         variance = np.zeros(count)
         for samples in np.unique(numbers).tolist():
             owner, cell = np.nonzero(numbers == samples)
@@ -247,13 +263,29 @@ def _allocated(squares: F32, goal: F32, most: int) -> NDArray[np.int32]:
     goal
         float32[pixel].
     most
-        Greatest number of samples of a cell.
+        Greatest number of samples of a pixel with more than one sample in a cell, a power of two.
     """
     power = squares**0.4
     total = np.maximum(squares.sum(axis=1) * goal, 1e-30)
     wanted = power * ((power.sum(axis=1) / total) ** (2 / 3))[:, None]
-    level = np.clip(np.ceil(np.log2(np.maximum(wanted, 1)) - _DOWN), 0, most.bit_length() - 1)
-    return np.left_shift(1, level.astype(np.int32)).astype(np.int32)
+    highest = most.bit_length() - 1
+
+    def rounded(numbers: F32, down: float) -> NDArray[np.int32]:
+        """Return powers of two from 1 to `most`, rounded down by at most `down` octaves."""
+        level = np.clip(np.ceil(np.log2(np.maximum(numbers, 1)) - down), 0, highest)
+        return np.left_shift(1, level.astype(np.int32)).astype(np.int32)
+
+    numbers = rounded(wanted, _DOWN)
+    sums = numbers.sum(axis=1)
+    over = np.flatnonzero(sums > max(most, squares.shape[1]))
+    # a cell of a pixel at its limit gets the part of the limit that it would have of the sum; rounding down leaves
+    # up to half of the limit, which half an octave more often fills
+    parts = numbers[over] * np.float32(most) / sums[over, None]
+    numbers[over] = rounded(parts, 1.0)
+    fuller = rounded(parts * np.float32(2**0.5), 1.0)
+    fits = fuller.sum(axis=1) <= most
+    numbers[over[fits]] = fuller[fits]
+    return numbers
 
 
 def green_per_second(spec: SampleSpec) -> F64:
