@@ -158,8 +158,11 @@ def test_new_values_of_a_lens_compile_no_kernel(evaluator: SceneEvaluator) -> No
     assert all(entry["cache_hit"] for entry in kernels)
 
 
-def test_an_evaluation_equals_the_pipelines_own_light(tmp_path_factory: pytest.TempPathFactory) -> None:
-    made = SceneEvaluator(study(tmp_path_factory, factor("lens.sensor_reflectance")))
+@pytest.mark.parametrize("keys", [{}, {"sources": "scene", "lens": "tessar_50_f2p8"}])
+def test_an_evaluation_equals_the_pipelines_own_light(
+    tmp_path_factory: pytest.TempPathFactory, keys: dict[str, str]
+) -> None:
+    made = SceneEvaluator(study(tmp_path_factory, factor("lens.sensor_reflectance"), straylight=LENS | keys))
     image = made._lit_image(point({}), made.factors.setting({}))
     exposed = made._exposed(point({}), made.factors.setting({}))
     fault = exposed.spec.faults["straylight"]

@@ -49,7 +49,7 @@ class FaultContext:
         user's own image.
     surroundings
         Radiance around that render, on the grids of `lens.straylight.scene.surrounding_grids`; empty if no fault of
-        the sample needs it.
+        the scene needs it.
     coating_loss
         Fraction of the coatings' area that another fault of the sample has removed, in [0, 1]. Only a model with
         `Fault.informed` gets it; for the others it is 0.

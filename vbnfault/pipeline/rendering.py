@@ -94,10 +94,11 @@ def render_view(spec: SampleSpec, pose: Pose) -> Rendering:
 
 
 def _surroundings(spec: SampleSpec, scene: RenderInput) -> tuple[Radiance, ...]:
-    """Render what lies around the view, coarsely, if a fault of the sample needs it."""
+    """Render what lies around the view, coarsely, if a fault of the scene needs it."""
     from .. import render
 
-    if not any(spec.faults[name].lit_by_surroundings for name in spec.commanded):
+    # also in samples that do not carry the fault: a study injects it into any view
+    if not any(fault.lit_by_surroundings for fault in spec.faults.values()):
         return ()
     view, out = scene.view, []
     own = RenderGrid(shape=(view.height_px, view.width_px), focal_px=float(view.intrinsics[0]))

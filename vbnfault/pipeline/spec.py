@@ -145,7 +145,7 @@ class Rendering:
         99th percentile over the lit pixels of the sampling noise as a fraction of the sensor's noise. NaN if
         `render.noise_fraction` is not set.
     surroundings
-        Radiance around the render, for the faults that need it; empty if the sample has none.
+        Radiance around the render, for the faults that need it; empty if the scene has none.
     """
 
     scene: RenderInput
