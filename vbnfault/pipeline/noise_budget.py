@@ -97,27 +97,18 @@ def sample_to_noise(
         exposure_s=exposure,
     )
 
-    def noise() -> F32:
-        """Return the noise of sampling over the sensor's, float32[y, x]."""
-        # two halves tell little of a single pixel, so neighbours are averaged; cells tell enough
-        by_halves = near & ~refined.by_cells
-        count = cv2.blur(by_halves.astype(np.float32), (3, 3))
-        mean = cv2.blur(np.where(by_halves, refined.variance, 0), (3, 3)) / np.maximum(count, 1e-6)
-        return np.sqrt(np.where(refined.by_cells, refined.variance, np.maximum(mean, 0)))
-
     def is_over(now: F32) -> bool:
         """Return whether too many lit pixels have too much noise."""
         over = np.count_nonzero((now > fraction) & shows)
         return bool(over > _NOISY_FRACTION * np.count_nonzero(lit))
 
     for _ in range(_ROUNDS):
-        if not is_over(now := noise()):
+        if not is_over(now := refined.noise(near)):
             break
         refined.refine(now > fraction, near, fraction)
-    now = noise()
+    now = refined.noise(near)
     return SampledRadiance(
-        # the Sun's own part depends on no rays, so the first one holds
-        radiance=whole,
+        radiance=whole,  # its array is that which `refine` has changed
         samples_per_pixel=float(refined.used.mean()),
         noise_fraction_p99=float(np.percentile(np.where(shows, now, 0)[lit], 99)) if lit.any() else 0.0,
     )
@@ -172,6 +163,14 @@ class _Refined:
         """Return the scene with a number of samples, and with random numbers that no earlier render had."""
         key = (self._scene.key + 0x9E3779B9 * (16 * self._rounds + use + 1)) & 0xFFFFFFFF
         return replace(self._scene, samples_per_pixel=samples, key=key)
+
+    def noise(self, near: Mask) -> F32:
+        """Return the noise of sampling over the sensor's, float32[y, x]; `near`: pixels that may be averaged."""
+        # two halves tell little of a single pixel, so neighbours are averaged; cells tell enough
+        by_halves = near & ~self.by_cells
+        count = cv2.blur(by_halves.astype(np.float32), (3, 3))
+        mean = cv2.blur(np.where(by_halves, self.variance, 0), (3, 3)) / np.maximum(count, 1e-6)
+        return np.sqrt(np.where(self.by_cells, self.variance, np.maximum(mean, 0)))
 
     def refine(self, noisy: Mask, near: Mask, fraction: float) -> None:
         """Render those of the noisy pixels again whose own variance is too large, if their noise shows (`near`)."""

@@ -19,7 +19,6 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-import json
 from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
@@ -33,7 +32,7 @@ from ..core import spectra
 from ..core.errors import InputError, shown
 from ..core.quantities import Electrons
 from ..core.tables import did_you_mean
-from ..faults import Fault, Params, act, from_dict, registry
+from ..faults import Fault, Params, act, registry
 from ..lens import Prescription
 from ..lens.changes import changed
 from ..lens.footprint import ImageFrame
@@ -49,12 +48,13 @@ from ..pipeline.resolve import resolve
 from ..pipeline.session import Session, configure_faults
 from ..pipeline.spec import Injection, Pose, Rendering, SampleSpec, SceneExposure
 from ..pipeline.stars import add_stars
-from ..scene.config import Scene, load_scene
+from ..scene.config import Scene
 from . import chosen_fault, image_metrics
 from . import navigation_metrics as nav
-from .factors import AFTER_RENDER, Factors, Setting
+from .factors import Factors, Setting
 from .image_metrics import LitImage
 from .kept import Kept
+from .scenes import StudyScene, check_models, faults_of, scene_of
 from .spec import Evaluation, Metric, StudySpec
 from .views import (
     Exposed,
@@ -93,13 +93,13 @@ class SceneEvaluator:
     def __init__(self, spec: StudySpec) -> None:
         self.spec = spec
         self.kept = Kept()
-        self._base = _scene_of(spec)
+        self._base = scene_of(spec)
         self._session: tuple[Hashable, Session] | None = None
         self._kept_scene = lru_cache(maxsize=16)(self._made_scene)
         with self._named():
             faults = dict(self._base.faults)
             if spec.models is not None:
-                _check_models(spec, faults)
+                check_models(spec, faults)
             camera = Session(self._plain_scene()).base_camera
             self._nominal_camera = camera
             self.factors = Factors(spec, self._base, camera, self._nominal_lens(camera))
@@ -231,7 +231,7 @@ class SceneEvaluator:
     @cached_property
     def _adding(self) -> str:
         """Return the fault class of the scene that adds light, by its soft layer; empty where it has none."""
-        adds = [name for name, fault in _faults(self._base).items() if fault.soft_layer.endswith("_added")]
+        adds = [name for name, fault in faults_of(self._base).items() if fault.soft_layer.endswith("_added")]
         return adds[0] if adds else ""
 
     def _plain_scene(self) -> Scene:
@@ -279,16 +279,16 @@ class SceneEvaluator:
 
     # --- stages ---------------------------------------------------------------------------------------------------
 
-    def _scene(self, evaluation: Evaluation, setting: Setting) -> _StudyScene:
+    def _scene(self, evaluation: Evaluation, setting: Setting) -> StudyScene:
         """Return the scene of an evaluation."""
         return self._kept_scene(evaluation.seed, evaluation.model, tuple(sorted(setting.scene.items())))
 
-    def _made_scene(self, seed: int, model: str, changes: tuple[tuple[str, Any], ...]) -> _StudyScene:
+    def _made_scene(self, seed: int, model: str, changes: tuple[tuple[str, Any], ...]) -> StudyScene:
         """Return the scene with a seed, with a model of the compared fault, and with changed keys."""
         with self._named():
-            return _StudyScene(self.factors.scene_of(seed, model, changes))
+            return StudyScene(self.factors.scene_of(seed, model, changes))
 
-    def _view(self, evaluation: Evaluation, made: _StudyScene) -> RenderedView:
+    def _view(self, evaluation: Evaluation, made: StudyScene) -> RenderedView:
         """Return a view, rendered where this was not done before for what the renderer reads of the scene."""
         key = made.render_key, evaluation.view
         return self.kept.once("render", key, lambda: self._rendered(key[0], made.scene, evaluation.view))
@@ -313,7 +313,7 @@ class SceneEvaluator:
         """Return the view of an evaluation with its camera, its Sun and its exposure."""
         made = self._scene(evaluation, setting)
         scene, view = made.scene, self._view(evaluation, made)
-        spec = replace(view.spec, scene=scene, faults=_faults(scene))
+        spec = replace(view.spec, scene=scene, faults=faults_of(scene))
         camera = self._camera(spec, setting)
         pose, rendering = with_sun(view, camera, setting.sun)
         far = setting.sun.get("distance_au")
@@ -434,18 +434,17 @@ class SceneEvaluator:
             added = parts["ghosts"][0] + parts["starburst"][0]
             added += parts["glare"][0]
             added *= seconds
-            # the veil of the Sun and that of the scene have the same distribution over the frame
             lost = source.scene_lost
             scene_e = exposed.scene_e
-            flux = scene_e.sum(axis=(1, 2), dtype=np.float64) * (lost if of_scene is None else 0 * lost)
-            focal_px = camera.focal_length_px
-            veil = cos4_map(camera_shape(camera), focal_px) * np.float32(1 / (np.pi * focal_px**2))
+            if of_scene is None:  # what the lens scatters of the scene returns as a veil, distributed as the Sun's
+                focal_px = camera.focal_length_px
+                veil = cos4_map(camera_shape(camera), focal_px) * np.float32(1 / (np.pi * focal_px**2))
+                flux = scene_e.sum(axis=(1, 2), dtype=np.float64) * lost
+                of_scene = veil * flux.astype(np.float32)[:, None, None]
             sun_veil = (per_s @ entering * camera.exposure_s).astype(np.float32)
             for channel, plane in enumerate(added):
                 plane += veil_plane * sun_veil[channel]
-                plane += veil * np.float32(flux[channel])
-                if of_scene is not None:
-                    plane += of_scene[channel]
+                plane += of_scene[channel]
             left = scene_e * (1 - lost).astype(np.float32)[:, None, None]
             if exposed.direct_e is not None:
                 left += exposed.direct_e * direct_left.astype(np.float32)[:, None, None]
@@ -522,7 +521,7 @@ class SceneEvaluator:
         There are none where the fault that a factor chooses cannot act, or does not show.
         """
         scene = self._scene(evaluation, setting).scene
-        faults = _faults(scene)
+        faults = faults_of(scene)
         frames: list[nav.NavigationFrame] = []
         first: Injection | None = None
         for clean in self._clean_views(evaluation, setting, count).views:
@@ -558,7 +557,7 @@ class SceneEvaluator:
 
     def _clean_view(self, seen: RenderedView, scene: Scene, setting: Setting) -> _CleanView:
         """Return a view of a sequence with its exposure and its clean twin."""
-        spec = replace(seen.spec, scene=scene, faults=_faults(scene))
+        spec = replace(seen.spec, scene=scene, faults=faults_of(scene))
         camera = self._camera(spec, setting)
         pose, rendering = with_sun(seen, camera, setting.sun)
         rate = camera.expose(rendering.light.rendered, 1.0)
@@ -626,68 +625,7 @@ def _rendered_sequence(view: RenderedView, count: int) -> list[RenderedView]:
     return views
 
 
-# --- the scene ---------------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class _StudyScene:
-    """Hold a scene of a study, and what identifies its renders."""
-
-    scene: Scene
-
-    @cached_property
-    def render_key(self) -> str:
-        """Return a digest of all that plan and renderer read of the scene."""
-        table = self.scene.resolved()
-        for key in ("title", "description"):
-            table.pop(key)
-        table["camera"] = {key: value for key, value in table["camera"].items() if key not in AFTER_RENDER}
-        table["faults"] = sorted((name, fault.needs_sun) for name, fault in _faults(self.scene).items())
-        return hashlib.sha256(json.dumps(table, sort_keys=True).encode()).hexdigest()
-
-
-def _scene_of(spec: StudySpec) -> Scene:
-    """Return the scene of a study without factors."""
-    values = {key: value for key, value in spec.scene.overrides.items() if value != {}}
-    scene = load_scene(spec.scene.base, values)
-    missing: dict[str, Any] = {
-        key: {} for key in spec.scene.overrides.keys() - values.keys() if not _has_table(scene, key)
-    }
-    if missing:
-        scene = load_scene(spec.scene.base, values | dict(sorted(missing.items())))
-    largest = max(spec.scene.views)
-    if largest >= scene.dataset.samples:
-        raise InputError(
-            f"study {shown(spec.title)}: scene.samples: sample {largest}: must be below dataset.samples = "
-            f"{scene.dataset.samples} of the scene {shown(spec.scene.base)}"
-        )
-    return scene
-
-
-def _has_table(scene: Scene, key: str) -> bool:
-    """Return whether a scene has the table of a dotted key."""
-    node: Any = scene.resolved()
-    for part in key.split("."):
-        node = node.get(part) if isinstance(node, dict) else None
-    return isinstance(node, dict)
-
-
-def _check_models(spec: StudySpec, faults: Mapping[str, Any]) -> None:
-    """Raise InputError if the fault or a model of the comparison is unknown."""
-    assert spec.models is not None
-    name, known = spec.models.fault, registry()
-    if name not in known:
-        raise InputError(f"models.fault = {shown(name)}: is unknown{did_you_mean(name, list(known))}")
-    if name not in faults:
-        raise InputError(f"models.fault = {shown(name)}: the scene {shown(spec.scene.base)} has no such fault")
-    for model in spec.models.compare:
-        if model not in known[name]:
-            raise InputError(f"models.compare: {shown(model)} is unknown{did_you_mean(model, list(known[name]))}")
-
-
-def _faults(scene: Scene) -> dict[str, Fault]:
-    """Return the faults of a scene."""
-    return {name: from_dict(name, table, source="scene") for name, table in scene.faults.items()}
+# --- values and images -------------------------------------------------------------------------------------------
 
 
 def _value(factor: Any, point: float) -> float | str:

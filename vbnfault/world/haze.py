@@ -43,9 +43,9 @@ _MOST_TANGENT = 1e4
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Frame:
-    """Hold a camera beside a coma: its view, and directions to the body's centre and at right angles to it in C.
+    """Hold a camera beside a coma.
 
-    `camera_m` float64[3] is the camera's position from the centre in L, `distance_m` its length.
+    `camera_m` float64[3] is its position from the centre of the coma in L, `distance_m` the length of that.
     """
 
     coma: Coma
