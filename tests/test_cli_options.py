@@ -50,6 +50,11 @@ def test_help_shows_the_text_and_the_default_of_every_option() -> None:
     assert seen > 30
 
 
+def test_help_shows_every_word_of_a_commands_text() -> None:
+    for name, command in COMMANDS.items():
+        assert " ".join(command.help.split()) in help_of(name), name  # a [word] would be taken for markup
+
+
 def test_a_number_without_a_default_says_what_holds_instead() -> None:
     counts = {"append"}  # nothing is appended without it
     for command, option in options():

@@ -97,7 +97,7 @@ def severity(
     workers: Annotated[int, typer.Option(min=1, max=MOST_PROCESSES, help="Number of processes.")] = 1,
 ) -> None:
     """Compute levels of severity: for each fault model five values that cost navigation the same. A scene reads
-    them by `file` in its table [severity], and `severity = 3` in the table of a fault. Models that the file has
+    them by `severity.file`, and `severity = 3` in the table of a fault. Models that the file has
     already stay in it.
     """
     from ..dataset import BuildOptions
