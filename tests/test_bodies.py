@@ -92,10 +92,17 @@ def magnitudes(name: str, phases_deg: Any) -> Array:
     return np.asarray(-2.5 * np.log10(flux[1:] / flux[0]))
 
 
-@pytest.mark.parametrize(("name", "g"), [("bennu", -0.08), ("ceres", 0.10), ("itokawa", 0.21)])
+@pytest.mark.parametrize(("name", "g"), [("ceres", 0.10), ("itokawa", 0.21)])
 def test_phase_curve_of_the_h_g_system(name: str, g: float) -> None:
     # exact but for the quadrature: the model divides by the closed form of a Lommel-Seeliger sphere
     np.testing.assert_allclose(10 ** (-0.4 * magnitudes(name, HG_DEG)), SBPY[g], rtol=1e-4)
+
+
+def test_bennu_lies_between_its_published_phase_laws() -> None:
+    """Hergenrother et al. 2013: G = -0.08, and 0.040 mag/° from 15 to 96° (below); they differ by 7 % in slope."""
+    measured = [phase for phase in HG_DEG if phase <= 96]
+    published = SBPY[-0.08][: len(measured)]
+    np.testing.assert_allclose(10 ** (-0.4 * magnitudes("bennu", measured)), published, rtol=0.05)
 
 
 def test_phase_curves_of_published_laws() -> None:
@@ -106,22 +113,90 @@ def test_phase_curves_of_published_laws() -> None:
     amplitude = (2.5 * math.log10(1.31) - 0.039 * 4.7) / (1 / 1.3 - 1 / 6)
     law = 0.039 * phases + amplitude * (1 - 1 / (1 + phases))
     np.testing.assert_allclose(10 ** (0.4 * (law - magnitudes("ryugu", phases))), 1, atol=0.05)
+    # Ceres: H = 3.14 with G, and V(1, 1, 0) = 3.48 with 0.036 mag/° (Ciarniello et al. 2017: both from 8 to 30°)
+    phases = np.array([8, 10, 15, 20, 25, 30])
+    law = 3.48 - 3.14 + 0.036 * phases
+    np.testing.assert_allclose(10 ** (0.4 * (law - magnitudes("ceres", phases))), 1, atol=0.05)
 
 
 @pytest.mark.parametrize(
-    ("name", "low_deg", "high_deg", "slope_mag_deg", "tolerance"),
+    ("name", "low_deg", "high_deg", "slope_mag_deg"),
     [
-        # Hergenrother et al. 2013 fit both this and G, which do not agree closer than the error of this, 7.5 %
-        ("bennu", 15, 96, 0.040, 0.08),
-        ("ryugu", 5, 75, 0.039, 0.05),  # Ishiguro et al. 2014
-        ("phobos", 20, 80, 0.033, 0.05),  # Noland & Veverka 1977
+        ("bennu", 15, 96, 0.040),  # Hergenrother et al. 2013
+        ("ryugu", 5, 75, 0.039),  # Ishiguro et al. 2014
+        ("phobos", 20, 80, 0.033),  # Noland & Veverka 1977
     ],
 )
-def test_phase_coefficients(
-    name: str, low_deg: float, high_deg: float, slope_mag_deg: float, tolerance: float
-) -> None:
+def test_phase_coefficients(name: str, low_deg: float, high_deg: float, slope_mag_deg: float) -> None:
     phases = np.linspace(low_deg, high_deg, 13)
-    assert np.polyfit(phases, magnitudes(name, phases), 1)[0] == pytest.approx(slope_mag_deg, rel=tolerance)
+    assert np.polyfit(phases, magnitudes(name, phases), 1)[0] == pytest.approx(slope_mag_deg, rel=0.05)
+
+
+@pytest.mark.parametrize(
+    ("name", "wavelength_nm", "bond_albedo", "tolerance"),
+    [
+        ("67p", 535.0, 0.0123, 0.05),  # Fornasier et al. 2015, table 3
+        ("67p", 649.0, 0.0157, 0.05),
+        ("ryugu", 550.0, 0.32 * 0.040, 0.05),  # phase integral of Ishiguro et al. 2014, 0.32 ± 0.03
+        ("eros", 550.0, 0.093, 0.06),  # Li et al. 2004, cited from memory
+    ],
+)
+def test_bond_albedos(name: str, wavelength_nm: float, bond_albedo: float, tolerance: float) -> None:
+    """A phase curve as a whole: p q with q = 2 ∫ Φ sin α dα; 48 nodes change it by less than 1e-3."""
+    x, w = np.polynomial.legendre.leggauss(48)
+    phases, ground = math.pi / 2 * (x + 1), ground_at(name, wavelength_nm)
+    flux = np.array([sphere_flux(ground, math.degrees(a))[0] for a in phases])
+    assert math.pi * (w * flux * np.sin(phases)).sum() == pytest.approx(bond_albedo, rel=tolerance)
+
+
+def shape_flux(body: Body, model: BandReflectance, phase_deg: float, turns: int = 6, pixels: int = 96) -> float:
+    """Mean I/F over the visible cross-section of a body and its rotation, with the shadows that it casts on itself.
+
+    Camera and Sun lie in the plane of the equator.
+    """
+    from vbnfault.render.mesh import mesh_scene
+    from vbnfault.render.runtime import mi
+
+    def vectors(array: Array) -> Any:
+        return mi.Vector3f(*(mi.Float(np.ascontiguousarray(c, dtype=np.float32)) for c in array.T))
+
+    vertices, faces = np.asarray(body.vertices_m), np.asarray(body.faces)
+    scene = mesh_scene("body", vertices.astype(np.float32), faces.astype(np.int32))
+    normals = np.cross(*(vertices[faces[:, k]] - vertices[faces[:, 0]] for k in (1, 2)))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    reach = 1.05 * np.linalg.norm(vertices, axis=1).max()
+    grid = ((np.arange(pixels) + 0.5) / pixels * 2 - 1) * reach
+    across, upwards = (a.ravel()[:, None] for a in np.meshgrid(grid, grid))
+    total, seen = 0.0, 0
+    for turn in np.arange(turns) * 2 * math.pi / turns:
+        view, east = np.array([[math.cos(turn), math.sin(turn), 0], [-math.sin(turn), math.cos(turn), 0]])
+        sun = math.cos(math.radians(phase_deg)) * view + math.sin(math.radians(phase_deg)) * east
+        start = across * east + upwards * np.array([0.0, 0, 1]) + 2 * reach * view
+        hit = scene.ray_intersect_preliminary(mi.Ray3f(vectors(start), mi.Vector3f(*map(float, -view))))
+        valid = np.array(hit.is_valid())
+        up, point = normals[np.array(hit.prim_index)[valid]], start[valid] - np.array(hit.t)[valid, None] * view
+        shadow = scene.ray_test(mi.Ray3f(vectors(point + 0.5 * up), mi.Vector3f(*map(float, sun))))
+        east_here = np.cross(up, [0.3, 0.5, 0.8])
+        east_here /= np.linalg.norm(east_here, axis=1, keepdims=True)
+        frame = np.stack([east_here, np.cross(up, east_here), up], axis=1)
+        factor = radiance_factor(model, frame @ sun, frame @ view)[0]
+        total += factor[(up @ sun > 0) & ~np.array(shadow)].sum()
+        seen += int(valid.sum())
+    return float(total / seen)
+
+
+def test_67p_has_its_published_phase_coefficient_with_the_shadows_of_its_shape() -> None:
+    """Fornasier et al. 2015: 0.047 ± 0.002 mag/° from 1.3 to 54°, A_geo 0.0677 at 649 nm; a sphere has 0.042.
+
+    96 pixels and 6 rotations are within 1 % of 160 and 12.
+    """
+    body, ground = assemble.make_body(scene_of("67P")), ground_at("67P", 649.0)
+    assert shape_flux(body, ground, 0.01) == pytest.approx(0.0677, rel=0.05)
+    phases = np.linspace(1.3, 54, 6)
+    curve = -2.5 * np.log10([shape_flux(body, ground, a) for a in phases])
+    assert np.polyfit(phases, curve, 1)[0] == pytest.approx(0.047, rel=0.05)
+    sphere = -2.5 * np.log10([sphere_flux(ground, a)[0] for a in phases])
+    assert np.polyfit(phases, sphere, 1)[0] < 0.95 * 0.047
 
 
 def test_67ps_albedos_per_filter() -> None:
