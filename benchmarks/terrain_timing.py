@@ -17,7 +17,8 @@ import psutil
 
 from vbnfault import render
 from vbnfault.body import EMBEDDED, PatchSpec, choose_sites, load_body
-from vbnfault.body.cache import FOLDER_VARIABLE, cached_patch
+from vbnfault.body.cache import cached_patch
+from vbnfault.core.array_files import FOLDER_VARIABLE
 
 
 def peak_gib() -> float:

@@ -155,18 +155,17 @@ def terrain(folder: Path) -> Callable[[], tuple[bool, bool]]:
     body = Body(name="ball", vertices_m=np.array(ball.vertices), faces=np.array(ball.faces))
     site = choose_sites(body, 1, seed=0)[0]
     patch = build_patch(body, site, PatchSpec(**COARSE))
-    key = cache.patch_key(body, site, PatchSpec(**COARSE))
+    key, arrays = cache.patch_key(body, site, PatchSpec(**COARSE)), cache.arrays_of(patch)
     file = folder / f"patch-{key}.patch"
-    cache._write(file, key, patch, 2**30)
+    cache.PATCHES.write(file, key, arrays, 2**30)
 
     def read() -> tuple[bool, bool]:
         try:
-            got, was_built = cache._read(file, key, site), False
+            got, was_built = cache.PATCHES.read(file, key), False
         except (OSError, ValueError):
-            got, was_built = patch, True
-            cache._write(file, key, patch, 2**30)
-        names = cache._ARRAYS
-        return all(np.array_equal(getattr(got, name), getattr(patch, name)) for name in names), was_built
+            got, was_built = arrays, True
+            cache.PATCHES.write(file, key, arrays, 2**30)
+        return all(np.array_equal(got[name], arrays[name]) for name in arrays), was_built
 
     return read
 

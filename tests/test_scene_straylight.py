@@ -14,12 +14,13 @@ from numpy.typing import NDArray
 from test_faults_kit import flat_electrons, make_context
 
 import vbnfault
-from vbnfault.core import llvm, spectra
+from vbnfault.core import array_files, llvm, spectra
 from vbnfault.core.errors import VbnfaultError
 from vbnfault.core.quantities import Electrons, Radiance
 from vbnfault.faults import FaultContext, from_dict
 from vbnfault.lens import ThinLens, load_lens, paraxial_properties
 from vbnfault.lens.prescription import Prescription
+from vbnfault.lens.straylight import ghost_response
 from vbnfault.lens.straylight.bundles import Tracer
 from vbnfault.lens.straylight.ghosts import boxes, lit_cells, traced_ghosts
 from vbnfault.lens.straylight.paraxial import paraxial_ghosts
@@ -284,6 +285,81 @@ def test_light_of_the_guard_band_counts_and_a_baffle_keeps_it_out(singlet: Presc
     # at the edge of the guard band, 22 degrees, the tube lights 43 % of the entrance
     for part in ("ghosts", "glare", "veil"):
         assert 0.2 < getattr(less, part).sum() / getattr(added, part).sum() < 0.6
+
+
+# --- the response on disk -----------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """An empty cache folder."""
+    monkeypatch.setenv(array_files.FOLDER_VARIABLE, str(tmp_path / "cache"))
+    return tmp_path / "cache"
+
+
+def fresh(scene: SceneInLens) -> F32:
+    """The table that a new process gets."""
+    ghost_response._response.cache_clear()
+    return scene.response.table
+
+
+def test_a_response_is_traced_once_and_read_by_others(
+    singlet: Prescription, folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Bit for bit; damage is found, whichever byte it is in, and the response is traced and kept again."""
+    scene = behind(singlet, 8, 30.0)
+    counted, trace = [0], ghost_response._traced_table
+
+    def counting(*args: Any) -> F32:
+        counted[0] += 1
+        return trace(*args)
+
+    monkeypatch.setattr(ghost_response, "_traced_table", counting)
+    traced = fresh(scene)
+    (path,) = folder.iterdir()
+    good = path.read_bytes()
+    np.testing.assert_array_equal(fresh(scene), traced)
+    assert counted == [1]
+    for place in (3, 40, 300, len(good) // 2, len(good) - 5):
+        damaged = bytearray(good)
+        damaged[place] ^= 4
+        path.write_bytes(damaged)
+        np.testing.assert_array_equal(fresh(scene), traced)
+        assert "the response of ghosts kept there is damaged" in capsys.readouterr().err
+        assert path.read_bytes() == good
+    assert counted == [6]
+
+
+def test_what_changes_a_response_changes_its_key(singlet: Prescription) -> None:
+    scene = behind(singlet, 8, 30.0)
+
+    def key(
+        lens: Prescription = singlet, nm: float = 550.0, loss: float = 0.0, of: Any = scene, **keys: Any
+    ) -> str:
+        settings = replace(scene.settings.ghosts, **keys)
+        return ghost_response.response_key(lens, (nm,), of.response.cells, settings, loss)
+
+    first, *others = singlet.surfaces
+    changed = [
+        replace(first, radius_mm=61.0),
+        replace(first, semi_diameter_mm=7.9),
+        replace(first, medium=replace(first.medium, coefficients=(1.61, 0.0))),
+        replace(first, conic=0.1),
+        replace(first, internal_transmittance_10mm=((400.0, 700.0), (0.9, 0.9))),
+    ]
+    keys = [
+        key(),
+        *(key(replace(singlet, surfaces=(surface, *others))) for surface in changed),
+        key(singlet.coated("mgf2")),
+        key(replace(singlet, sensor_reflectance=0.1)),
+        key(nm=551.0),
+        key(loss=0.5),
+        key(model="paraxial"),
+        key(of=behind(singlet, 8, 31.0)),
+        key(of=behind(singlet, 10, 30.0)),
+    ]
+    assert len(set(keys)) == len(keys)
+    assert key(replace(singlet, name="other", source="other")) == keys[0]
 
 
 # --- the fault --------------------------------------------------------------------------------------------------

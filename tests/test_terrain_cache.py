@@ -11,10 +11,11 @@ import pytest
 import trimesh
 
 from vbnfault.body import Body, Patch, Site, cache, choose_sites
-from vbnfault.body.cache import cache_folder, cached_patch, patch_key
+from vbnfault.body.cache import PATCHES, arrays_of, cached_patch, patch_key
 from vbnfault.body.patch import build_patch
 from vbnfault.body.spec import PatchSpec
-from vbnfault.core import activity
+from vbnfault.core import activity, array_files
+from vbnfault.core.array_files import cache_folder
 from vbnfault.core.errors import InputError
 
 COARSE = {"seed": 3, "facet_m": 20.0, "radius_m": 60.0, "min_boulder_m": 8.0, "max_triangles": 60_000}
@@ -33,15 +34,15 @@ def site(body: Body) -> Site:
 
 @pytest.fixture(autouse=True)
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.setenv(cache.FOLDER_VARIABLE, str(tmp_path / "cache"))
-    monkeypatch.delenv(cache.SIZE_VARIABLE, raising=False)
+    monkeypatch.setenv(array_files.FOLDER_VARIABLE, str(tmp_path / "cache"))
+    monkeypatch.delenv(array_files.SIZE_VARIABLE, raising=False)
     return tmp_path / "cache"
 
 
 def same(a: Patch, b: Patch) -> bool:
     return all(
         np.asarray(x).dtype == np.asarray(y).dtype and np.array_equal(x, y)
-        for x, y in ((getattr(a, name), getattr(b, name)) for name in cache._ARRAYS)
+        for x, y in zip(arrays_of(a).values(), arrays_of(b).values(), strict=True)
     )
 
 
@@ -161,7 +162,7 @@ def test_unwritable_folder_costs_nothing_but_time_and_is_told_once(
 ) -> None:
     blocked = tmp_path / "file"
     blocked.write_text("in the way")
-    monkeypatch.setenv(cache.FOLDER_VARIABLE, str(blocked / "below"))
+    monkeypatch.setenv(array_files.FOLDER_VARIABLE, str(blocked / "below"))
     patch = cached_patch(body, site, PatchSpec(**COARSE))
     told = f"warning: {blocked / 'below'}: terrain cannot be kept there (Not a directory), so every run builds it"
     assert capsys.readouterr().err.startswith(told)
@@ -171,8 +172,8 @@ def test_unwritable_folder_costs_nothing_but_time_and_is_told_once(
     def full(*args: object, **kwargs: object) -> bytes:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setenv(cache.FOLDER_VARIABLE, str(tmp_path / "full"))
-    monkeypatch.setattr(cache, "_parts", full)
+    monkeypatch.setenv(array_files.FOLDER_VARIABLE, str(tmp_path / "full"))
+    monkeypatch.setattr(array_files, "_parts", full)
     assert same(cached_patch(body, site, PatchSpec(**COARSE)), patch)
     assert list((tmp_path / "full").iterdir()) == []
     assert "full: terrain cannot be kept there (No space left on device)" in capsys.readouterr().err
@@ -182,7 +183,7 @@ def test_used_longest_ago_goes_first(body: Body, site: Site, folder: Path, monke
     first = cached_patch(body, site, PatchSpec(**COARSE))
     (path,) = folder.iterdir()
     size = path.stat().st_size
-    monkeypatch.setenv(cache.SIZE_VARIABLE, str(2.5 * size / 2**30))
+    monkeypatch.setenv(array_files.SIZE_VARIABLE, str(2.5 * size / 2**30))
     os.utime(path, (1000, 1000))
     cached_patch(body, site, PatchSpec(**{**COARSE, "seed": 4}))
     os.utime(next(p for p in folder.iterdir() if p != path), (2000, 2000))
@@ -207,34 +208,35 @@ def test_unfinished_files_of_the_dead_are_removed(body: Body, site: Site, folder
 def test_size_of_zero_keeps_nothing_and_nonsense_is_refused(
     body: Body, site: Site, folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setenv(cache.SIZE_VARIABLE, "0")
+    monkeypatch.setenv(array_files.SIZE_VARIABLE, "0")
     cached_patch(body, site, PatchSpec(**COARSE))
     assert not folder.exists()
     for text in ("-1", "many", "nan"):
-        monkeypatch.setenv(cache.SIZE_VARIABLE, text)
-        with pytest.raises(InputError, match=cache.SIZE_VARIABLE):
+        monkeypatch.setenv(array_files.SIZE_VARIABLE, text)
+        with pytest.raises(InputError, match=array_files.SIZE_VARIABLE):
             cached_patch(body, site, PatchSpec(**COARSE))
 
 
 def test_two_at_once_write_one_whole_file(body: Body, site: Site, folder: Path) -> None:
     patch = build_patch(body, site, PatchSpec(**COARSE))
     path = folder / "patch-race.patch"
-    writers = [threading.Thread(target=cache._write, args=(path, "race", patch, 2**30)) for _ in range(4)]
+    content = path, "race", arrays_of(patch), 2**30
+    writers = [threading.Thread(target=PATCHES.write, args=content) for _ in range(4)]
     for writer in writers:
         writer.start()
     for writer in writers:
         writer.join()
-    assert same(cache._read(path, "race", site), patch)
+    assert same(Patch(site=site, **PATCHES.read(path, "race")), patch)
     assert [p.name for p in folder.iterdir()] == [path.name]
 
 
 def test_folder_follows_the_platform(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.delenv(cache.FOLDER_VARIABLE)
+    monkeypatch.delenv(array_files.FOLDER_VARIABLE)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    monkeypatch.setattr(cache.sys, "platform", "linux")
+    monkeypatch.setattr(array_files.sys, "platform", "linux")
     assert cache_folder() == tmp_path / "vbnfault"
     monkeypatch.delenv("XDG_CACHE_HOME")
     assert cache_folder() == Path.home() / ".cache" / "vbnfault"
-    monkeypatch.setattr(cache.sys, "platform", "win32")
+    monkeypatch.setattr(array_files.sys, "platform", "win32")
     monkeypatch.setenv("LOCALAPPDATA", str(tmp_path))
     assert cache_folder() == tmp_path / "vbnfault" / "cache"

@@ -7,33 +7,45 @@ azimuthal harmonic n:
 
     E_n(r_m) = Σ_k T_n(r_m, t_k) S_n(t_k).
 
-`ghost_response` traces T once for a lens, from rays through the boxes of all ghosts (`ghosts.boxes`), and
-`GhostResponse` applies it. A source counts in the two rings and the two azimuths next to it, with linear weights.
-The light of each ray is spread over the sensor by a Gaussian that is as wide as the distance of its neighbours, at
-least half a ring. Ghosts that are sharper than a ring are therefore smooth on this scale.
+`ghost_response` traces T once for a lens, from rays through the boxes of all ghosts (`ghosts.boxes`), and keeps it
+on disk. `GhostResponse` applies it. A source counts in the two rings and the two azimuths next to it, with linear
+weights. The light of each ray is spread over the sensor by a Gaussian that is as wide as the distance of its
+neighbours, at least half a ring. Ghosts that are sharper than a ring are therefore smooth on this scale.
 
 A stop with blades is replaced by a round one of the same area, as in the image of the scene.
 """
 
 from __future__ import annotations
 
+import dataclasses
+import hashlib
+import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
+from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ...core import activity
+from ...core.array_files import ArrayFiles, code_hash
+from ...core.llvm import backend
+from ..glass import D_NM
 from ..prescription import Prescription
-from .bundles import Rays, Tracer
+from .bundles import Rays, Spots, Tracer
 from .ghosts import boxes, lit_cells
 from .irradiance import ParaxialTracer
 from .settings import GhostSettings, SensorGrid
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
+
+RESPONSES = ArrayFiles(kind="ghosts", content="response of ghosts")
+_SOURCES = ("bundles", "ghost_response", "ghosts", "irradiance", "paraxial", "settings", "steps")
+_OF_LENSES = ("coating", "glass", "paraxial", "prescription", "rays")
 
 _NARROWINGS = 3  # times that the box of a ghost's rays is narrowed to those that arrive near the sensor
 _THIN = 3.0  # distance of rays over the ghost's median, from which on light is thin
@@ -46,6 +58,7 @@ _BOXES = 2  # boxes are computed for every second ring of sources, and united wi
 _LEVELS = 5  # widths of the Gaussian, each twice the one before
 _SIGMA = 0.5  # the least width, in rings
 _SIGMAS = 3.5  # distance at which the Gaussian is cut off, in its widths
+_LEAST = 1e-7  # coefficients of Gaussians below this part of the first one are left out
 _BEYOND = 34  # rings beyond the frame's corner, from which the widest Gaussian spreads light into the frame
 
 
@@ -174,7 +187,8 @@ class _Smoothing:
         c_n(r) = exp(-(r - r₀)² / 2σ²) e^(-z) I_n(z) / (2π σ²), with z = r r₀ / σ².
 
     `weights[d + half]` float32[harmonic, ring] is this coefficient times the number of azimuths, for
-    r₀ = r_(m + d).
+    r₀ = r_(m + d). Harmonics at which it is below 1e-7 on all rings are left out; they follow from
+    e^(-z) I_n(z) ≈ exp(-n² / 2z) / √(2π z).
     """
 
     half: int
@@ -188,7 +202,8 @@ class _Smoothing:
         sigma = _SIGMA * 2**level  # in rings
         half = int(np.ceil(_SIGMAS * sigma))
         radius = np.arange(cells.rings) + 0.5
-        harmonic = np.arange(cells.azimuths // 2 + 1)[:, None]
+        most = np.ceil(np.sqrt(-2 * np.log(_LEAST) * radius[-1] * (radius[-1] + half)) / sigma)
+        harmonic = np.arange(min(int(most), cells.azimuths // 2) + 1)[:, None]
         weights = np.zeros((2 * half + 1, len(harmonic), cells.rings), dtype=np.float32)
         for d in range(-half, half + 1):
             from_ = radius + d
@@ -199,7 +214,8 @@ class _Smoothing:
 
     def add(self, flux: F32, out: F32) -> None:
         """Add the light of rings of flux, float32[band, harmonic, all rings], to `out` [band, harmonic, ring]."""
-        rings, every = out.shape[-1], flux.shape[-1]
+        rings, every, nodes = out.shape[-1], flux.shape[-1], self.weights.shape[1]
+        flux, out = flux[:, :nodes], out[:, :nodes]
         for d in range(-self.half, self.half + 1):
             first, last = max(0, -d), min(rings, every - d)
             if first < last:
@@ -236,7 +252,7 @@ class _Tracing:
         out = []
         for slope in self.cells.slopes[::_BOXES] + self.cells.slopes[-1:]:
             box = np.full((self.routes, 4), np.nan)
-            rays, _ = boxes(self.tracer, float(np.degrees(np.arctan(slope))))
+            rays, _ = boxes(self.tracer, float(np.degrees(np.arctan(slope))), arrive=False)
             box[rays.route] = rays.box_mm
             out.append(box)
         return out
@@ -253,15 +269,23 @@ class _Tracing:
             return out
         ends = slopes[max(ring - 1, 0)], slopes[min(ring + 1, len(slopes) - 1)]
         colours = self._colours(ghosts, float(slopes[ring]))
-        flux = np.zeros((_LEVELS * self.rings * self.nodes, self.bands), dtype=np.float32)
-        for offset in _within(_WITHIN):
-            position = ring + offset
-            slope = float(np.interp(abs(position), np.arange(len(slopes)), slopes))
-            for across in np.unique(ghosts.across):
-                chosen = ghosts.take(ghosts.across == across)
-                arrived = self._traced(chosen, int(across), slope, float(ends[1] - ends[0]) / 2 / _WITHIN)
+        arrived = []
+        # where neighbouring rings of sources have ghosts as close together as the rays, one field angle is enough
+        step = float(ends[1] - ends[0]) / 2
+        close = np.abs(self.tracer.matrix[ghosts.route, 0, 1]) * step < ghosts.spacing_mm
+        for angles, apart in ((1, close), (_WITHIN, ~close)):
+            position = ring + _within(angles)
+            sources = _Sources(
+                slope=np.interp(np.abs(position), np.arange(len(slopes)), slopes),
                 # the source on the other side of the axis has its ghosts on the other side too
-                flux += self._in_cells(arrived, colours[ghosts.across == across] / _WITHIN, mirrored=position < 0)
+                mirrored=position < 0,
+                spacing=step / angles,
+            )
+            for across in np.unique(ghosts.across[apart]):
+                chosen = apart & (ghosts.across == across)
+                part = colours[chosen] / np.float32(angles)
+                arrived.append(self._traced(ghosts.take(chosen), int(across), sources, part))
+        flux = self._in_cells(arrived)
         levels = flux.reshape(_LEVELS, self.rings, self.nodes, self.bands)
         for level in np.flatnonzero(levels.any(axis=(1, 2, 3))):
             self.smoothing[level].add(_cosines(levels[level].transpose(2, 1, 0)), out)
@@ -295,19 +319,17 @@ class _Tracing:
 
         The boxes are narrowed to these rays, again as long as a ghost is much larger than the sensor.
         """
-        across = np.zeros(len(route), dtype=np.int64)
+        ghosts = _Ghosts(route, box, np.zeros(len(route), dtype=np.int64), np.zeros(len(route)))
         for _ in range(_NARROWINGS):
-            if not len(route):
+            if not len(ghosts):
                 break
-            route, box, across, fraction = self._narrowed(route, box, slope)
+            ghosts, fraction = self._narrowed(ghosts.route, ghosts.box_mm, slope)
             if (fraction > 0.5).all():
                 break
-        return _Ghosts(route, box, across)
+        return ghosts
 
-    def _narrowed(
-        self, route: NDArray[np.int64], box: F64, slope: float
-    ) -> tuple[NDArray[np.int64], F64, NDArray[np.int64], F64]:
-        """Return routes, boxes and rays along their sides of `_Ghosts`, and how much each box became smaller."""
+    def _narrowed(self, route: NDArray[np.int64], box: F64, slope: float) -> tuple[_Ghosts, F64]:
+        """Return the ghosts in boxes, and how much each box became smaller."""
         shape = len(route), _COARSE, _COARSE
         rays = self._bundles(route, box, slope, [self.bands // 2])
         spots = self.tracer.trace(rays, _COARSE, centred=True, halved=False)
@@ -331,7 +353,7 @@ class _Tracing:
         rings = _median(spacing[seen], near) / self.cells.ring_mm * most
         wanted = np.maximum(np.minimum(rings, _ENOUGH), rings / (_CLOSE * self.cells.rings))
         across = np.array(_ACROSS)[np.minimum(np.searchsorted(_ACROSS, wanted), len(_ACROSS) - 1)]
-        return route[seen], out, across, fraction
+        return _Ghosts(route[seen], out, across, rings * self.cells.ring_mm / across), fraction
 
     def _colours(self, ghosts: _Ghosts, slope: float) -> F32:
         """Return the flux of each ghost in every band over that in the middle band, float32[ghost, band]."""
@@ -341,69 +363,138 @@ class _Tracing:
         middle = lit[:, self.bands // 2, None]
         return np.asarray(np.where(middle > 0, lit / np.where(middle > 0, middle, 1), 1.0), dtype=np.float32)
 
-    def _traced(self, ghosts: _Ghosts, across: int, slope: float, spacing: float) -> _Arrived:
-        """Return where the rays of one field angle arrive, for the half of each box with y > 0."""
-        rays = self._bundles(ghosts.route, ghosts.box_mm, slope, [self.bands // 2])
-        shape = len(ghosts), across, across
+    def _traced(self, ghosts: _Ghosts, across: int, sources: _Sources, colours: F32) -> _Arrived:
+        """Return where the rays of all sources arrive, for the half of each box with y > 0."""
+        be = backend()
+        dr, Float, UInt32 = be.dr, be.Float, be.UInt32
+        count, turns = len(ghosts), len(sources.slope)
+        parts = [
+            self._bundles(ghosts.route, ghosts.box_mm, float(slope), [self.bands // 2]) for slope in sources.slope
+        ]
+        rays = Rays(
+            route=np.tile(parts[0].route, turns),
+            wavelength=np.tile(parts[0].wavelength, turns),
+            box_mm=np.tile(ghosts.box_mm, (turns, 1)),
+            direction=np.concatenate([part.direction for part in parts]),
+        )
         spots = self.tracer.trace(rays, across, centred=True, halved=False)
-        lit = lit_cells(spots, across).numpy().reshape(shape)
-        x, y = (v.numpy().reshape(shape) for v in (spots.x_mm, spots.y_mm))
+        light = lit_cells(spots, across)
         # the Sun's beam is inclined, and both halves of the box count
-        area = 2 * 4 * rays.box_mm[:, 2] * rays.box_mm[:, 3] / across**2 / np.hypot(1, slope)
-        move = np.abs(self.tracer.matrix[ghosts.route, 0, 1]) * spacing
-        apart = np.maximum(_spacing(x, y, lit > 0), move[:, None, None]) / self.cells.ring_mm
-        level = np.clip(np.ceil(np.log2(np.maximum(apart, 1e-9))), 0, _LEVELS - 1).astype(np.int64)
-        return _Arrived(x, y, lit * area[:, None, None].astype(np.float32), level)
+        area = 2 * 4 * rays.box_mm[:, 2] * rays.box_mm[:, 3] / across**2 * rays.direction[:, 2]
+        move = np.abs(self.tracer.matrix[rays.route, 0, 1]) * sources.spacing
+        bundle = dr.arange(UInt32, dr.width(light)) // (across * across)
 
-    def _in_cells(self, arrived: _Arrived, colours: F32, *, mirrored: bool) -> F32:
+        def of_bundle(values: NDArray[Any]) -> Any:
+            return dr.gather(Float, Float(np.ascontiguousarray(values, dtype=np.float32)), bundle)
+
+        per_ring = dr.opaque(Float, 1 / self.cells.ring_mm)
+        apart = dr.maximum(_lit_spacing(spots, light, across), of_bundle(move)) * per_ring
+        level = dr.clip(dr.ceil(dr.log2(dr.maximum(apart, 1e-9))), 0, _LEVELS - 1)
+        radius = dr.sqrt(spots.x_mm * spots.x_mm + spots.y_mm * spots.y_mm) * per_ring - 0.5
+        chosen = (light > 0) & (radius < self.rings - 1)
+        radius = dr.maximum(radius, 0)
+        x = spots.x_mm * of_bundle(np.repeat(np.where(sources.mirrored, -1.0, 1.0), count))
+        turn = dr.atan2(dr.abs(spots.y_mm), x) * ((self.nodes - 1) / np.pi)
+        ring, node = UInt32(radius), dr.minimum(UInt32(turn), self.nodes - 2)
+        cell = (UInt32(level) * self.rings + ring) * self.nodes + node
+        across_ring, along_ring = radius - Float(ring), turn - Float(node)
+        flux = light * of_bundle(area)
+        dr.eval(chosen, cell, across_ring, along_ring, flux, bundle)
+        kept = dr.compress(chosen)
+        cell, across_ring, along_ring, flux, bundle = (
+            dr.gather(type(v), v, kept).numpy() for v in (cell, across_ring, along_ring, flux, bundle)
+        )
+        return _Arrived(cell, across_ring, along_ring, flux[:, None] * colours[bundle % count])
+
+    def _in_cells(self, arrived: Sequence[_Arrived]) -> F32:
         """Return the light in the cells of the half turn, both sides together, float32[cell, band]."""
         from scipy.sparse import csc_matrix
 
         rings, nodes = self.rings, self.nodes
-        radius = np.hypot(arrived.x_mm, arrived.y_mm) / np.float32(self.cells.ring_mm) - np.float32(0.5)
-        chosen = (arrived.light > 0) & (radius < rings - 1)
-        ghost = np.nonzero(chosen)[0]
-        x = -arrived.x_mm[chosen] if mirrored else arrived.x_mm[chosen]
-        turn = np.arctan2(np.abs(arrived.y_mm[chosen]), x) * np.float32((nodes - 1) / np.pi)
-        radius = np.maximum(radius[chosen], 0)
-        ring, node = radius.astype(np.int64), np.minimum(turn.astype(np.int64), nodes - 2)
-        across, along = radius - ring, turn - node
-        first = (arrived.level[chosen] * rings + ring) * nodes + node
-        cells = np.column_stack([first, first + 1, first + nodes, first + nodes + 1])
-        weights = np.column_stack(
-            [(1 - across) * (1 - along), (1 - across) * along, across * (1 - along), across * along]
-        )
-        spread = csc_matrix(
-            (weights.astype(np.float32).ravel(), cells.ravel(), np.arange(0, 4 * len(first) + 1, 4)),
-            shape=(_LEVELS * rings * nodes, len(first)),
-        )
-        return np.asarray(spread @ (arrived.light[chosen][:, None] * colours[ghost]))
+        first = np.concatenate([part.cell for part in arrived]).astype(np.int32)
+        across = np.concatenate([part.across for part in arrived])
+        along = np.concatenate([part.along for part in arrived])
+        cells, weights = np.empty((len(first), 4), dtype=np.int32), np.empty((len(first), 4), dtype=np.float32)
+        for k, (step, weight) in enumerate(
+            (
+                (0, (1 - across) * (1 - along)),
+                (1, (1 - across) * along),
+                (nodes, across * (1 - along)),
+                (nodes + 1, across * along),
+            )
+        ):
+            cells[:, k], weights[:, k] = first + step, weight
+        indptr = np.arange(0, 4 * len(first) + 1, 4, dtype=np.int32)
+        shape = _LEVELS * rings * nodes, len(first)
+        spread = csc_matrix((weights.ravel(), cells.ravel(), indptr), shape=shape)
+        return np.asarray(spread @ np.concatenate([part.light for part in arrived]))
 
 
 @dataclass(frozen=True, eq=False)
 class _Ghosts:
-    """Hold the routes to trace, half the boxes of their rays, float64[ghost, 4], and the rays along their sides."""
+    """Hold the routes to trace, half the boxes of their rays, float64[ghost, 4], and the rays along their sides.
+
+    `spacing_mm` float64[ghost] is the median distance of neighbouring rays on the sensor.
+    """
 
     route: NDArray[np.int64]
     box_mm: F64
     across: NDArray[np.int64]
+    spacing_mm: F64
 
     def __len__(self) -> int:
         return len(self.route)
 
     def take(self, chosen: NDArray[np.bool_]) -> _Ghosts:
         """Return some of the ghosts."""
-        return _Ghosts(self.route[chosen], self.box_mm[chosen], self.across[chosen])
+        return _Ghosts(self.route[chosen], self.box_mm[chosen], self.across[chosen], self.spacing_mm[chosen])
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Sources:
+    """Hold the field angles traced for a ring.
+
+    They are given by their slopes, float64[source], whether they lie on the other side of the axis, bool[source],
+    and their distance in slope.
+    """
+
+    slope: F64
+    mirrored: NDArray[np.bool_]
+    spacing: float
 
 
 @dataclass(frozen=True, eq=False)
 class _Arrived:
-    """Hold positions and flux of rays on the sensor, and the level of the Gaussian of each, [ghost, y, x] each."""
+    """Hold the rays that arrive within the rings.
 
-    x_mm: F32
-    y_mm: F32
+    They are given by the first of the four cells around each, int[ray], its position between them across and along
+    the ring, float32[ray], and its light, float32[ray, band].
+    """
+
+    cell: NDArray[Any]
+    across: F32
+    along: F32
     light: F32
-    level: NDArray[np.int64]
+
+
+def _lit_spacing(spots: Spots, light: Any, across: int) -> Any:
+    """Return the distance of each ray from its lit neighbours as `_spacing` does, a device array."""
+    be = backend()
+    dr = be.dr
+    each = dr.arange(be.UInt32, dr.width(light))
+    row = each // across
+    ix, iy = each - row * across, row % across
+    apart: Any = 0.0
+    for node, step in ((ix, 1), (iy, across)):
+        total: Any = 0.0
+        count: Any = 0.0
+        for has, neighbour in ((node > 0, each - step), (node < across - 1, each + step)):
+            both = has & (light > 0) & (dr.gather(be.Float, light, neighbour, has) > 0)
+            dx, dy = (v - dr.gather(be.Float, v, neighbour, has) for v in (spots.x_mm, spots.y_mm))
+            total = total + dr.select(both, dr.sqrt(dx * dx + dy * dy), 0)
+            count = count + dr.select(both, 1.0, 0.0)
+        apart = dr.maximum(apart, total / dr.maximum(count, 1))
+    return apart
 
 
 def _spacing(x: F32, y: F32, lit: NDArray[np.bool_]) -> F64:
@@ -438,6 +529,8 @@ def _median(values: F64, lit: NDArray[np.bool_]) -> F64:
 
 def _within(count: int) -> F64:
     """Return offsets between neighbouring rings, as densely as the linear weight of a source falls off."""
+    if count == 1:
+        return np.zeros(1)
     part = (np.arange(count) + 0.5) / count
     return np.where(part < 0.5, np.sqrt(2 * part) - 1, 1 - np.sqrt(2 * (1 - part)))
 
@@ -486,12 +579,65 @@ def _response(
     settings: GhostSettings,
     coating_loss: float,
 ) -> GhostResponse:
-    """Return the response at one coating loss; it is cached."""
+    """Return the response at one coating loss, from memory or from disk if it was traced before."""
+
+    def traced() -> dict[str, F32]:
+        activity.begin(f"ghosts of {lens.name} at every field angle (new response)")
+        return {"table": _traced_table(lens, wavelength_nm, cells, settings, coating_loss)}
+
+    key = response_key(lens, wavelength_nm, cells, settings, coating_loss)
+    table = RESPONSES.kept(key, traced)["table"]
+    table.setflags(write=False)
+    return GhostResponse(cells=cells, table=table)
+
+
+def _traced_table(
+    lens: Prescription,
+    wavelength_nm: tuple[float, ...],
+    cells: PolarCells,
+    settings: GhostSettings,
+    coating_loss: float,
+) -> F32:
+    """Return `GhostResponse.table` at one coating loss."""
     tracing = _Tracing(lens, np.array(wavelength_nm), cells, settings, coating_loss)
     count = len(cells.slopes)
     table = np.zeros((len(wavelength_nm), tracing.nodes, cells.rings, count), dtype=np.float32)
     if tracing.routes:
         for ring in range(count):
             table[..., ring] = tracing.ring(ring)
-    table.setflags(write=False)
-    return GhostResponse(cells=cells, table=table)
+    return table
+
+
+def response_key(
+    lens: Prescription,
+    wavelength_nm: tuple[float, ...],
+    cells: PolarCells,
+    settings: GhostSettings,
+    coating_loss: float,
+) -> str:
+    """Return the sha256 (hex) of all that determines a response.
+
+    Names do not count. Glasses count by their indices at the wavelengths that rays are traced at.
+    """
+    traced_nm = *wavelength_nm, float(np.median(wavelength_nm)), D_NM
+    surfaces = [dataclasses.asdict(s) for s in lens.with_round_stop().surfaces]
+    for surface in surfaces:
+        del surface["medium"]
+    content = {
+        "code": _code_hash(),
+        "surfaces": surfaces,
+        "indices": [lens.indices(nm).tolist() for nm in traced_nm],
+        "absorption": [[s.absorption_per_mm(nm) for s in lens.surfaces] for nm in wavelength_nm],
+        "sensor_reflectance": lens.sensor_reflectance,
+        "wavelength_nm": wavelength_nm,
+        "cells": dataclasses.asdict(cells),
+        "settings": [settings.model, settings.reflections, coating_loss],
+    }
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+
+
+@lru_cache(maxsize=1)
+def _code_hash() -> str:
+    """Return the sha256 (hex) of the sources that trace a response, the library versions and the platform."""
+    here = Path(__file__).parent
+    return code_hash([*(here / f"{name}.py" for name in _SOURCES), *(here.parent / f"{n}.py" for n in _OF_LENSES)])

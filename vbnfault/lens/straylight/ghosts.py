@@ -83,13 +83,13 @@ class Arrivals:
 
 
 def boxes(
-    made: Tracer, sun_deg: float, width: F64 | None = None, reach_mm: float = np.inf
+    made: Tracer, sun_deg: float, width: F64 | None = None, reach_mm: float = np.inf, *, arrive: bool = True
 ) -> tuple[Rays, Arrivals]:
     """Return the rays' box of every route that passes light, and its arrivals, for a Sun at azimuth 0.
 
     There is one bundle per route, at the first wavelength. Boxes are symmetric about the plane of axis and Sun;
     `Rays.disc` is the ellipse around all rays that pass. `width` is that of the rims' soft edges; rays that arrive
-    within `reach_mm` of the axis count as near.
+    within `reach_mm` of the axis count as near. Without `arrive` the arrivals are not computed.
     """
     tangent = np.tan(np.radians(sun_deg))
     direction = np.array([np.sin(np.radians(sun_deg)), 0.0, np.cos(np.radians(sun_deg))])
@@ -102,7 +102,7 @@ def boxes(
     edges = np.full(len(made.rows), _SHARP) if width is None else width
     last = len(made.wavelength_nm) - 1
     for ends in ((last // 2,), (0, last)):
-        box, disc, arrivals = _narrowed(made, route, ends, box, direction, edges, reach_mm)
+        box, disc, arrivals = _narrowed(made, route, ends, box, direction, edges, reach_mm if arrive else None)
         route = np.flatnonzero(np.isfinite(box[:, 0]))
         box, disc = box[route], disc[route]
         if not len(route):
@@ -142,12 +142,12 @@ def _narrowed(
     box: F64,
     direction: F64,
     width: F64,
-    reach_mm: float,
+    reach_mm: float | None,
 ) -> tuple[F64, F64, Arrivals]:
     """Return the boxes of the rays that pass, their ellipses, and the arrivals, each by route.
 
     Boxes are nan where no ray passes. Arrivals are those of the first wavelength given; `move_mm` compares them
-    with the last one.
+    with the last one. If `reach_mm` is None, they are not computed.
     """
     count = len(wavelength)
     rays = Rays(
@@ -157,11 +157,15 @@ def _narrowed(
         direction=np.tile(direction, (count * len(route), 1)),
     )
     spots = made.trace(rays, _COARSE, width)
-    margin, x, y, fraction = (
-        v.numpy().reshape(count, len(route), _COARSE, _COARSE)
-        for v in (spots.margin, spots.x_mm, spots.y_mm, spots.fraction)
-    )
+    shape = count, len(route), _COARSE, _COARSE
+    margin = spots.margin.numpy().reshape(shape)
     passes = (margin > -1).any(axis=0)
+    if reach_mm is None:
+        lattice = _CoarseRays(box=box, passes=passes, inside=passes)
+        low, high, spacing, kept = lattice.bounds(route, len(made.routes))
+        found = lattice.boxes(low, high, spacing, {int(route[k]): k for k in kept})
+        return *found, Arrivals.none(len(made.routes))
+    x, y, fraction = (v.numpy().reshape(shape) for v in (spots.x_mm, spots.y_mm, spots.fraction))
     near = (margin > -1).all(axis=0) & (np.hypot(x[0], y[0]) < reach_mm)
     apart = np.where(near, np.hypot(x[-1] - x[0], y[-1] - y[0]), np.nan).reshape(len(route), -1)
     with warnings.catch_warnings():
