@@ -41,13 +41,31 @@ def test_a_shift_is_found_and_undone() -> None:
     real, rendered = disc(83.3, 77.8), disc(80.0, 80.0)
     shift = flight_replay.shift_between(*map(flight_replay.look, (real, rendered)), search_px=8)
     assert shift == pytest.approx((3.3, -2.2), abs=0.15)
-    aligned = flight_replay.look(flight_replay.shifted(rendered, shift, 8.0))
+    aligned = flight_replay.look(ndimage.shift(rendered, shift[::-1], order=3, mode="nearest"))
     figures = flight_replay.compare(flight_replay.look(real), aligned, np.array([1.0, 0.0]))
     assert figures["iou"] > 0.985
     assert figures["rank"] > 0.95
     assert figures["limb_px"] <= 1.0
     for octave in ("power_8_16", "power_16_32"):
         assert figures[octave] == pytest.approx(1, rel=0.1)
+
+
+def test_an_image_moves_by_whole_pixels_and_continues_as_its_mirror_image() -> None:
+    image = np.arange(20.0).reshape(4, 5)
+    moved = flight_replay.shifted(image, (2, -1))
+    assert np.array_equal(moved[:3, 2:], image[1:, :3])
+    assert np.array_equal(moved[3, 2:], image[3, :3])
+    assert np.array_equal(moved[:3, :2], image[1:, 1::-1])
+    assert np.array_equal(flight_replay.shifted(image, (0, 0)), image)
+
+
+def test_raw_images_are_stretched_by_a_root_and_halved() -> None:
+    raw = np.zeros((4, 4), dtype=np.uint16)
+    raw[:2, :2] = 4200  # above the top code over black
+    raw[2:, :2] = 104
+    raw[2, 3] = 504
+    # over a black of 103.5 DN: 255; 3.985 √0.5 = 3 in 8 bits; 3.985 √400.5 = 80 in one pixel of four
+    assert flight_replay.developed(raw, 100.0).tolist() == [[255, 0], [3, 20]]
 
 
 def test_a_larger_body_has_a_smaller_overlap_and_a_limb_farther_out() -> None:
