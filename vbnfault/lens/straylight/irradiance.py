@@ -40,6 +40,7 @@ _DISC_RINGS = 3
 _LARGE_PX = 150.0  # radius of a rim's image from which on the image is large
 _PLAIN = 0.03  # edges below this fraction of the summed irradiance are drawn one level coarser
 _RAMP, _RAMP_PX = 7.0, 24.0  # distance from an edge, in its widths and at least in pixels, that is drawn finely
+_FRAME_PIXELS = 16  # smallest number of pixels of a level across the frame
 _SPREAD = 0.25, 256.0  # bounds of the size of rims' images relative to the paraxial size
 _SPREAD_SHARP = 4.0  # upper bound of the same in estimates of sharpness
 _LEAST = 1e-10  # irradiance over the Sun's below which a ghost is omitted
@@ -255,7 +256,9 @@ class FlareModel:
             """Return the coarsest level whose pixels are no larger than `px_` pixels."""
             return np.floor(np.log2(np.maximum(px_, 1.0))).astype(np.int64)
 
-        edge = np.minimum(level(blur_px / 1.5) + coarser, LEVELS - 1)
+        # a ghost may change over a fraction of the frame, and coarser pixels would flatten it
+        most = int(np.clip(level(np.float64(min(self.canvas.shape) / _FRAME_PIXELS)), 0, LEVELS - 1))
+        edge = np.minimum(level(blur_px / 1.5) + coarser, most)
         steady = np.hypot(self._sun, 0.5 * 2.0 ** edge[route] / px)
         width = np.clip(np.hypot(steady, self._fresnel), 1e-4, 0.5)
         one_px = width[least] * self._px[least] * sharp
@@ -263,10 +266,10 @@ class FlareModel:
         return _Detail(
             level=edge,
             # the inner part may have pixels as wide as a quarter of the ramp
-            inner_level=np.clip(level(ramp * one_px / sharp / 4), edge, LEVELS - 1),
+            inner_level=np.clip(level(ramp * one_px / sharp / 4), edge, most),
             # the Sun's disc, of twice its radius, limits the sharpness of a fold; in a large ghost two pixels do
             rough_level=np.minimum(
-                np.minimum(np.maximum(level(1.3 * sun_px), px[least] > _LARGE_PX), edge) + coarser, LEVELS - 1
+                np.minimum(np.maximum(level(1.3 * sun_px), px[least] > _LARGE_PX), edge) + coarser, most
             ),
             ramp=ramp,
             kind=edge_kind(steady[least], self._fresnel[least]),
