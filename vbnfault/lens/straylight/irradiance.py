@@ -257,7 +257,7 @@ class FlareModel:
             return np.floor(np.log2(np.maximum(px_, 1.0))).astype(np.int64)
 
         # a ghost may change over a fraction of the frame, and coarser pixels would flatten it
-        most = int(np.clip(level(np.float64(min(self.canvas.shape) / _FRAME_PIXELS)), 0, LEVELS - 1))
+        most = min(max(min(self.canvas.shape) // _FRAME_PIXELS, 1).bit_length() - 1, LEVELS - 1)
         edge = np.minimum(level(blur_px / 1.5) + coarser, most)
         steady = np.hypot(self._sun, 0.5 * 2.0 ** edge[route] / px)
         width = np.clip(np.hypot(steady, self._fresnel), 1e-4, 0.5)
