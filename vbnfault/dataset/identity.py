@@ -76,6 +76,8 @@ def scene_identity(session: pipeline.Session) -> dict[str, Any]:
         del scene["body"]["atmosphere"]  # stores of scenes without one stay as they were
     if session.scene.coma is None:
         del scene["coma"]
+    if session.scene.camera.point_spread is None:
+        del scene["camera"]["point_spread"]
     if session.scene.trajectory is None:
         del scene["trajectory"]
     else:

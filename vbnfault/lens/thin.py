@@ -1,5 +1,7 @@
 """Image a scene with an ideal thin lens: rectilinear, without distortion or ghosts, with finite depth of field.
 
+It images points as points, unless it is given a point spread (`halo`).
+
 The paper's nominal camera has no cos⁴ falloff: an extended scene gives the irradiance π T L / (4 N²) at every field
 angle, and natural vignetting is a fault of its own. The Sun, however, is a source of known flux, and a pupil of
 area A admits E☉ A cos θ of it. The Sun's direct image therefore follows the pupil,
@@ -14,7 +16,7 @@ already passed the pupil. Vignetting, which adds the cos⁴ to the scene, must n
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import ClassVar
 
@@ -23,6 +25,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..core.quantities import Irradiance, Radiance
 from ..core.sundisc import Pinhole
+from .halo import Halo
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -32,21 +35,28 @@ F64 = NDArray[np.float64]
 class ThinLens:
     """Describe a thin lens; `focus_distance_m` is the object distance in focus (inf: focused at infinity).
 
-    It has the interface `Lens`.
+    `halo` is its point spread, None for an ideal image; pixels then subtend `pixel_rad`. It has the interface
+    `Lens`.
     """
 
     focal_length_mm: float
     f_number: float
     transmission: float = 1.0
     focus_distance_m: float = float("inf")
+    halo: Halo | None = None
+    pixel_rad: float = 0.0
 
     name: ClassVar[str] = "thin lens"
     resamples: ClassVar[bool] = False
-    blurs: ClassVar[bool] = False
     falls_off: ClassVar[bool] = False
     guard_px: ClassVar[tuple[int, int]] = (0, 0)
     border_px: ClassVar[int] = 0
     distortion_residual_px: ClassVar[tuple[float, float]] = (0.0, 0.0)
+
+    @property
+    def blurs(self) -> bool:
+        """Return whether the lens has a point spread."""
+        return self.halo is not None
 
     @property
     def real(self) -> None:
@@ -94,16 +104,16 @@ class ThinLens:
         return Pinhole(intrinsics)
 
     def on_axis(self, radiance: Radiance) -> Irradiance:
-        """Return the irradiance of `image`, which does not depend on the position in the image."""
-        return self.image(radiance)
+        """Return the irradiance of radiance of any shape, which does not depend on the position in the image."""
+        return Irradiance(array=radiance.array * self._solid_angle, wavelength_nm=radiance.wavelength_nm)
 
     def on_frame(self, radiance: Radiance) -> Radiance:
         """Return the radiance itself: the image has the grid of the render."""
         return radiance
 
     def spread(self, light: F32, wavelength_nm: float) -> F32:
-        """Return the light itself: the lens has no point spread."""
-        return light
+        """Return light on the frame, float32[y, x], after the point spread, which is the same in all bands."""
+        return light if self.halo is None else np.asarray(self.halo.applied(light, self.pixel_rad))
 
     def image(self, radiance: Radiance) -> Irradiance:
         """Return the irradiance on the sensor plane, E = π T L / (4 N²), per band.
@@ -111,18 +121,29 @@ class ThinLens:
         It contains no cos⁴: the paper's nominal camera renders without it, and vignetting is a fault of its own
         (physics.md, section 6, warns of counting it twice).
         """
-        factor = np.float32(np.pi * self.transmission / (4 * self.f_number**2))
-        return Irradiance(array=radiance.array * factor, wavelength_nm=radiance.wavelength_nm)
+        sharp = self.on_axis(radiance)
+        if self.halo is None:
+            return sharp
+        return replace(sharp, array=np.asarray(self.halo.applied(sharp.array, self.pixel_rad)))
+
+    @property
+    def _solid_angle(self) -> np.float32:
+        """Return irradiance over radiance, π T / (4 N²)."""
+        return np.float32(np.pi * self.transmission / (4 * self.f_number**2))
 
     def image_of_sun(self, radiance: Radiance, pixel_pitch_um: float) -> Irradiance:
         """Return the irradiance of the Sun's direct image, π T L cos⁴θ / (4 N²), per band.
 
         Its power is E☉ T A cos θ at every field angle, the flux that the pupil admits.
         """
-        as_scene = self.image(radiance)
+        as_scene = self.on_axis(radiance)
         shape = as_scene.array.shape[1:]
         cos4 = cos4_map((int(shape[0]), int(shape[1])), self.focal_length_mm * 1e3 / pixel_pitch_um)
-        return Irradiance(array=as_scene.array * cos4, wavelength_nm=radiance.wavelength_nm)
+        array = as_scene.array * cos4
+        if self.halo is not None:
+            # in float64: the rounding errors of the Sun's disc may be as bright as the scene
+            array = np.asarray(self.halo.applied(array.astype(np.float64), self.pixel_rad), dtype=np.float32)
+        return Irradiance(array=array, wavelength_nm=radiance.wavelength_nm)
 
 
 # --- a rectilinear frame -----------------------------------------------------------------------------------------

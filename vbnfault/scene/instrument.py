@@ -43,6 +43,21 @@ OF_A_SENSOR_FILE = (
 )
 
 
+class PointSpreadTable(Table):
+    """Give a thin lens a point spread: a Gaussian core, and a halo that falls as a power of the angle.
+
+    The halo is light that lens, window and sensor scatter. Angles are as seen from the camera, whatever the number
+    of pixels; a pixel of a field of 5° over 1024 px subtends 85 µrad.
+    """
+
+    core_urad: float = Field(gt=0, le=1e5, description="standard deviation of the core")
+    halo_fraction: float = Field(0.0, ge=0, lt=1, description="fraction of the light that goes into the halo")
+    halo_urad: float = Field(
+        100.0, gt=0, le=1e6, description="angle beyond which the halo falls as a power: θ₀ of (1 + θ²/θ₀²)^(-p/2)"
+    )
+    halo_index: float = Field(3.0, gt=2, le=10, description="the power p")
+
+
 class CameraTable(Table):
     """Describe the camera and its exposure."""
 
@@ -72,6 +87,9 @@ class CameraTable(Table):
         description="of a thin lens, default 0.9; a prescription's follows from glass and coatings",
     )
     focus_distance_m: float | None = Field(None, gt=0, le=1e12, description="default: infinity")
+    point_spread: PointSpreadTable | None = Field(
+        None, description="of a thin lens; a prescription has its own; default: points stay points"
+    )
     detector: str = Field(
         "",
         description="a packaged detector or a sensor's TOML, with a colour mosaic or monochrome; its numbers are "
@@ -129,6 +147,8 @@ class CameraTable(Table):
             raise ValueError(
                 f"transmission = {self.transmission:g}: the lens has its own, of glass and coatings; leave one out"
             )
+        if self.lens and self.point_spread is not None:
+            raise ValueError("point_spread: the lens has its own, of rays and diffraction; leave one out")
         if not self.lens:  # with a prescription, None stays and means the prescription's own f-number
             for key, value in THIN_LENS.items():
                 if getattr(self, key) is None:

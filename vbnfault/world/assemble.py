@@ -16,12 +16,12 @@ from ..core import file_contents, frames, spectra, spice
 from ..core.errors import InputError
 from ..core.quantities import Radiance, Truth
 from ..detector import Detector, MosaicDetector, Sensor, ThreeColourDetector, load_sensor
-from ..lens import RealLens, ThinLens, closed_to, coating, load_lens, scaled_to_focal_length
+from ..lens import Halo, RealLens, ThinLens, closed_to, coating, load_lens, scaled_to_focal_length
 from ..reflectance import REFERENCE_NM, BandReflectance, radiance_factor
 from ..render.description import Sunlight, View
 from ..scene import bodies
 from ..scene.config import Scene
-from ..scene.instrument import THIN_LENS, CameraTable
+from ..scene.instrument import THIN_LENS, CameraTable, PointSpreadTable
 from ..scene.keyed_random import rng
 from ..scene.surroundings import OrbitTable, PoseTable, SpiceTable, SunTable
 from ..scene.target import EARTH, BodyTable
@@ -418,6 +418,20 @@ def _thin_lens(c: CameraTable, pixel_pitch_um: float) -> ThinLens:
         f_number=THIN_LENS["f_number"] if c.f_number is None else c.f_number,
         transmission=THIN_LENS["transmission"] if c.transmission is None else c.transmission,
         focus_distance_m=_focus_distance_m(c),
+        halo=_halo(c.point_spread),
+        pixel_rad=2 * float(np.tan(np.radians(c.fov_deg) / 2)) / c.width_px,
+    )
+
+
+def _halo(table: PointSpreadTable | None) -> Halo | None:
+    """Return the point spread of a thin lens, None without a table."""
+    if table is None:
+        return None
+    return Halo(
+        core_rad=1e-6 * table.core_urad,
+        halo_fraction=table.halo_fraction,
+        halo_rad=1e-6 * table.halo_urad,
+        halo_index=table.halo_index,
     )
 
 
