@@ -204,8 +204,8 @@ def _on_the_trajectory(spec: SampleSpec, flown: FlownPose) -> Pose:
         made_for = "poses" if scene.trajectory else "kernels"
         raise VbnfaultError(
             f"sample {spec.index}: at Julian date {flown.julian_date:.6f} {flown.name} is within "
-            f"geometry.clearance_m = {clearance:g} m of the ground, or below it; choose other {change}, or the "
-            f"body.shape that the {made_for} were made for"
+            f"geometry.clearance_m = {clearance:g} m of the ground, or below it; choose other {change}, a smaller "
+            f"clearance, or the body.shape that the {made_for} were made for"
         )
     needs_sun = any(spec.faults[name].needs_sun for name in spec.commanded)
     sees_sun = pose.sun_visible_fraction == 1.0 and float(pose.L_from_C[:, 2] @ pose.sun_L) > 0
