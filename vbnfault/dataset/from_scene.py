@@ -69,9 +69,10 @@ def estimated_seconds(session: pipeline.Session) -> float:
     if render.noise_fraction is not None:
         rays = min(4 * rays, max(rays, render.max_samples_per_pixel))
     megapixels = camera.width_px * camera.height_px / 1e6
-    sample_s = 0.3 + megapixels * (1.2 + 0.25 * rays * (1 + render.bounces))
+    variants = scene.dataset.variants_per_view
+    sample_s = 0.3 + megapixels * (1.2 + 0.25 * rays * (1 + render.bounces) / variants)
     patch_s = 16 * scene.patch.max_triangles / 1.6e6
-    terrains = len(session.plan) if scene.is_aimed else len(np.unique(session.plan.site))
+    terrains = len(session.plan) // variants if scene.is_aimed else len(np.unique(session.plan.site))
     return (len(session.plan) * sample_s + terrains * patch_s) / (os.cpu_count() or 1)
 
 

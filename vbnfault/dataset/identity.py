@@ -97,6 +97,10 @@ def scene_identity(session: pipeline.Session) -> dict[str, Any]:
             for plugin in plugins
         }
     del scene["dataset"]["samples"]
+    for table, key in (("dataset", "variants_per_view"), ("camera", "exposure_stops")):
+        values = getattr(session.scene, table)
+        if getattr(values, key) == type(values).model_fields[key].default:
+            del scene[table][key]  # stores of scenes without it stay as they were
     return scene
 
 

@@ -99,7 +99,7 @@ def _unmet(spec: SampleSpec, terrain: Terrain, view: AimedView) -> tuple[str, Po
         return "the camera above the ground", pose
     if not render.is_clear(surface, position[None], geometry.clearance_m)[0]:
         return f"geometry.clearance_m = {geometry.clearance_m:g} m to any surface", pose
-    needing = [name for name in spec.commanded if spec.faults[name].needs_sun]
+    needing = [name for name in spec.commanded_in_view if spec.faults[name].needs_sun]
     if geometry.sun_visibility == "required" and (needing or aim == "sun") and pose.sun_visible_fraction < 1:
         return "the whole Sun visible", pose
     least = geometry.min_lit_fraction if aim != "sun" else 0.0

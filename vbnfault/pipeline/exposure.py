@@ -27,10 +27,18 @@ _AT_ZERO_PHASE = ((0.0, 0.0, 1.0), (0.0, 0.0, 1.0))
 
 
 def meter(spec: SampleSpec, rendering: Rendering) -> SceneExposure:
-    """Set the exposure: fixed, or metered once on the noise-free, fault-free frame. All twins share it."""
+    """Set the exposure: fixed, or metered on the noise-free, fault-free frame. All twins share it."""
     rate = spec.camera.expose(rendering.light.rendered, 1.0)
-    seconds = exposure_s(spec.scene, spec.camera, rendering.truth, rate.merged)
+    seconds = exposure_s(spec.scene, spec.camera, rendering.truth, rate.merged) * exposure_factor(spec)
+    if spec.scene.camera.exposure_s == "auto":
+        seconds = float(np.clip(seconds, spec.scene.camera.exposure_min_s, spec.scene.camera.exposure_max_s))
     return SceneExposure(camera=replace(spec.camera, exposure_s=seconds), light=rendering.light, rate=rate)
+
+
+def exposure_factor(spec: SampleSpec) -> float:
+    """Return the factor by which the exposure of a sample is longer, drawn from `camera.exposure_stops`."""
+    low, high = spec.scene.camera.exposure_stops
+    return float(2 ** (low + (high - low) * spec.rng("meter", "stops").random())) if low or high else 1.0
 
 
 def exposure_s(scene: Scene, camera: Camera, truth: Truth, rate: Electrons) -> float:

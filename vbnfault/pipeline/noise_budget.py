@@ -77,6 +77,7 @@ def sample_to_noise(
     whole = sampled.radiance.with_array(light.view())
     sampled = replace(sampled, radiance=whole)  # a copy in all bands takes 37 MB for a frame of 1024 pixels
     exposure = foreseen_exposure_s(spec.scene, camera, truth, scene.view, whole)
+    exposure *= 2 ** max(spec.scene.camera.exposure_stops[1], 0.0)  # the longest of the samples of the view
     signal_e = np.einsum("b,byx->yx", electron_rate * exposure, whole.array)
     detector = camera.detector
     sensor_e = np.sqrt(

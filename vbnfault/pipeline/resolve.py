@@ -155,7 +155,7 @@ def _first_usable(spec: SampleSpec, views: _Views, count: int, unmet: dict[str, 
     if stratum == plan.SUN_AVERTED:
         least = plan.least_sun_angle_deg(scene)
         met[f"the Sun at least {least:.1f} deg from the boresight"] = views.sun_angle_deg() >= least
-    needing_sun = [name for name in spec.commanded if spec.faults[name].needs_sun]
+    needing_sun = [name for name in spec.commanded_in_view if spec.faults[name].needs_sun]
     if geometry.sun_visibility == "required" and needing_sun:
         # with the Sun behind the camera these faults cannot show, so such a view is rejected before it is rendered
         seen = (views.sun_visible == 1.0) & (views.sun_angle_deg() < 90)
@@ -207,6 +207,6 @@ def _on_the_trajectory(spec: SampleSpec, flown: FlownPose) -> Pose:
             f"geometry.clearance_m = {clearance:g} m of the ground, or below it; choose other {change}, a smaller "
             f"clearance, or the body.shape that the {made_for} were made for"
         )
-    needs_sun = any(spec.faults[name].needs_sun for name in spec.commanded)
+    needs_sun = any(spec.faults[name].needs_sun for name in spec.commanded_in_view)
     sees_sun = pose.sun_visible_fraction == 1.0 and float(pose.L_from_C[:, 2] @ pose.sun_L) > 0
     return replace(pose, resolved=sees_sun or not needs_sun)

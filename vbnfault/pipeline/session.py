@@ -27,7 +27,7 @@ from ..world.ground import GroundDetail, ground_details
 from ..world.spacecraft import SpacecraftMesh
 from .record import to_sample
 from .spec import DEFAULT_TWINS, Frame, SampleSpec, Terrain
-from .stages import simulate_frame
+from .stages import SharedViews, simulate_frame
 
 if TYPE_CHECKING:
     from ..render import TerrainMesh
@@ -182,6 +182,8 @@ class Session:
             self.trajectory = as_trajectory(poses)
         elif scene.trajectory is not None:
             self.trajectory = load_trajectory(scene.trajectory.file)
+        if self.trajectory is not None:
+            self.trajectory = self.trajectory.repeated(scene.dataset.variants_per_view)
         self.scene = scene = with_rows(scene, None if poses is None else self.trajectory)
         planned = sum(blocks or (scene.dataset.samples,))
         if self.trajectory is not None and planned > len(self.trajectory):
@@ -197,6 +199,7 @@ class Session:
         self._terrain: Terrain | None = None
         self._terrain_key: int | GroundDetail | None = None
         self._model: Terrain | None = None
+        self._shared_views = SharedViews()
         self._compiled = False  # the first sample compiles the kernels
 
     @cached_property
@@ -358,11 +361,12 @@ class Session:
     def spec(self, index: int) -> SampleSpec:
         """Return everything that `simulate` needs for one sample.
 
-        On a trajectory every sample has its own date, and with a table of poses its own distance of the Sun.
+        On a trajectory every view has its own date, and with a table of poses its own distance of the Sun.
         """
         scene, site = self.scene, int(self.plan.site[index])
+        first = self.plan.first_of_view(index)
         if scene.spice.spacecraft:
-            fraction = float(keyed_uniform(scene.dataset.seed, np.array([index]), "plan", "epoch")[0])
+            fraction = float(keyed_uniform(scene.dataset.seed, np.array([first]), "plan", "epoch")[0])
             sun = scene.sun.model_copy(update={"julian_date": assemble.epoch_jd(scene, site, fraction)})
             scene = scene.model_copy(update={"sun": sun})
         if self.trajectory is not None:
@@ -391,10 +395,10 @@ class Session:
         spec = self.spec(index)
         if not self._compiled:
             activity.begin("compiling of kernels, with the first sample")
-        sample = to_sample(simulate_frame(spec))
+        sample = to_sample(simulate_frame(spec, shared=self._shared_views))
         self._compiled = True
         return sample
 
     def frame(self, index: int) -> Frame:
         """Return one sample with the outcome of every stage, from its pose to its labels."""
-        return simulate_frame(self.spec(index))
+        return simulate_frame(self.spec(index), shared=self._shared_views)

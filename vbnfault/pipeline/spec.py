@@ -92,6 +92,17 @@ class SampleSpec:
         """Return the faults that the sample is commanded to carry, in dataset order."""
         return self.plan.commanded(self.index)
 
+    @property
+    def commanded_in_view(self) -> tuple[str, ...]:
+        """Return the faults that any sample of the view is commanded to carry, in dataset order."""
+        return self.plan.commanded_in_view(self.index)
+
+    @property
+    def of_view(self) -> SampleSpec:
+        """Return the specification of the first of the samples that share the view: it draws and renders it."""
+        first = self.plan.first_of_view(self.index)
+        return self if first == self.index else replace(self, index=first)
+
     def rng(self, stage: str, name: str) -> np.random.Generator:
         """Return the random generator of this sample for (stage, name)."""
         return keyed_random.rng(self.seed, self.index, stage, name)

@@ -2,14 +2,15 @@
 
     resolve ▶ render_view ▶ meter ▶ add_stars ▶ inject_faults ▶ take_images ▶ label
 
-Each stage is a function from frozen inputs to a frozen output. All twins share one expensive render. If a commanded
-fault cannot be visible in a view, the stages up to `inject_faults` run again with the next view of the sample.
+Each stage is a function from frozen inputs to a frozen output. All twins share one expensive render, and so do the
+samples of a view (`dataset.variants_per_view`). If a commanded fault cannot be visible in a view, the stages up to
+`inject_faults` run again with the next view of the sample.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ParamSpec, Protocol, TypeVar
 
 from ..core.errors import VbnfaultError
@@ -48,7 +49,35 @@ class _RenderedView:
     injection: Injection
 
 
-def simulate_frame(spec: SampleSpec, run: StageRunner = run_stage) -> Frame:
+class SharedViews:
+    """Render views, and keep the last ones for the samples that share them.
+
+    A view belongs to the first of its samples. So its pose and its render depend on no other sample, and not on the
+    order in which the samples are made.
+    """
+
+    def __init__(self) -> None:
+        self._first_sample = -1
+        self._kept: dict[int, tuple[Pose, Rendering]] = {}
+
+    def take(self, spec: SampleSpec, run: StageRunner, first_try: int) -> tuple[Pose, Rendering]:
+        """Return pose and render of a sample's view; `first_try` views of the plan were drawn before it."""
+        shared = spec.of_view
+        if shared.index != self._first_sample:
+            self._kept.clear()
+            self._first_sample = shared.index
+        if first_try in self._kept:
+            return self._kept[first_try]
+        pose = run(resolve, shared, first_try)
+        taken = pose, run(render_view, shared.at(pose), pose)
+        if spec.plan.variants > 1:
+            for older in [key for key in self._kept if key]:  # of the later views, the last one is enough
+                del self._kept[older]
+            self._kept[first_try] = taken
+        return taken
+
+
+def simulate_frame(spec: SampleSpec, run: StageRunner = run_stage, shared: SharedViews | None = None) -> Frame:
     """Run all stages of one sample and return its frame.
 
     If a commanded fault cannot be visible in a view, the sample's next view is used, up to `plan.max_views` views.
@@ -59,14 +88,16 @@ def simulate_frame(spec: SampleSpec, run: StageRunner = run_stage) -> Frame:
         The sample.
     run
         Function that calls each stage.
+    shared
+        Views that other samples have rendered, and where new ones are kept. The result does not depend on them.
 
     Raises
     ------
     VbnfaultError
         Names the sample and the faults that no view shows.
     """
-    views = 1
-    view = _take_view(spec, run, views=1, first_try=0)
+    views, shared = 1, shared or SharedViews()
+    view = _take_view(spec, run, shared, views=1, first_try=0)
     while unseen := _asking_for_another_view(spec, view.injection):
         if views == spec.scene.plan.max_views:
             raise VbnfaultError(
@@ -76,7 +107,7 @@ def simulate_frame(spec: SampleSpec, run: StageRunner = run_stage) -> Frame:
             )
         views, first_try = views + 1, view.pose.tries
         del view  # release its memory before the next render
-        view = _take_view(spec, run, views=views, first_try=first_try)
+        view = _take_view(spec, run, shared, views=views, first_try=first_try)
     spec = view.spec
     return Frame(
         spec=spec,
@@ -90,11 +121,14 @@ def simulate_frame(spec: SampleSpec, run: StageRunner = run_stage) -> Frame:
     )
 
 
-def _take_view(spec: SampleSpec, run: StageRunner, *, views: int, first_try: int) -> _RenderedView:
+def _take_view(
+    spec: SampleSpec, run: StageRunner, shared: SharedViews, *, views: int, first_try: int
+) -> _RenderedView:
     """Run the stages of one view; `first_try` views of the plan were drawn before it."""
-    pose = run(resolve, spec, first_try)
+    pose, rendering = shared.take(spec, run, first_try)
+    if not any(spec.faults[name].needs_sun for name in spec.commanded):
+        pose = replace(pose, resolved=True)  # only another sample of the view needs the Sun
     spec = spec.at(pose)
-    rendering = run(render_view, spec, pose)
     metered = run(meter, spec, rendering)
     exposure = run(add_stars, spec, pose, rendering, metered)
     injection = run(inject_faults, spec, pose, rendering, exposure, views)

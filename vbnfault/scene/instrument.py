@@ -8,7 +8,7 @@ from pydantic import Field, model_validator
 
 from ..core import spectra
 from ..core.architecture import ARCHITECTURES, READOUT_DIRECTIONS, Architecture, ReadoutDirection
-from ..core.tables import Table
+from ..core.tables import Table, pair_within
 
 # Values of a camera without a prescription, where the scene gives none.
 THIN_LENS = {"f_number": 4.0, "transmission": 0.9}
@@ -124,6 +124,11 @@ class CameraTable(Table):
     )
     exposure_min_s: float = Field(1e-5, gt=0, le=1e4, description="shortest exposure that 'auto' takes")
     exposure_max_s: float = Field(5.0, gt=0, le=1e4, description="longest exposure that 'auto' takes")
+    exposure_stops: pair_within(-10, 10) = Field(  # type: ignore[valid-type]
+        (0.0, 0.0),
+        description="the exposure of each sample is longer by 2 to a power drawn from this range, within "
+        "exposure_min_s and exposure_max_s if it is metered",
+    )
     metering_level: float = Field(
         0.75, gt=0, le=1, description="fraction of white given to metering_percentile of the sunlit pixels"
     )

@@ -54,6 +54,8 @@ class Plan:
     - `light` int64[n] is the sample whose Sun each sample has: itself, or the Sun-facing sample of its pair.
     - `paired` bool[n] marks the samples of pairs (`plan.pair_strata`).
     - `aim` uint8[n] is the aim, an index in `aims.AIMS`; None without `geometry.aim`.
+
+    `variants` consecutive samples share a view. They have the same variables, stratum, site and aim at every try.
     """
 
     faults: tuple[str, ...]
@@ -68,6 +70,7 @@ class Plan:
     light: NDArray[np.int64]
     paired: NDArray[np.bool_]
     aim: NDArray[np.uint8] | None = None
+    variants: int = 1
 
     def __len__(self) -> int:
         return len(self.stratum)
@@ -83,6 +86,16 @@ class Plan:
         """Return the faults that a sample is commanded to carry, in the order of `faults`."""
         return tuple(name for name, has in zip(self.faults, self.injected[index], strict=True) if has)
 
+    def first_of_view(self, index: int) -> int:
+        """Return the first of the samples that share a sample's view; the draws of the view have its key."""
+        return index - index % self.variants
+
+    def commanded_in_view(self, index: int) -> tuple[str, ...]:
+        """Return the faults that the samples of a view are commanded to carry, in the order of `faults`."""
+        first = self.first_of_view(index)
+        has_any = np.any(self.injected[first : first + self.variants], axis=0)
+        return tuple(np.array(self.faults, dtype=object)[has_any])
+
     def view(self, scene: Scene, index: int, attempt: int) -> dict[str, float]:
         """Return the variables of a sample's view at a try, counted from 0, under the names of VARIABLES.
 
@@ -90,14 +103,13 @@ class Plan:
         scene of the plan. The stratum, the site, the device and the aim of the sample do not change.
         """
         row = slice(index, index + 1)
+        key = np.array([self.first_of_view(index)])
         if attempt == 0:
             drawn = {name: values[row] for name, values in self.variables.items()}
         elif self.aim is not None:
-            drawn = aims.draw(scene, np.array([index]), self.aim[row], attempt)
+            drawn = aims.draw(scene, key, self.aim[row], attempt)
         else:
-            drawn = _views(
-                scene, np.array([index]), self.stratum[row], self.light[row], self.paired[row], attempt=attempt
-            )
+            drawn = _views(scene, key, self.stratum[row], self.light[row], self.paired[row], attempt=attempt)
         values = {name: float(column[0]) for name, column in drawn.items()}
         return values if self.aim is None else aims.of_aim(values, self.aim_of(index))
 
@@ -112,9 +124,17 @@ def make_plan(
     """Draw the plan of all blocks, each with its own fault matrix; default: one block of `dataset.samples`.
 
     `need_sun` names the faults whose samples face the Sun. Raises InputError where `sun_facing_nominal_fraction`
-    and the samples with these faults exceed all samples, and where the bounds of a stratum cannot be met.
+    and the samples with these faults exceed all samples, where the bounds of a stratum cannot be met, and where a
+    block has no whole number of views.
     """
     sizes = [scene.dataset.samples] if blocks is None else list(blocks)
+    variants = scene.dataset.variants_per_view
+    for size in sizes:
+        if size % variants:
+            raise InputError(
+                f"dataset.variants_per_view = {variants}: {size} samples are planned; their number must be a "
+                f"multiple of {variants}, such as {max(size - size % variants, variants)}"
+            )
     seed = scene.dataset.seed
     starts = np.cumsum([0, *sizes])
     samples = np.arange(int(starts[-1]), dtype=np.int64)
@@ -128,11 +148,12 @@ def make_plan(
     injected = np.concatenate([p[0] for p in parts])
     stratum = np.concatenate([p[1] for p in parts])
     light, paired = _pairs(scene, samples, stratum, shard)
+    views, light = samples - samples % variants, light - light % variants
     aim = np.concatenate([p[2] for p in parts]) if scene.is_aimed else None
     return Plan(
         faults=tuple(faults),
         variables=(
-            _views(scene, samples, stratum, light, paired) if aim is None else aims.draw(scene, samples, aim, 0)
+            _views(scene, views, stratum, light, paired) if aim is None else aims.draw(scene, views, aim, 0)
         ),
         injected=injected,
         stratum=stratum,
@@ -144,6 +165,7 @@ def make_plan(
         light=light,
         paired=paired,
         aim=aim,
+        variants=variants,
     )
 
 
@@ -339,12 +361,46 @@ def _block(
             f"plan.sun_facing_nominal_fraction = {scene.plan.sun_facing_nominal_fraction:g}: with {names} in "
             f"{towards_sun} of {n} samples it must be at most {(n - towards_sun) / n:g}"
         )
+    variants = scene.dataset.variants_per_view
+    facing = variants * -(-(towards_sun + nominal) // variants)  # the samples of a view share its stratum
     stratum = np.full(n, SUN_AVERTED, dtype=np.uint8)
-    stratum[: towards_sun + nominal] = SUN_FACING
-    order = _dealt(injected, stratum, shard, split, rng)
+    stratum[:facing] = SUN_FACING
+    views = np.arange(n)[:, None] if variants == 1 else _views_of_rows(injected, stratum, variants, rng)
+    traits: NDArray[np.bool_] = np.any(_traits(injected, stratum)[views], axis=1)
+    views = views[_dealt(traits, shard[::variants], split[::variants], rng)]
+    order = views.ravel()
     stratum = stratum[order]
-    aim = aims.deal(scene, stratum == SUN_FACING, rng) if scene.is_aimed else stratum[:0]
+    aim = stratum[:0]
+    if scene.is_aimed:
+        aim = np.repeat(aims.deal(scene, stratum[::variants] == SUN_FACING, rng), variants)
     return injected[order], stratum, aim
+
+
+def _traits(injected: NDArray[np.bool_], stratum: NDArray[np.uint8]) -> NDArray[np.bool_]:
+    """Return what every split should have of each row, bool[n, trait]: its stratum, its classes, or none."""
+    return np.column_stack([stratum == SUN_FACING, injected, ~injected.any(axis=1)])
+
+
+def _in_order_of_traits(traits: NDArray[np.bool_], rng: np.random.Generator) -> NDArray[np.int64]:
+    """Return the rows sorted by their traits, and at random among equal ones, int64[n]."""
+    bits = np.uint64(1) << np.arange(traits.shape[1], dtype=np.uint64)[::-1]
+    kind = (traits * bits).sum(axis=1, dtype=np.uint64)
+    return np.lexsort((rng.random(len(traits)), kind))
+
+
+def _views_of_rows(
+    injected: NDArray[np.bool_], stratum: NDArray[np.uint8], variants: int, rng: np.random.Generator
+) -> NDArray[np.int64]:
+    """Return the rows of the fault matrix that share a view, int64[view, variant].
+
+    The samples of a view have one stratum, and faults as different as possible.
+    """
+    line = _in_order_of_traits(_traits(injected, stratum), rng)
+    views = [
+        line[stratum[line] == which].reshape(variants, -1).T  # neighbours in the line come into different views
+        for which in (SUN_FACING, SUN_AVERTED)
+    ]
+    return np.asarray(rng.permuted(np.concatenate(views), axis=1))
 
 
 def _with_any(matrix: NDArray[np.bool_], faults: Sequence[str], wanted: Collection[str]) -> NDArray[np.bool_]:
@@ -436,22 +492,19 @@ def _level(rows: NDArray[np.bool_], rng: np.random.Generator) -> None:
 
 
 def _dealt(
-    injected: NDArray[np.bool_],
-    stratum: NDArray[np.uint8],
+    traits: NDArray[np.bool_],
     shard: NDArray[np.int64],
     split: NDArray[np.uint8],
     rng: np.random.Generator,
 ) -> NDArray[np.int64]:
-    """Return which row of the fault matrix each sample of a block takes, int64[n].
+    """Return which row of bool[n, trait] each place of a block takes, int64[n].
 
-    The rows are sorted by their classes and distributed over the shards, one row per shard and round. Then rows are
-    exchanged between splits where a split lacks a class that the block has often enough.
+    A row is a row of the fault matrix, or those of a view together. The rows are sorted by their traits and
+    distributed over the shards, one row per shard and round. Then rows are exchanged between splits where a split
+    lacks a trait that the block has often enough.
     """
     n = len(shard)
-    traits = np.column_stack([stratum == SUN_FACING, injected, ~injected.any(axis=1)])
-    bits = np.uint64(1) << np.arange(traits.shape[1], dtype=np.uint64)[::-1]
-    kind = (traits * bits).sum(axis=1, dtype=np.uint64)
-    line = np.lexsort((rng.random(n), kind))
+    line = _in_order_of_traits(traits, rng)
     turn = np.arange(n) - np.searchsorted(shard, shard, side="left")
     order = np.empty(n, dtype=np.int64)
     order[np.lexsort((rng.random(n), turn))] = line

@@ -46,6 +46,14 @@ class DatasetTable(Table):
     shard_samples: int = Field(
         8, ge=1, le=16, description="samples a shard, all of one site: what a kill can lose at most"
     )
+    variants_per_view: int = Field(
+        1,
+        ge=1,
+        le=16,
+        description="consecutive samples that share a view, its terrain and its radiance, and differ in faults, "
+        "device of the detector, noise and, with camera.exposure_stops, exposure; must divide samples and "
+        "shard_samples",
+    )
     layers: tuple[Layer, ...] = Field(DEFAULT_LAYERS, description="optional layers that are stored")
     mask_any: tuple[str, ...] | None = Field(
         None,
@@ -54,6 +62,15 @@ class DatasetTable(Table):
     split: SplitTable = SplitTable()
     licence: str = Field("CC-BY-4.0", description="licence of the dataset, as text")
     citation: str = Field("", description="how to cite the dataset, as text")
+
+    @model_validator(mode="after")
+    def _whole_views(self) -> DatasetTable:
+        if self.shard_samples % self.variants_per_view:
+            raise ValueError(
+                f"variants_per_view = {self.variants_per_view}, shard_samples = {self.shard_samples}: "
+                "shard_samples must be a multiple of variants_per_view, since one process makes a whole view"
+            )
+        return self
 
 
 class StratumTable(Table):

@@ -110,6 +110,20 @@ class Trajectory:
     def __len__(self) -> int:
         return len(self.name)
 
+    def repeated(self, count: int) -> Trajectory:
+        """Return the table with each row `count` times, for samples that share a view: NAME/0, NAME/1, ..."""
+        if count == 1:
+            return self
+        return Trajectory(
+            source=self.source,
+            name=tuple(f"{name}/{k}" for name in self.name for k in range(count)),
+            julian_date=np.repeat(self.julian_date, count),
+            camera_position_T_m=np.repeat(self.camera_position_T_m, count, axis=0),
+            camera_from_T=np.repeat(self.camera_from_T, count, axis=0),
+            sun_direction_T=np.repeat(self.sun_direction_T, count, axis=0),
+            sun_distance_au=np.repeat(self.sun_distance_au, count),
+        )
+
     def pose(self, index: int) -> FlownPose:
         """Return one row, counted from 0."""
         w, x, y, z = self.camera_from_T[index]
@@ -140,7 +154,8 @@ def with_rows(scene: Scene, trajectory: Trajectory | None = None) -> Scene:
     scene
         The scene. Without a trajectory it is returned as it is.
     trajectory
-        Table given in Python, which replaces that of the scene: all its rows are samples.
+        Table given in Python, which replaces that of the scene: all its rows are samples. Its rows are repeated
+        for the samples that share a view already.
 
     Raises
     ------
@@ -153,7 +168,7 @@ def with_rows(scene: Scene, trajectory: Trajectory | None = None) -> Scene:
     elif scene.trajectory is None:
         return scene
     else:
-        trajectory = load_trajectory(scene.trajectory.file)
+        trajectory = load_trajectory(scene.trajectory.file).repeated(scene.dataset.variants_per_view)
         samples = scene.dataset.samples if "samples" in scene.dataset.model_fields_set else len(trajectory)
         if samples > len(trajectory):
             raise InputError(

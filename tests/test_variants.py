@@ -1,0 +1,221 @@
+"""Several samples of one view: what they share, what differs, and that no sample depends on another."""
+
+from __future__ import annotations
+
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from conftest import ALL_FAULTS, small_scene
+from scipy import stats
+from synthetic import flip
+
+import vbnfault
+from vbnfault import store
+from vbnfault.core.errors import InputError
+from vbnfault.dataset.identity import scene_identity
+from vbnfault.pipeline import Session, stages
+from vbnfault.pipeline.exposure import exposure_factor
+from vbnfault.pipeline.spec import SampleSpec
+from vbnfault.scene import config, plan
+from vbnfault.scene.config import Scene
+
+NEED_SUN = ["straylight"]
+
+
+def scene_with(variants: int, samples: int = 16, **tables: dict[str, Any]) -> Scene:
+    table = {"samples": samples, "sites": 2, "shard_samples": 8, "variants_per_view": variants}
+    tables["dataset"] = {**table, **tables.get("dataset", {})}
+    return config.parse_scene(small_scene(**tables), source="test")
+
+
+def of_views(values: np.ndarray, variants: int) -> np.ndarray:
+    return np.asarray(values).reshape(-1, variants, *np.shape(values)[1:])
+
+
+# --- the plan ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("variants", [2, 8])
+@pytest.mark.parametrize("mode", ["per_class", "per_sample"])
+@pytest.mark.parametrize(
+    "extra",
+    [
+        {},
+        {"plan": {"pair_strata": True}, "geometry": {"sun_visibility": "as_drawn"}},
+        {"geometry": {"aim": {"sun": 1, "limb": 2}}},
+    ],
+)
+def test_samples_of_a_view_share_it_and_differ_in_faults(variants: int, mode: str, extra: dict[str, Any]) -> None:
+    tables = {**extra, "plan": {**extra.get("plan", {}), "mode": mode, "faulty_fraction": 0.4}}
+    scene = scene_with(variants, 320, **tables)
+    table = plan.make_plan(scene, ALL_FAULTS, [160, 160], need_sun=NEED_SUN)
+    for shared in (table.stratum, table.site, table.split, table.paired, table.light, *table.variables.values()):
+        per_view = of_views(shared, variants)
+        assert (per_view == per_view[:, :1]).all()
+    for index in (1, variants - 1, 160 + variants + 1):
+        first = index - index % variants
+        for attempt in (0, 1, 5):
+            assert table.view(scene, index, attempt) == table.view(scene, first, attempt)
+    assert len({list(table.view(scene, k, 1).values())[-1] for k in range(0, 320, variants)}) == 320 // variants
+    # what a sample with straylight needs holds for its whole view
+    assert (table.stratum[table.injects("straylight")] == plan.SUN_FACING).all()
+    # counts of the matrix are those of the plan without shared views
+    alone = plan.make_plan(scene_with(1, 320, **tables), ALL_FAULTS, [160, 160], need_sun=NEED_SUN)
+    assert np.array_equal(table.injected.sum(axis=0), alone.injected.sum(axis=0))
+    # no more than one further view faces the Sun than the samples with straylight fill
+    if "aim" not in extra.get("geometry", {}):
+        facing = [int((one.stratum[:160] == plan.SUN_FACING).sum()) for one in (table, alone)]
+        assert 0 <= facing[0] - facing[1] < variants
+    distinct = [len(np.unique(rows, axis=0)) for rows in of_views(table.injected, variants)]
+    # 40 % of the samples have faults: of 8 samples dealt at random, about 4 differ
+    assert np.mean(distinct) > (1.2 if variants == 2 else 3)
+
+
+def test_the_number_of_samples_must_be_a_multiple() -> None:
+    scene = scene_with(4)
+    with pytest.raises(
+        InputError, match=r"variants_per_view = 4: 6 samples are planned.* multiple of 4, such as 4"
+    ):
+        plan.make_plan(scene, ALL_FAULTS, [8, 6])
+    with pytest.raises(InputError, match=r"variants_per_view = 3, shard_samples = 8.*must be a multiple"):
+        scene_with(3)
+
+
+def test_a_scene_without_variants_keeps_its_identity() -> None:
+    """Stores of earlier versions must open and continue."""
+    identity = scene_identity(Session(scene_with(1)))
+    assert "variants_per_view" not in identity["dataset"]
+    assert "exposure_stops" not in identity["camera"]
+    scene = scene_with(2, camera={"exposure_stops": [-1, 1]})
+    identity = scene_identity(Session(scene))
+    assert identity["dataset"]["variants_per_view"] == 2
+    assert identity["camera"]["exposure_stops"] == [-1, 1]
+
+
+# --- samples ----------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def session() -> Session:
+    return Session(scene_with(4, camera={"exposure_stops": [-1.0, 1.0]}))
+
+
+def test_a_view_is_rendered_once_and_no_sample_depends_on_another(
+    session: Session, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rendered: Counter[int] = Counter()
+    render_view = stages.render_view
+
+    def counted(spec: Any, pose: Any) -> Any:
+        rendered[spec.index] += 1
+        return render_view(spec, pose)
+
+    monkeypatch.setattr(stages, "render_view", counted)
+    made = [session.frame(i) for i in range(8)]
+    views = [frame.views for frame in made]
+    # one render each for views 0 and 4, and one for every further view that some sample needs
+    assert rendered.keys() == {0, 4}
+    assert rendered[0] + rendered[4] == max(views[:4]) + max(views[4:])
+    for first in (0, 4):
+        same = [frame for frame in made[first : first + 4] if frame.views == 1]
+        assert len(same) > 1
+        for frame in same[1:]:
+            assert np.array_equal(frame.pose.position_L_m, same[0].pose.position_L_m)
+            assert frame.rendering.light.rendered.array is same[0].rendering.light.rendered.array
+            assert not np.array_equal(frame.images.image.array, same[0].images.image.array)
+            # the clean twins differ by noise and exposure
+            assert not np.array_equal(frame.images.clean.array, same[0].images.clean.array)
+    # in any order, in sessions of their own, across a change of the view
+    rendered.clear()
+    again = [session.frame(i) for i in (6, 3, 5)]
+    for frame, k in zip(again, (6, 3, 5), strict=True):
+        assert np.array_equal(frame.images.image.array, made[k].images.image.array)
+        assert np.array_equal(frame.labels.masks, made[k].labels.masks)
+        assert frame.drawn == made[k].drawn
+    assert rendered.keys() == {0, 4}
+
+
+def test_exposures_follow_their_stops(session: Session) -> None:
+    scene = scene_with(4, camera={"exposure_stops": [-1.0, 1.0], "exposure_s": 0.02}, dataset={"samples": 400})
+
+    own = Session(scene)
+    terrain = session.terrain(0)
+    stops = np.log2(
+        [
+            exposure_factor(SampleSpec(index=k, scene=scene, plan=own.plan, faults=own.faults, terrain=terrain))
+            for k in range(400)
+        ]
+    )
+    assert stats.kstest(stops, "uniform", args=(-1, 2)).pvalue > 1e-3
+    seconds = session.frame(1).camera.exposure_s
+    nominal = Session(scene_with(4)).frame(1).camera.exposure_s
+    assert seconds != nominal
+    assert 0.5 <= seconds / nominal <= 2
+
+
+# --- the store --------------------------------------------------------------------------------------------------
+
+
+def test_a_dataset_of_variants_through_the_store_and_back(tmp_path: Path) -> None:
+    layers = ["clean", "depth_m", "normal", "radiance"]
+    scene = scene_with(4, 8, dataset={"layers": layers, "shard_samples": 4}, plan={"faulty_fraction": 1.0})
+    path = tmp_path / "one.zarr"
+    one = vbnfault.build(scene, path, progress=False)
+    assert store.verify(path) == []
+    data = vbnfault.open_dataset(path)
+    first = (data["views"].values == 1).reshape(2, 4)
+    assert (first.sum(axis=1) > 1).all()
+    for name in ("depth_m", "radiance", "camera_position_T_m", "camera_from_T", "sun_direction_T"):
+        for view, members in zip(of_views(data[name].values, 4), first, strict=True):
+            assert np.array_equal(
+                view[members], np.broadcast_to(view[members][0], view[members].shape), equal_nan=True
+            )
+    images = of_views(data["image"].values, 4)
+    for view in images:
+        assert len({image.tobytes() for image in view}) == 4
+    splits = of_views(data["split"].values, 4)
+    assert (splits == splits[:, :1]).all()
+    # a stored sample is what its scene gives alone
+    alone = Session(scene).simulate(6)
+    assert np.array_equal(alone.layers["image"], data["image"].values[6])
+    assert np.array_equal(alone.layers["mask"], data["mask"].values[6])
+    # one damaged sample in the middle of a view is made again with the same bits
+    (damaged,) = path.glob("image/c/0/*/*/*")
+    flip(damaged, damaged.stat().st_size // 2)
+    again = vbnfault.build(scene, path, progress=False)
+    assert 0 < again.built < 4
+    assert again.digest == one.digest is not None
+    # an appended block has whole views, too
+    vbnfault.build(scene, path, progress=False, append=4)
+    assert store.verify(path) == []
+    with pytest.raises(InputError, match="multiple of 4"):
+        vbnfault.build(scene, path, progress=False, append=3)
+
+
+def test_rows_of_a_table_of_poses_are_seen_several_times() -> None:
+    scene = config.load_scene("navcam67p", {"dataset.variants_per_view": 2, "dataset.shard_samples": 8})
+    row = {
+        "name": "a",
+        "julian_date": 2456900.0,
+        "camera_x_T_m": 60e3,
+        "camera_y_T_m": 0.0,
+        "camera_z_T_m": 0.0,
+        "camera_from_T_w": 0.5,
+        "camera_from_T_x": 0.5,
+        "camera_from_T_y": -0.5,
+        "camera_from_T_z": -0.5,
+        "sun_x_T": 1.0,
+        "sun_y_T": 0.0,
+        "sun_z_T": 0.0,
+        "sun_distance_au": 3.4,
+    }
+    rows = [row, {**row, "name": "b", "camera_x_T_m": 80e3}]
+    session = Session(scene, poses={key: [one[key] for one in rows] for key in row})
+    assert session.trajectory is not None
+    assert session.trajectory.name == ("a/0", "a/1", "b/0", "b/1")
+    assert len(session.plan) == 4
+    assert [session.trajectory.pose(k).camera_position_T_m[0] for k in range(4)] == [60e3, 60e3, 80e3, 80e3]
+    assert [session.plan.first_of_view(k) for k in range(4)] == [0, 0, 2, 2]
