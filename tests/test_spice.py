@@ -327,15 +327,9 @@ def test_what_the_kernels_do_not_hold_is_said_in_a_sentence(folder: Path) -> Non
 # --- a scene on a spacecraft's way -----------------------------------------------------------------------------
 
 
-def test_a_scene_on_a_spacecrafts_way(
-    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """Camera and Sun of every sample are SPICE's at its own date; the picture looks where the camera does."""
+def flown_scene(folder: Path) -> dict[str, Any]:
+    """A small scene whose camera is on the spacecraft and looks at the body's centre."""
     from conftest import small_scene
-    from test_cli import run, toml
-
-    from vbnfault.pipeline import Session
-    from vbnfault.scene import config
 
     far = np.linalg.norm(POSITION_T_M)
     # the bus holds an attitude of no importance: mount the camera so that it looks at the body's centre
@@ -357,6 +351,20 @@ def test_a_scene_on_a_spacecrafts_way(
         },
     )
     table["camera"]["fov_deg"] = 5.0
+    return table
+
+
+def test_a_scene_on_a_spacecrafts_way(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Camera and Sun of every sample are SPICE's at its own date; the picture looks where the camera does."""
+    from test_cli import run, toml
+
+    from vbnfault.pipeline import Session
+    from vbnfault.scene import config
+
+    table = flown_scene(folder)
+    far, z = np.linalg.norm(POSITION_T_M), -frames.unit(POSITION_T_M)
     session = Session(config.parse_scene(table, source="test"))
     middle = session.sites[0].position_T_m
     across = np.cross(middle - POSITION_T_M, z)
@@ -403,3 +411,36 @@ def test_a_way_needs_all_its_keys(table: dict[str, Any], words: str) -> None:
 
     with pytest.raises(InputError, match=words):
         config.parse_scene(small_scene(spice=table), source="test")
+
+
+def test_a_coma_follows_the_date_of_each_sample(folder: Path, tmp_path: Path) -> None:
+    """Its light in the store is that of the Afρ at the Sun's distance in SPICE at the sample's own date."""
+    import vbnfault
+    from vbnfault.pipeline import Session
+    from vbnfault.scene import config
+
+    # so steep a power that some minutes change the light by 1e-4, a thousand times the rounding of float32
+    keys = {"afrho_cm": 500.0, "reference_au": 1.88, "distance_exponent": 20.0, "affects_ground": False}
+    table = flown_scene(folder)
+    table["dataset"] |= {"samples": 2, "shard_samples": 2, "layers": ["clean", "radiance", "semantic"]}
+    scene = config.parse_scene({**table, "coma": keys}, source="test")
+    out = tmp_path / "coma.zarr"
+    vbnfault.build(scene, out, workers=1)
+    assert vbnfault.verify(out).problems == []
+    data = vbnfault.open_dataset(out)
+    light, date = data["radiance"][1].values, float(data["julian_date"][1])
+    assert np.array_equal(light, Session(scene).simulate(1).layers["radiance"])
+    with spice.kernels(*all_of(folder)):
+        sun_au, start_au = (
+            np.linalg.norm(spice.sun_position_J_au(str(COMET), spice.et_s_from_julian_date(jd)))
+            for jd in (date, table["sun"]["julian_date"])
+        )
+    assert float(data["sun_distance_au"][1]) == pytest.approx(sun_au, rel=1e-9)
+    assert abs((start_au / sun_au) ** 20 - 1) > 1e-5
+    # the same view with that amount of dust at every distance
+    even = keys | {"afrho_cm": 500.0 * (sun_au / 1.88) ** -20, "distance_exponent": 0.0}
+    same = Session(config.parse_scene({**table, "coma": even}, source="test")).simulate(1).layers["radiance"]
+    sky = data["semantic"][1].values == 0
+    assert sky.any()
+    np.testing.assert_allclose(light[:, sky], same[:, sky], rtol=1e-6)
+    assert (light[:, sky] > 0).all()

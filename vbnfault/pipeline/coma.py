@@ -1,7 +1,8 @@
-"""Add the light of the dust around the body to a rendered radiance."""
+"""Add the light of the dust around the body to a rendered radiance, and take away what the dust hides."""
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import cv2
@@ -11,12 +12,13 @@ from ..core.quantities import Radiance, Truth
 from ..render.description import RenderInput
 from ..world import assemble
 from ..world.coma import SHADOW_CELLS, Shadow, make_coma, sun_axes
+from ..world.coma_ground import on_ground
 from ..world.haze import haze
 from .spec import Pose, SampleSpec
 
 
 def add_coma(spec: SampleSpec, pose: Pose, scene: RenderInput, truth: Truth, radiance: Radiance) -> Radiance:
-    """Return the radiance with the light of the scene's coma; without a coma it is returned as it is.
+    """Return the radiance before and within the scene's coma; without a coma it is returned as it is.
 
     `truth` is on the grid of the radiance.
     """
@@ -30,9 +32,25 @@ def add_coma(spec: SampleSpec, pose: Pose, scene: RenderInput, truth: Truth, rad
     axes = sun_axes(coma.outflow.sun)
     heights = render.heights_towards_sun(terrain.surface, coma.centre_L_m, axes, coma.reach_m, SHADOW_CELLS)
     shadow = Shadow.of(heights, axes, coma.reach_m)
-    light = haze(coma, shadow, scene.view, truth.depth_m, truth.semantic)
-    bands = scene.sun.irradiance_W_m2_nm * coma.colour(scene.wavelength_nm)
-    array = np.empty_like(radiance.array)
-    for band, factor in enumerate(bands):
-        cv2.scaleAdd(light, float(factor), radiance.array[band], array[band])
+    with ThreadPoolExecutor(2) as aside:  # numpy leaves the interpreter to others in the meantime
+        below = None
+        if table.affects_ground:
+            below = aside.submit(on_ground, coma, scene.view, truth, scene.reflectance)
+        light, depth = haze(coma, shadow, scene.view, truth.depth_m, truth.semantic)
+        bands = (scene.sun.irradiance_W_m2_nm * coma.colour(scene.wavelength_nm)).tolist()
+        array = np.empty_like(radiance.array)
+        if below is None:
+            for band, factor in enumerate(bands):
+                cv2.scaleAdd(light, factor, radiance.array[band], array[band])
+            return replace(radiance, array=array)
+        ground = below.result()
+        left = np.exp(-(depth + ground.depth_to_sun))
+
+        def fill(band: int) -> None:
+            factor = bands[band]
+            np.multiply(radiance.array[band], left, out=array[band])
+            cv2.scaleAdd(light, factor, array[band], array[band])
+            cv2.scaleAdd(ground.sky, factor * float(ground.band_factor[band]), array[band], array[band])
+
+        list(aside.map(fill, range(len(bands))))
     return replace(radiance, array=array)

@@ -23,6 +23,7 @@ from ..scene.config import Scene
 from ..scene.keyed_random import keyed_uniform
 from ..scene.trajectory import FlownPose, Trajectory, as_trajectory, load_trajectory, with_rows
 from ..world import assemble
+from ..world.coma import check_coma
 from ..world.ground import GroundDetail, ground_details
 from ..world.spacecraft import SpacecraftMesh
 from .record import to_sample
@@ -211,7 +212,11 @@ class Session:
     def body(self) -> Body:
         """Return the body, which is loaded at the first use."""
         activity.begin("shape of the body")
-        return assemble.make_body(self.scene)
+        body = assemble.make_body(self.scene)
+        if self.scene.coma is not None and self.trajectory is not None:
+            for distance_au in (self.trajectory.sun_distance_au.min(), self.trajectory.sun_distance_au.max()):
+                check_coma(self.scene.coma, body, float(distance_au))
+        return body
 
     def warn_of_doubts(self) -> None:
         """Warn if the body has values of another, named one, and if the frame is wider than the lens's field."""

@@ -92,6 +92,17 @@ class ComaTable(Table):
         le=1,
         description="slope of the dust's reflectance over that at 550 nm; 0.09: 67P (Boehnhardt et al. 2016)",
     )
+    grain_albedo: float = Field(
+        0.04,
+        ge=0.005,
+        le=1,
+        description="geometric albedo of the grains: the optical depth goes with Afρ over it; 0.04: assumed, as of "
+        "dark ground without its opposition surge",
+    )
+    affects_ground: bool = Field(
+        True,
+        description="whether the dust dims the light of the ground and of the Sun on it, and lights the ground",
+    )
     sunlit_fraction: float = Field(
         0.7,
         ge=0,

@@ -254,7 +254,7 @@ def make_body(scene: Scene) -> Body:
     """Return the scene's body. Raises InputError, also for a wrong map of its albedo or a coma it cannot have."""
     body = _body(scene)
     if scene.coma is not None:
-        check_coma(body, sun_distance_au(scene))
+        check_coma(scene.coma, body, sun_distance_au(scene))
     return body
 
 

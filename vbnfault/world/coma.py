@@ -18,10 +18,14 @@ the axes a_j; N_j makes the mean of their shape 1. The square (an assumed form) 
 terminator and 0 at midnight: gas that leaves sunlit ground expands sideways, too. The part of a line that lies in
 the body's shadow is taken away.
 
-Left out: extinction and multiple scattering, since the optical depth is small (Afρ / (2 A b) with A four times the
-grains' geometric albedo: 0.0016 for each metre of Afρ at 2 km with an albedo of 0.04); the curved trajectories of
-dust under radiation pressure, thousands of kilometres away; the acceleration region within some body radii (Gerig
-et al. 2018, Icarus 311, 1); and the Sun's angular radius in the shadow.
+The dust covers the area k G / r² in each unit of volume. With A four times the grains' geometric albedo p, which is
+the A of Afρ, the column of a line without ends covers Afρ / (2 A b) of the sky, so k = Afρ / (2 π A). This is the
+optical depth that `coma_ground` uses: light that grains larger than the wavelength diffract stays within a few
+degrees of its direction and counts as not scattered. At 2 km and p = 0.04 it is 0.0016 for each metre of Afρ.
+
+Left out: multiple scattering, since the optical depth is small; extinction of the light of dust, stars and the
+Sun's disc; the curved trajectories of dust under radiation pressure, thousands of kilometres away; the acceleration
+region within some body radii (Gerig et al. 2018, Icarus 311, 1); and the Sun's angular radius in the shadow.
 """
 
 from __future__ import annotations
@@ -67,6 +71,9 @@ _LINES_AT_ONCE = 1 << 13
 # Speed of the gas at 1 au, which falls with the root of the Sun's distance (Cochran & Schleicher 1993, Icarus 105,
 # 235). Dust is slower. A body with a greater escape speed keeps it, and has no coma of this kind.
 _GAS_SPEED_M_S = 850.0
+# Greatest optical depth at the limb for which light is taken to be scattered once. Grains of the albedo 0.04
+# scatter a sixth of what they take away, so up to some 15 % of the light would be scattered again.
+_MOST_DEPTH = 1.0
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -346,6 +353,11 @@ class Coma:
     outflow: Outflow
     table: ComaTable
 
+    @property
+    def cross_section_m(self) -> float:
+        """Return the area of grains in each unit of volume times r², where the density is 1, in m: k above."""
+        return self.afrho_m / (2 * np.pi * 4 * self.table.grain_albedo)
+
     def colour(self, wavelength_nm: F64) -> F64:
         """Return the dust's reflectance over that at 550 nm, float64[band]."""
         slope = self.table.reddening_per_100nm * (wavelength_nm - REFERENCE_NM) / 100
@@ -375,7 +387,11 @@ class Coma:
         return np.asarray((outside[0] + outside[1]) / distance_m + inside / self.core_m**2)
 
     def relative_light(self, camera_m: F64, directions: F64, length_m: F64, shadow: Shadow | None) -> F64:
-        """Return the light of lines over that with G = 1 and without shadow and phase function, float64[n].
+        """Return the first result of `relative`."""
+        return self.relative(camera_m, directions, length_m, shadow)[0]
+
+    def relative(self, camera_m: F64, directions: F64, length_m: F64, shadow: Shadow | None) -> tuple[F64, F64]:
+        """Return light and dust of lines over those with G = 1, float64[n] each; the light without phase function.
 
         Parameters
         ----------
@@ -388,15 +404,16 @@ class Coma:
         shadow
             The body's shadow. None: there is none.
         """
-        out = np.empty(len(directions))
-        for first in range(0, len(out), _LINES_AT_ONCE):
+        light, dust = np.empty(len(directions)), np.empty(len(directions))
+        for first in range(0, len(light), _LINES_AT_ONCE):
             part = slice(first, first + _LINES_AT_ONCE)
             lines = Lines.between(camera_m, directions[part], length_m[part])
-            lit = self.outflow.swept(lines)
+            swept = np.maximum(lines.swept_rad, 1e-300)
+            lit = all_dust = self.outflow.swept(lines)
             if shadow is not None:
                 lit = lit - shadow.swept(lines, self.outflow)
-            out[part] = np.maximum(lit, 0) / np.maximum(lines.swept_rad, 1e-300)
-        return out
+            light[part], dust[part] = np.maximum(lit, 0) / swept, all_dust / swept
+        return light, dust
 
 
 def make_coma(table: ComaTable, body: Body, site: Site, sun_L: F64, sun_distance_au: float, seed: int) -> Coma:
@@ -445,8 +462,8 @@ def _jets(table: ComaTable, seed: int) -> tuple[F64, F64, F64]:
     )
 
 
-def check_coma(body: Body, sun_distance_au: float) -> None:
-    """Raise InputError if the body's gravity holds its dust back."""
+def check_coma(table: ComaTable, body: Body, sun_distance_au: float) -> None:
+    """Raise InputError if the body's gravity holds its dust back, or if the dust is not optically thin."""
     radius_m = (3 * body.volume_m3 / (4 * np.pi)) ** (1 / 3)
     mass_kg = body.density_kg_m3 * body.volume_m3
     escape_m_s = float(np.sqrt(2 * spectra.GRAVITATION_SI * mass_kg / radius_m))
@@ -455,4 +472,12 @@ def check_coma(body: Body, sun_distance_au: float) -> None:
         raise InputError(
             f"coma.afrho_cm: {body.name} has an escape speed of {escape_m_s:.0f} m/s, so dust cannot flow out "
             f"freely; must be at most {gas_m_s:.0f} m/s, as the gas at {sun_distance_au:.3g} au; leave [coma] out"
+        )
+    nearness = (sun_distance_au / table.reference_au) ** -table.distance_exponent
+    depth = 0.01 * table.afrho_cm * nearness / (8 * table.grain_albedo * radius_m)
+    if depth > _MOST_DEPTH:
+        raise InputError(
+            f"coma.afrho_cm = {table.afrho_cm:g}: at {sun_distance_au:.3g} au the dust has an optical depth of "
+            f"{depth:.3g} at the limb of {body.name}, where light is no longer scattered only once; must be at "
+            f"most {table.afrho_cm * _MOST_DEPTH / depth:.3g}"
         )

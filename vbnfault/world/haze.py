@@ -12,6 +12,7 @@ from __future__ import annotations
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -94,14 +95,29 @@ class _Frame:
         rays = np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3) @ self.view.L_from_C.T
         return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))
 
-    def light(self, directions: F64, length_m: F64) -> F64:
-        """Return what `Coma.relative_light` returns, times the phase function."""
-        relative = self.coma.relative_light(self.camera_m, directions, length_m, self.shadow)
-        return np.asarray(relative * self.coma.phase(directions @ self.coma.outflow.sun))
+    def light(self, directions: F64, length_m: F64) -> tuple[F64, F64]:
+        """Return what `Coma.relative` returns, the light times the phase function."""
+        light, dust = self.coma.relative(self.camera_m, directions, length_m, self.shadow)
+        return np.asarray(light * self.coma.phase(directions @ self.coma.outflow.sun)), dust
 
 
-def haze(coma: Coma, shadow: Shadow | None, view: View, depth_m: F32, semantic: NDArray[np.uint8]) -> F32:
-    """Return the radiance of the dust over the Sun's irradiance at 550 nm, in 1/sr, float32[y, x].
+class Haze(NamedTuple):
+    """Hold the light of the dust in front of the scene, and how much dust there is.
+
+    Attributes
+    ----------
+    radiance
+        float32[y, x]: radiance over the Sun's irradiance at 550 nm, in 1/sr.
+    optical_depth
+        float32[y, x]: optical depth between the camera and the ground; 0 where there is no ground.
+    """
+
+    radiance: F32
+    optical_depth: F32
+
+
+def haze(coma: Coma, shadow: Shadow | None, view: View, depth_m: F32, semantic: NDArray[np.uint8]) -> Haze:
+    """Return the light of the dust and its optical depth in every pixel.
 
     Parameters
     ----------
@@ -127,11 +143,14 @@ def haze(coma: Coma, shadow: Shadow | None, view: View, depth_m: F32, semantic: 
         towards_sky = aside.submit(_on_sky, frame, sky, sine, cosine)
         ground = aside.submit(_on_ground, frame, rows, columns, length[part], (semantic == BODY)[part])
         out = _columns(coma, frame.distance_m, sine, cosine, length, sky)
+    light, dust = ground.result()
+    optical_depth = np.zeros_like(out)
+    optical_depth[part] = np.where(semantic[part] == BODY, out[part] * dust, 0) * np.float32(coma.cross_section_m)
     out *= np.where(sky, towards_sky.result(), 1)
-    out[part] *= np.where(sky[part], 1, ground.result())
+    out[part] *= np.where(sky[part], 1, light)
     _soften_limb(out, sky)
     out *= np.float32(coma.afrho_m / (8 * np.pi**2))
-    return out
+    return Haze(radiance=out, optical_depth=optical_depth)
 
 
 def _columns(coma: Coma, distance_m: float, sine: F32, cosine: F32, length_m: F32, endless: Mask) -> F32:
@@ -263,14 +282,16 @@ class _SkyTable:
         return np.asarray(np.maximum(light, 0) * phase, dtype=np.float32)
 
 
-def _on_ground(frame: _Frame, rows: tuple[int, int], columns: tuple[int, int], length_m: F32, body: Mask) -> F32:
-    """Return the light of lines that end at the ground over that of lines with G = 1, float32[y, x] of a part.
+def _on_ground(
+    frame: _Frame, rows: tuple[int, int], columns: tuple[int, int], length_m: F32, body: Mask
+) -> tuple[F32, F32]:
+    """Return light and dust of lines that end at the ground over those with G = 1, float32[y, x] of a part each.
 
     The nodes take the mean length of the lines around them. What is not the body has the values of its neighbours.
     """
     height, width = length_m.shape
     if not body.any():
-        return np.ones((height, width), dtype=np.float32)
+        return np.ones((height, width), dtype=np.float32), np.ones((height, width), dtype=np.float32)
     count = int(np.count_nonzero(body))
     stride = max(1, int(np.ceil(np.sqrt(count / _GROUND_NODES))))
     below, right = -height % stride, -width % stride
@@ -285,8 +306,13 @@ def _on_ground(frame: _Frame, rows: tuple[int, int], columns: tuple[int, int], l
     lengths = (means(np.where(body, length_m, 0)) / np.maximum(share, 1e-9))[seen]
     x_px, y_px = (first + _positions_px(0, n, stride) for first, n in zip((columns[0], rows[0]), size, strict=True))
     directions = frame.directions(x_px, y_px)[seen.ravel()]
-    nodes = np.zeros(seen.shape, dtype=np.float32)
-    nodes[seen] = frame.light(directions, lengths.astype(np.float64))
-    nearest = ndimage.distance_transform_edt(~seen, return_distances=False, return_indices=True)
-    full = cv2.resize(nodes[tuple(nearest)], (size[0] * stride, size[1] * stride), interpolation=cv2.INTER_LINEAR)
-    return np.asarray(full[:height, :width])
+    nearest = tuple(ndimage.distance_transform_edt(~seen, return_distances=False, return_indices=True))
+
+    def interpolated(values: F64) -> F32:
+        nodes = np.zeros(seen.shape, dtype=np.float32)
+        nodes[seen] = values
+        wide = cv2.resize(nodes[nearest], (size[0] * stride, size[1] * stride), interpolation=cv2.INTER_LINEAR)
+        return np.asarray(wide[:height, :width])
+
+    light, dust = frame.light(directions, lengths.astype(np.float64))
+    return interpolated(light), interpolated(dust)
