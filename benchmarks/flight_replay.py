@@ -5,11 +5,11 @@
     python benchmarks/flight_replay.py --frames FOLDER --poses other.csv --scene my_scene.toml --out replay
 
 FOLDER holds `poses.csv` (the columns of `[trajectory]`) and for each row an 8-bit image NAME.png. The camera is
-that of the scene, by default `navcam67p` with its detector, without its faults. It renders `BINNING` times the
-size of the frames, which are half native size, and the raw image is developed as they were (`developed`): the
-square root of the digital numbers over the bias in 8 bits, then means of 2x2 pixels. The labels of flight images
-are some pixels off, so every image is aligned first, by a shift of whole native pixels, which leaves its noise as
-it is.
+that of the scene, by default `navcam67p` with its detector; of faults it has `SPOTS` alone. It renders `BINNING`
+times the size of the frames, which are half native size, and the raw image is developed as they were
+(`developed`): the square root of the digital numbers over the bias in 8 bits, then means of 2x2 pixels. The labels
+of flight images are some pixels off, so every image is aligned first, by a shift of whole native pixels, which
+leaves its noise as it is.
 
 The stretch of the frames is not documented. That it is the square root of the 12 bits shows in their noise: it
 falls from 0.92 at a sky of 2.5 to 0.52 at 14, by the same curve in all frames. Of 255 (DN/4095)^g the exponent 0.5
@@ -28,6 +28,13 @@ the worst 5 % of:
 - `noise`, `column`: deviation of the sky from its local median, and of its columns' medians from a smooth curve, as
   fractions of `bright`.
 - `tracks`: bright spots and streaks in the sky, of 2 px or more.
+
+Of the spots in the sky of a real frame, 10 in the median, 2 of them of 2 px or more, stay where they are over at
+least three frames: warm pixels. The others, 20 and 14 of 2 px or more, lie where hardly another frame has one.
+Their number, sizes and brightness are those of tracks of protons in the exposure and the readout of 4.2 s, some of
+which are long; the catalogue of stars has nine brighter than magnitude 7 in such a field, of which about four
+show. `SPOTS` gives the rendered frames the same tracks, and the grains of the coma at 3.6 au. Stars and warm
+pixels come from scene and sensor.
 
 The scene gets a coma (`HAZE`) unless it has one. Its Afρ reproduces the haze of the frames, which falls as one over
 the distance from the centre and is brighter towards the Sun. An aperture of 10,000 km would then see 40 times the
@@ -78,6 +85,13 @@ BINNING = 2  # the frames have half the native size
 _STRETCH = 255 / 4095**0.5  # of a root of DN
 _BLACK_DN = 3.5  # over the bias of the sensor, shown as 0; fitted to the sky of 11 frames
 AFRHO_CM = 400.0  # fitted to the glow of the same frames
+# What leaves spots and tracks in the sky. Protons: flux, depth and diffusion fitted to the spots of 11 frames; in
+# quiet time CREME96 has 4.67 at the Sun-Earth point L2. Grains: the density at 100 km in August 2014, see
+# `vbnfault.faults.particles`.
+SPOTS: dict[str, dict[str, Any]] = {
+    "cosmic_rays": {"model": "tracks", "flux_per_cm2_s": 6.0, "thickness_um": 15.0, "diffusion_um": 4.0},
+    "particles": {"model": "coma_grains", "density_per_m3": 6e-4},
+}
 HAZE = {"reference_au": 3.6, "sunlit_fraction": 0.4, "distance_exponent": 0.0}
 
 
@@ -295,11 +309,12 @@ class Pair:
 
 
 def replay_scene(name: str, size_px: tuple[int, int], overrides: Mapping[str, Any]) -> vbnfault.Scene:
-    """Return a scene without faults for frames of (width, height) in px, that stores nothing but raw images."""
+    """Return a scene whose only faults are `SPOTS`, for frames of (width, height) in px, that stores raw images."""
     values = {"camera.width_px": BINNING * size_px[0], "camera.height_px": BINNING * size_px[1]}
     scene = vbnfault.load_scene(name, {**values, "dataset.layers": ["raw"], **overrides})
     dataset = scene.dataset.model_copy(update={"layers": ("raw",), "mask_any": None})
-    return scene.model_copy(update={"faults": {}, "dataset": dataset})
+    plan = scene.plan.model_copy(update={"mode": "per_sample", "faulty_fraction": 1.0, "on_invisible": "drop"})
+    return scene.model_copy(update={"faults": dict(SPOTS), "plan": plan, "dataset": dataset})
 
 
 def exposed_as(scene: vbnfault.Scene, real: Look) -> vbnfault.Scene:
