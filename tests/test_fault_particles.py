@@ -20,7 +20,7 @@ from vbnfault.core.errors import InputError
 from vbnfault.core.quantities import Electrons
 from vbnfault.detector import MosaicDetector, ThreeColourDetector, load_sensor
 from vbnfault.faults import FaultContext, act
-from vbnfault.faults.particles import _Population
+from vbnfault.faults.particles import _Population, diffracted
 from vbnfault.lens import RealLens, ThinLens, load_lens, scaled_to_field
 from vbnfault.pipeline import Session
 from vbnfault.scene import config
@@ -211,11 +211,57 @@ def test_irradiance_at_the_camera() -> None:
     view = np.stack([grains["slope_x"], grains["slope_y"], np.ones(grains["count"])])
     view /= np.linalg.norm(view, axis=0)
     phase = np.degrees(np.arccos(-np.array([0.6, 0.0, -0.8]) @ view))
-    expected = (
-        total * 0.06 * 10 ** (-0.4 * 0.047 * phase) * (grains["radius_mm"] * 1e-3 / grains["distance_m"]) ** 2
-    )
+    # at these angles diffraction adds at most 5e-4 of it
+    light = 0.06 * 10 ** (-0.4 * 0.047 * phase) + diffracted(grains["radius_mm"], phase)
+    expected = total * light * (grains["radius_mm"] * 1e-3 / grains["distance_m"]) ** 2
     np.testing.assert_allclose(grains["irradiance_W_m2"], expected, rtol=1e-4)
     assert 29 < phase.min() < phase.max() < 45
+
+
+@pytest.mark.parametrize("size", [60.0, 200.0, 600.0])
+def test_small_grains_diffract_light_as_mie_says(size: float) -> None:
+    """Of dark grains of x = 2π a / λ, whose light is diffraction plus Fresnel's reflection by their surface."""
+    import miepython
+
+    index, angle_deg = 1.6 - 0.3j, np.array([10.0, 20, 30, 45, 60, 80])
+    mu, cos_i = np.cos(np.radians(angle_deg)), np.sin(np.radians(angle_deg) / 2)
+    total = np.zeros(len(mu))
+    for x in size * np.linspace(0.8, 1.2, 41):  # so that rings average out
+        s1, s2 = miepython.S1_S2(index, x, mu, norm="wiscombe")
+        total += (np.abs(s1) ** 2 + np.abs(s2) ** 2) / 2 / x**2 / 41
+    inner = np.sqrt(1 - (1 - cos_i**2) / index**2)
+    across = np.abs((cos_i - index * inner) / (cos_i + index * inner)) ** 2
+    along = np.abs((inner - index * cos_i) / (inner + index * cos_i)) ** 2
+    radius_mm = size * 550e-6 / (2 * np.pi)
+    got = diffracted(np.full(len(mu), radius_mm), 180 - angle_deg)
+    # both kinds of light interfere where they are alike, by up to 15 %
+    np.testing.assert_allclose(got + (across + along) / 8, total, rtol=0.16)
+    if size == 60:
+        assert (got[:2] > 0.5 * total[:2]).all()
+
+
+def test_backlit_grains_are_all_searched() -> None:
+    """At the largest depth that is searched, no grain in the frame is bright enough, whatever its phase angle."""
+    sun = np.array([0.35, 0.1, 0.93]) / np.linalg.norm([0.35, 0.1, 0.93])
+    c = context(sun_direction_C=sun)
+    fault = make("particles", density_per_m3=1.0, radius_mm=[0.02, 5.0])
+    shown = fault.draw(c, rng(1))
+    without = make("particles", density_per_m3=1.0, radius_mm=[0.02, 5.0], diffraction=False).draw(c, rng(1))
+    assert shown["count"] > 2 * without["count"]
+    population = _Population(fault, c, density=0.002, camera_velocity=np.zeros(3), up=np.array([1.0, 0, 0]))
+    edge = np.linspace(-SIZE / 2, SIZE / 2, 33) / FOCAL_PX
+    slopes = np.stack(np.meshgrid(edge, edge), axis=-1).reshape(-1, 2)
+    rays = np.column_stack([slopes, np.ones(len(slopes))])
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    phase = np.degrees(np.arccos(np.clip(-rays @ sun, -1, 1)))
+    assert phase.max() > 160
+    for radius in (0.021, 0.1, 0.7, 4.0):
+        _, high = population._limits_m(np.array([radius]))
+        light = 0.09 * 10 ** (-0.4 * 0.047 * phase) + diffracted(np.full(len(phase), radius), phase)
+        irradiance = population.flux_W_m2 * light * (radius * 1e-3 / high) ** 2 * rays[:, 2] ** 2
+        pupil_m2 = np.pi * (FOCAL_MM * 1e-3 / 4) ** 2
+        electrons = irradiance * pupil_m2 / (PITCH_UM * 1e-6) ** 2 / rays[:, 2] ** 3 * population.electrons
+        assert electrons.max() <= population.least_e * 1.001 or high == 10_000.0
 
 
 @pytest.mark.parametrize("focus_m", [np.inf, 40.0, 5.0])

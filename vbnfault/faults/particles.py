@@ -4,13 +4,14 @@ On 28 March 2015 grains near Rosetta passed for stars in its star trackers, and 
 Its cameras showed grains as points, as tracks, and near by as large discs out of focus.
 
 **Where and how large.** Grains lie evenly in space, so their number rises with the square of their depth Z along
-the boresight. Their radii a follow a power law, dn ∝ a^-q da, with q near 2 far from the Sun and 3.7 at the
-perihelion of 67P (Rotundi et al. 2015, Science 347, aaa3905; Fulle et al. 2016, ApJ 821, 19). A comet that loses M
-of dust a second has M / (4π r² v) of it in a volume at the distance r. For 67P at its perihelion, 1.5e3 kg/s (Fulle
-et al. 2016) of 800 kg/m³ between 0.1 and 100 mm at 1 m/s and q = 3.7 are 200 grains per m³ on the ground, 6 at 10
-km and 0.014 at 200 km; at 3 au about a hundredth of it (assumed). Close to the spacecraft there may be many more:
-Güttler et al. 2017 (MNRAS 469, S312) saw a cloud of millimetre-sized aggregates at 2 to 40 m, which had come off
-Rosetta.
+the boresight. Their radii a follow a power law, dn ∝ a^-q da. Beyond 3 au 67P had q = 2 up to 1 mm and 4 above
+(Rotundi et al. 2015, Science 347, aaa3905, as summed up by Moreno et al. 2016, A&A 587, A155), at its perihelion
+3.7 (Fulle et al. 2016, ApJ 821, 19; 3.6 above 1 mm by its tail and trail: Moreno et al. 2017, MNRAS 469, S186). A
+comet that loses M of dust a second has M / (4π r² v) of it in a volume at the distance r. For 67P at its
+perihelion, 1.5e3 kg/s (Fulle et al. 2016; up to 3e3 three weeks later: Moreno et al. 2017) of 800 kg/m³ between 0.1
+and 100 mm at 1 m/s and q = 3.7 are 200 grains per m³ on the ground, 6 at 10 km and 0.014 at 200 km; at 3 au about a
+hundredth of it (assumed). Close to the spacecraft there may be many more: Güttler et al. 2017 (MNRAS 469, S312) saw
+a cloud of millimetre-sized aggregates at 2 to 40 m, which had come off Rosetta.
 
 **Motion.** A grain leaves along the vertical of the site, within a cone around it, with the speed v (a / 1 mm)^-p.
 Drag by gas gives p = 1/2 to a sphere that is still far slower than the gas. GIADA measured 3 m/s on average for
@@ -22,15 +23,22 @@ across the frame.
 
 **Light.** A grain of the geometric albedo A at the distance d gives the camera the irradiance
 
-    E = E☉ A Φ(α) (a / d)²,   Φ = 10^(-0.4 β α),
+    E = E☉ (A Φ(α) + D) (a / d)²,   Φ = 10^(-0.4 β α),
 
 with β = 0.047 mag/° of the nucleus of 67P (Fornasier et al. 2015, A&A 583, A30). Grains from a few millimetres on
-have its phase function (Fulle et al. 2018, MNRAS 476, 2835; Lemos et al. 2023); smaller ones are brighter beyond
-90° (Bertini et al. 2017, MNRAS 469, S404), which is left out. The power E T A_pupil cos θ (T: transmittance of the
-lens) is drawn as a disc of the radius √(blur² + (a f / Z)² + diffraction²), along the line (`lens.streaks`). The
-blur is that of the camera's focus. Like the scene, this light is vignetted. A grain takes from the light behind it
-the part that its shadow covers. It is lit where the camera is: by the visible part of the Sun's disc. Where the
-depth of the scene is known, nearer ground hides a grain.
+have its phase function (Fulle et al. 2018, MNRAS 476, 2835; Lemos et al. 2023). Smaller ones are brighter beyond
+90°, as the coma is (Bertini et al. 2017, MNRAS 469, S404), because they diffract sunlight around their rim. Their
+Fraunhofer pattern (k a J₁(x sin θ) / (x sin θ))², with x = k a = 2π a / λ and the scattering angle θ = 180° - α,
+has narrow rings. Its mean over sizes is that with J₁² = 1 / (π x sin θ), so that with Kirchhoff's obliquity
+
+    D = ((1 + cos θ) / 2)² / (π x sin³ θ).
+
+It exceeds the reflected light of a grain of 0.1 mm beyond 124°, and of 1 mm beyond 145°. Nearer to the Sun than 5°
+it stays as it is there. Its colour is taken to be that of the reflected light. The power E T A_pupil cos θ (T: the
+transmittance of the lens) is drawn as a disc of the radius √(blur² + (a f / Z)² + diffraction²), along the line
+(`lens.streaks`). The blur is that of the camera's focus. Like the scene, this light is vignetted. A grain takes
+from the light behind it the part that its shadow covers. It is lit where the camera is: by the visible part of the
+Sun's disc. Where the depth of the scene is known, nearer ground hides a grain.
 
 **What is left out.** Grains whose light, spread evenly over their figure, is below `least_noise` of the noise of a
 dark pixel; all of them together are the diffuse coma. Of more than `most_grains` the brightest stay; of so many
@@ -54,7 +62,7 @@ from ..detector.poisson import poisson_above_0
 from ..lens.streaks import Streaks, drawn, inside, pupil_support
 from .context import FaultContext, Params
 from .contract import Fault
-from .fields import Interval, bounds, number
+from .fields import Interval, bounds, flag, number
 from .planes import plus, times
 
 F32 = NDArray[np.float32]
@@ -66,6 +74,7 @@ _DRAWN_AT_ONCE = 1 << 16
 _ROUNDS = 16  # draws after which a sample stays without a grain
 _DIFFRACTION = 0.42  # σ of the Gaussian nearest to an Airy disc, in wavelengths times f-number
 _REFERENCE_NM = 550.0
+_LEAST_DIFFRACTION_DEG = 5.0  # from the Sun, within which diffracted light stays as it is there
 _DIGITS = 6  # of the stored parameters
 
 
@@ -114,6 +123,7 @@ class _Particles(Fault):
     phase_slope_mag_deg: float = number(
         0.047, limits=(0, 0.2), unit="mag/°", doc="fading with the phase angle; nucleus of 67P: 0.047"
     )
+    diffraction: bool = flag(True, doc="whether small grains diffract sunlight forwards, beyond 90° of phase")
     reddening_per_100nm: float = number(
         0.11, limits=(-0.2, 1), doc="slope of the albedo over that at 550 nm; nucleus of 67P: 0.11 to 0.16; ice: 0"
     )
@@ -273,6 +283,15 @@ def phase_function(phase_deg: F64, slope_mag_deg: float) -> F64:
     return np.asarray(10 ** (-0.4 * slope_mag_deg * phase_deg))
 
 
+def diffracted(radius_mm: F64, phase_deg: F64) -> F64:
+    """Return the light that grains diffract over what a white disc of their size sends back: D of the module."""
+    size = 2 * np.pi * radius_mm * 1e6 / _REFERENCE_NM
+    angle = np.radians(180 - phase_deg)
+    sine = np.sin(np.clip(angle, np.radians(_LEAST_DIFFRACTION_DEG), np.pi / 2))
+    obliquity = ((1 + np.cos(angle)) / 2) ** 2
+    return np.asarray(obliquity * np.minimum(1 / (np.pi * size * sine**3), size**2 / 4))
+
+
 def _electrons_per_irradiance(context: FaultContext, sun: _Sunlight, reddening_per_100nm: float) -> F64:
     """Return the electrons for an irradiance of 1 W/m² of grains' light on a pixel, float64[channel]."""
     camera, total = context.camera, sun.total(reddening_per_100nm)
@@ -409,7 +428,7 @@ class _Population:
         low, high = fault.radius_mm
         self.radius_mm = np.geomspace(low, max(high, low * (1 + 1e-9)), _RADII)
         number = (self.radius_mm / self.radius_mm[0]) ** (1 - fault.size_exponent)  # per step of log a
-        self.bright = self._brightest_e_m2()
+        self.bright = self._brightest_e_m2()  # float64[node]
         while True:
             volume_m3 = np.sum(self._parts(self.radius_mm), axis=0)
             self.shown_below = _summed(number * volume_m3) / _summed(number)[-1]
@@ -432,16 +451,19 @@ class _Population:
         moves = speed * camera.exposure_s / 2 * largest
         return np.asarray(moves + camera.lens.aperture_radius_m + radius_mm * 1e-3)
 
-    def _brightest_e_m2(self) -> float:
-        """Return the most electrons of a grain in the frame, times the square of its distance over its radius."""
+    def _brightest_e_m2(self) -> F64:
+        """Return the most electrons of a grain in the frame, times (distance / radius)², for each node of radii."""
         fault = self.fault
         sides = (np.linspace(-1.2 * half, 1.2 * half, 33) for half in self.half)
         slopes = np.stack(np.meshgrid(*sides), axis=-1).reshape(-1, 2)
-        phase = phase_function(self.sun.phase_deg(_directions(slopes)), fault.phase_slope_mag_deg).max()
-        power = (
-            self.flux_W_m2 * fault.albedo.hi * float(phase) * float(_pupil_per_pixel(self.context, slopes).max())
-        )
-        return power * self.electrons
+        phase_deg = self.sun.phase_deg(_directions(slopes))
+        reflected = fault.albedo.hi * float(phase_function(phase_deg, fault.phase_slope_mag_deg).max())
+        light = np.full_like(self.radius_mm, reflected)
+        if fault.diffraction:  # it rises with the phase angle; between two slopes this is larger than at both
+            step_deg = float(np.degrees(np.hypot(*self.half)) * 2.4 / 32)
+            light += diffracted(self.radius_mm, np.minimum(phase_deg.max() + step_deg, 180))
+        pupil = float(_pupil_per_pixel(self.context, slopes).max())
+        return np.asarray(self.flux_W_m2 * light * pupil * self.electrons)
 
     def _limits_m(self, radius_mm: F64) -> tuple[F64, F64]:
         """Return the smallest and largest depths of grains: as the fault's keys say, and as light and motion do."""
@@ -449,7 +471,8 @@ class _Population:
         nearest, farthest = fault.nearest_m, fault.farthest_m
         if context.depth_m is not None:
             farthest = min(farthest, float(np.max(context.depth_m)))
-        shows = radius_mm * 1e-3 * np.sqrt(self.bright / self.least_e)
+        bright = np.interp(np.log(radius_mm), np.log(self.radius_mm), self.bright)
+        shows = radius_mm * 1e-3 * np.sqrt(bright / self.least_e)
         low = np.maximum(nearest, self._reach_m(radius_mm))
         return low, np.maximum(np.minimum(farthest, shows), low)
 
@@ -512,7 +535,10 @@ class _Population:
         first, last = (camera.projection.pixel_of(slope + s * moved) for s in (-0.5, 0.5))
         distance = depth * np.sqrt(1 + (slope**2).sum(axis=1))
         albedo = fault.albedo.uniform(rng, count)
-        light = albedo * phase_function(self.sun.phase_deg(towards), fault.phase_slope_mag_deg)
+        phase_deg = self.sun.phase_deg(towards)
+        light = albedo * phase_function(phase_deg, fault.phase_slope_mag_deg)
+        if fault.diffraction:
+            light = light + diffracted(radius_mm, phase_deg)
         focus = abs(1 / depth - 1 / camera.lens.focus_distance_m)
         return _GrainsInView(
             x_px=(first[:, 0] + last[:, 0]) / 2,
