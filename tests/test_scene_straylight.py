@@ -36,6 +36,7 @@ try:
 except VbnfaultError as error:
     pytest.skip(f"no usable LLVM: {error}", allow_module_level=True)
 
+SKY_BODY = {"declination_deg": 0.0, "of_sunlight": 0.01}
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
@@ -444,6 +445,7 @@ def test_a_store_holds_the_straylight_of_the_scene(tmp_path: Path, singlet_file:
         camera={"width_px": 64, "height_px": 48},
         plan={"faulty_fraction": 1.0},
         geometry={"min_lit_fraction": 0.2},
+        sky={"bodies": [{"planet": "jupiter"}, *(SKY_BODY | {"right_ascension_deg": ra} for ra in (0.0, 180.0))]},
     )
     table["faults"] = {"straylight": {"model": "traced", "sources": "scene", "lens": str(singlet_file)}}
     scene = config.parse_scene(table, source="test")
@@ -451,7 +453,14 @@ def test_a_store_holds_the_straylight_of_the_scene(tmp_path: Path, singlet_file:
     assert vbnfault.build(scene, out, progress=False).built == 1
     assert vbnfault.verify(out).problems == []
     data = vbnfault.open_dataset(out)
-    stored, sample = data.isel(sample=0), to_sample(vbnfault.Session(scene).frame(0))
+    frame = vbnfault.Session(scene).frame(0)
+    stored, sample = data.isel(sample=0), to_sample(frame)
+    jupiter, *both = frame.context.far_sources
+    sunlight = spectra.solar_band_irradiance_W_m2_nm(frame.context.wavelength_nm, 1.0)
+    assert (jupiter.irradiance_W_m2_nm < 1e-9 * sunlight).all()
+    # of two opposite bodies, the ground hides at least one
+    assert sum(source.irradiance_W_m2_nm.any() for source in both) <= 1
+    np.testing.assert_allclose(both[0].direction_C, -both[1].direction_C, atol=1e-12)
     for name in ("image", "clean", "mask", "mask_effect", "straylight_added"):
         np.testing.assert_array_equal(stored[name].values, sample.layers[name])
     assert stored["injected"].values.all()

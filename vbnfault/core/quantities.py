@@ -68,6 +68,25 @@ class SunInView:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
+class FarSource:
+    """Describe the light of a far body at the camera.
+
+    Attributes
+    ----------
+    direction_C
+        float64[3]: unit vector towards it in the camera frame C.
+    angular_radius_rad
+        Angular radius of its disc.
+    irradiance_W_m2_nm
+        float64[band]: irradiance of its visible part.
+    """
+
+    direction_C: NDArray[np.float64]
+    angular_radius_rad: float
+    irradiance_W_m2_nm: NDArray[np.float64]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Radiance(Quantity):
     """Hold the spectral radiance at the camera at the band nodes `wavelength_nm` float64[band].
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..camera import Camera
-from ..core.quantities import Radiance
+from ..core.quantities import FarSource, Radiance
 from ..lens.footprint import ImageFrame
 
 Params = dict[str, Any]
@@ -50,6 +50,8 @@ class FaultContext:
     surroundings
         Radiance around that render, on the grids of `lens.straylight.scene.surrounding_grids`; empty if no fault of
         the scene needs it.
+    far_sources
+        Light of bright bodies beside the target; empty if no fault of the scene needs it.
     coating_loss
         Fraction of the coatings' area that another fault of the sample has removed, in [0, 1]. Only a model with
         `Fault.informed` gets it; for the others it is 0.
@@ -66,6 +68,7 @@ class FaultContext:
     up_C: NDArray[np.float64] | None = None
     radiance: Radiance | None = None
     surroundings: tuple[Radiance, ...] = ()
+    far_sources: tuple[FarSource, ...] = ()
     coating_loss: float = 0.0
     # `init=False`, because `dataclasses.replace` must not copy results of one frame to another
     _memo: dict[Any, Any] = field(default_factory=dict, init=False, repr=False)

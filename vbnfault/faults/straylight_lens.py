@@ -35,7 +35,7 @@ from numpy.typing import NDArray
 from ..core import spectra
 from ..core.quantities import Irradiance, Radiance
 from ..lens.straylight.scatter import CLEANLINESS_LIMITS, ROUGHNESS_NM_LIMITS, Cleanliness
-from ..lens.straylight.scene import RenderGrid, SceneInLens, surrounding_grids
+from ..lens.straylight.scene import PointSources, RenderGrid, SceneInLens, surrounding_grids
 from ..lens.straylight.settings import Baffle, DirectPath, GhostSettings, SensorGrid, StraylightSettings, SunSource
 from ..lens.straylight.total import SunlightInLens, scene_veil_fraction, veil_of
 from .context import FaultContext, Params
@@ -261,7 +261,8 @@ class _LensStraylight(LensFault):
         )
         weights = camera.detector.electron_rate_weights(nodes).astype(np.float64) * camera.exposure_s
         around = [_without_sun(one) for one in context.surroundings]
-        return np.ascontiguousarray(in_lens.straylight(array, weights, around).total.transpose(1, 2, 0))
+        total = in_lens.straylight(array, weights, around, _far_points(context, in_lens.reach)).total
+        return np.ascontiguousarray(total.transpose(1, 2, 0))
 
     def sunlight(self, params: Params, context: FaultContext) -> LensSunlight | None:
         """Return the Sun's light in the lens before any ray is traced; None if no Sun is in front of the camera."""
@@ -384,6 +385,28 @@ def _sun(context: FaultContext) -> tuple[float, float] | None:
 def _without_sun(radiance: Radiance) -> F32:
     """Return the radiance without the Sun's disc, float32[band, y, x]."""
     return radiance.array if radiance.sun is None else np.maximum(radiance.array - radiance.sun, 0)
+
+
+def _far_points(context: FaultContext, reach: float) -> list[tuple[PointSources, F32]]:
+    """Return the bright bodies out of the frame as points with their irradiances, float32[band, point].
+
+    A body with its middle in the frame is no source, since its image is not drawn. `reach` is the tangent of the
+    field angle up to which sources count.
+    """
+    camera = context.camera
+    half = np.array([camera.width_px, camera.height_px]) / 2 / camera.focal_length_px
+    out = []
+    for source in context.far_sources:
+        x, y, z = source.direction_C
+        if not source.irradiance_W_m2_nm.any() or (z > 0 and (np.abs([x, y]) < half * z).all()):
+            continue
+        points, fraction = PointSources.of_disc(
+            source.direction_C, source.angular_radius_rad, camera.focal_length_px, reach
+        )
+        if points.x:
+            irradiance = np.repeat(source.irradiance_W_m2_nm[:, None] * fraction, len(points.x), axis=1)
+            out.append((points, irradiance.astype(np.float32)))
+    return out
 
 
 def _sensor_grid(context: FaultContext) -> SensorGrid:

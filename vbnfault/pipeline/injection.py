@@ -71,6 +71,7 @@ def fault_context(pose: Pose, rendering: Rendering, exposure: SceneExposure) -> 
         up_C=-pose.L_from_C[2],
         radiance=exposure.light.rendered,
         surroundings=rendering.surroundings,
+        far_sources=rendering.far_sources,
     )
 
 

@@ -6,7 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..core.quantities import SKY, Radiance, Truth
+from ..core import spectra
+from ..core.quantities import SKY, FarSource, Radiance, Truth
 from ..lens.straylight.scene import RenderGrid, surrounding_grids
 from ..render.description import RenderInput, View
 from ..world import assemble
@@ -16,6 +17,7 @@ from .noise_budget import SampledRadiance, sample_to_noise
 from .spec import Pose, Rendering, SampleSpec, SceneLight
 
 _SURROUNDING_SAMPLES = 4  # of each pixel of the coarse renders around a view
+_LEAST_RAD = 1e-7  # of a disc whose visible fraction is computed
 _ANGLE_LAYERS = {"incidence_deg", "emission_deg", "phase_deg", "albedo"}
 
 
@@ -90,15 +92,53 @@ def render_view(spec: SampleSpec, pose: Pose) -> Rendering:
         samples_per_pixel=sampled.samples_per_pixel,
         noise_fraction_p99=sampled.noise_fraction_p99,
         surroundings=_surroundings(spec, scene),
+        far_sources=_far_sources(spec, pose),
     )
+
+
+def _has_sources_around(spec: SampleSpec) -> bool:
+    """Return whether a fault of the scene needs the light around the view.
+
+    It does so also in samples that do not carry the fault, since a study injects it into any view.
+    """
+    return any(fault.lit_by_surroundings for fault in spec.faults.values())
+
+
+def _far_sources(spec: SampleSpec, pose: Pose) -> tuple[FarSource, ...]:
+    """Return the light of the bodies of `sky.bodies` that ground and spacecraft do not hide."""
+    from .. import render
+
+    scene, site = spec.scene, spec.terrain.site
+    bodies = assemble.bright_bodies(scene) if _has_sources_around(spec) else ()
+    if not bodies:
+        return ()
+    T_from_J = assemble.target_attitude(scene, site.T_from_L @ pose.sun_L)
+    L_from_J = site.T_from_L.T @ T_from_J
+    sunlight = spectra.solar_band_irradiance_W_m2_nm(assemble.wavelengths_nm(scene), 1.0)
+    out = []
+    for body in bodies:
+        direction_L = L_from_J @ body.direction_J
+        disc = replace(
+            assemble.sunlight(scene, direction_L), angular_radius_rad=max(body.angular_radius_rad, _LEAST_RAD)
+        )
+        seen = render.sun_visible_fraction(
+            spec.terrain.surface, pose.position_L_m[None], [disc], pose.L_from_C[None]
+        )
+        out.append(
+            FarSource(
+                direction_C=pose.L_from_C.T @ direction_L,
+                angular_radius_rad=body.angular_radius_rad,
+                irradiance_W_m2_nm=sunlight * body.of_sunlight * float(seen[0]),
+            )
+        )
+    return tuple(out)
 
 
 def _surroundings(spec: SampleSpec, scene: RenderInput) -> tuple[Radiance, ...]:
     """Render what lies around the view, coarsely, if a fault of the scene needs it."""
     from .. import render
 
-    # also in samples that do not carry the fault: a study injects it into any view
-    if not any(fault.lit_by_surroundings for fault in spec.faults.values()):
+    if not _has_sources_around(spec):
         return ()
     view, out = scene.view, []
     own = RenderGrid(shape=(view.height_px, view.width_px), focal_px=float(view.intrinsics[0]))

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ..body import Body, Site
 from ..camera import Camera
-from ..core.quantities import RGBI, Electrons, Radiance, Truth
+from ..core.quantities import RGBI, Electrons, FarSource, Radiance, Truth
 from ..faults import Fault, FaultContext, Params
 from ..lens import Lens
 from ..render.description import RenderInput
@@ -157,6 +157,8 @@ class Rendering:
         `render.noise_fraction` is not set.
     surroundings
         Radiance around the render, for the faults that need it; empty if the scene has none.
+    far_sources
+        Light of bright bodies beside the target, for the same faults.
     """
 
     scene: RenderInput
@@ -166,6 +168,7 @@ class Rendering:
     samples_per_pixel: float
     noise_fraction_p99: float = float("nan")
     surroundings: tuple[Radiance, ...] = ()
+    far_sources: tuple[FarSource, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -83,14 +83,52 @@ class SpiceTable(Table):
         return self
 
 
+class BrightBodyTable(Table):
+    """Describe a bright body out of the frame, whose light reaches the lens: a planet, or a body of one's own.
+
+    It is a source of straylight if `sources = "scene"`; its image is not drawn.
+    """
+
+    planet: Literal["", "mercury", "venus", "earth", "mars", "jupiter", "saturn"] = Field(
+        "", description="at its position and brightness of the sample's date; the other keys are for other bodies"
+    )
+    right_ascension_deg: float | None = Field(None, ge=-360, le=360, description="ICRF, as seen from the target")
+    declination_deg: float | None = Field(None, ge=-90, le=90, description="ICRF, as seen from the target")
+    of_sunlight: float | None = Field(
+        None, gt=0, le=1, description="its irradiance over that of the Sun, both at the target"
+    )
+    angular_radius_deg: float = Field(0.0, ge=0, le=60, description="of its disc")
+
+    @model_validator(mode="after")
+    def _planet_or_own(self) -> BrightBodyTable:
+        for key in ("right_ascension_deg", "declination_deg", "of_sunlight"):
+            value = getattr(self, key)
+            if self.planet and value is not None:
+                raise ValueError(f"{key} = {value:g}: does not apply to planet = {self.planet!r}; leave it out")
+            if not self.planet and value is None:
+                raise ValueError(f"{key}: is missing; a body without planet needs it")
+        if self.planet and self.angular_radius_deg:
+            raise ValueError(
+                f"angular_radius_deg = {self.angular_radius_deg:g}: does not apply to planet = {self.planet!r}; "
+                "leave it out"
+            )
+        return self
+
+
 class SkyTable(Table):
-    """Set which stars the sky shows. An exposure for a sunlit comet hides stars, so the default is none."""
+    """Set which stars the sky shows, and which bright bodies stand beside the target.
+
+    An exposure for a sunlit comet hides stars, so the default is none.
+    """
 
     stars: Literal["off", "auto", "on"] = Field("off", description="auto: those that the exposure can show")
     limiting_magnitude: float = Field(
         7.0, ge=-2, le=7, description="V magnitude of the faintest star that is drawn"
     )
     sigma_px: float = Field(0.6, ge=0, le=16, description="Gaussian point spread of a thin lens")
+    bodies: tuple[BrightBodyTable, ...] = Field(
+        (), max_length=32, description="bright bodies out of the frame, as sources of straylight; default: none"
+    )
 
 
 class PoseTable(Table):

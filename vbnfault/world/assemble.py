@@ -26,6 +26,7 @@ from ..scene.keyed_random import rng
 from ..scene.surroundings import OrbitTable, PoseTable, SpiceTable, SunTable
 from ..scene.target import EARTH, BodyTable
 from ..scene.trajectory import FlownPose
+from . import bright_bodies as far
 from . import sky
 from .coma import check_coma
 from .ground import looked_at
@@ -152,6 +153,14 @@ def sunlight(scene: Scene, direction_L: F64) -> Sunlight:
         irradiance_W_m2_nm=spectra.solar_band_irradiance_W_m2_nm(wavelengths_nm(scene), distance),
         limb_darkening=spectra.limb_darkening(wavelengths_nm(scene)) if scene.sun.limb_darkening else None,
     )
+
+
+def bright_bodies(scene: Scene) -> tuple[far.BrightBody, ...]:
+    """Return the bright bodies beside the target that `sky.bodies` lists, at the date of the scene."""
+    if not scene.sky.bodies:
+        return ()
+    sun_J_au, _ = ephemeris(scene)
+    return far.bright_bodies(scene.sky.bodies, scene.sun.julian_date, sun_J_au, sun_distance_au(scene))
 
 
 def target_attitude(scene: Scene, sun_T: F64) -> F64:

@@ -9,7 +9,7 @@ in the radiance L, so that it is computed from responses that depend on the lens
 - the veil of mount, barrel and edges by its closed form (`total`), from the flux that enters the lens.
 
 Sources out of the field are in coarse renders around the first one (`surrounding_grids`), each four times as wide
-as the one before and without what that one shows.
+as the one before and without what that one shows, and far bodies beside the scene (`PointSources`).
 
 The Sun's disc is not part of the scene; `total` computes its straylight.
 """
@@ -29,6 +29,7 @@ from ..paraxial import paraxial_properties
 from ..prescription import Prescription
 from ..thin import cos4_map
 from .ghost_response import GhostResponse, PolarCells, ghost_response
+from .irradiance import disc_samples
 from .paraxial import axial_transmittance
 from .scatter import baffle_transmission, glare_kernels, scattered_fraction
 from .scene_scatter import DirectionGrid, SeparatedKernel, separated
@@ -36,7 +37,7 @@ from .settings import Baffle, SensorGrid, StraylightSettings
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
-Sources = tuple["RenderGrid", F32]
+Sources = tuple["RenderGrid | PointSources", F32]
 
 # Sizes of the cells of ghosts, in rings from the axis to the corner. Halving them changes the ghosts of
 # `nikkor_28_f2p8_camera` by less than 1 % of their light.
@@ -46,6 +47,8 @@ _ANGLES = 17  # field angles of the kernels of glare
 _WIDER = 4.0  # half the width of a surrounding render over that of the render within it
 _SURROUNDING_PX = 128
 _WIDEST_DEG = 75.0
+_WIDEST = float(np.tan(np.radians(_WIDEST_DEG)))
+_DISC_RINGS = 2  # of points that stand for the disc of a far body
 _RING_RATIO = 1.15  # ratio of the slopes of neighbouring rings of sources out of the field
 
 
@@ -109,17 +112,53 @@ class RenderGrid:
         return out.reshape(len(radiance), -1)
 
 
+@dataclass(frozen=True, kw_only=True)
+class PointSources:
+    """Describe far points as sources, by the tangents x/z and y/z of their directions.
+
+    `focal_px` is the focal length of the scene's render in pixels; the glare of the points is as sharp as `block`
+    of these pixels.
+    """
+
+    x: tuple[float, ...]
+    y: tuple[float, ...]
+    focal_px: float
+    block: int = 4
+
+    @property
+    def slopes(self) -> tuple[F64, F64]:
+        """Return the tangents of the directions, float64[source] each."""
+        return np.array(self.x), np.array(self.y)
+
+    @classmethod
+    def of_disc(
+        cls, direction_C: F64, radius_rad: float, focal_px: float, reach: float
+    ) -> tuple[PointSources, float]:
+        """Return the points of a disc before the camera, and the fraction of the disc's light that each stands for.
+
+        `reach` is the tangent of the largest field angle. A disc smaller than the sharpness of its glare is one
+        point.
+        """
+        offsets = disc_samples(_DISC_RINGS) if radius_rad * focal_px > cls.block else np.zeros((1, 2))
+        axis = direction_C / np.linalg.norm(direction_C)
+        first = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
+        first /= np.linalg.norm(first)
+        points = axis + np.tan(radius_rad) * offsets @ np.stack([first, np.cross(axis, first)])
+        near = (points[:, 2] > 0) & (np.hypot(points[:, 0], points[:, 1]) < reach * np.abs(points[:, 2]))
+        x, y = (points[near, k] / points[near, 2] for k in (0, 1))
+        return cls(x=tuple(x.tolist()), y=tuple(y.tolist()), focal_px=focal_px), 1 / len(offsets)
+
+
 def surrounding_grids(render: RenderGrid) -> tuple[RenderGrid, ...]:
     """Return the grids of coarse renders that show what lies around a render, up to 75 degrees from the axis."""
     grids: list[RenderGrid] = []
-    widest = float(np.tan(np.radians(_WIDEST_DEG)))
     inner = render.half
-    while min(inner) < widest:
-        half = min(_WIDER * max(inner), widest)
+    while min(inner) < _WIDEST:
+        half = min(_WIDER * max(inner), _WIDEST)
         grids.append(
             RenderGrid(shape=(_SURROUNDING_PX, _SURROUNDING_PX), focal_px=_SURROUNDING_PX / 2 / half, inner=inner)
         )
-        if half == widest:
+        if half == _WIDEST:
             break
         inner = half, half
     return tuple(grids)
@@ -175,7 +214,9 @@ class SceneInLens:
     around: tuple[RenderGrid, ...] = ()
     rings: tuple[int, int, int] = (SOURCE_RINGS, SENSOR_RINGS, AZIMUTHS)
 
-    def straylight(self, radiance: F32, weights: F64, around: Sequence[F32] = ()) -> SceneStraylight:
+    def straylight(
+        self, radiance: F32, weights: F64, around: Sequence[F32] = (), points: Sequence[Sources] = ()
+    ) -> SceneStraylight:
         """Return the straylight of a scene.
 
         Parameters
@@ -186,9 +227,12 @@ class SceneInLens:
             float64[channel, band], with which the bands are added.
         around
             The same of the renders around it, on the grids `around`.
+        points
+            `PointSources` and their irradiances, float32[band, source].
         """
         renders = zip((self.render, *self.around), (radiance, *around), strict=True)
-        sources = [(render, render.irradiance(array)) for render, array in renders]
+        sources: list[Sources] = [(render, render.irradiance(array)) for render, array in renders]
+        sources += points
         return SceneStraylight(
             ghosts=self.ghosts(sources, weights),
             glare=self.glare(sources, weights),
@@ -249,6 +293,11 @@ class SceneInLens:
         )
 
     @property
+    def reach(self) -> float:
+        """Return the tangent of the field angle up to which sources count."""
+        return self._cells.slopes[-1]
+
+    @property
     def _cells(self) -> PolarCells:
         """Return the cells of ghosts."""
         x, y = self.render.slopes
@@ -272,12 +321,12 @@ class SceneInLens:
         """Return the focal length of the lens in pixels of the sensor."""
         return paraxial_properties(self.lens).efl_mm / self.sensor.pitch_mm
 
-    def _places(self, grid: RenderGrid) -> _Places:
+    def _places(self, grid: RenderGrid | PointSources) -> _Places:
         """Return where the sources on a grid lie."""
         field = float(np.hypot(*self.render.half))
         return _places(grid, field, self.sensor, self.image, self._cells, self._efl_px)
 
-    def _kernel(self, grid: RenderGrid) -> SeparatedKernel:
+    def _kernel(self, grid: RenderGrid | PointSources) -> SeparatedKernel:
         """Return the glare of sources on a grid, with all losses but those at the baffle."""
         slope = np.tan(np.linspace(0, np.arctan(self._places(grid).slope.max()), _ANGLES))
         cleanliness = self.settings.cleanliness
@@ -339,7 +388,12 @@ class _Places:
 
 @lru_cache(maxsize=8)
 def _places(
-    render: RenderGrid, field: float, sensor: SensorGrid, image: Lens, cells: PolarCells, efl_px: float
+    render: RenderGrid | PointSources,
+    field: float,
+    sensor: SensorGrid,
+    image: Lens,
+    cells: PolarCells,
+    efl_px: float,
 ) -> _Places:
     """Return where the sources of a render lie; it is cached for the camera.
 
@@ -350,7 +404,7 @@ def _places(
     known = np.clip(slope, 1e-9, field)
     stretch = image.distorted(known) / known
     stretch *= image.focal_length_mm / sensor.pitch_mm / efl_px
-    position = np.arctan(slope) / np.arctan(slope.max()) * (_ANGLES - 1)
+    position = np.arctan(slope) / np.arctan(max(float(slope.max()), 1e-9)) * (_ANGLES - 1)
     angle = np.minimum(position.astype(np.int64), _ANGLES - 2)
     return _Places(
         slope=slope,
