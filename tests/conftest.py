@@ -73,6 +73,14 @@ def finished_store(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return filled(tmp_path_factory.mktemp("store") / "finished.zarr").path
 
 
+@pytest.fixture(scope="session")
+def described_store(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the path of a finished store of a real scene, with made-up pixels, which no test changes."""
+    from synthetic import of_a_scene
+
+    return of_a_scene(tmp_path_factory.mktemp("described") / "described.zarr").path
+
+
 @pytest.fixture
 def whole(finished_store: Path, tmp_path: Path) -> Any:
     """Return a copy of the finished store, to be damaged."""

@@ -249,6 +249,8 @@ def case_options(seeds: Seeds, rng: random.Random, here: Path) -> Case:
         "build": ["build", scene, "--out", out + ".zarr", "--dry-run"],
         "verify": ["verify", str(seeds.store)],
         "digest": ["digest", str(seeds.store)],
+        "stats": ["stats", str(seeds.store)],
+        "export": ["export", str(seeds.store), "--format", "coco", "--out", out],
         "preview": ["preview", str(seeds.store), "--out", out + ".png"],
         "lens": ["lens", "tessar_50_f2p8", "--out", out + ".png"],
         "flare": [
@@ -272,6 +274,7 @@ def case_options(seeds: Seeds, rng: random.Random, here: Path) -> Case:
     options = {
         "build": ["--samples", "--seed", "--workers", "--threads", "--append", "--set", "--out", "--scheduler"],
         "preview": ["--samples", "--out"],
+        "export": ["--format", "--out", "--workers"],
         "lens": ["--vary-seed", "--spread", "--json", "--toml", "--out"],
         "flare": [
             "--sun-deg",
@@ -338,8 +341,12 @@ def case_store(seeds: Seeds, rng: random.Random, here: Path) -> Case:
             path.write_bytes(flipped(path.read_bytes(), rng))
         files = [p for p in files if p.is_file()]
         described = [p for p in described if p.is_file()]
-    command = rng.choice(("verify", "verify", "preview", "digest"))
-    return [command, str(store), *(["--out", str(here / "sheet.png")] if command == "preview" else [])], {}
+    command = rng.choice(("verify", "verify", "preview", "digest", "stats", "export"))
+    more = {
+        "preview": ["--out", str(here / "sheet.png")],
+        "export": ["--out", str(here / "export"), "--format", "yolo"],
+    }
+    return [command, str(store), *more.get(command, [])], {}
 
 
 CASES: dict[str, tuple[Callable[[Seeds, random.Random, Path], Case], int]] = {  # function, percentage of cases

@@ -96,6 +96,61 @@ def filled(path: Path, samples: int = 10, **changes: object) -> st.Store:
     return store
 
 
+def of_a_scene(path: Path, samples: int = 6) -> st.Store:
+    """A finished store whose attributes and plan are those of a real scene; its pixels are made up."""
+    from conftest import small_scene
+
+    from vbnfault import dataset, pipeline
+    from vbnfault.scene import config
+
+    table = small_scene(
+        dataset={
+            "samples": samples,
+            "shard_samples": 2,
+            "sites": 3,
+            "layers": ["clean", "mask_effect", "depth_m", "normal", "semantic", "radiance"],
+            "licence": "CC0-1.0",
+            "citation": "A test",
+        },
+        camera={"width_px": 40, "height_px": 32},
+    )
+    table["faults"] = {name: {} for name in FAULTS}
+    session = pipeline.Session(config.parse_scene(table, source="described"))
+    spec = dataset.store_spec(session, (samples,))
+    store = st.create(path, spec, samples)
+    expected = dataset.planned(spec.attributes, spec.faults)
+    made = []
+    for i in range(samples):
+        sample, planned = fake_sample(spec, i), expected(i, 1)
+        injected = planned["injected"].tolist()
+        drawn = {f: {"model": "made_up", "x": [i, i + 0.5]} for f, on in zip(FAULTS, injected, strict=True) if on}
+        masks = np.stack([blobs(spec, i, k) & on for k, on in enumerate(injected)])
+        layers = {**sample.layers, "mask": masks, "radiance": made_up_radiance(spec, i)}
+        scalars = {**sample.scalars, **planned, "parameters": drawn, "exposure_s": 0.01 * (i + 1)}
+        made.append(dataclasses.replace(sample, layers={**layers, "mask_effect": masks}, scalars=scalars))
+    st.write_samples(store, made)
+    return store
+
+
+def made_up_radiance(spec: st.StoreSpec, index: int) -> np.ndarray:
+    """Made-up radiance of one sample."""
+    shape = (len(spec.wavelength_nm), spec.height, spec.width)
+    return np.random.default_rng([12, index]).random(shape).astype(spec.radiance_dtype)
+
+
+def blobs(spec: st.StoreSpec, index: int, fault: int) -> np.ndarray:
+    """A mask of several regions: single pixels, rings with holes, lines, whatever chance gives; never empty."""
+    rng = np.random.default_rng([13, index, fault])
+    if spec.faults[fault] not in LOCALISED:
+        return np.ones((spec.height, spec.width), bool)
+    y, x = np.mgrid[: spec.height, : spec.width]
+    mask = rng.random((spec.height, spec.width)) < 0.01
+    for cx, cy, r in rng.uniform((0, 0, 2), (spec.width, spec.height, 9), (3, 3)):
+        mask |= np.abs(np.hypot(x - cx, y - cy) - r) < rng.uniform(0.5, 3)
+    mask[rng.integers(spec.height)] |= fault == 1
+    return mask
+
+
 def flip(file: Path, position: int) -> None:
     data = bytearray(file.read_bytes())
     data[position] ^= 0x10

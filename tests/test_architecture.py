@@ -57,7 +57,7 @@ ONLY = {  # distribution → the packages or modules that import it
     "dask": {"dataset.dask"},
     "distributed": {"dataset.dask"},
     "typer": {"cli"},
-    "pyarrow": {"scene.trajectory", "study"},
+    "pyarrow": {"output.export.formats.huggingface", "scene.trajectory", "study"},
     "SALib": {"study"},
     "spiceypy": {"core.spice"},
     "OpenEXR": {"core.images"},

@@ -21,10 +21,12 @@ if TYPE_CHECKING:
     from .core.errors import InputError, VbnfaultError
     from .dataset import BuildOptions, verify
     from .dataset import build_scene as build
+    from .dataset.statistics import statistics
     from .detector.effects import Effect, Exposure
     from .detector.sensor import Sensor, load_sensor
     from .faults import Fault, FaultContext, Interval, bounds, choice, flag, number, path, rows, text
     from .lens import Prescription, load_lens
+    from .output.export import export_store as export
     from .output.flare_images import Flare, trace_flare
     from .pipeline import Session, simulate
     from .reflectance import DiscReflectance, Reflectance
@@ -53,6 +55,7 @@ _HOMES = {
     "build": "dataset:build_scene",
     "choice": "faults",
     "flag": "faults",
+    "export": "output.export:export_store",
     "load_lens": "lens",
     "load_scene": "scene.config",
     "load_sensor": "detector.sensor",
@@ -62,6 +65,7 @@ _HOMES = {
     "path": "faults",
     "rows": "faults",
     "simulate": "pipeline",
+    "statistics": "dataset.statistics",
     "study": "study:",
     "text": "faults",
     "trace_flare": "output.flare_images",
@@ -88,6 +92,7 @@ __all__ = [
     "bounds",
     "build",
     "choice",
+    "export",
     "flag",
     "load_lens",
     "load_scene",
@@ -98,6 +103,7 @@ __all__ = [
     "path",
     "rows",
     "simulate",
+    "statistics",
     "study",
     "text",
     "trace_flare",

@@ -17,7 +17,7 @@ from ..core.quantities import Sample
 from ..scene import config, plan
 from ..scene.config import Scene
 from ..scene.trajectory import with_rows
-from . import build, describe
+from . import build, card, describe
 from .identity import is_exact, planned, store_spec
 
 _MOST_SAMPLES = 10_000_000
@@ -86,7 +86,7 @@ def build_scene(
     source: str | None = None,
     **keywords: Any,
 ) -> build.Summary:
-    """Build, resume, repair or extend the store of a scene.
+    """Build, resume, repair or extend the store of a scene, and write its card when it is complete.
 
     Parameters
     ----------
@@ -135,6 +135,8 @@ def build_scene(
     blocks = build.planned_blocks(out, scene.dataset.samples, append=append or 0, overwrite=options.overwrite)
     factory, build_plan, description = _prepared(scene, blocks, source, options)
     summary = build.build(factory, build_plan, out, options)
+    if not options.dry_run and (summary.built or not card.has_card(store.open_store(out))):
+        card.write_card(out)
     return dataclasses.replace(summary, description=tuple(description))
 
 

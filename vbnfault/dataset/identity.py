@@ -317,6 +317,13 @@ def classes_that_need_sun(attributes: Mapping[str, Any]) -> list[str]:
     return sorted(classes)
 
 
+def stored_plan(attributes: Mapping[str, Any], faults: Sequence[str]) -> tuple[Scene, plan.Plan]:
+    """Return the scene of a store and its plan, from the root attributes and the fault axis of the store."""
+    scene = stored_scene(attributes)
+    need_sun = classes_that_need_sun(attributes)
+    return scene, plan.make_plan(scene, faults, attributes["blocks"], need_sun=need_sun)
+
+
 def planned(attributes: Mapping[str, Any], faults: Sequence[str]) -> Callable[[int, int], dict[str, Any]]:
     """Return a function that computes the planned scalars of a sample; `store.examine` calls this function.
 
@@ -330,8 +337,7 @@ def planned(attributes: Mapping[str, Any], faults: Sequence[str]) -> Callable[[i
     faults
         The fault axis of the store.
     """
-    scene = stored_scene(attributes)
-    table = plan.make_plan(scene, faults, attributes["blocks"], need_sun=classes_that_need_sun(attributes))
+    scene, table = stored_plan(attributes, faults)
 
     def expected(index: int, tries: int) -> dict[str, Any]:
         drawn = table.view(scene, index, tries - 1)

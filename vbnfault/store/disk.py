@@ -162,6 +162,26 @@ def write(root: Path, files: Iterable[tuple[str, bytes]]) -> None:
         raise
 
 
+def write_with(target: Path, make: Callable[[Path], object]) -> None:
+    """Replace one file durably by what `make` writes to a temporary path beside it; the folder must exist.
+
+    Unlike `write`, no content has to be in memory. Raises OSError if the file cannot be written.
+    """
+    partial = target.with_name(f"{target.name}.{uuid.uuid4().hex}{PARTIAL}")
+    try:
+        make(partial)
+        file = os.open(partial, os.O_RDWR | getattr(os, "O_BINARY", 0))
+        try:
+            _flush(file)
+        finally:
+            os.close(file)
+        rename(partial, target)
+    except BaseException:
+        with contextlib.suppress(OSError):
+            os.unlink(partial)
+        raise
+
+
 def _at_once(flush: Callable[[T], None], items: Iterable[T]) -> None:
     """Flush files or folders in parallel: a journaling file system commits once for all that wait."""
     with ThreadPoolExecutor(_FLUSHES) as pool:

@@ -50,8 +50,8 @@ _READS = 3
 class Store:
     """Hold an open store, as `open_store` returns it.
 
-    `array`, `read` and `read_sample` read through zarr, as a user does. `column` and `chunk` read the files
-    directly.
+    `array` and `read` read through zarr, as a user does, and so does `read_sample` the layers. `column` and `chunk`
+    read the files directly.
     """
 
     def __init__(self, path: Path, attributes: dict[str, Any], mode: str) -> None:
@@ -119,15 +119,16 @@ class Store:
             ) from error
         return np.asarray(values)
 
-    def read_sample(self, index: int) -> Sample:
-        """Return one sample, compared with its checksums.
+    def read_sample(self, index: int, layers: Collection[str] | None = None) -> Sample:
+        """Return one sample, compared with its checksums; with `layers`, only these of its layers.
 
         If the sample is being rewritten, the result is the old or the new version, never a mixture. Raises
         InputError if the sample does not exist or is not finished, VbnfaultError if it is damaged.
         """
         if not 0 <= index < self.samples:
             raise InputError(f"{self.path}: sample {index} does not exist; the range is 0 to {self.samples - 1}")
-        names = (*self.spec.pixel_layers, *SCALARS)
+        chosen = [name for name in self.spec.pixel_layers if layers is None or name in layers]
+        compared = [k for k, name in enumerate(self.spec.checked) if name in chosen or name not in self.spec.arrays]
         file = self.file("done", index // self.spec.shard_samples)
         mismatches = 0
         while mismatches < _READS:
@@ -135,19 +136,33 @@ class Store:
             if not self.read("done", index, index + 1)[0]:
                 raise InputError(f"{self.path}: sample {index} is not finished yet; the build command resumes")
             crcs = self.read("crc32c", index, index + 1)[0].tolist()
-            values = {name: self.read(name, index, index + 1)[0] for name in names}
-            layers = {name: values[name] for name in self.spec.pixel_layers}
-            scalars = {
-                name: str(values[name]) if array.is_text else values[name] for name, array in SCALARS.items()
-            }
-            crcs_of_layers = [crc32c(layer) if layer.size else 0 for layer in layers.values()]
-            if [*crcs_of_layers, crc_of_scalars(scalars)] == crcs:
-                return Sample(index=index, layers=layers, scalars=scalars)
+            arrays = {name: self.read(name, index, index + 1)[0] for name in chosen}
+            scalars = self._scalars(index)
+            crcs_of_layers = [crc32c(layer) if layer.size else 0 for layer in arrays.values()]
+            if [*crcs_of_layers, crc_of_scalars(scalars)] == [crcs[k] for k in compared]:
+                return Sample(index=index, layers=arrays, scalars=scalars)
             # a process that rewrites the sample replaces the file of `done` first
             mismatches += _stamp(file) == stamp
         raise VbnfaultError(
             f"{self.path}: sample {index} does not match its stored crc32c; the build command repairs it"
         )
+
+    def _scalars(self, index: int) -> dict[str, Any]:
+        """Return the scalars of a sample. Raises VbnfaultError if they cannot be decoded.
+
+        Their small files are read directly: through zarr, the 45 of them would take longer than an image.
+        """
+        number = index // self.spec.shard_samples
+        scalars: dict[str, Any] = {}
+        for name, row in SCALARS.items():
+            try:
+                value = self.column(name, number)[index - self.shard(number).start]
+            except (OSError, ValueError) as error:
+                raise VbnfaultError(
+                    f"{self.path}: {name} of sample {index} cannot be read ({error}); the build command repairs it"
+                ) from error
+            scalars[name] = str(value) if row.is_text else value
+        return scalars
 
     def column(self, name: str, number: int) -> NDArray[Any]:
         """Return a scalar for all samples of a shard. Raises OSError or ValueError if its chunk is damaged."""

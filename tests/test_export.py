@@ -1,0 +1,476 @@
+"""Exports: what other tools read equals the store, and an interrupted export ends as one that was not."""
+
+from __future__ import annotations
+
+import errno
+import hashlib
+import importlib
+import json
+import os
+import shutil
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from synthetic import filled
+
+from vbnfault import store as st
+from vbnfault.core import registry
+from vbnfault.core.errors import InputError, VbnfaultError
+from vbnfault.output.export import Entry, Format, export_store, formats
+from vbnfault.output.export.formats import coco
+from vbnfault.output.export.regions import coco_text, polygon, regions, whole
+
+NAMES = ("coco", "exr", "huggingface", "png", "webdataset", "yolo")
+SAMPLES = 6
+pytestmark = [
+    # rdflib, below mlcroissant, calls its own deprecated name; pycocotools ignores a keyword of numpy 2
+    pytest.mark.filterwarnings("ignore:ConjunctiveGraph is deprecated:DeprecationWarning"),
+    pytest.mark.filterwarnings("ignore:__array__ implementation doesn't accept a copy:DeprecationWarning"),
+]
+
+
+def reader(name: str) -> Any:
+    """Return a package of the extra `readers`; skip where it is not installed."""
+    return pytest.importorskip(name, reason=f"{name} is in the extra `readers`: pip install '.[readers]'")
+
+
+def tree(folder: Path) -> dict[str, str]:
+    """Return the digest of each file below a folder by name."""
+    files = sorted(path for path in folder.rglob("*") if path.is_file())
+    return {str(p.relative_to(folder)): hashlib.sha256(p.read_bytes()).hexdigest() for p in files}
+
+
+@pytest.fixture(scope="module")
+def exported(described_store: Path, tmp_path_factory: pytest.TempPathFactory) -> Any:
+    """Return what exports the store in a format, once, and returns the folder."""
+    made: dict[str, Path] = {}
+
+    def export(name: str) -> Path:
+        if name not in made:
+            made[name] = tmp_path_factory.mktemp("export") / name
+            export_store(described_store, made[name], name, progress=False)
+        return made[name]
+
+    return export
+
+
+@pytest.fixture(scope="module")
+def data(described_store: Path) -> Any:
+    """Return the store that is exported."""
+    return st.open_store(described_store)
+
+
+def split_of(data: st.Store) -> list[str]:
+    return [str(s) for s in data.read("split")]
+
+
+# --- every format -------------------------------------------------------------------------------------------
+
+
+def test_the_formats_are_these() -> None:
+    assert tuple(formats()) == NAMES
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_an_export_is_the_same_with_any_number_of_threads(
+    name: str, exported: Any, described_store: Path, tmp_path: Path
+) -> None:
+    summary = export_store(described_store, tmp_path / "again", name, workers=3, progress=False)
+    assert summary.written == summary.samples == SAMPLES
+    assert tree(tmp_path / "again") == tree(exported(name))
+    assert not [path for path in exported(name).rglob("*") if path.name.startswith(".") or ".partial" in path.name]
+    again = export_store(described_store, exported(name), name, progress=False)
+    assert again.written == 0  # it is complete
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_table_of_samples_has_splits_faults_and_parameters(name: str, exported: Any, data: st.Store) -> None:
+    lines = (exported(name) / "samples.jsonl").read_text().splitlines()
+    rows = {row["sample"]: row for row in map(json.loads, lines)}
+    assert sorted(rows) == list(range(SAMPLES))
+    injected, splits = data.read("injected").astype(bool), split_of(data)
+    for i, row in rows.items():
+        assert row["split"] == splits[i]
+        assert row["injected"] == [f for f, on in zip(data.spec.faults, injected[i], strict=True) if on]
+        assert row["parameters"] == json.loads(str(data.read("parameters", i, i + 1)[0]))
+        assert (exported(name) / row["file"]).is_file()
+        assert row["sun_xy_px"] == [None, None]  # NaN is no JSON
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_card_says_what_a_user_must_know(name: str, exported: Any, data: st.Store) -> None:
+    card = (exported(name) / "README.md").read_text()
+    attributes = data.attributes
+    for text in ("CC0-1.0", "A test", "Gallon", attributes["versions"]["zarr"], attributes["scene_hash"]):
+        assert text in card
+    assert "| patch.facet_m | 12.0 | set |" in card
+    assert "| camera.fov_deg | 65.0 | default |" in card
+    assert "| faults.dust_on_optics.count | [30, 100] | default |" in card
+    rows = [line for line in card.splitlines() if line.startswith("| ")]
+    classes = [row.split(" | ")[1] for row in rows if row[2].isdecimal()]
+    assert classes == list(data.spec.faults)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_mlcroissant_accepts_the_description_and_reads_the_samples(
+    name: str, exported: Any, data: st.Store, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    croissant = reader("mlcroissant")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    described = croissant.Dataset(str(exported(name) / "croissant.json"))
+    assert described.metadata.issues.errors == set()
+    rows = list(described.records("samples"))
+    splits = split_of(data)
+    assert {r["samples/sample"]: r["samples/split"].decode() for r in rows} == dict(enumerate(splits))
+    faults = [row["fault_classes/name"] for row in described.records("fault_classes")]
+    assert faults == list(data.spec.faults)
+
+
+# --- each format in the tool that it is for -------------------------------------------------------------------
+
+
+def test_png_files_hold_the_stored_numbers(exported: Any, data: st.Store) -> None:
+    folder, splits = exported("png"), split_of(data)
+    for i in range(data.samples):
+        sample = data.read_sample(i)
+        at = folder / splits[i]
+
+        def image(name: str, at: Path = at, i: int = i) -> np.ndarray:
+            return cv2.imread(str(at / name / f"{i:06d}.png"), cv2.IMREAD_UNCHANGED)
+
+        assert np.array_equal(image("image")[..., ::-1], sample.layers["image"][..., :3])
+        assert np.array_equal(image("image_intensity"), sample.layers["image"][..., 3])
+        assert np.array_equal(image("semantic"), sample.layers["semantic"])
+        for k, fault in enumerate(data.spec.faults):
+            assert np.array_equal(image(f"mask/{fault}") == 255, sample.layers["mask"][k])
+
+
+def test_png_of_the_raw_mosaic_has_16_bits(finished_store: Path, tmp_path: Path) -> None:
+    store = st.open_store(finished_store)
+    export_store(store, tmp_path / "png", "png", progress=False)
+    raw = cv2.imread(str(tmp_path / "png/train/raw/000000.png"), cv2.IMREAD_UNCHANGED)
+    assert raw.dtype == np.uint16
+    assert np.array_equal(raw, store.read_sample(0).layers["raw"])
+
+
+def test_pycocotools_reads_instances_that_make_up_the_masks(exported: Any, data: st.Store) -> None:
+    tool, masks = reader("pycocotools.coco"), reader("pycocotools.mask")
+    splits, instances = split_of(data), 0
+    for split in ("train", "val", "test"):
+        loaded = tool.COCO(str(exported("coco") / f"annotations/instances_{split}.json"))
+        assert loaded.getImgIds() == [i for i, s in enumerate(splits) if s == split]
+        assert [c["name"] for c in loaded.loadCats(loaded.getCatIds())] == list(data.spec.faults)
+        for i in loaded.getImgIds():
+            assert (exported("coco") / "images" / split / loaded.imgs[i]["file_name"]).is_file()
+            union = np.zeros((len(data.spec.faults), data.spec.height, data.spec.width), int)
+            for note in loaded.loadAnns(loaded.getAnnIds(imgIds=[i])):
+                pixels = loaded.annToMask(note)
+                union[note["category_id"] - 1] += pixels
+                assert note["area"] == pixels.sum() == masks.area(loaded.annToRLE(note))
+                assert note["bbox"] == masks.toBbox(loaded.annToRLE(note)).tolist()
+                assert note["iscrowd"] == 0
+                local = data.spec.faults[note["category_id"] - 1] in (data.spec.localised_faults or ())
+                assert cv2.connectedComponents(pixels, connectivity=8)[0] == 2 or not local
+                instances += 1
+            # every pixel of a mask is in one instance
+            assert np.array_equal(union, data.read_sample(i).layers["mask"])
+    assert instances > 50
+
+
+def test_a_mask_in_many_pieces_becomes_one_crowd(
+    data: st.Store, described_store: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(coco, "MOST_INSTANCES", 3)
+    summary = export_store(described_store, tmp_path / "coco", "coco", progress=False)
+    assert any("more than 3 pieces" in line and "iscrowd 1" in line for line in summary.lines())
+    notes = [
+        (note["image_id"], note)
+        for split in ("train", "val", "test")
+        for note in json.loads((tmp_path / f"coco/annotations/instances_{split}.json").read_text())["annotations"]
+    ]
+    crowds = [(i, note) for i, note in notes if note["iscrowd"]]
+    assert crowds
+    for i, note in crowds:
+        same = [n for j, n in notes if (j, n["category_id"]) == (i, note["category_id"])]
+        mask = data.read_sample(i).layers["mask"][note["category_id"] - 1]
+        assert len(same) == 1
+        assert note["area"] == mask.sum()
+
+
+def test_run_lengths_are_those_of_pycocotools() -> None:
+    masks = reader("pycocotools.mask")
+    rng = np.random.default_rng(5)
+    tried = [np.ones((7, 5), bool), np.eye(9, dtype=bool), np.arange(300 * 200).reshape(300, 200) % 37 < 2]
+    tried += [rng.random((13, 17)) < p for p in (0.02, 0.3, 0.9)]
+    for mask in [*tried, np.arange(12).reshape(3, 4) < 1, np.arange(12).reshape(3, 4) > 10]:
+        wanted = masks.encode(np.asfortranarray(mask.astype(np.uint8)))["counts"].decode()
+        assert coco_text(whole(mask).counts) == wanted
+        found = regions(mask)
+        assert sum(region.area for region in found) == mask.sum()
+        for region in found:
+            only = np.zeros(mask.shape, np.uint8, order="F")
+            x, y, w, h = region.box
+            only[y : y + h, x : x + w] = region.inside
+            assert coco_text(region.counts) == masks.encode(only)["counts"].decode()
+
+
+def test_yolo_outlines_and_boxes_give_the_regions_back(exported: Any, data: st.Store) -> None:
+    folder, splits = exported("yolo"), split_of(data)
+    text = (folder / "data.yaml").read_text()
+    assert [line.strip() for line in text.partition("names:\n")[2].splitlines()] == [
+        f"{k}: {name}" for k, name in enumerate(data.spec.faults)
+    ]
+    assert all(f"{split}: images/{split}" in text for split in ("train", "val", "test"))
+    size = np.array([data.spec.width, data.spec.height])
+    lines = 0
+    for i, split in enumerate(splits):
+        mask = data.read_sample(i).layers["mask"]
+        outlines = (folder / f"labels/{split}/{i:06d}.txt").read_text().splitlines()
+        boxes = (folder / f"boxes/{split}/{i:06d}.txt").read_text().splitlines()
+        assert (folder / f"images/{split}/{i:06d}.png").is_file()
+        drawn = np.zeros(mask.shape, np.uint8)
+        for outline, box in zip(outlines, boxes, strict=True):
+            k, *numbers = (float(v) for v in outline.split())
+            assert len(numbers) >= 6  # at least three vertices
+            assert all(0 <= v <= 1 for v in numbers)
+            one = np.zeros(mask.shape[1:], np.uint8)
+            points = np.reshape(numbers, (-1, 2)) * size
+            # Ultralytics' polygon2mask
+            cv2.fillPoly(one, [points.astype(np.int32)], 1)
+            drawn[int(k)] |= one
+            same, cx, cy, w, h = (float(v) for v in box.split())
+            rows, columns = np.flatnonzero(one.any(1)), np.flatnonzero(one.any(0))
+            wanted = [columns[0], rows[0], np.ptp(columns) + 1, np.ptp(rows) + 1]
+            edges = np.array([cx - w / 2, cy - h / 2, w, h]) * np.tile(size, 2)
+            assert same == k
+            assert edges == pytest.approx(wanted, abs=1e-3)  # of a pixel: six digits of a fraction
+            lines += 1
+        for k, fault in enumerate(data.spec.faults):
+            wanted_mask = np.zeros(mask.shape[1:], np.uint8)
+            if fault in (data.spec.localised_faults or ()):
+                for region in regions(mask[k]):  # an outline has no holes
+                    x, y, w, h = region.box
+                    contours, _ = cv2.findContours(region.inside.astype(np.uint8), cv2.RETR_EXTERNAL, 1)
+                    cv2.drawContours(wanted_mask[y : y + h, x : x + w], contours, -1, 1, cv2.FILLED)
+            assert np.array_equal(drawn[k], wanted_mask)
+            assert (drawn[k] >= mask[k]).all() or fault not in (data.spec.localised_faults or ())
+    assert lines > 50
+
+
+@pytest.mark.parametrize("pixels", [[(2, 3)], [(2, 3), (2, 4)], [(2, 3), (3, 4)], [(4, 2), (3, 3), (2, 4)]])
+def test_an_outline_of_the_smallest_regions_covers_them_exactly(pixels: list[tuple[int, int]]) -> None:
+    mask = np.zeros((8, 9), bool)
+    mask[tuple(np.transpose(pixels))] = True
+    (region,) = regions(mask)
+    drawn = np.zeros(mask.shape, np.uint8)
+    cv2.fillPoly(drawn, [polygon(region).astype(np.int32)], 1)
+    assert len(polygon(region)) >= 3
+    assert np.array_equal(drawn == 1, mask)
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # webdataset leaves files open
+def test_webdataset_reads_the_tar_files(exported: Any, data: st.Store) -> None:
+    tool = reader("webdataset")
+    splits, seen = split_of(data), []
+    for split in ("train", "val", "test"):
+        urls = sorted(str(path) for path in exported("webdataset").glob(f"{split}-*.tar"))
+        for item in tool.WebDataset(urls, shardshuffle=False).decode("rgb8"):
+            i = int(item["__key__"])
+            sample = data.read_sample(i)
+            assert splits[i] == split
+            assert np.array_equal(item["image.png"], sample.layers["image"][..., :3])
+            assert np.array_equal(item["depth_m.npy"], sample.layers["depth_m"])
+            assert item["json"]["injected"] == dict(zip(data.spec.faults, sample.scalars["injected"], strict=True))
+            for k, fault in enumerate(data.spec.faults):
+                assert np.array_equal(item[f"mask.{fault}.png"][..., 0] == 255, sample.layers["mask"][k])
+            seen.append(i)
+    assert sorted(seen) == list(range(SAMPLES))
+
+
+def test_datasets_reads_the_parquet_files_with_their_features(
+    exported: Any, data: st.Store, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setenv("HF_DATASETS_OFFLINE", "1")
+    tool = reader("datasets")
+    tool.disable_progress_bars()
+    loaded = tool.load_dataset(str(exported("huggingface")), cache_dir=str(tmp_path))
+    assert set(loaded) == {"train", "val", "test"}
+    features = loaded["train"].features
+    assert isinstance(features["image"], tool.Image)
+    assert features["faults"].feature.names == list(data.spec.faults)
+    splits, seen = split_of(data), []
+    for split, table in loaded.items():
+        for row in table:
+            i = row["sample"]
+            sample = data.read_sample(i)
+            assert splits[i] == split
+            assert np.array_equal(np.asarray(row["image"]), sample.layers["image"][..., :3])
+            for k, fault in enumerate(data.spec.faults):
+                assert np.array_equal(np.asarray(row[f"mask_{fault}"]) == 255, sample.layers["mask"][k])
+            assert row["faults"] == np.flatnonzero(sample.scalars["injected"]).tolist()
+            assert row["camera_from_T"] == sample.scalars["camera_from_T"].tolist()
+            seen.append(i)
+    assert sorted(seen) == list(range(SAMPLES))
+
+
+def test_openexr_reads_radiance_by_wavelength_and_truth(exported: Any, data: st.Store) -> None:
+    openexr = importlib.import_module("OpenEXR")
+    splits = split_of(data)
+    for i in (0, SAMPLES - 1):
+        sample = data.read_sample(i)
+        with openexr.File(str(exported("exr") / splits[i] / f"{i:06d}.exr"), separate_channels=True) as file:
+            channels = {name: channel.pixels for name, channel in file.channels().items()}
+        for k, band in enumerate(sample.layers["radiance"]):
+            assert np.array_equal(channels[f"radiance.{data.spec.wavelength_nm[k]:.1f}nm"], band)
+        for k, name in enumerate("RGBI"):
+            dn = np.rint(channels[name].astype(np.float32) * 255)
+            assert np.array_equal(dn, sample.layers["image"][..., k])
+        assert np.array_equal(channels["depth.Z"], sample.layers["depth_m"])
+        assert np.array_equal(channels["normal.Y"], sample.layers["normal"][..., 1])
+        assert np.array_equal(channels["mask.straylight"] == 1, sample.layers["mask"][2])
+
+
+def test_a_new_format_is_one_class(described_store: Path, tmp_path: Path) -> None:
+    with registry.undoing_registrations(always=True):
+
+        class Means(Format):
+            name, summary, pattern = "means", "The mean of each image.", "*.txt"
+
+            def layers(self, spec: st.StoreSpec) -> tuple[str, ...]:
+                return ("image",)
+
+            def files(self, store: st.Store, part: Any, sample: Any) -> Any:
+                file = f"{sample.index}.txt"
+                return Entry(sample.index, file), [(file, str(sample.layers["image"].mean()).encode())]
+
+        export_store(described_store, tmp_path / "means", "means", progress=False)
+    assert len(list((tmp_path / "means").glob("*.txt"))) == SAMPLES
+    assert "means" not in formats()
+
+
+# --- interruptions and bad input ------------------------------------------------------------------------------
+
+
+def test_a_killed_export_resumes_to_the_same_files() -> None:
+    """Kill exports at drawn file operations, in forked processes of one other interpreter; see `export_kills`."""
+    script = Path(__file__).with_name("export_kills.py")
+    command = [sys.executable, str(script), "--count", "4", "--formats", "coco", "webdataset"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "4 kills, 0 failures" in done.stdout
+
+
+def test_a_full_disk_is_one_sentence_and_loses_nothing(
+    described_store: Path, exported: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    left, write = [12], os.write
+
+    def filling(file: int, content: Any) -> int:
+        left[0] -= 1
+        if left[0] < 0:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        return write(file, content)
+
+    out = tmp_path / "out"
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "write", filling)
+        with pytest.raises(
+            VbnfaultError, match=r"out: No space left on device while writing the export; .*resumes"
+        ):
+            export_store(described_store, out, "yolo", progress=False)
+    before = tree(out)
+    assert len(before) > 5
+    assert not [name for name in before if name.endswith(".partial")]
+    assert export_store(described_store, out, "yolo", progress=False).samples == SAMPLES
+    assert tree(out) == tree(exported("yolo"))
+
+
+def test_a_finished_part_is_not_written_again_unless_a_file_is_missing(
+    described_store: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+
+    class Stopping(formats()["png"]):  # type: ignore[misc]
+        name = ""
+
+        def finish(self, finished: Any) -> Any:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("vbnfault.output.export.run.formats", lambda: {"png": Stopping})
+        with pytest.raises(VbnfaultError):
+            export_store(described_store, out, "png", progress=False)
+    stamps = {path: path.stat().st_mtime_ns for path in out.glob("*/image/*.png")}
+    lost = sorted(stamps)[0]
+    lost.unlink()
+    summary = export_store(described_store, out, "png", progress=False)
+    assert lost.is_file()
+    same = [path for path, stamp in stamps.items() if path.exists() and path.stat().st_mtime_ns == stamp]
+    assert 0 < summary.written < summary.samples
+    assert len(same) == summary.samples - summary.written
+
+
+def test_what_a_kill_leaves_of_the_first_file_is_removed(
+    described_store: Path, exported: Any, tmp_path: Path
+) -> None:
+    (tmp_path / f"export.json.{'0' * 32}.partial").write_bytes(b"half")
+    assert export_store(described_store, tmp_path, "webdataset", progress=False).written == SAMPLES
+    assert tree(tmp_path) == tree(exported("webdataset"))
+
+
+def test_bad_input_is_one_sentence(described_store: Path, tmp_path: Path) -> None:
+    def refused(match: str, out: Path = tmp_path / "new", name: str = "png", **more: Any) -> None:
+        before = tree(tmp_path)
+        with pytest.raises(InputError, match=match):
+            export_store(more.pop("store", described_store), out, name, progress=False, **more)
+        assert tree(tmp_path) == before  # nothing is written, nothing lost
+
+    refused(r"--format 'pgn': there is no such format \(did you mean png\?\)", name="pgn")
+    refused(r"--workers 0: must be a whole number from 1 to 64", workers=0)
+    refused("lies in the store", out=described_store / "png")
+    refused("no such store", store=tmp_path / "none.zarr")
+    photos = tmp_path / "photos"
+    photos.mkdir()
+    (photos / "cat.png").write_bytes(b"cat")
+    (tmp_path / "downloads").mkdir()
+    (tmp_path / "downloads/film.partial").touch()
+    refused("downloads: holds something else", out=tmp_path / "downloads")
+    refused("photos: holds something else than an export of vbnfault, so it is left alone", out=photos)
+    (tmp_path / "file").touch()
+    refused("file: is a file, not a folder", out=tmp_path / "file")
+    half = filled(tmp_path / "half.zarr", samples=4)
+    half._write_done(0, {0, 2})
+    refused("half.zarr: 2 of 4 samples are finished", store=half.path)
+
+
+def test_another_store_or_format_does_not_mix_into_an_export(
+    described_store: Path, finished_store: Path, exported: Any, tmp_path: Path
+) -> None:
+    before = tree(exported("png"))
+    with pytest.raises(InputError, match="format is 'png' there and 'exr' now"):
+        export_store(described_store, exported("png"), "exr", progress=False)
+    with pytest.raises(InputError, match="holds another export: samples is 6 there and 10 now"):
+        export_store(finished_store, exported("png"), "png", progress=False)
+    other = st.open_store(shutil.copytree(described_store, tmp_path / "s.zarr"), "r+")
+    changed = other.read_sample(1)
+    st.write_samples(other, [replace(changed, layers={**changed.layers, "image": changed.layers["clean"]})])
+    with pytest.raises(InputError, match="holds another export: contents_sha256"):
+        export_store(other, exported("png"), "png", progress=False)
+    assert tree(exported("png")) == before
+
+
+def test_a_damaged_sample_ends_an_export_until_it_is_repaired(finished_store: Path, tmp_path: Path) -> None:
+    copy = Path(shutil.copytree(finished_store, tmp_path / "s.zarr"))
+    file = st.open_store(copy).file("mask", 1)
+    good = file.read_bytes()
+    file.write_bytes(good[:40] + bytes([good[40] ^ 1]) + good[41:])
+    with pytest.raises(VbnfaultError, match="build command repairs it"):
+        export_store(copy, tmp_path / "out", "coco", progress=False)
+    file.write_bytes(good)
+    assert export_store(copy, tmp_path / "out", "coco", progress=False).samples == 10

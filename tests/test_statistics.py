@@ -1,0 +1,149 @@
+"""Statistics and card of a store: counts as brute force has them, a card that changes no digest."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import sys
+import warnings
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from vbnfault import cli, dataset
+from vbnfault import store as st
+from vbnfault.dataset import card, from_scene
+from vbnfault.dataset.build import BuildOptions
+from vbnfault.dataset.identity import stored_plan
+from vbnfault.dataset.statistics import statistics
+
+
+@pytest.fixture(scope="module")
+def data(described_store: Path) -> Any:
+    """Return the store, which no test changes."""
+    return st.open_store(described_store)
+
+
+@pytest.fixture
+def copy(described_store: Path, tmp_path: Path) -> Path:
+    """Return a copy of the store."""
+    return Path(shutil.copytree(described_store, tmp_path / "s.zarr"))
+
+
+def test_statistics_are_those_of_the_arrays(data: st.Store) -> None:
+    numbers = statistics(data).plain()
+    injected, split = data.read("injected").astype(int), np.array([str(s) for s in data.read("split")])
+    planned = stored_plan(data.attributes, data.spec.faults)[1].injected
+    assert numbers["samples"] == numbers["finished"] == len(injected) == sum(numbers["splits"].values())
+    for k, fault in enumerate(data.spec.faults):
+        counts = numbers["faults"][fault]
+        assert (counts["planned"], counts["realised"]) == (planned[:, k].sum(), injected[:, k].sum())
+        for name in ("train", "val", "test"):
+            assert counts["by_split"][name]["realised"] == injected[split == name, k].sum()
+        for j, other in enumerate(data.spec.faults):
+            assert numbers["co_occurrence"][fault][other] == (injected[:, k] & injected[:, j]).sum()
+    per_sample = np.bincount(injected.sum(axis=1))
+    assert numbers["faults_per_sample"] == {str(n): int(c) for n, c in enumerate(per_sample) if c}
+    assert numbers["ranges"]["exposure_s"]["all"] == {
+        "count": 6,
+        "min": 0.01,
+        "mean": pytest.approx(0.035, rel=1e-12),
+        "max": 0.06,
+    }
+    val = np.flatnonzero(split == "val")
+    assert numbers["ranges"]["exposure_s"]["val"]["min"] == 0.01 * (val[0] + 1)
+    fault = data.spec.faults[0]
+    with_fault = np.flatnonzero(injected[:, 0])
+    assert numbers["parameters"][fault]["x"]["max"] == with_fault[-1] + 0.5
+    assert numbers["parameters"][fault]["x"]["count"] == 2 * len(with_fault)
+    assert numbers["parameters"][fault]["model"] == {"values": {"made_up": len(with_fault)}}
+    assert numbers["bounds"]["dust_on_optics"]["count"] == [30, 100]
+
+
+def test_statistics_of_a_store_whose_plan_is_unknown(finished_store: Path) -> None:
+    numbers = statistics(finished_store)
+    assert not numbers.has_plan
+    assert numbers.plain()["faults"]["straylight"]["planned"] is None
+    assert any("plan is not known" in line for line in numbers.lines())
+
+
+def test_a_card_changes_neither_digest_nor_check_and_xarray_reads_as_before(copy: Path) -> None:
+    before, found = st.digest(copy), st.verify(copy)
+    with st.open_dataset(copy) as dataset_before:
+        arrays = {name: dataset_before[name].values for name in ("image", "mask", "parameters")}
+    first = [path.read_bytes() for path in card.write_card(copy)]
+    assert [path.read_bytes() for path in card.write_card(copy)] == first  # no date, no order
+    assert st.digest(copy) == before
+    assert st.verify(copy) == found
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        with st.open_dataset(copy) as after:
+            for name, values in arrays.items():
+                assert np.array_equal(after[name].values, values)
+    store = st.recover(copy)
+    assert card.has_card(store)
+    text = (copy / "README.md").read_text()
+    for part in ("CC0-1.0", "A test", "| `mask` | sample, fault, y, x | bool |", "| camera.width_px | 40 | set |"):
+        assert part in text
+
+
+@pytest.mark.filterwarnings("ignore:ConjunctiveGraph is deprecated:DeprecationWarning")
+def test_mlcroissant_accepts_the_description_of_a_store(copy: Path, data: st.Store) -> None:
+    croissant = pytest.importorskip("mlcroissant", reason="mlcroissant is in the extra `readers`")
+    card.write_card(copy)
+    described = croissant.Dataset(str(copy / "croissant.json"))
+    assert described.metadata.issues.errors == set()
+    assert {row["arrays/name"] for row in described.records("arrays")} == set(data.spec.arrays)
+    assert [row["fault_classes/name"] for row in described.records("fault_classes")] == list(data.spec.faults)
+
+
+def test_a_build_writes_the_card_once(copy: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A build that makes nothing leaves a card alone; one that makes samples, or finds none, writes it."""
+    made, written = [0], []
+
+    class Summary:
+        @property
+        def built(self) -> int:
+            return made[0]
+
+    monkeypatch.setattr(from_scene.build, "build", lambda *_: Summary())
+    monkeypatch.setattr(from_scene.build, "planned_blocks", lambda *_, **__: (6,))
+    monkeypatch.setattr(from_scene, "_prepared", lambda *_: (None, None, []))
+    monkeypatch.setattr(from_scene.dataclasses, "replace", lambda thing, **_: thing)
+    monkeypatch.setattr(from_scene.llvm, "find", lambda: None)
+    write = card.write_card
+    monkeypatch.setattr(card, "write_card", lambda path: written.append(write(path)))
+    for built, cards in ((0, 1), (0, 1), (3, 2)):
+        made[0] = built
+        dataset.build_scene("quickstart", copy, BuildOptions())
+        assert len(written) == cards
+
+
+def run(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
+    """Run a command in this process and return its exit code."""
+    monkeypatch.setattr(sys, "argv", ["vbnfault", *map(str, arguments)])
+    try:
+        cli.main()
+    except SystemExit as stop:
+        return int(stop.code or 0)
+    return 0
+
+
+def test_the_commands(copy: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(monkeypatch, "stats", copy) == 0
+    text = capsys.readouterr().out
+    for title in ("planned", "two classes occur together", "exposure_s", "drawn parameters", "samples by stratum"):
+        assert title in text
+    assert run(monkeypatch, "stats", copy, "--json") == 0
+    assert json.loads(capsys.readouterr().out)["samples"] == 6
+    assert run(monkeypatch, "card", copy) == 0
+    assert capsys.readouterr().out.split() == [str(copy / "README.md"), str(copy / "croissant.json")]
+    out = copy.with_name("out")
+    assert run(monkeypatch, "export", copy, "--format", "yolo", "--out", out, "--workers", 1) == 0
+    assert capsys.readouterr().out == f"{out}: 6 samples as yolo\n"
+    assert run(monkeypatch, "export", copy, "--format", "voc", "--out", out) == 2
+    assert "--format 'voc': there is no such format" in capsys.readouterr().err
+    assert run(monkeypatch, "stats", copy.with_name("none")) == 2
+    assert "no such store" in capsys.readouterr().err

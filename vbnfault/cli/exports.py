@@ -1,0 +1,56 @@
+"""Define the commands that describe a store and write it in the formats of other tools."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from .app import app
+from .options import StoreArgument, whole
+
+_PANEL = "Datasets"
+
+
+@app.command(rich_help_panel=_PANEL)
+def export(
+    store: StoreArgument,
+    format: Annotated[
+        str,
+        typer.Option(metavar="FORMAT", help="One of coco, exr, huggingface, png, webdataset and yolo."),
+    ],
+    out: Annotated[Path, typer.Option(help="Folder for the files; an interrupted export in it is resumed.")],
+    workers: Annotated[int, whole(1, 64, "Number of threads; the files do not depend on it.")] = 2,
+) -> None:
+    """Write a finished store in the format of other tools, with its splits, classes and a card."""
+    from ..output.export import export_store
+
+    for line in export_store(store, out, format, workers=workers).lines():
+        typer.echo(line)
+
+
+@app.command(rich_help_panel=_PANEL)
+def stats(
+    store: StoreArgument,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of tables.")] = False,
+) -> None:
+    """Print planned and realised statistics: classes by split, co-occurrence, exposure, ranges of parameters."""
+    from ..dataset.statistics import statistics
+
+    numbers = statistics(store)
+    if as_json:
+        typer.echo(json.dumps(numbers.plain(), indent=2, allow_nan=False))
+        return
+    for line in numbers.lines():
+        typer.echo(line)
+
+
+@app.command(rich_help_panel=_PANEL)
+def card(store: StoreArgument) -> None:
+    """Write the card (README.md) and the Croissant description of a store into it, as a build does at its end."""
+    from ..dataset.card import write_card
+
+    for path in write_card(store):
+        typer.echo(str(path))

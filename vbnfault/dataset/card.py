@@ -1,0 +1,202 @@
+"""Write the description of a dataset: `README.md`, the card for people, and `croissant.json`, for programs.
+
+Both lie in the store beside its arrays. They follow from the store, hold no date and belong to no digest; `verify`
+does not read them.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from .. import store as stores
+from ..faults import registry
+from ..scene import config
+from ..scene.bodies import named_body
+from ..store import Store, disk
+from .croissant import store_croissant
+from .statistics import Statistics, statistics
+
+README = "README.md"
+CROISSANT = "croissant.json"
+_LONGEST_VALUE = 80
+_SOFTWARE = "vbnfault, physically based, labelled, fault-injected camera images (CITATION.cff of the project)"
+_PAPER = (
+    "R. Gallon, F. Schiemenz, A. Menicucci, E. Gill: Addressing Camera Sensors Faults in Vision-Based Navigation: "
+    "Simulation and Dataset Development"
+)
+
+
+def write_card(path: str | os.PathLike[str] | Store) -> list[Path]:
+    """Write the card and the Croissant description into a store and return their paths.
+
+    Raises
+    ------
+    InputError
+        If there is no store at `path`.
+    VbnfaultError
+        If scalars cannot be read or the files cannot be written.
+    """
+    store = stores.open_store(path)
+    numbers = statistics(store)
+    files = {README: card(store, numbers), CROISSANT: to_json(store_croissant(store))}
+    with disk.explained(store.path, "writing the card"):
+        disk.write(store.path, ((name, text.encode()) for name, text in files.items()))
+    return [store.path / name for name in files]
+
+
+def has_card(store: Store) -> bool:
+    """Return whether a store holds its card and its Croissant description."""
+    return all((store.path / name).is_file() for name in (README, CROISSANT))
+
+
+def to_json(document: Mapping[str, Any]) -> str:
+    """Return a document as the text of a JSON file."""
+    return json.dumps(document, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+
+
+def card(store: Store, numbers: Statistics) -> str:
+    """Return the card of a store as Markdown, which says how to read the store."""
+    return "\n".join([*_head(store), "", *_reading(), "", *_arrays(store), "", *described(store, numbers)]) + "\n"
+
+
+def _head(store: Store) -> list[str]:
+    """Return title, description and size of the dataset."""
+    attributes, spec = store.attributes, store.spec
+    return [
+        f"# {attributes.get('title') or 'untitled dataset'}",
+        "",
+        *([str(attributes["description"]), ""] if attributes.get("description") else []),
+        "Labelled, fault-injected camera images for vision-based navigation near comets and other small bodies, "
+        f"made by vbnfault: {store.samples} samples of {spec.width} x {spec.height} px with the fault classes "
+        f"{', '.join(spec.faults) or '(none)'}.",
+    ]
+
+
+def _reading() -> list[str]:
+    """Return how to read a store."""
+    return [
+        "This folder is one Zarr v3 group. It opens in any Zarr reader:",
+        "",
+        "```python",
+        "import xarray",
+        "",
+        'data = xarray.open_zarr("PATH_OF_THIS_FOLDER")',
+        "```",
+        "",
+        "`vbnfault verify` checks it, `vbnfault stats` prints its statistics, `vbnfault export` "
+        "writes other formats.",
+    ]
+
+
+def _arrays(store: Store) -> list[str]:
+    """Return the table of the arrays of a store."""
+    rows = [["array", "dimensions", "dtype", "unit", "meaning"]]
+    rows += [
+        [f"`{name}`", ", ".join(row.dims), row.dtype, row.units, row.long_name]
+        for name, row in store.spec.arrays.items()
+    ]
+    return ["## Arrays", "", *markdown_table(rows)]
+
+
+def described(store: Store, numbers: Statistics) -> list[str]:
+    """Return what the cards of a store and of its exports share, as lines of Markdown."""
+    attributes = store.attributes
+    lines = ["## Licence and citation", ""]
+    lines += [f"- Licence of the data: {attributes.get('licence') or 'not stated'}"]
+    lines += [f"- Cite the dataset as: {attributes.get('citation') or 'not stated'}"]
+    lines += [f"- Software: {_SOFTWARE}", f"- Fault classes, masks and the paper's fault models: {_PAPER}", ""]
+    lines += ["## Fault classes", "", *markdown_table(_classes(store)), ""]
+    lines += ["## Statistics, planned and realised", "", "```text", *numbers.lines(), "```", ""]
+    lines += [
+        "## Provenance",
+        "",
+        "Every parameter of the scene, and where its value comes from. `default`: the default of "
+        "vbnfault. `set`: the "
+        "scene file or its command sets it. Pairs of faults are bounds; each sample's drawn values "
+        "are in the array "
+        "`parameters`. A value `sha256:...` is the digest of the contents of a file.",
+        "",
+        *markdown_table([["parameter", "value", "from"], *_provenance(attributes)]),
+        "",
+    ]
+    sources = attributes.get("detector", {}).get("sensor", {}).get("sources", {})
+    if sources:
+        rows = [["value of the sensor", "source"], *([key, str(text)] for key, text in sources.items())]
+        lines += ["Sources of the sensor's values:", "", *markdown_table(rows), ""]
+    optics = attributes.get("optics", {}).get("summary")
+    if optics:
+        lines += [f"Lens: {optics}", ""]
+    lines += ["## Versions", "", *markdown_table([["component", "version"], *_versions(store)])]
+    return lines
+
+
+def _classes(store: Store) -> list[list[str]]:
+    """Return the rows of the table of fault classes."""
+    spec, models = store.spec, store.attributes.get("fault_models", {})
+    rows = [["index", "class", "model", "localised", "mask", "rule of the mask"]]
+    for k, fault in enumerate(spec.faults):
+        kind = spec.mask_kinds[k] if spec.mask_kinds else ""
+        rule = spec.mask_rules[k] if spec.mask_rules else ""
+        local = "yes" if fault in (spec.localised_faults or ()) else "no"
+        rows.append([str(k), fault, str(models.get(fault, "")), local, kind, rule])
+    return rows
+
+
+def _versions(store: Store) -> list[list[str]]:
+    """Return name and version of everything that affects pixels, and what identifies the data."""
+    attributes = store.attributes
+    rows = [[name, str(version)] for name, version in attributes.get("versions", {}).items()]
+    rows += [["format of the store", str(store.root_attributes.get("format_version"))]]
+    rows += [[key, str(attributes[key])] for key in ("seed", "scene_hash", "blocks") if key in attributes]
+    if "versions_of_samples" in attributes:
+        rows.append(["samples of other versions", "see the root attribute versions_of_samples"])
+    return rows
+
+
+def markdown_table(rows: Sequence[Sequence[str]]) -> list[str]:
+    """Return rows, the first of which is the head, as a Markdown table."""
+    lines = ["| " + " | ".join(" ".join(cell.replace("|", " ").split()) for cell in row) + " |" for row in rows]
+    return [lines[0], "|" + "---|" * len(rows[0]), *lines[1:]]
+
+
+# --- provenance ---------------------------------------------------------------------------------------------
+
+
+def _provenance(attributes: Mapping[str, Any]) -> Iterator[list[str]]:
+    """Yield parameter, value and origin of every value of the stored scene."""
+    scene = attributes.get("scene", {})
+    defaults = _flat(config.parse_scene({"title": "defaults"}, source="defaults").resolved())
+    body = scene.get("body", {})
+    packaged = named_body(str(body.get("name", ""))) if isinstance(body, Mapping) else None
+    of_body = {f"body.{key}": value for key, value in _flat(packaged.body).items()} if packaged else {}
+    for fault, table in scene.get("faults", {}).items() if isinstance(scene.get("faults"), Mapping) else ():
+        cls = registry().get(fault, {}).get(table.get("model"))
+        if cls is not None:
+            defaults |= {f"faults.{fault}.{key}": value for key, value in _flat(cls().to_dict()).items()}
+    for key, value in _flat(scene).items():
+        if key.endswith("sha256"):
+            origin = "contents of the files"
+        elif key in of_body and json.dumps(of_body[key]) == json.dumps(value):
+            origin = f"packaged table of {packaged.name if packaged else ''}"
+        elif key in defaults and json.dumps(defaults[key]) == json.dumps(value):
+            origin = "default"
+        else:
+            origin = "set"
+        text = json.dumps(value, ensure_ascii=False)
+        yield [key, text if len(text) <= _LONGEST_VALUE else f"{text[: _LONGEST_VALUE - 3]}...", origin]
+
+
+def _flat(table: Mapping[str, Any], above: str = "") -> dict[str, Any]:
+    """Return the values of nested tables by dotted key."""
+    flat: dict[str, Any] = {}
+    for key, value in table.items():
+        name = f"{above}.{key}" if above else str(key)
+        if isinstance(value, Mapping) and value:
+            flat |= _flat(value, name)
+        else:
+            flat[name] = value
+    return flat

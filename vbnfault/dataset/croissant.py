@@ -1,0 +1,144 @@
+"""Describe a dataset in Croissant 1.0 "
+"(https://docs.mlcommons.org/croissant/docs/croissant-spec.html), as JSON-LD."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from ..store import SPLITS, Store
+
+_URL = "https://pypi.org/project/vbnfault/"
+_CONTEXT = {
+    "@language": "en",
+    "@vocab": "https://schema.org/",
+    "citeAs": "cr:citeAs",
+    "column": "cr:column",
+    "conformsTo": "dct:conformsTo",
+    "cr": "http://mlcommons.org/croissant/",
+    "rai": "http://mlcommons.org/croissant/RAI/",
+    "data": {"@id": "cr:data", "@type": "@json"},
+    "dataType": {"@id": "cr:dataType", "@type": "@vocab"},
+    "dct": "http://purl.org/dc/terms/",
+    "equivalentProperty": "cr:equivalentProperty",
+    "examples": {"@id": "cr:examples", "@type": "@json"},
+    "extract": "cr:extract",
+    "field": "cr:field",
+    "fileProperty": "cr:fileProperty",
+    "fileObject": "cr:fileObject",
+    "fileSet": "cr:fileSet",
+    "format": "cr:format",
+    "includes": "cr:includes",
+    "isLiveDataset": "cr:isLiveDataset",
+    "jsonPath": "cr:jsonPath",
+    "key": "cr:key",
+    "md5": "cr:md5",
+    "parentField": "cr:parentField",
+    "path": "cr:path",
+    "recordSet": "cr:recordSet",
+    "references": "cr:references",
+    "regex": "cr:regex",
+    "repeated": "cr:repeated",
+    "replace": "cr:replace",
+    "samplingRate": "cr:samplingRate",
+    "sc": "https://schema.org/",
+    "separator": "cr:separator",
+    "source": "cr:source",
+    "subField": "cr:subField",
+    "transform": "cr:transform",
+}
+_TEXT, _WHOLE, _NUMBER = "sc:Text", "sc:Integer", "sc:Float"
+
+
+def store_croissant(store: Store) -> dict[str, Any]:
+    """Return the Croissant description of a store: its files, fault classes, splits and arrays."""
+    spec = store.spec
+    files = [
+        {
+            "@type": "cr:FileSet",
+            "@id": "zarr",
+            "name": "zarr",
+            "description": "The files of one Zarr v3 group; read the folder with zarr or xarray.",
+            "encodingFormat": "application/vnd.zarr",
+            "includes": "**/c/**",
+        }
+    ]
+    arrays = [
+        {"name": n, "dimensions": " ".join(a.dims), "dtype": a.dtype, "units": a.units, "meaning": a.long_name}
+        for n, a in spec.arrays.items()
+    ]
+    return croissant(store, files, [inline("arrays", "Arrays of the Zarr group", arrays)])
+
+
+def croissant(store: Store, files: Sequence[Any], records: Sequence[Any]) -> dict[str, Any]:
+    """Return the Croissant description of a store or of one of its exports.
+
+    `files`: the entries of `distribution`. `records`: sets of records besides the fault classes and the splits.
+    """
+    attributes, spec = store.attributes, store.spec
+    title = str(attributes.get("title") or "untitled")
+    classes = [
+        {"index": k, "name": fault, "rule": spec.mask_rules[k] if spec.mask_rules else ""}
+        for k, fault in enumerate(spec.faults)
+    ]
+    shared = [inline("splits", "Splits; no site is in two of them", [{"name": name} for name in SPLITS])]
+    if classes:
+        shared.append(inline("fault_classes", "Fault classes in the order of the fault axis", classes))
+    # Croissant requires a citation, a URL and a version with three numbers
+    return {
+        "@context": _CONTEXT,
+        "@type": "sc:Dataset",
+        "conformsTo": "http://mlcommons.org/croissant/1.0",
+        "name": re.sub(r"[^A-Za-z0-9_-]+", "_", title),
+        "description": str(attributes.get("description") or f"Fault-injected camera images: {title}"),
+        "license": str(attributes.get("licence") or "not stated"),
+        "citeAs": str(attributes.get("citation") or f"{title}, made with vbnfault"),
+        "url": _URL,
+        "version": f"{store.root_attributes.get('format_version', 0)}.0.0",
+        "keywords": ["camera faults", "vision-based navigation", "comet", "segmentation", *spec.faults],
+        "creator": {"@type": "sc:Organization", "name": "vbnfault", "url": _URL},
+        "distribution": list(files),
+        "recordSet": [*shared, *records],
+    }
+
+
+def inline(name: str, description: str, rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Return a set of records whose values stand in the description itself."""
+    fields = [
+        {"@type": "cr:Field", "@id": f"{name}/{key}", "name": key, "description": key, "dataType": _type_of(value)}
+        for key, value in rows[0].items()
+    ]
+    data = [{f"{name}/{key}": value for key, value in row.items()} for row in rows]
+    return {
+        "@type": "cr:RecordSet",
+        "@id": name,
+        "name": name,
+        "description": description,
+        "field": fields,
+        "data": data,
+    }
+
+
+def columns(name: str, description: str, file: str, rows: Mapping[str, tuple[str, Any]]) -> dict[str, Any]:
+    """Return a set of records that are the rows of a table in a file.
+
+    `file`: the `@id` of the file object. `rows`: by column, its meaning and an example.
+    """
+    fields = [
+        {
+            "@type": "cr:Field",
+            "@id": f"{name}/{key}",
+            "name": key,
+            "description": meaning,
+            "dataType": _type_of(example),
+            "source": {"fileObject": {"@id": file}, "extract": {"column": key}},
+        }
+        for key, (meaning, example) in rows.items()
+    ]
+    return {"@type": "cr:RecordSet", "@id": name, "name": name, "description": description, "field": fields}
+
+
+def _type_of(value: Any) -> str:
+    """Return Croissant's type of a value."""
+    return _WHOLE if type(value) is int else _NUMBER if type(value) is float else _TEXT

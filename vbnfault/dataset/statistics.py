@@ -1,0 +1,334 @@
+"""Compute the planned and realised statistics of a store: counts, co-occurrence, exposure, ranges of parameters.
+
+Only scalars are read, a shard at a time, so a store of any size fits in memory.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .. import store as stores
+from ..core.errors import VbnfaultError
+from ..store import SPLITS, STRATA, FaultCounts, Store
+from .identity import stored_plan
+
+# scalars of one number a sample whose ranges are reported
+_RANGED = (
+    "exposure_s",
+    "sun_elevation_deg",
+    "sun_azimuth_deg",
+    "sun_distance_au",
+    "sun_visible_fraction",
+    "roll_deg",
+    "pitch_deg",
+    "yaw_deg",
+    "tries",
+    "views",
+    "samples_per_pixel",
+    "noise_fraction_p99",
+)
+_READ = ("injected", "split", "stratum", "site", "parameters", *_RANGED)
+_MOST_WORDS = 12  # different texts of a parameter that are counted
+
+
+@dataclass
+class Range:
+    """Hold how many finite numbers there were, the least, the mean and the greatest of them."""
+
+    count: int = 0
+    low: float = math.inf
+    high: float = -math.inf
+    total: float = 0.0
+
+    def add(self, values: NDArray[np.float64]) -> None:
+        """Add the finite ones of some numbers."""
+        finite = values[np.isfinite(values)]
+        if finite.size:
+            self.count += finite.size
+            self.low, self.high = min(self.low, float(finite.min())), max(self.high, float(finite.max()))
+            self.total += float(finite.sum())
+
+    def plain(self) -> dict[str, Any]:
+        """Return the range as JSON-able data; `min`, `mean` and `max` are None without a number."""
+        if not self.count:
+            return {"count": 0, "min": None, "mean": None, "max": None}
+        return {"count": self.count, "min": self.low, "mean": self.total / self.count, "max": self.high}
+
+
+@dataclass
+class _Parameter:
+    """Hold the drawn values of one parameter: the range of its numbers, and how often it has each text."""
+
+    numbers: Range = field(default_factory=Range)
+    words: Counter[str] = field(default_factory=Counter)
+
+    def plain(self) -> dict[str, Any]:
+        """Return the values as JSON-able data."""
+        if self.words:
+            return {"values": dict(sorted(self.words.items())[:_MOST_WORDS])}
+        return self.numbers.plain()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Statistics:
+    """Describe the finished samples of a store, and what was planned for them.
+
+    Attributes
+    ----------
+    samples, finished
+        Numbers of samples of the store and of those that are finished. Everything else is over the finished ones.
+    counts
+        How often each class is planned, and how often it is in the pixels, by split.
+    has_plan
+        Whether the plan could be computed from the scene in the store.
+    together
+        Co-occurrence, int[fault, fault]: the samples in which both classes are; the diagonal counts each class.
+    faults_per_sample
+        Number of samples by number of injected faults.
+    strata, sites
+        Number of samples by stratum, and number of different sites by split.
+    ranges
+        Range of each scalar, over all samples (`all`) and by split.
+    parameters
+        By class and parameter, the range of the drawn numbers or the count of each text.
+    bounds
+        By class and parameter, the bounds in the scene from which it was drawn.
+    """
+
+    samples: int
+    finished: int
+    counts: FaultCounts
+    has_plan: bool
+    together: NDArray[np.int64]
+    faults_per_sample: Mapping[int, int]
+    strata: Mapping[str, int]
+    sites: Mapping[str, int]
+    ranges: Mapping[str, Mapping[str, Range]]
+    parameters: Mapping[str, Mapping[str, _Parameter]]
+    bounds: Mapping[str, Mapping[str, tuple[float, float]]]
+
+    @property
+    def splits(self) -> list[str]:
+        """Return the splits that have samples, in their usual order."""
+        known = [name for name in SPLITS if name in self.counts.samples]
+        return [*known, *sorted(set(self.counts.samples) - set(known))]
+
+    def plain(self) -> dict[str, Any]:
+        """Return the statistics as JSON-able data."""
+        faults, counts = self.counts.faults, self.counts
+        return {
+            "samples": self.samples,
+            "finished": self.finished,
+            "splits": {name: counts.samples[name] for name in self.splits},
+            "sites": dict(self.sites),
+            "strata": dict(self.strata),
+            "faults": {
+                fault: {
+                    "planned": counts.planned(fault) if self.has_plan else None,
+                    "realised": counts.realised(fault),
+                    "by_split": {
+                        split: {
+                            "planned": counts.planned(fault, split) if self.has_plan else None,
+                            "realised": counts.realised(fault, split),
+                        }
+                        for split in self.splits
+                    },
+                }
+                for fault in faults
+            },
+            "faults_per_sample": {str(n): count for n, count in sorted(self.faults_per_sample.items())},
+            "co_occurrence": {
+                fault: dict(zip(faults, row.tolist(), strict=True))
+                for fault, row in zip(faults, self.together, strict=True)
+            },
+            "ranges": {n: {of: r.plain() for of, r in ranges.items()} for n, ranges in self.ranges.items()},
+            "parameters": {
+                fault: {name: values.plain() for name, values in sorted(parameters.items())}
+                for fault, parameters in self.parameters.items()
+            },
+            "bounds": {f: {key: list(pair) for key, pair in keys.items()} for f, keys in self.bounds.items()},
+        }
+
+    def lines(self) -> list[str]:
+        """Return the statistics as lines of text: one table for each kind."""
+        text = [f"{self.finished} of {self.samples} samples are finished"]
+        text += ["", *self.counts.lines()]
+        if not self.has_plan:
+            text.append("the plan is not known, because the scene in the store cannot be planned here")
+        for title, table in self.tables():
+            text += ["", title, *aligned(table)]
+        return text
+
+    def tables(self) -> Iterator[tuple[str, list[list[str]]]]:
+        """Yield title and rows of each table except that of the counts; the first row of each is its head."""
+        faults = self.counts.faults
+        yield "samples by stratum", [["stratum", "samples"], *([k, str(v)] for k, v in self.strata.items())]
+        yield (
+            "samples by number of faults",
+            [["faults", "samples"], *([str(k), str(v)] for k, v in sorted(self.faults_per_sample.items()))],
+        )
+        if faults:
+            rows = [[f, *map(str, row.tolist())] for f, row in zip(faults, self.together, strict=True)]
+            yield "samples in which two classes occur together", [["fault", *faults], *rows]
+        head = ["min", "mean", "max"]
+        rows = [
+            [name, of, *_numbers(one)]
+            for name, ranges in self.ranges.items()
+            for of, one in ranges.items()
+            if one.count and (of == "all" or name == "exposure_s")
+        ]
+        yield "scalars of the samples", [["scalar", "split", *head], *rows]
+        rows = [
+            [fault, name, *_described(values), self._bounds(fault, name)]
+            for fault, parameters in self.parameters.items()
+            for name, values in sorted(parameters.items())
+        ]
+        if rows:
+            yield "drawn parameters of the faults", [["fault", "parameter", "values", *head, "bounds"], *rows]
+
+    def _bounds(self, fault: str, name: str) -> str:
+        """Return the bounds that the scene gives for a parameter as text, "" if it gives none of this name."""
+        low_high = self.bounds.get(fault, {}).get(name.rpartition(".")[2])
+        return f"{low_high[0]:g} to {low_high[1]:g}" if low_high else ""
+
+
+def _numbers(one: Range) -> list[str]:
+    """Return least, mean and greatest as text."""
+    return [f"{one.low:.4g}", f"{one.total / one.count:.4g}", f"{one.high:.4g}"]
+
+
+def _described(values: _Parameter) -> list[str]:
+    """Return number of values, least, mean and greatest of a parameter as text, or the count of each text."""
+    if values.words:
+        common = ", ".join(f"{word} {count}" for word, count in sorted(values.words.items())[:_MOST_WORDS])
+        return [common, "", "", ""]
+    return [str(values.numbers.count), *(_numbers(values.numbers) if values.numbers.count else ("", "", ""))]
+
+
+def aligned(table: list[list[str]]) -> list[str]:
+    """Return the rows of a table as lines with aligned columns: those of numbers to the right, "
+    "others to the left."""
+    columns = list(zip(*table, strict=True))
+    adjusted = []
+    for column in columns:
+        width = max(map(len, column))
+        is_text = any(cell[:1].isalpha() for cell in column[1:])
+        adjusted.append([cell.ljust(width) if is_text else cell.rjust(width) for cell in column])
+    return ["  ".join(row).rstrip() for row in zip(*adjusted, strict=True)]
+
+
+def statistics(path: str | os.PathLike[str] | Store) -> Statistics:
+    """Return the planned and realised statistics of the finished samples of a store.
+
+    Raises
+    ------
+    InputError
+        If there is no store at `path`.
+    VbnfaultError
+        If scalars of finished samples cannot be read.
+    """
+    store = stores.open_store(path)
+    commanded, faults = _commanded(store), store.spec.faults
+    counts = FaultCounts(faults)
+    together = np.zeros((len(faults), len(faults)), dtype=np.int64)
+    per_sample: Counter[int] = Counter()
+    strata: Counter[str] = Counter()
+    sites: dict[str, set[int]] = {}
+    ranges: dict[str, dict[str, Range]] = {name: {} for name in _RANGED}
+    parameters: dict[str, dict[str, _Parameter]] = {fault: {} for fault in faults}
+    for samples, columns in _shards(store):
+        injected = columns["injected"].astype(np.int64).reshape(len(samples), len(faults))
+        together += injected.T @ injected
+        per_sample.update(injected.sum(axis=1).tolist())
+        strata.update(STRATA[k] for k in columns["stratum"].tolist())
+        split = [str(name) for name in columns["split"]]
+        for k, i in enumerate(samples):
+            counts.add(split[k], None if commanded is None else commanded[i], injected[k])
+            sites.setdefault(split[k], set()).add(int(columns["site"][k]))
+            for fault, drawn in json.loads(columns["parameters"][k] or "{}").items():
+                _add_parameters(parameters.setdefault(fault, {}), drawn)
+        for name in _RANGED:
+            for of in ("all", *dict.fromkeys(split)):
+                chosen = np.array([of in ("all", s) for s in split])
+                ranges[name].setdefault(of, Range()).add(columns[name][chosen].astype(np.float64))
+    return Statistics(
+        samples=store.samples,
+        finished=counts.samples.total(),
+        counts=counts,
+        has_plan=commanded is not None,
+        together=together,
+        faults_per_sample=dict(per_sample),
+        strata={name: strata[name] for name in STRATA if strata[name]},
+        sites={name: len(found) for name, found in sorted(sites.items())},
+        ranges=ranges,
+        parameters={fault: values for fault, values in parameters.items() if values},
+        bounds=_bounds(store),
+    )
+
+
+def _bounds(store: Store) -> dict[str, dict[str, tuple[float, float]]]:
+    """Return by class and key the pairs of numbers in the faults of the stored scene."""
+    tables = store.spec.attributes.get("scene", {}).get("faults", {})
+    return {
+        fault: {
+            key: (value[0], value[1])
+            for key, value in table.items()
+            if isinstance(value, list) and len(value) == 2 and all(type(v) in (int, float) for v in value)
+        }
+        for fault, table in tables.items()
+    }
+
+
+def _commanded(store: Store) -> NDArray[np.bool_] | None:
+    """Return the commanded faults bool[sample, fault], or None if the stored scene cannot be planned here."""
+    attributes = store.spec.attributes
+    try:
+        return stored_plan(attributes, store.spec.faults)[1].injected
+    except (VbnfaultError, KeyError):  # a scene of another program or of a plug-in that is not loaded
+        return None
+
+
+def _shards(store: Store) -> Iterator[tuple[list[int], dict[str, NDArray[Any]]]]:
+    """Yield for each shard its finished samples and their scalars by name."""
+    for number in store.begun():
+        finished = [i for i, done in store.done(number).items() if done]
+        if not finished:
+            continue
+        chosen = [i - store.shard(number).start for i in finished]
+        try:
+            columns = {name: store.column(name, number)[chosen] for name in _READ}
+        except (OSError, ValueError) as error:
+            raise VbnfaultError(
+                f"{store.path}: the scalars of samples {finished[0]}-{finished[-1]} cannot be read ({error}); "
+                "the build command repairs them"
+            ) from error
+        yield finished, columns
+
+
+def _add_parameters(known: dict[str, _Parameter], drawn: Any, name: str = "") -> None:
+    """Add the drawn parameters of one fault; entries of lists count as values of the list's name."""
+    if isinstance(drawn, Mapping):
+        for key, value in drawn.items():
+            _add_parameters(known, value, f"{name}.{key}" if name else str(key))
+    elif isinstance(drawn, list):
+        if drawn and all(type(value) in (int, float) for value in drawn):
+            known.setdefault(name, _Parameter()).numbers.add(np.asarray(drawn, dtype=np.float64))
+        else:
+            for value in drawn:
+                _add_parameters(known, value, name)
+    elif isinstance(drawn, str | bool):
+        words = known.setdefault(name, _Parameter()).words
+        word = str(drawn).lower() if isinstance(drawn, bool) else drawn
+        if word in words or len(words) < _MOST_WORDS:
+            words[word] += 1
+    elif drawn is not None:
+        known.setdefault(name, _Parameter()).numbers.add(np.array([drawn], dtype=np.float64))

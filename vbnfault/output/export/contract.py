@@ -1,0 +1,147 @@
+"""Define what a format of an export provides, and the registry of formats."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Collection, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import Any, ClassVar, NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ...core.errors import VbnfaultError
+from ...core.quantities import Sample
+from ...core.registry import Registry, is_name
+from ...store import Store, StoreSpec
+from .folder import Folder
+
+_registry: Registry[type[Format]]
+
+
+class Part(NamedTuple):
+    """Name a part of an export, which is written and resumed as a whole: some samples of one split.
+
+    `number` counts the parts of the export. `of_split` and `parts_of_split` count those of the split.
+    """
+
+    number: int
+    split: str
+    samples: tuple[int, ...]
+    of_split: int
+    parts_of_split: int
+
+
+class Entry(NamedTuple):
+    """Describe one exported sample: the file that holds its image, and what `Format.finish` needs to know of it."""
+
+    sample: int
+    file: str
+    note: Any = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Finished:
+    """Hold what `Format.finish` gets: the store, the splits, and the entries of all parts.
+
+    `entries` reads them again from the disk at each call, a part at a time.
+    """
+
+    store: Store
+    splits: tuple[str, ...]
+    parts: tuple[Part, ...]
+    folder: Folder
+
+    def entries(self, split: str) -> Iterator[Entry]:
+        """Yield the entries of a split in the order of the samples."""
+        for part in self.parts:
+            if part.split == split:
+                yield from (Entry(*entry) for entry in self.folder.part(part.number)["entries"])
+
+
+@dataclass(frozen=True, kw_only=True)
+class Closing:
+    """Hold what a format adds at the end: lines for the card, front matter of the card, and warnings to print."""
+
+    front: Sequence[str] = ()
+    lines: Sequence[str] = ()
+    warnings: Sequence[str] = field(default=())
+
+
+class Format(ABC):
+    """Write samples of a store in the format of other tools. A class with a `name` registers itself.
+
+    A format of one file and more for each sample defines `files`; one that joins samples in a file defines
+    `write_part`. `finish` writes what follows from all samples, such as an index. An object holds no state: parts
+    are written by several threads, in any order.
+    """
+
+    name: ClassVar[str] = ""
+    summary: ClassVar[str] = ""  # one sentence for the help
+    usage: ClassVar[Sequence[str]] = ()  # lines of Markdown for the card: the files, and how to read them
+    media_type: ClassVar[str] = "image/png"  # of the files in which the images are
+    pattern: ClassVar[str] = "**/*.png"  # which matches the names of these files
+    part_samples: ClassVar[int] = 16
+    part_bytes: ClassVar[int | None] = None  # if given, a part has about this size instead
+
+    def __init_subclass__(cls, **keywords: Any) -> None:
+        super().__init_subclass__(**keywords)
+        if cls.name:
+            if not is_name(cls.name):
+                raise TypeError(f"{cls.__qualname__}: name = {cls.name!r}: must be lower-case letters and digits")
+            _registry.add(cls.name, cls, module=cls.__module__, qualname=cls.__qualname__)
+
+    @abstractmethod
+    def layers(self, spec: StoreSpec) -> Collection[str]:
+        """Return the names of the layers that the format reads; each is a layer of `spec`."""
+
+    def samples_of_part(self, spec: StoreSpec) -> int:
+        """Return how many samples a part has at most; it depends on the store's spec only."""
+        if self.part_bytes is None:
+            return self.part_samples
+        return max(1, min(1024, self.part_bytes // spec.estimated_sample_bytes))
+
+    def write_part(self, store: Store, part: Part, samples: Iterable[Sample], folder: Folder) -> list[Entry]:
+        """Write the files of a part and return the entries of its samples; `samples` are read one at a time."""
+        entries = []
+        for sample in samples:
+            entry, files = self.files(store, part, sample)
+            folder.put(files)
+            entries.append(entry)
+        return entries
+
+    def files(self, store: Store, part: Part, sample: Sample) -> tuple[Entry, Iterable[tuple[str, bytes]]]:
+        """Return the entry of a sample, and the names and contents of its files."""
+        raise NotImplementedError
+
+    def finish(self, finished: Finished) -> Closing:
+        """Write what follows from all samples, and return what the card shall say."""
+        return Closing()
+
+
+_registry = Registry("export format", "vbnfault.output.export.formats")
+
+
+def formats() -> dict[str, type[Format]]:
+    """Return the registered formats by name."""
+    return dict(_registry)
+
+
+def number_text(index: int, samples: int) -> str:
+    """Return a sample's index with leading zeros, so that the names of all samples sort as their indices do."""
+    return f"{index:0{max(6, len(str(samples - 1)))}d}"
+
+
+def png(image: NDArray[Any]) -> bytes:
+    """Return an image, uint8 or uint16 [y, x] or [y, x, RGB], as the bytes of a PNG file."""
+    swapped = image[..., ::-1] if image.ndim == 3 else image
+    done, data = cv2.imencode(".png", np.ascontiguousarray(swapped))
+    if not done:
+        raise VbnfaultError("an image cannot be encoded as PNG")
+    return data.tobytes()
+
+
+def mask_png(mask: NDArray[np.bool_]) -> bytes:
+    """Return a mask as the bytes of an 8 bit PNG file: 255 where it is True, else 0."""
+    return png(mask.astype(np.uint8) * 255)

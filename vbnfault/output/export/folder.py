@@ -1,0 +1,137 @@
+"""Write the files of an export durably, and keep a record of the parts that are finished.
+
+    export.json             what is exported, in which format; written first and, when all is done, last
+    .parts/00012.json       the record of a finished part: its files with their sizes, and its entries
+
+A part's record is written after its files, so a part with a record needs no work when an export is resumed. The
+folder `.parts` is removed at the end.
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+import re
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any
+
+from ...core.errors import InputError
+from ...store import disk
+
+STATE = "export.json"
+_PARTS = ".parts"
+_OWN = re.compile(rf"{re.escape(STATE)}\.[0-9a-f]{{32}}{re.escape(disk.PARTIAL)}")
+_FILES_AT_ONCE = 8  # files that are open and in memory at once, in each thread
+
+
+class Folder:
+    """Write files of one export; `sizes` has the size in bytes of each file written by this object."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.sizes: dict[str, int] = {}
+
+    def fresh(self) -> Folder:
+        """Return the same folder with no file in `sizes`."""
+        return Folder(self.path)
+
+    def put(self, files: Iterable[tuple[str, bytes]]) -> None:
+        """Write files; each is complete or not there."""
+        rest = iter(files)
+        while batch := list(itertools.islice(rest, _FILES_AT_ONCE)):
+            disk.write(self.path, batch)
+            self.sizes |= {name: len(content) for name, content in batch}
+
+    def put_with(self, name: str, make: Callable[[Path], object]) -> None:
+        """Write one file by a function that gets a temporary path; it is complete or not there."""
+        target = self.path / name
+        target.parent.mkdir(parents=True, exist_ok=True)
+        disk.write_with(target, make)
+        self.sizes[name] = target.stat().st_size
+
+    # --- what an earlier command has done -------------------------------------------------------------------
+
+    def begin(self, identity: dict[str, Any]) -> bool:
+        """Begin or resume the export that `identity` describes; return whether it is complete already.
+
+        Raises
+        ------
+        InputError
+            The folder holds something else, or another export.
+        """
+        if self.path.exists() and not self.path.is_dir():
+            raise InputError(f"{self.path}: is a file, not a folder; choose another --out")
+        names = disk.names(self.path)
+        if all(_OWN.fullmatch(name) for name in names):  # also what a killed process left of its first file
+            for name in names:
+                (self.path / name).unlink(missing_ok=True)
+            self.path.mkdir(parents=True, exist_ok=True)
+            self._write_state(identity, complete=False)
+            return False
+        state = _document(self.path / STATE)
+        if state is None or state.get("kind") != "vbnfault export":
+            raise InputError(
+                f"{self.path}: holds something else than an export of vbnfault, so it is left alone; choose "
+                "another --out"
+            )
+        differing = [key for key in identity if state.get(key) != identity[key]]
+        if differing:
+            key = differing[0]
+            raise InputError(
+                f"{self.path}: holds another export: {key} is {state.get(key)!r} there and {identity[key]!r} now; "
+                "choose another --out, or delete the folder"
+            )
+        disk.remove_partials(self.path)
+        return bool(state.get("complete"))
+
+    def end(self, identity: dict[str, Any]) -> None:
+        """Mark the export as complete and remove what only its resumption needs."""
+        self._write_state(identity, complete=True)
+        self.clear()
+
+    def clear(self) -> None:
+        """Remove the records of parts."""
+        if (self.path / _PARTS).is_dir():
+            disk.remove_tree(self.path / _PARTS)
+
+    def _write_state(self, identity: dict[str, Any], *, complete: bool) -> None:
+        """Write what is exported, and whether all of it is there."""
+        state = {"kind": "vbnfault export", **identity, "complete": complete}
+        disk.write(self.path, [(STATE, json.dumps(state, indent=2).encode())])
+
+    def part(self, number: int) -> dict[str, Any]:
+        """Return the record of a finished part."""
+        record = _document(self.path / _PARTS / _part_name(number))
+        if record is None:
+            raise InputError(f"{self.path}: {_PARTS}/{_part_name(number)} is missing; run the same command again")
+        return record
+
+    def write_part(self, number: int, record: dict[str, Any]) -> None:
+        """Write the record of a part whose files are written; the files of this object are added to it."""
+        text = json.dumps({**record, "files": self.sizes}, allow_nan=False)
+        disk.write(self.path, [(f"{_PARTS}/{_part_name(number)}", text.encode())])
+
+    def has_part(self, number: int) -> bool:
+        """Return whether a part is finished and its files have their sizes still."""
+        record = _document(self.path / _PARTS / _part_name(number))
+        try:
+            return record is not None and all(
+                (self.path / name).stat().st_size == size for name, size in record["files"].items()
+            )
+        except (OSError, KeyError):
+            return False
+
+
+def _part_name(number: int) -> str:
+    """Return the file name of a part's record."""
+    return f"{number:06d}.json"
+
+
+def _document(path: Path) -> dict[str, Any] | None:
+    """Return the JSON object in a file; None if there is none."""
+    try:
+        document = json.loads(disk.read(path))
+    except (OSError, ValueError):
+        return None
+    return document if isinstance(document, dict) else None

@@ -1,0 +1,86 @@
+"""Export to OpenEXR: radiance by wavelength or the image, with depth, normals and masks as further channels."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable
+from functools import partial
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ....core.images import write_exr
+from ....core.quantities import CHANNELS, Sample
+from ....store import Store, StoreSpec
+from ..contract import Entry, Format, Part, number_text
+from ..folder import Folder
+
+_SKIPPED = ("clean", "mask_any")
+
+
+class Exr(Format):
+    """Write one OpenEXR file for each sample."""
+
+    name = "exr"
+    summary = "OpenEXR: one file of named channels for each sample, with image, radiance, depth, normals and masks."
+    media_type = "image/x-exr"
+    pattern = "*/*.exr"
+    usage: ClassVar = (
+        "A file is `SPLIT/NUMBER.exr`; the number is the index of the sample in the store. Its channels, in "
+        "scan-lines from the top, compressed without loss:",
+        "",
+        "- `R`, `G`, `B`, `I`: the image with faults, linear, DN / 255, half floats; times 255 and "
+        "rounded they are "
+        "the stored 8 bit values.",
+        "- `radiance.<wavelength>nm`: radiance at the camera without faults and noise, in W m-2 sr-1 nm-1, if the "
+        "store has the layer `radiance`.",
+        "- `depth.Z`: depth along the boresight in m, infinite on the sky. `normal.X`, `normal.Y`, `normal.Z`: in "
+        "the camera's frame (x right, y down, z boresight), 0 on the sky. `semantic`: 0 sky, 1 body, 2 Sun, "
+        "3 spacecraft.",
+        "- `mask.<fault>`: 1 where the mask is set. Any other layer of one number a pixel has its "
+        "name in the store.",
+    )
+
+    def layers(self, spec: StoreSpec) -> Collection[str]:
+        """Return the image, the masks and every layer of numbers."""
+        return [
+            name
+            for name, row in spec.pixel_layers.items()
+            if name not in _SKIPPED and not name.startswith("without_") and row.dims[-1] in ("x", "xyz", "channel")
+        ]
+
+    def write_part(self, store: Store, part: Part, samples: Iterable[Sample], folder: Folder) -> list[Entry]:
+        """Write one file for each sample."""
+        entries = []
+        for sample in samples:
+            name = f"{part.split}/{number_text(sample.index, store.samples)}.exr"
+            folder.put_with(name, partial(_write, store, sample))
+            entries.append(Entry(sample.index, name))
+        return entries
+
+
+def _write(store: Store, sample: Sample, path: Path) -> None:
+    """Write the file of one sample."""
+    channels: dict[str, NDArray[Any]] = {}
+    for name, layer in sample.layers.items():
+        channels |= _channels(store.spec, name, layer)
+    write_exr(path, channels)
+
+
+def _channels(spec: StoreSpec, name: str, layer: NDArray[Any]) -> dict[str, NDArray[Any]]:
+    """Return the channels of one layer by name, as float16, float32 or uint32."""
+    if name == "image":
+        scaled = (layer / np.float32(255)).astype(np.float16)
+        return {channel: np.ascontiguousarray(scaled[..., k]) for k, channel in enumerate(CHANNELS)}
+    if name == "radiance":
+        return {f"radiance.{w:.1f}nm": band for w, band in zip(spec.wavelength_nm, layer, strict=True)}
+    if name in ("mask", "mask_effect"):
+        return {f"{name}.{f}": mask.astype(np.float16) for f, mask in zip(spec.faults, layer, strict=True)}
+    if layer.ndim == 3:
+        kind = np.float16 if layer.dtype == np.float16 else np.float32
+        return {f"{name}.{axis}": np.ascontiguousarray(layer[..., k], kind) for k, axis in enumerate("XYZ")}
+    if layer.dtype.kind == "u":
+        return {name: layer.astype(np.uint32)}
+    number = layer.astype(np.float32) if layer.dtype.itemsize > 4 else layer
+    return {"depth.Z" if name == "depth_m" else name: np.ascontiguousarray(number)}

@@ -1,0 +1,61 @@
+"""Export to folders of PNG files: one folder for each split and each layer."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Iterator
+from typing import ClassVar
+
+import numpy as np
+
+from ....core.quantities import Sample
+from ....store import Store, StoreSpec
+from ..contract import Entry, Format, Part, mask_png, number_text, png
+
+_MASKS = ("mask", "mask_effect")
+_PLAIN = ("mask_any", "semantic", "raw")
+
+
+class PngFolders(Format):
+    """Write each image and mask as a PNG file of 8 bits, and the raw mosaic as one of 16 bits."""
+
+    name = "png"
+    summary = "PNG files of 8 bits, and of 16 bits for the raw mosaic, in a folder for each split and layer."
+    pattern = "*/image/*.png"
+    usage: ClassVar = (
+        "A file is `SPLIT/LAYER/NUMBER.png`; the number is the index of the sample in the store.",
+        "",
+        "- `image`, `clean` and `without_<fault>`: R, G, B of the image, 8 bits a channel, in DN. "
+        "`image_intensity` and the like: its intensity channel, 8 bits.",
+        "- `mask/<fault>`, `mask_effect/<fault>`, `mask_any`: 8 bits, 255 where the mask is set and 0 elsewhere.",
+        "- `semantic`: 8 bits; 0 sky, 1 body, 2 Sun, 3 spacecraft.",
+        "- `raw`: the mosaic of the analogue-to-digital converter, 16 bits, in DN and not scaled.",
+        "- A layer that the store lacks has no folder. Depth, normals and radiance are "
+        "floating-point numbers: export "
+        "them as `exr`.",
+    )
+
+    def layers(self, spec: StoreSpec) -> Collection[str]:
+        """Return the layers of whole numbers and the masks."""
+        return [
+            name
+            for name, row in spec.pixel_layers.items()
+            if name in (*_MASKS, *_PLAIN) or (row.dtype == "uint8" and row.dims[-1] == "channel")
+        ]
+
+    def files(self, store: Store, part: Part, sample: Sample) -> tuple[Entry, Iterable[tuple[str, bytes]]]:
+        """Return the files of one sample."""
+        number = number_text(sample.index, store.samples)
+        return Entry(sample.index, f"{part.split}/image/{number}.png"), self._files(store, part, sample, number)
+
+    def _files(self, store: Store, part: Part, sample: Sample, number: str) -> Iterator[tuple[str, bytes]]:
+        """Yield name and content of each file of a sample."""
+        for name, layer in sample.layers.items():
+            if name in _MASKS:
+                for fault, mask in zip(store.spec.faults, layer, strict=True):
+                    yield f"{part.split}/{name}/{fault}/{number}.png", mask_png(mask)
+            elif layer.ndim == 3:
+                yield f"{part.split}/{name}/{number}.png", png(layer[..., :3])
+                yield f"{part.split}/{name}_intensity/{number}.png", png(layer[..., 3])
+            else:
+                is_mask = layer.dtype == np.bool_
+                yield f"{part.split}/{name}/{number}.png", mask_png(layer) if is_mask else png(layer)

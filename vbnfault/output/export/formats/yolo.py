@@ -1,0 +1,83 @@
+"""Export to YOLO: PNG images, outlines and boxes as text, and `data.yaml`."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable
+from typing import ClassVar
+
+import numpy as np
+
+from ....core.quantities import Sample
+from ....store import SPLITS, Store, StoreSpec
+from ..contract import Closing, Entry, Finished, Format, Part, number_text, png
+from ..regions import Region, polygon, regions
+
+
+class Yolo(Format):
+    """Write images, and for each a file of outlines and one of boxes, as Ultralytics reads them."""
+
+    name = "yolo"
+    summary = "YOLO: 8 bit PNG images, outlines and boxes of the instances as text, and data.yaml."
+    pattern = "images/*/*.png"
+    usage: ClassVar = (
+        "- `data.yaml`: the splits and the names of all classes, in the order of the table below.",
+        "- `images/SPLIT/NUMBER.png`: R, G, B of the image, 8 bits a channel. The number is the "
+        "index of the sample.",
+        "- `labels/SPLIT/NUMBER.txt`: one outline a line, `class x1 y1 x2 y2 ...`, as fractions of "
+        "width and height. "
+        "Ultralytics trains segmentation with them, and detection with the boxes around them.",
+        "- `boxes/SPLIT/NUMBER.txt`: the same instances as exact boxes, `class x_centre y_centre "
+        "width height`, for "
+        "programs that read boxes only; rename the folder to `labels` for them.",
+        "- The instances are the connected regions (8 neighbours) of `mask` of the localised "
+        "classes. An outline runs "
+        "through the centres of the pixels at the edge and has no holes. A class that is not localised, such as "
+        "vignetting, has no instances here; `samples.jsonl` says which samples have it.",
+    )
+
+    def layers(self, spec: StoreSpec) -> Collection[str]:
+        """Return image and mask."""
+        return ("image", "mask")
+
+    def files(self, store: Store, part: Part, sample: Sample) -> tuple[Entry, Iterable[tuple[str, bytes]]]:
+        """Return image, outlines and boxes of one sample."""
+        spec, name = store.spec, f"{part.split}/{number_text(sample.index, store.samples)}"
+        found = [
+            (k, region)
+            for k, fault in enumerate(spec.faults)
+            if fault in (spec.localised_faults or ())
+            for region in regions(sample.layers["mask"][k])
+        ]
+        outlines = "".join(_outline_line(k, region, spec) for k, region in found)
+        boxes = "".join(_box_line(k, region, spec) for k, region in found)
+        image = f"images/{name}.png"
+        return Entry(sample.index, image), [
+            (image, png(sample.layers["image"][..., :3])),
+            (f"labels/{name}.txt", outlines.encode()),
+            (f"boxes/{name}.txt", boxes.encode()),
+        ]
+
+    def finish(self, finished: Finished) -> Closing:
+        """Write `data.yaml`."""
+        used = [name for name in SPLITS if name in finished.splits]
+        # Ultralytics asks for both; a small store may lack one of them
+        paths = {"train": "train", "val": "val", **{name: name for name in used}}
+        fallback = used[0] if used else "train"
+        # without a key `path`, paths start from the folder of this file
+        lines = [f"{key}: images/{name if name in used else fallback}" for key, name in paths.items()]
+        lines += ["names:", *(f"  {k}: {name}" for k, name in enumerate(finished.store.spec.faults))]
+        finished.folder.put([("data.yaml", ("\n".join(lines) + "\n").encode())])
+        return Closing()
+
+
+def _outline_line(category: int, region: Region, spec: StoreSpec) -> str:
+    """Return the line of a region's outline."""
+    points = polygon(region) / (spec.width, spec.height)
+    return f"{category} {' '.join(f'{v:.6f}' for v in np.ravel(points))}\n"
+
+
+def _box_line(category: int, region: Region, spec: StoreSpec) -> str:
+    """Return the line of a region's box."""
+    x, y, width, height = region.box
+    box = ((x + width / 2) / spec.width, (y + height / 2) / spec.height, width / spec.width, height / spec.height)
+    return f"{category} {' '.join(f'{v:.6f}' for v in box)}\n"

@@ -1,0 +1,294 @@
+"""Run an export: check store and folder, write the parts in threads, and finish with index, table and cards."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import threading
+from collections.abc import Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ... import __version__
+from ...core.errors import InputError, VbnfaultError, shown
+from ...core.quantities import Sample
+from ...core.tables import did_you_mean
+from ...dataset.card import to_json
+from ...dataset.croissant import columns, croissant
+from ...dataset.lock import locked
+from ...dataset.progress import Progress
+from ...dataset.statistics import Statistics, statistics
+from ...store import SPLITS, STRATA, Store, disk, open_store
+from ..json_files import plain
+from .card import export_card
+from .contract import Finished, Format, Part, formats
+from .folder import Folder
+
+SAMPLES = "samples.jsonl"
+MOST_THREADS = 64
+_PARSED = ("parameters", "proposal")  # scalars that hold JSON
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExportSummary:
+    """Describe an export: its folder, the numbers of samples in all and written now, and warnings."""
+
+    path: Path
+    format: str
+    samples: int
+    written: int
+    warnings: tuple[str, ...] = ()
+
+    def lines(self) -> list[str]:
+        """Return the summary as lines of text."""
+        before = f", {self.samples - self.written} of them written before" if self.written < self.samples else ""
+        text = f"{self.path}: {self.samples} samples as {self.format}{before}"
+        return [text, *(f"warning: {warning}" for warning in self.warnings)]
+
+
+def export_store(
+    store: str | os.PathLike[str] | Store,
+    out: str | os.PathLike[str],
+    format: str,
+    *,
+    workers: int = 1,
+    progress: bool = True,
+) -> ExportSummary:
+    """Write all samples of a finished store in the format of other tools, or resume an interrupted export.
+
+    The files do not depend on the number of workers or on interruptions.
+
+    Parameters
+    ----------
+    store
+        A store or its path.
+    out
+        Folder of the export; made if missing.
+    format
+        Name of a format: coco, exr, huggingface, png, webdataset, yolo, or one of a plug-in.
+    workers
+        Number of threads, 1 to 64. Each holds one sample in memory.
+    progress
+        Whether to show the progress on standard error.
+
+    Raises
+    ------
+    InputError
+        If there is no such store or format, the store is not finished, or the folder holds something else.
+    VbnfaultError
+        If a sample is damaged or the files cannot be written; the same call resumes.
+    """
+    known = formats()
+    if format not in known:
+        raise InputError(f"--format {shown(format)}: there is no such format{did_you_mean(str(format), [*known])}")
+    if type(workers) is not int or not 1 <= workers <= MOST_THREADS:
+        raise InputError(f"--workers {shown(workers)}: must be a whole number from 1 to {MOST_THREADS}")
+    store, target = open_store(store), Path(out)
+    _check_place(store, target)
+    _check_finished(store)
+    kind = known[format]()
+    identity = {
+        "format": format,
+        "vbnfault": __version__,
+        "samples": store.samples,
+        "contents_sha256": _contents_sha256(store),
+    }
+    with locked(target), disk.explained(target, "writing the export"):
+        folder, parts = Folder(target), _parts(store, kind.samples_of_part(store.spec))
+        if folder.begin(identity):
+            folder.clear()
+            return ExportSummary(path=target, format=format, samples=store.samples, written=0)
+        with Progress(store.samples, shown=progress) as bar:
+            written = _write_parts(store, kind, parts, folder, bar, workers)
+        warnings = _finish(store, kind, parts, folder)
+        folder.end(identity)
+    return ExportSummary(path=target, format=format, samples=store.samples, written=written, warnings=warnings)
+
+
+# --- before the work ----------------------------------------------------------------------------------------
+
+
+def _check_place(store: Store, target: Path) -> None:
+    """Refuse a folder within the store, or one that holds the store."""
+    inside, outside = store.path.resolve(), target.resolve()
+    if inside == outside or inside in outside.parents:
+        raise InputError(f"{target}: lies in the store; choose another --out")
+
+
+def _check_finished(store: Store) -> None:
+    """Refuse a store that lacks samples."""
+    finished = store.finished()
+    if finished < store.samples:
+        raise InputError(
+            f"{store.path}: {finished} of {store.samples} samples are finished; run the build command again, and "
+            "export the store when it is complete"
+        )
+
+
+def _contents_sha256(store: Store) -> str:
+    """Return a digest of the stored checksums of all layers and scalars, and of the layout of the store."""
+    total = hashlib.sha256(json.dumps(store.spec.plain(), sort_keys=True).encode())
+    for number in range(store.shards):
+        total.update(_column(store, "crc32c", number).tobytes())
+    return total.hexdigest()
+
+
+def _column(store: Store, name: str, number: int) -> NDArray[Any]:
+    """Return a scalar of a shard. Raises VbnfaultError if it cannot be read."""
+    try:
+        return store.column(name, number)
+    except (OSError, ValueError) as error:
+        raise VbnfaultError(
+            f"{store.path}: {name} of samples {store.shard(number).start}-{store.shard(number).stop - 1} cannot be "
+            f"read ({error}); the build command repairs it"
+        ) from error
+
+
+def _parts(store: Store, size: int) -> tuple[Part, ...]:
+    """Return the parts of an export: of each split, in ascending order, up to `size` samples."""
+    split = [str(name) for number in range(store.shards) for name in _column(store, "split", number)]
+    parts: list[Part] = []
+    for name in (*SPLITS, *sorted(set(split) - set(SPLITS))):
+        samples = [i for i, of_sample in enumerate(split) if of_sample == name]
+        starts = range(0, len(samples), size)
+        for k, start in enumerate(starts):
+            parts.append(Part(len(parts), name, tuple(samples[start : start + size]), k, len(starts)))
+    return tuple(parts)
+
+
+# --- the work -----------------------------------------------------------------------------------------------
+
+
+def _write_parts(
+    store: Store, kind: Format, parts: Sequence[Part], folder: Folder, bar: Progress, workers: int
+) -> int:
+    """Write the parts that are not finished yet, and return how many samples that were."""
+    missing = []
+    for part in parts:
+        if folder.has_part(part.number):
+            for _ in part.samples:
+                bar.advance(False)
+        else:
+            missing.append(part)
+    stop = threading.Event()
+    running: set[Future[Part]] = set()
+    pool = ThreadPoolExecutor(workers)
+    try:
+        for part in missing:
+            running.add(pool.submit(_write_part, store, kind, part, folder, stop))
+            if len(running) >= workers:
+                running = _finished_of(running, bar)
+        while running:
+            running = _finished_of(running, bar)
+    finally:
+        stop.set()
+        pool.shutdown(wait=True, cancel_futures=True)
+    return sum(len(part.samples) for part in missing)
+
+
+def _finished_of(running: set[Future[Part]], bar: Progress) -> set[Future[Part]]:
+    """Wait for a part, count its samples, and return what still runs. Raises what writing the part has raised."""
+    done, rest = wait(running, return_when=FIRST_COMPLETED)
+    for future in done:
+        for _ in future.result().samples:
+            bar.advance(True)
+    return rest
+
+
+def _write_part(store: Store, kind: Format, part: Part, folder: Folder, stop: threading.Event) -> Part:
+    """Write the files of a part, and then its record."""
+    own, rows = folder.fresh(), []
+    layers = kind.layers(store.spec)
+
+    def samples() -> Iterator[Sample]:
+        for index in part.samples:
+            if stop.is_set():
+                raise VbnfaultError("the export was stopped")
+            sample = store.read_sample(index, layers)
+            rows.append(_row(store, sample))
+            yield sample
+
+    entries = kind.write_part(store, part, samples(), own)
+    own.write_part(part.number, {"entries": entries, "rows": rows})
+    return part
+
+
+def _row(store: Store, sample: Sample) -> dict[str, Any]:
+    """Return the scalars of a sample as a row of the table of samples; names replace indices."""
+    scalars = {name: value for name, value in sample.scalars.items() if name not in _PARSED}
+    row = {name: plain(np.asarray(v).ravel() if np.ndim(v) else v) for name, v in scalars.items()}
+    row["injected"] = [f for f, on in zip(store.spec.faults, sample.scalars["injected"], strict=True) if on]
+    row["stratum"] = STRATA[int(row["stratum"])]
+    parsed = {name: json.loads(sample.scalars[name] or "{}") for name in _PARSED}
+    return {"sample": sample.index, **row, **plain(parsed)}
+
+
+# --- at the end ---------------------------------------------------------------------------------------------
+
+
+def _finish(store: Store, kind: Format, parts: Sequence[Part], folder: Folder) -> tuple[str, ...]:
+    """Write index, table of samples, card and Croissant description, and return the format's warnings."""
+    splits = tuple(dict.fromkeys(part.split for part in parts))
+    closing = kind.finish(Finished(store=store, splits=splits, parts=tuple(parts), folder=folder))
+    digest = hashlib.sha256()
+
+    def write_rows(path: Path) -> None:
+        with path.open("wb") as file:
+            for part in parts:
+                record = folder.part(part.number)
+                for (_, image, _note), row in zip(record["entries"], record["rows"], strict=True):
+                    line = json.dumps({"file": image, **row}, allow_nan=False).encode() + b"\n"
+                    digest.update(line)
+                    file.write(line)
+
+    folder.put_with(SAMPLES, write_rows)
+    numbers = statistics(store)
+    folder.put(
+        [
+            ("README.md", export_card(store, kind, closing, numbers).encode()),
+            ("croissant.json", to_json(_croissant(store, kind, digest.hexdigest(), numbers)).encode()),
+        ]
+    )
+    return tuple(closing.warnings)
+
+
+_COLUMNS = {
+    "file": ("file that holds the image", ""),
+    "sample": ("index of the sample in the store", 0),
+    "split": ("split of the dataset", ""),
+    "stratum": ("stratum of the sampling", ""),
+    "site": ("index of the site", 0),
+    "exposure_s": ("exposure time in s", 0.0),
+    "sun_elevation_deg": ("Sun elevation in L, up, in deg", 0.0),
+    "sun_distance_au": ("distance to the Sun in au", 0.0),
+}
+
+
+def _croissant(store: Store, kind: Format, sha256: str, numbers: Statistics) -> dict[str, Any]:
+    """Return the Croissant description of an export, whose records are the rows of the table of samples."""
+    files = [
+        {
+            "@type": "cr:FileObject",
+            "@id": SAMPLES,
+            "name": SAMPLES,
+            "description": "One line of JSON for each sample: file, split, faults and all scalars of the store.",
+            "contentUrl": SAMPLES,
+            "encodingFormat": "application/jsonlines",
+            "sha256": sha256,
+        },
+        {
+            "@type": "cr:FileSet",
+            "@id": "images",
+            "name": "images",
+            "description": kind.summary,
+            "encodingFormat": kind.media_type,
+            "includes": kind.pattern,
+        },
+    ]
+    return croissant(store, files, [columns("samples", f"The {numbers.finished} samples", SAMPLES, _COLUMNS)])
