@@ -28,11 +28,6 @@ from vbnfault.output.export.regions import coco_text, polygon, regions, whole
 
 NAMES = ("coco", "exr", "huggingface", "png", "webdataset", "yolo")
 SAMPLES = 6
-pytestmark = [
-    # rdflib, below mlcroissant, calls its own deprecated name; pycocotools ignores a keyword of numpy 2
-    pytest.mark.filterwarnings("ignore:ConjunctiveGraph is deprecated:DeprecationWarning"),
-    pytest.mark.filterwarnings("ignore:__array__ implementation doesn't accept a copy:DeprecationWarning"),
-]
 
 
 def reader(name: str) -> Any:

@@ -89,7 +89,6 @@ def test_a_card_changes_neither_digest_nor_check_and_xarray_reads_as_before(copy
         assert part in text
 
 
-@pytest.mark.filterwarnings("ignore:ConjunctiveGraph is deprecated:DeprecationWarning")
 def test_mlcroissant_accepts_the_description_of_a_store(copy: Path, data: st.Store) -> None:
     croissant = pytest.importorskip("mlcroissant", reason="mlcroissant is in the extra `readers`")
     card.write_card(copy)
