@@ -119,12 +119,19 @@ def device_map(path: Path, *, wavelength_nm: Any = (550.0,), **keys: Any) -> Any
 
 def looked_up(albedo: Any, longitude_deg: Any, latitude_deg: Any, footprint_m: float = 1e-3) -> Array:
     """Factors [band, point] on a sphere of 1000 m about the origin of T."""
+    from vbnfault.render.albedo import GroundPoints
     from vbnfault.render.runtime import mi
 
     lon, lat = np.broadcast_arrays(np.radians(longitude_deg), np.radians(latitude_deg))
     p = 1000 * np.stack([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)]) - [[0], [0], [500]]
     point = mi.Point3f(*(mi.Float(np.ascontiguousarray(row, np.float32)) for row in p))
-    return np.stack([f.numpy() for f in albedo.factors(point, mi.Float(footprint_m), mi.Bool(True))]).astype(float)
+    up = mi.Vector3f(0, 0, 1)  # from where it is seen and lit does not matter
+    ground = GroundPoints(
+        point_L_m=point, footprint_m=mi.Float(footprint_m), valid=mi.Bool(True), view_L=up, sun_L=up
+    )
+    factors, water = albedo.factors(ground)
+    assert water is None
+    return np.stack([f.numpy() for f in factors]).astype(float)
 
 
 def test_the_map_is_interpolated_across_the_seam_and_at_the_poles(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,29 @@ F64 = NDArray[np.float64]
 
 # The wavelengths of R, G and B of a coloured map. Between them factors are linear, beyond them constant.
 _RGB_NM = (650.0, 550.0, 450.0)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class GroundPoints:
+    """Hold points of the ground and how they are seen.
+
+    Attributes
+    ----------
+    point_L_m
+        Positions in L.
+    footprint_m
+        Distance between neighbouring rays at the points.
+    valid
+        Whether there is a point.
+    view_L, sun_L
+        Unit vectors towards the camera and the Sun.
+    """
+
+    point_L_m: Any
+    footprint_m: Any
+    valid: Any
+    view_L: Any
+    sun_L: Any
 
 
 class AlbedoMap:
@@ -65,23 +89,26 @@ class AlbedoMap:
         self._axes = [mi.Vector3f(*map(float, row)) for row in T_from_L]
         self._site = [float(x) for x in site_T_m]
 
-    def factors(self, point_L_m: Any, footprint_m: Any, valid: Any) -> list[Any]:
-        """Return the factors on the albedo at points in L: one for each band, or a single one if the map is grey.
+    def factors(self, ground: GroundPoints) -> tuple[list[Any], None]:
+        """Return the factors on the albedo, for each band or one if the map is grey, and None for water.
 
-        `footprint_m` is the distance between neighbouring rays at the points. Details of the map that are finer are
-        averaged.
+        Details of the map that are finer than the footprint of the points are averaged.
         """
-        values = self._sampled(point_L_m, footprint_m, valid)
-        return [_sum(row, values) for row in self._weights] if self.coloured else values
+        values = self._sampled(ground)
+        return ([_sum(row, values) for row in self._weights] if self.coloured else values), None
 
-    def at_reference(self, point_L_m: Any, footprint_m: Any, valid: Any) -> Any:
+    def at_reference(self, ground: GroundPoints) -> Any:
         """Return the factor in the reference band at the valid points."""
-        return _sum(self._weights[self._reference], self._sampled(point_L_m, footprint_m, valid))
+        return _sum(self._weights[self._reference], self._sampled(ground))
 
-    def _sampled(self, point_L_m: Any, footprint_m: Any, valid: Any) -> list[Any]:
+    def _sampled(self, ground: GroundPoints) -> list[Any]:
         """Return the value of each channel, bilinear within the level that fits the footprint."""
         # a ray that hits nothing ends at infinity, and an index made of that would lie outside the tables
-        point, footprint_m = dr.select(valid, mi.Vector3f(point_L_m), 0), dr.select(valid, footprint_m, 1)
+        valid = ground.valid
+        point, footprint_m = (
+            dr.select(valid, mi.Vector3f(ground.point_L_m), 0),
+            dr.select(valid, ground.footprint_m, 1),
+        )
         x, y, z = (dr.dot(axis, point) + s for axis, s in zip(self._axes, self._site, strict=True))
         across = dr.sqrt(x * x + y * y)
         longitude, latitude = dr.atan2(y, x), dr.atan2(z, across)

@@ -150,9 +150,11 @@ def air_light(
     begin = np.maximum(along - half, 0)
     reach = np.where(is_ground.ravel(), depth_m.ravel().astype(np.float64) * length, np.inf) / air.scale_height_m
     end = np.minimum(along + half, reach * stretch)
-    # a line without known ground that dips into the sphere ends there; one that passes between facets does not
-    dips = (miss2 < (unit - _FACET_SAG) ** 2) & (along > 0)
-    end = np.where(dips & ~is_ground.ravel(), np.minimum(end, along - np.sqrt(np.maximum(unit**2 - miss2, 0))), end)
+    # A line that dips into the sphere ends there; one without known ground that passes between facets does not.
+    # Facets may lie below the sphere, and a ray between two of them may even see the far side.
+    for deepest, on in ((unit - _FACET_SAG, is_ground.ravel()), (unit, ~is_ground.ravel())):
+        dips = on & (miss2 < (unit - _FACET_SAG) ** 2) & (along > 0)
+        end = np.where(dips, np.minimum(end, along - np.sqrt(np.maximum(deepest**2 - miss2, 0))), end)
     step = np.maximum(end - begin, 0) / _STEPS
     phase = 0.75 * (1 + (towards_L @ sun_L) ** 2) / (4 * np.pi)
     line = (along, np.sqrt(miss2), direction @ sun, float(start @ sun))

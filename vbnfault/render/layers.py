@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from ..core.quantities import BODY, SKY, SPACECRAFT, SUN, SunInView, Truth
 from ..core.sundisc import Pinhole, Projection, bounds_px, pixel_sums
+from .albedo import GroundPoints
 from .description import Sunlight, View
 from .emitter import SunDisc
 from .light import sun_in_view
@@ -60,7 +61,10 @@ def truth(
         layers["dust"] = dr.select(hit.valid, hit.dust, dr.nan)
         if surface.albedo is not None:
             footprint_m = hit.distance_m / float(view.intrinsics[0])
-            factor = surface.albedo.at_reference(hit.point, footprint_m, hit.valid)
+            ground = GroundPoints(
+                point_L_m=hit.point, footprint_m=footprint_m, valid=hit.valid, view_L=-rays.d, sun_L=centre
+            )
+            factor = surface.albedo.at_reference(ground)
             layers["albedo_factor"] = dr.select(hit.valid, factor, dr.nan)
         if hit.material is not None:
             layers["material"] = dr.select(hit.on_vehicle, mi.Int32(hit.material), mi.Int32(-1))
