@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from vbnfault import dataset, render
 from vbnfault.core.errors import InputError
@@ -108,6 +109,43 @@ def test_glint_has_its_closed_form_and_keeps_the_energy() -> None:
     there, back = earth.glint(a, b).numpy()[0] / a.z[0], earth.glint(b, a).numpy()[0] / b.z[0]
     assert there == pytest.approx(back, rel=1e-4)
     assert earth.glint(vectors(100.0, 0.0), up).numpy()[0] == 0
+    # the whole path through the air: once its depth each way straight up, 40 times at the horizon (Rozenberg 1966)
+    np.testing.assert_allclose(earth._air_mass(mi.Float([1.0, 0.5, 0.0])).numpy(), [1, 2, 40], rtol=1e-3)
+    bands = np.array([450.0, 650.0])
+    ground = render.EarthAlbedo(
+        RADIUS_M,
+        wavelength_nm=bands,
+        reference_band=0,
+        T_from_L=np.eye(3),
+        site_T_m=np.zeros(3),
+        air_depth=np.array([0.2, 0.05]),
+    )
+    terms = [t.numpy()[0] for t in ground._mirrored(mi.Float(0.5), up, up)]
+    np.testing.assert_allclose(terms, 0.5 * peak * np.exp([-0.2, -0.05]), rtol=1e-4)
+
+
+def test_a_camera_below_the_sun_sees_the_glint_of_the_sea() -> None:
+    """A site in the open sea, the Sun and the camera above it: red light there against 35° off the mirror."""
+    up = points(5000)
+    land = [np.array(earth.height_at(up, mi.Float(1e-4))) > earth.SEA_LEVEL - 0.05]
+    opacity = np.array(earth._clouds(up, mi.Float(0.03))[0])
+    directions = np.stack([np.array(c) for c in up], axis=1)
+    open_sea = (opacity == 0) & ~land[0] & (np.abs(directions[:, 2]) < 0.5)
+    # the one whose surroundings within 5° are the freest
+    free = [(opacity[directions @ d > 0.996].mean(), k) for k, d in enumerate(directions) if open_sea[k]]
+    site = directions[min(free)[1]]
+    down = np.stack([np.cross(-site, [0, 0, 1]), np.zeros(3), -site])
+    down[0] /= np.linalg.norm(down[0])
+    down[1] = np.cross(down[2], down[0])
+    x, y, z, w = Rotation.from_matrix(down).as_quat()
+    row = [("name", "a"), ("julian_date", 2457000.5), ("sun_distance_au", 1.0)]
+    row += [(f"camera_{a}_T_m", 6.9e6 * v) for a, v in zip("xyz", site, strict=True)]
+    row += [(f"camera_from_T_{a}", v) for a, v in zip("wxyz", (w, x, y, z), strict=True)]
+    row += [(f"sun_{a}_T", v) for a, v in zip("xyz", site, strict=True)]
+    keys = {"camera.width_px": 33, "camera.height_px": 33, "camera.fov_deg": 70.0, "render.samples_per_pixel": 4}
+    scene = config.load_scene("earth_observation", {**keys, "dataset.layers": ["clean", "radiance"]})
+    red = Session(scene, poses={k: [v] for k, v in row}).simulate(0).layers["radiance"][-2]
+    assert red[16, 16] > 2.5 * np.median(np.concatenate([red[0], red[-1], red[:, 0], red[:, -1]]))
 
 
 def test_clouds_have_shadows_away_from_the_sun_and_hide_the_glint() -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,6 +15,10 @@ F64 = NDArray[np.float64]
 
 # The wavelengths of R, G and B of a coloured map. Between them factors are linear, beyond them constant.
 _RGB_NM = (650.0, 550.0, 450.0)
+
+# Takes unit vectors towards the Sun and the camera, with z along the normal; returns what water adds to the terms of
+# the bands.
+Mirror = Callable[[Any, Any], list[Any]]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -90,7 +94,7 @@ class AlbedoMap:
         self._site = [float(x) for x in site_T_m]
 
     def factors(self, ground: GroundPoints) -> tuple[list[Any], None]:
-        """Return the factors on the albedo, for each band or one if the map is grey, and None for water.
+        """Return the factors on the albedo, for each band or one if the map is grey, and None: no water.
 
         Details of the map that are finer than the footprint of the points are averaged.
         """

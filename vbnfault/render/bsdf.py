@@ -11,9 +11,8 @@ from typing import Any
 import numpy as np
 
 from ..reflectance.hapke import HAPKE_TABLES, Hapke, hapke_at
-from .albedo import GroundPoints
+from .albedo import GroundPoints, Mirror
 from .description import RenderInput
-from .earth import glint
 from .emitter import SunDisc
 from .runtime import dr, mi
 from .surface import TerrainMesh, facing
@@ -37,7 +36,8 @@ class Reflection:
     ) -> None:
         self._scene, self._hit, self._banded = scene, hit, banded
         self._vehicle = surface.vehicle
-        self._factors, self._water = None, None
+        self._factors: list[Any] | None = None
+        self._mirror: Mirror | None = None
         if surface.albedo is not None:
             spacing = 1 / (float(scene.view.intrinsics[0]) * scene.samples_per_pixel**0.5)
             ground = GroundPoints(
@@ -47,7 +47,7 @@ class Reflection:
                 view_L=view,
                 sun_L=SunDisc(scene.sun).direction,
             )
-            self._factors, self._water = surface.albedo.factors(ground)
+            self._factors, self._mirror = surface.albedo.factors(ground)
         self._frame = mi.Frame3f(facing(normal, view))
         self._towards_viewer = self._frame.to_local(view)
         self._view = _triple(self._towards_viewer)
@@ -79,9 +79,9 @@ class Reflection:
         if self._factors is not None:
             each = self._factors * (len(terms) // len(self._factors))
             terms = [t * factor for t, factor in zip(terms, each, strict=True)]
-        if self._water is not None:
-            mirrored = self._water * glint(light, self._towards_viewer)
-            terms = [t + mirrored for t in terms]
+        if self._mirror is not None:
+            mirrored = self._mirror(light, self._towards_viewer)
+            terms = [t + m for t, m in zip(terms, mirrored, strict=True)]
         if self._vehicle is not None:
             on, lambert = self._hit.on_vehicle, dr.maximum(light.z, 0) * dr.inv_pi
             albedo = self._vehicle.albedo(self._hit.material, on)

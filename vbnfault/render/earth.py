@@ -14,12 +14,13 @@ Smith (1967, IEEE Trans. Antennas Propag. 15, 668). Foam, and light that waves r
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .albedo import GroundPoints
+from .albedo import GroundPoints, Mirror
 from .runtime import dr, mi
 
 F64 = NDArray[np.float64]
@@ -79,28 +80,47 @@ class EarthAlbedo:
         Index of the band of `at_reference`.
     T_from_L, site_T_m
         Rotation float64[3, 3] and position float64[3] in m of the axes L in the body-fixed frame T.
+    air_depth
+        Optical depth of the air straight up, float64[band]. Air takes twice as much of a mirrored beam as of the
+        light of other ground, for which `atmosphere` assumes that half of what is scattered still arrives.
     """
 
     coloured = True
 
     def __init__(
-        self, radius_m: float, *, wavelength_nm: F64, reference_band: int, T_from_L: F64, site_T_m: F64
+        self,
+        radius_m: float,
+        *,
+        wavelength_nm: F64,
+        reference_band: int,
+        T_from_L: F64,
+        site_T_m: F64,
+        air_depth: F64,
     ) -> None:
         order = np.argsort(_RGB_NM)
         hats = [np.interp(wavelength_nm, np.array(_RGB_NM)[order], np.eye(3)[k][order]) for k in range(3)]
         self._weights = np.stack(hats, axis=1) / MEAN_ALBEDO
         self._reference = reference_band
         self._radius_m = radius_m
+        self._air_depth = [float(depth) for depth in air_depth]
         self._axes = [mi.Vector3f(*map(float, row)) for row in T_from_L]
         self._site = [float(x) for x in site_T_m]
 
-    def factors(self, ground: GroundPoints) -> tuple[list[Any], Any]:
-        """Return the factors on the albedo, one for each band, and the fraction of water that mirrors the Sun.
+    def factors(self, ground: GroundPoints) -> tuple[list[Any], Mirror]:
+        """Return the factors on the albedo, one for each band, and a function for the light that water mirrors.
 
         Details finer than the footprint of the points are left out.
         """
         colour, water = self._seen(ground, shadows=True)
-        return [_weighted(row, colour) for row in self._weights], water
+        return [_weighted(row, colour) for row in self._weights], partial(self._mirrored, water)
+
+    def _mirrored(self, water: Any, light: Any, view: Any) -> list[Any]:
+        """Return the radiance of water in each band over the irradiance on a plane that faces the Sun, in 1/sr.
+
+        `light` and `view` are unit vectors in axes with z straight up.
+        """
+        value, air = water * glint(light, view), _air_mass(light.z) + _air_mass(view.z)
+        return [value * dr.exp(-0.5 * depth * air) for depth in self._air_depth]
 
     def at_reference(self, ground: GroundPoints) -> Any:
         """Return the factor in the reference band, without the shadows of clouds."""
@@ -159,6 +179,12 @@ def glint(light: Any, view: Any) -> Any:
     seen = 1 / (1 + _hidden(cos_i) + _hidden(cos_e))
     value = _fresnel(dr.dot(light, half)) * slopes * seen / (4 * cos_e * dr.square(cos2))
     return dr.select(light.z > 0, value, 0)
+
+
+def _air_mass(cosine: Any) -> Any:
+    """Return the air towards a zenith angle in units of the air straight up (Rozenberg 1966, Twilight: a fit)."""
+    c = dr.maximum(cosine, 0)
+    return 1 / (c + 0.025 * dr.exp(-11 * c))
 
 
 def _hidden(cosine: Any) -> Any:

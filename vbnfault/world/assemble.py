@@ -247,6 +247,7 @@ def render_albedo(scene: Scene, site: Site) -> AlbedoMap | EarthAlbedo | None:
             reference_band=reference_band(scene),
             T_from_L=site.T_from_L,
             site_T_m=site.position_T_m,
+            air_depth=air_depth(scene),
         )
     loaded = load_albedo_map(scene.body.albedo_map)
     return render.AlbedoMap(
@@ -257,6 +258,14 @@ def render_albedo(scene: Scene, site: Site) -> AlbedoMap | EarthAlbedo | None:
         T_from_L=site.T_from_L,
         site_T_m=site.position_T_m,
     )
+
+
+def air_depth(scene: Scene) -> F64:
+    """Return the optical depth of the body's air straight up, float64[band]; 0 without air."""
+    from ..render.atmosphere import rayleigh_depth
+
+    nodes, table = wavelengths_nm(scene), scene.body.atmosphere
+    return np.zeros(len(nodes)) if table is None else rayleigh_depth(nodes, table.optical_depth)
 
 
 def make_body(scene: Scene) -> Body:
