@@ -268,6 +268,7 @@ def case_options(seeds: Seeds, rng: random.Random, here: Path) -> Case:
             "550",
         ],
         "list": ["list", "scenes"],
+        "shape": ["shape", "Bennu", "--out", out, "--url", "http://127.0.0.1:9/bennu.bds"],  # nobody listens there
     }
     name = rng.choice(list(sound))
     arguments = sound[name]

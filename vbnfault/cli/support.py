@@ -158,6 +158,31 @@ def new(
 
 
 @app.command(rich_help_panel=_PANEL)
+def shape(
+    body: Annotated[str, typer.Argument(help="Name of a packaged body (`vbnfault list bodies`).", metavar="BODY")],
+    out: Annotated[
+        Path, typer.Option(help="Folder for the file and for shapes.lock, which keeps its checksum.")
+    ] = (Path(".")),
+    url: Annotated[
+        str | None, typer.Option(help="Another address, such as that of a mirror.", show_default="the body's")
+    ] = None,
+) -> None:
+    """Download the published shape model of a body and check its SHA-256, or check the file that lies there."""
+    from ..body.download import LOCK, fetch_shape
+    from ..scene.bodies import body_to_download
+
+    known = body_to_download(body)
+    fetched = fetch_shape(known.url if url is None else url, out, sha256=known.sha256)
+    typer.echo(f"{fetched.path}: {'downloaded' if fetched.is_new else 'lies there already'}, {known.source}")
+    typer.echo(f"{fetched.pin.size_bytes} bytes, SHA-256 {fetched.pin.sha256}")
+    if fetched.was_known:
+        typer.echo("the checksum is the one that was known")
+    else:
+        typer.echo(f"nobody published a checksum; {out / LOCK} keeps this one, and later downloads must have it")
+    typer.echo(f'in the scene: [body] name = "{body}", shape = "{fetched.path}"')
+
+
+@app.command(rich_help_panel=_PANEL)
 def schema(
     kind: Annotated[str, typer.Argument(help="One of scene, lens, sensor and study.", metavar="KIND")] = "scene",
     plugins: PluginOption = None,

@@ -16,8 +16,8 @@ F64 = NDArray[np.float64]
 # The wavelengths of R, G and B of a coloured map. Between them factors are linear, beyond them constant.
 _RGB_NM = (650.0, 550.0, 450.0)
 
-# Takes unit vectors towards the Sun and the camera, with z along the normal; returns what water adds to the terms of
-# the bands.
+# Takes unit vectors towards the Sun and the camera, with z along the normal; returns what water adds to the terms
+# of the bands.
 Mirror = Callable[[Any, Any], list[Any]]
 
 

@@ -23,6 +23,15 @@ _OWN_KEYS |= {"pole_ra_deg", "pole_dec_deg", "prime_meridian_deg", "albedo_map"}
 _CLOSE = 0.75
 
 
+class ShapeFile(Table):
+    """Name a published shape model that `vbnfault shape` downloads."""
+
+    url: str = Field(description="address of the file")
+    source: str = Field(description="who made the model, and from what")
+    sha256: str = Field("", pattern="^([0-9a-f]{64})?$", description="checksum, where somebody published it")
+    size_bytes: int = Field(0, ge=0, description="size; 0: unknown")
+
+
 class BodyFile(Table):
     """Describe a named body: published figures, and the tables of a scene that they set."""
 
@@ -36,6 +45,7 @@ class BodyFile(Table):
     body: dict[str, Any] = Field(description="defaults of the scene's table [body]")
     orbit: dict[str, Any] | None = Field(None, description="default of the scene's table [orbit]")
     spice: dict[str, Any] = Field(default_factory=dict, description="defaults of the scene's table [spice]")
+    shape_file: ShapeFile | None = Field(None, description="a published shape model")
 
 
 @lru_cache(maxsize=1)
@@ -50,6 +60,17 @@ def packaged_bodies() -> Mapping[str, BodyFile]:
 def named_body(name: str) -> BodyFile | None:
     """Return the packaged body of a name, in any case and with or without its number, or None."""
     return packaged_bodies().get(_names().get(_plain(name), ""))
+
+
+def body_to_download(name: str) -> ShapeFile:
+    """Return the published shape model of a packaged body. Raises InputError, which lists the bodies with one."""
+    body = named_body(name)
+    if body is None and name == packaged_bodies()[DEFAULT].name:
+        body = packaged_bodies()[DEFAULT]
+    if body is None or body.shape_file is None:
+        known = ", ".join(key for key, file in packaged_bodies().items() if file.shape_file is not None)
+        raise InputError(f"shape {shown(name)}: no body with a known address of a shape model; known: {known}")
+    return body.shape_file
 
 
 def nearest_body(name: str) -> str:
