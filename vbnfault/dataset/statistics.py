@@ -37,6 +37,7 @@ _RANGED = (
     "noise_fraction_p99",
 )
 _READ = ("injected", "split", "stratum", "site", "parameters", *_RANGED)
+_SHARDS_AT_ONCE = 64
 _MOST_WORDS = 12  # different texts of a parameter that are counted
 
 
@@ -245,7 +246,7 @@ def statistics(path: str | os.PathLike[str] | Store) -> Statistics:
     sites: dict[str, set[int]] = {}
     ranges: dict[str, dict[str, Range]] = {name: {} for name in _RANGED}
     parameters: dict[str, dict[str, _Parameter]] = {fault: {} for fault in faults}
-    for samples, columns in _shards(store):
+    for samples, columns in _groups(store):
         injected = columns["injected"].astype(np.int64).reshape(len(samples), len(faults))
         together += injected.T @ injected
         per_sample.update(injected.sum(axis=1).tolist())
@@ -256,9 +257,9 @@ def statistics(path: str | os.PathLike[str] | Store) -> Statistics:
             sites.setdefault(split[k], set()).add(int(columns["site"][k]))
             for fault, drawn in json.loads(columns["parameters"][k] or "{}").items():
                 _add_parameters(parameters.setdefault(fault, {}), drawn)
+        samples_of = {of: np.array([of in ("all", s) for s in split]) for of in ("all", *dict.fromkeys(split))}
         for name in _RANGED:
-            for of in ("all", *dict.fromkeys(split)):
-                chosen = np.array([of in ("all", s) for s in split])
+            for of, chosen in samples_of.items():
                 ranges[name].setdefault(of, Range()).add(columns[name][chosen].astype(np.float64))
     return Statistics(
         samples=store.samples,
@@ -297,21 +298,28 @@ def _commanded(store: Store) -> NDArray[np.bool_] | None:
         return None
 
 
-def _shards(store: Store) -> Iterator[tuple[list[int], dict[str, NDArray[Any]]]]:
-    """Yield for each shard its finished samples and their scalars by name."""
-    for number in store.begun():
-        finished = [i for i, done in store.done(number).items() if done]
-        if not finished:
-            continue
-        chosen = [i - store.shard(number).start for i in finished]
-        try:
-            columns = {name: store.column(name, number)[chosen] for name in _READ}
-        except (OSError, ValueError) as error:
-            raise VbnfaultError(
-                f"{store.path}: the scalars of samples {finished[0]}-{finished[-1]} cannot be read ({error}); "
-                "the build command repairs them"
-            ) from error
-        yield finished, columns
+def _groups(store: Store) -> Iterator[tuple[list[int], dict[str, NDArray[Any]]]]:
+    """Yield the finished samples of some shards at once, and their scalars by name."""
+    begun = store.begun()
+    for start in range(0, len(begun), _SHARDS_AT_ONCE):
+        samples: list[int] = []
+        columns: dict[str, list[NDArray[Any]]] = {name: [] for name in _READ}
+        for number in begun[start : start + _SHARDS_AT_ONCE]:
+            finished = [i for i, done in store.done(number).items() if done]
+            if not finished:
+                continue
+            chosen = [i - store.shard(number).start for i in finished]
+            try:
+                for name in _READ:
+                    columns[name].append(store.column(name, number)[chosen])
+            except (OSError, ValueError) as error:
+                raise VbnfaultError(
+                    f"{store.path}: the scalars of samples {finished[0]}-{finished[-1]} cannot be read ({error}); "
+                    "the build command repairs them"
+                ) from error
+            samples += finished
+        if samples:
+            yield samples, {name: np.concatenate(parts) for name, parts in columns.items()}
 
 
 def _add_parameters(known: dict[str, _Parameter], drawn: Any, name: str = "") -> None:
