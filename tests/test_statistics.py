@@ -103,6 +103,8 @@ def test_a_build_writes_the_card_once(copy: Path, monkeypatch: pytest.MonkeyPatc
     made, written = [0], []
 
     class Summary:
+        counts = ()
+
         @property
         def built(self) -> int:
             return made[0]

@@ -4,7 +4,7 @@
 of masks and encodes them, `folder` writes the files and keeps what an interrupted export has finished.
 """
 
-from .contract import Entry, Format, Part, formats
+from .contract import Entry, ExportPart, Format, formats
 from .run import ExportSummary, export_store
 
-__all__ = ["Entry", "ExportSummary", "Format", "Part", "export_store", "formats"]
+__all__ = ["Entry", "ExportPart", "ExportSummary", "Format", "export_store", "formats"]

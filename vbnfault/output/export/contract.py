@@ -20,7 +20,7 @@ from .folder import Folder
 _registry: Registry[type[Format]]
 
 
-class Part(NamedTuple):
+class ExportPart(NamedTuple):
     """Name a part of an export, which is written and resumed as a whole: some samples of one split.
 
     `number` counts the parts of the export. `of_split` and `parts_of_split` count those of the split.
@@ -50,7 +50,7 @@ class Finished:
 
     store: Store
     splits: tuple[str, ...]
-    parts: tuple[Part, ...]
+    parts: tuple[ExportPart, ...]
     folder: Folder
 
     def entries(self, split: str) -> Iterator[Entry]:
@@ -102,7 +102,7 @@ class Format(ABC):
             return self.part_samples
         return max(1, min(1024, self.part_bytes // spec.estimated_sample_bytes))
 
-    def write_part(self, store: Store, part: Part, samples: Iterable[Sample], folder: Folder) -> list[Entry]:
+    def write_part(self, store: Store, part: ExportPart, samples: Iterable[Sample], folder: Folder) -> list[Entry]:
         """Write the files of a part and return the entries of its samples; `samples` are read one at a time."""
         entries = []
         for sample in samples:
@@ -111,7 +111,7 @@ class Format(ABC):
             entries.append(entry)
         return entries
 
-    def files(self, store: Store, part: Part, sample: Sample) -> tuple[Entry, Iterable[tuple[str, bytes]]]:
+    def files(self, store: Store, part: ExportPart, sample: Sample) -> tuple[Entry, Iterable[tuple[str, bytes]]]:
         """Return the entry of a sample, and the names and contents of its files."""
         raise NotImplementedError
 

@@ -27,7 +27,7 @@ from ...dataset.statistics import Statistics, statistics
 from ...store import SPLITS, STRATA, Store, disk, open_store
 from ..json_files import plain
 from .card import export_card
-from .contract import Finished, Format, Part, formats
+from .contract import ExportPart, Finished, Format, formats
 from .folder import Folder
 
 SAMPLES = "samples.jsonl"
@@ -150,15 +150,15 @@ def _column(store: Store, name: str, number: int) -> NDArray[Any]:
         ) from error
 
 
-def _parts(store: Store, size: int) -> tuple[Part, ...]:
+def _parts(store: Store, size: int) -> tuple[ExportPart, ...]:
     """Return the parts of an export: of each split, in ascending order, up to `size` samples."""
     split = [str(name) for number in range(store.shards) for name in _column(store, "split", number)]
-    parts: list[Part] = []
+    parts: list[ExportPart] = []
     for name in (*SPLITS, *sorted(set(split) - set(SPLITS))):
         samples = [i for i, of_sample in enumerate(split) if of_sample == name]
         starts = range(0, len(samples), size)
         for k, start in enumerate(starts):
-            parts.append(Part(len(parts), name, tuple(samples[start : start + size]), k, len(starts)))
+            parts.append(ExportPart(len(parts), name, tuple(samples[start : start + size]), k, len(starts)))
     return tuple(parts)
 
 
@@ -166,7 +166,7 @@ def _parts(store: Store, size: int) -> tuple[Part, ...]:
 
 
 def _write_parts(
-    store: Store, kind: Format, parts: Sequence[Part], folder: Folder, bar: Progress, workers: int
+    store: Store, kind: Format, parts: Sequence[ExportPart], folder: Folder, bar: Progress, workers: int
 ) -> int:
     """Write the parts that are not finished yet, and return how many samples that were."""
     missing = []
@@ -177,7 +177,7 @@ def _write_parts(
         else:
             missing.append(part)
     stop = threading.Event()
-    running: set[Future[Part]] = set()
+    running: set[Future[ExportPart]] = set()
     pool = ThreadPoolExecutor(workers)
     try:
         for part in missing:
@@ -192,7 +192,7 @@ def _write_parts(
     return sum(len(part.samples) for part in missing)
 
 
-def _finished_of(running: set[Future[Part]], bar: Progress) -> set[Future[Part]]:
+def _finished_of(running: set[Future[ExportPart]], bar: Progress) -> set[Future[ExportPart]]:
     """Wait for a part, count its samples, and return what still runs. Raises what writing the part has raised."""
     done, rest = wait(running, return_when=FIRST_COMPLETED)
     for future in done:
@@ -201,7 +201,7 @@ def _finished_of(running: set[Future[Part]], bar: Progress) -> set[Future[Part]]
     return rest
 
 
-def _write_part(store: Store, kind: Format, part: Part, folder: Folder, stop: threading.Event) -> Part:
+def _write_part(store: Store, kind: Format, part: ExportPart, folder: Folder, stop: threading.Event) -> ExportPart:
     """Write the files of a part, and then its record."""
     own, rows = folder.fresh(), []
     layers = kind.layers(store.spec)
@@ -232,7 +232,7 @@ def _row(store: Store, sample: Sample) -> dict[str, Any]:
 # --- at the end ---------------------------------------------------------------------------------------------
 
 
-def _finish(store: Store, kind: Format, parts: Sequence[Part], folder: Folder) -> tuple[str, ...]:
+def _finish(store: Store, kind: Format, parts: Sequence[ExportPart], folder: Folder) -> tuple[str, ...]:
     """Write index, table of samples, card and Croissant description, and return the format's warnings."""
     splits = tuple(dict.fromkeys(part.split for part in parts))
     closing = kind.finish(Finished(store=store, splits=splits, parts=tuple(parts), folder=folder))

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from .... import __version__
 from ....core.quantities import Sample
 from ....store import Store, StoreSpec
-from ..contract import Closing, Entry, Finished, Format, Part, number_text, png
+from ..contract import Closing, Entry, ExportPart, Finished, Format, number_text, png
 from ..regions import Region, coco_text, regions, whole
 
 # regions of one class in one image from which they are written as one crowd region: COCO's own limit of detections
@@ -48,7 +48,7 @@ class Coco(Format):
         """Return image and mask."""
         return ("image", "mask")
 
-    def files(self, store: Store, part: Part, sample: Sample) -> tuple[Entry, Iterable[tuple[str, bytes]]]:
+    def files(self, store: Store, part: ExportPart, sample: Sample) -> tuple[Entry, Iterable[tuple[str, bytes]]]:
         """Return the image of one sample; its annotations are the note of the entry."""
         name = f"images/{part.split}/{number_text(sample.index, store.samples)}.png"
         note = list(annotations_of(store.spec, sample.layers["mask"]))

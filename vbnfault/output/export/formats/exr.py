@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from ....core.images import write_exr
 from ....core.quantities import CHANNELS, Sample
 from ....store import Store, StoreSpec
-from ..contract import Entry, Format, Part, number_text
+from ..contract import Entry, ExportPart, Format, number_text
 from ..folder import Folder
 
 _SKIPPED = ("clean", "mask_any")
@@ -50,7 +50,7 @@ class Exr(Format):
             if name not in _SKIPPED and not name.startswith("without_") and row.dims[-1] in ("x", "xyz", "channel")
         ]
 
-    def write_part(self, store: Store, part: Part, samples: Iterable[Sample], folder: Folder) -> list[Entry]:
+    def write_part(self, store: Store, part: ExportPart, samples: Iterable[Sample], folder: Folder) -> list[Entry]:
         """Write one file for each sample."""
         entries = []
         for sample in samples:

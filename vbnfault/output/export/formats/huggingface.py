@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 
 from ....core.quantities import Sample
 from ....store import STRATA, Store, StoreSpec
-from ..contract import Closing, Entry, Finished, Format, Part, mask_png, number_text, png
+from ..contract import Closing, Entry, ExportPart, Finished, Format, mask_png, number_text, png
 from ..folder import Folder
 
 _IMAGE = {"_type": "Image"}
@@ -43,7 +43,7 @@ class HuggingFace(Format):
         """Return images and masks."""
         return ("image", "clean", "mask", "mask_any")
 
-    def write_part(self, store: Store, part: Part, samples: Iterable[Sample], folder: Folder) -> list[Entry]:
+    def write_part(self, store: Store, part: ExportPart, samples: Iterable[Sample], folder: Folder) -> list[Entry]:
         """Write one Parquet file, a few rows at a time."""
         import pyarrow
         import pyarrow.parquet

@@ -9,7 +9,7 @@ import numpy as np
 
 from ....core.quantities import Sample
 from ....store import Store, StoreSpec
-from ..contract import Entry, Format, Part, mask_png, number_text, png
+from ..contract import Entry, ExportPart, Format, mask_png, number_text, png
 
 _MASKS = ("mask", "mask_effect")
 _PLAIN = ("mask_any", "semantic", "raw")
@@ -42,12 +42,12 @@ class PngFolders(Format):
             if name in (*_MASKS, *_PLAIN) or (row.dtype == "uint8" and row.dims[-1] == "channel")
         ]
 
-    def files(self, store: Store, part: Part, sample: Sample) -> tuple[Entry, Iterable[tuple[str, bytes]]]:
+    def files(self, store: Store, part: ExportPart, sample: Sample) -> tuple[Entry, Iterable[tuple[str, bytes]]]:
         """Return the files of one sample."""
         number = number_text(sample.index, store.samples)
         return Entry(sample.index, f"{part.split}/image/{number}.png"), self._files(store, part, sample, number)
 
-    def _files(self, store: Store, part: Part, sample: Sample, number: str) -> Iterator[tuple[str, bytes]]:
+    def _files(self, store: Store, part: ExportPart, sample: Sample, number: str) -> Iterator[tuple[str, bytes]]:
         """Yield name and content of each file of a sample."""
         for name, layer in sample.layers.items():
             if name in _MASKS:

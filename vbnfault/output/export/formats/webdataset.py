@@ -14,7 +14,7 @@ import numpy as np
 from ....core.quantities import Sample
 from ....store import Store, StoreSpec
 from ...json_files import plain
-from ..contract import Entry, Format, Part, mask_png, number_text, png
+from ..contract import Entry, ExportPart, Format, mask_png, number_text, png
 from ..folder import Folder
 
 _ARRAYS = ("depth_m", "normal")
@@ -48,7 +48,7 @@ class WebDataset(Format):
         wanted = ("image", "clean", "mask", *_PLAIN, *_ARRAYS)
         return [name for name in wanted if name in spec.pixel_layers]
 
-    def write_part(self, store: Store, part: Part, samples: Iterable[Sample], folder: Folder) -> list[Entry]:
+    def write_part(self, store: Store, part: ExportPart, samples: Iterable[Sample], folder: Folder) -> list[Entry]:
         """Write one tar file."""
         name = f"{part.split}-{part.of_split:06d}.tar"
         entries: list[Entry] = []

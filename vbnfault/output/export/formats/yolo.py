@@ -9,7 +9,7 @@ import numpy as np
 
 from ....core.quantities import Sample
 from ....store import SPLITS, Store, StoreSpec
-from ..contract import Closing, Entry, Finished, Format, Part, number_text, png
+from ..contract import Closing, Entry, ExportPart, Finished, Format, number_text, png
 from ..regions import Region, polygon, regions
 
 
@@ -39,7 +39,7 @@ class Yolo(Format):
         """Return image and mask."""
         return ("image", "mask")
 
-    def files(self, store: Store, part: Part, sample: Sample) -> tuple[Entry, Iterable[tuple[str, bytes]]]:
+    def files(self, store: Store, part: ExportPart, sample: Sample) -> tuple[Entry, Iterable[tuple[str, bytes]]]:
         """Return image, outlines and boxes of one sample."""
         spec, name = store.spec, f"{part.split}/{number_text(sample.index, store.samples)}"
         found = [
