@@ -146,6 +146,21 @@ def test_the_faintest_and_the_rarest() -> None:
     assert fault.draw(replace(c, sun_visible_fraction=0.0), rng())["count"] == 0
 
 
+def test_a_cloud_so_dense_that_every_grain_is_spread_wide(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of 1e6 pebbles and boulders per m³ some are shown, and at most twice the stated number is tried."""
+    tried = []
+    candidates = _Population._candidates
+
+    def counted(self: _Population, count: int, generator: np.random.Generator) -> Any:
+        tried.append(count)
+        return candidates(self, count, generator)
+
+    monkeypatch.setattr(_Population, "_candidates", counted)
+    dense = make("particles", density_per_m3=1e6, radius_mm=[1.0, 1000.0], most_grains=300)
+    assert dense.draw(context(), rng(1))["count"] == 300
+    assert sum(tried) < 2.1 * 300_000
+
+
 def test_speeds_and_directions() -> None:
     """Across the line of sight a grain of the radius a moves v √(1 mm / a) in a second: f v t / Z in the image."""
     still, c = all_seen(density_per_m3=5.0)

@@ -42,7 +42,7 @@ Sun's disc. Where the depth of the scene is known, nearer ground hides a grain.
 
 **What is left out.** Grains whose light, spread evenly over their figure, is below `least_noise` of the noise of a
 dark pixel; all of them together are the diffuse coma. Of more than `most_grains` the brightest stay; of so many
-that 3e5 of them had to be tried, those above a higher limit.
+that 3e5 of them had to be tried, those above a higher limit, or any of them if none is above it.
 
 The parameters list the grains, one list for each property: position and extent of the streak in pixels, radius,
 depth, distance, and irradiance at the camera.
@@ -429,13 +429,17 @@ class _Population:
         self.radius_mm = np.geomspace(low, max(high, low * (1 + 1e-9)), _RADII)
         number = (self.radius_mm / self.radius_mm[0]) ** (1 - fault.size_exponent)  # per step of log a
         self.bright = self._brightest_e_m2()  # float64[node]
-        while True:
-            volume_m3 = np.sum(self._parts(self.radius_mm), axis=0)
-            self.shown_below = _summed(number * volume_m3) / _summed(number)[-1]
-            self.mean = float(density * self.shown_below[-1])
-            if self.mean <= _MOST_DRAWN:
-                break
+        self._number, self._density, self._wanted_e = number, density, self.least_e
+        self.mean = self._drawn_on_average()
+        while self.mean > _MOST_DRAWN:
             self.least_e *= 1.5
+            self.mean = self._drawn_on_average()
+
+    def _drawn_on_average(self) -> float:
+        """Return the mean number of grains to try with the limit `least_e`."""
+        volume_m3 = np.sum(self._parts(self.radius_mm), axis=0)
+        self.shown_below = _summed(self._number * volume_m3) / _summed(self._number)[-1]
+        return float(self._density * self.shown_below[-1])
 
     def _speed(self, radius_mm: F64, at_1mm_m_s: F64 | float) -> F64:
         """Return the speeds of grains, in m/s."""
@@ -496,12 +500,22 @@ class _Population:
         none = self._candidates(0, rng)
         if self.mean < 1e-300 or self.electrons <= 0:
             return none
-        for _ in range(_ROUNDS):
+        for _ in range(int(np.clip(_MOST_DRAWN / max(self.mean, 1), 1, _ROUNDS))):
             for grains in self._experiments(rng):
                 if len(grains.x_px):
-                    brightest = np.argsort(-self._level_e(grains), kind="stable")
-                    return grains.select(np.sort(brightest[: int(self.fault.most_grains)]))
+                    return self._brightest(grains)
+        if self.least_e > self._wanted_e:
+            # the light of all is spread over so many pixels that none reaches the higher limit: any of them serve
+            self.least_e = self._wanted_e
+            self.mean = min(self._drawn_on_average(), _MOST_DRAWN)
+            for grains in self._experiments(rng):
+                return self._brightest(grains)
         return none
+
+    def _brightest(self, grains: _GrainsInView) -> _GrainsInView:
+        """Return at most `most_grains` grains, in their order."""
+        brightest = np.argsort(-self._level_e(grains), kind="stable")
+        return grains.select(np.sort(brightest[: int(self.fault.most_grains)]))
 
     def _experiments(self, rng: np.random.Generator) -> Iterator[_GrainsInView]:
         """Return the grains that show in independent draws of at least one candidate each, some at once if few."""
