@@ -19,6 +19,7 @@ from vbnfault.dataset.identity import scene_identity, stored_scene
 from vbnfault.pipeline import Session
 from vbnfault.scene import config
 from vbnfault.scene.target import AlbedoMapTable
+from vbnfault.world import surface_map
 from vbnfault.world.surface_map import load_albedo_map
 
 Array = NDArray[np.float64]
@@ -75,9 +76,19 @@ def orbit_scene(path: Path, **map_keys: Any) -> dict[str, Any]:
 
 
 @pytest.mark.filterwarnings("ignore:body.shape = 'ellipsoid'")  # it turns as 67P does, which does not matter here
-def test_a_bright_quadrant_lies_at_its_longitudes_and_latitudes(tmp_path: Path) -> None:
-    path = written(tmp_path / "map.png", np.roll(quadrant(), 64, axis=1))
-    scene = config.parse_scene(orbit_scene(path, left_longitude_deg=0.0), source="t.toml")
+@pytest.mark.parametrize(
+    ("projection", "left_longitude_deg"),
+    [("equirectangular", 0.0), ("equirectangular", -180.0), ("cylindrical_equal_area", 90.0)],
+)
+def test_a_bright_quadrant_lies_at_its_longitudes_and_latitudes(
+    tmp_path: Path, projection: str, left_longitude_deg: float
+) -> None:
+    image = np.roll(quadrant(), -round((left_longitude_deg + 180) / 360 * 128), axis=1)
+    if projection == "cylindrical_equal_area":
+        image = image[::2]  # half as many rows: any height will do, and the equator stays in the middle
+    path = written(tmp_path / "map.png", image)
+    table = orbit_scene(path, left_longitude_deg=left_longitude_deg, projection=projection)
+    scene = config.parse_scene(table, source="t.toml")
     dataset.build_scene(scene, tmp_path / "s.zarr", source="t.toml", workers=1)
     seen = np.zeros(2, dtype=int)
     with store.open_dataset(tmp_path / "s.zarr") as data:
@@ -211,6 +222,30 @@ def test_a_coloured_map_acts_on_its_bands(tmp_path: Path) -> None:
         device_map(tmp_path / "m.png", neutral="mean", wavelength_nm=(450.0, 550.0, 650.0)), [0.0], [0.0]
     )
     np.testing.assert_allclose(mean[:, 0], np.array([51, 102, 255]) / 136, atol=1e-4)
+
+
+def test_an_equal_area_map_keeps_area_and_latitudes(tmp_path: Path) -> None:
+    """Rows are at equal steps of the sine: the cap north of 30°, a quarter of the area, is the upper quarter."""
+    image = np.full((400, 360), 51, dtype=np.uint8)
+    image[:100] = 255
+    keys = {"file": str(written(tmp_path / "m.png", image)), "projection": "cylindrical_equal_area"}
+    loaded = load_albedo_map(AlbedoMapTable(**keys))
+    assert loaded.levels[0].shape == (182, 360, 1)
+    latitude = 90 - (np.arange(180) + 0.5)
+    rows = loaded.levels[0][1:-1, 0, 0]
+    np.testing.assert_allclose(rows[latitude > 30.5], 1 / 0.4, rtol=1e-5)  # 0.4: a quarter of 1, the rest 0.2
+    np.testing.assert_allclose(rows[latitude < 29.5], 0.2 / 0.4, rtol=1e-5)
+    rng = np.random.default_rng(3).uniform(0.1, 1, (50, 64, 1)).astype(np.float32)
+    weights = np.cos((0.5 - (np.arange(32) + 0.5) / 32) * np.pi)
+    even = surface_map._with_equal_latitudes(rng)
+    assert even.shape == (32, 64, 1)
+    # the weights of the test are those of the rows' centres, 2e-4 from those of their areas
+    np.testing.assert_allclose(np.average(even, axis=0, weights=weights), rng.mean(axis=0), rtol=2e-3)
+    odd = {**keys, "file": str(written(tmp_path / "odd.png", image[:, :-1]))}
+    with pytest.raises(InputError, match=r"has 359 x 400 pixels; a map with projection = 'cylindrical_equal_area'"):
+        load_albedo_map(AlbedoMapTable(**odd))
+    with pytest.raises(InputError, match=r"body\.albedo_map\.projection = 'mercator': must be "):
+        config.parse_scene(orbit_scene(Path("m.png"), projection="mercator"), source="t.toml")
 
 
 def test_the_mean_is_over_the_area_of_the_body(tmp_path: Path) -> None:

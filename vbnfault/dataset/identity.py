@@ -74,6 +74,8 @@ def scene_identity(session: pipeline.Session) -> dict[str, Any]:
         scene[f"{folder}_sha256"] = user_files.sha256(data)
     if session.scene.body.atmosphere is None:
         del scene["body"]["atmosphere"]  # stores of scenes without one stay as they were
+    if (albedo_map := session.scene.body.albedo_map) and albedo_map.projection == "equirectangular":
+        del scene["body"]["albedo_map"]["projection"]
     if session.scene.coma is None:
         del scene["coma"]
     if session.scene.camera.point_spread is None:

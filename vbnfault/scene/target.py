@@ -44,16 +44,23 @@ EARTH = "earth"
 
 
 class AlbedoMapTable(Table):
-    """Give a map whose values multiply the albedo of the body: an equirectangular image of the whole body.
+    """Give a map whose values multiply the albedo of the body: an image of the whole body in a stated projection.
 
     Columns are longitudes, which increase to the east (right); rows are planetocentric latitudes from 90° north
-    (top) to 90° south. Both are those of the body-fixed frame T: longitude 0 on +x, the north pole on +z.
+    (top) to 90° south, or their sines. Both are those of the body-fixed frame T: longitude 0 on +x, the north pole
+    on +z.
     """
 
     file: str = Field(
-        description="PNG or TIFF file, grey or RGB, 8, 16 or 32 bits, twice as wide as high; or 'earth': a "
+        description="PNG or TIFF file, grey or RGB, 8, 16 or 32 bits, twice as wide as high if it is "
+        "equirectangular; or 'earth': a "
         "procedural Earth with oceans, continents, ice and clouds, sharp at any distance, whose mean albedo is "
         "that of [body]"
+    )
+    projection: Literal["equirectangular", "cylindrical_equal_area"] = Field(
+        "equirectangular",
+        description="of the image: rows at equal steps of the latitude (simple cylindrical, plate carrée), or of "
+        "its sine (Lambert's cylindrical equal-area projection, of any height)",
     )
     left_longitude_deg: float = Field(
         -180.0, ge=-360, le=360, description="east longitude of the left edge; 0 for a map from 0 to 360°"
@@ -69,14 +76,11 @@ class AlbedoMapTable(Table):
 
     @model_validator(mode="after")
     def _one_earth(self) -> AlbedoMapTable:
-        if self.file == EARTH and (self.left_longitude_deg, self.encoding, self.neutral) != (
-            -180,
-            "linear",
-            "mean",
-        ):
+        given = (self.projection, self.left_longitude_deg, self.encoding, self.neutral)
+        if self.file == EARTH and given != ("equirectangular", -180, "linear", "mean"):
             raise ValueError(
-                "file = 'earth': takes no left_longitude_deg, encoding or neutral, which are for files; leave them "
-                "out"
+                "file = 'earth': takes no left_longitude_deg, projection, encoding or neutral, which are for "
+                "files; leave them out"
             )
         return self
 

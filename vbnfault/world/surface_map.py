@@ -1,7 +1,8 @@
 """Read a map of a body's albedo and prepare it for filtered look-ups.
 
-A map is a simple cylindrical (equirectangular) image of the whole body: columns are planetocentric longitudes that
-increase to the east, rows are planetocentric latitudes from the north pole (top) to the south pole.
+A map is an image of the whole body: columns are planetocentric longitudes that increase to the east, rows are
+planetocentric latitudes (equirectangular projection) or their sines (cylindrical equal-area projection) from the
+north pole (top) to the south pole. The latter is resampled to the former.
 """
 
 from __future__ import annotations
@@ -60,7 +61,14 @@ def _factors(table: AlbedoMapTable) -> Float32:
     values = image[:, :, None] if image.ndim == 2 else image[:, :, :3]
     rows, columns, channels = values.shape
     _check_values(path, rows, columns, channels)
-    if columns != 2 * rows or rows < _LEAST_ROWS:
+    is_equal_area = table.projection == "cylindrical_equal_area"
+    if is_equal_area and (columns % 2 or columns < 2 * _LEAST_ROWS or rows < _LEAST_ROWS):
+        raise InputError(
+            f"body.albedo_map.file = {path!r}: has {columns} x {rows} pixels; a map with projection = "
+            f"'cylindrical_equal_area' has an even number of columns, at least {2 * _LEAST_ROWS}, and at least "
+            f"{_LEAST_ROWS} rows"
+        )
+    if not is_equal_area and (columns != 2 * rows or rows < _LEAST_ROWS):
         raise InputError(
             f"body.albedo_map.file = {path!r}: has {columns} x {rows} pixels; a map of the whole body has twice as "
             f"many columns as rows, and at least {_LEAST_ROWS} rows"
@@ -78,6 +86,10 @@ def _factors(table: AlbedoMapTable) -> Float32:
         values = values[..., :1]
     if table.encoding == "srgb":  # IEC 61966-2-1
         values = np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4).astype(np.float32)
+    if is_equal_area:
+        values = _with_equal_latitudes(values)
+        rows = len(values)
+        _check_values(path, rows, columns, channels)
     neutral = table.neutral
     if neutral == "mean":  # over the area, and over the channels, so that a map keeps its colour
         latitude = (0.5 - (np.arange(rows) + 0.5) / rows) * np.pi
@@ -85,6 +97,23 @@ def _factors(table: AlbedoMapTable) -> Float32:
         if neutral <= 0:
             raise InputError(f"body.albedo_map.file = {path!r}: is black; give body.albedo_map.neutral")
     return np.asarray(values / neutral, dtype=np.float32)
+
+
+def _with_equal_latitudes(values: Float32) -> Float32:
+    """Return a map with rows at equal steps of the latitude from one with rows at equal steps of its sine.
+
+    It has half as many rows as columns. Each new row is the mean of the old ones over its range of sines, so that area times value is kept.
+    """
+    old, columns, channels = values.shape
+    # the integral from the top down to each border between rows, linear within a row
+    total = np.zeros((old + 1, columns * channels))
+    np.cumsum(values.reshape(old, -1), axis=0, out=total[1:])
+    borders = (1 - np.cos(np.linspace(0, np.pi, columns // 2 + 1))) / 2 * old
+    low = np.minimum(borders.astype(int), old - 1)
+    part = (borders - low)[:, None]
+    at_borders = total[low] * (1 - part) + total[low + 1] * part
+    means = np.diff(at_borders, axis=0) / np.diff(borders)[:, None]
+    return means.reshape(columns // 2, columns, channels).astype(np.float32)
 
 
 def _check_values(path: str, rows: int, columns: int, channels: int) -> None:
