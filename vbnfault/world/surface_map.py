@@ -102,7 +102,8 @@ def _factors(table: AlbedoMapTable) -> Float32:
 def _with_equal_latitudes(values: Float32) -> Float32:
     """Return a map with rows at equal steps of the latitude from one with rows at equal steps of its sine.
 
-    It has half as many rows as columns. Each new row is the mean of the old ones over its range of sines, so that area times value is kept.
+    It has half as many rows as columns. Each row is the mean of the old ones over its range of sines, so that area
+    times value is kept.
     """
     old, columns, channels = values.shape
     # the integral from the top down to each border between rows, linear within a row
