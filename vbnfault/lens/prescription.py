@@ -106,6 +106,18 @@ class Surface:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Hood:
+    """Describe a hood: a round edge of `radius_mm`, `length_mm` before the first vertex, around the axis.
+
+    It keeps light out that comes from the side. Its wall between this edge and the lens may be a cylinder or a
+    cone, and is black.
+    """
+
+    length_mm: float
+    radius_mm: float
+
+
+@dataclass(frozen=True, kw_only=True)
 class Prescription:
     """Describe a lens by its surfaces, front to back, with air in front and behind.
 
@@ -117,6 +129,8 @@ class Prescription:
         Fraction of the light that the sensor reflects, the same at all angles.
     scale
         Factor by which the lens was scaled since it was read.
+    hood
+        What stands before the lens; None: nothing.
     """
 
     name: str
@@ -124,6 +138,7 @@ class Prescription:
     surfaces: tuple[Surface, ...]
     sensor_reflectance: float = 0.0
     scale: float = 1.0
+    hood: Hood | None = None
 
     @property
     def stop(self) -> int:
@@ -142,7 +157,8 @@ class Prescription:
     def scaled(self, factor: float) -> Prescription:
         """Return the lens with every length of its drawing multiplied by a factor.
 
-        These lengths are radii, thicknesses (of elements, gaps and plates), rims, stop and aspheric coefficients.
+        These lengths are radii, thicknesses (of elements, gaps and plates), rims, stop, hood and aspheric
+        coefficients.
 
         Some properties keep their physical size: the layers of coatings in nm and therefore their reflectance,
         roughness in nm, grains of dust in µm, the number of particles per area at a cleanliness level, and the
@@ -159,7 +175,8 @@ class Prescription:
             )
             for s in self.surfaces
         )
-        return replace(self, surfaces=surfaces, scale=self.scale * factor)
+        hood = self.hood and Hood(length_mm=self.hood.length_mm * factor, radius_mm=self.hood.radius_mm * factor)
+        return replace(self, surfaces=surfaces, scale=self.scale * factor, hood=hood)
 
     def with_round_stop(self) -> Prescription:
         """Return the lens with a round stop of the same area, for models with rotational symmetry."""

@@ -19,7 +19,7 @@ from ..core.errors import InputError
 from ..core.tables import Fraction, Table
 from .coating import Layer
 from .glass import AIR, CLEAR, D_NM, GLASSES, Glass, Transmittance, check_index, from_abbe, from_coefficients
-from .prescription import Prescription, Surface, facing_air
+from .prescription import Hood, Prescription, Surface, facing_air
 from .zemax import LENS_SUFFIX, GlassCatalogue, read_catalogue, read_lens
 
 _RIM_POINTS = 65
@@ -127,6 +127,15 @@ Row = Annotated[
 ]
 
 
+class HoodTable(Table):
+    """Describe a hood before the lens, which keeps light from the side out of it; its edge is round."""
+
+    length_mm: float = Field(gt=0, le=1e6, description="distance of its edge before the first vertex")
+    radius_mm: float = Field(
+        gt=0, le=1e6, description="radius of its edge, at least that of the first surface's rim"
+    )
+
+
 class PrescriptionFile(Table):
     """Describe a lens by its surfaces, front to back, with air in front and behind."""
 
@@ -135,6 +144,7 @@ class PrescriptionFile(Table):
     glass_catalogues: tuple[str, ...] = Field(
         (), description="glass catalogues (.agf) whose glasses the rows may name; paths from the file's folder"
     )
+    hood: HoodTable | None = Field(None, description="what stands before the lens; default: nothing")
     surface: tuple[Row, ...] = Field(min_length=1, description="rows of the prescription, counted from 0")
 
     @model_validator(mode="after")
@@ -211,6 +221,7 @@ def _prescription(file: PrescriptionFile, source: str, catalogues: Sequence[Glas
         source=file.source,
         surfaces=surfaces,
         sensor_reflectance=file.sensor_reflectance,
+        hood=None if file.hood is None else Hood(**file.hood.model_dump()),
     )
     _check(lens, source)
     return lens
@@ -296,7 +307,22 @@ def _coating(given: str | tuple[CoatingLayer, ...], front: Glass, back: Glass, w
 
 
 def _check(lens: Prescription, source: str) -> None:
-    """Raise InputError unless the lens has its stop in one medium, ends in air, and no two surfaces cross."""
+    """Raise InputError unless the lens has its stop in one medium, ends in air, and no two surfaces cross.
+
+    A hood stands before the first surface and is at least as wide.
+    """
+    first = lens.surfaces[0]
+    if lens.hood is not None and lens.hood.radius_mm < first.semi_diameter_mm:
+        raise InputError(
+            f"{source}: hood.radius_mm = {lens.hood.radius_mm:g}: must be at least {first.semi_diameter_mm:g}, the "
+            "radius of the first surface's rim"
+        )
+    bulge = -float(np.min(first.sag_mm(np.linspace(0, first.semi_diameter_mm, _RIM_POINTS))))
+    if lens.hood is not None and lens.hood.length_mm < bulge:
+        raise InputError(
+            f"{source}: hood.length_mm = {lens.hood.length_mm:g}: must be at least {bulge:g}, where the first "
+            "surface's rim stands"
+        )
     if lens.surfaces[-1].medium.nd != 1.0:
         raise InputError(f"{source}: surface[{len(lens.surfaces) - 1}].nd: behind the last surface there is air")
     media = (AIR, *(s.medium for s in lens.surfaces))
@@ -324,7 +350,10 @@ def to_table(lens: Prescription) -> dict[str, Any]:
     rows = [_row(surface) for surface in lens.surfaces]
     if lens.sensor_reflectance:
         rows.append({"sensor": True, "reflectance": lens.sensor_reflectance})
-    return {"name": lens.name, "source": lens.source, "surface": rows}
+    head: dict[str, Any] = {"name": lens.name, "source": lens.source}
+    if lens.hood is not None:
+        head["hood"] = {"length_mm": lens.hood.length_mm, "radius_mm": lens.hood.radius_mm}
+    return {**head, "surface": rows}
 
 
 def _row(surface: Surface) -> dict[str, Any]:

@@ -59,6 +59,11 @@ def layout(lens: Prescription, *, half_field_deg: float = 20.0) -> Figure:
     axes = figure.add_subplot()
     _draw_rays(axes, lens, half_field_deg)
     outline = _draw_surfaces(axes, lens)
+    if lens.hood is not None:
+        rim = lens.surfaces[0]
+        for side in (-1, 1):
+            z = [-lens.hood.length_mm, float(rim.sag_mm(rim.semi_diameter_mm))]
+            axes.plot(z, [side * lens.hood.radius_mm, side * rim.semi_diameter_mm], color="black", lw=2.5)
     sensor = lens.vertices_mm[-1] + optics.bfd_mm
     half = optics.efl_mm * np.tan(np.radians(half_field_deg))
     axes.plot([sensor, sensor], [-half, half], color="black", lw=2)
@@ -103,9 +108,11 @@ def _draw_surfaces(axes: Any, lens: Prescription) -> list[tuple[float, float]]:
 
 
 def _draw_rays(axes: Any, lens: Prescription, half_field_deg: float) -> None:
-    """Draw the rays of each field that reach the sensor."""
+    """Draw the rays of each field that come past the hood and reach the sensor."""
     optics, pupil = paraxial_properties(lens), real_pupil_diameter_mm(lens)
     front = min(float(z.min()) for z, _ in _edges(lens))
+    if lens.hood is not None:
+        front = min(front, -lens.hood.length_mm)
     # rays start on a plane in front of all surfaces and aim at the entrance pupil
     start = front - 0.12 * (lens.vertices_mm[-1] + optics.bfd_mm)
     for fraction, colour in zip(_FIELDS, _COLOURS, strict=True):
@@ -124,7 +131,11 @@ def _draw_rays(axes: Any, lens: Prescription, half_field_deg: float) -> None:
             va="center",
             color=colour,
         )
-        for ray in np.moveaxis(traced.points_mm[:, traced.arrives], 1, 0):
+        arrives = traced.arrives
+        if lens.hood is not None:
+            at_hood = origin[:, 1] - slope * (origin[:, 2] + lens.hood.length_mm)
+            arrives = arrives & (np.abs(at_hood) <= lens.hood.radius_mm)
+        for ray in np.moveaxis(traced.points_mm[:, arrives], 1, 0):
             axes.plot(ray[:, 2], ray[:, 1], color=colour, lw=0.6)
 
 

@@ -422,14 +422,14 @@ class SceneEvaluator:
         glare_key = light.glare_key, light.glare_samples_key
         with self.kept.timed("light"):
             parts = {
-                "ghosts": self._channels("ghosts", levels.mixed, light.ghost_key, per_s * light.lit),
+                "ghosts": self._channels("ghosts", levels.mixed, light.ghost_key, per_s * light.past_baffle),
                 "starburst": self._channels("starburst", burst.mixed, light.starburst_key, per_s * burst_gain),
                 "glare": self._channels("glare", lambda w: samples.mixed(table, w), glare_key, per_s * glare_gain),
             }
             entering, veil_plane = light.veil_light()
             taken = (burst.flux_mm2 + burst.beyond_mm2) * burst_gain + entering
             taken = taken + (samples.flux_mm2(table) + glare_beyond) * glare_gain
-            direct_left = source.channel_mean(light.direct_fraction(levels.flux_mm2 * light.lit, taken))
+            direct_left = source.channel_mean(light.direct_fraction(levels.flux_mm2 * light.past_baffle, taken))
             seconds = np.float32(camera.exposure_s)
             added = parts["ghosts"][0] + parts["starburst"][0]
             added += parts["glare"][0]
@@ -448,7 +448,7 @@ class SceneEvaluator:
             left = scene_e * (1 - lost).astype(np.float32)[:, None, None]
             if exposed.direct_e is not None:
                 left += exposed.direct_e * direct_left.astype(np.float32)[:, None, None]
-        ghosts_e = self._single_ghosts(light, per_s * light.lit * camera.exposure_s / pitch_mm**2)
+        ghosts_e = self._single_ghosts(light, per_s * light.past_baffle * camera.exposure_s / pitch_mm**2)
         totals = {name: float(total.mean() * camera.exposure_s) for name, (_, total) in parts.items()}
         return {"kept": left, "added": added, "parts_e": totals, "ghosts_e": ghosts_e}
 

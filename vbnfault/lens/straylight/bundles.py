@@ -297,6 +297,8 @@ class Tracer:
         self.met = np.concatenate([met for _, met in pairs_of]) if pairs_of else np.zeros((0, 2, 2))
         self._tables = self._upload()
         self._recorded: dict[Any, Any] = {}
+        # width of the soft edge of the hood, in its radii; whoever knows the Sun's disc sets it
+        self.hood_width = 1e-3
 
     def _upload(self) -> dict[str, Any]:
         """Compute the tables of all steps, and return the tables that are stored on the device."""
@@ -421,7 +423,7 @@ class Tracer:
         centred, light = options.get("centred", False), options.get("light", True)
         even = options.get("halved", True) and not rays.direction[:, 1].any() and not rays.box_mm[:, 1].any()
         single = len(self.routes) == len(self.wavelength_nm) == len(rays) == 1
-        plain = width is None and not light and not even and not self._bladed
+        plain = width is None and not light and not even and not self._bladed and self.lens.hood is None
         if single and plain and (centred or rays.disc is None):
             return self._alone(rays, side, centred)
         be = backend()
@@ -431,7 +433,8 @@ class Tracer:
         per_width = (np.zeros(len(self.rows)) if width is None else 1 / width).astype(np.float32)
         sides = 2 if even and self._bladed else 1
         none, unit = dr.zeros(be.Float, count), dr.full(be.Float, 1, count)
-        rim = (none, dr.full(be.Float, 1e6, count)) if soft else (none,)
+        outside, margin = self._hood_rim(start)
+        rim = (outside * outside, margin) if soft else (outside * outside,)
         ray = (start.x, start.y, none, start.dx, start.dy, start.dz, unit, *(rim * sides))
         if len(self.routes) == len(self.wavelength_nm) == 1:
             # one path and one wavelength: all numbers are constants of the kernel, and nothing is fetched
@@ -451,6 +454,18 @@ class Tracer:
             dr.scatter(out, mirrored, start.mirrored)
         dr.eval(whole)
         return Spots(rays, side, *whole)
+
+    def _hood_rim(self, start: Any) -> tuple[Any, Any]:
+        """Return the relative radius of each ray at the hood, and its margin there, as in `Spots`."""
+        be, hood = backend(), self.lens.hood
+        dr, count = be.dr, be.dr.width(start.x)
+        if hood is None:
+            return dr.zeros(be.Float, count), dr.full(be.Float, 1e6, count)
+        length, per_radius = (dr.opaque(be.Float, v) for v in (hood.length_mm, 1 / hood.radius_mm))
+        before = length / start.dz
+        x, y = dr.fma(-before, start.dx, start.x), dr.fma(-before, start.dy, start.y)
+        outside = dr.sqrt(x * x + y * y) * per_radius
+        return outside, (1 - outside) * dr.opaque(be.Float, 1 / self.hood_width)
 
     def _followed(
         self, ray: tuple[Any, ...], start: Any, per_width: NDArray[np.float32], soft: bool

@@ -629,6 +629,7 @@ def response_key(
         "indices": [lens.indices(nm).tolist() for nm in traced_nm],
         "absorption": [[s.absorption_per_mm(nm) for s in lens.surfaces] for nm in wavelength_nm],
         "sensor_reflectance": lens.sensor_reflectance,
+        "hood": lens.hood and dataclasses.asdict(lens.hood),
         "wavelength_nm": wavelength_nm,
         "cells": dataclasses.asdict(cells),
         "settings": [settings.model, settings.reflections, coating_loss],

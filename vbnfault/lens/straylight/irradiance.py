@@ -111,12 +111,7 @@ class ParaxialTracer(Tracer):
             margin = dr.minimum(margin, (1 - beyond) * dr.gather(be.Float, per_width, step))
             return step + 1, dr.maximum(radius, beyond), margin
 
-        count = dr.width(x)
-        first = (
-            dr.gather(be.UInt32, t["start"], start.route),
-            dr.zeros(be.Float, count),
-            dr.full(be.Float, 1e6, count),
-        )
+        first = (dr.gather(be.UInt32, t["start"], start.route), *self._hood_rim(start))
         _, radius, margin = dr.while_loop(first, on, body, mode="symbolic")
         spots = Spots(
             rays=rays,
@@ -205,6 +200,9 @@ class FlareModel:
         at = np.arange((len(self.nodes_nm) - 1) * _SUBDIVISIONS + 1) / _SUBDIVISIONS
         self._fine = np.interp(at, np.arange(len(self.nodes_nm)), self.nodes_nm)
         self._tracer = kind(lens, self._fine, reflections=settings.reflections)
+        if lens.hood is not None:
+            shift = sun_radius_rad * lens.hood.length_mm / lens.hood.radius_mm  # of the edge's shadow
+            self._tracer.hood_width = max(shift, self._tracer.hood_width)
         self._diffraction, self._across = settings.diffraction, settings.across
         self._reach_mm = float(np.hypot(*shape) / 2 * pitch_mm)
         self._last_boxes: tuple[tuple[float, float], tuple[Tracer, Rays, Arrivals]] | None = None

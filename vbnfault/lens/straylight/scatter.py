@@ -604,6 +604,21 @@ def point_source_transmittance(
 # --- a baffle ---------------------------------------------------------------------------------------------------
 
 
+def hood_transmission(lens: Prescription, slope: ArrayLike) -> F64:
+    """Return the fraction of the lens's first rim that far sources light past its hood, float64 like `slope`.
+
+    `slope` is the tangent of the field angle. The fraction is the overlap of two circles: the rim, and the hood's
+    edge, whose shadow is shifted by length × slope. Beyond the cutoff, where the shift is the sum of both radii, it
+    is 0. Without a hood it is 1.
+    """
+    shift = np.abs(np.asarray(slope, dtype=np.float64))
+    if lens.hood is None:
+        return np.ones(shift.shape)
+    small = lens.surfaces[0].semi_diameter_mm
+    overlap = disc_overlap(lens.hood.length_mm * shift, small, lens.hood.radius_mm)
+    return np.clip(overlap / (np.pi * small**2), 0.0, 1.0)
+
+
 def baffle_transmission(
     sun_deg: ArrayLike,
     *,

@@ -31,7 +31,7 @@ from ..thin import cos4_map
 from .ghost_response import GhostResponse, PolarCells, ghost_response
 from .irradiance import disc_samples
 from .paraxial import axial_transmittance
-from .scatter import baffle_transmission, glare_kernels, scattered_fraction
+from .scatter import baffle_transmission, glare_kernels, hood_transmission, scattered_fraction
 from .scene_scatter import DirectionGrid, SeparatedKernel, separated
 from .settings import Baffle, SensorGrid, StraylightSettings
 
@@ -250,7 +250,10 @@ class SceneInLens:
             return np.zeros((len(weights), *self.sensor.shape), dtype=np.float32)
         light = sum(self._places(grid).polar @ irradiance.T for grid, irradiance in sources)
         light = light.reshape(len(cells.slopes), cells.azimuths, len(self.nodes_nm))
-        light *= self._lit(np.array(cells.slopes)).astype(np.float32)[:, None, None]
+        # rays of ghosts meet the hood themselves
+        light *= lit_fraction(self.lens, self.settings.baffle, np.array(cells.slopes)).astype(np.float32)[
+            :, None, None
+        ]
         return response.image(light, weights, self.sensor)
 
     def glare(self, sources: Sequence[Sources], weights: F64) -> F32:
@@ -342,8 +345,9 @@ class SceneInLens:
         return np.where(single > 0, fraction / np.where(single > 0, single, 1), 1.0)
 
     def _lit(self, slope: F64) -> F64:
-        """Return the fraction of the lens's entrance that sources at field angles light through the baffle."""
-        return lit_fraction(self.lens, self.settings.baffle, slope)
+        """Return the fraction of the lens's entrance that sources light through the baffle and past the hood."""
+        past_baffle = lit_fraction(self.lens, self.settings.baffle, slope)
+        return np.minimum(past_baffle, hood_transmission(self.lens, slope))
 
 
 def lit_fraction(lens: Prescription, baffle: Baffle, slope: F64) -> F64:

@@ -39,7 +39,14 @@ from ..thin import cos4_map
 from .irradiance import FlareModel, flare_model
 from .paraxial import axial_transmittance
 from .pyramid import Pyramid
-from .scatter import Cleanliness, VeilingGlare, baffle_transmission, scattered_fraction, veiling_glare
+from .scatter import (
+    Cleanliness,
+    VeilingGlare,
+    baffle_transmission,
+    hood_transmission,
+    scattered_fraction,
+    veiling_glare,
+)
 from .settings import DEFAULT, Baffle, DirectPath, SensorGrid, StraylightSettings, SunSource
 from .starburst import Starburst, StarburstFrame, starburst
 
@@ -107,8 +114,8 @@ class SunlightInLens:
         float64[band]: transmittance of the lens along its axis, and of the path of the direct image.
     admitted_mm2, beam_fraction
         As in `DirectPath`.
-    lit
-        Fraction of the entrance that the Sun lights.
+    past_baffle, past_hood
+        Fraction of the entrance that the Sun lights through the baffle, and past the lens's own hood.
     pupil_mm2
         Area of the paraxial entrance pupil across the Sun's direction.
     """
@@ -122,7 +129,8 @@ class SunlightInLens:
     passed: F64
     admitted_mm2: float
     beam_fraction: float
-    lit: float
+    past_baffle: float
+    past_hood: float
     pupil_mm2: float
 
     @classmethod
@@ -167,7 +175,8 @@ class SunlightInLens:
             passed=np.broadcast_to(path.transmittance, own.shape),
             admitted_mm2=path.admitted_mm2,
             beam_fraction=path.beam_fraction,
-            lit=_lit_fraction(lens, settings.baffle, sun.angle_deg),
+            past_baffle=_lit_fraction(lens, settings.baffle, sun.angle_deg),
+            past_hood=float(hood_transmission(lens, np.tan(np.radians(sun.angle_deg)))),
             pupil_mm2=pupil_mm2,
         )
 
@@ -177,7 +186,7 @@ class SunlightInLens:
         burst, burst_beyond = self.starburst()
         glare, glare_beyond = self.glare()
         veil, veil_beyond = self.veil()
-        ghosts = self.ghost_model().image(self.sun.angle_deg, self.sun.azimuth_deg) * np.float32(self.lit)
+        ghosts = self.ghost_model().image(self.sun.angle_deg, self.sun.azimuth_deg) * np.float32(self.past_baffle)
         beyond = burst_beyond + glare_beyond + veil_beyond
         taken = sum(_flux_mm2(layer, pitch_mm) for layer in (burst, glare, veil)) + beyond
         return Straylight(
@@ -188,6 +197,11 @@ class SunlightInLens:
             direct_fraction=self.direct_fraction(_flux_mm2(ghosts, pitch_mm), taken),
             beyond_mm2=beyond,
         )
+
+    @property
+    def lit(self) -> float:
+        """Return the fraction of the entrance that the Sun lights; rays of ghosts meet the hood themselves."""
+        return min(self.past_baffle, self.past_hood)
 
     @property
     def _efl_mm(self) -> float:
