@@ -11,13 +11,15 @@ from typing import Any
 
 import numpy as np
 import pytest
+from conftest import small_scene
 
-from vbnfault import cli, dataset
+from vbnfault import cli, dataset, pipeline
 from vbnfault import store as st
 from vbnfault.dataset import card, from_scene
 from vbnfault.dataset.build import BuildOptions
 from vbnfault.dataset.identity import stored_plan
 from vbnfault.dataset.statistics import statistics
+from vbnfault.scene import config
 
 
 @pytest.fixture(scope="module")
@@ -87,6 +89,24 @@ def test_a_card_changes_neither_digest_nor_check_and_xarray_reads_as_before(copy
     text = (copy / "README.md").read_text()
     for part in ("CC0-1.0", "A test", "| `mask` | sample, fault, y, x | bool |", "| camera.width_px | 40 | set |"):
         assert part in text
+
+
+def test_the_card_names_the_origin_of_every_value(tmp_path: Path) -> None:
+    scene = config.parse_scene(small_scene(body={"name": "Bennu", "density_kg_m3": 1200.0}), source="bennu")
+    store = st.create(tmp_path / "s.zarr", dataset.store_spec(pipeline.Session(scene), (16,)), 16)
+    readme = card.write_card(store)[0].read_text()  # no sample is made yet
+    rows = [line.strip("| ").split(" | ") for line in readme.splitlines() if line.startswith("| ")]
+    origins = {row[0]: row[-1] for row in rows}
+    wanted = {
+        "body.rotation_period_h": "packaged table of 101955 Bennu",
+        "orbit.eccentricity": "packaged table of 101955 Bennu",
+        "body.density_kg_m3": "set",
+        "dataset.seed": "set",
+        "render.bounces": "default",
+        "faults.vignetting.mask_loss": "default",
+        "body.shape_sha256": "contents of the files",
+    }
+    assert {key: origins[key] for key in wanted} == wanted
 
 
 def test_mlcroissant_accepts_the_description_of_a_store(copy: Path, data: st.Store) -> None:

@@ -172,7 +172,8 @@ def _provenance(attributes: Mapping[str, Any]) -> Iterator[list[str]]:
     defaults = _flat(config.parse_scene({"title": "defaults"}, source="defaults").resolved())
     body = scene.get("body", {})
     packaged = named_body(str(body.get("name", ""))) if isinstance(body, Mapping) else None
-    of_body = {f"body.{key}": value for key, value in _flat(packaged.body).items()} if packaged else {}
+    tables = {name: getattr(packaged, name, None) or {} for name in ("body", "orbit", "spice")}
+    of_body = _flat({name: table for name, table in tables.items() if table})
     for fault, table in scene.get("faults", {}).items() if isinstance(scene.get("faults"), Mapping) else ():
         cls = registry().get(fault, {}).get(table.get("model"))
         if cls is not None:
