@@ -23,7 +23,7 @@ from vbnfault.scene import config
 from vbnfault.scene.coma import ComaTable, PhaseFunctionTable
 from vbnfault.scene.trajectory import as_trajectory
 from vbnfault.world.coma import Coma, Lines, Outflow, Shadow, make_coma, sun_axes
-from vbnfault.world.coma_ground import diffuse_reflectance, irradiance_of_sky
+from vbnfault.world.coma_ground import diffuse_reflectance, dust_towards_sun, irradiance_of_sky
 from vbnfault.world.dust_phase import relative_phase
 from vbnfault.world.haze import haze
 
@@ -325,6 +325,24 @@ def test_light_of_the_sky_is_the_sum_over_20000_directions(zenith_deg: float) ->
     )
     # 576 directions by Gauss and Legendre, and a point 0.5 m above the shadow's edge: 1.5 %, measured below 1.4 %
     np.testing.assert_allclose(got, want, rtol=0.015)
+
+
+@pytest.mark.parametrize(
+    ("radius_m", "afrho_m", "lost", "by_day", "by_night"),
+    [(1700, 0.06, 8.5e-5, 1.6e-5, 9.4e-7), (1700, 4, 5.7e-3, 1e-3, 6.3e-5), (5500, 300, 0.13, 0.024, 1.5e-3)],
+)
+def test_the_light_of_the_ground_that_the_how_to_states(
+    radius_m: float, afrho_m: float, lost: float, by_day: float, by_night: float
+) -> None:
+    """On level ground; for 67P less than half of the noise of an image."""
+    cosine, level = np.cos(np.radians([30.0, 110.0])), np.ones(2)
+    sky = irradiance_of_sky("halley_marcus", 0.7, cosine, level, level) * afrho_m / (8 * np.pi**2 * radius_m)
+    depth = dust_towards_sun("halley_marcus", 0.7, cosine)[0] * afrho_m / (8 * np.pi * 0.04 * radius_m)
+    got = [depth, sky[0] / cosine[0], sky[1]]
+    np.testing.assert_allclose(got, (lost, by_day, by_night), rtol=0.05)  # two digits
+    if radius_m == 1700:
+        electrons, read_noise_e = 13_500 / 2, 13.0
+        assert max(got) * electrons < 0.5 * np.hypot(read_noise_e, np.sqrt(electrons))
 
 
 def test_a_lambert_surface_sends_even_light_to_all_sides() -> None:
