@@ -133,6 +133,7 @@ def compare(session: pipeline.Session, samples: list[int]) -> None:
         row |= {"views": frames[0].views, "noise_p99": rendering.noise_fraction_p99, "terrain": duration}
         rows.append((row, cpu))
         show(str(index), row, cpu)
+        del frames, spec, rendering, view  # they hold the terrain, beside which the next one would be made
     for title, of in (("median", np.median), ("largest", np.max)):
         both = [{name: float(of([pair[k][name] for pair in rows])) for name in rows[0][k]} for k in (0, 1)]
         show(title, *both)

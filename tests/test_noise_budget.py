@@ -166,6 +166,39 @@ def test_a_view_takes_fewer_samples_than_by_whole_pixels(monkeypatch: pytest.Mon
     assert sum(taken) < 0.75 * sum(whole)
 
 
+def test_bits_do_not_depend_on_how_many_cells_are_held(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Light of cells is summed in parts, to bound memory; a part never divides a pixel."""
+    chosen = np.random.default_rng(5).random((40, 16)) < 0.6
+    chosen[7:20] = False
+    monkeypatch.setattr(noise_budget, "_CELLS_AT_ONCE", 21)
+    spans = list(noise_budget._spans(chosen))
+    assert [span.start for span in spans] == [0, *(span.stop for span in spans[:-1])]
+    assert spans[-1].stop == len(chosen)
+    assert max(chosen[span].sum() for span in spans) <= 21
+    session = Session(physical())
+    spec = session.spec(0)
+    pose = resolve(spec)
+    divided = render_view(spec, pose).light.rendered.array
+    monkeypatch.undo()
+    np.testing.assert_array_equal(divided, render_view(spec, pose).light.rendered.array)
+
+
+def test_only_the_last_round_exceeds_the_limit(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Three rounds of a view that stays too noisy: the limit twice, then twice the limit."""
+    limits = []
+    allocated = noise_budget._allocated
+
+    def noted(squares: np.ndarray, goal: np.ndarray, most: int) -> np.ndarray:
+        limits.append(most)
+        return allocated(squares, goal, most)
+
+    monkeypatch.setattr(noise_budget, "_allocated", noted)
+    session = Session(physical(render={"noise_fraction": 0.02, "max_samples_per_pixel": 64}))
+    spec = session.spec(0)
+    render_view(spec, resolve(spec))
+    assert limits == [64, 64, 128]
+
+
 def test_the_exposure_is_foreseen_without_imaging(monkeypatch: pytest.MonkeyPatch) -> None:
     """The exposure within 3 %, though the lens images the render once a sample, for the metering."""
     imaged = []

@@ -221,7 +221,7 @@ def test_light_is_traced_once_for_each_state_of_the_coatings(monkeypatch: pytest
 
         monkeypatch.setattr(module, name, count)
 
-    counted(SunlightInLens, "total")
+    counted(SunlightInLens, "combined")
     counted(dust_lens, "_shadows")
     faults = {
         "straylight": {"model": "paraxial"},
@@ -244,7 +244,7 @@ def test_light_is_traced_once_for_each_state_of_the_coatings(monkeypatch: pytest
             whole.append(dict(calls))
     # with the worn coatings, and with whole ones where the degradation is left out
     assert whole
-    assert all(count == {"total": 2, "_shadows": 1} for count in whole), whole
+    assert all(count == {"combined": 2, "_shadows": 1} for count in whole), whole
 
 
 def test_a_redrawn_fault_leaves_the_draws_and_results_of_the_others(monkeypatch: pytest.MonkeyPatch) -> None:

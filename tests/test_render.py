@@ -279,6 +279,25 @@ def test_clearance_is_the_distance_to_the_nearest_facet() -> None:
     assert render.is_clear(surface, positions, 0.0).all()
 
 
+def test_facets_near_a_position_are_all_found() -> None:
+    """Every facet whose box is within reach of a position; there are more positions than one kernel takes."""
+    rng = np.random.default_rng(4)
+    vertices = rng.uniform(-50, 50, (900, 3)).astype(np.float32) + np.float32(2000)
+    faces = rng.permutation(900).reshape(300, 3).astype(np.int32)
+    surface = render.TerrainMesh(vertices, faces, np.ones(300, bool))
+    positions = rng.uniform(-50, 50, (11, 3)) + 2000
+    corners = vertices[faces].astype(float)
+    np.testing.assert_array_equal(surface.corners_m(np.array([7, 3])), corners[[7, 3]])
+    low, high = corners.min(axis=1), corners.max(axis=1)
+    away = np.maximum(np.maximum(low[None] - positions[:, None], positions[:, None] - high[None]), 0)
+    distance = np.linalg.norm(away, axis=2)
+    reach = float(np.quantile(distance, 0.05))
+    found = surface.facets_near(positions, reach)
+    assert set(np.flatnonzero((distance <= reach).any(axis=0))) <= set(found)
+    assert 0 < len(found) < 300
+    assert (distance[:, found].min(axis=0) < reach + 0.01).all()  # 2000 m has 0.0002 m in float32
+
+
 def test_overhang_does_not_count_as_ground_from_below() -> None:
     # the start lies inside the cube: its bottom faces down, the plane below is the ground
     surface = join(plane(), box(np.array([0.0, 0.0, -300.0]), 20.0))

@@ -146,7 +146,7 @@ def test_starburst_glare_and_veil_come_from_the_direct_light(sun_deg: float) -> 
     admitted = np.pi / 4 * optics.entrance_pupil_diameter_mm**2 * np.cos(np.radians(sun_deg)) * transmitted(lens)
     books = []
     for size in (SIZE, 9 * SIZE):
-        found = SunlightInLens.of(
+        light = SunlightInLens.of(
             lens,
             wavelength_nm=NODES,
             sensor=SensorGrid(shape=(size, size), pitch_mm=pitch),
@@ -154,7 +154,11 @@ def test_starburst_glare_and_veil_come_from_the_direct_light(sun_deg: float) -> 
             settings=StraylightSettings(
                 ghosts=GhostSettings(model="paraxial"), cleanliness=Cleanliness(level=300.0), veil_fraction=0.02
             ),
-        ).total()
+        )
+        found = light.total()
+        combined, left_of_it = light.combined()
+        np.testing.assert_array_equal(combined, found.total)
+        np.testing.assert_array_equal(left_of_it, found.direct_fraction)
         strayed = sum(flux(layer, pitch) for layer in (found.starburst, found.glare, found.veil))
         books.append((strayed, found.beyond_mm2, found.direct_fraction))
         # 1e-6: sums of float32

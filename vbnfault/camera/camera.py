@@ -48,7 +48,9 @@ class Camera:
         if radiance.sun is None:
             return electrons(self.lens.image(radiance))
         # the rounding errors of the Sun's radiance may be as large as the radiance of the scene
-        scene = replace(radiance, array=np.maximum(radiance.array - radiance.sun, 0), sun=None, disc=None)
+        sunless = radiance.array - radiance.sun
+        np.maximum(sunless, 0, out=sunless)
+        scene = replace(radiance, array=sunless, sun=None, disc=None)
         sun = replace(radiance, array=radiance.sun, sun=None)
         of_scene = electrons(self.lens.image(scene))
         direct = electrons(self.lens.image_of_sun(sun, self.detector.pixel_pitch_um))

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from typing import Any, ClassVar, NamedTuple, Self
 
 import numpy as np
@@ -129,9 +128,9 @@ class Electrons(Quantity):
     unit = "e-"
     axes = ("y", "x", "channel")
 
-    @cached_property
+    @property
     def merged(self) -> Electrons:
-        """Return all light in one array, as the detector needs it."""
+        """Return all light in one array, as the detector needs it. It is added anew, so that no copy is kept."""
         if self.past_rims is None:
             return self
         return replace(self, array=self.array + self.past_rims, past_rims=None)

@@ -181,7 +181,7 @@ class MosaicDetector:
         return _device(self.sensor, self.seed, (self.height_px, self.width_px), self.direction)
 
 
-@lru_cache(maxsize=4)
+@lru_cache(maxsize=2)  # a device takes 13 MB for 1024 pixels
 def _device(sensor: Sensor, seed: int, shape: tuple[int, int], direction: str) -> Device:
     """Return a device from the cache, or make it."""
     return Device(sensor, seed, shape=shape, direction=direction)

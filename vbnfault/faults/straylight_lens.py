@@ -229,15 +229,13 @@ class _LensStraylight(LensFault):
             lost = self.scene_lost(params, context)
             return _Light(added=scene, direct_left=1 - lost, scene_lost=lost, scene_added=True)
         camera, light = context.camera, source.light
-        parts = light.total()
-        on_sensor = Irradiance(
-            array=parts.total * source.irradiance_W_m2_nm.astype(np.float32)[:, None, None],
-            wavelength_nm=light.nodes_nm,
-        )
+        combined, direct_fraction = light.combined()
+        combined *= source.irradiance_W_m2_nm.astype(np.float32)[:, None, None]
+        on_sensor = Irradiance(array=combined, wavelength_nm=light.nodes_nm)
         added = camera.detector.electrons_expected(on_sensor, camera.exposure_s).array
         return _Light(
             added=added if scene is None else plus(added, scene),
-            direct_left=source.channel_mean(parts.direct_fraction),
+            direct_left=source.channel_mean(direct_fraction),
             scene_lost=source.scene_lost,
             scene_added=scene is not None,
         )

@@ -6,7 +6,7 @@ are computed once. They are kept by the draws that they depend on, each identifi
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from functools import cached_property
 from typing import Any
 
@@ -50,16 +50,23 @@ class Development:
         The sample as its faults see it, before a fault informs others.
     rng
         Function that returns the random generator of the sample for (stage, name).
+    twins
+        Classes without which an image will be taken: the light of these twins is kept.
 
     All methods take the draws by fault class. Two draws with equal keys must be the same draw.
     """
 
     def __init__(
-        self, *, exposure: SceneExposure, context: FaultContext, rng: Callable[[str, str], np.random.Generator]
+        self,
+        *,
+        exposure: SceneExposure,
+        context: FaultContext,
+        rng: Callable[[str, str], np.random.Generator],
+        twins: Collection[str] = (),
     ) -> None:
         self.exposure = exposure
         self.context = context
-        self._rng = rng
+        self._rng, self._twins = rng, twins
         self._cameras: dict[Keys, Camera] = {(): exposure.camera}
         self._contexts: dict[Keys, FaultContext] = {(): context}
         self._signals: dict[Any, Electrons] = {}
@@ -103,18 +110,27 @@ class Development:
 
     # --- light -----------------------------------------------------------------------------------------------
 
-    def signal(self, draws: Draws, names: Sequence[str]) -> Electrons:
-        """Return the expected electrons with the optical faults `names`, in physical order, of those drawn."""
+    def signal(self, draws: Draws, names: Sequence[str], *, keep: bool = True) -> Electrons:
+        """Return the expected electrons with the optical faults `names`, in physical order, of those drawn.
+
+        A signal takes 25 to 38 MB for 1024 pixels. It is kept if `keep` is set. Of those that lead to it, each with
+        one fault more, only the ones that lead to all drawn faults are kept, because every effect needs some of
+        them.
+        """
         key = (self._instrument(draws), _acting_keys(draws, names))
-        if key not in self._signals:
+        signal = self._signals.get(key)
+        if signal is None:
             if names:
                 *before, last = names
-                draw = draws[last]
-                context = self.context_of(draw.fault, draws)
-                self._signals[key] = act(draw.fault, self.signal(draws, before), draw.params, context)
+                draw, context = draws[last], self.context_of(draws[last].fault, draws)
+                leads = before == acting_at(draws, "electrons")[: len(before)]
+                light = self.signal(draws, before, keep=keep and leads)
+                signal = act(draw.fault, light, draw.params, context)
             else:
-                self._signals[key] = self._undisturbed(draws)
-        return self._signals[key]
+                signal = self._undisturbed(draws)
+            if keep:
+                self._signals[key] = signal
+        return signal
 
     def _instrument(self, draws: Draws) -> Keys:
         """Return the keys of the faults that alter the camera, if its expected electrons differ for them."""
@@ -131,12 +147,15 @@ class Development:
 
     # --- images ----------------------------------------------------------------------------------------------
 
-    def image(self, draws: Draws, *, noisy: bool = True) -> RGBI:
-        """Return the finished image with the drawn faults, with or without the noise of the exposure."""
+    def image(self, draws: Draws, *, noisy: bool = True, keep_signals: bool = True) -> RGBI:
+        """Return the finished image with the drawn faults, with or without the noise of the exposure.
+
+        Images are kept; the signals that lead to them are kept if `keep_signals` is set.
+        """
         readout = acting_at(draws, "rgbi")
         key = (*self._image_key(draws, noisy), _keys(draws, readout))
         if key not in self._images:
-            before = self._before_readout(draws, noisy)
+            before = self._before_readout(draws, noisy, keep_signals)
             self._images[key] = self._read_out(before, draws) if readout else before
         return self._images[key]
 
@@ -145,12 +164,12 @@ class Development:
         inside = [name for step in ("electrons", *MOSAIC_STEPS) for name in acting_at(draws, step)]
         return _keys(draws, _altering(draws)), _acting_keys(draws, inside), noisy
 
-    def _before_readout(self, draws: Draws, noisy: bool) -> RGBI:
+    def _before_readout(self, draws: Draws, noisy: bool, keep_signals: bool = True) -> RGBI:
         """Return the image with the drawn faults, except those that act on the finished image."""
         key = (*self._image_key(draws, noisy), ())
         if key not in self._images:
             camera = self.camera_with(draws)
-            signal = self.signal(draws, acting_at(draws, "electrons")).merged
+            signal = self.signal(draws, acting_at(draws, "electrons"), keep=keep_signals).merged
             noise = self.noise if noisy else None
             self._images[key] = camera.detector.develop(signal, camera.exposure_s, noise, self._acts(draws))
         return self._images[key]
@@ -204,11 +223,13 @@ class Development:
         """Return `effect`, computed anew."""
         others = without(draws, name)
         if not self.is_local(draws, name):
-            with_it, lacking = (self.image(d, noisy=False).array for d in (draws, others))
+            with_it = self.image(draws, noisy=False).array
+            lacking = self.image(others, noisy=False, keep_signals=name in self._twins).array
             return masks.effect(with_it, lacking, least_dn)
         # only pixels whose signal differs can change, so only these are developed
         optical = acting_at(draws, "electrons")
-        whole, part = (self.signal(d, [n for n in optical if n in d]).merged for d in (draws, others))
+        whole = self.signal(draws, optical).merged
+        part = self.signal(others, [n for n in optical if n != name], keep=name in self._twins).merged
         differ = whole.array != part.array
         changed = np.flatnonzero(np.logical_or.reduce([differ[..., k] for k in range(differ.shape[2])]))
         if not len(changed):

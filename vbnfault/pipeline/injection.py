@@ -7,12 +7,14 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
+from ..core.memory import release_unused
 from ..faults import MOSAIC_STEPS, FaultContext
 from . import masks
 from .development import Development, Draws, acting_at, informs
-from .spec import Draw, Injection, Pose, Rendering, SampleSpec, SceneExposure
+from .spec import Draw, Injection, Pose, Rendering, SampleSpec, SceneExposure, stored_layers
 
 _DRAW_TRIES = 8
+_THREADS = 2  # for the effects of faults
 # If a step changes a pixel by this many DN, the change survives every later optical step within the paper's tables
 # (cos⁴ at 255 → 105 keeps 41 %). Such a fault counts as visible without a full comparison.
 _CLEARLY_VISIBLE_DN = 6.0
@@ -36,7 +38,12 @@ def inject_faults(
     commanded = list(spec.commanded if commanded is None else commanded)
     if not pose.resolved or pose.sun_visible_fraction == 0:
         commanded = [name for name in commanded if not spec.faults[name].needs_sun]
-    development = Development(exposure=exposure, context=fault_context(pose, rendering, exposure), rng=spec.rng)
+    development = Development(
+        exposure=exposure,
+        context=fault_context(pose, rendering, exposure),
+        rng=spec.rng,
+        twins=[name for name in spec.faults if f"without_{name}" in stored_layers(spec.scene, spec.faults)],
+    )
     # every view uses new draws: a draw that is invisible in one view is not tried again in the next
     attempt = (views - 1) * _DRAW_TRIES
     last = attempt + _DRAW_TRIES - 1
@@ -47,11 +54,13 @@ def inject_faults(
         draws = draw_faults(spec, development, commanded, {}, attempt)
         _prepare_signals(development, draws)
         clean.result()
+    release_unused()
     while invisible := _invisible(development, draws, stored="mask_effect" in spec.scene.dataset.layers):
         draws = {name: draw for name, draw in draws.items() if name not in invisible}
         attempt += 1
         if attempt <= last:
             draws = draw_faults(spec, development, commanded, draws, attempt)
+    release_unused()
     return Injection(draws=draws, development=development)
 
 
@@ -111,7 +120,13 @@ def _invisible(development: Development, draws: Draws, *, stored: bool) -> list[
         return not development.effect(draws, name, draws[name].fault.effect_level_dn).any()
 
     if stored:
-        return [name for name in draws if is_invisible(name)]
+        if not draws:
+            return []
+        development.image(draws, noisy=False)  # all effects need it
+        # numpy and OpenCV use one core for most steps
+        with ThreadPoolExecutor(_THREADS) as pool:
+            verdicts = pool.map(is_invisible, draws)
+            return [name for name, invisible in zip(draws, verdicts, strict=True) if invisible]
     doubtful = sorted(_doubtful(development, draws))
     return [n for n in doubtful if not _shows_on_some_rows(development, draws, n) and is_invisible(n)]
 

@@ -8,6 +8,8 @@ cells, so keeping them would be a bias.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -22,7 +24,7 @@ from .exposure import foreseen_exposure_s, rate_on_axis
 from .spec import SampleSpec
 
 if TYPE_CHECKING:
-    from ..render import Sampled
+    from ..render import Cells, Sampled
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -42,8 +44,11 @@ _SURELY = 1.5
 _WORTH = 1.2
 # Octaves by which the number of samples of a cell may be rounded down to a power of two.
 _DOWN = 0.25
+# Cells whose light is held at once; all of a frame would take 200 MB.
+_CELLS_AT_ONCE = 1 << 20
 # Rows of pixels whose samples are compared with their neighbours at a time, to bound memory.
-_STRIP = 128
+_STRIP = 64
+_THREADS = 2
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -103,10 +108,10 @@ def sample_to_noise(
         over = np.count_nonzero((now > fraction) & shows)
         return bool(over > _NOISY_FRACTION * np.count_nonzero(lit))
 
-    for _ in range(_ROUNDS):
+    for k in range(_ROUNDS):
         if not is_over(now := refined.noise(near)):
             break
-        refined.refine(now > fraction, near, fraction)
+        refined.refine(now > fraction, near, fraction, is_last=k == _ROUNDS - 1)
     now = refined.noise(near)
     return SampledRadiance(
         radiance=whole,  # its array is that which `refine` has changed
@@ -173,8 +178,12 @@ class _Refined:
         mean = cv2.blur(np.where(by_halves, self.variance, 0), (3, 3)) / np.maximum(count, 1e-6)
         return np.sqrt(np.where(self.by_cells, self.variance, np.maximum(mean, 0)))
 
-    def refine(self, noisy: Mask, near: Mask, fraction: float) -> None:
-        """Render those of the noisy pixels again whose own variance is too large, if their noise shows (`near`)."""
+    def refine(self, noisy: Mask, near: Mask, fraction: float, *, is_last: bool = False) -> None:
+        """Render those of the noisy pixels again whose own variance is too large, if their noise shows (`near`).
+
+        The last round takes up to twice the limit in a pixel: where most lit pixels lie at hard edges of shadows,
+        the limit would otherwise leave more than `_NOISY_FRACTION` of them with too much noise.
+        """
         if not self._rounds:
             # the error over 3×3 pixels corrects what the ranges let expect
             measured, foreseen = (cv2.blur(v, (3, 3)) for v in (self.variance, self._single))
@@ -185,7 +194,7 @@ class _Refined:
         noisy = noisy | (self._single > (_SURELY * fraction) ** 2)
         pixels = np.flatnonzero(noisy & near & (goal < 1))
         squares = self._range[pixels].astype(np.float32) ** 2
-        numbers = _allocated(squares, goal.ravel()[pixels], self._most)
+        numbers = _allocated(squares, goal.ravel()[pixels], self._most * (2 if is_last else 1))
         more = numbers.sum(axis=1) > _WORTH * self.used.ravel()[pixels]
         pixels, squares, numbers = pixels[more], squares[more], numbers[more]
         self._rounds += 1
@@ -210,26 +219,47 @@ class _Refined:
         total = np.zeros((len(self._array), count), dtype=np.float32)
         variance = np.zeros(count)
         for samples in np.unique(numbers).tolist():
-            owner, cell = np.nonzero(numbers == samples)
-            listed = render.Cells(pixel=pixels[owner], cell=cell.astype(np.uint32), side=side)
             scene = self._next(cells * samples, samples.bit_length())
-            light, signal, error = render.direct_in_cells(self._surface, scene, self._signal, listed, samples)
-            for band, values in zip(total, light, strict=True):
-                band += np.bincount(owner, values, count)
-            if samples == 1:
-                # half the squared difference of two single samples is the variance of one
-                before = self._samples[listed.pixel, cell].astype(np.float32)
-                apart = np.abs(signal / self._white_e - before)
-                variance += np.bincount(owner, (apart * self._white_e) ** 2 / 2, count)
-                known = self._range[listed.pixel, cell]
-                self._range[listed.pixel, cell] = np.maximum(known, apart.astype(np.float16))
-            elif samples == 2:
-                # the two halves of a cell lie side by side: alternating signs cancel what changes evenly
-                sign = 1 - 2 * ((cell % side + cell // side) % 2)
-                variance += np.bincount(owner, sign * error, count) ** 2
-            else:
-                variance += np.bincount(owner, error.astype(np.float64) ** 2, count)
+            for span in _spans(numbers == samples):
+                owner, cell = np.nonzero(numbers[span] == samples)
+                listed = render.Cells(pixel=pixels[span][owner], cell=cell.astype(np.uint32), side=side)
+                light, signal, error = render.direct_in_cells(self._surface, scene, self._signal, listed, samples)
+                for band, values in zip(total[:, span], light, strict=True):
+                    band += np.bincount(owner, values, len(band))
+                variance[span] += self._variance(owner, listed, samples, signal, error, len(variance[span]))
         return total / cells, variance / cells**2
+
+    def _variance(
+        self, owner: NDArray[np.intp], listed: Cells, samples: int, signal: F32, error: F32, count: int
+    ) -> F64:
+        """Return the summed variances of cells, float64[pixel]; `owner` is the index of each cell's pixel."""
+        cell, side = listed.cell, listed.side
+        if samples == 1:
+            # half the squared difference of two single samples is the variance of one
+            before = self._samples[listed.pixel, cell].astype(np.float32)
+            apart = np.abs(signal / self._white_e - before)
+            known = self._range[listed.pixel, cell]
+            self._range[listed.pixel, cell] = np.maximum(known, apart.astype(np.float16))
+            return np.asarray(np.bincount(owner, (apart * self._white_e) ** 2 / 2, count), np.float64)
+        if samples == 2:
+            # the two halves of a cell lie side by side: alternating signs cancel what changes evenly
+            sign = 1 - 2 * ((cell % side + cell // side) % 2).astype(np.int64)
+            return np.asarray(np.bincount(owner, sign * error, count), np.float64) ** 2
+        return np.asarray(np.bincount(owner, error.astype(np.float64) ** 2, count), np.float64)
+
+
+def _spans(chosen: Mask) -> Iterator[slice]:
+    """Yield ranges of pixels of which about `_CELLS_AT_ONCE` cells are chosen, given bool[pixel, cell].
+
+    A pixel's cells stay together, so their sums do not depend on the ranges.
+    """
+    before = np.cumsum(chosen.sum(axis=1))
+    start = 0
+    while start < len(before):
+        taken = int(before[start - 1]) if start else 0
+        stop = max(start + 1, int(np.searchsorted(before, taken + _CELLS_AT_ONCE, side="right")))
+        yield slice(start, stop)
+        start = stop
 
 
 def _ranges(samples: NDArray[np.float16], shape: tuple[int, int]) -> NDArray[np.float16]:
@@ -238,7 +268,8 @@ def _ranges(samples: NDArray[np.float16], shape: tuple[int, int]) -> NDArray[np.
     out = np.empty((height, width, side, side), dtype=np.float16)
     by_row = samples.reshape(height, width, side, side)
     kernel = np.ones((3, 3), np.uint8)
-    for start in range(0, height, _STRIP):
+
+    def of_strip(start: int) -> None:
         stop = min(start + _STRIP, height)
         low, high = max(start - 1, 0), min(stop + 1, height)
         grid = np.ascontiguousarray(by_row[low:high].transpose(0, 2, 1, 3), np.float32)
@@ -246,6 +277,9 @@ def _ranges(samples: NDArray[np.float16], shape: tuple[int, int]) -> NDArray[np.
         spread = cv2.dilate(grid, kernel) - cv2.erode(grid, kernel)
         spread = spread[(start - low) * side : (stop - low) * side].reshape(stop - start, side, width, side)
         out[start:stop] = spread.transpose(0, 2, 1, 3)
+
+    with ThreadPoolExecutor(_THREADS) as pool:  # numpy and OpenCV use one core here
+        list(pool.map(of_strip, range(0, height, _STRIP)))
     return out.reshape(height * width, side * side)
 
 

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from ..core import spectra
+from ..core.memory import release_unused
 from ..core.quantities import SKY, FarSource, Radiance, Truth
 from ..lens.straylight.scene import RenderGrid, surrounding_grids
 from ..render.description import RenderInput, View
@@ -79,6 +80,7 @@ def render_view(spec: SampleSpec, pose: Pose) -> Rendering:
         )
     else:
         sampled = sample_to_noise(spec, scene, truth, guide, spec.scene.render.noise_fraction)
+        release_unused()  # the samples of all pixels
     rendered = sampled.radiance
     if has_air and guide is not None:
         rendered = add_atmosphere(spec, scene, guide, rendered)

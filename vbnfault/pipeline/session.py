@@ -16,6 +16,7 @@ from ..body.refine import GROWTH_POWER
 from ..camera import Camera
 from ..core import activity
 from ..core.errors import InputError
+from ..core.memory import release_unused
 from ..core.quantities import SOFT_KINDS, Sample
 from ..faults import Fault, dataset_order, from_dict, load_plugins, plugins_of
 from ..scene import config, plan
@@ -293,10 +294,13 @@ class Session:
 
         if self._threads is not None:
             render.set_threads(self._threads)
+        release_unused()  # what the last terrain and the last sample took
         activity.begin(f"terrain of site {site.index}")
         patch = self.patch(site, detail)
-        surface = self.surface(patch)
-        return Terrain(body=self.body, site=patch.site, surface=surface, vehicle=self.vehicle)
+        site, surface = patch.site, self.surface(patch)
+        del patch
+        release_unused()
+        return Terrain(body=self.body, site=site, surface=surface, vehicle=self.vehicle)
 
     def surface(self, patch: Patch) -> TerrainMesh:
         """Return the renderer's copy of a patch, with relief finer than its facets and the scene's spacecraft."""

@@ -144,7 +144,7 @@ class Rendering:
     scene
         Input of the renderer: the view and its sunlight.
     light
-        Radiance without stars.
+        Radiance without stars; in a finished frame that with stars.
     truth
         Truth at the chief rays of the image's pixel centres.
     open_sky

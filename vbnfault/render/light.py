@@ -35,6 +35,7 @@ _CELLS = (128, 1024)
 # Points of the pupil per cell, if the grid has the least number of cells. Several are needed because parts of a
 # spacecraft a metre away are out of focus.
 _PUPIL_POINTS = 4
+_LIMB_DIGITS = 12
 # Steps of a sequence that is even in four dimensions: powers of 1/x, where x is the root of x⁵ = x + 1.
 _KRONECKER = 1.1673039782614187 ** -np.arange(1.0, 5.0)
 
@@ -88,7 +89,7 @@ def _with_sun(surface: TerrainMesh, scene: RenderInput, array: NDArray[np.float3
     array = array.reshape(bands, view.height_px, view.width_px)
     sun: NDArray[np.float32] | None = None
     if (disc := sun_in_view(surface, view, scene.sun)) is not None:
-        sun = np.zeros_like(array)
+        sun = np.zeros(array.shape, np.float32)  # pages that stay empty take no memory
         if add_mean(sun, disc, Pinhole(view.intrinsics), range(bands)) is None:
             sun = None
         else:
@@ -239,7 +240,8 @@ class Direct(Light):
         if self.limb.profiles is None:
             return None
         light = signal * self.scene.sun.irradiance_W_m2_nm
-        return tuple((light @ self.limb.profiles / light.sum()).tolist())
+        # without the digits that rounding leaves, so that all exposures share the tables of points
+        return tuple(np.round(light @ self.limb.profiles / light.sum(), _LIMB_DIGITS).tolist())
 
     @staticmethod
     def signal(terms: list[Any], factors: NDArray[np.float64]) -> Any:

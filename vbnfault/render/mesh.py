@@ -14,7 +14,8 @@ def mesh_scene(name: str, vertices_m: NDArray[np.float32], faces: NDArray[np.int
     """Return a Mitsuba scene of one triangle mesh: `vertices_m` float32[n, 3], `faces` int32[m, 3]."""
     mesh = mi.Mesh(name, len(vertices_m), len(faces))
     parameters = mi.traverse(mesh)
-    parameters["vertex_positions"] = mi.Float(np.ascontiguousarray(vertices_m, np.float32).ravel())
+    # drjit keeps the numpy array that it is given; a copy lets go of the file that a patch is a part of
+    parameters["vertex_positions"] = mi.Float(np.array(vertices_m, np.float32).ravel())
     parameters["faces"] = mi.UInt32(np.ascontiguousarray(faces, np.uint32).ravel())
     parameters.update()
     return mi.load_dict({"type": "scene", name: mesh})

@@ -50,16 +50,15 @@ def ground_height_m(surface: TerrainMesh, x_m: F64, y_m: F64, start_height_m: fl
 def is_clear(surface: TerrainMesh, position_L_m: F64, clearance_m: float) -> NDArray[np.bool_]:
     """Return which positions float64[n, 3] are at least `clearance_m` from every facet, bool[n].
 
-    Distances are exact. Boxes around runs of neighbouring facets leave few facets to measure.
+    Distances are exact. The boxes of the facets leave few facets to measure.
     """
-    clear = np.ones(len(position_L_m), dtype=bool)
-    for k, position in enumerate(np.asarray(position_L_m, dtype=np.float64)):
-        near = surface.facets_near(position, clearance_m)
-        for start in range(0, len(near), _FACETS):
-            corners = surface.corners_m(near[start : start + _FACETS])
-            if (_distance_m(corners - position) < clearance_m).any():
-                clear[k] = False
-                break
+    positions = np.asarray(position_L_m, dtype=np.float64)
+    clear = np.ones(len(positions), dtype=bool)
+    near = surface.facets_near(positions, clearance_m)
+    for start in range(0, len(near), _FACETS):
+        corners = surface.corners_m(near[start : start + _FACETS])
+        for k in np.flatnonzero(clear):
+            clear[k] = not (_distance_m(corners - positions[k]) < clearance_m).any()
     return clear
 
 

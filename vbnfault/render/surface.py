@@ -20,21 +20,13 @@ from .detail import Detail, FineRelief
 from .earth import EarthAlbedo
 from .mesh import mesh_scene
 from .runtime import dr, mi
+from .sampling import opaque_vector
 from .vehicle import Vehicle, World
 
 # Float32 resolves 2⁻²³ of a coordinate. Hit distance, ray direction and vertex rounding each err by about one unit.
 # Eight units therefore clear the facet and do not visibly move the shadow (1 mm at 1 km).
 _OFFSET = 8 * 2.0**-23
-_RUN = 64  # facets in a box that bounds their distance
-# Steps that spread the 21 bits of a number to every third bit: shift, and the bits that are kept.
-_SPREAD = (
-    (32, 0x1F00000000FFFF),
-    (16, 0x1F0000FF0000FF),
-    (8, 0x100F00F00F00F00F),
-    (4, 0x10C30C30C30C30C3),
-    (2, 0x1249249249249249),
-)
-
+_POSITIONS = 8  # that one kernel compares with the facets
 # Least cosine between a normal and the direction to the viewer. Truth stores normals in half precision,
 # which moves a cosine by up to √3 · 2⁻¹².
 _LEAST_COSINE = 2.0**-11
@@ -74,39 +66,43 @@ class TerrainMesh:
         with ThreadPoolExecutor(1) as aside:  # the last steps of building the tree keep only one core busy
             normals = aside.submit(_vertex_normals, vertices_m, faces, flat)
             self.scene = mesh_scene("terrain", vertices_m, faces)
-        self._corners = _corner_records(vertices_m, faces, flat, normals.result())
+        self._corners = _corner_records(self.scene.shapes()[0], len(faces), flat, normals.result())
         self._dust = mi.Float(0.0 if dust is None else np.ascontiguousarray(_with_a_fourth(dust[faces])).ravel())
         dr.eval(self._corners, self._dust)
         self.vehicle, self.fine, self.albedo = vehicle, fine, albedo
-        self._vertices_m, self._faces = vertices_m, faces
+        self._mesh, self._facet_count = self.scene.shapes()[0], len(faces)
 
     def corners_m(self, facets: NDArray[np.intp]) -> NDArray[np.float64]:
         """Return the corners of facets, float64[facet, corner, 3] in L."""
-        return self._vertices_m[self._faces[facets]].astype(np.float64)
+        corners = self._corners_of(mi.UInt32(np.ascontiguousarray(facets, np.uint32)))
+        return np.stack([corner.numpy().T for corner in corners], axis=1).astype(np.float64)
 
-    def facets_near(self, position_L_m: NDArray[np.float64], reach_m: float) -> NDArray[np.intp]:
-        """Return the indices of all facets within `reach_m` of a position, and of some others.
+    def facets_near(self, positions_L_m: NDArray[np.float64], reach_m: float) -> NDArray[np.intp]:
+        """Return the indices of all facets within `reach_m` of any position float64[n, 3], and of few others.
 
-        These are the facets of every run whose box is within reach.
+        These are the facets whose bounding boxes are within reach. One kernel tests all facets for a few positions;
+        an order of the facets by position would take ten times as long and serve few samples.
         """
-        order, low, high = self._boxes_m
-        away = np.maximum(np.maximum(low - position_L_m, position_L_m - high), 0)
-        runs = np.flatnonzero(np.einsum("ri,ri->r", away, away) <= reach_m**2)
-        positions = (runs[:, None] * _RUN + np.arange(_RUN)).ravel()
-        return order[positions[positions < len(order)]]
+        corners = self._corners_of(dr.arange(mi.UInt32, self._facet_count))
+        low, high = (f(f(corners[0], corners[1]), corners[2]) for f in (dr.minimum, dr.maximum))
+        near = np.zeros(self._facet_count, dtype=bool)
+        for start in range(0, len(positions_L_m), _POSITIONS):
+            within = mi.Bool(False)
+            for position in positions_L_m[start : start + _POSITIONS]:
+                point = opaque_vector(mi.Point3f, position)
+                away = dr.maximum(dr.maximum(low - point, point - high), 0)
+                # the position is rounded to float32
+                reach = reach_m + _OFFSET * (float(np.abs(position).max()) + reach_m)
+                within |= dr.squared_norm(away) <= dr.opaque(mi.Float, reach**2)
+            near |= within.numpy().astype(bool)
+        return np.flatnonzero(near)
 
-    @cached_property
-    def _boxes_m(self) -> tuple[NDArray[np.intp], NDArray[np.float64], NDArray[np.float64]]:
-        """Return an order of the facets that keeps neighbours together, and boxes around runs of `_RUN` of them.
-
-        The boxes are given by their lower and upper corners, float64[run, 3] each.
-        """
-        order = np.argsort(_morton(self._vertices_m[self._faces[:, 0]]), kind="stable")
-        starts = np.arange(0, len(order), _RUN)
-        corners = [self._vertices_m[self._faces[order, k]] for k in range(3)]
-        low = np.minimum.reduceat(np.minimum.reduce(corners), starts)
-        high = np.maximum.reduceat(np.maximum.reduce(corners), starts)
-        return order, low.astype(np.float64), high.astype(np.float64)
+    def _corners_of(self, facet: Any) -> list[Any]:
+        """Return the three corners of facets, given by their index."""
+        vertices, faces = self._mesh.vertex_positions_buffer(), self._mesh.faces_buffer()
+        return [
+            dr.gather(mi.Point3f, vertices, dr.gather(mi.UInt32, faces, 3 * facet + corner)) for corner in range(3)
+        ]
 
     def seen_from(self, view: View) -> TerrainMesh | World:
         """Return what a camera sees: the terrain, and its own spacecraft if there is one."""
@@ -130,22 +126,6 @@ class TerrainMesh:
     def occluded(self, rays: Any, active: Any, *, coherent: bool = True) -> Any:
         """Return whether anything lies along the rays; set `coherent` where neighbouring rays are alike."""
         return self.scene.ray_test(rays, coherent, active)
-
-
-def _morton(points_m: NDArray[np.float32]) -> NDArray[np.uint64]:
-    """Return the index of points float32[n, 3] along a curve that keeps neighbours together, uint64[n].
-
-    The index interleaves the bits of the coordinates, 21 each (Morton 1966).
-    """
-    low = points_m.min(axis=0)
-    cells = (points_m - low) * (np.float32(2**21 - 1) / max(float((points_m - low).max()), 1e-30))
-    code = np.zeros(len(points_m), dtype=np.uint64)
-    for k in range(3):
-        bits = cells[:, k].astype(np.uint64)
-        for shift, kept in _SPREAD:
-            bits = (bits | (bits << np.uint64(shift))) & np.uint64(kept)
-        code |= bits << np.uint64(k)
-    return code
 
 
 class Hit:
@@ -229,18 +209,15 @@ def _with_a_fourth(three: NDArray[np.float32]) -> NDArray[np.float32]:
     return np.pad(three.astype(np.float32), ((0, 0), (0, 1)))
 
 
-def _corner_records(
-    vertices: NDArray[np.float32], faces: NDArray[np.int32], flat: NDArray[np.bool_], normals: NDArray[np.float32]
-) -> Any:
+def _corner_records(mesh: Any, facets: int, flat: NDArray[np.bool_], normals: NDArray[np.float32]) -> Any:
     """Return four floats per corner of each facet: its unit normal, and the distance of its tangent plane from 0.
 
     The normal is the facet's own if the facet is flat, else that of the vertex. The order is
     [facet, corner, float]. drjit fetches four floats, a power of two, in one packet.
     """
-    corner = dr.arange(mi.UInt32, 3 * len(faces))
+    corner = dr.arange(mi.UInt32, 3 * facets)
     facet = corner // 3
-    table = mi.UInt32(np.ascontiguousarray(faces, np.uint32).ravel())
-    coordinates = mi.Float(np.ascontiguousarray(vertices).ravel())
+    table, coordinates = mesh.faces_buffer(), mesh.vertex_positions_buffer()
     a, b, c = (dr.gather(mi.Vector3f, coordinates, dr.gather(mi.UInt32, table, 3 * facet + k)) for k in range(3))
     across = dr.cross(b - a, c - a)
     own = across * dr.rcp(dr.maximum(dr.norm(across), 1e-30))

@@ -197,7 +197,12 @@ class RenderTable(Table):
         description="most noise of sampling, over the sensor's own, in 99 % of lit pixels: more samples where it "
         "takes them; default: no more anywhere",
     )
-    max_samples_per_pixel: int = Field(256, ge=1, le=4096, description="a power of four; for noise_fraction")
+    max_samples_per_pixel: int = Field(
+        256,
+        ge=1,
+        le=4096,
+        description="a power of four; for noise_fraction; the last of three rounds takes up to twice as many",
+    )
     bounces: int = Field(0, ge=0, le=4, description="reflections between sunlit ground and the ground that is seen")
 
     @model_validator(mode="after")

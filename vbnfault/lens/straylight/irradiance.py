@@ -206,6 +206,7 @@ class FlareModel:
         self._diffraction, self._across = settings.diffraction, settings.across
         self._reach_mm = float(np.hypot(*shape) / 2 * pitch_mm)
         self._last_boxes: tuple[tuple[float, float], tuple[Tracer, Rays, Arrivals]] | None = None
+        self._last_worn: tuple[float, FlareModel] | None = None
         self._soften()
 
     def _soften(self) -> None:
@@ -283,13 +284,16 @@ class FlareModel:
         return out
 
     def worn(self, coating_loss: float) -> FlareModel:
-        """Return the model with a fraction of the coatings' area gone, as `Tracer.worn` does."""
+        """Return the model with a fraction of the coatings' area gone, as `Tracer.worn` does; the last is kept."""
         if not coating_loss:
             return self
-        other = copy.copy(self)
-        other._tracer = self._tracer.worn(coating_loss)
-        other._last_boxes = None
-        return other
+        last = self._last_worn  # another thread may replace it
+        if last is None or last[0] != coating_loss:
+            other = copy.copy(self)
+            other._tracer = self._tracer.worn(coating_loss)
+            other._last_boxes = other._last_worn = None
+            self._last_worn = last = coating_loss, other
+        return last[1]
 
     def image(self, sun_deg: float, azimuth_deg: float = 0.0, *, only: tuple[int, int] | None = None) -> F32:
         """Return the irradiance of all ghosts over the Sun's at the entrance, float32[band, y, x].
@@ -342,11 +346,12 @@ class FlareModel:
 
     def _boxes(self, sun_deg: float, turn: float) -> tuple[Tracer, Rays, Arrivals]:
         """Return the tracer for an azimuth, the boxes of all ghosts, and where they arrive; the last are kept."""
-        key = sun_deg, turn
-        if self._last_boxes is None or self._last_boxes[0] != key:
+        key, last = (sun_deg, turn), self._last_boxes
+        if last is None or last[0] != key:
             made = self._tracer.turned(turn)
-            self._last_boxes = key, (made, *boxes(made, sun_deg, self._detail.width, self._reach_mm))
-        return self._last_boxes[1]
+            last = key, (made, *boxes(made, sun_deg, self._detail.width, self._reach_mm))
+            self._last_boxes = last
+        return last[1]
 
     def flux_mm2(
         self, sun_deg: float, azimuth_deg: float, only: Collection[tuple[int, ...]], *, across: int = 48

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any, TypeVar
 
 import cv2
 import numpy as np
@@ -15,6 +16,7 @@ from ...core.llvm import backend
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
+T = TypeVar("T")
 
 LEVELS = 6
 MARGIN = 4  # pixels around each level, for cells that lie partly outside
@@ -65,8 +67,18 @@ class Pyramid:
         return summed(self.canvas, [np.tensordot(mix, level, 1) for level in self.levels])
 
 
-def summed(canvas: Canvas, levels: Sequence[F32]) -> F32:
-    """Return the sum of levels of resolution, each resized to the frame; both are float32[layer, y, x]."""
+def summed(canvas: Canvas, levels: Sequence[NDArray[Any]], unit: float | None = None) -> F32:
+    """Return the sum of levels of resolution, each resized to the frame, float32[layer, y, x].
+
+    Parameters
+    ----------
+    canvas
+        The frame.
+    levels
+        float32[layer, y, x] of each level, or int64 in units of `unit`.
+    unit
+        Value of an integer of 1.
+    """
     out = np.empty((len(levels[0]), *canvas.shape), dtype=np.float32)
 
     def resize(layer: int) -> None:
@@ -75,6 +87,8 @@ def summed(canvas: Canvas, levels: Sequence[F32]) -> F32:
         for level in range(LEVELS - 1, -1, -1):
             height, width = (int(v) for v in canvas.sizes[level])
             here = levels[level][layer]
+            if unit is not None:  # layer by layer, because a copy of all levels takes 45 MB for 1024 pixels
+                here = np.multiply(here, unit, dtype=np.float32)
             if below is not None:
                 # folds end in steps, which pixel centres sample unevenly
                 calm = cv2.GaussianBlur(below, (3, 3), _CALM_SIGMA)
@@ -87,7 +101,12 @@ def summed(canvas: Canvas, levels: Sequence[F32]) -> F32:
         # the parts are sampled on different lattices, so that their sum may be slightly negative
         np.maximum(below[rows, columns], 0, out=out[layer])
 
+    in_layers(resize, len(out))
+    return out
+
+
+def in_layers(step: Callable[[int], T], count: int) -> list[T]:
+    """Return `step` of every layer from 0 to below `count`, computed in as many threads as a render has."""
     # numpy and OpenCV release the interpreter's lock
     with ThreadPoolExecutor(backend().dr.thread_count()) as pool:
-        list(pool.map(resize, range(len(out))))
-    return out
+        return list(pool.map(step, range(count)))

@@ -272,17 +272,20 @@ class Sums:
 
     def levels(self) -> Pyramid:
         """Return the sums of every level and band."""
-        canvas, total = self.canvas, self._total.numpy().view(np.int64)
-        levels = []
-        for level in range(LEVELS):
-            part = total[canvas.starts[level] : canvas.starts[level + 1]]
-            part = part.reshape(canvas.bands, *canvas.sizes[level])
-            levels.append(np.multiply(part, 1 / _UNITS, dtype=np.float32))
-        return Pyramid(canvas=canvas, levels=tuple(levels))
+        levels = tuple(np.multiply(part, 1 / _UNITS, dtype=np.float32) for part in self._parts())
+        return Pyramid(canvas=self.canvas, levels=levels)
 
     def irradiance(self) -> F32:
         """Return the sum of all levels, float32[band, y, x]."""
-        return summed(self.canvas, self.levels().levels)
+        return summed(self.canvas, self._parts(), 1 / _UNITS)
+
+    def _parts(self) -> list[NDArray[np.int64]]:
+        """Return the integer sums of every level, int64[band, y, x]."""
+        canvas, total = self.canvas, self._total.numpy().view(np.int64)
+        return [
+            total[canvas.starts[level] : canvas.starts[level + 1]].reshape(canvas.bands, *canvas.sizes[level])
+            for level in range(LEVELS)
+        ]
 
 
 def _shared_out(work: NDArray[np.uint32], chosen: NDArray[np.int64]) -> NDArray[np.uint32]:

@@ -24,6 +24,7 @@ from ..prescription import Prescription
 from ..rays import forward
 from ..thin import beyond_frame
 from .paraxial import along, axial_transmittance, mirrors
+from .pyramid import in_layers
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -362,8 +363,7 @@ class VeilingGlare:
         index = self.samples(sun_xy_mm, shape, pitch_mm)
         table = self.table
         out = np.empty((len(table), *shape), dtype=np.float32)
-        for row, band in zip(table, out, strict=True):
-            np.take(row, index, out=band, mode="clip")
+        in_layers(lambda band: np.take(table[band], index, out=out[band], mode="clip"), len(table))
         return out
 
     @property

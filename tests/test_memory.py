@@ -1,0 +1,104 @@
+"""Memory of a sample: the arrays that its stages keep, and what is left of it afterwards."""
+
+from __future__ import annotations
+
+import gc
+import os
+import sys
+import tracemalloc
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import small_scene
+
+from vbnfault.core import memory
+from vbnfault.core.llvm import backend
+from vbnfault.pipeline import Session
+from vbnfault.pipeline.development import acting_at, without
+from vbnfault.pipeline.injection import inject_faults
+from vbnfault.pipeline.record import to_sample
+from vbnfault.pipeline.stages import simulate_frame
+from vbnfault.scene import config
+
+SIZE = 64
+
+
+def six_faults() -> Session:
+    """A camera with a real lens and a mosaic, and a sample with one model of every optical class."""
+    scene = small_scene(
+        dataset={"layers": ["clean", "without_straylight", "mask_effect", "raw"]},
+        camera={
+            "width_px": SIZE,
+            "height_px": SIZE,
+            "lens": "nikkor_28_f2p8_camera",
+            "detector": "cmv4000",
+            "exposure_max_s": 0.015,
+        },
+        geometry={"sun_visibility": "required"},
+    )
+    scene["faults"] = {
+        "straylight": {"model": "paraxial"},
+        "dust_on_optics": {"model": "defocused"},
+        "optics_degradation": {"model": "contamination"},
+        "vignetting": {"model": "lens"},
+    }
+    return Session(config.parse_scene(scene, source="test"))
+
+
+def test_twins_leave_no_light_behind() -> None:
+    """Kept are the light that leads to the image, once for each fault, and that of the stored twin: no other."""
+    session = six_faults()
+    index = next(i for i in range(len(session.plan)) if len(session.plan.commanded(i)) == 4)
+    frame = session.frame(index)
+    injection = inject_faults(frame.spec, frame.pose, frame.rendering, frame.exposure)
+    draws, development = injection.draws, injection.development
+    optical = acting_at(draws, "electrons")
+    assert len(optical) == 4
+    kept = development._signals
+    assert len(kept) <= len(optical) + 2
+    # planes of the scene's light and of the light past the rims, each in three colours
+    assert sum(q.array.nbytes + q.past_rims.nbytes for q in kept.values()) <= len(kept) * 2 * 3 * 4 * SIZE**2
+    # what was not kept is computed again, with the same bits
+    for name in optical:
+        again = development.signal(without(draws, name), [n for n in optical if n != name])
+        once_more = development.signal(without(draws, name), [n for n in optical if n != name], keep=False)
+        np.testing.assert_array_equal(again.merged.array, once_more.merged.array)
+    # all light in one array is added when it is needed
+    assert all("merged" not in vars(q) for q in kept.values())
+
+
+def test_samples_leave_nothing_behind() -> None:
+    """Bytes that Python and numpy hold after a sample, from the second on: no more than a plane of the image."""
+    session = six_faults()
+    held = []
+    tracemalloc.start()
+    try:
+        for _ in range(2):
+            for index in range(3):
+                to_sample(simulate_frame(session.spec(index)))
+            gc.collect()
+            held.append(tracemalloc.get_traced_memory()[0])
+    finally:
+        tracemalloc.stop()
+    assert held[1] - held[0] < 4 * SIZE**2
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads the resident memory from /proc")
+def test_unused_memory_is_released() -> None:
+    """drjit keeps freed arrays; they no longer count as resident once they are released."""
+    dr, Float = backend().dr, backend().Float
+
+    def resident() -> int:
+        return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+
+    memory.release_unused(always=True)
+    before = resident()
+    array = dr.arange(Float, 1 << 24) * 1.5
+    dr.eval(array)
+    dr.sync_thread()
+    held = resident()
+    assert held - before > 0.9 * 2**26
+    del array
+    memory.release_unused(always=True)
+    assert resident() < held - 0.9 * 2**26
