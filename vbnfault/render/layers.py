@@ -9,8 +9,9 @@ from numpy.typing import NDArray
 
 from ..core.quantities import BODY, SKY, SPACECRAFT, SUN, SunInView, Truth
 from ..core.sundisc import Pinhole, Projection, bounds_px, pixel_sums
-from .albedo import GroundPoints
+from .albedo import AlbedoMap, GroundPoints
 from .description import Sunlight, View
+from .earth import EarthAlbedo
 from .emitter import SunDisc
 from .light import sun_in_view
 from .runtime import dr, mi
@@ -60,11 +61,7 @@ def truth(
         layers |= {name: dr.select(hit.valid, _angle_deg(*pair), dr.nan) for name, pair in pairs.items()}
         layers["dust"] = dr.select(hit.valid, hit.dust, dr.nan)
         if surface.albedo is not None:
-            footprint_m = hit.distance_m / float(view.intrinsics[0])
-            ground = GroundPoints(
-                point_L_m=hit.point, footprint_m=footprint_m, valid=hit.valid, view_L=-rays.d, sun_L=centre
-            )
-            factor = surface.albedo.at_reference(ground)
+            factor = _albedo_factor(surface.albedo, view, hit, rays, centre)
             layers["albedo_factor"] = dr.select(hit.valid, factor, dr.nan)
         if hit.material is not None:
             layers["material"] = dr.select(hit.on_vehicle, mi.Int32(hit.material), mi.Int32(-1))
@@ -80,6 +77,14 @@ def truth(
         normal=np.stack([c.numpy() for c in in_camera], axis=-1).astype(np.float16).reshape(*shape, 3),
         semantic=classes,
         **{to: layers[name].numpy().reshape(shape) for name, to in more.items() if name in layers},
+    )
+
+
+def _albedo_factor(albedo: AlbedoMap | EarthAlbedo, view: View, hit: Any, rays: Any, sun_L: Any) -> Any:
+    """Return the factor of a map of the albedo, in the reference band, where the rays of pixels hit."""
+    spacing_m = hit.distance_m / float(view.intrinsics[0])
+    return albedo.at_reference(
+        GroundPoints(point_L_m=hit.point, footprint_m=spacing_m, valid=hit.valid, view_L=-rays.d, sun_L=sun_L)
     )
 
 
