@@ -41,7 +41,8 @@ the distance from the centre and is brighter towards the Sun. An aperture of 10,
 light of the nucleus, but until June 2014 the comet exceeded the light of its nucleus only somewhat (Tubiana et al.
 2015, A&A 573, A62). So most of this haze is light that the camera scatters. `--afrho-cm 0` leaves it out.
 
-`replay.json` holds all figures, `sheet.png` the pairs real | rendered at full size, with the same stretch.
+`replay.json` holds all figures, `sheet.png` the pairs real | rendered at full size, with the same stretch, and
+`pairs` the aligned images, which `flight_classifier.py` tries to tell apart.
 """
 
 from __future__ import annotations
@@ -381,6 +382,13 @@ def sheet(pairs: Sequence[Pair], across: int = 3) -> NDArray[np.uint8]:
     return np.asarray(np.vstack(rows), dtype=np.uint8)
 
 
+def write_pair(folder: Path, pair: Pair) -> None:
+    """Write NAME_real.png and NAME_rendered.png, aligned, in 8 bits."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for which, one in (("real", pair.real), ("rendered", pair.rendered)):
+        cv2.imwrite(str(folder / f"{pair.name}_{which}.png"), one.image.astype(np.uint8))
+
+
 def table(figures: Mapping[str, tuple[float, float]]) -> list[str]:
     """Return the summary as lines of text."""
     lines = [f"{'figure':<16}{'median':>10}{'worst 5 %':>11}"]
@@ -438,8 +446,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
             flush=True,
         )
         pairs.append(pair)
+        write_pair(given.out / "pairs", pair)
     figures = summary([pair.figures for pair in pairs])
-    given.out.mkdir(parents=True, exist_ok=True)
     result = {
         "summary": {name: list(pair) for name, pair in figures.items()},
         "frames": {pair.name: {**pair.figures, "shift_xy_px": pair.shift_xy} for pair in pairs},
