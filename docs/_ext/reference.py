@@ -55,6 +55,7 @@ _UNITS = {
     "_s": "s",
     "_TeV_g": "TeV/g",
     "_um": "µm",
+    "_urad": "µrad",
     "_K": "K",
     "_mag_deg": "mag/°",
     "_years": "a",
