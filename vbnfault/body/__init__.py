@@ -33,10 +33,11 @@ from .shape import (
     vertex_normals,
 )
 from .sites import Site, Sites, choose_sites, local_level, site_at
-from .spec import PatchSpec
+from .spec import Fractured, PatchSpec
 
 __all__ = [
     "Body",
+    "Fractured",
     "Patch",
     "PatchSpec",
     "PolyhedronGravity",

@@ -112,7 +112,7 @@ def add_boulders(ground: GroundMesh, spec: PatchSpec, *, rng: np.random.Generato
     smallest = smallest_at(distance, spec.min_boulder_m, spec.boulder_near_m)
     bearing = smallest < LARGEST_M
     favour = np.zeros(len(faces))
-    favour[bearing] = _favour(ground, normals[bearing], faces[bearing], spec.seed)
+    favour[bearing] = _favour(ground, normals[bearing], faces[bearing], spec)
     law = SizeLaw(per_m2=1e-6 * spec.boulders_per_km2, index=spec.boulder_index)
     diameter, face, position, least = scatter(points, faces, favour, smallest, law, rng)
 
@@ -166,15 +166,19 @@ def _levels(diameter_m: Float64, facet_m: Float64, distance_m: Float64, budget: 
     return level
 
 
-def _favour(ground: GroundMesh, normals: Float64, faces: Int32, seed: int) -> Float64:
+def _favour(ground: GroundMesh, normals: Float64, faces: Int32, spec: PatchSpec) -> Float64:
     """Return the relative density of boulders on some faces, float64[m], from their normals and vertices."""
     dust, talus = ground.dust[faces], ground.talus[faces]
     place = Points(ground.place_T_m[faces].mean(axis=1))
     count = len(faces)
-    broad = place.gradient(110.0, noise_key(seed, 9001), count) / GRADIENT_STD
-    close = place.gradient(23.0, noise_key(seed, 9002), count) / GRADIENT_STD
+    broad = place.gradient(110.0, noise_key(spec.seed, 9001), count) / GRADIENT_STD
+    close = place.gradient(23.0, noise_key(spec.seed, 9002), count) / GRADIENT_STD
     cluster = np.exp(1.0 * broad.astype(np.float64) + 0.6 * close)
-    cover = 0.15 + 0.6 * (1 - dust.mean(axis=1)) + 7.0 * talus.mean(axis=1)
+    cover = 0.15 + 0.6 * (1 - dust.mean(axis=1))
+    if spec.fractured is None:
+        cover = cover + 7.0 * talus.mean(axis=1)
+    else:
+        cover = cover * (1 + (spec.fractured.apron - 1) * talus.mean(axis=1))
     # Boulders do not stay on steep ground.
     lie = np.clip((-normals[:, 2] - 0.70) / (0.84 - 0.70), 0, 1)
     return np.asarray(cluster * cover * lie, dtype=np.float64)

@@ -25,6 +25,7 @@ _OFFSET_CELLS = 0.37
 
 # Standard deviation of `Points.gradient`, measured over a million points.
 GRADIENT_STD = 0.191
+PLANES_STD = 0.1826
 
 
 def octave_rotation(number: int) -> Float64:
@@ -52,6 +53,14 @@ class Points:
     def gradient(self, wavelength_m: float, key: int, count: int) -> Float32:
         """Return gradient noise of one cycle per 1-2 wavelengths, float32[count], mean 0, within ±1.3."""
         (value,) = self._run(_gradient, wavelength_m, key, count)
+        return value
+
+    def planes(self, width_m: float, key: int, count: int) -> Float32:
+        """Return a continuous surface of planes that meet in edges, float32[count], 0 to 1 with mean 0.5.
+
+        Random values at the corners of cells of that width are interpolated linearly in tetrahedra.
+        """
+        (value,) = self._run(_planes, width_m, key, count)
         return value
 
     def blocks(self, width_m: float, key: int, count: int) -> tuple[Float32, Float32, Float32]:
@@ -148,6 +157,29 @@ def _gradient(d: Any, q: list[Any], word: Any) -> tuple[Any, ...]:
             dot = dot + (2 * _unit(d, h, 10 * axis) - (1 - 1 / 1024)) * (f[axis] - step)
             weight = weight * (fade[axis] if step else 1 - fade[axis])
         total = total + weight * dot
+    return (total,)
+
+
+def _planes(d: Any, q: list[Any], word: Any) -> tuple[Any, ...]:
+    """Return values interpolated linearly in the six tetrahedra of each cell (Kuhn 1960) at positions in cells."""
+    words, f = _split(d, q)
+    high = d.dr.maximum(f[0], d.dr.maximum(f[1], f[2]))
+    low = d.dr.minimum(f[0], d.dr.minimum(f[1], f[2]))
+    first = [f[0] >= high, (f[1] >= high) & (f[0] < high), (f[2] >= high) & (f[0] < high) & (f[1] < high)]
+    last = [(f[0] <= low) & ~first[0], None, None]
+    last[1] = (f[1] <= low) & ~first[1] & ~last[0]
+    last[2] = ~last[0] & ~last[1]
+    middle = f[0] + f[1] + f[2] - high - low
+    corners = (
+        [words[axis][0] for axis in range(3)],
+        [d.dr.select(first[axis], words[axis][1], words[axis][0]) for axis in range(3)],
+        [d.dr.select(last[axis], words[axis][0], words[axis][1]) for axis in range(3)],
+        [words[axis][1] for axis in range(3)],
+    )
+    weights = (1 - high, high - middle, middle - low, low)
+    total = d.Float(0)
+    for (x, y, z), weight in zip(corners, weights, strict=True):
+        total = total + weight * _unit(d, _mix(d, x ^ y ^ z ^ word), 0)
     return (total,)
 
 

@@ -12,17 +12,17 @@ of the slope against gravity. The relief consists of:
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from .fields import GRADIENT_STD, Points
+from . import fractured
 from .gravity import GRAVITATIONAL_CONSTANT
-from .noise import Float32, noise_key
-from .roughness import Roughness, deviogram
+from .noise import Float32
+from .octaves import Octaves, smooth_max, smooth_step
+from .roughness import Roughness
 from .shape import Float64, Int32, vertex_normals
 from .sites import Site
 from .spec import PatchSpec
@@ -30,20 +30,14 @@ from .spec import PatchSpec
 if TYPE_CHECKING:
     from . import Body
 
-# A field fades in as its wavelength grows from 1.6 to 2.8 facets.
-_FADE = (1.6, 2.8)
 _SHARED_M = 20.0  # longer octaves raise dust and rock alike
 LONGEST_EDGES = 1.0  # wavelength of the longest octave, in mean edges of the model
 _REGION_EDGES = 4.5  # size of the regions, in longest octaves
 _SHORTEST_FACETS = 1.8  # wavelength of the shortest octave, in the smallest facets
 
-_CRATER_WIDTHS_M = (72.0, 36.0, 18.0, 9.0)  # cells; diameters are a third to two thirds of their width
-_CRATER_SHARE_PER_DENSITY = 1534e-6  # fraction of the cells, per crater of 10 m or more in a square kilometre
-
 _TERRACE_M = (5.5, 2.6)  # height of a step, and of the smaller steps between them
 # (cell width, height per unit of block noise) of the broken ground, in metres
 _BLOCKS_M = ((17.0, 1.9), (6.0, 0.95), (2.2, 0.40), (0.85, 0.14))
-_CRACK_DEPTH = 0.30  # of the cracks between blocks, per unit of the blocks' height
 _STRATA_M = ((9.0, 1.3), (3.1, 0.55), (1.1, 0.20))  # thickness of a layer, and how far a hard layer stands out
 
 _CLOD_CELLS_M = (2.1, 1.2, 0.7)
@@ -59,7 +53,7 @@ _SLUMPS, _SLUMP_STEPS = 4, 25
 
 _TALUS_CELL_M = 4.0
 _TALUS_REACH_M = 480.0
-_TALUS_WIDTH_M = 9.0
+_TALUS_WIDTH_M, _APRON_WIDTH_M = 9.0, 32.0  # of debris below small and large cliffs
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -114,40 +108,51 @@ def add_relief(
         slope = _slope_deg(points, normals, faces, up)
         return Ground(
             height_m=np.zeros(len(points)),
-            dust=1 - _smooth_step(*_DUST_LEAVES_DEG, slope),
+            dust=1 - smooth_step(*_DUST_LEAVES_DEG, slope),
             talus=np.zeros(len(points), dtype=np.float32),
         )
     # Points are sorted by facet size, so that each octave is evaluated at a leading part of them only.
     order = np.argsort(facet_m, kind="stable")
     rank = np.empty_like(order)
     rank[order] = np.arange(len(order))
-    noise = _Octaves(points[order] + site.position_T_m, facet_m[order], spec.seed, roughness, longest_m)
+    noise = Octaves(points[order] + site.position_T_m, facet_m[order], spec.seed, roughness, longest_m)
 
     # Roughness differs between regions. Far away, facets show few octaves, and evenly rough ground would look like
     # orange peel.
-    region = 0.45 + 0.95 * _smooth_step(-1.0, 1.2, noise.gradient(_REGION_EDGES * longest_m, 210))
+    region = 0.45 + 0.95 * smooth_step(-1.0, 1.2, noise.gradient(_REGION_EDGES * longest_m, 210))
     swell = region * noise.fractal(longest_m, _SHARED_M, 0)
-    on_cliffs = _smooth_step(26.0, 42.0, _slope_deg(points, normals, faces, up))[order]
-    broad = _terraced(noise, swell) + (1 - on_cliffs) * noise.craters(spec.craters_per_km2)
     shown = noise.shown(longest_m)
-    raised = points + (scale * (broad * shown)[rank].astype(np.float64))[:, None] * normals
-    slope = _slope_deg(raised, normals, faces, up)
-    talus = _talus(np.einsum("ni,ij->nj", raised, site.T_from_L), slope)
-    height, dust = _surface(noise, broad, slope[order], talus[order], elevation[order])
-    height_m = scale * (height * shown)[rank].astype(np.float64)
-    return Ground(height_m=_slumped(points, faces, height_m), dust=dust[rank], talus=talus)
 
+    def raised(height: Float32) -> Float64:
+        return points + (scale * (height * shown)[rank].astype(np.float64))[:, None] * normals
 
-def _smooth_step(low: float, high: float, x: NDArray) -> Float32:
-    """Return a smooth step from 0 at `low` to 1 at `high`."""
-    t = np.clip((np.asarray(x, dtype=np.float32) - np.float32(low)) / np.float32(high - low), 0, 1)
-    return np.asarray(t * t * (3 - 2 * t), dtype=np.float32)
+    def slope_of(height: Float32) -> Float32:
+        return _slope_deg(raised(height), normals, faces, up)[order]
 
-
-def _smooth_max(a: NDArray, b: NDArray, width: float) -> NDArray:
-    """Return the maximum, rounded where a and b differ by less than `width`."""
-    h = np.maximum(np.float32(width) - np.abs(a - b), 0) / np.float32(width)
-    return np.asarray(np.maximum(a, b) + h * h * np.float32(width / 4))
+    model_slope = _slope_deg(points, normals, faces, up)[order]
+    pits = (1 - smooth_step(26.0, 42.0, model_slope)) * noise.craters(spec.craters_per_km2)
+    if spec.fractured is None:
+        broad = _terraced(noise, swell) + pits
+    else:
+        rock = fractured.bedrock(noise, swell, elevation[order], model_slope, slope_of, spec.fractured)
+        broad = rock.height_m + pits
+    slope = slope_of(broad)
+    place_L = np.einsum("ni,ij->nj", raised(broad), site.T_from_L)
+    talus = _talus(place_L, slope[rank], _TALUS_WIDTH_M)
+    if spec.fractured is None:
+        height, dust = _surface(noise, broad, slope, talus[order], elevation[order])
+    else:
+        talus = np.maximum(talus, _talus(place_L, slope[rank], _APRON_WIDTH_M))
+        lie = fractured.Lie(
+            model_slope_deg=model_slope, slope_deg=slope, talus=talus[order], elevation_m=elevation[order]
+        )
+        height, dust = fractured.surface(noise, rock, broad, lie, spec.fractured)
+    height_m = _slumped(points, faces, scale * (height * shown)[rank].astype(np.float64))
+    dust = dust[rank]
+    if spec.fractured is not None:
+        slope = _slope_deg(points + height_m[:, None] * normals, normals, faces, up)
+        dust = dust * fractured.dust_that_rests(slope, spec.fractured)
+    return Ground(height_m=height_m, dust=dust, talus=talus)
 
 
 # --- the vertical and slopes ------------------------------------------------------------------------------------
@@ -183,124 +188,12 @@ def _slope_deg(points: Float64, normals: Float64, faces: Int32, up: Float64) -> 
     return np.degrees(np.arccos(np.clip(cosine, -1, 1))).astype(np.float32)
 
 
-# --- noise that the facets can show -----------------------------------------------------------------------------
-
-
-class _Octaves:
-    """Evaluate fields at points sorted by their facet size; a field is 0 where the facets cannot show it."""
-
-    def __init__(
-        self, place_m: Float64, facet_m: Float64, seed: int, roughness: Roughness, longest_m: float
-    ) -> None:
-        self.place_m = place_m
-        self.facet_m = facet_m
-        self._seed = seed
-        self._points = Points(place_m)
-        self._roughness = roughness
-        self._longest_m = longest_m
-        self._unit = 1.0 / windowed_deviation(roughness.hurst)
-
-    def bent(self, shift_m: NDArray) -> _Octaves:
-        """Return the same fields at shifted positions."""
-        return _Octaves(self.place_m + shift_m, self.facet_m, self._seed, self._roughness, self._longest_m)
-
-    def shown(self, wavelength_m: float) -> Float32:
-        """Return how well the facets show a wavelength, float32[n] in [0, 1]."""
-        return _smooth_step(*_FADE, wavelength_m / self.facet_m)
-
-    def _count(self, wavelength_m: float) -> int:
-        """Return the number of points whose facets can show a wavelength."""
-        return int(np.searchsorted(self.facet_m, wavelength_m / _FADE[0]))
-
-    def _full(self, part: Float32, wavelength_m: float) -> Float32:
-        """Return values of the leading points, faded in by their facet size, and 0 at the other points."""
-        out = np.zeros(len(self.facet_m), dtype=np.float32)
-        n = len(part)
-        out[:n] = part * _smooth_step(*_FADE, wavelength_m / self.facet_m[:n])
-        return out
-
-    def gradient(self, wavelength_m: float, stream: int) -> Float32:
-        """Return gradient noise of standard deviation 1."""
-        count = self._count(wavelength_m)
-        part = self._points.gradient(wavelength_m, noise_key(self._seed, stream), count)
-        return self._full(part, wavelength_m) * np.float32(1 / GRADIENT_STD)
-
-    def amplitude(self, wavelength_m: float) -> np.float32:
-        """Return the factor on an octave of standard deviation 1 that makes all octaves follow the law."""
-        return np.float32(self._unit * float(self._roughness.deviation_at(wavelength_m)))
-
-    def wavelengths(self, longest_m: float, shortest_m: float) -> list[tuple[int, float]]:
-        """Return the octaves in (shortest, longest] as (number, wavelength); the patch's longest is number 0."""
-        last = int(np.ceil(np.log2(self._longest_m / shortest_m)))
-        both = [(k, self._longest_m / 2**k) for k in range(last + 1)]
-        return [(k, w) for k, w in both if shortest_m < w <= longest_m * 1.0001]
-
-    def fractal(self, longest_m: float, shortest_m: float, stream: int) -> Float32:
-        """Return the sum of plain octaves that follow the roughness law, metres."""
-        total = np.zeros(len(self.facet_m), dtype=np.float32)
-        for k, wavelength in self.wavelengths(longest_m, shortest_m):
-            total += self.amplitude(wavelength) * self.gradient(wavelength, stream + k)
-        return total
-
-    def blocks(self, width_m: float, height_m: float, stream: int) -> Float32:
-        """Return the height of blocks of that width, each at its own level, with cracks between them, metres."""
-        count = self._count(width_m)
-        level, other, gap = self._points.blocks(width_m, noise_key(self._seed, stream), count)
-        step = np.float32(height_m) * (other - level)
-        # A step narrower than two facets, or steeper than 60°, would have an edge like a saw.
-        ramp = np.maximum(0.06 * width_m, 1.8 * self.facet_m[:count]).astype(np.float32)
-        ramp = np.maximum(ramp, 0.45 * np.abs(step))
-        edge = 1 - _smooth_step(0, 1, gap / ramp)
-        crack = np.minimum(np.float32(_CRACK_DEPTH * height_m), 0.5 * ramp)
-        return self._full(height_m * level + (0.5 * step - crack) * edge, width_m)
-
-    def craters(self, per_km2: float) -> Float32:
-        """Return the height of craters on cells of all widths, metres."""
-        total = np.zeros(len(self.facet_m), dtype=np.float32)
-        fraction = min(1.0, _CRATER_SHARE_PER_DENSITY * per_km2)
-        for k, width in enumerate(_CRATER_WIDTHS_M):
-            shows = width / 4  # as a wavelength; the smallest bowls are a third of the cell wide
-            part = self._points.craters(width, noise_key(self._seed, 400 + k), self._count(shows), fraction)
-            total += self._full(part, shows)
-        return total
-
-    def clods(self, width_m: float, stream: int, fraction: float) -> Float32:
-        """Return the height of half-buried stones on cells of that width, metres."""
-        shows = 0.7 * width_m
-        part = self._points.clods(width_m, noise_key(self._seed, stream), self._count(shows), fraction)
-        return self._full(part, shows)
-
-
-@lru_cache(maxsize=16)
-def windowed_deviation(hurst: float) -> float:
-    """Return ν(1) that `deviogram` measures on octaves with wavelengths w and standard deviations w^hurst.
-
-    The measurement uses 40 tiles. The quadric fitted to each removes a part of the long octaves, as it does on a
-    model.
-    """
-    side, tiles = 36, 40
-    x, y = np.meshgrid(np.arange(side) / 6.0, np.arange(side) / 6.0, indexing="ij")
-    tile = np.column_stack([x.ravel(), y.ravel(), np.zeros(side * side)])
-    position = (tile[None] + 400.0 * np.arange(tiles)[:, None, None] * np.array([1.0, 0.7, 0.3])).reshape(-1, 3)
-    field, height = Points(position), np.zeros(len(position))
-    for k in range(-4, 6):
-        key = noise_key(1, 40 + k)
-        height += 2.0 ** (k * hurst) / GRADIENT_STD * field.gradient(2.0**k, key, len(position))
-    total = 0.0
-    up = np.tile([0.0, 0.0, 1.0], (side * side, 1))
-    for part in range(tiles):
-        # The heights are scaled down, so that distances stay those along the plane.
-        surface = tile + np.array([0.0, 0.0, 1e-4]) * height.reshape(tiles, -1)[part][:, None]
-        total += 1e8 * float(deviogram(surface, up, np.array([1.0]), windows=9)[0]) ** 2
-    return float(np.sqrt(total / tiles))
-
-
 # --- components of the ground -----------------------------------------------------------------------------------
 
 
-def _terraced(noise: _Octaves, swell: Float32) -> Float32:
+def _terraced(noise: Octaves, swell: Float32) -> Float32:
     """Return heights gathered into treads of uneven rise, in patches, so that scarps end along their length."""
-    where = _smooth_step(0.1, 1.5, noise.gradient(120.0, 200) + 0.5 * noise.gradient(31.0, 201))
+    where = smooth_step(0.1, 1.5, noise.gradient(120.0, 200) + 0.5 * noise.gradient(31.0, 201))
     wander = swell + 1.6 * noise.gradient(43.0, 202) + 0.7 * noise.gradient(17.0, 203)
     wander += 0.16 * noise.gradient(6.0, 204) + 0.05 * noise.gradient(2.3, 205)
     out = swell.copy()
@@ -310,19 +203,19 @@ def _terraced(noise: _Octaves, swell: Float32) -> Float32:
         tread = np.floor(u)
         # Random factors weaken some of the steps.
         kept = where * height_fraction * rise[tread.astype(np.int64) & 255]
-        out += kept * (step * (tread + _smooth_step(0.30, 0.98, u - tread)) - wander)
+        out += kept * (step * (tread + smooth_step(0.30, 0.98, u - tread)) - wander)
     return out
 
 
 def _surface(
-    noise: _Octaves, broad: Float32, slope: Float32, talus: Float32, elevation: Float64
+    noise: Octaves, broad: Float32, slope: Float32, talus: Float32, elevation: Float64
 ) -> tuple[Float32, Float32]:
     """Return the height in metres and the dust cover, both float32[n]."""
     history = noise.gradient(66.0, 100) + 0.45 * noise.gradient(25.0, 101)
-    cliff = _smooth_step(*_CLIFF_DEG, slope + 3 * history)
+    cliff = smooth_step(*_CLIFF_DEG, slope + 3 * history)
     # 1 where the ground is consolidated and broken, 0 where it is loose.
-    bare = _smooth_step(*_BARE_DEG, slope + 11 * history)
-    vigour = 0.55 + 1.0 * _smooth_step(-1.2, 1.4, noise.gradient(47.0, 102)) * (0.6 + 0.4 * bare)
+    bare = smooth_step(*_BARE_DEG, slope + 11 * history)
+    vigour = 0.55 + 1.0 * smooth_step(-1.2, 1.4, noise.gradient(47.0, 102)) * (0.6 + 0.4 * bare)
 
     shortest = max(_SHORTEST_FACETS * float(noise.facet_m[0]), 0.05)
     rough, grit = np.zeros_like(broad), np.zeros_like(broad)
@@ -340,7 +233,7 @@ def _surface(
     bend = np.column_stack([1.1 * noise.gradient(7.0, 110 + axis) for axis in range(3)])
     bend += np.column_stack([0.25 * noise.gradient(1.9, 113 + axis) for axis in range(3)])
     bent = noise.bent(bend)
-    joints = _smooth_step(-1.0, 0.8, noise.gradient(33.0, 116))
+    joints = smooth_step(-1.0, 0.8, noise.gradient(33.0, 116))
     for number, (width, height) in enumerate(_BLOCKS_M):
         rock += bare * (0.4 + 0.6 * joints) * bent.blocks(width, height, 120 + number)
     rock += cliff * _strata(noise, elevation + np.einsum("ni,i->n", bend, np.array([0.5, 0.3, 0.4])))
@@ -349,20 +242,20 @@ def _surface(
     # Dust settles on level ground and hides everything below its own slowly varying surface.
     depth = 0.75 + 0.9 * noise.gradient(58.0, 130) + 0.4 * noise.gradient(19.0, 131)
     depth -= 1.1 * bare * (0.5 + 0.5 * joints) + 0.5 * talus
-    depth -= 9.0 * _smooth_step(*_DUST_LEAVES_DEG, slope)
+    depth -= 9.0 * smooth_step(*_DUST_LEAVES_DEG, slope)
     ripples = 0.5 + 0.5 * np.tanh(noise.gradient(40.0, 132))
     dust = broad + depth + grit + 0.05 * ripples * noise.gradient(4.5, 133)
     clods = np.zeros_like(rock)
     for number, width in enumerate(_CLOD_CELLS_M):
         clods = np.maximum(clods, noise.clods(width, 160 + number, 0.55))
-    strewn = 0.15 + 0.85 * _smooth_step(-0.4, 1.4, noise.gradient(13.0, 170) + 0.6 * noise.gradient(41.0, 171))
+    strewn = 0.15 + 0.85 * smooth_step(-0.4, 1.4, noise.gradient(13.0, 170) + 0.6 * noise.gradient(41.0, 171))
     dust = dust + clods * np.maximum(strewn, talus)
-    cover = _smooth_step(-0.12, 0.30, dust - rock)
+    cover = smooth_step(-0.12, 0.30, dust - rock)
     # Stones and lumps of the ground below show through thin dust.
-    return _smooth_max(rock, dust, 0.30), cover
+    return smooth_max(rock, dust, 0.30), cover
 
 
-def _strata(noise: _Octaves, elevation: Float64) -> Float32:
+def _strata(noise: Octaves, elevation: Float64) -> Float32:
     """Return how far the layers of uneven hardness stand out of a cliff, metres."""
     total = np.zeros(len(elevation), dtype=np.float32)
     for number, (thickness, reach) in enumerate(_STRATA_M):
@@ -372,7 +265,7 @@ def _strata(noise: _Octaves, elevation: Float64) -> Float32:
         k = layer.astype(np.int64)
         inside = (u - layer).astype(np.float32)
         ramp = np.clip(1.5 * noise.facet_m / thickness, 0.12, 0.5).astype(np.float32)
-        blend = _smooth_step(0, 1, inside / ramp)
+        blend = smooth_step(0, 1, inside / ramp)
         below, here = hard[(k - 1) & 4095], hard[k & 4095]
         total += noise.shown(thickness) * np.float32(reach) * (below + blend * (here - below) - 0.5)
     return total
@@ -409,13 +302,13 @@ def _slumped(points: Float64, faces: Int32, height_m: Float64) -> Float64:
     return height
 
 
-def _talus(points_L: Float64, slope: Float32) -> Float32:
+def _talus(points_L: Float64, slope: Float32, width_m: float) -> Float32:
     """Return the debris at the feet of cliffs, float32[n]: it lies on moderate slopes below steep ground nearby."""
     cells = int(2 * _TALUS_REACH_M / _TALUS_CELL_M)
     cell_xy = np.floor((points_L[:, :2] + _TALUS_REACH_M) / _TALUS_CELL_M).astype(np.int64)
     inside = ((cell_xy >= 0) & (cell_xy < cells)).all(axis=1) & (np.abs(points_L[:, 2]) < _TALUS_REACH_M)
     cell = cell_xy[inside, 0] * cells + cell_xy[inside, 1]
-    weight = _smooth_step(*_CLIFF_DEG, slope[inside]).astype(np.float64)
+    weight = smooth_step(*_CLIFF_DEG, slope[inside]).astype(np.float64)
     height = -points_L[inside, 2]
 
     def grid(values: NDArray) -> Float64:
@@ -423,10 +316,10 @@ def _talus(points_L: Float64, slope: Float32) -> Float32:
 
     count = np.maximum(grid(np.ones(len(cell))), 1)
     steep, above = grid(weight) / count, grid(weight * height) / count
-    spread = _TALUS_WIDTH_M / _TALUS_CELL_M
+    spread = width_m / _TALUS_CELL_M
     near = ndimage.gaussian_filter(steep, spread)
     level = ndimage.gaussian_filter(above, spread) / np.maximum(near, 1e-6)
     out = np.zeros(len(points_L), dtype=np.float32)
-    below = _smooth_step(1.0, 5.0, level.ravel()[cell] - height)
-    out[inside] = _smooth_step(0.02, 0.22, near.ravel()[cell]) * below
-    return out * (1 - _smooth_step(33.0, 42.0, slope))
+    below = smooth_step(1.0, 5.0, level.ravel()[cell] - height)
+    out[inside] = smooth_step(0.02, 0.22, near.ravel()[cell]) * below
+    return out * (1 - smooth_step(33.0, 42.0, slope))

@@ -4,12 +4,31 @@ from __future__ import annotations
 
 from pydantic import Field
 
-from ..core.tables import table_class
+from ..core.tables import pair_within, table_class
 
 # Boulders of 7 m or more. Pajola et al. (2015, A&A 583, A37) counted 3546 on 36.4 km²: 97.4 ± 1.6 per km², with the
 # Poisson error of the count.
 PER_KM2 = 98.0
 INDEX = 3.6
+
+
+@table_class()
+class Fractured:
+    """Shape the ground as layered and jointed rock with basins of dust, in place of rounded relief."""
+
+    strata: float = Field(default=1.0, ge=0, le=3, description="factor on terraces and ledges")
+    joints: float = Field(default=1.0, ge=0, le=3, description="factor on the blocks and cracks between fractures")
+    dust_m: float = Field(default=1.5, ge=0, le=20, description="thickness of dust on level ground")
+    dust_slope_deg: pair_within(0, 85) = Field(  # type: ignore[valid-type]
+        default=(20.0, 42.0), description="slopes up to which all dust rests, and from which none does"
+    )
+    border_m: float = Field(default=1.5, gt=0, le=20, description="thickness over which the cover of dust grows")
+    apron: float = Field(
+        default=8.0,
+        ge=1,
+        le=50,
+        description="density of boulders on debris at the feet of cliffs, over that of other ground",
+    )
 
 
 @table_class()
@@ -61,4 +80,7 @@ class PatchSpec:
         ge=0.3,
         le=1.2,
         description="exponent of the roughness below the model's facets; default: that measured on the model",
+    )
+    fractured: Fractured | None = Field(
+        default=None, description="layered and jointed rock; default: rounded relief"
     )

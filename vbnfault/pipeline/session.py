@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..body import Body, Patch, PatchSpec, Site, Sites, cached_patch, choose_sites
+from ..body import Body, Fractured, Patch, PatchSpec, Site, Sites, cached_patch, choose_sites
 from ..body.refine import GROWTH_POWER
 from ..camera import Camera
 from ..core import activity
@@ -346,7 +346,10 @@ class Session:
             boulder_index=table.boulder_index,
             boulders_per_km2=table.boulders_per_km2,
             max_triangles=max(table.max_triangles, 2 * len(self.body.faces)),
+            fractured=None if table.fractured is None else Fractured(**table.fractured.model_dump()),
         )
+        if table.fractured is not None:
+            spec = replace(spec, boulder_near_m=max(table.radius_m, spec.boulder_near_m))
         if detail is not None:
             spec = replace(
                 spec,

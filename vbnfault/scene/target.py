@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 from pydantic import Field, model_validator
 
 from ..core import spectra
-from ..core.tables import Table
+from ..core.tables import Table, pair_within
 from ..reflectance import AnyReflectance
 from ..reflectance.disc import Lambert
 
@@ -156,6 +156,24 @@ class BodyTable(Table):
         return self
 
 
+class FracturedTable(Table):
+    """Shape the ground as layered and jointed rock with basins of dust, as on 67P."""
+
+    strata: float = Field(1.0, ge=0, le=3, description="factor on terraces and ledges")
+    joints: float = Field(1.0, ge=0, le=3, description="factor on the blocks and cracks between fractures")
+    dust_m: float = Field(1.5, ge=0, le=20, description="thickness of dust on level ground")
+    dust_slope_deg: pair_within(0, 85) = Field(  # type: ignore[valid-type]
+        (20.0, 42.0), description="slopes up to which all dust rests, and from which none does"
+    )
+    border_m: float = Field(1.5, gt=0, le=20, description="thickness over which the cover of dust grows")
+    apron: float = Field(
+        8.0,
+        ge=1,
+        le=50,
+        description="density of boulders on debris at the feet of cliffs, over that of other ground",
+    )
+
+
 class PatchTable(Table):
     """Set how far and how finely the terrain around a site is refined."""
 
@@ -173,3 +191,6 @@ class PatchTable(Table):
     min_boulder_m: float = Field(0.25, ge=0.05, le=1000, description="diameter of the smallest near the site")
     boulder_index: float = Field(3.6, ge=0.5, le=6, description="of the cumulative size law; Pajola et al. 2015")
     boulders_per_km2: float = Field(98.0, ge=0, le=1e5, description="of 7 m or more; Pajola et al. 2015")
+    fractured: FracturedTable | None = Field(
+        None, description="layered and jointed rock in place of rounded relief"
+    )

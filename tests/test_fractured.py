@@ -1,0 +1,208 @@
+"""Layered and jointed ground: its steps, its dust, its boulders, and what makes it look broken and not melted."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from vbnfault.body import (
+    Body,
+    Fractured,
+    Patch,
+    PatchSpec,
+    build_patch,
+    choose_sites,
+    fractured,
+    load_body,
+    site_at,
+)
+from vbnfault.body.boulders import GroundMesh, _favour
+from vbnfault.body.fields import PLANES_STD, Points
+from vbnfault.body.octaves import Octaves
+from vbnfault.body.roughness import Roughness, deviogram, model_roughness
+from vbnfault.body.shape import vertex_normals
+from vbnfault.core.errors import InputError
+from vbnfault.scene.config import load_scene
+
+FINE = {"seed": 7, "facet_m": 0.7, "radius_m": 40.0, "min_boulder_m": 0.8, "max_triangles": 300_000}
+
+
+@pytest.fixture(scope="module")
+def body() -> Body:
+    return load_body()
+
+
+@pytest.fixture(scope="module")
+def patches(body: Body) -> list[Patch]:
+    sites = choose_sites(body, 3, seed=7)
+    return [build_patch(body, site, PatchSpec(**FINE, fractured=Fractured())) for site in sites]
+
+
+def ground_of(patch: Patch) -> tuple[np.ndarray, np.ndarray]:
+    faces = patch.faces[~patch.face_is_boulder]
+    return patch.vertices_L_m[: faces.max() + 1].astype(np.float64), faces
+
+
+def octaves(place_m: np.ndarray, facet_m: float) -> Octaves:
+    law = Roughness(deviation_m=12.0, baseline_m=75.0, hurst=1.0)
+    return Octaves(place_m, np.full(len(place_m), facet_m), 3, law, 80.0)
+
+
+# --- closed forms -----------------------------------------------------------------------------------------------
+
+
+def test_layers_cover_a_coordinate_without_gaps() -> None:
+    x = np.linspace(-5000.0, 5000.0, 400_001)
+    index, inside, thickness = fractured._layers(x, 10.0, (1, 2))
+    assert inside.min() >= 0
+    assert inside.max() <= 1
+    assert set(np.unique(np.diff(index))) == {0, 1}
+    # Edges are jittered by up to 0.8 of a cell: layers measure 2 to 18 m, 10 m in the mean.
+    assert 2.0 <= thickness.min() < 6.0 < 14.0 < thickness.max() <= 18.0
+    assert (index[-1] - index[0]) / 1000.0 == pytest.approx(1.0, abs=0.002)
+    # Within a layer the position rises evenly by the step over its thickness; float32 of it: 6e-8.
+    same = np.diff(index) == 0
+    np.testing.assert_allclose(np.diff(inside)[same], 0.025 / thickness[1:][same], atol=3e-6)
+
+
+def test_planes_are_linear_between_edges() -> None:
+    line = np.array([3100.0, -2200.0, 1700.0]) + np.linspace(0, 300, 60_001)[:, None] * np.array([0.6, 0.64, 0.48])
+    height = Points(line).planes(20.0, 5, len(line)).astype(np.float64)
+    # Values of neighbours differ by at most 1 over an edge of a cell: 5 mm of 20 m, on each of three axes.
+    assert np.abs(np.diff(height)).max() < 3 * 0.005 / 20
+    # The line meets some ten faces of tetrahedra in each of its 15 cells; elsewhere only float32 bends it.
+    assert np.mean(np.abs(np.diff(height, 2)) > 1e-6) < 15 * 10 / 60_000
+    spread = Points(np.random.default_rng(1).uniform(-3000, 3000, (200_000, 3))).planes(20.0, 5, 200_000)
+    assert spread.std() == pytest.approx(PLANES_STD, rel=0.01)
+    assert spread.mean() == pytest.approx(0.5, abs=0.005)
+
+
+def test_layers_turn_an_incline_into_treads_and_scarps() -> None:
+    # An incline of 25°, finely sampled. The layers gather its rise into scarps, and change no height by more than
+    # two of the thickest layers.
+    x = np.arange(0.0, 1500.0, 0.25)
+    place = np.column_stack([x, 0.37 * x, 0.11 * x])
+    steep = np.tan(np.radians(25.0))
+    noise = octaves(place, 0.25)
+    rise = fractured._terraces(noise, steep * x, np.full(len(x), steep, np.float32), np.ones(len(x), np.float32))
+    slope = np.gradient(steep * x + rise, x)
+    assert slope.mean() == pytest.approx(steep, rel=0.1)
+    assert np.median(slope) < 0.6 * steep  # treads are most of the way
+    assert np.percentile(slope, 97) > 2.5 * steep  # scarps
+    assert np.abs(rise).max() < 2 * 1.8 * 34.0
+    # none of it where there are no layers, and scarps are as wide as coarse facets can show
+    nothing = fractured._terraces(
+        noise, steep * x, np.full(len(x), steep, np.float32), np.zeros(len(x), np.float32)
+    )
+    assert not nothing.any()
+
+
+def test_boulders_gather_on_debris_by_the_factor_asked_for() -> None:
+    side = 40
+    x, y = (axis.ravel() for axis in np.meshgrid(np.arange(side) * 5.0, np.arange(side) * 5.0, indexing="ij"))
+    corner = np.arange(side * side).reshape(side, side)
+    faces = np.column_stack([corner[:-1, :-1].ravel(), corner[1:, :-1].ravel(), corner[:-1, 1:].ravel()]).astype(
+        np.int32
+    )
+    points = np.column_stack([x, y, 0 * x])
+    up = np.tile([0.0, 0.0, -1.0], (len(faces), 1))
+    for apron in (1.0, 8.0):
+        spec = PatchSpec(seed=1, fractured=Fractured(apron=apron))
+        density = []
+        for talus in (0.0, 1.0):
+            ground = GroundMesh(
+                points=points,
+                faces=faces,
+                facet_m=np.full(len(points), 5.0),
+                dust=np.full(len(points), 0.3, np.float32),
+                talus=np.full(len(points), talus, np.float32),
+                place_T_m=points,
+            )
+            density.append(_favour(ground, up, faces, spec))
+        np.testing.assert_allclose(density[1], apron * density[0], rtol=1e-6)
+        assert density[0].std() > 0  # clusters
+
+
+# --- the ground of a patch --------------------------------------------------------------------------------------
+
+
+def test_fractured_ground_continues_the_models_spectrum(body: Body, patches: list[Patch]) -> None:
+    law = model_roughness(body)
+    baselines = np.array([2.5, 5.0, 12.0, 30.0])
+    rows = []
+    for patch in patches:
+        points, faces = ground_of(patch)
+        normals, distance = vertex_normals(points, faces), np.linalg.norm(points, axis=1)
+        row = []
+        for baseline in baselines:
+            near = np.flatnonzero(distance < 20.0 + 6.0 * baseline)[:: 1 if baseline < 8 else 4]
+            row.append(deviogram(points[near], normals[near], np.array([baseline]), windows=40)[0])
+        rows.append(row)
+    ratio = np.sqrt(np.mean(np.square(rows), axis=0)) / law.deviation_at(baselines)
+    # as for the rounded ground: three places differ from each other by a factor of two
+    assert (ratio > 0.6).all(), ratio
+    assert (ratio < 1.6).all(), ratio
+
+
+def test_dust_thins_out_with_the_slope(patches: list[Patch]) -> None:
+    dust, slope = [], []
+    for patch in patches:
+        points, faces = ground_of(patch)
+        near = np.linalg.norm(points, axis=1) < 200.0
+        slope.append(np.degrees(np.arccos(-vertex_normals(points, faces)[near, 2])))
+        dust.append(patch.dust[: len(points)][near])
+    cover, steepness = np.concatenate(dust), np.concatenate(slope)
+    means = [cover[(steepness >= low) & (steepness < low + 10)].mean() for low in range(0, 70, 10)]
+    # falls with the slope, without a step: no more than a third from one ten degrees to the next
+    assert all(a > b - 0.02 for a, b in itertools.pairwise(means)), means
+    assert max(a - b for a, b in itertools.pairwise(means)) < 0.33
+    assert means[0] > 0.5
+    assert means[-1] < 0.1
+    # The angle of repose: no dust lies on ground steeper than 42 + 2°. Here slopes refer to the vertical of the
+    # site; that of the ground differs by some degrees within 200 m.
+    assert np.mean(cover[steepness > 47.0] > 0.1) < 2e-3
+    # soft borders: an eighth of the ground at least is neither bare nor wholly covered
+    assert np.mean((cover > 0.15) & (cover < 0.85)) > 1 / 8
+
+
+def test_neighbouring_sites_see_the_same_fractured_ground(body: Body) -> None:
+    first = choose_sites(body, 1, seed=7)[0]
+    second = site_at(body, 1, first.position_T_m + 25.0 * first.T_from_L[:, 0])
+    even = {"seed": 7, "facet_m": 6.0, "radius_m": 150.0, "min_boulder_m": 1e6, "fractured": Fractured()}
+    a, b = (build_patch(body, site, PatchSpec(**even)) for site in (first, second))
+    flat = [build_patch(body, site, PatchSpec(**even, relief=0.0)) for site in (first, second)]
+
+    def in_T(patch: Patch) -> np.ndarray:
+        return patch.vertices_L_m.astype(np.float64) @ patch.site.T_from_L.T + patch.site.position_T_m
+
+    from scipy.spatial import cKDTree
+
+    near = np.flatnonzero(np.linalg.norm(flat[0].vertices_L_m, axis=1) < 110.0)
+    apart, twin = cKDTree(in_T(flat[1])).query(in_T(flat[0])[near])
+    same = apart < 1e-3
+    assert same.sum() > 300
+    raised = np.linalg.norm((in_T(a) - in_T(flat[0]))[near[same]], axis=1)
+    difference = np.linalg.norm(in_T(a)[near[same]] - in_T(b)[twin[same]], axis=1)
+    # Elevation and slopes refer to each site's own expansion of gravity, and scarps slump along each mesh's edges.
+    assert raised.std() > 0.5
+    assert np.median(difference) < 0.05
+    assert stats.spearmanr(raised, np.linalg.norm((in_T(b) - in_T(flat[1]))[twin[same]], axis=1))[0] > 0.95
+
+
+# --- keys -------------------------------------------------------------------------------------------------------
+
+
+def test_keys_of_the_scene() -> None:
+    assert load_scene("quickstart").patch.fractured is None
+    assert load_scene("navcam67p").patch.fractured is not None
+    table = load_scene("quickstart", {"patch.fractured": {"dust_m": 2.5}}).patch.fractured
+    assert table is not None
+    assert Fractured(**table.model_dump()) == Fractured(dust_m=2.5)
+    for key, value in (("dust_slope_deg", [40.0, 20.0]), ("apron", 0.0), ("border_m", 0.0), ("strata", -1.0)):
+        with pytest.raises(InputError, match=key):
+            load_scene("quickstart", {f"patch.fractured.{key}": value})
+    with pytest.raises(InputError, match="joints"):
+        Fractured(joints=5.0)
