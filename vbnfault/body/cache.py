@@ -23,10 +23,8 @@ if TYPE_CHECKING:
     from . import Body
 
 PATCHES = ArrayFiles(kind="patch", content="terrain")
-_SOURCES = (
-    *("fields", "noise", "octaves", "refine", "relief", "fractured", "roughness", "boulders", "patch", "gravity"),
-    "shape",
-)
+_SOURCES = ("fields", "noise", "octaves", "refine", "relief", "fractured", "roughness", "boulders", "patch")
+_SOURCES += ("gravity", "shape")
 _ARRAYS = tuple(name for name in Patch.__dataclass_fields__ if name != "site")
 
 
