@@ -23,8 +23,8 @@ if TYPE_CHECKING:
     from . import Body
 
 PATCHES = ArrayFiles(kind="patch", content="terrain")
-_SOURCES = ("fields", "noise", "octaves", "refine", "relief", "fractured", "roughness", "boulders", "patch")
-_SOURCES += ("gravity", "shape")
+_GROUND = ("fields", "noise", "octaves", "relief", "fractured", "roughness")
+_SOURCES = (*_GROUND, "refine", "boulders", "patch", "gravity", "shape")
 _ARRAYS = tuple(name for name in Patch.__dataclass_fields__ if name != "site")
 
 

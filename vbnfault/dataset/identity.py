@@ -80,6 +80,8 @@ def scene_identity(session: pipeline.Session) -> dict[str, Any]:
         del scene["coma"]
     if session.scene.camera.point_spread is None:
         del scene["camera"]["point_spread"]
+    if session.scene.patch.fractured is None:
+        del scene["patch"]["fractured"]
     if not session.scene.sky.bodies:
         del scene["sky"]["bodies"]
     if session.scene.trajectory is None:
