@@ -35,6 +35,7 @@ def inject_faults(
     A fault without a visible effect is drawn again a few times, then left out. So the result holds the faults that
     are in the image, and labels never claim more.
     """
+    release_unused()  # what imaging took
     commanded = list(spec.commanded if commanded is None else commanded)
     if not pose.resolved or pose.sun_visible_fraction == 0:
         commanded = [name for name in commanded if not spec.faults[name].needs_sun]
@@ -123,10 +124,15 @@ def _invisible(development: Development, draws: Draws, *, stored: bool) -> list[
         if not draws:
             return []
         development.image(draws, noisy=False)  # all effects need it
-        # numpy and OpenCV use one core for most steps
+        # without a fault that informs others, their light is computed anew, with both cores and much memory
+        alone = [name for name in draws if informs(draws[name].fault)]
+        invisible = {name: is_invisible(name) for name in alone}
+        release_unused()
+        # numpy and OpenCV use one core for most steps of the others
+        others = [name for name in draws if name not in invisible]
         with ThreadPoolExecutor(_THREADS) as pool:
-            verdicts = pool.map(is_invisible, draws)
-            return [name for name, invisible in zip(draws, verdicts, strict=True) if invisible]
+            invisible |= dict(zip(others, pool.map(is_invisible, others), strict=True))
+        return [name for name in draws if invisible[name]]
     doubtful = sorted(_doubtful(development, draws))
     return [n for n in doubtful if not _shows_on_some_rows(development, draws, n) and is_invisible(n)]
 
