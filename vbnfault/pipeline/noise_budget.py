@@ -17,6 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core.memory import release_unused
 from ..core.quantities import Radiance, Truth
 from ..render.description import RenderInput
 from ..world import assemble
@@ -74,6 +75,7 @@ def sample_to_noise(
 
     camera = spec.camera
     electron_rate = green_per_second(spec)
+    release_unused()  # what the sample before took
     sampled = render.direct_by_sample(spec.terrain.surface, scene, electron_rate)
     indirect = None
     if guide is not None and scene.bounces:
@@ -81,6 +83,7 @@ def sample_to_noise(
     light = sampled.radiance.array.copy() if indirect is None else sampled.radiance.array + indirect
     whole = sampled.radiance.with_array(light.view())
     sampled = replace(sampled, radiance=whole)  # a copy in all bands takes 37 MB for a frame of 1024 pixels
+    release_unused()  # samples in cells have wavefronts of other sizes
     exposure = foreseen_exposure_s(spec.scene, camera, truth, scene.view, whole)
     exposure *= 2 ** max(spec.scene.camera.exposure_stops[1], 0.0)  # the longest of the samples of the view
     signal_e = np.einsum("b,byx->yx", electron_rate * exposure, whole.array)
@@ -182,7 +185,8 @@ class _Refined:
         """Render those of the noisy pixels again whose own variance is too large, if their noise shows (`near`).
 
         The last round takes up to twice the limit in a pixel: where most lit pixels lie at hard edges of shadows,
-        the limit would otherwise leave more than `_NOISY_FRACTION` of them with too much noise.
+        the limit would otherwise leave more than `_NOISY_FRACTION` of them with too much noise. A cell takes no
+        more than in the earlier rounds, because the table of points for 4096 samples takes half a second.
         """
         if not self._rounds:
             # the error over 3×3 pixels corrects what the ranges let expect
@@ -194,7 +198,10 @@ class _Refined:
         noisy = noisy | (self._single > (_SURELY * fraction) ** 2)
         pixels = np.flatnonzero(noisy & near & (goal < 1))
         squares = self._range[pixels].astype(np.float32) ** 2
-        numbers = _allocated(squares, goal.ravel()[pixels], self._most * (2 if is_last else 1))
+        most, most_in_cell = self._most, self._most
+        if is_last and squares.shape[1] > 1:
+            most, most_in_cell = 2 * most, most // 2  # in earlier rounds no cell has more than half
+        numbers = np.minimum(_allocated(squares, goal.ravel()[pixels], most), most_in_cell)
         more = numbers.sum(axis=1) > _WORTH * self.used.ravel()[pixels]
         pixels, squares, numbers = pixels[more], squares[more], numbers[more]
         self._rounds += 1
