@@ -10,6 +10,7 @@ import math
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -32,6 +33,7 @@ from .shape import (
     signed_volume,
     vertex_normals,
 )
+from .sharpen import sharpened
 from .sites import Site, Sites, choose_sites, local_level, site_at
 from .spec import Fractured, PatchSpec
 
@@ -142,6 +144,7 @@ def load_body(
     *,
     unit: Unit = "auto",
     name: str | None = None,
+    sharpen: float | Literal["auto"] = 0.0,
     density_kg_m3: float = DENSITY_67P_KG_M3,
     rotation_period_s: float = ROTATION_PERIOD_67P_S,
 ) -> Body:
@@ -158,6 +161,8 @@ def load_body(
         Unit of the file, see `load_shape`; not used for the embedded nucleus.
     name
         Default: "embedded" or the file's name without its suffix.
+    sharpen
+        Gain with which relief lost by smoothing is restored, see `sharpened`; not used for the embedded nucleus.
 
     Raises
     ------
@@ -168,6 +173,7 @@ def load_body(
         vertices_m, faces = embedded_nucleus()
     else:
         vertices_m, faces = load_shape(shape, unit)
+        vertices_m = sharpened(vertices_m, faces, sharpen)
     return Body(
         name=name or (EMBEDDED if str(shape) == EMBEDDED else Path(shape).stem),
         vertices_m=vertices_m,

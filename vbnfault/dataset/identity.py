@@ -76,6 +76,8 @@ def scene_identity(session: pipeline.Session) -> dict[str, Any]:
         del scene["body"]["atmosphere"]  # stores of scenes without one stay as they were
     if (albedo_map := session.scene.body.albedo_map) and albedo_map.projection == "equirectangular":
         del scene["body"]["albedo_map"]["projection"]
+    if session.scene.body.sharpen == 0:
+        del scene["body"]["sharpen"]
     if session.scene.coma is None:
         del scene["coma"]
     if session.scene.camera.point_spread is None:

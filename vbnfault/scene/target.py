@@ -112,6 +112,11 @@ class BodyTable(Table):
         description="'embedded', 'ellipsoid', or a shape file: OBJ, PLY, STL, GLB, PDS TAB, ICQ, WRL, BDS",
     )
     unit: Literal["auto", "m", "km"] = Field("auto", description="of the shape file; auto: from its size")
+    sharpen: Literal["auto"] | Annotated[float, Field(ge=0, le=2)] = Field(
+        0.0,
+        description="restores the relief that a smoothed shape file has lost near its facets: the gain of its "
+        "shortest wavelengths; 'auto': as far as its roughness at longer ones asks for; 0: the file as it is",
+    )
     semi_axes_m: tuple[SemiAxis, SemiAxis, SemiAxis] = Field(
         (1000.0, 1000.0, 1000.0), description="of an 'ellipsoid'"
     )
@@ -137,6 +142,12 @@ class BodyTable(Table):
     def _round(self) -> BodyTable:
         if self.atmosphere is not None and (self.shape != "ellipsoid" or self.relief_m):
             raise ValueError("atmosphere: needs shape = 'ellipsoid' without relief_m")
+        return self
+
+    @model_validator(mode="after")
+    def _sharp(self) -> BodyTable:
+        if self.sharpen and self.shape in ("embedded", "ellipsoid"):
+            raise ValueError(f"sharpen = {self.sharpen!r}: needs a shape file, not shape = {self.shape!r}")
         return self
 
     @model_validator(mode="after")

@@ -288,7 +288,7 @@ def _body(scene: Scene) -> Body:
     if table.shape == "ellipsoid":
         vertices, faces = ellipsoid(table.semi_axes_m, table.relief_m)
         return Body(name=table.name, vertices_m=vertices, faces=faces, **physical)
-    return load_body(table.shape, unit=table.unit, name=table.name, **physical)
+    return load_body(table.shape, unit=table.unit, name=table.name, sharpen=table.sharpen, **physical)
 
 
 # A shape that differs by more than these fractions in volume or longest extent belongs to another body.

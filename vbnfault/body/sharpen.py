@@ -1,0 +1,91 @@
+"""Restore relief that a smoothed shape model has lost near the size of its facets.
+
+Models made from images, or thinned out, are smoother than their facets allow: crests and cliffs are rounded, and
+the silhouette, which crests make, is too small. On natural ground, the deviogram (`roughness`) grows at most as the
+distance itself (Shepard et al. 2001, JGR 106, 32777). A steeper one shows how much is missing.
+
+Each vertex moves along its normal by a gain g times the height that one step of implicit smoothing over a mean edge
+takes away (Desbrun et al. 1999, SIGGRAPH, 317). Waves of the wavenumber k are amplified by
+1 + g · k²e² / (1 + k²e²), with the mean edge e. Nothing is random: rounded crests become sharper.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+import scipy.sparse
+from numpy.typing import NDArray
+from scipy.sparse import linalg
+
+from .roughness import deviogram, mean_edge_m
+from .shape import Float64, Int32, vertex_normals
+
+# Baselines in mean edges: the deviogram at the longer one, which smoothing hardly changes, is continued to the
+# shorter.
+_SHORT, _LONG = 1.3, 3.8
+_STEEPEST = 1.0
+MOST_GAIN = 2.0  # with more, facets fold
+_STEPS = 5  # of the search for the gain: to 1/32 of the most
+_TOLERANCE = 1e-8
+
+
+def sharpened(vertices_m: Float64, faces: Int32, gain: float | Literal["auto"]) -> Float64:
+    """Return the vertices of a shape model with its short wavelengths amplified, float64[n, 3].
+
+    `gain` is g, from 0 to `MOST_GAIN`. "auto" is the smallest that brings the deviogram at 1.3 edges to that at 3.8
+    edges, times the ratio of the two; it is 0 for a model that is rough enough.
+    """
+    if gain == 0:
+        return vertices_m
+    lost = _lost_heights(vertices_m, faces)
+    if gain != "auto":
+        return np.asarray(vertices_m + gain * lost)
+    short_m, long_m = np.array([_SHORT, _LONG]) * mean_edge_m(vertices_m, faces)
+    wanted = _deviation(vertices_m, faces, long_m) * (short_m / long_m) ** _STEEPEST
+    if not _deviation(vertices_m, faces, short_m) < wanted:  # nan where the model has too few points
+        return vertices_m
+    low, high = 0.0, MOST_GAIN
+    for _ in range(_STEPS):
+        middle = 0.5 * (low + high)
+        enough = _deviation(vertices_m + middle * lost, faces, short_m) >= wanted
+        low, high = (low, middle) if enough else (middle, high)
+    return np.asarray(vertices_m + high * lost)
+
+
+def _deviation(vertices_m: Float64, faces: Int32, baseline_m: float) -> float:
+    """Return the deviogram in metres at one baseline."""
+    return float(deviogram(vertices_m, vertex_normals(vertices_m, faces), np.array([baseline_m]))[0])
+
+
+def _lost_heights(vertices_m: Float64, faces: Int32) -> Float64:
+    """Return along each normal how far one step of smoothing over a mean edge moves a vertex inwards."""
+    stiffness, area = _laplacian(vertices_m, faces)
+    system = scipy.sparse.diags(area) + mean_edge_m(vertices_m, faces) ** 2 * stiffness
+    jacobi = scipy.sparse.diags(1 / system.diagonal())
+    smooth = np.empty_like(vertices_m)
+    for axis in range(3):
+        smooth[:, axis], _ = linalg.cg(
+            system, area * vertices_m[:, axis], x0=vertices_m[:, axis], rtol=_TOLERANCE, M=jacobi
+        )
+    normals = vertex_normals(vertices_m, faces)
+    return np.asarray(np.einsum("ni,ni->n", vertices_m - smooth, normals)[:, None] * normals)
+
+
+def _laplacian(vertices_m: Float64, faces: Int32) -> tuple[scipy.sparse.csr_matrix, NDArray[np.float64]]:
+    """Return the cotangent Laplacian (Meyer et al. 2003), positive semidefinite, and the area of each vertex.
+
+    Cotangents of obtuse angles, which are negative, count as 0. Thus the matrix stays positive.
+    """
+    count = len(vertices_m)
+    weights = scipy.sparse.csr_matrix((count, count))
+    area = np.zeros(count)
+    for corner in range(3):
+        here, i, j = (faces[:, (corner + k) % 3] for k in range(3))
+        a, b = vertices_m[i] - vertices_m[here], vertices_m[j] - vertices_m[here]
+        across = np.linalg.norm(np.cross(a, b), axis=1)
+        half_cot = 0.5 * np.maximum(np.einsum("ni,ni->n", a, b), 0) / np.maximum(across, 1e-30)
+        pairs = np.concatenate([i, j]), np.concatenate([j, i])
+        weights = weights + scipy.sparse.csr_matrix((np.tile(half_cot, 2), pairs), shape=(count, count))
+        area += np.bincount(here, across / 6, count)
+    return scipy.sparse.diags(np.asarray(weights.sum(axis=1)).ravel()) - weights, area
