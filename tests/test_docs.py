@@ -233,6 +233,7 @@ def test_figures_are_small() -> None:
 
 # Numbers without a unit: counts, fractions, ratios, exponents, and coefficients of formulas.
 _DIMENSIONLESS = """
+    sharpen
     adc_bits antiblooming asymmetry axis bands bits blade_rounding blades boulder_index bounces camera_axes
     classes_per_sample coefficients coherent_amplitude coherent_width conic dark_nonuniformity dead_share
     default_material distance_exponent dust_contrast eccentricity exposure_stops f_number faulty_fraction

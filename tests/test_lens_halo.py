@@ -86,11 +86,11 @@ def test_the_suns_image_has_the_point_spread_too() -> None:
 
 def test_a_scene_sets_the_point_spread_in_angles() -> None:
     values = {"camera.point_spread.core_urad": 60.0, "camera.width_px": 64, "camera.height_px": 64}
-    scene = vbnfault.load_scene("navcam67p", values)
+    scene = vbnfault.load_scene("paper67p", values)
     lens = vbnfault.Session(scene).base_camera.lens
     seen = (lens.halo.core_rad, lens.halo.halo_fraction, lens.halo.halo_rad, lens.halo.halo_index)
     assert seen == pytest.approx((60e-6, 0.0, 100e-6, 3.0))
-    assert lens.pixel_rad == pytest.approx(2 * np.tan(np.radians(2.5)) / 64)
+    assert lens.pixel_rad == pytest.approx(2 * np.tan(np.radians(32.5)) / 64)
 
 
 @pytest.mark.parametrize(
