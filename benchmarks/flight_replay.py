@@ -36,9 +36,9 @@ which are long; the catalogue of stars has nine brighter than magnitude 7 in suc
 show. `SPOTS` gives the rendered frames the same tracks, and the grains of the coma at 3.6 au. Stars and warm
 pixels come from scene and sensor.
 
-A shape file is sharpened as far as its own roughness asks for (`body.sharpen`). The random relief below its
-facets has the amplitude `RELIEF`: 1 agrees best with the texture of the frames but lowers `rank`, since it is not the relief of
-the comet. `--set body.sharpen=0 --set patch.relief=1` turns both off.
+A shape file is sharpened as far as its own roughness asks for (`body.sharpen`). The random relief below its facets
+has the amplitude `RELIEF`: 1 agrees best with the texture of the frames but lowers `rank`, since it is not that
+of the comet. `--set body.sharpen=0 --set patch.relief=1` turns both off.
 
 The scene gets a coma (`HAZE`) unless it has one. Its Afρ reproduces the haze of the frames, which falls as one over
 the distance from the centre and is brighter towards the Sun. An aperture of 10,000 km would then see 30 times the
