@@ -91,7 +91,7 @@ BINNING = 2  # the frames have half the native size
 _HALVING = (0.035, 0.465, 0.465, 0.035)
 _STRETCH = 255 / 4095**0.5  # of a root of DN
 _BLACK_DN = 3.5  # over the bias of the sensor, shown as 0; fitted to the sky of 11 frames
-AFRHO_CM = 270.0  # fitted to the glow of the same frames
+AFRHO_CM = 270.0  # chosen beside the halo of the point spread for the glow of all 33 frames
 # What leaves spots and tracks in the sky. Protons: flux, depth and diffusion fitted to the spots of 11 frames; in
 # quiet time CREME96 has 4.67 at the Sun-Earth point L2. Grains: the density at 100 km in August 2014, see
 # `vbnfault.faults.particles`.
