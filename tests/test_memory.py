@@ -24,7 +24,8 @@ from vbnfault.scene import config
 SIZE = 64
 
 
-def six_faults() -> Session:
+@pytest.fixture(scope="module")
+def session() -> Session:
     """A camera with a real lens and a mosaic, and a sample with one model of every optical class."""
     scene = small_scene(
         dataset={"layers": ["clean", "without_straylight", "mask_effect", "raw"]},
@@ -46,9 +47,8 @@ def six_faults() -> Session:
     return Session(config.parse_scene(scene, source="test"))
 
 
-def test_twins_leave_no_light_behind() -> None:
+def test_twins_leave_no_light_behind(session: Session) -> None:
     """Kept are the light that leads to the image, once for each fault, and that of the stored twin: no other."""
-    session = six_faults()
     index = next(i for i in range(len(session.plan)) if len(session.plan.commanded(i)) == 4)
     frame = session.frame(index)
     injection = inject_faults(frame.spec, frame.pose, frame.rendering, frame.exposure)
@@ -68,9 +68,8 @@ def test_twins_leave_no_light_behind() -> None:
     assert all("merged" not in vars(q) for q in kept.values())
 
 
-def test_samples_leave_nothing_behind() -> None:
+def test_samples_leave_nothing_behind(session: Session) -> None:
     """Bytes that Python and numpy hold after a sample, from the second on: no more than a plane of the image."""
-    session = six_faults()
     held = []
     tracemalloc.start()
     try:

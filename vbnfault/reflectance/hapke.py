@@ -163,7 +163,7 @@ HAPKE_TABLES: dict[str, tuple[tuple[float, ...], ...]] = {
         (882.0, 0.052, -0.40, 2.08, 0.027, 0.0, 1.0, 15.0, 1.0),
         (989.0, 0.066, -0.35, 2.07, 0.032, 0.0, 1.0, 15.0, 1.0),
     ),
-    # disc-resolved at 649 nm (the same paper, table 4); at other wavelengths w follows the disc-integrated spectrum
+    # disc-resolved at 649 nm (the same paper, table 4); at other wavelengths w follows the disc-integrated albedo
     "67p_hapke2002": ((649.0, 0.042, -0.37, 2.5, 0.079, 0.188, 0.017, 15.0, 1.0),),
     "67p_hapke2012": ((649.0, 0.034, -0.42, 2.25, 0.061, 0.0, 1.0, 28.0, 1.20),),
 }
@@ -174,7 +174,8 @@ def hapke_at(wavelength_nm: ArrayLike, table: str | tuple[tuple[float, ...], ...
 
     They are interpolated linearly and are constant beyond the ends of the table. `table` names one of
     `HAPKE_TABLES` or gives rows (wavelength in nm, then the columns of `Hapke` in order). The single-wavelength
-    sets of 67P take the relative spectrum of w from the disc-integrated table.
+    sets of 67P scale w as the geometric albedo of the disc-integrated table, since the other parameters of that
+    table vary with wavelength, too: w alone rises twice as much to 989 nm as the albedo.
 
     Raises
     ------
@@ -186,8 +187,9 @@ def hapke_at(wavelength_nm: ArrayLike, table: str | tuple[tuple[float, ...], ...
     rows = rows[np.argsort(rows[:, 0])]
     columns = {name: np.interp(nodes_nm, rows[:, 0], rows[:, k]) for k, name in enumerate(COLUMNS, start=1)}
     if isinstance(table, str) and len(rows) == 1:
-        spectrum = np.array(HAPKE_TABLES["67p_fornasier2015"])
-        here, there = (np.interp(x, spectrum[:, 0], spectrum[:, 1]) for x in (nodes_nm, rows[0, 0]))
+        spectrum_nm = np.array(HAPKE_TABLES["67p_fornasier2015"])[:, 0]
+        albedo = geometric_albedo(hapke_at(spectrum_nm))
+        here, there = (np.interp(x, spectrum_nm, albedo) for x in (nodes_nm, rows[0, 0]))
         columns["single_scattering_albedo"] = columns["single_scattering_albedo"] * here / there
     return Hapke(**columns)
 
