@@ -6,6 +6,7 @@ import itertools
 
 import numpy as np
 import pytest
+from ground_kit import deviation_over_law, ground_of
 from scipy import stats
 
 from vbnfault.body import (
@@ -22,7 +23,7 @@ from vbnfault.body import (
 from vbnfault.body.boulders import GroundMesh, _favour
 from vbnfault.body.fields import PLANES_STD, Points
 from vbnfault.body.octaves import Octaves
-from vbnfault.body.roughness import Roughness, deviogram, model_roughness
+from vbnfault.body.roughness import Roughness
 from vbnfault.body.shape import vertex_normals
 from vbnfault.core.errors import InputError
 from vbnfault.scene.config import load_scene
@@ -39,11 +40,6 @@ def body() -> Body:
 def patches(body: Body) -> list[Patch]:
     sites = choose_sites(body, 3, seed=7)
     return [build_patch(body, site, PatchSpec(**FINE, fractured=Fractured())) for site in sites]
-
-
-def ground_of(patch: Patch) -> tuple[np.ndarray, np.ndarray]:
-    faces = patch.faces[~patch.face_is_boulder]
-    return patch.vertices_L_m[: faces.max() + 1].astype(np.float64), faces
 
 
 def octaves(place_m: np.ndarray, facet_m: float) -> Octaves:
@@ -130,18 +126,7 @@ def test_boulders_gather_on_debris_by_the_factor_asked_for() -> None:
 
 
 def test_fractured_ground_continues_the_models_spectrum(body: Body, patches: list[Patch]) -> None:
-    law = model_roughness(body)
-    baselines = np.array([2.5, 5.0, 12.0, 30.0])
-    rows = []
-    for patch in patches:
-        points, faces = ground_of(patch)
-        normals, distance = vertex_normals(points, faces), np.linalg.norm(points, axis=1)
-        row = []
-        for baseline in baselines:
-            near = np.flatnonzero(distance < 20.0 + 6.0 * baseline)[:: 1 if baseline < 8 else 4]
-            row.append(deviogram(points[near], normals[near], np.array([baseline]), windows=40)[0])
-        rows.append(row)
-    ratio = np.sqrt(np.mean(np.square(rows), axis=0)) / law.deviation_at(baselines)
+    ratio = deviation_over_law(body, patches, [2.5, 5.0, 12.0, 30.0])
     # as for the rounded ground: three places differ from each other by a factor of two
     assert (ratio > 0.6).all(), ratio
     assert (ratio < 1.6).all(), ratio

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-import sys
 import warnings
 from pathlib import Path
 from typing import Any
@@ -12,8 +11,9 @@ from typing import Any
 import numpy as np
 import pytest
 from conftest import small_scene
+from test_cli import run
 
-from vbnfault import cli, dataset, pipeline
+from vbnfault import dataset, pipeline
 from vbnfault import store as st
 from vbnfault.dataset import card, from_scene
 from vbnfault.dataset.build import BuildOptions
@@ -140,16 +140,6 @@ def test_a_build_writes_the_card_once(copy: Path, monkeypatch: pytest.MonkeyPatc
         made[0] = built
         dataset.build_scene("quickstart", copy, BuildOptions())
         assert len(written) == cards
-
-
-def run(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
-    """Run a command in this process and return its exit code."""
-    monkeypatch.setattr(sys, "argv", ["vbnfault", *map(str, arguments)])
-    try:
-        cli.main()
-    except SystemExit as stop:
-        return int(stop.code or 0)
-    return 0
 
 
 def test_the_commands(copy: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:

@@ -8,6 +8,7 @@ import sys
 import numpy as np
 import pytest
 import trimesh
+from ground_kit import deviation_over_law, ground_of
 
 from vbnfault.body import Body, Patch, PatchSpec, Site, build_patch, choose_sites, load_body, relief, site_at
 from vbnfault.body.fields import GRADIENT_STD, Points
@@ -32,11 +33,6 @@ def sites(body: Body) -> tuple[Site, ...]:
 @pytest.fixture(scope="module")
 def patches(body: Body, sites: tuple[Site, ...]) -> list[Patch]:
     return [build_patch(body, site, PatchSpec(**FINE)) for site in sites]
-
-
-def ground_of(patch: Patch) -> tuple[np.ndarray, np.ndarray]:
-    faces = patch.faces[~patch.face_is_boulder]
-    return patch.vertices_L_m[: faces.max() + 1].astype(np.float64), faces
 
 
 # --- fields -----------------------------------------------------------------------------------------------------
@@ -118,18 +114,7 @@ def test_model_law_is_anchored_on_the_model(body: Body) -> None:
 
 
 def test_terrain_continues_the_models_spectrum(body: Body, patches: list[Patch]) -> None:
-    law = model_roughness(body)
-    baselines = np.array([2.0, 5.0, 12.0, 30.0])
-    found = []
-    for patch in patches:
-        points, faces = ground_of(patch)
-        normals, distance = vertex_normals(points, faces), np.linalg.norm(points, axis=1)
-        row = []
-        for baseline in baselines:
-            near = np.flatnonzero(distance < 20.0 + 6.0 * baseline)[:: 1 if baseline < 8 else 4]
-            row.append(deviogram(points[near], normals[near], np.array([baseline]), windows=40)[0])
-        found.append(row)
-    ratio = np.sqrt(np.mean(np.square(found), axis=0)) / law.deviation_at(baselines)
+    ratio = deviation_over_law(body, patches, [2.0, 5.0, 12.0, 30.0])
     # Four places differ from each other by a factor of two (dust plains, outcrops): their mean square by 1.5.
     assert (ratio > 0.65).all(), ratio
     assert (ratio < 1.5).all(), ratio

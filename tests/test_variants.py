@@ -150,10 +150,10 @@ def test_exposures_follow_their_stops(session: Session) -> None:
         ]
     )
     assert stats.kstest(stops, "uniform", args=(-1, 2)).pvalue > 1e-3
-    seconds = session.frame(1).camera.exposure_s
-    nominal = Session(scene_with(4)).frame(1).camera.exposure_s
-    assert seconds != nominal
-    assert 0.5 <= seconds / nominal <= 2
+    exposure_s = session.frame(1).camera.exposure_s
+    nominal_s = Session(scene_with(4)).frame(1).camera.exposure_s
+    assert exposure_s != nominal_s
+    assert 0.5 <= exposure_s / nominal_s <= 2
 
 
 # --- the store --------------------------------------------------------------------------------------------------

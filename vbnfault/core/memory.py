@@ -33,7 +33,7 @@ def release_unused(*, always: bool = False) -> None:
 
 
 def _resident_bytes() -> int:
-    """Return the resident memory of the process; `_ENOUGH` where the system does not tell."""
+    """Return the resident memory of the process; `_ENOUGH` if the system does not report it."""
     try:
         pages = Path("/proc/self/statm").read_text(encoding="ascii").split()[1]
         return int(pages) * os.sysconf("SC_PAGE_SIZE")

@@ -104,7 +104,7 @@ def croissant(store: Store, files: Sequence[Any], records: Sequence[Any]) -> dic
 
 
 def inline(name: str, description: str, rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Return a set of records whose values stand in the description itself."""
+    """Return a Croissant record set whose values the description itself lists."""
     fields = [
         {"@type": "cr:Field", "@id": f"{name}/{key}", "name": key, "description": key, "dataType": _type_of(value)}
         for key, value in rows[0].items()

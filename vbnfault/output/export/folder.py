@@ -37,7 +37,7 @@ class Folder:
         return Folder(self.path)
 
     def put(self, files: Iterable[tuple[str, bytes]]) -> None:
-        """Write files; each is complete or not there."""
+        """Write files; a file is whole or absent, also after a kill."""
         rest = iter(files)
         while batch := list(itertools.islice(rest, _FILES_AT_ONCE)):
             disk.write(self.path, batch)
