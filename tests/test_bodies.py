@@ -138,7 +138,7 @@ def test_phase_coefficients(name: str, low_deg: float, high_deg: float, slope_ma
         ("67p", 535.0, 0.0123, 0.05),  # Fornasier et al. 2015, table 3
         ("67p", 649.0, 0.0157, 0.05),
         ("ryugu", 550.0, 0.32 * 0.040, 0.05),  # phase integral of Ishiguro et al. 2014, 0.32 ± 0.03
-        ("eros", 550.0, 0.093, 0.06),  # Li et al. 2004, cited from memory
+        ("eros", 550.0, 0.093, 0.05),  # Li et al. 2004, cited from memory
     ],
 )
 def test_bond_albedos(name: str, wavelength_nm: float, bond_albedo: float, tolerance: float) -> None:
@@ -147,6 +147,30 @@ def test_bond_albedos(name: str, wavelength_nm: float, bond_albedo: float, toler
     phases, ground = math.pi / 2 * (x + 1), ground_at(name, wavelength_nm)
     flux = np.array([sphere_flux(ground, math.degrees(a))[0] for a in phases])
     assert math.pi * (w * flux * np.sin(phases)).sum() == pytest.approx(bond_albedo, rel=tolerance)
+
+
+@pytest.mark.parametrize(
+    ("parameters", "albedo"),
+    [
+        ((0.22, -0.33, 1.5, 0.020, 18.0), 0.21),  # Ida: Helfenstein et al. 1996, Icarus 120, 48
+        ((0.43, -0.29, 1.0, 0.022, 36.0), 0.29),  # Eros: Domingue et al. 2002, Icarus 155, 205 (disc-integrated)
+    ],
+)
+def test_published_hapke_parameters_give_their_published_albedo(
+    parameters: tuple[float, ...], albedo: float
+) -> None:
+    """Two digits are published: half a unit of the last."""
+    names = (
+        "single_scattering_albedo",
+        "asymmetry",
+        "shadow_hiding_amplitude",
+        "shadow_hiding_width",
+        "roughness_deg",
+    )
+    photometry = {"model": "hapke", "hapke": [{"wavelength_nm": 550.0} | dict(zip(names, parameters, strict=True))]}
+    body = {"shape": "ellipsoid", "semi_axes_m": [100.0] * 3, "photometry": photometry}
+    scene = config.parse_scene({"title": "t", "body": body}, source="t.toml")
+    assert sphere_flux(assemble.ground_reflectance(scene), 1e-5)[0] == pytest.approx(albedo, abs=0.005)
 
 
 def shape_flux(body: Body, model: BandReflectance, phase_deg: float, turns: int = 6, pixels: int = 96) -> float:
