@@ -333,6 +333,15 @@ def test_a_saturated_pixel_is_white_whatever_the_gain(gain: float | None) -> Non
         np.testing.assert_allclose(picture.astype(int), shown, atol=1)
 
 
+def test_a_dark_signal_that_fills_the_well_gives_white_and_not_black() -> None:
+    made = sensor(readout=replace(sensor().readout, full_well_e=15_000.0))
+    device = MosaicDetector(sensor=made, width_px=32, height_px=32).device
+    exposure_s = 100 * 15_000.0 / float(device.dark_rate_e_s.mean())
+    raw = device.raw(np.zeros((32, 32), np.float32), exposure_s)
+    # 1 % of the range is left above black, 40 DN; the read noise of 3 DN stays visible: 4.5 standard deviations
+    assert device.rgbi(raw, exposure_s).array.min() >= 255 - round(4.5 * 3 / 40 * 255)
+
+
 @pytest.mark.parametrize(
     ("table", "words"),
     [

@@ -245,9 +245,11 @@ def test_saturation_gives_the_top_code_and_255(bits: int) -> None:
         np.testing.assert_array_equal(detector.develop(flat(detector, light), SHORT_S, None).array, 255)
 
 
-def test_saturation_is_white_after_a_long_exposure_too() -> None:
+@pytest.mark.parametrize("exposure_s", [5.0, 1e4])
+def test_saturation_is_white_after_a_long_exposure_too(exposure_s: float) -> None:
+    # after 1e4 s the dark signal alone fills the well
     detector = ThreeColourDetector(dark_current_e_s=125)
-    np.testing.assert_array_equal(detector.develop(flat(detector, 1e6), 5.0, None).array, 255)
+    np.testing.assert_array_equal(detector.develop(flat(detector, 1e6), exposure_s, None).array, 255)
 
 
 def test_full_well_clips_before_bias_and_read_noise() -> None:
