@@ -233,7 +233,7 @@ class Device:
         if self.row_black_dn is not None:
             mosaic, highest = mosaic - self.row_black_dn, float(self.row_black_dn.max())
         # white is the range above the highest black level. A saturated pixel then stays white, even if its full
-        # well lies below the top code or the dark signal of a long exposure alone fills it: 1 % of the range is left
+        # well lies below the top code or dark signal alone fills it (1 % of the range is then left)
         white = sensor.readout.bias_dn + sensor.readout.system_gain_dn_per_e * sensor.readout.white_e
         black = min(black, white - highest - 0.01 * (white - sensor.readout.bias_dn))
         full = 255.0 / (white - black - highest)

@@ -175,8 +175,8 @@ class ThreeColourDetector:
 
     def _shower(self, exposure_s: float) -> Callable[[F32], NDArray[np.uint8]]:
         """Return the function that computes the 8 bit image of a block."""
-        # white is the range above the black level, so a saturated pixel stays white after a long exposure, even after
-        # one so long that the dark signal alone saturates the pixels: 1 % of the range is always left
+        # white is the range above the black level, so a saturated pixel stays white after a long exposure. Where
+        # the dark signal alone saturates the pixels, 1 % of the range is left
         dark_dn = self.bias_dn + self.dark_current_e_s * exposure_s * self.gain_dn_per_e
         black = np.float32(min(dark_dn, self.adc_max_dn - 0.01 * (self.adc_max_dn - self.bias_dn)))
         scale = (255.0 / (self.adc_max_dn - float(black)) * self.white_balance).astype(np.float32)
