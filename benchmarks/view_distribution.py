@@ -31,7 +31,7 @@ from scipy import stats
 
 from vbnfault import store
 from vbnfault.dataset.identity import classes_that_need_sun, stored_scene
-from vbnfault.scene import plan
+from vbnfault.scene import names, plan
 
 VARIABLES = ("height_m", "roll_deg", "pitch_deg", "yaw_deg", "sun_elevation_deg", "sun_azimuth_deg")
 TABLE_SAMPLES = 200_000
@@ -90,7 +90,7 @@ def views_of(path: Path) -> list[Views]:
     tries = np.asarray(opened.read("tries"))[whole]
     kept = [made.view(scene, int(i), int(k) - 1) for i, k in zip(whole, tries, strict=True)]
     out = []
-    for code, name in enumerate(plan.STRATA):
+    for code, name in enumerate(names.STRATA):
         here = made.stratum[whole] == code
         if not here.any():
             continue

@@ -14,7 +14,7 @@ from ..core import frames
 from ..detector import Detector
 from ..pipeline import Session
 from ..pipeline.exposure import reference_exposure_s
-from ..scene import aims, plan
+from ..scene import aims, names, plan
 from ..scene.bodies import named_body
 from ..scene.config import Scene
 from ..scene.trajectory import Trajectory
@@ -68,7 +68,7 @@ def _samples(session: Session) -> list[str]:
         each = _range(per_device.min(), per_device.max())
         lines[0] += f"; {len(per_device)} devices of the detector, {each} samples each"
     chosen: dict[str, NDArray[np.bool_]] = {"samples": np.ones(len(table), dtype=bool)}
-    chosen |= {name: np.asarray(table.stratum == k) for k, name in enumerate(plan.STRATA)}
+    chosen |= {name: np.asarray(table.stratum == k) for k, name in enumerate(names.STRATA)}
     chosen["no fault"] = np.asarray(~table.injected.any(axis=1))
     chosen |= {name: table.injects(name) for name in table.faults}
     splits = {name: table.split == k for k, name in enumerate(plan.SPLITS)}
@@ -154,7 +154,7 @@ def _geometry(session: Session) -> list[str]:
         towards = _REFERENCES[stratum.reference]
         lit = f"at least {stratum.min_lit_fraction:.0%} sunlit ground" if stratum.min_lit_fraction else "any ground"
         lines.append(
-            f"  {plan.STRATA[k]}: Sun elevation {_bounds(stratum.sun_elevation_deg)}, azimuth "
+            f"  {names.STRATA[k]}: Sun elevation {_bounds(stratum.sun_elevation_deg)}, azimuth "
             f"{_bounds(stratum.sun_azimuth_deg)} deg; camera from {towards} by roll {_bounds(stratum.roll_deg)}, "
             f"pitch {_bounds(stratum.pitch_deg)}, yaw {_bounds(stratum.yaw_deg)} deg; {lit}"
         )
@@ -292,5 +292,5 @@ def _bounds(pair: tuple[float, float] | None) -> str:
 
 def _effects(detector: Detector) -> str:
     """Return the effects of plug-ins that act in a detector, as a clause."""
-    names = [] if detector.mosaic is None else [effect.name for effect in detector.mosaic.sensor.effects]
-    return f" with {' and '.join(names)}" if names else ""
+    effects = [] if detector.mosaic is None else [effect.name for effect in detector.mosaic.sensor.effects]
+    return f" with {' and '.join(effects)}" if effects else ""

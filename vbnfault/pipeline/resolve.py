@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ..core import frames
 from ..core.errors import VbnfaultError
 from ..render.description import Sunlight
-from ..scene import plan
+from ..scene import names, plan
 from ..scene.trajectory import FlownPose
 from ..world import assemble
 from ..world.ground import encloses
@@ -57,7 +57,7 @@ def resolve(spec: SampleSpec, first_try: int = 0) -> Pose:
         chosen = _first_usable(spec, views, count, unmet)
         if chosen is not None:
             return views.pose(chosen, start)
-    raise no_view(spec, plan.STRATA[spec.plan.stratum[spec.index]], unmet)
+    raise no_view(spec, names.STRATA[spec.plan.stratum[spec.index]], unmet)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

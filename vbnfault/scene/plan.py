@@ -26,10 +26,9 @@ from ..core import frames
 from ..core.errors import InputError
 from . import aims, keyed_random
 from .config import Scene
+from .names import SPLITS
 from .sampling import StratumTable
 
-STRATA = ("sun-facing", "sun-averted")
-SPLITS = ("train", "val", "test")
 SUN_FACING, SUN_AVERTED = 0, 1
 
 _SUN = ("sun_azimuth_deg", "sun_elevation_deg")

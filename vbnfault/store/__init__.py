@@ -50,6 +50,7 @@ from .schema import (
     Member,
     StoreSpec,
 )
+from .shards import FetchedSample, ShardReader
 
 __all__ = [
     "EFFECT_RULE",
@@ -64,11 +65,13 @@ __all__ = [
     "Array",
     "Encoded",
     "FaultCounts",
+    "FetchedSample",
     "Member",
     "Planned",
     "Problem",
     "Report",
     "SampleDigests",
+    "ShardReader",
     "Store",
     "StoreSpec",
     "append_samples",

@@ -51,6 +51,17 @@ def decompress(data: bytes) -> bytes:
         raise ValueError(str(error)) from error
 
 
+def decompress_into(data: bytes, out: NDArray[Any]) -> None:
+    """Decompress a chunk into a contiguous array. Raises ValueError if it is damaged or too large.
+
+    A chunk that is too small leaves the end of `out` as it was, which the stored checksum of the layer detects.
+    """
+    try:
+        Zstd().decode(data, out=out.reshape(-1).view(np.uint8))
+    except (RuntimeError, MemoryError) as error:
+        raise ValueError(str(error)) from error
+
+
 # --- shard files: the `sharding_indexed` layout of the Zarr v3 specification, index at the end -------------
 
 
@@ -66,17 +77,27 @@ def join_shard(chunks: Mapping[int, bytes], count: int) -> bytes:
     return b"".join([*parts, table, struct.pack("<I", google_crc32c.value(table))])
 
 
+def index_size(count: int) -> int:
+    """Return the size in bytes of the index, with its checksum, at the end of a shard file of `count` chunks."""
+    return 16 * count + 4
+
+
+def chunk_ranges(tail: bytes, count: int) -> dict[int, tuple[int, int]]:
+    """Return start and length of each chunk by number, from the last `index_size(count)` bytes of a shard file.
+
+    Raises ValueError if the index is damaged.
+    """
+    table, crc = tail[:-4], tail[-4:]
+    if len(tail) != index_size(count) or struct.pack("<I", google_crc32c.value(table)) != crc:
+        raise ValueError("truncated or overwritten: its index does not match its checksum")
+    rows = np.frombuffer(table, dtype="<u8").reshape(count, 2).tolist()
+    return {i: (start, length) for i, (start, length) in enumerate(rows) if start != _ABSENT}
+
+
 def split_shard(data: bytes, count: int) -> dict[int, bytes]:
     """Return the compressed chunks of a shard file by number. Raises ValueError if its index is damaged."""
-    size = 16 * count
-    table, crc = data[-size - 4 : -4], data[-4:]
-    if len(table) != size or struct.pack("<I", google_crc32c.value(table)) != crc:
-        raise ValueError("truncated or overwritten: its index does not match its checksum")
-    chunks = {}
-    for i, (start, length) in enumerate(np.frombuffer(table, dtype="<u8").reshape(count, 2).tolist()):
-        if start != _ABSENT:
-            chunks[i] = data[start : start + length]
-    return chunks
+    ranges = chunk_ranges(data[-index_size(count) :], count)
+    return {i: data[start : start + length] for i, (start, length) in ranges.items()}
 
 
 # --- one sample, ready to be written ----------------------------------------------------------------------

@@ -13,7 +13,7 @@ import errno
 import os
 import stat
 import uuid
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import TypeVar
@@ -66,6 +66,41 @@ def read(path: Path) -> bytes:
     InputError
         This user may not read the file.
     """
+    with _regular_file(path) as file:
+        parts = []
+        while part := os.read(file, 1 << 30):
+            parts.append(part)
+    return parts[0] if len(parts) == 1 else b"".join(parts)
+
+
+def read_parts(
+    path: Path, tail: int, choose: Callable[[bytes], Sequence[tuple[int, int]]]
+) -> list[tuple[int, bytes]]:
+    """Return parts of a regular file, each with its start in the file; a part may be shorter at the file's end.
+
+    Parameters
+    ----------
+    path
+        The file, which is opened once, so that all parts are of one version of it.
+    tail
+        Number of bytes at the end of the file that `choose` receives.
+    choose
+        Returns start and length of each part.
+
+    Raises
+    ------
+    Misplaced, OSError, InputError
+        As `read` does.
+    """
+    with _regular_file(path) as file:
+        size = os.fstat(file).st_size
+        ranges = choose(os.pread(file, tail, max(0, size - tail)))
+        return [(start, os.pread(file, length, start)) for start, length in ranges]
+
+
+@contextlib.contextmanager
+def _regular_file(path: Path) -> Iterator[int]:
+    """Open a regular file for reading in a `with` block. Raises what `read` says."""
     # without O_NONBLOCK, opening a pipe would wait for a writer
     flags = os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
     try:
@@ -80,12 +115,9 @@ def read(path: Path) -> bytes:
         status = os.fstat(file)
         if not stat.S_ISREG(status.st_mode):
             raise Misplaced(errno.EISDIR, "it is not a regular file", str(path))
-        parts = []
-        while part := os.read(file, 1 << 30):
-            parts.append(part)
+        yield file
     finally:
         os.close(file)
-    return parts[0] if len(parts) == 1 else b"".join(parts)
 
 
 def expect_file(path: Path) -> None:

@@ -13,16 +13,24 @@ import uuid
 import warnings
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-import zarr
 from numpy.typing import NDArray
 
 from ..core.errors import InputError, VbnfaultError
 from ..core.quantities import Sample
 from . import disk
-from .codec import Encoded, crc32c, crc_of_scalars, encode, join_shard, split_shard
+from .codec import (
+    Encoded,
+    chunk_ranges,
+    crc32c,
+    crc_of_scalars,
+    encode,
+    index_size,
+    join_shard,
+    split_shard,
+)
 from .layout import (
     CHECKSUM,
     DOCUMENT,
@@ -40,6 +48,9 @@ from .layout import (
     to_bytes,
 )
 from .schema import FORMAT_VERSION, FORMATS, SCALARS, StoreSpec, spec_from_plain
+
+if TYPE_CHECKING:
+    import zarr
 
 # errors that mean a damaged or missing file; any other OSError may be temporary
 _DAMAGE = (ValueError, FileNotFoundError, NotADirectoryError, disk.Misplaced)
@@ -76,6 +87,8 @@ class Store:
     def array(self, name: str) -> zarr.Array[Any]:
         """Return the zarr array. Raises VbnfaultError if it is missing or its metadata cannot be read."""
         if name not in self._arrays:
+            import zarr  # not above: reading the files directly needs no zarr, and its import takes 0.4 s
+
             try:
                 disk.expect_file(self.path / name / DOCUMENT)
                 self._arrays[name] = zarr.open_array(self.path / name, mode=self._mode, zarr_format=3)
@@ -217,16 +230,31 @@ class Store:
         """Return the path of the file that holds an array's values for one shard."""
         return self.path / self.file_name(name, number)
 
-    def chunk(self, name: str, number: int) -> dict[int, bytes]:
-        """Return the compressed chunks of a layer's shard by sample.
+    def chunk(self, name: str, number: int, samples: Collection[int] | None = None) -> dict[int, bytes]:
+        """Return the compressed chunks of a layer's shard by sample; with `samples`, read only those of the file.
 
         Raises ValueError or OSError if the file is damaged or missing.
         """
+        size, first = self.spec.shard_samples, number * self.spec.shard_samples
         if self.spec.empty(name):
-            return dict.fromkeys(self.shard(number), b"")
-        size = self.spec.shard_samples
-        chunks = split_shard(disk.read(self.file(name, number)), size)
-        return {number * size + i: chunk for i, chunk in chunks.items()}
+            return dict.fromkeys(self.shard(number) if samples is None else samples, b"")
+        if samples is None:
+            chunks = split_shard(disk.read(self.file(name, number)), size)
+            return {first + i: chunk for i, chunk in chunks.items()}
+        wanted: dict[int, tuple[int, int]] = {}
+
+        def choose(tail: bytes) -> list[tuple[int, int]]:
+            ranges = chunk_ranges(tail, size)
+            wanted.update({i: ranges[i - first] for i in samples if i - first in ranges})
+            return _joined(wanted.values())
+
+        parts = disk.read_parts(self.file(name, number), index_size(size), choose)
+        return {
+            i: data[start - begin : start - begin + length]
+            for i, (start, length) in wanted.items()
+            for begin, data in parts
+            if begin <= start and start + length <= begin + len(data)
+        }
 
     def write_shard(self, number: int, given: Mapping[int, Encoded], damaged: Collection[int] = ()) -> set[int]:
         """Write a shard: the `given` samples, and unchanged those that were finished before.
@@ -316,6 +344,17 @@ class Store:
                 values = {i: e.crc32c if name == "crc32c" else e.scalars[name] for i, e in given.items()}
                 values |= {i: columns[name][i - first] for i in kept}
                 yield self.file_name(name, number), self._column_bytes(name, number, values)
+
+
+def _joined(ranges: Iterable[tuple[int, int]]) -> list[tuple[int, int]]:
+    """Return start and length of ranges of bytes, in ascending order; ranges that touch become one."""
+    joined: list[tuple[int, int]] = []
+    for start, length in sorted(set(ranges)):
+        if joined and sum(joined[-1]) == start:
+            joined[-1] = joined[-1][0], joined[-1][1] + length
+        else:
+            joined.append((start, length))
+    return joined
 
 
 def _stamp(file: Path) -> tuple[int, int] | None:

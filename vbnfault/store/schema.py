@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from ..core.errors import InputError
 from ..core.quantities import CHANNELS, DEFECTS, soft_kind
-from ..scene.plan import SPLITS, STRATA
+from ..scene.names import SPLITS, STRATA
 
 # Format version → the first version of vbnfault that wrote it. A store of another format is refused in a sentence
 # and left as it is: its arrays could not be distinguished from damaged ones, and the samples that are missing would

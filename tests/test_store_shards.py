@@ -1,0 +1,120 @@
+"""Reading samples from shard files for trainers: what is stored, each file opened once, damage in one sentence."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from synthetic import fake_sample, filled, flip
+
+from vbnfault import store as st
+from vbnfault.core.errors import VbnfaultError
+from vbnfault.store import disk
+
+LAYERS = ("image", "mask", "depth_m")
+
+
+def decoded(reader: st.ShardReader, fetched: st.FetchedSample, name: str) -> np.ndarray:
+    spec = reader.store.spec
+    out = np.empty(spec.shape(spec.pixel_layers[name]), spec.pixel_layers[name].dtype)
+    reader.decode(fetched, name, out)
+    return out
+
+
+@pytest.mark.parametrize("chosen", [[4], [5, 7], [7, 4, 6, 5], [8, 9]])
+def test_layers_are_those_that_were_written(finished_store: Path, chosen: list[int]) -> None:
+    store = st.open_store(finished_store)
+    reader = st.ShardReader(store, LAYERS)
+    fetched = reader.fetch(chosen[0] // 4, chosen)
+    assert list(fetched) == chosen
+    for i in chosen:
+        written = fake_sample(store.spec, i).layers
+        assert fetched[i].size == sum(map(len, fetched[i].chunks.values())) > 0
+        for name in LAYERS:
+            assert np.array_equal(decoded(reader, fetched[i], name), written[name])
+
+
+def test_each_file_is_opened_once_and_only_the_bytes_wanted_are_read(
+    finished_store: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store = st.open_store(finished_store)
+    whole = {name: store.chunk(name, 1) for name in LAYERS}
+    reads: list[tuple[str, int]] = []
+    real = disk.read_parts
+
+    def counting(path: Path, *given: Any) -> Any:
+        parts = real(path, *given)
+        reads.append((path.relative_to(store.path).parts[0], sum(len(data) for _, data in parts)))
+        return parts
+
+    monkeypatch.setattr(disk, "read_parts", counting)
+    fetched = st.ShardReader(store, LAYERS).fetch(1, [5, 6])
+    assert [name for name, _ in reads] == list(LAYERS)
+    assert [size for _, size in reads] == [len(whole[name][5]) + len(whole[name][6]) for name in LAYERS]
+    assert fetched[6].chunks == {name: whole[name][6] for name in LAYERS}
+
+
+def test_chunks_that_touch_are_read_at_once(finished_store: Path) -> None:
+    store, ranges = st.open_store(finished_store), []
+    real = disk.os.pread
+
+    def counting(file: int, length: int, start: int) -> bytes:
+        ranges.append((start, length))
+        return real(file, length, start)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(disk.os, "pread", counting)
+        store.chunk("image", 0, [0, 1, 3])
+    assert len(ranges) == 3  # the index, 0 with 1, and 3
+    assert ranges[1][1] == sum(len(store.chunk("image", 0)[i]) for i in (0, 1))
+
+
+@pytest.mark.parametrize(
+    ("position", "says"),
+    [
+        (40, r"mask of sample 4 (cannot be decoded|does not match its stored crc32c)"),
+        (-20, r"mask of samples 4-7 cannot be read, the shard file mask/c/1/0/0/0 is damaged or missing"),
+    ],
+)
+def test_damage_is_told_in_one_sentence(whole: st.Store, position: int, says: str) -> None:
+    flip(whole.file("mask", 1), position)
+    reader = st.ShardReader(whole, ["mask"])
+    with pytest.raises(VbnfaultError) as caught:
+        decoded(reader, reader.fetch(1, [4])[4], "mask")
+    message = str(caught.value)
+    assert re.match(rf"{whole.path}: {says}", message)
+    assert message.endswith("; the build command repairs it")
+
+
+def test_another_layer_in_the_place_of_a_chunk_is_noticed(whole: st.Store) -> None:
+    whole.file("clean", 1).write_bytes(whole.file("image", 1).read_bytes())
+    reader = st.ShardReader(whole, ["clean"])
+    assert sum(fake_sample(whole.spec, 4).scalars["injected"]) > 0
+    with pytest.raises(VbnfaultError, match="clean of sample 4 does not match its stored crc32c"):
+        decoded(reader, reader.fetch(1, [4])[4], "clean")
+
+
+def test_a_sample_that_is_rewritten_meanwhile_is_read_again(tmp_path: Path) -> None:
+    store = filled(tmp_path / "s.zarr", 4)
+    reader = st.ShardReader(store, ["raw"])
+    stale = reader.fetch(0, [2])[2]
+    stale.chunks["raw"] = stale.chunks["raw"][:-3]
+    assert np.array_equal(decoded(reader, stale, "raw"), fake_sample(store.spec, 2).layers["raw"])
+
+
+def test_a_store_opens_without_zarr_and_the_checks_of_scenes(finished_store: Path) -> None:
+    """A spawned worker of a trainer starts with this import."""
+    code = f"""
+import sys
+from vbnfault import store
+reader = store.ShardReader(store.open_store({str(finished_store)!r}), ["image"])
+reader.fetch(0, [1])
+print(sorted({{"zarr", "pydantic", "scipy", "xarray", "mitsuba", "drjit", "cv2"}} & set(sys.modules)))
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
