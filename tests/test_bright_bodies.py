@@ -59,6 +59,12 @@ def test_light_follows_phase_and_distance() -> None:
     assert lambert_phase(0.0) == 1
     assert lambert_phase(np.pi / 2) == pytest.approx(1 / np.pi)
     assert lambert_phase(np.pi) == pytest.approx(0, abs=1e-15)
+    # a quarter of Jupiter, 3 au from it: light of its V(1, 0) and distances, by the phase law
+    from_sun = PLANETS["jupiter"].position_J_au(2457000.5)
+    aside = frames.unit(np.cross(from_sun, [0.0, 0, 1]))
+    light = planet("jupiter", 2457000.5, -(from_sun + 3 * aside)).of_sunlight
+    full = 10 ** (0.4 * (9.395 - 26.76)) / (3 * np.linalg.norm(from_sun)) ** 2
+    assert light == pytest.approx(full / np.pi, rel=1e-12)
     own = BrightBodyTable(right_ascension_deg=90.0, declination_deg=0.0, of_sunlight=1e-3, angular_radius_deg=2.0)
     (body,) = bright_bodies((own,), 2457000.5, np.array([1.0, 0, 0]), 2.0)
     np.testing.assert_allclose(body.direction_J, [0, 1, 0], atol=1e-15)

@@ -96,6 +96,38 @@ def test_layers_turn_an_incline_into_treads_and_scarps() -> None:
     assert not nothing.any()
 
 
+def bedrock_of_an_incline(**keys: float) -> fractured.Bedrock:
+    """Rock on an incline of 25°, sampled every 0.25 m along 1.5 km."""
+    x = np.arange(0.0, 1500.0, 0.25)
+    slope = np.full(len(x), 25.0, np.float32)
+    place = np.column_stack([x, 0.37 * x, 0.11 * x])
+    elevation = np.tan(np.radians(25.0)) * x
+    nothing = np.zeros(len(x), np.float32)
+    spec = Fractured(**keys)
+    return fractured.bedrock(
+        octaves(place, 0.25), nothing, elevation, slope, lambda height: slope + 0 * height, spec
+    )
+
+
+def test_the_rock_is_made_of_planes_joints_and_layers() -> None:
+    def bend(height: np.ndarray) -> float:
+        """Median over the mean of the second differences, 0.85 for a Gaussian, near 0 between sharp edges."""
+        second = np.abs(np.diff(height[::8].astype(np.float64), 2))
+        return float(np.median(second) / second.mean())
+
+    planes = bedrock_of_an_incline(strata=0.0, joints=0.0)
+    np.testing.assert_array_equal(planes.height_m, planes.swell_m)
+    assert planes.height_m.std() > 1.0
+    assert bend(planes.height_m) < 0.5
+    # keys act in proportion, and each brings height of its own
+    jointed = [bedrock_of_an_incline(strata=0.0, joints=value).height_m - planes.height_m for value in (1.0, 2.0)]
+    assert jointed[0].std() > 0.3
+    np.testing.assert_allclose(jointed[1], 2 * jointed[0], atol=1e-3)
+    layered = [bedrock_of_an_incline(strata=value, joints=0.0).height_m - planes.height_m for value in (1.0, 2.0)]
+    assert layered[0].std() > 0.3
+    np.testing.assert_allclose(layered[1], 2 * layered[0], atol=1e-3)
+
+
 def test_boulders_gather_on_debris_by_the_factor_asked_for() -> None:
     side = 40
     x, y = (axis.ravel() for axis in np.meshgrid(np.arange(side) * 5.0, np.arange(side) * 5.0, indexing="ij"))

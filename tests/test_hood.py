@@ -109,6 +109,9 @@ def test_a_scene_past_the_hood(hooded: Prescription) -> None:
     # a ring holds the sources as far as its neighbours
     assert not flux[slopes > (RADIUS + RIM) / LENGTH + 2 * slopes[1]].any()
     assert slopes[-1] > 0.7
+    # glare and veil are dimmed by the shade of the hood, as for the Sun
+    angles = np.array([0.0, 0.4, 1.02 * (RADIUS + RIM) / LENGTH])
+    np.testing.assert_allclose(scene._lit(angles), [1.0, overlap(LENGTH * 0.4), 0.0], atol=1e-9)
     keys = {
         ghost_response.response_key(lens, (550.0,), response.cells, scene.settings.ghosts, 0.0)
         for lens in (hooded, replace(hooded, hood=None), replace(hooded, hood=Hood(length_mm=41, radius_mm=RADIUS)))
