@@ -251,6 +251,7 @@ def case_options(seeds: Seeds, rng: random.Random, here: Path) -> Case:
         "digest": ["digest", str(seeds.store)],
         "stats": ["stats", str(seeds.store)],
         "export": ["export", str(seeds.store), "--format", "coco", "--out", out],
+        "merge": ["merge", str(seeds.store), "--out", out + "m.zarr"],
         "preview": ["preview", str(seeds.store), "--out", out + ".png"],
         "lens": ["lens", "tessar_50_f2p8", "--out", out + ".png"],
         "flare": [
@@ -273,9 +274,20 @@ def case_options(seeds: Seeds, rng: random.Random, here: Path) -> Case:
     name = rng.choice(list(sound))
     arguments = sound[name]
     options = {
-        "build": ["--samples", "--seed", "--workers", "--threads", "--append", "--set", "--out", "--scheduler"],
+        "build": [
+            "--samples",
+            "--seed",
+            "--workers",
+            "--threads",
+            "--append",
+            "--set",
+            "--out",
+            "--scheduler",
+            "--shard-range",
+        ],
         "preview": ["--samples", "--out"],
         "export": ["--format", "--out", "--workers"],
+        "merge": ["--out", "--move"],
         "lens": ["--vary-seed", "--spread", "--json", "--toml", "--out"],
         "flare": [
             "--sun-deg",

@@ -33,6 +33,7 @@ COMMANDS = {
     "new": "lens own --out {} --overwrite",
     "export": "{}/s.zarr --format png --out {}/e",
     "card": "{}/s.zarr",
+    "merge": "{}/s.zarr --out {}/m.zarr",
     "stats": "{}/s.zarr",
     "shape": "67P --url http://localhost/s.obj --out {}",  # the file lies there already
 }
@@ -89,7 +90,7 @@ def test_every_command_is_tried() -> None:
 def test_a_reader_that_leaves_ends_a_command_in_silence_and_a_full_disk_with_a_sentence(
     name: str, folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    if name == "export":  # later runs find the files of the first one, and show no progress
+    if name in ("export", "merge"):  # later runs find the files of the first one, and show no progress
         assert run(monkeypatch, *arguments(name, folder)) == 0
         capsys.readouterr()
     assert run(monkeypatch, *arguments(name, folder)) == 0

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from .core.errors import InputError, VbnfaultError
     from .dataset import BuildOptions, verify
     from .dataset import build_scene as build
+    from .dataset import merge_stores as merge
     from .dataset.statistics import statistics
     from .detector.effects import Effect, Exposure
     from .detector.sensor import Sensor, load_sensor
@@ -59,6 +60,7 @@ _HOMES = {
     "load_lens": "lens",
     "load_scene": "scene.config",
     "load_sensor": "detector.sensor",
+    "merge": "dataset:merge_stores",
     "navigation": "navigation:",
     "number": "faults",
     "open_dataset": "store",
@@ -97,6 +99,7 @@ __all__ = [
     "load_lens",
     "load_scene",
     "load_sensor",
+    "merge",
     "navigation",
     "number",
     "open_dataset",

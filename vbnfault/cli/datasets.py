@@ -18,6 +18,7 @@ from .options import (
     SceneOptions,
     StoreArgument,
     grouped,
+    shard_range,
     whole,
     writing,
 )
@@ -36,6 +37,16 @@ class WorkOptions:
     ] = None
     scheduler: Annotated[
         str | None, typer.Option(help="Address of a Dask scheduler whose workers build, such as tcp://host:8786.")
+    ] = None
+    shard_range: Annotated[
+        range | None,
+        typer.Option(
+            parser=shard_range,
+            metavar="A:B",
+            help="Make only the shards A to B - 1, counted from 0. Several commands with disjoint ranges may write "
+            "into one store, or each into its own for the command merge.",
+            show_default="all shards",
+        ),
     ] = None
     overwrite: Annotated[bool, typer.Option(help="Delete an existing store first.")] = False
     dry_run: Annotated[bool, typer.Option(help="Plan and describe the dataset, but render nothing.")] = False
@@ -67,6 +78,19 @@ def build(
     source = dataclasses.replace(options, samples=None).load(scene)
     summary = dataset.build_scene(source, out, how, samples=options.samples, append=append, source=scene)
     for line in summary.lines():
+        typer.echo(line)
+
+
+@app.command(rich_help_panel=_PANEL)
+def merge(
+    stores: Annotated[list[Path], typer.Argument(help="Paths of stores of one dataset.", metavar="STORE...")],
+    out: Annotated[Path, typer.Option(help="Path of the store that gets all samples; one of STORE, or a new one.")],
+    move: Annotated[bool, typer.Option(help="Remove each shard from its store once it is merged.")] = False,
+) -> None:
+    """Join stores of one dataset, made with --shard-range, into one store."""
+    from .. import dataset
+
+    for line in dataset.merge_stores(stores, out, move=move).lines():
         typer.echo(line)
 
 

@@ -7,6 +7,7 @@ import dataclasses
 import functools
 import inspect
 import math
+import re
 import tomllib
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -57,6 +58,14 @@ def replaced(what: str, example: str) -> Any:
     """Return the option that replaces values of a file: of what, and an example."""
     text = f"Replace a value of the {what}, such as {example}; may be repeated."
     return typer.Option("--set", metavar="KEY=VALUE", help=text)
+
+
+def shard_range(text: str) -> range:
+    """Return the range of `--shard-range A:B`; `BuildOptions` checks their order. Raises InputError."""
+    match = re.fullmatch(r"(\d{1,12}):(\d{1,12})", text.strip(), re.ASCII)
+    if match is None:
+        raise InputError(f"--shard-range {shown(text)}: must be A:B, whole numbers with 0 <= A < B, such as 0:4")
+    return range(int(match[1]), int(match[2]))
 
 
 def whole(low: int, high: int, text: str, *, unset: str | None = None) -> Any:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 import os
 import sys
+from pathlib import Path
 
 from .errors import InputError, shown
 from .resources import PACKAGE
@@ -21,6 +23,35 @@ def whole_number(name: str, high: int) -> int:
     if not (text.isascii() and text.isdigit() and len(text) < 20 and int(text) <= high):
         raise InputError(f"{name} = {shown(text)}: must be a whole number from 0 to {high}")
     return int(text)
+
+
+def usable_cores() -> int:
+    """Return how many processor cores this process may use, at least 1.
+
+    On a machine that a batch system divides, this is less than the machine has: the affinity of the process, and
+    the quota of processor time of its control groups (`cpu.max`, Linux), rounded up.
+    """
+    affinity = getattr(os, "sched_getaffinity", None)
+    cores = len(affinity(0)) if affinity else os.cpu_count() or 1
+    return max(1, math.ceil(min(cores, _quota_of_cores())))
+
+
+def _quota_of_cores(root: Path = Path("/sys/fs/cgroup"), of_process: Path = Path("/proc/self/cgroup")) -> float:
+    """Return the least quota, in cores, of the control groups (version 2) of this process; infinite without one."""
+    least = math.inf
+    try:
+        lines = of_process.read_text(encoding="utf-8").splitlines()
+        name = next(line.removeprefix("0::/") for line in lines if line.startswith("0::/"))
+        groups = [root / name, *(root / name).parents]
+    except (OSError, StopIteration):
+        return least
+    for group in groups:
+        try:
+            quota, period = (group / "cpu.max").read_text(encoding="ascii").split()
+            least = min(least, int(quota) / int(period))
+        except (OSError, ValueError, ZeroDivisionError):  # none here, or "max"
+            continue
+    return least
 
 
 def import_path() -> list[str]:

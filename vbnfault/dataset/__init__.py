@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from .checking import missing_plugins, verify
     from .from_scene import SessionFactory, build_scene, describe_scene
     from .identity import is_exact, planned, scene_identity, store_spec
+    from .merge import merge_stores
 
 __all__ = [
     "BuildOptions",
@@ -24,6 +25,7 @@ __all__ = [
     "build_scene",
     "describe_scene",
     "is_exact",
+    "merge_stores",
     "missing_plugins",
     "planned",
     "scene_identity",
@@ -38,6 +40,7 @@ _HOMES = {
     "build_scene": "from_scene",
     "describe_scene": "from_scene",
     "is_exact": "identity",
+    "merge_stores": "merge",
     "missing_plugins": "checking",
     "planned": "identity",
     "scene_identity": "identity",

@@ -8,7 +8,7 @@ interruptions and repairs.
 
 from __future__ import annotations
 
-import os
+import contextlib
 import shutil
 import sys
 import time
@@ -21,16 +21,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .. import store as store_module
+from ..core import environment
 from ..core.errors import InputError, VbnfaultError, shown
 from ..core.interrupts import Stopped, exit_code, finishing, interruptible
 from ..store import FaultCounts, Planned, Store, StoreSpec
 from .dask import check_scheduler, run_on_dask
 from .errors import BuildFailed, Interrupted
-from .lock import locked
+from .lock import locked, others_at_work, prepared_by_one
 from .processes import Pool
 from .progress import Progress, duration_text, size_text
 from .resume import check_same_scene, planned_blocks, with_versions_noted
 from .tasks import Run, SampleMaker, SampleWorkers, SessionFactory
+from .versions import known
 from .work import run_here
 
 __all__ = [
@@ -69,6 +71,9 @@ class BuildOptions:
         Plan and describe the build, but make nothing.
     progress : bool
         Show the progress on standard error.
+    shard_range : range, optional
+        Make only these shards, counted from 0, of the whole dataset. Commands with disjoint ranges may write into
+        one store at the same time; `merge_stores` joins several stores.
     recycle_shards : int
         Number of shards after which a worker process is replaced: long runs of LLVM grow and finally fail.
 
@@ -85,6 +90,7 @@ class BuildOptions:
     accept_versions: bool = False
     dry_run: bool = False
     progress: bool = True
+    shard_range: range | None = None
     recycle_shards: int = 32
 
     def __post_init__(self) -> None:
@@ -98,6 +104,24 @@ class BuildOptions:
                 f"--workers {self.workers} and --scheduler {self.scheduler} exclude each other: the cluster has its"
                 " own workers; give one of them"
             )
+        if self.shard_range is not None:
+            part = self.shard_range
+            if part.step != 1 or not 0 <= part.start < part.stop:
+                raise InputError(
+                    f"--shard-range {part.start}:{part.stop}: must be A:B, whole numbers with 0 <= A < B"
+                )
+            if self.overwrite:
+                raise InputError("--shard-range and --overwrite exclude each other: delete the store first")
+
+    def shards_of(self, count: int) -> range:
+        """Return the shards to make of a store of `count` shards. Raises InputError if it has no such shards."""
+        part = range(count) if self.shard_range is None else self.shard_range
+        if part.stop > count:
+            raise InputError(
+                f"--shard-range {part.start}:{part.stop}: the dataset has {count} shards; must be A:B with "
+                f"0 <= A < B <= {count}"
+            )
+        return part
 
 
 def _check_whole(option: str, value: int) -> None:
@@ -149,6 +173,16 @@ class BuildPlan:
         object.__setattr__(self, "blocks", blocks)
         object.__setattr__(self, "spec", StoreSpec(**values))
 
+    @property
+    def shards(self) -> int:
+        """Return the number of shards of the whole dataset."""
+        return -(-len(self.site) // self.spec.shard_samples)
+
+    def samples_of(self, shards: range) -> int:
+        """Return the number of samples of some shards."""
+        size = self.spec.shard_samples
+        return min(shards.stop * size, len(self.site)) - shards.start * size
+
     def fault_counts(self) -> dict[str, int]:
         """Return the number of samples that are planned for each fault class; empty if that is not known."""
         if self.planned_faults is None:
@@ -162,10 +196,14 @@ class Summary:
 
     Attributes
     ----------
+    samples, shards
+        What the build completes: everything, or the shards of `shard_range`.
+    shard_range
+        The shards that the build completes, if these are not all of the store.
     finished, built
         Numbers of samples that existed before, and that were made now.
     estimated_bytes, free_bytes
-        Approximate size of the whole store, and free space on its disk.
+        Approximate size of these samples, and free space on the disk of the store.
     fault_counts
         Number of samples planned for each fault class.
     optics
@@ -173,7 +211,7 @@ class Summary:
     seconds
         Duration of the build.
     estimated_seconds
-        Estimated duration of building the whole dataset; None if unknown.
+        Estimated duration of building all of these samples; None if unknown.
     counts, digest
         Of the store after the build; None before it. `digest` is also None if a sample is missing.
     description
@@ -189,6 +227,7 @@ class Summary:
     free_bytes: int
     fault_counts: Mapping[str, int] = field(default_factory=dict)
     optics: str = ""
+    shard_range: range | None = None
     built: int = 0
     seconds: float = 0.0
     estimated_seconds: float | None = None
@@ -196,9 +235,15 @@ class Summary:
     digest: str | None = None
     description: tuple[str, ...] = ()
 
+    @property
+    def _where(self) -> str:
+        """Return the path, and the range of shards if it is not all of them, as text."""
+        part = self.shard_range
+        return f"{self.path}" if part is None else f"{self.path}: shards {part.start}:{part.stop}"
+
     def outlook(self) -> list[str]:
         """Return lines that say what there is to do."""
-        head = f"{self.path}: {self.samples} samples at {self.sites} sites in {self.shards} shards"
+        head = f"{self._where}: {self.samples} samples at {self.sites} sites in {self.shards} shards"
         size = f"about {size_text(self.estimated_bytes)}, {size_text(self.free_bytes)} free"
         lines = [f"{head}, {size}; {self.finished} of them were finished before"]
         if self.optics:
@@ -214,7 +259,7 @@ class Summary:
         """Return lines that say what was done, or, before a build, what there is to do."""
         if self.counts is None:
             return [*self.outlook(), *self.description]
-        lines = [f"{self.path}: {self.samples} samples, {self.finished} of them finished before"]
+        lines = [f"{self._where}: {self.samples} samples, {self.finished} of them finished before"]
         if self.built:
             lines.append(f"{self.built} samples built in {duration_text(self.seconds)}")
         lines += self.counts.lines()
@@ -228,7 +273,7 @@ class Summary:
 def build(
     session_factory: SessionFactory,
     plan: BuildPlan,
-    out: str | os.PathLike[str],
+    out: str | Path,
     options: BuildOptions | None = None,
 ) -> Summary:
     """Build, resume, repair or extend the store at `out`; the module's docstring describes how.
@@ -266,9 +311,10 @@ def build(
     began = time.monotonic()
     with interruptible():
         try:
-            with locked(path):
+            with contextlib.ExitStack() as stack:
+                store = _locked_store(plan, path, options, stack)
                 summary = _outlook(plan, path, options)  # another build may have ended before the lock was free
-                run = _run(session_factory, plan, options, summary)
+                run = _run(session_factory, plan, options, store, summary)
         except (Stopped, KeyboardInterrupt) as stop:
             raise _interrupted(path, len(plan.site), stop) from stop
         run.raise_failures()
@@ -277,17 +323,18 @@ def build(
             summary,
             built=run.built,
             seconds=time.monotonic() - began,
-            counts=store_module.count_faults(store, plan.planned_faults),
+            counts=store_module.count_faults(store, plan.planned_faults, summary.shard_range),
             # every sample was read or made in this run, so its digest is known already
             digest=run.digests.of(store) if run.digests.complete else None,
         )
 
 
-def _run(session_factory: SessionFactory, plan: BuildPlan, options: BuildOptions, summary: Summary) -> Run:
-    """Prepare the store, do all tasks, and return the run with its results. The caller holds the store's lock."""
-    store = _prepared_store(plan, summary.path, options)
-    progress = Progress(len(plan.site), shown=options.progress)
-    run = Run(store, plan.site, progress, plan.expected, exact=plan.exact)
+def _run(
+    session_factory: SessionFactory, plan: BuildPlan, options: BuildOptions, store: Store, summary: Summary
+) -> Run:
+    """Do all tasks, and return the run with its results. The caller holds the store's lock."""
+    progress, shards = Progress(summary.samples, shown=options.progress), options.shards_of(store.shards)
+    run = Run(store, plan.site, progress, plan.expected, exact=plan.exact, shards=shards)
     with run.progress:
         for line in summary.outlook():
             run.progress.say(line)
@@ -307,23 +354,53 @@ def _interrupted(path: Path, samples: int, stop: Stopped | KeyboardInterrupt) ->
 
 def _outlook(plan: BuildPlan, path: Path, options: BuildOptions) -> Summary:
     """Return what a build would do. Raises InputError if the store at `path` holds another scene."""
-    finished = 0
+    finished, shards = 0, options.shards_of(plan.shards)
+    part = None if options.shard_range is None else shards
     if store_module.is_store(path) and not options.overwrite:
         store = store_module.open_store(path)
         check_same_scene(store, plan.spec, plan.blocks, accept_versions=options.accept_versions)
-        finished = store.finished()
+        begun = range(min(shards.stop, store.shards))[shards.start :]
+        finished = store.finished() if part is None else sum(sum(store.done(n).values()) for n in begun)
+    samples = plan.samples_of(shards)
+    seconds = plan.estimated_seconds
     return Summary(
         path=path,
-        samples=len(plan.site),
-        shards=-(-len(plan.site) // plan.spec.shard_samples),
-        sites=len(np.unique(plan.site)),
+        samples=samples,
+        shards=len(shards),
+        shard_range=part,
+        sites=len(np.unique(plan.site[shards.start * plan.spec.shard_samples :][:samples])),
         finished=finished,
-        estimated_bytes=plan.spec.estimated_sample_bytes * len(plan.site),
+        estimated_bytes=plan.spec.estimated_sample_bytes * samples,
         free_bytes=_free_bytes(path),
         fault_counts=plan.fault_counts(),
-        estimated_seconds=plan.estimated_seconds,
+        estimated_seconds=None if seconds is None else seconds * samples / len(plan.site),
         optics=plan.spec.attributes.get("optics", {}).get("summary", ""),
     )
+
+
+def _locked_store(plan: BuildPlan, path: Path, options: BuildOptions, stack: contextlib.ExitStack) -> Store:
+    """Lock what the build writes until the stack ends, and return the store, created, repaired or extended.
+
+    Of several builds that write different shards, the first one prepares the store. The others find it whole.
+    """
+    if options.shard_range is None:
+        stack.enter_context(locked(path))
+        _outlook(plan, path, options)  # another build may have made another store before the lock was free
+        return _prepared_store(plan, path, options)
+    shards = options.shards_of(plan.shards)
+    with prepared_by_one(path):
+        stack.enter_context(locked(path, shards))
+        _outlook(plan, path, options)
+        if not others_at_work(path, shards):
+            return _prepared_store(plan, path, options)
+        store = store_module.open_store(path, "r+")
+        versions = plan.spec.attributes.get("versions", {})
+        if store.samples < len(plan.site) or versions not in known(store.attributes):
+            raise VbnfaultError(
+                f"{path}: another command is writing shards of it, so no samples or versions can be added now; "
+                "wait until it ends"
+            )
+        return store
 
 
 def _prepared_store(plan: BuildPlan, path: Path, options: BuildOptions) -> Store:
@@ -345,7 +422,7 @@ def _do_tasks(session_factory: SessionFactory, run: Run, options: BuildOptions) 
     elif options.workers == 1:
         run_here(workers, run)
     else:
-        threads = options.threads or max(1, (os.cpu_count() or 1) // options.workers)
+        threads = options.threads or max(1, environment.usable_cores() // options.workers)
         Pool(workers, run, threads, options.recycle_shards).work(options.workers)
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import os
 import sys
 from pathlib import Path
 from typing import Any
@@ -73,7 +72,7 @@ def estimated_seconds(session: pipeline.Session) -> float:
     sample_s = 0.3 + megapixels * (1.2 + 0.25 * rays * (1 + render.bounces) / variants)
     patch_s = 16 * scene.patch.max_triangles / 1.6e6
     terrains = len(session.plan) // variants if scene.is_aimed else len(np.unique(session.plan.site))
-    return (len(session.plan) * sample_s + terrains * patch_s) / (os.cpu_count() or 1)
+    return (len(session.plan) * sample_s + terrains * patch_s) / environment.usable_cores()
 
 
 def build_scene(
@@ -139,9 +138,12 @@ def build_scene(
 
 
 def _with_card(out: Path, summary: build.Summary) -> build.Summary:
-    """Write the card of a store that was built or has none, and return the summary of its build."""
-    if summary.counts is not None and (summary.built or not card.has_card(store.open_store(out))):
-        card.write_card(out)
+    """Write the card of a complete store that was built or has none, and return the summary of its build."""
+    if summary.counts is not None:
+        opened = store.open_store(out)
+        complete = summary.shard_range is None or opened.finished() == opened.samples
+        if complete and (summary.built or not card.has_card(opened)):
+            card.write_card(opened)
     return summary
 
 

@@ -1,4 +1,9 @@
-"""Lock a store or a study: only one command writes to it at a time, even if its folder is replaced meanwhile."""
+"""Lock a store or a study: only one command writes to it at a time, even if its folder is replaced meanwhile.
+
+Commands that each write a range of the shards of one store (`--shard-range`) may work at the same time if their
+ranges are disjoint. Each command first takes the lock of what it writes, then looks for the locks of others that
+overlap: so of two that begin together, at least one sees the other.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +11,7 @@ import contextlib
 import json
 import os
 import platform
+import re
 import stat
 import threading
 import time
@@ -13,7 +19,7 @@ import uuid
 from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Any, NamedTuple
 
 from ..core.errors import InputError, VbnfaultError
 
@@ -24,19 +30,22 @@ except ImportError:  # Windows has no such locks
     fcntl = None
 
 _SECONDS_BETWEEN_BEATS = 10.0
+_SECONDS_BETWEEN_TRIES = 0.1
+_SECONDS_TO_PREPARE = 600.0  # after which a command does not wait any longer until another has prepared a store
 
 
 @contextlib.contextmanager
-def locked(path: Path) -> Iterator[None]:
-    """Hold the lock of the store or study at `path` during a `with` block.
+def locked(path: Path, shards: range | None = None) -> Iterator[None]:
+    """Hold the lock of the store or study at `path`, or of some of its shards, during a `with` block.
 
-    The lock is a locked file beside the store, `.NAME.lock`. So it exists before the store does, and it stays when
-    the store is replaced. The operating system releases the lock when the process ends.
+    The lock is a locked file beside the store, `.NAME.lock`, or `.NAME.shards-A-B.lock` for the shards A to B - 1.
+    So it exists before the store does, and it stays when the store is replaced. The operating system releases the
+    lock when the process ends.
 
-    If the file system has no locks, a file `.NAME.owner` holds the host, the process number and the start time of
-    its owner instead. If its owner ran on this host and has ended, the file is removed and the lock taken. The file
-    of an owner on another host is never removed; the error then states the file and the owner's last heart-beat.
-    The two kinds of lock have different names, so that one never removes the file of the other.
+    If the file system has no locks, a file that ends in `.owner` holds the host, the process number and the start
+    time of its owner instead. If its owner ran on this host and has ended, the file is removed and the lock taken.
+    The file of an owner on another host is never removed; the error then states the file and the owner's last
+    heart-beat. The two kinds of lock have different names, so that one never removes the file of the other.
 
     Raises
     ------
@@ -45,6 +54,101 @@ def locked(path: Path) -> Iterator[None]:
     InputError
         No lock can be made at this path.
     """
+    with contextlib.ExitStack() as stack:
+        _take(path, _stem(path, shards), stack)
+        for held in _held_locks(path):
+            if held.shards != shards and _overlap(held.shards, shards):
+                raise held.error(path)
+        yield
+
+
+@contextlib.contextmanager
+def prepared_by_one(path: Path) -> Iterator[None]:
+    """Let the commands that write shards of one store pass a `with` block one after the other.
+
+    In it, a command takes the lock of its shards, and the first one creates or repairs the store. Raises
+    VbnfaultError after ten minutes of waiting.
+    """
+    until = time.monotonic() + _SECONDS_TO_PREPARE
+    with contextlib.ExitStack() as stack:
+        while True:
+            try:
+                _take(path, f".{path.name}.prepare", stack)
+                break
+            except VbnfaultError as error:
+                if isinstance(error, InputError) or time.monotonic() > until:
+                    raise
+            time.sleep(_SECONDS_BETWEEN_TRIES)
+        yield
+
+
+def others_at_work(path: Path, shards: range) -> bool:
+    """Return whether other commands write other shards of the store at `path` now."""
+    return any(held.shards not in (None, shards) for held in _held_locks(path))
+
+
+def _stem(path: Path, shards: range | None) -> str:
+    """Return the name of a lock without its ending."""
+    return f".{path.name}" if shards is None else f".{path.name}.shards-{shards.start}-{shards.stop}"
+
+
+def _overlap(a: range | None, b: range | None) -> bool:
+    """Return whether two commands write to the same shards; None stands for the whole store."""
+    return a is None or b is None or (a.start < b.stop and b.start < a.stop)
+
+
+class _HeldLock(NamedTuple):
+    """Hold what another process has locked: some shards, or everything (None), and the file of the lock."""
+
+    shards: range | None
+    file: Path
+
+    def error(self, path: Path) -> VbnfaultError:
+        """Return the error for a command that wants the same."""
+        return _held(path, _read_owner(self.file), self.file if self.file.suffix == ".owner" else None, self.shards)
+
+
+def _held_locks(path: Path) -> Iterator[_HeldLock]:
+    """Yield the locks of the store at `path` that a process holds, this one's too, and remove abandoned files."""
+    own = re.compile(rf"\.{re.escape(path.name)}(?:\.shards-(\d+)-(\d+))?\.(lock|owner)")
+    try:
+        names = sorted(os.listdir(path.absolute().parent))
+    except OSError:  # a folder that this user may not list: only the lock of the whole is taken there
+        return
+    for name in names:
+        match = own.fullmatch(name)
+        if match is None:
+            continue
+        file = path.absolute().with_name(name)
+        is_held = _is_locked(file) if match[3] == "lock" else not _has_ended(_read_owner(file))
+        if is_held:
+            yield _HeldLock(range(int(match[1]), int(match[2])) if match[1] else None, file)
+        elif match[3] == "owner":
+            _remove_owner(file, _read_owner(file))
+
+
+def _is_locked(file: Path) -> bool:
+    """Return whether a process holds the lock of a file; otherwise remove the file, which was left behind."""
+    if fcntl is None:
+        return False
+    try:
+        handle = os.open(file, os.O_RDONLY)
+    except OSError:
+        return False
+    try:
+        fcntl.flock(handle, fcntl.LOCK_SH | fcntl.LOCK_NB)  # shared: others that look do not disturb each other
+        file.unlink(missing_ok=True)
+    except BlockingIOError:
+        return True
+    except OSError:
+        return False
+    finally:
+        os.close(handle)
+    return False
+
+
+def _take(path: Path, stem: str, stack: contextlib.ExitStack) -> None:
+    """Take a lock until the stack ends. Raises VbnfaultError if another process holds it."""
     beside = path.absolute().parent
     try:
         beside.mkdir(parents=True, exist_ok=True)
@@ -52,19 +156,20 @@ def locked(path: Path) -> Iterator[None]:
         above = next((p for p in path.absolute().parents if os.path.isfile(p)), None)
         why = f"{above} is a file, not a folder" if above else error.strerror
         raise InputError(f"{path}: nothing can be created here: {why}") from None
-    with contextlib.ExitStack() as stack:
-        if fcntl is None or not _lock_file(path, beside / f".{path.name}.lock", stack):
-            _own(path, beside / f".{path.name}.owner", stack)
-        yield
+    if fcntl is None or not _lock_file(path, beside / f"{stem}.lock", stack):
+        _own(path, beside / f"{stem}.owner", stack)
 
 
 def _lock_file(path: Path, file: Path, stack: contextlib.ExitStack) -> bool:
     """Lock a file until the stack ends, which removes the file. Return False if the file system has no locks."""
     assert fcntl is not None
+    whole = file.name == f"{_stem(path, None)}.lock"
     while True:
         try:
             handle = os.open(file, os.O_RDWR | os.O_CREAT, 0o666)
         except OSError as error:
+            if not whole:
+                raise InputError(f"{file}: a lock cannot be created here: {error.strerror}") from None
             if not os.path.isdir(path):
                 raise InputError(f"{path}: nothing can be created here: {error.strerror}") from None
             # its parent folder is not writable, so the store cannot be replaced: lock the store's own folder
@@ -175,10 +280,13 @@ def _remove_owner(file: Path, owner: dict[str, Any]) -> None:
     aside.unlink(missing_ok=True)
 
 
-def _held(path: Path, owner: dict[str, Any], file: Path | None = None) -> VbnfaultError:
+def _held(
+    path: Path, owner: dict[str, Any], file: Path | None = None, shards: range | None = None
+) -> VbnfaultError:
     """Return the error for a lock that another command holds."""
     by = f" (process {owner['pid']} on {owner['host']})" if {"pid", "host"} <= owner.keys() else ""
-    sentence = f"{path}: another command is writing to it{by}; wait until it ends"
+    what = "to it" if shards is None else f"shards {shards.start}:{shards.stop} of it"
+    sentence = f"{path}: another command is writing {what}{by}; wait until it ends"
     if file is not None:
         with contextlib.suppress(OSError):
             beat = time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(file.stat().st_mtime))

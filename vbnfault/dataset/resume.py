@@ -79,12 +79,8 @@ def check_same_scene(
             )
         differing = []
     if differing:
-        # keys of the scene first: they tell a user more than the hashes that follow from them
-        differing.sort(key=lambda d: (not d.key.startswith("scene."), "hash" in d.key, d.key))
-        first = [d.text for d in differing[:4]]
-        more = f", and {len(differing) - 4} more" if len(differing) > 4 else ""
         raise InputError(
-            f"{store.path}: holds another dataset: {'; '.join(first)}{more}; "
+            f"{store.path}: holds another dataset: {_named(differing, 'in the store', 'now')}; "
             f"choose another --out, or --overwrite to replace it"
         )
     blocks_of_store = tuple(store.attributes.get("blocks", [store.samples]))
@@ -93,6 +89,34 @@ def check_same_scene(
             f"{store.path}: holds blocks of {_sum_text(blocks_of_store)} samples, not {_sum_text(blocks)}; "
             f"choose another --out, or --overwrite to replace it"
         )
+
+
+def check_same_dataset(store: Store, reference: Store) -> None:
+    """Raise InputError with the differences if two stores do not hold samples of one dataset.
+
+    Scene, seed, blocks of samples, versions and size of the shards must be equal.
+    """
+    stored, wanted = (
+        {
+            **_compared(s.spec),
+            "blocks": s.attributes.get("blocks", [s.samples]),
+            "shard_samples": s.spec.shard_samples,
+        }
+        for s in (store, reference)
+    )
+    differing = list(_differences(stored, wanted))
+    if differing:
+        raise InputError(
+            f"{store.path}: holds another dataset than {reference.path}: {_named(differing, 'here', 'there')}"
+        )
+
+
+def _named(differing: list[_Difference], *holders: str) -> str:
+    """Return the first differences in words; `holders` say where the two values of each are."""
+    # keys of the scene first: they tell a user more than the hashes that follow from them
+    differing.sort(key=lambda d: (not d.key.startswith("scene."), "hash" in d.key, d.key))
+    more = f", and {len(differing) - 4} more" if len(differing) > 4 else ""
+    return "; ".join(d.text(*holders) for d in differing[:4]) + more
 
 
 _NOT_COMPARED = {
@@ -116,14 +140,13 @@ class _Difference(NamedTuple):
     stored: Any
     wanted: Any
 
-    @property
-    def text(self) -> str:
+    def text(self, holds_stored: str, holds_wanted: str) -> str:
         """Return the difference in words; long values begin shortly before the part that differs."""
         texts = ["absent" if value is _ABSENT else repr(value) for value in (self.stored, self.wanted)]
         equal = next((k for k, pair in enumerate(zip(*texts, strict=False)) if pair[0] != pair[1]), 0)
         start = max(0, equal - _LONGEST_VALUE // 3)
         stored, wanted = (_part(text, start) for text in texts)
-        return f"{self.key} is {stored} in the store and {wanted} now"
+        return f"{self.key} is {stored} {holds_stored} and {wanted} {holds_wanted}"
 
 
 def _part(text: str, start: int) -> str:

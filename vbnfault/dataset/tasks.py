@@ -145,7 +145,7 @@ def work(simulate: Callable[[int], Sample], store: Store, task: Task, tick: Tick
 
 
 class Run:
-    """Assign the tasks of a build by site, and collect their results."""
+    """Assign the tasks of a build by site, and collect their results; `shards`: all of the store by default."""
 
     task_noun, item_noun = "shard", "sample"
 
@@ -157,6 +157,7 @@ class Run:
         expected: Planned | None = None,
         *,
         exact: bool = False,
+        shards: range | None = None,
     ) -> None:
         self.store, self.sites, self.progress = store, sites, progress
         self.path = store.path
@@ -165,13 +166,14 @@ class Run:
         self.digests = SampleDigests(store.samples)
         self.failures: dict[int, str] = {}
         self._outcome: dict[int, str] = {}
-        self._queue = Queue([self.lead(shard) for shard in range(store.shards)])
+        self._shards = range(store.shards) if shards is None else shards
+        self._queue = Queue({shard: self.lead(shard) for shard in self._shards})
         self._begun = frozenset(store.begun())
 
     @property
     def tasks(self) -> int:
-        """Return the number of shards."""
-        return self.store.shards
+        """Return the number of shards to complete."""
+        return len(self._shards)
 
     def items(self, number: int) -> Sequence[int]:
         """Return the samples of a shard."""

@@ -43,6 +43,30 @@ def made_now(
     return [{"versions": versions, "samples": _ranges(made)} for versions, made in entries if made]
 
 
+def joined(
+    attributes: Mapping[str, Any], taken: Iterable[tuple[Mapping[str, Any], Collection[int]]]
+) -> list[dict[str, Any]]:
+    """Return the new attribute `versions_of_samples` of a store that takes samples of other stores.
+
+    Parameters
+    ----------
+    attributes
+        Root attributes of the store. Its `versions` are those of the others.
+    taken
+        For each of the others, its root attributes and the samples that are taken.
+    """
+    everything = list(taken)
+    new = {i for _, samples in everything for i in samples}
+    made = [(entry["versions"], _samples(entry) - new) for entry in _entries(attributes)]
+    for others, samples in everything:
+        for entry in _entries(others):
+            of_entry = next((known for versions, known in made if versions == entry["versions"]), None)
+            if of_entry is None:
+                made.append((entry["versions"], of_entry := set()))
+            of_entry.update(_samples(entry) & set(samples))
+    return [{"versions": versions, "samples": _ranges(samples)} for versions, samples in made if samples]
+
+
 def _entries(attributes: Mapping[str, Any]) -> list[dict[str, Any]]:
     """Return the tables of `versions_of_samples`; none if the attribute is missing."""
     return list(attributes.get(VERSIONS_OF_SAMPLES, ()))

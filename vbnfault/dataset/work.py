@@ -9,7 +9,7 @@ from __future__ import annotations
 import heapq
 import traceback
 from collections import Counter, deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Generic, Protocol, TypeVar
 
@@ -87,12 +87,15 @@ class Job(Protocol):
 
 
 class Queue:
-    """Assign tasks so that a worker stays with one lead, such as a site, whose costly data it keeps."""
+    """Assign tasks so that a worker stays with one lead, such as a site, whose costly data it keeps.
 
-    def __init__(self, leads: Sequence[int]) -> None:
+    `leads`: the lead of each task by its number.
+    """
+
+    def __init__(self, leads: Mapping[int, int]) -> None:
         self._leads = leads
         self._by_lead: dict[int, deque[int]] = {}
-        for task, lead in enumerate(leads):
+        for task, lead in leads.items():
             self._by_lead.setdefault(lead, deque()).append(task)
         # heap of leads, those with the most tasks left first; an entry is updated when it is taken out
         self._longest = [(-len(tasks), lead) for lead, tasks in self._by_lead.items()]

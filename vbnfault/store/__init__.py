@@ -28,6 +28,7 @@ from .check import (
     examine,
     examine_shard,
     problem_samples,
+    spans,
     unplanned_samples,
     verify,
 )
@@ -88,6 +89,7 @@ __all__ = [
     "open_store",
     "problem_samples",
     "recover",
+    "spans",
     "unplanned_samples",
     "verify",
     "write_samples",

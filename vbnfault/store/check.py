@@ -77,15 +77,15 @@ def examine_shard(store: Store, number: int, *, labels: bool = False) -> ShardCh
     samples = store.shard(number)
     columns, unreadable = _columns(store, number)
     if "done" not in columns and store.file("image", number).exists():
-        problem = Problem(tuple(samples), f"done of samples {_spans(samples)}: {unreadable['done']}")
+        problem = Problem(tuple(samples), f"done of samples {spans(samples)}: {unreadable['done']}")
         return ShardCheck([problem], {}, {}, {})
     finished = [i for i in samples if "done" in columns and columns["done"][i - samples.start]]
     missing = tuple(i for i in samples if i not in finished)
-    problems = [Problem(missing, f"samples {_spans(missing)}: not finished", True)] if missing else []
+    problems = [Problem(missing, f"samples {spans(missing)}: not finished", True)] if missing else []
     if not finished:
         return ShardCheck(problems, {}, {}, {})
     problems += [
-        Problem(tuple(finished), f"{name} of samples {_spans(finished)}: {why}") for name, why in unreadable.items()
+        Problem(tuple(finished), f"{name} of samples {spans(finished)}: {why}") for name, why in unreadable.items()
     ]
     if "crc32c" not in columns:
         return ShardCheck(problems, {}, {}, {})
@@ -175,7 +175,7 @@ def _chunks(store: Store, number: int, finished: list[int]) -> tuple[dict[str, d
         except OSError as error:
             why = f"cannot be read: {error.strerror}"
         if name not in chunks:
-            sentence = f"{name} of samples {_spans(finished)}: the shard file {file} {why}"
+            sentence = f"{name} of samples {spans(finished)}: the shard file {file} {why}"
             problems.append(Problem(tuple(finished), sentence))
     return chunks, problems
 
@@ -205,7 +205,7 @@ def _layers(
     return problems, layers
 
 
-def _spans(indices: Iterable[int]) -> str:
+def spans(indices: Iterable[int]) -> str:
     """Return sorted indices as ranges: `3-7, 9` for 3, 4, 5, 6, 7, 9."""
     runs: list[list[int]] = []
     for i in sorted(indices):
@@ -219,7 +219,7 @@ def _spans(indices: Iterable[int]) -> str:
 def _not_built(samples: list[int]) -> Iterator[str]:
     """Yield one sentence that lists the first ranges of the samples that are not built yet; none if all are."""
     if samples:
-        ranges = _spans(samples).split(", ")
+        ranges = spans(samples).split(", ")
         more = f" and {len(ranges) - _MOST_RANGES} ranges more" if len(ranges) > _MOST_RANGES else ""
         listed = ", ".join(ranges[:_MOST_RANGES]) + more
         yield f"samples {listed} are not built yet" if len(samples) > 1 else f"sample {listed} is not built yet"
@@ -344,13 +344,16 @@ def examine(
     return Report(problems, digests.of(store) if digests.complete else None, counts)
 
 
-def count_faults(store: Store, planned: NDArray[np.bool_] | None = None) -> FaultCounts:
+def count_faults(
+    store: Store, planned: NDArray[np.bool_] | None = None, shards: range | None = None
+) -> FaultCounts:
     """Return how often each fault is injected in the finished samples, and how often it is planned there.
 
-    `planned`: commanded faults, bool[sample, fault]. Only the arrays `done`, `split` and `injected` are read.
+    `planned`: commanded faults, bool[sample, fault]. `shards`: which shards are counted; all by default. Only
+    the arrays `done`, `split` and `injected` are read.
     """
     counts = FaultCounts(store.spec.faults)
-    for number in range(store.shards):
+    for number in range(store.shards) if shards is None else shards:
         finished = [i for i, done in store.done(number).items() if done]
         if not finished:
             continue

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 import struct
 from collections.abc import Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
@@ -28,7 +27,7 @@ _ABSENT = 2**64 - 1  # marks a missing chunk in a shard's index (Zarr v3 specifi
 def threads() -> int:
     """Return how many threads compress or check the layers of a sample, 1 to 4."""
     given = environment.whole_number("VBNFAULT_THREADS", environment.MOST_THREADS)
-    return max(1, min(4, given or os.cpu_count() or 1))
+    return max(1, min(4, given or environment.usable_cores()))
 
 
 def crc32c(array: NDArray[Any]) -> int:

@@ -143,7 +143,7 @@ def names(folder: Path) -> list[str]:
         raise denied(error, folder) from error
 
 
-def write(root: Path, files: Iterable[tuple[str, bytes]]) -> None:
+def write(root: Path, files: Iterable[tuple[str, bytes | Path]]) -> None:
     """Replace files durably, as one batch; each is the old or the complete new one at any moment.
 
     If something else (a folder, a link, a pipe) has the name of a file or of its folder below `root`, it is
@@ -155,7 +155,8 @@ def write(root: Path, files: Iterable[tuple[str, bytes]]) -> None:
         An existing folder.
     files
         Name relative to `root`, separated by `/`, and content. They are taken one at a time, so that only one
-        content is in memory.
+        content is in memory. A path in place of a content is a file that gets this second name (a hard link), or is
+        copied where that is impossible.
 
     Raises
     ------
@@ -172,6 +173,12 @@ def write(root: Path, files: Iterable[tuple[str, bytes]]) -> None:
             changed[target.parent] = None
             partial = target.with_name(f"{target.name}.{uuid.uuid4().hex}{PARTIAL}")
             written.append((partial, target))
+            if isinstance(content, Path):
+                try:
+                    os.link(content, partial, follow_symlinks=False)
+                    continue
+                except OSError:  # on another device, or a file system without links
+                    content = read(content)
             flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0)
             opened.append(os.open(partial, flags, 0o666))
             _write_all(opened[-1], content)
@@ -280,6 +287,16 @@ def flush_folder(folder: Path) -> None:
         _flush(file)
     finally:
         os.close(file)
+
+
+def remove(root: Path, files: Iterable[str]) -> None:
+    """Remove files below `root` durably, as one batch; files that do not exist are left out."""
+    folders: dict[Path, None] = {}
+    for name in files:
+        with contextlib.suppress(FileNotFoundError, NotADirectoryError):
+            os.unlink(root / name)
+            folders[(root / name).parent] = None
+    _at_once(flush_folder, folders)
 
 
 def rename(source: Path, target: Path) -> None:

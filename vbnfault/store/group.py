@@ -283,6 +283,56 @@ class Store:
             self._write_done(number, {*given, *kept})
         return wished - kept
 
+    def copy_shard(self, number: int, source: Store, finished: Collection[int], *, link: bool = False) -> None:
+        """Copy the files of a shard from another store of the same schema; `done` is written last.
+
+        Parameters
+        ----------
+        finished
+            The samples that are finished then: those that were so in `source` before this call.
+        link
+            Give the files a second name here, where the file system can, so that no byte is copied.
+
+        Raises
+        ------
+        VbnfaultError
+            The files cannot be read or written.
+        """
+        samples = self.shard(number)
+        with disk.explained(self.path, f"copying samples {samples.start}-{samples.stop - 1} from {source.path}"):
+            if any(self.done(number).values()):
+                self._write_done(number, set())
+            names = [name for name in self.spec.arrays if name != "done" and not self.spec.empty(name)]
+            files = [(self.file_name(name, number), source.file(name, number)) for name in names]
+            disk.write(self.path, ((name, path if link else disk.read(path)) for name, path in files))
+            self._write_done(number, set(finished))
+
+    def remove_shard(self, number: int) -> None:
+        """Remove the files of a shard, `done` first, so that its samples are not finished any more."""
+        samples = self.shard(number)
+        with disk.explained(self.path, f"removing samples {samples.start}-{samples.stop - 1}"):
+            disk.remove(self.path, [self.file_name("done", number)])
+            disk.remove(self.path, [self.file_name(name, number) for name in self.spec.arrays])
+
+    def encoded(self, number: int, samples: Collection[int]) -> dict[int, Encoded]:
+        """Return some samples of a shard as they are stored, for `write_shard` of another store; no digest is set.
+
+        Raises OSError or ValueError if their files are damaged.
+        """
+        first = self.shard(number).start
+        chunks = {name: self.chunk(name, number) for name in self.spec.pixel_layers}
+        columns = {name: self.column(name, number) for name in (*SCALARS, "crc32c")}
+        return {
+            i: Encoded(
+                index=i,
+                chunks={name: chunks[name][i] for name in chunks},
+                scalars={name: columns[name][i - first] for name in SCALARS},
+                crc32c=columns["crc32c"][i - first],
+                digest=b"",
+            )
+            for i in samples
+        }
+
     def _finished(self, number: int, *, strict: bool) -> set[int]:
         """Return the samples of a shard that are marked as finished in `done`.
 

@@ -177,7 +177,7 @@ class StudyJob:
             for block in range(seeds * views)
             for first in range(0, in_block, size)
         ]
-        self._queue = Queue([chunk.start // in_block for chunk in self._chunks])
+        self._queue = Queue({n: chunk.start // in_block for n, chunk in enumerate(self._chunks)})
         self.finished = sum(
             len(results.read_chunk(path, number).keys() & set(chunk)) for number, chunk in enumerate(self._chunks)
         )

@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from .. import __version__
-from ..core import file_contents, tables, toml_files
+from ..core import environment, file_contents, tables, toml_files
 from ..core.errors import InputError, VbnfaultError, shown
 from ..core.interrupts import Stopped, exit_code, finishing, interruptible
 from ..dataset import BuildOptions
@@ -420,7 +420,7 @@ def _evaluate(source: ChunkWorkers, evaluator: Evaluator, job: StudyJob, options
             elif options.workers == 1:
                 run_here(partial(source.with_evaluator, evaluator), job)
             else:
-                threads = options.threads or max(1, (os.cpu_count() or 1) // options.workers)
+                threads = options.threads or max(1, environment.usable_cores() // options.workers)
                 tasks = max(options.recycle_shards, _MOST_EVALUATIONS_OF_A_PROCESS // job.chunk_size)
                 Pool(source, job, threads, tasks).work(options.workers)
     except (Stopped, KeyboardInterrupt) as stop:

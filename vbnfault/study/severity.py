@@ -8,7 +8,6 @@ to none of them. The interval of the error comes from a bootstrap over the views
 
 from __future__ import annotations
 
-import os
 import shlex
 import warnings
 from collections.abc import Mapping, Sequence
@@ -21,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import isotonic_regression
 
-from ..core import toml_files
+from ..core import environment, toml_files
 from ..core.errors import InputError, VbnfaultError, shown
 from ..core.interrupts import Stopped, exit_code, interruptible
 from ..core.tables import did_you_mean
@@ -323,7 +322,7 @@ def evaluate_models(
             if options.workers == 1:
                 run_here(workers, job)
             else:
-                threads = options.threads or max(1, (os.cpu_count() or 1) // options.workers)
+                threads = options.threads or max(1, environment.usable_cores() // options.workers)
                 Pool(workers, job, threads, options.recycle_shards).work(options.workers)
     except (Stopped, KeyboardInterrupt) as stop:
         raise Interrupted(f"{job.path}: interrupted; nothing was written", exit_code(stop)) from stop

@@ -295,7 +295,7 @@ class SeverityJob:
 
     def __init__(self, path: Path, groups: Sequence[ViewGroup], progress: Progress) -> None:
         self.path, self.progress, self._groups = path, progress, groups
-        self._queue = Queue([0] * len(groups))
+        self._queue = Queue(dict.fromkeys(range(len(groups)), 0))
         self.errors: dict[int, dict[str, list[tuple[float, float]]]] = {}
         self._counted: set[int] = set()
 

@@ -1,0 +1,302 @@
+"""Ranges of shards made by several commands, into one store or into several that are merged: one digest."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import platform
+import re
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import victim
+from kills import forked
+from synthetic import SAMPLES, Session, fake_sample, make_spec, run
+from typer.testing import CliRunner
+
+from vbnfault import cli
+from vbnfault import store as st
+from vbnfault.core import environment
+from vbnfault.core.errors import InputError, VbnfaultError
+from vbnfault.core.quantities import Sample
+from vbnfault.dataset import build as bd
+from vbnfault.dataset import lock
+from vbnfault.dataset.merge import MergeSummary, join_stores
+
+SHARDS = 5
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("whole") / "s.zarr"
+    run(out)
+    return out
+
+
+@pytest.fixture(scope="module")
+def parts_once(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("parts")
+    run(folder / "a.zarr", shard_range=range(2))
+    run(folder / "b.zarr", shard_range=range(2, SHARDS))
+    return folder
+
+
+@pytest.fixture
+def parts(parts_once: Path, tmp_path: Path) -> list[Path]:
+    """Stores of the shards 0:2 and 2:5."""
+    return [Path(shutil.copytree(parts_once / name, tmp_path / name)) for name in ("a.zarr", "b.zarr")]
+
+
+def merge(stores: list[Path], out: Path, **options: bool) -> MergeSummary:
+    return join_stores(stores, out, progress=False, **options)
+
+
+def remake(store: Path, index: int, **attributes: object) -> None:
+    """Replace a sample of a store by another one."""
+    sample = fake_sample(make_spec(), index)
+    st.write_samples(store, [dataclasses.replace(sample, scalars={**sample.scalars, **attributes})])
+
+
+@dataclasses.dataclass
+class Guest:
+    """Runs another command at its first sample, when its own command holds its locks."""
+
+    action: object
+
+    def __call__(self) -> Guest:
+        return self
+
+    def simulate(self, index: int) -> Sample:
+        action, self.action = self.action, None
+        if action:
+            action()  # type: ignore[operator]
+        return Session().simulate(index)
+
+
+def test_ranges_at_work_at_once_make_one_store(tmp_path: Path, whole: Path) -> None:
+    out = tmp_path / "s.zarr"
+
+    def others() -> None:
+        (out / "left.partial").touch()  # of a command at work
+        for part in (range(1, 3), range(1), range(SHARDS)):
+            with pytest.raises(VbnfaultError, match=r"another command is writing shards 0:2 of it \(process"):
+                run(out, shard_range=part) if part != range(1) else run(out)
+        summary = run(out, shard_range=range(2, SHARDS))
+        assert (summary.samples, summary.built, summary.shards) == (10, 10, 3)
+        assert summary.digest is None
+        assert (out / "left.partial").exists()  # a range does not repair while others write
+
+    with lock.locked(out), pytest.raises(VbnfaultError, match="another command is writing to it"):
+        run(out, shard_range=range(2))
+    summary = run(out, Guest(others), shard_range=range(2))
+    assert "shards 0:2" in summary.lines()[0]
+    assert "8 samples at" in summary.outlook()[0]
+    assert [p.name for p in tmp_path.iterdir()] == ["s.zarr"]
+    assert run(out).built == 0
+    assert not (out / "left.partial").exists()
+    assert st.digest(out) == st.digest(whole)
+    with pytest.raises(InputError, match=r"--shard-range 4:6: the dataset has 5 shards; .* B <= 5"):
+        run(out, shard_range=range(4, 6))
+
+
+def test_ranges_without_locks_of_the_file_system(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, whole: Path
+) -> None:
+    monkeypatch.setattr(lock, "fcntl", None)
+    out = tmp_path / "s.zarr"
+
+    def others() -> None:
+        with pytest.raises(VbnfaultError, match=r"shards 0:2 of it .*\.owner if it has ended"):
+            run(out, shard_range=range(1, 3))
+        run(out, shard_range=range(2, SHARDS))
+
+    killed = {"host": platform.node(), "pid": 1, "started": 0}
+    (tmp_path / ".s.zarr.shards-0-4.owner").write_text(json.dumps(killed))
+    run(out, Guest(others), shard_range=range(2))
+    assert [p.name for p in tmp_path.iterdir()] == ["s.zarr"]
+    assert st.digest(out) == st.digest(whole)
+
+
+def test_a_range_cannot_extend_a_store_while_another_range_is_written(tmp_path: Path) -> None:
+    out = tmp_path / "s.zarr"
+
+    def others() -> None:
+        with pytest.raises(VbnfaultError, match="no samples or versions can be added now"):
+            run(out, samples=24, blocks=(SAMPLES, 6), shard_range=range(3, 5))
+
+    run(out, Guest(others), shard_range=range(2))
+    assert run(out, samples=24, blocks=(SAMPLES, 6), shard_range=range(5, 6)).built == 4
+
+
+@pytest.mark.parametrize(
+    ("part", "sentence"),
+    [
+        (range(2, 2), "--shard-range 2:2: must be A:B, whole numbers with 0 <= A < B"),
+        (range(0, 4, 2), "--shard-range 0:4: must be A:B"),
+        (range(-1, 2), "--shard-range -1:2: must be A:B"),
+    ],
+)
+def test_a_range_is_checked(part: range, sentence: str) -> None:
+    with pytest.raises(InputError, match=sentence):
+        bd.BuildOptions(shard_range=part)
+    with pytest.raises(InputError, match="--shard-range and --overwrite exclude each other"):
+        bd.BuildOptions(shard_range=range(1), overwrite=True)
+
+
+@pytest.mark.parametrize("text", ["3", "a:b", "1:", "-1:2", "1:2:3", "1:99999999999999"])
+def test_the_command_checks_the_text_of_a_range(text: str, tmp_path: Path) -> None:
+    given = ["build", "quickstart", "--out", str(tmp_path / "x"), "--dry-run", "--shard-range", text]
+    shown = CliRunner().invoke(cli.app, given)
+    assert "must be A:B, whole numbers with 0 <= A < B, such as 0:4" in str(shown.exception)
+
+
+# --- merge ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("move", [False, True])
+def test_merged_stores_have_the_digest_of_one_build(
+    tmp_path: Path, parts: list[Path], whole: Path, move: bool
+) -> None:
+    out = tmp_path / "m.zarr"
+    summary = merge(parts, out, move=move)
+    assert (summary.finished, summary.before, [*summary.taken.values()]) == (SAMPLES, 0, [8, 10])
+    assert summary.digest == st.digest(whole)
+    assert st.verify(out) == []
+    assert [st.open_store(part).finished() for part in parts] == ([0, 0] if move else [8, 10])
+    assert merge(parts, out, move=move).before == SAMPLES
+    assert run(out).built == 0
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a.zarr", "b.zarr", "m.zarr"]
+
+
+def test_one_of_the_stores_may_get_the_samples(parts: list[Path], whole: Path) -> None:
+    assert merge(parts, parts[1]).digest == st.digest(whole)
+    assert merge(parts[:1], parts[1]).before == SAMPLES
+    with pytest.raises(InputError, match="there is nothing to merge"):
+        merge(parts[:1], parts[0])
+
+
+def test_samples_of_one_shard_in_two_stores_are_joined(tmp_path: Path, parts: list[Path], whole: Path) -> None:
+    lacks = [{1, 2}, {0, 3}]
+    for part, numbers in zip(parts, lacks, strict=True):
+        shutil.rmtree(part)
+        with pytest.raises(bd.BuildFailed):
+            run(part, Session(raises=frozenset(numbers)))
+    summary = merge(parts, tmp_path / "m.zarr", move=True)
+    assert summary.digest == st.digest(whole)
+    assert [*summary.taken.values()] == [16, 2]
+
+
+def test_samples_that_no_store_holds_are_named(tmp_path: Path, parts: list[Path]) -> None:
+    summary = merge(parts[1:], tmp_path / "m.zarr")
+    assert summary.digest is None
+    assert summary.lines()[-1].startswith("samples 0-7 are in none of the stores")
+    assert run(tmp_path / "m.zarr").built == 8
+
+
+@pytest.mark.parametrize(
+    ("changes", "sentence"),
+    [
+        ({"seed": 8}, "seed is 8 here and 7 there"),
+        ({"scene_hash": "abd"}, "scene_hash is 'abd' here and 'abc' there"),
+        ({"versions": {"numpy": "1"}}, r"versions.numpy is '1' here and absent there"),
+        ({"blocks": [20]}, r"blocks is \[20\] here and \[18\] there"),
+    ],
+)
+def test_stores_of_another_dataset_are_refused(
+    tmp_path: Path, parts: list[Path], changes: dict, sentence: str
+) -> None:
+    other = tmp_path / "c.zarr"
+    attributes = {**st.open_store(parts[0]).attributes, **changes}
+    st.create(other, make_spec(attributes=attributes), sum(attributes["blocks"]))
+    with pytest.raises(InputError, match=rf"c\.zarr: holds another dataset than .*a\.zarr: {sentence}"):
+        merge([*parts, other], tmp_path / "m.zarr")
+    assert not (tmp_path / "m.zarr").exists()
+
+
+def test_a_sample_that_differs_between_stores_is_refused(tmp_path: Path, parts: list[Path]) -> None:
+    merge(parts[:1], parts[1])
+    remake(parts[1], 5, tries=3)
+    before = [st.digest(part) for part in parts]
+    with pytest.raises(InputError, match=r"b\.zarr: sample 5 differs from that in .*a\.zarr in scalars"):
+        merge(parts, tmp_path / "m.zarr")
+    assert not (tmp_path / "m.zarr").exists()
+    assert [st.digest(part) for part in parts] == before
+
+
+def test_a_damaged_sample_is_taken_from_another_store_or_reported(
+    tmp_path: Path, parts: list[Path], whole: Path
+) -> None:
+    out = tmp_path / "m.zarr"
+    file = st.open_store(parts[0]).file("image", 1)
+    data = bytearray(file.read_bytes())
+    data[40] ^= 1
+    file.write_bytes(bytes(data))
+    with pytest.raises(VbnfaultError, match=r"1 samples \(4\) are damaged in every .*a\.zarr: sample 4: im"):
+        merge(parts, out, move=True)
+    assert [i for i, done in st.open_store(parts[0]).done(1).items() if done] == [4, 5, 6, 7]  # nothing is lost
+    sound = tmp_path / "c.zarr"
+    run(sound, shard_range=range(1, 2))
+    assert merge([*parts, sound], out, move=True).digest == st.digest(whole)
+
+
+def test_versions_of_samples_are_joined(tmp_path: Path, parts: list[Path]) -> None:
+    for part, entries in zip(
+        parts,
+        ([{"versions": {"v": "2"}, "samples": [[2, 9]]}], [{"versions": {"v": "2"}, "samples": [[16, 17]]}]),
+        strict=True,
+    ):
+        st.open_store(part, "r+").update_attributes({"versions_of_samples": entries})
+    merge(parts, tmp_path / "m.zarr")
+    made = st.open_store(tmp_path / "m.zarr").attributes["versions_of_samples"]
+    assert made == [{"versions": {"v": "2"}, "samples": [[2, 7], [16, 17]]}]
+
+
+@pytest.mark.parametrize("move", [False, True])
+def test_a_killed_merge_is_resumed(tmp_path: Path, parts: list[Path], whole: Path, move: bool) -> None:
+    out = tmp_path / "m.zarr"
+    rng = np.random.default_rng(5)
+    ended = []
+    for _ in range(4):
+        step = victim.step("write", count=int(rng.integers(20, 900)), torn=True)
+
+        def disturbed(step: dict = step) -> str | None:
+            victim.follow([step])
+            return merge(parts, out, move=move).digest
+
+        ended.append(forked(disturbed)[0])
+        held = [st.open_store(path).finished() for path in (*parts, *([out] if st.is_store(out) else []))]
+        assert sum(held) >= SAMPLES
+    assert -9 in ended
+    assert merge(parts, out, move=move).digest == st.digest(whole)
+    assert not [*out.rglob("*.partial"), *tmp_path.glob(".*")]
+
+
+# --- processor cores --------------------------------------------------------------------------------------
+
+
+def test_threads_follow_affinity_and_quota(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(environment, "_quota_of_cores", lambda: np.inf)
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {3, 5, 7}, raising=False)
+    assert environment.usable_cores() == 3
+    monkeypatch.setattr(environment, "_quota_of_cores", lambda: 1.5)
+    assert environment.usable_cores() == 2
+    monkeypatch.delattr(os, "sched_getaffinity")
+    monkeypatch.setattr(os, "cpu_count", lambda: None)
+    assert environment.usable_cores() == 1
+    monkeypatch.undo()
+    for name, text in {"a/b": "max 100000", "a": "250000 100000", "": "nonsense"}.items():
+        (tmp_path / name).mkdir(parents=True, exist_ok=True)
+        (tmp_path / name / "cpu.max").write_text(text)
+    (tmp_path / "cgroup").write_text("3:cpu:/x\n0::/a/b\n")
+    assert environment._quota_of_cores(tmp_path, tmp_path / "cgroup") == 2.5
+    assert environment._quota_of_cores(tmp_path, tmp_path / "none") == np.inf
+
+
+def test_the_command_merges(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, parts: list[Path]) -> None:
+    monkeypatch.setattr("vbnfault.dataset.card.write_card", lambda path: [path])
+    shown = CliRunner().invoke(cli.app, ["merge", *map(str, parts), "--out", str(tmp_path / "m"), "--move"])
+    assert shown.exit_code == 0
+    assert re.search(r"18 of 18 samples, 0 of them merged before\n8 samples moved .*\n.*\ndigest ", shown.output)
