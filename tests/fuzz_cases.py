@@ -253,6 +253,7 @@ def case_options(seeds: Seeds, rng: random.Random, here: Path) -> Case:
         "export": ["export", str(seeds.store), "--format", "coco", "--out", out],
         "merge": ["merge", str(seeds.store), "--out", out + "m.zarr"],
         "preview": ["preview", str(seeds.store), "--out", out + ".png"],
+        "report": ["report", str(seeds.store), "--out", out + ".html"],
         "lens": ["lens", "tessar_50_f2p8", "--out", out + ".png"],
         "flare": [
             "flare",
@@ -286,6 +287,7 @@ def case_options(seeds: Seeds, rng: random.Random, here: Path) -> Case:
             "--shard-range",
         ],
         "preview": ["--samples", "--out"],
+        "report": ["--samples", "--pixels", "--out"],
         "export": ["--format", "--out", "--workers"],
         "merge": ["--out", "--move"],
         "lens": ["--vary-seed", "--spread", "--json", "--toml", "--out"],
@@ -354,9 +356,10 @@ def case_store(seeds: Seeds, rng: random.Random, here: Path) -> Case:
             path.write_bytes(flipped(path.read_bytes(), rng))
         files = [p for p in files if p.is_file()]
         described = [p for p in described if p.is_file()]
-    command = rng.choice(("verify", "verify", "preview", "digest", "stats", "export"))
+    command = rng.choice(("verify", "verify", "preview", "digest", "stats", "export", "report"))
     more = {
         "preview": ["--out", str(here / "sheet.png")],
+        "report": ["--out", str(here / "report.html")],
         "export": ["--out", str(here / "export"), "--format", "yolo"],
     }
     return [command, str(store), *more.get(command, [])], {}

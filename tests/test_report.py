@@ -1,106 +1,287 @@
-"""The contact sheet shows every chosen sample, its masks in their colours, and says what it cannot do."""
+"""The report of a dataset: what it says of a store, which stores it takes, and its page in a real browser."""
 
 from __future__ import annotations
 
+import re
+import shutil
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
-from conftest import ALL_FAULTS
-from synthetic import FAULTS, fake_sample, make_spec
+from browser import WHY_NOT, found, opened
+from synthetic import FAULTS, fake_sample, filled, flip, make_spec
 
 from vbnfault import store as st
 from vbnfault.core.errors import InputError
-from vbnfault.output import contact_sheet
+from vbnfault.core.html_page import Page, Section, embedded_json
+from vbnfault.core.images import indexed_png
+from vbnfault.output.report import Limits, write_report
+from vbnfault.output.report.charts import Histogram, boxes, number, ticks
+from vbnfault.output.report.gallery import parameter_table, pick
+from vbnfault.output.report.measure import Drawn, key_bounds, read_drawn, read_pixels, read_scalars
 
 
 @pytest.fixture(scope="module")
-def store(tmp_path_factory: pytest.TempPathFactory) -> st.Store:
-    """7 samples, the third unfinished."""
-    store = st.create(tmp_path_factory.mktemp("report") / "s.zarr", make_spec(64), 7)
-    st.write_samples(store, [fake_sample(store.spec, i) for i in range(7) if i != 2])
-    return store
+def page(described_store: Path, tmp_path_factory: pytest.TempPathFactory) -> str:
+    """The report of a store of a real scene."""
+    out = tmp_path_factory.mktemp("report") / "r.html"
+    assert write_report(described_store, out) == out
+    return out.read_text(encoding="utf-8")
 
 
-def near(image: np.ndarray, colour: tuple[int, int, int], within: int = 2) -> int:
-    """How many pixels of an RGB image are of this colour, each channel `within` some DN."""
-    return int((np.abs(image.astype(int) - colour).max(-1) <= within).sum())
+def test_the_page_needs_no_other_file_and_holds_every_section(page: str) -> None:
+    assert not re.search(r'(?:src|href)="(?!data:|#)', page)
+    assert not re.search(r"url\((?!data:)|@import|https?://", page)
+    names = re.findall(r'<section id="(\w+)">', page)
+    assert names == ["gallery", "balance", "together", "sun", "view", "parameters", "exposure", "areas", "about"]
+    assert page.count('class="card"') == 6
+    assert page.count("<svg") == page.count("</svg>") > 20
+    text = re.sub(r"data:[^\"]*", "", page)
+    assert "NaN" not in text
+    assert ">nan" not in text
 
 
-def test_the_sheet_has_a_tile_for_each_finished_sample(store: st.Store, tmp_path: Path) -> None:
-    assert contact_sheet.preview(store.path, tmp_path / "all.png") == 6
-    assert contact_sheet.preview(store.path, tmp_path / "few.png", max_samples=4) == 4
-    big, small = (cv2.imread(str(tmp_path / n))[..., ::-1] for n in ("all.png", "few.png"))
-    assert big.shape[0] * big.shape[1] > small.shape[0] * small.shape[1]
-    assert len(np.unique(big.reshape(-1, 3), axis=0)) > 100
+def test_planned_and_realised_numbers_are_those_of_the_store(page: str, described_store: Path) -> None:
+    data = st.open_store(described_store)
+    injected, split = data.read("injected").astype(bool), data.read("split")
+    for k, fault in enumerate(FAULTS):
+        for name in sorted(set(split)):
+            count, of = int(injected[split == name, k].sum()), int((split == name).sum())
+            words = f"{fault.replace('_', ' ')}, {name}: {count} of {of} samples, {count} planned"
+            assert f"<title>{words}</title>" in page
 
 
-def test_masks_can_be_left_out(store: st.Store, tmp_path: Path) -> None:
-    contact_sheet.preview(store, tmp_path / "with.png")
-    contact_sheet.preview(store, tmp_path / "without.png", masks=False)
-    sheets = [cv2.imread(str(tmp_path / n))[..., ::-1] for n in ("with.png", "without.png")]
-    for k in range(3):  # outlines, antialiased, come on top of the legend and the captions
-        with_masks, without = (near(sheet, contact_sheet.COLOURS[k], within=60) for sheet in sheets)
-        assert with_masks > without + 100
+def test_what_is_measured_is_what_the_layers_hold(described_store: Path) -> None:
+    data = st.open_store(described_store)
+    scalars = read_scalars(data)
+    pixels = read_pixels(data, scalars, 4)
+    assert pixels.positions.tolist() == [0, 2, 3, 5]
+    for k, i in enumerate(pixels.positions):
+        image, mask = data.read("image", i, i + 1)[0], data.read("mask", i, i + 1)[0]
+        assert pixels.saturated["image"][k] == np.mean((image[..., :3] == 255).any(axis=2))
+        assert pixels.mean_dn["image"][k] == pytest.approx(image[..., 3].mean())
+        np.testing.assert_allclose(pixels.areas["mask"][k], mask.reshape(len(FAULTS), -1).mean(axis=1))
+    drawn, read = read_drawn(data, scalars)
+    assert read == 6
+    counts = data.read("injected").astype(bool).sum(axis=0)
+    assert {d.fault: len(d.values) for d in drawn} == {f: 2 * n for f, n in zip(FAULTS, counts, strict=True) if n}
 
 
-def test_overlay_colours_the_mask_and_nothing_else() -> None:
-    rgb = np.full((60, 80, 3), 100, np.uint8)
-    mask = np.zeros((4, 60, 80), bool)
-    mask[1, 20:40, 30:50] = True
-    mask[2, :5] = True
-    out = contact_sheet.overlay(rgb, mask, [False, True, False, False])
-    inside = 100 * 0.7 + np.array(contact_sheet.COLOURS[1]) * 0.3
-    assert np.abs(out[30, 40] - inside).max() <= 1  # truncation to uint8
-    far = np.ones((60, 80), bool)
-    far[18:42, 28:52] = False  # a pixel's width of outline, antialiased
-    np.testing.assert_array_equal(out[far], rgb[far])
-    assert (rgb == 100).all()
+def test_directions_of_the_sun_follow_from_azimuth_elevation_and_attitude(tmp_path: Path) -> None:
+    # a level frame that is T, a camera that is T turned by 90 degrees about z: the Sun in T is (0.6, 0, -0.8)
+    spec = make_spec()
+    store = st.create(tmp_path / "s.zarr", spec, 1)
+    sample = fake_sample(spec, 0)
+    half = np.sqrt(0.5)
+    turned = {"sun_direction_T": (0.6, 0, -0.8), "T_from_L": np.eye(3), "camera_from_T": (half, 0, 0, half)}
+    sample.scalars.update(turned)
+    st.write_samples(store, [sample])
+    scalars = read_scalars(store)
+    np.testing.assert_allclose(scalars.sun_L[0], (0.6, 0, -0.8), atol=1e-12)
+    np.testing.assert_allclose(scalars.sun_C[0], (0, 0.6, -0.8), atol=1e-12)
 
 
-def test_a_mask_over_the_whole_frame_is_a_border() -> None:
-    rgb = np.full((60, 80, 3), 100, np.uint8)
-    out = contact_sheet.overlay(rgb, np.ones((4, 60, 80), bool), [False, False, False, True])
-    np.testing.assert_array_equal(out[10:50, 10:70], 100)
-    assert near(out, contact_sheet.COLOURS[3]) > 200
+# --- stores of every kind -----------------------------------------------------------------------------------
 
 
-def test_a_class_that_marks_whole_images_is_a_border_however_much_its_mask_covers() -> None:
-    rgb = np.full((60, 80, 3), 100, np.uint8)
-    mask = np.zeros((1, 60, 80), bool)
-    mask[0, ::2] = True
-    out = contact_sheet.overlay(rgb, mask, [True], localised=[False])
-    np.testing.assert_array_equal(out[10:50, 10:70], 100)
-    assert near(out, contact_sheet.COLOURS[0]) > 200
+def test_an_unfinished_store_is_reported_as_far_as_it_is(tmp_path: Path) -> None:
+    store = st.create(tmp_path / "s.zarr", make_spec(), 40)
+    with pytest.raises(InputError, match="no sample is finished yet"):
+        write_report(store, tmp_path / "r.html")
+    st.write_samples(store, [fake_sample(store.spec, i) for i in (3, 9)])
+    text = write_report(store, tmp_path / "r.html").read_text()
+    assert "2 of 40 finished" in text
+    assert text.count('class="card"') == 2
 
 
-def test_a_lone_broken_pixel_survives_shrinking() -> None:
-    mask = np.zeros((1024, 1024), bool)
-    mask[517, 301] = True
-    small = contact_sheet._resized_mask(mask, (320, 320))
-    assert 1 <= small.sum() <= 4
-    assert small[161:163, 93:96].any()
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"layers": ()},  # no effects, no depth
+        {"faults": (), "mask_any_faults": (), "layers": ()},
+        {"faults": (*FAULTS, "of_a_plug_in"), "layers": ()},
+        {"size": 300, "layers": ()},  # not small enough for PNG
+    ],
+)
+def test_stores_of_every_kind_have_a_report(changes: dict[str, Any], tmp_path: Path) -> None:
+    if "of_a_plug_in" in changes.get("faults", ()):
+        store = st.create(tmp_path / "s.zarr", make_spec(**changes), 1)
+        sample = fake_sample(make_spec(layers=()), 0)
+        mask = np.concatenate([sample.layers["mask"], sample.layers["mask"][:1]])
+        sample.layers["mask"] = mask
+        sample.scalars["injected"] = np.array([True] * 5)
+        sample.scalars["parameters"] = {"of_a_plug_in": {"depth": [{"x": 1.5}, {"x": 2}], "on": True, "who": "<b>"}}
+        st.write_samples(store, [sample])
+    elif changes.get("faults") == ():
+        store = st.create(tmp_path / "s.zarr", make_spec(**changes), 1)
+        sample = fake_sample(make_spec(layers=()), 0)
+        sample.layers.update(mask=np.zeros((0, 24, 32), bool), mask_any=np.zeros((24, 32), bool))
+        sample.scalars.update(injected=np.zeros(0, bool), parameters={})
+        st.write_samples(store, [sample])
+    else:
+        store = filled(tmp_path / "s.zarr", 1, **changes)
+    text = write_report(store, tmp_path / "r.html").read_text()
+    assert text.count('class="card"') == 1
+    assert "Effects" not in text
+    assert ("image/webp" in text) == ("size" in changes)
+    assert ("&lt;b&gt;" in text) == ("of_a_plug_in" in changes.get("faults", ()))
 
 
-def test_abbreviations_are_short_and_distinct() -> None:
-    short = contact_sheet.abbreviations((*ALL_FAULTS, "dark_offset"))
-    assert short["dust_on_optics"] == "DO"
-    assert short["straylight"] == "St"
-    assert len(set(short.values())) == 7
-    assert max(map(len, short.values())) <= 4
-    assert list(contact_sheet.abbreviations(FAULTS)) == list(FAULTS)
+def test_damaged_samples_are_counted_and_left_out(whole: st.Store, tmp_path: Path) -> None:
+    flip(whole.file("stratum", 0), 12)
+    shutil.rmtree(whole.path / "image" / "c" / "1")
+    text = write_report(whole, tmp_path / "r.html").read_text()
+    assert "4 finished samples whose scalars cannot be read and 4 whose pixels cannot be read" in text
+    assert text.count('class="card"') == 2
 
 
-def test_what_cannot_be_shown_is_one_sentence(store: st.Store, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="no such store"):
-        contact_sheet.preview(tmp_path / "none", tmp_path / "a.png")
-    empty = st.create(tmp_path / "empty.zarr", make_spec(), 3)
-    with pytest.raises(InputError, match="no sample is finished"):
-        contact_sheet.preview(empty, tmp_path / "a.png")
-    with pytest.raises(InputError, match=r"a.png: cannot be written: No such file or directory"):
-        contact_sheet.preview(store, tmp_path / "folder" / "a.png")
-    with pytest.raises(InputError, match=r"must end in .png"):
-        contact_sheet.preview(store, tmp_path / "a.jpg")
-    with pytest.raises(InputError, match="must be at least 1"):
-        contact_sheet.preview(store, tmp_path / "a.png", max_samples=0)
+def test_a_large_store_is_sampled_and_the_page_says_so(described_store: Path, tmp_path: Path) -> None:
+    text = write_report(described_store, tmp_path / "r.html", Limits(gallery=3, pixels=2)).read_text()
+    assert "3 of 6 finished samples" in text
+    assert "of 2 samples, evenly spaced" in text
+
+
+def test_the_gallery_has_every_class_of_every_split_where_there_is_room(tmp_path: Path) -> None:
+    scalars = read_scalars(filled(tmp_path / "s.zarr", 30, layers=()))
+    for most in (1, 5, 24, 30, 99):
+        chosen = pick(scalars, most)
+        assert chosen == sorted(set(chosen))
+        assert len(chosen) == min(most, 30)
+    chosen = np.array(pick(scalars, 18))
+    for k in range(len(FAULTS)):
+        for split in range(3):
+            inside = scalars.split == split
+            assert (
+                scalars.injected[chosen][scalars.split[chosen] == split, k].any()
+                == scalars.injected[inside, k].any()
+            )
+
+
+def test_files_that_are_no_page_are_refused(finished_store: Path, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"must end in \.html"):
+        write_report(finished_store, tmp_path / "r.pdf")
+    with pytest.raises(InputError, match="cannot be written"):
+        write_report(finished_store, tmp_path / "no" / "r.html")
+    assert list(tmp_path.iterdir()) == []
+
+
+# --- parts --------------------------------------------------------------------------------------------------
+
+
+def test_a_mask_of_two_bits_a_pixel_is_read_back() -> None:
+    values = np.random.default_rng(1).integers(0, 3, (7, 9)).astype(np.uint8)
+    palette = ((0, 0, 0, 0), (240, 228, 66, 77), (240, 228, 66, 235))
+    decoded = cv2.imdecode(np.frombuffer(indexed_png(values, palette), np.uint8), cv2.IMREAD_UNCHANGED)
+    np.testing.assert_array_equal(decoded[..., [2, 1, 0, 3]], np.array(palette)[values])
+
+
+def test_bounds_belong_to_the_key_of_the_parameter() -> None:
+    bounds = {"straylight": {"radius": (0.05, 0.3), "glare_radius": (0.2, 0.45), "index": (1.0, 10.0)}}
+
+    def of(name: str) -> tuple[float, float] | None:
+        return key_bounds(bounds, Drawn(fault="straylight", name=name, values=np.zeros(0), split=np.zeros(0, int)))
+
+    assert of("flares.radius") == (0.05, 0.3)
+    assert of("glare.radius") == (0.2, 0.45)
+    assert of("glare.index") is None
+    assert of("index") == (1.0, 10.0)
+    assert of("nothing") is None
+
+
+def test_a_histogram_holds_every_value_once() -> None:
+    values = np.array([0, 1, 1, 2, 10.0])
+    text = Histogram(title="x", unit="s", groups=[("all", values)], bounds=[("", (0, 10))], limits=(0, 10)).markup()
+    heights = [float(v) for v in re.findall(r"V([\d.]+)H", text.split("<title>all")[0].rpartition("<path")[2])]
+    base = 118.0 + 14 - 24
+    risen = [(base - h) / (base - 14) for h in heights]
+    assert sum(risen) == pytest.approx(5 / 2, abs=0.02)  # the highest bin, of two values, has the full height
+    assert "bounds  0 to 10" in text
+
+
+def test_zeros_of_a_logarithmic_histogram_have_a_bar_of_their_own() -> None:
+    text = Histogram(title="x", unit="", groups=[("all", np.array([0, 0, 0, 0.1]))], logarithmic=True).markup()
+    bar = re.search(r'<rect x="10.0" y="([\d.]+)" width="6" height="([\d.]+)"', text)
+    assert bar
+    assert float(bar[2]) == 118 + 14 - 24 - 14  # three quarters is the highest
+
+
+def test_boxes_show_the_quantiles_on_a_logarithmic_axis() -> None:
+    text = boxes([("dust", "red", [("train", np.logspace(-4, 0, 101))])], 1e-4)
+    left, room = 170.0, 760 - 170 - 60.0
+    median = re.search(r'class="median" d="M([\d.]+)', text)
+    assert median
+    assert float(median[1]) == pytest.approx(left + room / 2, abs=0.1)
+
+
+def test_numbers_and_ticks_are_short() -> None:
+    assert [number(v) for v in (0, -1.5, 1e-6, 2.5e8)] == ["0", "−1.5", "10⁻⁶", "2.5·10⁸"]
+    assert ticks(0, 360) == [0, 100, 200, 300]
+    assert ticks(3, 3) == [3]
+
+
+def test_long_lists_are_shortened() -> None:
+    text = parameter_table({"x": list(range(50)), "flares": [{"r": 0.25}, {"r": 1}], "none": [], "off": None})
+    assert "50 values, 0 to 49" in text
+    assert "flares (2)" in text
+    assert parameter_table("damaged") == "<p>no parameters</p>"
+
+
+def test_text_cannot_end_a_script_or_an_element() -> None:
+    assert "</" not in embedded_json({"a": "</script>"})
+    page = Page(title="<x>", description="", facts={"a": "", "b": "&"}, sections=[Section("s", "<h>", "<p>")])
+    assert "<title>&lt;x&gt;</title>" in page.markup()
+    assert "<dt>a" not in page.markup()
+
+
+# --- in a browser -------------------------------------------------------------------------------------------
+
+
+@pytest.mark.skipif(found() is None, reason=WHY_NOT)
+def test_the_page_in_a_browser(described_store: Path, tmp_path: Path) -> None:
+    url = write_report(described_store, tmp_path / "r.html").as_uri()
+    with opened() as page:
+        page.look(1366, 768)
+        page.goto(url)
+        shown = "[...document.querySelectorAll('.mask')].filter((m) => m.checkVisibility()).length"
+        before = page.evaluate(shown)
+        own = page.evaluate("document.querySelectorAll('.gallery .mask[data-fault=\"0\"]').length")
+        assert own > 0
+        page.click('.tools .toggle[data-fault="0"]')
+        assert page.evaluate(shown) == before - own
+        page.press("1")  # the same by a key
+        assert page.evaluate(shown) == before
+
+        clean = "getComputedStyle(document.querySelector('.clean')).visibility"
+        assert page.evaluate(clean) == "hidden"
+        page.press("c")
+        assert page.evaluate(clean) == "visible"
+
+        page.click(".open", 2)
+        page.wait("document.querySelector('dialog h3').textContent === 'Sample 2'")
+        page.click('dialog [data-step="1"]')
+        page.wait("document.querySelector('dialog h3').textContent === 'Sample 3'")
+        page.press("ArrowLeft")
+        page.wait("document.querySelector('dialog h3').textContent === 'Sample 2'")
+        page.press("Escape")
+        page.wait("!document.querySelector('dialog').open")
+        assert page.evaluate("document.activeElement.ariaLabel").startswith("Open sample 2")
+
+        page.evaluate("document.getElementById('g-class').value = '0'")
+        page.evaluate("document.getElementById('g-class').dispatchEvent(new Event('change'))")
+        visible = page.evaluate("[...document.querySelectorAll('.card')].filter((c) => c.checkVisibility()).length")
+        injected = st.open_store(described_store).read("injected").astype(bool)
+        assert visible == injected[:, 0].sum()
+
+        dots = "document.querySelector('.graticule.near').getAttribute('d')"
+        drawn = page.evaluate(dots)
+        page.evaluate("document.querySelector('.sphere').focus()")
+        page.press("ArrowRight")
+        assert page.evaluate(dots) != drawn
+        wide = "document.documentElement.scrollWidth <= innerWidth"
+        for width in (1920, 1366, 390):
+            page.look(width, 768)
+            assert page.evaluate(wide), width
+        assert page.errors == []
+        assert [u for u in page.requests if not u.startswith(("data:", "file:"))] == []

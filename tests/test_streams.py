@@ -35,6 +35,7 @@ COMMANDS = {
     "card": "{}/s.zarr",
     "merge": "{}/s.zarr --out {}/m.zarr",
     "stats": "{}/s.zarr",
+    "report": "{}/s.zarr --out {}/r.html",
     "shape": "67P --url http://localhost/s.obj --out {}",  # the file lies there already
 }
 # they end with the test render, a sample's files, an evaluated study or levels, and print through the same calls

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from .lens import Prescription, load_lens
     from .output.export import export_store as export
     from .output.flare_images import Flare, trace_flare
+    from .output.report import write_report as report
     from .pipeline import Session, simulate
     from .reflectance import DiscReflectance, Reflectance
     from .scene.config import Scene, load_scene
@@ -65,6 +66,7 @@ _HOMES = {
     "number": "faults",
     "open_dataset": "store",
     "path": "faults",
+    "report": "output.report:write_report",
     "rows": "faults",
     "simulate": "pipeline",
     "statistics": "dataset.statistics",
@@ -104,6 +106,7 @@ __all__ = [
     "number",
     "open_dataset",
     "path",
+    "report",
     "rows",
     "simulate",
     "statistics",

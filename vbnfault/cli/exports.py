@@ -54,3 +54,16 @@ def card(store: StoreArgument) -> None:
 
     for path in write_card(store):
         typer.echo(str(path))
+
+
+@app.command(rich_help_panel=_PANEL)
+def report(
+    store: StoreArgument,
+    out: Annotated[Path, typer.Option(help="Page to write; its name ends in .html.")],
+    samples: Annotated[int, whole(1, 200, "Largest number of samples in the gallery.")] = 36,
+    pixels: Annotated[int, whole(1, 1_000_000, "Largest number of samples whose pixels are read.")] = 400,
+) -> None:
+    """Write a report of a store as one page: a gallery, and what was planned, drawn and realised, by split."""
+    from ..output.report import Limits, write_report
+
+    typer.echo(str(write_report(store, out, Limits(gallery=samples, pixels=pixels))))

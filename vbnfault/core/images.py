@@ -6,7 +6,8 @@ Arrays have their channels in the order R, G, B, alpha.
 from __future__ import annotations
 
 import struct
-from collections.abc import Mapping
+import zlib
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -89,6 +90,49 @@ def write_png(path: Path, image: NDArray[Any], *, smallest: bool = False) -> Pat
         raise VbnfaultError(f"{path}: the image cannot be encoded as PNG")
     path.write_bytes(data.tobytes())
     return path
+
+
+def indexed_png(values: NDArray[np.uint8], palette: Sequence[tuple[int, int, int, int]]) -> bytes:
+    """Return a PNG file of two bits a pixel: small masks of up to four colours.
+
+    Parameters
+    ----------
+    values
+        Number of the colour of each pixel, 0 to 3, [y, x].
+    palette
+        Up to four colours as R, G, B, opacity, 0 to 255.
+    """
+    height, width = values.shape
+    padded = np.zeros((height, -(-width // 4) * 4), np.uint8)
+    padded[:, :width] = values
+    four = padded.reshape(height, -1, 4)
+    packed = four[..., 0] << 6 | four[..., 1] << 4 | four[..., 2] << 2 | four[..., 3]
+    lines = np.pad(packed, ((0, 0), (1, 0)))  # a line begins with the number of its filter, 0 for none
+    chunks = {
+        b"IHDR": struct.pack(">IIBBBBB", width, height, 2, 3, 0, 0, 0),
+        b"PLTE": bytes(value for colour in palette for value in colour[:3]),
+        b"tRNS": bytes(colour[3] for colour in palette),
+        b"IDAT": zlib.compress(lines.tobytes(), 9),
+        b"IEND": b"",
+    }
+    parts = [
+        struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+        for kind, data in chunks.items()
+    ]
+    return b"".join([_PNG, *parts])
+
+
+def encoded(rgb: NDArray[np.uint8], ending: str, quality: int = 0) -> bytes:
+    """Return an RGB image [y, x, 3] as the content of a file of the kind `ending`: `.png`, `.webp` or `.jpg`.
+
+    `quality`: 1 to 100 of a lossy kind. Raises VbnfaultError if OpenCV cannot encode it.
+    """
+    lossy = {".webp": cv2.IMWRITE_WEBP_QUALITY, ".jpg": cv2.IMWRITE_JPEG_QUALITY}
+    options = [lossy[ending], quality] if ending in lossy else [cv2.IMWRITE_PNG_COMPRESSION, 4]
+    done, data = cv2.imencode(ending, np.ascontiguousarray(_swapped(rgb)), options)
+    if not done:
+        raise VbnfaultError(f"the image cannot be encoded as {ending}")
+    return bytes(data.tobytes())
 
 
 def write_exr(path: Path, channels: Mapping[str, NDArray[Any]]) -> Path:

@@ -159,10 +159,10 @@ def _tile(store: Store, index: int, short: Mapping[str, str], masks: bool) -> U8
     scale = _TILE_PX / max(spec.height, spec.width)
     size = (max(1, round(spec.width * scale)), max(1, round(spec.height * scale)))
     # a shrunk mask is True where any of its pixels is, so that a single broken pixel stays visible
-    rgb = _resized(read("image")[..., :3], size)
+    rgb = resized(read("image")[..., :3], size)
     injected = read("injected").astype(bool)
     if masks:
-        small = np.stack([_resized_mask(m, size) for m in read("mask")])
+        small = np.stack([resized_mask(m, size) for m in read("mask")])
         localised = [fault in (spec.localised_faults or ()) for fault in spec.faults]
         rgb = overlay(rgb, small, injected.tolist(), localised)
     tile = np.full((size[1] + _CAPTION_PX, size[0], 3), _PANEL, np.uint8)
@@ -183,14 +183,14 @@ def _tile(store: Store, index: int, short: Mapping[str, str], masks: bool) -> U8
     return tile
 
 
-def _resized(image: U8, size: tuple[int, int]) -> U8:
+def resized(image: U8, size: tuple[int, int]) -> U8:
     """Return an image at a size (width, height): shrunk by averaging, enlarged without interpolation."""
     shrinks = size[0] <= image.shape[1]
     how = cv2.INTER_AREA if shrinks else cv2.INTER_NEAREST
     return np.asarray(cv2.resize(np.ascontiguousarray(image), size, interpolation=how), dtype=np.uint8)
 
 
-def _resized_mask(mask: NDArray[np.bool_], size: tuple[int, int]) -> NDArray[np.bool_]:
+def resized_mask(mask: NDArray[np.bool_], size: tuple[int, int]) -> NDArray[np.bool_]:
     """Return a mask at a size (width, height); a new pixel is True if any mask pixel inside it is."""
     if size[0] > mask.shape[1]:
         return cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST).astype(bool)

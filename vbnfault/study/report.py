@@ -6,12 +6,10 @@ in its folder, with the images that `extreme_images` has made before.
 
 from __future__ import annotations
 
-import base64
-import html
 import json
 import os
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
@@ -20,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 import cv2
 import numpy as np
 
+from ..core.html_page import Page, Section, data_url, escaped, grouped_digits, html_table, with_minus
 from . import sheets
 from .extreme_images import IMAGES
 from .plots import drawings, save
@@ -98,11 +97,8 @@ def write_report(
                 drawing.kind, drawing.metric, drawing.note, float(size[0]), svg.read_text(encoding="utf-8"), png
             )
         )
-    page = _page(results, _within_budget(figures), folder / IMAGES)
     path = folder / PAGE
-    temporary = path.with_name(f".{PAGE}.{os.getpid()}.partial")
-    temporary.write_text(page, encoding="utf-8")
-    temporary.replace(path)
+    _page(results, _within_budget(figures), folder / IMAGES).write(path)
     return path
 
 
@@ -126,13 +122,13 @@ class _Figure:
         least = 0.0 if self.width_pt <= _NARROW_PT else _LEAST_SCALE * self.width_pt
         words = SECTIONS[self.kind].title + (f": {self.metric}" if self.metric else "")
         if self.as_png:
-            data = base64.b64encode(self.png.read_bytes()).decode()
+            source = data_url(self.png.read_bytes(), "image/png")
             style = f"width:{self.width_pt:.0f}pt;min-width:{least:.0f}pt"
-            drawn = f'<img alt="{html.escape(words)}" style="{style}" src="data:image/png;base64,{data}">'
+            drawn = f'<img alt="{escaped(words)}" style="{style}" src="{source}">'
         else:
             drawn = inline_svg(self.svg, f"{self.kind}-{self.metric}", words)
             drawn = drawn.replace("<svg", f'<svg style="min-width:{least:.0f}pt"', 1)
-        note = f"<figcaption>{html.escape(self.note)}</figcaption>" if self.note else ""
+        note = f"<figcaption>{escaped(self.note)}</figcaption>" if self.note else ""
         return f'<figure class="drawing"><div class="scroll">{drawn}</div>{note}</figure>'
 
 
@@ -158,7 +154,7 @@ def inline_svg(text: str, prefix: str, label: str) -> str:
         text = text.replace(f": {colour}", f": var(--{name})")
     text = re.sub(r"base64,[^\"]*", lambda match: re.sub(r"\s", "", match[0]), text)
     text = re.sub(r"<defs>\s*</defs>", "", re.sub(r"\s+", " ", text))
-    return text.replace("<svg", f'<svg role="img" aria-label="{html.escape(label)}"', 1).strip()
+    return text.replace("<svg", f'<svg role="img" aria-label="{escaped(label)}"', 1).strip()
 
 
 def _within_budget(figures: Sequence[_Figure]) -> list[_Figure]:
@@ -193,13 +189,16 @@ def _images(results: StudyResults, folder: Path) -> str:
         ends = ((extremes.best, extremes.best_row), (extremes.worst, extremes.worst_row))
         for name, path, (value, row) in zip(("best", "worst"), paths, ends, strict=True):
             where = _where(results, row)
-            source = base64.b64encode(data[path]).decode()
+            source = data_url(data[path], "image/png")
             coarse = ' class="coarse"' if _width(data[path]) < _COARSE_PX else ""
             items.append(
-                f'<div><img{coarse} alt="{name} image of {_e(metric)}" src="data:image/png;base64,{source}">'
-                f'<span class="small"><b>{name}</b>: {_e(_quantity(value, unit))}<br>{_e(where)}</span></div>'
+                f'<div><img{coarse} alt="{name} image of {escaped(metric)}" src="{source}">'
+                f'<span class="small"><b>{name}</b>: {escaped(_quantity(value, unit))}<br>'
+                f"{escaped(where)}</span></div>"
             )
-        parts.append(f'<figure><h3><code>{_e(metric)}</code></h3><div class="pair">{"".join(items)}</div></figure>')
+        parts.append(
+            f'<figure><h3><code>{escaped(metric)}</code></h3><div class="pair">{"".join(items)}</div></figure>'
+        )
     return f'<div class="figures">{"".join(parts)}</div>' if parts else ""
 
 
@@ -229,17 +228,16 @@ def _where(results: StudyResults, row: int) -> str:
 # ------------------------------------------------------------------------------------ the page
 
 
-def _page(results: StudyResults, figures: Sequence[_Figure], images: Path) -> str:
+def _page(results: StudyResults, figures: Sequence[_Figure], images: Path) -> Page:
     """Return the whole page."""
-    style = resources.files(__package__).joinpath("report.css").read_text(encoding="utf-8")
     only_faults = results.has("fault_quantile") and len(results.factors) == 1
-    parts: list[tuple[str, str, str]] = [] if only_faults else [("summary", "In short", _summary(results))]
+    parts = [] if only_faults else [Section("summary", "In short", _summary(results))]
     for kind, section in SECTIONS.items():
         members = [figure.markup() for figure in figures if figure.kind == kind]
         if members:
             how = f"{section.how(results)} {sample(results, kind)}"
-            body = f'<p class="how">{_e(how)}</p><div class="figures">{"".join(members)}</div>'
-            parts.append((kind, section.title, body + (_ranking(results) if kind == "ranking" else "")))
+            body = f'<p class="how">{escaped(how)}</p><div class="figures">{"".join(members)}</div>'
+            parts.append(Section(kind, section.title, body + (_ranking(results) if kind == "ranking" else "")))
     pictures = _images(results, images)
     if pictures:
         how = (
@@ -248,43 +246,38 @@ def _page(results: StudyResults, figures: Sequence[_Figure], images: Path) -> st
             "with one exposure for both images and one curve of brightness (arcsinh), which shows faint light "
             "beside the Sun: what differs between the two is light, not the display."
         )
-        parts.append(("images", "Best and worst images", f'<p class="how">{_e(how)}</p>{pictures}'))
+        parts.append(Section("images", "Best and worst images", f'<p class="how">{escaped(how)}</p>{pictures}'))
     if not only_faults:
-        parts.append(("tables", "Tables of indices", _index_tables(results)))
+        parts.append(Section("tables", "Tables of indices", _index_tables(results)))
     parts += [
-        ("asked", "What was asked", _asked(results)),
-        ("quality", "What to watch", _quality(results)),
-        ("formulae", "Formulae", _formulae(results)),
-        ("versions", "Time and versions", _provenance(results)),
+        Section("asked", "What was asked", _asked(results)),
+        Section("quality", "What to watch", _quality(results)),
+        Section("formulae", "Formulae", _formulae(results)),
+        Section("versions", "Time and versions", _provenance(results)),
     ]
-    title = str(results.spec.get("title") or results.dataset.attrs.get("title") or "Study")
-    links = "".join(f'<a href="#{name}">{_e(head)}</a>' for name, head, _ in parts)
-    body = "".join(f'<section id="{name}"><h2>{_e(head)}</h2>{content}</section>' for name, head, content in parts)
-    return (
-        '<!DOCTYPE html><html lang="en"><head><meta charset="utf-8">'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        f"<title>{_e(title)}</title><style>{style}</style></head><body><main>"
-        f"<header><h1>{_e(title)}</h1><p>{_e(str(results.spec.get('description') or ''))}</p>"
-        f"{_facts(results)}<nav>{links}</nav></header>{body}</main></body></html>\n"
+    return Page(
+        title=str(results.spec.get("title") or results.dataset.attrs.get("title") or "Study"),
+        description=str(results.spec.get("description") or ""),
+        facts=_facts(results),
+        sections=parts,
+        style=resources.files(__package__).joinpath("report.css").read_text(encoding="utf-8"),
     )
 
 
-def _facts(results: StudyResults) -> str:
+def _facts(results: StudyResults) -> dict[str, str]:
     """Return the numbers that describe the study."""
     design, scene = results.spec["design"], results.spec.get("scene", {})
     failed = int((~results.succeeded).sum())
-    facts = {
+    return {
         "Design": f"{results.method.replace('_', ' ')}, n\N{NO-BREAK SPACE}=\N{NO-BREAK SPACE}{design['n']}",
         "Factors": str(len(results.factors)),
         "Metrics": str(len(results.metrics)),
         "Models": ", ".join(results.models) if len(results.models) > 1 else "one",
         "Scene": Path(str(scene.get("base", ""))).name,
         "Views and seeds": f"{len(np.unique(results.column('view')))} × {len(np.unique(results.column('seed')))}",
-        "Evaluations": f"{results.table.num_rows:,}".replace(",", "\N{NARROW NO-BREAK SPACE}"),
+        "Evaluations": grouped_digits(results.table.num_rows),
         "Failed": str(failed),
     }
-    items = "".join(f"<div><dt>{_e(k)}</dt><dd>{_e(v)}</dd></div>" for k, v in facts.items() if v)
-    return f'<dl class="facts">{items}</dl>'
 
 
 def _summary(results: StudyResults) -> str:
@@ -299,11 +292,15 @@ def _summary(results: StudyResults) -> str:
             mean = float(results.dataset["mean"].sel(metric=metric, model=model))
             deviation = float(np.sqrt(results.dataset["variance"].sel(metric=metric, model=model)))
             about = results.about(metric, "description")
-            name = f'<code>{_e(metric)}</code><br><span class="small about">{_e(about)}</span>' if k == 0 else ""
+            name = (
+                f'<code>{escaped(metric)}</code><br><span class="small about">{escaped(about)}</span>'
+                if k == 0
+                else ""
+            )
             rows.append(
                 [
                     name,
-                    *([_e(model)] if several else []),
+                    *([escaped(model)] if several else []),
                     _leading(results, metric, model),
                     _unbroken(_quantity(mean, unit)),
                     _unbroken(_quantity(deviation, unit)),
@@ -315,7 +312,7 @@ def _summary(results: StudyResults) -> str:
     )
     if results.has_noise_floor:
         words += ", where their interval lies above that of the dummy factor, which acts on nothing"
-    return f"<p>{_e(words)}.</p>{_table(heads, rows, group=len(results.models))}{_model_form(results)}"
+    return f"<p>{escaped(words)}.</p>{html_table(heads, rows, group=len(results.models))}{_model_form(results)}"
 
 
 def _leading(results: StudyResults, metric: str, model: str) -> str:
@@ -326,7 +323,7 @@ def _leading(results: StudyResults, metric: str, model: str) -> str:
         swings = {factor: points.swing(factor).size for factor in results.factors} if points.values.size else {}
         floor = points.chance_swing()
         above = {f: s for f, s in swings.items() if s > max(floor, 0.0)}
-        shown = {f: _e(_quantity(s, results.about(metric, "unit"), 2)) for f, s in above.items()}
+        shown = {f: escaped(_quantity(s, results.about(metric, "unit"), 2)) for f, s in above.items()}
         order = sorted(above, key=lambda f: -above[f])
     else:
         index, bounds = results.index(name, metric, model), results.index(f"{name}_interval", metric, model)
@@ -339,12 +336,13 @@ def _leading(results: StudyResults, metric: str, model: str) -> str:
         unit = results.about(metric, "unit") if name == "mu_star" else ""
         values = {f: float(index.sel(factor=f)) for f in order}
         shown = {
-            f: _e(_quantity(v, unit, 2) if name == "mu_star" else _minus(f"{v:.2f}")) for f, v in values.items()
+            f: escaped(_quantity(v, unit, 2) if name == "mu_star" else with_minus(f"{v:.2f}"))
+            for f, v in values.items()
         }
     if not order:
         constant = float(results.dataset["variance"].sel(metric=metric, model=model)) == 0
         return f'<span class="small">{"constant" if constant else "none"}</span>'
-    named = ", ".join(f"<code>{_e(f)}</code>&nbsp;{shown[f]}" for f in order[:_MOST_LEADING])
+    named = ", ".join(f"<code>{escaped(f)}</code>&nbsp;{shown[f]}" for f in order[:_MOST_LEADING])
     more = len(order) - _MOST_LEADING
     return named + (f" and {more} more" if more > 0 else "")
 
@@ -362,7 +360,7 @@ def _model_form(results: StudyResults) -> str:
         if "model_share_interval" in results.dataset:
             low, high = results.dataset["model_share_interval"].sel(metric=metric, bound=["low", "high"]).values
             interval = f" [{100 * low:.0f}, {100 * high:.0f}]"
-        parts.append(f"<code>{_e(metric)}</code>&nbsp;{100 * share:.0f}{interval}&nbsp;%")
+        parts.append(f"<code>{escaped(metric)}</code>&nbsp;{100 * share:.0f}{interval}&nbsp;%")
     listed = ", ".join(parts)
     return f"<p>The choice of the model causes this part of the variance: {listed}.</p>" if parts else ""
 
@@ -374,16 +372,16 @@ def _ranking(results: StudyResults) -> str:
         unit = results.about(metric, "unit")
         end = "" if unit in ("", "1") else f" / {unit}"
         heads = ["rank", "fault", "views", f"median{end}", f"middle half{end}", _SWAP]
-        rows = [[_e(cell) for cell in row] for row in ranking_rows(results, metric)]
-        about = _e(results.about(metric, "description"))
-        table = _table(heads, rows, numbers=[0, 2, 3, 4, 5])
-        parts.append(f'<h3><code>{_e(metric)}</code></h3><p class="small">{about}</p>{table}')
+        rows = [[escaped(cell) for cell in row] for row in ranking_rows(results, metric)]
+        about = escaped(results.about(metric, "description"))
+        table = html_table(heads, rows, numbers=[0, 2, 3, 4, 5])
+        parts.append(f'<h3><code>{escaped(metric)}</code></h3><p class="small">{about}</p>{table}')
     words = (
         f"Brackets hold the {100 * results.confidence:g} % interval over views. Views: those in which the metric "
         "has a value, of those in which the fault acts. The last column is the fraction of the resamples in which "
         "the median of the next fault is the worse one."
     )
-    return f'<p class="how">{_e(words)}</p>{"".join(parts)}'
+    return f'<p class="how">{escaped(words)}</p>{"".join(parts)}'
 
 
 def _index_tables(results: StudyResults) -> str:
@@ -403,17 +401,17 @@ def _index_tables(results: StudyResults) -> str:
                 heads.append(f"{model}: {head}{end}" if several else f"{head}{end}")
         rows, floors = [], []
         for factor in (*results.ranked(metric), DUMMY):
-            cells = [f"<code>{_e(factor)}</code>"]
+            cells = [f"<code>{escaped(factor)}</code>"]
             for model in results.models:
                 cells += [_index_cell(results, name, metric, model, factor) for name in names]
             rows.append(cells)
             floors.append(factor == DUMMY)
-        table = _table(heads, rows, numbers=range(1, len(heads)), faint=floors)
-        parts.append(f"<h3><code>{_e(metric)}</code></h3>{table}")
+        table = html_table(heads, rows, numbers=range(1, len(heads)), faint=floors)
+        parts.append(f"<h3><code>{escaped(metric)}</code></h3>{table}")
     words = "The last row is the dummy factor."
     if any(f"{name}_interval" in results.dataset for name in names):
         words = f"Brackets hold the {100 * results.confidence:g}\N{NO-BREAK SPACE}% interval. {words}"
-    return f'<p class="how">{_e(words)}</p>{"".join(parts)}'
+    return f'<p class="how">{escaped(words)}</p>{"".join(parts)}'
 
 
 def _index_cell(results: StudyResults, name: str, metric: str, model: str, factor: str) -> str:
@@ -426,7 +424,7 @@ def _index_cell(results: StudyResults, name: str, metric: str, model: str, facto
         return "–"
 
     def text(number: float) -> str:
-        return _minus(f"{number:.3f}" if fraction else f"{number:.3g}")
+        return with_minus(f"{number:.3f}" if fraction else f"{number:.3g}")
 
     if bounds is None:
         return text(value)
@@ -439,28 +437,32 @@ def _asked(results: StudyResults) -> str:
     spec = results.spec
     rows = [
         [
-            f"<code>{_e(entry['key'])}</code>"
-            + (f'<br><span class="small">{_e(entry["description"])}</span>' if entry.get("description") else ""),
-            _e(_distribution(entry)),
-            _e(_unit_words(str(entry.get("unit") or ""))),
+            f"<code>{escaped(entry['key'])}</code>"
+            + (
+                f'<br><span class="small">{escaped(entry["description"])}</span>'
+                if entry.get("description")
+                else ""
+            ),
+            escaped(_distribution(entry)),
+            escaped(_unit_words(str(entry.get("unit") or ""))),
         ]
         for entry in spec.get("factor", ())
     ]
-    factors = _table(["factor", "distribution", "unit"], rows)
+    factors = html_table(["factor", "distribution", "unit"], rows)
     rows = [
         [
-            f"<code>{_e(metric)}</code>",
-            _e(results.about(metric, "description")),
-            _e(_unit_words(results.about(metric, "unit"))),
-            _e(results.about(metric, "source")),
+            f"<code>{escaped(metric)}</code>",
+            escaped(results.about(metric, "description")),
+            escaped(_unit_words(results.about(metric, "unit"))),
+            escaped(results.about(metric, "source")),
         ]
         for metric in results.metrics
     ]
-    metrics = _table(["metric", "meaning", "unit", "source"], rows)
+    metrics = html_table(["metric", "meaning", "unit", "source"], rows)
     others = {name: spec[name] for name in ("design", "scene", "models") if spec.get(name)}
     items = "".join(
-        f"<li>{_e(name)}: "
-        + ", ".join(f"<code>{_e(k)}</code> = {_e(_plain(v))}" for k, v in _flat(entry))
+        f"<li>{escaped(name)}: "
+        + ", ".join(f"<code>{escaped(k)}</code> = {escaped(_plain(v))}" for k, v in _flat(entry))
         + "</li>"
         for name, entry in others.items()
     )
@@ -507,7 +509,7 @@ def _missed(results: StudyResults) -> str:
     n = int(results.spec["design"]["n"])
     needed = 2 ** int(np.ceil(np.log2(n * (missed[0][0] / asked) ** 2)))
     rows = [
-        [f"<code>{_e(metric)}</code>", _e(model), f"<code>{_e(factor)}</code>", f"{width:.3f}"]
+        [f"<code>{escaped(metric)}</code>", escaped(model), f"<code>{escaped(factor)}</code>", f"{width:.3f}"]
         for width, metric, model, factor in missed[:_MOST_ROWS]
     ]
     more = f"<p class='small'>and {len(missed) - _MOST_ROWS} more</p>" if len(missed) > _MOST_ROWS else ""
@@ -515,8 +517,8 @@ def _missed(results: StudyResults) -> str:
         f"{len(missed)} total indices have a half-width above {asked:g}. The widest would need at most about "
         f"n = {needed} in place of n = {n}."
     )
-    table = _table(["metric", "model", "factor", "half-width"], rows, numbers=[3])
-    return f'<div class="warning"><p>{_e(words)}</p></div>{table}{more}'
+    table = html_table(["metric", "model", "factor", "half-width"], rows, numbers=[3])
+    return f'<div class="warning"><p>{escaped(words)}</p></div>{table}{more}'
 
 
 def _left_out(results: StudyResults) -> str:
@@ -525,7 +527,7 @@ def _left_out(results: StudyResults) -> str:
         metric: int((~np.isfinite(np.asarray(results.column(metric), dtype=float)) & results.succeeded).sum())
         for metric in results.metrics
     }
-    named = ", ".join(f"<code>{_e(metric)}</code> ({count})" for metric, count in counts.items() if count)
+    named = ", ".join(f"<code>{escaped(metric)}</code> ({count})" for metric, count in counts.items() if count)
     return f"<p>Metrics that have no value in some successful evaluations: {named}.</p>" if named else ""
 
 
@@ -536,11 +538,12 @@ def _failures(results: StudyResults) -> str:
         return "<p>No evaluation failed.</p>"
     names = ("evaluation", "seed", "view", "model", "role", "error")
     rows = [
-        [_e(_plain(results.table.column(name)[int(row)].as_py())) for name in names] for row in failed[:_MOST_ROWS]
+        [escaped(_plain(results.table.column(name)[int(row)].as_py())) for name in names]
+        for row in failed[:_MOST_ROWS]
     ]
     more = f"<p class='small'>and {failed.size - _MOST_ROWS} more</p>" if failed.size > _MOST_ROWS else ""
     words = f"{failed.size} of {results.table.num_rows} evaluations failed; the indices leave them out."
-    return f'<div class="warning"><p>{_e(words)}</p></div>{_table(names, rows)}{more}'
+    return f'<div class="warning"><p>{escaped(words)}</p></div>{html_table(names, rows)}{more}'
 
 
 def _formulae(results: StudyResults) -> str:
@@ -548,7 +551,9 @@ def _formulae(results: StudyResults) -> str:
     parts = []
     for names, (words, formula) in FORMULAE.items():
         if any(results.has(name) for name in names):
-            parts.append(f'<p>{_e(words)}</p><div class="formula"><math display="block">{formula}</math></div>')
+            parts.append(
+                f'<p>{escaped(words)}</p><div class="formula"><math display="block">{formula}</math></div>'
+            )
     return "".join(parts) or "<p>The figures show conditional means and medians only.</p>"
 
 
@@ -559,13 +564,13 @@ def _provenance(results: StudyResults) -> str:
     if timings:
         total = sum(timings.values()) or 1.0
         rows = [
-            [_e(stage), f"{seconds:.1f}", f"{100 * seconds / total:.0f}"]
+            [escaped(stage), f"{seconds:.1f}", f"{100 * seconds / total:.0f}"]
             for stage, seconds in sorted(timings.items(), key=lambda entry: -entry[1])
         ]
-        table = _table(["stage", "time / s", "fraction / %"], rows, numbers=[1, 2])
+        table = html_table(["stage", "time / s", "fraction / %"], rows, numbers=[1, 2])
         parts.append(f"<p>Time by stage, summed over all processes and all runs of the study.</p>{table}")
     if versions:
-        named = ", ".join(f"{_e(name)}&nbsp;{_e(str(version))}" for name, version in versions.items())
+        named = ", ".join(f"{escaped(name)}&nbsp;{escaped(str(version))}" for name, version in versions.items())
         parts.append(f"<p>Versions: {named}.</p>")
     return "".join(parts) or "<p>Not recorded.</p>"
 
@@ -573,53 +578,9 @@ def _provenance(results: StudyResults) -> str:
 # ------------------------------------------------------------------------------------ small pieces
 
 
-def _e(text: object) -> str:
-    """Return a text with the characters that mean something in HTML escaped."""
-    return html.escape(str(text))
-
-
-def _table(
-    heads: Iterable[str],
-    rows: Sequence[Sequence[str]],
-    *,
-    numbers: Iterable[int] = (),
-    faint: Sequence[bool] = (),
-    group: int = 1,
-) -> str:
-    """Return a table.
-
-    Parameters
-    ----------
-    heads, rows
-        Headings as text, cells as markup.
-    numbers
-        Columns of numbers, which are aligned at the right.
-    faint
-        Rows that are written in a fainter colour.
-    group
-        The first cell of every so many rows spans all of them.
-    """
-    heads, right = list(heads), set(numbers)
-    classes = [' class="number"' if k in right else "" for k in range(len(heads))]
-    head = "".join(f"<th{c}>{_e(text)}</th>" for c, text in zip(classes, heads, strict=True))
-    body = []
-    for k, row in enumerate(rows):
-        cells = [f"<td{c}>{cell}</td>" for c, cell in zip(classes, row, strict=True)]
-        if group > 1:
-            cells[0] = "" if k % group else cells[0].replace("<td", f'<td rowspan="{group}"', 1)
-        mark = ' class="floor"' if k < len(faint) and faint[k] else ""
-        body.append(f"<tr{mark}>{''.join(cells)}</tr>")
-    return f'<div class="scroll"><table><thead><tr>{head}</tr></thead><tbody>{"".join(body)}</tbody></table></div>'
-
-
 def _unbroken(text: str) -> str:
     """Return a text as markup that stays on one line."""
-    return f'<span class="unbroken">{_e(text)}</span>'
-
-
-def _minus(text: str) -> str:
-    """Return a number with a real minus sign."""
-    return text.replace("-", "\N{MINUS SIGN}")
+    return f'<span class="unbroken">{escaped(text)}</span>'
 
 
 def _quantity(value: float, unit: str, digits: int = 3) -> str:
@@ -628,7 +589,7 @@ def _quantity(value: float, unit: str, digits: int = 3) -> str:
         return "–"
     leading, _, power = f"{value:.{digits}g}".partition("e")
     number = leading if not power else f"{leading}·{sheets.power(int(power))}"
-    return _minus(number) + ("" if unit in ("", "1") else f" {unit}")
+    return with_minus(number) + ("" if unit in ("", "1") else f" {unit}")
 
 
 def _unit_words(unit: str) -> str:
@@ -639,7 +600,7 @@ def _unit_words(unit: str) -> str:
 def _plain(value: Any) -> str:
     """Return a value of the study file as text."""
     if isinstance(value, float):
-        return _minus(f"{value:.6g}")
+        return with_minus(f"{value:.6g}")
     if isinstance(value, list | tuple):
         return "[" + ", ".join(_plain(entry) for entry in value) + "]"
     return str(value)

@@ -1,0 +1,298 @@
+"""Read from a store what its report shows: scalars of all finished samples, pixels of some of them."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...core.errors import VbnfaultError
+from ...store import SPLITS, STRATA, Store
+
+F64 = NDArray[np.float64]
+
+_MOST_DRAWN = 20_000  # samples whose drawn parameters are read
+_SATURATED_DN = 255
+_READ = (
+    "injected",
+    "split",
+    "stratum",
+    "exposure_s",
+    "position_L_m",
+    "sun_direction_T",
+    "camera_from_T",
+    "T_from_L",
+    "sun_azimuth_deg",
+    "sun_elevation_deg",
+    "roll_deg",
+    "pitch_deg",
+    "yaw_deg",
+    "sun_distance_au",
+    "sun_visible_fraction",
+)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Scalars:
+    """Hold the scalars of the finished samples of a store that can be read.
+
+    Attributes
+    ----------
+    samples
+        Their indices, int64[n], ascending.
+    split_names, split
+        Names of the splits that have samples, and of each sample the index of its split, int64[n].
+    columns
+        Values by name of the scalar, the first axis is that of `samples`.
+    unreadable
+        Number of finished samples that could not be read.
+    """
+
+    samples: NDArray[np.int64]
+    split_names: tuple[str, ...]
+    split: NDArray[np.int64]
+    columns: Mapping[str, NDArray[Any]]
+    unreadable: int
+
+    @property
+    def injected(self) -> NDArray[np.bool_]:
+        """Return the faults that are in the pixels, bool[n, fault]."""
+        return self.columns["injected"].astype(bool).reshape(len(self.samples), -1)
+
+    @property
+    def strata(self) -> NDArray[np.int64]:
+        """Return the index of each sample's stratum, int64[n]."""
+        return self.columns["stratum"].astype(np.int64)
+
+    def stratum(self, position: int) -> str:
+        """Return the name of a sample's stratum."""
+        k = int(self.strata[position])
+        return STRATA[k] if k < len(STRATA) else f"stratum {k}"
+
+    @cached_property
+    def sun_L(self) -> F64:
+        """Return the unit vectors towards the Sun in the local level frame L (x north, y east, z down), [n, 3]."""
+        return np.einsum("nji,nj->ni", self.columns["T_from_L"], self.columns["sun_direction_T"])
+
+    @cached_property
+    def sun_C(self) -> F64:
+        """Return the unit vectors towards the Sun in the camera frame C (x right, y down, z boresight), [n, 3]."""
+        w, x, y, z = self.columns["camera_from_T"].T
+        rotation = np.array(
+            [
+                [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+                [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+                [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+            ]
+        )
+        return np.einsum("ijn,nj->ni", rotation, self.columns["sun_direction_T"])
+
+    def by_split(self, values: F64, of: NDArray[np.int64] | None = None) -> list[tuple[str, F64]]:
+        """Return the finite values of each split with its name.
+
+        `of`: the positions in `samples` that the values belong to; by default all.
+        """
+        split = self.split if of is None else self.split[of]
+        chosen = [(name, values[split == k]) for k, name in enumerate(self.split_names)]
+        return [(name, part[np.isfinite(part)]) for name, part in chosen]
+
+
+def read_scalars(store: Store) -> Scalars:
+    """Return the scalars of the finished samples; samples whose files are damaged are counted and left out."""
+    samples: list[int] = []
+    parts: dict[str, list[NDArray[Any]]] = {name: [] for name in _READ}
+    unreadable = 0
+    for number in store.begun():
+        finished = [i for i, done in store.done(number).items() if done]
+        chosen = [i - store.shard(number).start for i in finished]
+        try:
+            columns = {name: store.column(name, number)[chosen] for name in _READ} if finished else {}
+        except (OSError, ValueError):
+            unreadable += len(finished)
+            continue
+        samples += finished
+        for name, column in columns.items():
+            parts[name].append(column)
+    columns = {name: np.concatenate(part) if part else np.zeros(0) for name, part in parts.items()}
+    words = [str(word) for word in columns["split"]]
+    names = tuple(sorted(set(words), key=lambda w: (SPLITS.index(w) if w in SPLITS else len(SPLITS), w)))
+    return Scalars(
+        samples=np.array(samples, dtype=np.int64),
+        split_names=names,
+        split=np.array([names.index(word) for word in words], dtype=np.int64),
+        columns=columns,
+        unreadable=unreadable,
+    )
+
+
+def spread(count: int, most: int) -> NDArray[np.int64]:
+    """Return up to `most` of the numbers 0 to `count` - 1, evenly spaced and ascending."""
+    return np.unique(np.linspace(0, max(count - 1, 0), min(count, most)).round().astype(np.int64))[:count]
+
+
+# --- drawn parameters ---------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Drawn:
+    """Hold the drawn numbers of one parameter of a fault, with the index of the split of each."""
+
+    fault: str
+    name: str
+    values: F64
+    split: NDArray[np.int64]
+
+
+def read_drawn(store: Store, scalars: Scalars) -> tuple[list[Drawn], int]:
+    """Return the drawn parameters of the faults, and from how many samples they were read."""
+    values: dict[tuple[str, str], list[F64]] = {}
+    splits: dict[tuple[str, str], list[NDArray[np.int64]]] = {}
+    chosen = spread(len(scalars.samples), _MOST_DRAWN)
+    size = store.spec.shard_samples
+    for number, positions in _by_shard(scalars.samples, chosen, size).items():
+        try:
+            texts = store.column("parameters", number)
+        except (OSError, ValueError):
+            continue
+        for position in positions:
+            drawn = parsed(texts[scalars.samples[position] - number * size])
+            for fault, parameters in drawn.items():
+                for name, numbers in _numbers(parameters):
+                    values.setdefault((fault, name), []).append(numbers)
+                    of_split = np.full(len(numbers), scalars.split[position])
+                    splits.setdefault((fault, name), []).append(of_split)
+    order = {fault: k for k, fault in enumerate(store.spec.faults)}
+    keys = sorted(values, key=lambda key: (order.get(key[0], len(order)), key[1]))
+    return [
+        Drawn(fault=f, name=n, values=np.concatenate(values[f, n]), split=np.concatenate(splits[f, n]))
+        for f, n in keys
+    ], len(chosen)
+
+
+def parsed(text: Any) -> dict[str, Any]:
+    """Return the parameters of a sample by fault; empty if the text is no table in JSON."""
+    try:
+        table = json.loads(str(text or "{}"))
+    except (ValueError, RecursionError):
+        return {}
+    return table if isinstance(table, dict) else {}
+
+
+def _by_shard(samples: NDArray[np.int64], chosen: NDArray[np.int64], size: int) -> dict[int, list[int]]:
+    """Return the chosen positions by shard."""
+    shards: dict[int, list[int]] = {}
+    for position in chosen.tolist():
+        shards.setdefault(int(samples[position]) // size, []).append(position)
+    return shards
+
+
+def _numbers(drawn: Any, name: str = "") -> Iterator[tuple[str, F64]]:
+    """Yield the numbers of nested parameters with their dotted names; entries of lists have the list's name."""
+    if isinstance(drawn, Mapping):
+        for key, value in drawn.items():
+            yield from _numbers(value, f"{name}.{key}" if name else str(key))
+    elif isinstance(drawn, list):
+        if drawn and all(type(value) in (int, float) for value in drawn):
+            yield name, np.asarray(drawn, dtype=np.float64)
+        else:
+            for value in drawn:
+                yield from _numbers(value, name)
+    elif isinstance(drawn, int | float) and not isinstance(drawn, bool):
+        yield name, np.array([drawn], dtype=np.float64)
+
+
+def key_bounds(bounds: Mapping[str, Mapping[str, tuple[float, float]]], drawn: Drawn) -> tuple[float, float] | None:
+    """Return the bounds that the scene gives for a parameter; None if it has none under the parameter's name.
+
+    A parameter `glare.radius` belongs to the key `glare_radius`, and `flares.radius` to `radius` unless a key
+    begins with `flares_`.
+    """
+    keys = bounds.get(drawn.fault, {})
+    table, _, name = drawn.name.rpartition(".")
+    joined = drawn.name.replace(".", "_")
+    if joined in keys or not table or any(key.startswith(f"{table}_") for key in keys):
+        return keys.get(joined)
+    return keys.get(name)
+
+
+def geometry_bounds(store: Store, name: str) -> list[tuple[str, tuple[float, float]]]:
+    """Return the bounds of a variable of the geometry: of all samples (""), or one pair for each stratum."""
+    geometry = store.attributes.get("scene", {}).get("geometry", {})
+    if not isinstance(geometry, Mapping):
+        return []
+    if (pair := _pair(geometry.get(name))) is not None:
+        return [("", pair)]
+    tables = [(stratum, geometry.get(stratum.replace("-", "_"))) for stratum in STRATA]
+    found = [(stratum, _pair(t.get(name)) if isinstance(t, Mapping) else None) for stratum, t in tables]
+    return [(stratum, pair) for stratum, pair in found if pair is not None]
+
+
+def _pair(value: Any) -> tuple[float, float] | None:
+    """Return a list of two numbers as bounds, None for anything else."""
+    is_pair = isinstance(value, Sequence) and len(value) == 2 and all(type(v) in (int, float) for v in value)
+    return (float(value[0]), float(value[1])) if is_pair else None
+
+
+# --- pixels -------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Pixels:
+    """Hold what was computed from the pixels of some samples.
+
+    Attributes
+    ----------
+    positions
+        Positions of these samples in `Scalars.samples`, int64[m].
+    saturated, mean_dn
+        By layer (`image`, `clean`): the fraction of the pixels in which a colour is at full scale, and the mean
+        intensity in DN; float64[m].
+    areas
+        By layer (`mask`, `mask_effect`): the fraction of the frame that each mask covers, float64[m, fault].
+    unreadable
+        Number of further samples whose pixels could not be read.
+    """
+
+    positions: NDArray[np.int64]
+    saturated: Mapping[str, F64]
+    mean_dn: Mapping[str, F64]
+    areas: Mapping[str, F64]
+    unreadable: int
+
+
+def read_pixels(store: Store, scalars: Scalars, most: int) -> Pixels:
+    """Return what the pixels of up to `most` finished samples, evenly spaced, say."""
+    images = [name for name in ("image", "clean") if name in store.spec.pixel_layers]
+    masks = [name for name in ("mask", "mask_effect") if name in store.spec.pixel_layers and store.spec.faults]
+    rows: dict[str, list[Any]] = {name: [] for name in (*images, *masks)}
+    positions = []
+    for position in spread(len(scalars.samples), most).tolist():
+        index = int(scalars.samples[position])
+        try:
+            layers = store.read_sample(index, {*images, *masks}).layers
+        except VbnfaultError:
+            continue
+        positions.append(position)
+        for image in images:
+            rows[image].append(_of_image(layers[image]))
+        for mask in masks:
+            rows[mask].append(layers[mask].mean(axis=(1, 2)))
+    of_images = {name: np.array(rows[name], dtype=np.float64).reshape(-1, 2) for name in images}
+    return Pixels(
+        positions=np.array(positions, dtype=np.int64),
+        saturated={name: values[:, 0] for name, values in of_images.items()},
+        mean_dn={name: values[:, 1] for name, values in of_images.items()},
+        areas={n: np.array(rows[n], dtype=np.float64).reshape(-1, len(store.spec.faults)) for n in masks},
+        unreadable=len(spread(len(scalars.samples), most)) - len(positions),
+    )
+
+
+def _of_image(image: NDArray[Any]) -> tuple[float, float]:
+    """Return the saturated fraction and the mean intensity of an image, uint8[y, x, channel]."""
+    saturated = (image[..., :3] >= _SATURATED_DN).any(axis=-1).mean()
+    return float(saturated), float(image[..., -1].mean())
