@@ -38,13 +38,14 @@ LONGEST_PX = 64
 MOST_SAMPLES = 4
 SMALLER = {
     "detector": ["--pixels", "64", "--points", "12", "--stack", "4"],
-    "flare": ["--pixels", "64"],
+    "flare": ["--pixels", "64", "--wavelength-nm", "550"],
 }
+BASE_SAMPLES = 8  # of a study
 OUTPUTS = ("--out", "--json", "--toml")
 # a documented count → one with which the command takes seconds
 FEWER = {"--samples": MOST_SAMPLES, "--append": 2, "--sample": MOST_SAMPLES - 1}
 
-load_scene = vbnfault.load_scene
+load_scene, run_study = vbnfault.load_scene, vbnfault.study.study
 
 
 def page_name(page: Path) -> str:
@@ -81,6 +82,12 @@ def small_scene(name: str | Path, overrides: dict[str, Any] | None = None) -> vb
     """Load a scene as the page says, and then on small images."""
     given = dict(overrides or {})
     return load_scene(name, given | small_values(load_scene(name, given)))
+
+
+def small_study(*arguments: Any, **keywords: Any) -> Any:
+    """Run a study that renders with few base samples."""
+    fewer = {} if "evaluator" in keywords else {"overrides": {"design.n": BASE_SAMPLES}}
+    return run_study(*arguments, **fewer, **keywords)
 
 
 @pytest.fixture(scope="module")
@@ -136,6 +143,7 @@ def test_every_block_runs_in_order(
         return
     monkeypatch.setenv("MPLBACKEND", "Agg")
     monkeypatch.setattr(vbnfault, "load_scene", small_scene)
+    monkeypatch.setattr(vbnfault.study, "study", small_study)
     if "67p.obj" in page.read_text(encoding="utf-8"):
         # a user's own shape: the real comet's name, the embedded body's form
         body = load_body("embedded")

@@ -14,7 +14,7 @@ from vbnfault.pipeline.spec import Pose, SampleSpec
 from vbnfault.scene import config, plan
 from vbnfault.world import assemble
 
-N = 2000
+N = 500
 
 
 @pytest.fixture(scope="module")
@@ -53,7 +53,7 @@ def test_straylight_samples_see_the_whole_sun_and_averted_ones_do_not_look_at_it
 ) -> None:
     session, poses = resolved
     straylight = session.plan.injects("straylight")
-    assert straylight.sum() > 500
+    assert straylight.sum() > 120
     for pose, has in zip(poses, straylight, strict=True):
         angle = np.degrees(np.arccos(pose.L_from_C[:, 2] @ pose.sun_L))
         if has:
@@ -77,7 +77,7 @@ def test_the_pose_is_the_plans_view_of_its_try(resolved: tuple[Session, list[Pos
         assert pose.sun_azimuth_deg == v["sun_azimuth_deg"]
         assert pose.sun_elevation_deg == v["sun_elevation_deg"]
         redrawn += pose.tries > 1
-    assert redrawn > 200  # the Sun is below the horizon in many a proposal
+    assert redrawn > 50  # the Sun is below the horizon in many a proposal
 
 
 def test_redrawn_samples_follow_the_conditional_distribution(resolved: tuple[Session, list[Pose]]) -> None:
@@ -86,7 +86,7 @@ def test_redrawn_samples_follow_the_conditional_distribution(resolved: tuple[Ses
     surface = session.terrain(0).surface
     chosen = np.flatnonzero(session.plan.injects("straylight"))
     rng = np.random.default_rng(2024)
-    n = 3 * len(chosen)
+    n = 12 * len(chosen)
     x, y, height = rng.uniform(-150, 150, n), rng.uniform(-150, 150, n), rng.uniform(0, 100, n)
     azimuth, elevation = rng.uniform(0, 360, n), rng.uniform(-30, 30, n)
     ground = render.ground_height_m(surface, x, y, 424.3)
