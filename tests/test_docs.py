@@ -23,6 +23,7 @@ from vbnfault.core.tables import json_schema
 from vbnfault.detector import Sensor
 from vbnfault.faults import registry
 from vbnfault.lens.prescription_file import PrescriptionFile
+from vbnfault.lens.straylight import ghosts
 from vbnfault.reflectance import registry as reflectances
 
 ROOT = Path(__file__).parents[1]
@@ -41,6 +42,7 @@ SMALLER = {
     "flare": ["--pixels", "64", "--wavelength-nm", "550"],
 }
 BASE_SAMPLES = 8  # of a study
+RAYS_ACROSS = 96  # of a ghost
 OUTPUTS = ("--out", "--json", "--toml")
 # a documented count → one with which the command takes seconds
 FEWER = {"--samples": MOST_SAMPLES, "--append": 2, "--sample": MOST_SAMPLES - 1}
@@ -144,6 +146,7 @@ def test_every_block_runs_in_order(
     monkeypatch.setenv("MPLBACKEND", "Agg")
     monkeypatch.setattr(vbnfault, "load_scene", small_scene)
     monkeypatch.setattr(vbnfault.study, "study", small_study)
+    monkeypatch.setattr(ghosts, "FINE", RAYS_ACROSS)
     if "67p.obj" in page.read_text(encoding="utf-8"):
         # a user's own shape: the real comet's name, the embedded body's form
         body = load_body("embedded")
