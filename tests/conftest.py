@@ -52,8 +52,8 @@ ALL_FAULTS = (
     "optics_degradation",
 )
 
-# Patches are cached for this run alone: the tests neither read nor fill the user's cache. The processes of xdist, and
-# those that tests start, share the folder of the first process.
+# Patches are cached for this run alone: the tests neither read nor fill the cache of the user. The processes of
+# xdist, and those that tests start, share the folder of the first process.
 if "VBNFAULT_TESTS_CACHE" not in os.environ:
     _CACHE = tempfile.TemporaryDirectory(prefix="vbnfault-tests-")
     os.environ["VBNFAULT_TESTS_CACHE"] = _CACHE.name
