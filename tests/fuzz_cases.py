@@ -247,6 +247,7 @@ def case_options(seeds: Seeds, rng: random.Random, here: Path) -> Case:
     out = str(here / "out")
     sound: dict[str, list[str]] = {
         "build": ["build", scene, "--out", out + ".zarr", "--dry-run"],
+        "retake": ["retake", str(seeds.store), "--scene", scene, "--out", out + ".zarr", "--dry-run"],
         "verify": ["verify", str(seeds.store)],
         "digest": ["digest", str(seeds.store)],
         "stats": ["stats", str(seeds.store)],
@@ -286,6 +287,7 @@ def case_options(seeds: Seeds, rng: random.Random, here: Path) -> Case:
             "--scheduler",
             "--shard-range",
         ],
+        "retake": ["--seed", "--workers", "--threads", "--set", "--out", "--scene"],
         "preview": ["--samples", "--out"],
         "report": ["--samples", "--pixels", "--out"],
         "export": ["--format", "--out", "--workers"],

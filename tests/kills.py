@@ -60,6 +60,21 @@ def build_rendered(out: Path, workers: int) -> None:
     dataset.build_scene(config.parse_scene(table, source="kills"), out, source="kills", workers=workers)
 
 
+def build_retaken(out: Path, workers: int) -> None:
+    """Take 6 rendered samples again; the store beside `out` that has them is built by the first call."""
+    import vbnfault
+    from vbnfault import store
+    from vbnfault.scene import config
+
+    views, layers = out.parent / "views.store", {"layers": ["scene_radiance", "depth_m", "normal", "semantic"]}
+    sampling = {"samples": 6, "shard_samples": 2, "sites": 2}
+    tables = {"camera": {"width_px": 48}, "faults": {"vignetting": {}, "broken_lines": {}}}
+    if not store.is_store(views):
+        vbnfault.build(config.parse_scene(small_scene(dataset=sampling | layers, **tables), source="kills"), views)
+    scene = config.parse_scene(small_scene(dataset={**sampling, "seed": 2}, **tables), source="kills")
+    vbnfault.retake(views, scene, out, workers=workers)
+
+
 def finished(out: Path) -> int:
     """Return how many samples of a store are finished; 0 if there is no store."""
     from vbnfault import store
@@ -98,10 +113,10 @@ def main() -> int:
     """Run the rounds; the exit code is 1 if one failed."""
     options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     options.add_argument("--count", type=int, default=500, help="kills in all")
-    options.add_argument("--rendering", choices=("on", "off"), default="off")
+    options.add_argument("--rendering", choices=("on", "off", "retake"), default="off")
     options.add_argument("--seed", type=int, default=0)
     given = options.parse_args()
-    build = build_rendered if given.rendering == "on" else build_synthetic
+    build = {"on": build_rendered, "off": build_synthetic, "retake": build_retaken}[given.rendering]
     os.environ.pop("VICTIM_PLAN", None)
     folder = Path(tempfile.mkdtemp(prefix="kills-"))
     os.environ.setdefault("VBNFAULT_CACHE_DIR", str(folder / "cache"))

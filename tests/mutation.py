@@ -63,7 +63,7 @@ GROUPS: dict[str, tuple[list[str], list[str]]] = {
 }
 # functions of a module that form their own group
 PARTS: dict[str, set[str]] = {
-    "splits": {"shortcomings", "site_split", "individual_split", "_in_turn", "_individuals", "_dealt", "_exchange"}
+    "splits": {"shortcomings", "site_split", "individual_split", "_in_turn", "individuals", "_dealt", "_exchange"}
     | {"_shard_sites", "_site_order"},
 }
 _ALWAYS = ["-q", "-n", "0", "-p", "no:cacheprovider", "-m", "not slow"]

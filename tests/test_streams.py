@@ -38,8 +38,9 @@ COMMANDS = {
     "report": "{}/s.zarr --out {}/r.html",
     "shape": "67P --url http://localhost/s.obj --out {}",  # the file lies there already
 }
-# they end with the test render, a sample's files, an evaluated study or levels, and print through the same calls
-_WITH_MITSUBA = {"render", "doctor", "study", "severity"}
+# they end with the test render, a sample's files, samples, an evaluated study or levels, and print through the same
+# calls
+_WITH_MITSUBA = {"render", "retake", "doctor", "study", "severity"}
 
 
 @pytest.fixture(scope="module")

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from .dataset import BuildOptions, verify
     from .dataset import build_scene as build
     from .dataset import merge_stores as merge
+    from .dataset.retake import retake
     from .dataset.statistics import statistics
     from .detector.effects import Effect, Exposure
     from .detector.sensor import Sensor, load_sensor
@@ -67,6 +68,7 @@ _HOMES = {
     "open_dataset": "store",
     "path": "faults",
     "report": "output.report:write_report",
+    "retake": "dataset.retake",
     "rows": "faults",
     "simulate": "pipeline",
     "statistics": "dataset.statistics",
@@ -107,6 +109,7 @@ __all__ = [
     "open_dataset",
     "path",
     "report",
+    "retake",
     "rows",
     "simulate",
     "statistics",

@@ -16,6 +16,7 @@ from .options import (
     MOST_SAMPLES,
     SceneArgument,
     SceneOptions,
+    SceneValues,
     StoreArgument,
     grouped,
     shard_range,
@@ -91,6 +92,23 @@ def merge(
     from .. import dataset
 
     for line in dataset.merge_stores(stores, out, move=move).lines():
+        typer.echo(line)
+
+
+@app.command(rich_help_panel=_PANEL)
+@grouped
+def retake(
+    store: StoreArgument,
+    scene: Annotated[str, typer.Option(help="Path of a scene file, or name of a packaged scene.")],
+    out: Annotated[Path, typer.Option(help="Path of the new store, made or resumed.")],
+    options: SceneValues,
+    work: WorkOptions,
+) -> None:
+    """Take a store's samples again with another scene's faults, lens or detector, on the stored radiance."""
+    from ..dataset import retake as retaking
+
+    how = retaking.build.BuildOptions(**vars(work))
+    for line in retaking.retake(store, options.load(scene), out, how, source=scene).lines():
         typer.echo(line)
 
 

@@ -116,13 +116,9 @@ def grouped(command: Callable[..., None]) -> Callable[..., None]:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class SceneOptions:
-    """Hold the options that replace values of a scene file."""
+class SceneValues:
+    """Hold the options that replace values of a scene file, whose number of samples is given by something else."""
 
-    samples: Annotated[
-        int | None,
-        whole(1, MOST_SAMPLES, "Number of samples to plan.", unset="the scene's"),
-    ] = None
     seed: Annotated[
         int | None,
         whole(0, MOST_SEED, "Seed of all random numbers.", unset="the scene's"),
@@ -136,9 +132,26 @@ class SceneOptions:
         """Return the scene with these values."""
         from ..scene import config
 
-        named = {"dataset.samples": self.samples, "dataset.seed": self.seed}
-        values = overrides(self.settings) | {key: value for key, value in named.items() if value is not None}
-        return config.load_scene(scene, values)
+        named = {key: value for key, value in self._named().items() if value is not None}
+        return config.load_scene(scene, overrides(self.settings) | named)
+
+    def _named(self) -> dict[str, int | None]:
+        """Return the values that have options of their own, by key of the scene."""
+        return {"dataset.seed": self.seed}
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class SceneOptions(SceneValues):
+    """Hold the options that replace values of a scene file."""
+
+    samples: Annotated[
+        int | None,
+        whole(1, MOST_SAMPLES, "Number of samples to plan.", unset="the scene's"),
+    ] = None
+
+    def _named(self) -> dict[str, int | None]:
+        """Return the values that have options of their own, by key of the scene."""
+        return {**super()._named(), "dataset.samples": self.samples}
 
 
 def overrides(settings: list[str] | None) -> dict[str, Any]:

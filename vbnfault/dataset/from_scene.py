@@ -133,11 +133,11 @@ def build_scene(
     scene = with_rows(_with_samples(scene, samples))
     blocks = build.planned_blocks(out, scene.dataset.samples, append=append or 0, overwrite=options.overwrite)
     factory, build_plan, description = _prepared(scene, blocks, source, options)
-    summary = _with_card(out, build.build(factory, build_plan, out, options))
+    summary = with_card(out, build.build(factory, build_plan, out, options))
     return dataclasses.replace(summary, description=tuple(description))
 
 
-def _with_card(out: Path, summary: build.Summary) -> build.Summary:
+def with_card(out: Path, summary: build.Summary) -> build.Summary:
     """Write the card of a complete store that was built or has none, and return the summary of its build."""
     if summary.counts is not None:
         opened = store.open_store(out)

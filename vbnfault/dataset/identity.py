@@ -15,7 +15,11 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from .. import __version__, pipeline, reflectance, store
+from ..camera import Camera
 from ..core import file_contents, llvm, resources, user_files
 from ..core.errors import InputError, VbnfaultError
 from ..detector import Detector
@@ -28,6 +32,7 @@ from ..scene import config, plan
 from ..scene.config import Scene
 from ..scene.hashing import content_hash
 from ..scene.instrument import OF_THE_DETECTOR
+from ..scene.retaken_plan import make_retaken_plan
 from ..scene.sampling import OF_AN_AIM
 from ..scene.target import EARTH
 from ..store import StoreSpec
@@ -35,6 +40,10 @@ from ..world import assemble
 
 # A new version of one of these libraries may change pixel values.
 _LIBRARIES = ("mitsuba", "drjit", "numpy", "scipy", "trimesh", "scikit-image", "colour-science", "zarr")
+# Root attribute of a store whose samples were taken again from the radiance of another: `samples`, the ranges
+# [first, last] of the other's plan that it holds; `repeats`, how often it holds each; `source`, what identifies the
+# other store and its plan.
+RETAKE = "retake"
 _OPENCV = ("opencv-python-headless", "opencv-python")
 
 
@@ -105,7 +114,11 @@ def scene_identity(session: pipeline.Session) -> dict[str, Any]:
             for plugin in plugins
         }
     del scene["dataset"]["samples"]
-    for table, key in (("dataset", "variants_per_view"), ("camera", "exposure_stops")):
+    for table, key in (
+        ("dataset", "variants_per_view"),
+        ("dataset", "radiance_dtype"),
+        ("camera", "exposure_stops"),
+    ):
         values = getattr(session.scene, table)
         if getattr(values, key) == type(values).model_fields[key].default:
             del scene[table][key]  # stores of scenes without it stay as they were
@@ -219,11 +232,18 @@ def store_spec(session: pipeline.Session, blocks: Sequence[int]) -> StoreSpec:
         detector_names=tuple(f"{camera.detector.name} {k}" for k in range(individuals))
         if individuals > 1
         else (camera.detector.name,),
-        radiance_dtype="float32",
+        radiance_dtype=dataset.radiance_dtype,
+        rendered_shape=_rendered_shape(camera) if "scene_radiance" in layers else (),
         shard_samples=dataset.shard_samples,
         sample_names=() if session.trajectory is None else session.trajectory.name,
         attributes=_root_attributes(session, blocks),
     )
+
+
+def _rendered_shape(camera: Camera) -> tuple[int, int]:
+    """Return rows and columns of a render, with the guard band that the camera's lens needs."""
+    guard_x, guard_y = camera.lens.guard_px
+    return camera.height_px + 2 * guard_y, camera.width_px + 2 * guard_x
 
 
 def _root_attributes(session: pipeline.Session, blocks: Sequence[int]) -> dict[str, Any]:
@@ -282,13 +302,13 @@ def is_exact(attributes: Mapping[str, Any]) -> bool:
 
     A fault that is invisible in a view can be injected only if the view is drawn again. The result is therefore
     False if `plan.on_invisible` is not `redraw_view`, if SPICE or a table of poses places the camera, or if
-    `geometry.sun_visibility` is `as_drawn`.
+    `geometry.sun_visibility` is `as_drawn`, or if the store was taken again from the views of another.
     """
     scene = attributes["scene"]
     redraws = scene.get("plan", {}).get("on_invisible") == "redraw_view"
     as_drawn = scene.get("geometry", {}).get("sun_visibility") == "as_drawn"
     flown = scene.get("spice", {}).get("spacecraft") or scene.get("trajectory")
-    return bool(redraws and not as_drawn and not flown)
+    return bool(redraws and not as_drawn and not flown and RETAKE not in attributes)
 
 
 def stored_scene(attributes: Mapping[str, Any]) -> Scene:
@@ -324,10 +344,44 @@ def classes_that_need_sun(attributes: Mapping[str, Any]) -> list[str]:
 
 
 def stored_plan(attributes: Mapping[str, Any], faults: Sequence[str]) -> tuple[Scene, plan.Plan]:
-    """Return the scene of a store and its plan, from the root attributes and the fault axis of the store."""
+    """Return the scene of a store and its plan, from the root attributes and the fault axis of the store.
+
+    In a store that was taken again, `plan_numbers` are the samples of this plan that it holds.
+    """
     scene = stored_scene(attributes)
-    need_sun = classes_that_need_sun(attributes)
-    return scene, plan.make_plan(scene, faults, attributes["blocks"], need_sun=need_sun)
+    need_sun, blocks = classes_that_need_sun(attributes), blocks_of_plan(attributes)
+    if RETAKE not in attributes:
+        return scene, plan.make_plan(scene, faults, blocks, need_sun=need_sun)
+    views = earlier_views(attributes)
+    return scene, make_retaken_plan(scene, faults, views, blocks, need_sun=need_sun)
+
+
+def earlier_views(attributes: Mapping[str, Any]) -> plan.EarlierViews:
+    """Return the views of the store from which a store was taken again, from the root attributes of the latter."""
+    retake = attributes[RETAKE]
+    scene, table = stored_plan(retake["source"], retake["source"]["faults"])
+    return plan.EarlierViews(scene=scene, plan=table, repeats=retake["repeats"])
+
+
+def blocks_of_plan(attributes: Mapping[str, Any]) -> tuple[int, ...]:
+    """Return the numbers of samples that the plan of a store drew together."""
+    if RETAKE not in attributes:
+        return tuple(attributes["blocks"])
+    retake = attributes[RETAKE]
+    return tuple(size * retake["repeats"] for size in blocks_of_plan(retake["source"]))
+
+
+def plan_numbers(attributes: Mapping[str, Any]) -> NDArray[np.int64]:
+    """Return the number in the plan of each sample of a store, int64[sample].
+
+    It is the sample's index, unless the store was taken again from one that was not complete.
+    """
+    if RETAKE not in attributes:
+        return np.arange(sum(attributes["blocks"]), dtype=np.int64)
+    retake = attributes[RETAKE]
+    first = [np.arange(low, high + 1, dtype=np.int64) for low, high in retake["samples"]]
+    repeats = retake["repeats"]
+    return np.asarray((np.concatenate(first)[:, None] * repeats + np.arange(repeats)).ravel())
 
 
 def planned(attributes: Mapping[str, Any], faults: Sequence[str]) -> Callable[[int, int], dict[str, Any]]:
@@ -344,8 +398,10 @@ def planned(attributes: Mapping[str, Any], faults: Sequence[str]) -> Callable[[i
         The fault axis of the store.
     """
     scene, table = stored_plan(attributes, faults)
+    numbers = plan_numbers(attributes)
 
-    def expected(index: int, tries: int) -> dict[str, Any]:
+    def expected(sample: int, tries: int) -> dict[str, Any]:
+        index = int(numbers[sample])
         drawn = table.view(scene, index, tries - 1)
         # the plan does not set these angles if a trajectory places camera and Sun, or if the camera aims
         names = ("sun_azimuth_deg", "sun_elevation_deg", "roll_deg", "pitch_deg", "yaw_deg")

@@ -68,7 +68,7 @@ def check_same_scene(
 
     `accept_versions`: other versions of the libraries are no difference.
     """
-    differing = list(_differences(_compared(store.spec), _compared(spec)))
+    differing = list(differences(_compared(store.spec), _compared(spec)))
     if differing and all(d.key.startswith("versions.") or d.key == "scene_hash" for d in differing):
         if not accept_versions and spec.attributes.get("versions") not in versions.known(store.attributes):
             changed = versions.differences(store.attributes, spec.attributes)
@@ -133,7 +133,7 @@ _ABSENT = object()
 _LONGEST_VALUE = 60
 
 
-class _Difference(NamedTuple):
+class Difference(NamedTuple):
     """Hold one value that differs between a store and a scene, with its dotted key."""
 
     key: str
@@ -165,21 +165,21 @@ def _compared(spec: StoreSpec) -> dict[str, Any]:
     return {key: value for key, value in everything.items() if key not in _NOT_COMPARED}
 
 
-def _differences(stored: Any, wanted: Any, key: str = "") -> Iterator[_Difference]:
+def differences(stored: Any, wanted: Any, key: str = "") -> Iterator[Difference]:
     """Yield the values that differ, each by its deepest key: `table.key`, and `key[2]` within a list."""
     if isinstance(stored, dict) and isinstance(wanted, dict):
         for name in {**wanted, **stored}:
             below = f"{key}.{name}" if key else str(name)
-            yield from _differences(stored.get(name, _ABSENT), wanted.get(name, _ABSENT), below)
+            yield from differences(stored.get(name, _ABSENT), wanted.get(name, _ABSENT), below)
     elif wanted is _ABSENT and isinstance(stored, dict) and stored:
-        yield from _differences(stored, {}, key)
+        yield from differences(stored, {}, key)
     elif stored is _ABSENT and isinstance(wanted, dict) and wanted:
-        yield from _differences({}, wanted, key)
+        yield from differences({}, wanted, key)
     elif _same_length(stored, wanted) and (_has_parts(stored) or _has_parts(wanted)):
         for k, pair in enumerate(zip(stored, wanted, strict=True)):
-            yield from _differences(*pair, f"{key}[{k}]")
+            yield from differences(*pair, f"{key}[{k}]")
     elif stored is _ABSENT or wanted is _ABSENT or stored != wanted:
-        yield _Difference(key, stored, wanted)
+        yield Difference(key, stored, wanted)
 
 
 def _same_length(stored: Any, wanted: Any) -> bool:

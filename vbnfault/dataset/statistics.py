@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from .. import store as stores
 from ..core.errors import VbnfaultError
 from ..store import SPLITS, STRATA, FaultCounts, Store
-from .identity import stored_plan
+from .identity import plan_numbers, stored_plan
 
 # scalars of one number a sample whose ranges are reported
 _RANGED = (
@@ -293,7 +293,7 @@ def _commanded(store: Store) -> NDArray[np.bool_] | None:
     """Return the commanded faults bool[sample, fault], or None if the stored scene cannot be planned here."""
     attributes = store.spec.attributes
     try:
-        return stored_plan(attributes, store.spec.faults)[1].injected
+        return stored_plan(attributes, store.spec.faults)[1].injected[plan_numbers(attributes)]
     except (VbnfaultError, KeyError):  # a scene of another program or of a plug-in that is not loaded
         return None
 

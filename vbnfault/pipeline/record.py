@@ -50,7 +50,10 @@ def _layers(frame: Frame) -> dict[str, NDArray[Any]]:
         elif name in ("raw", "defects"):
             layers[name] = getattr(images, name)
         elif name == "radiance":
-            layers[name] = frame.exposure.light.on_image.array
+            layers[name] = _as_stored(frame.exposure.light.on_image.array, spec.scene)
+        elif name == "scene_radiance":
+            assert frame.starless is not None
+            layers[name] = _as_stored(frame.starless.array, spec.scene)
         elif name == "albedo":
             layers[name] = assemble.normal_albedo(spec.scene, frame.rendering.truth, spec.terrain.vehicle)
         elif name == "point_T_m":
@@ -58,6 +61,15 @@ def _layers(frame: Frame) -> dict[str, NDArray[Any]]:
         elif name in _TRUTH_LAYERS:
             layers[name] = getattr(frame.rendering.truth, name)
     return layers
+
+
+def _as_stored(radiance: NDArray[np.float32], scene: Scene) -> NDArray[Any]:
+    """Return a radiance in the data type in which the scene stores it."""
+    dtype = np.dtype(scene.dataset.radiance_dtype)
+    if dtype == radiance.dtype:
+        return radiance
+    # the Sun's disc has up to half of the greatest float16
+    return np.minimum(radiance, np.finfo(dtype).max).astype(dtype)
 
 
 def _geometry(frame: Frame) -> dict[str, Any]:

@@ -19,7 +19,8 @@ from .spec import Pose, Rendering, SampleSpec, SceneLight
 
 _SURROUNDING_SAMPLES = 4  # of each pixel of the coarse renders around a view
 _LEAST_RAD = 1e-7  # of a disc whose visible fraction is computed
-_ANGLE_LAYERS = {"incidence_deg", "emission_deg", "phase_deg", "albedo"}
+# layers of truth that need the angles of the light
+ANGLE_LAYERS = {"incidence_deg", "emission_deg", "phase_deg", "albedo"}
 
 
 def describe(spec: SampleSpec, pose: Pose) -> RenderInput:
@@ -56,7 +57,7 @@ def render_view(spec: SampleSpec, pose: Pose) -> Rendering:
     from .. import render
 
     camera, scene, surface = spec.camera, describe(spec, pose), spec.terrain.surface
-    angles = bool(_ANGLE_LAYERS & set(spec.scene.dataset.layers))
+    angles = bool(ANGLE_LAYERS & set(spec.scene.dataset.layers))
     stars = spec.scene.sky.stars != "off"
     has_coma = spec.scene.coma is not None
     has_air = spec.scene.body.atmosphere is not None
@@ -93,8 +94,8 @@ def render_view(spec: SampleSpec, pose: Pose) -> Rendering:
         open_sky=guide.semantic == SKY if stars and guide is not None else None,
         samples_per_pixel=sampled.samples_per_pixel,
         noise_fraction_p99=sampled.noise_fraction_p99,
-        surroundings=_surroundings(spec, scene),
-        far_sources=_far_sources(spec, pose),
+        surroundings=surroundings(spec, scene),
+        far_sources=far_sources(spec, pose),
     )
 
 
@@ -106,7 +107,7 @@ def _has_sources_around(spec: SampleSpec) -> bool:
     return any(fault.lit_by_surroundings for fault in spec.faults.values())
 
 
-def _far_sources(spec: SampleSpec, pose: Pose) -> tuple[FarSource, ...]:
+def far_sources(spec: SampleSpec, pose: Pose) -> tuple[FarSource, ...]:
     """Return the light of the bodies of `sky.bodies` that ground and spacecraft do not hide."""
     from .. import render
 
@@ -136,7 +137,7 @@ def _far_sources(spec: SampleSpec, pose: Pose) -> tuple[FarSource, ...]:
     return tuple(out)
 
 
-def _surroundings(spec: SampleSpec, scene: RenderInput) -> tuple[Radiance, ...]:
+def surroundings(spec: SampleSpec, scene: RenderInput) -> tuple[Radiance, ...]:
     """Render what lies around the view, coarsely, if a fault of the scene needs it."""
     from .. import render
 

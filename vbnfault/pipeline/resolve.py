@@ -89,10 +89,10 @@ class _Views:
         suns = [replace(light, direction_L=direction) for direction in directions]
         position = np.column_stack([x, y, -height])
         reference = plan.strata(scene)[spec.plan.stratum[spec.index]].reference
-        references_L = _references_L(reference, spec.terrain, position, directions)
+        towards_L = references_L(reference, spec.terrain, position, directions)
         axes = [
             frames.L_from_C(towards, d["roll_deg"], d["pitch_deg"], d["yaw_deg"], north_up=reference == "centre")
-            for towards, d in zip(references_L, drawn, strict=True)
+            for towards, d in zip(towards_L, drawn, strict=True)
         ]
         visible = render.sun_visible_fraction(spec.terrain.surface, position, suns, np.stack(axes))
         return _Views(
@@ -125,9 +125,7 @@ class _Views:
         )
 
 
-def _references_L(
-    reference: str, terrain: Terrain, position_L_m: F64, sun_directions_L: Sequence[F64]
-) -> list[F64]:
+def references_L(reference: str, terrain: Terrain, position_L_m: F64, sun_directions_L: Sequence[F64]) -> list[F64]:
     """Return the direction in L from which the attitude of each view counts; `reference` names it in the scene."""
     if reference == "sun":
         return list(sun_directions_L)

@@ -375,32 +375,32 @@ class Session:
 
         On a trajectory every view has its own date, and with a table of poses its own distance of the Sun.
         """
-        scene, site = self.scene, int(self.plan.site[index])
-        first = self.plan.first_of_view(index)
+        site, aims = int(self.plan.site[index]), self.scene.is_aimed
+        if self.trajectory is not None:
+            terrain = self.flown_terrain(index)
+        else:
+            terrain = self.model_terrain(site) if aims else self.terrain(site)
+        return SampleSpec(
+            index=index,
+            scene=self.dated_scene(index),
+            plan=self.plan,
+            faults=self.faults,
+            terrain=terrain,
+            flown=None if self.trajectory is None else self.trajectory.pose(index),
+            terrain_of=self.aimed_terrain if aims else None,
+        )
+
+    def dated_scene(self, index: int) -> Scene:
+        """Return the scene with the date of a sample's view, and with its distance of the Sun on a trajectory."""
+        scene, values = self.scene, {}
         if scene.spice.spacecraft:
-            fraction = float(keyed_uniform(scene.dataset.seed, np.array([first]), "plan", "epoch")[0])
-            sun = scene.sun.model_copy(update={"julian_date": assemble.epoch_jd(scene, site, fraction)})
-            scene = scene.model_copy(update={"sun": sun})
+            first = np.array([self.plan.first_of_view(index)])
+            fraction = float(keyed_uniform(scene.dataset.seed, first, "plan", "epoch")[0])
+            values = {"julian_date": assemble.epoch_jd(scene, int(self.plan.site[index]), fraction)}
         if self.trajectory is not None:
             flown = self.trajectory.pose(index)
             values = {"julian_date": flown.julian_date, "distance_au": flown.sun_distance_au}
-            return SampleSpec(
-                index=index,
-                scene=scene.model_copy(update={"sun": scene.sun.model_copy(update=values)}),
-                plan=self.plan,
-                faults=self.faults,
-                terrain=self.flown_terrain(index),
-                flown=flown,
-            )
-        aims = scene.is_aimed
-        return SampleSpec(
-            index=index,
-            scene=scene,
-            plan=self.plan,
-            faults=self.faults,
-            terrain=self.model_terrain(site) if aims else self.terrain(site),
-            terrain_of=self.aimed_terrain if aims else None,
-        )
+        return scene.model_copy(update={"sun": scene.sun.model_copy(update=values)}) if values else scene
 
     def simulate(self, index: int) -> Sample:
         """Return one finished sample."""

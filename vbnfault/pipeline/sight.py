@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..body import Site
 from ..core import frames
 from ..core.errors import VbnfaultError
 from ..scene.instrument import CameraTable
@@ -28,22 +30,28 @@ def placed(spec: SampleSpec, terrain: Terrain, flown: FlownPose) -> Pose:
     """Return a pose in T as the pose of a sample over a terrain, in whose L it is. No condition is checked."""
     from .. import render
 
-    site, surface = terrain.site, terrain.surface
+    pose = in_local_frame(terrain.site, flown)
+    light = assemble.sunlight(spec.scene, pose.sun_L)
+    position, axes = pose.position_L_m[None], pose.L_from_C[None]
+    visible = float(render.sun_visible_fraction(terrain.surface, position, [light], axes)[0])
+    variables = spec.plan.view(spec.scene, spec.index, 0)
+    return replace(pose, sun_visible_fraction=visible, variables=variables)
+
+
+def in_local_frame(site: Site, flown: FlownPose) -> Pose:
+    """Return a pose in T as a pose in the L of a site, without variables and as if the whole Sun were visible."""
     L_from_T = site.T_from_L.T
-    position = L_from_T @ (flown.camera_position_T_m - site.position_T_m)
-    axes, sun_L = L_from_T @ flown.T_from_C, L_from_T @ flown.sun_direction_T
-    light = assemble.sunlight(spec.scene, sun_L)
-    visible = float(render.sun_visible_fraction(surface, position[None], [light], axes[None])[0])
+    sun_L = L_from_T @ flown.sun_direction_T
     azimuth, elevation = frames.azimuth_elevation_deg(sun_L)
     return Pose(
-        position_L_m=position,
-        L_from_C=axes,
+        position_L_m=L_from_T @ (flown.camera_position_T_m - site.position_T_m),
+        L_from_C=L_from_T @ flown.T_from_C,
         sun_L=sun_L,
         sun_azimuth_deg=azimuth,
         sun_elevation_deg=elevation,
-        sun_visible_fraction=visible,
+        sun_visible_fraction=1.0,
         tries=1,
-        variables=spec.plan.view(spec.scene, spec.index, 0),
+        variables={},
         resolved=True,
     )
 

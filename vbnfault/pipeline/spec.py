@@ -250,12 +250,17 @@ class Labels:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Frame:
-    """Hold the outcome of every stage of one sample. `views` counts the views that were rendered for it."""
+    """Hold the outcome of every stage of one sample.
+
+    `views` counts the views that were rendered for it. `starless` is the radiance of the render without stars, if
+    the scene stores `scene_radiance`.
+    """
 
     spec: SampleSpec
     views: int
     pose: Pose
     rendering: Rendering
+    starless: Radiance | None
     exposure: SceneExposure
     injection: Injection
     images: Images

@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 from typing import ParamSpec, Protocol, TypeVar
 
 from ..core.errors import VbnfaultError
+from ..core.quantities import Radiance
 from .exposure import meter
 from .images import take_images
 from .injection import inject_faults
@@ -45,6 +46,7 @@ class _RenderedView:
     spec: SampleSpec
     pose: Pose
     rendering: Rendering
+    starless: Radiance | None
     exposure: SceneExposure
     injection: Injection
 
@@ -108,12 +110,39 @@ def simulate_frame(spec: SampleSpec, run: StageRunner = run_stage, shared: Share
         views, first_try = views + 1, view.pose.tries
         del view  # release its memory before the next render
         view = _take_view(spec, run, shared, views=views, first_try=first_try)
+    return _frame(view, views, run)
+
+
+def simulate_stored_view(
+    spec: SampleSpec, pose: Pose, rendering: Rendering, views: int, run: StageRunner = run_stage
+) -> Frame:
+    """Run the stages behind the render for one sample, whose view is given, and return its frame.
+
+    A commanded fault that is not visible is left out, since there is no other view.
+
+    Parameters
+    ----------
+    spec
+        The sample, with the terrain of the pose.
+    pose, rendering
+        The outcomes of `resolve` and `render_view`.
+    views
+        Number of views that were rendered for the sample; each has its own draws of the faults.
+    run
+        Function that calls each stage.
+    """
+    return _frame(_expose(spec, run, pose, rendering, views), views, run)
+
+
+def _frame(view: _RenderedView, views: int, run: StageRunner) -> Frame:
+    """Run the last stages of a sample, whose view is kept, and return its frame."""
     spec = view.spec
     return Frame(
         spec=spec,
         views=views,
         pose=view.pose,
         rendering=view.rendering,
+        starless=view.starless,
         exposure=view.exposure,
         injection=view.injection,
         images=run(take_images, spec, view.injection),
@@ -128,12 +157,19 @@ def _take_view(
     pose, rendering = shared.take(spec, run, first_try)
     if not any(spec.faults[name].needs_sun for name in spec.commanded):
         pose = replace(pose, resolved=True)  # only another sample of the view needs the Sun
-    spec = spec.at(pose)
+    return _expose(spec.at(pose), run, pose, rendering, views)
+
+
+def _expose(spec: SampleSpec, run: StageRunner, pose: Pose, rendering: Rendering, views: int) -> _RenderedView:
+    """Run the stages from the exposure of a rendered view to its faults."""
     exposure = run(add_stars, spec, pose, rendering, run(meter, spec, rendering))
+    starless = rendering.light.rendered if "scene_radiance" in spec.scene.dataset.layers else None
     # a second copy of the light without stars takes 37 MB for 1024 pixels
     rendering = replace(rendering, light=exposure.light)
     injection = run(inject_faults, spec, pose, rendering, exposure, views)
-    return _RenderedView(spec=spec, pose=pose, rendering=rendering, exposure=exposure, injection=injection)
+    return _RenderedView(
+        spec=spec, pose=pose, rendering=rendering, starless=starless, exposure=exposure, injection=injection
+    )
 
 
 def _asking_for_another_view(spec: SampleSpec, injection: Injection) -> list[str]:

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from .earth import EarthAlbedo
     from .integrate import radiance
     from .layers import truth
-    from .light import Sampled, direct, direct_by_sample
+    from .light import Sampled, direct, direct_by_sample, sun_in_view
     from .resolve import (
         first_ground,
         ground_height_m,
@@ -57,6 +57,7 @@ _HOMES = {
     "is_clear": "resolve",
     "radiance": "integrate",
     "set_threads": "runtime",
+    "sun_in_view": "light",
     "sun_visible_fraction": "resolve",
     "sunlit_ground": "resolve",
     "truth": "layers",
@@ -127,6 +128,7 @@ __all__ = [
     "radiance",
     "self_test",
     "set_threads",
+    "sun_in_view",
     "sun_visible_fraction",
     "sunlit_ground",
     "truth",

@@ -93,3 +93,19 @@ class RenderInput:
     key: int
     bounces: int = 0
     dust_contrast: F64 | None = None
+
+
+def may_see_sun(view: View, sun: Sunlight) -> bool:
+    """Return whether the Sun's disc may lie in the frame.
+
+    The margin is far larger than the lens's finite aperture.
+    """
+    x, y, z = view.L_from_C.T @ sun.direction_L
+    fx, fy, cx, cy = view.intrinsics
+    if z <= 0:
+        return False
+    # the tangent of the angle grows faster at the edge of a wide field
+    margin = 0.02 + np.tan(2 * sun.angular_radius_rad) * (1 + (x * x + y * y) / z**2)
+    across = (-cx / fx - margin, (view.width_px - cx) / fx + margin)
+    along = (-cy / fy - margin, (view.height_px - cy) / fy + margin)
+    return bool(across[0] <= x / z <= across[1] and along[0] <= y / z <= along[1])

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from ..core.quantities import Radiance, SunInView
 from ..core.sundisc import Pinhole, add_mean, axes, bounds_px
 from .bsdf import Reflection, has_bands
-from .description import RenderInput, Sunlight, View
+from .description import RenderInput, Sunlight, View, may_see_sun
 from .detail import Detail
 from .emitter import Limb, SunDisc, mu, polynomial
 from .runtime import dr, mi
@@ -103,7 +103,7 @@ def sun_in_view(surface: TerrainMesh, view: View, sun: Sunlight) -> SunInView | 
     Rays go from the pupil to points of the disc, one or more in each cell of a grid. The position of an edge across
     the disc is then known to a cell's width, and the area on one side of it to 1e-3 of the disc.
     """
-    if not _may_see(view, sun):
+    if not may_see_sun(view, sun):
         return None
     disc = SunInView(
         direction_C=view.L_from_C.T @ sun.direction_L,
@@ -263,19 +263,3 @@ class Direct(Light):
             inverse = dr.rcp(polynomial(np.array(strata.limb), mu(point)))
             terms = [term * inverse for term in terms]
         return [dr.select(lit, term, 0) for term in terms]
-
-
-def _may_see(view: View, sun: Sunlight) -> bool:
-    """Return whether the Sun's disc may lie in the frame.
-
-    The margin is far larger than the lens's finite aperture.
-    """
-    x, y, z = view.L_from_C.T @ sun.direction_L
-    fx, fy, cx, cy = view.intrinsics
-    if z <= 0:
-        return False
-    # the tangent of the angle grows faster at the edge of a wide field
-    margin = 0.02 + np.tan(2 * sun.angular_radius_rad) * (1 + (x * x + y * y) / z**2)
-    across = (-cx / fx - margin, (view.width_px - cx) / fx + margin)
-    along = (-cy / fy - margin, (view.height_px - cy) / fy + margin)
-    return bool(across[0] <= x / z <= across[1] and along[0] <= y / z <= along[1])

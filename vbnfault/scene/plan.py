@@ -41,6 +41,18 @@ _MAX_EXCHANGES = 200
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
+class EarlierViews:
+    """Hold the views that a dataset takes over from an earlier one, as those of `scene` and its `plan`.
+
+    Sample i of the later plan has the view of sample i // `repeats` of the earlier one.
+    """
+
+    scene: Scene
+    plan: Plan
+    repeats: int = 1
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Plan:
     """Hold the plan of n samples.
 
@@ -53,6 +65,7 @@ class Plan:
     - `light` int64[n] is the sample whose Sun each sample has: itself, or the Sun-facing sample of its pair.
     - `paired` bool[n] marks the samples of pairs (`plan.pair_strata`).
     - `aim` uint8[n] is the aim, an index in `aims.AIMS`; None without `geometry.aim`.
+    - `views` are those of an earlier dataset, if the plan takes them over.
 
     `variants` consecutive samples share a view. They have the same variables, stratum, site and aim at every try.
     """
@@ -69,6 +82,7 @@ class Plan:
     light: NDArray[np.int64]
     paired: NDArray[np.bool_]
     aim: NDArray[np.uint8] | None = None
+    views: EarlierViews | None = None
     variants: int = 1
 
     def __len__(self) -> int:
@@ -99,8 +113,11 @@ class Plan:
         """Return the variables of a sample's view at a try, counted from 0, under the names of VARIABLES.
 
         If the camera aims, the names are those of `aims.AIM_VARIABLES` that the sample's aim needs. `scene` is the
-        scene of the plan. The stratum, the site, the device and the aim of the sample do not change.
+        scene of the plan, unless `views` has another. The stratum, the site, the device and the aim of the sample
+        do not change.
         """
+        if self.views is not None:
+            return self.views.plan.view(self.views.scene, index // self.views.repeats, attempt)
         row = slice(index, index + 1)
         key = np.array([self.first_of_view(index)])
         if attempt == 0:
@@ -160,7 +177,7 @@ def make_plan(
         split=split,
         architecture=_pick(seed, samples, "architecture", len(scene.camera.architectures)),
         readout_direction=_pick(seed, samples, "readout_direction", len(scene.camera.readout_directions)),
-        individual=_individuals(scene, samples, split),
+        individual=individuals(scene, samples, split),
         light=light,
         paired=paired,
         aim=aim,
@@ -608,7 +625,7 @@ def _in_turn(scene: Scene, count: int, used: NDArray[Any]) -> NDArray[np.uint8]:
     return line[:count]
 
 
-def _individuals(scene: Scene, samples: NDArray[np.int64], split: NDArray[np.uint8]) -> NDArray[np.int32]:
+def individuals(scene: Scene, samples: NDArray[np.int64], split: NDArray[np.uint8]) -> NDArray[np.int32]:
     """Return the device that takes each sample, from the devices of its split, int32[n]."""
     of_split = individual_split(scene)
     u = keyed_random.keyed_uniform(scene.dataset.seed, samples, "plan", "individual")

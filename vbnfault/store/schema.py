@@ -98,7 +98,15 @@ LAYERS: dict[str, Array] = {
         ratio=0.4,
     ),
     "radiance": Array("sample band y x", "float16", "W m-2 sr-1 nm-1", "radiance at the camera", ratio=0.7),
+    "scene_radiance": Array(
+        "sample band y_rendered x_rendered",
+        "float16",
+        "W m-2 sr-1 nm-1",
+        "radiance before the lens, on the pinhole grid of the render with its guard band, without stars",
+        ratio=0.7,
+    ),
 }
+RADIANCE_LAYERS = ("radiance", "scene_radiance")  # their data type is `StoreSpec.radiance_dtype`
 # The rule for `mask_effect`, and for the mask of a class that is labelled by effect.
 EFFECT_DN = 1
 EFFECT_RULE = (
@@ -200,7 +208,7 @@ class StoreSpec:
     mask_any_faults
         The classes whose masks `mask_any` unites.
     wavelength_nm
-        Nodes of the bands of `radiance`.
+        Nodes of the bands of `radiance` and `scene_radiance`.
     layers
         Optional layers: names in `LAYERS` or `soft_layers`, or `without_<fault>`.
     localised_faults
@@ -221,6 +229,10 @@ class StoreSpec:
         For each of `STRATA`, the direction from which roll, pitch and yaw are measured: "sun", "nadir" or "centre".
     centre_of_mass_T_m
         The body's centre of mass in T, which the reference "centre" names; stored only with this reference.
+    radiance_dtype
+        Data type of the layers `RADIANCE_LAYERS`: float16 or float32.
+    rendered_shape
+        Rows and columns of `scene_radiance`, which has a guard band around the image; () if it is not stored.
     shard_samples
         Samples a shard. 0 chooses the largest number up to 16 for which the largest array of a shard stays within
         1 GiB and all layers within 2 GiB. A number that is too large is lowered to its largest divisor within these
@@ -252,6 +264,7 @@ class StoreSpec:
     detector_names: tuple[str, ...] = ()
     sample_names: tuple[str, ...] = ()
     radiance_dtype: str = "float16"
+    rendered_shape: tuple[int, ...] = ()
     shard_samples: int = 0
     attributes: Mapping[str, Any] = field(default_factory=dict)
 
@@ -278,7 +291,7 @@ class StoreSpec:
         """Return the schema row of every layer by name, in the order of the `layer` axis."""
         layers = {name: LAYERS[name] for name in REQUIRED_LAYERS}
         for name in self.layers:
-            if name == "radiance":
+            if name in RADIANCE_LAYERS:
                 layers[name] = replace(LAYERS[name], dtype=self.radiance_dtype)
             elif name in LAYERS:
                 layers[name] = LAYERS[name]
@@ -307,6 +320,9 @@ class StoreSpec:
         sizes = {
             "y": self.height,
             "x": self.width,
+            **dict(
+                zip(("y_rendered", "x_rendered"), self.rendered_shape or (self.height, self.width), strict=True)
+            ),
             "fault": len(self.faults),
             "band": len(self.wavelength_nm),
             "layer": len(self.checked),
@@ -339,7 +355,7 @@ class StoreSpec:
             **dict.fromkeys(("roll_deg", "pitch_deg", "yaw_deg"), attitude),
             "detector_individual": {"names": list(self.detector_names)},
             "split": {"names": list(SPLITS)},
-            "radiance": {"coordinates": "wavelength_nm"},
+            **{name: {"coordinates": "wavelength_nm"} for name in RADIANCE_LAYERS},
         }
         size = self.shard_samples
         members = {}
@@ -375,6 +391,7 @@ class StoreSpec:
             "layer": _coordinate("layer", self.checked, long_name="what a checksum covers"),
             **{name: _coordinate(name, tuple(labels), long_name=name) for name, labels in _LABELS.items()},
             **(bands if self.wavelength_nm else {}),
+            **self._rendered_coordinates(),
             **(
                 {"name": _coordinate("sample", self.sample_names[:samples], long_name="name of the sample")}
                 if self.sample_names
@@ -382,6 +399,17 @@ class StoreSpec:
             ),
             "sample": _coordinate("sample", np.arange(samples, dtype=np.int64), long_name="sample"),
         }
+
+    def _rendered_coordinates(self) -> dict[str, Member]:
+        """Return the coordinates of the grid of `scene_radiance`: those of the image, continued beyond it."""
+        if not self.rendered_shape:
+            return {}
+        out = {}
+        for dim, size, of_image in zip("yx", self.rendered_shape, (self.height, self.width), strict=True):
+            values = np.arange(size) + 0.5 - (size - of_image) / 2
+            name = f"{dim}_rendered"
+            out[name] = _coordinate(name, values, units="px", long_name="pixel centres, 0 at the image's border")
+        return out
 
     def layer_bytes(self, name: str) -> int:
         """Return the uncompressed size of one sample of a layer, in bytes."""
@@ -400,6 +428,8 @@ class StoreSpec:
         plain = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "attributes"}
         if not self.sample_names:
             del plain["sample_names"]  # stores without names stay as they were
+        if not self.rendered_shape:
+            del plain["rendered_shape"]
         return plain
 
 
