@@ -72,8 +72,9 @@ def smaller(words: list[str]) -> list[str]:
     for k, (option, value) in enumerate(itertools.pairwise(words)):
         if option in FEWER:
             out[k + 1] = str(min(FEWER[option], int(value)))
-    if words[1] in ("build", "render", "describe"):
-        small = small_values(load_scene(words[2]))
+    if words[1] in ("build", "render", "describe", "retake"):
+        scene = words[words.index("--scene") + 1] if words[1] == "retake" else words[2]
+        small = small_values(load_scene(scene))
         if "--samples" in words or words[1] == "describe":
             del small["dataset.samples"]
         out += [word for key, value in small.items() for word in ("--set", f"{key}={value}")]
