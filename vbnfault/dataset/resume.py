@@ -104,14 +104,14 @@ def check_same_dataset(store: Store, reference: Store) -> None:
         }
         for s in (store, reference)
     )
-    differing = list(_differences(stored, wanted))
+    differing = list(differences(stored, wanted))
     if differing:
         raise InputError(
             f"{store.path}: holds another dataset than {reference.path}: {_named(differing, 'here', 'there')}"
         )
 
 
-def _named(differing: list[_Difference], *holders: str) -> str:
+def _named(differing: list[Difference], *holders: str) -> str:
     """Return the first differences in words; `holders` say where the two values of each are."""
     # keys of the scene first: they tell a user more than the hashes that follow from them
     differing.sort(key=lambda d: (not d.key.startswith("scene."), "hash" in d.key, d.key))
