@@ -280,8 +280,9 @@ def _repeats(opened: Store, scene: Scene, source: str) -> int:
 def _check_same_view(opened: Store, session: pipeline.Session, source: str) -> None:
     """Raise InputError if a scene asks for another view, ground, light or render than the store has."""
     for difference in _differing(opened.attributes["scene"], scene_identity(session)):
+        text = difference.text(f"in {opened.path}", "now")
         raise InputError(
-            f"{source}: {difference.text(f'in {opened.path}', 'now')}: a retake keeps view, ground, light and render; only faults, lens, detector and "
+            f"{source}: {text}: a retake keeps view, ground, light and render; only faults, lens, detector and "
             "exposure may differ"
         )
 
