@@ -14,6 +14,7 @@ from conftest import small_scene
 from lens_kit import bundle
 
 from vbnfault import dataset, pipeline
+from vbnfault.camera import Camera
 from vbnfault.core import resources
 from vbnfault.core.errors import InputError
 from vbnfault.core.quantities import BODY, SUN, Radiance
@@ -24,6 +25,8 @@ from vbnfault.lens import (
 from vbnfault.lens.footprint import DEFAULT_LENS
 from vbnfault.lens.glass import D_NM
 from vbnfault.pipeline.record import to_sample
+from vbnfault.pipeline.spec import SceneExposure, SceneLight
+from vbnfault.pipeline.stars import _rate_with
 from vbnfault.render.description import View
 from vbnfault.scene import config, plan
 from vbnfault.world import assemble, sky
@@ -91,6 +94,20 @@ def test_the_lens_of_a_thin_camera_is_told_by_its_contents(tmp_path: Path, monke
         assert (identity(faults, **camera) != was) == other, (faults, camera)
 
 
+def _check_stars_are_imaged_alone(scene: config.Scene, camera: Camera, dark: Radiance, view: View) -> None:
+    """Above ground that fills the lower half, stars have the electrons that an image of all light together has."""
+    sky_part = np.arange(view.height_px)[:, None] < view.height_px // 2 + np.zeros(view.width_px)
+    ground = dark.with_array(np.where(sky_part, np.float32(0), np.float32(1e-7)) + np.zeros_like(dark.array))
+    stars = assemble.visible_stars(scene, ground, camera, np.eye(3), sky_part, view)
+    assert stars is not None
+    starry = stars.added_to(ground)
+    light = SceneLight(lens=camera.lens, rendered=ground)
+    exposure = SceneExposure(camera=camera, light=light, rate=camera.expose(ground, 1.0))
+    rate, together = _rate_with(stars, exposure, starry).array, camera.expose(starry, 1.0).array
+    assert (together - exposure.rate.array).max() > 0.1 * together.max()
+    np.testing.assert_allclose(rate, together, rtol=1e-5, atol=1e-6 * float(together.max()))
+
+
 @pytest.mark.parametrize("sigma_px", [0.0, 2.5])
 def test_stars_go_through_the_lens(sigma_px: float) -> None:
     """A catalogue's stars on the sensor: where the camera has them, with the light that the beam lets pass.
@@ -117,6 +134,7 @@ def test_stars_go_through_the_lens(sigma_px: float) -> None:
     dark = Radiance(array=np.zeros((3, view.height_px, view.width_px), np.float32), wavelength_nm=nodes)
     seen = assemble.with_stars(stars, dark, c, np.eye(3), np.ones(dark.array.shape[1:], dtype=bool), view)
     image = lens.image(seen)
+    _check_stars_are_imaged_alone(stars, c, seen, view)
     catalogue = sky.load_catalogue().brighter_than(2.5)
     found = [
         (place, k)

@@ -101,3 +101,30 @@ def test_unused_memory_is_released() -> None:
     del array
     memory.release_unused(always=True)
     assert resident() < held - 0.9 * 2**26
+
+
+def test_memory_is_released_in_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nothing is released while a step fits below the limit; what drjit keeps only if the rest was not enough."""
+    held, released = [0], []
+
+    def frees(name: str, left: int) -> None:
+        def release() -> None:
+            released.append(name)
+            held[0] = left
+
+        monkeypatch.setattr(memory, name, release)
+
+    monkeypatch.setattr(memory, "_resident_bytes", lambda: held[0])
+    limit = memory._MOST
+    for before, coming, after_trim, want in (
+        (limit - 2, 1, 0, []),
+        (limit - 2, 2, limit - 3, ["_trim"]),
+        (limit, 0, limit - 1, ["_trim"]),
+        (limit, 9, limit - 9, ["_trim", "_flush"]),
+    ):
+        held[0] = before
+        released.clear()
+        frees("_trim", after_trim)
+        frees("_flush", 0)
+        memory.release_unused(coming)
+        assert released == want, (before, coming)

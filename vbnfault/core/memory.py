@@ -13,32 +13,50 @@ from collections.abc import Callable
 from functools import lru_cache
 from pathlib import Path
 
-# Resident memory in bytes below which nothing is released: memory that is kept makes the next stages faster.
-_ENOUGH = 900 << 20
+# Resident memory in bytes that a process reaches before it releases any. To take memory back from the system costs
+# a tenth of a sample's time where every stage does it, so memory is released only where a step would pass this.
+_MOST = 1280 << 20
 
 
-def release_unused(*, always: bool = False) -> None:
-    """Return freed memory to the operating system if the process holds much; no array is affected.
+def release_unused(coming_bytes: int = 0, *, always: bool = False) -> None:
+    """Return freed memory to the operating system if the process would otherwise hold too much of it.
 
-    `always`: also if the process holds little.
+    No array is affected.
+
+    Parameters
+    ----------
+    coming_bytes
+        Memory that the next step takes in arrays of other sizes than those that were freed.
+    always
+        Release it also if the process holds little.
     """
-    if not always and _resident_bytes() < _ENOUGH:
-        return
+    for release in (_trim, _flush):  # what drjit keeps serves the next wavefront, so it is released last
+        if always or _resident_bytes() + coming_bytes >= _MOST:
+            release()
+
+
+def _flush() -> None:
+    """Return to the system what drjit keeps."""
     drjit = sys.modules.get("drjit")
     if drjit is not None:
         drjit.flush_malloc_cache()
+        _trim()
+
+
+def _trim() -> None:
+    """Return to the system what the C library keeps."""
     trim = _malloc_trim()
     if trim is not None:
         trim(0)
 
 
 def _resident_bytes() -> int:
-    """Return the resident memory of the process; `_ENOUGH` if the system does not report it."""
+    """Return the resident memory of the process; `_MOST` if the system does not report it."""
     try:
         pages = Path("/proc/self/statm").read_text(encoding="ascii").split()[1]
         return int(pages) * os.sysconf("SC_PAGE_SIZE")
     except (OSError, ValueError, AttributeError):
-        return _ENOUGH
+        return _MOST
 
 
 @lru_cache(maxsize=1)

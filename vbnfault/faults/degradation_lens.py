@@ -126,7 +126,7 @@ class Contamination(LensFault):
         lost = params["haze"] + sum(s["share"] for s in params["scratches"])
         out = times(quantity.array, passes * (1 - lost))
         if lost:
-            strewn = _strewn(quantity.array, quantity.white_e, params, context.frame)
+            strewn = _strewn(quantity.array, quantity.white_e, params, context)
             out += times(strewn, passes)
         return quantity.with_array(out)
 
@@ -287,8 +287,9 @@ def kernel(params: Params, frame: ImageFrame, shape: tuple[int, int]) -> F32:
     return out.astype(np.float32)
 
 
-def _strewn(array: F32, white_e: F32, params: Params, frame: ImageFrame) -> F32:
+def _strewn(array: F32, white_e: F32, params: Params, context: FaultContext) -> F32:
     """Return the scattered light, float32[y, x, channel]."""
+    frame = context.frame
     step = _cell_px(frame)
     height, width, channels = array.shape
     rows, columns = -(-height // step), -(-width // step)
@@ -307,7 +308,9 @@ def _strewn(array: F32, white_e: F32, params: Params, frame: ImageFrame) -> F32:
     ).reshape(*shape, channels)
     around[top : top + rows, left : left + columns] = cells
     planes = np.ascontiguousarray(np.moveaxis(around, -1, 0))
-    spread = fft.irfft2(fft.rfft2(planes) * fft.rfft2(kernel(params, frame, shape)), s=shape)
+    # all twins share the transform of the kernel
+    waves = context.once("contamination.kernel", params, lambda: fft.rfft2(kernel(params, frame, shape)))
+    spread = fft.irfft2(fft.rfft2(planes) * waves, s=shape)
     inner = np.moveaxis(spread[:, top - 1 : top + rows + 1, left - 1 : left + columns + 1], 0, -1)
     inner = np.maximum(np.ascontiguousarray(inner), np.float32(0))
     if step == 1:

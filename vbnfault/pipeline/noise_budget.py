@@ -75,7 +75,8 @@ def sample_to_noise(
 
     camera = spec.camera
     electron_rate = green_per_second(spec)
-    release_unused()  # what the sample before took
+    frame_bytes = 4 * len(electron_rate) * scene.view.height_px * scene.view.width_px
+    release_unused(6 * frame_bytes)  # what the sample before took
     sampled = render.direct_by_sample(spec.terrain.surface, scene, electron_rate)
     indirect = None
     if guide is not None and scene.bounces:
@@ -83,7 +84,7 @@ def sample_to_noise(
     light = sampled.radiance.array.copy() if indirect is None else sampled.radiance.array + indirect
     whole = sampled.radiance.with_array(light.view())
     sampled = replace(sampled, radiance=whole)  # a copy in all bands takes 37 MB for a frame of 1024 pixels
-    release_unused()  # samples in cells have wavefronts of other sizes
+    release_unused(2 * frame_bytes)  # samples in cells have wavefronts of other sizes
     exposure = foreseen_exposure_s(spec.scene, camera, truth, scene.view, whole)
     exposure *= 2 ** max(spec.scene.camera.exposure_stops[1], 0.0)  # the longest of the samples of the view
     signal_e = np.einsum("b,byx->yx", electron_rate * exposure, whole.array)

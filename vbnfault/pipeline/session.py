@@ -36,6 +36,8 @@ if TYPE_CHECKING:
 
 # Limit of the slope of an octave of the finest relief: steeper relief would look like needles.
 _STEEPEST_DETAIL = 0.12
+# Memory that a new terrain takes (a patch of a million triangles and its tree of boxes), and its first render.
+_TERRAIN_BYTES, _RENDER_BYTES = 400 << 20, 300 << 20
 # Leaving out the smallest boulders is usual: the packaged scenes keep at least a quarter of those that are drawn. A
 # smaller fraction than this one means that the ground takes nearly all triangles.
 _FEWEST_KEPT = 0.05
@@ -294,12 +296,12 @@ class Session:
 
         if self._threads is not None:
             render.set_threads(self._threads)
-        release_unused()  # what the last terrain and the last sample took
+        release_unused(_TERRAIN_BYTES)  # what the last terrain and the last sample took
         activity.begin(f"terrain of site {site.index}")
         patch = self.patch(site, detail)
         site, surface = patch.site, self.surface(patch)
         del patch
-        release_unused()
+        release_unused(_RENDER_BYTES)
         return Terrain(body=self.body, site=site, surface=surface, vehicle=self.vehicle)
 
     def surface(self, patch: Patch) -> TerrainMesh:

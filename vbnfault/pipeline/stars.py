@@ -4,7 +4,12 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
+
+from ..camera import Camera
+from ..core.quantities import Electrons, Radiance
 from ..world import assemble
+from ..world.sky import StarRadiance
 from .spec import Pose, Rendering, SampleSpec, SceneExposure, SceneLight
 
 
@@ -16,10 +21,22 @@ def add_stars(spec: SampleSpec, pose: Pose, rendering: Rendering, exposure: Scen
     T_from_J = assemble.target_attitude(spec.scene, T_from_L @ pose.sun_L)
     J_from_C = T_from_J.T @ T_from_L @ pose.L_from_C
     starless = exposure.light.rendered
-    starry = assemble.with_stars(
+    stars = assemble.visible_stars(
         spec.scene, starless, exposure.camera, J_from_C, rendering.open_sky, rendering.scene.view
     )
-    if starry is starless:
+    if stars is None:
         return exposure
-    light = SceneLight(lens=exposure.light.lens, rendered=starry)
-    return replace(exposure, light=light, rate=exposure.camera.expose(starry, 1.0))
+    light = SceneLight(lens=exposure.light.lens, rendered=stars.added_to(starless))
+    return replace(exposure, light=light, rate=_rate_with(stars, exposure, light.rendered))
+
+
+def _rate_with(stars: StarRadiance, exposure: SceneExposure, starry: Radiance) -> Electrons:
+    """Return the electrons expected after one second of a radiance that contains the stars."""
+    camera: Camera = exposure.camera
+    if camera.lens.real is None:
+        return camera.expose(starry, 1.0)
+    # a lens with surfaces spreads light over few pixels, so that most of the stars' own image is dark and quick
+    array = np.zeros(starry.array.shape, np.float32)  # pages that stay empty take no memory
+    array[:, stars.rows, stars.columns] = stars.radiance
+    own = camera.expose(Radiance(array=array, wavelength_nm=starry.wavelength_nm), 1.0)
+    return replace(exposure.rate, array=exposure.rate.array + own.array)

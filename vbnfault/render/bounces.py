@@ -12,6 +12,7 @@ edges of surfaces (à trous: Dammertz et al. 2010, HPG, 67) then averages over n
 from __future__ import annotations
 
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from typing import Any
 
@@ -67,9 +68,13 @@ def indirect(surface: TerrainMesh, scene: RenderInput, truth: Truth) -> Image:
     # colour varies less than brightness, so it is averaged more widely
     colours = np.stack([_averaged(band) for band in light])
     colours /= np.maximum(colours.sum(axis=0), 1e-6 * brightness.max())
-    for band, colour in zip(out, colours, strict=True):
-        wide = cv2.resize(colour, (2 * coarse.view.width_px, 2 * coarse.view.height_px))
-        np.multiply(wide[: out.shape[1], : out.shape[2]], bright, out=band)
+
+    def coloured(band: int) -> None:
+        wide = cv2.resize(colours[band], (2 * coarse.view.width_px, 2 * coarse.view.height_px))
+        np.multiply(wide[: out.shape[1], : out.shape[2]], bright, out=out[band])
+
+    with ThreadPoolExecutor(dr.thread_count()) as pool:  # numpy and OpenCV use one core here
+        list(pool.map(coloured, range(len(out))))
     return out
 
 

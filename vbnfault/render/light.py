@@ -90,10 +90,11 @@ def _with_sun(surface: TerrainMesh, scene: RenderInput, array: NDArray[np.float3
     sun: NDArray[np.float32] | None = None
     if (disc := sun_in_view(surface, view, scene.sun)) is not None:
         sun = np.zeros(array.shape, np.float32)  # pages that stay empty take no memory
-        if add_mean(sun, disc, Pinhole(view.intrinsics), range(bands)) is None:
+        window = add_mean(sun, disc, Pinhole(view.intrinsics), range(bands))
+        if window is None:
             sun = None
         else:
-            array += sun
+            array[:, *window] += sun[:, *window]
     return Radiance(array=array, wavelength_nm=scene.wavelength_nm, sun=sun, disc=None if sun is None else disc)
 
 
@@ -101,10 +102,20 @@ def sun_in_view(surface: TerrainMesh, view: View, sun: Sunlight) -> SunInView | 
     """Return the Sun's disc as the camera sees it and which parts are hidden; None if it is not in the frame.
 
     Rays go from the pupil to points of the disc, one or more in each cell of a grid. The position of an edge across
-    the disc is then known to a cell's width, and the area on one side of it to 1e-3 of the disc.
+    the disc is then known to a cell's width, and the area on one side of it to 1e-3 of the disc. Radiance and truth
+    of a view share the result.
     """
     if not may_see_sun(view, sun):
         return None
+    if (kept := surface.kept_sun) is not None and kept[0] is view and kept[1] is sun:
+        return kept[2]
+    disc = _traced_disc(surface, view, sun)
+    surface.kept_sun = view, sun, disc
+    return disc
+
+
+def _traced_disc(surface: TerrainMesh, view: View, sun: Sunlight) -> SunInView | None:
+    """Return `sun_in_view` of a disc that may lie in the frame."""
     disc = SunInView(
         direction_C=view.L_from_C.T @ sun.direction_L,
         angular_radius_rad=sun.angular_radius_rad,
@@ -222,8 +233,11 @@ class Direct(Light):
                 signals[1][span] = terms.pop().numpy().reshape(-1, spp)
             sums = [dr.block_sum(term, spp) for term in terms]
             dr.eval(*sums)
-            for row, total in zip(weights, sums, strict=False):
+            for k, (row, total) in enumerate(zip(weights, sums, strict=False)):
                 values = total.numpy()
+                if self.banded:  # the only term of its band, which is quicker than a sum
+                    np.multiply(values, row[k], out=out[k, span])
+                    continue
                 if not values.any():
                     continue
                 for band in np.flatnonzero(row):

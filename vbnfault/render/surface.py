@@ -14,8 +14,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core.quantities import SunInView
 from .albedo import AlbedoMap
-from .description import View
+from .description import Sunlight, View
 from .detail import Detail, FineRelief
 from .earth import EarthAlbedo
 from .mesh import mesh_scene
@@ -71,6 +72,7 @@ class TerrainMesh:
         dr.eval(self._corners, self._dust)
         self.vehicle, self.fine, self.albedo = vehicle, fine, albedo
         self._mesh, self._facet_count = self.scene.shapes()[0], len(faces)
+        self.kept_sun: tuple[View, Sunlight, SunInView | None] | None = None  # the last result of `sun_in_view`
 
     def corners_m(self, facets: NDArray[np.intp]) -> NDArray[np.float64]:
         """Return the corners of facets, float64[facet, corner, 3] in L."""

@@ -557,7 +557,20 @@ def with_stars(
     open_sky: NDArray[np.bool_],
     view: View | None = None,
 ) -> Radiance:
-    """Return the radiance with the stars that the scene asks for and the exposure can show.
+    """Return the radiance with the stars of `visible_stars` added; the parameters are the same."""
+    stars = visible_stars(scene, radiance, camera, J_from_C, open_sky, view)
+    return radiance if stars is None else stars.added_to(radiance)
+
+
+def visible_stars(
+    scene: Scene,
+    radiance: Radiance,
+    camera: Camera,
+    J_from_C: F64,
+    open_sky: NDArray[np.bool_],
+    view: View | None = None,
+) -> sky.StarRadiance | None:
+    """Return the stars that the scene asks for and the exposure can show; None if there are none.
 
     Parameters
     ----------
@@ -578,11 +591,11 @@ def with_stars(
     `sky.sigma_px` is.
     """
     if scene.sky.stars == "off" or not open_sky.any():
-        return radiance
+        return None
     sigma_px = _STAR_SIGMA_PX if camera.lens.blurs else scene.sky.sigma_px
     faintest = _faintest_star(scene, camera, radiance.wavelength_nm, sigma_px)
     if faintest < sky.BRIGHTEST_V:
-        return radiance
+        return None
     grid = camera if view is None else view
     stars = sky.star_radiance(
         sky.load_catalogue().brighter_than(faintest),
@@ -595,7 +608,7 @@ def with_stars(
         sky=open_sky,
         lens_falloff=camera.lens.falls_off,
     )
-    return stars.added_to(radiance)
+    return stars if len(stars.rows) else None
 
 
 def _faintest_star(scene: Scene, camera: Camera, wavelength_nm: F64, sigma_px: float) -> float:

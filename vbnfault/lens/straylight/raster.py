@@ -36,7 +36,7 @@ EDGE_LOW, EDGE_HIGH = -1.0, 5.0  # range of the profile of a soft edge, in width
 _EDGE_NODES = 2049
 _UNLIKE = 0.05  # ratio of neighbouring areas below which a fold is near
 _SMOOTH = 0.5  # change of irradiance over a pixel that still looks smooth
-_LANES = 16  # lanes of a vector unit
+_NEIGHBOURS = 4096  # lanes that follow each other, mostly cells side by side, whose pixels share the cache
 _NARROW_PX = 1.5  # cells narrower than this are drawn by points
 _POINTS = 64  # largest number of points along each side of a cell
 _WANDER = 1.0  # largest distance of a cell's points beyond its corners, in sizes of the cell
@@ -266,7 +266,8 @@ class Sums:
             for start, weight in bands:
                 # negative numbers wrap around, and wrap back when they are read as signed
                 units = be.UInt64(be.Int64(dr.round(dr.clip(value, -_MOST, _MOST) * weight)))
-                dr.scatter_add(total, units, start + pixel, shown & (weight > 0), mode=dr.ReduceMode.Auto)
+                # the lanes of a vector rarely add to the same pixel, so they are not summed beforehand
+                dr.scatter_add(total, units, start + pixel, shown & (weight > 0), mode=dr.ReduceMode.Direct)
 
         return add
 
@@ -291,15 +292,16 @@ class Sums:
 def _shared_out(work: NDArray[np.uint32], chosen: NDArray[np.int64]) -> NDArray[np.uint32]:
     """Return lanes in an order that balances the work.
 
-    Lanes with equal work are neighbours, because neighbours in the vector unit wait for one another. Groups of such
-    lanes are scattered so that every thread gets some of the large ones.
+    Lanes with equal work are neighbours, because neighbours in the vector unit wait for one another. Among those,
+    neighbouring cells follow each other. Groups of such lanes are scattered so that every thread gets some of the
+    large ones.
     """
     size = np.minimum(work[chosen], 65535).astype(np.uint16)
     order = chosen[np.argsort(size, kind="stable")].astype(np.uint32)
-    groups = len(order) // _LANES
+    groups = len(order) // _NEIGHBOURS
     golden = np.argsort(np.arange(groups) * ((np.sqrt(5) - 1) / 2) % 1)
-    rest = order[groups * _LANES :]
-    return np.concatenate([order[: groups * _LANES].reshape(groups, _LANES)[golden].ravel(), rest])
+    rest = order[groups * _NEIGHBOURS :]
+    return np.concatenate([order[: groups * _NEIGHBOURS].reshape(groups, _NEIGHBOURS)[golden].ravel(), rest])
 
 
 class _Triangle:

@@ -205,8 +205,10 @@ class SunlightInLens:
         The values are those of `total`, but the parts are not kept: each takes 34 MB for 1024 pixels and 8 bands.
         """
         pitch_mm = self.sensor.pitch_mm
+        frame_bytes = 4 * len(self.nodes_nm) * self.sensor.shape[0] * self.sensor.shape[1]
+        release_unused(9 * frame_bytes)  # the sums of all levels take 90 MB, the cells 200 MB
         combined = self._ghosts()
-        release_unused()  # the sums of all levels take 90 MB
+        release_unused()
         ghosts_mm2 = _flux_mm2(combined, pitch_mm)
         fluxes, outside = [], []
         for part in (self.starburst, self.glare, self.veil):
