@@ -14,7 +14,7 @@ from vbnfault.detector import ThreeColourDetector
 from vbnfault.lens import ThinLens
 from vbnfault.reflectance.disc import Lambert
 from vbnfault.render.description import RenderInput, Sunlight, View
-from vbnfault.render.runtime import dr, mi
+from vbnfault.render.runtime import dr, mi, packets
 
 UP = np.array([0.0, 0.0, -1.0])
 NODES = spectra.band_nodes_nm(400.0, 700.0, 8)
@@ -335,6 +335,15 @@ def test_a_new_view_compiles_nothing() -> None:
     compiled = [k for k in history if "hash" in k and not k["cache_hit"]]
     assert history
     assert not compiled
+
+
+def test_tables_of_packets_are_aligned() -> None:
+    """Wherever numpy's memory begins: otherwise drjit makes another kernel, which fetches single numbers."""
+    values = np.arange(97, dtype=np.float32)
+    for start in range(3):
+        table = packets(mi.Float, values[start : start + 94].reshape(2, 47))
+        assert table.data_() % 64 == 0
+        np.testing.assert_array_equal(table.numpy(), values[start : start + 94])
 
 
 def test_large_images_are_cut_without_a_seam() -> None:

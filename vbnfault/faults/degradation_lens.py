@@ -309,7 +309,7 @@ def _strewn(array: F32, white_e: F32, params: Params, context: FaultContext) -> 
     around[top : top + rows, left : left + columns] = cells
     planes = np.ascontiguousarray(np.moveaxis(around, -1, 0))
     # all twins share the transform of the kernel
-    waves = context.once("contamination.kernel", params, lambda: fft.rfft2(kernel(params, frame, shape)))
+    waves = context.once(f"contamination.kernel {shape}", params, lambda: fft.rfft2(kernel(params, frame, shape)))
     spread = fft.irfft2(fft.rfft2(planes) * waves, s=shape)
     inner = np.moveaxis(spread[:, top - 1 : top + rows + 1, left - 1 : left + columns + 1], 0, -1)
     inner = np.maximum(np.ascontiguousarray(inner), np.float32(0))

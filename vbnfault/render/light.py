@@ -268,12 +268,19 @@ class Direct(Light):
         hit = self.world.intersect(rays)
         point = strata.disc(SUN_DIMENSION)
         towards, lit = self.lit(hit, point)
-        terms = self.reflection(hit, rays, strata).terms(towards)
-        if not self.banded:
-            terms = [terms[0] * profile for profile in self.limb.terms(mu(point))]
-        elif self.limb.profiles is not None:
-            terms = [t * polynomial(c, mu(point)) for t, c in zip(terms, self.limb.profiles, strict=True)]
-        if strata.limb is not None:
-            inverse = dr.rcp(polynomial(np.array(strata.limb), mu(point)))
-            terms = [term * inverse for term in terms]
-        return [dr.select(lit, term, 0) for term in terms]
+
+        def sunlit() -> tuple[Any, ...]:
+            """Return the terms of samples that sunlight reaches."""
+            terms = self.reflection(hit, rays, strata).terms(towards)
+            if not self.banded:
+                terms = [terms[0] * profile for profile in self.limb.terms(mu(point))]
+            elif self.limb.profiles is not None:
+                terms = [t * polynomial(c, mu(point)) for t, c in zip(terms, self.limb.profiles, strict=True)]
+            if strata.limb is not None:
+                inverse = dr.rcp(polynomial(np.array(strata.limb), mu(point)))
+                terms = [term * inverse for term in terms]
+            return tuple(terms)
+
+        # packets of samples without sunlight skip the branch
+        none = tuple(mi.Float(0) for _ in range(len(self.weights)))
+        return list(dr.if_stmt((), lit, sunlit, lambda: none, mode="symbolic"))
