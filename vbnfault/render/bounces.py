@@ -25,7 +25,7 @@ from .bsdf import has_bands
 from .cells import Cells, CellStrata
 from .description import RenderInput, View
 from .light import WAVEFRONT, Light
-from .runtime import dr, mi
+from .runtime import dr, mi, packets
 from .sampling import SUN_DIMENSION, Optics, Strata
 from .surface import TerrainMesh, facing
 
@@ -60,7 +60,7 @@ def indirect(surface: TerrainMesh, scene: RenderInput, truth: Truth) -> Image:
     out = np.zeros((len(light), scene.view.height_px, scene.view.width_px), dtype=np.float32)
     if not brightness.any():
         return out
-    smooth = mi.Float(brightness.ravel())
+    smooth = packets(mi.Float, brightness)
     for stride in _STRIDES:
         smooth = guide.filtered(smooth, stride)
         dr.eval(smooth)
@@ -282,7 +282,7 @@ class _Guide:
         """Return the guide of a view's truth."""
         record = np.concatenate([truth.normal.astype(np.float32), truth.depth_m[..., None]], axis=2)
         record[~np.isfinite(truth.depth_m)] = 0
-        return cls(view, mi.Float(record.ravel()))
+        return cls(view, packets(mi.Float, record))
 
     def _geometry_at(self, x: Any, y: Any) -> tuple[Any, Any, Any]:
         """Return the normal, the position in camera axes and the depth (0 on the sky) at pixels."""

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .runtime import dr, mi
+from .runtime import dr, mi, packets
 
 _SIDE = 512  # texels
 _LEVELS = 8
@@ -173,7 +173,7 @@ def _pyramid() -> Any:
     ]
     # each texel with its neighbours to the right, below, and both makes one packet
     corners = [np.stack([np.roll(w, (-j, -i), (0, 1)) for j in (0, 1) for i in (0, 1)], axis=-1) for w in words]
-    table = mi.Int32(np.concatenate([of.reshape(-1) for of in corners]))
+    table = packets(mi.Int32, np.concatenate([of.reshape(-1) for of in corners]))
     dr.eval(table)
     return table
 

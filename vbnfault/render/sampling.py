@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .description import View
-from .runtime import dr, mi
+from .runtime import dr, mi, packets
 
 # Dimension of a sample's random numbers for the Sun's disc. The lens uses dimension 1, bounces use the later ones.
 SUN_DIMENSION = 0
@@ -109,7 +109,7 @@ _DISC_SETS = 256
 def _disc_table(samples: int, dimension: int, limb: tuple[float, ...] | None = None) -> Any:
     """Return stratified points of the unit disc: `_DISC_SETS` sets of `samples`, each set in its own order."""
     points = disc_sets(samples, dimension) if limb is None else limb_sets(samples, dimension, limb)
-    table = mi.Float(points.astype(np.float32).ravel())
+    table = packets(mi.Float, points.astype(np.float32))
     dr.eval(table)
     return table
 

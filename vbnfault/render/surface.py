@@ -20,7 +20,7 @@ from .description import Sunlight, View
 from .detail import Detail, FineRelief
 from .earth import EarthAlbedo
 from .mesh import mesh_scene
-from .runtime import dr, mi
+from .runtime import dr, mi, packets
 from .sampling import opaque_vector
 from .vehicle import Vehicle, World
 
@@ -68,7 +68,7 @@ class TerrainMesh:
             normals = aside.submit(_vertex_normals, vertices_m, faces, flat)
             self.scene = mesh_scene("terrain", vertices_m, faces)
         self._corners = _corner_records(self.scene.shapes()[0], len(faces), flat, normals.result())
-        self._dust = mi.Float(0.0 if dust is None else np.ascontiguousarray(_with_a_fourth(dust[faces])).ravel())
+        self._dust = mi.Float(0.0) if dust is None else packets(mi.Float, _with_a_fourth(dust[faces]))
         dr.eval(self._corners, self._dust)
         self.vehicle, self.fine, self.albedo = vehicle, fine, albedo
         self._mesh, self._facet_count = self.scene.shapes()[0], len(faces)

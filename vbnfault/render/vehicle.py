@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from .description import View
 from .detail import Detail
 from .mesh import mesh_scene
-from .runtime import dr, mi
+from .runtime import dr, mi, packets
 from .sampling import opaque_vector
 
 if TYPE_CHECKING:
@@ -58,7 +58,7 @@ class Vehicle:
         normal = np.cross(b - a, c - a)
         normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
         # four floats per facet, fetched in one packet: its normal and its material
-        self._facets = mi.Float(np.column_stack([normal, face_material]).astype(np.float32).ravel())
+        self._facets = packets(mi.Float, np.column_stack([normal, face_material]).astype(np.float32))
         self._reflectance = [mi.Float(np.ascontiguousarray(column, np.float32)) for column in reflectance.T]
         dr.eval(self._facets, *self._reflectance)
 
