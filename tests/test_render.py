@@ -342,7 +342,7 @@ def test_tables_of_packets_are_aligned() -> None:
     values = np.arange(97, dtype=np.float32)
     for start in range(3):
         table = packets(mi.Float, values[start : start + 94].reshape(2, 47))
-        assert table.data_() % 64 == 0
+        assert table.numpy().ctypes.data % 64 == 0
         np.testing.assert_array_equal(table.numpy(), values[start : start + 94])
 
 
