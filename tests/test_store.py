@@ -56,7 +56,7 @@ def test_xarray_opens_it_without_a_warning_and_shows_axes_units_and_coordinates(
         warnings.simplefilter("error")
         with xarray.open_zarr(whole.path) as data:
             assert data["image"].dims == ("sample", "y", "x", "channel")
-            assert data["image"].attrs["units"] == "DN"
+            assert data["image"].attrs["units"] == "count"
             assert data["depth_m"].attrs["units"] == "m"
             assert list(data["channel"].values) == ["R", "G", "B", "I"]
             assert list(data["fault"].values) == list(FAULTS)
@@ -291,7 +291,7 @@ def test_paths_that_hold_no_store_are_one_sentence(tmp_path: Path, whole: st.Sto
 @pytest.mark.parametrize(
     ("version", "sentence"),
     [
-        (st.FORMAT_VERSION + 1, f"reads {st.FORMAT_VERSION}; install a newer one$"),
+        (st.FORMAT_VERSION + 1, f"reads up to {st.FORMAT_VERSION}; install a newer one$"),
         (
             1,
             "of vbnfault 0.1: .*earlier.*; open it with xarray, complete it with vbnfault 0.1, or",

@@ -36,6 +36,7 @@ COMMANDS = {
     "merge": "{}/s.zarr --out {}/m.zarr",
     "stats": "{}/s.zarr",
     "report": "{}/s.zarr --out {}/r.html",
+    "migrate": "{}/s.zarr",
     "shape": "67P --url http://localhost/s.obj --out {}",  # the file lies there already
 }
 # they end with the test render, a sample's files, samples, an evaluated study or levels, and print through the same

@@ -431,17 +431,17 @@ def _fault_overview(classes: Mapping[str, Mapping[str, Any]]) -> str:
 def store_arrays() -> dict[str, Any]:
     """Return the schema row of every array that a store may hold, by name; `<fault>` stands for a class."""
     from vbnfault import faults as registered
-    from vbnfault.store import schema
+    from vbnfault import store as stores
 
     classes = registered.registry()
     soft = {cls.soft_layer: name for name, models in classes.items() for cls in models.values() if cls.soft_layer}
-    spec = schema.StoreSpec(
+    spec = stores.StoreSpec(
         height=1,
         width=1,
         faults=(*classes, "<fault>"),
         mask_any_faults=(),
         soft_layers=(*(next((s for s, f in soft.items() if f == name), "") for name in classes), ""),
-        layers=(*(n for n in schema.LAYERS if n not in schema.REQUIRED_LAYERS), "without_<fault>", *soft),
+        layers=(*(n for n in stores.LAYERS if n not in stores.REQUIRED_LAYERS), "without_<fault>", *soft),
         wavelength_nm=(550.0,),
     )
     return dict(spec.arrays)
@@ -449,11 +449,11 @@ def store_arrays() -> dict[str, Any]:
 
 def store() -> str:
     """Return every array of a store with its dimensions, type, unit and meaning."""
-    from vbnfault.store import schema
+    from vbnfault import store as stores
 
     arrays = store_arrays()
     layers = {n: row for n, row in arrays.items() if {"y", "x"} <= set(row.dims)}
-    required = {n: row for n, row in layers.items() if n in schema.REQUIRED_LAYERS}
+    required = {n: row for n, row in layers.items() if n in stores.REQUIRED_LAYERS}
     optional = {n: row for n, row in layers.items() if n not in required}
     scalars = {n: row for n, row in arrays.items() if n not in layers}
 
@@ -470,7 +470,7 @@ def store() -> str:
 
     return "\n".join(
         [
-            f"This vbnfault writes the format version {schema.FORMAT_VERSION}.",
+            f"This vbnfault writes the format version {stores.FORMAT_VERSION}.",
             "\n## Layers that every store has\n",
             rows(required),
             "\n## Optional layers\n\nThe scene key `dataset.layers` names them.\n",

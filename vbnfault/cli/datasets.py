@@ -194,6 +194,25 @@ def digest(store: StoreArgument) -> None:
 
 
 @app.command(rich_help_panel=_PANEL)
+def migrate(
+    store: StoreArgument,
+    out: Annotated[
+        Path | None,
+        typer.Option(help="Path of a copy, which takes fewer bytes; without it the store itself is changed."),
+    ] = None,
+) -> None:
+    """Bring a store of an earlier format to that of this vbnfault; values and digest stay the same."""
+    from .. import store as stores
+    from ..dataset.migration import migrate_store
+
+    opened = stores.open_store(store)
+    before, length = opened.spec.format_version, opened.samples if out is not None else 0
+    with typer.progressbar(length=length, label="samples", file=sys.stderr, hidden=not length) as bar:
+        migrated = migrate_store(store, out, progress=bar.update)
+    typer.echo(f"{migrated.path}: {migrated.samples} samples, format {migrated.spec.format_version}, was {before}")
+
+
+@app.command(rich_help_panel=_PANEL)
 def preview(
     store: StoreArgument,
     out: Annotated[Path, typer.Option(help="PNG file to write.")],

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from .from_scene import SessionFactory, build_scene, describe_scene
     from .identity import is_exact, planned, scene_identity, store_spec
     from .merge import merge_stores
+    from .migration import migrate_store
 
 __all__ = [
     "BuildOptions",
@@ -26,6 +27,7 @@ __all__ = [
     "describe_scene",
     "is_exact",
     "merge_stores",
+    "migrate_store",
     "missing_plugins",
     "planned",
     "scene_identity",
@@ -41,6 +43,7 @@ _HOMES = {
     "describe_scene": "from_scene",
     "is_exact": "identity",
     "merge_stores": "merge",
+    "migrate_store": "migration",
     "missing_plugins": "checking",
     "planned": "identity",
     "scene_identity": "identity",

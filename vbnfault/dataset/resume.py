@@ -161,7 +161,7 @@ def _part(text: str, start: int) -> str:
 
 def _compared(spec: StoreSpec) -> dict[str, Any]:
     """Return what a store and a scene must have in common, as plain data."""
-    everything = json.loads(json.dumps({**spec.attributes, **spec.plain()}))
+    everything = json.loads(json.dumps({**spec.attributes, **spec.data}))
     return {key: value for key, value in everything.items() if key not in _NOT_COMPARED}
 
 

@@ -17,6 +17,7 @@ Only this package imports zarr. A sample has layers (arrays with one value or ve
   rebuilt.
 """
 
+from .arrays import EFFECT_RULE, LAYERS, REQUIRED_LAYERS, SCALARS, SEMANTIC, Array
 from .check import (
     Planned,
     Problem,
@@ -34,23 +35,12 @@ from .check import (
 )
 from .codec import Encoded, encode, mask_union
 from .counts import FaultCounts
+from .formats import FORMAT_VERSION
 from .group import Store, create, is_store, open_store, write_samples
 from .labelled import open_dataset
 from .metadata import append_samples, recover
-from .schema import (
-    EFFECT_RULE,
-    FORMAT_VERSION,
-    LAYERS,
-    REQUIRED_LAYERS,
-    SCALARS,
-    SEMANTIC,
-    SPLITS,
-    STRATA,
-    VOLATILE_ATTRIBUTES,
-    Array,
-    Member,
-    StoreSpec,
-)
+from .migration import check_target, migrate, migrate_copy
+from .schema import SPLITS, STRATA, VOLATILE_ATTRIBUTES, Member, StoreSpec
 from .shards import FetchedSample, ShardReader
 
 __all__ = [
@@ -77,6 +67,7 @@ __all__ = [
     "StoreSpec",
     "append_samples",
     "check_shard",
+    "check_target",
     "count_faults",
     "create",
     "digest",
@@ -85,6 +76,8 @@ __all__ = [
     "examine_shard",
     "is_store",
     "mask_union",
+    "migrate",
+    "migrate_copy",
     "open_dataset",
     "open_store",
     "problem_samples",

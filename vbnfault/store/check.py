@@ -18,11 +18,14 @@ from numpy.typing import NDArray
 
 from ..core.errors import VbnfaultError
 from ..core.quantities import soft_kind
-from .codec import DIGEST_BYTES, crc_of_scalars, decompress, mask_union, sample_digest, threads
+from .arrays import SCALARS
+from .codec import DIGEST_BYTES, crc_of_scalars, mask_union, sample_digest, threads
+from .compressors import compressor
 from .counts import FaultCounts
+from .formats import DIGEST_VERSION
 from .group import Store, open_store
 from .metadata import metadata_problems, short
-from .schema import SCALARS, VOLATILE_ATTRIBUTES, StoreSpec
+from .schema import VOLATILE_ATTRIBUTES, StoreSpec
 
 
 class Problem(NamedTuple):
@@ -195,7 +198,7 @@ def _layers(
             why = f"has no chunk in {file}"
         else:
             try:
-                layers[name] = decompress(chunks[name][i])
+                layers[name] = compressor(store.spec.codecs[name]).decode(chunks[name][i])
                 if google_crc32c.value(layers[name]) != crcs[k]:
                     why = f"in {file} does not match its stored crc32c"
             except ValueError:
@@ -498,9 +501,11 @@ class SampleDigests:
         A sample without a digest counts as unfinished: zeros stand for it.
         """
         attributes = {k: v for k, v in store.attributes.items() if k not in VOLATILE_ATTRIBUTES}
-        plain = {k: v for k, v in store.spec.plain().items() if k != "shard_samples"}
+        attributes["format_version"] = DIGEST_VERSION
         arrays = [[name, array.dims, array.dtype] for name, array in sorted(store.spec.arrays.items())]
-        total = hashlib.sha256(json.dumps([attributes, plain, store.samples, arrays], sort_keys=True).encode())
+        total = hashlib.sha256(
+            json.dumps([attributes, store.spec.data, store.samples, arrays], sort_keys=True).encode()
+        )
         total.update(self._digests.data)
         return total.hexdigest()
 

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from ..core.errors import InputError, VbnfaultError
 from ..core.quantities import Sample
 from . import disk
+from .arrays import SCALARS
 from .codec import (
     Encoded,
     chunk_ranges,
@@ -31,6 +32,7 @@ from .codec import (
     join_shard,
     split_shard,
 )
+from .formats import FIRST_PROGRAM, FORMAT_VERSION, READ_VERSIONS
 from .layout import (
     CHECKSUM,
     DOCUMENT,
@@ -47,7 +49,7 @@ from .layout import (
     sealed,
     to_bytes,
 )
-from .schema import FORMAT_VERSION, FORMATS, SCALARS, StoreSpec, spec_from_plain
+from .schema import StoreSpec, spec_from_plain
 
 if TYPE_CHECKING:
     import zarr
@@ -440,14 +442,14 @@ def create(path: str | os.PathLike[str], spec: StoreSpec, samples: int, *, overw
         target.absolute().parent.mkdir(parents=True, exist_ok=True)
         _remove_abandoned(target.absolute())
         with _hidden_folder(target.absolute()) as hidden:
-            disk.write(hidden, _group_files(spec, samples))
+            disk.write(hidden, group_files(spec, samples))
             _replace(hidden, target.absolute(), old=old)
     except OSError as error:
         raise InputError(f"{target}: no store can be created here: {error.strerror or error}") from error
     return open_store(target, "r+")
 
 
-def _group_files(spec: StoreSpec, samples: int) -> Iterator[tuple[str, bytes]]:
+def group_files(spec: StoreSpec, samples: int) -> Iterator[tuple[str, bytes]]:
     """Yield the name and content of every file of an empty store, the root last."""
     members, attributes = spec.members(samples), root_attributes(spec, samples)
     arrays = array_documents(members)
@@ -649,13 +651,13 @@ def _check_format(path: Path, version: Any) -> None:
         raise InputError(f"{path}: {_NO_STORE}")
     if version > FORMAT_VERSION:
         raise InputError(
-            f"{path}: format_version = {version}: this vbnfault reads {FORMAT_VERSION}; install a newer one"
+            f"{path}: format_version = {version}: this vbnfault reads up to {FORMAT_VERSION}; install a newer one"
         )
-    if version < FORMAT_VERSION:
+    if version not in READ_VERSIONS:
         raise InputError(
-            f"{path}: format_version = {version}, of vbnfault {FORMATS[version]}: an earlier vbnfault made it, and "
-            f"this one reads {FORMAT_VERSION}; open it with xarray, complete it with vbnfault {FORMATS[version]}, "
-            "or build it again with another --out or --overwrite"
+            f"{path}: format_version = {version}, of vbnfault {FIRST_PROGRAM}: an earlier vbnfault made it, and "
+            f"this one reads {READ_VERSIONS[0]} and {FORMAT_VERSION}; open it with xarray, complete it with "
+            f"vbnfault {FIRST_PROGRAM}, or build it again with another --out or --overwrite"
         )
 
 

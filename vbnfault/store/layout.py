@@ -20,8 +20,8 @@ import numpy as np
 from numcodecs import VLenUTF8
 from numpy.typing import NDArray
 
-from .codec import ZSTD_LEVEL, compress, decompress
-from .schema import FORMAT_VERSION, Member, StoreSpec
+from .compressors import ZSTD, compressor
+from .schema import Member, StoreSpec
 
 DOCUMENT = "zarr.json"
 SPARE = "spare"
@@ -29,7 +29,6 @@ CHECKSUM = "attributes_sha256"
 # root attributes that the store needs for itself; all others are the user's
 OWN_ATTRIBUTES = ("store", "samples", "coordinates", CHECKSUM)
 
-_ZSTD = {"name": "zstd", "configuration": {"level": ZSTD_LEVEL, "checksum": True}}
 _LITTLE_ENDIAN = {"name": "bytes", "configuration": {"endian": "little"}}
 
 
@@ -60,11 +59,10 @@ def root_attributes(spec: StoreSpec, samples: int) -> dict[str, Any]:
         {
             **json.loads(json.dumps(spec.attributes)),
             "format": "vbnfault",
-            "format_version": FORMAT_VERSION,
+            "format_version": spec.format_version,
             "store": json.loads(json.dumps(spec.plain())),
             "samples": samples,
-            # xarray then shows them as coordinates of `band` and `sample`
-            "coordinates": "wavelength_nm name" if spec.sample_names else "wavelength_nm",
+            "coordinates": spec.extra_coordinates,
         }
     )
 
@@ -81,7 +79,7 @@ def _array_document(member: Member) -> dict[str, Any]:
     values = (
         {"name": "vlen-utf8", "configuration": {}} if is_text else _LITTLE_ENDIAN if wide else {"name": "bytes"}
     )
-    codecs: list[dict[str, Any]] = [values, _ZSTD]
+    codecs: list[dict[str, Any]] = [values, *compressor(member.codec).documents]
     if member.shards is not None:
         sharding = {
             "chunk_shape": list(member.chunks),
@@ -143,12 +141,12 @@ def coordinate_chunks(member: Member) -> Iterator[tuple[str, NDArray[Any]]]:
 
 def encode_values(values: NDArray[Any]) -> bytes:
     """Return numbers or texts (dtype object) as the bytes of a chunk file."""
-    return compress(VLenUTF8().encode(values) if values.dtype == object else values)
+    return compressor(ZSTD).encode(VLenUTF8().encode(values) if values.dtype == object else values)
 
 
 def decode_values(data: bytes, dtype: str) -> NDArray[Any]:
     """Return the values of a chunk file as a flat array. Raises ValueError if the file is damaged."""
-    plain = decompress(data)
+    plain = compressor(ZSTD).decode(data)
     if dtype != "str":
         return np.frombuffer(plain, dtype=dtype)
     try:

@@ -26,7 +26,7 @@ from .layout import (
     sealed,
     to_bytes,
 )
-from .schema import Member
+from .schema import Member, spec_from_plain
 
 
 def metadata_problems(store: Store) -> tuple[list[str], bool]:
@@ -160,7 +160,7 @@ def append_samples(
         raise InputError(f"append = {count}: must be at least 1")
     values = json.loads(json.dumps(attributes or {}))
     with disk.explained(store.path, f"adding {count} samples"):
-        _bring_to(store, {**store.root_attributes, **values, "samples": store.samples + count})
+        bring_to(store, {**store.root_attributes, **values, "samples": store.samples + count})
     return open_store(store.path, "r+")
 
 
@@ -174,14 +174,14 @@ def recover(path: str | os.PathLike[str]) -> Store:
     store = open_store(path, "r+")
     with disk.explained(store.path, "recovering the store"):
         disk.remove_partials(store.path)
-        _bring_to(store, store.root_attributes)
+        bring_to(store, store.root_attributes)
     return open_store(store.path, "r+")
 
 
-def _bring_to(store: Store, attributes: Mapping[str, Any]) -> None:
+def bring_to(store: Store, attributes: Mapping[str, Any]) -> None:
     """Rewrite the metadata and coordinates that differ from `attributes`: arrays, then `spare`, then the root."""
     attributes = sealed(attributes)
-    members = store.spec.members(int(attributes["samples"]))
+    members = spec_from_plain(attributes["store"], attributes).members(int(attributes["samples"]))
     documents = array_documents(members)
     disk.write(store.path, _outdated_arrays(store.path, members, documents))
     for name, document in (

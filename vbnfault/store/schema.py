@@ -14,22 +14,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.errors import InputError
-from ..core.quantities import CHANNELS, DEFECTS, soft_kind
+from ..core.quantities import CHANNELS
 from ..scene.names import SPLITS, STRATA
-
-# Format version → the first version of vbnfault that wrote it. A store of another format is refused in a sentence
-# and left as it is: its arrays could not be distinguished from damaged ones, and the samples that are missing would
-# come from other code. xarray reads the stores of every format. The way from one format to the next is:
-#
-# 1 → 2: build again. `spare` and the checksum of the root are new, `distortion` has eight coefficients instead of
-#        five, `split` is a string instead of a number, and `resolved` and `views` are new. The samples of format 1
-#        do not say what these two hold, and were made by other code, so no program can convert a store.
-#
-# A format whose arrays all follow from those of the one before needs no new build: then `recover`, which brings the
-# metadata to the schema under the lock of a build, is the place to convert, before `_check_format` refuses.
-FORMATS = {1: "0.1", 2: "0.2"}
-FORMAT_VERSION = max(FORMATS)
-SEMANTIC = ("sky", "body", "sun", "spacecraft")
+from .arrays import (
+    EFFECT_DN,
+    EFFECT_RULE,
+    LAYERS,
+    MASK_ANY_RULE,
+    RADIANCE_LAYERS,
+    REQUIRED_LAYERS,
+    SCALARS,
+    Array,
+    soft_row,
+    without_row,
+)
+from .compressors import ZSTD, fitting
+from .formats import FORMAT_VERSION, in_format_2
 
 # Root attributes that say when or how a store was written. The digest leaves them out.
 VOLATILE_ATTRIBUTES = ("created", "modified", "command")
@@ -41,124 +41,6 @@ MAX_HELD_BYTES = 2**31  # all layers of a shard, uncompressed: a task may have t
 _SCALARS = "scalars"  # the entry of the `layer` axis that stands for all scalars of a sample
 
 
-@dataclass(frozen=True)
-class Array:
-    """Describe one array of the schema. `ratio` is its typical compressed size over the uncompressed size."""
-
-    dimensions: str
-    dtype: str
-    units: str
-    long_name: str
-    names: tuple[str, ...] = ()  # CF flag meanings, of the values 0, 1, … or of the bits 0, 1, …
-    bits: bool = False  # whether `names` are of bits
-    ratio: float = 1.0
-
-    @property
-    def dims(self) -> tuple[str, ...]:
-        """Return the names of the dimensions, in order."""
-        return tuple(self.dimensions.split())
-
-    @property
-    def is_text(self) -> bool:
-        """Return whether the values are strings."""
-        return self.dtype == "str"
-
-    @property
-    def fill(self) -> Any:
-        """Return the value that an unwritten sample has."""
-        return "" if self.is_text else float("nan") if self.dtype == "float64" else 0
-
-
-_IMAGE = "sample y x channel"
-
-# Layers (per-pixel arrays): a chunk holds one sample, and chunks are sharded.
-LAYERS: dict[str, Array] = {
-    "image": Array(_IMAGE, "uint8", "DN", "image with faults", ratio=0.45),
-    "mask": Array("sample fault y x", "bool", "1", "where each fault is, by its kind", ratio=0.005),
-    "mask_any": Array("sample y x", "bool", "1", "union of mask over the faults named here", ratio=0.005),
-    "clean": Array(_IMAGE, "uint8", "DN", "same camera, exposure and noise, no fault", ratio=0.45),
-    # the layers from here on are optional; `StoreSpec.pixel_layers` makes the rows of `without_<fault>`
-    "mask_effect": Array("sample fault y x", "bool", "1", "where each fault changes the image", ratio=0.02),
-    "raw": Array("sample y x", "uint16", "DN", "raw mosaic of the analogue-to-digital converter", ratio=0.6),
-    "defects": Array(
-        "sample y x", "uint8", "1", "what is wrong with a pixel of the mosaic", DEFECTS, bits=True, ratio=0.01
-    ),
-    "depth_m": Array("sample y x", "float32", "m", "depth along the boresight, inf on the sky", ratio=0.5),
-    "normal": Array("sample y x xyz", "float16", "1", "surface normal in C, 0 on the sky", ratio=0.55),
-    "semantic": Array("sample y x", "uint8", "1", "what a pixel shows", SEMANTIC, ratio=0.01),
-    "point_T_m": Array("sample y x xyz", "float64", "m", "surface point in T, NaN on the sky", ratio=0.9),
-    "incidence_deg": Array("sample y x", "float32", "deg", "normal to Sun, NaN on the sky", ratio=0.8),
-    "emission_deg": Array("sample y x", "float32", "deg", "normal to camera, NaN on the sky", ratio=0.8),
-    "phase_deg": Array("sample y x", "float32", "deg", "Sun to camera at the surface, NaN on the sky", ratio=0.7),
-    "albedo": Array(
-        "sample y x",
-        "float32",
-        "1",
-        "I/F at i = e = phase = 0 near 649 nm, spacecraft included, NaN on the sky",
-        ratio=0.4,
-    ),
-    "radiance": Array("sample band y x", "float16", "W m-2 sr-1 nm-1", "radiance at the camera", ratio=0.7),
-    "scene_radiance": Array(
-        "sample band y_rendered x_rendered",
-        "float16",
-        "W m-2 sr-1 nm-1",
-        "radiance before the lens, on the pinhole grid of the render with its guard band, without stars",
-        ratio=0.7,
-    ),
-}
-RADIANCE_LAYERS = ("radiance", "scene_radiance")  # their data type is `StoreSpec.radiance_dtype`
-# The rule for `mask_effect`, and for the mask of a class that is labelled by effect.
-EFFECT_DN = 1
-EFFECT_RULE = (
-    f"a channel of the noise-free 8 bit image changes by {EFFECT_DN} DN or more when the fault is switched off "
-    "and the others are kept"
-)
-MASK_ANY_RULE = "union of the masks of the classes in the attribute faults, which dataset.mask_any chose"
-REQUIRED_LAYERS = ("image", "mask", "mask_any", "clean")
-
-# Scalars and small vectors: one chunk holds a whole shard, so that a task writes whole chunks.
-SCALARS: dict[str, Array] = {
-    "injected": Array("sample fault", "bool", "1", "faults that are in the pixels"),
-    "camera_position_T_m": Array("sample xyz", "float64", "m", "camera position in T"),
-    "position_L_m": Array("sample xyz", "float64", "m", "camera position in L, from the site"),
-    "camera_from_T": Array("sample quaternion", "float64", "1", "attitude, unit quaternion"),
-    "T_from_L": Array("sample axis_row axis_col", "float64", "1", "rotation from the local level frame to T"),
-    "T_from_J": Array("sample axis_row axis_col", "float64", "1", "rotation from the inertial frame J to T"),
-    "site_T_m": Array("sample xyz", "float64", "m", "site, the origin of L, in T"),
-    "sun_direction_T": Array("sample xyz", "float64", "1", "unit vector towards the Sun in T"),
-    "sun_distance_au": Array("sample", "float64", "au", "distance to the Sun"),
-    "julian_date": Array("sample", "float64", "d", "Julian date (TDB)"),
-    "intrinsics": Array("sample intrinsic", "float64", "px", "pinhole camera, pixel centres at +0.5"),
-    "distortion": Array(
-        "sample coefficient", "float64", "1", "of the lens at 587.6 nm, as OpenCV takes it, for the intrinsics"
-    ),
-    "sun_azimuth_deg": Array("sample", "float64", "deg", "Sun azimuth in L, from north towards east"),
-    "sun_elevation_deg": Array("sample", "float64", "deg", "Sun elevation in L, up"),
-    "roll_deg": Array("sample", "float64", "deg", "tilt of the boresight from its stratum's reference about x"),
-    "pitch_deg": Array("sample", "float64", "deg", "tilt of the boresight from its stratum's reference about y"),
-    "yaw_deg": Array("sample", "float64", "deg", "turn about the boresight, from that reference"),
-    "sun_xy_px": Array("sample xy", "float64", "px", "Sun centre in the image, NaN behind the camera"),
-    "sun_visible_fraction": Array("sample", "float64", "1", "part of the solar disc that is not occluded"),
-    "exposure_s": Array("sample", "float64", "s", "exposure time"),
-    "samples_per_pixel": Array("sample", "float64", "1", "mean number of render samples a pixel"),
-    "noise_fraction_p99": Array(
-        "sample",
-        "float64",
-        "1",
-        "noise of sampling over the sensor's, 99th percentile of lit pixels; NaN: not asked",
-    ),
-    "tries": Array("sample", "int32", "1", "views drawn, of which the last was kept"),
-    "views": Array("sample", "int32", "1", "views rendered, of which the last shows every commanded fault"),
-    "resolved": Array("sample", "bool", "1", "the pose meets every condition of the scene"),
-    "stratum": Array("sample", "uint8", "1", "stratum of the sampling", STRATA),
-    "site": Array("sample", "int32", "1", "index of the site"),
-    "lens": Array("sample", "int32", "1", "index of the lens"),
-    "detector_individual": Array("sample", "int32", "1", "index of the individual detector"),
-    "split": Array("sample", "str", "1", "split of the dataset, constant per site"),
-    "parameters": Array("sample", "str", "1", "drawn parameters of every injected fault, JSON"),
-    "proposal": Array("sample", "str", "1", "proposed variables before redraws, JSON"),
-}
-
 _LABELS = {  # coordinates of the short axes
     "channel": CHANNELS,
     "xyz": ("x", "y", "z"),
@@ -169,13 +51,33 @@ _LABELS = {  # coordinates of the short axes
     "intrinsic": ("fx", "fy", "cx", "cy"),
     "coefficient": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
 }
+_DESCRIPTIONS = {  # of the coordinates
+    "y": "Minus the coordinate row: it falls from the top of an image to its bottom, so that plots stand upright.",
+    "row": "Distance of a pixel's centre from the upper edge of the image in pixels, downwards; the first is 0.5.",
+    "x": "Distance of a pixel's centre from the left edge of the image in pixels; the first is 0.5.",
+    "y_rendered": "The coordinate y, continued beyond the image onto the guard band of the render.",
+    "x_rendered": "The coordinate x, continued beyond the image onto the guard band of the render.",
+    "fault": "Name of the fault class.",
+    "layer": "Name of the layer that a checksum covers; scalars stands for all values that are not layers.",
+    "channel": "Colour of the channel; I is the intensity.",
+    "xyz": "Axis of a vector.",
+    "axis_row": "Axis of a matrix's row.",
+    "axis_col": "Axis of a matrix's column.",
+    "xy": "Axis of a position in the image.",
+    "quaternion": "Component of a unit quaternion.",
+    "intrinsic": "Focal lengths along x and y, and principal point.",
+    "coefficient": "Coefficient of OpenCV's rational model of distortion.",
+    "wavelength_nm": "Wavelength that stands for a band of the radiance.",
+    "name": "Name of the sample in the table of poses.",
+    "sample": "Index of the sample, from 0.",
+}
 
 
 class Member(NamedTuple):
     """Describe the required layout of one array of the group; `create`, `verify` and `recover` use it.
 
     `values`: the values of a coordinate; None for an array that tasks write. `chunks`, `shards`: shapes of zarr's
-    chunks and shards, at least 1 in every axis.
+    chunks and shards, at least 1 in every axis. `codec`: the name of the codec of its chunks.
     """
 
     shape: tuple[int, ...]
@@ -186,12 +88,14 @@ class Member(NamedTuple):
     dims: tuple[str, ...]
     attributes: dict[str, Any]
     values: NDArray[Any] | tuple[str, ...] | None = None
+    codec: str = ZSTD
 
 
-def _coordinate(dim: str, values: NDArray[Any] | tuple[str, ...], **attributes: str) -> Member:
-    """Return the entry of `StoreSpec.members` for the coordinate of one axis."""
+def _coordinate(name: str, dim: str, values: NDArray[Any] | tuple[str, ...], long_name: str, **more: str) -> Member:
+    """Return the entry of `StoreSpec.members` for the coordinate `name` along one axis."""
     dtype, fill = (values.dtype.name, 0) if isinstance(values, np.ndarray) else ("str", "")
     chunks = (65536 if dim == "sample" else max(1, len(values)),)
+    attributes = {"long_name": long_name, "units": "1", "description": _DESCRIPTIONS[name], **more}
     return Member((len(values),), chunks, None, dtype, fill, (dim,), attributes, values)
 
 
@@ -237,13 +141,17 @@ class StoreSpec:
         Samples a shard. 0 chooses the largest number up to 16 for which the largest array of a shard stays within
         1 GiB and all layers within 2 GiB. A number that is too large is lowered to its largest divisor within these
         limits.
+    codecs
+        Names of the codecs of the layers, by layer; those of `Array.codec` by default.
+    format_version
+        2 or 3, the format of the metadata.
     attributes
         JSON-able root attributes.
 
     Raises
     ------
     InputError
-        For a layer or fault that does not exist.
+        For a layer, a fault or a codec that does not exist.
     """
 
     height: int
@@ -266,6 +174,8 @@ class StoreSpec:
     radiance_dtype: str = "float16"
     rendered_shape: tuple[int, ...] = ()
     shard_samples: int = 0
+    codecs: Mapping[str, str] = field(default_factory=dict)
+    format_version: int = FORMAT_VERSION
     attributes: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -285,6 +195,11 @@ class StoreSpec:
         # the plan assigns sites to groups of the wished size; a divisor keeps each shard within one group
         size = next(n for n in range(min(wished, most), 0, -1) if wished % n == 0)
         object.__setattr__(self, "shard_samples", size)
+        codecs = {name: self.codecs.get(name, row.codec) for name, row in self.pixel_layers.items()}
+        if self.format_version == 2:
+            codecs = dict.fromkeys(codecs, ZSTD)
+        codecs = {name: fitting(codec, self.layer_bytes(name)) for name, codec in codecs.items()}
+        object.__setattr__(self, "codecs", codecs)
 
     @cached_property
     def pixel_layers(self) -> dict[str, Array]:
@@ -296,18 +211,28 @@ class StoreSpec:
             elif name in LAYERS:
                 layers[name] = LAYERS[name]
             elif name in self.soft_layers:
-                kind, fault = soft_kind(name), self.faults[self.soft_layers.index(name)]
-                layers[name] = Array("sample y x", kind.dtype, kind.units, f"{fault}: {kind.meaning}", ratio=0.4)
+                layers[name] = soft_row(name, self.faults[self.soft_layers.index(name)])
             else:
-                without = name.removeprefix("without_")
-                layers[name] = Array(_IMAGE, "uint8", "DN", f"the image without {without}", ratio=0.45)
+                layers[name] = without_row(name.removeprefix("without_"))
         return layers
 
     @cached_property
     def arrays(self) -> dict[str, Array]:
         """Return the schema row by name of every array that tasks write."""
-        crc32c = Array("sample layer", "uint32", "1", "CRC-32C of the decoded bytes")
-        done = Array("sample", "uint8", "1", "1 where a sample is whole; written last")
+        crc32c = Array(
+            "sample layer",
+            "uint32",
+            "1",
+            "CRC-32C of the decoded bytes",
+            "Checksum of every layer of a sample, and one of all its scalars; vbnfault verify compares them.",
+        )
+        done = Array(
+            "sample",
+            "uint8",
+            "1",
+            "1 where a sample is whole; written last",
+            "0 where a sample is not built yet; its other values are then not valid.",
+        )
         return {**self.pixel_layers, **SCALARS, "crc32c": crc32c, "done": done}
 
     @property
@@ -363,7 +288,11 @@ class StoreSpec:
             shape = self.shape(row)
             chunk = tuple(max(1, n) for n in shape)
             sharded = name in self.pixel_layers
-            attributes: dict[str, Any] = {"long_name": row.long_name, "units": row.units}
+            attributes: dict[str, Any] = {
+                "long_name": row.long_name,
+                "units": row.units,
+                "description": row.description,
+            }
             if row.names:
                 values = [1 << k if row.bits else k for k in range(len(row.names))]
                 attributes["flag_masks" if row.bits else "flag_values"] = values
@@ -376,29 +305,33 @@ class StoreSpec:
                 fill=row.fill,
                 dims=row.dims,
                 attributes={**attributes, **extra.get(name, {})},
+                codec=self.codecs.get(name, ZSTD),
             )
-        return {**members, **self.coordinates(samples)}
+        members |= self.coordinates(samples)
+        return in_format_2(members) if self.format_version == 2 else members
 
     def coordinates(self, samples: int) -> dict[str, Member]:
         """Return the required layout by name of every coordinate of a store of `samples` samples."""
-        y, x = np.arange(self.height) + 0.5, np.arange(self.width) + 0.5
+        rows, columns = np.arange(self.height) + 0.5, np.arange(self.width) + 0.5
         nodes = np.array(self.wavelength_nm, dtype=np.float64)
-        bands = {"wavelength_nm": _coordinate("band", nodes, units="nm", long_name="wavelength of the band")}
-        return {
-            "y": _coordinate("y", y, units="px", long_name="row, pixel centres at +0.5"),
-            "x": _coordinate("x", x, units="px", long_name="column, pixel centres at +0.5"),
-            "fault": _coordinate("fault", self.faults, long_name="fault class"),
-            "layer": _coordinate("layer", self.checked, long_name="what a checksum covers"),
-            **{name: _coordinate(name, tuple(labels), long_name=name) for name, labels in _LABELS.items()},
-            **(bands if self.wavelength_nm else {}),
+        numbers = np.arange(samples, dtype=np.int64)
+        coordinates = {
+            "y": _coordinate("y", "y", -rows, "minus the row", axis="Y"),
+            "row": _coordinate("row", "y", rows, "row, pixel centres at +0.5"),
+            "x": _coordinate("x", "x", columns, "column, pixel centres at +0.5", axis="X"),
+            "fault": _coordinate("fault", "fault", self.faults, "fault class"),
+            "layer": _coordinate("layer", "layer", self.checked, "what a checksum covers"),
+            **{name: _coordinate(name, name, tuple(labels), name) for name, labels in _LABELS.items()},
             **self._rendered_coordinates(),
-            **(
-                {"name": _coordinate("sample", self.sample_names[:samples], long_name="name of the sample")}
-                if self.sample_names
-                else {}
-            ),
-            "sample": _coordinate("sample", np.arange(samples, dtype=np.int64), long_name="sample"),
         }
+        if self.wavelength_nm:
+            coordinates["wavelength_nm"] = _coordinate(
+                "wavelength_nm", "band", nodes, "wavelength of the band", units="nm"
+            )
+        if self.sample_names:
+            names = self.sample_names[:samples]
+            coordinates["name"] = _coordinate("name", "sample", names, "name of the sample")
+        return {**coordinates, "sample": _coordinate("sample", "sample", numbers, "sample")}
 
     def _rendered_coordinates(self) -> dict[str, Member]:
         """Return the coordinates of the grid of `scene_radiance`: those of the image, continued beyond it."""
@@ -408,7 +341,8 @@ class StoreSpec:
         for dim, size, of_image in zip("yx", self.rendered_shape, (self.height, self.width), strict=True):
             values = np.arange(size) + 0.5 - (size - of_image) / 2
             name = f"{dim}_rendered"
-            out[name] = _coordinate(name, values, units="px", long_name="pixel centres, 0 at the image's border")
+            sign = -1 if dim == "y" else 1
+            out[name] = _coordinate(name, name, sign * values, "pixel centres, 0 at the image's border")
         return out
 
     def layer_bytes(self, name: str) -> int:
@@ -425,16 +359,31 @@ class StoreSpec:
     def plain(self) -> dict[str, Any]:
         """Return the fields as plain data, without the root attributes; `spec_from_plain` reads them back."""
         # asdict would copy the whole scene first
-        plain = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "attributes"}
+        kept_in_the_root = ("attributes", "format_version")
+        plain = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in kept_in_the_root}
         if not self.sample_names:
             del plain["sample_names"]  # stores without names stay as they were
         if not self.rendered_shape:
             del plain["rendered_shape"]
+        if self.format_version == 2:
+            del plain["codecs"]
         return plain
+
+    @property
+    def data(self) -> dict[str, Any]:
+        """Return `plain` without what does not alter a decoded value, for digests and comparisons."""
+        return {key: value for key, value in self.plain().items() if key not in ("shard_samples", "codecs")}
+
+    @property
+    def extra_coordinates(self) -> str:
+        """Return the root attribute by which xarray shows arrays as coordinates that are no axis."""
+        names = {"wavelength_nm": True, "row": self.format_version > 2, "name": bool(self.sample_names)}
+        return " ".join(name for name, shown in names.items() if shown)
 
 
 def spec_from_plain(plain: Mapping[str, Any], attributes: Mapping[str, Any]) -> StoreSpec:
     """Return the StoreSpec that the result of `StoreSpec.plain` and a store's root attributes describe."""
     known = {f.name for f in fields(StoreSpec)}
     values: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in plain.items() if k in known}
-    return StoreSpec(**values, attributes=attributes)
+    version = attributes.get("format_version", FORMAT_VERSION)
+    return StoreSpec(**{**values, "attributes": attributes, "format_version": version})

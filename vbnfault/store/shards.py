@@ -13,7 +13,8 @@ from typing import Any
 from numpy.typing import NDArray
 
 from ..core.errors import VbnfaultError
-from .codec import crc32c, decompress_into
+from .codec import crc32c
+from .compressors import compressor
 from .group import Store
 
 # A compressed chunk of at most this size, such as an empty mask, is likely to occur again: its checksum is kept.
@@ -101,7 +102,7 @@ class ShardReader:
         if not out.size:
             return ""
         try:
-            decompress_into(data, out)
+            compressor(self.store.spec.codecs[name]).decode_into(data, out)
         except ValueError:
             return "cannot be decoded"
         crc = self._small.get(data) if len(data) <= _SMALL_CHUNK else None

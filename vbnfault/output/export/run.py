@@ -133,7 +133,7 @@ def _check_finished(store: Store) -> None:
 
 def _contents_sha256(store: Store) -> str:
     """Return a digest of the stored checksums of all layers and scalars, and of the layout of the store."""
-    total = hashlib.sha256(json.dumps(store.spec.plain(), sort_keys=True).encode())
+    total = hashlib.sha256(json.dumps(store.spec.data, sort_keys=True).encode())
     for number in range(store.shards):
         total.update(_column(store, "crc32c", number).tobytes())
     return total.hexdigest()

@@ -1,0 +1,460 @@
+"""Describe every array of a store: its dimensions, dtype, unit and meaning.
+
+This module holds plain data; it reads and writes no file.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from ..core.quantities import DEFECTS, soft_kind
+from ..scene.names import STRATA
+from .compressors import ZSTD
+
+# Words of Blosc are the values of a pixel that change together; its bit shuffle packs the bits of masks, too. Every
+# reader of Zarr v3 has these codecs, zarrita.js included.
+_IMAGE = "blosc zstd 1 bitshuffle 1"
+_BITS = "blosc zstd 3 bitshuffle 1"
+_RAW = "blosc zstd 1 bitshuffle 2"
+_NORMAL = "blosc zstd 3 shuffle 6"
+_HALF = "blosc zstd 1 bitshuffle 2"
+_SINGLE = "blosc zstd 3 shuffle 4"
+_DOUBLE = "blosc zstd 3 shuffle 8"
+
+SEMANTIC = ("sky", "body", "sun", "spacecraft")
+
+
+@dataclass(frozen=True)
+class Array:
+    """Describe one array of the schema.
+
+    `units` are words of UDUNITS, or "1". `description` says what the values mean and how they were made. `codec` is
+    the name of the codec that new stores use (`codec.Codec`), and `ratio` the typical compressed size over the
+    uncompressed size; `benchmarks/codecs.py` measures both.
+    """
+
+    dimensions: str
+    dtype: str
+    units: str
+    long_name: str
+    description: str
+    names: tuple[str, ...] = ()  # CF flag meanings, of the values 0, 1, … or of the bits 0, 1, …
+    bits: bool = False  # whether `names` are of bits
+    codec: str = ZSTD
+    ratio: float = 1.0
+
+    @property
+    def dims(self) -> tuple[str, ...]:
+        """Return the names of the dimensions, in order."""
+        return tuple(self.dimensions.split())
+
+    @property
+    def is_text(self) -> bool:
+        """Return whether the values are strings."""
+        return self.dtype == "str"
+
+    @property
+    def fill(self) -> Any:
+        """Return the value that an unwritten sample has."""
+        return "" if self.is_text else float("nan") if self.dtype == "float64" else 0
+
+
+_PIXELS = "sample y x channel"
+
+# Layers (per-pixel arrays): a chunk holds one sample, and chunks are sharded.
+LAYERS: dict[str, Array] = {
+    "image": Array(
+        _PIXELS,
+        "uint8",
+        "count",
+        "image with faults",
+        "8 bit image as the camera delivers it, linear in light, with noise and every injected fault.",
+        codec=_IMAGE,
+        ratio=0.45,
+    ),
+    "mask": Array(
+        "sample fault y x",
+        "bool",
+        "1",
+        "where each fault is, by its kind",
+        "True in the pixels of a fault. The attributes rules and kinds say how the mask of each class is made.",
+        codec=_BITS,
+        ratio=0.005,
+    ),
+    "mask_any": Array(
+        "sample y x",
+        "bool",
+        "1",
+        "union of mask over the faults named here",
+        "True where at least one of the classes in the attribute faults has its mask.",
+        codec=_BITS,
+        ratio=0.005,
+    ),
+    "clean": Array(
+        _PIXELS,
+        "uint8",
+        "count",
+        "same camera, exposure and noise, no fault",
+        "The image as it would be without any fault: same view, camera, exposure and noise.",
+        codec=_IMAGE,
+        ratio=0.45,
+    ),
+    # the layers from here on are optional; `StoreSpec.pixel_layers` makes the rows of `without_<fault>`
+    "mask_effect": Array(
+        "sample fault y x",
+        "bool",
+        "1",
+        "where each fault changes the image",
+        "True where the noise-free 8 bit image changes if this fault alone is switched off.",
+        codec=_BITS,
+        ratio=0.02,
+    ),
+    "raw": Array(
+        "sample y x",
+        "uint16",
+        "count",
+        "raw mosaic of the analogue-to-digital converter",
+        "Numbers of the converter before demosaicing, one colour filter for each pixel, with offset and noise.",
+        codec=_RAW,
+        ratio=0.6,
+    ),
+    "defects": Array(
+        "sample y x",
+        "uint8",
+        "1",
+        "what is wrong with a pixel of the mosaic",
+        "Bits that say which defects the detector's pixel has; 0 is a sound pixel.",
+        DEFECTS,
+        bits=True,
+        codec=_BITS,
+        ratio=0.01,
+    ),
+    "depth_m": Array(
+        "sample y x",
+        "float32",
+        "m",
+        "depth along the boresight, inf on the sky",
+        "Distance of what the pixel's centre shows from the camera's plane, along the boresight.",
+        codec=_SINGLE,
+        ratio=0.5,
+    ),
+    "normal": Array(
+        "sample y x xyz",
+        "float16",
+        "1",
+        "surface normal in C, 0 on the sky",
+        "Unit vector out of the surface at the pixel's centre, in the camera's frame: x right, y down, z forward.",
+        codec=_NORMAL,
+        ratio=0.55,
+    ),
+    "semantic": Array(
+        "sample y x",
+        "uint8",
+        "1",
+        "what a pixel shows",
+        "Class of what the pixel's centre shows, without faults.",
+        SEMANTIC,
+        codec=_BITS,
+        ratio=0.01,
+    ),
+    "point_T_m": Array(
+        "sample y x xyz",
+        "float64",
+        "m",
+        "surface point in T, NaN on the sky",
+        "Position of the ground at the pixel's centre in T, the frame fixed to the body.",
+        codec=_DOUBLE,
+        ratio=0.9,
+    ),
+    "incidence_deg": Array(
+        "sample y x",
+        "float32",
+        "degree",
+        "normal to Sun, NaN on the sky",
+        "Angle between the surface normal and the direction to the Sun; above 90 the ground faces away from it.",
+        codec=_SINGLE,
+        ratio=0.8,
+    ),
+    "emission_deg": Array(
+        "sample y x",
+        "float32",
+        "degree",
+        "normal to camera, NaN on the sky",
+        "Angle between the surface normal and the direction to the camera.",
+        codec=_SINGLE,
+        ratio=0.8,
+    ),
+    "phase_deg": Array(
+        "sample y x",
+        "float32",
+        "degree",
+        "Sun to camera at the surface, NaN on the sky",
+        "Angle at the ground between the directions to the Sun and to the camera.",
+        codec=_SINGLE,
+        ratio=0.7,
+    ),
+    "albedo": Array(
+        "sample y x",
+        "float32",
+        "1",
+        "I/F at i = e = phase = 0 near 649 nm, spacecraft included, NaN on the sky",
+        "Normal albedo of the ground or of the spacecraft's material, in the band of the scene closest to 649 nm.",
+        codec=_SINGLE,
+        ratio=0.4,
+    ),
+    "radiance": Array(
+        "sample band y x",
+        "float16",
+        "W m-2 sr-1 nm-1",
+        "radiance at the camera",
+        "Spectral radiance that reaches the lens, without faults and noise, at the wavelengths of wavelength_nm.",
+        codec=_HALF,
+        ratio=0.7,
+    ),
+    "scene_radiance": Array(
+        "sample band y_rendered x_rendered",
+        "float16",
+        "W m-2 sr-1 nm-1",
+        "radiance before the lens, on the pinhole grid of the render with its guard band, without stars",
+        "Spectral radiance of the scene as rendered, from which vbnfault retake makes other images of the view.",
+        codec=_HALF,
+        ratio=0.7,
+    ),
+}
+RADIANCE_LAYERS = ("radiance", "scene_radiance")  # their data type is `StoreSpec.radiance_dtype`
+
+
+def without_row(fault: str) -> Array:
+    """Return the schema row of the layer `without_<fault>`."""
+    return Array(
+        _PIXELS,
+        "uint8",
+        "count",
+        f"the image without {fault}",
+        f"The image with every fault but {fault}: same view, camera, exposure and noise.",
+        codec=_IMAGE,
+        ratio=0.45,
+    )
+
+
+def soft_row(name: str, fault: str) -> Array:
+    """Return the schema row of the soft layer `name` of a fault class."""
+    kind = soft_kind(name)
+    return Array(
+        "sample y x",
+        kind.dtype,
+        "count" if kind.units == "DN" else kind.units,
+        f"{fault}: {kind.meaning}",
+        f"Strength of {fault} in each pixel, without the other faults; {kind.neutral:g} where it is absent.",
+        codec=_HALF if kind.dtype == "float16" else _SINGLE,
+        ratio=0.4,
+    )
+
+
+# The rule for `mask_effect`, and for the mask of a class that is labelled by effect.
+EFFECT_DN = 1
+EFFECT_RULE = (
+    f"a channel of the noise-free 8 bit image changes by {EFFECT_DN} DN or more when the fault is switched off "
+    "and the others are kept"
+)
+MASK_ANY_RULE = "union of the masks of the classes in the attribute faults, which dataset.mask_any chose"
+REQUIRED_LAYERS = ("image", "mask", "mask_any", "clean")
+
+# Scalars and small vectors: one chunk holds a whole shard, so that a task writes whole chunks.
+SCALARS: dict[str, Array] = {
+    "injected": Array(
+        "sample fault",
+        "bool",
+        "1",
+        "faults that are in the pixels",
+        "True for the classes that change this image. A commanded fault without any effect is not injected.",
+    ),
+    "camera_position_T_m": Array(
+        "sample xyz",
+        "float64",
+        "m",
+        "camera position in T",
+        "Position of the camera in T, the frame fixed to the body.",
+    ),
+    "position_L_m": Array(
+        "sample xyz",
+        "float64",
+        "m",
+        "camera position in L, from the site",
+        "Position of the camera in the local level frame L: x north, y east, z down.",
+    ),
+    "camera_from_T": Array(
+        "sample quaternion",
+        "float64",
+        "1",
+        "attitude, unit quaternion",
+        "Rotation that takes vectors from T to the camera's frame C; w comes first.",
+    ),
+    "T_from_L": Array(
+        "sample axis_row axis_col",
+        "float64",
+        "1",
+        "rotation from the local level frame to T",
+        "Matrix that takes vectors from the local level frame of the site to the body's frame T.",
+    ),
+    "T_from_J": Array(
+        "sample axis_row axis_col",
+        "float64",
+        "1",
+        "rotation from the inertial frame J to T",
+        "Matrix that takes vectors from the inertial frame J, which does not turn with the body, to T.",
+    ),
+    "site_T_m": Array(
+        "sample xyz",
+        "float64",
+        "m",
+        "site, the origin of L, in T",
+        "Position of the site on the body's surface, around which the terrain is refined.",
+    ),
+    "sun_direction_T": Array(
+        "sample xyz",
+        "float64",
+        "1",
+        "unit vector towards the Sun in T",
+        "Direction from the site to the centre of the Sun.",
+    ),
+    "sun_distance_au": Array(
+        "sample", "float64", "au", "distance to the Sun", "Distance from the body to the Sun; it sets the sunlight."
+    ),
+    "julian_date": Array(
+        "sample", "float64", "d", "Julian date (TDB)", "Time of the exposure as a Julian date in dynamical time."
+    ),
+    "intrinsics": Array(
+        "sample intrinsic",
+        "float64",
+        "1",
+        "pinhole camera, pixel centres at +0.5",
+        "Focal lengths and principal point in pixels, from the top left corner, as in OpenCV's camera matrix.",
+    ),
+    "distortion": Array(
+        "sample coefficient",
+        "float64",
+        "1",
+        "of the lens at 587.6 nm, as OpenCV takes it, for the intrinsics",
+        "Coefficients of OpenCV's rational model of distortion, fitted to the chief rays of the lens.",
+    ),
+    "sun_azimuth_deg": Array(
+        "sample",
+        "float64",
+        "degree",
+        "Sun azimuth in L, from north towards east",
+        "Direction of the Sun over the site's horizon.",
+    ),
+    "sun_elevation_deg": Array(
+        "sample", "float64", "degree", "Sun elevation in L, up", "Height of the Sun above the site's horizon."
+    ),
+    "roll_deg": Array(
+        "sample",
+        "float64",
+        "degree",
+        "tilt of the boresight from its stratum's reference about x",
+        "First angle of the attitude; the attribute reference names the direction of each stratum.",
+    ),
+    "pitch_deg": Array(
+        "sample",
+        "float64",
+        "degree",
+        "tilt of the boresight from its stratum's reference about y",
+        "Second angle of the attitude; the attribute reference names the direction of each stratum.",
+    ),
+    "yaw_deg": Array(
+        "sample",
+        "float64",
+        "degree",
+        "turn about the boresight, from that reference",
+        "Third angle of the attitude; the attribute reference names the direction of each stratum.",
+    ),
+    "sun_xy_px": Array(
+        "sample xy",
+        "float64",
+        "1",
+        "Sun centre in the image, NaN behind the camera",
+        "Column and row of the Sun's centre in pixels, from the top left corner; it may lie outside the image.",
+    ),
+    "sun_visible_fraction": Array(
+        "sample",
+        "float64",
+        "1",
+        "part of the solar disc that is not occluded",
+        "Seen from the camera: 1 is the whole disc, 0 a Sun behind the ground or the spacecraft.",
+    ),
+    "exposure_s": Array(
+        "sample",
+        "float64",
+        "s",
+        "exposure time",
+        "Metered once on the image without noise and faults, and shared by every twin of the sample.",
+    ),
+    "samples_per_pixel": Array(
+        "sample",
+        "float64",
+        "1",
+        "mean number of render samples a pixel",
+        "Larger than the number of the scene where the render had to reduce its noise.",
+    ),
+    "noise_fraction_p99": Array(
+        "sample",
+        "float64",
+        "1",
+        "noise of sampling over the sensor's, 99th percentile of lit pixels; NaN: not asked",
+        "Standard deviation of the render in units of that of the sensor, over the lit pixels.",
+    ),
+    "tries": Array(
+        "sample", "int32", "1", "views drawn, of which the last was kept", "A view is drawn again if it is refused."
+    ),
+    "views": Array(
+        "sample",
+        "int32",
+        "1",
+        "views rendered, of which the last shows every commanded fault",
+        "More than 1 where a commanded fault did not show at first.",
+    ),
+    "resolved": Array(
+        "sample",
+        "bool",
+        "1",
+        "the pose meets every condition of the scene",
+        "False if no view that met them was drawn; the sample then holds the last one.",
+    ),
+    "stratum": Array(
+        "sample", "uint8", "1", "stratum of the sampling", "Whether the view was drawn to face the Sun.", STRATA
+    ),
+    "site": Array(
+        "sample", "int32", "1", "index of the site", "Position in the attribute names; a site is in one split only."
+    ),
+    "lens": Array("sample", "int32", "1", "index of the lens", "Position in the attribute names."),
+    "detector_individual": Array(
+        "sample",
+        "int32",
+        "1",
+        "index of the individual detector",
+        "Position in the attribute names; each individual has its own defects.",
+    ),
+    "split": Array(
+        "sample",
+        "str",
+        "1",
+        "split of the dataset, constant per site",
+        "train, val or test; samples of one site or one view are never in two splits.",
+    ),
+    "parameters": Array(
+        "sample",
+        "str",
+        "1",
+        "drawn parameters of every injected fault, JSON",
+        "By class, the model and the drawn values from which the fault can be injected again.",
+    ),
+    "proposal": Array(
+        "sample",
+        "str",
+        "1",
+        "proposed variables before redraws, JSON",
+        "What the plan drew for the sample before any rendering: its view and its commanded faults.",
+    ),
+}

@@ -1,0 +1,113 @@
+"""Compress the chunks of a store, with the codecs that every reader of Zarr v3 has: Zstd, and Blosc with a CRC-32C.
+
+A codec has a name, which the root attributes of a store keep for each layer:
+
+- `zstd LEVEL`: Zstd with a checksum of its own.
+- `blosc zstd LEVEL SHUFFLE SIZE`: Blosc, which first sorts the bytes (`shuffle`) or bits (`bitshuffle`) of words
+  of SIZE bytes by weight, and then compresses blocks with Zstd; behind it the CRC-32C of the compressed bytes,
+  because Blosc has no checksum.
+
+Blosc in a thread other than the main one uses a single thread, so that equal data give equal bytes.
+"""
+
+from __future__ import annotations
+
+import functools
+import re
+import struct
+from dataclasses import dataclass
+from typing import Any
+
+import google_crc32c
+import numpy as np
+from numcodecs import Blosc, Zstd
+from numpy.typing import NDArray
+
+from ..core.errors import InputError, shown
+
+# Level 1: 16 ms for a noisy 1024 px RGBI image; level 3 takes three times as long and saves a sixth.
+ZSTD = "zstd 1"
+_MOST_BYTES = Blosc.max_buffer_size  # that Blosc can compress as one chunk
+_NAME = re.compile(r"zstd (\d{1,2})|blosc zstd (\d) (shuffle|bitshuffle) (\d{1,2})")
+_DAMAGED = (RuntimeError, MemoryError, ValueError)
+
+
+@dataclass(frozen=True)
+class Compressor:
+    """Compress chunks and decompress them again; `shuffle` is "" for plain Zstd."""
+
+    level: int
+    shuffle: str = ""
+    word_bytes: int = 1
+
+    @property
+    def documents(self) -> list[dict[str, Any]]:
+        """Return the codecs as `zarr.json` lists them."""
+        if not self.shuffle:
+            return [{"name": "zstd", "configuration": {"level": self.level, "checksum": True}}]
+        blosc = {
+            "typesize": self.word_bytes,
+            "cname": "zstd",
+            "clevel": self.level,
+            "shuffle": self.shuffle,
+            "blocksize": 0,
+        }
+        return [{"name": "blosc", "configuration": blosc}, {"name": "crc32c"}]
+
+    def encode(self, data: Any) -> bytes:
+        """Return data as the bytes of a chunk."""
+        if not self.shuffle:
+            return bytes(Zstd(level=self.level, checksum=True).encode(data))
+        shuffle = {"shuffle": Blosc.SHUFFLE, "bitshuffle": Blosc.BITSHUFFLE}[self.shuffle]
+        words = np.frombuffer(memoryview(data).cast("B"), dtype=f"V{self.word_bytes}")
+        coded = bytes(Blosc(cname="zstd", clevel=self.level, shuffle=shuffle).encode(words))
+        return coded + struct.pack("<I", google_crc32c.value(coded))
+
+    def decode(self, data: bytes) -> bytes:
+        """Return the data that `encode` was given. Raises ValueError if the chunk or its checksum is wrong."""
+        try:
+            if not self.shuffle:
+                return bytes(Zstd().decode(data))
+            return bytes(Blosc().decode(_checked(data)))
+        except _DAMAGED as error:  # a damaged header may request any size
+            raise ValueError(str(error)) from error
+
+    def decode_into(self, data: bytes, out: NDArray[Any]) -> None:
+        """Decode a chunk into a contiguous array. Raises ValueError if it is damaged or too large.
+
+        A chunk that is too small leaves the end of `out` as it was, which the stored checksum of the layer detects.
+        """
+        room = out.reshape(-1).view(np.uint8)
+        try:
+            if self.shuffle:
+                Blosc().decode(_checked(data), out=room)
+            else:
+                Zstd().decode(data, out=room)
+        except _DAMAGED as error:
+            raise ValueError(str(error)) from error
+
+
+def _checked(data: bytes) -> bytes:
+    """Return a chunk without the checksum at its end. Raises ValueError if that does not match."""
+    if struct.pack("<I", google_crc32c.value(data[:-4])) != data[-4:]:
+        raise ValueError("it does not match its checksum")
+    return data[:-4]
+
+
+@functools.cache
+def compressor(name: str) -> Compressor:
+    """Return the codec of a name. Raises InputError if there is none of this name."""
+    match = _NAME.fullmatch(name) if isinstance(name, str) else None
+    if match is None:
+        raise InputError(f"codec = {shown(name)}: must be 'zstd LEVEL' or 'blosc zstd LEVEL SHUFFLE SIZE'")
+    if match[1]:
+        return Compressor(int(match[1]))
+    return Compressor(int(match[2]), match[3], int(match[4]))
+
+
+def fitting(name: str, chunk_bytes: int) -> str:
+    """Return the name of the codec for chunks of a size: plain Zstd where they are too large for Blosc.
+
+    Raises InputError if there is no codec of this name.
+    """
+    return name if chunk_bytes <= _MOST_BYTES or not compressor(name).shuffle else ZSTD
