@@ -210,7 +210,7 @@ def test_a_copy_begun_from_another_state_of_the_source_is_begun_anew(
     old: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     target = tmp_path / "new.zarr"
-    assert killed_after(monkeypatch, 600, lambda: st.migrate_copy(st.open_store(old), target))
+    assert killed_after(monkeypatch, 250, lambda: st.migrate_copy(st.open_store(old), target))
     grown = st.append_samples(old, 1)
     assert st.migrate_copy(grown, target).samples == 6
 
@@ -313,7 +313,8 @@ def everything() -> st.StoreSpec:
     soft = ("dust_opacity", "", "straylight_added", "vignetting_factor", "glint_opacity")
     layers = (*LAYERS, *(f"without_{fault}" for fault in faults), *filter(None, soft))
     optional = tuple(name for name in layers if name not in st.REQUIRED_LAYERS)
-    return make_spec(faults=faults, layers=optional, soft_layers=soft, sample_names=("a", "b"), mask_any_faults=())
+    more = {"sample_names": ("a", "b"), "mask_any_faults": (), "rendered_shape": (28, 36)}
+    return make_spec(faults=faults, layers=optional, soft_layers=soft, **more)
 
 
 def test_every_variable_has_a_name_a_unit_and_a_description() -> None:

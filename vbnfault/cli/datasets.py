@@ -206,7 +206,10 @@ def migrate(
     from ..dataset.migration import migrate_store
 
     opened = stores.open_store(store)
-    before, length = opened.spec.format_version, opened.samples if out is not None else 0
+    before, length = opened.spec.format_version, 0
+    if out is not None:
+        stores.check_target(opened, out)
+        length = opened.samples
     with typer.progressbar(length=length, label="samples", file=sys.stderr, hidden=not length) as bar:
         migrated = migrate_store(store, out, progress=bar.update)
     typer.echo(f"{migrated.path}: {migrated.samples} samples, format {migrated.spec.format_version}, was {before}")

@@ -40,8 +40,6 @@ def migrate_store(
         If the store is damaged, the files cannot be written, or another command writes to one of the stores.
     """
     source = stores.open_store(path)
-    if out is not None:
-        stores.check_target(source, Path(out).absolute())
     with locked(source.path):
         if out is None:
             store = stores.migrate(source.path)

@@ -67,10 +67,20 @@ class Range:
 
 @dataclass
 class _Parameter:
-    """Hold the drawn values of one parameter: the range of its numbers, and how often it has each text."""
+    """Hold the drawn values of one parameter: the range of its numbers, and how often it has each text.
+
+    `pending` are numbers that `settle` adds to the range, many at once.
+    """
 
     numbers: Range = field(default_factory=Range)
     words: Counter[str] = field(default_factory=Counter)
+    pending: list[float] = field(default_factory=list)
+
+    def settle(self) -> None:
+        """Add the pending numbers to the range."""
+        if self.pending:
+            self.numbers.add(np.array(self.pending, dtype=np.float64))
+            self.pending.clear()
 
     def plain(self) -> dict[str, Any]:
         """Return the values as JSON-able data."""
@@ -251,16 +261,22 @@ def statistics(path: str | os.PathLike[str] | Store) -> Statistics:
         together += injected.T @ injected
         per_sample.update(injected.sum(axis=1).tolist())
         strata.update(STRATA[k] for k in columns["stratum"].tolist())
-        split = [str(name) for name in columns["split"]]
-        for k, i in enumerate(samples):
-            counts.add(split[k], None if commanded is None else commanded[i], injected[k])
-            sites.setdefault(split[k], set()).add(int(columns["site"][k]))
-            for fault, drawn in json.loads(columns["parameters"][k] or "{}").items():
+        split = columns["split"]
+        counts.add_all(split, None if commanded is None else commanded[samples], injected > 0)
+        samples_of = {of: split == of for of in dict.fromkeys(split.tolist())}
+        for of, chosen in samples_of.items():
+            sites.setdefault(of, set()).update(columns["site"][chosen].tolist())
+        for text in columns["parameters"].tolist():
+            for fault, drawn in json.loads(text or "{}").items():
                 _add_parameters(parameters.setdefault(fault, {}), drawn)
-        samples_of = {of: np.array([of in ("all", s) for s in split]) for of in ("all", *dict.fromkeys(split))}
+        for values in parameters.values():
+            for parameter in values.values():
+                parameter.settle()
         for name in _RANGED:
+            numbers = columns[name].astype(np.float64)
+            ranges[name].setdefault("all", Range()).add(numbers)
             for of, chosen in samples_of.items():
-                ranges[name].setdefault(of, Range()).add(columns[name][chosen].astype(np.float64))
+                ranges[name].setdefault(of, Range()).add(numbers[chosen])
     return Statistics(
         samples=store.samples,
         finished=counts.samples.total(),
@@ -329,14 +345,21 @@ def _add_parameters(known: dict[str, _Parameter], drawn: Any, name: str = "") ->
             _add_parameters(known, value, f"{name}.{key}" if name else str(key))
     elif isinstance(drawn, list):
         if drawn and all(type(value) in (int, float) for value in drawn):
-            known.setdefault(name, _Parameter()).numbers.add(np.asarray(drawn, dtype=np.float64))
+            _parameter(known, name).pending.extend(drawn)
         else:
             for value in drawn:
                 _add_parameters(known, value, name)
     elif isinstance(drawn, str | bool):
-        words = known.setdefault(name, _Parameter()).words
+        words = _parameter(known, name).words
         word = str(drawn).lower() if isinstance(drawn, bool) else drawn
         if word in words or len(words) < _MOST_WORDS:
             words[word] += 1
     elif drawn is not None:
-        known.setdefault(name, _Parameter()).numbers.add(np.array([drawn], dtype=np.float64))
+        _parameter(known, name).pending.append(drawn)
+
+
+def _parameter(known: dict[str, _Parameter], name: str) -> _Parameter:
+    """Return the values of a parameter, new ones if it is not known yet."""
+    if name not in known:
+        known[name] = _Parameter()
+    return known[name]

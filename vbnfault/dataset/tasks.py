@@ -167,7 +167,10 @@ class Run:
         self.failures: dict[int, str] = {}
         self._outcome: dict[int, str] = {}
         self._shards = range(store.shards) if shards is None else shards
-        self._queue = Queue({shard: self.lead(shard) for shard in self._shards})
+        # a build of a large store begins with what is missing, and checks afterwards what is there
+        leads, whole = {shard: self.lead(shard) for shard in self._shards}, store.whole_shards()
+        unfinished = [shard for shard in self._shards if shard not in whole]
+        self._queues = Queue(leads, unfinished), Queue(leads, [shard for shard in self._shards if shard in whole])
         self._begun = frozenset(store.begun())
 
     @property
@@ -193,8 +196,12 @@ class Run:
         return Task(shard=shard, sites=sites, unplanned=frozenset(unplanned), skip=skip, careful=careful)
 
     def next_task(self, last: int | None = None, busy: Sequence[int] = ()) -> int | None:
-        """Return the shard that a worker does after the shard `last`, of the same site if one is left."""
-        return self._queue.next(last, busy)
+        """Return the shard that a worker does after the shard `last`, of the same site if one is left.
+
+        Shards that are marked as finished come last.
+        """
+        tasks = (queue.next(last, busy) for queue in self._queues)
+        return next((task for task in tasks if task is not None), None)
 
     def tick(self, item: int, what: str, text: str) -> None:
         """Record an event of a sample, see `Tick`. Raises BuildFailed after too many failures without a success."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 import heapq
 import traceback
 from collections import Counter, deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Generic, Protocol, TypeVar
 
@@ -89,14 +89,14 @@ class Job(Protocol):
 class Queue:
     """Assign tasks so that a worker stays with one lead, such as a site, whose costly data it keeps.
 
-    `leads`: the lead of each task by its number.
+    `leads`: the lead of each task by its number. `tasks`: the tasks to assign; all by default.
     """
 
-    def __init__(self, leads: Mapping[int, int]) -> None:
+    def __init__(self, leads: Mapping[int, int], tasks: Iterable[int] | None = None) -> None:
         self._leads = leads
         self._by_lead: dict[int, deque[int]] = {}
-        for task, lead in leads.items():
-            self._by_lead.setdefault(lead, deque()).append(task)
+        for task in leads if tasks is None else tasks:
+            self._by_lead.setdefault(leads[task], deque()).append(task)
         # heap of leads, those with the most tasks left first; an entry is updated when it is taken out
         self._longest = [(-len(tasks), lead) for lead, tasks in self._by_lead.items()]
         heapq.heapify(self._longest)
@@ -108,7 +108,7 @@ class Queue:
         `busy` tasks, and among equal leads from the one with the most tasks left.
         """
         lead = None if last is None else self._leads[last]
-        if lead is None or not self._by_lead[lead]:
+        if lead is None or not self._by_lead.get(lead):
             lead = self._next_lead(Counter(self._leads[task] for task in busy))
         return None if lead is None else self._by_lead[lead].popleft()
 

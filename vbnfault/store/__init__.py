@@ -17,7 +17,7 @@ Only this package imports zarr. A sample has layers (arrays with one value or ve
   rebuilt.
 """
 
-from .arrays import EFFECT_RULE, LAYERS, REQUIRED_LAYERS, SCALARS, SEMANTIC, Array
+from .arrays import EFFECT_RULE, LAYERS, REQUIRED_LAYERS, SCALARS, SEMANTIC, Array, Member
 from .check import (
     Planned,
     Problem,
@@ -40,7 +40,7 @@ from .group import Store, create, is_store, open_store, write_samples
 from .labelled import open_dataset
 from .metadata import append_samples, recover
 from .migration import check_target, migrate, migrate_copy
-from .schema import SPLITS, STRATA, VOLATILE_ATTRIBUTES, Member, StoreSpec
+from .schema import SPLITS, STRATA, VOLATILE_ATTRIBUTES, StoreSpec
 from .shards import FetchedSample, ShardReader
 
 __all__ = [

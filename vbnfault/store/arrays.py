@@ -6,7 +6,9 @@ This module holds plain data; it reads and writes no file.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
+
+from numpy.typing import NDArray
 
 from ..core.quantities import DEFECTS, soft_kind
 from ..scene.names import STRATA
@@ -58,6 +60,24 @@ class Array:
     def fill(self) -> Any:
         """Return the value that an unwritten sample has."""
         return "" if self.is_text else float("nan") if self.dtype == "float64" else 0
+
+
+class Member(NamedTuple):
+    """Describe the required layout of one array of the group; `create`, `verify` and `recover` use it.
+
+    `values`: the values of a coordinate; None for an array that tasks write. `chunks`, `shards`: shapes of zarr's
+    chunks and shards, at least 1 in every axis. `codec`: the name of the codec of its chunks.
+    """
+
+    shape: tuple[int, ...]
+    chunks: tuple[int, ...]
+    shards: tuple[int, ...] | None
+    dtype: str
+    fill: Any
+    dims: tuple[str, ...]
+    attributes: dict[str, Any]
+    values: NDArray[Any] | tuple[str, ...] | None = None
+    codec: str = ZSTD
 
 
 _PIXELS = "sample y x channel"

@@ -356,15 +356,13 @@ def count_faults(
     the arrays `done`, `split` and `injected` are read.
     """
     counts = FaultCounts(store.spec.faults)
-    for number in range(store.shards) if shards is None else shards:
-        finished = [i for i, done in store.done(number).items() if done]
-        if not finished:
+    for number in store.begun():
+        done = np.array(list(store.done(number).values()))
+        if (shards is not None and number not in shards) or not done.any():
             continue
-        start = store.shard(number).start
-        split, injected = store.column("split", number), store.column("injected", number)
-        for i in finished:
-            commanded = None if planned is None else planned[i]
-            counts.add(str(split[i - start]), commanded, injected[i - start])
+        samples = store.shard(number)
+        commanded = None if planned is None else planned[samples.start : samples.stop][done]
+        counts.add_all(store.column("split", number)[done], commanded, store.column("injected", number)[done])
     return counts
 
 

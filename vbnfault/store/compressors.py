@@ -21,6 +21,7 @@ from typing import Any
 import google_crc32c
 import numpy as np
 from numcodecs import Blosc, Zstd
+from numcodecs.zstd import decompress
 from numpy.typing import NDArray
 
 from ..core.errors import InputError, shown
@@ -67,7 +68,7 @@ class Compressor:
         """Return the data that `encode` was given. Raises ValueError if the chunk or its checksum is wrong."""
         try:
             if not self.shuffle:
-                return bytes(Zstd().decode(data))
+                return bytes(decompress(data))
             return bytes(Blosc().decode(_checked(data)))
         except _DAMAGED as error:  # a damaged header may request any size
             raise ValueError(str(error)) from error
@@ -110,4 +111,4 @@ def fitting(name: str, chunk_bytes: int) -> str:
 
     Raises InputError if there is no codec of this name.
     """
-    return name if chunk_bytes <= _MOST_BYTES or not compressor(name).shuffle else ZSTD
+    return name if not compressor(name).shuffle or chunk_bytes <= _MOST_BYTES else ZSTD

@@ -4,6 +4,10 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from .schema import SPLITS
 
@@ -32,6 +36,18 @@ class FaultCounts:
         for counts, flags in ((self._planned, planned), (self._realised, injected)):
             for fault, is_in in zip(self.faults, flags if flags is not None else (), strict=False):
                 counts[split, fault] += bool(is_in)
+
+    def add_all(self, splits: NDArray[Any], planned: NDArray[np.bool_] | None, injected: NDArray[np.bool_]) -> None:
+        """Count some samples at once, as `add` counts each: str[sample], bool[sample, fault]."""
+        self._has_plan &= planned is not None
+        for split in dict.fromkeys(splits.tolist()):
+            chosen = splits == split
+            self.samples[split] += int(chosen.sum())
+            for counts, flags in ((self._planned, planned), (self._realised, injected)):
+                if flags is not None:
+                    totals = flags[chosen].sum(axis=0).tolist()
+                    for fault, total in zip(self.faults, totals, strict=True):
+                        counts[split, fault] += total
 
     def planned(self, fault: str, split: str | None = None) -> int:
         """Return the number of samples for which a fault is planned, in one split or in all."""

@@ -44,7 +44,7 @@ def explained(path: Path, doing: str) -> Iterator[None]:
         ) from error
 
 
-def denied(error: PermissionError, path: Path) -> InputError:
+def denied(error: PermissionError, path: str | Path) -> InputError:
     """Return the error for a file or folder that this user may not read.
 
     This is no damage, so it must not lead to a repair: it is no OSError, which callers take for damage.
@@ -54,7 +54,7 @@ def denied(error: PermissionError, path: Path) -> InputError:
     )
 
 
-def read(path: Path) -> bytes:
+def read(path: str | Path) -> bytes:
     """Return the content of a regular file.
 
     Raises
@@ -67,9 +67,12 @@ def read(path: Path) -> bytes:
         This user may not read the file.
     """
     with _regular_file(path) as file:
-        parts = []
-        while part := os.read(file, 1 << 30):
-            parts.append(part)
+        # os.read reserves what it may read; one byte more than the file has tells that nothing follows
+        size = os.fstat(file).st_size
+        parts = [os.read(file, min(size + 1, 1 << 30))]
+        if len(parts[0]) != size:
+            while part := os.read(file, 1 << 30):
+                parts.append(part)
     return parts[0] if len(parts) == 1 else b"".join(parts)
 
 
@@ -99,7 +102,7 @@ def read_parts(
 
 
 @contextlib.contextmanager
-def _regular_file(path: Path) -> Iterator[int]:
+def _regular_file(path: str | Path) -> Iterator[int]:
     """Open a regular file for reading in a `with` block. Raises what `read` says."""
     # without O_NONBLOCK, opening a pipe would wait for a writer
     flags = os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)

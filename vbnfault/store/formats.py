@@ -16,12 +16,10 @@ xarray reads the stores of every format.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-if TYPE_CHECKING:
-    from .schema import Member
+from .arrays import Member
 
 FORMAT_VERSION = 3
 READ_VERSIONS = (2, 3)

@@ -75,6 +75,8 @@ class Store:
         self.spec = spec_from_plain(attributes["store"], self.attributes)
         self._mode: Any = mode
         self._arrays: dict[str, zarr.Array[Any]] = {}
+        self._shapes: dict[str, tuple[int, ...]] = {}
+        self._folder = str(path)
 
     @property
     def shards(self) -> int:
@@ -181,11 +183,18 @@ class Store:
 
     def column(self, name: str, number: int) -> NDArray[Any]:
         """Return a scalar for all samples of a shard. Raises OSError or ValueError if its chunk is damaged."""
-        row, size = self.spec.arrays[name], self.spec.shard_samples
-        if self.spec.empty(name):
-            return np.zeros((len(self.shard(number)), *self.spec.shape(row)), dtype=row.dtype)
-        values = decode_values(disk.read(self.file(name, number)), row.dtype)
-        return values.reshape(size, *self.spec.shape(row))[: len(self.shard(number))]
+        row, shape = self.spec.arrays[name], self._shape(name)
+        samples = len(self.shard(number))
+        if 0 in shape:
+            return np.zeros((samples, *shape), dtype=row.dtype)
+        values = decode_values(disk.read(f"{self._folder}/{self.file_name(name, number)}"), row.dtype)
+        return values.reshape(self.spec.shard_samples, *shape)[:samples]
+
+    def _shape(self, name: str) -> tuple[int, ...]:
+        """Return the shape of one sample of an array; a large store asks for it a hundred thousand times."""
+        if name not in self._shapes:
+            self._shapes[name] = self.spec.shape(self.spec.arrays[name])
+        return self._shapes[name]
 
     def _column_bytes(self, name: str, number: int, values: Mapping[int, Any]) -> bytes:
         """Return the chunk file of a scalar of a shard; samples without a value get the fill value."""
@@ -212,21 +221,28 @@ class Store:
 
     def finished(self) -> int:
         """Return how many samples are marked as finished in `done`."""
-        total, whole = 0, self.samples // self.spec.shard_samples
+        return sum(count for _, count in self._counts())
+
+    def whole_shards(self) -> set[int]:
+        """Return the shards whose samples are all marked as finished in `done`."""
+        return {number for number, count in self._counts() if count == len(self.shard(number))}
+
+    def _counts(self) -> Iterator[tuple[int, int]]:
+        """Yield each shard that has files, and how many of its samples are marked as finished in `done`."""
+        full = self.samples // self.spec.shard_samples
         counts: dict[bytes, int] = {}  # most files have the same content, so each content is decoded once
         for number in self.begun():
             try:
-                data = disk.read(self.file("done", number))
-                if data not in counts or number >= whole:
+                data = disk.read(f"{self._folder}/{self.file_name('done', number)}")
+                if data not in counts or number >= full:
                     counts[data] = sum(self.done(number).values())
             except OSError:
                 continue
-            total += counts[data]
-        return total
+            yield number, counts[data]
 
     def file_name(self, name: str, number: int) -> str:
         """Return the name, relative to the store, of the file that holds an array's values for one shard."""
-        return "/".join([name, "c", str(number), *("0" for _ in self.spec.arrays[name].dims[1:])])
+        return f"{name}/c/{number}{'/0' * len(self._shape(name))}"
 
     def file(self, name: str, number: int) -> Path:
         """Return the path of the file that holds an array's values for one shard."""

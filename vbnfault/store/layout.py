@@ -20,8 +20,9 @@ import numpy as np
 from numcodecs import VLenUTF8
 from numpy.typing import NDArray
 
+from .arrays import Member
 from .compressors import ZSTD, compressor
-from .schema import Member, StoreSpec
+from .schema import StoreSpec
 
 DOCUMENT = "zarr.json"
 SPARE = "spare"

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from ..core.errors import InputError
 from . import disk
+from .arrays import Member
 from .group import Store, open_store, read_document, read_root
 from .layout import (
     DOCUMENT,
@@ -26,7 +27,7 @@ from .layout import (
     sealed,
     to_bytes,
 )
-from .schema import Member, spec_from_plain
+from .schema import spec_from_plain
 
 
 def metadata_problems(store: Store) -> tuple[list[str], bool]:

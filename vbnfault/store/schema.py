@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +25,7 @@ from .arrays import (
     REQUIRED_LAYERS,
     SCALARS,
     Array,
+    Member,
     soft_row,
     without_row,
 )
@@ -71,24 +72,6 @@ _DESCRIPTIONS = {  # of the coordinates
     "name": "Name of the sample in the table of poses.",
     "sample": "Index of the sample, from 0.",
 }
-
-
-class Member(NamedTuple):
-    """Describe the required layout of one array of the group; `create`, `verify` and `recover` use it.
-
-    `values`: the values of a coordinate; None for an array that tasks write. `chunks`, `shards`: shapes of zarr's
-    chunks and shards, at least 1 in every axis. `codec`: the name of the codec of its chunks.
-    """
-
-    shape: tuple[int, ...]
-    chunks: tuple[int, ...]
-    shards: tuple[int, ...] | None
-    dtype: str
-    fill: Any
-    dims: tuple[str, ...]
-    attributes: dict[str, Any]
-    values: NDArray[Any] | tuple[str, ...] | None = None
-    codec: str = ZSTD
 
 
 def _coordinate(name: str, dim: str, values: NDArray[Any] | tuple[str, ...], long_name: str, **more: str) -> Member:
