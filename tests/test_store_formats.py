@@ -290,7 +290,7 @@ def test_zarr_itself_writes_the_codecs_of_the_documents(tmp_path: Path) -> None:
     import zarr
 
     store = filled(tmp_path / "s.zarr", samples=1)
-    for name in ("image", "depth_m", "normal", "mask"):
+    for name in ("image", "depth_m", "normal", "raw"):
         array = zarr.open_array(store.path / name, mode="r")
         same = zarr.create_array(
             tmp_path / f"{name}.zarr",
