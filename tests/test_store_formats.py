@@ -355,3 +355,15 @@ def test_xarray_draws_images_upright(finished_store: Path) -> None:
         upper, lower = (drawn[int(height - (box.y0 + f * box.height)), x] for f in (0.75, 0.25))
         plt.close(figure)
         assert (upper, lower) == (255, 0), name
+
+
+def test_stores_of_other_codecs_are_merged_after_a_migration(old: Path, tmp_path: Path) -> None:
+    new = dataset.migrate_store(old, tmp_path / "new.zarr").path
+    with pytest.raises(
+        InputError, match=r"new\.zarr: has another format or other codecs than .*s\.zarr; make a copy"
+    ):
+        dataset.merge_stores([old, new], tmp_path / "m.zarr", progress=False)
+    for store, out in ((old, "old-merged.zarr"), (new, "new-merged.zarr")):
+        assert dataset.merge_stores([store], tmp_path / out, progress=False).digest == DIGEST
+        assert dataset.verify(tmp_path / out).problems == []
+        assert st.open_store(tmp_path / out).spec.codecs == st.open_store(store).spec.codecs

@@ -153,12 +153,14 @@ class _Merge:
         known = [*([store_module.open_store(target)] if exists else []), *sources]
         for other in known[1:]:
             check_same_dataset(other, known[0])
+            _check_same_codecs(other, known[0])
         _check_equal_samples(known)
         self.sources, self._move = sources, move
         if not exists:
             first = sources[0].spec
             attributes = {k: v for k, v in first.attributes.items() if k != versions.VERSIONS_OF_SAMPLES}
-            spec = StoreSpec(**{**first.plain(), "attributes": attributes})
+            kept = {"attributes": attributes, "format_version": first.format_version}
+            spec = StoreSpec(**{**first.plain(), **kept})
             store_module.create(target, spec, sources[0].samples)
         self.store = self._with_versions(store_module.recover(target))
         self._digests = SampleDigests(self.store.samples)
@@ -249,6 +251,15 @@ class _Merge:
         except (OSError, ValueError) as error:
             raise VbnfaultError(f"{source.path}: shard {number} changed while it was read ({error})") from error
         self.store.write_shard(number, encoded, damaged=set(self.store.shard(number)).difference(held, new))
+
+
+def _check_same_codecs(store: Store, other: Store) -> None:
+    """Raise InputError if chunks of one store cannot be copied into the other."""
+    if (store.spec.format_version, store.spec.codecs) != (other.spec.format_version, other.spec.codecs):
+        raise InputError(
+            f"{store.path}: has another format or other codecs than {other.path}; make a copy of each with "
+            "vbnfault migrate STORE --out NEW, and merge the copies"
+        )
 
 
 def _check_equal_samples(stores: Sequence[Store]) -> None:
