@@ -123,7 +123,7 @@ def test_a_build_writes_the_card_once(copy: Path, monkeypatch: pytest.MonkeyPatc
     made, written = [0], []
 
     class Summary:
-        counts = ()
+        counts, shard_range = (), None
 
         @property
         def built(self) -> int:
