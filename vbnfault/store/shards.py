@@ -17,8 +17,8 @@ from .codec import crc32c
 from .compressors import compressor
 from .group import Store
 
-# A compressed chunk of at most this size, such as an empty mask, is likely to occur again: its checksum is kept.
-_SMALL_CHUNK = 4096
+# A compressed chunk of at most this size may be that of an empty mask, which occurs again and again.
+_SMALL_CHUNK = 1024
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,7 +45,8 @@ class ShardReader:
         self.store = store
         self.layers = tuple(layers)
         self._checked = {name: k for k, name in enumerate(store.spec.checked)}
-        self._small: dict[bytes, int] = {}
+        # checksums of compressed chunks of zeros by layer, which are filled in without decoding them again
+        self._zeros: dict[tuple[str, bytes], int] = {}
 
     def fetch(self, number: int, samples: Collection[int]) -> dict[int, FetchedSample]:
         """Return the compressed chunks of samples of one shard; each file is opened once.
@@ -101,15 +102,17 @@ class ShardReader:
         data = fetched.chunks[name]
         if not out.size:
             return ""
-        try:
-            compressor(self.store.spec.codecs[name]).decode_into(data, out)
-        except ValueError:
-            return "cannot be decoded"
-        crc = self._small.get(data) if len(data) <= _SMALL_CHUNK else None
-        if crc is None:
+        crc = self._zeros.get((name, data)) if len(data) <= _SMALL_CHUNK else None
+        if crc is not None:
+            out.fill(0)
+        else:
+            try:
+                compressor(self.store.spec.codecs[name]).decode_into(data, out)
+            except ValueError:
+                return "cannot be decoded"
             crc = crc32c(out)
-            if len(data) <= _SMALL_CHUNK and len(self._small) < 1000:
-                self._small[data] = crc
+            if len(data) <= _SMALL_CHUNK and crc == fetched.crc32c[name] and not out.any():
+                self._zeros[name, data] = crc
         return "" if crc == fetched.crc32c[name] else "does not match its stored crc32c"
 
     def _span(self, number: int) -> str:
