@@ -27,7 +27,12 @@ DATASET = PIPELINE | {"pipeline", "store"}
 OUTPUT = DATASET | {"dataset"}
 MAY_IMPORT: dict[str, set[str]] = {
     "__init__": OUTPUT
-    | {"navigation", "study", "output"},  # for type checkers; at run time a name loads its module when it is used
+    | {
+        "navigation",
+        "study",
+        "output",
+        "torch",
+    },  # for type checkers; at run time a name loads its module when it is used
     "core": set(),
     "reflectance": {"core"},
     "body": {"core"},
@@ -42,6 +47,8 @@ MAY_IMPORT: dict[str, set[str]] = {
     "world": WORLD,
     "pipeline": PIPELINE,
     "store": {"core", "scene"},
+    "train": {"core", "scene", "store"},
+    "torch": {"core", "store", "train"},
     "dataset": DATASET,
     "study": OUTPUT | {"navigation"},
     "output": OUTPUT | {"navigation", "study"},
@@ -56,6 +63,7 @@ ONLY = {  # distribution → the packages or modules that import it
     "numcodecs": {"store"},
     "dask": {"dataset.dask"},
     "distributed": {"dataset.dask"},
+    "torch": {"torch"},
     "typer": {"cli"},
     "pyarrow": {"output.export.formats.huggingface", "scene.trajectory", "study"},
     "SALib": {"study"},

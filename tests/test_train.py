@@ -290,3 +290,22 @@ print(sorted({{"zarr", "xarray", "pydantic", "scipy", "cv2", "mitsuba", "drjit",
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
+
+
+def test_without_pytorch_its_layer_says_what_to_install() -> None:
+    code = """
+import sys
+sys.modules["torch"] = None
+import vbnfault
+print(vbnfault.torch.__all__)
+try:
+    from vbnfault.torch import Loader
+except ModuleNotFoundError as error:
+    print(error)
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    names, sentence = done.stdout.splitlines()
+    assert "SampleDataset" in names
+    assert sentence == (
+        "vbnfault.torch.Loader needs PyTorch, which is not installed: pip install 'vbnfault[torch]'"
+    )

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.2.0"
 
 if TYPE_CHECKING:
-    from . import navigation
+    from . import navigation, torch
     from .core.errors import InputError, VbnfaultError
     from .dataset import BuildOptions, verify
     from .dataset import build_scene as build
@@ -74,6 +74,7 @@ _HOMES = {
     "statistics": "dataset.statistics",
     "study": "study:",
     "text": "faults",
+    "torch": "torch:",
     "trace_flare": "output.flare_images",
     "verify": "dataset",
 }
@@ -115,6 +116,7 @@ __all__ = [
     "statistics",
     "study",
     "text",
+    "torch",
     "trace_flare",
     "verify",
 ]

@@ -518,9 +518,15 @@ def _module(name: str) -> str:
 
     module = importlib.import_module(name)
     lines = [f".. automodule:: {name}", "   :no-members:", ""]
+    try:
+        exports = {export: getattr(module, export) for export in module.__all__}
+    except ModuleNotFoundError as error:
+        if error.name != "torch":
+            raise
+        exports = {}  # an optional library: its how-to page says the same
     for kind, belongs in (("function", inspect.isfunction), ("class", inspect.isclass)):
-        for export in module.__all__:
-            if belongs(getattr(module, export)):
+        for export, value in exports.items():
+            if belongs(value):
                 members = ["   :members:"] if kind == "class" else []
                 lines += [f".. auto{kind}:: {name}.{export}", *members, ""]
     return "```{eval-rst}\n" + "\n".join(lines) + "```\n"
