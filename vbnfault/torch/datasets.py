@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.utils.data import Dataset, IterableDataset, Sampler, default_collate, get_worker_info
 
+from ..core import environment
 from ..core.errors import InputError, VbnfaultError, shown
 from ..store import open_store
 from ..train import Columns, Order, SampleReader, Targets, select
@@ -367,9 +368,7 @@ def split_batch(batch: Batch) -> list[Batch]:
 
 def threads_of(workers: int) -> int:
     """Return how many threads decode in each of so many workers, 1 to 8."""
-    affinity = getattr(os, "sched_getaffinity", None)
-    cores = len(affinity(0)) if affinity else os.cpu_count() or 1
-    return max(1, min(MOST_THREADS, cores // max(1, workers)))
+    return max(1, min(MOST_THREADS, environment.usable_cores() // max(1, workers)))
 
 
 def _shared_numbers(count: int) -> Tensor:
