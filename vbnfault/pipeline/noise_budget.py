@@ -49,6 +49,7 @@ _DOWN = 0.25
 _CELLS_AT_ONCE = 1 << 20
 # Rows of pixels whose samples are compared with their neighbours at a time, to bound memory.
 _STRIP = 64
+_ROWS = 1 << 15  # pixels whose squared ranges are summed at a time
 _THREADS = 2
 
 
@@ -81,7 +82,7 @@ def sample_to_noise(
     indirect = None
     if guide is not None and scene.bounces:
         indirect = render.indirect(spec.terrain.surface, scene, guide)
-    light = sampled.radiance.array.copy() if indirect is None else sampled.radiance.array + indirect
+    light = sampled.radiance.array.copy() if indirect is None else _sum_of(sampled.radiance.array, indirect)
     whole = sampled.radiance.with_array(light.view())
     sampled = replace(sampled, radiance=whole)  # a copy in all bands takes 37 MB for a frame of 1024 pixels
     release_unused(2 * frame_bytes)  # samples in cells have wavefronts of other sizes
@@ -112,11 +113,12 @@ def sample_to_noise(
         over = np.count_nonzero((now > fraction) & shows)
         return bool(over > _NOISY_FRACTION * np.count_nonzero(lit))
 
+    now = refined.noise(near)
     for k in range(_ROUNDS):
-        if not is_over(now := refined.noise(near)):
+        if not is_over(now):
             break
         refined.refine(now > fraction, near, fraction, is_last=k == _ROUNDS - 1)
-    now = refined.noise(near)
+        now = refined.noise(near)
     return SampledRadiance(
         radiance=whole,  # its array is that which `refine` has changed
         samples_per_pixel=float(refined.used.mean()),
@@ -164,7 +166,7 @@ class _Refined:
         self._range = _ranges(samples, (height, width))
         # Variance of a pixel with one sample in each cell. The square of the range is proportional to it; `refine`
         # finds the factor.
-        square = np.einsum("pc,pc->p", self._range, self._range, dtype=np.float32) / cells**2
+        square = _square_sums(self._range) / cells**2
         self._single = square.reshape(height, width) * (self._white_e / sensor_e) ** 2
         # what the later samples of a pixel leave of it
         self._left = np.ones_like(self._single)
@@ -289,6 +291,23 @@ def _ranges(samples: NDArray[np.float16], shape: tuple[int, int]) -> NDArray[np.
     with ThreadPoolExecutor(_THREADS) as pool:  # numpy and OpenCV use one core here
         list(pool.map(of_strip, range(0, height, _STRIP)))
     return out.reshape(height * width, side * side)
+
+
+def _sum_of(a: F32, b: F32) -> F32:
+    """Return the sum of two radiances, float32[band, y, x]."""
+    out = np.empty_like(a)
+    with ThreadPoolExecutor(_THREADS) as pool:
+        list(pool.map(lambda band: np.add(a[band], b[band], out=out[band]), range(len(a))))
+    return out
+
+
+def _square_sums(values: NDArray[np.float16]) -> F32:
+    """Return the sum of the squares of each row, float32[row]."""
+    out = np.empty(len(values), np.float32)
+    for start in range(0, len(values), _ROWS):  # as float32 the rows stay in the cache
+        part = values[start : start + _ROWS].astype(np.float32)
+        out[start : start + _ROWS] = np.einsum("pc,pc->p", part, part)
+    return out
 
 
 def _allocated(squares: F32, goal: F32, most: int) -> NDArray[np.int32]:

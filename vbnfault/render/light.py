@@ -221,20 +221,22 @@ class Direct(Light):
             signals = np.zeros(pixels.count, np.float32), np.empty((pixels.count, spp), np.float16)
             factors, limb = weights.astype(np.float64) @ signal, self.mean_limb(signal)
             white = float(signal @ self.scene.sun.irradiance_W_m2_nm) / np.pi
-        for part in pixels.parts(max(1, WAVEFRONT // (spp * len(weights)))):
+
+        def started(part: Pixels) -> tuple[slice, list[Any], Any]:
+            """Let the kernels of a part run; return its pixels, the sums of its terms, and the samples' signals."""
             strata = Strata(part, spp, self.scene.key, limb)
-            terms = self.terms(strata)
+            terms, samples = self.terms(strata), None
             if factors is not None:
                 seen = self.signal(terms, factors)
-                terms += [seen * strata.checkered(), seen * dr.opaque(mi.Float, spp / white)]
-            dr.eval(*terms)  # without this, every block sum would trace the rays again
-            span = slice(part.first, part.first + part.count)
-            if signals is not None:
-                signals[1][span] = terms.pop().numpy().reshape(-1, spp)
+                samples = dr.float16_array_t(mi.Float)(seen * dr.opaque(mi.Float, spp / white))
+                terms.append(seen * strata.checkered())
+            dr.eval(*terms, samples)  # without this, every block sum would trace the rays again
             sums = [dr.block_sum(term, spp) for term in terms]
             dr.eval(*sums)
-            for k, (row, total) in enumerate(zip(weights, sums, strict=False)):
-                values = total.numpy()
+            return slice(part.first, part.first + part.count), sums, samples
+
+        def take(span: slice, sums: list[NDArray[np.float32]], samples: NDArray[np.float16] | None) -> None:
+            for k, (row, values) in enumerate(zip(weights, sums, strict=False)):
                 if self.banded:  # the only term of its band, which is quicker than a sum
                     np.multiply(values, row[k], out=out[k, span])
                     continue
@@ -242,8 +244,18 @@ class Direct(Light):
                     continue
                 for band in np.flatnonzero(row):
                     out[band, span] += values * row[band]
-            if signals is not None:
-                signals[0][span] = sums[-1].numpy()
+            if signals is not None and samples is not None:
+                signals[0][span] = sums[-1]
+                signals[1][span] = samples.reshape(-1, spp)
+
+        done: tuple[slice, list[NDArray[np.float32]], NDArray[np.float16] | None] | None = None
+        for part in pixels.parts(max(1, WAVEFRONT // (spp * len(weights)))):
+            span, sums, samples = started(part)
+            if done is not None:  # numpy uses one core: it works while the kernels of the next part run
+                take(*done)
+            done = span, [total.numpy() for total in sums], None if samples is None else samples.numpy()
+        if done is not None:
+            take(*done)
         return out, signals
 
     def mean_limb(self, signal: NDArray[np.float64]) -> tuple[float, ...] | None:
