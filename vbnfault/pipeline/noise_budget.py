@@ -51,6 +51,8 @@ _CELLS_AT_ONCE = 1 << 20
 _STRIP = 64
 _ROWS = 1 << 15  # pixels whose squared ranges are summed at a time
 _THREADS = 2
+# Memory that the first samples of 1024×1024 pixels in eight bands take, and samples in cells beside them.
+_RENDER_BYTES, _CELLS_BYTES = 220 << 20, 70 << 20
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -76,8 +78,7 @@ def sample_to_noise(
 
     camera = spec.camera
     electron_rate = green_per_second(spec)
-    frame_bytes = 4 * len(electron_rate) * scene.view.height_px * scene.view.width_px
-    release_unused(6 * frame_bytes)  # what the sample before took
+    release_unused(_RENDER_BYTES)  # what the sample before took
     sampled = render.direct_by_sample(spec.terrain.surface, scene, electron_rate)
     indirect = None
     if guide is not None and scene.bounces:
@@ -85,7 +86,7 @@ def sample_to_noise(
     light = sampled.radiance.array.copy() if indirect is None else _sum_of(sampled.radiance.array, indirect)
     whole = sampled.radiance.with_array(light.view())
     sampled = replace(sampled, radiance=whole)  # a copy in all bands takes 37 MB for a frame of 1024 pixels
-    release_unused(2 * frame_bytes)  # samples in cells have wavefronts of other sizes
+    release_unused(_CELLS_BYTES)  # samples in cells have wavefronts of other sizes
     exposure = foreseen_exposure_s(spec.scene, camera, truth, scene.view, whole)
     exposure *= 2 ** max(spec.scene.camera.exposure_stops[1], 0.0)  # the longest of the samples of the view
     signal_e = np.einsum("b,byx->yx", electron_rate * exposure, whole.array)
