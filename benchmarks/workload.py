@@ -141,6 +141,7 @@ class Workload:
             views=1,
             pose=pose,
             rendering=rendering,
+            starless=None,
             exposure=exposure,
             injection=injection,
             images=images,
