@@ -32,18 +32,22 @@ the worst 5 % of:
 Of the spots in the sky of a real frame, 10 in the median, 2 of them of 2 px or more, stay where they are over at
 least three frames: warm pixels. The others, 20 and 14 of 2 px or more, lie where hardly another frame has one.
 Their number, sizes and brightness are those of tracks of protons in the exposure and the readout of 4.2 s, some of
-which are long; the catalogue of stars has nine brighter than magnitude 7 in such a field, of which about four
-show. `SPOTS` gives the rendered frames the same tracks, and the grains of the coma at 3.6 au. Stars and warm
-pixels come from scene and sensor.
+which are long; at the 4.65 e/DN of the sensor they fit fast protons, which leave the least charge; the catalogue of
+stars has nine brighter than magnitude 7 in such a field, of which about four show. `SPOTS` gives the rendered
+frames the same tracks, and the grains of the coma at 3.6 au. Stars and warm pixels come from scene and sensor.
 
 A shape file is sharpened as far as its own roughness asks for (`body.sharpen`). The random relief below its facets
 has the amplitude `RELIEF`: 1 agrees best with the texture of the frames but lowers `rank`, since it is not that
 of the comet. `--set body.sharpen=0 --set patch.relief=1` turns both off.
 
-The scene gets a coma (`HAZE`) unless it has one. Its Afρ reproduces the haze of the frames, which falls as one over
-the distance from the centre and is brighter towards the Sun. An aperture of 10,000 km would then see 30 times the
-light of the nucleus, but until June 2014 the comet exceeded the light of its nucleus only somewhat (Tubiana et al.
-2015, A&A 573, A62). So most of this haze is light that the camera scatters. `--afrho-cm 0` leaves it out.
+The sky of 31 frames is the sum of six parts, fitted by least squares to means over 8 px: the halo of the limb;
+light scattered farther, 0.5 % of that of the body (0.4 to 0.8 % in four fifths of the frames; the wings of the
+point spread); smear of both directions, 1.15e-6 of a column's light; dark signal that rises along the columns by
+2.0 DN (1.5 to 3.0); a bias that differs by 0.8 DN between the first twenty and the last eleven; and a coma (`HAZE`,
+unless the scene has one). Coma and wings are told apart by little else than the side of the Sun: without a coma the
+wings hold 0.9 % of the light, and the fit is worse by a tenth. With the Afρ here an aperture of 10,000 km would see
+some 6 times the light of the nucleus; until June 2014 the comet exceeded it only somewhat (Tubiana et al. 2015, A&A
+573, A62). `--afrho-cm 0` leaves it out.
 
 `replay.json` holds all figures, `sheet.png` the pairs real | rendered at full size, with the same stretch, and
 `pairs` the aligned images, which `flight_classifier.py` tries to tell apart.
@@ -90,13 +94,19 @@ BINNING = 2  # the frames have half the native size
 # Weights of native pixels in each axis of the halving: noise of neighbours in the frames correlates by 0.07
 _HALVING = (0.035, 0.465, 0.465, 0.035)
 _STRETCH = 255 / 4095**0.5  # of a root of DN
-_BLACK_DN = 3.5  # over the bias of the sensor, shown as 0; fitted to the sky of 11 frames
-AFRHO_CM = 270.0  # chosen beside the halo of the point spread for the glow of all 33 frames
-# What leaves spots and tracks in the sky. Protons: flux, depth and diffusion fitted to the spots of 11 frames; in
-# quiet time CREME96 has 4.67 at the Sun-Earth point L2. Grains: the density at 100 km in August 2014, see
-# `vbnfault.faults.particles`.
+_BLACK_DN = -0.35  # over the bias of the sensor, shown as 0: the mean background of 31 frames
+AFRHO_CM = 50.0  # chosen beside halo and wings of the point spread for the sky of 31 frames
+# What leaves spots and tracks in the sky. Protons: flux, depth and diffusion fitted to the spots of 11 frames,
+# least energy assumed (spacecraft and solar wind keep out slower ones); in quiet time CREME96 has 4.67 at the
+# Sun-Earth point L2. Grains: the density at 100 km in August 2014, see `vbnfault.faults.particles`.
 SPOTS: dict[str, dict[str, Any]] = {
-    "cosmic_rays": {"model": "tracks", "flux_per_cm2_s": 6.0, "thickness_um": 15.0, "diffusion_um": 4.0},
+    "cosmic_rays": {
+        "model": "tracks",
+        "flux_per_cm2_s": 6.0,
+        "energy_MeV": [300.0, 5000.0],
+        "thickness_um": 15.0,
+        "diffusion_um": 4.0,
+    },
     "particles": {"model": "coma_grains", "density_per_m3": 6e-4},
 }
 # Random relief lowers the rank correlation: this is about the least with the texture within a factor of 2.

@@ -21,6 +21,7 @@ from vbnfault.core.registry import chained, forget
 from vbnfault.detector import MosaicDetector, Sensor
 from vbnfault.detector.chain import Device, MosaicNoise
 from vbnfault.detector.effects import STEPS, Effect, Exposure, contract, order, registry
+from vbnfault.detector.effects.electrons import DarkCurrent
 from vbnfault.detector.sensor import load_sensor, parse_sensor
 
 SHAPE = (48, 40)
@@ -218,3 +219,35 @@ def test_an_unknown_effect_is_named() -> None:
     table = {"architecture": "cmos", "pixel_pitch_um": 5.5, "readout": {"bits": 12, "full_well_e": 1e4}}
     with pytest.raises(InputError, match=r"t.toml: effects.afterimege: no such effect \(did you mean afterimage"):
         parse_sensor({**table, "effects": {"afterimege": {}}}, source="t.toml")
+
+
+def test_bias_and_temperature_drift_from_exposure_to_exposure() -> None:
+    """The bias moves every pixel alike, the temperature the dark current; without noise and with 0 neither acts."""
+    calm = load_sensor("rosetta_navcam")
+    calm = dataclasses.replace(
+        calm,
+        temperature_drift_K=0.0,
+        readout=dataclasses.replace(calm.readout, bias_drift_dn_rms=0.0, read_noise_e_rms=0.0, bits=16),
+    )
+    drifting = dataclasses.replace(calm, readout=dataclasses.replace(calm.readout, bias_drift_dn_rms=40.0))
+    plain, moved = (Device(sensor, 3, shape=SHAPE) for sensor in (calm, drifting))
+    np.testing.assert_array_equal(moved.raw(LIGHT, 0.1), plain.raw(LIGHT, 0.1))
+    shifts = []
+    for seed in range(150):
+        apart = moved.raw(LIGHT / 4, 0.1, noise(seed)).astype(int) - plain.raw(LIGHT / 4, 0.1, noise(seed))
+        assert np.ptp(apart) <= 2  # rounding of either
+        shifts.append(apart.mean())
+    # of 150 values, the standard error of the mean is 40 / 12 and that of the deviation 40 / 17
+    assert abs(np.mean(shifts)) < 4 * 40 / 12
+    assert np.std(shifts) == pytest.approx(40, abs=4 * 40 / 17)
+    warm = Device(dataclasses.replace(calm, temperature_drift_K=3.0), 3, shape=SHAPE)
+    np.testing.assert_array_equal(warm.expected_e(LIGHT, 0.1), plain.expected_e(LIGHT, 0.1))
+    dark = plain.expected_e(np.zeros_like(LIGHT), 5.0, {})
+    ratios = []
+    for seed in range(60):
+        acting = Exposure(device=warm, exposure_s=5.0, noise=noise(seed), acts={})
+        added = DarkCurrent().apply(np.zeros_like(LIGHT), acting)
+        ratios.append(float(np.median(added / dark)))
+        np.testing.assert_allclose(added, dark * ratios[-1], rtol=1e-4)
+    # Eg / 2kT² is 0.113 per K at 240 K, so 3 K are a factor of e^0.34
+    assert np.std(np.log(ratios)) == pytest.approx(0.34, rel=0.4)

@@ -256,7 +256,7 @@ _DIMENSIONLESS = """
     rts_share samples samples_per_pixel seed shadow_hiding_amplitude shadow_hiding_width shard_samples sharpen
     shutter_transmission single_scattering_albedo site sites size_power slope_parameter strata strength
     stuck_bits stuck_share sun sun_facing_nominal_fraction sunlit_fraction test tile train transmission
-    trap_share val value variants_per_view vd
+    trap_share val value variants_per_view vd wing_index
 """
 
 

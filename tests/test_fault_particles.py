@@ -348,7 +348,7 @@ def test_tracks_in_a_navigation_camera() -> None:
         sensor=load_sensor("rosetta_navcam"), seed=3, width_px=1024, height_px=1024, direction="up"
     )
     lens = ThinLens(focal_length_mm=152.5, f_number=5.1, transmission=0.0083)
-    camera = Camera(lens=lens, detector=detector, architecture="frame_transfer_ccd", exposure_s=3.0)
+    camera = Camera(lens=lens, detector=detector, architecture="frame_transfer_ccd", exposure_s=0.43)
     nodes = spectra.band_nodes_nm(400.0, 1000.0, 8)
     noise_e = detector.read_noise_e_rms
     tracks = []
@@ -359,8 +359,8 @@ def test_tracks_in_a_navigation_camera() -> None:
         # the number whose mean signal over their figures reaches five times the noise
         fault = make("particles", density_per_m3=per_m3, least_noise=5.0)
         tracks.append(np.mean([fault.draw(c, rng(seed))["count"] for seed in range(4)]))
-    assert noise_e == 18
-    assert 10 < tracks[0] < 60
+    assert noise_e == 2
+    assert 10 < tracks[0] < 100
     assert tracks[1] < 6
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -46,6 +48,18 @@ def test_the_halo_is_the_stated_law() -> None:
         assert image[200, 200 + away] == pytest.approx(law, rel=0.1)
     slope = np.log(image[200, 280] / image[200, 220]) / np.log(4)
     assert slope == pytest.approx(-2.8, abs=0.15)
+
+
+def test_wings_are_a_second_and_wider_halo() -> None:
+    """Wings alone are a halo of the same law; what they take, the core lacks."""
+    winged = replace(HALO, wing_fraction=0.02, wing_rad=5e-3, wing_index=4.0)
+    alone = Halo(core_rad=HALO.core_rad, halo_fraction=0.02, halo_rad=5e-3, halo_index=4.0)
+    core = Halo(core_rad=HALO.core_rad, halo_fraction=0.0, halo_rad=1e-4, halo_index=3.0)
+    made, *parts = (one.on_pixels(PIXEL_RAD, (150, 150)) for one in (winged, HALO, alone, core))
+    np.testing.assert_allclose(made, parts[0] + parts[1] - parts[2], rtol=1e-9, atol=1e-15)
+    assert winged.applied(point(), PIXEL_RAD).sum() == pytest.approx(1, abs=1e-12)
+    law = 0.02 * 2 / (2 * np.pi * 50**2)  # of a pixel in the middle of the wings, whose frame holds nearly all
+    assert (made - parts[0])[0, 40] == pytest.approx(law * (1 + 0.8**2) ** -2, rel=0.1)
 
 
 def test_a_body_that_fills_the_frame_is_as_bright_at_its_edges() -> None:
@@ -99,6 +113,10 @@ def test_a_scene_sets_the_point_spread_in_angles() -> None:
         ({"camera.point_spread.core_urad": 0.0}, "core_urad = 0.0"),
         ({"camera.point_spread.core_urad": 60.0, "camera.point_spread.halo_index": 2.0}, "halo_index = 2.0"),
         ({"camera.point_spread.halo_fraction": 0.1}, "core_urad"),
+        (
+            {f"camera.point_spread.{key}": 0.5 for key in ("core_urad", "halo_fraction", "wing_fraction")},
+            "halo_fraction = 0.5, wing_fraction = 0.5: must be below 1",
+        ),
         ({"camera.point_spread.core_urad": 60.0, "camera.lens": "tessar"}, "point_spread: the lens has its own"),
     ],
 )

@@ -44,6 +44,9 @@ class ReadoutSpec:
         default=13_500.0, gt=0, description="full well; it clips the electrons before all later effects"
     )
     bias_dn: int = Field(default=64, ge=0, le=65535, description="level without light, up to the top code")
+    bias_drift_dn_rms: float = Field(
+        default=0.0, ge=0, description="standard deviation of the bias from exposure to exposure"
+    )
     gain_dn_per_e: float | None = Field(
         default=None, gt=0, description="system gain K of EMVA 1288; default: the full well reaches the top code"
     )

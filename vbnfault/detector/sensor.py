@@ -116,6 +116,12 @@ class Sensor:
     )
     quantum_efficiency: tuple[Curve, ...] = Field(default=(), description="efficiency of single channels")
     temperature_K: float = Field(default=293.0, ge=100, le=400, description="operating temperature")
+    temperature_drift_K: float = Field(
+        default=0.0,
+        ge=0,
+        le=20,
+        description="standard deviation of the temperature from exposure to exposure; the dark current follows it",
+    )
     demosaic: Method = Field(default="malvar", description="method for a Bayer pattern; others use bilinear")
     correct_defects: bool = Field(
         default=False, description="whether known defects are replaced before demosaicing"

@@ -1,10 +1,10 @@
-"""Blur an image by a point spread of two parts: a core, and the halo of light that optics and sensor scatter.
+"""Blur an image by a core and by the light that optics and sensor scatter, in a halo and in wide wings.
 
-Measured point spreads of cameras consist of a narrow core and of wings that fall as a power of the angle. Here
+Measured point spreads of cameras consist of a narrow core and of light that falls as a power of the angle. Here
 
-    PSF(θ) = (1 - h) · exp(-θ² / 2σ²) / (2π σ²) + h · (p - 2) / (2π θ₀²) · (1 + θ² / θ₀²)^(-p/2),
+    PSF(θ) = (1 - Σ hᵢ) · exp(-θ² / 2σ²) / (2π σ²) + Σ hᵢ · (pᵢ - 2) / (2π θᵢ²) · (1 + θ² / θᵢ²)^(-pᵢ/2),
 
-a Gaussian and the profile of Moffat (1969, A&A 3, 455). It is the same over the frame and in all bands, and
+a Gaussian and two profiles of Moffat (1969, A&A 3, 455). It is the same over the frame and in all bands, and
 conserves the light of the frame.
 """
 
@@ -28,13 +28,17 @@ _FINE = 9  # points along each side of a pixel for that
 class Halo:
     """Describe a point spread with a halo.
 
-    `core_rad` is σ, `halo_fraction` h, `halo_rad` θ₀ and `halo_index` p, which is above 2. Angles are in radians.
+    `core_rad` is σ. `halo_fraction`, `halo_rad` and `halo_index` are h, θ and p of the halo, the fields `wing_…`
+    those of the wings; p is above 2. Angles are in radians.
     """
 
     core_rad: float
     halo_fraction: float
     halo_rad: float
     halo_index: float
+    wing_fraction: float = 0.0
+    wing_rad: float = 1.0
+    wing_index: float = 3.0
 
     def applied(self, light: NDArray[np.floating], pixel_rad: float) -> NDArray[np.floating]:
         """Return light, float[..., y, x], after the point spread, at least 0.
@@ -63,19 +67,26 @@ class Halo:
         The sum over offsets of either sign is 1; at the largest offsets, both signs are the same pixel.
         """
         core = [_gaussian(self.core_rad / pixel_rad, size) for size in shape]
-        y, x = (np.arange(size + 1, dtype=np.float64) for size in shape)
-        scale, power = self.halo_rad / pixel_rad, -self.halo_index / 2
+        out = (1 - self.halo_fraction - self.wing_fraction) * core[0][:, None] * core[1]
+        out += self.halo_fraction * _moffat(self.halo_rad / pixel_rad, self.halo_index, shape)
+        if self.wing_fraction:
+            out += self.wing_fraction * _moffat(self.wing_rad / pixel_rad, self.wing_index, shape)
+        return np.asarray(out)
 
-        def moffat(down: F64, across: F64) -> F64:
-            return np.asarray((1 + (down[:, None] ** 2 + across**2) / scale**2) ** power)
 
-        wing = moffat(y, x)
-        near = tuple(min(_FINE_PX, size) for size in shape)
-        inside = (np.arange(_FINE) + 0.5) / _FINE - 0.5
-        fine = moffat(*((np.arange(size)[:, None] + inside).ravel() for size in near))
-        wing[: near[0], : near[1]] = fine.reshape(near[0], _FINE, near[1], _FINE).mean(axis=(1, 3))
-        wing /= _both_signs(wing).sum()
-        return np.asarray((1 - self.halo_fraction) * core[0][:, None] * core[1] + self.halo_fraction * wing)
+def _moffat(scale_px: float, index: float, shape: tuple[int, int]) -> F64:
+    """Return a profile of Moffat averaged over pixels, on the offsets of `Halo.on_pixels`; its sum is 1."""
+
+    def profile(down: F64, across: F64) -> F64:
+        return np.asarray((1 + (down[:, None] ** 2 + across**2) / scale_px**2) ** (-index / 2))
+
+    y, x = (np.arange(size + 1, dtype=np.float64) for size in shape)
+    out = profile(y, x)
+    near = tuple(min(_FINE_PX, size) for size in shape)
+    inside = (np.arange(_FINE) + 0.5) / _FINE - 0.5
+    fine = profile(*((np.arange(size)[:, None] + inside).ravel() for size in near))
+    out[: near[0], : near[1]] = fine.reshape(near[0], _FINE, near[1], _FINE).mean(axis=(1, 3))
+    return out / _both_signs(out).sum()
 
 
 def _both_signs(quadrant: F64) -> F64:

@@ -44,10 +44,10 @@ OF_A_SENSOR_FILE = (
 
 
 class PointSpreadTable(Table):
-    """Give a thin lens a point spread: a Gaussian core, and a halo that falls as a power of the angle.
+    """Give a thin lens a point spread: a Gaussian core, a halo that falls as a power of the angle, and wide wings.
 
-    The halo is light that lens, window and sensor scatter. Angles are as seen from the camera, whatever the number
-    of pixels; a pixel of a field of 5° over 1024 px subtends 85 µrad.
+    Halo and wings are light that lens, window and sensor scatter. Angles are as seen from the camera, whatever the
+    number of pixels; a pixel of a field of 5° over 1024 px subtends 85 µrad.
     """
 
     core_urad: float = Field(gt=0, le=1e5, description="standard deviation of the core")
@@ -56,6 +56,20 @@ class PointSpreadTable(Table):
         100.0, gt=0, le=1e6, description="angle beyond which the halo falls as a power: θ₀ of (1 + θ²/θ₀²)^(-p/2)"
     )
     halo_index: float = Field(3.0, gt=2, le=10, description="the power p")
+    wing_fraction: float = Field(
+        0.0, ge=0, lt=1, description="fraction of the light that goes into the wings, a second and wider halo"
+    )
+    wing_urad: float = Field(1e4, gt=0, le=1e6, description="angle beyond which the wings fall, as halo_urad")
+    wing_index: float = Field(3.0, gt=2, le=10, description="their power, as halo_index")
+
+    @model_validator(mode="after")
+    def _light_left(self) -> PointSpreadTable:
+        if self.halo_fraction + self.wing_fraction >= 1:
+            raise ValueError(
+                f"halo_fraction = {self.halo_fraction:g}, wing_fraction = {self.wing_fraction:g}: must be below 1 "
+                "together"
+            )
+        return self
 
 
 class CameraTable(Table):

@@ -450,6 +450,9 @@ def _halo(table: PointSpreadTable | None) -> Halo | None:
         halo_fraction=table.halo_fraction,
         halo_rad=1e-6 * table.halo_urad,
         halo_index=table.halo_index,
+        wing_fraction=table.wing_fraction,
+        wing_rad=1e-6 * table.wing_urad,
+        wing_index=table.wing_index,
     )
 
 

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..dark import Telegraph
+from ..dark import Telegraph, silicon_factor
 from ..noise import poisson_quantile
 from ..transfer import passing_dark_e
 from .contract import F32, Effect, Exposure, FaultStep
@@ -20,9 +20,12 @@ class DarkCurrent(Effect):
 
     def apply(self, signal: F32, exposure: Exposure) -> F32:
         """Return the electrons with dark current, without telegraph signals."""
-        device = exposure.device
-        out = np.asarray(cv2.scaleAdd(device.dark_rate_e_s, exposure.exposure_s, signal))
-        return out if device.transfer_dark_e is None else cv2.add(out, device.transfer_dark_e)
+        device, factor = exposure.device, dark_factor(exposure)
+        out = np.asarray(cv2.scaleAdd(device.dark_rate_e_s, exposure.exposure_s * factor, signal))
+        moved = device.transfer_dark_e
+        if moved is None:
+            return out
+        return cv2.add(out, moved) if factor == 1 else np.asarray(cv2.scaleAdd(moved, factor, out))
 
 
 class TelegraphSignals(Effect):
@@ -70,6 +73,18 @@ class ChargeStep(FaultStep):
 
     name = "charge"
     after = "shot_noise"
+
+
+def dark_factor(exposure: Exposure) -> float:
+    """Return the dark current of an exposure over that at the sensor's mean temperature; 1 without noise.
+
+    Undamaged and damaged pixels follow the temperature by nearly the same law, so one factor serves both.
+    """
+    mean_K, drift_K = exposure.device.temperature_K, exposure.sensor.temperature_drift_K
+    rng = exposure.rng("temperature") if drift_K else None
+    if rng is None:
+        return 1.0
+    return silicon_factor(mean_K + drift_K * float(np.clip(rng.standard_normal(), -3, 3)), mean_K)
 
 
 def upper_fraction(signals: Telegraph, exposure_s: float, seed: int) -> NDArray[np.float64]:

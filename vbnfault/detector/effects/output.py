@@ -75,8 +75,13 @@ def full_well_to_codes(signal: F32, exposure: Exposure) -> Raw:
 
 
 def _with_offsets(exposure: Exposure) -> ReadoutIndividual:
-    """Return the device's chain with the offsets that faults have changed."""
-    chain = exposure.device.readout_individual
+    """Return the device's chain with the drift of its bias, and the offsets that faults have changed."""
+    chain, readout = exposure.device.readout_individual, exposure.sensor.readout
+    rng = exposure.rng("bias") if readout.bias_drift_dn_rms else None
+    if rng is not None:
+        drift_e = rng.standard_normal() * readout.bias_drift_dn_rms / readout.system_gain_dn_per_e
+        rows = np.zeros(exposure.device.shape[0], dtype=np.float32) if chain.row_e is None else chain.row_e
+        chain = replace(chain, row_e=rows + np.float32(drift_e))
     if not exposure.acts.get("offsets"):
         return chain
     return replace(chain, pixel_e=exposure.acted("offsets", chain.pixel_e))
