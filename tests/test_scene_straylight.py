@@ -15,7 +15,7 @@ from test_faults_kit import flat_electrons, make_context
 
 import vbnfault
 from vbnfault.core import array_files, llvm, spectra
-from vbnfault.core.errors import VbnfaultError
+from vbnfault.core.errors import InputError, VbnfaultError
 from vbnfault.core.quantities import Electrons, Radiance
 from vbnfault.faults import FaultContext, from_dict
 from vbnfault.lens import ThinLens, load_lens, paraxial_properties
@@ -26,7 +26,9 @@ from vbnfault.lens.straylight.ghosts import boxes, lit_cells, traced_ghosts
 from vbnfault.lens.straylight.paraxial import paraxial_ghosts
 from vbnfault.lens.straylight.scatter import Cleanliness
 from vbnfault.lens.straylight.scene import RenderGrid, SceneInLens, surrounding_grids
+from vbnfault.lens.straylight.scene_diffraction import POINT_SPREAD_PX, starburst_of_source, wing_fraction
 from vbnfault.lens.straylight.settings import Baffle, DirectPath, SensorGrid, StraylightSettings, SunSource
+from vbnfault.lens.straylight.starburst import StarburstFrame
 from vbnfault.lens.straylight.total import SunlightInLens
 from vbnfault.pipeline.record import to_sample
 from vbnfault.scene import config
@@ -163,6 +165,62 @@ def test_every_lit_pixel_as_a_source() -> None:
     assert np.abs(found.total - oracle).sum() < 0.02 * oracle.sum()
     # the sum over the pixels has neither error
     assert found.total.sum() == pytest.approx(oracle.sum(), rel=0.005)
+
+
+def with_blades(blades: int) -> Prescription:
+    """A lens whose stop has so many blades; 0 is round."""
+    lens = load_lens("tessar_50_f2p8")
+    stop = replace(lens.surfaces[lens.stop], blades=blades, rotation_deg=17.0)
+    return replace(lens, surfaces=(*lens.surfaces[: lens.stop], stop, *lens.surfaces[lens.stop + 1 :]))
+
+
+@pytest.mark.parametrize("blades", [0, 5])
+def test_the_stop_diffracts_light_of_every_lit_pixel(blades: int) -> None:
+    """Beyond the point spread, every lit pixel has the starburst of a Sun as wide as the pixel, within 2 %."""
+    scene = replace(behind(with_blades(blades), 48, 35.0), diffraction=True)
+    radiance = disc(scene.render.shape, 0.55, 0.45, 0.05)
+    made = scene.starburst([(scene.render, scene.render.irradiance(radiance))], np.eye(1))[0]
+    pitch, efl_mm = scene.sensor.pitch_mm, paraxial_properties(scene.lens).efl_mm
+    side = (np.arange(48) + 0.5 - 24) * pitch / efl_mm
+    cosine = 1 / np.sqrt(1 + side**2 + side[:, None] ** 2)
+    expected = np.zeros((48, 48))
+    for x, y, irradiance in points(scene.render, radiance, 1):
+        sun = SunSource(
+            angle_deg=float(np.degrees(np.arctan(np.hypot(x, y)))),
+            azimuth_deg=float(np.degrees(np.arctan2(y, x))),
+            radius_rad=float(np.pi**-0.5 / scene.render.focal_px),
+        )
+        path = DirectPath(transmittance=scene.passed, admitted_mm2=1.0)
+        light = SunlightInLens.of(scene.lens, wavelength_nm=NODES, sensor=scene.sensor, sun=sun, path=path)
+        shorter = 1 / np.sqrt(1 + x * x + y * y)
+        away = np.hypot(side * cosine - x * shorter, side[:, None] * cosine - y * shorter)
+        fade = np.clip((away * efl_mm / pitch - POINT_SPREAD_PX + 1) / 2, 0, 1)
+        expected += irradiance[0] * light.starburst()[0][0] * fade
+    assert np.abs(made - expected).sum() < 0.02 * expected.sum()
+    assert made.sum() == pytest.approx(expected.sum(), rel=0.005)
+    assert (
+        scene.straylight(radiance, np.eye(1)).total.sum()
+        > replace(scene, diffraction=False).straylight(radiance, np.eye(1)).total.sum()
+    )
+
+
+def test_the_image_loses_what_the_stop_diffracts() -> None:
+    """Light in the frame and beyond it, beyond 7 px, is the fraction that the image loses, but for the fade-in."""
+    scene = replace(behind(with_blades(6), 96, 20.0), diffraction=True)
+    burst = starburst_of_source(scene.lens, NODES, 1 / scene.render.focal_px)
+    point = np.zeros((1, 96, 96), dtype=np.float32)
+    point[0, 48, 48] = 1
+    irradiance = scene.render.irradiance(point)
+    inside = (
+        scene.starburst([(scene.render, irradiance)], np.eye(1)).sum(dtype=np.float64) * scene.sensor.pitch_mm**2
+    )
+    frame = StarburstFrame(sun_xy_mm=(0.0, 0.0), wavelength_nm=NODES, sensor=scene.sensor)
+    passed_mm2 = (
+        0.8 * irradiance.sum() * np.pi / 4 * paraxial_properties(scene.lens).entrance_pupil_diameter_mm ** 2
+    )
+    beyond = 0.8 * irradiance.sum() * burst.beyond_mm2(frame)[0]
+    lost = wing_fraction(burst, NODES, scene.sensor)[0]
+    assert (inside + beyond) / passed_mm2 == pytest.approx(lost, rel=0.03)
 
 
 def test_the_response_has_the_flux_of_the_traced_ghosts(singlet: Prescription) -> None:
@@ -401,6 +459,21 @@ def test_the_scene_adds_light_without_a_sun(singlet_file: Path) -> None:
     lost = 1 - left / grey.array
     assert (lost > 0.004).all()  # the veil takes at least 0.5 % of the image
     assert (lost < 0.04).all()
+
+
+def test_the_scenes_diffraction_is_off_unless_asked_for(singlet_file: Path) -> None:
+    where = context(None)
+    grey = flat_electrons(where, 0.5)
+    plain = injected(where, grey, singlet_file, sources="scene")[0]
+    wings, fault = injected(where, grey, singlet_file, sources="scene", scene_diffraction=True)
+    assert "scene_diffraction" not in injected(where, grey, singlet_file, sources="scene")[1].draw_state(
+        np.random.default_rng(3)
+    )
+    assert fault.draw_state(np.random.default_rng(3))["scene_diffraction"] is True
+    assert wings.mean() > plain.mean()  # the lit disc is far brighter than the grey image
+    assert (wings > 0.9 * plain).all()  # which loses some percent at most
+    with pytest.raises(InputError, match="scene_diffraction: needs sources = 'scene'"):
+        from_dict("straylight", {"model": "traced", "scene_diffraction": True}, source="scene.toml")
 
 
 def test_the_scene_comes_on_top_of_the_sun(singlet_file: Path) -> None:

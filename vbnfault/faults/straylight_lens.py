@@ -36,11 +36,12 @@ from ..core import spectra
 from ..core.quantities import Irradiance, Radiance
 from ..lens.straylight.scatter import CLEANLINESS_LIMITS, ROUGHNESS_NM_LIMITS, Cleanliness
 from ..lens.straylight.scene import PointSources, RenderGrid, SceneInLens, surrounding_grids
+from ..lens.straylight.scene_diffraction import starburst_of_source, wing_fraction
 from ..lens.straylight.settings import Baffle, DirectPath, GhostSettings, SensorGrid, StraylightSettings, SunSource
 from ..lens.straylight.total import SunlightInLens, scene_veil_fraction, veil_of
 from .context import FaultContext, Params
 from .contract import LensFault
-from .fields import Interval, Severity, bounds, choice, number
+from .fields import Interval, Severity, bounds, choice, flag, number
 from .planes import intensity_dn, plus, times
 
 F32 = NDArray[np.float32]
@@ -134,6 +135,11 @@ class _LensStraylight(LensFault):
         ("sun", "scene"),
         doc="of ghosts and glare: the Sun alone, or the whole rendered scene and the Sun where it is in view",
     )
+    scene_diffraction: bool = flag(
+        False,
+        doc="whether the stop diffracts light of the scene, too, beyond the point spread of the lens; a measured "
+        "camera.point_spread includes it; needs sources = 'scene'",
+    )
     reflections: int = number(2, limits=(2, 4), integer=True, doc="of the ghosts: 2, or 4 for those of four too")
     baffle_length_mm: float = number(0.0, limits=(0, 1e4), unit="mm", doc="of a tube in front of the lens")
     baffle_radius_mm: float = number(0.0, limits=(0, 1e4), unit="mm", doc="of that tube")
@@ -159,6 +165,8 @@ class _LensStraylight(LensFault):
         super().validate()
         if self.reflections not in (2, 4):
             raise ValueError(f"reflections = {self.reflections}: must be 2 or 4")
+        if self.scene_diffraction and self.sources != "scene":
+            raise ValueError("scene_diffraction: needs sources = 'scene'")
         if self.baffle_length_mm and not self.baffle_radius_mm:
             raise ValueError("baffle_length_mm: needs baffle_radius_mm")
 
@@ -182,6 +190,8 @@ class _LensStraylight(LensFault):
         }
         if self.sources != "sun":  # so that the stored parameters of other scenes stay as they are
             params["sources"] = self.sources
+        if self.scene_diffraction:
+            params["scene_diffraction"] = True
         return params
 
     def apply(self, quantity: Any, params: Params, context: FaultContext) -> Any:
@@ -256,6 +266,7 @@ class _LensStraylight(LensFault):
             image=camera.lens,
             settings=self._settings(params, context),
             passed=camera.lens.transmittance(nodes),
+            diffraction=_diffracts(params, context),
         )
         weights = camera.detector.electron_rate_weights(nodes).astype(np.float64) * camera.exposure_s
         around = [_without_sun(one) for one in context.surroundings]
@@ -320,7 +331,15 @@ class _LensStraylight(LensFault):
             cleanliness=settings.cleanliness,
             veil_fraction=settings.veil_fraction,
         )
+        if _diffracts(params, context):
+            lost = 1 - (1 - lost) * (1 - self._diffracted(params, context))
         return np.asarray(_channel_weights(context) @ lost)
+
+    def _diffracted(self, params: Params, context: FaultContext) -> F64:
+        """Return the fraction of the scene's light that the stop diffracts far enough, float64[band]."""
+        lens, nodes = context.frame.prescription(params["lens"], params["coating"]), _sunlight(context)[0]
+        burst = starburst_of_source(lens, nodes, 1 / context.camera.focal_length_px)
+        return wing_fraction(burst, nodes, _sensor_grid(context))
 
     def _ghosts(self, params: Params, context: FaultContext) -> list[dict[str, Any]]:
         """Return the brightest ghosts in the frame as plain data."""
@@ -353,6 +372,13 @@ class _LensStraylight(LensFault):
             }
             for g in ghosts
         ]
+
+
+def _diffracts(params: Params, context: FaultContext) -> bool:
+    """Return whether the stop diffracts light of the scene; a measured point spread already contains its wings."""
+    lens = context.camera.lens
+    measured = lens.real is None and lens.blurs
+    return bool(params.get("scene_diffraction", False)) and context.radiance is not None and not measured
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -5,7 +5,8 @@ direction, where dA / f² is the area of a pixel of the render in focal lengths.
 in the radiance L, so that it is computed from responses that depend on the lens alone:
 
 - ghosts by `ghost_response`, in polar cells;
-- glare by `scene_scatter`, as convolutions over direction cosines;
+- glare by `scene_scatter` and the light that the stop diffracts (starburst) by `scene_diffraction`, as
+  convolutions over direction cosines;
 - the veil of mount, barrel and edges by its closed form (`total`), from the flux that enters the lens.
 
 Sources out of the field are in coarse renders around the first one (`surrounding_grids`), each four times as wide
@@ -32,6 +33,7 @@ from .ghost_response import GhostResponse, PolarCells, ghost_response
 from .irradiance import disc_samples
 from .paraxial import axial_transmittance
 from .scatter import baffle_transmission, glare_kernels, hood_transmission, scattered_fraction
+from .scene_diffraction import starburst_of_source, wing_spectra
 from .scene_scatter import DirectionGrid, SeparatedKernel, separated
 from .settings import Baffle, SensorGrid, StraylightSettings
 
@@ -49,6 +51,7 @@ _SURROUNDING_PX = 128
 _WIDEST_DEG = 75.0
 _WIDEST = float(np.tan(np.radians(_WIDEST_DEG)))
 _DISC_RINGS = 2  # of points that stand for the disc of a far body
+_STEPS_OF_SPIKES = 2  # of the grid of directions in a source, on which the stop has spikes as narrow as the source
 _RING_RATIO = 1.15  # ratio of the slopes of neighbouring rings of sources out of the field
 
 
@@ -171,11 +174,13 @@ class SceneStraylight:
     ghosts: F32
     glare: F32
     veil: F32
+    starburst: F32 | None = None
 
     @property
     def total(self) -> F32:
-        """Return the sum of ghosts, glare and veil."""
-        return np.asarray(self.ghosts + self.glare + self.veil)
+        """Return the sum of all parts."""
+        total = self.ghosts + self.glare + self.veil
+        return np.asarray(total if self.starburst is None else total + self.starburst)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -202,6 +207,8 @@ class SceneInLens:
         Grids of the renders around that of the scene.
     rings
         Largest number of rings of sources and of the sensor, and of azimuths, of the cells of ghosts.
+    diffraction
+        Whether the stop diffracts light of the scene beyond the point spread.
     """
 
     lens: Prescription
@@ -213,6 +220,7 @@ class SceneInLens:
     passed: F64
     around: tuple[RenderGrid, ...] = ()
     rings: tuple[int, int, int] = (SOURCE_RINGS, SENSOR_RINGS, AZIMUTHS)
+    diffraction: bool = False
 
     def straylight(
         self, radiance: F32, weights: F64, around: Sequence[F32] = (), points: Sequence[Sources] = ()
@@ -237,6 +245,7 @@ class SceneInLens:
             ghosts=self.ghosts(sources, weights),
             glare=self.glare(sources, weights),
             veil=self.veil(sources, weights),
+            starburst=self.starburst(sources, weights) if self.diffraction else None,
         )
 
     def ghosts(self, sources: Sequence[Sources], weights: F64) -> F32:
@@ -273,6 +282,28 @@ class SceneInLens:
                 scattered += places.directions.convolved(terms)
         # the transform leaves rounding errors where there is no light
         return np.maximum(scattered * cos4_map(self.sensor.shape, self._efl_px), 0, out=scattered)
+
+    def starburst(self, sources: Sequence[Sources], weights: F64) -> F32:
+        """Return what the stop diffracts beyond the point spread; arguments and result as those of `ghosts`."""
+        diffracted = np.zeros((len(weights), *self.sensor.shape), dtype=np.float32)
+        for grid, irradiance in sources:
+            if not irradiance.any():
+                continue
+            places = self._places(grid)
+            finer = _STEPS_OF_SPIKES if self.lens.surfaces[self.lens.stop].blades else 1
+            field = float(np.hypot(*self.render.half))
+            directions = _directions(grid, field, self.sensor, self.image, self._efl_px, finer)
+            burst = starburst_of_source(self.lens, self.nodes_nm, grid.block / grid.focal_px)
+            kernels, mix = wing_spectra(burst, self.nodes_nm, directions, self.sensor)
+            # the Sun's starburst scales with the beam across its direction, too
+            kept = (self._lit(places.slope) / np.hypot(1, places.slope)).astype(np.float32)
+            gains = np.einsum("cb,b,bk->kcb", weights, self.passed, mix).astype(np.float32)
+            terms = [
+                (np.einsum("cb,bs->cs", gain, irradiance) * kept, kernel)
+                for gain, kernel in zip(gains, kernels, strict=True)
+            ]
+            diffracted += directions.convolved(terms)
+        return np.maximum(diffracted * cos4_map(self.sensor.shape, self._efl_px), 0, out=diffracted)
 
     def veil(self, sources: Sequence[Sources], weights: F64) -> F32:
         """Return what mount, barrel and edges scatter; arguments and result as those of `ghosts`."""
@@ -405,17 +436,25 @@ def _places(
     """
     x, y = render.slopes
     slope = np.hypot(x, y)
-    known = np.clip(slope, 1e-9, field)
-    stretch = image.distorted(known) / known
-    stretch *= image.focal_length_mm / sensor.pitch_mm / efl_px
     position = np.arctan(slope) / np.arctan(max(float(slope.max()), 1e-9)) * (_ANGLES - 1)
     angle = np.minimum(position.astype(np.int64), _ANGLES - 2)
     return _Places(
         slope=slope,
         polar=cells.source_weights(x, y),
-        directions=DirectionGrid.of(
-            x * stretch, y * stretch, render.block / render.focal_px, sensor, efl_px * sensor.pitch_mm
-        ),
+        directions=_directions(render, field, sensor, image, efl_px, 1),
         angle=angle,
         rest=(position - angle).astype(np.float32),
     )
+
+
+@lru_cache(maxsize=8)
+def _directions(
+    render: RenderGrid | PointSources, field: float, sensor: SensorGrid, image: Lens, efl_px: float, finer: int
+) -> DirectionGrid:
+    """Return the grid of direction cosines for the sources of a render, with `finer` steps in each source."""
+    x, y = render.slopes
+    known = np.clip(np.hypot(x, y), 1e-9, field)
+    stretch = image.distorted(known) / known
+    stretch *= image.focal_length_mm / sensor.pitch_mm / efl_px
+    step = render.block / render.focal_px / finer
+    return DirectionGrid.of(x * stretch, y * stretch, step, sensor, efl_px * sensor.pitch_mm)

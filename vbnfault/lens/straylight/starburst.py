@@ -38,7 +38,7 @@ spikes are also too faint, so their flux is right.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields
 from typing import Any
 
@@ -290,6 +290,31 @@ class Starburst:
             if mix is not None:
                 _mixed(layers, mix, strip)
         return out
+
+    def layers_at(self, frame: StarburstFrame, u: F32, v: F32) -> tuple[F32, F64]:
+        """Return |A|² / λ² in mm² at the distances (u, v) in direction cosines, and weights, both as `layers`.
+
+        `u` and `v` are float32 that broadcast to [y, x]. Inside the disc the value is that just outside.
+        """
+        tables, mix = self._tables(frame)
+        nearest = self._sines(frame.sensor.pitch_mm)[0]
+        per_log = np.float32(0.5 * (self.radii - 1) / np.log(_FARTHEST / nearest))
+        u, v = np.broadcast_arrays(u, v)
+        apart = np.maximum(u * u + v * v, np.float32(nearest**2))
+        angle = np.arctan2(np.abs(v), np.copysign(u, u * v)) * np.float32(self.angles / np.pi)
+        row = (np.log(apart) - np.float32(2 * np.log(nearest))) * per_log
+        apart -= np.float32(self.sun_radius_rad**2)
+        layers = [
+            cv2.remap(t, angle, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE) / apart for t in tables
+        ]
+        return np.stack(layers), mix.astype(np.float64)
+
+    def flux_by_distance(self, frame: StarburstFrame, weight: Callable[[F64], F64]) -> F64:
+        """Return the integral of |A|² / λ² over directions, weighted by distance, float64[band] in mm²."""
+        tables, mix = self._tables(frame)
+        sine = self._sines(frame.sensor.pitch_mm)
+        mean = tables[..., :-1].mean(axis=-1, dtype=np.float64) / (sine**2 - self.sun_radius_rad**2)
+        return np.asarray(mix @ np.trapezoid(2 * np.pi * mean * weight(sine) * sine**2, x=np.log(sine), axis=1))
 
     def beyond_mm2(self, frame: StarburstFrame) -> F64:
         """Return the flux on the sensor plane outside the frame, float64[band] in mm².

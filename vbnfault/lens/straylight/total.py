@@ -12,7 +12,8 @@ losses), the rest of the ghosts is subtracted from the direct image too.
 
 An extended scene follows the same rule where its effect is visible: the image loses the fraction that surfaces,
 mount, barrel and edges scatter, and all of it returns as a veil. Diffraction and ghosts of the scene stay in its
-image: the point spread contains the diffraction, and neighbouring light outshines the ghosts.
+image: within some pixels the point spread contains the diffraction, and neighbouring light outshines the ghosts.
+`scene` computes both farther away; what the stop then diffracts beyond the point spread, the image loses too.
 
 Veil. The walls behind the lens, lit by the transmitted light, act as a small Lambertian source on the axis at a
 focal length from the sensor (assumed):
