@@ -1,9 +1,9 @@
 """Compute what the stop diffracts of an extended scene: the far wings of every part of it.
 
 Each part of the scene has the starburst of a small Sun (`starburst`), at distances from `POINT_SPREAD_PX` pixels
-on: nearer, the point spread of the lens already holds its light. The light depends on the distance of two directions
-in direction cosines alone, so that of a scene is a convolution, with one kernel for each of the starburst's few
-tables. Rims that cut off part of an oblique beam are left out.
+on: nearer, the point spread of the lens already holds its light. The light depends on the distance of two
+directions in direction cosines alone, so that of a scene is a convolution, with one kernel for each of the few
+tables of the starburst. Rims that cut off part of an oblique beam are left out.
 
 A camera whose point spread was measured (`camera.point_spread`) has the wings of its stop in it.
 """
