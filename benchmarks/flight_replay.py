@@ -102,7 +102,7 @@ AFRHO_CM = 50.0  # chosen beside halo and wings of the point spread for the sky 
 SPOTS: dict[str, dict[str, Any]] = {
     "cosmic_rays": {
         "model": "tracks",
-        "flux_per_cm2_s": 6.0,
+        "flux_per_cm2_s": 7.0,
         "energy_MeV": [300.0, 5000.0],
         "thickness_um": 15.0,
         "diffusion_um": 4.0,
