@@ -91,6 +91,9 @@ def scene_identity(session: pipeline.Session) -> dict[str, Any]:
         del scene["coma"]
     if session.scene.camera.point_spread is None:
         del scene["camera"]["point_spread"]
+    elif not session.scene.camera.point_spread.wing_fraction:
+        for key in ("wing_fraction", "wing_urad", "wing_index"):
+            del scene["camera"]["point_spread"][key]
     if session.scene.patch.fractured is None:
         del scene["patch"]["fractured"]
     if not session.scene.sky.bodies:
