@@ -94,7 +94,7 @@ BINNING = 2  # the frames have half the native size
 # Weights of native pixels in each axis of the halving: noise of neighbours in the frames correlates by 0.07
 _HALVING = (0.035, 0.465, 0.465, 0.035)
 _STRETCH = 255 / 4095**0.5  # of a root of DN
-_BLACK_DN = -0.35  # over the bias of the sensor, shown as 0: the mean background of 31 frames
+_BLACK_DN = -0.5  # over the bias of the sensor, shown as 0: the mean background of 31 frames is 0.35 over it
 AFRHO_CM = 50.0  # chosen beside halo and wings of the point spread for the sky of 31 frames
 # What leaves spots and tracks in the sky. Protons: flux, depth and diffusion fitted to the spots of 11 frames,
 # least energy assumed (spacecraft and solar wind keep out slower ones); in quiet time CREME96 has 4.67 at the

@@ -62,7 +62,7 @@ def test_an_image_moves_by_whole_pixels_and_continues_as_its_mirror_image() -> N
 def test_raw_images_are_stretched_by_a_root_and_halved() -> None:
     raw = np.full((12, 12), 4200, dtype=np.uint16)  # above the top code over black
     raw[6:] = 104
-    # over a black of 99.65 DN: 255 and 3.985 √4.35 = 8 in 8 bits; next to the edge a neighbour weighs 0.035
+    # over a black of 99.5 DN: 255 and 3.985 √4.5 = 8 in 8 bits; next to the edge a neighbour weighs 0.035
     column = [255, 255, round(0.965 * 255 + 0.035 * 8), round(0.965 * 8 + 0.035 * 255), 8, 8]
     assert flight_replay.developed(raw, 100.0).tolist() == [[value] * 6 for value in column]
     assert flight_replay.developed(raw.T, 100.0).T.tolist() == [[value] * 6 for value in column]
