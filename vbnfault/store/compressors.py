@@ -6,8 +6,6 @@ A codec has a name, which the root attributes of a store keep for each layer:
 - `blosc zstd LEVEL SHUFFLE SIZE`: Blosc, which first sorts the bytes (`shuffle`) or bits (`bitshuffle`) of words
   of SIZE bytes by weight, and then compresses blocks with Zstd; behind it the CRC-32C of the compressed bytes,
   because Blosc has no checksum.
-
-Blosc in a thread other than the main one uses a single thread, so that equal data give equal bytes.
 """
 
 from __future__ import annotations
@@ -20,7 +18,7 @@ from typing import Any
 
 import google_crc32c
 import numpy as np
-from numcodecs import Blosc, Zstd
+from numcodecs import Blosc, Zstd, blosc
 from numcodecs.zstd import decompress
 from numpy.typing import NDArray
 
@@ -30,6 +28,9 @@ from ..core.errors import InputError, shown
 ZSTD = "zstd 1"
 _MOST_BYTES = Blosc.max_buffer_size  # that Blosc can compress as one chunk
 _NAME = re.compile(r"zstd (\d{1,2})|blosc zstd (\d) (shuffle|bitshuffle) (\d{1,2})")
+# numcodecs makes a semaphore for Blosc in each process, of which multiprocessing complains if a worker is killed or
+# the terminal hangs up. Where there are none, Blosc takes one thread, in which equal data also give equal bytes.
+blosc._MUTEX, blosc._MUTEX_IS_INIT = None, True
 _DAMAGED = (RuntimeError, MemoryError, ValueError)
 
 
@@ -46,14 +47,14 @@ class Compressor:
         """Return the codecs as `zarr.json` lists them."""
         if not self.shuffle:
             return [{"name": "zstd", "configuration": {"level": self.level, "checksum": True}}]
-        blosc = {
+        configuration = {
             "typesize": self.word_bytes,
             "cname": "zstd",
             "clevel": self.level,
             "shuffle": self.shuffle,
             "blocksize": 0,
         }
-        return [{"name": "blosc", "configuration": blosc}, {"name": "crc32c"}]
+        return [{"name": "blosc", "configuration": configuration}, {"name": "crc32c"}]
 
     def encode(self, data: Any) -> bytes:
         """Return data as the bytes of a chunk."""
